@@ -21,7 +21,7 @@ import yaml
 import vkc_pin as vkc
 from vkc_pin.cli.commands import make_parser
 from vkc_pin.validation.report import Violation
-from vkc_pin.world.files.documents import Document, check
+from vkc_pin.world.files.documents import Document, parse_document
 from vkc_pin.world.models.dynamics.joint_resistance import ObjectJointSchema
 from vkc_pin.world.models.object_file import AttachmentSchema, LatchSchema, ObjectSchema
 from vkc_pin.world.models.robot_schema import BaseSchema, RobotSchema
@@ -98,17 +98,17 @@ def test_yaml_examples_fit_their_schemas(tmp_path: Path) -> None:
         *((own, "drawer.urdf") for own in (narrow, push, rollers)),
         (closer, "door.urdf"),
     ):
-        assert check(Document(yaml.safe_load(text)), ObjectSchema).urdf == urdf
+        assert parse_document(Document(yaml.safe_load(text)), ObjectSchema).urdf == urdf
     (tmp_path / "hatch.yaml").write_text(whole, encoding="utf-8")
     assert vkc.load_scene(tmp_path / "hatch.yaml").objects["hatch"].object.name == "hatch"
-    assert check(Document(yaml.safe_load(described)), ObjectSchema).urdf == "door.urdf"
+    assert parse_document(Document(yaml.safe_load(described)), ObjectSchema).urdf == "door.urdf"
     robot, telescope, wheels = blocks(ROOT / "docs/robots.md", "yaml")
-    followed = check(Document(yaml.safe_load(telescope)), RobotSchema).couplings
+    followed = parse_document(Document(yaml.safe_load(telescope)), RobotSchema).couplings
     assert [coupling.joint for coupling in followed.values()] == ["joint_arm_l3"] * 3
-    rolls = check(Document(yaml.safe_load(wheels)), RobotSchema).base
+    rolls = parse_document(Document(yaml.safe_load(wheels)), RobotSchema).base
     assert rolls.wheels is not None
     assert (round(rolls.wheels.rim_speed, 3), rolls.turning_radius) == (1.0, 1.2)
-    assert check(Document(yaml.safe_load(robot)), RobotSchema).tool_frame == "tool"
+    assert parse_document(Document(yaml.safe_load(robot)), RobotSchema).tool_frame == "tool"
 
 
 def test_every_field_is_documented() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from vkc_pin.errors import InputError, UnknownNameError, VkcError, nearest_name, shown
+from vkc_pin.errors import InputError, UnknownNameError, VkcError, find_nearest_name, format_value
 
 
 @pytest.mark.parametrize(
@@ -36,8 +36,8 @@ def test_the_name_that_was_meant() -> None:
     assert str(UnknownNameError("link", "xyz", [])) == "there is no link 'xyz'; there are: none"
     many = UnknownNameError("link", "xyz", [f"l{k}" for k in range(20)])
     assert str(many).endswith("l11, ...")
-    assert nearest_name("abc", ["abd", "xyz"]) == "abd"
-    assert nearest_name("abc", ["xyz"]) is None
+    assert find_nearest_name("abc", ["abd", "xyz"]) == "abd"
+    assert find_nearest_name("abc", ["xyz"]) is None
 
 
 def test_messages_are_short_whatever_came() -> None:
@@ -47,6 +47,9 @@ def test_messages_are_short_whatever_came() -> None:
         assert (
             len(str(InputError("wrong", field=long, file=long, expected=value, got=value))) < 3000
         )
-        assert len(shown(value)) < 3000
+        assert len(format_value(value)) < 3000
     assert len(str(UnknownNameError(long, long, [long, "door"], field="it"))) < 3000
-    assert (shown([1, 2.5, "door"]), shown(10**30)) == ("[1, 2.5, 'door']", str(10**30))
+    assert (format_value([1, 2.5, "door"]), format_value(10**30)) == (
+        "[1, 2.5, 'door']",
+        str(10**30),
+    )

@@ -18,7 +18,7 @@ import trimesh
 from cutting import cut, solid_volume
 from numpy.typing import NDArray
 
-from vkc_pin.world.files.hulls import outer_hull
+from vkc_pin.world.files.hulls import compute_outer_hull
 from vkc_pin.world.files.urdf import UrdfFile, read_urdf
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.models.robot_schema import find_python_packages, read_robot
@@ -107,7 +107,7 @@ def main() -> None:
 
 def visual_meshes(file: UrdfFile, link: str) -> list[trimesh.Trimesh]:
     """Return the visual geometry of a link, one mesh per element, in the link's frame, [m]."""
-    return [shape.mesh() for shape in file.shapes("visual") if shape.link == link]
+    return [shape.make_mesh() for shape in file.read_shapes("visual") if shape.link == link]
 
 
 def convex_pieces(meshes: list[trimesh.Trimesh], link: Link) -> list[trimesh.Trimesh]:
@@ -117,7 +117,7 @@ def convex_pieces(meshes: list[trimesh.Trimesh], link: Link) -> list[trimesh.Tri
         points = [np.vstack([meshes[k].vertices for k in group]) for group in link.groups]
     else:
         points = cut(trimesh.util.concatenate(meshes), link.pieces, axis=link.axis)
-    return [outer_hull(piece, vertices=CORNERS) for piece in points]
+    return [compute_outer_hull(piece, vertices=CORNERS) for piece in points]
 
 
 if __name__ == "__main__":

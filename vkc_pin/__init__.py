@@ -13,7 +13,7 @@ from vkc_pin.utils import notebook
 
 _public, _names, __all__ = lazy_loader.attach_stub(__name__, __file__)
 __all__ += ["__version__", "cpin"]
-notebook.cards_from("vkc_pin.visualization.plots.notebook_cards")
+notebook.register_card_module("vkc_pin.visualization.plots.notebook_cards")
 
 
 def __dir__() -> list[str]:

@@ -7,42 +7,55 @@ import reprlib
 from collections.abc import Iterable
 from pathlib import Path
 
-__all__ = ["BuildError", "InputError", "UnknownNameError", "VkcError", "nearest_name", "shown"]
+__all__ = [
+    "BuildError",
+    "InputError",
+    "UnknownNameError",
+    "VkcError",
+    "find_nearest_name",
+    "format_value",
+]
 
-_LONGEST = 300  # characters of what came, or was expected, that a message shows
-_NAME = 80  # characters of a name
+_MAX_VALUE_LENGTH = 300  # characters of what came, or was expected, that a message shows
+_MAX_NAME_LENGTH = 80  # characters of a name
 
 
-class _Brief(reprlib.Repr):
+class _ShortRepr(reprlib.Repr):
     def repr_int(self, x: int, level: int) -> str:
         bits = x.bit_length()  # Python refuses to write out very large ones
         return repr(x) if bits <= 256 else f"an integer of {bits} bits"
 
 
-_brief = _Brief()
-_brief.maxlevel, _brief.maxtuple, _brief.maxlist, _brief.maxdict, _brief.maxset = 5, 12, 12, 8, 8
-_brief.maxstring = _brief.maxother = 200
+_SHORT_REPR = _ShortRepr()
+(
+    _SHORT_REPR.maxlevel,
+    _SHORT_REPR.maxtuple,
+    _SHORT_REPR.maxlist,
+    _SHORT_REPR.maxdict,
+    _SHORT_REPR.maxset,
+) = 5, 12, 12, 8, 8
+_SHORT_REPR.maxstring = _SHORT_REPR.maxother = 200
 
 
-def shown(value: object) -> str:
+def format_value(value: object) -> str:
     """Return a value as messages show it: its `repr`, but neither long nor deep, and without failing where that does."""
-    return _brief.repr(value)
+    return _SHORT_REPR.repr(value)
 
 
-def _short(text: str, most: int = _LONGEST) -> str:
+def _shorten(text: str, most: int = _MAX_VALUE_LENGTH) -> str:
     return text if len(text) <= most else f"{text[: most - 43]}...{text[-40:]}"
 
 
-def _told(value: object) -> str:
+def _format_detail(value: object) -> str:
     if isinstance(value, float | Path):
-        return _short(str(value))
-    return _short(value if isinstance(value, str) else shown(value))
+        return _shorten(str(value))
+    return _shorten(value if isinstance(value, str) else format_value(value))
 
 
-def nearest_name(name: str, choices: Iterable[str]) -> str | None:
+def find_nearest_name(name: str, choices: Iterable[str]) -> str | None:
     """Return the choice that resembles `name` most, or None if none does."""
     matches = difflib.get_close_matches(
-        _short(name, _NAME), [str(c) for c in choices], n=1, cutoff=0.5
+        _shorten(name, _MAX_NAME_LENGTH), [str(c) for c in choices], n=1, cutoff=0.5
     )
     return matches[0] if matches else None
 
@@ -79,16 +92,17 @@ class InputError(VkcError, ValueError):
     ) -> None:
         self.problem, self.file, self.line, self.field = problem, file, line, field
         self.expected, self.got = expected, got
-        named = None if file is None else _short(str(file))
+        named = None if file is None else _shorten(str(file))
         where = "" if named is None else f"{named}:{line}: " if line is not None else f"{named}: "
-        what = problem if field is None else f"{_short(field)}: {problem}"
+        what = problem if field is None else f"{_shorten(field)}: {problem}"
         details = [
-            f"{label} {_told(value)}"
+            f"{label} {_format_detail(value)}"
             for label, value in (("expected", expected), ("got", got))
             if value is not None
         ]
         super().__init__(
-            _short(where + what, 6 * _LONGEST) + (f" ({', '.join(details)})" if details else "")
+            _shorten(where + what, 6 * _MAX_VALUE_LENGTH)
+            + (f" ({', '.join(details)})" if details else "")
         )
 
 
@@ -106,12 +120,12 @@ class UnknownNameError(InputError):
         field: str | None = None,
     ) -> None:
         self.kind, self.name, self.choices = kind, name, tuple(str(c) for c in choices)
-        self.nearest = nearest_name(name, self.choices)
-        listed = ", ".join(_short(choice, _NAME) for choice in self.choices[:12]) + (
+        self.nearest = find_nearest_name(name, self.choices)
+        listed = ", ".join(_shorten(choice, _MAX_NAME_LENGTH) for choice in self.choices[:12]) + (
             ", ..." if len(self.choices) > 12 else ""
         )
         hint = f"; did you mean '{self.nearest}'?" if self.nearest else ""
-        problem = f"there is no {kind} '{_short(name, _NAME)}'{hint} There are: {listed or 'none'}"
+        problem = f"there is no {kind} '{_shorten(name, _MAX_NAME_LENGTH)}'{hint} There are: {listed or 'none'}"
         super().__init__(
             problem if hint else problem.replace(" There are", "; there are", 1),
             file=file,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any, Self
 
-from vkc_pin.errors import InputError, shown
-from vkc_pin.utils.arguments import number, whole
+from vkc_pin.errors import InputError, format_value
+from vkc_pin.utils.arguments import check_integer, check_number
 
 __all__ = ["Options"]
 
@@ -105,11 +105,11 @@ class Options:
                         "unknown",
                         field=field,
                         expected=" or ".join(map(repr, EFFORTS)),
-                        got=shown(value),
+                        got=format_value(value),
                     )
                 object.__setattr__(self, item.name, str(value))
             elif item.type == "int":
-                value = whole(
+                value = check_integer(
                     value, field, low=1, high=_MOST[item.name]
                 )  # NumPy's own integers do not go into JSON
                 object.__setattr__(self, item.name, value)
@@ -117,7 +117,7 @@ class Options:
                 low, high = _RANGES.get(item.name, (_SMALLEST, _LARGEST))
                 expected = f"a {'positive ' if low else ''}finite number, from {low:g} to {high:g}"
                 object.__setattr__(
-                    self, item.name, number(value, field, expected, low=low, high=high)
+                    self, item.name, check_number(value, field, expected, low=low, high=high)
                 )
 
     @classmethod

@@ -105,7 +105,7 @@ def test_every_experiment_takes_a_scheduler(
         asked.append(scheduler)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("vkc_pin.benchmarks.harness.runner.results", results)
+    monkeypatch.setattr("vkc_pin.benchmarks.harness.runner.run_tasks", results)
     names = [
         "initialization",
         "baselines",

@@ -81,7 +81,7 @@ def test_adding_to_a_dataset(made: Dataset, tmp_path: Path) -> None:
 
 def test_a_finished_one_is_left_as_it_is(made: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     before = {file: file.read_bytes() for file in made.folder.rglob("*") if file.is_file()}
-    monkeypatch.setattr(module, "results", None)  # nothing is run
+    monkeypatch.setattr(module, "run_tasks", None)  # nothing is run
     generate(SMALL, EPISODES, made.folder)
     assert {file: file.read_bytes() for file in made.folder.rglob("*") if file.is_file()} == before
     with pytest.raises(InputError, match="more episodes"):
@@ -216,16 +216,16 @@ def test_full_shards_are_written_once_and_their_work_goes(
 def test_a_block_that_takes_its_process_with_it_is_tried_one_by_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from vkc_pin.utils.parallel.engine import Died
+    from vkc_pin.utils.parallel.engine import CrashedTask
 
     asked: list[Sequence[int]] = []
 
     def results(function: Any, tasks: Any, **options: Any) -> Any:
         for key, (said, numbers, robots) in tasks:
             asked.append(list(numbers))
-            yield key, Died("killed") if 1 in numbers else function((said, numbers, robots))
+            yield key, CrashedTask("killed") if 1 in numbers else function((said, numbers, robots))
 
-    monkeypatch.setattr(module, "results", lambda *a, **k: (line for line in results(*a, **k)))
+    monkeypatch.setattr(module, "run_tasks", lambda *a, **k: (line for line in results(*a, **k)))
     out = generate(SMALL, 2, tmp_path / "out")
     assert asked[:3] == [[0, 1], [0], [1]]
     assert 1 not in out.numbers()

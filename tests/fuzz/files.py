@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 
 import vkc_pin as vkc
-from vkc_pin.world.files.resources import folder
+from vkc_pin.world.files.resources import find_resource_folder
 
 from . import odd
 from .calls import TINY
@@ -32,7 +32,7 @@ def pool() -> Path:
     root = Path(tempfile.mkdtemp(prefix="vkc_fuzz_files_"))
     atexit.register(shutil.rmtree, root, ignore_errors=True)
     for kind in ("robots", "scenes"):
-        shutil.copytree(folder(kind), root / kind)
+        shutil.copytree(find_resource_folder(kind), root / kind)
     for name in MESHES.values():
         if not name.endswith("dae"):
             trimesh.creation.box(extents=(0.5, 0.4, 0.3)).export(root / "scenes" / name)
@@ -146,7 +146,8 @@ def run_document(given: dict[str, Any]) -> str:
     """Build the scene from its description, and use it."""
     document = changed(_documents()[given["scene"]], given["changes"])
     return _used(
-        vkc.Scene.from_document(document, folder("scenes")), planned=given.get("plan", False)
+        vkc.Scene.from_document(document, find_resource_folder("scenes")),
+        planned=given.get("plan", False),
     )
 
 

@@ -10,7 +10,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin.planning.base_paths.base_clearance import Shape
-from vkc_pin.world.files.meshes import convex_hull
+from vkc_pin.world.files.meshes import make_convex_hull
 
 HALL = (-5.0, 5.0, -5.0, 5.0)
 MARGIN = 0.02
@@ -39,7 +39,7 @@ def arm() -> list[Shape]:
 
 def wedge() -> coal.Convex:
     """Return a convex mesh: a prism with a triangle as its base, lower at one end."""
-    return convex_hull(
+    return make_convex_hull(
         [(0, 0, 0), (0.6, 0, 0), (0, 0.4, 0), (0, 0, 0.5), (0.6, 0, 0.2), (0, 0.4, 0.5)]
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from vkc_pin.world.files.resources import folder
+from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.scene.scene import Scene
 
 AT, BIN, BELOW = (1.0, 0.0, 0.036), (0.0, 2.0, 0.16), (-1.0, 0.0, 0.037)
@@ -31,4 +31,4 @@ def littered(*obstacles: dict[str, Any]) -> Scene:
         "objects": [{"name": "litter", "type": "litter", "position": list(AT)}],
         "obstacles": [inside, *obstacles],
     }
-    return Scene.from_document(document, folder("scenes"))
+    return Scene.from_document(document, find_resource_folder("scenes"))

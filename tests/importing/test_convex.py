@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import vkc_pin as vkc
 from vkc_pin.importing import convex
 from vkc_pin.importing.convex import compute_concavity, compute_solid_volume, decompose
-from vkc_pin.utils import disk_cache as kept
+from vkc_pin.utils import disk_cache
 
 box = trimesh.creation.box
 
@@ -135,7 +135,7 @@ def test_a_mesh_that_was_cut_is_not_cut_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is kept gives the same pieces to the last bit; other meshes and settings are cut on their own."""
-    monkeypatch.setenv(kept.VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(disk_cache.CACHE_VARIABLE, str(tmp_path / "cache"))
     cut, real = [], convex._cut_mesh
     monkeypatch.setattr(convex, "_cut_mesh", lambda *rest: (cut.append(rest), real(*rest))[1])
     mesh = tray()

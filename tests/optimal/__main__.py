@@ -16,7 +16,7 @@ from vkc_pin.benchmarks.harness.record import commit
 from vkc_pin.benchmarks.harness.tables import foot
 from vkc_pin.benchmarks.problems.problem_set import TASKS as ALL
 from vkc_pin.benchmarks.problems.problem_set import started
-from vkc_pin.utils.parallel.machine import machine, peak_memory, versions
+from vkc_pin.utils.parallel.machine import describe_machine, find_versions, measure_peak_memory
 
 from .bound import bound
 
@@ -56,7 +56,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--tasks", nargs="+", default=NAMES, choices=NAMES)
     parser.add_argument("--json", type=Path, help="where to write the figures of each plan")
     given = parser.parse_args(arguments)
-    rows, began, known = list[dict[str, Any]](), time.perf_counter(), machine()
+    rows, began, known = list[dict[str, Any]](), time.perf_counter(), describe_machine()
     for name in given.tasks:
         for number in range(given.starts):
             scene = started(name, given.seed, number)
@@ -75,13 +75,13 @@ def main(arguments: list[str] | None = None) -> int:
     if given.json is not None:
         session = {"jobs": 1, "trials": len(rows), "seconds": round(time.perf_counter() - began, 1)}
         meta = {
-            "versions": versions(),
+            "versions": find_versions(),
             "machine": known,
             "seed": given.seed,
             "starts": given.starts,
             "sessions": [session],
         }
-        meta["peak_memory_mb"] = round(peak_memory(), 1)
+        meta["peak_memory_mb"] = round(measure_peak_memory(), 1)
         given.json.write_text(
             json.dumps({"meta": meta, "trials": rows}, indent=1) + "\n", encoding="utf-8"
         )

@@ -20,7 +20,7 @@ from helpers.drives import hall
 
 import vkc_pin as vkc
 from vkc_pin.validation.validate import validate
-from vkc_pin.world.files.resources import folder
+from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.trajectory.wheels import make_rolling_limits
 from vkc_pin.world.trajectory.world_model import World
 
@@ -46,7 +46,7 @@ def tool(scene: vkc.Scene, row: np.ndarray) -> pin.SE3:
 
 def handle(hinge: float, knob: float) -> pin.SE3:
     """Return where a tool holds the door's lever: the door's URDF, its place in the scene and its grasp, by hand."""
-    model = pin.buildModelFromUrdf(str(folder("scenes") / "objects" / "door.urdf"))
+    model = pin.buildModelFromUrdf(str(find_resource_folder("scenes") / "objects" / "door.urdf"))
     data, q = model.createData(), pin.neutral(model)
     for name, value in (("hinge", hinge), ("knob", knob)):
         q[model.joints[model.getJointId(name)].idx_q] = value
@@ -476,7 +476,7 @@ def test_a_steered_base_drives_as_a_car(step: Any) -> None:
 
 def test_wheels_make_a_motion_slow(tmp_path: Path) -> None:
     """Wheels that go 0.2 m/s, where those of the robot as it is go faster."""
-    files = folder("robots") / "husky_ur5e"
+    files = find_resource_folder("robots") / "husky_ur5e"
     text = (
         (files / "robot.yaml").read_text(encoding="utf-8").replace("speed: 6.057", "speed: 1.2114")
     )

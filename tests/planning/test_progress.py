@@ -148,7 +148,7 @@ def test_it_is_off_unless_asked_for(terminal: Terminal) -> None:
 
 @pytest.mark.parametrize("value", [None, 1, "yes"])
 def test_true_or_false(value: Any) -> None:
-    with pytest.raises(vkc.InputError, match="progress: wrong kind of argument"):
+    with pytest.raises(vkc.InputError, match="progress: wrong type of argument"):
         vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=value)
 
 

@@ -21,7 +21,7 @@ from vkc_pin.planning.retiming.retime import retime_trajectory
 from vkc_pin.planning.solver.solution import Iteration, Solution
 from vkc_pin.planning.solver.to_trajectory import make_trajectory
 from vkc_pin.planning.statistics import STAGES
-from vkc_pin.utils.budget import Budget, spend
+from vkc_pin.utils.budget import Budget, record_evaluations
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.task.compiler import compile_task
 
@@ -66,7 +66,7 @@ class Scripted:
         self.events.append(event)
         self.stop(event)
         if not event.endswith("*"):  # as the real search for seeds does
-            spend()
+            record_evaluations()
 
     def z(self, problem: vkc.TrajectoryProblem, name: str, height: float) -> np.ndarray:
         share = np.arange(1, problem.segments + 1) / problem.segments
@@ -118,7 +118,7 @@ class Scripted:
         self.budget, guess = Budget(), settings.pop("guess", None)
         request = PlanningRequest("auto", SHORT, **settings)
         task = compile_task(scene, steps, SHORT)
-        with self.budget.running():
+        with self.budget.activate():
             self.result = module.solve_task(scene, task, request, guess=guess)
         return self.result.plan
 
@@ -355,7 +355,7 @@ def test_ctrl_c_anywhere(when: str, name: str, monkeypatch: pytest.MonkeyPatch) 
     script = Scripted(monkeypatch, [2.0, 1.0, 3.0])
 
     def stop(event: str) -> None:
-        script.budget.pressed |= event == when
+        script.budget.is_interrupted |= event == when
 
     script.stop = stop
     plan = script.run()
@@ -417,7 +417,7 @@ def test_standing_still_costs_nothing() -> None:
 
 def test_what_a_problem_leaves_is_trimmed_at_its_end() -> None:
     """Not only when a call ends: a chore has many problems."""
-    scene, cache = drawer_scene(), Cache(nbytes=1.0)
+    scene, cache = drawer_scene(), Cache(max_nbytes=1.0)
     request = PlanningRequest("auto", SHORT, cache=cache)
     assert module.solve_task(scene, compile_task(scene, PULL, SHORT), request).plan.success
     assert cache.info().entries == 1

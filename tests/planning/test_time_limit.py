@@ -31,7 +31,7 @@ class Looks:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.count, self.last = 0, np.inf
-        monkeypatch.setattr(Budget, "ended", property(self.ended))
+        monkeypatch.setattr(Budget, "stop_status", property(self.ended))
 
     def ended(self, budget: Budget) -> str:
         self.count += 1

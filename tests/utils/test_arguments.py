@@ -12,7 +12,7 @@ import pytest
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils import arguments as check
-from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.resources import check_path
 
 
 class Hostile:
@@ -28,17 +28,17 @@ class Hostile:
 
 
 CHECKS: dict[str, Callable[[Any], Any]] = {
-    "number": lambda value: check.number(value, "it"),
-    "quantity": lambda value: check.quantity(value, "it"),
-    "whole": lambda value: check.whole(value, "it", low=0),
-    "numbers": lambda value: check.numbers(value, "it"),
-    "text": lambda value: check.text(value, "it"),
-    "flag": lambda value: check.flag(value, "it"),
-    "known": lambda value: check.known(value, ["door"], "object", "it"),
-    "instance": lambda value: check.instance(value, Path, "it"),
-    "mapping": lambda value: check.mapping(value, "it"),
-    "items": lambda value: check.items(value, "it", "a list of texts", str),
-    "file_path": lambda value: file_path(value, "it"),
+    "number": lambda value: check.check_number(value, "it"),
+    "quantity": lambda value: check.check_coordinate(value, "it"),
+    "whole": lambda value: check.check_integer(value, "it", low=0),
+    "numbers": lambda value: check.check_array(value, "it"),
+    "text": lambda value: check.check_text(value, "it"),
+    "flag": lambda value: check.check_bool(value, "it"),
+    "known": lambda value: check.check_choice(value, ["door"], "object", "it"),
+    "instance": lambda value: check.check_instance(value, Path, "it"),
+    "mapping": lambda value: check.check_mapping(value, "it"),
+    "items": lambda value: check.check_list(value, "it", "a list of texts", str),
+    "file_path": lambda value: check_path(value, "it"),
 }
 WRONG = [
     None,
@@ -71,21 +71,24 @@ def test_what_is_of_the_wrong_kind_is_refused(name: str, value: Any) -> None:
 
 def test_numbers_have_bounds() -> None:
     assert (
-        check.number(np.float32(0.5), "it"),
-        check.number(np.array(2), "it"),
-        check.quantity(-1e4, "it"),
+        check.check_number(np.float32(0.5), "it"),
+        check.check_number(np.array(2), "it"),
+        check.check_coordinate(-1e4, "it"),
     ) == (0.5, 2.0, -1e4)
     for value in (np.nan, np.inf, -np.inf, 10**5000, True, np.bool_(True), "1"):
         with pytest.raises(InputError):
-            check.number(value, "it")
+            check.check_number(value, "it")
     for wrong in (0.0, -1.0):
         with pytest.raises(InputError, match="it: out of range"):
-            check.number(wrong, "it", low=0.0, above=True)
+            check.check_number(wrong, "it", low=0.0, strict=True)
     with pytest.raises(InputError, match="from -10000 to 10000, got 10001"):
-        check.quantity(10001, "it")
+        check.check_coordinate(10001, "it")
     with pytest.raises(InputError, match="an integer of 16610 bits"):
-        check.whole(10**5000, "it", low=0)
-    assert (check.whole(np.int8(3), "it", low=3), type(check.whole(np.int8(3), "it", low=3))) == (
+        check.check_integer(10**5000, "it", low=0)
+    assert (
+        check.check_integer(np.int8(3), "it", low=3),
+        type(check.check_integer(np.int8(3), "it", low=3)),
+    ) == (
         3,
         int,
     )
@@ -93,10 +96,10 @@ def test_numbers_have_bounds() -> None:
 
 def test_arrays_are_of_real_numbers_and_copied() -> None:
     given = np.arange(3.0)
-    found = check.numbers(given, "it")
+    found = check.check_array(given, "it")
     given[0] = 7.0
     assert found.tolist() == [0.0, 1.0, 2.0]
-    assert check.numbers([], "it").shape == (0,)
+    assert check.check_array([], "it").shape == (0,)
     for value in (
         ["1", "2"],
         [1j],
@@ -107,29 +110,29 @@ def test_arrays_are_of_real_numbers_and_copied() -> None:
         b"12",
     ):
         with pytest.raises(InputError, match="it: not numbers"):
-            check.numbers(value, "it")
+            check.check_array(value, "it")
 
 
 def test_lists_end() -> None:
-    assert check.items((name for name in "ab"), "it", "texts", str) == ("a", "b")
-    assert check.items({"a": 1}.keys(), "it", "texts", str) == ("a",)
+    assert check.check_list((name for name in "ab"), "it", "texts", str) == ("a", "b")
+    assert check.check_list({"a": 1}.keys(), "it", "texts", str) == ("a",)
     with pytest.raises(InputError, match="it: too many entries"):
-        check.items(itertools.count(), "it", "numbers")
+        check.check_list(itertools.count(), "it", "numbers")
     for value in ("ab", b"ab", 3, {"a": 1}, {"a"}, np.array(3)):
         with pytest.raises(InputError, match="it: not a list"):
-            check.items(value, "it", "texts")
-    with pytest.raises(InputError, match=r"it\[1\]: wrong kind of entry \(expected texts, got 3\)"):
-        check.items(["a", 3], "it", "texts", str)
+            check.check_list(value, "it", "texts")
+    with pytest.raises(InputError, match=r"it\[1\]: wrong type of entry \(expected texts, got 3\)"):
+        check.check_list(["a", 3], "it", "texts", str)
 
 
 def test_names_are_those_that_there_are() -> None:
-    assert check.known(np.str_("door"), ["door"], "object") == "door"
+    assert check.check_choice(np.str_("door"), ["door"], "object") == "door"
     with pytest.raises(UnknownNameError, match="did you mean 'door'"):
-        check.known("dor", ["door"], "object")
+        check.check_choice("dor", ["door"], "object")
 
 
 def test_paths_can_be_those_of_files(tmp_path: Path) -> None:
-    assert file_path(str(tmp_path), "it") == file_path(tmp_path, "it") == tmp_path
+    assert check_path(str(tmp_path), "it") == check_path(tmp_path, "it") == tmp_path
     for value in ("", "a\0b", "a\ud800", "x" * 256, "x/" * 2048, b"x", 3):
         with pytest.raises(InputError, match=r"^it: (no file can be called that|not a path)"):
-            file_path(value, "it")
+            check_path(value, "it")

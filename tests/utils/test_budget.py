@@ -8,7 +8,14 @@ from collections.abc import Iterator
 
 import pytest
 
-from vkc_pin.utils.budget import Budget, SpentError, current_ending, reserve_time, spend, unlimited
+from vkc_pin.utils.budget import (
+    Budget,
+    BudgetExhaustedError,
+    current_ending,
+    record_evaluations,
+    reserve_time,
+    suspend_budget,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -26,23 +33,23 @@ def press() -> None:
 
 
 def test_the_first_ctrl_c_is_noted() -> None:
-    with Budget().running() as budget:
-        spend()
-        assert not budget.ended
+    with Budget().activate() as budget:
+        record_evaluations()
+        assert not budget.stop_status
         press()
-        assert budget.ended == "interrupted"
-        with pytest.raises(SpentError, match="interrupted"):
-            spend()
+        assert budget.stop_status == "interrupted"
+        with pytest.raises(BudgetExhaustedError, match="interrupted"):
+            record_evaluations()
 
 
 def test_the_second_raises() -> None:
-    with pytest.raises(KeyboardInterrupt), Budget().running():  # noqa: PT012
+    with pytest.raises(KeyboardInterrupt), Budget().activate():  # noqa: PT012
         press()
         press()
 
 
 def test_an_error_puts_the_handler_back() -> None:
-    with pytest.raises(ValueError, match="mine"), Budget().running():
+    with pytest.raises(ValueError, match="mine"), Budget().activate():
         raise ValueError("mine")
 
 
@@ -50,8 +57,8 @@ def test_a_handler_that_python_did_not_install_is_left_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(signal, "getsignal", lambda number: None)
-    with Budget().running() as budget:
-        assert not budget.ended
+    with Budget().activate() as budget:
+        assert not budget.stop_status
     monkeypatch.undo()
 
 
@@ -59,42 +66,42 @@ def test_other_threads_get_no_signals() -> None:
     seen: list[bool] = []
 
     def work() -> None:
-        spend(10**9)  # of no budget: that of the main thread is not this thread's
-        with Budget().running() as budget:
-            seen.append(budget.pressed)
+        record_evaluations(10**9)  # of no budget: that of the main thread is not this thread's
+        with Budget().activate() as budget:
+            seen.append(budget.is_interrupted)
 
-    with Budget(effort=1).running() as mine:
+    with Budget(effort=1).activate() as mine:
         thread = threading.Thread(target=work)
         thread.start()
         thread.join()
     assert seen == [False]
-    assert mine.used == 0
+    assert mine.evaluations == 0
 
 
 def test_effort_counts_down() -> None:
     """All of it may be used."""
-    with Budget(effort=10).running() as budget:
-        spend(4)
-        spend(6)
-        spend()
-        with pytest.raises(SpentError, match="effort spent"):
-            spend(1)
-        assert (budget.used, budget.ended) == (11, "effort spent")
+    with Budget(effort=10).activate() as budget:
+        record_evaluations(4)
+        record_evaluations(6)
+        record_evaluations()
+        with pytest.raises(BudgetExhaustedError, match="effort spent"):
+            record_evaluations(1)
+        assert (budget.evaluations, budget.stop_status) == (11, "effort spent")
 
 
 def test_nothing_counts_where_no_budget_runs() -> None:
-    spend(10**9)
-    with Budget(effort=1).running() as budget, unlimited():
-        spend(10**9)
-    assert (budget.used, budget.ended) == (0, "")
+    record_evaluations(10**9)
+    with Budget(effort=1).activate() as budget, suspend_budget():
+        record_evaluations(10**9)
+    assert (budget.evaluations, budget.stop_status) == (0, "")
 
 
 def test_a_budget_within_another() -> None:
-    with Budget(effort=5).running() as outer:
-        with Budget(effort=1).running(), pytest.raises(SpentError):
-            spend(2)
-        spend(5)
-        assert outer.used == 5
+    with Budget(effort=5).activate() as outer:
+        with Budget(effort=1).activate(), pytest.raises(BudgetExhaustedError):
+            record_evaluations(2)
+        record_evaluations(5)
+        assert outer.evaluations == 5
 
 
 def test_the_clock_keeps_time_for_checking(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,13 +109,13 @@ def test_the_clock_keeps_time_for_checking(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     budget = Budget(seconds=10.0)
     now[0] = 108.0
-    assert budget.ended == ""
-    with budget.running():
+    assert budget.stop_status == ""
+    with budget.activate():
         reserve_time("validation", 1.5)
         reserve_time("planned steps", 1.0)
         assert current_ending() == "time limit"
         reserve_time("validation", 9.0, default=True)
         reserve_time("planned steps", 0.0)
-    assert budget.ended == ""
-    budget.pressed = True
-    assert budget.ended == "interrupted"
+    assert budget.stop_status == ""
+    budget.is_interrupted = True
+    assert budget.stop_status == "interrupted"

@@ -24,7 +24,7 @@ def sized(nbytes: int) -> Any:
 
 @given(st.lists(st.integers(0, 9)), st.integers(1, 5))
 def test_the_last_used_are_kept(asked: list[int], entries: int) -> None:
-    cache, kept, built = Cache(entries=entries), list[int](), list[int]()
+    cache, kept, built = Cache(max_entries=entries), list[int](), list[int]()
     for key in asked:
 
         def build(key: int = key) -> Any:
@@ -52,13 +52,13 @@ def test_what_begins_alike_can_be_dropped() -> None:
         "solver",
     ]:
         cache.get(key, lambda: sized(1))
-    cache.drop("solver", 1)
-    assert list(cache._kept) == [("program", 1), ("solver", 2, "a"), "solver"]
+    cache.evict("solver", 1)
+    assert list(cache._objects) == [("program", 1), ("solver", 2, "a"), "solver"]
 
 
 @given(st.lists(st.integers(0, 100), min_size=1, unique=True), st.integers(0, 300))
 def test_trimming_lets_go_of_the_oldest_until_it_fits(sizes: list[int], nbytes: int) -> None:
-    cache = Cache(nbytes=nbytes)
+    cache = Cache(max_nbytes=nbytes)
     for size in sizes:
         cache.get(size, lambda size=size: sized(size))
     cache.trim()
@@ -75,7 +75,7 @@ def test_trimming_lets_go_of_the_oldest_until_it_fits(sizes: list[int], nbytes: 
 )
 def test_trimming_gives_memory_back() -> None:
     """Also what lies between blocks that are still in use: otherwise a process grows with every structure that it meets."""
-    cache, between = Cache(nbytes=1.0), []
+    cache, between = Cache(max_nbytes=1.0), []
     for key in range(20):
         blocks = []
         for _ in range(100):
@@ -109,7 +109,7 @@ def test_the_time_of_parts_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
     cache = Cache()
     cache.get("whole", lambda: (cache.get("part", lambda: sized(1)), sized(2))[1])
     assert (
-        cache.building == 2.0
+        cache.build_time == 2.0
     )  # the clock is looked at when either begins, and when the whole ends
 
 

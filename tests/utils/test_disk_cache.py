@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.utils import disk_cache as kept
+from vkc_pin.utils import disk_cache
 
 PLAIN = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
@@ -20,7 +20,7 @@ PLAIN = st.recursive(
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv(kept.VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(disk_cache.CACHE_VARIABLE, str(tmp_path / "cache"))
     return tmp_path / "cache" / "vkc_pin"
 
 
@@ -35,16 +35,16 @@ def never() -> None:
 def test_what_is_kept_comes_back(here: Path, key: bytes, data: object) -> None:
     for file in here.glob("*.json"):
         file.unlink()
-    assert kept.record(key, lambda: data) == data
+    assert disk_cache.load_or_build(key, lambda: data) == data
     (file,) = here.iterdir()
     assert file.stat().st_mode & 0o777 == 0o600
-    assert kept.record(key, never) == data
-    assert kept.record(key + b"x", lambda: "other") == "other"
+    assert disk_cache.load_or_build(key, never) == data
+    assert disk_cache.load_or_build(key + b"x", lambda: "other") == "other"
 
 
 @pytest.mark.parametrize("harm", ["cut", "changed", "writable", "link", "folder"])
 def test_what_cannot_be_trusted_is_built_again(here: Path, tmp_path: Path, harm: str) -> None:
-    assert kept.record(b"key", lambda: [1.5, "a"]) == [1.5, "a"]
+    assert disk_cache.load_or_build(b"key", lambda: [1.5, "a"]) == [1.5, "a"]
     (file,) = here.iterdir()
     if harm == "cut":
         file.write_bytes(file.read_bytes()[:-1])
@@ -57,12 +57,15 @@ def test_what_cannot_be_trusted_is_built_again(here: Path, tmp_path: Path, harm:
         file.symlink_to(tmp_path / "elsewhere")
     else:
         here.chmod(0o777)
-    assert kept.record(b"key", lambda: "new") == "new"
+    assert disk_cache.load_or_build(b"key", lambda: "new") == "new"
 
 
 def test_without_a_folder_nothing_is_kept(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(kept.VARIABLE, "off")
-    assert [kept.record(b"key", lambda count=count: count) for count in (1, 2)] == [1, 2]  # type: ignore[misc]
+    monkeypatch.setenv(disk_cache.CACHE_VARIABLE, "off")
+    assert [disk_cache.load_or_build(b"key", lambda count=count: count) for count in (1, 2)] == [
+        1,
+        2,
+    ]  # type: ignore[misc]
     assert not here.exists()
 
 
@@ -72,6 +75,6 @@ def test_a_folder_that_is_full_or_read_only_does_no_harm(
     def full(*_: object) -> None:
         raise OSError("no space left")
 
-    kept.record(b"other", lambda: 1)
+    disk_cache.load_or_build(b"other", lambda: 1)
     monkeypatch.setattr(os, "fdopen", full)
-    assert kept.record(b"key", lambda: 2) == 2
+    assert disk_cache.load_or_build(b"key", lambda: 2) == 2

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from vkc_pin.utils.budget import Budget
-from vkc_pin.utils.interrupt import deferred, raising
+from vkc_pin.utils.interrupt import defer_interrupt, raise_on_interrupt
 
 
 @pytest.fixture(autouse=True)
@@ -25,7 +25,7 @@ def press() -> None:
 
 def test_it_waits_for_the_end_of_what_is_short() -> None:
     done = []
-    with pytest.raises(KeyboardInterrupt), raising(), deferred():  # noqa: PT012
+    with pytest.raises(KeyboardInterrupt), raise_on_interrupt(), defer_interrupt():  # noqa: PT012
         press()
         press()
         done.append("all")
@@ -33,22 +33,22 @@ def test_it_waits_for_the_end_of_what_is_short() -> None:
 
 
 def test_nothing_waits_if_nothing_was_pressed() -> None:
-    with deferred():
+    with defer_interrupt():
         pass
 
 
 def test_planning_hears_of_what_waited() -> None:
-    with Budget().running() as budget, deferred():
+    with Budget().activate() as budget, defer_interrupt():
         press()
-        assert not budget.pressed
-    assert budget.pressed
+        assert not budget.is_interrupted
+    assert budget.is_interrupted
 
 
 def test_it_raises_where_it_is_asked_to() -> None:
     seen: list[int] = []
     mine = signal.signal(signal.SIGINT, lambda number, frame: seen.append(number))
     try:
-        with pytest.raises(KeyboardInterrupt), raising():
+        with pytest.raises(KeyboardInterrupt), raise_on_interrupt():
             press()
         press()
     finally:

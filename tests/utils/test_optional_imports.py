@@ -10,7 +10,7 @@ import vkc_pin as vkc
 from vkc_pin.errors import BuildError
 from vkc_pin.planning.base_paths.base_path import shortest_path
 from vkc_pin.planning.base_paths.grid import BaseGrid
-from vkc_pin.utils import optional_imports as needed
+from vkc_pin.utils import optional_imports
 
 
 def a_path() -> object:
@@ -19,7 +19,7 @@ def a_path() -> object:
 
 
 def test_a_module_is_imported() -> None:
-    assert needed.compiled_module("vkc_pin.planning.base_paths._driving").Paths
+    assert optional_imports.import_compiled("vkc_pin.planning.base_paths._driving").Paths
 
 
 def test_a_module_that_is_missing_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -27,7 +27,7 @@ def test_a_module_that_is_missing_says_so(monkeypatch: pytest.MonkeyPatch) -> No
         raise ImportError(f"no {name}")
 
     with monkeypatch.context() as patch:
-        patch.setattr(needed, "import_module", missing)
+        patch.setattr(optional_imports, "import_module", missing)
         with pytest.raises(
             BuildError, match=r"_driving cannot be imported \(no .*compiler.*pip install"
         ):
@@ -36,15 +36,17 @@ def test_a_module_that_is_missing_says_so(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_package_that_is_there_is_returned() -> None:
-    assert needed.optional_package("yaml", "import", what="nothing").safe_load("a: 1") == {"a": 1}
+    assert optional_imports.import_optional("yaml", "import", purpose="nothing").safe_load(
+        "a: 1"
+    ) == {"a": 1}
 
 
 @pytest.mark.parametrize("name", ["coacd", "coacd.inside"])
 def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setitem(sys.modules, "coacd", None)
     with pytest.raises(vkc.InputError) as caught:
-        needed.optional_package(
-            name, "import", what="cutting a mesh", file="robot.urdf", field="mesh"
+        optional_imports.import_optional(
+            name, "import", purpose="cutting a mesh", file="robot.urdf", field="mesh"
         )
     assert 'pip install "vkc-pin[import]"' in str(caught.value)
     assert (caught.value.file, caught.value.field) == ("robot.urdf", "mesh")

@@ -17,7 +17,7 @@ from vkc_pin.visualization.triangles import (
     to_solid,
     tube,
 )
-from vkc_pin.world.files.meshes import MeshPart, to_bvh
+from vkc_pin.world.files.meshes import MeshPart, make_bvh
 from vkc_pin.world.models.shapes import triangulate
 
 
@@ -41,7 +41,7 @@ def ball(radius: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
         (coal.Cylinder(0.5, 2.0), np.pi / 2, (1, 1, 2)),
         (coal.Cone(0.5, 3.0), np.pi / 4, (1, 1, 3)),
         (coal.Capsule(0.5, 2.0), np.pi / 2 + np.pi / 6, (1, 1, 3)),
-        (to_bvh(MeshPart(*ball())), np.pi / 6, (1, 1, 1)),
+        (make_bvh(MeshPart(*ball())), np.pi / 6, (1, 1, 1)),
     ],
 )
 def test_surface_of_every_shape(
@@ -57,10 +57,10 @@ def test_surface_of_every_shape(
 
 
 def test_convex_shapes() -> None:
-    from vkc_pin.world.files.meshes import convex_hull
+    from vkc_pin.world.files.meshes import make_convex_hull
 
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 2) for z in (0, 3)], float)
-    assert trimesh.Trimesh(*triangulate(convex_hull(corners))).volume == pytest.approx(6.0)
+    assert trimesh.Trimesh(*triangulate(make_convex_hull(corners))).volume == pytest.approx(6.0)
 
 
 def test_a_half_space_has_no_surface() -> None:

@@ -16,7 +16,7 @@ from vkc_pin.planning.initialization.keyframes import KeyframeSampler
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.utils.budget import spend
+from vkc_pin.utils.budget import record_evaluations
 
 __all__ = ["QP", "ArmKinematics"]
 
@@ -55,7 +55,7 @@ class ArmKinematics:
         box = _Box(self.columns, chain.lower, chain.upper, z.copy())
         configuration = pink.Configuration(model, model.createData(), chain.coordinates.q(box.z))
         for _ in range(_ITERATIONS):
-            spend(1)
+            record_evaluations(1)
             if np.abs(task.compute_error(configuration)).max() < TOLERANCE:
                 return box.z, True
             try:

@@ -26,7 +26,7 @@ from vkc_pin.planning.solver.to_trajectory import make_trajectory
 from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
 from vkc_pin.planning.statistics import STAGES
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.budget import SpentError, spend
+from vkc_pin.utils.budget import BudgetExhaustedError, record_evaluations
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
@@ -97,7 +97,7 @@ class Attempt:
                     self._withdrawn(
                         functools.partial(self._drive, goals), FailedError("no base path")
                     )
-        except (FailedError, SpentError) as error:
+        except (FailedError, BudgetExhaustedError) as error:
             failure = error if isinstance(error, FailedError) else FailedError(str(error))
             parts = [*self.parts, *failure.parts] or [
                 make_stationary_trajectory(self.scene, self.options)
@@ -287,7 +287,7 @@ class Attempt:
                 self.times[key] += value
             if solution.converged:
                 return solution.z, solution.dt
-            spend()
+            record_evaluations()
             if not failure.parts:
                 failure = FailedError(cause, make_trajectory(problem, solution.z, solution.dt))
         raise failure

@@ -41,7 +41,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 from vkc_pin.baselines.attempt import FINER, Attempt, Doable
-from vkc_pin.errors import InputError, shown
+from vkc_pin.errors import InputError, format_value
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, acquire_cache
@@ -49,7 +49,7 @@ from vkc_pin.planning.request import check_arguments, make_budget
 from vkc_pin.planning.results import build_plan
 from vkc_pin.planning.retime_validated import retime_validated
 from vkc_pin.planning.statistics import PlanningStatistics
-from vkc_pin.utils.arguments import known, whole
+from vkc_pin.utils.arguments import check_choice, check_integer
 from vkc_pin.utils.budget import reserve_time
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
@@ -108,9 +108,9 @@ def plan_separately(
     options = Options() if options is None else options
     budget = make_budget(time_limit, effort)
     check_arguments(scene, options, seed)
-    known(method, BASELINES, "method", "method")
-    whole(retries, "retries", low=1)
-    whole(finer, "finer", low=1, high=LARGEST_FINER)
+    check_choice(method, BASELINES, "method", "method")
+    check_integer(retries, "retries", low=1)
+    check_integer(finer, "finer", low=1, high=LARGEST_FINER)
     task = compile_task(scene, steps, options)
     actions: list[Doable] = []
     for number, step in enumerate(task.steps):
@@ -120,11 +120,11 @@ def plan_separately(
                 "the baselines know no such step",
                 field=f"steps[{number}]",
                 expected=expected,
-                got=shown(step),
+                got=format_value(step),
             )
         actions.append(step)
-    with acquire_cache(planner) as cache, budget.running():
-        began, times, iterations, before = time.perf_counter(), Counter[str](), 0, cache.building
+    with acquire_cache(planner) as cache, budget.activate():
+        began, times, iterations, before = time.perf_counter(), Counter[str](), 0, cache.build_time
         best: tuple[float, str, int, Trajectory, Report] | None = None
         for number in range(retries):
             attempt = Attempt(
@@ -148,10 +148,10 @@ def plan_separately(
             times.update(attempt.times)
             if best is None or status == "success" or came > best[0]:
                 best = came, status, number, trajectory, report
-            ended = budget.ended
+            ended = budget.stop_status
             if status == "success" or ended:
                 break
-        built = cache.building - before
+        built = cache.build_time - before
     assert best is not None
     _, status, tried, trajectory, report = best
     if ended and status not in ("success", ended):
@@ -162,7 +162,7 @@ def plan_separately(
         build_time=built,
         iterations=iterations,
         rounds=number + 1,
-        evaluations=budget.used,
+        evaluations=budget.evaluations,
     ).with_times(times)
     name = f"{method}, try {tried + 1}"
     return build_plan(

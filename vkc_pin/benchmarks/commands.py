@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.utils.interrupt import raising
+from vkc_pin.utils.interrupt import raise_on_interrupt
 
 __all__ = ["EXIT_INTERRUPTED", "EXIT_OK", "add_bench", "natural", "positive", "stopped"]
 
@@ -339,7 +339,7 @@ def _bench_door(arguments: argparse.Namespace) -> int:
 
     if arguments.json is not None:
         check_outputs({"--json": arguments.json})
-    with raising():
+    with raise_on_interrupt():
         result = door.run(
             trials=arguments.trials, seed=arguments.seed, progress=not arguments.quiet
         )
@@ -360,7 +360,7 @@ def _bench_experiment(arguments: argparse.Namespace) -> int:
         if value is not None and name not in others
     }
     try:
-        with raising():
+        with raise_on_interrupt():
             experiment.run(**settings, progress=not arguments.quiet)
     except KeyboardInterrupt as stop:
         return stopped(arguments.given, stop)

@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 from tqdm import tqdm
 
-from vkc_pin.benchmarks.harness.record import distribution, meta, peak_memory, trial
+from vkc_pin.benchmarks.harness.record import distribution, measure_peak_memory, meta, trial
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
@@ -84,7 +84,9 @@ def run(*, trials: int, seed: int, progress: bool = True) -> dict[str, Any]:
         grasp = plan(start.with_state("door", {"knob": TURNED}), [Grasp("door")], seed=seed)
         record("push blind", push(start, seed, grasp) if grasp.success else grasp)
     return {
-        "meta": meta(benchmark="door", seed=seed, trials=trials, peak_memory_mb=peak_memory()),
+        "meta": meta(
+            benchmark="door", seed=seed, trials=trials, peak_memory_mb=measure_peak_memory()
+        ),
         "trials": records,
     }
 

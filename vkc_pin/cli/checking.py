@@ -76,7 +76,7 @@ def _scene(arguments: argparse.Namespace) -> int:
             raise InputError(
                 "not the name of a picture", field="--plot", expected=expected, got=arguments.plot
             )
-        check_outputs({"--plot": arguments.plot}, kept={"SCENE": arguments.what})
+        check_outputs({"--plot": arguments.plot}, inputs={"SCENE": arguments.what})
     found = vkc.check_scene(vkc.load_scene(arguments.what), seed=arguments.seed)
     if arguments.plot is not None:
         found.plot(arguments.plot)

@@ -85,7 +85,7 @@ def _plan(arguments: argparse.Namespace) -> int:
                 "this is the name of a picture", field="--plots", expected="a folder", got=folder
             )
         outputs["--plots"] = Path(folder, "joints.png")
-    check_outputs(outputs | _new_folders(arguments), kept={"SCENE": arguments.scene})
+    check_outputs(outputs | _new_folders(arguments), inputs={"SCENE": arguments.scene})
     scene = vkc.load_scene(arguments.scene)
     plan = vkc.plan(
         scene,
@@ -171,7 +171,7 @@ def _export(arguments: argparse.Namespace) -> int:
             expected="--csv FILE or --ros FILE as well",
         )
     plain = {option: path for option, path in files.items() if option not in _FOLDERS}
-    check_outputs(_options(plain) | _new_folders(arguments), kept={"PLAN": arguments.plan})
+    check_outputs(_options(plain) | _new_folders(arguments), inputs={"PLAN": arguments.plan})
     plan = vkc.Plan.load(arguments.plan)
     names = arguments.joints.split(",") if arguments.joints else None
     joints = names[0] if names is not None and len(names) == 1 and names[0] in GROUPS else names
@@ -193,7 +193,7 @@ def _view(arguments: argparse.Namespace) -> int:
     from vkc_pin.visualization import viewer as visualization
 
     files = _chosen(arguments, ("html",))
-    check_outputs(_options(files), kept={"SCENE|PLAN": arguments.what})
+    check_outputs(_options(files), inputs={"SCENE|PLAN": arguments.what})
     shown: Any = (
         vkc.Plan.load(arguments.what)
         if str(arguments.what).endswith(".npz")
@@ -217,7 +217,7 @@ def _srdf(arguments: argparse.Namespace) -> int:
     from vkc_pin.world.models.robot_file import load_robot
     from vkc_pin.world.models.self_collisions import write_srdf
 
-    check_outputs({"--output": arguments.output}, kept={"ROBOT": arguments.robot})
+    check_outputs({"--output": arguments.output}, inputs={"ROBOT": arguments.robot})
     written = write_srdf(
         load_robot(arguments.robot),
         arguments.output,
@@ -230,7 +230,7 @@ def _srdf(arguments: argparse.Namespace) -> int:
 
 def make_parser() -> argparse.ArgumentParser:
     """Return what understands the command line; each command sets `run`, which takes what was understood."""
-    from vkc_pin.benchmarks.harness.record import versions
+    from vkc_pin.benchmarks.harness.record import find_versions
 
     parser = argparse.ArgumentParser(
         prog="vkc-pin",
@@ -240,7 +240,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     listed = ", ".join(
         f"{name} {number}"
-        for name, number in {**versions(), "Python": platform.python_version()}.items()
+        for name, number in {**find_versions(), "Python": platform.python_version()}.items()
     )
     parser.add_argument(
         "--version",

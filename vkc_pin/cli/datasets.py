@@ -8,7 +8,7 @@ from typing import Any
 
 from vkc_pin.benchmarks.commands import EXIT_OK, natural, positive, stopped
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.utils.interrupt import raising
+from vkc_pin.utils.interrupt import raise_on_interrupt
 
 __all__ = ["add_datasets"]
 
@@ -86,7 +86,7 @@ def _generate(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
 
     try:
-        with raising():
+        with raise_on_interrupt():
             dataset = vkc.generate(
                 arguments.recipe,
                 arguments.episodes,
@@ -115,7 +115,7 @@ def _generate(arguments: argparse.Namespace) -> int:
 def _check(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
 
-    with raising():
+    with raise_on_interrupt():
         found = vkc.check_dataset(
             arguments.folder,
             jobs=arguments.jobs,

@@ -51,7 +51,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
 
     files = {name: path for name in _FILES if (path := getattr(arguments, name)) is not None}
     check_outputs(
-        {f"--{name}": path for name, path in files.items()}, kept={"PLAN": arguments.plan}
+        {f"--{name}": path for name, path in files.items()}, inputs={"PLAN": arguments.plan}
     )
     plan = vkc.Plan.load(arguments.plan)
     actual = None

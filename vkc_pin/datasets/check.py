@@ -25,8 +25,8 @@ from vkc_pin.datasets.problems import resolve_episode_terms
 from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
 from vkc_pin.datasets.statistics import make_statistics_page
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.utils.arguments import whole
-from vkc_pin.utils.parallel.engine import Died, clustered, results
+from vkc_pin.utils.arguments import check_integer
+from vkc_pin.utils.parallel.engine import CrashedTask, is_dask_installed, run_tasks
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.writing import check_inside, check_writable, write_atomically
 
@@ -107,7 +107,7 @@ def check_dataset(
     """
     from tqdm import tqdm
 
-    jobs, seed = whole(jobs, "jobs", low=1, high=4096), whole(seed, "seed", low=0)
+    jobs, seed = check_integer(jobs, "jobs", low=1, high=4096), check_integer(seed, "seed", low=0)
     dataset = Dataset.open(folder)
     target = dataset.folder / "statistics.html" if page is None else Path(page)
     if page is None:
@@ -121,10 +121,10 @@ def check_dataset(
     )
     found: dict[int, tuple[list[dict[str, Any]], list[str]]] = {}
     with tqdm(total=len(shards), unit="shard", disable=not progress) as bar:
-        for key, result in results(check_shard, tasks, jobs=jobs, dask=clustered()):
+        for key, result in run_tasks(check_shard, tasks, jobs=jobs, dask=is_dask_installed()):
             found[int(key)] = (
                 ([], [f"{shards[int(key)]}: {result.reason}"])
-                if isinstance(result, Died)
+                if isinstance(result, CrashedTask)
                 else result
             )
             bar.update()

@@ -14,7 +14,7 @@ from vkc_pin.datasets.episode import Episode, get_work_file
 from vkc_pin.datasets.formats.hdf5 import read_episodes, read_numbers, write_shard
 from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.writing import check_name, write_atomically
 
 __all__ = ["EPISODES_A_SHARD", "Dataset", "Register", "write_table"]
@@ -68,7 +68,7 @@ class Dataset:
         Raises:
             InputError: The folder holds no dataset.
         """
-        path = file_path(folder, "folder", "a folder that `vkc-pin generate` has written")
+        path = check_path(folder, "folder", "a folder that `vkc-pin generate` has written")
         if not (path / "recipe.yaml").is_file():
             raise InputError(
                 "the folder holds no dataset",

@@ -26,10 +26,14 @@ from vkc_pin.simulation.cameras.images import Images, render_images
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.simulation.result import SimulationResult
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.parallel.machine import peak_memory, process_name, resident_memory
+from vkc_pin.utils.parallel.machine import (
+    identify_process,
+    measure_peak_memory,
+    measure_resident_memory,
+)
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
-from vkc_pin.world.files.resources import folder
+from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.files.writing import check_name
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step, step_from_dict, step_to_dict
@@ -106,7 +110,7 @@ class Episode:
                 file = self.robots / check_name(robot["name"], "robot.name") / "robot.yaml"
                 robot["name"] = str(file) if file.is_file() else robot["name"]
             document = {**self.document, "robot": robot, "start": self.start}
-            return Scene.from_document(document, self.where or folder("scenes"))
+            return Scene.from_document(document, self.where or find_resource_folder("scenes"))
 
     def validate(self) -> Report:
         """Return the report of the independent validation in the rebuilt scene."""
@@ -186,9 +190,9 @@ def run_attempt(document: Mapping[str, Any], number: int, robots: Mapping[str, s
         "cpu_time": round(time.process_time() - start_cpu_time, 4),
     }
     record |= {
-        "memory_mb": round(peak_memory(), 1),
-        "resident_mb": round(resident_memory(), 1),
-        "process": process_name(),
+        "memory_mb": round(measure_peak_memory(), 1),
+        "resident_mb": round(measure_resident_memory(), 1),
+        "process": identify_process(),
     }
     return record, data if record["success"] else b""
 
@@ -278,7 +282,7 @@ def pack(
         arrays[f"knot_{name}"] = (
             np.array(values, float) if name == "times" else _round_to_grid(values)
         )
-    outside = plan_result.scene.folder.resolve() != folder("scenes").resolve()
+    outside = plan_result.scene.folder.resolve() != find_resource_folder("scenes").resolve()
     data = {
         "number": number,
         "about": dict(about),

@@ -26,11 +26,11 @@ from vkc_pin.datasets.recipes.terms import make_entries
 from vkc_pin.datasets.robots import check_frames, prepare_robots
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.simulation.physics import import_mujoco
-from vkc_pin.utils.arguments import flag, whole
-from vkc_pin.utils.parallel.engine import Died, needs_dask, results
+from vkc_pin.utils.arguments import check_bool, check_integer
+from vkc_pin.utils.parallel.engine import CrashedTask, require_dask, run_tasks
 from vkc_pin.utils.parallel.journal import Journal
-from vkc_pin.utils.parallel.machine import process_name, versions
-from vkc_pin.world.files.resources import file_path
+from vkc_pin.utils.parallel.machine import find_versions, identify_process
+from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.writing import (
     check_links,
     check_replaceable,
@@ -95,21 +95,24 @@ def generate(
             without a display.
         KeyboardInterrupt: Ctrl-C was pressed; the same call continues the run.
     """
-    wanted, jobs = whole(episodes, "episodes", low=1), whole(jobs, "jobs", low=1, high=4096)
+    wanted, jobs = (
+        check_integer(episodes, "episodes", low=1),
+        check_integer(jobs, "jobs", low=1, high=4096),
+    )
     loaded = load_recipe(recipe, variants=variants, simulate=simulate)
-    if flag(cameras, "cameras") and not loaded.fields.cameras:
+    if check_bool(cameras, "cameras") and not loaded.fields.cameras:
         loaded = load_recipe(loaded, cameras=CAMERAS)
     if entries := make_entries(terms):
         loaded = load_recipe(loaded, terms=[*loaded.document["terms"], *entries])
     hdf5.require_h5py()
-    if flag(lerobot, "lerobot"):
+    if check_bool(lerobot, "lerobot"):
         lerobot_layout.require_pyarrow(loaded.fields.rate)
     if loaded.fields.simulate:
         import_mujoco()
     check_frames(loaded)
     if jobs > 1 or scheduler is not None:
-        needs_dask(scheduler)
-    folder = file_path(out, "out", "a folder")
+        require_dask(scheduler)
+    folder = check_path(out, "out", "a folder")
     with _open_journal(folder, loaded) as journal:
         if lerobot and (folder / "lerobot").is_dir():
             for robot in (folder / "lerobot").iterdir():
@@ -154,7 +157,7 @@ def _open_journal(folder: Path, recipe: Recipe) -> Iterator[Journal]:
         check_links(folder)
     check_writable(file)
     folder.mkdir(parents=True, exist_ok=True)
-    header = {"settings": {"recipe": recipe.digest}, "versions": versions()}
+    header = {"settings": {"recipe": recipe.digest}, "versions": find_versions()}
     with file.open("a+b") as stream:
         yield Journal(file, stream, header, "episodes")
 
@@ -219,7 +222,7 @@ def _run_attempts(
         smoothing=0.05,
         disable=not progress,
     )
-    outcomes = results(
+    outcomes = run_tasks(
         make_parts,
         tasks(),
         jobs=jobs,
@@ -233,11 +236,13 @@ def _run_attempts(
             for key, result in lines:
                 numbers = [int(number) for number in key.split(",")]
                 # Run each number alone to find the one that ended the process.
-                if isinstance(result, Died) and len(numbers) > 1:
+                if isinstance(result, CrashedTask) and len(numbers) > 1:
                     retried.extend(numbers)
                     continue
                 for record, data in (
-                    [_make_failure(numbers[0], result)] if isinstance(result, Died) else result
+                    [_make_failure(numbers[0], result)]
+                    if isinstance(result, CrashedTask)
+                    else result
                 ):
                     if record["status"] == "interrupted":
                         raise KeyboardInterrupt
@@ -274,7 +279,7 @@ class _Clock:
 
     def subtract(self, record: Mapping[str, Any]) -> None:
         """Subtract the CPU time of an attempt that this process ran."""
-        if record.get("process") == process_name():
+        if record.get("process") == identify_process():
             self._worked += float(record["cpu_time"])
 
     @property
@@ -299,7 +304,7 @@ def _save(
     )
 
 
-def _make_failure(number: int, outcome: Died) -> Made:
+def _make_failure(number: int, outcome: CrashedTask) -> Made:
     return {"number": number, "success": False, "status": "died", "reason": outcome.reason}, b""
 
 
@@ -311,7 +316,7 @@ def _write_card(dataset: Dataset, register: Register) -> None:
         "license": recipe.fields.license,
         "digest": recipe.digest,
         "rate": recipe.fields.rate,
-        "versions": versions(),
+        "versions": find_versions(),
         "recipe": yaml.safe_dump(recipe.document, sort_keys=False, allow_unicode=True),
     }
     write_atomically(

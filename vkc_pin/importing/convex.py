@@ -19,13 +19,13 @@ import numpy as np
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing.slicing import is_flat, slice_mesh, thicken
-from vkc_pin.utils.arguments import number, quantity, whole
+from vkc_pin.utils.arguments import check_coordinate, check_integer, check_number
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.disk_cache import record
-from vkc_pin.utils.optional_imports import optional_package
-from vkc_pin.world.files.hulls import compute_hull, outer_hull
-from vkc_pin.world.files.meshes import MeshPart, coarser, load_mesh, to_bvh
-from vkc_pin.world.files.resources import file_path
+from vkc_pin.utils.disk_cache import load_or_build
+from vkc_pin.utils.optional_imports import import_optional
+from vkc_pin.world.files.hulls import compute_hull, compute_outer_hull
+from vkc_pin.world.files.meshes import MeshPart, load_mesh, make_bvh, simplify_mesh
+from vkc_pin.world.files.resources import check_path
 
 if TYPE_CHECKING:
     import trimesh
@@ -109,9 +109,9 @@ def decompose(
     """
     import trimesh
 
-    whole(most_pieces, "most_pieces", low=1)
-    whole(corners, "corners", low=8)
-    error, overhead = quantity(error, "error"), number(overhead, "overhead", low=0.0)
+    check_integer(most_pieces, "most_pieces", low=1)
+    check_integer(corners, "corners", low=8)
+    error, overhead = check_coordinate(error, "error"), check_number(overhead, "overhead", low=0.0)
     if error <= 0.0:
         raise InputError(
             "`error` must be positive", field="error", expected="a number above 0 [m]", got=error
@@ -119,7 +119,7 @@ def decompose(
     if isinstance(mesh, trimesh.Trimesh):
         file, loaded = None, mesh
     else:
-        file = file_path(mesh, "mesh", "a mesh or a mesh file")
+        file = check_path(mesh, "mesh", "a mesh or a mesh file")
         loaded = load_mesh(file)
     hull = _make_hull(loaded.vertices, file)
     hulls, solid = [hull], min(compute_solid_volume(loaded), float(hull.volume))
@@ -143,7 +143,9 @@ def decompose(
                     )
                 ]
 
-            parts = record(_make_cache_key(loaded, most_pieces, error, corners, seed), cut_pieces)
+            parts = load_or_build(
+                _make_cache_key(loaded, most_pieces, error, corners, seed), cut_pieces
+            )
             hulls = [compute_hull(np.array(part)) for part in parts]
     pieces = tuple(_simplify(hulls, corners))
     # The volume of an open mesh is only measured, and the pieces contain the mesh.
@@ -195,7 +197,7 @@ def _make_cache_key(mesh: trimesh.Trimesh, *settings: float) -> bytes:
 def _simplify(pieces: Sequence[trimesh.Trimesh], corners: int) -> list[trimesh.Trimesh]:
     """Replace pieces with many vertices by enclosing polytopes with few."""
     return [
-        outer_hull(one.vertices, vertices=corners)
+        compute_outer_hull(one.vertices, vertices=corners)
         if len(one.vertices) > _CORNER_TOLERANCE * corners
         else one
         for one in pieces
@@ -227,7 +229,7 @@ def _cut_mesh(
 
     merged = _merge_vertices(mesh)
     if not merged.is_volume or len(merged.faces) > _MAX_TRIANGLES:
-        coarse = coarser(
+        coarse = simplify_mesh(
             MeshPart(np.asarray(merged.vertices), np.asarray(merged.faces)),
             merged.extents.max() / _CELLS,
         )
@@ -235,8 +237,8 @@ def _cut_mesh(
             thicken(part)
             for part in slice_mesh(trimesh.Trimesh(coarse.vertices, coarse.faces), max_parts)
         ]
-    coacd = optional_package(
-        "coacd", "import", what="cutting a concave mesh into convex pieces", file=file
+    coacd = import_optional(
+        "coacd", "import", purpose="cutting a concave mesh into convex pieces", file=file
     )
     coacd.set_log_level("off")
     loaded = coacd.Mesh(merged.vertices, merged.faces)
@@ -285,7 +287,7 @@ def _measure_protrusion(pieces: Sequence[trimesh.Trimesh], mesh: trimesh.Trimesh
     import trimesh
 
     triangles, here, request, result = (
-        to_bvh(mesh),
+        make_bvh(mesh),
         coal.Transform3s(),
         coal.DistanceRequest(),
         coal.DistanceResult(),

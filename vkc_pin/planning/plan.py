@@ -13,11 +13,11 @@ import numpy as np
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
 from vkc_pin.planning.statistics import PlanningStatistics
-from vkc_pin.utils.arguments import flag
+from vkc_pin.utils.arguments import check_bool
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import check_arguments, validate
-from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import compile_each_step
@@ -223,7 +223,7 @@ class Plan:
         """
         about = {
             "scene": self.scene.document,
-            "folder": serialize_folder(self.scene.folder, file_path(path, "path")),
+            "folder": serialize_folder(self.scene.folder, check_path(path, "path")),
             "steps": [step_to_dict(step) for step in self.steps],
             "options": asdict(self.options),
             "trajectory": self.trajectory.to_dict(),
@@ -254,12 +254,12 @@ class Plan:
             InputError: The file is missing, damaged, of another format or no plan, something in it
                 is inconsistent, or the scene has no such robot, object or file.
         """
-        path = file_path(path, "path", "a saved plan (.npz)")
+        path = check_path(path, "path", "a saved plan (.npz)")
         about, arrays = read_archive(path)
         try:
             plan = cls._from_archive(about, arrays, path)
             check_arguments(plan.scene, plan.steps, plan.trajectory, plan.terms)
-            return _revalidate(plan) if flag(validate, "validate") else plan
+            return _revalidate(plan) if check_bool(validate, "validate") else plan
         except InputError as error:
             if error.file is not None:
                 raise

@@ -15,7 +15,7 @@ from vkc_pin.planning.request import make_budget, make_request
 from vkc_pin.planning.sequential import plan_sequentially, plan_simultaneously
 from vkc_pin.planning.solver.solution import Iteration
 from vkc_pin.planning.window import plan_with_window
-from vkc_pin.utils.arguments import flag, instance, number, whole
+from vkc_pin.utils.arguments import check_bool, check_instance, check_integer, check_number
 from vkc_pin.utils.cache import Cache, CacheInfo
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import compile_each_step
@@ -40,8 +40,8 @@ class Planner:
     """
 
     def __init__(self, *, entries: int = 512, megabytes: float = 128.0) -> None:
-        self.entries = whole(entries, "entries", low=1)
-        self.megabytes = number(megabytes, "megabytes", "more than 0", low=0.0, above=True)
+        self.entries = check_integer(entries, "entries", low=1)
+        self.megabytes = check_number(megabytes, "megabytes", "more than 0", low=0.0, strict=True)
         self._idle: list[Cache] = []
         self._lock = threading.Lock()
 
@@ -68,7 +68,11 @@ class Planner:
     def acquire(self) -> Iterator[Cache]:
         """Acquire a cache for exclusive use, the most recently used if possible; evict at the end."""
         with self._lock:
-            new = None if self._idle else Cache(entries=self.entries, nbytes=1e6 * self.megabytes)
+            new = (
+                None
+                if self._idle
+                else Cache(max_entries=self.entries, max_nbytes=1e6 * self.megabytes)
+            )
             cache = self._idle.pop() if new is None else new
         try:
             yield cache
@@ -88,7 +92,7 @@ _shared = Planner()
 
 def acquire_cache(planner: Planner | None) -> contextlib.AbstractContextManager[Cache]:
     """Acquire a cache of a planner, or of the process's own; see `Planner.acquire`."""
-    return (_shared if planner is None else instance(planner, Planner, "planner")).acquire()
+    return (_shared if planner is None else check_instance(planner, Planner, "planner")).acquire()
 
 
 def plan(
@@ -156,13 +160,13 @@ def plan(
         perturbation=perturbation,
         terms=terms,
     )
-    simultaneous = flag(simultaneous, "simultaneous")
+    simultaneous = check_bool(simultaneous, "simultaneous")
     if window is not None:
-        window, steps = whole(window, "window", low=1), as_steps(steps)
+        window, steps = check_integer(window, "window", low=1), as_steps(steps)
         if not simultaneous:
             problem = "cannot be combined with `simultaneous=False`"
             raise InputError(problem, field="window", expected="None", got=window)
-    with acquire_cache(planner) as cache, shown(progress) as line, budget.running():
+    with acquire_cache(planner) as cache, shown(progress) as line, budget.activate():
         request = dataclasses.replace(request, progress=line, cache=cache)
         tasks = _compile(scene, steps, request.options, each=window is not None)
         holds = dict.fromkeys(hold for task in tasks for hold in task.holds if hold.by is not None)

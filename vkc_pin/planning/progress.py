@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, TextIO
 
 from vkc_pin.errors import InputError
-from vkc_pin.errors import shown as told
+from vkc_pin.errors import format_value as told
 from vkc_pin.utils.notebook import in_notebook
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def shown(progress: object) -> Iterator[Progress]:
     """
     if not isinstance(progress, bool):
         raise InputError(
-            "wrong kind of argument", field="progress", expected="True or False", got=told(progress)
+            "wrong type of argument", field="progress", expected="True or False", got=told(progress)
         )
     line = Progress(_screen() if progress else None)
     try:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from vkc_pin.errors import InputError, shown
+from vkc_pin.errors import InputError, format_value
 from vkc_pin.options import Options
 from vkc_pin.planning.initialization.methods import INITIALIZATIONS
 from vkc_pin.planning.progress import Progress
 from vkc_pin.planning.solver.solution import Iteration
-from vkc_pin.utils.arguments import instance, known, number, whole
+from vkc_pin.utils.arguments import check_choice, check_instance, check_integer, check_number
 from vkc_pin.utils.budget import Budget
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.scene.scene import Scene
@@ -64,13 +64,13 @@ def make_request(
     """
     options = Options() if options is None else options
     check_arguments(scene, options, seed)
-    known(initialization, INITIALIZATIONS, "initialization", "initialization")
-    noise = number(perturbation, "perturbation", "a number of at least 0", low=0.0)
+    check_choice(initialization, INITIALIZATIONS, "initialization", "initialization")
+    noise = check_number(perturbation, "perturbation", "a number of at least 0", low=0.0)
     if noise > MAX_PERTURBATION:
         expected = f"at most {MAX_PERTURBATION:g}"
         raise InputError("out of range", field="perturbation", expected=expected, got=noise)
     if callback is not None and not callable(callback):
-        expected, got = "a function of an Iteration", shown(callback)
+        expected, got = "a function of an Iteration", format_value(callback)
         raise InputError("cannot be called", field="callback", expected=expected, got=got)
     return PlanningRequest(
         initialization, options, callback, int(seed), noise, trace_terms(scene, terms)
@@ -84,12 +84,14 @@ def make_budget(time_limit: object, effort: object) -> Budget:
         InputError: A limit is invalid.
     """
     if time_limit is not None:
-        time_limit = number(time_limit, "time_limit", "seconds, more than 0", low=0.0, above=True)
-    return Budget(time_limit, None if effort is None else whole(effort, "effort", low=1))
+        time_limit = check_number(
+            time_limit, "time_limit", "seconds, more than 0", low=0.0, strict=True
+        )
+    return Budget(time_limit, None if effort is None else check_integer(effort, "effort", low=1))
 
 
 def check_arguments(scene: object, options: object, seed: object) -> None:
     """Check the types of a scene, options and a random seed. Raises `InputError`."""
     for name, value, kind in (("scene", scene, Scene), ("options", options, Options)):
-        instance(value, kind, name)
-    whole(seed, "seed", low=0)
+        check_instance(value, kind, name)
+    check_integer(seed, "seed", low=0)

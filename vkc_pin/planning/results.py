@@ -12,7 +12,7 @@ from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.statistics import PlanningStatistics
-from vkc_pin.utils.budget import ENDINGS, current_ending
+from vkc_pin.utils.budget import STOP_STATUSES, current_ending
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.contact_rules import compute_start_opening
@@ -32,7 +32,7 @@ __all__ = [
     "sum_statistics",
 ]
 
-FINAL = (*ENDINGS, "infeasible")
+FINAL = (*STOP_STATUSES, "infeasible")
 """Statuses after which no alternative is tried."""
 
 

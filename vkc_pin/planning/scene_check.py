@@ -15,7 +15,7 @@ from vkc_pin.planning.diagnosis.diagnosis import diagnose_goals, find_impossible
 from vkc_pin.planning.initialization.keyframes import sample_goal_configurations
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.utils.arguments import instance, whole
+from vkc_pin.utils.arguments import check_instance, check_integer
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.scene.clearance_exemptions import (
@@ -174,9 +174,9 @@ def check_scene(scene: Scene, *, options: Options | None = None, seed: int = 0) 
     Raises:
         InputError: An argument is wrong.
     """
-    instance(scene, Scene, "scene")
-    options = Options() if options is None else instance(options, Options, "options")
-    seed, cache = whole(seed, "seed", low=0), Cache()
+    check_instance(scene, Scene, "scene")
+    options = Options() if options is None else check_instance(options, Options, "options")
+    seed, cache = check_integer(seed, "seed", low=0), Cache()
     reach = [Reach(scene.tool_placement())]
     problem = TrajectoryProblem(
         scene, compile_task(scene, reach, options, nothing=True), options, (), cache=cache

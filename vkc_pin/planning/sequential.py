@@ -10,7 +10,7 @@ from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.results import FINAL, add_statistics, concatenate_plans
 from vkc_pin.planning.solve_task import TaskResult, solve_task
-from vkc_pin.utils.budget import ENDINGS, current_ending, reserve_time
+from vkc_pin.utils.budget import STOP_STATUSES, current_ending, reserve_time
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import generate_alternatives, has_open_attachment
 from vkc_pin.world.task.actuation import find_shared_coordinate
@@ -72,7 +72,7 @@ def plan_simultaneously(scene: Scene, task: Task, request: PlanningRequest) -> P
     if len(task.steps) == 1:
         return solve_with_alternatives(scene, task, request).plan
     plan = solve_task(scene, task, request).plan
-    final = ENDINGS if any(has_open_attachment(scene, step) for step in task.steps) else FINAL
+    final = STOP_STATUSES if any(has_open_attachment(scene, step) for step in task.steps) else FINAL
     if plan.success or plan.status in final:
         return plan
     apart = plan_sequentially(scene, task, request)
@@ -98,7 +98,7 @@ def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) 
     statistics, notes = [first.plan.statistics], list[str]()
     # Terms may name phases by their numbers, which grasping anew would change.
     for name, steps in generate_alternatives(scene, task, anew=not request.terms):
-        if last.plan.success or last.plan.status in ENDINGS or first.is_grasp_independent:
+        if last.plan.success or last.plan.status in STOP_STATUSES or first.is_grasp_independent:
             break
         other = compile_task(scene, steps, request.options)
         last = solve_task(scene, other, request, check_goals_first=True)
@@ -109,7 +109,7 @@ def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) 
     if last is first:
         return first
     plan = first.plan
-    status = last.plan.status if last.plan.status in ENDINGS else plan.status
+    status = last.plan.status if last.plan.status in STOP_STATUSES else plan.status
     report = dataclasses.replace(plan.validation, notes=(*plan.validation.notes, *notes))
     failed = dataclasses.replace(plan, validation=report, status=status)
     return dataclasses.replace(first, plan=add_statistics(failed, statistics))

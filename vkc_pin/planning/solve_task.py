@@ -32,12 +32,12 @@ from vkc_pin.planning.solver.to_trajectory import make_trajectory
 from vkc_pin.planning.statistics import STAGES, PlanningStatistics
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.budget import (
-    ENDINGS,
-    SpentError,
+    STOP_STATUSES,
+    BudgetExhaustedError,
     count_evaluations,
+    record_evaluations,
     reserve_time,
-    spend,
-    unlimited,
+    suspend_budget,
 )
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
@@ -107,15 +107,15 @@ def solve_task(
             guess, since there are probably none.
     """
     began, cache = time.perf_counter(), request.cache
-    built, evaluated = cache.building, count_evaluations()
+    built, evaluated = cache.build_time, count_evaluations()
     request.progress.begin([phase.name for phase in task.phases])
     search = _Search(scene, task, request)
     try:
         best, status = search.run(guess, check_goals_first)
-    except SpentError as end:
+    except BudgetExhaustedError as end:
         best, status = search.find_nearest() or search.make_standing(), str(end)
     cache.trim()  # a chore has many problems, whose solvers grow while they are used
-    build_time = cache.building - built
+    build_time = cache.build_time - built
     statistics = PlanningStatistics(
         planning_time=time.perf_counter() - began - build_time,
         build_time=build_time,
@@ -234,9 +234,9 @@ class _Search:
                     self._best = candidate
                 if self._best.status == "success":
                     return self._best, "success"
-                if solution.status in ENDINGS:
+                if solution.status in STOP_STATUSES:
                     return self._best, solution.status
-            spend()
+            record_evaluations()
             if is_search and self._find_proofs(problem):
                 break
             if number == 1 and is_search and not _has_free_ends(problem, guess):
@@ -245,7 +245,7 @@ class _Search:
                 break
             if any(goal.is_deep for goal in goals):
                 break
-        spend()
+        record_evaluations()
         return self._explain_failure(problem, [goal.text for goal in goals], is_search=is_search)
 
     def _explain_failure(
@@ -308,13 +308,13 @@ class _Search:
             ),
         )
         while True:
-            began, built = time.perf_counter(), request.cache.building
+            began, built = time.perf_counter(), request.cache.build_time
             request.progress.doing("looking for an initial guess")
             try:
                 guess = next(guesses, None)
             finally:
                 took = time.perf_counter() - began
-                self.times["initialization"] += took - (request.cache.building - built)
+                self.times["initialization"] += took - (request.cache.build_time - built)
             if guess is None or self._proofs:
                 return
             yield guess
@@ -336,7 +336,7 @@ class _Search:
 
     def _evaluate(self, problem: TrajectoryProblem, solution: Solution, name: str) -> _Candidate:
         """Retime and validate a solution; where that finds violations, retime closer to its segments."""
-        with unlimited():
+        with suspend_budget():
             waypoints = make_trajectory(problem, solution.z, solution.dt)
         began, validated = time.perf_counter(), self.times["validation"]
         if self._has_velocity_terms:

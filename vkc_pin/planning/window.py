@@ -15,7 +15,7 @@ from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.results import FINAL, concatenate_plans
 from vkc_pin.planning.solve_task import Guess, TaskResult, solve_task
 from vkc_pin.planning.statistics import PlanningStatistics
-from vkc_pin.utils.budget import ENDINGS, current_ending, reserve_time
+from vkc_pin.utils.budget import STOP_STATUSES, current_ending, reserve_time
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import generate_alternatives, group_into_actions
 from vkc_pin.world.task.actuation import find_shared_coordinate
@@ -146,7 +146,7 @@ class _SlidingWindow:
             if result.plan.success:
                 self.ahead = self._divide(result, first, last)
         for attempt in range(1, 1 + self._attempts):
-            if failed is None or failed.status in ENDINGS:
+            if failed is None or failed.status in STOP_STATUSES:
                 break
             result = self._solve(first, self._current_scene, task, attempt)
             if result.plan.success:
@@ -188,7 +188,7 @@ class _SlidingWindow:
         scene = self.ahead[-1].after if self.ahead else self._current_scene
         task, chosen = self._compile(scene, number, number + 1), self.actions[number]
         failed = self._plan_alone(number, scene, task)
-        if failed is None or failed.status in ENDINGS:
+        if failed is None or failed.status in STOP_STATUSES:
             return failed
         for _, steps in generate_alternatives(scene, task):
             self.actions[number] = steps
@@ -199,7 +199,7 @@ class _SlidingWindow:
             if other is None:
                 return None
             self.actions[number] = chosen
-            if other.status in ENDINGS:
+            if other.status in STOP_STATUSES:
                 return other
         return failed
 

@@ -11,7 +11,7 @@ from vkc_pin.procedural.furniture.catalogue import KINDS
 from vkc_pin.procedural.rooms.fixtures import RANDOM
 from vkc_pin.procedural.rooms.random_room import random_room
 from vkc_pin.procedural.rooms.settings import RoomSettings
-from vkc_pin.utils.arguments import instance, number, whole
+from vkc_pin.utils.arguments import check_instance, check_integer, check_number
 from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
@@ -38,8 +38,8 @@ def goals(scene: Scene, *, share: float = 0.5) -> tuple[Step, ...]:
     Raises:
         InputError: `share` is out of range.
     """
-    instance(scene, Scene, "scene")
-    if not 0.0 < number(share, "share") <= 1.0:
+    check_instance(scene, Scene, "scene")
+    if not 0.0 < check_number(share, "share") <= 1.0:
         raise InputError("out of range", field="share", expected="above 0 and at most 1", got=share)
     found: list[Step] = []
     for name, placed in scene.objects.items():
@@ -71,7 +71,7 @@ def random_task(
             this size.
         UnknownNameError: There is no such field, or no such type of object.
     """
-    rng = np.random.default_rng([6, whole(seed, "seed", low=0)])
+    rng = np.random.default_rng([6, check_integer(seed, "seed", low=0)])
     count = 1 + int(rng.integers(_MAX_OBJECTS))
     kinds = tuple(RANDOM + str(kind) for kind in rng.choice(sorted(KINDS), count, replace=False))
     share = round(float(rng.uniform(*_SHARES)), 3)

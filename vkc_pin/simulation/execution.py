@@ -30,7 +30,7 @@ from vkc_pin.simulation.servos import (
     sample_reference,
 )
 from vkc_pin.simulation.welds import Grips, Latches, find_hold_spans, find_latches
-from vkc_pin.utils.arguments import instance
+from vkc_pin.utils.arguments import check_instance
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH
 from vkc_pin.world.scene.hold import Hold
@@ -81,13 +81,13 @@ def simulate(
             argument is invalid.
     """
     mujoco = import_mujoco()
-    physics = Physics() if physics is None else instance(physics, Physics, "physics")
+    physics = Physics() if physics is None else check_instance(physics, Physics, "physics")
     if grasp not in GRASPS:
         raise InputError(
             "unknown grasp model", field="grasp", expected=", ".join(GRASPS), got=grasp
         )
     steps = as_steps(steps)
-    executed_scene = scene if actual is None else instance(actual, Scene, "actual")
+    executed_scene = scene if actual is None else check_instance(actual, Scene, "actual")
     for name, placed in scene.objects.items():
         if (
             name not in executed_scene.objects

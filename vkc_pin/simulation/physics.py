@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arguments import flag, number
+from vkc_pin.utils.arguments import check_bool, check_number
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.optional_imports import optional_package
+from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.models.dynamics.mass import compute_solid_inertia
 from vkc_pin.world.trajectory.world_model import World
 
@@ -83,15 +83,15 @@ class Physics:
         for item in fields(self):
             name = item.name
             if name == "balanced":
-                flag(self.balanced, "Physics.balanced")
+                check_bool(self.balanced, "Physics.balanced")
                 continue
             high = _MAX_STEP if name == "timestep" else float("inf")
-            value = number(
+            value = check_number(
                 getattr(self, name),
                 f"Physics.{name}",
                 low=0.0,
                 high=high,
-                above=name not in _NONNEGATIVE,
+                strict=name not in _NONNEGATIVE,
             )
             object.__setattr__(self, name, value)
 
@@ -102,7 +102,7 @@ def import_mujoco() -> Any:
     Raises:
         InputError: MuJoCo is not installed or cannot be imported.
     """
-    return optional_package("mujoco", "sim", what="simulating")
+    return import_optional("mujoco", "sim", purpose="simulating")
 
 
 def complete_inertias(world: World, physics: Physics) -> list[str]:

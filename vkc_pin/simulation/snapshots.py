@@ -179,7 +179,7 @@ def write_snapshots(executed: Execution, path: str | Path, *, count: int = 6) ->
         InputError: `count` is out of range.
         VkcError: OpenGL is not available without a display.
     """
-    count = arguments.whole(count, "count", low=2, high=_MAX_SNAPSHOTS)
+    count = arguments.check_integer(count, "count", low=2, high=_MAX_SNAPSHOTS)
     first, last = float(executed.planned.times[0]), float(executed.planned.times[-1])
     held = [phase for phase in executed.planned.phases if phase.holds]
     begin = float(executed.planned.times[held[0].first]) if held else first
@@ -227,7 +227,7 @@ def write_video(executed: Execution, path: str | Path, *, rate: float = 25.0) ->
         VkcError: OpenGL is not available without a display, or ffmpeg fails.
     """
     rate, encoder = (
-        arguments.number(rate, "rate", "frames per second", low=1.0, high=_MAX_RATE),
+        arguments.check_number(rate, "rate", "frames per second", low=1.0, high=_MAX_RATE),
         _find_ffmpeg(),
     )
     times = np.arange(executed.trajectory.times[0], executed.trajectory.times[-1], 1.0 / rate)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LARGEST", "Bools", "Floats", "Ints"]
+__all__ = ["MAX_COORDINATE", "Bools", "Floats", "Ints"]
 
-LARGEST = 1e4
+MAX_COORDINATE = 1e4
 """Largest length [m] or angle [rad] that a file or an argument may name."""
 
 Floats = NDArray[np.float64]

@@ -10,24 +10,24 @@ from collections.abc import Iterator
 from contextvars import ContextVar
 from types import FrameType
 
-from vkc_pin.utils.interrupt import handled
+from vkc_pin.utils.interrupt import handle_interrupt
 
 __all__ = [
-    "ENDINGS",
+    "STOP_STATUSES",
     "Budget",
-    "SpentError",
+    "BudgetExhaustedError",
     "count_evaluations",
     "current_ending",
+    "record_evaluations",
     "reserve_time",
-    "spend",
-    "unlimited",
+    "suspend_budget",
 ]
 
-ENDINGS = ("interrupted", "effort spent", "time limit")
+STOP_STATUSES = ("interrupted", "effort spent", "time limit")
 """Why a budget may be at its end; what becomes the status of plans."""
 
 
-class SpentError(Exception):
+class BudgetExhaustedError(Exception):
     """The budget is at its end: whoever has something to show for it catches this; it never reaches the user."""
 
 
@@ -42,51 +42,51 @@ class Budget:
         effort: Evaluations; None: unlimited.
 
     Attributes:
-        pressed: Whether Ctrl-C was pressed.
-        used: Evaluations so far.
+        is_interrupted: Whether Ctrl-C was pressed.
+        evaluations: Evaluations so far.
         reserved: Purpose → time that is kept for validating the best trajectory at the end [s].
     """
 
     def __init__(self, seconds: float | None = None, effort: int | None = None) -> None:
         self._deadline = math.inf if seconds is None else time.perf_counter() + seconds
         self._effort = math.inf if effort is None else effort
-        self.pressed, self.used = False, 0
+        self.is_interrupted, self.evaluations = False, 0
         self.reserved: dict[str, float] = {}
 
     @property
-    def ended(self) -> str:
+    def stop_status(self) -> str:
         """One of `ENDINGS`, or "" while it lasts."""
-        if self.pressed:
+        if self.is_interrupted:
             return "interrupted"
-        if self.used > self._effort:
+        if self.evaluations > self._effort:
             return "effort spent"
         late = time.perf_counter() + sum(self.reserved.values()) > self._deadline
         return "time limit" if late else ""
 
     @contextlib.contextmanager
-    def running(self) -> Iterator[Budget]:
+    def activate(self) -> Iterator[Budget]:
         """Make this the budget of the thread, and note the first Ctrl-C instead of raising; the second one raises.
 
         CasADi swallows KeyboardInterrupt inside a solve and reports some failure instead. Signals
         reach the main thread only: elsewhere nothing changes.
         """
-        token = _RUNNING.set(self)
+        token = _ACTIVE.set(self)
 
         def note(number: int, frame: FrameType | None) -> None:
-            self.pressed = True
+            self.is_interrupted = True
             signal.signal(signal.SIGINT, before)
 
         try:
-            with handled(note) as before:
+            with handle_interrupt(note) as before:
                 yield self
         finally:
-            _RUNNING.reset(token)
+            _ACTIVE.reset(token)
 
 
-_RUNNING: ContextVar[Budget | None] = ContextVar("running", default=None)  # each thread has its own
+_ACTIVE: ContextVar[Budget | None] = ContextVar("running", default=None)  # each thread has its own
 
 
-def spend(units: int = 0) -> None:
+def record_evaluations(units: int = 0) -> None:
     """Count work in the budget that runs in this thread, if there is one.
 
     Whatever may take long calls this often: a hundredth of a second is a good measure.
@@ -98,23 +98,23 @@ def spend(units: int = 0) -> None:
     Raises:
         SpentError: It is at its end.
     """
-    budget = _RUNNING.get()
+    budget = _ACTIVE.get()
     if budget is not None:
-        budget.used += units
-        if budget.ended:
-            raise SpentError(budget.ended)
+        budget.evaluations += units
+        if budget.stop_status:
+            raise BudgetExhaustedError(budget.stop_status)
 
 
 def count_evaluations() -> int:
     """Return the evaluations so far in the budget of this thread; 0 without one."""
-    budget = _RUNNING.get()
-    return 0 if budget is None else budget.used
+    budget = _ACTIVE.get()
+    return 0 if budget is None else budget.evaluations
 
 
 def current_ending() -> str:
     """Return which of `ENDINGS` has ended the budget of this thread, or "" while it lasts."""
-    budget = _RUNNING.get()
-    return "" if budget is None else budget.ended
+    budget = _ACTIVE.get()
+    return "" if budget is None else budget.stop_status
 
 
 def reserve_time(purpose: str, seconds: float, *, default: bool = False) -> None:
@@ -125,16 +125,16 @@ def reserve_time(purpose: str, seconds: float, *, default: bool = False) -> None
         seconds: How much [s].
         default: Keep an earlier time of the same purpose.
     """
-    budget = _RUNNING.get()
+    budget = _ACTIVE.get()
     if budget is not None and not (default and budget.reserved.get(purpose)):
         budget.reserved[purpose] = seconds
 
 
 @contextlib.contextmanager
-def unlimited() -> Iterator[None]:
+def suspend_budget() -> Iterator[None]:
     """Let nothing count for a while: what must be done in any case."""
-    token = _RUNNING.set(None)
+    token = _ACTIVE.set(None)
     try:
         yield
     finally:
-        _RUNNING.reset(token)
+        _ACTIVE.reset(token)

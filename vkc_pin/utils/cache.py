@@ -1,4 +1,4 @@
-"""Cache: what planning builds once and can use again, kept as long as there is room."""
+"""Caches objects that planning builds once and uses again."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any, TypeVar, cast
 
-from vkc_pin.utils.budget import spend
+from vkc_pin.utils.budget import record_evaluations
 
 __all__ = ["Cache", "CacheInfo"]
 
@@ -19,13 +19,13 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class CacheInfo:
-    """How full a cache is, and what it was good for.
+    """Contents and use of a cache.
 
     Attributes:
-        entries: Number of objects kept.
-        nbytes: Their size in memory, estimated [bytes].
-        hits: How often something was there when it was asked for.
-        misses: How often it had to be built.
+        entries: Number of cached objects.
+        nbytes: Their estimated size in memory [bytes].
+        hits: Requests that found an object.
+        misses: Requests that built one.
     """
 
     entries: int = 0
@@ -35,84 +35,70 @@ class CacheInfo:
 
 
 class Cache:
-    """Keeps what was built, by key; what was used longest ago goes first.
+    """Least-recently-used cache of objects that are determined by their key.
 
-    What is kept depends on its key alone, so that it makes no difference to a result whether it was
-    there. For one thread at a time: what is kept may have buffers of its own.
+    One thread at a time may use it: cached objects may have buffers.
 
     Args:
-        entries: How many objects are kept at most.
-        nbytes: How much memory they take at most [bytes], by each object's own estimate `nbytes`;
-            the one that was used last is kept in any case.
+        max_entries: Largest number of objects.
+        max_nbytes: Largest memory [bytes], by the objects' own estimate `nbytes`. The object used
+            last stays in any case.
 
     Attributes:
-        building: Time spent on building so far [s].
+        build_time: Time spent on building so far [s].
     """
 
-    def __init__(self, *, entries: int = 512, nbytes: float = 2.0**30) -> None:
-        self.entries, self.nbytes, self.building = entries, nbytes, 0.0
-        self._kept: OrderedDict[Hashable, Any] = OrderedDict()
+    def __init__(self, *, max_entries: int = 512, max_nbytes: float = 2.0**30) -> None:
+        self.max_entries, self.max_nbytes, self.build_time = max_entries, max_nbytes, 0.0
+        self._objects: OrderedDict[Hashable, Any] = OrderedDict()
         self._hits = self._misses = self._depth = 0
 
     def get(self, key: Hashable, build: Callable[[], T]) -> T:
-        """Return what is kept under `key`, built if it is not there.
+        """Return the object of `key`, which is built if it is not cached.
 
         Args:
-            key: All that the result depends on, after the name of its kind.
-            build: Makes it; it may ask this cache for parts.
+            key: Kind of object, then everything that it depends on.
+            build: Builds the object; it may ask this cache for parts.
 
         Raises:
-            SpentError: It is not there, and the budget is at its end.
+            BudgetExhaustedError: The object is not cached, and the budget is exhausted.
         """
-        if key in self._kept:
+        if key in self._objects:
             self._hits += 1
         else:
-            spend()
+            record_evaluations()
             self._misses += 1
             began, self._depth = time.perf_counter(), self._depth + 1
             try:
-                self._kept[key] = build()
+                self._objects[key] = build()
             finally:
                 self._depth -= 1
-                if not self._depth:  # parts are built within the time of the whole
-                    self.building += time.perf_counter() - began
-        self._kept.move_to_end(key)
-        value = cast(T, self._kept[key])
-        while len(self._kept) > self.entries:
-            self._kept.popitem(last=False)
+                if not self._depth:  # the time of the whole includes that of its parts
+                    self.build_time += time.perf_counter() - began
+        self._objects.move_to_end(key)
+        value = cast(T, self._objects[key])
+        while len(self._objects) > self.max_entries:
+            self._objects.popitem(last=False)
         return value
 
-    def drop(self, *beginning: Hashable) -> None:
-        """Let go of what is kept under keys that begin like this."""
-        for key in [
-            key
-            for key in self._kept
-            if isinstance(key, tuple) and key[: len(beginning)] == beginning
-        ]:
-            del self._kept[key]
+    def evict(self, *prefix: Hashable) -> None:
+        """Evict all objects whose key starts with `prefix`."""
+        for key in list(self._objects):
+            if isinstance(key, tuple) and key[: len(prefix)] == prefix:
+                del self._objects[key]
 
     def trim(self) -> None:
-        """Let go of what there is no room for, and give its memory back: objects grow while they are used."""
+        """Evict objects beyond `max_nbytes`, and release their memory: objects grow in use."""
         total = self.info().nbytes
-        if total <= self.nbytes:
+        if total <= self.max_nbytes:
             return
-        while total > self.nbytes and len(self._kept) > 1:
-            total -= int(self._kept.popitem(last=False)[1].nbytes)
-        _give_back()
+        while total > self.max_nbytes and len(self._objects) > 1:
+            total -= int(self._objects.popitem(last=False)[1].nbytes)
+        # glibc keeps freed memory between used blocks; other C libraries have no such call
+        with contextlib.suppress(AttributeError, OSError, TypeError):
+            ctypes.CDLL(None).malloc_trim(0)
 
     def info(self) -> CacheInfo:
-        """Return how full it is."""
-        return CacheInfo(
-            len(self._kept),
-            sum(int(value.nbytes) for value in self._kept.values()),
-            self._hits,
-            self._misses,
-        )
-
-
-def _give_back() -> None:
-    """Give freed memory back to the system: glibc keeps what lies between blocks that are in use, ever more of it."""
-    with contextlib.suppress(
-        AttributeError, OSError, TypeError
-    ):  # other C libraries have no such call
-        ctypes.CDLL(None).malloc_trim(0)
+        """Return the contents and use of the cache."""
+        nbytes = sum(int(value.nbytes) for value in self._objects.values())
+        return CacheInfo(len(self._objects), nbytes, self._hits, self._misses)

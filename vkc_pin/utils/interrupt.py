@@ -9,11 +9,13 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
-__all__ = ["deferred", "handled", "raising"]
+__all__ = ["defer_interrupt", "handle_interrupt", "raise_on_interrupt"]
 
 
 @contextlib.contextmanager
-def handled(handler: Callable[[int, FrameType | None], object] | signal.Handlers) -> Iterator[Any]:
+def handle_interrupt(
+    handler: Callable[[int, FrameType | None], object] | signal.Handlers,
+) -> Iterator[Any]:
     """Let `handler` have Ctrl-C, and yield what had it before; where it cannot be had, nothing changes.
 
     Signals reach the main thread only.
@@ -32,7 +34,7 @@ def handled(handler: Callable[[int, FrameType | None], object] | signal.Handlers
 
 
 @contextlib.contextmanager
-def deferred() -> Iterator[None]:
+def defer_interrupt() -> Iterator[None]:
     """Let Ctrl-C wait for the end of something short that must not be left half done."""
     pressed: list[int] = []
 
@@ -40,7 +42,7 @@ def deferred() -> Iterator[None]:
         pressed.append(number)
 
     try:
-        with handled(note):
+        with handle_interrupt(note):
             yield
     finally:
         if pressed:
@@ -48,7 +50,7 @@ def deferred() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def raising() -> Iterator[None]:
+def raise_on_interrupt() -> Iterator[None]:
     """Let Ctrl-C raise KeyboardInterrupt, as it does unless somebody chose otherwise."""
-    with handled(signal.default_int_handler):
+    with handle_interrupt(signal.default_int_handler):
         yield

@@ -7,27 +7,27 @@ from functools import singledispatch
 from html import escape
 from importlib import import_module
 
-__all__ = ["card", "cards_from", "in_notebook", "show"]
+__all__ = ["in_notebook", "make_card", "register_card_module", "render_card"]
 
-_makers: list[str] = []  # modules that register cards, imported when the first one is shown
+_card_modules: list[str] = []  # modules that register cards, imported when the first one is shown
 
 
 @singledispatch
-def card(value: object) -> str:
+def make_card(value: object) -> str:
     """Return what a notebook shows of `value`, as HTML: its text, unless a module registers something else for its type."""
     return f"<pre>{escape(repr(value))}</pre>"
 
 
-def cards_from(module: str) -> None:
+def register_card_module(module: str) -> None:
     """Name a module that registers cards, which is imported when a notebook shows the first one."""
-    _makers.append(module)
+    _card_modules.append(module)
 
 
-def show(value: object) -> str:
+def render_card(value: object) -> str:
     """Return `value`'s card, as HTML."""
-    for module in _makers:
+    for module in _card_modules:
         import_module(module)
-    return card(value)
+    return make_card(value)
 
 
 def in_notebook() -> bool:

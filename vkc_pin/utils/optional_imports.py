@@ -7,12 +7,12 @@ from typing import Any
 
 from vkc_pin.errors import BuildError, InputError
 
-__all__ = ["REBUILD", "compiled_module", "optional_package"]
+__all__ = ["REBUILD_HINT", "import_compiled", "import_optional"]
 
-REBUILD = "build vkc-pin again: pip install --force-reinstall --no-deps --no-cache-dir vkc-pin (in a checkout: '.')"
+REBUILD_HINT = "build vkc-pin again: pip install --force-reinstall --no-deps --no-cache-dir vkc-pin (in a checkout: '.')"
 
 
-def compiled_module(name: str) -> Any:
+def import_compiled(name: str) -> Any:
     """Return a compiled module of this package.
 
     Args:
@@ -26,19 +26,19 @@ def compiled_module(name: str) -> Any:
     except ImportError as error:
         raise BuildError(
             f"the compiled module {name} cannot be imported ({error}). It is built when vkc-pin is installed, "
-            f"which needs a C++17 compiler (Debian, Ubuntu: apt install g++); then {REBUILD}"
+            f"which needs a C++17 compiler (Debian, Ubuntu: apt install g++); then {REBUILD_HINT}"
         ) from error
 
 
-def optional_package(
-    name: str, extra: str, *, what: str, file: object = None, field: str | None = None
+def import_optional(
+    name: str, extra: str, *, purpose: str, file: object = None, field: str | None = None
 ) -> Any:
     """Return a package, or a module of one, that only an extra of this package asks for.
 
     Args:
         name: Its name.
         extra: The extra: `import`, `sim`.
-        what: What needs it, for the message: "reading MJCF".
+        purpose: What needs it, for the message: "reading MJCF".
         file: The file that needs it, for the message.
         field: The option that needs it, for the message.
 
@@ -51,7 +51,7 @@ def optional_package(
         package = name.partition(".")[0]
         missing = isinstance(error, ModuleNotFoundError) and error.name == package
         raise InputError(
-            f"{what} needs the Python package {package}",
+            f"{purpose} needs the Python package {package}",
             file=None if file is None else str(file),
             field=field,
             expected=f'pip install "vkc-pin[{extra}]"',

@@ -7,7 +7,13 @@ from dataclasses import KW_ONLY, asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arguments import items, mapping, number, text, whole
+from vkc_pin.utils.arguments import (
+    check_integer,
+    check_list,
+    check_mapping,
+    check_number,
+    check_text,
+)
 
 if TYPE_CHECKING:
     from vkc_pin.options import Options
@@ -218,7 +224,7 @@ class Report:
         Raises:
             InputError: A field is missing or has the wrong type.
         """
-        fields = dict(mapping(data, "report"))
+        fields = dict(check_mapping(data, "report"))
         for name in (
             "clearance",
             "closure_error",
@@ -226,27 +232,31 @@ class Report:
         ):  # infinite where nothing can collide
             if name in fields:
                 fields[name] = _parse_real(fields[name], name)
-        nearest: tuple[Any, ...] = items(
+        nearest: tuple[Any, ...] = check_list(
             fields.get("clearances", ()), "clearances", "a list of distances"
         )
         fields["clearances"] = tuple(
             _parse_real(one, f"clearances[{k}]") for k, one in enumerate(nearest)
         )
-        fields["states"] = whole(fields.get("states", 0), "states", low=0)
-        listed: tuple[Any, ...] = items(
+        fields["states"] = check_integer(fields.get("states", 0), "states", low=0)
+        listed: tuple[Any, ...] = check_list(
             fields.get("violations"), "violations", "a list of violations"
         )
         fields["violations"] = tuple(
             _parse_violation(one, f"violations[{k}]") for k, one in enumerate(listed)
         )
-        notes: tuple[Any, ...] = items(fields.get("notes"), "notes", "a list of texts")
-        fields["notes"] = tuple(text(note, f"notes[{k}]") for k, note in enumerate(notes))
-        fields["torque"] = number(fields.get("torque", 0.0), "torque", low=0.0)
-        bounds: tuple[Any, ...] = items(fields.get("bounds", ()), "bounds", "a list of bounds")
+        notes: tuple[Any, ...] = check_list(fields.get("notes"), "notes", "a list of texts")
+        fields["notes"] = tuple(check_text(note, f"notes[{k}]") for k, note in enumerate(notes))
+        fields["torque"] = check_number(fields.get("torque", 0.0), "torque", low=0.0)
+        bounds: tuple[Any, ...] = check_list(fields.get("bounds", ()), "bounds", "a list of bounds")
         fields["bounds"] = tuple(_parse_bound(one, f"bounds[{k}]") for k, one in enumerate(bounds))
-        remarks: tuple[Any, ...] = items(fields.get("remarks", ()), "remarks", "a list of texts")
-        fields["remarks"] = tuple(text(remark, f"remarks[{k}]") for k, remark in enumerate(remarks))
-        exempt: tuple[Any, ...] = items(
+        remarks: tuple[Any, ...] = check_list(
+            fields.get("remarks", ()), "remarks", "a list of texts"
+        )
+        fields["remarks"] = tuple(
+            check_text(remark, f"remarks[{k}]") for k, remark in enumerate(remarks)
+        )
+        exempt: tuple[Any, ...] = check_list(
             fields.get("exemptions", ()), "exemptions", "a list of exemptions"
         )
         fields["exemptions"] = tuple(
@@ -262,17 +272,17 @@ class Report:
 
 def _parse_real(value: Any, field: str) -> float:
     """Return a number, possibly infinite. Raises `InputError` for anything else."""
-    return value if isinstance(value, float) else number(value, field)
+    return value if isinstance(value, float) else check_number(value, field)
 
 
 def _parse_violation(data: Any, field: str) -> Violation:
     """Parse a violation. Raises `InputError` for missing fields and wrong types."""
-    given = mapping(data, field)
+    given = check_mapping(data, field)
     for name in ("constraint", "subject", "unit", "detail"):
-        given[name] = text(given.get(name), f"{field}.{name}")
+        given[name] = check_text(given.get(name), f"{field}.{name}")
     for name in ("time", "amount"):
         given[name] = _parse_real(given.get(name), f"{field}.{name}")
-    given["waypoint"] = whole(given.get("waypoint"), f"{field}.waypoint", low=0)
+    given["waypoint"] = check_integer(given.get("waypoint"), f"{field}.waypoint", low=0)
     try:
         return Violation(**given)
     except TypeError as error:
@@ -283,10 +293,10 @@ def _parse_violation(data: Any, field: str) -> Violation:
 
 def _parse_exemption(data: Any, field: str) -> Exemption:
     """Parse an exemption. Raises `InputError` for missing fields and wrong types."""
-    given = mapping(data, field)
+    given = check_mapping(data, field)
     for name in ("subject", "reason"):
-        given[name] = text(given.get(name), f"{field}.{name}")
-    given["distance"] = number(given.get("distance"), f"{field}.distance")
+        given[name] = check_text(given.get(name), f"{field}.{name}")
+    given["distance"] = check_number(given.get("distance"), f"{field}.distance")
     try:
         return Exemption(**given)
     except TypeError as error:
@@ -297,11 +307,11 @@ def _parse_exemption(data: Any, field: str) -> Exemption:
 
 def _parse_bound(data: Any, field: str) -> Bound:
     """Parse a bound. Raises `InputError` for missing fields and wrong types."""
-    given = mapping(data, field)
+    given = check_mapping(data, field)
     for name in ("subject", "kind"):
-        given[name] = text(given.get(name), f"{field}.{name}")
+        given[name] = check_text(given.get(name), f"{field}.{name}")
     for name in ("share", "begin", "end"):
-        given[name] = number(given.get(name), f"{field}.{name}")
+        given[name] = check_number(given.get(name), f"{field}.{name}")
     try:
         return Bound(**given)
     except TypeError as error:

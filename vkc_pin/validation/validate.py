@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vkc_pin.options import Options
-from vkc_pin.utils.arguments import instance
+from vkc_pin.utils.arguments import check_instance
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.closure import find_drift
 from vkc_pin.validation.contact_windows import check_gripper, check_pushes, find_contact_windows
@@ -75,7 +75,7 @@ def validate(
         InputError: The trajectory does not belong to the scene's robot and objects.
         UnknownNameError: A step or term names something that does not exist.
     """
-    options = Options() if options is None else instance(options, Options, "options")
+    options = Options() if options is None else check_instance(options, Options, "options")
     return _Validator(*check_arguments(scene, steps, trajectory, terms), options).make_report()
 
 
@@ -84,7 +84,10 @@ def check_arguments(
 ) -> tuple[Samples, tuple[Step, ...], tuple[Term, ...]]:
     """Check the arguments of `validate` and prepare them; raises what `validate` raises."""
     samples, asked = (
-        Samples(instance(scene, Scene, "scene"), instance(trajectory, Trajectory, "trajectory")),
+        Samples(
+            check_instance(scene, Scene, "scene"),
+            check_instance(trajectory, Trajectory, "trajectory"),
+        ),
         as_steps(steps),
     )
     check_steps(samples, asked)

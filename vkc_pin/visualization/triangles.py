@@ -11,7 +11,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.files.meshes import MeshPart, coarser
+from vkc_pin.world.files.meshes import MeshPart, simplify_mesh
 from vkc_pin.world.models.shapes import triangulate
 
 __all__ = ["Solid", "box_solid", "coarse", "merge_solids", "shade", "to_solid", "tube"]
@@ -63,7 +63,9 @@ def shade(vertices: Floats, faces: NDArray[np.int64]) -> Solid:
 
 def coarse(solid: Solid, width: float) -> Solid:
     """Simplify a mesh by merging the vertices in each cell of a grid of `width` [m]."""
-    part = coarser(MeshPart(solid.vertices.astype(float), solid.faces.astype(np.int64)), width)
+    part = simplify_mesh(
+        MeshPart(solid.vertices.astype(float), solid.faces.astype(np.int64)), width
+    )
     return shade(part.vertices, part.faces)
 
 

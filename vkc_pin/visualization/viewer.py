@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.utils.arguments import flag, instance, mapping, whole
+from vkc_pin.utils.arguments import check_bool, check_instance, check_integer, check_mapping
 from vkc_pin.utils.notebook import in_notebook
 from vkc_pin.validation.report import CheckedMotion
 from vkc_pin.world.files.writing import write_atomically
@@ -65,9 +65,9 @@ def show(
         VkcError: The server does not start.
     """
     scene, plan = _parts(plan_or_scene)
-    height = whole(height, "height", low=1, high=100_000)
+    height = check_integer(height, "height", low=1, high=100_000)
     if open_browser is not None:
-        flag(open_browser, "open_browser")
+        check_bool(open_browser, "open_browser")
     if in_notebook():
         from IPython.display import HTML
 
@@ -110,7 +110,9 @@ def animate(plan: CheckedMotion, viewer: meshcat.Visualizer | None = None) -> me
         raise InputError(
             "a scene has no motion", field="plan", expected="a Plan", got=type(plan).__name__
         )
-    viewer = open_viewer() if viewer is None else instance(viewer, meshcat.Visualizer, "viewer")
+    viewer = (
+        open_viewer() if viewer is None else check_instance(viewer, meshcat.Visualizer, "viewer")
+    )
     _draw(viewer, scene, known)
     return viewer
 
@@ -202,7 +204,9 @@ def _draw(
     from vkc_pin.visualization.drawing import Drawing
 
     motion = () if plan is None else (plan.trajectory, plan.validation)
-    named = mapping({} if frames is None else frames, "frames", "names, each with a pinocchio.SE3")
+    named = check_mapping(
+        {} if frames is None else frames, "frames", "names, each with a pinocchio.SE3"
+    )
     placed = {name: as_placement(where, name=f"frames.{name}") for name, where in named.items()}
     Drawing(viewer, scene, *motion).draw(play=play, frames=placed)
 

@@ -335,7 +335,7 @@ def test_progress(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
 def test_sources_are_those_that_planning_depends_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from vkc_pin.world.files.resources import folder
+    from vkc_pin.world.files.resources import find_resource_folder
 
     for name in (
         "__init__.py",
@@ -347,9 +347,11 @@ def test_sources_are_those_that_planning_depends_on(
     ):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("1\n")
-    monkeypatch.setattr(runner, "package_folder", lambda: tmp_path)
+    monkeypatch.setattr(runner, "find_package_folder", lambda: tmp_path)
     monkeypatch.setattr(
-        runner, "folder", lambda kind: tmp_path / "scenes" if kind == "scenes" else folder(kind)
+        runner,
+        "folder",
+        lambda kind: tmp_path / "scenes" if kind == "scenes" else find_resource_folder(kind),
     )
     first = runner._sources()
     for name, counts in (

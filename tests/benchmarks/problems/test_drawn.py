@@ -15,7 +15,7 @@ from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.planning.plan import Plan
 from vkc_pin.procedural.tasks import random_task
-from vkc_pin.world.files.resources import available
+from vkc_pin.world.files.resources import list_resources
 from vkc_pin.world.task.steps import step_to_dict
 
 
@@ -29,7 +29,7 @@ def test_problems_follow_from_their_numbers() -> None:
 
 def test_all_scenes_take_turns_with_obstacles_and_all_kinds_of_steps() -> None:
     problems = [drawn(0, number) for number in range(1, 121, 2)]
-    names = sorted(available("scenes", "*.yaml"))
+    names = sorted(list_resources("scenes", "*.yaml"))
     assert [own.scene.name for own in problems[: len(names)]] == names
     steps = {type(step).__name__ for own in problems for step in own.steps}
     assert steps == {"Actuate", "Grasp", "Place", "Reach", "Touch", "GoTo"}

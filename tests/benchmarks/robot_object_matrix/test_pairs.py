@@ -22,7 +22,7 @@ from vkc_pin.benchmarks.robot_object_matrix.pairs import (
 from vkc_pin.planning.diagnosis.diagnosis import BlockedGoal
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.procedural.furniture.catalogue import KINDS
-from vkc_pin.world.files.resources import folder
+from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import START_CLEARANCE
@@ -49,7 +49,7 @@ def test_what_there_is() -> None:
 
 
 def test_descriptions_are_the_same_wherever_they_are_read() -> None:
-    stored = folder("scenes") / "objects" / "narrow_door.yaml"
+    stored = find_resource_folder("scenes") / "objects" / "narrow_door.yaml"
     by_name, by_path = description_of("narrow_door"), description_of(str(stored))
     assert by_name == by_path
     assert Path(by_name["urdf"]).is_absolute()

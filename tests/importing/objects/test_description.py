@@ -19,7 +19,7 @@ def test_volumes_of_parts_are_those_of_their_shapes() -> None:
         ("cylinder", (0.1, 0.2), np.pi * 2e-3),
         ("capsule", (0.1, 0.2), np.pi * 2e-3 + 4.0 / 3.0 * np.pi * 1e-3),
     ):
-        mesh = Part(name="", placement=where, kind=kind, size=size).mesh()
+        mesh = Part(name="", placement=where, kind=kind, size=size).make_mesh()
         assert mesh.volume == pytest.approx(volume, rel=0.02)
         assert np.allclose(mesh.bounds.mean(axis=0), [1.0, 2.0, 3.0], atol=1e-6)
 

@@ -44,7 +44,7 @@ def test_bodies_that_move_freely_are_kept_if_wanted(tmp_path: Path) -> None:
 def test_meshes_are_where_the_file_has_them(tmp_path: Path) -> None:
     """MuJoCo moves meshes into their principal axes."""
     (tmp_path / "t.xml").write_text(MJCF)
-    looks = read_object_mjcf(tmp_path / "t.xml").links["door"].visual[2].mesh()
+    looks = read_object_mjcf(tmp_path / "t.xml").links["door"].visual[2].make_mesh()
     assert np.allclose(looks.bounds, [[-0.02, 0.1, 0.0], [0.08, 0.2, 0.1]], atol=1e-6)
 
 

@@ -47,8 +47,8 @@ def test_a_bracket_leaves_room_for_fingers() -> None:
     found, notes = pieces(alone(bracket))
     assert len(found) == 3
     between = np.array([[0.02, 0.0, 0.01]])
-    assert not any(part.mesh().contains(between).any() for part in found)
-    assert sum(part.mesh().volume for part in found) == pytest.approx(bracket.volume, rel=0.3)
+    assert not any(part.make_mesh().contains(between).any() for part in found)
+    assert sum(part.make_mesh().volume for part in found) == pytest.approx(bracket.volume, rel=0.3)
     assert notes == ()
 
 
@@ -58,7 +58,7 @@ def test_flat_shapes_get_thick_and_are_named(tmp_path: Path) -> None:
     decoration = next(
         part for part in done.links["link_0"].collision if part.name == "decoration-6"
     )
-    assert decoration.mesh().volume > 0.0
+    assert decoration.make_mesh().volume > 0.0
     assert any("decoration-6" in note and "link_0" in note for note in done.notes)
 
 
@@ -66,13 +66,13 @@ def test_what_lies_inside_of_another_piece_goes() -> None:
     large, small = trimesh.creation.box((0.3, 0.3, 0.3)), trimesh.creation.box((0.1, 0.1, 0.1))
     beside = small.copy().apply_translation((0.15, 0.0, 0.0))
     found, _ = pieces(alone(small, large, beside))
-    assert sorted(round(part.mesh().volume, 6) for part in found) == [0.001, 0.027]
+    assert sorted(round(part.make_mesh().volume, 6) for part in found) == [0.001, 0.027]
 
 
 def test_boxes_stay_boxes_and_what_is_seen_collides_where_nothing_else_does() -> None:
     box = Part(name="", placement=HERE, kind="box", size=(0.1, 0.1, 0.1))
     found = decompose_links(
-        Description(Path("f"), {"a": Link("a", (box,))}, {}), {id(box): box.mesh()}
+        Description(Path("f"), {"a": Link("a", (box,))}, {}), {id(box): box.make_mesh()}
     )
     assert found.links["a"].collision == (box,)
     assert any("visual geometry is used" in note for note in found.notes)
@@ -100,5 +100,5 @@ def test_a_file_that_is_there_twice_is_cut_once_and_is_where_it_stands(tmp_path:
     for at, pieces in zip(places, found, strict=True):
         for part, piece in zip(pieces, cut, strict=True):
             assert np.allclose(
-                part.mesh().vertices, piece.copy().apply_transform(at.homogeneous).vertices
+                part.make_mesh().vertices, piece.copy().apply_transform(at.homogeneous).vertices
             )

@@ -119,10 +119,11 @@ def test_links_whose_names_look_alike_keep_their_own_meshes(
     }
     write_urdf(Description(tmp_path / "x", links, joints), tmp_path / "thing.urdf")
     shapes = {
-        kind: read_urdf(tmp_path / "thing.urdf").shapes(kind) for kind in ("collision", "visual")
+        kind: read_urdf(tmp_path / "thing.urdf").read_shapes(kind)
+        for kind in ("collision", "visual")
     }
     for kind, found in shapes.items():
-        volumes = {shape.link: shape.mesh().volume for shape in found}
+        volumes = {shape.link: shape.make_mesh().volume for shape in found}
         assert volumes == pytest.approx({small: 0.1**3, large: 0.2**3}), kind
         names = {shape.file.name for shape in found if shape.file is not None}
         assert len(names) == 2

@@ -23,7 +23,7 @@ from vkc_pin.world.models.robot_model import build_full_model
 
 def arms_of(file: UrdfFile) -> list[Arm]:
     return find_arms(
-        file, build_body_tree(file), {}, {shape.link for shape in file.shapes("collision")}
+        file, build_body_tree(file), {}, {shape.link for shape in file.read_shapes("collision")}
     )
 
 
@@ -62,7 +62,7 @@ def test_groups_of_an_srdf_name_arms(tmp_path: Path) -> None:
 
 def test_a_base_of_its_own_is_no_part_of_the_arm(tmp_path: Path) -> None:
     file = read_urdf(write_arms(tmp_path, own_base=True))
-    solid = {shape.link for shape in file.shapes("collision")}
+    solid = {shape.link for shape in file.read_shapes("collision")}
     assert find_own_base(build_body_tree(file), solid) == ("drive_x", "drive_y", "drive_yaw")
     assert arms_of(file)[0].joints[0] == "arm_1_joint"
     plain = read_urdf(write_arms(tmp_path))
@@ -70,7 +70,7 @@ def test_a_base_of_its_own_is_no_part_of_the_arm(tmp_path: Path) -> None:
 
 
 def robots(pattern: str) -> Path:
-    folder = resources.example_robot_data()
+    folder = resources.find_example_robot_data()
     assert folder is not None
     return next(iter(sorted((folder / "robots").glob(pattern))))
 

@@ -15,7 +15,7 @@ from vkc_pin.world.models.robot_model import build_full_model
 def found(path: Path) -> tuple[Arm, object]:
     file = read_urdf(path)
     arm = find_arms(
-        file, build_body_tree(file), {}, {shape.link for shape in file.shapes("collision")}
+        file, build_body_tree(file), {}, {shape.link for shape in file.read_shapes("collision")}
     )[0]
     return arm, analyze_hand(file, build_full_model(file), arm)
 

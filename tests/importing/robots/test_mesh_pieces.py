@@ -44,14 +44,14 @@ def test_pieces_stand_where_the_mesh_stood(file: Path, tmp_path: Path) -> None:
     folder = tmp_path / "own"
     root, pieces, notes = write_meshes(read_urdf(file), folder, most_pieces=4)
     (folder / "r.urdf").write_bytes(ElementTree.tostring(root))
-    shapes = read_urdf(folder / "r.urdf").shapes("collision")
+    shapes = read_urdf(folder / "r.urdf").read_shapes("collision")
     assert [shape.kind for shape in shapes] == ["box", "mesh", "mesh"]
     before = next(
         shape
-        for shape in read_urdf(file).shapes("collision")
+        for shape in read_urdf(file).read_shapes("collision")
         if shape.file and shape.file.name == "angle.stl"
-    ).mesh()
-    after = trimesh.util.concatenate([shape.mesh() for shape in shapes[1:]])
+    ).make_mesh()
+    after = trimesh.util.concatenate([shape.make_mesh() for shape in shapes[1:]])
     assert after.bounds == pytest.approx(before.bounds)
     assert after.volume == pytest.approx(before.volume, rel=1e-5)
     (piece,) = pieces
@@ -122,7 +122,7 @@ def test_links_whose_names_look_alike_keep_their_own_pieces(
     for name, size in (("s", 0.1), ("l", 0.2)):
         trimesh.creation.box((size,) * 3).export(tmp_path / f"{name}.stl")
     made = own(tmp_path, link(small, "s.stl", "s.stl"), link(large, "l.stl", "l.stl"))
-    volumes = {shape.link: shape.mesh().volume for shape in made.shapes("collision")}
+    volumes = {shape.link: shape.make_mesh().volume for shape in made.read_shapes("collision")}
     assert volumes == pytest.approx({small: 0.1**3, large: 0.2**3})
     assert {path.name for path in (tmp_path / "own" / "collision").iterdir()} == files
 
@@ -141,8 +141,8 @@ def test_meshes_of_one_name_in_several_folders_keep_their_shapes_and_colours(
         tmp_path,
         *(link(name, str(file.relative_to(tmp_path)), str(file)) for name, file in seen.items()),
     )
-    shapes = {shape.link: shape for shape in made.shapes("visual")}
-    assert {name: shape.mesh().volume for name, shape in shapes.items()} == pytest.approx(
+    shapes = {shape.link: shape for shape in made.read_shapes("visual")}
+    assert {name: shape.make_mesh().volume for name, shape in shapes.items()} == pytest.approx(
         {"a": 0.1**3, "b": 0.2**3, "c": 0.3**3}
     )
     for name, shape in shapes.items():
@@ -163,6 +163,8 @@ def test_names_of_meshes_become_portable(tmp_path: Path) -> None:
     meshes = {"a": "con.obj", "b": "a b.obj", "c": f"{'x' * 200}.obj"}
     made = own(tmp_path, *(link(name, file, file) for name, file in meshes.items()))
     files = {
-        shape.link: shape.file.name for shape in made.shapes("visual") if shape.file is not None
+        shape.link: shape.file.name
+        for shape in made.read_shapes("visual")
+        if shape.file is not None
     }
     assert files == {"a": "con_.obj", "b": "a_b.obj", "c": f"{'x' * 64}.obj"}

@@ -28,7 +28,7 @@ def test_what_a_urdf_does_not_have_is_left_out_and_what_is_missing_is_told(tmp_p
 
 
 def test_groups_and_states_come_from_the_srdf_beside(tmp_path: Path) -> None:
-    folder = resources.example_robot_data()
+    folder = resources.find_example_robot_data()
     assert folder is not None
     source = read(folder / "robots" / "panda_description" / "urdf" / "panda.urdf", tmp_path)
     assert source.groups["panda_arm" if "panda_arm" in source.groups else "arm"][:1]

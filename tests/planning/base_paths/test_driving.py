@@ -9,7 +9,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from vkc_pin.planning.base_paths.grid import HEADINGS, BaseGrid
-from vkc_pin.utils.optional_imports import compiled_module
+from vkc_pin.utils.optional_imports import import_compiled
 
 MODULE = "vkc_pin.planning.base_paths._driving"
 CELLS, LIMIT = 9, 2**60
@@ -37,7 +37,7 @@ class Graph:
         self.moves = GRID.moves.astype(np.int64)
 
     def paths(self) -> Any:
-        return compiled_module(MODULE).Paths(
+        return import_compiled(MODULE).Paths(
             self.flags.astype(np.uint8), self.moves, self.costs, self.begins, self.ends
         )
 

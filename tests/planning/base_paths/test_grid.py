@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import dijkstra
 from vkc_pin.errors import InputError
 from vkc_pin.planning.base_paths.base_clearance import Shape
 from vkc_pin.planning.base_paths.grid import HEADINGS, BaseGrid
-from vkc_pin.utils.optional_imports import compiled_module
+from vkc_pin.utils.optional_imports import import_compiled
 
 STANDING = [*furniture(), *clutter(2, 20)]
 
@@ -139,7 +139,7 @@ def test_distances_from_blocked_places() -> None:
 
 
 def test_moves_out_of_the_arena_are_rejected(grid: BaseGrid) -> None:
-    floor = compiled_module("vkc_pin.planning.base_paths._driving").Floor
+    floor = import_compiled("vkc_pin.planning.base_paths._driving").Floor
     for lengths in (np.zeros(HEADINGS), -grid.lengths, np.full(HEADINGS, np.nan)):
         with pytest.raises(ValueError, match="lead"):
             floor(grid.blocked.view(np.uint8), grid.moves, lengths)

@@ -27,7 +27,7 @@ from vkc_pin.options import Options
 from vkc_pin.planning.chain.collision_pairs import build_phase_geometries
 from vkc_pin.planning.chain.contacts import Contacts
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.utils.budget import Budget, SpentError
+from vkc_pin.utils.budget import Budget, BudgetExhaustedError
 from vkc_pin.world.models.shapes import get_link_name
 from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions
 from vkc_pin.world.scene.contact_rules import CONTACT_WINDOW
@@ -627,23 +627,23 @@ def test_every_evaluated_configuration_is_charged() -> None:
         lambda: problem.contacts.first_blocked(z, 1, reach=0.0, allowed=1.0),
     ):
         budget = Budget()
-        with budget.running():
+        with budget.activate():
             look()
-        assert budget.used == 7
+        assert budget.evaluations == 7
 
 
 def test_configurations_after_a_blocked_one_are_not_charged() -> None:
     problem = door_problem()
     z = np.tile(problem.start, (5, 1))
     z[2:, :2] = door_scene().objects["door"].placement.translation[:2]  # amid the door
-    with Budget().running() as budget:
+    with Budget().activate() as budget:
         assert problem.contacts.first_blocked(z, 1, reach=0.1, allowed=0.01) == 2
-    assert budget.used == 3
+    assert budget.evaluations == 3
 
 
 def test_pairing_stops_when_the_budget_is_exhausted() -> None:
     problem = door_problem()
-    with Budget(seconds=0.0).running(), pytest.raises(SpentError):
+    with Budget(seconds=0.0).activate(), pytest.raises(BudgetExhaustedError):
         build_phase_geometries(door_scene(), problem.chain, problem.task, SHORT)
 
 

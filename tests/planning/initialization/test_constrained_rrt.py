@@ -15,7 +15,7 @@ from vkc_pin.planning.initialization.constrained_rrt import find_constrained_pat
 from vkc_pin.planning.initialization.interpolation import Interpolator
 from vkc_pin.planning.initialization.keyframes import KeyframeSampler, compute_shortfall
 from vkc_pin.planning.initialization.rrt import MAX_EXTENSIONS, STEP
-from vkc_pin.utils.budget import Budget, SpentError
+from vkc_pin.utils.budget import Budget, BudgetExhaustedError
 from vkc_pin.world.scene.scene import Scene
 
 FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=24)
@@ -119,7 +119,7 @@ def test_equal_random_seeds_give_equal_paths() -> None:
 
 
 def test_a_budget_ends_the_search() -> None:
-    with Budget(effort=50).running(), pytest.raises(SpentError):
+    with Budget(effort=50).activate(), pytest.raises(BudgetExhaustedError):
         search(0)
 
 

@@ -18,8 +18,8 @@ import vkc_pin as vkc
 from vkc_pin.planning.initialization import rrt as trees
 from vkc_pin.planning.initialization.base_routes import BaseRoutes
 from vkc_pin.planning.initialization.rrt import connect, resample_path
-from vkc_pin.utils.budget import Budget, SpentError
-from vkc_pin.utils.optional_imports import compiled_module
+from vkc_pin.utils.budget import Budget, BudgetExhaustedError
+from vkc_pin.utils.optional_imports import import_compiled
 
 SIZE = 9  # x, y and yaw of the base, six joints of the arm
 METRE = np.array([2.0, 2.0, *np.ones(SIZE - 2)])  # how much each coordinate counts
@@ -474,16 +474,16 @@ def test_free_runs_alone_lead_through_the_gate(found: bool) -> None:
 
 def test_collision_checks_count_as_evaluations() -> None:
     problem, _, _ = gate()
-    with Budget().running() as budget:
+    with Budget().activate() as budget:
         through(0)
-        whole = budget.used
+        whole = budget.evaluations
         one = search()
         assert one._trees
-        before = budget.used
+        before = budget.evaluations
         assert one.is_free(np.array([problem.start, problem.start + 0.01 * np.eye(SIZE)[3]]))
-        assert budget.used == before + 1
+        assert budget.evaluations == before + 1
     assert whole > 500
-    with Budget(effort=whole // 2).running(), pytest.raises(SpentError):
+    with Budget(effort=whole // 2).activate(), pytest.raises(BudgetExhaustedError):
         through(0)
 
 
@@ -500,7 +500,7 @@ def test_compiled_trees_reject_invalid_arguments() -> None:
     ):
         with pytest.raises(ValueError, match=r"robot's coordinates|one configuration|two ends"):
             call()
-    trees_of = compiled_module("vkc_pin.planning.initialization._trees").Trees
+    trees_of = import_compiled("vkc_pin.planning.initialization._trees").Trees
     good = [
         one.weights,
         one.lower,

@@ -10,16 +10,16 @@ from pathlib import Path
 import pytest
 
 from vkc_pin.planning.kinematics import libraries
-from vkc_pin.planning.kinematics.libraries import BUILD, VARIABLE, Libraries
+from vkc_pin.planning.kinematics.libraries import BUILD, CACHE_VARIABLE, Libraries
 from vkc_pin.planning.kinematics.machine_code import compile_jobs
-from vkc_pin.utils.disk_cache import TEMPORARY
+from vkc_pin.utils.disk_cache import TEMPORARY_PREFIX
 
 LIBRARY = bytes(range(256)) * 40
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Libraries:
-    monkeypatch.setenv(VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     found = Libraries.open_default()
     assert found is not None
     return found
@@ -51,16 +51,16 @@ def test_default_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     for off in ("", "off", " OFF "):
-        monkeypatch.setenv(VARIABLE, off)
+        monkeypatch.setenv(CACHE_VARIABLE, off)
         assert here() is None
     assert not (tmp_path / "home").exists()
-    monkeypatch.setenv(VARIABLE, str(tmp_path / "deep" / "own"))
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "deep" / "own"))
     assert here() == tmp_path / "deep" / "own" / "vkc_pin"
     for made in (tmp_path / "deep" / "own", tmp_path / "deep" / "own" / "vkc_pin"):
         assert made.stat().st_mode & 0o777 == 0o700
-    monkeypatch.setenv(VARIABLE, "~/mine")
+    monkeypatch.setenv(CACHE_VARIABLE, "~/mine")
     assert here() == tmp_path / "home" / "mine" / "vkc_pin"
-    monkeypatch.delenv(VARIABLE)
+    monkeypatch.delenv(CACHE_VARIABLE)
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     assert here() == tmp_path / "home" / ".cache" / "vkc_pin"
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")
@@ -98,11 +98,11 @@ def test_paths_that_are_no_folder_are_not_used(
         tmp_path / "file" / "cache",
         Path("/proc/nowhere"),
     ):
-        monkeypatch.setenv(VARIABLE, str(place))
+        monkeypatch.setenv(CACHE_VARIABLE, str(place))
         assert Libraries.open_default() is None, place
     (tmp_path / "around").mkdir(mode=0o700)
     (tmp_path / "around" / "vkc_pin").symlink_to(folder.path)
-    monkeypatch.setenv(VARIABLE, str(tmp_path / "around"))
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "around"))
     assert Libraries.open_default() is None
 
 
@@ -200,7 +200,7 @@ def test_files_of_dead_processes_are_removed_after_a_day(folder: Libraries) -> N
     lock = folder.lock()
     assert lock is not None
     os.close(lock)
-    handle, _ = tempfile.mkstemp(dir=folder.path, prefix=TEMPORARY)
+    handle, _ = tempfile.mkstemp(dir=folder.path, prefix=TEMPORARY_PREFIX)
     os.close(handle)
     for name in (f"{B}.job", f"{B}.failed"):
         (folder.path / name).write_bytes(b"")

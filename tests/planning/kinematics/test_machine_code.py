@@ -20,7 +20,7 @@ import vkc_pin as vkc
 from vkc_pin.options import Options
 from vkc_pin.planning.kinematics import batch, machine_code
 from vkc_pin.planning.kinematics.batch import BatchFunction
-from vkc_pin.planning.kinematics.libraries import VARIABLE, Libraries
+from vkc_pin.planning.kinematics.libraries import CACHE_VARIABLE, Libraries
 from vkc_pin.planning.kinematics.machine_code import MachineCode, compile_jobs, wait
 from vkc_pin.planning.nlp.transcription import Transcription, transcribe
 from vkc_pin.planning.nlp.waypoint import WaypointFunctions
@@ -34,7 +34,7 @@ QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes"}
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Libraries:
-    monkeypatch.setenv(VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     monkeypatch.delenv("CC", raising=False)
     found = Libraries.open_default()
     assert found is not None
@@ -358,7 +358,7 @@ def planned(planner: vkc.Planner | None = None) -> list[bytes]:
 @pytest.fixture(scope="module")
 def expected() -> list[bytes]:
     """Return the motion that is found without libraries."""
-    assert os.environ[VARIABLE] == "off"
+    assert os.environ[CACHE_VARIABLE] == "off"
     return planned()
 
 
@@ -404,9 +404,9 @@ def test_planning_works_without_a_compiler(
     elif trouble == "open to others":
         folder.path.chmod(0o777)
     elif trouble == "no folder":
-        monkeypatch.setenv(VARIABLE, "/proc/nowhere")
+        monkeypatch.setenv(CACHE_VARIABLE, "/proc/nowhere")
     elif trouble == "off":
-        monkeypatch.setenv(VARIABLE, "off")
+        monkeypatch.setenv(CACHE_VARIABLE, "off")
     planner = vkc.Planner()
     assert planned(planner) == expected
     assert wait() == (trouble not in ("open to others", "no folder", "off"))

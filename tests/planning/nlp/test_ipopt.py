@@ -32,11 +32,11 @@ def test_ipopt_stops(budget: dict[str, Any], iterations: int | None) -> None:
         "print_time": False,
     }
     solver = ca.nlpsol("rosenbrock", "ipopt", program, options)
-    with Budget(**budget).running() as running:
+    with Budget(**budget).activate() as running:
         result = solver(x0=[-1.2, 1.0], lbg=-10.0, ubg=10.0, p=0.0)
     stats = solver.stats()
     assert stats["success"] is (iterations is None)
-    assert running.used == 10 * (stats["iter_count"] + 1)
+    assert running.evaluations == 10 * (stats["iter_count"] + 1)
     if iterations is None:
         np.testing.assert_allclose(np.ravel(result["x"]), 1.0, atol=1e-6)
     else:

@@ -609,7 +609,7 @@ def moved_door(scene: Scene) -> Scene:
 def test_one_program_serves_all_problems_of_a_structure() -> None:
     steps, scene = [Actuate("door", {"hinge": 1.2})], door_scene()
     first = program_of(scene, steps, options=OPTIONS)
-    spent = CACHE.building
+    spent = CACHE.build_time
     fewer = dataclasses.replace(scene, obstacles=(), obstacle_labels=())
     others = [
         program_of(scene.with_start(base=[-1.0, 0.2, 0.5]), steps, options=OPTIONS),
@@ -622,7 +622,7 @@ def test_one_program_serves_all_problems_of_a_structure() -> None:
     ]
     for other in others:
         assert other.transcription is first.transcription
-    assert CACHE.building == spent
+    assert CACHE.build_time == spent
     again = [
         program_of(scene, [Reach(pin.SE3.Random())], options=OPTIONS).transcription
         for _ in range(2)
@@ -691,8 +691,8 @@ def test_solvers_are_cached() -> None:
     structure, cache = problem("reach").transcription.structure, Cache()
     t = transcribe(structure, cache)
     assert transcribe(structure, cache) is t
-    first, spent = t.solver(rates=False, options=QUIET), cache.building
+    first, spent = t.solver(rates=False, options=QUIET), cache.build_time
     assert t.solver(rates=False, options=dict(reversed(QUIET.items()))) is first
-    assert cache.building == spent
+    assert cache.build_time == spent
     assert t.solver(rates=False, options={**QUIET, "ipopt.tol": 1e-3}) is not first
-    assert cache.building > spent
+    assert cache.build_time > spent

@@ -181,7 +181,7 @@ def test_one_plane_and_no_pose(chain: VirtualKinematicChain) -> None:
 
 
 def test_functions_of_one_kind_are_built_once(chain: VirtualKinematicChain) -> None:
-    model, poses, cache = door_scene().robot.model, some_poses(chain)[1:2], Cache(entries=4)
+    model, poses, cache = door_scene().robot.model, some_poses(chain)[1:2], Cache(max_entries=4)
     first = get_waypoint_functions(model, 1, poses, cache)
     later = (dataclasses.replace(poses[0], waypoints=(4, 5)),)
     assert get_waypoint_functions(model.copy(), 1, later, cache) is first, (

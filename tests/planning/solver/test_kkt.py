@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.planning.solver.subproblem import make_linear_solver_options
-from vkc_pin.utils.optional_imports import compiled_module
+from vkc_pin.utils.optional_imports import import_compiled
 
-KKT = compiled_module("vkc_pin.planning.solver._kkt")
+KKT = import_compiled("vkc_pin.planning.solver._kkt")
 OWN = make_linear_solver_options()
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
 

@@ -500,7 +500,7 @@ def test_feasible_motion_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_no_time() -> None:
     problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
-    with Budget(seconds=0.0).running():
+    with Budget(seconds=0.0).activate():
         solution = solve(problem, seed)
     assert (solution.status, solution.converged, solution.rounds) == ("time limit", False, 0)
     np.testing.assert_array_equal(solution.z, problem.clip(seed))
@@ -508,7 +508,7 @@ def test_no_time() -> None:
 
 def test_time_limit_returns_the_best_iterate() -> None:
     problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
-    with Budget(seconds=1e-3).running():
+    with Budget(seconds=1e-3).activate():
         solution = solve(problem, seed)
     assert solution.status == "time limit"
     assert solution.rounds <= 1
@@ -518,15 +518,15 @@ def test_time_limit_returns_the_best_iterate() -> None:
 def test_evaluation_limit_is_deterministic() -> None:
     """The best iterate is returned; a sufficient budget changes nothing."""
     problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
-    with Budget().running() as budget:
+    with Budget().activate() as budget:
         whole = solve(problem, seed)
-    with Budget(effort=budget.used).running():
+    with Budget(effort=budget.evaluations).activate():
         same = solve(problem, seed)
     np.testing.assert_array_equal(same.z, whole.z)
     assert same.converged
     cut = []
     for _ in range(2):
-        with Budget(effort=budget.used // 2).running():
+        with Budget(effort=budget.evaluations // 2).activate():
             cut.append(solve(problem, seed))
     assert cut[0].status == "effort spent"
     assert 0 < cut[0].rounds < whole.rounds
@@ -537,7 +537,7 @@ def test_evaluation_limit_is_deterministic() -> None:
 def test_guesses_outside_the_bounds_are_clipped() -> None:
     problem = round_a_pillar()
     wild = straight(problem, 3.2) + 20.0
-    with Budget(seconds=0.0).running():
+    with Budget(seconds=0.0).activate():
         solution = solve(problem, wild)
     assert np.all((solution.z >= problem.lower) & (solution.z <= problem.upper))
 

@@ -20,7 +20,7 @@ from vkc_pin.planning.solver.segment_planes import SegmentContacts
 from vkc_pin.planning.solver.solution import Solution
 from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
 from vkc_pin.planning.solver.tunnelling import Crossing
-from vkc_pin.utils.budget import SpentError
+from vkc_pin.utils.budget import BudgetExhaustedError
 
 N = 8
 
@@ -348,7 +348,7 @@ def test_exhausted_budget_is_the_status_unless_feasible(
     def ended(loop: _Loop, *_: Any) -> None:
         if good:
             loop.solution.converged, loop.feasible = True, kept
-        raise SpentError("time limit")
+        raise BudgetExhaustedError("time limit")
 
     monkeypatch.setattr(module, "_iterate", ended)
     monkeypatch.setattr(_Loop, "find_contacts", lambda loop, z: (make_empty_contacts(), True, []))

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.parallel.journal import Journal, Kept
+from vkc_pin.utils.parallel.journal import Journal, JournalContents
 
 HEADER = {"settings": {"recipe": "abc"}, "versions": {"pin": "4"}}
 
@@ -44,7 +44,7 @@ def test_it_is_read_while_it_is_written(tmp_path: Path) -> None:
             journal.append(line(key))
     journal._stream.write(b'{"key": "5", "rec')
     journal._stream.flush()
-    kept = Kept.read(tmp_path / "j")
+    kept = JournalContents.read(tmp_path / "j")
     assert (kept.lines, kept.sessions, kept.memory) == (
         journal.lines,
         journal.sessions,
@@ -53,10 +53,10 @@ def test_it_is_read_while_it_is_written(tmp_path: Path) -> None:
     assert kept.seconds == 2.0 + 1.5  # of each session, the time until its last task
     assert (tmp_path / "j").read_bytes().endswith(b'"rec')
     with pytest.raises(InputError, match="cannot read this"):
-        Kept.read(tmp_path / "nothing")
+        JournalContents.read(tmp_path / "nothing")
     (tmp_path / "bad").write_bytes(b'{}\n{"key": "1"}\n')
     with pytest.raises(InputError, match="this line is damaged") as caught:
-        Kept.read(tmp_path / "bad")
+        JournalContents.read(tmp_path / "bad")
     assert caught.value.line == 2
 
 
@@ -96,7 +96,7 @@ def test_records_stay_in_the_file(tmp_path: Path) -> None:
     tracemalloc.start()
     for key in range(300):
         journal.append({**line(key), "records": [{"number": key, "way": way}]})
-    kept = Kept.read(tmp_path / "j")
+    kept = JournalContents.read(tmp_path / "j")
     size, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert size < (tmp_path / "j").stat().st_size / 5
@@ -117,7 +117,7 @@ def test_records_stay_in_the_file(tmp_path: Path) -> None:
     )  # what is run again counts
     assert (
         journal.lines["7"]
-        == Kept.read(tmp_path / "j").lines["7"]
+        == JournalContents.read(tmp_path / "j").lines["7"]
         == [{"number": 7}, {"number": 7, "again": True}]
     )
 
@@ -135,7 +135,7 @@ def test_memories_and_the_time_of_the_writer(tmp_path: Path) -> None:
                 "client_seconds": 0.01 * key,
             }
         )
-    kept = Kept.read(tmp_path / "j")
+    kept = JournalContents.read(tmp_path / "j")
     assert kept.memories == {"a": [10.0, 30.0], "b": [20.0]}
     assert kept.sessions == [{"jobs": 2, "trials": 4, "seconds": 1.5, "client_seconds": 0.03}]
 

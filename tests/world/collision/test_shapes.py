@@ -16,7 +16,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.world.collision import shapes as shapes_module
 from vkc_pin.world.collision.placements import flatten_placements
 from vkc_pin.world.collision.shapes import Shapes, Witnesses, count_distance_queries
-from vkc_pin.world.files.meshes import convex_hull
+from vkc_pin.world.files.meshes import make_convex_hull
 
 MOVING = 4
 SEEDS = st.integers(0, 2**32 - 1)
@@ -50,8 +50,8 @@ def solid(kind: str, rng: np.random.Generator) -> coal.CollisionGeometry:
         "Cylinder": lambda: coal.Cylinder(a, b),
         "Cone": lambda: coal.Cone(a, b),
         "Ellipsoid": lambda: coal.Ellipsoid(a, b, c),
-        "Convex": lambda: convex_hull(rng.normal(scale=0.2, size=(12, 3))),
-        "large Convex": lambda: convex_hull(
+        "Convex": lambda: make_convex_hull(rng.normal(scale=0.2, size=(12, 3))),
+        "large Convex": lambda: make_convex_hull(
             rng.normal(scale=0.2, size=(400, 3))
         ),  # coal uses hill climbing for hulls of this size
         "TriangleP": lambda: coal.TriangleP(*corners),

@@ -13,17 +13,17 @@ import pinocchio as pin
 import pytest
 
 from vkc_pin.errors import BuildError, InputError
-from vkc_pin.utils import optional_imports as needed
+from vkc_pin.utils import optional_imports
 from vkc_pin.world.collision import solids
 from vkc_pin.world.collision.shapes import Shapes
 from vkc_pin.world.collision.solids import convert_solid
-from vkc_pin.world.files.meshes import convex_hull, indices
+from vkc_pin.world.files.meshes import get_triangles, make_convex_hull
 
 NOWHERE = np.array([[[1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0]] * 2])
 
 
 def hull(seed: int) -> coal.Convex:
-    return convex_hull(np.random.default_rng(seed).normal(size=(30, 3)))
+    return make_convex_hull(np.random.default_rng(seed).normal(size=(30, 3)))
 
 
 def distance(first: coal.CollisionGeometry, second: coal.CollisionGeometry) -> float:
@@ -74,9 +74,9 @@ def test_triangles_keep_their_corners() -> None:
     mesh.addVertices(points)
     mesh.addTriangles(np.array(faces))
     mesh.endModel()
-    np.testing.assert_array_equal(indices(mesh), faces)
+    np.testing.assert_array_equal(get_triangles(mesh), faces)
     shape = hull(2)
-    corners = indices(shape)
+    corners = get_triangles(shape)
     assert corners.shape == (shape.num_polygons, 3)
     assert set(corners.ravel().tolist()) == set(range(shape.num_points))
 
@@ -96,7 +96,7 @@ def test_incompatible_modules_raise(monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         with monkeypatch.context() as patch:
             built = types.SimpleNamespace(COAL_VERSION=theirs, PINOCCHIO_VERSION=mine)
-            patch.setattr(solids, "compiled_module", lambda _, built=built: built)
+            patch.setattr(solids, "import_compiled", lambda _, built=built: built)
             with pytest.raises(BuildError, match=message):
                 solids.load_compiled()
 
@@ -104,7 +104,7 @@ def test_incompatible_modules_raise(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ImportError(f"no {name}")
 
     with monkeypatch.context() as patch:
-        patch.setattr(needed, "import_module", missing)
+        patch.setattr(optional_imports, "import_module", missing)
         with pytest.raises(BuildError, match="compiler"):
             solids.load_compiled()
     solids.load_compiled.cache_clear()

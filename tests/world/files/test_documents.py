@@ -18,8 +18,8 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.files import documents
 from vkc_pin.world.files.documents import (
     Document,
-    check,
-    field_name,
+    format_field,
+    parse_document,
     parse_json,
     read_bytes,
     read_text,
@@ -81,17 +81,17 @@ def test_what_is_written_is_read_with_the_line_of_every_field(data: dict[str, An
     lines = text.splitlines()
     for path, value in paths(data).items():
         assert functools.reduce(lambda inner, key: inner[key], path, document.data) == value
-        assert document.line((*path, "nothing", 3)) == document.line(path)
+        assert document.find_line((*path, "nothing", 3)) == document.find_line(path)
         if path and isinstance(path[-1], str):
-            where = document.line(path)
+            where = document.find_line(path)
             assert where is not None
             assert f"{path[-1]}:" in lines[where - 1].replace("'", "")
 
 
 def test_fields_are_called_as_users_write_them() -> None:
-    assert field_name(("obstacles", 3, "size")) == "obstacles[3].size"
-    assert field_name((0, "a")) == "[0].a"
-    assert field_name(()) == ""
+    assert format_field(("obstacles", 3, "size")) == "obstacles[3].size"
+    assert format_field((0, "a")) == "[0].a"
+    assert format_field(()) == ""
 
 
 @pytest.mark.parametrize(
@@ -141,30 +141,30 @@ def test_the_first_wrong_field_is_told(
     tmp_path: Path, text: str, line: int | None, field: str, told: str
 ) -> None:
     with pytest.raises(InputError, match=told) as caught:
-        check(read_yaml(written(tmp_path, text)), Thing)
+        parse_document(read_yaml(written(tmp_path, text)), Thing)
     assert (caught.value.field, caught.value.file) == (field, tmp_path / "thing.yaml")
     assert line is None or caught.value.line == line
 
 
 def test_what_fits_becomes_the_schema() -> None:
-    thing = check(Document({"name": "a", "parts": [{"size": 2, "at": [1, 2, 3]}]}), Thing)
+    thing = parse_document(Document({"name": "a", "parts": [{"size": 2, "at": [1, 2, 3]}]}), Thing)
     assert thing == Thing(name="a", parts=(Part(size=2.0, at=(1.0, 2.0, 3.0)),))
 
 
 def test_errors_inside_get_the_place_unless_they_have_one(tmp_path: Path) -> None:
     document = read_yaml(written(tmp_path, "a: 1\nb:\n  c: 2\n"))
-    with pytest.raises(InputError) as plain, document.at(("b", "c")):
+    with pytest.raises(InputError) as plain, document.annotate_errors(("b", "c")):
         raise InputError("too large", field="mass", expected=1, got=2)
     assert (plain.value.line, plain.value.field, plain.value.problem) == (
         3,
         "b.c",
         "mass: too large",
     )
-    with pytest.raises(UnknownNameError) as unknown, document.at(("b",)):
+    with pytest.raises(UnknownNameError) as unknown, document.annotate_errors(("b",)):
         raise UnknownNameError("link", "armm", ["arm", "leg"])
     assert (unknown.value.line, unknown.value.nearest) == (2, "arm")
     elsewhere = InputError("too large", file="other.yaml", line=7)
-    with pytest.raises(InputError) as same, document.at(("b",)):
+    with pytest.raises(InputError) as same, document.annotate_errors(("b",)):
         raise elsewhere
     assert same.value is elsewhere
 
@@ -192,7 +192,7 @@ def test_pipes_and_large_files_are_refused(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(InputError, match=r"cannot read the YAML .*got a pipe or a device"):
         read_yaml(tmp_path / "pipe.yaml")  # nobody ever writes into it
     file = written(tmp_path, "a: 1")
-    monkeypatch.setattr(documents, "LARGEST_FILE", 3)
+    monkeypatch.setattr(documents, "MAX_FILE_SIZE", 3)
     with pytest.raises(InputError, match=r"the YAML is too large .*at most 3 bytes, got 4"):
         read_yaml(file)
 
@@ -212,29 +212,31 @@ def test_aliases_of_aliases(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("open_", "close"), [("[", "]"), ("{a: ", "}")])
 def test_lists_inside_each_other(tmp_path: Path, open_: str, close: str) -> None:
-    fine = read_yaml(written(tmp_path, open_ * documents.DEEPEST + "1" + close * documents.DEEPEST))
-    assert len(max(fine.lines, key=len)) == documents.DEEPEST
-    for count in (documents.DEEPEST + 1, 1_000_000):
+    fine = read_yaml(
+        written(tmp_path, open_ * documents.MAX_DEPTH + "1" + close * documents.MAX_DEPTH)
+    )
+    assert len(max(fine.lines, key=len)) == documents.MAX_DEPTH
+    for count in (documents.MAX_DEPTH + 1, 1_000_000):
         with pytest.raises(InputError, match=r"too many lists|not valid YAML"):
             read_yaml(written(tmp_path, open_ * count + "1" + close * count))
 
 
 def test_many_lists_after_each_other_are_not_deep(tmp_path: Path) -> None:
     assert (
-        len(read_yaml(written(tmp_path, "[" + "[1], " * (10 * documents.DEEPEST) + "]")).data)
-        == 10 * documents.DEEPEST
+        len(read_yaml(written(tmp_path, "[" + "[1], " * (10 * documents.MAX_DEPTH) + "]")).data)
+        == 10 * documents.MAX_DEPTH
     )
 
 
 def test_json_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
     assert parse_json('{"a": [1, {"b": "[["}]}', "file") == {"a": [1, {"b": "[["}]}
-    deepest = "[" * documents.DEEPEST + "]" * documents.DEEPEST
+    deepest = "[" * documents.MAX_DEPTH + "]" * documents.MAX_DEPTH
     assert str(parse_json(deepest, "file")) == deepest
     for text, said in (
         (f"[{deepest}]", "too many lists and objects inside each other"),
         ("[" * 100_000, "not JSON"),
         ('{"a": ' * 100_000 + "1" + "}" * 100_000, "not JSON"),
-        ("[" + "[]," * documents.MOST_FIELDS + "[]]", "too many lists and objects .expected"),
+        ("[" + "[]," * documents.MAX_FIELDS + "[]]", "too many lists and objects .expected"),
         ("1" * 5000, "not JSON"),
         ("[1,\n2,,]", "file:2: not JSON"),
     ):
@@ -260,13 +262,13 @@ def test_what_has_no_end_is_refused() -> None:
         (0.0 for _ in itertools.count()),
         map(abs, itertools.count()),
     ):
-        with pytest.raises(InputError, match=r"parts\[0\].at: wrong kind of value") as raised:
-            check(Document({"name": "a", "parts": [{"size": 1.0, "at": endless}]}), Thing)
+        with pytest.raises(InputError, match=r"parts\[0\].at: wrong type of value") as raised:
+            parse_document(Document({"name": "a", "parts": [{"size": 1.0, "at": endless}]}), Thing)
         assert raised.value.expected == "a list, fields, text or a number"
     for at in ((1.0, 2.0, 3.0), [1, 2, 3]):
-        assert check(Document({"name": "a", "parts": [{"size": 1.0, "at": at}]}), Thing).parts[
-            0
-        ].at == (1.0, 2.0, 3.0)
+        assert parse_document(
+            Document({"name": "a", "parts": [{"size": 1.0, "at": at}]}), Thing
+        ).parts[0].at == (1.0, 2.0, 3.0)
 
 
 def test_text_can_be_written() -> None:
@@ -276,8 +278,8 @@ def test_text_can_be_written() -> None:
         Document(["\ud800"]),
     ):
         with pytest.raises(InputError, match="not text"):
-            check(document, Thing)
+            parse_document(document, Thing)
     around: dict[str, object] = {}
     around["inside"] = around
     with pytest.raises(InputError, match="inside: too many lists inside each other"):
-        check(Document(around), Thing)
+        parse_document(Document(around), Thing)

@@ -14,7 +14,7 @@ from helpers.poles import POLE
 from scipy.spatial import ConvexHull
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.hulls import compute_hull, outer_hull
+from vkc_pin.world.files.hulls import compute_hull, compute_outer_hull
 
 ROOT = Path(__file__).resolve().parents[3]
 ROBOT = ROOT / "robots" / "husky_ur5e"
@@ -74,7 +74,7 @@ def test_outer_hull_contains_its_points_with_few_corners(vertices: int) -> None:
     points = np.asarray(
         tube.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])).vertices
     )
-    hull = outer_hull(points, vertices=vertices)
+    hull = compute_outer_hull(points, vertices=vertices)
     assert len(hull.vertices) <= vertices
     assert outside(points, hull) < 1e-9
     assert 1.0 < hull.volume / tube.volume < (1.2 if vertices == 40 else 1.35)

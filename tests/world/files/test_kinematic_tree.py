@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.utils.arrays import LARGEST
+from vkc_pin.utils.arrays import MAX_COORDINATE
 from vkc_pin.world.files.urdf import load_urdf, read_urdf
 
 SHAPE = "<collision><geometry><sphere radius='0.1'/></geometry></collision>"
@@ -95,7 +95,10 @@ def links(*names: str) -> list[str]:
             "j: origin rpy: wrong numbers",
         ),
         (
-            [*links("a", "b"), joint("j", "a", "b", inside=f'<origin xyz="{2 * LARGEST} 0 0"/>')],
+            [
+                *links("a", "b"),
+                joint("j", "a", "b", inside=f'<origin xyz="{2 * MAX_COORDINATE} 0 0"/>'),
+            ],
             4,
             "expected at most 10000",
         ),

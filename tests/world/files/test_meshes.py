@@ -10,7 +10,13 @@ import pytest
 import trimesh
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.meshes import convex_hull, load_convex, load_mesh, load_parts, to_bvh
+from vkc_pin.world.files.meshes import (
+    load_convex,
+    load_mesh,
+    load_parts,
+    make_bvh,
+    make_convex_hull,
+)
 
 # Two cubes of edge 1, one metre apart; in an OBJ file the indices go on counting through all
 # objects.
@@ -55,7 +61,7 @@ def test_convex_hull_is_what_coal_holds(tmp_path: Path) -> None:
 
 def test_hull_of_many_points() -> None:
     points = np.random.default_rng(0).standard_normal((500, 3))
-    assert convex_hull(points).computeVolume() == pytest.approx(
+    assert make_convex_hull(points).computeVolume() == pytest.approx(
         trimesh.convex.convex_hull(points).volume
     )
 
@@ -63,7 +69,7 @@ def test_hull_of_many_points() -> None:
 def test_finely_meshed_cone_has_more_neighbours_than_coal_takes() -> None:
     angles = np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False)
     rim = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(400)])
-    shape = convex_hull(np.vstack([rim, [0.0, 0.0, 2.0]]))
+    shape = make_convex_hull(np.vstack([rim, [0.0, 0.0, 2.0]]))
     assert np.pi * 2.0 / 3.0 - 1e-3 < shape.computeVolume() < 1.1 * np.pi * 2.0 / 3.0
     hull = trimesh.convex.convex_hull(np.asarray(shape.points()))
     assert (
@@ -79,7 +85,7 @@ def test_colours_are_parts(tmp_path: Path) -> None:
     ]
     assert sum(len(part.faces) for part in parts) == 24
     assert max(part.vertices.max() for part in parts) == pytest.approx(6.0)
-    shape = to_bvh(parts[0])
+    shape = make_bvh(parts[0])
     assert shape.num_tris == len(parts[0].faces)
 
 

@@ -8,23 +8,28 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vkc_pin.errors import UnknownNameError
-from vkc_pin.world.files.resources import available, choose_file_names, find, folder
+from vkc_pin.world.files.resources import (
+    choose_file_names,
+    find_resource,
+    find_resource_folder,
+    list_resources,
+)
 
 
 def test_what_travels_with_the_package() -> None:
-    assert {"door", "drawer"} <= set(available("scenes", "*.yaml"))
-    assert "husky_ur5e" in available("robots", "*")
+    assert {"door", "drawer"} <= set(list_resources("scenes", "*.yaml"))
+    assert "husky_ur5e" in list_resources("robots", "*")
     for kind, pattern in (("scenes", "*.yaml"), ("robots", "*")):
-        for name, path in available(kind, pattern).items():
+        for name, path in list_resources(kind, pattern).items():
             assert path.exists()
             assert path.stem == name
-            assert path.parent == folder(kind)
+            assert path.parent == find_resource_folder(kind)
 
 
 def test_names_work_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = find("scenes", "*.yaml", "door", what="scene")
+    before = find_resource("scenes", "*.yaml", "door", noun="scene")
     monkeypatch.chdir(tmp_path)
-    assert find("scenes", "*.yaml", "door", what="scene") == before
+    assert find_resource("scenes", "*.yaml", "door", noun="scene") == before
     assert before.is_absolute()
 
 
@@ -32,8 +37,8 @@ def test_a_name_that_does_not_exist() -> None:
     with pytest.raises(
         UnknownNameError, match=r"there is no scene 'draw'; did you mean 'drawer'\?"
     ) as caught:
-        find("scenes", "*.yaml", "draw", what="scene")
-    assert set(caught.value.choices) == set(available("scenes", "*.yaml"))
+        find_resource("scenes", "*.yaml", "draw", noun="scene")
+    assert set(caught.value.choices) == set(list_resources("scenes", "*.yaml"))
 
 
 def test_an_installed_package_has_them_inside(
@@ -45,9 +50,11 @@ def test_an_installed_package_has_them_inside(
     monkeypatch.setattr(
         "vkc_pin.world.files.resources.__file__", str(inside / "world" / "files" / "resources.py")
     )
-    assert folder("scenes") == inside / "scenes"
-    assert list(available("scenes", "*.yaml")) == ["own"]
-    assert folder("robots") == inside.parent / "robots"  # a source tree has them beside the package
+    assert find_resource_folder("scenes") == inside / "scenes"
+    assert list(list_resources("scenes", "*.yaml")) == ["own"]
+    assert (
+        find_resource_folder("robots") == inside.parent / "robots"
+    )  # a source tree has them beside the package
 
 
 # Names of new files

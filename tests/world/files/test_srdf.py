@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.files.srdf import Srdf, group_tip, read_groups, read_srdf
+from vkc_pin.world.files.srdf import Srdf, find_group_tip, read_groups, read_srdf
 
 LINKS = ("base", "arm", "hand")
 
@@ -94,13 +94,13 @@ def test_groups_are_joints_or_chains(tmp_path: Path) -> None:
         "arm": (("c", "b"), "three"),
         "shoulder": (("a", "b"), "two"),
     }
-    assert group_tip(file, urdf, "arm") == "three"
+    assert find_group_tip(file, urdf, "arm") == "three"
     with pytest.raises(UnknownNameError, match="There are: arm, shoulder") as caught:
-        group_tip(file, urdf, "shouldr")
+        find_group_tip(file, urdf, "shouldr")
     assert (caught.value.nearest, caught.value.file, caught.value.field) == (
         "shoulder",
         file,
         "arm",
     )
     with pytest.raises(UnknownNameError, match="there are: none"):
-        group_tip(None, urdf, "arm")
+        find_group_tip(None, urdf, "arm")

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.urdf import _rotation, load_urdf, read_urdf
+from vkc_pin.world.files.urdf import _compute_rotation, load_urdf, read_urdf
 
 WEDGE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
 ANGLES = st.floats(-7.0, 7.0)
@@ -59,8 +59,8 @@ def test_triangles_enclose_the_solid(tmp_path: Path, shape: str, volume: float) 
     (tmp_path / "wedge.obj").write_text(WEDGE)
     (found,) = read_urdf(
         urdf(tmp_path, collision(shape, '<origin xyz="1 2 3" rpy="0.1 0.2 0.3"/>'))
-    ).shapes("collision")
-    mesh, solid = found.mesh(), found.solid()
+    ).read_shapes("collision")
+    mesh, solid = found.make_mesh(), found.make_solid()
     assert volume * (1 - 1e-3) <= mesh.volume <= 1.02 * volume
     solid.computeLocalAABB()
     box = solid.aabb_local
@@ -77,7 +77,7 @@ def test_a_flat_mesh_is_named_by_link_and_file(tmp_path: Path) -> None:
         "collision"
     )
     with pytest.warns(UserWarning, match=rf"{found.link} of .*sheet\.obj is flat"):
-        assert found.solid().computeVolume() == pytest.approx(2e-3)
+        assert found.make_solid().computeVolume() == pytest.approx(2e-3)
 
 
 def test_the_hull_of_a_mesh_is_its_solid(tmp_path: Path) -> None:
@@ -86,8 +86,8 @@ def test_the_hull_of_a_mesh_is_its_solid(tmp_path: Path) -> None:
     (found,) = read_urdf(urdf(tmp_path, collision('<mesh filename="ring.stl"/>'))).shapes(
         "collision"
     )
-    assert found.solid().computeVolume() == pytest.approx(ring.convex_hull.volume, rel=1e-3)
-    assert found.mesh().volume == pytest.approx(ring.volume, rel=1e-3)
+    assert found.make_solid().computeVolume() == pytest.approx(ring.convex_hull.volume, rel=1e-3)
+    assert found.make_mesh().volume == pytest.approx(ring.volume, rel=1e-3)
     assert ring.volume < 0.9 * ring.convex_hull.volume
 
 
@@ -95,13 +95,13 @@ def test_the_hull_of_a_mesh_is_its_solid(tmp_path: Path) -> None:
 @given(ANGLES, ANGLES, ANGLES)
 def test_angles_are_those_of_pinocchio(roll: float, pitch: float, yaw: float) -> None:
     np.testing.assert_allclose(
-        _rotation(roll, pitch, yaw), pin.rpy.rpyToMatrix(roll, pitch, yaw), atol=1e-14
+        _compute_rotation(roll, pitch, yaw), pin.rpy.rpyToMatrix(roll, pitch, yaw), atol=1e-14
     )
     origin = f'<origin rpy="{roll} {pitch} {yaw}"/>'
     element = f'<link name="b"/><joint name="j" type="fixed"><parent link="a"/><child link="b"/>{origin}</joint>'
     model = pin.buildModelFromXML(f'<robot name="r"><link name="a"/>{element}</robot>')
     np.testing.assert_array_equal(
-        _rotation(roll, pitch, yaw), model.frames[model.getFrameId("b")].placement.rotation
+        _compute_rotation(roll, pitch, yaw), model.frames[model.getFrameId("b")].placement.rotation
     )
 
 
@@ -111,7 +111,7 @@ def test_colours_by_name_and_in_place(tmp_path: Path) -> None:
     named, plain = f'<visual>{ball}<material name="red"/></visual>', f"<visual>{ball}</visual>"
     shapes = read_urdf(
         urdf(tmp_path, named + own + plain + collision('<sphere radius="1"/>'))
-    ).shapes("visual")
+    ).read_shapes("visual")
     assert [shape.colour for shape in shapes] == [(1.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 1.0), None]
     assert [shape.name for shape in shapes] == ["a_0", "a_1", "a_2"]
 

@@ -19,8 +19,8 @@ from vkc_pin.world.files.writing import (
     check_outputs,
     check_replaceable,
     check_writable,
-    folder_at_once,
     write_atomically,
+    write_folder_atomically,
 )
 
 
@@ -186,7 +186,7 @@ def test_outputs_that_get_in_each_others_way(tmp_path: Path) -> None:
     one, other = tmp_path / "one", tmp_path / "other"
     check_outputs(
         {"--a": one, "--b": other, "--c": tmp_path / "new" / "file"},
-        kept={"PLAN": tmp_path / "plan"},
+        inputs={"PLAN": tmp_path / "plan"},
     )
     with pytest.raises(InputError, match=r"--b: cannot write this .*got a folder"):
         check_outputs({"--a": one, "--b": tmp_path})
@@ -194,9 +194,9 @@ def test_outputs_that_get_in_each_others_way(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"--b: this file is named twice .*than --a"):
             check_outputs({"--a": one, "--b": again})
     with pytest.raises(InputError, match=r"--a: this file is named twice .*than PLAN"):
-        check_outputs({"--a": one}, kept={"PLAN": one})
+        check_outputs({"--a": one}, inputs={"PLAN": one})
     with pytest.raises(InputError, match="PLAN: no file can be called that"):
-        check_outputs({"--a": one}, kept={"PLAN": "a\ud800"})
+        check_outputs({"--a": one}, inputs={"PLAN": "a\ud800"})
     with pytest.raises(InputError, match=r"--b: a file cannot be a folder .*file of --a"):
         check_outputs({"--a": one, "--b": one / "two" / "three"})
     assert everything(tmp_path) == {"link"}
@@ -239,29 +239,29 @@ def test_ctrl_c_waits_until_it_is_whole(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_a_folder_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     target = tmp_path / "new" / "folder"
-    with folder_at_once(target) as staging:
+    with write_folder_atomically(target) as staging:
         (staging / "a").write_text("1", encoding="utf-8")
         assert not target.exists()
     assert sorted(path.name for path in target.iterdir()) == [".vkc-pin.json", "a"]
-    with pytest.raises(FileNotFoundError), folder_at_once(target, force=True) as staging:
+    with pytest.raises(FileNotFoundError), write_folder_atomically(target, force=True) as staging:
         (staging / "none" / "b").write_text("2", encoding="utf-8")
     assert (target / "a").read_text() == "1"
-    with pytest.raises(InputError, match="there already"), folder_at_once(target):
+    with pytest.raises(InputError, match="there already"), write_folder_atomically(target):
         pass
-    with folder_at_once(target, force=True) as staging:
+    with write_folder_atomically(target, force=True) as staging:
         (staging / "b").write_text("2", encoding="utf-8")
     assert sorted(path.name for path in target.iterdir()) == [".vkc-pin.json", "b"]
     assert [path.name for path in target.parent.iterdir()] == ["folder"]
     (tmp_path / "file").write_text("3", encoding="utf-8")
     with (
         pytest.raises(InputError, match="no folder"),
-        folder_at_once(tmp_path / "file", force=True),
+        write_folder_atomically(tmp_path / "file", force=True),
     ):
         pass
 
 
 def write_folder(target: Path, force: bool = True) -> None:
-    with folder_at_once(target, force=force) as staging:
+    with write_folder_atomically(target, force=force) as staging:
         (staging / "deep").mkdir()
         (staging / "deep" / "a").write_text("own", encoding="utf-8")
 
@@ -290,7 +290,10 @@ def test_a_folder_with_files_of_others_is_not_replaced(
 def test_a_file_that_comes_while_a_folder_is_written_remains(tmp_path: Path) -> None:
     target = tmp_path / "folder"
     write_folder(target)
-    with pytest.raises(InputError, match="would delete"), folder_at_once(target, force=True):
+    with (
+        pytest.raises(InputError, match="would delete"),
+        write_folder_atomically(target, force=True),
+    ):
         (target / "notes.txt").write_text("mine")
     assert everything(tmp_path) == {
         "folder",
@@ -299,7 +302,10 @@ def test_a_file_that_comes_while_a_folder_is_written_remains(tmp_path: Path) -> 
         "folder/deep/a",
         "folder/notes.txt",
     }
-    with pytest.raises(InputError, match="there already"), folder_at_once(tmp_path / "new"):
+    with (
+        pytest.raises(InputError, match="there already"),
+        write_folder_atomically(tmp_path / "new"),
+    ):
         (tmp_path / "new").mkdir()
 
 
@@ -353,7 +359,7 @@ def test_a_folder_that_cannot_be_renamed_is_still_there(
     monkeypatch.setattr(Path, "rename", refuse)
     with (
         pytest.raises(InputError, match="input/output error"),
-        folder_at_once(target, force=True) as staging,
+        write_folder_atomically(target, force=True) as staging,
     ):
         (staging / "new").touch()
     assert everything(tmp_path) == before

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.xml import check_indices, line_of, parse_xml, quote, replace_forbidden
+from vkc_pin.world.files.xml import check_indices, find_line, parse_xml, quote, replace_forbidden
 
 FILE = Path("thing.urdf")
 
@@ -37,10 +37,10 @@ def test_elements_are_those_of_the_standard_library_and_know_their_lines(tree: o
     text = "\n".join([*lines, "</robot>"])
     own, theirs = parse_xml(text, FILE), ElementTree.fromstring(text)
     assert ElementTree.tostring(own) == ElementTree.tostring(theirs)
-    assert line_of(own) == 1
+    assert find_line(own) == 1
     for element in own.iter("list"):
-        assert line_of(element) == int(element.get("number", ""))
-    assert line_of(theirs) is None
+        assert find_line(element) == int(element.get("number", ""))
+    assert find_line(theirs) is None
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_entities_are_refused() -> None:
 
 def test_a_hundred_thousand_elements_inside_each_other() -> None:
     root = parse_xml("<a>" * 100_000 + "</a>" * 100_000, FILE)
-    assert line_of(root) == 1
+    assert find_line(root) == 1
 
 
 @pytest.mark.parametrize("indices", ["0 ~ 1", "0 1.5 2", "zero", "0 1 2x", "<![CDATA[0 ~ 1]]>"])

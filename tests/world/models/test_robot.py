@@ -135,7 +135,7 @@ def test_collision_shapes_enclose_the_links(husky: Robot) -> None:
         )
         frame = husky.model.frames[husky.model.getFrameId(link)].placement
         skin = trimesh.util.concatenate(
-            [shape.mesh() for shape in husky.file.shapes("visual") if shape.link == link]
+            [shape.make_mesh() for shape in husky.file.read_shapes("visual") if shape.link == link]
         )
         points = np.vstack([skin.vertices, trimesh.sample.sample_surface(skin, 3000, seed=0)[0]])
         points = points @ frame.rotation.T + frame.translation

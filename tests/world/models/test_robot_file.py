@@ -17,7 +17,7 @@ from vkc_pin.world.files import resources
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import find_robot, load_robot
 
-FOLDER = resources.folder("robots") / "husky_ur5e"
+FOLDER = resources.find_resource_folder("robots") / "husky_ur5e"
 
 
 @pytest.fixture(scope="module")

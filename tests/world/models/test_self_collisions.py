@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from vkc_pin.options import Options
-from vkc_pin.utils import disk_cache as kept
+from vkc_pin.utils import disk_cache
 from vkc_pin.world.files import resources
 from vkc_pin.world.files.srdf import read_srdf
 from vkc_pin.world.models import self_collisions
@@ -19,7 +19,7 @@ from vkc_pin.world.models.self_collisions import (
     write_srdf,
 )
 
-SRDF = resources.folder("robots") / "husky_ur5e" / "husky_ur5e.srdf"
+SRDF = resources.find_resource_folder("robots") / "husky_ur5e" / "husky_ur5e.srdf"
 
 
 @pytest.fixture(scope="module")
@@ -261,7 +261,7 @@ def test_unstated_homes_are_collision_free(tmp_path: Path) -> None:
 
 def test_analysis_is_cached_by_its_inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A second call does not sample; changed shapes, limits, homes or lists do."""
-    monkeypatch.setenv(kept.VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setenv(disk_cache.CACHE_VARIABLE, str(tmp_path / "cache"))
     sampled, real = [], self_collisions._compute_analysis
     monkeypatch.setattr(
         self_collisions, "_compute_analysis", lambda *rest: (sampled.append(rest), real(*rest))[1]

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.meshes import MeshPart, to_bvh
+from vkc_pin.world.files.meshes import MeshPart, make_bvh
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.models.shapes import (
     LIMIT_SLACK,
@@ -86,7 +86,7 @@ def test_surfaces_are_closed_and_have_the_right_volume(number: int) -> None:
 
 def test_meshes_keep_their_triangles() -> None:
     box = trimesh.creation.box((0.1, 0.2, 0.3))
-    mesh = to_bvh(MeshPart(np.asarray(box.vertices), np.asarray(box.faces)))
+    mesh = make_bvh(MeshPart(np.asarray(box.vertices), np.asarray(box.faces)))
     mesh.buildConvexRepresentation(False)
     for shape in (mesh, mesh.convex):
         vertices, faces = triangulate(shape)

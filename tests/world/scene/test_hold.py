@@ -13,7 +13,7 @@ from helpers.drawers import drawer_scene
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.files.resources import folder
+from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.scene.hold import Hold, check_hold_order, make_holds
 from vkc_pin.world.scene.scene import Scene
@@ -123,7 +123,7 @@ def test_only_held_objects_can_hold() -> None:
 
 def described(path: Path, name: str, old: str, new: str) -> str:
     """Write a modified copy of an object's description; return its path."""
-    source = Path(str(folder("scenes"))) / "objects"
+    source = Path(str(find_resource_folder("scenes"))) / "objects"
     shutil.copy(source / f"{name}.urdf", path)
     text = (source / f"{name}.yaml").read_text()
     assert old in text

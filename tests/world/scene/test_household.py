@@ -14,7 +14,7 @@ import pytest
 from vkc_pin.planning.chain.inverse_kinematics import PoseSolver
 from vkc_pin.planning.chain.inversion import invert
 from vkc_pin.planning.chain.pose import PoseRow
-from vkc_pin.world.files.resources import folder
+from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.models.articulated_object import ArticulatedObject, Freedom
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.robot import Robot
@@ -344,7 +344,7 @@ def test_dishwasher_door_shuts_and_the_rack_comes_out_over_it() -> None:
 
 
 def test_furniture_is_as_its_colours_and_descriptions_say() -> None:
-    files = sorted((folder("scenes") / "furniture").glob("*.urdf"))
+    files = sorted((find_resource_folder("scenes") / "furniture").glob("*.urdf"))
     used = {item["file"] for item in scene().document["obstacles"] if item["type"] == "urdf"}
     assert {f"furniture/{file.name}" for file in files} | {"objects/low_drawer.urdf"} == used
     heights = {
@@ -363,7 +363,7 @@ def test_furniture_is_as_its_colours_and_descriptions_say() -> None:
             "position": [0, 0, 0],
         }
         robot = {"robot": "husky_ur5e", "start": {"base": [3, 3, 0]}, "obstacles": [item]}
-        alone = obstacles(Scene.from_document(robot, folder("scenes")))
+        alone = obstacles(Scene.from_document(robot, find_resource_folder("scenes")))
         np.testing.assert_allclose(bounds(alone)[:, 2], [0.0, height], atol=1e-9)
 
 

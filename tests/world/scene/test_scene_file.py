@@ -13,7 +13,7 @@ import pytest
 from helpers.rooms import TINY, load
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.files.resources import folder
+from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene, load_scene
 
@@ -516,7 +516,7 @@ def test_bad_documents_are_refused_without_a_file() -> None:
 
 
 def test_the_packaged_scenes_all_load() -> None:
-    files = sorted(folder("scenes").glob("*.yaml"))
+    files = sorted(find_resource_folder("scenes").glob("*.yaml"))
     assert {file.stem for file in files} >= {"door", "drawer"}
     for file in files:
         assert load_scene(file).name == file.stem

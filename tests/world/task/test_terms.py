@@ -191,7 +191,7 @@ def test_lists_of_terms_are_checked() -> None:
     for terms in (tilt(), 3, "upright"):
         with pytest.raises(vkc.InputError, match=r"^terms(\[0\])?: not a list"):
             trace_terms(room(table()), terms)  # type: ignore[arg-type]
-    with pytest.raises(vkc.InputError, match=r"terms\[1\]: wrong kind of entry"):
+    with pytest.raises(vkc.InputError, match=r"terms\[1\]: wrong type of entry"):
         trace_terms(room(table()), [tilt(), lambda s: 0])  # type: ignore[list-item]
     with pytest.raises(vkc.InputError, match="two terms share a name"):
         trace_terms(room(table()), [tilt(), tilt(lower=0.5)])

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.datasets.dataset import Dataset
-from vkc_pin.utils.parallel.journal import Kept
+from vkc_pin.utils.parallel.journal import JournalContents
 
 __all__ = ["WORKERS", "Costs", "measured", "simulated"]
 
@@ -51,7 +51,7 @@ class Costs:
 
 def measured(dataset: Dataset) -> Costs:
     """Return what a dataset's journal says of its tasks, of which there is one at least."""
-    kept = Kept.read(dataset.folder / "journal.jsonl")
+    kept = JournalContents.read(dataset.folder / "journal.jsonl")
     fields = dataset.recipe.fields
     size = fields.rooms.episodes * fields.variants
     tasks: dict[tuple[int, str], list[float]] = {}

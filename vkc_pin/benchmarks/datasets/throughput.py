@@ -22,7 +22,7 @@ from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generate import generate
 from vkc_pin.datasets.recipes.recipe import TASKS, load_recipe
 from vkc_pin.errors import InputError
-from vkc_pin.utils.parallel.journal import Kept
+from vkc_pin.utils.parallel.journal import JournalContents
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
 from vkc_pin.world.files.writing import write_atomically
 
@@ -140,7 +140,7 @@ def record(task: str, dataset: Dataset, jobs: int | None, wall: float) -> dict[s
         jobs: Processes of the last session; None: as many as there were.
         wall: Time of the call [s], with what starting processes and writing takes.
     """
-    kept = Kept.read(dataset.folder / "journal.jsonl")
+    kept = JournalContents.read(dataset.folder / "journal.jsonl")
     attempts = [record for (record,) in kept.lines.values()]
     good = sum(bool(one["success"]) for one in attempts)
     worked = sum(float(one.get("cpu_time", 0.0)) for one in attempts)

@@ -22,7 +22,7 @@ from vkc_pin.planning.planner import plan
 from vkc_pin.simulation.execution import GRASPS, simulate
 from vkc_pin.simulation.physics import Physics, import_mujoco
 from vkc_pin.simulation.result import SimulationResult
-from vkc_pin.utils.arguments import known
+from vkc_pin.utils.arguments import check_choice
 
 __all__ = ["TASKS", "report", "run"]
 
@@ -97,7 +97,7 @@ def run(
         "mujoco": version("mujoco"),
         **LIMITS,
     }
-    settings |= {"physics": vars(Physics()), "grasp": known(grasp, GRASPS, "grasp")}
+    settings |= {"physics": vars(Physics()), "grasp": check_choice(grasp, GRASPS, "grasp")}
     specs = [
         {
             "key": f"{list(TASKS).index(name):02d}/{number:04d}",

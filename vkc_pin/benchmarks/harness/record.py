@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.planning.plan import Plan
-from vkc_pin.utils.parallel.machine import machine, peak_memory, versions
-from vkc_pin.world.files.resources import package_folder
+from vkc_pin.utils.parallel.machine import describe_machine, find_versions, measure_peak_memory
+from vkc_pin.world.files.resources import find_package_folder
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -20,12 +20,12 @@ __all__ = [
     "Solve",
     "commit",
     "distribution",
+    "find_versions",
+    "measure_peak_memory",
     "meta",
-    "peak_memory",
     "peaks",
     "trial",
     "values",
-    "versions",
 ]
 
 Record = Mapping[str, Any]
@@ -36,13 +36,26 @@ Solve = Callable[[Scene, Mapping[str, Any]], Plan]
 
 def meta(**settings: Any) -> dict[str, Any]:
     """Return commit, versions, machine and `settings` (seed, trials, ...)."""
-    return {"commit": commit(), "versions": versions(), "machine": machine(), **settings}
+    return {
+        "commit": commit(),
+        "versions": find_versions(),
+        "machine": describe_machine(),
+        **settings,
+    }
 
 
 @functools.cache
 def commit() -> str | None:
     """Return which commit the package's sources are of, `-dirty` if they are changed; None where git does not know."""
-    command = ["git", "-C", str(package_folder()), "describe", "--always", "--dirty", "--abbrev=12"]
+    command = [
+        "git",
+        "-C",
+        str(find_package_folder()),
+        "describe",
+        "--always",
+        "--dirty",
+        "--abbrev=12",
+    ]
     try:
         return (
             subprocess.run(

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from vkc_pin.benchmarks.harness.record import meta, peak_memory
+from vkc_pin.benchmarks.harness.record import measure_peak_memory, meta
 from vkc_pin.benchmarks.harness.tables import to_csv
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.utils.parallel.engine import Died, needs_dask, results
+from vkc_pin.utils.parallel.engine import CrashedTask, require_dask, run_tasks
 from vkc_pin.utils.parallel.journal import Journal
-from vkc_pin.world.files.resources import folder, package_folder
+from vkc_pin.world.files.resources import find_package_folder, find_resource_folder
 from vkc_pin.world.files.writing import check_links, check_writable, write_atomically
 
 __all__ = ["Function", "check_folder", "chosen", "run"]
@@ -81,7 +81,7 @@ def run(
     if jobs < 1:
         raise InputError("out of range", field="jobs", expected="at least 1", got=jobs)
     if scheduler is not None:
-        needs_dask(scheduler)
+        require_dask(scheduler)
     todo = {str(trial["key"]): dict(trial) for trial in trials}
     if len(todo) < len(trials):
         raise InputError("two trials have the same key", field="trials")
@@ -188,10 +188,10 @@ def _run(
     began, told = time.perf_counter(), set[str]()
     journal.append({"session": {"jobs": jobs}})
     tasks = ((str(trial["key"]), trial) for trial in trials)
-    found = results(functools.partial(_attempt, function), tasks, jobs=jobs, scheduler=scheduler)
+    found = run_tasks(functools.partial(_attempt, function), tasks, jobs=jobs, scheduler=scheduler)
     with bar, contextlib.closing(found) as lines:
         for key, line in lines:
-            line = _given_up(key, line) if isinstance(line, Died) else line
+            line = _given_up(key, line) if isinstance(line, CrashedTask) else line
             if any(record.get("status") == "interrupted" for record in line["records"]):
                 raise KeyboardInterrupt
             journal.append({**line, "seconds": round(time.perf_counter() - began, 3)})
@@ -224,10 +224,10 @@ def _attempt(function: Function, trial: dict[str, Any]) -> dict[str, Any]:
             "violations": [message],
         }
         records, more = [{**trial, **failure}], {"traceback": traceback.format_exc()}
-    return {"key": key, "memory_mb": round(peak_memory(), 1), "records": records, **more}
+    return {"key": key, "memory_mb": round(measure_peak_memory(), 1), "records": records, **more}
 
 
-def _given_up(key: str, died: Died) -> dict[str, Any]:
+def _given_up(key: str, died: CrashedTask) -> dict[str, Any]:
     """Return the line of a trial that no process survived."""
     failure = {
         "key": key,
@@ -255,7 +255,7 @@ def _plain(value: Any) -> Any:
 
 def _sources() -> str:
     """Return a digest of all that planning depends on here: the package's sources, scenes and robots."""
-    package, digest = package_folder(), hashlib.sha256()
+    package, digest = find_package_folder(), hashlib.sha256()
     named = {
         path.relative_to(package).as_posix(): path
         for suffix in ("py", "cpp")
@@ -263,8 +263,13 @@ def _sources() -> str:
     }
     named = {name: path for name, path in named.items() if not name.startswith(_NO_PART)}
     for kind in ("scenes", "robots"):
-        files = (path for path in folder(kind).rglob("*") if path.suffix in _DESCRIPTIONS)
-        named |= {f"{kind}/{path.relative_to(folder(kind)).as_posix()}": path for path in files}
+        files = (
+            path for path in find_resource_folder(kind).rglob("*") if path.suffix in _DESCRIPTIONS
+        )
+        named |= {
+            f"{kind}/{path.relative_to(find_resource_folder(kind)).as_posix()}": path
+            for path in files
+        }
     for name in sorted(named):
         digest.update(f"{name}\n".encode() + named[name].read_bytes())
     return digest.hexdigest()[:12]

@@ -20,7 +20,7 @@ from vkc_pin.benchmarks.peers.sampled import dense
 from vkc_pin.benchmarks.peers.tasks import Given, beginning, ends
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.optional_imports import optional_package
+from vkc_pin.utils.optional_imports import import_optional
 
 __all__ = ["plan_by_projection"]
 
@@ -38,8 +38,8 @@ def plan_by_projection(
     accept: Callable[[Floats], bool],
 ) -> Found:
     """Plan with roboplan; see `found.Peer`."""
-    core = optional_package("roboplan.core", "peers", what="bench peers")
-    rrt = optional_package("roboplan.rrt", "peers", what="bench peers")
+    core = import_optional("roboplan.core", "peers", purpose="bench peers")
+    rrt = import_optional("roboplan.rrt", "peers", purpose="bench peers")
     goals = ends(problem, np.random.default_rng([seed, 1]), _ENDS)
     if not len(goals):
         return Found(status="no configuration at the goal")

@@ -22,7 +22,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.optional_imports import optional_package
+from vkc_pin.utils.optional_imports import import_optional
 
 __all__ = ["METHODS", "PEERS", "TIME_LIMIT", "report", "run"]
 
@@ -178,7 +178,7 @@ def _installed(methods: Sequence[str]) -> dict[str, str]:
         try:
             found[package] = version(package)
         except PackageNotFoundError:
-            optional_package(module, "peers", what="bench peers")
+            import_optional(module, "peers", purpose="bench peers")
             raise
     return found
 

@@ -23,7 +23,7 @@ from vkc_pin.benchmarks.peers.found import Clock, Found
 from vkc_pin.benchmarks.peers.tasks import Given, beginning, ends
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.optional_imports import optional_package
+from vkc_pin.utils.optional_imports import import_optional
 
 __all__ = ["dense", "plan_by_sampling", "ranges"]
 
@@ -53,7 +53,7 @@ def plan_by_sampling(
 ) -> Found:
     """Plan with OMPL; see `found.Peer`."""
     ob, og, ou = (
-        optional_package(f"ompl.{part}", "peers", what="bench peers")
+        import_optional(f"ompl.{part}", "peers", purpose="bench peers")
         for part in ("base", "geometric", "util")
     )
     ou.setLogLevel(ou.LogLevel.LOG_NONE)

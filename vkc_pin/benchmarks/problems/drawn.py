@@ -19,7 +19,7 @@ from vkc_pin.options import Options
 from vkc_pin.procedural.rooms.fixtures import OPENABLE
 from vkc_pin.procedural.rooms.random_room import random_room
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.files.resources import available
+from vkc_pin.world.files.resources import list_resources
 from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import make_world_shapes
@@ -46,7 +46,7 @@ def drawn(seed: int, number: int) -> Problem:
         InputError: No scene in some tries had a place for everything.
     """
     rng = np.random.default_rng([3, seed, number])
-    names = sorted(available("scenes", "*.yaml"))
+    names = sorted(list_resources("scenes", "*.yaml"))
     for _ in range(_TRIES):
         try:
             scene = (

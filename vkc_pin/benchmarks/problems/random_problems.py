@@ -20,7 +20,7 @@ from vkc_pin.benchmarks.problems.problem_set import Problem
 from vkc_pin.errors import InputError
 from vkc_pin.planning.planner import plan
 from vkc_pin.procedural.tasks import random_task
-from vkc_pin.utils.arguments import known
+from vkc_pin.utils.arguments import check_choice
 from vkc_pin.world.task.steps import Actuate, Grasp
 
 __all__ = ["report", "run"]
@@ -65,7 +65,7 @@ def run(
     """
     if problems < 1:
         raise InputError("out of range", field="problems", expected="at least 1", got=problems)
-    known(of, OF, "set of problems", "of")
+    check_choice(of, OF, "set of problems", "of")
     settings = {
         "benchmark": "random" if of == OF[0] else of,
         "seed": seed,

@@ -15,7 +15,7 @@ from vkc_pin.benchmarks.robot_object_matrix.pairs import description_of
 from vkc_pin.errors import InputError
 from vkc_pin.importing.objects.object_import import ImportedObject, import_object
 from vkc_pin.importing.robots.robot_import import import_robot
-from vkc_pin.world.files.writing import check_name, folder_at_once, write_atomically
+from vkc_pin.world.files.writing import check_name, write_atomically, write_folder_atomically
 from vkc_pin.world.models.robot_file import find_robot, load_robot
 
 __all__ = ["DEFAULT", "Given", "parsed", "ready_object", "ready_robot"]
@@ -131,7 +131,7 @@ def ready_object(one: Given, folder: Path) -> str:
     name = check_name(one.called, "objects")
     made = folder / name / f"{name}.yaml"
     if not made.is_file():
-        with folder_at_once(made.parent, force=True) as staging, warnings.catch_warnings():
+        with write_folder_atomically(made.parent, force=True) as staging, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what is left out, its report would say
             imported = import_object(one.path, staging / "as_it_was", link=one.link)
             _face(imported)

@@ -24,7 +24,7 @@ from vkc_pin.procedural.rooms.footprints import Floor
 from vkc_pin.procedural.tasks import goals
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.files.documents import read_yaml
-from vkc_pin.world.files.resources import available, folder, located
+from vkc_pin.world.files.resources import find_file, find_resource_folder, list_resources
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.scene.scene import Scene
@@ -121,10 +121,10 @@ def description_of(name: str) -> dict[str, Any]:
     match = _of_kind(name)
     if match:
         return random_object(*match)
-    stored = available("scenes", "objects/*.yaml")
+    stored = list_resources("scenes", "objects/*.yaml")
     if name not in stored and not _is_path(name):
         raise UnknownNameError("object", name, [*OBJECTS, *stored], field="objects")
-    file = located(name, "scenes", "objects/*.yaml", what="object")
+    file = find_file(name, "scenes", "objects/*.yaml", noun="object")
     data = read_yaml(file).data
     if not isinstance(data, dict) or not isinstance(data.get("urdf"), str):
         raise InputError(
@@ -158,7 +158,7 @@ def hall(robot: str, name: str, description: Mapping[str, Any]) -> Scene:
         "obstacles": [*parts.make_walls(floor, _HEIGHT, [part]), *part.obstacles],
         "objects": [{**entry, "type": dict(description)}],
     }
-    return Scene.from_document(document, folder("scenes"))
+    return Scene.from_document(document, find_resource_folder("scenes"))
 
 
 def pair(robot: Robot, called: str, name: str, *, seed: int = 0) -> Pair:

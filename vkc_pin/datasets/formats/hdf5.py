@@ -23,7 +23,7 @@ from vkc_pin.datasets.formats.samples import sample_episode
 from vkc_pin.errors import InputError
 from vkc_pin.simulation.cameras.images import Images
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.utils.optional_imports import optional_package
+from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.files.documents import parse_json, read_text
 from vkc_pin.world.files.writing import check_name, write_atomically
 from vkc_pin.world.models.robot import Robot
@@ -49,7 +49,7 @@ def require_h5py() -> Any:
     Raises:
         InputError: It is not installed.
     """
-    return optional_package("h5py", "data", what="a dataset")
+    return import_optional("h5py", "data", purpose="a dataset")
 
 
 def write_shard(path: Path, parts: Sequence[tuple[Path, int]], scenes: Path) -> Path:

@@ -20,8 +20,8 @@ from vkc_pin.datasets.episode import Episode
 from vkc_pin.datasets.formats.samples import sample_episode
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.optional_imports import optional_package
-from vkc_pin.world.files.writing import folder_at_once
+from vkc_pin.utils.optional_imports import import_optional
+from vkc_pin.world.files.writing import write_folder_atomically
 from vkc_pin.world.models.robot import Robot
 
 __all__ = ["VERSION", "describe_task", "require_pyarrow", "write_lerobot"]
@@ -57,8 +57,8 @@ def require_pyarrow(rate: float) -> Any:
             expected="a whole number",
             got=rate,
         )
-    optional_package("pyarrow.parquet", "data", what="LeRobot's layout", field="lerobot")
-    return optional_package("pyarrow", "data", what="LeRobot's layout", field="lerobot")
+    import_optional("pyarrow.parquet", "data", purpose="LeRobot's layout", field="lerobot")
+    return import_optional("pyarrow", "data", purpose="LeRobot's layout", field="lerobot")
 
 
 def describe_task(about: Mapping[str, Any]) -> str:
@@ -86,7 +86,7 @@ def write_lerobot(path: Path, episodes: Iterable[Episode], robot: Robot, rate: f
         rate: Frames a second, a whole number.
     """
     arrow = require_pyarrow(rate)
-    with folder_at_once(path, force=True) as folder:
+    with write_folder_atomically(path, force=True) as folder:
         writer = _Writer(arrow, folder, robot, rate)
         for episode in episodes:
             writer.add(episode)

@@ -20,20 +20,20 @@ from vkc_pin.procedural.rooms.fixtures import list_openable_types
 from vkc_pin.procedural.rooms.parts import CARRIED
 from vkc_pin.procedural.rooms.settings import RoomSettings
 from vkc_pin.simulation.cameras.mount import BASE, HAND, Camera
-from vkc_pin.utils.arguments import mapping
-from vkc_pin.world.files.documents import Document, check, read_yaml
+from vkc_pin.utils.arguments import check_mapping
+from vkc_pin.world.files.documents import Document, parse_document, read_yaml
 from vkc_pin.world.files.fields import (
     Name,
-    NotNegative,
+    NonNegative,
     Number,
     Positive,
     Schema,
     Vector3,
-    count,
     require,
-    text_for,
+    require_length,
+    wrap_text,
 )
-from vkc_pin.world.files.resources import available, located
+from vkc_pin.world.files.resources import find_file, list_resources
 from vkc_pin.world.models.robot_file import find_robot
 from vkc_pin.world.task.terms import Term, trace_terms_without_scene
 
@@ -61,7 +61,7 @@ _increasing = require(
 _share = require(
     lambda value: value[0] > 0.0 and value[1] <= 1.0, "out of range", "shares above 0 and up to 1"
 )
-Interval = Annotated[tuple[Number, Number], count(2), _increasing]
+Interval = Annotated[tuple[Number, Number], require_length(2), _increasing]
 Share = Annotated[Interval, _share]
 Whole = Annotated[int, Field(strict=True, ge=1)]
 Pixels = Annotated[int, Field(strict=True, ge=8, le=2048)]
@@ -94,7 +94,7 @@ class StartSchema(Schema):
     """Where episodes start: how far the base is from what it goes to [m], how far arm joints are from home [rad]."""
 
     distance: Interval = (0.0, 10.0)
-    arm: NotNegative = 0.0
+    arm: NonNegative = 0.0
 
 
 class GoalSchema(Schema):
@@ -137,7 +137,7 @@ CAMERAS = (
 """The cameras of recipes that are asked for images and name none: one above the base, one beside the fingers."""
 
 _some = require(lambda value: value, "there is nothing", "at least one")
-Robots = Annotated[tuple[Annotated[RobotEntry, text_for("name")], ...], _some]
+Robots = Annotated[tuple[Annotated[RobotEntry, wrap_text("name")], ...], _some]
 
 
 class RecipeSchema(Schema):
@@ -241,12 +241,12 @@ def load_recipe(recipe: str | Path | Mapping[str, Any] | Recipe, **changes: Any)
     if isinstance(recipe, Recipe):
         document = Document(recipe.document)
     elif isinstance(recipe, Mapping):
-        document = Document(mapping(recipe, "recipe", "fields of a recipe"))
+        document = Document(check_mapping(recipe, "recipe", "fields of a recipe"))
     else:
-        document = read_yaml(located(recipe, "scenes", "recipes/*.yaml", what="recipe"))
+        document = read_yaml(find_file(recipe, "scenes", "recipes/*.yaml", noun="recipe"))
     if isinstance(document.data, dict):
         document = Document({**document.data, **changes}, document.file, document.lines)
-    fields = check(document, RecipeSchema)
+    fields = parse_document(document, RecipeSchema)
     folder = document.file.parent if document.file else Path()
     found = {
         "robots": _robots(document, fields.robots, folder),
@@ -257,20 +257,22 @@ def load_recipe(recipe: str | Path | Mapping[str, Any] | Recipe, **changes: Any)
     }
     for k, kind in enumerate(fields.carried):
         if kind not in CARRIED:
-            raise document.unknown(("carried", k), "object that is carried", kind, CARRIED)
+            raise document.make_unknown_name_error(
+                ("carried", k), "object that is carried", kind, CARRIED
+            )
     if fields.scenes and "fetch-place" in fields.tasks:
         expected = "random rooms, whose tables are known, or only given-open and drive-open"
-        raise document.error(
+        raise document.make_error(
             ("tasks",),
             "nothing says where to put things in scene files",
             expected=expected,
             got="fetch-place",
         )
     for k, camera in enumerate(fields.cameras):
-        with document.at(("cameras", k)):
+        with document.annotate_errors(("cameras", k)):
             Camera(**camera.model_dump())
         if camera.name in [other.name for other in fields.cameras[:k]]:
-            raise document.error(
+            raise document.make_error(
                 ("cameras", k, "name"),
                 "two cameras of one name",
                 expected="another name",
@@ -279,8 +281,10 @@ def load_recipe(recipe: str | Path | Mapping[str, Any] | Recipe, **changes: Any)
     check_entries(document, fields.terms, TASKS)
     if fields.cameras and not fields.simulate:
         expected = "`simulate: true` as well, or --simulate: images are of what happens in physics"
-        raise document.error(("cameras",), "nothing is simulated", expected=expected, got="cameras")
-    with document.at(("rooms",)):
+        raise document.make_error(
+            ("cameras",), "nothing is simulated", expected=expected, got="cameras"
+        )
+    with document.annotate_errors(("rooms",)):
         RoomSettings(
             clutter=fields.rooms.clutter[0], width=fields.rooms.width, front=fields.rooms.front
         )
@@ -291,12 +295,14 @@ def load_recipe(recipe: str | Path | Mapping[str, Any] | Recipe, **changes: Any)
 def _options(document: Document, given: Mapping[str, Any]) -> Options:
     for name in given:
         if name not in Options.__dataclass_fields__:
-            raise document.unknown(("options", name), "option", name, Options.__dataclass_fields__)
+            raise document.make_unknown_name_error(
+                ("options", name), "option", name, Options.__dataclass_fields__
+            )
     try:
         return Options(**given)
     except InputError as error:
         name = (error.field or "").removeprefix("Options.")
-        raise document.error(
+        raise document.make_error(
             ("options", name), error.problem, expected=error.expected, got=error.got
         ) from error
 
@@ -321,7 +327,7 @@ def _robots(
     found: dict[str, str] = {}
     robots = []
     for k, entry in enumerate(entries):
-        with document.at(("robots", k)):
+        with document.annotate_errors(("robots", k)):
             path = find_robot(
                 str((folder / entry.name).resolve()) if _is_path(entry.name) else entry.name
             )
@@ -330,7 +336,7 @@ def _robots(
         )
         name = robots[-1].name
         if found.setdefault(get_robot_name(name), name) != name:
-            raise document.error(
+            raise document.make_error(
                 ("robots", k),
                 "two robots of one name",
                 expected="folders of different names",
@@ -342,7 +348,7 @@ def _robots(
 def _object(document: Document, place: int, name: str, folder: Path) -> str:
     if not _is_path(name):
         if name not in list_openable_types():
-            raise document.unknown(
+            raise document.make_unknown_name_error(
                 ("objects", place), "object that opens", name, list_openable_types()
             )
         return name
@@ -351,14 +357,14 @@ def _object(document: Document, place: int, name: str, folder: Path) -> str:
 
 def _scene(document: Document, place: int, name: str, folder: Path) -> str:
     if not _is_path(name):
-        known = available("scenes", "*.yaml")
+        known = list_resources("scenes", "*.yaml")
         if name not in known:
             raise UnknownNameError(
                 "scene",
                 name,
                 known,
                 file=document.file,
-                line=document.line(("scenes", place)),
+                line=document.find_line(("scenes", place)),
                 field="scenes",
             )
         return name
@@ -367,5 +373,7 @@ def _scene(document: Document, place: int, name: str, folder: Path) -> str:
 
 def _file(document: Document, path: tuple[str | int, ...], file: Path) -> str:
     if not file.is_file():
-        raise document.error(path, "there is no such file", expected="an existing file", got=file)
+        raise document.make_error(
+            path, "there is no such file", expected="an existing file", got=file
+        )
     return str(file.resolve())

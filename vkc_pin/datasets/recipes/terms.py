@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from vkc_pin.simulation.cameras.mount import BASE, HAND, resolve_frame
-from vkc_pin.utils.arguments import known
+from vkc_pin.utils.arguments import check_choice
 from vkc_pin.world.files.documents import Document
-from vkc_pin.world.files.fields import Positive, Schema, Vector3, count, require
+from vkc_pin.world.files.fields import Positive, Schema, Vector3, require, require_length
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.terms import (
@@ -44,7 +44,7 @@ Axis = Annotated[
     Vector3,
     require(lambda value: math.hypot(*value) > 0.0, "no direction", "an axis of some length"),
 ]
-Size = Annotated[tuple[Positive, Positive, Positive], count(3)]
+Size = Annotated[tuple[Positive, Positive, Positive], require_length(3)]
 
 
 class _Entry(Schema):
@@ -168,11 +168,13 @@ def check_entries(document: Document, entries: Sequence[Entry], tasks: Sequence[
     for k, entry in enumerate(entries):
         for j, task in enumerate(entry.tasks):
             if task not in tasks:
-                raise document.unknown(("terms", k, "tasks", j), "task", task, tasks)
-        with document.at(("terms", k)):
+                raise document.make_unknown_name_error(
+                    ("terms", k, "tasks", j), "task", task, tasks
+                )
+        with document.annotate_errors(("terms", k)):
             (term,) = trace_terms_without_scene([entry.term()])
         if term.name in names:
-            raise document.error(
+            raise document.make_error(
                 ("terms", k), "two terms of one name", expected="another `name`", got=term.name
             )
         names.append(term.name)
@@ -190,9 +192,9 @@ def check_robot(robot: Robot, terms: Sequence[Term]) -> None:
     for term in terms:
         where = f"terms[{term.name!r}]"
         for frame in (name for name in term.formula.frames if "." not in name):
-            known(frame, frames, f"frame of {robot.name}", where)
+            check_choice(frame, frames, f"frame of {robot.name}", where)
         for coordinate in (name for name in term.formula.coordinates if "." not in name):
-            known(coordinate, robot.coordinates.names, f"coordinate of {robot.name}", where)
+            check_choice(coordinate, robot.coordinates.names, f"coordinate of {robot.name}", where)
 
 
 def resolve_terms(

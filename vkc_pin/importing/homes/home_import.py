@@ -29,10 +29,10 @@ from vkc_pin.importing.objects.object_import import read_description
 from vkc_pin.importing.objects.pieces import PieceCache
 from vkc_pin.importing.targets import check_target, format_comment, get_origin_marker
 from vkc_pin.options import Options
-from vkc_pin.utils.arguments import flag, instance, number, whole
+from vkc_pin.utils.arguments import check_bool, check_instance, check_integer, check_number
 from vkc_pin.world.files.documents import read_text
-from vkc_pin.world.files.resources import choose_file_names, file_path
-from vkc_pin.world.files.writing import folder_at_once, write_atomically
+from vkc_pin.world.files.resources import check_path, choose_file_names
+from vkc_pin.world.files.writing import write_atomically, write_folder_atomically
 from vkc_pin.world.files.xml import parse_xml
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.scene.obstacles import FLOOR
@@ -119,16 +119,16 @@ def import_home(
             folder holds other files; an argument is invalid; or the robot finds no start pose.
         UnknownNameError: The robot is unknown, or the file refers to an undefined name.
     """
-    path = file_path(file, "file", "a URDF or MJCF file")
-    floor = number(floor, "floor", "a height [m]", low=-_LARGEST, high=_LARGEST)
-    whole(most, "most", low=1, high=100)
-    rng = np.random.default_rng(whole(seed, "seed", low=0))
-    options = Options() if options is None else instance(options, Options, "options")
+    path = check_path(file, "file", "a URDF or MJCF file")
+    floor = check_number(floor, "floor", "a height [m]", low=-_LARGEST, high=_LARGEST)
+    check_integer(most, "most", low=1, high=100)
+    rng = np.random.default_rng(check_integer(seed, "seed", low=0))
+    options = Options() if options is None else check_instance(options, Options, "options")
     hand = load_robot(robot)
     target = (
-        file_path(folder, "folder", "a folder") if folder is not None else Path(_choose_name(path))
+        check_path(folder, "folder", "a folder") if folder is not None else Path(_choose_name(path))
     )
-    check_target(target, _COMMAND, force=flag(force, "force"))
+    check_target(target, _COMMAND, force=check_bool(force, "force"))
     if parse_xml(read_text(path, "URDF or MJCF"), path).tag == "sdf":
         raise InputError(
             "homes are imported from URDF and MJCF only",
@@ -152,7 +152,9 @@ def import_home(
             expected=expected,
             got=f"{home.shapes} fixed shapes",
         )
-    with folder_at_once(target, force=True) as staging:  # `check_target` allowed replacing it
+    with write_folder_atomically(
+        target, force=True
+    ) as staging:  # `check_target` allowed replacing it
         known: PieceCache = {}
         names = [thing.name for thing in home.objects]
         taken = {FLOOR, *names}

@@ -117,7 +117,7 @@ def split_home(description: Description) -> Home:
         for child in children:
             part = _add_empty_base(description, child)
             objects.append(_place_object(child, part, places[name]))
-        low = [part for part in link.solid if part.mesh().bounds[1, 2] <= FLOOR_RISE]
+        low = [part for part in link.solid if part.make_mesh().bounds[1, 2] <= FLOOR_RISE]
         floor += [part.name or name for part in low]
         solid = tuple(part for part in link.solid if not any(part is other for other in low))
         if solid:
@@ -225,5 +225,5 @@ def _measure_length(link: Link) -> float:
     """Return the horizontal length of a link [m]; 0 without shapes."""
     if not link.solid:
         return 0.0
-    boxes = np.array([part.mesh().bounds for part in link.solid])
+    boxes = np.array([part.make_mesh().bounds for part in link.solid])
     return float((boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0))[:2].max())

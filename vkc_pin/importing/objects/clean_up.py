@@ -196,7 +196,7 @@ def load_surfaces(description: Description) -> Surfaces:
     parts = [
         part for link in description.links.values() for part in (*link.visual, *link.collision)
     ]
-    return {id(part): part.mesh() for part in parts}
+    return {id(part): part.make_mesh() for part in parts}
 
 
 def compute_bounds(

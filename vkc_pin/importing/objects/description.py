@@ -48,7 +48,7 @@ class Part:
     triangles: trimesh.Trimesh | None = None
     colour: Colour | None = None
 
-    def mesh(self) -> trimesh.Trimesh:
+    def make_mesh(self) -> trimesh.Trimesh:
         """Return the surface in the frame of its link [m].
 
         Raises:

@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
-from vkc_pin.utils.optional_imports import optional_package
+from vkc_pin.utils.optional_imports import import_optional
 
 __all__ = ["read_object_mjcf"]
 
@@ -30,7 +30,7 @@ def read_object_mjcf(file: Path, *, free: bool = False) -> Description:
     Raises:
         InputError: MuJoCo is not installed or cannot read the file.
     """
-    mujoco = optional_package("mujoco", "import", what="reading MJCF", file=file)
+    mujoco = import_optional("mujoco", "import", purpose="reading MJCF", file=file)
     try:
         model = mujoco.MjModel.from_xml_path(str(file))
     except ValueError as error:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.errors import InputError, shown
+from vkc_pin.errors import InputError, format_value
 from vkc_pin.importing.objects.clean_up import (
     add_missing_limits,
     compute_bounds,
@@ -37,11 +37,11 @@ from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
 from vkc_pin.importing.targets import check_target, get_origin_marker
 from vkc_pin.options import Options
-from vkc_pin.utils.arguments import flag, instance, quantity, whole
+from vkc_pin.utils.arguments import check_bool, check_coordinate, check_instance, check_integer
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.documents import read_text
-from vkc_pin.world.files.resources import choose_file_names, file_path
-from vkc_pin.world.files.writing import folder_at_once
+from vkc_pin.world.files.resources import check_path, choose_file_names
+from vkc_pin.world.files.writing import write_folder_atomically
 from vkc_pin.world.files.xml import parse_xml
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.world.models.object_file import load_object
@@ -106,7 +106,7 @@ def read_description(file: str | Path, *, free: bool = False) -> Description:
         InputError: The format is unknown, or the file cannot be read.
         UnknownNameError: The file refers to an unknown name.
     """
-    path = file_path(file, "file", "a URDF, MJCF or SDF file")
+    path = check_path(file, "file", "a URDF, MJCF or SDF file")
     root = parse_xml(read_text(path, "URDF, MJCF or SDF"), path).tag
     readers: dict[str, Callable[[Path], Description]] = {
         "robot": partial(read_object_urdf, free=free),
@@ -157,13 +157,16 @@ def import_object(
             files, or an argument is invalid.
         UnknownNameError: The link or robot is unknown, or the file refers to an unknown name.
     """
-    path = file_path(file, "file", "a URDF, MJCF or SDF file")
+    path = check_path(file, "file", "a URDF, MJCF or SDF file")
     if up not in ("y", "z"):
         raise InputError(
-            "`up` must be an axis of the file", field="up", expected='"y" or "z"', got=shown(up)
+            "`up` must be an axis of the file",
+            field="up",
+            expected='"y" or "z"',
+            got=format_value(up),
         )
     for name, value in (("height", height), ("scale", scale)):
-        if value is not None and quantity(value, name) <= 0.0:
+        if value is not None and check_coordinate(value, name) <= 0.0:
             raise InputError(
                 f"`{name}` must be positive", field=name, expected="a number above 0", got=value
             )
@@ -171,13 +174,13 @@ def import_object(
         raise InputError(
             "`height` and `scale` exclude each other", field="height, scale", expected="one of them"
         )
-    whole(most, "most", low=1, high=100)
-    options = Options() if options is None else instance(options, Options, "options")
+    check_integer(most, "most", low=1, high=100)
+    options = Options() if options is None else check_instance(options, Options, "options")
     clearances = {"dist_safe": options.dist_safe, "grasp_clearance": options.grasp_clearance}
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     name = _choose_name(path, link)
-    target = Path(name) if folder is None else file_path(folder, "folder", "a folder")
-    check_target(target, _COMMAND, force=flag(force, "force"))
+    target = Path(name) if folder is None else check_path(folder, "folder", "a folder")
+    check_target(target, _COMMAND, force=check_bool(force, "force"))
     description = read_description(path)
     description = (
         extract_subtree(description, link)
@@ -193,7 +196,9 @@ def import_object(
     if description.is_massless:
         description = dataclasses.replace(description, notes=(*description.notes, WEIGHTLESS))
     description = decompose_links(description, load_surfaces(description))
-    with folder_at_once(target, force=True) as staging:  # `check_target` allowed replacing it
+    with write_folder_atomically(
+        target, force=True
+    ) as staging:  # `check_target` allowed replacing it
         yaml, urdf, picture = (
             staging / f"{name}.yaml",
             staging / f"{name}.urdf",

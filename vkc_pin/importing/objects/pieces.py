@@ -93,7 +93,7 @@ def _find_cached_pieces(part: Part, error: float, cache: PieceCache) -> Sequence
     key = (part.file, part.size, error)
     if key not in cache:
         cache[key] = _make_convex(
-            dataclasses.replace(part, placement=pin.SE3.Identity()).mesh(), error
+            dataclasses.replace(part, placement=pin.SE3.Identity()).make_mesh(), error
         )
     return [piece.copy().apply_transform(part.placement.homogeneous) for piece in cache[key]]
 

@@ -11,8 +11,8 @@ import pinocchio as pin
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part, make_inertia
 from vkc_pin.world.files.documents import read_text
-from vkc_pin.world.files.kinematic_tree import MOMENTS, numbers_of
-from vkc_pin.world.files.xml import line_of, parse_xml
+from vkc_pin.world.files.kinematic_tree import MOMENTS, parse_numbers
+from vkc_pin.world.files.xml import find_line, parse_xml
 
 __all__ = ["read_object_sdf"]
 
@@ -43,7 +43,7 @@ def read_object_sdf(file: Path) -> Description:
         raise InputError(
             problem,
             file=file,
-            line=line_of(nested),
+            line=find_line(nested),
             field=nested.tag,
             expected="links and joints in one model",
         )
@@ -76,7 +76,7 @@ class _Reader:
                         link,
                         names,
                         file=self.file,
-                        line=line_of(joint),
+                        line=find_line(joint),
                         field=joint.get("name"),
                     )
         roots = [name for name in names if name not in joints]
@@ -139,7 +139,7 @@ class _Reader:
         if pose is None:
             return self.pose(default_frame, visited)
         text = ElementTree.Element("pose", {"numbers": pose.text or ""})
-        values = numbers_of(
+        values = parse_numbers(
             self.file,
             text,
             "numbers",
@@ -296,7 +296,7 @@ class _Reader:
         raise InputError(
             "the mesh file does not exist",
             file=self.file,
-            line=line_of(shape),
+            line=find_line(shape),
             field=name,
             expected="a mesh file",
             got=uri,
@@ -307,7 +307,9 @@ class _Reader:
     ) -> tuple[float, ...]:
         found = element.findtext(key)
         text = ElementTree.Element(element.tag, {} if found is None else {key: found})
-        return numbers_of(self.file, text, key, count, default=default, where=where, largest=1e308)
+        return parse_numbers(
+            self.file, text, key, count, default=default, where=where, largest=1e308
+        )
 
     def _read_text(self, element: ElementTree.Element, key: str) -> str:
         return (element.findtext(key) or "").strip()

@@ -11,7 +11,12 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part, make_inertia
-from vkc_pin.world.files.kinematic_tree import check_tree, inertial_of, numbers_of, origin_of
+from vkc_pin.world.files.kinematic_tree import (
+    check_tree,
+    parse_inertial,
+    parse_numbers,
+    parse_origin,
+)
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.files.xml import read_xml
 
@@ -55,7 +60,7 @@ def read_object_urdf(file: Path, *, free: bool = False) -> Description:
         kind: {link: [] for link in urdf.links} for kind in ("visual", "collision")
     }
     for kind, by_link in parts.items():
-        for shape in urdf.shapes(kind):
+        for shape in urdf.read_shapes(kind):
             name = names.get((kind, shape.name)) or names.get(("mesh", str(shape.file))) or ""
             by_link[shape.link].append(
                 Part(
@@ -109,7 +114,7 @@ def _read_limits(
     if limit.get("lower") is None and limit.get("upper") is None:
         return None
     low, high = (
-        numbers_of(file, limit, key, 1, default="0", where=name, largest=math.inf)[0]
+        parse_numbers(file, limit, key, 1, default="0", where=name, largest=math.inf)[0]
         for key in ("lower", "upper")
     )
     if low > high:
@@ -128,7 +133,7 @@ def _read_inertia(file: Path, link: ElementTree.Element, notes: list[str]) -> pi
     if stated is None:
         return pin.Inertia.Zero()
     try:
-        mass, moments, origin = inertial_of(file, stated, name)
+        mass, moments, origin = parse_inertial(file, stated, name)
         return make_inertia(mass, moments, _make_placement(origin))
     except InputError as error:
         notes.append(f"link '{name}': {error}: its <inertial> counts as none")
@@ -148,9 +153,9 @@ def _read_joint(
     axis, limit = element.find("axis"), element.find("limit")
     direction = np.array([1.0, 0.0, 0.0])
     if axis is not None and kind not in ("fixed", "floating"):
-        direction = np.array(numbers_of(file, axis, "xyz", 3, default="1 0 0", where=name))
+        direction = np.array(parse_numbers(file, axis, "xyz", 3, default="1 0 0", where=name))
     velocity = (
-        numbers_of(file, limit, "velocity", 1, default="0", where=name)[0]
+        parse_numbers(file, limit, "velocity", 1, default="0", where=name)[0]
         if limit is not None
         else 0.0
     )
@@ -158,7 +163,7 @@ def _read_joint(
     resistance = {
         key: 0.0
         if dynamics is None
-        else max(0.0, numbers_of(file, dynamics, key, 1, default="0", where=name)[0])
+        else max(0.0, parse_numbers(file, dynamics, key, 1, default="0", where=name)[0])
         for key in ("damping", "friction")
     }
     ends = [
@@ -170,7 +175,7 @@ def _read_joint(
         kind=kind,
         parent=ends[0],
         child=ends[1],
-        placement=_make_placement(origin_of(file, element, name)),
+        placement=_make_placement(parse_origin(file, element, name)),
         axis=direction / np.linalg.norm(direction),
         limits=None if kind == "continuous" else limits,
         velocity=velocity if velocity > 0.0 else None,

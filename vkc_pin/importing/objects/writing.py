@@ -49,7 +49,7 @@ def write_urdf(description: Description, file: Path) -> None:
         for number, part in enumerate(_replace_capsules(link.collision)):
             piece = None
             if part.kind == "mesh":
-                piece = _write_mesh(file, f"collision/{stem}_{number}.stl", part.mesh())
+                piece = _write_mesh(file, f"collision/{stem}_{number}.stl", part.make_mesh())
             lines += _format_shape("collision", part.name, part, piece, None)
         lines += _format_inertia(link.inertia)
         lines.append("  </link>")
@@ -103,7 +103,7 @@ def _collect_visuals(link: Link) -> list[tuple[Part | None, trimesh.Trimesh | No
                 mesh.apply_transform(part.placement.homogeneous)
                 meshes.setdefault(coloured.colour or _GREY, []).append(mesh)
         else:
-            meshes.setdefault(part.colour or _GREY, []).append(part.mesh())
+            meshes.setdefault(part.colour or _GREY, []).append(part.make_mesh())
     return shapes + [
         (None, trimesh.util.concatenate(same), colour) for colour, same in meshes.items()
     ]

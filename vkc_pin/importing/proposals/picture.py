@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.importing.proposals.proposal import Proposal, Proposals
-from vkc_pin.utils.arguments import instance
+from vkc_pin.utils.arguments import check_instance
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
 from vkc_pin.world.models.shapes import get_link_name, triangulate
@@ -47,7 +47,7 @@ def plot_attachments(proposals: Proposals, path: str | Path | None = None) -> Fi
     Returns:
         The figure.
     """
-    instance(proposals, Proposals, "proposals")
+    check_instance(proposals, Proposals, "proposals")
     drawn = proposals.found[:_PANELS]
     panels = max(1, len(drawn) + bool(proposals.because))
     columns = min(panels, _COLUMNS)

@@ -22,7 +22,7 @@ from vkc_pin.importing.proposals.ranking import (
     score_grasp,
 )
 from vkc_pin.importing.proposals.sections import Piece
-from vkc_pin.utils.arguments import instance, number, whole
+from vkc_pin.utils.arguments import check_instance, check_integer, check_number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment
@@ -89,11 +89,11 @@ def propose_attachments(
             argument is invalid.
         UnknownNameError: The robot is unknown.
     """
-    instance(item, ArticulatedObject, "object")
-    whole(most, "most", low=1, high=100)
+    check_instance(item, ArticulatedObject, "object")
+    check_integer(most, "most", low=1, high=100)
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     for name, value in (("dist_safe", dist_safe), ("grasp_clearance", grasp_clearance)):
-        number(value, name, "a distance [m]", low=0.0, high=1.0)
+        check_number(value, name, "a distance [m]", low=0.0, high=1.0)
     search = _Search(item, robot, dist_safe, grasp_clearance, most)
     found = [
         proposal

@@ -15,7 +15,7 @@ from vkc_pin.importing.proposals.hand import make_hand
 from vkc_pin.importing.robots.envelopes import find_envelopes
 from vkc_pin.importing.robots.rest_configuration import Clearances, find_inseparable_pairs
 from vkc_pin.options import Options
-from vkc_pin.utils.arguments import number, whole
+from vkc_pin.utils.arguments import check_integer, check_number
 from vkc_pin.world.files.meshes import load_mesh
 from vkc_pin.world.models.couplings.limits import DEFAULT_JOINT_VELOCITY
 from vkc_pin.world.models.dynamics.torque_limits import UNLIMITED
@@ -110,11 +110,11 @@ def doctor(
     Raises:
         InputError: The robot cannot be loaded, or an argument is invalid.
     """
-    whole(samples, "samples", low=1)
+    check_integer(samples, "samples", low=1)
     clearance = (
         Options().dist_safe
         if margin is None
-        else number(margin, "margin", "a clearance [m]", low=0.0, above=True)
+        else check_number(margin, "margin", "a clearance [m]", low=0.0, strict=True)
     )
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -308,7 +308,7 @@ def _check_hand(robot: Robot) -> list[Finding]:
 
 def _check_shapes(robot: Robot) -> list[Finding]:
     findings, link_of_mesh = [], {}
-    for shape in robot.file.shapes("collision"):
+    for shape in robot.file.read_shapes("collision"):
         if shape.file is not None and (shape.file, shape.size) not in link_of_mesh:
             link_of_mesh[shape.file, shape.size] = shape.link
     concave = []

@@ -30,7 +30,7 @@ def find_envelopes(robot: Robot) -> dict[str, float]:
             tool frame.
     """
     joint = robot.model.frames[robot.model.getFrameId(robot.tool_frame)].parentJoint
-    visible = {shape.link for shape in robot.file.shapes("visual")}
+    visible = {shape.link for shape in robot.file.read_shapes("visual")}
     surfaces: dict[str, list[tuple[Floats, Floats]]] = {}
     for k, shape in enumerate(robot.collision.geometryObjects):
         if shape.parentJoint == joint:

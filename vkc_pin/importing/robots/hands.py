@@ -343,10 +343,10 @@ def _sample_points(file: UrdfFile, links: Sequence[str]) -> dict[str, Floats]:
     points_by_link: dict[str, Floats] = {}
     for kind in ("collision", "visual"):
         new: dict[str, list[Floats]] = {}
-        for shape in file.shapes(kind):
+        for shape in file.read_shapes(kind):
             if shape.link in links and shape.link not in points_by_link:
                 try:
-                    mesh = shape.mesh()
+                    mesh = shape.make_mesh()
                 except InputError:
                     continue
                 corners, sampled = (

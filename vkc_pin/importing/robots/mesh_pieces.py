@@ -70,7 +70,7 @@ def write_meshes(
     stems = dict(zip(links, choose_file_names(links), strict=True))
     decompositions, notes = list[Piece](), list[str]()
     shapes: dict[str, list[UrdfShape]] = {}
-    for shape in file.shapes("collision"):
+    for shape in file.read_shapes("collision"):
         shapes.setdefault(shape.link, []).append(shape)
     # Pieces and hull volume by mesh file and scale
     done: dict[tuple[Path, tuple[float, ...]], tuple[Pieces, float]] = {}

@@ -16,7 +16,7 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.optional_imports import optional_package
+from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.world.files.xml import replace_forbidden
 
@@ -50,7 +50,7 @@ def convert_mjcf(file: Path, folder: Path) -> ConvertedRobot:
     Raises:
         InputError: MuJoCo is not installed or cannot read the file; the error contains its message.
     """
-    mujoco = optional_package("mujoco", "import", what="an MJCF file", file=file)
+    mujoco = import_optional("mujoco", "import", purpose="an MJCF file", file=file)
     try:
         model = mujoco.MjModel.from_xml_path(str(file.resolve()))
     except (ValueError, RuntimeError) as error:

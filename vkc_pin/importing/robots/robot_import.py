@@ -38,11 +38,11 @@ from vkc_pin.importing.robots.rest_configuration import (
 from vkc_pin.importing.robots.sources import Source, choose_free_name, read_source
 from vkc_pin.importing.targets import check_target, format_comment, get_origin_marker
 from vkc_pin.options import Options
-from vkc_pin.utils.arguments import flag, mapping, text, whole
+from vkc_pin.utils.arguments import check_bool, check_integer, check_mapping, check_text
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.files.resources import choose_file_names, file_path
+from vkc_pin.world.files.resources import check_path, choose_file_names
 from vkc_pin.world.files.urdf import UrdfFile
-from vkc_pin.world.files.writing import folder_at_once
+from vkc_pin.world.files.writing import write_folder_atomically
 from vkc_pin.world.files.xml import replace_forbidden
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
@@ -122,24 +122,26 @@ def import_robot(
             extra `import` is missing.
         UnknownNameError: The arm or frame is unknown; the error names the nearest one.
     """
-    path = file_path(file, "file", "a URDF, xacro or MJCF file")
+    path = check_path(file, "file", "a URDF, xacro or MJCF file")
     (name,) = choose_file_names([path.name.split(".")[0]], fallback="robot")
-    target = Path(name) if folder is None else file_path(folder, "folder", "a folder")
+    target = Path(name) if folder is None else check_path(folder, "folder", "a folder")
     for field, given in (("arm", arm), ("tool_frame", tool_frame)):
         if given is not None:
-            text(given, field, "a name")
-    whole(most_pieces, "most_pieces", low=1)
-    whole(samples, "samples", low=1)
+            check_text(given, field, "a name")
+    check_integer(most_pieces, "most_pieces", low=1)
+    check_integer(samples, "samples", low=1)
     places = {
-        key: file_path(place, f"packages.{key}")
-        for key, place in mapping(packages or {}, "packages").items()
+        key: check_path(place, f"packages.{key}")
+        for key, place in check_mapping(packages or {}, "packages").items()
     }
     given_arguments = {
-        key: str(value) for key, value in mapping(arguments or {}, "arguments").items()
+        key: str(value) for key, value in check_mapping(arguments or {}, "arguments").items()
     }
-    srdf_path = None if srdf is None else file_path(srdf, "srdf")
-    check_target(target, "import-robot", force=flag(force, "force"))
-    with folder_at_once(target, force=True) as staging:  # `check_target` allowed replacing it
+    srdf_path = None if srdf is None else check_path(srdf, "srdf")
+    check_target(target, "import-robot", force=check_bool(force, "force"))
+    with write_folder_atomically(
+        target, force=True
+    ) as staging:  # `check_target` allowed replacing it
         source = read_source(
             path, staging / ".meshes", packages=places, arguments=given_arguments, srdf=srdf_path
         )
@@ -163,10 +165,10 @@ class _Importer:
         self, arm: str | None, tool_frame: str | None, most_pieces: int, samples: int, seed: int
     ) -> ImportedRobot:
         """Write all files into the folder."""
-        solid = {shape.link for shape in self._file.shapes("collision")}
+        solid = {shape.link for shape in self._file.read_shapes("collision")}
         if not solid:
             self._use_visual_shapes()
-            solid = {shape.link for shape in self._file.shapes("collision")}
+            solid = {shape.link for shape in self._file.read_shapes("collision")}
         if tool_frame is not None and tool_frame not in (names := sorted(self._get_names())):
             raise UnknownNameError(
                 "frame", tool_frame, names, file=self._file.path, field="tool_frame"
@@ -213,7 +215,7 @@ class _Importer:
             for visual in link.findall("visual"):
                 element = ElementTree.SubElement(link, "collision")
                 element.extend(child for child in visual if child.tag in ("origin", "geometry"))
-        if not self._file.shapes("collision"):
+        if not self._file.read_shapes("collision"):
             raise InputError(
                 "the robot has no shapes",
                 file=self._file.path,

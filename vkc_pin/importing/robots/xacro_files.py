@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import Any
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.optional_imports import optional_package
+from vkc_pin.utils.optional_imports import import_optional
 
 __all__ = ["expand_xacro"]
 
@@ -28,9 +28,9 @@ def expand_xacro(file: Path, packages: Mapping[str, Path], arguments: Mapping[st
         InputError: xacro is not installed, or it cannot process the file; the error contains its
             message.
     """
-    xacro = optional_package("xacro", "import", what="a xacro file", file=file)
-    substitution = optional_package(
-        "xacro.substitution_args", "import", what="a xacro file", file=file
+    xacro = import_optional("xacro", "import", purpose="a xacro file", file=file)
+    substitution = import_optional(
+        "xacro.substitution_args", "import", purpose="a xacro file", file=file
     )
     messages = io.StringIO()
     try:

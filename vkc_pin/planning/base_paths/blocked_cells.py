@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from vkc_pin.planning.base_paths.base_clearance import DIRECTIONS, Shape, compute_hull_points
 from vkc_pin.utils.arrays import Bools, Floats, Ints
-from vkc_pin.utils.budget import spend
+from vkc_pin.utils.budget import record_evaluations
 
 __all__ = ["Lattice", "Solid", "SupportCache", "find_colliding_cells", "make_solids", "slice_solid"]
 
@@ -265,7 +265,7 @@ def _fill_cells(
         for known, index, number, which in zip(parts, indices, (i, j), (solid, other), strict=True):
             key = (number, 0.0, 0.0) if which.prism else (number, low, high)
             index.append(known.setdefault(key, (len(known), (which, *key[1:])))[0])
-    spend()
+    record_evaluations()
     moving, standing = np.array(indices)
     cosine, sine = np.cos(lattice.yaws)[:, None], np.sin(lattice.yaws)[:, None]
     turned = -np.stack(
@@ -279,7 +279,7 @@ def _fill_cells(
     other_support, other_overshoot = views.get(
         [part for _, part in parts[1].values()], DIRECTIONS[None]
     )
-    spend()
+    record_evaluations()
     allowed = (
         _MIN_COSINE * margin - overshoot[moving] - other_overshoot[standing] - _ROUNDING
     )  # (pairs, H)

@@ -13,9 +13,9 @@ from vkc_pin.errors import InputError
 from vkc_pin.planning.base_paths.base_clearance import DIRECTIONS, MovingShapes, Obstacles, Shape
 from vkc_pin.planning.base_paths.blocked_cells import Lattice, SupportCache, find_colliding_cells
 from vkc_pin.utils.arrays import Bools, Floats, Ints
-from vkc_pin.utils.budget import spend
+from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.utils.cache import Cache
-from vkc_pin.utils.optional_imports import compiled_module
+from vkc_pin.utils.optional_imports import import_compiled
 
 __all__ = ["HEADINGS", "BaseGrid", "compute_fine_cell_count"]
 
@@ -312,7 +312,7 @@ class BaseGrid:
         shape = (self.cells, self.cells)
         rooms = (np.full(shape, _MAX_CLEARANCE), np.full(shape, _MAX_CLEARANCE))
         for s, support in enumerate(self.base.world.support):
-            spend()
+            record_evaluations()
             reach = max(float(body.exclusion_radius[s]) for body in bodies) + _MAX_CLEARANCE
             if reach < 0.0:  # no shape can hit it
                 continue
@@ -361,5 +361,5 @@ class BaseGrid:
     @cached_property
     def _floor(self) -> Any:
         """Compiled search of distances over the cells, turning being free."""
-        module = compiled_module("vkc_pin.planning.base_paths._driving")
+        module = import_compiled("vkc_pin.planning.base_paths._driving")
         return module.Floor(self.blocked.view(np.uint8), self.moves, self.lengths)

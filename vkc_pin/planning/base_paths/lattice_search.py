@@ -27,8 +27,8 @@ from vkc_pin.planning.base_paths.motion_primitives import (
     wrap_angle,
 )
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.budget import spend
-from vkc_pin.utils.optional_imports import compiled_module
+from vkc_pin.utils.budget import record_evaluations
+from vkc_pin.utils.optional_imports import import_compiled
 
 __all__ = ["find_cheapest_path"]
 
@@ -54,7 +54,7 @@ def find_cheapest_path(
         return None
     search = _Search(ends)
     while True:
-        spend(1)
+        record_evaluations(1)
         limit = ends.direct[-1][0] if ends.direct else _NONE
         cost, end, begin, nodes = search.paths.cheapest(limit)
         if len(nodes):
@@ -90,7 +90,7 @@ class _Search:
         costs = np.column_stack(
             [lengths, np.rint(BACKWARDS * grid.lengths / UNIT), left, np.roll(left, 1)]
         )
-        self.paths = compiled_module("vkc_pin.planning.base_paths._driving").Paths(
+        self.paths = import_compiled("vkc_pin.planning.base_paths._driving").Paths(
             self._make_flags(),
             grid.moves.astype(np.int64),
             np.maximum(costs, 1.0).astype(np.int64),

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.optional_imports import compiled_module
+from vkc_pin.utils.optional_imports import import_compiled
 
 __all__ = ["compute_lengths", "find_shortest_path_pieces"]
 
@@ -52,7 +52,7 @@ def find_shortest_path_pieces(goal: Floats, radius: float) -> list[tuple[float, 
 def _compute_words(goals: Floats) -> Floats:
     """Return lengths in radii and turns of the pieces of paths, (B, 5, 2); 0 if unused."""
     return np.asarray(
-        compiled_module("vkc_pin.planning.base_paths._driving").shortest_words(
+        import_compiled("vkc_pin.planning.base_paths._driving").shortest_words(
             np.ascontiguousarray(goals, float)
         )
     )

@@ -13,7 +13,7 @@ import pinocchio as pin
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.planning.chain.inversion import invert
 from vkc_pin.planning.chain.kinematics import Kinematics, get_kinematics
-from vkc_pin.utils.arguments import instance
+from vkc_pin.utils.arguments import check_instance
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.models.coordinates import Coordinates
@@ -266,9 +266,9 @@ def consolidate(
         InputError: Two grasps move the same joint, or a freedom of a grasp has the name of a joint
             of its object.
     """
-    robot = instance(scene, Scene, "scene").robot
+    robot = check_instance(scene, Scene, "scene").robot
     holds = resolve_holds(scene.objects, make_holds(holds) if isinstance(holds, Mapping) else holds)
-    cache = Cache() if cache is None else instance(cache, Cache, "cache")
+    cache = Cache() if cache is None else check_instance(cache, Cache, "cache")
     model, collision = pin.Model(robot.model), pin.GeometryModel()
     graft_geometry(
         collision,

@@ -15,7 +15,7 @@ from vkc_pin.planning.chain.chain import VirtualKinematicChain
 from vkc_pin.planning.chain.easing import REDUCED_MARGIN_RATIO, find_reduced_margins
 from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.utils.budget import spend
+from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.world.collision.margins import MarginRegion
 from vkc_pin.world.models.shapes import compute_bounding_box, get_link_name, get_local_name
 from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions, make_shape_keys
@@ -158,7 +158,7 @@ class _PairBuilder:
                 shape.name = f"{name}.{shape.name}"
                 shapes.append(shape)
                 labels.append(label)
-        spend()
+        record_evaluations()
         attached = {
             i
             for name, indices in attached_shapes.items()

@@ -22,7 +22,7 @@ from vkc_pin.planning.chain.chain import VirtualKinematicChain
 from vkc_pin.planning.chain.collision_pairs import build_phase_geometries
 from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.utils.budget import spend
+from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.world.collision.clearances import Clearances
 from vkc_pin.world.collision.placements import ShapePlacements
 from vkc_pin.world.collision.shapes import Shapes
@@ -211,7 +211,7 @@ class ContactModel:
             static: Whether pairs with geometry fixed in the world count; otherwise only pairs of
                 two moving geometries.
         """
-        spend(len(z))
+        record_evaluations(len(z))
         q, phase_of = self.chain.coordinates.q(z), self.find_phases(waypoints)
         parts: list[tuple[NDArray[Any], ...]] = []
         for number in dict.fromkeys(phase_of.tolist()):
@@ -249,7 +249,7 @@ class ContactModel:
         found = clearances.find_first_violation(
             self.chain.coordinates.q(z), z, waypoint, reach=reach, allowed=allowed
         )
-        spend(min(found + 1, len(z)))
+        record_evaluations(min(found + 1, len(z)))
         return found
 
     def make_line_checker(

@@ -10,7 +10,7 @@ from vkc_pin.planning.chain.kinematics import get_kinematics
 from vkc_pin.planning.chain.pose import PoseRow, build_pose_residual, flatten_target
 from vkc_pin.planning.kinematics.batch import BatchFunction
 from vkc_pin.utils.arrays import Bools, Floats
-from vkc_pin.utils.budget import spend
+from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.utils.cache import Cache
 
 __all__ = ["MAX_STEP", "PoseSolver"]
@@ -93,7 +93,7 @@ class PoseSolver:
         errors = np.empty(len(z))
         unsolved, rows = np.arange(len(z)), z  # unsolved configurations and their limits
         for remaining in range(iterations, -1, -1):
-            spend(len(rows))
+            record_evaluations(len(rows))
             error, moved = self._step_function(rows, goal, lower, upper, weights)
             errors[unsolved] = error[:, 0]
             is_unsolved = error[:, 0] >= tolerance

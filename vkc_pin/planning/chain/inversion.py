@@ -10,7 +10,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arguments import instance
+from vkc_pin.utils.arguments import check_instance
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.world.models.coordinates import Coordinates
@@ -63,7 +63,7 @@ def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
         UnknownNameError: The object has no such link.
         InputError: `state` has the wrong size, or a joint on the path cannot be inverted.
     """
-    source = instance(obj, ArticulatedObject, "obj").model
+    source = check_instance(obj, ArticulatedObject, "obj").model
     root = source.frames[obj.link_frame(link)]
     data = source.createData()
     pin.forwardKinematics(source, data, obj.coordinates.q(state))

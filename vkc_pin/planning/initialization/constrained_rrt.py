@@ -60,7 +60,7 @@ def find_constrained_path(
         no path was found.
 
     Raises:
-        SpentError: The planning budget is exhausted.
+        BudgetExhaustedError: The planning budget is exhausted.
     """
     search = _Search(sampler, phase, steps)
     path = search.run(through, tries)

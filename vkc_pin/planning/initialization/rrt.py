@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 from vkc_pin.planning.initialization.keyframes import compute_shortfall, sample_smoothstep
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.budget import spend
-from vkc_pin.utils.optional_imports import compiled_module
+from vkc_pin.utils.budget import record_evaluations
+from vkc_pin.utils.optional_imports import import_compiled
 
 __all__ = ["MAX_EXTENSIONS", "STEP", "connect", "has_arm_detour", "resample_path"]
 
@@ -182,11 +182,11 @@ class _Search:
             np.array([len(run) for run in self.free_runs], np.int64),
             int(self.rng.integers(2**63)),
         )
-        module = compiled_module("vkc_pin.planning.initialization._trees")
+        module = import_compiled("vkc_pin.planning.initialization._trees")
         return module.Trees(self._lines, *rows, lengths, _PATH_SPREAD, _END_SPREAD, seed)
 
     def _spend(self) -> None:
-        spend(self._lines.looked())
+        record_evaluations(self._lines.looked())
 
     def is_free(self, path: Floats) -> bool:
         """Return whether a path, shape (K, m), is nearly collision-free."""

@@ -17,7 +17,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.utils.arguments import instance, items, known, whole
+from vkc_pin.utils.arguments import check_choice, check_instance, check_integer, check_list
 
 if TYPE_CHECKING:
     import casadi
@@ -89,7 +89,7 @@ def frame_placements(model: pin.Model, frames: Sequence[str | int]) -> casadi.Fu
         InputError: Several different frames of the model have this name.
         BuildError: The compiled module is missing or does not fit the installed packages.
     """
-    listed: tuple[Any, ...] = items(
+    listed: tuple[Any, ...] = check_list(
         [frames] if isinstance(frames, str) else frames, "frames", "a list of frames"
     )
     indices = [_find_frame(model, frame, f"frames[{i}]") for i, frame in enumerate(listed)]
@@ -119,7 +119,7 @@ def frame_jacobian(
         InputError: Several different frames of the model have this name.
         BuildError: The compiled module is missing or does not fit the installed packages.
     """
-    known(reference, _REFERENCE_FRAMES, "reference", "reference")
+    check_choice(reference, _REFERENCE_FRAMES, "reference", "reference")
     index = _find_frame(model, frame, "frame")
     return _get_backend()(
         "frame_jacobian", _round_quarter_turns(model), index, _REFERENCE_FRAMES[reference]
@@ -161,7 +161,7 @@ def _find_frame(model: pin.Model, frame: str | int, field: str) -> int:
     """Return the checked index of `frame` in `model.frames`."""
     names = [f.name for f in _round_quarter_turns(model).frames]
     if not isinstance(frame, str):
-        number = whole(frame, field, low=-1)
+        number = check_integer(frame, field, low=-1)
         if not 0 <= number < len(names):
             raise UnknownNameError("frame", str(number), [f"0 to {len(names) - 1}"], field=field)
         return number
@@ -189,7 +189,7 @@ def _round_quarter_turns(model: pin.Model) -> pin.Model:
     import numpy as np
     import pinocchio as pin
 
-    copy = instance(model, pin.Model, "model").copy()
+    copy = check_instance(model, pin.Model, "model").copy()
     for placement in [*copy.jointPlacements, *(frame.placement for frame in copy.frames)]:
         rotation, nearest = placement.rotation, np.round(placement.rotation)
         placement.rotation = np.where(np.abs(rotation - nearest) <= 4e-16, nearest, rotation)

@@ -15,7 +15,7 @@ import casadi
 import pinocchio as pin
 
 from vkc_pin.errors import BuildError
-from vkc_pin.utils.optional_imports import REBUILD, compiled_module
+from vkc_pin.utils.optional_imports import REBUILD_HINT, import_compiled
 
 __all__ = ["build_compiled", "build_upstream", "check_versions"]
 
@@ -55,7 +55,7 @@ def check_versions(built: dict[str, str], installed: dict[str, str]) -> None:
         )
         raise BuildError(
             f"vkc_pin.planning.kinematics was compiled against {mismatches}. "
-            f"Either pip install {requirements}, or {REBUILD}"
+            f"Either pip install {requirements}, or {REBUILD_HINT}"
         )
 
 
@@ -67,14 +67,14 @@ def _parse_release(version: str) -> tuple[int, int]:
     except (IndexError, ValueError):
         raise BuildError(
             f"cannot read the version '{version}' of a library that "
-            f"vkc_pin.planning.kinematics needs; {REBUILD}"
+            f"vkc_pin.planning.kinematics needs; {REBUILD_HINT}"
         ) from None
 
 
 @cache
 def _import_extension() -> Any:
     """Import the compiled module once and check its versions."""
-    extension = compiled_module("vkc_pin.planning.kinematics._cpin")
+    extension = import_compiled("vkc_pin.planning.kinematics._cpin")
     check_versions(
         {"pin": extension.PINOCCHIO_VERSION, "casadi": extension.CASADI_VERSION},
         {"pin": pin.__version__, "casadi": casadi.__version__},

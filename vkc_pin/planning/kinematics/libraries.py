@@ -11,9 +11,15 @@ import stat
 import time
 from pathlib import Path
 
-from vkc_pin.utils.disk_cache import TEMPORARY, VARIABLE, folder, only_mine, write_whole
+from vkc_pin.utils.disk_cache import (
+    CACHE_VARIABLE,
+    TEMPORARY_PREFIX,
+    find_cache_folder,
+    is_private,
+    write_private_file,
+)
 
-__all__ = ["BUILD", "VARIABLE", "Libraries"]
+__all__ = ["BUILD", "CACHE_VARIABLE", "Libraries"]
 
 BUILD = ".build-"
 """Start of the names of folders in which libraries are compiled."""
@@ -28,7 +34,7 @@ _RETRY_DELAY = 86400.0
 # Names of the files and folders that the package creates here. No others are removed or executed.
 _RANDOM_SUFFIX = "[a-z0-9_]{8}"  # suffix of names by `tempfile`
 _FILE_PATTERN = re.compile(
-    rf"[0-9a-f]{{40}}\.(?:so|json|job|failed)|{re.escape(TEMPORARY)}{_RANDOM_SUFFIX}"
+    rf"[0-9a-f]{{40}}\.(?:so|json|job|failed)|{re.escape(TEMPORARY_PREFIX)}{_RANDOM_SUFFIX}"
 )
 _BUILD_PATTERN = re.compile(re.escape(BUILD) + _RANDOM_SUFFIX)
 _DIGEST_SIZE = hashlib.sha256().digest_size  # bytes appended to a library; loaders ignore them
@@ -54,7 +60,7 @@ class Libraries:
 
         Returns None if there is none, or if other users might have written to it.
         """
-        path = folder()
+        path = find_cache_folder()
         return None if path is None else cls(path)
 
     def exists(self, key: str) -> bool:
@@ -69,7 +75,7 @@ class Libraries:
                 os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb"
             ) as stream:
                 status = os.fstat(stream.fileno())
-                if not stat.S_ISREG(status.st_mode) or not only_mine(status):
+                if not stat.S_ISREG(status.st_mode) or not is_private(status):
                     return None
                 data = stream.read()
         except OSError:
@@ -100,7 +106,7 @@ class Libraries:
         """Return the contents of a pending job."""
         path = self.path / f"{key}.job"
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as stream:
-            if not only_mine(os.fstat(stream.fileno())):
+            if not is_private(os.fstat(stream.fileno())):
                 raise PermissionError(f"others may have written {path}")
             return stream.read()
 
@@ -183,4 +189,4 @@ class Libraries:
         fcntl.flock(handle, fcntl.LOCK_UN)
 
     def _write(self, name: str, data: bytes) -> None:
-        write_whole(self.path / name, data)
+        write_private_file(self.path / name, data)

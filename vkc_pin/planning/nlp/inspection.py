@@ -12,7 +12,7 @@ import numpy as np
 from vkc_pin.options import Options
 from vkc_pin.planning.chain.contacts import ContactModel
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.utils.arguments import instance
+from vkc_pin.utils.arguments import check_instance
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.scene.scene import Scene
@@ -170,9 +170,9 @@ def build(
     Raises:
         InputError: The steps or terms refer to an unknown name, or the task is impossible.
     """
-    options = Options() if options is None else instance(options, Options, "options")
-    cache = None if cache is None else instance(cache, Cache, "cache")
-    instance(scene, Scene, "scene")
+    options = Options() if options is None else check_instance(options, Options, "options")
+    cache = None if cache is None else check_instance(cache, Cache, "cache")
+    check_instance(scene, Scene, "scene")
     task, terms = compile_task(scene, steps, options), trace_terms(scene, terms)
     check_terms_active(terms, summarize_phases(task))
     return TrajectoryProblem(scene, task, options, terms, cache=cache)

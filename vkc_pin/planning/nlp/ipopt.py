@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.budget import SpentError, spend
+from vkc_pin.utils.budget import BudgetExhaustedError, record_evaluations
 
 __all__ = ["BYTES_PER_ENTRY", "Ipopt", "Monitor", "make_ipopt"]
 
@@ -51,8 +51,8 @@ class Monitor(ca.Callback):
     def eval(self, arguments: list[ca.DM]) -> list[int]:
         """Return [1] (stop) if the budget is exhausted, otherwise [0]."""
         try:
-            spend(self._waypoints)
-        except SpentError:
+            record_evaluations(self._waypoints)
+        except BudgetExhaustedError:
             return [1]
         return [0]
 
@@ -138,7 +138,7 @@ def make_ipopt(
     defaults = {"print_time": False, "record_time": True, "calc_lam_p": False, "no_nlp_grad": True}
     monitor = Monitor(x.numel(), g.numel(), parameters.numel(), waypoints)
     callback = {"iteration_callback": monitor}
-    spend()
+    record_evaluations()
     program = {"x": x, "p": parameters, "f": f, "g": g}
     solver = ca.nlpsol(
         "trajectory", "ipopt", program, {**defaults, **functions, **callback, **options}

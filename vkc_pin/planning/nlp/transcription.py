@@ -26,7 +26,7 @@ from vkc_pin.planning.nlp.sparse import assemble, make_curvature, make_differenc
 from vkc_pin.planning.nlp.term_rows import TermProgram
 from vkc_pin.planning.nlp.waypoint import StepRows, Structure, get_waypoint_functions
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.utils.budget import spend
+from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.trajectory.wheels import RollingLimits
@@ -73,7 +73,7 @@ class Transcription:
         self.uncompiled_functions: list[MachineCode] = []
         self._make_symbols()
         for part in (self._make_objective, self._make_constraints, self._make_rates):
-            spend()
+            record_evaluations()
             part()
         self.pose_solvers = [PoseSolver(structure.model, pose, cache) for pose in structure.poses]
 
@@ -444,6 +444,6 @@ def transcribe(structure: Structure, cache: Cache) -> Transcription:
         code.try_load() for code in program.uncompiled_functions
     ):
         return program
-    cache.drop(*key)
-    cache.drop("ipopt", structure.key)
+    cache.evict(*key)
+    cache.evict("ipopt", structure.key)
     return cache.get(key, lambda: Transcription(structure, cache))

@@ -20,7 +20,7 @@ from vkc_pin.planning.kinematics.machine_code import MachineCode
 from vkc_pin.planning.nlp.sparse import assemble
 from vkc_pin.planning.nlp.term_rows import TermRow
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.utils.budget import spend
+from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.trajectory.wheels import OMNIDIRECTIONAL, RollingLimits
@@ -121,7 +121,7 @@ class WaypointFunctions:
         variables = ca.vertcat(z, s, relaxation)
         plane_jacobian = ca.horzcat(coordinate_jacobian, ca.SX.eye(slots), ca.SX(slots, 1))
         jacobian = ca.vertcat(plane_jacobian, ca.jacobian(pose_values, variables))
-        spend()
+        record_evaluations()
         w = ca.SX.sym("w", 12 * joints)
         hessian = ca.triu(
             ca.hessian(ca.dot(w, stacked) + ca.dot(pose_multipliers, pose_values), variables)[0]
@@ -133,10 +133,10 @@ class WaypointFunctions:
             z, relaxation, targets, pose_offsets, planes.T @ plane_multipliers, multipliers
         )
         inputs = [variables, ca.vec(planes), offsets, ca.vec(targets), ca.vec(pose_offsets)]
-        spend()
+        record_evaluations()
         self.value = ca.Function("g", inputs, [rows])
         self.jacobian = ca.Function("rows_jacobian", inputs, [ca.vertcat(*jacobian.nonzeros())])
-        spend()
+        record_evaluations()
         self.jacobian_pattern = jacobian.sparsity().get_triplet()
         self.hessian = ca.Function(
             "lagrangian_hessian", [*inputs, multipliers], [ca.vertcat(*hessian.nonzeros())]

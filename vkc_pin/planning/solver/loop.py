@@ -23,7 +23,7 @@ from vkc_pin.planning.solver.trust_region import (
 )
 from vkc_pin.planning.solver.tunnelling import Crossing, find_new_crossings
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.budget import ENDINGS, SpentError, spend
+from vkc_pin.utils.budget import STOP_STATUSES, BudgetExhaustedError, record_evaluations
 
 __all__ = ["solve"]
 
@@ -205,12 +205,12 @@ def solve(
     try:
         loop.begin()
         _iterate(loop, region, callback, loop.options.max_outer if rounds is None else rounds)
-    except SpentError as end:
+    except BudgetExhaustedError as end:
         solution.status = "converged" if solution.converged else str(end)
     # Rounds after the first feasible one only try to shorten the trajectory.
     if loop.feasible is not None:
         solution.z, solution.dt = loop.feasible
-    elif solution.status not in ENDINGS:
+    elif solution.status not in STOP_STATUSES:
         shortfall = problem.evaluate_contacts(
             solution.z, reach=problem.options.largest_margin, nearest=1
         ).compute_violation()
@@ -228,7 +228,7 @@ def _iterate(
     shortfall, nearly = loop.found.amounts["clearance"], _is_nearly_feasible(loop.found)
     best = float("inf")  # objective of the last feasible trajectory
     for _ in range(rounds):
-        spend()
+        record_evaluations()
         trial = loop.try_step(region.radius)
         before, after = loop.compute_penalties(trial)
         accepted = loop.is_acceptable(trial, before, after)

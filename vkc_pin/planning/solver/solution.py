@@ -49,7 +49,7 @@ class Solution:
         z: Best iterate z_1..z_N, shape (N, n).
         dt: Its time steps, shape (N,) [s].
         converged: Whether the loop met its own convergence criteria.
-        status: "converged", "not converged", or one of `budget.ENDINGS`.
+        status: "converged", "not converged", or one of `budget.STOP_STATUSES`.
         shortfall: Largest clearance violation at a waypoint [m] of a solution that did not
             converge, if it is too large for `validation` to accept; otherwise 0.
         radius: Final trust-region radii, shape (N,) [m] or [rad].

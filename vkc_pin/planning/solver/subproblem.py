@@ -14,7 +14,7 @@ from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.nlp.timing import Timing
 from vkc_pin.planning.solver.solution import Solution
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.optional_imports import compiled_module
+from vkc_pin.utils.optional_imports import import_compiled
 
 __all__ = ["Step", "Subproblem", "make_linear_solver_options"]
 
@@ -53,7 +53,7 @@ def make_linear_solver_options() -> dict[str, Any]:
     """
     return {
         "ipopt.linear_solver": "ma27",
-        "ipopt.hsllib": compiled_module("vkc_pin.planning.solver._kkt").__file__,
+        "ipopt.hsllib": import_compiled("vkc_pin.planning.solver._kkt").__file__,
         "ipopt.linear_system_scaling": "none",
         "ipopt.ma27_la_init_factor": 1.0,  # the factorization is not stored in Ipopt's arrays
     }

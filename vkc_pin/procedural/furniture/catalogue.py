@@ -16,8 +16,8 @@ from vkc_pin.errors import InputError
 from vkc_pin.procedural.furniture import flaps, leaves, valves
 from vkc_pin.procedural.furniture.building import ObjectBuilder
 from vkc_pin.procedural.furniture.draws import Sampler
-from vkc_pin.utils.arguments import known, mapping, whole
-from vkc_pin.world.files.resources import file_path
+from vkc_pin.utils.arguments import check_choice, check_integer, check_mapping
+from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.models.object_file import load_object
 
@@ -73,8 +73,8 @@ def random_object(kind: str, seed: int = 0) -> dict[str, Any]:
         UnknownNameError: There is no such kind.
         InputError: `seed` is not an integer of at least 0.
     """
-    own = KINDS[known(kind, KINDS, "kind of furniture", "kind")]
-    rng = np.random.default_rng([4, zlib.crc32(kind.encode()), whole(seed, "seed", low=0)])
+    own = KINDS[check_choice(kind, KINDS, "kind of furniture", "kind")]
+    rng = np.random.default_rng([4, zlib.crc32(kind.encode()), check_integer(seed, "seed", low=0)])
     return own.make(Sampler(rng)).description
 
 
@@ -91,7 +91,7 @@ def write_object(description: Mapping[str, Any], path: str | Path) -> Path:
     Raises:
         InputError: The description is invalid, or a file cannot be written.
     """
-    plain, file = mapping(description, "description"), file_path(path, "path")
+    plain, file = check_mapping(description, "description"), check_path(path, "path")
     if file.suffix not in (".yaml", ".yml"):
         raise InputError(
             "not an object file",

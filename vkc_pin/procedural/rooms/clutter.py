@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arguments import instance, whole
+from vkc_pin.utils.arguments import check_instance, check_integer
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.placed_object import make_world_shapes
@@ -71,8 +71,8 @@ def add_clutter(
     Raises:
         InputError: There is no space for so many objects.
     """
-    things, seed = whole(things, "things", low=0), whole(seed, "seed", low=0)
-    faces = _Faces(instance(scene, Scene, "scene"), clear)
+    things, seed = check_integer(things, "things", low=0), check_integer(seed, "seed", low=0)
+    faces = _Faces(check_instance(scene, Scene, "scene"), clear)
     rng = np.random.default_rng([5, seed])
     placed = [faces.place(f"clutter_{number + 1}", rng) for number in range(things)]
     document = {**scene.document, "obstacles": [*scene.document.get("obstacles", ()), *placed]}

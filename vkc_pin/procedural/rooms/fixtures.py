@@ -15,7 +15,7 @@ import pinocchio as pin
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.procedural.furniture.catalogue import KINDS, random_object
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.files.resources import available
+from vkc_pin.world.files.resources import list_resources
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.shapes import compute_world_box
@@ -96,7 +96,7 @@ def list_openable_types() -> list[str]:
     return [
         *OPENABLE,
         *(RANDOM + kind for kind in KINDS),
-        *(name for name in available("scenes", "objects/*.yaml") if name not in OPENABLE),
+        *(name for name in list_resources("scenes", "objects/*.yaml") if name not in OPENABLE),
     ]
 
 

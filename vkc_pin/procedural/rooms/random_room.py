@@ -17,8 +17,8 @@ from vkc_pin.procedural.rooms.fixtures import OPENABLE, Fixture, make_fixture, m
 from vkc_pin.procedural.rooms.footprints import Floor, Frame
 from vkc_pin.procedural.rooms.parts import Part
 from vkc_pin.procedural.rooms.settings import RoomSettings
-from vkc_pin.utils.arguments import instance, whole
-from vkc_pin.world.files.resources import folder
+from vkc_pin.utils.arguments import check_instance, check_integer
+from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.models.shapes import compute_world_box
@@ -81,7 +81,7 @@ class Layout:
             ],
             "objects": [entry for part in self.parts for entry in part.objects],
         }
-        return Scene.from_document(document, folder("scenes"))
+        return Scene.from_document(document, find_resource_folder("scenes"))
 
 
 def random_room(number: int, settings: RoomSettings | None = None, **changes: Any) -> Scene:
@@ -107,13 +107,13 @@ def random_room(number: int, settings: RoomSettings | None = None, **changes: An
 
 def sample_layout(number: int, settings: RoomSettings | None = None, **changes: Any) -> Layout:
     """Return the layout of a random room; see `random_room`."""
-    number = whole(number, "number", low=0)
+    number = check_integer(number, "number", low=0)
     known = [item.name for item in dataclasses.fields(RoomSettings)]
     for name in changes:
         if name not in known:
             raise UnknownNameError("field of RoomSettings", name, known, field=name)
     chosen = dataclasses.replace(
-        RoomSettings() if settings is None else instance(settings, RoomSettings, "settings"),
+        RoomSettings() if settings is None else check_instance(settings, RoomSettings, "settings"),
         **changes,
     )
     rng, radius = (

@@ -7,11 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.errors import InputError, shown
+from vkc_pin.errors import InputError, format_value
 from vkc_pin.procedural.rooms.fixtures import list_openable_types
 from vkc_pin.procedural.rooms.parts import CARRIED
-from vkc_pin.utils.arguments import is_number, items, known, mapping, text, whole
-from vkc_pin.world.files.resources import file_path
+from vkc_pin.utils.arguments import (
+    check_choice,
+    check_integer,
+    check_list,
+    check_mapping,
+    check_text,
+    is_number,
+)
+from vkc_pin.world.files.resources import check_path
 
 __all__ = ["RoomSettings"]
 
@@ -55,27 +62,32 @@ class RoomSettings:
         expected = "two lengths of 4 to 20 m, the lower one first"
         if not isinstance(self.width, tuple | list) or len(self.width) != 2:
             raise InputError(
-                "not an interval", field="width", expected=expected, got=shown(self.width)
+                "not an interval", field="width", expected=expected, got=format_value(self.width)
             )
         for value in self.width:
             _check_range("width", value, 4.0, 20.0)
         if self.width[0] > self.width[1]:
             raise InputError(
-                "the interval is empty", field="width", expected=expected, got=shown(self.width)
+                "the interval is empty",
+                field="width",
+                expected=expected,
+                got=format_value(self.width),
             )
         object.__setattr__(self, "width", tuple(map(float, self.width)))
-        object.__setattr__(self, "tables", whole(self.tables, "tables", low=0, high=10))
+        object.__setattr__(self, "tables", check_integer(self.tables, "tables", low=0, high=10))
         if self.objects is not None:
             object.__setattr__(
                 self,
                 "objects",
-                tuple(map(_parse_openable, items(self.objects, "objects", "a list of types"))),
+                tuple(map(_parse_openable, check_list(self.objects, "objects", "a list of types"))),
             )
-        kinds: tuple[Any, ...] = items(self.carried, "carried", "a list of types")
+        kinds: tuple[Any, ...] = check_list(self.carried, "carried", "a list of types")
         object.__setattr__(
             self,
             "carried",
-            tuple(known(kind, CARRIED, "object that is carried", "carried") for kind in kinds),
+            tuple(
+                check_choice(kind, CARRIED, "object that is carried", "carried") for kind in kinds
+            ),
         )
         object.__setattr__(self, "robot", _parse_robot(self.robot))
         if len(self.carried) > _MAX_CARRIED:
@@ -97,14 +109,14 @@ class RoomSettings:
 def _parse_openable(kind: Any) -> str | dict[str, Any]:
     """Return the type of an object that can be opened. Raises an error for an unknown name."""
     if isinstance(kind, Mapping):
-        return mapping(kind, "objects")
+        return check_mapping(kind, "objects")
     is_path = isinstance(kind, Path) or (
         isinstance(kind, str) and (kind.endswith((".yaml", ".yml")) or "/" in kind)
     )
     return (
-        str(file_path(kind, "objects"))
+        str(check_path(kind, "objects"))
         if is_path
-        else known(kind, list_openable_types(), "object that opens", "objects")
+        else check_choice(kind, list_openable_types(), "object that opens", "objects")
     )
 
 
@@ -117,9 +129,9 @@ def _parse_robot(robot: Any) -> str:
         isinstance(robot, str) and (robot.endswith((".urdf", ".yaml", ".yml")) or "/" in robot)
     )
     return (
-        str(file_path(robot, "robot").resolve())
+        str(check_path(robot, "robot").resolve())
         if is_path
-        else text(robot, "robot", "a robot's name, or the path of its file")
+        else check_text(robot, "robot", "a robot's name, or the path of its file")
     )
 
 
@@ -130,5 +142,5 @@ def _check_range(name: str, value: Any, low: float, high: float) -> None:
             "out of range",
             field=name,
             expected=f"a number from {low:g} to {high:g}",
-            got=shown(value),
+            got=format_value(value),
         )

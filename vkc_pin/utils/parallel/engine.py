@@ -20,26 +20,28 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from vkc_pin.errors import InputError, VkcError, shown
-from vkc_pin.utils.interrupt import handled
-from vkc_pin.utils.optional_imports import optional_package
+from vkc_pin.errors import InputError, VkcError, format_value
+from vkc_pin.utils.interrupt import handle_interrupt
+from vkc_pin.utils.optional_imports import import_optional
 
-__all__ = ["DEATHS", "Died", "clustered", "needs_dask", "results"]
+__all__ = ["MAX_CRASHES", "CrashedTask", "is_dask_installed", "require_dask", "run_tasks"]
 
-DEATHS = 4
+MAX_CRASHES = 4
 """How many processes a task may take with it on a cluster before it is given up."""
 _ADDRESS = re.compile(r"[a-z]+://[^/\s]+:\d{1,5}")
-_AHEAD = 2  # tasks that wait for each process, so that none waits for a task
-_CONNECTING = 20.0  # [s] to reach a scheduler
-_LOOKED = 5.0  # [s] without a result after which it is looked whether all processes are there
+_QUEUED_PER_WORKER = 2  # tasks that wait for each process, so that none waits for a task
+_CONNECT_TIMEOUT = 20.0  # [s] to reach a scheduler
+_CHECK_INTERVAL = (
+    5.0  # [s] without a result after which it is looked whether all processes are there
+)
 
-_LEAST = 2_000_000_000  # [bytes] of memory that a process may take, however many there are
+_MIN_MEMORY = 2_000_000_000  # [bytes] of memory that a process may take, however many there are
 
 Function = Callable[[Any], Any]
 
 
 @dataclass(frozen=True)
-class Died:
+class CrashedTask:
     """What comes of a task that no process survived.
 
     Attributes:
@@ -49,7 +51,7 @@ class Died:
     reason: str
 
 
-def needs_dask(scheduler: str | None) -> None:
+def require_dask(scheduler: str | None) -> None:
     """Look for Dask, which runs tasks in other processes, and at the address of a scheduler.
 
     Args:
@@ -61,12 +63,15 @@ def needs_dask(scheduler: str | None) -> None:
     field = "jobs" if scheduler is None else "scheduler"
     if scheduler is not None and not (isinstance(scheduler, str) and _ADDRESS.fullmatch(scheduler)):
         raise InputError(
-            "not an address", field=field, expected="such as tcp://HOST:8786", got=shown(scheduler)
+            "not an address",
+            field=field,
+            expected="such as tcp://HOST:8786",
+            got=format_value(scheduler),
         )
-    optional_package("distributed", "cluster", what="running in other processes", field=field)
+    import_optional("distributed", "cluster", purpose="running in other processes", field=field)
 
 
-def clustered() -> bool:
+def is_dask_installed() -> bool:
     """Return whether Dask is installed, which runs tasks on clusters (the extra `cluster`)."""
     try:
         import distributed  # noqa: F401
@@ -75,7 +80,7 @@ def clustered() -> bool:
     return True
 
 
-def results(
+def run_tasks(
     function: Function,
     tasks: Iterable[tuple[str, Any]],
     *,
@@ -112,15 +117,15 @@ def results(
         VkcError: A process died, without Dask.
     """
     if scheduler is not None or (dask and jobs > 1):
-        yield from _on_cluster(function, tasks, jobs, scheduler, limit, tell)
+        yield from _run_on_cluster(function, tasks, jobs, scheduler, limit, tell)
     elif jobs > 1:
-        yield from _on_processes(function, tasks, jobs, limit)
+        yield from _run_in_processes(function, tasks, jobs, limit)
     else:
         for key, task in tasks:
             yield key, function(task)
 
 
-def _on_processes(
+def _run_in_processes(
     function: Function, tasks: Iterable[tuple[str, Any]], jobs: int, limit: float | None
 ) -> Generator[tuple[str, Any]]:
     from joblib import Parallel, delayed, parallel_config
@@ -130,7 +135,8 @@ def _on_processes(
     with parallel_config(backend="loky", n_jobs=jobs, inner_max_num_threads=1):
         parallel = Parallel(return_as="generator_unordered", batch_size=1, max_nbytes=None)
         found = parallel(
-            delayed(_elsewhere)(function, key, task, limit, os.getpid()) for key, task in tasks
+            delayed(_run_in_child_process)(function, key, task, limit, os.getpid())
+            for key, task in tasks
         )
     try:
         yield from found
@@ -144,7 +150,7 @@ def _on_processes(
             found.close()
 
 
-def _on_cluster(
+def _run_on_cluster(
     function: Function,
     tasks: Iterable[tuple[str, Any]],
     jobs: int,
@@ -152,11 +158,11 @@ def _on_cluster(
     limit: float | None,
     tell: Callable[[str], object] | None,
 ) -> Generator[tuple[str, Any]]:
-    needs_dask(scheduler)
+    require_dask(scheduler)
     from distributed import Future, KilledWorker
 
     left = iter(tasks)
-    with _client(jobs, scheduler) as (client, cluster), client.as_current():
+    with _open_client(jobs, scheduler) as (client, cluster), client.as_current():
         if tell is not None:
             tell(f"Dask's dashboard: {client.dashboard_link}")
         running: dict[str, tuple[str, Any, Future]] = {}
@@ -171,7 +177,9 @@ def _on_cluster(
         def submit(key: str, task: Any) -> None:
             # results of the same name would be shared among clients
             name = f"vkc-{key}-{secrets.token_hex(4)}"
-            future = client.submit(_watched, function, task, limit, key=name, pure=False)
+            future = client.submit(
+                _run_with_time_limit, function, task, limit, key=name, pure=False
+            )
             running[name] = key, task, future
             future.add_done_callback(ended.put)
 
@@ -183,7 +191,9 @@ def _on_cluster(
             if alone:
                 submit(*suspects.pop())
                 return
-            room = _AHEAD * max(1, len(client.nthreads()) if scheduler else jobs) - len(running)
+            room = _QUEUED_PER_WORKER * max(1, len(client.nthreads()) if scheduler else jobs) - len(
+                running
+            )
             for key, task in itertools.islice(left, max(0, room)):
                 submit(key, task)
 
@@ -191,7 +201,7 @@ def _on_cluster(
         try:
             while running:
                 try:
-                    future = ended.get(timeout=_LOOKED)
+                    future = ended.get(timeout=_CHECK_INTERVAL)
                 except queue.Empty:
                     if cluster is not None:
                         cluster.scale(
@@ -208,8 +218,8 @@ def _on_cluster(
                 except KilledWorker:
                     if alone:
                         late = "" if limit is None else f", or longer than {limit:g} s"
-                        result = Died(
-                            f"{DEATHS} processes died with it: out of memory, a crash{late}"
+                        result = CrashedTask(
+                            f"{MAX_CRASHES} processes died with it: out of memory, a crash{late}"
                         )
                     else:
                         suspects.append((key, task))
@@ -223,7 +233,7 @@ def _on_cluster(
 
 
 @contextlib.contextmanager
-def _client(jobs: int, scheduler: str | None) -> Generator[tuple[Any, Any]]:
+def _open_client(jobs: int, scheduler: str | None) -> Generator[tuple[Any, Any]]:
     """Lend a client of a scheduler, or of processes of this machine that end with it, and what these are the workers of."""
     import logging
 
@@ -231,7 +241,7 @@ def _client(jobs: int, scheduler: str | None) -> Generator[tuple[Any, Any]]:
     from distributed import Client, LocalCluster
 
     settings = {
-        "distributed.scheduler.allowed-failures": DEATHS // 2 - 1,  # and as many alone
+        "distributed.scheduler.allowed-failures": MAX_CRASHES // 2 - 1,  # and as many alone
         "distributed.logging.distributed": "error",
         "distributed.worker.multiprocessing-method": "spawn",
         # it keeps every second of the last hour, 150 kB each of stacks like ours
@@ -247,25 +257,25 @@ def _client(jobs: int, scheduler: str | None) -> Generator[tuple[Any, Any]]:
         # So there is nothing to move to the disk; and a process that is paused, for what it keeps
         # of rooms and programs, never gets less, so that all would wait for it for ever.
         **{f"distributed.worker.memory.{what}": False for what in ("target", "spill", "pause")},
-        "distributed.comm.timeouts.connect": f"{_CONNECTING:g}s",
+        "distributed.comm.timeouts.connect": f"{_CONNECT_TIMEOUT:g}s",
     }
     with dask.config.set(settings), contextlib.ExitStack() as stack:
         if scheduler is None:
-            with handled(signal.SIG_IGN):  # which processes inherit: Ctrl-C is this one's
+            with handle_interrupt(signal.SIG_IGN):  # which processes inherit: Ctrl-C is this one's
                 cluster = stack.enter_context(
                     LocalCluster(
                         n_workers=jobs,
                         threads_per_worker=1,
                         host="127.0.0.1",
                         dashboard_address="127.0.0.1:0",
-                        memory_limit=_share(jobs),
+                        memory_limit=_compute_memory_limit(jobs),
                         silence_logs=logging.CRITICAL,
                     )
                 )
             yield stack.enter_context(Client(cluster, set_as_default=False)), cluster
             return
         try:
-            client = Client(scheduler, timeout=_CONNECTING, set_as_default=False)
+            client = Client(scheduler, timeout=_CONNECT_TIMEOUT, set_as_default=False)
         except (OSError, ValueError) as error:
             raise InputError(
                 "no scheduler answers there",
@@ -276,14 +286,14 @@ def _client(jobs: int, scheduler: str | None) -> Generator[tuple[Any, Any]]:
         yield stack.enter_context(client), None
 
 
-def _share(jobs: int) -> int:
+def _compute_memory_limit(jobs: int) -> int:
     """Return how much memory each of some processes of this machine may take before it is ended and started anew [bytes]."""
     from distributed.system import MEMORY_LIMIT
 
-    return max(int(MEMORY_LIMIT) // jobs, _LEAST)
+    return max(int(MEMORY_LIMIT) // jobs, _MIN_MEMORY)
 
 
-def _watched(function: Function, task: Any, limit: float | None) -> Any:
+def _run_with_time_limit(function: Function, task: Any, limit: float | None) -> Any:
     """Run one task; end this process if it takes longer than a limit [s], be it in the middle of compiled code."""
     signal.setitimer(
         signal.ITIMER_REAL, limit or 0.0
@@ -294,17 +304,17 @@ def _watched(function: Function, task: Any, limit: float | None) -> Any:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
-def _elsewhere(
+def _run_in_child_process(
     function: Function, key: str, task: Any, limit: float | None, parent: int
 ) -> tuple[str, Any]:
     """Run one task in a process of its own, which leaves Ctrl-C, that reaches all processes, to `parent` and ends with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _end_with(parent)
-    return key, _watched(function, task, limit)
+    _exit_with_parent(parent)
+    return key, _run_with_time_limit(function, task, limit)
 
 
 @cache
-def _end_with(parent: int) -> None:
+def _exit_with_parent(parent: int) -> None:
     """Let this process end soon after `parent` was killed, instead of working on for nobody."""
 
     def watch() -> None:

@@ -10,7 +10,7 @@ from typing import IO, Any
 
 from vkc_pin.errors import InputError
 
-__all__ = ["Journal", "Kept", "Records"]
+__all__ = ["Journal", "JournalContents", "Records"]
 
 
 class Records(Mapping[str, list[dict[str, Any]]]):
@@ -48,7 +48,7 @@ class Records(Mapping[str, list[dict[str, Any]]]):
         return len(self._places)
 
 
-class Kept:
+class JournalContents:
     """What a journal says.
 
     Args:
@@ -72,13 +72,13 @@ class Kept:
         self.processes: dict[str, str] = {}
 
     @classmethod
-    def read(cls, path: Path) -> Kept:
+    def read(cls, path: Path) -> JournalContents:
         """Return what a file says, be it while another process writes it.
 
         Raises:
             InputError: It cannot be read, or has a line that is none.
         """
-        kept = Kept(path)
+        kept = JournalContents(path)
         try:
             with path.open("rb") as stream:
                 kept._parse(path, stream)
@@ -136,7 +136,7 @@ class Kept:
             self.memories.setdefault(line["process"], []).append(line["resident_mb"])
 
 
-class Journal(Kept):
+class Journal(JournalContents):
     """The finished tasks in a file: a header, then a line for each task and for each session of running them.
 
     Every line is whole, or the last one and taken off when the file is opened again.
@@ -179,7 +179,7 @@ class Journal(Kept):
 
     def _check_begun(self) -> None:
         """Raise InputError if a file without a whole line is not the beginning of the header."""
-        header = _line(self._header)
+        header = _encode_line(self._header)
         self._stream.seek(0)
         if not header.startswith(begun := self._stream.read(len(header))):
             expected = "a new file, or the lines that a run writes"
@@ -187,14 +187,14 @@ class Journal(Kept):
             raise InputError("not a journal", file=self._path, line=1, expected=expected, got=got)
 
     def _write(self, line: Mapping[str, Any]) -> None:
-        text = _line(line)
+        text = _encode_line(line)
         self._stream.write(text)
         self._stream.flush()
         self._end += len(text)
 
     def _begin(self, header: Mapping[str, Any]) -> None:
         """Raise an error that names what differs between two headers, if anything does."""
-        old, new = _flat(header), _flat(self._header)
+        old, new = _flatten(header), _flatten(self._header)
         differing = [name for name in {**old, **new} if old.get(name) != new.get(name)]
         if differing:
             named = [name for name in differing if name != "specification"] or differing
@@ -208,12 +208,12 @@ class Journal(Kept):
             )
 
 
-def _line(data: Mapping[str, Any]) -> bytes:
+def _encode_line(data: Mapping[str, Any]) -> bytes:
     """Return plain data as a line of a journal."""
     return json.dumps(data, allow_nan=False).encode() + b"\n"
 
 
-def _flat(data: Mapping[str, Any]) -> dict[str, Any]:
+def _flatten(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entries of a header by name: settings by their own, others as "versions.pin"."""
     flat: dict[str, Any] = {}
     for name, value in data.items():

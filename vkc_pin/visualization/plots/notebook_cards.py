@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from vkc_pin.utils.notebook import card
+from vkc_pin.utils.notebook import make_card
 from vkc_pin.validation.report import CheckedMotion
 from vkc_pin.visualization.plots.style import STYLE
 from vkc_pin.visualization.plots.top_view import draw_top_view
@@ -29,7 +29,7 @@ _LISTED = 6  # violations and notes shown; the report has all of them
 _GOOD, _BAD = "#1a7f37", "#c62828"
 
 
-@card.register(Scene)
+@make_card.register(Scene)
 def scene_html(scene: Scene) -> str:
     """Render a scene as HTML, with an overview and a top view."""
     objects = []

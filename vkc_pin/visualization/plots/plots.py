@@ -22,7 +22,7 @@ from vkc_pin.visualization.plots.style import (
     use_style,
 )
 from vkc_pin.visualization.plots.top_view import draw_top_view
-from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.trajectory.world_model import World
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def plot(plan: CheckedMotion, path: str | Path | None = None) -> Figure | dict[s
         InputError: `plan` is not a plan, or `path` is a file of another type.
     """
     _check(plan)
-    target = None if path is None else file_path(path, "path")
+    target = None if path is None else check_path(path, "path")
     if target is None or target.suffix.lower() in PICTURES:
         return save_figure(_combined(plan), target)
     if target.is_file():

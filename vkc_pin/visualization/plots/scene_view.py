@@ -14,7 +14,7 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.visualization.plots.plots import PICTURES
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
 from vkc_pin.visualization.plots.top_view import draw_top_view, outline
-from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene
@@ -64,7 +64,7 @@ def plot_scene(
     """
     from matplotlib.patches import Polygon
 
-    target = None if path is None else file_path(path, "path")
+    target = None if path is None else check_path(path, "path")
     if target is not None and target.suffix.lower() not in PICTURES:
         raise InputError(
             "not the name of a picture",

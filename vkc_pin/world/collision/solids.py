@@ -12,8 +12,8 @@ import pinocchio as pin
 
 from vkc_pin.errors import BuildError, InputError
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.optional_imports import REBUILD, compiled_module
-from vkc_pin.world.files.meshes import indices
+from vkc_pin.utils.optional_imports import REBUILD_HINT, import_compiled
+from vkc_pin.world.files.meshes import get_triangles
 
 __all__ = ["convert_solid", "load_compiled"]
 
@@ -26,7 +26,7 @@ def load_compiled() -> Any:
         BuildError: The module is missing, or was compiled against another release of coal or
             Pinocchio than the installed one.
     """
-    module = compiled_module("vkc_pin.world.collision._distances")
+    module = import_compiled("vkc_pin.world.collision._distances")
     for package, version, installed in (
         ("coal", module.COAL_VERSION, coal.__version__),
         ("pin", module.PINOCCHIO_VERSION, pin.__version__),
@@ -36,7 +36,7 @@ def load_compiled() -> Any:
             raise BuildError(
                 f"vkc_pin.world.collision was compiled against {package} {version}, "
                 f"but {installed} is installed. "
-                f"Either pip install '{package}=={'.'.join(built)}.*', or {REBUILD}"
+                f"Either pip install '{package}=={'.'.join(built)}.*', or {REBUILD_HINT}"
             )
     return module
 
@@ -95,7 +95,7 @@ def _convert_cached(shape: Any, points: Floats, radius: float) -> Any:
         owner, before, swept, solid = _cache[key]
         if owner() is shape and before == content and swept == radius:
             return solid
-    faces = indices(shape)
+    faces = get_triangles(shape)
     solid = (
         load_compiled().convex(points, faces, radius)
         if isinstance(shape, coal.Convex)

@@ -14,15 +14,23 @@ from typing import Any, TypeVar
 import pydantic
 import yaml
 
-from vkc_pin.errors import InputError, UnknownNameError, shown
+from vkc_pin.errors import InputError, UnknownNameError, format_value
 
-__all__ = ["Document", "check", "field_name", "parse_json", "read_bytes", "read_text", "read_yaml"]
+__all__ = [
+    "Document",
+    "format_field",
+    "parse_document",
+    "parse_json",
+    "read_bytes",
+    "read_text",
+    "read_yaml",
+]
 
-LARGEST_FILE = 50_000_000
+MAX_FILE_SIZE = 50_000_000
 """Largest description file [bytes]."""
-MOST_FIELDS = 300_000
+MAX_FIELDS = 300_000
 """Most fields and items that a YAML file may have, with those of its aliases."""
-DEEPEST = 50
+MAX_DEPTH = 50
 """Most lists and fields inside each other."""
 
 Key = str | int
@@ -50,7 +58,7 @@ _SIGNS = {
 }
 
 
-def field_name(path: tuple[Key, ...]) -> str:
+def format_field(path: tuple[Key, ...]) -> str:
     """Return a field's path as users write it: ("obstacles", 3, "size") is `obstacles[3].size`."""
     text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path)
     return text.removeprefix(".")
@@ -70,35 +78,40 @@ class Document:
     file: Path | None = None
     lines: dict[tuple[Key, ...], int] = field(default_factory=dict)
 
-    def line(self, path: tuple[Key, ...]) -> int | None:
+    def find_line(self, path: tuple[Key, ...]) -> int | None:
         """Return the line of the field at `path`, or of the closest field around it."""
         while path and path not in self.lines:
             path = path[:-1]
         return self.lines.get(path)
 
-    def error(
+    def make_error(
         self, path: tuple[Key, ...], problem: str, *, expected: object = None, got: object = None
     ) -> InputError:
         """Return (not raise) the error that says that the field at `path` is wrong."""
         return InputError(
             problem,
             file=self.file,
-            line=self.line(path),
-            field=field_name(path),
+            line=self.find_line(path),
+            field=format_field(path),
             expected=expected,
             got=got,
         )
 
-    def unknown(
+    def make_unknown_name_error(
         self, path: tuple[Key, ...], kind: str, name: object, choices: Iterator[str] | Any
     ) -> UnknownNameError:
         """Return (not raise) the error that says that the field at `path` names something that does not exist."""
         return UnknownNameError(
-            kind, str(name), choices, file=self.file, line=self.line(path), field=field_name(path)
+            kind,
+            str(name),
+            choices,
+            file=self.file,
+            line=self.find_line(path),
+            field=format_field(path),
         )
 
     @contextmanager
-    def at(self, path: tuple[Key, ...]) -> Iterator[None]:
+    def annotate_errors(self, path: tuple[Key, ...]) -> Iterator[None]:
         """Give errors raised inside the place `path`, unless they name a file of their own."""
         try:
             yield
@@ -106,9 +119,11 @@ class Document:
             if error.file is not None:
                 raise
             if isinstance(error, UnknownNameError):
-                raise self.unknown(path, error.kind, error.name, error.choices) from error
+                raise self.make_unknown_name_error(
+                    path, error.kind, error.name, error.choices
+                ) from error
             where = f"{error.field}: " if error.field else ""
-            raise self.error(
+            raise self.make_error(
                 path, where + error.problem, expected=error.expected, got=error.got
             ) from error
 
@@ -121,7 +136,7 @@ def read_bytes(file: str | Path, kind: str, largest: int | None = None) -> bytes
             `largest` bytes (None: `LARGEST_FILE`), or cannot be read.
     """
     path, expected = Path(file), f"an existing {kind} file"
-    largest = LARGEST_FILE if largest is None else largest
+    largest = MAX_FILE_SIZE if largest is None else largest
     try:
         if (
             not path.is_file() and not path.is_dir() and path.exists()
@@ -171,9 +186,9 @@ def parse_json(text: str, file: str | Path) -> Any:
     many = text.count("[") + text.count(
         "{"
     )  # before they are made: each takes twenty times its text
-    if many > MOST_FIELDS:
+    if many > MAX_FIELDS:
         raise InputError(
-            "too many lists and objects", file=file, expected=f"at most {MOST_FIELDS}", got=many
+            "too many lists and objects", file=file, expected=f"at most {MAX_FIELDS}", got=many
         )
     try:
         data = json.loads(text)
@@ -184,11 +199,11 @@ def parse_json(text: str, file: str | Path) -> Any:
     level, depth = [data], 0
     while level := [item for item in level if isinstance(item, dict | list)]:
         depth += 1
-        if depth > DEEPEST:
+        if depth > MAX_DEPTH:
             raise InputError(
                 "too many lists and objects inside each other",
                 file=file,
-                expected=f"at most {DEEPEST}",
+                expected=f"at most {MAX_DEPTH}",
             )
         level = [
             inner for item in level for inner in (item.values() if isinstance(item, dict) else item)
@@ -214,7 +229,7 @@ def read_yaml(file: str | Path) -> Document:
         _check_depth(yaml.parse(text, Loader=loader_type), path)
         node = loader.get_single_node()
         if node is not None:
-            _locate(node, (), lines, path, set())
+            _record_lines(node, (), lines, path, set())
         data = None if node is None else loader.construct_document(node)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -231,7 +246,7 @@ def read_yaml(file: str | Path) -> Document:
     return Document(data, path, lines)
 
 
-def check(document: Document, schema: type[T]) -> T:
+def parse_document(document: Document, schema: type[T]) -> T:
     """Return `document` as `schema`.
 
     Raises:
@@ -243,9 +258,9 @@ def check(document: Document, schema: type[T]) -> T:
         return schema.model_validate(document.data)
     except pydantic.ValidationError as problem:
         errors = problem.errors(include_url=False)
-    located = [(_path(document.data, error), error) for error in errors]
-    path, first = min(located, key=lambda item: document.line(item[0]) or 0)
-    raise _translate(document, path, first)
+    located = [(_find_error_path(document.data, error), error) for error in errors]
+    path, first = min(located, key=lambda item: document.find_line(item[0]) or 0)
+    raise _translate_error(document, path, first)
 
 
 def _check_plain(document: Document) -> None:
@@ -253,14 +268,14 @@ def _check_plain(document: Document) -> None:
     left: list[tuple[tuple[Key, ...], Any]] = [((), document.data)]
     while left:
         path, value = left.pop()
-        if len(path) > DEEPEST:  # data that contain themselves have no end
-            raise document.error(
-                path[:1], "too many lists inside each other", expected=f"at most {DEEPEST}"
+        if len(path) > MAX_DEPTH:  # data that contain themselves have no end
+            raise document.make_error(
+                path[:1], "too many lists inside each other", expected=f"at most {MAX_DEPTH}"
             )
         if isinstance(value, dict):
             left += [(path, name) for name in value if isinstance(name, str)]
             left += [
-                ((*path, name if isinstance(name, int | str) else shown(name)), entry)
+                ((*path, name if isinstance(name, int | str) else format_value(name)), entry)
                 for name, entry in value.items()
             ]
         elif isinstance(value, list | tuple):
@@ -269,17 +284,17 @@ def _check_plain(document: Document) -> None:
             try:
                 value.encode("utf-8")
             except UnicodeEncodeError:
-                raise document.error(
+                raise document.make_error(
                     path, "not text", expected="text in UTF-8", got=ascii(value)
                 ) from None
         elif isinstance(value, Iterable) and not isinstance(
             value, Mapping | Set | bytes | bytearray
         ):
-            raise document.error(
+            raise document.make_error(
                 path,
-                "wrong kind of value",
+                "wrong type of value",
                 expected="a list, fields, text or a number",
-                got=shown(value),
+                got=format_value(value),
             )
 
 
@@ -289,19 +304,19 @@ def _check_depth(events: Iterable[yaml.Event], file: Path) -> None:
     for event in events:
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
-            if depth > DEEPEST:
+            if depth > MAX_DEPTH:
                 line = event.start_mark.line + 1 if event.start_mark else None
                 raise InputError(
                     "too many lists inside each other",
                     file=file,
                     line=line,
-                    expected=f"at most {DEEPEST}",
+                    expected=f"at most {MAX_DEPTH}",
                 )
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
 
 
-def _locate(
+def _record_lines(
     node: yaml.Node,
     path: tuple[Key, ...],
     lines: dict[tuple[Key, ...], int],
@@ -310,19 +325,19 @@ def _locate(
 ) -> None:
     """Write the lines of `node` and of everything below it into `lines`; `above` holds the nodes it stands in."""
     lines.setdefault(path, node.start_mark.line + 1)
-    if len(lines) > MOST_FIELDS:  # a few lines of aliases of aliases make any number
+    if len(lines) > MAX_FIELDS:  # a few lines of aliases of aliases make any number
         raise InputError(
             "too many fields",
             file=file,
             line=node.start_mark.line + 1,
-            expected=f"at most {MOST_FIELDS}",
+            expected=f"at most {MAX_FIELDS}",
         )
     if id(node) in above:
         raise InputError(
             "an alias contains itself",
             file=file,
             line=node.start_mark.line + 1,
-            field=field_name(path),
+            field=format_field(path),
         )
     above = above | {id(node)}
     if isinstance(node, yaml.MappingNode):
@@ -336,17 +351,17 @@ def _locate(
                 lines_of = f"lines {seen[name]} and {line}"
                 problem = "this field stands here twice"
                 raise InputError(
-                    problem, file=file, line=line, field=field_name((*path, name)), got=lines_of
+                    problem, file=file, line=line, field=format_field((*path, name)), got=lines_of
                 )
             seen[name] = line
             lines[(*path, name)] = line
-            _locate(value, (*path, name), lines, file, above)
+            _record_lines(value, (*path, name), lines, file, above)
     elif isinstance(node, yaml.SequenceNode):
         for index, item in enumerate(node.value):
-            _locate(item, (*path, index), lines, file, above)
+            _record_lines(item, (*path, index), lines, file, above)
 
 
-def _path(data: Any, error: Any) -> tuple[Key, ...]:
+def _find_error_path(data: Any, error: Any) -> tuple[Key, ...]:
     """Return the path of an error in the data: pydantic's, without the tags of unions, which are no fields."""
     path: list[Key] = []
     location = error["loc"]
@@ -364,31 +379,33 @@ def _path(data: Any, error: Any) -> tuple[Key, ...]:
     return tuple(path)
 
 
-def _translate(document: Document, path: tuple[Key, ...], error: Any) -> InputError:
+def _translate_error(document: Document, path: tuple[Key, ...], error: Any) -> InputError:
     """Return the exception that says what pydantic's `error` at `path` means."""
     kind, context, got = error["type"], error.get("ctx", {}), error["input"]
     if kind == "unknown_field":
-        return document.unknown(path, "field", context["name"], context["choices"])
+        return document.make_unknown_name_error(path, "field", context["name"], context["choices"])
     if kind in ("missing", "union_tag_not_found"):
         tag = kind == "union_tag_not_found"
-        return document.error(
+        return document.make_error(
             path, "missing", expected="the object's kind" if tag else "a value", got="nothing"
         )
     if kind in ("union_tag_invalid", "literal_error"):
         choices = re.findall(
             r"'([^']*)'", context["expected_tags" if kind == "union_tag_invalid" else "expected"]
         )
-        return document.unknown(path, str(path[-1]), context.get("tag", got), choices)
+        return document.make_unknown_name_error(
+            path, str(path[-1]), context.get("tag", got), choices
+        )
     if kind == "too_long":
-        return document.error(
+        return document.make_error(
             path,
             "too many",
             expected=f"at most {context['max_length']}",
             got=context["actual_length"],
         )
     if kind == "vkc":
-        return document.error(
-            path, context["problem"], expected=context["expected"], got=shown(got)
+        return document.make_error(
+            path, context["problem"], expected=context["expected"], got=format_value(got)
         )
     if kind in _SIGNS:
         problem, expected = (
@@ -397,4 +414,4 @@ def _translate(document: Document, path: tuple[Key, ...], error: Any) -> InputEr
         )
     else:
         problem, expected = "wrong value", _EXPECTED.get(kind, error["msg"])
-    return document.error(path, problem, expected=expected, got=shown(got))
+    return document.make_error(path, problem, expected=expected, got=format_value(got))

@@ -10,34 +10,34 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from vkc_pin.utils.arrays import LARGEST
+from vkc_pin.utils.arrays import MAX_COORDINATE
 
 __all__ = [
     "JointSchema",
     "Name",
-    "NotNegative",
+    "NonNegative",
     "Number",
     "Positive",
     "Quaternion",
     "Schema",
     "Vector3",
-    "count",
-    "fail",
+    "make_validation_error",
     "require",
-    "text_for",
+    "require_length",
+    "wrap_text",
 ]
 
 
-def fail(problem: str, expected: str) -> PydanticCustomError:
+def make_validation_error(problem: str, expected: str) -> PydanticCustomError:
     """Return (not raise) the error of a validator: what is wrong and what would be right."""
     return PydanticCustomError("vkc", "{problem}", {"problem": problem, "expected": expected})
 
 
-def _number(value: Any) -> Any:
+def _reject_bool(value: Any) -> Any:
     if isinstance(
         value, bool
     ):  # YAML turns yes, no, on, off into booleans, and pydantic those into 1 and 0
-        raise fail("wrong value", "a number")
+        raise make_validation_error("wrong value", "a number")
     return value
 
 
@@ -46,57 +46,61 @@ def require(holds: Callable[[Any], object], problem: str, expected: str) -> Afte
 
     def required(value: Any) -> Any:
         if not holds(value):
-            raise fail(problem, expected)
+            raise make_validation_error(problem, expected)
         return value
 
     return AfterValidator(required)
 
 
-def text_for(field: str) -> BeforeValidator:
+def wrap_text(field: str) -> BeforeValidator:
     """Return the validator that takes text for a schema with this field alone."""
     return BeforeValidator(lambda value: {field: value} if isinstance(value, str) else value)
 
 
-def count(number: int) -> BeforeValidator:
+def require_length(number: int) -> BeforeValidator:
     """Return the validator that wants a list of `number` values: pydantic alone would not say how many it expected."""
 
     def counted(value: Any) -> Any:
         if not isinstance(value, list | tuple):
-            raise fail("wrong value", f"a list of {number} values")
+            raise make_validation_error("wrong value", f"a list of {number} values")
         if len(value) != number:
-            raise fail("wrong number of values", f"{number} values")
+            raise make_validation_error("wrong number of values", f"{number} values")
         return value
 
     return BeforeValidator(counted)
 
 
-_bounded = require(
-    lambda value: abs(value) <= LARGEST,
+_IN_RANGE = require(
+    lambda value: abs(value) <= MAX_COORDINATE,
     "out of range",
-    f"a number from {-LARGEST:g} to {LARGEST:g}",
+    f"a number from {-MAX_COORDINATE:g} to {MAX_COORDINATE:g}",
 )
-Number = Annotated[float, BeforeValidator(_number), Field(allow_inf_nan=False), _bounded]
+Number = Annotated[float, BeforeValidator(_reject_bool), Field(allow_inf_nan=False), _IN_RANGE]
 Positive = Annotated[Number, Field(gt=0.0)]
-NotNegative = Annotated[Number, Field(ge=0.0)]
-Vector3 = Annotated[tuple[Number, Number, Number], count(3)]
+NonNegative = Annotated[Number, Field(ge=0.0)]
+Vector3 = Annotated[tuple[Number, Number, Number], require_length(3)]
 _NAME = re.compile(r"[^\s./]([^./]*[^\s./])?")
-_is_name = require(
+_VALID_NAME = require(
     lambda name: name.isprintable() and _NAME.fullmatch(name),
     "not a name",
     "text without '.', '/' or spaces around it",
 )
-Name = Annotated[str, _is_name]
+Name = Annotated[str, _VALID_NAME]
 
 
-def _normalised(value: tuple[float, ...]) -> tuple[float, ...]:
+def _normalize_quaternion(value: tuple[float, ...]) -> tuple[float, ...]:
     norm = math.hypot(*value)
-    if abs(norm - 1.0) > _UNIT:
-        raise fail("not a rotation", f"a quaternion [x, y, z, w] of length 1, not {norm:.4g}")
+    if abs(norm - 1.0) > _NORM_TOLERANCE:
+        raise make_validation_error(
+            "not a rotation", f"a quaternion [x, y, z, w] of length 1, not {norm:.4g}"
+        )
     return tuple(number / norm for number in value)
 
 
-_UNIT = 1e-3  # by which a quaternion may miss length 1: files have three decimals
-Quaternion = Annotated[tuple[Number, Number, Number, Number], count(4), AfterValidator(_normalised)]
+_NORM_TOLERANCE = 1e-3  # by which a quaternion may miss length 1: files have three decimals
+Quaternion = Annotated[
+    tuple[Number, Number, Number, Number], require_length(4), AfterValidator(_normalize_quaternion)
+]
 """A rotation as a unit quaternion, the scalar last: [x, y, z, w]; normalised."""
 
 

@@ -15,20 +15,20 @@ if TYPE_CHECKING:
     import trimesh
     from scipy.spatial import ConvexHull
 
-__all__ = ["FLAT", "compute_hull", "outer_hull", "thickened"]
+__all__ = ["SHEET_THICKNESS", "compute_hull", "compute_outer_hull", "thicken"]
 
-FLAT = 1e-3
+SHEET_THICKNESS = 1e-3
 """What a part gets as thickness that has none [m]: a picture on a wall, a rug, a pane."""
-_THIN = (
+_FLATNESS_RATIO = (
     1e-5  # of the largest extent: thinner than 10 µm in a metre is drawn as a sheet, not as a solid
 )
-_GAP = 5e-4  # [m]: no cut takes away less
-_DIRECTIONS = 400  # of cuts, spread over the sphere
+_MIN_CUT_DEPTH = 5e-4  # [m]: no cut takes away less
+_NUM_DIRECTIONS = 400  # of cuts, spread over the sphere
 # Options of Qhull, tried in this order: scaled to the unit cube, unscaled, and joggled.
-_QHULL = ("QbB Pp Qt", "Pp Qt", "Pp QJ")
+_QHULL_OPTIONS = ("QbB Pp Qt", "Pp Qt", "Pp QJ")
 
 
-def thickened(points: ArrayLike) -> tuple[Floats, bool]:
+def thicken(points: ArrayLike) -> tuple[Floats, bool]:
     """Return points that span a volume, and whether they did not before: then `FLAT` is added across what they lie in.
 
     A sheet becomes a plate with the sheet in its middle, a line a square bar, a point a cube.
@@ -40,10 +40,12 @@ def thickened(points: ArrayLike) -> tuple[Floats, bool]:
     around = given - given.mean(axis=0)
     axes = np.linalg.eigh(around.T @ around)[1].T
     extents = np.ptp(around @ axes.T, axis=0)
-    (flat,) = np.nonzero(extents <= _THIN * extents.max())
+    (flat,) = np.nonzero(extents <= _FLATNESS_RATIO * extents.max())
     found = given
     for axis in axes[flat]:
-        found = np.concatenate([found - FLAT / 2.0 * axis, found + FLAT / 2.0 * axis])
+        found = np.concatenate(
+            [found - SHEET_THICKNESS / 2.0 * axis, found + SHEET_THICKNESS / 2.0 * axis]
+        )
     return found, bool(len(flat))
 
 
@@ -64,16 +66,16 @@ def compute_hull(points: ArrayLike) -> trimesh.Trimesh:
     from scipy.spatial import ConvexHull, QhullError
 
     given = np.asarray(points, float)
-    for options in _QHULL:
+    for options in _QHULL_OPTIONS:
         with contextlib.suppress(QhullError):
-            mesh = _orient(ConvexHull(given, qhull_options=options))
+            mesh = _orient_faces(ConvexHull(given, qhull_options=options))
             if mesh.is_winding_consistent:
                 return mesh
     expected = "at least four points that are not in one plane"
     raise InputError("the points span no volume", expected=expected)
 
 
-def _orient(hull: ConvexHull) -> trimesh.Trimesh:
+def _orient_faces(hull: ConvexHull) -> trimesh.Trimesh:
     """Return the triangles of a hull with normals that point away from its centroid."""
     import trimesh
 
@@ -90,7 +92,7 @@ def _orient(hull: ConvexHull) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, faces, face_normals=normals)
 
 
-def outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trimesh:
+def compute_outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trimesh:
     """Return a convex polytope of few vertices that contains `points`; what is flat is thickened first.
 
     It starts as the box along the principal axes of the hull and is cut, again and again, by the
@@ -103,26 +105,26 @@ def outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trimesh:
     Returns:
         The polytope; every point lies in it (up to rounding, 1e-9 m).
     """
-    hull = compute_hull(thickened(points)[0])
+    hull = compute_hull(thicken(points)[0])
     corners = np.asarray(hull.vertices)
-    normals = _directions(hull)
+    normals = _sample_directions(hull)
     offsets = (corners @ normals.T).max(axis=0)
     axes = np.linalg.eigh(np.cov(corners.T))[1].T
     found = []
     for frame in (np.eye(3), axes):
         box = np.vstack([frame, -frame])
         chosen_normals, chosen_offsets = box, (corners @ box.T).max(axis=0)
-        polytope = _intersect(chosen_normals, chosen_offsets, corners)
+        polytope = _intersect_half_spaces(chosen_normals, chosen_offsets, corners)
         for _ in range(4 * vertices):
             depth = (polytope.points @ normals.T).max(axis=0) - offsets
             order = np.argsort(-depth)[:12]
             trials = []
-            for k in order[depth[order] > _GAP]:
+            for k in order[depth[order] > _MIN_CUT_DEPTH]:
                 planes = (
                     np.vstack([chosen_normals, normals[k]]),
                     np.append(chosen_offsets, offsets[k]),
                 )
-                trial = _intersect(*planes, corners)
+                trial = _intersect_half_spaces(*planes, corners)
                 if len(trial.vertices) <= vertices:
                     trials.append((trial, planes))
             if not trials:
@@ -134,10 +136,10 @@ def outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trimesh:
     return compute_hull(min(found, key=lambda polytope: polytope.volume).points)
 
 
-def _directions(hull: trimesh.Trimesh) -> Floats:
+def _sample_directions(hull: trimesh.Trimesh) -> Floats:
     """Return the normals worth trying: those of the hull's faces, and some spread evenly over the sphere."""
-    k = np.arange(_DIRECTIONS) + 0.5
-    z, turn = 1.0 - 2.0 * k / _DIRECTIONS, np.pi * (1.0 + 5.0**0.5) * k
+    k = np.arange(_NUM_DIRECTIONS) + 0.5
+    z, turn = 1.0 - 2.0 * k / _NUM_DIRECTIONS, np.pi * (1.0 + 5.0**0.5) * k
     spread = np.stack(
         [np.sqrt(1.0 - z**2) * np.cos(turn), np.sqrt(1.0 - z**2) * np.sin(turn), z], axis=1
     )
@@ -145,7 +147,9 @@ def _directions(hull: trimesh.Trimesh) -> Floats:
     return np.vstack([np.asarray(hull.face_normals)[np.sort(first)], spread])
 
 
-def _intersect(normals: NDArray[Any], offsets: NDArray[Any], inner: NDArray[Any]) -> ConvexHull:
+def _intersect_half_spaces(
+    normals: NDArray[Any], offsets: NDArray[Any], inner: NDArray[Any]
+) -> ConvexHull:
     """Return the polytope {x: normals·x ≤ offsets}; `inner` are points in it."""
     from scipy.spatial import ConvexHull, HalfspaceIntersection
 

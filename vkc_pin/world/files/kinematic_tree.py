@@ -15,18 +15,25 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.utils.arrays import LARGEST
-from vkc_pin.world.files.xml import line_of, replace_forbidden
+from vkc_pin.utils.arrays import MAX_COORDINATE
+from vkc_pin.world.files.xml import find_line, replace_forbidden
 
-__all__ = ["MOMENTS", "check_tree", "inertial_of", "numbers_of", "origin_of", "plain_tree"]
+__all__ = [
+    "MOMENTS",
+    "check_tree",
+    "parse_inertial",
+    "parse_numbers",
+    "parse_origin",
+    "simplify_tree",
+]
 
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 """Attributes of <inertia>, along the rows of the upper triangle."""
 
-_KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
-_LIMITED = ("revolute", "prismatic")
-_WITHOUT_AXIS = ("fixed", "floating")
-_SILENT = (
+_JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
+_LIMITED_TYPES = ("revolute", "prismatic")
+_TYPES_WITHOUT_AXIS = ("fixed", "floating")
+_XACRO_DEFINITIONS = (
     "xacro:arg",
     "xacro:property",
 )  # of xacro's elements those that put nothing in their place
@@ -42,8 +49,8 @@ def check_tree(file: Path, root: ElementTree.Element) -> None:
         UnknownNameError: A joint names a link that does not exist.
     """
     for element in root.iter():
-        if element.tag.startswith("xacro:") and element.tag not in _SILENT:
-            expected, line = "a plain URDF: xacro FILE > robot.urdf", line_of(element)
+        if element.tag.startswith("xacro:") and element.tag not in _XACRO_DEFINITIONS:
+            expected, line = "a plain URDF: xacro FILE > robot.urdf", find_line(element)
             raise InputError(
                 "xacro has not been run",
                 file=file,
@@ -51,16 +58,16 @@ def check_tree(file: Path, root: ElementTree.Element) -> None:
                 expected=expected,
                 got=f"<{element.tag}>",
             )
-    links = _named(file, root, "link")
+    links = _index_by_name(file, root, "link")
     if not links:
         raise InputError("there are no links", file=file, expected="<link> elements")
     above: dict[str, tuple[str, str]] = {}  # link → its parent, and the joint between
-    joints = _named(file, root, "joint")
+    joints = _index_by_name(file, root, "joint")
     for name, joint in joints.items():
         _check_joint(file, name, joint, joints)
-        parent, child = (_link(file, name, joint, key, links) for key in ("parent", "child"))
+        parent, child = (_find_link(file, name, joint, key, links) for key in ("parent", "child"))
         if child in above:
-            got, line = f"joints '{above[child][1]}' and '{name}'", line_of(joint)
+            got, line = f"joints '{above[child][1]}' and '{name}'", find_line(joint)
             raise InputError(
                 "a link with two parents",
                 file=file,
@@ -73,7 +80,7 @@ def check_tree(file: Path, root: ElementTree.Element) -> None:
     _check_roots(file, links, above)
 
 
-def plain_tree(file: Path, root: ElementTree.Element) -> tuple[str, frozenset[str]]:
+def simplify_tree(file: Path, root: ElementTree.Element) -> tuple[str, frozenset[str]]:
     """Return links and joints of a URDF that was checked, as one that parsers understand, without shapes and extensions.
 
     What a limit does not say is 0; joints that say nothing about velocity are named. Mimicking is
@@ -100,21 +107,23 @@ def plain_tree(file: Path, root: ElementTree.Element) -> tuple[str, frozenset[st
         for key in ("parent", "child"):
             if (end := joint.find(key)) is not None:
                 ElementTree.SubElement(added, key, link=end.get("link", ""))
-        if kind not in _WITHOUT_AXIS and (axis := joint.find("axis")) is not None:
+        if kind not in _TYPES_WITHOUT_AXIS and (axis := joint.find("axis")) is not None:
             ElementTree.SubElement(
                 added,
                 "axis",
-                xyz=_written(numbers_of(file, axis, "xyz", 3, default="1 0 0", where=name)),
+                xyz=_format_numbers(
+                    parse_numbers(file, axis, "xyz", 3, default="1 0 0", where=name)
+                ),
             )
-        if (limit := joint.find("limit")) is not None and kind not in _WITHOUT_AXIS:
+        if (limit := joint.find("limit")) is not None and kind not in _TYPES_WITHOUT_AXIS:
             silent.update([name] if limit.get("velocity") is None else [])
-            if kind in _LIMITED and limit.get("lower") is None and limit.get("upper") is None:
+            if kind in _LIMITED_TYPES and limit.get("lower") is None and limit.get("upper") is None:
                 warnings.warn(
-                    f"{file}:{line_of(limit)}: {name}: a limit without lower and upper: it cannot move",
+                    f"{file}:{find_line(limit)}: {name}: a limit without lower and upper: it cannot move",
                     stacklevel=2,
                 )
             said = {
-                key: _written(_limit(file, name, limit, key))
+                key: _format_numbers(_parse_limit(file, name, limit, key))
                 for key in ("lower", "upper", "velocity", "effort")
             }
             ElementTree.SubElement(added, "limit", said)
@@ -126,7 +135,7 @@ def _add_origin(
 ) -> None:
     if origin is not None:
         said = {
-            key: _written(numbers_of(file, origin, key, 3, default="0 0 0", where=where))
+            key: _format_numbers(parse_numbers(file, origin, key, 3, default="0 0 0", where=where))
             for key in ("xyz", "rpy")
         }
         ElementTree.SubElement(parent, "origin", said)
@@ -135,60 +144,62 @@ def _add_origin(
 def _add_inertial(file: Path, link: ElementTree.Element, inertial: ElementTree.Element) -> None:
     """Add mass and inertia to a link, or warn."""
     try:
-        mass, moments, (position, angles) = inertial_of(file, inertial, link.get("name", ""))
+        mass, moments, (position, angles) = parse_inertial(file, inertial, link.get("name", ""))
     except InputError as error:
         warnings.warn(f"{error}: this <inertial> counts as none", stacklevel=2)
         return
     added = ElementTree.SubElement(link, "inertial")
-    ElementTree.SubElement(added, "origin", xyz=_written(position), rpy=_written(angles))
-    ElementTree.SubElement(added, "mass", value=_written((mass,)))
+    ElementTree.SubElement(
+        added, "origin", xyz=_format_numbers(position), rpy=_format_numbers(angles)
+    )
+    ElementTree.SubElement(added, "mass", value=_format_numbers((mass,)))
     ElementTree.SubElement(
         added,
         "inertia",
-        {key: _written((value,)) for key, value in zip(MOMENTS, moments, strict=True)},
+        {key: _format_numbers((value,)) for key, value in zip(MOMENTS, moments, strict=True)},
     )
 
 
-def origin_of(
+def parse_origin(
     file: Path, element: ElementTree.Element, where: str
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return what the <origin> of an element says, position [m] and roll, pitch and yaw [rad]; zeros if it has none.
 
     Raises:
-        InputError: A number is wrong, as in `numbers_of`.
+        InputError: A number is wrong, as in `parse_numbers`.
     """
     if (origin := element.find("origin")) is None:
         return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     position, angles = (
-        numbers_of(file, origin, key, 3, default="0 0 0", where=where) for key in ("xyz", "rpy")
+        parse_numbers(file, origin, key, 3, default="0 0 0", where=where) for key in ("xyz", "rpy")
     )
     return position, angles
 
 
-def inertial_of(
+def parse_inertial(
     file: Path, inertial: ElementTree.Element, where: str
 ) -> tuple[float, tuple[float, ...], tuple[tuple[float, ...], tuple[float, ...]]]:
     """Return what an <inertial> says: mass [kg], moments about its centre [kg·m²] as `MOMENTS` names them, and `origin_of` it.
 
     Raises:
-        InputError: It has no mass or no moments, or a number is wrong, as in `numbers_of`.
+        InputError: It has no mass or no moments, or a number is wrong, as in `parse_numbers`.
     """
     mass, inertia = inertial.find("mass"), inertial.find("inertia")
     if mass is None or inertia is None:
         lacks = f"an <inertial> without <{'mass' if mass is None else 'inertia'}>"
-        raise InputError(lacks, file=file, line=line_of(inertial), field=where)
-    (weight,) = numbers_of(file, mass, "value", 1, default=None, where=where)
+        raise InputError(lacks, file=file, line=find_line(inertial), field=where)
+    (weight,) = parse_numbers(file, mass, "value", 1, default=None, where=where)
     moments = tuple(
-        numbers_of(file, inertia, key, 1, default="0", where=where)[0] for key in MOMENTS
+        parse_numbers(file, inertia, key, 1, default="0", where=where)[0] for key in MOMENTS
     )
-    return weight, moments, origin_of(file, inertial, where)
+    return weight, moments, parse_origin(file, inertial, where)
 
 
-def _written(values: tuple[float, ...]) -> str:
+def _format_numbers(values: tuple[float, ...]) -> str:
     return " ".join(map(repr, values))
 
 
-def numbers_of(
+def parse_numbers(
     file: Path,
     element: ElementTree.Element,
     key: str,
@@ -196,7 +207,7 @@ def numbers_of(
     *,
     default: str | None,
     where: str,
-    largest: float = LARGEST,
+    largest: float = MAX_COORDINATE,
 ) -> tuple[float, ...]:
     """Return numbers in an attribute of an element.
 
@@ -229,7 +240,7 @@ def numbers_of(
         raise InputError(
             "wrong numbers",
             file=file,
-            line=line_of(element),
+            line=find_line(element),
             field=field,
             expected=expected,
             got=text,
@@ -237,7 +248,9 @@ def numbers_of(
     return values
 
 
-def _named(file: Path, root: ElementTree.Element, tag: str) -> dict[str, ElementTree.Element]:
+def _index_by_name(
+    file: Path, root: ElementTree.Element, tag: str
+) -> dict[str, ElementTree.Element]:
     """Return the elements of a kind by their names."""
     found: dict[str, ElementTree.Element] = {}
     for element in root.findall(tag):
@@ -246,19 +259,19 @@ def _named(file: Path, root: ElementTree.Element, tag: str) -> dict[str, Element
             raise InputError(
                 f"a {tag} without a name",
                 file=file,
-                line=line_of(element),
+                line=find_line(element),
                 expected=f'<{tag} name="...">',
             )
         if name in found:
-            got = f"lines {line_of(found[name])} and {line_of(element)}"
+            got = f"lines {find_line(found[name])} and {find_line(element)}"
             raise InputError(
-                f"two {tag}s of one name", file=file, line=line_of(element), field=name, got=got
+                f"two {tag}s of one name", file=file, line=find_line(element), field=name, got=got
             )
         found[name] = element
     return found
 
 
-def _link(
+def _find_link(
     file: Path,
     name: str,
     joint: ElementTree.Element,
@@ -271,28 +284,28 @@ def _link(
         raise InputError(
             "a joint that connects nothing",
             file=file,
-            line=line_of(joint),
+            line=find_line(joint),
             field=name,
             expected=f'<{key} link="...">',
         )
     link = element.get("link", "")
     if link not in links:
         raise UnknownNameError(
-            "link", link, links, file=file, line=line_of(element), field=f"{name}: {key}"
+            "link", link, links, file=file, line=find_line(element), field=f"{name}: {key}"
         )
     return link
 
 
-def _limit(file: Path, name: str, limit: ElementTree.Element, key: str) -> tuple[float, ...]:
-    return numbers_of(file, limit, key, 1, default="0", where=name, largest=math.inf)
+def _parse_limit(file: Path, name: str, limit: ElementTree.Element, key: str) -> tuple[float, ...]:
+    return parse_numbers(file, limit, key, 1, default="0", where=name, largest=math.inf)
 
 
 def _check_joint(
     file: Path, name: str, joint: ElementTree.Element, joints: Collection[str]
 ) -> None:
-    kind, line = joint.get("type"), line_of(joint)
-    if kind not in _KINDS:
-        expected = ", ".join(_KINDS)
+    kind, line = joint.get("type"), find_line(joint)
+    if kind not in _JOINT_TYPES:
+        expected = ", ".join(_JOINT_TYPES)
         raise InputError(
             "this joint type is not supported",
             file=file,
@@ -303,24 +316,25 @@ def _check_joint(
         )
     for origin in joint.findall("origin"):
         for key in ("xyz", "rpy"):
-            numbers_of(file, origin, key, 3, default="0 0 0", where=name)
-    for axis in joint.findall("axis") if kind not in _WITHOUT_AXIS else ():
-        if not math.hypot(*numbers_of(file, axis, "xyz", 3, default="1 0 0", where=name)) > 0.0:
-            line = line_of(axis)
+            parse_numbers(file, origin, key, 3, default="0 0 0", where=name)
+    for axis in joint.findall("axis") if kind not in _TYPES_WITHOUT_AXIS else ():
+        if not math.hypot(*parse_numbers(file, axis, "xyz", 3, default="1 0 0", where=name)) > 0.0:
+            line = find_line(axis)
             raise InputError(
                 "an axis without direction", file=file, line=line, field=name, got=axis.get("xyz")
             )
     limits = joint.findall("limit")
-    if kind in _LIMITED and not limits:
+    if kind in _LIMITED_TYPES and not limits:
         raise InputError(
             f"a {kind} joint without limits", file=file, line=line, field=name, expected="<limit>"
         )
     for limit in limits:
         lower, upper, _, _ = (
-            _limit(file, name, limit, key)[0] for key in ("lower", "upper", "velocity", "effort")
+            _parse_limit(file, name, limit, key)[0]
+            for key in ("lower", "upper", "velocity", "effort")
         )
-        if kind in _LIMITED and lower > upper:
-            field, got, line = f"{name}: limit", f"{lower:g} and {upper:g}", line_of(limit)
+        if kind in _LIMITED_TYPES and lower > upper:
+            field, got, line = f"{name}: limit", f"{lower:g} and {upper:g}", find_line(limit)
             problem = "limits in the wrong order"
             raise InputError(
                 problem, file=file, line=line, field=field, expected="lower ≤ upper", got=got
@@ -328,11 +342,11 @@ def _check_joint(
     for mimic in joint.findall("mimic"):
         if (followed := mimic.get("joint", "")) not in joints:  # published robots have that
             warnings.warn(
-                f"{file}:{line_of(mimic)}: {name}: there is no joint '{followed}' to follow",
+                f"{file}:{find_line(mimic)}: {name}: there is no joint '{followed}' to follow",
                 stacklevel=2,
             )
         for key, default in (("multiplier", "1"), ("offset", "0")):
-            numbers_of(file, mimic, key, 1, default=default, where=name)
+            parse_numbers(file, mimic, key, 1, default=default, where=name)
 
 
 def _check_roots(
@@ -341,7 +355,7 @@ def _check_roots(
     """Check that all links hang on one."""
     roots = [link for link in links if link not in above]
     if len(roots) > 1:
-        got, line = ", ".join(roots[:5]), line_of(links[roots[1]])
+        got, line = ", ".join(roots[:5]), find_line(links[roots[1]])
         raise InputError(
             "links that nothing connects",
             file=file,
@@ -352,10 +366,10 @@ def _check_roots(
         )
     reaches = set(roots)
     for link in links:
-        path = list(_up(link, above, reaches))
+        path = list(_walk_to_root(link, above, reaches))
         if path and path[-1] in path[:-1]:
             circle = path[path.index(path[-1]) :]
-            line = line_of(links[link])
+            line = find_line(links[link])
             raise InputError(
                 "links in a circle",
                 file=file,
@@ -367,7 +381,9 @@ def _check_roots(
         reaches.update(path)
 
 
-def _up(link: str, above: Mapping[str, tuple[str, str]], reaches: set[str]) -> Iterator[str]:
+def _walk_to_root(
+    link: str, above: Mapping[str, tuple[str, str]], reaches: set[str]
+) -> Iterator[str]:
     """Yield a link and those it hangs on, up to one that `reaches` the root, or to one for the second time."""
     passed: set[str] = set()
     while link not in reaches:

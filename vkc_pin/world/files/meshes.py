@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arrays import LARGEST, Floats, Ints
-from vkc_pin.world.files.hulls import FLAT, compute_hull, outer_hull, thickened
-from vkc_pin.world.files.resources import file_path
+from vkc_pin.utils.arrays import MAX_COORDINATE, Floats, Ints
+from vkc_pin.world.files.hulls import SHEET_THICKNESS, compute_hull, compute_outer_hull, thicken
+from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.xml import check_indices
 
 if TYPE_CHECKING:
@@ -29,18 +29,18 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MeshPart",
-    "coarser",
-    "convex_hull",
-    "indices",
+    "get_triangles",
     "load_convex",
     "load_mesh",
     "load_parts",
-    "to_bvh",
+    "make_bvh",
+    "make_convex_hull",
+    "simplify_mesh",
 ]
 
-_NEIGHBOURS = 255  # coal's corners have no more
-_HULLS = 512  # that a process keeps: robots are loaded again and again
-_TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
+_MAX_NEIGHBOURS = 255  # coal's corners have no more
+_MAX_CACHED_HULLS = 512  # that a process keeps: robots are loaded again and again
+_HULL_TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +73,8 @@ def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.T
     """
     import trimesh
 
-    file = file_path(path, "path", "a mesh file")
-    factors = _factors(file, scale)
+    file = check_path(path, "path", "a mesh file")
+    factors = _check_scale(file, scale)
     if not file.is_file():
         raise InputError("there is no such mesh", file=file, expected="a mesh file")
     by_coal = file.suffix.lower() == ".dae"
@@ -83,7 +83,7 @@ def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.T
     try:
         if by_coal:
             shape = coal.MeshLoader().load(str(file), np.ones(3))
-            mesh = trimesh.Trimesh(np.array(shape.vertices()), indices(shape))
+            mesh = trimesh.Trimesh(np.array(shape.vertices()), get_triangles(shape))
         else:
             mesh = trimesh.load_mesh(file, force="mesh", skip_materials=True)
             if isinstance(mesh, trimesh.Scene):
@@ -105,11 +105,11 @@ def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.T
         )
     with np.errstate(over="ignore"):
         farthest = float(np.abs(mesh.vertices * factors).max())
-    if farthest > LARGEST:
+    if farthest > MAX_COORDINATE:
         raise InputError(
             "the mesh is out of range",
             file=file,
-            expected=f"coordinates up to {LARGEST:g} m",
+            expected=f"coordinates up to {MAX_COORDINATE:g} m",
             got=f"{farthest:g}",
         )
     mesh.apply_transform(np.diag([*factors, 1.0]))
@@ -129,28 +129,30 @@ def load_convex(
     Raises:
         InputError: The mesh cannot be read or is empty, or coal does not hold what the file holds.
     """
-    file = file_path(path, "path", "a mesh file")
+    file = check_path(path, "path", "a mesh file")
     if file.is_file():
         stat = file.stat()
         with contextlib.suppress(InputError):  # said below, with what it is a part of
-            kept = _hull(
+            kept = _load_hull(
                 file.absolute(),
                 (stat.st_mtime_ns, stat.st_size),
-                tuple(_factors(file, scale).tolist()),
+                tuple(_check_scale(file, scale).tolist()),
             )
             if kept is not None:
                 return kept
-    return convex_hull(load_mesh(path, scale).vertices, file=path, about=about)
+    return make_convex_hull(load_mesh(path, scale).vertices, file=path, about=about)
 
 
-@lru_cache(maxsize=_HULLS)
-def _hull(file: Path, version: tuple[int, int], scale: tuple[float, ...]) -> coal.Convex | None:
+@lru_cache(maxsize=_MAX_CACHED_HULLS)
+def _load_hull(
+    file: Path, version: tuple[int, int], scale: tuple[float, ...]
+) -> coal.Convex | None:
     """Return the hull of a mesh in a version of its file, None if that is flat, of which each use warns."""
     points = load_mesh(file, scale).vertices
-    return None if thickened(np.asarray(points, float))[1] else convex_hull(points, file=file)
+    return None if thicken(np.asarray(points, float))[1] else make_convex_hull(points, file=file)
 
 
-def convex_hull(
+def make_convex_hull(
     points: ArrayLike, *, file: str | Path | None = None, about: str | None = None
 ) -> coal.Convex:
     """Return the convex hull of `points`, shape (n, 3), [m], as a coal shape.
@@ -169,22 +171,23 @@ def convex_hull(
     given = np.asarray(points, float)
     if not len(given):
         raise InputError("a hull of nothing", file=file, field=about, expected="at least one point")
-    given, was_flat = thickened(given)
+    given, was_flat = thicken(given)
     if was_flat:
         named = " of ".join(str(part) for part in (about, file) if part is not None) or "a mesh"
         warnings.warn(
-            f"{named} is flat: it collides as a plate, {1e3 * FLAT:g} mm thick", stacklevel=2
+            f"{named} is flat: it collides as a plate, {1e3 * SHEET_THICKNESS:g} mm thick",
+            stacklevel=2,
         )
     hull = compute_hull(given)
     if (
-        np.bincount(np.asarray(hull.faces).ravel()).max() > _NEIGHBOURS
+        np.bincount(np.asarray(hull.faces).ravel()).max() > _MAX_NEIGHBOURS
     ):  # the tip of a finely meshed cone, a fine disc
-        hull = outer_hull(hull.vertices, vertices=60)
+        hull = compute_outer_hull(hull.vertices, vertices=60)
     vertices, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
     vertices.extend(np.asarray(hull.vertices, float))
     triangles.extend(coal.Triangle(*face) for face in np.asarray(hull.faces).tolist())
     shape = coal.Convex(vertices, triangles)
-    corners = np.asarray(shape.points())[indices(shape)]
+    corners = np.asarray(shape.points())[get_triangles(shape)]
     area = (
         np.linalg.norm(
             np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
@@ -195,7 +198,7 @@ def convex_hull(
         ("volume", shape.computeVolume(), hull.volume),
         ("area", area, hull.area),
     ):
-        if not abs(held - wanted) <= _TOLERANCE * abs(wanted) or wanted <= 0.0:
+        if not abs(held - wanted) <= _HULL_TOLERANCE * abs(wanted) or wanted <= 0.0:
             problem = f"coal does not hold this hull: wrong {what}"
             raise InputError(problem, file=file, field=about, expected=wanted, got=held)
     shape.computeLocalAABB()
@@ -222,8 +225,10 @@ def load_parts(
     file = Path(path)
     if file.suffix.lower() != ".obj" or not file.is_file():
         whole = load_mesh(file, scale)
-        return [coarser(MeshPart(np.asarray(whole.vertices), np.asarray(whole.faces)), detail)]
-    factors = _factors(file, scale)
+        return [
+            simplify_mesh(MeshPart(np.asarray(whole.vertices), np.asarray(whole.faces)), detail)
+        ]
+    factors = _check_scale(file, scale)
     try:
         scene = trimesh.load_scene(file, process=False, group_material=True, split_object=False)
     except Exception as error:
@@ -231,16 +236,16 @@ def load_parts(
             f"cannot read the mesh: {error}", file=file, expected="an OBJ file"
         ) from error
     parts = [
-        MeshPart(np.asarray(mesh.vertices) * factors, np.asarray(mesh.faces), _colour(mesh))
+        MeshPart(np.asarray(mesh.vertices) * factors, np.asarray(mesh.faces), _find_colour(mesh))
         for mesh in scene.geometry.values()
         if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)
     ]
     if not parts:
         raise InputError("the mesh is empty", file=file, expected="at least one triangle")
-    return [coarser(part, detail) for part in parts]
+    return [simplify_mesh(part, detail) for part in parts]
 
 
-def coarser(part: MeshPart, detail: float) -> MeshPart:
+def simplify_mesh(part: MeshPart, detail: float) -> MeshPart:
     """Return a lighter copy: the vertices in each cell of a grid become their mean, triangles without area go.
 
     Args:
@@ -264,7 +269,7 @@ def coarser(part: MeshPart, detail: float) -> MeshPart:
     return MeshPart(means / count[:, None], faces[np.sort(first)], part.colour)
 
 
-def to_bvh(part: MeshPart | trimesh.Trimesh) -> coal.BVHModelOBBRSS:
+def make_bvh(part: MeshPart | trimesh.Trimesh) -> coal.BVHModelOBBRSS:
     """Return the triangles of `part` as a coal shape, for display."""
     shape = coal.BVHModelOBBRSS()
     shape.beginModel(len(part.faces), len(part.vertices))
@@ -274,7 +279,7 @@ def to_bvh(part: MeshPart | trimesh.Trimesh) -> coal.BVHModelOBBRSS:
     return shape
 
 
-def _factors(file: Path, scale: ArrayLike) -> Floats:
+def _check_scale(file: Path, scale: ArrayLike) -> Floats:
     factors = np.asarray(scale, float)
     if factors.shape not in ((), (1,), (3,)) or not (
         np.isfinite(factors).all() and (factors != 0.0).all()
@@ -289,7 +294,7 @@ def _factors(file: Path, scale: ArrayLike) -> Floats:
     return np.broadcast_to(factors, (3,)).astype(float)
 
 
-def indices(shape: coal.Convex | coal.BVHModelBase) -> Ints:
+def get_triangles(shape: coal.Convex | coal.BVHModelBase) -> Ints:
     """Return the corners of the triangles of a coal shape, shape (m, 3)."""
     convex = isinstance(shape, coal.Convex)
     count, item = (
@@ -300,7 +305,7 @@ def indices(shape: coal.Convex | coal.BVHModelBase) -> Ints:
     ).reshape(-1, 3)
 
 
-def _colour(mesh: trimesh.Trimesh) -> tuple[float, float, float, float] | None:
+def _find_colour(mesh: trimesh.Trimesh) -> tuple[float, float, float, float] | None:
     material = getattr(mesh.visual, "material", None)
     if material is None:
         return None
@@ -312,7 +317,7 @@ def _colour(mesh: trimesh.Trimesh) -> tuple[float, float, float, float] | None:
     return (float(rgba[0]), float(rgba[1]), float(rgba[2]), float(rgba[3]))
 
 
-def _settle_boxes() -> None:
+def _fix_box_support() -> None:
     """Let coal take boxes as they are, whatever it is asked first.
 
     coal 3.0.3 decides once per process, from the first direction in which it looks for a box's
@@ -335,4 +340,4 @@ def _settle_boxes() -> None:
         coal.distance(shape, here, box, where, coal.DistanceRequest(), coal.DistanceResult())
 
 
-_settle_boxes()
+_fix_box_support()

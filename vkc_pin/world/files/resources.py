@@ -11,62 +11,64 @@ from typing import Any
 
 import pinocchio as pin
 
-from vkc_pin.errors import InputError, UnknownNameError, shown
+from vkc_pin.errors import InputError, UnknownNameError, format_value
 
 __all__ = [
-    "available",
+    "check_path",
     "choose_file_names",
-    "example_robot_data",
-    "file_path",
-    "find",
-    "folder",
-    "located",
-    "package_folder",
+    "find_example_robot_data",
+    "find_file",
+    "find_package_folder",
+    "find_resource",
+    "find_resource_folder",
+    "list_resources",
 ]
 
-_LONGEST = 64  # characters of a file name without extension; file systems take 255 bytes with it
+_MAX_NAME_LENGTH = (
+    64  # characters of a file name without extension; file systems take 255 bytes with it
+)
 _FILE_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
-_PORTS = {f"{port}{number}" for port in ("com", "lpt") for number in range(10)}
-_DEVICES = {"con", "prn", "aux", "nul", *_PORTS}  # reserved on Windows
+_PORT_NAMES = {f"{port}{number}" for port in ("com", "lpt") for number in range(10)}
+_RESERVED_NAMES = {"con", "prn", "aux", "nul", *_PORT_NAMES}  # reserved on Windows
 
 
-def package_folder() -> Path:
+def find_package_folder() -> Path:
     """Return the folder of the package's sources."""
     return Path(__file__).resolve().parents[2]
 
 
-def folder(kind: str) -> Path:
+def find_resource_folder(kind: str) -> Path:
     """Return the folder of `kind` ("robots" or "scenes"): inside the installed package, else beside it."""
-    package = package_folder()
+    package = find_package_folder()
     inside = package / kind
     return inside if inside.is_dir() else package.parent / kind
 
 
-def available(kind: str, pattern: str) -> dict[str, Path]:
+def list_resources(kind: str, pattern: str) -> dict[str, Path]:
     """Return name → path of what `folder(kind)` holds, by glob `pattern` (the name is the file's or folder's stem)."""
-    return {path.stem: path for path in sorted(folder(kind).glob(pattern))}
+    return {path.stem: path for path in sorted(find_resource_folder(kind).glob(pattern))}
 
 
-def find(kind: str, pattern: str, name: str, *, what: str) -> Path:
+def find_resource(kind: str, pattern: str, name: str, *, noun: str) -> Path:
     """Return the path of `name` among `available(kind, pattern)`.
 
     Raises:
-        UnknownNameError: There is none; `what` ("robot", "scene") names the kind in the message.
+        UnknownNameError: There is none; `noun` ("robot", "scene") names the kind in the message.
     """
-    found = available(kind, pattern)
+    found = list_resources(kind, pattern)
     if name not in found:
-        raise UnknownNameError(what, name, found)
+        raise UnknownNameError(noun, name, found)
     return found[name]
 
 
-def file_path(value: Any, field: str, expected: str = "a path") -> Path:
+def check_path(value: Any, field: str, expected: str = "a path") -> Path:
     """Return the path of a file, whether it exists or not.
 
     Raises:
         InputError: It is neither text nor a path, or no file can be called that.
     """
     if not isinstance(value, str | Path):
-        raise InputError("not a path", field=field, expected=expected, got=shown(value))
+        raise InputError("not a path", field=field, expected=expected, got=format_value(value))
     name = str(value)
     try:
         coded = os.fsencode(name)
@@ -74,25 +76,25 @@ def file_path(value: Any, field: str, expected: str = "a path") -> Path:
         coded = b""
     if not coded or b"\0" in coded or len(coded) >= 4096 or max(map(len, coded.split(b"/"))) > 255:
         raise InputError(
-            "no file can be called that", field=field, expected=expected, got=shown(name)
+            "no file can be called that", field=field, expected=expected, got=format_value(name)
         )
     return Path(value)
 
 
-def located(name_or_path: str | Path, kind: str, pattern: str, *, what: str) -> Path:
+def find_file(name_or_path: str | Path, kind: str, pattern: str, *, noun: str) -> Path:
     """Return a file by its path (of a .yaml file, or with a slash in it), or by its name; see `find`.
 
     Raises:
         UnknownNameError: There is none of that name.
         InputError: It is neither a name nor a path.
     """
-    path = file_path(name_or_path, what, f"the name of a {what}, or a path")
+    path = check_path(name_or_path, noun, f"the name of a {noun}, or a path")
     name = str(name_or_path)
     by_path = isinstance(name_or_path, Path) or name.endswith((".yaml", ".yml")) or "/" in name
-    return path if by_path else find(kind, pattern, name, what=what)
+    return path if by_path else find_resource(kind, pattern, name, noun=noun)
 
 
-def example_robot_data() -> Path | None:
+def find_example_robot_data() -> Path | None:
     """Return the folder of example-robot-data (in the wheels of cmeel: cmeel.prefix/share), or None."""
     prefixes = [Path(pin.__file__).resolve().parents[4]]
     spec = importlib.util.find_spec("cmeel")
@@ -136,7 +138,7 @@ def choose_file_names(
         new, number = stem, numbers.get(stem.lower(), 1)
         while new.lower() in used:
             number += 1
-            new = f"{stem[: _LONGEST - 1 - len(str(number))]}_{number}"
+            new = f"{stem[: _MAX_NAME_LENGTH - 1 - len(str(number))]}_{number}"
         numbers[stem.lower()] = number
         chosen[index] = new
         used.add(new.lower())
@@ -144,12 +146,12 @@ def choose_file_names(
 
 
 def _is_file_name(name: str) -> bool:
-    return _FILE_NAME.fullmatch(name) is not None and name.lower() not in _DEVICES
+    return _FILE_NAME.fullmatch(name) is not None and name.lower() not in _RESERVED_NAMES
 
 
 def _replace_characters(name: str, fallback: str) -> str:
     """Return a name with "_" in place of each character that file names lack, shortened."""
-    stem = re.sub(r"[^A-Za-z0-9_-]", "_", name)[:_LONGEST]
+    stem = re.sub(r"[^A-Za-z0-9_-]", "_", name)[:_MAX_NAME_LENGTH]
     if re.search(r"[A-Za-z0-9]", stem) is None:
         return fallback
-    return f"{stem}_" if stem.lower() in _DEVICES else stem
+    return f"{stem}_" if stem.lower() in _RESERVED_NAMES else stem

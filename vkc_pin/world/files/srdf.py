@@ -10,7 +10,7 @@ from pathlib import Path
 from vkc_pin.errors import UnknownNameError
 from vkc_pin.world.files.xml import read_xml
 
-__all__ = ["Srdf", "SrdfGroup", "group_tip", "read_groups", "read_srdf"]
+__all__ = ["Srdf", "SrdfGroup", "find_group_tip", "read_groups", "read_srdf"]
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def read_groups(path: str | Path, urdf: ElementTree.Element) -> dict[str, SrdfGr
     return groups
 
 
-def group_tip(path: Path | None, urdf: ElementTree.Element, name: str) -> str:
+def find_group_tip(path: Path | None, urdf: ElementTree.Element, name: str) -> str:
     """Return the link at the end of a group of an SRDF. Raises `UnknownNameError` if there is no such group, or no SRDF."""
     groups = {} if path is None else read_groups(path, urdf)
     if name not in groups:

@@ -16,22 +16,22 @@ import pinocchio as pin
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files import resources
-from vkc_pin.world.files.kinematic_tree import check_tree, numbers_of, plain_tree
-from vkc_pin.world.files.meshes import load_convex, load_mesh, to_bvh
-from vkc_pin.world.files.resources import file_path
-from vkc_pin.world.files.xml import line_of, read_xml
+from vkc_pin.world.files.kinematic_tree import check_tree, parse_numbers, simplify_tree
+from vkc_pin.world.files.meshes import load_convex, load_mesh, make_bvh
+from vkc_pin.world.files.resources import check_path
+from vkc_pin.world.files.xml import find_line, read_xml
 
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["UrdfFile", "UrdfShape", "load_urdf", "read_urdf", "tree_model"]
+__all__ = ["UrdfFile", "UrdfShape", "build_model", "load_urdf", "read_urdf"]
 
 Colour = tuple[float, float, float, float]
 _LIGHT_GREY: Colour = (0.9, 0.9, 0.9, 1.0)
 # shapes of a kind that become one model: Pinocchio's take the third power of their number in time
 # to grow
-_MOST = 1000
-_JOINTS = ("revolute", "continuous", "prismatic", "fixed")
+_MAX_SHAPES = 1000
+_JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed")
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class UrdfShape:
     file: Path | None = None
     colour: Colour | None = None
 
-    def solid(self) -> coal.CollisionGeometry:
+    def make_solid(self) -> coal.CollisionGeometry:
         """Return it as a coal shape in its own frame, a mesh as its convex hull.
 
         Raises:
@@ -74,7 +74,7 @@ class UrdfShape:
         }
         return kinds[self.kind](*self.size)
 
-    def mesh(self) -> trimesh.Trimesh:
+    def make_mesh(self) -> trimesh.Trimesh:
         """Return its triangles in the link's frame, [m]; round shapes as circumscribed polygons of 64 sides."""
         import trimesh
 
@@ -116,7 +116,7 @@ class UrdfFile:
         """The names of the links, in the file's order."""
         return tuple(link.get("name", "") for link in self.root.findall("link"))
 
-    def shapes(self, kind: str) -> list[UrdfShape]:
+    def read_shapes(self, kind: str) -> list[UrdfShape]:
         """Return all elements of `kind`, "visual" or "collision".
 
         Raises:
@@ -136,18 +136,18 @@ class UrdfFile:
                 found.append(self._shape(name, f"{name}_{index}", element, colours))
         return found
 
-    def few_shapes(self, kind: str) -> list[UrdfShape]:
-        """Return all elements of a kind for one model; see `shapes`.
+    def read_shapes_for_model(self, kind: str) -> list[UrdfShape]:
+        """Return all elements of a kind for one model; see `read_shapes`.
 
         Raises:
             InputError: As there, or there are too many.
         """
-        shapes = self.shapes(kind)
-        if len(shapes) > _MOST:
+        shapes = self.read_shapes(kind)
+        if len(shapes) > _MAX_SHAPES:
             raise InputError(
                 f"too many <{kind}> elements",
                 file=self.path,
-                expected=f"at most {_MOST}",
+                expected=f"at most {_MAX_SHAPES}",
                 got=len(shapes),
             )
         return shapes
@@ -167,7 +167,7 @@ class UrdfFile:
             folders += [folder / package for folder in around] + list(around)
             if (
                 package == "example-robot-data"
-                and (data := resources.example_robot_data()) is not None
+                and (data := resources.find_example_robot_data()) is not None
             ):
                 folders.append(data)  # for copies of its URDFs, wherever they are
             candidates = [folder / inside for folder in folders]
@@ -177,7 +177,7 @@ class UrdfFile:
                 folder / plain for folder in (self.path.parent, self.path.resolve().parent)
             ]  # plain, if absolute
         for candidate in candidates:
-            if file_path(candidate, "filename", "a mesh file").is_file():
+            if check_path(candidate, "filename", "a mesh file").is_file():
                 return candidate
         tried = f"nothing at {candidates[0]}"
         raise InputError(
@@ -197,7 +197,7 @@ class UrdfFile:
             raise InputError(
                 "an element without geometry",
                 file=self.path,
-                line=line_of(element),
+                line=find_line(element),
                 field=name,
                 expected="<geometry> with a shape",
             )
@@ -208,7 +208,7 @@ class UrdfFile:
                 self._numbers(origin, "xyz", 3, "0 0 0", name),
                 self._numbers(origin, "rpy", 3, "0 0 0", name),
             )
-            placement = pin.SE3(_rotation(*angles), np.array(position))
+            placement = pin.SE3(_compute_rotation(*angles), np.array(position))
         material = element.find("material")
         colour = (
             None
@@ -234,7 +234,7 @@ class UrdfFile:
             raise InputError(
                 "this shape is not supported",
                 file=self.path,
-                line=line_of(element),
+                line=find_line(element),
                 field=name,
                 expected=known,
                 got=shape.tag,
@@ -243,7 +243,7 @@ class UrdfFile:
             raise InputError(
                 "a shape without volume",
                 file=self.path,
-                line=line_of(element),
+                line=find_line(element),
                 field=name,
                 expected="sizes above 0",
                 got=size,
@@ -262,7 +262,7 @@ class UrdfFile:
     def _numbers(
         self, element: ElementTree.Element, key: str, count: int, default: str | None, where: str
     ) -> tuple[float, ...]:
-        return numbers_of(self.path, element, key, count, default=default, where=where)
+        return parse_numbers(self.path, element, key, count, default=default, where=where)
 
 
 def read_urdf(
@@ -288,7 +288,7 @@ def read_urdf(
     return UrdfFile(file.absolute(), text, root, dict(packages or {}))
 
 
-def tree_model(file: UrdfFile, *root: pin.JointModelPlanar | str) -> pin.Model:
+def build_model(file: UrdfFile, *root: pin.JointModelPlanar | str) -> pin.Model:
     """Return the Pinocchio model of all links and joints of a URDF.
 
     A joint whose limit says nothing about velocity has none, as one without a limit; efforts play
@@ -301,7 +301,7 @@ def tree_model(file: UrdfFile, *root: pin.JointModelPlanar | str) -> pin.Model:
     Raises:
         InputError: It is no valid URDF.
     """
-    text, silent = plain_tree(file.path, file.root)
+    text, silent = simplify_tree(file.path, file.root)
     try:
         model = pin.buildModelFromXML(text, *root)
     except (ValueError, RuntimeError) as error:
@@ -334,15 +334,18 @@ def load_urdf(
     for joint in file.root.findall(
         "joint"
     ):  # what Pinocchio would accept with another meaning, or refuse without saying why
-        name, kind, line = joint.get("name"), joint.get("type"), line_of(joint)
-        if kind not in _JOINTS:
-            problem, expected = "this joint type is not supported", ", ".join(_JOINTS)
+        name, kind, line = joint.get("name"), joint.get("type"), find_line(joint)
+        if kind not in _JOINT_TYPES:
+            problem, expected = "this joint type is not supported", ", ".join(_JOINT_TYPES)
             raise InputError(problem, file=path, line=line, field=name, expected=expected, got=kind)
         if joint.find("mimic") is not None:  # Pinocchio's parser would let it move on its own
             problem = "joints that mimic others are not supported"
             raise InputError(problem, file=path, line=line, field=name, expected="no <mimic>")
-    model = tree_model(file)
-    collision, visual = _geometry(model, file, "collision"), _geometry(model, file, "visual")
+    model = build_model(file)
+    collision, visual = (
+        _build_geometry(model, file, "collision"),
+        _build_geometry(model, file, "visual"),
+    )
     if len(visual.geometryObjects) > 0 and len(collision.geometryObjects) == 0:
         raise InputError(
             "nothing in this URDF can collide",
@@ -353,18 +356,19 @@ def load_urdf(
     return model, collision, visual
 
 
-def _geometry(model: pin.Model, file: UrdfFile, kind: str) -> pin.GeometryModel:
+def _build_geometry(model: pin.Model, file: UrdfFile, kind: str) -> pin.GeometryModel:
     """Return the shapes of `kind`, "visual" or "collision", on the links of `model`, in the order of its frames."""
     geometry = pin.GeometryModel()
     shapes = [
-        (model.getFrameId(shape.link, pin.FrameType.BODY), shape) for shape in file.few_shapes(kind)
+        (model.getFrameId(shape.link, pin.FrameType.BODY), shape)
+        for shape in file.read_shapes_for_model(kind)
     ]
     for index, shape in sorted(shapes, key=lambda pair: pair[0]):
         frame = model.frames[index]
         solid = (
-            to_bvh(load_mesh(shape.file, shape.size))
+            make_bvh(load_mesh(shape.file, shape.size))
             if kind == "visual" and shape.file is not None
-            else shape.solid()
+            else shape.make_solid()
         )
         added = pin.GeometryObject(
             shape.name, frame.parentJoint, index, frame.placement * shape.placement, solid
@@ -379,7 +383,7 @@ def _geometry(model: pin.Model, file: UrdfFile, kind: str) -> pin.GeometryModel:
     return geometry
 
 
-def _rotation(roll: float, pitch: float, yaw: float) -> Floats:
+def _compute_rotation(roll: float, pitch: float, yaw: float) -> Floats:
     """Return the rotation, shape (3, 3), of angles [rad] about fixed axes, to the last bit as Pinocchio's reader has it."""
     (a, u), (b, v), (c, w) = (
         (math.sin(angle / 2.0), math.cos(angle / 2.0)) for angle in (roll, pitch, yaw)

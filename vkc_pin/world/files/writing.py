@@ -11,10 +11,10 @@ import stat
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from vkc_pin.errors import InputError, shown
-from vkc_pin.utils.interrupt import deferred
+from vkc_pin.errors import InputError, format_value
+from vkc_pin.utils.interrupt import defer_interrupt
 from vkc_pin.world.files.documents import parse_json, read_text
-from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.resources import check_path
 
 __all__ = [
     "check_inside",
@@ -23,14 +23,14 @@ __all__ = [
     "check_outputs",
     "check_replaceable",
     "check_writable",
-    "folder_at_once",
     "write_atomically",
+    "write_folder_atomically",
 ]
 
 MANIFEST = ".vkc-pin.json"
-"""File in every folder of `folder_at_once` that lists its other files."""
-_LONGEST_NAME = 200  # bytes, so that an ending can be added
-_SHOWN = 3  # files that a message names
+"""File in every folder of `write_folder_atomically` that lists its other files."""
+_MAX_NAME_LENGTH = 200  # bytes, so that an ending can be added
+_MAX_LISTED = 3  # files that a message names
 
 
 def write_atomically(path: str | Path, data: bytes) -> Path:
@@ -42,11 +42,11 @@ def write_atomically(path: str | Path, data: bytes) -> Path:
     Raises:
         InputError: The path names something else than a file, or it cannot be written.
     """
-    with _told(path):
-        target, mode = _target(path)
+    with _report_path_errors(path):
+        target, mode = _resolve_target(path)
         target.parent.mkdir(parents=True, exist_ok=True)
-        with deferred():
-            temporary = _temporary(target.parent)
+        with defer_interrupt():
+            temporary = _make_temporary_path(target.parent)
             try:
                 with temporary.open("xb") as stream:
                     stream.write(data)
@@ -66,8 +66,8 @@ def check_writable(path: str | Path, *, field: str | None = None) -> Path:
         InputError: It cannot: the path, which `field` names, is that of something else, or nothing
             can be made there.
     """
-    with _told(path, field):
-        target, _ = _target(path)
+    with _report_path_errors(path, field):
+        target, _ = _resolve_target(path)
         place, missing = target.parent, [target.name]
         while not place.exists():
             missing.append(place.name)
@@ -75,8 +75,10 @@ def check_writable(path: str | Path, *, field: str | None = None) -> Path:
         for name in missing:  # no file system takes any name
             with contextlib.suppress(FileNotFoundError):
                 (place / name).lstat()
-        temporary = _temporary(place)  # only trying tells: of a disk that is read-only, say
-        with deferred():
+        temporary = _make_temporary_path(
+            place
+        )  # only trying tells: of a disk that is read-only, say
+        with defer_interrupt():
             try:
                 temporary.open("xb").close()
             finally:
@@ -85,21 +87,21 @@ def check_writable(path: str | Path, *, field: str | None = None) -> Path:
 
 
 def check_outputs(
-    files: Mapping[str, str | Path], *, kept: Mapping[str, str | Path] | None = None
+    files: Mapping[str, str | Path], *, inputs: Mapping[str, str | Path] | None = None
 ) -> None:
     """Check that files can be written, and do not get in each other's way.
 
     Args:
         files: Option or argument → the file that it names.
-        kept: Option or argument → a file that is read, and must not be written.
+        inputs: Option or argument → a file that is read, and must not be written.
 
     Raises:
         InputError: One of them cannot be written, names what another one does, or needs a folder
             where another one is a file.
     """
     taken = {
-        Path(os.path.realpath(file_path(path, field))): field
-        for field, path in (kept or {}).items()
+        Path(os.path.realpath(check_path(path, field))): field
+        for field, path in (inputs or {}).items()
     }
     targets: dict[Path, str] = {}
     for field, path in files.items():
@@ -142,12 +144,12 @@ def check_name(name: object, field: str, *, file: str | Path | None = None) -> s
     if (
         isinstance(name, str)
         and plain
-        and 0 < len(name.encode()) <= _LONGEST_NAME
+        and 0 < len(name.encode()) <= _MAX_NAME_LENGTH
         and name[0] != "."
     ):
         return name
-    expected = f"at most {_LONGEST_NAME} bytes of text without slashes, not beginning with a dot"
-    problem, got = "not a plain file name", shown(name)
+    expected = f"at most {_MAX_NAME_LENGTH} bytes of text without slashes, not beginning with a dot"
+    problem, got = "not a plain file name", format_value(name)
     raise InputError(problem, file=file, field=field, expected=expected, got=got)
 
 
@@ -173,27 +175,27 @@ def check_links(folder: str | Path) -> None:
     Raises:
         InputError: A link does, or the folder cannot be read.
     """
-    with _told(folder):
-        links = [entry.path for entry in _walk(folder) if entry.is_symlink()]
+    with _report_path_errors(folder):
+        links = [entry.path for entry in _walk_files(folder) if entry.is_symlink()]
     for link in links:
         check_inside(link, folder)
 
 
 def check_replaceable(folder: str | Path) -> None:
-    """Check that a folder has no files but those that `folder_at_once` wrote to it.
+    """Check that a folder has no files but those that `write_folder_atomically` wrote to it.
 
     Raises:
         InputError: It has others, or cannot be read.
     """
-    with _told(folder):
-        found = {os.path.relpath(entry.path, folder) for entry in _walk(folder)}
+    with _report_path_errors(folder):
+        found = {os.path.relpath(entry.path, folder) for entry in _walk_files(folder)}
     if others := sorted(found - {MANIFEST} - _read_manifest(Path(folder))):
-        more = f" and {len(others) - _SHOWN} more" if len(others) > _SHOWN else ""
+        more = f" and {len(others) - _MAX_LISTED} more" if len(others) > _MAX_LISTED else ""
         raise InputError(
             "the folder has files that vkc-pin did not write, and would delete",
             file=folder,
             expected="a folder without them: move them elsewhere",
-            got=f"{', '.join(others[:_SHOWN])}{more}",
+            got=f"{', '.join(others[:_MAX_LISTED])}{more}",
         )
 
 
@@ -206,7 +208,7 @@ def _read_manifest(folder: Path) -> set[str]:
         return set()
 
 
-def _walk(folder: str | Path) -> Iterator[os.DirEntry[str]]:
+def _walk_files(folder: str | Path) -> Iterator[os.DirEntry[str]]:
     """Yield every entry below a folder that is not a folder itself. Links are not followed."""
     pending = [os.fspath(folder)]
     while pending:
@@ -219,7 +221,7 @@ def _walk(folder: str | Path) -> Iterator[os.DirEntry[str]]:
 
 
 @contextlib.contextmanager
-def folder_at_once(path: str | Path, *, force: bool = False) -> Iterator[Path]:
+def write_folder_atomically(path: str | Path, *, force: bool = False) -> Iterator[Path]:
     """Yield a new folder to write into, which becomes `path` if nothing is raised, else is removed.
 
     A list of its files is written to it as well, so that a later call can replace it safely.
@@ -232,18 +234,18 @@ def folder_at_once(path: str | Path, *, force: bool = False) -> Iterator[Path]:
         InputError: The folder exists and may not be replaced, it cannot be created, or `path` is
             not a folder.
     """
-    target = Path(os.path.realpath(file_path(path, "path", "a folder")))
+    target = Path(os.path.realpath(check_path(path, "path", "a folder")))
     _check_target(target, path, force)
-    with _told(path):
+    with _report_path_errors(path):
         target.parent.mkdir(parents=True, exist_ok=True)
-        staging = _temporary(target.parent)
+        staging = _make_temporary_path(target.parent)
         staging.mkdir()
     try:
         yield staging
         _check_target(target, path, force)  # it may have changed in the meantime
-        with _told(path), deferred():
+        with _report_path_errors(path), defer_interrupt():
             _write_manifest(staging)
-            _replace(target, staging)
+            _replace_folder(target, staging)
     finally:
         shutil.rmtree(staging, ignore_errors=True)
 
@@ -262,16 +264,16 @@ def _check_target(target: Path, path: str | Path, force: bool) -> None:
 
 def _write_manifest(folder: Path) -> None:
     (folder / MANIFEST).unlink(missing_ok=True)
-    files = sorted(os.path.relpath(entry.path, folder) for entry in _walk(folder))
+    files = sorted(os.path.relpath(entry.path, folder) for entry in _walk_files(folder))
     (folder / MANIFEST).write_text(json.dumps({"files": files}, indent=1) + "\n", encoding="utf-8")
 
 
-def _replace(target: Path, staging: Path) -> None:
+def _replace_folder(target: Path, staging: Path) -> None:
     """Rename a folder to `target`, and delete the one that had that name."""
     if not target.exists():
         staging.rename(target)
         return
-    old = _temporary(target.parent)
+    old = _make_temporary_path(target.parent)
     target.rename(old)
     try:
         staging.rename(target)
@@ -281,7 +283,7 @@ def _replace(target: Path, staging: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _target(path: str | Path) -> tuple[Path, int | None]:
+def _resolve_target(path: str | Path) -> tuple[Path, int | None]:
     """Return what a path leads to, and the mode of what is there; None if nothing is."""
     target = Path(os.path.realpath(path))
     try:
@@ -300,16 +302,16 @@ def _target(path: str | Path) -> tuple[Path, int | None]:
     return target, stat.S_IMODE(found.st_mode)
 
 
-def _temporary(folder: Path) -> Path:
+def _make_temporary_path(folder: Path) -> Path:
     """Return a new name in a folder, for a file that is renamed when it is whole."""
     return folder / f".vkc-pin-{secrets.token_hex(8)}"
 
 
 @contextlib.contextmanager
-def _told(path: str | Path, field: str | None = None) -> Iterator[None]:
+def _report_path_errors(path: str | Path, field: str | None = None) -> Iterator[None]:
     """Say what is wrong with a path."""
     path = (
-        path if isinstance(path, str) else file_path(path, "path")
+        path if isinstance(path, str) else check_path(path, "path")
     )  # text may end with a slash, which paths forget
     try:
         yield

@@ -9,19 +9,19 @@ from typing import Any
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
-from vkc_pin.errors import InputError, shown
+from vkc_pin.errors import InputError, format_value
 from vkc_pin.world.files.documents import read_text
 
 __all__ = [
     "check_indices",
-    "line_of",
+    "find_line",
     "parse_xml",
     "quote",
     "read_xml",
     "replace_forbidden",
 ]
 
-_INDICES = ("h", "p", "v", "vcount")
+_INDEX_ELEMENTS = ("h", "p", "v", "vcount")
 _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
@@ -31,7 +31,7 @@ class _Element(ElementTree.Element):
     line: int | None = None
 
 
-def line_of(element: ElementTree.Element) -> int | None:
+def find_line(element: ElementTree.Element) -> int | None:
     """Return the line in which an element begins, counted from 1; None if that is not known."""
     return getattr(element, "line", None)
 
@@ -120,7 +120,7 @@ def check_indices(file: Path) -> None:
         inside.append(tag.rpartition(":")[2])
 
     def text(data: str) -> None:
-        if inside and inside[-1] in _INDICES and data.strip("0123456789+- \t\r\n"):
+        if inside and inside[-1] in _INDEX_ELEMENTS and data.strip("0123456789+- \t\r\n"):
             line, field = parser.CurrentLineNumber, f"<{inside[-1]}>"
             raise InputError(
                 "not indices",
@@ -128,7 +128,7 @@ def check_indices(file: Path) -> None:
                 line=line,
                 field=field,
                 expected="whole numbers",
-                got=shown(data),
+                got=format_value(data),
             )
 
     def end(_: str) -> None:

@@ -14,7 +14,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arguments import known, number, numbers
+from vkc_pin.utils.arguments import check_array, check_choice, check_number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.dynamics.joint_resistance import Resistance
@@ -67,7 +67,7 @@ class Freedom:
         Raises:
             InputError: The value is not a finite number.
         """
-        value = number(value, "value")
+        value = check_number(value, "value")
         if self.kind == "revolute":
             turn = pin.exp3(self.axis * value)
             return pin.SE3(turn, self.through - turn @ self.through)
@@ -131,7 +131,7 @@ class Attachment:
         Raises:
             InputError: The number of values differs from that of freedoms.
         """
-        given = numbers(values, self.name)
+        given = check_array(values, self.name)
         if given.shape != (len(self.freedoms),):
             expected = f"{len(self.freedoms)}, one per freedom"
             raise InputError(
@@ -250,7 +250,7 @@ class ArticulatedObject:
                     field="attachment",
                 )
             return next(iter(self.attachments.values()))
-        return self.attachments[known(name, self.attachments, f"attachment of {self.name}")]
+        return self.attachments[check_choice(name, self.attachments, f"attachment of {self.name}")]
 
     def link_frame(self, link: str) -> int:
         """Return the index of the frame of `link` in `model`.
@@ -260,7 +260,7 @@ class ArticulatedObject:
         """
         return int(
             self.model.getFrameId(
-                known(link, self.links, f"link of {self.name}"), pin.FrameType.BODY
+                check_choice(link, self.links, f"link of {self.name}"), pin.FrameType.BODY
             )
         )
 

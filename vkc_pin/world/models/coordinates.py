@@ -14,7 +14,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arguments import known, numbers
+from vkc_pin.utils.arguments import check_array, check_choice
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 
 __all__ = ["Coordinates", "MovedJoint", "wrap_angle"]
@@ -225,7 +225,7 @@ class Coordinates:
 
     def q(self, z: ArrayLike) -> Floats:
         """Return Pinocchio's configurations q, shape (..., nq), for `z`, shape (..., n)."""
-        z = numbers(z, "z")
+        z = check_array(z, "z")
         if z.shape[-1:] != (self.size,):
             raise InputError(
                 "wrong number of coordinates",
@@ -250,7 +250,7 @@ class Coordinates:
 
         Angles are in (-π, π].
         """
-        q = numbers(q, "q")
+        q = check_array(q, "q")
         if q.shape[-1:] != (self.nq,):
             raise InputError(
                 "wrong size of configuration", field="q", expected=f"(..., {self.nq})", got=q.shape
@@ -284,7 +284,7 @@ class Coordinates:
         Raises:
             UnknownNameError: The coordinate does not exist.
         """
-        return self.names.index(known(name, self.names, "coordinate"))
+        return self.names.index(check_choice(name, self.names, "coordinate"))
 
 
 def wrap_angle(angle: Any) -> Any:

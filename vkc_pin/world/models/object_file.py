@@ -12,21 +12,21 @@ import pinocchio as pin
 from pydantic import Field, model_validator
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arguments import mapping
-from vkc_pin.world.files.documents import Document, check, read_yaml
+from vkc_pin.utils.arguments import check_mapping
+from vkc_pin.world.files.documents import Document, parse_document, read_yaml
 from vkc_pin.world.files.fields import (
     Name,
-    NotNegative,
+    NonNegative,
     Number,
     Positive,
     Quaternion,
     Schema,
     Vector3,
-    count,
-    fail,
+    make_validation_error,
     require,
+    require_length,
 )
-from vkc_pin.world.files.resources import file_path, located
+from vkc_pin.world.files.resources import check_path, find_file
 from vkc_pin.world.files.urdf import load_urdf
 from vkc_pin.world.models.articulated_object import (
     DEFAULT_ACCELERATION,
@@ -61,7 +61,7 @@ _is_nonzero = require(
     "a direction cannot be zero",
     "a nonzero vector",
 )
-Limits = Annotated[tuple[Number, Number], count(2), _contains_zero]
+Limits = Annotated[tuple[Number, Number], require_length(2), _contains_zero]
 Direction = Annotated[Vector3, _is_nonzero]
 
 
@@ -77,9 +77,11 @@ class FreedomSchema(Schema):
     @model_validator(mode="after")
     def _consistent(self) -> FreedomSchema:
         if (self.slide is None) == (self.turn is None):
-            raise fail("a freedom needs one axis", "either slide or turn")
+            raise make_validation_error("a freedom needs one axis", "either slide or turn")
         if self.slide is not None and self.through is not None:
-            raise fail("`through` has no meaning for a slide", "through with turn only")
+            raise make_validation_error(
+                "`through` has no meaning for a slide", "through with turn only"
+            )
         return self
 
 
@@ -97,11 +99,11 @@ class AttachmentSchema(Schema):
     axis: Direction | None = None
     limits: Limits | None = None
     turn: Limits | None = None
-    standoff: NotNegative = 0.0
+    standoff: NonNegative = 0.0
     freedoms: tuple[FreedomSchema, ...] = ()
     firm: bool | None = None  # default: whether the object is free
-    clearance: NotNegative | None = None
-    opening: NotNegative | None = None
+    clearance: NonNegative | None = None
+    opening: NonNegative | None = None
     contact: Literal["grasp", "push"] = "grasp"
 
     @model_validator(mode="after")
@@ -166,7 +168,7 @@ class AttachmentSchema(Schema):
             (len(set(names)) < len(names), "two freedoms share a name", "different names"),
         ):
             if is_invalid:
-                raise fail(problem, expected)
+                raise make_validation_error(problem, expected)
         return self
 
 
@@ -185,11 +187,11 @@ class ObjectSchema(Schema):
 
     urdf: str
     free: bool = False
-    mass: NotNegative | None = None
+    mass: NonNegative | None = None
     joints: Mapping[str, ObjectJointSchema] = Field(default_factory=dict)
     attachments: tuple[AttachmentSchema, ...]  # may be empty, for objects that are obstacles only
     latches: tuple[LatchSchema, ...] = ()
-    own_collisions: tuple[Annotated[tuple[str, ...], count(2)], ...] = ()
+    own_collisions: tuple[Annotated[tuple[str, ...], require_length(2)], ...] = ()
 
 
 def load_object(
@@ -209,9 +211,9 @@ def load_object(
     """
     if isinstance(name_or_path, Mapping):
         return build_object(
-            Document(mapping(name_or_path, "description")), file_path(folder, "folder")
+            Document(check_mapping(name_or_path, "description")), check_path(folder, "folder")
         )
-    file = located(name_or_path, "scenes", "objects/*.yaml", what="object")
+    file = find_file(name_or_path, "scenes", "objects/*.yaml", noun="object")
     return build_object(read_yaml(file), file.parent, file.stem)
 
 
@@ -227,14 +229,14 @@ def build_object(document: Document, folder: Path, name: str | None = None) -> A
         UnknownNameError: The description names a field, link or joint that does not exist.
         InputError: The description or its URDF is invalid.
     """
-    schema = check(document, ObjectSchema)
+    schema = parse_document(document, ObjectSchema)
     text = schema.urdf if schema.urdf.lstrip().startswith("<") else None
     urdf = (
         folder / schema.urdf
         if text is None
         else Path(f"{document.file or folder / 'description'}: urdf")
     )
-    with document.at(("urdf",)):
+    with document.annotate_errors(("urdf",)):
         model, collision, visual = load_urdf(urdf, text=text)
         coordinates = Coordinates(model)
     names, links = (
@@ -248,7 +250,7 @@ def build_object(document: Document, folder: Path, name: str | None = None) -> A
     velocity[np.isinf(velocity)] = DEFAULT_VELOCITY
     for joint, limits in schema.joints.items():
         if joint not in names:
-            raise document.unknown(("joints", joint), "joint", joint, names)
+            raise document.make_unknown_name_error(("joints", joint), "joint", joint, names)
         index = coordinates.index(joint)
         velocity[index] = limits.velocity or velocity[index]
         acceleration[index] = limits.acceleration or acceleration[index]
@@ -262,14 +264,16 @@ def build_object(document: Document, folder: Path, name: str | None = None) -> A
                 "`mass` applies to free objects only",
                 "masses of links in its URDF, or free: true",
             )
-            raise document.error(("mass",), problem, expected=expected, got=schema.mass)
+            raise document.make_error(("mass",), problem, expected=expected, got=schema.mass)
         set_mass(model, collision, schema.mass)
     attachments: dict[str, Attachment] = {}
     for index, item in enumerate(schema.attachments):
         if item.link not in links:
-            raise document.unknown(("attachments", index, "link"), "link", item.link, links)
+            raise document.make_unknown_name_error(
+                ("attachments", index, "link"), "link", item.link, links
+            )
         if item.name in attachments:
-            raise document.error(
+            raise document.make_error(
                 ("attachments", index, "name"),
                 "this attachment name is already used",
                 expected="a new name",
@@ -277,7 +281,7 @@ def build_object(document: Document, folder: Path, name: str | None = None) -> A
             )
         if schema.free and item.contact == "push":
             problem = "free objects cannot be pushed, since no joint guides them"
-            raise document.error(
+            raise document.make_error(
                 ("attachments", index, "contact"), problem, expected="grasp", got=item.contact
             )
         attachment = _build_attachment(item, firm=schema.free)
@@ -286,7 +290,7 @@ def build_object(document: Document, folder: Path, name: str | None = None) -> A
         }.intersection(attachment.coordinates)
         if duplicates:  # "grip_slide" beside a "grip" that slides
             problem, got = "its coordinate's name is already used", ", ".join(duplicates)
-            raise document.error(
+            raise document.make_error(
                 ("attachments", index, "name"), problem, expected="a new name", got=got
             )
         attachments[item.name] = attachment
@@ -370,9 +374,11 @@ def _read_own_pairs(
     for number, pair in enumerate(schema.own_collisions):
         for place, link in enumerate(pair):
             if link not in links:
-                raise document.unknown(("own_collisions", number, place), "link", link, links)
+                raise document.make_unknown_name_error(
+                    ("own_collisions", number, place), "link", link, links
+                )
         if pair[0] == pair[1]:
-            raise document.error(
+            raise document.make_error(
                 ("own_collisions", number),
                 "a link cannot collide with itself",
                 expected="two links",
@@ -392,12 +398,14 @@ def _build_latches(
             ("released_by", item.released_by, item.threshold),
         ):
             if joint not in coordinates.names:
-                raise document.unknown((*at, role), "joint", joint, coordinates.names)
+                raise document.make_unknown_name_error(
+                    (*at, role), "joint", joint, coordinates.names
+                )
             index = coordinates.index(joint)
             lower, upper = coordinates.lower[index], coordinates.upper[index]
             if not lower <= value <= upper:
                 key = "held_at" if role == "joint" else "threshold"
-                raise document.error(
+                raise document.make_error(
                     (*at, key),
                     f"outside the limits of {joint}",
                     expected=f"{lower:g} to {upper:g}",
@@ -405,7 +413,7 @@ def _build_latches(
                 )
         if item.joint == item.released_by:
             problem = "a joint cannot release itself"
-            raise document.error(
+            raise document.make_error(
                 (*at, "released_by"), problem, expected="another joint", got=item.released_by
             )
         latches.append(

@@ -15,7 +15,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arguments import whole
+from vkc_pin.utils.arguments import check_integer
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.models.coordinates import Coordinates
@@ -246,7 +246,9 @@ class Robot:
         Raises:
             InputError: The shape does not exist.
         """
-        geometry = whole(geometry, "geometry", low=0, high=len(self.collision.geometryObjects) - 1)
+        geometry = check_integer(
+            geometry, "geometry", low=0, high=len(self.collision.geometryObjects) - 1
+        )
         return get_link_name(self.collision.geometryObjects[geometry].name)
 
     def own_margin(self, links: tuple[str, str], margin: float) -> float:

@@ -11,12 +11,12 @@ from typing import Literal, get_args
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.errors import InputError, UnknownNameError, shown
-from vkc_pin.utils.arguments import mapping, quantity, text
+from vkc_pin.errors import InputError, UnknownNameError, format_value
+from vkc_pin.utils.arguments import check_coordinate, check_mapping, check_text
 from vkc_pin.world.files import resources
 from vkc_pin.world.files.documents import Document
-from vkc_pin.world.files.resources import file_path
-from vkc_pin.world.files.srdf import Srdf, group_tip, read_srdf
+from vkc_pin.world.files.resources import check_path
+from vkc_pin.world.files.srdf import Srdf, find_group_tip, read_srdf
 from vkc_pin.world.files.urdf import UrdfFile, read_urdf
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.couplings.coupled_joints import apply_couplings
@@ -59,9 +59,10 @@ _ALIASES = {
 def list_robots() -> dict[str, Path]:
     """Return robot name → file: robots in robots/, then those of example-robot-data."""
     known = {
-        path.parent.name: path for path in sorted(resources.folder("robots").glob("*/robot.yaml"))
+        path.parent.name: path
+        for path in sorted(resources.find_resource_folder("robots").glob("*/robot.yaml"))
     }
-    folder = resources.example_robot_data()
+    folder = resources.find_example_robot_data()
     if folder is not None:
         files = sorted(folder.glob("robots/*/*/*.urdf"))
         stems = {file.stem: file for file in reversed(files)}
@@ -170,14 +171,14 @@ def load_robot(
     ):
         if not isinstance(value, str) or value not in choices:
             raise InputError(
-                f"wrong {kind}", field=field, expected=" or ".join(choices), got=shown(value)
+                f"wrong {kind}", field=field, expected=" or ".join(choices), got=format_value(value)
             )
     for field, given_name, kind in (
         ("tool_frame", tool_frame, "the name of a frame"),
         ("arm", arm, "the name of a group"),
     ):
         if given_name is not None:
-            text(given_name, field, kind)
+            check_text(given_name, field, kind)
     if arm is not None and tool_frame is not None:
         raise InputError(
             "`arm` and `tool_frame` exclude each other",
@@ -187,17 +188,21 @@ def load_robot(
         )
     positions = {}
     for field, values in (("locked_joints", locked_joints), ("home", home)):
-        checked = mapping({} if values is None else values, field, "joints, each with its position")
+        checked = check_mapping(
+            {} if values is None else values, field, "joints, each with its position"
+        )
         positions[field] = {
-            joint: quantity(value, f"{field}.{joint}") for joint, value in checked.items()
+            joint: check_coordinate(value, f"{field}.{joint}") for joint, value in checked.items()
         }
     home, locked_joints = positions["home"], positions["locked_joints"]
     files = _read_files(
         name,
-        mapping({} if packages is None else packages, "packages", "packages, each with its folder"),
+        check_mapping(
+            {} if packages is None else packages, "packages", "packages, each with its folder"
+        ),
     )
     urdf, settings = files.urdf, files.settings
-    srdf_path = file_path(srdf, "srdf") if srdf is not None else files.find_srdf()
+    srdf_path = check_path(srdf, "srdf") if srdf is not None else files.find_srdf()
     semantics = (
         read_srdf(srdf_path, links=urdf.links)
         if srdf_path is not None and pairs == "srdf"
@@ -229,7 +234,7 @@ def load_robot(
         problem = "the virtual base replaces the joints of the robot's base, which are locked"
         warnings.warn(f"{urdf.path}: {problem}: {unstated}", stacklevel=2)
     root_height, rest = (
-        settings.base.height if height is None else quantity(height, "height"),
+        settings.base.height if height is None else check_coordinate(height, "height"),
         {**rest, **locked},
     )
     model = build_planned_model(full, urdf, tool, rest, locked, height=root_height)
@@ -323,7 +328,11 @@ class _RobotFiles:
     def find_tool_frame(self, arm: str | None, srdf: Path | None) -> str | None:
         """Return the tool frame named by a group of the SRDF or by robot.yaml, or None."""
         group = self.settings.arm if arm is None else arm
-        return self.settings.tool_frame if group is None else group_tip(srdf, self.urdf.root, group)
+        return (
+            self.settings.tool_frame
+            if group is None
+            else find_group_tip(srdf, self.urdf.root, group)
+        )
 
     def check_names(self, joints: Collection[str]) -> None:
         """Check that the joints and links named in robot.yaml exist.
@@ -335,10 +344,14 @@ class _RobotFiles:
         for key in ("home", "locked_joints", "gripper", "joints"):
             for joint in getattr(settings, key):
                 if joint not in joints:
-                    raise self.document.unknown((key, joint), "joint", joint, joints)
+                    raise self.document.make_unknown_name_error(
+                        (key, joint), "joint", joint, joints
+                    )
         for link in settings.touch_links:
             if link not in self.urdf.links:
-                raise self.document.unknown(("touch_links",), "link", link, self.urdf.links)
+                raise self.document.make_unknown_name_error(
+                    ("touch_links",), "link", link, self.urdf.links
+                )
 
     def check_limits(self, full: pin.Model, joint: str, position: float, field: str) -> None:
         """Check that a home or locked position is within the joint's limits.
@@ -359,7 +372,7 @@ class _RobotFiles:
                     ("home", self.settings.home),
                 ):
                     if section.get(joint) == position:
-                        raise self.document.error(
+                        raise self.document.make_error(
                             (key, joint), problem, expected=expected, got=position
                         )
                 raise InputError(
@@ -389,7 +402,7 @@ class _RobotFiles:
                         f"{follows:g}, or no value",
                     )
                     if joint in self.settings.home:
-                        raise self.document.error(
+                        raise self.document.make_error(
                             ("home", joint), problem, expected=expected, got=rest[joint]
                         )
                     raise InputError(
@@ -403,7 +416,7 @@ class _RobotFiles:
 
 def _read_files(name: str | Path, packages: Mapping[str, str | Path]) -> _RobotFiles:
     """Find and read a robot's URDF and its robot.yaml, if there is one."""
-    file_path(name, "name", "a robot's name, or a path")
+    check_path(name, "name", "a robot's name, or a path")
     source = find_robot(name)
     document = Document({})
     settings = RobotSchema(urdf=source.name)
@@ -413,7 +426,7 @@ def _read_files(name: str | Path, packages: Mapping[str, str | Path]) -> _RobotF
     if source.suffix == ".yaml":
         settings, document = read_robot(source)
     folders = {
-        key: file_path(folder, f"packages.{key}", "a folder") for key, folder in packages.items()
+        key: check_path(folder, f"packages.{key}", "a folder") for key, folder in packages.items()
     }
     folders = {
         **find_python_packages(tuple(p for p in settings.packages if p not in folders), document),

@@ -10,8 +10,8 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.files.meshes import load_parts, to_bvh
-from vkc_pin.world.files.urdf import UrdfFile, UrdfShape, tree_model
+from vkc_pin.world.files.meshes import load_parts, make_bvh
+from vkc_pin.world.files.urdf import UrdfFile, UrdfShape, build_model
 from vkc_pin.world.models.couplings.coupled_joints import (
     JointCoupling,
     find_coupled_groups,
@@ -51,7 +51,7 @@ def build_full_model(file: UrdfFile) -> pin.Model:
     Raises:
         InputError: The file is not a valid URDF.
     """
-    return tree_model(file, pin.JointModelPlanar(), BASE_JOINT)
+    return build_model(file, pin.JointModelPlanar(), BASE_JOINT)
 
 
 def build_planned_model(
@@ -237,7 +237,7 @@ def find_base_joints(full: pin.Model, file: UrdfFile) -> tuple[str, ...]:
     """
     data, slides, found, joint = full.createData(), list[Floats](), list[str](), 1
     pin.computeJointJacobians(full, data, pin.neutral(full))
-    solid = {shape.link for shape in file.shapes("collision")}
+    solid = {shape.link for shape in file.read_shapes("collision")}
     carries = {
         frame.parentJoint
         for frame in full.frames
@@ -312,9 +312,9 @@ def load_collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryMod
             shapes.
     """
     geometry = pin.GeometryModel()
-    for shape in file.few_shapes("collision"):
+    for shape in file.read_shapes_for_model("collision"):
         geometry.addGeometryObject(
-            _make_geometry_object(model, shape, shape.name, shape.solid(), _GREY)
+            _make_geometry_object(model, shape, shape.name, shape.make_solid(), _GREY)
         )
     if len(geometry.geometryObjects) == 0:
         raise InputError(
@@ -337,11 +337,11 @@ def load_visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
         InputError: A shape is not supported, or a mesh cannot be read.
     """
     geometry = pin.GeometryModel()
-    for shape in file.few_shapes("visual"):
+    for shape in file.read_shapes_for_model("visual"):
         if shape.file is None:
             geometry.addGeometryObject(
                 _make_geometry_object(
-                    model, shape, shape.name, shape.solid(), shape.colour or _GREY
+                    model, shape, shape.name, shape.make_solid(), shape.colour or _GREY
                 )
             )
             continue
@@ -350,7 +350,7 @@ def load_visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
             name = shape.name if len(parts) == 1 else f"{shape.name}_{k}"
             colour = shape.colour or part.colour or _GREY
             geometry.addGeometryObject(
-                _make_geometry_object(model, shape, name, to_bvh(part), colour)
+                _make_geometry_object(model, shape, name, make_bvh(part), colour)
             )
     return geometry
 

@@ -9,16 +9,16 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arguments import quantity
-from vkc_pin.world.files.documents import Document, check, read_yaml
+from vkc_pin.utils.arguments import check_coordinate
+from vkc_pin.world.files.documents import Document, parse_document, read_yaml
 from vkc_pin.world.files.fields import (
     JointSchema,
-    NotNegative,
+    NonNegative,
     Number,
     Positive,
     Schema,
     require,
-    text_for,
+    wrap_text,
 )
 
 __all__ = [
@@ -80,7 +80,7 @@ class BaseSchema(Schema):
 class RobotJointSchema(JointSchema):
     """Corrections to a robot's joint in the URDF; effort [N·m] or [N], where 0 means unknown."""
 
-    effort: NotNegative | None = None
+    effort: NonNegative | None = None
 
 
 class FingerSchema(Schema):
@@ -113,7 +113,9 @@ class RobotSchema(Schema):
     home: dict[str, Number] = Field(default_factory=dict)
     locked_joints: dict[str, Number] = Field(default_factory=dict)
     gripper: dict[str, FingerSchema] = Field(default_factory=dict)
-    couplings: dict[str, Annotated[CouplingSchema, text_for("joint")]] = Field(default_factory=dict)
+    couplings: dict[str, Annotated[CouplingSchema, wrap_text("joint")]] = Field(
+        default_factory=dict
+    )
     joints: dict[str, RobotJointSchema] = Field(default_factory=dict)
 
 
@@ -132,9 +134,9 @@ def read_robot(file: Path) -> tuple[RobotSchema, Document]:
             expected="fields (name: value)",
             got=type(document.data).__name__,
         )
-    settings = check(document, RobotSchema)
+    settings = parse_document(document, RobotSchema)
     if settings.arm is not None and settings.tool_frame is not None:
-        raise document.error(
+        raise document.make_error(
             ("arm",),
             "`arm` and `tool_frame` exclude each other",
             expected="one of them",
@@ -172,7 +174,7 @@ def read_wheels(
     radius = (
         settings.base.turning_radius
         if turning_radius is None
-        else quantity(turning_radius, "turning_radius")
+        else check_coordinate(turning_radius, "turning_radius")
     )
     if radius is None:
         expected = "turning_radius [m] as an argument, or under `base` in robot.yaml"
@@ -204,7 +206,7 @@ def find_python_packages(names: tuple[str, ...], document: Document) -> dict[str
         spec = importlib.util.find_spec(name) if name.isidentifier() else None
         if spec is None or not spec.submodule_search_locations:
             problem = "the Python package with the robot's meshes is not installed"
-            raise document.error(
+            raise document.make_error(
                 ("packages", index), problem, expected=f"pip install {name.replace('_', '-')}"
             )
         folders[name] = Path(next(iter(spec.submodule_search_locations)))

@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.disk_cache import record
+from vkc_pin.utils.disk_cache import load_or_build
 from vkc_pin.world.files.srdf import Srdf
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.files.xml import quote
@@ -161,7 +161,7 @@ def analyze_self_collisions(
         robot.fingerprint,
     )
     key = json.dumps(inputs).encode()
-    allowed, tight, home = record(
+    allowed, tight, home = load_or_build(
         key, lambda: _to_plain_lists(_compute_analysis(robot, listed, loose, samples))
     )
     return SelfCollisionAnalysis(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Bools, Floats, Ints
-from vkc_pin.world.files.meshes import indices
+from vkc_pin.world.files.meshes import get_triangles
 from vkc_pin.world.models.grafting import round_placement
 
 __all__ = [
@@ -163,7 +163,7 @@ def triangulate(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64
         mesh.apply_translation([0.0, 0.0, -(mesh.bounds[0, 2] + mesh.bounds[1, 2]) / 2.0])
     elif isinstance(shape, coal.BVHModelBase | coal.Convex):
         points = shape.points() if isinstance(shape, coal.Convex) else shape.vertices()
-        return np.array(points, float), indices(shape)
+        return np.array(points, float), get_triangles(shape)
     else:
         raise InputError(
             "this shape cannot be drawn", expected="a solid or a mesh", got=type(shape).__name__

@@ -13,8 +13,14 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.errors import InputError, UnknownNameError, shown
-from vkc_pin.utils.arguments import instance, items, mapping, numbers, text
+from vkc_pin.errors import InputError, UnknownNameError, format_value
+from vkc_pin.utils.arguments import (
+    check_array,
+    check_instance,
+    check_list,
+    check_mapping,
+    check_text,
+)
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import clamp_to_limits, compute_clearance, list_placed_shapes
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
@@ -64,11 +70,11 @@ class Hold:
     def __post_init__(self) -> None:
         for name in ("object", "attachment", "link"):
             if name != "link" or self.link is not None:
-                text(getattr(self, name), f"Hold.{name}", "a name")
+                check_text(getattr(self, name), f"Hold.{name}", "a name")
         if self.by is not None:
-            instance(self.by, Hold, "Hold.by")
+            check_instance(self.by, Hold, "Hold.by")
         object.__setattr__(
-            self, "at", tuple(numbers(self.at, "Hold.at", "a list of numbers").ravel().tolist())
+            self, "at", tuple(check_array(self.at, "Hold.at", "a list of numbers").ravel().tolist())
         )
 
     @property
@@ -97,8 +103,11 @@ def make_holds(
         InputError: Objects hold each other in a cycle, `by` is not of that form, or too many
             objects are held.
     """
-    held = mapping(held, "held", "object names, each with that of an attachment")
-    by, at = mapping({} if by is None else by, "by"), mapping({} if at is None else at, "at")
+    held = check_mapping(held, "held", "object names, each with that of an attachment")
+    by, at = (
+        check_mapping({} if by is None else by, "by"),
+        check_mapping({} if at is None else at, "at"),
+    )
     if len(held) > MAX_HELD:
         raise InputError(
             "too many objects are held", field="held", expected=f"at most {MAX_HELD}", got=len(held)
@@ -126,7 +135,7 @@ def make_holds(
                         "not a link of an object",
                         field="by",
                         expected=expected,
-                        got=shown(by[name]),
+                        got=format_value(by[name]),
                     )
                 if owner not in held:
                     raise UnknownNameError("held object", owner, held, field="by")
@@ -145,7 +154,7 @@ def check_hold_order(holds: Iterable[Hold]) -> tuple[Hold, ...]:
     Raises:
         InputError: A hold comes before the one it depends on.
     """
-    holds = items(holds, "holds", "a list of Hold", Hold)
+    holds = check_list(holds, "holds", "a list of Hold", Hold)
     for number, hold in enumerate(holds):
         if hold.by not in (None, *holds[:number]):
             raise InputError(

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import UnknownNameError
-from vkc_pin.utils.arguments import mapping, number
+from vkc_pin.utils.arguments import check_mapping, check_number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.collision.placements import flatten_placements
 from vkc_pin.world.models.articulated_object import ArticulatedObject
@@ -64,12 +64,12 @@ class PlacedObject:
             InputError: A value is not finite or outside the joint's limits.
         """
         state, coordinates = self.state.copy(), self.object.coordinates
-        for joint, given in mapping(values, "values", "joints, each with its value").items():
+        for joint, given in check_mapping(values, "values", "joints, each with its value").items():
             if joint not in coordinates.names:
                 raise UnknownNameError(
                     f"joint of {self.name}", joint, coordinates.names, field=f"{self.name}.{joint}"
                 )
-            index, value = coordinates.index(joint), number(given, f"{self.name}.{joint}")
+            index, value = coordinates.index(joint), check_number(given, f"{self.name}.{joint}")
             state[index] = clamp_to_limits(
                 value, self.object.lower[index], self.object.upper[index], f"{self.name}.{joint}"
             )

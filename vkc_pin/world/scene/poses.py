@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.errors import InputError, shown
-from vkc_pin.utils.arguments import numbers
-from vkc_pin.utils.arrays import LARGEST
+from vkc_pin.errors import InputError, format_value
+from vkc_pin.utils.arguments import check_array
+from vkc_pin.utils.arrays import MAX_COORDINATE
 
 __all__ = ["as_placement", "as_target"]
 
@@ -29,16 +29,16 @@ def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
         InputError: `pose` has none of these forms, is not finite, exceeds `LARGEST`, or its
             rotation is not a proper rotation.
     """
-    array = numbers(
+    array = check_array(
         pose.homogeneous if isinstance(pose, pin.SE3) else pose, name, _POSE, problem="not a pose"
     )
     if array.shape not in ((6,), (7,), (4, 4)):
-        got = f"an array of shape {array.shape}" if array.ndim else shown(pose)
+        got = f"an array of shape {array.shape}" if array.ndim else format_value(pose)
         raise InputError("not a pose", field=name, expected=_POSE, got=got)
     if not np.all(np.isfinite(array)):
         raise InputError("not finite", field=name, expected=_POSE, got=array.tolist())
-    if np.abs(array).max() > LARGEST:
-        expected = f"metres and radians from {-LARGEST:g} to {LARGEST:g}"
+    if np.abs(array).max() > MAX_COORDINATE:
+        expected = f"metres and radians from {-MAX_COORDINATE:g} to {MAX_COORDINATE:g}"
         raise InputError("out of range", field=name, expected=expected, got=array.tolist())
     if array.shape == (6,):
         return pin.SE3(pin.rpy.rpyToMatrix(*array[3:]), array[:3])
@@ -76,16 +76,18 @@ def as_target(target: Any, *, name: str) -> pin.SE3 | tuple[float, float, float]
     """
     if isinstance(target, pin.SE3):
         return as_placement(target, name=name)
-    point = numbers(
+    point = check_array(
         target, name, f"a point (x, y, z), or a pose: {_POSE}", problem="not a pose or a point"
     )
     if point.ndim < 2 and point.shape not in ((3,), (6,), (7,)):
         expected = f"a point (x, y, z), or a pose: {_POSE}"
-        raise InputError("not a pose or a point", field=name, expected=expected, got=shown(target))
+        raise InputError(
+            "not a pose or a point", field=name, expected=expected, got=format_value(target)
+        )
     if point.shape != (3,):
         return as_placement(target, name=name)
-    if not np.abs(point).max() <= LARGEST:
-        expected = f"a point (x, y, z) of metres from {-LARGEST:g} to {LARGEST:g}"
+    if not np.abs(point).max() <= MAX_COORDINATE:
+        expected = f"a point (x, y, z) of metres from {-MAX_COORDINATE:g} to {MAX_COORDINATE:g}"
         problem = "out of range" if np.isfinite(point).all() else "not finite"
         raise InputError(problem, field=name, expected=expected, got=point.tolist())
     return (float(point[0]), float(point[1]), float(point[2]))

@@ -15,11 +15,17 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from vkc_pin.errors import InputError, shown
-from vkc_pin.utils.arguments import instance, is_number, known, mapping, numbers
+from vkc_pin.errors import InputError, format_value
+from vkc_pin.utils.arguments import (
+    check_array,
+    check_choice,
+    check_instance,
+    check_mapping,
+    is_number,
+)
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.notebook import show
-from vkc_pin.world.files.resources import file_path, located
+from vkc_pin.utils.notebook import render_card
+from vkc_pin.world.files.resources import check_path, find_file
 from vkc_pin.world.models.shapes import clamp_to_limits, compute_clearance, list_placed_shapes
 from vkc_pin.world.scene.clearance_exemptions import warn_of_overlaps
 from vkc_pin.world.scene.hold import (
@@ -103,7 +109,7 @@ class Scene:
         )
 
     def _repr_html_(self) -> str:
-        return show(self)
+        return render_card(self)
 
     @property
     def held(self) -> dict[str, str]:
@@ -132,7 +138,7 @@ class Scene:
         from vkc_pin.world.scene.scene_file import make_scene_fields
 
         fields = make_scene_fields(
-            Document(mapping(document, "document")), file_path(folder, "folder")
+            Document(check_mapping(document, "document")), check_path(folder, "folder")
         )
         return _check_new_scene(Scene(**fields)._with())
 
@@ -151,7 +157,7 @@ class Scene:
         for part_name, values, part in (("base", base, slice(0, 3)), ("arm", arm, slice(3, None))):
             if values is None:
                 continue
-            given = numbers(values, part_name)
+            given = check_array(values, part_name)
             if given.shape != start[part].shape:
                 raise InputError(
                     "wrong number of values",
@@ -262,7 +268,7 @@ class Scene:
         )
 
     def _find_object(self, name: str) -> PlacedObject:
-        return self.objects[known(name, self.objects, "object")]
+        return self.objects[check_choice(name, self.objects, "object")]
 
     def _with(self, **fields: Any) -> Scene:
         """Return the scene with other attributes, and with free held objects placed in the hand."""
@@ -293,7 +299,7 @@ class Scene:
         """
         if not is_number(reach) or reach != reach:
             raise InputError(
-                "not a number", field="reach", expected="a distance [m]", got=shown(reach)
+                "not a number", field="reach", expected="a distance [m]", got=format_value(reach)
             )
         reach = float(min(reach, 1e300))
         model, geometry = (
@@ -333,7 +339,7 @@ class Scene:
             InputError: The scene has no start region, the robot holds a fixed object, or no free
                 pose was found.
         """
-        instance(rng, np.random.Generator, "rng")
+        check_instance(rng, np.random.Generator, "rng")
         region, file = self.start_region, self.file
         if region is None:
             raise InputError(
@@ -374,7 +380,7 @@ def load_scene(name_or_path: str | Path) -> Scene:
     from vkc_pin.world.files.documents import read_yaml
     from vkc_pin.world.scene.scene_file import make_scene_fields
 
-    file = located(name_or_path, "scenes", "*.yaml", what="scene")
+    file = find_file(name_or_path, "scenes", "*.yaml", noun="scene")
     return _check_new_scene(Scene(**make_scene_fields(read_yaml(file), file.parent))._with())
 
 

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.errors import nearest_name
+from vkc_pin.errors import find_nearest_name
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.files.documents import Document, check
-from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.documents import Document, parse_document
+from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.srdf import read_srdf
 from vkc_pin.world.models.grafting import round_placement
 from vkc_pin.world.models.object_file import build_object, load_object
@@ -42,7 +42,7 @@ def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         InputError: The description is invalid; `UnknownNameError` where it names something that
             does not exist.
     """
-    description = check(document, schema.SceneSchema)
+    description = parse_document(document, schema.SceneSchema)
     robot = _load_robot(document, description, folder)
     _check_unique_names(document, description)
     objects = {
@@ -158,7 +158,7 @@ def _load_robot(document: Document, description: schema.SceneSchema, folder: Pat
     item, height = description.robot, description.start.z
     is_path = item.name.endswith((".urdf", ".yaml", ".yml")) or "/" in item.name
     is_short = isinstance(document.data["robot"], str)  # robot: husky_ur5e
-    with document.at(("robot",) if is_short else ("robot", "name")):
+    with document.annotate_errors(("robot",) if is_short else ("robot", "name")):
         name = folder / item.name if is_path else item.name
         turning = item.turning_radius
         return load_robot(
@@ -172,13 +172,13 @@ def _check_unique_names(document: Document, description: schema.SceneSchema) -> 
         for index, item in enumerate(items):
             path = (group, index, "name")
             if item.name in used:
-                raise document.error(
+                raise document.make_error(
                     path,
                     "this name is already used",
                     expected="a new name",
                     got=f"{item.name}, as {used[item.name]}",
                 )
-            line = document.line(path)
+            line = document.find_line(path)
             used[item.name] = f"{group}[{index}]" + (f" in line {line}" if line else "")
 
 
@@ -191,13 +191,13 @@ def _check_within_arena(
     ):
         if not low <= value <= high:
             entry = ("start", "base", 0 if axis == "x" else 1)
-            raise document.error(
+            raise document.make_error(
                 entry, "outside the arena", expected=f"{axis} from {low:g} to {high:g}", got=value
             )
         interval = getattr(description.start_region, axis, None)
         if interval is not None and not low <= interval[0] <= interval[1] <= high:
             path = ("start_region", axis)
-            raise document.error(
+            raise document.make_error(
                 path,
                 "outside the arena",
                 expected=f"{axis} from {low:g} to {high:g}",
@@ -210,14 +210,14 @@ def _make_start(document: Document, item: schema.StartSchema, robot: Robot) -> F
     names = robot.coordinates.names[3:]
     if len(arm) != len(names):
         expected = f"{len(names)} values: {', '.join(names)}"
-        raise document.error(
+        raise document.make_error(
             ("start", "arm"), "wrong number of arm joints", expected=expected, got=len(arm)
         )
     start = np.concatenate([item.base, arm])
     lower, upper = robot.start_limits
     for index, name in enumerate(robot.coordinates.names):
         path = ("start", "base", index) if index < 3 else ("start", "arm", index - 3)
-        with document.at(path):
+        with document.annotate_errors(path):
             start[index] = clamp_to_limits(start[index], lower[index], upper[index], name)
     return start
 
@@ -231,8 +231,8 @@ def _make_holds(
     for name in held:
         path = ("start", "held", name)
         if name not in objects:
-            raise document.unknown(path, "object", name, objects)
-        with document.at(path):
+            raise document.make_unknown_name_error(path, "object", name, objects)
+        with document.annotate_errors(path):
             owner = by.get(name, "").partition(".")[0]
             both = {one: attachments[one] for one in (owner, name) if one in held}
             through, values = (
@@ -240,7 +240,7 @@ def _make_holds(
                 {name: at[name]} if name in at else {},
             )
             resolve_holds(objects, make_holds(both, through, values))
-    with document.at(("start", "held")):
+    with document.annotate_errors(("start", "held")):
         return resolve_holds(objects, make_holds(attachments, by, at))
 
 
@@ -272,7 +272,7 @@ def _find_allowed_pairs(
             for place, name in enumerate(pair):
                 if name not in labels:
                     is_short = isinstance(document.data["allow"][number], list | tuple)
-                    raise document.unknown(
+                    raise document.make_unknown_name_error(
                         ("allow", number, *(() if is_short else ("pair",)), place),
                         "link, object or obstacle",
                         name,
@@ -293,21 +293,21 @@ def _make_pose(item: schema.PoseSchema) -> pin.SE3:
 
 
 def _find_file(document: Document, path: tuple[str | int, ...], folder: Path, name: str) -> Path:
-    with document.at(path):
-        file = file_path(folder / name, "file", "the name of a file")
+    with document.annotate_errors(path):
+        file = check_path(folder / name, "file", "the name of a file")
     if not file.is_file():
         similar = _find_similar_name(file)
         expected = f"a file in {folder}" + (
             f", perhaps {Path(name).with_name(similar)}" if similar else ""
         )
-        raise document.error(path, "there is no such file", expected=expected, got=name)
+        raise document.make_error(path, "there is no such file", expected=expected, got=name)
     return file
 
 
 def _find_similar_name(file: Path) -> str | None:
     """Return the most similar name in the folder of a missing file, among files of its type."""
     with contextlib.suppress(OSError):
-        return nearest_name(
+        return find_nearest_name(
             file.name,
             sorted(one.name for one in file.parent.iterdir() if one.suffix == file.suffix),
         )
@@ -318,7 +318,7 @@ def _load_object(
     document: Document, path: tuple[str | int, ...], item: schema.PlacedObjectSchema, folder: Path
 ) -> PlacedObject:
     at, kind = (*path, "type"), item.type
-    with document.at(at):
+    with document.annotate_errors(at):
         if isinstance(kind, dict):
             loaded = build_object(_extract_part(document, at), folder)
         else:
@@ -327,10 +327,10 @@ def _load_object(
     neutral = np.clip(0.0, loaded.lower, loaded.upper)
     placed = PlacedObject(item.name, loaded, _make_pose(item), neutral)
     for joint, value in item.state.items():
-        with document.at((*path, "state", joint)):
+        with document.annotate_errors((*path, "state", joint)):
             placed = placed.with_state({joint: value})
     for number, attachment in enumerate(item.reversed or ()):
-        with document.at((*path, "reversed", number)):
+        with document.annotate_errors((*path, "reversed", number)):
             placed = placed.with_reversed(attachment)
     return placed
 
@@ -349,5 +349,5 @@ def _load_obstacle(
 ) -> tuple[list[pin.GeometryObject], list[pin.GeometryObject]]:
     if isinstance(item, schema.UrdfSchema | schema.MeshSchema):
         _find_file(document, (*path, "file"), folder, item.file)
-    with document.at((*path, "file")):
+    with document.annotate_errors((*path, "file")):
         return make_obstacle_shapes(item, _make_pose(item), folder)

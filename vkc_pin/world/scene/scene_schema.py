@@ -11,16 +11,16 @@ from pydantic import BeforeValidator, Field, model_validator
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.fields import (
     Name,
-    NotNegative,
+    NonNegative,
     Number,
     Positive,
     Quaternion,
     Schema,
     Vector3,
-    count,
-    fail,
+    make_validation_error,
     require,
-    text_for,
+    require_length,
+    wrap_text,
 )
 from vkc_pin.world.models.robot import Base
 
@@ -68,7 +68,7 @@ COLOURS: dict[str, tuple[float, float, float]] = {
 def _parse_colour(value: Any) -> Any:
     if isinstance(value, str):
         if value not in COLOURS:
-            raise fail(
+            raise make_validation_error(
                 f"unknown colour '{value}'",
                 f"one of {', '.join(COLOURS)}, or [red, green, blue] from 0 to 1",
             )
@@ -88,26 +88,28 @@ def _parse_scale(value: Any) -> Any:
 
 def _parse_arm(value: Any) -> Any:
     if isinstance(value, str) and value != "home":
-        raise fail(f"unknown arm configuration '{value}'", "home, or a list of joint values [rad]")
+        raise make_validation_error(
+            f"unknown arm configuration '{value}'", "home, or a list of joint values [rad]"
+        )
     if not isinstance(value, str | list | tuple):
-        raise fail("wrong value", "home, or a list of joint values [rad]")
+        raise make_validation_error("wrong value", "home, or a list of joint values [rad]")
     return None if value == "home" else value
 
 
 def _parse_heading(value: Any) -> Any:
     if isinstance(value, str) and value != "any":
-        raise fail(f"unknown heading '{value}'", "any, or [lowest, highest]")
+        raise make_validation_error(f"unknown heading '{value}'", "any, or [lowest, highest]")
     return None if value == "any" else value
 
 
 Fraction = Annotated[Number, Field(ge=0.0, le=1.0)]
-Size = Annotated[tuple[Positive, Positive, Positive], count(3)]
+Size = Annotated[tuple[Positive, Positive, Positive], require_length(3)]
 Colour = Annotated[
-    tuple[Fraction, Fraction, Fraction, Fraction], count(4), BeforeValidator(_parse_colour)
+    tuple[Fraction, Fraction, Fraction, Fraction], require_length(4), BeforeValidator(_parse_colour)
 ]
 Interval = Annotated[
     tuple[Number, Number],
-    count(2),
+    require_length(2),
     require(lambda value: value[0] <= value[1], "the interval is empty", "[lowest, highest]"),
 ]
 Description = Annotated[
@@ -135,7 +137,9 @@ class PoseSchema(Schema):
     @model_validator(mode="after")
     def _check_orientation(self) -> PoseSchema:
         if sum(given is not None for given in (self.rpy, self.yaw, self.quaternion)) > 1:
-            raise fail("more than one orientation", "one of rpy, yaw and quaternion")
+            raise make_validation_error(
+                "more than one orientation", "one of rpy, yaw and quaternion"
+            )
         return self
 
 
@@ -239,9 +243,9 @@ class StartSchema(Schema):
 
     base: Vector3
     z: Number | None = None
-    opening: NotNegative | None = None
+    opening: NonNegative | None = None
     arm: Annotated[tuple[Number, ...] | None, BeforeValidator(_parse_arm)] = None
-    held: Mapping[str, Annotated[HeldSchema, text_for("attachment")]] = Field(default_factory=dict)
+    held: Mapping[str, Annotated[HeldSchema, wrap_text("attachment")]] = Field(default_factory=dict)
 
 
 class ArenaSchema(Schema):
@@ -277,7 +281,7 @@ class AllowSchema(Schema):
     `margin` is the clearance that the pair keeps [m]; None: none.
     """
 
-    pair: Annotated[tuple[str, str], count(2)] | None = None
+    pair: Annotated[tuple[str, str], require_length(2)] | None = None
     srdf: str | None = None
     margin: Number | None = None
 
@@ -286,7 +290,7 @@ class AllowSchema(Schema):
         if (self.pair is None) == (self.srdf is None) or (
             self.srdf is not None and self.margin is not None
         ):
-            raise fail(
+            raise make_validation_error(
                 "neither a pair nor an SRDF file",
                 "[one, other], {pair: [one, other], margin: 0.005}, or the name of an SRDF file",
             )
@@ -297,7 +301,7 @@ class SceneSchema(Schema):
     """A scene file."""
 
     name: Name | None = None
-    robot: Annotated[SceneRobotSchema, text_for("name")]
+    robot: Annotated[SceneRobotSchema, wrap_text("name")]
     start: StartSchema
     arena: ArenaSchema = ArenaSchema()
     start_region: RegionSchema | None = None

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.errors import InputError, UnknownNameError, shown
+from vkc_pin.errors import InputError, UnknownNameError, format_value
 from vkc_pin.options import Options
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import PlacedObject
@@ -188,7 +188,7 @@ class _Compiler:
                 f"'{name}' is fixed in the world",
                 field=f"{where}.by",
                 expected="the hand itself",
-                got=shown(by),
+                got=format_value(by),
             )
         if name in self.released_by:
             problem = f"the placement of '{name}' at this step is known only after planning"
@@ -236,7 +236,7 @@ class _Compiler:
                 "not a link of an object",
                 field=where,
                 expected="<object>.<link>, e.g. stick.tip",
-                got=shown(frame),
+                got=format_value(frame),
             )
         placed = find_object(self.scene, owner, where)
         hold = self._find_hold(owner)
@@ -252,7 +252,7 @@ class _Compiler:
                 problem,
                 field=where,
                 expected=f"a link of what it carries ({held})",
-                got=shown(frame),
+                got=format_value(frame),
             )
         check_link(placed, link, where)
         return hold, link
@@ -370,7 +370,7 @@ class _Compiler:
         """Release one object, or all."""
         if not self.held:
             raise InputError(
-                "the hand is empty", field=where, expected="something held", got=shown(step)
+                "the hand is empty", field=where, expected="something held", got=format_value(step)
             )
         if step.object is not None and self._find_hold(step.object) is None:
             held = [hold.object for hold in self.held]

@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from vkc_pin.utils.arguments import known, text
+from vkc_pin.utils.arguments import check_choice, check_text
 from vkc_pin.utils.arrays import Floats
 
 __all__ = ["Formula", "State"]
@@ -76,9 +76,9 @@ class State:
         """
         choices = self._known[kind]
         if choices is None:
-            text(name, self._field or kind, f"the name of a {kind}")
+            check_text(name, self._field or kind, f"the name of a {kind}")
         else:
-            known(name, choices, kind, self._field)
+            check_choice(name, choices, kind, self._field)
         size = 12 if kind == "frame" else 1
         return self._symbols[kind].setdefault(
             name, (ca.SX.sym("now", size), ca.SX.sym("before", size))

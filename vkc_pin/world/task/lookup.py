@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.utils.arguments import known
+from vkc_pin.utils.arguments import check_choice
 from vkc_pin.world.models.articulated_object import Attachment
 from vkc_pin.world.scene.contact_rules import (
     compute_grasp_opening,
@@ -40,7 +40,7 @@ def find_object(scene: Scene, name: str, where: str) -> PlacedObject:
     Raises:
         UnknownNameError: There is none.
     """
-    return scene.objects[known(name, scene.objects, "object", where)]
+    return scene.objects[check_choice(name, scene.objects, "object", where)]
 
 
 def find_attachment(placed: PlacedObject, name: str | None, where: str) -> Attachment:

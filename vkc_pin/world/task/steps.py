@@ -8,8 +8,14 @@ from typing import Any
 
 import pinocchio as pin
 
-from vkc_pin.errors import InputError, UnknownNameError, shown
-from vkc_pin.utils.arguments import items, known, mapping, quantity, text
+from vkc_pin.errors import InputError, UnknownNameError, format_value
+from vkc_pin.utils.arguments import (
+    check_choice,
+    check_coordinate,
+    check_list,
+    check_mapping,
+    check_text,
+)
 from vkc_pin.world.scene.poses import as_placement, as_target
 
 __all__ = [
@@ -33,7 +39,9 @@ def _check_names(step: Any, **optional: bool) -> None:
     for name, may_be_none in optional.items():
         value = getattr(step, name)
         if value is not None or not may_be_none:
-            object.__setattr__(step, name, text(value, f"{type(step).__name__}.{name}", "a name"))
+            object.__setattr__(
+                step, name, check_text(value, f"{type(step).__name__}.{name}", "a name")
+            )
 
 
 @dataclass(frozen=True)
@@ -96,11 +104,12 @@ class Actuate:
                 "nothing to actuate",
                 field="Actuate.joints",
                 expected=expected,
-                got=shown(self.joints),
+                got=format_value(self.joints),
             )
-        given = mapping(self.joints, "Actuate.joints", expected)
+        given = check_mapping(self.joints, "Actuate.joints", expected)
         joints = {
-            name: quantity(value, f"Actuate.joints[{name!r}]") for name, value in given.items()
+            name: check_coordinate(value, f"Actuate.joints[{name!r}]")
+            for name, value in given.items()
         }
         object.__setattr__(self, "joints", joints)
 
@@ -120,7 +129,9 @@ class Touch:
     target: Any
 
     def __post_init__(self) -> None:
-        text(self.frame, "Touch.frame", "<object>.<link>, e.g. stick.tip, or a frame of the robot")
+        check_text(
+            self.frame, "Touch.frame", "<object>.<link>, e.g. stick.tip, or a frame of the robot"
+        )
         object.__setattr__(self, "target", as_target(self.target, name="Touch.target"))
 
 
@@ -175,7 +186,9 @@ class GoTo:
     def __post_init__(self) -> None:
         for name in ("x", "y", "yaw"):
             if name != "yaw" or self.yaw is not None:
-                object.__setattr__(self, name, quantity(getattr(self, name), f"GoTo.{name}"))
+                object.__setattr__(
+                    self, name, check_coordinate(getattr(self, name), f"GoTo.{name}")
+                )
 
 
 Step = Reach | Grasp | Actuate | GoTo | Touch | Place | Release
@@ -192,9 +205,9 @@ def as_steps(steps: Sequence[Step]) -> tuple[Step, ...]:
     """
     if isinstance(steps, STEPS):
         raise InputError(
-            "a single step", field="steps", expected="a list of steps", got=shown(steps)
+            "a single step", field="steps", expected="a list of steps", got=format_value(steps)
         )
-    found: tuple[Step, ...] = items(steps, "steps", "a list of steps")
+    found: tuple[Step, ...] = check_list(steps, "steps", "a list of steps")
     if not found:
         raise InputError(
             "there is nothing to do",
@@ -206,7 +219,7 @@ def as_steps(steps: Sequence[Step]) -> tuple[Step, ...]:
         if not isinstance(step, STEPS):
             expected = ", ".join(kind.__name__ for kind in STEPS)
             raise InputError(
-                "not a step", field=f"steps[{number}]", expected=expected, got=shown(step)
+                "not a step", field=f"steps[{number}]", expected=expected, got=format_value(step)
             )
     return found
 
@@ -227,8 +240,8 @@ def step_from_dict(data: Mapping[str, Any]) -> Step:
         UnknownNameError: There is no such step, or it has no such field.
         InputError: A field is missing or invalid.
     """
-    given = mapping(data, "step", "a step as data")
-    kind = known(given.pop("step", ""), _KINDS, "step", "step")
+    given = check_mapping(data, "step", "a step as data")
+    kind = check_choice(given.pop("step", ""), _KINDS, "step", "step")
     known_fields = {item.name: item for item in fields(_KINDS[kind])}
     for name in given:
         if name not in known_fields:

@@ -15,8 +15,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from vkc_pin.errors import InputError, UnknownNameError, shown
-from vkc_pin.utils.arguments import items, mapping, number, numbers
+from vkc_pin.errors import InputError, UnknownNameError, format_value
+from vkc_pin.utils.arguments import check_array, check_list, check_mapping, check_number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.task.formula import Formula, State
 
@@ -54,11 +54,13 @@ class _Term:
                 "not a name",
                 field=f"{type(self).__name__}.name",
                 expected="text",
-                got=shown(self.name),
+                got=format_value(self.name),
             )
         if not callable(self.expression) and not isinstance(self.expression, Formula):
             expected = "a function of a State, e.g. lambda s: s.coordinate('elbow_joint')"
-            raise self.make_error("not a function", "expression", expected, shown(self.expression))
+            raise self.make_error(
+                "not a function", "expression", expected, format_value(self.expression)
+            )
         if self.during is not None:
             names = (self.during,) if isinstance(self.during, str) else self.during
             if (
@@ -70,12 +72,12 @@ class _Term:
                     "not phases",
                     "during",
                     "names of phases, e.g. ['place cup']",
-                    shown(self.during),
+                    format_value(self.during),
                 )
             object.__setattr__(self, "during", tuple(names))
         if self.holding is not None and not isinstance(self.holding, str):
             raise self.make_error(
-                "not an object", "holding", "an object's name", shown(self.holding)
+                "not an object", "holding", "an object's name", format_value(self.holding)
             )
 
     def make_error(
@@ -90,7 +92,7 @@ class _Term:
         """Check that a field is a positive number."""
         where, expected = f"terms[{self.name!r}].{field}", "a positive finite number"
         object.__setattr__(
-            self, field, number(getattr(self, field), where, expected, low=0.0, above=True)
+            self, field, check_number(getattr(self, field), where, expected, low=0.0, strict=True)
         )
 
     def is_active(self, phase: str, held: Iterable[str]) -> bool:
@@ -138,7 +140,7 @@ class Constraint(_Term):
         self.compute_bounds(self.expression.rows if isinstance(self.expression, Formula) else None)
 
     def _check_bound(self, field: str, value: Any) -> float | tuple[float, ...]:
-        given = numbers(
+        given = check_array(
             value,
             f"terms[{self.name!r}].{field}",
             "a number or a list of them",
@@ -147,7 +149,7 @@ class Constraint(_Term):
         wrong = np.isnan(given) | (given == (np.inf if field == "lower" else -np.inf))
         if given.ndim > 1 or not given.size or wrong.any():
             raise self.make_error(
-                "no such bound", field, "a number or a list of them", shown(value)
+                "no such bound", field, "a number or a list of them", format_value(value)
             )
         return float(given) if given.ndim == 0 else tuple(given.tolist())
 
@@ -176,21 +178,24 @@ class Constraint(_Term):
                 else f"one number, or {rows}, like the expression"
             )
             raise self.make_error(
-                "wrong number of bounds", "lower, upper", expected, shown((self.lower, self.upper))
+                "wrong number of bounds",
+                "lower, upper",
+                expected,
+                format_value((self.lower, self.upper)),
             ) from None
         if not (np.isfinite(lower) | np.isfinite(upper)).all():
             raise self.make_error(
                 "no bound",
                 "lower, upper",
                 "at least one of them, finite",
-                shown((self.lower, self.upper)),
+                format_value((self.lower, self.upper)),
             )
         if (lower > upper).any():
             raise self.make_error(
                 "lower is more than upper",
                 "lower, upper",
                 "lower <= upper",
-                shown((self.lower, self.upper)),
+                format_value((self.lower, self.upper)),
             )
         return lower, upper
 
@@ -226,7 +231,7 @@ def trace_terms(scene: Scene, terms: Sequence[Term]) -> tuple[Term, ...]:
         UnknownNameError: A frame, coordinate or object does not exist.
         InputError: They are not terms, two share a name, or an expression is invalid.
     """
-    terms = items(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost))
+    terms = check_list(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost))
     if not terms:
         return ()
     robot = [str(frame.name) for frame in scene.robot.model.frames if frame.name != "universe"]
@@ -248,7 +253,7 @@ def trace_terms_without_scene(terms: Sequence[Term]) -> tuple[Term, ...]:
         InputError: They are not terms, two share a name, or an expression is invalid.
     """
     return _trace_all(
-        items(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost)), None, None
+        check_list(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost)), None, None
     )
 
 
@@ -275,7 +280,7 @@ def _trace_all(
                 "two terms share a name",
                 field="terms",
                 expected="different names",
-                got=shown(term.name),
+                got=format_value(term.name),
             )
         found.append(_trace(term, State(frames, coordinates, f"terms[{term.name!r}].expression")))
     return tuple(found)
@@ -298,14 +303,14 @@ def _trace(term: Term, state: State) -> Term:
             "it does not depend on the state",
             "expression",
             "an expression of what a State returns",
-            shown(value),
+            format_value(value),
         )
     if not isinstance(value, ca.SX):
         raise term.make_error(
             "no CasADi expression",
             "expression",
             "a number or a column, e.g. of ca.vertcat",
-            shown(value),
+            format_value(value),
         )
     if (
         not value.is_vector()
@@ -355,7 +360,7 @@ def check_terms_active(terms: Iterable[Term], phases: Sequence[tuple[str, Iterab
                 f"{name!r} holds {', '.join(held) or 'nothing'}" for name, held in phases
             )
             raise term.make_error(
-                "never held in these phases", "holding", held, shown(term.holding)
+                "never held in these phases", "holding", held, format_value(term.holding)
             )
 
 
@@ -370,7 +375,7 @@ def term_from_dict(data: Mapping[str, Any]) -> Term:
     Raises:
         InputError: The data are invalid.
     """
-    fields = mapping(data, "terms", "a term as data")
+    fields = check_mapping(data, "terms", "a term as data")
     kinds: dict[str, type[Constraint] | type[Cost]] = {"Constraint": Constraint, "Cost": Cost}
     try:
         given = fields.pop("expression")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arguments import numbers
+from vkc_pin.utils.arguments import check_array
 from vkc_pin.utils.arrays import Floats, Ints
 
 __all__ = ["MIN_INTERVAL", "Curve", "concatenate_curves", "sample_evenly", "sample_intervals"]
@@ -44,7 +44,7 @@ class Curve:
 
     def __post_init__(self) -> None:
         times, positions, rates = (
-            numbers(getattr(self, name), f"curve.{name}")
+            check_array(getattr(self, name), f"curve.{name}")
             for name in ("times", "positions", "rates")
         )
         if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) >= MIN_INTERVAL):

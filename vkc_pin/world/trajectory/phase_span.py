@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arguments import mapping, number, text, whole
+from vkc_pin.utils.arguments import check_integer, check_mapping, check_number, check_text
 from vkc_pin.world.scene.hold import Hold, check_hold_order, make_holds
 
 __all__ = ["PhaseSpan", "get_required"]
@@ -35,15 +35,19 @@ class PhaseSpan:
     opening: float | None = None
 
     def __post_init__(self) -> None:
-        text(self.name, "PhaseSpan.name")
+        check_text(self.name, "PhaseSpan.name")
         for name in ("first", "last"):
-            object.__setattr__(self, name, whole(getattr(self, name), f"PhaseSpan.{name}", low=0))
+            object.__setattr__(
+                self, name, check_integer(getattr(self, name), f"PhaseSpan.{name}", low=0)
+            )
         object.__setattr__(self, "holds", check_hold_order(self.holds))
         if self.opening is not None:
             object.__setattr__(
                 self,
                 "opening",
-                number(self.opening, "PhaseSpan.opening", "a distance [m]", low=0.0, high=1.0),
+                check_number(
+                    self.opening, "PhaseSpan.opening", "a distance [m]", low=0.0, high=1.0
+                ),
             )
 
     @property
@@ -74,7 +78,7 @@ class PhaseSpan:
         Raises:
             InputError: Something is missing from it or does not fit.
         """
-        phase = mapping(data, where)
+        phase = check_mapping(data, where)
         held = make_holds(get_required(phase, "held"), phase.get("by"))
         name, first, last = (get_required(phase, key) for key in ("name", "first", "last"))
         return cls(name, first, last, held, phase.get("opening"))

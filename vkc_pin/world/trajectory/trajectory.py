@@ -12,7 +12,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arguments import finite, instance, items, known, mapping, number, text, whole
+from vkc_pin.utils.arguments import (
+    check_choice,
+    check_finite_array,
+    check_instance,
+    check_integer,
+    check_list,
+    check_mapping,
+    check_number,
+    check_text,
+)
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.trajectory.curve import Curve, sample_evenly
 from vkc_pin.world.trajectory.formats import ros, rosbag, tables
@@ -51,14 +60,14 @@ class Trajectory:
     curve: Curve | None = None
 
     def __post_init__(self) -> None:
-        listed: tuple[Any, ...] = items(self.names, "Trajectory.names", "a list of names")
+        listed: tuple[Any, ...] = check_list(self.names, "Trajectory.names", "a list of names")
         names = tuple(
-            text(name, f"Trajectory.names[{k}]", "a name") for k, name in enumerate(listed)
+            check_text(name, f"Trajectory.names[{k}]", "a name") for k, name in enumerate(listed)
         )
-        phases = items(self.phases, "Trajectory.phases", "a list of PhaseSpan", PhaseSpan)
+        phases = check_list(self.phases, "Trajectory.phases", "a list of PhaseSpan", PhaseSpan)
         times, positions = (
-            finite(self.times, "Trajectory.times"),
-            finite(self.positions, "Trajectory.positions"),
+            check_finite_array(self.times, "Trajectory.times"),
+            check_finite_array(self.positions, "Trajectory.positions"),
         )
         counts = Counter(names)
         if (twice := next((name for name in names if counts[name] > 1), None)) is not None:
@@ -74,7 +83,7 @@ class Trajectory:
             raise InputError(
                 "wrong shape", field="Trajectory.positions", expected=shape, got=positions.shape
             )
-        size = whole(self.robot_size, "Trajectory.robot_size", low=3, high=len(names))
+        size = check_integer(self.robot_size, "Trajectory.robot_size", low=3, high=len(names))
         edges = [0, *(phase.last for phase in phases)]
         if edges[-1] != len(times) - 1 or any(
             phase.first != before or phase.last <= before
@@ -86,7 +95,7 @@ class Trajectory:
                 problem, field="Trajectory.phases", expected=f"0 to {len(times) - 1}", got=got
             )
         if self.curve is not None:
-            instance(self.curve, Curve, "Trajectory.curve").check_through(times, positions)
+            check_instance(self.curve, Curve, "Trajectory.curve").check_through(times, positions)
         for array in (times, positions):
             array.setflags(write=False)
         kept = {
@@ -105,7 +114,7 @@ class Trajectory:
         Raises:
             InputError: `time` is not finite.
         """
-        time = finite(time, "time")
+        time = check_finite_array(time, "time")
         if self.curve is not None:
             return self.curve.at(time)
         columns = [np.interp(time, self.times, column) for column in self.positions.T]
@@ -121,7 +130,7 @@ class Trajectory:
         Velocities are 0 outside the motion. Without a curve they jump at waypoints, where the next
         segment counts. Raises `InputError` if `time` is not finite.
         """
-        time = finite(time, "time")
+        time = check_finite_array(time, "time")
         if self.curve is not None:
             return self.curve.velocity(time)
         inside = ((time >= self.times[0]) & (time <= self.times[-1]))[..., None]
@@ -136,7 +145,7 @@ class Trajectory:
         They jump at the curve's knots. Without a curve they are 0, and velocities jump. Raises
         `InputError` if `time` is not finite.
         """
-        time = finite(time, "time")
+        time = check_finite_array(time, "time")
         if self.curve is not None:
             return self.curve.acceleration(time)
         return np.zeros((*time.shape, len(self.names)))
@@ -150,7 +159,7 @@ class Trajectory:
         Raises:
             InputError: `rate` is not positive, or gives too many samples.
         """
-        rate = number(rate, "rate", "samples a second, more than 0", low=0.0, above=True)
+        rate = check_number(rate, "rate", "samples a second, more than 0", low=0.0, strict=True)
         duration = float(self.times[-1] - self.times[0])
         if duration * rate > MOST_SAMPLES:
             raise InputError(
@@ -168,7 +177,9 @@ class Trajectory:
         Raises:
             UnknownNameError: There is no such coordinate.
         """
-        return np.array(self.positions[:, self.names.index(known(name, self.names, "coordinate"))])
+        return np.array(
+            self.positions[:, self.names.index(check_choice(name, self.names, "coordinate"))]
+        )
 
     def ranges(self) -> tuple[Floats, Floats]:
         """Return the smallest and largest positions of every segment, shape (T − 1, n) each."""
@@ -264,7 +275,9 @@ class Trajectory:
         """
         if not isinstance(data, Mapping):
             raise InputError("not a trajectory", expected="an object", got=type(data).__name__)
-        listed: tuple[Any, ...] = items(get_required(data, "phases"), "phases", "a list of phases")
+        listed: tuple[Any, ...] = check_list(
+            get_required(data, "phases"), "phases", "a list of phases"
+        )
         phases = [PhaseSpan.from_dict(item, f"phases[{k}]") for k, item in enumerate(listed)]
         names, times, positions, size = (
             get_required(data, key) for key in ("names", "times", "positions", "robot_size")
@@ -273,7 +286,7 @@ class Trajectory:
         if curve is not None:
             curve = Curve(
                 *(
-                    get_required(mapping(curve, "curve"), key)
+                    get_required(check_mapping(curve, "curve"), key)
                     for key in ("times", "positions", "rates")
                 )
             )
@@ -331,7 +344,7 @@ class Trajectory:
         Raises:
             InputError: A field is missing or invalid; the error names it.
         """
-        motion = None if like is None else instance(like, Trajectory, "like").to_dict()
+        motion = None if like is None else check_instance(like, Trajectory, "like").to_dict()
         data = ros.from_ros(message, like=motion, robot_size=robot_size)
         return cls._read(data, None if isinstance(message, Mapping) else message)
 

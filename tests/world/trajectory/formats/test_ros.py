@@ -239,9 +239,9 @@ def changed(message: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
     ("path", "value", "expected"),
     [
         ("joint_names", None, "joint_names: this is missing"),
-        ("joint_names", "x", "joint_names: wrong kind of value .expected a list, got 'x'"),
+        ("joint_names", "x", "joint_names: wrong type of value .expected a list, got 'x'"),
         ("joint_names/1", "base_x", "Trajectory.names: a name occurs twice"),
-        ("points", {}, "points: wrong kind of value"),
+        ("points", {}, "points: wrong type of value"),
         ("points", [], "Trajectory.times: times do not increase"),
         ("points/2", 3, r"points\[2\].positions: this is missing"),
         (
@@ -259,7 +259,7 @@ def changed(message: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
         (
             "points/1/time_from_start/sec",
             0.5,
-            r"points\[1\].time_from_start.sec: wrong kind of value .expected a whole number",
+            r"points\[1\].time_from_start.sec: wrong type of value .expected a whole number",
         ),
         ("points/1/time_from_start", None, r"points\[1\].time_from_start: this is missing"),
         (

@@ -215,7 +215,7 @@ HELD = "0,0,0,0,1,a,"
         (
             Trajectory.from_ros,
             '{"joint_names": "' + "x" * 19_000_000 + '"}',
-            "joint_names: wrong kind of value",
+            "joint_names: wrong type of value",
         ),
         (Trajectory.from_json, " " * 20_000_001, "the JSON is too large"),
     ],

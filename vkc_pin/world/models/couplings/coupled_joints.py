@@ -11,7 +11,7 @@ import pinocchio as pin
 from vkc_pin.errors import InputError
 from vkc_pin.world.files.documents import Document
 from vkc_pin.world.files.urdf import UrdfFile
-from vkc_pin.world.files.xml import line_of
+from vkc_pin.world.files.xml import find_line
 from vkc_pin.world.models.robot_schema import CouplingSchema
 
 __all__ = [
@@ -109,7 +109,7 @@ def check_followers(full: pin.Model, file: UrdfFile, tool_frame: str) -> None:
             raise InputError(
                 problem,
                 file=file.path,
-                line=line_of(element),
+                line=find_line(element),
                 field=joint,
                 expected=expected,
                 got=got,
@@ -149,7 +149,7 @@ def apply_couplings(
     for joint, coupling in couplings.items():
         for name in (joint, coupling.joint):
             if name not in movable:
-                raise document.unknown(
+                raise document.make_unknown_name_error(
                     ("couplings", joint), "joint that turns or slides", name, movable
                 )
         for mimic in movable[joint].findall("mimic"):
@@ -162,7 +162,7 @@ def apply_couplings(
     for joint, coupling in couplings.items():
         if _resolve_coupling(joint, mimics, movable, any_leader=True) is None:
             problem, expected = "couplings are circular", "a leader that follows no joint"
-            raise document.error(
+            raise document.make_error(
                 ("couplings", joint), problem, expected=expected, got=coupling.joint
             )
 

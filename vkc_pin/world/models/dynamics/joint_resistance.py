@@ -11,9 +11,9 @@ import numpy as np
 
 from vkc_pin.errors import InputError
 from vkc_pin.world.files.documents import Document
-from vkc_pin.world.files.fields import JointSchema, NotNegative, Number
-from vkc_pin.world.files.kinematic_tree import numbers_of
-from vkc_pin.world.files.xml import line_of, read_xml
+from vkc_pin.world.files.fields import JointSchema, NonNegative, Number
+from vkc_pin.world.files.kinematic_tree import parse_numbers
+from vkc_pin.world.files.xml import find_line, read_xml
 
 __all__ = ["ObjectJointSchema", "Resistance", "read_resistances"]
 
@@ -54,9 +54,9 @@ class Resistance:
 class ObjectJointSchema(JointSchema):
     """Properties of an object's joint that a URDF lacks, and its resistance; see `Resistance`."""
 
-    friction: NotNegative | None = None
-    damping: NotNegative | None = None
-    stiffness: NotNegative | None = None
+    friction: NonNegative | None = None
+    damping: NonNegative | None = None
+    stiffness: NonNegative | None = None
     springref: Number | None = None
 
 
@@ -91,12 +91,12 @@ def read_resistances(
             continue
         for dynamics in joint.findall("dynamics"):
             for key in ("friction", "damping"):
-                (stated[key],) = numbers_of(urdf, dynamics, key, 1, default="0", where=name)
+                (stated[key],) = parse_numbers(urdf, dynamics, key, 1, default="0", where=name)
                 if stated[key] < 0.0:
                     problem, field, line = (
                         "friction and damping must not be negative",
                         f"{name}: dynamics {key}",
-                        line_of(dynamics),
+                        find_line(dynamics),
                     )
                     raise InputError(
                         problem,
@@ -109,7 +109,7 @@ def read_resistances(
         given = joints.get(name, ObjectJointSchema())
         if given.springref is not None and given.stiffness is None:
             problem, expected = "springref without stiffness", "stiffness as well"
-            raise document.error(
+            raise document.make_error(
                 ("joints", name, "springref"), problem, expected=expected, got=given.springref
             )
         described = given.model_dump(

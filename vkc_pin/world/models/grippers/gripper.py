@@ -89,7 +89,7 @@ class Gripper:
         """
         if opening is None:
             return self.rest
-        opening = arguments.number(opening, "opening", "between the fingers [m]")
+        opening = arguments.check_number(opening, "opening", "between the fingers [m]")
         if not self.min_opening - WIDTH_TOLERANCE <= opening <= self.max_opening + WIDTH_TOLERANCE:
             expected = f"{self.min_opening:.4g} to {self.max_opening:.4g} m"
             raise InputError(
@@ -223,13 +223,15 @@ def build_gripper(
         where = ("gripper", joint)
         if joint in follows:
             problem, leader = "this joint follows another one", follows[joint].leader
-            raise document.error(
+            raise document.make_error(
                 where, problem, expected=f"'{leader}', which it follows", got=joint
             )
         joint_index = full.getJointId(joint)
         if joint_index in palm or arm not in list(full.supports[joint_index]):
             expected = f"a joint of the hand, a descendant of '{full.names[arm]}'"
-            raise document.error(where, "this is not a finger joint", expected=expected, got=joint)
+            raise document.make_error(
+                where, "this is not a finger joint", expected=expected, got=joint
+            )
         joint_model = full.joints[joint_index]
         low, high = (-np.inf, np.inf)
         if joint_model.nq == 1:
@@ -240,11 +242,11 @@ def build_gripper(
         for key, value in (("closed", finger.closed), ("open", finger.open)):
             if not low - LIMIT_SLACK <= value <= high + LIMIT_SLACK:
                 problem = "this finger position is outside the joint's limits"
-                raise document.error(
+                raise document.make_error(
                     (*where, key), problem, expected=f"between {low:g} and {high:g}", got=value
                 )
         if finger.closed == finger.open:
-            raise document.error(
+            raise document.make_error(
                 where,
                 "this finger joint does not move",
                 expected="different positions for closed and open",
@@ -286,5 +288,7 @@ def build_gripper(
             f"a larger opening when open than when closed, along the x axis of '{tool_frame}'"
         )
         got = f"{1e3 * gripper.min_opening:.1f} mm closed, {1e3 * gripper.max_opening:.1f} mm open"
-        raise document.error(("gripper",), "the gripper does not open", expected=expected, got=got)
+        raise document.make_error(
+            ("gripper",), "the gripper does not open", expected=expected, got=got
+        )
     return gripper

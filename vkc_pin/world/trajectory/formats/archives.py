@@ -17,10 +17,16 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model,
 from pydantic.types import FailFast
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arguments import finite
-from vkc_pin.world.files.documents import MOST_FIELDS, Document, check, parse_json, read_bytes
-from vkc_pin.world.files.fields import Schema, fail
-from vkc_pin.world.files.resources import folder
+from vkc_pin.utils.arguments import check_finite_array
+from vkc_pin.world.files.documents import (
+    MAX_FIELDS,
+    Document,
+    parse_document,
+    parse_json,
+    read_bytes,
+)
+from vkc_pin.world.files.fields import Schema, make_validation_error
+from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.files.writing import write_atomically
 
 __all__ = [
@@ -122,13 +128,15 @@ def _number(value: Any) -> bool:
 def _row(found: dict[str, Any]) -> dict[str, Any]:
     for name, value in found.items():
         if value != math.inf and not _number(value):
-            raise fail(f"{name!r} is no number", "numbers by name")
+            raise make_validation_error(f"{name!r} is no number", "numbers by name")
     return found
 
 
 def _folder(found: Named) -> Named:
     if found != {"package": "scenes"} and set(found) != {"relative", "absolute"}:
-        raise fail("no folder of a scene", 'package: "scenes", or relative and absolute')
+        raise make_validation_error(
+            "no folder of a scene", 'package: "scenes", or relative and absolute'
+        )
     return found
 
 
@@ -166,7 +174,7 @@ class _Others(BaseModel):
     def _numbers(self) -> Self:
         for name, value in (self.model_extra or {}).items():
             if isinstance(value, bool) or not _number(value):
-                raise fail(f"the metric {name!r} is none", "a finite number")
+                raise make_validation_error(f"the metric {name!r} is none", "a finite number")
         return self
 
 
@@ -267,18 +275,20 @@ def read_archive(file: Path) -> tuple[dict[str, Any], dict[str, Any]]:
             "not a saved plan", file=file, expected="a file written by Plan.save", got=error
         ) from error
     text = str(arrays.pop("about"))
-    if text.count(",") > MOST_FIELDS:
+    if text.count(",") > MAX_FIELDS:
         raise InputError(
-            "the description has too many fields", file=file, expected=f"at most {MOST_FIELDS}"
+            "the description has too many fields", file=file, expected=f"at most {MAX_FIELDS}"
         )
     about = parse_json(text, file)
     if isinstance(about, dict) and about.get("format") != FORMAT:
         raise InputError(
             "unknown format", file=file, field="format", expected=FORMAT, got=about.get("format")
         )
-    found: dict[str, Any] = {name: finite(array, name, file) for name, array in arrays.items()}
+    found: dict[str, Any] = {
+        name: check_finite_array(array, name, file) for name, array in arrays.items()
+    }
     knots = {name.removeprefix("knot_"): found.pop(name) for name in CURVE if name in found}
-    return check(Document(about, file), _About).model_dump(), found | (
+    return parse_document(Document(about, file), _About).model_dump(), found | (
         {"curve": knots} if knots else {}
     )
 
@@ -317,7 +327,7 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Any:
 def serialize_folder(scene_folder: Path, plan: Path) -> dict[str, str]:
     """Describe a scene's folder: in the package, or by relative and absolute paths."""
     there = scene_folder.resolve()
-    if there == folder("scenes").resolve():
+    if there == find_resource_folder("scenes").resolve():
         return {"package": "scenes"}
     return {"relative": os.path.relpath(there, plan.resolve().parent), "absolute": str(there)}
 
@@ -325,6 +335,6 @@ def serialize_folder(scene_folder: Path, plan: Path) -> dict[str, str]:
 def resolve_folder(data: Mapping[str, str], plan: Path) -> Path:
     """Return the folder described by `serialize_folder`."""
     if "package" in data:
-        return folder(data["package"])
+        return find_resource_folder(data["package"])
     beside = plan.resolve().parent / data["relative"]
     return beside if beside.is_dir() else Path(data["absolute"])

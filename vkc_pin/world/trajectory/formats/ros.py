@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.errors import InputError, shown
-from vkc_pin.utils.arguments import flag, is_number, number, text, whole
+from vkc_pin.errors import InputError, format_value
+from vkc_pin.utils.arguments import check_bool, check_integer, check_number, check_text, is_number
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.trajectory.curve import Curve, sample_evenly
 from vkc_pin.world.trajectory.formats.tables import (
     infer_robot_size,
@@ -76,13 +76,17 @@ def to_ros(
         InputError: `joints` names none, or one twice; `rate`, `derivatives` or `stamp` is out of
             range.
     """
-    curve, smooth, frame = motion.get("curve"), flag(smooth, "smooth"), text(frame, "frame")
+    curve, smooth, frame = (
+        motion.get("curve"),
+        check_bool(smooth, "smooth"),
+        check_text(frame, "frame"),
+    )
     derivatives = (
         (2 if curve is None else 1)
         if derivatives is None
-        else whole(derivatives, "derivatives", low=0, high=2)
+        else check_integer(derivatives, "derivatives", low=0, high=2)
     )
-    if (stamp := number(stamp, "stamp", "seconds, at least 0", low=0.0)) >= 2.0**31:
+    if (stamp := check_number(stamp, "stamp", "seconds, at least 0", low=0.0)) >= 2.0**31:
         raise InputError(
             "out of range", field="stamp", expected="seconds, less than 2^31", got=stamp
         )
@@ -99,7 +103,7 @@ def to_ros(
         else Curve(times, positions, np.array(curve["rates"], float)[:, columns])
     )
     if rate is not None:
-        rate = number(rate, "rate", "points a second, more than 0", low=0.0, above=True)
+        rate = check_number(rate, "rate", "points a second, more than 0", low=0.0, strict=True)
         most = _MOST // max(len(columns), 1)  # a group may be empty
         if times[-1] * rate > most:
             expected = f"at most {most} points, {most / times[-1]:.4g} a second for this motion of {times[-1]:.4g} s"
@@ -168,7 +172,7 @@ def from_ros(
     file = (
         None
         if isinstance(message, Mapping)
-        else file_path(message, "message", "a JointTrajectory as data, or a JSON file")
+        else check_path(message, "message", "a JointTrajectory as data, or a JSON file")
     )
     data = read_json(file) if file is not None else message
     names = _field(data, "joint_names", list, file, "")
@@ -190,7 +194,11 @@ def from_ros(
             if not is_number(value):
                 field = f"{where}positions[{place}]"
                 raise InputError(
-                    "not a number", file=file, field=field, expected="a number", got=shown(value)
+                    "not a number",
+                    file=file,
+                    field=field,
+                    expected="a number",
+                    got=format_value(value),
                 )
         since = _field(point, "time_from_start", dict, file, where)
         sec, nanosec = (
@@ -199,10 +207,14 @@ def from_ros(
         rows.append(row)
         slopes.append(_rates(point, len(names), file, where))
         times.append(
-            number(sec, f"{where}time_from_start.sec")
-            + number(nanosec, f"{where}time_from_start.nanosec") / _NANO
+            check_number(sec, f"{where}time_from_start.sec")
+            + check_number(nanosec, f"{where}time_from_start.nanosec") / _NANO
         )
-    size = infer_robot_size(names) if robot_size is None else whole(robot_size, "robot_size", low=3)
+    size = (
+        infer_robot_size(names)
+        if robot_size is None
+        else check_integer(robot_size, "robot_size", low=3)
+    )
     phases = [make_single_phase(len(rows))] if len(rows) > 1 else []
     if like is not None:
         size, began = like["robot_size"], np.array(like["times"], float)
@@ -242,7 +254,7 @@ def _rates(point: Any, size: int, file: Path | None, where: str) -> list[float]:
         if not is_number(value):
             field = f"{where}velocities[{place}]"
             raise InputError(
-                "not a number", file=file, field=field, expected="a number", got=shown(value)
+                "not a number", file=file, field=field, expected="a number", got=format_value(value)
             )
     return values
 
@@ -310,6 +322,10 @@ def _field(data: Any, key: str, kind: type, file: Path | None, where: str) -> An
     value = data[key]
     if not isinstance(value, Mapping if kind is dict else kind) or isinstance(value, bool):
         raise InputError(
-            "wrong kind of value", file=file, field=where + key, expected=expected, got=shown(value)
+            "wrong type of value",
+            file=file,
+            field=where + key,
+            expected=expected,
+            got=format_value(value),
         )
     return value

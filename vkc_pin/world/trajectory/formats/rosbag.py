@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arguments import number, text
-from vkc_pin.utils.optional_imports import optional_package
-from vkc_pin.world.files.writing import folder_at_once
+from vkc_pin.utils.arguments import check_number, check_text
+from vkc_pin.utils.optional_imports import import_optional
+from vkc_pin.world.files.writing import write_folder_atomically
 from vkc_pin.world.trajectory.formats.ros import to_ros
 
 __all__ = ["TOPICS", "import_rosbags", "write_rosbag"]
@@ -75,15 +75,15 @@ def write_rosbag(
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_typestore
 
-    states = number(states, "states", "messages a second, more than 0", low=0.0, above=True)
+    states = check_number(states, "states", "messages a second, more than 0", low=0.0, strict=True)
     begin = _namespace(namespace)
     store: Any = get_typestore(Stores.ROS2_HUMBLE)
-    own = text(base_frame, "base_frame")
+    own = check_text(base_frame, "base_frame")
     messages = _messages(
         motion, store.types, rate, states, frame=frame, base_frame=own, stamp=stamp
     )
     found = sorted(messages, key=lambda item: item[1])
-    with folder_at_once(path, force=force) as staging:
+    with write_folder_atomically(path, force=force) as staging:
         inside = staging / Path(path).absolute().name  # which the database is named after
         with Writer(inside, version=_FORMAT) as writer:
             ends = [end for end in TOPICS if any(end == own for own, _, _ in found)]
@@ -105,11 +105,11 @@ def import_rosbags() -> Any:
     Raises:
         InputError: `rosbags` is not installed or cannot be imported.
     """
-    return optional_package("rosbags", "ros", what="recording for ROS")
+    return import_optional("rosbags", "ros", purpose="recording for ROS")
 
 
 def _namespace(name: str) -> str:
-    parts = text(name, "namespace").strip("/").split("/") if name != "" else [""]
+    parts = check_text(name, "namespace").strip("/").split("/") if name != "" else [""]
     if parts != [""] and not all(part.isascii() and part.isidentifier() for part in parts):
         raise InputError(
             "no name of topics",

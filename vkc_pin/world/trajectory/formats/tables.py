@@ -16,10 +16,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from vkc_pin.errors import InputError, UnknownNameError, shown
-from vkc_pin.utils.arguments import items, mapping, text, whole
+from vkc_pin.errors import InputError, UnknownNameError, format_value
+from vkc_pin.utils.arguments import check_integer, check_list, check_mapping, check_text
 from vkc_pin.world.files.documents import parse_json, read_text
-from vkc_pin.world.files.resources import file_path
+from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.writing import write_atomically
 
 __all__ = [
@@ -81,10 +81,10 @@ def write_csv(
     columns, phases = select_columns(motion, joints), motion["phases"]
     x, y, yaw = motion["names"][:3]
     known = {x: "m", y: "m", yaw: "rad"}
-    for name, unit in mapping(
+    for name, unit in check_mapping(
         {} if units is None else units, "units", "names of coordinates, each with its unit"
     ).items():
-        known[name] = text(unit, f"units[{name!r}]")
+        known[name] = check_text(unit, f"units[{name!r}]")
     lines: list[str] = []
     table = csv.writer(
         SimpleNamespace(write=lines.append)
@@ -157,7 +157,7 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
         InputError: The file is missing, or something in it does not fit; the error names line and
             column.
     """
-    path = file_path(path, "path")
+    path = check_path(path, "path")
     table = read_text(path, "CSV", LARGEST_MOTION)
     if (many := table.count("\n")) > MOST_LINES:
         raise InputError("too many lines", file=path, expected=f"at most {MOST_LINES}", got=many)
@@ -181,7 +181,7 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
             line=1,
             field="first column",
             expected=_TIME,
-            got=shown(header[0]),
+            got=format_value(header[0]),
         )
     opens = tuple(header[-4:]) == (*_PHASES, _OPENING)
     told = opens or tuple(header[-3:]) == _PHASES
@@ -240,7 +240,7 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
         "positions": [row[1:] for row in rows],
         "robot_size": infer_robot_size(names)
         if robot_size is None
-        else whole(robot_size, "robot_size", low=3),
+        else check_integer(robot_size, "robot_size", low=3),
         "phases": phases,
     }
 
@@ -257,7 +257,7 @@ def read_json(path: str | Path) -> Any:
         InputError: The file is missing, is no JSON, or is larger than a motion can be; the error
             names the line.
     """
-    path = file_path(path, "path")
+    path = check_path(path, "path")
     return parse_json(read_text(path, "JSON", LARGEST_MOTION), path)
 
 
@@ -280,7 +280,7 @@ def select_columns(motion: Mapping[str, Any], joints: str | Sequence[str]) -> li
         if joints not in groups:
             raise UnknownNameError("group of joints", joints, GROUPS, field="joints")
         return list(range(*groups[joints]))
-    names = items(joints, "joints", f"one of {', '.join(GROUPS)}, or a list of names", str)
+    names = check_list(joints, "joints", f"one of {', '.join(GROUPS)}, or a list of names", str)
     if not names:
         raise InputError(
             "no joints",
@@ -328,7 +328,7 @@ def _number(cell: str, path: Path, line: int, column: str) -> float:
             line=line,
             field=column,
             expected="a finite number",
-            got=shown(cell),
+            got=format_value(cell),
         )
     return value
 
@@ -351,7 +351,7 @@ def _add_phase(
             line=line,
             field="phase",
             expected=expected,
-            got=shown(number),
+            got=format_value(number),
         )
     if int(number) == len(phases):
         phases[-1]["last"] = row
@@ -365,7 +365,12 @@ def _add_phase(
     except (ValueError, AttributeError, TypeError, LookupError, RecursionError):
         wanted = 'JSON such as {"door": "handle"}'
         raise InputError(
-            "not what is held", file=path, line=line, field="held", expected=wanted, got=shown(held)
+            "not what is held",
+            file=path,
+            line=line,
+            field="held",
+            expected=wanted,
+            got=format_value(held),
         ) from None
     stands = {} if opening is None else {_OPENING: opening}
     phases.append(

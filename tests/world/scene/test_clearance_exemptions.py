@@ -16,15 +16,12 @@ from hypothesis import strategies as st
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.validation.validate import validate
-from vkc_pin.world.models.shapes import compute_shape_distance, get_link_name
 from vkc_pin.world.scene import clearance_exemptions as neighbours
 from vkc_pin.world.scene.clearance_exemptions import (
     ClearanceExemption,
     find_clearance_exemptions,
     find_close_pairs,
 )
-from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene, load_scene
 
 SAFE = 0.02
@@ -63,10 +60,8 @@ def in_wall(depth: float = 0.05, **fields: Any) -> Scene:
 
 
 @given(gap=st.floats(0.001, 0.018), begin=st.floats(1.4, 1.8))
-@settings(max_examples=20, deadline=None)
-def test_a_drawer_beside_a_panel_is_its_neighbour_until_it_is_past_it(
-    gap: float, begin: float
-) -> None:
+@settings(max_examples=8, deadline=None)
+def test_drawer_is_exempt_from_a_panel_until_it_has_passed_it(gap: float, begin: float) -> None:
     (close,) = find_close_pairs(beside(gap, begin), SAFE)
     assert close[:2] == ("drawer.tray", "side")
     assert close.distance == pytest.approx(gap, abs=1e-6)
@@ -82,28 +77,6 @@ def test_a_drawer_beside_a_panel_is_its_neighbour_until_it_is_past_it(
         if leaves > drawer_scene().objects["drawer"].object.upper[0]
         else pytest.approx(leaves, abs=2e-4)
     )
-
-
-def test_link_distance_is_that_of_the_closest_shapes() -> None:
-    scene = beside(0.012).with_state("drawer", {"slide": 0.2})
-    shapes = [
-        (f"drawer.{get_link_name(shape.name)}", shape)
-        for shape in make_world_shapes(scene.objects["drawer"])
-    ]
-    moving = [shape for label, shape in shapes if label == "drawer.tray"]
-    least: dict[str, float] = {}
-    for label, other in zip(scene.obstacle_labels, scene.obstacles, strict=True):
-        for shape in moving if label != FLOOR else ():
-            distance = compute_shape_distance(
-                shape.geometry, shape.placement, other.geometry, other.placement
-            )
-            least[label] = min(least.get(label, np.inf), distance)
-    found = {pair.second: pair.distance for pair in find_close_pairs(scene, 0.6)}
-    assert len(moving) > 3
-    assert found == pytest.approx(
-        {label: distance for label, distance in least.items() if distance < 0.6}, abs=1e-9
-    )
-    assert {"side", "wall_east"} <= set(found)
 
 
 def test_cache_depends_on_obstacles_and_states() -> None:
@@ -128,7 +101,7 @@ def test_cache_depends_on_obstacles_and_states() -> None:
     )  # each shape of the tray that is close has its own
 
 
-def test_two_drawers_side_by_side_are_neighbours_until_either_is_past_the_other() -> None:
+def test_drawers_side_by_side_are_exempt_until_either_has_passed() -> None:
     gap, thick = 0.015, 0.018  # between the fronts, and of each
     drawer = {"type": "drawer", "position": [1.93, 0.0, 0.0]}
     at = [[1.93, y, 0.0] for y in (0.0, 2 * TRAY + gap)]
@@ -147,13 +120,6 @@ def test_two_drawers_side_by_side_are_neighbours_until_either_is_past_the_other(
     assert one.is_active(["near.slide", "next.slide"], out).tolist() == [True, True, False, False]
 
 
-def test_packaged_scenes_have_no_close_pairs() -> None:
-    for name in ("door", "drawer", "fetch", "household", "corridor_door", "aisle_drawer"):
-        scene = load_scene(name)
-        assert find_clearance_exemptions(scene, SAFE) == ()
-        assert find_close_pairs(scene, SAFE) == []
-
-
 def test_warning_names_overlapping_links() -> None:
     with pytest.warns(
         UserWarning, match=r"tight: .*door\.panel – wall overlap by 50\.0 mm.*`allow:`"
@@ -162,32 +128,15 @@ def test_warning_names_overlapping_links() -> None:
     assert len(caught) == 1
     (one,) = find_clearance_exemptions(scene, SAFE)
     assert one.is_between("wall", "door.panel")
-    assert one.margin == -np.inf
-    assert one.ranges == {"door.hinge": (-np.inf, np.inf)}  # its hinge is in the wall for ever
+    assert (one.margin, one.ranges) == (-np.inf, {"door.hinge": (-np.inf, np.inf)})
 
 
-def test_open_door_keeps_the_exemption_of_its_wall() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        scene = in_wall(0.003)
-    shut = find_clearance_exemptions(scene, SAFE)
-    (ajar,) = {
-        one.ranges["door.hinge"]
-        for one in find_clearance_exemptions(scene.with_state("door", {"hinge": 1.0}), SAFE)
-    }
-    assert {one.ranges["door.hinge"] for one in shut} == {ajar}
-
-
-def test_open_drawer_keeps_the_exemption_of_its_neighbour() -> None:
+def test_exemptions_of_built_neighbours_hold_in_any_state() -> None:
     (one,) = find_clearance_exemptions(beside(0.004), SAFE)
-    assert find_close_pairs(beside(0.004).with_state("drawer", {"slide": 0.4}), SAFE) == []
-    (other,) = find_clearance_exemptions(beside(0.004).with_state("drawer", {"slide": 0.4}), SAFE)
-    assert (other.first, other.second, other.margin, other.ranges) == (
-        one.first,
-        one.second,
-        one.margin,
-        one.ranges,
-    )
+    opened = beside(0.004).with_state("drawer", {"slide": 0.4})
+    assert find_close_pairs(opened, SAFE) == []
+    (other,) = find_clearance_exemptions(opened, SAFE)
+    assert (other.shapes, other.margin, other.ranges) == (one.shapes, one.margin, one.ranges)
 
 
 def test_held_and_resting_objects_have_no_exemptions() -> None:
@@ -217,10 +166,8 @@ def test_exemption_is_active_where_every_joint_is_in_range() -> None:
     ("allow", "margin"),
     [
         ([["door.panel", "wall"]], -np.inf),
-        ([["wall", "door"]], -np.inf),
         ([{"pair": ["door", "wall"], "margin": 0.004}], 0.004),
         ([{"pair": ["door", "wall"], "margin": 0.004}, ["door.panel", "wall"]], -np.inf),
-        (["home.srdf"], -np.inf),
         ([{"srdf": "home.srdf"}], -np.inf),
     ],
 )
@@ -229,7 +176,7 @@ def test_allowed_pairs_of_a_scene(tmp_path: Path, allow: list[Any], margin: floa
         '<robot name="home"><disable_collisions link1="door.panel" link2="wall" reason="as built"/></robot>'
     )
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # what is allowed is not told of
+        warnings.simplefilter("error")  # allowed overlaps raise no warning
         scene = Scene.from_document({**in_wall(-0.004).document, "allow": allow}, tmp_path)
     assert scene.allowed[frozenset(("door.panel", "wall"))] == margin
     assert find_close_pairs(scene, SAFE) == []
@@ -244,12 +191,9 @@ def test_allowed_pairs_of_a_scene(tmp_path: Path, allow: list[Any], margin: floa
     [
         ([["door.panle", "wall"]], "allow[0][0]", "did you mean 'door.panel'"),
         ([{"pair": ["door", "wal"]}], "allow[0].pair[1]", "did you mean 'wall'"),
-        ([["door"]], "allow[0]", "2 values"),
         ([{"margin": 0.1}], "allow[0]", "neither a pair nor an SRDF file"),
-        ([{"srdf": "home.srdf", "margin": 0.1}], "allow[0]", "neither a pair nor an SRDF file"),
         (["nowhere.srdf"], "allow[0]", "there is no such file"),
         ([{"pair": ["door", "wall"], "margin": "thin"}], "allow[0].margin", "a number"),
-        ([7], "allow[0]", ""),
     ],
 )
 def test_errors_name_invalid_allowed_pairs(allow: list[Any], field: str, said: str) -> None:
@@ -259,7 +203,7 @@ def test_errors_name_invalid_allowed_pairs(allow: list[Any], field: str, said: s
     assert said in str(caught.value)
 
 
-def test_a_file_that_is_missing_is_named_with_the_nearest_one(tmp_path: Path) -> None:
+def test_missing_file_suggests_the_nearest_one(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     for name in ("door.yaml", "door.yml", "oven.yaml"):
         (tmp_path / "mine" / name).touch()
@@ -275,7 +219,7 @@ def test_a_file_that_is_missing_is_named_with_the_nearest_one(tmp_path: Path) ->
             )
 
 
-def test_an_srdf_of_other_links_is_refused_by_line(tmp_path: Path) -> None:
+def test_unknown_links_in_srdf_are_located(tmp_path: Path) -> None:
     (tmp_path / "home.srdf").write_text(
         '<robot name="home">\n<disable_collisions link1="doro" link2="wall"/>\n</robot>'
     )
@@ -283,19 +227,13 @@ def test_an_srdf_of_other_links_is_refused_by_line(tmp_path: Path) -> None:
         Scene.from_document({**in_wall(-0.03).document, "allow": ["home.srdf"]}, tmp_path)
 
 
-def test_plans_open_and_close_overlapping_doors(tmp_path: Path) -> None:
-    """Every success is judged by the oracle, which has its own idea of neighbours."""
-    plan = vkc.plan(beside(0.004), [vkc.Actuate("drawer", {"slide": 0.3})])
-    assert plan.success, plan.report()
-    assert 0.003 < plan.validation.clearance < 0.0045
+def test_door_opens_and_closes_in_its_wall() -> None:
+    """The oracle, which finds neighbours on its own, judges the plan too."""
     with pytest.warns(UserWarning, match="overlap by 50"):
         scene = in_wall()
-    both = vkc.plan(scene, [vkc.Actuate("door", HINGE), vkc.Actuate("door", {"hinge": 0.0})])
-    assert both.success, both.report()
-    assert both.validation.clearance > 0.015  # of what must be apart
-    both.save(tmp_path / "both.npz")
-    with pytest.warns(UserWarning, match="overlap by 50"):
-        assert vkc.Plan.load(tmp_path / "both.npz").success
+    plan = vkc.plan(scene, [vkc.Actuate("door", HINGE), vkc.Actuate("door", {"hinge": 0.0})])
+    assert plan.success, plan.report()
+    assert plan.validation.clearance > 0.015  # of pairs that are not exempt
 
 
 def test_cup_may_leave_but_not_enter_an_overlap() -> None:
@@ -308,79 +246,19 @@ def test_cup_may_leave_but_not_enter_an_overlap() -> None:
     assert plan.success, plan.report()
     deep = validate(scene, [vkc.Place("cup", (1.5, 0.4, 0.749))], plan.trajectory)
     assert {violation.constraint for violation in deep.violations} == {"goal"}
-    into = vkc.plan(scene, [vkc.Place("cup", (1.5, 0.4, 0.747))])
-    assert into.status == "infeasible"
-    assert "cup.cup – table overlap by" in into.validation.notes[0]
 
 
-def test_left_overlap_is_not_exempt_again() -> None:
-    """A leaf that swings by 1.2 rad may not swing into a post that it was never near."""
-    post = {"name": "post", "type": "box", "size": [0.08, 0.1, 0.5], "position": [3.2, -0.3, 0.25]}
-    document = in_wall(-0.06).document
-    blocked = Scene.from_document({**document, "obstacles": [*document["obstacles"], post]})
-    plan = vkc.plan(blocked, [vkc.Actuate("door", HINGE)])
-    assert plan.status == "infeasible"
-    (note,) = plan.validation.notes
-    assert "proven: between 0 and 1.2" in note
-    assert "door.panel – post overlap by" in note
-    allowed = Scene.from_document({**blocked.document, "allow": [["door", "post"]]})
-    assert vkc.plan(allowed, [vkc.Actuate("door", HINGE)]).success
-
-
-def test_a_leaf_whose_edge_swings_into_the_wall_is_proven_to() -> None:
-    """3 mm are too few for a leaf 40 mm thick that turns about its edge, unless the scene allows it."""
+def test_allowed_margin_decides_about_a_leaf_that_turns_into_its_wall() -> None:
+    """3 mm are too few for a leaf 40 mm thick that turns about its edge."""
     scene = in_wall(-0.003)
     plan = vkc.plan(scene, [vkc.Actuate("door", HINGE)])
     assert plan.status == "infeasible"
     (note,) = plan.validation.notes
-    overlap = float(note.rpartition("overlap by ")[2].removesuffix(" mm"))
     assert "door.panel – wall" in note
-    short = Scene.from_document(
-        {**scene.document, "allow": [{"pair": ["door", "wall"], "margin": -1e-3 * (overlap - 2.0)}]}
-    )
-    assert vkc.plan(short, [vkc.Actuate("door", HINGE)]).status == "infeasible"
-    enough = Scene.from_document(
-        {**scene.document, "allow": [{"pair": ["door", "wall"], "margin": -1e-3 * (overlap + 0.2)}]}
-    )
+    overlap = float(note.rpartition("overlap by ")[2].removesuffix(" mm"))
+    pair = {"pair": ["door", "wall"], "margin": -1e-3 * (overlap + 0.2)}
+    enough = Scene.from_document({**scene.document, "allow": [pair]})
     assert vkc.plan(enough, [vkc.Actuate("door", HINGE)]).success
-
-
-def test_robot_may_overlap_allowed_obstacles() -> None:
-    mat = {"name": "mat", "type": "box", "size": [1.2, 1.2, 0.2], "position": [0.0, 0.0, 0.1]}
-    document = {"robot": "husky_ur5e", "start": {"base": [0.0, 0.0, 0.0]}, "obstacles": [mat]}
-    refused = vkc.plan(Scene.from_document(document), [vkc.GoTo(2.0, 0.0)])
-    assert refused.status == "infeasible"
-    touching = sorted({v.subject.split(" – ")[0] for v in refused.validation.violations})
-    assert touching
-    plan = vkc.plan(
-        Scene.from_document({**document, "allow": [[link, "mat"] for link in touching]}),
-        [vkc.GoTo(2.0, 0.0)],
-    )
-    assert plan.success, plan.report()
-
-
-def test_only_nearby_obstacles_are_measured(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    rng = np.random.default_rng(0)
-    boxes = [
-        {
-            "name": f"b{k}",
-            "type": "box",
-            "size": [0.02, 0.02, 0.02],
-            "position": [*rng.uniform(-4, 1.5, 2).tolist(), 1.0],
-        }
-        for k in range(9_990)
-    ]
-    document = in_wall(-0.004).document
-    asked = []
-    measured = neighbours.compute_shape_distance
-    monkeypatch.setattr(
-        neighbours, "compute_shape_distance", lambda *given: asked.append(given) or measured(*given)
-    )
-    scene = Scene.from_document({**document, "obstacles": [*document["obstacles"], *boxes]})
-    assert [pair[:2] for pair in find_close_pairs(scene, SAFE)] == [("door.panel", "wall")]
-    assert 1 <= len(asked) < 10
 
 
 def test_unreached_links_are_never_near() -> None:
@@ -452,10 +330,6 @@ def test_exemption_applies_to_shapes_not_links(tmp_path: Path) -> None:
     assert -0.045 < used.distance < -0.03  # the corner of the leaf, 40 mm thick, turns in the post
     assert "1.0 mm inside each other" in used.reason
     assert f"exempt      {used}" in opened.report()
-    opened.save(tmp_path / "opened.npz")
-    assert (
-        vkc.Plan.load(tmp_path / "opened.npz").validation.exemptions == opened.validation.exemptions
-    )
 
     blocked = hinged_at_post(tmp_path / "blocked", block=True)
     (one,) = find_clearance_exemptions(blocked, SAFE)
@@ -464,11 +338,6 @@ def test_exemption_applies_to_shapes_not_links(tmp_path: Path) -> None:
     (hit,) = (found for found in report.violations if found.constraint == "penetration")
     assert hit.subject == "door.leaf – wall"
     assert hit.amount == pytest.approx(0.161, abs=0.002)
-    refused = vkc.plan(blocked, steps)
-    assert refused.status == "infeasible"
-    assert any("door.leaf – wall overlap by 16" in note for note in refused.validation.notes), (
-        refused.report()
-    )
 
 
 def test_overlap_of_two_joints_is_bounded_by_each_alone() -> None:

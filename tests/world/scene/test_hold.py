@@ -23,69 +23,29 @@ BALL = Hold("ball", "pull", STICK, "tip")
 FLY = Hold("fly", "leg", BALL, "ball")
 
 
-def test_grasping_frames_of_holds() -> None:
-    assert make_holds({}, {}) == ()
-    assert make_holds({"door": "handle", "drawer": "knob"}, {}) == (
-        Hold("door", "handle"),
-        Hold("drawer", "knob"),
-    )
-    assert (STICK.by, STICK.link, STICK.frame) == (None, None, None)
-    assert (BALL.by, BALL.link, BALL.frame) == (STICK, "tip", "stick.tip")
-    assert [str(hold) for hold in (STICK, BALL, FLY)] == [
-        "stick.grip",
-        "ball.pull by stick.tip",
-        "fly.leg by ball.ball",
-    ]
+def test_holds_are_equal_by_object_attachment_and_frame() -> None:
+    assert (STICK.frame, BALL.frame) == (None, "stick.tip")
+    assert [str(hold) for hold in (STICK, BALL)] == ["stick.grip", "ball.pull by stick.tip"]
+    again = Hold("ball", "pull", Hold("stick", "grip", at=(0.1, 2.0)), "tip")
+    assert (again, hash(again)) == (BALL, hash(BALL))
+    for other in (
+        Hold("ball", "pull"),
+        Hold("ball", "pull", STICK, "stick"),
+        Hold("ball", "pull", Hold("stick", "end"), "tip"),
+    ):
+        assert other != BALL
 
 
-@pytest.mark.parametrize("order", list(itertools.permutations(["stick", "ball", "fly", "door"])))
+@pytest.mark.parametrize("order", list(itertools.permutations(["stick", "ball", "fly"])))
 def test_holds_are_ordered_by_dependency(order: tuple[str, ...]) -> None:
-    attachments = {"stick": "grip", "ball": "pull", "fly": "leg", "door": "handle"}
+    attachments = {"stick": "grip", "ball": "pull", "fly": "leg"}
     found = make_holds(
         {name: attachments[name] for name in order}, {"fly": "ball.ball", "ball": "stick.tip"}
     )
-    assert sorted(found, key=str) == sorted([STICK, BALL, FLY, Hold("door", "handle")], key=str)
+    assert sorted(found, key=str) == sorted([STICK, BALL, FLY], key=str)
     assert found.index(STICK) < found.index(BALL) < found.index(FLY)
-
-
-def test_equal_holds_are_one_key() -> None:
-    again = Hold("ball", "pull", Hold("stick", "grip"), "tip")
-    assert again == BALL
-    assert hash(again) == hash(BALL)
-    assert Hold("ball", "pull") != BALL
-    assert Hold("ball", "pull", STICK, "stick") != BALL
-    assert Hold("ball", "pull", Hold("stick", "end"), "tip") != BALL
-
-
-@pytest.mark.parametrize(
-    ("held", "by"),
-    [
-        ({}, {}),
-        ({"stick": "grip"}, {}),
-        (
-            {"fly": "leg", "stick": "grip", "ball": "pull"},
-            {"fly": "ball.ball", "ball": "stick.tip"},
-        ),
-        (
-            {"ball": "pull", "fly": "leg", "stick": "grip"},
-            {"fly": "stick.tip", "ball": "stick.tip"},
-        ),
-    ],
-)
-def test_mappings_round_trip(held: dict[str, str], by: dict[str, str]) -> None:
-    found = make_holds(held, by)
-    assert {hold.object: hold.attachment for hold in found} == held
-    assert {hold.object: hold.frame for hold in found if hold.by} == by
-    assert (
-        make_holds({hold.object: hold.attachment for hold in found}, by)
-        == check_hold_order(iter(found))
-        == found
-    )
-
-
-def test_values_do_not_make_another_hold() -> None:
-    (again,) = make_holds({"stick": "grip"}, at={"stick": [0.1, 2]})
-    assert (again, hash(again), again.at, STICK.at) == (STICK, hash(STICK), (0.1, 2.0), ())
+    assert check_hold_order(iter(found)) == found
+    assert make_holds({}, {}) == ()
 
 
 def test_a_hold_comes_after_the_one_it_depends_on() -> None:
@@ -156,8 +116,6 @@ def test_approach_from_inside_is_reversed(
             given.tool(np.zeros(len(given.freedoms))),
             atol=1e-12,
         )
-    plan = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.3})])  # judged by the oracle as well
-    assert plan.success, plan.report()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         again = Scene.from_document(scene.document, scene.folder)
@@ -165,32 +123,6 @@ def test_approach_from_inside_is_reversed(
     np.testing.assert_array_equal(
         again.objects["drawer"].object.attachment().placement, placed.object.attachment().placement
     )
-
-
-def test_approach_that_is_no_better_reversed_is_kept() -> None:
-    for name in (
-        "drawer",
-        "door",
-        "household",
-        "fetch",
-        "tray",
-        "init_1",
-        "aisle_drawer",
-        "corridor_door",
-    ):
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            scene = vkc.load_scene(name)
-        assert all(placed.reversed == () for placed in scene.objects.values())
-    walls = [
-        {"name": f"w{k}", "type": "box", "size": [3, 3, 0.1], "position": [0, 0, 0.5 + k]}
-        for k in range(2)
-    ]
-    around = {
-        **drawer_scene().document,
-        "obstacles": walls,
-    }  # what others stand there is no matter of the object
-    assert Scene.from_document(around, drawer_scene().folder).objects["drawer"].reversed == ()
 
 
 def test_approach_from_below_the_floor_is_reversed(tmp_path: Path) -> None:
@@ -213,46 +145,7 @@ def test_approach_from_below_the_floor_is_reversed(tmp_path: Path) -> None:
     assert high.objects["ball"].reversed == flat.objects["ball"].reversed == ()
 
 
-def test_approach_by_a_reversed_stick_is_reversed(tmp_path: Path) -> None:
-    fixed = described(
-        tmp_path,
-        "ball",
-        "joint: spherical\n    standoff: 0.035",
-        "joint: fixed\n    standoff: 0.035",
-    )
-    document = {"robot": "husky_ur5e", "start": {"base": [0.0, 0.0, 0.0]}}
-    stick = {"name": "stick", "type": "stick", "position": [2.0, 0.0, 0.5]}
-    ball = {"name": "ball", "type": fixed, "position": [1.2, 0.0, 0.036]}
-    scene = Scene.from_document({**document, "objects": [stick, ball]})
-    hold = Hold("ball", "pull", STICK, "tip")
-    assert scene.with_approaches([hold]) is scene
-    backwards = scene.with_approaches([]).objects["ball"].with_reversed("pull")
-    from_below = Scene.from_document(
-        {**document, "objects": [stick, {**ball, "reversed": ["pull"]}]}
-    )
-    np.testing.assert_array_equal(
-        from_below.objects["ball"].object.attachment("pull").placement,
-        backwards.object.attachment("pull").placement,
-    )
-    up = described(
-        tmp_path,
-        "ball",
-        "joint: spherical\n    standoff: 0.035",
-        "joint: fixed\n    standoff: 0.035",
-    )
-    text = Path(up).read_text()
-    first, _, last = text.rpartition("approach: [0, 0, -1]")
-    Path(up).write_text(f"{first}approach: [0, 0, 1]{last}")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a hand would come from below as well
-        wrong = Scene.from_document({**document, "objects": [stick, {**ball, "type": up}]})
-    if not wrong.objects["ball"].reversed:
-        with pytest.warns(UserWarning, match=r"stick\.tip would come to ball\.pull"):
-            wrong = wrong.with_approaches([hold])
-    assert wrong.objects["ball"].reversed == ("pull",)
-
-
-@pytest.mark.parametrize("name", ["drawer", "door", "ball", "cup", "stick", "cabinet", "tray"])
+@pytest.mark.parametrize("name", ["door", "ball", "stick"])
 def test_reversing_twice_restores_the_approach(name: str) -> None:
     placed = next(iter(drawer_scene().objects.values()))
     placed = vkc.PlacedObject(
@@ -278,3 +171,21 @@ def test_reversing_twice_restores_the_approach(name: str) -> None:
         )
     with pytest.raises(UnknownNameError, match="there is no attachment"):
         placed.with_reversed("nowhere")
+
+
+def test_approach_through_a_held_object_is_reversed(tmp_path: Path) -> None:
+    joint = "joint: {}\n    standoff: 0.035"
+    fixed = described(tmp_path, "ball", joint.format("spherical"), joint.format("fixed"))
+    first, _, last = Path(fixed).read_text().rpartition("approach: [0, 0, -1]")
+    document = {"robot": "husky_ur5e", "start": {"base": [0.0, 0.0, 0.0]}}
+    stick = {"name": "stick", "type": "stick", "position": [2.0, 0.0, 0.5]}
+    ball = {"name": "ball", "type": fixed, "position": [1.2, 0.0, 0.036]}
+    scene = Scene.from_document({**document, "objects": [stick, ball]})
+    hold = Hold("ball", "pull", STICK, "tip")
+    assert scene.with_approaches([hold]) is scene
+    Path(fixed).write_text(f"{first}approach: [0, 0, 1]{last}")
+    with warnings.catch_warnings(record=True) as caught:
+        from_below = Scene.from_document({**document, "objects": [stick, ball]})
+        from_below = from_below.with_approaches([hold])
+    assert "would approach ball.pull" in str(caught[0].message)
+    assert from_below.objects["ball"].reversed == ("pull",)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 
 import coal
@@ -13,14 +12,8 @@ import pytest
 from helpers.rooms import TINY, load
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene, load_scene
-
-
-@pytest.fixture(scope="module")
-def door() -> Scene:
-    return load_scene("door")
 
 
 def test_every_kind_of_obstacle(tmp_path: Path) -> None:
@@ -78,48 +71,23 @@ def test_every_kind_of_obstacle(tmp_path: Path) -> None:
     assert [s.name for s in again.obstacles] == [s.name for s in scene.obstacles]
 
 
-def test_thousands_of_obstacles(tmp_path: Path) -> None:
-    """They are loaded in time that grows as they do: a minute would be a square of it."""
-    entry = "  - {{name: b{}, type: sphere, radius: 0.01, position: [9, 9, 9]}}\n"
-    began = time.perf_counter()
-    scene = load(tmp_path, TINY + "".join(map(entry.format, range(3000))))
-    assert time.perf_counter() - began < 30.0
-    assert (
-        len(scene.obstacles) == len(scene.obstacle_labels) == len(scene.obstacle_visual) + 1 > 3000
-    )
+def test_number_of_obstacles_is_limited() -> None:
+    ball = {"name": "b", "type": "sphere", "radius": 0.01, "position": [9, 9, 9]}
+    document = {"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}, "obstacles": [ball] * 10_001}
     with pytest.raises(InputError, match="too many") as caught:
-        load(tmp_path, TINY + "".join(map(entry.format, range(10_001))))
+        Scene.from_document(document)
     assert caught.value.field == "obstacles"
     assert len(str(caught.value)) < 300
 
 
 def test_orientations_may_be_quaternions(tmp_path: Path) -> None:
-    half = np.sqrt(0.5)
     extra = f"""\
   - {{name: turned, type: box, size: [1, 2, 3], position: [0, 3, 2], yaw: {np.pi / 2}}}
   - {{name: same, type: box, size: [1, 2, 3], position: [0, -3, 2], quaternion: [0, 0, 0.7071, 0.7071]}}
 """
     scene = load(tmp_path, TINY + extra)
-    drawer = {
-        "name": "drawer",
-        "type": "drawer",
-        "position": [2, 0, 0],
-        "quaternion": [0, 0, -half, half],
-    }
-    scene = Scene.from_document({**scene.document, "objects": [drawer]}, tmp_path)
     turns = {shape.name: shape.placement.rotation for shape in scene.obstacles}
     np.testing.assert_allclose(turns["turned"], turns["same"], atol=1e-12)
-    np.testing.assert_allclose(
-        pin.rpy.matrixToRpy(scene.objects["drawer"].placement.rotation),
-        [0, 0, -np.pi / 2],
-        atol=1e-12,
-    )
-    same(scene, Scene.from_document(scene.document, tmp_path))
-    moved = scene.with_placement("drawer", pin.SE3(pin.rpy.rpyToMatrix(0.1, 0.2, 0.3), np.ones(3)))
-    again = Scene.from_document(moved.document, tmp_path).objects["drawer"].placement
-    np.testing.assert_allclose(
-        again.homogeneous, moved.objects["drawer"].placement.homogeneous, atol=1e-12
-    )
 
 
 @pytest.mark.parametrize(
@@ -134,7 +102,7 @@ def test_orientations_may_be_quaternions(tmp_path: Path) -> None:
         ("quaternion: [0, 0, 0, 1], rpy: [0, 0, 0]", "more than one orientation"),
     ],
 )
-def test_wrong_quaternions_are_located(tmp_path: Path, orientation: str, said: str) -> None:
+def test_invalid_orientations_are_located(tmp_path: Path, orientation: str, said: str) -> None:
     with pytest.raises(InputError, match=said) as caught:
         load(
             tmp_path,
@@ -144,63 +112,19 @@ def test_wrong_quaternions_are_located(tmp_path: Path, orientation: str, said: s
     assert caught.value.line == len(TINY.splitlines()) + 1
 
 
-def test_a_scene_without_a_floor(tmp_path: Path) -> None:
+def test_floor_is_optional(tmp_path: Path) -> None:
     assert FLOOR not in load(tmp_path, TINY + "floor: false\n").obstacle_labels
-
-
-def same(a: Scene, b: Scene) -> None:
-    """Assert that two scenes are equal in everything a planner looks at."""
-    assert (a.name, a.arena, a.floor, dict(a.held), a.start_region) == (
-        b.name,
-        b.arena,
-        b.floor,
-        dict(b.held),
-        b.start_region,
-    )
-    np.testing.assert_array_equal(a.start, b.start)
-    assert a.obstacle_labels == b.obstacle_labels
-    for x, y in zip(a.obstacles, b.obstacles, strict=True):
-        assert x.name == y.name
-        assert type(x.geometry) is type(y.geometry)
-        assert x.geometry.computeVolume() == y.geometry.computeVolume()
-        np.testing.assert_array_equal(x.placement.homogeneous, y.placement.homogeneous)
-        np.testing.assert_array_equal(x.meshColor, y.meshColor)
-    assert a.objects.keys() == b.objects.keys()
-    for name, placed in a.objects.items():
-        np.testing.assert_array_equal(placed.state, b.objects[name].state)
-        np.testing.assert_array_equal(
-            placed.placement.homogeneous, b.objects[name].placement.homogeneous
-        )
-    assert a.document == b.document
-
-
-def test_the_document_rebuilds_the_scene(door: Scene) -> None:
-    changed = door.with_start(base=[0.1, 0.2, -1.0], arm=door.robot.home + 0.1).with_state(
-        "door", {"hinge": 0.25, "knob": 0.1}
-    )
-    for scene in (door, changed):
-        same(scene, Scene.from_document(json.loads(json.dumps(scene.document)), scene.folder))
-    np.testing.assert_array_equal(changed.start[:3], [0.1, 0.2, -1.0])
-    np.testing.assert_array_equal(changed.start[3:], door.robot.home + 0.1)
-    np.testing.assert_array_equal(changed.objects["door"].state, [0.25, 0.1])
-    np.testing.assert_array_equal(door.objects["door"].state, [0.0, 0.0])
 
 
 @pytest.mark.parametrize(
     ("old", "new", "line", "field", "nearest"),
     [
         ("robot: husky_ur5e", "robot: husky_ur5", 1, "robot", "husky_ur5e"),
-        ("robot: husky_ur5e", "robot:\n  name: husky\n  base: omni", 2, "robot.name", "husky_ur5e"),
         ("robot: husky_ur5e", "robot: {name: husky_ur5e, base: omnni}", 1, "robot.base", "omni"),
         ("  arm: home", "  arn: home", 4, "start.arn", "arm"),
-        ("start_region:", "start_regon:", 5, "start_regon", "start_region"),
-        ("  arm: home", "  arm: home\n  held: {frnt: handle}", 5, "start.held.frnt", "front"),
-        ("  arm: home", "  arm: home\n  held: {front: handel}", 5, "start.held.front", "handle"),
         ("type: door", "type: doors", 9, "objects[0].type", "door"),
         ("state: {hinge: 0.3}", "state: {hing: 0.3}", 11, "objects[0].state.hing", "hinge"),
-        ("    state:", "    states:", 11, "objects[0].states", "state"),
         ("type: box", "type: bax", 13, "obstacles[0].type", "box"),
-        ("    type: cylinder", "    type: cilinder", 15, "obstacles[1].type", "cylinder"),
         ("    radius: 0.1", "    radus: 0.1", 16, "obstacles[1].radus", "radius"),
     ],
 )
@@ -221,162 +145,45 @@ def test_unknown_names_are_located_with_a_suggestion(
     assert f"did you mean '{nearest}'?" in str(error)
 
 
+SIZE, BASE = "size: [0.5, 0.4, 0.3]", "base: [0.0, 0.0, 0.5]"
+
+
 @pytest.mark.parametrize(
     ("old", "new", "line", "field", "details"),
     [
-        (
-            "base: [0.0, 0.0, 0.5]",
-            "base: [0.0, 0.0]",
-            3,
-            "start.base",
-            "expected 3 values, got [0.0, 0.0]",
-        ),
-        (
-            "base: [0.0, 0.0, 0.5]",
-            "base: [0.0, .nan, 0.5]",
-            3,
-            "start.base[1]",
-            "expected a finite number, got nan",
-        ),
-        (
-            "base: [0.0, 0.0, 0.5]",
-            "base: [0.0, .inf, 0.5]",
-            3,
-            "start.base[1]",
-            "expected a finite number, got inf",
-        ),
-        (
-            "base: [0.0, 0.0, 0.5]",
-            "base: [0.0, north, 0.5]",
-            3,
-            "start.base[1]",
-            "expected a number, got 'north'",
-        ),
-        (
-            "base: [0.0, 0.0, 0.5]",
-            "base: [0.0, yes, 0.5]",
-            3,
-            "start.base[1]",
-            "expected a number, got True",
-        ),
-        (
-            "base: [0.0, 0.0, 0.5]",
-            "base: [9.0, 0.0, 0.5]",
-            3,
-            "start.base[0]",
-            "expected x from -4 to 4, got 9.0",
-        ),
-        ("  base: [0.0, 0.0, 0.5]\n", "", 2, "start.base", "missing"),
+        (BASE, "base: [0.0, 0.0]", 3, "start.base", "expected 3 values, got [0.0, 0.0]"),
+        (BASE, "base: [0.0, .inf, 0.5]", 3, "start.base[1]", "expected a finite number, got inf"),
+        (BASE, "base: [0.0, yes, 0.5]", 3, "start.base[1]", "expected a number, got True"),
+        (BASE, "base: [9.0, 0.0, 0.5]", 3, "start.base[0]", "expected x from -4 to 4, got 9.0"),
+        (f"  {BASE}\n", "", 2, "start.base", "missing"),
         ("arm: home", "arm: [0, 0, 0]", 4, "start.arm", "wrong number of arm joints"),
         ("arm: home", "arm: rest", 4, "start.arm", "expected home, or a list of joint values"),
-        (
-            "x: [-1, 1], y",
-            "x: [1, -1], y",
-            5,
-            "start_region.x",
-            "expected [lowest, highest], got [1, -1]",
-        ),
+        ("arm: home", "z: high", 4, "start.z", "a number"),
+        ("x: [-1, 1], y", "x: [1, -1], y", 5, "start_region.x", "expected [lowest, highest]"),
         ("x: [-1, 1], y", "x: [-9, 1], y", 5, "start_region.x", "expected x from -4 to 4"),
         ("yaw: any", "yaw: north", 5, "start_region.yaw", "expected any, or [lowest, highest]"),
-        (
-            "state: {hinge: 0.3}",
-            "state: {hinge: 3}",
-            11,
-            "objects[0].state.hinge",
-            "expected -1.57 to 1.57, got 3",
-        ),
-        (
-            "state: {hinge: 0.3}",
-            "state: {hinge: .nan}",
-            11,
-            "objects[0].state.hinge",
-            "expected a finite number, got nan",
-        ),
+        ("{hinge: 0.3}", "{hinge: 3}", 11, "objects[0].state.hinge", "expected -1.57 to 1.57"),
         ("type: door", "type: my/door.yaml", 9, "objects[0].type", "got my/door.yaml"),
-        (
-            "size: [0.5, 0.4, 0.3]",
-            "size: [0.5, -0.4, 0.3]",
-            13,
-            "obstacles[0].size[1]",
-            "expected a number > 0, got -0.4",
-        ),
-        (
-            "size: [0.5, 0.4, 0.3]",
-            "size: 0.5",
-            13,
-            "obstacles[0].size",
-            "expected a list of 3 values, got 0.5",
-        ),
-        (
-            "size: [0.5, 0.4, 0.3]",
-            "size: [1, 2, 3, 4]",
-            13,
-            "obstacles[0].size",
-            "wrong number of values",
-        ),
-        (
-            "yaw: 0.2, ",
-            "yaw: 0.2, rpy: [0, 0, 0], ",
-            13,
-            "obstacles[0]",
-            "expected one of rpy, yaw and quaternion",
-        ),
+        ("type: door", "type: 5", 9, "objects[0].type", "the name or file"),
+        ("type: door", "type: {}", 9, "urdf", "missing"),
+        (SIZE, "size: [0.5, -0.4, 0.3]", 13, "obstacles[0].size[1]", "expected a number > 0"),
+        (SIZE, "size: [1, 2, 3, 4]", 13, "obstacles[0].size", "wrong number of values"),
+        ("yaw: 0.2, ", "yaw: 0.2, rpy: [0, 0, 0], ", 13, "obstacles[0]", "one of rpy, yaw and"),
         ("colour: [1, 0, 0]", "colour: rd", 13, "obstacles[0].colour", "unknown colour 'rd'"),
-        (
-            "colour: [1, 0, 0]",
-            "colour: [255, 0, 0]",
-            13,
-            "obstacles[0].colour[0]",
-            "expected a number <= 1, got 255",
-        ),
-        (
-            "    radius: 0.1",
-            "    radius: 0",
-            16,
-            "obstacles[1].radius",
-            "expected a number > 0, got 0",
-        ),
+        ("colour: [1, 0, 0]", "colour: [255, 0, 0]", 13, "obstacles[0].colour[0]", "number <= 1"),
         ("    type: cylinder\n", "", 14, "obstacles[1].type", "missing"),
-        ("    length: 1.0\n", "", 14, "obstacles[1].length", "missing"),
-        (
-            "name: post",
-            "name: crate",
-            14,
-            "obstacles[1].name",
-            "got crate, as obstacles[0] in line 13",
-        ),
-        (
-            "name: front",
-            "name: crate",
-            8,
-            "objects[0].name",
-            "got crate, as obstacles[0] in line 13",
-        ),
+        ("name: post", "name: crate", 14, "obstacles[1].name", "as obstacles[0] in line 13"),
+        ("name: front", "name: crate", 8, "objects[0].name", "as obstacles[0] in line 13"),
         ("name: front", "name: floor", 8, "objects[0].name", "got floor, as the floor"),
         ("name: front", "name: a.b", 8, "objects[0].name", "not a name"),
-        (
-            "type: box, size: [0.5, 0.4, 0.3]",
-            "type: mesh, file: none.obj",
-            13,
-            "obstacles[0].file",
-            "got none.obj",
-        ),
-        (
-            "type: box, size: [0.5, 0.4, 0.3]",
-            "type: urdf, file: none.urdf",
-            13,
-            "obstacles[0].file",
-            "got none.urdf",
-        ),
+        (f"box, {SIZE}", "mesh, file: none.obj", 13, "obstacles[0].file", "got none.obj"),
         ("robot: husky_ur5e\n", "", 1, "robot", "missing"),
         ("start:\n", "robot: x\nstart:\n", 2, "robot", "lines 1 and 2"),
         ("  arm: home", "  arm: [home", 5, None, "not valid YAML"),
-        ("  arm: home", "\tarm: home", 4, None, "not valid YAML"),
-        (TINY, "", None, "", "expected fields (name: value), got None"),
         (TINY, "- 1\n", 1, "", "expected fields (name: value), got [1]"),
     ],
 )
-def test_bad_input_is_located(
+def test_invalid_input_is_located(
     tmp_path: Path, old: str, new: str, line: int | None, field: str | None, details: str
 ) -> None:
     assert old in TINY
@@ -400,7 +207,7 @@ def test_the_first_error_in_the_file_is_reported(tmp_path: Path) -> None:
     assert caught.value.line == 4
 
 
-def test_errors_in_files_that_a_scene_names_point_into_these(tmp_path: Path) -> None:
+def test_errors_in_named_files_are_located_there(tmp_path: Path) -> None:
     (tmp_path / "bad.yaml").write_text("urdf: none.urdf\nattachment: []\n")
     with pytest.raises(UnknownNameError) as caught:
         load(tmp_path, TINY.replace("type: door", "type: bad.yaml"))
@@ -443,7 +250,7 @@ objects:
 """
 
 
-def test_objects_that_a_scene_describes_itself(tmp_path: Path) -> None:
+def test_inline_object_descriptions(tmp_path: Path) -> None:
     file = tmp_path / "room.yaml"
     file.write_text(DESCRIBED)
     scene = load_scene(file)
@@ -464,8 +271,6 @@ def test_objects_that_a_scene_describes_itself(tmp_path: Path) -> None:
     [
         ("link: leaf,", "link: leav,", 11, "attachments[0].link"),
         ("acceleration: 3", "acceleration: -3", 9, "joints.hinge.acceleration"),
-        ("      joints:", "      jonts:", 8, "jonts"),
-        ('size="0.5 0.5 0.02"', 'size="0.5 0.5"', 4, "leaf_0: box size"),
         ('<child link="leaf"/>', '<child link="leav"/>', 7, "hinge: child"),
     ],
 )
@@ -483,20 +288,7 @@ def test_errors_in_inline_descriptions_are_located(
     assert (caught.value.line, caught.value.field) == (line, field)
 
 
-def test_objects_of_no_kind(tmp_path: Path) -> None:
-    plain = {"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}}
-    for kind, field, said in (
-        (5, "objects[0].type", "the name or file"),
-        ({}, "objects[0].type", "urdf: missing"),
-    ):
-        with pytest.raises(InputError, match=said) as caught:
-            Scene.from_document(
-                {**plain, "objects": [{"name": "it", "type": kind, "position": [0, 0, 0]}]}
-            )
-        assert caught.value.field == field
-
-
-def test_unknown_scenes_and_missing_files(tmp_path: Path) -> None:
+def test_missing_scenes_are_reported(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError) as caught:
         load_scene("dor")
     assert caught.value.nearest == "door"
@@ -505,40 +297,16 @@ def test_unknown_scenes_and_missing_files(tmp_path: Path) -> None:
     assert missing.value.file == tmp_path / "none.yaml"
 
 
-def test_bad_documents_are_refused_without_a_file() -> None:
-    with pytest.raises(InputError) as caught:
-        Scene.from_document({"robot": "husky_ur5e", "start": {"base": [0, 0, "x"]}})
-    assert (caught.value.file, caught.value.line, caught.value.field) == (
-        None,
-        None,
-        "start.base[2]",
-    )
-
-
-def test_the_packaged_scenes_all_load() -> None:
-    files = sorted(find_resource_folder("scenes").glob("*.yaml"))
-    assert {file.stem for file in files} >= {"door", "drawer"}
-    for file in files:
-        assert load_scene(file).name == file.stem
-
-
-def test_a_start_may_have_a_height(tmp_path: Path) -> None:
+def test_start_may_have_a_height(tmp_path: Path) -> None:
     """The height is constant and part of the document; scenes of one robot may differ."""
-    low, high = (
-        load(tmp_path, TINY),
-        load(tmp_path, TINY.replace("arm: home", "arm: home\n  z: 0.4")),
-    )
+    high = load(tmp_path, TINY.replace("arm: home", "arm: home\n  z: 0.4"))
+    low = load(tmp_path, TINY)
     assert (low.robot.height, high.robot.height) == (0.0, 0.4)
     assert "z" not in low.document["start"]
     again = Scene.from_document(high.with_start(base=[1.0, 0.0, 0.0]).document, tmp_path)
     assert again.document["start"]["z"] == again.robot.height == 0.4
-    at = [
-        scene.robot.model.frames[scene.robot.model.getFrameId("tool")].placement.translation
-        for scene in (low, high)
-    ]
-    np.testing.assert_array_equal(*at)  # above the wrist
-    rise = [scene.robot.model.jointPlacements[2].translation for scene in (high, low)]
-    np.testing.assert_allclose(rise[0] - rise[1], [0.0, 0.0, 0.4], atol=1e-12)
-    with pytest.raises(InputError, match=r"start\.z") as caught:
-        load(tmp_path, TINY.replace("arm: home", "z: high"))
-    assert caught.value.line == 4
+    rise = (
+        high.tool_placement().translation
+        - low.with_start(base=high.start[:3]).tool_placement().translation
+    )
+    np.testing.assert_allclose(rise, [0.0, 0.0, 0.4], atol=1e-12)

@@ -1,0 +1,258 @@
+"""Tests that the packaged scenes have the dimensions of the experiments, and room for their motions."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable
+from functools import cache
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from vkc_pin.world.files.resources import find_resource_folder
+from vkc_pin.world.models.object_file import load_object
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.shapes import (
+    compute_clearance,
+    compute_world_box,
+    get_link_name,
+    list_placed_shapes,
+)
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
+from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
+
+DIST_SAFE, GRASP_CLEARANCE = 0.02, 0.005  # [m], the planner's
+SCENES = sorted(file.stem for file in find_resource_folder("scenes").glob("*.yaml"))
+OBJECTS = (
+    *("narrow_door", "low_drawer", "dishwasher", "refrigerator", "cabinet", "cup", "broom"),
+    *("stick", "ball", "litter", "door", "drawer"),
+)
+
+
+@cache
+def scene(name: str = "household") -> Scene:
+    return load_scene(name)
+
+
+def at_origin(name: str, **state: float) -> PlacedObject:
+    item = load_object(name)
+    placed = PlacedObject(name, item, pin.SE3.Identity(), np.zeros(item.coordinates.size))
+    return placed.with_state(state)
+
+
+def parts(placed: PlacedObject, *links: str) -> list[pin.GeometryObject]:
+    """Return an object's shapes, of all links by default, in the world frame."""
+    return [s for s in make_world_shapes(placed) if not links or get_link_name(s.name) in links]
+
+
+def obstacles(here: Scene, *names: str) -> list[pin.GeometryObject]:
+    """Return the shapes of obstacles, by default of all but the floor."""
+    labels = zip(here.obstacles, here.obstacle_labels, strict=True)
+    return [s for s, label in labels if (label in names if names else label != FLOOR)]
+
+
+def surroundings(here: Scene, without: str = "") -> list[pin.GeometryObject]:
+    """Return the shapes of all obstacles but the floor, and of all objects but one."""
+    others = [placed for name, placed in here.objects.items() if name != without]
+    return obstacles(here) + [shape for placed in others for shape in parts(placed)]
+
+
+def clearance(shapes: Iterable[pin.GeometryObject], others: Iterable[pin.GeometryObject]) -> float:
+    return compute_clearance(list_placed_shapes(shapes), list_placed_shapes(others), reach=0.2)
+
+
+def bounds(shapes: Iterable[pin.GeometryObject]) -> np.ndarray:
+    """Return the lowest and highest x, y, z, shape (2, 3) [m]."""
+    boxes = np.array([compute_world_box(shape.geometry, shape.placement) for shape in shapes])
+    return np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+
+
+def robot_shapes(robot: Robot, z: np.ndarray, links: Iterable[str]) -> list[pin.GeometryObject]:
+    """Return the shapes of some links at a configuration, in the world frame."""
+    data, places = robot.model.createData(), robot.collision.createData()
+    pin.updateGeometryPlacements(robot.model, data, robot.collision, places, robot.coordinates.q(z))
+    return [
+        pin.GeometryObject(shape.name, 0, 0, places.oMg[k], shape.geometry)
+        for k, shape in enumerate(robot.collision.geometryObjects)
+        if robot.link_of(k) in links
+    ]
+
+
+def hand(tool: pin.SE3) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:
+    """Return the shapes of the open gripper with the tool frame at `tool`."""
+    here = scene().with_start(base=[0.0, 0.0, 0.0], arm=scene().robot.home)
+    back = tool * here.tool_placement().inverse()
+    shapes = robot_shapes(here.robot, here.start, here.robot.touch_links)
+    return [(shape.geometry, back * shape.placement) for shape in shapes]
+
+
+@pytest.mark.parametrize("name", [name for name in SCENES if scene(name).start_region])
+def test_random_starts_fill_their_region(name: str) -> None:
+    here, rng = scene(name), np.random.default_rng(0)
+    region = here.start_region
+    assert here.name == name
+    assert region is not None
+    assert here.start_clearance() >= START_CLEARANCE
+    drawn = [here.sample_start(rng) for _ in range(25)]
+    assert min(one.start_clearance(reach=0.1) for one in drawn) >= START_CLEARANCE
+    bases = np.array([one.start[:3] for one in drawn])
+    for column, (low, high) in enumerate((region.x, region.y)):
+        assert low <= bases[:, column].min()
+        assert bases[:, column].max() <= high
+        assert np.ptp(bases[:, column]) > 0.6 * (high - low)
+    assert np.ptp(bases[:, 2]) > 4.0
+
+
+@pytest.mark.parametrize(
+    ("name", "owner", "joint", "upper"),
+    [
+        ("door", "door", "hinge", 1.57),
+        ("drawer", "drawer", "slide", 0.4),
+        ("corridor_door", "door", "hinge", np.pi / 2),
+        ("aisle_drawer", "drawer", "slide", 0.65),
+        ("household", "door", "hinge", 1.75),
+        ("household", "drawer", "slide", 0.35),
+        ("household", "dishwasher", "rack", 0.55),
+        ("household", "refrigerator", "hinge", 2.0),
+        ("household", "cabinet", "hinge", 1.9),
+    ],
+)
+def test_joints_move_freely_over_their_range(
+    name: str, owner: str, joint: str, upper: float
+) -> None:
+    placed, rest = scene(name).objects[owner], surroundings(scene(name), owner)
+    item = placed.object
+    k = item.coordinates.index(joint)
+    assert item.upper[k] == pytest.approx(upper)
+    moving = item.links_moved_by({joint})
+    for value in np.linspace(item.lower[k], item.upper[k], 12):
+        moved = placed.with_state({joint: float(value)})
+        assert clearance(parts(moved, *moving), rest) > DIST_SAFE, value
+        others = [link for link in item.links if link not in moving]
+        assert clearance(parts(moved, *moving), parts(moved, *others)) > 0.004, value
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_hand_fits_around_every_attachment(name: str) -> None:
+    """Open fingers are clear of the grasped link, the rest of the hand of other links."""
+    for attachment in load_object(name).attachments.values():
+        if attachment.name == "pull":  # grasped by broom and stick, not by the hand
+            continue
+        opened = name == "dishwasher" and attachment.link == "rack"
+        placed = at_origin(name, **({"door": np.pi / 2} if opened else {}))
+        tool = placed.link_placement(attachment.link) * attachment.placement
+        tool = tool * attachment.motion(np.zeros(len(attachment.freedoms)))
+        pushes = attachment.contact == "push"
+        shapes = hand(tool * scene().robot.front.inverse() if pushes else tool)
+        gap = compute_clearance(shapes, list_placed_shapes(parts(placed, attachment.link)))
+        if pushes:
+            assert gap == pytest.approx(attachment.standoff, abs=1e-5) or gap > GRASP_CLEARANCE
+        else:
+            assert gap > GRASP_CLEARANCE, attachment.name
+        others = [link for link in placed.object.links if link != attachment.link]
+        if others and name not in ("stick", "broom"):
+            near = compute_clearance(shapes, list_placed_shapes(parts(placed, *others)))
+            assert near > DIST_SAFE, attachment.name
+
+
+@pytest.mark.parametrize(
+    ("name", "names", "low", "high"),
+    [
+        ("corridor_door", ["block_left"], (0.0, 1.0, 0.0), (5.0, 5.0, 2.06)),
+        ("corridor_door", ["block_right"], (0.0, -5.0, 0.0), (5.0, -1.0, 2.06)),
+        ("corridor_door", ["door.panel"], (4.975, -0.55, 0.01), (5.025, 0.55, 2.06)),
+        ("aisle_drawer", ["worktop_1", "counter_1"], (0.0, 0.875, 0.0), (2.25, 4.125, 0.7)),
+        ("aisle_drawer", ["worktop_2", "counter_2"], (3.5, -0.5, 0.0), (4.5, 5.5, 0.7)),
+        ("init_1", ["table_top"], (2.0, 0.0, 0.68), (3.0, 2.0, 0.72)),
+        ("init_1", ["low_table_top"], (-2.0, 2.7, 0.75), (1.0, 4.3, 0.8)),
+        ("init_1", ["cube"], (-1.1, 3.9, 0.0), (-0.9, 4.1, 0.2)),
+        ("init_3", ["block"], (1.0, -3.5, 0.0), (3.0, -0.5, 2.1)),
+    ],
+)
+def test_dimensions_match_the_paper(
+    name: str, names: list[str], low: tuple[float, ...], high: tuple[float, ...]
+) -> None:
+    shapes = obstacles(scene(name), *names)
+    for label in names if not shapes else ():
+        owner, _, link = label.partition(".")
+        shapes = parts(scene(name).objects[owner], link)
+    np.testing.assert_allclose(bounds(shapes), [low, high], atol=1e-9)
+
+
+def test_second_and_third_scene_add_obstacles_to_the_first() -> None:
+    first, *others = (dict(scene(f"init_{k}").document) for k in (1, 2, 3))
+    added = [{"crate_1", "crate_2"}, {"block"}]
+    for other, names in zip(others, added, strict=True):
+        count = len(first["obstacles"])
+        assert other["obstacles"][:count] == first["obstacles"]
+        assert {item["name"] for item in other["obstacles"][count:]} == names
+        same = {"name": first["name"], "obstacles": first["obstacles"]}
+        assert {**other, **same} == first
+
+
+@pytest.mark.parametrize(
+    ("name", "state", "begin", "end"),
+    [
+        ("corridor_door", {"hinge": 1.5}, (0.0, -0.1), (6.5, -0.1)),
+        ("aisle_drawer", {}, (2.875, -1.0), (2.875, 4.8)),
+        ("household", {"hinge": 1.52}, (1.5, -0.15), (1.64, 2.25)),
+        ("household", {}, (1.2, -0.4), (-2.4, -0.4)),
+        ("household", {}, (-1.0, -0.5), (-1.0, 2.3)),
+        ("gap_table", {}, (-2.0, -1.575), (1.0, -1.575)),
+    ],
+)
+def test_base_fits_through_passages(
+    name: str, state: dict[str, float], begin: tuple[float, float], end: tuple[float, float]
+) -> None:
+    here = scene(name).with_state("door", state) if state else scene(name)
+    heading = float(np.arctan2(end[1] - begin[1], end[0] - begin[0]))
+    for x, y in np.linspace(begin, end, 20):
+        z = np.array([x, y, heading, *here.robot.home])
+        base = robot_shapes(here.robot, z, ["base_link"])
+        assert clearance(base, surroundings(here)) > DIST_SAFE, (x, y)
+
+
+def test_gap_between_pillar_and_wall_is_the_only_passage() -> None:
+    here = scene("gap_table")
+    for first, second, width in (
+        ("pillar", "wall_south", 0.85),
+        ("pillar", "sideboard", 0.0),
+        ("sideboard", "wall_north", 0.0),
+    ):
+        one, two = (list_placed_shapes(obstacles(here, name)) for name in (first, second))
+        assert compute_clearance(one, two) == pytest.approx(width, abs=1e-6)
+
+
+def test_household_is_furnished_without_overlaps() -> None:
+    here = scene()
+    np.testing.assert_allclose(
+        bounds(surroundings(here)), [[-4.1, -4.1, 0.0], [4.1, 4.1, 2.4]], atol=1e-9
+    )
+    assert len(surroundings(here)) >= 120
+    for name, placed in here.objects.items():
+        links = ("panel", "lever") if name == "door" else ()  # its frame fills an opening
+        assert clearance(parts(placed, *links), surroundings(here, name)) > 9e-4, name
+
+
+def test_stick_and_ball_attachments() -> None:
+    """The hand slides and turns on the stick, and never grasps the ball from below."""
+    placed = scene("init_1").objects["stick"]
+    np.testing.assert_allclose(placed.link_placement("tip").translation, [2.75, 1.0, 0.771])
+    grip = placed.object.attachment("grip")
+    assert (grip.joint, grip.firm) == ("cylindrical", True)
+    for slide, turn in itertools.product((-0.095, 0.0, 0.095), (-1.2, 0.0, 1.2)):
+        tool = placed.link_placement("stick") * grip.placement * grip.motion([slide, turn])
+        gap = compute_clearance(hand(tool), list_placed_shapes(parts(placed)))
+        assert gap > GRASP_CLEARANCE
+    ball = load_object("ball").attachment("grip")
+    for turn in itertools.product((-1.5, 0.0, 1.5), repeat=3):
+        assert (ball.placement * ball.motion(turn)).rotation[2, 2] < 0.0
+
+
+def test_lever_holds_the_door_shut() -> None:
+    (latch,) = scene("corridor_door").objects["door"].object.latches
+    assert (latch.joint, latch.held_at, latch.released_by) == ("hinge", 0.0, "knob")
+    assert (latch.threshold, latch.engaged_within) == (0.5, 0.05)

@@ -1,4 +1,4 @@
-"""Which pairs are looked at, and what is asked of each."""
+"""The table lists the pairs that can collide, with their clearances."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def door() -> Scene:
     return door_scene()
 
 
-def test_which_pairs_count(door: Scene) -> None:
+def test_pairs_of_robot_objects_and_walls(door: Scene) -> None:
     motion = wander(door, 0, size=0.1)
     table = PairTable(door, CollisionShapes(World(door)), motion, 0.02)
     robot, things = door.robot.collision, door.objects["door"].object.collision.geometryObjects
@@ -47,8 +47,7 @@ def test_which_pairs_count(door: Scene) -> None:
     assert len({frozenset(pair) for pair in table.pairs.tolist()}) == expected
 
 
-def test_some_may_be_closer_for_a_while(door: Scene) -> None:
-    """Only the pairs that were said to, then alone, and each with its own overlap that counts as contact."""
+def test_windows_change_margin_and_contact_of_their_pairs(door: Scene) -> None:
     motion = wander(door, 0, size=0.1)
     plain = PairTable(door, CollisionShapes(World(door)), motion, 0.02)
     every = np.arange(len(plain.pairs))
@@ -74,8 +73,7 @@ def test_some_may_be_closer_for_a_while(door: Scene) -> None:
         )
 
 
-def test_a_window_of_pairs_that_are_not_looked_at_is_nobody_elses(door: Scene) -> None:
-    """Neighbouring links, or two walls: what is said of them must not end up with another pair."""
+def test_windows_of_unlisted_pairs_have_no_effect(door: Scene) -> None:
     motion = wander(door, 0, size=0.1)
     plain = PairTable(door, CollisionShapes(World(door)), motion, 0.02)
     known, count = {(min(pair), max(pair)) for pair in plain.pairs.tolist()}, len(plain.groups)
@@ -95,8 +93,7 @@ def test_a_window_of_pairs_that_are_not_looked_at_is_nobody_elses(door: Scene) -
     assert not table.get_contact_overlaps(every, np.zeros_like(every), np.ones_like(every)).any()
 
 
-def test_a_side_branch_that_nothing_moves_hits_nothing_that_stands() -> None:
-    """A second door in a cabinet may well be shut next to a wall."""
+def test_links_that_never_move_are_not_paired_with_obstacles() -> None:
     scene = full_scene()
     names = (*scene.robot.coordinates.names, "cabinet.slide", "cabinet.swing")
     positions = np.vstack(
@@ -119,8 +116,7 @@ def test_a_side_branch_that_nothing_moves_hits_nothing_that_stands() -> None:
         assert {moving, "cabinet.lid"} not in paired
 
 
-def test_which_pairs_of_free_objects_count() -> None:
-    """What is carried can hit everything but itself, the floor too; what stands by hits only what moves."""
+def test_pairs_of_free_objects() -> None:
     scene = room(table(), stand(), objects=("stick", "ball"))
     still = Script(scene).go(moved_base(scene.start, y=0.1)).motion()
     carried = Script(scene).take("stick").go(moved_base(scene.start, y=0.1)).motion()
@@ -143,8 +139,8 @@ def test_which_pairs_of_free_objects_count() -> None:
     assert moves["ball.ball"] == robots | {"stick.stick", "stick.tip"}
 
 
-def test_what_does_not_move_in_a_phase_is_not_looked_at_in_it() -> None:
-    """A stick that lies on a table, is carried, and lies there again."""
+def test_close_pairs_move_in_their_phase() -> None:
+    """The stick lies on a table, is carried, and lies there again."""
     scene = room(table())
     script = (
         Script(scene)
@@ -182,7 +178,7 @@ def test_what_does_not_move_in_a_phase_is_not_looked_at_in_it() -> None:
             )
 
 
-def test_links_of_an_object_that_can_meet() -> None:
+def test_self_collision_of_an_object() -> None:
     scene = load_scene("household")
     names = (*scene.robot.coordinates.names, "dishwasher.rack")
     rows = np.vstack([np.append(scene.start, value) for value in (0.0, 0.2)])
@@ -198,8 +194,7 @@ def test_links_of_an_object_that_can_meet() -> None:
     assert own == {("dishwasher.door", "dishwasher.rack")}
 
 
-def test_links_of_the_robot_have_a_clearance_of_their_own(door: Scene) -> None:
-    """As the program has it, also where links are always close."""
+def test_self_clearance_of_the_robot(door: Scene) -> None:
     first, second = next(iter(door.robot.own_margins(0.02)))
     one, other = sorted((door.robot.link_of(first), door.robot.link_of(second)))
     scene = dataclasses.replace(

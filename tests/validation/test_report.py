@@ -1,8 +1,9 @@
-"""Reports: as text, and as plain data and back."""
+"""Reports as text, and as plain data and back."""
 
 from __future__ import annotations
 
 import json
+import math
 import re
 from typing import Any
 
@@ -11,10 +12,10 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
-from vkc_pin.validation.report import Bound, Report, Violation
+from vkc_pin.validation.report import Bound, Exemption, Report, Violation
 from vkc_pin.visualization.plots.clearance import compute_clearance_curves
 
-ONE = Violation(
+LIMIT = Violation(
     "limit",
     "elbow_joint",
     waypoint=4,
@@ -23,93 +24,117 @@ ONE = Violation(
     unit="rad",
     detail="3.2 rad is outside",
 )
-TWO = Violation(
-    "penetration",
-    "forearm_link – sofa",
-    waypoint=7,
-    time=1.9,
-    amount=0.01,
-    unit="m",
-    detail="overlap by 10.0 mm",
+PENETRATION = Violation("penetration", "forearm_link – sofa", amount=0.01, unit="m", detail="deep")
+FAST = Bound("base_x", "velocity", share=0.625, begin=1.0, end=2.5)
+REST = Bound("", "rest", share=0.25, begin=0.0, end=1.0)
+FULL = Report(
+    (LIMIT, PENETRATION),
+    -0.01,
+    closure_error=0.001,
+    closure_angle=0.002,
+    clearances=(0.3, -0.01),
+    states=12,
+    notes=("a wall is in the way",),
+    torque=0.5,
+    bounds=(FAST, REST),
+    remarks=("no masses",),
+    exemptions=(Exemption("door.leaf – wall", -0.001, "the scene allows it"),),
 )
 
 
-def test_text() -> None:
-    assert Report(states=12).ok
-    assert "every constraint holds" in "\n".join(Report(states=12).lines())
-    text = "\n".join(Report((ONE, TWO), states=12).lines())
-    assert "2 constraint(s) violated" in text
-    assert "limit elbow_joint: 3.2 rad is outside (waypoint 4, 1.00 s)" in text
-    assert "penetration forearm_link – sofa: overlap by 10.0 mm (waypoint 7, 1.90 s)" in text
-
-
-def test_what_nobody_says_is_nothing() -> None:
-    assert (Report().states, Report().torque, Report().clearance) == (0, 0.0, np.inf)
-    plain = Violation("goal", "base", amount=1.0, unit="m", detail="far")
-    assert (plain.waypoint, plain.time) == (0, 0.0)
-
-
-def test_text_names_four_bounds_and_twelve_violations() -> None:
-    every = tuple(
-        Bound(f"joint_{k}", "velocity", share=0.1, begin=k, end=k + 1.0) for k in range(6)
-    )
-    (told,) = Report(bounds=every).timing()
-    assert [f"joint_{k}" in told for k in range(6)] == [True] * 4 + [False] * 2
-    lines = Report((ONE,) * 14).lines()
-    assert sum("limit elbow_joint" in line for line in lines) == 12
-    assert "... and 2 more" in lines[-1]
-    assert len(Report((ONE,) * 12).lines()) == 13  # and nothing of "0 more"
-
-
-def test_reports_that_say_otherwise() -> None:
-    one = Report((ONE,), 0.01, closure_error=1e-4, closure_angle=0.0)
-    assert one.contradictions(one) == []
-    assert one.contradictions(Report((ONE,), 0.010005, closure_error=1e-4)) == []
-    assert one.contradictions(Report((ONE,), 0.02, closure_error=1e-4)) == [
-        "clearance 0.02 m instead of 0.01 m"
+def test_text_of_violations() -> None:
+    head = "validation  3 configurations checked: "
+    assert Report(states=3).lines() == [head + "every constraint holds"]
+    assert FULL.lines() == [
+        "validation  12 configurations checked: 2 constraint(s) violated",
+        "  - limit elbow_joint: 3.2 rad is outside (waypoint 4, 1.00 s)",
+        "  - penetration forearm_link – sofa: deep (waypoint 0, 0.00 s)",
+        "  because a wall is in the way",
     ]
-    assert one.contradictions(Report((ONE,), 0.01, closure_error=1e-4, closure_angle=0.5)) == [
-        "closure_angle 0.5 rad instead of 0 rad"
+    assert len(Report((LIMIT,) * 12).lines()) == 13
+    assert Report((LIMIT,) * 14).lines()[-1] == "  ... and 2 more"
+
+
+def test_text_of_limiting_constraints() -> None:
+    assert Report().timing() == []
+    assert FULL.timing() == [
+        "bounded by  base_x velocity 62 % (1.0 to 2.5 s), rest 25 % (0.0 to 1.0 s)",
+        "torques     at most 50 % of the motors' limits",
+        "unknown     no masses",
+        "exempt      door.leaf – wall: overlap by 1.0 mm; the scene allows it",
     ]
-    assert one.contradictions(Report((), 0.01, closure_error=1e-4)) == ["every constraint holds"]
+    (listed,) = Report(bounds=(REST,) * 6).timing()
+    assert listed.count("rest") == 4
+    assert FULL.measures() == {"clearance": -0.01, "closure_error": 0.001, "torque": 0.5}
+
+
+@pytest.mark.parametrize(("off", "differs"), [(0.9e-5, False), (1.5e-5, True), (math.nan, True)])
+@pytest.mark.parametrize("field", ["clearance", "closure_error", "closure_angle"])
+def test_contradictions_of_numbers(field: str, off: float, differs: bool) -> None:
+    numbers = dict.fromkeys(("clearance", "closure_error", "closure_angle"), 0.5)
+    for sign in (-1.0, 1.0):
+        other = Report(**{**numbers, field: 0.5 + sign * off})  # type: ignore[arg-type]
+        lines = Report(**numbers).contradictions(other)  # type: ignore[arg-type]
+        assert [line.partition(" ")[0] for line in lines] == [field] * differs
+
+
+def test_contradictions_of_verdicts() -> None:
+    assert FULL.contradictions(FULL) == Report().contradictions(Report()) == []
+    assert Report().contradictions(Report(clearance=0.5)) == ["clearance 0.5 m instead of inf m"]
+    assert Report().contradictions(Report((LIMIT,))) == ["1 constraint(s) violated"]
+    assert Report((LIMIT,)).contradictions(Report()) == ["every constraint holds"]
 
 
 def test_round_trip() -> None:
-    for report in (
-        Report(
-            (ONE, TWO),
-            -0.01,
-            closure_error=0.001,
-            closure_angle=0.002,
-            states=12,
-            notes=("a wall is in the way",),
-        ),
-        Report(),
-    ):
+    for report in (FULL, Report()):
         assert Report.from_dict(json.loads(json.dumps(report.to_dict()))) == report
-    assert not Report((ONE,)).ok
+    only = FULL.with_reasons([LIMIT])
+    assert vars(only) == {**vars(FULL), "violations": (LIMIT,)}
+
+
+def test_missing_fields_have_defaults() -> None:
+    data = FULL.to_dict()
+    for name in ("clearances", "states", "torque", "bounds", "remarks", "closure_angle"):
+        del data[name]
+    found = Report.from_dict({**data, "clearance": 1, "closure_error": np.float64(0.5)})
+    assert found == Report(
+        FULL.violations,
+        1.0,
+        closure_error=0.5,
+        notes=FULL.notes,
+        exemptions=FULL.exemptions,
+    )
 
 
 @pytest.mark.parametrize(
     ("path", "value", "field"),
     [
+        (("violations",), 3, "violations"),
+        (("violations", 0), 3, "violations[0]"),
         (("violations", 0, "time"), "soon", "violations[0].time"),
         (("violations", 0, "amount"), None, "violations[0].amount"),
         (("violations", 1, "subject"), 3, "violations[1].subject"),
         (("violations", 1, "waypoint"), -1, "violations[1].waypoint"),
         (("violations", 1, "more"), 1, "violations[1]"),
-        (("violations",), 3, "violations"),
-        (("violations",), [3], "violations[0]"),
-        (("notes",), [3], "notes[0]"),
+        (("notes",), 3, "notes"),
+        (("notes", 0), 3, "notes[0]"),
+        (("remarks", 0), 3, "remarks[0]"),
         (("clearance",), "near", "clearance"),
+        (("clearances", 0), "near", "clearances[0]"),
         (("closure_error",), 10**500, "closure_error"),
         (("states",), 1.5, "states"),
+        (("torque",), -0.1, "torque"),
+        (("bounds", 0, "share"), "half", "bounds[0].share"),
+        (("bounds", 1, "end"), math.inf, "bounds[1].end"),
+        (("bounds", 0, "kind"), None, "bounds[0].kind"),
+        (("bounds", 0, "more"), 1, "bounds[0]"),
+        (("exemptions", 0, "distance"), "far", "exemptions[0].distance"),
+        (("exemptions", 0, "more"), 1, "exemptions[0]"),
         (("more",), 1.5, None),
     ],
 )
-def test_what_is_no_report(path: tuple[str | int, ...], value: object, field: str | None) -> None:
-    data: Any = Report((ONE, TWO), states=12).to_dict()
-    data["violations"] = list(data["violations"])
+def test_invalid_data(path: tuple[str | int, ...], value: object, field: str | None) -> None:
+    data: Any = json.loads(json.dumps(FULL.to_dict()))
     place = data
     for key in path[:-1]:
         place = place[key]
@@ -119,34 +144,23 @@ def test_what_is_no_report(path: tuple[str | int, ...], value: object, field: st
     assert caught.value.field == field
 
 
-def test_a_line_for_each_phase_says_when_how_far_and_how_close(door_plan: vkc.Plan) -> None:
+def test_text_by_phase(door_plan: vkc.Plan) -> None:
     report, motion = door_plan.validation, door_plan.trajectory
-    assert min(report.clearances) == report.clearance
-    assert len(report.clearances) == len(motion.phases)
     parts = motion.parts()
-    assert sum(part.base_effort() for part in parts) == pytest.approx(motion.base_effort())
-    assert sum(part.arm_effort() for part in parts) == pytest.approx(motion.arm_effort())
-    for line, part, phase, close in zip(
-        report.by_phase(motion), parts, motion.phases, report.clearances, strict=True
-    ):
-        numbers = [
-            float(number) for number in re.findall(r"-?[\d.]+(?= (?:to|s|m|rad|mm)\b)", line)
-        ]
-        first, last = motion.times[[phase.first, phase.last]]
-        np.testing.assert_allclose(
-            numbers, [first, last, part.base_effort(), part.arm_effort(), 1e3 * close], atol=0.06
-        )
-        assert line.endswith(phase.name)
-    assert Report.from_dict(json.loads(json.dumps(report.to_dict()))) == report
+    for line, part, close in zip(report.by_phase(motion), parts, report.clearances, strict=True):
+        numbers = map(float, re.findall(r"-?[\d.]+(?= (?:to|s|m|rad|mm)\b)", line))
+        base, arm = part.base_effort(), part.arm_effort()
+        expected = [part.times[0], part.times[-1], base, arm, 1e3 * close]
+        np.testing.assert_allclose(list(numbers), expected, atol=0.06)
+        assert line.endswith(part.phases[0].name)
+    assert Report().by_phase(motion)[0].count("inf mm") == 1
 
 
-def test_each_phase_has_the_clearance_of_its_own_motion(door_plan: vkc.Plan) -> None:
-    """The curves that are plotted are asked of coal in another way."""
-    fine = door_plan.trajectory
-    for phase, close in zip(fine.phases, door_plan.validation.clearances, strict=True):
+def test_clearance_of_each_phase(door_plan: vkc.Plan) -> None:
+    fine, report = door_plan.trajectory, door_plan.validation
+    assert min(report.clearances) == report.clearance
+    for phase, close in zip(fine.phases, report.clearances, strict=True):
         times = fine.times[phase.first + 1 : phase.last + 1]
         curves = compute_clearance_curves(door_plan.scene, fine, times)
-        least = min(
-            float(curve.distances.min()) for curve in curves if not curve.name.startswith("gripper")
-        )
-        assert close <= least + 1e-6
+        others = [curve for curve in curves if not curve.name.startswith("gripper")]
+        assert close <= min(float(curve.distances.min()) for curve in others) + 1e-6

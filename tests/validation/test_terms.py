@@ -1,4 +1,4 @@
-"""Own constraints on motions that nobody planned, whose violations are known from geometry."""
+"""The validator checks user constraints, whose violations are known from geometry."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from vkc_pin.validation.terms import INTERMEDIATE_FACTOR
 START = hall().start
 
 
-def found(
+def find_violations(
     scene: vkc.Scene, trajectory: vkc.Trajectory, term: vkc.Constraint, steps: Any = None
 ) -> list[vkc.Violation]:
-    """Return what validation says of a term alone."""
+    """Return the violations of one constraint."""
     steps = steps or [vkc.GoTo(*trajectory.positions[-1, :2])]
     report = vkc.validate(scene, steps, trajectory, terms=[term])
     return [violation for violation in report.violations if violation.constraint == "term"]
 
 
-def low(upper: float, **fields: Any) -> vkc.Constraint:
+def limit_tip(upper: float, **fields: Any) -> vkc.Constraint:
     return vkc.Constraint("low tip", lambda s: s.position("stick.tip")[2], upper=upper, **fields)
 
 
-def test_a_carried_link_is_where_the_hand_has_brought_it() -> None:
+def test_constraint_on_a_grasped_object() -> None:
     scene = room(table())
     motion, place = carried_over(scene, aside=0.3).motion(), [vkc.Place("stick", (0.8, 0.3, 0.551))]
     link = scene.objects["stick"].object.link_placement("tip", [])
     highest = (STICK * link).translation[2] + 0.2
-    assert found(scene, motion, low(highest + 1e-4), place) == []
-    (violation,) = found(scene, motion, low(TOP + 0.1), place)
+    assert find_violations(scene, motion, limit_tip(highest + 1e-4), place) == []
+    (violation,) = find_violations(scene, motion, limit_tip(TOP + 0.1), place)
     assert (violation.subject, violation.unit) == ("low tip", "")
     assert violation.amount == pytest.approx(highest - TOP - 0.1, abs=1e-6)
     assert f"{highest:.6g} is more than 0.6 by" in violation.detail
@@ -44,18 +44,18 @@ def test_a_carried_link_is_where_the_hand_has_brought_it() -> None:
     assert motion.times[held[0].first] <= violation.time <= motion.times[held[-1].last]
     # Nothing is wrong where it stands, before and after.
     assert (
-        found(
+        find_violations(
             scene,
             motion,
-            low(TOP + 0.1, during=[motion.phases[0].name, motion.phases[-1].name]),
+            limit_tip(TOP + 0.1, during=[motion.phases[0].name, motion.phases[-1].name]),
             place,
         )
         == []
     )
-    assert len(found(scene, motion, low(TOP + 0.1, holding="stick"), place)) == 1
+    assert len(find_violations(scene, motion, limit_tip(TOP + 0.1, holding="stick"), place)) == 1
 
 
-def test_the_worst_is_named_with_place_time_and_entry() -> None:
+def test_worst_violation_is_reported_with_entry_and_time() -> None:
     scene = hall()
     motion = through(scene, START, moved(START, x=2.0), moved(START, x=2.0, y=1.0))
     within = vkc.Constraint(
@@ -63,12 +63,12 @@ def test_the_worst_is_named_with_place_time_and_entry() -> None:
         lambda s: ca.vertcat(s.coordinate("base_x"), s.position("base_link")[1]),
         upper=[1.5, 0.25],
     )
-    (violation,) = found(scene, motion, within)
+    (violation,) = find_violations(scene, motion, within)
     assert violation.amount == pytest.approx(0.75, abs=1e-9)
     assert violation.waypoint == len(motion.times) - 1
     assert violation.time == pytest.approx(motion.times[-1])
     assert violation.detail == "entry 1: 1 is more than 0.25 by 0.75"
-    (violation,) = found(scene, motion, dataclasses.replace(within, during="drive 1"))
+    (violation,) = find_violations(scene, motion, dataclasses.replace(within, during="drive 1"))
     assert violation.detail == "entry 0: 2 is more than 1.5 by 0.5"
     assert violation.waypoint == 40
     report = vkc.validate(scene, [vkc.GoTo(2.0, 1.0)], motion, terms=[within])
@@ -77,7 +77,7 @@ def test_the_worst_is_named_with_place_time_and_entry() -> None:
     assert vkc.validate(scene, [vkc.GoTo(2.0, 1.0)], motion).ok
 
 
-def test_costs_are_nothing_to_check() -> None:
+def test_costs_are_ignored() -> None:
     motion = through(hall(), START, moved(START, x=2.0))
     assert vkc.validate(
         hall(),
@@ -100,13 +100,13 @@ def test_tolerance_at_waypoints(bound: str, excess: float, wrong: bool) -> None:
         lambda s: s.coordinate("base_x") if bound == "upper" else 2 - s.coordinate("base_x"),
         **fields,
     )
-    assert len(found(hall(), motion, term)) == wrong
-    assert found(hall(), motion, dataclasses.replace(term, tolerance=2 * excess)) == []
+    assert len(find_violations(hall(), motion, term)) == wrong
+    assert find_violations(hall(), motion, dataclasses.replace(term, tolerance=2 * excess)) == []
 
 
 @pytest.mark.parametrize(("turn", "wrong"), [(0.2, False), (0.6, True)])
-def test_between_waypoints(turn: float, wrong: bool) -> None:
-    """The hand swings out in the middle of a turn of the base, by r·(1 − cos(turn/2)), and is at its bound at both ends."""
+def test_tolerance_between_waypoints(turn: float, wrong: bool) -> None:
+    """The hand swings out by r·(1 − cos(turn/2)) in the middle of a turn of the base."""
     scene, steps = hall(), 2
     arm = scene.tool_placement().translation
     ahead, away = np.arctan2(arm[1], arm[0]), float(np.hypot(*arm[:2]))
@@ -117,7 +117,7 @@ def test_between_waypoints(turn: float, wrong: bool) -> None:
     term = vkc.Constraint("behind", lambda s: s.position("tool")[0], upper=edge)
     out = away - edge
     assert (out > INTERMEDIATE_FACTOR * term.tolerance) == wrong
-    violations = found(scene, motion, term)
+    violations = find_violations(scene, motion, term)
     assert len(violations) == wrong
     for violation in violations:
         assert violation.amount == pytest.approx(out, rel=1e-3)
@@ -126,7 +126,7 @@ def test_between_waypoints(turn: float, wrong: bool) -> None:
         assert "between waypoints" in violation.detail
     assert (
         len(
-            found(
+            find_violations(
                 scene, motion, dataclasses.replace(term, tolerance=out / INTERMEDIATE_FACTOR * 0.9)
             )
         )
@@ -134,7 +134,7 @@ def test_between_waypoints(turn: float, wrong: bool) -> None:
     )
 
 
-def test_speeds_are_those_of_the_last_step() -> None:
+def test_velocities_are_those_of_the_segment() -> None:
     scene = hall()
     motion = through(scene, START, moved(START, x=2.0))
     speeds = np.abs(np.diff(motion.positions[:, 0])) / DT
@@ -143,34 +143,45 @@ def test_speeds_are_those_of_the_last_step() -> None:
         slow = vkc.Constraint(
             "slow", lambda s, frame=frame: ca.norm_2(s.velocity(frame)), upper=fastest + 1e-4
         )
-        assert found(scene, motion, slow) == []
-        (violation,) = found(scene, motion, dataclasses.replace(slow, upper=0.9 * fastest))
+        assert find_violations(scene, motion, slow) == []
+        (violation,) = find_violations(
+            scene, motion, dataclasses.replace(slow, upper=0.9 * fastest)
+        )
         assert violation.amount == pytest.approx(0.1 * fastest, rel=1e-3)
         assert violation.waypoint in np.flatnonzero(speeds > 0.999 * fastest) + 1
     rate = vkc.Constraint("rate", lambda s: s.rate("base_x"), upper=0.9 * fastest)
-    assert found(scene, motion, rate)[0].amount == pytest.approx(0.1 * fastest, rel=1e-6)
+    assert find_violations(scene, motion, rate)[0].amount == pytest.approx(0.1 * fastest, rel=1e-6)
     # Nothing jumps at waypoints, so that nothing is worse between them than at both.
     brakes = vkc.Constraint(
         "brakes", lambda s: s.rate("base_x") - 0.2 * (2.0 - s.coordinate("base_x")), upper=0.0
     )
     values = speeds - 0.2 * (2.0 - motion.positions[1:, 0])
     assert values.max() > 0.1
-    (violation,) = found(scene, motion, brakes)
+    (violation,) = find_violations(scene, motion, brakes)
     assert violation.amount == pytest.approx(values.max(), abs=1e-3)
 
 
-def test_a_constraint_begins_after_the_first_waypoint_of_its_phases() -> None:
+def test_constraint_holds_after_the_first_waypoint_of_its_phases() -> None:
     scene = hall()
     motion = through(scene, START, moved(START, x=2.0), moved(START, x=2.5))
     ahead = vkc.Constraint("ahead", lambda s: s.coordinate("base_x"), lower=2.0)
-    assert len(found(scene, motion, ahead)) == 1
-    assert found(scene, motion, dataclasses.replace(ahead, during="drive 2")) == []
+    assert len(find_violations(scene, motion, ahead)) == 1
+    assert find_violations(scene, motion, dataclasses.replace(ahead, during="drive 2")) == []
     clear = dataclasses.replace(ahead, lower=motion.positions[41, 0], during="drive 2")
-    assert found(scene, motion, clear) == []  # although where the phase begins is before that
-    assert len(found(scene, motion, dataclasses.replace(clear, during=["drive 1", "drive 2"]))) == 1
+    assert (
+        find_violations(scene, motion, clear) == []
+    )  # although where the phase begins is before that
+    assert (
+        len(
+            find_violations(
+                scene, motion, dataclasses.replace(clear, during=["drive 1", "drive 2"])
+            )
+        )
+        == 1
+    )
 
 
-def test_waiting_for_the_gripper_belongs_to_the_phase_before() -> None:
+def test_constraint_holds_after_the_wait_for_the_gripper() -> None:
     scene = hall()
     driven = through(scene, START, moved(START, x=1.0), moved(START, x=2.0), steps=10)
     rows = np.vstack([driven.positions[:11], driven.positions[10:]])  # stands still for a step
@@ -179,19 +190,19 @@ def test_waiting_for_the_gripper_belongs_to_the_phase_before() -> None:
     ahead = vkc.Constraint(
         "ahead", lambda s: s.coordinate("base_x"), lower=rows[12, 0], during="drive 2"
     )
-    assert found(scene, motion, ahead) == []
-    assert len(found(scene, motion, dataclasses.replace(ahead, lower=rows[13, 0]))) == 1
+    assert find_violations(scene, motion, ahead) == []
+    assert len(find_violations(scene, motion, dataclasses.replace(ahead, lower=rows[13, 0]))) == 1
     still = dataclasses.replace(
         motion, positions=np.vstack([rows[:11], np.tile(rows[10], (11, 1))])
     )
     assert (
-        len(found(scene, still, ahead, [vkc.GoTo(1.0, 0.0)])) == 1
+        len(find_violations(scene, still, ahead, [vkc.GoTo(1.0, 0.0)])) == 1
     )  # who does not move at all does not get there
 
 
-def test_what_is_no_number_is_a_violation() -> None:
+def test_nan_is_a_violation() -> None:
     motion = through(hall(), START, moved(START, x=2.0))
     term = vkc.Constraint("log", lambda s: ca.log(s.coordinate("base_x") - 1.0), lower=-100.0)
-    (violation,) = found(hall(), motion, term)
+    (violation,) = find_violations(hall(), motion, term)
     assert violation.amount == np.inf
     assert "nan" in violation.detail

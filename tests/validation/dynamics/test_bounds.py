@@ -1,4 +1,4 @@
-"""What bounds the duration of a motion."""
+"""Reports name the limits that bound the duration."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vkc_pin.world.trajectory.dynamics.torques import sample_curve
 
 
 @pytest.mark.parametrize("made", [door_plan, drawer_plan])
-def test_bounds_share_the_duration_and_limits_are_reached_where_they_say(made: object) -> None:
+def test_motion_is_at_its_bounds_where_reported(made: object) -> None:
     plan: vkc.Plan = made()  # type: ignore[operator]
     motion, samples = plan.trajectory, Samples(plan.scene, plan.trajectory)
     found = plan.validation.bounds
@@ -38,7 +38,7 @@ def test_bounds_share_the_duration_and_limits_are_reached_where_they_say(made: o
             assert values.max() > 0.9 * samples.get_limits(bound.subject)[place]
 
 
-def test_torques_count_as_any_other_limit() -> None:
+def test_torques_bound_the_duration() -> None:
     plan = door_plan()
     samples, curve = Samples(plan.scene, plan.trajectory), plan.trajectory.curve
     assert curve is not None
@@ -50,8 +50,7 @@ def test_torques_count_as_any_other_limit() -> None:
     assert first.begin == 0.0
 
 
-def test_of_several_stretches_the_longest_is_named() -> None:
-    """Wherever in the motion: at its begin, in between, or at its end."""
+def test_longest_interval_is_reported() -> None:
     plan = door_plan()
     samples, curve = Samples(plan.scene, plan.trajectory), plan.trajectory.curve
     assert curve is not None
@@ -73,27 +72,7 @@ def test_of_several_stretches_the_longest_is_named() -> None:
         assert (first.begin, first.end) == (curve.times[long[0]], curve.times[long[1]])
 
 
-def test_what_bounds_a_two_hundredth_of_the_duration_is_told_of() -> None:
-    plan = door_plan()
-    samples, curve = Samples(plan.scene, plan.trajectory), plan.trajectory.curve
-    assert curve is not None
-    moments, shares = sample_curve(curve), np.diff(curve.times) / curve.times[-1]
-    number = {
-        told: int(np.argmin(np.abs(shares - share)))
-        for told, share in ((True, 0.0075), (False, 0.002))
-    }
-    assert 0.005 < shares[number[True]] < 0.01, "no cubic takes so long: choose several"
-    assert shares[number[False]] < 0.005
-    for told, piece in number.items():
-        torques = np.zeros((len(moments.times), plan.trajectory.robot_size))
-        torques[moments.pieces == piece, 4] = 50.0
-        assert (
-            "torque"
-            in {bound.kind for bound in find_limiting_constraints(samples, moments, torques, 0.0)}
-        ) == told
-
-
-def test_without_a_curve_nothing_is_said() -> None:
+def test_motion_without_curve_has_no_bounds() -> None:
     plan = drawer_plan()
     bare = dataclasses.replace(plan.trajectory, curve=None)
     assert (

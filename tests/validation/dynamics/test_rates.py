@@ -1,4 +1,4 @@
-"""Velocities, accelerations and jerks beyond limits are named, with the amount."""
+"""Violated limits of velocity, acceleration and jerk are named, with the amount."""
 
 from __future__ import annotations
 
@@ -17,30 +17,32 @@ from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.trajectory import PhaseSpan, Trajectory
 
 
-def found(motion: Trajectory, **options: float) -> dict[tuple[str, str], Violation]:
+def find_violations(motion: Trajectory, **options: float) -> dict[tuple[str, str], Violation]:
     rows = check_rates(Samples(drawer_plan().scene, motion), vkc.Options(**options))  # type: ignore[arg-type]
     return {(row.constraint, row.unit): row for row in rows if row.subject == "elbow_joint"}
 
 
-def eased() -> Trajectory:
+def retime_smoothly() -> Trajectory:
     plan = drawer_plan()
     return retime_trajectory(plan.scene, plan.trajectory, jerk_time=0.2)
 
 
-def test_jerks_are_looked_at_where_they_are_limited() -> None:
-    motion = eased()
-    assert not found(motion, jerk_time=0.2)
-    assert not found(motion)
-    assert not found(drawer_plan().trajectory)
-    (kind,) = found(motion, jerk_time=0.5)
+def test_jerk_violation() -> None:
+    motion = retime_smoothly()
+    assert not find_violations(motion, jerk_time=0.2)
+    assert not find_violations(motion)
+    assert not find_violations(drawer_plan().trajectory)
+    (kind,) = find_violations(motion, jerk_time=0.5)
     assert kind == ("jerk", "rad/s³")
     assert motion.curve is not None
     strongest = motion.curve.compute_jerks()[0][:, motion.names.index("elbow_joint")].max()
-    assert found(motion, jerk_time=0.5)[kind].amount == pytest.approx(strongest - 1.4 / 0.5)
+    assert find_violations(motion, jerk_time=0.5)[kind].amount == pytest.approx(
+        strongest - 1.4 / 0.5
+    )
 
 
-def played(share: float) -> Trajectory:
-    """The elbow alone, from rest to rest along one cubic, whose strongest acceleration is this share of its limit, 1.4 rad/s²."""
+def move_elbow(share: float) -> Trajectory:
+    """Move the elbow from rest to rest along one cubic, whose largest acceleration is `share` of its limit, 1.4 rad/s²."""
     plan = drawer_plan()
     motion, elbow = plan.trajectory, plan.trajectory.names.index("elbow_joint")
     rows = np.tile(motion.positions[0], (2, 1))
@@ -55,30 +57,30 @@ def played(share: float) -> Trajectory:
 @pytest.mark.parametrize(
     ("share", "kinds"), [(1.0005, set()), (1.0015, {"acceleration"}), (0.5, set())]
 )
-def test_an_excess_of_a_thousandth_of_the_limit_is_all_right(share: float, kinds: set[str]) -> None:
-    assert {kind for kind, _ in found(played(share))} == kinds
+def test_tolerance_of_rates(share: float, kinds: set[str]) -> None:
+    assert {kind for kind, _ in find_violations(move_elbow(share))} == kinds
 
 
 @pytest.mark.parametrize(("speed", "rests"), [(0.9e-6, True), (1.5e-6, False)])
 @pytest.mark.parametrize("end", [0, -1])
-def test_a_motion_begins_and_ends_at_rest(speed: float, rests: bool, end: int) -> None:
-    motion = played(0.1)
+def test_motion_must_begin_and_end_at_rest(speed: float, rests: bool, end: int) -> None:
+    motion = move_elbow(0.1)
     assert motion.curve is not None
     rates = motion.curve.rates.copy()
     rates[end, motion.names.index("elbow_joint")] = speed
     curve = Curve(motion.curve.times, motion.curve.positions, rates)
-    rows = found(dataclasses.replace(motion, curve=curve))
+    rows = find_violations(dataclasses.replace(motion, curve=curve))
     assert (not rows) == rests
     if not rests:
         (row,) = rows.values()
         assert (row.constraint, row.waypoint) == ("velocity", 0 if end == 0 else 1)
 
 
-def test_accelerations_that_jump_are_named() -> None:
+def test_jumps_of_acceleration() -> None:
     motion = drawer_plan().trajectory
     assert motion.curve is not None
     jumps = motion.curve.compute_jerks()[1][:, motion.names.index("elbow_joint")]
-    violation = found(motion, jerk_time=1e-3)["jerk", "rad/s² at once"]
+    violation = find_violations(motion, jerk_time=1e-3)["jerk", "rad/s² at once"]
     assert violation.amount == pytest.approx(jumps.max() - 1.4e-3)
     at = motion.curve.times[int(np.argmax(jumps))]
     assert (
@@ -88,8 +90,8 @@ def test_accelerations_that_jump_are_named() -> None:
     )
 
 
-def test_what_is_gone_through_faster_is_too_fast_in_all_that_it_does() -> None:
-    motion = eased()
+def test_accelerated_motion_violates_all_rates() -> None:
+    motion = retime_smoothly()
     assert motion.curve is not None
     quick = Curve(motion.curve.times / 3.0, motion.curve.positions, motion.curve.rates * 3.0)
     rows = check_rates(
@@ -101,9 +103,9 @@ def test_what_is_gone_through_faster_is_too_fast_in_all_that_it_does() -> None:
     assert {row.constraint for row in rows} == {"velocity", "acceleration", "jerk"}
 
 
-def test_reports_say_where_jerk_bounds_the_duration() -> None:
+def test_jerk_bounds_the_duration() -> None:
     plan = drawer_plan()
-    report = vkc.validate(plan.scene, plan.steps, eased(), vkc.Options(jerk_time=0.2))
+    report = vkc.validate(plan.scene, plan.steps, retime_smoothly(), vkc.Options(jerk_time=0.2))
     assert report.ok
     assert "jerk" in {bound.kind for bound in report.bounds}
     assert "jerk" not in {bound.kind for bound in plan.validation.bounds}

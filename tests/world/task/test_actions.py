@@ -43,22 +43,6 @@ def test_steps_with_one_object_form_one_action() -> None:
     ]
 
 
-def test_grouping_keeps_all_steps() -> None:
-    steps = [
-        vkc.Release(),
-        vkc.Release(),
-        G("cup"),
-        vkc.GoTo(1, 0),
-        G("door"),
-        OPEN,
-        OPEN,
-        vkc.Release(),
-    ]
-    actions = group_into_actions(steps)
-    assert [step for action in actions for step in action] == steps
-    assert len(actions) == 6  # a grasp of one thing is no part of what is done with another
-
-
 def test_steps_are_compiled_in_the_scene_that_the_previous_steps_leave() -> None:
     """Each step is compiled in the scene that the steps before leave."""
     scene, options = vkc.load_scene("household"), vkc.Options()
@@ -115,15 +99,3 @@ def test_free_object_is_regrasped_only_if_it_rests_on_a_support(stands: bool) ->
         == [("litter.grip, grasped again", again)] * stands
     )
     assert not list(generate_alternatives(scene, task)), "only where phases may be more"
-
-
-def test_released_object_can_be_regrasped_if_nothing_has_moved() -> None:
-    """Otherwise only the motion decides where it rests, and the plan cannot grasp it again."""
-    scene = littered().with_held({"litter": "grip"})
-    compile_task(scene, [vkc.Release("litter"), vkc.Place("litter", BIN)], vkc.Options())
-    with pytest.raises(vkc.InputError, match="known only after planning"):
-        compile_task(
-            scene,
-            [vkc.GoTo(0.0, 1.0), vkc.Release("litter"), vkc.Place("litter", BIN)],
-            vkc.Options(),
-        )

@@ -38,7 +38,7 @@ def moved(placed: PlacedObject, attachment: Attachment, joint: str, values: list
     return float((here * attachment.placement).rotation[:, 2] @ shift)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=15)
 @given(
     st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3),
     st.lists(st.floats(-0.3, 0.3), min_size=3, max_size=3),
@@ -103,19 +103,11 @@ def at(hinge: float) -> Scene:
 
 @pytest.mark.parametrize(
     ("begin", "end", "face", "way"),
-    [(-1.2, 0.0, "push", 1), (1.2, 0.0, "push_back", -1), (0.3, 0.9, "push", 1)],
+    [(-1.2, 0.0, "push", 1), (1.57, 2.0, "push_back", -1), (0.3, 0.9, "push", 1)],
 )
-def test_a_door_is_pushed_shut_or_further_open(
-    begin: float, end: float, face: str, way: int
-) -> None:
+def test_door_is_pushed_shut_or_further_open(begin: float, end: float, face: str, way: int) -> None:
     reach, move = compiled(at(begin), {"hinge": end}, face).phases
     assert (reach.pushed, move.pushed, move.name) == ({}, {"door.hinge": way}, "move door.hinge")
-
-
-def test_push_goal_is_clipped_to_the_limit() -> None:
-    """A door that is as far open as it goes is not pulled further."""
-    (_, move) = compiled(at(1.57), {"hinge": 2.0}, "push_back").phases
-    assert move.pushed == {"door.hinge": -1}
 
 
 def test_push_direction_depends_on_the_state_after_previous_steps() -> None:
@@ -164,14 +156,6 @@ def test_push_direction_depends_on_the_state_after_previous_steps() -> None:
         compile_task(there, steps[1:], Options())
 
 
-def test_grasp_has_no_push_directions() -> None:
-    assert [phase.pushed for phase in compiled(at(0.0), {"hinge": 1.0}, "handle").phases] == [
-        {},
-        {},
-        {},
-    ]
-
-
 @pytest.mark.parametrize(
     ("begin", "end", "face", "way"), [(-0.5, -1.0, "push", "up"), (0.5, 1.0, "push_back", "down")]
 )
@@ -187,16 +171,6 @@ def test_push_cannot_pull(begin: float, end: float, face: str, way: str) -> None
 def test_a_latched_door_cannot_be_pushed_open() -> None:
     with pytest.raises(InputError, match="latched"):
         compiled(at(0.0), {"hinge": 1.0}, "push")
-
-
-def test_drawer_front_cannot_be_pulled() -> None:
-    scene = vkc.load_scene("drawer")
-    with pytest.raises(InputError, match="moves 'slide' down only"):
-        compiled(scene, {"slide": 0.3}, "push", "drawer")
-    (_, move) = compiled(
-        scene.with_state("drawer", {"slide": 0.3}), {"slide": 0.0}, "push", "drawer"
-    ).phases
-    assert move.pushed == {"drawer.slide": -1}
 
 
 @pytest.mark.parametrize(

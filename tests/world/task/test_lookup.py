@@ -4,31 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 
-import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.small_problems import CABINET_STATE, full_scene
+from helpers.small_problems import full_scene
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.task.lookup import (
     check_link,
     find_attachment,
-    find_joint_limits,
     find_object,
     find_path_joints,
     find_robot_frame,
 )
-
-
-def test_objects_attachments_links_and_frames() -> None:
-    scene = full_scene()
-    cabinet = find_object(scene, "cabinet", "object")
-    assert cabinet is scene.objects["cabinet"]
-    assert find_attachment(cabinet, None, "attachment").name == "grip"
-    assert find_attachment(cabinet, "bar", "attachment").name == "bar"
-    check_link(cabinet, "tray", "link")
-    assert find_robot_frame(scene, None, "frame") == scene.robot.tool_frame
-    assert find_robot_frame(scene, "forearm_link", "frame") == "forearm_link"
 
 
 def test_unknown_names_are_reported() -> None:
@@ -67,13 +54,3 @@ def test_path_joints_move_the_attachment() -> None:
     assert find_path_joints(cabinet, cabinet.object.attachments["grip"]) == ["swing", "slide"], (
         "base first"
     )
-
-
-def test_joint_limits_match_the_file() -> None:
-    cabinet = full_scene().objects["cabinet"]
-    assert find_joint_limits(cabinet, "cabinet.swing") == (-1.0, 2.0)
-    assert find_joint_limits(cabinet, "cabinet.slide") == (0.0, 0.3)
-    for name, value in CABINET_STATE.items():
-        low, high = find_joint_limits(cabinet, f"cabinet.{name}")
-        assert low <= value <= high
-    assert np.isfinite(find_joint_limits(full_scene().objects["door"], "door.hinge")).all()

@@ -91,13 +91,6 @@ def test_phase_names() -> None:
     assert str(FrameGoal("tool", POSE)) == "tool"
 
 
-def test_equal_keys_mean_equal_phases() -> None:
-    """However long they take and whatever is held."""
-    one, other = Phase("go", (), 3), Phase("go", (), 9, held=(Hold("cup", "side"),))
-    assert one.key == other.key
-    assert Phase("turn", ("door.knob",), 3).key != Phase("move", ("door.knob",), 3).key
-
-
 def test_summary_lists_held_objects() -> None:
     found = summarize_phases(compile_task(scene_for(CARRYING), CARRYING, SHORT))
     assert found[:4] == [

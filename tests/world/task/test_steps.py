@@ -9,11 +9,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.scene.poses import as_placement, as_target
+from vkc_pin.world.scene.poses import as_placement
 from vkc_pin.world.task.steps import (
-    STEPS,
     Actuate,
     GoTo,
     Grasp,
@@ -29,19 +27,16 @@ from vkc_pin.world.task.steps import (
 TURN = pin.SE3(pin.rpy.rpyToMatrix(0.1, -0.2, 0.3), np.array([1.0, 2.0, 3.0]))
 
 
-@pytest.mark.parametrize(
-    "pose", [TURN, TURN.homogeneous, TURN.homogeneous.tolist(), [1.0, 2.0, 3.0, 0.1, -0.2, 0.3]]
-)
-def test_poses(pose: Any) -> None:
-    np.testing.assert_allclose(as_placement(pose).homogeneous, TURN.homogeneous, atol=1e-15)
-    np.testing.assert_allclose(Reach(pose).pose.homogeneous, TURN.homogeneous, atol=1e-15)
-
-
-def test_a_pose_is_copied() -> None:
-    pose = pin.SE3(TURN)
-    step = Reach(pose)
-    pose.translation[:] = 0.0
-    assert step.pose == TURN
+@pytest.mark.parametrize("pose", [TURN, TURN.homogeneous, [1.0, 2.0, 3.0, 0.1, -0.2, 0.3]])
+def test_poses_and_points_are_converted_and_copied(pose: Any) -> None:
+    for found in (as_placement(pose), Reach(pose).pose, Touch("stick.tip", pose).target):
+        np.testing.assert_allclose(found.homogeneous, TURN.homogeneous, atol=1e-15)
+    point, own = np.array([1, -2, 3]), pin.SE3(TURN)
+    steps = Place("stick", point), Reach(own)
+    point[:], own.translation[:] = 0, 0.0
+    assert steps[0].pose == (1.0, -2.0, 3.0)
+    assert {type(value) for value in steps[0].pose} == {float}
+    assert steps[1].pose == TURN
 
 
 def spoiled(row: int, column: int, value: float) -> np.ndarray:
@@ -54,20 +49,14 @@ def spoiled(row: int, column: int, value: float) -> np.ndarray:
     ("pose", "problem"),
     [
         ("here", "not a pose"),
-        (None, "not a pose"),
-        ({"x": 1.0}, "not a pose"),
         ([1.0, 2.0, 3.0], "not a pose"),
         ([[1.0], [1.0, 2.0]], "not a pose"),
-        (np.eye(3), "not a pose"),
         ([1.0, 2.0, 3.0, 0.0, 0.0, np.nan], "not finite"),
         (spoiled(0, 3, np.inf), "not finite"),
         (pin.SE3(np.eye(3), np.array([np.nan, 0.0, 0.0])), "not finite"),
         (spoiled(0, 0, 0.5), "not a rotation"),
         (np.diag([1.0, 1.0, -1.0, 1.0]), "not a rotation"),
-        (pin.SE3(2.0 * np.eye(3), np.zeros(3)), "not a rotation"),
-        (np.diag([2.0, 2.0, 2.0, 1.0]), "not a rotation"),
         (spoiled(3, 3, 0.0), "last row"),
-        (pin.SE3(np.eye(3), np.ones(3)).homogeneous.T, "last row"),
     ],
 )
 def test_invalid_poses_are_rejected(pose: Any, problem: str) -> None:
@@ -83,14 +72,9 @@ def test_invalid_poses_are_rejected(pose: Any, problem: str) -> None:
     ("joints", "field"),
     [
         ({}, "Actuate.joints"),
-        (None, "Actuate.joints"),
-        (1.2, "Actuate.joints"),
-        ("hinge", "Actuate.joints"),
         ([("hinge", 1.2)], "Actuate.joints"),
         ({"hinge": "wide"}, "Actuate.joints['hinge']"),
-        ({"hinge": None}, "Actuate.joints['hinge']"),
         ({"knob": 0.1, "hinge": np.nan}, "Actuate.joints['hinge']"),
-        ({"hinge": np.inf}, "Actuate.joints['hinge']"),
     ],
 )
 def test_invalid_joints_are_rejected(joints: Any, field: str) -> None:
@@ -100,41 +84,13 @@ def test_invalid_joints_are_rejected(joints: Any, field: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "point", [(1.0, -2.0, 3.0), [1, -2, 3], np.array([1.0, -2.0, 3.0]), np.array([1, -2, 3])]
-)
-def test_points(point: Any) -> None:
-    for target in (
-        as_target(point, name="p"),
-        Touch("stick.tip", point).target,
-        Place("stick", point).pose,
-    ):
-        assert target == (1.0, -2.0, 3.0)
-        assert [type(value) for value in target] == [float] * 3
-
-
-@pytest.mark.parametrize("pose", [TURN, TURN.homogeneous, [1.0, 2.0, 3.0, 0.1, -0.2, 0.3]])
-def test_targets_that_are_poses(pose: Any) -> None:
-    for target in (
-        as_target(pose, name="p"),
-        Touch("stick.tip", pose).target,
-        Place("stick", pose).pose,
-    ):
-        assert isinstance(target, pin.SE3)
-        np.testing.assert_allclose(target.homogeneous, TURN.homogeneous, atol=1e-15)
-
-
-@pytest.mark.parametrize(
     ("target", "problem"),
     [
         ("here", "not a pose"),
-        (None, "not a pose"),
-        (1.0, "not a pose"),
         ([1.0, 2.0], "not a pose"),
         ([1.0, 2.0, 3.0, 4.0], "not a pose"),
-        ([[1.0], [1.0, 2.0]], "not a pose"),
         (np.zeros((3, 1)), "not a pose"),
         ([0.0, np.nan, 0.0], "not finite"),
-        ([0.0, 0.0, -np.inf], "not finite"),
         ([1.0, 2.0, 3.0, 0.0, np.inf, 0.0], "not finite"),
         (spoiled(0, 0, 0.5), "not a rotation"),
     ],
@@ -149,30 +105,12 @@ def test_invalid_targets_are_rejected(target: Any, problem: str) -> None:
         assert caught.value.field == field
 
 
-def test_a_point_is_copied() -> None:
-    point = np.ones(3)
-    step = Touch("stick.tip", point)
-    point[:] = 0.0
-    assert step.target == (1.0, 1.0, 1.0)
-
-
-def test_actuate_needs_joints() -> None:
-    with pytest.raises(InputError):
-        Actuate("door")
-
-
 @pytest.mark.parametrize("field", ["x", "y", "yaw"])
-@pytest.mark.parametrize("value", ["there", np.nan, -np.inf, [1.0, 2.0], {}])
+@pytest.mark.parametrize("value", ["there", np.nan, [1.0, 2.0]])
 def test_invalid_base_goals_are_rejected(field: str, value: Any) -> None:
     with pytest.raises(InputError) as caught:
         GoTo(**{"x": 0.0, "y": 0.0, "yaw": 0.0, field: value})
     assert caught.value.field == f"GoTo.{field}"
-
-
-def test_only_the_heading_is_optional() -> None:
-    assert GoTo(1.0, 2.0).yaw is None
-    with pytest.raises(InputError, match=r"GoTo\.x"):
-        GoTo(None, 2.0)  # type: ignore[arg-type]
 
 
 def test_numbers_become_plain() -> None:
@@ -188,20 +126,15 @@ def test_numbers_become_plain() -> None:
     "step",
     [
         Reach(TURN, "wrist_3_link"),
-        Reach(TURN),
         Grasp("door"),
-        Grasp("door", "handle_free"),
-        Grasp("ball", by="stick.tip"),
         Grasp("ball", "pull", "stick.tip"),
         Touch("stick.tip", (1.0, 2.0, -3.0)),
         Touch("tool", TURN),
         Place("stick", [1.0, 2.0, 3.0]),
         Place("stick", TURN, "end"),
         Release(),
-        Release("stick"),
         Actuate("door", {"hinge": 1.2, "knob": 0.1}, "handle"),
         GoTo(1.0, -2.0),
-        GoTo(1.0, -2.0, 0.3),
     ],
 )
 def test_round_trip(step: Step) -> None:
@@ -211,16 +144,6 @@ def test_round_trip(step: Step) -> None:
     assert again == step
 
 
-def test_every_kind_of_step_is_known_and_exported() -> None:
-    assert set(STEPS) == {Reach, Grasp, Actuate, GoTo, Touch, Place, Release}
-    assert {kind.__name__ for kind in STEPS} <= set(vkc.__all__)
-
-
-def test_steps_of_earlier_plans() -> None:
-    """Saved when a grasp could not yet go through anything."""
-    assert step_from_dict({"step": "Grasp", "object": "door", "attachment": None}) == Grasp("door")
-
-
 @pytest.mark.parametrize(
     ("data", "field", "nearest"),
     [
@@ -228,13 +151,9 @@ def test_steps_of_earlier_plans() -> None:
         ({"object": "door"}, "step", None),
         ({"step": "Grasp", "objects": "door"}, "Grasp.objects", "object"),
         ({"step": "GoTo", "x": 0.0, "y": 0.0, "jaw": 0.0}, "GoTo.jaw", "yaw"),
-        ({"step": "Tuch", "frame": "tool", "target": [0.0, 0.0, 0.0]}, "step", "Touch"),
-        ({"step": "Touch", "frame": "tool", "targt": [0.0, 0.0, 0.0]}, "Touch.targt", "target"),
-        ({"step": "Place", "object": "stick", "pos": [0.0, 0.0, 0.0]}, "Place.pos", "pose"),
-        ({"step": "Release", "objects": "stick"}, "Release.objects", "object"),
     ],
 )
-def test_data_with_unknown_names_are_rejected(
+def test_unknown_names_in_data_are_rejected(
     data: dict[str, Any], field: str, nearest: str | None
 ) -> None:
     with pytest.raises(UnknownNameError) as caught:
@@ -245,9 +164,7 @@ def test_data_with_unknown_names_are_rejected(
 @pytest.mark.parametrize(
     ("data", "field"),
     [
-        ({"step": "Reach"}, "Reach.pose"),
         ({"step": "GoTo", "x": 1.0}, "GoTo.y"),
-        ({"step": "Touch", "frame": "tool"}, "Touch.target"),
         ({"step": "Place", "pose": [0.0, 0.0, 0.0]}, "Place.object"),
     ],
 )

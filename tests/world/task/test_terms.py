@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Callable
 from typing import Any
@@ -48,7 +47,7 @@ def three() -> list[vkc.Constraint | vkc.Cost]:
     ]
 
 
-def test_terms_become_data_and_back() -> None:
+def test_terms_survive_a_round_trip_through_data() -> None:
     found = trace_terms(room(table()), three())
     assert [term.name for term in found] == ["slow", "within", "elbow"]
     assert [term.formula.uses_time_step for term in found] == [True, False, False]
@@ -60,7 +59,7 @@ def test_terms_become_data_and_back() -> None:
     assert trace_terms(room(table()), []) == ()
 
 
-def test_bounds() -> None:
+def test_bounds_are_extended_to_all_rows() -> None:
     unbounded = np.inf
     slow, within, _ = trace_terms(room(table()), three())
     assert isinstance(slow, vkc.Constraint)
@@ -93,21 +92,15 @@ def test_when_terms_are_active() -> None:
     ("fields", "message"),
     [
         ({"lower": None}, r"terms\['upright'\]\.lower, upper: no bound"),
-        ({"lower": -np.inf}, r"terms\['upright'\]\.lower, upper: no bound"),
-        ({"lower": -np.inf, "upper": np.inf}, "no bound"),
         ({"lower": [0.0, -np.inf]}, "no bound"),
         ({"lower": np.inf}, r"\.lower: no such bound"),
-        ({"upper": np.nan}, r"\.upper: no such bound"),
         ({"lower": [[0.0]]}, r"\.lower: no such bound"),
-        ({"lower": []}, r"\.lower: no such bound"),
         ({"lower": "low"}, r"\.lower: not a number"),
         ({"upper": 0.9}, "lower is more than upper"),
         ({"lower": [0, 3], "upper": [1, 2]}, "lower is more than upper"),
         ({"lower": [0, 0], "upper": [1, 2, 3]}, "wrong number of bounds"),
         ({"tolerance": 0.0}, r"\.tolerance: out of range"),
-        ({"tolerance": True}, r"\.tolerance: out of range"),
         ({"during": []}, r"\.during: not phases"),
-        ({"during": [3]}, r"\.during: not phases"),
         ({"holding": 3}, r"\.holding: not an object"),
     ],
 )
@@ -121,7 +114,7 @@ def test_names_expressions_and_weights_are_checked() -> None:
         vkc.Cost("", lambda s: s.coordinate("base_x"))
     with pytest.raises(vkc.InputError, match=r"terms\['far'\]\.expression: not a function"):
         vkc.Constraint("far", 3.0, lower=0.0)  # type: ignore[arg-type]
-    for weight in (0.0, -1.0, np.nan, np.inf, "much"):
+    for weight in (0.0, np.inf, "much"):
         with pytest.raises(vkc.InputError, match=r"terms\['far'\]\.weight: out of range"):
             vkc.Cost("far", lambda s: s.coordinate("base_x"), weight=weight)  # type: ignore[arg-type]
     with pytest.raises(TypeError):
@@ -136,12 +129,9 @@ def own(s: vkc.State) -> Any:
     ("expression", "message"),
     [
         (lambda s: 3.0, "it does not depend on the state"),
-        (lambda s: ca.SX(3.0), "it does not depend on the state"),
         (lambda s: 0 * s.coordinate("base_x"), "it does not depend on the state"),
         (lambda s: None, "no CasADi expression"),
-        (lambda s: [s.coordinate("base_x")], "no CasADi expression"),
         (lambda s: s.rotation("tool"), "wrong shape"),
-        (lambda s: ca.SX(0, 1), "wrong shape"),
         (lambda s: s.coordinate("base_x") >= 1.0, "a comparison"),
         (lambda s: s.coordinate("base_x") + ca.SX.sym("mine"), "it has symbols of its own"),
         (
@@ -149,7 +139,6 @@ def own(s: vkc.State) -> Any:
             "it cannot be evaluated",
         ),
         (own, "it cannot be evaluated.*mine"),
-        (lambda s: s.position("tool")[7], "it cannot be evaluated"),
     ],
 )
 def test_errors_name_the_invalid_expression(
@@ -187,16 +176,6 @@ def test_unknown_names_are_named() -> None:
         trace_terms(hall(), trace_terms(scene, [tilt()]))
 
 
-def test_lists_of_terms_are_checked() -> None:
-    for terms in (tilt(), 3, "upright"):
-        with pytest.raises(vkc.InputError, match=r"^terms(\[0\])?: not a list"):
-            trace_terms(room(table()), terms)  # type: ignore[arg-type]
-    with pytest.raises(vkc.InputError, match=r"terms\[1\]: wrong type of entry"):
-        trace_terms(room(table()), [tilt(), lambda s: 0])  # type: ignore[list-item]
-    with pytest.raises(vkc.InputError, match="two terms share a name"):
-        trace_terms(room(table()), [tilt(), tilt(lower=0.5)])
-
-
 def test_unknown_phases_are_rejected() -> None:
     phases = [("reach stick.grip", ()), ("place stick", ("stick",))]
     check_terms_active([tilt(), tilt(during="place stick"), tilt(holding="stick")], phases)
@@ -222,6 +201,8 @@ def test_invalid_terms_are_found_before_planning(function: Callable[..., Any]) -
         ([vkc.Cost("far", lambda s: s.position("too")[0])], "there is no frame 'too'"),
         ([tilt(lower=[0, 0])], "wrong number of bounds"),
         (tilt(), "terms: not a list"),
+        ([tilt(), lambda s: 0], r"terms\[1\]: wrong type of entry"),
+        ([tilt(), tilt(lower=0.5)], "two terms share a name"),
     ):
         with pytest.raises(vkc.InputError, match=message):
             function(room(table()), steps, options=SHORT, terms=terms)
@@ -230,26 +211,22 @@ def test_invalid_terms_are_found_before_planning(function: Callable[..., Any]) -
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"code": None},
         {"code": "rm"},
         {"code": [["open", [0], 0, 0.0]]},
         {"code": [["sin", [9], 0, 0.0]]},
         {"code": [["input", [99], 0, 0.0]]},
-        {"code": [["input", [], 0, 0.0]]},
         {"rows": "many"},
-        {"rows": -1},
-        {"frames": None},
         {"frames": []},
     ],
 )
-def test_saved_expressions_that_are_damaged_are_refused(wrong: dict[str, Any]) -> None:
+def test_damaged_expressions_are_rejected(wrong: dict[str, Any]) -> None:
     (term,) = trace_terms(room(table()), [tilt()])
     data = term_to_dict(term)
     with pytest.raises(vkc.InputError, match="not a saved term"):
         term_from_dict({**data, "expression": {**data["expression"], **wrong}})
 
 
-def test_saved_terms_that_are_damaged_are_refused() -> None:
+def test_damaged_terms_are_rejected() -> None:
     (term,) = trace_terms(room(table()), [tilt()])
     data = term_to_dict(term)
     for broken in (
@@ -262,8 +239,3 @@ def test_saved_terms_that_are_damaged_are_refused() -> None:
             term_from_dict(broken)
     with pytest.raises(vkc.InputError, match="lower is more than upper"):
         term_from_dict({**data, "upper": 0.5})
-
-
-def test_a_term_is_frozen() -> None:
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        tilt().lower = 0.5  # type: ignore[misc]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -42,10 +41,7 @@ def problem(scene: Scene, *steps: Step) -> TrajectoryProblem:
 
 
 def margins(p: TrajectoryProblem, phase: int) -> dict[tuple[str, str], np.ndarray]:
-    """Return links → the smallest reduced margin of their pairs at each waypoint of a phase.
-
-    Those of the hand are `test_contacts`' business.
-    """
+    """Return links → smallest reduced margin at each waypoint of a phase, except of the hand."""
     part, first = p.contacts.phases[phase], int(p.contacts.first_waypoint[phase])
     waypoints = range(first, first + p.task.phases[phase].segments + 1)
     found: dict[tuple[str, str], np.ndarray] = {}
@@ -58,10 +54,10 @@ def margins(p: TrajectoryProblem, phase: int) -> dict[tuple[str, str], np.ndarra
     return found
 
 
-def only_near(
+def assert_reduced(
     row: np.ndarray, margin: float, *, begin: bool = False, end: bool = False, within: float = 1e-6
 ) -> None:
-    """Assert that a margin holds near the begin or the end, and dist_safe elsewhere."""
+    """Assert that a margin applies near begin or end, and dist_safe elsewhere."""
     expected = np.full(N + 1, LONG.dist_safe)
     if begin:
         expected[: NEAR + 1] = margin
@@ -74,23 +70,23 @@ def test_margins_are_not_reduced_without_need() -> None:
     p = problem(room(table(gap=GAP)), GoTo(0.0, 1.0))
     assert margins(p, 0) == {}
     far = problem(room(table(gap=0.03)), Place("stick", ASIDE))
-    assert [margins(far, phase) for phase in (0, 1)] == [{}, {}]  # further than dist_safe anyway
+    assert [margins(far, phase) for phase in (0, 1)] == [{}, {}]
 
 
-def test_what_is_lifted_may_be_close_to_what_it_lay_on_and_what_is_lowered_to_what_it_will() -> (
-    None
-):
-    p = problem(room(table(gap=GAP)), Place("stick", ASIDE), GoTo(0.0, 1.0))
-    assert [phase.name for phase in p.task.phases] == ["reach stick.grip", "place stick", "go to"]
-    assert margins(p, 0) == {}
-    assert margins(p, 2) == {}
-    found = margins(p, 1)
-    assert set(found) == {("stick.stick", "table")}
-    only_near(found["stick.stick", "table"], REDUCED_MARGIN_RATIO * GAP, begin=True, end=True)
+def test_margins_are_reduced_where_objects_are_lifted_and_placed() -> None:
+    """Placed elsewhere, or grasped again, an object has its margins reduced there."""
+    steps = [Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 1.0)]
+    p = problem(room(table(gap=GAP)), *steps)
+    names = ["reach stick.grip", "place stick", "reach stick.grip", "go to"]
+    assert [phase.name for phase in p.task.phases] == names
+    assert [margins(p, phase) for phase in (0, 2)] == [{}, {}]
+    for phase, where in ((1, {"begin": True, "end": True}), (3, {"begin": True})):
+        found = margins(p, phase)
+        assert set(found) == {("stick.stick", "table")}
+        assert_reduced(found["stick.stick", "table"], REDUCED_MARGIN_RATIO * GAP, **where)
 
 
-def test_the_margin_is_half_the_distance_of_that_shape() -> None:
-    """Only the discs are close, as they lie lower; a wall at the tip has its own distance."""
+def test_margin_is_half_the_distance_of_each_shape() -> None:
     wall = box("wall", [0.3, 0.02, 0.3], [0.8, 0.25 + 0.01 + 0.01, TOP + 0.1])
     p = problem(room(table(gap=GAP), wall), Place("stick", ASIDE))
     part, first = p.contacts.phases[1], int(p.contacts.first_waypoint[1])
@@ -113,84 +109,52 @@ def test_the_margin_is_half_the_distance_of_that_shape() -> None:
     assert margin == pytest.approx(REDUCED_MARGIN_RATIO * 0.01, abs=1e-6)
 
 
-def test_how_long_it_may_be_close_does_not_hang_on_the_number_of_waypoints() -> None:
-    """Twice as many waypoints, half as far apart in time: the same seconds at either end."""
-    steps, spans = [Place("stick", ASIDE)], []
-    for options in (
-        LONG,
-        dataclasses.replace(LONG, dt=LONG.dt / 2, reach_waypoints=2 * LONG.reach_waypoints),
-    ):
-        p = program_of(room(table(gap=GAP)), steps, options=options)
-        first = int(p.contacts.first_waypoint[1])
-        moments = [
-            moment for eased in p.contacts.phases[1].reduced_margins.values() for moment in eased
-        ]
-        spans.append(
-            {
-                ((begin - first) * options.dt, (end - first) * options.dt)
-                for begin, end, _ in moments
-            }
-        )
-    assert (
-        spans[0] == spans[1] == {(0.0, CONTACT_WINDOW), (N * LONG.dt - CONTACT_WINDOW, N * LONG.dt)}
-    )
+def test_duration_of_reduced_margins_does_not_depend_on_the_time_step() -> None:
+    fine = dataclasses.replace(LONG, dt=LONG.dt / 2, reach_waypoints=2 * N)
+    for options in (LONG, fine):
+        p = program_of(room(table(gap=GAP)), [Place("stick", ASIDE)], options=options)
+        first, reduced = p.contacts.first_waypoint[1], p.contacts.phases[1].reduced_margins
+        spans = {(begin - first, end - first) for row in reduced.values() for begin, end, _ in row}
+        assert {(begin * options.dt, end * options.dt) for begin, end in spans} == {
+            (0.0, CONTACT_WINDOW),
+            (N * LONG.dt - CONTACT_WINDOW, N * LONG.dt),
+        }
 
 
 @pytest.mark.parametrize("gap", [0.0, -1e-3])
-def test_what_rests_on_or_in_something_may_be_as_close_as_that(gap: float) -> None:
-    p = problem(room(table(gap=gap)), Place("stick", ASIDE))
+def test_initial_penetration_may_be_left_but_not_entered(gap: float) -> None:
+    p = problem(room(table(gap=gap)), Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 0.0))
     found = margins(p, 1)["stick.stick", "table"]
-    np.testing.assert_allclose(
-        found[: NEAR + 1], gap, rtol=0.0, atol=1e-6
-    )  # it stands there, but may not be put there
-    only_near(np.append(np.zeros(NEAR + 1), found[NEAR + 1 :]), 0.0, begin=True, end=True)
+    np.testing.assert_allclose(found[: NEAR + 1], gap, rtol=0.0, atol=1e-6)
+    assert_reduced(np.append(np.zeros(NEAR + 1), found[NEAR + 1 :]), 0.0, begin=True, end=True)
+    assert_reduced(margins(p, 3)["stick.stick", "table"], 0.0, begin=True)
 
 
-def test_what_is_put_down_elsewhere_is_eased_there_alone() -> None:
+def test_margins_are_reduced_to_the_object_below_only() -> None:
     other = box("other", [0.5, 0.6, 0.02], [0.8, 1.0, TOP - GAP - 0.01])
     small = box("table", [0.5, 0.7, 0.02], [0.8, 0.0, TOP - GAP - 0.01])
     p = problem(room(small, other), Place("stick", lifted(STICK, [0.0, 1.0, 0.0])))
     found = margins(p, 1)
     assert set(found) == {("stick.stick", "table"), ("stick.stick", "other")}
-    only_near(found["stick.stick", "table"], REDUCED_MARGIN_RATIO * GAP, begin=True)
-    only_near(found["stick.stick", "other"], REDUCED_MARGIN_RATIO * GAP, end=True)
-
-
-def test_taken_again_it_is_eased_where_it_was_put() -> None:
-    p = problem(room(table(gap=GAP)), Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 0.0))
-    assert [phase.name for phase in p.task.phases] == [
-        "reach stick.grip",
-        "place stick",
-        "reach stick.grip",
-        "go to",
-    ]
-    only_near(margins(p, 3)["stick.stick", "table"], REDUCED_MARGIN_RATIO * GAP, begin=True)
+    assert_reduced(found["stick.stick", "table"], REDUCED_MARGIN_RATIO * GAP, begin=True)
+    assert_reduced(found["stick.stick", "other"], REDUCED_MARGIN_RATIO * GAP, end=True)
 
 
 @pytest.mark.parametrize(
     ("gap", "margin"), [(GAP, REDUCED_MARGIN_RATIO * GAP), (0.0, 0.0), (-1e-3, -1e-3)]
 )
-def test_what_is_in_the_hand_at_the_start_may_leave_what_it_lies_on(
-    gap: float, margin: float
-) -> None:
-    """So a step that is planned on its own begins as well as in the middle of a chore."""
+def test_object_grasped_at_the_start_may_leave_its_support(gap: float, margin: float) -> None:
     scene, row = room(table(gap=gap)), reaching(tool_at(STICK), above(STICK))
     held = scene.with_start(base=row[:3], arm=row[3:]).with_held({"stick": "grip"})
     found = margins(problem(held, GoTo(0.0, 1.0), GoTo(0.0, 0.0)), 0)
     assert set(found) == {("stick.stick", "table")}
-    only_near(found["stick.stick", "table"], margin, begin=True)
+    assert_reduced(found["stick.stick", "table"], margin, begin=True)
     assert margins(problem(held, GoTo(0.0, 1.0), GoTo(0.0, 0.0)), 1) == {}
     raised = held.with_start(base=moved_base(row, x=-0.1)[:3], arm=above(STICK)[3:])
     assert margins(problem(raised, GoTo(0.0, 1.0)), 0) == {}
 
 
-def test_taken_again_it_stands_in_nothing() -> None:
-    """An object may leave an initial penetration once; later placements are collision-free."""
-    p = problem(room(table(gap=-1e-3)), Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 0.0))
-    only_near(margins(p, 3)["stick.stick", "table"], 0.0, begin=True)
-
-
-def test_what_rides_is_eased_from_what_is_beside_it_where_the_ride_begins_alone() -> None:
+def test_margins_of_supported_objects_are_reduced_where_transport_begins() -> None:
     options = dataclasses.replace(LONG, move_waypoints=N)
     p = program_of(plates(cups=1, wall=0.01), [Actuate("plate", {"slide": 0.3})], options=options)
     (number,) = (k for k, phase in enumerate(p.task.phases) if phase.supported)
@@ -199,9 +163,7 @@ def test_what_rides_is_eased_from_what_is_beside_it_where_the_ride_begins_alone(
     assert row[-1] == LONG.dist_safe
 
 
-def test_what_rides_on_something_carried_is_eased_from_what_is_beside_it_where_that_is_lifted() -> (
-    None
-):
+def test_margins_of_objects_on_a_tray_are_reduced_where_it_is_lifted() -> None:
     """A cup on a tray is 1 cm in front of a wall; there is none where the tray is placed."""
     things = [
         {"name": "tray", "type": "tray.yaml", "position": [0.8, 0.0, 0.7]},
@@ -212,13 +174,12 @@ def test_what_rides_on_something_carried_is_eased_from_what_is_beside_it_where_t
         Place("tray", (-0.5, -1.5, 0.7)),
     )
     (number,) = (k for k, phase in enumerate(p.task.phases) if phase.supported)
-    only_near(
+    assert_reduced(
         margins(p, number)["cup.cup", "wall"], REDUCED_MARGIN_RATIO * 0.01, begin=True, within=1e-4
     )
 
 
-def test_in_a_short_phase_both_ends_must_be_possible() -> None:
-    """The object is lifted and placed within a few waypoints and finally rests on the table."""
+def test_short_phases_begin_and_end_with_reduced_margins() -> None:
     options = dataclasses.replace(SHORT, reach_waypoints=NEAR)
     p = program_of(
         room(table(gap=GAP)), [Place("stick", lifted(STICK, [0.0, 0.5, -GAP]))], options=options
@@ -226,43 +187,30 @@ def test_in_a_short_phase_both_ends_must_be_possible() -> None:
     np.testing.assert_allclose(margins(p, 1)["stick.stick", "table"], np.zeros(NEAR + 1), atol=1e-6)
 
 
-def test_margin_from_the_floor_is_reduced() -> None:
+def test_margins_to_the_floor_are_reduced() -> None:
     low = pin.SE3(np.eye(3), np.array([0.8, 0.0, 0.051]))
     p = problem(room(), Place("stick", low))
     found = margins(p, 1)
     assert set(found) == {("stick.stick", FLOOR)}
-    only_near(found["stick.stick", FLOOR], REDUCED_MARGIN_RATIO * 1e-3, end=True)
+    assert_reduced(found["stick.stick", FLOOR], REDUCED_MARGIN_RATIO * 1e-3, end=True)
 
 
-def tip_at_a_wall(gap: float, *steps: Step) -> tuple[TrajectoryProblem, np.ndarray]:
-    """Return the problem of touching a point `gap` before a wall and then `steps`; the point."""
+@pytest.mark.parametrize(
+    ("gap", "margin"), [(0.0, 0.0), (0.006, 0.003), (-0.01, 0.0), (0.03, None)]
+)
+def test_margins_are_reduced_before_and_after_a_touch(gap: float, margin: float | None) -> None:
     point = np.array([0.8, 0.7, 0.75])
-    scene = room(box("wall", [0.3, 0.1, 0.3], point + np.array([0.0, gap + 0.05, 0.0]))).with_held(
-        {"stick": "grip"}
-    )
-    return problem(scene, Touch("stick.tip", point), *steps), point
-
-
-@pytest.mark.parametrize(("gap", "margin"), [(0.0, 0.0), (0.006, 0.003), (-0.01, 0.0)])
-def test_a_tip_may_be_close_to_what_is_at_its_target_before_and_after(
-    gap: float, margin: float
-) -> None:
-    p, _ = tip_at_a_wall(gap, GoTo(0.0, 0.0), GoTo(0.0, 1.0))
-    for phase, where in ((0, {"end": True}), (1, {"begin": True})):
+    wall = box("wall", [0.3, 0.1, 0.3], point + np.array([0.0, gap + 0.05, 0.0]))
+    scene = room(wall).with_held({"stick": "grip"})
+    p = problem(scene, Touch("stick.tip", point), GoTo(0.0, 0.0), GoTo(0.0, 1.0))
+    for phase, where in ((0, {"end": True}), (1, {"begin": True}), (2, {})):
         found = margins(p, phase)
-        assert set(found) == {("stick.tip", "wall")}
-        only_near(
-            found["stick.tip", "wall"], margin, **where, within=6e-5
-        )  # a point has a size here, 0.1 mm
-    assert margins(p, 2) == {}
+        assert set(found) == ({("stick.tip", "wall")} if where and margin is not None else set())
+        for row in found.values():  # a point has a size of 0.1 mm here
+            assert_reduced(row, margin or 0.0, **where, within=6e-5)
 
 
-def test_target_in_the_air_reduces_no_margin() -> None:
-    p, _ = tip_at_a_wall(0.021, GoTo(0.0, 0.0))
-    assert [margins(p, phase) for phase in (0, 1)] == [{}, {}]
-
-
-def test_reaching_a_pose_is_no_touch() -> None:
+def test_margins_are_reduced_for_touches_but_not_for_poses() -> None:
     scene = room(table(gap=GAP)).with_held({"stick": "grip"})
     reach = Touch("forearm_link", (0.8, 0.0, TOP))
     found = margins(problem(scene, reach), 0)
@@ -270,37 +218,19 @@ def test_reaching_a_pose_is_no_touch() -> None:
     assert margins(problem(scene, Reach(pin.SE3(np.eye(3), np.array([0.8, 0.0, TOP])))), 0) == {}
 
 
-def resting(steps: Sequence[Step]) -> tuple[TrajectoryProblem, np.ndarray]:
-    """Return a problem on the table and a motion that lifts and places the stick."""
-    scene = room(table(gap=GAP))
-    p = problem(scene, *steps)
-    up, down = np.array(scene.start), reaching(tool_at(STICK), above(STICK))
-    there, over = moved_base(down, y=0.5), moved_base(up, y=0.5)
-    rows = [*np.linspace(up, down, N + 1)[1:]]
-    knots = np.array([down, up, over, there])
-    share = np.linspace(0.0, 3.0, N + 1)[1:]
-    rows += list(np.array([np.interp(share, np.arange(4.0), column) for column in knots.T]).T)
+def test_motion_that_lifts_and_places_keeps_its_margins() -> None:
+    p = problem(room(table(gap=GAP)), Place("stick", ASIDE))
+    up, down = np.array(p.scene.start), reaching(tool_at(STICK), above(STICK))
+    corners = np.array([down, up, moved_base(up, y=0.5), moved_base(down, y=0.5)])
+    at = np.linspace(0.0, 3.0, N + 1)[1:]
     z = np.zeros((p.segments, p.chain.size))
-    z[:, :9] = rows
-    return p, z
-
-
-def test_a_motion_that_lifts_and_lowers_keeps_its_margins() -> None:
-    """The solver sees no shortfall where the stick lies, only its usual margin elsewhere."""
-    p, z = resting([Place("stick", ASIDE)])
+    z[:N, :9] = np.linspace(up, down, N + 1)[1:]
+    z[N:, :9] = np.transpose([np.interp(at, np.arange(4.0), column) for column in corners.T])
     contacts = p.evaluate_contacts(z, reach=0.05)
-    part = p.contacts.phases[1]
-    labels = np.array(part.labels)
-    lies = {}
-    for waypoint, pair, distance, margin in zip(
-        contacts.waypoint, contacts.pair, contacts.distance, contacts.margin, strict=True
-    ):
-        if waypoint >= N and {labels[pair[0]], labels[pair[1]]} == {"stick.stick", "table"}:
-            lies[int(waypoint) + 1] = min(
-                lies.get(int(waypoint) + 1, (np.inf, 0.0)), (float(distance), float(margin))
-            )
-    assert lies[2 * N] == (
-        pytest.approx(GAP, abs=1e-6),
-        pytest.approx(REDUCED_MARGIN_RATIO * GAP, abs=1e-7),
-    )
-    assert all(distance >= margin for distance, margin in lies.values())
+    contacts = contacts.select(np.flatnonzero(contacts.waypoint >= N))
+    links = np.array(p.contacts.phases[1].labels)[contacts.pair]
+    own = contacts.select(np.flatnonzero((links == ("stick.stick", "table")).all(axis=1)))
+    assert own.compute_violation() == 0.0
+    last = own.select(np.flatnonzero(own.waypoint == 2 * N - 1))
+    assert last.distance.min() == pytest.approx(GAP, abs=1e-6)
+    assert last.margin.min() == pytest.approx(REDUCED_MARGIN_RATIO * GAP, abs=1e-7)

@@ -1,6 +1,8 @@
-"""Inverse kinematics, its solutions checked with numeric Pinocchio."""
+"""Checks solutions of inverse kinematics with numeric Pinocchio."""
 
 from __future__ import annotations
+
+from functools import cache
 
 import numpy as np
 import pinocchio as pin
@@ -11,52 +13,90 @@ from vkc_pin.planning.chain.chain import VirtualKinematicChain, consolidate
 from vkc_pin.planning.chain.inverse_kinematics import PoseSolver
 from vkc_pin.planning.chain.pose import PoseRow
 
-GRASPS = [{}, {"door": "handle"}, {"cabinet": "ball"}]
+Shift = tuple[int, tuple[float, float, float]]
+KINDS = {"pose": 6, "point": 3, "upright": 5}
 
 
-@pytest.fixture(params=GRASPS, ids=["robot", "door", "ball"])
+@pytest.fixture(scope="module", params=[{}, {"cabinet": "ball"}], ids=["robot", "ball"])
 def chain(request: pytest.FixtureRequest) -> VirtualKinematicChain:
     return consolidate(full_scene(), request.param)
 
 
-def solver_and_frame(chain: VirtualKinematicChain) -> tuple[PoseSolver, int, pin.SE3]:
-    """Return a solver of the last frame there is: the tool, or what is at the chain's end."""
-    name = chain.robot.tool_frame
+@pytest.fixture(scope="module")
+def robot() -> VirtualKinematicChain:
+    return consolidate(door_scene(), {})
+
+
+def last_frame(chain: VirtualKinematicChain) -> tuple[int, pin.SE3]:
+    """Return joint and local placement of the grasped object's base, or else of the tool."""
     if chain.closures:
         (closure,) = chain.closures.values()
-        return (
-            PoseSolver(chain.model, PoseRow(closure.joint, closure.local, ())),
-            closure.joint,
-            closure.local,
-        )
-    frame = chain.model.frames[chain.model.getFrameId(name)]
-    return (
-        PoseSolver(chain.model, PoseRow(frame.parentJoint, pin.SE3(frame.placement), ())),
-        frame.parentJoint,
-        pin.SE3(frame.placement),
-    )
+        return closure.joint, closure.local
+    return chain.frame(chain.robot.tool_frame)
 
 
-def placement(chain: VirtualKinematicChain, joint: int, local: pin.SE3, z: np.ndarray) -> pin.SE3:
+@cache
+def make_solver(
+    chain: VirtualKinematicChain, kind: str = "pose", shift: Shift | None = None
+) -> PoseSolver:
+    return PoseSolver(chain.model, PoseRow(*last_frame(chain), (), kind, shift))
+
+
+def place(
+    chain: VirtualKinematicChain, z: np.ndarray, frame: tuple[int, pin.SE3] | None = None
+) -> pin.SE3:
+    joint, local = frame or last_frame(chain)
     data = chain.model.createData()
     pin.forwardKinematics(chain.model, data, chain.coordinates.q(z))
     return data.oMi[joint] * local
 
 
-def errors(
-    chain: VirtualKinematicChain, joint: int, local: pin.SE3, z: np.ndarray, target: pin.SE3
-) -> np.ndarray:
-    """Return distance [m] or angle [rad] to the target, whichever is larger, shape (B,)."""
-    found = [placement(chain, joint, local, row) for row in z]
-    return np.array(
-        [
-            max(
-                np.linalg.norm(p.translation - target.translation),
-                np.linalg.norm(pin.log3(target.rotation.T @ p.rotation)),
-            )
-            for p in found
-        ]
+def compute_tilt(placement: pin.SE3, target: pin.SE3) -> float:
+    """Return the angle [rad] between the body's and the target's vertical."""
+    vertical = target.rotation.T @ np.array([0.0, 0.0, 1.0])
+    return float(np.arccos(np.clip((placement.rotation @ vertical)[2], -1.0, 1.0)))
+
+
+def compute_error(kind: str, placement: pin.SE3, target: pin.SE3) -> float:
+    """Return distance [m] or angle [rad] to the goal, whichever is larger."""
+    angle = {
+        "pose": float(np.linalg.norm(pin.log3(target.rotation.T @ placement.rotation))),
+        "point": 0.0,
+        "upright": compute_tilt(placement, target),
+    }[kind]
+    return max(float(np.linalg.norm(placement.translation - target.translation)), angle)
+
+
+def solve(
+    chain: VirtualKinematicChain,
+    guesses: np.ndarray,
+    target: pin.SE3,
+    kind: str = "pose",
+    *,
+    shift: Shift | None = None,
+    lower: np.ndarray | None = None,
+    upper: np.ndarray | None = None,
+    weights: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return solutions and their mask, checked against limits and target."""
+    usual = limits(chain)
+    lower, upper = usual[0] if lower is None else lower, usual[1] if upper is None else upper
+    z, found = make_solver(chain, kind, shift).solve(
+        guesses,
+        target,
+        lower=lower,
+        upper=upper,
+        weights=np.ones(chain.size) if weights is None else weights,
+        iterations=40,
     )
+    assert z.shape == guesses.shape
+    assert np.isfinite(z).all()
+    assert ((z >= lower) & (z <= upper)).all()
+    if shift is None:
+        errors = np.array([compute_error(kind, place(chain, row), target) for row in z])
+        assert (errors[found] < 3e-6).all()  # each residual is below 1e-6
+        assert (errors[~found] > 5e-7).all()
+    return z, found
 
 
 def limits(chain: VirtualKinematicChain) -> tuple[np.ndarray, np.ndarray]:
@@ -65,313 +105,136 @@ def limits(chain: VirtualKinematicChain) -> tuple[np.ndarray, np.ndarray]:
     return lower, upper
 
 
-def test_residual_and_jacobian(chain: VirtualKinematicChain) -> None:
-    solver, joint, local = solver_and_frame(chain)
-    z = random_configurations(chain.lower, chain.upper, 10, np.random.default_rng(0))
-    target = placement(chain, joint, local, z[0])
+def home(chain: VirtualKinematicChain, *base: float) -> np.ndarray:
+    return np.concatenate([base or [0.0, 0.0, 0.0], chain.robot.home])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("shifted", [False, True])
+def test_residuals_and_jacobians(chain: VirtualKinematicChain, kind: str, shifted: bool) -> None:
+    """A shift is fixed in another joint's frame, such as a hand's approach direction."""
+    hand, vector = chain.robot.model.njoints - 1, (0.03, -0.05, 0.08)
+    solver = make_solver(chain, kind, (hand, vector) if shifted else None)
+    z = random_configurations(chain.lower, chain.upper, 5, np.random.default_rng(0))
+    target = place(chain, z[0])
     residual, jacobian = solver.evaluate(z, target)
-    assert residual.shape == (10, 6)
-    assert jacobian.shape == (10, 6, chain.size)
-    np.testing.assert_allclose(residual[0], 0.0, atol=1e-9)
-    for row in range(10):
-        at = placement(chain, joint, local, z[row])
+    assert residual.shape == (5, KINDS[kind])
+    assert jacobian.shape == (5, KINDS[kind], chain.size)
+    for row in range(5):
+        at = place(chain, z[row])
+        offset = at.translation - target.translation
+        if shifted:
+            frame = (hand, pin.SE3.Identity())
+            offset = offset + place(chain, z[row], frame).rotation @ np.array(vector)
+        np.testing.assert_allclose(residual[row, :3], offset, rtol=0.0, atol=1e-9)
         turn = pin.log3(target.rotation.T @ at.rotation)
         angle = max(np.linalg.norm(turn), 1e-12)
-        expected = np.r_[at.translation - target.translation, 2 * np.sin(angle / 2) * turn / angle]
-        np.testing.assert_allclose(residual[row], expected, rtol=0.0, atol=1e-8)
-        change = 1e-6 * np.eye(chain.size)
+        if kind == "pose":
+            chord = 2 * np.sin(angle / 2) * turn / angle
+            np.testing.assert_allclose(residual[row, 3:], chord, rtol=0.0, atol=1e-8)
+        elif kind == "upright":
+            chord = 2 * np.sin(compute_tilt(at, target) / 2)
+            assert np.linalg.norm(residual[row, 3:]) == pytest.approx(chord, abs=1e-7)
         ahead, behind = (
-            solver.evaluate(z[row] + change, target)[0],
-            solver.evaluate(z[row] - change, target)[0],
+            solver.evaluate(z[row] + sign * 1e-6 * np.eye(chain.size), target)[0]
+            for sign in (1.0, -1.0)
         )
         np.testing.assert_allclose(jacobian[row], (ahead - behind).T / 2e-6, rtol=0.0, atol=1e-6)
 
 
-def test_solutions_reach_the_pose_within_limits(chain: VirtualKinematicChain) -> None:
-    solver, joint, local = solver_and_frame(chain)
-    lower, upper = limits(chain)
-    rng = np.random.default_rng(1)
-    targets = random_configurations(chain.lower, chain.upper, 8, rng, arena=1.0)
-    solved = 0
-    for row in targets:
-        target = placement(chain, joint, local, row)
-        seeds = np.clip(row + rng.uniform(-0.5, 0.5, (40, chain.size)), chain.lower, chain.upper)
-        z, found = solver.solve(
-            seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=25
-        )
-        assert z.shape == seeds.shape
-        assert found.shape == (40,)
-        assert np.all(z >= lower)
-        assert np.all(z <= upper)
-        missing = errors(chain, joint, local, z, target)
-        assert np.all(missing[found] < 3e-6)  # each of six residuals is below 1e-6
-        assert np.all(missing[~found] > 5e-7)
-        solved += int(found.sum())
-    assert solved > 0.7 * 40 * len(targets)
+@pytest.mark.parametrize("kind", KINDS)
+def test_solutions_attain_the_goal_within_limits(chain: VirtualKinematicChain, kind: str) -> None:
+    rng, turned, solved = np.random.default_rng(1), 0.0, []
+    for row in random_configurations(chain.lower, chain.upper, 4, rng, arena=1.0):
+        target = place(chain, row)
+        guesses = np.clip(row + rng.uniform(-0.6, 0.6, (30, chain.size)), chain.lower, chain.upper)
+        z, found = solve(chain, guesses, target, kind)
+        solved.append(found.mean())
+        rotations = [place(chain, one).rotation for one in z[found]]
+        turned = max(turned, *(np.linalg.norm(pin.log3(target.rotation.T @ r)) for r in rotations))
+    assert np.mean(solved) > 0.7
+    assert (turned > 0.3) == (kind != "pose")  # freedoms are used
 
 
-def test_seeds_that_fit_are_left_alone(chain: VirtualKinematicChain) -> None:
-    solver, joint, local = solver_and_frame(chain)
+def test_guesses_at_the_goal_are_not_changed(chain: VirtualKinematicChain) -> None:
     z = random_configurations(chain.lower, chain.upper, 1, np.random.default_rng(2))
-    lower, upper = limits(chain)
-    target = placement(chain, joint, local, z[0])
-    same, found = solver.solve(z, target, lower=lower, upper=upper, weights=np.ones(chain.size))
+    same, found = solve(chain, z, place(chain, z[0]))
     assert found.all()
     np.testing.assert_array_equal(same, z)
 
 
-def test_what_cannot_be_reached_is_said() -> None:
-    chain = consolidate(door_scene(), {})
-    solver, _, _ = solver_and_frame(chain)
-    lower, upper = limits(chain)
-    seeds = random_configurations(chain.lower, chain.upper, 30, np.random.default_rng(3))
-    z, found = solver.solve(
-        seeds,
-        pin.SE3(np.eye(3), np.array([0.0, 0.0, 9.0])),
-        lower=lower,
-        upper=upper,
-        weights=np.ones(chain.size),
-    )
+def test_unreachable_goal(robot: VirtualKinematicChain) -> None:
+    guesses = random_configurations(robot.lower, robot.upper, 30, np.random.default_rng(3))
+    far = pin.SE3(np.eye(3), np.array([0.0, 0.0, 9.0]))
+    _, found = solve(robot, guesses, far)
     assert not found.any()
-    assert np.all(np.isfinite(z))
-    assert np.all((z >= lower) & (z <= upper))
 
 
-def test_equal_limits_keep_coordinates_where_they_are() -> None:
-    """For all configurations alike, and for each its own."""
-    chain = consolidate(door_scene(), {})
-    solver, joint, local = solver_and_frame(chain)
-    rng = np.random.default_rng(4)
-    goal = np.concatenate([[0.5, -0.3, 0.4], chain.robot.home])
-    target = placement(chain, joint, local, goal)
-    seeds = goal + rng.uniform(-0.3, 0.3, (40, chain.size))
-    lower, upper = limits(chain)
+def test_equal_limits_fix_coordinates(robot: VirtualKinematicChain) -> None:
+    goal, rng = home(robot, 0.5, -0.3, 0.4), np.random.default_rng(4)
+    target, guesses = place(robot, goal), goal + rng.uniform(-0.3, 0.3, (40, robot.size))
+    lower, upper = limits(robot)
     lower[5] = upper[5] = goal[5]
-    z, found = solver.solve(
-        seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=25
-    )
+    _, found = solve(robot, guesses, target, lower=lower, upper=upper)
     assert found.mean() > 0.8
-    assert np.all(z[:, 5] == goal[5])
-    rows_lower, rows_upper = np.tile(limits(chain)[0], (40, 1)), np.tile(limits(chain)[1], (40, 1))
-    rows_lower[:, 2] = rows_upper[:, 2] = seeds[:, 2]
-    z, found = solver.solve(
-        seeds,
-        target,
-        lower=rows_lower,
-        upper=rows_upper,
-        weights=np.ones(chain.size),
-        iterations=25,
-    )
+    lower, upper = (np.tile(side, (40, 1)) for side in limits(robot))  # one row per guess
+    lower[:, 2] = upper[:, 2] = guesses[:, 2]
+    _, found = solve(robot, guesses, target, lower=lower, upper=upper)
     assert found.mean() > 0.8
-    np.testing.assert_array_equal(z[:, 2], seeds[:, 2])
-    assert np.all(errors(chain, joint, local, z[found], target) < 3e-6)
 
 
-def test_a_limit_in_the_way_is_respected_and_got_round() -> None:
-    chain = consolidate(door_scene(), {})
-    solver, joint, local = solver_and_frame(chain)
-    goal = np.concatenate([[0.0, 0.0, 0.0], chain.robot.home])
-    target = placement(chain, joint, local, goal)
-    rng = np.random.default_rng(5)
-    seeds = goal + rng.uniform(-0.1, 0.1, (40, chain.size))
-    seeds[:, 0] = -0.2 - rng.uniform(0.0, 0.03, 40)
-    lower, upper = limits(chain)
+def test_goal_is_attained_despite_an_active_limit(robot: VirtualKinematicChain) -> None:
+    goal, rng = home(robot), np.random.default_rng(5)
+    guesses = goal + rng.uniform(-0.1, 0.1, (40, robot.size))
+    guesses[:, 0] = -0.2 - rng.uniform(0.0, 0.03, 40)
+    upper = limits(robot)[1]
     farthest = []
-    for edge in (3.0, -0.2):  # how far the base may come
-        upper[0] = edge
-        z, found = solver.solve(
-            seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=40
-        )
+    for upper[0] in (3.0, -0.2):
+        z, found = solve(robot, guesses, place(robot, goal), upper=upper)
         assert found.mean() > 0.8
         farthest.append(z[found, 0].max())
     assert farthest[0] > -0.15
-    assert farthest[1] <= -0.2
 
 
-def test_what_is_dear_to_move_moves_less() -> None:
-    chain = consolidate(door_scene(), {})
-    solver, joint, local = solver_and_frame(chain)
-    goal = np.concatenate([[0.0, 0.0, 0.0], chain.robot.home])
-    target = placement(chain, joint, local, goal)
-    seeds = goal + np.random.default_rng(6).uniform(-0.2, 0.2, (60, chain.size))
-    lower, upper = limits(chain)
+def test_coordinates_of_large_weight_move_less(robot: VirtualKinematicChain) -> None:
+    goal = home(robot)
+    guesses = goal + np.random.default_rng(6).uniform(-0.2, 0.2, (60, robot.size))
     travel = []
     for weight in (0.1, 100.0):
-        weights = np.ones(chain.size)
-        weights[:3] = weight
-        z, found = solver.solve(
-            seeds, target, lower=lower, upper=upper, weights=weights, iterations=30
-        )
+        weights = np.concatenate([np.full(3, weight), np.ones(robot.size - 3)])
+        z, found = solve(robot, guesses, place(robot, goal), weights=weights)
         assert found.mean() > 0.8
-        travel.append(np.abs(z - seeds)[found, :3].sum(axis=1).mean())
+        travel.append(np.abs(z - guesses)[found, :3].sum(axis=1).mean())
     assert travel[1] < 0.3 * travel[0]
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_half_a_turn_away_is_not_taken_for_there(axis: int) -> None:
-    chain = consolidate(door_scene(), {})
-    solver, joint, local = solver_and_frame(chain)
-    start = np.concatenate([[0.0, 0.0, 0.0], chain.robot.home])
-    about = pin.AngleAxis(np.pi, np.eye(3)[axis]).matrix()
-    target = placement(chain, joint, local, start) * pin.SE3(about, np.zeros(3))
-    residual, _ = solver.evaluate(start[None], target)
-    assert np.linalg.norm(residual[0, 3:]) > 0.5
-    lower, upper = limits(chain)
-    z, found = solver.solve(
-        start[None], target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=60
-    )
-    assert found.all() == (errors(chain, joint, local, z, target) < 3e-6).all()
+@pytest.mark.parametrize("axis", range(3))
+def test_half_turns_are_no_solutions(robot: VirtualKinematicChain, axis: int) -> None:
+    start = home(robot)
+    half_turn = pin.SE3(pin.exp3(np.pi * np.eye(3)[axis]), np.zeros(3))
+    solve(robot, start[None], place(robot, start) * half_turn)
 
 
-# --- points, and what stands upright
-# ----------------------------------------------------------------------------------
+@pytest.mark.parametrize("axis", range(2))
+def test_upside_down_frames_are_turned_upright(robot: VirtualKinematicChain, axis: int) -> None:
+    """The gradient of a plain tilt vanishes there."""
+    start = home(robot)
+    here = place(robot, start)
+    target = pin.SE3(pin.exp3(np.pi * np.eye(3)[axis]) @ here.rotation, here.translation)
+    assert compute_tilt(here, target) == pytest.approx(np.pi, abs=1e-6)
+    others = np.random.default_rng(9).uniform(-0.3, 0.3, (40, robot.size))
+    guesses = start + np.vstack([np.zeros(robot.size), others])
+    _, found = solve(robot, guesses, target, "upright")
+    assert found[0]
+    assert found.mean() > 0.5
 
 
-def tilt(placement: pin.SE3, target: pin.SE3) -> float:
-    """Return the angle [rad] between the body's and the target's vertical."""
-    vertical = target.rotation.T @ np.array([0.0, 0.0, 1.0])
-    return float(np.arccos(np.clip((placement.rotation @ vertical)[2], -1.0, 1.0)))
-
-
-@pytest.mark.parametrize(("kind", "rows"), [("point", 3), ("upright", 5)])
-def test_residuals_and_jacobians_of_other_goals(
-    chain: VirtualKinematicChain, kind: str, rows: int
-) -> None:
-    _, joint, local = solver_and_frame(chain)
-    solver = PoseSolver(chain.model, PoseRow(joint, local, (), kind))
-    z = random_configurations(chain.lower, chain.upper, 10, np.random.default_rng(7))
-    target = placement(chain, joint, local, z[0])
-    assert (solver.rows, solver.size) == (rows, chain.size)
-    residual, jacobian = solver.evaluate(z, target)
-    assert residual.shape == (10, rows)
-    assert jacobian.shape == (10, rows, chain.size)
-    np.testing.assert_allclose(residual[0], 0.0, atol=1e-9)
-    for row in range(10):
-        at = placement(chain, joint, local, z[row])
-        np.testing.assert_allclose(
-            residual[row, :3], at.translation - target.translation, rtol=0.0, atol=1e-9
-        )
-        if kind == "upright":
-            assert np.linalg.norm(residual[row, 3:]) == pytest.approx(
-                2 * np.sin(tilt(at, target) / 2), abs=1e-7
-            )
-        change = 1e-6 * np.eye(chain.size)
-        ahead, behind = (
-            solver.evaluate(z[row] + change, target)[0],
-            solver.evaluate(z[row] - change, target)[0],
-        )
-        np.testing.assert_allclose(jacobian[row], (ahead - behind).T / 2e-6, rtol=0.0, atol=1e-6)
-
-
-@pytest.mark.parametrize("kind", ["point", "upright"])
-def test_other_goals_are_reached_within_limits_at_what_orientation_they_leave(
-    chain: VirtualKinematicChain, kind: str
-) -> None:
-    _, joint, local = solver_and_frame(chain)
-    solver, (lower, upper) = PoseSolver(chain.model, PoseRow(joint, local, (), kind)), limits(chain)
-    rng = np.random.default_rng(8)
-    solved, turned = 0, 0.0
-    targets = random_configurations(chain.lower, chain.upper, 8, rng, arena=1.0)
-    for row in targets:
-        target = placement(chain, joint, local, row)
-        seeds = np.clip(row + rng.uniform(-0.7, 0.7, (30, chain.size)), chain.lower, chain.upper)
-        z, found = solver.solve(
-            seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=25
-        )
-        assert np.all((z >= lower) & (z <= upper))
-        for at in (placement(chain, joint, local, row) for row in z[found]):
-            assert np.linalg.norm(at.translation - target.translation) < 3e-6
-            if kind == "upright":
-                assert tilt(at, target) < 3e-6
-            turned = max(turned, float(np.linalg.norm(pin.log3(target.rotation.T @ at.rotation))))
-        solved += int(found.sum())
-    assert solved > 0.7 * 30 * len(targets)
-    assert turned > 0.3  # it makes use of the freedom
-
-
-def test_what_hangs_upside_down_is_turned_upright() -> None:
-    """A hand that points up is to point down: the gradient of a plain tilt vanishes there."""
-    chain = consolidate(door_scene(), {})
-    _, joint, local = solver_and_frame(chain)
-    solver, (lower, upper) = (
-        PoseSolver(chain.model, PoseRow(joint, local, (), "upright")),
-        limits(chain),
-    )
-    start = np.concatenate([[0.0, 0.0, 0.0], chain.robot.home])
-    here = placement(chain, joint, local, start)
-    for axis in np.eye(3)[:2]:
-        target = pin.SE3(pin.exp3(np.pi * axis) @ here.rotation, here.translation)
-        assert tilt(here, target) == pytest.approx(np.pi, abs=1e-6)
-        seeds = start + np.vstack(
-            [np.zeros(chain.size), np.random.default_rng(9).uniform(-0.3, 0.3, (40, chain.size))]
-        )
-        residual, _ = solver.evaluate(seeds[:1], target)
-        assert np.linalg.norm(residual[0, 3:]) > 1.0
-        z, found = solver.solve(
-            seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=60
-        )
-        assert found[0]
-        assert found.mean() > 0.5
-        for row in z[found]:
-            at = placement(chain, joint, local, row)
-            assert tilt(at, target) < 3e-6
-            assert np.linalg.norm(at.translation - target.translation) < 3e-6
-
-
-# --- short of a place, along a direction that another joint has
-# -------------------------------------------------------
-
-
-def test_residuals_and_jacobians_with_a_shift(chain: VirtualKinematicChain) -> None:
-    """The shift is fixed in another joint's frame, such as a hand's approach direction."""
-    _, joint, local = solver_and_frame(chain)
-    hand, vector = chain.robot.model.njoints - 1, (0.03, -0.05, 0.08)
-    z = random_configurations(chain.lower, chain.upper, 10, np.random.default_rng(10))
-    target = placement(chain, joint, local, z[0])
-    for kind in ("pose", "point", "upright"):
-        solver = PoseSolver(chain.model, PoseRow(joint, local, (), kind, (hand, vector)))
-        plain = PoseSolver(chain.model, PoseRow(joint, local, (), kind))
-        residual, jacobian = solver.evaluate(z, target)
-        shifted = np.array(
-            [
-                placement(chain, hand, pin.SE3.Identity(), row).rotation @ np.array(vector)
-                for row in z
-            ]
-        )
-        np.testing.assert_allclose(
-            residual[:, :3], plain.evaluate(z, target)[0][:, :3] + shifted, rtol=0.0, atol=1e-9
-        )
-        np.testing.assert_allclose(
-            residual[:, 3:], plain.evaluate(z, target)[0][:, 3:], rtol=0.0, atol=1e-9
-        )
-        change = 1e-6 * np.eye(chain.size)
-        for row in range(10):
-            ahead, behind = (
-                solver.evaluate(z[row] + change, target)[0],
-                solver.evaluate(z[row] - change, target)[0],
-            )
-            np.testing.assert_allclose(
-                jacobian[row, :3], (ahead - behind).T[:3] / 2e-6, rtol=0.0, atol=1e-6
-            )
-        np.testing.assert_allclose(
-            jacobian[:, 3:], plain.evaluate(z, target)[1][:, 3:], rtol=0.0, atol=1e-9
-        )
-
-
-def test_a_hand_that_is_short_of_its_goal_along_its_approach() -> None:
-    chain = consolidate(door_scene(), {})
-    _, joint, local = solver_and_frame(chain)
-    goal = np.concatenate([[0.5, -0.3, 0.4], chain.robot.home])
-    target = placement(chain, joint, local, goal)
-    vector = 0.08 * local.rotation[:, 2]
-    solver = PoseSolver(
-        chain.model, PoseRow(joint, local, (), "pose", (joint, tuple(vector.tolist())))
-    )
-    seeds = goal + np.random.default_rng(11).uniform(-0.3, 0.3, (40, chain.size))
-    lower, upper = limits(chain)
-    z, found = solver.solve(
-        seeds, target, lower=lower, upper=upper, weights=np.ones(chain.size), iterations=25
-    )
+def test_hand_stops_short_of_its_goal_along_the_approach(robot: VirtualKinematicChain) -> None:
+    goal = home(robot, 0.5, -0.3, 0.4)
+    joint, local = last_frame(robot)
+    shift = (joint, tuple((0.08 * local.rotation[:, 2]).tolist()))
+    guesses = goal + np.random.default_rng(11).uniform(-0.3, 0.3, (40, robot.size))
+    z, found = solve(robot, guesses, place(robot, goal), shift=shift)
     assert found.mean() > 0.8
-    back = target * pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.08]))
-    assert np.all(errors(chain, joint, local, z[found], back) < 3e-6)
+    short = place(robot, goal) * pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.08]))
+    assert all(compute_error("pose", place(robot, row), short) < 3e-6 for row in z[found])

@@ -20,7 +20,7 @@ from helpers.small_problems import (
 from vkc_pin.planning.chain.collision_pairs import build_phase_geometries
 from vkc_pin.planning.chain.contacts import Contacts
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.utils.budget import Budget, SpentError
+from vkc_pin.utils.budget import Budget, BudgetExhaustedError
 from vkc_pin.world.task.steps import Actuate, GoTo
 
 CURVED = {"Cylinder", "Cone", "Capsule", "Sphere", "Ellipsoid"}
@@ -276,9 +276,9 @@ def test_evaluations_are_charged_to_the_budget() -> None:
         (lambda: problem.contacts.first_blocked(z, 1, reach=0.0, allowed=1.0), 5),
         (lambda: problem.contacts.first_blocked(inside, 1, reach=0.1, allowed=0.01), 3),
     ):
-        with Budget().running() as budget:
+        with Budget().activate() as budget:
             found = evaluate()
-        assert budget.used == expected
+        assert budget.evaluations == expected
     assert found == 2
-    with Budget(seconds=0.0).running(), pytest.raises(SpentError):
+    with Budget(seconds=0.0).activate(), pytest.raises(BudgetExhaustedError):
         build_phase_geometries(door_scene(), problem.chain, problem.task, SHORT)

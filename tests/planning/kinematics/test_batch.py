@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from vkc_pin.planning.kinematics.batch import _MAX_BUFFERS, BatchFunction
+from vkc_pin.planning.kinematics.batch import BatchFunction
 
 
 def make() -> ca.Function:
@@ -19,32 +19,25 @@ def make() -> ca.Function:
     return ca.Function("f", [x, y], [ca.densify(matrix), ca.sumsqr(x) + y[1]])
 
 
+FUNCTION = make()
+
+
 def one_by_one(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    function = make()
-    found = [function(a, b) for a, b in zip(x, np.broadcast_to(y, (len(x), 2)), strict=True)]
+    found = [FUNCTION(a, b) for a, b in zip(x, np.broadcast_to(y, (len(x), 2)), strict=True)]
     return np.array([np.asarray(m).ravel(order="F") for m, _ in found]), np.array(
         [np.asarray(s).ravel() for _, s in found]
     )
 
 
-@pytest.mark.parametrize("batch", [1, 2, 7, 300])
-def test_rows_are_those_of_the_function_with_entries_by_column(batch: int) -> None:
-    rng = np.random.default_rng(batch)
-    x, y = rng.normal(size=(batch, 3)), rng.normal(size=(batch, 2))
-    matrix, number = BatchFunction(make())(x, y)
-    expected = one_by_one(x, y)
-    assert matrix.shape == (batch, 6)
-    assert number.shape == (batch, 1)
-    np.testing.assert_allclose(matrix, expected[0], rtol=0.0, atol=1e-14)
-    np.testing.assert_allclose(number, expected[1], rtol=0.0, atol=1e-14)
-
-
-def test_one_row_for_all() -> None:
-    rng = np.random.default_rng(0)
-    x, y = rng.normal(size=(5, 3)), rng.normal(size=2)
-    np.testing.assert_allclose(
-        BatchFunction(make())(x, y)[0], one_by_one(x, y)[0], rtol=0.0, atol=1e-14
-    )
+def test_batch_evaluation_equals_single_evaluations() -> None:
+    """Batch sizes may change; inputs may be one row for all, not contiguous, or integers."""
+    function, rng = BatchFunction(make()), np.random.default_rng(0)
+    for batch in [*range(1, 330, 16), 3, 1, 2]:
+        x, y = rng.normal(size=(batch, 3)), rng.normal(size=(batch, 2))
+        integers = np.arange(6 * batch)[::-1].reshape(batch, 6)[:, ::2] % 7
+        for inputs in ((x, y), (x, y[0]), (integers, np.asfortranarray(y))):
+            for found, expected in zip(function(*inputs), one_by_one(*inputs), strict=True):
+                np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12)
 
 
 def test_results_are_the_callers_own() -> None:
@@ -59,24 +52,7 @@ def test_results_are_the_callers_own() -> None:
     np.testing.assert_array_equal(function(first, y)[0], kept_before)
 
 
-def test_sizes_may_change_from_call_to_call() -> None:
-    function, rng = BatchFunction(make()), np.random.default_rng(0)
-    for batch in [*range(1, 2 * _MAX_BUFFERS), 3, 1, 2 * _MAX_BUFFERS - 1, 3]:
-        x, y = rng.normal(size=(batch, 3)), rng.normal(size=(batch, 2))
-        np.testing.assert_allclose(function(x, y)[0], one_by_one(x, y)[0], rtol=0.0, atol=1e-14)
-
-
-def test_arrays_need_not_be_contiguous_nor_of_floats() -> None:
-    x, y = (
-        np.arange(24)[::-1].reshape(4, 6)[:, ::2],
-        np.asfortranarray(np.arange(8.0).reshape(4, 2)),
-    )
-    np.testing.assert_allclose(
-        BatchFunction(make())(x, y)[0], one_by_one(x, y)[0], rtol=0.0, atol=1e-12
-    )
-
-
 @pytest.mark.parametrize("shapes", [[(4, 3), (5, 2)], [(4, 2), (4, 2)], [(4, 3), (4, 3)], [(4, 3)]])
-def test_wrong_shapes_are_refused(shapes: list[tuple[int, ...]]) -> None:
+def test_wrong_shapes_are_rejected(shapes: list[tuple[int, ...]]) -> None:
     with pytest.raises(ValueError, match=r"shape|argument"):
         BatchFunction(make())(*(np.zeros(shape) for shape in shapes))

@@ -41,16 +41,11 @@ def unbounded_unaligned() -> pin.JointModel:
 JOINTS: dict[str, Callable[[], object]] = {
     "planar": pin.JointModelPlanar,
     "revolute_x": pin.JointModelRX,
-    "revolute_y": pin.JointModelRY,
     "revolute_z": pin.JointModelRZ,
     "revolute_unaligned": lambda: pin.JointModelRevoluteUnaligned(AXIS),
     "unbounded_x": pin.JointModelRUBX,
-    "unbounded_y": pin.JointModelRUBY,
-    "unbounded_z": pin.JointModelRUBZ,
     "unbounded_unaligned": unbounded_unaligned,
-    "prismatic_x": pin.JointModelPX,
     "prismatic_y": pin.JointModelPY,
-    "prismatic_z": pin.JointModelPZ,
     "prismatic_unaligned": lambda: pin.JointModelPrismaticUnaligned(AXIS),
     "composite": composite,
     "spherical": pin.JointModelSpherical,
@@ -136,56 +131,37 @@ def test_kinematics_and_dynamics_equal_numeric_pinocchio(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", JOINTS)
-@pytest.mark.parametrize("reference", ["local_world_aligned", "local", "world"])
-def test_frame_jacobian_equals_numeric_pinocchio(kind: str, reference: str) -> None:
+def test_frame_jacobian_equals_numeric_pinocchio(kind: str) -> None:
     model = tree(*dict.fromkeys(("planar", kind)))
-    frame = model.getFrameId(f"{kind}_tip")
-    jacobian = cpin.frame_jacobian(model, f"{kind}_tip", reference)  # type: ignore[arg-type]
-    axes = {"local_world_aligned": pin.LOCAL_WORLD_ALIGNED, "local": pin.LOCAL, "world": pin.WORLD}[
-        reference
-    ]
-    data = model.createData()
-    for q in configurations(model):
-        expected = pin.computeFrameJacobian(model, data, q, frame, axes)
-        np.testing.assert_allclose(jacobian(q).full(), expected, atol=TOLERANCE, rtol=0)
+    frame, data = model.getFrameId(f"{kind}_tip"), model.createData()
+    for reference in ("local_world_aligned", "local", "world"):
+        jacobian = cpin.frame_jacobian(model, f"{kind}_tip", reference)
+        axes = getattr(pin, reference.upper())
+        for q in configurations(model, 2):
+            expected = pin.computeFrameJacobian(model, data, q, frame, axes)
+            np.testing.assert_allclose(jacobian(q).full(), expected, atol=TOLERANCE, rtol=0)
 
 
-def test_first_derivatives_equal_differences_of_numeric_pinocchio(arm: pin.Model) -> None:
-    coordinates = Coordinates(arm)
-    z = casadi.SX.sym("z", coordinates.size)
-    placements = casadi.vec(casadi.densify(cpin.joint_placements(arm)(coordinates.q_symbolic(z))))
-    jacobian = casadi.Function("jacobian", [z], [casadi.jacobian(placements, z)])
-    point, step = np.random.default_rng(2).normal(size=coordinates.size), 1e-6
-    for i, direction in enumerate(np.eye(coordinates.size)):
-        ahead, behind = (
-            numeric_placements(arm, coordinates.q(point + sign * step * direction))
-            for sign in (1, -1)
-        )
-        difference = ((ahead - behind) / (2 * step)).ravel(order="F")
-        np.testing.assert_allclose(jacobian(point).full()[:, i], difference, atol=1e-7)
-
-
-def test_second_derivatives_equal_differences_of_numeric_pinocchio(arm: pin.Model) -> None:
+def test_derivatives_equal_differences_of_numeric_pinocchio(arm: pin.Model) -> None:
     coordinates, random = Coordinates(arm), np.random.default_rng(4)
     n, step = coordinates.size, 1e-4
     weights = random.normal(size=(12, arm.njoints - 1))
     z = casadi.SX.sym("z", n)
     value = casadi.dot(weights, cpin.joint_placements(arm)(coordinates.q_symbolic(z)))
-    hessian = casadi.Function("hessian", [z], [casadi.hessian(value, z)[0]])
+    derivatives = casadi.Function("derivatives", [z], casadi.hessian(value, z))
     point = random.normal(size=n)
 
     def numeric(at: np.ndarray) -> float:
         return float(np.sum(weights * numeric_placements(arm, coordinates.q(at))))
 
-    for _ in range(20):
-        direction = random.normal(size=n)
-        difference = (
-            numeric(point + step * direction)
-            - 2 * numeric(point)
-            + numeric(point - step * direction)
-        ) / step**2
-        exact = direction @ hessian(point).full() @ direction
-        assert exact == pytest.approx(difference, rel=1e-5, abs=1e-4)
+    hessian, gradient = (part.full().squeeze() for part in derivatives(point))
+    for direction in random.normal(size=(20, n)):
+        ahead, behind = numeric(point + step * direction), numeric(point - step * direction)
+        slope = (ahead - behind) / (2 * step)
+        assert direction @ gradient == pytest.approx(slope, rel=1e-5, abs=1e-5)
+        curvature = (ahead - 2 * numeric(point) + behind) / step**2
+        exact = direction @ hessian @ direction
+        assert exact == pytest.approx(curvature, rel=1e-5, abs=1e-4)
 
 
 def test_dynamics_derivatives_equal_numeric_pinocchio() -> None:
@@ -209,18 +185,13 @@ def test_dynamics_derivatives_equal_numeric_pinocchio() -> None:
 
 
 def test_functions_name_their_inputs_and_outputs(arm: pin.Model) -> None:
-    joints, torque = cpin.joint_placements(arm), cpin.rnea(arm)
-    assert (joints.name(), joints.name_in(), joints.name_out()) == (
-        "joint_placements",
-        ["q"],
-        ["M"],
-    )
-    assert joints.size_in(0) == (arm.nq, 1)
-    assert joints.size_out(0) == (12, arm.njoints - 1)
-    assert (torque.name_in(), torque.name_out()) == (["q", "v", "a"], ["tau"])
-    assert torque.size_out(0) == (arm.nv, 1)
-    assert cpin.center_of_mass(arm).name_out() == ["com"]
-    assert cpin.frame_jacobian(arm, "planar_tip").name_out() == ["J"]
+    for function, inputs, output in (
+        (cpin.joint_placements(arm), ["q"], "M"),
+        (cpin.rnea(arm), ["q", "v", "a"], "tau"),
+        (cpin.center_of_mass(arm), ["q"], "com"),
+        (cpin.frame_jacobian(arm, "planar_tip"), ["q"], "J"),
+    ):
+        assert (function.name_in(), function.name_out()) == (inputs, [output])
 
 
 def test_rounded_quarter_turns_add_no_instructions() -> None:
@@ -240,28 +211,16 @@ def test_rounded_quarter_turns_add_no_instructions() -> None:
     assert cpin.joint_placements(planar).nnz_out() == 7  # c, s, -s, c, 1, x, y
 
 
-def test_infinite_limits_do_not_matter(arm: pin.Model) -> None:
-    model = arm.copy()
-    model.lowerPositionLimit, model.upperPositionLimit = (
-        np.full(model.nq, -np.inf),
-        np.full(model.nq, np.inf),
-    )
-    q = next(configurations(arm))
-    np.testing.assert_allclose(
-        cpin.joint_placements(model)(q).full(), numeric_placements(arm, q), atol=TOLERANCE
-    )
+def test_models_without_joints_and_empty_frame_lists() -> None:
+    model = pin.Model()
+    assert cpin.joint_placements(model).size_out(0) == (12, 0)
+    assert cpin.frame_placements(model, []).size_out(0) == (12, 0)
 
 
 def test_model_is_not_modified(arm: pin.Model) -> None:
     before = arm.copy()
     cpin.joint_placements(arm)
     assert arm == before
-
-
-def test_models_without_joints_and_empty_frame_lists() -> None:
-    model = pin.Model()
-    assert cpin.joint_placements(model).size_out(0) == (12, 0)
-    assert cpin.frame_placements(model, []).size_out(0) == (12, 0)
 
 
 def test_frames_by_index_and_single_name(arm: pin.Model) -> None:
@@ -284,7 +243,7 @@ def test_unknown_names_are_rejected(arm: pin.Model) -> None:
         cpin.frame_jacobian(arm, "planar_tip", "locale")  # type: ignore[arg-type]
 
 
-def test_ambiguous_frame_names_are_refused(arm: pin.Model) -> None:
+def test_ambiguous_frame_names_are_rejected(arm: pin.Model) -> None:
     model = arm.copy()
     for parent, kind in ((1, pin.FrameType.OP_FRAME), (2, pin.FrameType.SENSOR)):
         model.addFrame(pin.Frame("twice", parent, 0, pin.SE3.Identity(), kind))
@@ -293,7 +252,7 @@ def test_ambiguous_frame_names_are_refused(arm: pin.Model) -> None:
 
 
 @pytest.mark.parametrize("installed", ["4.10.0", "5.1.0", "4.0.3"])
-def test_another_release_is_refused(installed: str) -> None:
+def test_other_releases_are_rejected(installed: str) -> None:
     with pytest.raises(
         BuildError, match=rf"pin 4\.1\.0, but {installed} is installed.*pip install 'pin==4\.1\.\*'"
     ):
@@ -302,15 +261,11 @@ def test_another_release_is_refused(installed: str) -> None:
         )
 
 
-def test_a_patch_release_is_accepted() -> None:
-    backends.check_versions(
-        {"pin": "4.1.0", "casadi": "3.8.2"}, {"pin": "4.1.12", "casadi": "3.8.2+local"}
-    )
-
-
-def test_an_unreadable_version_is_a_build_error() -> None:
+def test_patch_releases_are_accepted() -> None:
+    built, installed = {"pin": "4.1.0", "casadi": "3.8.2"}, {"pin": "4.1.12", "casadi": "3.8.2+x"}
+    backends.check_versions(built, installed)
     with pytest.raises(BuildError, match="cannot read the version 'unknown'"):
-        backends.check_versions({"pin": "4.1.0"}, {"pin": "unknown"})
+        backends.check_versions(built, {**installed, "pin": "unknown"})
 
 
 def test_a_missing_extension_says_what_to_install(
@@ -352,29 +307,19 @@ def test_upstream_equals_compiled(arm: pin.Model) -> None:
         np.testing.assert_allclose(one, other, atol=TOLERANCE)
 
 
-@pytest.mark.parametrize(
-    "first",
-    ["casadi", "pinocchio", "vkc_pin.planning.kinematics", "vkc_pin.planning.kinematics.backends"],
-)
-def test_any_order_of_import_works(first: str) -> None:
+@pytest.mark.parametrize("first", ["casadi", "pinocchio", "vkc_pin.planning.kinematics"])
+def test_compiled_module_is_imported_at_first_use(first: str) -> None:
+    """Whatever is imported first."""
     code = f"""
 import {first}
-import casadi, pinocchio, vkc_pin.planning.kinematics
+import sys, casadi, pinocchio, vkc_pin.planning.kinematics as cpin
+assert "vkc_pin.planning.kinematics._cpin" not in sys.modules
 model = pinocchio.Model()
 model.addJoint(0, pinocchio.JointModelRZ(), pinocchio.SE3.Identity(), "j")
-print(vkc_pin.planning.kinematics.joint_placements(model)(0.5)[0])
+print(cpin.joint_placements(model)(0.5)[0])
 """
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
     )
     assert done.returncode == 0, done.stderr
     assert float(done.stdout) == pytest.approx(np.cos(0.5))
-
-
-def test_the_compiled_module_is_loaded_at_first_use() -> None:
-    name = "vkc_pin.planning.kinematics"
-    code = f"import sys, {name}; print('{name}._cpin' in sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
-    )
-    assert done.stdout.strip() == "False"

@@ -28,34 +28,19 @@ def test_demo_has_no_violations() -> None:
 
 
 def test_goals_beyond_limits_of_every_kind() -> None:
-    drawer = problem(vkc.load_scene("drawer"), vkc.Actuate("drawer", {"slide": 0.6}))
-    (violation,) = find_impossible_conditions(drawer)
-    assert (violation.constraint, violation.subject, violation.unit) == (
-        "goal",
-        "drawer.slide",
-        "m",
-    )
-    assert violation.amount == pytest.approx(0.2)
-    assert violation.waypoint == drawer.segments
-    first, second = find_impossible_conditions(
-        problem(door_scene(), vkc.Actuate("door", {"hinge": -2.0}), vkc.GoTo(0.0, 3.0))
-    )
-    assert (first.subject, first.unit, second.subject, second.unit) == (
-        "door.hinge",
-        "rad",
-        "base_y",
-        "m",
-    )
+    steps = [vkc.Actuate("door", {"hinge": -2.0}), vkc.GoTo(0.0, 3.0)]
+    first, second = find_impossible_conditions(problem(door_scene(), *steps))
+    assert first.constraint == second.constraint == "goal"
+    assert (first.subject, first.unit) == ("door.hinge", "rad")
+    assert (second.subject, second.unit) == ("base_y", "m")
     assert (first.amount, second.amount) == (pytest.approx(0.43), pytest.approx(0.9))
     assert first.waypoint < second.waypoint
 
 
 def test_goal_at_the_limit_is_allowed() -> None:
     scene = door_scene()
-    assert find_impossible_conditions(problem(scene, vkc.Actuate("door", {"hinge": 1.57}))) == []
-    assert (
-        find_impossible_conditions(problem(scene, vkc.GoTo(scene.arena[1], scene.arena[3]))) == []
-    )
+    steps = [vkc.Actuate("door", {"hinge": 1.57}), vkc.GoTo(scene.arena[1], scene.arena[3])]
+    assert find_impossible_conditions(problem(scene, *steps)) == []
 
 
 def test_start_in_contact() -> None:
@@ -85,54 +70,42 @@ def test_links_of_several_shapes_are_listed_once() -> None:
     assert len(subjects) == len(set(subjects))
 
 
-@pytest.mark.parametrize("gap", [1e-3, 1e-17, 0.0, -5e-5, -2e-3])
+@pytest.mark.parametrize("gap", [1e-3, 0.0, -2e-3])
 def test_attached_object_may_rest_on_another_at_the_start(gap: float) -> None:
     down = reaching(tool_at(STICK), above(STICK))
-    held = room(table(gap=gap)).with_start(base=down[:3], arm=down[3:]).with_held({"stick": "grip"})
+    scene = room(table(gap=gap)).with_start(base=down[:3], arm=down[3:])
+    held = scene.with_held({"stick": "grip"})
     assert find_impossible_conditions(problem(held, vkc.GoTo(0.0, 1.0))) == []
-    inside = box(
-        "table", [0.5, 2.4, 0.02], [0.8, 0.0, TOP - 0.01 + 0.002]
-    )  # the arm, which holds nothing there, in a block
-    block = room(inside, box("block", [0.2, 0.2, 0.2], [float(down[0]), float(down[1]), 0.3]))
-    start = block.with_start(base=down[:3], arm=down[3:]).with_held({"stick": "grip"})
-    assert {
-        v.constraint for v in find_impossible_conditions(problem(start, vkc.GoTo(0.0, 1.0)))
-    } == {"start"}
+
+
+def test_robot_with_an_attached_object_may_not_start_inside_a_block() -> None:
+    down = reaching(tool_at(STICK), above(STICK))
+    top = box("table", [0.5, 2.4, 0.02], [0.8, 0.0, TOP - 0.01 + 0.002])
+    block = box("block", [0.2, 0.2, 0.2], [float(down[0]), float(down[1]), 0.3])
+    start = room(top, block).with_start(base=down[:3], arm=down[3:]).with_held({"stick": "grip"})
+    found = find_impossible_conditions(problem(start, vkc.GoTo(0.0, 1.0)))
+    assert {violation.constraint for violation in found} == {"start"}
 
 
 def test_residual_of_an_unreachable_target_is_reported() -> None:
-    ((line, short_by),) = diagnose_goals(
-        problem(hall(), vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0))), 0
+    target = problem(hall(), vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0)))
+    (goal,) = diagnose_goals(target, 0)
+    assert goal.text.startswith("reach with tool: out of reach")
+    assert float(goal.text.split("the nearest stays ")[1].split()[0]) == pytest.approx(
+        goal.shortfall, abs=1e-3
     )
-    assert line.startswith("reach with tool: out of reach")
-    short = float(line.split("the nearest stays ")[1].split()[0])
-    assert short_by == pytest.approx(short, abs=1e-3)
-    assert 1.5 < short < 3.0
+    assert 1.5 < goal.shortfall < 3.0
+    assert goal.is_deep
+    assert diagnose_goals(target, 0) == [goal]
 
 
-def test_obstacles_of_all_goal_configurations_are_reported() -> None:
-    ((line, short_by),) = diagnose_goals(
-        problem(hall(obstacles=[CRATE]), vkc.GoTo(1.5, 0.0, 0.0)), 0
-    )
-    assert line.endswith("base_link – crate overlap by 270.0 mm")
-    assert short_by == pytest.approx(0.27 + SHORT.dist_safe)
-
-
-def test_phases_are_diagnosed_separately() -> None:
+def test_obstacles_of_all_goal_configurations_are_reported_by_phase() -> None:
     two = problem(hall(obstacles=[CRATE]), vkc.GoTo(0.2, 0.0, 0.0), vkc.GoTo(1.5, 0.0, 0.0))
     assert diagnose_goal(two, 0, 0) is None
-    assert [diagnose_goal(two, 1, 0)] == diagnose_goals(two, 0)
-
-
-def test_goal_without_a_base_position_is_not_diagnosed() -> None:
-    grasp = problem(door_scene(), vkc.Grasp("door"))
-    assert diagnose_goals(grasp, 0) == diagnose_goals(grasp, 1) == []
-
-
-def test_diagnosis_is_deterministic() -> None:
-    crate = problem(hall(obstacles=[CRATE]), vkc.Reach((1.5, 0.0, 0.2, 0.0, np.pi, 0.0)))
-    assert diagnose_goals(crate, 3) == diagnose_goals(crate, 3)
-    assert diagnose_goals(crate, 3)
+    (goal,) = diagnose_goals(two, 0)
+    assert goal == diagnose_goal(two, 1, 0)
+    assert goal.text.endswith("base_link – crate overlap by 270.0 mm")
+    assert goal.shortfall == pytest.approx(0.27 + SHORT.dist_safe)
 
 
 def test_grasp_is_free_when_placing() -> None:

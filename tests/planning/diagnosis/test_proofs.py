@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from helpers.drives import hall
 from helpers.small_problems import SHORT, program_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin.planning.base_paths.base_path import shortest_path
@@ -29,6 +31,9 @@ def box(name: str, size: Sequence[float], at: Sequence[float], yaw: float = 0.0)
     }
 
 
+FENCE = box("fence", (0.1, 12.0, 1.0), (1.2, 0.0, 0.5))
+
+
 def problem(obstacles: Sequence[dict[str, Any]], *steps: Any) -> vkc.TrajectoryProblem:
     return program_of(hall(obstacles=obstacles), list(steps), options=SHORT)
 
@@ -41,120 +46,103 @@ def gap(width: float) -> list[dict[str, Any]]:
     ]
 
 
-def ring(x: float, y: float, half: float = 1.0) -> list[dict[str, Any]]:
-    sides = {"north": (0, 1), "south": (0, -1), "east": (1, 0), "west": (-1, 0)}
-    return [
-        box(
-            name,
-            (0.1 if u else 2 * half, 0.1 if v else 2 * half, 1.0),
-            (x + half * u, y + half * v, 0.5),
-        )
-        for name, (u, v) in sides.items()
-    ]
-
-
 @pytest.mark.parametrize("step", [vkc.GoTo(3.0, 0.0), vkc.GoTo(3.0, 2.0, 1.0), FAR], ids=str)
 def test_closed_wall_separates_the_goal(step: Any) -> None:
     clutter = [
         box("crate", (0.4, 0.4, 0.4), (0.0, 2.0, 0.2)),
         box("shelf", (0.4, 2.0, 1.0), (5.0, 3.0, 0.5)),
     ]
-    (line,) = find_proofs(
-        problem([box("fence", (0.1, 12.0, 1.0), (1.2, 0.0, 0.5)), *clutter], step)
-    )
+    (line,) = find_proofs(problem([FENCE, *clutter], step))
     assert "no path for the base, " + PROVEN in line
     assert line.endswith("cut off by fence")
 
 
-@pytest.mark.parametrize(("x", "goal"), [(0.0, 4.0), (4.0, 4.0)], ids=["start", "goal"])
-def test_all_sides_of_a_ring_are_named(x: float, goal: float) -> None:
-    (line,) = find_proofs(problem(ring(x, 0.0), vkc.GoTo(goal, 0.0)))
+@pytest.mark.parametrize("x", [0.0, 4.0], ids=["start", "goal"])
+def test_all_sides_of_a_ring_are_named(x: float) -> None:
+    sides = {"north": (0, 1), "south": (0, -1), "east": (1, 0), "west": (-1, 0)}
+    ring = [
+        box(name, (0.1 if u else 2.0, 0.1 if v else 2.0, 1.0), (x + u, v, 0.5))
+        for name, (u, v) in sides.items()
+    ]
+    (line,) = find_proofs(problem(ring, vkc.GoTo(4.0, 0.0)))
     assert line.endswith("cut off by north, south, east, west")
 
 
-@pytest.mark.parametrize("width", [0.3, 0.5, 0.62])
-def test_narrow_gap_is_proven(width: float) -> None:
-    (line,) = find_proofs(problem(gap(width), vkc.GoTo(3.0, 0.0)))
-    assert line.endswith("cut off by left, right")
+@pytest.mark.parametrize("width", [0.3, 0.62, 0.68, 0.85])  # the base is 0.67 m wide
+def test_gap_too_narrow_for_the_base_is_proven(width: float) -> None:
+    lines = find_proofs(problem(gap(width), vkc.GoTo(3.0, 0.0)))
+    assert bool(lines) == (width < 0.67)
+    assert all(line.endswith("cut off by left, right") for line in lines)
 
 
-@pytest.mark.parametrize("width", [0.68, 0.7, 0.85, 2.0])  # the base is 0.67 m wide
-def test_wide_gap_proves_nothing(width: float) -> None:
-    assert find_proofs(problem(gap(width), vkc.GoTo(3.0, 0.0))) == []
-
-
-def test_wall_that_the_arm_reaches_across_proves_nothing() -> None:
-    assert (
-        find_proofs(
-            problem(
-                [box("fence", (0.1, 12.0, 0.6), (1.2, 0.0, 0.3))],
-                vkc.Reach((1.8, 0.0, 1.0, 0.0, np.pi / 2, 0.0)),
-            )
-        )
-        == []
-    )
-
-
-def test_wall_that_the_base_passes_under_proves_nothing() -> None:
-    assert (
-        find_proofs(problem([box("beam", (0.1, 12.0, 0.3), (1.2, 0.0, 1.5))], vkc.GoTo(3.0, 0.0)))
-        == []
-    )
+@pytest.mark.parametrize(
+    ("wall", "step"),
+    [
+        (
+            box("fence", (0.1, 12.0, 0.6), (1.2, 0.0, 0.3)),
+            vkc.Reach((1.8, 0.0, 1.0, 0.0, np.pi / 2, 0.0)),
+        ),
+        (box("beam", (0.1, 12.0, 0.3), (1.2, 0.0, 1.5)), vkc.GoTo(3.0, 0.0)),
+    ],
+    ids=["arm reaches across", "base passes under"],
+)
+def test_passable_wall_proves_nothing(wall: dict[str, Any], step: Any) -> None:
+    assert find_proofs(problem([wall], step)) == []
 
 
 @pytest.mark.parametrize("height", [0.42, 0.47])
 def test_wall_that_the_arm_mount_hits_is_proven(height: float) -> None:
-    beam = box("beam", (0.1, 13.0, 1.0), (1.2, 0.0, 0.5 + height))
-    (line,) = find_proofs(problem([beam], vkc.GoTo(3.0, 0.0)))
+    """The base passes under a shorter one at the arena's edge, with the mount beside it."""
+    longer, shorter = (box("beam", (0.1, y, 1.0), (1.2, 0.0, 0.5 + height)) for y in (13.0, 12.0))
+    (line,) = find_proofs(problem([longer], vkc.GoTo(3.0, 0.0)))
     assert line.endswith("cut off by beam")
-    shorter = {
-        **beam,
-        "size": [0.1, 12.0, 1.0],
-    }  # the base passes under it at the arena's edge, the foot beside it
     assert find_proofs(problem([shorter], vkc.GoTo(3.0, 0.0))) == []
 
 
-def test_blocked_goal_is_proven() -> None:
-    (line,) = find_proofs(
-        problem([box("crate", (0.6, 0.6, 0.4), (1.5, 0.0, 0.2))], vkc.GoTo(1.5, 0.0))
-    )
-    assert line.startswith("go to: no place for the base, " + PROVEN)
-    assert line.endswith("it hits crate")
-
-
-def test_goal_too_high_is_proven() -> None:
-    (line,) = find_proofs(problem([], vkc.Reach((1.5, 0.0, 3.0, 0.0, 0.0, 0.0))))
-    assert line.startswith("reach with tool: out of reach, " + PROVEN)
-
-
 @pytest.mark.parametrize(
-    "obstacles", [[], [box("crate", (0.4, 0.4, 0.4), (0.0, 2.0, 0.2))]], ids=["empty", "crate"]
+    ("step", "begin", "end"),
+    [
+        (vkc.GoTo(1.5, 0.0), "go to: no place for the base, " + PROVEN, "it hits crate"),
+        (
+            vkc.Reach((1.5, 0.0, 3.0, 0.0, 0.0, 0.0)),
+            "reach with tool: out of reach, " + PROVEN,
+            "m long",
+        ),
+        (
+            vkc.Reach((8.0, 0.0, 0.8, np.pi / 2, 0.0, 0.0)),
+            "reach with tool: ",
+            PROVEN + "the goal is in reach from outside the arena alone",
+        ),
+    ],
+    ids=["blocked", "too high", "outside"],
 )
-def test_goal_outside_the_arena_is_proven(obstacles: list[dict[str, Any]]) -> None:
-    (line,) = find_proofs(problem(obstacles, vkc.Reach((8.0, 0.0, 0.8, np.pi / 2, 0.0, 0.0))))
-    assert line.endswith("proven: the goal is in reach from outside the arena alone")
+def test_unreachable_goal_is_proven(step: Any, begin: str, end: str) -> None:
+    (line,) = find_proofs(problem([box("crate", (0.6, 0.6, 0.4), (1.5, 0.0, 0.2))], step))
+    assert line.startswith(begin)
+    assert line.endswith(end)
 
 
 def test_failing_phase_is_named() -> None:
     steps = [vkc.GoTo(-1.0, 0.0), vkc.GoTo(3.0, 0.0)]
-    lines = find_proofs(problem([box("fence", (0.1, 12.0, 1.0), (1.2, 0.0, 0.5))], *steps))
-    assert len(lines) == 1
-    assert lines[0].startswith("go to: ")
-    assert find_proofs(problem([box("fence", (0.1, 12.0, 1.0), (1.2, 0.0, 0.5))], steps[0])) == []
-
-
-def door_room(*steps: Any) -> vkc.TrajectoryProblem:
-    return program_of(vkc.load_scene("door"), list(steps), options=SHORT)
+    (line,) = find_proofs(problem([FENCE], *steps))
+    assert line.startswith("go to: ")
+    assert find_proofs(problem([FENCE], steps[0])) == []
 
 
 def test_closed_door_is_named_unless_opened() -> None:
-    (line,) = find_proofs(door_room(vkc.GoTo(4.0, 0.0)))
+    steps = [vkc.Actuate("door", {"hinge": 1.4}), vkc.GoTo(4.0, 0.0)]
+    blocked, opened = (
+        find_proofs(program_of(vkc.load_scene("door"), own, options=SHORT))
+        for own in (steps[1:], steps)
+    )
+    (line,) = blocked
     assert "door.panel" in line
     assert line.endswith("; door is closed meanwhile")
-    assert find_proofs(door_room(vkc.Actuate("door", {"hinge": 1.4}), vkc.GoTo(4.0, 0.0))) == []
+    assert opened == []
 
 
-@pytest.mark.parametrize("seed", range(40))
+@settings(max_examples=16, deadline=None)
+@given(st.integers(0, 2**32 - 1))
 def test_existing_path_disproves_nothing(seed: int) -> None:
     rng = np.random.default_rng(seed)
     places = rng.uniform(-5.0, 5.0, (70, 2))
@@ -177,15 +165,13 @@ def test_existing_path_disproves_nothing(seed: int) -> None:
         assert find_proofs(own) == []
 
 
-@pytest.mark.parametrize(
-    "name", ["door", "drawer", "corridor_door", "aisle_drawer", "gap_table", "household", "fetch"]
-)
+@pytest.mark.parametrize("name", ["corridor_door", "aisle_drawer", "household", "fetch"])
 def test_nothing_is_proven_for_packaged_scenes(name: str) -> None:
     scene = vkc.load_scene(name)
-    fixed = [
+    fixed = (
         n
         for n, placed in scene.objects.items()
         if not placed.object.free and placed.object.attachments
-    ]
-    for thing in fixed[:3]:
-        assert find_proofs(program_of(scene, [vkc.Grasp(thing)], options=SHORT)) == []
+    )
+    grasp = vkc.Grasp(next(fixed))
+    assert find_proofs(program_of(scene, [grasp], options=SHORT)) == []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import cache
 
 import numpy as np
 import pytest
@@ -14,57 +13,33 @@ from vkc_pin.planning.initialization.approach_paths import ApproachPaths
 from vkc_pin.planning.initialization.beam_search import BeamSearch
 from vkc_pin.planning.initialization.keyframes import KeyframeSampler
 
-FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 
-
-@cache
-def grasp() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
-    """Return the problem of opening the door and a configuration that holds its handle."""
-    problem = program_of(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=FEW)
-    found = BeamSearch(KeyframeSampler(problem, np.random.default_rng(0))).search(thorough=True)
-    return problem, found.paths[int(np.argmin(found.cost)), 1]
-
-
-def approach(*, keeps_base_fixed: bool) -> ApproachPaths:
-    return ApproachPaths(
-        KeyframeSampler(grasp()[0], np.random.default_rng(0)), keeps_base_fixed=keeps_base_fixed
-    )
-
-
-def back(z: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Return the tool's motion from `z` to `near` in its own frame [m], and the turn's cosine."""
-    hand, there = (
-        dataclasses.replace(door_scene(), start=row[:9]).tool_placement() for row in (z, near)
-    )
-    off = hand.inverse() * there
-    return np.array([*off.translation, (np.trace(off.rotation) - 1.0) / 2.0])
-
-
-@pytest.mark.parametrize("keeps_base_fixed", [False, True])
-def test_hand_retreats_straight_from_a_handle(keeps_base_fixed: bool) -> None:
-    problem, z = grasp()
-    (near,) = approach(keeps_base_fixed=keeps_base_fixed).find_approach_start(
-        z, problem.task.phases[0]
-    )
-    np.testing.assert_allclose(back(z, near), [0.0, 0.0, -FEW.approach, 1.0], atol=1e-3)
-    driven = np.abs(near - z)[:3].max()
-    assert driven == 0.0 if keeps_base_fixed else driven > 1e-3
-    assert np.all(near[9:] == z[9:]), "what is grasped stays where it is"
-
-
-def test_base_drives_if_the_arm_alone_cannot_retreat(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem, z = grasp()
-    for metres in (0.6, 1.0):
-        monkeypatch.setattr(problem, "options", dataclasses.replace(FEW, approach=metres))
-        (near,) = approach(keeps_base_fixed=True)._move_tool(z, np.array([0.0, -1.0, 0.0]))
-        alone = approach(keeps_base_fixed=True)._move_tool(
-            z, np.array([0.0, -1.0, 0.0]), drives=False
-        )
-        hand, there = (
-            dataclasses.replace(door_scene(), start=row[:9]).tool_placement() for row in (z, near)
-        )
-        np.testing.assert_allclose(
-            there.translation - hand.translation, [0.0, -metres, 0.0], atol=1e-3
-        )
-        assert (len(alone) == 0) == bool(np.abs(near - z)[:3].max() > 0.0)
-    assert len(alone) == 0, "it reaches a metre further: choose more"
+@pytest.mark.parametrize("length", [0.1, 0.7])
+def test_hand_approaches_and_retreats_straight(length: float) -> None:
+    """A fixed base drives only if the arm alone cannot reach that far."""
+    options = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20, approach=length)
+    steps = [vkc.Actuate("door", {"hinge": 1.2}), vkc.GoTo(-1.0, 0.5)]
+    problem = program_of(door_scene(), steps, options=options)
+    sampler = KeyframeSampler(problem, np.random.default_rng(0))
+    found = BeamSearch(sampler).search(thorough=False)
+    path = found.paths[int(np.argmin(found.cost))]
+    phases = problem.task.phases
+    grasp, release = (path[found.waypoints.index(int(problem.ends[k]))] for k in (0, 2))
+    for keeps_base_fixed in (False, True):
+        paths = ApproachPaths(sampler, keeps_base_fixed=keeps_base_fixed)
+        approach = paths.find_approach_start(grasp, phases[0])
+        retreat = paths.find_retreat_end(release, phases[3], phases[2])
+        for z, (near,) in ((grasp, approach), (release, retreat)):
+            hand, other = (
+                dataclasses.replace(door_scene(), start=row[:9]).tool_placement()
+                for row in (z, near)
+            )
+            offset = hand.inverse() * other
+            np.testing.assert_allclose(offset.translation, [0.0, 0.0, -length], atol=1e-3)
+            np.testing.assert_allclose(offset.rotation, np.eye(3), atol=1e-3)
+            assert np.all(near[9:] == z[9:]), "the door stays where it is"
+        driven = np.abs(approach[0] - grasp)[:3].max()
+        assert (driven > 1e-3) == (not keeps_base_fixed or length == 0.7)
+    alone = ApproachPaths(sampler).find_release_retreat(grasp, phases[3])
+    np.testing.assert_array_equal(alone, approach if length == 0.1 else np.empty((0, len(grasp))))
+    assert len(ApproachPaths(sampler).find_approach_start(release, phases[2])) == 0

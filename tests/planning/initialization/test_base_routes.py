@@ -1,65 +1,63 @@
+"""Tests of base paths around a wall and through gates, and of folded arms."""
+
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.gates import GOAL, NARROW, TIGHT, gated, walled
 from helpers.small_problems import program_of
 
 import vkc_pin as vkc
-from vkc_pin.planning.initialization.base_routes import BaseRoutes
-from vkc_pin.planning.initialization.keyframes import SIMILARITY_TOLERANCE
+from vkc_pin.planning.initialization.base_routes import BaseRoutes, find_folded_arms
+from vkc_pin.planning.initialization.keyframes import SIMILARITY_TOLERANCE, compute_shortfall
 from vkc_pin.planning.initialization.methods import initialize
+
+BEYOND = np.array([4.0, 1.5, 0.0])  # [m], [rad] a pose beyond the wall
 
 
 def test_path_leads_through_the_gap() -> None:
     problem = walled(1.6)
     routes, start = BaseRoutes(problem), problem.start[:3]
-    goal = np.array([4.0, 1.5, 0.0])
-    way = routes.find_path(0, start, goal, 40)
-    assert way is not None
-    assert way.shape == (40, 3)
-    np.testing.assert_allclose(way[-1, :2], goal[:2], atol=1e-9)
-    assert abs((way[-1, 2] - goal[2] + np.pi) % (2 * np.pi) - np.pi) < 1e-9
-    crossing = way[np.argmin(np.abs(way[:, 0] - 2.0))]
-    assert crossing[1] < -1.4  # the wall reaches from y = -1.4 up
-    assert (
-        routes.compute_distances(0, start[None], goal[None])[0]
-        > np.hypot(*(goal[:2] - start[:2])) + 1.0
+    path, guide = (
+        find(0, start, BEYOND, 40) for find in (routes.find_path, routes.find_guide_path)
     )
+    assert path is not None
+    assert guide is not None
+    np.testing.assert_allclose(guide, path, atol=1e-9)
+    assert path.shape == (40, 3)
+    np.testing.assert_allclose(path[-1, :2], BEYOND[:2], atol=1e-9)
+    assert abs((path[-1, 2] + np.pi) % (2 * np.pi) - np.pi) < 1e-9
+    crossing = path[np.argmin(np.abs(path[:, 0] - 2.0))]
+    assert crossing[1] < -1.4  # the wall reaches from y = -1.4 up
+    distance = routes.compute_distances(0, start[None], BEYOND[None])[0]
+    assert distance > np.hypot(*(BEYOND - start)[:2]) + 1.0
 
 
 def test_missing_path_is_noted() -> None:
-    problem = walled(0.0)
-    assert (
-        BaseRoutes(problem).find_path(0, problem.start[:3], np.array([4.0, 1.5, 0.0]), 40) is None
-    )
-    notes: list[str] = []
+    problem, notes = walled(0.0), list[str]()
+    routes = BaseRoutes(problem)
+    assert routes.find_path(0, problem.start[:3], BEYOND, 40) is None
+    assert routes.find_guide_path(0, problem.start[:3], np.array([5.5, 0.0, 0.0]), 40) is None
     assert list(initialize(problem, "astar", 0, notes=notes)) == []
-    assert len(notes) == 1
-    assert "found no path for the base" in notes[0]
-    plan = vkc.plan(problem.scene, [vkc.GoTo(4.0, 1.5, 0.0)], initialization="astar")
-    assert plan.status == "infeasible"
-    assert "no path for the base, proven" in plan.report()
+    (note,) = notes
+    assert "found no path for the base" in note
 
 
 def test_guess_follows_the_path_with_its_heading() -> None:
     problem = walled(1.6)
-    (seed,) = initialize(problem, "astar", 0)
-    assert seed.name == "astar"
-    path = problem.waypoints(seed.z)[:, :3]
+    (guess,) = initialize(problem, "astar", 0)
+    path = problem.waypoints(guess.z)[:, :3]
     steps = np.diff(path[:, :2], axis=0)
-    length = np.linalg.norm(steps, axis=1)
     heading = path[:-1, 2] + np.diff(path[:, 2]) / 2
     along = np.abs(steps[:, 0] * np.cos(heading) + steps[:, 1] * np.sin(heading))
-    assert np.sum(along) > 0.8 * np.sum(length)  # forwards or backwards, not sideways
-    assert problem.evaluate_contacts(seed.z, reach=0.02).compute_violation() < 0.02
+    assert np.sum(along) > 0.8 * np.sum(np.linalg.norm(steps, axis=1))
+    assert problem.evaluate_contacts(guess.z, reach=0.02).compute_violation() < 0.02
 
 
-# --- narrow places
-# ------------------------------------------------------------
-
-
-@pytest.mark.parametrize("width", [NARROW, TIGHT])
+@pytest.mark.parametrize("width", [NARROW, TIGHT, 0.64])  # the base is 0.67 m wide
 def test_folded_arm_fits_through_a_narrow_gate(width: float) -> None:
     problem = gated(width)
     routes, start, goal = BaseRoutes(problem), problem.start[:3], np.array(GOAL)
@@ -67,101 +65,157 @@ def test_folded_arm_fits_through_a_narrow_gate(width: float) -> None:
         routes.compute_distances(0, start[None], goal[None], folded=each)[0]
         for each in (False, True)
     )
-    straight = np.hypot(*(goal - start)[:2])
     assert np.isinf(home)
-    assert straight <= folded < 1.1 * straight
     assert routes.find_path(0, start, goal, 40) is None
     guide = routes.find_guide_path(0, start, goal, 40)
+    if width == 0.64:
+        assert np.isinf(folded)
+        assert guide is None
+        return
+    straight = np.hypot(*(goal - start)[:2])
+    assert straight <= folded < 1.1 * straight
     assert guide is not None
-    assert guide.shape == (40, 3)
     np.testing.assert_allclose(guide[-1], goal, atol=1e-9)
-    through = np.array([[np.interp(2.0, guide[:, 0], guide[:, 1])]])
-    assert abs(through) < 0.03, "it is as wide as the base and a hand"
-    # Nothing but the arm is in the way: with it folded the base hits nothing all along.
-    z = np.tile(problem.start, (len(guide), 1))
+    z = np.tile(problem.start, (40, 1))
     z[:, :3], z[:, 3:] = guide, routes.get_folded_arm(0)
-    assert problem.contacts.evaluate(z, np.ones(len(z), int), reach=0.1).compute_clearance() > 0.0
-
-
-def test_gate_too_narrow_for_the_base_has_no_path() -> None:
-    problem = gated(0.64)
-    routes, start, goal = BaseRoutes(problem), problem.start[:3], np.array(GOAL)
-    assert np.isinf(routes.compute_distances(0, start[None], goal[None], folded=True)[0])
-    assert routes.find_guide_path(0, start, goal, 40) is None
-
-
-def test_grids_are_cached_separately() -> None:
-    routes = BaseRoutes(gated(NARROW))
-    home, folded = routes.get_grid(0), routes.get_grid(0, folded=True)
-    assert home is routes.get_grid(0)
-    assert folded is routes.get_grid(0, folded=True)
-    assert folded is not home
-    assert np.all(folded.step < home.step)
-
-
-def test_guide_is_the_usual_path_if_the_arm_at_home_fits() -> None:
-    problem = walled(1.6)
-    routes, start, goal = BaseRoutes(problem), problem.start[:3], np.array([4.0, 1.5, 0.0])
-    guide, way = routes.find_guide_path(0, start, goal, 40), routes.find_path(0, start, goal, 40)
-    assert guide is not None
-    assert way is not None
-    np.testing.assert_allclose(guide, way, atol=1e-9)
+    assert problem.contacts.evaluate(z, np.ones(40, int), reach=0.1).compute_clearance() > 0.0
 
 
 def test_guide_reaches_goals_within_the_margin() -> None:
-    """Inverse kinematics often leads there."""
+    """Inverse kinematics often leads there; the wall begins at 1.9, the base is 0.5 m long."""
     problem = walled(1.6)
     routes, start = BaseRoutes(problem), problem.start[:3]
-    near, inside = (
-        np.array([1.39, 1.0, 0.0]),
-        np.array([1.5, 1.0, 0.0]),
-    )  # the wall begins at 1.9, the base is 0.5 m long before
-    assert problem.options.dist_safe > 0.01
+    near, colliding = np.array([1.39, 1.0, 0.0]), np.array([1.5, 1.0, 0.0])
     assert routes.find_path(0, start, near, 40) is None
     guide = routes.find_guide_path(0, start, near, 40)
     assert guide is not None
     np.testing.assert_allclose(guide[-1], near, atol=1e-9)
-    assert routes.find_guide_path(0, start, inside, 40) is None
-
-
-def test_guide_to_goals_in_collision_does_not_exist() -> None:
-    problem = walled(0.0)
-    block = np.array([5.5, 0.0, 0.0])  # behind the wall, and so is all that is beside it
-    assert BaseRoutes(problem).find_guide_path(0, problem.start[:3], block, 40) is None
-
-
-def test_folded_arm_is_cached_per_load(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The hand is empty in the first phase, and holds the cup in the second."""
-    problem = program_of(vkc.load_scene("household"), [vkc.Grasp("cup"), vkc.GoTo(1.0, 0.5)])
-    asked: list[int] = []
-
-    def fold(_: object, phase: int, *__: object) -> np.ndarray:
-        asked.append(phase)
-        return np.full((1, 6), float(phase))
-
-    monkeypatch.setattr("vkc_pin.planning.initialization.base_routes.find_folded_arms", fold)
-    routes = BaseRoutes(problem)
-    assert [routes.get_folded_arm(phase)[0] for phase in (0, 1, 0, 1)] == [0.0, 1.0, 0.0, 1.0]
-    assert asked == [0, 1]
+    assert routes.find_guide_path(0, start, colliding, 40) is None
 
 
 def test_similar_starts_share_distances() -> None:
     """Starts on both sides of a wall agree, in one query or several."""
     problem = walled(1.6)
-    goal = np.array([4.0, 1.5, 0.0])
     starts = np.array([[x, y, 0.0] for x in (0.5, 3.5) for y in (-0.55, -0.35, 0.05, 0.85)])
-    together = BaseRoutes(problem).compute_distances(0, starts, np.tile(goal, (len(starts), 1)))
-    alone = [
-        BaseRoutes(problem).compute_distances(0, start[None], goal[None])[0] for start in starts
-    ]
-    np.testing.assert_array_equal(together, alone)
+    goals = np.tile(BEYOND, (len(starts), 1))
+    shared = BaseRoutes(problem)
+    together = shared.compute_distances(0, starts, goals)
+    for start, distance in zip(starts, together, strict=True):
+        assert BaseRoutes(problem).compute_distances(0, start[None], BEYOND[None])[0] == distance
     assert np.abs(np.diff(np.sort(together))).min() > 1e-3
     beside = starts + np.array([0.04, -0.04, 0.0])
-    routes = BaseRoutes(problem)
-    shared = [
-        routes.compute_distances(0, each, np.tile(goal, (len(starts), 1)))
-        for each in (starts, beside)
-    ]
-    np.testing.assert_array_equal(shared[0], shared[1])
-    own = BaseRoutes(problem).compute_distances(0, beside, np.tile(goal, (len(starts), 1)))
-    assert np.abs(own - shared[1]).max() < np.hypot(SIMILARITY_TOLERANCE, SIMILARITY_TOLERANCE)
+    np.testing.assert_array_equal(shared.compute_distances(0, beside, goals), together)
+    own = BaseRoutes(problem).compute_distances(0, beside, goals)
+    assert 0.0 < np.abs(own - together).max() < np.hypot(*[SIMILARITY_TOLERANCE] * 2)
+
+
+# --- folded arms
+
+TASKS = {  # scene, and steps in the last phase of which the load is carried
+    "nothing": ("household", [vkc.GoTo(1.0, 0.5)]),
+    "cup": ("household", [vkc.Grasp("cup"), vkc.GoTo(1.0, 0.5)]),
+    "stick": ("init_1", [vkc.Grasp("stick"), vkc.GoTo(0.0, 0.0)]),
+}
+
+
+@cache
+def carry(load: str) -> vkc.TrajectoryProblem:
+    name, steps = TASKS[load]
+    return program_of(vkc.load_scene(name), steps)
+
+
+def configure(load: str, arm: np.ndarray | None = None) -> np.ndarray:
+    """Return a configuration at the origin with an arm posture. Default: at home."""
+    chain = carry(load).chain
+    z = np.clip(np.zeros(chain.size), chain.lower, chain.upper)
+    z[3:9] = chain.robot.home if arm is None else arm
+    return z
+
+
+@cache
+def find_arms(load: str) -> np.ndarray:
+    p = carry(load)
+    return find_folded_arms(p, len(p.task.phases) - 1, configure(load))
+
+
+def compute_extent(load: str, z: np.ndarray, *, base: bool = False) -> np.ndarray:
+    """Return the bounding box of arm and load or of the base by coal and Pinocchio, (2, 3)."""
+    chain = carry(load).chain
+    data, placed = chain.model.createData(), pin.GeometryData(chain.collision)
+    pin.updateGeometryPlacements(chain.model, data, chain.collision, placed, chain.coordinates.q(z))
+    corners = []
+    for shape, where in zip(chain.collision.geometryObjects, placed.oMg, strict=True):
+        if (shape.parentJoint == 1) if base else (shape.parentJoint > 1):
+            if hasattr(shape.geometry, "points"):
+                points = np.asarray(shape.geometry.points())
+            else:
+                shape.geometry.computeLocalAABB()
+                box = shape.geometry.aabb_local
+                points = np.array(np.meshgrid(*zip(box.min_, box.max_, strict=True)))
+                points = points.reshape(3, -1).T
+            corners.append(points @ where.rotation.T + where.translation)
+    rows = np.vstack(corners)
+    return np.array([rows.min(axis=0), rows.max(axis=0)])
+
+
+@pytest.mark.parametrize("load", TASKS)
+def test_folded_arms_are_compact_and_free(load: str) -> None:
+    """No arm extends further than the first or the base; the package's boxes are larger."""
+    p, arms = carry(load), find_arms(load)
+    assert len(arms) > 10
+    first, home = (
+        compute_extent(load, configure(load, arms[0])),
+        compute_extent(load, configure(load)),
+    )
+    assert np.abs(first[:, 1]).max() < 0.7 * np.abs(home[:, 1]).max()
+    assert first[0, 2] > 0.1, "it is above the floor"
+    assert np.abs(first[:, 0]).max() < 0.7
+    own = compute_extent(load, configure(load), base=True)
+    allowed = np.abs(np.vstack([first, own])).max(axis=0)[:2] + 0.03
+    sizes, robot = [], p.chain.robot
+    data, shapes = robot.model.createData(), robot.collision.createData()
+    for arm in arms:
+        z = configure(load, arm)
+        extent = np.abs(compute_extent(load, z)).max(axis=0)
+        assert np.all(extent[:2] <= allowed)
+        sizes.append(extent.sum())
+        assert np.all((z >= p.chain.lower) & (z <= p.chain.upper))
+        pin.computeDistances(robot.model, data, robot.collision, shapes, robot.coordinates.q(z[:9]))
+        distances = [result.min_distance for result in shapes.distanceResults]
+        assert min(distances) > p.options.dist_safe - 1e-4
+        z[:2] = 50.0  # far from all obstacles only the load can collide
+        contacts = p.contacts.evaluate(z[None], np.array([p.segments]), reach=p.options.dist_safe)
+        assert contacts.compute_violation() == 0.0
+    assert min(sizes) > sizes[0] - 0.03
+    np.testing.assert_array_equal(
+        find_folded_arms(p, len(p.task.phases) - 1, configure(load)), arms
+    )
+
+
+def test_obstacles_do_not_count_for_folded_arms() -> None:
+    """The base is in the wall between the rooms."""
+    p, z = carry("nothing"), configure("nothing")
+    z[:2] = 0.0, 1.25
+    assert compute_shortfall(p, z[None], 1)[0] > 0.1
+    assert compute_shortfall(p, z[None], 1, standing=False)[0] == 0.0
+
+
+def test_nearest_folded_arm_minimizes_the_motion() -> None:
+    """Angles that differ by full turns are the same posture."""
+    p, arms = carry("cup"), find_arms("cup")
+    routes, lower, upper = BaseRoutes(p), p.chain.lower[3:9], p.chain.upper[3:9]
+    np.testing.assert_array_equal(routes.get_folded_arm(1), arms[0])
+    metric, rng = p.chain.metric[3:9], np.random.default_rng(0)
+
+    def measure(arm: np.ndarray) -> np.ndarray:
+        return np.asarray((np.abs(arm - first) + np.abs(arm - last)) @ metric)
+
+    for _ in range(20):
+        first, last = rng.uniform(lower, upper, (2, 6))
+        near = routes.find_nearest_folded_arm(1, first, last)
+        assert np.all((near >= lower) & (near <= upper))
+        turns = (near - arms) / (2.0 * np.pi)
+        assert np.abs(turns - np.round(turns)).max(axis=1).min() < 1e-9
+        for wound in (arms, arms + 2.0 * np.pi, arms - 2.0 * np.pi):
+            is_inside = np.all((wound >= lower) & (wound <= upper), axis=1)
+            assert measure(near) <= measure(wound[is_inside]).min(initial=np.inf) + 1e-9

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -17,6 +19,7 @@ from vkc_pin.planning.initialization.keyframes import (
     sample_goal_configurations,
     sample_smoothstep,
 )
+from vkc_pin.utils.budget import Budget
 
 OPEN = vkc.Actuate("door", {"hinge": 1.2})
 
@@ -31,10 +34,10 @@ def drive() -> vkc.TrajectoryProblem:
     return vkc.build(door_scene(), [vkc.GoTo(0.3, 0.2)], options=SHORT)
 
 
-def knots(
-    problem: vkc.TrajectoryProblem, seed: int = 0, known: KeyframeCache | None = None
+def make_sampler(
+    problem: vkc.TrajectoryProblem, seed: int = 0, cache: KeyframeCache | None = None
 ) -> KeyframeSampler:
-    return KeyframeSampler(problem, np.random.default_rng(seed), known)
+    return KeyframeSampler(problem, np.random.default_rng(seed), cache)
 
 
 def test_the_profile_starts_and_ends_at_rest() -> None:
@@ -59,74 +62,66 @@ def test_object_joints_move_to_their_goals_phase_by_phase(problem: vkc.Trajector
     np.testing.assert_array_equal(z[:, :9], np.tile(problem.start[:9], (problem.segments, 1)))
 
 
-@pytest.mark.parametrize("how", ["scatter", "track", "shake"])
-def test_hand_is_at_the_handle_at_every_waypoint(problem: vkc.TrajectoryProblem, how: str) -> None:
-    search = knots(problem)
-    grasp = int(problem.ends[0])
-    first, found = search.sample(np.tile(problem.start, (64, 1)), grasp, "scatter")
-    assert found.sum() > 10
-    for waypoint in (grasp, grasp + 1, problem.segments):
-        z, found = search.sample(first, waypoint, how)
-        hinge, knob = (
-            search.object_motion[waypoint - 1, problem.chain.index(f"door.{name}")]
-            for name in ("hinge", "knob")
-        )
+def test_samples_hold_the_handle_at_every_waypoint(problem: vkc.TrajectoryProblem) -> None:
+    sampler, grasp, steps = make_sampler(problem), int(problem.ends[0]), {}
+    first, reached = sampler.sample(np.tile(problem.start, (64, 1)), grasp, "scatter")
+    assert reached.sum() > 10
+    columns = [problem.chain.index(f"door.{name}") for name in ("hinge", "knob")]
+    for how, waypoint in itertools.product(
+        ("scatter", "track", "shake"), (grasp, grasp + 1, problem.segments)
+    ):
+        z, found = sampler.sample(first[reached], waypoint, how)
         assert found.any()
+        joints = sampler.object_motion[waypoint - 1, columns]
         for row in z[found]:
-            assert hand_off_the_handle(door_scene(), row[:9], hinge, knob) < 2e-4
-        np.testing.assert_array_equal(
-            z[:, search.object_columns],
-            np.tile(search.object_motion[waypoint - 1, search.object_columns], (len(z), 1)),
-        )
-        arms = slice(3, 9)
-        assert (z[found, arms] >= problem.lower[waypoint - 1, arms] - 1e-9).all()
-        assert (z[found, arms] <= problem.upper[waypoint - 1, arms] + 1e-9).all()
-
-
-def test_track_stays_near_and_scatter_does_not(problem: vkc.TrajectoryProblem) -> None:
-    search, grasp = knots(problem), int(problem.ends[0])
-    z, found = search.sample(np.tile(problem.start, (64, 1)), grasp, "scatter")
-    steps = {}
-    for how in ("scatter", "track", "shake"):
-        after, there = search.sample(z[found], grasp + 1, how)
-        steps[how] = np.median(np.abs(after - z[found])[there, 3:9].max(axis=1))
-    assert steps["track"] < steps["shake"] < steps["scatter"]
+            assert hand_off_the_handle(door_scene(), row[:9], *joints) < 2e-4
+        np.testing.assert_array_equal(z[:, columns], np.tile(joints, (len(z), 1)))
+        lower, upper = (limits[waypoint - 1, 3:9] for limits in (problem.lower, problem.upper))
+        assert np.all((z[found, 3:9] >= lower - 1e-9) & (z[found, 3:9] <= upper + 1e-9))
+        steps[how, waypoint] = np.median(np.abs(z - first[reached])[found, 3:9].max(axis=1))
+    track, shake, scatter = (steps[how, grasp + 1] for how in ("track", "shake", "scatter"))
+    assert track < shake < scatter
 
 
 def test_robots_stay_without_a_pose_constraint(drive: vkc.TrajectoryProblem) -> None:
-    search = knots(drive)
-    assert search.find_pose(1) is None
+    sampler = make_sampler(drive)
+    assert sampler.find_pose(1) is None
     before = np.tile(drive.start, (3, 1)) + np.arange(3)[:, None] * 1e-3
-    z, found = search.sample(before, 1, "track")
+    z, found = sampler.sample(before, 1, "track")
     assert found.all()
     np.testing.assert_array_equal(z, before)
-    assert search.push_clear(z, 1) is z
+    assert sampler.push_clear(z, 1) is z
 
 
-def test_cached_results_are_not_computed_again(
-    problem: vkc.TrajectoryProblem, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cached_results_are_not_computed_again(problem: vkc.TrajectoryProblem) -> None:
     """The random generator continues as without a cache."""
-    known, grasp, start = KeyframeCache(), int(problem.ends[0]), np.tile(problem.start, (16, 1))
-    one, other, alone = knots(problem, 3, known), knots(problem, 3, known), knots(problem, 3)
-    first = one.sample(start, grasp, "scatter")
-    depths = one.compute_shortfall(first[0], grasp)
-    monkeypatch.setattr(KeyframeSampler, "_perturb_arms", None)
-    monkeypatch.setattr("vkc_pin.planning.initialization.keyframes.compute_shortfall", None)
-    for values, same in zip(first, other.sample(start, grasp, "scatter"), strict=True):
-        np.testing.assert_array_equal(values, same)
-    assert one.rng.bit_generator.state == other.rng.bit_generator.state
-    np.testing.assert_array_equal(other.compute_shortfall(first[0][::-1], grasp), depths[::-1])
-    monkeypatch.undo()
-    np.testing.assert_array_equal(alone.sample(start, grasp, "scatter")[0], first[0])
-    assert alone.rng.bit_generator.state == one.rng.bit_generator.state
-    assert not np.array_equal(knots(problem, 4).sample(start, grasp, "scatter")[0], first[0])
+    cache, grasp, start = KeyframeCache(), int(problem.ends[0]), np.tile(problem.start, (16, 1))
+    samplers = [make_sampler(problem, 3), *(make_sampler(problem, 3, cache) for _ in range(2))]
+    results, used = [], []
+    for sampler in samplers:
+        with Budget().running() as budget:
+            drawn = [sampler.sample(start, grasp, "scatter") for _ in range(2)]
+            z = np.concatenate([z for z, _ in drawn])
+            found = np.concatenate([found for _, found in drawn])
+            shortfalls = sampler.compute_shortfall(z, grasp)
+            pushed = sampler.push_clear(z, grasp)
+        results.append([z, found, shortfalls, pushed, sampler.rng.random(3)])
+        used.append(budget.evaluations)
+    assert used[0] == used[1] > used[2] == 0
+    for values in zip(*results, strict=True):
+        np.testing.assert_array_equal(values[0], values[1])
+        np.testing.assert_array_equal(values[0], values[2])
+    z, _, shortfalls, *_ = results[0]
+    assert not np.array_equal(z[:16], z[16:])
+    np.testing.assert_array_equal(samplers[2].compute_shortfall(z[::-1], grasp), shortfalls[::-1])
+    other = make_sampler(problem, 4).sample(start, grasp, "scatter")[0]
+    assert not np.array_equal(other, z[:16])
 
 
 def test_shortfall_is_the_largest_of_any_pair(problem: vkc.TrajectoryProblem) -> None:
     """Against Pinocchio's and coal's distances of all pairs, without culling."""
-    search, grasp = knots(problem), int(problem.ends[0])
-    z, _ = search.sample(np.tile(problem.start, (24, 1)), grasp, "scatter")
+    sampler, grasp = make_sampler(problem), int(problem.ends[0])
+    z, _ = sampler.sample(np.tile(problem.start, (24, 1)), grasp, "scatter")
     part, model = problem.contacts.phases[0], problem.chain.model
     geometry, data = all_pairs(part), model.createData()
     shapes, pairs = pin.GeometryData(geometry), np.arange(len(part.pairs))
@@ -141,16 +136,16 @@ def test_shortfall_is_the_largest_of_any_pair(problem: vkc.TrajectoryProblem) ->
 
 
 def test_free_keyframes_satisfy_the_pose_constraint(problem: vkc.TrajectoryProblem) -> None:
-    search, grasp = knots(problem), int(problem.ends[0])
-    z, found = search.sample(np.tile(problem.start, (64, 1)), grasp, "scatter")
+    sampler, grasp = make_sampler(problem), int(problem.ends[0])
+    z, found = sampler.sample(np.tile(problem.start, (64, 1)), grasp, "scatter")
     away = z[found] + 0.01 * np.eye(problem.chain.size)[0]  # a centimetre from the handle
-    assert (search.compute_shortfall(away, grasp) <= 0.0).any()
-    assert not search.has_free_keyframe(grasp)
-    depths = search.compute_shortfall(z[found], grasp)
+    assert (sampler.compute_shortfall(away, grasp) <= 0.0).any()
+    assert not sampler.has_free_keyframe(grasp)
+    depths = sampler.compute_shortfall(z[found], grasp)
     assert 0 < np.count_nonzero(depths > 0.0) < len(depths)
-    assert search.has_free_keyframe(grasp)
-    assert not search.has_free_keyframe(grasp + 1)
-    other = knots(problem)
+    assert sampler.has_free_keyframe(grasp)
+    assert not sampler.has_free_keyframe(grasp + 1)
+    other = make_sampler(problem)
     other.compute_shortfall(z[found][depths > 0.0], grasp)
     assert not other.has_free_keyframe(grasp)
 

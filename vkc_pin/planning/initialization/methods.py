@@ -25,12 +25,12 @@ from vkc_pin.planning.nlp.merit import Merit, measure_infeasibility
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats, Ints
 
-__all__ = ["INITIALIZATIONS", "initialize"]
+__all__ = ["INITIALIZATIONS", "MAX_GOOD_PENETRATION", "initialize", "interleave_guesses"]
 
 INITIALIZATIONS = ("auto", "interpolated", "astar", "rrt", "stationary")
 # [m] penetration at a waypoint above which other guesses come first, and total shortfall up to
 # which a guess is good enough
-_MAX_GOOD_PENETRATION = 0.045
+MAX_GOOD_PENETRATION = 0.045
 _COMPARED_PATHS = 8  # paths of the beam that are turned into guesses and compared
 _PLACE_SAMPLES = 128  # random places that are compared for each phase end of a stationary guess
 
@@ -77,7 +77,9 @@ def initialize(
         shared = _Shared(problem, random_seed, messages, BaseRoutes(problem), KeyframeCache())
         kinds = ("interpolated", "astar", "rrt") if method == "auto" else (method,)
         check = is_infeasible if method == "auto" else lambda _: False
-        guesses = _interleave(*(_generate_guesses(kind, shared, count, check) for kind in kinds))
+        guesses = interleave_guesses(
+            *(_generate_guesses(kind, shared, count, check) for kind in kinds)
+        )
     rng = np.random.default_rng([random_seed, 1])
     for guess in guesses:
         yield (
@@ -97,7 +99,7 @@ def _generate_guesses(
         yield from _RrtSearch(shared).generate(count)
 
 
-def _interleave(*kinds: Iterator[InitialGuess | None]) -> Iterator[InitialGuess]:
+def interleave_guesses(*kinds: Iterator[InitialGuess | None]) -> Iterator[InitialGuess]:
     """Interleave the initialization methods.
 
     Guesses in collision are postponed until no method offers a collision-free one. Methods are
@@ -114,7 +116,7 @@ def _interleave(*kinds: Iterator[InitialGuess | None]) -> Iterator[InitialGuess]
             except StopIteration:
                 continue
             waiting.append(kind)
-            good = guess is not None and not guess.penetration > _MAX_GOOD_PENETRATION
+            good = guess is not None and not guess.penetration > MAX_GOOD_PENETRATION
             (poor.discard if good else poor.add)(kind)
             if guess is not None:
                 found.append(guess)
@@ -302,7 +304,7 @@ class _GuessSearch:
             shortfall: Total clearance shortfall [m].
             penetration: Largest penetration [m].
         """
-        return shortfall < _MAX_GOOD_PENETRATION
+        return shortfall < MAX_GOOD_PENETRATION
 
     def _select_best(
         self, found: SearchResult, used: Sequence[Floats]
@@ -373,7 +375,7 @@ class _RrtSearch(_GuessSearch):
         return None
 
     def _is_sufficient(self, z: Floats, shortfall: float, penetration: float) -> bool:
-        return penetration <= _MAX_GOOD_PENETRATION and not has_arm_detour(self.problem, z)
+        return penetration <= MAX_GOOD_PENETRATION and not has_arm_detour(self.problem, z)
 
     def _order_paths(self, found: SearchResult) -> Iterable[Floats]:
         # Paths with keyframes in collision come last.

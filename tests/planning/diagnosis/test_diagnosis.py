@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import numpy as np
 import pytest
 from helpers.carrying import STICK, TOP, above, box, reaching, room, table, tool_at
 from helpers.drives import hall

@@ -197,7 +197,7 @@ def test_obstacles_do_not_count_for_folded_arms() -> None:
     p, z = carry("nothing"), configure("nothing")
     z[:2] = 0.0, 1.25
     assert compute_shortfall(p, z[None], 1)[0] > 0.1
-    assert compute_shortfall(p, z[None], 1, standing=False)[0] == 0.0
+    assert compute_shortfall(p, z[None], 1, static=False)[0] == 0.0
 
 
 def test_nearest_folded_arm_minimizes_the_motion() -> None:

@@ -47,7 +47,9 @@ def find_path(
     problem, guide, arms = gate()
     ends = at(problem, GOAL)[None] if ends is None else ends
     rng = np.random.default_rng(seed)
-    return connect(problem, 0, problem.start, ends, poses=guide, arms=arms, rng=rng, tries=tries)
+    return connect(
+        problem, 0, problem.start, ends, poses=guide, arms=arms, rng=rng, max_extensions=tries
+    )
 
 
 def connect_directly(
@@ -56,7 +58,14 @@ def connect_directly(
     """Find a path between two configurations, sampled near both of them."""
     ends, rng = np.array([first, last]), np.random.default_rng(0)
     return connect(
-        problem, 0, first, ends[1:], poses=ends[:, :3], arms=ends[:, 3:], rng=rng, tries=tries
+        problem,
+        0,
+        first,
+        ends[1:],
+        poses=ends[:, :3],
+        arms=ends[:, 3:],
+        rng=rng,
+        max_extensions=tries,
     )
 
 

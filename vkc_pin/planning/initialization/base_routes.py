@@ -14,7 +14,7 @@ from vkc_pin.planning.base_paths.base_path import BasePath, sample_poses, shorte
 from vkc_pin.planning.base_paths.grid import BaseGrid, compute_fine_cell_count
 from vkc_pin.planning.initialization.keyframes import SIMILARITY_TOLERANCE, compute_shortfall
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.utils.arrays import Bools, Floats
+from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.collision.threads import count_threads
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.obstacles import FLOOR
@@ -36,8 +36,8 @@ class BaseRoutes:
     """
 
     def __init__(self, problem: TrajectoryProblem) -> None:
-        self.problem = problem
-        self.arm = slice(3, problem.chain.robot.coordinates.size)
+        self.problem, self.chain = problem, problem.chain
+        self.arm = slice(3, self.chain.robot.coordinates.size)
         self._grids: dict[tuple[int, bool], BaseGrid] = {}
         self._folded: dict[tuple[Hold, ...], Floats] = {}
         self._distances: dict[tuple[int, bool, int, int], Floats] = {}
@@ -54,26 +54,20 @@ class BaseRoutes:
         """
         key = (phase, folded)
         if key not in self._grids:
-            z, arena, margin = (
-                self._make_resting_configuration(),
-                self.problem.scene.arena,
-                self.problem.options.dist_safe,
-            )
-            cache, turning = self.problem.cache, self.problem.chain.robot.lever
+            z, arena = self._make_resting_configuration(), self.problem.scene.arena
+            how: dict[str, Any] = {"margin": self.problem.options.dist_safe}
             if folded:
                 z[self.arm] = self.get_folded_arm(phase)
-            moving, standing = collect_grid_shapes(self.problem, phase, z)
+                how = {"margin": 0.0, "cells": compute_fine_cell_count(arena, how["margin"])}
+            how |= {"near": _REACHING_RADIUS, "cache": self.problem.cache}
+            moving, fixed = collect_grid_shapes(self.problem, phase, z)
             # The arm's first link counts with the base: a low base must not drive under a table
             # that the arm would hit.
             base = [shape for joint, shape in moving if joint <= _ARM_BASE]
             carried = [shape for joint, shape in moving if joint > _ARM_BASE]
-            how: dict[str, Any] = (
-                {"margin": 0.0, "cells": compute_fine_cell_count(arena, margin)}
-                if folded
-                else {"margin": margin}
+            self._grids[key] = BaseGrid(
+                base, carried, fixed, arena, turning=self.chain.robot.lever, **how
             )
-            how |= {"near": _REACHING_RADIUS, "turning": turning, "cache": cache}
-            self._grids[key] = BaseGrid(base, carried, standing, arena, **how)
         return self._grids[key]
 
     def get_folded_arm(self, phase: int) -> Floats:
@@ -82,9 +76,9 @@ class BaseRoutes:
 
     def find_nearest_folded_arm(self, phase: int, first: Floats, last: Floats) -> Floats:
         """Return the folded arm nearest to the motion between two postures, all (m - 3,)."""
-        chain, arms = self.problem.chain, self._get_folded_arms(phase)
-        turning = [self.problem.unit(name) == "rad" for name in chain.names[self.arm]]
-        wound = arms + 2.0 * np.pi * np.array([0.0, -1.0, 1.0])[:, None, None] * turning
+        chain, arms = self.chain, self._get_folded_arms(phase)
+        turns = [self.problem.unit(name) == "rad" for name in chain.names[self.arm]]
+        wound = arms + 2.0 * np.pi * np.array([0.0, -1.0, 1.0])[:, None, None] * turns
         lengths = (np.abs(wound - first) + np.abs(wound - last)) * chain.metric[self.arm]
         is_outside = (wound < chain.lower[self.arm]) | (wound > chain.upper[self.arm])
         lengths[1:][is_outside[1:]] = np.inf
@@ -94,14 +88,13 @@ class BaseRoutes:
     def _get_folded_arms(self, phase: int) -> Floats:
         held = self.problem.task.phases[phase].held
         if held not in self._folded:
-            self._folded[held] = find_folded_arms(
-                self.problem, phase, self._make_resting_configuration()
-            )
+            resting = self._make_resting_configuration()
+            self._folded[held] = find_folded_arms(self.problem, phase, resting)
         return self._folded[held]
 
     def _make_resting_configuration(self) -> Floats:
         """Return the arm at home on a base at the origin, grasp coordinates near 0, shape (n,)."""
-        chain, z = self.problem.chain, self.problem.start.copy()
+        chain, z = self.chain, self.problem.start.copy()
         z[:3], z[self.arm] = 0.0, chain.robot.home
         for column in (chain.index(name) for names in chain.virtual.values() for name in names):
             z[column] = np.clip(0.0, chain.lower[column], chain.upper[column])
@@ -115,21 +108,16 @@ class BaseRoutes:
         Infinite: there is no path. Starts within `SIMILARITY_TOLERANCE` share the distances of the
         first one.
         """
-        grid = self.get_grid(phase, folded=folded)
-        end = np.clip(
-            np.floor((goals[:, :2] - grid.origin) / grid.step + 0.5).astype(int), 0, grid.cells - 1
-        ).tolist()
+        grid, known = self.get_grid(phase, folded=folded), self._distances
+        end = np.floor((goals[:, :2] - grid.origin) / grid.step + 0.5).astype(int)
+        end = np.clip(end, 0, grid.cells - 1)
         begin = np.floor(starts[:, :2] / SIMILARITY_TOLERANCE).astype(int).tolist()
         keys = [(phase, folded, *cell) for cell in begin]
-        new = {
-            key: start[:2]
-            for key, start in zip(keys, starts, strict=True)
-            if key not in self._distances
-        }
+        new = {key: start[:2] for key, start in zip(keys, starts, strict=True) if key not in known}
         if new:
             found = grid.compute_distances(np.array(list(new.values())), threads=count_threads())
-            self._distances |= dict(zip(new, found, strict=True))
-        return np.array([self._distances[key][i, j] for key, (i, j) in zip(keys, end, strict=True)])
+            known |= dict(zip(new, found, strict=True))
+        return np.array([known[key][i, j] for key, (i, j) in zip(keys, end.tolist(), strict=True)])
 
     def find_path(self, phase: int, start: Floats, goal: Floats, steps: int) -> Floats | None:
         """Find `steps` base poses from start to goal, both (3,), without the start: (steps, 3).
@@ -137,49 +125,33 @@ class BaseRoutes:
         The heading is continuous and ends at an angle equivalent to the goal's. None if there is no
         path.
         """
-        path = self._find_shortest(phase, start, goal)
-        return (
-            None
-            if path is None
-            else self._sample_poses(
-                self.get_grid(phase), path, steps, self.problem.chain.robot.lever
-            )
-        )
+        return self._find_path(phase, start, goal, steps, folded=False)
 
-    def _find_shortest(
-        self, phase: int, start: Floats, goal: Floats, *, folded: bool = False
-    ) -> BasePath | None:
-        """Return the cached shortest base path from start to goal, both (3,), if there is one."""
+    def find_guide_path(self, phase: int, start: Floats, goal: Floats, steps: int) -> Floats | None:
+        """Find a path as `find_path` does, with the arm at home or, if there is none, folded."""
+        path = self._find_path(phase, start, goal, steps, folded=False)
+        if path is None:  # the fine grid only where it is needed
+            path = self._find_path(phase, start, goal, steps, folded=True)
+        return path
+
+    def _find_path(
+        self, phase: int, start: Floats, goal: Floats, steps: int, *, folded: bool
+    ) -> Floats | None:
+        grid, rolling = self.get_grid(phase, folded=folded), self.problem.rolling
         key = (phase, folded, start.tobytes(), goal.tobytes())
         if key not in self._paths:
-            self._paths[key] = shortest_path(
-                self.get_grid(phase, folded=folded), start.tolist(), goal[None]
-            )
-        return self._paths[key]
-
-    def _sample_poses(self, grid: BaseGrid, path: BasePath, steps: int, turning: float) -> Floats:
-        """Sample poses along a path; a base on wheels gets one at each corner, so that it rolls."""
-        rolling = self.problem.rolling
+            self._paths[key] = shortest_path(grid, start.tolist(), goal[None])
+        path, turning = self._paths[key], self.chain.robot.lever
+        if path is None:
+            return None
         if rolling.is_omnidirectional:
             return sample_poses(path, steps, turning=turning)
-        corners = path.poses
+        corners = path.poses  # a base on wheels gets a pose at each corner, so that it rolls
         if rolling.turning_radius > 0.0:
             corners = Curves(rolling.turning_radius, turning).fit(
                 corners, lambda pose: grid.is_pose_free(*pose, reaching=True)
             )
         return sample_path(corners, steps, turning=turning)
-
-    def find_guide_path(self, phase: int, start: Floats, goal: Floats, steps: int) -> Floats | None:
-        """Find a guide path of base poses from start to goal, both (3,), shape (steps, 3).
-
-        The arm is at home or, if there is no such path, folded. None if there is no path at all.
-        """
-        for folded in (False, True):  # the fine grid only where it is needed
-            path = self._find_shortest(phase, start, goal, folded=folded)
-            if path is not None:
-                grid = self.get_grid(phase, folded=folded)
-                return self._sample_poses(grid, path, steps, grid.turning)
-        return None
 
 
 def find_folded_arms(problem: TrajectoryProblem, phase: int, resting: Floats) -> Floats:
@@ -205,37 +177,31 @@ def find_folded_arms(problem: TrajectoryProblem, phase: int, resting: Floats) ->
     upper = np.where(turns, np.minimum(chain.upper[arm], home + np.pi), chain.upper[arm])
     z = np.tile(resting, (_POSTURE_SAMPLES, 1))
     z[:, arm] = [home, *rng.uniform(lower, upper, (_POSTURE_SAMPLES - 1, len(home)))]
+    waypoint = problem.contacts.find_waypoint(phase)
+
+    def select_free(postures: Ints) -> Ints:
+        """Select those that keep the margins of robot and load themselves."""
+        shortfall = compute_shortfall(problem, z[postures], waypoint, static=False)
+        return postures[shortfall <= 0.0]
+
     reach, base = _compute_reach(problem, phase, z)
     order = np.argsort(reach.sum(axis=1), kind="stable")
     # One of the first is usually free.
-    for tried in np.array_split(order, math.isqrt(_POSTURE_SAMPLES)):
-        free = tried[_is_self_clear(problem, phase, z[tried])]
+    for postures in np.array_split(order, math.isqrt(_POSTURE_SAMPLES)):
+        free = select_free(postures)
         if len(free):
             best = free[0]
             extent = np.maximum(base, reach[best])[:2]
             others = np.flatnonzero((reach[:, :2] <= extent).all(axis=1))
-            return np.vstack(
-                [z[best, arm], z[others[_is_self_clear(problem, phase, z[others])], arm]]
-            )
+            return np.vstack([z[best, arm], z[select_free(others), arm]])
     return np.array(home[None])
-
-
-def _is_self_clear(problem: TrajectoryProblem, phase: int, z: Floats) -> Bools:
-    """Return for which configurations, (B, n), robot and load keep their own margins, (B,)."""
-    return (
-        compute_shortfall(problem, z, problem.contacts.find_waypoint(phase), standing=False) <= 0.0
-    )
 
 
 def _compute_reach(problem: TrajectoryProblem, phase: int, z: Floats) -> tuple[Floats, Floats]:
     """Return extents along the base's axes of arm and load, (B, 3), and of the base, (3,) [m]."""
-    chain, shapes = problem.chain, problem.contacts.phases[phase].shapes
-    rotations, translations = chain.joint_placements(z)
+    rotations, translations = problem.chain.joint_placements(z)
     reach, base = np.zeros((len(z), 3)), np.zeros(3)
-    carried = problem.contacts.find_attached_geometries(phase)
-    for shape in (
-        shapes[i] for i in [*range(len(chain.robot.collision.geometryObjects)), *carried]
-    ):
+    for shape in _collect_moving_shapes(problem, phase):
         joint = shape.parentJoint
         corners, radius = compute_hull_points(shape.geometry, shape.placement, outer=True)
         at = (
@@ -249,6 +215,13 @@ def _compute_reach(problem: TrajectoryProblem, phase: int, z: Floats) -> tuple[F
         else:
             np.maximum(base, own[0], out=base)
     return reach, base
+
+
+def _collect_moving_shapes(problem: TrajectoryProblem, phase: int) -> list[pin.GeometryObject]:
+    """Return the shapes of the robot and of its load."""
+    robot = range(len(problem.chain.robot.collision.geometryObjects))
+    attached = problem.contacts.find_attached_geometries(phase)
+    return [problem.contacts.phases[phase].shapes[i] for i in [*robot, *attached]]
 
 
 def collect_grid_shapes(
@@ -265,20 +238,19 @@ def collect_grid_shapes(
         Shapes on the base in its frame, with their joint, robot first; obstacles in the world
         without the floor and allowed contacts.
     """
-    chain, part = problem.chain, problem.contacts.phases[phase]
-    rotations, translations = chain.joint_placements(z[None])
-    robot = range(len(chain.robot.collision.geometryObjects))
-    held = problem.contacts.find_attached_geometries(phase)
+    part = problem.contacts.phases[phase]
+    rotations, translations = problem.chain.joint_placements(z[None])
     moving: list[tuple[int, Shape]] = []
-    for shape in (part.shapes[i] for i in [*robot, *held]):
+    for shape in _collect_moving_shapes(problem, phase):
         joint = shape.parentJoint
         carrier = pin.SE3(rotations[0, joint], translations[0, joint])
         moving.append((joint, (shape.geometry, carrier * shape.placement)))
-    base = [i for i in robot if part.shapes[i].parentJoint < _ARM_BASE]
+    robot = part.shapes[: len(problem.chain.robot.collision.geometryObjects)]
+    base = [i for i, shape in enumerate(robot) if shape.parentJoint < _ARM_BASE]
     hits = set(part.pairs[np.isin(part.pairs[:, 0], base), 1].tolist())  # without allowed contacts
-    standing: list[Shape] = [
+    fixed: list[Shape] = [
         (shape.geometry, shape.placement)
         for i, (shape, label) in enumerate(zip(part.shapes, part.labels, strict=True))
         if shape.parentJoint == 0 and label != FLOOR and (i in hits or not base)
     ]
-    return moving, standing
+    return moving, fixed

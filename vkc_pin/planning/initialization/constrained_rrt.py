@@ -18,7 +18,6 @@ from vkc_pin.planning.initialization.keyframes import (
     compute_shortfall,
 )
 from vkc_pin.planning.initialization.rrt import STEP, resample_path
-from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 
 __all__ = ["find_constrained_path", "is_obstructed"]
@@ -44,7 +43,7 @@ def is_obstructed(sampler: KeyframeSampler, phase: int, through: Floats, straigh
 
 
 def find_constrained_path(
-    sampler: KeyframeSampler, phase: int, through: Floats, steps: int, tries: int
+    sampler: KeyframeSampler, phase: int, through: Floats, steps: int, max_extensions: int
 ) -> Floats | None:
     """Find waypoints of a closed-chain phase from the first of some configurations.
 
@@ -53,7 +52,7 @@ def find_constrained_path(
         phase: Number of the phase.
         through: Configurations at its keyframes, shape (K, n).
         steps: Number of waypoints of the phase.
-        tries: Maximum number of tree extensions.
+        max_extensions: Maximum number of tree extensions.
 
     Returns:
         Collision-free waypoints, shape (steps, n), which may end at another configuration; None if
@@ -63,7 +62,7 @@ def find_constrained_path(
         BudgetExhaustedError: The planning budget is exhausted.
     """
     search = _Search(sampler, phase, steps)
-    path = search.run(through, tries)
+    path = search.run(through, max_extensions)
     return None if path is None else search.resample(search.shorten(path), steps)
 
 
@@ -75,7 +74,7 @@ class _Path(NamedTuple):
 
 
 class _Tree:
-    """Tree of configurations, each with its progress (a fractional waypoint) and its parent."""
+    """Tree of configurations, each with its progress and its parent."""
 
     def __init__(self, z: Floats, at: Floats) -> None:
         self.z, self.at, self.parents = z, at, np.full(len(z), -1)
@@ -87,7 +86,6 @@ class _Tree:
         return np.arange(len(self.z) - len(z), len(self.z))
 
     def trace_to_root(self, node: int) -> _Path:
-        """Return the path from a node to its root."""
         nodes = [node]
         while self.parents[nodes[-1]] >= 0:
             nodes.append(int(self.parents[nodes[-1]]))
@@ -95,12 +93,7 @@ class _Tree:
 
 
 class _Search:
-    """Searches paths through one phase.
-
-    Attributes:
-        begin: Last waypoint of the phase before.
-        end: Last waypoint of the phase.
-    """
+    """Searches paths through one phase, from waypoint `begin` to `end`."""
 
     def __init__(self, sampler: KeyframeSampler, phase: int, steps: int) -> None:
         self.sampler, self.problem = sampler, sampler.problem
@@ -109,22 +102,15 @@ class _Search:
         self.waypoint = self.problem.contacts.find_waypoint(phase)
         pose = sampler.find_pose(self.end)
         assert pose is not None, "a grasped articulated object closes the chain"
-        self.solver, self.target = sampler.get_pose_solver(pose)
-        before = self.problem.start if self.begin == 0 else sampler.object_motion[self.begin - 1]
-        self.object_motion = np.vstack([before, sampler.object_motion[self.begin : self.end]])[
-            :, sampler.object_columns
-        ]
+        self.pose = pose
+        motion = np.vstack([self.problem.start, sampler.object_motion])
+        self.object_motion = motion[self.begin : self.end + 1, sampler.object_columns]
         self.grasp_columns = sampler.find_grasp_columns(self.end)
 
     def project(self, z: Floats, at: Floats) -> tuple[Floats, Bools]:
-        """Project configurations, shape (B, n), to the closure manifold.
+        """Project configurations, shape (B, n), with their progress to the closure manifold.
 
-        Args:
-            z: Configurations.
-            at: Their progress, shape (B,); it determines the object joints.
-
-        Returns:
-            Projected configurations, and a mask of those that satisfy the closure.
+        Returns projected configurations, and a mask of those that satisfy the closure.
         """
         z, columns = z.copy(), self.sampler.object_columns
         whole = np.arange(self.begin, self.end + 1)
@@ -133,24 +119,14 @@ class _Search:
         )
         lower, upper = self.sampler.compute_limits(z, self.waypoint)
         lower[:, columns] = upper[:, columns] = z[:, columns]
-        return self.solver.solve(
-            z,
-            self.target,
-            lower=lower,
-            upper=upper,
-            weights=self.sampler.weights,
-            tolerance=TOLERANCE,
-        )
+        return self.sampler.solve_pose(z, self.pose, lower, upper)
 
     def are_free(self, z: Floats) -> Bools:
         """Return which configurations are nearly collision-free, shape (B,)."""
-        return (
-            compute_shortfall(self.problem, z, self.waypoint, reach=0.0)
-            <= self.problem.options.dist_safe
-        )
+        shortfall = compute_shortfall(self.problem, z, self.waypoint, reach=0.0)
+        return shortfall <= self.problem.options.dist_safe
 
     def compute_distances(self, z: Floats, other: Floats) -> Floats:
-        """Return distances between configurations in the metric of searches."""
         return np.asarray(np.linalg.norm((z - other) * self.sampler.weights, axis=-1))
 
     def sample_free(self, through: Floats, waypoint: int) -> Floats:
@@ -158,22 +134,19 @@ class _Search:
         before, found = through[np.arange(SAMPLE_COUNT // 4) % len(through)], []
         for how in ("scatter", "shake"):
             z, closed = self.sampler.sample(before, waypoint, how)
-            found.append(
-                z[closed & (z[:, self.grasp_columns] == through[0, self.grasp_columns]).all(axis=1)]
-            )
+            is_same = z[:, self.grasp_columns] == through[0, self.grasp_columns]
+            found.append(z[closed & is_same.all(axis=1)])
         z = np.concatenate(found)
         return z[self.are_free(z)] if len(z) else z
 
-    def run(self, through: Floats, tries: int) -> _Path | None:
-        """Find a path from the first configuration to the end of the phase, or None."""
+    def run(self, through: Floats, max_extensions: int) -> _Path | None:
+        """Find a path from the first configuration to the end of the phase."""
         ends = np.vstack([through[-1:], self.sample_free(through, self.end)])
         ends = ends[self.are_free(ends)]
-        one, other = (
-            _Tree(through[:1], np.array([float(self.begin)])),
-            _Tree(ends, np.full(len(ends), float(self.end))),
-        )
+        one = _Tree(through[:1], np.array([float(self.begin)]))
+        other = _Tree(ends, np.full(len(ends), float(self.end)))
         forwards, grown, tips = True, 0, np.zeros(1, int)
-        while len(ends) and grown < tries:
+        while len(ends) and grown < max_extensions:
             path = self.try_connect(one, other, tips)
             if path is not None:
                 return path if forwards else _Path(path.z[::-1], path.at[::-1])
@@ -201,24 +174,24 @@ class _Search:
         ends = np.array(
             [int(np.argmin(self.compute_distances(tree.z, goal))) for goal in goals], int
         )
-        going = np.arange(len(goals))
-        while len(going):
-            left = self.compute_distances(tree.z[ends[going]], goals[going])
-            going, left = going[left > STEP], left[left > STEP]
-            here, share = ends[going], STEP / left
+        growing = np.arange(len(goals))
+        while len(growing):
+            left = self.compute_distances(tree.z[ends[growing]], goals[growing])
+            growing, left = growing[left > STEP], left[left > STEP]
+            here, share = ends[growing], STEP / left
+            progress = tree.at[here] + share * (at[growing] - tree.at[here])
             moved, closed = self.project(
-                tree.z[here] + share[:, None] * (goals[going] - tree.z[here]),
-                now := tree.at[here] + share * (at[going] - tree.at[here]),
+                tree.z[here] + share[:, None] * (goals[growing] - tree.z[here]), progress
             )
-            nearer = left - self.compute_distances(moved, goals[going])
+            nearer = left - self.compute_distances(moved, goals[growing])
             good = (
                 closed
                 & (self.compute_distances(moved, tree.z[here]) <= 2.0 * STEP)
                 & (nearer > STEP / 4.0)
             )
             good[good] = self.are_free(moved[good])
-            going = going[good]
-            ends[going] = tree.add(moved[good], now[good], here[good])
+            growing = growing[good]
+            ends[growing] = tree.add(moved[good], progress[good], here[good])
         return ends
 
     def shorten(self, path: _Path) -> _Path:
@@ -233,17 +206,18 @@ class _Search:
             middle, closed = self.project(
                 path.z[first] + share * (path.z[last] - path.z[first]), at
             )
-            shortcut = np.vstack([path.z[first], middle, path.z[last]])
-            gaps = self.compute_distances(shortcut[1:], shortcut[:-1])
-            before = path.z[first : last + 1]
-            shorter = (
+            gaps = self.compute_gaps(np.vstack([path.z[first], middle, path.z[last]]))
+            is_shorter = (
                 gaps.max() <= 2.0 * STEP
-                and gaps.sum() < self.compute_distances(before[1:], before[:-1]).sum()
+                and gaps.sum() < self.compute_gaps(path.z[first : last + 1]).sum()
             )
-            if closed.all() and shorter and self.are_free(middle).all():
+            if closed.all() and is_shorter and self.are_free(middle).all():
                 z = np.vstack([path.z[: first + 1], middle, path.z[last:]])
                 path = _Path(z, np.concatenate([path.at[: first + 1], at, path.at[last:]]))
         return path
+
+    def compute_gaps(self, z: Floats) -> Floats:
+        return self.compute_distances(z[1:], z[:-1])
 
     def resample(self, path: _Path, steps: int) -> Floats | None:
         """Resample a path to `steps` waypoints, slow at both ends; None if a projection fails."""

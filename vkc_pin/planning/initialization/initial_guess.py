@@ -80,7 +80,7 @@ def make_initial_guess(problem: TrajectoryProblem, parts: Sequence[PhaseWaypoint
 
 
 def _resample(waypoints: Floats, segments: int) -> Floats:
-    """Resample waypoints, shape (K, n), to `segments` waypoints after the first."""
+    """Resample waypoints to `segments` ones after the first."""
     if len(waypoints) == segments + 1:
         return waypoints[1:]
     at = np.linspace(0.0, len(waypoints) - 1, segments + 1)[1:]
@@ -92,13 +92,9 @@ def _resample(waypoints: Floats, segments: int) -> Floats:
 def perturb(
     problem: TrajectoryProblem, z: Floats, deviation: float, rng: np.random.Generator
 ) -> Floats:
-    """Add smooth noise to the robot's coordinates: sine half-waves with amplitudes ∝ length².
+    """Add smooth noise of some standard deviation [m] or [rad] to the robot's part of z, (N, n).
 
-    Args:
-        problem: Problem.
-        z: z_1..z_N, shape (N, n).
-        deviation: Standard deviation of the noise [m] or [rad].
-        rng: Random number generator.
+    Noise is a sum of sine half-waves with amplitudes ∝ length².
     """
     robot, waves = problem.chain.robot.coordinates.size, np.arange(1, len(z) + 1)
     shape = np.sin(np.pi * np.outer(waves / (len(z) + 1), waves)) / waves**2

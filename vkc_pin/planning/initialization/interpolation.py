@@ -21,9 +21,6 @@ __all__ = ["AStarPaths", "CurvePaths", "Interpolator", "Paths", "RrtPaths", "mak
 class AStarPaths:
     """Paths with the base on the shortest path around obstacles and the arm straight."""
 
-    checks_approach = False
-    """Whether approach configurations in collision are left out."""
-
     def __init__(self, routes: BaseRoutes) -> None:
         self.routes = routes
 
@@ -52,8 +49,6 @@ class AStarPaths:
 class CurvePaths:
     """Paths with the base on the shortest curve, ignoring obstacles, and the arm straight."""
 
-    checks_approach = False
-
     def __init__(self, curves: Curves) -> None:
         self.curves = curves
 
@@ -70,11 +65,9 @@ class CurvePaths:
 class RrtPaths:
     """Paths of base and arm by RRT: guided by a base path, or constrained to a closed chain."""
 
-    checks_approach = True
-
     def __init__(self, sampler: KeyframeSampler, routes: BaseRoutes) -> None:
         self.sampler, self.problem, self.routes = sampler, sampler.problem, routes
-        self.failed: Counter[int] = Counter()  # consecutive failures per phase
+        self._failures: Counter[int] = Counter()  # consecutive ones per phase
 
     def find_path(
         self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool
@@ -92,38 +85,35 @@ class RrtPaths:
             else:
                 guide[:, 2] -= turned  # the trees find where the base can turn
             poses = guide
-        folded = (
-            self.routes.get_folded_arm(phase),
-            self.routes.find_nearest_folded_arm(phase, first[3:size], last[3:size]),
-        )
-        arms = [first[3:size], last[3:size], problem.chain.robot.home, *folded]
+        start, goal = first[3:size], last[3:size]
+        folded = self.routes.get_folded_arm(phase)
+        nearest = self.routes.find_nearest_folded_arm(phase, start, goal)
+        arms = np.array([start, goal, problem.chain.robot.home, folded, nearest])
         ends = np.tile(last[:size], (1 if reaches else len(arms), 1))
         if not reaches:
             ends[:, 3:] = arms
-        rng, tries = self.sampler.rng, self._get_extension_limit(phase)
+        rng, limit = self.sampler.rng, self._get_extension_limit(phase)
         path = connect(
-            problem, phase, first, ends, poses=poses, arms=np.array(arms), rng=rng, tries=tries
+            problem, phase, first, ends, poses=poses, arms=arms, rng=rng, max_extensions=limit
         )
-        self.failed[phase] = 0 if path is not None else self.failed[phase] + 1
-        return (
-            None
-            if path is None
-            else resample_path(path, steps, self.sampler.chain.metric[: path.shape[1]])
-        )
+        self._count_failures(phase, path)
+        return None if path is None else resample_path(path, steps, problem.chain.metric[:size])
 
     def find_constrained_path(self, phase: int, through: Floats, straight: Floats) -> Floats | None:
         """Find waypoints of a closed phase around obstacles; None if straight lines are free."""
         if not is_obstructed(self.sampler, phase, through, straight):
             return None
-        path = find_constrained_path(
-            self.sampler, phase, through, len(straight), self._get_extension_limit(phase)
-        )
-        self.failed[phase] = 0 if path is not None else self.failed[phase] + 1
+        limit = self._get_extension_limit(phase)
+        path = find_constrained_path(self.sampler, phase, through, len(straight), limit)
+        self._count_failures(phase, path)
         return path
 
     def _get_extension_limit(self, phase: int) -> int:
-        """Return the tree extension limit of a phase, which is halved after every failure."""
-        return max(1, MAX_EXTENSIONS // 2 ** self.failed[phase])
+        """Return the maximum number of tree extensions, which is halved after every failure."""
+        return max(1, MAX_EXTENSIONS // 2 ** self._failures[phase])
+
+    def _count_failures(self, phase: int, path: Floats | None) -> None:
+        self._failures[phase] = 0 if path is not None else self._failures[phase] + 1
 
 
 Paths = CurvePaths | AStarPaths | RrtPaths
@@ -143,6 +133,9 @@ class Interpolator:
         sampler: Keyframe sampler.
         approach: Straight approach and retreat paths.
         paths: Paths for open phases. Default: straight.
+
+    Attributes:
+        blocked: A line for every phase without a path.
     """
 
     def __init__(
@@ -151,7 +144,6 @@ class Interpolator:
         self.sampler, self.problem = sampler, sampler.problem
         self.approach, self.paths = approach, paths
         self.blocked: list[str] = []
-        """A line for every phase without a path."""
 
     def interpolate(self, through: Floats, at: list[int]) -> Floats | None:
         """Interpolate waypoints through keyframes, and close the chain where it must be closed.
@@ -163,43 +155,36 @@ class Interpolator:
         Returns:
             z_1..z_N, shape (N, n); None if a phase has no path.
         """
-        problem, size = self.problem, self.problem.chain.size
-        z, keyframes, objects = (
-            np.empty((problem.segments, size)),
+        problem, keyframes, objects = (
+            self.problem,
             through.copy(),
             self.sampler.object_motion.copy(),
         )
+        z = np.empty((problem.segments, problem.chain.size))
         begin, previous = 0, None
         for number, (phase, end) in enumerate(
             zip(problem.task.phases, problem.ends.tolist(), strict=True)
         ):
             inside = [k for k, waypoint in enumerate(at) if begin <= waypoint <= end]
+            rows = z[begin:end]
             if problem.closed(phase):
-                self._fill_straight(
-                    z[begin:end], keyframes[inside], [at[k] - begin for k in inside]
-                )
+                self._fill_straight(rows, keyframes[inside], [at[k] - begin for k in inside])
                 path = (
-                    self.paths.find_constrained_path(number, keyframes[inside], z[begin:end])
+                    self.paths.find_constrained_path(number, keyframes[inside], rows)
                     if isinstance(self.paths, RrtPaths)
                     else None
                 )
                 if path is not None:
-                    z[begin:end] = objects[begin:end] = path
+                    rows[:] = objects[begin:end] = path
                     keyframes[inside[-1]] = path[-1]
-            elif not self._fill_open_phase(z[begin:end], keyframes, inside, number, previous):
+            elif not self._fill_open_phase(rows, keyframes, inside, number, previous):
                 return None
             begin, previous = end, phase
         self._close_chain(z, objects)
         return problem.clip(z)
 
     def _fill_straight(self, z: Floats, through: Floats, when: list[int]) -> None:
-        """Fill rows of z, shape (steps, n), with straight lines through configurations.
-
-        Args:
-            z: Rows to fill.
-            through: Configurations, shape (K, n).
-            when: Their rows, counted from the row before z.
-        """
+        """Fill rows of z with straight lines through configurations, at rows `when` from 1."""
         s = np.concatenate([[0.0], sample_smoothstep(len(z))])
         for column in range(z.shape[1]):
             z[:, column] = np.interp(s[1:], s[when], through[:, column])
@@ -211,17 +196,9 @@ class Interpolator:
     def _fill_open_phase(
         self, z: Floats, keyframes: Floats, inside: list[int], number: int, previous: Phase | None
     ) -> bool:
-        """Fill the rows of an open phase, and turn later keyframes by its full turns.
+        """Fill the rows of an open phase if it has a path, and turn later keyframes by full turns.
 
-        Args:
-            z: Rows to fill, shape (steps, n).
-            keyframes: All keyframes, shape (K, n); modified in place.
-            inside: Indices of the keyframes at the start and the end of the phase.
-            number: Number of the phase.
-            previous: Phase before it.
-
-        Returns:
-            Whether there is a path.
+        Its start and its end are keyframes `inside`.
         """
         problem, phase = self.problem, self.problem.task.phases[number]
         end = int(problem.ends[number])
@@ -255,36 +232,28 @@ class Interpolator:
     def _find_via_points(
         self, ends: Floats, number: int, previous: Phase | None, segments: int
     ) -> tuple[Floats, list[int], int, int]:
-        """Find the configurations through which a phase passes, with retreat and approach.
+        """Add retreat and approach to the configurations at the ends of a phase, shape (2, n).
 
-        Args:
-            ends: Configurations at its start and its end, shape (2, n).
-            number: Number of the phase.
-            previous: Phase before it.
-            segments: Number of its segments.
-
-        Returns:
-            Configurations, shape (K, n); their waypoints, from 0; indices of those between which
-            the path is neither retreat nor approach.
+        Returns configurations, shape (K, n), their waypoints from 0, and the indices of those
+        between which the path is neither retreat nor approach.
         """
-        phase = self.problem.task.phases[number]
+        phase, options = self.problem.task.phases[number], self.problem.options
         first = self.approach.find_retreat_end(ends[0], phase, previous)
         last = self.approach.find_approach_start(ends[1], phase)
-        if self.paths is not None and self.paths.checks_approach:
+        if isinstance(self.paths, RrtPaths):  # which avoid collisions elsewhere
             waypoint = self.problem.contacts.find_waypoint(number)
             first, last = (
                 part[: len(part) if self._is_free(part, waypoint) else 0] for part in (first, last)
             )
-        steps = self.problem.options.steps(self.problem.options.approach_time)
+        steps = options.steps(options.approach_time)
         spacing = max(1, min(steps, segments // (2 * max(len(first) + len(last), 1))))
         when = [0, *(spacing * (1 + k) for k in range(len(first)))]
         when += [*(segments - spacing * (len(last) - k) for k in range(len(last))), segments]
         return np.vstack([ends[:1], first, last, ends[1:]]), when, len(first), len(first) + 1
 
     def _is_free(self, z: Floats, waypoint: int) -> bool:
-        return not len(z) or bool(
-            np.all(self.sampler.compute_shortfall(z, waypoint) < self.problem.options.dist_safe / 2)
-        )
+        shortfall = self.sampler.compute_shortfall(z, waypoint) if len(z) else np.zeros(0)
+        return bool(np.all(shortfall < self.problem.options.dist_safe / 2))
 
     def _close_chain(self, z: Floats, objects: Floats) -> None:
         """Set object joints in z, shape (N, n), to those of `objects`, and solve the closures."""
@@ -297,12 +266,6 @@ class Interpolator:
                 lower[:, columns] = upper[:, columns] = objects[np.ix_(rows, columns)]
                 if self.sampler.curves is not None:
                     lower[:, :3] = upper[:, :3] = z[rows, :3]
-                solver, target = self.sampler.get_pose_solver(pose)
-                z[rows], _ = solver.solve(
-                    z[rows],
-                    target,
-                    lower=lower,
-                    upper=upper,
-                    weights=self.sampler.weights,
-                    iterations=6,
+                z[rows], _ = self.sampler.solve_pose(
+                    z[rows], pose, lower, upper, iterations=6, tolerance=1e-6
                 )

@@ -28,6 +28,7 @@ __all__ = [
 
 SIMILARITY_TOLERANCE = 0.1  # [m], [rad] within which configurations are treated as the same
 SAMPLE_COUNT = 192  # random start configurations of inverse kinematics per keyframe
+_RowCache = dict[tuple[int, bytes], Floats]  # by waypoint and configuration
 
 
 class KeyframeCache:
@@ -44,25 +45,20 @@ class KeyframeCache:
 
     def __init__(self) -> None:
         self.samples: dict[tuple[str, int, bytes], tuple[Floats, Bools, Any]] = {}
-        self.shortfalls: dict[tuple[int, bytes], Floats] = {}
-        self.pushed: dict[tuple[int, bytes], Floats] = {}
-
-
-_RowCache = dict[tuple[int, bytes], Floats]
+        self.shortfalls: _RowCache = {}
+        self.pushed: _RowCache = {}
 
 
 def _look_up_rows(
-    known: _RowCache, compute: Callable[[Floats, int], Floats], z: Floats, waypoint: int
+    known: _RowCache, compute: Callable[[Floats], Floats], z: Floats, waypoint: int
 ) -> Floats:
-    """Return `compute(z, waypoint)`, one result per row of z, computing only uncached rows."""
+    """Return `compute(z)`, one result per row of z, computing only uncached rows."""
+    if not len(z):
+        return compute(z)
     keys = [(waypoint, row.tobytes()) for row in z]
     new = [k for k, key in enumerate(keys) if key not in known]
-    if len(new) == len(z):
-        found = compute(z, waypoint)
-        known.update(zip(keys, found, strict=True))
-        return found
     if new:
-        known.update(zip((keys[k] for k in new), compute(z[new], waypoint), strict=True))
+        known.update(zip((keys[k] for k in new), compute(z[new]), strict=True))
     return np.array([known[key] for key in keys])
 
 
@@ -75,7 +71,6 @@ class KeyframeSampler:
         cache: Results of other searches of the problem. Default: an empty cache.
 
     Attributes:
-        problem: Problem.
         object_motion: Motion of the object joints, shape (N, n); the other columns are the start's.
         object_columns: Columns of the object joints.
         weights: Weight of each coordinate in distances, shape (n,).
@@ -89,38 +84,40 @@ class KeyframeSampler:
         rng: np.random.Generator,
         cache: KeyframeCache | None = None,
     ) -> None:
-        self.problem, self.rng = problem, rng
+        self.problem, self.chain, self.rng = problem, problem.chain, rng
         self.cache = KeyframeCache() if cache is None else cache
-        self.chain = problem.chain
         self.robot_size = self.chain.robot.coordinates.size
         self.weights = self.chain.metric.copy()
         # Also where a grasp slides.
         self.weights[[column for column, _, _ in problem.choices]] = 1.0
-        self.curves = (
-            None
-            if problem.rolling.is_omnidirectional
-            else Curves(problem.rolling.turning_radius, self.chain.robot.lever)
-        )
+        rolling, lever = problem.rolling, self.chain.robot.lever
+        self.curves = None if rolling.is_omnidirectional else Curves(rolling.turning_radius, lever)
         self.object_columns = np.array([self.chain.index(name) for name in problem.task.state], int)
-        self.object_motion = interpolate_object_joints(
-            problem, np.tile(problem.start, (problem.segments, 1))
-        )
+        self.object_motion = interpolate_object_joints(problem, problem.still)
 
     def find_pose(self, waypoint: int) -> int | None:
         """Return the index of the pose constraint at a waypoint; None: at most a level one."""
-        poses = self.problem.transcription.structure.poses
-        return next(
-            (
-                k
-                for k, pose in enumerate(poses)
-                if waypoint in pose.waypoints and pose.kind != "level"
-            ),
-            None,
-        )
+        for k, pose in enumerate(self.problem.transcription.structure.poses):
+            if waypoint in pose.waypoints and pose.kind != "level":
+                return k
+        return None
 
     def get_pose_solver(self, pose: int) -> tuple[PoseSolver, pin.SE3]:
         """Return the inverse kinematics solver of a pose constraint, and its target."""
         return self.problem.transcription.pose_solvers[pose], self.problem.targets[pose]
+
+    def solve_pose(
+        self, z: Floats, pose: int, lower: Floats, upper: Floats, **how: Any
+    ) -> tuple[Floats, Bools]:
+        """Solve a pose constraint for configurations, shape (B, n); see `PoseSolver.solve`."""
+        solver, target = self.get_pose_solver(pose)
+        how = {"tolerance": TOLERANCE, **how}
+        return solver.solve(z, target, lower=lower, upper=upper, weights=self.weights, **how)
+
+    def compute_residual(self, z: Floats, pose: int) -> Floats:
+        """Return the largest residual of a pose constraint, shape (B,) [m] or [rad]."""
+        solver, target = self.get_pose_solver(pose)
+        return np.asarray(np.abs(solver.evaluate(z, target)[0]).max(axis=1))
 
     def sample(self, before: Floats, waypoint: int, how: str) -> tuple[Floats, Bools]:
         """Sample configurations for a waypoint.
@@ -136,13 +133,11 @@ class KeyframeSampler:
         """
         if how != "scatter":
             return self._sample(before, waypoint, how)
-        key = (str(self.rng.bit_generator.state), waypoint, before.tobytes())
-        if key not in self.cache.samples:
-            self.cache.samples[key] = (
-                *self._sample(before, waypoint, how),
-                self.rng.bit_generator.state,
-            )
-        z, found, self.rng.bit_generator.state = self.cache.samples[key]
+        generator, known = self.rng.bit_generator, self.cache.samples
+        key = (str(generator.state), waypoint, before.tobytes())
+        if key not in known:
+            known[key] = (*self._sample(before, waypoint, how), generator.state)
+        z, found, generator.state = known[key]
         return z.copy(), found.copy()
 
     def _sample(self, before: Floats, waypoint: int, how: str) -> tuple[Floats, Bools]:
@@ -152,48 +147,39 @@ class KeyframeSampler:
         pose = self.find_pose(waypoint)
         if pose is None:
             return np.clip(z, lower, upper), np.ones(len(z), bool)
-        solver, target = self.get_pose_solver(pose)
         # Random grasps; half of the arms near home, the others near the preceding configuration.
         if how == "scatter":
-            for hold in self.problem.task.phases[
-                int(np.searchsorted(self.problem.ends, waypoint))
-            ].grasps:
-                for column in map(self.chain.index, self.chain.virtual[hold]):
-                    z[:, column] = self.rng.uniform(
-                        self.chain.lower[column], self.chain.upper[column], len(z)
-                    )
+            phase = self.problem.task.phases[int(np.searchsorted(self.problem.ends, waypoint))]
+            for name in (name for hold in phase.grasps for name in self.chain.virtual[hold]):
+                column = self.chain.index(name)
+                low, high = self.chain.lower[column], self.chain.upper[column]
+                z[:, column] = self.rng.uniform(low, high, len(z))
             z[::2, 3 : self.robot_size] = self.chain.robot.home
         if how != "track":
             z = self._perturb_arms(z, pose, (0.1, 2.0) if how == "scatter" else (0.05, 0.5))
-        z, found = solver.solve(
-            z, target, lower=lower, upper=upper, weights=self.weights, tolerance=TOLERANCE
-        )
+        z, found = self.solve_pose(z, pose, lower, upper)
         if how == "scatter":
             z = self._unwrap_angles(z, before, lower, upper)
-        elif self.curves is not None and self._is_closed_at(waypoint):
-            z, found = self._fit_base_to_arc(z, found, before, waypoint, pose)
+        elif self.curves is not None and self.is_closed_at(waypoint):
+            z, found = self._fit_base_to_arc(z, before, waypoint, pose)
         return z, found
 
     def _fit_base_to_arc(
-        self, z: Floats, found: Bools, before: Floats, waypoint: int, pose: int
+        self, z: Floats, before: Floats, waypoint: int, pose: int
     ) -> tuple[Floats, Bools]:
         """Move the bases to the nearest pose on an arc from `before`, if the arms still reach."""
-        rolling, turning = self.problem.rolling, self.chain.robot.lever
-        there, (solver, target) = z.copy(), self.get_pose_solver(pose)
-        there[:, :3] = find_nearest_arc(
-            before[:, :3], z[:, :3], radius=rolling.turning_radius, turning=turning
-        )
+        radius, turning = self.problem.rolling.turning_radius, self.chain.robot.lever
+        near = z.copy()
+        near[:, :3] = find_nearest_arc(before[:, :3], z[:, :3], radius=radius, turning=turning)
         lower, upper = self.compute_limits(before, waypoint)
-        lower[:, :3] = upper[:, :3] = np.clip(there[:, :3], lower[:, :3], upper[:, :3])
-        there, reached = solver.solve(
-            there, target, lower=lower, upper=upper, weights=self.weights, tolerance=TOLERANCE
-        )
-        return np.where(reached[:, None], there, z), reached
+        lower[:, :3] = upper[:, :3] = np.clip(near[:, :3], lower[:, :3], upper[:, :3])
+        near, reached = self.solve_pose(near, pose, lower, upper)
+        return np.where(reached[:, None], near, z), reached
 
-    def _is_closed_at(self, waypoint: int) -> bool:
-        return self.problem.closed(
-            self.problem.task.phases[self.problem.contacts.find_phase(waypoint)]
-        )
+    def is_closed_at(self, waypoint: int) -> bool:
+        """Return whether the chain is closed in the phase of a waypoint."""
+        phase = self.problem.contacts.find_phase(waypoint)
+        return self.problem.closed(self.problem.task.phases[phase])
 
     def push_clear(self, z: Floats, waypoint: int) -> Floats:
         """Push configurations, shape (B, n), out of collision; see `resolve_collisions`."""
@@ -201,41 +187,27 @@ class KeyframeSampler:
         if pose is None:
             return z
         return _look_up_rows(
-            self.cache.pushed, lambda rows, at: self._push_clear(rows, at, pose), z, waypoint
+            self.cache.pushed, lambda rows: self._push_clear(rows, waypoint, pose), z, waypoint
         )
 
     def _push_clear(self, z: Floats, waypoint: int, pose: int) -> Floats:
         lower, upper = self.compute_limits(z, waypoint)
-        if self.curves is not None and self._is_closed_at(waypoint):
+        if self.curves is not None and self.is_closed_at(waypoint):
             lower[:, :3] = upper[:, :3] = z[:, :3]  # the base stays on its arc
-        solver, target = self.get_pose_solver(pose)
-        weights = self.weights
-        pushed = resolve_collisions(
-            self.problem, z, waypoint, solver, target, lower=lower, upper=upper, weights=weights
-        )
-        exact, _ = solver.solve(
-            pushed,
-            target,
-            lower=lower,
-            upper=upper,
-            weights=weights,
-            iterations=3,
-            tolerance=TOLERANCE,
-        )
-        return exact
+        how: dict[str, Any] = {"lower": lower, "upper": upper, "weights": self.weights}
+        z = resolve_collisions(self.problem, z, waypoint, *self.get_pose_solver(pose), **how)
+        return self.solve_pose(z, pose, lower, upper, iterations=3)[0]
 
     def compute_limits(self, before: Floats, waypoint: int) -> tuple[Floats, Floats]:
         """Return limits at a waypoint after configurations `before`, shape (B, n) each."""
-        row = waypoint - 1
+        row, objects = waypoint - 1, self.object_columns
         lower, upper = (
             np.tile(limits[row], (len(before), 1))
             for limits in (self.problem.lower, self.problem.upper)
         )
-        lower[:, self.object_columns] = upper[:, self.object_columns] = self.object_motion[
-            row, self.object_columns
-        ]
-        for column in self.find_grasp_columns(waypoint):
-            lower[:, column] = upper[:, column] = before[:, column]
+        lower[:, objects] = upper[:, objects] = self.object_motion[row, objects]
+        grasp = self.find_grasp_columns(waypoint)
+        lower[:, grasp] = upper[:, grasp] = before[:, grasp]
         return lower, upper
 
     def find_grasp_columns(self, waypoint: int) -> list[int]:
@@ -243,21 +215,14 @@ class KeyframeSampler:
         return [column for column, grasp, last in self.problem.choices if grasp < waypoint <= last]
 
     def _perturb_arms(self, z: Floats, pose: int, deviations: tuple[float, float]) -> Floats:
-        """Perturb the arms and align the bases with pose constraint `pose`.
-
-        Args:
-            z: Configurations, shape (B, n).
-            pose: Index of the pose constraint.
-            deviations: Bounds of the standard deviation, [m] and [rad].
-        """
+        """Perturb the arms by a random deviation, and align the bases with a pose constraint."""
         spread, z = self.rng.uniform(*deviations, (len(z), 1)), z.copy()
-        z[:, 3 : self.robot_size] += spread * self.rng.normal(
-            0.0, 1.0, (len(z), self.robot_size - 3)
-        )
+        noise = self.rng.normal(0.0, 1.0, (len(z), self.robot_size - 3))
+        z[:, 3 : self.robot_size] += spread * noise
         return self._align_bases(np.clip(z, self.chain.lower, self.chain.upper), pose)
 
     def _align_bases(self, z: Floats, pose: int) -> Floats:
-        """Move the bases so that pose constraint `pose` holds in position and heading.
+        """Move the bases so that a pose constraint holds in position and heading.
 
         Height and tilt are left to the arm. A base motion multiplies the frame's placement from the
         left, so it equals the error T* T⁻¹, projected to the floor.
@@ -282,22 +247,22 @@ class KeyframeSampler:
 
     def _unwrap_angles(self, z: Floats, before: Floats, lower: Floats, upper: Floats) -> Floats:
         """Replace each revolute robot joint's angle by the equivalent one nearest to `before`."""
-        z = z.copy()
-        for column in range(2, self.robot_size):
-            if self.problem.unit(self.chain.names[column]) == "m":
-                continue
-            nearest = (
-                before[:, column] + (z[:, column] - before[:, column] + np.pi) % (2 * np.pi) - np.pi
-            )
-            inside = (nearest >= lower[:, column]) & (nearest <= upper[:, column])
-            z[:, column] = np.where(inside, nearest, z[:, column])
+        turns = [
+            column
+            for column in range(2, self.robot_size)
+            if self.problem.unit(self.chain.names[column]) != "m"
+        ]
+        z, angle, start = z.copy(), z[:, turns], before[:, turns]
+        nearest = start + (angle - start + np.pi) % (2 * np.pi) - np.pi
+        is_inside = (nearest >= lower[:, turns]) & (nearest <= upper[:, turns])
+        z[:, turns] = np.where(is_inside, nearest, angle)
         return z
 
     def compute_shortfall(self, z: Floats, waypoint: int) -> Floats:
         """Return the clearance shortfall of each configuration, shape (B,) [m]."""
         return _look_up_rows(
             self.cache.shortfalls,
-            lambda rows, at: compute_shortfall(self.problem, rows, at),
+            lambda rows: compute_shortfall(self.problem, rows, waypoint),
             z,
             waypoint,
         )
@@ -312,10 +277,7 @@ class KeyframeSampler:
         pose = self.find_pose(waypoint)
         if pose is None or not rows:
             return bool(rows)
-        solver, target = self.get_pose_solver(pose)
-        return bool(
-            (np.abs(solver.evaluate(np.array(rows), target)[0]).max(axis=1) < TOLERANCE).any()
-        )
+        return bool((self.compute_residual(np.array(rows), pose) < TOLERANCE).any())
 
 
 def compute_shortfall(
@@ -323,7 +285,7 @@ def compute_shortfall(
     z: Floats,
     waypoint: int,
     *,
-    standing: bool = True,
+    static: bool = True,
     reach: float | None = None,
 ) -> Floats:
     """Return the clearance shortfall of configurations at a waypoint, shape (B,) [m].
@@ -332,15 +294,12 @@ def compute_shortfall(
         problem: Problem.
         z: Configurations, shape (B, n).
         waypoint: Waypoint of the configurations.
-        standing: Whether fixed obstacles count; otherwise only the robot itself and attached
-            objects.
+        static: Whether fixed obstacles count; otherwise only the robot itself and attached objects.
         reach: Largest distance of pairs that count [m]. Default: the largest margin.
     """
-    waypoints, reach = (
-        np.full(len(z), waypoint),
-        problem.options.largest_margin if reach is None else reach,
-    )
-    contacts = problem.contacts.evaluate(z, waypoints, reach=reach, nearest=1, static=standing)
+    reach = problem.options.largest_margin if reach is None else reach
+    waypoints = np.full(len(z), waypoint)
+    contacts = problem.contacts.evaluate(z, waypoints, reach=reach, nearest=1, static=static)
     return contacts.compute_shortfall(len(z))
 
 
@@ -358,28 +317,27 @@ def sample_goal_configurations(
         Configurations, shape (B, n), and their residuals, shape (B,) [m] or [rad]; None if the
         waypoint has neither a pose constraint nor a fixed base position.
     """
-    search = KeyframeSampler(problem, rng)
-    pose, row = search.find_pose(waypoint), waypoint - 1
+    sampler = KeyframeSampler(problem, rng)
+    pose, lower, upper = (
+        sampler.find_pose(waypoint),
+        problem.lower[waypoint - 1],
+        problem.upper[waypoint - 1],
+    )
     z = np.tile(problem.start, (SAMPLE_COUNT, 1))
-    for column in search.find_grasp_columns(waypoint):  # the earlier grasp is free here
-        lower, upper = np.clip(
-            [problem.lower[row, column], problem.upper[row, column]], -np.pi, np.pi
-        )
-        z[:, column] = rng.uniform(lower, upper, SAMPLE_COUNT)
+    for column in sampler.find_grasp_columns(waypoint):  # the earlier grasp is free here
+        low, high = np.clip([lower[column], upper[column]], -np.pi, np.pi)
+        z[:, column] = rng.uniform(low, high, SAMPLE_COUNT)
     if pose is not None:
-        z, found = search.sample(z, waypoint, "scatter")
+        z, found = sampler.sample(z, waypoint, "scatter")
         pushed = z.copy()
-        pushed[found] = search.push_clear(z[found], waypoint)
-        solver, target = search.get_pose_solver(pose)
-        before, after = (
-            np.abs(solver.evaluate(rows, target)[0]).max(axis=1) for rows in (z, pushed)
-        )
+        pushed[found] = sampler.push_clear(z[found], waypoint)
+        before, after = (sampler.compute_residual(rows, pose) for rows in (z, pushed))
         kept = after < TOLERANCE  # where the pushed configuration is still feasible
         return np.where(kept[:, None], pushed, z), np.where(kept, after, before)
-    if (problem.lower[row, :2] < problem.upper[row, :2]).any():
+    if (lower[:2] < upper[:2]).any():
         return None
     z[:, 2:] += rng.normal(0.0, 1.0, z[:, 2:].shape)
-    return np.clip(z, problem.lower[row], problem.upper[row]), np.zeros(len(z))
+    return np.clip(z, lower, upper), np.zeros(len(z))
 
 
 def sample_smoothstep(steps: int) -> Floats:

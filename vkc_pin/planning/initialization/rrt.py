@@ -47,7 +47,7 @@ def connect(
     poses: Floats,
     arms: Floats,
     rng: np.random.Generator,
-    tries: int = MAX_EXTENSIONS,
+    max_extensions: int = MAX_EXTENSIONS,
 ) -> Floats | None:
     """Find a nearly collision-free path of the robot.
 
@@ -59,36 +59,32 @@ def connect(
         poses: x, y [m] and yaw [rad] along a guide path of the base, shape (P, 3).
         arms: Arm postures that are likely to be needed, shape (A, m - 3) [m] or [rad].
         rng: Random number generator.
-        tries: Maximum number of tree extensions.
+        max_extensions: Maximum number of tree extensions.
 
     Returns:
         Corners of the path, shape (K, m); None if no path was found.
     """
     coarse, fine = (_Search(problem, phase, first, poses, arms, rng, step) for step in _STEP_SIZES)
-    path = coarse.run(ends, tries)
+    path = coarse.run(ends, max_extensions)
     if path is not None and not fine.is_free(path):
-        path = fine.run(ends, tries)
+        path = fine.run(ends, max_extensions)
     return None if path is None else fine.straighten(path)
 
 
 def has_arm_detour(problem: TrajectoryProblem, z: Floats) -> bool:
     """Return whether the arm takes a detour in an open phase of a motion z_1..z_N, shape (N, n)."""
-    rows, metric = (
-        problem.waypoints(z)[:, : problem.chain.robot.coordinates.size],
-        problem.chain.metric,
-    )
+    size, metric = problem.chain.robot.coordinates.size, problem.chain.metric
+    rows = problem.waypoints(z)[:, :size]
     spans = zip(problem.task.phases, itertools.pairwise([0, *problem.ends.tolist()]), strict=True)
     paths = [rows[begin : end + 1] for phase, (begin, end) in spans if not problem.closed(phase)]
-    return any(_compute_detour(path, metric[: path.shape[1]]) > _MAX_DETOUR for path in paths)
+    return any(_compute_detour(path, metric[:size]) > _MAX_DETOUR for path in paths)
 
 
 def _compute_detour(path: Floats, metric: Floats) -> float:
     """Return the share of a path, shape (K, m), by which the arm exceeds its straight path."""
     base, arm = np.split(path * metric, [3], axis=1)
-    length, driven = (
-        np.abs(np.diff(arm, axis=0)).sum(),
-        np.linalg.norm(np.diff(base, axis=0), axis=1).sum(),
-    )
+    length = np.abs(np.diff(arm, axis=0)).sum()
+    driven = np.linalg.norm(np.diff(base, axis=0), axis=1).sum()
     return float((length - np.abs(arm[-1] - arm[0]).sum()) / max(length + driven, 1e-12))
 
 
@@ -113,61 +109,45 @@ class _Search:
         rng: np.random.Generator,
         step: float,
     ) -> None:
-        self.problem, self.first, self.poses, self.arms, self.rng, self.step = (
-            problem,
-            first,
-            poses,
-            arms,
-            rng,
-            step,
-        )
+        self.problem, self.first, self.poses, self.arms = problem, first, poses, arms
+        self.rng, self.step = rng, step
         self.size = problem.chain.robot.coordinates.size
         self.waypoint = problem.contacts.find_waypoint(phase)
         # Shortfalls up to the margin are allowed: the solver resolves them.
         self.allowed = problem.options.dist_safe
         self.weights = problem.chain.metric[: self.size]
         limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
-        self.lower, self.upper = np.ascontiguousarray(limits.T)
+        self.lower, self.upper = limits.T
 
-    def run(self, ends: Floats, tries: int) -> Floats | None:
-        """Find a path to one of `ends`, shape (E, m); None if there is none."""
+    def run(self, ends: Floats, max_extensions: int) -> Floats | None:
+        """Find a path to one of `ends`, shape (E, m), with shortcuts between random points."""
         shortfall = self._compute_shortfall(ends)
         ends = ends[shortfall <= max(self.allowed, shortfall.min())]
-        path = self._trees.run(_as_rows(self.first[None, : self.size]), _as_rows(ends), tries)
-        self._spend()
-        return self._shorten(path) if len(path) else None
+        start = self.first[None, : self.size]
+        path = self._call(self._trees.run, start, _as_rows(ends), max_extensions)
+        return self._call(self._trees.shortened, path) if len(path) else None
 
-    @cached_property
-    def free_runs(self) -> list[Floats]:
-        """Collision-free sections of the guide path with each of the arms, shape (R, m) each."""
-        runs = []
+    def _find_free_sections(self) -> list[Floats]:
+        """Return collision-free sections of the guide path with each of the arms, (R, m) each."""
+        sections = []
         for arm in self.arms:
-            rows = np.clip(
-                np.column_stack([self.poses, np.tile(arm, (len(self.poses), 1))]),
-                self.lower,
-                self.upper,
-            )
+            rows = np.column_stack([self.poses, np.tile(arm, (len(self.poses), 1))])
+            rows = np.clip(rows, self.lower, self.upper)
             middles = (rows[1:] + rows[:-1]) / 2
             free = self._compute_shortfall(np.concatenate([rows, middles])) <= self.allowed
-            begin = None
-            for k in range(len(rows)):
-                if begin is None and free[k]:
-                    begin = k
-                if begin is not None and (
-                    k + 1 == len(rows) or not (free[len(rows) + k] and free[k + 1])
-                ):
-                    runs.append(rows[begin : k + 1])
-                    begin = None
-        return runs
+            at = np.flatnonzero(free[: len(rows)])
+            is_joined = free[len(rows) + at[:-1]] & (np.diff(at) == 1)
+            parts = np.split(at, np.flatnonzero(~is_joined) + 1)
+            sections += [rows[part] for part in parts if len(part)]
+        return sections
 
     @cached_property
     def _lines(self) -> Any:
         """Collision checker of straight lines."""
-        contacts, weights = self.problem.contacts, self.weights
-        return contacts.make_line_checker(
+        return self.problem.contacts.make_line_checker(
             self.first,
             self.waypoint,
-            weights=weights,
+            weights=self.weights,
             step=self.step,
             reach=0.0,
             allowed=self.allowed,
@@ -176,27 +156,19 @@ class _Search:
     @cached_property
     def _trees(self) -> Any:
         """Compiled trees and shortcuts."""
-        runs = np.concatenate(self.free_runs) if self.free_runs else np.empty((0, self.size))
-        rows = map(_as_rows, (self.weights, self.lower, self.upper, self.poses, self.arms, runs))
-        lengths, seed = (
-            np.array([len(run) for run in self.free_runs], np.int64),
-            int(self.rng.integers(2**63)),
-        )
+        sections = self._find_free_sections()
+        rows = np.concatenate([np.empty((0, self.size)), *sections])
+        parts = map(_as_rows, (self.weights, self.lower, self.upper, self.poses, self.arms, rows))
+        lengths = np.array([len(section) for section in sections], np.int64)
+        random_seed = int(self.rng.integers(2**63))
         module = import_compiled("vkc_pin.planning.initialization._trees")
-        return module.Trees(self._lines, *rows, lengths, _PATH_SPREAD, _END_SPREAD, seed)
+        return module.Trees(self._lines, *parts, lengths, _PATH_SPREAD, _END_SPREAD, random_seed)
 
-    def _spend(self) -> None:
+    def _call(self, method: Any, rows: ArrayLike, *arguments: Any) -> Any:
+        """Call a method of the trees, and record the evaluations of its collision checks."""
+        result = method(_as_rows(rows), *arguments)
         record_evaluations(self._lines.looked())
-
-    def is_free(self, path: Floats) -> bool:
-        """Return whether a path, shape (K, m), is nearly collision-free."""
-        return all(self.compute_free_share(a, b) == 1.0 for a, b in itertools.pairwise(path))
-
-    def compute_free_share(self, a: Floats, b: Floats) -> float:
-        """Return the collision-free share of the straight line from `a` to `b`, both (m,)."""
-        share = float(self._trees.along(_as_rows([a, b])))
-        self._spend()
-        return share
+        return result
 
     def _compute_shortfall(self, rows: Floats) -> Floats:
         """Return the shortfall of overlapping pairs for robot rows, (B, m), shape (B,) [m]."""
@@ -204,11 +176,9 @@ class _Search:
         z[:, : self.size] = rows
         return compute_shortfall(self.problem, z, self.waypoint, reach=0.0)
 
-    def _shorten(self, path: Floats) -> Floats:
-        """Shortcut a path between random points on it, as many times as it has rows."""
-        path = self._trees.shortened(_as_rows(path))
-        self._spend()
-        return path
+    def is_free(self, path: Floats) -> bool:
+        """Return whether a path, shape (K, m), is nearly collision-free."""
+        return all(self._call(self._trees.along, ends) == 1.0 for ends in itertools.pairwise(path))
 
     def straighten(self, path: Floats) -> Floats:
         """Straighten the motion of the arm, and of each joint alone, where that is collision-free.
@@ -219,27 +189,18 @@ class _Search:
         first along the whole path, then between random points on it. Detours of the arm are treated
         repeatedly as long as that pays off.
         """
-        length, path = np.inf, self._shorten_partially(path, 0)
-        while self.compute_length(path) < (1.0 - _MIN_SAVING) * length:
-            length, path = (
-                self.compute_length(path),
-                self._shorten_partially(path, _SHORTCUT_ROUNDS),
-            )
+        previous, path = np.inf, self._call(self._trees.evened, path, 0, _MIN_SAVING)
+        while (length := self._compute_length(path)) < (1.0 - _MIN_SAVING) * previous:
+            previous = length
+            path = self._call(self._trees.evened, path, _SHORTCUT_ROUNDS, _MIN_SAVING)
             if _compute_detour(path, self.weights) <= _MAX_DETOUR:
                 break
         return path
 
-    def _shorten_partially(self, path: Floats, times: int) -> Floats:
-        """Apply partial shortcuts, along the whole path (`times` 0) or between random points."""
-        path = self._trees.evened(_as_rows(path), times, _MIN_SAVING)
-        self._spend()
-        return path
-
-    def compute_length(self, path: Floats) -> float:
-        """Return the length of a path, shape (K, m)."""
+    def _compute_length(self, path: Floats) -> float:
         return float(np.linalg.norm(np.diff(path, axis=0) * self.weights, axis=1).sum())
 
 
 def _as_rows(rows: ArrayLike) -> Floats:
-    """Return rows as a contiguous array, as the compiled code expects it."""
+    """Return a contiguous array, as the compiled code expects it."""
     return np.ascontiguousarray(rows, float)

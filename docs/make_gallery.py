@@ -67,7 +67,7 @@ def opened(robot: str, file: str, thing: str, folder: Path) -> vkc.Plan:
             kept.parent.mkdir(parents=True, exist_ok=True)
             plan.save(kept)
             return plan
-    raise SystemExit(f"{robot} opens no {thing}: {plan.report()}")
+    raise SystemExit(f"{robot} opens no {thing}: {plan.summary()}")
 
 
 def triangles_of(scene: vkc.Scene) -> Iterator[tuple[np.ndarray, np.ndarray]]:

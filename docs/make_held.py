@@ -46,7 +46,7 @@ def main() -> int:
     step = vkc.Actuate("door", {"hinge": 0.0}, "handle_free")
     plan = vkc.plan(scene, [step], options=chores.CHORES["cluttered"].options, initialization="rrt")
     joining.RrtPaths.find_constrained_path = search
-    sys.stdout.write(plan.report() + "\n")
+    sys.stdout.write(plan.summary() + "\n")
     problem, ways = seen[-1]
     phase = len(problem.task.phases) - 1
     with use_style():

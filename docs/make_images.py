@@ -83,7 +83,8 @@ def picture(
 def attachments() -> None:
     """Write the picture of proposed attachments."""
     plot_attachments(
-        vkc.propose_attachments(vkc.load_object("dishwasher"), most=2), IMAGES / "attachments.png"
+        vkc.importing.propose_attachments(vkc.load_object("dishwasher"), most=2),
+        IMAGES / "attachments.png",
     )
 
 
@@ -117,7 +118,7 @@ def cluttered_picture() -> None:
 def room_picture() -> None:
     """Write random rooms from above, with little and with much in them."""
     rooms = [
-        vkc.random_room(number, clutter=clutter)
+        vkc.procedural.random_room(number, clutter=clutter)
         for number, clutter in ((3, 0.2), (1, 0.5), (2, 0.9))
     ]
     with use_style():
@@ -135,7 +136,7 @@ def furniture_picture() -> None:
     with use_style():
         figure = new_figure(12.0, 5.6)
         for place, (kind, seed) in enumerate(FURNITURE.items(), start=1):
-            thing = vkc.load_object(vkc.random_object(kind, seed))
+            thing = vkc.load_object(vkc.procedural.random_object(kind, seed))
             state = np.array(
                 [
                     0.0 if name == "knob" else 0.5 * high
@@ -193,9 +194,9 @@ def task_picture() -> None:
     with use_style():
         figure = new_figure(12.0, 8.4)
         for own, seed in zip(figure.subfigures(2, 2).ravel(), TASKS, strict=True):
-            room, steps = vkc.random_task(seed)
+            room, steps = vkc.procedural.random_task(seed)
             plan = vkc.plan(room, steps)
-            sys.stdout.write(plan.report() + "\n")
+            sys.stdout.write(plan.summary() + "\n")
             draw_top_view(own, World(room), plan.trajectory)
         save_figure(figure, IMAGES / "random_tasks.png")
 
@@ -209,9 +210,9 @@ def import_picture() -> None:
     """A home of three rooms that was one URDF, and the motion that opens its refrigerator, from above."""
     with tempfile.TemporaryDirectory() as folder:
         file, _ = home_urdf(Path(folder))
-        scene = vkc.import_home(file, Path(folder) / "out").scene
+        scene = vkc.importing.import_home(file, Path(folder) / "out").scene
         plan = vkc.plan(scene, [vkc.Actuate("refrigerator_body", {"refrigerator_hinge": 0.94})])
-        sys.stdout.write(plan.report() + "\n")
+        sys.stdout.write(plan.summary() + "\n")
         with use_style():
             figure = new_figure(8.0, 6.6)
             draw_top_view(figure, World(scene), plan.trajectory)
@@ -267,7 +268,7 @@ def bases_picture() -> None:
                 vkc.Scene.from_document(document, scene.folder),
                 [vkc.Actuate("door", {"hinge": 1.2})],
             )
-            sys.stdout.write(plan.report() + "\n")
+            sys.stdout.write(plan.summary() + "\n")
             draw_top_view(part, World(plan.scene), plan.trajectory)
         save_figure(figure, IMAGES / "bases.png")
 
@@ -279,7 +280,7 @@ def opening_picture() -> None:
     with tempfile.TemporaryDirectory() as folder, use_style():
         scene = between_cheeks(write_gripper(Path(folder)), opening=FINGERS)
         plan = vkc.plan(scene, [vkc.Grasp("drawer")])
-        sys.stdout.write(plan.report() + "\n")
+        sys.stdout.write(plan.summary() + "\n")
         world, figure = World(scene), new_figure(8.0, 3.4)
         row = world.compute_positions(plan.trajectory)[-1]
         first = world.coordinates.index("finger_a_joint")
@@ -363,7 +364,7 @@ def main() -> int:
     chore = saved[2] if len(saved) > 2 else vkc.plan(home, chores.home(home), window=2)
     through = saved[3] if len(saved) > 3 else vkc.plan(gap.started(0, SHOWN), [vkc.Reach(gap.POSE)])
     for plan in (door, stick, chore, through):
-        sys.stdout.write(plan.report() + "\n")
+        sys.stdout.write(plan.summary() + "\n")
         if not plan.success:
             return 1
     attachments()

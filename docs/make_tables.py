@@ -112,7 +112,8 @@ def door() -> str:
             own = of(found["trials"], {"task": task})
             times = [f"{value:.3f}" for value in distribution(own, "planning_time")]
             efforts = [
-                f"{distribution(own, field)[0]:.2f}" for field in ("base_effort", "arm_effort")
+                f"{distribution(own, field)[0]:.2f}"
+                for field in ("base_path_length", "arm_path_length")
             ]
             built = f"{max(trial['build_time'] for trial in own):.2f}"
             rows.append([task, str(found["meta"]["seed"]), good(own), *times, *efforts, built])
@@ -125,8 +126,8 @@ def door() -> str:
         "success",
         "planning time, median [s]",
         "95th percentile [s]",
-        "base effort [m]",
-        "arm effort [rad]",
+        "base path length [m]",
+        "arm path length [rad]",
     ]
     split = ["task", *(f"{name} [s]" for name in PARTS.values()), "Ipopt iterations"]
     most = max(found["meta"]["peak_memory_mb"] for found in results)

@@ -34,7 +34,7 @@ def points(trials: Sequence[Mapping[str, Any]]) -> list[tuple[float, float, floa
     whole = [number for number in numbers if all(found[w, number]["success"] for w in weights)]
     mean = {
         field: [np.mean([found[w, n][field] for n in whole]) for w in weights]
-        for field in ("base_effort", "arm_effort")
+        for field in ("base_path_length", "arm_path_length")
     }
     return [
         (w, float(base), float(arm), len(whole))

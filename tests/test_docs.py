@@ -76,7 +76,7 @@ def test_python_runs(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         assert (tmp_path / written).is_file()
     plan = names.get("plan")
     if isinstance(plan, vkc.Plan):
-        assert plan.success, plan.report()
+        assert plan.success, plan.summary()
 
 
 def test_readme_is_brief() -> None:

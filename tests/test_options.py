@@ -17,7 +17,7 @@ REAL = [item.name for item in fields(Options) if item.type == "float"]
 
 
 def test_every_option_is_of_a_known_kind_and_documented() -> None:
-    assert sorted([*WHOLE, *REAL, "effort"]) == sorted(item.name for item in fields(Options))
+    assert sorted([*WHOLE, *REAL, "objective"]) == sorted(item.name for item in fields(Options))
     assert "dist_safe" in REAL
     assert "move_waypoints" in WHOLE
     assert Options.__doc__ is not None
@@ -87,17 +87,17 @@ def test_they_stay_as_they_are() -> None:
         Options().dt = 0.1  # type: ignore[misc]
 
 
-def test_effort_is_one_of_two() -> None:
-    assert Options(effort="squares").effort == "squares"
+def test_objective_is_one_of_two() -> None:
+    assert Options(objective="control_effort").objective == "control_effort"
     for value in ("lengths", None, 1, np.nan):
         with pytest.raises(InputError, match="'length' or 'squares'") as caught:
-            Options(effort=value)  # type: ignore[arg-type]
-        assert caught.value.field == "Options.effort"
+            Options(objective=value)  # type: ignore[arg-type]
+        assert caught.value.field == "Options.objective"
 
 
 def test_the_paper_minimises_squares_with_equal_weights() -> None:
     paper = Options.paper(dt=0.5, velocity_weight_base=2.0)
-    assert (paper.effort, paper.dt, paper.velocity_weight_base) == ("squares", 0.5, 2.0)
+    assert (paper.objective, paper.dt, paper.velocity_weight_base) == ("control_effort", 0.5, 2.0)
     assert (
         paper.velocity_weight_heading
         == paper.velocity_weight_arm

@@ -1,18 +1,16 @@
 import types
 
-from . import baselines, benchmarks, simulation, validation, visualization
-from .datasets.check import DatasetCheck, check_dataset
-from .datasets.dataset import Dataset
-from .datasets.episode import Episode
-from .datasets.generate import generate
-from .datasets.recipes.recipe import Recipe, load_recipe
+from . import (
+    baselines,
+    benchmarks,
+    datasets,
+    importing,
+    procedural,
+    simulation,
+    validation,
+    visualization,
+)
 from .errors import BuildError, InputError, UnknownNameError, VkcError
-from .importing.homes.home_import import ImportedHome, import_home
-from .importing.objects.object_import import ImportedObject, import_object
-from .importing.proposals.proposal import Proposal, Proposals
-from .importing.proposals.propose import propose_attachments
-from .importing.robots.doctor import Diagnosis, doctor
-from .importing.robots.robot_import import ImportedRobot, import_robot
 from .options import Options
 from .planning.chain.chain import VirtualKinematicChain, consolidate
 from .planning.chain.inversion import invert
@@ -22,13 +20,10 @@ from .planning.plan import Plan
 from .planning.planner import Planner, plan
 from .planning.scene_check import ReachableAttachment, SceneCheck, check_scene
 from .planning.solver.solution import Iteration
-from .procedural.furniture.catalogue import random_object, write_object
-from .procedural.rooms.random_room import random_room
-from .procedural.rooms.settings import RoomSettings
-from .procedural.tasks import goals, random_task
 from .simulation.physics import Physics
 from .simulation.result import SimulationResult
 from .validation.report import Report, Violation
+from .validation.tolerances import Tolerances
 from .validation.validate import validate
 from .world.models.articulated_object import ArticulatedObject, Attachment, Freedom, Latch
 from .world.models.object_file import load_object
@@ -53,17 +48,10 @@ __all__ = [
     "BuildError",
     "Constraint",
     "Cost",
-    "Dataset",
-    "DatasetCheck",
-    "Diagnosis",
-    "Episode",
     "Freedom",
     "GoTo",
     "Grasp",
     "Hold",
-    "ImportedHome",
-    "ImportedObject",
-    "ImportedRobot",
     "InputError",
     "Iteration",
     "Latch",
@@ -74,19 +62,16 @@ __all__ = [
     "PlacedObject",
     "Plan",
     "Planner",
-    "Proposal",
-    "Proposals",
     "Reach",
     "ReachableAttachment",
-    "Recipe",
     "Release",
     "Report",
     "Robot",
-    "RoomSettings",
     "Scene",
     "SceneCheck",
     "SimulationResult",
     "State",
+    "Tolerances",
     "Touch",
     "Trajectory",
     "TrajectoryProblem",
@@ -98,29 +83,19 @@ __all__ = [
     "baselines",
     "benchmarks",
     "build",
-    "check_dataset",
     "check_scene",
     "consolidate",
     "cpin",
-    "doctor",
-    "generate",
-    "goals",
-    "import_home",
-    "import_object",
-    "import_robot",
+    "datasets",
+    "importing",
     "invert",
     "load_object",
-    "load_recipe",
     "load_robot",
     "load_scene",
     "plan",
-    "propose_attachments",
-    "random_object",
-    "random_room",
-    "random_task",
+    "procedural",
     "simulation",
     "validate",
     "validation",
     "visualization",
-    "write_object",
 ]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from vkc_pin.errors import InputError, format_value
 from vkc_pin.utils.arguments import check_integer, check_number
 
 __all__ = ["Options"]
 
-EFFORTS = ("length", "squares")
+OBJECTIVES = ("path_length", "control_effort")
 _SMALLEST, _LARGEST = 1e-9, 1e9  # of numbers
 _RANGES = {
     "dt": (1e-3, 60.0),
@@ -44,7 +44,7 @@ class Options:
             half of what they can [m].
         grasp_clearance: Clearance of the gripper's touch links to an object near its grasp, where
             the attachment states none [m].
-        effort: What is minimised: "length", of the way, or "squares", eq. 1.
+        objective: "path_length", or "control_effort" for the squares of eq. 1.
         velocity_weight_base: W_vel of eq. 1 for the base's place, and for every joint that slides
             [1/m²].
         velocity_weight_heading: W_vel for its heading [1/rad²].
@@ -56,10 +56,6 @@ class Options:
         approach_time: How long it takes, at `dt` a waypoint [s].
         contact_slots: Witness planes a waypoint can hold.
         contact_reach: Pairs closer than this get a witness plane [m].
-        closure_position: Largest drift of a held object's base that `validation` accepts [m].
-        closure_angle: The same for its orientation [rad].
-        goal_position: ξ_goal, distance [m].
-        goal_angle: ξ_goal, angle [rad].
         max_outer: Rounds of the witness-plane loop.
         max_iterations: Ipopt iterations in one round.
         penalty: First weight of the exact ℓ1 penalty on clearance slack; it is adapted.
@@ -76,7 +72,7 @@ class Options:
     dist_safe: float = 0.02
     self_distance: float = 0.02
     grasp_clearance: float = 0.005
-    effort: str = "length"
+    objective: Literal["path_length", "control_effort"] = "path_length"
     velocity_weight_base: float = 1.0
     velocity_weight_heading: float = 0.025
     velocity_weight_arm: float = 0.025
@@ -86,10 +82,6 @@ class Options:
     approach_time: float = 1.0
     contact_slots: int = 4
     contact_reach: float = 0.25
-    closure_position: float = 1e-3
-    closure_angle: float = 1e-3
-    goal_position: float = 1e-3
-    goal_angle: float = 1e-3
     max_outer: int = 40
     max_iterations: int = 200
     penalty: float = 50.0
@@ -99,12 +91,12 @@ class Options:
         for item in fields(self):
             value = getattr(self, item.name)
             field = f"Options.{item.name}"
-            if item.type == "str":
-                if not isinstance(value, str) or value not in EFFORTS:
+            if item.name == "objective":
+                if not isinstance(value, str) or value not in OBJECTIVES:
                     raise InputError(
                         "unknown",
                         field=field,
-                        expected=" or ".join(map(repr, EFFORTS)),
+                        expected=" or ".join(map(repr, OBJECTIVES)),
                         got=format_value(value),
                     )
                 object.__setattr__(self, item.name, str(value))
@@ -130,7 +122,7 @@ class Options:
         weights = dict.fromkeys(
             (item.name for item in fields(cls) if item.name.startswith("velocity_weight")), 1.0
         )
-        return cls(**{"effort": "squares", **weights, **changes})
+        return cls(**{"objective": "control_effort", **weights, **changes})
 
     @property
     def largest_margin(self) -> float:

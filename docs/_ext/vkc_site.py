@@ -78,7 +78,7 @@ def films(app: Sphinx, problem: Exception | None) -> None:
     shutil.copytree(ROOT / "docs" / "animations", folder, dirs_exist_ok=True)
     plan = vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 1.2})])
     if not plan.success:
-        raise RuntimeError(plan.report())
+        raise RuntimeError(plan.summary())
     plan.to_html(folder / "door.html")
     (Path(app.outdir) / "index.html").write_text(REDIRECT.format(f"{START}.html"), encoding="utf-8")
 

@@ -89,7 +89,7 @@ def stands(found: vkc.Plan, waypoint: int, name: str = "cup") -> pin.SE3:
 
 def test_a_cup_is_carried_from_table_to_table() -> None:
     found = carried()
-    assert found.success, found.report()
+    assert found.success, found.summary()
     assert vkc.validate(found.scene, found.steps, found.trajectory, found.options).ok
     assert names(found) == CARRIED
     assert [dict(phase.held) for phase in found.trajectory.phases] == [
@@ -132,7 +132,7 @@ def test_with_the_arm_at_home_the_cup_is_turned_over_and_stands_upright_all_the_
     """As it stood before the plan; not as the hand has turned it when it is put down."""
     only(monkeypatch, -2)
     found = plan(room(), CARRY)
-    assert found.success, found.report()
+    assert found.success, found.summary()
     np.testing.assert_allclose(rows(found, 3)[0, 3:], found.scene.robot.home, atol=1e-6)
     on_the_way = stands(found, found.trajectory.phases[3].first)
     assert on_the_way.rotation[2, 2] < 0.9
@@ -154,7 +154,7 @@ def test_what_is_held_at_the_start_is_carried_on() -> None:
         at={"cup": [values[name.removeprefix("side_")] for name in attachment.coordinates]},
     )
     found = plan(held, CARRY)
-    assert found.success, found.report()
+    assert found.success, found.summary()
     assert names(found) == ["go to", "place cup", "let go"]
 
 
@@ -163,7 +163,7 @@ def test_no_room_to_put_it_down(monkeypatch: pytest.MonkeyPatch) -> None:
     found = plan(room(box("crate", [0.3, 0.3, 0.3], [THERE[0], THERE[1], 0.85])), CARRY)
     assert (found.success, found.status) == (False, "no base pose")
     assert names(found) == CARRIED[:2]
-    assert "goal" in {v.constraint for v in found.validation.violations}
+    assert "goal" in {v.constraint for v in found.report.violations}
 
 
 def test_where_one_way_to_hold_the_arm_leads_nowhere_the_next_is_tried(
@@ -181,7 +181,7 @@ def test_where_one_way_to_hold_the_arm_leads_nowhere_the_next_is_tried(
     monkeypatch.setattr(Attempt, "_drive", only_at_home)
     monkeypatch.setattr(attempt, "_ENDS", 2)
     found = plan(room(), CARRY)
-    assert found.success, found.report()
+    assert found.success, found.summary()
     assert names(found) == CARRIED
     assert len(driven) == 4, "to the cup; twice with the arm a little drawn back; at home"
     np.testing.assert_allclose(driven[1], driven[2])
@@ -194,7 +194,7 @@ def test_where_one_way_to_hold_the_arm_leads_nowhere_the_next_is_tried(
 
 def test_it_drives_on_when_the_drawer_is_open() -> None:
     found = pulled_and_gone()
-    assert found.success, found.report()
+    assert found.success, found.summary()
     assert names(found)[:3] == ["go to", "reach drawer.handle", "move drawer.slide"]
     assert set(names(found)[3:]) == {"go to"}
     last = found.trajectory.positions[-1]
@@ -207,7 +207,7 @@ def test_it_drives_on_when_the_drawer_is_open() -> None:
 @pytest.mark.parametrize("yaw", [None, 2.0, -2.0])
 def test_it_drives(yaw: float | None) -> None:
     found = plan(open_scene(), vkc.GoTo(-1.0, 1.0, yaw))
-    assert found.success, found.report()
+    assert found.success, found.summary()
     assert names(found) == ["go to"]
     assert np.ptp(found.trajectory.positions[:, 3:9], axis=0).max() == 0.0
     np.testing.assert_allclose(found.trajectory.positions[-1, :2], [-1.0, 1.0], atol=1e-3)

@@ -66,8 +66,8 @@ def limited(monkeypatch: pytest.MonkeyPatch, *, tries: int = 1000, stands: int =
 def failed(scene: vkc.Scene, **arguments: Any) -> vkc.Plan:
     plan = plan_separately(scene, [PULL], **{"options": OPTIONS, "retries": 1, **arguments})
     assert not plan.success
-    assert plan.validation.violations
-    assert f"FAILED, {plan.status}" in plan.report()
+    assert plan.report.violations
+    assert f"FAILED, {plan.status}" in plan.summary()
     return plan
 
 
@@ -79,11 +79,11 @@ def failed(scene: vkc.Scene, **arguments: Any) -> vkc.Plan:
 @pytest.mark.parametrize("task", PLANS)
 def test_in_open_space(task: str, method: str) -> None:
     plan = PLANS[task](method)
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     assert plan.status == "success"
     again = vkc.validate(plan.scene, plan.steps, plan.trajectory, plan.options)
     assert again.ok, again.lines()
-    assert again.clearance == plan.validation.clearance > 0.0
+    assert again.clearance == plan.report.clearance > 0.0
     np.testing.assert_allclose(plan.trajectory.positions[0, :9], plan.scene.start, atol=1e-9)
     name, goal = {"drawer": ("drawer.slide", 0.3), "door": ("door.hinge", 0.3)}[task]
     assert plan.trajectory.column(name)[-1] == pytest.approx(goal, abs=1e-3)
@@ -92,20 +92,20 @@ def test_in_open_space(task: str, method: str) -> None:
 
 @pytest.mark.parametrize("method", BASELINES)
 @pytest.mark.parametrize("task", PLANS)
-def test_efforts_are_the_trajectorys(task: str, method: str) -> None:
+def test_path_lengths_are_those_of_the_trajectory(task: str, method: str) -> None:
     plan = PLANS[task](method)
     m, motion = plan.metrics, plan.trajectory
     change = np.diff(motion(np.linspace(motion.times[0], motion.times[-1], 50_001)), axis=0)
-    assert m["base_effort"] == pytest.approx(
+    assert m["base_path_length"] == pytest.approx(
         sum(np.hypot(x, y) for x, y in change[:, :2]), rel=1e-3
     )
-    assert m["base_effort_l1"] == pytest.approx(
+    assert m["base_path_length_l1"] == pytest.approx(
         np.abs(change[:, 0]).sum() + np.abs(change[:, 1]).sum(), rel=1e-3
     )
-    assert m["arm_effort"] == pytest.approx(np.abs(change[:, 3:9]).sum(), rel=1e-3)
+    assert m["arm_path_length"] == pytest.approx(np.abs(change[:, 3:9]).sum(), rel=1e-3)
     assert m["duration"] == plan.trajectory.times[-1]
-    assert m["clearance"] == plan.validation.clearance
-    assert m["closure_error"] == plan.validation.closure_error
+    assert m["clearance"] == plan.report.clearance
+    assert m["closure_error"] == plan.report.closure_error
     assert m["rounds"] == 1.0
     assert m["iterations"] > 0.0
     parts = sum(m[f"time_{part}"] for part in (*STAGES, "following"))
@@ -156,7 +156,7 @@ def test_b1_moves_the_drawer_by_its_time_law_and_the_hand_stays_on_the_bar() -> 
 def test_a_differential_base() -> None:
     scene = open_scene(base="differential")
     plan = plan_separately(scene, [PULL], options=OPTIONS)
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     x, y, yaw = plan.trajectory.positions[:, :3].T
     heading = (yaw[1:] + yaw[:-1]) / 2
     assert np.abs(np.cos(heading) * np.diff(y) - np.sin(heading) * np.diff(x)).max() < 1e-3
@@ -214,9 +214,7 @@ def test_an_aisle_too_narrow_to_stand_in(method: str, monkeypatch: pytest.Monkey
     assert plan.status == "no base pose"
     assert [phase.name for phase in plan.trajectory.phases] == ["stand"]
     assert np.ptp(plan.trajectory.positions, axis=0).max() == 0.0, "it stands at its start"
-    assert [(v.constraint, v.subject) for v in plan.validation.violations] == [
-        ("goal", "drawer.slide")
-    ]
+    assert [(v.constraint, v.subject) for v in plan.report.violations] == [("goal", "drawer.slide")]
 
 
 @pytest.mark.parametrize("method", BASELINES)
@@ -240,12 +238,12 @@ def test_no_room_for_the_drawer_when_it_is_open(monkeypatch: pytest.MonkeyPatch)
     assert [phase.name for phase in plan.trajectory.phases] == ["go to", "reach drawer.handle"]
     last = plan.trajectory.positions[-1]
     assert off(plan.scene, last, handle()) < 1e-3
-    kinds = {v.constraint for v in plan.validation.violations}
+    kinds = {v.constraint for v in plan.report.violations}
     assert "goal" in kinds
     # A motion that ends before the grasp has no leave to be as close to the tray as a grasp is.
     assert all(
         v.subject.endswith("drawer.tray")
-        for v in plan.validation.violations
+        for v in plan.report.violations
         if v.constraint == "clearance"
     )
     assert kinds <= {"goal", "clearance"}
@@ -262,7 +260,7 @@ def test_the_arm_does_not_reach(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = failed(with_boxes(open_scene(), **shelves), options=options)
     assert plan.status == "arm does not reach"
     assert [phase.name for phase in plan.trajectory.phases][-2:] == ["go to", "reach drawer.handle"]
-    assert {"goal", "clearance"} & {v.constraint for v in plan.validation.violations}
+    assert {"goal", "clearance"} & {v.constraint for v in plan.report.violations}
 
 
 def test_no_way_for_the_base_while_the_drawer_moves(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -296,7 +294,7 @@ def test_how_it_follows_is_checked(
         "what there is of it can be looked at"
     )
     wanted = {"too fast": {"velocity", "acceleration"}, "closure": {"slide", "closure"}}[cause]
-    assert wanted & {v.constraint for v in plan.validation.violations}
+    assert wanted & {v.constraint for v in plan.report.violations}
 
 
 def test_of_several_ends_the_one_that_came_furthest_counts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -336,7 +334,7 @@ def test_where_the_arm_does_not_reach_the_next_place_is_tried(
     monkeypatch.setattr(attempt.Attempt, "_reach", second_time)
     monkeypatch.setattr(attempt.Attempt, "_free", lambda self, poses: free(self, poses)[[0, 0]])
     plan = plan_separately(open_scene(), [PULL], options=OPTIONS, retries=1)
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     assert [phase.name for phase in plan.trajectory.phases] == [
         "go to",
         "reach drawer.handle",
@@ -481,7 +479,7 @@ def test_a_real_try_that_fails_is_followed_by_one_with_other_random_numbers(
     task = TASKS["door"]
     plan = plan_separately(scene, task.steps, method="B1", seed=111)
     tries = int(plan.initialization.removeprefix("B1, try "))
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     assert seeds == [[111, number] for number in range(tries)]
     assert tries > 1, "the first try sufficed: choose another start"
     assert plan.metrics["rounds"] == len(ends) == tries
@@ -496,7 +494,7 @@ def test_after_the_time_limit_there_is_no_other_try(monkeypatch: pytest.MonkeyPa
     plan = plan_separately(drawer_scene(), [PULL], retries=4, time_limit=1e-9)
     assert len(tries.seeds) == 1
     assert plan.status == "time limit", "not all tries were made"
-    assert plan.validation.notes == ("the try that came furthest failed with: collision",)
+    assert plan.report.notes == ("the try that came furthest failed with: collision",)
 
 
 def test_a_time_limit_that_is_not_reached_changes_nothing() -> None:
@@ -588,7 +586,7 @@ def test_one_thing_after_another() -> None:
     second = {"name": "second", "type": "drawer", "position": [1.93, -1.4, 0.0]}
     scene = changed(open_scene(), objects=[*drawer_scene().document["objects"], second])
     plan = plan_separately(scene, [PULL, vkc.Actuate("second", {"slide": 0.2})], options=OPTIONS)
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     names = [phase.name for phase in plan.trajectory.phases]
     first = ["go to", "reach drawer.handle", "move drawer.slide"]
     assert names == [*first, "go to", "reach second.handle", "move second.slide"]
@@ -599,14 +597,14 @@ def test_the_same_thing_twice() -> None:
     plan = plan_separately(
         open_scene(), [vkc.Actuate("drawer", {"slide": 0.15}), PULL], options=OPTIONS
     )
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     names = [phase.name for phase in plan.trajectory.phases]
     assert names == ["go to", "reach drawer.handle", "move drawer.slide", "move drawer.slide"]
 
 
 def test_what_is_taken_is_what_moves_the_joints(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first attachment of a refrigerator with two leaves moves the left one."""
-    thing = vkc.load_object(vkc.random_object("refrigerator", 0))
+    thing = vkc.load_object(vkc.procedural.random_object("refrigerator", 0))
     placed = vkc.PlacedObject("it", thing, pin.SE3.Identity(), np.zeros(2))
     scene = dataclasses.replace(door_scene(), objects={"it": placed})
     taken: list[Any] = []
@@ -620,7 +618,7 @@ def test_what_is_taken_is_what_moves_the_joints(monkeypatch: pytest.MonkeyPatch)
 
 def test_what_is_held_at_the_start() -> None:
     plan = plan_separately(holding(open_scene()), [PULL], options=OPTIONS)
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     assert [phase.name for phase in plan.trajectory.phases] == ["move drawer.slide"]
 
 
@@ -639,15 +637,15 @@ def test_a_time_limit_ends_planning_inside_a_try(monkeypatch: pytest.MonkeyPatch
     assert plan.metrics["rounds"] == 1.0
 
 
-def test_effort_ends_planning_at_the_same_place() -> None:
+def test_max_evaluations_ends_planning_at_the_same_place() -> None:
     whole = open_drawer("B1")
-    used = int(whole.metrics["effort"])
-    assert digest(plan_separately(drawer_scene(), [PULL], effort=used)) == digest(whole)
+    used = int(whole.metrics["evaluations"])
+    assert digest(plan_separately(drawer_scene(), [PULL], max_evaluations=used)) == digest(whole)
     short = [
-        plan_separately(drawer_scene(), [PULL], effort=2 * used // 3, planner=planner)
+        plan_separately(drawer_scene(), [PULL], max_evaluations=2 * used // 3, planner=planner)
         for planner in (None, vkc.Planner())
     ]
-    assert [plan.status for plan in short] == ["effort spent"] * 2
+    assert [plan.status for plan in short] == ["evaluation limit"] * 2
     assert digest(short[0]) == digest(short[1])
 
 

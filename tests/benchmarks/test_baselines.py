@@ -18,7 +18,7 @@ from vkc_pin.benchmarks.baselines import COMPARED_PLANNERS, TASKS
 from vkc_pin.benchmarks.comparison import shown
 from vkc_pin.benchmarks.comparison_report import report
 from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.harness.limits import EFFORT, LIMITS
+from vkc_pin.benchmarks.harness.limits import LIMITS, MAX_EVALUATIONS
 from vkc_pin.benchmarks.harness.record import peaks
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
@@ -74,8 +74,8 @@ def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     metrics = {
         **plan.trajectory.metrics(),
         **PlanningStatistics(1.0 + number + k, 0.5, 12, 3).to_metrics(),
-        "base_effort": 4.0 + number - k,
-        "arm_effort": 7.0,
+        "base_path_length": 4.0 + number - k,
+        "arm_path_length": 7.0,
         "clearance": np.inf,
         "closure_error": 1e-4,
     }
@@ -142,11 +142,11 @@ def test_trials(result: dict[str, Any]) -> None:
         assert t["success"] == (t["number"] in GOOD[t["method"]])
         assert t["duration"] == pytest.approx(6.0)
     meta = result["meta"]
-    assert (meta["benchmark"], meta["seed"], meta["starts"], meta["effort"]) == (
+    assert (meta["benchmark"], meta["seed"], meta["starts"], meta["max_evaluations"]) == (
         "baselines",
         5,
         3,
-        EFFORT,
+        MAX_EVALUATIONS,
     )
     assert (meta["tasks"], meta["methods"]) == (["door"], list(COMPARED_PLANNERS))
     assert (meta["scenes"], meta["goals"]) == (
@@ -203,8 +203,10 @@ def test_baselines_in_other_numbers_of_waypoints_and_with_other_budgets(
         comparison, "plan_separately", lambda scene, steps, **how: asked.append(how)
     )
     for method in ("B1", "B1x1", "B2x3"):
-        baselines.plan_trial("scene", {"scene": "door", "method": method, "seed": 8, "effort": 7})  # type: ignore[arg-type]
-    common = {**LIMITS, "effort": 7, "seed": 8}
+        baselines.plan_trial(
+            "scene", {"scene": "door", "method": method, "seed": 8, "max_evaluations": 7}
+        )  # type: ignore[arg-type]
+    common = {**LIMITS, "max_evaluations": 7, "seed": 8}
     assert asked == [
         {**common, "method": "B1", "finer": 2},
         {**common, "method": "B1", "finer": 1},
@@ -264,9 +266,9 @@ def test_peaks_against_numbers_by_hand() -> None:
     # Way: 5, 0 and √2; arm: 0.5, 0.4 and 0, and 0, 3 and 0.6.
     expected = {
         "duration": 3.5,
-        "base_effort": 5.0 + np.sqrt(2.0),
-        "base_effort_l1": 9.0,
-        "arm_effort": 4.5,
+        "base_path_length": 5.0 + np.sqrt(2.0),
+        "base_path_length_l1": 9.0,
+        "arm_path_length": 4.5,
     }
     assert motion.metrics() == pytest.approx(expected)
 
@@ -345,7 +347,7 @@ def test_tables_against_numbers_by_hand(out: Path, result: dict[str, Any]) -> No
     assert "9 trials, 1 at a time" in text.splitlines()[-1]
 
 
-def test_errors_have_no_times_and_no_efforts(result: dict[str, Any]) -> None:
+def test_errors_have_no_times_and_no_path_lengths(result: dict[str, Any]) -> None:
     error = {
         "success": False,
         "status": "error",
@@ -427,7 +429,7 @@ def test_view_shows_a_failure_with_the_offending_links_in_red(
                     for key in track["keys"]
                     if key["value"][0] > 0.85 and key["value"][1] < 0.1
                 ]
-    found = vkc.Plan.load(file).validation.violations  # of the motion, not of the file
+    found = vkc.Plan.load(file).report.violations  # of the motion, not of the file
     close = [
         violation for violation in found if violation.constraint in ("penetration", "clearance")
     ]

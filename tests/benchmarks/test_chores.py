@@ -121,7 +121,7 @@ def test_what_hangs_on_seeds_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyP
         scene: vkc.Scene, steps: list[vkc.Step], *, options: vkc.Options, seed: int
     ) -> list[vkc.Plan]:
         plans = [stay(scene, {"seed": seed, "number": number}) for number in (1, 0)]
-        return [with_metrics(one, {**one.metrics, "arm_effort": float(seed)}) for one in plans]
+        return [with_metrics(one, {**one.metrics, "arm_path_length": float(seed)}) for one in plans]
 
     monkeypatch.setattr(stepwise, "step_by_step", two)
     settings = {
@@ -139,7 +139,7 @@ def test_what_hangs_on_seeds_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyP
         (5, "VKC", True),
         (5, "step by step", False),
     ]
-    assert [one["arm_effort"] for one in result["trials"][1::2]] == [8.0, 10.0]
+    assert [one["arm_path_length"] for one in result["trials"][1::2]] == [8.0, 10.0]
     assert [one["steps_done"] for one in result["trials"]] == [None, 1, 10, 1]
     table = (tmp_path / "table.md").read_text(encoding="utf-8")
     assert "| fetch | 0 | in one call | 1 of 2 | all |" in table
@@ -182,7 +182,7 @@ def test_every_chore_is_really_planned(
         chores.CHORES[name].options,
     )
     plan = vkc.plan(scene, steps, options=options, seed=7, window=2)
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     assert vkc.validate(scene, plan.steps, plan.trajectory, options).ok
     last = plan.end_scene()
     for owner, value in joints.items():
@@ -213,5 +213,5 @@ def test_ten_steps_in_one_call(tmp_path: Path, capsys: pytest.CaptureFixture[str
     (trial,) = json.loads((tmp_path / "out" / "results.json").read_text(encoding="utf-8"))["trials"]
     assert trial["success"], trial["violations"]
     assert trial["planning_time"] < trial["wall_time"]
-    assert trial["base_effort"] > 10.0  # from table to table to cabinet
+    assert trial["base_path_length"] > 10.0  # from table to table to cabinet
     assert "| fetch | 10 | 1 of 1 |" in capsys.readouterr().out

@@ -65,8 +65,8 @@ def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
         **plan.trajectory.metrics(),
         "planning_time": 2.0 + number - 0.5 * k,
         "build_time": 0.5,
-        "base_effort": 5.0 + number - k,
-        "arm_effort": 9.0 + 2.0 * number,
+        "base_path_length": 5.0 + number - k,
+        "arm_path_length": 9.0 + 2.0 * number,
         "clearance": 0.02,
         "closure_error": 1e-4,
         "iterations": 12.0,
@@ -172,7 +172,7 @@ def test_the_variant_has_the_numbers_of_the_papers_code() -> None:
 
 def test_the_variant_begins_where_the_experiment_does() -> None:
     plain, paper = (
-        which.specify(trials=2, seed=3, tasks=list(TASKS), methods=["VKC"], effort=7)
+        which.specify(trials=2, seed=3, tasks=list(TASKS), methods=["VKC"], max_evaluations=7)
         for which in (COMPARISON, PAPER)
     )
     assert plain == paper
@@ -222,7 +222,7 @@ def test_the_variant_is_really_planned(name: str) -> None:
     (spec,) = PAPER.specify(trials=1, seed=7, tasks=[name], methods=["VKC"])
     scene = placed(papers_home(), spec).with_start(base=spec["base"])
     plan = PAPER.plan_trial(scene, spec)
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     assert vkc.validate(scene, PAPER.tasks[name].steps, plan.trajectory, plan.options).ok
 
 
@@ -236,10 +236,10 @@ def test_every_task_is_really_planned(name: str, method: str) -> None:
     scene = placed(vkc.load_scene(task.scene), spec).with_start(base=spec["base"])
     plan = household.plan_trial(scene, spec)
     if method == "VKC":
-        assert plan.success, plan.report()
+        assert plan.success, plan.summary()
     report = vkc.validate(scene, task.steps, plan.trajectory, plan.options)
     assert report.ok == plan.success
-    assert report.contradictions(plan.validation) == []
+    assert report.contradictions(plan.report) == []
 
 
 def test_the_cup_stands_wholly_on_the_coffee_table() -> None:
@@ -381,8 +381,8 @@ def test_tables_against_numbers_by_hand(out: Path) -> None:
     assert own[10] == ["door", "arm [rad]", "–", "11.00 ± –; 11.00", "10.00 ± 1.41; 10.00"]
     pictures = (
         "success",
-        "base_effort",
-        "arm_effort",
+        "base_path_length",
+        "arm_path_length",
         "planning_time",
         "cup_joints",
         "door_joints",
@@ -415,8 +415,8 @@ def test_charts_have_all_tasks_and_methods(
     assert all(case[:3] == (12, ["cup", "door"], COMPARED_PLANNERS) for case in drawn.values())
     assert {name: case[3].get("shared") for name, case in drawn.items()} == {
         "success.png": None,
-        "base_effort.png": True,
-        "arm_effort.png": True,
+        "base_path_length.png": True,
+        "arm_path_length.png": True,
         "planning_time.png": False,
     }
 

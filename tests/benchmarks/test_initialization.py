@@ -14,7 +14,7 @@ from helpers.fake_plan import fake_plan, with_metrics
 import vkc_pin as vkc
 from vkc_pin.benchmarks import initialization
 from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.harness.limits import EFFORT
+from vkc_pin.benchmarks.harness.limits import MAX_EVALUATIONS
 from vkc_pin.benchmarks.initialization import COMPARED_INITIALIZATIONS, STEPWISE, TARGET
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.validation.report import Report, Violation
@@ -41,9 +41,9 @@ def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
         "planning_time": 1.0 + number + 0.25 * COMPARED_INITIALIZATIONS.index(method)
         if method in COMPARED_INITIALIZATIONS
         else 3.0,
-        "base_effort": (5.0 if method == STEPWISE else 4.0) + number,
-        "base_effort_l1": 6.0 + number,
-        "arm_effort": 7.0 + (number if method == STEPWISE else 0.0),
+        "base_path_length": (5.0 if method == STEPWISE else 4.0) + number,
+        "base_path_length_l1": 6.0 + number,
+        "arm_path_length": 7.0 + (number if method == STEPWISE else 0.0),
         "clearance": np.inf,
         "closure_error": 1e-4,
         "build_time": 0.5,
@@ -113,7 +113,7 @@ def test_trials(result: dict[str, Any]) -> None:
         3,
         2,
     )
-    assert (meta["target"], meta["effort"]) == (list(TARGET), EFFORT)
+    assert (meta["target"], meta["max_evaluations"]) == (list(TARGET), MAX_EVALUATIONS)
     assert {"pin", "casadi", "coal", "numpy", "vkc-pin"} <= set(meta["versions"])
 
 
@@ -163,7 +163,8 @@ def test_the_task(monkeypatch: pytest.MonkeyPatch) -> None:
     for method in ("stationary", "auto", STEPWISE):
         initialization.plan_trial("scene", {**spec, "method": method})  # type: ignore[arg-type]
     assert all(
-        scene == "scene" and how["effort"] == EFFORT and how["seed"] == 8 for scene, _, how in asked
+        scene == "scene" and how["max_evaluations"] == MAX_EVALUATIONS and how["seed"] == 8
+        for scene, _, how in asked
     )
     assert all(how["perturbation"] == 0.05 for _, _, how in asked)
     assert [(how["initialization"], how["joint"]) for _, _, how in asked] == [
@@ -221,8 +222,8 @@ def test_chart_and_csv(out: Path, result: dict[str, Any]) -> None:
     assert 0.02 < float((np.ptp(image, axis=2) > 0.2).mean()) < 0.6  # coloured bars
     with (out / "results.csv").open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
-    assert [(row["key"], float(row["base_effort"])) for row in rows] == [
-        (trial["key"], trial["base_effort"]) for trial in result["trials"]
+    assert [(row["key"], float(row["base_path_length"])) for row in rows] == [
+        (trial["key"], trial["base_path_length"]) for trial in result["trials"]
     ]
 
 

@@ -13,7 +13,7 @@ from helpers.fake_plan import fake_plan, with_metrics
 import vkc_pin as vkc
 from vkc_pin.benchmarks import scale
 from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.harness.limits import EFFORT
+from vkc_pin.benchmarks.harness.limits import MAX_EVALUATIONS
 from vkc_pin.benchmarks.scale import AXES, crowded, refined
 from vkc_pin.cli import main
 from vkc_pin.errors import InputError
@@ -56,9 +56,9 @@ def planned(
                 "build_time": 0.0,
             },
             **{
-                "base_effort": 2.0,
-                "base_effort_l1": 2.5,
-                "arm_effort": 7.0,
+                "base_path_length": 2.0,
+                "base_path_length_l1": 2.5,
+                "arm_path_length": 7.0,
                 "clearance": 0.02,
                 "closure_error": 1e-7,
             },
@@ -129,7 +129,7 @@ def test_trials_and_table(
     (_, steps, how), *rest = planned
     assert len(rest) == 12  # and one before, to pay for what is built once
     assert [(step.object, step.joints) for step in steps] == [("door", {"hinge": 1.2})]
-    assert (how["seed"], how["effort"]) == (2, EFFORT)
+    assert (how["seed"], how["max_evaluations"]) == (2, MAX_EVALUATIONS)
     result = json.loads((tmp_path / "results.json").read_text(encoding="utf-8"))
     meta, trials = result["meta"], result["trials"]
     assert (meta["benchmark"], meta["seed"], meta["starts"]) == ("scale", 2, 3)

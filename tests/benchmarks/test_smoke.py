@@ -32,14 +32,14 @@ FIELDS = {
         "planning_time",
     ),
     *(
-        "base_effort",
-        "base_effort_l1",
-        "arm_effort",
+        "base_path_length",
+        "base_path_length_l1",
+        "arm_path_length",
         "clearance",
         "closure_error",
         "iterations",
         "rounds",
-        "effort",
+        "evaluations",
         "waypoints",
     ),
     *("initialization", "build_time", "failed_constraint", "violations"),
@@ -70,8 +70,12 @@ def check(trial: dict[str, Any], method: str, number: int) -> None:
     )
     assert 0.0 <= trial["clearance"] < 0.02  # the stick is near the table and the cube
     assert 0.0 <= trial["closure_error"] <= 1e-3
-    assert trial["base_effort"] <= trial["base_effort_l1"] <= np.sqrt(2.0) * trial["base_effort"]
-    assert trial["arm_effort"] > 0.5
+    assert (
+        trial["base_path_length"]
+        <= trial["base_path_length_l1"]
+        <= np.sqrt(2.0) * trial["base_path_length"]
+    )
+    assert trial["arm_path_length"] > 0.5
     start, stick = (
         np.array(trial["start"]),
         load_scene("init_1").objects["stick"].placement.translation,
@@ -87,7 +91,7 @@ def check(trial: dict[str, Any], method: str, number: int) -> None:
         - 0.5
     )
     assert farther > 2.0
-    assert trial["base_effort"] > farther
+    assert trial["base_path_length"] > farther
     parts = [trial[name] for name in trial if name.startswith("time_")]
     assert all(part >= 0.0 for part in parts)
     assert 0.0 < sum(parts) <= trial["planning_time"]
@@ -149,9 +153,11 @@ def test_an_experiment_on_a_scheduler_of_somebody_else(tmp_path: Path) -> None:
         for where in ("there", "here")
     ]
     assert [
-        [trial[name] for name in ("key", "success", "effort", "base_effort")] for trial in found[0]
+        [trial[name] for name in ("key", "success", "evaluations", "base_path_length")]
+        for trial in found[0]
     ] == [
-        [trial[name] for name in ("key", "success", "effort", "base_effort")] for trial in found[1]
+        [trial[name] for name in ("key", "success", "evaluations", "base_path_length")]
+        for trial in found[1]
     ]
 
 
@@ -202,7 +208,7 @@ def test_initialization(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     for row, trial in zip(rows, result["trials"], strict=True):
         assert set(row) == FIELDS
         assert (row["success"], row["status"], row["failed_constraint"]) == ("true", "success", "")
-        for name in ("planning_time", "base_effort", "arm_effort", "start"):
+        for name in ("planning_time", "base_path_length", "arm_path_length", "start"):
             assert json.loads(row[name]) == trial[name]
 
     table = (out / "table.md").read_text(encoding="utf-8")
@@ -212,7 +218,7 @@ def test_initialization(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert cells[:3] == ["init_1: no obstacle", "astar", "2 of 2"]
     medians = (
         np.median([trial[name] for trial in result["trials"]])
-        for name in ("planning_time", "base_effort", "arm_effort")
+        for name in ("planning_time", "base_path_length", "arm_path_length")
     )
     assert [cells[3], cells[5], cells[6]] == [f"{value:.2f}" for value in medians]
     assert cells[7:9] == ["0", "none"]
@@ -259,7 +265,7 @@ def test_auto_is_compared_with_step_after_step(tmp_path: Path) -> None:
         .read_text(encoding="utf-8")
         .split("## One problem against step after step")[1]
     )
-    for name, field in (("base [m]", "base_effort"), ("arm [rad]", "arm_effort")):
+    for name, field in (("base [m]", "base_path_length"), ("arm [rad]", "arm_path_length")):
         (line,) = [
             line
             for line in compared.splitlines()
@@ -314,12 +320,16 @@ def test_baselines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         )
         if not t["success"]:
             continue
-        assert t["base_effort"] <= t["base_effort_l1"] <= np.sqrt(2.0) * t["base_effort"]
+        assert (
+            t["base_path_length"]
+            <= t["base_path_length_l1"]
+            <= np.sqrt(2.0) * t["base_path_length"]
+        )
         # From the start to within reach of the drawer, which is at x = 4, y = 2.5.
-        assert t["base_effort"] > np.linalg.norm(np.array(t["start"][:2]) - [4.0, 2.5]) - 1.9
+        assert t["base_path_length"] > np.linalg.norm(np.array(t["start"][:2]) - [4.0, 2.5]) - 1.9
         assert 0.0 < t["peak_velocity"] <= np.pi
         assert 0.0 < t["peak_acceleration"] <= 1.4 + 1e-3  # the limit
-        assert t["peak_velocity"] * 6 * t["duration"] > t["arm_effort"] > 1.0
+        assert t["peak_velocity"] * 6 * t["duration"] > t["arm_path_length"] > 1.0
     assert trials[0]["start"] == trials[1]["start"] != trials[2]["start"] == trials[3]["start"]
 
     # The motions in the picture are those of the trial.
@@ -374,7 +384,7 @@ def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert t["success"] == (t["status"] == "success") == (not t["violations"])
         assert t["success"], t["violations"]
         assert (
-            t["base_effort"] > 1.5 - t["start"][0]
+            t["base_path_length"] > 1.5 - t["start"][0]
         )  # from the start to within reach of the door, which is at x = 2.5
         assert 0.0 < sum(t[name] for name in t if name.startswith("time_")) <= t["planning_time"]
     assert trials[0]["start"] == trials[1]["start"] != trials[2]["start"] == trials[3]["start"]
@@ -426,11 +436,11 @@ def test_household(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
             assert end.rotation[2, 2] > np.cos(2e-3)
         else:
             assert found.trajectory.column("cabinet.hinge")[-1] == pytest.approx(0.4, abs=5e-3)
-        assert t["base_effort"] > 1.0
+        assert t["base_path_length"] > 1.0
     for name in (
         "success",
-        "base_effort",
-        "arm_effort",
+        "base_path_length",
+        "arm_path_length",
         "planning_time",
         "cup_joints",
         "cabinet_joints",

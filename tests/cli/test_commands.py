@@ -175,11 +175,14 @@ def test_a_plan_that_fails_returns_1_and_is_written(
     assert data["violations"]
 
 
-def test_effort_ends_planning(capsys: pytest.CaptureFixture[str]) -> None:
+def test_max_evaluations_ends_planning(capsys: pytest.CaptureFixture[str]) -> None:
     assert (
-        cli.main(["plan", "drawer", "--set", "drawer.slide=0.3", "--effort", "500", "--quiet"]) == 1
+        cli.main(
+            ["plan", "drawer", "--set", "drawer.slide=0.3", "--max-evaluations", "500", "--quiet"]
+        )
+        == 1
     )
-    assert capsys.readouterr().out.startswith("drawer: FAILED, effort spent")
+    assert capsys.readouterr().out.startswith("drawer: FAILED, evaluation limit")
 
 
 @pytest.mark.parametrize(
@@ -209,7 +212,10 @@ def test_effort_ends_planning(capsys: pytest.CaptureFixture[str]) -> None:
             ["plan", "door", "--set", "door.hinge=1", "--time-limit", "-1"],
             ["time_limit", "more than 0"],
         ),
-        (["plan", "door", "--set", "door.hinge=1", "--effort", "0"], ["effort", "at least 1"]),
+        (
+            ["plan", "door", "--set", "door.hinge=1", "--max-evaluations", "0"],
+            ["max_evaluations", "at least 1"],
+        ),
         (
             ["plan", "door", "--set", "door.hinge=1", "--time-limit", "soon"],
             ["--time-limit", "soon"],
@@ -371,17 +377,17 @@ def test_check_says_what_the_file_says_otherwise(
     planned: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plan = vkc.Plan.load(planned.folder / "door.npz")
-    report = dataclasses.replace(plan.validation, clearance=plan.validation.clearance + 0.1)
+    report = dataclasses.replace(plan.report, clearance=plan.report.clearance + 0.1)
     assert (
         cli.main(
             [
                 "check",
-                str(dataclasses.replace(plan, validation=report).save(tmp_path / "better.npz")),
+                str(dataclasses.replace(plan, report=report).save(tmp_path / "better.npz")),
             ]
         )
         == 1
     )
-    here = plan.validation.clearance
+    here = plan.report.clearance
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].endswith("every constraint holds")
     assert (
@@ -463,8 +469,8 @@ def test_bench(bench: tuple[int, dict[str, Any]]) -> None:
             "status": str,
             "success": bool,
             "planning_time": float,
-            "base_effort": float,
-            "arm_effort": float,
+            "base_path_length": float,
+            "arm_path_length": float,
             "clearance": float,
             "closure_error": float,
             "iterations": int,
@@ -592,7 +598,7 @@ def test_records_of_failures(door_plan: vkc.Plan) -> None:
     )
     worse = dataclasses.replace(
         door_plan,
-        validation=vkc.Report((blame,)),
+        report=vkc.Report((blame,)),
         status="rejected",
     )
     trial = record.trial(worse, method="VKC", seed=0, task="whole")

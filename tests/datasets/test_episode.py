@@ -83,9 +83,9 @@ def test_an_exception_is_a_failure_on_record(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_a_plan_that_fails_is_a_failure_with_its_reason() -> None:
-    record, data = run_attempt({**DOCUMENT, "effort": 1}, 0, {})
+    record, data = run_attempt({**DOCUMENT, "max_evaluations": 1}, 0, {})
     assert (record["success"], data) == (False, b"")
-    assert record["status"] == "effort spent"
+    assert record["status"] == "evaluation limit"
     assert record["reason"]
 
 

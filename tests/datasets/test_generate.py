@@ -100,7 +100,9 @@ def test_what_somebody_has_removed_is_made_again(
 
 @pytest.mark.parametrize("kind", ["SIGINT", "SIGKILL"])
 def test_a_stop_loses_and_doubles_nothing(made: Dataset, tmp_path: Path, kind: str) -> None:
-    script = f"import sys, vkc_pin as vkc; vkc.generate({SMALL!r}, {EPISODES}, sys.argv[1])"
+    script = (
+        f"import sys, vkc_pin as vkc; vkc.datasets.generate({SMALL!r}, {EPISODES}, sys.argv[1])"
+    )
     process = subprocess.Popen(
         [sys.executable, "-c", script, str(tmp_path / "out")],
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
@@ -134,7 +136,7 @@ def test_nothing_is_written_into_what_is_something_else(made: Dataset, tmp_path:
         generate(SMALL, 1, tmp_path / "mine")
     assert [file.name for file in (tmp_path / "mine").iterdir()] == ["thesis.tex"]
     with pytest.raises(InputError, match="run otherwise") as caught:
-        generate({**SMALL, "effort": 7}, EPISODES, made.folder)
+        generate({**SMALL, "max_evaluations": 7}, EPISODES, made.folder)
     assert caught.value.field == "recipe"
     with pytest.raises(UnknownNameError, match="did you mean 'random_oven'"):
         generate({**SMALL, "objects": ["random_ovens"]}, 1, tmp_path / "new")

@@ -235,12 +235,12 @@ CALLS: dict[str, Call] = {
         _method(lambda: scene().robot.coordinates, "index"), lambda: {"name": "base_x"}
     ),
     "random_room": Call(
-        vkc.random_room,
+        vkc.procedural.random_room,
         lambda: {"number": 0, "settings": None, "clutter": 0.0, "tables": 0, "objects": ()},
         0.3,
     ),
     "random_task": Call(
-        vkc.random_task,
+        vkc.procedural.random_task,
         lambda: {
             "seed": 0,
             "settings": None,
@@ -250,17 +250,18 @@ CALLS: dict[str, Call] = {
         },
         0.3,
     ),
-    "random_object": Call(vkc.random_object, lambda: {"kind": "oven", "seed": 0}),
+    "random_object": Call(vkc.procedural.random_object, lambda: {"kind": "oven", "seed": 0}),
     "write_object": Call(
-        _written(lambda path, **k: vkc.write_object(path=path, **k)),
-        lambda: {"path": "oven.yaml", "description": vkc.random_object("oven")},
+        _written(lambda path, **k: vkc.procedural.write_object(path=path, **k)),
+        lambda: {"path": "oven.yaml", "description": vkc.procedural.random_object("oven")},
     ),
     "load_object described": Call(
-        vkc.load_object, lambda: {"name_or_path": vkc.random_object("door"), "folder": "."}
+        vkc.load_object,
+        lambda: {"name_or_path": vkc.procedural.random_object("door"), "folder": "."},
     ),
-    "goals": Call(vkc.goals, lambda: {"scene": scene(), "share": 0.5}),
+    "goals": Call(vkc.procedural.goals, lambda: {"scene": scene(), "share": 0.5}),
     "RoomSettings": Call(
-        vkc.RoomSettings,
+        vkc.procedural.RoomSettings,
         lambda: {
             "clutter": 0.5,
             "objects": ("door", "drawer"),
@@ -279,7 +280,7 @@ CALLS: dict[str, Call] = {
         lambda: {name: getattr(vkc.Options(), name) for name in vkc.Options.__dataclass_fields__},
         2.0,
     ),
-    "Options.paper": Call(vkc.Options.paper, lambda: {"dt": 0.5, "effort": "squares"}),
+    "Options.paper": Call(vkc.Options.paper, lambda: {"dt": 0.5, "objective": "control_effort"}),
     "Reach": Call(_planned(vkc.Reach), lambda: {"pose": list(_POSE), "frame": None}),
     "Grasp": Call(_planned(vkc.Grasp), lambda: {"object": "ball", "attachment": None, "by": None}),
     "Actuate": Call(

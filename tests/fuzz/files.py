@@ -121,7 +121,7 @@ def _used(scene: vkc.Scene, *, planned: bool) -> str:
         if not placed.object.free and placed.object.coordinates.names:
             steps = [vkc.Actuate(name, {placed.object.coordinates.names[0]: 0.1})]
     plan = vkc.plan(scene, steps, options=vkc.Options(**TINY), time_limit=0.2)
-    plan.report()
+    plan.summary()
     return "planned"
 
 
@@ -185,7 +185,7 @@ def run_options(given: dict[str, Any]) -> str:
     scene = vkc.load_scene("drawer")
     vkc.plan(
         scene, [vkc.Actuate("drawer", {"slide": 0.2})], options=options, time_limit=0.2
-    ).report()
+    ).summary()
     return "planned"
 
 

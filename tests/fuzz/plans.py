@@ -150,7 +150,7 @@ def run(given: dict[str, Any]) -> str:
     file = folder() / "spoiled.npz"
     file.write_bytes(_content(given))
     plan = vkc.Plan.load(file)
-    plan.report()
+    plan.summary()
     json.dumps(plan.to_dict())
     repr(plan)
     vkc.validate(plan.scene, plan.steps, plan.trajectory, plan.options, plan.terms)

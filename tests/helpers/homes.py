@@ -41,7 +41,7 @@ def home_urdf(folder: Path) -> tuple[Path, int]:
         _box(world, (x1 - x0, y1 - y0, 2.5), ((x0 + x1) / 2, (y0 + y1) / 2, 1.25), name)
     _box(world, (9.6, 10.2, 0.1), (0.0, 1.0, -0.05), "slab")
     for kind, (x, y, yaw, seed) in PLACES.items():
-        source = ElementTree.fromstring(str(vkc.random_object(kind, seed)["urdf"]))
+        source = ElementTree.fromstring(str(vkc.procedural.random_object(kind, seed)["urdf"]))
         own = [link.get("name", "") for link in source.findall("link")]
         for element in (*source.findall("link"), *source.findall("joint")):
             for name in [element, *element.findall("parent"), *element.findall("child")]:
@@ -98,7 +98,7 @@ HOME_MJCF = """<mujoco>
 
 def _beside_the_door() -> dict[str, tuple[float, float, float, float]]:
     """Return the two walls beside the door's leaf, which starts at its hinge, and goes along x or against it."""
-    door = vkc.load_object(vkc.random_object("door", PLACES["door"][3]))
+    door = vkc.load_object(vkc.procedural.random_object("door", PLACES["door"][3]))
     import pinocchio as pin
 
     data, yaw = door.model.createData(), PLACES["door"][2]

@@ -32,7 +32,7 @@ class Relaxed:
     def _parameters(self, *, relaxed: bool) -> np.ndarray:
         p, f = self.problem, self.found
         given = {
-            "weights": p.effort.weights(*p.rates(self.z)),
+            "weights": p.motion_cost.weights(*p.rates(self.z)),
             "penalty": CLEARANCE,
             "dt": self.timing.dt,
         }
@@ -68,7 +68,7 @@ class Relaxed:
         return float(
             sum(
                 np.sum(w * part**2)
-                for w, part in zip(self.problem.effort.weights(*given), given, strict=True)
+                for w, part in zip(self.problem.motion_cost.weights(*given), given, strict=True)
             )
         )
 

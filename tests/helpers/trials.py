@@ -21,7 +21,7 @@ def square(spec: dict[str, Any]) -> dict[str, Any]:
     """A deterministic trial, with the fields and types that records have."""
     k = spec["number"]
     values = {
-        "effort": np.float64(k) / 3.0,
+        "evaluations": np.float64(k) / 3.0,
         "good": np.bool_(k % 2),
         "start": np.array([k, 0.1]),
         "distance": np.inf,

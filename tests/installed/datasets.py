@@ -15,7 +15,7 @@ EPISODES = 2
 
 
 def main() -> None:
-    dataset = vkc.generate(SMALL, EPISODES, "small", lerobot=True)
+    dataset = vkc.datasets.generate(SMALL, EPISODES, "small", lerobot=True)
     assert sum(episode.validate().ok for episode in dataset.episodes()) == EPISODES
     assert list(Path("small").rglob("*.parquet"))
     subprocess.run([COMMAND, "dataset", "check", "small"], check=True)

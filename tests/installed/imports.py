@@ -70,13 +70,13 @@ def main() -> None:
     Path("home.urdf").write_text(HOME, encoding="utf-8")
     Path("home.xml").write_text(HOME_MJCF, encoding="utf-8")
     Path("box.urdf").write_text(BOX, encoding="utf-8")
-    home = vkc.import_home("home.urdf", "urdf_home")
+    home = vkc.importing.import_home("home.urdf", "urdf_home")
     assert "lamp" in vkc.load_scene(home.file).obstacle_names
-    assert vkc.load_scene(vkc.import_home("home.xml", "mjcf_home").file).objects
-    assert vkc.import_object("box.urdf", "box").proposals.opening("hinge")
+    assert vkc.load_scene(vkc.importing.import_home("home.xml", "mjcf_home").file).objects
+    assert vkc.importing.import_object("box.urdf", "box").proposals.opening("hinge")
     for shape in ("pole", "prism"):
         file = write_xacro(Path(), shape)
-        assert vkc.import_robot(file, f"robot_{shape}", samples=SAMPLES).pieces
+        assert vkc.importing.import_robot(file, f"robot_{shape}", samples=SAMPLES).pieces
 
 
 if __name__ == "__main__":

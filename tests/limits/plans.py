@@ -33,7 +33,7 @@ def exported(folder: Path, count: int, *, first: int = 0, seed: int = 0) -> Iter
             else:
                 name = list(TASKS)[number % len(TASKS)]
                 scene, steps = started(name, seed, number), TASKS[name].steps
-            plan = vkc.plan(scene, steps, seed=seed, effort=1_000_000)
+            plan = vkc.plan(scene, steps, seed=seed, max_evaluations=1_000_000)
             if not plan.success:
                 continue
             plan.to_csv(file.with_suffix(".csv"))

@@ -60,7 +60,7 @@ def main(arguments: list[str] | None = None) -> int:
     for name in given.tasks:
         for number in range(given.starts):
             scene = started(name, given.seed, number)
-            plan = vkc.plan(scene, ALL[name].steps, seed=given.seed, effort=1_000_000)
+            plan = vkc.plan(scene, ALL[name].steps, seed=given.seed, max_evaluations=1_000_000)
             if plan.success:
                 least, heavy = bound(plan.scene, plan.trajectory)
                 duration = float(plan.trajectory.times[-1])

@@ -284,7 +284,7 @@ def _closure(world: World, stage: Stage, hold: Hold) -> Iterator[Violation]:
     size = len(times)
     off = np.broadcast_to(np.linalg.norm(holder.at - right.at, axis=1), size)
     turned = np.broadcast_to(turn_between(holder.turn, right.turn), size)
-    for amount, key, unit in ((off, "closure_position", "m"), (turned, "closure_angle", "rad")):
-        limit = world.plan.options[key]
+    limit = 1e-3
+    for amount, unit in ((off, "m"), (turned, "rad")):
         subject, why = f"{hold.object}.{hold.attachment}", f"more than {limit:g} {unit}"
         yield from _worst("closure", subject, amount - limit - 1e-7, times, why)

@@ -38,7 +38,7 @@ def plans(tmp_path_factory: pytest.TempPathFactory, door_plan: vkc.Plan) -> dict
     folder, found = tmp_path_factory.mktemp("plans"), {"door": door_plan}
     for name, (scene, steps) in TASKS.items():
         found[name] = vkc.plan(vkc.load_scene(scene), steps)
-        assert found[name].success, found[name].report()
+        assert found[name].success, found[name].summary()
     return {name: plan.save(folder / f"{name}.npz") for name, plan in found.items()}
 
 
@@ -187,7 +187,7 @@ def test_bases_on_wheels(base: str, tmp_path: Path) -> None:
     """Good plans pass; one on which the base slips, turns in place where it cannot, or whose wheels are too fast, does not."""
     robot = {"base": base, **({"turning_radius": 0.8} if base == "ackermann" else {})}
     plan = vkc.plan(hall(**robot), [vkc.GoTo(1.5, 0.8, 0.3)])
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     path = plan.save(tmp_path / "plan.npz")
     assert judge(path).agrees
 

@@ -27,7 +27,7 @@ def test_a_handle_is_reached_by_a_robot_that_stands_still(seed: int) -> None:
     attachment = placed.object.attachment()
     pose = placed.link_placement(attachment.link) * attachment.placement
     plan = vkc.plan(start, [vkc.Reach(pin.SE3(pose))], initialization="stationary", seed=seed)
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     assert plan.initialization.startswith("stationary")
 
 
@@ -40,7 +40,7 @@ def test_a_drawer_is_pulled_by_a_robot_that_stands_still(seed: int) -> None:
         initialization="stationary",
         seed=seed,
     )
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -49,7 +49,7 @@ def test_a_seed_that_shakes_by_half_a_metre(seed: int) -> None:
     plan = vkc.plan(
         hall(obstacles=[PILLAR]), [vkc.GoTo(2.4, 0.0)], perturbation=0.5, seed=seed, options=options
     )
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
 
 
 @pytest.mark.parametrize("axis", [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -68,4 +68,4 @@ def test_the_hand_turns_right_round(axis: list[float], angle: float) -> None:
         initialization="stationary",
         options=vkc.Options(reach_waypoints=20),
     )
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()

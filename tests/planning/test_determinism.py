@@ -23,7 +23,7 @@ SCRIPT = "from test_determinism import digest, door, stick; print(digest({}()))"
 
 def digest(plan: vkc.Plan) -> str:
     """Return a hash of a motion's times and positions, to the last bit."""
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     motion = plan.trajectory
     data = [
         " ".join(motion.names).encode(),

@@ -40,7 +40,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def plan(robot: Path) -> vkc.Plan:
     found = vkc.plan(between_cheeks(robot, opening=NARROW), PULL)
-    assert found.success, found.report()
+    assert found.success, found.summary()
     return found
 
 
@@ -58,7 +58,7 @@ def test_fingers_that_are_fully_open_are_too_close_and_narrower_ones_are_not(
     wide = vkc.plan(between_cheeks(robot), PULL)
     assert not wide.success
     assert {("clearance", "finger_a – left"), ("clearance", "finger_b – right")} & names(
-        wide.validation
+        wide.report
     )
     assert [phase.opening for phase in wide.trajectory.phases] == [None, None, None]
     assert [phase.opening for phase in plan.trajectory.phases] == [NARROW, NARROW, NARROW]
@@ -85,7 +85,7 @@ def test_fingers_that_open_where_they_let_go_are_looked_at_on_their_way(
     near = between_cheeks(robot, opening=NARROW, gap=0.055)
     asked = [vkc.Grasp("drawer"), vkc.Release()]
     found = vkc.plan(near, asked)
-    assert found.success, found.report()
+    assert found.success, found.summary()
     motion = found.trajectory
     last = motion.phases[-1]
     assert last.last - last.first == 1  # one step of time, in which the robot rests
@@ -189,7 +189,7 @@ def test_the_gripper_changes_where_it_lets_go_and_takes_hold(robot: Path) -> Non
     task = compile_task(scene, steps, vkc.Options())
     assert [phase.opening for phase in task.phases] == [NARROW, NARROW, None, None, None]
     found = vkc.plan(scene, steps)
-    assert found.success, found.report()
+    assert found.success, found.summary()
     spans = found.trajectory.phases
     assert [span.opening for span in spans] == [NARROW, NARROW, None, None, None]
     world = World(scene)
@@ -218,7 +218,7 @@ def test_a_finger_gets_where_it_is_asked_to_with_the_gripper_as_it_is(
     place = data.oMf[opened.model.getFrameId(finger)].copy()
     for step in (vkc.Reach(place, finger), vkc.Touch(finger, place.translation.tolist())):
         found = vkc.plan(scene, [step])
-        assert found.success, found.report()
+        assert found.success, found.summary()
         assert [phase.opening for phase in found.trajectory.phases] == [opening]
         end = opened.coordinates.q(found.trajectory.positions[-1])
         pin.framesForwardKinematics(opened.model, data, end)
@@ -238,7 +238,7 @@ def test_own_terms_about_a_finger_see_it_where_it_stands(robot: Path) -> None:
         "beside", lambda s: s.position("finger_a")[1], lower=y - 5e-3, upper=y + 5e-3
     )
     found = vkc.plan(scene, [vkc.GoTo(-0.2, 0.0, 0.0)], terms=[beside])
-    assert found.success, found.report()
+    assert found.success, found.summary()
 
 
 def test_a_chore_rests_where_its_parts_change_the_opening(robot: Path) -> None:
@@ -246,7 +246,7 @@ def test_a_chore_rests_where_its_parts_change_the_opening(robot: Path) -> None:
     found = vkc.plan(
         between_cheeks(robot, opening=NARROW), [vkc.GoTo(-0.3, 0.2), PULL[0]], window=1
     )
-    assert found.success, found.report()
+    assert found.success, found.summary()
     go, reach, _ = found.trajectory.phases
     assert (go.opening, reach.opening) == (None, NARROW)
     times, rows = found.trajectory.times, found.trajectory.positions
@@ -319,7 +319,7 @@ def test_without_openings_nothing_changes(tmp_path: Path) -> None:
             else write_gripper(tmp_path / name, gripper=gripper)
         )
         found.append(vkc.plan(between_cheeks(robot, gap=0.2), PULL))
-        assert found[-1].success, found[-1].report()
+        assert found[-1].success, found[-1].summary()
     one, other = (plan.trajectory for plan in found)
     assert np.array_equal(one.positions, other.positions)
     assert np.array_equal(one.times, other.times)

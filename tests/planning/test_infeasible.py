@@ -30,13 +30,13 @@ def explained(plan: vkc.Plan, *texts: str) -> str:
     """The plan failed, says so in words that contain `texts`, and every violation has its place and amount."""
     assert not plan.success
     assert plan.status in ("infeasible", "not converged", "rejected")
-    assert plan.validation.violations
-    for violation in plan.validation.violations:
+    assert plan.report.violations
+    for violation in plan.report.violations:
         assert violation.subject
         assert violation.amount > 0.0
         assert 0 <= violation.waypoint < len(plan.trajectory.times)
         assert f"waypoint {violation.waypoint}" in str(violation)
-    report = plan.report()
+    report = plan.summary()
     assert report.splitlines()[0].startswith(f"{plan.scene.name}: FAILED, {plan.status} — ")
     for text in texts:
         assert text in report, report
@@ -47,9 +47,9 @@ def explained(plan: vkc.Plan, *texts: str) -> str:
 def the(plan: vkc.Plan, constraint: str, subject: str) -> vkc.Violation:
     """Return the violation of a constraint whose subject contains `subject`."""
     found = [
-        v for v in plan.validation.violations if v.constraint == constraint and subject in v.subject
+        v for v in plan.report.violations if v.constraint == constraint and subject in v.subject
     ]
-    assert found, plan.report()
+    assert found, plan.summary()
     return found[0]
 
 
@@ -69,7 +69,7 @@ def test_a_goal_beyond_a_joint_limit(joints: dict[str, float], name: str, beyond
     plan = vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", joints)], options=QUICK)
     assert plan.status == "infeasible"
     explained(plan, f"goal {name}: {next(iter(joints.values())):g} is beyond the limits")
-    first = plan.validation.violations[0]
+    first = plan.report.violations[0]
     assert (first.constraint, first.subject, first.unit) == ("goal", name, "rad")
     assert first.amount == pytest.approx(beyond)
     assert plan.metrics["rounds"] == 0  # nothing was tried
@@ -110,7 +110,7 @@ def test_a_start_in_collision() -> None:
     explained(
         plan, "start base_link – crate: overlap by 195.0 mm at the start (waypoint 0, 0.00 s)"
     )
-    first = plan.validation.violations[0]
+    first = plan.report.violations[0]
     assert (first.constraint, first.subject, first.waypoint) == ("start", "base_link – crate", 0)
     assert first.amount == pytest.approx(0.195, abs=1e-3)
 
@@ -175,7 +175,7 @@ def test_what_failed_is_saved_with_its_reasons(tmp_path: Any) -> None:
     plan = vkc.plan(hall(), [vkc.Reach((1.5, 0.0, 3.0, 0.0, 0.0, 0.0))], options=QUICK)
     loaded = vkc.Plan.load(plan.save(tmp_path / "failed.npz"))
     assert not loaded.success
-    assert loaded.report() == plan.report()
+    assert loaded.summary() == plan.summary()
 
 
 def test_the_stationary_seed_is_explained_too() -> None:

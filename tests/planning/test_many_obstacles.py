@@ -415,7 +415,7 @@ def test_culling_changes_no_plan(task: str, monkeypatch: pytest.MonkeyPatch) -> 
     np.testing.assert_allclose(
         one.trajectory.positions, other.trajectory.positions, rtol=0.0, atol=1e-5
     )
-    for name in ("clearance", "closure_error", "base_effort", "arm_effort"):
+    for name in ("clearance", "closure_error", "base_path_length", "arm_path_length"):
         assert one.metrics[name] == pytest.approx(other.metrics[name], abs=1e-5)
     for name in ("rounds", "iterations"):
         assert one.metrics[name] == other.metrics[name]

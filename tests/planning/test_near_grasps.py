@@ -53,8 +53,8 @@ def test_a_handle_that_has_a_neighbour_of_the_same_object_can_be_taken(tmp_path:
     """12 mm from it, less than all else keeps. Were more asked for, validation and oracle would both say so."""
     scene = below_a_ledge(tmp_path, gap=0.012)
     plan = vkc.plan(scene, STEPS)
-    assert plan.success, plan.report()
-    assert 0.0 < plan.validation.clearance < 0.0125  # it does come that close
+    assert plan.success, plan.summary()
+    assert 0.0 < plan.report.clearance < 0.0125  # it does come that close
     file = plan.save(tmp_path / "plan.npz")
     assert judge(file).agrees
     stricter = below_a_ledge(
@@ -79,7 +79,7 @@ def test_the_attachment_says_how_close_is_too_close(
         options=vkc.Options(max_restarts=1),
     )
     assert not plan.success
-    assert any("drawer.ledge" in str(one) for one in plan.validation.violations)
+    assert any("drawer.ledge" in str(one) for one in plan.report.violations)
 
 
 def test_a_neighbour_that_is_no_part_of_the_object_keeps_the_full_clearance(tmp_path: Path) -> None:

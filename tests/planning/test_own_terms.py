@@ -64,7 +64,7 @@ def upright(seed: int = 0) -> vkc.Plan:
 
 
 def checked(plan: vkc.Plan) -> vkc.Plan:
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     return plan
 
 
@@ -233,7 +233,7 @@ def test_a_seed_may_be_far_from_a_constraint() -> None:
     )
     plan = checked(vkc.plan(hall(), [vkc.GoTo(2.0, 0.0)], options=SHORT, terms=[around]))
     assert np.linalg.norm(plan.trajectory.positions[:, :2] - middle, axis=1).min() >= 0.799
-    assert plan.trajectory.base_effort() > 2.2
+    assert plan.trajectory.base_path_length() > 2.2
 
 
 def test_what_cannot_be_kept_is_reported() -> None:
@@ -245,11 +245,9 @@ def test_what_cannot_be_kept_is_reported() -> None:
         terms=[never],
     )
     assert not plan.success
-    assert "term never:" in plan.report()
+    assert "term never:" in plan.summary()
     (violation,) = [
-        v
-        for v in plan.validation.violations
-        if v.constraint == "term" and "between" not in v.detail
+        v for v in plan.report.violations if v.constraint == "term" and "between" not in v.detail
     ]
     assert violation.amount > 7.0
 

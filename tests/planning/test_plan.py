@@ -45,7 +45,7 @@ def same(first: vkc.Plan, second: vkc.Plan) -> None:
     assert first.scene.document == second.scene.document
     np.testing.assert_array_equal(first.scene.start, second.scene.start)
     assert first.scene.name == second.scene.name
-    assert first.report() == second.report()
+    assert first.summary() == second.summary()
 
 
 def contents(path: Path) -> dict[str, Any]:
@@ -84,7 +84,7 @@ def own_scene(tmp_path: Path) -> vkc.Scene:
 
 def short_plan(scene: vkc.Scene) -> vkc.Plan:
     plan = vkc.plan(scene, [vkc.GoTo(0.3, 0.0)], options=vkc.Options(reach_waypoints=8))
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     return plan
 
 
@@ -93,7 +93,7 @@ def test_round_trip(door_plan: vkc.Plan, saved: Path) -> None:
     same(door_plan, loaded)
     assert (
         vkc.validate(loaded.scene, loaded.steps, loaded.trajectory, loaded.options)
-        == door_plan.validation
+        == door_plan.report
     )
     same(door_plan, vkc.Plan.load(loaded.save(saved.parent / "again.npz")))
 
@@ -109,7 +109,7 @@ def test_round_trip_of_every_step(door_plan: vkc.Plan, tmp_path: Path) -> None:
         door_plan, steps=steps, options=vkc.Options(dt=0.1 + 0.2), seed=7, status="rejected"
     )
     odd = dataclasses.replace(
-        odd, validation=vkc.validate(odd.scene, steps, odd.trajectory, odd.options)
+        odd, report=vkc.validate(odd.scene, steps, odd.trajectory, odd.options)
     )
     same(odd, vkc.Plan.load(odd.save(tmp_path / "odd.npz")))
 
@@ -315,15 +315,15 @@ def test_writing_replaces_what_was_there(tmp_path: Path) -> None:
 
 
 def test_the_report_of_a_success(door_plan: vkc.Plan) -> None:
-    report, m = door_plan.report(), door_plan.metrics
+    report, m = door_plan.summary(), door_plan.metrics
     assert (
         report.splitlines()[0]
         == "door: success — reach door.handle, turn door.knob, move door.hinge, door.knob"
     )
     for text in (
         f"{m['duration']:.1f} s, {len(door_plan.trajectory.times)} waypoints",
-        f"base {m['base_effort']:.2f} m",
-        f"arm {m['arm_effort']:.2f} rad",
+        f"base {m['base_path_length']:.2f} m",
+        f"arm {m['arm_path_length']:.2f} rad",
         f"{1e3 * m['clearance']:.1f} mm at the closest",
         f"{m['planning_time']:.3f} s after {m['build_time']:.2f} s of symbolic build",
         "seeds ",
@@ -347,9 +347,9 @@ def test_the_report_of_a_failure(door_plan: vkc.Plan) -> None:
         detail="overlap by 30 mm",
     )
     failed = dataclasses.replace(
-        door_plan, status="rejected", validation=Report((blame,), -0.03, states=100)
+        door_plan, status="rejected", report=Report((blame,), -0.03, states=100)
     )
-    report = failed.report()
+    report = failed.summary()
     assert report.startswith("door: FAILED, rejected — reach")
     assert "penetration forearm_link – sofa: overlap by 30 mm (waypoint 9, 4.00 s)" in report
 
@@ -360,7 +360,7 @@ def test_success_needs_both_words(door_plan: vkc.Plan) -> None:
     blame = Violation(
         "goal", "base", waypoint=9, time=4.0, amount=0.03, unit="m", detail="elsewhere"
     )
-    assert not dataclasses.replace(door_plan, validation=Report((blame,))).success
+    assert not dataclasses.replace(door_plan, report=Report((blame,))).success
 
 
 def test_plain_data(door_plan: vkc.Plan) -> None:
@@ -378,8 +378,8 @@ def test_plain_data(door_plan: vkc.Plan) -> None:
         "held": {},
         "by": {},
     }
-    open_space = dataclasses.replace(door_plan.validation, clearance=float("inf"))
-    endless = dataclasses.replace(door_plan, validation=open_space)
+    open_space = dataclasses.replace(door_plan.report, clearance=float("inf"))
+    endless = dataclasses.replace(door_plan, report=open_space)
     assert (
         json.loads(json.dumps(endless.to_dict(), allow_nan=False))["metrics"]["clearance"] is None
     )
@@ -387,7 +387,10 @@ def test_plain_data(door_plan: vkc.Plan) -> None:
 
 def test_repr(door_plan: vkc.Plan) -> None:
     m = door_plan.metrics
-    expected = f"<Plan success: base {m['base_effort']:.2f} m, arm {m['arm_effort']:.2f} rad, {m['planning_time']:.2f} s>"
+    expected = (
+        f"<Plan success: base {m['base_path_length']:.2f} m, "
+        f"arm {m['arm_path_length']:.2f} rad, {m['planning_time']:.2f} s>"
+    )
     assert repr(door_plan) == expected
 
 

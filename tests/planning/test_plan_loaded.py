@@ -38,20 +38,20 @@ def test_a_failed_plan_keeps_its_violations(door_plan: vkc.Plan, tmp_path: Path)
     positions = door_plan.trajectory.positions.copy()
     positions[5, 2] += 1.5  # such reports are not of motions that are right
     bent = dataclasses.replace(door_plan.trajectory, positions=positions, curve=None)
-    failed = dataclasses.replace(door_plan, trajectory=bent, validation=report, status="infeasible")
+    failed = dataclasses.replace(door_plan, trajectory=bent, report=report, status="infeasible")
     loaded = vkc.Plan.load(failed.save(tmp_path / "failed.npz"))
     assert (loaded.success, loaded.status, loaded.claimed) == (False, "infeasible", report)
-    assert (loaded.validation.violations, loaded.validation.notes) == ((blame,), report.notes)
+    assert (loaded.report.violations, loaded.report.notes) == ((blame,), report.notes)
     late = dataclasses.replace(
         failed, status="time limit"
     )  # then the violations are those of the motion
     loaded = vkc.Plan.load(late.save(tmp_path / "late.npz"))
-    assert {v.constraint for v in loaded.validation.violations} == {
+    assert {v.constraint for v in loaded.report.violations} == {
         "velocity",
         "acceleration",
         "torque",
     }
-    assert (loaded.success, loaded.status, loaded.validation.notes) == (
+    assert (loaded.success, loaded.status, loaded.report.notes) == (
         False,
         "time limit",
         report.notes,
@@ -72,7 +72,7 @@ def test_success_is_not_what_the_file_says(door_plan: vkc.Plan, tmp_path: Path) 
     assert bad.success
     loaded = vkc.Plan.load(bad.save(tmp_path / "bad.npz"))
     assert (loaded.success, loaded.status) == (False, "rejected")
-    assert loaded.report().startswith("door: FAILED, rejected")
+    assert loaded.summary().startswith("door: FAILED, rejected")
     assert loaded.to_dict()["status"] == "rejected"
     assert repr(loaded).startswith("<Plan rejected")
     assert loaded.claimed is not None
@@ -90,7 +90,7 @@ def test_without_validation_the_report_is_the_claim_of_the_file(
 
     monkeypatch.setattr("vkc_pin.planning.plan.validate", validate)
     loaded = vkc.Plan.load(saved, validate=False)
-    assert (loaded.is_validated, loaded.success, loaded.validation) == (
+    assert (loaded.is_validated, loaded.success, loaded.report) == (
         False,
         False,
         loaded.claimed,
@@ -109,11 +109,11 @@ def test_the_reasons_of_an_infeasible_task_are_those_of_its_file(
         spoiled(door_plan), status="infeasible", validation=Report((blame,), notes=("so it is",))
     )
     path = said.save(tmp_path / "said.npz")
-    assert vkc.Plan.load(path).validation.violations == (blame,)
-    assert vkc.Plan.load(path).validation.notes == ("so it is",)
-    right = dataclasses.replace(door_plan, status="infeasible", validation=said.validation)
+    assert vkc.Plan.load(path).report.violations == (blame,)
+    assert vkc.Plan.load(path).report.notes == ("so it is",)
+    right = dataclasses.replace(door_plan, status="infeasible", report=said.report)
     loaded = vkc.Plan.load(right.save(path))
-    assert (loaded.validation.ok, loaded.success) == (True, False)
+    assert (loaded.report.ok, loaded.success) == (True, False)
     assert "1 constraint(s) violated" in loaded.contradictions()
 
 
@@ -138,9 +138,7 @@ def test_a_motion_without_end(door_plan: vkc.Plan, tmp_path: Path) -> None:
         if said is None:
             loaded = vkc.Plan.load(path)
             assert not loaded.success
-            assert "sampling" in {
-                violation.constraint for violation in loaded.validation.violations
-            }
+            assert "sampling" in {violation.constraint for violation in loaded.report.violations}
             continue
         with pytest.raises(vkc.InputError, match=said) as caught:
             vkc.Plan.load(path)

@@ -73,11 +73,11 @@ def column(plan: vkc.Plan, name: str) -> np.ndarray:
 
 def confirm(plan: vkc.Plan) -> None:
     """Success, and an independent second look agrees."""
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     assert plan.status == "success"
     again = vkc.validate(plan.scene, plan.steps, plan.trajectory, plan.options)
     assert again.ok, again.lines()
-    assert again.clearance == plan.validation.clearance
+    assert again.clearance == plan.report.clearance
 
 
 def test_the_demo_opens_the_door(demo: vkc.Plan) -> None:
@@ -116,7 +116,7 @@ def test_the_demo_is_one_unbroken_motion(demo: vkc.Plan) -> None:
         demo.options.grasp_time
     )
     # It does not wander: from the start to the handle and on by the door's width.
-    assert trajectory.base_effort() < 6.0
+    assert trajectory.base_path_length() < 6.0
 
 
 def test_metrics_are_the_trajectorys(demo: vkc.Plan) -> None:
@@ -125,15 +125,15 @@ def test_metrics_are_the_trajectorys(demo: vkc.Plan) -> None:
         demo.trajectory(np.linspace(0.0, demo.trajectory.times[-1], 50_001)),
     )
     base = np.diff(positions[:, :2], axis=0)
-    assert m["base_effort"] == pytest.approx(np.sqrt((base**2).sum(axis=1)).sum(), rel=1e-3)
-    assert m["base_effort_l1"] == pytest.approx(np.abs(base).sum(), rel=1e-3)
-    assert m["arm_effort"] == pytest.approx(
+    assert m["base_path_length"] == pytest.approx(np.sqrt((base**2).sum(axis=1)).sum(), rel=1e-3)
+    assert m["base_path_length_l1"] == pytest.approx(np.abs(base).sum(), rel=1e-3)
+    assert m["arm_path_length"] == pytest.approx(
         np.abs(np.diff(positions[:, 3:9], axis=0)).sum(), rel=1e-3
     )
     assert m["duration"] == demo.trajectory.times[-1]
-    assert m["clearance"] == demo.validation.clearance
+    assert m["clearance"] == demo.report.clearance
     assert m["clearance"] > 0.0
-    assert m["closure_error"] == demo.validation.closure_error
+    assert m["closure_error"] == demo.report.closure_error
     parts = sum(
         m[f"time_{part}"] for part in ("initialization", "coal", "casadi", "ipopt", "validation")
     )
@@ -355,8 +355,8 @@ def test_a_time_limit_ends_planning_with_the_best_so_far(
     assert len(done) == plan.metrics["rounds"] == rounds
     assert plan.metrics["planning_time"] > limit
     assert np.isfinite(plan.trajectory.positions).all()
-    assert plan.validation.violations
-    assert "FAILED, time limit" in plan.report()
+    assert plan.report.violations
+    assert "FAILED, time limit" in plan.summary()
 
 
 def test_a_time_limit_that_is_not_reached_changes_nothing(demo: vkc.Plan) -> None:
@@ -398,7 +398,7 @@ def test_ctrl_c_returns_the_best_so_far(demo: vkc.Plan, ctrl_c: Any, delay: floa
     )
     assert plan.status == "interrupted"
     assert not plan.success
-    assert plan.validation.violations
+    assert plan.report.violations
     assert 2 <= len(rows) < 50
     assert signal.getsignal(signal.SIGINT) is before
 
@@ -436,7 +436,7 @@ def test_a_start_closer_than_dist_safe(gap: float) -> None:
     assert 0.0 < scene.start_clearance() < SEEN.dist_safe / 2 + 1e-6
     plan = vkc.plan(scene, [vkc.GoTo(-1.0, 0.5)], options=SEEN)
     confirm(plan)
-    assert plan.validation.clearance == pytest.approx(scene.start_clearance(), abs=1e-6)
+    assert plan.report.clearance == pytest.approx(scene.start_clearance(), abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -451,7 +451,7 @@ def test_a_differential_base_does_not_slip(step: Any) -> None:
     heading = (yaw[1:] + yaw[:-1]) / 2
     sideways = np.cos(heading) * np.diff(y) - np.sin(heading) * np.diff(x)
     assert np.abs(sideways).max() < 1e-4
-    assert plan.metrics["base_effort"] > 0.3
+    assert plan.metrics["base_path_length"] > 0.3
     slipping = vkc.plan(hall(base="omni"), [step])
     x, y, yaw = slipping.trajectory.positions[:, :3].T
     heading = (yaw[1:] + yaw[:-1]) / 2
@@ -471,7 +471,7 @@ def test_a_steered_base_drives_as_a_car(step: Any) -> None:
     )
     assert np.abs(aside).max() < 1e-4
     assert (0.8 * np.abs(turn) - np.abs(along)).max() < 1e-4
-    assert plan.metrics["base_effort"] > 0.3
+    assert plan.metrics["base_path_length"] > 0.3
 
 
 def test_wheels_make_a_motion_slow(tmp_path: Path) -> None:
@@ -532,8 +532,8 @@ MISUSES: dict[str, tuple[dict[str, Any], str, str]] = {
     "no time": ({"time_limit": 0.0}, "time_limit", "more than 0"),
     "negative time": ({"time_limit": -1.0}, "time_limit", "-1.0"),
     "endless time": ({"time_limit": float("inf")}, "time_limit", "inf"),
-    "no effort": ({"effort": 0}, "effort", "at least 1"),
-    "half a unit": ({"effort": 1.5}, "effort", "1.5"),
+    "no evaluations": ({"max_evaluations": 0}, "max_evaluations", "at least 1"),
+    "half a unit": ({"max_evaluations": 1.5}, "max_evaluations", "1.5"),
     "no number": ({"time_limit": float("nan")}, "time_limit", "nan"),
     "time as text": ({"time_limit": "5"}, "time_limit", "'5'"),
     "options as a dictionary": ({"options": {"dt": 0.1}}, "options", "Options"),
@@ -576,7 +576,7 @@ def test_a_robot_that_nobody_prepared_reaches() -> None:
     assert scene.robot.tight["arm_2_link", "torso_lift_link"] == pytest.approx(0.0188, abs=1e-4)
     target = pin.SE3(np.eye(3), np.array([1.5, 0.4, 0.9]))
     plan = vkc.plan(scene, [vkc.Reach(target)], options=SEEN)
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     assert tool(scene, plan.trajectory.positions[-1]).isApprox(target, 2e-3)
     motion, steps = plan.trajectory, plan.steps
     assert validate(plan.scene, steps, motion, SEEN).ok

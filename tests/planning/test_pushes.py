@@ -79,7 +79,7 @@ def gaps(plan: vkc.Plan, thing: str, face: str) -> np.ndarray:
 def test_what_stands_open_is_pushed_shut(case: tuple[str, str, str, float, str]) -> None:
     """The hand's foremost point stays within what its tilt takes of the face, and the joint never goes back."""
     plan, (_, thing, joint, begin, face) = shut(*case), case
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     column = plan.trajectory.positions[:, plan.trajectory.names.index(f"{thing}.{joint}")]
     assert (column[0], abs(column[-1]) < 1e-3) == (begin, True)
     assert (np.diff(column) * np.sign(begin)).max() < 1e-6
@@ -124,7 +124,7 @@ def test_a_bowl_is_taken_at_its_rim(yaw: float) -> None:
     scene = vkc.load_scene("tray").document
     scene["objects"] = [{"name": "bowl", "type": "bowl", "position": [0.9, 0.5, 0.701], "yaw": yaw}]
     plan = vkc.plan(vkc.Scene.from_document(scene), [vkc.Place("bowl", (-0.3, -1.95, 0.701))])
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     motion, (phase,) = plan.trajectory, [one for one in plan.trajectory.phases if one.holds]
     row = motion.positions[phase.first]
     robot = plan.scene.robot

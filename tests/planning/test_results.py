@@ -17,14 +17,14 @@ def test_nothing_moves_and_nothing_is_done(name: str) -> None:
     spent = [PlanningStatistics(1.5), PlanningStatistics(0.5, rounds=2)]
     plan = concatenate_plans(scene, [vkc.GoTo(0.3, 0.2)], request, [], statistics=spent)
     assert (plan.status, plan.success, plan.seed) == ("interrupted", False, 3)
-    assert {violation.constraint for violation in plan.validation.violations} == {"goal"}
+    assert {violation.constraint for violation in plan.report.violations} == {"goal"}
     assert (plan.trajectory.positions == plan.trajectory.positions[0]).all()
     assert (plan.metrics["planning_time"], plan.metrics["rounds"], plan.metrics["time_coal"]) == (
         2.0,
         2.0,
         0.0,
     )
-    assert "FAILED, interrupted" in plan.report()
+    assert "FAILED, interrupted" in plan.summary()
     assert "interrupted" in plan._repr_html_()
 
 
@@ -34,7 +34,7 @@ def test_what_is_held_is_held() -> None:
     held = scene.with_held({"stick": attachment})
     plan = concatenate_plans(held, [vkc.GoTo(0.3, 0.2)], PlanningRequest("auto", vkc.Options()), [])
     assert plan.trajectory.phases[0].held == {"stick": attachment}
-    assert "unheld" not in {violation.constraint for violation in plan.validation.violations}
+    assert "unheld" not in {violation.constraint for violation in plan.report.violations}
 
 
 def test_it_is_a_plan_like_any_other(tmp_path_factory: pytest.TempPathFactory) -> None:
@@ -45,5 +45,5 @@ def test_it_is_a_plan_like_any_other(tmp_path_factory: pytest.TempPathFactory) -
         [],
     )
     folder = tmp_path_factory.mktemp("standing")
-    assert Plan.load(plan.save(folder / "plan.npz")).report() == plan.report()
+    assert Plan.load(plan.save(folder / "plan.npz")).summary() == plan.summary()
     assert plan.to_html(folder / "plan.html").stat().st_size > 100_000

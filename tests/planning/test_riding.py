@@ -27,7 +27,7 @@ def test_a_cup_on_a_plate_comes_along_and_is_taken_off() -> None:
         plates(wall=0.03),
         [vkc.Actuate("plate", {"slide": 0.4}), vkc.Place("cup", [0.2, -1.0, 0.0])],
     )
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     slide = plan.trajectory.column("plate.slide")
     for value, placement in zip(slide[: plan.trajectory.phases[1].last], where(plan), strict=False):
         np.testing.assert_allclose(
@@ -49,7 +49,7 @@ def test_it_is_where_it_came_to_in_the_scene_after() -> None:
 
 def test_a_tray_is_carried_level() -> None:
     plan = vkc.plan(trays(), [vkc.Place("tray", [-0.5, -1.5, 0.7])])
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     assert (
         max(float(np.arccos(min(placement.rotation[2, 2], 1.0))) for placement in where(plan))
         < 1e-3
@@ -60,10 +60,10 @@ def test_a_tray_is_carried_level() -> None:
 
 def test_what_stands_on_what_is_in_the_hand_from_the_start_comes_along() -> None:
     first = vkc.plan(trays(), [vkc.Grasp("tray"), vkc.GoTo(-1.0, 0.3)])
-    assert first.success, first.report()
+    assert first.success, first.summary()
     after = compute_final_scene(first.scene, first.trajectory, first.trajectory.phases[-1].holds)
     second = vkc.plan(after, [vkc.Place("tray", [-0.5, -1.5, 0.7])])
-    assert second.success, second.report()
+    assert second.success, second.summary()
     apart = where(second, "tray")[-1].actInv(where(second)[-1]).translation
     np.testing.assert_allclose(apart, [0.02, 0.05, 0.02], rtol=0.0, atol=1e-5)
 
@@ -89,7 +89,7 @@ def test_validation_sees_what_tips_and_what_the_cup_hits() -> None:
 
 def test_the_hand_closes_while_the_robot_stands_still() -> None:
     plan = vkc.plan(plates(), [vkc.Actuate("plate", {"slide": 0.2})])
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     begin = plan.trajectory.phases[1].first
     times = plan.trajectory.times.copy()
     times[begin + 1 :] -= 0.4  # less time for the gripper

@@ -125,11 +125,11 @@ def test_one_plans_on_from_the_end_scene() -> None:
         held.start, grasp.trajectory.positions[-1, : len(held.start)], atol=1e-9
     )
     pulled = vkc.plan(held, [vkc.Actuate("drawer", {"slide": 0.3})])
-    assert pulled.success, pulled.report()
+    assert pulled.success, pulled.summary()
     after = pulled.end_scene()
     assert after.objects["drawer"].state[0] == pytest.approx(0.3, abs=1e-3)
     gone = vkc.plan(after, [vkc.Release(), vkc.GoTo(0.0, 0.0)])
-    assert gone.success, gone.report()
+    assert gone.success, gone.summary()
     assert gone.end_scene().held == {}
     refused = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 9.0})])
     with pytest.raises(InputError, match="no success"):

@@ -161,7 +161,7 @@ def test_real_seeds_are_tried_in_turn_until_validation_accepts_a_motion(
     monkeypatch.setattr(module, "solve", answered)
     own = drawn_problem(number)
     plan = vkc.plan(own.scene, own.steps, seed=random_seed)
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     assert asked == ["seed", "solve"] * len(solved)
     assert len(solved) > 1, "the first seed sufficed: choose another problem"
     assert plan.initialization == given[-1].name
@@ -289,42 +289,42 @@ def test_no_seed_is_looked_for_when_time_is_up(monkeypatch: pytest.MonkeyPatch) 
     plan = script.run()
     assert script.events == ["a", "a*", "b", "b*"]
     assert (plan.status, plan.initialization, plan.success) == ("time limit", "a", False)
-    assert plan.validation.violations
+    assert plan.report.violations
 
 
 def test_the_real_solver_stops() -> None:
     """Also while the program is built, and while seeds are looked for: a robot that stands is what there is then."""
-    late, spent = "time limit", "effort spent"
+    late, spent = "time limit", "evaluation limit"
     budgets: list[tuple[dict[str, Any], str]] = [
         ({"time_limit": 1e-3}, late),
-        ({"effort": 1}, spent),
-        ({"effort": 3000}, spent),
+        ({"max_evaluations": 1}, spent),
+        ({"max_evaluations": 3000}, spent),
     ]
     for budget, status in budgets:
         plan = vkc.plan(
             door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], planner=vkc.Planner(), **budget
         )
         assert (plan.status, plan.initialization, plan.metrics["rounds"]) == (status, "none", 0)
-        assert plan.validation.violations
+        assert plan.report.violations
         assert np.ptp(plan.trajectory.positions, axis=0).max() == 0.0
         assert np.isfinite(plan.metrics["duration"])
 
 
-def test_effort_that_suffices_changes_nothing() -> None:
+def test_a_sufficient_budget_changes_nothing() -> None:
     """It is the same whether all has to be built or is there; with one unit less there is none."""
     scene, steps = door_scene(), [vkc.Actuate("door", {"hinge": 1.2})]
     whole = vkc.plan(scene, steps, planner=vkc.Planner())
     assert whole.success
-    used = int(whole.metrics["effort"])
-    again = vkc.plan(scene, steps, effort=used)
+    used = int(whole.metrics["evaluations"])
+    again = vkc.plan(scene, steps, max_evaluations=used)
     assert again.success
-    assert again.metrics["effort"] == used
+    assert again.metrics["evaluations"] == used
     np.testing.assert_array_equal(again.trajectory.positions, whole.trajectory.positions)
     short = [
-        vkc.plan(scene, steps, effort=used // 2, planner=planner)
+        vkc.plan(scene, steps, max_evaluations=used // 2, planner=planner)
         for planner in (None, vkc.Planner())
     ]
-    assert [plan.status for plan in short] == ["effort spent"] * 2
+    assert [plan.status for plan in short] == ["evaluation limit"] * 2
     np.testing.assert_array_equal(short[0].trajectory.positions, short[1].trajectory.positions)
 
 
@@ -385,7 +385,7 @@ def test_a_weight_weighs_what_it_says(field: str, columns: list[int]) -> None:
         for value in (getattr(SHORT, field), 7.0)
     ]
     usual, other = (
-        program_of(drawer_scene(), PULL, options=each).effort.metric for each in options
+        program_of(drawer_scene(), PULL, options=each).motion_cost.metric for each in options
     )
     np.testing.assert_array_equal(other[columns], 7.0)
     np.testing.assert_array_equal(np.delete(other, columns), np.delete(usual, columns))

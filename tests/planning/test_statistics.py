@@ -24,7 +24,7 @@ def test_records_keep_their_names() -> None:
         "build_time": 1.0,
         "iterations": 7.0,
         "rounds": 3.0,
-        "effort": 500.0,
+        "evaluations": 500.0,
         **{f"time_{stage}": value for stage, value in times.items()},
     }
     assert PlanningStatistics.from_metrics(metrics) == statistics

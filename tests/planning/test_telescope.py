@@ -34,7 +34,7 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> vkc.Plan:
 
 def test_a_drawer_is_opened_with_it(opened: vkc.Plan) -> None:
     """By the word of the validation, and by that of the oracle, which moves all segments by its own reading of the files."""
-    assert opened.success, opened.report()
+    assert opened.success, opened.summary()
     assert opened.trajectory is not None
     assert opened.trajectory.names[: opened.trajectory.robot_size] == NAMES
     out = opened.trajectory.positions[:, 4]
@@ -95,7 +95,7 @@ def test_it_counts_as_what_its_segments_go(opened: vkc.Plan) -> None:
     out, lift = NAMES.index("out_1"), NAMES.index("lift")
     assert chain.metric[out] == pytest.approx(4.0 * chain.metric[lift])
     problem = program_of(opened.scene, list(opened.steps))
-    assert problem.effort.metric[out] == pytest.approx(16.0 * problem.effort.metric[lift])
+    assert problem.motion_cost.metric[out] == pytest.approx(16.0 * problem.motion_cost.metric[lift])
     model = chain.robot.model
     q = chain.robot.coordinates.q(np.concatenate([np.zeros(3), chain.robot.home]))
     jacobian = pin.computeFrameJacobian(
@@ -132,7 +132,7 @@ def coupled(tmp_path_factory: pytest.TempPathFactory) -> vkc.Plan:
         more="joints: {roll_joint: {velocity: 0.9, acceleration: 0.6}}\n",
     )
     plan = vkc.plan(scene, [vkc.Reach(reachable(scene))], seed=0)
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     return plan
 
 

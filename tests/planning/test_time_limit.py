@@ -48,16 +48,16 @@ def test_a_plan_comes_back_wherever_time_is_up(
 ) -> None:
     looks = Looks(monkeypatch)
     whole = looks.upto(np.inf, call)
-    assert whole.success, whole.report()
+    assert whole.success, whole.summary()
     count = looks.count
     assert count > 50
     rounds = []
     for last in [0, 1, 2, 3, 5, *np.linspace(8, count - 8, 9).astype(int).tolist()]:
         plan = looks.upto(last, call)
         assert plan.success or plan.status == "time limit"
-        assert plan.success == plan.validation.ok
+        assert plan.success == plan.report.ok
         assert np.isfinite(plan.trajectory.positions).all()
-        assert plan.metrics["effort"] <= whole.metrics["effort"]
+        assert plan.metrics["evaluations"] <= whole.metrics["evaluations"]
         rounds.append(plan.metrics["rounds"])
     assert rounds[0] <= rounds[-1] <= whole.metrics["rounds"]
 
@@ -65,7 +65,7 @@ def test_a_plan_comes_back_wherever_time_is_up(
 def test_what_is_decided_of_a_chore_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     looks, steps = Looks(monkeypatch), [*PULL, vkc.GoTo(0.0, 0.0), vkc.GoTo(0.3, 0.0)]
     whole = looks.upto(np.inf, lambda: vkc.plan(drawer_scene(), steps, options=SHORT, window=2))
-    assert whole.success, whole.report()
+    assert whole.success, whole.summary()
     phases = []
     for last in np.linspace(1, looks.count - 1, 8).astype(int).tolist():
         plan = looks.upto(last, lambda: vkc.plan(drawer_scene(), steps, options=SHORT, window=2))
@@ -82,4 +82,4 @@ def test_a_hard_task_takes_no_longer_than_it_may(limit: float) -> None:
     plan = vkc.plan(scene, fetch(scene), time_limit=limit, planner=vkc.Planner(), window=2)
     assert time.perf_counter() - began < limit + 3.0
     assert plan.status == "time limit"
-    assert plan.validation.violations
+    assert plan.report.violations

@@ -54,7 +54,7 @@ def tip(scene: vkc.Scene, row: np.ndarray, trajectory: vkc.Trajectory) -> np.nda
 
 def test_the_tip_reaches_its_target_to_a_millimetre() -> None:
     found = plan()
-    assert found.success, found.report()
+    assert found.success, found.summary()
     assert (
         np.linalg.norm(tip(start(), found.trajectory.positions[-1], found.trajectory) - TARGET)
         < 1e-3
@@ -74,7 +74,7 @@ def test_grasping_anywhere_costs_less_than_at_one_place() -> None:
     for seed in range(5, 10):
         touch, scene = vkc.Touch("stick.tip", TARGET), start(seed)
         fixed = solve(scene, [vkc.Grasp("stick", "end"), touch], request)
-        assert fixed.plan.success, fixed.plan.report()
+        assert fixed.plan.success, fixed.plan.summary()
         before = objective(fixed.problem, fixed.z)
         again, anywhere = (
             solve(scene, [vkc.Grasp("stick", name), touch], request, partial(going_on, fixed))
@@ -82,7 +82,7 @@ def test_grasping_anywhere_costs_less_than_at_one_place() -> None:
         )
         better = anywhere.plan
         for motion in (again.plan, better):
-            assert motion.success, motion.report()
+            assert motion.success, motion.summary()
             assert motion.initialization == "as with the fixed grasp"
         same = going_on(fixed, anywhere.problem).z
         assert anywhere.problem.pose_error(same) < 1e-3
@@ -121,7 +121,7 @@ def test_one_problem_costs_less_than_step_after_step() -> None:
     assert [part.result.plan.success for part in parts] == [True, True]
     pieces = [part.result.phase_waypoints() for part in parts]
     one = solve(start(), steps, request, lambda problem: make_initial_guess(problem, pieces))
-    assert one.plan.success, one.plan.report()
+    assert one.plan.success, one.plan.summary()
     before = objective(one.problem, make_initial_guess(one.problem, pieces).z)
     assert objective(one.problem, one.z) < before
     assert (

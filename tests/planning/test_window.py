@@ -137,7 +137,7 @@ def test_each_action_is_planned_once_alone_and_with_the_next(
 ) -> None:
     problems = Problems(monkeypatch, lambda steps: False)
     plan = plan_actions(home(), [OPEN, *CUP, SHUT])
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     asked = [
         item for k, item in enumerate(problems.asked) if item not in problems.asked[:k]
     ]  # some twice, if the first fails
@@ -155,7 +155,7 @@ def test_where_the_next_cannot_be_done_both_are_planned_anew(
 ) -> None:
     problems = Problems(monkeypatch, lambda steps: steps == (SHUT,))
     plan = plan_actions(home(), [OPEN, SHUT])
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     alone = [(SHUT,)] * vkc.Options().max_restarts
     assert [steps for steps, _ in problems.asked] == [(OPEN,), *alone, (OPEN, SHUT)]
     assert not problems.asked[-1][1]  # from seeds of its own
@@ -180,7 +180,7 @@ def test_a_decision_that_leads_nowhere_is_given_up(monkeypatch: pytest.MonkeyPat
     """With a window of one nothing is foreseen: only a step back helps."""
     problems = Problems(monkeypatch, lambda steps: steps == (SHUT,))
     plan = plan_actions(home(), [OPEN, SHUT], window=1)
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     alone = [steps for steps, _ in problems.asked]
     assert alone[0] == (OPEN,)
     assert (OPEN, SHUT) in alone
@@ -198,7 +198,7 @@ def test_what_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     assert not plan.success
     assert plan.status == "not converged"
-    assert plan.validation.notes[0].startswith("steps[2], Grasp(object='cold_cup'")
+    assert plan.report.notes[0].startswith("steps[2], Grasp(object='cold_cup'")
     assert [phase.name for phase in plan.trajectory.phases][:2] == [
         "go to",
         "reach refrigerator.handle",
@@ -222,11 +222,13 @@ def test_time_is_for_all_steps_together(monkeypatch: pytest.MonkeyPatch) -> None
     assert plan.trajectory.phases[1].name == "move refrigerator.hinge"
 
 
-def test_effort_is_for_all_steps_together() -> None:
+def test_max_evaluations_bounds_all_steps_together() -> None:
     alone = plan_actions(home(), [OPEN])
-    plan = plan_actions(home(), [OPEN, *CUP], effort=int(alone.metrics["effort"]) + 1000)
-    assert (plan.status, plan.success) == ("effort spent", False)
-    assert "steps[1]" in plan.validation.notes[0]
+    plan = plan_actions(
+        home(), [OPEN, *CUP], max_evaluations=int(alone.metrics["evaluations"]) + 1000
+    )
+    assert (plan.status, plan.success) == ("evaluation limit", False)
+    assert "steps[1]" in plan.report.notes[0]
     assert plan.trajectory.phases[1].name == "move refrigerator.hinge"
 
 
@@ -249,7 +251,7 @@ def test_ctrl_c_leaves_what_is_done() -> None:
 def test_the_robot_does_not_stop_between_ways() -> None:
     """It rests where its hand closes or opens; a motion that goes on from one step to the next is not cut there."""
     plan = plan_actions(home(), [vkc.GoTo(1.0, -0.9), vkc.GoTo(0.4, -0.7), vkc.GoTo(0.2, -0.2)])
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     speed = np.linalg.norm(plan.trajectory.velocities()[:, :2], axis=1)
     first = plan.trajectory.phases[0].last
     assert speed[first - 1 : first + 1].min() > 0.1 * speed.max()
@@ -261,7 +263,7 @@ def test_the_robot_does_not_stop_between_ways() -> None:
 
 def test_a_chore_of_four_steps() -> None:
     plan = fridge()
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     assert plan.steps == (OPEN, *CUP, SHUT)
     assert [phase.name.partition(" ")[0] for phase in plan.trajectory.phases] == [
         "reach",
@@ -284,7 +286,7 @@ def test_a_chore_of_four_steps() -> None:
 
 def test_metrics_are_those_of_the_whole_chore() -> None:
     plan = fridge()
-    assert plan.metrics["base_effort"] == pytest.approx(plan.trajectory.base_effort())
+    assert plan.metrics["base_path_length"] == pytest.approx(plan.trajectory.base_path_length())
     parts = sum(
         plan.metrics[f"time_{part}"]
         for part in ("initialization", "coal", "casadi", "ipopt", "validation")
@@ -314,6 +316,6 @@ def test_with_the_next_in_mind_less_is_moved(start: int) -> None:
     scene = vkc.load_scene("init_1").sample_start(np.random.default_rng(start))
     steps = [G("stick"), vkc.Touch("stick.tip", TARGET)]
     blind, seeing = (plan_actions(scene, steps, window=window) for window in (1, 2))
-    assert blind.success, blind.report()
-    assert seeing.success, seeing.report()
+    assert blind.success, blind.summary()
+    assert seeing.success, seeing.summary()
     assert price(seeing) < price(blind)

@@ -14,7 +14,8 @@ from vkc_pin.procedural.furniture.catalogue import KINDS
 def test_goals_lists_every_joint_and_free_object_once() -> None:
     home = vkc.load_scene("household")
     offered = {
-        (step.object, *getattr(step, "joints", ())): step for step in vkc.goals(home, share=0.5)
+        (step.object, *getattr(step, "joints", ())): step
+        for step in vkc.procedural.goals(home, share=0.5)
     }
     assert {key for key in offered if len(key) == 2} == {
         *(("door", "hinge"), ("drawer", "slide"), ("dishwasher", "rack"), ("dishwasher", "door")),
@@ -29,19 +30,19 @@ def test_goals_lists_every_joint_and_free_object_once() -> None:
 
 def test_open_joints_are_closed() -> None:
     scene = vkc.load_scene("drawer")
-    (step,) = vkc.goals(scene.with_state("drawer", {"slide": 0.4}), share=0.75)
+    (step,) = vkc.procedural.goals(scene.with_state("drawer", {"slide": 0.4}), share=0.75)
     assert isinstance(step, vkc.Actuate)
     assert step.joints == {"slide": pytest.approx(0.1)}
 
 
 def test_joints_without_limits_turn_by_a_fraction_of_a_turn() -> None:
-    description = vkc.random_object("valve", 0)
+    description = vkc.procedural.random_object("valve", 0)
     urdf = description["urdf"].replace('type="revolute"', 'type="continuous"')
     here = {"name": "valve", "type": {**description, "urdf": urdf}, "position": [2.0, 0.0, 0.0]}
     scene = vkc.Scene.from_document(
         {"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}, "objects": [here]}
     )
-    (step,) = vkc.goals(scene, share=0.25)
+    (step,) = vkc.procedural.goals(scene, share=0.25)
     assert isinstance(step, vkc.Actuate)
     assert step.joints["turn"] == pytest.approx(np.pi / 2, abs=1e-3)
 
@@ -49,7 +50,7 @@ def test_joints_without_limits_turn_by_a_fraction_of_a_turn() -> None:
 def test_no_goal_is_beyond_a_limit() -> None:
     scene = vkc.load_scene("corridor_door")
     door = scene.objects["door"].object
-    (step,) = vkc.goals(scene, share=0.5)
+    (step,) = vkc.procedural.goals(scene, share=0.5)
     assert isinstance(step, vkc.Actuate)
     assert step.joints["hinge"] == door.upper[door.coordinates.index("hinge")] == np.pi / 2.0, (
         "rounded it would be 1.571"
@@ -59,32 +60,36 @@ def test_no_goal_is_beyond_a_limit() -> None:
 @pytest.mark.parametrize("share", [0.0, 1.1, -0.5, "half", float("nan")])
 def test_invalid_shares_are_rejected(share: object) -> None:
     with pytest.raises(vkc.InputError) as found:
-        vkc.goals(vkc.load_scene("drawer"), share=share)  # type: ignore[arg-type]
+        vkc.procedural.goals(vkc.load_scene("drawer"), share=share)  # type: ignore[arg-type]
     assert found.value.field == "share"
 
 
 def test_random_tasks_are_reproducible() -> None:
-    (room, steps), (same, again), (other, _) = (vkc.random_task(seed) for seed in (3, 3, 4))
+    (room, steps), (same, again), (other, _) = (
+        vkc.procedural.random_task(seed) for seed in (3, 3, 4)
+    )
     assert (room.document, steps) == (same.document, again)
     assert room.document != other.document
     kinds = tuple(f"random_{placed.object.name}" for placed in room.objects.values())
-    assert vkc.random_room(3, objects=kinds).document == room.document
+    assert vkc.procedural.random_room(3, objects=kinds).document == room.document
 
 
 def test_random_tasks_accept_room_settings() -> None:
-    room, (step,) = vkc.random_task(2, clutter=0.0, objects=("drawer",), carried=("cup",))
+    room, (step,) = vkc.procedural.random_task(
+        2, clutter=0.0, objects=("drawer",), carried=("cup",)
+    )
     assert list(room.objects) == ["drawer", "cup"]
     assert step.object in room.objects  # type: ignore[union-attr]
     with pytest.raises(vkc.InputError, match="no step is possible"):
-        vkc.random_task(2, clutter=0.0, objects=())
+        vkc.procedural.random_task(2, clutter=0.0, objects=())
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_is_opened(kind: str, tmp_path: Path) -> None:
     """From a random start in a furnished room; the plan saves the object and is loaded elsewhere."""
-    room, steps = vkc.random_task(11, objects=(f"random_{kind}",), clutter=0.3)
+    room, steps = vkc.procedural.random_task(11, objects=(f"random_{kind}",), clutter=0.3)
     plan = vkc.plan(room, steps)
-    assert plan.success, plan.validation
+    assert plan.success, plan.report
     (step,) = steps
     assert isinstance(step, vkc.Actuate)
     (joint, value), *_ = step.joints.items()

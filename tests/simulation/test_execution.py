@@ -17,7 +17,7 @@ from vkc_pin.world.scene.scene import Scene
 
 def test_drawer_is_pulled() -> None:
     result = drawer_plan().simulate()
-    assert result.ok, result.report()
+    assert result.ok, result.summary()
     (miss,) = result.misses
     assert (miss.subject, miss.unit) == ("drawer.slide", "m")
     assert miss.amount < 0.01
@@ -47,9 +47,9 @@ def test_telescope_segments_move_together(tmp_path: Path) -> None:
         [vkc.Actuate("drawer", {"slide": 0.15})],
         seed=0,
     )
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     result = plan.simulate()
-    assert result.ok, result.report()
+    assert result.ok, result.summary()
     assert result.tracking.arm[0] < np.radians(1.0)
     assert (
         np.abs(
@@ -62,7 +62,7 @@ def test_telescope_segments_move_together(tmp_path: Path) -> None:
 
 def test_latched_door_opens_when_its_lever_is_turned() -> None:
     result = door_plan().simulate()
-    assert result.ok, result.report()
+    assert result.ok, result.summary()
     before = result.trajectory.times < result.grips[0].begin
     assert np.abs(result.trajectory.column("door.hinge")[before]).max() < 1e-3
     assert result.trajectory.column("door.hinge")[-1] == pytest.approx(1.2, abs=0.02)
@@ -95,7 +95,7 @@ def test_hand_loses_heavy_object() -> None:
     )
     assert light.grips[0].broken is None
     assert heavy.grips[0].broken is not None
-    assert "stick.grip was pulled out of the hand" in heavy.report()
+    assert "stick.grip was pulled out of the hand" in heavy.summary()
     assert not heavy.ok
 
 
@@ -118,7 +118,7 @@ def test_contact_with_unplanned_obstacle_is_reported() -> None:
     assert 0.0 < hit[0].begin < 11.0
     assert max(contact.depth for contact in hit) > 1e-4
     assert any("drawer.slide" in line for line in result.problems())  # the drawer stays closed
-    assert "crate" in result.report()
+    assert "crate" in result.summary()
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -129,7 +129,7 @@ def test_diverged_simulation_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert result.diverged is not None
     assert result.diverged < 10.0
     assert not result.ok
-    assert "the integration diverged" in result.report()
+    assert "the integration diverged" in result.summary()
     assert len(result.rows) == len(result.trajectory.times)
     assert np.isfinite(result.rows).all()
     assert list(tmp_path.iterdir()) == []  # MuJoCo would log it here

@@ -70,7 +70,7 @@ def test_other_threads_get_no_signals() -> None:
         with Budget().activate() as budget:
             seen.append(budget.is_interrupted)
 
-    with Budget(effort=1).activate() as mine:
+    with Budget(max_evaluations=1).activate() as mine:
         thread = threading.Thread(target=work)
         thread.start()
         thread.join()
@@ -80,25 +80,25 @@ def test_other_threads_get_no_signals() -> None:
 
 def test_effort_counts_down() -> None:
     """All of it may be used."""
-    with Budget(effort=10).activate() as budget:
+    with Budget(max_evaluations=10).activate() as budget:
         record_evaluations(4)
         record_evaluations(6)
         record_evaluations()
-        with pytest.raises(BudgetExhaustedError, match="effort spent"):
+        with pytest.raises(BudgetExhaustedError, match="evaluation limit"):
             record_evaluations(1)
-        assert (budget.evaluations, budget.stop_status) == (11, "effort spent")
+        assert (budget.evaluations, budget.stop_status) == (11, "evaluation limit")
 
 
 def test_nothing_counts_where_no_budget_runs() -> None:
     record_evaluations(10**9)
-    with Budget(effort=1).activate() as budget, suspend_budget():
+    with Budget(max_evaluations=1).activate() as budget, suspend_budget():
         record_evaluations(10**9)
     assert (budget.evaluations, budget.stop_status) == (0, "")
 
 
 def test_a_budget_within_another() -> None:
-    with Budget(effort=5).activate() as outer:
-        with Budget(effort=1).activate(), pytest.raises(BudgetExhaustedError):
+    with Budget(max_evaluations=5).activate() as outer:
+        with Budget(max_evaluations=1).activate(), pytest.raises(BudgetExhaustedError):
             record_evaluations(2)
         record_evaluations(5)
         assert outer.evaluations == 5

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.validation.closure import (
     RESOLUTION,
@@ -19,13 +18,13 @@ from vkc_pin.validation.validate import validate
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-LIMITS = (Options().closure_position, Options().closure_angle)
+LIMITS = (vkc.Tolerances().closure_position, vkc.Tolerances().closure_angle)
 
 
 @pytest.fixture(scope="module")
 def plan() -> Plan:
     found = vkc.plan(vkc.load_scene("drawer"), [vkc.Actuate("drawer", {"slide": 0.3})])
-    assert found.success, found.report()
+    assert found.success, found.summary()
     return found
 
 

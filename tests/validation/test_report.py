@@ -145,11 +145,11 @@ def test_invalid_data(path: tuple[str | int, ...], value: object, field: str | N
 
 
 def test_text_by_phase(door_plan: vkc.Plan) -> None:
-    report, motion = door_plan.validation, door_plan.trajectory
+    report, motion = door_plan.report, door_plan.trajectory
     parts = motion.parts()
     for line, part, close in zip(report.by_phase(motion), parts, report.clearances, strict=True):
         numbers = map(float, re.findall(r"-?[\d.]+(?= (?:to|s|m|rad|mm)\b)", line))
-        base, arm = part.base_effort(), part.arm_effort()
+        base, arm = part.base_path_length(), part.arm_path_length()
         expected = [part.times[0], part.times[-1], base, arm, 1e3 * close]
         np.testing.assert_allclose(list(numbers), expected, atol=0.06)
         assert line.endswith(part.phases[0].name)
@@ -157,7 +157,7 @@ def test_text_by_phase(door_plan: vkc.Plan) -> None:
 
 
 def test_clearance_of_each_phase(door_plan: vkc.Plan) -> None:
-    fine, report = door_plan.trajectory, door_plan.validation
+    fine, report = door_plan.trajectory, door_plan.report
     assert min(report.clearances) == report.clearance
     for phase, close in zip(fine.phases, report.clearances, strict=True):
         times = fine.times[phase.first + 1 : phase.last + 1]

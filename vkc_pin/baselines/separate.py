@@ -39,6 +39,7 @@ import dataclasses
 import time
 from collections import Counter
 from collections.abc import Sequence
+from typing import cast
 
 from vkc_pin.baselines.attempt import FINER, Attempt, Doable
 from vkc_pin.errors import InputError, format_value
@@ -56,6 +57,7 @@ from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Step
+from vkc_pin.world.trajectory.formats.archives import PlanStatus
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["BASELINES", "RETRIES", "plan_separately"]
@@ -74,7 +76,7 @@ def plan_separately(
     options: Options | None = None,
     seed: int = 0,
     time_limit: float | None = None,
-    effort: int | None = None,
+    max_evaluations: int | None = None,
     retries: int = RETRIES,
     finer: int = FINER,
     planner: Planner | None = None,
@@ -88,7 +90,7 @@ def plan_separately(
         options: As for `planner.plan`.
         seed: Of the random numbers.
         time_limit: As for `planner.plan`.
-        effort: As for `planner.plan`; an iteration of inverse kinematics of the arm counts 1.
+        max_evaluations: As for `planner.plan`; an iteration of inverse kinematics of the arm counts 1.
         retries: How often all is tried, with other random numbers, until validation accepts a
             motion.
         finer: In how many times `Options.move_waypoints` objects are moved; 1: in as many as by
@@ -99,14 +101,14 @@ def plan_separately(
         The plan of the first try that validation accepts, else the one that came furthest. Its
         status is then the cause: "no base pose", "no base path", "arm does not reach", "no inverse
         kinematics", "collision", "too fast", "closure" or "rejected" by validation; "time limit",
-        "effort spent" or "interrupted" if not all tries were made. Planning time is that of all
+        "evaluation limit" or "interrupted" if not all tries were made. Planning time is that of all
         tries; `rounds` is their number.
 
     Raises:
         InputError: Steps that cannot be done or are of another kind, or an argument is wrong.
     """
     options = Options() if options is None else options
-    budget = make_budget(time_limit, effort)
+    budget = make_budget(time_limit, max_evaluations)
     check_arguments(scene, options, seed)
     check_choice(method, BASELINES, "method", "method")
     check_integer(retries, "retries", low=1)
@@ -125,7 +127,7 @@ def plan_separately(
         actions.append(step)
     with acquire_cache(planner) as cache, budget.activate():
         began, times, iterations, before = time.perf_counter(), Counter[str](), 0, cache.build_time
-        best: tuple[float, str, int, Trajectory, Report] | None = None
+        best: tuple[float, PlanStatus, int, Trajectory, Report] | None = None
         for number in range(retries):
             attempt = Attempt(
                 scene,
@@ -143,7 +145,7 @@ def plan_separately(
             took = time.perf_counter() - checked
             reserve_time("validation", took)
             attempt.times["retiming"] += took - (attempt.times["validation"] - before_checks)
-            status = "success" if report.ok else cause or "rejected"
+            status = "success" if report.ok else cast("PlanStatus", cause or "rejected")
             iterations += attempt.iterations
             times.update(attempt.times)
             if best is None or status == "success" or came > best[0]:

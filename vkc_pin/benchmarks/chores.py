@@ -33,7 +33,7 @@ THINGS = 300  # in the cluttered home
 _AROUND = 0.2  # [m] around what the chore is about that stays free there
 _LIMITS = {
     **LIMITS,
-    "effort": 4 * LIMITS["effort"],
+    "max_evaluations": 4 * LIMITS["max_evaluations"],
 }  # eighteen steps take half a million units and more
 
 _METHODS = {ONE_CALL: "in one call", STEP_BY_STEP: "step by step"}
@@ -284,7 +284,7 @@ def report(result: Mapping[str, Any]) -> str:
         wall, _ = distribution(own, "wall_time")
         efforts = (
             decimal(distribution(good, field)[0])
-            for field in ("base_effort", "arm_effort", "duration")
+            for field in ("base_path_length", "arm_path_length", "duration")
         )
         number = str(len(about["steps"][chore]))
         times = (decimal(value) for value in (wall, planning, late))
@@ -298,7 +298,7 @@ def report(result: Mapping[str, Any]) -> str:
         "95th percentile [s]",
     ]
     head += ["base [m]", "arm [rad]", "duration [s]", "failures"]
-    fields = ("wall_time", "planning_time", "base_effort", "arm_effort")
+    fields = ("wall_time", "planning_time", "base_path_length", "arm_path_length")
     every = [
         [
             record["scene"],
@@ -357,8 +357,8 @@ def _seeds_table(result: Mapping[str, Any]) -> str:
             ", ".join("all" if n == steps else f"{n:.0f}" for n in values(own, "steps_done")) or "–"
         )
         spent, spreads = values(own, "cpu_time"), list[str]()
-        for effort in ("base_effort", "arm_effort"):
-            found = values(good, effort)
+        for name in ("base_path_length", "arm_path_length"):
+            found = values(good, name)
             spreads += _apart(min(found), max(found)) if found else ["–"] * 3
         cpu = (decimal(float(np.median(spent))), decimal(max(spent))) if spent else ("–", "–")
         rows.append(

@@ -59,10 +59,10 @@ def add_bench(commands: Any) -> None:
         others = "B1x1 B2x1 (as many waypoints as VKC, not twice as many) B1x3 B2x3"
         _add_choice(comparison, "methods", f"B1 B2 VKC (default: these) {others}")
         comparison.add_argument(
-            "--effort",
+            "--max-evaluations",
             type=positive,
             metavar="E",
-            help="units of effort a trial may take (default 1000000)",
+            help="evaluations that a trial may take (default 1000000)",
         )
         if name == "household":
             words = (

@@ -20,7 +20,7 @@ from vkc_pin.baselines.separate import BASELINES, RETRIES, plan_separately
 from vkc_pin.benchmarks.comparison_report import WAYPOINTS, report
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import motions_chart
-from vkc_pin.benchmarks.harness.limits import EFFORT, LIMITS
+from vkc_pin.benchmarks.harness.limits import LIMITS, MAX_EVALUATIONS
 from vkc_pin.benchmarks.harness.record import Record, Solve, peaks, trial
 from vkc_pin.errors import InputError
 from vkc_pin.planning.plan import Plan
@@ -78,11 +78,11 @@ class Comparison:
     load: Callable[[str], Scene] = load_scene
 
     def plan_trial(self, scene: Scene, spec: Mapping[str, Any]) -> Plan:
-        """Plan the task of one trial: `scene` (the task's name), `method`, `seed`, `effort` and `planner` say how."""
+        """Plan the task of one trial: `scene` (the task's name), `method`, `seed`, `max_evaluations` and `planner` say how."""
         steps = self.tasks[spec["scene"]].steps
         how: dict[str, Any] = {
             **LIMITS,
-            **{key: spec[key] for key in ("effort", "planner") if key in spec},
+            **{key: spec[key] for key in ("max_evaluations", "planner") if key in spec},
             "seed": spec["seed"],
         }
         if spec["method"] == "VKC":
@@ -97,7 +97,7 @@ class Comparison:
         seed: int,
         tasks: Sequence[str],
         methods: Sequence[str],
-        effort: int = EFFORT,
+        max_evaluations: int = MAX_EVALUATIONS,
     ) -> list[dict[str, Any]]:
         """Return the trials: every task, method and start, in this order, in which a process can keep what it has built.
 
@@ -128,7 +128,7 @@ class Comparison:
                         **start,
                         "seed": seed + number,
                     }
-                    specs.append({**spec, "effort": effort})
+                    specs.append({**spec, "max_evaluations": max_evaluations})
         return specs
 
     def run(
@@ -142,7 +142,7 @@ class Comparison:
         scheduler: str | None = None,
         tasks: Sequence[str] | None = None,
         methods: Sequence[str] = COMPARED_PLANNERS,
-        effort: int = EFFORT,
+        max_evaluations: int = MAX_EVALUATIONS,
         save_failures: bool = False,
         progress: bool = True,
     ) -> dict[str, Any]:
@@ -162,7 +162,7 @@ class Comparison:
                 `engine.results`.
             tasks: Some of the tasks; None: all.
             methods: Some of `METHODS`.
-            effort: What each trial may take at most, in units of effort.
+            max_evaluations: What each trial may take at most, in evaluations.
             save_failures: Save the plan of every failure; those that ran before without this are
                 planned once more.
             progress: Whether to show progress bars.
@@ -180,7 +180,13 @@ class Comparison:
         if trials < 1:
             raise InputError("out of range", field="trials", expected="at least 1", got=trials)
         specs, out = (
-            self.specify(trials=trials, seed=seed, tasks=tasks, methods=methods, effort=effort),
+            self.specify(
+                trials=trials,
+                seed=seed,
+                tasks=tasks,
+                methods=methods,
+                max_evaluations=max_evaluations,
+            ),
             Path(out),
         )
         settings = {
@@ -192,7 +198,7 @@ class Comparison:
         }
         settings["scenes"] = {name: self.tasks[name].scene for name in tasks}
         settings["goals"] = {name: goals(self.tasks[name].steps) for name in tasks}
-        settings |= {**LIMITS, "effort": effort, "retries": RETRIES}
+        settings |= {**LIMITS, "max_evaluations": max_evaluations, "retries": RETRIES}
         trials_of = _Trials(self, out, solve or self.plan_trial, timed=solve is None)
         record = functools.partial(trials_of.record, save_failures=save_failures)
         result = runner.run(

@@ -181,17 +181,17 @@ def _budgets(
     tasks: Mapping[str, str],
     methods: Sequence[str],
 ) -> list[str]:
-    """Return a section on what less effort would have led to, if effort was limited."""
-    if "effort" not in about or not values(records, "effort"):
+    """Return a section on successes within shares of the budget, if there was one."""
+    if "max_evaluations" not in about or not values(records, "evaluations"):
         return []
-    shares = [(name, about["effort"] * share) for name, share in BUDGETS.items()]
+    shares = [(name, about["max_evaluations"] * share) for name, share in BUDGETS.items()]
     rows = []
     for task, method in product(tasks, methods):
         own = _of(records, task, method)
-        good = values([record for record in own if record["success"]], "effort")
-        within = [sum(effort <= limit for effort in good) for _, limit in shares]
+        good = values([record for record in own if record["success"]], "evaluations")
+        within = [sum(count <= limit for count in good) for _, limit in shares]
         gain = 100.0 * (within[-1] - within[-2]) / max(len(own), 1)
-        most = f"{max(good) / about['effort']:.3f}" if good else "–"
+        most = f"{max(good) / about['max_evaluations']:.3f}" if good else "–"
         rows.append(
             [task, method, *(f"{number} of {len(own)}" for number in within), f"{gain:.0f}", most]
         )
@@ -203,8 +203,8 @@ def _budgets(
         "most, as a share",
     ]
     text = (
-        "Successes within shares of the budget. Effort only ends planning, so a success within a share is one with that as the "
-        "budget, too; two thirds and half as much again are all of it."
+        "Successes within shares of the budget. The budget only ends planning, so a success within a share is one with that "
+        "as the budget, too; two thirds and half as much again are all of it."
     )
     return ["## Had the budget been smaller", text, markdown(head, rows, text=2)]
 

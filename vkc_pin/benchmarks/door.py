@@ -110,8 +110,8 @@ def table(result: dict[str, Any]) -> str:
         lines.append(
             f"{task:12}{f'{good}/{len(rows)}':>10}{time:>18.3f}{late:>8.3f}"
             + "".join(f"{part:>8.3f}" for part in split)
-            + f"{distribution(rows, 'iterations')[0]:>7.0f}{distribution(rows, 'base_effort')[0]:>10.2f}"
-            + f"{distribution(rows, 'arm_effort')[0]:>11.2f}{max(t['build_time'] for t in rows):>11.2f}"
+            + f"{distribution(rows, 'iterations')[0]:>7.0f}{distribution(rows, 'base_path_length')[0]:>10.2f}"
+            + f"{distribution(rows, 'arm_path_length')[0]:>11.2f}{max(t['build_time'] for t in rows):>11.2f}"
         )
     lines.append(f"peak memory {result['meta']['peak_memory_mb']:.0f} MB")
     for t in result["trials"]:

@@ -74,15 +74,19 @@ TASKS = {
 def _draw(
     records: Sequence[Record], out: Path, tasks: Mapping[str, str], methods: Sequence[str]
 ) -> list[str]:
-    """Draw success.png, base_effort.png, arm_effort.png and planning_time.png, each with all tasks and methods."""
+    """Draw success.png, base_path_length.png, arm_path_length.png and planning_time.png, each with all tasks and methods."""
     shown = {task: task for task in tasks}
     success_chart(records, out / "success.png", shown, methods, title="Success")
     pictures = ["![Success, with Wilson's intervals of 95 % confidence](success.png)"]
-    for name, unit in (("base effort", "m"), ("arm effort", "rad"), ("planning time", "s")):
+    for name, unit in (
+        ("base path length", "m"),
+        ("arm path length", "rad"),
+        ("planning time", "s"),
+    ):
         how: Any = {
             "field": name.replace(" ", "_"),
             "label": f"{name} [{unit}]",
-            "shared": name.endswith("effort"),
+            "shared": name.endswith("path length"),
         }
         means_chart(records, out / f"{how['field']}.png", shown, methods, **how)
         pictures.append(

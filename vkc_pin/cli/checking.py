@@ -57,13 +57,13 @@ def _plan(arguments: argparse.Namespace) -> int:
     sys.stdout.write(
         "\n".join(
             [
-                *plan.validation.lines(),
+                *plan.report.lines(),
                 *(f"  the file says otherwise: {line}" for line in otherwise),
             ]
         )
         + "\n"
     )
-    return _OK if plan.validation.ok and not otherwise else _FAILED
+    return _OK if plan.report.ok and not otherwise else _FAILED
 
 
 def _scene(arguments: argparse.Namespace) -> int:

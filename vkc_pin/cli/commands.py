@@ -92,7 +92,7 @@ def _plan(arguments: argparse.Namespace) -> int:
         steps,
         initialization=arguments.initialization,
         time_limit=arguments.time_limit,
-        effort=arguments.effort,
+        max_evaluations=arguments.max_evaluations,
         seed=arguments.seed,
         callback=None if arguments.quiet else _progress,
     )
@@ -106,7 +106,9 @@ def _plan(arguments: argparse.Namespace) -> int:
         "html": plan.to_html,
         "plots": plan.plot,
     }
-    if not _write(_chosen(arguments, (*_FILES, *_FOLDERS, "plots")), writers, plan.report() + "\n"):
+    if not _write(
+        _chosen(arguments, (*_FILES, *_FOLDERS, "plots")), writers, plan.summary() + "\n"
+    ):
         return EXIT_MISUSE
     return EXIT_OK if plan.success else _FAILURES.get(plan.status, EXIT_FAILED)
 
@@ -293,7 +295,10 @@ def make_parser() -> argparse.ArgumentParser:
         "--time-limit", type=float, metavar="SECONDS", help="return the best motion found by then"
     )
     plan.add_argument(
-        "--effort", type=int, metavar="UNITS", help="return the best motion found with so much work"
+        "--max-evaluations",
+        type=int,
+        metavar="UNITS",
+        help="return the best motion found with so much work",
     )
     plan.add_argument("--seed", type=natural, default=0, help="of the random numbers (default 0)")
     plan.add_argument("--quiet", action="store_true", help="no progress")

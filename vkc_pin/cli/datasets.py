@@ -87,7 +87,7 @@ def _generate(arguments: argparse.Namespace) -> int:
 
     try:
         with raise_on_interrupt():
-            dataset = vkc.generate(
+            dataset = vkc.datasets.generate(
                 arguments.recipe,
                 arguments.episodes,
                 arguments.out,
@@ -116,7 +116,7 @@ def _check(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
 
     with raise_on_interrupt():
-        found = vkc.check_dataset(
+        found = vkc.datasets.check_dataset(
             arguments.folder,
             jobs=arguments.jobs,
             page=arguments.html,

@@ -195,7 +195,7 @@ def _import_object(arguments: argparse.Namespace) -> int:
         most=arguments.most,
         force=arguments.force,
     )
-    sys.stdout.write(f"{done.report()}\nwrote {done.file}\nwrote {done.picture}\n")
+    sys.stdout.write(f"{done.summary()}\nwrote {done.file}\nwrote {done.picture}\n")
     return EXIT_OK
 
 
@@ -211,7 +211,7 @@ def _import_home(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         force=arguments.force,
     )
-    sys.stdout.write(f"{done.report()}\nwrote {done.file}\n")
+    sys.stdout.write(f"{done.summary()}\nwrote {done.file}\n")
     return EXIT_OK
 
 

@@ -68,6 +68,6 @@ def _simulate(arguments: argparse.Namespace) -> int:
     for name, path in files.items():
         writers[name](path)
     sys.stdout.write(
-        "".join([f"{result.report()}\n", *(f"wrote {path}\n" for path in files.values())])
+        "".join([f"{result.summary()}\n", *(f"wrote {path}\n" for path in files.values())])
     )
     return _OK if result.ok else _FAILED

@@ -38,8 +38,8 @@ _COLUMNS = (
     ),
     *(
         "duration",
-        "base_effort",
-        "arm_effort",
+        "base_path_length",
+        "arm_path_length",
         "clearance",
         "waypoints",
         "scene",

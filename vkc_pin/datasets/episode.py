@@ -157,7 +157,7 @@ def run_attempt(document: Mapping[str, Any], number: int, robots: Mapping[str, s
                 problem.steps,
                 options=problem.options,
                 seed=problem.seed,
-                effort=recipe.fields.effort,
+                max_evaluations=recipe.fields.max_evaluations,
                 time_limit=recipe.fields.time_limit,
                 perturbation=0.0 if problem.seed == 0 else _PERTURBATION,
                 terms=problem.terms,
@@ -201,11 +201,11 @@ _PERTURBATION = 0.05  # [m], [rad] noise of initial guesses of further variants
 
 
 def _record_plan(plan_result: Plan) -> dict[str, Any]:
-    worst = [str(one) for one in plan_result.validation.violations[:1]]
+    worst = [str(one) for one in plan_result.report.violations[:1]]
     reason = (
         ""
         if plan_result.success
-        else "; ".join([*worst, *plan_result.validation.notes[:2]]) or plan_result.status
+        else "; ".join([*worst, *plan_result.report.notes[:2]]) or plan_result.status
     )
     return {
         "success": plan_result.success,
@@ -214,7 +214,7 @@ def _record_plan(plan_result: Plan) -> dict[str, Any]:
         "planning_time": round(plan_result.metrics["planning_time"], 4),
         "build_time": round(plan_result.metrics["build_time"], 4),
         "validation_time": round(plan_result.metrics["time_validation"], 4),
-        "effort": int(plan_result.metrics["effort"]),
+        "evaluations": int(plan_result.metrics["evaluations"]),
         "initialization": plan_result.initialization,
     }
 
@@ -240,13 +240,13 @@ def sample_times(motion: Trajectory, rate: float) -> Floats:
 def _select_metrics(plan_result: Plan) -> dict[str, float]:
     """Return a plan's metrics that do not depend on the machine."""
     names = (
-        "base_effort",
-        "base_effort_l1",
-        "arm_effort",
+        "base_path_length",
+        "base_path_length_l1",
+        "arm_path_length",
         "clearance",
         "closure_error",
         "duration",
-        "effort",
+        "evaluations",
     )
     return {
         name: float(plan_result.metrics[name])
@@ -294,12 +294,12 @@ def pack(
         "options": asdict(plan_result.options),
         "motion": motion,
         "validation": {
-            **plan_result.validation.to_dict(),
-            "clearance": _finite_or_none(plan_result.validation.clearance),
+            **plan_result.report.to_dict(),
+            "clearance": _finite_or_none(plan_result.report.clearance),
         },
     }
     data["validation"]["clearances"] = [
-        _finite_or_none(value) for value in plan_result.validation.clearances
+        _finite_or_none(value) for value in plan_result.report.clearances
     ]
     buffer = io.BytesIO()
     seen: Any = {"images": np.frombuffer(images, np.uint8)} if images else {}
@@ -314,7 +314,7 @@ def pack(
         **{
             name: round(value, 5)
             for name, value in _select_metrics(plan_result).items()
-            if name != "effort"
+            if name != "evaluations"
         },
         "way": sample_coarse_trajectory(plan_result.trajectory),
     }

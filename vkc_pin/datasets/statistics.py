@@ -108,7 +108,7 @@ def _counts(field: str, records: Sequence[Mapping[str, Any]]) -> str:
     for name, count in counted.most_common():
         own = [record for record in records if str(record[field]) == name]
         duration = float(np.median([float(record["duration"]) for record in own]))
-        gone = float(np.median([float(record["base_effort"]) for record in own]))
+        gone = float(np.median([float(record["base_path_length"]) for record in own]))
         rows.append(
             [
                 name,
@@ -184,8 +184,8 @@ def _histograms(records: Sequence[Mapping[str, Any]]) -> Figure:
         axes = figure.subplots(2, 3).ravel()
         fields = (
             ("duration", "duration [s]"),
-            ("base_effort", "way of the base [m]"),
-            ("arm_effort", "way of the arm [rad]"),
+            ("base_path_length", "way of the base [m]"),
+            ("arm_path_length", "way of the arm [rad]"),
         )
         for own, (field, label) in zip(
             axes, (*fields, ("clearance", "least clearance [m]")), strict=False

@@ -1,1 +1,5 @@
 """Imports robots, objects and homes from files of other programs, and proposes attachments."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

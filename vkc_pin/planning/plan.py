@@ -24,6 +24,7 @@ from vkc_pin.world.task.actions import compile_each_step
 from vkc_pin.world.task.steps import Step, step_from_dict, step_to_dict
 from vkc_pin.world.task.terms import Term, term_from_dict, term_to_dict
 from vkc_pin.world.trajectory.formats.archives import (
+    PlanStatus,
     read_archive,
     resolve_folder,
     serialize_folder,
@@ -49,8 +50,8 @@ class Plan:
         steps: Steps to be done.
         options: Options of planning.
         trajectory: The trajectory; after a failure, the best one found.
-        validation: Report of the independent validation.
-        status: "success", "infeasible", "not converged", "time limit", "effort spent",
+        report: Report of the independent validation.
+        status: "success", "infeasible", "not converged", "time limit", "evaluation limit",
             "interrupted", "rejected"; of baselines that fail, the stage.
         statistics: Times and counts of planning.
         seed: Random seed.
@@ -58,7 +59,7 @@ class Plan:
         history: One row per round of the solver.
         terms: Constraints and costs of the user, with their expressions as data.
         claimed: Report in the file that the plan was loaded from; else None.
-        is_validated: Whether `validation` is this program's own; False for a plan that was loaded
+        is_validated: Whether `report` is this program's own; False for a plan that was loaded
             without validation, whose report is its file's claim.
     """
 
@@ -66,8 +67,8 @@ class Plan:
     steps: tuple[Step, ...]
     options: Options
     trajectory: Trajectory
-    validation: Report
-    status: str
+    report: Report
+    status: PlanStatus
     statistics: PlanningStatistics = field(default_factory=PlanningStatistics)
     seed: int = 0
     initialization: str = ""
@@ -79,13 +80,13 @@ class Plan:
     @property
     def success(self) -> bool:
         """Whether the independent validation found no violation, and all steps are done."""
-        return self.is_validated and self.validation.ok and self.status == "success"
+        return self.is_validated and self.report.ok and self.status == "success"
 
     @property
     def metrics(self) -> dict[str, float]:
         """Metrics of the trajectory, its validation and planning, by name.
 
-        duration [s], base_effort and base_effort_l1 [m], arm_effort [rad], clearance and
+        duration [s], base_path_length and base_path_length_l1 [m], arm_path_length [rad], clearance and
         closure_error [m], torque [share of the limit], and those of `PlanningStatistics.to_metrics`.
         """
         statistics = self.statistics.to_metrics()
@@ -116,29 +117,26 @@ class Plan:
 
     def contradictions(self) -> list[str]:
         """Return what the file that the plan was loaded from says otherwise than the check of its motion, one line each."""
-        return [] if self.claimed is None else self.validation.contradictions(self.claimed)
+        return [] if self.claimed is None else self.report.contradictions(self.claimed)
 
-    def report(self) -> str:
-        """Return what came out, for people: success or what is violated (the first twelve), efforts, clearance, times."""
+    def summary(self) -> str:
+        """Return a readable summary: success or the first twelve violations, path lengths, times."""
         m = self.metrics
         lines = [
             f"{self.scene.name}: {'success' if self.success else f'FAILED, {self.status}'} — "
             + ", ".join(p.name for p in self.trajectory.phases),
             f"  motion      {m['duration']:.1f} s, {len(self.trajectory.times)} waypoints",
-            *(f"  {line}" for line in self.validation.timing()),
-            f"  effort      base {m['base_effort']:.2f} m (|dx|+|dy| {m['base_effort_l1']:.2f} m), arm {m['arm_effort']:.2f} rad",
+            *(f"  {line}" for line in self.report.timing()),
+            f"  path        base {m['base_path_length']:.2f} m "
+            f"(|dx|+|dy| {m['base_path_length_l1']:.2f} m), arm {m['arm_path_length']:.2f} rad",
             f"  clearance   {1e3 * m['clearance']:.1f} mm at the closest, closure within {1e3 * m['closure_error']:.3f} mm",
             f"  planning    {m['planning_time']:.3f} s after {m['build_time']:.2f} s of symbolic build: "
             f"seeds {m['time_initialization']:.3f}, coal {m['time_coal']:.3f}, CasADi {m['time_casadi']:.3f}, "
             f"Ipopt {m['time_ipopt']:.3f}, validation {m['time_validation']:.3f}; "
             f"{int(m['rounds'])} rounds, {int(m['iterations'])} Ipopt iterations, "
-            f"effort {int(m.get('effort', 0))}, seed {self.initialization}",
-            *(
-                f"  {line}"
-                for line in self.validation.by_phase(self.trajectory)
-                if len(self.steps) > 1
-            ),
-            *(f"  {line}" for line in self.validation.lines()),
+            f"{self.statistics.evaluations} evaluations, initial guess {self.initialization}",
+            *(f"  {line}" for line in self.report.by_phase(self.trajectory) if len(self.steps) > 1),
+            *(f"  {line}" for line in self.report.lines()),
         ]
         return "\n".join(lines)
 
@@ -154,11 +152,11 @@ class Plan:
             },
             "seed": self.seed,
             "initialization": self.initialization,
-            "violations": [asdict(violation) for violation in self.validation.violations],
-            "notes": list(self.validation.notes),
-            "bounds": [asdict(bound) for bound in self.validation.bounds],
-            "remarks": list(self.validation.remarks),
-            "exemptions": [asdict(exemption) for exemption in self.validation.exemptions],
+            "violations": [asdict(violation) for violation in self.report.violations],
+            "notes": list(self.report.notes),
+            "bounds": [asdict(bound) for bound in self.report.bounds],
+            "remarks": list(self.report.remarks),
+            "exemptions": [asdict(exemption) for exemption in self.report.exemptions],
             "trajectory": self.trajectory.to_dict(),
         }
 
@@ -181,8 +179,11 @@ class Plan:
         return self.trajectory.to_rosbag(path, **options)
 
     def __repr__(self) -> str:
-        m = self.metrics
-        return f"<Plan {self.status}: base {m['base_effort']:.2f} m, arm {m['arm_effort']:.2f} rad, {m['planning_time']:.2f} s>"
+        return (
+            f"<Plan {self.status}: base {self.trajectory.base_path_length():.2f} m, "
+            f"arm {self.trajectory.arm_path_length():.2f} rad, "
+            f"{self.statistics.planning_time:.2f} s>"
+        )
 
     def _repr_html_(self) -> str:
         from vkc_pin.visualization.plots.notebook_cards import motion_html
@@ -227,7 +228,7 @@ class Plan:
             "steps": [step_to_dict(step) for step in self.steps],
             "options": asdict(self.options),
             "trajectory": self.trajectory.to_dict(),
-            "validation": self.validation.to_dict(),
+            "validation": self.report.to_dict(),
             "status": self.status,
             "metrics": {**self.metrics, **_measure(self)},
             "seed": self.seed,
@@ -304,7 +305,7 @@ class Plan:
             steps=tuple(step_from_dict(step) for step in about["steps"]),
             options=_saved(about["options"]),
             trajectory=trajectory,
-            validation=claimed,
+            report=claimed,
             status=about["status"],
             statistics=PlanningStatistics.from_metrics(metrics),
             seed=about["seed"],
@@ -319,19 +320,19 @@ class Plan:
 def _revalidate(plan: Plan) -> Plan:
     """Return a loaded plan with a report of its own."""
     report = validate(plan.scene, plan.steps, plan.trajectory, plan.options, plan.terms)
-    status, claimed = plan.status, plan.validation
+    status, claimed = plan.status, plan.report
     if status == "success" and not report.ok:
         status = "rejected"
     if not report.ok:
         report = replace(report, notes=claimed.notes)
         if status == "infeasible":
             report = report.with_reasons(claimed.violations or report.violations)
-    return replace(plan, validation=report, status=status, is_validated=True)
+    return replace(plan, report=report, status=status, is_validated=True)
 
 
 def _measure(plan: Plan) -> dict[str, float]:
     """Return the metrics of a plan's trajectory and its validation."""
-    return {**plan.trajectory.metrics(), **plan.validation.measures()}
+    return {**plan.trajectory.metrics(), **plan.report.measures()}
 
 
 def _saved(options: Mapping[str, Any]) -> Options:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
+from vkc_pin.planning.initialization.methods import Initialization
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.progress import shown
 from vkc_pin.planning.request import make_budget, make_request
@@ -99,11 +100,11 @@ def plan(
     scene: Scene,
     steps: Sequence[Step],
     *,
-    initialization: str = "auto",
+    initialization: Initialization = "auto",
     options: Options | None = None,
     callback: Callable[[Iteration], None] | None = None,
     time_limit: float | None = None,
-    effort: int | None = None,
+    max_evaluations: int | None = None,
     seed: int = 0,
     simultaneous: bool = True,
     window: int | None = None,
@@ -124,8 +125,8 @@ def plan(
         callback: Called with an `Iteration` after every round of the solver.
         time_limit: Wall-clock limit of the call [s], after which the best trajectory so far is
             returned with status "time limit". Success then depends on the machine and its load.
-        effort: Limit on evaluated configurations, by searches for initial guesses and by every
-            iteration of Ipopt at each waypoint; the status is then "effort spent". It has the same
+        max_evaluations: Limit on evaluated configurations, by searches for initial guesses and by every
+            iteration of Ipopt at each waypoint; the status is then "evaluation limit". It has the same
             effect on every machine. 100 000 evaluations take some ten seconds;
             `plan.statistics.evaluations` counts them.
         seed: Random seed. The result is reproducible bit for bit on the same machine, unless
@@ -150,7 +151,7 @@ def plan(
     Raises:
         InputError: An argument is invalid, or a step or term names an unknown or impossible goal.
     """
-    budget = make_budget(time_limit, effort)
+    budget = make_budget(time_limit, max_evaluations)
     request = make_request(
         scene,
         initialization=initialization,

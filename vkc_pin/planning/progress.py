@@ -62,7 +62,7 @@ class Progress:
         """Leave one line on what came out."""
         m, name = plan.metrics, plan.scene.name
         result = "success" if plan.success else f"FAILED, {plan.status}"
-        took = f"base {m['base_effort']:.2f} m, arm {m['arm_effort']:.2f} rad, planned in {m['planning_time']:.2f} s"
+        took = f"base {m['base_path_length']:.2f} m, arm {m['arm_path_length']:.2f} rad, planned in {m['planning_time']:.2f} s"
         self._last(f"{name}: {result} — {took}")
 
     def stop(self) -> None:

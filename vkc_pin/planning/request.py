@@ -77,7 +77,7 @@ def make_request(
     )
 
 
-def make_budget(time_limit: object, effort: object) -> Budget:
+def make_budget(time_limit: object, max_evaluations: object) -> Budget:
     """Return the budget of a planning call, which starts now; see `plan`.
 
     Raises:
@@ -87,7 +87,12 @@ def make_budget(time_limit: object, effort: object) -> Budget:
         time_limit = check_number(
             time_limit, "time_limit", "seconds, more than 0", low=0.0, strict=True
         )
-    return Budget(time_limit, None if effort is None else check_integer(effort, "effort", low=1))
+    return Budget(
+        time_limit,
+        None
+        if max_evaluations is None
+        else check_integer(max_evaluations, "max_evaluations", low=1),
+    )
 
 
 def check_arguments(scene: object, options: object, seed: object) -> None:

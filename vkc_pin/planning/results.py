@@ -19,6 +19,7 @@ from vkc_pin.world.scene.contact_rules import compute_start_opening
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
 from vkc_pin.world.task.terms import Term
+from vkc_pin.world.trajectory.formats.archives import PlanStatus
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.splicing import concatenate_trajectories
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -52,7 +53,7 @@ def build_plan(
     options: Options,
     trajectory: Trajectory,
     report: Report,
-    status: str,
+    status: PlanStatus,
     *,
     statistics: PlanningStatistics,
     random_seed: int,
@@ -80,7 +81,7 @@ def build_plan(
         steps=tuple(steps),
         options=options,
         trajectory=trajectory,
-        validation=report,
+        report=report,
         status=status,
         statistics=statistics,
         seed=random_seed,
@@ -122,7 +123,9 @@ def concatenate_plans(
     rows = [row for part in parts for row in part.history] if history is None else history
     if parts:
         request.progress.doing("checking all of it")
-        status = current_ending() or ("rejected" if parts[-1].success else parts[-1].status)
+        status: PlanStatus = current_ending() or (
+            "rejected" if parts[-1].success else parts[-1].status
+        )
         trajectory = concatenate_trajectories(
             [part.trajectory for part in parts], pause=request.options.grasp_time
         )
@@ -135,7 +138,7 @@ def concatenate_plans(
     took = time.perf_counter() - start
     if parts:
         total += PlanningStatistics(planning_time=took, validation_time=took)
-        report = dataclasses.replace(report, notes=(*notes, *parts[-1].validation.notes))
+        report = dataclasses.replace(report, notes=(*notes, *parts[-1].report.notes))
         status = "success" if report.ok else status
     if began is not None:
         planning_time = time.perf_counter() - began - total.build_time

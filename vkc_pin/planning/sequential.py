@@ -105,13 +105,13 @@ def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) 
         statistics.append(last.plan.statistics)
         if last.plan.success:
             return dataclasses.replace(last, plan=add_statistics(last.plan, statistics))
-        notes.append(f"at {name}: {next(iter(last.plan.validation.notes), last.plan.status)}")
+        notes.append(f"at {name}: {next(iter(last.plan.report.notes), last.plan.status)}")
     if last is first:
         return first
     plan = first.plan
     status = last.plan.status if last.plan.status in STOP_STATUSES else plan.status
-    report = dataclasses.replace(plan.validation, notes=(*plan.validation.notes, *notes))
-    failed = dataclasses.replace(plan, validation=report, status=status)
+    report = dataclasses.replace(plan.report, notes=(*plan.report.notes, *notes))
+    failed = dataclasses.replace(plan, report=report, status=status)
     return dataclasses.replace(first, plan=add_statistics(failed, statistics))
 
 

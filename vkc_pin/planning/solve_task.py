@@ -44,6 +44,7 @@ from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.terms import trace_terms
+from vkc_pin.world.trajectory.formats.archives import PlanStatus
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["TaskResult", "solve_task"]
@@ -113,7 +114,7 @@ def solve_task(
     try:
         best, status = search.run(guess, check_goals_first)
     except BudgetExhaustedError as end:
-        best, status = search.find_nearest() or search.make_standing(), str(end)
+        best, status = search.find_nearest() or search.make_standing(), end.status
     cache.trim()  # a chore has many problems, whose solvers grow while they are used
     build_time = cache.build_time - built
     statistics = PlanningStatistics(
@@ -156,7 +157,7 @@ class _Candidate:
     z: Floats
     trajectory: Trajectory
     report: Report
-    status: str
+    status: PlanStatus
 
     @property
     def violation(self) -> float:
@@ -199,7 +200,7 @@ class _Search:
         self._goals: dict[int, BlockedGoal | None] = {}
         self._proofs: list[str] | None = None
 
-    def run(self, guess: Guess | None, check_goals_first: bool) -> tuple[_Candidate, str]:
+    def run(self, guess: Guess | None, check_goals_first: bool) -> tuple[_Candidate, PlanStatus]:
         """Return the best candidate and the status of the plan; see `solve_task`."""
         options, terms, cache = self.request.options, self.request.terms, self.request.cache
         problem = TrajectoryProblem(self.scene, self.task, options, terms, cache=cache)
@@ -219,7 +220,7 @@ class _Search:
 
     def _try_guesses(
         self, problem: TrajectoryProblem, guesses: Iterator[InitialGuess], *, is_search: bool
-    ) -> tuple[_Candidate, str]:
+    ) -> tuple[_Candidate, PlanStatus]:
         """Return the best candidate and the status, with notes on what prevents success."""
         goals: list[BlockedGoal] = []
         for number, guess in enumerate(guesses, start=1):
@@ -250,7 +251,7 @@ class _Search:
 
     def _explain_failure(
         self, problem: TrajectoryProblem, lines: list[str], *, is_search: bool
-    ) -> tuple[_Candidate, str]:
+    ) -> tuple[_Candidate, PlanStatus]:
         """Return the best candidate and the status of a failure, with notes on its causes."""
         if is_search and self._find_proofs(problem):
             best = self._make_stationary(problem)
@@ -352,7 +353,8 @@ class _Search:
             )
         took = time.perf_counter() - began
         self.times["retiming"] += took - (self.times["validation"] - validated)
-        status = "success" if report.ok else "rejected" if solution.converged else "not converged"
+        failure: PlanStatus = "rejected" if solution.converged else "not converged"
+        status = "success" if report.ok else failure
         return _Candidate(name, solution.z, trajectory, report, status)
 
     @cached_property

@@ -62,7 +62,7 @@ class PlanningStatistics:
         counts = {
             "iterations": float(self.iterations),
             "rounds": float(self.rounds),
-            "effort": float(self.evaluations),
+            "evaluations": float(self.evaluations),
         }
         return {
             "planning_time": self.planning_time,
@@ -81,6 +81,6 @@ class PlanningStatistics:
             build_time=float(metrics.get("build_time", 0.0)),
             iterations=int(metrics.get("iterations", 0)),
             rounds=int(metrics.get("rounds", 0)),
-            evaluations=int(metrics.get("effort", 0)),
+            evaluations=int(metrics.get("evaluations", 0)),
             **times,
         )

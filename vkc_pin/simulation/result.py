@@ -148,7 +148,7 @@ class SimulationResult:
         ]
         return problems + [str(contact) for contact in self.contacts if contact.depth > DEPTH]
 
-    def report(self) -> str:
+    def summary(self) -> str:
         """Return a readable report."""
         t, problems = self.tracking, self.problems()
         head = "ok" if self.ok else f"FAILED, {len(problems)} problem(s)"

@@ -1,4 +1,4 @@
-"""What ends planning early: Ctrl-C, a clock, or effort, which counts work and is the same on every machine."""
+"""Budget of a planning call: Ctrl-C, wall-clock time and number of evaluations."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextvars import ContextVar
 from types import FrameType
+from typing import Literal, get_args
 
 from vkc_pin.utils.interrupt import handle_interrupt
 
@@ -16,6 +17,7 @@ __all__ = [
     "STOP_STATUSES",
     "Budget",
     "BudgetExhaustedError",
+    "StopStatus",
     "count_evaluations",
     "current_ending",
     "record_evaluations",
@@ -23,12 +25,21 @@ __all__ = [
     "suspend_budget",
 ]
 
-STOP_STATUSES = ("interrupted", "effort spent", "time limit")
+StopStatus = Literal["interrupted", "evaluation limit", "time limit"]
+STOP_STATUSES: tuple[StopStatus, ...] = get_args(StopStatus)
 """Why a budget may be at its end; what becomes the status of plans."""
 
 
 class BudgetExhaustedError(Exception):
-    """The budget is at its end: whoever has something to show for it catches this; it never reaches the user."""
+    """A limit of the budget is reached. Planning catches it and returns its best result.
+
+    Attributes:
+        status: Limit that was reached.
+    """
+
+    def __init__(self, status: StopStatus) -> None:
+        super().__init__(status)
+        self.status = status
 
 
 class Budget:
@@ -39,7 +50,7 @@ class Budget:
 
     Args:
         seconds: Wall-clock time; None: unlimited.
-        effort: Evaluations; None: unlimited.
+        max_evaluations: Evaluations; None: unlimited.
 
     Attributes:
         is_interrupted: Whether Ctrl-C was pressed.
@@ -47,19 +58,19 @@ class Budget:
         reserved: Purpose → time that is kept for validating the best trajectory at the end [s].
     """
 
-    def __init__(self, seconds: float | None = None, effort: int | None = None) -> None:
+    def __init__(self, seconds: float | None = None, max_evaluations: int | None = None) -> None:
         self._deadline = math.inf if seconds is None else time.perf_counter() + seconds
-        self._effort = math.inf if effort is None else effort
+        self._max_evaluations = math.inf if max_evaluations is None else max_evaluations
         self.is_interrupted, self.evaluations = False, 0
         self.reserved: dict[str, float] = {}
 
     @property
-    def stop_status(self) -> str:
-        """One of `ENDINGS`, or "" while it lasts."""
+    def stop_status(self) -> StopStatus | Literal[""]:
+        """One of `STOP_STATUSES`, or "" while it lasts."""
         if self.is_interrupted:
             return "interrupted"
-        if self.evaluations > self._effort:
-            return "effort spent"
+        if self.evaluations > self._max_evaluations:
+            return "evaluation limit"
         late = time.perf_counter() + sum(self.reserved.values()) > self._deadline
         return "time limit" if late else ""
 
@@ -92,11 +103,10 @@ def record_evaluations(units: int = 0) -> None:
     Whatever may take long calls this often: a hundredth of a second is a good measure.
 
     Args:
-        units: Of effort; 0: what the same call may do today and not tomorrow, like building what a
-            cache has lost.
+        units: Number of evaluations; 0 for work that depends on the state of caches.
 
     Raises:
-        SpentError: It is at its end.
+        BudgetExhaustedError: A limit is reached.
     """
     budget = _ACTIVE.get()
     if budget is not None:
@@ -111,8 +121,8 @@ def count_evaluations() -> int:
     return 0 if budget is None else budget.evaluations
 
 
-def current_ending() -> str:
-    """Return which of `ENDINGS` has ended the budget of this thread, or "" while it lasts."""
+def current_ending() -> StopStatus | Literal[""]:
+    """Return which of `STOP_STATUSES` has ended the budget of this thread, or "" while it lasts."""
     budget = _ACTIVE.get()
     return "" if budget is None else budget.stop_status
 

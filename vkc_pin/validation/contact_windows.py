@@ -14,6 +14,7 @@ from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.goals import MOTION_TOLERANCE
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
+from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.models.grippers.bar_width import WIDTH_TOLERANCE
 from vkc_pin.world.scene.clearance_exemptions import ClearanceExemption, find_clearance_exemptions
 from vkc_pin.world.scene.contact_rules import (
@@ -61,7 +62,11 @@ class Window(NamedTuple):
 
 
 def find_contact_windows(
-    samples: Samples, solids: CollisionShapes, steps: Sequence[Step], options: Options
+    samples: Samples,
+    solids: CollisionShapes,
+    steps: Sequence[Step],
+    options: Options,
+    tolerances: Tolerances,
 ) -> list[Window]:
     """Find all pairs of a motion that may be close, and when, by the scene's contact rules.
 
@@ -70,8 +75,9 @@ def find_contact_windows(
         solids: Collision shapes of its world.
         steps: Steps of the task.
         options: Clearances and time step.
+        tolerances: Errors with which the hand counts as at its attachment.
     """
-    return list(_WindowFinder(samples, solids, options).find(steps))
+    return list(_WindowFinder(samples, solids, options, tolerances).find(steps))
 
 
 def check_gripper(samples: Samples, options: Options) -> Iterator[Violation]:
@@ -176,8 +182,11 @@ def check_pushes(samples: Samples) -> Iterator[Violation]:
 
 
 class _WindowFinder:
-    def __init__(self, samples: Samples, solids: CollisionShapes, options: Options) -> None:
+    def __init__(
+        self, samples: Samples, solids: CollisionShapes, options: Options, tolerances: Tolerances
+    ) -> None:
         self.samples, self.solids, self.options = samples, solids, options
+        self.tolerances = tolerances
         self.scene, self.trajectory, world = samples.scene, samples.trajectory, samples.world
         self.labels, self.keys = np.array(world.collision_labels), world.collision_keys
         self.q = world.coordinates.q(samples.z[samples.waypoint_rows])
@@ -293,7 +302,9 @@ class _WindowFinder:
                     step.object, name, self.samples.waypoint_rows[ends], step.by
                 )
                 for at in ends[
-                    (errors <= (self.options.goal_position, self.options.goal_angle)).all(axis=1)
+                    (errors <= (self.tolerances.goal_position, self.tolerances.goal_angle)).all(
+                        axis=1
+                    )
                 ].tolist():
                     yield from self._find_hand_windows(
                         self._make_hold(step, name),

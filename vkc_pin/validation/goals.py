@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import UnknownNameError
-from vkc_pin.options import Options
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
+from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.models.coordinates import wrap_angle
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 
@@ -71,7 +71,7 @@ def check_steps(samples: Samples, steps: Sequence[Step]) -> None:
                 )
 
 
-def check_goals(samples: Samples, steps: Sequence[Step], options: Options) -> list[Violation]:
+def check_goals(samples: Samples, steps: Sequence[Step], tolerances: Tolerances) -> list[Violation]:
     """Check that the steps are carried out in their order: constraints "goal" and "order".
 
     For each step there must be a phase at whose end the goal of the step holds and everything that
@@ -84,7 +84,7 @@ def check_goals(samples: Samples, steps: Sequence[Step], options: Options) -> li
     hands = _find_grasped_objects(samples, steps)
     misses = [
         [
-            _compute_goal_errors(samples, step, k, options)
+            _compute_goal_errors(samples, step, k, tolerances)
             + _find_missing_grasps(samples, steps, hands, number, k)
             for k in range(len(ends))
         ]
@@ -238,13 +238,13 @@ def _measure_joint_motion(samples: Samples, number: int) -> dict[str, tuple[floa
 
 
 def _compute_goal_errors(
-    samples: Samples, step: Step, end: int, options: Options
+    samples: Samples, step: Step, end: int, tolerances: Tolerances
 ) -> list[GoalError]:
     """Return the unmet parts of a step's goal after `end` phases."""
     phases = samples.trajectory.phases
     row, misses = int(samples.waypoint_rows[phases[end - 1].last if end else 0]), []
     held = phases[min(end, len(phases) - 1)].held  # grasps of the next phase
-    tolerance = {"m": options.goal_position, "rad": options.goal_angle}
+    tolerance = {"m": tolerances.goal_position, "rad": tolerances.goal_angle}
 
     def expect(subject: str, error: float, unit: str, detail: str) -> None:
         if not error <= tolerance[unit]:

@@ -188,7 +188,7 @@ class Report:
             first, last, effort = (
                 part.times[0],
                 part.times[-1],
-                (part.base_effort(), part.arm_effort()),
+                (part.base_path_length(), part.arm_path_length()),
             )
             travel = f"base {effort[0]:5.2f} m, arm {effort[1]:5.2f} rad, {1e3 * close:6.1f} mm"
             lines.append(f"{first:6.1f} to {last:6.1f} s: {travel}, {part.phases[0].name}")
@@ -337,7 +337,7 @@ class CheckedMotion(Protocol):
         """Validated motion."""
 
     @property
-    def validation(self) -> Report:
+    def report(self) -> Report:
         """Validation report."""
 
     @property

@@ -26,6 +26,7 @@ from vkc_pin.validation.rolling import check_rolling
 from vkc_pin.validation.samples import MAX_SAMPLES, Samples
 from vkc_pin.validation.sweep import Hit, sweep
 from vkc_pin.validation.terms import check_terms
+from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.scene.clearance_exemptions import (
     CONTACT_DEPTH,
     ClearanceExemption,
@@ -53,6 +54,8 @@ def validate(
     trajectory: Trajectory,
     options: Options | None = None,
     terms: Sequence[Term] = (),
+    *,
+    tolerances: Tolerances | None = None,
 ) -> Report:
     """Check a motion against its scene, steps and user terms.
 
@@ -60,8 +63,9 @@ def validate(
         scene: Scene of the motion. The motion must begin at the scene's start.
         steps: Steps that the motion must carry out, in this order.
         trajectory: Motion, along its curve or linear between waypoints.
-        options: Tolerances and dist_safe. Default: `Options()`.
+        options: Clearances and durations to keep. Default: `Options()`.
         terms: User terms. Constraints are checked, costs are ignored.
+        tolerances: Accepted errors of grasps and goals. Default: `Tolerances()`.
 
     Returns:
         Report of all violated constraints: start; limits of position, velocity, acceleration, jerk
@@ -76,7 +80,11 @@ def validate(
         UnknownNameError: A step or term names something that does not exist.
     """
     options = Options() if options is None else check_instance(options, Options, "options")
-    return _Validator(*check_arguments(scene, steps, trajectory, terms), options).make_report()
+    accepted = Tolerances()
+    if tolerances is not None:
+        accepted = check_instance(tolerances, Tolerances, "tolerances")
+    arguments = check_arguments(scene, steps, trajectory, terms)
+    return _Validator(*arguments, options, accepted).make_report()
 
 
 def check_arguments(
@@ -96,8 +104,14 @@ def check_arguments(
 
 class _Validator:
     def __init__(
-        self, samples: Samples, steps: Sequence[Step], terms: Sequence[Term], options: Options
+        self,
+        samples: Samples,
+        steps: Sequence[Step],
+        terms: Sequence[Term],
+        options: Options,
+        tolerances: Tolerances,
     ) -> None:
+        self.tolerances = tolerances
         self.samples, self.steps, self.options, self.terms = samples, steps, options, terms
         self.scene, self.trajectory = samples.scene, samples.trajectory
         self.violations: list[Violation] = []
@@ -116,7 +130,7 @@ class _Validator:
             check()
         self.violations += check_rates(self.samples, self.options)
         self.violations += check_rolling(self.samples)
-        self.violations += check_goals(self.samples, self.steps, self.options)
+        self.violations += check_goals(self.samples, self.steps, self.tolerances)
         self.violations += check_terms(self.samples, self.terms)
         motors = MotorLoads(self.samples)
         self.violations += [
@@ -316,7 +330,10 @@ class _Validator:
 
     def _check_closure(self) -> tuple[float, float]:
         """Check grasp closure (eq. 2) and return the largest drift, [m] and [rad]."""
-        largest, limits = np.zeros(2), (self.options.closure_position, self.options.closure_angle)
+        largest, limits = (
+            np.zeros(2),
+            (self.tolerances.closure_position, self.tolerances.closure_angle),
+        )
         for phase in self.trajectory.phases:
             for hold in phase.holds:
                 drift = find_drift(self.samples, phase, hold, limits)
@@ -389,7 +406,7 @@ class _Validator:
             CollisionShapes(self.samples.world),
             [phase.last for phase in self.trajectory.phases],
         )
-        near = find_contact_windows(samples, solids, self.steps, self.options)
+        near = find_contact_windows(samples, solids, self.steps, self.options, self.tolerances)
         safe, own = self.options.dist_safe, self.options.self_distance
         pairs = PairTable(
             self.scene, solids, self.trajectory, safe, own, windows=near, samples=samples

@@ -203,7 +203,7 @@ def _draw(
 ) -> None:
     from vkc_pin.visualization.drawing import Drawing
 
-    motion = () if plan is None else (plan.trajectory, plan.validation)
+    motion = () if plan is None else (plan.trajectory, plan.report)
     named = check_mapping(
         {} if frames is None else frames, "frames", "names, each with a pinocchio.SE3"
     )
@@ -232,8 +232,7 @@ def _film(scene: Scene, plan: CheckedMotion | None) -> dict[str, Any]:
             for phase in plan.trajectory.phases
         ],
         "notes": [
-            {"text": f"{v.constraint}: {v.subject}", "time": v.time}
-            for v in plan.validation.violations
+            {"text": f"{v.constraint}: {v.subject}", "time": v.time} for v in plan.report.violations
         ],
         "headline": f"{scene.name}: {'success' if plan.success else 'FAILED, ' + plan.status}",
     }

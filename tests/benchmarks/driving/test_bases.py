@@ -57,7 +57,7 @@ def test_bench_bases(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         ]
         assert f"| 1 of 1 | {record['planning_time']:.3f} |" in row
         assert (
-            f"| {record['base_effort']:.2f} | {record['arm_effort']:.2f} | {record['duration']:.2f} |"
+            f"| {record['base_path_length']:.2f} | {record['arm_path_length']:.2f} | {record['duration']:.2f} |"
             in row
         )
 
@@ -71,7 +71,14 @@ def test_failures_are_listed() -> None:
         "status": "rejected",
         "violations": ["turning base"],
     }
-    fields = ("planning_time", "effort", "iterations", "base_effort", "arm_effort", "duration")
+    fields = (
+        "planning_time",
+        "evaluations",
+        "iterations",
+        "base_path_length",
+        "arm_path_length",
+        "duration",
+    )
     about = {"starts": 5, "seed": 0, "radius": 0.8, "tasks": ["door"], "bases": ["ackermann"]}
     foot = {
         **meta(),

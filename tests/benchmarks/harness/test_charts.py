@@ -85,7 +85,7 @@ def test_a_method_without_trials_has_no_bar() -> None:
 def record(
     method: str, number: int, success: bool, base: float, time: float | None
 ) -> dict[str, Any]:
-    efforts = {"base_effort": base, "arm_effort": 10.0 * base, "planning_time": time}
+    efforts = {"base_path_length": base, "arm_path_length": 10.0 * base, "planning_time": time}
     return {"scene": "a", "method": method, "number": number, "success": success, **efforts}
 
 
@@ -169,8 +169,8 @@ def test_means_against_numbers_by_hand() -> None:
         None,
         scenes,
         ["one", "two"],
-        field="base_effort",
-        label="base effort [m]",
+        field="base_path_length",
+        label="base path length [m]",
         shared=True,
     )
     (axes,) = figure.axes
@@ -186,10 +186,10 @@ def test_means_against_numbers_by_hand() -> None:
         pytest.approx([5.5 - spread, 5.5 + spread]),
     ]
     assert [text.get_text() for text in axes.texts] == ["3.5", "7", "5.5"]
-    assert axes.get_ylabel() == "base effort [m]"
+    assert axes.get_ylabel() == "base path length [m]"
     assert (
         axes.get_title()
-        == "Base effort: mean and standard deviation over trials in which all methods succeed"
+        == "Base path length: mean and standard deviation over trials in which all methods succeed"
     )
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "two"]
     assert axes.get_ylim()[1] > 7.0
@@ -227,7 +227,7 @@ def test_motions_are_those_of_the_plans(tmp_path: Path) -> None:
     slow = dataclasses.replace(
         plan,
         status="success",
-        validation=Report(),
+        report=Report(),
         trajectory=dataclasses.replace(plan.trajectory, times=2.0 * plan.trajectory.times),
     )
     path = tmp_path / "new" / "motions.png"

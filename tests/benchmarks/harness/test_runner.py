@@ -58,7 +58,7 @@ def test_results(tmp_path: Path) -> None:
         "key": "003",
         "number": 3,
         "square": 9,
-        "effort": 1.0,
+        "evaluations": 1.0,
         "good": True,
         "start": [3.0, 0.1],
         "distance": None,

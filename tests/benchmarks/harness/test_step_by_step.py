@@ -28,7 +28,9 @@ def test_each_begins_where_the_one_before_ends(plans: list[vkc.Plan]) -> None:
 def test_the_record_is_of_all_of_them(plans: list[vkc.Plan]) -> None:
     record = combined(plans, 4, method="step by step", seed=3, number=0)
     assert (record["success"], record["steps_done"], record["number"]) == (False, 2, 0)
-    assert record["base_effort"] == pytest.approx(sum(one.metrics["base_effort"] for one in plans))
+    assert record["base_path_length"] == pytest.approx(
+        sum(one.metrics["base_path_length"] for one in plans)
+    )
     assert record["clearance"] == min(one.metrics["clearance"] for one in plans)
     assert record["status"] == plans[-1].status
     assert "steps[2]" in record["failed_constraint"]

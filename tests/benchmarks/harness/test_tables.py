@@ -36,9 +36,9 @@ def record(
     if time is not None:
         found |= {
             "planning_time": time,
-            "base_effort": base,
-            "base_effort_l1": 2.0 * base,
-            "arm_effort": arm,
+            "base_path_length": base,
+            "base_path_length_l1": 2.0 * base,
+            "arm_path_length": arm,
         }
     return found
 
@@ -124,7 +124,7 @@ def test_comparison_against_numbers_by_hand() -> None:
     )
     assert head == [
         "scene",
-        "effort",
+        "evaluations",
         "one: median (quartiles)",
         "two: median (quartiles)",
         "lower with one",

@@ -16,7 +16,7 @@ def test_a_path_through_a_wall_is_rejected() -> None:
     result = judged(own, problem, straight, "found", name="nobody", seed=0)
     assert not result.success
     assert result.status == "rejected"
-    assert "closure" in {violation.constraint for violation in result.validation.violations}
+    assert "closure" in {violation.constraint for violation in result.report.violations}
     assert judged(own, problem, None, "timed out", name="nobody", seed=0).status == "timed out"
 
 

@@ -87,8 +87,8 @@ def test_the_table_counts_what_ran_out_of_time() -> None:
     }
     good |= {
         "time_own": 0.5,
-        "base_effort": 1.5,
-        "arm_effort": 2.0,
+        "base_path_length": 1.5,
+        "arm_path_length": 2.0,
         "clearance_at": 0.03,
         "clearance_between": 0.025,
     }

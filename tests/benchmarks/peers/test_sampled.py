@@ -27,7 +27,7 @@ def test_a_problem(task: str) -> None:
     assert found.path is not None, (found.status, found.about)
     assert np.array_equal(found.path[0], problem.start)
     result = judged(own, problem, found.path, found.status, name="peer", seed=0)
-    assert result.success, result.validation
+    assert result.success, result.report
     assert (
         min(value for value in clearances(problem, result.trajectory).values() if value is not None)
         > 0.0

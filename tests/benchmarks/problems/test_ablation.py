@@ -71,8 +71,14 @@ def test_tasks(tmp_path: Path) -> None:
     assert (result["meta"]["tasks"], result["meta"]["starts"]) == (["door", "drawer"], 2)
     told = {(r["task"], r["number"], r["method"]): r for r in result["trials"]}
     assert len(told) == len(result["trials"]) == 8
-    assert told["drawer", 0, "unchanged"]["base_effort"] == told["drawer", 0, CHANGE]["base_effort"]
-    assert told["drawer", 0, CHANGE]["base_effort"] != told["drawer", 1, CHANGE]["base_effort"]
+    assert (
+        told["drawer", 0, "unchanged"]["base_path_length"]
+        == told["drawer", 0, CHANGE]["base_path_length"]
+    )
+    assert (
+        told["drawer", 0, CHANGE]["base_path_length"]
+        != told["drawer", 1, CHANGE]["base_path_length"]
+    )
     text = ablation.report(result)
     good = sum(
         record["success"]
@@ -87,8 +93,8 @@ def test_tasks(tmp_path: Path) -> None:
 def test_ratios_are_of_pairs_of_successes() -> None:
     def record(number: int, method: str, time: float, success: bool = True) -> dict[str, object]:
         efforts = {
-            "base_effort": 1.0,
-            "arm_effort": 0.0,
+            "base_path_length": 1.0,
+            "arm_path_length": 0.0,
             "objective": 2.0 * time,
             "rounds": 1,
             "iterations": 2,

@@ -27,7 +27,7 @@ def test_what_can_be_proven_is(kind: str) -> None:
         assert plan.status == "infeasible"
         assert plan.metrics["rounds"] <= vkc.Options().max_outer  # one seed at most is tried before
         assert kind == "joint beyond its limit" or any(
-            "proven: " in note for note in plan.validation.notes
+            "proven: " in note for note in plan.report.notes
         )
 
 

@@ -40,10 +40,10 @@ def test_spread(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert [(r["number"], r["seed"]) for r in trials] == [(9, 4), (9, 5), (42, 4), (42, 5)]
     for number in (9, 42):
         own = [r for r in trials if r["number"] == number]
-        found = spread.spread_of(own, "base_effort")
+        found = spread.spread_of(own, "base_path_length")
         assert f"| {number} | {own[0]['problem']} | {sum(r['success'] for r in own)} of 2 |" in said
         if all(r["success"] for r in own):
-            efforts = [r["base_effort"] for r in own]
+            efforts = [r["base_path_length"] for r in own]
             assert found == pytest.approx(max(efforts) / min(efforts) - 1.0)
 
 

@@ -21,7 +21,7 @@ def drawn() -> vkc.Plan:
 
 def test_the_objective_is_that_of_the_solver(drawn: vkc.Plan) -> None:
     """A grasp without freedoms: all coordinates count, and the last round that was accepted has the motion's value."""
-    assert drawn.success, drawn.report()
+    assert drawn.success, drawn.summary()
     (last, *_) = [row["objective"] for row in reversed(drawn.history) if row["accepted"]]
     assert trials.objective(drawn) == pytest.approx(last, rel=1e-6)
 

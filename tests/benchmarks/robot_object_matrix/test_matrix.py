@@ -43,7 +43,9 @@ RECORDS = [
 
 
 def test_report() -> None:
-    text = report({"meta": {**meta(starts=2, seed=0, share=0.5, effort=1000)}, "trials": RECORDS})
+    text = report(
+        {"meta": {**meta(starts=2, seed=0, share=0.5, max_evaluations=1000)}, "trials": RECORDS}
+    )
     assert "3 robots, 3 objects of 3 kinds, 2 random starts each" in text
     assert "A joint is opened by 50% of its range" in text
     assert "| one | 3 | 2 | 1 (50%) | 2 (100%) | 1.00 | 2.70 | 0.50 |" in text

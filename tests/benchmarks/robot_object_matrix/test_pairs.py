@@ -54,7 +54,7 @@ def test_descriptions_are_the_same_wherever_they_are_read() -> None:
     assert by_name == by_path
     assert Path(by_name["urdf"]).is_absolute()
     assert vkc.load_object(by_name).name == "narrow_door"
-    assert description_of("oven_7") == vkc.random_object("oven", 7)
+    assert description_of("oven_7") == vkc.procedural.random_object("oven", 7)
     with pytest.raises(vkc.UnknownNameError, match="did you mean 'oven_0'"):
         description_of("ofen_0")
 
@@ -93,7 +93,9 @@ def test_half_of_the_range_by_what_was_proposed(husky: vkc.Robot) -> None:
     assert found.scene is not None
     assert found.step is not None
     item = found.scene.objects["it"].object
-    proposals = vkc.propose_attachments(vkc.load_object(vkc.random_object("drawers", 0)), husky)
+    proposals = vkc.importing.propose_attachments(
+        vkc.load_object(vkc.procedural.random_object("drawers", 0)), husky
+    )
     ((joint, goal),) = found.step.joints.items()
     assert found.step.attachment is None, "planning chooses"
     assert goal == pytest.approx(
@@ -160,7 +162,7 @@ def test_what_is_low_stands_on_a_counter(tmp_path: Path, height: float, raised: 
 
 def _written(path: Path, **more: Any) -> str:
     description: Mapping[str, Any] = {"urdf": SMOOTH, "attachments": [], **more}
-    return str(vkc.write_object(description, path))
+    return str(vkc.procedural.write_object(description, path))
 
 
 def test_what_no_hand_can_hold_is_out_of_reach(husky: vkc.Robot, tmp_path: Path) -> None:

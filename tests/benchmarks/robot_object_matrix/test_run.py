@@ -22,7 +22,7 @@ def same_sources(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_bench_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    description = vkc.random_object("drawers", 0)
+    description = vkc.procedural.random_object("drawers", 0)
     slide = vkc.load_object(description)
     urdf = (
         '<robot name="smooth"><link name="frame"/>'
@@ -30,7 +30,9 @@ def test_bench_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         '<joint name="slide" type="prismatic"><parent link="frame"/><child link="block"/><axis xyz="-1 0 0"/>'
         '<limit lower="0" upper="0.3" effort="1" velocity="1"/></joint></robot>'
     )
-    smooth = vkc.write_object({"urdf": urdf, "attachments": []}, tmp_path / "smooth.yaml")
+    smooth = vkc.procedural.write_object(
+        {"urdf": urdf, "attachments": []}, tmp_path / "smooth.yaml"
+    )
     out = tmp_path / "out"
     command = [
         "bench",
@@ -59,7 +61,7 @@ def test_bench_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert (opened["success"], opened["violations"], opened["kind"]) == (True, [], "drawers")
     reach = (slide.upper - slide.lower)[slide.coordinates.index(opened["joint"])]
     assert opened["goal"] == pytest.approx(SHARE * reach, abs=1e-3)
-    assert opened["base_effort"] > 0.5, "it starts 2 m away"
+    assert opened["base_path_length"] > 0.5, "it starts 2 m away"
     assert (other["success"], other["status"]) == (False, "unreachable")
 
     journal = (out / "trials.jsonl").read_bytes()

@@ -18,8 +18,8 @@ def test_attempts_come_as_parts_of_a_shard(tmp_path: Path) -> None:
     made, plain = make_parts((document, [0, 1], {})), run_attempts((document, [0, 1], {}))
     assert [record["success"] for record, _ in made] == [True, True]
     for (record, data), (same, _) in zip(made, plain, strict=True):
-        assert {key: record[key] for key in ("number", "way", "scene", "effort")} == {
-            key: same[key] for key in ("number", "way", "scene", "effort")
+        assert {key: record[key] for key in ("number", "way", "scene", "evaluations")} == {
+            key: same[key] for key in ("number", "way", "scene", "evaluations")
         }
         (tmp_path / f"{record['number']}.hdf5").write_bytes(data)
     shard = write_shard(

@@ -53,7 +53,7 @@ def test_a_document_makes_the_same_recipe(tmp_path: Path) -> None:
     [
         ({"name": "other"}, True),
         ({"license": "MIT"}, True),
-        ({"effort": 7}, False),
+        ({"max_evaluations": 7}, False),
         ({"rate": 12}, False),
         ({"variants": 2}, False),
     ],
@@ -63,7 +63,7 @@ def test_the_digest_is_that_of_what_episodes_depend_on(change: dict[str, Any], s
 
 
 def test_random_numbers_are_those_of_recipe_and_words() -> None:
-    recipe, other = load_recipe(SMALL), load_recipe({**SMALL, "effort": 7})
+    recipe, other = load_recipe(SMALL), load_recipe({**SMALL, "max_evaluations": 7})
     draws = [
         r.rng(*words).random(4)
         for r, words in ((recipe, ("a", 1)), (recipe, ("a", 2)), (other, ("a", 1)))
@@ -81,7 +81,7 @@ def test_random_numbers_are_those_of_recipe_and_words() -> None:
         ("tasks: [drive-opn]", "tasks[0]", "did you mean 'drive-open'"),
         ("carried: [cups]", "carried[0]", "did you mean 'cup'"),
         ("scenes: [dor]\ntasks: [drive-open]", "scenes", "did you mean 'door'"),
-        ("efort: 3", "efort", "did you mean 'effort'"),
+        ("max_evaluation: 3", "max_evaluation", "did you mean 'max_evaluations'"),
         ("options: {dist_saf: 0.1}", "options.dist_saf", "did you mean 'dist_safe'"),
     ],
 )
@@ -98,7 +98,7 @@ def test_names_that_do_not_exist(tmp_path: Path, line: str, field: str, said: st
 @pytest.mark.parametrize(
     ("line", "field"),
     [
-        ("effort: 0", "effort"),
+        ("max_evaluations: 0", "max_evaluations"),
         ("variants: -1", "variants"),
         ("robots: []", "robots"),
         ("goal: {share: [0.5, 0.4]}", "goal.share"),

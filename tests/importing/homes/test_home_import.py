@@ -18,13 +18,15 @@ pytestmark = pytest.mark.filterwarnings(
 
 
 @pytest.fixture(scope="module")
-def home(tmp_path_factory: pytest.TempPathFactory) -> vkc.ImportedHome:
+def home(tmp_path_factory: pytest.TempPathFactory) -> vkc.importing.ImportedHome:
     folder = tmp_path_factory.mktemp("home")
     file, _ = home_urdf(folder)
-    return vkc.import_home(file, folder / "out")
+    return vkc.importing.import_home(file, folder / "out")
 
 
-def test_every_shape_of_the_file_is_imported(home: vkc.ImportedHome, tmp_path: Path) -> None:
+def test_every_shape_of_the_file_is_imported(
+    home: vkc.importing.ImportedHome, tmp_path: Path
+) -> None:
     _, shapes = home_urdf(tmp_path)
     assert home.shapes["file"] == shapes
     assert home.shapes["floor"] == 2
@@ -46,7 +48,7 @@ def test_every_shape_of_the_file_is_imported(home: vkc.ImportedHome, tmp_path: P
     assert len(scene.obstacles) == home.shapes["obstacles"] + 2  # with the floor
 
 
-def test_placements_agree_with_the_file(home: vkc.ImportedHome) -> None:
+def test_placements_agree_with_the_file(home: vkc.importing.ImportedHome) -> None:
     scene = home.scene
     assert scene.arena == pytest.approx((-4.8, 4.8, -4.1, 6.1))
     for kind in PLACES:
@@ -58,7 +60,7 @@ def test_placements_agree_with_the_file(home: vkc.ImportedHome) -> None:
             "objects": [
                 {
                     "name": "it",
-                    "type": vkc.random_object(kind, seed),
+                    "type": vkc.procedural.random_object(kind, seed),
                     "position": [x, y, 0],
                     "yaw": yaw,
                 }
@@ -85,15 +87,15 @@ def test_placements_agree_with_the_file(home: vkc.ImportedHome) -> None:
     ]
 
 
-def test_start_is_free_and_reaches_most_objects(home: vkc.ImportedHome) -> None:
+def test_start_is_free_and_reaches_most_objects(home: vkc.importing.ImportedHome) -> None:
     assert home.scene.start_clearance() >= START_CLEARANCE
     assert home.scene.start[1] < 2.9  # the bedroom has the lump alone, which no hand can grasp
     assert home.reached == 6
     assert home.scene.sample_start(np.random.default_rng(1)).start_clearance() >= START_CLEARANCE
 
 
-def test_report_names_objects_that_no_hand_can_grasp(home: vkc.ImportedHome) -> None:
-    report = home.report()
+def test_report_names_objects_that_no_hand_can_grasp(home: vkc.importing.ImportedHome) -> None:
+    report = home.summary()
     for text in (
         "67 shapes",
         "part of it: slab, carpet",
@@ -103,18 +105,20 @@ def test_report_names_objects_that_no_hand_can_grasp(home: vkc.ImportedHome) -> 
     ):
         assert text in report, text
     assert not home.scene.objects["lump"].object.attachments
-    assert "lump" not in {getattr(step, "object", None) for step in vkc.goals(home.scene)}
+    assert "lump" not in {
+        getattr(step, "object", None) for step in vkc.procedural.goals(home.scene)
+    }
 
 
-def test_imported_objects_can_be_opened_and_grasped(home: vkc.ImportedHome) -> None:
+def test_imported_objects_can_be_opened_and_grasped(home: vkc.importing.ImportedHome) -> None:
     steps = {
         step.object: step
-        for step in vkc.goals(home.scene)
+        for step in vkc.procedural.goals(home.scene)
         if isinstance(step, vkc.Actuate | vkc.Grasp)
     }
     for name in ("refrigerator_body", "drawers_case", "dishwasher_body", "door_frame", "cup_0"):
         plan = vkc.plan(home.scene, [steps[name]])
-        assert plan.success, plan.report()
+        assert plan.success, plan.summary()
         assert vkc.validate(home.scene, [steps[name]], plan.trajectory).ok
         for joint, value in getattr(steps[name], "joints", {}).items():
             assert plan.trajectory.column(f"{name}.{joint}")[-1] == pytest.approx(value, abs=1e-3)
@@ -123,7 +127,7 @@ def test_imported_objects_can_be_opened_and_grasped(home: vkc.ImportedHome) -> N
 def test_mjcf_home_is_imported(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     (tmp_path / "small.xml").write_text(HOME_MJCF)
-    done = vkc.import_home(tmp_path / "small.xml", tmp_path / "out")
+    done = vkc.importing.import_home(tmp_path / "small.xml", tmp_path / "out")
     assert done.shapes == {"file": 9, "obstacles": 5, "objects": 4, "floor": 0}
     assert set(done.scene.obstacle_names) == {"north", "south", "east", "west", "board"}
     assert {name: placed.object.free for name, placed in done.scene.objects.items()} == {
@@ -132,11 +136,11 @@ def test_mjcf_home_is_imported(tmp_path: Path) -> None:
     }
     assert any("'ground'" in note and "plane" in note for note in done.notes)
     assert done.scene.objects["mug"].placement.translation == pytest.approx([0.0, 2.3, 0.7])
-    steps = vkc.goals(done.scene)
+    steps = vkc.procedural.goals(done.scene)
     assert len(steps) == 2
     for step in steps:
         plan = vkc.plan(done.scene, [step])
-        assert plan.success, plan.report()
+        assert plan.success, plan.summary()
 
 
 def test_floor_height_is_respected(tmp_path: Path) -> None:
@@ -147,7 +151,7 @@ def test_floor_height_is_respected(tmp_path: Path) -> None:
         .replace("<freejoint/>", "")
         .replace('type="plane" size="5 5 0.1"', 'type="box" size="3 3 0.1" pos="0 0 -0.1"')
     )
-    done = vkc.import_home(tmp_path / "small.xml", tmp_path / "out", floor=2.8)
+    done = vkc.importing.import_home(tmp_path / "small.xml", tmp_path / "out", floor=2.8)
     assert done.shapes["floor"] == 1
     assert "cupboard" in done.scene.objects
     low = min(
@@ -173,7 +177,7 @@ def test_invalid_homes_and_arguments_are_refused(tmp_path: Path) -> None:
         (still, {"options": 1}, "options"),
     ):
         with pytest.raises(vkc.InputError, match=word):
-            vkc.import_home(file, tmp_path / "out", **wrong)  # type: ignore[arg-type]
+            vkc.importing.import_home(file, tmp_path / "out", **wrong)  # type: ignore[arg-type]
     assert not (tmp_path / "out").exists()
     assert not list(tmp_path.glob(".import-home-*"))
 
@@ -186,18 +190,18 @@ def test_folder_is_replaced_only_with_force(tmp_path: Path) -> None:
     (out / "letter.txt").write_text("mine")
     for force in (False, True):
         with pytest.raises(vkc.InputError, match="already exists"):
-            vkc.import_home(tmp_path / "small.xml", out, force=force)
+            vkc.importing.import_home(tmp_path / "small.xml", out, force=force)
     assert (out / "letter.txt").read_text() == "mine"
     (out / "letter.txt").unlink()
-    first = vkc.import_home(tmp_path / "small.xml", out, seed=1)
+    first = vkc.importing.import_home(tmp_path / "small.xml", out, seed=1)
     (out / "objects" / "old").mkdir()
     (out / "objects" / "letter.txt").write_text("mine")
     with pytest.raises(vkc.InputError, match="--force"):
-        vkc.import_home(tmp_path / "small.xml", out)
+        vkc.importing.import_home(tmp_path / "small.xml", out)
     with pytest.raises(vkc.InputError, match=r"would delete .*got objects/letter\.txt\)"):
-        vkc.import_home(tmp_path / "small.xml", out, force=True)
+        vkc.importing.import_home(tmp_path / "small.xml", out, force=True)
     (out / "objects" / "letter.txt").unlink()
-    again = vkc.import_home(tmp_path / "small.xml", out, seed=1, force=True)
+    again = vkc.importing.import_home(tmp_path / "small.xml", out, seed=1, force=True)
     assert np.array_equal(first.scene.start, again.scene.start), "the same seed, another start"
     assert not (out / "objects" / "old").exists()
 
@@ -249,7 +253,7 @@ def test_objects_with_similar_names_stay_distinct(
     wardrobe: str, cabinet: str, files: tuple[str, str], tmp_path: Path
 ) -> None:
     write_halves(tmp_path / "h.urdf", wardrobe, cabinet)
-    done = vkc.import_home(tmp_path / "h.urdf", tmp_path / "out")
+    done = vkc.importing.import_home(tmp_path / "h.urdf", tmp_path / "out")
     entries = {entry["name"]: entry["type"] for entry in done.scene.document["objects"]}
     names = wardrobe, cabinet.replace(" ", "_")
     assert entries == {
@@ -274,14 +278,14 @@ def test_objects_with_similar_names_stay_distinct(
     )
     assert not plan.success
     assert plan.status == "infeasible"
-    again = vkc.import_home(tmp_path / "h.urdf", tmp_path / "out", force=True)
+    again = vkc.importing.import_home(tmp_path / "h.urdf", tmp_path / "out", force=True)
     assert again.scene.document == done.scene.document
 
 
 def test_file_name_cannot_add_fields_to_the_scene(tmp_path: Path) -> None:
     file = tmp_path / "x\nfloor: false\n#\x01\udcff.urdf"
     write_halves(file, "wardrobe", "cabinet")
-    done = vkc.import_home(file, tmp_path / "out")
+    done = vkc.importing.import_home(file, tmp_path / "out")
     assert done.scene.floor
     assert done.scene.name == "x_floor_false"
     head = done.file.read_text(encoding="utf-8").splitlines()[0]

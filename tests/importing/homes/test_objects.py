@@ -47,10 +47,10 @@ def test_free_object_has_no_joint(tmp_path: Path) -> None:
         "type": "objects/can/can.yaml",
         "position": [1.0, 2.0, 0.7],
     }
-    assert done.report().startswith("can: carried by can_")
+    assert done.summary().startswith("can: carried by can_")
 
 
 def test_thick_object_is_reported(tmp_path: Path) -> None:
     done = write_object(_can(0.3), vkc.load_robot("husky_ur5e"), tmp_path, {}, **SETTINGS)
     assert not vkc.load_object(tmp_path / "objects" / "can" / "can.yaml").attachments
-    assert "carried by no hand: nothing of it fits" in done.report()
+    assert "carried by no hand: nothing of it fits" in done.summary()

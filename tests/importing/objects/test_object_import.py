@@ -14,13 +14,13 @@ from vkc_pin.importing.objects.object_import import read_description
 
 
 @pytest.fixture(scope="module")
-def cabinet(tmp_path_factory: pytest.TempPathFactory) -> vkc.ImportedObject:
+def cabinet(tmp_path_factory: pytest.TempPathFactory) -> vkc.importing.ImportedObject:
     folder = tmp_path_factory.mktemp("partnet")
-    return vkc.import_object(partnet(folder / "45427"), folder / "out", height=0.8)
+    return vkc.importing.import_object(partnet(folder / "45427"), folder / "out", height=0.8)
 
 
 def test_a_cabinet_of_partnet_stands_on_the_floor_in_its_height(
-    cabinet: vkc.ImportedObject,
+    cabinet: vkc.importing.ImportedObject,
 ) -> None:
     assert cabinet.file.name == "object_45427.yaml"
     assert cabinet.size[2] == pytest.approx(0.8)
@@ -40,7 +40,7 @@ def test_a_cabinet_of_partnet_stands_on_the_floor_in_its_height(
     assert item.upper[item.coordinates.index("joint_0")] == pytest.approx(0.8 * 0.36)
 
 
-def test_handles_are_found_named_or_not(cabinet: vkc.ImportedObject) -> None:
+def test_handles_are_found_named_or_not(cabinet: vkc.importing.ImportedObject) -> None:
     drawer, door = (cabinet.proposals.opening(joint)[0] for joint in ("joint_0", "joint_1"))
     assert drawer.named
     assert not door.named
@@ -52,8 +52,8 @@ def test_handles_are_found_named_or_not(cabinet: vkc.ImportedObject) -> None:
     ]
 
 
-def test_report_lists_changes(cabinet: vkc.ImportedObject) -> None:
-    report = cabinet.report()
+def test_report_lists_changes(cabinet: vkc.importing.ImportedObject) -> None:
+    report = cabinet.summary()
     for text in (
         "joint_1' states no limits",
         "joint_3",
@@ -66,7 +66,9 @@ def test_report_lists_changes(cabinet: vkc.ImportedObject) -> None:
     assert cabinet.picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_scene_with_it_can_be_planned(cabinet: vkc.ImportedObject, tmp_path: Path) -> None:
+def test_a_scene_with_it_can_be_planned(
+    cabinet: vkc.importing.ImportedObject, tmp_path: Path
+) -> None:
     best = cabinet.proposals.opening("joint_0")[0].attachment
     tool = cabinet.object.link_placement(best.link, np.zeros(2)) * best.placement
     back = -tool.rotation[:2, 2]
@@ -83,7 +85,7 @@ def test_a_scene_with_it_can_be_planned(cabinet: vkc.ImportedObject, tmp_path: P
     plan = vkc.plan(
         vkc.load_scene(tmp_path / "alone.yaml"), [vkc.Actuate("it", {"joint_0": 0.2}, best.name)]
     )
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     assert plan.trajectory.column("it.joint_0")[-1] == pytest.approx(0.2, abs=1e-3)
 
 
@@ -92,7 +94,7 @@ def test_the_same_box_in_other_formats(name: str, text: str, tmp_path: Path) -> 
     if name.endswith("xml"):
         pytest.importorskip("mujoco")
     (tmp_path / name).write_text(text)
-    done = vkc.import_object(tmp_path / name, tmp_path / "out")
+    done = vkc.importing.import_object(tmp_path / name, tmp_path / "out")
     best = done.proposals.opening("hinge")[0]
     assert best.kind == "bar"
     assert best.thickness == pytest.approx(0.02, rel=0.02)
@@ -101,7 +103,9 @@ def test_the_same_box_in_other_formats(name: str, text: str, tmp_path: Path) -> 
 
 
 def test_a_link_alone(tmp_path: Path) -> None:
-    done = vkc.import_object(partnet(tmp_path / "in"), tmp_path / "out", link="link_2", up="y")
+    done = vkc.importing.import_object(
+        partnet(tmp_path / "in"), tmp_path / "out", link="link_2", up="y"
+    )
     assert done.file.name == "link_2.yaml"
     assert set(done.object.coordinates.names) == {"joint_0", "joint_1"}
     assert done.size[2] == pytest.approx(1.0)
@@ -122,7 +126,7 @@ def test_invalid_objects_and_arguments_are_refused(tmp_path: Path) -> None:
         ({"most": 0}, "most"),
     ):
         with pytest.raises(vkc.InputError, match=word):
-            vkc.import_object(file, **{"folder": tmp_path / "out", **wrong})  # type: ignore[arg-type]
+            vkc.importing.import_object(file, **{"folder": tmp_path / "out", **wrong})  # type: ignore[arg-type]
     assert not (tmp_path / "out").exists()
 
 
@@ -131,28 +135,30 @@ def test_failed_import_leaves_no_files(tmp_path: Path) -> None:
     out = tmp_path / "made" / "box"
     handless = dataclasses.replace(vkc.load_robot("husky_ur5e"), touch_links=())
     with pytest.raises(vkc.InputError, match="touch_links"):
-        vkc.import_object(tmp_path / "box.sdf", out, robot=handless)
+        vkc.importing.import_object(tmp_path / "box.sdf", out, robot=handless)
     assert list((tmp_path / "made").iterdir()) == []
     out.mkdir()
-    done = vkc.import_object(tmp_path / "box.sdf", out, most=1)
+    done = vkc.importing.import_object(tmp_path / "box.sdf", out, most=1)
     assert [path.name for path in out.parent.iterdir()] == ["box"]
     assert done.file == out / "box.yaml"
     assert done.picture.is_file()
     (out / "old.stl").touch()
     with pytest.raises(vkc.InputError, match="--force"):
-        vkc.import_object(tmp_path / "box.sdf", out, most=1)
+        vkc.importing.import_object(tmp_path / "box.sdf", out, most=1)
     with pytest.raises(vkc.InputError, match=r"would delete .*got old\.stl\)"):
-        vkc.import_object(tmp_path / "box.sdf", out, most=1, force=True)
+        vkc.importing.import_object(tmp_path / "box.sdf", out, most=1, force=True)
     (out / "old.stl").unlink()
-    assert vkc.import_object(tmp_path / "box.sdf", out, most=1, force=True).file == done.file
-    again = vkc.propose_attachments(done.proposals.object, "husky_ur5e", most=1)
+    assert (
+        vkc.importing.import_object(tmp_path / "box.sdf", out, most=1, force=True).file == done.file
+    )
+    again = vkc.importing.propose_attachments(done.proposals.object, "husky_ur5e", most=1)
     assert [one.attachment.name for one in again.found] == list(done.object.attachments)
 
 
 def test_a_file_name_cannot_add_fields_to_the_description(tmp_path: Path) -> None:
     file = tmp_path / "x\nfree: true\n#\x01\udcff.sdf"
     file.write_text(SDF)
-    done = vkc.import_object(file, tmp_path / "out", most=1)
+    done = vkc.importing.import_object(file, tmp_path / "out", most=1)
     assert done.file.name == "x_free_true.yaml"
     assert not done.object.free
     text = done.file.read_text(encoding="utf-8")
@@ -160,7 +166,7 @@ def test_a_file_name_cannot_add_fields_to_the_description(tmp_path: Path) -> Non
     assert text.startswith(
         "# Made of x\\nfree: true\\n#\\x01\\udcff.sdf by vkc-pin import-object.\n"
     )
-    again = vkc.import_object(file, tmp_path / "out", most=1, force=True)
+    again = vkc.importing.import_object(file, tmp_path / "out", most=1, force=True)
     assert again.file == done.file
 
 
@@ -171,7 +177,7 @@ def test_a_file_name_cannot_add_fields_to_the_description(tmp_path: Path) -> Non
 def test_an_object_is_named_after_its_link(link: str, name: str, tmp_path: Path) -> None:
     file = partnet(tmp_path / "in")
     file.write_text(file.read_text().replace('"link_2"', f'"{link}"'))
-    done = vkc.import_object(file, tmp_path / "out", link=link, up="y", most=1)
+    done = vkc.importing.import_object(file, tmp_path / "out", link=link, up="y", most=1)
     assert done.file.name == f"{name}.yaml"
     assert {path.name for path in done.file.parent.glob("*.urdf")} == {f"{name}.urdf"}
     assert done.object.base_link == link
@@ -194,6 +200,6 @@ def test_links_whose_names_look_alike_keep_their_own_pieces(
         text += f'<parent link="case"/><child link="{name}"/>'
         text += '<axis xyz="-1 0 0"/><limit lower="0" upper="0.3"/></joint>'
     (tmp_path / "o.urdf").write_text(f'<robot name="o">{text}</robot>', encoding="utf-8")
-    item = vkc.import_object(tmp_path / "o.urdf", tmp_path / "out", most=1).object
+    item = vkc.importing.import_object(tmp_path / "o.urdf", tmp_path / "out", most=1).object
     volumes = [shape.geometry.computeVolume() for shape in item.collision.geometryObjects]
     assert volumes == pytest.approx([0.4 * 0.6 * 0.8, 0.05**3, 0.2**3])

@@ -13,7 +13,7 @@ from vkc_pin.importing.proposals.picture import plot_attachments
 def test_a_panel_for_every_attachment(tmp_path: Path) -> None:
     from PIL import Image
 
-    found = vkc.propose_attachments(flap(tmp_path, BAR.format("")))
+    found = vkc.importing.propose_attachments(flap(tmp_path, BAR.format("")))
     figure = plot_attachments(found, tmp_path / "attachments.png")
     assert len(figure.axes) == len(found.found)
     assert [axes.get_title().split()[0] for axes in figure.axes] == [
@@ -25,7 +25,7 @@ def test_a_panel_for_every_attachment(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_opened_is_said(tmp_path: Path) -> None:
-    found = vkc.propose_attachments(flap(tmp_path, thick=0.12))
+    found = vkc.importing.propose_attachments(flap(tmp_path, thick=0.12))
     figure = plot_attachments(found)
     assert "120 mm at its thinnest" in figure.axes[0].texts[0].get_text()
 

@@ -12,13 +12,15 @@ import vkc_pin as vkc
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> vkc.Proposals:
-    return vkc.propose_attachments(
+def found(tmp_path_factory: pytest.TempPathFactory) -> vkc.importing.Proposals:
+    return vkc.importing.propose_attachments(
         flap(tmp_path_factory.mktemp("flap"), BAR.format(' name="handle"'))
     )
 
 
-def test_descriptions_load_as_the_same_attachments(found: vkc.Proposals, tmp_path: Path) -> None:
+def test_descriptions_load_as_the_same_attachments(
+    found: vkc.importing.Proposals, tmp_path: Path
+) -> None:
     written = yaml.safe_dump([proposal.description() for proposal in found.found])
     loaded = flap(
         tmp_path,
@@ -36,14 +38,14 @@ def test_descriptions_load_as_the_same_attachments(found: vkc.Proposals, tmp_pat
             assert np.allclose(one.axis, other.axis)
 
 
-def test_applied_gives_the_object_the_best_one_first(found: vkc.Proposals) -> None:
+def test_applied_gives_the_object_the_best_one_first(found: vkc.importing.Proposals) -> None:
     item = found.applied()
     assert item.attachment().name == found.found[0].attachment.name == "flap_bar"
     assert found.opening("hinge") == found.found
     assert "flap_bar" in repr(found)
 
 
-def test_a_line_names_few_of_the_joints_that_must_be_open(found: vkc.Proposals) -> None:
+def test_a_line_names_few_of_the_joints_that_must_be_open(found: vkc.importing.Proposals) -> None:
     first = found.found[0]
     ends = {
         0: "1.5 rad",
@@ -52,11 +54,11 @@ def test_a_line_names_few_of_the_joints_that_must_be_open(found: vkc.Proposals) 
     }
     for count, said in ends.items():
         one = dataclasses.replace(first, when={f"j{k}": 1.0 for k in range(count)})
-        assert dataclasses.replace(found, found=(one,)).report().splitlines()[1].endswith(said)
+        assert dataclasses.replace(found, found=(one,)).summary().splitlines()[1].endswith(said)
 
 
-def test_the_report_says_what_opens_and_how_far(found: vkc.Proposals) -> None:
-    lines = found.report().splitlines()
+def test_the_report_says_what_opens_and_how_far(found: vkc.importing.Proposals) -> None:
+    lines = found.summary().splitlines()
     assert lines[0] == "hinge, 0 to 1.5 rad"
     assert "flap_bar (bar, named as a handle): 20 mm thick, cylindrical" in lines[1]
     assert "opens to 1.5 rad" in lines[1]

@@ -37,7 +37,10 @@ def test_the_best_proposal_is_the_bar_that_somebody_chose(
 ) -> None:
     """On the same bar: beside the hand-written grasp by no more than the hand can slide, along the bar, closing across it."""
     item = vkc.load_object(name)
-    best, wanted = vkc.propose_attachments(item).opening(joint)[0], item.attachment(handle)
+    best, wanted = (
+        vkc.importing.propose_attachments(item).opening(joint)[0],
+        item.attachment(handle),
+    )
     assert best.attachment.link == wanted.link
     apart = best.attachment.placement.inverse() * wanted.placement
     slide = next(freedom for freedom in best.attachment.freedoms if freedom.kind == "prismatic")
@@ -51,7 +54,7 @@ def test_the_best_proposal_is_the_bar_that_somebody_chose(
 def test_every_proposal_has_the_clearance_that_plans_must_keep() -> None:
     for name in ("drawer", "cabinet", "door", "dishwasher"):
         item = vkc.load_object(name)
-        found = vkc.propose_attachments(item)
+        found = vkc.importing.propose_attachments(item)
         fitting = HandClearance(item, found.hand, 0.02, 0.005)
         for proposal in found.found:
             state = np.clip(np.zeros(len(item.lower)), item.lower, item.upper)
@@ -64,14 +67,14 @@ def test_every_proposal_has_the_clearance_that_plans_must_keep() -> None:
 
 
 def test_a_door_in_the_way_is_opened_first() -> None:
-    found = vkc.propose_attachments(vkc.load_object("dishwasher"))
+    found = vkc.importing.propose_attachments(vkc.load_object("dishwasher"))
     assert found.because == {}
     assert dict(found.opening("rack")[0].when) == {"door": pytest.approx(np.pi / 2.0)}
-    assert "while door is at 1.57" in found.report()
+    assert "while door is at 1.57" in found.summary()
 
 
 def test_without_a_handle_it_is_the_free_edge_far_from_the_hinge(tmp_path: Path) -> None:
-    best = vkc.propose_attachments(flap(tmp_path, behind=0.1)).found[0]
+    best = vkc.importing.propose_attachments(flap(tmp_path, behind=0.1)).found[0]
     assert best.kind == "edge"
     assert best.thickness == pytest.approx(0.02)
     assert best.attachment.placement.translation[1] > 0.5
@@ -79,35 +82,35 @@ def test_without_a_handle_it_is_the_free_edge_far_from_the_hinge(tmp_path: Path)
 
 def test_a_name_decides_between_equals(tmp_path: Path) -> None:
     other = BAR.replace("-0.08 0.5 0", "-0.08 0.4 0").format(' name="handle"')
-    first = vkc.propose_attachments(flap(tmp_path, BAR.format(""))).found[0]
+    first = vkc.importing.propose_attachments(flap(tmp_path, BAR.format(""))).found[0]
     assert not first.named
     assert first.attachment.placement.translation[1] == pytest.approx(0.5)
-    named = vkc.propose_attachments(flap(tmp_path, BAR.format("") + other)).found[0]
+    named = vkc.importing.propose_attachments(flap(tmp_path, BAR.format("") + other)).found[0]
     assert named.named
     assert named.attachment.placement.translation[1] == pytest.approx(0.4)
 
 
 def test_what_is_too_thick_has_no_attachment_and_says_so(tmp_path: Path) -> None:
-    found = vkc.propose_attachments(flap(tmp_path, thick=0.12))
+    found = vkc.importing.propose_attachments(flap(tmp_path, thick=0.12))
     assert found.found == ()
     assert "nothing of it fits between the fingers, 86 mm apart" in found.because["hinge"]
     assert "120 mm at its thinnest" in found.because["hinge"]
-    assert found.because["hinge"] in found.report()
+    assert found.because["hinge"] in found.summary()
     assert dict(found.applied().attachments) == {}
 
 
 def test_a_bar_without_room_behind_it_is_given_up(tmp_path: Path) -> None:
     flush = BAR.replace("-0.08", "-0.03").format(' name="handle"')
-    found = vkc.propose_attachments(flap(tmp_path, flush, thick=0.09))
+    found = vkc.importing.propose_attachments(flap(tmp_path, flush, thick=0.09))
     assert "are not 5 mm from flap" in found.because["hinge"]
 
 
 def test_a_bar_close_to_the_flap_is_taken_with_the_finger_tips(tmp_path: Path) -> None:
     close = BAR.replace("-0.08", "-0.03").format(' name="handle"')
-    best = vkc.propose_attachments(flap(tmp_path, close)).found[0]
+    best = vkc.importing.propose_attachments(flap(tmp_path, close)).found[0]
     assert best.kind == "bar"
     assert best.attachment.standoff > 0.0
-    tight = vkc.propose_attachments(flap(tmp_path, close), grasp_clearance=0.02)
+    tight = vkc.importing.propose_attachments(flap(tmp_path, close), grasp_clearance=0.02)
     assert all(proposal.kind != "bar" for proposal in tight.found)
 
 
@@ -120,7 +123,7 @@ def knob(z: float, turned: float = 0.0) -> str:
 def test_two_knobs_come_before_one_with_the_hand_turned(tmp_path: Path) -> None:
     """Turned, the hand has the better one nearly as well as before; but what keeps it from there does so in both cases."""
     alone, two = (
-        vkc.propose_attachments(flap(tmp_path, text), most=2).found
+        vkc.importing.propose_attachments(flap(tmp_path, text), most=2).found
         for text in (knob(0.0), knob(0.0) + knob(0.25))
     )
     (first, turned), (same, other) = alone, two
@@ -134,7 +137,9 @@ def test_two_knobs_come_before_one_with_the_hand_turned(tmp_path: Path) -> None:
 
 def test_a_hand_that_is_turned_a_little_is_not_proposed_again(tmp_path: Path) -> None:
     """Of two pieces one in the other, turned by 45°, each has its own faces."""
-    found = vkc.propose_attachments(flap(tmp_path, knob(0.0) + knob(0.0, np.pi / 4)), most=8).found
+    found = vkc.importing.propose_attachments(
+        flap(tmp_path, knob(0.0) + knob(0.0, np.pi / 4)), most=8
+    ).found
     places = [proposal.attachment.placement for proposal in found if proposal.kind == "knob"]
     assert len(places) >= 2
     for one, other in itertools.combinations(places, 2):
@@ -147,7 +152,7 @@ def test_a_hand_that_is_turned_a_little_is_not_proposed_again(tmp_path: Path) ->
 
 def test_posts_end_the_slide(tmp_path: Path) -> None:
     free, held = (
-        vkc.propose_attachments(flap(tmp_path, BAR.format("") + posts)).found[0]
+        vkc.importing.propose_attachments(flap(tmp_path, BAR.format("") + posts)).found[0]
         for posts in ("", POSTS)
     )
     lengths = [
@@ -158,32 +163,32 @@ def test_posts_end_the_slide(tmp_path: Path) -> None:
 
 
 def test_the_same_object_gives_the_same_proposals() -> None:
-    one, other = (vkc.propose_attachments(vkc.load_object("cabinet")) for _ in range(2))
+    one, other = (vkc.importing.propose_attachments(vkc.load_object("cabinet")) for _ in range(2))
     assert [p.description() for p in one.found] == [p.description() for p in other.found]
 
 
 def test_clearances_are_those_that_plans_keep_by_default() -> None:
-    defaults = inspect.signature(vkc.propose_attachments).parameters
+    defaults = inspect.signature(vkc.importing.propose_attachments).parameters
     for name in ("dist_safe", "grasp_clearance"):
         assert defaults[name].default == getattr(vkc.Options(), name)
 
 
 def test_wrong_arguments() -> None:
     with pytest.raises(vkc.InputError, match="ArticulatedObject"):
-        vkc.propose_attachments("drawer")  # type: ignore[arg-type]
+        vkc.importing.propose_attachments("drawer")  # type: ignore[arg-type]
     with pytest.raises(vkc.UnknownNameError, match="husky_ur5e"):
-        vkc.propose_attachments(vkc.load_object("drawer"), "husky_ur5")
+        vkc.importing.propose_attachments(vkc.load_object("drawer"), "husky_ur5")
     with pytest.raises(vkc.InputError, match="dist_safe"):
-        vkc.propose_attachments(vkc.load_object("drawer"), dist_safe=-0.1)
+        vkc.importing.propose_attachments(vkc.load_object("drawer"), dist_safe=-0.1)
     with pytest.raises(vkc.InputError, match="most"):
-        vkc.propose_attachments(vkc.load_object("drawer"), most=0)
+        vkc.importing.propose_attachments(vkc.load_object("drawer"), most=0)
 
 
 @pytest.mark.parametrize("name", ["drawer", "cabinet"])
 def test_the_best_proposal_opens_it(name: str, tmp_path: Path) -> None:
     """Alone on the floor; the oracle judges the motion."""
     item = vkc.load_object(name)
-    found = vkc.propose_attachments(item)
+    found = vkc.importing.propose_attachments(item)
     file, joint = tmp_path / f"{name}.yaml", item.coordinates.names[0]
     file.write_text(
         yaml.safe_dump(
@@ -200,19 +205,19 @@ def test_the_best_proposal_opens_it(name: str, tmp_path: Path) -> None:
     }
     (tmp_path / "alone.yaml").write_text(yaml.safe_dump(scene))
     plan = vkc.plan(vkc.load_scene(tmp_path / "alone.yaml"), [vkc.Actuate("it", {joint: 0.3})])
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     assert plan.trajectory.column(f"it.{joint}")[-1] == pytest.approx(0.3, abs=1e-3)
 
 
 def test_fingers_come_closer_together_where_they_have_no_room_fully_open(tmp_path: Path) -> None:
     """Posts of the drawer's frame stand 60 mm from the middle of its handle, on both sides."""
     item, robot = vkc.load_object(cheeky_drawer()), vkc.load_robot(write_gripper(tmp_path))
-    found = vkc.propose_attachments(item, robot)
+    found = vkc.importing.propose_attachments(item, robot)
     best = found.opening("slide")[0]
     assert best.thickness == pytest.approx(0.02)
     assert best.attachment.opening == pytest.approx(0.03)  # 5 mm on both sides
     assert best.description()["opening"] == 0.03
-    assert "20 mm thick, fingers 30 mm apart" in found.report()
+    assert "20 mm thick, fingers 30 mm apart" in found.summary()
     fitting = HandClearance(item, make_hand(robot.opened(best.attachment.opening)), 0.02, 0.005)
     tool = item.link_placement("front", [0.0]) * best.attachment.tool(
         np.zeros(len(best.attachment.freedoms))
@@ -220,11 +225,13 @@ def test_fingers_come_closer_together_where_they_have_no_room_fully_open(tmp_pat
     assert fitting.find_obstruction(tool, "front") is None
     assert HandClearance(item, found.hand, 0.02, 0.005).find_obstruction(tool, "front") is not None
     still = dataclasses.replace(robot, gripper=None)
-    assert best.kind not in {one.kind for one in vkc.propose_attachments(item, still).found}
+    assert best.kind not in {
+        one.kind for one in vkc.importing.propose_attachments(item, still).found
+    }
 
 
 def test_fingers_that_have_room_stay_fully_open(tmp_path: Path) -> None:
     item, robot = vkc.load_object(cheeky_drawer(gap=0.15)), vkc.load_robot(write_gripper(tmp_path))
-    assert [one.attachment.opening for one in vkc.propose_attachments(item, robot).found][:1] == [
-        None
-    ]
+    assert [one.attachment.opening for one in vkc.importing.propose_attachments(item, robot).found][
+        :1
+    ] == [None]

@@ -19,7 +19,7 @@ def find_texts(diagnosis: Diagnosis, level: str, topic: str) -> list[str]:
 
 
 def test_the_robot_that_comes_along_is_healthy() -> None:
-    found = vkc.doctor("husky_ur5e", samples=40)
+    found = vkc.importing.doctor("husky_ur5e", samples=40)
     assert found.healthy
     assert find_texts(found, "note", "home")[0].startswith("free")
 
@@ -30,7 +30,7 @@ def test_home_in_collision_and_below_the_floor(tmp_path: Path) -> None:
     (tmp_path / "robot" / "robot.yaml").write_text(
         json.dumps({"urdf": file.name, "home": home}), encoding="utf-8"
     )
-    found = vkc.doctor(tmp_path / "robot", samples=20)
+    found = vkc.importing.doctor(tmp_path / "robot", samples=20)
     assert not found.healthy
     assert "below the floor" in " ".join(find_texts(found, "fault", "home"))
     assert "links that overlap at home are not checked" in " ".join(
@@ -43,12 +43,12 @@ def test_home_in_collision_and_below_the_floor(tmp_path: Path) -> None:
 def test_pairs_that_nothing_brings_apart(tmp_path: Path) -> None:
     """The first link turns about the vertical, 30 mm above the body."""
     robot = vkc.load_robot(write_arms(tmp_path), pairs="all")
-    found = vkc.doctor(robot, samples=60, margin=0.035)
+    found = vkc.importing.doctor(robot, samples=60, margin=0.035)
     assert any(
         "body and arm_1 were never more than 30.0 mm" in text
         for text in find_texts(found, "fault", "pairs")
     )
-    fewer = vkc.doctor(robot, samples=60, margin=1e-3)
+    fewer = vkc.importing.doctor(robot, samples=60, margin=1e-3)
     assert len(find_texts(fewer, "fault", "pairs")) < len(find_texts(found, "fault", "pairs"))
 
 
@@ -58,7 +58,7 @@ def test_missing_limits_and_masses_are_reported(tmp_path: Path) -> None:
         'effort="10" velocity="1.5"', 'effort="0" velocity="0"', 3
     )
     path.write_text(text, encoding="utf-8")
-    found = vkc.doctor(path, samples=5)
+    found = vkc.importing.doctor(path, samples=5)
     assert (
         "arm_1_joint, arm_2_joint, arm_3_joint (assumed: 3.14, 3.14, 3.14)"
         in find_texts(found, "warning", "limits")[0]
@@ -70,7 +70,7 @@ def test_missing_limits_and_masses_are_reported(tmp_path: Path) -> None:
 
 def test_hand_in_front_of_its_tool_frame_is_reported(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
-    assert find_texts(vkc.doctor(path, samples=5), "warning", "hand") == [
+    assert find_texts(vkc.importing.doctor(path, samples=5), "warning", "hand") == [
         "no link may touch what is grasped"
     ]
     text = path.read_text(encoding="utf-8").replace(
@@ -83,7 +83,7 @@ def test_hand_in_front_of_its_tool_frame_is_reported(tmp_path: Path) -> None:
     (tmp_path / "robot.yaml").write_text(settings, encoding="utf-8")
     assert (
         "in front of its tool frame back"
-        in find_texts(vkc.doctor(tmp_path, samples=5), "fault", "hand")[0]
+        in find_texts(vkc.importing.doctor(tmp_path, samples=5), "fault", "hand")[0]
     )
 
 
@@ -95,7 +95,7 @@ def test_values_of_robot_yaml_are_respected(tmp_path: Path) -> None:
     path.write_text(text, encoding="utf-8")
     named = {"urdf": path.name, "joints": {"arm_1_joint": {"velocity": 2.0, "effort": 30.0}}}
     (tmp_path / "robot.yaml").write_text(json.dumps(named), encoding="utf-8")
-    found = vkc.doctor(tmp_path, samples=5)
+    found = vkc.importing.doctor(tmp_path, samples=5)
     assert "no velocity limit in the file: arm_2_joint (assumed: 3.14)" in find_texts(
         found, "warning", "limits"
     )
@@ -121,7 +121,7 @@ def test_closed_hand_is_reported(tmp_path: Path) -> None:
         (tmp_path / "robot.yaml").write_text(json.dumps(named), encoding="utf-8")
         lines = [
             text
-            for text in find_texts(vkc.doctor(tmp_path, samples=5), "warning", "hand")
+            for text in find_texts(vkc.importing.doctor(tmp_path, samples=5), "warning", "hand")
             if "no room" in text
         ]
         assert len(lines) == count
@@ -130,8 +130,8 @@ def test_closed_hand_is_reported(tmp_path: Path) -> None:
 def test_invalid_argument_is_named() -> None:
     for wrong in ({"samples": 0}, {"margin": -1.0}):
         with pytest.raises(vkc.InputError) as refused:
-            vkc.doctor("husky_ur5e", **wrong)  # type: ignore[arg-type]
+            vkc.importing.doctor("husky_ur5e", **wrong)  # type: ignore[arg-type]
         assert refused.value.field == next(iter(wrong))
     with pytest.raises(vkc.UnknownNameError) as caught:
-        vkc.doctor("husky_ur5")
+        vkc.importing.doctor("husky_ur5")
     assert caught.value.nearest == "husky_ur5e"

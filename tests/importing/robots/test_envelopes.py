@@ -60,11 +60,11 @@ def test_only_what_collides_is_left_out(tmp_path: Path) -> None:
 
 def test_importing_leaves_it_out_and_the_doctor_finds_it(tmp_path: Path) -> None:
     file = caged(tmp_path / "given")
-    imported = vkc.import_robot(file, tmp_path / "mine", samples=50)
+    imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=50)
     assert "cage" not in imported.robot.links
     assert "cage" not in imported.robot.touch_links
     assert {"hand", "finger_a", "finger_b"} <= set(imported.robot.touch_links)
     assert "cage encloses" in str(imported)
-    found = vkc.doctor(vkc.load_robot(file, tool_frame="hand"), samples=5)
+    found = vkc.importing.doctor(vkc.load_robot(file, tool_frame="hand"), samples=5)
     assert "cage encloses" in str(found)
-    assert "cage" not in str(vkc.doctor(imported.robot, samples=5))
+    assert "cage" not in str(vkc.importing.doctor(imported.robot, samples=5))

@@ -19,7 +19,7 @@ SAMPLES = 150
 
 
 @pytest.fixture(scope="module")
-def imported(tmp_path_factory: pytest.TempPathFactory) -> vkc.ImportedRobot:
+def imported(tmp_path_factory: pytest.TempPathFactory) -> vkc.importing.ImportedRobot:
     """Two arms on a base of their own, 0.35 m up, the base an open bin; imported without anything written by hand."""
     folder = tmp_path_factory.mktemp("imported")
     walls = [trimesh.creation.box((0.5, 0.4, 0.05)).apply_translation((0, 0, -0.325))]
@@ -31,10 +31,10 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> vkc.ImportedRobot:
         folder / "given" / "bin.stl", trimesh.util.concatenate(walls).export(file_type="stl")
     )
     file = write_arms(folder / "given", sides=("left_", "right_"), own_base=True, mesh="bin.stl")
-    return vkc.import_robot(file, folder / "mine", arm="right", samples=SAMPLES)
+    return vkc.importing.import_robot(file, folder / "mine", arm="right", samples=SAMPLES)
 
 
-def test_the_folder_is_whole(imported: vkc.ImportedRobot) -> None:
+def test_the_folder_is_whole(imported: vkc.importing.ImportedRobot) -> None:
     names = {path.name for path in imported.folder.iterdir()}
     assert names == {".vkc-pin.json", "robot.yaml", "mine.urdf", "mine.srdf", "collision"}
     again = vkc.load_robot(imported.folder)
@@ -50,7 +50,7 @@ def test_the_folder_is_whole(imported: vkc.ImportedRobot) -> None:
     np.testing.assert_array_equal(again.home, imported.robot.home)
 
 
-def test_what_was_guessed_is_told(imported: vkc.ImportedRobot) -> None:
+def test_what_was_guessed_is_told(imported: vkc.importing.ImportedRobot) -> None:
     assert imported.arms == ("right", "left")
     said = str(imported)
     for part in (
@@ -63,7 +63,7 @@ def test_what_was_guessed_is_told(imported: vkc.ImportedRobot) -> None:
     assert imported.diagnosis.healthy
 
 
-def test_the_base_is_hollow_and_stands_on_the_floor(imported: vkc.ImportedRobot) -> None:
+def test_the_base_is_hollow_and_stands_on_the_floor(imported: vkc.importing.ImportedRobot) -> None:
     (piece,) = imported.pieces
     assert piece.count == 3
     assert piece.overhead < 0.05
@@ -78,7 +78,9 @@ def test_the_base_is_hollow_and_stands_on_the_floor(imported: vkc.ImportedRobot)
     )
 
 
-def test_the_gripper_opens_and_other_hands_stand_still(imported: vkc.ImportedRobot) -> None:
+def test_the_gripper_opens_and_other_hands_stand_still(
+    imported: vkc.importing.ImportedRobot,
+) -> None:
     gripper, said = (
         imported.robot.gripper,
         yaml.safe_load((imported.folder / "robot.yaml").read_text(encoding="utf-8")),
@@ -98,7 +100,7 @@ def test_a_gripper_that_does_not_open_as_guessed_is_locked_and_told(tmp_path: Pa
         file.read_text(encoding="utf-8").replace("</robot>", bar + joint + "</robot>"),
         encoding="utf-8",
     )
-    made = vkc.import_robot(file, tmp_path / "mine", samples=SAMPLES)
+    made = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
     said = (made.folder / "robot.yaml").read_text(encoding="utf-8")
     assert made.robot.gripper is None
     assert "gripper" not in said
@@ -106,14 +108,14 @@ def test_a_gripper_that_does_not_open_as_guessed_is_locked_and_told(tmp_path: Pa
     assert "the fingers are locked: the gripper does not open" in str(made)
 
 
-def test_home_has_room(imported: vkc.ImportedRobot) -> None:
+def test_home_has_room(imported: vkc.importing.ImportedRobot) -> None:
     look = Clearances(imported.robot)
     look.place(imported.robot.home)
     assert look.least() >= HOME_ROOM
     assert len(look.pairs) > 0
 
 
-def test_reachable_poses_are_planned(imported: vkc.ImportedRobot, tmp_path: Path) -> None:
+def test_reachable_poses_are_planned(imported: vkc.importing.ImportedRobot, tmp_path: Path) -> None:
     scene = tmp_path / "scene.yaml"
     scene.write_text(
         f"robot: {imported.folder / 'robot.yaml'}\nstart: {{base: [0, 0, 0]}}\n", encoding="utf-8"
@@ -136,7 +138,7 @@ def test_reachable_poses_are_planned(imported: vkc.ImportedRobot, tmp_path: Path
             goals.append(data.oMf[frame].copy())
     for goal in goals:
         plan = vkc.plan(loaded, [vkc.Reach(goal)])
-        assert plan.success, plan.report()
+        assert plan.success, plan.summary()
 
 
 def test_home_keeps_apart_what_overlaps_at_zero(tmp_path: Path) -> None:
@@ -159,7 +161,7 @@ def test_home_keeps_apart_what_overlaps_at_zero(tmp_path: Path) -> None:
         warnings.simplefilter(
             "error"
         )  # "links that overlap at home are not checked", and names of folders that are gone
-        imported = vkc.import_robot(file, tmp_path / "mine", samples=SAMPLES)
+        imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
     look = Clearances(imported.robot)
     look.place(imported.robot.home)
     assert look.least() >= HOME_ROOM
@@ -174,7 +176,7 @@ def test_warnings_name_files_that_are_there_to_stay(tmp_path: Path) -> None:
     text = file.read_text(encoding="utf-8").replace('lower="-2" upper="2" effort', "effort", 2)
     file.write_text(text, encoding="utf-8")
     with pytest.warns(UserWarning, match="arm_1_joint") as told:
-        imported = vkc.import_robot(file, tmp_path / "mine", samples=20)
+        imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=20)
     named = {str(warning.message).partition(":")[0] for warning in told}
     assert named == {str(imported.folder.resolve() / "mine.urdf")}
 
@@ -188,28 +190,28 @@ def test_a_folder_is_replaced_only_if_asked_and_left_alone_if_importing_fails(
     (target / "notes.txt").write_text("dear", encoding="utf-8")
     for force in (False, True):
         with pytest.raises(vkc.InputError, match="already exists"):
-            vkc.import_robot(file, target, force=force)
+            vkc.importing.import_robot(file, target, force=force)
     assert [path.name for path in target.iterdir()] == ["notes.txt"]
     (target / "notes.txt").unlink()
-    vkc.import_robot(file, target, samples=SAMPLES)
+    vkc.importing.import_robot(file, target, samples=SAMPLES)
     (target / "notes.txt").write_text("dear", encoding="utf-8")
     with pytest.raises(vkc.InputError, match="--force"):
-        vkc.import_robot(file, target)
+        vkc.importing.import_robot(file, target)
     with pytest.raises(vkc.InputError, match=r"would delete .*got notes\.txt\)"):
-        vkc.import_robot(file, target, samples=SAMPLES, force=True)
+        vkc.importing.import_robot(file, target, samples=SAMPLES, force=True)
     (target / "notes.txt").rename(tmp_path / "notes.txt")
     (target / "mine.urdf").write_text("changed by hand", encoding="utf-8")
     with pytest.raises(
         vkc.UnknownNameError,
         match=r"given/robot\.urdf: tool_frame: .*did you mean 'right_hand'|'hand'",
     ):
-        vkc.import_robot(file, target, tool_frame="hnd", force=True)
+        vkc.importing.import_robot(file, target, tool_frame="hnd", force=True)
     with pytest.raises(vkc.UnknownNameError):
-        vkc.import_robot(file, target, arm="third", force=True)
+        vkc.importing.import_robot(file, target, arm="third", force=True)
     assert (target / "mine.urdf").read_text(encoding="utf-8") == "changed by hand"
     names = ["given", "mine", "notes.txt"]
     assert sorted(path.name for path in tmp_path.iterdir()) == names, "nothing is half written"
-    vkc.import_robot(file, target, samples=SAMPLES, force=True)
+    vkc.importing.import_robot(file, target, samples=SAMPLES, force=True)
     assert (target / "mine.urdf").read_text(encoding="utf-8") != "changed by hand"
     assert (target / "robot.yaml").is_file()
     assert sorted(path.name for path in tmp_path.iterdir()) == names
@@ -227,7 +229,7 @@ def test_what_is_no_robot_is_named(tmp_path: Path, text: str, said: str) -> None
     file = tmp_path / "wrong.urdf"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(vkc.InputError, match=said):
-        vkc.import_robot(file, tmp_path / "out")
+        vkc.importing.import_robot(file, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -238,7 +240,7 @@ def test_a_telescope_is_proposed_as_one_coordinate(tmp_path: Path) -> None:
             write_telescope(tmp_path / f"given{mimics}", couplings="", mimics=mimics).parent
             / "robot.urdf"
         )
-        made = vkc.import_robot(file, tmp_path / f"mine{mimics}", samples=SAMPLES)
+        made = vkc.importing.import_robot(file, tmp_path / f"mine{mimics}", samples=SAMPLES)
         assert made.robot.coordinates.names[3:] == (
             "lift",
             "out_1",
@@ -263,7 +265,7 @@ def test_names_of_files_and_folders_are_quoted_or_replaced(
         (None, "x_tool_frame__body____", "x_tool_frame__body____"),
         ("моя\x01\n", "моя\x01\n", "robot"),
     ):
-        made = vkc.import_robot(file, folder, samples=SAMPLES)
+        made = vkc.importing.import_robot(file, folder, samples=SAMPLES)
         assert made.folder.name == target
         said = yaml.safe_load((made.folder / "robot.yaml").read_text(encoding="utf-8"))
         assert (said["urdf"], said["srdf"], said["tool_frame"]) == (
@@ -280,7 +282,7 @@ def test_names_of_files_and_folders_are_quoted_or_replaced(
             "# Made of x\\ntool_frame: body\\n#\\x01\\udcff.urdf (URDF) by vkc-pin import-robot."
         )
         assert vkc.load_robot(made.folder).name == target
-        again = vkc.import_robot(file, folder, samples=SAMPLES, force=True)
+        again = vkc.importing.import_robot(file, folder, samples=SAMPLES, force=True)
         assert sorted(path.name for path in again.folder.iterdir()) == sorted(
             path.name for path in made.folder.iterdir()
         )

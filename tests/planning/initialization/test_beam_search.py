@@ -48,7 +48,7 @@ def search(*, drives: bool = False, thorough: bool = True, backwards: bool = Fal
 
 def compute_lengths(p: vkc.TrajectoryProblem, paths: np.ndarray) -> np.ndarray:
     """Return path lengths in radians of the arm, shape (B,)."""
-    steps = np.abs(np.diff(paths, axis=1)) * np.sqrt(p.effort.metric / 0.025)
+    steps = np.abs(np.diff(paths, axis=1)) * np.sqrt(p.motion_cost.metric / 0.025)
     driven = np.linalg.norm(steps[..., :2], axis=2).sum(axis=1)
     return np.asarray(driven + steps[..., 2:].sum(axis=(1, 2)))
 
@@ -109,7 +109,7 @@ def test_path_cost_with_routes_is_the_driving_distance() -> None:
     path = found.paths[0]
     (distance,) = routes.compute_distances(0, path[:1, :3], path[1:, :3])
     assert distance > np.hypot(*(path[1] - path[0])[:2]) + 1.0
-    metric = np.sqrt(p.effort.metric / 0.025)
+    metric = np.sqrt(p.motion_cost.metric / 0.025)
     turned = np.abs(path[1] - path[0])[2:] @ metric[2:]
     assert found.cost[0] == pytest.approx(metric[0] * distance + turned)
 

@@ -327,6 +327,6 @@ def test_narrow_door_is_closed_from_outside() -> None:
         [vkc.Grasp("door", "handle_free"), vkc.Actuate("door", {"hinge": 0.0})],
         seed=0,
     )
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     assert plan.trajectory.column("door.hinge")[-1] == pytest.approx(0.0, abs=1e-3)
     assert plan.trajectory.positions[-1, 1] < 1.0  # the wall is at 1.25

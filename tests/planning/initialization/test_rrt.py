@@ -206,7 +206,10 @@ def test_a_budget_ends_the_search() -> None:
     with Budget().running() as budget:
         find_path(0)
     assert budget.evaluations > 500
-    with Budget(effort=budget.evaluations // 2).running(), pytest.raises(BudgetExhaustedError):
+    with (
+        Budget(max_evaluations=budget.evaluations // 2).running(),
+        pytest.raises(BudgetExhaustedError),
+    ):
         find_path(0)
 
 

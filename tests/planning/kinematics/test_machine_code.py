@@ -311,7 +311,7 @@ def planned(planner: vkc.Planner | None = None) -> list[bytes]:
     """Return a plan by the given planner, or by a new one without caches."""
     steps, options = [Grasp("door")], vkc.Options(reach_waypoints=10)
     plan = vkc.plan(door_scene(), steps, options=options, planner=planner or vkc.Planner())
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     return [plan.trajectory.times.tobytes(), plan.trajectory.positions.tobytes()]
 
 

@@ -13,7 +13,9 @@ from vkc_pin.utils.budget import Budget
 
 
 @pytest.mark.parametrize(
-    ("budget", "iterations"), [({"seconds": 0.0}, 0), ({"effort": 30}, 3), ({}, None)], ids=str
+    ("budget", "iterations"),
+    [({"seconds": 0.0}, 0), ({"max_evaluations": 30}, 3), ({}, None)],
+    ids=str,
 )
 def test_ipopt_stops(budget: dict[str, Any], iterations: int | None) -> None:
     """Of ten units an iteration, the first of which is the beginning."""

@@ -117,7 +117,7 @@ def test_its_directional_derivative_is_that_of_finite_differences(kind: str, see
 
     t = p.transcription
     steps, directions = p.rates(z), p.rates(z + along)
-    weights_of_f = p.effort.weights(*steps)  # a quadratic function with the slope of f
+    weights_of_f = p.motion_cost.weights(*steps)  # a quadratic function with the slope of f
     slope = sum(
         2 * np.sum(w * a * (b - a)) for w, a, b in zip(weights_of_f, steps, directions, strict=True)
     )

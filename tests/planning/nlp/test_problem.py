@@ -13,6 +13,7 @@ from helpers.carrying import STICK, lifted, room, stand, table
 from helpers.relaxed import check_relaxation, iterates
 from helpers.small_problems import SHORT, door_scene, full_scene, program_of, random_configurations
 
+import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
@@ -287,8 +288,8 @@ def test_pose_error_and_drift(opened: TrajectoryProblem) -> None:
     assert opened.pose_error(z) == pytest.approx(worst, abs=1e-8)
     reach, _, move, _ = opened.ends.tolist()
     between = [residual((path[t] + path[t + 1]) / 2) for t in range(reach, move)]
-    drifts = [np.linalg.norm(r[:3]) / SHORT.closure_position for r in between]
-    drifts += [np.linalg.norm(r[3:]) / SHORT.closure_angle for r in between]
+    drifts = [np.linalg.norm(r[:3]) / vkc.Tolerances().closure_position for r in between]
+    drifts += [np.linalg.norm(r[3:]) / vkc.Tolerances().closure_angle for r in between]
     assert opened.drift(z) == pytest.approx(max(drifts), rel=1e-6)
     alone = program_of(door_scene(), [GoTo(0.0, 0.0)], options=SHORT)
     assert alone.pose_error(random_path(alone)) == alone.drift(random_path(alone)) == 0.0
@@ -413,7 +414,9 @@ def test_initially_held_object_stays_in_the_hand(fetching: TrajectoryProblem) ->
         column for column, _, _ in problem.choices
     ]  # what is clamped changes while grasping only, at next to no cost
     np.testing.assert_allclose(
-        problem.effort.metric[chosen], 1e-4 * problem.options.velocity_weight_object, rtol=1e-12
+        problem.motion_cost.metric[chosen],
+        1e-4 * problem.options.velocity_weight_object,
+        rtol=1e-12,
     )
 
 

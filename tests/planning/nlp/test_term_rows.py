@@ -267,7 +267,7 @@ def test_derivatives_are_those_of_finite_differences(name: str) -> None:
         "pose_offsets": pose_offsets,
         "excess": excess,
         "relaxation_weights": relaxation_weights,
-        "weights": p.effort.weights(*p.rates(random_path(p, 2)[1:])),
+        "weights": p.motion_cost.weights(*p.rates(random_path(p, 2)[1:])),
     }
     parameters = t.parameter_vector(
         p.start, planes, offsets, p.target_matrix(), penalty=PENALTY, dt=times(p), **taken
@@ -299,7 +299,7 @@ def test_derivatives_are_those_of_finite_differences(name: str) -> None:
     given = p.rates(z)
     squares = sum(np.sum(w * part**2) for w, part in zip(taken["weights"], given, strict=True))
     assert p.objective(z, times(p)) == pytest.approx(
-        p.effort.value(*given) + p.term_evaluator.compute_cost(z, times(p))
+        p.motion_cost.value(*given) + p.term_evaluator.compute_cost(z, times(p))
     )
     assert squares + p.term_evaluator.compute_cost(z, times(p)) == pytest.approx(
         float(f) - PENALTY * slack.sum() - relaxation_weights @ shares, rel=1e-9

@@ -162,7 +162,7 @@ def test_a_planned_motion_keeps_its_limits_and_its_grasp(door_plan: vkc.Plan) ->
     motion = door_plan.trajectory
     check_limits(door_plan.scene, motion)
     assert door_plan.success
-    assert door_plan.validation.closure_error < 1e-3
+    assert door_plan.report.closure_error < 1e-3
     turn = next(phase for phase in motion.phases if phase.name.startswith("turn"))
     inside = np.linspace(motion.times[turn.first], motion.times[turn.last], 200)
     hinge = motion(inside)[:, motion.names.index("door.hinge")]
@@ -173,5 +173,5 @@ def test_a_planned_motion_keeps_its_limits_and_its_grasp(door_plan: vkc.Plan) ->
 def test_own_constraints_on_velocities_keep_the_programs_time() -> None:
     limit = vkc.Constraint("gently", lambda s: ca.norm_2(s.velocity("base_link")), upper=0.3)
     plan = vkc.plan(door_scene(), [vkc.GoTo(0.5, 0.2)], terms=[limit])
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     assert plan.trajectory.curve is None

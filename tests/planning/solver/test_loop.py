@@ -520,15 +520,15 @@ def test_evaluation_limit_is_deterministic() -> None:
     problem, seed = round_a_pillar(), straight(round_a_pillar(), 3.2)
     with Budget().activate() as budget:
         whole = solve(problem, seed)
-    with Budget(effort=budget.evaluations).activate():
+    with Budget(max_evaluations=budget.evaluations).activate():
         same = solve(problem, seed)
     np.testing.assert_array_equal(same.z, whole.z)
     assert same.converged
     cut = []
     for _ in range(2):
-        with Budget(effort=budget.evaluations // 2).activate():
+        with Budget(max_evaluations=budget.evaluations // 2).activate():
             cut.append(solve(problem, seed))
-    assert cut[0].status == "effort spent"
+    assert cut[0].status == "evaluation limit"
     assert 0 < cut[0].rounds < whole.rounds
     assert (cut[0].rounds, cut[0].iterations) == (cut[1].rounds, cut[1].iterations)
     np.testing.assert_array_equal(cut[0].z, cut[1].z)

@@ -53,9 +53,9 @@ def sub_states(problem: TrajectoryProblem, z: np.ndarray, segment: int, count: i
 def test_thin_obstacle_between_waypoints_is_avoided(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, steps = past_a_post(), [vkc.GoTo(0.0, WIDTH, 0.0)]
     plan = vkc.plan(scene, steps, options=FEW)
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     assert (
-        plan.trajectory.arm_effort() + plan.trajectory.base_effort() > WIDTH + 0.005
+        plan.trajectory.arm_path_length() + plan.trajectory.base_path_length() > WIDTH + 0.005
     )  # it went round the post
 
     problem, _ = straight(scene)
@@ -73,10 +73,10 @@ def test_thin_obstacle_between_waypoints_is_avoided(monkeypatch: pytest.MonkeyPa
     blind = vkc.plan(scene, steps, options=FEW, initialization="interpolated")
     assert not blind.success
     assert blind.status == "rejected"  # the solver was content, validation was not
-    assert {(v.constraint, "post" in v.subject) for v in blind.validation.violations} == {
+    assert {(v.constraint, "post" in v.subject) for v in blind.report.violations} == {
         ("penetration", True)
     }
-    segment = int(blind.validation.violations[0].waypoint)
+    segment = int(blind.report.violations[0].waypoint)
     ends = problem.contacts.evaluate(
         blind.trajectory.positions[segment : segment + 2], np.array([1, 1]), reach=0.02
     )

@@ -68,7 +68,7 @@ class Made:
                 f"high {timing and timing.dt}",
             ),
             rates=lambda z: ("first", "second"),
-            effort=SimpleNamespace(weights=lambda *rates: ("weights", *rates)),
+            motion_cost=SimpleNamespace(weights=lambda *rates: ("weights", *rates)),
             rolling=SimpleNamespace(compute_gears=lambda path: ("gears", path)),
             waypoints=lambda z: "path",
         )

@@ -28,7 +28,7 @@ EACH = st.sampled_from(sorted(KINDS))
 
 
 def placed(kind: str, seed: int) -> vkc.PlacedObject:
-    thing = vkc.load_object(vkc.random_object(kind, seed))
+    thing = vkc.load_object(vkc.procedural.random_object(kind, seed))
     return vkc.PlacedObject(kind, thing, pin.SE3.Identity(), np.clip(0.0, thing.lower, thing.upper))
 
 
@@ -137,7 +137,7 @@ def test_doors_open_towards_the_user(kind: str, seed: int) -> None:
 def test_doors_are_pushed_and_pulled_to_either_side() -> None:
     seen = set()
     for seed in range(60):
-        door = vkc.load_object(vkc.random_object("door", seed))
+        door = vkc.load_object(vkc.procedural.random_object("door", seed))
         handle = door.attachment()
         state = np.zeros(door.coordinates.size)
         shut = (door.link_placement(handle.link, state) * handle.placement).translation
@@ -149,19 +149,19 @@ def test_doors_are_pushed_and_pulled_to_either_side() -> None:
 
 def test_random_objects_are_reproducible() -> None:
     for kind in KINDS:
-        one, same, other = (vkc.random_object(kind, seed) for seed in (3, 3, 4))
+        one, same, other = (vkc.procedural.random_object(kind, seed) for seed in (3, 3, 4))
         assert one == same != other
-    code = "import json, vkc_pin as vkc; print(json.dumps(vkc.random_object('oven', 8)))"
+    code = "import json, vkc_pin as vkc; print(json.dumps(vkc.procedural.random_object('oven', 8)))"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
     )
-    assert yaml.safe_load(done.stdout) == vkc.random_object("oven", 8)
+    assert yaml.safe_load(done.stdout) == vkc.procedural.random_object("oven", 8)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_objects_are_written_to_files(kind: str, tmp_path: Path) -> None:
-    made = vkc.random_object(kind, 5)
-    file = vkc.write_object(made, tmp_path / "new" / "thing.yaml")
+    made = vkc.procedural.random_object(kind, 5)
+    file = vkc.procedural.write_object(made, tmp_path / "new" / "thing.yaml")
     assert sorted(path.name for path in file.parent.iterdir()) == ["thing.urdf", "thing.yaml"]
     kept, described = vkc.load_object(file), vkc.load_object(made)
     assert (kept.name, kept.urdf) == ("thing", tmp_path / "new" / "thing.urdf")
@@ -172,11 +172,13 @@ def test_objects_are_written_to_files(kind: str, tmp_path: Path) -> None:
 
 def test_invalid_arguments_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(vkc.UnknownNameError, match="did you mean 'refrigerator'"):
-        vkc.random_object("refigerator")
+        vkc.procedural.random_object("refigerator")
     with pytest.raises(vkc.InputError, match="whole number"):
-        vkc.random_object("oven", -1)
+        vkc.procedural.random_object("oven", -1)
     with pytest.raises(vkc.InputError, match=r"ends with \.yaml"):
-        vkc.write_object(vkc.random_object("oven"), tmp_path / "oven.urdf")
+        vkc.procedural.write_object(vkc.procedural.random_object("oven"), tmp_path / "oven.urdf")
     with pytest.raises(vkc.InputError, match="attachments"):
-        vkc.write_object({"urdf": vkc.random_object("oven")["urdf"]}, tmp_path / "oven.yaml")
+        vkc.procedural.write_object(
+            {"urdf": vkc.procedural.random_object("oven")["urdf"]}, tmp_path / "oven.yaml"
+        )
     assert not list(tmp_path.iterdir())

@@ -36,7 +36,7 @@ def test_names() -> None:
     assert make_fixture_name("random_oven") == "oven"
     assert make_fixture_name("door") == "door"
     assert make_fixture_name("/some/where/my.oven.yaml") == "my_oven"
-    assert make_fixture_name(vkc.random_object("valve")) == "valve"
+    assert make_fixture_name(vkc.procedural.random_object("valve")) == "valve"
     assert {*OPENABLE, "random_oven", "dishwasher", "counter_drawer"} <= set(list_openable_types())
     assert len(set(list_openable_types())) == len(list_openable_types())
 
@@ -49,7 +49,7 @@ def test_sizes_follow_from_the_seed() -> None:
 
 
 def test_raised_object_is_lowered_to_the_floor(tmp_path: Path) -> None:
-    description = vkc.random_object("oven", 1)
+    description = vkc.procedural.random_object("oven", 1)
     description["urdf"] = description["urdf"].replace('<link name="body">', '<link name="root"/><joint name="up" type="fixed">'
         '<parent link="root"/><child link="body"/><origin xyz="0 0 0.7"/></joint><link name="body">')  # fmt: skip
     assert make_fixture(description).lift == pytest.approx(-0.7, abs=1e-3)

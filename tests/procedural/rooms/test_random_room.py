@@ -103,22 +103,22 @@ def test_a_room_is_sound(
 
 
 def test_random_rooms_are_reproducible() -> None:
-    one, same, other = (vkc.random_room(number, clutter=0.7).document for number in (5, 5, 6))
+    one, same, other = (
+        vkc.procedural.random_room(number, clutter=0.7).document for number in (5, 5, 6)
+    )
     assert one == same
     assert one != other
-    assert vkc.random_room(5, clutter=0.2).document != one
-    assert vkc.random_room(5, vkc.RoomSettings(clutter=0.7)).document == one
-    assert vkc.random_room(np.int64(5), clutter=0.7).document == one  # type: ignore[arg-type]
+    assert vkc.procedural.random_room(5, clutter=0.2).document != one
+    assert vkc.procedural.random_room(5, vkc.procedural.RoomSettings(clutter=0.7)).document == one
+    assert vkc.procedural.random_room(np.int64(5), clutter=0.7).document == one  # type: ignore[arg-type]
 
 
 def test_another_process_makes_the_same_room() -> None:
-    code = (
-        "import json, vkc_pin as vkc; print(json.dumps(vkc.random_room(8, clutter=0.4).document))"
-    )
+    code = "import json, vkc_pin as vkc; print(json.dumps(vkc.procedural.random_room(8, clutter=0.4).document))"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
     )
-    assert yaml.safe_load(done.stdout) == vkc.random_room(8, clutter=0.4).document
+    assert yaml.safe_load(done.stdout) == vkc.procedural.random_room(8, clutter=0.4).document
 
 
 def test_one_room_in_numbers() -> None:
@@ -129,7 +129,7 @@ def test_one_room_in_numbers() -> None:
 
 
 def test_a_room_can_be_saved(tmp_path: Path) -> None:
-    room = vkc.random_room(2, objects=("door",), carried=("cup",))
+    room = vkc.procedural.random_room(2, objects=("door",), carried=("cup",))
     file = tmp_path / "room.yaml"
     file.write_text(yaml.safe_dump(room.document), encoding="utf-8")
     again = vkc.load_scene(file)
@@ -146,7 +146,7 @@ def test_random_objects_differ_between_rooms_and_are_saved(
     tmp_path: Path,
 ) -> None:
     asked = ("random_drawers", "random_drawers", "random_microwave", "refrigerator")
-    rooms = [vkc.random_room(number, objects=asked, clutter=0.1) for number in (4, 5)]
+    rooms = [vkc.procedural.random_room(number, objects=asked, clutter=0.1) for number in (4, 5)]
     assert list(rooms[0].objects) == ["drawers_1", "drawers_2", "microwave", "refrigerator"]
     sizes = {
         tuple(placed.object.upper)
@@ -166,10 +166,10 @@ def test_random_objects_differ_between_rooms_and_are_saved(
 def test_objects_by_path_and_by_description(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    description = vkc.random_object("chest", 3)
-    vkc.write_object(description, tmp_path / "my.chest.yaml")
+    description = vkc.procedural.random_object("chest", 3)
+    vkc.procedural.write_object(description, tmp_path / "my.chest.yaml")
     monkeypatch.chdir(tmp_path)
-    room = vkc.random_room(
+    room = vkc.procedural.random_room(
         1,
         objects=["./my.chest.yaml", tmp_path / "my.chest.yaml", description, "dishwasher"],
         clutter=0.0,
@@ -187,13 +187,13 @@ def test_objects_by_path_and_by_description(
 
 
 def test_requested_parts_are_present() -> None:
-    room = vkc.random_room(
+    room = vkc.procedural.random_room(
         3, objects=("drawer", "drawer", "door"), tables=2, carried=("cup", "ball"), clutter=0.0
     )
     assert list(room.objects) == ["drawer_1", "drawer_2", "door", "cup", "ball"]
     assert sum(name.endswith("_top") for name in room.obstacle_names) == 2
     few, many = (
-        len(vkc.random_room(3, objects=(), clutter=clutter).obstacle_names)
+        len(vkc.procedural.random_room(3, objects=(), clutter=clutter).obstacle_names)
         for clutter in (0.1, 1.0)
     )
     assert few < many
@@ -202,7 +202,7 @@ def test_requested_parts_are_present() -> None:
 @pytest.mark.parametrize("number", [-1, 1.5, True, "1"])
 def test_invalid_numbers_are_rejected(number: object) -> None:
     with pytest.raises(vkc.InputError) as found:
-        vkc.random_room(number)  # type: ignore[arg-type]
+        vkc.procedural.random_room(number)  # type: ignore[arg-type]
     assert (found.value.field, found.value.expected, found.value.got) == (
         "number",
         "a whole number of at least 0",
@@ -212,14 +212,14 @@ def test_invalid_numbers_are_rejected(number: object) -> None:
 
 def test_unknown_settings_and_parts_are_rejected() -> None:
     with pytest.raises(vkc.UnknownNameError, match="did you mean 'clutter'"):
-        vkc.random_room(0, cluter=0.5)
+        vkc.procedural.random_room(0, cluter=0.5)
     with pytest.raises(vkc.UnknownNameError, match="table_9"):
         sample_layout(0).find_part("table_9")
 
 
 def test_error_if_parts_do_not_fit() -> None:
     with pytest.raises(vkc.InputError) as found:
-        vkc.random_room(0, width=(4.0, 4.0), objects=("cabinet",) * 6)
+        vkc.procedural.random_room(0, width=(4.0, 4.0), objects=("cabinet",) * 6)
     assert found.value.field == "clutter"
     assert "fewer objects" in str(found.value.expected)
 
@@ -238,11 +238,14 @@ def test_imported_objects_and_robots(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert make_fixture("dishwasher").face == pytest.approx(0.0, abs=0.03)
     write_gripper(tmp_path / "mine")
     monkeypatch.chdir(tmp_path)
-    room = vkc.random_room(
+    room = vkc.procedural.random_room(
         7, objects=[{"urdf": urdf, "attachments": []}], robot="mine/robot.yaml", clutter=0.0
     )
     assert room.robot.name == "mine"
     assert list(room.objects) == ["oven"]
     assert (
-        vkc.random_room(7, objects=["drawer"], robot=Path("mine"), clutter=0.0).robot.name == "mine"
+        vkc.procedural.random_room(
+            7, objects=["drawer"], robot=Path("mine"), clutter=0.0
+        ).robot.name
+        == "mine"
     )  # type: ignore[arg-type]

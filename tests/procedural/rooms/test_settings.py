@@ -30,7 +30,7 @@ import vkc_pin as vkc
 )
 def test_invalid_settings_are_rejected(changes: dict[str, Any], field: str, expected: str) -> None:
     with pytest.raises(vkc.InputError) as found:
-        vkc.RoomSettings(**changes)
+        vkc.procedural.RoomSettings(**changes)
     assert found.value.field == field
     assert expected in str(found.value.expected)
     assert found.value.got is not None
@@ -46,10 +46,10 @@ def test_invalid_settings_are_rejected(changes: dict[str, Any], field: str, expe
 )
 def test_unknown_types(field: str, name: str, nearest: str) -> None:
     with pytest.raises(vkc.UnknownNameError) as found:
-        vkc.RoomSettings(**{field: (name,)})  # type: ignore[arg-type]
+        vkc.procedural.RoomSettings(**{field: (name,)})  # type: ignore[arg-type]
     assert (found.value.field, found.value.name, found.value.nearest) == (field, name, nearest)
 
 
 def test_lists_become_tuples() -> None:
-    settings = vkc.RoomSettings(objects=["door"], width=[4, 5])  # type: ignore[arg-type]
+    settings = vkc.procedural.RoomSettings(objects=["door"], width=[4, 5])  # type: ignore[arg-type]
     assert (settings.objects, settings.width) == (("door",), (4.0, 5.0))

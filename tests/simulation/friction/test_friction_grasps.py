@@ -25,7 +25,7 @@ def cup_plan() -> Plan:
 def test_drawer_is_pulled_by_friction() -> None:
     plan = drawer_plan()
     result = plan.simulate(grasp="friction")
-    assert result.ok, result.report()
+    assert result.ok, result.summary()
     assert result.contacts == ()
     (grip,) = result.grips
     assert grip.slip < 0.005
@@ -49,7 +49,7 @@ def test_slipping_object_is_lost(physics: vkc.Physics) -> None:
 
 def test_cup_is_carried_and_placed() -> None:
     result = cup_plan().simulate(grasp="friction")
-    assert result.ok, result.report()
+    assert result.ok, result.summary()
     (grip,) = result.grips
     assert grip.force > 0.25 * 9.81 * 0.9  # its weight at least
     # MuJoCo's default contacts creep on curves; see `Builder.has_friction_grasps`.
@@ -60,9 +60,9 @@ def test_cup_is_carried_and_placed() -> None:
 def test_described_gripper_closes_its_own_fingers(tmp_path: Path) -> None:
     scene = between_cheeks(write_gripper(tmp_path), opening=0.03)
     plan = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.15})])
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     result = plan.simulate(grasp="friction")
-    assert result.ok, result.report()
+    assert result.ok, result.summary()
     assert not any("slide towards" in note for note in result.notes)
     # Fingers close on the handle, 20 mm apart, and slightly further as contacts are compliant.
     world = result.rows[:, len(scene.start) : len(scene.start) + 2]
@@ -73,7 +73,7 @@ def test_object_in_hand_at_start_stays_there() -> None:
     scene = holding()
     result = simulate(scene, [vkc.Grasp("stick")], still(scene, 1.5), grasp="friction")
     (grip,) = result.grips
-    assert grip.broken is None, result.report()
+    assert grip.broken is None, result.summary()
     assert grip.force == pytest.approx(9.81 * 0.4, rel=0.3)
     assert result.misses[0].amount < 0.01
     lost = simulate(

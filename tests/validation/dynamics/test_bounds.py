@@ -18,7 +18,7 @@ from vkc_pin.world.trajectory.dynamics.torques import sample_curve
 def test_motion_is_at_its_bounds_where_reported(made: object) -> None:
     plan: vkc.Plan = made()  # type: ignore[operator]
     motion, samples = plan.trajectory, Samples(plan.scene, plan.trajectory)
-    found = plan.validation.bounds
+    found = plan.report.bounds
     assert 0.9 < sum(bound.share for bound in found) <= 1.0 + 1e-9
     assert [bound.share for bound in found] == sorted(
         (bound.share for bound in found), reverse=True

@@ -108,4 +108,4 @@ def test_jerk_bounds_the_duration() -> None:
     report = vkc.validate(plan.scene, plan.steps, retime_smoothly(), vkc.Options(jerk_time=0.2))
     assert report.ok
     assert "jerk" in {bound.kind for bound in report.bounds}
-    assert "jerk" not in {bound.kind for bound in plan.validation.bounds}
+    assert "jerk" not in {bound.kind for bound in plan.report.bounds}

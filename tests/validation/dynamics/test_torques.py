@@ -96,12 +96,12 @@ def test_massless_payload_is_remarked() -> None:
 
 def test_torques_are_reported_and_saved(tmp_path: Path) -> None:
     plan = door_plan()
-    assert plan.metrics["torque"] == plan.validation.torque > 0.0
+    assert plan.metrics["torque"] == plan.report.torque > 0.0
     assert (
-        f"torques     at most {100.0 * plan.validation.torque:.0f} % of the motors' limits"
-        in plan.report()
+        f"torques     at most {100.0 * plan.report.torque:.0f} % of the motors' limits"
+        in plan.summary()
     )
-    assert f"bounded by  {plan.validation.bounds[0]}" in plan.report()
-    assert plan.to_dict()["bounds"][0] == dataclasses.asdict(plan.validation.bounds[0])
+    assert f"bounded by  {plan.report.bounds[0]}" in plan.summary()
+    assert plan.to_dict()["bounds"][0] == dataclasses.asdict(plan.report.bounds[0])
     loaded = vkc.Plan.load(plan.save(tmp_path / "door.npz"))
-    assert loaded.claimed == plan.validation == loaded.validation
+    assert loaded.claimed == plan.report == loaded.report

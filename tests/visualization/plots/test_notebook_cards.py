@@ -40,7 +40,7 @@ def test_a_failed_plan_says_so_in_words_and_colour(plan: Plan) -> None:
     html = plan._repr_html_()
     assert re.search(r'door: <span style="color: #c62828">FAILED, rejected</span>', html)
     assert "<li>penetration forearm_link – sofa: overlap by 30 mm (waypoint 9, 4.00 s)</li>" in html
-    assert cells(html)["base"] == f"{plan.metrics['base_effort']:.2f} m"
+    assert cells(html)["base"] == f"{plan.metrics['base_path_length']:.2f} m"
 
 
 def test_a_good_plan(door_plan: Plan) -> None:
@@ -48,8 +48,8 @@ def test_a_good_plan(door_plan: Plan) -> None:
     assert '<span style="color: #1a7f37">success</span>' in html
     assert "<li>" not in html
     told, m = cells(html), door_plan.metrics
-    assert told["base"] == f"{m['base_effort']:.2f} m"
-    assert told["arm"] == f"{m['arm_effort']:.2f} rad"
+    assert told["base"] == f"{m['base_path_length']:.2f} m"
+    assert told["arm"] == f"{m['arm_path_length']:.2f} rad"
     assert told["clearance"] == f"{1e3 * m['clearance']:.1f} mm"
     assert told["duration"] == f"{m['duration']:.1f} s"
     assert told["planned in"] == f"{m['planning_time']:.2f} s"
@@ -58,8 +58,8 @@ def test_a_good_plan(door_plan: Plan) -> None:
 
 
 def test_long_lists_are_cut(plan: Plan) -> None:
-    (violation,) = plan.validation.violations
-    many = dataclasses.replace(plan, validation=Report((violation,) * 9, notes=("no way",)))
+    (violation,) = plan.report.violations
+    many = dataclasses.replace(plan, report=Report((violation,) * 9, notes=("no way",)))
     html = many._repr_html_()
     assert html.count("<li>") == 7
     assert "... and 4 more" in html
@@ -80,7 +80,7 @@ def test_the_picture_is_small_and_not_empty(door_plan: Plan) -> None:
 def test_names_cannot_break_out(plan: Plan) -> None:
     bad = '<script>alert(1)</script>&"'
     scene = dataclasses.replace(plan.scene, name=bad)
-    violation = dataclasses.replace(plan.validation.violations[0], subject=bad, detail=bad)
+    violation = dataclasses.replace(plan.report.violations[0], subject=bad, detail=bad)
     phases = tuple(dataclasses.replace(phase, name=bad) for phase in plan.trajectory.phases)
     evil = dataclasses.replace(
         plan,

@@ -232,8 +232,8 @@ def test_door_opens_and_closes_in_its_wall() -> None:
     with pytest.warns(UserWarning, match="overlap by 50"):
         scene = in_wall()
     plan = vkc.plan(scene, [vkc.Actuate("door", HINGE), vkc.Actuate("door", {"hinge": 0.0})])
-    assert plan.success, plan.report()
-    assert plan.validation.clearance > 0.015  # of pairs that are not exempt
+    assert plan.success, plan.summary()
+    assert plan.report.clearance > 0.015  # of pairs that are not exempt
 
 
 def test_cup_may_leave_but_not_enter_an_overlap() -> None:
@@ -243,7 +243,7 @@ def test_cup_may_leave_but_not_enter_an_overlap() -> None:
     with pytest.warns(UserWarning, match=r"cup\.cup – table overlap by 2\.0 mm"):
         scene = Scene.from_document({**document, "obstacles": tables})
     plan = vkc.plan(scene, [vkc.Place("cup", (1.5, 0.4, 0.751))])
-    assert plan.success, plan.report()
+    assert plan.success, plan.summary()
     deep = validate(scene, [vkc.Place("cup", (1.5, 0.4, 0.749))], plan.trajectory)
     assert {violation.constraint for violation in deep.violations} == {"goal"}
 
@@ -253,7 +253,7 @@ def test_allowed_margin_decides_about_a_leaf_that_turns_into_its_wall() -> None:
     scene = in_wall(-0.003)
     plan = vkc.plan(scene, [vkc.Actuate("door", HINGE)])
     assert plan.status == "infeasible"
-    (note,) = plan.validation.notes
+    (note,) = plan.report.notes
     assert "door.panel – wall" in note
     overlap = float(note.rpartition("overlap by ")[2].removesuffix(" mm"))
     pair = {"pair": ["door", "wall"], "margin": -1e-3 * (overlap + 0.2)}
@@ -324,12 +324,12 @@ def test_exemption_applies_to_shapes_not_links(tmp_path: Path) -> None:
     steps = [vkc.Actuate("door", {"hinge": 1.2})]
     free = hinged_at_post(tmp_path / "free", block=False)
     opened = vkc.plan(free, steps)
-    assert opened.success, opened.report()
-    (used,) = opened.validation.exemptions
+    assert opened.success, opened.summary()
+    (used,) = opened.report.exemptions
     assert used.subject == "door.leaf – wall"
     assert -0.045 < used.distance < -0.03  # the corner of the leaf, 40 mm thick, turns in the post
     assert "1.0 mm inside each other" in used.reason
-    assert f"exempt      {used}" in opened.report()
+    assert f"exempt      {used}" in opened.summary()
 
     blocked = hinged_at_post(tmp_path / "blocked", block=True)
     (one,) = find_clearance_exemptions(blocked, SAFE)

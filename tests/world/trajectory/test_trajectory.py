@@ -16,9 +16,9 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def test_efforts() -> None:
-    assert example().base_effort() == pytest.approx(5.0 + 1.0)
-    assert example().base_effort_l1() == pytest.approx(3.0 + 4.0 + 1.0)
-    assert example().arm_effort() == pytest.approx(
+    assert example().base_path_length() == pytest.approx(5.0 + 1.0)
+    assert example().base_path_length_l1() == pytest.approx(3.0 + 4.0 + 1.0)
+    assert example().arm_path_length() == pytest.approx(
         0.1 + 0.2 + 0.4 + 0.1
     )  # neither the heading nor the door counts
 

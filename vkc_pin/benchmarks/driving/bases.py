@@ -128,7 +128,7 @@ def report(result: Mapping[str, Any]) -> str:
         "success",
         "time, median [s]",
         "95th percentile [s]",
-        "units of effort",
+        "evaluations",
         "Ipopt iterations",
     ]
     parts = [
@@ -146,9 +146,10 @@ def _row(task: str, base: str, records: Sequence[Record]) -> list[str]:
     rows = [record for record in records if (record["task"], record["base"]) == (task, base)]
     good = [row for row in rows if row["success"]]
     time, late = distribution(rows, "planning_time")
-    counts = [f"{distribution(rows, field)[0]:.0f}" for field in ("effort", "iterations")]
+    counts = [f"{distribution(rows, field)[0]:.0f}" for field in ("evaluations", "iterations")]
     lengths = [
-        f"{distribution(good, field)[0]:.2f}" for field in ("base_effort", "arm_effort", "duration")
+        f"{distribution(good, field)[0]:.2f}"
+        for field in ("base_path_length", "arm_path_length", "duration")
     ]
     return [
         task,

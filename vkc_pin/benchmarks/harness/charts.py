@@ -125,7 +125,7 @@ def means_chart(
 def criteria_chart(
     records: Sequence[Record], path: str | Path | None, methods: Sequence[str], *, title: str = ""
 ) -> Figure:
-    """Draw a task's success rate, base effort, arm effort and planning time as bars, side by side.
+    """Draw a task's success rate, base path length, arm path length and planning time as bars, side by side.
 
     Rates have Wilson's intervals of 95 % confidence. The other bars are medians with quartiles:
     times over all trials, efforts over the trials in which all methods succeed, or over each
@@ -149,8 +149,8 @@ def criteria_chart(
     shared = f"median and quartiles over {where}"
     panels = (
         ("success", "success [%]", "all trials,\n95 % confidence (Wilson)", ".0f"),
-        ("base_effort", "base effort [m]", shared, ".2f"),
-        ("arm_effort", "arm effort [rad]", shared, ".2f"),
+        ("base_path_length", "base path length [m]", shared, ".2f"),
+        ("arm_path_length", "arm path length [rad]", shared, ".2f"),
         ("planning_time", "planning time [s]", "median and quartiles\nover all trials", ".2f"),
     )
     with use_style():
@@ -160,7 +160,7 @@ def criteria_chart(
         ):
             for k, method in enumerate(methods):
                 own = [record for record in records if record["method"] == method]
-                if field in ("base_effort", "arm_effort"):
+                if field in ("base_path_length", "arm_path_length"):
                     own = [row[k] for row in both] or [
                         record for record in own if record["success"]
                     ]

@@ -70,7 +70,7 @@ def commit() -> str | None:
 def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
     """Return the record of one plan; success is validation's word."""
     m = plan.metrics
-    first = plan.validation.violations[0] if plan.validation.violations else None
+    first = plan.report.violations[0] if plan.report.violations else None
     failed = (
         None if plan.success else (f"{first.constraint} {first.subject}" if first else plan.status)
     )
@@ -83,7 +83,12 @@ def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
         "status": plan.status,
         **{
             field: m[field]
-            for field in ("planning_time", "base_effort", "base_effort_l1", "arm_effort")
+            for field in (
+                "planning_time",
+                "base_path_length",
+                "base_path_length_l1",
+                "arm_path_length",
+            )
         },
         "clearance": m["clearance"]
         if np.isfinite(m["clearance"])
@@ -91,13 +96,13 @@ def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
         "closure_error": m["closure_error"],
         "iterations": int(m["iterations"]),
         "rounds": int(m["rounds"]),
-        "effort": int(m.get("effort", 0)),
+        "evaluations": int(m.get("evaluations", 0)),
         "waypoints": len(plan.trajectory.times),
         "initialization": plan.initialization,
         "build_time": m["build_time"],
         **{key: value for key, value in m.items() if key.startswith("time_")},
         "failed_constraint": failed,
-        "violations": [str(v) for v in plan.validation.violations],
+        "violations": [str(v) for v in plan.report.violations],
         "commit": commit(),
         **more,
     }

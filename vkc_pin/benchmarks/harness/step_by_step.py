@@ -37,13 +37,13 @@ def combined(
     ]
     sums = (
         "planning_time",
-        "base_effort",
-        "base_effort_l1",
-        "arm_effort",
+        "base_path_length",
+        "base_path_length_l1",
+        "arm_path_length",
         "duration",
         "build_time",
     )
-    counts = ("iterations", "rounds", "effort", "waypoints")
+    counts = ("iterations", "rounds", "evaluations", "waypoints")
     times = [key for key in records[0] if key.startswith("time_")]
     clearances = [record["clearance"] for record in records if record["clearance"] is not None]
     good = sum(record["success"] for record in records)

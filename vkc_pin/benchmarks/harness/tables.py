@@ -32,9 +32,9 @@ __all__ = [
 ]
 
 EFFORTS = {
-    "base_effort": "base [m]",
-    "base_effort_l1": "base |dx|+|dy| [m]",
-    "arm_effort": "arm [rad]",
+    "base_path_length": "base [m]",
+    "base_path_length_l1": "base |dx|+|dy| [m]",
+    "arm_path_length": "arm [rad]",
 }
 """What motions are compared by: field → name."""
 TIMES = {
@@ -151,7 +151,8 @@ def methods_table(
             good = [record for record in own if record["success"]]
             time, late = distribution(own, "planning_time")
             efforts = (
-                decimal(distribution(good, field)[0]) for field in ("base_effort", "arm_effort")
+                decimal(distribution(good, field)[0])
+                for field in ("base_path_length", "arm_path_length")
             )
             times = (decimal(time), decimal(late))
             rows.append(
@@ -214,7 +215,7 @@ def comparison_table(
             )
     head = [
         "scene",
-        "effort",
+        "evaluations",
         *(f"{name}: median (quartiles)" for name in names),
         f"lower with {names[0]}",
     ]

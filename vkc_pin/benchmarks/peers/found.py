@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from vkc_pin.planning.statistics import PlanningStatistics
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.trajectory.formats.archives import PlanStatus
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -120,7 +121,7 @@ def judged(
         problem.options,
         trajectory,
         report,
-        said,
+        cast("PlanStatus", said),  # a failed peer's own word
         statistics=PlanningStatistics(),
         random_seed=seed,
         initialization=name,

@@ -82,7 +82,7 @@ def plan_by_trajopt(
                 ).tolist(),
                 "lower": lower.tolist(),
                 "upper": upper.tolist(),
-                "weights": np.sqrt(problem.effort.metric).tolist(),
+                "weights": np.sqrt(problem.motion_cost.metric).tolist(),
                 "target": problem.targets[0].homogeneous.tolist(),
                 "at": [int(t) for t in goal.waypoints],
                 "goal": asked,

@@ -7,7 +7,7 @@ import functools
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from vkc_pin.baselines.separate import BASELINES, plan_separately
 from vkc_pin.benchmarks.harness import runner
@@ -23,6 +23,7 @@ from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import import_optional
+from vkc_pin.world.trajectory.formats.archives import PlanStatus
 
 __all__ = ["METHODS", "PEERS", "TIME_LIMIT", "report", "run"]
 
@@ -153,7 +154,7 @@ def _row(task: str, method: str, records: Sequence[Record]) -> list[str]:
         percentile,
         distribution(records, "time_own")[0],
     ]
-    efforts = [distribution(good, field)[0] for field in ("base_effort", "arm_effort")]
+    efforts = [distribution(good, field)[0] for field in ("base_path_length", "arm_path_length")]
     least = [
         min(values(good, f"clearance_{where}"), default=float("nan")) * 1e3
         for where in ("at", "between")
@@ -229,7 +230,9 @@ def _by_peer(own: Given, method: str, seed: int, clock: Clock) -> tuple[Plan, Fo
         accept(found.path)
     said = judgements[0]
     late = not said.success and found.status == "timed out"  # what it has by then may be no motion
-    return dataclasses.replace(said, status="timed out") if late else said, found
+    return dataclasses.replace(
+        said, status=cast("PlanStatus", found.status)
+    ) if late else said, found
 
 
 def _by_us(own: Given, method: str, seed: int, time_limit: float) -> Plan:

@@ -31,8 +31,8 @@ __all__ = ["SUMMARY", "every_trial", "report", "run", "specify", "summary"]
 PAIRED = {
     "planning_time": "time",
     "cpu_time": "CPU",
-    "base_effort": "base",
-    "arm_effort": "arm",
+    "base_path_length": "base",
+    "arm_path_length": "arm",
     "objective": "objective",
 }
 """What is compared with the unchanged planner, problem by problem: field → name."""
@@ -215,7 +215,7 @@ def report(result: Mapping[str, Any]) -> str:
 
 def every_trial(records: Sequence[Record]) -> str:
     """Return a table of all trials: what, how it went, and what it took."""
-    fields = ("planning_time", "cpu_time", "base_effort", "arm_effort", "objective")
+    fields = ("planning_time", "cpu_time", "base_path_length", "arm_path_length", "objective")
     rows = []
     for r in records:
         numbers = (float("nan") if r.get(field) is None else float(r[field]) for field in fields)
@@ -254,7 +254,9 @@ def summary(own: Sequence[Record]) -> list[str]:
         median, late = distribution(own, field)
         times += [median, _mean(own, field), late]
     counts = [f"{_mean(own, field):.1f}" for field in ("rounds", "iterations")]
-    efforts = [decimal(distribution(good, field)[0]) for field in ("base_effort", "arm_effort")]
+    efforts = [
+        decimal(distribution(good, field)[0]) for field in ("base_path_length", "arm_path_length")
+    ]
     return [
         f"{len(good)} of {len(own)}",
         f"{first} of {len(own)}",

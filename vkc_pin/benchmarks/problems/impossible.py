@@ -131,10 +131,8 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
     began = time.perf_counter()
     found = plan(scene, steps, seed=seed, **LIMITS)
     took = time.perf_counter() - began - found.metrics["build_time"]
-    notes = found.validation.notes
-    reasons = [
-        violation for violation in found.validation.violations if violation.constraint == "goal"
-    ]
+    notes = found.report.notes
+    reasons = [violation for violation in found.report.violations if violation.constraint == "goal"]
     explained = bool(notes) or (found.status == "infeasible" and bool(reasons))
     proven = any(PROVEN in note for note in notes) or (found.status == "infeasible" and not notes)
     more = {

@@ -28,7 +28,7 @@ __all__ = ["report", "run"]
 _ROOMS = 100_000  # of one seed
 _LIMITS = {
     **LIMITS,
-    "effort": LIMITS["effort"] // 10,
+    "max_evaluations": LIMITS["max_evaluations"] // 10,
 }  # many of them cannot be done; those that can take up to 60 000
 OF = ("anything", "rooms")
 

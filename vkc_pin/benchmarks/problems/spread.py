@@ -20,7 +20,11 @@ from vkc_pin.errors import InputError
 
 __all__ = ["report", "run", "spread_of"]
 
-FIELDS = {"objective": "objective", "base_effort": "base effort", "arm_effort": "arm effort"}
+FIELDS = {
+    "objective": "objective",
+    "base_path_length": "base path length",
+    "arm_path_length": "arm path length",
+}
 """What is compared: field → name."""
 WITHIN = 0.1  # of the least: what counts as the same
 

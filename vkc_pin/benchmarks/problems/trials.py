@@ -105,7 +105,7 @@ def objective(found: Plan, planner: Planner | None = None) -> float | None:
         freedoms = {name for names in problem.chain.virtual.values() for name in names}
         counted = np.array([name not in freedoms for name in problem.chain.names])
         first, second = problem.rates(found.trajectory.positions[rows])
-        return problem.effort.value(first * counted, second * counted)
+        return problem.motion_cost.value(first * counted, second * counted)
 
 
 @functools.cache

@@ -264,7 +264,7 @@ def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
         scene, records = Scene.from_document(document), []
         for number, pose in enumerate(poses):
             one = plan(scene, [Reach(pose)], seed=seed, **LIMITS)
-            because = "; ".join(one.validation.notes)
+            because = "; ".join(one.report.notes)
             records.append(
                 trial(one, method="VKC", seed=seed, number=number, **about, because=because)
             )

@@ -136,7 +136,7 @@ def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
         for number in range(spec["starts"]):
             scene = found.scene.sample_start(np.random.default_rng([7, seed, number]))
             one = plan(scene, [found.step], seed=seed, **LIMITS)
-            because = "; ".join(one.validation.notes)
+            because = "; ".join(one.report.notes)
             taken = one.trajectory.phases[-1].held.get(found.step.object, "")
             records.append(
                 trial(

@@ -165,7 +165,7 @@ class RecipeSchema(Schema):
     goal: GoalSchema = GoalSchema()
     grasps: Literal["freest", "any"] = "freest"
     options: dict[str, Any] = Field(default_factory=dict)
-    effort: Whole = 100_000
+    max_evaluations: Whole = 100_000
     time_limit: Positive = 60.0
     variants: Whole = 1
     rate: Positive = 10.0

@@ -65,7 +65,7 @@ class ImportedHome:
     reached: int
     notes: tuple[str, ...]
 
-    def report(self) -> str:
+    def summary(self) -> str:
         """Return a readable report."""
         x_low, x_high, y_low, y_high = self.scene.arena
         size = f"{x_high - x_low:.1f} × {y_high - y_low:.1f} m"
@@ -82,7 +82,7 @@ class ImportedHome:
                 f"  {self.shapes['file']} shapes in the file: {parts}",
                 *(f"  {note}" for note in self.notes),
                 f"start at ({base}), with free floor to {self.reached} of these objects",
-                *(f"  {thing.report()}" for thing in self.things),
+                *(f"  {thing.summary()}" for thing in self.things),
             ]
         )
 

@@ -45,7 +45,7 @@ class ImportedHomeObject:
     entry: dict[str, Any]
     notes: tuple[str, ...]
 
-    def report(self) -> str:
+    def summary(self) -> str:
         """Return a line about the attachments of the object."""
         best = {
             joint: self.proposals.opening(joint)

@@ -76,7 +76,7 @@ class ImportedObject:
     notes: tuple[str, ...]
     picture: Path
 
-    def report(self) -> str:
+    def summary(self) -> str:
         """Return a readable report."""
         pieces, joints = (
             len(self.object.collision.geometryObjects),
@@ -90,7 +90,7 @@ class ImportedObject:
             head,
             *notes,
             f"attachments for the hand of {self.proposals.hand.robot}, best first:",
-            self.proposals.report(),
+            self.proposals.summary(),
         ]
         return "\n".join(lines)
 

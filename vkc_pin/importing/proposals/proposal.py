@@ -92,7 +92,7 @@ class Proposals:
         attachments = {proposal.attachment.name: proposal.attachment for proposal in self.found}
         return dataclasses.replace(self.object, attachments=MappingProxyType(attachments))
 
-    def report(self) -> str:
+    def summary(self) -> str:
         """Return a line for each attachment by joint, or the reason why it has none."""
         lines = []
         for index, joint in enumerate(self.object.coordinates.names):

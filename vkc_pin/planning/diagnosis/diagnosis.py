@@ -12,6 +12,7 @@ from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Violation
+from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH
 
 __all__ = ["BlockedGoal", "diagnose_goal", "diagnose_goals", "find_impossible_conditions"]
@@ -59,7 +60,7 @@ def find_impossible_conditions(problem: TrajectoryProblem) -> list[Violation]:
     for goal, solver in zip(problem.pose_goals, problem.transcription.pose_solvers, strict=True):
         if goal.kind == "closure" and goal.object in problem.scene.held and 1 in goal.row.waypoints:
             error = float(np.abs(solver.evaluate(problem.start[None], goal.target)[0]).max())
-            if error > problem.options.closure_position:
+            if error > Tolerances().closure_position:
                 detail = (
                     f"it is grasped at the start, but the hand is {error:.4f} m or rad "
                     "from its attachment"

@@ -89,7 +89,9 @@ class BeamSearch:
     ) -> None:
         self.sampler, self.problem, self.routes = sampler, sampler.problem, routes
         self.for_narrow_passages = for_narrow_passages
-        self.metric = np.sqrt(self.problem.effort.metric / self.problem.options.velocity_weight_arm)
+        self.metric = np.sqrt(
+            self.problem.motion_cost.metric / self.problem.options.velocity_weight_arm
+        )
         self.approaches = {
             end: find_approach_waypoint(end - phase.segments, end, self.problem.options)
             for phase, end in zip(self.problem.task.phases, self.problem.ends.tolist(), strict=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -24,9 +25,16 @@ from vkc_pin.planning.nlp.merit import Merit, measure_infeasibility
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 
-__all__ = ["INITIALIZATIONS", "MAX_GOOD_PENETRATION", "initialize", "interleave_guesses"]
+__all__ = [
+    "INITIALIZATIONS",
+    "MAX_GOOD_PENETRATION",
+    "Initialization",
+    "initialize",
+    "interleave_guesses",
+]
 
-INITIALIZATIONS = ("auto", "interpolated", "astar", "rrt", "stationary")
+Initialization = Literal["auto", "interpolated", "astar", "rrt", "stationary"]
+INITIALIZATIONS: tuple[Initialization, ...] = get_args(Initialization)
 MAX_GOOD_PENETRATION = 0.045
 """Penetration [m] at a waypoint, or total shortfall, of a guess that is good enough."""
 _COMPARED_PATHS = 8  # paths of the beam that are turned into guesses and compared

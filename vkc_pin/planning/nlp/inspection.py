@@ -91,7 +91,7 @@ def planes(problem: TrajectoryProblem, z: Floats, waypoint: int) -> list[Plane]:
     coefficients, offsets = model.compute_planes(z, contacts, slots=t.slots)
     x = t.pack(z)
     dt, targets = problem.timing_for(z).dt, problem.target_matrix()
-    weights, penalty = problem.effort.weights(*problem.rates(z)), problem.options.penalty
+    weights, penalty = problem.motion_cost.weights(*problem.rates(z)), problem.options.penalty
     parameters = t.parameter_vector(
         problem.start, coefficients, offsets, targets, weights=weights, penalty=penalty, dt=dt
     )

@@ -26,6 +26,7 @@ from vkc_pin.planning.nlp.transcription import transcribe
 from vkc_pin.planning.nlp.waypoint import Structure
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.cache import Cache
+from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.models.coordinates import wrap_angle
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
@@ -37,6 +38,7 @@ __all__ = ["TrajectoryProblem"]
 
 # Relative cost of coordinates that are chosen at the grasp and constant afterwards; it only
 # regularises the problem.
+_TOLERANCES = Tolerances()
 _CHOSEN_FREEDOM_WEIGHT = 1e-4
 
 
@@ -51,7 +53,7 @@ class TrajectoryProblem:
         rolling: Motion constraints of its base.
         contacts: Collision model of the task.
         transcription: Symbolic program, shared between problems of one structure.
-        effort: Cost of the motion.
+        motion_cost: Cost of the motion.
         start: z_0, shape (n,).
         lower, upper: Bounds of z_1..z_N, shape (N, n): joint limits (eq. 4), fixed coordinates,
             joint goals.
@@ -85,7 +87,7 @@ class TrajectoryProblem:
         self.targets = tuple(goal.target for goal in self.pose_goals)
         rows, self.terms = locate_terms(scene, self.chain, task, terms)
         self.transcription = transcribe(self._make_structure(rows), self.cache)
-        self.effort = self._make_motion_cost()
+        self.motion_cost = self._make_motion_cost()
         self.start = self._make_start()
         self.lower, self.upper = self._make_bounds()
         for array in (self.start, self.lower, self.upper):
@@ -147,7 +149,11 @@ class TrajectoryProblem:
         metric[[column for column, _, _ in self.choices]] *= _CHOSEN_FREEDOM_WEIGHT
         stops = self.transcription.structure.stops
         return MotionCost(
-            metric, o.acceleration_weight / o.dt**2, self.ends, stops, length=o.effort == "length"
+            metric,
+            o.acceleration_weight / o.dt**2,
+            self.ends,
+            stops,
+            length=o.objective == "path_length",
         )
 
     def _make_start(self) -> Floats:
@@ -294,7 +300,7 @@ class TrajectoryProblem:
             z: z_1..z_N.
             dt: Step durations, shape (N,) [s].
         """
-        return self.effort.value(*self.rates(z)) + self.term_evaluator.compute_cost(z, dt)
+        return self.motion_cost.value(*self.rates(z)) + self.term_evaluator.compute_cost(z, dt)
 
     def pose_error(self, z: Floats) -> float:
         """Return the largest residual of closure (eq. 2), goals (eq. 3) and rolling [m], [rad]."""
@@ -351,7 +357,7 @@ class TrajectoryProblem:
         """
         path, worst = self.waypoints(z), 0.0
         midpoints = (path[1:] + path[:-1]) / 2
-        allowed = np.array([self.options.closure_position, self.options.closure_angle])
+        allowed = np.array([_TOLERANCES.closure_position, _TOLERANCES.closure_angle])
         for goal, solver in zip(self.pose_goals, self.transcription.pose_solvers, strict=True):
             closed = np.array(
                 [t - 1 for t in goal.row.waypoints if t - 1 in goal.row.waypoints], int

@@ -142,7 +142,7 @@ class Subproblem:
             planes,
             offsets,
             self._targets,
-            weights=problem.effort.weights(*problem.rates(z)),
+            weights=problem.motion_cost.weights(*problem.rates(z)),
             penalty=merit.weights["clearance"],
             dt=timing.dt,
             pose_offsets=found.pose_offsets,

@@ -59,16 +59,14 @@ def motion_html(plan: CheckedMotion) -> str:
     head = f'<b>{escape(plan.scene.name)}: <span style="color: {_GOOD if good else _BAD}">{escape(status)}</span></b>'
     phases = escape(", ".join(phase.name for phase in plan.trajectory.phases))
     rows = [
-        ("base", _value(m, "base_effort", "m", 2)),
-        ("arm", _value(m, "arm_effort", "rad", 2)),
+        ("base", _value(m, "base_path_length", "m", 2)),
+        ("arm", _value(m, "arm_path_length", "rad", 2)),
         ("clearance", _value(m, "clearance", "mm", 1, 1e3)),
         ("duration", _value(m, "duration", "s", 1)),
         ("planned in", _value(m, "planning_time", "s", 2)),
         ("seed", escape(f"{plan.initialization or 'unknown'}, random numbers {plan.seed}")),
     ]
-    found = [str(violation) for violation in plan.validation.violations] + list(
-        plan.validation.notes
-    )
+    found = [str(violation) for violation in plan.report.violations] + list(plan.report.notes)
     lines = [
         *found[:_LISTED],
         *([f"... and {len(found) - _LISTED} more"] if len(found) > _LISTED else []),

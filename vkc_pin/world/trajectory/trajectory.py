@@ -212,15 +212,15 @@ class Trajectory:
         )
         return np.asarray(np.diff(velocity, axis=0) / spans[:, None])
 
-    def base_effort(self) -> float:
+    def base_path_length(self) -> float:
         """Return the path length of the base, Σ √(δx² + δy²) [m]."""
         return float(np.linalg.norm(np.diff(self._path[:, :2], axis=0), axis=1).sum())
 
-    def base_effort_l1(self) -> float:
+    def base_path_length_l1(self) -> float:
         """Return Σ |δx| + |δy| [m], the metric of the method's authors."""
         return float(np.abs(np.diff(self._path[:, :2], axis=0)).sum())
 
-    def arm_effort(self) -> float:
+    def arm_path_length(self) -> float:
         """Return the sum of the arm joints' absolute displacements, Σ |δq_arm| [rad]."""
         return float(np.abs(np.diff(self._path[:, 3 : self.robot_size], axis=0)).sum())
 
@@ -247,12 +247,12 @@ class Trajectory:
         ]
 
     def metrics(self) -> dict[str, float]:
-        """Return duration [s], base_effort and base_effort_l1 [m], and arm_effort [rad]."""
+        """Return duration [s], base_path_length and base_path_length_l1 [m], and arm_path_length [rad]."""
         return {
             "duration": float(self.times[-1] - self.times[0]),
-            "base_effort": self.base_effort(),
-            "base_effort_l1": self.base_effort_l1(),
-            "arm_effort": self.arm_effort(),
+            "base_path_length": self.base_path_length(),
+            "base_path_length_l1": self.base_path_length_l1(),
+            "arm_path_length": self.arm_path_length(),
         }
 
     def to_dict(self) -> dict[str, Any]:

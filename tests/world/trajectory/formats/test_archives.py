@@ -88,10 +88,10 @@ def test_what_is_written_is_read(tmp_path: Path, saved: Path) -> None:
 DESCRIPTIONS: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
     (lambda about: about.pop("metrics"), "metrics: missing"),
     (lambda about: about.update(metrics=[1, 2]), "metrics: wrong value"),
-    (lambda about: about["metrics"].pop("base_effort"), "metrics.base_effort: missing"),
+    (lambda about: about["metrics"].pop("base_path_length"), "metrics.base_path_length: missing"),
     (
-        lambda about: about["metrics"].update(arm_effort=math.nan),
-        "metrics.arm_effort: wrong value .expected a finite number",
+        lambda about: about["metrics"].update(arm_path_length=math.nan),
+        "metrics.arm_path_length: wrong value .expected a finite number",
     ),
     (lambda about: about["metrics"].update(rounds=-1), "metrics.rounds: out of range"),
     (lambda about: about["metrics"].update(rounds=10**400), "metrics.rounds: wrong value"),
@@ -102,8 +102,8 @@ DESCRIPTIONS: list[tuple[Callable[[dict[str, Any]], Any], str]] = [
     (lambda about: about["metrics"].update(more=None), "metrics: the metric 'more' is none"),
     (lambda about: about["metrics"].update(clearance=math.nan), "metrics.clearance: out of range"),
     (
-        lambda about: about["metrics"].update(base_effort=0.1),
-        r"metrics.base_effort: not that of motion and report .*got 0.1",
+        lambda about: about["metrics"].update(base_path_length=0.1),
+        r"metrics.base_path_length: not that of motion and report .*got 0.1",
     ),
     (
         lambda about: about["metrics"].update(clearance=0.1),

@@ -10,7 +10,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, model_validator
@@ -33,6 +33,7 @@ __all__ = [
     "FORMAT",
     "METRICS",
     "STATUSES",
+    "PlanStatus",
     "read_archive",
     "resolve_folder",
     "serialize_folder",
@@ -47,34 +48,32 @@ ARRAYS = {"about": ("U", 0), "times": ("f", 1), "positions": ("f", 2)}
 CURVE = {"knot_times": ("f", 1), "knot_positions": ("f", 2), "knot_rates": ("f", 2)}
 """Additional parts of a motion with a curve."""
 _PARTS = ARRAYS | CURVE
-STATUSES = (
-    *(
-        "success",
-        "infeasible",
-        "not converged",
-        "time limit",
-        "effort spent",
-        "interrupted",
-        "rejected",
-    ),
-    *(
-        "no base pose",
-        "no base path",
-        "arm does not reach",
-        "no inverse kinematics",
-        "collision",
-        "too fast",
-        "closure",
-    ),
-)
+PlanStatus = Literal[
+    "success",
+    "infeasible",
+    "not converged",
+    "time limit",
+    "evaluation limit",
+    "interrupted",
+    "rejected",
+    "no base pose",
+    "no base path",
+    "arm does not reach",
+    "no inverse kinematics",
+    "collision",
+    "too fast",
+    "closure",
+]
+STATUSES: tuple[PlanStatus, ...] = get_args(PlanStatus)
+"""Statuses of plans; the last seven are stages in which a baseline failed."""
 """Status of plans; those in the second group belong to baselines."""
 METRICS = (
     *(
         "planning_time",
         "build_time",
-        "base_effort",
-        "base_effort_l1",
-        "arm_effort",
+        "base_path_length",
+        "base_path_length_l1",
+        "arm_path_length",
         "clearance",
         "closure_error",
         "duration",
@@ -82,7 +81,7 @@ METRICS = (
     *(
         "iterations",
         "rounds",
-        "effort",
+        "evaluations",
         "time_initialization",
         "time_coal",
         "time_casadi",
@@ -178,7 +177,7 @@ class _Others(BaseModel):
         return self
 
 
-_LATER = ("effort", "time_retiming", "torque")  # older files do not have it
+_LATER = ("evaluations", "time_retiming", "torque")  # older files do not have it
 _kinds: dict[str, Any] = {
     name: (Distance if name == "clearance" else Measured, 0.0 if name in _LATER else ...)
     for name in METRICS
@@ -224,7 +223,7 @@ class _About(Schema):
     options: dict[str, Any]
     trajectory: _Motion
     validation: _Report
-    status: Literal[STATUSES]  # type: ignore[valid-type]
+    status: PlanStatus
     metrics: _Metrics  # type: ignore[valid-type]
     seed: Count
     initialization: Text

@@ -1,0 +1,15 @@
+from .check import DatasetCheck, check_dataset
+from .dataset import Dataset
+from .episode import Episode
+from .generate import generate
+from .recipes.recipe import Recipe, load_recipe
+
+__all__ = [
+    "Dataset",
+    "DatasetCheck",
+    "Episode",
+    "Recipe",
+    "check_dataset",
+    "generate",
+    "load_recipe",
+]

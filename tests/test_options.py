@@ -90,7 +90,7 @@ def test_they_stay_as_they_are() -> None:
 def test_objective_is_one_of_two() -> None:
     assert Options(objective="control_effort").objective == "control_effort"
     for value in ("lengths", None, 1, np.nan):
-        with pytest.raises(InputError, match="'length' or 'squares'") as caught:
+        with pytest.raises(InputError, match="'path_length' or 'control_effort'") as caught:
             Options(objective=value)  # type: ignore[arg-type]
         assert caught.value.field == "Options.objective"
 

@@ -31,7 +31,7 @@ f 2 3 4
 
 def same(first: vkc.Plan, second: vkc.Plan) -> None:
     """Everything about two plans is equal, bit for bit."""
-    for name in ("steps", "options", "validation", "status", "seed", "initialization", "success"):
+    for name in ("steps", "options", "report", "status", "seed", "initialization", "success"):
         a, b = getattr(first, name), getattr(second, name)
         if name == "steps":
             a, b = [repr(step) for step in a], [repr(step) for step in b]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -39,26 +38,6 @@ def test_goal_of_an_object_joint(door_plan: vkc.Plan) -> None:
     assert (found.constraint, found.subject, found.unit) == ("goal", "door.hinge", "rad")
     assert found.waypoint == len(door_plan.trajectory.times) - 1
     assert found.amount == pytest.approx(0.05 - vkc.Tolerances().goal_angle, abs=1e-6)
-
-
-@pytest.mark.parametrize(("angle", "ok"), [(0.049, False), (0.051, True)])
-def test_goal_tolerance(door_plan: vkc.Plan, angle: float, ok: bool) -> None:
-    report = validate(
-        door_plan.scene,
-        [vkc.Actuate("door", {"hinge": 1.25})],
-        door_plan.trajectory,
-        tolerances=vkc.Tolerances(goal_angle=angle),
-    )
-    assert report.ok is ok
-
-
-@pytest.mark.parametrize(
-    "name", ["closure_position", "closure_angle", "goal_position", "goal_angle"]
-)
-@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, 11.0, "1", None])
-def test_invalid_tolerances(name: str, value: Any) -> None:
-    with pytest.raises(InputError, match=name):
-        vkc.Tolerances(**{name: value})
 
 
 def test_goal_of_a_grasp(door_plan: vkc.Plan) -> None:

@@ -1,4 +1,4 @@
-"""The command as a process: closed and full outputs lose nothing, Ctrl-C leaves nothing half done."""
+"""The process loses no files to closed or full outputs, and Ctrl-C leaves none half written."""
 
 from __future__ import annotations
 
@@ -30,10 +30,11 @@ UNFINISHED = [
 ]
 INFEASIBLE = ["plan", "drawer", "--set", "drawer.slide=9"]
 SUCCESS = ["plan", "drawer", "--set", "drawer.slide=0.3"]
+OUTPUTS = ["--save", "plan.npz", "--json", "plan.json", "--html", "plan.html"]
 
 
 @pytest.fixture(autouse=True)
-def here(monkeypatch: pytest.MonkeyPatch) -> None:
+def source_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(
         "PYTHONPATH", os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
     )
@@ -41,21 +42,21 @@ def here(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def full(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A device that is always full: one of our own if we may make one, or the machine's."""
+    """A device that is always full: a new one if permitted, else the system's."""
     path = tmp_path_factory.mktemp("device") / "full"
     if os.getuid() == 0:
         os.mknod(path, stat.S_IFCHR | 0o666, os.makedev(1, 7))
     else:
         path = Path("/dev/full")
     if not path.is_char_device():
-        pytest.skip("there is no device that is always full")
+        pytest.skip("no device is always full")
     return path
 
 
 def shell(
     redirected: str, words: list[str], folder: Path, full: Path
 ) -> subprocess.CompletedProcess[str]:
-    """Run a command with outputs redirected as a shell does it; PIPE is one that nobody reads from any more."""
+    """Run a command with redirected outputs; PIPE has no reader, FULL is a full device."""
     reads, writes = os.pipe()
     os.close(reads)
     redirected = redirected.replace("PIPE", f"&{writes}").replace("FULL", str(full))
@@ -74,8 +75,8 @@ def shell(
         os.close(writes)
 
 
-def whole(folder: Path) -> set[str]:
-    """Return the names of all files in a folder, each of which is complete."""
+def check_complete(folder: Path) -> set[str]:
+    """Return the names of all files in a folder; each of them must be complete."""
     names = {path.name for path in folder.iterdir()}
     assert not [name for name in names if name.startswith(".")]
     for name in names:
@@ -92,70 +93,52 @@ def whole(folder: Path) -> set[str]:
 
 @pytest.mark.parametrize(
     ("redirected", "words", "code"),
-    [
-        *(
-            (redirected, UNFINISHED, 1)
-            for redirected in (">PIPE", ">&-", "2>&-", "2>PIPE", "2>FULL", ">PIPE 2>PIPE")
-        ),
-        (">&- 2>&- <&-", INFEASIBLE, 3),
-    ],
+    [(">PIPE", UNFINISHED, 1), ("2>FULL", UNFINISHED, 1), (">&- 2>&- <&-", INFEASIBLE, 3)],
 )
-def test_closed_outputs_lose_nothing(
+def test_files_are_written_when_outputs_are_closed(
     redirected: str, words: list[str], code: int, tmp_path: Path, full: Path
 ) -> None:
-    """Nor is the next file that is opened taken for the output that is closed."""
-    done = shell(
-        redirected,
-        [*words, "--save", "plan.npz", "--json", "plan.json", "--html", "plan.html"],
-        tmp_path,
-        full,
-    )
+    """A file opened next must not take the place of the closed output."""
+    done = shell(redirected, [*words, *OUTPUTS], tmp_path, full)
     assert done.returncode == code, done
     assert "Traceback" not in done.stderr
     assert "cannot print" not in done.stderr
-    assert whole(tmp_path) == {"plan.npz", "plan.json", "plan.html"}
+    assert check_complete(tmp_path) == {"plan.npz", "plan.json", "plan.html"}
     if redirected.startswith("2"):
         assert "wrote plan.html" in done.stdout
 
 
-@pytest.mark.parametrize("redirected", ["", ">PIPE", ">&-", "2>FULL"])
-def test_progress_that_nobody_sees_is_no_failure(
-    redirected: str, tmp_path: Path, full: Path
-) -> None:
-    done = shell(redirected, [*SUCCESS, "--save", "plan.npz"], tmp_path, full)
+def test_progress_that_cannot_be_printed_is_no_failure(tmp_path: Path, full: Path) -> None:
+    done = shell("2>FULL", [*SUCCESS, "--save", "plan.npz"], tmp_path, full)
     assert done.returncode == 0, done
     assert vkc.Plan.load(tmp_path / "plan.npz").success
-    assert ("round  1" in done.stderr) == ("2>" not in redirected)
-    assert ("drawer: success" in done.stdout) == (redirected in ("", "2>FULL"))
+    assert "drawer: success" in done.stdout
 
 
 @pytest.mark.parametrize(
-    ("words", "code"),
-    [(UNFINISHED, 1), (INFEASIBLE, 3), (["view", "drawer"], 2)],
-    ids=["failed", "infeasible", "done"],
+    ("words", "code"), [(INFEASIBLE, 3), (["view", "drawer"], 2)], ids=["infeasible", "success"]
 )
-def test_a_full_disk_is_no_success(words: list[str], code: int, tmp_path: Path, full: Path) -> None:
-    """The files are there all the same, and what was no success stays what it was."""
+def test_report_on_a_full_disk_is_no_success(
+    words: list[str], code: int, tmp_path: Path, full: Path
+) -> None:
+    """Files are written all the same, and a failure keeps its code."""
     done = shell(">FULL", [*words, "--html", "page.html"], tmp_path, full)
     assert (done.returncode, done.stdout) == (code, "")
     assert done.stderr.splitlines()[-1] == "vkc-pin: cannot print: No space left on device"
     assert "Traceback" not in done.stderr
-    assert whole(tmp_path) == {"page.html"}
+    assert check_complete(tmp_path) == {"page.html"}
 
 
-@pytest.mark.parametrize(
-    ("redirected", "code"), [(">PIPE", 0), (">&-", 0), (">FULL", 2), ("2>FULL >FULL", 2)]
-)
-@pytest.mark.parametrize("word", ["--help", "--version"])
-def test_help_goes_the_same_way(
-    redirected: str, code: int, word: str, tmp_path: Path, full: Path
+@pytest.mark.parametrize(("redirected", "code"), [(">PIPE", 0), (">FULL", 2)])
+def test_help_on_closed_and_full_outputs(
+    redirected: str, code: int, tmp_path: Path, full: Path
 ) -> None:
-    done = shell(redirected, [word], tmp_path, full)
+    done = shell(redirected, ["--help"], tmp_path, full)
     assert done.returncode == code, done
     assert "Traceback" not in done.stderr
 
 
-def test_letters_that_the_terminal_does_not_have(
+def test_characters_outside_the_encoding_are_escaped(
     tmp_path: Path, full: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PYTHONIOENCODING", "ascii")
@@ -164,8 +147,8 @@ def test_letters_that_the_terminal_does_not_have(
     assert "drawer: FAILED, time limit \\u2014 stand" in done.stdout
 
 
-def started(words: list[str], folder: Path, *options: str) -> subprocess.Popen[str]:
-    """Start a command that Ctrl-C reaches, with options of Python."""
+def start(words: list[str], folder: Path, *options: str) -> subprocess.Popen[str]:
+    """Start a command that Ctrl-C interrupts, with options of Python."""
     command = [COMMAND[0], *options, *COMMAND[1:], *words]
     return subprocess.Popen(
         command,
@@ -175,100 +158,74 @@ def started(words: list[str], folder: Path, *options: str) -> subprocess.Popen[s
         text=True,
         preexec_fn=lambda: signal.signal(
             signal.SIGINT, signal.SIG_DFL
-        ),  # a shell may have made the tests ignore it
+        ),  # the shell of the tests may ignore it
     )
 
 
-def lines(process: subprocess.Popen[str], said: list[str]) -> Iterator[str]:
+def read_lines(process: subprocess.Popen[str], printed: list[str]) -> Iterator[str]:
     assert process.stderr is not None
     for line in process.stderr:
-        said.append(line)
+        printed.append(line)
         yield line
 
 
-def ended(process: subprocess.Popen[str], said: list[str]) -> int:
-    """Return the code a process ends with, which says nothing that it should not."""
+def finish(process: subprocess.Popen[str], printed: list[str]) -> int:
+    """Return the exit code of a process; it must end without a traceback."""
     assert process.stderr is not None
-    said += process.stderr.readlines()
+    printed += process.stderr.readlines()
     process.communicate(timeout=60)
-    told = "".join(line for line in said if not line.startswith("import time:"))
-    assert "Traceback" not in told, told
-    assert "Exception ignored" not in told, told
+    errors = "".join(line for line in printed if not line.startswith("import time:"))
+    assert "Traceback" not in errors, errors
+    assert "Exception ignored" not in errors, errors
     return process.returncode
 
 
-OUTPUTS = ["--save", "plan.npz", "--json", "plan.json", "--html", "plan.html"]
-
-
-@pytest.mark.parametrize(
-    "module",
-    [
-        "_signal",
-        "argparse",
-        "numpy",
-        "pinocchio",
-        "vkc_pin.world.scene.scene",
-        "coal",
-        "casadi",
-        "vkc_pin.planning.plan",
-        "vkc_pin.planning.solver.loop",
-    ],
-)
-def test_ctrl_c_while_it_imports(module: str, tmp_path: Path) -> None:
-    process, said = (
-        started([*SUCCESS, *OUTPUTS], tmp_path, "-X", "importtime"),
-        [],
-    )  # it then tells what it imports
+@pytest.mark.parametrize("module", ["argparse", "pinocchio", "vkc_pin.planning.solver.loop"])
+def test_ctrl_c_during_imports_writes_nothing(module: str, tmp_path: Path) -> None:
+    process, printed = start([*SUCCESS, *OUTPUTS], tmp_path, "-X", "importtime"), []
     begun = False
-    for line in lines(process, said):
+    for line in read_lines(process, printed):
         name = line.rpartition("|")[2].strip()
-        begun = (
-            begun or name == "vkc_pin"
-        )  # from here on it is in our hands, but for the few lines that take it there
-        if begun and (name == module or module == "_signal"):
-            time.sleep(0.05 if module == "_signal" else 0.0)
+        begun = begun or name == "vkc_pin"  # the handler is installed from here on
+        if begun and name == module:
             process.send_signal(signal.SIGINT)
             break
     else:
         pytest.fail(f"{module} is not imported")
-    assert ended(process, said) == 130
-    assert whole(tmp_path) == set()
+    assert finish(process, printed) == 130
+    assert check_complete(tmp_path) == set()
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.1, 0.3])
-def test_ctrl_c_while_it_plans(delay: float, tmp_path: Path) -> None:
-    """It returns the best there is by then, and writes it."""
-    process, said = started([*SUCCESS, *OUTPUTS], tmp_path), []
-    next(line for line in lines(process, said) if re.match(r"  round +1 ", line))
-    time.sleep(delay)
+def test_ctrl_c_while_planning_writes_the_best_motion(tmp_path: Path) -> None:
+    process, printed = start([*SUCCESS, *OUTPUTS], tmp_path), []
+    next(line for line in read_lines(process, printed) if re.match(r"  round +1 ", line))
     process.send_signal(signal.SIGINT)
-    code = ended(process, said)
-    assert code in (0, 130)  # at the very end it makes no difference any more
-    assert whole(tmp_path) <= {"plan.npz", "plan.json", "plan.html"}
+    code = finish(process, printed)
+    assert code in (0, 130)  # planning may be over by then
+    assert check_complete(tmp_path) <= {"plan.npz", "plan.json", "plan.html"}
     if code == 130 and (tmp_path / "plan.npz").exists():
         assert vkc.Plan.load(tmp_path / "plan.npz").status in ("interrupted", "success")
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.05, 0.1, 0.2, 0.4, 0.8])
-def test_ctrl_c_while_it_writes(delay: float, tmp_path: Path) -> None:
-    """Written is the plan, and of the rest nothing or all."""
-    process = started([*SUCCESS, *OUTPUTS, "--plots", "plots", "--quiet"], tmp_path)
+@pytest.mark.parametrize("delay", [0.0, 0.2])
+def test_ctrl_c_while_writing_leaves_complete_files(delay: float, tmp_path: Path) -> None:
+    process = start([*SUCCESS, *OUTPUTS, "--plots", "plots", "--quiet"], tmp_path)
     while not (tmp_path / "plan.npz").exists():
         assert process.poll() is None
         time.sleep(0.002)
     time.sleep(delay)
     process.send_signal(signal.SIGINT)
-    assert ended(process, []) in (0, 130)
+    assert finish(process, []) in (0, 130)
     for picture in (tmp_path / "plots").glob("*"):
         assert picture.read_bytes()[-8:-4] == b"IEND"
         picture.unlink()
     if (tmp_path / "plots").is_dir():
         (tmp_path / "plots").rmdir()
-    assert {"plan.npz"} <= whole(tmp_path)
+    assert {"plan.npz"} <= check_complete(tmp_path)
 
 
-def test_ctrl_c_that_is_ignored_stays_so(tmp_path: Path) -> None:
-    """As it is in the background of a script."""
+def test_ignored_ctrl_c_stays_ignored(tmp_path: Path) -> None:
+    """Background processes of scripts ignore it."""
     command = [*COMMAND, "view", "drawer", "--html", "page.html"]
     process = subprocess.Popen(
         command, cwd=tmp_path, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -277,4 +234,4 @@ def test_ctrl_c_that_is_ignored_stays_so(tmp_path: Path) -> None:
         process.send_signal(signal.SIGINT)
         time.sleep(0.05)
     assert process.returncode == 0
-    assert whole(tmp_path) == {"page.html"}
+    assert check_complete(tmp_path) == {"page.html"}

@@ -1,4 +1,4 @@
-"""Plans to execute in physics, and motions that stand still."""
+"""Plans to execute in physics, results of executions, and stationary motions."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import pinocchio as pin
 
 import vkc_pin as vkc
 from vkc_pin.planning.plan import Plan
+from vkc_pin.simulation.result import SimulationResult
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import PhaseSpan, Trajectory
 
-__all__ = ["door_plan", "drawer_plan", "holding", "still", "with_mass"]
+__all__ = ["door_plan", "drawer_plan", "drawer_result", "holding", "still", "with_mass"]
 
 
 @cache
@@ -30,6 +31,12 @@ def door_plan() -> Plan:
     plan = vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 1.2})])
     assert plan.success
     return plan
+
+
+@cache
+def drawer_result() -> SimulationResult:
+    """Return the execution of the plan that pulls the drawer."""
+    return drawer_plan().simulate()
 
 
 def holding() -> Scene:

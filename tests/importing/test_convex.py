@@ -8,10 +8,10 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
 
 import vkc_pin as vkc
-from vkc_pin.importing import convex
-from vkc_pin.importing.convex import compute_concavity, compute_solid_volume, decompose
+from vkc_pin.importing.convex import compute_concavity, compute_solid_volume, decompose, slice_mesh
 from vkc_pin.utils import disk_cache
 
 box = trimesh.creation.box
@@ -43,27 +43,20 @@ def tray() -> trimesh.Trimesh:
     return mesh
 
 
-def test_a_convex_mesh_stays_one_piece_of_its_own_volume() -> None:
-    pieces = decompose(box((0.3, 0.2, 0.1)))
-    assert len(pieces.meshes) == 1
-    assert pieces.volume == pytest.approx(0.006)
-    assert pieces.solid == pytest.approx(0.006)
-    assert pieces.overhead == pytest.approx(0.0, abs=1e-9)
-    assert pieces.error < 1e-5
-
-
-def test_bodies_become_pieces_of_their_own() -> None:
-    """No search: two boxes are two boxes, to the millimetre."""
-    pieces = decompose(
-        trimesh.util.concatenate(
-            [box((1, 0.1, 0.1)), box((0.1, 0.1, 1)).apply_translation((0.4, 0, 0.6))]
-        )
-    )
+def test_convex_bodies_stay_as_they_are() -> None:
+    corner = box((0.1, 0.1, 1)).apply_translation((0.4, 0, 0.6))
+    pieces = decompose(trimesh.util.concatenate([box((1, 0.1, 0.1)), corner]))
     assert sorted(len(piece.vertices) for piece in pieces.meshes) == [8, 8]
     assert pieces.volume == pytest.approx(0.02, rel=1e-6)
+    assert pieces.error < 1e-5
+    single = decompose(box((0.3, 0.2, 0.1)))
+    assert (single.solid, single.overhead) == pytest.approx((0.006, 0.0), abs=1e-9)
 
 
-def test_a_bin_becomes_hollow() -> None:
+def test_bin_becomes_hollow_the_same_way_every_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pieces from the cache equal those of the first call bit for bit."""
     mesh = tray()
     assert compute_concavity(mesh) > 0.08
     pieces = decompose(mesh)
@@ -74,18 +67,18 @@ def test_a_bin_becomes_hollow() -> None:
     assert inside(pieces.meshes, trimesh.sample.sample_surface(mesh, 3000, seed=5)[0]).max() < 2e-3
     assert inside(pieces.meshes, mesh.vertices).max() < 1e-7
     assert decompose(mesh, most_pieces=1).overhead > 1.5
-
-
-def test_the_same_mesh_gives_the_same_pieces() -> None:
-    first, second = decompose(tray()), decompose(tray())
-    assert len(first.meshes) == len(second.meshes)
-    for one, other in zip(first.meshes, second.meshes, strict=True):
-        np.testing.assert_array_equal(one.vertices, other.vertices)
+    monkeypatch.setenv(disk_cache.CACHE_VARIABLE, str(tmp_path / "cache"))
+    for again in (decompose(mesh), decompose(mesh)):
+        assert (again.solid, again.error) == (pieces.solid, pieces.error)
+        for one, other in zip(pieces.meshes, again.meshes, strict=True):
+            np.testing.assert_array_equal(one.vertices, other.vertices)
+            np.testing.assert_array_equal(one.faces, other.faces)
+    assert len(decompose(mesh, most_pieces=6).meshes) <= 6
 
 
 @settings(max_examples=8, deadline=None)
 @given(st.integers(0, 2**31))
-def test_pieces_contain_the_corners_of_whatever_is_cut(seed: int) -> None:
+def test_pieces_contain_the_corners_of_the_mesh(seed: int) -> None:
     """An angle of random arms; every second one has a triangle missing, and is cut by planes."""
     rng = np.random.default_rng(seed)
     a, b, c = rng.uniform(0.2, 0.6, 3)
@@ -102,7 +95,7 @@ def test_pieces_contain_the_corners_of_whatever_is_cut(seed: int) -> None:
     assert pieces.volume < 0.8 * decompose(mesh, most_pieces=1).volume
 
 
-def test_volume_of_a_skin_that_is_not_closed() -> None:
+def test_volume_of_an_open_surface() -> None:
     """A box without a corner of its lid holds what it held; one without the lid is a thin shell."""
     whole = box((0.4, 0.3, 0.2)).subdivide_to_size(0.02)
     pierced, open_ = whole.copy(), whole.copy()
@@ -113,7 +106,9 @@ def test_volume_of_a_skin_that_is_not_closed() -> None:
     assert not pierced.is_watertight
 
 
-def test_what_cannot_be_cut_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_meshes_and_arguments_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     flat = tmp_path / "flat.stl"
     trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]]).export(
         flat
@@ -131,31 +126,15 @@ def test_what_cannot_be_cut_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyP
         decompose(tray())
 
 
-def test_a_mesh_that_was_cut_is_not_cut_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What is kept gives the same pieces to the last bit; other meshes and settings are cut on their own."""
-    monkeypatch.setenv(disk_cache.CACHE_VARIABLE, str(tmp_path / "cache"))
-    cut, real = [], convex._cut_mesh
-    monkeypatch.setattr(convex, "_cut_mesh", lambda *rest: (cut.append(rest), real(*rest))[1])
-    mesh = tray()
-    first, again = decompose(mesh), decompose(mesh)
-    assert len(cut) == 1
-    assert (first.solid, first.error) == (again.solid, again.error)
-    for one, other in zip(first.meshes, again.meshes, strict=True):
-        np.testing.assert_array_equal(one.vertices, other.vertices)
-        np.testing.assert_array_equal(one.faces, other.faces)
-    wider = mesh.copy()
-    wider.apply_scale((1.0, 1.0, 1.01))
-    asked: list[float] = []
-    monkeypatch.setattr(
-        convex, "_cut_mesh", lambda mesh, most, *_: (asked.append(most), [mesh.vertices])[1]
+def test_open_angle_is_cut_into_its_arms() -> None:
+    """Two plates without ends, at a right angle: cut near where they meet."""
+    plates = [trimesh.creation.box((1.0, 0.02, 0.5)), trimesh.creation.box((0.02, 1.0, 0.5))]
+    mesh = trimesh.util.concatenate(
+        [plates[0].apply_translation((0.5, 0, 0)), plates[1].apply_translation((0, 0.5, 0))]
     )
-    for other, changed in (
-        (wider, {}),
-        (mesh, {"most_pieces": 6}),
-        (mesh, {"error": 0.03}),
-        (mesh, {"seed": 1}),
-    ):
-        decompose(other, **changed)  # type: ignore[arg-type]
-    assert len(asked) == 4
+    mesh.update_faces(np.abs(mesh.face_normals[:, 2]) < 0.5)
+    parts = slice_mesh(mesh, 4)
+    assert 2 <= len(parts) <= 4
+    assert sum(ConvexHull(part).volume for part in parts) < 0.3 * ConvexHull(mesh.vertices).volume
+    for corner in mesh.vertices:
+        assert any(np.abs(part - corner).max(axis=1).min() < 1e-12 for part in parts)

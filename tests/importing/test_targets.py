@@ -30,19 +30,13 @@ def test_only_output_of_the_same_command_may_be_replaced(tmp_path: Path) -> None
         with pytest.raises(vkc.InputError, match=expected) as caught:
             check_target(folder, command, force=force)
         assert caught.value.field == "folder"
+    with pytest.raises(vkc.InputError, match="got a file"):
+        check_target(folder / "a.yaml", "import-home", force=True)
     (folder / "a.yaml").write_text(
         f"no first line\n{get_origin_marker('import-home')}.\n", encoding="utf-8"
     )
     with pytest.raises(vkc.InputError, match="other files"):
         check_target(folder, "import-home", force=True)
-
-
-def test_file_in_place_of_folder_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "mine").write_text(
-        f"# Made of x {get_origin_marker('import-home')}.\n", encoding="utf-8"
-    )
-    with pytest.raises(vkc.InputError, match="got a file"):
-        check_target(tmp_path / "mine", "import-home", force=True)
 
 
 @given(st.text())
@@ -55,14 +49,3 @@ def test_comment_is_one_line_with_the_text(text: str) -> None:
         assert yaml.load(f"{line}free: false\n", Loader=loader) == {"free": False}
     escaped = line[2:-1].encode("ascii", "backslashreplace")
     assert escaped.decode("unicode_escape") == text
-
-
-def test_plain_text_is_kept_in_comment() -> None:
-    assert format_comment("Made of Küche (1).urdf: “x”.") == "# Made of Küche (1).urdf: “x”.\n"
-
-
-def test_marker_is_found_after_the_longest_file_name(tmp_path: Path) -> None:
-    name = "\udcff" * 255
-    head = format_comment(f"Made of {name} {get_origin_marker('import-home')}.")
-    (tmp_path / "a.yaml").write_text(head, encoding="utf-8")
-    check_target(tmp_path, "import-home", force=True)

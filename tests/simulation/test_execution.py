@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.executions import door_plan, drawer_plan, holding, still, with_mass
-from helpers.telescopes import telescope_scene
+from helpers.executions import door_plan, drawer_plan, drawer_result, holding, still, with_mass
 
 import vkc_pin as vkc
 from vkc_pin.simulation.execution import simulate
@@ -16,7 +15,7 @@ from vkc_pin.world.scene.scene import Scene
 
 
 def test_drawer_is_pulled() -> None:
-    result = drawer_plan().simulate()
+    result = drawer_result()
     assert result.ok, result.summary()
     (miss,) = result.misses
     assert (miss.subject, miss.unit) == ("drawer.slide", "m")
@@ -36,30 +35,6 @@ def test_drawer_is_pulled() -> None:
     assert result.contacts == ()
 
 
-def test_telescope_segments_move_together(tmp_path: Path) -> None:
-    scene = telescope_scene(tmp_path, base="fixed")
-    file = tmp_path / "robot.urdf"
-    file.write_text(
-        file.read_text().replace('effort="10"', 'effort="300"')
-    )  # the lift carries the whole arm
-    plan = vkc.plan(
-        vkc.Scene.from_document(scene.document, tmp_path),
-        [vkc.Actuate("drawer", {"slide": 0.15})],
-        seed=0,
-    )
-    assert plan.success, plan.summary()
-    result = plan.simulate()
-    assert result.ok, result.summary()
-    assert result.tracking.arm[0] < np.radians(1.0)
-    assert (
-        np.abs(
-            result.trajectory.column("out_1") - plan.trajectory.at(result.trajectory.times)[:, 4]
-        ).max()
-        < 1e-3
-    )
-    assert {*result.tracking.shares} == {*scene.robot.coordinates.names[3:]}
-
-
 def test_latched_door_opens_when_its_lever_is_turned() -> None:
     result = door_plan().simulate()
     assert result.ok, result.summary()
@@ -71,29 +46,11 @@ def test_latched_door_opens_when_its_lever_is_turned() -> None:
     assert max(result.tracking.shares.values()) < 1.0
 
 
-def test_latch_with_higher_threshold_keeps_the_door_closed() -> None:
-    """The robot repeats its motion at a stiffer latch: the hand loses the handle."""
-    plan = door_plan()
-    document = plan.scene.document
-    scene = Scene.from_document(document, plan.scene.folder).with_start(
-        base=plan.scene.start[:3], arm=plan.scene.start[3:]
-    )
-    (latch,) = scene.objects["door"].object.latches
-    object.__setattr__(latch, "threshold", 0.75)
-    result = plan.simulate(actual=scene)
-    assert not result.ok
-    assert result.grips[0].broken is not None
-    assert any("pulled out of the hand" in line for line in result.problems())
-    assert any("door.hinge" in line for line in result.problems())
-
-
 def test_hand_loses_heavy_object() -> None:
     scene = holding()
-    light = simulate(scene, [vkc.Grasp("stick")], still(scene))
     heavy = simulate(
         scene, [vkc.Grasp("stick")], still(scene), actual=with_mass(scene, "stick", 60.0)
     )
-    assert light.grips[0].broken is None
     assert heavy.grips[0].broken is not None
     assert "stick.grip was pulled out of the hand" in heavy.summary()
     assert not heavy.ok
@@ -136,12 +93,11 @@ def test_diverged_simulation_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_simulation_is_deterministic() -> None:
-    one, other = drawer_plan().simulate(), drawer_plan().simulate()
-    np.testing.assert_array_equal(one.rows, other.rows)
+    np.testing.assert_array_equal(drawer_plan().simulate().rows, drawer_result().rows)
 
 
 def test_result_round_trips_through_json(tmp_path: Path) -> None:
-    result = drawer_plan().simulate()
+    result = drawer_result()
     data = json.loads(result.to_json(tmp_path / "result.json").read_text(encoding="utf-8"))
     assert data["ok"] is True
     assert data["misses"][0]["subject"] == "drawer.slide"
@@ -155,15 +111,10 @@ def test_result_round_trips_through_json(tmp_path: Path) -> None:
         ({"grasp": "glue"}, "grasp"),
         ({"physics": 3}, "physics"),
         ({"actual": "drawer"}, "actual"),
+        ({"actual": vkc.load_scene("door")}, "actual"),
     ],
 )
 def test_invalid_argument_is_named(options: dict[str, object], field: str) -> None:
     with pytest.raises(vkc.InputError) as caught:
         drawer_plan().simulate(**options)
     assert caught.value.field == field
-
-
-def test_missing_object_is_refused() -> None:
-    with pytest.raises(vkc.InputError, match="lacks the object 'drawer'") as caught:
-        drawer_plan().simulate(actual=vkc.load_scene("door"))
-    assert caught.value.expected == "drawer"

@@ -45,7 +45,7 @@ def random_rows(world: World, count: int) -> np.ndarray:
     return rows
 
 
-@pytest.mark.parametrize("name", ["door", "drawer", "household", "init_1", "tray", "coupled"])
+@pytest.mark.parametrize("name", ["door", "household", "coupled"])
 def test_placements_agree_with_pinocchio(name: str, tmp_path: Path) -> None:
     coupled = name == "coupled"
     scene = coupled_scene(tmp_path) if coupled else vkc.load_scene(name)
@@ -82,9 +82,8 @@ def test_placements_agree_with_pinocchio(name: str, tmp_path: Path) -> None:
             np.testing.assert_allclose(vertices.max(axis=0), points.max(axis=0), atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["door", "household", "tray"])
-def test_masses_agree_with_pinocchio(name: str) -> None:
-    physical = build_model(vkc.load_scene(name))
+def test_masses_agree_with_pinocchio() -> None:
+    physical = build_model(vkc.load_scene("household"))
     tree = World(physical.world.scene).model  # as the files have it
     for joint in range(1, tree.njoints):
         inertia, body = tree.inertias[joint], int(physical.bodies[joint])

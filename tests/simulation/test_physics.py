@@ -40,11 +40,6 @@ def test_out_of_range_setting_is_named(name: str, value: object) -> None:
     assert caught.value.field == f"Physics.{name}"
 
 
-def test_settings_are_converted_to_floats() -> None:
-    assert vkc.Physics(settle=1).settle == 1.0
-    assert vkc.Physics(balanced=False).balanced is False
-
-
 def test_impossible_inertia_is_corrected_with_a_note() -> None:
     world = World(holding())
     joint = world.model.getJointId("stick.placement")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from helpers.executions import drawer_plan, holding, still
+from helpers.executions import drawer_result, holding, still
 
 import vkc_pin as vkc
 from vkc_pin.simulation.execution import simulate
@@ -22,7 +22,7 @@ def test_replay_reproduces_executed_coordinates() -> None:
 
 
 def test_page_contains_motion_and_ghost(tmp_path: Path) -> None:
-    result = drawer_plan().simulate()
+    result = drawer_result()
     text = result.to_html(tmp_path / "page.html").read_text(encoding="utf-8")
     assert "drawer in physics: ok" in text
     assert "as planned" in text

@@ -10,7 +10,7 @@ MOTION = np.array(
 )
 
 
-def test_all_of_the_motion_is_in_the_picture() -> None:
+def test_camera_sees_the_whole_motion() -> None:
     target, position = choose_viewpoint(MOTION, [])
     depth_axis = target - position
     distance = np.linalg.norm(depth_axis)
@@ -27,7 +27,7 @@ def test_all_of_the_motion_is_in_the_picture() -> None:
     assert np.abs(local @ right / depth).max() > 0.5 * half, "not from far away either"
 
 
-def test_a_motion_along_x_is_seen_from_the_side_with_x_to_the_right() -> None:
+def test_motion_along_x_is_seen_from_its_side() -> None:
     target, position = choose_viewpoint(MOTION, [])
     assert position[1] < -2.0
     assert abs(position[0] - target[0]) < 1.5
@@ -35,12 +35,12 @@ def test_a_motion_along_x_is_seen_from_the_side_with_x_to_the_right() -> None:
 
 
 @pytest.mark.parametrize(("opacity", "behind"), [(1.0, False), (0.0, True)])
-def test_it_walks_round_what_stands_in_the_way(opacity: float, behind: bool) -> None:
+def test_camera_avoids_opaque_obstructions(opacity: float, behind: bool) -> None:
     cupboard = (np.array([-2.0, -1.6, 0.0]), np.array([4.0, -1.0, 4.0]), opacity)
     assert bool(choose_viewpoint(MOTION, [cupboard])[1][1] < -1.6) is behind
 
 
-def test_a_single_point_is_seen_too() -> None:
+def test_single_point_has_a_viewpoint() -> None:
     _, position = choose_viewpoint(np.zeros((1, 3)), [])
     assert np.isfinite(position).all()
     assert np.linalg.norm(position) >= 1.0

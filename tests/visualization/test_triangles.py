@@ -6,7 +6,6 @@ import pinocchio as pin
 import pytest
 import trimesh
 
-from vkc_pin.errors import InputError
 from vkc_pin.visualization.plots.top_view import outline
 from vkc_pin.visualization.triangles import (
     Solid,
@@ -17,8 +16,6 @@ from vkc_pin.visualization.triangles import (
     to_solid,
     tube,
 )
-from vkc_pin.world.files.meshes import MeshPart, make_bvh
-from vkc_pin.world.models.shapes import triangulate
 
 
 def as_mesh(solid: Solid) -> trimesh.Trimesh:
@@ -32,43 +29,7 @@ def ball(radius: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
     return np.array(mesh.vertices), np.array(mesh.faces)
 
 
-@pytest.mark.parametrize(
-    ("shape", "volume", "size"),
-    [
-        (coal.Box(1.0, 2.0, 3.0), 6.0, (1, 2, 3)),
-        (coal.Sphere(0.5), np.pi / 6, (1, 1, 1)),
-        (coal.Ellipsoid(1.0, 2.0, 3.0), 8 * np.pi, (2, 4, 6)),
-        (coal.Cylinder(0.5, 2.0), np.pi / 2, (1, 1, 2)),
-        (coal.Cone(0.5, 3.0), np.pi / 4, (1, 1, 3)),
-        (coal.Capsule(0.5, 2.0), np.pi / 2 + np.pi / 6, (1, 1, 3)),
-        (make_bvh(MeshPart(*ball())), np.pi / 6, (1, 1, 1)),
-    ],
-)
-def test_surface_of_every_shape(
-    shape: coal.CollisionGeometry, volume: float, size: tuple[float, ...]
-) -> None:
-    vertices, faces = triangulate(shape)
-    mesh = trimesh.Trimesh(vertices, faces)
-    assert mesh.volume == pytest.approx(volume, rel=0.05), "wound outwards, and nearly round"
-    assert np.allclose(np.ptp(vertices, axis=0), size, rtol=0.03)
-    assert np.allclose(vertices.min(axis=0) + vertices.max(axis=0), 0.0, atol=1e-6), (
-        "centred as coal's shapes are"
-    )
-
-
-def test_convex_shapes() -> None:
-    from vkc_pin.world.files.meshes import make_convex_hull
-
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 2) for z in (0, 3)], float)
-    assert trimesh.Trimesh(*triangulate(make_convex_hull(corners))).volume == pytest.approx(6.0)
-
-
-def test_a_half_space_has_no_surface() -> None:
-    with pytest.raises(InputError, match="cannot be drawn"):
-        triangulate(coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0))
-
-
-def test_boxes_have_edges_and_balls_have_none() -> None:
+def test_boxes_are_shaded_flat_and_balls_smooth() -> None:
     box = to_solid(coal.Box(1.0, 1.0, 1.0))
     assert np.allclose(np.sort(np.abs(box.normals), axis=1), [0, 0, 1], atol=0.02), (
         "each side its own normal"
@@ -93,14 +54,14 @@ def test_sides_of_a_box_face_outwards() -> None:
         assert (np.einsum("ij,ij->i", turn, solid.normals[:2]) > 0).all()
 
 
-def test_a_coarse_copy_is_lighter_and_as_large() -> None:
+def test_coarse_copy_has_fewer_faces_and_the_same_volume() -> None:
     fine = shade(*ball())
     light = coarse(fine, 0.1)
     assert len(light.faces) < 0.8 * len(fine.faces)
     assert as_mesh(light).volume == pytest.approx(as_mesh(fine).volume, rel=0.1)
 
 
-def test_moving_and_merging() -> None:
+def test_solids_are_moved_and_merged() -> None:
     solid = box_solid(np.zeros(3), np.ones(3))
     moved = solid.moved(
         pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, np.pi / 2), np.array([5.0, 0.0, 0.0]))
@@ -111,7 +72,7 @@ def test_moving_and_merging() -> None:
     assert as_mesh(both).volume == pytest.approx(2.0, rel=1e-5)
 
 
-def test_a_tube_follows_its_line() -> None:
+def test_tube_follows_its_line() -> None:
     angle = np.linspace(0.0, 3.0, 60)
     line = np.column_stack([np.cos(angle), np.sin(angle), 0.2 * angle])
     solid = tube(line, 0.01)

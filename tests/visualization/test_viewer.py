@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-import html
+import dataclasses
 import json
 import re
 import socket
@@ -22,7 +22,7 @@ from helpers.pages import clips, commands_of
 from vkc_pin.errors import InputError
 from vkc_pin.planning.plan import Plan
 from vkc_pin.visualization import viewer as visualization
-from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.scene.scene import load_scene
 from vkc_pin.world.trajectory.world_model import World
 
 needs_chromium = pytest.mark.skipif(browser.CHROMIUM is None, reason="Chromium is not installed")
@@ -43,27 +43,6 @@ def commands(page: Path) -> list[dict[str, Any]]:
     return commands_of(page.read_text(encoding="utf-8"))
 
 
-@pytest.fixture(scope="module")
-def shots(page: Path) -> dict[float, np.ndarray]:
-    return {moment: picture(page, moment) for moment in (0.0, 3.0, 6.0)}
-
-
-def picture(page: Path, moment: float) -> np.ndarray:
-    from PIL import Image
-
-    for budget in (
-        6.0,
-        20.0,
-    ):  # see browser.document: on a busy machine the first may end before anything is drawn
-        file = browser.screenshot(
-            page, page.with_name(f"{moment}.png"), time=moment, size=(800, 500), budget=budget
-        )
-        pixels = np.asarray(Image.open(file).convert("RGB"), int)
-        if len(np.unique(pixels.reshape(-1, 3), axis=0)) > 100:
-            break
-    return pixels
-
-
 def drawn(commands: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     return {c["path"]: c["object"] for c in commands if c["type"] == "set_object"}
 
@@ -76,42 +55,36 @@ def vertices(item: dict[str, Any]) -> np.ndarray:
 # What is drawn
 
 
-def test_page_has_robot_door_walls_paths_and_ghosts(commands: list[dict[str, Any]]) -> None:
-    things = drawn(commands)
-    robot, door = (
-        ("forearm_link", "gripper_link", "base_link"),
-        ("door/frame", "hinge/panel", "knob/lever"),
-    )
-    for part in (*robot, *door, "wall_west", "sofa", "floor", "grid"):
-        assert any(part in path for path in things), part
-    for path in (
-        "paths/tool",
-        "paths/base",
-        "ghosts/start/robot",
-        "ghosts/end/robot",
-        "ghosts/start/door",
-        "ghosts/end/door",
+def test_page_has_robot_door_walls_paths_and_ghosts(
+    commands: list[dict[str, Any]], plan: Plan
+) -> None:
+    shapes = drawn(commands)
+    for part in (
+        "forearm_link",
+        "door/frame",
+        "hinge/panel",
+        "knob/lever",
+        "sofa",
+        "floor",
+        "grid",
     ):
-        assert f"/meshcat/{path}" in things
-    arm = [vertices(item) for path, item in things.items() if "forearm_link" in path]
-    assert sum(len(points) for points in arm) > 3000, "the arm's real meshes"
+        assert any(part in path for path in shapes), part
+    assert {"/meshcat/paths/tool", "/meshcat/paths/base"} <= shapes.keys()
+    arm = [vertices(item) for path, item in shapes.items() if "forearm_link" in path]
+    assert sum(len(points) for points in arm) > 3000, "the arm's visual meshes"
+    robot = [item for path, item in shapes.items() if path.startswith("/meshcat/robot/")]
+    assert len({item["materials"][0]["color"] for item in robot}) >= 5
+    for name, shown in (("start", [False, True]), ("end", [True, False])):
+        for owner in ("robot", "door"):
+            path = f"/meshcat/ghosts/{name}/{owner}"
+            assert path in shapes
+            (track,) = clips(commands)[path]["tracks"]
+            keys = track["keys"]
+            assert [keys[0]["value"], keys[-1]["value"]] == shown
+            assert [keys[0]["time"], keys[-1]["time"]] == [0.0, plan.trajectory.times[-1]]
 
 
-def test_robot_is_drawn_in_several_colours(commands: list[dict[str, Any]]) -> None:
-    things = drawn(commands)
-    assert (
-        len(
-            {
-                item["materials"][0]["color"]
-                for path, item in things.items()
-                if path.startswith("/meshcat/robot/")
-            }
-        )
-        >= 5
-    )
-
-
-def test_walls_let_one_look_in(commands: list[dict[str, Any]]) -> None:
+def test_walls_are_transparent_from_outside(commands: list[dict[str, Any]]) -> None:
     things = drawn(commands)
     for name in ("wall_west", "wall_south"):
         outside = things[f"/meshcat/room/walls/{name}/outside"]["materials"][0]
@@ -125,9 +98,7 @@ def test_walls_let_one_look_in(commands: list[dict[str, Any]]) -> None:
     )
 
 
-def test_ghosts_stand_where_the_motion_starts_and_ends(
-    commands: list[dict[str, Any]], plan: Plan
-) -> None:
+def test_ghosts_show_start_and_end(commands: list[dict[str, Any]], plan: Plan) -> None:
     things = drawn(commands)
     for name, row in (("start", 0), ("end", -1)):
         middle = vertices(things[f"/meshcat/ghosts/{name}/robot"]).mean(axis=0)
@@ -136,58 +107,22 @@ def test_ghosts_stand_where_the_motion_starts_and_ends(
     assert vertices(things["/meshcat/ghosts/end/door"])[:, 0].max() > 3.2
 
 
-def test_a_scene_alone_is_drawn_without_motion(tmp_path: Path) -> None:
-    file = visualization.to_html(load_scene("drawer"), tmp_path / "deep" / "drawer.html")
-    commands = commands_of(file.read_text(encoding="utf-8"))
-    assert not clips(commands)
-    assert any("drawer" in path for path in drawn(commands))
-    assert not any("ghosts" in path or "paths" in path for path in drawn(commands))
-
-
-def test_names_that_look_alike_are_drawn_apart(tmp_path: Path) -> None:
-    """Two links of an object, each on a joint of its own, and two fixed ones."""
-    sizes = {"a+b": 0.1, "a b": 0.2, "c+d": 0.3, "c d": 0.4}
-    kinds = {"a+b": "prismatic", "a b": "prismatic", "c+d": "fixed", "c d": "fixed"}
-    limit = '<axis xyz="1 0 0"/><limit lower="0" upper="1" velocity="1" effort="1"/>'
-    shape = '<geometry><box size="{0} {0} {0}"/></geometry>'
-    text = '<robot name="o"><link name="case"/>' + "".join(
-        f'<link name="{name}"><collision>{shape.format(size)}</collision>'
-        f"<visual>{shape.format(size)}</visual></link>"
-        f'<joint name="{name}" type="{kinds[name]}"><parent link="case"/><child link="{name}"/>'
-        f'<origin xyz="0 0 {10 * size}"/>{limit}</joint>'
-        for name, size in sizes.items()
-    )
-    kind = {"urdf": f"{text}</robot>", "attachments": []}
-    document = {
-        "robot": "husky_ur5e",
-        "start": {"base": [-3, -3, 0]},
-        "objects": [{"name": "it", "type": kind, "position": [0, 0, 0]}],
-    }
-    frames = {"x+y": pin.SE3.Identity(), "x y": pin.SE3(np.eye(3), np.ones(3))}
-    file = visualization.to_html(Scene.from_document(document), tmp_path / "it.html", frames=frames)
-    commands = commands_of(file.read_text(encoding="utf-8"))
-    boxes = {path: item for path, item in drawn(commands).items() if "/objects/it/" in path}
-    extents = sorted(np.ptp(vertices(item), axis=0)[0] for item in boxes.values())
-    assert extents == pytest.approx(sorted(sizes.values()), abs=1e-3)
-    places = {c["path"]: c["matrix"][14] for c in commands if c["type"] == "set_transform"}
-    heights = [
-        sum(height for above, height in places.items() if f"{path}/".startswith(f"{above}/"))
-        for path in boxes
-    ]
-    floor = places["/meshcat"]
-    assert sorted(heights) == pytest.approx([10 * size + floor for size in sizes.values()])
-    assert len([path for path in places if path.startswith("/meshcat/frames/")]) == 2
-
-
 # Time
 
 
-def test_frames_are_drawn_where_they_are(tmp_path: Path) -> None:
+def test_scene_is_drawn_with_frames_and_without_markup_from_its_name(tmp_path: Path) -> None:
     placement = pin.SE3(pin.rpy.rpyToMatrix(0.1, -0.4, 2.0), np.array([1.0, -0.5, 0.8]))
+    scene = dataclasses.replace(load_scene("drawer"), name="</script><b>%FILM%")
     file = visualization.to_html(
-        load_scene("door"), tmp_path / "frames.html", frames={"door.hinge": placement}
+        scene, tmp_path / "deep" / "drawer.html", frames={"door.hinge": placement}
     )
-    commands = commands_of(file.read_text(encoding="utf-8"))
+    text = file.read_text(encoding="utf-8")
+    assert "<b>" not in text
+    assert "<title>&lt;/script&gt;&lt;b&gt;%FILM%" in text
+    commands = commands_of(text)
+    assert not clips(commands)
+    assert any("drawer" in path for path in drawn(commands))
+    assert not any("ghosts" in path or "paths" in path for path in drawn(commands))
     things = {
         path: item for path, item in drawn(commands).items() if path.startswith("/meshcat/frames/")
     }
@@ -208,17 +143,7 @@ def test_frames_are_drawn_where_they_are(tmp_path: Path) -> None:
     assert np.allclose(np.reshape(stands, (4, 4)).T, placement.homogeneous)
 
 
-def test_animation_takes_as_long_as_the_motion(commands: list[dict[str, Any]], plan: Plan) -> None:
-    for path, clip in clips(commands).items():
-        assert clip["fps"] == 1, "so that key times are seconds"
-        for track in clip["tracks"]:
-            times = [key["time"] for key in track["keys"]]
-            assert times[0] == 0.0
-            assert times[-1] == pytest.approx(plan.trajectory.times[-1]), path
-            assert (np.diff(times) > 0).all()
-
-
-def test_interpolated_frames_are_the_motion_itself(
+def test_interpolated_animation_agrees_with_the_motion(
     commands: list[dict[str, Any]], plan: Plan
 ) -> None:
     """Joint by joint as three.js does it: positions linear, quaternions along the great circle."""
@@ -269,15 +194,9 @@ def local_placement(
     return placement
 
 
-def test_ghosts_hide_while_the_real_thing_is_there(commands: list[dict[str, Any]]) -> None:
-    for name, first, last in (("start", False, True), ("end", True, False)):
-        for owner in ("robot", "door"):
-            (track,) = clips(commands)[f"/meshcat/ghosts/{name}/{owner}"]["tracks"]
-            values = [key["value"] for key in track["keys"]]
-            assert (values[0], values[-1]) == (first, last)
-
-
-def test_offending_links_turn_red_at_that_time(commands: list[dict[str, Any]]) -> None:
+def test_violating_links_turn_red_at_the_time_of_the_violation(
+    commands: list[dict[str, Any]],
+) -> None:
     red = {
         path: clip["tracks"][0]
         for path, clip in clips(commands).items()
@@ -305,7 +224,7 @@ def test_page_is_one_file_that_loads_nothing(page: Path) -> None:
     assert [file.name for file in page.parent.glob("*.html")] == ["door.html"]
 
 
-def test_page_says_what_the_motion_is(page: Path, plan: Plan) -> None:
+def test_page_contains_phases_violations_and_status(page: Path, plan: Plan) -> None:
     match = re.search(r'id="film">(.*?)</script>', page.read_text(encoding="utf-8"))
     assert match
     film = json.loads(match[1])
@@ -315,27 +234,7 @@ def test_page_says_what_the_motion_is(page: Path, plan: Plan) -> None:
     assert "rejected" in film["headline"]
 
 
-def test_page_is_written_whole_or_not_at_all(
-    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    target = tmp_path / "door.html"
-    target.write_text("before")
-    monkeypatch.setattr("vkc_pin.visualization.viewer._packed", lambda data: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        visualization.to_html(plan, target)
-    assert [file.name for file in tmp_path.iterdir()] == ["door.html"]
-    assert target.read_text() == "before"
-
-
-def test_names_cannot_break_out_of_the_page() -> None:
-    from vkc_pin.visualization.viewer import Recorder, render_page
-
-    text = render_page(Recorder(), title="<b>%FILM%", film={"headline": "</script><b>"})
-    assert "<b>" not in text
-    assert "<title>&lt;b&gt;%FILM%</title>" in text
-
-
-def test_what_cannot_be_shown(plan: Plan, tmp_path: Path) -> None:
+def test_arguments_that_cannot_be_shown_are_refused(plan: Plan, tmp_path: Path) -> None:
     for call in (
         lambda: visualization.show("door"),
         lambda: visualization.to_html(None, tmp_path / "x.html"),
@@ -349,17 +248,6 @@ def test_what_cannot_be_shown(plan: Plan, tmp_path: Path) -> None:
 # Notebook and server
 
 
-def test_in_a_notebook_the_view_is_part_of_it(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(visualization, "in_notebook", lambda: True)
-    cell = visualization.show(plan, height=300)._repr_html_()
-    match = re.fullmatch(
-        r'<div><iframe srcdoc="([^"]*)" style="[^"]*height: 300px[^"]*" title="door"></iframe></div>',
-        cell,
-    )
-    assert match
-    assert len(drawn(commands_of(html.unescape(match[1])))) > 50
-
-
 @pytest.fixture(scope="module")
 def viewer(plan: Plan) -> Iterator[Any]:
     yield visualization.show(plan, open_browser=False)
@@ -368,84 +256,38 @@ def viewer(plan: Plan) -> Iterator[Any]:
     process[0].kill()
 
 
-def listening(port: int) -> set[str]:
-    """Return the local addresses, as hexadecimal numbers, at which somebody listens on `port`."""
-    lines = [
-        line.split()
-        for name in ("tcp", "tcp6")
-        for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]
-    ]
-    return {
-        where
-        for where, at in (line[1].split(":") for line in lines if line[3] == "0A")
-        if int(at, 16) == port
-    }
-
-
-@pytest.mark.skipif(not Path("/proc/net/tcp").is_file(), reason="needs /proc")
-def test_server_listens_on_loopback_only(viewer: Any) -> None:
-    assert visualization._server is not None
-    for address in visualization._server[1:]:
-        port = int(re.findall(r":(\d+)", address)[0])
-        assert listening(port) == {"0100007F"}, address
-
-
-def answer(
-    port: int, host: str | None, *more: str, path: str = "/static/", version: str = "1.1"
-) -> int:
-    """Return the status that the server answers a request with."""
-    lines = [
-        f"GET {path} HTTP/{version}",
-        *([] if host is None else [f"Host: {host}"]),
-        "Connection: close",
-        *more,
-        "",
-        "",
-    ]
-    if more:
-        lines.remove("Connection: close")
+def request(port: int, host: str, *lines: str) -> int:
+    """Return the status of the server's answer; further lines ask for its websocket."""
+    head = [f"GET {'/' if lines else '/static/'} HTTP/1.1", f"Host: {host}"]
+    head += lines or ["Connection: close"]
     with socket.create_connection(("127.0.0.1", port), timeout=20) as connection:
-        connection.sendall("\r\n".join(lines).encode())
+        connection.sendall("\r\n".join([*head, "", ""]).encode())
         return int(connection.makefile("rb").readline().split()[1])
 
 
-def test_server_is_for_this_machine_only_by_whatever_name_it_is_asked(viewer: Any) -> None:
-    """A page elsewhere may call this machine by a name of its own."""
+def test_server_answers_only_this_machine(viewer: Any) -> None:
+    """Web pages elsewhere may resolve names of their own to this machine."""
     assert visualization._server is not None
     port = int(visualization._server[2].split(":")[2].split("/")[0])
-    for host in ("localhost", "LOCALHOST", "127.0.0.1", "[::1]"):
-        assert (answer(port, f"{host}:{port}"), answer(port, host)) == (200, 200), host
     upgrade = (
         "Connection: Upgrade",
         "Upgrade: websocket",
         "Sec-WebSocket-Version: 13",
         "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
     )
-    assert answer(port, f"localhost:{port}", *upgrade, path="/") == 101
-    assert (
-        answer(port, f"localhost:{port}", *upgrade, f"Origin: http://localhost:{port}", path="/")
-        == 101
-    )
-    for origin in (
-        "http://evil.example",
-        f"http://evil.example:{port}",
-        "http://localhost:1",
-        "null",
-    ):
-        assert answer(port, f"localhost:{port}", *upgrade, f"Origin: {origin}", path="/") == 403, (
-            origin
-        )
-    for host in (
-        "evil.example",
-        f"evil.example:{port}",
-        "localhost.evil.example",
-        "127.0.0.1.evil.example",
-        "0.0.0.0",
-        "127.0.0.1@evil",
-    ):
-        assert answer(port, host) in (400, 403), host
-        assert answer(port, host, *upgrade, f"Origin: http://{host}", path="/") in (400, 403), host
-    assert answer(port, None, version="1.0") == 403
+    for host in ("localhost", "LOCALHOST", "127.0.0.1", f"[::1]:{port}"):
+        assert request(port, host) == 200, host
+    local = f"localhost:{port}"
+    assert request(port, local, *upgrade, f"Origin: http://{local}") == 101
+    for origin in ("http://evil.example", f"http://evil.example:{port}", "http://localhost:1"):
+        assert request(port, local, *upgrade, f"Origin: {origin}") == 403, origin
+    for host in (f"evil.example:{port}", "localhost.evil.example", "0.0.0.0", "127.0.0.1@evil"):
+        assert request(port, host) in (400, 403), host
+        assert request(port, host, *upgrade, f"Origin: http://{host}") in (400, 403), host
+    for address in visualization._server[1:]:
+        (number,) = re.findall(r":(\d+)", address)[:1]
+        with pytest.raises(ConnectionRefusedError):  # bound to 127.0.0.1 only
+            socket.create_connection(("127.0.0.2", int(number)), timeout=20)
 
 
 def test_server_serves_the_motion(viewer: Any, plan: Plan) -> None:
@@ -456,7 +298,7 @@ def test_server_serves_the_motion(viewer: Any, plan: Plan) -> None:
     assert visualization.animate(plan).url() == viewer.url(), "one window for a process"
 
 
-def test_animate_into_a_viewer_of_ones_own(plan: Plan) -> None:
+def test_animate_uses_a_given_viewer(plan: Plan) -> None:
     import meshcat
 
     from vkc_pin.visualization.viewer import Recorder
@@ -480,24 +322,33 @@ def test_server_ends_with_its_process() -> None:
     pytest.fail("the server outlives its process")
 
 
-# A real browser
+# Browser
+
+
+def take_picture(page: Path, moment: float) -> np.ndarray:
+    from PIL import Image
+
+    for budget in (6.0, 20.0):  # a busy browser may end before it has drawn anything
+        file = page.with_name(f"{moment}.png")
+        browser.screenshot(page, file, time=moment, size=(800, 500), budget=budget)
+        pixels = np.asarray(Image.open(file).convert("RGB"), int)
+        if len(np.unique(pixels.reshape(-1, 3), axis=0)) > 100:
+            break
+    return pixels
 
 
 @needs_chromium
 @pytest.mark.browser
-def test_picture_is_not_empty_and_changes_over_time(shots: dict[float, np.ndarray]) -> None:
-    for shot in shots.values():
-        inner = shot[80:-60]
-        assert len(np.unique(inner.reshape(-1, 3), axis=0)) > 2000
-        assert inner.std() > 20
-    for before, after in ((0.0, 3.0), (3.0, 6.0)):
-        changed = (np.abs(shots[before] - shots[after]).max(axis=2) > 25)[80:-60]
-        assert 0.005 < changed.mean() < 0.5, "the robot has moved, the room has not"
+def test_picture_changes_over_time(page: Path) -> None:
+    start, end = (take_picture(page, moment)[80:-60] for moment in (0.0, 6.0))
+    assert len(np.unique(start.reshape(-1, 3), axis=0)) > 2000
+    changed = np.abs(start - end).max(axis=2) > 25
+    assert 0.005 < changed.mean() < 0.5, "the robot has moved, the room has not"
 
 
 @needs_chromium
 @pytest.mark.browser
-def test_browser_shows_each_thing_where_it_is_at_that_time(page: Path, plan: Plan) -> None:
+def test_browser_shows_links_at_their_placements(page: Path, plan: Plan) -> None:
     probe = """
     <script>
     const waiting = setInterval(() => {
@@ -546,29 +397,3 @@ def test_browser_shows_each_thing_where_it_is_at_that_time(page: Path, plan: Pla
             name
         )
     assert 0.1 < row[world.coordinates.index("door.hinge")] < HINGE
-
-
-@needs_chromium
-@pytest.mark.browser
-def test_page_plays_by_itself_and_in_time(page: Path) -> None:
-    probe = """
-    <script>
-    let first = null;
-    const watch = (stamp) => {
-      const at = window.vkc ? vkc.time() : 0;
-      if (first === null && at > 0) first = [stamp, at];
-      if (first !== null && at > first[1] + 1) {
-        const panel = document.createElement("pre");
-        panel.id = "pace";
-        panel.textContent = JSON.stringify([stamp - first[0], at - first[1]]);
-        document.body.appendChild(panel);
-      } else requestAnimationFrame(watch);
-    };
-    requestAnimationFrame(watch);
-    </script></body>"""
-    probed = page.with_name("paced.htm")
-    probed.write_text(page.read_text(encoding="utf-8").replace("</body>", probe), encoding="utf-8")
-    match = re.search(r'<pre id="pace">(.*?)</pre>', browser.document(probed, until='id="pace"'))
-    assert match, "the film runs"
-    passed, played = json.loads(match[1])
-    assert 0.0 < played <= 1.05e-3 * passed, "at most as fast as the browser's clock"

@@ -1,8 +1,8 @@
 """Decomposes concave meshes into convex pieces with CoACD (Wei et al., SIGGRAPH 2022).
 
 Pieces contain the surface that they are made from, since planning would drive through whatever they
-leave uncovered. CoACD takes closed meshes of few triangles; other meshes are cut by planes, see
-`slicing`.
+leave uncovered. CoACD takes closed meshes of few triangles; it would remesh others for minutes, so
+these are cut by planes.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ import coal
 import numpy as np
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.slicing import is_flat, slice_mesh, thicken
 from vkc_pin.utils.arguments import check_coordinate, check_integer, check_number
-from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.disk_cache import load_or_build
 from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.files.hulls import compute_hull, compute_outer_hull
@@ -30,7 +29,19 @@ from vkc_pin.world.files.resources import check_path
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["ERROR", "PIECES", "Pieces", "compute_concavity", "compute_solid_volume", "decompose"]
+__all__ = [
+    "ERROR",
+    "PIECES",
+    "THICKNESS",
+    "Pieces",
+    "compute_concavity",
+    "compute_solid_volume",
+    "decompose",
+    "is_flat",
+    "measure_outside",
+    "slice_mesh",
+    "thicken",
+]
 
 ERROR = 0.02
 """Largest protrusion of pieces over the surface [m], about the clearance margin of motions."""
@@ -133,15 +144,10 @@ def decompose(
 
             def cut_pieces() -> list[list[list[float]]]:
                 """Return the vertices of each piece."""
-                parts = _cut_mesh(loaded, most_pieces, error, seed, file) or [
-                    np.asarray(hull.vertices)
-                ]
-                return [
-                    piece.vertices.tolist()
-                    for piece in _simplify(
-                        _enclose_surface(parts, _sample_surface(loaded)), corners
-                    )
-                ]
+                parts = _cut_mesh(loaded, most_pieces, error, seed, file)
+                parts = parts or [np.asarray(hull.vertices)]
+                pieces = _simplify(_enclose_surface(parts, _sample_surface(loaded)), corners)
+                return [piece.vertices.tolist() for piece in pieces]
 
             parts = load_or_build(
                 _make_cache_key(loaded, most_pieces, error, corners, seed), cut_pieces
@@ -154,11 +160,7 @@ def decompose(
 
 
 def compute_concavity(mesh: trimesh.Trimesh) -> float:
-    """Return the largest protrusion of a mesh's convex hull over its surface [m], sampled.
-
-    Raises:
-        InputError: The mesh is flat.
-    """
+    """Return the largest protrusion of a mesh's convex hull over its surface [m], sampled."""
     return _measure_protrusion([_make_hull(mesh.vertices, None)], mesh)
 
 
@@ -205,10 +207,7 @@ def _simplify(pieces: Sequence[trimesh.Trimesh], corners: int) -> list[trimesh.T
 
 
 def _make_body_hulls(mesh: trimesh.Trimesh, max_parts: int) -> list[trimesh.Trimesh]:
-    """Return the hulls of a mesh's connected bodies.
-
-    The list is empty if there is one body, more than `max_parts`, or a flat one.
-    """
+    """Return the hulls of a mesh's connected bodies."""
     merged = _merge_vertices(mesh)
     if not 1 < merged.body_count <= max_parts:
         return []
@@ -221,10 +220,7 @@ def _make_body_hulls(mesh: trimesh.Trimesh, max_parts: int) -> list[trimesh.Trim
 def _cut_mesh(
     mesh: trimesh.Trimesh, max_parts: int, error: float, seed: int, file: Path | None
 ) -> list[Floats]:
-    """Return the vertices of parts of a mesh.
-
-    CoACD cuts it; open meshes and those with many triangles are sliced.
-    """
+    """Return the vertices of parts of a mesh."""
     import trimesh
 
     merged = _merge_vertices(mesh)
@@ -301,28 +297,17 @@ def _measure_protrusion(pieces: Sequence[trimesh.Trimesh], mesh: trimesh.Trimesh
         is_covered = np.zeros(len(points), bool)
         for other in pieces:
             if other is not piece:
-                is_covered |= _measure_outside(other, points) < -_POINT_RADIUS
+                is_covered |= measure_outside(other, points) < -_POINT_RADIUS
         for point in points[~is_covered]:
             result.clear()
-            furthest = max(
-                furthest,
-                coal.distance(
-                    point_shape,
-                    coal.Transform3s(np.eye(3), point),
-                    triangles,
-                    here,
-                    request,
-                    result,
-                ),
-            )
+            place = coal.Transform3s(np.eye(3), point)
+            distance = coal.distance(point_shape, place, triangles, here, request, result)
+            furthest = max(furthest, distance)
     return furthest
 
 
-def _measure_outside(piece: trimesh.Trimesh, points: Floats) -> Floats:
-    """Return the signed distances of points, shape (n, 3), from a convex piece, shape (n,) [m].
-
-    They are negative inside.
-    """
+def measure_outside(piece: trimesh.Trimesh, points: Floats) -> Floats:
+    """Return the signed distances of points, shape (n, 3), from a convex piece, shape (n,) [m]."""
     normals = np.asarray(piece.face_normals)
     return np.asarray(
         (
@@ -332,14 +317,107 @@ def _measure_outside(piece: trimesh.Trimesh, points: Floats) -> Floats:
 
 
 def _enclose_surface(parts: list[Floats], surface: Floats) -> list[trimesh.Trimesh]:
-    """Return the hulls of parts, extended to contain a surface.
-
-    Each point of the surface that lies in no part is added to the nearest one.
-    """
+    """Return the hulls of parts, extended to contain a surface."""
     hulls = [compute_hull(part) for part in parts]
-    beyond = np.array([_measure_outside(hull, surface) for hull in hulls])
+    beyond = np.array([measure_outside(hull, surface) for hull in hulls])
     nearest, is_outside = beyond.argmin(axis=0), beyond.min(axis=0) > 1e-9
     return [
         compute_hull(np.vstack([np.asarray(hull.vertices), surface[is_outside & (nearest == k)]]))
         for k, hull in enumerate(hulls)
     ]
+
+
+THICKNESS = 1e-3
+"""Thickness that flat parts are given [m]."""
+_FLAT_RATIO = 1e-4  # thickness relative to the extent up to which points are flat
+_FLAT_THICKNESS = 1e-5  # [m] thickness up to which points are flat
+_PLANES = 12  # number of cutting planes along each axis
+_MIN_GAIN = 0.01  # smallest reduction of volume of a cut, relative to the whole hull
+
+
+def slice_mesh(mesh: trimesh.Trimesh, max_parts: int) -> list[Floats]:
+    """Cut a mesh by planes into parts whose convex hulls have a small total volume.
+
+    Greedily, the part whose best cut reduces the volume most is cut in two. Planes are normal to
+    the axes of the mesh and to its principal axes. Points on a cut belong to both sides, so that
+    the hulls contain the mesh.
+
+    Returns:
+        The points of each part, shape (n, 3).
+    """
+    vertices, edges = np.asarray(mesh.vertices, float), np.asarray(mesh.edges_unique)
+    axes = np.vstack([np.eye(3), np.linalg.eigh(np.cov(vertices.T))[1].T])
+    least = _MIN_GAIN * _compute_hull_volume(vertices)
+    parts = [(vertices, edges)]
+    cuts = [_find_best_cut(vertices, edges, axes)]
+    while len(parts) < max_parts:
+        k = int(np.argmax([gain for gain, _ in cuts]))
+        gain, halves = cuts[k]
+        if gain <= least:
+            break
+        parts[k : k + 1] = halves
+        cuts[k : k + 1] = [_find_best_cut(*half, axes) for half in halves]
+    return [points for points, _ in parts]
+
+
+def is_flat(points: Floats) -> bool:
+    """Return whether points, shape (n, 3) [m], lie almost in one plane."""
+    if len(points) < 4:
+        return True
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
+    return bool(spread[-1] <= max(_FLAT_THICKNESS, _FLAT_RATIO * spread[0]))
+
+
+def thicken(points: Floats) -> Floats:
+    """Return points that span a volume: flat ones become layers `THICKNESS` apart."""
+    if not is_flat(points):
+        return points
+    axes = np.linalg.svd(points - points.mean(axis=0))[2]
+    # Along all axes, since the points may lie on a line.
+    layers = [points + 0.5 * side * THICKNESS * axis for axis in axes for side in (-1.0, 1.0)]
+    return np.vstack(layers)
+
+
+def _find_best_cut(
+    points: Floats, edges: Ints, axes: Floats
+) -> tuple[float, list[tuple[Floats, Ints]]]:
+    """Return the largest reduction of the hulls' volume by one cut [m³], and the two sides."""
+    whole = _compute_hull_volume(points)
+    best: tuple[float, list[tuple[Floats, Ints]]] = (0.0, [])
+    if whole == 0.0:
+        return best
+    for axis in axes:
+        along = points @ axis
+        for place in np.linspace(along.min(), along.max(), _PLANES + 2)[1:-1]:
+            sides = [_clip(points, edges, sign * along, sign * place) for sign in (1.0, -1.0)]
+            if min(len(side) for side, _ in sides) < 3:
+                continue
+            gain = whole - sum(_compute_hull_volume(side) for side, _ in sides)
+            if gain > best[0]:
+                best = (gain, sides)
+    return best
+
+
+def _clip(points: Floats, edges: Ints, along: Floats, place: float) -> tuple[Floats, Ints]:
+    """Return the points with `along` up to `place`, those on cut edges, and the edges between."""
+    is_inside = along <= place
+    index = np.cumsum(is_inside) - 1
+    inside = edges[is_inside[edges].all(axis=1)]
+    crossing = edges[is_inside[edges[:, 0]] != is_inside[edges[:, 1]]]
+    start, end = crossing[:, 0], crossing[:, 1]
+    fraction = ((place - along[start]) / (along[end] - along[start]))[:, None]
+    cut = points[start] * (1.0 - fraction) + points[end] * fraction
+    cut_edges = np.column_stack(
+        [index[np.where(is_inside[start], start, end)], is_inside.sum() + np.arange(len(cut))]
+    )
+    return np.vstack([points[is_inside], cut]), np.vstack([index[inside], cut_edges])
+
+
+def _compute_hull_volume(points: Floats) -> float:
+    """Return the volume of the convex hull of points [m³]; 0 if they are flat."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        return float(ConvexHull(points).volume) if len(points) > 3 else 0.0
+    except (QhullError, ValueError):
+        return 0.0

@@ -1,12 +1,25 @@
-"""Checks the folder that an import writes to, and formats the comments of its YAML files."""
+"""Checks the folder that an import writes to, and formats the contents of its files."""
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
 
 from vkc_pin.errors import InputError
 
-__all__ = ["check_target", "format_comment", "get_origin_marker"]
+__all__ = [
+    "add_connection",
+    "add_origin",
+    "check_target",
+    "format_comment",
+    "format_numbers",
+    "get_origin_marker",
+    "round_values",
+]
 
 # Characters to read of a first line: file names have up to 255 bytes, or 1530 when escaped.
 _FIRST_LINE_LENGTH = 4096
@@ -31,6 +44,33 @@ def format_comment(text: str) -> str:
     return f"# {line}\n"
 
 
+def round_values(values: Any, digits: int = 6) -> list[float]:
+    """Return rounded values without negative zeros."""
+    return [float(value) + 0.0 for value in np.round(np.asarray(values, float), digits) + 0.0]
+
+
+def format_numbers(values: Any) -> str:
+    """Format numbers for an attribute of a URDF."""
+    return " ".join(f"{value:.9g}" for value in values)
+
+
+def add_connection(
+    root: ElementTree.Element, name: str, kind: str, parent: str, child: str, placement: pin.SE3
+) -> ElementTree.Element:
+    """Add a joint to a URDF and return it."""
+    joint = ElementTree.SubElement(root, "joint", name=name, type=kind)
+    add_origin(joint, placement)
+    ElementTree.SubElement(joint, "parent", link=parent)
+    ElementTree.SubElement(joint, "child", link=child)
+    return joint
+
+
+def add_origin(element: ElementTree.Element, placement: pin.SE3) -> None:
+    """Add an <origin> to an element of a URDF."""
+    xyz, rpy = placement.translation, pin.rpy.matrixToRpy(placement.rotation)
+    ElementTree.SubElement(element, "origin", xyz=format_numbers(xyz), rpy=format_numbers(rpy))
+
+
 def check_target(folder: Path, command: str, *, force: bool) -> None:
     """Check that an import may write to a folder, so that it does not overwrite other files.
 
@@ -38,9 +78,6 @@ def check_target(folder: Path, command: str, *, force: bool) -> None:
         folder: The folder.
         command: Name of the command, e.g. "import-home".
         force: Whether the command may replace its own earlier output.
-
-    Raises:
-        InputError: The folder holds other files, or may not be replaced.
     """
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
@@ -49,16 +86,10 @@ def check_target(folder: Path, command: str, *, force: bool) -> None:
     )
     if force and own:
         return
-    expected = "a new or an empty folder" + (
-        ", or force=True (--force) to replace it" if own else ""
-    )
-    got = (
-        "a file"
-        if not folder.is_dir()
-        else f"an earlier output of {command}"
-        if own
-        else "other files"
-    )
+    expected, got = "a new or an empty folder", "other files" if folder.is_dir() else "a file"
+    if own:
+        expected += ", or force=True (--force) to replace it"
+        got = f"an earlier output of {command}"
     raise InputError(
         "the target already exists", file=folder, field="folder", expected=expected, got=got
     )

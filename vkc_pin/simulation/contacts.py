@@ -88,12 +88,7 @@ class Pairs:
 
 
 def find_contact_pairs(world: World, holds: Iterable[Hold]) -> Pairs:
-    """Return the pairs of shapes that may touch.
-
-    Args:
-        world: The world in its start configuration.
-        holds: All holds that are ever welded.
-    """
+    """Return the pairs of shapes that may touch."""
     labels, joints = world.collision_labels, [shape.parentJoint for shape in world.shapes]
     pairs = np.array(
         [pair for pair in _iterate_planner_pairs(world) if joints[pair[0]] or joints[pair[1]]], int

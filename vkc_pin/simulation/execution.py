@@ -15,9 +15,9 @@ from vkc_pin.simulation.friction.friction_grasps import (
     Span,
     Squeezes,
     find_grip_changes,
+    insert_pauses,
     split_spans,
 )
-from vkc_pin.simulation.friction.pauses import insert_pauses
 from vkc_pin.simulation.goals import measure_goal_errors
 from vkc_pin.simulation.model import Builder, PhysicalWorld
 from vkc_pin.simulation.physics import Physics, complete_inertias, import_mujoco
@@ -279,12 +279,7 @@ class _Run:
             self.contact_samples.setdefault(pair, []).append((clock, depth))
 
     def make_result(self, scene: Scene, steps: Sequence[Step]) -> SimulationResult:
-        """Return the result of the execution.
-
-        Args:
-            scene: Scene of the plan.
-            steps: Steps of the task.
-        """
+        """Return the result of the execution."""
         rows = self.physical.from_qpos(self.states)
         contacts: tuple[Contact, ...] = find_unplanned_contacts(
             scene, self.trajectory, self.contact_samples, _CONTACT_PERIOD
@@ -322,10 +317,7 @@ class _Run:
         )
 
     def _make_trajectory(self, rows: Floats) -> Trajectory:
-        """Return the executed motion in the plan's coordinates.
-
-        Degrees of freedom of grasps are as planned.
-        """
+        """Return the executed motion in the plan's coordinates."""
         names, own = self.trajectory.names, self.tree.coordinates.names
         positions = self.trajectory.at(self.clocks)
         for column, name in enumerate(names):

@@ -107,10 +107,7 @@ def measure_goal_errors(
 def _compute_errors(
     world: World, step: Step, row: Floats, planned: Floats
 ) -> Iterator[tuple[str, float, str]]:
-    """Yield the error of each subject of a step at configuration `row`.
-
-    `planned` is the planned configuration, to which a grasp is compared.
-    """
+    """Yield the error of each subject of a step at configuration `row`."""
     names, units = world.coordinates.names, world.coordinates.units
     if isinstance(step, Actuate):
         for joint, goal in step.joints.items():

@@ -128,9 +128,6 @@ class Builder:
                 after the welds.
             add_bodies: Called before the shapes are added, to add bodies.
             add_extras: Called last, to add lights or actuators, for example.
-
-        Raises:
-            InputError: MuJoCo rejects the model.
         """
         mj, spec, option = self.mj, self.spec, self.spec.option
         option.timestep = self.physics.timestep
@@ -233,11 +230,7 @@ class Builder:
                 joint.limited, joint.range = self.mj.mjtLimited.mjLIMITED_TRUE, [lower, upper]
 
     def _add_joint(self, body: Any, name: str, twist: Floats) -> tuple[Any, bool]:
-        """Add a joint along or about a twist's axis, shape (6,).
-
-        Returns:
-            The joint, and whether it is prismatic.
-        """
+        """Add a joint along or about a twist's axis, shape (6,)."""
         kind, slides = self.mj.mjtJoint, bool(np.linalg.norm(twist[:3]) > 0.5)
         axis = twist[:3] if slides else twist[3:]
         return body.add_joint(
@@ -307,10 +300,7 @@ class Builder:
         return self.bodies[target.parentJoint], target.placement
 
     def _add_weld(self, hold: Hold) -> None:
-        """Add a weld between holder and link.
-
-        If the grasp has degrees of freedom, the weld ends at an intermediate body that has them.
-        """
+        """Add a weld between holder and link."""
         scene = self.world.scene
         attachment = scene.objects[hold.object].object.attachment(hold.attachment)
         holder, _ = self.find_frame(hold.frame or scene.robot.tool_frame)

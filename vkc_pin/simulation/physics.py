@@ -97,21 +97,12 @@ class Physics:
 
 
 def import_mujoco() -> Any:
-    """Return the package `mujoco`.
-
-    Raises:
-        InputError: MuJoCo is not installed or cannot be imported.
-    """
+    """Return the package `mujoco`."""
     return import_optional("mujoco", "sim", purpose="simulating")
 
 
 def complete_inertias(world: World, physics: Physics) -> list[str]:
-    """Give every body a mass and a physically possible inertia; return one note per assumption.
-
-    Args:
-        world: The tree, whose model is changed in place.
-        physics: Settings with the density of links without a mass.
-    """
+    """Give every body a mass and a physically possible inertia; return one note per assumption."""
     tree, notes, estimated = world.model, list[str](), list[str]()
     for j in range(1, tree.njoints):
         inertia, name = tree.inertias[j], str(tree.names[j])
@@ -137,10 +128,7 @@ def complete_inertias(world: World, physics: Physics) -> list[str]:
 
 
 def _make_inertia_possible(inertia: pin.Inertia) -> tuple[Floats, float]:
-    """Return the nearest possible inertia [kg·m²], shape (3, 3), and the relative increase.
-
-    No principal moment can exceed the sum of the other two, but descriptions are rounded.
-    """
+    """Return the nearest possible inertia [kg·m²], shape (3, 3), and the relative increase."""
     tensor = np.asarray(inertia.inertia)
     first, second, third = np.linalg.eigvalsh(tensor).tolist()
     added = max(0.0, third - first - second, _LEAST_INERTIA * inertia.mass - first) * (1.0 + 1e-6)

@@ -118,9 +118,6 @@ class RenderedScene:
         Args:
             times: Times, shape (K,) [s].
             viewpoint: Target and position of the camera, shape (3,) each [m].
-
-        Raises:
-            VkcError: OpenGL is not available without a display.
         """
         mj, model = self.mj, self.model
         data, camera, option = mj.MjData(model), mj.MjvCamera(), mj.MjvOption()
@@ -167,17 +164,8 @@ def write_snapshots(executed: Execution, path: str | Path, *, count: int = 6) ->
 
     They are evenly distributed over the time in which the robot holds something, plus one before.
 
-    Args:
-        executed: The executed motion.
-        path: Output file, written atomically.
-        count: Number of snapshots.
-
     Returns:
         The path.
-
-    Raises:
-        InputError: `count` is out of range.
-        VkcError: OpenGL is not available without a display.
     """
     count = arguments.check_integer(count, "count", low=2, high=_MAX_SNAPSHOTS)
     first, last = float(executed.planned.times[0]), float(executed.planned.times[-1])
@@ -221,10 +209,6 @@ def write_video(executed: Execution, path: str | Path, *, rate: float = 25.0) ->
 
     Returns:
         The path.
-
-    Raises:
-        InputError: `rate` is out of range, or ffmpeg is not installed.
-        VkcError: OpenGL is not available without a display, or ffmpeg fails.
     """
     rate, encoder = (
         arguments.check_number(rate, "rate", "frames per second", low=1.0, high=_MAX_RATE),
@@ -320,11 +304,7 @@ def _add_visuals(builder: Builder, size: tuple[int, int], wall_opacity: float) -
 
 @contextlib.contextmanager
 def open_gl_context(size: tuple[int, int]) -> Iterator[None]:
-    """Provide an OpenGL context without a display, for images of a size [pixels].
-
-    Raises:
-        VkcError: No context is available; the message lists the attempts.
-    """
+    """Provide an OpenGL context without a display, for images of a size [pixels]."""
     tried = []
     for name in _CONTEXTS:
         try:

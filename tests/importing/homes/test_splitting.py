@@ -113,29 +113,6 @@ def test_free_object_is_rigid_and_separate() -> None:
     assert any("'to_lid'" in note for note in home.notes)
 
 
-def test_free_object_joints_are_fixed_within_limits() -> None:
-    """A lid that cannot be shut is fixed at its lower limit, not where the file's zero is."""
-    links = [Link("world"), _box("laptop"), _box("lid")]
-    home = split_home(
-        _home(
-            links,
-            [
-                _hung("world", "laptop", "floating", None),
-                _hung("laptop", "lid", "prismatic", (0.25, 1.0)),
-            ],
-        )
-    )
-    (laptop,) = home.objects
-    (hinge,) = laptop.description.joints.values()
-    assert hinge.kind == "fixed"
-    where = laptop.description.compute_placements()
-    base, lid = (
-        where[name].act(laptop.description.links[name].solid[0].placement.translation)
-        for name in ("laptop", "lid")
-    )
-    assert lid - base == pytest.approx([0.3 + 0.25, 0.0, 0.0])
-
-
 def test_flat_shapes_are_part_of_the_floor() -> None:
     links = [
         _box("world", (9.0, 9.0, 0.2), -0.1),

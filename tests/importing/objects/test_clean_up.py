@@ -35,7 +35,7 @@ def cabinet(tmp_path: Path) -> Description:
     return read_object_urdf(partnet(tmp_path))
 
 
-def test_fixed_links_become_one_and_dead_ones_go(cabinet: Description) -> None:
+def test_fixed_links_are_merged(cabinet: Description) -> None:
     found = merge_fixed_links(cabinet)
     assert set(found.links) == {"base", "link_0", "link_1"}
     assert found.joints["link_0"].parent == "base"
@@ -48,61 +48,9 @@ def test_fixed_links_become_one_and_dead_ones_go(cabinet: Description) -> None:
     assert "link_2_frame-1" in [part.name for part in found.links["base"].visual]
 
 
-def test_a_handle_fixed_to_a_door_is_part_of_it_and_keeps_its_name() -> None:
-    box = Part(name="", placement=pin.SE3.Identity(), kind="box", size=(0.1, 0.1, 0.1))
-    place = pin.SE3(np.eye(3), np.array([0.0, 0.5, 0.0]))
-    joints = {
-        "door": Joint(
-            name="hinge",
-            kind="revolute",
-            parent="case",
-            child="door",
-            placement=place,
-            limits=(0.0, 1.0),
-        ),
-        "handle": Joint(name="weld", kind="fixed", parent="door", child="handle", placement=place),
-        "flap": Joint(
-            name="stuck",
-            kind="revolute",
-            parent="handle",
-            child="flap",
-            placement=place,
-            limits=(0.3, 0.3),
-        ),
-    }
-    links = {
-        "case": Link("case", (), (box,)),
-        "door": Link("door", (box,)),
-        "handle": Link("handle", (), (box,)),
-        "flap": Link("flap", (), (box,)),
-    }
-    weights = {
-        name: pin.Inertia(k + 1.0, np.array([0.1, 0.0, 0.0]), 0.01 * np.eye(3))
-        for k, name in enumerate(links)
-    }
-    links = {name: dataclasses.replace(link, inertia=weights[name]) for name, link in links.items()}
-    found = merge_fixed_links(Description(Path("f"), links, joints))
-    assert set(found.links) == {"case", "door"}
-    assert found.links["case"].inertia.mass == 1.0
-    assert found.links["door"].inertia.mass == 2.0 + 3.0 + 4.0
-    middles = [
-        weights["door"].lever,
-        place.act(weights["handle"].lever),
-        2.0 * place.translation + weights["flap"].lever,
-    ]
-    assert np.allclose(
-        found.links["door"].inertia.lever, np.average(middles, axis=0, weights=[2.0, 3.0, 4.0])
-    )
-    assert [part.name for part in found.links["door"].collision] == ["", "handle", "flap"]
-    turned = found.links["door"].collision[2].placement
-    assert np.allclose(turned.translation, [0.0, 1.0, 0.0])
-    assert np.allclose(turned.rotation, pin.rpy.rpyToMatrix(0.3, 0.0, 0.0))
-    assert any("stuck" in note for note in found.notes)
-
-
 @settings(max_examples=20, deadline=None)
 @given(factor=st.floats(0.1, 10.0), slide=st.floats(0.0, 0.36))
-def test_scaling_scales_everything(
+def test_scaling_scales_shapes_and_limits(
     factor: float, slide: float, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     cabinet = read_object_urdf(partnet(tmp_path_factory.mktemp("p") / "x"))
@@ -113,21 +61,64 @@ def test_scaling_scales_everything(
     assert large.joints["link_0"].limits == pytest.approx((0.0, factor * 0.36))
 
 
-def test_masses_stay_as_stated_when_scaled_and_turn_with_the_root() -> None:
-    weight = pin.Inertia(2.0, np.array([0.1, 0.2, 0.3]), np.diag([0.1, 0.2, 0.25]))
-    one = Description(Path("f"), {"a": Link("a", inertia=weight)}, {})
-    large = scale_object(one, 3.0).links["a"].inertia
-    assert large.mass == 2.0
-    assert np.allclose(large.lever, 3.0 * weight.lever)
-    assert np.allclose(large.inertia, 9.0 * weight.inertia)
-    turned = make_upright(one, "y").links["a"].inertia
+def test_inertia_is_merged_scaled_and_turned() -> None:
+    """A handle is fixed to a door, and a flap to the handle: its limits are equal."""
+    place = pin.SE3(np.eye(3), np.array([0.0, 0.5, 0.0]))
+    box = Part(name="", placement=pin.SE3.Identity(), kind="box", size=(0.1, 0.1, 0.1))
+    inertia = pin.Inertia(2.0, np.array([0.1, 0.2, 0.3]), np.diag([0.1, 0.2, 0.25]))
+    parents = {"door": "case", "handle": "door", "flap": "handle"}
+    limits = {"door": (0.0, 1.0), "handle": None, "flap": (0.3, 0.3)}
+    joints = {
+        child: Joint(
+            name=f"{child}_joint",
+            kind="revolute" if limits[child] else "fixed",
+            parent=parent,
+            child=child,
+            placement=place,
+            limits=limits[child],
+        )
+        for child, parent in parents.items()
+    }
+    links = {name: Link(name, (), (box,), inertia) for name in ("case", *parents)}
+    merged = merge_fixed_links(Description(Path("f"), links, joints))
+    assert set(merged.links) == {"case", "door"}
+    door = merged.links["door"]
+    flap = pin.SE3(pin.rpy.rpyToMatrix(0.3, 0.0, 0.0), np.array([0.0, 1.0, 0.0]))
+    assert [part.name for part in door.collision] == ["", "handle", "flap"]
+    assert np.allclose(door.collision[2].placement.homogeneous, flap.homogeneous)
+    assert door.inertia.isApprox(inertia + place.act(inertia) + flap.act(inertia))
+    assert any("flap_joint" in note for note in merged.notes)
+    alone = Description(Path("f"), {"a": Link("a", inertia=inertia)}, {})
+    large = scale_object(alone, 3.0).links["a"].inertia
+    assert large.isApprox(pin.Inertia(2.0, 3.0 * inertia.lever, 9.0 * inertia.inertia))
+    turned = make_upright(alone, "y").links["a"].inertia
     assert np.allclose(turned.lever, [0.1, -0.3, 0.2])
-    assert sorted(np.diag(turned.inertia)) == pytest.approx([0.1, 0.2, 0.25])
-    assert not one.is_massless
-    assert Description(Path("f"), {"a": Link("a")}, {}).is_massless
+    assert not alone.is_massless
 
 
-def test_limits_that_are_missing_open_outwards(cabinet: Description) -> None:
+def test_separate_objects_in_one_file_are_noted(tmp_path: Path) -> None:
+    def box(name: str, parent: str, kind: str) -> str:
+        return (
+            f'<link name="{name}"><collision><geometry><box size="1 1 1"/></geometry></collision>'
+            f'</link><joint name="{name}_joint" type="{kind}"><parent link="{parent}"/>'
+            f'<child link="{name}"/><axis xyz="0 0 1"/><limit lower="0" upper="1"/></joint>'
+        )
+
+    def find_notes(*parts: str) -> tuple[str, ...]:
+        file = tmp_path / "it.urdf"
+        file.write_text(f'<robot name="it"><link name="world"/>{"".join(parts)}</robot>')
+        return find_multiple_objects(read_object_urdf(file))
+
+    oven = box("oven", "world", "fixed") + box("door", "oven", "revolute")
+    chest = box("chest", "world", "fixed") + box("lid", "chest", "revolute")
+    (note,) = find_notes(oven, chest, box("rack", "chest", "prismatic"))
+    assert "'oven' (1 joint), 'chest' (2 joints)" in note
+    assert find_notes(oven) == find_notes(oven, box("wall", "world", "fixed")) == ()
+    drawers = box("upper", "world", "prismatic"), box("lower", "world", "prismatic")
+    assert find_notes(*drawers) == ()
+
+
+def test_missing_limits_open_outwards(cabinet: Description) -> None:
     found = merge_fixed_links(cabinet)
     meshes = load_surfaces(found)
     limited = add_missing_limits(found, meshes)
@@ -151,7 +142,7 @@ def test_limits_that_are_missing_open_outwards(cabinet: Description) -> None:
     assert any("only 1.6°" in note or "only 2°" in note for note in noted)
 
 
-def test_up_root_and_part_of_it(cabinet: Description) -> None:
+def test_subtree_is_extracted_turned_and_moved(cabinet: Description) -> None:
     found = make_upright(extract_subtree(cabinet, "link_2"), "y")
     low, high = compute_bounds(found, load_surfaces(found))
     assert (high - low)[2] == pytest.approx(1.0)
@@ -161,7 +152,7 @@ def test_up_root_and_part_of_it(cabinet: Description) -> None:
         extract_subtree(cabinet, "link2")
 
 
-def test_names_without_dots_and_slashes_that_differ() -> None:
+def test_renamed_links_and_joints_stay_distinct() -> None:
     links = {name: Link(name) for name in ("a/b", "a.b", "c d")}
     joints = {
         name: Joint(
@@ -175,32 +166,8 @@ def test_names_without_dots_and_slashes_that_differ() -> None:
     assert {joint.parent for joint in found.joints.values()} == {"a_b"}
 
 
-def test_a_file_of_several_things_is_told_from_one_with_several_joints(tmp_path: Path) -> None:
-    def box(name: str, parent: str, kind: str) -> str:
-        link = f'<link name="{name}"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>'
-        ends = f'<parent link="{parent}"/><child link="{name}"/><axis xyz="0 0 1"/><limit lower="0" upper="1"/>'
-        return f'{link}<joint name="{name}_read_joint" type="{kind}">{ends}</joint>'
-
-    def said(*parts: str) -> tuple[str, ...]:
-        (tmp_path / "it.urdf").write_text(
-            f'<robot name="it"><link name="world"/>{"".join(parts)}</robot>'
-        )
-        return find_multiple_objects(read_object_urdf(tmp_path / "it.urdf"))
-
-    oven = box("oven", "world", "fixed") + box("door", "oven", "revolute")
-    (note,) = said(
-        oven,
-        box("chest", "world", "fixed"),
-        box("lid", "chest", "revolute"),
-        box("rack", "chest", "prismatic"),
-    )
-    assert "'oven' (1 joint), 'chest' (2 joints)" in note
-    assert said(oven) == said(oven, box("wall", "world", "fixed")) == ()
-    assert said(box("upper", "world", "prismatic"), box("lower", "world", "prismatic")) == ()
-
-
 @given(st.lists(st.text(max_size=5), max_size=8))
-def test_chosen_names_are_names_of_scenes_and_differ(wanted: list[str]) -> None:
+def test_chosen_names_are_valid_and_distinct(wanted: list[str]) -> None:
     taken = set[str]()
     names = [choose_name(name, taken) for name in wanted]
     assert len(set(names)) == len(names)
@@ -209,7 +176,7 @@ def test_chosen_names_are_names_of_scenes_and_differ(wanted: list[str]) -> None:
         TypeAdapter(Name).validate_python(name)
 
 
-def test_names_that_scenes_accept_stay() -> None:
+def test_valid_names_are_kept() -> None:
     taken = set[str]()
     names = ["a+b", "a b", "шкаф", "a\x7fb\u200b", "a_b"]
     assert [choose_name(name, taken) for name in names] == ["a+b", "a_b", "шкаф", "a_b_2", "a_b_3"]

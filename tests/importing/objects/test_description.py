@@ -5,13 +5,11 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.downloads import partnet
 
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
-from vkc_pin.importing.objects.urdf import read_object_urdf
 
 
-def test_volumes_of_parts_are_those_of_their_shapes() -> None:
+def test_part_meshes_have_volume_and_placement() -> None:
     where = pin.SE3(np.eye(3), np.array([1.0, 2.0, 3.0]))
     for kind, size, volume in (
         ("box", (0.1, 0.2, 0.3), 0.006),
@@ -39,9 +37,3 @@ def test_placements_follow_the_joints() -> None:
         [1.0, 1.0, 0.3],
     )
     assert found.subtree("b") == {"b", "c"}
-
-
-def test_what_is_seen_is_solid_where_nothing_else_is(tmp_path: Path) -> None:
-    case = read_object_urdf(partnet(tmp_path)).links["link_2"]
-    assert case.solid == case.collision
-    assert Link("", case.visual).solid == case.visual

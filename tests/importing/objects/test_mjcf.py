@@ -12,13 +12,15 @@ from vkc_pin.importing.objects.mjcf import read_object_mjcf
 pytest.importorskip("mujoco")
 
 
-def test_bodies_joints_and_shapes(tmp_path: Path) -> None:
-    (tmp_path / "t.xml").write_text(MJCF)
+def test_bodies_joints_and_shapes_are_read(tmp_path: Path) -> None:
+    resisting = 'name="hinge" damping="0.4" frictionloss="0.2"'
+    (tmp_path / "t.xml").write_text(MJCF.replace('name="hinge"', resisting))
     found = read_object_mjcf(tmp_path / "t.xml")
     assert list(found.links) == ["world", "case", "door"]
     hinge = found.joints["door"]
     assert (hinge.name, hinge.kind, hinge.limits) == ("hinge", "revolute", (-1.5, 0.0))
     assert np.allclose(hinge.axis, [0.0, 0.0, -1.0])
+    assert (hinge.damping, hinge.friction) == (0.4, 0.2)
     place = found.compute_placements()["door"]
     assert np.allclose(place.translation, [0.75, -0.3, 0.4])
     assert [(part.name, part.kind) for part in found.links["door"].collision] == [
@@ -27,28 +29,19 @@ def test_bodies_joints_and_shapes(tmp_path: Path) -> None:
     ]
     assert found.links["door"].collision[1].size == pytest.approx((0.01, 0.3))
     assert [part.name for part in found.links["door"].visual] == ["leaf", "handle", "looks"]
+    looks = found.links["door"].visual[2].make_mesh()  # MuJoCo moves meshes to their principal axes
+    assert np.allclose(looks.bounds, [[-0.02, 0.1, 0.0], [0.08, 0.2, 0.1]], atol=1e-6)
     notes = " ".join(found.notes)
     assert "'cup' is free" in notes
     assert "'floor'" in notes
+    with_free = read_object_mjcf(tmp_path / "t.xml", free=True)
+    assert (with_free.joints["cup"].kind, with_free.joints["cup"].parent) == ("floating", "world")
+    assert with_free.compute_placements()["cup"].translation == pytest.approx([2.0, 0.0, 0.0])
+    assert [part.kind for part in with_free.links["cup"].collision] == ["sphere"]
+    assert "'cup'" not in " ".join(with_free.notes)
 
 
-def test_bodies_that_move_freely_are_kept_if_wanted(tmp_path: Path) -> None:
-    (tmp_path / "t.xml").write_text(MJCF)
-    found = read_object_mjcf(tmp_path / "t.xml", free=True)
-    assert (found.joints["cup"].kind, found.joints["cup"].parent) == ("floating", "world")
-    assert found.compute_placements()["cup"].translation == pytest.approx([2.0, 0.0, 0.0])
-    assert [part.kind for part in found.links["cup"].collision] == ["sphere"]
-    assert "'cup'" not in " ".join(found.notes)
-
-
-def test_meshes_are_where_the_file_has_them(tmp_path: Path) -> None:
-    """MuJoCo moves meshes into their principal axes."""
-    (tmp_path / "t.xml").write_text(MJCF)
-    looks = read_object_mjcf(tmp_path / "t.xml").links["door"].visual[2].make_mesh()
-    assert np.allclose(looks.bounds, [[-0.02, 0.1, 0.0], [0.08, 0.2, 0.1]], atol=1e-6)
-
-
-def test_what_mujoco_does_not_understand(tmp_path: Path) -> None:
+def test_invalid_file_is_named(tmp_path: Path) -> None:
     (tmp_path / "t.xml").write_text(
         '<mujoco><worldbody><geom type="bx" size="1 1 1"/></worldbody></mujoco>'
     )
@@ -56,15 +49,7 @@ def test_what_mujoco_does_not_understand(tmp_path: Path) -> None:
         read_object_mjcf(tmp_path / "t.xml")
 
 
-def test_what_joints_resist_with(tmp_path: Path) -> None:
-    (tmp_path / "t.xml").write_text(
-        MJCF.replace('name="hinge"', 'name="hinge" damping="0.4" frictionloss="0.2"')
-    )
-    hinge = read_object_mjcf(tmp_path / "t.xml").joints["door"]
-    assert (hinge.damping, hinge.friction) == (0.4, 0.2)
-
-
-def test_what_bodies_weigh(tmp_path: Path) -> None:
+def test_inertia_agrees_with_mujoco(tmp_path: Path) -> None:
     """Masses and moments about the world's origin are MuJoCo's, which infers them from the geoms."""
     mujoco = pytest.importorskip("mujoco")
     (tmp_path / "t.xml").write_text(MJCF)
@@ -83,7 +68,7 @@ def test_what_bodies_weigh(tmp_path: Path) -> None:
     assert found.links["door"].inertia.mass > 0.0
 
 
-def test_links_without_names_of_their_own_replace_no_others(tmp_path: Path) -> None:
+def test_unnamed_bodies_get_unique_names(tmp_path: Path) -> None:
     """The body with two joints needs a second link, and the third body has no name."""
     (tmp_path / "t.xml").write_text(
         """<mujoco><worldbody><body name="case"><geom size="0.1"/>

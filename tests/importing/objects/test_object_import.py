@@ -4,10 +4,10 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
-import trimesh
 import yaml
-from helpers.downloads import MJCF, SDF, partnet
+from helpers.downloads import SDF, partnet
 
 import vkc_pin as vkc
 from vkc_pin.importing.objects.object_import import read_description
@@ -19,14 +19,24 @@ def cabinet(tmp_path_factory: pytest.TempPathFactory) -> vkc.importing.ImportedO
     return vkc.importing.import_object(partnet(folder / "45427"), folder / "out", height=0.8)
 
 
-def test_a_cabinet_of_partnet_stands_on_the_floor_in_its_height(
-    cabinet: vkc.importing.ImportedObject,
-) -> None:
+def test_import_finds_handles_and_reports_changes(cabinet: vkc.importing.ImportedObject) -> None:
+    drawer, door = (cabinet.proposals.opening(joint)[0] for joint in ("joint_0", "joint_1"))
+    assert (drawer.named, door.named) == (True, False)
+    assert (drawer.kind, door.kind) == ("bar", "bar")
+    assert drawer.thickness == pytest.approx(0.8 * 0.02, rel=0.01)
+    names = [proposal.attachment.name for proposal in cabinet.proposals.found]
+    assert list(cabinet.object.attachments) == names
+    report = cabinet.summary()
+    changes = ("joint_1' states no limits", "joint_3", "decoration-6")
+    for text in (*changes, "2 joints", "0.80 m", "husky_ur5e"):
+        assert text in report, text
+    assert cabinet.picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_object_stands_on_the_floor_in_its_height(cabinet: vkc.importing.ImportedObject) -> None:
     assert cabinet.file.name == "object_45427.yaml"
     assert cabinet.size[2] == pytest.approx(0.8)
     item, data = cabinet.object, cabinet.object.model.createData()
-    import pinocchio as pin
-
     pin.forwardKinematics(item.model, data, item.coordinates.q(np.zeros(2)))
     corners = [
         (data.oMi[shape.parentJoint] * shape.placement).act(np.asarray(point))
@@ -40,33 +50,7 @@ def test_a_cabinet_of_partnet_stands_on_the_floor_in_its_height(
     assert item.upper[item.coordinates.index("joint_0")] == pytest.approx(0.8 * 0.36)
 
 
-def test_handles_are_found_named_or_not(cabinet: vkc.importing.ImportedObject) -> None:
-    drawer, door = (cabinet.proposals.opening(joint)[0] for joint in ("joint_0", "joint_1"))
-    assert drawer.named
-    assert not door.named
-    assert {drawer.kind, door.kind} == {"bar"}
-    assert drawer.thickness == pytest.approx(0.8 * 0.02, rel=0.01)
-    assert cabinet.object.attachment(drawer.attachment.name).joint == drawer.attachment.joint
-    assert list(cabinet.object.attachments) == [
-        proposal.attachment.name for proposal in cabinet.proposals.found
-    ]
-
-
-def test_report_lists_changes(cabinet: vkc.importing.ImportedObject) -> None:
-    report = cabinet.summary()
-    for text in (
-        "joint_1' states no limits",
-        "joint_3",
-        "decoration-6",
-        "2 joints",
-        "0.80 m",
-        "husky_ur5e",
-    ):
-        assert text in report, text
-    assert cabinet.picture.read_bytes().startswith(b"\x89PNG")
-
-
-def test_a_scene_with_it_can_be_planned(
+def test_imported_object_can_be_opened(
     cabinet: vkc.importing.ImportedObject, tmp_path: Path
 ) -> None:
     best = cabinet.proposals.opening("joint_0")[0].attachment
@@ -89,24 +73,15 @@ def test_a_scene_with_it_can_be_planned(
     assert plan.trajectory.column("it.joint_0")[-1] == pytest.approx(0.2, abs=1e-3)
 
 
-@pytest.mark.parametrize(("name", "text"), [("box.sdf", SDF), ("box.xml", MJCF)])
-def test_the_same_box_in_other_formats(name: str, text: str, tmp_path: Path) -> None:
-    if name.endswith("xml"):
-        pytest.importorskip("mujoco")
-    (tmp_path / name).write_text(text)
-    done = vkc.importing.import_object(tmp_path / name, tmp_path / "out")
-    best = done.proposals.opening("hinge")[0]
-    assert best.kind == "bar"
-    assert best.thickness == pytest.approx(0.02, rel=0.02)
-    assert best.opens["hinge"] == pytest.approx(-1.5)
-    assert done.size == pytest.approx([0.54, 0.6, 0.8], abs=0.01)
-
-
-def test_a_link_alone(tmp_path: Path) -> None:
-    done = vkc.importing.import_object(
-        partnet(tmp_path / "in"), tmp_path / "out", link="link_2", up="y"
-    )
-    assert done.file.name == "link_2.yaml"
+@pytest.mark.parametrize(("link", "name"), [("link_2", "link_2"), ("+", "object")])
+def test_single_link_is_imported_under_its_name(link: str, name: str, tmp_path: Path) -> None:
+    file = partnet(tmp_path / "in")
+    file.write_text(file.read_text().replace('"link_2"', f'"{link}"'))
+    done = vkc.importing.import_object(file, tmp_path / "out", link=link, up="y", most=1)
+    assert done.file.name == f"{name}.yaml"
+    assert (done.file.parent / f"{name}.urdf").is_file()
+    assert done.object.base_link == link
+    assert (f"# Name of the link: {link}\n" in done.file.read_text()) == (link != name)
     assert set(done.object.coordinates.names) == {"joint_0", "joint_1"}
     assert done.size[2] == pytest.approx(1.0)
 
@@ -147,59 +122,5 @@ def test_failed_import_leaves_no_files(tmp_path: Path) -> None:
         vkc.importing.import_object(tmp_path / "box.sdf", out, most=1)
     with pytest.raises(vkc.InputError, match=r"would delete .*got old\.stl\)"):
         vkc.importing.import_object(tmp_path / "box.sdf", out, most=1, force=True)
-    (out / "old.stl").unlink()
-    assert (
-        vkc.importing.import_object(tmp_path / "box.sdf", out, most=1, force=True).file == done.file
-    )
     again = vkc.importing.propose_attachments(done.proposals.object, "husky_ur5e", most=1)
     assert [one.attachment.name for one in again.found] == list(done.object.attachments)
-
-
-def test_a_file_name_cannot_add_fields_to_the_description(tmp_path: Path) -> None:
-    file = tmp_path / "x\nfree: true\n#\x01\udcff.sdf"
-    file.write_text(SDF)
-    done = vkc.importing.import_object(file, tmp_path / "out", most=1)
-    assert done.file.name == "x_free_true.yaml"
-    assert not done.object.free
-    text = done.file.read_text(encoding="utf-8")
-    assert set(yaml.safe_load(text)) == {"urdf", "attachments"}
-    assert text.startswith(
-        "# Made of x\\nfree: true\\n#\\x01\\udcff.sdf by vkc-pin import-object.\n"
-    )
-    again = vkc.importing.import_object(file, tmp_path / "out", most=1, force=True)
-    assert again.file == done.file
-
-
-@pytest.mark.parametrize(
-    ("link", "name"),
-    [("link_2", "link_2"), ("+", "object"), ("con", "con_"), ("x" * 300, "x" * 64)],
-)
-def test_an_object_is_named_after_its_link(link: str, name: str, tmp_path: Path) -> None:
-    file = partnet(tmp_path / "in")
-    file.write_text(file.read_text().replace('"link_2"', f'"{link}"'))
-    done = vkc.importing.import_object(file, tmp_path / "out", link=link, up="y", most=1)
-    assert done.file.name == f"{name}.yaml"
-    assert {path.name for path in done.file.parent.glob("*.urdf")} == {f"{name}.urdf"}
-    assert done.object.base_link == link
-    assert (f"# Name of the link: {link}\n" in done.file.read_text()) == (link != name)
-
-
-@pytest.mark.parametrize(("small", "large"), [("left", "right"), ("é", "ü"), ("a+b", "a b")])
-def test_links_whose_names_look_alike_keep_their_own_pieces(
-    small: str, large: str, tmp_path: Path
-) -> None:
-    def link(name: str, geometry: str, x: float = 0.0, z: float = 0.0) -> str:
-        shape = f'<origin xyz="{x} 0 {z}"/><geometry>{geometry}</geometry>'
-        return f'<link name="{name}"><collision>{shape}</collision></link>'
-
-    text = link("case", '<box size="0.4 0.6 0.8"/>', 0.2, 0.4)
-    for name, size, y in ((small, 0.05, 0.2), (large, 0.2, -0.2)):
-        trimesh.creation.box((size,) * 3).export(tmp_path / f"{size}.stl")
-        text += link(name, f'<mesh filename="{size}.stl"/>')
-        text += f'<joint name="{name}_joint" type="prismatic"><origin xyz="-0.2 {y} 0.5"/>'
-        text += f'<parent link="case"/><child link="{name}"/>'
-        text += '<axis xyz="-1 0 0"/><limit lower="0" upper="0.3"/></joint>'
-    (tmp_path / "o.urdf").write_text(f'<robot name="o">{text}</robot>', encoding="utf-8")
-    item = vkc.importing.import_object(tmp_path / "o.urdf", tmp_path / "out", most=1).object
-    volumes = [shape.geometry.computeVolume() for shape in item.collision.geometryObjects]
-    assert volumes == pytest.approx([0.4 * 0.6 * 0.8, 0.05**3, 0.2**3])

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-import pytest
 import trimesh
 from helpers.downloads import partnet
 
@@ -32,27 +31,7 @@ def pieces(description: Description) -> tuple[tuple[Part, ...], tuple[str, ...]]
     return found.links["b"].collision, found.notes
 
 
-def test_a_bracket_leaves_room_for_fingers() -> None:
-    pytest.importorskip("coacd")
-    outline = (
-        np.array([[0, -15], [7, -15], [7, 15], [0, 15], [0, 13], [5, 13], [5, -13], [0, -13]])
-        / 100.0
-    )
-    above = np.array([[0, 1, 6], [0, 6, 7], [1, 2, 5], [1, 5, 6], [2, 3, 4], [2, 4, 5]])
-    around = [[k, (k + 1) % 8, side] for k in range(8) for side in ((k + 1) % 8 + 8, -1)]
-    sides = [[k, j, top] if top > 0 else [k, j + 8, k + 8] for k, j, top in around]
-    corners = np.vstack([np.column_stack([outline, np.full(8, z)]) for z in (0.0, 0.02)])
-    bracket = trimesh.Trimesh(corners, np.vstack([above[:, ::-1], above + 8, sides]))
-    assert bracket.is_volume
-    found, notes = pieces(alone(bracket))
-    assert len(found) == 3
-    between = np.array([[0.02, 0.0, 0.01]])
-    assert not any(part.make_mesh().contains(between).any() for part in found)
-    assert sum(part.make_mesh().volume for part in found) == pytest.approx(bracket.volume, rel=0.3)
-    assert notes == ()
-
-
-def test_flat_shapes_get_thick_and_are_named(tmp_path: Path) -> None:
+def test_flat_shapes_are_thickened_and_noted(tmp_path: Path) -> None:
     found = merge_fixed_links(read_object_urdf(partnet(tmp_path)))
     done = decompose_links(found, load_surfaces(found))
     decoration = next(
@@ -62,14 +41,14 @@ def test_flat_shapes_get_thick_and_are_named(tmp_path: Path) -> None:
     assert any("decoration-6" in note and "link_0" in note for note in done.notes)
 
 
-def test_what_lies_inside_of_another_piece_goes() -> None:
+def test_enclosed_pieces_are_removed() -> None:
     large, small = trimesh.creation.box((0.3, 0.3, 0.3)), trimesh.creation.box((0.1, 0.1, 0.1))
     beside = small.copy().apply_translation((0.15, 0.0, 0.0))
     found, _ = pieces(alone(small, large, beside))
     assert sorted(round(part.make_mesh().volume, 6) for part in found) == [0.001, 0.027]
 
 
-def test_boxes_stay_boxes_and_what_is_seen_collides_where_nothing_else_does() -> None:
+def test_visual_boxes_replace_missing_collision_geometry() -> None:
     box = Part(name="", placement=HERE, kind="box", size=(0.1, 0.1, 0.1))
     found = decompose_links(
         Description(Path("f"), {"a": Link("a", (box,))}, {}), {id(box): box.make_mesh()}
@@ -78,7 +57,7 @@ def test_boxes_stay_boxes_and_what_is_seen_collides_where_nothing_else_does() ->
     assert any("visual geometry is used" in note for note in found.notes)
 
 
-def test_a_file_that_is_there_twice_is_cut_once_and_is_where_it_stands(tmp_path: Path) -> None:
+def test_repeated_mesh_is_decomposed_once(tmp_path: Path) -> None:
     trimesh.creation.annulus(0.3, 0.5, 0.2).export(tmp_path / "ring.stl")
     places = [
         pin.SE3(pin.rpy.rpyToMatrix(0.2, 0.3, k), np.array([float(k), 0.0, 0.5])) for k in range(2)

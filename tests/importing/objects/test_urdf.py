@@ -7,10 +7,11 @@ import pytest
 from helpers.downloads import partnet
 
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.importing.objects.description import Link
 from vkc_pin.importing.objects.urdf import read_object_urdf
 
 
-def test_what_partnet_leaves_out_is_none(tmp_path: Path) -> None:
+def test_missing_values_of_partnet_are_none(tmp_path: Path) -> None:
     found = read_object_urdf(partnet(tmp_path))
     assert found.root == "base"
     joints = {joint.name: joint for joint in found.joints.values()}
@@ -18,23 +19,24 @@ def test_what_partnet_leaves_out_is_none(tmp_path: Path) -> None:
     assert joints["joint_1"].limits is None
     assert joints["joint_3"].kind == "continuous"
     assert {joint.velocity for joint in joints.values()} == {None}
-
-
-def test_what_collides_is_called_as_what_is_seen(tmp_path: Path) -> None:
-    drawer = read_object_urdf(partnet(tmp_path)).links["link_0"]
+    drawer = found.links["link_0"]
     assert [part.name for part in drawer.collision] == [part.name for part in drawer.visual]
     assert "handle-7" in [part.name for part in drawer.collision]
+    case = found.links["link_2"]
+    assert case.solid == case.collision
+    assert Link("", case.visual).solid == case.visual
 
 
-def test_limits_the_wrong_way_round_and_unknown_joints_are_noted(tmp_path: Path) -> None:
+def test_swapped_limits_and_unsupported_joints_are_noted(tmp_path: Path) -> None:
     text = """<robot name="t"><link name="a"/><link name="b"/><link name="c"/>
     <joint name="j" type="revolute"><parent link="a"/><child link="b"/><limit lower="1" upper="-0.5"/>
-      <mimic joint="k"/></joint>
+      <mimic joint="k"/><dynamics damping="0.4" friction="-1"/></joint>
     <joint name="k" type="floating"><parent link="a"/><child link="c"/></joint></robot>"""
     (tmp_path / "t.urdf").write_text(text)
     found = read_object_urdf(tmp_path / "t.urdf")
     assert found.joints["b"].limits == (-0.5, 1.0)
     assert np.allclose(found.joints["b"].axis, [1.0, 0.0, 0.0])
+    assert (found.joints["b"].damping, found.joints["b"].friction) == (0.4, 0.0)
     assert found.joints["c"].kind == "fixed"
     assert [
         word in " ".join(found.notes)
@@ -58,15 +60,6 @@ def test_errors_name_file_and_element(tmp_path: Path) -> None:
     )
     with pytest.raises(InputError, match=r"gone\.obj"):
         read_object_urdf(file)
-
-
-def test_joint_resistance_is_read(tmp_path: Path) -> None:
-    text = """<robot name="t"><link name="a"/><link name="b"/><link name="c"/>
-    <joint name="j" type="continuous"><parent link="a"/><child link="b"/><dynamics damping="0.4" friction="0.2"/></joint>
-    <joint name="k" type="continuous"><parent link="b"/><child link="c"/><dynamics damping="-1"/></joint></robot>"""
-    (tmp_path / "t.urdf").write_text(text)
-    found = read_object_urdf(tmp_path / "t.urdf").joints
-    assert [(joint.damping, joint.friction) for joint in found.values()] == [(0.4, 0.2), (0.0, 0.0)]
 
 
 def test_inertia_is_read(tmp_path: Path) -> None:

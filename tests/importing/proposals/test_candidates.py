@@ -7,9 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.importing.proposals.candidates import Candidate, Thickness, find_candidates
+from vkc_pin.importing.proposals.candidates import (
+    Candidate,
+    Piece,
+    Section,
+    Thickness,
+    find_candidates,
+)
 from vkc_pin.importing.proposals.hand import Hand
-from vkc_pin.importing.proposals.sections import Piece
 
 HAND = Hand("none", (), (), opening=0.086, tip=0.019, width=0.022)
 UP = np.array([0.0, 0.0, 1.0])
@@ -25,7 +30,7 @@ def found(
     return list(find_candidates(piece, HAND, 0.005, UP, seen)), seen
 
 
-def test_a_bar_is_taken_around_in_its_middle() -> None:
+def test_bar_is_grasped_around_its_middle() -> None:
     grasps, _ = found(coal.Cylinder(0.01, 0.3), pin.SE3(np.eye(3), np.array([0.1, 0.2, 0.3])))
     bars = [
         grasp
@@ -43,7 +48,7 @@ def test_a_bar_is_taken_around_in_its_middle() -> None:
         assert grasp.round == pytest.approx(1.6)
 
 
-def test_a_leaf_is_taken_at_its_edges() -> None:
+def test_panel_is_grasped_at_its_edges() -> None:
     grasps, seen = found(coal.Box(0.02, 0.6, 0.8))
     assert {grasp.kind for grasp in grasps} == {"edge"}
     assert seen.too_thick > 0
@@ -53,13 +58,6 @@ def test_a_leaf_is_taken_at_its_edges() -> None:
         depth = abs(grasp.placement.translation @ tool[:, 2])
         assert np.isclose(depth, [0.28, 0.38]).any()  # 20 mm behind the edge
         assert grasp.round == 0.0
-
-
-def test_a_block_is_too_thick() -> None:
-    grasps, seen = found(coal.Box(0.1, 0.1, 0.1))
-    assert grasps == []
-    assert seen.tried == seen.too_thick > 0
-    assert seen.thinnest == pytest.approx(0.1)
 
 
 @settings(max_examples=30, deadline=None)
@@ -74,3 +72,56 @@ def test_every_grasp_fits_and_closes_upwards(size: tuple[float, float, float], y
         assert np.linalg.det(tool) > 0.0
         assert tool[2, 0] >= -0.3 - 1e-9  # of two hands half a turn apart, the one that points up
         assert grasp.span[0] <= 0.0 <= grasp.span[1]
+
+
+def piece(geometry: coal.CollisionGeometry, placement: pin.SE3 | None = None) -> Piece:
+    return Piece.from_shape(
+        pin.GeometryObject("link_0", 0, 0, placement or pin.SE3.Identity(), geometry)
+    )
+
+
+angles = st.floats(-3.0, 3.0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(roll=angles, pitch=angles, yaw=angles)
+def test_axes_of_a_turned_box_are_its_own(roll: float, pitch: float, yaw: float) -> None:
+    rotation = pin.rpy.rpyToMatrix(roll, pitch, yaw)
+    box = piece(coal.Box(0.5, 0.2, 0.05), pin.SE3(rotation, np.array([1.0, 2.0, 3.0])))
+    assert np.allclose(box.axes @ box.axes.T, np.eye(3), atol=1e-9)
+    assert np.allclose(
+        np.ptp(box.extents, axis=1), [0.5, 0.2, 0.05], rtol=0.031
+    )  # as thin as along any, within 3 %
+
+
+def test_section_of_a_turned_box() -> None:
+    turn = pin.rpy.rpyToMatrix(0.0, 0.0, 0.7)
+    box = piece(coal.Box(0.5, 0.2, 0.05), pin.SE3(turn, np.array([1.0, 0.0, 0.0])))
+    section = box.cut(0, float(box.extents[0].mean()))
+    assert section is not None
+    assert np.allclose(section.centre, [1.0, 0.0, 0.0], atol=1e-9)
+    widths = sorted(np.ptp(section.polygon, axis=0))
+    assert widths == pytest.approx([0.05, 0.2])
+    assert box.cut(0, float(box.extents[0, 1]) + 0.01) is None
+
+
+SQUARE = Section(
+    np.zeros(3),
+    np.eye(3)[:2],
+    np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * 0.01,
+)
+
+
+def test_faces_are_graspable_and_corners_are_not() -> None:
+    assert SQUARE.is_graspable(np.array([1.0, 0.0]))
+    assert SQUARE.is_graspable(np.array([np.cos(0.3), np.sin(0.3)]))
+    assert not SQUARE.is_graspable(np.array([1.0, 1.0]) / np.sqrt(2.0))
+
+
+def test_clipped_section_keeps_its_remainder() -> None:
+    left = SQUARE.clip(np.array([1.0, 0.0]), -0.005)
+    assert left is not None
+    assert left.extent(np.array([1.0, 0.0])) == pytest.approx((-0.01, -0.005))
+    assert left.extent(np.array([0.0, 1.0])) == pytest.approx((-0.01, 0.01))
+    assert SQUARE.clip(np.array([1.0, 0.0]), -0.02) is None
+    assert np.allclose(left.to_joint_frame(np.array([0.001, 0.002])), [0.001, 0.002, 0.0])

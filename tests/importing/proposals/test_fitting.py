@@ -9,8 +9,10 @@ import pytest
 from helpers.furniture import BAR, flap
 
 import vkc_pin as vkc
-from vkc_pin.importing.proposals.fitting import HandClearance, Obstruction
+from vkc_pin.importing.proposals.candidates import Piece, Thickness, find_candidates
+from vkc_pin.importing.proposals.fitting import GraspMotion, HandClearance, Obstruction
 from vkc_pin.importing.proposals.hand import make_hand
+from vkc_pin.importing.proposals.ranking import Opening, find_openings
 from vkc_pin.world.models.shapes import compute_clearance
 
 FRONT = np.column_stack(
@@ -25,11 +27,9 @@ def fitting(tmp_path: Path) -> HandClearance:
     )
 
 
-def test_a_hand_around_a_bar_has_room(fitting: HandClearance) -> None:
-    assert fitting.find_obstruction(pin.SE3(FRONT, np.array([-0.08, 0.5, 0.5])), "flap") is None
-
-
-def test_what_is_in_the_way_is_named(fitting: HandClearance) -> None:
+def test_obstruction_is_named(fitting: HandClearance) -> None:
+    middle = pin.SE3(FRONT, np.array([-0.08, 0.5, 0.5]))
+    assert fitting.find_obstruction(middle, "flap") is None
     beside = pin.SE3(FRONT, np.array([-0.08, 0.535, 0.5]))
     assert fitting.find_obstruction(beside, "flap") == Obstruction("fingers", "flap")
     assert fitting.find_obstruction(
@@ -42,7 +42,7 @@ def test_what_is_in_the_way_is_named(fitting: HandClearance) -> None:
     assert fitting.find_obstruction(below, "flap") == Obstruction("floor")
 
 
-def test_the_object_is_where_its_joints_are(fitting: HandClearance) -> None:
+def test_object_is_placed_at_its_joint_positions(fitting: HandClearance) -> None:
     tool = pin.SE3(FRONT, np.array([-0.08, 0.5, 0.5]))
     fitting.place(np.array([1.2]))
     assert (
@@ -53,7 +53,7 @@ def test_the_object_is_where_its_joints_are(fitting: HandClearance) -> None:
     assert fitting.find_obstruction(turned * tool, "flap") is None
 
 
-def test_clearance_is_that_of_coal(fitting: HandClearance) -> None:
+def test_clearance_agrees_with_coal(fitting: HandClearance) -> None:
     """A hand at places on a line: blocked if and only if coal finds it closer than the options allow."""
     shapes, hand = fitting.item.collision.geometryObjects, fitting.hand
     data = fitting.item.model.createData()
@@ -88,3 +88,57 @@ def test_clearance_is_that_of_coal(fitting: HandClearance) -> None:
         while abs(other - one) > 1e-4:
             middle = (one + other) / 2.0
             one, other = (middle, other) if free(middle) == before else (one, middle)
+
+
+def grip(folder: Path, **what: str) -> tuple[GraspMotion, Opening, HandClearance]:
+    """Return the hand at the middle of the bar, from the front."""
+    fitting = HandClearance(
+        flap(folder, BAR.format(""), **what), make_hand(vkc.load_robot("husky_ur5e")), 0.02, 0.005
+    )
+    pieces = {
+        1: [
+            Piece.from_shape(shape)
+            for shape in fitting.item.collision.geometryObjects
+            if shape.parentJoint == 1
+        ]
+    }
+    bar = next(
+        piece
+        for piece in pieces[1]
+        if np.ptp(piece.vertices[:, 0]) < 0.03 and np.ptp(piece.vertices[:, 1]) < 0.03
+    )
+    grasps = find_candidates(bar, fitting.hand, 0.005, np.array([0.0, 0.0, 1.0]), Thickness())
+    front = next(
+        g
+        for g in grasps
+        if g.placement.rotation[0, 2] > 0.99 and abs(g.placement.translation[2]) < 1e-6
+    )
+    return GraspMotion(fitting, front, 0.0), find_openings(fitting.item, pieces)[1], fitting
+
+
+def test_free_bar_permits_sliding_and_turning(tmp_path: Path) -> None:
+    hand, opening, fitting = grip(tmp_path)
+    assert hand.follow(opening) == pytest.approx(1.5)
+    assert np.allclose(fitting.state, 0.0)  # put back
+    kind, freedoms = hand.freedoms()
+    assert kind == "cylindrical"
+    slide, turn = freedoms
+    assert slide.upper == -slide.lower == pytest.approx(hand.slack)
+    assert 0.12 <= slide.upper <= 0.15 - fitting.hand.width / 2
+    assert turn.lower < -0.3
+    assert turn.upper > 0.3
+
+
+def test_obstacles_limit_slide_and_opening(tmp_path: Path) -> None:
+    above = '<collision><origin xyz="-0.15 0.5 0.68"/><geometry><box size="0.3 0.6 0.02"/></geometry></collision>'
+    hand, opening, _ = grip(tmp_path, before=above)
+    hand.follow(opening)
+    slide = hand.freedoms()[1][0]
+    assert slide.upper - slide.lower < 0.25
+    assert hand.slack < 0.13
+    wall = '<collision><origin xyz="-0.5 -0.3 0.5"/><geometry><box size="0.4 0.02 1.0"/></geometry></collision>'
+    hand, opening, _ = grip(tmp_path, before=wall)
+    assert 0.5 < hand.follow(opening) <= 1.5
+    shelf = '<collision><origin xyz="-0.7 0.3 0.5"/><geometry><box size="0.4 0.8 1.0"/></geometry></collision>'
+    hand, opening, _ = grip(tmp_path, before=shelf)
+    assert hand.follow(opening) < 1.0

@@ -8,7 +8,7 @@ import vkc_pin as vkc
 from vkc_pin.importing.proposals.hand import make_hand
 
 
-def test_the_opening_is_that_of_the_maker() -> None:
+def test_hand_dimensions_agree_with_the_data_sheet() -> None:
     hand = make_hand(vkc.load_robot("husky_ur5e"))
     assert hand.opening == pytest.approx(0.086, abs=2e-4)  # robots/husky_ur5e/README.md
     assert 0.015 < hand.tip < 0.022
@@ -17,13 +17,13 @@ def test_the_opening_is_that_of_the_maker() -> None:
     assert len(hand.others) == 1  # the wrist behind it
 
 
-def test_a_robot_without_touch_links_has_no_hand() -> None:
+def test_robot_without_touch_links_has_no_hand() -> None:
     robot = dataclasses.replace(vkc.load_robot("husky_ur5e"), touch_links=())
     with pytest.raises(vkc.InputError, match="touch_links"):
         make_hand(robot)
 
 
-def test_a_tool_frame_inside_the_palm_leaves_no_room() -> None:
+def test_tool_frame_inside_the_palm_is_refused() -> None:
     robot = dataclasses.replace(vkc.load_robot("husky_ur5e"), tool_frame="gripper_link")
     with pytest.raises(vkc.InputError, match="no room between the fingers"):
         make_hand(robot)

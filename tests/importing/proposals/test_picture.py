@@ -10,7 +10,7 @@ import vkc_pin as vkc
 from vkc_pin.importing.proposals.picture import plot_attachments
 
 
-def test_a_panel_for_every_attachment(tmp_path: Path) -> None:
+def test_picture_has_a_panel_for_every_attachment(tmp_path: Path) -> None:
     from PIL import Image
 
     found = vkc.importing.propose_attachments(flap(tmp_path, BAR.format("")))
@@ -24,12 +24,9 @@ def test_a_panel_for_every_attachment(tmp_path: Path) -> None:
     assert blue > 200 * len(found.found)
 
 
-def test_what_cannot_be_opened_is_said(tmp_path: Path) -> None:
+def test_picture_explains_missing_attachments(tmp_path: Path) -> None:
+    with pytest.raises(vkc.InputError, match="proposals"):
+        plot_attachments("drawer")  # type: ignore[arg-type]
     found = vkc.importing.propose_attachments(flap(tmp_path, thick=0.12))
     figure = plot_attachments(found)
     assert "120 mm at its thinnest" in figure.axes[0].texts[0].get_text()
-
-
-def test_wrong_arguments() -> None:
-    with pytest.raises(vkc.InputError, match="proposals"):
-        plot_attachments("drawer")  # type: ignore[arg-type]

@@ -38,27 +38,18 @@ def test_descriptions_load_as_the_same_attachments(
             assert np.allclose(one.axis, other.axis)
 
 
-def test_applied_gives_the_object_the_best_one_first(found: vkc.importing.Proposals) -> None:
+def test_applied_object_has_the_best_attachment_first(found: vkc.importing.Proposals) -> None:
     item = found.applied()
     assert item.attachment().name == found.found[0].attachment.name == "flap_bar"
     assert found.opening("hinge") == found.found
     assert "flap_bar" in repr(found)
 
 
-def test_a_line_names_few_of_the_joints_that_must_be_open(found: vkc.importing.Proposals) -> None:
-    first = found.found[0]
-    ends = {
-        0: "1.5 rad",
-        2: "1.5 rad, while j0 is at 1, j1 is at 1",
-        5: "j2 is at 1 and 2 more joints are open",
-    }
-    for count, said in ends.items():
-        one = dataclasses.replace(first, when={f"j{k}": 1.0 for k in range(count)})
-        assert dataclasses.replace(found, found=(one,)).summary().splitlines()[1].endswith(said)
-
-
-def test_the_report_says_what_opens_and_how_far(found: vkc.importing.Proposals) -> None:
+def test_report_lists_attachments_and_openings(found: vkc.importing.Proposals) -> None:
     lines = found.summary().splitlines()
     assert lines[0] == "hinge, 0 to 1.5 rad"
     assert "flap_bar (bar, named as a handle): 20 mm thick, cylindrical" in lines[1]
     assert "opens to 1.5 rad" in lines[1]
+    many = dataclasses.replace(found.found[0], when={f"j{k}": 1.0 for k in range(5)})
+    line = dataclasses.replace(found, found=(many,)).summary().splitlines()[1]
+    assert line.endswith("j2 is at 1 and 2 more joints are open")

@@ -1,13 +1,10 @@
 from __future__ import annotations
 
 import dataclasses
-import inspect
-import itertools
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from helpers.furniture import BAR, flap
 from helpers.grippers import cheeky_drawer, write_gripper
 
@@ -15,24 +12,16 @@ import vkc_pin as vkc
 from vkc_pin.importing.proposals.fitting import HandClearance
 from vkc_pin.importing.proposals.hand import make_hand
 
-POSTS = "".join(
-    f'<collision><origin xyz="-0.045 0.5 {z}"/><geometry><box size="0.07 0.09 0.014"/></geometry></collision>'
-    for z in (-0.13, 0.13)
-)
 HAND_WRITTEN = [
     ("drawer", "slide", "handle"),
-    ("low_drawer", "slide", "handle"),
-    ("counter_drawer", "slide", "handle"),
     ("cabinet", "hinge", "handle"),
-    ("refrigerator", "hinge", "handle"),
     ("dishwasher", "door", "door_handle"),
     ("door", "knob", "handle"),
-    ("narrow_door", "hinge", "handle"),
 ]
 
 
 @pytest.mark.parametrize(("name", "joint", "handle"), HAND_WRITTEN)
-def test_the_best_proposal_is_the_bar_that_somebody_chose(
+def test_best_proposal_agrees_with_the_handwritten_attachment(
     name: str, joint: str, handle: str
 ) -> None:
     """On the same bar: beside the hand-written grasp by no more than the hand can slide, along the bar, closing across it."""
@@ -51,8 +40,8 @@ def test_the_best_proposal_is_the_bar_that_somebody_chose(
     assert best.opens[joint] == pytest.approx(high if abs(high) >= abs(low) else low)
 
 
-def test_every_proposal_has_the_clearance_that_plans_must_keep() -> None:
-    for name in ("drawer", "cabinet", "door", "dishwasher"):
+def test_proposals_keep_the_required_clearance() -> None:
+    for name in ("door", "dishwasher"):
         item = vkc.load_object(name)
         found = vkc.importing.propose_attachments(item)
         fitting = HandClearance(item, found.hand, 0.02, 0.005)
@@ -66,21 +55,21 @@ def test_every_proposal_has_the_clearance_that_plans_must_keep() -> None:
             assert fitting.find_obstruction(tool, grip.link) is None, (name, grip.name)
 
 
-def test_a_door_in_the_way_is_opened_first() -> None:
+def test_obstructing_door_is_opened_first() -> None:
     found = vkc.importing.propose_attachments(vkc.load_object("dishwasher"))
     assert found.because == {}
     assert dict(found.opening("rack")[0].when) == {"door": pytest.approx(np.pi / 2.0)}
     assert "while door is at 1.57" in found.summary()
 
 
-def test_without_a_handle_it_is_the_free_edge_far_from_the_hinge(tmp_path: Path) -> None:
+def test_without_handle_the_free_edge_is_grasped(tmp_path: Path) -> None:
     best = vkc.importing.propose_attachments(flap(tmp_path, behind=0.1)).found[0]
     assert best.kind == "edge"
     assert best.thickness == pytest.approx(0.02)
     assert best.attachment.placement.translation[1] > 0.5
 
 
-def test_a_name_decides_between_equals(tmp_path: Path) -> None:
+def test_named_handle_is_preferred(tmp_path: Path) -> None:
     other = BAR.replace("-0.08 0.5 0", "-0.08 0.4 0").format(' name="handle"')
     first = vkc.importing.propose_attachments(flap(tmp_path, BAR.format(""))).found[0]
     assert not first.named
@@ -90,7 +79,7 @@ def test_a_name_decides_between_equals(tmp_path: Path) -> None:
     assert named.attachment.placement.translation[1] == pytest.approx(0.4)
 
 
-def test_what_is_too_thick_has_no_attachment_and_says_so(tmp_path: Path) -> None:
+def test_thick_object_has_no_attachment(tmp_path: Path) -> None:
     found = vkc.importing.propose_attachments(flap(tmp_path, thick=0.12))
     assert found.found == ()
     assert "nothing of it fits between the fingers, 86 mm apart" in found.because["hinge"]
@@ -99,13 +88,13 @@ def test_what_is_too_thick_has_no_attachment_and_says_so(tmp_path: Path) -> None
     assert dict(found.applied().attachments) == {}
 
 
-def test_a_bar_without_room_behind_it_is_given_up(tmp_path: Path) -> None:
+def test_bar_without_clearance_behind_it_is_rejected(tmp_path: Path) -> None:
     flush = BAR.replace("-0.08", "-0.03").format(' name="handle"')
     found = vkc.importing.propose_attachments(flap(tmp_path, flush, thick=0.09))
     assert "are not 5 mm from flap" in found.because["hinge"]
 
 
-def test_a_bar_close_to_the_flap_is_taken_with_the_finger_tips(tmp_path: Path) -> None:
+def test_bar_close_to_the_flap_is_grasped_with_the_fingertips(tmp_path: Path) -> None:
     close = BAR.replace("-0.08", "-0.03").format(' name="handle"')
     best = vkc.importing.propose_attachments(flap(tmp_path, close)).found[0]
     assert best.kind == "bar"
@@ -120,7 +109,7 @@ def knob(z: float, turned: float = 0.0) -> str:
     return f'<collision><origin xyz="-0.055 0.5 {z}" rpy="{turned} 0 0"/>{shape}</collision>'
 
 
-def test_two_knobs_come_before_one_with_the_hand_turned(tmp_path: Path) -> None:
+def test_distinct_knobs_rank_before_turned_hands(tmp_path: Path) -> None:
     """Turned, the hand has the better one nearly as well as before; but what keeps it from there does so in both cases."""
     alone, two = (
         vkc.importing.propose_attachments(flap(tmp_path, text), most=2).found
@@ -135,45 +124,7 @@ def test_two_knobs_come_before_one_with_the_hand_turned(tmp_path: Path) -> None:
     np.testing.assert_allclose(heights, [0.0, 0.0, 0.0, 0.25], atol=1e-6)
 
 
-def test_a_hand_that_is_turned_a_little_is_not_proposed_again(tmp_path: Path) -> None:
-    """Of two pieces one in the other, turned by 45°, each has its own faces."""
-    found = vkc.importing.propose_attachments(
-        flap(tmp_path, knob(0.0) + knob(0.0, np.pi / 4)), most=8
-    ).found
-    places = [proposal.attachment.placement for proposal in found if proposal.kind == "knob"]
-    assert len(places) >= 2
-    for one, other in itertools.combinations(places, 2):
-        same = (
-            one.rotation[:, 2] @ other.rotation[:, 2] > 0.5
-            and np.linalg.norm(one.translation - other.translation) < 0.03
-        )
-        assert not same or abs(one.rotation[:, 1] @ other.rotation[:, 1]) < 0.5
-
-
-def test_posts_end_the_slide(tmp_path: Path) -> None:
-    free, held = (
-        vkc.importing.propose_attachments(flap(tmp_path, BAR.format("") + posts)).found[0]
-        for posts in ("", POSTS)
-    )
-    lengths = [
-        best.attachment.freedoms[0].upper - best.attachment.freedoms[0].lower
-        for best in (free, held)
-    ]
-    assert lengths[1] < lengths[0] - 0.02
-
-
-def test_the_same_object_gives_the_same_proposals() -> None:
-    one, other = (vkc.importing.propose_attachments(vkc.load_object("cabinet")) for _ in range(2))
-    assert [p.description() for p in one.found] == [p.description() for p in other.found]
-
-
-def test_clearances_are_those_that_plans_keep_by_default() -> None:
-    defaults = inspect.signature(vkc.importing.propose_attachments).parameters
-    for name in ("dist_safe", "grasp_clearance"):
-        assert defaults[name].default == getattr(vkc.Options(), name)
-
-
-def test_wrong_arguments() -> None:
+def test_invalid_arguments_are_named() -> None:
     with pytest.raises(vkc.InputError, match="ArticulatedObject"):
         vkc.importing.propose_attachments("drawer")  # type: ignore[arg-type]
     with pytest.raises(vkc.UnknownNameError, match="husky_ur5e"):
@@ -184,32 +135,7 @@ def test_wrong_arguments() -> None:
         vkc.importing.propose_attachments(vkc.load_object("drawer"), most=0)
 
 
-@pytest.mark.parametrize("name", ["drawer", "cabinet"])
-def test_the_best_proposal_opens_it(name: str, tmp_path: Path) -> None:
-    """Alone on the floor; the oracle judges the motion."""
-    item = vkc.load_object(name)
-    found = vkc.importing.propose_attachments(item)
-    file, joint = tmp_path / f"{name}.yaml", item.coordinates.names[0]
-    file.write_text(
-        yaml.safe_dump(
-            {"urdf": str(item.urdf), "attachments": [p.description() for p in found.found]}
-        )
-    )
-    scene = {
-        "name": "alone",
-        "robot": {"name": "husky_ur5e", "base": "omni"},
-        "start": {"base": [-1.6, 0.3, 0.0], "arm": "home"},
-        "arena": {"x": [-4, 4], "y": [-4, 4]},
-        "floor": True,
-        "objects": [{"name": "it", "type": str(file), "position": [0, 0, 0]}],
-    }
-    (tmp_path / "alone.yaml").write_text(yaml.safe_dump(scene))
-    plan = vkc.plan(vkc.load_scene(tmp_path / "alone.yaml"), [vkc.Actuate("it", {joint: 0.3})])
-    assert plan.success, plan.summary()
-    assert plan.trajectory.column(f"it.{joint}")[-1] == pytest.approx(0.3, abs=1e-3)
-
-
-def test_fingers_come_closer_together_where_they_have_no_room_fully_open(tmp_path: Path) -> None:
+def test_fingers_close_partly_where_space_is_narrow(tmp_path: Path) -> None:
     """Posts of the drawer's frame stand 60 mm from the middle of its handle, on both sides."""
     item, robot = vkc.load_object(cheeky_drawer()), vkc.load_robot(write_gripper(tmp_path))
     found = vkc.importing.propose_attachments(item, robot)
@@ -224,14 +150,9 @@ def test_fingers_come_closer_together_where_they_have_no_room_fully_open(tmp_pat
     )
     assert fitting.find_obstruction(tool, "front") is None
     assert HandClearance(item, found.hand, 0.02, 0.005).find_obstruction(tool, "front") is not None
+    wide = vkc.importing.propose_attachments(vkc.load_object(cheeky_drawer(gap=0.15)), robot)
+    assert wide.found[0].attachment.opening is None
     still = dataclasses.replace(robot, gripper=None)
     assert best.kind not in {
         one.kind for one in vkc.importing.propose_attachments(item, still).found
     }
-
-
-def test_fingers_that_have_room_stay_fully_open(tmp_path: Path) -> None:
-    item, robot = vkc.load_object(cheeky_drawer(gap=0.15)), vkc.load_robot(write_gripper(tmp_path))
-    assert [one.attachment.opening for one in vkc.importing.propose_attachments(item, robot).found][
-        :1
-    ] == [None]

@@ -10,14 +10,13 @@ import pytest
 from helpers.furniture import BAR, flap
 
 import vkc_pin as vkc
-from vkc_pin.importing.proposals.candidates import Candidate
+from vkc_pin.importing.proposals.candidates import Candidate, Piece
 from vkc_pin.importing.proposals.ranking import (
     Opening,
     find_named_handles,
     find_openings,
     score_grasp,
 )
-from vkc_pin.importing.proposals.sections import Piece
 
 FRONT = np.column_stack(
     [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
@@ -32,7 +31,7 @@ def opening_of(name_or_path: str | Path) -> Opening:
     return find_openings(item, pieces)[1]
 
 
-def test_how_a_hinge_and_a_slide_open(tmp_path: Path) -> None:
+def test_openings_of_hinge_and_slide(tmp_path: Path) -> None:
     flap(tmp_path, BAR.format(""))
     hinge = opening_of(tmp_path / "flap.yaml")
     assert (hinge.turns, hinge.closed, hinge.opened) == (True, 0.0, 1.5)
@@ -44,7 +43,7 @@ def test_how_a_hinge_and_a_slide_open(tmp_path: Path) -> None:
     assert slide.low[0] < -0.12
 
 
-def test_leverage_side_pull_and_name_count(tmp_path: Path) -> None:
+def test_score_depends_on_leverage_side_and_name(tmp_path: Path) -> None:
     flap(tmp_path, BAR.format(""))
     hinge = opening_of(tmp_path / "flap.yaml")
     bar = Candidate(
@@ -76,7 +75,7 @@ def test_leverage_side_pull_and_name_count(tmp_path: Path) -> None:
     assert best > at(-0.08, 0.55, 0.5, grasp=dataclasses.replace(bar, kind="edge"))
 
 
-def test_what_is_called_a_handle() -> None:
+def test_handles_are_named_by_elements_and_meshes() -> None:
     text = """<robot><link name="door"><collision/><collision name="Handle-3"/>
     <collision><geometry><mesh filename="meshes/knob_7.obj"/></geometry></collision></link>
     <link name="lever"><collision/></link></robot>"""

@@ -18,13 +18,13 @@ def find_texts(diagnosis: Diagnosis, level: str, topic: str) -> list[str]:
     ]
 
 
-def test_the_robot_that_comes_along_is_healthy() -> None:
+def test_included_robot_is_healthy() -> None:
     found = vkc.importing.doctor("husky_ur5e", samples=40)
     assert found.healthy
     assert find_texts(found, "note", "home")[0].startswith("free")
 
 
-def test_home_in_collision_and_below_the_floor(tmp_path: Path) -> None:
+def test_home_in_collision_and_below_the_floor_is_reported(tmp_path: Path) -> None:
     file = write_arms(tmp_path / "robot")
     home = {"arm_2_joint": 1.9, "arm_3_joint": 1.9}
     (tmp_path / "robot" / "robot.yaml").write_text(
@@ -40,7 +40,7 @@ def test_home_in_collision_and_below_the_floor(tmp_path: Path) -> None:
     assert "fault" in str(found).splitlines()[1]
 
 
-def test_pairs_that_nothing_brings_apart(tmp_path: Path) -> None:
+def test_inseparable_pairs_are_reported(tmp_path: Path) -> None:
     """The first link turns about the vertical, 30 mm above the body."""
     robot = vkc.load_robot(write_arms(tmp_path), pairs="all")
     found = vkc.importing.doctor(robot, samples=60, margin=0.035)
@@ -66,6 +66,14 @@ def test_missing_limits_and_masses_are_reported(tmp_path: Path) -> None:
     assert "arm_1_joint" in find_texts(found, "note", "effort")[0]
     assert "arm_4_joint" not in find_texts(found, "note", "effort")[0]
     assert "body" in find_texts(found, "note", "mass")[0]
+    stated = {"urdf": path.name, "joints": {"arm_1_joint": {"velocity": 2.0, "effort": 30.0}}}
+    (tmp_path / "robot.yaml").write_text(json.dumps(stated), encoding="utf-8")
+    found = vkc.importing.doctor(tmp_path, samples=5)
+    assert (
+        "no velocity limit in the file: arm_2_joint, arm_3_joint (assumed: 3.14, 3.14)"
+        in find_texts(found, "warning", "limits")
+    )
+    assert "arm_1_joint" not in find_texts(found, "note", "effort")[0]
 
 
 def test_hand_in_front_of_its_tool_frame_is_reported(tmp_path: Path) -> None:
@@ -87,44 +95,23 @@ def test_hand_in_front_of_its_tool_frame_is_reported(tmp_path: Path) -> None:
     )
 
 
-def test_values_of_robot_yaml_are_respected(tmp_path: Path) -> None:
-    path = write_arms(tmp_path)
-    text = path.read_text(encoding="utf-8").replace(
-        'effort="10" velocity="1.5"', 'effort="0" velocity="0"', 2
-    )
-    path.write_text(text, encoding="utf-8")
-    named = {"urdf": path.name, "joints": {"arm_1_joint": {"velocity": 2.0, "effort": 30.0}}}
-    (tmp_path / "robot.yaml").write_text(json.dumps(named), encoding="utf-8")
-    found = vkc.importing.doctor(tmp_path, samples=5)
-    assert "no velocity limit in the file: arm_2_joint (assumed: 3.14)" in find_texts(
-        found, "warning", "limits"
-    )
-    assert "no effort limit: arm_2_joint (their torques are not limited)" in find_texts(
-        found, "note", "effort"
-    )
-
-
 def test_closed_hand_is_reported(tmp_path: Path) -> None:
-    """A hand whose fingers are closed cannot grasp; an open one can."""
     path = write_arms(tmp_path)
-    for where, count in ((0.0, 1), (0.03, 0)):
-        named = {"urdf": path.name, "tool_frame": "hand", "touch_links": ["finger_a", "finger_b"]}
-        tool = path.read_text(encoding="utf-8")
-        if "tool" not in tool:
-            joint = '<link name="tool"/><joint name="tool_joint" type="fixed"><parent link="hand"/><child link="tool"/>'
-            joint += '<origin xyz="0 0 0.125" rpy="0 0 1.5707963267948966"/></joint></robot>'
-            path.write_text(tool.replace("</robot>", joint), encoding="utf-8")
-        named |= {
+    tool = (
+        '<link name="tool"/><joint name="tool_joint" type="fixed"><parent link="hand"/>'
+        '<child link="tool"/><origin xyz="0 0 0.125" rpy="0 0 1.57079633"/></joint></robot>'
+    )
+    path.write_text(path.read_text(encoding="utf-8").replace("</robot>", tool), encoding="utf-8")
+    for position, is_reported in ((0.0, True), (0.03, False)):
+        settings = {
+            "urdf": path.name,
             "tool_frame": "tool",
-            "locked_joints": {"finger_a_joint": where, "finger_b_joint": where},
+            "touch_links": ["finger_a", "finger_b"],
+            "locked_joints": {"finger_a_joint": position, "finger_b_joint": position},
         }
-        (tmp_path / "robot.yaml").write_text(json.dumps(named), encoding="utf-8")
-        lines = [
-            text
-            for text in find_texts(vkc.importing.doctor(tmp_path, samples=5), "warning", "hand")
-            if "no room" in text
-        ]
-        assert len(lines) == count
+        (tmp_path / "robot.yaml").write_text(json.dumps(settings), encoding="utf-8")
+        warnings = find_texts(vkc.importing.doctor(tmp_path, samples=5), "warning", "hand")
+        assert any("no room" in text for text in warnings) == is_reported
 
 
 def test_invalid_argument_is_named() -> None:

@@ -1,13 +1,12 @@
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
 from helpers.arm_urdf import write_arms
 
 import vkc_pin as vkc
-from vkc_pin.importing.robots.envelopes import find_envelopes, remove_collision_shapes
+from vkc_pin.importing.robots.envelopes import find_envelopes
 
 
 def caged(folder: Path, *, size: str = "0.3 0.3 0.3", visual: bool = False) -> Path:
@@ -24,7 +23,7 @@ def caged(folder: Path, *, size: str = "0.3 0.3 0.3", visual: bool = False) -> P
     return file
 
 
-def test_a_box_around_the_hand(tmp_path: Path) -> None:
+def test_box_around_the_hand_is_an_envelope(tmp_path: Path) -> None:
     """Of hand and fingers it has everything; of the arm's last link, which it turns with, a part."""
     robot = vkc.load_robot(caged(tmp_path), pairs="all", tool_frame="hand")
     found = find_envelopes(robot)
@@ -35,30 +34,14 @@ def test_a_box_around_the_hand(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "given", [{"size": "0.02 0.02 0.02"}, {"visual": True}], ids=["small", "seen"]
 )
-def test_shapes_that_belong_to_the_hand(tmp_path: Path, given: dict[str, object]) -> None:
+def test_small_and_visible_shapes_are_not_envelopes(
+    tmp_path: Path, given: dict[str, object]
+) -> None:
     robot = vkc.load_robot(caged(tmp_path, **given), pairs="all", tool_frame="hand")  # type: ignore[arg-type]
     assert find_envelopes(robot) == {}
 
 
-def test_a_robot_of_which_nothing_is_seen_has_none(tmp_path: Path) -> None:
-    file = caged(tmp_path)
-    root = ElementTree.fromstring(file.read_text(encoding="utf-8"))
-    for link in root.iter("link"):
-        for visual in link.findall("visual"):
-            link.remove(visual)
-    file.write_bytes(ElementTree.tostring(root))
-    assert find_envelopes(vkc.load_robot(file, pairs="all", tool_frame="hand")) == {}
-
-
-def test_only_what_collides_is_left_out(tmp_path: Path) -> None:
-    root = ElementTree.fromstring(caged(tmp_path, visual=True).read_text(encoding="utf-8"))
-    remove_collision_shapes(root, ["cage"])
-    cage = next(link for link in root.iter("link") if link.get("name") == "cage")
-    assert [child.tag for child in cage] == ["visual"]
-    assert len(root.findall("link/collision")) == 9
-
-
-def test_importing_leaves_it_out_and_the_doctor_finds_it(tmp_path: Path) -> None:
+def test_import_removes_envelopes_and_doctor_reports_them(tmp_path: Path) -> None:
     file = caged(tmp_path / "given")
     imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=50)
     assert "cage" not in imported.robot.links

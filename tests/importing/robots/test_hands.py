@@ -20,7 +20,7 @@ def found(path: Path) -> tuple[Arm, object]:
     return arm, analyze_hand(file, build_full_model(file), arm)
 
 
-def test_the_frame_lies_between_the_fingertips(tmp_path: Path) -> None:
+def test_tool_frame_lies_between_the_fingertips(tmp_path: Path) -> None:
     _, hand = found(write_arms(tmp_path))
     assert hand.link == "arm_5"
     np.testing.assert_allclose(
@@ -39,7 +39,7 @@ def test_the_frame_lies_between_the_fingertips(tmp_path: Path) -> None:
     assert hand.sure == "sure"
 
 
-def test_one_jaw_opens_from_the_hand(tmp_path: Path) -> None:
+def test_single_jaw_opens_from_the_hand(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
     text = path.read_text(encoding="utf-8")
     still = text.replace(
@@ -54,7 +54,7 @@ def test_one_jaw_opens_from_the_hand(tmp_path: Path) -> None:
     assert np.abs(hand.tool.rotation[1, 0]) > 0.9
 
 
-def test_a_flange_points_along_its_last_axis(tmp_path: Path) -> None:
+def test_tool_frame_of_a_flange_points_along_the_last_axis(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace('type="prismatic"', 'type="fixed"'), encoding="utf-8")

@@ -34,36 +34,37 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> vkc.importing.Imported
     return vkc.importing.import_robot(file, folder / "mine", arm="right", samples=SAMPLES)
 
 
-def test_the_folder_is_whole(imported: vkc.importing.ImportedRobot) -> None:
+def test_folder_describes_the_robot(imported: vkc.importing.ImportedRobot) -> None:
     names = {path.name for path in imported.folder.iterdir()}
     assert names == {".vkc-pin.json", "robot.yaml", "mine.urdf", "mine.srdf", "collision"}
     again = vkc.load_robot(imported.folder)
     assert again.name == "mine"
     assert again.coordinates.names[3:] == tuple(f"right_arm_{k}_joint" for k in range(1, 6))
     assert again.tool_frame == "tool"
-    assert set(again.touch_links) == {
-        "right_arm_5",
-        "right_hand",
-        "right_finger_a",
-        "right_finger_b",
-    }
+    touching = ("arm_5", "hand", "finger_a", "finger_b")
+    assert set(again.touch_links) == {f"right_{name}" for name in touching}
     np.testing.assert_array_equal(again.home, imported.robot.home)
+    gripper = again.gripper
+    assert gripper is not None
+    assert gripper.names == ("right_finger_a_joint", "right_finger_b_joint")
+    assert (gripper.min_opening, gripper.max_opening) == (0.0, pytest.approx(0.08, abs=2e-4))
+    stated = yaml.safe_load((imported.folder / "robot.yaml").read_text(encoding="utf-8"))
+    assert not set(stated["locked_joints"]) & set(stated["gripper"])
 
 
-def test_what_was_guessed_is_told(imported: vkc.importing.ImportedRobot) -> None:
+def test_report_lists_guesses(imported: vkc.importing.ImportedRobot) -> None:
     assert imported.arms == ("right", "left")
-    said = str(imported)
     for part in (
         "drive_x, drive_y, drive_yaw are locked",
         "arm: right, 5 joints",
         "open from 0 to 80 mm",
         "bin.stl in 3 pieces",
     ):
-        assert part in said, said
+        assert part in str(imported)
     assert imported.diagnosis.healthy
 
 
-def test_the_base_is_hollow_and_stands_on_the_floor(imported: vkc.importing.ImportedRobot) -> None:
+def test_base_is_hollow_and_stands_on_the_floor(imported: vkc.importing.ImportedRobot) -> None:
     (piece,) = imported.pieces
     assert piece.count == 3
     assert piece.overhead < 0.05
@@ -72,26 +73,14 @@ def test_the_base_is_hollow_and_stands_on_the_floor(imported: vkc.importing.Impo
     look = Clearances(imported.robot)
     look.place(imported.robot.home)
     assert look.floor(moved=False)[0][1] == pytest.approx(0.0, abs=1e-5)
+    assert look.least() >= HOME_ROOM
     robot = imported.robot.model
     assert robot.frames[robot.getFrameId("body")].placement.translation[2] == pytest.approx(
         HEIGHT, abs=1e-5
     )
 
 
-def test_the_gripper_opens_and_other_hands_stand_still(
-    imported: vkc.importing.ImportedRobot,
-) -> None:
-    gripper, said = (
-        imported.robot.gripper,
-        yaml.safe_load((imported.folder / "robot.yaml").read_text(encoding="utf-8")),
-    )
-    assert gripper is not None
-    assert gripper.names == ("right_finger_a_joint", "right_finger_b_joint")
-    assert (gripper.min_opening, gripper.max_opening) == (0.0, pytest.approx(0.08, abs=2e-4))
-    assert not set(said["locked_joints"]) & set(said["gripper"])
-
-
-def test_a_gripper_that_does_not_open_as_guessed_is_locked_and_told(tmp_path: Path) -> None:
+def test_gripper_that_does_not_open_is_locked(tmp_path: Path) -> None:
     """A bar across the fingertips leaves no room between the fingers, wherever they are."""
     file = write_arms(tmp_path / "given")
     bar = '<link name="bar"><collision><geometry><box size="0.02 0.02 0.09"/></geometry></collision></link>'
@@ -108,13 +97,6 @@ def test_a_gripper_that_does_not_open_as_guessed_is_locked_and_told(tmp_path: Pa
     assert "the fingers are locked: the gripper does not open" in str(made)
 
 
-def test_home_has_room(imported: vkc.importing.ImportedRobot) -> None:
-    look = Clearances(imported.robot)
-    look.place(imported.robot.home)
-    assert look.least() >= HOME_ROOM
-    assert len(look.pairs) > 0
-
-
 def test_reachable_poses_are_planned(imported: vkc.importing.ImportedRobot, tmp_path: Path) -> None:
     scene = tmp_path / "scene.yaml"
     scene.write_text(
@@ -128,7 +110,7 @@ def test_reachable_poses_are_planned(imported: vkc.importing.ImportedRobot, tmp_
         robot.model.getFrameId(robot.tool_frame),
     )
     goals = []
-    while len(goals) < 2:
+    while len(goals) < 1:
         arm = rng.uniform(robot.lower[3:], robot.upper[3:])
         look.place(arm)
         if look.least() > HOME_ROOM:
@@ -141,7 +123,7 @@ def test_reachable_poses_are_planned(imported: vkc.importing.ImportedRobot, tmp_
         assert plan.success, plan.summary()
 
 
-def test_home_keeps_apart_what_overlaps_at_zero(tmp_path: Path) -> None:
+def test_links_that_overlap_at_zero_are_separated_at_home(tmp_path: Path) -> None:
     """Folded at 0, so that its links are in each other there: these pairs are kept apart all the same, and home is elsewhere."""
     file = write_arms(tmp_path / "given")
     text = file.read_text(encoding="utf-8")
@@ -171,50 +153,24 @@ def test_home_keeps_apart_what_overlaps_at_zero(tmp_path: Path) -> None:
     assert ("arm_4", "body") in kept_apart
 
 
-def test_warnings_name_files_that_are_there_to_stay(tmp_path: Path) -> None:
-    file = write_arms(tmp_path / "given", own_base=True)
-    text = file.read_text(encoding="utf-8").replace('lower="-2" upper="2" effort', "effort", 2)
-    file.write_text(text, encoding="utf-8")
-    with pytest.warns(UserWarning, match="arm_1_joint") as told:
-        imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=20)
-    named = {str(warning.message).partition(":")[0] for warning in told}
-    assert named == {str(imported.folder.resolve() / "mine.urdf")}
-
-
-def test_a_folder_is_replaced_only_if_asked_and_left_alone_if_importing_fails(
-    tmp_path: Path,
-) -> None:
-    file = write_arms(tmp_path / "given")
-    target = tmp_path / "mine"
-    target.mkdir()
-    (target / "notes.txt").write_text("dear", encoding="utf-8")
-    for force in (False, True):
-        with pytest.raises(vkc.InputError, match="already exists"):
-            vkc.importing.import_robot(file, target, force=force)
-    assert [path.name for path in target.iterdir()] == ["notes.txt"]
-    (target / "notes.txt").unlink()
-    vkc.importing.import_robot(file, target, samples=SAMPLES)
+def test_folder_is_replaced_only_with_force_and_kept_on_failure(tmp_path: Path) -> None:
+    file, target = write_arms(tmp_path / "given"), tmp_path / "mine"
+    vkc.importing.import_robot(file, target, samples=20)
     (target / "notes.txt").write_text("dear", encoding="utf-8")
     with pytest.raises(vkc.InputError, match="--force"):
         vkc.importing.import_robot(file, target)
     with pytest.raises(vkc.InputError, match=r"would delete .*got notes\.txt\)"):
-        vkc.importing.import_robot(file, target, samples=SAMPLES, force=True)
-    (target / "notes.txt").rename(tmp_path / "notes.txt")
+        vkc.importing.import_robot(file, target, samples=20, force=True)
+    (target / "notes.txt").unlink()
     (target / "mine.urdf").write_text("changed by hand", encoding="utf-8")
-    with pytest.raises(
-        vkc.UnknownNameError,
-        match=r"given/robot\.urdf: tool_frame: .*did you mean 'right_hand'|'hand'",
-    ):
+    with pytest.raises(vkc.UnknownNameError, match=r"given/robot\.urdf: tool_frame: .*'hand'"):
         vkc.importing.import_robot(file, target, tool_frame="hnd", force=True)
     with pytest.raises(vkc.UnknownNameError):
         vkc.importing.import_robot(file, target, arm="third", force=True)
     assert (target / "mine.urdf").read_text(encoding="utf-8") == "changed by hand"
-    names = ["given", "mine", "notes.txt"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == names, "nothing is half written"
-    vkc.importing.import_robot(file, target, samples=SAMPLES, force=True)
+    vkc.importing.import_robot(file, target, samples=20, force=True)
     assert (target / "mine.urdf").read_text(encoding="utf-8") != "changed by hand"
-    assert (target / "robot.yaml").is_file()
-    assert sorted(path.name for path in tmp_path.iterdir()) == names
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["given", "mine"]
 
 
 @pytest.mark.parametrize(
@@ -225,7 +181,7 @@ def test_a_folder_is_replaced_only_if_asked_and_left_alone_if_importing_fails(
         ("not xml", "not valid XML"),
     ],
 )
-def test_what_is_no_robot_is_named(tmp_path: Path, text: str, said: str) -> None:
+def test_invalid_robots_are_named(tmp_path: Path, text: str, said: str) -> None:
     file = tmp_path / "wrong.urdf"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(vkc.InputError, match=said):
@@ -233,9 +189,9 @@ def test_what_is_no_robot_is_named(tmp_path: Path, text: str, said: str) -> None
     assert not (tmp_path / "out").exists()
 
 
-def test_a_telescope_is_proposed_as_one_coordinate(tmp_path: Path) -> None:
+def test_telescope_is_proposed_as_one_coordinate(tmp_path: Path) -> None:
     """Where the file does not say so, with what to do if it is none; where it does, nothing is proposed."""
-    for mimics, told in (("", True), ("first", False), ("chain", False)):
+    for mimics, told in (("", True), ("chain", False)):
         file = (
             write_telescope(tmp_path / f"given{mimics}", couplings="", mimics=mimics).parent
             / "robot.urdf"
@@ -254,35 +210,20 @@ def test_a_telescope_is_proposed_as_one_coordinate(tmp_path: Path) -> None:
         assert set(said["home"]) == {*made.robot.coordinates.names[3:]}
 
 
-def test_names_of_files_and_folders_are_quoted_or_replaced(
+def test_file_name_cannot_add_fields_to_the_description(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = write_arms(tmp_path / "given").read_text(encoding="utf-8").replace(' name="robot"', "")
     file = tmp_path / "x\ntool_frame: body\n#\x01\udcff.urdf"
     file.write_text(text, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    for folder, target, stem in (
-        (None, "x_tool_frame__body____", "x_tool_frame__body____"),
-        ("моя\x01\n", "моя\x01\n", "robot"),
-    ):
-        made = vkc.importing.import_robot(file, folder, samples=SAMPLES)
-        assert made.folder.name == target
-        said = yaml.safe_load((made.folder / "robot.yaml").read_text(encoding="utf-8"))
-        assert (said["urdf"], said["srdf"], said["tool_frame"]) == (
-            f"{stem}.urdf",
-            f"{stem}.srdf",
-            "tool",
-        )
-        assert {path.suffix: path.stem for path in made.folder.glob("*.?rdf")} == {
-            ".urdf": stem,
-            ".srdf": stem,
-        }
-        head = (made.folder / "robot.yaml").read_text(encoding="utf-8").splitlines()[0]
-        assert head.startswith(
-            "# Made of x\\ntool_frame: body\\n#\\x01\\udcff.urdf (URDF) by vkc-pin import-robot."
-        )
-        assert vkc.load_robot(made.folder).name == target
-        again = vkc.importing.import_robot(file, folder, samples=SAMPLES, force=True)
-        assert sorted(path.name for path in again.folder.iterdir()) == sorted(
-            path.name for path in made.folder.iterdir()
-        )
+    made = vkc.importing.import_robot(file, None, samples=20)
+    stem = "x_tool_frame__body____"
+    assert made.folder.name == stem
+    assert {path.stem for path in made.folder.glob("*.?rdf")} == {stem}
+    stated = (made.folder / "robot.yaml").read_text(encoding="utf-8")
+    assert stated.startswith(
+        "# Made of x\\ntool_frame: body\\n#\\x01\\udcff.urdf (URDF) by vkc-pin"
+    )
+    assert yaml.safe_load(stated)["tool_frame"] == "tool"
+    assert vkc.load_robot(made.folder).name == stem

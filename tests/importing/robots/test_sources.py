@@ -1,20 +1,22 @@
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
 from helpers.arm_urdf import write_arms
 
 import vkc_pin as vkc
-from vkc_pin.importing.robots.sources import Source, read_source
+from vkc_pin.importing.robots.sources import Source, expand_xacro, read_source
 from vkc_pin.world.files import resources
+from vkc_pin.world.files.xml import parse_xml
 
 
 def read(file: Path, scratch: Path) -> Source:
     return read_source(file, scratch, packages={}, arguments={})
 
 
-def test_what_a_urdf_does_not_have_is_left_out_and_what_is_missing_is_told(tmp_path: Path) -> None:
+def test_foreign_elements_are_removed_and_missing_limits_noted(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
     text = path.read_text(encoding="utf-8").replace(' effort="10"', "", 1)
     path.write_text(
@@ -27,20 +29,74 @@ def test_what_a_urdf_does_not_have_is_left_out_and_what_is_missing_is_told(tmp_p
     assert source.file.root.find("gazebo") is None
 
 
-def test_groups_and_states_come_from_the_srdf_beside(tmp_path: Path) -> None:
-    folder = resources.find_example_robot_data()
-    assert folder is not None
-    source = read(folder / "robots" / "panda_description" / "urdf" / "panda.urdf", tmp_path)
-    assert source.groups["panda_arm" if "panda_arm" in source.groups else "arm"][:1]
-    assert source.srdf.states
-    assert source.srdf.allowed
-
-
-def test_an_srdf_of_another_robot_is_named(tmp_path: Path) -> None:
+def test_srdf_beside_the_urdf_is_read_unless_of_another_robot(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
     other = "<robot name='x'><disable_collisions link1='elsewhere' link2='body'/></robot>"
     (tmp_path / "robot.srdf").write_text(other, encoding="utf-8")
+    folder = resources.example_robot_data()
+    assert folder is not None
+    panda = read(folder / "robots" / "panda_description" / "urdf" / "panda.urdf", tmp_path)
+    assert panda.groups
+    assert panda.srdf.states
+    assert panda.srdf.allowed
     source = read(path, tmp_path)
     assert any("links of another robot" in note for note in source.notes)
     with pytest.raises(vkc.UnknownNameError):
         read_source(path, tmp_path, packages={}, arguments={}, srdf=tmp_path / "robot.srdf")
+
+
+TEXT = """<?xml version="1.0"?>
+<robot name="two" xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <xacro:include filename="$(find my_parts)/links.xacro"/>
+  <xacro:arg name="length" default="0.3"/>
+  <xacro:stick name="upper" length="$(arg length)"/>
+</robot>
+"""
+PART = """<?xml version="1.0"?>
+<robot xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <xacro:macro name="stick" params="name length">
+    <link name="${name}"><collision><geometry><box size="${2*length} 0.1 0.1"/></geometry></collision></link>
+  </xacro:macro>
+</robot>
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "work" / "my_robot" / "urdf" / "two.xacro"
+    part = tmp_path / "work" / "my_parts" / "links.xacro"
+    for where, text in ((path, TEXT), (part, PART)):
+        where.parent.mkdir(parents=True)
+        where.write_text(text, encoding="utf-8")
+    return path
+
+
+def size(text: str, file: Path) -> str | None:
+    box = parse_xml(text, file).find("link/collision/geometry/box")
+    assert box is not None
+    return box.get("size")
+
+
+def test_packages_are_found_around_the_file(file: Path) -> None:
+    assert size(expand_xacro(file, {}, {}), file) == "0.6 0.1 0.1"
+    assert size(expand_xacro(file, {}, {"length": "0.5"}), file) == "1.0 0.1 0.1"
+
+
+def test_given_packages_take_precedence(file: Path, tmp_path: Path) -> None:
+    other = tmp_path / "elsewhere"
+    other.mkdir()
+    (other / "links.xacro").write_text(PART.replace("2*length", "4*length"), encoding="utf-8")
+    assert size(expand_xacro(file, {"my_parts": other}, {}), file).startswith("1.2")  # type: ignore[union-attr]
+
+
+def test_errors_name_the_cause(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file.write_text(TEXT.replace("my_parts", "my_prats"), encoding="utf-8")
+    with pytest.raises(vkc.InputError, match="my_prats") as caught:
+        expand_xacro(file, {}, {})
+    assert caught.value.file == file
+    file.write_text(TEXT.replace("$(arg length)", "${1/0}"), encoding="utf-8")
+    with pytest.raises(vkc.InputError, match="xacro cannot process the file"):
+        expand_xacro(file, {}, {})
+    monkeypatch.setitem(sys.modules, "xacro", None)
+    with pytest.raises(vkc.InputError, match=r"vkc-pin\[import\]"):
+        expand_xacro(file, {}, {})

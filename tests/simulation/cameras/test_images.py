@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.executions import drawer_plan
+from helpers.executions import drawer_result
 
 import vkc_pin as vkc
-from vkc_pin.simulation import snapshots
 from vkc_pin.simulation.cameras.images import ROBOT, Images, render_images
 from vkc_pin.simulation.cameras.mount import Camera
 from vkc_pin.simulation.replay import Replay
-from vkc_pin.simulation.result import SimulationResult
 
 HEAD = Camera("head", "base", (0.0, 0.0, 1.5), (1.2, 0.0, 0.6), width=96, height=64)
 WRIST = Camera(
@@ -28,16 +26,11 @@ WRIST = Camera(
 
 
 @pytest.fixture(scope="module")
-def executed() -> SimulationResult:
-    return drawer_plan().simulate()
-
-
-@pytest.fixture(scope="module")
-def images(executed: SimulationResult) -> Images:
+def images() -> Images:
+    executed = drawer_result()
+    times = np.array([0.0, 0.0, executed.planned.times[-1]])
     try:
-        return render_images(
-            executed, [HEAD, WRIST], np.array([0.0, 0.0, executed.planned.times[-1]])
-        )
+        return render_images(executed, [HEAD, WRIST], times)
     except vkc.VkcError as error:  # no OpenGL on this machine
         pytest.skip(str(error))
 
@@ -61,8 +54,9 @@ def test_images_change_only_with_time(images: Images) -> None:
         assert (pixels[0] != pixels[2]).mean() > 0.01, name
 
 
-def test_depth_of_floor_pixels_is_consistent(images: Images, executed: SimulationResult) -> None:
+def test_depth_of_floor_pixels_is_consistent(images: Images) -> None:
     """Floor pixels, projected back along their rays, lie at height 0 and all others above."""
+    executed = drawer_result()
     world = Replay(executed.scene, executed.trajectory.times, executed.rows)
     data = world.model.createData()
     row = world.compute_positions(executed.trajectory, np.array([executed.planned.times[-1]]))[0]
@@ -92,11 +86,3 @@ def test_images_round_trip_through_bytes(images: Images) -> None:
     assert list(decoded.pictures) == list(images.pictures)
     for name, pixels in images.pictures.items():
         np.testing.assert_array_equal(decoded.pictures[name], pixels)
-
-
-def test_missing_opengl_is_reported(
-    monkeypatch: pytest.MonkeyPatch, executed: SimulationResult
-) -> None:
-    monkeypatch.setattr(snapshots, "_CONTEXTS", ("no_such_context",))
-    with pytest.raises(vkc.VkcError, match="EGL or OSMesa"):
-        render_images(executed, [HEAD], np.zeros(1))

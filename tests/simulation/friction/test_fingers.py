@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -52,10 +53,9 @@ def test_described_gripper_uses_its_own_joints(tmp_path: Path) -> None:
 
 def test_hand_without_fingers_is_refused() -> None:
     scene = vkc.load_scene("drawer")
-    object.__setattr__(
-        scene.robot, "touch_links", frozenset({"gripper_link", "gripper_left_finger"})
-    )
+    touch_links = frozenset({"gripper_link", "gripper_left_finger"})
+    robot = dataclasses.replace(scene.robot, touch_links=touch_links)
     with pytest.raises(vkc.InputError, match="no fingers that close") as caught:
-        find_fingers(World(scene), Physics())
+        find_fingers(World(dataclasses.replace(scene, robot=robot)), Physics())
     assert caught.value.field == "grasp"
     assert "gripper" in str(caught.value.expected)

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
-from helpers.executions import drawer_plan, holding, still
+from helpers.executions import drawer_plan, drawer_result, holding, still
+from helpers.fake_plan import fake_plan
 from helpers.grippers import between_cheeks, write_gripper
 
 import vkc_pin as vkc
-from vkc_pin.planning.plan import Plan
 from vkc_pin.simulation.execution import simulate
-
-
-@cache
-def cup_plan() -> Plan:
-    """Return a plan that carries a cup to another table."""
-    plan = vkc.plan(vkc.load_scene("household"), [vkc.Place("cup", (-0.6, -1.6, 0.751))])
-    assert plan.success
-    return plan
+from vkc_pin.simulation.friction.friction_grasps import insert_pauses
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def test_drawer_is_pulled_by_friction() -> None:
@@ -30,7 +24,7 @@ def test_drawer_is_pulled_by_friction() -> None:
     (grip,) = result.grips
     assert grip.slip < 0.005
     # The pulling force is about that of a weld; the robot waits while the fingers close.
-    welded = plan.simulate().grips[0]
+    welded = drawer_result().grips[0]
     assert 0.2 * welded.force < grip.force < 3.0 * welded.force
     assert result.planned.times[-1] == pytest.approx(
         plan.trajectory.times[-1] + result.physics.grip_time
@@ -38,8 +32,8 @@ def test_drawer_is_pulled_by_friction() -> None:
     assert any("slide towards each other" in note for note in result.notes)
 
 
-@pytest.mark.parametrize("physics", [vkc.Physics(friction=1e-3), vkc.Physics(closing_force=0.2)])
-def test_slipping_object_is_lost(physics: vkc.Physics) -> None:
+def test_slipping_object_is_lost() -> None:
+    physics = vkc.Physics(closing_force=0.2)
     result = drawer_plan().simulate(grasp="friction", physics=physics)
     assert not result.ok
     assert result.grips[0].broken is not None
@@ -48,7 +42,8 @@ def test_slipping_object_is_lost(physics: vkc.Physics) -> None:
 
 
 def test_cup_is_carried_and_placed() -> None:
-    result = cup_plan().simulate(grasp="friction")
+    plan = vkc.plan(vkc.load_scene("household"), [vkc.Place("cup", (-0.6, -1.6, 0.751))])
+    result = plan.simulate(grasp="friction")
     assert result.ok, result.summary()
     (grip,) = result.grips
     assert grip.force > 0.25 * 9.81 * 0.9  # its weight at least
@@ -76,11 +71,37 @@ def test_object_in_hand_at_start_stays_there() -> None:
     assert grip.broken is None, result.summary()
     assert grip.force == pytest.approx(9.81 * 0.4, rel=0.3)
     assert result.misses[0].amount < 0.01
-    lost = simulate(
-        scene,
-        [vkc.Grasp("stick")],
-        still(scene, 1.5),
-        grasp="friction",
-        physics=vkc.Physics(friction=1e-3),
+
+
+@pytest.mark.parametrize("make", [drawer_plan, fake_plan])
+def test_pause_is_inserted_at_waypoint(make: object) -> None:
+    motion: Trajectory = make().trajectory  # type: ignore[operator]
+    at = motion.phases[1].first
+    time = float(motion.times[at])
+    longer = insert_pauses(motion, [at, at], 0.5)
+    assert len(longer.times) == len(motion.times) + 1
+    assert longer.times[-1] == pytest.approx(motion.times[-1] + 0.5)
+    before, after = (
+        np.linspace(0.0, time - 1e-6, 50),
+        np.linspace(time + 1e-6, motion.times[-1], 50),
     )
-    assert lost.grips[0].broken is not None or lost.misses[0].amount > 0.01
+    for read in ("at", "velocity", "acceleration"):
+        one, other = getattr(longer, read), getattr(motion, read)
+        np.testing.assert_allclose(one(before), other(before), atol=1e-9)
+        np.testing.assert_allclose(one(after + 0.5), other(after), atol=1e-6)
+    inside = time + np.linspace(1e-6, 0.5 - 1e-6, 20)
+    np.testing.assert_allclose(longer.at(inside), np.tile(motion.at(time), (20, 1)), atol=1e-12)
+    assert np.abs(longer.velocity(inside)).max() < 1e-9
+    # The pause belongs to the phase that begins there.
+    assert [(p.first, p.last) for p in longer.phases][:2] == [
+        (0, at),
+        (at, motion.phases[1].last + 1),
+    ]
+    assert [p.holds for p in longer.phases] == [p.holds for p in motion.phases]
+
+
+def test_pause_of_a_moving_curve_is_refused() -> None:
+    motion = drawer_plan().trajectory
+    assert insert_pauses(motion, [], 0.25) is motion
+    with pytest.raises(vkc.InputError, match="while the robot moves"):
+        insert_pauses(motion, [motion.phases[0].last // 2], 0.5)

@@ -71,9 +71,6 @@ def split_home(description: Description) -> Home:
     A fixed link with joints becomes one object with everything that moves on it. On links of the
     building, each joint starts an object of its own, without fixed shapes: doors may swing past
     walls.
-
-    Args:
-        description: The home, with the floor at z = 0 and names that scenes accept.
     """
     description = _fix_immovable_joints(description)
     joints, notes = description.joints, list(description.notes)
@@ -159,7 +156,7 @@ def _fix_immovable_joints(description: Description) -> Description:
             continue
         is_single_valued = joint.limits is not None and joint.limits[0] == joint.limits[1]
         if is_single_valued or not any(
-            description.links[link].solid for link in description.subtree(child)
+            description.links[link].solid for link in _collect_attached_links(description, child)
         ):
             reason = "has a single value" if is_single_valued else "moves no shape"
             notes.append(f"joint '{joint.name}' {reason}: fixed")

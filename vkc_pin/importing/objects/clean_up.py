@@ -42,11 +42,7 @@ _UP = {"z": np.eye(3), "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1
 
 
 def extract_subtree(description: Description, link: str) -> Description:
-    """Return a link and its descendants as an object of their own.
-
-    Raises:
-        UnknownNameError: The link does not exist.
-    """
+    """Return a link and its descendants as an object of their own."""
     if link not in description.links:
         raise UnknownNameError("link", link, description.links, file=description.file, field="link")
     subtree = description.subtree(link)
@@ -202,16 +198,7 @@ def load_surfaces(description: Description) -> Surfaces:
 def compute_bounds(
     description: Description, meshes: Surfaces, values: Mapping[str, float] | None = None
 ) -> tuple[Floats, Floats]:
-    """Return the bounding box of the collision geometry in the root's frame [m].
-
-    Args:
-        description: The object.
-        meshes: Its surfaces.
-        values: Joint positions by name; others are at zero.
-
-    Raises:
-        InputError: The object has no shapes.
-    """
+    """Return the bounding box of the collision geometry in the root's frame [m]."""
     placements = description.compute_placements(values)
     points = [
         np.asarray(meshes[id(part)].vertices) @ placements[name].rotation.T

@@ -49,11 +49,7 @@ class Part:
     colour: Colour | None = None
 
     def make_mesh(self) -> trimesh.Trimesh:
-        """Return the surface in the frame of its link [m].
-
-        Raises:
-            InputError: The mesh file cannot be read or is empty.
-        """
+        """Return the surface in the frame of its link [m]."""
         import trimesh
 
         if self.triangles is not None:
@@ -191,9 +187,6 @@ def make_inertia(mass: float, moments: Iterable[float], placement: pin.SE3) -> p
         moments: Moments of inertia about the centre of mass [kg·m²], in the order of
             `vkc_pin.world.files.kinematic_tree.MOMENTS`.
         placement: Frame of the moments at the centre of mass, in the link's frame.
-
-    Raises:
-        InputError: The mass or a principal moment is negative.
     """
     xx, xy, xz, yy, yz, zz = moments
     tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])

@@ -26,9 +26,6 @@ def read_object_mjcf(file: Path, *, free: bool = False) -> Description:
     Args:
         file: The file.
         free: Whether to keep free bodies, on floating joints; otherwise they are left out.
-
-    Raises:
-        InputError: MuJoCo is not installed or cannot read the file.
     """
     mujoco = import_optional("mujoco", "import", purpose="reading MJCF", file=file)
     try:

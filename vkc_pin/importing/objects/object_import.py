@@ -101,10 +101,6 @@ def read_description(file: str | Path, *, free: bool = False) -> Description:
     Args:
         file: The file.
         free: Whether to keep free bodies, on floating joints (URDF and MJCF).
-
-    Raises:
-        InputError: The format is unknown, or the file cannot be read.
-        UnknownNameError: The file refers to an unknown name.
     """
     path = check_path(file, "file", "a URDF, MJCF or SDF file")
     root = parse_xml(read_text(path, "URDF, MJCF or SDF"), path).tag

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.importing.convex import ERROR, compute_concavity, decompose
+from vkc_pin.importing.convex import (
+    ERROR,
+    THICKNESS,
+    compute_concavity,
+    decompose,
+    is_flat,
+    measure_outside,
+    thicken,
+)
 from vkc_pin.importing.objects.clean_up import Surfaces
 from vkc_pin.importing.objects.description import Description, Link, Part
-from vkc_pin.importing.slicing import THICKNESS, is_flat, thicken
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.hulls import compute_hull
 
 if TYPE_CHECKING:
@@ -37,22 +43,11 @@ def decompose_links(
     """Return the object with convex collision geometry only.
 
     Notes name flat shapes, and links that collide with their visual shapes.
-
-    Args:
-        description: The object.
-        meshes: Surfaces of its parts.
-        cache: Cache of pieces of mesh files, to which this adds: the chairs of a home are one file.
-
-    Raises:
-        InputError: A mesh is concave, and CoACD is not installed.
     """
     notes, links = list(description.notes), dict[str, Link]()
     for name, link in description.links.items():
-        error, solids, flat_parts = (
-            _FINE if name in description.joints else ERROR,
-            list[Part](),
-            list[str](),
-        )
+        error = _FINE if name in description.joints else ERROR
+        solids, flat_parts = list[Part](), list[str]()
         for part in link.solid:
             mesh = meshes[id(part)]
             if part.kind != "mesh":
@@ -76,15 +71,15 @@ def decompose_links(
                 )
                 for piece in pieces
             ]
-        outer = _remove_inner(solids)
         if flat_parts:
             names = ", ".join(dict.fromkeys(flat_parts))
-            notes.append(
-                f"link '{name}': flat shapes were made {1e3 * THICKNESS:g} mm thick: {names}"
-            )
+            made = f"flat shapes were made {1e3 * THICKNESS:g} mm thick"
+            notes.append(f"link '{name}': {made}: {names}")
         if link.visual and not link.collision:
             notes.append(f"link '{name}' has no collision geometry: its visual geometry is used")
-        links[name] = Link(name, link.visual or link.collision, tuple(outer), link.inertia)
+        links[name] = Link(
+            name, link.visual or link.collision, tuple(_remove_inner(solids)), link.inertia
+        )
     return dataclasses.replace(description, links=links, notes=tuple(notes))
 
 
@@ -109,19 +104,14 @@ def _make_convex(mesh: trimesh.Trimesh, error: float) -> Sequence[trimesh.Trimes
 
 def _remove_inner(parts: list[Part]) -> list[Part]:
     """Return the parts without meshes that lie inside another one."""
-    planes: Mapping[int, tuple[Floats, Floats]] = {
-        k: (np.asarray(part.triangles.face_normals), np.asarray(part.triangles.triangles)[:, 0])
+    meshes = {
+        k: part.triangles
         for k, part in enumerate(parts)
         if part.triangles is not None and part.kind == "mesh"
     }
-    order = sorted(planes, key=lambda k: -parts[k].triangles.volume)  # type: ignore[union-attr]
-    removed: set[int] = set()
-    for number, k in enumerate(order):
-        corners = np.asarray(parts[k].triangles.vertices)  # type: ignore[union-attr]
-        for other in order[:number]:
-            if other not in removed:
-                normals, points = planes[other]
-                if (corners @ normals.T - np.einsum("ij,ij->i", normals, points)).max() < _INSIDE:
-                    removed.add(k)
-                    break
-    return [part for k, part in enumerate(parts) if k not in removed]
+    outer = list[int]()
+    for k in sorted(meshes, key=lambda k: -meshes[k].volume):
+        corners = np.asarray(meshes[k].vertices)
+        if all(measure_outside(meshes[other], corners).max() >= _INSIDE for other in outer):
+            outer.append(k)
+    return [part for k, part in enumerate(parts) if k not in meshes or k in outer]

@@ -21,13 +21,7 @@ _BASE = "world"
 
 
 def read_object_sdf(file: Path) -> Description:
-    """Read the description of an object from an SDF file.
-
-    Raises:
-        InputError: The file cannot be read, does not hold exactly one model, or its model is
-            nested.
-        UnknownNameError: The file refers to an unknown frame or link.
-    """
+    """Read the description of an object from an SDF file."""
     root = parse_xml(read_text(file, "SDF"), file)
     models = root.findall("model") or root.findall("world/model")
     if root.tag != "sdf" or len(models) != 1:

@@ -31,11 +31,6 @@ def read_object_urdf(file: Path, *, free: bool = False) -> Description:
     Args:
         file: The file.
         free: Whether joints may be floating; otherwise floating joints count as fixed.
-
-    Raises:
-        InputError: The file cannot be read, its links do not form a tree, or a mesh file is
-            missing.
-        UnknownNameError: A joint refers to an unknown link.
     """
     _, root = read_xml(file, "URDF")
     notes = list[str]()
@@ -103,10 +98,7 @@ def _find_shape_names(root: ElementTree.Element) -> dict[tuple[str, str], str]:
 def _read_limits(
     file: Path, joint: ElementTree.Element, notes: list[str]
 ) -> tuple[float, float] | None:
-    """Return the limits of a joint, or None if the file states none.
-
-    The element is changed so that any URDF reader accepts it.
-    """
+    """Return the limits of a joint, or None if the file states none."""
     limit, name = joint.find("limit"), joint.get("name", "")
     if limit is None:
         joint.append(ElementTree.Element("limit", {"lower": "0", "upper": "0"}))

@@ -32,10 +32,6 @@ def write_urdf(description: Description, file: Path) -> None:
     """Write a URDF, and its meshes in the folders `collision` and `visual` beside it.
 
     Mesh files are named after their links, see `choose_file_names`.
-
-    Args:
-        description: The object, with convex collision geometry.
-        file: Output URDF.
     """
     lines = ['<?xml version="1.0"?>', f"<robot name={quote(file.stem)}>"]
     stems = choose_file_names(description.links)
@@ -86,10 +82,7 @@ def write_description(
 
 
 def _collect_visuals(link: Link) -> list[tuple[Part | None, trimesh.Trimesh | None, Colour]]:
-    """Return the visual shapes of a link.
-
-    Primitive shapes keep their placement; meshes are in the link's frame, merged by colour.
-    """
+    """Return the visual shapes of a link."""
     import trimesh
 
     shapes: list[tuple[Part | None, trimesh.Trimesh | None, Colour]] = []
@@ -110,10 +103,7 @@ def _collect_visuals(link: Link) -> list[tuple[Part | None, trimesh.Trimesh | No
 
 
 def _replace_capsules(parts: Sequence[Part]) -> list[Part]:
-    """Replace each capsule by a cylinder and two spheres.
-
-    URDF has no capsules, and many readers drop the whole link.
-    """
+    """Replace each capsule by a cylinder and two spheres."""
     shapes = list[Part]()
     for part in parts:
         if part.kind != "capsule":

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from vkc_pin.importing.proposals.hand import Hand
-from vkc_pin.importing.proposals.sections import Piece, Section
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.models.shapes import get_link_name, triangulate
 
-__all__ = ["Candidate", "Thickness", "find_candidates"]
+__all__ = ["Candidate", "Piece", "Section", "Thickness", "find_candidates"]
 
 DEEP = 0.06
 """Depth along the approach above which a piece is an edge rather than a bar [m]."""
@@ -118,10 +120,7 @@ def _find_grasp(
 
 
 def _make_tool_axes(axes: Floats, approach: Floats, up: Floats) -> Floats:
-    """Return the tool's axes as columns, shape (3, 3), for an approach in the plane of two axes.
-
-    Of the two possible orientations, it has the closing direction, or else the bar, pointing up.
-    """
+    """Return the tool's axes as columns, shape (3, 3), for an approach in the plane of two axes."""
     z, x = approach @ axes, np.array([-approach[1], approach[0]]) @ axes
     y = np.cross(z, x)
     direction = x @ up if abs(x @ up) > _LEVEL else y @ up
@@ -147,3 +146,139 @@ def _measure_rotation(section: Section, approach: Floats, thickness: float, wide
                 return rotation
         rotation = float(angle)
     return rotation
+
+
+# Relative difference up to which widths are equal. The frame's own axes are preferred then, as
+# round bars have no axes of their own.
+_EQUAL_WIDTH = 0.03
+# Largest angle between the closing direction and a face normal: rubber on smooth paint, friction
+# 0.36.
+_SLIP = np.radians(20.0)
+_SAME = 1e-9  # [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """A planar cross-section of a convex piece.
+
+    Attributes:
+        centre: Origin of the plane's coordinates, in the frame of the piece's joint, shape (3,)
+            [m].
+        axes: Two directions that span the plane, shape (2, 3).
+        polygon: Vertices in order, in the plane's coordinates, shape (n, 2) [m].
+    """
+
+    centre: Floats
+    axes: Floats
+    polygon: Floats
+
+    def extent(self, direction: Floats) -> tuple[float, float]:
+        """Return the extent along a unit direction in the plane, shape (2,) [m]."""
+        along = self.polygon @ direction
+        return float(along.min()), float(along.max())
+
+    def clip(self, direction: Floats, limit: float) -> Section | None:
+        """Return the part up to `limit` [m] along a unit direction, shape (2,); None if empty."""
+        along, corners = self.polygon @ direction - limit, list[Floats]()
+        for k, (here, there) in enumerate(zip(along, np.roll(along, -1), strict=True)):
+            if here <= 0.0:
+                corners.append(self.polygon[k])
+            if here * there < 0.0:
+                corners.append(
+                    self.polygon[k]
+                    + here / (here - there) * (self.polygon[(k + 1) % len(along)] - self.polygon[k])
+                )
+        return Section(self.centre, self.axes, np.array(corners)) if len(corners) > 2 else None
+
+    def is_graspable(self, closing: Floats) -> bool:
+        """Return whether fingers that close along a unit direction, shape (2,), do not slip."""
+        edges = np.roll(self.polygon, -1, axis=0) - self.polygon
+        lengths = np.linalg.norm(edges, axis=1)
+        edges = edges[lengths > 1e-5] / lengths[lengths > 1e-5, None]
+        # Outward normals, as the vertices are ordered counter-clockwise.
+        facing = np.column_stack([edges[:, 1], -edges[:, 0]]) @ closing
+        return bool(
+            len(facing) and facing.max() >= np.cos(_SLIP) and facing.min() <= -np.cos(_SLIP)
+        )
+
+    def to_joint_frame(self, place: Floats) -> Floats:
+        """Return a point of the plane, shape (2,), in the frame of the joint, shape (3,) [m]."""
+        return np.asarray(self.centre + place @ self.axes)
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A convex shape of a link.
+
+    Attributes:
+        link: Its link.
+        name: Its name, `<link>_<k>`.
+        vertices: Vertices in the frame of its joint, shape (n, 3) [m].
+        faces: Triangles, shape (m, 3).
+    """
+
+    link: str
+    name: str
+    vertices: Floats
+    faces: NDArray[np.int64]
+
+    @classmethod
+    def from_shape(cls, shape: pin.GeometryObject) -> Piece:
+        """Return the piece of an object's shape."""
+        vertices, faces = triangulate(shape.geometry)
+        placed = vertices @ shape.placement.rotation.T + shape.placement.translation
+        return cls(get_link_name(shape.name), str(shape.name), np.asarray(placed), faces)
+
+    @cached_property
+    def axes(self) -> Floats:
+        """Perpendicular axes of a tight box, by rows, the thinnest last, shape (3, 3)."""
+        corners = self.vertices[self.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        lengths = np.linalg.norm(normals, axis=1)
+        normals = normals[lengths > 1e-12] / lengths[lengths > 1e-12, None]
+        _, first = np.unique(normals.round(4), axis=0, return_index=True)
+        normals = np.vstack([np.eye(3), normals[np.sort(first)]])
+        thin = self._find_narrowest(normals)
+        across = normals - np.outer(normals @ thin, thin)
+        lengths = np.linalg.norm(across, axis=1)
+        second = self._find_narrowest(across[lengths > 0.3] / lengths[lengths > 0.3, None])
+        return np.array([np.cross(second, thin), second, thin])
+
+    def _find_narrowest(self, directions: Floats) -> Floats:
+        """Return the first direction, of shape (n, 3), along which the width is about minimal."""
+        widths = np.ptp(self.vertices @ directions.T, axis=0)
+        return np.asarray(
+            directions[int(np.argmax(widths <= (1.0 + _EQUAL_WIDTH) * widths.min() + _SAME))]
+        )
+
+    @cached_property
+    def extents(self) -> Floats:
+        """Lower and upper extent along each of `axes`, shape (3, 2) [m]."""
+        along = self.vertices @ self.axes.T
+        return np.column_stack([along.min(axis=0), along.max(axis=0)])
+
+    @cached_property
+    def _edges(self) -> NDArray[np.int64]:
+        pairs = np.sort(
+            np.vstack([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]]), axis=1
+        )
+        return np.unique(pairs, axis=0)
+
+    def cut(self, axis: int, at: float) -> Section | None:
+        """Return the cross-section normal to `axes[axis]` at `at` [m]; None if there is none."""
+        normal, plane = self.axes[axis], np.delete(self.axes, axis, axis=0)
+        height = self.vertices @ normal - at
+        first, second = height[self._edges].T
+        cut = (first < 0.0) != (second < 0.0)
+        if cut.sum() < 3:
+            return None
+        ends, fraction = self._edges[cut], (first[cut] / (first[cut] - second[cut]))[:, None]
+        points = (1.0 - fraction) * self.vertices[ends[:, 0]] + fraction * self.vertices[ends[:, 1]]
+        flat = points @ plane.T
+        centre = (flat.min(axis=0) + flat.max(axis=0)) / 2.0
+        flat -= centre
+        inside = flat - flat.mean(axis=0)
+        flat = flat[np.argsort(np.arctan2(inside[:, 1], inside[:, 0]))]
+        if np.ptp(flat, axis=0).min() <= _SAME:
+            return None
+        return Section(np.asarray(at * normal + centre @ plane), plane, flat)

@@ -42,12 +42,7 @@ class Hand:
 
 
 def make_hand(robot: Robot) -> Hand:
-    """Return the open hand of a robot.
-
-    Raises:
-        InputError: The robot has no touch links, or there is no room between them at the tool
-            frame.
-    """
+    """Return the open hand of a robot."""
     if not robot.touch_links:
         problem = f"the hand of '{robot.name}' is undefined"
         expected = "touch_links in a robot.yaml, such as `vkc-pin import-robot` writes"

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
-
 from vkc_pin.importing.proposals.hand import Hand
+from vkc_pin.importing.targets import round_values
 from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment
 
 __all__ = ["Proposal", "Proposals"]
@@ -47,12 +46,12 @@ class Proposal:
         data: dict[str, Any] = {
             "name": item.name,
             "link": item.link,
-            "position": _round_values(item.placement.translation, 5),
-            "approach": _round_values(item.placement.rotation[:, 2], 12),
-            "closing": _round_values(item.placement.rotation[:, 0], 12),
+            "position": round_values(item.placement.translation, 5),
+            "approach": round_values(item.placement.rotation[:, 2], 12),
+            "closing": round_values(item.placement.rotation[:, 0], 12),
         }
         if item.freedoms:
-            data |= {"joint": item.joint, "axis": _round_values(item.freedoms[0].axis, 12)}
+            data |= {"joint": item.joint, "axis": round_values(item.freedoms[0].axis, 12)}
             data["limits"] = [item.freedoms[0].lower, item.freedoms[0].upper]
         if len(item.freedoms) == 2:
             data["turn"] = [item.freedoms[1].lower, item.freedoms[1].upper]
@@ -139,8 +138,3 @@ def _format_conditions(conditions: list[str]) -> str:
         else ""
     )
     return f", while {', '.join(conditions[:_MAX_LISTED])}{more}"
-
-
-def _round_values(vector: Any, digits: int) -> list[float]:
-    """Return rounded values without negative zeros."""
-    return [float(value) + 0.0 for value in np.round(np.asarray(vector, float), digits) + 0.0]

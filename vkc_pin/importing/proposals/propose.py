@@ -10,9 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.importing.proposals.candidates import Candidate, Thickness, find_candidates
-from vkc_pin.importing.proposals.fitting import HandClearance, Obstruction
-from vkc_pin.importing.proposals.freedom import GraspMotion
+from vkc_pin.importing.proposals.candidates import Candidate, Piece, Thickness, find_candidates
+from vkc_pin.importing.proposals.fitting import GraspMotion, HandClearance, Obstruction
 from vkc_pin.importing.proposals.hand import make_hand
 from vkc_pin.importing.proposals.proposal import Proposal, Proposals
 from vkc_pin.importing.proposals.ranking import (
@@ -21,7 +20,6 @@ from vkc_pin.importing.proposals.ranking import (
     find_openings,
     score_grasp,
 )
-from vkc_pin.importing.proposals.sections import Piece
 from vkc_pin.utils.arguments import check_instance, check_integer, check_number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.urdf import read_urdf
@@ -131,11 +129,7 @@ class _Search:
         self._handles = {} if item.urdf is None else find_named_handles(read_urdf(item.urdf).root)
 
     def propose_for_joint(self, number: int) -> list[Proposal]:
-        """Return the proposals for the links that joint `number` moves directly, best first.
-
-        If a part of another joint obstructs it, such as the door of a dishwasher its rack, that
-        joint is opened.
-        """
+        """Return the proposals for the links that joint `number` moves directly, best first."""
         found = self._propose_at(number, {})
         if not found:
             links = {
@@ -223,10 +217,7 @@ class _Search:
     def _evaluate(
         self, best: float, grasp: Candidate, opening: Opening, tally: _Tally, named: bool
     ) -> Proposal | None:
-        """Evaluate a grasp with the hand placed there.
-
-        None means that the hand is obstructed, which `tally` records.
-        """
+        """Evaluate a grasp with the hand placed there."""
         link, at = grasp.piece.link, self.fitting.joint(opening.number)
         furthest = max(0.0, self.fitting.hand.tip - _HELD) if grasp.kind != "edge" else 0.0
         reasons = list[Obstruction]()
@@ -360,10 +351,7 @@ def _retreat(joint_opening: float) -> pin.SE3:
 
 
 def _rank(kept: list[tuple[Proposal, Candidate]]) -> list[tuple[float, Proposal]]:
-    """Return proposals with their ranks, best first.
-
-    The rank is the score, reduced for rotations of a better grasp about its approach.
-    """
+    """Return proposals with their ranks, best first."""
     ranked, better = list[tuple[float, Proposal]](), list[tuple[Proposal, Candidate]]()
     for proposal, grasp in kept:
         count = sum(_are_similar(taken, other, grasp, turned=True) for other, taken in better)
@@ -375,11 +363,7 @@ def _rank(kept: list[tuple[Proposal, Candidate]]) -> list[tuple[float, Proposal]
 def _are_similar(
     taken: Candidate, proposal: Proposal, other: Candidate, *, turned: bool = False
 ) -> bool:
-    """Return whether a grasp is similar to a proposed one.
-
-    It has a similar direction of approach, and a position to which the hand can slide. Its
-    orientation is similar as well, unless it may be `turned` about its approach.
-    """
+    """Return whether a grasp is similar to a proposed one."""
     first, second = taken.placement, other.placement
     if first.rotation[:, 2] @ second.rotation[:, 2] < _SIMILAR:
         return False

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.importing.proposals.candidates import Candidate
-from vkc_pin.importing.proposals.sections import Piece
+from vkc_pin.importing.proposals.candidates import Candidate, Piece
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 
@@ -53,12 +52,7 @@ class Opening:
 
 
 def find_openings(item: ArticulatedObject, pieces: dict[int, list[Piece]]) -> dict[int, Opening]:
-    """Return the opening motions of an object's joints, by their numbers in its model.
-
-    Args:
-        item: The object.
-        pieces: Pieces by the number of their joint.
-    """
+    """Return the opening motions of an object's joints, by their numbers in its model."""
     data, openings = item.model.createData(), {}
     state = np.clip(np.zeros(len(item.lower)), item.lower, item.upper)
     pin.computeJointJacobians(item.model, data, item.coordinates.q(state))

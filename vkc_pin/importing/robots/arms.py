@@ -252,10 +252,6 @@ def choose_arm(
             best arm.
         file: The robot.
         groups: Groups of an SRDF.
-
-    Raises:
-        InputError: The robot has no arm.
-        UnknownNameError: No arm has this name.
     """
     if not arms:
         expected = (
@@ -289,10 +285,6 @@ def find_telescopes(full: pin.Model, joints: Sequence[str]) -> list[tuple[str, .
     """Find telescopes: consecutive prismatic joints of an arm with equal axes and limits.
 
     One motor moves all segments of a telescope.
-
-    Args:
-        full: The robot with all its joints.
-        joints: The arm's joints, from the root on.
     """
     data, telescopes = full.createData(), list[list[str]]()
     pin.forwardKinematics(full, data, pin.neutral(full))

@@ -70,13 +70,7 @@ class Hand:
 
 
 def analyze_hand(file: UrdfFile, full: pin.Model, arm: Arm) -> Hand:
-    """Find the tool frame and the fingers of an arm's hand.
-
-    Args:
-        file: The robot.
-        full: Its model with all joints.
-        arm: The arm.
-    """
+    """Find the tool frame and the fingers of an arm's hand."""
     return _HandAnalysis(file, full, arm).run()
 
 
@@ -162,10 +156,7 @@ class _HandAnalysis:
         return np.vstack(points_by_link)
 
     def _divide_fingers(self, fingers: Sequence[Body]) -> tuple[list[Body], list[Body]]:
-        """Return two groups of fingers that close against each other.
-
-        The second group is empty if the palm is the other side.
-        """
+        """Return two groups of fingers that close against each other."""
         if len(fingers) == 1:
             return list(fingers), []
         thumbs = [
@@ -206,10 +197,7 @@ class _HandAnalysis:
         )
 
     def _find_fingertip(self, finger: Body, positions: Mapping[str, float]) -> Floats:
-        """Return the points of a finger's last body that are furthest from its first joint.
-
-        They are in the palm's frame.
-        """
+        """Return the points of a finger's last body that are furthest from its first joint."""
         points = self._find_points(_find_last_body(finger, self._points), positions, alone=True)
         far = np.linalg.norm(points - self._find_base(finger), axis=1)
         return points[far >= far.max() - max(_TIP, _SHARE * (far.max() - far.min()))]
@@ -295,10 +283,7 @@ class _HandAnalysis:
         return tuple(side[side @ approach >= (side @ approach).max() - _TIP] for side in (a, b))
 
     def _use_flange(self, touch: tuple[str, ...]) -> Hand:
-        """Return the tool frame at the end of an arm without fingers.
-
-        Its z axis is the last joint's axis, or points away from that joint.
-        """
+        """Return the tool frame at the end of an arm without fingers."""
         joint = self._full.getJointId(self._arm.joints[-1])
         palm = self._place({})
         wrist = palm.actInv(self._data.oMi[joint])
@@ -336,10 +321,7 @@ class _HandAnalysis:
 
 
 def _sample_points(file: UrdfFile, links: Sequence[str]) -> dict[str, Floats]:
-    """Return points on links, shape (n, 3) in the link's frame [m].
-
-    They are on the collision shapes, or else on the visual shapes.
-    """
+    """Return points on links, shape (n, 3) in the link's frame [m]."""
     points_by_link: dict[str, Floats] = {}
     for kind in ("collision", "visual"):
         new: dict[str, list[Floats]] = {}

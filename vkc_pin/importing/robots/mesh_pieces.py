@@ -56,14 +56,6 @@ def write_meshes(
 
     Links without collision shapes collide with their visual shapes. Flat collision meshes, and
     visual meshes that cannot be read, are left out.
-
-    Args:
-        file: The URDF.
-        folder: Output folder.
-        most_pieces: Largest number of pieces of one mesh; 1 keeps hulls.
-
-    Raises:
-        InputError: A collision mesh cannot be read.
     """
     root = copy.deepcopy(file.root)
     links = {link.get("name", ""): link for link in root.findall("link")}

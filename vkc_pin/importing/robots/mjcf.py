@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
+from vkc_pin.importing.targets import add_connection, add_origin, format_numbers
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.files.resources import choose_file_names
@@ -46,9 +47,6 @@ def convert_mjcf(file: Path, folder: Path) -> ConvertedRobot:
     Bodies become links, and several joints of a body a chain of links. Notes name everything that a
     URDF cannot express: ball joints and free joints below the root are locked, planes left out.
     Other trees are left out.
-
-    Raises:
-        InputError: MuJoCo is not installed or cannot read the file; the error contains its message.
     """
     mujoco = import_optional("mujoco", "import", purpose="an MJCF file", file=file)
     try:
@@ -162,8 +160,7 @@ class _Converter:
             above, placement = below, anchor.inverse()
         link = ElementTree.SubElement(self._result.root, "link", name=name)
         added = self._add_name(f"{name}_fixed")
-        fixed = ElementTree.SubElement(self._result.root, "joint", name=added, type="fixed")
-        _add_connection(fixed, above, name, placement)
+        add_connection(self._result.root, added, "fixed", above, name, placement)
         self._convert_inertia(link, body)
         self._convert_shapes(link, body)
 
@@ -172,9 +169,8 @@ class _Converter:
         turns = model.jnt_type[joint] == self._mujoco.mjtJoint.mjJNT_HINGE
         limited = bool(model.jnt_limited[joint])
         kind = ("revolute" if limited else "continuous") if turns else "prismatic"
-        element = ElementTree.SubElement(self._result.root, "joint", name=name, type=kind)
-        _add_connection(element, above, below, placement)
-        ElementTree.SubElement(element, "axis", xyz=_format_numbers(model.jnt_axis[joint]))
+        element = add_connection(self._result.root, name, kind, above, below, placement)
+        ElementTree.SubElement(element, "axis", xyz=format_numbers(model.jnt_axis[joint]))
         low, high = model.jnt_range[joint] - model.qpos0[model.jnt_qposadr[joint]]
         if not limited and not turns:
             low, high = -_FAR, _FAR
@@ -201,18 +197,13 @@ class _Converter:
         if model.body_mass[body] <= 0.0:
             return
         inertial = ElementTree.SubElement(link, "inertial")
-        _add_origin(
+        add_origin(
             inertial, pin.SE3(_to_rotation(model.body_iquat[body]), model.body_ipos[body].copy())
         )
         ElementTree.SubElement(inertial, "mass", value=f"{model.body_mass[body]:.9g}")
-        moments = dict(
-            zip(
-                ("ixx", "iyy", "izz"),
-                (f"{moment:.9g}" for moment in model.body_inertia[body]),
-                strict=True,
-            )
-        )
-        ElementTree.SubElement(inertial, "inertia", {**moments, "ixy": "0", "ixz": "0", "iyz": "0"})
+        ixx, iyy, izz = (f"{moment:.9g}" for moment in model.body_inertia[body])
+        moments = {"ixx": ixx, "iyy": iyy, "izz": izz, "ixy": "0", "ixz": "0", "iyz": "0"}
+        ElementTree.SubElement(inertial, "inertia", moments)
 
     def _convert_shapes(self, link: ElementTree.Element, body: int) -> None:
         model = self._model
@@ -230,17 +221,13 @@ class _Converter:
 
         model, types = self._model, self._mujoco.mjtGeom
         size, shape = model.geom_size[geom], int(model.geom_type[geom])
+        radius = {"radius": f"{size[0]:.9g}"}
+        long = {**radius, "length": f"{2.0 * size[1]:.9g}"}
         shapes: dict[int, tuple[str, dict[str, str]]] = {
-            int(types.mjGEOM_SPHERE): ("sphere", {"radius": f"{size[0]:.9g}"}),
-            int(types.mjGEOM_CAPSULE): (
-                "capsule",
-                {"radius": f"{size[0]:.9g}", "length": f"{2.0 * size[1]:.9g}"},
-            ),
-            int(types.mjGEOM_CYLINDER): (
-                "cylinder",
-                {"radius": f"{size[0]:.9g}", "length": f"{2.0 * size[1]:.9g}"},
-            ),
-            int(types.mjGEOM_BOX): ("box", {"size": _format_numbers(2.0 * size)}),
+            int(types.mjGEOM_SPHERE): ("sphere", radius),
+            int(types.mjGEOM_CAPSULE): ("capsule", long),
+            int(types.mjGEOM_CYLINDER): ("cylinder", long),
+            int(types.mjGEOM_BOX): ("box", {"size": format_numbers(2.0 * size)}),
         }
         if shape == types.mjGEOM_MESH:
             data = int(model.geom_dataid[geom])
@@ -263,7 +250,7 @@ class _Converter:
             )
             return
         element = ElementTree.SubElement(link, kind)
-        _add_origin(
+        add_origin(
             element, pin.SE3(_to_rotation(model.geom_quat[geom]), model.geom_pos[geom].copy())
         )
         tag, attributes = shapes[shape]
@@ -272,7 +259,7 @@ class _Converter:
             material = int(model.geom_matid[geom])
             colour = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
             named = ElementTree.SubElement(element, "material", name=f"{link.get('name')}_{geom}")
-            ElementTree.SubElement(named, "color", rgba=_format_numbers(colour))
+            ElementTree.SubElement(named, "color", rgba=format_numbers(colour))
 
     def _write_mesh(self, name: str, mesh: Any) -> Path:
         self._stems += choose_file_names([name], taken=self._stems)
@@ -282,11 +269,7 @@ class _Converter:
         return file
 
     def _convert_couplings(self) -> None:
-        """Write couplings of two joints as <mimic>.
-
-        The first joint follows the second; if it follows another one already, the second follows
-        it.
-        """
+        """Write couplings of two joints as <mimic>."""
         model, joints = (
             self._model,
             {joint.get("name", ""): joint for joint in self._result.root.findall("joint")},
@@ -337,22 +320,3 @@ class _Converter:
 def _to_rotation(quaternion: Floats) -> Floats:
     """Return the rotation matrix, shape (3, 3), of a quaternion w, x, y, z."""
     return np.array(pin.Quaternion(*(float(part) for part in quaternion)).normalized().matrix())
-
-
-def _format_numbers(values: Any) -> str:
-    return " ".join(f"{value:.9g}" for value in values)
-
-
-def _add_origin(element: ElementTree.Element, placement: pin.SE3) -> None:
-    ElementTree.SubElement(
-        element,
-        "origin",
-        xyz=_format_numbers(placement.translation),
-        rpy=_format_numbers(pin.rpy.matrixToRpy(placement.rotation)),
-    )
-
-
-def _add_connection(joint: ElementTree.Element, above: str, below: str, placement: pin.SE3) -> None:
-    _add_origin(joint, placement)
-    ElementTree.SubElement(joint, "parent", link=above)
-    ElementTree.SubElement(joint, "child", link=below)

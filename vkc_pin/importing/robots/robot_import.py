@@ -36,7 +36,12 @@ from vkc_pin.importing.robots.rest_configuration import (
     measure_floor_heights,
 )
 from vkc_pin.importing.robots.sources import Source, choose_free_name, read_source
-from vkc_pin.importing.targets import check_target, format_comment, get_origin_marker
+from vkc_pin.importing.targets import (
+    add_connection,
+    check_target,
+    format_comment,
+    get_origin_marker,
+)
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import check_bool, check_integer, check_mapping, check_text
 from vkc_pin.utils.arrays import Floats
@@ -200,14 +205,10 @@ class _Importer:
         self, robot: Robot, arms: list[Arm], chosen: Arm | None, pieces: list[Piece]
     ) -> ImportedRobot:
         findings = (*doctor(robot).findings, *self._findings)
-        names = (
-            []
-            if chosen is None
-            else [chosen.name, *(arm.name for arm in arms if arm is not chosen)]
-        )
-        return ImportedRobot(
-            self._folder, robot, tuple(names), tuple(pieces), Diagnosis(self._name, findings)
-        )
+        others = [arm.name for arm in arms if arm is not chosen]
+        names = () if chosen is None else (chosen.name, *others)
+        diagnosis = Diagnosis(self._name, findings)
+        return ImportedRobot(self._folder, robot, names, tuple(pieces), diagnosis)
 
     def _use_visual_shapes(self) -> None:
         """Use visual shapes for collision if the file has no collision shapes."""
@@ -272,10 +273,7 @@ class _Importer:
             )
 
     def _write_and_load(self) -> Robot:
-        """Write the files and return the robot.
-
-        If the guessed gripper does not open, its fingers are locked.
-        """
+        """Write the files and return the robot."""
         self._write()
         try:
             return load_robot(self._folder / "robot.yaml", pairs="all")
@@ -303,15 +301,7 @@ class _Importer:
     def _add_link(self, name: str, parent: str, placement: pin.SE3) -> None:
         root = self._file.root
         ElementTree.SubElement(root, "link", name=name)
-        joint = ElementTree.SubElement(root, "joint", name=f"{name}_joint", type="fixed")
-        angles = pin.rpy.matrixToRpy(placement.rotation)
-        xyz, rpy = (
-            " ".join(f"{value:.9g}" for value in values)
-            for values in (placement.translation, angles)
-        )
-        ElementTree.SubElement(joint, "origin", xyz=xyz, rpy=rpy)
-        ElementTree.SubElement(joint, "parent", link=parent)
-        ElementTree.SubElement(joint, "child", link=name)
+        add_connection(root, f"{name}_joint", "fixed", parent, name, placement)
 
     def _write(self) -> None:
         settings = {
@@ -335,11 +325,9 @@ class _Importer:
         self._settings["touch_links"] = [
             link for link in self._settings.get("touch_links", ()) if link not in envelopes
         ]
-        texts = [
-            f"{link} encloses {share:.0%} of the hand: left out"
-            for link, share in envelopes.items()
-        ]
-        self._findings += [Finding("warning", "hand", text) for text in texts]
+        for link, share in envelopes.items():
+            text = f"{link} encloses {share:.0%} of the hand: left out"
+            self._findings.append(Finding("warning", "hand", text))
         return self._write_and_load()
 
     def _place_on_floor(self, robot: Robot, seed: int) -> Robot:
@@ -360,12 +348,9 @@ class _Importer:
         ElementTree.SubElement(joint, "origin", xyz=f"0 0 {lift + raised:.6g}", rpy="0 0 0")
         ElementTree.SubElement(joint, "parent", link=floor)
         ElementTree.SubElement(joint, "child", link=root)
-        why = (
-            f"{1e3 * raised:.0f} mm of it keep all links of the arm clear of the floor"
-            if raised
-            else ""
-        )
-        why = why or "it stands on its lowest point"
+        why = "it stands on its lowest point"
+        if raised:
+            why = f"{1e3 * raised:.0f} mm of it keep all links of the arm clear of the floor"
         self._guess(
             "likely",
             f"{root} is {lift + raised:.3f} m above the floor, the new root '{floor}': {why}",
@@ -389,14 +374,10 @@ class _Importer:
             self._findings.append(Finding("note", "pairs", text))
             allowed[min(one, other), max(one, other)] = "Near"
         checked, arm = set_collision_pairs(robot, allowed), robot.coordinates.names[3:]
-        states = [
-            (name, state)
-            for name, state in self._source.srdf.states.items()
-            if set(arm) <= set(state)
-        ]
         named = [
             (f"the state '{name}' of the file", find_arm_positions(robot, state))
-            for name, state in states
+            for name, state in self._source.srdf.states.items()
+            if set(arm) <= set(state)
         ]
         home = find_home(checked, [*named, ("joints at 0 or mid-range", robot.home)], seed=seed)
         self._settings["home"] = {

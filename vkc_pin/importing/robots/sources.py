@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing.robots.mjcf import convert_mjcf
-from vkc_pin.importing.robots.xacro_files import expand_xacro
+from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.kinematic_tree import check_tree
 from vkc_pin.world.files.srdf import Srdf, read_groups, read_srdf
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.files.xml import parse_xml
 
-__all__ = ["Source", "choose_free_name", "read_source"]
+__all__ = ["Source", "choose_free_name", "expand_xacro", "read_source"]
 
 # Elements of a URDF; others belong to simulators and controllers.
 _KEPT = ("link", "joint", "material")
@@ -57,9 +61,6 @@ def read_source(
         packages: Maps package names to folders, for `package://` and `$(find NAME)`.
         arguments: Arguments of a xacro file.
         srdf: The SRDF; defaults to the one beside the file or in `../srdf`.
-
-    Raises:
-        InputError: The format is unknown, or the file cannot be read.
     """
     text = read_text(file, "robot")
     root = parse_xml(text, file)
@@ -161,3 +162,56 @@ def _read_matching_srdf(path: Path, file: UrdfFile) -> Srdf | None:
 
 def _read_group_joints(path: Path, file: UrdfFile) -> dict[str, tuple[str, ...]]:
     return {name: group.joints for name, group in read_groups(path, file.root).items()}
+
+
+def expand_xacro(file: Path, packages: Mapping[str, Path], arguments: Mapping[str, str]) -> str:
+    """Return the URDF of a xacro file.
+
+    Args:
+        file: The file.
+        packages: Maps package names to folders, for `$(find NAME)`; others are searched for in the
+            folders around the file.
+        arguments: Values of `<xacro:arg>` elements, instead of their defaults.
+    """
+    xacro = import_optional("xacro", "import", purpose="a xacro file", file=file)
+    substitution = import_optional(
+        "xacro.substitution_args", "import", purpose="a xacro file", file=file
+    )
+    messages = io.StringIO()
+    try:
+        with _search_packages(substitution, file, packages), contextlib.redirect_stderr(messages):
+            document = xacro.process_file(str(file), mappings=dict(arguments))
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:  # macros, expressions and XML raise any type
+        raise InputError(
+            f"xacro cannot process the file: {error or messages.getvalue().strip()}", file=file
+        ) from error
+    return str(document.toprettyxml(indent="  "))
+
+
+@contextlib.contextmanager
+def _search_packages(
+    substitution: ModuleType, file: Path, packages: Mapping[str, Path]
+) -> Iterator[None]:
+    """Let `$(find NAME)` search around `file`; xacro itself would ask ROS."""
+
+    def find(name: str) -> str:
+        places = [packages[name]] if name in packages else []
+        for folder in file.resolve().parents:
+            places += [folder / name, folder] if folder.name == name else [folder / name]
+        for place in places:
+            if place.is_dir():
+                return str(place)
+        expected = f"a folder {name} around the file, or packages={{'{name}': folder}}"
+        raise InputError(
+            f"package '{name}' was not found", file=file, field=f"$(find {name})", expected=expected
+        )
+
+    module: Any = substitution
+    original = module._eval_find
+    module._eval_find = find
+    try:
+        yield
+    finally:
+        module._eval_find = original

@@ -100,10 +100,7 @@ def render_images(executed: Execution, cameras: Sequence[Camera], times: Floats)
 def _render(
     scene: RenderedScene, cameras: Sequence[Camera], times: Floats, size: tuple[int, int]
 ) -> Any:
-    """Yield the images of every camera at every time.
-
-    Each item is the camera's name with colours, distances [mm] and geoms; geom 0 is none.
-    """
+    """Yield the images of every camera at every time."""
     mj, model = scene.mj, scene.model
     data, option, view = mj.MjData(model), mj.MjvOption(), mj.MjvCamera()
     near, far = (

@@ -86,11 +86,7 @@ def resolve_frame(robot: Robot, frame: str) -> str:
 
 
 def check_frame(robot: Robot, frame: str) -> None:
-    """Check that a robot has a frame.
-
-    Raises:
-        UnknownNameError: The robot lacks the frame.
-    """
+    """Check that a robot has a frame."""
     known = sorted(
         {
             BASE,

@@ -112,15 +112,7 @@ class Fingers:
 
 
 def find_fingers(world: World, physics: Physics) -> Fingers:
-    """Return the fingers of a robot.
-
-    Args:
-        world: The scene.
-        physics: Settings with the closing force.
-
-    Raises:
-        InputError: The hand has no fingers that could close.
-    """
+    """Return the fingers of a robot."""
     gripper = world.scene.robot.gripper
     if gripper is not None:
         return Fingers(gripper.names, gripper.closed, gripper.open)
@@ -136,11 +128,7 @@ def find_fingers(world: World, physics: Physics) -> Fingers:
 def limit_finger_servos(
     servos: Sequence[Servo], fingers: Fingers, world: World, physics: Physics
 ) -> tuple[Servo, ...]:
-    """Return the servos, those of fingers limited to the hand's closing force.
-
-    Raises:
-        InputError: A finger is revolute and its URDF states no effort limit.
-    """
+    """Return the servos, those of fingers limited to the hand's closing force."""
     units = dict(zip(world.coordinates.names, world.coordinates.units, strict=True))
     limited = []
     for servo in servos:

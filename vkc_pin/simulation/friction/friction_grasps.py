@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from vkc_pin.errors import InputError
 from vkc_pin.simulation.friction.fingers import Fingers
 from vkc_pin.simulation.model import PhysicalWorld
 from vkc_pin.simulation.physics import Physics, import_mujoco
 from vkc_pin.simulation.welds import Grip
-from vkc_pin.utils.arrays import Bools, Floats
+from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.world.scene.contact_rules import find_grasped_link, find_touch_links
 from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["Span", "Squeezes", "find_grip_changes", "split_spans"]
+__all__ = ["Span", "Squeezes", "find_grip_changes", "insert_pauses", "split_spans"]
 
 Span = tuple[Hold, float, float]
 """A hold with its begin and end [s]."""
@@ -180,10 +182,7 @@ class Squeezes:
         return np.asarray(where), np.asarray(turn.T @ (where - data.xpos[body]))
 
     def _compute_wrench(self, data: Any, squeeze: _Squeeze, tool: Floats) -> Floats | None:
-        """Return the hand's force and torque on the grasped link, shape (6,), at the tool's origin.
-
-        None means that they do not touch.
-        """
+        """Return the hand's force and torque on the grasped link, shape (6,), at the tool's origin."""
         pairs = np.asarray(data.contact.geom).reshape(-1, 2)
         ahead = squeeze.hand[pairs[:, 0]] & squeeze.link[pairs[:, 1]]
         back = squeeze.link[pairs[:, 0]] & squeeze.hand[pairs[:, 1]]
@@ -211,3 +210,57 @@ def split_spans(spans: Sequence[Span], begin: float) -> tuple[list[Span], list[S
     own = [span for span in spans if span[0].by is None]
     others = [span for span in spans if span[0].by is not None]
     return [*((hold, first, begin) for hold, first, _ in own if first < begin), *others], own
+
+
+_REST = 1e-6  # [m/s] or [rad/s] up to which the robot is at rest
+
+
+def insert_pauses(trajectory: Trajectory, waypoints: Iterable[int], seconds: float) -> Trajectory:
+    """Insert a pause at some waypoints.
+
+    Each of these waypoints is duplicated; both copies belong to the phase that begins there.
+
+    Args:
+        trajectory: The trajectory.
+        waypoints: Waypoints at which to pause, none of them the last one.
+        seconds: Duration of each pause [s].
+    """
+    at = np.array(sorted(set(waypoints)), int)
+    if not len(at):
+        return trajectory
+    curve = trajectory.curve
+    if curve is not None:
+        knots = np.searchsorted(curve.times, trajectory.times[at])
+        moving = np.abs(curve.rates[knots]).max(axis=1) > _REST
+        if moving.any():
+            got = f"moving at {trajectory.times[at[moving]][0]:.2f} s"
+            raise InputError(
+                "the hand closes or opens while the robot moves",
+                field="trajectory",
+                expected="a trajectory at rest",
+                got=got,
+            )
+        rates = np.insert(curve.rates, knots + 1, 0.0, axis=0)
+        rates[knots + np.arange(len(knots))] = 0.0
+        positions = np.insert(curve.positions, knots + 1, curve.positions[knots], axis=0)
+        curve = Curve(_insert_delays(curve.times, knots, seconds), positions, rates)
+
+    def shift_index(waypoint: int) -> int:
+        return waypoint + int(np.searchsorted(at, waypoint))
+
+    return replace(
+        trajectory,
+        times=_insert_delays(trajectory.times, at, seconds),
+        positions=np.insert(trajectory.positions, at + 1, trajectory.positions[at], axis=0),
+        phases=tuple(
+            replace(phase, first=shift_index(phase.first), last=shift_index(phase.last))
+            for phase in trajectory.phases
+        ),
+        curve=curve,
+    )
+
+
+def _insert_delays(times: Floats, at: Ints, seconds: float) -> Floats:
+    """Return times with those at indices `at` doubled, `seconds` apart, and later ones delayed."""
+    delays = seconds * np.searchsorted(at, np.arange(len(times)))
+    return np.asarray(np.insert(times + delays, at + 1, (times + delays)[at] + seconds))

@@ -1,9 +1,10 @@
-"""Writes the movable parts of a home as objects of a scene, with proposed attachments."""
+"""Writes the parts of a home: objects with proposed attachments, and obstacles."""
 
 from __future__ import annotations
 
 import dataclasses
 import tempfile
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,17 +12,26 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.importing.homes.splitting import HomeObject
-from vkc_pin.importing.objects.clean_up import add_missing_limits, load_surfaces, merge_fixed_links
-from vkc_pin.importing.objects.description import Description, Joint, Link
+from vkc_pin.importing.homes.splitting import Home, HomeObject
+from vkc_pin.importing.objects.clean_up import (
+    add_missing_limits,
+    choose_name,
+    compute_bounds,
+    load_surfaces,
+    merge_fixed_links,
+    move_root,
+)
+from vkc_pin.importing.objects.description import Colour, Description, Joint, Link, Part
 from vkc_pin.importing.objects.pieces import PieceCache, decompose_links
 from vkc_pin.importing.objects.writing import write_description, write_urdf
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
+from vkc_pin.importing.targets import round_values
+from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.robot import Robot
 
-__all__ = ["ImportedHomeObject", "write_object"]
+__all__ = ["ImportedHomeObject", "write_object", "write_obstacles"]
 
 _LIFT = 0.2  # [m] by which a free object is lifted to test whether a hand can hold it
 
@@ -84,9 +94,6 @@ def write_object(
         stem: Name of the object's folder and files, without extension.
         most: Largest number of attachments of one joint.
         clearances: Clearances as in `propose_attachments`.
-
-    Raises:
-        InputError: A mesh is concave, and CoACD is not installed.
     """
     description = merge_fixed_links(item.description)
     if item.free:
@@ -141,3 +148,88 @@ def _remove_lift_joint(description: Description) -> Description:
     """Return the object without its lift joint."""
     ((child, _),) = description.joints.items()
     return dataclasses.replace(description, links={child: description.links[child]}, joints={})
+
+
+# [m], and without unit: tolerance within which a visual and a collision shape coincide
+_ALIKE = 1e-4
+
+
+def write_obstacles(
+    home: Home, source: Path, folder: Path, taken: set[str], known: PieceCache
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Write the fixed parts of a home, and return the scene's obstacle entries and notes.
+
+    Each piece of furniture is one obstacle, so that reports name it; so is each shape of the
+    building. Primitive shapes are written into the scene itself. Others become a URDF with convex
+    pieces, whose origin is on the floor below its centre.
+    """
+    entries, notes = list[dict[str, Any]](), list[str]()
+    named = {choose_name(link.name, taken): link for link in _iterate_obstacle_links(home)}
+    written = [name for name, link in named.items() if not _is_simple(link)]
+    stems = dict(zip(written, choose_file_names(written), strict=True))
+    for name, link in named.items():
+        if name not in stems:
+            entries.append(_make_simple_entry(name, link))
+            continue
+        description = Description(source, {name: Link(name, link.visual, link.collision)}, {})
+        low, high = compute_bounds(description, load_surfaces(description))
+        origin = np.array([*((low + high) / 2.0)[:2], 0.0]).round(6)
+        description = move_root(description, pin.SE3(np.eye(3), -origin))
+        description = decompose_links(description, load_surfaces(description), known)
+        notes += description.notes
+        address = f"obstacles/{stems[name]}/{stems[name]}.urdf"
+        write_urdf(description, folder / address)
+        entries.append(
+            {"name": name, "type": "urdf", "file": address, "position": round_values(origin)}
+        )
+    return entries, notes
+
+
+def _iterate_obstacle_links(home: Home) -> Iterator[Link]:
+    """Yield the links that become one obstacle each."""
+    for link in home.building:
+        for number, part in enumerate(link.solid):
+            colour = _find_colour(part, link.visual)
+            shapes = (dataclasses.replace(part, colour=colour),)
+            name = link.name if len(link.solid) == 1 else f"{link.name}_{number}"
+            yield Link(part.name or name, shapes, shapes)
+    yield from home.furniture
+
+
+def _is_simple(link: Link) -> bool:
+    """Return whether a link's collision geometry is one primitive shape."""
+    return len(link.solid) == 1 and link.solid[0].kind != "mesh"
+
+
+def _make_simple_entry(name: str, link: Link) -> dict[str, Any]:
+    """Return the scene entry of a link that is a box, sphere, cylinder or capsule."""
+    (part,) = link.solid
+    size = [round(float(value), 6) for value in part.size]
+    entry: dict[str, Any] = {"name": name, "type": part.kind}
+    entry |= (
+        {"size": size}
+        if part.kind == "box"
+        else dict(zip(("radius", "length"), size, strict=False))
+    )
+    entry["position"] = round_values(part.placement.translation)
+    if not np.allclose(part.placement.rotation, np.eye(3), atol=1e-9):
+        entry["rpy"] = round_values(pin.rpy.matrixToRpy(part.placement.rotation), 9)
+    colour = _find_colour(part, link.visual)
+    if colour is not None:
+        entry["colour"] = [round(float(value), 4) for value in colour]
+    return entry
+
+
+def _find_colour(part: Part, visual: Iterable[Part]) -> Colour | None:
+    """Return the colour of a shape, or of the visual shape at the same placement."""
+    if part.colour is not None:
+        return part.colour
+    placement = part.placement.homogeneous
+    return next(
+        (
+            other.colour
+            for other in visual
+            if np.allclose(other.placement.homogeneous, placement, atol=_ALIKE)
+        ),
+        None,
+    )

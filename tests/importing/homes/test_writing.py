@@ -8,10 +8,56 @@ import pinocchio as pin
 import pytest
 import trimesh
 
-from vkc_pin.importing.homes.obstacles import write_obstacles
-from vkc_pin.importing.homes.splitting import Home
-from vkc_pin.importing.objects.description import Link, Part
+import vkc_pin as vkc
+from vkc_pin.importing.homes.splitting import Home, HomeObject
+from vkc_pin.importing.homes.writing import write_object, write_obstacles
+from vkc_pin.importing.objects.description import Description, Link, Part
 from vkc_pin.world.scene.scene import Scene
+
+SETTINGS = {"stem": "can", "most": 2, "dist_safe": 0.02, "grasp_clearance": 0.005}
+
+
+def _can(radius: float) -> HomeObject:
+    part = Part(
+        name="",
+        placement=pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.06])),
+        kind="cylinder",
+        size=(radius, 0.12),
+    )
+    return HomeObject(
+        "can",
+        Description(Path("home.urdf"), {"can": Link("can", (part,), (part,))}, {}),
+        (1.0, 2.0, 0.7),
+        free=True,
+    )
+
+
+def test_free_object_has_no_joint(tmp_path: Path) -> None:
+    done = write_object(_can(0.03), vkc.load_robot("husky_ur5e"), tmp_path, {}, **SETTINGS)
+    item = vkc.load_object(tmp_path / "objects" / "can" / "can.yaml")
+    assert item.free
+    assert item.coordinates.size == 0
+    assert item.base_link == "can"
+    assert (
+        list(item.attachments)
+        == [proposal.attachment.name for proposal in done.proposals.found]
+        != []
+    )
+    for attachment in item.attachments.values():
+        assert attachment.placement.translation[2] > 0.0
+        assert attachment.firm
+    assert done.entry == {
+        "name": "can",
+        "type": "objects/can/can.yaml",
+        "position": [1.0, 2.0, 0.7],
+    }
+    assert done.summary().startswith("can: carried by can_")
+
+
+def test_thick_object_is_reported(tmp_path: Path) -> None:
+    done = write_object(_can(0.3), vkc.load_robot("husky_ur5e"), tmp_path, {}, **SETTINGS)
+    assert not vkc.load_object(tmp_path / "objects" / "can" / "can.yaml").attachments
+    assert "carried by no hand: nothing of it fits" in done.summary()
 
 
 def make_part(name: str, kind: str, size: tuple[float, ...], at: pin.SE3, **more: object) -> Part:
@@ -63,45 +109,3 @@ def test_primitive_shapes_stay_and_others_become_urdf(tmp_path: Path) -> None:
         )  # balls of triangles are smaller
         if part.kind != "mesh":
             assert shape.placement.isApprox(part.placement, 1e-5)
-
-
-@pytest.mark.parametrize(
-    ("first", "second", "files"),
-    [
-        ("wardrobe", "stool", ("wardrobe", "stool")),
-        ("шкаф", "стул", ("part", "part_2")),
-        ("衣柜", "凳子", ("part", "part_2")),
-        ("a+b", "a b", ("a_b_2", "a_b")),
-        ("Chair", "chair", ("Chair", "chair_2")),
-        ("con", "x" * 300, ("con_", "x" * 64)),
-    ],
-)
-def test_links_with_similar_names_keep_their_own_shapes(
-    first: str, second: str, files: tuple[str, str], tmp_path: Path
-) -> None:
-    def pair(name: str, size: tuple[float, float, float], x: float) -> Link:
-        boxes = (
-            make_part("", "box", size, pin.SE3(np.eye(3), np.array([x, y, 1.0])))
-            for y in (0.0, 0.1)
-        )
-        return Link(name, (), tuple(boxes))
-
-    links = [pair(first, (0.4, 3.4, 1.9), -1.0), pair(second, (0.2, 0.2, 0.3), 3.0)]
-    home = Home((), tuple(links), (), (), 4, ())
-    entries, _ = write_obstacles(home, tmp_path / "home.urdf", tmp_path, set(), {})
-    assert [entry["name"] for entry in entries] == [first, second.replace(" ", "_")]
-    assert [entry["file"] for entry in entries] == [
-        f"obstacles/{name}/{name}.urdf" for name in files
-    ]
-    document = {
-        "robot": "husky_ur5e",
-        "start": {"base": [-3, -3, 0]},
-        "obstacles": entries,
-        "floor": False,
-    }
-    scene = Scene.from_document(document, tmp_path)
-    for shape, part in zip(
-        scene.obstacles, [part for link in links for part in link.collision], strict=True
-    ):
-        assert 2.0 * shape.geometry.halfSide == pytest.approx(part.size)
-        assert shape.placement.isApprox(part.placement, 1e-5)

@@ -54,4 +54,4 @@ def test_infeasible_recipe_fails(tmp_path: Path, capsys: pytest.CaptureFixture[s
     file.write_text(yaml.safe_dump({**SMALL, **far}), encoding="utf-8")
     out = str(tmp_path / "out")
     assert main(["generate", str(file), "--episodes", "1", "--out", out, "--quiet"]) == 1
-    assert "0 episodes of 1" in capsys.readouterr().err
+    assert "0 of 1 episodes" in capsys.readouterr().err

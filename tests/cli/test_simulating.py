@@ -35,7 +35,7 @@ def test_misuse_is_explained_and_writes_nothing(
 ) -> None:
     before = Path(plan).read_bytes()
     for options, expected in (
-        (["--actual", "door", "--json", str(tmp_path / "data.json")], "not there"),
+        (["--actual", "door", "--json", str(tmp_path / "data.json")], "lacks the object 'drawer'"),
         (["--json", plan], "--json"),
         (["--grasp", "glue"], "expected weld, friction, got glue"),
     ):

@@ -184,14 +184,11 @@ class _Run:
             self.squeezes = Squeezes(
                 self.physical, self.fingers, friction_spans, trajectory, physics, _CONTACT_PERIOD
             )
-        settle = max(
-            physics.settle,
-            physics.grip_time + _CLOSED_TIME if self.scene.holds and friction_spans else 0.0,
-        )
-        start, end = (
-            float(trajectory.times[0]) - settle,
-            float(trajectory.times[-1]) + physics.settle,
-        )
+        settle = physics.settle
+        if self.scene.holds and friction_spans:
+            settle = max(settle, physics.grip_time + _CLOSED_TIME)
+        start = float(trajectory.times[0]) - settle
+        end = float(trajectory.times[-1]) + physics.settle
         steps = np.arange(int(np.ceil((end - start) / physics.timestep - 1e-9)) + 1)
         self.times: Floats = np.asarray(start + physics.timestep * steps, float)
         self.diverged: float | None = None
@@ -207,9 +204,8 @@ class _Run:
         fingers = sample_fingers(self.tree, self.planned, self.trajectory.times, self.times)
         targets = np.column_stack([motion[0], fingers])
         feedforward = compute_feedforward(self.tree, self.servos, targets, motion)
-        feedforward[:, : motion[1].shape[1]] += motion[1] * [
-            servo.damping for servo in self.servos[: motion[1].shape[1]]
-        ]
+        count = motion[1].shape[1]
+        feedforward[:, :count] += motion[1] * [servo.damping for servo in self.servos[:count]]
         commands = targets + feedforward / [servo.stiffness for servo in self.servos]
         if self.squeezes is not None and self.fingers is not None:
             finger_columns, finger_motors = self.fingers.find_addresses(self.physical)
@@ -252,12 +248,9 @@ class _Run:
                 not np.isfinite(data.qpos).all()
                 or data.warning[mj.mjtWarning.mjWARN_BADQACC].number
             ):
-                self.times, self.errors, self.efforts = (
-                    self.times[: k + 1],
-                    self.errors[: k + 1],
-                    self.efforts[: k + 1],
-                )
-                self.diverged = clock
+                self.diverged, end = clock, k + 1
+                self.times, self.errors = self.times[:end], self.errors[:end]
+                self.efforts = self.efforts[:end]
                 break
         # After a divergence the last state is repeated.
         records += [records[-1]] * (len(recorded) - len(records))
@@ -289,10 +282,8 @@ class _Run:
             names = "; ".join(" – ".join(pair) for pair in self.pairs.overlapping)
             notes.append(f"overlap at the start, and therefore do not collide: {names}")
         if self.fingers is not None and self.fingers.sides is not None:
-            notes.append(
-                "the hand is described without finger joints: "
-                "its two sides slide towards each other"
-            )
+            reason = "the hand is described without finger joints"
+            notes.append(f"{reason}: its two sides slide towards each other")
         grips = [
             grip for grip in self.grips.grips if grip.end > grip.begin or grip.broken is not None
         ]

@@ -71,11 +71,8 @@ def measure_goal_errors(
     """
     planned = World(scene)
     edges = [0, *(phase.last for phase in trajectory.phases)]
-    ends, start, errors = (
-        planned.compute_positions(trajectory, trajectory.times[edges]),
-        0,
-        list[Miss](),
-    )
+    ends = planned.compute_positions(trajectory, trajectory.times[edges])
+    start, errors, last = 0, list[Miss](), len(ends) - 1
 
     def is_completed(step: Step, k: int) -> bool:
         if isinstance(step, Grasp | Release):
@@ -91,12 +88,8 @@ def measure_goal_errors(
         )
 
     for number, step in enumerate(steps):
-        last = len(ends) - 1
-        start = (
-            last
-            if number == len(steps) - 1
-            else next((k for k in range(start, last) if is_completed(step, k)), last)
-        )
+        completed = (k for k in range(start, last) if is_completed(step, k))
+        start = last if number == len(steps) - 1 else next(completed, last)
         at = float(trajectory.times[edges[start]])
         row = len(times) - 1 if start == last else int(np.argmin(np.abs(times - at)))
         for subject, amount, unit in _compute_errors(world, step, rows[row], ends[start]):
@@ -125,11 +118,8 @@ def _compute_errors(
             _compute_placement(world, at, link).actInv(_compute_placement(world, at, hand))
             for at in (row, planned)
         )
-        yield (
-            f"grasp of {step.object}",
-            float(np.linalg.norm(one.translation - other.translation)),
-            "m",
-        )
+        offset = float(np.linalg.norm(one.translation - other.translation))
+        yield f"grasp of {step.object}", offset, "m"
     elif isinstance(step, Reach | Touch | Place):
         yield from _compute_pose_errors(world, step, row)
 
@@ -145,24 +135,14 @@ def _compute_pose_errors(
         frame = step.frame or robot.tool_frame
     goal: Any = step.target if isinstance(step, Touch) else step.pose
     placement, has_pose = _compute_placement(world, row, frame), isinstance(goal, pin.SE3)
-    yield (
-        frame,
-        float(
-            np.linalg.norm(
-                placement.translation - (goal.translation if has_pose else np.asarray(goal))
-            )
-        ),
-        "m",
-    )
+    position = goal.translation if has_pose else np.asarray(goal)
+    yield frame, float(np.linalg.norm(placement.translation - position)), "m"
     if has_pose:
         yield frame, float(np.linalg.norm(pin.log3(goal.rotation.T @ placement.rotation))), "rad"
     elif isinstance(step, Place):  # any heading, the same tilt as at the start
         is_held = step.object in world.scene.held
-        vertical = (
-            np.array([0.0, 0.0, 1.0])
-            if is_held
-            else world.scene.objects[step.object].placement.rotation[2]
-        )
+        at_start = world.scene.objects[step.object].placement.rotation[2]
+        vertical = np.array([0.0, 0.0, 1.0]) if is_held else at_start
         yield frame, float(np.arccos(np.clip(placement.rotation[2] @ vertical, -1.0, 1.0))), "rad"
 
 

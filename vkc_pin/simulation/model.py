@@ -222,12 +222,9 @@ class Builder:
             usual = self.physics.prismatic_damping if slides else self.physics.revolute_damping
             joint.damping[0], joint.frictionloss = stated.damping or usual, stated.friction
             joint.stiffness[0], joint.springref = stated.stiffness, stated.springref
-            lower, upper = (
-                self.world.coordinates.lower[column],
-                self.world.coordinates.upper[column],
-            )
-            if np.isfinite([lower, upper]).all():
-                joint.limited, joint.range = self.mj.mjtLimited.mjLIMITED_TRUE, [lower, upper]
+            bounds = self.world.coordinates.lower[column], self.world.coordinates.upper[column]
+            if np.isfinite(bounds).all():
+                joint.limited, joint.range = self.mj.mjtLimited.mjLIMITED_TRUE, bounds
 
     def _add_joint(self, body: Any, name: str, twist: Floats) -> tuple[Any, bool]:
         """Add a joint along or about a twist's axis, shape (6,)."""
@@ -250,12 +247,8 @@ class Builder:
             )
             geom = self.add_geom(body, f"shape {number}", shape.geometry, place)
             geom.contype, geom.conaffinity = int(pairs.types[number]), int(pairs.affinities[number])
-            geom.friction[0], geom.condim, geom.solref, geom.group = (
-                self.physics.friction,
-                4,
-                _CONTACT,
-                3,
-            )
+            geom.friction[0], geom.condim = self.physics.friction, 4
+            geom.solref, geom.group = _CONTACT, 3
             geom.rgba = [*np.asarray(shape.meshColor)[:3], 1.0]
         for first, second in pairs.always.tolist():
             pair = self.spec.add_pair(geomname1=f"shape {first}", geomname2=f"shape {second}")
@@ -282,9 +275,8 @@ class Builder:
         if isinstance(shape, coal.Sphere):
             return body.add_geom(type=kinds.mjGEOM_SPHERE, size=[shape.radius, 0.0, 0.0], **where)
         if isinstance(shape, coal.Cylinder | coal.Capsule):
-            kind = (
-                kinds.mjGEOM_CYLINDER if isinstance(shape, coal.Cylinder) else kinds.mjGEOM_CAPSULE
-            )
+            is_cylinder = isinstance(shape, coal.Cylinder)
+            kind = kinds.mjGEOM_CYLINDER if is_cylinder else kinds.mjGEOM_CAPSULE
             return body.add_geom(type=kind, size=[shape.radius, shape.halfLength, 0.0], **where)
         if isinstance(shape, coal.Ellipsoid):
             return body.add_geom(type=kinds.mjGEOM_ELLIPSOID, size=shape.radii, **where)
@@ -320,18 +312,12 @@ class Builder:
         body = link.add_body(
             name=name, pos=place.translation, quat=to_mujoco_quaternion(place), gravcomp=1.0
         )
-        body.mass, body.inertia, body.explicitinertial = (
-            _CARRIER_MASS,
-            np.full(3, _CARRIER_INERTIA),
-            True,
-        )
+        body.mass, body.inertia = _CARRIER_MASS, np.full(3, _CARRIER_INERTIA)
+        body.explicitinertial = True
         joints = self._carrier_joints[hold] = []
         for k, freedom in enumerate(attachment.freedoms):
-            kind = (
-                self.mj.mjtJoint.mjJNT_HINGE
-                if freedom.kind == "revolute"
-                else self.mj.mjtJoint.mjJNT_SLIDE
-            )
+            kinds = self.mj.mjtJoint
+            kind = kinds.mjJNT_HINGE if freedom.kind == "revolute" else kinds.mjJNT_SLIDE
             joint = body.add_joint(
                 name=f"{name} {k}", type=kind, axis=freedom.axis, pos=freedom.through
             )
@@ -351,10 +337,8 @@ class Builder:
         equality = self._add_joint_equality(
             str(self.world.model.names[move.joint]), move.offset, active=True
         )
-        equality.name2, equality.data[1] = (
-            self.world.coordinates.names[move.coordinate],
-            move.factor,
-        )
+        equality.name2 = self.world.coordinates.names[move.coordinate]
+        equality.data[1] = move.factor
         equality.solref = [2.0 * self.physics.timestep, 1.0]  # as stiff as the integrator allows
 
     def _find_addresses(self, model: Any) -> tuple[Ints, Ints]:

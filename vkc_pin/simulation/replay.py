@@ -55,18 +55,8 @@ class Replay(World):
         self._times, self._rows = times, rows.copy()
         for name in (name for name, placed in scene.objects.items() if placed.object.free):
             quaternions = self._rows[:, self.get_placement_columns(name)][:, 3:]
-            signs = np.cumprod(
-                np.concatenate(
-                    [
-                        [1.0],
-                        np.where(
-                            np.einsum("kc,kc->k", quaternions[1:], quaternions[:-1]) < 0.0,
-                            -1.0,
-                            1.0,
-                        ),
-                    ]
-                )
-            )
+            flips = np.einsum("kc,kc->k", quaternions[1:], quaternions[:-1]) < 0.0
+            signs = np.cumprod([1.0, *np.where(flips, -1.0, 1.0)])
             self._rows[:, self.get_placement_columns(name)][:, 3:] *= signs[:, None]
 
     def compute_positions(

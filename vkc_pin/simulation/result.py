@@ -176,17 +176,11 @@ class SimulationResult:
                 f"{name} {100.0 * share:.0f} %" for name, share in shares[:_LISTED_MOTORS]
             )
             lines.append(f"  motors      at most {loads} of their limits")
-        lines.append(
-            f"  contacts    {len(self.contacts)} not planned"
-            if self.contacts
-            else "  contacts    as planned"
-        )
+        count = f"{len(self.contacts)} not planned" if self.contacts else "as planned"
+        lines.append(f"  contacts    {count}")
         lines += [f"  - {contact}" for contact in self.contacts[:_LISTED_CONTACTS]]
-        lines += (
-            [f"  ... and {len(self.contacts) - _LISTED_CONTACTS} more"]
-            if len(self.contacts) > _LISTED_CONTACTS
-            else []
-        )
+        if (more := len(self.contacts) - _LISTED_CONTACTS) > 0:
+            lines.append(f"  ... and {more} more")
         lines += [f"  note        {note}" for note in self.notes]
         lines += [f"  because     {problem}" for problem in problems]
         return "\n".join(lines)
@@ -228,19 +222,11 @@ class SimulationResult:
         )
 
     def plot(self, path: str | Path, *, count: int = 6) -> Path:
-        """Write an image (.png) of `count` snapshots; see `snapshots.write_snapshots`.
-
-        Returns:
-            The path.
-        """
+        """Write an image (.png) of `count` snapshots, and return its path."""
         return write_snapshots(self, path, count=count)
 
     def to_mp4(self, path: str | Path, *, rate: float = 25.0) -> Path:
-        """Write a video of the executed motion with ffmpeg; see `snapshots.write_video`.
-
-        Returns:
-            The path.
-        """
+        """Write a video (.mp4) with a frame `rate` [Hz] by ffmpeg, and return its path."""
         return write_video(self, path, rate=rate)
 
     def __repr__(self) -> str:

@@ -102,13 +102,33 @@ class RenderedScene:
             if label == FLOOR:
                 yield int(model.geom(f"shape {number}").id), label, False
 
-    def sample(self, times: Floats) -> Floats:
-        """Return the world coordinates at times [s], shape (K,): shape (K, n)."""
-        return self._world.compute_positions(self._executed.trajectory, times)
+    def iterate_states(
+        self, times: Floats, size: tuple[int, int]
+    ) -> Iterator[tuple[Any, Any, Any]]:
+        """Yield `MjData`, `MjvScene` and `MjrContext` for images of a size at times [s], shape (K,).
 
-    def to_qpos(self, row: Floats) -> Floats:
-        """Return MuJoCo's configuration for world coordinates, shape (n,)."""
-        return self._physical.to_qpos(row)
+        Raises:
+            VkcError: OpenGL is not available without a display.
+        """
+        mj, model = self.mj, self.model
+        data = mj.MjData(model)
+        with open_gl_context(size):
+            gl_scene = mj.MjvScene(model, maxgeom=20_000)
+            gl_context = mj.MjrContext(model, mj.mjtFontScale.mjFONTSCALE_100)
+            mj.mjr_setBuffer(mj.mjtFramebuffer.mjFB_OFFSCREEN, gl_context)
+            for row in self._world.compute_positions(self._executed.trajectory, times):
+                data.qpos[:] = self._physical.to_qpos(row)
+                mj.mj_forward(model, data)
+                yield data, gl_scene, gl_context
+            gl_context.free()
+
+    def update_view(self, data: Any, gl_scene: Any, camera: Any) -> None:
+        """Update a scene of OpenGL for a state and a camera."""
+        mj = self.mj
+        everything = mj.mjtCatBit.mjCAT_ALL
+        mj.mjv_updateScene(
+            self.model, data, mj.MjvOption(), mj.MjvPerturb(), camera, everything, gl_scene
+        )
 
     def render(
         self, times: Floats, viewpoint: tuple[Floats, Floats]
@@ -119,31 +139,19 @@ class RenderedScene:
             times: Times, shape (K,) [s].
             viewpoint: Target and position of the camera, shape (3,) each [m].
         """
-        mj, model = self.mj, self.model
-        data, camera, option = mj.MjData(model), mj.MjvCamera(), mj.MjvOption()
+        mj, camera = self.mj, self.mj.MjvCamera()
         target, place = viewpoint
         ahead = target - place
         camera.lookat[:], camera.distance = target, float(np.linalg.norm(ahead))
         camera.azimuth = float(np.degrees(np.arctan2(ahead[1], ahead[0])))
         camera.elevation = float(np.degrees(np.arcsin(ahead[2] / camera.distance)))
         window = mj.MjrRect(0, 0, *_SIZE)
-        with open_gl_context(_SIZE):
-            gl_scene, gl_context = (
-                mj.MjvScene(model, maxgeom=20_000),
-                mj.MjrContext(model, mj.mjtFontScale.mjFONTSCALE_100),
-            )
-            mj.mjr_setBuffer(mj.mjtFramebuffer.mjFB_OFFSCREEN, gl_context)
-            for row in self.sample(times):
-                data.qpos[:] = self.to_qpos(row)
-                mj.mj_forward(model, data)
-                mj.mjv_updateScene(
-                    model, data, option, mj.MjvPerturb(), camera, mj.mjtCatBit.mjCAT_ALL, gl_scene
-                )
-                mj.mjr_render(window, gl_scene, gl_context)
-                pixels = np.zeros((_SIZE[1], _SIZE[0], 3), np.uint8)
-                mj.mjr_readPixels(pixels, None, window, gl_context)
-                yield pixels[::-1]
-            gl_context.free()
+        for data, gl_scene, gl_context in self.iterate_states(times, _SIZE):
+            self.update_view(data, gl_scene, camera)
+            mj.mjr_render(window, gl_scene, gl_context)
+            pixels = np.zeros((_SIZE[1], _SIZE[0], 3), np.uint8)
+            mj.mjr_readPixels(pixels, None, window, gl_context)
+            yield pixels[::-1]
 
     def find_viewpoint(self) -> tuple[Floats, Floats]:
         """Return a viewpoint that sees the whole motion; see `Drawing.viewpoint`."""
@@ -185,14 +193,8 @@ def write_snapshots(executed: Execution, path: str | Path, *, count: int = 6) ->
         axes = figure.add_subplot(rows, columns, number)
         axes.imshow(picture)
         axes.set_axis_off()
-        phase = next(
-            (
-                p.name
-                for p in executed.planned.phases
-                if time <= executed.planned.times[p.last] + 1e-9
-            ),
-            "",
-        )
+        ends = ((p.name, executed.planned.times[p.last]) for p in executed.planned.phases)
+        phase = next((name for name, end in ends if time <= end + 1e-9), "")
         axes.set_title(f"{time:.1f} s – {phase}", fontsize=10)
     data = io.BytesIO()
     figure.savefig(data, format="png")
@@ -218,29 +220,8 @@ def write_video(executed: Execution, path: str | Path, *, rate: float = 25.0) ->
     scene, size = RenderedScene(executed), "x".join(map(str, _SIZE))
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "film.mp4")
-        input_options = [
-            "-f",
-            "rawvideo",
-            "-pix_fmt",
-            "rgb24",
-            "-s",
-            size,
-            "-r",
-            str(rate),
-            "-i",
-            "-",
-        ]
-        command = [
-            encoder,
-            "-loglevel",
-            "error",
-            *input_options,
-            "-c:v",
-            "libx264",
-            "-pix_fmt",
-            "yuv420p",
-            str(file),
-        ]
+        read = f"-loglevel error -f rawvideo -pix_fmt rgb24 -s {size} -r {rate} -i -"
+        command = [encoder, *f"{read} -c:v libx264 -pix_fmt yuv420p".split(), str(file)]
         pictures = b"".join(
             picture.tobytes() for picture in scene.render(times, scene.find_viewpoint())
         )
@@ -293,13 +274,15 @@ def _add_visuals(builder: Builder, size: tuple[int, int], wall_opacity: float) -
     spec.worldbody.add_light(
         type=sun, dir=[0.1, 0.15, -1.0], pos=[0.0, 0.0, 6.0], diffuse=[0.5] * 3
     )
-    sky = {
-        "type": mj.mjtTexture.mjTEXTURE_SKYBOX,
-        "builtin": mj.mjtBuiltin.mjBUILTIN_GRADIENT,
-        "width": 64,
-        "height": 384,
-    }
-    spec.add_texture(name="sky", rgb1=[0.93, 0.95, 0.97], rgb2=[0.99, 0.99, 0.99], **sky)
+    spec.add_texture(
+        name="sky",
+        type=mj.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mj.mjtBuiltin.mjBUILTIN_GRADIENT,
+        width=64,
+        height=384,
+        rgb1=[0.93, 0.95, 0.97],
+        rgb2=[0.99, 0.99, 0.99],
+    )
 
 
 @contextlib.contextmanager

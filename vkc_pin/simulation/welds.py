@@ -96,13 +96,8 @@ class Grips:
         *,
         touching: Collection[Hold] = (),
     ) -> None:
-        self._touching = touching
-        self.physical, self.holds, self.schedule, self.pairs = (
-            physical,
-            list(holds),
-            list(schedule),
-            pairs,
-        )
+        self.physical, self.pairs, self._touching = physical, pairs, touching
+        self.holds, self.schedule = list(holds), list(schedule)
         self.trajectory, self.physics, self._engine = trajectory, physics, import_mujoco()
         self.grips: list[Grip] = []
         self._active: dict[Hold, tuple[int, float]] = {}  # index into grips, and end [s]
@@ -117,18 +112,10 @@ class Grips:
         while self.schedule and self.schedule[0][1] <= clock:
             hold, begin, end = self.schedule.pop(0)
             self._engage(data, hold, clock)
-            self._active[hold], self._forces[hold] = (
-                (len(self.grips), end),
-                deque(maxlen=self._window),
-            )
-            times = self.trajectory.times
-            self.grips.append(
-                Grip(str(hold), max(begin, float(times[0])), min(end, float(times[-1])))
-            )
-
-    def is_active(self, hold: Hold) -> bool:
-        """Return whether a hold is active."""
-        return hold in self._active
+            self._active[hold] = len(self.grips), end
+            self._forces[hold] = deque(maxlen=self._window)
+            first, last = self.trajectory.times[[0, -1]].tolist()
+            self.grips.append(Grip(str(hold), max(begin, first), min(end, last)))
 
     def measure(self, data: Any, clock: float) -> None:
         """Record the load on the welds after a step, and release those that are overloaded."""

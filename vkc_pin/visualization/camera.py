@@ -14,9 +14,8 @@ FIELD_OF_VIEW = 40.0
 """Vertical opening angle of the camera [degrees]."""
 _ASPECT = 1.5  # assumed width over height of the picture
 _ELEVATION = np.radians(38.0)
-_AZIMUTHS = np.radians(
-    np.arange(-90.0, 270.0, 15.0)
-)  # the first wins where all are as good: x to the right, y away
+# The first of equal azimuths is chosen: x to the right, y away.
+_AZIMUTHS = np.radians(np.arange(-90.0, 270.0, 15.0))
 
 
 def choose_viewpoint(
@@ -38,9 +37,8 @@ def choose_viewpoint(
         hidden = np.zeros(len(points))
         last = float((points @ towards).min())
         for low, high, opacity in boxes:
-            if (
-                np.maximum(low * towards, high * towards).sum() > last
-            ):  # otherwise it stands behind everything
+            # Other boxes are behind all points.
+            if np.maximum(low * towards, high * towards).sum() > last:
                 np.maximum(hidden, opacity * _crosses(flat, towards, low, high), out=hidden)
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         breadth = np.ptp(points @ right) / max(
@@ -52,9 +50,8 @@ def choose_viewpoint(
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     up = np.cross(towards, right)
     offsets = points - target
-    tangent = (
-        np.tan(np.radians(FIELD_OF_VIEW) / 2.0) * 0.80
-    )  # some air around, and room for the bar below
+    # Leave a margin, and space for the control bar.
+    tangent = np.tan(np.radians(FIELD_OF_VIEW) / 2.0) * 0.80
     depth = offsets @ towards
     needed = (
         np.maximum(np.abs(offsets @ up) / tangent, np.abs(offsets @ right) / (tangent * _ASPECT))
@@ -77,14 +74,11 @@ def _crosses(points: Floats, direction: Floats, lower: Floats, upper: Floats) ->
     """Return which points, shape (3, n), have rays along `direction` that meet the box."""
     enter, leave = np.full(points.shape[1], -np.inf), np.full(points.shape[1], np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
-        for values, slope, low, high in zip(
-            points, direction + 0.0, lower, upper, strict=True
-        ):  # + 0: no negative zeros
+        # + 0 avoids negative zeros.
+        for values, slope, low, high in zip(points, direction + 0.0, lower, upper, strict=True):
             near, far = (low, high) if slope >= 0.0 else (high, low)
-            np.fmax(
-                enter, (near - values) / slope, out=enter
-            )  # in a face that the ray runs along there is no number: no bound
+            # NaN, for a ray along a face, is no bound.
+            np.fmax(enter, (near - values) / slope, out=enter)
             np.fmin(leave, (far - values) / slope, out=leave)
-    return np.asarray(
-        (leave > enter) & (enter > 0.05)
-    )  # what lies in a box or on it is not hidden by it
+    # A box does not hide the points in it or on it.
+    return np.asarray((leave > enter) & (enter > 0.05))

@@ -89,13 +89,8 @@ class Drawing:
         times: Floats | None = None,
         beside: Motion | None = None,
     ) -> None:
-        self.viewer, self.scene, self.trajectory, self.report, self.beside = (
-            viewer,
-            scene,
-            trajectory,
-            report,
-            beside,
-        )
+        self.viewer, self.scene, self.trajectory = viewer, scene, trajectory
+        self.report, self.beside = report, beside
         self.world = World(scene) if world is None else world
         self.motion: Motion = sample_motion(self.world, trajectory, times)
         self.room = Room(scene)
@@ -137,20 +132,17 @@ class Drawing:
                 coarse(item.solid, _GHOST_DETAIL) if moving[item.joint] else None
                 for item in self.items
             ]
-            for name, row, colour in (
-                (("start", 0, _START), ("end", -1, _END)) if self.beside is None else ()
-            ):
-                self._ghosts(name, row, colour)
-            self._other()
+            if self.beside is None:
+                self._ghosts("start", 0, _START)
+                self._ghosts("end", -1, _END)
+            else:
+                self._other(self.beside)
         self.viewer.window.send(SetAnimation(self._animation(), play=play, repetitions=1))
 
     def viewpoint(self) -> tuple[Floats, Floats]:
         """Choose target and position of the camera so that motion and objects are in the picture."""
-        motion, around = (
-            self.motion,
-            np.array([[x, y, 0.0] for x in (-0.6, 0.6) for y in (-0.6, 0.6)]),
-        )
-        high = np.array([0.0, 0.0, 1.0])
+        motion, high = self.motion, np.array([0.0, 0.0, 1.0])
+        around = np.array([[x, y, 0.0] for x in (-0.6, 0.6) for y in (-0.6, 0.6)])
         points = [
             (motion.base[:, None] * (1.0 - high) + around).reshape(-1, 3),
             motion.base + high,
@@ -242,25 +234,18 @@ class Drawing:
 
     def _paths(self) -> None:
         assert self.trajectory is not None
-        times = np.linspace(
-            self.trajectory.times[0],
-            self.trajectory.times[-1],
-            max(2, int(20 * self.trajectory.times[-1])),
-        )
-        motion = sample_motion(
-            self.world, self.trajectory, np.unique(np.concatenate([times, self.trajectory.times]))
-        )
+        own = self.trajectory.times
+        times = np.linspace(own[0], own[-1], max(2, int(20 * own[-1])))
+        times = np.unique(np.concatenate([times, own]))
+        motion = sample_motion(self.world, self.trajectory, times)
         for name, points, radius, colour in (
             ("tool", motion.tool, 0.008, _TOOL),
             ("base", motion.base * [1.0, 1.0, 0.0] + [0.0, 0.0, 0.006], 0.014, _BASE),
         ):
             solid = tube(points, radius)
             if solid is not None:
-                self._unshadowed(
-                    f"paths/{name}",
-                    Triangles(solid),
-                    g.MeshBasicMaterial(color=hexadecimal(colour)),
-                )
+                flat = g.MeshBasicMaterial(color=hexadecimal(colour))
+                self._unshadowed(f"paths/{name}", Triangles(solid), flat)
 
     def _ghosts(self, name: str, row: int, colour: tuple[float, float, float]) -> None:
         """Draw moving bodies at `row` as ghosts, one each for the robot and every object."""
@@ -275,19 +260,16 @@ class Drawing:
                     Ghost(merge_solids(solids), colour)
                 )
 
-    def _other(self) -> None:
+    def _other(self, beside: Motion) -> None:
         """Draw the ghosts of the second motion."""
-        if self.beside is None:
-            return
         for item, light in zip(self.items, self.light, strict=True):
             if light is not None:
                 ghost = f"{_BESIDE}/{item.path}"
                 self.viewer[ghost].set_object(Ghost(light, _START))
                 self.viewer[ghost].set_transform(item.placement.homogeneous)
         for joint in range(1, self.world.model.njoints):
-            self.viewer[f"{_BESIDE}/{self.nodes[joint]}"].set_transform(
-                self.beside.local[joint][0].homogeneous
-            )
+            node = self.viewer[f"{_BESIDE}/{self.nodes[joint]}"]
+            node.set_transform(beside.local[joint][0].homogeneous)
 
     def _movers(self) -> dict[str, Bools]:
         """Return the masks of moving joints, shape (joints,), of the robot and of every object."""
@@ -312,13 +294,8 @@ class Drawing:
         lens = place["/Cameras/default/rotated/<object>"]
         lens.set_property("fov", FIELD_OF_VIEW)
         lens.set_property("position", [float(x), float(z), float(-y)])
-        for name in (
-            "/Grid",
-            "/Axes",
-            "/Lights/PointLightNegativeX",
-            "/Lights/PointLightPositiveX",
-            "/Lights/FillLight",
-        ):
+        lights = ("PointLightNegativeX", "PointLightPositiveX", "FillLight")
+        for name in ("/Grid", "/Axes", *(f"/Lights/{light}" for light in lights)):
             place[name].set_property("visible", False)
         place["/Lights/AmbientLight/<object>"].set_property("intensity", 0.62)
         place["/Lights/Sun"].set_object(
@@ -343,15 +320,9 @@ class Drawing:
                     pin.Quaternion(placement.rotation).coeffs().tolist() for placement in local
                 ]
                 tracks = [Track("quaternion", "quaternion", times, quaternions)]
-                if np.ptp([placement.translation for placement in local], axis=0).max() > 1e-9:
-                    tracks.append(
-                        Track(
-                            "position",
-                            "vector3",
-                            times,
-                            [placement.translation.tolist() for placement in local],
-                        )
-                    )
+                positions = [placement.translation.tolist() for placement in local]
+                if np.ptp(positions, axis=0).max() > 1e-9:
+                    tracks.append(Track("position", "vector3", times, positions))
                 self._clip(movie, above + self.nodes[j], tracks)
         for name, row in (("start", 0), ("end", -1)) if self.beside is None else ():
             for owner, joints in self.movers.items():

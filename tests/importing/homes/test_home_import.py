@@ -8,7 +8,7 @@ from helpers.downloads import SDF
 from helpers.homes import HOME_MJCF, PLACES, WALLS, home_urdf
 
 import vkc_pin as vkc
-from vkc_pin.importing.homes.home_import import _find_start, find_free_start
+from vkc_pin.importing.homes.home_import import find_free_start
 from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import START_CLEARANCE
@@ -225,10 +225,8 @@ def test_missing_start_pose_is_reported() -> None:
     full = [
         {"name": "block", "type": "box", "size": [10.0, 4.0, 2.0], "position": [-1.0, 0.0, 1.0]}
     ]
-    with pytest.raises(vkc.InputError, match="floor"):
-        find_free_start(make_divided_room(3.0, obstacles=full), np.random.default_rng(0))
     with pytest.raises(vkc.InputError, match=r"home\.xml: robot, floor: no start pose") as caught:
-        _find_start(
-            make_divided_room(3.0, obstacles=full), Path("home.xml"), np.random.default_rng(0)
+        find_free_start(
+            make_divided_room(3.0, obstacles=full), np.random.default_rng(0), Path("home.xml")
         )
     assert caught.value.field == "robot, floor"

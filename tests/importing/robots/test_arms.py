@@ -70,7 +70,7 @@ def test_base_joints_are_not_part_of_the_arm(tmp_path: Path) -> None:
 
 
 def robots(pattern: str) -> Path:
-    folder = resources.example_robot_data()
+    folder = resources.find_example_robot_data()
     assert folder is not None
     return next(iter(sorted((folder / "robots").glob(pattern))))
 

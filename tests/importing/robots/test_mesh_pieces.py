@@ -110,7 +110,7 @@ def test_meshes_of_equal_names_keep_their_shapes_and_colours(
         tmp_path,
         *(link(name, str(file.relative_to(tmp_path)), str(file)) for name, file in seen.items()),
     )
-    shapes = {shape.link: shape for shape in made.shapes("visual")}
+    shapes = {shape.link: shape for shape in made.read_shapes("visual")}
     assert {name: shape.make_mesh().volume for name, shape in shapes.items()} == pytest.approx(
         {"a": 0.1**3, "b": 0.2**3, "c": 0.3**3}
     )

@@ -33,7 +33,7 @@ def test_srdf_beside_the_urdf_is_read_unless_of_another_robot(tmp_path: Path) ->
     path = write_arms(tmp_path)
     other = "<robot name='x'><disable_collisions link1='elsewhere' link2='body'/></robot>"
     (tmp_path / "robot.srdf").write_text(other, encoding="utf-8")
-    folder = resources.example_robot_data()
+    folder = resources.find_example_robot_data()
     assert folder is not None
     panda = read(folder / "robots" / "panda_description" / "urdf" / "panda.urdf", tmp_path)
     assert panda.groups

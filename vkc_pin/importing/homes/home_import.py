@@ -178,7 +178,7 @@ def import_home(
         }
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they are repeated when the scene is loaded
-            scene, reached = _find_start(Scene.from_document(document, staging), path, rng)
+            scene, reached = find_free_start(Scene.from_document(document, staging), rng, path)
         document["start"] = {"base": scene.start[:3].tolist()}
         _write_scene(staging / "scene.yaml", path, document)
     weight = (WEIGHTLESS,) if all(thing.description.is_massless for thing in home.objects) else ()
@@ -199,16 +199,6 @@ def import_home(
     )
 
 
-def _find_start(scene: Scene, path: Path, rng: np.random.Generator) -> tuple[Scene, int]:
-    """Run `find_free_start`; add the file's name to its error."""
-    try:
-        return find_free_start(scene, rng)
-    except InputError as error:
-        raise InputError(
-            error.problem, file=path, field=error.field, expected=error.expected, got=error.got
-        ) from None
-
-
 def _round_interval(low: float, high: float) -> list[float]:
     return [round(float(low), 3), round(float(high), 3)]
 
@@ -227,12 +217,8 @@ def _resolve_robot(robot: str | Path) -> str:
 
 def _write_scene(file: Path, source: Path, document: Mapping[str, Any]) -> None:
     head = format_comment(f"Made of {source.name} {get_origin_marker(_COMMAND)}.")
-    write_atomically(
-        file,
-        (
-            head + yaml.safe_dump(document, sort_keys=False, width=130, default_flow_style=None)
-        ).encode(),
-    )
+    body = yaml.safe_dump(document, sort_keys=False, width=130, default_flow_style=None)
+    write_atomically(file, (head + body).encode())
 
 
 def _note_floor_shapes(home: Home) -> list[str]:
@@ -248,12 +234,8 @@ def _count_shapes(home: Home) -> dict[str, int]:
         len(link.solid) for thing in home.objects for link in thing.description.links.values()
     )
     obstacles = sum(len(link.solid) for link in (*home.building, *home.furniture))
-    return {
-        "file": home.shapes,
-        "obstacles": obstacles,
-        "objects": objects,
-        "floor": len(home.floor),
-    }
+    shapes = {"file": home.shapes, "obstacles": obstacles, "objects": objects}
+    return {**shapes, "floor": len(home.floor)}
 
 
 _BASE = 1  # joint number of a robot's base
@@ -264,7 +246,9 @@ _TRIES = 4000  # sampled poses
 _CHOICE = 12  # free poses of which the one with the largest clearance is chosen
 
 
-def find_free_start(scene: Scene, rng: np.random.Generator) -> tuple[Scene, int]:
+def find_free_start(
+    scene: Scene, rng: np.random.Generator, file: Path | None = None
+) -> tuple[Scene, int]:
     """Return the scene with a free start pose, and the number of objects that it reaches.
 
     The start is on the connected floor from which most objects can be reached. All joints count as
@@ -302,18 +286,20 @@ def find_free_start(scene: Scene, rng: np.random.Generator) -> tuple[Scene, int]
             scene.with_start(base=_sample_pose(places, rng, low, high))
             for _ in range(_TRIES // len(order) + 1)
         )
-        found = list(
-            itertools.islice(
-                ((s, c) for s in draws if (c := s.start_clearance(reach=1.0)) >= START_CLEARANCE),
-                _CHOICE,
-            )
+        free_draws = (
+            (s, c) for s in draws if (c := s.start_clearance(reach=1.0)) >= START_CLEARANCE
         )
+        found = list(itertools.islice(free_draws, _CHOICE))
         if found:
             return max(found, key=lambda entry: entry[1])[0], int(reached[region])
     problem = f"no start pose of {robot.name} has a clearance of {START_CLEARANCE} m"
     expected = "a home with free floor for the robot, at the height `floor`"
     raise InputError(
-        problem, field="robot, floor", expected=expected, got=f"none in {_TRIES} tries"
+        problem,
+        file=file,
+        field="robot, floor",
+        expected=expected,
+        got=f"none in {_TRIES} tries",
     )
 
 

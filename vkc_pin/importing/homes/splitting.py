@@ -87,12 +87,8 @@ def split_home(description: Description) -> Home:
         - fixed
     ):
         fixed |= added
-    building, furniture, floor, objects = (
-        list[Link](),
-        list[Link](),
-        list[str](),
-        list[HomeObject](),
-    )
+    building, furniture = list[Link](), list[Link]()
+    floor, objects = list[str](), list[HomeObject]()
     for name in (name for name in description.links if name in fixed):
         link = description.links[name].transform(places[name])
         children = [
@@ -102,14 +98,9 @@ def split_home(description: Description) -> Home:
         ]
         large = name == description.root or _measure_length(link) > _BUILDING
         if children and not large:
-            links_of_object = {name}.union(
-                *(_collect_attached_links(description, child) for child in children)
-            )
-            objects.append(
-                _place_object(
-                    name, _extract_links(description, name, links_of_object), places[name]
-                )
-            )
+            attached = (_collect_attached_links(description, child) for child in children)
+            part = _extract_links(description, name, {name}.union(*attached))
+            objects.append(_place_object(name, part, places[name]))
             continue
         for child in children:
             part = _add_empty_base(description, child)
@@ -129,19 +120,10 @@ def split_home(description: Description) -> Home:
         fixed_joints = dict(part.joints)
         for child, joint in part.joints.items():
             if joint.kind in _MOVING:
-                placement = joint.placement * joint.compute_motion(values.get(joint.name, 0.0))
-                fixed_joints[child] = dataclasses.replace(
-                    joint, kind="fixed", placement=placement, limits=None
-                )
+                fixed_joints[child] = _fix_joint(joint, values.get(joint.name, 0.0))
                 notes.append(f"joint '{joint.name}' belongs to the free object '{name}': fixed")
-        objects.append(
-            _place_object(
-                name,
-                dataclasses.replace(part, joints=fixed_joints),
-                current_placements[name],
-                free=True,
-            )
-        )
+        rigid = dataclasses.replace(part, joints=fixed_joints)
+        objects.append(_place_object(name, rigid, current_placements[name], free=True))
     shapes = sum(len(link.solid) for link in description.links.values())
     return Home(
         tuple(building), tuple(furniture), tuple(floor), tuple(objects), shapes, tuple(notes)
@@ -160,13 +142,15 @@ def _fix_immovable_joints(description: Description) -> Description:
         ):
             reason = "has a single value" if is_single_valued else "moves no shape"
             notes.append(f"joint '{joint.name}' {reason}: fixed")
-            placement = joint.placement * joint.compute_motion(
-                joint.limits[0] if is_single_valued and joint.limits else 0.0
-            )
-            joints[child] = dataclasses.replace(
-                joint, kind="fixed", placement=placement, limits=None
-            )
+            value = joint.limits[0] if is_single_valued and joint.limits else 0.0
+            joints[child] = _fix_joint(joint, value)
     return dataclasses.replace(description, joints=joints, notes=tuple(notes))
+
+
+def _fix_joint(joint: Joint, value: float) -> Joint:
+    """Return a joint fixed at a position."""
+    placement = joint.placement * joint.compute_motion(value)
+    return dataclasses.replace(joint, kind="fixed", placement=placement, limits=None)
 
 
 def _collect_attached_links(description: Description, link: str) -> set[str]:
@@ -193,10 +177,8 @@ def _extract_links(
 
 def _add_empty_base(description: Description, child: str) -> Description:
     """Return the subtree of a joint, including the joint, on a base link without shapes."""
-    part, base = (
-        _extract_links(description, child, _collect_attached_links(description, child)),
-        f"{child}_base",
-    )
+    part = _extract_links(description, child, _collect_attached_links(description, child))
+    base = f"{child}_base"
     while base in description.links:
         base += "_"
     joint: Joint = dataclasses.replace(description.joints[child], parent=base)

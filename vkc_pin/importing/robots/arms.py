@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pinocchio as pin
@@ -236,8 +236,7 @@ def find_arms(
     arms.sort(key=lambda arm: -arm.score)
     names = [arm.name for arm in arms]
     return [
-        arm if names.count(arm.name) == 1 else Arm(arm.palm.links[0], *_get_other_fields(arm))
-        for arm in arms
+        arm if names.count(arm.name) == 1 else replace(arm, name=arm.palm.links[0]) for arm in arms
     ]
 
 
@@ -312,10 +311,6 @@ def find_telescopes(full: pin.Model, joints: Sequence[str]) -> list[tuple[str, .
 def _get_last_joints(joints: Sequence[str]) -> set[str]:
     """Return the joints that identify an arm."""
     return set(joints[-4:])
-
-
-def _get_other_fields(arm: Arm) -> tuple[tuple[str, ...], Body, tuple[Body, ...], str, str, float]:
-    return arm.joints, arm.palm, arm.fingers, arm.sure, arm.why, arm.score
 
 
 def _is_palm(body: Body) -> bool:

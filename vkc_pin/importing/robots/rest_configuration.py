@@ -143,8 +143,7 @@ def find_home(robot: Robot, named: Iterable[tuple[str, Floats]], *, seed: int = 
             return Home(positions, clearance, how)
         if best is None or clearance > best.clearance:
             best = Home(positions, clearance, how)
-    rng = np.random.default_rng(seed)
-    low, high = np.maximum(robot.lower[3:], -np.pi), np.minimum(robot.upper[3:], np.pi)
+    rng, (low, high) = np.random.default_rng(seed), _get_bounds(robot)
     middle, span = 0.5 * (low + high), np.maximum(high - low, 1e-9)
     frame, data = robot.model.getFrameId(robot.tool_frame), robot.model.createData()
 
@@ -156,9 +155,8 @@ def find_home(robot: Robot, named: Iterable[tuple[str, Floats]], *, seed: int = 
             robot.model, data, robot.coordinates.q(np.concatenate([np.zeros(3), arm]))
         )
         out = float(np.hypot(*data.oMf[frame].translation[:2]))
-        return 100.0 * max(0.0, HOME_ROOM - clearance) + float(
-            (((arm - middle) / span) ** 2).mean()
-        ) + 0.3 * out, clearance
+        offset = float((((arm - middle) / span) ** 2).mean())
+        return 100.0 * max(0.0, HOME_ROOM - clearance) + offset + 0.3 * out, clearance
 
     trials = [middle, *rng.uniform(low, high, (_SAMPLES, len(low)))]
     value, clearance, chosen = min(
@@ -193,7 +191,7 @@ def find_inseparable_pairs(
         The pairs with their largest distance [m].
     """
     clearances, rng = Clearances(robot), np.random.default_rng(seed)
-    low, high = np.maximum(robot.lower[3:], -np.pi), np.minimum(robot.upper[3:], np.pi)
+    low, high = _get_bounds(robot)
     pairs = clearances.by_links()
     furthest, separated = dict.fromkeys(pairs.links, -np.inf), dict.fromkeys(pairs.links, 0)
     for arm in (robot.home, *rng.uniform(low, high, (samples, len(low)))):
@@ -210,6 +208,11 @@ def find_inseparable_pairs(
     return {links: furthest[links] for links in pairs.links}
 
 
+def _get_bounds(robot: Robot) -> tuple[Floats, Floats]:
+    """Return the arm's position limits within ±π, shape (n − 3,) each."""
+    return np.maximum(robot.lower[3:], -np.pi), np.minimum(robot.upper[3:], np.pi)
+
+
 def measure_floor_heights(
     robot: Robot, *, samples: int = 200, seed: int = 0
 ) -> tuple[float, float]:
@@ -221,7 +224,7 @@ def measure_floor_heights(
     clearances, rng = Clearances(robot), np.random.default_rng(seed)
     clearances.place(robot.home)
     base_heights = [height for link, height in clearances.floor(moved=False)]
-    low, high = np.maximum(robot.lower[3:], -np.pi), np.minimum(robot.upper[3:], np.pi)
+    low, high = _get_bounds(robot)
     best: dict[str, float] = {}
     for arm in rng.uniform(low, high, (samples, len(low))):
         clearances.place(arm)

@@ -68,12 +68,8 @@ def read_source(
     states: dict[str, dict[str, float]] = {}
     if root.tag == "mujoco":
         converted = convert_mjcf(file, scratch)
-        kind, notes, states, text = (
-            "MJCF",
-            converted.notes,
-            converted.states,
-            _format_xml(converted.root),
-        )
+        kind, notes, states = "MJCF", converted.notes, converted.states
+        text = _format_xml(converted.root)
     elif root.tag != "robot":
         expected = "<robot> (URDF or xacro) or <mujoco> (MJCF)"
         raise InputError(
@@ -95,30 +91,23 @@ def read_source(
     srdf_path = srdf if srdf is not None else _find_srdf(file)
     if srdf_path is None:
         return Source(read, kind, Srdf({}, states), {}, tuple(notes))
-    semantics = (
-        read_srdf(srdf_path, links=read.links)
-        if srdf is not None
-        else _read_matching_srdf(srdf_path, read)
-    )
-    if semantics is None:
+    try:
+        semantics = read_srdf(srdf_path, links=read.links)
+    except InputError:
+        if srdf is not None:
+            raise
         notes.append(f"ignored {srdf_path.name} beside it, which names links of another robot")
         return Source(read, kind, Srdf({}, states), {}, tuple(notes))
-    return Source(
-        read,
-        kind,
-        Srdf(semantics.allowed, {**states, **semantics.states}),
-        _read_group_joints(srdf_path, read),
-        tuple(notes),
-    )
+    groups = {name: group.joints for name, group in read_groups(srdf_path, read.root).items()}
+    merged = Srdf(semantics.allowed, {**states, **semantics.states})
+    return Source(read, kind, merged, groups, tuple(notes))
 
 
 def choose_free_name(name: str, taken: set[str]) -> str:
     """Return a name such that neither it nor `<name>_joint` is taken."""
-    return (
-        name
-        if name not in taken and f"{name}_joint" not in taken
-        else choose_free_name(f"{name}_", taken)
-    )
+    while taken & {name, f"{name}_joint"}:
+        name += "_"
+    return name
 
 
 def _complete_limits(root: ElementTree.Element) -> list[str]:
@@ -151,17 +140,6 @@ def _find_srdf(file: Path) -> Path | None:
         for folder in (file.parent, file.parent.parent / "srdf")
     ]
     return next((place for place in places if place.is_file()), None)
-
-
-def _read_matching_srdf(path: Path, file: UrdfFile) -> Srdf | None:
-    try:
-        return read_srdf(path, links=file.links)
-    except InputError:
-        return None
-
-
-def _read_group_joints(path: Path, file: UrdfFile) -> dict[str, tuple[str, ...]]:
-    return {name: group.joints for name, group in read_groups(path, file.root).items()}
 
 
 def expand_xacro(file: Path, packages: Mapping[str, Path], arguments: Mapping[str, str]) -> str:

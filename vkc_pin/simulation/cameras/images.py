@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from vkc_pin.simulation.cameras.mount import Camera
 from vkc_pin.simulation.model import Builder, to_mujoco_quaternion
 from vkc_pin.simulation.replay import Execution
-from vkc_pin.simulation.snapshots import RenderedScene, open_gl_context
+from vkc_pin.simulation.snapshots import RenderedScene
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
 
@@ -102,47 +102,27 @@ def _render(
 ) -> Any:
     """Yield the images of every camera at every time."""
     mj, model = scene.mj, scene.model
-    data, option, view = mj.MjData(model), mj.MjvOption(), mj.MjvCamera()
+    view = mj.MjvCamera()
     near, far = (
         float(limit * model.stat.extent) for limit in (model.vis.map.znear, model.vis.map.zfar)
     )
     view.type = mj.mjtCamera.mjCAMERA_FIXED
-    with open_gl_context(size):
-        gl_scene, gl_context = (
-            mj.MjvScene(model, maxgeom=20_000),
-            mj.MjrContext(model, mj.mjtFontScale.mjFONTSCALE_100),
-        )
-        mj.mjr_setBuffer(mj.mjtFramebuffer.mjFB_OFFSCREEN, gl_context)
-        for row in scene.sample(times):
-            data.qpos[:] = scene.to_qpos(row)
-            mj.mj_forward(model, data)
-            for camera in cameras:
-                view.fixedcamid = model.camera(camera.name).id
-                mj.mjv_updateScene(
-                    model, data, option, mj.MjvPerturb(), view, mj.mjtCatBit.mjCAT_ALL, gl_scene
-                )
-                window, shape = (
-                    mj.MjrRect(0, 0, camera.width, camera.height),
-                    (camera.height, camera.width),
-                )
-                colours, codes = np.zeros((2, *shape, 3), np.uint8)
-                depth = np.zeros(shape, np.float32)
-                mj.mjr_render(window, gl_scene, gl_context)
-                mj.mjr_readPixels(colours, depth, window, gl_context)
-                flags = [int(mj.mjtRndFlag.mjRND_SEGMENT), int(mj.mjtRndFlag.mjRND_IDCOLOR)]
-                gl_scene.flags[flags] = 1
-                mj.mjr_render(window, gl_scene, gl_context)
-                mj.mjr_readPixels(codes, None, window, gl_context)
-                gl_scene.flags[flags] = 0
-                yield (
-                    camera.name,
-                    (
-                        colours[::-1],
-                        _to_millimetres(depth, near, far)[::-1],
-                        _decode_geoms(gl_scene, codes)[::-1],
-                    ),
-                )
-        gl_context.free()
+    flags = [int(mj.mjtRndFlag.mjRND_SEGMENT), int(mj.mjtRndFlag.mjRND_IDCOLOR)]
+    for data, gl_scene, gl_context in scene.iterate_states(times, size):
+        for camera in cameras:
+            view.fixedcamid = model.camera(camera.name).id
+            scene.update_view(data, gl_scene, view)
+            window = mj.MjrRect(0, 0, camera.width, camera.height)
+            colours, codes = np.zeros((2, camera.height, camera.width, 3), np.uint8)
+            depth = np.zeros(colours.shape[:2], np.float32)
+            mj.mjr_render(window, gl_scene, gl_context)
+            mj.mjr_readPixels(colours, depth, window, gl_context)
+            gl_scene.flags[flags] = 1
+            mj.mjr_render(window, gl_scene, gl_context)
+            mj.mjr_readPixels(codes, None, window, gl_context)
+            gl_scene.flags[flags] = 0
+            distances, geoms = _to_millimetres(depth, near, far), _decode_geoms(gl_scene, codes)
+            yield camera.name, (colours[::-1], distances[::-1], geoms[::-1])
 
 
 def _to_millimetres(depth: Any, near: float, far: float) -> NDArray[np.generic]:

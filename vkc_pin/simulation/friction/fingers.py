@@ -81,15 +81,11 @@ class Fingers:
             body.mass, body.inertia, body.explicitinertial = _MASS, np.full(3, 1e-4), True
             joint = body.add_joint(name=name, type=kinds.mjJNT_SLIDE, axis=[-sign, 0.0, 0.0])
             servo.configure_joint(joint, builder.mj)
-            joint.limited, joint.range = (
-                builder.mj.mjtLimited.mjLIMITED_TRUE,
-                [0.0, self.sides.travel],
-            )
+            limited = builder.mj.mjtLimited.mjLIMITED_TRUE
+            joint.limited, joint.range = limited, [0.0, self.sides.travel]
             for number in shapes:
-                builder.moved_shapes[number] = (
-                    body,
-                    tool.actInv(builder.world.shapes[number].placement),
-                )
+                place = tool.actInv(builder.world.shapes[number].placement)
+                builder.moved_shapes[number] = body, place
 
     def add_drives(self, builder: Builder) -> None:
         """Add the motors of sliding sides and the coupling of all fingers."""
@@ -145,12 +141,8 @@ def limit_finger_servos(
                 raise InputError(
                     problem, field="grasp", expected='an effort limit, or grasp="weld"', got=name
                 )
-            moved, bandwidth, ratio = (
-                servo.inertia - servo.armature,
-                physics.arm_bandwidth,
-                physics.damping_ratio,
-            )
-            servo = make_servo(name, moved, limit, units[name], bandwidth, ratio)
+            moved, ratio = servo.inertia - servo.armature, physics.damping_ratio
+            servo = make_servo(name, moved, limit, units[name], physics.arm_bandwidth, ratio)
         limited.append(servo)
     return tuple(limited)
 
@@ -168,15 +160,11 @@ def _find_sides(world: World) -> Sides:
     for number, shape in hand:
         place = back * shape.placement
         x = _project_on_x(place, shape)
-        if (x.min() > 0.0 or x.max() < 0.0) and not check_bar_fits(
-            2.0 * _REACH, [(shape.geometry, place)]
-        ):
+        beside = x.min() > 0.0 or x.max() < 0.0
+        if beside and not check_bar_fits(2.0 * _REACH, [(shape.geometry, place)]):
             sides[0 if x.min() > 0.0 else 1].append(number)
-    travel = (
-        find_widest_bar([(shape.geometry, back * shape.placement) for _, shape in hand]) / 2.0
-        if all(sides)
-        else 0.0
-    )
+    placed = [(shape.geometry, back * shape.placement) for _, shape in hand]
+    travel = find_widest_bar(placed) / 2.0 if all(sides) else 0.0
     if not (all(sides) and 0.0 < travel < _REACH):
         expected = (
             "a robot.yaml with a `gripper`, "

@@ -46,7 +46,7 @@ class _Squeeze:
     """One grasp by friction.
 
     Attributes:
-        hold, begin, end: The hold with its begin and end [s].
+        begin, end: Begin and end of the hold [s].
         hand, link: Masks of the geoms of hand and grasped link, shape (geoms,).
         pairs: Pairs of their labels, which may touch.
         grip: Measurements so far.
@@ -55,7 +55,6 @@ class _Squeeze:
         missing: Number of consecutive samples without contact.
     """
 
-    hold: Hold
     begin: float
     end: float
     hand: Bools
@@ -88,12 +87,8 @@ class Squeezes:
         physics: Physics,
         period: float,
     ) -> None:
-        self._physical, self._fingers, self._physics, self._period = (
-            physical,
-            fingers,
-            physics,
-            period,
-        )
+        self._physical, self._fingers = physical, fingers
+        self._physics, self._period = physics, period
         self._engine = import_mujoco()
         first, last = float(trajectory.times[0]), float(trajectory.times[-1])
         world, scene = physical.world, physical.world.scene
@@ -103,13 +98,9 @@ class Squeezes:
         for hold, begin, end in spans:
             hands, link = frozenset(find_touch_links(scene, hold)), find_grasped_link(scene, hold)
             pairs = frozenset((min(hand, link), max(hand, link)) for hand in hands)
-            own, grip = (
-                np.isin(labels, list(hands)),
-                Grip(str(hold), max(begin, first), min(end, last)),
-            )
-            self._squeezes.append(
-                _Squeeze(hold, begin, end, own, np.asarray(labels == link), pairs, grip)
-            )
+            own, held = np.isin(labels, list(hands)), np.asarray(labels == link)
+            grip = Grip(str(hold), max(begin, first), min(end, last))
+            self._squeezes.append(_Squeeze(begin, end, own, held, pairs, grip))
         tree = world.model
         self._tool = tree.frames[tree.getFrameId(scene.robot.tool_frame)]
 
@@ -128,12 +119,8 @@ class Squeezes:
         shares, time = np.zeros(len(times)), self._physics.grip_time
         for squeeze in self._squeezes:
             begin = max(squeeze.begin, float(times[0]))
-            corners = [
-                begin,
-                begin + time,
-                max(squeeze.end, begin + time),
-                max(squeeze.end, begin + time) + time,
-            ]
+            end = max(squeeze.end, begin + time)
+            corners = [begin, begin + time, end, end + time]
             shares = np.maximum(shares, np.interp(times, corners, [0.0, 1.0, 1.0, 0.0]))
         fingers = self._fingers
         closed = fingers.closed + _OVERTRAVEL * (fingers.closed - fingers.open)
@@ -162,10 +149,8 @@ class Squeezes:
             squeeze.forces.append(np.zeros(6) if pull is None else pull)
             mean = np.mean(squeeze.forces, axis=0)
             grip = squeeze.grip
-            force, torque = (
-                max(grip.force, float(np.linalg.norm(mean[:3]))),
-                max(grip.torque, float(np.linalg.norm(mean[3:]))),
-            )
+            force = max(grip.force, float(np.linalg.norm(mean[:3])))
+            torque = max(grip.torque, float(np.linalg.norm(mean[3:])))
             slip = max(grip.slip, float(np.linalg.norm(place - squeeze.place)))
             lost_time = clock if squeeze.missing * self._period >= _LOST_TIME else None
             squeeze.grip = replace(grip, force=force, torque=torque, slip=slip, broken=lost_time)

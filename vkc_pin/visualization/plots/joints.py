@@ -17,16 +17,17 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-__all__ = ["QUANTITIES", "SAMPLES", "Quantity", "draw_joints", "groups_of", "name_phases"]
+__all__ = ["DASHES", "SAMPLES", "draw_joints", "groups_of", "name_phases"]
 
 SAMPLES = 240
 """Number of times at which a motion is drawn, besides its waypoints and knots."""
 _BEFORE = 1e-9  # offset before a knot, where accelerations jump [s]
-_DASHES: Any = {"linestyle": (0, (5, 3)), "linewidth": 0.9}
+DASHES: Any = {"linestyle": (0, (5, 3)), "linewidth": 0.9}
+"""Style of limits."""
 
 
 @dataclass(frozen=True)
-class Quantity:
+class _Quantity:
     """A quantity that is drawn over time, in its own column.
 
     Attributes:
@@ -69,22 +70,22 @@ def _accelerations(plan: CheckedMotion, times: Floats) -> tuple[Floats, Floats]:
     )
 
 
-QUANTITIES: tuple[Quantity, ...] = (
-    Quantity(
+_QUANTITIES: tuple[_Quantity, ...] = (
+    _Quantity(
         "position",
         {"m": "m", "rad": "rad"},
         lambda plan, times: (times, plan.trajectory.at(times)),
         lambda plan, name: float("inf"),
         lambda motion: {},
     ),
-    Quantity(
+    _Quantity(
         "velocity",
         {"m": "m/s", "rad": "rad/s"},
         lambda plan, times: (times, plan.trajectory.velocity(times)),
         _limit("velocity"),
         lambda motion: {"drawstyle": "default" if motion.curve is not None else "steps-post"},
     ),
-    Quantity(
+    _Quantity(
         "acceleration",
         {"m": "m/s²", "rad": "rad/s²"},
         _accelerations,
@@ -92,10 +93,9 @@ QUANTITIES: tuple[Quantity, ...] = (
         lambda motion: {} if motion.curve is not None else {"marker": ".", "linestyle": "none"},
     ),
 )
-"""Drawn quantities, from left to right."""
 
 
-def _jerk() -> Quantity:
+def _jerk() -> _Quantity:
     """Return the jerk, constant on each cubic of a curve; it is drawn where jerks are limited."""
 
     def values(plan: CheckedMotion, times: Floats) -> tuple[Floats, Floats]:
@@ -110,7 +110,7 @@ def _jerk() -> Quantity:
     def limit(plan: CheckedMotion, name: str) -> float:
         return _limit("acceleration")(plan, name) / plan.options.jerk_time
 
-    return Quantity(
+    return _Quantity(
         "jerk",
         {"m": "m/s³", "rad": "rad/s³"},
         values,
@@ -134,7 +134,7 @@ def draw_joints(figure: FigureBase, plan: CheckedMotion) -> None:
     """Draw all quantities, with one row each for base, arm and objects."""
     groups, motion = groups_of(plan.trajectory), plan.trajectory
     eased = motion.curve is not None and plan.options.jerk_time > 0.0
-    drawn = (*QUANTITIES, _jerk()) if eased else QUANTITIES
+    drawn = (*_QUANTITIES, _jerk()) if eased else _QUANTITIES
     axes: Any = figure.subplots(len(groups), len(drawn), sharex=True, squeeze=False)
     parts = [np.linspace(motion.times[0], motion.times[-1], SAMPLES), motion.times]
     if motion.curve is not None:
@@ -170,7 +170,7 @@ def draw_joints(figure: FigureBase, plan: CheckedMotion) -> None:
 def _draw(
     place: Axes,
     plan: CheckedMotion,
-    quantity: Quantity,
+    quantity: _Quantity,
     group: str,
     columns: list[int],
     moments: Floats,
@@ -191,9 +191,9 @@ def _draw(
         same = [k for k, other in enumerate(limits) if other == limit]
         colour = COLOURS[same[0] % len(COLOURS)] if len(same) == 1 else "0.35"
         for sign in (-1.0, 1.0):
-            place.axhline(sign * limit, color=colour, **_DASHES)
+            place.axhline(sign * limit, color=colour, **DASHES)
     if any(map(np.isfinite, limits)):
-        place.plot([], [], color="0.35", label="limit", **_DASHES)
+        place.plot([], [], color="0.35", label="limit", **DASHES)
     own = {"base": ("m", "rad"), "arm": ("rad",), "object": ("rad", "m")}[group]
     place.set_ylabel(f"{group} {quantity.name} [{', '.join(quantity.units[unit] for unit in own)}]")
 

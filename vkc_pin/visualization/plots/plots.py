@@ -13,7 +13,7 @@ import numpy as np
 from vkc_pin.errors import InputError
 from vkc_pin.validation.report import CheckedMotion
 from vkc_pin.visualization.plots.clearance import compute_clearance_curves
-from vkc_pin.visualization.plots.joints import SAMPLES, draw_joints, groups_of, name_phases
+from vkc_pin.visualization.plots.joints import DASHES, SAMPLES, draw_joints, groups_of, name_phases
 from vkc_pin.visualization.plots.style import (
     COLOURS,
     new_figure,
@@ -134,25 +134,12 @@ def _draw_clearance(figure: FigureBase, plan: CheckedMotion) -> None:
         touching = "grasps" in curve.name
         colour = "0.6" if touching else COLOURS[k % len(COLOURS)]
         label = f"{curve.name}: {1e3 * distance:.0f} mm, {pair}, {when:.1f} s"
-        style = ":" if touching else "-"
-        axes.plot(
-            curve.times,
-            1e3 * curve.distances,
-            color=colour,
-            linestyle=style,
-            linewidth=1.5,
-            label=label,
-        )
+        style: Any = {"linestyle": ":" if touching else "-", "linewidth": 1.5, "label": label}
+        axes.plot(curve.times, 1e3 * curve.distances, color=colour, **style)
         if distance < _SHOWN:
             axes.plot([when], [1e3 * distance], "o", color=colour, markersize=4.5)
         lowest = min(lowest, distance)
-    axes.axhline(
-        1e3 * safe,
-        color="0.35",
-        linestyle=(0, (5, 3)),
-        linewidth=0.9,
-        label=f"required: {1e3 * safe:.0f} mm",
-    )
+    axes.axhline(1e3 * safe, color="0.35", **DASHES, label=f"required: {1e3 * safe:.0f} mm")
     if lowest < 0.0:
         axes.axhspan(1e3 * lowest * 1.1, 0.0, color="#d1495b", alpha=0.12, linewidth=0.0)
     axes.set_ylim(1e3 * lowest * 1.1, 1e3 * _SHOWN)

@@ -90,13 +90,8 @@ def plot_scene(
         for name, at, direction, base in approaches:
             (x, y), (u, v) = at[:2].tolist(), (at[:2] - _ARROW * direction[:2]).tolist()
             colour = red if base is None else blue
-            axes.annotate(
-                "",
-                (x, y),
-                (u, v),
-                arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 1.8},
-                zorder=7,
-            )
+            arrow = {"arrowstyle": "->", "color": colour, "linewidth": 1.8}
+            axes.annotate("", (x, y), (u, v), arrowprops=arrow, zorder=7)
             owner, _, own = name.partition(".")
             beside = (
                 k

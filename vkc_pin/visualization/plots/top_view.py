@@ -90,13 +90,8 @@ def _draw_motion(axes: Axes, world: World, trajectory: Trajectory | None) -> Non
             tail, nose = (
                 motion.world[k, 1] @ np.array([[0.0, 0.0, 0.0, 1.0], [0.45, 0.0, 0.0, 1.0]]).T
             )[:2].T
-            axes.annotate(
-                "",
-                nose,
-                tail,
-                arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 1.6},
-                zorder=4,
-            )
+            arrow = {"arrowstyle": "->", "color": colour, "linewidth": 1.6}
+            axes.annotate("", nose, tail, arrowprops=arrow, zorder=4)
         for i in moving:
             joint = world.shapes[i].parentJoint
             if not ends and np.allclose(
@@ -112,25 +107,13 @@ def _draw_motion(axes: Axes, world: World, trajectory: Trajectory | None) -> Non
     fine = sample_motion(
         world, trajectory, np.linspace(trajectory.times[0], trajectory.times[-1], 400)
     )
-    axes.plot(
-        fine.base[:, 0],
-        fine.base[:, 1],
-        color=_BASE,
-        linewidth=1.6,
-        zorder=4,
-        label="path of the base",
-    )
-    axes.plot(
-        fine.tool[:, 0],
-        fine.tool[:, 1],
-        color=_TOOL,
-        linewidth=1.6,
-        zorder=4,
-        label="path of the tool",
-    )
-    for path, name in ((fine.base, _BASE), (fine.tool, _TOOL)):
-        axes.plot(*path[0, :2], "o", color=name, markersize=4.5, zorder=5)
-        axes.plot(*path[-1, :2], "s", color=name, markersize=4.5, zorder=5)
+    paths = (("base", fine.base, _BASE), ("tool", fine.tool, _TOOL))
+    for name, path, colour in paths:
+        label = f"path of the {name}"
+        axes.plot(*path[:, :2].T, color=colour, linewidth=1.6, zorder=4, label=label)
+    for _, path, colour in paths:
+        axes.plot(*path[0, :2], "o", color=colour, markersize=4.5, zorder=5)
+        axes.plot(*path[-1, :2], "s", color=colour, markersize=4.5, zorder=5)
 
 
 def _moments(trajectory: Trajectory) -> Floats:

@@ -191,7 +191,7 @@ def test_notebook_runs_and_its_cells_show_what_they_should(name: str, tmp_path: 
     if name == "01_first_plan":
         plan = vkc.Plan.load(tmp_path / "door.npz")
         steps = [vkc.Actuate("door", {"hinge": 1.2})]
-        assert vkc.validate(vkc.load_scene("door"), steps, plan.trajectory, vkc.Options()).ok
+        assert vkc.validate(vkc.load_scene("door"), steps, plan.trajectory).ok
         assert plan.trajectory.column("door.hinge")[-1] == pytest.approx(1.2, abs=1e-3)
 
 

@@ -1,4 +1,4 @@
-"""Paths of bases on wheels keep to what wheels do."""
+"""Tests that arcs and curves roll without slip."""
 
 from __future__ import annotations
 
@@ -116,27 +116,28 @@ def test_twist_between_two_poses_is_constant(
     )
 
 
-def test_a_path_stops_at_its_corners() -> None:
-    corners = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.557, 1.0], [1.0, 1.557, 0.2]])
-    path = sample_path(corners, 20, turning=TURNING)
-    for corner in corners[1:]:
+CORNERS = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.557, 1.0], [1.0, 1.557, 0.2]])
+
+
+def test_sampled_paths_stop_at_corners() -> None:
+    path = sample_path(CORNERS, 20, turning=TURNING)
+    for corner in CORNERS[1:]:
         assert np.abs(path - corner).max(axis=1).min() < 1e-9
     lengths = np.abs(np.diff(path, axis=0)).sum(axis=1)
     assert lengths[-1] < lengths.max() / 2
 
 
-def test_fewer_steps_than_corners_still_reach_the_end() -> None:
-    corners = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.557, 1.0], [1.0, 1.557, 0.2]])
-    path = sample_path(corners, 2, turning=TURNING)
+def test_paths_reach_the_end_with_fewer_steps_than_corners() -> None:
+    path = sample_path(CORNERS, 2, turning=TURNING)
     assert path.shape == (2, 3)
-    np.testing.assert_allclose(path[-1], corners[-1], atol=1e-12)
+    np.testing.assert_allclose(path[-1], CORNERS[-1], atol=1e-12)
     np.testing.assert_array_equal(
-        sample_path(corners[:1], 3, turning=TURNING), np.tile(corners[:1], (3, 1))
+        sample_path(CORNERS[:1], 3, turning=TURNING), np.tile(CORNERS[:1], (3, 1))
     )
 
 
-def test_a_car_follows_a_path_with_turns_in_place() -> None:
-    """The path avoids a wall; without the wall it is the shortest curve."""
+def test_car_curves_replace_turns_in_place() -> None:
+    """The path avoids a wall; without it, it is the shortest curve."""
     path = np.array(
         [
             [0.0, 0.0, 1.5],
@@ -164,6 +165,4 @@ def test_a_car_follows_a_path_with_turns_in_place() -> None:
     np.testing.assert_allclose(
         curves.fit(path, lambda _: True), curves.compute_corners(path[0], path[-1]), atol=1e-9
     )
-    assert equal(curves.fit(path, lambda _: False)[-1], path[-1]), (
-        "what nothing leads through is the solver's to push apart"
-    )
+    assert equal(curves.fit(path, lambda _: False)[-1], path[-1])

@@ -1,3 +1,5 @@
+"""Compares clearance checks of a moving base with coal."""
+
 from __future__ import annotations
 
 import coal
@@ -40,62 +42,21 @@ def scene(seed: int) -> tuple[list[Shape], list[Shape], MovingShapes]:
     return shapes, standing, MovingShapes(shapes, Obstacles(standing), MARGIN)
 
 
-@settings(max_examples=30, deadline=None)
-@given(SEEDS)
-def test_drives_agree_with_coal(seed: int) -> None:
-    shapes, standing, body = scene(seed)
-    rng = np.random.default_rng(seed + 1)
-    a, yaw = rng.uniform(-2.0, 2.0, 2), rng.uniform(-4.0, 4.0)
-    b = a + rng.uniform(0.0, 1.0) * rng.uniform(-1.0, 1.0, 2)
-    nearest = min(
-        distance(shapes, standing, pose) for pose in between([*a, yaw], [*b, yaw], length=0.004)
-    )
-    if body.is_drive_free(a, b, yaw):
-        assert nearest >= MARGIN - BLINK
-    else:
-        assert nearest < MARGIN + 0.004
-
-
-@settings(max_examples=30, deadline=None)
-@given(SEEDS)
-def test_turns_agree_with_coal(seed: int) -> None:
-    shapes, standing, body = scene(seed)
-    rng = np.random.default_rng(seed + 1)
-    place, start = rng.uniform(-2.0, 2.0, 2), rng.uniform(-4.0, 4.0)
-    end = start + rng.uniform(-2.0, 2.0) * rng.uniform()
-    nearest = min(
-        distance(shapes, standing, pose)
-        for pose in between([*place, start], [*place, end], angle=0.004)
-    )
-    if body.is_turn_free(place, start, end):
-        assert nearest >= MARGIN - BLINK
-    else:
-        assert nearest < MARGIN + 0.004
-
-
-def test_random_cases_include_free_and_blocked() -> None:
-    """The two tests above need enough free and blocked cases."""
+def test_drives_and_turns_agree_with_coal() -> None:
     answers = []
-    for seed in range(60):
-        _, _, body = scene(seed)
-        rng = np.random.default_rng(seed)
-        a = rng.uniform(-2.0, 2.0, 2)
-        answers += [body.is_drive_free(a, a + 0.3, 0.5), body.is_turn_free(a, 0.0, 1.0)]
+    for seed in range(25):
+        shapes, standing, body = scene(seed)
+        rng = np.random.default_rng(seed + 1)
+        a, yaw = rng.uniform(-2.0, 2.0, 2), rng.uniform(-4.0, 4.0)
+        b, end = a + rng.uniform(-1.0, 1.0, 2), yaw + rng.uniform(-2.0, 2.0) * rng.uniform()
+        for is_free, poses in (
+            (body.is_drive_free(a, b, yaw), between([*a, yaw], [*b, yaw], length=0.004)),
+            (body.is_turn_free(a, yaw, end), between([*a, yaw], [*a, end], angle=0.004)),
+        ):
+            nearest = min(distance(shapes, standing, pose) for pose in poses)
+            assert nearest >= MARGIN - BLINK if is_free else nearest < MARGIN + 0.004
+            answers.append(is_free)
     assert 0.2 < np.mean(answers) < 0.8
-
-
-def test_drive_along_a_wall_needs_few_distance_queries(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
-    distance_of = MovingShapes._compute_distance
-    monkeypatch.setattr(
-        MovingShapes, "_compute_distance", lambda *args: asked.append(args) or distance_of(*args)
-    )
-    ball: list[Shape] = [(coal.Sphere(0.3), at(0.0, 0.0, 0.4))]
-    wall = [(coal.Box(10.0, 0.1, 1.0), at(0.0, 0.355 + MARGIN, 0.5, 0.003))]
-    body = MovingShapes(ball, Obstacles(wall), MARGIN)
-    assert body.is_drive_free(np.array([0.0, 0.0]), np.array([3.0, 0.0]), 0.0)
-    assert len(asked) < 30  # every two millimetres it would be 1500
-    assert not body.is_drive_free(np.array([0.0, 0.0]), np.array([-3.0, 0.0]), 0.0)
 
 
 def test_shapes_at_different_heights_form_no_pairs() -> None:
@@ -108,7 +69,7 @@ def test_shapes_at_different_heights_form_no_pairs() -> None:
     )
 
 
-def test_everything_is_free_without_obstacles() -> None:
+def test_all_motions_are_free_without_obstacles() -> None:
     for body in (
         MovingShapes([], Obstacles(clutter(0, 5)), MARGIN),
         MovingShapes(chassis(), Obstacles([]), MARGIN),
@@ -147,7 +108,7 @@ SHAPES = [
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: type(shape).__name__)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(seed=SEEDS)
 def test_hull_points_bound_shapes_from_inside_and_outside(
     shape: coal.CollisionGeometry, seed: int
@@ -164,7 +125,6 @@ def test_hull_points_bound_shapes_from_inside_and_outside(
     assert nothing == 0.0
     for u in DIRECTIONS[:: int(rng.integers(1, 8))]:
         normal = np.array([*u, 0.0])
-        # How far the shape reaches along u, from its distance to a half-space far away.
         wall = coal.Halfspace(-normal, -10.0)
         gap = coal.distance(
             shape, where, wall, coal.Transform3s(), coal.DistanceRequest(), coal.DistanceResult()

@@ -1,3 +1,5 @@
+"""Tests paths of bases that turn in place, checked with coal."""
+
 from __future__ import annotations
 
 import itertools
@@ -25,7 +27,6 @@ from vkc_pin.errors import InputError
 from vkc_pin.planning.base_paths.base_clearance import Shape
 from vkc_pin.planning.base_paths.base_path import BasePath, sample_poses, shortest_path
 from vkc_pin.planning.base_paths.grid import BaseGrid
-from vkc_pin.planning.base_paths.lattice_search import _Search
 from vkc_pin.planning.base_paths.motion_primitives import BACKWARDS, SIDEWAYS
 
 TURNING = 0.3  # [m/rad] where a grid is not told
@@ -61,12 +62,12 @@ def check(
     for a, b in itertools.pairwise(poses):
         way = b[:2] - a[:2]
         length = np.hypot(*way)
-        if length > 1e-9:  # a drive: straight ahead or back
-            assert abs(a[2] - b[2]) < 1e-9  # the path takes headings that are closer for one
+        if length > 1e-9:
+            assert abs(a[2] - b[2]) < 1e-9
             ahead = way @ (np.cos(a[2]), np.sin(a[2]))
             if abs(ahead) == pytest.approx(length, abs=1e-9):
                 cost += length * (1.0 if ahead > 0.0 else BACKWARDS)
-            else:  # it slides, next to the start or the goal
+            else:  # it slides beside start or goal
                 assert length <= 0.6
                 assert any(
                     np.array_equal(p[:2], place[:2]) for p in (a, b) for place in (start, goal)
@@ -94,7 +95,7 @@ def find(
     return shortest_path(grid, start, np.array(goals), **options)  # type: ignore[arg-type]
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=2, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 @example(280)  # a drive whose ends differ in heading by a rounding error
 @example(955485)  # a move from near the start to near a goal, which in between is near neither
@@ -113,27 +114,31 @@ def test_paths_are_collision_free(seed: int) -> None:
         check(plain, start, goals, chassis(), arm(), standing)
 
 
-def test_path_in_an_empty_hall_is_straight() -> None:
-    path = find([], [-3.0, -2.0, 0.3], [[3.1, 1.7, -0.4]])
+AHEAD = np.arctan2(3.7, 6.1)
+
+
+@pytest.mark.parametrize(
+    ("poses", "cost"),
+    [
+        (  # straight ahead
+            [[-3.0, -2.0, 0.3], [-3.0, -2.0, AHEAD], [3.1, 1.7, AHEAD], [3.1, 1.7, -0.4]],
+            np.hypot(6.1, 3.7) + TURNING * (2 * AHEAD + 0.1),
+        ),
+        ([[0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]], BACKWARDS),
+        ([[0.0, 0.0, 3.0], [0.0, 0.0, 2 * np.pi - 3.0]], TURNING * (2 * np.pi - 6.0)),
+        ([[0.0, 0.0, 3.0], [0.0, 0.0, 3.0]], 0.0),
+    ],
+)
+def test_shortest_paths_without_obstacles(poses: list[list[float]], cost: float) -> None:
+    path = find([], poses[0], [poses[-1]])
     assert path is not None
-    ahead = np.arctan2(3.7, 6.1)
-    np.testing.assert_allclose(
-        path.poses,
-        [[-3.0, -2.0, 0.3], [-3.0, -2.0, ahead], [3.1, 1.7, ahead], [3.1, 1.7, -0.4]],
-        atol=1e-9,
-    )
-    assert path.cost == pytest.approx(np.hypot(6.1, 3.7) + TURNING * (2 * ahead + 0.1))
+    np.testing.assert_allclose(path.poses, poses, atol=1e-9)
+    assert path.cost == pytest.approx(cost)
+    assert sample_poses(path, 3, turning=TURNING)[-1] == pytest.approx(poses[-1])
 
 
-def test_base_drives_backwards_where_that_is_cheaper() -> None:
-    path = find([], [0.0, 0.0, 0.0], [[-1.0, 0.0, 0.0]])
-    assert path is not None
-    assert path.cost == pytest.approx(BACKWARDS)
-    assert np.all(path.poses[:, 2] == 0.0)
-
-
-def test_base_drives_sideways_where_it_cannot_turn() -> None:
-    """Both poses are along a wall; in the open the base turns instead."""
+def test_base_drives_sideways_along_a_wall() -> None:
+    """In the open it turns instead."""
     walls: list[Shape] = [(coal.Box(3.0, 0.1, 1.0), at(x, 0.0, 0.5)) for x in (-2.0, 2.0)]
     y = 0.05 + 0.335 + 0.03
     start, goals = np.array([-2.0, y, 0.0]), np.array([[2.0, y, 0.0]])
@@ -145,28 +150,11 @@ def test_base_drives_sideways_where_it_cannot_turn() -> None:
     assert free.cost == pytest.approx(2.0 + TURNING * np.pi)
 
 
-def test_turning_in_place_and_staying() -> None:
-    turned, stayed = (
-        find([], [0.0, 0.0, 3.0], [[0.0, 0.0, -3.0]]),
-        find([], [0.0, 0.0, 3.0], [[0.0, 0.0, 3.0]]),
-    )
-    assert turned is not None
-    assert stayed is not None
-    np.testing.assert_allclose(turned.poses, [[0.0, 0.0, 3.0], [0.0, 0.0, 2 * np.pi - 3.0]])
-    np.testing.assert_array_equal(stayed.poses, [[0.0, 0.0, 3.0], [0.0, 0.0, 3.0]])
-    assert stayed.cost == 0.0
-    np.testing.assert_array_equal(sample_poses(stayed, 3, turning=TURNING), [[0.0, 0.0, 3.0]] * 3)
-
-
 def test_narrow_gap_is_passed_lengthwise() -> None:
     standing, start, goals = wall_with_a_gap(0.85), [-2.5, 1.0, np.pi / 2], [[2.5, -1.0, np.pi / 2]]
     path = find(standing, start, goals)
     assert path is not None
     check(path, np.array(start), np.array(goals), chassis(), [], standing)
-    waypoints = sample_poses(path, 400, turning=TURNING)
-    inside = waypoints[np.abs(waypoints[:, 0]) < 0.2]
-    assert len(inside) > 5
-    assert np.all(np.abs(np.sin(inside[:, 2])) < 0.5)
     assert find(standing, start, goals, base=chassis(1.0, 0.85)) is None
     assert find(wall_with_a_gap(1.2), start, goals, base=chassis(1.0, 0.85)) is not None
 
@@ -200,76 +188,49 @@ def test_only_the_base_counts_near_start_and_goals() -> None:
     assert path is not None
     check(path, start, goals, chassis(), rod, tables)
     between_them = [*tables, (coal.Box(0.4, 20.0, 0.1), at(0.0, 0.0, 0.85))]
-    assert (
-        shortest_path(BaseGrid(chassis(), rod, between_them, HALL, MARGIN, near=NEAR), start, goals)
-        is None
-    )
-    assert (
-        shortest_path(BaseGrid(chassis(), rod, between_them, HALL, MARGIN, near=3.0), start, goals)
-        is not None
-    )
-    assert (
-        shortest_path(BaseGrid(chassis(), rod, tables, HALL, MARGIN, near=0.0), start, goals)
-        is None
-    )
+    for standing, near, is_free in (
+        (between_them, NEAR, False),
+        (between_them, 3.0, True),
+        (tables, 0.0, False),
+    ):
+        grid = BaseGrid(chassis(), rod, standing, HALL, MARGIN, near=near)
+        assert (shortest_path(grid, start, goals) is not None) == is_free
 
 
-def test_start_within_the_margin_is_left() -> None:
-    """The base comes no closer to the obstacle, and does not cross it."""
-    wall: list[Shape] = [(coal.Box(4.0, 0.1, 1.0), at(0.0, 0.0, 0.5))]
-    start, goals = [0.0, -0.05 - 0.335 - 0.01, 0.0], [[0.0, 1.5, 0.0]]
-    path = find(wall, start, goals)
+@pytest.mark.parametrize(
+    ("block", "start", "goal", "clearance"),
+    [
+        ((4.0, 0.1), (0.0, -0.395), (0.0, 1.5), 0.01),  # within the margin of a wall
+        ((1.0, 1.0), (-0.8, 0.0), (3.0, 0.0), -0.2),  # within a block
+    ],
+)
+def test_blocked_start_is_left_the_short_way(
+    block: tuple[float, float],
+    start: tuple[float, float],
+    goal: tuple[float, float],
+    clearance: float,
+) -> None:
+    """The base does not cross the obstacle."""
+    standing: list[Shape] = [(coal.Box(*block, 1.0), at(0.0, 0.0, 0.5))]
+    path = find(standing, [*start, 0.0], [[*goal, 0.0]])
     assert path is not None
-    distances = [
-        distance(chassis(), wall, pose)
-        for a, b in itertools.pairwise(path.poses)
-        for pose in between(a, b)
-    ]
-    assert distances[0] == pytest.approx(0.01)
-    assert min(distances) >= 0.01 - BLINK
-    last = max(k for k, d in enumerate(distances) if d < MARGIN - BLINK)
-    assert last < 200  # centimetres, or fiftieths of a radian
+    poses = np.concatenate([between(a, b) for a, b in itertools.pairwise(path.poses)])
+    distances = np.array([distance(chassis(), standing, pose) for pose in poses])
+    assert distances[0] == pytest.approx(clearance, abs=0.01)
+    assert clearance < 0.0 or distances.min() >= distances[0] - BLINK
+    blocked = np.flatnonzero(distances < MARGIN - BLINK)
+    assert (np.diff(blocked) == 1).all()
+    axis = 1 if clearance > 0.0 else 0
+    assert poses[blocked, axis].max() <= start[axis] + 1e-9
+    assert len(blocked) < 200  # centimetres, or fiftieths of a radian
     assert path.cost > 4.0
-
-
-def test_start_in_collision_is_left() -> None:
-    block: list[Shape] = [(coal.Box(1.0, 1.0, 1.0), at(0.0, 0.0, 0.5))]
-    start, goals = [-0.8, 0.0, 0.0], [[3.0, 0.0, 0.0]]
-    path = find(block, start, goals)
-    assert path is not None
-    distances = np.array(
-        [
-            distance(chassis(), block, p)
-            for a, b in itertools.pairwise(path.poses)
-            for p in between(a, b)
-        ]
-    )
-    assert distances[0] < -0.1
-    assert np.all(np.diff(np.flatnonzero(distances < MARGIN - BLINK)) == 1)  # it leaves once
-    leaves = np.concatenate([between(a, b) for a, b in itertools.pairwise(path.poses)])[
-        distances < MARGIN - BLINK
-    ]
-    assert leaves[:, 0].max() <= -0.8  # the short way out, not through
-
-
-def test_start_deep_in_collision_has_no_path() -> None:
-    block: list[Shape] = [(coal.Box(6.0, 6.0, 1.0), at(0.0, 0.0, 0.5))]
-    assert find(block, [0.0, 0.0, 0.0], [[4.0, 4.0, 0.0]]) is None
-    assert (
-        find([], [20.0, 0.0, 0.0], [[4.0, 4.0, 0.0]]) is not None
-    )  # outside the arena nothing is in the way
 
 
 def test_blocked_goals_are_skipped() -> None:
     block: list[Shape] = [(coal.Box(1.0, 1.0, 1.0), at(2.0, 0.0, 0.5))]
-    start, blocked, free = [0.0, 0.0, 0.0], [2.0, 0.2, 0.0], [-4.0, 0.0, 1.0]
-    path = find(block, start, [blocked, free])
+    path = find(block, [0.0, 0.0, 0.0], [[2.0, 0.2, 0.0], [-4.0, 0.0, 1.0]])
     assert path is not None
     assert path.goal == 1
-    assert find(block, start, [blocked]) is None
-    assert (
-        shortest_path(BaseGrid(chassis(), [], block, HALL, MARGIN), start, np.empty((0, 3))) is None
-    )
 
 
 def test_additional_goal_costs_count() -> None:
@@ -281,24 +242,32 @@ def test_additional_goal_costs_count() -> None:
     assert [path.cost for path in found if path is not None] == pytest.approx([1.0, 1.0, 2.0, 2.5])
 
 
-def test_closed_room_has_no_path() -> None:
+def test_tasks_without_a_path() -> None:
+    """Goals or start are blocked, or one of them is in a closed room."""
+    block: list[Shape] = [(coal.Box(6.0, 6.0, 1.0), at(0.0, 0.0, 0.5))]
     room: list[Shape] = [(coal.Box(3.0, 0.1, 1.0), at(0.0, y, 0.5)) for y in (-1.5, 1.5)]
     room += [(coal.Box(0.1, 3.0, 1.0), at(x, 0.0, 0.5)) for x in (-1.5, 1.5)]
-    assert find(room, [3.0, 3.0, 0.0], [[0.0, 0.0, 0.0]]) is None
-    assert find(room, [0.0, 0.0, 0.0], [[3.0, 3.0, 0.0]]) is None
+    inside, outside = [0.0, 0.0, 0.0], [4.0, 4.0, 0.0]
+    for standing in (block, room):
+        assert find(standing, inside, [outside]) is None
+        assert find(standing, outside, [inside]) is None
     assert find(room, [0.3, 0.0, 0.0], [[-0.3, 0.0, 2.0]]) is not None
+    assert find([], [20.0, 0.0, 0.0], [outside]) is not None  # from outside the arena
+    assert (
+        shortest_path(BaseGrid(chassis(), [], [], HALL, MARGIN), inside, np.empty((0, 3))) is None
+    )
 
 
 def test_search_is_deterministic() -> None:
     rng = np.random.default_rng(3)
-    for _ in range(5):
+    for _ in range(2):
         start, goals = (
             rng.uniform([-4, -4, -3], [4, 4, 3]),
             rng.uniform([-4, -4, -3], [4, 4, 3], size=(5, 3)),
         )
         grid = BaseGrid(chassis(), arm(), [*furniture(), *clutter(1, 10)], HALL, MARGIN)
         again = BaseGrid(chassis(), arm(), [*furniture(), *clutter(1, 10)], HALL, MARGIN)
-        shortest_path(again, goals[0], goals[1:])  # which leaves what it found out
+        shortest_path(again, goals[0], goals[1:])  # fills its caches
         paths = [shortest_path(g, start, goals) for g in (grid, grid, again)]
         for other in paths[1:]:
             assert (paths[0] is None) == (other is None)
@@ -325,7 +294,6 @@ def test_poses_are_sampled_along_a_path(around_the_block: BasePath, steps: int) 
     waypoints = sample_poses(path, steps, turning=TURNING)
     assert waypoints.shape == (steps, 3)
     np.testing.assert_array_equal(waypoints[-1], path.poses[-1])
-    # Each is on the path, further along than the one before.
     change = np.diff(path.poses, axis=0)
     passed = np.concatenate(
         [[0.0], np.cumsum(np.hypot(change[:, 0], change[:, 1]) + TURNING * np.abs(change[:, 2]))]
@@ -335,14 +303,12 @@ def test_poses_are_sampled_along_a_path(around_the_block: BasePath, steps: int) 
     nearest = [np.abs(poses - waypoint).max(axis=1).argmin() for waypoint in waypoints]
     assert np.abs(poses[nearest] - waypoints).max() < 1e-3
     assert np.all(np.diff(nearest) > 0)
-    if steps == 40:
+    if steps == 40:  # it starts and ends slowly
         progress = np.diff(dense[[0, *nearest]])
-        assert progress[0] < 0.2 * progress.max()
-        assert progress[-1] < 0.2 * progress.max()
-        assert progress[0] == pytest.approx(passed[-1] * (3 / 40**2 - 2 / 40**3), abs=1e-3)
+        assert max(progress[0], progress[-1]) < 0.2 * progress.max()
 
 
-def test_turning_takes_poses() -> None:
+def test_turns_take_poses() -> None:
     path = find([], [0.0, 0.0, 0.0], [[1.0, 0.0, 3.0]])
     assert path is not None
     waypoints = sample_poses(path, 50, turning=TURNING)
@@ -361,7 +327,7 @@ def test_turning_takes_poses() -> None:
         ([0.0, 0.0, 0.0], [[1.0, 0.0, 0.0]], [-1.0], "costs"),
     ],
 )
-def test_bad_input(
+def test_invalid_arguments_are_rejected(
     start: list[float], goals: list[list[float]], costs: list[float] | None, field: str
 ) -> None:
     with pytest.raises(InputError) as raised:
@@ -369,25 +335,6 @@ def test_bad_input(
     assert raised.value.field == field
 
 
-def test_no_waypoints(around_the_block: BasePath) -> None:
+def test_number_of_sampled_poses_is_checked(around_the_block: BasePath) -> None:
     with pytest.raises(InputError, match="steps"):
         sample_poses(around_the_block, 0, turning=TURNING)
-
-
-def test_search_checks_few_moves(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fewer than one in a thousand nodes is checked exactly."""
-    move, asked = _Search._is_move_free, 0
-
-    def counted(self: _Search, node: int, after: int) -> bool:
-        nonlocal asked
-        asked += 1
-        return move(self, node, after)
-
-    monkeypatch.setattr(_Search, "_is_move_free", counted)
-    rng, searches = np.random.default_rng(0), 11
-    grid = BaseGrid(chassis(), arm(), furniture(), HALL, MARGIN)
-    for _ in range(searches):
-        start = rng.uniform([1.2, -4.6, -np.pi], [2.8, -4.2, np.pi])
-        goals = rng.uniform([1.2, -0.5, -np.pi], [3.8, 2.8, np.pi], size=(8, 3))
-        assert shortest_path(grid, start, goals) is not None
-    assert searches <= asked < 1e-3 * searches * grid.blocked.size

@@ -1,3 +1,5 @@
+"""Compares blocked cells with coal."""
+
 from __future__ import annotations
 
 import coal
@@ -30,7 +32,7 @@ def test_found_cells_collide_and_few_are_missed(name: str) -> None:
     standing, rng = SCENES[name], np.random.default_rng(0)
     grid = BaseGrid(chassis(), CARRIED, standing, HALL, MARGIN)
     blocked, known = np.zeros(2), np.zeros(2)
-    for i, j, heading in rng.integers([100, 100, 16], size=(800, 3)).tolist():
+    for i, j, heading in rng.integers([100, 100, 16], size=(400, 3)).tolist():
         pose = [*grid.center(i, j), grid.yaws[heading]]
         for body, (shapes, mask) in enumerate(
             ((chassis(), grid.blocked), (CARRIED, grid.carried_blocked))
@@ -39,12 +41,12 @@ def test_found_cells_collide_and_few_are_missed(name: str) -> None:
             assert hit or not mask[i, j, heading]
             blocked[body] += hit
             known[body] += mask[i, j, heading]
-    assert blocked.min() > 50
+    assert blocked.min() > 25
     assert known[0] > 0.9 * blocked[0]
-    assert known[1] > 0.4 * blocked[1]  # most of the rest is over the base, where that is stuck
+    assert known[1] > 0.4 * blocked[1]  # most others are above the base, where that collides
 
 
-def test_a_box_before_a_wall() -> None:
+def test_cells_of_a_box_before_a_wall() -> None:
     """Cells are found whose centres are within half the box and the margin."""
     lattice = Lattice(np.array([0.05, 0.05]), np.array([0.1, 0.1]), 20, np.array([0.0, np.pi / 2]))
     wall: list[Shape] = [(coal.Box(0.2, 10.0, 1.0), at(1.0, 1.0, 0.5))]
@@ -72,7 +74,7 @@ def test_only_shapes_of_common_heights_collide() -> None:
         low, high, [(coal.Box(5.0, 5.0, 2.0), at(0.5, 0.5, 1.0))], lattice, MARGIN
     )
     assert both.all()
-    assert not over.any()  # it is within the outline of the base, which is stuck anyway
+    assert not over.any()  # within the outline of the base, which collides
 
 
 def test_flat_shapes_and_unknown_ones_are_ignored() -> None:

@@ -1,3 +1,5 @@
+"""Compares repaired cheapest paths with SciPy's in a new graph."""
+
 from __future__ import annotations
 
 import itertools
@@ -113,12 +115,11 @@ class Graph:
             self.begins[begin, 1] = LIMIT
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_cheapest_path_is_repaired_after_every_change(seed: int) -> None:
-    """The path equals SciPy's in a new graph, and does not depend on the order of changes."""
     graph = Graph(seed)
     paths, lengths = graph.paths(), []
-    for _ in range(25):
+    for _ in range(12):
         found = paths.cheapest(LIMIT)
         graph.check(found)
         fresh = graph.paths().cheapest(LIMIT)

@@ -1,11 +1,11 @@
+"""Compares lattice searches with SciPy's search of a graph of all states."""
+
 from __future__ import annotations
 
 import coal
 import numpy as np
 import pytest
 from helpers.base_scenes import MARGIN, at, chassis, clutter
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
@@ -20,10 +20,10 @@ from vkc_pin.planning.base_paths.motion_primitives import (
     wrap_angle,
 )
 
-TURNING = 0.3  # [m/rad] where a grid is not told
+TURNING = 0.3  # [m/rad], default of a grid
 
 CELLS, ROOM = 13, (-2.0, 2.0, -2.0, 2.0)
-ENTRY = 0.6  # [m] between start or goal and the cells from which the way over the grid goes on
+ENTRY = 0.6  # [m], maximum distance of start or goal to connected cells
 
 
 def reference(
@@ -143,44 +143,18 @@ def task(
     return grid, start, poses[100:103], rng.choice([0.0, 1.0], 3)
 
 
-@pytest.mark.long
-@settings(max_examples=25, deadline=None)
-@given(st.integers(0, 2**32 - 1))
-def test_no_path_over_the_grid_is_cheaper(seed: int) -> None:
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_cheapest_path_is_found(seed: int) -> None:
     grid, start, goals, extra = task(seed)
     expected = reference(grid, start, goals, extra)
-    fresh, *_ = task(seed)  # which remembers nothing
+    fresh, *_ = task(seed)  # with empty caches
     found = find_cheapest_path(SearchSpace(fresh, start, goals), extra)
     if grid.is_pose_free(*start):
         assert (np.inf if found is None else found[0]) == pytest.approx(expected, abs=1e-4)
 
 
-def test_random_cases_include_paths_and_none() -> None:
-    """The test above needs cases with and without a path, and with detours."""
-    found = []
-    for seed in range(30):
-        grid, start, goals, extra = task(seed)
-        way = find_cheapest_path(SearchSpace(grid, start, goals), extra)
-        found.append(0 if way is None else len(way[2]))
-    assert found.count(0) > 2
-    assert sum(drives > 3 for drives in found) > 5
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_cached_moves_do_not_change_the_result(seed: int) -> None:
-    grid, start, goals, extra = task(seed)
-    first, second = (find_cheapest_path(SearchSpace(grid, start, goals), extra) for _ in range(2))
-    assert (first is None) == (second is None)
-    if first is not None and second is not None:
-        assert first[:2] == second[:2]
-        assert first[3] == second[3]
-        for one, other in zip(first[2], second[2], strict=True):
-            assert (*one.a, *one.b, one.yaw) == (*other.a, *other.b, other.yaw)
-
-
 @pytest.mark.parametrize("seed", range(6))
 def test_earlier_searches_do_not_change_the_result(seed: int) -> None:
-    """The path does not depend on earlier searches with other starts and goals."""
     grid, start, goals, extra = task(seed)
     fresh, *_ = task(seed)
     rng = np.random.default_rng(seed)
@@ -189,14 +163,15 @@ def test_earlier_searches_do_not_change_the_result(seed: int) -> None:
     for other in rng.uniform([-1.8, -1.8, -3.0], [1.8, 1.8, 3.0], size=(4, 3)):
         find_cheapest_path(SearchSpace(grid, other, goals[:2]), extra[:2])
         find_cheapest_path(SearchSpace(grid, start, other[None]), extra[:1])
-    first, second = (
-        find_cheapest_path(SearchSpace(one, start, goals), extra) for one in (grid, fresh)
+    first, *others = (
+        find_cheapest_path(SearchSpace(one, start, goals), extra) for one in (fresh, grid, grid)
     )
-    assert (first is None) == (second is None)
-    if first is not None and second is not None:
-        assert first[:2] == second[:2]
-        for one, other in zip(first[2], second[2], strict=True):
-            assert (*one.a, *one.b, one.yaw) == (*other.a, *other.b, other.yaw)
+    for other in others:
+        assert (first is None) == (other is None)
+        if first is not None and other is not None:
+            assert (*first[:2], first[3]) == (*other[:2], other[3])
+            for drive, same in zip(first[2], other[2], strict=True):
+                assert (*drive.a, *drive.b, drive.yaw) == (*same.a, *same.b, same.yaw)
 
 
 def test_start_and_goal_on_cells() -> None:
@@ -220,7 +195,7 @@ def test_start_and_goal_on_cells() -> None:
     assert same[0] == 0.0
 
 
-def test_path_much_longer_than_the_heuristic(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_path_much_longer_than_the_heuristic() -> None:
     """The obstacle on the short path is not known in advance."""
     gate: list[Shape] = [(coal.Box(0.1, 1.4, 1.0), at(0.0, y, 0.5)) for y in (-1.3, 1.3)]
     lid: list[Shape] = [

@@ -1,11 +1,11 @@
+"""Tests drives, turns and connections of start and goals with the grid."""
+
 from __future__ import annotations
 
 import coal
 import numpy as np
 import pytest
 from helpers.base_scenes import HALL, MARGIN, at, chassis
-from hypothesis import given
-from hypothesis import strategies as st
 
 from vkc_pin.planning.base_paths.base_clearance import Shape
 from vkc_pin.planning.base_paths.grid import BaseGrid
@@ -19,7 +19,7 @@ from vkc_pin.planning.base_paths.motion_primitives import (
     wrap_angle,
 )
 
-TURNING = 0.3  # [m/rad] where a grid is not told
+TURNING = 0.3  # [m/rad], default of a grid
 
 START = np.array([0.0, 0.0, 0.0])
 
@@ -35,13 +35,6 @@ def space(
     return SearchSpace(grid, START, np.array(goals))
 
 
-@given(st.floats(-50.0, 50.0))
-def test_wrap_angle(angle: float) -> None:
-    assert -np.pi <= wrap_angle(angle) <= np.pi
-    assert np.cos(wrap_angle(angle)) == pytest.approx(np.cos(angle), abs=1e-9)
-    assert np.sin(wrap_angle(angle)) == pytest.approx(np.sin(angle), abs=1e-9)
-
-
 @pytest.mark.parametrize(
     ("turned", "factor"), [(0.0, 1.0), (np.pi, BACKWARDS), (0.1, SIDEWAYS), (np.pi / 2, SIDEWAYS)]
 )
@@ -49,22 +42,6 @@ def test_drive_cost(turned: float, factor: float) -> None:
     drive = Drive(np.zeros(2), np.array([4.0, 3.0]), np.arctan2(3.0, 4.0) + turned)
     assert drive.length == 5.0
     assert drive.cost == pytest.approx(5.0 * factor)
-
-
-def test_drives_are_split_outside_end_regions() -> None:
-    """The parts equal those found by sampling points."""
-    rng = np.random.default_rng(0)
-    places = space([], rng.uniform(-3.0, 3.0, (4, 3)).tolist())
-    for _ in range(50):
-        drive = Drive(*rng.uniform(-4.0, 4.0, (2, 2)), 0.0)
-        parts = list(places._split_outside_ends(drive))
-        for share in rng.uniform(size=40):
-            point = drive.a + share * (drive.b - drive.a)
-            away = min(np.hypot(*(point - place[:2])) for place in (START, *places.goals))
-            covered = any((point - a) @ (point - b) <= 0.0 for a, b in parts)
-            assert covered == (away > 1.0)
-    still = [Drive(np.array(place), np.array(place), 0.0) for place in ([4.5, 4.5], [0.5, 0.5])]
-    assert [len(list(places._split_outside_ends(drive))) for drive in still] == [1, 0]
 
 
 def test_cells_near_start_and_goals() -> None:
@@ -82,24 +59,24 @@ def test_connections_reach_the_cells_around() -> None:
     assert len(np.unique(starts.cell)) == np.sum(
         [np.hypot(*np.subtract(places.center(c), (0, 0))) <= 0.6 for c in range(10_000)]
     )
-    for ways, leaving in ((starts, True), (ends, False)):
+    for connections, leaving in ((starts, True), (ends, False)):
         kinds = set()
-        for k in range(len(ways.cell)):
-            heading = float(places.grid.yaws[ways.heading[k]])
+        for k in range(len(connections.cell)):
+            heading = float(places.grid.yaws[connections.heading[k]])
             drive, after = (
-                places.get_start_drive(ways, k)
+                places.get_start_drive(connections, k)
                 if leaving
-                else places.get_goal_drive(ways, k, 0, heading)
+                else places.get_goal_drive(connections, k, 0, heading)
             )
             before = 0.0 if leaving else heading
             expected = drive.cost + TURNING * (abs(drive.yaw - before) + abs(after - drive.yaw))
-            assert ways.cost[k] * UNIT == pytest.approx(expected, abs=2 * UNIT)
+            assert connections.cost[k] * UNIT == pytest.approx(expected, abs=2 * UNIT)
             assert abs(wrap_angle(after - (heading if leaving else 1.0))) < 1e-9
             np.testing.assert_array_equal(
                 drive.a if leaving else drive.b, [0.0, 0.0] if leaving else [3.0, 3.0]
             )
             np.testing.assert_array_equal(
-                drive.b if leaving else drive.a, places.center(ways.cell[k])
+                drive.b if leaving else drive.a, places.center(connections.cell[k])
             )
             kinds.add(round(drive.cost / drive.length, 6))
         assert kinds == {1.0, BACKWARDS, SIDEWAYS}
@@ -114,7 +91,7 @@ def test_connections_without_space_to_turn_are_omitted() -> None:
     assert space([], [[3.0, 0.0, 0.0]]).get_starts().yaw.max() > 1.5
 
 
-def test_a_blocked_start() -> None:
+def test_blocked_start_has_exit_margins() -> None:
     close, over = [(coal.Box(1.0, 1.0, 1.0), at(x, 0.0, 0.5)) for x in (1.01, 0.9)]
     free, near, inside = (
         space([], [[3.0, 0.0, 0.0]]),
@@ -129,7 +106,7 @@ def test_a_blocked_start() -> None:
     assert inside.exit_margins[0] == -np.inf
     assert inside.exit_cost > 1.0
     back = near.get_direct_drive(0, 1)
-    assert back is None  # three metres, too far for a blocked start
+    assert back is None  # too far for a blocked start
     short = inside.get_direct_drive(0, 1)
     assert short is not None
     assert inside.is_sweep_free(0.0, *short, inside.exit_margins)
@@ -146,7 +123,6 @@ def test_load_counts_away_from_start_and_goals() -> None:
     assert not places.is_drive_free(Drive(np.array([0.5, 0.0]), np.array([3.5, 0.0]), 0.0))
     assert places.is_turn_free(START[:2], 0.0, 3.0)
     assert not places.is_turn_free(np.array([2.0, 0.0]), 0.3, 3.3)
-    # The rod passes over the second post's cells, where only the mask knows.
     assert not places.looks_free(Drive(np.array([0.5, 0.0]), np.array([3.5, 0.0]), 0.0))
     assert places.looks_free(Drive(np.array([-0.5, 0.0]), np.array([0.5, 0.0]), 0.0))
 

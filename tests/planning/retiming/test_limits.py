@@ -26,7 +26,7 @@ def test_limits_are_those_of_robot_and_objects() -> None:
     assert not limits.has_unlimited_jerk
 
 
-def test_wheels_have_a_velocity_of_their_own() -> None:
+def test_wheels_have_velocity_limits() -> None:
     limits = Limits.from_scene(SCENE, NAMES, 0.2).with_wheels(
         RollingLimits(track=0.8, wheel_speed=0.9)
     )
@@ -43,7 +43,7 @@ def test_wheels_have_a_velocity_of_their_own() -> None:
         (9.0, 99.0, 99.0, 1.0),
     ],
 )
-def test_a_curve_is_slowed_until_all_limits_are_kept(
+def test_curves_are_slowed_down_to_their_limits(
     velocity: float, acceleration: float, jerk: float, factor: float
 ) -> None:
     """The curve is 3s² − 2s³: a velocity of 1.5, an acceleration of 6 and a jerk of 12."""

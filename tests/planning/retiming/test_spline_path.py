@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 
@@ -16,20 +16,19 @@ def points(seed: int, count: int = 8) -> np.ndarray:
     return np.cumsum(np.random.default_rng(seed).normal(size=(count, 3)), axis=0)
 
 
+@settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6), st.integers(3, 12))
-def test_without_limits_it_is_twice_differentiable(seed: int, count: int) -> None:
-    given_points = points(seed, count)
-    path = fit_path(given_points, np.ones(3), NOWHERE)
-    np.testing.assert_allclose(
-        np.diff(path.x), np.linalg.norm(np.diff(given_points, axis=0), axis=1)
-    )
+def test_path_without_limits_is_a_natural_spline(seed: int, count: int) -> None:
+    waypoints = points(seed, count)
+    path = fit_path(waypoints, np.ones(3), NOWHERE)
+    np.testing.assert_allclose(np.diff(path.x), np.linalg.norm(np.diff(waypoints, axis=0), axis=1))
     along = np.linspace(path.x[0], path.x[-1], 200)
     np.testing.assert_allclose(
-        path(along), CubicSpline(path.x, given_points, bc_type="natural")(along), atol=1e-9
+        path(along), CubicSpline(path.x, waypoints, bc_type="natural")(along), atol=1e-9
     )
 
 
-def test_two_points_are_a_straight_line() -> None:
+def test_path_of_two_points_is_straight() -> None:
     path = fit_path(
         np.array([[0.0, 0.0, 1.0], [1.0, 2.0, 1.0]]), np.array([1.0, 0.5, 1.0]), NOWHERE
     )
@@ -39,23 +38,22 @@ def test_two_points_are_a_straight_line() -> None:
 
 def test_linear_constraints_of_waypoints_hold_along_the_path() -> None:
     """The path is linear in the waypoints: zero combinations of coordinates stay zero."""
-    given_points = points(5)
-    given_points[:, 2] = 2.0 * given_points[:, 0] - given_points[:, 1]
-    path = fit_path(given_points, np.ones(3), NOWHERE)
+    waypoints = points(5)
+    waypoints[:, 2] = 2.0 * waypoints[:, 0] - waypoints[:, 1]
+    path = fit_path(waypoints, np.ones(3), NOWHERE)
     found = path(np.linspace(path.x[0], path.x[-1], 300))
     np.testing.assert_allclose(found[:, 2], 2.0 * found[:, 0] - found[:, 1], atol=1e-9)
 
 
+@settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6))
 def test_path_stays_within_limits(seed: int) -> None:
-    given_points = points(seed)
-    lower, upper = given_points.min(axis=0), given_points.max(axis=0)
-    path = fit_path(given_points, np.ones(3), (lower, upper))
+    waypoints = points(seed)
+    lower, upper = waypoints.min(axis=0), waypoints.max(axis=0)
+    path = fit_path(waypoints, np.ones(3), (lower, upper))
     found = path(np.linspace(path.x[0], path.x[-1], 500))
     assert (found >= lower - 1e-9).all()
     assert (found <= upper + 1e-9).all()
-    np.testing.assert_allclose(path(path.x), given_points, atol=1e-12)
-    outside = fit_path(
-        given_points, np.ones(3), (lower + 0.1, upper)
-    )  # where it is already, as a start may be
-    assert outside(np.linspace(path.x[0], path.x[-1], 500)).min() >= given_points.min() - 1e-9
+    np.testing.assert_allclose(path(path.x), waypoints, atol=1e-12)
+    outside = fit_path(waypoints, np.ones(3), (lower + 0.1, upper))  # as a start may be
+    assert outside(np.linspace(path.x[0], path.x[-1], 500)).min() >= waypoints.min() - 1e-9

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.planning.retiming.spline_path import fit_path
@@ -35,8 +38,9 @@ def test_duration_of_a_straight_path(length: float, fastest: float, strongest: f
     assert speeds.max() <= fastest * (1 + 1e-6)
 
 
+@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**5))
-def test_limits_hold_all_along(seed: int) -> None:
+def test_limits_hold_along_the_path(seed: int) -> None:
     rng = np.random.default_rng(seed)
     path = fit_path(np.cumsum(rng.normal(size=(6, 2)), axis=0), np.ones(2), FREE)
     places = np.unique(
@@ -57,3 +61,20 @@ def test_limits_hold_all_along(seed: int) -> None:
 def test_no_speeds_without_limits() -> None:
     path = fit_path(np.array([[0.0, 0.0], [1.0, 0.0]]), np.ones(2), FREE)
     assert compute_speeds(path, path.x, np.full(2, np.inf), np.full(2, np.inf)) is None
+
+
+def test_matplotlib_is_not_imported() -> None:
+    """It takes half a second, and only plots of toppra need it; these still work."""
+    code = """
+import sys, numpy as np
+from vkc_pin.planning.retiming.spline_path import fit_path
+from vkc_pin.planning.retiming.topp_ra import compute_speeds
+free = np.full(1, np.inf)
+path = fit_path(np.array([[0.0], [1.0]]), np.ones(1), (-free, free))
+assert compute_speeds(path, np.linspace(0.0, 1.0, 9), np.ones(1), np.ones(1)) is not None
+assert not [name for name in sys.modules if name.startswith("matplotlib")]
+from toppra.algorithm.algorithm import plt
+import matplotlib.pyplot
+assert plt.figure is matplotlib.pyplot.figure
+"""
+    subprocess.run([sys.executable, "-c", code], timeout=60, check=True)

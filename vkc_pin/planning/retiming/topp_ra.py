@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Callable
+from functools import cache
+from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,12 +19,9 @@ if TYPE_CHECKING:
 
 __all__ = ["compute_speeds"]
 
-_KNOT_OFFSETS = (
-    1e-3,
-    1e-2,
-    # Offsets of the constrained points from the ends of a segment, relative to its length;
-    # accelerations are discontinuous at the ends.
-)
+# Offsets of constrained points from the ends of a segment, where accelerations jump, relative to its
+# length; the second one is tried if the first fails.
+_KNOT_OFFSETS = (1e-3, 1e-2)
 
 
 def compute_speeds(
@@ -47,6 +48,7 @@ def compute_speeds(
     Returns:
         Path velocities, shape (K,) [1/s], or None if they cannot be computed.
     """
+    _import_toppra()
     from toppra.algorithm import TOPPRA
     from toppra.constraint import (
         DiscretizationType,
@@ -57,19 +59,17 @@ def compute_speeds(
     limited = np.flatnonzero(np.isfinite(velocity) & np.isfinite(acceleration))
     if not len(limited):
         return None
-    _silence_toppra()
-    rates = JointVelocityConstraint(np.column_stack([-velocity[limited], velocity[limited]]))
-    limits = np.column_stack([-acceleration[limited], acceleration[limited]])
-    changes = JointAccelerationConstraint(
-        limits, discretization_scheme=DiscretizationType.Interpolation
-    )
+    constraints: list[Any] = [
+        JointVelocityConstraint(np.column_stack([-velocity[limited], velocity[limited]])),
+        JointAccelerationConstraint(
+            np.column_stack([-acceleration[limited], acceleration[limited]]),
+            discretization_scheme=DiscretizationType.Interpolation,
+        ),
+    ]
+    if linear is not None:
+        constraints.append(_to_toppra_constraint(linear, len(limited)))
     for offset in _KNOT_OFFSETS:
         grid = _replace_knots(path.x, positions, offset)
-        constraints = (
-            [rates, changes]
-            if linear is None
-            else [rates, changes, _to_toppra_constraint(linear, len(limited))]
-        )
         solver = TOPPRA(
             constraints, _to_toppra_path(path, limited), gridpoints=grid, solver_wrapper="seidel"
         )
@@ -79,11 +79,34 @@ def compute_speeds(
     return None
 
 
-def _replace_knots(knots: Floats, positions: Floats, offset: float) -> Floats:
-    """Return the grid with each interior knot replaced by two points beside it.
+@cache
+def _import_toppra() -> None:
+    """Import `toppra` with placeholders of matplotlib, whose import takes longer than a plan."""
+    names = [name for name in ("matplotlib", "matplotlib.pyplot") if name not in sys.modules]
+    placeholders = {name: _Placeholder(name) for name in names}
+    if "matplotlib" in placeholders:
+        placeholders["matplotlib"].pyplot = placeholders["matplotlib.pyplot"]
+    sys.modules |= placeholders
+    try:
+        logger = logging.getLogger(import_module("toppra").__name__)
+    finally:
+        for name in placeholders:
+            del sys.modules[name]
+    if logger.level == logging.NOTSET:  # failures are handled here
+        logger.setLevel(logging.CRITICAL)
 
-    Accelerations are discontinuous at knots. The offset is relative to the shorter segment.
-    """
+
+class _Placeholder(ModuleType):
+    """Module that imports the real one when it is used."""
+
+    def __getattr__(self, name: str) -> Any:
+        if sys.modules.get(self.__name__) is self:
+            raise AttributeError(name)
+        return getattr(import_module(self.__name__), name)
+
+
+def _replace_knots(knots: Floats, positions: Floats, offset: float) -> Floats:
+    """Return the grid with each interior knot replaced by two points beside it."""
     gaps = np.minimum(np.diff(knots)[1:], np.diff(knots)[:-1]) * offset
     inside = knots[1:-1]
     return np.sort(np.concatenate([np.setdiff1d(positions, inside), inside - gaps, inside + gaps]))
@@ -111,7 +134,7 @@ def _to_toppra_constraint(
     from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
 
     class Bound(LinearConstraint):
-        dof, identical = size, True
+        dof = size
 
         def __init__(self) -> None:
             super().__init__()
@@ -127,10 +150,3 @@ def _to_toppra_constraint(
             )
 
     return Bound()
-
-
-def _silence_toppra() -> None:
-    """Silence the logger of `toppra` unless its level was set; failures are handled here."""
-    logger = logging.getLogger("toppra")
-    if logger.level == logging.NOTSET:
-        logger.setLevel(logging.CRITICAL)

@@ -16,6 +16,7 @@ from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
 from vkc_pin.planning.nlp.inspection import build
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.cache import Cache
+from vkc_pin.world.collision.margins import Margins
 from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment, Freedom
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.scene.placed_object import PlacedObject
@@ -181,3 +182,9 @@ def program_of(
 ) -> TrajectoryProblem:
     """Return the program of `steps`; tests of one process share the symbolic ones."""
     return build(scene, steps, options=options, terms=terms, cache=CACHE)
+
+
+def margins_at(part: PhaseGeometry, pairs: np.ndarray, waypoints: np.ndarray) -> np.ndarray:
+    """Return margins of pairs at waypoints, shape (n,) [m], without `margin_regions`."""
+    margins = Margins(part.margins, part.reduced_margins)
+    return margins.compute_margins(pairs, waypoints, np.empty((1, 0)), np.zeros(len(pairs), int))

@@ -152,7 +152,10 @@ def check_contacts(
     which = np.array([number[tuple(pair)] for pair in contacts.pair.tolist()], int)
     every, same = np.arange(len(part.pairs)), np.full(len(part.pairs), problem.ends[phase])
     margins = np.array(
-        [part.margins_at(every, same, z, np.full(len(every), row)) for row in range(len(z))]
+        [
+            part.margin_table.compute_margins(every, same, z, np.full(len(every), row))
+            for row in range(len(z))
+        ]
     )
     assert len(set(zip(contacts.waypoint.tolist(), which.tolist(), strict=True))) == len(which)
     np.testing.assert_allclose(

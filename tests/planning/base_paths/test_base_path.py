@@ -23,7 +23,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from vkc_pin.errors import InputError
 from vkc_pin.planning.base_paths.base_clearance import Shape
 from vkc_pin.planning.base_paths.base_path import BasePath, sample_poses, shortest_path
 from vkc_pin.planning.base_paths.grid import BaseGrid
@@ -314,27 +313,3 @@ def test_turns_take_poses() -> None:
     waypoints = sample_poses(path, 50, turning=TURNING)
     assert np.sum(waypoints[:, 0] > 1.0 - 1e-9) > 20
     assert np.sum(sample_poses(path, 50, turning=0.01)[:, 0] > 1.0 - 1e-9) < 12
-
-
-@pytest.mark.parametrize(
-    ("start", "goals", "costs", "field"),
-    [
-        ([0.0, 0.0], [[1.0, 0.0, 0.0]], None, "start"),
-        ([0.0, 0.0, np.nan], [[1.0, 0.0, 0.0]], None, "start"),
-        ([0.0, 0.0, 0.0], [[1.0, 0.0]], None, "goals"),
-        ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], None, "goals"),
-        ([0.0, 0.0, 0.0], [[1.0, 0.0, 0.0]], [1.0, 2.0], "costs"),
-        ([0.0, 0.0, 0.0], [[1.0, 0.0, 0.0]], [-1.0], "costs"),
-    ],
-)
-def test_invalid_arguments_are_rejected(
-    start: list[float], goals: list[list[float]], costs: list[float] | None, field: str
-) -> None:
-    with pytest.raises(InputError) as raised:
-        find([], start, goals, costs=costs)
-    assert raised.value.field == field
-
-
-def test_number_of_sampled_poses_is_checked(around_the_block: BasePath) -> None:
-    with pytest.raises(InputError, match="steps"):
-        sample_poses(around_the_block, 0, turning=TURNING)

@@ -20,7 +20,6 @@ from helpers.base_scenes import (
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from vkc_pin.errors import InputError
 from vkc_pin.planning.base_paths.base_clearance import Shape
 from vkc_pin.planning.base_paths.grid import HEADINGS, BaseGrid
 from vkc_pin.utils.optional_imports import import_compiled
@@ -150,22 +149,3 @@ def test_arena_need_not_be_square() -> None:
         free = distance(chassis(), standing, pose) >= MARGIN
         assert grid.is_cell_free(i, j, heading) == free
         assert not (free and grid.blocked[i, j, heading])
-
-
-@pytest.mark.parametrize(
-    ("arena", "margin", "options", "field"),
-    [
-        ((0.0, 0.0, -1.0, 1.0), 0.02, {}, "arena"),
-        ((0.0, np.inf, -1.0, 1.0), 0.02, {}, "arena"),
-        ((0.0, 1.0, -1.0), 0.02, {}, "arena"),
-        (HALL, -0.01, {}, "margin"),
-        (HALL, 0.02, {"near": np.nan}, "near"),
-        (HALL, 0.02, {"cells": 1}, "cells"),
-    ],
-)
-def test_invalid_arguments_are_rejected(
-    arena: tuple[float, ...], margin: float, options: dict[str, float], field: str
-) -> None:
-    with pytest.raises(InputError) as raised:
-        BaseGrid(chassis(), [], [], arena, margin, **options)  # type: ignore[arg-type]
-    assert raised.value.field == field

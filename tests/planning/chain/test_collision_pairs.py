@@ -13,6 +13,7 @@ from helpers.small_problems import (
     SHORT,
     door_scene,
     full_scene,
+    margins_at,
     program_of,
     with_attachment,
     with_objects,
@@ -48,7 +49,7 @@ def pairs(
     part = problem.contacts.phases[phase]
     every = np.arange(len(part.pairs))
     margins = (
-        part.margins if waypoint is None else part.margins_at(every, np.full(len(every), waypoint))
+        part.margins if waypoint is None else margins_at(part, every, np.full(len(every), waypoint))
     )
     found = collections.defaultdict(list)
     for (first, second), margin in zip(part.pairs, margins, strict=True):

@@ -13,6 +13,7 @@ from helpers.small_problems import (
     SHORT,
     all_pairs,
     door_scene,
+    margins_at,
     program_of,
     random_configurations,
 )
@@ -79,7 +80,7 @@ def test_all_pairs_within_reach_are_found_with_their_distances(phase: int) -> No
         contacts.distance, distances[contacts.waypoint, which], rtol=0.0, atol=COAL
     )
     np.testing.assert_array_equal(
-        contacts.margin, part.margins_at(which, waypoints[contacts.waypoint])
+        contacts.margin, margins_at(part, which, waypoints[contacts.waypoint])
     )
     # d = n·(b − a), and n is a unit vector.
     np.testing.assert_allclose(np.linalg.norm(contacts.normal, axis=1), 1.0, atol=1e-9)

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 from helpers.carrying import STICK, lifted, room, stand, table
-from helpers.small_problems import SHORT, program_of, random_configurations
+from helpers.small_problems import SHORT, margins_at, program_of, random_configurations
 
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.world.scene.obstacles import FLOOR
@@ -58,7 +58,7 @@ def margins(
     )
     found: dict[tuple[str, str], set[float]] = {}
     waypoint = problem.contacts.first_waypoint[phase + (at == "last")]
-    asked = part.margins_at(every, np.full(len(every), waypoint)) if at else part.margins
+    asked = margins_at(part, every, np.full(len(every), waypoint)) if at else part.margins
     for (first, second), margin in zip(part.pairs, asked, strict=True):
         found.setdefault((part.labels[first], part.labels[second]), set()).add(float(margin))
     return found

@@ -20,7 +20,7 @@ from helpers.carrying import (
     tool_at,
 )
 from helpers.riding import cup, plates, scene_of
-from helpers.small_problems import SHORT, program_of
+from helpers.small_problems import SHORT, margins_at, program_of
 
 from vkc_pin.planning.chain.easing import REDUCED_MARGIN_RATIO
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
@@ -46,7 +46,7 @@ def margins(p: TrajectoryProblem, phase: int) -> dict[tuple[str, str], np.ndarra
     waypoints = range(first, first + p.task.phases[phase].segments + 1)
     found: dict[tuple[str, str], np.ndarray] = {}
     for k, pair in enumerate(part.pairs.tolist()):
-        row = part.margins_at(np.full(len(waypoints), k), np.array(waypoints))
+        row = margins_at(part, np.full(len(waypoints), k), np.array(waypoints))
         assert k in part.reduced_margins or (row == part.margins[k]).all()
         if k in part.reduced_margins and part.labels[pair[0]] not in p.scene.robot.touch_links:
             key = (part.labels[pair[0]], part.labels[pair[1]])

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.planning.chain.inversion import invert
+from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.object_file import load_object
 
 KINDS = ("revolute", "continuous", "prismatic", "fixed")
@@ -72,36 +73,32 @@ def test_inverted_trees_keep_all_frames_and_shapes(tree: tuple[str, int], seed: 
     urdf, root = tree
     thing = load_text(urdf, "urdf: thing.urdf\nattachments: [{name: a, link: l0}]")
     link, z = f"l{root}", np.random.default_rng(seed).uniform(-3.0, 3.0, thing.coordinates.size)
-    inverted = invert(thing, link, z)
-    moving = inverted.coordinates.names
+    model, collision = invert(thing, link, z)
+    coordinates = Coordinates(model)
+    moving = coordinates.names
     assert set(moving) <= set(thing.coordinates.names)
-    q = inverted.coordinates.q(np.array([z[thing.coordinates.index(name)] for name in moving]))
-    for old_geometry, new_geometry in (
-        (thing.collision, inverted.collision),
-        (thing.visual, inverted.visual),
-    ):
-        bodies, shapes = placements(thing.model, old_geometry, thing.coordinates.q(z))
-        new_bodies, new_shapes = placements(inverted.model, new_geometry, q)
-        assert new_bodies.keys() == bodies.keys()
-        assert new_shapes.keys() == shapes.keys()
-        to_root = bodies[link].inverse()
-        for old, new in ((bodies, new_bodies), (shapes, new_shapes)):
-            for name in old:
-                np.testing.assert_allclose(
-                    new[name].homogeneous, (to_root * old[name]).homogeneous, atol=1e-12, rtol=0.0
-                )
+    q = coordinates.q(np.array([z[thing.coordinates.index(name)] for name in moving]))
+    bodies, shapes = placements(thing.model, thing.collision, thing.coordinates.q(z))
+    new_bodies, new_shapes = placements(model, collision, q)
+    assert new_bodies.keys() == bodies.keys()
+    assert new_shapes.keys() == shapes.keys()
+    to_root = bodies[link].inverse()
+    for old, new in ((bodies, new_bodies), (shapes, new_shapes)):
+        for name in old:
+            np.testing.assert_allclose(
+                new[name].homogeneous, (to_root * old[name]).homogeneous, atol=1e-12, rtol=0.0
+            )
     for name in moving:
-        old, new = thing.coordinates.index(name), inverted.coordinates.index(name)
+        old, new = thing.coordinates.index(name), coordinates.index(name)
         for attribute in ("lower", "upper", "velocity"):
             assert (
-                getattr(inverted.coordinates, attribute)[new]
-                == getattr(thing.coordinates, attribute)[old]
+                getattr(coordinates, attribute)[new] == getattr(thing.coordinates, attribute)[old]
             )
-    assert sum(i.mass for i in inverted.model.inertias) == pytest.approx(
+    assert sum(i.mass for i in model.inertias) == pytest.approx(
         sum(i.mass for i in thing.model.inertias)
     )
-    for shape in inverted.collision.geometryObjects:
-        frame = inverted.model.frames[shape.parentFrame]
+    for shape in collision.geometryObjects:
+        frame = model.frames[shape.parentFrame]
         assert frame.parentJoint == shape.parentJoint
         assert shape.name.startswith(frame.name)
 
@@ -116,15 +113,15 @@ def test_only_joints_on_the_path_to_the_base_move() -> None:
     )
     urdf = f'<robot name="t">{links}{joints}</robot>'
     thing = load_text(urdf, "urdf: thing.urdf\nattachments: [{name: a, link: hand}]")
-    assert invert(thing, "hand", np.zeros(4)).coordinates.names == ("wrist", "shoulder")
-    assert invert(thing, "base", np.zeros(4)).model.nq == 0
+    assert [*invert(thing, "hand", np.zeros(4))[0].names[1:]] == ["wrist", "shoulder"]
+    assert invert(thing, "base", np.zeros(4))[0].nq == 0
 
 
 def test_inverting_aligned_joints_leaves_exact_zeros_and_ones() -> None:
-    inverted = invert(load_object("door"), "lever", [0.0, 0.0])
-    for placement in inverted.model.jointPlacements:
+    model, _ = invert(load_object("door"), "lever", [0.0, 0.0])
+    for placement in model.jointPlacements:
         assert set(np.abs(placement.rotation).ravel()) <= {0.0, 1.0}
-    assert [joint.shortname() for joint in inverted.model.joints][1:] == [
+    assert [joint.shortname() for joint in model.joints][1:] == [
         "JointModelRZ",
         "JointModelRZ",
     ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import coal
 import numpy as np
 import pinocchio as pin
+from helpers.small_problems import margins_at
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -153,4 +154,4 @@ def test_margins_are_reduced_between_waypoints() -> None:
     expected = part.margins[pairs].copy()
     expected[(pairs == 3) & (waypoints >= 2) & (waypoints <= 4)] = 0.001
     expected[(pairs == 3) & (waypoints >= 5) & (waypoints <= 6)] = 0.004
-    np.testing.assert_array_equal(part.margins_at(pairs, waypoints), expected)  # and never widened
+    np.testing.assert_array_equal(margins_at(part, pairs, waypoints), expected)  # and never widened

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.small_problems import SHORT, all_pairs, door_scene, hand_off_the_handle
+from helpers.small_problems import SHORT, all_pairs, door_scene, hand_off_the_handle, margins_at
 
 import vkc_pin as vkc
 from vkc_pin.planning.initialization.keyframes import (
@@ -125,7 +125,7 @@ def test_shortfall_is_the_largest_of_any_pair(problem: vkc.TrajectoryProblem) ->
     part, model = problem.contacts.phases[0], problem.chain.model
     geometry, data = all_pairs(part), model.createData()
     shapes, pairs = pin.GeometryData(geometry), np.arange(len(part.pairs))
-    margins, expected = part.margins_at(pairs, np.full(len(pairs), grasp)), []
+    margins, expected = margins_at(part, pairs, np.full(len(pairs), grasp)), []
     for q in problem.chain.coordinates.q(z):
         pin.updateGeometryPlacements(model, data, geometry, shapes, q)
         pin.computeDistances(geometry, shapes)

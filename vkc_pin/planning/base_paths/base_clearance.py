@@ -255,14 +255,6 @@ class MovingShapes:
         """Return whether a pair keeps its margin by conservative advancement.
 
         The plane between two convex shapes separates them until one has moved through it.
-
-        Args:
-            row: Number of the pair.
-            query: Function of row and progress that returns the distance [m] and an upper bound of
-                the closing speed.
-            end: Progress at the end of the motion.
-            advance: Minimum advance between queries.
-            margins: Margins from each obstacle, shape (S,) [m].
         """
         at, margin = 0.0, margins[self.standing[row]]
         while True:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vkc_pin.errors import InputError
 from vkc_pin.planning.base_paths.grid import BaseGrid
 from vkc_pin.planning.base_paths.lattice_search import find_cheapest_path
 from vkc_pin.planning.base_paths.motion_primitives import Drive, SearchSpace, wrap_angle
@@ -57,25 +56,9 @@ def shortest_path(
         costs: Additional cost of each goal, shape (G,) [m]. Default: none.
         smooth: Whether to shorten the path where it turns more often than necessary.
 
-    Raises:
-        InputError: A shape is wrong, or a number is not finite.
     """
     begin, ends = np.asarray(start, float), np.asarray(goals, float)
     extra = np.zeros(len(ends)) if costs is None else np.asarray(costs, float)
-    for field, value, shape in (
-        ("start", begin, (3,)),
-        ("goals", ends, (len(ends), 3)),
-        ("costs", extra, (len(ends),)),
-    ):
-        if value.shape != shape or not np.all(np.isfinite(value)):
-            expected = f"finite numbers, shape {shape}"
-            raise InputError(
-                "wrong shape or values", field=field, expected=expected, got=value.tolist()
-            )
-    if np.any(extra < 0.0):
-        raise InputError(
-            "a cost is negative", field="costs", expected="numbers >= 0", got=extra.tolist()
-        )
     space = SearchSpace(grid, begin, ends)
     found = find_cheapest_path(space, extra)
     if found is None:
@@ -87,18 +70,13 @@ def shortest_path(
 
 
 def sample_poses(path: BasePath, steps: int, *, turning: float) -> Floats:
-    """Sample poses along a path without its start, slow at both ends, the last at its goal.
+    """Return poses along a path without its start, slow at both ends, shape (steps, 3).
 
     Args:
         path: Base path.
         steps: Number of poses, at least 1.
         turning: Cost of turning, relative to driving [m/rad].
-
-    Returns:
-        Poses, shape (steps, 3) [m, rad].
     """
-    if steps < 1:
-        raise InputError("no waypoints", field="steps", expected="at least 1", got=steps)
     change = np.diff(path.poses, axis=0)
     passed = np.concatenate(
         [[0.0], np.cumsum(np.hypot(change[:, 0], change[:, 1]) + turning * np.abs(change[:, 2]))]
@@ -111,16 +89,7 @@ def sample_poses(path: BasePath, steps: int, *, turning: float) -> Floats:
 
 
 def _shorten(space: SearchSpace, drives: list[Drive], last: float) -> tuple[list[Drive], float]:
-    """Replace drives by straight shortcuts where those are free and cheaper.
-
-    Args:
-        space: Search space.
-        drives: Drives of the path.
-        last: Yaw at the goal [rad].
-
-    Returns:
-        Drives, and the yaw at the goal [rad].
-    """
+    """Replace drives by straight shortcuts where those are free and cheaper."""
     forced = 0 if space.exit_margins is None else 1  # the first drive leaves a blocked start
     result, yaw = drives[:forced], drives[0].yaw if forced else float(space.start[2])
     rest = []
@@ -130,7 +99,7 @@ def _shorten(space: SearchSpace, drives: list[Drive], last: float) -> tuple[list
     while rest:
         yaws = np.array([yaw, *(drive.yaw for drive in rest), last])
         turns = space.grid.turning * np.abs(np.diff(yaws))
-        # Cost up to the end of each drive, including the turn to the next.
+        # cost up to the end of each drive, including the turn to the next
         cost = turns[0] + np.cumsum([drive.cost for drive in rest] + turns[1:])
         best, low, high = None, 1, len(rest)
         tried = high
@@ -156,30 +125,15 @@ def _shorten(space: SearchSpace, drives: list[Drive], last: float) -> tuple[list
 def _find_shortcut(
     space: SearchSpace, a: Floats, b: Floats, *, before: float, after: float, limit: float
 ) -> tuple[Drive, float] | None:
-    """Return a straight drive between points, and the yaw after it, if it is free and cheap.
-
-    Args:
-        space: Search space.
-        a: Start, shape (2,) [m].
-        b: End, shape (2,) [m].
-        before: Yaw before the first turn [rad].
-        after: Yaw after the last turn, up to full turns [rad].
-        limit: Cost of drive and turns that must not be reached [m].
-    """
-    found = []
+    """Return a straight drive between points, and the yaw after it, if it is free and cheap."""
     if np.hypot(*(b - a)) < _SAME:
         return None
+    found = []
     for backwards in (0.0, np.pi):
         yaw = float(before + wrap_angle(np.arctan2(b[1] - a[1], b[0] - a[0]) + backwards - before))
         drive, end = Drive(a, b, yaw), float(yaw + wrap_angle(after - yaw))
-        found.append(
-            (
-                drive.cost + space.grid.turning * (abs(yaw - before) + abs(end - yaw)),
-                backwards,
-                drive,
-                end,
-            )
-        )
+        cost = drive.cost + space.grid.turning * (abs(yaw - before) + abs(end - yaw))
+        found.append((cost, backwards, drive, end))
     cost, _, drive, end = min(found)
     is_useful = (
         cost < limit - _SAME and space.looks_free(drive) and space.is_sweep_free(before, drive, end)

@@ -292,13 +292,7 @@ def _fill_cells(
 
 
 def _rasterize(reach: NDArray[np.float32], heading: Ints, lattice: Lattice) -> Bools:
-    """Return the cells inside any of many polygons, by heading, shape (cells, cells, H).
-
-    Args:
-        reach: Support functions of the polygons along `DIRECTIONS`, shape (Q, 32) [m].
-        heading: Heading of each polygon, shape (Q,).
-        lattice: Cells and headings.
-    """
+    """Return the cells inside any of many polygons, by heading, shape (cells, cells, H)."""
     cells, quarter = lattice.cells, len(DIRECTIONS) // 4
     (x0, y0), (dx, dy) = lattice.origin, lattice.step
     begin = np.clip(np.floor((-reach[:, 2 * quarter] - x0) / dx) + 1, 0, cells).astype(int)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vkc_pin.errors import InputError
 from vkc_pin.planning.base_paths.base_clearance import DIRECTIONS, MovingShapes, Obstacles, Shape
 from vkc_pin.planning.base_paths.blocked_cells import Lattice, SupportCache, find_colliding_cells
 from vkc_pin.utils.arrays import Bools, Floats, Ints
@@ -81,31 +80,11 @@ class BaseGrid:
             arena: x_min, x_max, y_min, y_max [m]; the base's origin stays inside.
             margin: Clearance to keep [m].
             cells: Number of cells along each side.
-            near: Radius around the start and goals of a search in which only `base` counts, since
-                the arm approaches or retreats there [m].
-            turning: Cost of turning, relative to driving [m/rad].
+            near: See `near`.
+            turning: See `turning`.
             cache: Cache of support functions. Default: none.
-
-        Raises:
-            InputError: The arena is empty, or a number is out of range.
         """
         low, high = np.array(arena[::2], float), np.array(arena[1::2], float)
-        if not (len(arena) == 4 and np.all(np.isfinite(arena)) and np.all(high > low)):
-            raise InputError(
-                "the arena is empty",
-                field="arena",
-                expected="x_min < x_max and y_min < y_max",
-                got=list(arena),
-            )
-        for field, value, least in (
-            ("margin", margin, 0.0),
-            ("near", near, 0.0),
-            ("cells", cells, 2),
-        ):
-            if not (np.isfinite(value) and value >= least):
-                raise InputError(
-                    "out of range", field=field, expected=f"at least {least:g}", got=value
-                )
         self.cells, self.near, self.turning = int(cells), float(near), float(turning)
         self.step = (high - low) / cells
         self.origin = low + self.step / 2
@@ -115,10 +94,8 @@ class BaseGrid:
         ) % (2 * np.pi)
         self.lengths = np.hypot(*(_CELL_MOVES * self.step).T)
         world = Obstacles(standing)
-        self.base, self.carried = (
-            MovingShapes(base, world, margin),
-            MovingShapes(carried, world, margin),
-        )
+        self.base = MovingShapes(base, world, margin)
+        self.carried = MovingShapes(carried, world, margin)
         views = (cache or Cache()).get("plan views", SupportCache)
         lattice = Lattice(self.origin, self.step, self.cells, self.yaws)
         self.blocked, self.carried_blocked = find_colliding_cells(
@@ -135,21 +112,11 @@ class BaseGrid:
 
     def find_cells_within(self, x: float, y: float, radius: float) -> Ints:
         """Return the cells whose centres are within `radius` [m] of a place, shape (C, 2)."""
-        low = np.maximum(np.ceil((np.array([x, y]) - radius - self.origin) / self.step), 0).astype(
-            int
-        )
-        high = (
-            np.minimum(
-                np.floor((np.array([x, y]) + radius - self.origin) / self.step), self.cells - 1
-            ).astype(int)
-            + 1
-        )
-        i, j = (
-            grid.ravel()
-            for grid in np.meshgrid(
-                np.arange(low[0], high[0]), np.arange(low[1], high[1]), indexing="ij"
-            )
-        )
+        place = np.array([x, y])
+        low = np.maximum(np.ceil((place - radius - self.origin) / self.step), 0)
+        high = np.minimum(np.floor((place + radius - self.origin) / self.step), self.cells - 1) + 1
+        ranges = (np.arange(*ends) for ends in zip(low.astype(int), high.astype(int), strict=True))
+        i, j = (grid.ravel() for grid in np.meshgrid(*ranges, indexing="ij"))
         inside = (
             np.hypot(self.origin[0] + i * self.step[0] - x, self.origin[1] + j * self.step[1] - y)
             <= radius
@@ -161,40 +128,27 @@ class BaseGrid:
 
         `reaching` as in `is_pose_free`.
         """
-        key = (_FREE, int(reaching), i, j, heading)
-        if self._known[key] < 0:
-            roomy = self._is_roomy(i, j, reaching)
-            self._store(
-                key,
-                roomy
+        return self._query(
+            (_FREE, int(reaching), i, j, heading),
+            lambda: (
+                self._is_roomy(i, j, reaching)
                 or self.is_pose_free(
                     *self.center(i, j), float(self.yaws[heading]), reaching=reaching
-                ),
-            )
-        return bool(self._known[key])
+                )
+            ),
+        )
 
     def is_pose_free(self, x: float, y: float, yaw: float, *, reaching: bool = False) -> bool:
-        """Return whether the margins are kept at a pose in the world.
+        """Return whether the margins are kept at a pose x, y [m], yaw [rad] in the world.
 
-        Args:
-            x: Position [m].
-            y: Position [m].
-            yaw: Heading [rad].
-            reaching: Whether the arm approaches or retreats, so that only the base counts.
+        `reaching`: the arm approaches or retreats, so that only the base counts.
         """
         return self.is_drive_free((x, y), (x, y), yaw, reaching=reaching)
 
     def is_drive_free(
         self, a: ArrayLike, b: ArrayLike, yaw: float, *, reaching: bool = False
     ) -> bool:
-        """Return whether the margins are kept along a straight line.
-
-        Args:
-            a: Start in the world, shape (2,) [m].
-            b: End in the world, shape (2,) [m].
-            yaw: Constant heading [rad].
-            reaching: As in `is_pose_free`.
-        """
+        """Return whether the margins are kept from a to b, shape (2,) [m], at a heading [rad]."""
         begin, end = np.asarray(a, float), np.asarray(b, float)
         return self.base.is_drive_free(begin, end, yaw) and (
             reaching or self.carried.is_drive_free(begin, end, yaw)
@@ -209,14 +163,9 @@ class BaseGrid:
         reaching: bool = False,
         margins: Floats | None = None,
     ) -> bool:
-        """Return whether the margins are kept while turning in place from one yaw to another.
+        """Return whether the margins are kept while turning at a place, (2,) [m], between yaws [rad].
 
-        Args:
-            at: Position in the world, shape (2,) [m].
-            start: First yaw [rad].
-            end: Last yaw [rad].
-            reaching: As in `is_pose_free`.
-            margins: Margins of the base from each obstacle, shape (S,) [m]. Default: the grid's.
+        `margins`: those of the base from each obstacle, shape (S,) [m]. Default: the grid's.
         """
         place = np.asarray(at, float)
         return self.base.is_turn_free(place, start, end, margins) and (
@@ -232,70 +181,61 @@ class BaseGrid:
             Margin from each of `standing`, shape (S,) [m], -inf for ignored ones; None if the pose
             is free.
         """
-        return (
-            None
-            if self.is_pose_free(x, y, yaw, reaching=True)
-            else self.base.compute_exit_margins(np.array([x, y]), yaw)
-        )
+        if self.is_pose_free(x, y, yaw, reaching=True):
+            return None
+        return self.base.compute_exit_margins(np.array([x, y]), yaw)
 
     def is_move_free(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
         """Return whether the move ahead from a cell at a heading is free; cached."""
-        key = (_FORWARD, int(reaching), i, j, heading)
-        if self._known[key] < 0:
+
+        def check() -> bool:
             k, m = i + int(self.moves[heading, 0]), j + int(self.moves[heading, 1])
             enough = self.lengths[heading]
             room = [maps[i][j] + maps[k][m] for maps in self._clearance_maps]
-            roomy = room[0] >= enough and (reaching or room[1] >= enough)
-            ends = self.center(i, j), self.center(k, m)
-            self._store(
-                key,
-                roomy or self.is_drive_free(*ends, float(self.yaws[heading]), reaching=reaching),
+            return bool(room[0] >= enough and (reaching or room[1] >= enough)) or (
+                self.is_drive_free(
+                    self.center(i, j),
+                    self.center(k, m),
+                    float(self.yaws[heading]),
+                    reaching=reaching,
+                )
             )
-        return bool(self._known[key])
+
+        return self._query((_FORWARD, int(reaching), i, j, heading), check)
 
     def is_left_turn_free(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
         """Return whether turning in a cell from a heading to the next is free; cached."""
-        key = (_LEFT, int(reaching), i, j, heading)
-        if self._known[key] < 0:
-            end = float(self.yaws[heading + 1]) if heading + 1 < HEADINGS else 2 * np.pi
-            roomy = self._is_roomy(i, j, reaching)
-            self._store(
-                key,
-                roomy
+        end = float(self.yaws[heading + 1]) if heading + 1 < HEADINGS else 2 * np.pi
+        return self._query(
+            (_LEFT, int(reaching), i, j, heading),
+            lambda: (
+                self._is_roomy(i, j, reaching)
                 or self.is_turn_free(
                     self.center(i, j), float(self.yaws[heading]), end, reaching=reaching
-                ),
-            )
-        return bool(self._known[key])
+                )
+            ),
+        )
 
     def get_blocked_moves(self, reaching: Bools) -> tuple[Ints, Ints, Ints]:
-        """Return the known blocked queries: cells, moves ahead, and left turns.
+        """Return the known blocked cells, moves ahead, and left turns, shape (K, 3) each.
 
         Args:
             reaching: Where only the base counts, shape (cells, cells).
-
-        Returns:
-            Cells and headings as in `is_cell_free`, `is_move_free` and `is_left_turn_free`, shape
-            (K, 3) each.
         """
         found = []
         for parts in self._blocked_moves:
             rows = [np.array(part, int).reshape(-1, 3) for part in parts]
-            found.append(
-                np.concatenate(
-                    [
-                        part[reaching[part[:, 0], part[:, 1]] == alone]
-                        for alone, part in enumerate(rows)
-                    ]
-                )
-            )
+            chosen = [row[reaching[row[:, 0], row[:, 1]] == only] for only, row in enumerate(rows)]
+            found.append(np.concatenate(chosen))
         return found[_FREE], found[_FORWARD], found[_LEFT]
 
-    def _store(self, key: tuple[int, int, int, int, int], free: bool) -> None:
-        """Cache an answer; `key` holds query, whether only the base counts, cell and heading."""
-        self._known[key] = free
-        if not free:
-            self._blocked_moves[key[0]][key[1]].append(key[2:])
+    def _query(self, key: tuple[int, int, int, int, int], check: Callable[[], bool]) -> bool:
+        """Return a cached answer; `key`: query, whether only the base counts, cell and heading."""
+        if self._known[key] < 0:
+            self._known[key] = check()
+            if not self._known[key]:
+                self._blocked_moves[key[0]][key[1]].append(key[2:])
+        return bool(self._known[key])
 
     def _is_roomy(self, i: int, j: int, reaching: bool) -> bool:
         """Return whether a cell is free at any heading."""
@@ -320,18 +260,14 @@ class BaseGrid:
             columns = slice(*np.searchsorted(y, [-support[24] - reach, support[8] + reach]))
             distance = (along_x[rows, None] + (along_y[columns] - support)).max(axis=2)
             for body, room in zip(bodies, rooms, strict=True):
-                np.minimum(
-                    room[rows, columns],
-                    distance - body.exclusion_radius[s],
-                    out=room[rows, columns],
-                )
+                part = room[rows, columns]
+                np.minimum(part, distance - body.exclusion_radius[s], out=part)
         return [room.tolist() for room in rooms]
 
     def compute_distances(self, starts: Floats, *, threads: int = 1) -> Floats:
         """Return lower bounds of the driving distance from places to every cell.
 
-        Turning is free, and only certain collisions of the base count. Each start takes about a
-        millisecond on 100 x 100 cells.
+        Turning is free, and only certain collisions of the base count.
 
         Args:
             starts: Places, shape (W, 2) [m].
@@ -348,12 +284,8 @@ class BaseGrid:
                 cells = cells[~blocked[cells[:, 0], cells[:, 1]]]
                 if len(cells):
                     break
-            entries.append(
-                (
-                    self.cells * cells[:, 0] + cells[:, 1],
-                    np.hypot(*(self.origin + cells * self.step - (x, y)).T),
-                )
-            )
+            lengths = np.hypot(*(self.origin + cells * self.step - (x, y)).T)
+            entries.append((self.cells * cells[:, 0] + cells[:, 1], lengths))
         firsts = np.cumsum([0, *(len(cells) for cells, _ in entries)])
         begins, costs = (np.concatenate(part) for part in zip(*entries, strict=True))
         return np.asarray(self._floor.distances(firsts, begins, costs, threads))

@@ -17,16 +17,16 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from vkc_pin.planning.base_paths.connections import EndConnections
 from vkc_pin.planning.base_paths.grid import HEADINGS
 from vkc_pin.planning.base_paths.motion_primitives import (
     BACKWARDS,
     UNIT,
+    Connections,
     Drive,
     SearchSpace,
     wrap_angle,
 )
-from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.utils.optional_imports import import_compiled
 
@@ -35,6 +35,72 @@ __all__ = ["find_cheapest_path"]
 _AHEAD, _BACK, _LEFT, _RIGHT = range(4)  # kinds of moves, as in `_driving.cpp`
 _BLOCKED, _NO_AHEAD, _NO_LEFT = 1, 2, 4  # flags of nodes
 _NONE = 2**60  # [UNIT] more than any path costs
+
+
+class _EndConnections:
+    """Connections of start and goals, with their costs.
+
+    Attributes:
+        starts: Connections of the start with the cells around it.
+        ends: Connections of all free goals, one goal after the other; costs include the goals' own.
+        goal: Goal of each of the `ends`.
+        direct: Straight drives from the start to goals as cost [UNIT], goal and kind (see
+            `SearchSpace.get_direct_drive`), the cheapest last.
+    """
+
+    def __init__(self, space: SearchSpace, extra: Floats) -> None:
+        self.space = space
+        self.starts = space.get_starts()
+        goals = [g for g, goal in enumerate(space.goals) if space.is_pose_free(goal)]
+        more = {goal: round(float(extra[goal]) / UNIT) for goal in goals}
+        ends = {goal: space.get_ends(goal) for goal in goals}
+        self.goal = np.repeat(np.array([*ends], int), [len(part.cell) for part in ends.values()])
+        parts = [(p.cell, p.heading, p.yaw, p.cost + more[goal]) for goal, p in ends.items()]
+        none = np.zeros(0, int)
+        columns = zip((none, none, np.zeros(0), none), *parts, strict=True)
+        self.ends = Connections(*map(np.concatenate, columns))
+        drives = [
+            (goal, how, space.get_direct_drive(goal, how)) for goal in goals for how in range(3)
+        ]
+        found = [
+            (self._compute_cost(*drive) + more[goal], goal, how)
+            for goal, how, drive in drives
+            if drive is not None
+        ]
+        self.direct = sorted(found, reverse=True)
+        self._checked_goals: set[int] = set()  # goals whose turning range was checked
+
+    def _compute_cost(self, drive: Drive, last: float) -> int:
+        turned = abs(drive.yaw - self.space.start[2]) + abs(last - drive.yaw)
+        return round((drive.cost * self.space.exit_cost + self.space.grid.turning * turned) / UNIT)
+
+    def is_start_free(self, number: int) -> bool:
+        """Return whether a connection from the start is free."""
+        space = self.space
+        return space.is_sweep_free(
+            float(space.start[2]), *space.get_start_drive(self.starts, number), space.exit_margins
+        )
+
+    def is_direct_free(self, goal: int, how: int) -> bool:
+        """Return whether a straight drive from the start to a goal is free."""
+        direct = self.space.get_direct_drive(goal, how)
+        return direct is not None and self.space.is_sweep_free(
+            float(self.space.start[2]), *direct, self.space.exit_margins
+        )
+
+    def find_blocked(self, number: int) -> Ints:
+        """Return the connections that are blocked along with one to a goal; none if it is free."""
+        space, goal = self.space, int(self.goal[number])
+        yaw = float(space.grid.yaws[self.ends.heading[number]])
+        if space.is_sweep_free(yaw, *space.get_goal_drive(self.ends, number, goal, yaw)):
+            return np.empty(0, int)
+        others = np.empty(0, int)
+        if goal not in self._checked_goals:
+            self._checked_goals.add(goal)
+            others = np.flatnonzero(
+                (self.goal == goal) & ~space.find_turnable(space.goals[goal], self.ends)
+            )
+        return np.append(others, number)
 
 
 def find_cheapest_path(
@@ -49,7 +115,7 @@ def find_cheapest_path(
     Returns:
         Cost [m], goal, drives with continuous yaws, and the yaw at the goal [rad].
     """
-    ends = EndConnections(space, extra)
+    ends = _EndConnections(space, extra)
     if not len(ends.goal):
         return None
     search = _Search(ends)
@@ -74,13 +140,9 @@ class _Search:
     """Moves of one search, from which blocked ones are removed.
 
     Nodes are numbered (i·cells + j)·HEADINGS + heading.
-
-    Attributes:
-        connections: Connections of start and goals.
-        paths: Compiled search of the cheapest paths.
     """
 
-    def __init__(self, connections: EndConnections) -> None:
+    def __init__(self, connections: _EndConnections) -> None:
         self.connections = connections
         self.space, self.grid = connections.space, connections.space.grid
         grid, starts, ends = self.grid, connections.starts, connections.ends
@@ -112,13 +174,7 @@ class _Search:
         return flags
 
     def is_path_free(self, path: list[int], begin: int, end: int) -> bool:
-        """Return whether a path is free; otherwise remove its blocked moves.
-
-        Args:
-            path: Nodes from the start on.
-            begin: Number of the connection from the start.
-            end: Number of the connection to a goal.
-        """
+        """Return whether a path is free; otherwise remove its blocked moves."""
         blocked = self.connections.find_blocked(end)
         if len(blocked):
             self.paths.close(blocked, True)

@@ -194,14 +194,7 @@ class SearchSpace:
     def _connections(
         self, pose: Floats, sign: float, radius: float, cost_factor: float
     ) -> Connections:
-        """Return connections from a pose (`sign` 1) or to it (-1).
-
-        Args:
-            pose: Pose, shape (3,).
-            sign: Direction of the connections.
-            radius: Range [m].
-            cost_factor: Cost of a metre.
-        """
+        """Return connections from a pose (`sign` 1) or to it (-1)."""
         grid = self.grid
         step = float(grid.step.max())
         cells = grid.find_cells_within(

@@ -212,16 +212,7 @@ def find_blocked_cells(
 
 
 def _compute_signed_distance(outline: Floats, x: Floats, y: Floats) -> Floats:
-    """Return signed distances from a convex polygon, negative inside.
-
-    Args:
-        outline: Corners, counter-clockwise, shape (n, 2) [m].
-        x: Coordinates of the rows, shape (X, 1) [m].
-        y: Coordinates of the columns, shape (1, Y) [m].
-
-    Returns:
-        Distances, shape (X, Y) [m].
-    """
+    """Return signed distances from a convex polygon, negative inside."""
     square, inside = (
         np.full((len(x), y.shape[1]), np.inf),
         np.full((len(x), y.shape[1]), len(outline) > 2),

@@ -16,6 +16,7 @@ from vkc_pin.planning.chain.kinematics import Kinematics, get_kinematics
 from vkc_pin.utils.arguments import check_instance
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.utils.cache import Cache
+from vkc_pin.world.models.articulated_object import Attachment
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.grafting import graft, graft_geometry, round_placement
 from vkc_pin.world.models.robot import Robot
@@ -54,9 +55,9 @@ class VirtualKinematicChain:
 
     Attributes:
         robot: The robot at its root.
-        model: `pinocchio.Model`; joint 1 is the planar virtual base, followed by the arm and, for
-            each grasp, the virtual joint of the attachment and the object's joints from the
-            attachable link to its base, inverted.
+        model: Joint 1 is the planar virtual base, followed by the arm and, for each grasp, the
+            virtual joint of the attachment and the object's joints from the attachable link to its
+            base, inverted.
         coordinates: Minimal coordinates z of `model`.
         names: Coordinate names, shape (n,); `<object>.<joint>` for objects, `<object>.<attachment>`
             for virtual joints.
@@ -110,14 +111,10 @@ class VirtualKinematicChain:
         return get_kinematics(self.model, self.cache)
 
     def joint_placements(self, z: Floats) -> tuple[Floats, Floats]:
-        """Return the world placements of all joints.
-
-        Args:
-            z: Configurations, shape (W, n).
+        """Return the world placements of all joints at z, shape (W, n); joint 0 is the world.
 
         Returns:
-            Rotations, shape (W, J, 3, 3), and translations, shape (W, J, 3) [m]; joint 0 is the
-            world.
+            Rotations, shape (W, J, 3, 3), and translations, shape (W, J, 3) [m].
         """
         batch, joints = len(z), self.model.njoints
         (columns,) = self._kinematics.batch(z)
@@ -144,11 +141,8 @@ class VirtualKinematicChain:
         """
         data, moves = self.model.createData(), self.coordinates.moves
         pin.forwardKinematics(self.model, data, pin.neutral(self.model))
-        linear, angular, fixed = (
-            np.zeros((len(moves), 3)),
-            np.zeros((len(moves), 3)),
-            np.zeros(len(moves), bool),
-        )
+        linear, angular = np.zeros((2, len(moves), 3))
+        fixed = np.zeros(len(moves), bool)
         for row, move in enumerate(moves):
             if str(self.model.joints[move.joint].shortname()) == "JointModelPlanar":
                 part = move.coordinate - self.coordinates.joints.index(move.joint)
@@ -157,13 +151,8 @@ class VirtualKinematicChain:
             else:
                 motion = np.asarray(data.joints[move.joint].S, float).ravel()
                 linear[row], angular[row] = motion[:3], motion[3:]
-        return (
-            np.array([m.coordinate for m in moves]),
-            np.array([m.joint for m in moves]),
-            linear,
-            angular,
-            fixed,
-        )
+        coordinates, joints = np.array([(move.coordinate, move.joint) for move in moves]).T
+        return coordinates, joints, linear, angular, fixed
 
     def point_jacobians(self, z: Floats, which: Ints, joint: Ints, point: Floats) -> Floats:
         """Return the Jacobians of points that are fixed in joints' frames, shape (C, 3, n).
@@ -177,19 +166,13 @@ class VirtualKinematicChain:
         coordinate, owner, linear, angular, fixed = self.motions
         rotations, translations = self.joint_placements(z)
         axes = rotations[:, owner]
-        linear_motion = np.where(fixed[:, None], linear, np.einsum("bnij,nj->bni", axes, linear))[
-            which
-        ]
-        angular_motion = np.einsum("bnij,nj->bni", axes, angular)[which]
-        motion = linear_motion + np.cross(
-            angular_motion, point[:, None] - translations[:, owner][which]
-        )
+        translating = np.where(fixed[:, None], linear, np.einsum("bnij,nj->bni", axes, linear))
+        rotating = np.einsum("bnij,nj->bni", axes, angular)[which]
+        arm = point[:, None] - translations[:, owner][which]
+        motion = translating[which] + np.cross(rotating, arm)
         motion = motion * self.carries[joint][:, owner, None]
-        return np.asarray(
-            np.add.reduceat(
-                motion, np.searchsorted(coordinate, np.arange(self.size)), axis=1
-            ).swapaxes(1, 2)
-        )
+        firsts = np.searchsorted(coordinate, np.arange(self.size))
+        return np.asarray(np.add.reduceat(motion, firsts, axis=1).swapaxes(1, 2))
 
     def opened(self, opening: float | None) -> pin.GeometryModel:
         """Return the collision geometry with the robot's gripper at an opening [m].
@@ -215,11 +198,9 @@ class VirtualKinematicChain:
 
     def holder(self, hold: Hold) -> tuple[int, pin.SE3]:
         """Return the joint that carries the frame of a hold, and the frame's placement on it."""
-        return (
-            self.frame(self.robot.tool_frame)
-            if hold.by is None
-            else self.frame(str(hold.link), hold.by)
-        )
+        if hold.by is None:
+            return self.frame(self.robot.tool_frame)
+        return self.frame(str(hold.link), hold.by)
 
     def frame(
         self, name: str, hold: Hold | None = None, *, opening: float | None = None
@@ -270,113 +251,67 @@ def consolidate(
     holds = resolve_holds(scene.objects, make_holds(holds) if isinstance(holds, Mapping) else holds)
     cache = Cache() if cache is None else check_instance(cache, Cache, "cache")
     model, collision = pin.Model(robot.model), pin.GeometryModel()
-    graft_geometry(
-        collision,
-        robot.collision.geometryObjects,
-        joints=list(range(model.njoints)),
-        placement=pin.SE3.Identity(),
-    )
+    shapes, joints = robot.collision.geometryObjects, list(range(model.njoints))
+    graft_geometry(collision, shapes, joints=joints, placement=pin.SE3.Identity())
     names = list(robot.coordinates.names)
-    limits = [list(robot.lower), list(robot.upper), list(robot.velocity), list(robot.acceleration)]
+    limits = [*zip(robot.lower, robot.upper, robot.velocity, robot.acceleration, strict=True)]
     held_geometries, closures, virtual, hold_coordinates = {}, {}, {}, {}
     prefixes: dict[Hold, str] = {}
     for hold in holds:
-        name = hold.object
-        placed = scene.objects[name]
-        attachment = placed.object.attachment(hold.attachment)
-        # Pinocchio finds frames by unique names: the second branch of an object needs another
-        # prefix.
+        name, placed = hold.object, scene.objects[hold.object]
+        item, attachment = placed.object, placed.object.attachment(hold.attachment)
+        # Pinocchio finds frames by unique names: a second branch of an object gets another prefix.
         prefix = prefixes[hold] = name + "'" * sum(other.object == name for other in prefixes) + "."
         holder = robot.tool_frame if hold.by is None else f"{prefixes[hold.by]}{hold.link}"
         tool = model.frames[model.getFrameId(holder)]
-        parent, placement = (
-            tool.parentJoint,
-            tool.placement * compute_hand_frame(robot, attachment) * attachment.offset.inverse(),
+        placement = tool.placement * compute_hand_frame(robot, attachment)
+        parent, placement, added = _add_virtual_joint(
+            model, tool.parentJoint, placement * attachment.offset.inverse(), attachment, name
         )
-        added = []
-        # J(v)⁻¹, tool to object: the axis of each joint is negated and the order of joints
-        # reversed.
-        for suffix, freedom in reversed(
-            [*zip(attachment.coordinates, attachment.freedoms, strict=True)]
-        ):
-            kind = (
-                pin.JointModelRevoluteUnaligned
-                if freedom.kind == "revolute"
-                else pin.JointModelPrismaticUnaligned
-            )
-            joint_name, joint, low, high = (
-                f"{name}.{suffix}",
-                kind(-freedom.axis),
-                freedom.lower,
-                freedom.upper,
-            )
-            own = [np.array([value]) for value in (np.inf, FREEDOM_VELOCITY, low, high)]
-            through = pin.SE3(np.eye(3), freedom.through)
-            parent = model.addJoint(
-                parent, joint, round_placement(placement * through), joint_name, *own
-            )
-            placement = through.inverse()
-            added.append(joint_name)
-            for row, value in zip(
-                limits, (low, high, FREEDOM_VELOCITY, FREEDOM_ACCELERATION), strict=True
-            ):
-                row.append(value)
         virtual[hold] = tuple(added)
-        tree = invert(placed.object, attachment.link, placed.state)
+        limits += added.values()
+        tree, shapes = invert(item, attachment.link, placed.state)
         placement = round_placement(placement * attachment.placement.inverse())
-        joints = graft(model, tree.model, parent=parent, placement=placement, prefix=prefix)
-        names += added
-        for joint_name in tree.model.names[1:]:
-            names.append(f"{name}.{joint_name}")
-            index = placed.object.coordinates.names.index(joint_name)
-            object_limits = (
-                placed.object.lower,
-                placed.object.upper,
-                placed.object.velocity,
-                placed.object.acceleration,
-            )
-            for row, values in zip(limits, object_limits, strict=True):
-                row.append(float(values[index]))
-        hold_coordinates[hold] = (
-            *added,
-            *(f"{name}.{joint_name}" for joint_name in tree.model.names[1:]),
-        )
-        base = model.frames[model.getFrameId(f"{prefix}{placed.object.base_link}")]
-        moving = list(tree.collision.geometryObjects)
-        if not placed.object.free:
+        joints = graft(model, tree, parent=parent, placement=placement, prefix=prefix)
+        of_object = zip(item.lower, item.upper, item.velocity, item.acceleration, strict=True)
+        rows = dict(zip(item.coordinates.names, of_object, strict=True))
+        limits += [rows[joint] for joint in tree.names[1:]]
+        hold_coordinates[hold] = (*added, *(f"{name}.{joint}" for joint in tree.names[1:]))
+        names += hold_coordinates[hold]
+        base = model.frames[model.getFrameId(f"{prefix}{item.base_link}")]
+        moving = list(shapes.geometryObjects)
+        if not item.free:
             # Links that the held joints do not move (a door's frame, another door in it) are fixed
             # in the world, whether or not the chain is closed.
             moving = [shape for shape in moving if joints[shape.parentJoint] != base.parentJoint]
         held_geometries[hold] = tuple(
             graft_geometry(collision, moving, joints=joints, placement=placement, prefix=prefix)
         )
-        target = placed.link_placement(placed.object.base_link)
+        target = placed.link_placement(item.base_link)
         closures[hold] = Closure(base.parentJoint, pin.SE3(base.placement), target)
-    for joint_name in names:
-        if names.count(joint_name) > 1:
+    for name in names:
+        if names.count(name) > 1:
             problem = (
                 "two coordinates share this name (two grasps of one joint, "
                 "or an attachment named like a joint of its object)"
             )
-            raise InputError(problem, field=joint_name, expected="unique coordinate names")
+            raise InputError(problem, field=name, expected="unique coordinate names")
     ride_geometries = {}
     for number, ride in enumerate(rides):
         frame = model.frames[model.getFrameId(prefixes[ride.hold] + ride.link)]
         placed = dataclasses.replace(
             scene.objects[ride.object], placement=frame.placement * ride.placement_in_link
         )
-        prefix = ride.object + "^" * (number + 1) + "."
-        shapes = make_world_shapes(placed)
         ride_geometries[ride] = tuple(
             graft_geometry(
                 collision,
-                shapes,
+                make_world_shapes(placed),
                 joints=[frame.parentJoint],
                 placement=pin.SE3.Identity(),
-                prefix=prefix,
+                prefix=ride.object + "^" * (number + 1) + ".",
             )
         )
-    lower, upper, velocity, acceleration = (np.array(row, float) for row in limits)
+    lower, upper, velocity, acceleration = np.array(limits, float).T.copy()
     return VirtualKinematicChain(
         robot=robot,
         model=model,
@@ -395,3 +330,26 @@ def consolidate(
         prefixes=prefixes,
         cache=cache,
     )
+
+
+def _add_virtual_joint(
+    model: pin.Model, parent: int, placement: pin.SE3, attachment: Attachment, name: str
+) -> tuple[int, pin.SE3, dict[str, tuple[float, float, float, float]]]:
+    """Add J(v)⁻¹, tool to object: reversed joints with negated axes.
+
+    Returns last joint, placement of the attachment on it, and coordinate names → limits.
+    """
+    added = {}
+    for suffix, freedom in reversed(
+        [*zip(attachment.coordinates, attachment.freedoms, strict=True)]
+    ):
+        revolute = freedom.kind == "revolute"
+        kind = pin.JointModelRevoluteUnaligned if revolute else pin.JointModelPrismaticUnaligned
+        low, high = freedom.lower, freedom.upper
+        bounds = [np.array([value]) for value in (np.inf, FREEDOM_VELOCITY, low, high)]
+        through = pin.SE3(np.eye(3), freedom.through)
+        at, joint_name = round_placement(placement * through), f"{name}.{suffix}"
+        parent = model.addJoint(parent, kind(-freedom.axis), at, joint_name, *bounds)
+        placement = through.inverse()
+        added[joint_name] = (low, high, FREEDOM_VELOCITY, FREEDOM_ACCELERATION)
+    return parent, placement, added

@@ -224,14 +224,7 @@ class _PairBuilder:
     def _apply_exemptions(
         self, phase: Phase, table: Floats, labels: Sequence[str], keys: Sequence[str]
     ) -> tuple[Floats, list[MarginRegion]]:
-        """Return pairs with the margins that the scene allows, and the joint-dependent exemptions.
-
-        Args:
-            phase: The phase.
-            table: Pairs and their usual margins, shape (P, 3).
-            labels: Labels of all shapes.
-            keys: Keys of all shapes, see `clearance_exemptions.make_shape_keys`.
-        """
+        """Return pairs with the margins that the scene allows, and the joint-dependent exemptions."""
         if not self._allowances:
             return table, []
         base = len(labels)
@@ -297,11 +290,6 @@ class _PairBuilder:
 
         Only `floor_movers` are paired with the floor: wheels stand on it, and the gap below doors
         is as modelled.
-
-        Args:
-            first: Index of the first obstacle.
-            moving: Moving geometries.
-            floor_movers: Those of them that can collide with the floor.
         """
         ones, others = np.array(moving, int), np.arange(len(self._obstacles))
         is_floor = np.array([label == FLOOR for label in self.scene.obstacle_labels], bool)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,15 +62,7 @@ class Contacts:
 
     def arrays(self) -> tuple[NDArray[Any], ...]:
         """Return the arrays in the order of the attributes."""
-        return (
-            self.waypoint,
-            self.pair,
-            self.distance,
-            self.margin,
-            self.normal,
-            self.first,
-            self.second,
-        )
+        return tuple(getattr(self, field.name) for field in dataclasses.fields(self))
 
     def select(self, index: Ints) -> Contacts:
         """Return the contacts at `index`, in that order."""
@@ -116,20 +109,18 @@ class ContactModel:
         self.first_waypoint = np.concatenate(
             [[0], np.cumsum([phase.segments for phase in task.phases])]
         )
-        openings = dict.fromkeys(phase.opening for phase in task.phases)
         placed = {
-            opening: ShapePlacements(chain.model, chain.opened(opening)) for opening in openings
+            opening: ShapePlacements(chain.model, chain.opened(opening))
+            for opening in dict.fromkeys(phase.opening for phase in task.phases)
         }
         self.phases = build_phase_geometries(scene, chain, task, options)
         self._clearances = [
             self._make_clearances(part, placed[phase.opening])
             for part, phase in zip(self.phases, task.phases, strict=True)
         ]
-        # All geometries after the chain's own are fixed in the world.
         own = [shape.parentJoint for shape in chain.collision.geometryObjects]
-        self._joints = np.array(
-            own + [0] * (max(len(part.labels) for part in self.phases) - len(own))
-        )
+        n_fixed = max(len(part.labels) for part in self.phases) - len(own)
+        self._joints = np.array(own + [0] * n_fixed)
 
     def _make_clearances(self, part: PhaseGeometry, placed: ShapePlacements) -> Clearances:
         moving = len(self.chain.collision.geometryObjects)
@@ -160,24 +151,18 @@ class ContactModel:
                 placed = dataclasses.replace(
                     self.scene.objects[name], placement=carrier * closure.local
                 )
-                shapes = zip(
-                    self.phases[number].released[name], make_world_shapes(placed), strict=True
-                )
-                where |= {index: shape.placement for index, shape in shapes}
+                placements = [shape.placement for shape in make_world_shapes(placed)]
+                where |= zip(self.phases[number].released[name], placements, strict=True)
             if where:
-                view.phases[number] = self.phases[number].with_placements(where)
-                view._clearances[number] = self._clearances[number].move_fixed(
-                    view.phases[number].boxes, where
-                )
+                view.phases[number] = part = self.phases[number].with_placements(where)
+                view._clearances[number] = self._clearances[number].move_fixed(part.boxes, where)
         return view
 
     def find_attached_geometries(self, phase: int) -> list[int]:
         """Return the geometries of grasped objects in a phase and of objects supported by them."""
         held, supported = self.task.phases[phase].held, self.task.phases[phase].supported
-        found = [self.chain.held_geometries[hold] for hold in held] + [
-            self.chain.ride_geometries[ride] for ride in supported
-        ]
-        return [i for indices in found for i in indices]
+        found = [self.chain.held_geometries[hold] for hold in held]
+        return [*itertools.chain(*found, *(self.chain.ride_geometries[ride] for ride in supported))]
 
     def find_phase(self, waypoint: int) -> int:
         """Return the phase of a waypoint: at a boundary the earlier one, before the grasp."""
@@ -236,9 +221,6 @@ class ContactModel:
     def first_blocked(self, z: Floats, waypoint: int, *, reach: float, allowed: float) -> int:
         """Return the first configuration with a shortfall of more than `allowed` [m]; W if none.
 
-        The search stops at that configuration. This saves most of the work of `evaluate` if only
-        the first collision matters.
-
         Args:
             z: Configurations, shape (W, n).
             waypoint: Waypoint whose phase all of them belong to.
@@ -262,24 +244,15 @@ class ContactModel:
         reach: float,
         allowed: float,
     ) -> Any:
-        """Return a checker of straight lines in the first coordinates.
-
-        See `Clearances.make_line_checker`.
-
-        Args:
-            z: Configuration that gives all other coordinates, shape (n,).
-            waypoint: Waypoint whose phase counts.
-            weights: Weight of each coordinate that moves, shape (m,).
-            step: Maximum weighted distance between consecutive checks.
-            reach: Pairs further apart are ignored [m].
-            allowed: Allowed margin shortfall [m].
-        """
-        places, clearances = (
+        """Return `Clearances.make_line_checker` of a waypoint's phase."""
+        return self._clearances[self.find_phase(waypoint)].make_line_checker(
             self.chain.coordinates.index_maps,
-            self._clearances[self.find_phase(waypoint)],
-        )
-        return clearances.make_line_checker(
-            places, z, waypoint, weights=weights, step=step, reach=reach, allowed=allowed
+            z,
+            waypoint,
+            weights=weights,
+            step=step,
+            reach=reach,
+            allowed=allowed,
         )
 
     def compute_placements(self, z: Floats) -> tuple[Floats, Floats]:
@@ -291,9 +264,8 @@ class ContactModel:
             self.chain.joint_placements(z[row : row + _KINEMATICS_BATCH])
             for row in range(0, max(len(z), 1), _KINEMATICS_BATCH)
         ]
-        return np.concatenate([rotations for rotations, _ in parts]), np.concatenate(
-            [moves for _, moves in parts]
-        )
+        rotations, translations = map(np.concatenate, zip(*parts, strict=True))
+        return rotations, translations
 
     def get_joints(self, geometries: Ints) -> Ints:
         """Return the chain's joints that carry `geometries`; 0 for geometry fixed in the world."""
@@ -302,10 +274,8 @@ class ContactModel:
     def compute_gradients(self, z: Floats, contacts: Contacts) -> Floats:
         """Return the distance gradients n·(∂b − ∂a) of contacts at `z`, shape (C, n)."""
         joints = self.get_joints(contacts.pair)
-        which, points = (
-            np.tile(contacts.waypoint, 2),
-            np.concatenate([contacts.first, contacts.second]),
-        )
+        which = np.tile(contacts.waypoint, 2)
+        points = np.concatenate([contacts.first, contacts.second])
         first, second = np.split(self.chain.point_jacobians(z, which, joints.T.ravel(), points), 2)
         return np.asarray(np.einsum("ci,cij->cj", contacts.normal, second - first))
 
@@ -320,14 +290,10 @@ class ContactModel:
         found, phase_of = np.empty((len(z), 3)), self.find_phases(waypoints)
         for number in set(phase_of.tolist()):
             members = np.flatnonzero(phase_of == number)
-            where = self._clearances[number].placements.compute_placements(
-                self.chain.coordinates.q(z[members])
-            )
-            found[members] = (
-                self._clearances[number]
-                .shapes.compute_witnesses(where, np.arange(len(members)), pairs[members])
-                .normal
-            )
+            clearances, rows = self._clearances[number], np.arange(len(members))
+            q = self.chain.coordinates.q(z[members])
+            where = clearances.placements.compute_placements(q)
+            found[members] = clearances.shapes.compute_witnesses(where, rows, pairs[members]).normal
         return found
 
     def compute_planes(self, z: Floats, contacts: Contacts, *, slots: int) -> tuple[Floats, Floats]:
@@ -353,10 +319,8 @@ class ContactModel:
         row, slot, normal = contacts.waypoint[keep], place[keep], contacts.normal[keep]
         offset = contacts.margin[keep].copy()
         rotations, translations = self.chain.joint_placements(z)
-        for column, points, sign in (
-            (0, contacts.first[keep], -1.0),
-            (1, contacts.second[keep], 1.0),
-        ):
+        for column, points, sign in ((0, contacts.first, -1.0), (1, contacts.second, 1.0)):
+            points = points[keep]
             joint = self._joints[contacts.pair[keep, column]]
             is_static = joint == 0
             offset[is_static] -= sign * np.einsum("ci,ci->c", normal[is_static], points[is_static])

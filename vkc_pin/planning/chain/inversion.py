@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -13,35 +12,15 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_instance
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.articulated_object import ArticulatedObject
-from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.grafting import add_joint, round_placement
 
-__all__ = ["InvertedTree", "invert"]
+__all__ = ["invert"]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class InvertedTree:
-    """An object re-rooted at one of its links: `model`'s universe frame is that link's frame.
-
-    Attributes:
-        model: Joints on the path from the link to the base link, with their names, coordinates and
-            limits, and a body frame for each link of the object, by its name.
-        collision, visual: The object's geometry, with its names, on the bodies of `model`.
-        coordinates: Minimal coordinates of `model`.
-        link: The new root link.
-        base_link: The object's base link, a body frame of `model`.
-    """
-
-    model: pin.Model
-    collision: pin.GeometryModel
-    visual: pin.GeometryModel
-    coordinates: Coordinates
-    link: str
-    base_link: str
-
-
-def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
-    """Re-root `obj` at `link`.
+def invert(
+    obj: ArticulatedObject, link: str, state: ArrayLike
+) -> tuple[pin.Model, pin.GeometryModel]:
+    """Re-root an object at a link, whose frame becomes the universe frame.
 
     With placement P and motion J(q) of a joint, parent → child is P·J(q), so child → parent is
     J(q)⁻¹·P⁻¹. For revolute and prismatic joints J(q)⁻¹ is the same joint with a negated axis. A
@@ -52,12 +31,12 @@ def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
     Args:
         obj: The object.
         link: The new root link.
-        state: Joint positions, shape (n,), [rad] or [m]. Joints that are not on the path from
-            `link` to the base link are locked at these values; the values of joints on the path do
-            not matter.
+        state: Joint positions, shape (n,), [rad] or [m], at which joints that are not on the path
+            from `link` to the base link are locked.
 
     Returns:
-        The inverted tree.
+        Joints on the path from the link to the base link, with their names and limits, and a body
+        frame for each link; and the collision geometry on these bodies.
 
     Raises:
         UnknownNameError: The object has no such link.
@@ -73,8 +52,7 @@ def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
 
     model = pin.Model()
     model.name = obj.name
-    # For each joint of the path: the joint of the new model that carries its body, and the body's
-    # placement on it.
+    # joint of the path → joint of the new model that carries its body, and the body's placement
     carrier: dict[int, tuple[int, pin.SE3]] = {path[0]: (0, root.placement.inverse())}
     for child, parent in pairwise(path):
         new_parent, body = carrier[child]
@@ -101,27 +79,16 @@ def invert(obj: ArticulatedObject, link: str, state: ArrayLike) -> InvertedTree:
     for index, frame in enumerate(source.frames):
         if frame.type == pin.FrameType.BODY:
             new, placement = place(frame.parentJoint, frame.placement)
-            frames[index] = model.addFrame(
-                pin.Frame(frame.name, new, 0, placement, pin.FrameType.BODY), False
-            )
+            body_frame = pin.Frame(frame.name, new, 0, placement, pin.FrameType.BODY)
+            frames[index] = model.addFrame(body_frame, False)
 
-    def transfer_geometry(geometry: pin.GeometryModel) -> pin.GeometryModel:
-        transferred = pin.GeometryModel()
-        for shape in geometry.geometryObjects:
-            copy = pin.GeometryObject(shape)
-            copy.parentJoint, copy.placement = place(shape.parentJoint, shape.placement)
-            copy.parentFrame = frames[shape.parentFrame]
-            transferred.addGeometryObject(copy)
-        return transferred
-
-    return InvertedTree(
-        model=model,
-        collision=transfer_geometry(obj.collision),
-        visual=transfer_geometry(obj.visual),
-        coordinates=Coordinates(model),
-        link=link,
-        base_link=obj.base_link,
-    )
+    collision = pin.GeometryModel()
+    for shape in obj.collision.geometryObjects:
+        copy = pin.GeometryObject(shape)
+        copy.parentJoint, copy.placement = place(shape.parentJoint, shape.placement)
+        copy.parentFrame = frames[shape.parentFrame]
+        collision.addGeometryObject(copy)
+    return model, collision
 
 
 def _align_with_z(model: pin.Model, data: pin.Data, index: int) -> tuple[pin.JointModel, Floats]:

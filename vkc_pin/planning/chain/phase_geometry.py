@@ -52,32 +52,10 @@ class PhaseGeometry:
     margin_regions: Sequence[MarginRegion] = ()
     released: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
-    def margins_at(
-        self, pairs: Ints, waypoints: Ints, z: Floats | None = None, rows: Ints | None = None
-    ) -> Floats:
-        """Return the margins of pairs at waypoints, shape (n,) [m]; -inf: none.
-
-        Args:
-            pairs: Pair numbers, shape (n,).
-            waypoints: Waypoints, shape (n,).
-            z: Configurations, shape (W, m). If None, `margin_regions` are ignored.
-            rows: Configuration of each pair, shape (n,).
-        """
-        if z is None:
-            return self._base_margins.compute_margins(
-                pairs, waypoints, np.empty((1, 0)), np.zeros(len(pairs), int)
-            )
-        return self.margin_table.compute_margins(
-            pairs, waypoints, z, np.arange(len(z)) if rows is None else rows
-        )
-
     def with_placements(self, placements: Mapping[int, pin.SE3]) -> PhaseGeometry:
         """Return a copy with some static geometries at other placements in the world."""
-        shapes, rotation, translation = (
-            list(self.shapes),
-            self.rotation.copy(),
-            self.translation.copy(),
-        )
+        shapes = list(self.shapes)
+        rotation, translation = self.rotation.copy(), self.translation.copy()
         for geometry, placement in placements.items():
             shapes[geometry] = pin.GeometryObject(shapes[geometry])
             shapes[geometry].placement = placement
@@ -92,13 +70,7 @@ class PhaseGeometry:
         return moved
 
     def find_static_near(self, reach: float, lower: Floats, upper: Floats) -> Ints:
-        """Return the static geometries that may be within `reach` of an axis-aligned box.
-
-        Args:
-            reach: Distance [m].
-            lower: Lower corner of the box, shape (3,) [m].
-            upper: Upper corner, shape (3,) [m].
-        """
+        """Return static geometries within `reach` [m] of a box with corners lower and upper, (3,)."""
         lows, highs = self._static_boxes
         near = (lows < (upper + reach)[:, None]) & (highs > (lower - reach)[:, None])
         return np.flatnonzero(near.all(axis=0)) + self._n_moving
@@ -112,11 +84,6 @@ class PhaseGeometry:
     def margin_table(self) -> Margins:
         """Margins of all pairs with their exceptions."""
         return Margins(self.margins, self.reduced_margins, self.margin_regions)
-
-    @cached_property
-    def _base_margins(self) -> Margins:
-        """Margins without `margin_regions`."""
-        return Margins(self.margins, self.reduced_margins)
 
     @cached_property
     def _n_moving(self) -> int:

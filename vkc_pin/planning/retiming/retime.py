@@ -108,13 +108,7 @@ def retime_trajectory(
 
 
 def _subdivide(positions: Floats, places: Ints, rolling: RollingLimits) -> Floats:
-    """Return waypoints, shape (T, n), and points on the lines (wheeled bases: arcs) between them.
-
-    Args:
-        positions: The waypoints.
-        places: Index of each waypoint among the points, shape (T,).
-        rolling: Motion constraints of the base.
-    """
+    """Return waypoints, shape (T, n), and points on the lines (wheeled bases: arcs) between them."""
     at = np.interp(np.arange(places[-1] + 1), places, np.arange(len(places)))
     points = np.stack(
         [np.interp(np.arange(places[-1] + 1), places, column) for column in positions.T], axis=-1
@@ -127,12 +121,7 @@ def _subdivide(positions: Floats, places: Ints, rolling: RollingLimits) -> Float
 
 
 def _split_into_runs(is_still: Bools, moving_joints: Bools) -> Iterator[list[int]]:
-    """Yield the steps of each run between stops, see `retime_trajectory`.
-
-    Args:
-        is_still: Mask of steps without motion, shape (N,).
-        moving_joints: Mask of steps in which each joint of an object moves, shape (N, k).
-    """
+    """Yield the steps of each run between stops, see `retime_trajectory`."""
     stops = (moving_joints[1:] != moving_joints[:-1]).any(axis=1) | (is_still[1:] != is_still[:-1])
     edges = [0, *(np.flatnonzero(stops) + 1).tolist(), len(is_still)]
     yield from (list(range(first, last)) for first, last in itertools.pairwise(edges))
@@ -145,11 +134,7 @@ def _follow_waypoints(
     rolling: RollingLimits,
     torque_bounds: TorqueBounds | None,
 ) -> list[tuple[Curve, Ints]]:
-    """Return curves through waypoints, shape (m, n), from stop to stop.
-
-    Returns:
-        Each curve with the indices of its knots at waypoints, except the first.
-    """
+    """Return curves through waypoints, shape (m, n), from stop to stop."""
     bounds = limits.lower, limits.upper
     if not rolling.is_omnidirectional:
         return list(
@@ -262,15 +247,7 @@ def _retime_path(
 def _follow_at_speeds(
     path: CubicHermiteSpline, places: Floats, points: Floats, speeds: Floats, limits: Limits
 ) -> tuple[Curve, Ints]:
-    """Return the curve along a path at given speeds, and the waypoints' knots.
-
-    Args:
-        path: The path.
-        places: Path positions, shape (K,).
-        points: Waypoints, shape (m, n).
-        speeds: Path velocities at `places`, shape (K,).
-        limits: Limits of the path's coordinates.
-    """
+    """Return the curve along a path at given speeds, and the waypoints' knots."""
     times = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(places) / (speeds[1:] + speeds[:-1]))])
     return _follow_at_pace(path, Curve(times, places[:, None], speeds[:, None]), points, limits)
 
@@ -278,14 +255,7 @@ def _follow_at_speeds(
 def _follow_at_pace(
     path: CubicHermiteSpline, pace: Curve, points: Floats, limits: Limits
 ) -> tuple[Curve, Ints]:
-    """Return the curve along a path at a pace, or slower, and the knots of the waypoints.
-
-    Args:
-        path: The path.
-        pace: Progress along the path over time.
-        points: Waypoints, shape (m, n).
-        limits: Limits of the path's coordinates.
-    """
+    """Return the curve along a path at a pace, or slower, and the knots of the waypoints."""
     if limits.has_unlimited_jerk:
         places = pace.positions[:, 0]
         curve = limits.slow_down(Curve(pace.times, path(places), path(places, 1) * pace.rates))
@@ -314,11 +284,6 @@ def _make_straight_curve(points: Floats, limits: Limits, least: Floats) -> Curve
 
     3s² − 2s³ has a peak velocity of 1.5 and a peak acceleration of 6, which is attained in a jump.
     With jerk limits the acceleration is therefore almost zero.
-
-    Args:
-        points: The waypoints.
-        limits: Limits of the coordinates.
-        least: Minimum duration of each step, shape (m − 1,) [s].
     """
     distances = np.abs(np.diff(points, axis=0))
     acceleration = limits.acceleration * (1.0 if limits.has_unlimited_jerk else _JUMP_RATIO)

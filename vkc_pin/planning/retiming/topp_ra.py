@@ -85,7 +85,7 @@ def _import_toppra() -> None:
     names = [name for name in ("matplotlib", "matplotlib.pyplot") if name not in sys.modules]
     placeholders = {name: _Placeholder(name) for name in names}
     if "matplotlib" in placeholders:
-        placeholders["matplotlib"].pyplot = placeholders["matplotlib.pyplot"]
+        placeholders["matplotlib"].__dict__["pyplot"] = placeholders["matplotlib.pyplot"]
     sys.modules |= placeholders
     try:
         logger = logging.getLogger(import_module("toppra").__name__)

@@ -77,15 +77,7 @@ class TorqueBounds:
         velocities: Floats,
         accelerations: Floats,
     ) -> Floats:
-        """Return the torques relative to their limits, shape (K, m).
-
-        Args:
-            pieces: Piece of the path or curve, shape (K,).
-            n_pieces: Number of pieces of the path or curve.
-            positions: Configurations, shape (K, n).
-            velocities: Velocities, shape (K, n).
-            accelerations: Accelerations, shape (K, n).
-        """
+        """Return the torques relative to their limits, shape (K, m)."""
         torques = self._torques.at(
             self._phases[pieces // (n_pieces // len(self._phases))],
             positions,

@@ -157,11 +157,6 @@ def _compute_curvatures(turns: Floats, distances: Floats, radius: float) -> Floa
     A step with curvature κ in the middle of the arc, and a and b at its ends, has curvature 3/2·κ −
     (a + b)/4 half-way. This is at most 1/r if both are at least 3κ − 2/r. Otherwise the curvature
     is the mean of the adjacent steps'.
-
-    Args:
-        turns: Rotation in each step, shape (m − 1,) [rad].
-        distances: Distance driven in each step, shape (m − 1,) [m].
-        radius: Minimum turning radius r [m].
     """
     curvatures = radius * turns / np.where(np.abs(distances) > _MIN_DISTANCE, distances, np.inf)
     lower, upper = np.minimum(3.0 * curvatures - 2.0, 1.0), np.maximum(3.0 * curvatures + 2.0, -1.0)
@@ -174,15 +169,7 @@ def _compute_curvatures(turns: Floats, distances: Floats, radius: float) -> Floa
 
 
 class _StepFitter:
-    """Fits the steps of a base from pose to pose, each parametrised by s from 0 to 1.
-
-    Args:
-        poses: (x, y, yaw), shape (N + 1, 3).
-        slopes: Derivatives of yaw and distance along the path at the poses, shape (N + 1, 2).
-        spans: Path lengths of the steps, shape (N,).
-        distances: Distances driven in the steps, shape (N,) [m].
-        parts: Pieces per step; knots are at their ends.
-    """
+    """Fits the steps of a base from pose to pose, each parametrised by s from 0 to 1."""
 
     def __init__(
         self, poses: Floats, slopes: Floats, spans: Floats, distances: Floats, parts: int
@@ -253,9 +240,6 @@ class _StepFitter:
 
         A bump that only corrects rounding increases the curvature of a short step as much as a
         turn.
-
-        Returns:
-            The remaining gaps, see `compute_gap`.
         """
         fitted = self.distances, self.distance_bumps, self.heading_bumps
         self.distances, self.distance_bumps, self.heading_bumps = (
@@ -282,11 +266,7 @@ class _StepFitter:
         )
 
     def evaluate_knots(self, gaps: Floats) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
-        """Return poses and distances at the knots, with their derivatives, gaps distributed.
-
-        Returns:
-            Poses, shape (K, 3), their derivatives, and (distances, derivatives), shape (K,) each.
-        """
+        """Return poses and distances at the knots, with their derivatives, gaps distributed."""
         s = np.arange(self.parts + 1) / self.parts
         pieces = (
             (self._compute_velocity() * self._weights)
@@ -326,17 +306,7 @@ class _StepFitter:
 def _evaluate_hermite(
     s: Floats, change: Floats, before: Floats, after: Floats
 ) -> tuple[Floats, Floats]:
-    """Return cubics from 0 to `change` with given end slopes, and their derivatives, at s.
-
-    Args:
-        s: Parameters, shape (K,).
-        change: Values at s = 1, shape (N, 1).
-        before: Slopes at s = 0, shape (N, 1).
-        after: Slopes at s = 1, shape (N, 1).
-
-    Returns:
-        Values and derivatives, shape (N, K) each.
-    """
+    """Return cubics from 0 to `change` with given end slopes, and their derivatives, at s."""
     value = change * (3.0 - 2.0 * s) * s**2 + before * s * (1.0 - s) ** 2 - after * s**2 * (1.0 - s)
     slope = (
         change * 6.0 * (s - s**2)

@@ -73,33 +73,6 @@ def test_masses_and_inertias_match_pinocchio() -> None:
     np.testing.assert_allclose(found.inertia, expected.inertia, rtol=0.0, atol=1e-4)
 
 
-def test_limits_and_rates_match_the_request() -> None:
-    thing = load_object(built().description)
-    assert (thing.name, thing.links, thing.urdf) == ("thing", ("base", "tray"), None)
-    assert (thing.lower[0], thing.upper[0], thing.velocity[0], thing.acceleration[0]) == (
-        -0.1,
-        0.3,
-        0.5,
-        1.5,
-    )
-    np.testing.assert_allclose(
-        thing.link_placement("tray", [0.2]).translation, [-0.2, 0.0, 0.6], rtol=0.0, atol=1e-12
-    )
-
-
-def test_visual_shapes_equal_collision_shapes() -> None:
-    thing = load_object(built().description)
-    drawn, solid = (
-        [
-            (type(shape.geometry).__name__, shape.placement.homogeneous.tolist())
-            for shape in geometry.geometryObjects
-        ]
-        for geometry in (thing.visual, thing.collision)
-    )
-    assert drawn == solid
-    assert len(drawn) == 5
-
-
 def test_a_case_is_open_in_front_and_closed_elsewhere() -> None:
     link = LinkBuilder("case")
     link.add_case((0.0, -0.3, 0.1), (0.5, 0.3, 0.9), 0.02, "white", "oak")

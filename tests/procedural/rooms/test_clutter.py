@@ -34,10 +34,12 @@ def parts(scene: vkc.Scene) -> tuple[list, list]:
     ], new
 
 
-@settings(max_examples=5, deadline=None)
-@given(st.integers(0, 2**31), st.integers(1, 60))
+@settings(max_examples=2, deadline=None)
+@given(st.integers(0, 2**31), st.integers(1, 25))
 def test_clutter_rests_or_hangs_without_collisions(seed: int, things: int) -> None:
-    old, new = parts(add_clutter(home(), things, seed=seed, clear=[PLACE]))
+    scene = add_clutter(home(), things, seed=seed, clear=[PLACE])
+    assert add_clutter(home(), things, seed=seed, clear=[PLACE]).document == scene.document
+    old, new = parts(scene)
     assert len(new) == things
     for shape in new:
         picture = isinstance(shape.geometry, coal.Box) and 2 * min(shape.geometry.halfSide) == 0.025
@@ -58,7 +60,7 @@ def test_clutter_rests_or_hangs_without_collisions(seed: int, things: int) -> No
 
 
 def test_clutter_keeps_free_places_clear() -> None:
-    _, new = parts(add_clutter(home(), 250, seed=2, clear=[PLACE]))
+    _, new = parts(add_clutter(home(), 100, seed=2, clear=[PLACE]))
     shapes = [(shape.geometry, shape.placement) for shape in new]
     ball = vkc.load_scene("household").objects["cup"].placement.copy()
     for middle, radius in [
@@ -69,18 +71,11 @@ def test_clutter_keeps_free_places_clear() -> None:
         assert compute_clearance(shapes, [(coal.Sphere(radius), ball)]) > -1e-6
 
 
-def test_clutter_depends_on_the_seed() -> None:
-    one, same, other = (add_clutter(home(), 20, seed=seed).document for seed in (3, 3, 4))
-    assert one == same
-    assert one != other
-
-
 def test_too_much_clutter_is_rejected() -> None:
-    with pytest.raises(InputError, match="no space"):
-        add_clutter(home(), 5000)
-    with pytest.raises(InputError, match="no space"):
-        add_clutter(
-            vkc.Scene.from_document({"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}}), 1
-        )
+    shelf = {"name": "shelf", "type": "box", "size": [0.4, 0.4, 0.5], "position": [2, 0, 0.25]}
+    empty = {"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}}
+    for obstacles, things in (([shelf], 30), ([], 1)):
+        with pytest.raises(InputError, match="no space"):
+            add_clutter(vkc.Scene.from_document({**empty, "obstacles": obstacles}), things)
     with pytest.raises(InputError, match="things"):
         add_clutter(home(), -1)

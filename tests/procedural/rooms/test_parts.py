@@ -7,7 +7,7 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin.procedural.rooms import parts
-from vkc_pin.procedural.rooms.fixtures import OPENABLE, make_fixture
+from vkc_pin.procedural.rooms.fixtures import make_fixture
 from vkc_pin.procedural.rooms.footprints import Floor, Frame
 from vkc_pin.world.models.shapes import compute_clearance, compute_world_box, list_placed_shapes
 from vkc_pin.world.scene.placed_object import make_world_shapes
@@ -64,14 +64,9 @@ def test_a_shelf_stands_against_its_wall() -> None:
     assert min(np.diff(boards)) > 0.3
 
 
-def test_a_box() -> None:
-    box = parts.make_box("box", Frame(1.0, 2.0, np.pi / 2), (0.4, 0.6, 0.8), "red")
-    low, high = extent(scene(box))
-    assert [*low, *high] == pytest.approx([0.7, 1.8, 0.0, 1.3, 2.2, 0.8], abs=1e-3)
-
-
-@pytest.mark.parametrize("kind", [*OPENABLE, "random_oven", "random_door", "random_chest"])
-@pytest.mark.parametrize("side", range(4))
+@pytest.mark.parametrize(
+    ("kind", "side"), [("door", 0), ("drawer", 1), ("random_oven", 2), ("random_door", 3)]
+)
 def test_openable_object_is_at_its_wall_with_free_floor(kind: str, side: int) -> None:
     part = parts.make_openable(kind, make_fixture(kind, side), FLOOR, side, 0.5, 1.8)
     room = scene(part, walls=True)
@@ -100,8 +95,9 @@ def test_openable_object_is_at_its_wall_with_free_floor(kind: str, side: int) ->
     assert FLOOR.compute_half_length(side + 1) - abs(np.array(part.standing_place)[side % 2]) > 0.8
 
 
-@pytest.mark.parametrize("kind", ["random_microwave", "random_faucet"])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    ("kind", "seed"), [("random_microwave", 0), ("random_faucet", 1), ("random_faucet", 2)]
+)
 def test_small_objects_are_on_a_counter(kind: str, seed: int) -> None:
     part = parts.make_openable("it", make_fixture(kind, seed), FLOOR, 2, 0.3, 1.8)
     low, high = extent(scene(part))

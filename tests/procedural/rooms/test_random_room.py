@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import itertools
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from helpers.grippers import write_gripper
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
@@ -20,8 +17,6 @@ from vkc_pin.procedural.rooms.fixtures import OPENABLE, make_fixture
 from vkc_pin.procedural.rooms.random_room import Layout, sample_layout
 from vkc_pin.world.models.shapes import (
     compute_clearance,
-    compute_shape_distance,
-    compute_world_box,
     list_placed_shapes,
 )
 from vkc_pin.world.scene.obstacles import FLOOR
@@ -53,9 +48,9 @@ def groups(layout: Layout, scene: vkc.Scene) -> dict[str, list]:
     return found
 
 
-@settings(max_examples=12, deadline=None, phases=[Phase.generate])
+@settings(max_examples=4, deadline=None, phases=[Phase.generate])
 @given(NUMBERS, st.floats(0.0, 1.0), OBJECTS, st.booleans())
-def test_a_room_is_sound(
+def test_rooms_are_free_of_overlaps_and_have_places_to_stand(
     number: int, clutter: float, objects: tuple[str, ...] | None, cup: bool
 ) -> None:
     layout = sample_layout(
@@ -103,87 +98,16 @@ def test_a_room_is_sound(
 
 
 def test_random_rooms_are_reproducible() -> None:
-    one, same, other = (
-        vkc.procedural.random_room(number, clutter=0.7).document for number in (5, 5, 6)
-    )
-    assert one == same
+    one, other = (vkc.procedural.random_room(number, clutter=0.3).document for number in (5, 6))
     assert one != other
-    assert vkc.procedural.random_room(5, clutter=0.2).document != one
-    assert vkc.procedural.random_room(5, vkc.procedural.RoomSettings(clutter=0.7)).document == one
-    assert vkc.procedural.random_room(np.int64(5), clutter=0.7).document == one  # type: ignore[arg-type]
+    assert vkc.procedural.random_room(5, vkc.procedural.RoomSettings(clutter=0.3)).document == one
 
 
-def test_another_process_makes_the_same_room() -> None:
-    code = "import json, vkc_pin as vkc; print(json.dumps(vkc.procedural.random_room(8, clutter=0.4).document))"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
-    )
-    assert yaml.safe_load(done.stdout) == vkc.procedural.random_room(8, clutter=0.4).document
-
-
-def test_one_room_in_numbers() -> None:
-    """It must stay what it is on all machines: results on record are of these rooms."""
+def test_room_zero_is_the_same_on_all_machines() -> None:
+    """Recorded results refer to these rooms."""
     layout = sample_layout(0)
     assert (layout.floor.width, layout.floor.depth) == (5.54, 6.85)
     assert [part.name for part in layout.parts][:2] == ["narrow_door", "table_1"]
-
-
-def test_a_room_can_be_saved(tmp_path: Path) -> None:
-    room = vkc.procedural.random_room(2, objects=("door",), carried=("cup",))
-    file = tmp_path / "room.yaml"
-    file.write_text(yaml.safe_dump(room.document), encoding="utf-8")
-    again = vkc.load_scene(file)
-    assert again.document == room.document
-    for one, other in zip(room.obstacles, again.obstacles, strict=True):
-        assert one.placement.isApprox(other.placement)
-        assert (
-            compute_shape_distance(one.geometry, one.placement, other.geometry, other.placement)
-            < 0.0
-        )
-
-
-def test_random_objects_differ_between_rooms_and_are_saved(
-    tmp_path: Path,
-) -> None:
-    asked = ("random_drawers", "random_drawers", "random_microwave", "refrigerator")
-    rooms = [vkc.procedural.random_room(number, objects=asked, clutter=0.1) for number in (4, 5)]
-    assert list(rooms[0].objects) == ["drawers_1", "drawers_2", "microwave", "refrigerator"]
-    sizes = {
-        tuple(placed.object.upper)
-        for room in rooms
-        for name, placed in room.objects.items()
-        if "drawers" in name
-    }
-    assert len(sizes) == 4
-    assert {"microwave_counter", "microwave_worktop"} <= set(rooms[0].obstacle_names)
-    file = tmp_path / "room.yaml"
-    file.write_text(yaml.safe_dump(rooms[0].document), encoding="utf-8")
-    again = vkc.load_scene(file)
-    assert again.document == rooms[0].document
-    assert again.objects["drawers_1"].object.model == rooms[0].objects["drawers_1"].object.model
-
-
-def test_objects_by_path_and_by_description(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    description = vkc.procedural.random_object("chest", 3)
-    vkc.procedural.write_object(description, tmp_path / "my.chest.yaml")
-    monkeypatch.chdir(tmp_path)
-    room = vkc.procedural.random_room(
-        1,
-        objects=["./my.chest.yaml", tmp_path / "my.chest.yaml", description, "dishwasher"],
-        clutter=0.0,
-    )
-    assert list(room.objects) == ["my_chest_1", "my_chest_2", "chest", "dishwasher"]
-    monkeypatch.chdir("/")
-    again = vkc.Scene.from_document(room.document, room.folder)  # paths are whole
-    assert again.document == room.document
-    for name in room.objects:
-        low = min(
-            compute_world_box(shape.geometry, shape.placement)[0][2]
-            for shape in make_world_shapes(room.objects[name])
-        )
-        assert low == pytest.approx(0.0, abs=1e-4)
 
 
 def test_requested_parts_are_present() -> None:
@@ -199,20 +123,11 @@ def test_requested_parts_are_present() -> None:
     assert few < many
 
 
-@pytest.mark.parametrize("number", [-1, 1.5, True, "1"])
-def test_invalid_numbers_are_rejected(number: object) -> None:
-    with pytest.raises(vkc.InputError) as found:
-        vkc.procedural.random_room(number)  # type: ignore[arg-type]
-    assert (found.value.field, found.value.expected, found.value.got) == (
-        "number",
-        "a whole number of at least 0",
-        repr(number),
-    )
-
-
 def test_unknown_settings_and_parts_are_rejected() -> None:
     with pytest.raises(vkc.UnknownNameError, match="did you mean 'clutter'"):
         vkc.procedural.random_room(0, cluter=0.5)
+    with pytest.raises(vkc.InputError, match="a whole number of at least 0"):
+        vkc.procedural.random_room(-1)
     with pytest.raises(vkc.UnknownNameError, match="table_9"):
         sample_layout(0).find_part("table_9")
 
@@ -243,9 +158,3 @@ def test_imported_objects_and_robots(tmp_path: Path, monkeypatch: pytest.MonkeyP
     )
     assert room.robot.name == "mine"
     assert list(room.objects) == ["oven"]
-    assert (
-        vkc.procedural.random_room(
-            7, objects=["drawer"], robot=Path("mine"), clutter=0.0
-        ).robot.name
-        == "mine"
-    )  # type: ignore[arg-type]

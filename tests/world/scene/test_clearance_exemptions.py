@@ -16,13 +16,12 @@ from hypothesis import strategies as st
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.validation.validate import validate
-from vkc_pin.world.scene import clearance_exemptions as neighbours
 from vkc_pin.world.scene.clearance_exemptions import (
     ClearanceExemption,
     find_clearance_exemptions,
     find_close_pairs,
 )
-from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.scene.scene import Scene
 
 SAFE = 0.02
 # y of the side of the drawer's front, which reaches from x = 1.885 to 1.903 when it is shut
@@ -139,22 +138,6 @@ def test_exemptions_of_built_neighbours_hold_in_any_state() -> None:
     assert (other.shapes, other.margin, other.ranges) == (one.shapes, one.margin, one.ranges)
 
 
-def test_held_and_resting_objects_have_no_exemptions() -> None:
-    scene = load_scene("init_1")
-    assert find_close_pairs(scene, 0.3) == []
-    with pytest.warns(UserWarning, match="overlap by 10"):
-        sunk = changed(
-            scene, objects=[{**scene.document["objects"][0], "position": [2.5, 1.0, 0.76]}]
-        )
-    (close,) = find_close_pairs(sunk, SAFE)
-    assert close[:2] == ("stick.stick", "table_top")
-    held = sunk.with_held({"stick": "grip"})
-    assert find_close_pairs(held, SAFE) == []
-    assert (
-        find_clearance_exemptions(sunk, SAFE) == ()
-    )  # it may leave when it is lifted; that is not told by joints
-
-
 def test_exemption_is_active_where_every_joint_is_in_range() -> None:
     one = ClearanceExemption("a.b", "c", 0.0, 0.01, {"a.x": (0.0, 1.0), "a.y": (-np.inf, 0.5)})
     states = np.array([[9.0, 0.5, 0.0], [9.0, 1.5, 0.0], [9.0, 1.0, 0.6], [9.0, 0.0, -7.0]])
@@ -261,23 +244,6 @@ def test_allowed_margin_decides_about_a_leaf_that_turns_into_its_wall() -> None:
     assert vkc.plan(enough, [vkc.Actuate("door", HINGE)]).success
 
 
-def test_unreached_links_are_never_near() -> None:
-    """In a home, a refrigerator's door is near those links only that it reaches."""
-    home = load_scene("household")
-    standing = neighbours.PlacedShapes(home, home.objects)
-    label, values = "refrigerator.door", np.linspace(0.0, 2.0, 9)
-    reached = standing.find_links_near_sweep(label, 0, values)
-    others = {one for one in standing.labels if not one.startswith("refrigerator.")}
-    met = {
-        one
-        for one in others
-        if standing.compute_distances(label, 0, values, standing.find_shapes([one]), 0.0).min()
-        < 0.0
-    }
-    assert met <= reached
-    assert len(reached & others) < len(others) / 5
-
-
 LEAF = (
     '<robot name="d"><link name="frame"/><link name="leaf">{leaf}'
     '<collision><origin xyz="-0.07 -0.7 1"/><geometry><box size="0.02 0.02 0.2"/></geometry></collision></link>'
@@ -338,48 +304,3 @@ def test_exemption_applies_to_shapes_not_links(tmp_path: Path) -> None:
     (hit,) = (found for found in report.violations if found.constraint == "penetration")
     assert hit.subject == "door.leaf – wall"
     assert hit.amount == pytest.approx(0.161, abs=0.002)
-
-
-def test_overlap_of_two_joints_is_bounded_by_each_alone() -> None:
-    """A lever on a leaf, 5 mm inside a panel: only overlaps by one joint alone are exempt."""
-    lever = (
-        '<link name="lever">{}</link><joint name="turn" type="revolute"><parent link="leaf"/><child link="lever"/>'
-        '<origin xyz="0.055 -0.4 1"/><axis xyz="1 0 0"/><limit lower="0" upper="0.5" velocity="1" effort="1"/></joint></robot>'
-    ).format(box("0.025 0.1 0", "0.05 0.3 0.03"))
-    urdf = LEAF.format(leaf=box("0.02 -0.4 1", "0.04 0.8 2")).replace("</robot>", lever)
-    attachment = {
-        "name": "h",
-        "link": "leaf",
-        "position": [-0.07, -0.7, 1.0],
-        "approach": [1, 0, 0],
-        "closing": [0, 1, 0],
-    }
-    document = {
-        "robot": "husky_ur5e",
-        "start": {"base": [-1.5, 0, 0]},
-        "objects": [
-            {
-                "name": "door",
-                "position": [1.5, 0.4, 0],
-                "type": {"urdf": urdf, "attachments": [attachment]},
-            }
-        ],
-        "obstacles": [
-            {"name": "panel", "type": "box", "size": [0.06, 0.5, 0.5], "position": [1.63, 0.3, 1.0]}
-        ],
-    }
-    with pytest.warns(UserWarning, match=r"door\.lever – panel overlap by 5"):
-        scene = Scene.from_document(document)
-    (one,) = (one for one in find_clearance_exemptions(scene, SAFE) if one.first == "door.lever")
-    assert set(one.ranges) == {"door.hinge", "door.turn"}
-    standing, least = neighbours.PlacedShapes(scene, scene.objects), 0.0
-    for index, upper in ((0, 1.5), (1, 0.5)):
-        (alone,) = standing.compute_distances(
-            "door.lever", index, np.linspace(0.0, upper, 2001), standing.find_shapes(["panel"]), 0.1
-        ).T
-        inside = (
-            alone[0][: int(np.argmax(alone[0] >= SAFE))] if (alone[0] >= SAFE).any() else alone[0]
-        )
-        least = min(least, float(inside.min()))
-    assert one.margin == pytest.approx(least, abs=1e-4)
-    assert one.margin < -0.004

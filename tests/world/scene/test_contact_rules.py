@@ -15,14 +15,10 @@ from helpers.small_problems import door_scene
 from vkc_pin.options import Options
 from vkc_pin.world.models.articulated_object import Attachment
 from vkc_pin.world.scene.contact_rules import (
-    CONTACT_WINDOW,
     compute_grasp_opening,
     compute_hand_clearance,
     compute_hand_frame,
     compute_start_opening,
-    find_grasped_link,
-    find_gripper_hold,
-    find_touch_links,
     is_rigid_grasp,
 )
 from vkc_pin.world.scene.hold import Hold
@@ -39,14 +35,6 @@ def door(attachment: str = "handle", **fields: object) -> Scene:
     given = scene.objects["door"].object.attachments
     changed: Attachment = dataclasses.replace(given[attachment], **fields)  # type: ignore[arg-type]
     return with_object(scene, attachments={**given, attachment: changed})
-
-
-def test_grasping_and_grasped_links() -> None:
-    scene = door_scene()
-    assert CONTACT_WINDOW == 1.0  # [s], as the pages say
-    assert find_grasped_link(scene, HANDLE) == LEVER
-    assert tuple(find_touch_links(scene, HANDLE)) == scene.robot.touch_links
-    assert find_touch_links(scene, THROUGH) == ("stick.tip",)
 
 
 @pytest.mark.parametrize(
@@ -89,14 +77,6 @@ def test_rigid_grasps(attachment: str, contact: str, firm: bool, as_one: bool) -
         attachment == "handle_free"
     )
     assert is_rigid_grasp(scene, Hold("door", attachment)) == as_one
-
-
-def test_hold_of_the_gripper_itself() -> None:
-    stick = Hold("stick", "grip")
-    assert find_gripper_hold([]) is None
-    assert find_gripper_hold([THROUGH]) is None
-    assert find_gripper_hold([THROUGH, stick]) is stick
-    assert find_gripper_hold([stick, THROUGH]) is stick
 
 
 def test_hand_frame_of_a_push_is_the_foremost_point() -> None:

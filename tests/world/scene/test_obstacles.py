@@ -11,7 +11,6 @@ import pydantic
 import pytest
 import trimesh
 
-from vkc_pin.errors import InputError
 from vkc_pin.world.models.shapes import compute_world_box, triangulate
 from vkc_pin.world.scene.obstacles import FLOOR, make_floor_shape, make_obstacle_shapes
 from vkc_pin.world.scene.scene_schema import ObstacleSchema
@@ -79,13 +78,6 @@ def test_a_urdf_stands_with_its_joints_at_zero(tmp_path: Path) -> None:
     for shape, local in zip(solid, where, strict=True):
         assert shape.placement.isApprox(POSE * local, 1e-12)
         np.testing.assert_array_equal(shape.meshColor, [1, 0, 0, 1])
-
-
-@pytest.mark.parametrize("kind", ["urdf", "mesh"])
-def test_missing_file_is_reported(kind: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError) as caught:
-        described(tmp_path, type=kind, file="none.obj")
-    assert caught.value.file == tmp_path / "none.obj"
 
 
 def test_the_floor_lies_under_the_whole_arena_and_a_border() -> None:

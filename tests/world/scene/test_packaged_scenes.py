@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable
 from functools import cache
 
@@ -182,17 +181,6 @@ def test_dimensions_match_the_paper(
     np.testing.assert_allclose(bounds(shapes), [low, high], atol=1e-9)
 
 
-def test_second_and_third_scene_add_obstacles_to_the_first() -> None:
-    first, *others = (dict(scene(f"init_{k}").document) for k in (1, 2, 3))
-    added = [{"crate_1", "crate_2"}, {"block"}]
-    for other, names in zip(others, added, strict=True):
-        count = len(first["obstacles"])
-        assert other["obstacles"][:count] == first["obstacles"]
-        assert {item["name"] for item in other["obstacles"][count:]} == names
-        same = {"name": first["name"], "obstacles": first["obstacles"]}
-        assert {**other, **same} == first
-
-
 @pytest.mark.parametrize(
     ("name", "state", "begin", "end"),
     [
@@ -235,24 +223,3 @@ def test_household_is_furnished_without_overlaps() -> None:
     for name, placed in here.objects.items():
         links = ("panel", "lever") if name == "door" else ()  # its frame fills an opening
         assert clearance(parts(placed, *links), surroundings(here, name)) > 9e-4, name
-
-
-def test_stick_and_ball_attachments() -> None:
-    """The hand slides and turns on the stick, and never grasps the ball from below."""
-    placed = scene("init_1").objects["stick"]
-    np.testing.assert_allclose(placed.link_placement("tip").translation, [2.75, 1.0, 0.771])
-    grip = placed.object.attachment("grip")
-    assert (grip.joint, grip.firm) == ("cylindrical", True)
-    for slide, turn in itertools.product((-0.095, 0.0, 0.095), (-1.2, 0.0, 1.2)):
-        tool = placed.link_placement("stick") * grip.placement * grip.motion([slide, turn])
-        gap = compute_clearance(hand(tool), list_placed_shapes(parts(placed)))
-        assert gap > GRASP_CLEARANCE
-    ball = load_object("ball").attachment("grip")
-    for turn in itertools.product((-1.5, 0.0, 1.5), repeat=3):
-        assert (ball.placement * ball.motion(turn)).rotation[2, 2] < 0.0
-
-
-def test_lever_holds_the_door_shut() -> None:
-    (latch,) = scene("corridor_door").objects["door"].object.latches
-    assert (latch.joint, latch.held_at, latch.released_by) == ("hinge", 0.0, "knob")
-    assert (latch.threshold, latch.engaged_within) == (0.5, 0.05)

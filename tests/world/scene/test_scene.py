@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ from helpers.rooms import TINY, load
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.scene.scene import Scene, load_scene
-from vkc_pin.world.scene.scene_schema import RegionSchema
 
 
 @pytest.fixture(scope="module")
@@ -116,26 +114,6 @@ def test_held_free_object_is_in_the_hand(tmp_path: Path) -> None:
     holds_the_door = TINY.replace("  arm: home\n", "  arm: home\n  held: {front: handle}\n")
     with pytest.raises(InputError, match=r"start\.held\.front"):
         load(tmp_path, holds_the_door).sample_start(np.random.default_rng(0))
-
-
-@pytest.mark.parametrize("yaw", [None, (0.5, 0.7)])
-def test_samples_fill_the_region(yaw: tuple[float, float] | None) -> None:
-    low, high = np.array([-1.0, 2.0, -np.pi]), np.array([3.0, 2.5, np.pi])
-    if yaw is not None:
-        low[2], high[2] = yaw
-    rng = np.random.default_rng(0)
-    drawn = np.array(
-        list(
-            itertools.islice(
-                RegionSchema(x=(-1.0, 3.0), y=(2.0, 2.5), yaw=yaw).sample_poses(rng), 2000
-            )
-        )
-    )
-    assert ((drawn >= low) & (drawn <= high)).all()
-    shares = (drawn - low) / (high - low)
-    counts = np.array([np.histogram(column, 4, (0.0, 1.0))[0] for column in shares.T])
-    assert (np.abs(counts - 500) < 100).all(), "evenly: five standard deviations are 97"
-    assert (np.abs(np.corrcoef(shares.T) - np.eye(3)) < 0.1).all()
 
 
 def test_start_limits_are_infinite_for_a_fixed_base() -> None:

@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.carrying import lifted
 from helpers.riding import TOP, cup, folder, plates, scene_of
 
 from vkc_pin.world.models.shapes import get_link_name
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.scene.support import (
-    RESTING_DISTANCE,
     compute_tilt,
     find_supported_objects,
     find_supports,
@@ -80,13 +78,3 @@ def test_tilt_ignores_the_heading(angle: float) -> None:
     first, last = (pin.utils.rotate("z", rng.uniform()) for _ in range(2))
     leaning = pin.SE3(first @ pin.utils.rotate("x", angle) @ last, rng.normal(size=3))
     assert compute_tilt(before, leaning * before) == pytest.approx(angle, abs=1e-9)
-
-
-def test_resting_distance_exceeds_rounding() -> None:
-    assert 1e-3 < RESTING_DISTANCE < 0.02
-    thin = [
-        {"name": "sheet", "type": "box", "size": [0.3, 0.3, 0.002], "position": [0.0, 0.0, 0.499]}
-    ]
-    for at, stands in ((0.5, True), (0.502, True), (0.51, False)):
-        assert on(scene_of([cup(at=(0.0, 0.0, at))], thin)) == ({"sheet"} if stands else set())
-    assert lifted(pin.SE3.Identity()).translation[2] > RESTING_DISTANCE

@@ -80,7 +80,13 @@ def test_opening_a_door_has_three_phases() -> None:
     assert all(phase.base is None and phase.frames == () for phase in task.phases)
 
 
-def test_turned_knob_needs_no_turn_phase() -> None:
+def test_latch_is_turned_only_where_it_is_engaged() -> None:
+    for state, names in (
+        ({"hinge": 0.3}, ["reach door.handle", "move door.hinge"]),
+        ({"hinge": 0.03}, ["reach door.handle", "turn door.knob", "move door.hinge, door.knob"]),
+    ):
+        task = phases([OPEN], door_scene().with_state("door", state))
+        assert [phase.name for phase in task.phases] == names
     task = phases([OPEN], door_scene().with_state("door", {"knob": 0.6}))
     assert [phase.name for phase in task.phases] == [
         "reach door.handle",
@@ -88,18 +94,6 @@ def test_turned_knob_needs_no_turn_phase() -> None:
     ]
     assert task.phases[1].ranges["door.knob"] == (TURNED, KNOB[1])
     assert task.phases[1].initial_values == {"door.hinge": 0.0, "door.knob": 0.6}
-
-
-def test_open_door_needs_no_turn_phase() -> None:
-    """Out of the latch's reach nothing needs turning; within it, it does."""
-    task = phases([OPEN], door_scene().with_state("door", {"hinge": 0.3}))
-    assert [phase.name for phase in task.phases] == ["reach door.handle", "move door.hinge"]
-    task = phases([OPEN], door_scene().with_state("door", {"hinge": 0.03}))
-    assert [phase.name for phase in task.phases] == [
-        "reach door.handle",
-        "turn door.knob",
-        "move door.hinge, door.knob",
-    ]
 
 
 def test_hinge_and_knob_together() -> None:
@@ -121,15 +115,6 @@ def test_hinge_and_knob_together() -> None:
     assert back.phases[3].values == {"door.knob": 0.0}
     assert back.phases[3].ranges == {"door.knob": KNOB}
     assert back.phases[3].initial_values == {"door.hinge": 1.2, "door.knob": TURNED}
-
-
-def test_object_of_two_steps_is_grasped_once() -> None:
-    task = phases([Grasp("door"), OPEN, Actuate("door", {"hinge": 0.5})])
-    assert [phase.name for phase in task.phases][2:] == [
-        "move door.hinge, door.knob",
-        "move door.hinge",
-    ]
-    assert task.phases[3].initial_values == {"door.hinge": 1.2, "door.knob": TURNED}
 
 
 def test_reach_has_one_frame_goal() -> None:
@@ -282,20 +267,6 @@ def test_present_or_previous_attachment_is_preferred() -> None:
     assert task.holds == (Hold("door", "handle_free"),)
     task = phases([OPEN], door_scene().with_held({"door": "handle_free"}))
     assert task.holds == (Hold("door", "handle_free"),)
-
-
-def test_attachment_that_cannot_release_the_latch_is_skipped() -> None:
-    """The plate moves the hinge, and no knob: while the latch is shut, it will not do."""
-    scene = with_link(door_scene(), "plate", "panel")
-    attachments = scene.objects["door"].object.attachments
-    thing = dataclasses.replace(
-        scene.objects["door"].object, attachments={"plate": attachments["plate"], **attachments}
-    )
-    scene = with_objects(scene, {"door": dataclasses.replace(scene.objects["door"], object=thing)})
-    assert phases([OPEN], scene).holds == (HANDLE,)
-    assert phases([OPEN], scene.with_state("door", {"hinge": 0.2})).holds == (
-        Hold("door", "plate"),
-    )
 
 
 def test_object_grasped_at_two_attachments_in_turn() -> None:

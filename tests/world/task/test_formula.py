@@ -6,7 +6,6 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from vkc_pin.errors import UnknownNameError
 from vkc_pin.world.task.formula import ROUNDING, Formula, State
 
 FRAMES, COORDINATES = ("tool", "cup.cup"), ("elbow_joint", "door.hinge")
@@ -52,20 +51,6 @@ def test_state_returns_the_named_quantities() -> None:
     ]
     expected += [x[:, 24], (x[:, 25] - before[:, 25]) / DT]
     np.testing.assert_allclose(formula.evaluate(x), np.stack(expected, axis=1), atol=1e-12)
-
-
-def test_formula_lists_its_inputs() -> None:
-    s = state()
-    assert not s.make_formula(s.position("tool")).uses_previous
-    s = state()
-    change = s.make_formula(s.rate("elbow_joint") * 2.0)
-    assert (change.uses_previous, change.uses_time_step, change.input_indices) == (
-        True,
-        True,
-        {0, 1, 2},
-    )
-    s = state()
-    assert s.make_formula(ca.sin(s.coordinate("elbow_joint"))).input_indices == {0}
 
 
 @pytest.mark.parametrize(
@@ -123,20 +108,3 @@ def test_square_roots_are_differentiable_at_zero() -> None:
     moving = still.copy()
     moving[9] += 0.5 * DT
     assert float(formula.function(moving)) == pytest.approx(0.5, abs=2e-8)
-
-
-def test_error_suggests_the_nearest_name() -> None:
-    for ask, kind, name, nearest in (
-        (State.position, "frame", "tol", "tool"),
-        (State.velocity, "frame", "cup.cap", "cup.cup"),
-        (State.rotation, "frame", "nowhere", None),
-        (State.coordinate, "coordinate", "elbow_jiont", "elbow_joint"),
-        (State.rate, "coordinate", "door.hing", "door.hinge"),
-    ):
-        with pytest.raises(UnknownNameError, match=f"there is no {kind} '{name}'") as caught:
-            ask(state(), name)
-        assert caught.value.nearest == nearest
-    s = state()
-    formula = s.make_formula(s.position("tool"))
-    with pytest.raises(UnknownNameError, match="there is no frame 'tool'"):
-        State(["other"], COORDINATES).check_names(formula)

@@ -11,7 +11,7 @@ from helpers.small_problems import SHORT, full_scene
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
-from vkc_pin.world.task.phases import FrameGoal, Phase, Task, summarize_phases
+from vkc_pin.world.task.phases import FrameGoal, Phase, Task
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
@@ -89,14 +89,3 @@ def test_phase_names() -> None:
     held = Hold("door", "handle")
     assert str(FrameGoal("panel", POSE, hold=held)) == "door.panel"
     assert str(FrameGoal("tool", POSE)) == "tool"
-
-
-def test_summary_lists_held_objects() -> None:
-    found = summarize_phases(compile_task(scene_for(CARRYING), CARRYING, SHORT))
-    assert found[:4] == [
-        ("reach stick.grip", ()),
-        ("touch with stick.tip", ("stick",)),
-        ("reach ball.pull by stick.tip", ("stick",)),
-        ("place ball", ("stick", "ball")),
-    ]
-    assert found[-1] == ("go to", ())

@@ -50,7 +50,6 @@ def spoiled(row: int, column: int, value: float) -> np.ndarray:
     [
         ("here", "not a pose"),
         ([1.0, 2.0, 3.0], "not a pose"),
-        ([[1.0], [1.0, 2.0]], "not a pose"),
         ([1.0, 2.0, 3.0, 0.0, 0.0, np.nan], "not finite"),
         (spoiled(0, 3, np.inf), "not finite"),
         (pin.SE3(np.eye(3), np.array([np.nan, 0.0, 0.0])), "not finite"),
@@ -88,10 +87,8 @@ def test_invalid_joints_are_rejected(joints: Any, field: str) -> None:
     [
         ("here", "not a pose"),
         ([1.0, 2.0], "not a pose"),
-        ([1.0, 2.0, 3.0, 4.0], "not a pose"),
         (np.zeros((3, 1)), "not a pose"),
         ([0.0, np.nan, 0.0], "not finite"),
-        ([1.0, 2.0, 3.0, 0.0, np.inf, 0.0], "not finite"),
         (spoiled(0, 0, 0.5), "not a rotation"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Phases as plain data."""
+"""Tests phases as plain data."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 from vkc_pin.errors import InputError
 from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.trajectory.phase_span import PhaseSpan, get_required
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
 
 STICK = Hold("stick", "grip")
 
@@ -21,7 +21,7 @@ STICK = Hold("stick", "grip")
         PhaseSpan("open", 1, 7, (Hold("door", "handle"),), 0.04),
     ],
 )
-def test_what_is_written_is_read(span: PhaseSpan) -> None:
+def test_round_trip(span: PhaseSpan) -> None:
     data = span.to_dict()
     assert ("opening" in data) == (span.opening is not None)
     assert PhaseSpan.from_dict(data, "phases[0]") == span
@@ -36,15 +36,14 @@ def test_what_is_written_is_read(span: PhaseSpan) -> None:
         ({"opening": "wide"}, "PhaseSpan.opening"),
     ],
 )
-def test_what_does_not_fit(wrong: dict[str, Any], field: str) -> None:
+def test_invalid_fields_are_rejected(wrong: dict[str, Any], field: str) -> None:
     with pytest.raises(InputError) as raised:
         PhaseSpan.from_dict({**PhaseSpan("go", 0, 4).to_dict(), **wrong}, "phases[0]")
     assert raised.value.field == field
 
 
-def test_what_is_missing_is_named() -> None:
+def test_missing_fields_are_named() -> None:
     with pytest.raises(InputError, match="held: this is missing from a trajectory"):
         PhaseSpan.from_dict({"name": "go", "first": 0, "last": 1}, "phases[0]")
     with pytest.raises(InputError, match=r"phases\[3\]"):
         PhaseSpan.from_dict("go", "phases[3]")
-    assert get_required({"a": 1}, "a") == 1

@@ -25,14 +25,14 @@ def motion(world: World, plan: Plan) -> Motion:
     return sample_motion(world, plan.trajectory)
 
 
-def test_key_frames_are_the_waypoints_and_more_where_it_turns_far(plan: Plan) -> None:
+def test_key_times_are_waypoints_and_more_on_long_turns(plan: Plan) -> None:
     times = key_times(plan.trajectory)
     assert set(plan.trajectory.times) <= set(times)
     assert np.abs(np.diff(plan.trajectory.at(times), axis=0)).max() <= 1.0 + 1e-9
     assert (np.diff(times) > 0).all()
 
 
-def test_where_joints_are_faster_than_what_moves_them_there_are_more(plan: Plan) -> None:
+def test_key_times_limit_the_change_of_coordinates(plan: Plan) -> None:
     names = plan.trajectory.names
     times = key_times(plan.trajectory, {names[0]: 2.0, names[3]: 0.0125})
     moved = np.abs(np.diff(plan.trajectory.at(times), axis=0))
@@ -40,7 +40,9 @@ def test_where_joints_are_faster_than_what_moves_them_there_are_more(plan: Plan)
     assert len(times) > len(key_times(plan.trajectory))
 
 
-def test_placements_are_those_of_the_world(motion: Motion, world: World, plan: Plan) -> None:
+def test_placements_equal_those_of_the_world_model(
+    motion: Motion, world: World, plan: Plan
+) -> None:
     data, k = world.model.createData(), 5
     (row,) = world.compute_positions(plan.trajectory, [motion.times[k]])
     pin.framesForwardKinematics(world.model, data, world.coordinates.q(row))
@@ -53,16 +55,10 @@ def test_placements_are_those_of_the_world(motion: Motion, world: World, plan: P
         assert np.allclose(parent @ motion.local[j][k].homogeneous, data.oMi[j].homogeneous)
 
 
-def test_what_moves_and_when_it_is_away(motion: Motion, world: World) -> None:
+def test_moving_joints_and_departures(motion: Motion, world: World) -> None:
     assert motion.moving[1:].all()
     base = np.arange(world.model.njoints) == 1
     away = motion.away(base, 0)
     assert not away[0]
     assert away[-1]
     assert motion.away(base, -1).tolist()[-1] is False
-
-
-def test_a_scene_alone_stands_still(world: World) -> None:
-    still = sample_motion(world, None)
-    assert len(still.times) == 1
-    assert not still.moving.any()

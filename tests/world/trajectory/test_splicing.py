@@ -1,10 +1,10 @@
-"""Motions are joined, extract_phases, and known where they were not."""
+"""Tests the concatenation and division of trajectories."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.written import NAMES, PHASES, ROWS, TIMES, example
+from helpers.written import NAMES, ROWS
 
 from vkc_pin.errors import InputError
 from vkc_pin.world.scene.hold import Hold, make_holds
@@ -17,7 +17,7 @@ from vkc_pin.world.trajectory.splicing import (
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
-def test_what_is_not_known_is_as_it_was_or_as_it_will_be() -> None:
+def test_missing_values_are_filled_from_their_neighbours() -> None:
     nan = np.nan
     table = np.array(
         [[nan, 1.0, nan], [2.0, nan, nan], [nan, nan, nan], [3.0, 4.0, nan], [nan, nan, nan]]
@@ -28,7 +28,7 @@ def test_what_is_not_known_is_as_it_was_or_as_it_will_be() -> None:
 
 
 def parts() -> tuple[Trajectory, Trajectory, Trajectory]:
-    """Reach for the door, open it, and go on, holding what was held; only the second knows the door's hinge."""
+    """Return motions that reach for the door, open it and go on; the second has its hinge."""
     robot = NAMES[:5]
     held = (Hold("door", "handle"),)
     reach = Trajectory(
@@ -45,8 +45,7 @@ def parts() -> tuple[Trajectory, Trajectory, Trajectory]:
     return reach, opens, after
 
 
-def test_motions_are_joined() -> None:
-    """The hand closes between the first two, so the robot waits there; between the others it does not."""
+def test_concatenation_pauses_at_new_grasps() -> None:
     whole = concatenate_trajectories(parts(), pause=0.25)
     assert whole.names == NAMES
     np.testing.assert_allclose(whole.times, [0.0, 1.0, 3.0, 3.25, 4.25, 4.75])
@@ -65,7 +64,7 @@ def test_motions_are_joined() -> None:
     assert whole.robot_size == 5
 
 
-def test_what_is_held_through_another_thing_makes_a_pause_too() -> None:
+def test_indirect_grasps_pause_too() -> None:
     both = {"stick": "grip", "ball": "pull"}
     holds = [
         make_holds(both, {"ball": "stick.tip"}),
@@ -79,14 +78,7 @@ def test_what_is_held_through_another_thing_makes_a_pause_too() -> None:
     )
 
 
-def test_one_motion_alone_stays_as_it_is() -> None:
-    whole = concatenate_trajectories([example()], pause=1.0)
-    np.testing.assert_array_equal(whole.positions, ROWS)
-    np.testing.assert_array_equal(whole.times, TIMES)
-    assert whole.phases == PHASES
-
-
-def test_only_motions_that_follow_one_another_can_be_joined() -> None:
+def test_motions_must_follow_one_another() -> None:
     reach, opens, _ = parts()
     with pytest.raises(InputError) as raised:
         concatenate_trajectories([reach, reach], pause=0.1)
@@ -100,7 +92,7 @@ def test_only_motions_that_follow_one_another_can_be_joined() -> None:
         concatenate_trajectories([], pause=0.1)
 
 
-def test_what_was_joined_can_be_cut_apart() -> None:
+def test_concatenated_motions_can_be_divided() -> None:
     first, last = 0, 0
     whole = concatenate_trajectories(parts(), pause=0.25)
     for part in parts():

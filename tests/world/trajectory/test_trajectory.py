@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.written import NAMES, PHASES, ROWS, TIMES, example
 
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError
 from vkc_pin.world.scene.hold import make_holds
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -21,11 +21,6 @@ def test_efforts() -> None:
     assert example().arm_path_length() == pytest.approx(
         0.1 + 0.2 + 0.4 + 0.1
     )  # neither the heading nor the door counts
-
-
-def test_velocities() -> None:
-    expected = [[1.5, 2.0, 0.25, 0.05, -0.1, 0.0], [0.0] * 6, [-0.25, 0.0, 0.875, -0.1, 0.025, 0.3]]
-    np.testing.assert_allclose(example().velocities(), expected)
 
 
 def test_accelerations() -> None:
@@ -52,26 +47,6 @@ def test_what_is_no_time(time: Any) -> None:
     for ask in (example().at, example().velocity, example().acceleration):
         with pytest.raises(InputError, match="time"):
             ask(time)
-
-
-def test_columns() -> None:
-    column = example().column("door.hinge")
-    np.testing.assert_array_equal(column, ROWS[:, 5])
-    column[:] = 7.0  # a copy
-    np.testing.assert_array_equal(example().column("door.hinge"), ROWS[:, 5])
-    with pytest.raises(UnknownNameError) as caught:
-        example().column("door.hing")
-    assert caught.value.nearest == "door.hinge"
-
-
-def test_it_cannot_be_changed() -> None:
-    rows = ROWS.copy()
-    motion = example(positions=rows)
-    rows[0, 0] = 9.0
-    assert motion.positions[0, 0] == 0.0
-    for array in (motion.positions, motion.times):
-        with pytest.raises(ValueError, match="read-only"):
-            array[0] = 1.0
 
 
 def test_round_trip() -> None:

@@ -1,4 +1,4 @@
-"""How a base on wheels moves in a step, against finely divided motions."""
+"""Tests steps of wheeled bases against finely divided motions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SPEEDS = st.lists(st.tuples(st.floats(-0.5, 0.5), st.floats(-0.6, 0.6)), min_siz
 
 
 def driven(speeds: list[tuple[float, float]]) -> np.ndarray:
-    """Return the poses that arcs lead to, of lengths [m] and turns [rad], by small steps along them."""
+    """Return poses after arcs of lengths [m] and turns [rad], by small steps."""
     poses = [np.array([0.3, -0.2, 0.9])]
     for length, turn in speeds:
         heading = poses[-1][2] + turn * (np.arange(2000) + 0.5) / 2000
@@ -27,7 +27,7 @@ def driven(speeds: list[tuple[float, float]]) -> np.ndarray:
 
 @settings(deadline=None)
 @given(SPEEDS)
-def test_arcs_go_along_alone(speeds: list[tuple[float, float]]) -> None:
+def test_arcs_do_not_slip_sideways(speeds: list[tuple[float, float]]) -> None:
     """Their chords are as long as twice the radius times the sine of half of the turn."""
     along, aside, turn = RollingLimits.compute_steps(driven(speeds))
     lengths, turns = np.array(speeds).T
@@ -37,7 +37,7 @@ def test_arcs_go_along_alone(speeds: list[tuple[float, float]]) -> None:
     assert RollingLimits().compute_error(driven(speeds)) < 1e-6
 
 
-def test_the_error_is_the_worst_of_slipping_and_turning() -> None:
+def test_error_is_the_larger_of_slip_and_turn() -> None:
     path = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.03, 0.0], [1.1, 0.03, 0.2]])
     assert RollingLimits().compute_error(path) == pytest.approx(0.03)
     assert RollingLimits(turning_radius=0.8).compute_error(path) == pytest.approx(
@@ -46,7 +46,7 @@ def test_the_error_is_the_worst_of_slipping_and_turning() -> None:
     assert OMNIDIRECTIONAL.compute_error(path) == 0.0
 
 
-def test_gears_are_those_of_the_step_before_where_it_stands() -> None:
+def test_gears_persist_at_rest() -> None:
     x = np.cumsum([0.0, 0.0, 0.2, 0.1, 0.0, -0.1, 0.0, 0.00005, 0.3])
     path = np.column_stack([x, 0.0 * x, 0.0 * x])
     np.testing.assert_array_equal(
@@ -59,7 +59,7 @@ def test_gears_are_those_of_the_step_before_where_it_stands() -> None:
     np.testing.assert_array_equal(OMNIDIRECTIONAL.compute_gears(-path), np.ones(8))
 
 
-def test_times_are_those_of_the_faster_wheel() -> None:
+def test_times_follow_the_faster_wheel() -> None:
     rolling = RollingLimits(track=0.6, wheel_speed=0.5)
     path = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 0.0, -1.0], [1.0, 0.0, -1.0]])
     np.testing.assert_allclose(rolling.compute_min_times(path), [2.0, 0.6, 0.0])
@@ -69,7 +69,7 @@ def test_times_are_those_of_the_faster_wheel() -> None:
     assert not OMNIDIRECTIONAL.compute_min_times(path).any()
 
 
-def test_the_limits_are_the_robots() -> None:
+def test_limits_follow_from_the_robot() -> None:
     assert make_rolling_limits(hall().robot) is OMNIDIRECTIONAL
     assert make_rolling_limits(hall(base="fixed").robot) is OMNIDIRECTIONAL
     tank, car = (

@@ -1,11 +1,11 @@
-"""Builds articulated objects from boxes, cylinders and spheres, as URDF and attachments."""
+"""Builds articulated objects of random sizes from boxes, cylinders and spheres, as URDF."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -13,11 +13,12 @@ import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
 
-__all__ = ["COLOURS", "LinkBuilder", "ObjectBuilder", "Point"]
+__all__ = ["LinkBuilder", "ObjectBuilder", "Point", "Sampler"]
 
+T = TypeVar("T")
 Point = Sequence[float]
 
-COLOURS: dict[str, tuple[float, float, float]] = {
+_COLOURS: dict[str, tuple[float, float, float]] = {
     "dark": (0.2, 0.21, 0.23),
     "glass": (0.30, 0.36, 0.40),
     "oak": (0.76, 0.60, 0.42),
@@ -42,15 +43,7 @@ _EFFORT = {"revolute": 30.0, "prismatic": 40.0}  # [N·m], [N]
 
 @dataclass(frozen=True)
 class _Shape:
-    """A shape of a link; lengths [m].
-
-    Attributes:
-        kind: "box", "cylinder" or "sphere".
-        size: Edges of a box, radius and length of a cylinder, or radius of a sphere.
-        centre: Its centre in the link's frame.
-        rpy: Its orientation as roll, pitch, yaw [rad].
-        colour: Name of its colour, see `COLOURS`.
-    """
+    """A box (edges), cylinder (radius, length) or sphere (radius), in the link's frame [m], [rad]."""
 
     kind: str
     size: tuple[float, ...]
@@ -94,10 +87,8 @@ class _Shape:
             squares = np.square(self.size)
             return np.diag(self.mass * (squares.sum() - squares) / 12.0)
         radius, length = self.size
-        along, across = (
-            0.5 * self.mass * radius**2,
-            self.mass * (3.0 * radius**2 + length**2) / 12.0,
-        )
+        along = 0.5 * self.mass * radius**2
+        across = self.mass * (3.0 * radius**2 + length**2) / 12.0
         rotation = pin.rpy.rpyToMatrix(*self.rpy)
         return np.asarray(rotation @ np.diag([across, across, along]) @ rotation.T)
 
@@ -111,16 +102,9 @@ class LinkBuilder:
 
     def add_box(self, low: Point, high: Point, colour: str) -> None:
         """Add a box between two corners."""
-        size = tuple(b - a for a, b in zip(low, high, strict=True))
-        self.shapes.append(
-            _Shape(
-                "box",
-                size,
-                tuple((a + b) / 2.0 for a, b in zip(low, high, strict=True)),
-                _NO_ROTATION,
-                colour,
-            )
-        )
+        ends = [*zip(low, high, strict=True)]
+        size, centre = tuple(b - a for a, b in ends), tuple((a + b) / 2.0 for a, b in ends)
+        self.shapes.append(_Shape("box", size, centre, _NO_ROTATION, colour))
 
     def add_cylinder(
         self, centre: Point, radius: float, length: float, axis: str, colour: str
@@ -167,10 +151,8 @@ class LinkBuilder:
             for i in range(3)
             for j in range(i, 3)
         )
-        mass, origin = (
-            f'<mass value="{_format_numbers([masses.sum()])}"/>',
-            f'<origin xyz="{_format_numbers(middle)}"/>',
-        )
+        mass = f'<mass value="{_format_numbers([masses.sum()])}"/>'
+        origin = f'<origin xyz="{_format_numbers(middle)}"/>'
         lines = [
             f"  <link name={quoteattr(self.name)}>",
             f"    <inertial>{origin}{mass}<inertia {entries}/></inertial>",
@@ -183,16 +165,10 @@ class LinkBuilder:
 
 @dataclass
 class ObjectBuilder:
-    """An articulated object under construction.
+    """An articulated object under construction; `description` is the input of `load_object`.
 
-    The frame of its base link lies on the floor (or on its support), below the middle of its front:
-    x points into the object, away from the user, z up. `description` is the input of
-    `vkc_pin.load_object`.
-
-    Attributes:
-        name: Its name.
-        base: Base link.
-        links: Other links, each with the URDF element `<joint>` that moves it.
+    The base frame lies on the support, below the middle of the object's front: x points away from
+    the user, z up.
     """
 
     name: str
@@ -215,19 +191,7 @@ class ObjectBuilder:
         parent: str | None = None,
         acceleration: float = 1.0,
     ) -> LinkBuilder:
-        """Add a joint, and return the link that it moves.
-
-        Args:
-            name: Name of the joint.
-            kind: "revolute" or "prismatic".
-            origin: Origin of joint and link in the parent's frame [m].
-            axis: Joint axis.
-            upper: Upper limit [rad] or [m].
-            lower: Lower limit [rad] or [m].
-            link: Name of the link.
-            parent: Name of the parent link; None: the base.
-            acceleration: Acceleration limit [rad/s²] or [m/s²].
-        """
+        """Add a joint, and return the link that it moves."""
         child = LinkBuilder(link)
         limits = f'lower="{_format_numbers([lower])}" upper="{_format_numbers([upper])}"'
         velocity, effort = (_format_numbers([limit[kind]]) for limit in (_VELOCITY, _EFFORT))
@@ -268,7 +232,7 @@ class ObjectBuilder:
         used = sorted({shape.colour for link in links for shape in link.shapes})
         materials = [
             f'  <material name="{name}"><color rgba="{colour} 1"/></material>'
-            for name, colour in ((name, _format_numbers(COLOURS[name])) for name in used)
+            for name, colour in ((name, _format_numbers(_COLOURS[name])) for name in used)
         ]
         parts = [part for link, joint in self.links for part in (joint, link.make_xml())]
         head = ['<?xml version="1.0"?>', f"<robot name={quoteattr(self.name)}>", *materials]
@@ -277,17 +241,35 @@ class ObjectBuilder:
     @property
     def description(self) -> dict[str, Any]:
         """The object's description as plain data, including its URDF."""
-        plain: dict[str, Any] = {"urdf": self.urdf}
-        plain["joints"] = {
-            name: {"acceleration": value} for name, value in self.accelerations.items()
+        plain = {
+            "urdf": self.urdf,
+            "joints": {name: {"acceleration": a} for name, a in self.accelerations.items()},
+            "attachments": [_to_plain_data(item) for item in self.attachments],
         }
-        plain["attachments"] = [_to_plain_data(item) for item in self.attachments]
-        return {
-            **plain,
-            **(
-                {"latches": [_to_plain_data(item) for item in self.latches]} if self.latches else {}
-            ),
-        }
+        return {**plain, "latches": self.latches} if self.latches else plain
+
+
+class Sampler:
+    """Random sizes and choices from a random number generator."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+
+    def draw(self, low: float, high: float) -> float:
+        """Return a length [m] or angle [rad] between two, rounded to three decimals."""
+        return round(float(self._rng.uniform(low, high)), 3)
+
+    def draw_integer(self, low: int, high: int) -> int:
+        """Return an integer from `low` to `high`, both included."""
+        return int(self._rng.integers(low, high + 1))
+
+    def flip(self, probability: float) -> bool:
+        """Return True with a probability."""
+        return bool(self._rng.random() < probability)
+
+    def choose(self, choices: Sequence[T]) -> T:
+        """Return one of the choices."""
+        return choices[int(self._rng.integers(len(choices)))]
 
 
 def _format_numbers(values: Sequence[float] | Floats, digits: int = 4) -> str:

@@ -13,9 +13,8 @@ import numpy as np
 import yaml
 
 from vkc_pin.errors import InputError
-from vkc_pin.procedural.furniture import flaps, leaves, valves
-from vkc_pin.procedural.furniture.building import ObjectBuilder
-from vkc_pin.procedural.furniture.draws import Sampler
+from vkc_pin.procedural.furniture import generators
+from vkc_pin.procedural.furniture.building import ObjectBuilder, Sampler
 from vkc_pin.utils.arguments import check_choice, check_integer, check_mapping
 from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.writing import write_atomically
@@ -42,16 +41,16 @@ class Kind:
 
 KINDS: Mapping[str, Kind] = MappingProxyType(
     {
-        "cabinet": Kind(leaves.make_cabinet, "floor", 0.7),
-        "chest": Kind(flaps.make_chest, "floor", 0.5),
-        "dishwasher": Kind(flaps.make_dishwasher, "floor", 0.6),
-        "door": Kind(leaves.make_door, "wall", 0.5),
-        "drawers": Kind(flaps.make_drawers, "floor", 0.5),
-        "faucet": Kind(valves.make_faucet, "counter", 0.5),
-        "microwave": Kind(leaves.make_microwave, "counter", 0.6),
-        "oven": Kind(flaps.make_oven, "floor", 0.6),
-        "refrigerator": Kind(leaves.make_refrigerator, "floor", 0.7),
-        "valve": Kind(valves.make_valve, "floor", 0.7),
+        "cabinet": Kind(generators.make_cabinet, "floor", 0.7),
+        "chest": Kind(generators.make_chest, "floor", 0.5),
+        "dishwasher": Kind(generators.make_dishwasher, "floor", 0.6),
+        "door": Kind(generators.make_door, "wall", 0.5),
+        "drawers": Kind(generators.make_drawers, "floor", 0.5),
+        "faucet": Kind(generators.make_faucet, "counter", 0.5),
+        "microwave": Kind(generators.make_microwave, "counter", 0.6),
+        "oven": Kind(generators.make_oven, "floor", 0.6),
+        "refrigerator": Kind(generators.make_refrigerator, "floor", 0.7),
+        "valve": Kind(generators.make_valve, "floor", 0.7),
     }
 )
 """Kinds by name."""
@@ -93,12 +92,8 @@ def write_object(description: Mapping[str, Any], path: str | Path) -> Path:
     """
     plain, file = check_mapping(description, "description"), check_path(path, "path")
     if file.suffix not in (".yaml", ".yml"):
-        raise InputError(
-            "not an object file",
-            field="path",
-            expected="a path that ends with .yaml",
-            got=file.name,
-        )
+        expected = "a path that ends with .yaml"
+        raise InputError("not an object file", field="path", expected=expected, got=file.name)
     load_object(plain, folder=file.parent)  # raises an error if it is invalid
     urdf = plain["urdf"]
     if urdf.lstrip().startswith("<"):

@@ -35,14 +35,6 @@ def add_upright_bar(
     """Add a vertical bar in front of a face, with attachments `name` and `<name>_free`.
 
     The face looks along -x.
-
-    Args:
-        builder: Object under construction.
-        link: Link of the bar.
-        at: Position of the bar's middle on the face, in the link's frame [m].
-        length: Length of the bar, at least 0.1 [m].
-        out: Distance from the face to the bar's centre line [m].
-        name: Name of the attachment.
     """
     middle, reach = _add_posts_and_bar(link, at, length, out, "z")
     where: tuple[LinkBuilder, Point, Point, Point] = (link, middle, (1, 0, 0), (0, 1, 0))
@@ -71,19 +63,17 @@ def add_level_bar(
     Args:
         builder: Object under construction.
         link: Link of the bar.
-        at: Position of the bar's middle on the face, in the link's frame [m].
+        at: Middle of the bar on the face, in the link's frame [m].
         length: Length of the bar, at least 0.1 [m].
         out: Distance from the face to the bar's centre line [m].
         height: Height of the bar above the floor [m].
         name: Name of the attachment.
-        turn: Range of the hand's rotation about the bar [rad]; None: that of its tilt.
+        turn: Range of the hand's rotation about the bar [rad]. Default: its tilt.
     """
     middle, reach = _add_posts_and_bar(link, at, length, out, "y")
     down = _STEEPEST * float(np.clip((_LEVEL - height) / 0.25, 0.0, 1.0))
-    approach, closing = (
-        (math.cos(down), 0.0, -math.sin(down)),
-        (math.sin(down), 0.0, math.cos(down)),
-    )
+    c, s = math.cos(down), math.sin(down)
+    approach, closing = (c, 0.0, -s), (s, 0.0, c)
     where: tuple[LinkBuilder, Point, Point, Point] = (link, middle, approach, closing)
     builder.add_attachment(name, *where)
     limits = list(turn) if turn is not None else _make_interval(_TILT)
@@ -103,13 +93,6 @@ def add_knob(
     """Add a round knob in front of a face, with attachments `name` and `<name>_free`.
 
     The face looks along -x.
-
-    Args:
-        builder: Object under construction.
-        link: Link of the knob.
-        at: Position of the knob on the face, in the link's frame [m].
-        out: Distance from the face to the knob's centre [m].
-        name: Name of the attachment.
     """
     x, y, z = at
     link.add_sphere((x - out, y, z), 0.016, "steel")
@@ -122,11 +105,7 @@ def add_knob(
 def _add_posts_and_bar(
     link: LinkBuilder, at: Point, length: float, out: float, axis: str
 ) -> tuple[Point, float]:
-    """Add a bar along an axis on two posts.
-
-    Returns:
-        Middle of the bar, and the range of a hand along it to either side [m].
-    """
+    """Add a bar along an axis on two posts."""
     x, y, z = at
     middle, end = (x - out, y, z), length / 2.0 - _POST
     link.add_cylinder(middle, 0.01, length, axis, "steel")

@@ -108,16 +108,7 @@ def make_fixture_name(kind: str | Mapping[str, Any]) -> str:
 
 
 def make_fixture(kind: str | Mapping[str, Any], seed: int = 0) -> Fixture:
-    """Return an object that can be opened.
-
-    Args:
-        kind: One of `list_openable_types()`, the path of a description (.yaml), or a description.
-        seed: Random seed of random sizes.
-
-    Raises:
-        UnknownNameError: There is no such object.
-        InputError: Its description is invalid, or it is a free object.
-    """
+    """Return an object that can be opened."""
     if isinstance(kind, str) and kind.startswith(RANDOM):
         if kind.removeprefix(RANDOM) not in KINDS:
             raise UnknownNameError(

@@ -105,12 +105,7 @@ class Floor:
         return (self.width if side % 2 else self.depth) / 2.0
 
     def make_wall_frame(self, side: int, along: float) -> Frame:
-        """Return a frame on a wall's inner face, with x out of the room and y along the wall.
-
-        Args:
-            side: 0 east, 1 north, 2 west, 3 south.
-            along: Distance from the wall's middle, to the left as seen from the room [m].
-        """
+        """Return a frame on a wall's inner face, with x out of the room and y along the wall."""
         c, s = _QUARTERS[side]
         out = self.compute_half_length(side + 1)
         return Frame(round(c * out - s * along, 3), round(s * out + c * along, 3), math.atan2(s, c))

@@ -60,14 +60,7 @@ class Part:
 
 
 def make_box(name: str, frame: Frame, size: Sequence[float], colour: str) -> Part:
-    """Return a box on the floor, centred at the frame's origin.
-
-    Args:
-        name: Its name.
-        frame: Its frame.
-        size: Edges along the frame's x, y, z [m].
-        colour: Its colour.
-    """
+    """Return a box on the floor, centred at the frame's origin."""
     footprint = Rectangle(frame.x, frame.y, size[0], size[1], frame.yaw)
     return Part(
         name,
@@ -116,14 +109,7 @@ def make_table(name: str, frame: Frame, size: tuple[float, float, float]) -> Par
 
 
 def make_shelf(name: str, frame: Frame, size: tuple[float, float, float], boards: int) -> Part:
-    """Return an open shelf with two sides, a back and boards, its back against a wall.
-
-    Args:
-        name: Its name.
-        frame: Frame on the wall's inner face, x out of the room.
-        size: Depth, width and height [m].
-        boards: Number of boards from bottom to top, at least 2.
-    """
+    """Return an open shelf with two sides, a back and boards, its back against a wall."""
     depth, width, height = size
     middle = -AIR - depth / 2.0
     back = _make_box_entry(
@@ -159,14 +145,6 @@ def make_openable(
     """Return an object that can be opened: in a wall, against it, or on a counter against it.
 
     The floor in front of it stays free.
-
-    Args:
-        name: Its name in the scene.
-        own: The object.
-        floor: Floor of the room.
-        side: Side of the wall.
-        along: Position of its middle along the wall, see `Floor.make_wall_frame` [m].
-        front: Depth of the free floor in front of it [m].
     """
     low, high, counter = own.low, own.high, own.counter
     middle = (low[1] + high[1]) / 2.0
@@ -217,15 +195,7 @@ def make_openable(
 
 
 def make_carried_object(name: str, kind: str, on: Part, x: float, y: float) -> Part:
-    """Return a free object on a table.
-
-    Args:
-        name: Its name in the scene.
-        kind: Its type.
-        on: Table.
-        x: Position along the table's frame, away from its free side [m].
-        y: Position across it [m].
-    """
+    """Return a free object on a table."""
     place = on.frame.transform_point(x, y)
     entry = {
         "name": name,
@@ -294,16 +264,7 @@ def _make_box_entry(
     size: Sequence[float],
     colour: str,
 ) -> dict[str, Any]:
-    """Return a box as an entry of a scene, centred at a point of a frame.
-
-    Args:
-        name: Its name.
-        frame: Frame.
-        at: Its centre along the frame's x and y [m].
-        z: Its lowest and highest z [m].
-        size: Its edges along the frame's x and y [m].
-        colour: Its colour.
-    """
+    """Return a box as an entry of a scene, centred at a point of a frame."""
     edges = [round(float(edge), 3) for edge in (*size, z[1] - z[0])]
     position = [*frame.transform_point(*at), round((z[0] + z[1]) / 2.0, 4)]
     return {

@@ -166,11 +166,7 @@ class _Room:
     def furnish(
         self, named: Sequence[tuple[str, Fixture]] | None
     ) -> tuple[Floor, tuple[Part, ...], tuple[float, float, float]] | None:
-        """Return floor, parts and start, or None if a part does not fit.
-
-        Args:
-            named: Objects that can be opened, with their names; None: one or two of `OPENABLE`.
-        """
+        """Return floor, parts and start, or None if a part does not fit."""
         if named is None:
             count = int(self.rng.integers(1, 3))
             named = _name_fixtures(

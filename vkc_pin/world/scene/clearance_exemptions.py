@@ -143,12 +143,7 @@ class ClearanceExemption:
         return [(min(i, j), max(i, j)) for i in ones for j in others]
 
     def is_active(self, names: Sequence[str], states: Floats) -> Bools:
-        """Return at which states the exemption is active, shape (S,).
-
-        Args:
-            names: Names of the n coordinates.
-            states: Values of the coordinates, shape (S, n), [rad] or [m].
-        """
+        """Return at which states the exemption is active, shape (S,)."""
         inside = np.ones(len(states), bool)
         for name, (lower, upper) in self.ranges.items():
             column = states[:, names.index(name)]
@@ -179,10 +174,6 @@ def find_clearance_exemptions(scene: SceneLike, dist_safe: float) -> tuple[Clear
     """Return all pairs that may be closer than the clearance margin.
 
     These are the links that the scene allows, and neighbouring shapes.
-
-    Args:
-        scene: Scene.
-        dist_safe: Clearance margin [m].
     """
 
     def find() -> tuple[ClearanceExemption, ...]:
@@ -273,10 +264,6 @@ def _find_neighbours(scene: SceneLike, dist_safe: float) -> Iterator[ClearanceEx
 
 class PlacedShapes:
     """The S shapes of objects and obstacles in the world.
-
-    Args:
-        scene: Scene.
-        objects: Objects, in the states to examine.
 
     Attributes:
         labels: Link or obstacle of each shape.
@@ -467,12 +454,7 @@ class PlacedShapes:
         others: Sequence[pin.GeometryObject],
         reach: float,
     ) -> tuple[Floats, Bools]:
-        """Return placements of a link's shapes for values of a coordinate, and near pairs.
-
-        Returns:
-            Placements, shape (V, K, 12), and a mask of pairs with close bounding boxes, shape (V,
-            K, O).
-        """
+        """Return placements of a link's shapes for values of a coordinate, and near pairs."""
         owner, _, link = label.partition(".")
         where, lower, upper = sweep_link_shapes(self.objects[owner], link, index, values)
         lows, highs = (

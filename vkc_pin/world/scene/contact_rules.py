@@ -70,12 +70,6 @@ def compute_hand_clearance(scene: Scene, hold: Hold, link: str, options: Options
     """Return the clearance that the grasping links keep from a link of the grasped object [m].
 
     It applies during the grasp and shortly before and after.
-
-    Args:
-        scene: Scene with the objects.
-        hold: Hold.
-        link: Link of the grasped object, "<object>.<link>".
-        options: Clearances for attachments that have none of their own.
     """
     attachment = scene.objects[hold.object].object.attachments[hold.attachment]
     if (hold.by or attachment.contact == "push") and link == find_grasped_link(scene, hold):

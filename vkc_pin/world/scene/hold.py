@@ -97,11 +97,6 @@ def make_holds(
         held: Object → attachment.
         by: Object → "<object>.<link>", for objects that the tool itself does not hold.
         at: Object → values of its attachment's freedoms, [m] and [rad].
-
-    Raises:
-        UnknownNameError: `by` or `at` name an object that is not held.
-        InputError: Objects hold each other in a cycle, `by` is not of that form, or too many
-            objects are held.
     """
     held = check_mapping(held, "held", "object names, each with that of an attachment")
     by, at = (
@@ -149,11 +144,7 @@ def make_holds(
 
 
 def check_hold_order(holds: Iterable[Hold]) -> tuple[Hold, ...]:
-    """Return the holds as a tuple if each comes after the one it depends on.
-
-    Raises:
-        InputError: A hold comes before the one it depends on.
-    """
+    """Return the holds as a tuple if each comes after the one it depends on."""
     holds = check_list(holds, "holds", "a list of Hold", Hold)
     for number, hold in enumerate(holds):
         if hold.by not in (None, *holds[:number]):
@@ -166,13 +157,7 @@ def check_hold_order(holds: Iterable[Hold]) -> tuple[Hold, ...]:
 
 
 def resolve_holds(objects: Mapping[str, PlacedObject], holds: Iterable[Hold]) -> tuple[Hold, ...]:
-    """Return holds checked against the objects, with values for all freedoms (default 0).
-
-    Raises:
-        UnknownNameError: There is no such object, attachment or link.
-        InputError: Values do not fit the attachment's freedoms, or an object is held through one
-            that cannot hold it.
-    """
+    """Return holds checked against the objects, with values for all freedoms (default 0)."""
     found: dict[Hold, Hold] = {}
     for hold in check_hold_order(holds):
         if hold.object not in objects:
@@ -207,13 +192,7 @@ def resolve_holds(objects: Mapping[str, PlacedObject], holds: Iterable[Hold]) ->
 def place_held_objects(
     objects: Mapping[str, PlacedObject], tool: Callable[[], pin.SE3], holds: Iterable[Hold]
 ) -> Mapping[str, PlacedObject]:
-    """Return the objects with every free held object at its placement in the hand.
-
-    Args:
-        objects: Objects by name.
-        tool: Returns the placement of the tool frame in the world.
-        holds: Holds with the values of all freedoms, each after the one it depends on.
-    """
+    """Return the objects with every free held object at its placement in the hand."""
     placed = dict(objects)
     for hold in holds:
         one = placed[hold.object]
@@ -228,14 +207,7 @@ def place_held_objects(
 def find_reversed_approaches(
     objects: Mapping[str, PlacedObject], holds: Iterable[Hold], robot: Robot, floor: Solids
 ) -> list[Hold]:
-    """Return the holds whose approach overlaps the object or the floor, unless reversed.
-
-    Args:
-        objects: All objects at their placements.
-        holds: Holds to check.
-        robot: Robot, whose gripper opens as far as each attachment states.
-        floor: Floor, if there is one.
-    """
+    """Return the holds whose approach overlaps the object or the floor, unless reversed."""
     found, hands = list[Hold](), dict[float | None, Solids]()
     for hold in holds:
         placed = objects[hold.object]
@@ -263,14 +235,7 @@ def find_reversed_approaches(
 def warn_of_openings(
     objects: Mapping[str, PlacedObject], robot: Robot, start: float | None, where: str
 ) -> None:
-    """Warn of openings out of the gripper's range, which are replaced by the nearest possible one.
-
-    Args:
-        objects: Objects whose attachments state an opening.
-        robot: Robot.
-        start: Opening at the start [m]; None: unspecified.
-        where: Beginning of the warning, which names the scene.
-    """
+    """Warn of openings out of the gripper's range, which are replaced by the nearest possible one."""
     requested = {} if start is None else {"the start": start}
     for name, placed in objects.items():
         own = placed.object.attachments.values()

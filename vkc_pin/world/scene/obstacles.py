@@ -25,16 +25,7 @@ _FLOOR_BORDER = 2.0  # [m] beyond the arena: an arm may reach over its edge
 def make_obstacle_shapes(
     item: schema.ObstacleSchema, pose: pin.SE3, folder: Path
 ) -> tuple[list[pin.GeometryObject], list[pin.GeometryObject]]:
-    """Return the visual and the collision shapes of an obstacle, in the world frame.
-
-    Args:
-        item: Description of the obstacle.
-        pose: Its placement in the world frame.
-        folder: Folder that the path of its mesh or URDF is relative to.
-
-    Raises:
-        InputError: The file cannot be read.
-    """
+    """Return the visual and the collision shapes of an obstacle, in the world frame."""
     from vkc_pin.world.scene import scene_schema as schema
 
     if isinstance(item, schema.UrdfSchema):

@@ -109,10 +109,6 @@ class PlacedObject:
 def make_world_shapes(placed: PlacedObject, *, visual: bool = False) -> list[pin.GeometryObject]:
     """Return copies of an object's shapes with parent joint 0 and placements in the world frame.
 
-    Args:
-        placed: Object.
-        visual: Return visual instead of collision shapes.
-
     Returns:
         Shapes in the object's own order, with their names in the object (`<link>_<number>`).
     """

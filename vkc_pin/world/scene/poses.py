@@ -18,17 +18,7 @@ _NORM_TOLERANCE = 1e-3  # of a unit quaternion
 
 
 def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
-    """Return `pose` as a `pinocchio.SE3`.
-
-    Args:
-        pose: An SE3, a 4 × 4 homogeneous matrix, (x, y, z, roll, pitch, yaw) in [m] and [rad], or
-            (x, y, z, qx, qy, qz, qw) with a unit quaternion, scalar last.
-        name: Name of the argument in error messages.
-
-    Raises:
-        InputError: `pose` has none of these forms, is not finite, exceeds `LARGEST`, or its
-            rotation is not a proper rotation.
-    """
+    """Return `pose` as a `pinocchio.SE3`."""
     array = check_array(
         pose.homogeneous if isinstance(pose, pin.SE3) else pose, name, _POSE, problem="not a pose"
     )
@@ -65,15 +55,7 @@ def as_placement(pose: Any, *, name: str = "pose") -> pin.SE3:
 
 
 def as_target(target: Any, *, name: str) -> pin.SE3 | tuple[float, float, float]:
-    """Return a point [m] for three numbers, and a placement otherwise; see `as_placement`.
-
-    Args:
-        target: Point (x, y, z) [m], or a pose.
-        name: Name of the argument in error messages.
-
-    Raises:
-        InputError: `target` is neither.
-    """
+    """Return a point [m] for three numbers, and a placement otherwise; see `as_placement`."""
     if isinstance(target, pin.SE3):
         return as_placement(target, name=name)
     point = check_array(

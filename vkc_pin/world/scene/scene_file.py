@@ -32,16 +32,7 @@ __all__ = ["make_document", "make_scene_fields"]
 
 
 def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
-    """Return the attributes of the `Scene` that `document` describes, by name.
-
-    Args:
-        document: Description.
-        folder: Folder that relative paths in it refer to.
-
-    Raises:
-        InputError: The description is invalid; `UnknownNameError` where it names something that
-            does not exist.
-    """
+    """Return the attributes of the `Scene` that `document` describes, by name."""
     description = parse_document(document, schema.SceneSchema)
     robot = _load_robot(document, description, folder)
     _check_unique_names(document, description)

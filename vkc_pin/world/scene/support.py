@@ -52,12 +52,7 @@ class SupportedObject:
 def find_supports(
     placed: PlacedObject, shapes: Iterable[tuple[str, pin.GeometryObject]]
 ) -> set[str]:
-    """Return the labels of the shapes that an object rests on.
-
-    Args:
-        placed: Object.
-        shapes: Label and shape of every possible support, in the world frame.
-    """
+    """Return the labels of the shapes that an object rests on."""
     own = make_world_shapes(placed)
     boxes = [compute_world_box(shape.geometry, shape.placement) for shape in own]
     found: set[str] = set()
@@ -78,11 +73,6 @@ def find_supported_objects(
     objects: Mapping[str, PlacedObject], moving: Mapping[str, Collection[str]], free: Iterable[str]
 ) -> dict[str, str]:
     """Return the free objects that rest on moving links, directly or on top of others.
-
-    Args:
-        objects: All objects at their placements.
-        moving: Object → its links that move.
-        free: Names of the free objects that are not grasped.
 
     Returns:
         Free object → "<object>.<link>" of the moving link at the bottom of the stack.

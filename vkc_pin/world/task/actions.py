@@ -63,11 +63,6 @@ def generate_alternatives(
     Alternatives exist only if a single step leaves its attachment open; of several such steps, each
     has been planned alone before. An object that is held already may have been grasped where it
     cannot be moved from, or put down; then it is released and grasped again.
-
-    Args:
-        scene: Scene in which the task begins.
-        task: Task with the default attachments.
-        anew: Whether objects may be released and grasped again, which adds phases.
     """
     if anew and (again := _regrasp(scene, task.steps[0])):
         named = again[-1]
@@ -121,9 +116,6 @@ def compile_each_step(scene: Scene, steps: Sequence[Step], options: Options) -> 
 
     Returns:
         Task of each step.
-
-    Raises:
-        InputError: A step is infeasible; the error names the first such step.
     """
     tasks: list[Task] = []
     for number, step in enumerate(as_steps(steps)):

@@ -42,11 +42,6 @@ def compute_advance(
 
     The unit is [m/rad], or 1 for a prismatic joint. The velocity of the link is linear in the
     position of the contact, so a region of slides has its extremes at the corners.
-
-    Args:
-        placed: Object, in the state of interest.
-        attachment: Attachment that is pushed.
-        joint: Joint of the object.
     """
     model, data = placed.object.model, placed.object.model.createData()
     frame, index = placed.object.link_frame(attachment.link), model.getJointId(joint)
@@ -89,19 +84,7 @@ def find_push_directions(
     values: Mapping[str, float],
     where: str,
 ) -> dict[str, int]:
-    """Return the direction in which a push moves each coordinate: 1 up, -1 down; empty for a grasp.
-
-    Args:
-        placed: Object.
-        attachment: Attachment of the hand.
-        state: Coordinate "<object>.<joint>" → initial value [rad] or [m].
-        values: Coordinate → final value [rad] or [m].
-        where: Field of the request, for errors.
-
-    Raises:
-        InputError: Pushing there does not move a joint, does not move it in the same direction all
-            over the region, or moves it in the other direction.
-    """
+    """Return the direction in which a push moves each coordinate: 1 up, -1 down; empty for a grasp."""
     if attachment.contact != "push":
         return {}
     own = {
@@ -168,20 +151,7 @@ def check_actuation(
     values: Mapping[str, float],
     where: str,
 ) -> None:
-    """Check that a hand at an attachment can bring joints to values.
-
-    Args:
-        placed: Object.
-        attachment: Attachment of the hand.
-        state: Coordinate "<object>.<joint>" → initial value [rad] or [m]; default: that in the
-            scene.
-        values: Coordinate → final value, for the joints that are to move.
-        where: Step of the request, for errors.
-
-    Raises:
-        InputError: A joint, or the joint that releases its latch, does not move with the
-            attachment, or a push cannot move it in that direction.
-    """
+    """Check that a hand at an attachment can bring joints to values."""
     name, path = placed.name, find_path_joints(placed, attachment)
     for joint in (coordinate.partition(".")[2] for coordinate in values):
         if joint not in path:
@@ -211,18 +181,7 @@ def check_actuation(
 def find_driving_attachments(
     placed: PlacedObject, state: Mapping[str, float], values: Mapping[str, float], where: str
 ) -> list[str]:
-    """Return the attachments at which a hand can bring joints to values, in the object's order.
-
-    Args:
-        placed: Object.
-        state: As for `check_actuation`.
-        values: As for `check_actuation`.
-        where: Step of the request, for errors.
-
-    Raises:
-        InputError: There is none; the error says which joints each attachment moves, or why the
-            only one cannot.
-    """
+    """Return the attachments at which a hand can bring joints to values, in the object's order."""
     found, errors = list[str](), list[InputError]()
     for name, attachment in placed.object.attachments.items():
         try:
@@ -267,18 +226,6 @@ def choose_attachment(
     """Return the attachment at which a hand brings joints to values.
 
     It is the named one, or else the first that can.
-
-    Args:
-        placed: Object.
-        named: Attachment named by the step; None leaves it open.
-        used: Attachments preferred in that case: the present and the previous one.
-        state: As for `check_actuation`.
-        values: As for `check_actuation`.
-        where: Step of the request, for errors.
-
-    Raises:
-        UnknownNameError: There is no attachment of that name.
-        InputError: The named attachment cannot, or none can.
     """
     attachment = find_attachment(placed, named, f"{where}.attachment")
     if named is not None:

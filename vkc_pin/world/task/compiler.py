@@ -428,19 +428,7 @@ class _Compiler:
 def compile_task(
     scene: Scene, steps: Sequence[Step], options: Options, *, nothing: bool = False, first: int = 0
 ) -> Task:
-    """Compile steps to phases, beginning at the scene's start.
-
-    Args:
-        scene: Robot, objects and holds at the start.
-        steps: Steps.
-        options: Numbers of waypoints of the phases.
-        nothing: Whether steps that change nothing are allowed; they have no phases.
-        first: Number of the first of `steps` in the user's list, for messages.
-
-    Raises:
-        InputError: There are no steps, an object, joint, attachment or frame is unknown, a joint
-            cannot be moved in that direction, or the hand would have to hold a second object.
-    """
+    """Compile steps to phases, beginning at the scene's start."""
     steps = as_steps(steps)
     compiler, marks = _Compiler(scene, options), list[StepBoundary]()
     for index, step in enumerate(steps, start=first):

@@ -30,31 +30,12 @@ __all__ = [
 
 
 def find_object(scene: Scene, name: str, where: str) -> PlacedObject:
-    """Return an object of a scene.
-
-    Args:
-        scene: Scene.
-        name: Name of the object.
-        where: Field that names it, for the error.
-
-    Raises:
-        UnknownNameError: There is none.
-    """
+    """Return an object of a scene."""
     return scene.objects[check_choice(name, scene.objects, "object", where)]
 
 
 def find_attachment(placed: PlacedObject, name: str | None, where: str) -> Attachment:
-    """Return an object's attachment `name`, or its first one.
-
-    Args:
-        placed: Object.
-        name: Name of the attachment; None: the first.
-        where: Field that names it, for errors.
-
-    Raises:
-        UnknownNameError: There is none of that name.
-        InputError: The object has no attachment.
-    """
+    """Return an object's attachment `name`, or its first one."""
     attachments = placed.object.attachments
     if name is None:
         if not attachments:
@@ -68,31 +49,13 @@ def find_attachment(placed: PlacedObject, name: str | None, where: str) -> Attac
 
 
 def check_link(placed: PlacedObject, link: str, where: str) -> None:
-    """Check that an object has a link.
-
-    Args:
-        placed: Object.
-        link: Name of the link.
-        where: Field that names it, for the error.
-
-    Raises:
-        UnknownNameError: It has no such link.
-    """
+    """Check that an object has a link."""
     if link not in placed.object.links:
         raise UnknownNameError(f"link of '{placed.name}'", link, placed.object.links, field=where)
 
 
 def find_robot_frame(scene: Scene, name: str | None, where: str) -> str:
-    """Return the name of a robot frame, by default the tool frame.
-
-    Args:
-        scene: Scene.
-        name: Name of the frame; None: the tool frame.
-        where: Field that names it, for the error.
-
-    Raises:
-        UnknownNameError: There is none.
-    """
+    """Return the name of a robot frame, by default the tool frame."""
     frame = name or scene.robot.tool_frame
     frames = [f.name for f in scene.robot.model.frames]
     if frame not in frames:

@@ -198,11 +198,7 @@ _KINDS: dict[str, Any] = {kind.__name__: kind for kind in STEPS}
 
 
 def as_steps(steps: Sequence[Step]) -> tuple[Step, ...]:
-    """Return steps as a tuple.
-
-    Raises:
-        InputError: They are not a list of steps, or there are none.
-    """
+    """Return steps as a tuple."""
     if isinstance(steps, STEPS):
         raise InputError(
             "a single step", field="steps", expected="a list of steps", got=format_value(steps)
@@ -234,12 +230,7 @@ def step_to_dict(step: Step) -> dict[str, Any]:
 
 
 def step_from_dict(data: Mapping[str, Any]) -> Step:
-    """Return the step that `step_to_dict` converted to `data`.
-
-    Raises:
-        UnknownNameError: There is no such step, or it has no such field.
-        InputError: A field is missing or invalid.
-    """
+    """Return the step that `step_to_dict` converted to `data`."""
     given = check_mapping(data, "step", "a step as data")
     kind = check_choice(given.pop("step", ""), _KINDS, "step", "step")
     known_fields = {item.name: item for item in fields(_KINDS[kind])}

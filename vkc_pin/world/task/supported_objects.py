@@ -34,10 +34,6 @@ class SupportTracker:
     Attributes:
         carried: Objects that rest on held free objects.
         moved: Names of the objects that have moved with their support.
-
-    Args:
-        scene: Scene at the start.
-        resting: Free object → its placement, for free objects that are not held; updated here.
     """
 
     def __init__(self, scene: Scene, resting: dict[str, pin.SE3]) -> None:
@@ -116,18 +112,7 @@ def place_objects(
 def find_objects_supported_by(
     scene: Scene, now: Mapping[str, PlacedObject], hold: Hold, joints: Set[str], where: str
 ) -> tuple[SupportedObject, ...]:
-    """Return the objects that will rest on a held object while it moves.
-
-    Args:
-        scene: Scene.
-        now: Objects that are not held when the motion begins, and the held one.
-        hold: Hold.
-        joints: Joints of a fixed object that will move; a free object moves with all its links.
-        where: Step, for messages.
-
-    Raises:
-        InputError: An object rests both on a moving and on a fixed link.
-    """
+    """Return the objects that will rest on a held object while it moves."""
     item = now[hold.object].object
     links = set(item.links) if item.free else item.links_moved_by(joints)
     free = [name for name, placed in now.items() if placed.object.free and name != hold.object]
@@ -171,17 +156,7 @@ def find_objects_supported_by(
 def compute_placement_after_motion(
     one: SupportedObject, before: PlacedObject, after: PlacedObject, where: str
 ) -> pin.SE3:
-    """Return the placement of a supported object after a joint of its support has moved.
-
-    Args:
-        one: Supported object.
-        before: Supporting object before the motion.
-        after: Supporting object after the motion.
-        where: Step, for messages.
-
-    Raises:
-        InputError: The supporting link tilts too much.
-    """
+    """Return the placement of a supported object after a joint of its support has moved."""
     link = after.link_placement(one.link)
     if (angle := compute_tilt(before.link_placement(one.link), link)) > MAX_TILT:
         problem, got = (

@@ -225,12 +225,7 @@ Term = Constraint | Cost
 
 
 def trace_terms(scene: Scene, terms: Sequence[Term]) -> tuple[Term, ...]:
-    """Return terms with their expressions as plain data, checked against a scene.
-
-    Raises:
-        UnknownNameError: A frame, coordinate or object does not exist.
-        InputError: They are not terms, two share a name, or an expression is invalid.
-    """
+    """Return terms with their expressions as plain data, checked against a scene."""
     terms = check_list(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost))
     if not terms:
         return ()
@@ -247,11 +242,7 @@ def trace_terms(scene: Scene, terms: Sequence[Term]) -> tuple[Term, ...]:
 
 
 def trace_terms_without_scene(terms: Sequence[Term]) -> tuple[Term, ...]:
-    """Return terms with their expressions as plain data, with any names of frames and coordinates.
-
-    Raises:
-        InputError: They are not terms, two share a name, or an expression is invalid.
-    """
+    """Return terms with their expressions as plain data, with any names of frames and coordinates."""
     return _trace_all(
         check_list(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost)), None, None
     )
@@ -340,16 +331,7 @@ def _trace(term: Term, state: State) -> Term:
 
 
 def check_terms_active(terms: Iterable[Term], phases: Sequence[tuple[str, Iterable[str]]]) -> None:
-    """Check that every term applies in some phase of a task.
-
-    Args:
-        terms: Terms.
-        phases: Name of every phase of the task, and the objects held in it.
-
-    Raises:
-        UnknownNameError: `during` names a phase that does not exist.
-        InputError: A term applies in no phase.
-    """
+    """Check that every term applies in some phase of a task."""
     names = list(dict.fromkeys(name for name, _ in phases))
     for term in terms:
         for name in term.during or ():
@@ -370,11 +352,7 @@ def term_to_dict(term: Term) -> dict[str, Any]:
 
 
 def term_from_dict(data: Mapping[str, Any]) -> Term:
-    """Return the term that `term_to_dict` converted to `data`.
-
-    Raises:
-        InputError: The data are invalid.
-    """
+    """Return the term that `term_to_dict` converted to `data`."""
     fields = check_mapping(data, "terms", "a term as data")
     kinds: dict[str, type[Constraint] | type[Cost]] = {"Constraint": Constraint, "Cost": Cost}
     try:

@@ -18,7 +18,7 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["FreeObjects", "to_free_joint_positions"]
 
-# [m] and [rad] by which a grasp that is kept differs between samples: what interpolation rounds
+# [m], [rad] rounding of constant grasp coordinates between samples
 _STILL = 1e-12
 
 
@@ -31,10 +31,6 @@ class FreeObjects:
 
     Attributes:
         names: Names of the free objects.
-
-    Args:
-        scene: Scene at the start.
-        trajectory: Motion in the scene.
     """
 
     def __init__(self, scene: Scene, trajectory: Trajectory) -> None:
@@ -57,9 +53,9 @@ class FreeObjects:
             now = np.flatnonzero(((times > begin) | (number == 0)) & ((times <= end) | last))
             if not (len(now) and rows):
                 continue
-            where, rides = self._begins[number]
-            moving = self._within(
-                phase, np.clip(np.concatenate([[begin], times[now]]), begin, end), where, rides
+            where, supports = self._begins[number]
+            moving = self._place_moving(
+                phase, np.clip(np.concatenate([[begin], times[now]]), begin, end), where, supports
             )
             for name, placement in where.items():
                 rows[name][now] = (
@@ -81,35 +77,37 @@ class FreeObjects:
     @cached_property
     def supports(self) -> list[dict[str, str]]:
         """For every phase, supported free object → supporting link, "<object>.<link>"."""
-        return [rides for _, rides in self._begins]
+        return [supports for _, supports in self._begins]
 
     @cached_property
     def _begins(self) -> list[tuple[dict[str, pin.SE3], dict[str, str]]]:
         """Placements of free objects when each phase begins, and the supports in it."""
         where, found = {name: self.scene.objects[name].placement for name in self.names}, []
         for phase in self.trajectory.phases:
-            rides = self._rides(phase, where) if where else {}
-            found.append((where, rides))
+            supports = self._find_supports(phase, where) if where else {}
+            found.append((where, supports))
             ends = (
-                self._within(phase, self.trajectory.times[[phase.first, phase.last]], where, rides)
+                self._place_moving(
+                    phase, self.trajectory.times[[phase.first, phase.last]], where, supports
+                )
                 if where
                 else {}
             )
             where = {**where, **{name: placements[-1] for name, placements in ends.items()}}
         return found
 
-    def _within(
+    def _place_moving(
         self,
         phase: PhaseSpan,
         times: Floats,
         where: Mapping[str, pin.SE3],
-        rides: Mapping[str, str],
+        supports: Mapping[str, str],
     ) -> dict[str, list[pin.SE3]]:
-        """Compute placements of moving objects at times, from their placements at the phase's begin."""
-        held = self._held(phase, times, where)
-        return {**held, **self._riding(rides, times, where, held)}
+        """Compute placements of moving objects at times, from those at the phase's begin."""
+        held = self._place_held(phase, times, where)
+        return {**held, **self._place_supported(supports, times, where, held)}
 
-    def _held(
+    def _place_held(
         self, phase: PhaseSpan, times: Floats, where: Mapping[str, pin.SE3]
     ) -> dict[str, list[pin.SE3]]:
         values, robot = self.trajectory.at(times), self.scene.robot
@@ -122,13 +120,10 @@ class FreeObjects:
             if not placed.object.free:
                 continue
             if hold.by is None:
-                for q in (
-                    robot.coordinates.q(values[:, : self.trajectory.robot_size])
-                    if not tools
-                    else ()
-                ):
-                    pin.forwardKinematics(robot.model, data, q)
-                    tools.append(pin.updateFramePlacement(robot.model, data, tool).copy())
+                if not tools:
+                    for q in robot.coordinates.q(values[:, : self.trajectory.robot_size]):
+                        pin.forwardKinematics(robot.model, data, q)
+                        tools.append(pin.updateFramePlacement(robot.model, data, tool).copy())
                 holders = tools
             else:
                 carrier = self.scene.objects[hold.by.object]
@@ -138,34 +133,30 @@ class FreeObjects:
             grasped = placed.object.link_placement(attachment.link, placed.state)
             names = [f"{hold.object}.{name}" for name in attachment.coordinates]
             freedom = values[:, [self.trajectory.names.index(name) for name in names]]
-            still = (
-                attachment.tool(freedom[0]) if np.all(np.ptp(freedom, axis=0) <= _STILL) else None
-            )
+            if np.all(np.ptp(freedom, axis=0) <= _STILL):
+                grasps = [attachment.tool(freedom[0])] * len(freedom)
+            else:
+                grasps = [attachment.tool(row) for row in freedom]
             ideal = [
-                holder
-                * (grasped * (still if still is not None else attachment.tool(row))).inverse()
-                for holder, row in zip(holders, freedom, strict=True)
+                holder * (grasped * grasp).inverse()
+                for holder, grasp in zip(holders, grasps, strict=True)
             ]
-            offset = (
-                ideal[0].inverse() * where[hold.object]
-            )  # the hand may close a hair beside the attachment
+            offset = ideal[0].inverse() * where[hold.object]  # the hand may close beside the grasp
             found[hold.object] = [placement * offset for placement in ideal]
         return found
 
-    def _riding(
+    def _place_supported(
         self,
-        rides: Mapping[str, str],
+        supports: Mapping[str, str],
         times: Floats,
         where: Mapping[str, pin.SE3],
         held: Mapping[str, Sequence[pin.SE3]],
     ) -> dict[str, list[pin.SE3]]:
-        values = (
-            dict(zip(self.trajectory.names, self.trajectory.at(times).T, strict=True))
-            if rides
-            else {}
-        )
+        if not supports:
+            return {}
+        values = dict(zip(self.trajectory.names, self.trajectory.at(times).T, strict=True))
         found: dict[str, list[pin.SE3]] = {}
-        for name, label in rides.items():
+        for name, label in supports.items():
             owner, _, link = label.partition(".")
             carrier = self.scene.objects[owner]
             states = np.tile(carrier.state, (len(times), 1))
@@ -180,37 +171,27 @@ class FreeObjects:
             found[name] = [placement * local for placement in links]
         return found
 
-    def _rides(self, phase: PhaseSpan, where: Mapping[str, pin.SE3]) -> dict[str, str]:
+    def _find_supports(self, phase: PhaseSpan, where: Mapping[str, pin.SE3]) -> dict[str, str]:
         """Find free object → supporting link of a phase, from placements at its begin."""
         names, (low, high) = self.trajectory.names, self._ranges
-        spreads = high[phase.first : phase.last].max(axis=0) - low[phase.first : phase.last].min(
-            axis=0
-        )
+        own = slice(phase.first, phase.last)
+        spreads = high[own].max(axis=0) - low[own].min(axis=0)
         moved = {name for name, spread in zip(names, spreads, strict=True) if spread > 0.0}
         begin = dict(zip(names, self.trajectory.positions[phase.first].tolist(), strict=True))
         moving, objects = dict[str, set[str]](), dict[str, PlacedObject]()
         for name, placed in self.scene.objects.items():
             joints = placed.object.coordinates.names
-            state = np.array(
-                [
-                    begin.get(f"{name}.{joint}", value)
-                    for joint, value in zip(joints, placed.state, strict=True)
-                ],
-                float,
-            )
-            objects[name] = dataclasses.replace(
-                placed, placement=where.get(name, placed.placement), state=state
-            )
+            values = zip(joints, placed.state, strict=True)
+            state = np.array([begin.get(f"{name}.{j}", value) for j, value in values], float)
+            there = where.get(name, placed.placement)
+            objects[name] = dataclasses.replace(placed, placement=there, state=state)
             driven = {joint for joint in joints if f"{name}.{joint}" in moved}
             if placed.object.free:
                 moving |= {name: set(placed.object.links)} if name in phase.held else {}
             elif driven:
                 moving[name] = placed.object.links_moved_by(driven)
-        return (
-            find_supported_objects(objects, moving, where.keys() - phase.held.keys())
-            if moving
-            else {}
-        )
+        free = where.keys() - phase.held.keys()
+        return find_supported_objects(objects, moving, free) if moving else {}
 
 
 def to_free_joint_positions(placement: pin.SE3) -> Floats:

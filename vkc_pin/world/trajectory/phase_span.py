@@ -1,4 +1,4 @@
-"""Stretches of a motion in which the same things are held."""
+"""Defines parts of a trajectory with constant holds."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ __all__ = ["PhaseSpan", "get_required"]
 
 @dataclass(frozen=True)
 class PhaseSpan:
-    """A stretch of a trajectory in which the same things are held.
+    """A part of a trajectory with constant holds.
 
     Attributes:
-        name: What happens in it, e.g. "reach door.handle".
-        first, last: Its waypoints; `last` is the next phase's `first`.
-        holds: All that is held in it, each hold after the one it depends on.
-        opening: How far the gripper is open in it [m]; None: as the robot rests. If it was
-            otherwise in the phase before, the fingers move from the first waypoint to the second.
+        name: Name of the phase, e.g. "reach door.handle".
+        first, last: Its first and last waypoint; the next phase begins at `last`.
+        holds: Holds during the phase, each after the one it depends on.
+        opening: Gripper opening [m]; None: as in the robot's rest configuration. From another
+            opening, the fingers move between the first two waypoints.
 
     Raises:
-        InputError: Something is held through what is not, or an opening is none.
+        InputError: An object is held through one that is not held, or a number is out of range.
     """
 
     name: str
@@ -42,21 +42,17 @@ class PhaseSpan:
             )
         object.__setattr__(self, "holds", check_hold_order(self.holds))
         if self.opening is not None:
-            object.__setattr__(
-                self,
-                "opening",
-                check_number(
-                    self.opening, "PhaseSpan.opening", "a distance [m]", low=0.0, high=1.0
-                ),
-            )
+            field, expected = "PhaseSpan.opening", "a distance [m]"
+            opening = check_number(self.opening, field, expected, low=0.0, high=1.0)
+            object.__setattr__(self, "opening", opening)
 
     @property
     def held(self) -> dict[str, str]:
-        """Object → attachment, for all that is held in it."""
+        """Object → attachment of the held objects."""
         return {hold.object: hold.attachment for hold in self.holds}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data of it; `by` names the link, "<object>.<link>", for what is held through another object."""
+        """Return plain data; `by` maps objects held through another to its link, "<object>.<link>"."""
         by = {hold.object: hold.frame for hold in self.holds if hold.by}
         data = {
             "name": self.name,
@@ -69,14 +65,10 @@ class PhaseSpan:
 
     @classmethod
     def from_dict(cls, data: Any, where: str) -> PhaseSpan:
-        """Return what `to_dict` made `data` of.
-
-        Args:
-            data: Plain data.
-            where: The field that it stands in, for errors.
+        """Return the phase described by data from `to_dict`, in the field `where`.
 
         Raises:
-            InputError: Something is missing from it or does not fit.
+            InputError: A field is missing or invalid.
         """
         phase = check_mapping(data, where)
         held = make_holds(get_required(phase, "held"), phase.get("by"))
@@ -85,7 +77,7 @@ class PhaseSpan:
 
 
 def get_required(data: Mapping[str, Any], name: str) -> Any:
-    """Return an entry of a motion's data. Raises `InputError` if it is not there."""
+    """Return an entry of a motion's data. Raises `InputError` if it is missing."""
     if name not in data:
         raise InputError("this is missing from a trajectory", field=name)
     return data[name]

@@ -55,10 +55,6 @@ def key_times(trajectory: Trajectory, strides: Mapping[str, float] | None = None
     """Return waypoint times and intermediate times at most 1 rad or m apart, shape (K,) [s].
 
     Between these times a viewer's interpolation of joint positions and quaternions is exact.
-
-    Args:
-        trajectory: Motion.
-        strides: Coordinate → largest step. Default: 1.
     """
     most = [(strides or {}).get(name, _TURN) for name in trajectory.names]
     steps = np.abs(np.diff(trajectory.positions, axis=0) / most).max(axis=1)
@@ -72,17 +68,12 @@ def key_times(trajectory: Trajectory, strides: Mapping[str, float] | None = None
 def sample_motion(
     world: World, trajectory: Trajectory | None, times: Floats | None = None
 ) -> Motion:
-    """Sample the world's motion at `times`, (K,) [s], or at key times; without a motion, its start."""
+    """Sample a motion at `times`, (K,) [s], or at key times; without a motion, the start."""
     if trajectory is None:
         times, rows = np.zeros(1), world.start[None]
     else:
-        strides = dict(
-            zip(
-                world.coordinates.names,
-                world.coordinates.compute_max_steps(_TURN, _TURN).tolist(),
-                strict=True,
-            )
-        )
+        steps = world.coordinates.compute_max_steps(_TURN, _TURN).tolist()
+        strides = dict(zip(world.coordinates.names, steps, strict=True))
         times = key_times(trajectory, strides) if times is None else np.asarray(times, float)
         rows = world.compute_positions(trajectory, times)
     model, data = world.model, world.model.createData()

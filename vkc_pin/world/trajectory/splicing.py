@@ -17,54 +17,42 @@ __all__ = ["concatenate_trajectories", "extract_phases", "fill_missing_values"]
 
 
 def concatenate_trajectories(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:
-    """Concatenate motions.
+    """Concatenate motions, with pauses [s] where holds or the gripper opening change.
 
-    Args:
-        parts: Motions, each of which begins where its predecessor ends. Coordinates that a part
-            lacks are constant in it.
-        pause: Rest between two parts where the gripper closes or opens [s].
-
-    Raises:
-        InputError: There is no motion, or one does not begin where its predecessor ends.
+    Missing coordinates keep their last known value, or have the next one. Raises `InputError` if a
+    motion begins more than 1e-6 [m], [rad] from the end of its predecessor.
     """
     if not parts:
-        raise InputError(
-            "nothing to concatenate", field="parts", expected="at least one trajectory"
-        )
+        expected = "at least one trajectory"
+        raise InputError("nothing to concatenate", field="parts", expected=expected)
     robot = parts[0].robot_size
     names = list(dict.fromkeys(name for part in parts for name in part.names))
-    curves = [_curve_of(part) for part in parts]
+    curves = [_get_curve(part) for part in parts]
     waypoints, knots, phases = _Rows(names), _Rows(names), list[PhaseSpan]()
     for number, (part, curve) in enumerate(zip(parts, curves, strict=True)):
         shift = waits = 0
         if number:
             apart = np.abs(part.positions[0, :robot] - waypoints.last(part.names[:robot])).max()
             if not apart <= 1e-6:
-                where = f"parts[{number}]"
-                raise InputError(
-                    "a motion does not begin where the one before it ends",
-                    field=where,
-                    got=f"{apart:g} apart",
-                )
+                problem = "a motion does not begin where the one before it ends"
+                got = f"{apart:g} apart"
+                raise InputError(problem, field=f"parts[{number}]", got=got)
             before, after = phases[-1], part.phases[0]
-            shift, waits = (
-                len(waypoints) - 1,
-                set(before.holds) != set(after.holds) or before.opening != after.opening,
-            )
+            waits = set(before.holds) != set(after.holds) or before.opening != after.opening
+            shift = len(waypoints.times) - 1 + waits
         rest = pause if waits else 0.0
         waypoints.add(part.names, part.times, part.positions, rest)
         if curve is not None:
             knots.add(part.names, curve.times, curve.positions, rest, curve.rates)
         for k, phase in enumerate(part.phases):
             first = phases[-1].last if phases else 0
-            last = phase.last + shift + int(waits)
-            phases.append(
-                replace(
-                    phase, first=first if k == 0 else phase.first + shift + int(waits), last=last
-                )
-            )
-    whole = None if any(curve is None for curve in curves) else knots.curve()
-    return Trajectory(tuple(names), waypoints.at(), waypoints.filled(), tuple(phases), robot, whole)
+            first = phase.first + shift if k else first
+            phases.append(replace(phase, first=first, last=phase.last + shift))
+    whole = None
+    if all(curve is not None for curve in curves):
+        whole = Curve(np.array(knots.times), knots.fill(), np.array(knots.rates))
+    times = np.array(waypoints.times)
+    return Trajectory(tuple(names), times, waypoints.fill(), tuple(phases), robot, whole)
 
 
 class _Rows:
@@ -76,9 +64,6 @@ class _Rows:
         self.rows: list[Floats] = []
         self.rates: list[Floats] = []
 
-    def __len__(self) -> int:
-        return len(self.times)
-
     def add(
         self,
         names: Sequence[str],
@@ -88,15 +73,11 @@ class _Rows:
         rates: Floats | None = None,
     ) -> None:
         """Append rows after a rest [s]; without a rest, the first row repeats the last one."""
-        columns, begin = (
-            [self.names.index(name) for name in names],
-            0.0 if not self.times else self.times[-1] + rest,
-        )
+        columns = [self.names.index(name) for name in names]
+        begin = self.times[-1] + rest if self.times else 0.0
         skipped = 1 if self.times and not rest else 0
-        values, slopes = (
-            np.full((len(times), len(self.names)), np.nan),
-            np.zeros((len(times), len(self.names))),
-        )
+        shape = (len(times), len(self.names))
+        values, slopes = np.full(shape, np.nan), np.zeros(shape)
         values[:, columns] = positions
         slopes[:, columns] = 0.0 if rates is None else rates
         moments = begin + (times - times[0])
@@ -108,17 +89,11 @@ class _Rows:
         """Return the last values of coordinates."""
         return np.asarray(self.rows[-1][[self.names.index(name) for name in names]])
 
-    def at(self) -> Floats:
-        return np.array(self.times)
-
-    def filled(self) -> Floats:
+    def fill(self) -> Floats:
         return fill_missing_values(np.array(self.rows))
 
-    def curve(self) -> Curve:
-        return Curve(self.at(), self.filled(), np.array(self.rates))
 
-
-def _curve_of(part: Trajectory) -> Curve | None:
+def _get_curve(part: Trajectory) -> Curve | None:
     """Return a motion's curve, a constant one for a motion at rest, or None."""
     if part.curve is None and not np.ptp(part.positions, axis=0).any():
         return Curve(part.times, part.positions, np.zeros_like(part.positions))
@@ -134,25 +109,15 @@ def fill_missing_values(table: Floats) -> Floats:
     for column in table.T:
         known = np.flatnonzero(~np.isnan(column))
         if len(known):
-            column[:] = column[
-                known[
-                    np.maximum(np.searchsorted(known, np.arange(len(column)), side="right") - 1, 0)
-                ]
-            ]
+            last = np.searchsorted(known, np.arange(len(column)), side="right") - 1
+            column[:] = column[known[np.maximum(last, 0)]]
     return table
 
 
 def extract_phases(
     trajectory: Trajectory, names: Sequence[str], begin: int, end: int | None
 ) -> Trajectory:
-    """Extract phases and coordinates of a motion.
-
-    Args:
-        trajectory: Motion.
-        names: Names of the coordinates, in the wanted order.
-        begin: First phase.
-        end: Phase after the last one. Default: the end of the motion.
-    """
+    """Extract phases and coordinates of a motion."""
     phases = trajectory.phases[begin:end]
     first, last = phases[0].first, phases[-1].last
     columns = [trajectory.names.index(name) for name in names]

@@ -43,21 +43,20 @@ class RollingLimits:
 
     @staticmethod
     def compute_steps(path: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return longitudinal, lateral [m] and angular motion [rad] of N segments, shape (N,) each."""
+        """Return longitudinal, lateral [m], angular motion [rad] of N segments, shape (N,) each."""
         dx, dy, turn = np.diff(path[:, :3], axis=0).T
         return *rotate_into_base_frame(dx, dy, path[:-1, 2] + turn / 2), turn
 
     def compute_error(self, path: Floats) -> float:
-        """Return the largest lateral motion, or shortfall for the turning radius, of any segment [m]."""
+        """Return the largest lateral motion, or shortfall of the turning radius [m]."""
         if self.is_omnidirectional:
             return 0.0
         along, aside, turn = self.compute_steps(path)
-        return float(
-            max(np.abs(aside).max(), (self.turning_radius * np.abs(turn) - np.abs(along)).max())
-        )
+        shortfall = self.turning_radius * np.abs(turn) - np.abs(along)
+        return float(max(np.abs(aside).max(), shortfall.max()))
 
     def compute_gears(self, path: Floats) -> Floats:
-        """Return 1 for forward and -1 for backward segments, shape (N,); rests take their neighbour's."""
+        """Return 1 for forward, -1 for backward segments, shape (N,); rests keep the last gear."""
         if self.is_omnidirectional:
             return np.ones(len(path) - 1)
         along, _, _ = self.compute_steps(path)
@@ -65,11 +64,8 @@ class RollingLimits:
         known = np.flatnonzero(gear)
         if not len(known):
             return np.ones(len(gear))
-        return np.asarray(
-            gear[
-                known[np.maximum(np.searchsorted(known, np.arange(len(gear)), side="right") - 1, 0)]
-            ]
-        )
+        last = np.searchsorted(known, np.arange(len(gear)), side="right") - 1
+        return np.asarray(gear[known[np.maximum(last, 0)]])
 
     def compute_min_times(self, path: Floats) -> Floats:
         """Return the shortest durations of segments at the wheels' speed limit, shape (N,) [s]."""

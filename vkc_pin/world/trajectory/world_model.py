@@ -37,20 +37,17 @@ class World:
     """A scene's robot, objects and obstacles in one `pinocchio.Model`.
 
     Attributes:
-        model: Robot (joint 1 is the planar base, fingers come last), then every object's own tree;
-            joints of objects are `<object>.<joint>`, the free joint of one that can be carried
-            `<object>.placement`, frames `<object>.<link>`.
-        coordinates: Its minimal coordinates, n of them: the robot's, then the objects'.
+        model: Robot (joint 1 is the planar base, fingers come last), then the tree of every object,
+            with joints `<object>.<joint>`, frames `<object>.<link>`, and a free joint
+            `<object>.placement` for free objects.
+        coordinates: Its n minimal coordinates: the robot's, then the objects'.
         bodies: Collision geometry of robot and objects.
-        shapes: These shapes, then those of the obstacles, which stand in the world (parent joint
-            0).
-        collision, visual: All geometry in one, put together when first asked for; what stands still
-            has parent joint 0.
-        collision_labels, visual_labels: For each geometry, the link or obstacle it belongs to, e.g.
-            "forearm_link", "door.panel", "sofa".
-        collision_keys: For each of `shapes`, its key in every model of the scene, see
-            `neighbours.shape_keys`.
-        start: The scene's start and the objects' placements and states, shape (n,).
+        shapes: These shapes, then those of the obstacles (parent joint 0).
+        collision, visual: Geometry of robot, objects and obstacles, built on first use.
+        collision_labels, visual_labels: Link or obstacle of each shape, e.g. "forearm_link",
+            "door.panel", "sofa".
+        collision_keys: Key of each of `shapes`, see `make_shape_keys`.
+        start: Start of the robot, then placements and states of the objects, shape (n,).
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -66,15 +63,12 @@ class World:
                     0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"{name}.{FREE_JOINT}"
                 )
                 placement = pin.SE3.Identity()
+            own, prefix = placed.object.model, f"{name}."
             self._joints[name] = graft(
-                self.model,
-                placed.object.model,
-                parent=parent,
-                placement=placement,
-                prefix=f"{name}.",
+                self.model, own, parent=parent, placement=placement, prefix=prefix
             )
         objects = {name: placed.object.collision for name, placed in scene.objects.items()}
-        self.bodies = self._geometry(robot.collision, objects)
+        self.bodies = self._graft_all(robot.collision, objects)
         self.shapes = (*self.bodies.geometryObjects, *scene.obstacles)
         self.collision_labels = [
             *(get_link_name(shape.name) for shape in self.bodies.geometryObjects),
@@ -84,34 +78,27 @@ class World:
             self.collision_labels, [shape.name for shape in self.shapes]
         )
         self.coordinates = Coordinates(self.model)
-        states = [
-            np.concatenate(
-                [
-                    to_free_joint_positions(placed.placement) if placed.object.free else [],
-                    placed.state,
-                ]
-            )
-            for placed in scene.objects.values()
-        ]
-        fingers = (
-            np.zeros(0)
-            if robot.gripper is None
-            else robot.gripper.compute_positions(compute_start_opening(scene))
-        )
-        self.start: Floats = np.concatenate([np.asarray(scene.start), fingers, *states])
+        start = [np.asarray(scene.start)]
+        if robot.gripper is not None:
+            start.append(robot.gripper.compute_positions(compute_start_opening(scene)))
+        for placed in scene.objects.values():
+            if placed.object.free:
+                start.append(to_free_joint_positions(placed.placement))
+            start.append(placed.state)
+        self.start: Floats = np.concatenate(start)
 
     @cached_property
     def collision(self) -> pin.GeometryModel:
-        """What collides, as one; with many obstacles that takes a while, as Pinocchio's models take quadratic time to grow."""
+        """All collision geometry; its construction takes quadratic time in the number of obstacles."""
         geometry = self.bodies.copy()
         graft_geometry(geometry, self.scene.obstacles, joints=[0], placement=pin.SE3.Identity())
         return geometry
 
     @cached_property
     def visual(self) -> pin.GeometryModel:
-        """What to draw; put together when first asked for, since meshes for display are large."""
+        """All visual geometry."""
         objects = {name: placed.object.visual for name, placed in self.scene.objects.items()}
-        geometry = self._geometry(self.scene.robot.visual, objects)
+        geometry = self._graft_all(self.scene.robot.visual, objects)
         graft_geometry(
             geometry, self.scene.obstacle_visual, joints=[0], placement=pin.SE3.Identity()
         )
@@ -119,21 +106,19 @@ class World:
 
     @cached_property
     def visual_labels(self) -> list[str]:
-        """For each geometry of `visual`, the link or obstacle it belongs to."""
+        """Link or obstacle of each shape of `visual`."""
         links = {str(frame.name) for frame in self.model.frames if frame.type == pin.FrameType.BODY}
         shapes = list(self.visual.geometryObjects)
         moving = len(shapes) - len(self.scene.obstacle_visual)
         labels = []
         for shape in shapes[:moving]:
             label = get_link_name(shape.name)
-            while (
-                label not in links and "_" in label
-            ):  # a mesh of several parts is `<link>_<number>_<part>`
+            while label not in links and "_" in label:  # a part is `<link>_<number>_<part>`
                 label = label.rpartition("_")[0]
             labels.append(label)
         return labels + [shape.name for shape in shapes[moving:]]
 
-    def _geometry(
+    def _graft_all(
         self, robot: pin.GeometryModel, objects: Mapping[str, pin.GeometryModel]
     ) -> pin.GeometryModel:
         """Return the shapes of robot and objects, in this order."""
@@ -143,14 +128,9 @@ class World:
         graft_geometry(geometry, own, joints=list(range(self._robot_joints)), placement=here)
         for name, source in objects.items():
             placed = self.scene.objects[name]
-            where = here if placed.object.free else placed.placement
-            graft_geometry(
-                geometry,
-                source.geometryObjects,
-                joints=self._joints[name],
-                placement=where,
-                prefix=f"{name}.",
-            )
+            where, joints = here if placed.object.free else placed.placement, self._joints[name]
+            shapes, prefix = source.geometryObjects, f"{name}."
+            graft_geometry(geometry, shapes, joints=joints, placement=where, prefix=prefix)
         return geometry
 
     def compute_positions(
@@ -159,14 +139,7 @@ class World:
         times: ArrayLike | None = None,
         free: FreeObjects | None = None,
     ) -> Floats:
-        """Compute minimal coordinates of the world along a trajectory, shape (K, n).
-
-        Args:
-            trajectory: Motion in this scene. Coordinates that it does not name keep their start
-                values, except for free objects.
-            times: Increasing times, shape (K,) [s]. Default: the waypoints.
-            free: Free objects along the trajectory, if they exist already.
-        """
+        """Compute minimal coordinates of the world along a trajectory, shape (K, n)."""
         times = trajectory.times if times is None else np.asarray(times, float)
         values = trajectory.at(times)
         rows = np.tile(self.start, (len(values), 1))
@@ -180,7 +153,7 @@ class World:
         gripper = self.scene.robot.gripper
         if gripper is not None:
             first = len(self.scene.start)
-            rows[:, first : first + len(gripper.names)] = _fingers(
+            rows[:, first : first + len(gripper.names)] = _compute_finger_positions(
                 gripper, compute_start_opening(self.scene), trajectory, times
             )
         return rows
@@ -201,7 +174,7 @@ class World:
         return slice(first, first + 7)
 
 
-def _fingers(
+def _compute_finger_positions(
     gripper: Gripper, start: float | None, trajectory: Trajectory, times: Floats
 ) -> Floats:
     """Compute finger positions along a motion, shape (K, k), [m] or [rad].
@@ -224,13 +197,7 @@ def _fingers(
 
 
 def compute_final_scene(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> Scene:
-    """Compute the scene at the end of a motion.
-
-    Args:
-        scene: Scene at the start.
-        trajectory: Motion.
-        holds: Holds at the end.
-    """
+    """Compute the scene at the end of a motion."""
     last = dict(zip(trajectory.names, trajectory.positions[-1].tolist(), strict=True))
 
     def end(coordinate: str, lower: float, upper: float) -> float:
@@ -244,10 +211,10 @@ def compute_final_scene(scene: Scene, trajectory: Trajectory, holds: Sequence[Ho
     world = World(scene)
     (row,) = world.compute_positions(trajectory, trajectory.times[-1:])
     for name, placed in scene.objects.items():
-        thing = placed.object
-        if thing.free:
+        item = placed.object
+        if item.free:
             after = after.with_placement(name, world.get_placement(name, row))
-        joints = zip(thing.coordinates.names, thing.lower, thing.upper, strict=True)
+        joints = zip(item.coordinates.names, item.lower, item.upper, strict=True)
         state = {
             joint: end(f"{name}.{joint}", low, high)
             for joint, low, high in joints
@@ -268,15 +235,12 @@ def compute_final_scene(scene: Scene, trajectory: Trajectory, holds: Sequence[Ho
 
 def find_coordinate_units(scene: Scene) -> dict[str, str]:
     """Return coordinate → unit, "m" or "rad", of robot, objects and freedoms of grasps."""
-    units = dict(zip(scene.robot.coordinates.names, scene.robot.coordinates.units, strict=True))
+    own = scene.robot.coordinates
+    units = dict(zip(own.names, own.units, strict=True))
     for owner, placed in scene.objects.items():
-        own = dict(
-            zip(placed.object.coordinates.names, placed.object.coordinates.units, strict=True)
-        )
-        for attachment in placed.object.attachments.values():
-            own |= {
-                name: freedom.unit
-                for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True)
-            }
-        units |= {f"{owner}.{name}": unit for name, unit in own.items()}
+        own = placed.object.coordinates
+        pairs = [*zip(own.names, own.units, strict=True)]
+        for grasp in placed.object.attachments.values():
+            pairs += zip(grasp.coordinates, (one.unit for one in grasp.freedoms), strict=True)
+        units |= {f"{owner}.{name}": unit for name, unit in pairs}
     return units

@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.closers import changed, closer
-from oracle import motors
-from oracle.plan import read_plan
-from oracle.stage import World as Judged
+from helpers.closers import changed
 
 import vkc_pin as vkc
-from vkc_pin.validation.dynamics.torques import MotorLoads
-from vkc_pin.validation.samples import Samples
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.dynamics.torques import Torques
 from vkc_pin.world.trajectory.trajectory import PhaseSpan, Trajectory
@@ -92,42 +85,6 @@ def test_a_payload_at_rest_weighs_by_its_lever() -> None:
     for twist in axes[3:]:
         hand.append(3.0 * 9.81 * (twist[:3] + np.cross(twist[3:], where))[2])
     np.testing.assert_allclose(torques[1][3:] - torques[0][3:], hand, atol=1e-6)
-
-
-def seen(plan: vkc.Plan, file: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest torque of every joint as the package and the oracle find it."""
-    own = MotorLoads(Samples(plan.scene, plan.trajectory)).torques
-    plan.save(file)
-    world = Judged(read_plan(file))
-    found = dict.fromkeys(world.robot.arm, 0.0)
-    excess, carries = motors.EXCESS, motors._carries
-    motors.EXCESS, motors._carries = -1.0, lambda *_: True  # type: ignore[assignment]
-    try:
-        for stage in world.stages():
-            for violation in motors.check_motors(world, stage):
-                found[violation.subject] = max(found[violation.subject], violation.amount)
-    finally:
-        motors.EXCESS, motors._carries = excess, carries
-    return np.abs(own).max(axis=0)[3:], np.array(list(found.values()))
-
-
-def test_virtual_work_comes_to_the_same_at_a_door_that_resists(tmp_path: Path) -> None:
-    scene = closer(damping=60.0, friction=3.0, stiffness=20.0, springref=-1.0)
-    plan = vkc.plan(scene, [vkc.Actuate("door", {"hinge": 1.2}, "handle_free")])
-    assert plan.success
-    own, other = seen(plan, tmp_path / "door.npz")
-    np.testing.assert_allclose(own, other, rtol=0.02, atol=0.05)
-
-
-def test_and_with_a_tray_and_what_stands_on_it(tmp_path: Path) -> None:
-    plan = vkc.plan(vkc.load_scene("tray"), [vkc.Place("tray", [-0.3, -1.96, 0.7])])
-    assert plan.success
-    own, other = seen(plan, tmp_path / "tray.npz")
-    np.testing.assert_allclose(own, other, rtol=0.02, atol=0.05)
-    alone = Torques(
-        changed(changed(plan.scene, "tray", mass=0.0), "cup", mass=0.0), plan.trajectory
-    )
-    assert "tray" in alone.massless_objects
 
 
 def test_acceleration_of_the_base_pulls_at_the_arm() -> None:

@@ -1,23 +1,22 @@
+"""Tests trajectories as CSV and JSON, their errors, and `vkc-pin export`."""
+
 from __future__ import annotations
 
 import csv
 import json
-import os
 import re
 import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from helpers.fake_plan import fake_plan
-from helpers.written import FILES, ROBOT, broken, same, trajectories
+from helpers.written import FILES, broken, same, trajectories
 from hypothesis import given
 
 import vkc_pin as vkc
 from vkc_pin import cli
 from vkc_pin.planning.plan import Plan
-from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -25,9 +24,6 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 @pytest.fixture(scope="module")
 def plan() -> Plan:
     return fake_plan()
-
-
-# There and back
 
 
 @FILES
@@ -40,27 +36,6 @@ def test_tables_are_exact(trajectory: Trajectory, tmp_path: Path) -> None:
 @given(trajectory=trajectories())
 def test_json_is_exact(trajectory: Trajectory, tmp_path: Path) -> None:
     assert same(Trajectory.from_json(trajectory.to_json(tmp_path / "motion.json")), trajectory)
-
-
-@pytest.mark.parametrize("name", ["a\rb", "\n", "\r\n", 'a "quoted", name'])
-def test_names_with_line_ends_come_back(name: str, tmp_path: Path) -> None:
-    phase = PhaseSpan(name, 0, 1, (Hold(name, name), Hold("other", name, Hold(name, name), name)))
-    trajectory = Trajectory(ROBOT[:3], np.arange(2.0), np.zeros((2, 3)), (phase,), 3)
-    assert same(Trajectory.from_csv(trajectory.to_csv(tmp_path / "motion.csv")), trajectory)
-
-
-def test_a_plan_comes_back(plan: Plan, tmp_path: Path) -> None:
-    assert same(Trajectory.from_csv(plan.to_csv(tmp_path / "door.csv")), plan.trajectory)
-    assert same(Trajectory.from_json(plan.to_json(tmp_path / "door.json")), plan.trajectory)
-    path = broken(tmp_path / "ros.json", json.dumps(plan.to_ros(joints="all")))
-    back = Trajectory.from_ros(path, like=plan.trajectory)
-    assert (back.phases, back.positions.tolist()) == (
-        plan.trajectory.phases,
-        plan.trajectory.positions.tolist(),
-    )
-
-
-# Tables
 
 
 def test_columns_have_names_and_units(plan: Plan, tmp_path: Path) -> None:
@@ -92,7 +67,7 @@ def test_columns_have_names_and_units(plan: Plan, tmp_path: Path) -> None:
         ("all", 12),
     ],
 )
-def test_some_of_the_joints(plan: Plan, tmp_path: Path, joints: Any, count: int) -> None:
+def test_groups_of_joints(plan: Plan, tmp_path: Path, joints: Any, count: int) -> None:
     header = (
         plan.to_csv(tmp_path / "some.csv", joints=joints)
         .read_text(encoding="utf-8")
@@ -105,7 +80,7 @@ def test_some_of_the_joints(plan: Plan, tmp_path: Path, joints: Any, count: int)
     assert all(len(point["positions"]) == count for point in plan.to_ros(joints=joints)["points"])
 
 
-def test_names_that_there_are_not(plan: Plan, tmp_path: Path) -> None:
+def test_unknown_joints_are_rejected(plan: Plan, tmp_path: Path) -> None:
     with pytest.raises(vkc.UnknownNameError, match="did you mean 'robot'"):
         plan.to_ros(joints="robo")
     with pytest.raises(vkc.UnknownNameError, match=r"joints\[1\].*door.hinge"):
@@ -115,7 +90,7 @@ def test_names_that_there_are_not(plan: Plan, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_table_from_elsewhere(tmp_path: Path) -> None:
+def test_plain_tables_are_read(tmp_path: Path) -> None:
     text = "\ufefftime,base_x,base_y,base_yaw,door.hinge\r\n0,0,0,0,0\r\n\r\n0.5,1,2,3,4\r\n"
     found = Trajectory.from_csv(broken(tmp_path / "own.csv", text))
     assert (found.names, found.robot_size) == (("base_x", "base_y", "base_yaw", "door.hinge"), 3)
@@ -138,27 +113,22 @@ GOOD = "0.0,0,0,0,1,go,{}\n"
             HEAD + GOOD + "1.0,0,zero,0,1,go,{}\n",
             "bad.csv:3: base_y: not a number .expected a finite number, got 'zero'",
         ),
-        (HEAD + GOOD + "1.0,nan,0,0,1,go,{}\n", "bad.csv:3: base_x: not a number"),
         (
             HEAD + GOOD + "1.0,0,0,0,3,go,{}\n",
             "bad.csv:3: phase: not the next phase .expected 1 or 2, got '3'",
         ),
-        (HEAD + "0.0,0,0,0,2,go,{}\n", "bad.csv:2: phase: not the next phase .expected 1, got '2'"),
-        (HEAD + "0.0,0,0,0,1,go,door\n", "bad.csv:2: held: not what is held"),
-        (HEAD + '0.0,0,0,0,1,go,"{""door"": 3}"\n', "bad.csv:2: held: not what is held"),
-        (HEAD + '0.0,0,0,0,1,go,"[1]"\n', "bad.csv:2: held: not what is held"),
+        (HEAD + "0.0,0,0,0,1,go,door\n", "bad.csv:2: held: not the held objects"),
+        (HEAD + '0.0,0,0,0,1,go,"[1]"\n', "bad.csv:2: held: not the held objects"),
         (HEAD + GOOD, "bad.csv: Trajectory.times: times do not increase"),
-        (HEAD + GOOD + GOOD, "bad.csv: Trajectory.times: times do not increase"),
         ("time,arm\n0,0\n1,1\n", "bad.csv: Trajectory.robot_size: out of range"),
-        ("time\n0\n1\n", "bad.csv: Trajectory.robot_size: out of range"),
     ],
 )
-def test_bad_tables(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_tables_are_rejected(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(vkc.InputError, match=message):
         Trajectory.from_csv(broken(tmp_path / "bad.csv", text))
 
 
-def test_files_that_are_not_there_or_no_text(tmp_path: Path) -> None:
+def test_unreadable_files_are_rejected(tmp_path: Path) -> None:
     for read in (Trajectory.from_csv, Trajectory.from_json, Trajectory.from_ros):
         with pytest.raises(
             vkc.InputError, match=r"none.csv: cannot read the (CSV|JSON) .*No such file"
@@ -184,44 +154,22 @@ HELD = "0,0,0,0,1,a,"
         ),
         (Trajectory.from_csv, "time,x,y,yaw\n" + "0,0,0,0\n" * 300_000, "too many lines"),
         (Trajectory.from_csv, "time," + "x" * 200_000, ":1: not a table .got field larger"),
-        (Trajectory.from_csv, "time,x,y,yaw\n0,0,0," + "9" * 100_000, ":2: yaw: not a number"),
         (
             Trajectory.from_csv,
             "time,x,y,yaw,phase,phase_name,held\n" + HELD + "[" * 100_000,
-            ":2: held: not what is held",
+            ":2: held: not the held objects",
         ),
         (Trajectory.from_json, "[" * 1_000_000, "too many lists|not JSON"),
-        (Trajectory.from_json, '{"names": [' + "1," * 5_000_000 + "1]}", "phases: this is missing"),
-        (
-            Trajectory.from_json,
-            '{"names": ['
-            + ",".join(f'"{k}"' for k in range(500_000))
-            + ',"7"], "times": [0, 1], "positions": [[0]],'
-            ' "robot_size": 3, "phases": []}',
-            "Trajectory.names: too many entries",
-        ),
-        (
-            Trajectory.from_json,
-            '{"names": ["x"], "times": [0, 1], "positions": ["'
-            + "x" * 5_000_000
-            + '"], "robot_size": 3, "phases": []}',
-            "Trajectory.positions: not numbers",
-        ),
         (
             Trajectory.from_ros,
             '{"joint_names": ["x"], "points": [' + "[]," * 400_000 + "[]]}",
             "too many lists and objects",
         ),
-        (
-            Trajectory.from_ros,
-            '{"joint_names": "' + "x" * 19_000_000 + '"}',
-            "joint_names: wrong type of value",
-        ),
         (Trajectory.from_json, " " * 20_000_001, "the JSON is too large"),
     ],
     ids=lambda value: value if isinstance(value, str) and len(value) < 60 else "",
 )
-def test_files_of_any_size_and_depth_are_refused_in_time(
+def test_large_and_deep_files_are_rejected_in_time(
     read: Any, text: str, message: str, tmp_path: Path
 ) -> None:
     began = time.process_time()
@@ -231,16 +179,6 @@ def test_files_of_any_size_and_depth_are_refused_in_time(
     assert time.process_time() - began < 10.0
 
 
-def test_pipes_are_refused(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe")
-    for read in (Trajectory.from_csv, Trajectory.from_json, Trajectory.from_ros):
-        with pytest.raises(vkc.InputError, match="got a pipe or a device"):
-            read(tmp_path / "pipe")
-
-
-# JSON
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -248,7 +186,6 @@ def test_pipes_are_refused(tmp_path: Path) -> None:
         ("[]", "bad.json: not a trajectory .expected an object, got list"),
         ("{}", "bad.json: phases: this is missing"),
         ('{"trajectory": 3}', "bad.json: trajectory: not a trajectory"),
-        ('{"trajectory": {"names": []}}', "bad.json: trajectory.phases: this is missing"),
         ('{"names": [], "phases": 3}', "bad.json: phases: not a list"),
         (
             '{"names": ["a"], "times": [0, 1], "positions": [[1], ["x"]], "robot_size": 3, "phases": []}',
@@ -256,15 +193,9 @@ def test_pipes_are_refused(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_bad_json(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_json_is_rejected(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(vkc.InputError, match=message):
         Trajectory.from_json(broken(tmp_path / "bad.json", text))
-
-
-# ROS
-
-
-# The command line
 
 
 def test_export_of_a_saved_plan(
@@ -308,7 +239,7 @@ def test_export_of_a_saved_plan(
         (["--ros", "x.json", "--rate", "0"], "rate: out of range"),
     ],
 )
-def test_misuse(
+def test_invalid_export_options_are_rejected(
     plan: Plan,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],

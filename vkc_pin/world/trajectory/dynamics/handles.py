@@ -32,13 +32,7 @@ class Motion(NamedTuple):
 
 
 class Handle:
-    """A hand at an attachment of a fixed object.
-
-    Args:
-        scene: Scene of the object.
-        hold: Grasp of the object.
-        riders: Supported loads on the object.
-    """
+    """A hand at an attachment of a fixed object."""
 
     def __init__(self, scene: Scene, hold: Hold, riders: Riders = ()) -> None:
         self.name, self.placed = hold.object, scene.objects[hold.object]
@@ -95,14 +89,6 @@ class Handle:
         """Compute positions of the hand and the free directions of its grasp, in the object's axes.
 
         The hand exerts no force in a free direction. Firm grasps and pushes have none.
-
-        Args:
-            turns: Rotations of the grasped link, shape (K, 3, 3).
-            origins: Origins of the grasped link, shape (K, 3).
-            values: Values of the grasp's freedoms, shape (K, f).
-
-        Returns:
-            Positions, shape (K, 3), and directions, shape (K, f or 0, 6).
         """
         at, axes = self.attachment, list[tuple[Floats, Floats | None]]()
         rotation, origin = turns @ at.placement.rotation, origins + turns @ at.placement.translation
@@ -161,11 +147,7 @@ class Handle:
         return np.column_stack([np.zeros((size, 0)), *columns])
 
     def _bases(self, turns: Floats) -> Floats:
-        """Compute bases of equally weighted wrenches, shape (K, 6, r); for a push, its direction.
-
-        Args:
-            turns: Rotations of the link, shape (K, 3, 3).
-        """
+        """Compute bases of equally weighted wrenches, shape (K, 6, r); for a push, its direction."""
         if self.attachment.contact == "push":
             return np.pad(turns @ self.attachment.placement.rotation[:, 2], ((0, 0), (0, 3)))[
                 ..., None

@@ -75,11 +75,6 @@ class Torques:
     object, the hand exerts the smallest sufficient wrench; see `Handle`. Friction and rotor
     inertias of the arm's joints are neglected, since robot descriptions rarely give them. An object
     in a grasp with freedoms is placed as in the middle of the phase.
-
-    Args:
-        scene: Scene with robot and objects.
-        trajectory: Motion. Only the order of its phases matters, not their times.
-        free: Free objects along the motion, if they exist already.
     """
 
     def __init__(

@@ -41,13 +41,12 @@ __all__ = [
 ]
 
 FORMAT = 1
-LARGEST_ARCHIVE, LARGEST_MEMBER = 20_000_000, 40_000_000
-"""Largest file, and largest part of it unpacked [bytes]: some 200 000 waypoints of 25 coordinates."""
-ARRAYS = {"about": ("U", 0), "times": ("f", 1), "positions": ("f", 2)}
-"""Parts of the archive: kind and number of axes of the array."""
-CURVE = {"knot_times": ("f", 1), "knot_positions": ("f", 2), "knot_rates": ("f", 2)}
-"""Additional parts of a motion with a curve."""
-_PARTS = ARRAYS | CURVE
+# Sizes of a file and of an unpacked part [bytes]: 200 000 waypoints of 25 coordinates.
+_MAX_ARCHIVE, _MAX_MEMBER = 20_000_000, 40_000_000
+# Parts of the archive, and of a motion with a curve: kind and number of axes of the array.
+_ARRAYS = {"about": ("U", 0), "times": ("f", 1), "positions": ("f", 2)}
+_CURVE = {"knot_times": ("f", 1), "knot_positions": ("f", 2), "knot_rates": ("f", 2)}
+_PARTS = _ARRAYS | _CURVE
 PlanStatus = Literal[
     "success",
     "infeasible",
@@ -66,72 +65,55 @@ PlanStatus = Literal[
 ]
 STATUSES: tuple[PlanStatus, ...] = get_args(PlanStatus)
 """Statuses of plans; the last seven are stages in which a baseline failed."""
-"""Status of plans; those in the second group belong to baselines."""
 METRICS = (
-    *(
-        "planning_time",
-        "build_time",
-        "base_path_length",
-        "base_path_length_l1",
-        "arm_path_length",
-        "clearance",
-        "closure_error",
-        "duration",
-    ),
-    *(
-        "iterations",
-        "rounds",
-        "evaluations",
-        "time_initialization",
-        "time_coal",
-        "time_casadi",
-        "time_ipopt",
-        "time_validation",
-    ),
-    *("time_retiming", "torque"),
+    "planning_time",
+    "build_time",
+    "base_path_length",
+    "base_path_length_l1",
+    "arm_path_length",
+    "clearance",
+    "closure_error",
+    "duration",
+    "iterations",
+    "rounds",
+    "evaluations",
+    "time_initialization",
+    "time_coal",
+    "time_casadi",
+    "time_ipopt",
+    "time_validation",
+    "time_retiming",
+    "torque",
 )
 """Metrics of every plan; baselines have more."""
 
-_DAMAGED = (
-    *(
-        zipfile.BadZipFile,
-        zlib.error,
-        OSError,
-        EOFError,
-        RuntimeError,
-    ),  # a zip archive that is none, or encrypted
-    *(
-        ValueError,
-        SyntaxError,
-        TypeError,
-        LookupError,
-        OverflowError,
-        MemoryError,
-    ),  # an array that is none
-)
+# Raised for damaged or encrypted zip archives, and for damaged arrays.
+_DAMAGED = (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError)
+_DAMAGED += (ValueError, SyntaxError, TypeError, LookupError, OverflowError, MemoryError)
 
 Text = Annotated[str, Field(strict=True)]
 Count = Annotated[int, Field(strict=True, ge=0)]
-Distance = Annotated[float, Field(strict=True, gt=-math.inf)]  # which a NaN is not
+Distance = Annotated[float, Field(strict=True, gt=-math.inf)]  # not NaN
 Measured = Annotated[float, Field(strict=True, ge=0.0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Named = dict[str, Text]
 
 
-def _number(value: Any) -> bool:
+def _is_finite(value: Any) -> bool:
     try:
         return isinstance(value, int | float) and math.isfinite(value)
-    except OverflowError:  # a whole number of hundreds of digits
+    except OverflowError:  # an integer of hundreds of digits
         return False
 
 
-def _row(found: dict[str, Any]) -> dict[str, Any]:
+def _check_row(found: dict[str, Any]) -> dict[str, Any]:
     for name, value in found.items():
-        if value != math.inf and not _number(value):
+        if value != math.inf and not _is_finite(value):
             raise make_validation_error(f"{name!r} is no number", "numbers by name")
     return found
 
 
-def _folder(found: Named) -> Named:
+def _check_folder(found: Named) -> Named:
     if found != {"package": "scenes"} and set(found) != {"relative", "absolute"}:
         raise make_validation_error(
             "no folder of a scene", 'package: "scenes", or relative and absolute'
@@ -158,26 +140,26 @@ class _Violation(Schema):
     constraint: Text
     subject: Text
     waypoint: Count
-    time: Annotated[float, Field(strict=True, allow_inf_nan=False)]
-    amount: Annotated[float, Field(strict=True, allow_inf_nan=False)]
+    time: Finite
+    amount: Finite
     unit: Text
     detail: Text
 
 
 class _Others(BaseModel):
-    """Metrics beside those that are known."""
+    """Additional metrics."""
 
     model_config = ConfigDict(extra="allow")
 
     @model_validator(mode="after")
-    def _numbers(self) -> Self:
+    def _check_numbers(self) -> Self:
         for name, value in (self.model_extra or {}).items():
-            if isinstance(value, bool) or not _number(value):
+            if isinstance(value, bool) or not _is_finite(value):
                 raise make_validation_error(f"the metric {name!r} is none", "a finite number")
         return self
 
 
-_LATER = ("evaluations", "time_retiming", "torque")  # older files do not have it
+_LATER = ("evaluations", "time_retiming", "torque")  # missing in older files
 _kinds: dict[str, Any] = {
     name: (Distance if name == "clearance" else Measured, 0.0 if name in _LATER else ...)
     for name in METRICS
@@ -189,13 +171,13 @@ class _Bound(Schema):
     subject: Text
     kind: Text
     share: Measured
-    begin: Annotated[float, Field(strict=True, allow_inf_nan=False)]
-    end: Annotated[float, Field(strict=True, allow_inf_nan=False)]
+    begin: Finite
+    end: Finite
 
 
 class _Exemption(Schema):
     subject: Text
-    distance: Annotated[float, Field(strict=True, allow_inf_nan=False)]
+    distance: Finite
     reason: Text
 
 
@@ -204,21 +186,21 @@ class _Report(Schema):
     clearance: Distance
     closure_error: Measured
     closure_angle: Measured
-    clearances: Annotated[tuple[Distance, ...], FailFast()] = ()  # older files do not have it
+    clearances: Annotated[tuple[Distance, ...], FailFast()] = ()  # missing in older files
     states: Count
     notes: Annotated[list[Text], FailFast()]
-    torque: Measured = 0.0  # older files have none of these
+    torque: Measured = 0.0  # these are missing in older files
     bounds: Annotated[tuple[_Bound, ...], FailFast()] = ()
     remarks: Annotated[tuple[Text, ...], FailFast()] = ()
     exemptions: Annotated[tuple[_Exemption, ...], FailFast()] = ()
 
 
 class _About(Schema):
-    """The description; what scenes, steps, options and terms make of their parts they check themselves."""
+    """Scenes, steps, options and terms check their own parts when they are built."""
 
     format: int
     scene: dict[str, Any]
-    folder: Annotated[Named, AfterValidator(_folder)]
+    folder: Annotated[Named, AfterValidator(_check_folder)]
     steps: Annotated[list[dict[str, Any]], FailFast()]
     options: dict[str, Any]
     trajectory: _Motion
@@ -227,7 +209,7 @@ class _About(Schema):
     metrics: _Metrics  # type: ignore[valid-type]
     seed: Count
     initialization: Text
-    history: Annotated[list[Annotated[dict[str, Any], AfterValidator(_row)]], FailFast()]
+    history: Annotated[list[Annotated[dict[str, Any], AfterValidator(_check_row)]], FailFast()]
     terms: Annotated[list[dict[str, Any]], FailFast()] = Field(default_factory=list)
 
 
@@ -247,26 +229,25 @@ def write_archive(file: str | Path, about: Mapping[str, Any]) -> Path:
 
 
 def read_archive(file: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the description in the file of a saved plan, and its arrays: "times", "positions", and "curve", if there is one.
+    """Return the description in a saved plan, and its arrays "times", "positions" and "curve".
 
-    Nothing is unpacked before its size is known, and there are no pickles in it.
+    Sizes are checked before anything is unpacked; pickles are not accepted.
 
     Raises:
-        InputError: The file cannot be read, is no saved plan, is larger than one can be, or
-            something in it does not fit.
+        InputError: The file cannot be read, is not a saved plan, or is too large or invalid.
     """
-    data = read_bytes(file, "plan", LARGEST_ARCHIVE)
+    data = read_bytes(file, "plan", _MAX_ARCHIVE)
     try:
-        if (parts := data.count(b"PK\x01\x02")) > 2 * len(_PARTS):  # before a list of them is made
+        if (parts := data.count(b"PK\x01\x02")) > 2 * len(_PARTS):  # before they are listed
             raise ValueError(f"{parts} parts")
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             names = sorted(name.removesuffix(".npy") for name in archive.namelist())
-            if names not in (sorted(ARRAYS), sorted(_PARTS)):
+            if names not in (sorted(_ARRAYS), sorted(_PARTS)):
                 raise ValueError(
-                    f"its parts are {', '.join(names) or 'none'}, not {', '.join(sorted(ARRAYS))}"
+                    f"its parts are {', '.join(names) or 'none'}, not {', '.join(sorted(_ARRAYS))}"
                 )
             arrays = {
-                info.filename.removesuffix(".npy"): _array(archive, info)
+                info.filename.removesuffix(".npy"): _read_array(archive, info)
                 for info in archive.infolist()
             }
     except _DAMAGED as error:
@@ -286,22 +267,22 @@ def read_archive(file: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     found: dict[str, Any] = {
         name: check_finite_array(array, name, file) for name, array in arrays.items()
     }
-    knots = {name.removeprefix("knot_"): found.pop(name) for name in CURVE if name in found}
+    knots = {name.removeprefix("knot_"): found.pop(name) for name in _CURVE if name in found}
     return parse_document(Document(about, file), _About).model_dump(), found | (
         {"curve": knots} if knots else {}
     )
 
 
-def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Any:
-    """Return one part of an archive; the header must say what there is of it."""
+def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> Any:
+    """Return one part of an archive, whose header must match its size."""
     name = info.filename.removesuffix(".npy")
     kind, axes = _PARTS[name]
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError(f"{name} is packed in an unknown way")
+        raise ValueError(f"{name} is compressed by an unknown method")
     with archive.open(info) as packed:
-        stream = io.BytesIO(packed.read(LARGEST_MEMBER + 1))
-    if (size := stream.getbuffer().nbytes) > LARGEST_MEMBER:
-        raise ValueError(f"{name} is larger than {LARGEST_MEMBER:g} bytes")
+        stream = io.BytesIO(packed.read(_MAX_MEMBER + 1))
+    if (size := stream.getbuffer().nbytes) > _MAX_MEMBER:
+        raise ValueError(f"{name} is larger than {_MAX_MEMBER:g} bytes")
     major, _ = np.lib.format.read_magic(stream)
     header = (
         np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0

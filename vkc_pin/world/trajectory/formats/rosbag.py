@@ -31,7 +31,7 @@ TOPICS: Mapping[str, str] = {
     "phases": "std_msgs/msg/String",
 }
 """Recorded topics: suffix of the topic name → message type."""
-_FORMAT = 8  # of rosbag2: the last with profiles of quality as text, which older readers want
+_FORMAT = 8  # of rosbag2, the last that older readers accept
 _NANO = 1_000_000_000
 
 
@@ -47,44 +47,41 @@ def write_rosbag(
     stamp: float = 0.0,
     force: bool = False,
 ) -> Path:
-    """Write a motion as a recording of ROS 2: a folder with metadata.yaml and a database; return its path.
+    """Write a motion as a ROS 2 bag, a folder with metadata.yaml and a database; return its path.
 
-    Trajectories and the path are one message each, at the recording's begin. Velocities of the
-    base, in its own frame, and joint states of objects follow one another at a rate; "phases" says
-    as JSON, where each begins, what is held from then on, and how far the gripper is open. Topics
-    about what the motion does not have (an arm, objects) are left out.
+    Trajectories and the path are single messages at the beginning. Velocities of the base, in its
+    own frame, and joint states of objects follow at a rate. "phases" states as JSON, where each
+    phase begins, its holds and gripper opening. Topics of absent parts (arm, objects) are left out.
 
     Args:
-        motion: What to write.
-        path: The folder to make.
-        rate: Points a second of the trajectories and of the path [Hz]; see `to_ros`. None: the
-            knots of the curve, or else the waypoints.
-        states: Velocities of the base and states of objects a second [Hz]; see `to_ros`, too.
-        namespace: What the topics' names begin with.
+        motion: Motion.
+        path: Folder to create.
+        rate: Points per second of trajectories and path [Hz]; see `to_ros`.
+        states: Messages per second of base velocities and object states [Hz].
+        namespace: Beginning of the topic names.
         frame: `header.frame_id`, the frame of the base's coordinates.
-        base_frame: The same of the base's velocities.
-        stamp: `header.stamp` of the trajectories [s]; in ROS, zero means at once. The recording
-            begins then.
-        force: Replace a folder that is there.
+        base_frame: `header.frame_id` of the base's velocities.
+        stamp: `header.stamp` of the trajectories, at which the recording begins [s].
+        force: Whether to replace an existing folder.
 
     Raises:
-        InputError: The package `rosbags` is not installed, the folder cannot be made or is there
-            already, `namespace` is no name of topics, or a rate or `stamp` is out of range.
+        InputError: The package `rosbags` is not installed, the folder exists or cannot be created,
+            or an argument is invalid.
     """
     import_rosbags()
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_typestore
 
     states = check_number(states, "states", "messages a second, more than 0", low=0.0, strict=True)
-    begin = _namespace(namespace)
+    begin = _check_namespace(namespace)
     store: Any = get_typestore(Stores.ROS2_HUMBLE)
     own = check_text(base_frame, "base_frame")
-    messages = _messages(
+    messages = _make_messages(
         motion, store.types, rate, states, frame=frame, base_frame=own, stamp=stamp
     )
     found = sorted(messages, key=lambda item: item[1])
     with write_folder_atomically(path, force=force) as staging:
-        inside = staging / Path(path).absolute().name  # which the database is named after
+        inside = staging / Path(path).absolute().name  # names the database
         with Writer(inside, version=_FORMAT) as writer:
             ends = [end for end in TOPICS if any(end == own for own, _, _ in found)]
             topics = {
@@ -100,27 +97,19 @@ def write_rosbag(
 
 
 def import_rosbags() -> Any:
-    """Return the package `rosbags`.
-
-    Raises:
-        InputError: `rosbags` is not installed or cannot be imported.
-    """
+    """Return the package `rosbags`."""
     return import_optional("rosbags", "ros", purpose="recording for ROS")
 
 
-def _namespace(name: str) -> str:
+def _check_namespace(name: str) -> str:
     parts = check_text(name, "namespace").strip("/").split("/") if name != "" else [""]
     if parts != [""] and not all(part.isascii() and part.isidentifier() for part in parts):
-        raise InputError(
-            "no name of topics",
-            field="namespace",
-            expected="words with slashes between, e.g. /vkc",
-            got=name,
-        )
+        expected = "words separated by slashes, e.g. /vkc"
+        raise InputError("not a topic name", field="namespace", expected=expected, got=name)
     return "".join(f"/{part}" for part in parts if part)
 
 
-def _messages(
+def _make_messages(
     motion: Mapping[str, Any],
     types: Any,
     rate: float | None,
@@ -130,30 +119,39 @@ def _messages(
     base_frame: str,
     stamp: float,
 ) -> Iterator[tuple[str, int, Any]]:
-    """Yield every message, with the end of its topic's name and when it is recorded [ns]."""
+    """Yield suffix of the topic, time of recording [ns] and message."""
     base = to_ros(motion, joints="base", rate=rate, frame=frame, stamp=stamp)
-    begin = _nanoseconds(base["header"]["stamp"])
+    begin = _count_nanoseconds(base["header"]["stamp"])
     arm = to_ros(motion, joints="arm", rate=rate, frame=frame, stamp=stamp)
     for end, found in (("arm/joint_trajectory", arm), ("base/joint_trajectory", base)):
         if found["joint_names"]:
-            yield end, begin, _trajectory(types, found)
+            yield end, begin, _make_trajectory(types, found)
     header, stamped = types["std_msgs/msg/Header"], types["geometry_msgs/msg/PoseStamped"]
     poses = [
         stamped(
-            header(_time(types, begin + _nanoseconds(p["time_from_start"])), frame), _pose(types, p)
+            header(_make_time(types, begin + _count_nanoseconds(p["time_from_start"])), frame),
+            _make_pose(types, p),
         )
         for p in base["points"]
     ]
-    yield "base/path", begin, types["nav_msgs/msg/Path"](header(_time(types, begin), frame), poses)
+    yield (
+        "base/path",
+        begin,
+        types["nav_msgs/msg/Path"](header(_make_time(types, begin), frame), poses),
+    )
     for point in to_ros(motion, joints="base", rate=states, derivatives=1)["points"]:
-        when = begin + _nanoseconds(point["time_from_start"])
-        yield "base/cmd_vel", when, _twist(types, point, header(_time(types, when), base_frame))
+        when = begin + _count_nanoseconds(point["time_from_start"])
+        yield (
+            "base/cmd_vel",
+            when,
+            _make_twist(types, point, header(_make_time(types, when), base_frame)),
+        )
     objects = to_ros(motion, joints="objects", rate=states, derivatives=1)
     for point in objects["points"] if objects["joint_names"] else ():
-        when = begin + _nanoseconds(point["time_from_start"])
+        when = begin + _count_nanoseconds(point["time_from_start"])
         values = (np.array(point[key], float) for key in ("positions", "velocities", "effort"))
         state = types["sensor_msgs/msg/JointState"](
-            header(_time(types, when), frame), objects["joint_names"], *values
+            header(_make_time(types, when), frame), objects["joint_names"], *values
         )
         yield "objects/joint_states", when, state
     for phase in motion["phases"]:
@@ -161,7 +159,7 @@ def _messages(
         yield "phases", when, types["std_msgs/msg/String"](json.dumps(phase))
 
 
-def _trajectory(types: Any, found: Mapping[str, Any]) -> Any:
+def _make_trajectory(types: Any, found: Mapping[str, Any]) -> Any:
     header, duration = found["header"], types["builtin_interfaces/msg/Duration"]
     kind = types["trajectory_msgs/msg/JointTrajectoryPoint"]
     keys = ("positions", "velocities", "accelerations", "effort")
@@ -170,32 +168,30 @@ def _trajectory(types: Any, found: Mapping[str, Any]) -> Any:
         for point in found["points"]
     ]
     named = types["std_msgs/msg/Header"](
-        _time(types, _nanoseconds(header["stamp"])), header["frame_id"]
+        _make_time(types, _count_nanoseconds(header["stamp"])), header["frame_id"]
     )
     return types["trajectory_msgs/msg/JointTrajectory"](named, found["joint_names"], points)
 
 
-def _pose(types: Any, point: Mapping[str, Any]) -> Any:
+def _make_pose(types: Any, point: Mapping[str, Any]) -> Any:
     x, y, yaw = point["positions"]
     turn = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(yaw / 2.0), math.cos(yaw / 2.0))
     return types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](x, y, 0.0), turn)
 
 
-def _twist(types: Any, point: Mapping[str, Any], header: Any) -> Any:
+def _make_twist(types: Any, point: Mapping[str, Any], header: Any) -> Any:
     """Return a velocity of the base in its own frame."""
-    (vx, vy, turning), yaw, vector = (
-        point["velocities"],
-        point["positions"][2],
-        types["geometry_msgs/msg/Vector3"],
-    )
-    ahead, aside = math.cos(yaw) * vx + math.sin(yaw) * vy, math.cos(yaw) * vy - math.sin(yaw) * vx
-    twist = types["geometry_msgs/msg/Twist"](vector(ahead, aside, 0.0), vector(0.0, 0.0, turning))
+    vx, vy, turn = point["velocities"]
+    c, s = math.cos(point["positions"][2]), math.sin(point["positions"][2])
+    vector = types["geometry_msgs/msg/Vector3"]
+    linear, angular = vector(c * vx + s * vy, c * vy - s * vx, 0.0), vector(0.0, 0.0, turn)
+    twist = types["geometry_msgs/msg/Twist"](linear, angular)
     return types["geometry_msgs/msg/TwistStamped"](header, twist)
 
 
-def _time(types: Any, nanoseconds: int) -> Any:
+def _make_time(types: Any, nanoseconds: int) -> Any:
     return types["builtin_interfaces/msg/Time"](*divmod(nanoseconds, _NANO))
 
 
-def _nanoseconds(when: Mapping[str, int]) -> int:
+def _count_nanoseconds(when: Mapping[str, int]) -> int:
     return when["sec"] * _NANO + when["nanosec"]

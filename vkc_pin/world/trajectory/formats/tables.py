@@ -1,7 +1,7 @@
 """Reads and writes motions as CSV tables and as JSON.
 
-A motion is plain data as returned by `Trajectory.to_dict`. Times are in seconds, positions in metres
-and radians. The base has three coordinates, x, y and yaw in the world frame.
+A motion is plain data as returned by `Trajectory.to_dict`. Times are in seconds, positions in
+metres and radians. The base has three coordinates, x, y and yaw in the world frame.
 """
 
 from __future__ import annotations
@@ -24,9 +24,6 @@ from vkc_pin.world.files.writing import write_atomically
 
 __all__ = [
     "GROUPS",
-    "LARGEST_MOTION",
-    "MOST_COLUMNS",
-    "MOST_LINES",
     "infer_robot_size",
     "make_single_phase",
     "read_csv",
@@ -38,16 +35,11 @@ __all__ = [
 
 GROUPS = ("all", "robot", "base", "arm", "objects")
 """Groups of coordinates: all, base and arm, base, arm, or joints of objects."""
-LARGEST_MOTION = 20_000_000
-"""Largest file of a motion [bytes], for about 30 000 waypoints of 25 coordinates."""
-MOST_LINES, MOST_COLUMNS = 200_000, 1000
-"""Largest numbers of lines and columns of a table."""
-_TIME, _PHASES = (
-    "time",
-    ("phase", "phase_name", "held"),
-)  # the first column of a table, and the last ones
-_RATE, _WAYPOINT = " velocity", "waypoint"  # of the columns of a curve
-_OPENING = "opening"  # after these, where a gripper opens
+_MAX_BYTES = 20_000_000  # of a file: about 30 000 waypoints of 25 coordinates
+_MAX_LINES, _MAX_COLUMNS = 200_000, 1000
+_TIME, _PHASES = "time", ("phase", "phase_name", "held")  # first and last columns of a table
+_RATE, _WAYPOINT = " velocity", "waypoint"  # additional columns of a curve
+_OPENING = "opening"  # additional last column if a phase states a gripper opening
 
 
 def write_csv(
@@ -57,148 +49,99 @@ def write_csv(
     joints: str | Sequence[str] = "all",
     units: Mapping[str, str] | None = None,
 ) -> Path:
-    """Write a table, a line a waypoint, whole or not at all; return the path.
+    """Write a table with one line per waypoint atomically; return the path.
 
-    The first line names the columns, with units in brackets where they are known: `time [s]`,
-    `base_x [m]`, `base_y [m]`, `base_yaw [rad]`, the arm's joints, the objects' joints, then
-    `phase` (counted from 1), `phase_name` and `held`, as JSON, and `opening [m]` of the gripper if
-    a phase says what it is, empty where it rests. A waypoint between two phases is in the earlier
-    one. Numbers have as many digits as it takes to read back the very same.
+    The first line names the columns, with units where they are known: `time [s]`, `base_x [m]`,
+    `base_y [m]`, `base_yaw [rad]`, the arm's joints, the objects' joints, `phase` (from 1),
+    `phase_name`, `held` (JSON) and, if a phase states it, `opening [m]` of the gripper. A waypoint
+    between two phases belongs to the earlier one. Numbers are exact.
 
     A trajectory with a curve has one line per knot. After the positions come the velocities of the
-    same coordinates (`base_x velocity [m/s]` and so on), and then `waypoint`: 1 for a knot that is
-    a waypoint, else 0.
+    same coordinates (`base_x velocity [m/s]` and so on), and `waypoint`: 1 for a knot that is a
+    waypoint, else 0.
 
     Args:
-        motion: What to write.
-        path: The file.
-        joints: One of `GROUPS`, or names of coordinates in the order wanted.
-        units: Coordinate → unit, "m" or "rad"; those of the base need not be given.
+        motion: Motion.
+        path: File.
+        joints: One of `GROUPS`, or names of coordinates in the wanted order.
+        units: Coordinate → unit, "m" or "rad"; units of the base are known.
 
     Raises:
         UnknownNameError: There is no such group or coordinate.
     """
     columns, phases = select_columns(motion, joints), motion["phases"]
-    x, y, yaw = motion["names"][:3]
-    known = {x: "m", y: "m", yaw: "rad"}
-    for name, unit in check_mapping(
-        {} if units is None else units, "units", "names of coordinates, each with its unit"
-    ).items():
+    known = dict(zip(motion["names"], ("m", "m", "rad"), strict=False))
+    expected = "names of coordinates, each with its unit"
+    for name, unit in check_mapping({} if units is None else units, "units", expected).items():
         known[name] = check_text(unit, f"units[{name!r}]")
     lines: list[str] = []
-    table = csv.writer(
-        SimpleNamespace(write=lines.append)
-    )  # its lines end with "\r\n", so it puts either of them in quotes
+    # The writer ends lines with "\r\n", so that it quotes names with either character.
+    table = csv.writer(SimpleNamespace(write=lines.append))
     names = [motion["names"][k] for k in columns]
-    opens = [f"{_OPENING} [m]"] if any(phase.get(_OPENING) is not None for phase in phases) else []
-    named = [f"{name} [{known[name]}]" if name in known else name for name in names]
-    curve = motion.get("curve")
-    if curve is not None:
-        named += [
-            f"{name}{_RATE} [{known[name]}/s]" if name in known else name + _RATE for name in names
-        ] + [_WAYPOINT]
-    table.writerow([f"{_TIME} [s]", *named, *_PHASES, *opens])
+    header = [f"{name} [{known[name]}]" if name in known else name for name in names]
+    if motion.get("curve") is not None:
+        header += [
+            name + _RATE + (f" [{known[name]}/s]" if name in known else "") for name in names
+        ]
+        header.append(_WAYPOINT)
+    has_openings = any(phase.get(_OPENING) is not None for phase in phases)
+    openings = [f"{_OPENING} [m]"] if has_openings else []
+    table.writerow([f"{_TIME} [s]", *header, *_PHASES, *openings])
     number = 0
-    for moment, waypoint, row, told in _written(motion, columns):
+    for time, waypoint, values in _list_rows(motion, columns):
         number += waypoint > phases[number]["last"]
         phase = phases[number]
         held = {
             name: [at, phase["by"][name]] if name in phase["by"] else at
             for name, at in phase["held"].items()
         }
-        values = [*(repr(float(value)) for value in row), *told]
-        opening = "" if phase.get(_OPENING) is None else repr(float(phase[_OPENING]))
-        table.writerow(
-            [
-                repr(float(moment)),
-                *values,
-                number + 1,
-                phase["name"],
-                json.dumps(held),
-                *([opening] if opens else []),
-            ]
-        )
-    return write_atomically(
-        path, "".join(line.removesuffix("\r\n") + "\n" for line in lines).encode("utf-8")
-    )
+        if has_openings:
+            opening = phase.get(_OPENING)
+            openings = ["" if opening is None else repr(float(opening))]
+        cells = [number + 1, phase["name"], json.dumps(held), *openings]
+        table.writerow([repr(float(time)), *values, *cells])
+    text = "".join(line.removesuffix("\r\n") + "\n" for line in lines)
+    return write_atomically(path, text.encode("utf-8"))
 
 
-def _written(
+def _list_rows(
     motion: Mapping[str, Any], columns: Sequence[int]
-) -> Iterator[tuple[float, int, list[float], list[str]]]:
-    """Yield time, current or next waypoint, numbers and waypoint flag of every line."""
-    curve = motion.get("curve")
-    if curve is None:
-        for k, (moment, row) in enumerate(zip(motion["times"], motion["positions"], strict=True)):
-            yield moment, k, [row[column] for column in columns], []
-        return
-    next_one = 0
-    for moment, row, rates in zip(curve["times"], curve["positions"], curve["rates"], strict=True):
-        is_one = moment == motion["times"][next_one]
-        yield (
-            moment,
-            next_one,
-            [values[column] for values in (row, rates) for column in columns],
-            [str(int(is_one))],
-        )
-        next_one = min(next_one + is_one, len(motion["times"]) - 1)
+) -> Iterator[tuple[float, int, list[str]]]:
+    """Yield time, present or next waypoint, and cells of every line."""
+    waypoint, curve = 0, motion.get("curve")
+    source = motion if curve is None else curve
+    for k, (time, row) in enumerate(zip(source["times"], source["positions"], strict=True)):
+        cells = [repr(float(row[column])) for column in columns]
+        is_waypoint = time == motion["times"][waypoint]
+        if curve is not None:
+            cells += [repr(float(curve["rates"][k][column])) for column in columns]
+            cells.append(str(int(is_waypoint)))
+        yield time, waypoint, cells
+        waypoint = min(waypoint + is_waypoint, len(motion["times"]) - 1)
 
 
 def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, Any]:
-    """Return the motion in a table: what `write_csv` wrote with all of the robot's coordinates in it, or one like it.
+    """Return the motion in a table like those of `write_csv`, with all robot coordinates.
 
     Args:
-        path: The file. Without the columns `phase`, `phase_name` and `held`, all of it is one phase
-            in which nothing is held.
-        robot_size: How many of the coordinates are the robot's; None: those before the first with a
-            dot in its name.
-
-    Raises:
-        InputError: The file is missing, or something in it does not fit; the error names line and
-            column.
+        path: File. Without the columns `phase`, `phase_name` and `held`, the motion is one phase
+            without holds.
+        robot_size: Number of robot coordinates. Default: those before the first with a dot in its
+            name.
     """
     path = check_path(path, "path")
-    table = read_text(path, "CSV", LARGEST_MOTION)
-    if (many := table.count("\n")) > MOST_LINES:
-        raise InputError("too many lines", file=path, expected=f"at most {MOST_LINES}", got=many)
-    lines = _lines(table, path)
-    header = next(lines, (0, []))[1]
-    if len(header) > MOST_COLUMNS:
-        raise InputError(
-            "too many columns",
-            file=path,
-            line=1,
-            expected=f"at most {MOST_COLUMNS}",
-            got=len(header),
-        )
-    header = [re.sub(r" \[(s|m|rad|m/s|rad/s)\]$", "", name) for name in header]
-    if not header:
-        raise InputError("an empty file", file=path, expected="a table with a line of names")
-    if header[0] != _TIME:
-        raise InputError(
-            "not a table of waypoints",
-            file=path,
-            line=1,
-            field="first column",
-            expected=_TIME,
-            got=format_value(header[0]),
-        )
-    opens = tuple(header[-4:]) == (*_PHASES, _OPENING)
-    told = opens or tuple(header[-3:]) == _PHASES
-    last = len(header) - (len(_PHASES) + opens if told else 0)
-    names, curved = header[1:last], header[last - 1] == _WAYPOINT and last > 1
-    if curved:
-        half = (len(names) - 1) // 2
-        names, rates = names[:half], names[half:-1]
-        if rates != [name + _RATE for name in names]:
-            expected = ", ".join(name + _RATE for name in names)
-            raise InputError(
-                "not the velocities of its coordinates",
-                file=path,
-                line=1,
-                expected=expected,
-                got=", ".join(rates),
-            )
+    table = read_text(path, "CSV", _MAX_BYTES)
+    if (many := table.count("\n")) > _MAX_LINES:
+        raise InputError("too many lines", file=path, expected=f"at most {_MAX_LINES}", got=many)
+    lines = _read_lines(table, path)
+    header = _check_header(next(lines, (0, []))[1], path)
+    has_openings = tuple(header[-4:]) == (*_PHASES, _OPENING)
+    has_phases = has_openings or tuple(header[-3:]) == _PHASES
+    last = len(header) - (len(_PHASES) + has_openings if has_phases else 0)
+    names, is_curve = header[1:last], header[last - 1] == _WAYPOINT and last > 1
+    if is_curve:
+        names = _check_rate_columns(names, path)
+    own = slice(1, len(names) + 1)
     rows: list[list[float]] = []
     knots: list[list[float]] = []
     phases: list[dict[str, Any]] = []
@@ -206,43 +149,69 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
         if not cells:
             continue
         if len(cells) != len(header):
-            raise InputError(
-                "wrong number of columns",
-                file=path,
-                line=number,
-                expected=len(header),
-                got=len(cells),
-            )
+            expected, got = len(header), len(cells)
+            problem = "wrong number of columns"
+            raise InputError(problem, file=path, line=number, expected=expected, got=got)
         row = [
-            _number(cell, path, number, name)
+            _parse_number(cell, path, number, name)
             for cell, name in zip(cells[:last], header, strict=False)
         ]
-        if curved:
-            knots.append(row)
-            if not row[-1]:
-                continue
-        rows.append(row[: len(names) + 1])
-        if told:
-            opening = _number(cells[-1], path, number, _OPENING) if opens and cells[-1] else None
-            _add_phase(phases, cells[last : last + 3], opening, len(rows) - 1, path, number)
-    if not told and len(rows) > 1:
+        knots.append(row)
+        if is_curve and not row[-1]:
+            continue
+        rows.append(row)
+        if has_phases:
+            opening = cells[-1] if has_openings else ""
+            stated = {_OPENING: _parse_number(opening, path, number, _OPENING)} if opening else {}
+            _add_phase(phases, cells[last : last + 3], stated, len(rows) - 1, path, number)
+    if not has_phases and len(rows) > 1:
         phases = [make_single_phase(len(rows))]
-    own = slice(1, len(names) + 1)
-    curve = {
-        "times": [knot[0] for knot in knots],
-        "positions": [knot[own] for knot in knots],
-        "rates": [knot[own.stop : -1] for knot in knots],
-    }
-    return {
-        **({"curve": curve} if curved else {}),
+    if robot_size is not None:
+        robot_size = check_integer(robot_size, "robot_size", low=3)
+    motion = {
         "names": names,
         "times": [row[0] for row in rows],
-        "positions": [row[1:] for row in rows],
-        "robot_size": infer_robot_size(names)
-        if robot_size is None
-        else check_integer(robot_size, "robot_size", low=3),
+        "positions": [row[own] for row in rows],
+        "robot_size": infer_robot_size(names) if robot_size is None else robot_size,
         "phases": phases,
     }
+    if is_curve:
+        motion["curve"] = {
+            "times": [knot[0] for knot in knots],
+            "positions": [knot[own] for knot in knots],
+            "rates": [knot[own.stop : -1] for knot in knots],
+        }
+    return motion
+
+
+def _check_header(cells: list[str], path: Path) -> list[str]:
+    """Return the column names of a table without their units."""
+    if len(cells) > _MAX_COLUMNS:
+        expected, got = f"at most {_MAX_COLUMNS}", len(cells)
+        raise InputError("too many columns", file=path, line=1, expected=expected, got=got)
+    header = [re.sub(r" \[(s|m|rad|m/s|rad/s)\]$", "", name) for name in cells]
+    if not header:
+        raise InputError("an empty file", file=path, expected="a table with a line of names")
+    if header[0] != _TIME:
+        problem, got = "not a table of waypoints", format_value(header[0])
+        raise InputError(problem, file=path, line=1, field="first column", expected=_TIME, got=got)
+    return header
+
+
+def _check_rate_columns(columns: list[str], path: Path) -> list[str]:
+    """Return the coordinates of a curve's columns, which are followed by their velocities."""
+    half = (len(columns) - 1) // 2
+    names, rates = columns[:half], columns[half:-1]
+    expected = [name + _RATE for name in names]
+    if rates != expected:
+        raise InputError(
+            "not the velocities of its coordinates",
+            file=path,
+            line=1,
+            expected=", ".join(expected),
+            got=", ".join(rates),
+        )
+    return names
 
 
 def write_json(motion: Mapping[str, Any], path: str | Path) -> Path:
@@ -251,23 +220,13 @@ def write_json(motion: Mapping[str, Any], path: str | Path) -> Path:
 
 
 def read_json(path: str | Path) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        InputError: The file is missing, is no JSON, or is larger than a motion can be; the error
-            names the line.
-    """
+    """Read a JSON file."""
     path = check_path(path, "path")
-    return parse_json(read_text(path, "JSON", LARGEST_MOTION), path)
+    return parse_json(read_text(path, "JSON", _MAX_BYTES), path)
 
 
 def select_columns(motion: Mapping[str, Any], joints: str | Sequence[str]) -> list[int]:
-    """Select columns of a motion by one of `GROUPS`, or by names in the wanted order.
-
-    Raises:
-        UnknownNameError: There is no such group or coordinate.
-        InputError: There is no name, or one occurs twice.
-    """
+    """Select columns of a motion by one of `GROUPS`, or by names in the wanted order."""
     known, robot, size = motion["names"], motion["robot_size"], len(motion["names"])
     groups = {
         "all": (0, size),
@@ -306,7 +265,7 @@ def make_single_phase(waypoints: int) -> dict[str, Any]:
     return {"name": "motion", "first": 0, "last": waypoints - 1, "held": {}, "by": {}}
 
 
-def _lines(text: str, path: Path) -> Iterator[tuple[int, list[str]]]:
+def _read_lines(text: str, path: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield line number and cells of every line of a table."""
     reader = csv.reader(io.StringIO(text, newline=""))
     try:
@@ -316,19 +275,15 @@ def _lines(text: str, path: Path) -> Iterator[tuple[int, list[str]]]:
         raise InputError("not a table", file=path, line=reader.line_num, got=str(error)) from None
 
 
-def _number(cell: str, path: Path, line: int, column: str) -> float:
+def _parse_number(cell: str, path: Path, line: int, column: str) -> float:
     try:
         value = float(cell)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
+        expected, got = "a finite number", format_value(cell)
         raise InputError(
-            "not a number",
-            file=path,
-            line=line,
-            field=column,
-            expected="a finite number",
-            got=format_value(cell),
+            "not a number", file=path, line=line, field=column, expected=expected, got=got
         )
     return value
 
@@ -336,7 +291,7 @@ def _number(cell: str, path: Path, line: int, column: str) -> float:
 def _add_phase(
     phases: list[dict[str, Any]],
     cells: Sequence[str],
-    opening: float | None,
+    opening: dict[str, float],
     row: int,
     path: Path,
     line: int,
@@ -345,34 +300,24 @@ def _add_phase(
     number, name, held = cells
     expected = f"{len(phases)} or {len(phases) + 1}" if phases else "1"
     if number not in expected.split(" or "):
-        raise InputError(
-            "not the next phase",
-            file=path,
-            line=line,
-            field="phase",
-            expected=expected,
-            got=format_value(number),
-        )
+        problem, got = "not the next phase", format_value(number)
+        raise InputError(problem, file=path, line=line, field="phase", expected=expected, got=got)
     if int(number) == len(phases):
         phases[-1]["last"] = row
         return
     try:
-        found = json.loads(held)
-        at = {
-            thing: where if isinstance(where, str) else where[0] for thing, where in found.items()
-        }
-        by = {thing: where[1] for thing, where in found.items() if not isinstance(where, str)}
+        items = json.loads(held).items()
+        at = {name: hold if isinstance(hold, str) else hold[0] for name, hold in items}
+        by = {name: hold[1] for name, hold in items if not isinstance(hold, str)}
     except (ValueError, AttributeError, TypeError, LookupError, RecursionError):
-        wanted = 'JSON such as {"door": "handle"}'
+        problem, expected = "not the held objects", 'JSON such as {"door": "handle"}'
         raise InputError(
-            "not what is held",
+            problem,
             file=path,
             line=line,
             field="held",
-            expected=wanted,
+            expected=expected,
             got=format_value(held),
         ) from None
-    stands = {} if opening is None else {_OPENING: opening}
-    phases.append(
-        {"name": name, "first": max(row - 1, 0), "last": row, "held": at, "by": by, **stands}
-    )
+    first = max(row - 1, 0)
+    phases.append({"name": name, "first": first, "last": row, "held": at, "by": by, **opening})

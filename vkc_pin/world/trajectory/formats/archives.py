@@ -88,8 +88,10 @@ METRICS = (
 """Metrics of every plan; baselines have more."""
 
 # Raised for damaged or encrypted zip archives, and for damaged arrays.
-_DAMAGED = (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError)
-_DAMAGED += (ValueError, SyntaxError, TypeError, LookupError, OverflowError, MemoryError)
+_DAMAGED = (
+    *(zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError),
+    *(ValueError, SyntaxError, TypeError, LookupError, OverflowError, MemoryError),
+)
 
 Text = Annotated[str, Field(strict=True)]
 Count = Annotated[int, Field(strict=True, ge=0)]

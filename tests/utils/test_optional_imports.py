@@ -13,16 +13,12 @@ from vkc_pin.planning.base_paths.grid import BaseGrid
 from vkc_pin.utils import optional_imports
 
 
-def a_path() -> object:
+def find_path() -> object:
     grid = BaseGrid([], [], [], (-2.0, 2.0, -2.0, 2.0), 0.0, cells=9)
     return shortest_path(grid, [-1.0, -1.0, 0.0], np.array([[1.0, 1.0, 0.5]]))
 
 
-def test_a_module_is_imported() -> None:
-    assert optional_imports.import_compiled("vkc_pin.planning.base_paths._driving").Paths
-
-
-def test_a_module_that_is_missing_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_compiled_modules_raise(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> types.ModuleType:
         raise ImportError(f"no {name}")
 
@@ -31,18 +27,18 @@ def test_a_module_that_is_missing_says_so(monkeypatch: pytest.MonkeyPatch) -> No
         with pytest.raises(
             BuildError, match=r"_driving cannot be imported \(no .*compiler.*pip install"
         ):
-            a_path()
-    assert a_path() is not None
+            find_path()
+    assert find_path() is not None
 
 
-def test_a_package_that_is_there_is_returned() -> None:
+def test_installed_packages_are_returned() -> None:
     assert optional_imports.import_optional("yaml", "import", purpose="nothing").safe_load(
         "a: 1"
     ) == {"a": 1}
 
 
 @pytest.mark.parametrize("name", ["coacd", "coacd.inside"])
-def test_a_missing_package_names_the_extra(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_missing_packages_name_the_extra(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setitem(sys.modules, "coacd", None)
     with pytest.raises(vkc.InputError) as caught:
         optional_imports.import_optional(

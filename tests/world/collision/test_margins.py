@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -47,23 +46,3 @@ def test_the_least_that_holds_there(seed: int) -> None:
     np.testing.assert_array_equal(
         Margins(usual, eased, places).compute_margins(pairs, waypoints, z, rows), expected
     )
-
-
-def test_invalid_arrays_raise() -> None:
-    usual, one, z = np.zeros(3), np.zeros(1, int), np.zeros((1, 2))
-    with pytest.raises(IndexError, match="pair"):
-        Margins(usual, {3: [(0, 1, 0.0)]})
-    for place in (
-        MarginRegion(one + 3, 0.0, one, z[0, :1], z[0, :1]),
-        MarginRegion(one, 0.0, one - 1, z[0, :1], z[0, :1]),
-    ):
-        with pytest.raises(IndexError):
-            Margins(usual, {}, [place])
-    with pytest.raises(ValueError, match="limits"):
-        Margins(usual, {}, [MarginRegion(one, 0.0, one, z[0], z[0, :1])])
-    table = Margins(usual, {}, [MarginRegion(one, 0.0, one + 1, z[0, :1], z[0, :1])])
-    for pairs, rows in ((one + 3, one), (one - 1, one), (one, one + 1), (one, one - 1)):
-        with pytest.raises(IndexError):
-            table.compute_margins(pairs, one, z, rows)
-    with pytest.raises(ValueError, match="coordinates"):
-        table.compute_margins(one, one, z[:, :1], one)

@@ -6,8 +6,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.memory import growth
-from helpers.small_problems import door_scene, random_configurations
+from helpers.small_problems import door_scene
 
 from vkc_pin.world.collision.placements import ShapePlacements, flatten_placements
 from vkc_pin.world.trajectory.world_model import World
@@ -20,13 +19,6 @@ def test_placements_are_flattened_by_columns() -> None:
         numbers, [*rotation[:, 0], *rotation[:, 1], *rotation[:, 2], 4.0, 5.0, 6.0]
     )
     assert flatten_placements([]).shape == (0, 12)
-
-
-def test_serialization_leaks_no_memory() -> None:
-    world = World(door_scene())
-    left, objects = growth(lambda: [ShapePlacements(world.model, world.bodies) for _ in range(50)])
-    assert left <= 50 * 8
-    assert objects <= 50 / 2
 
 
 def check(model: pin.Model, geometry: pin.GeometryModel, q: np.ndarray) -> None:
@@ -42,16 +34,6 @@ def check(model: pin.Model, geometry: pin.GeometryModel, q: np.ndarray) -> None:
     np.testing.assert_array_equal(
         mine.compute_placements(q[:1]), found[:1]
     )  # earlier results must not change
-
-
-def test_placements_match_pinocchio() -> None:
-    world = World(door_scene())
-    limits = (np.full(world.coordinates.size, limit) for limit in (-1.0, 1.0))
-    check(
-        world.model,
-        world.bodies,
-        world.coordinates.q(random_configurations(*limits, 5, np.random.default_rng(0))),
-    )
 
 
 JOINTS = [
@@ -87,18 +69,3 @@ def test_configurations_of_wrong_size_raise() -> None:
         ShapePlacements(world.model, world.bodies).compute_placements(
             np.zeros((2, world.model.nq + 1))
         )
-
-
-def test_empty_input_gives_empty_output() -> None:
-    world = World(door_scene())
-    q = world.coordinates.q(np.zeros((2, world.coordinates.size)))
-    assert ShapePlacements(world.model, world.bodies).compute_placements(q[:0]).shape == (
-        0,
-        len(world.bodies.geometryObjects),
-        12,
-    )
-    assert ShapePlacements(world.model, pin.GeometryModel()).compute_placements(q).shape == (
-        2,
-        0,
-        12,
-    )

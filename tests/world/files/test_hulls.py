@@ -1,11 +1,9 @@
 from __future__ import annotations
 
-import importlib.util
 import shutil
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -20,22 +18,12 @@ ROOT = Path(__file__).resolve().parents[3]
 ROBOT = ROOT / "robots" / "husky_ur5e"
 
 
-@pytest.fixture(scope="module")
-def cutting() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("cutting", ROOT / "tools" / "cutting.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def outside(points: np.ndarray, hull: trimesh.Trimesh) -> float:
     planes = np.einsum("ij,ij->i", hull.face_normals, hull.triangles[:, 0])
     return float((points @ hull.face_normals.T - planes).max())
 
 
-def test_hull_of_a_thin_pole_is_closed_and_faces_outward() -> None:
+def test_hulls_of_thin_poles_are_closed_and_face_outward() -> None:
     hull = compute_hull(POLE)
     assert hull.is_volume
     assert hull.volume == pytest.approx(ConvexHull(POLE).volume, rel=1e-12)
@@ -53,7 +41,7 @@ def test_hull_of_a_thin_pole_is_closed_and_faces_outward() -> None:
     ],
     ids=["box", "cylinder", "ball", "ring"],
 )
-def test_hull_equals_that_of_trimesh(mesh: trimesh.Trimesh) -> None:
+def test_hulls_equal_those_of_trimesh(mesh: trimesh.Trimesh) -> None:
     points = mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])).vertices
     hull, expected = compute_hull(points), trimesh.convex.convex_hull(points)
     np.testing.assert_array_equal(hull.vertices, expected.vertices)
@@ -62,14 +50,14 @@ def test_hull_equals_that_of_trimesh(mesh: trimesh.Trimesh) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 3, 4, 20])
-def test_points_in_one_plane_have_no_hull(count: int) -> None:
+def test_coplanar_points_raise(count: int) -> None:
     points = np.random.default_rng(0).uniform(size=(count, 3)) * (1.0, 1.0, 0.0)
     with pytest.raises(InputError, match="span no volume"):
         compute_hull(points)
 
 
 @pytest.mark.parametrize("vertices", [16, 40])
-def test_outer_hull_contains_its_points_with_few_corners(vertices: int) -> None:
+def test_outer_hulls_contain_their_points(vertices: int) -> None:
     tube = trimesh.creation.cylinder(0.05, height=0.4, sections=100)
     points = np.asarray(
         tube.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3])).vertices
@@ -80,35 +68,8 @@ def test_outer_hull_contains_its_points_with_few_corners(vertices: int) -> None:
     assert 1.0 < hull.volume / tube.volume < (1.2 if vertices == 40 else 1.35)
 
 
-def test_cut_finds_the_waist(cutting: ModuleType) -> None:
-    parts = [
-        trimesh.creation.box((0.2, 0.2, 0.1)),
-        trimesh.creation.box((0.05, 0.05, 0.5)),
-        trimesh.creation.box((0.2, 0.2, 0.1)),
-    ]
-    for part, z in zip(parts, (0.05, 0.35, 0.65), strict=True):
-        part.apply_translation([0, 0, z])
-    dumbbell = trimesh.util.concatenate(parts)
-    pieces = [
-        trimesh.convex.convex_hull(points)
-        for points in cutting.cut(dumbbell, 3, axis=(0, 0, 1), steps=14)
-    ]
-    assert (
-        sum(piece.volume for piece in pieces)
-        < 0.4 * trimesh.convex.convex_hull(dumbbell.vertices).volume
-    )
-    inside = trimesh.sample.sample_surface(dumbbell, 500, seed=1)[0]
-    assert max(min(outside(point[None], piece) for piece in pieces) for point in inside) < 1e-9
-
-
-def test_solid_volume_of_an_open_skin(cutting: ModuleType) -> None:
-    tube = trimesh.creation.cylinder(0.05, height=0.2, sections=64)
-    open_tube = tube.submesh([np.flatnonzero(np.abs(tube.face_normals[:, 2]) < 0.5)], append=True)
-    assert not open_tube.is_watertight
-    assert cutting.solid_volume([open_tube], pitch=0.002) == pytest.approx(tube.volume, rel=0.03)
-
-
-def test_the_tool_makes_the_committed_meshes(tmp_path: Path) -> None:
+@pytest.mark.long
+def test_the_tool_reproduces_the_committed_meshes(tmp_path: Path) -> None:
     folder, name = tmp_path / ROBOT.name, "wrist_3_link_0.stl"
     shutil.copytree(ROBOT, folder)
     (folder / "collision" / name).unlink()

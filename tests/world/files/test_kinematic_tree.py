@@ -1,4 +1,4 @@
-"""Links and joints of URDFs make one tree, or are refused by file and line before any parser sees them."""
+"""Tests that links and joints of URDFs must form one tree."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.utils.arrays import MAX_COORDINATE
+from vkc_pin.errors import InputError
 from vkc_pin.world.files.urdf import load_urdf, read_urdf
 
 SHAPE = "<collision><geometry><sphere radius='0.1'/></geometry></collision>"
@@ -29,133 +28,54 @@ def links(*names: str) -> list[str]:
     return [f'<link name="{name}">{SHAPE}</link>' for name in names]
 
 
+def two(kind: str = "fixed", inside: str = "") -> list[str]:
+    """Return two links and a joint `j` between them."""
+    return [*links("a", "b"), joint("j", "a", "b", kind=kind, inside=inside)]
+
+
 @pytest.mark.parametrize(
     ("lines", "line", "message"),
     [
         ([], None, "there are no links"),
         (links("a", "a"), 3, "a: two links of one name .got lines 2 and 3"),
         (links("a", " "), 3, "a link without a name"),
-        (
-            [*links("a", "b", "c"), joint("j", "a", "b"), joint("j", "a", "c")],
-            6,
-            "j: two joints of one name",
-        ),
-        (
-            [*links("a", "b", "c"), joint("j", "a", "c"), joint("k", "b", "c")],
-            6,
-            "c: a link with two parents .*'j' and 'k'",
-        ),
-        (
-            [*links("a", "b"), joint("j", "a", "b"), joint("k", "b", "a")],
-            2,
-            "a: links in a circle .*a → b → a",
-        ),
+        ([*two(), joint("j", "a", "b")], 5, "j: two joints of one name"),
+        ([*two(), joint("k", "a", "b")], 5, "b: a link with two parents .*'j' and 'k'"),
+        ([*two(), joint("k", "b", "a")], 2, "a: links in a circle .*a → b → a"),
         ([*links("a"), joint("j", "a", "a")], 2, "a: links in a circle .*a → a"),
-        (
-            [*links("r", "a", "b"), joint("j", "a", "b"), joint("k", "b", "a")],
-            3,
-            "a: links in a circle",
-        ),
+        ([*two(), joint("k", "b", "a"), *links("r")], 2, "a: links in a circle"),
         (links("a", "b"), 3, "b: links that nothing connects .*got a, b"),
-        ([*links("a"), joint("j", "a", "b")], 3, "j: child: there is no link 'b'"),
-        ([*links("a"), joint("j", "", "a")], 3, "j: parent: there is no link ''"),
+        ([*links("a"), joint("j", "a", "aa")], 3, "j: child: there is no link 'aa'; did you mean"),
         (
             [*links("a"), '<joint name="j" type="fixed"><parent link="a"/></joint>'],
             3,
             "j: a joint that connects nothing .*<child",
         ),
+        (two("hinge"), 4, "j: this joint type is not supported .*got hinge"),
+        (two("prismatic"), 4, "j: a prismatic joint without limits"),
+        (two(inside='<origin xyz="nan 0 0"/>'), 4, "j: origin xyz: wrong numbers"),
+        (two(inside='<origin rpy="0 0"/>'), 4, "j: origin rpy: wrong numbers"),
+        (two(inside='<origin xyz="20000 0 0"/>'), 4, "expected at most 10000"),
+        (two("continuous", '<axis xyz="0 0 0"/>'), 4, "j: an axis without direction"),
         (
-            [*links("a", "b"), joint("j", "a", "b", kind="hinge")],
-            4,
-            "j: this joint type is not supported .*got hinge",
-        ),
-        (
-            [*links("a", "b"), joint("j", "a", "b").replace(' type="fixed"', "")],
-            4,
-            "j: this joint type is not supported",
-        ),
-        (
-            [*links("a", "b"), joint("j", "a", "b", kind="prismatic")],
-            4,
-            "j: a prismatic joint without limits",
-        ),
-        (
-            [*links("a", "b"), joint("j", "a", "b", inside='<origin xyz="nan 0 0"/>')],
-            4,
-            "j: origin xyz: wrong numbers",
-        ),
-        (
-            [*links("a", "b"), joint("j", "a", "b", inside='<origin xyz="0,1 0 0"/>')],
-            4,
-            "j: origin xyz: wrong numbers",
-        ),
-        (
-            [*links("a", "b"), joint("j", "a", "b", inside='<origin rpy="0 0"/>')],
-            4,
-            "j: origin rpy: wrong numbers",
-        ),
-        (
-            [
-                *links("a", "b"),
-                joint("j", "a", "b", inside=f'<origin xyz="{2 * MAX_COORDINATE} 0 0"/>'),
-            ],
-            4,
-            "expected at most 10000",
-        ),
-        (
-            [
-                *links("a", "b"),
-                joint("j", "a", "b", kind="continuous", inside='<axis xyz="0 0 0"/>'),
-            ],
-            4,
-            "j: an axis without direction",
-        ),
-        (
-            [
-                *links("a", "b"),
-                joint(
-                    "j",
-                    "a",
-                    "b",
-                    kind="revolute",
-                    inside='<limit lower="1" upper="0" velocity="1"/>',
-                ),
-            ],
+            two("revolute", '<limit lower="1" upper="0" velocity="1"/>'),
             4,
             "j: limit: limits in the wrong order .*got 1 and 0",
         ),
         (
-            [
-                *links("a", "b"),
-                joint(
-                    "j",
-                    "a",
-                    "b",
-                    kind="revolute",
-                    inside='<limit lower="0" upper="inf" velocity="1"/>',
-                ),
-            ],
+            two("revolute", '<limit lower="0" upper="inf" velocity="1"/>'),
             4,
             "j: limit upper: wrong numbers .*1 finite number, got inf",
         ),
         (
-            [
-                *links("a", "b"),
-                joint(
-                    "j", "a", "b", kind="continuous", inside='<mimic joint="j" multiplier="twice"/>'
-                ),
-            ],
+            two("continuous", '<mimic joint="j" multiplier="twice"/>'),
             4,
             "j: mimic multiplier: wrong numbers .*got twice",
         ),
-        (
-            [*links("a"), '<xacro:wheel side="left"/>'],
-            3,
-            "xacro has not been run .*xacro FILE .*got <xacro:wheel>",
-        ),
+        ([*links("a"), '<xacro:wheel side="left"/>'], 3, "xacro has not .*got <xacro:wheel>"),
     ],
 )
-def test_what_is_no_tree_is_refused(
+def test_invalid_trees_raise(
     tmp_path: Path, lines: list[str], line: int | None, message: str
 ) -> None:
     file = written(tmp_path, *lines)
@@ -164,17 +84,24 @@ def test_what_is_no_tree_is_refused(
     assert (caught.value.file, caught.value.line) == (file, line)
 
 
-def test_what_does_not_move_needs_no_axis(tmp_path: Path) -> None:
-    file = written(tmp_path, *links("a", "b"), joint("j", "a", "b", inside='<axis xyz="0 0 0"/>'))
-    assert read_urdf(file).links == ("a", "b")
+def test_fixed_joints_need_no_axis(tmp_path: Path) -> None:
+    assert read_urdf(written(tmp_path, *two(inside='<axis xyz="0 0 0"/>'))).links == ("a", "b")
 
 
-@settings(max_examples=60, deadline=None)
+def test_incomplete_limits_and_couplings_warn(tmp_path: Path) -> None:
+    limit = '<limit effort="1" velocity="1"/>'
+    with pytest.warns(UserWarning, match="thing.urdf:4: j: a limit without lower and upper"):
+        load_urdf(written(tmp_path, *two("revolute", limit)))
+    with pytest.warns(UserWarning, match="thing.urdf:4: j: there is no joint 'k' to follow"):
+        read_urdf(written(tmp_path, *two("continuous", '<mimic joint="k"/>')))
+
+
+@settings(max_examples=30, deadline=None)
 @given(st.integers(1, 12), st.integers(0, 2**32 - 1), st.booleans())
-def test_trees_are_read_and_one_joint_more_is_not(
+def test_additional_joints_break_a_tree(
     tmp_path_factory: pytest.TempPathFactory, count: int, seed: int, more: bool
 ) -> None:
-    """Whatever the order of links and joints; one more joint makes a circle, or gives a link a second parent."""
+    """Holds in any order; one more joint closes a circle or gives a link a second parent."""
     rng = np.random.default_rng(seed)
     names = [f"l{k}" for k in rng.permutation(count)]
     lines = links(*names)
@@ -195,16 +122,7 @@ def test_trees_are_read_and_one_joint_more_is_not(
         assert model.njoints == 1
 
 
-def test_the_nearest_link_is_named(tmp_path: Path) -> None:
-    with pytest.raises(UnknownNameError) as caught:
-        read_urdf(
-            written(tmp_path, *links("upper_arm", "forearm"), joint("j", "uper_arm", "forearm"))
-        )
-    assert caught.value.nearest == "upper_arm"
-
-
-def test_what_planning_does_not_need_may_be_left_out(tmp_path: Path) -> None:
-    """A limit without effort or velocity: the joint has none, and only what is missing differs."""
+def test_velocity_and_effort_limits_are_optional(tmp_path: Path) -> None:
     lines = [
         *links("a", "b", "c"),
         joint("k", "b", "c", kind="prismatic", inside='<limit upper="2" velocity="3"/>'),
@@ -222,8 +140,8 @@ def test_what_planning_does_not_need_may_be_left_out(tmp_path: Path) -> None:
     np.testing.assert_array_equal(model.upperPositionLimit, [0.5, 2.0])
 
 
-def test_extensions_say_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """Elements of simulators and of nobody known, with prefixes that nothing declares; no parser complains behind our back."""
+def test_extensions_are_ignored(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Elements of simulators and undeclared prefixes change nothing, and no parser complains."""
     lines = [
         *links("a", "b"),
         joint("j", "a", "b", kind="continuous", inside='<axis xyz="0 0 1"/><limit effort="3"/>'),
@@ -246,12 +164,6 @@ def test_extensions_say_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str
     assert not capfd.readouterr().err
 
 
-def test_a_robot_without_a_name_is_called_like_its_file(tmp_path: Path) -> None:
-    file = written(tmp_path, *links("a"))
-    file.write_text(file.read_text().replace(' name="r"', ""))
-    assert load_urdf(file)[0].name == "thing"
-
-
 @pytest.mark.parametrize(
     ("inertial", "message"),
     [
@@ -266,7 +178,7 @@ def test_a_robot_without_a_name_is_called_like_its_file(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_masses_that_are_none(tmp_path: Path, inertial: str, message: str) -> None:
+def test_incomplete_inertials_warn(tmp_path: Path, inertial: str, message: str) -> None:
     lines = [*links("r", "a"), joint("j", "r", "a", kind="continuous")]
     lines[:2] = [lines[1].replace("</link>", f"{inertial}</link>"), lines[0]]
     with pytest.warns(UserWarning, match=message):
@@ -274,24 +186,7 @@ def test_masses_that_are_none(tmp_path: Path, inertial: str, message: str) -> No
     assert model.inertias[1].mass == 0.0
 
 
-def test_a_limit_without_numbers_is_warned_of(tmp_path: Path) -> None:
-    lines = [
-        *links("a", "b"),
-        joint("j", "a", "b", kind="revolute", inside='<limit effort="1" velocity="1"/>'),
-    ]
-    with pytest.warns(
-        UserWarning, match="thing.urdf:4: j: a limit without lower and upper: it cannot move"
-    ):
-        load_urdf(written(tmp_path, *lines))
-
-
-def test_a_joint_that_follows_nothing_is_warned_of(tmp_path: Path) -> None:
-    lines = [*links("a", "b"), joint("j", "a", "b", kind="continuous", inside='<mimic joint="k"/>')]
-    with pytest.warns(UserWarning, match="thing.urdf:4: j: there is no joint 'k' to follow"):
-        read_urdf(written(tmp_path, *lines))
-
-
-def test_a_robot_without_a_name_is_named_like_its_file_whatever_that_is(tmp_path: Path) -> None:
+def test_unnamed_robots_are_named_after_their_file(tmp_path: Path) -> None:
     file = tmp_path / "x\x01\udcff\n.urdf"
     file.write_text(f"<robot>{''.join(links('a'))}</robot>")
     model, collision, _ = load_urdf(file)

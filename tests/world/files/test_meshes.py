@@ -39,14 +39,14 @@ def two_cubes(path: Path, materials: bool = False) -> Path:
     return path
 
 
-def test_objects_of_an_obj_file_stay_apart(tmp_path: Path) -> None:
+def test_objects_of_an_obj_file_are_separate(tmp_path: Path) -> None:
     mesh = load_mesh(two_cubes(tmp_path / "two.obj"))
     assert mesh.area == pytest.approx(12.0)
     assert abs(mesh.volume) == pytest.approx(2.0)
     np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [3, 1, 1]])
 
 
-def test_convex_hull_is_what_coal_holds(tmp_path: Path) -> None:
+def test_convex_hulls_equal_the_mesh(tmp_path: Path) -> None:
     shape = load_convex(two_cubes(tmp_path / "two.obj"), (0.5, 1.0, 2.0))
     assert isinstance(shape, coal.Convex)
     assert shape.computeVolume() == pytest.approx(1.5 * 1.0 * 2.0)
@@ -59,16 +59,9 @@ def test_convex_hull_is_what_coal_holds(tmp_path: Path) -> None:
     assert distance == pytest.approx(0.7, abs=1e-6)
 
 
-def test_hull_of_many_points() -> None:
-    points = np.random.default_rng(0).standard_normal((500, 3))
-    assert make_convex_hull(points).computeVolume() == pytest.approx(
-        trimesh.convex.convex_hull(points).volume
-    )
-
-
-def test_finely_meshed_cone_has_more_neighbours_than_coal_takes() -> None:
-    angles = np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False)
-    rim = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(400)])
+def test_hulls_with_many_neighbours_are_simplified() -> None:
+    angles = np.linspace(0.0, 2.0 * np.pi, 260, endpoint=False)
+    rim = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(260)])
     shape = make_convex_hull(np.vstack([rim, [0.0, 0.0, 2.0]]))
     assert np.pi * 2.0 / 3.0 - 1e-3 < shape.computeVolume() < 1.1 * np.pi * 2.0 / 3.0
     hull = trimesh.convex.convex_hull(np.asarray(shape.points()))
@@ -77,7 +70,7 @@ def test_finely_meshed_cone_has_more_neighbours_than_coal_takes() -> None:
     ).max() < 1e-7
 
 
-def test_colours_are_parts(tmp_path: Path) -> None:
+def test_colours_divide_meshes_into_parts(tmp_path: Path) -> None:
     parts = load_parts(two_cubes(tmp_path / "two.obj", materials=True), 2.0)
     assert sorted(part.colour or () for part in parts) == [
         (0.0, 0.0, 1.0, 1.0),
@@ -89,7 +82,7 @@ def test_colours_are_parts(tmp_path: Path) -> None:
     assert shape.num_tris == len(parts[0].faces)
 
 
-def test_less_detail_keeps_the_shape(tmp_path: Path) -> None:
+def test_simplified_meshes_keep_their_shape(tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.1)
     ball.export(tmp_path / "ball.stl")
     (fine,) = load_parts(tmp_path / "ball.stl")
@@ -98,24 +91,40 @@ def test_less_detail_keeps_the_shape(tmp_path: Path) -> None:
     assert np.abs(np.linalg.norm(coarse.vertices, axis=1) - 0.1).max() < 0.01
 
 
+def test_thin_meshes_need_no_further_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For flat points trimesh would import networkx, which is no dependency."""
+    monkeypatch.setitem(sys.modules, "networkx", None)
+    rng, file = np.random.default_rng(0), tmp_path / "few.off"
+    for thickness in (1.0, 0.0, 1e-3, 1e-4, 1e-8, 1e-13) * 4:
+        points = rng.normal(size=(6, 3)) * (1.0, 1.0, thickness)
+        rows = "\n".join(" ".join(map(repr, row)) for row in points.tolist())
+        file.write_text(f"OFF\n6 2 0\n{rows}\n3 0 1 2\n3 3 4 5\n")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            assert load_convex(file).computeVolume() > 0.0
+        assert len(caught) == (thickness < 1e-5)
+
+
+@pytest.mark.parametrize("scale", [(1.0, 0.0, 1.0), (1.0, 2.0), (np.nan, 1.0, 1.0)])
+def test_invalid_scales_raise(tmp_path: Path, scale: tuple[float, ...]) -> None:
+    with pytest.raises(InputError, match="scale"):
+        load_mesh(two_cubes(tmp_path / "two.obj"), scale)
+
+
 @pytest.mark.parametrize(
     ("name", "text", "problem"),
     [
         ("none.obj", None, "there is no such mesh"),
-        ("empty.obj", "", "empty|cannot read"),
         ("points.obj", "v 0 0 0\nv 1 0 0\n", "empty|cannot read"),
         ("broken.stl", "not an STL file", "empty|cannot read"),
-        ("thing.xyz3", "?", "cannot read"),
         ("number.obj", "v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "no numbers|cannot|empty"),
         ("flat.obj", "v 0 0\nv 1 0\nv 0 1\nv 1 1\nf 1 2 3\nf 2 3 4\n", "cannot read"),
-        (
-            "far.obj",
-            "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1e300\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 3 1 4\n",
-            "out of range",
-        ),
+        ("far.obj", "v 0 0 0\nv 1 0 0\nv 0 1e300 0\nf 1 2 3\n", "out of range"),
     ],
 )
-def test_bad_meshes_are_named(tmp_path: Path, name: str, text: str | None, problem: str) -> None:
+def test_invalid_meshes_raise(tmp_path: Path, name: str, text: str | None, problem: str) -> None:
     file = tmp_path / name
     if text is not None:
         file.write_text(text)
@@ -127,61 +136,19 @@ def test_bad_meshes_are_named(tmp_path: Path, name: str, text: str | None, probl
 @pytest.mark.parametrize(
     ("text", "size"),
     [
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", (1.0, 1.0, 1e-3)),
-        ("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\n", (1.0, 1.0, 1e-3)),
-        (
-            "v 0 0 1\nv 1 0 1\nv 0 1 1\nv 4 0 1\nv 5 0 1\nv 4 3 1\nf 1 2 3\nf 4 5 6\n",
-            (5.0, 3.0, 1e-3),
-        ),
-        ("v 0 0 0\nv 1 0 0\nv 1 1 1e-7\nv 0 1 0\nf 1 2 3\nf 1 3 4\n", (1.0, 1.0, 1e-3)),
-        ("v 0 2 0\nv 1 2 0\nv 3 2 0\nf 1 2 3\n", (3.0, 1e-3, 1e-3)),  # a line
+        ("v 0 0 2\nv 1 0 2\nv 0 1 2\nf 1 2 3\n", (1.0, 1.0, 1e-3)),
+        ("v 0 0 2\nv 1 0 2\nv 1 1 2.0000001\nv 0 1 2\nf 1 2 3\nf 1 3 4\n", (1.0, 1.0, 1e-3)),
+        ("v 0 2 2\nv 1 2 2\nv 3 2 2\nf 1 2 3\n", (3.0, 1e-3, 1e-3)),
     ],
-    ids=["triangle", "square", "two", "nearly", "line"],
+    ids=["triangle", "nearly flat", "line"],
 )
-def test_flat_meshes_are_thickened_with_a_warning(
+def test_flat_meshes_become_plates_with_a_warning(
     tmp_path: Path, text: str, size: tuple[float, float, float]
 ) -> None:
     file = tmp_path / "picture.obj"
     file.write_text(text)
-    with pytest.warns(
-        UserWarning, match=r"hall of .*picture\.obj is flat: it collides as a plate, 1 mm thick"
-    ):
-        shape = load_convex(file, about="hall")
-    corners = np.asarray(shape.points())
-    assert np.ptp(corners, axis=0) == pytest.approx(
-        size, rel=0.42 if size[1] == 1e-3 else 1e-3
-    )  # a bar may stand on its edge
-    given = load_mesh(file).vertices
-    for point in np.asarray(given):  # the sheet is in its middle
-        ball = coal.distance(
-            shape, coal.Transform3s(), coal.Sphere(1e-5), coal.Transform3s(np.eye(3), point), coal.DistanceRequest(),
-            coal.DistanceResult(),
-        )  # fmt: skip
-        assert ball < 0.0
-
-
-def test_few_triangles_of_any_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """trimesh asks for networkx where Qhull shakes flat points into a hull; it is none of our dependencies."""
-    monkeypatch.setitem(sys.modules, "networkx", None)
-    rng, file = np.random.default_rng(0), tmp_path / "few.off"
-    said = 0
-    for number in range(60):
-        points = rng.normal(size=(6, 3))
-        points[:, 2] *= (1.0, 0.0, 10.0 ** -rng.integers(3, 14))[number % 3]
-        rows = "\n".join(" ".join(map(repr, row)) for row in points.tolist())
-        file.write_text(f"OFF\n6 2 0\n{rows}\n3 0 1 2\n3 3 4 5\n")
-        assert len(load_mesh(file).faces) == 2
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            shape = load_convex(file)
-        said += len(caught)
-        least = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[-1]
-        assert shape.computeVolume() > 0.0
-        assert len(caught) == (least < 1e-5 * np.ptp(points, axis=0).max()) or 1e-6 < least < 1e-4
-    assert 20 <= said <= 40
-
-
-@pytest.mark.parametrize("scale", [(1.0, 0.0, 1.0), (1.0, 2.0), (np.nan, 1.0, 1.0)])
-def test_bad_scale(tmp_path: Path, scale: tuple[float, ...]) -> None:
-    with pytest.raises(InputError, match="scale"):
-        load_mesh(two_cubes(tmp_path / "two.obj"), scale)
+    with pytest.warns(UserWarning, match=r"hall of .*picture\.obj is flat: .*plate, 1 mm thick"):
+        corners = np.asarray(load_convex(file, about="hall").points())
+    tolerance = 0.42 if size[1] == 1e-3 else 1e-3  # a bar may be rotated about its axis
+    assert np.ptp(corners, axis=0) == pytest.approx(size, rel=tolerance)
+    assert corners[:, 2].min() + corners[:, 2].max() == pytest.approx(4.0, abs=1e-6)

@@ -1,4 +1,4 @@
-"""What an SRDF says: pairs that may touch, and named states."""
+"""Tests pairs, states and groups of SRDF files."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.files.srdf import Srdf, find_group_tip, read_groups, read_srdf
+from vkc_pin.world.files.srdf import Srdf, SrdfGroup, find_group_tip, read_groups, read_srdf
 
 LINKS = ("base", "arm", "hand")
 
@@ -28,8 +28,8 @@ def test_pairs_are_sorted_and_keep_their_reason(tmp_path: Path) -> None:
     assert read(tmp_path, pairs).allowed == {("arm", "hand"): "Adjacent", ("arm", "base"): ""}
 
 
-def test_states_of_several_groups_are_put_together(tmp_path: Path) -> None:
-    """And joints with more than one coordinate are left out."""
+def test_states_of_several_groups_are_merged(tmp_path: Path) -> None:
+    """Joints with several coordinates are skipped."""
     srdf = read(
         tmp_path,
         state("home", a="0.5") + state("up", a="-1e-1", floating="1 0 0") + state("home", b="2"),
@@ -46,7 +46,7 @@ def test_states_of_several_groups_are_put_together(tmp_path: Path) -> None:
         (["up", "default", "rest"], "default"),
     ],
 )
-def test_the_state_to_rest_in(tmp_path: Path, names: list[str], chosen: str) -> None:
+def test_home_states_are_preferred(tmp_path: Path, names: list[str], chosen: str) -> None:
     values = {name: float(number) for number, name in enumerate(names)}
     srdf = read(
         tmp_path,
@@ -57,7 +57,7 @@ def test_the_state_to_rest_in(tmp_path: Path, names: list[str], chosen: str) -> 
     assert srdf.state(["a", "z"]) == {}
 
 
-def test_links_that_there_are_not(tmp_path: Path) -> None:
+def test_unknown_links_raise(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError) as caught:
         read(
             tmp_path,
@@ -70,37 +70,31 @@ def test_links_that_there_are_not(tmp_path: Path) -> None:
     )
 
 
-def test_what_is_no_srdf(tmp_path: Path) -> None:
+def test_missing_files_raise(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot read the SRDF"):
         read_srdf(tmp_path / "none.srdf", links=LINKS)
 
 
 def test_groups_are_joints_or_chains(tmp_path: Path) -> None:
-    """A chain has the joints between its links, the last one first; groups of links alone are no groups of joints."""
-    chain = [("a", "base", "one"), ("b", "one", "two"), ("c", "two", "three")]
-    joints = (
-        f'<joint name="{name}"><parent link="{above}"/><child link="{below}"/></joint>'
-        for name, above, below in chain
+    """A chain lists its joints from the tip; groups of links only are ignored."""
+    urdf = ElementTree.fromstring(
+        '<robot><joint name="a"><parent link="base"/><child link="one"/></joint>'
+        '<joint name="b"><parent link="one"/><child link="two"/></joint>'
+        '<joint name="c"><parent link="two"/><child link="three"/></joint></robot>'
     )
-    urdf = ElementTree.fromstring(f"<robot>{''.join(joints)}</robot>")
     file = tmp_path / "groups.srdf"
     file.write_text(
         '<robot name="r"><group name="arm"><chain base_link="one" tip_link="three"/></group>'
         '<group name="shoulder"><joint name="a"/><joint name="b"/><joint name="elsewhere"/></group>'
         '<group name="hand"><link name="three"/></group></robot>'
     )
-    groups = read_groups(file, urdf)
-    assert {name: (group.joints, group.tip) for name, group in groups.items()} == {
-        "arm": (("c", "b"), "three"),
-        "shoulder": (("a", "b"), "two"),
+    assert read_groups(file, urdf) == {
+        "arm": SrdfGroup(("c", "b"), "three"),
+        "shoulder": SrdfGroup(("a", "b"), "two"),
     }
     assert find_group_tip(file, urdf, "arm") == "three"
-    with pytest.raises(UnknownNameError, match="There are: arm, shoulder") as caught:
+    with pytest.raises(UnknownNameError, match=r"arm: .*There are: arm, shoulder") as caught:
         find_group_tip(file, urdf, "shouldr")
-    assert (caught.value.nearest, caught.value.file, caught.value.field) == (
-        "shoulder",
-        file,
-        "arm",
-    )
+    assert (caught.value.nearest, caught.value.file) == ("shoulder", file)
     with pytest.raises(UnknownNameError, match="there are: none"):
         find_group_tip(None, urdf, "arm")

@@ -51,80 +51,45 @@ def test_names_joints_and_limits_of_coordinates() -> None:
     assert caught.value.nearest == "thing_qw"
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_configurations_round_trip(seed: int) -> None:
-    coordinates, rng = Coordinates(mixed()), np.random.default_rng(seed)
+    model, rng = mixed(), np.random.default_rng(seed)
+    coordinates, data = Coordinates(model), model.createData()
     z = random_z(rng, 4, 3)
     q = coordinates.q(z)
-    assert q.shape == (4, 3, coordinates.nq)
-    assert pin.Model(mixed()).nq == coordinates.nq
-    for row in q.reshape(-1, coordinates.nq):
-        assert pin.isNormalized(mixed(), row, 1e-12)
     np.testing.assert_allclose(coordinates.z(q), z, atol=1e-12)
     np.testing.assert_array_equal(coordinates.q(z[0, 0]), q[0, 0])
-    # The length of a quaternion has no effect.
-    longer = z.copy()
+    longer = z.copy()  # the length of a quaternion has no effect
     longer[..., 7:11] *= rng.uniform(0.1, 9.0, (4, 3, 1))
     np.testing.assert_allclose(coordinates.q(longer), q, atol=1e-12)
+    z, q = z[0, 0], q[0, 0]
+    pin.forwardKinematics(model, data, q)
+    base, thing, lid = data.oMi[1], data.oMi[3], data.oMi[4]
+    assert thing.isApprox(pin.XYZQUATToSE3(z[4:11]), 1e-12)
+    np.testing.assert_allclose(base.translation, [*z[:2], 0.0])
+    np.testing.assert_allclose(base.rotation, pin.utils.rotate("z", z[2]), atol=1e-12)
+    expected = pin.utils.rotate("x", z[11])
+    np.testing.assert_allclose((thing.inverse() * lid).rotation, expected, atol=1e-12)
 
 
-@settings(max_examples=60, deadline=None)
-@given(st.integers(0, 2**32 - 1))
-def test_free_joints_are_placed_by_their_coordinates(seed: int) -> None:
-    model = mixed()
-    coordinates, data, (z,) = (
-        Coordinates(model),
-        model.createData(),
-        random_z(np.random.default_rng(seed), 1),
-    )
-    pin.forwardKinematics(model, data, coordinates.q(z))
-    np.testing.assert_allclose(
-        data.oMi[3].homogeneous, pin.XYZQUATToSE3(z[4:11]).homogeneous, atol=1e-12
-    )
-    np.testing.assert_allclose(data.oMi[1].translation[:2], z[:2])
-    np.testing.assert_allclose(data.oMi[1].rotation, pin.utils.rotate("z", z[2]), atol=1e-12)
-    np.testing.assert_allclose(
-        (data.oMi[3].inverse() * data.oMi[4]).rotation, pin.utils.rotate("x", z[11]), atol=1e-12
-    )
-
-
-@pytest.mark.parametrize("angle", [0.0, 0.1, 1.0, 2.0, np.pi - 1e-6, np.pi])
+@pytest.mark.parametrize("angle", [0.1, 2.0, np.pi - 1e-6])
 def test_quaternions_interpolate_about_one_axis(angle: float) -> None:
-    """Linear interpolation rotates about one axis; the midpoint is at half the angle, up to π."""
+    """The midpoint of a linear interpolation is at half the angle."""
     model, rng = mixed(), np.random.default_rng(0)
-    coordinates = Coordinates(model)
-    for _ in range(20):
-        axis = rng.normal(size=3)
-        axis /= np.linalg.norm(axis)
-        first = pin.SE3.Random()
-        second = pin.SE3(
-            first.rotation @ pin.exp3(angle * axis), first.translation + rng.normal(size=3)
-        )
-        ends = np.zeros((2, coordinates.size))
-        ends[:, 4:11] = [pin.SE3ToXYZQUAT(first), pin.SE3ToXYZQUAT(second)]
-        if ends[0, 7:11] @ ends[1, 7:11] < 0.0:  # the nearer of both quaternions of an orientation
-            ends[1, 7:11] *= -1.0
-        data = model.createData()
-        angles = []
-        for share in (0.0, 0.25, 0.5, 0.75, 1.0):
-            pin.forwardKinematics(
-                model, data, coordinates.q((1 - share) * ends[0] + share * ends[1])
-            )
-            at = data.oMi[3]
-            np.testing.assert_allclose(
-                at.translation,
-                (1 - share) * first.translation + share * second.translation,
-                atol=1e-12,
-            )
-            turn = pin.log3(first.rotation.T @ at.rotation)
-            if angle > 1e-3 and 0.0 < share < 1.0:
-                np.testing.assert_allclose(np.abs(turn @ axis), np.linalg.norm(turn), atol=1e-6)
-            angles.append(np.linalg.norm(turn))
-        assert angles[2] == pytest.approx(angle / 2, abs=1e-6)
-        assert angles[4] == pytest.approx(angle, abs=1e-5)
-        assert np.all(np.diff(angles) >= -1e-9)
-        assert angles[3] - angles[2] == pytest.approx(angles[2] - angles[1], abs=1e-6)  # symmetric
+    coordinates, data = Coordinates(model), model.createData()
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    first = pin.SE3.Random()
+    second = pin.SE3(first.rotation @ pin.exp3(angle * axis), first.translation + 1.0)
+    ends = np.zeros((2, coordinates.size))
+    ends[:, 4:11] = [pin.SE3ToXYZQUAT(first), pin.SE3ToXYZQUAT(second)]
+    if ends[0, 7:11] @ ends[1, 7:11] < 0.0:  # the nearer of both quaternions of an orientation
+        ends[1, 7:11] *= -1.0
+    pin.forwardKinematics(model, data, coordinates.q(ends.mean(axis=0)))
+    np.testing.assert_allclose(data.oMi[3].translation, first.translation + 0.5, atol=1e-12)
+    turn = pin.log3(first.rotation.T @ data.oMi[3].rotation)
+    np.testing.assert_allclose(turn, 0.5 * angle * axis, atol=1e-6)
 
 
 def test_symbolic_configurations_match_numeric_ones() -> None:

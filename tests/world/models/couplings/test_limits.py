@@ -7,19 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.telescopes import joint, link, write_telescope
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.world.files.urdf import read_urdf
-from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.models.couplings.limits import apply_robot_limits, tighten_coupled_limits
-from vkc_pin.world.models.robot_model import (
-    build_full_model,
-    build_planned_model,
-    compute_rest_positions,
-)
-from vkc_pin.world.models.robot_schema import RobotSchema
 
 
 def make_coupled_robot(
@@ -92,13 +81,6 @@ def test_robot_yaml_limits_any_coupled_joint(tmp_path: Path) -> None:
     assert (robot.velocity[3], robot.acceleration[3]) == (0.05, 2.0)
 
 
-def test_default_velocity_and_acceleration_limits(tmp_path: Path) -> None:
-    text = write_telescope(tmp_path).parent / "robot.urdf"
-    text.write_text(text.read_text().replace('velocity="0.5" ', ""))
-    robot = vkc.load_robot(tmp_path)
-    assert (robot.velocity[4], robot.acceleration[4]) == (np.pi, 1.4)
-
-
 def test_default_limits_apply_to_the_fastest_joint(tmp_path: Path) -> None:
     couplings = (
         "out_2: {joint: out_1, multiplier: 0.5}, "
@@ -131,51 +113,3 @@ def test_incompatible_limits_raise(tmp_path: Path) -> None:
         match=r"one: no position satisfies the limits of its follower 'two'.*2 to 3.*-1 to 1",
     ):
         make_coupled_robot(tmp_path, 'multiplier="1"', second=(2.0, 3.0))
-
-
-@settings(max_examples=80, deadline=None)
-@given(st.integers(0, 2**32 - 1))
-def test_limits_of_coordinates_are_tight_for_all_joints(seed: int) -> None:
-    """No joint exceeds its limits, and at each limit of a coordinate one joint attains its own."""
-    rng = np.random.default_rng(seed)
-    parts, bounds, speeds = [link("l0", "0.1 0.1 0.1")], {}, {}
-    for k in range(4):
-        bounds[f"j{k}"], speeds[f"j{k}"] = (
-            (-rng.uniform(0.5, 2.0), rng.uniform(0.5, 2.0)),
-            rng.uniform(0.1, 2.0),
-        )
-        factor, offset = rng.uniform(0.2, 3.0) * rng.choice([-1.0, 1.0]), rng.uniform(-0.05, 0.05)
-        inside = f'<mimic joint="j0" multiplier="{factor}" offset="{offset}"/>' if k else ""
-        kind = ("revolute", "prismatic")[k % 2]
-        moved = joint(
-            f"j{k}",
-            kind,
-            f"l{k}",
-            f"l{k + 1}",
-            limits=bounds[f"j{k}"],
-            velocity=speeds[f"j{k}"],
-            inside=inside,
-        )
-        parts += [link(f"l{k + 1}"), moved]
-    file = read_urdf(Path("robot.urdf"), text=f'<robot name="robot">{"".join(parts)}</robot>')
-    full = tighten_coupled_limits(build_full_model(file), file, "l4")
-    model = build_planned_model(full, file, "l4", compute_rest_positions(full, file, {}), {})
-    coordinates, lower, upper, velocity, _ = apply_robot_limits(
-        full, model, RobotSchema(urdf="robot.urdf"), "omni"
-    )
-    assert coordinates.names[3:] == ("j0",)
-    reached = []
-    for move in Coordinates(model).moves[3:]:
-        name = str(model.names[move.joint])
-        ends = sorted(move.factor * np.array([lower[3], upper[3]]) + move.offset)
-        low, high = bounds[name]
-        assert low - 1e-9 <= ends[0]
-        assert ends[1] <= high + 1e-9
-        assert abs(move.factor) * velocity[3] <= speeds[name] + 1e-9
-        reached.append(
-            (
-                min(ends[0] - low, high - ends[1]) < 1e-9,
-                abs(abs(move.factor) * velocity[3] - speeds[name]) < 1e-9,
-            )
-        )
-    assert all(any(column) for column in zip(*reached, strict=True))

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.telescopes import FOLLOWERS, joint, link, write_telescope
+from helpers.telescopes import joint, link, write_telescope
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -16,7 +15,7 @@ import vkc_pin as vkc
 from vkc_pin.planning import kinematics as cpin
 from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.models.couplings.coupled_joints import JointCoupling, find_followers
+from vkc_pin.world.models.couplings.coupled_joints import find_followers
 from vkc_pin.world.models.couplings.limits import tighten_coupled_limits
 from vkc_pin.world.models.couplings.mimic_joints import sort_joints
 from vkc_pin.world.models.robot_model import (
@@ -56,10 +55,10 @@ def random_robot(rng: np.random.Generator) -> tuple[str, str]:
     return f'<robot name="robot">{"".join(parts)}</robot>', f"l{count}"
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_kinematics_match_independent_joints(seed: int) -> None:
-    """Compares placements and all Jacobians of Pinocchio with independent joints."""
+    """Compares placements and Jacobians with finite differences of independent joints."""
     rng = np.random.default_rng(seed)
     text, tool = random_robot(rng)
     file = read_urdf(Path("robot.urdf"), text=text)
@@ -68,22 +67,7 @@ def test_kinematics_match_independent_joints(seed: int) -> None:
     rest = compute_rest_positions(full, file, {})
     model, follows = build_planned_model(full, file, tool, rest, {}), find_followers(file.root)
     coordinates = Coordinates(model)
-    assert len({frame.name for frame in model.frames}) == model.nframes
     z = rng.uniform(-1.0, 1.0, coordinates.size)
-    planned = {str(name) for name in model.names[2:]}
-    assert planned == {*coordinates.names[3:]} | {joint for joint in planned if joint in follows}
-    assert len(coordinates.moves) == len(planned) + 3
-    for move in coordinates.moves[3:]:
-        joint, leader = str(model.names[move.joint]), coordinates.names[move.coordinate]
-        led = follows.get(joint, JointCoupling(joint, 1.0, 0.0))
-        assert (leader, move.factor, move.offset) == (
-            led.leader,
-            pytest.approx(led.factor),
-            pytest.approx(led.offset),
-        )
-        assert move.slides == (
-            single.joints[single.getJointId(joint)].shortname().startswith("JointModelP")
-        )
 
     def everything(z: np.ndarray) -> np.ndarray:
         values = dict(zip(coordinates.names, z, strict=True))
@@ -101,73 +85,30 @@ def test_kinematics_match_independent_joints(seed: int) -> None:
         expected = theirs.oMf[single.getFrameId(frame.name, pin.FrameType.BODY)]
         np.testing.assert_allclose(ours.homogeneous, expected.homogeneous, atol=1e-9)
 
-    def column(k: int) -> np.ndarray:
-        step = np.zeros(coordinates.size)
-        step[k] = 1e-6
+    differences = []
+    for step in 1e-6 * np.eye(coordinates.size)[2:]:  # x and y in z are in the world frame
         ends = []
-        for way in (step, -step):
-            pin.framesForwardKinematics(single, theirs, everything(z + way))
+        for at in (z + step, z - step):
+            pin.framesForwardKinematics(single, theirs, everything(at))
             ends.append(theirs.oMf[single.getFrameId(tool, pin.FrameType.BODY)].copy())
         turn = pin.log3(ends[0].rotation @ ends[1].rotation.T)
-        return np.concatenate([ends[0].translation - ends[1].translation, turn]) / 2e-6
-
-    differences = np.column_stack(
-        [column(k) for k in range(2, coordinates.size)]
-    )  # x and y in z are in the world frame
-    numeric = pin.computeFrameJacobian(
-        model, data, coordinates.q(z), model.getFrameId(tool), pin.LOCAL_WORLD_ALIGNED
-    )
-    np.testing.assert_allclose(numeric[:, 2:], differences, atol=1e-6)
-    np.testing.assert_allclose(
-        np.array(cpin.frame_jacobian(model, tool)(coordinates.q(z)))[:, 2:], differences, atol=1e-6
-    )
-    v = ca.SX.sym("z", coordinates.size)
-    placed = cpin.frame_placements(model, [tool])(coordinates.q_symbolic(v))
-    slope = np.array(ca.Function("slope", [v], [ca.jacobian(placed[9:], v)])(z))
-    np.testing.assert_allclose(slope[:, 2:], differences[:3], atol=1e-6)
+        move = ends[0].translation - ends[1].translation
+        differences.append(np.concatenate([move, turn]) / 2e-6)
+    jacobian = np.array(cpin.frame_jacobian(model, tool)(coordinates.q(z)))
+    np.testing.assert_allclose(jacobian[:, 2:], np.transpose(differences), atol=1e-6)
 
 
 def test_dynamics_include_followers(tmp_path: Path) -> None:
-    """Gravity torques equal the gradient of the potential energy."""
     robot = vkc.load_robot(write_telescope(tmp_path))
     model, rng = pin.Model(robot.model), np.random.default_rng(0)
     for j in range(1, model.njoints):
         model.inertias[j] = pin.Inertia.Random()
-    z, v, a = rng.uniform(-0.5, 0.5, model.nv), rng.normal(size=model.nv), rng.normal(size=model.nv)
+    z, v, a = rng.uniform(-0.5, 0.5, (3, model.nv))
     q, data = robot.coordinates.q(z), model.createData()
-    np.testing.assert_allclose(
-        np.array(cpin.rnea(model)(q, v, a)).ravel(), pin.rnea(model, data, q, v, a), atol=1e-9
-    )
-    center = cpin.center_of_mass(model)
-    np.testing.assert_allclose(
-        np.array(center(q)).ravel(), pin.centerOfMass(model, data, q), atol=1e-9
-    )
-
-    def energy(z: np.ndarray) -> float:
-        return float(
-            -model.gravity.linear
-            @ np.array(center(robot.coordinates.q(z))).ravel()
-            * pin.computeTotalMass(model)
-        )
-
-    slopes = [(energy(z + step) - energy(z - step)) / 2e-6 for step in 1e-6 * np.eye(model.nv)[3:]]
-    np.testing.assert_allclose(pin.rnea(model, data, q, 0.0 * v, 0.0 * a)[3:], slopes, atol=1e-5)
-
-
-def test_models_are_distinguished_by_their_couplings(tmp_path: Path) -> None:
-    """Cached programs are found by the model's text, which depends on multipliers."""
-    texts = set()
-    for k, multiplier in enumerate((1.0, 2.0)):
-        attributes = ", ".join(
-            f"{joint}: {{joint: {leader}, multiplier: {multiplier}}}"
-            for joint, leader in FOLLOWERS.items()
-        )
-        model = vkc.load_robot(write_telescope(tmp_path / str(k), couplings=attributes)).model
-        again = pin.Model()
-        again.loadFromString(model.saveToString())
-        assert again == model
-        texts.add(model.saveToString())
-    assert len(texts) == 2
+    torques, expected = cpin.rnea(model)(q, v, a), pin.rnea(model, data, q, v, a)
+    np.testing.assert_allclose(np.array(torques).ravel(), expected, atol=1e-9)
+    center, expected = cpin.center_of_mass(model)(q), pin.centerOfMass(model, data, q)
+    np.testing.assert_allclose(np.array(center).ravel(), expected, atol=1e-9)
 
 
 def test_joints_are_sorted_after_their_leaders() -> None:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 from helpers.objects import URDF, load_text
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError
 from vkc_pin.world.models.dynamics.joint_resistance import Resistance
-from vkc_pin.world.models.object_file import load_object
 
 TAIL = "attachments: []\n"
 REAL = st.floats(-1e3, 1e3)
@@ -36,19 +33,6 @@ def test_the_description_overrides_the_urdf_per_value() -> None:
     )
     assert load_text(urdf, text).resistance["hinge"] == Resistance(
         friction=0.0, damping=0.5, stiffness=4.0, springref=-2.0
-    )
-
-
-def test_limits_and_resistance_can_be_combined() -> None:
-    thing = load_text(
-        URDF,
-        "urdf: thing.urdf\n"
-        f"joints: {{hinge: {{acceleration: 3, velocity: 0.5, damping: 1}}}}\n{TAIL}",
-    )
-    assert (thing.velocity[0], thing.acceleration[0], thing.resistance["hinge"].damping) == (
-        0.5,
-        3.0,
-        1.0,
     )
 
 
@@ -95,11 +79,6 @@ def test_invalid_values_raise_with_their_line(fields: str, field: str, problem: 
     assert (caught.value.field, caught.value.line) == (field, 4)
 
 
-def test_unknown_fields_raise_with_a_suggestion() -> None:
-    with pytest.raises(UnknownNameError, match="friction"):
-        load_text(URDF, f"urdf: thing.urdf\njoints: {{hinge: {{frictionloss: 1}}}}\n{TAIL}")
-
-
 @pytest.mark.parametrize(
     "attributes", ['friction="-1"', 'damping="much"', 'damping="1 2"', 'friction="inf"']
 )
@@ -111,8 +90,3 @@ def test_invalid_urdf_dynamics_raise_with_their_line(attributes: str) -> None:
     assert caught.value.line == 4
     assert caught.value.field == f"hinge: dynamics {attributes.partition('=')[0]}"
     assert str(caught.value.file).endswith("thing.urdf")
-
-
-def test_resistance_is_read_from_inline_urdfs() -> None:
-    thing = load_object({"urdf": with_dynamics('damping="0.25"'), "attachments": []})
-    assert math.isclose(thing.resistance["hinge"].damping, 0.25)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from helpers.objects import load_text
 
@@ -53,14 +52,6 @@ def test_mass_is_zero_by_default_and_may_be_zero() -> None:
     assert block(BOX + inertial, "mass: 0").mass == 0.0
 
 
-def test_mass_is_the_sum_over_links() -> None:
-    assert (
-        load_object("door").mass
-        == pytest.approx(sum(i.mass for i in load_object("door").model.inertias))
-        == 45.3
-    )
-
-
 @pytest.mark.parametrize("value", ["-1.0", "heavy", ".inf"])
 def test_invalid_masses_raise(value: str) -> None:
     with pytest.raises(InputError) as caught:
@@ -75,13 +66,3 @@ def test_fixed_objects_cannot_have_a_mass() -> None:
             "urdf: thing.urdf\nmass: 3\nattachments: []\n",
         )
     assert (caught.value.field, caught.value.line) == ("mass", 2)
-
-
-def test_mass_changes_only_inertias() -> None:
-    heavy = load_object(
-        {"urdf": "cup.urdf", "free": True, "mass": 2.0, "attachments": []}, folder="scenes/objects"
-    )
-    plain = load_object("cup")
-    assert isinstance(heavy.model, pin.Model)
-    assert heavy.links == plain.links
-    assert len(heavy.collision.geometryObjects) == len(plain.collision.geometryObjects)

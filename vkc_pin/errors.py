@@ -1,4 +1,4 @@
-"""Exceptions of the package. All derive from `VkcError` and carry data, not only text."""
+"""Defines the exceptions of the package, which carry data as well as text."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ __all__ = [
     "format_value",
 ]
 
-_MAX_VALUE_LENGTH = 300  # characters of what came, or was expected, that a message shows
-_MAX_NAME_LENGTH = 80  # characters of a name
+_MAX_VALUE_LENGTH = 300  # characters of a value in a message
+_MAX_NAME_LENGTH = 80
 
 
 class _ShortRepr(reprlib.Repr):
@@ -38,7 +38,7 @@ _SHORT_REPR.maxstring = _SHORT_REPR.maxother = 200
 
 
 def format_value(value: object) -> str:
-    """Return a value as messages show it: its `repr`, but neither long nor deep, and without failing where that does."""
+    """Return the `repr` of a value, shortened in length and depth, without its exceptions."""
     return _SHORT_REPR.repr(value)
 
 
@@ -53,7 +53,7 @@ def _format_detail(value: object) -> str:
 
 
 def find_nearest_name(name: str, choices: Iterable[str]) -> str | None:
-    """Return the choice that resembles `name` most, or None if none does."""
+    """Return the choice most similar to `name`, or None if none is similar."""
     matches = difflib.get_close_matches(
         _shorten(name, _MAX_NAME_LENGTH), [str(c) for c in choices], n=1, cutoff=0.5
     )
@@ -61,23 +61,23 @@ def find_nearest_name(name: str, choices: Iterable[str]) -> str | None:
 
 
 class VkcError(Exception):
-    """Base class of every error this package raises on purpose."""
+    """Base class of the errors of this package."""
 
 
 class BuildError(VkcError):
-    """The compiled part of the package is missing or does not fit what is installed."""
+    """The compiled part is missing, or does not fit the installed packages."""
 
 
 class InputError(VkcError, ValueError):
-    """Bad input: says where it stands, what was expected and what came.
+    """Invalid input, with its place, the expected values and the given one.
 
     Attributes:
-        problem: What is wrong, in one sentence.
-        file: The file it stands in, if any.
-        line: The line in that file, counted from 1, if known.
-        field: The field or argument, e.g. `obstacles[3].size`.
-        expected: What would have been right.
-        got: What came instead.
+        problem: The problem in one sentence.
+        file: File of the input, if any.
+        line: Line in that file, counted from 1, if known.
+        field: Field or argument, such as `obstacles[3].size`.
+        expected: Valid values.
+        got: The given value.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class InputError(VkcError, ValueError):
 
 
 class UnknownNameError(InputError):
-    """A name of some `kind` that does not exist; `choices` are those that do, `nearest` the one that resembles it most."""
+    """A name of some `kind` that does not exist, with all `choices` and the `nearest`."""
 
     def __init__(
         self,

@@ -1,8 +1,7 @@
-"""Checks of what callers hand over: what is not of the right kind becomes an `InputError` that names the argument.
+"""Checks arguments of public functions, and raises `InputError` with the name of the argument.
 
-Everything public looks at its arguments with these before it uses them. They ask for the kind of a
-value first, and nothing of a value of another kind: what it would answer to `len`, `float` or a
-comparison is anybody's guess.
+The checks test the type of a value first and ask values of other types for nothing: their `len`,
+`float` or comparisons may do anything.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import itertools
 import math
 from collections.abc import Collection, Iterator, KeysView, Mapping, Sequence, ValuesView
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 
@@ -35,11 +34,15 @@ __all__ = [
 
 T = TypeVar("T")
 MAX_ENTRIES = 100_000
-"""Most entries of a list that an argument may be."""
+"""Largest number of entries of a list."""
+
+
+def _fail(problem: str, field: str, expected: str, value: Any) -> NoReturn:
+    raise InputError(problem, field=field, expected=expected, got=format_value(value)) from None
 
 
 def is_number(value: object) -> bool:
-    """Return whether a value is a real number, of Python or NumPy; True and False are none, and NaN is one."""
+    """Return whether a value is a real number of Python or NumPy, including NaN but no booleans."""
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
@@ -55,135 +58,126 @@ def check_number(
     """Return a finite number.
 
     Args:
-        value: What was given.
-        field: The argument's name.
-        expected: What would be right, for the message.
-        low: The lowest that will do.
-        high: The highest that will do.
-        strict: Whether it must be more than `low`.
+        value: The argument.
+        field: Its name.
+        expected: Valid values, for the message.
+        low: Smallest valid number.
+        high: Largest valid number.
+        strict: Exclude `low` itself.
 
     Raises:
-        InputError: It is none, not finite, too low or too high.
+        InputError: The value is not a finite number, or out of range.
     """
     if isinstance(value, np.ndarray) and value.ndim == 0 and value.dtype.kind in "iuf":
         value = value.item()
+    is_bounded = low > -math.inf
     if not is_number(value):
-        problem = "not a number" if low == -math.inf else "out of range"
-        raise InputError(problem, field=field, expected=expected, got=format_value(value))
+        _fail("out of range" if is_bounded else "not a number", field, expected, value)
     try:
         found = float(value)
     except OverflowError:
         found = math.inf
     if not (math.isfinite(found) and low <= found <= high) or (strict and found == low):
-        problem = "not finite" if low == -math.inf else "out of range"
-        raise InputError(problem, field=field, expected=expected, got=format_value(value))
+        _fail("out of range" if is_bounded else "not finite", field, expected, value)
     return found
 
 
 def check_coordinate(value: Any, field: str) -> float:
-    """Return a length [m] or an angle [rad] of at most `LARGEST`, either way. Raises `InputError` if it is none."""
+    """Return a length [m] or angle [rad] of magnitude up to `MAX_COORDINATE`.
+
+    Raises:
+        InputError: The value is not such a number.
+    """
     expected = f"a number from {-MAX_COORDINATE:g} to {MAX_COORDINATE:g}"
     found = check_number(value, field, expected)
     if abs(found) > MAX_COORDINATE:
-        raise InputError("out of range", field=field, expected=expected, got=format_value(value))
+        _fail("out of range", field, expected, value)
     return found
 
 
 def check_integer(value: Any, field: str, *, low: int, high: int = 2**63 - 1) -> int:
-    """Return a whole number from `low` to `high`. Raises `InputError` if it is none."""
-    if (
-        not isinstance(value, int | np.integer)
-        or isinstance(value, bool)
-        or not low <= value <= high
-    ):
-        expected = (
-            f"a whole number of at least {low}"
-            if high == 2**63 - 1
-            else f"a whole number from {low} to {high}"
-        )
-        raise InputError("out of range", field=field, expected=expected, got=format_value(value))
+    """Return an integer from `low` to `high`.
+
+    Raises:
+        InputError: The value is not such an integer.
+    """
+    is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not is_integer or not low <= value <= high:
+        bounds = f"of at least {low}" if high == 2**63 - 1 else f"from {low} to {high}"
+        _fail("out of range", field, f"a whole number {bounds}", value)
     return int(value)
 
 
 def check_array(
     value: Any, field: str, expected: str = "an array of numbers", *, problem: str = "not numbers"
 ) -> Floats:
-    """Return a copy of an array of numbers, of any shape and not looked at further.
+    """Return a copy of an array of real numbers, of any shape; they may be infinite or NaN.
 
     Args:
-        value: A number, a list, of lists if need be, or an array.
-        field: The argument's name.
-        expected: What would be right, for the message.
-        problem: What is wrong otherwise, for the message.
+        value: A number, a list, nested lists, or an array.
+        field: Name of the argument.
+        expected: Valid values, for the message.
+        problem: Problem with other values, for the message.
 
     Raises:
-        InputError: It is none, or has entries that are no real numbers.
+        InputError: The value is not an array of real numbers.
     """
     try:
         array = np.asarray(value)
-    except (
-        TypeError,
-        ValueError,
-        OverflowError,
-        RecursionError,
-    ):  # lists of unequal lengths, or too deep
-        raise InputError(problem, field=field, expected=expected, got=format_value(value)) from None
+    except (TypeError, ValueError, OverflowError, RecursionError):  # ragged or deeply nested lists
+        _fail(problem, field, expected, value)
     if array.dtype.kind not in "iuf" and array.size:
-        raise InputError(problem, field=field, expected=expected, got=format_value(value))
+        _fail(problem, field, expected, value)
     return np.array(array, float) if array.size else np.zeros(array.shape)
 
 
 def check_finite_array(value: Any, field: str, file: str | Path | None = None) -> Floats:
-    """Return a copy of an array of numbers, as `numbers` does, that are all finite.
+    """Return a copy of an array of finite numbers; see `check_array`.
 
     Raises:
-        InputError: As `numbers`; or a number is not finite, with its place in the array.
+        InputError: A number is not finite, with its index, or as in `check_array`.
     """
     array = check_array(value, field)
     if not np.isfinite(array).all():
         where = np.argwhere(~np.isfinite(array))[0].tolist()
-        got = array[tuple(where)]
         raise InputError(
             "not finite",
             file=file,
             field=f"{field}{where or ''}",
             expected="finite numbers",
-            got=got,
+            got=array[tuple(where)],
         )
     return array
 
 
 def check_text(value: Any, field: str, expected: str = "text") -> str:
-    """Return a text. Raises `InputError` if it is none."""
-    if not isinstance(value, str) or not _is_utf8(value):
-        raise InputError("not text", field=field, expected=expected, got=format_value(value))
-    return str(value)
+    """Return text that UTF-8 can encode: half of a surrogate pair cannot be written to a file.
 
-
-def _is_utf8(value: str) -> bool:
-    """Return whether a text can be written into a file: halves of surrogate pairs cannot."""
+    Raises:
+        InputError: The value is not such a text.
+    """
     try:
-        value.encode("utf-8")
+        if isinstance(value, str):
+            value.encode("utf-8")
+            return str(value)
     except UnicodeEncodeError:
-        return False
-    return True
+        pass
+    _fail("not text", field, expected, value)
 
 
 def check_bool(value: Any, field: str) -> bool:
-    """Return True or False. Raises `InputError` if it is neither."""
+    """Return True or False; raise `InputError` for other values."""
     if not isinstance(value, bool | np.bool_):
-        raise InputError(
-            "neither true nor false", field=field, expected="True or False", got=format_value(value)
-        )
+        _fail("neither true nor false", field, "True or False", value)
     return bool(value)
 
 
 def check_choice(value: Any, choices: Collection[str], kind: str, field: str | None = None) -> str:
-    """Return a name that is one of `choices`, which are of some `kind`.
+    """Return a name that is one of `choices`, which name things of a `kind`.
 
     Raises:
-        InputError: It is no text.
-        UnknownNameError: It is none of them.
+        InputError: The value is not text.
+        UnknownNameError: The name is not one of them.
     """
     name = check_text(value, field or kind, f"the name of a {kind}")
     if name not in choices:
@@ -194,64 +188,47 @@ def check_choice(value: Any, choices: Collection[str], kind: str, field: str | N
 def check_instance(
     value: Any, kind: type[T] | tuple[type[T], ...], field: str, expected: str | None = None
 ) -> T:
-    """Return a value that is of some kind. Raises `InputError` if it is not."""
+    """Return an instance of a type, or of one of several; raise `InputError` for other values."""
     if not isinstance(value, kind):
-        name = (
-            kind.__name__ if isinstance(kind, type) else " or ".join(one.__name__ for one in kind)
-        )
-        raise InputError(
-            "wrong type of argument",
-            field=field,
-            expected=expected or f"a {name}",
-            got=format_value(value),
-        )
+        kinds = kind if isinstance(kind, tuple) else (kind,)
+        name = " or ".join(one.__name__ for one in kinds)
+        _fail("wrong type of argument", field, expected or f"a {name}", value)
     return value
 
 
 def check_mapping(
     value: Any, field: str, expected: str = "names, each with its value"
 ) -> dict[str, Any]:
-    """Return a dictionary whose keys are texts. Raises `InputError` if it is none."""
+    """Return a dictionary whose keys are text; raise `InputError` for other values."""
     if not isinstance(value, Mapping):
-        raise InputError(
-            "wrong type of argument",
-            field=field,
-            expected=f"a dictionary: {expected}",
-            got=format_value(value),
-        )
+        _fail("wrong type of argument", field, f"a dictionary: {expected}", value)
     return {check_text(name, f"{field}: a name in it"): entry for name, entry in value.items()}
 
 
 def check_list(
     value: Any, field: str, expected: str, kind: type[T] | tuple[type[T], ...] | None = None
 ) -> tuple[T, ...]:
-    """Return a list as a tuple, its entries of some kind if one is given.
+    """Return the entries of a list, tuple, array, or iterator of at most `MAX_ENTRIES` entries.
 
     Args:
-        value: A list, a tuple, an array, or an iterator that ends before `MOST` entries.
-        field: The argument's name.
-        expected: What would be right, for the message.
-        kind: What its entries must be.
+        value: The argument.
+        field: Its name.
+        expected: Valid values, for the message.
+        kind: Type of its entries. Default: any.
 
     Raises:
-        InputError: It is no list, or an entry is of another kind.
+        InputError: The value is not a list, or an entry has another type.
     """
-    listed = isinstance(value, Sequence | Iterator | KeysView | ValuesView) and not isinstance(
+    is_list = isinstance(value, Sequence | Iterator | KeysView | ValuesView) and not isinstance(
         value, str | bytes | bytearray
     )
-    if not listed and not (isinstance(value, np.ndarray) and value.ndim):
-        raise InputError("not a list", field=field, expected=expected, got=format_value(value))
+    if not is_list and not (isinstance(value, np.ndarray) and value.ndim):
+        _fail("not a list", field, expected, value)
     found = tuple(itertools.islice(value, MAX_ENTRIES + 1))
     if len(found) > MAX_ENTRIES:
-        raise InputError(
-            "too many entries", field=field, expected=f"at most {MAX_ENTRIES}", got="more"
-        )
-    for place, entry in enumerate(found):
+        expected = f"at most {MAX_ENTRIES}"
+        raise InputError("too many entries", field=field, expected=expected, got="more")
+    for index, entry in enumerate(found):
         if kind is not None and not isinstance(entry, kind):
-            raise InputError(
-                "wrong type of entry",
-                field=f"{field}[{place}]",
-                expected=expected,
-                got=format_value(entry),
-            )
+            _fail("wrong type of entry", f"{field}[{index}]", expected, entry)
     return found

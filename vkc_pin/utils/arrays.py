@@ -1,4 +1,4 @@
-"""Names for the arrays that functions take and return, and how large numbers may be; shapes and units are in docstrings."""
+"""Names the array types of signatures, and limits coordinates."""
 
 from __future__ import annotations
 
@@ -8,11 +8,8 @@ from numpy.typing import NDArray
 __all__ = ["MAX_COORDINATE", "Bools", "Floats", "Ints"]
 
 MAX_COORDINATE = 1e4
-"""Largest length [m] or angle [rad] that a file or an argument may name."""
+"""Largest length [m] or angle [rad] in files and arguments."""
 
 Floats = NDArray[np.float64]
-"""Numbers of double precision."""
 Ints = NDArray[np.int_]
-"""Indices and counts."""
 Bools = NDArray[np.bool_]
-"""Masks."""

@@ -1,4 +1,4 @@
-"""Budget of a planning call: Ctrl-C, wall-clock time and number of evaluations."""
+"""Ends planning early: at Ctrl-C, at a time, or after a reproducible number of evaluations."""
 
 from __future__ import annotations
 
@@ -27,15 +27,11 @@ __all__ = [
 
 StopStatus = Literal["interrupted", "evaluation limit", "time limit"]
 STOP_STATUSES: tuple[StopStatus, ...] = get_args(StopStatus)
-"""Why a budget may be at its end; what becomes the status of plans."""
+"""Reasons to stop, which become the status of plans."""
 
 
 class BudgetExhaustedError(Exception):
-    """A limit of the budget is reached. Planning catches it and returns its best result.
-
-    Attributes:
-        status: Limit that was reached.
-    """
+    """The budget is exhausted: a limit, its `status`, is reached. Planning returns its best result."""
 
     def __init__(self, status: StopStatus) -> None:
         super().__init__(status)
@@ -43,19 +39,19 @@ class BudgetExhaustedError(Exception):
 
 
 class Budget:
-    """Limits of one planning call, which start with its construction.
+    """Limits of one planning call, from its construction on.
 
-    One evaluation is a configuration whose frames or distances are computed. Every iteration of
-    Ipopt evaluates all waypoints.
+    An evaluation is a configuration whose frames or distances are computed. Each iteration of Ipopt
+    evaluates all waypoints.
 
     Args:
-        seconds: Wall-clock time; None: unlimited.
-        max_evaluations: Evaluations; None: unlimited.
+        seconds: Wall-clock time [s]. Default: unlimited.
+        max_evaluations: Number of evaluations. Default: unlimited.
 
     Attributes:
         is_interrupted: Whether Ctrl-C was pressed.
         evaluations: Evaluations so far.
-        reserved: Purpose → time that is kept for validating the best trajectory at the end [s].
+        reserved: Purpose → time reserved at the end [s].
     """
 
     def __init__(self, seconds: float | None = None, max_evaluations: int | None = None) -> None:
@@ -66,7 +62,7 @@ class Budget:
 
     @property
     def stop_status(self) -> StopStatus | Literal[""]:
-        """One of `STOP_STATUSES`, or "" while it lasts."""
+        """One of `STOP_STATUSES`, or "" before the end."""
         if self.is_interrupted:
             return "interrupted"
         if self.evaluations > self._max_evaluations:
@@ -76,10 +72,9 @@ class Budget:
 
     @contextlib.contextmanager
     def activate(self) -> Iterator[Budget]:
-        """Make this the budget of the thread, and note the first Ctrl-C instead of raising; the second one raises.
+        """Make this the budget of the thread, which notes the first Ctrl-C; the second one raises.
 
-        CasADi swallows KeyboardInterrupt inside a solve and reports some failure instead. Signals
-        reach the main thread only: elsewhere nothing changes.
+        CasADi swallows KeyboardInterrupt inside a solve and reports some other failure.
         """
         token = _ACTIVE.set(self)
 
@@ -94,23 +89,23 @@ class Budget:
             _ACTIVE.reset(token)
 
 
-_ACTIVE: ContextVar[Budget | None] = ContextVar("running", default=None)  # each thread has its own
+_ACTIVE: ContextVar[Budget | None] = ContextVar("active", default=None)  # one per thread
 
 
-def record_evaluations(units: int = 0) -> None:
-    """Count work in the budget that runs in this thread, if there is one.
+def record_evaluations(count: int = 0) -> None:
+    """Add evaluations to the budget of this thread, if there is one.
 
-    Whatever may take long calls this often: a hundredth of a second is a good measure.
+    Long computations call this about every 10 ms.
 
     Args:
-        units: Number of evaluations; 0 for work that depends on the state of caches.
+        count: Number of evaluations; 0 for work that depends on the state of a cache.
 
     Raises:
-        BudgetExhaustedError: A limit is reached.
+        BudgetExhaustedError: The budget is exhausted.
     """
     budget = _ACTIVE.get()
     if budget is not None:
-        budget.evaluations += units
+        budget.evaluations += count
         if budget.stop_status:
             raise BudgetExhaustedError(budget.stop_status)
 
@@ -122,18 +117,18 @@ def count_evaluations() -> int:
 
 
 def current_ending() -> StopStatus | Literal[""]:
-    """Return which of `STOP_STATUSES` has ended the budget of this thread, or "" while it lasts."""
+    """Return the `stop_status` of this thread's budget; "" without one."""
     budget = _ACTIVE.get()
     return "" if budget is None else budget.stop_status
 
 
 def reserve_time(purpose: str, seconds: float, *, default: bool = False) -> None:
-    """Keep time at the end of this thread's budget, as for validating the best trajectory.
+    """Reserve time at the end of this thread's budget, as for validation.
 
     Args:
-        purpose: What it is kept for; a later call with the same purpose replaces the time.
-        seconds: How much [s].
-        default: Keep an earlier time of the same purpose.
+        purpose: Purpose of the time; a later call with the same purpose replaces it.
+        seconds: Time [s].
+        default: Keep an earlier reservation for the same purpose.
     """
     budget = _ACTIVE.get()
     if budget is not None and not (default and budget.reserved.get(purpose)):
@@ -142,7 +137,7 @@ def reserve_time(purpose: str, seconds: float, *, default: bool = False) -> None
 
 @contextlib.contextmanager
 def suspend_budget() -> Iterator[None]:
-    """Let nothing count for a while: what must be done in any case."""
+    """Suspend the budget of this thread for work that must be done in any case."""
     token = _ACTIVE.set(None)
     try:
         yield

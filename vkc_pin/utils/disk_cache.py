@@ -1,4 +1,4 @@
-"""What is kept on disk from process to process: the folder for it, and records in it that are found by what they depend on."""
+"""Caches records on disk under a digest of their inputs, in a folder private to the user."""
 
 from __future__ import annotations
 
@@ -21,76 +21,72 @@ __all__ = [
     "write_private_file",
 ]
 
-CACHE_VARIABLE = "VKC_PIN_CACHE"  # names the folder around the cache; empty or "off": no cache
-
-TEMPORARY_PREFIX = ".new-"  # start of the names of incomplete files
-_FOLDER_NAME = "vkc_pin"  # of the cache's own folder, apart from other files
-_MAX_RECORD_SIZE = 2**24  # bytes of a record; those of the largest robots take some 10 kB
+CACHE_VARIABLE = "VKC_PIN_CACHE"
+"""Environment variable with the folder around the cache; empty or "off": no cache."""
+TEMPORARY_PREFIX = ".new-"
+"""Start of the names of incomplete files."""
+_FOLDER_NAME = "vkc_pin"
+_MAX_RECORD_SIZE = 2**24  # [bytes]; records of large robots have 10 kB
 
 
 def find_cache_folder() -> Path | None:
-    """Return this user's cache folder, creating it if necessary.
+    """Return this user's cache folder, which is created if necessary.
 
-    Returns:
-        The folder `vkc_pin` in the one that `VKC_PIN_CACHE` names, else in the user's cache folder.
-        None if the cache is off, or if other users could write to it.
+    It is the folder `vkc_pin` in `CACHE_VARIABLE`, or else in the user's cache folder. Returns None
+    if the cache is off, or if other users could write to it.
     """
     named = os.environ.get(CACHE_VARIABLE)
     if os.name != "posix" or (named is not None and named.strip().lower() in ("", "off")):
         return None
     try:
         if named is not None:
-            above = Path(named).expanduser().absolute()
-            above.mkdir(mode=0o700, parents=True, exist_ok=True)
-            if not _is_private_folder(above):
+            parent = Path(named).expanduser().absolute()
+            parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if not _is_private_folder(parent):
                 return None
         else:
             caches = Path(os.environ.get("XDG_CACHE_HOME", ""))
-            above = caches if caches.is_absolute() else Path.home() / ".cache"
-        path = above / _FOLDER_NAME
+            parent = caches if caches.is_absolute() else Path.home() / ".cache"
+        path = parent / _FOLDER_NAME
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
         return path if _is_private_folder(path) else None
-    except (OSError, RuntimeError):  # RuntimeError: nobody knows where the user's home is
+    except (OSError, RuntimeError):  # RuntimeError: the user has no known home
         return None
 
 
 def _is_private_folder(path: Path) -> bool:
-    """Return whether a path is a folder, not a link to one, that only this user can write to."""
-    status = path.lstat()
+    status = path.lstat()  # links are not followed
     return stat.S_ISDIR(status.st_mode) and is_private(status)
 
 
 def is_private(status: os.stat_result) -> bool:
-    """Whether a file is this user's, and nobody else may write it."""
+    """Return whether a file belongs to this user, and no other user may write to it."""
     return status.st_uid == os.geteuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
 
 def load_or_build(key: bytes, build: Callable[[], Any]) -> Any:
-    """Return plain data that is kept under a key, built if it is not there, or damaged, or if nothing can be kept.
+    """Return the record of a key; it is built if it is missing or damaged, or the cache is off.
 
     Args:
-        key: All that the data depends on, and first of all the name and the version of what builds
-            it.
-        build: Makes it: lists, dictionaries, text and numbers, which come back equal to the last
-            bit.
+        key: Everything that the data depend on, including name and version of the builder.
+        build: Returns the data: lists, dictionaries, text and numbers. They are restored exactly.
     """
-    here = find_cache_folder()
-    path = None if here is None else here / f"{hashlib.sha256(key).hexdigest()[:40]}.json"
+    folder = find_cache_folder()
+    path = None if folder is None else folder / f"{hashlib.sha256(key).hexdigest()[:40]}.json"
     if path is not None:
-        with contextlib.suppress(OSError, ValueError):  # ValueError: what is there is no record
+        with contextlib.suppress(OSError, ValueError):
             return _read_record(path)
     data = build()
     if path is not None:
         text = json.dumps(data)
+        digest = hashlib.sha256(text.encode()).hexdigest()
         with contextlib.suppress(OSError):
-            write_private_file(
-                path, f"{hashlib.sha256(text.encode()).hexdigest()}\n{text}".encode()
-            )
+            write_private_file(path, f"{digest}\n{text}".encode())
     return data
 
 
 def write_private_file(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all, for the owner's eyes only. Raises OSError if it cannot be written."""
+    """Write a file atomically, readable by its owner only. Raises OSError on failure."""
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY_PREFIX)
     try:
         with os.fdopen(handle, "wb") as stream:
@@ -103,18 +99,15 @@ def write_private_file(path: Path, data: bytes) -> None:
 
 
 def _read_record(path: Path) -> Any:
-    """Return what a record says. Raises OSError if it is not there or somebody else's, ValueError if it is damaged."""
+    """Return a record. Raises OSError if it is missing or foreign, ValueError if it is damaged."""
     with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as stream:
         status = os.fstat(stream.fileno())
-        if (
-            not stat.S_ISREG(status.st_mode)
-            or not is_private(status)
-            or status.st_size > _MAX_RECORD_SIZE
-        ):
+        is_own_file = stat.S_ISREG(status.st_mode) and is_private(status)
+        if not is_own_file or status.st_size > _MAX_RECORD_SIZE:
             raise PermissionError(f"others may have written {path}")
         digest, _, text = stream.read().partition(b"\n")
     if hashlib.sha256(text).hexdigest().encode() != digest:
         raise ValueError(f"{path} is damaged")
     with contextlib.suppress(OSError):
-        os.utime(path)  # when it was used last
+        os.utime(path)  # time of the last use
     return json.loads(text)

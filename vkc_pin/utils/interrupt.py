@@ -1,4 +1,4 @@
-"""Who has Ctrl-C for a while."""
+"""Handles Ctrl-C, which reaches the main thread only: elsewhere nothing changes."""
 
 from __future__ import annotations
 
@@ -16,13 +16,9 @@ __all__ = ["defer_interrupt", "handle_interrupt", "raise_on_interrupt"]
 def handle_interrupt(
     handler: Callable[[int, FrameType | None], object] | signal.Handlers,
 ) -> Iterator[Any]:
-    """Let `handler` have Ctrl-C, and yield what had it before; where it cannot be had, nothing changes.
-
-    Signals reach the main thread only.
-    """
-    before = signal.getsignal(
-        signal.SIGINT
-    )  # None: whoever embeds Python handles it, and could not be put back
+    """Call `handler` at Ctrl-C, and yield the previous handler."""
+    before = signal.getsignal(signal.SIGINT)
+    # None: a program that embeds Python handles the signal, and could not be restored
     if before is None or threading.current_thread() is not threading.main_thread():
         yield before
         return
@@ -35,14 +31,10 @@ def handle_interrupt(
 
 @contextlib.contextmanager
 def defer_interrupt() -> Iterator[None]:
-    """Let Ctrl-C wait for the end of something short that must not be left half done."""
+    """Defer Ctrl-C to the end of a short operation that must be complete."""
     pressed: list[int] = []
-
-    def note(number: int, frame: FrameType | None) -> None:
-        pressed.append(number)
-
     try:
-        with handle_interrupt(note):
+        with handle_interrupt(lambda number, frame: pressed.append(number)):
             yield
     finally:
         if pressed:
@@ -51,6 +43,6 @@ def defer_interrupt() -> Iterator[None]:
 
 @contextlib.contextmanager
 def raise_on_interrupt() -> Iterator[None]:
-    """Let Ctrl-C raise KeyboardInterrupt, as it does unless somebody chose otherwise."""
+    """Raise KeyboardInterrupt at Ctrl-C, as Python does by default."""
     with handle_interrupt(signal.default_int_handler):
         yield

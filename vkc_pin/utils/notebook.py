@@ -1,4 +1,4 @@
-"""Notebooks: whether this runs in one, and what one shows of a cell's value."""
+"""Renders values in Jupyter notebooks."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from importlib import import_module
 
 __all__ = ["in_notebook", "make_card", "register_card_module", "render_card"]
 
-_card_modules: list[str] = []  # modules that register cards, imported when the first one is shown
+_card_modules: list[str] = []
 
 
 @singledispatch
 def make_card(value: object) -> str:
-    """Return what a notebook shows of `value`, as HTML: its text, unless a module registers something else for its type."""
+    """Return the HTML card of a value; modules register functions for their types."""
     return f"<pre>{escape(repr(value))}</pre>"
 
 
 def register_card_module(module: str) -> None:
-    """Name a module that registers cards, which is imported when a notebook shows the first one."""
+    """Register a module with cards, which is imported when the first card is rendered."""
     _card_modules.append(module)
 
 
 def render_card(value: object) -> str:
-    """Return `value`'s card, as HTML."""
+    """Return the card of a value as HTML, with the cards of all registered modules."""
     for module in _card_modules:
         import_module(module)
     return make_card(value)
 
 
 def in_notebook() -> bool:
-    """Return whether this runs in a Jupyter kernel."""
+    """Return whether this process is a Jupyter kernel."""
     if "IPython" not in sys.modules:
         return False
     shell = sys.modules["IPython"].get_ipython()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from pathlib import Path
 
@@ -165,16 +166,13 @@ def test_unknown_names_raise() -> None:
 
 
 def test_invalid_files_raise(tmp_path: Path) -> None:
-    for inside, problem in (
-        (
-            '<collision><geometry><mesh filename="package://nowhere/m.stl"/></geometry></collision>',
-            r"package://nowhere/m\.stl",
-        ),
-        ('<visual><geometry><sphere radius="1"/></geometry></visual>', "no collision geometry"),
+    file = small_urdf(tmp_path)
+    text = file.read_text()
+    for new, problem in (
+        (text.replace("collision>", "visual>"), "no collision geometry"),
+        (re.sub("<box.*?/>", '<mesh filename="package://no/m.stl"/>', text), "package://no/m.stl"),
     ):
-        link = f'<link name="m">{inside}</link>'
-        file = tmp_path / "robot.urdf"
-        file.write_text(f'<robot name="r">{link}</robot>')
+        file.write_text(new)
         with pytest.raises(InputError, match=problem):
             load_robot(file)
 

@@ -1,1 +1,1 @@
-"""What runs many tasks on many processes, and what keeps a record of it."""
+"""Runs tasks in parallel and records their results."""

@@ -1,7 +1,6 @@
-"""Runs a function on many tasks, in this process, on others of this machine or on a cluster, and yields what comes of each.
+"""Runs a function on many tasks: in this process, in others of this machine, or on a cluster.
 
-Whoever calls keeps what comes: processes that work know no files. A task that is lost with its
-process is run again.
+Only the calling process writes files. The tasks of a lost process are run again.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import secrets
 import signal
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -27,52 +26,39 @@ from vkc_pin.utils.optional_imports import import_optional
 __all__ = ["MAX_CRASHES", "CrashedTask", "is_dask_installed", "require_dask", "run_tasks"]
 
 MAX_CRASHES = 4
-"""How many processes a task may take with it on a cluster before it is given up."""
+"""Number of processes that a task may crash on a cluster before it is given up."""
 _ADDRESS = re.compile(r"[a-z]+://[^/\s]+:\d{1,5}")
-_QUEUED_PER_WORKER = 2  # tasks that wait for each process, so that none waits for a task
-_CONNECT_TIMEOUT = 20.0  # [s] to reach a scheduler
-_CHECK_INTERVAL = (
-    5.0  # [s] without a result after which it is looked whether all processes are there
-)
-
-_MIN_MEMORY = 2_000_000_000  # [bytes] of memory that a process may take, however many there are
+_QUEUED_PER_WORKER = 2  # so that no worker waits for a task
+_CONNECT_TIMEOUT = 20.0  # [s]
+_CHECK_INTERVAL = 5.0  # [s] without a result, after which the workers are checked
+_MIN_MEMORY = 2_000_000_000  # [bytes] that each process may use, however many there are
 
 Function = Callable[[Any], Any]
+Results = Generator[tuple[str, Any]]
 
 
 @dataclass(frozen=True)
 class CrashedTask:
-    """What comes of a task that no process survived.
-
-    Attributes:
-        reason: In words.
-    """
+    """Result of a task that crashed all its processes, with the reason in words."""
 
     reason: str
 
 
 def require_dask(scheduler: str | None) -> None:
-    """Look for Dask, which runs tasks in other processes, and at the address of a scheduler.
-
-    Args:
-        scheduler: Address of the scheduler that is asked for, None for processes of this machine.
+    """Check that Dask is installed, and the address of its scheduler, if one is given.
 
     Raises:
-        InputError: It is not installed, or the address is none.
+        InputError: Dask is not installed, or the address is invalid.
     """
     field = "jobs" if scheduler is None else "scheduler"
     if scheduler is not None and not (isinstance(scheduler, str) and _ADDRESS.fullmatch(scheduler)):
-        raise InputError(
-            "not an address",
-            field=field,
-            expected="such as tcp://HOST:8786",
-            got=format_value(scheduler),
-        )
+        expected, got = "such as tcp://HOST:8786", format_value(scheduler)
+        raise InputError("not an address", field=field, expected=expected, got=got)
     import_optional("distributed", "cluster", purpose="running in other processes", field=field)
 
 
 def is_dask_installed() -> bool:
-    """Return whether Dask is installed, which runs tasks on clusters (the extra `cluster`)."""
+    """Return whether Dask is installed (the extra `cluster`)."""
     try:
         import distributed  # noqa: F401
     except ImportError:
@@ -89,32 +75,29 @@ def run_tasks(
     dask: bool = False,
     limit: float | None = None,
     tell: Callable[[str], object] | None = None,
-) -> Generator[tuple[str, Any]]:
-    """Yield the key of every task and what the function returns for it, in the order in which they end.
+) -> Results:
+    """Yield the key and the result of every task, in the order of completion.
 
-    Tasks are taken from their iterable when a process is about to be free, not before: what was
-    yielded can decide about them. With one job and no scheduler all run in this process. Otherwise
-    the function and the tasks must be such that other processes can read them. Processes leave
+    Tasks are taken from their iterable only when a process is nearly free, so that earlier results
+    can decide about them. Other processes need a function and tasks that can be pickled, and leave
     Ctrl-C to this one.
 
     Args:
-        function: What runs a task.
+        function: Function of a task.
         tasks: Key and task, each.
-        jobs: Number of processes on this machine, each with one thread of BLAS.
-        scheduler: Address of a Dask scheduler ("tcp://host:8786") whose workers run the tasks;
-            None: this machine.
-        dask: Whether processes on this machine are Dask's, which are started anew when they die,
-            and whose tasks are run again. Without it, a process that dies ends all.
-        limit: Time of a task by the clock [s], after which its process is ended, whatever it does.
-            In this process there is none.
-        tell: Takes lines for people, such as where Dask's dashboard is.
+        jobs: Number of processes on this machine, each with one BLAS thread; 1: this process.
+        scheduler: Address of a Dask scheduler ("tcp://host:8786") whose workers run the tasks.
+        dask: Use Dask for processes on this machine, which restarts them when they crash. Without
+            it, a crash ends the run.
+        limit: Wall-clock time of a task [s] after which its process is killed; not in this process.
+        tell: Receives messages for users, such as the address of Dask's dashboard.
 
     Yields:
-        Key, and what came of the task; `Died` on a cluster if that took `DEATHS` processes with it.
+        Key and result; a `CrashedTask` if the task crashed `MAX_CRASHES` processes of Dask.
 
     Raises:
-        InputError: Dask is not installed though it is needed, or no scheduler answers.
-        VkcError: A process died, without Dask.
+        InputError: Dask is needed and not installed, or no scheduler answers.
+        VkcError: A process crashed, without Dask.
     """
     if scheduler is not None or (dask and jobs > 1):
         yield from _run_on_cluster(function, tasks, jobs, scheduler, limit, tell)
@@ -127,11 +110,11 @@ def run_tasks(
 
 def _run_in_processes(
     function: Function, tasks: Iterable[tuple[str, Any]], jobs: int, limit: float | None
-) -> Generator[tuple[str, Any]]:
+) -> Results:
     from joblib import Parallel, delayed, parallel_config
     from joblib.externals.loky.process_executor import BrokenProcessPool
 
-    # Batches of one: a batch comes back as a whole, and a stop would lose all of it.
+    # a stop would lose whole batches, so they have one task each
     with parallel_config(backend="loky", n_jobs=jobs, inner_max_num_threads=1):
         parallel = Parallel(return_as="generator_unordered", batch_size=1, max_nbytes=None)
         found = parallel(
@@ -141,13 +124,13 @@ def _run_in_processes(
     try:
         yield from found
     except BrokenProcessPool as error:
-        problem = "a process died, perhaps for want of memory; the trials that were done are kept, and the same call goes on"
-        raise VkcError(f"{problem} ({str(error).splitlines()[0]})") from error
+        raise VkcError(
+            "a process died, perhaps for want of memory; the trials that were done are kept, and "
+            f"the same call goes on ({str(error).splitlines()[0]})"
+        ) from error
     finally:
-        with contextlib.suppress(
-            KeyboardInterrupt
-        ):  # this ends the other processes' tasks if some are still running
-            found.close()
+        with contextlib.suppress(KeyboardInterrupt):
+            found.close()  # ends running tasks
 
 
 def _run_on_cluster(
@@ -157,111 +140,109 @@ def _run_on_cluster(
     scheduler: str | None,
     limit: float | None,
     tell: Callable[[str], object] | None,
-) -> Generator[tuple[str, Any]]:
+) -> Results:
     require_dask(scheduler)
-    from distributed import Future, KilledWorker
-
-    left = iter(tasks)
     with _open_client(jobs, scheduler) as (client, cluster), client.as_current():
         if tell is not None:
             tell(f"Dask's dashboard: {client.dashboard_link}")
-        running: dict[str, tuple[str, Any, Future]] = {}
-        ended: queue.SimpleQueue[Future] = (
-            queue.SimpleQueue()
-        )  # waiting for all that run would cost more the more there are
-        suspects: list[
-            tuple[str, Any]
-        ] = []  # tried again with nothing beside them: another one may have killed the process
-        alone = False
-
-        def submit(key: str, task: Any) -> None:
-            # results of the same name would be shared among clients
-            name = f"vkc-{key}-{secrets.token_hex(4)}"
-            future = client.submit(
-                _run_with_time_limit, function, task, limit, key=name, pure=False
-            )
-            running[name] = key, task, future
-            future.add_done_callback(ended.put)
-
-        def feed() -> None:
-            nonlocal alone
-            if running and (alone or suspects):
-                return
-            alone = bool(suspects)
-            if alone:
-                submit(*suspects.pop())
-                return
-            room = _QUEUED_PER_WORKER * max(1, len(client.nthreads()) if scheduler else jobs) - len(
-                running
-            )
-            for key, task in itertools.islice(left, max(0, room)):
-                submit(key, task)
-
-        feed()
+        run = _ClusterRun(client, function, iter(tasks), limit)
+        run.submit_tasks(None if scheduler else jobs)
         try:
-            while running:
+            while run.running:
                 try:
-                    future = ended.get(timeout=_CHECK_INTERVAL)
+                    future = run.ended.get(timeout=_CHECK_INTERVAL)
                 except queue.Empty:
                     if cluster is not None:
-                        cluster.scale(
-                            jobs
-                            # a process that was killed while it started is not started anew otherwise
-                        )
+                        cluster.scale(jobs)  # restarts processes that were killed at their start
                     elif tell is not None and not client.nthreads():
                         tell(f"{scheduler} has no workers; waiting for some")
-                        tell = None  # once
+                        tell = None
                     continue
-                key, task, _ = running.pop(future.key)
-                try:
-                    result = future.result()
-                except KilledWorker:
-                    if alone:
-                        late = "" if limit is None else f", or longer than {limit:g} s"
-                        result = CrashedTask(
-                            f"{MAX_CRASHES} processes died with it: out of memory, a crash{late}"
-                        )
-                    else:
-                        suspects.append((key, task))
-                        feed()
-                        continue
-                future.release()
-                yield key, result
-                feed()
+                if (outcome := run.collect(future)) is not None:
+                    yield outcome
+                run.submit_tasks(None if scheduler else jobs)
         finally:
-            client.cancel([future for *_, future in running.values()], force=True)
+            client.cancel([future for *_, future in run.running.values()], force=True)
+
+
+class _ClusterRun:
+    """Tasks on a cluster. After a crash, tasks are repeated alone to find its cause."""
+
+    def __init__(
+        self, client: Any, function: Function, tasks: Iterator[tuple[str, Any]], limit: float | None
+    ) -> None:
+        self.client, self.function, self.tasks, self.limit = client, function, tasks, limit
+        self.running: dict[str, tuple[str, Any, Any]] = {}
+        self.ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self.suspects: list[tuple[str, Any]] = []
+        self.is_alone = False
+
+    def submit_tasks(self, workers: int | None) -> None:
+        if self.running and (self.is_alone or self.suspects):
+            return
+        self.is_alone = bool(self.suspects)
+        if self.is_alone:
+            self._submit(*self.suspects.pop())
+            return
+        workers = max(1, len(self.client.nthreads())) if workers is None else workers
+        room = _QUEUED_PER_WORKER * workers - len(self.running)
+        for key, task in itertools.islice(self.tasks, max(0, room)):
+            self._submit(key, task)
+
+    def _submit(self, key: str, task: Any) -> None:
+        name = f"vkc-{key}-{secrets.token_hex(4)}"  # clients share results of the same name
+        future = self.client.submit(
+            _run_with_time_limit, self.function, task, self.limit, key=name, pure=False
+        )
+        self.running[name] = key, task, future
+        future.add_done_callback(self.ended.put)
+
+    def collect(self, future: Any) -> tuple[str, Any] | None:
+        """Return key and result of a task; None if it is to be repeated alone."""
+        from distributed import KilledWorker
+
+        key, task, _ = self.running.pop(future.key)
+        try:
+            result = future.result()
+        except KilledWorker:
+            if not self.is_alone:
+                self.suspects.append((key, task))
+                return None
+            late = "" if self.limit is None else f", or longer than {self.limit:g} s"
+            reason = f"{MAX_CRASHES} processes died with it: out of memory, a crash{late}"
+            result = CrashedTask(reason)
+        future.release()
+        return key, result
 
 
 @contextlib.contextmanager
 def _open_client(jobs: int, scheduler: str | None) -> Generator[tuple[Any, Any]]:
-    """Lend a client of a scheduler, or of processes of this machine that end with it, and what these are the workers of."""
+    """Yield a client, and the local cluster that it started, if no scheduler is given."""
     import logging
 
     import dask
     from distributed import Client, LocalCluster
 
     settings = {
-        "distributed.scheduler.allowed-failures": MAX_CRASHES // 2 - 1,  # and as many alone
+        "distributed.scheduler.allowed-failures": MAX_CRASHES // 2 - 1,  # twice: once alone
         "distributed.logging.distributed": "error",
         "distributed.worker.multiprocessing-method": "spawn",
-        # it keeps every second of the last hour, 150 kB each of stacks like ours
+        # the profiler keeps stacks of the last hour, 150 kB per second
         "distributed.worker.profile.enabled": False,
-        # Tasks take seconds. At Dask's own intervals, of 20 to 500 ms, looking whether all is well
-        # took 4 % of a core.
+        # tasks take seconds; checks at Dask's own intervals, 20 to 500 ms, took 4 % of a core
         "distributed.admin.tick.interval": "1s",
         "distributed.admin.tick.cycle": "10s",
         "distributed.admin.system-monitor.interval": "5s",
         "distributed.worker.memory.monitor-interval": "1s",
-        # results leave the processes at once
         "distributed.scheduler.active-memory-manager.start": False,
-        # So there is nothing to move to the disk; and a process that is paused, for what it keeps
-        # of rooms and programs, never gets less, so that all would wait for it for ever.
-        **{f"distributed.worker.memory.{what}": False for what in ("target", "spill", "pause")},
+        # Results leave the processes at once, so there is nothing to spill. A paused process, with
+        # its caches full, would never resume.
+        **{f"distributed.worker.memory.{key}": False for key in ("target", "spill", "pause")},
         "distributed.comm.timeouts.connect": f"{_CONNECT_TIMEOUT:g}s",
     }
     with dask.config.set(settings), contextlib.ExitStack() as stack:
         if scheduler is None:
-            with handle_interrupt(signal.SIG_IGN):  # which processes inherit: Ctrl-C is this one's
+            with handle_interrupt(signal.SIG_IGN):  # inherited by the processes
                 cluster = stack.enter_context(
                     LocalCluster(
                         n_workers=jobs,
@@ -287,17 +268,15 @@ def _open_client(jobs: int, scheduler: str | None) -> Generator[tuple[Any, Any]]
 
 
 def _compute_memory_limit(jobs: int) -> int:
-    """Return how much memory each of some processes of this machine may take before it is ended and started anew [bytes]."""
+    """Return the memory of a process after which it is restarted [bytes]."""
     from distributed.system import MEMORY_LIMIT
 
     return max(int(MEMORY_LIMIT) // jobs, _MIN_MEMORY)
 
 
 def _run_with_time_limit(function: Function, task: Any, limit: float | None) -> Any:
-    """Run one task; end this process if it takes longer than a limit [s], be it in the middle of compiled code."""
-    signal.setitimer(
-        signal.ITIMER_REAL, limit or 0.0
-    )  # nobody handles its signal, which ends the process then
+    # nothing handles the signal, which kills the process even in compiled code
+    signal.setitimer(signal.ITIMER_REAL, limit or 0.0)
     try:
         return function(task)
     finally:
@@ -307,15 +286,14 @@ def _run_with_time_limit(function: Function, task: Any, limit: float | None) -> 
 def _run_in_child_process(
     function: Function, key: str, task: Any, limit: float | None, parent: int
 ) -> tuple[str, Any]:
-    """Run one task in a process of its own, which leaves Ctrl-C, that reaches all processes, to `parent` and ends with it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     _exit_with_parent(parent)
     return key, _run_with_time_limit(function, task, limit)
 
 
 @cache
 def _exit_with_parent(parent: int) -> None:
-    """Let this process end soon after `parent` was killed, instead of working on for nobody."""
+    """Exit soon after the parent process was killed."""
 
     def watch() -> None:
         while os.getppid() == parent:

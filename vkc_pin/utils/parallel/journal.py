@@ -1,4 +1,4 @@
-"""What was run, in a file that one process writes: nothing that is in it is run again, whatever stopped the run."""
+"""Records finished tasks in a file that one process writes, so that interrupted runs go on."""
 
 from __future__ import annotations
 
@@ -14,54 +14,46 @@ __all__ = ["Journal", "JournalContents", "Records"]
 
 
 class Records(Mapping[str, list[dict[str, Any]]]):
-    """Key → records of a finished task. Its line is read when it is asked for: a run may have millions.
-
-    Args:
-        path: The journal.
-    """
+    """Key → records of a finished task, read from the journal on access: there may be millions."""
 
     def __init__(self, path: Path) -> None:
         self._path = path.absolute()
-        self._places: dict[str, int] = {}
+        self._offsets: dict[str, int] = {}
 
-    def note(self, key: str, place: int) -> None:
-        """Take note of where in the file [bytes] the line of a task begins."""
-        self._places[key] = place
+    def add(self, key: str, offset: int) -> None:
+        """Add a task by the offset of its line in the file [bytes]."""
+        self._offsets[key] = offset
 
     def __getitem__(self, key: str) -> list[dict[str, Any]]:
-        place = self._places[key]
+        offset = self._offsets[key]
         with self._path.open("rb") as stream:
-            stream.seek(place)
+            stream.seek(offset)
             records: list[dict[str, Any]] = json.loads(stream.readline())["records"]
         return records
 
     def __delitem__(self, key: str) -> None:
-        del self._places[key]
+        del self._offsets[key]
 
     def __contains__(self, key: object) -> bool:
-        return key in self._places
+        return key in self._offsets
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._places)
+        return iter(self._offsets)
 
     def __len__(self) -> int:
-        return len(self._places)
+        return len(self._offsets)
 
 
 class JournalContents:
-    """What a journal says.
-
-    Args:
-        path: Of the journal.
+    """Contents of a journal.
 
     Attributes:
-        lines: The records of every finished task.
-        sessions: For each session its jobs, the number of tasks, the time until the last of them
-            [s] and, if tasks say it, the processor time until then of the process that writes [s].
-        memory: The largest memory of a process [MB].
-        memories: Process → the memory it used after each of its tasks [MB], in their order; of
-            tasks that say it.
-        processes: Key → the process that ran the task; of tasks that say it.
+        lines: Records of every finished task.
+        sessions: Jobs of each session, number of tasks, time until the last of them [s] and, if
+            recorded, processor time of the writing process until then [s].
+        memory: Largest memory of a process [MB].
+        memories: Process → memory after each of its tasks, if recorded [MB].
+        processes: Key → process of the task, if recorded.
     """
 
     def __init__(self, path: Path) -> None:
@@ -73,28 +65,29 @@ class JournalContents:
 
     @classmethod
     def read(cls, path: Path) -> JournalContents:
-        """Return what a file says, be it while another process writes it.
+        """Return the contents of a file, which another process may be writing.
 
         Raises:
-            InputError: It cannot be read, or has a line that is none.
+            InputError: The file cannot be read, or has an invalid line.
         """
-        kept = JournalContents(path)
+        contents = JournalContents(path)
         try:
             with path.open("rb") as stream:
-                kept._parse(path, stream)
+                contents._parse(path, stream)
         except OSError as error:
+            got = error.strerror
             raise InputError(
-                "cannot read this", file=path, expected="a journal", got=error.strerror
+                "cannot read this", file=path, expected="a journal", got=got
             ) from error
-        return kept
+        return contents
 
     @property
     def seconds(self) -> float:
-        """How long the sessions took in all, each until the last of its tasks [s]."""
+        """Total time of the sessions, each until its last task [s]."""
         return float(sum(session["seconds"] for session in self.sessions))
 
     def _parse(self, path: Path, lines: Iterable[bytes]) -> int:
-        """Take note of all that whole lines say; return where they end [bytes]."""
+        """Read all complete lines, and return the offset of their end [bytes]."""
         end = 0
         for number, text in enumerate(lines, start=1):
             if not text.endswith(b"\n"):
@@ -102,9 +95,9 @@ class JournalContents:
             try:
                 line = json.loads(text)
                 if number == 1:
-                    self._begin(line)
+                    self._check_header(line)
                 else:
-                    self._take(line, end)
+                    self._add(line, end)
             except (ValueError, LookupError, TypeError, AttributeError) as error:
                 if isinstance(error, InputError):
                     raise
@@ -115,17 +108,16 @@ class JournalContents:
             end += len(text)
         return end
 
-    def _begin(self, header: Mapping[str, Any]) -> None:
-        """Take note of the first line."""
+    def _check_header(self, header: Mapping[str, Any]) -> None:
+        """Accept any header."""
 
-    def _take(self, line: dict[str, Any], place: int) -> None:
-        """Take note of a line that begins at some place [bytes]."""
+    def _add(self, line: dict[str, Any], offset: int) -> None:
         if "session" in line:
             self.sessions.append({**line["session"], "trials": 0, "seconds": 0.0})
             return
         if not isinstance(line["records"], list):
             raise TypeError("a task's records are a list")
-        self.lines.note(line["key"], place)
+        self.lines.add(line["key"], offset)
         self.memory = max(self.memory, line["memory_mb"])
         self.sessions[-1]["trials"] += 1
         self.sessions[-1]["seconds"] = line["seconds"]
@@ -137,48 +129,47 @@ class JournalContents:
 
 
 class Journal(JournalContents):
-    """The finished tasks in a file: a header, then a line for each task and for each session of running them.
+    """File of finished tasks: a header, then a line for each task and for each session.
 
-    Every line is whole, or the last one and taken off when the file is opened again.
+    Only the last line may be incomplete; it is removed when the file is opened again.
 
     Args:
         path: The file, for messages.
         stream: The file, open for reading and appending ("a+b").
-        header: Everything that what is kept depends on: plain data, fields by name, in groups.
-        what: What is kept there, in messages.
+        header: Plain data that the results depend on: fields by name, in groups.
+        kind: Plural name of the tasks, for messages.
 
     Raises:
-        InputError: Another process has the file, it is not a journal, or its header is another one.
+        InputError: Another process writes the file, it is not a journal, or its header differs.
     """
 
     def __init__(
-        self, path: Path, stream: IO[bytes], header: Mapping[str, Any], what: str = "trials"
+        self, path: Path, stream: IO[bytes], header: Mapping[str, Any], kind: str = "trials"
     ) -> None:
         super().__init__(path)
-        try:  # for this process alone
+        try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise InputError(
-                "another run is writing to this folder; wait for it, or use another", file=path
-            ) from None
-        self._path, self._stream, self._what = path, stream, what
+            problem = "another run is writing to this folder; wait for it, or use another"
+            raise InputError(problem, file=path) from None
+        self._path, self._stream, self._kind = path, stream, kind
         self._header = json.loads(json.dumps(header))
         stream.seek(0)
         self._end = self._parse(path, stream)
         if not self._end:
-            self._check_begun()
-        stream.truncate(self._end)  # removes the last line if it is incomplete
+            self._check_partial_header()
+        stream.truncate(self._end)
         if not self._end:
             self._write(self._header)
 
     def append(self, line: dict[str, Any]) -> None:
-        """Write one line down, and take note of it."""
-        place = self._end
+        """Write a line, and add it to the contents."""
+        offset = self._end
         self._write(line)
-        self._take(line, place)
+        self._add(line, offset)
 
-    def _check_begun(self) -> None:
-        """Raise InputError if a file without a whole line is not the beginning of the header."""
+    def _check_partial_header(self) -> None:
+        """Check that a file without a complete line is a part of the header."""
         header = _encode_line(self._header)
         self._stream.seek(0)
         if not header.startswith(begun := self._stream.read(len(header))):
@@ -192,35 +183,35 @@ class Journal(JournalContents):
         self._stream.flush()
         self._end += len(text)
 
-    def _begin(self, header: Mapping[str, Any]) -> None:
-        """Raise an error that names what differs between two headers, if anything does."""
+    def _check_header(self, header: Mapping[str, Any]) -> None:
+        """Raise an error that names the differences to this journal's header."""
         old, new = _flatten(header), _flatten(self._header)
         differing = [name for name in {**old, **new} if old.get(name) != new.get(name)]
         if differing:
             named = [name for name in differing if name != "specification"] or differing
-            problem = f"the {self._what} in this folder were run otherwise; use another folder than {self._path.parent}"
             was, now = (
                 ", ".join(f"{name.rpartition('.')[2]} {side.get(name)}" for name in named)
                 for side in (old, new)
             )
-            raise InputError(
-                problem, file=self._path, field=", ".join(named), expected=was, got=now
+            problem = (
+                f"the {self._kind} in this folder were run otherwise; "
+                f"use another folder than {self._path.parent}"
             )
+            field = ", ".join(named)
+            raise InputError(problem, file=self._path, field=field, expected=was, got=now)
 
 
 def _encode_line(data: Mapping[str, Any]) -> bytes:
-    """Return plain data as a line of a journal."""
     return json.dumps(data, allow_nan=False).encode() + b"\n"
 
 
 def _flatten(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of a header by name: settings by their own, others as "versions.pin"."""
+    """Return the entries of a header: settings by their own name, others as "versions.pin"."""
     flat: dict[str, Any] = {}
     for name, value in data.items():
         prefix = "" if name == "settings" else f"{name}."
-        flat |= (
-            {f"{prefix}{key}": item for key, item in value.items()}
-            if isinstance(value, Mapping)
-            else {name: value}
-        )
+        if isinstance(value, Mapping):
+            flat |= {f"{prefix}{key}": item for key, item in value.items()}
+        else:
+            flat[name] = value
     return flat

@@ -1,4 +1,4 @@
-"""What results depend on beside the question: versions and the machine; and the memory that a process takes."""
+"""Describes versions, machine and memory use of this process."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ __all__ = [
 ]
 
 PACKAGES = ("vkc-pin", "pin", "coal", "casadi", "numpy")
-"""The package and what motions depend on."""
+"""The package and the dependencies that affect motions."""
 
 
 def find_versions() -> dict[str, str]:
-    """Return the versions of the package and of what motions depend on."""
+    """Return the versions of `PACKAGES`."""
     found = {}
     for package in PACKAGES:
         try:
@@ -35,7 +35,7 @@ def find_versions() -> dict[str, str]:
 
 
 def describe_machine() -> dict[str, Any]:
-    """Return what machine this is."""
+    """Return system, processor and Python version."""
     return {
         "system": platform.system(),
         "machine": platform.machine(),
@@ -46,7 +46,6 @@ def describe_machine() -> dict[str, Any]:
 
 
 def _find_processor_name() -> str:
-    """Return the processor's name where the system tells it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -58,12 +57,12 @@ def _find_processor_name() -> str:
 
 
 def measure_peak_memory() -> float:
-    """Return the largest memory this process has used so far [MB]."""
+    """Return the largest memory use of this process so far [MB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
 def measure_resident_memory() -> float:
-    """Return the memory this process uses now [MB], or the most so far where the system does not tell."""
+    """Return the current memory use of this process [MB], or the largest one outside Linux."""
     try:
         pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
     except OSError:
@@ -72,5 +71,5 @@ def measure_resident_memory() -> float:
 
 
 def identify_process() -> str:
-    """Return what tells this process from others, also of other machines."""
+    """Return a name of this process that is unique among machines."""
     return f"{socket.gethostname()}-{os.getpid()}"

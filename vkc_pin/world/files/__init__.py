@@ -1,1 +1,1 @@
-"""Descriptions and meshes: reads them, and writes files whole; knows no robot."""
+"""Reads descriptions and meshes, and writes files atomically, without knowledge of robots."""

@@ -1,4 +1,4 @@
-"""Description files: YAML read safely and checked against a schema, with errors that name file, line and field."""
+"""Reads YAML, JSON and text files, checks them, and reports errors with file, line and field."""
 
 from __future__ import annotations
 
@@ -59,19 +59,19 @@ _SIGNS = {
 
 
 def format_field(path: tuple[Key, ...]) -> str:
-    """Return a field's path as users write it: ("obstacles", 3, "size") is `obstacles[3].size`."""
+    """Return the path of a field as users write it: `obstacles[3].size`."""
     text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path)
     return text.removeprefix(".")
 
 
 @dataclass(frozen=True)
 class Document:
-    """Plain data with the place where each of its fields stands.
+    """Plain data with the line of each field.
 
     Attributes:
-        data: What was read: dictionaries, lists, text, numbers.
-        file: The file it came from, or None for data that was handed over.
-        lines: Field path → line, counted from 1; empty for data that was handed over.
+        data: Dictionaries, lists, text and numbers.
+        file: File of the data, or None for arguments.
+        lines: Path of a field → line, counted from 1; empty for arguments.
     """
 
     data: Any
@@ -79,7 +79,7 @@ class Document:
     lines: dict[tuple[Key, ...], int] = field(default_factory=dict)
 
     def find_line(self, path: tuple[Key, ...]) -> int | None:
-        """Return the line of the field at `path`, or of the closest field around it."""
+        """Return the line of the field at `path`, or of its closest parent."""
         while path and path not in self.lines:
             path = path[:-1]
         return self.lines.get(path)
@@ -87,7 +87,7 @@ class Document:
     def make_error(
         self, path: tuple[Key, ...], problem: str, *, expected: object = None, got: object = None
     ) -> InputError:
-        """Return (not raise) the error that says that the field at `path` is wrong."""
+        """Return the error for the field at `path`."""
         return InputError(
             problem,
             file=self.file,
@@ -100,7 +100,7 @@ class Document:
     def make_unknown_name_error(
         self, path: tuple[Key, ...], kind: str, name: object, choices: Iterator[str] | Any
     ) -> UnknownNameError:
-        """Return (not raise) the error that says that the field at `path` names something that does not exist."""
+        """Return the error for an unknown name in the field at `path`."""
         return UnknownNameError(
             kind,
             str(name),
@@ -112,7 +112,7 @@ class Document:
 
     @contextmanager
     def annotate_errors(self, path: tuple[Key, ...]) -> Iterator[None]:
-        """Give errors raised inside the place `path`, unless they name a file of their own."""
+        """Add file, line and field to errors raised inside, unless they name a file."""
         try:
             yield
         except InputError as error:
@@ -129,11 +129,11 @@ class Document:
 
 
 def read_bytes(file: str | Path, kind: str, largest: int | None = None) -> bytes:
-    """Return what a file of a `kind` ("YAML", "URDF", "plan") holds.
+    """Return the contents of a file of a `kind` ("YAML", "URDF", "plan").
 
     Raises:
-        InputError: It does not exist, is no file (but a folder, a pipe, a device), has more than
-            `largest` bytes (None: `LARGEST_FILE`), or cannot be read.
+        InputError: The path is not a readable file, or the file has more than `largest` bytes
+            (default: `MAX_FILE_SIZE`).
     """
     path, expected = Path(file), f"an existing {kind} file"
     largest = MAX_FILE_SIZE if largest is None else largest
@@ -162,10 +162,10 @@ def read_bytes(file: str | Path, kind: str, largest: int | None = None) -> bytes
 
 
 def read_text(file: str | Path, kind: str, largest: int | None = None) -> str:
-    """Return what a text file holds, as `read_bytes` does.
+    """Return the contents of a text file; see `read_bytes`.
 
     Raises:
-        InputError: It cannot be read, or is not encoded in UTF-8.
+        InputError: The file cannot be read, or is not encoded in UTF-8.
     """
     try:
         return read_bytes(file, kind, largest).decode("utf-8-sig")
@@ -177,11 +177,10 @@ def read_text(file: str | Path, kind: str, largest: int | None = None) -> str:
 
 
 def parse_json(text: str, file: str | Path) -> Any:
-    """Return what JSON says.
+    """Return the data of a JSON text.
 
     Raises:
-        InputError: It is no JSON, holds more lists and objects than `MOST_FIELDS`, or more inside
-            each other than `DEEPEST`.
+        InputError: The text is not JSON, or exceeds `MAX_FIELDS` or `MAX_DEPTH`.
     """
     many = text.count("[") + text.count(
         "{"
@@ -215,9 +214,8 @@ def read_yaml(file: str | Path) -> Document:
     """Read a YAML file, with the line of every field.
 
     Raises:
-        InputError: The file does not exist, is no valid YAML, holds a key twice, or has more
-            fields, or more inside each other, than a scene can mean: see `MOST_FIELDS` and
-            `DEEPEST`.
+        InputError: The file cannot be read, is not YAML, has a key twice, or exceeds `MAX_FIELDS`
+            or `MAX_DEPTH`.
     """
     path = Path(file)
     text = read_text(path, "YAML")
@@ -247,11 +245,11 @@ def read_yaml(file: str | Path) -> Document:
 
 
 def parse_document(document: Document, schema: type[T]) -> T:
-    """Return `document` as `schema`.
+    """Return `document` as an instance of `schema`.
 
     Raises:
-        InputError: It does not fit; the error is about the first wrong field in the file.
-        UnknownNameError: The same, where a name resembles one that would fit.
+        InputError: A field is invalid; the error is about the first one in the file.
+        UnknownNameError: A name is unknown.
     """
     _check_plain(document)
     try:
@@ -264,7 +262,7 @@ def parse_document(document: Document, schema: type[T]) -> T:
 
 
 def _check_plain(document: Document) -> None:
-    """Raise InputError if something may have no end, or a text, or a field's name, holds half of a surrogate pair."""
+    """Reject endless iterators, recursive data, and text that UTF-8 cannot encode."""
     left: list[tuple[tuple[Key, ...], Any]] = [((), document.data)]
     while left:
         path, value = left.pop()
@@ -299,7 +297,7 @@ def _check_plain(document: Document) -> None:
 
 
 def _check_depth(events: Iterable[yaml.Event], file: Path) -> None:
-    """Raise InputError if lists and fields are too deep inside each other: what builds them goes down as deep."""
+    """Reject deeply nested YAML before it is built, which is recursive."""
     depth = 0
     for event in events:
         if isinstance(event, yaml.CollectionStartEvent):
@@ -323,7 +321,7 @@ def _record_lines(
     file: Path,
     above: set[int],
 ) -> None:
-    """Write the lines of `node` and of everything below it into `lines`; `above` holds the nodes it stands in."""
+    """Add the lines of `node` and its descendants to `lines`; `above` has the ids of its parents."""
     lines.setdefault(path, node.start_mark.line + 1)
     if len(lines) > MAX_FIELDS:  # a few lines of aliases of aliases make any number
         raise InputError(
@@ -362,7 +360,7 @@ def _record_lines(
 
 
 def _find_error_path(data: Any, error: Any) -> tuple[Key, ...]:
-    """Return the path of an error in the data: pydantic's, without the tags of unions, which are no fields."""
+    """Return the path of pydantic's error in the data, without the tags of unions."""
     path: list[Key] = []
     location = error["loc"]
     for position, key in enumerate(location):
@@ -380,7 +378,6 @@ def _find_error_path(data: Any, error: Any) -> tuple[Key, ...]:
 
 
 def _translate_error(document: Document, path: tuple[Key, ...], error: Any) -> InputError:
-    """Return the exception that says what pydantic's `error` at `path` means."""
     kind, context, got = error["type"], error.get("ctx", {}), error["input"]
     if kind == "unknown_field":
         return document.make_unknown_name_error(path, "field", context["name"], context["choices"])

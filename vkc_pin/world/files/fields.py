@@ -1,4 +1,4 @@
-"""Types of the values that description files of robots, objects and scenes have in common."""
+"""Defines the types of fields that several description files share."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = [
 
 
 def make_validation_error(problem: str, expected: str) -> PydanticCustomError:
-    """Return (not raise) the error of a validator: what is wrong and what would be right."""
+    """Return the error of a validator."""
     return PydanticCustomError("vkc", "{problem}", {"problem": problem, "expected": expected})
 
 
@@ -42,7 +42,7 @@ def _reject_bool(value: Any) -> Any:
 
 
 def require(holds: Callable[[Any], object], problem: str, expected: str) -> AfterValidator:
-    """Return the validator that refuses a value of which something does not hold."""
+    """Return a validator that rejects values for which `holds` is false."""
 
     def required(value: Any) -> Any:
         if not holds(value):
@@ -53,12 +53,12 @@ def require(holds: Callable[[Any], object], problem: str, expected: str) -> Afte
 
 
 def wrap_text(field: str) -> BeforeValidator:
-    """Return the validator that takes text for a schema with this field alone."""
+    """Return a validator that accepts text in place of a schema with this field alone."""
     return BeforeValidator(lambda value: {field: value} if isinstance(value, str) else value)
 
 
 def require_length(number: int) -> BeforeValidator:
-    """Return the validator that wants a list of `number` values: pydantic alone would not say how many it expected."""
+    """Return a validator for lists of `number` values, since pydantic's error lacks the number."""
 
     def counted(value: Any) -> Any:
         if not isinstance(value, list | tuple):
@@ -105,7 +105,7 @@ Quaternion = Annotated[
 
 
 class Schema(BaseModel):
-    """Base of all schemas: immutable, and an unknown field is an error that knows the valid ones."""
+    """Base of all schemas: immutable, with errors for unknown fields that name the valid ones."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -121,7 +121,7 @@ class Schema(BaseModel):
 
 
 class JointSchema(Schema):
-    """What a URDF cannot say about a joint: [m/s] and [m/s²], or [rad/s] and [rad/s²]."""
+    """Limits of a joint that URDFs lack: [m/s] and [m/s²], or [rad/s] and [rad/s²]."""
 
     velocity: Positive | None = None
     acceleration: Positive | None = None

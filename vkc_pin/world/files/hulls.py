@@ -29,12 +29,10 @@ _QHULL_OPTIONS = ("QbB Pp Qt", "Pp Qt", "Pp QJ")
 
 
 def thicken(points: ArrayLike) -> tuple[Floats, bool]:
-    """Return points that span a volume, and whether they did not before: then `FLAT` is added across what they lie in.
+    """Return points that span a volume, and whether the given ones, shape (n, 3) [m], do not.
 
-    A sheet becomes a plate with the sheet in its middle, a line a square bar, a point a cube.
-
-    Args:
-        points: Shape (n, 3), [m].
+    A plane set becomes a plate around it, a line a square bar, a point a cube, all with thickness
+    `SHEET_THICKNESS`.
     """
     given = np.asarray(points, float)
     around = given - given.mean(axis=0)
@@ -50,15 +48,11 @@ def thicken(points: ArrayLike) -> tuple[Floats, bool]:
 
 
 def compute_hull(points: ArrayLike) -> trimesh.Trimesh:
-    """Return the convex hull of points as a mesh whose faces point outward.
+    """Return the convex hull of points, shape (n, 3) [m], as a mesh whose faces point outward.
 
-    It equals `trimesh.convex.convex_hull` bit for bit, except for some thin bodies whose hull,
-    scaled by Qhull to the unit cube, has triangles that overlap. trimesh then needs networkx and
-    returns a hull with a triangle that faces inward. Here Qhull runs again without scaling. The
-    result was closed and convex for all 120 such bodies that were tested.
-
-    Args:
-        points: Shape (n, 3), [m].
+    It equals `trimesh.convex.convex_hull` bit for bit, except for some thin bodies, for which Qhull
+    returns overlapping triangles after scaling to the unit cube; trimesh then needs networkx and
+    returns an inverted triangle. Here Qhull runs again without scaling.
 
     Raises:
         InputError: The points span no volume.
@@ -93,17 +87,14 @@ def _orient_faces(hull: ConvexHull) -> trimesh.Trimesh:
 
 
 def compute_outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trimesh:
-    """Return a convex polytope of few vertices that contains `points`; what is flat is thickened first.
+    """Return a convex polytope with few vertices that contains all points, up to 1e-9 m.
 
-    It starts as the box along the principal axes of the hull and is cut, again and again, by the
-    plane that touches the hull and lies deepest below one of the polytope's corners.
+    The box along the principal axes of the hull is cut repeatedly by the tangent plane of the hull
+    that lies deepest below one of the polytope's corners. Flat sets are thickened first.
 
     Args:
-        points: Shape (n, 3), [m].
-        vertices: The largest number of its vertices.
-
-    Returns:
-        The polytope; every point lies in it (up to rounding, 1e-9 m).
+        points: Shape (n, 3) [m].
+        vertices: Maximum number of vertices.
     """
     hull = compute_hull(thicken(points)[0])
     corners = np.asarray(hull.vertices)
@@ -137,7 +128,7 @@ def compute_outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trim
 
 
 def _sample_directions(hull: trimesh.Trimesh) -> Floats:
-    """Return the normals worth trying: those of the hull's faces, and some spread evenly over the sphere."""
+    """Return normals of candidate cuts: those of the hull, and some spread over the sphere."""
     k = np.arange(_NUM_DIRECTIONS) + 0.5
     z, turn = 1.0 - 2.0 * k / _NUM_DIRECTIONS, np.pi * (1.0 + 5.0**0.5) * k
     spread = np.stack(
@@ -150,7 +141,7 @@ def _sample_directions(hull: trimesh.Trimesh) -> Floats:
 def _intersect_half_spaces(
     normals: NDArray[Any], offsets: NDArray[Any], inner: NDArray[Any]
 ) -> ConvexHull:
-    """Return the polytope {x: normals·x ≤ offsets}; `inner` are points in it."""
+    """Return the polytope {x: normals·x ≤ offsets}, which contains the points `inner`."""
     from scipy.spatial import ConvexHull, HalfspaceIntersection
 
     centre = inner.mean(axis=0)

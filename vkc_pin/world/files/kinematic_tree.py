@@ -1,9 +1,8 @@
-"""Checks of the links and joints of a URDF: they make one tree, of numbers that mean something.
+"""Checks that the links and joints of a URDF form one tree with valid numbers.
 
-Parsers take that for granted: a circle of links never ends, a link with two parents gets one of
-them without a word, and an origin that is no number becomes none. They also refuse whole files, and
-do not say where, for want of a number that nobody needs, or for what programs of all kinds write
-into a URDF for themselves. So they get what was checked here, and nothing else.
+Parsers assume that: they hang in circles, ignore second parents, and drop invalid origins. They
+also reject files for extensions or missing numbers that planning does not need. They are given a
+simplified URDF of checked links and joints.
 """
 
 from __future__ import annotations
@@ -40,12 +39,10 @@ _XACRO_DEFINITIONS = (
 
 
 def check_tree(file: Path, root: ElementTree.Element) -> None:
-    """Check that links and joints make one tree.
+    """Check that links and joints form one tree, with valid names, types and numbers.
 
     Raises:
-        InputError: A name is missing or given twice, a link has two parents or goes in a circle,
-            there are several roots or none, a joint's type, origin, axis, limit or mimic is wrong,
-            or macros of xacro are still to be put in.
+        InputError: A name, joint or root is invalid, or xacro has not been run.
         UnknownNameError: A joint names a link that does not exist.
     """
     for element in root.iter():
@@ -81,18 +78,12 @@ def check_tree(file: Path, root: ElementTree.Element) -> None:
 
 
 def simplify_tree(file: Path, root: ElementTree.Element) -> tuple[str, frozenset[str]]:
-    """Return links and joints of a URDF that was checked, as one that parsers understand, without shapes and extensions.
+    """Return a URDF of a checked tree without shapes, extensions and mimic elements.
 
-    What a limit does not say is 0; joints that say nothing about velocity are named. Mimicking is
-    left to the caller. An <inertial> that is not whole counts as none, with a warning: kinematics
-    need none.
-
-    Args:
-        file: The URDF.
-        root: What it says.
+    Missing limits are 0. Warns about an incomplete <inertial>, which is dropped.
 
     Returns:
-        The text, and the joints without velocity.
+        The URDF, and the joints without a velocity limit.
     """
     plain = ElementTree.Element("robot", name=root.get("name") or replace_forbidden(file.stem))
     silent = set[str]()
@@ -119,7 +110,8 @@ def simplify_tree(file: Path, root: ElementTree.Element) -> tuple[str, frozenset
             silent.update([name] if limit.get("velocity") is None else [])
             if kind in _LIMITED_TYPES and limit.get("lower") is None and limit.get("upper") is None:
                 warnings.warn(
-                    f"{file}:{find_line(limit)}: {name}: a limit without lower and upper: it cannot move",
+                    f"{file}:{find_line(limit)}: {name}: "
+                    "a limit without lower and upper: it cannot move",
                     stacklevel=2,
                 )
             said = {
@@ -142,7 +134,6 @@ def _add_origin(
 
 
 def _add_inertial(file: Path, link: ElementTree.Element, inertial: ElementTree.Element) -> None:
-    """Add mass and inertia to a link, or warn."""
     try:
         mass, moments, (position, angles) = parse_inertial(file, inertial, link.get("name", ""))
     except InputError as error:
@@ -163,10 +154,10 @@ def _add_inertial(file: Path, link: ElementTree.Element, inertial: ElementTree.E
 def parse_origin(
     file: Path, element: ElementTree.Element, where: str
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return what the <origin> of an element says, position [m] and roll, pitch and yaw [rad]; zeros if it has none.
+    """Return position [m] and roll, pitch, yaw [rad] of an element's <origin>; zeros without one.
 
     Raises:
-        InputError: A number is wrong, as in `parse_numbers`.
+        InputError: A number is invalid.
     """
     if (origin := element.find("origin")) is None:
         return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
@@ -179,10 +170,10 @@ def parse_origin(
 def parse_inertial(
     file: Path, inertial: ElementTree.Element, where: str
 ) -> tuple[float, tuple[float, ...], tuple[tuple[float, ...], tuple[float, ...]]]:
-    """Return what an <inertial> says: mass [kg], moments about its centre [kg·m²] as `MOMENTS` names them, and `origin_of` it.
+    """Return mass [kg], moments [kg·m²] in the order of `MOMENTS`, and origin of an <inertial>.
 
     Raises:
-        InputError: It has no mass or no moments, or a number is wrong, as in `parse_numbers`.
+        InputError: Mass or moments are missing, or a number is invalid.
     """
     mass, inertia = inertial.find("mass"), inertial.find("inertia")
     if mass is None or inertia is None:
@@ -209,19 +200,19 @@ def parse_numbers(
     where: str,
     largest: float = MAX_COORDINATE,
 ) -> tuple[float, ...]:
-    """Return numbers in an attribute of an element.
+    """Return `count` numbers of an attribute.
 
     Args:
         file: The URDF.
         element: The element.
         key: The attribute.
-        count: How many there have to be.
-        default: What holds where there is none; None: there has to be one.
-        where: What the element belongs to, for messages.
-        largest: None may be larger, or less than the negative of it.
+        count: Required number of values.
+        default: Text for a missing attribute; None: the attribute is required.
+        where: Link or joint of the element, for messages.
+        largest: Largest valid magnitude.
 
     Raises:
-        InputError: There are more or less of them, or one is no number, infinite or too large.
+        InputError: The attribute has another number of values, or an invalid one.
     """
     text = element.get(key, default)
     try:
@@ -251,7 +242,7 @@ def parse_numbers(
 def _index_by_name(
     file: Path, root: ElementTree.Element, tag: str
 ) -> dict[str, ElementTree.Element]:
-    """Return the elements of a kind by their names."""
+    """Return the elements with a tag by name."""
     found: dict[str, ElementTree.Element] = {}
     for element in root.findall(tag):
         name = element.get("name", "")
@@ -352,7 +343,7 @@ def _check_joint(
 def _check_roots(
     file: Path, links: Mapping[str, ElementTree.Element], above: Mapping[str, tuple[str, str]]
 ) -> None:
-    """Check that all links hang on one."""
+    """Check that all links descend from one root."""
     roots = [link for link in links if link not in above]
     if len(roots) > 1:
         got, line = ", ".join(roots[:5]), find_line(links[roots[1]])
@@ -384,7 +375,7 @@ def _check_roots(
 def _walk_to_root(
     link: str, above: Mapping[str, tuple[str, str]], reaches: set[str]
 ) -> Iterator[str]:
-    """Yield a link and those it hangs on, up to one that `reaches` the root, or to one for the second time."""
+    """Yield a link and its ancestors, up to a link in `reaches` or the first repeated one."""
     passed: set[str] = set()
     while link not in reaches:
         yield link

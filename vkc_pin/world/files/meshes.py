@@ -1,8 +1,7 @@
-"""Reads mesh files and turns them into coal shapes, and checks that coal holds what the file holds.
+"""Reads mesh files and converts them to coal shapes, whose volume and area are checked.
 
-Meshes are read with trimesh: coal 3.0.3's own reader restarts the triangle indices at every object
-of an OBJ file, and what it makes of such a file collides where nothing is. Only COLLADA files
-(`.dae`), for which trimesh would need another package, are read by coal.
+Meshes are read with trimesh: coal 3.0.3 restarts the triangle indices at every object of an OBJ
+file. Only COLLADA files (`.dae`), for which trimesh would need another package, are read by coal.
 """
 
 from __future__ import annotations
@@ -45,12 +44,12 @@ _HULL_TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be fro
 
 @dataclass(frozen=True, eq=False)
 class MeshPart:
-    """The part of a mesh that has one colour.
+    """Triangles of one colour.
 
     Attributes:
-        vertices: Shape (n, 3), [m].
+        vertices: Shape (n, 3) [m].
         faces: Shape (m, 3), indices of vertices.
-        colour: Red, green, blue, opacity in [0, 1], or None if the file names none.
+        colour: Red, green, blue, opacity in [0, 1], or None if the file has none.
     """
 
     vertices: Floats
@@ -59,17 +58,14 @@ class MeshPart:
 
 
 def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.Trimesh:
-    """Read a mesh file as one mesh.
+    """Return a mesh file as one mesh of all its objects, in the file's frame [m].
 
     Args:
         path: OBJ, STL, PLY, OFF, glTF or COLLADA file.
-        scale: One factor per axis, or one for all, from the file's unit to [m].
-
-    Returns:
-        The mesh of all the file's objects together, in the file's frame, [m].
+        scale: Factor from the file's unit to [m], or one for each axis.
 
     Raises:
-        InputError: The file does not exist, cannot be read, or holds no triangle.
+        InputError: The file cannot be read, or has no triangles.
     """
     import trimesh
 
@@ -119,15 +115,15 @@ def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.T
 def load_convex(
     path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, about: str | None = None
 ) -> coal.Convex:
-    """Return the convex hull of a mesh file as a coal shape, in the file's frame, [m].
+    """Return the convex hull of a mesh file as a coal shape, in the file's frame [m].
 
     Args:
-        path: The mesh file, see `load_mesh`.
-        scale: One factor per axis, or one for all, from the file's unit to [m].
-        about: The link or obstacle that it is a part of, for warnings and errors.
+        path: Mesh file; see `load_mesh`.
+        scale: Factor from the file's unit to [m], or one for each axis.
+        about: Link or obstacle of the mesh, for warnings and errors.
 
     Raises:
-        InputError: The mesh cannot be read or is empty, or coal does not hold what the file holds.
+        InputError: The mesh cannot be read, or coal's hull is wrong.
     """
     file = check_path(path, "path", "a mesh file")
     if file.is_file():
@@ -147,7 +143,7 @@ def load_convex(
 def _load_hull(
     file: Path, version: tuple[int, int], scale: tuple[float, ...]
 ) -> coal.Convex | None:
-    """Return the hull of a mesh in a version of its file, None if that is flat, of which each use warns."""
+    """Return the hull of a version of a mesh file; None if it is flat, since each use warns."""
     points = load_mesh(file, scale).vertices
     return None if thicken(np.asarray(points, float))[1] else make_convex_hull(points, file=file)
 
@@ -155,18 +151,17 @@ def _load_hull(
 def make_convex_hull(
     points: ArrayLike, *, file: str | Path | None = None, about: str | None = None
 ) -> coal.Convex:
-    """Return the convex hull of `points`, shape (n, 3), [m], as a coal shape.
+    """Return the convex hull of points, shape (n, 3) [m], as a coal shape.
 
-    Points in one plane, as of a picture on a wall, become a plate of 1 mm around that plane, with a
-    warning.
+    Coplanar points, such as those of a picture, become a plate of 1 mm, with a warning.
 
     Args:
         points: The points.
-        file: The file that they are of, for warnings and errors.
-        about: The link or obstacle that they are a part of, for the same.
+        file: File of the points, for warnings and errors.
+        about: Link or obstacle of the points, for warnings and errors.
 
     Raises:
-        InputError: There are no points, or coal's volume or area is not that of the hull.
+        InputError: There are no points, or coal's volume or area is wrong.
     """
     given = np.asarray(points, float)
     if not len(given):
@@ -208,17 +203,15 @@ def make_convex_hull(
 def load_parts(
     path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, detail: float = 0.0
 ) -> list[MeshPart]:
-    """Read a mesh file for display: one part for each of its colours, those of textures averaged.
+    """Read a mesh file for display: one part per colour, with the mean colour of textures.
 
     Args:
-        path: The mesh file, see `load_mesh`.
-        scale: One factor per axis, or one for all, from the file's unit to [m].
-        detail: Vertices closer together than about this [m] become one; 0 keeps the file's own
-            triangles. The mesh that a maker publishes often has screws and bevels that make a page
-            heavy and that nobody sees.
+        path: Mesh file; see `load_mesh`.
+        scale: Factor from the file's unit to [m], or one for each axis.
+        detail: Cell size of `simplify_mesh` [m]; 0 keeps all triangles.
 
     Raises:
-        InputError: As `load_mesh`.
+        InputError: The file cannot be read, or has no triangles.
     """
     import trimesh
 
@@ -246,12 +239,7 @@ def load_parts(
 
 
 def simplify_mesh(part: MeshPart, detail: float) -> MeshPart:
-    """Return a lighter copy: the vertices in each cell of a grid become their mean, triangles without area go.
-
-    Args:
-        part: The triangles.
-        detail: Width of the cells [m]; 0 keeps all as it is.
-    """
+    """Return a mesh whose vertices in each cell of a grid of width `detail` [m] are merged."""
     if detail <= 0.0:
         return part
     cells = np.round(part.vertices / detail).astype(np.int64)
@@ -270,7 +258,7 @@ def simplify_mesh(part: MeshPart, detail: float) -> MeshPart:
 
 
 def make_bvh(part: MeshPart | trimesh.Trimesh) -> coal.BVHModelOBBRSS:
-    """Return the triangles of `part` as a coal shape, for display."""
+    """Return the triangles of `part` as a coal shape for display."""
     shape = coal.BVHModelOBBRSS()
     shape.beginModel(len(part.faces), len(part.vertices))
     shape.addVertices(np.asarray(part.vertices, float))
@@ -295,7 +283,7 @@ def _check_scale(file: Path, scale: ArrayLike) -> Floats:
 
 
 def get_triangles(shape: coal.Convex | coal.BVHModelBase) -> Ints:
-    """Return the corners of the triangles of a coal shape, shape (m, 3)."""
+    """Return the vertex indices of the triangles of a coal shape, shape (m, 3)."""
     convex = isinstance(shape, coal.Convex)
     count, item = (
         (shape.num_polygons, shape.polygons) if convex else (shape.num_tris, shape.tri_indices)
@@ -318,14 +306,11 @@ def _find_colour(mesh: trimesh.Trimesh) -> tuple[float, float, float, float] | N
 
 
 def _fix_box_support() -> None:
-    """Let coal take boxes as they are, whatever it is asked first.
+    """Fix the support function of boxes for this process.
 
-    coal 3.0.3 decides once per process, from the first direction in which it looks for a box's
-    furthest corner, whether boxes are 1e-10 larger on their negative sides: yes if a component is
-    zero (a `static` in `getShapeSupport`, gone in later versions). So the first question of a
-    process would decide on the last digits of every distance to a box. This one has no such
-    component. It is asked here, below all that asks for distances; compiled code asks the same
-    library.
+    The first direction in which coal 3.0.3 supports a box decides whether all boxes are 1e-10 larger
+    on their negative sides: they are if a component is zero (a `static` in `getShapeSupport`).
+    These queries, without such a component, precede all others.
     """
     turned = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
     box, here, there = (

@@ -1,4 +1,4 @@
-"""Finds files that users name and files of the package, and chooses names for new files."""
+"""Finds files of users and of the package, and chooses names for new files."""
 
 from __future__ import annotations
 
@@ -38,22 +38,22 @@ def find_package_folder() -> Path:
 
 
 def find_resource_folder(kind: str) -> Path:
-    """Return the folder of `kind` ("robots" or "scenes"): inside the installed package, else beside it."""
+    """Return the folder "robots" or "scenes" (`kind`), in the installed package or beside it."""
     package = find_package_folder()
     inside = package / kind
     return inside if inside.is_dir() else package.parent / kind
 
 
 def list_resources(kind: str, pattern: str) -> dict[str, Path]:
-    """Return name → path of what `folder(kind)` holds, by glob `pattern` (the name is the file's or folder's stem)."""
+    """Return name → path of the files or folders of a `kind` that match a glob pattern."""
     return {path.stem: path for path in sorted(find_resource_folder(kind).glob(pattern))}
 
 
 def find_resource(kind: str, pattern: str, name: str, *, noun: str) -> Path:
-    """Return the path of `name` among `available(kind, pattern)`.
+    """Return the path of a resource by its name; see `list_resources`.
 
     Raises:
-        UnknownNameError: There is none; `noun` ("robot", "scene") names the kind in the message.
+        UnknownNameError: There is no such `noun` ("robot", "scene").
     """
     found = list_resources(kind, pattern)
     if name not in found:
@@ -62,10 +62,10 @@ def find_resource(kind: str, pattern: str, name: str, *, noun: str) -> Path:
 
 
 def check_path(value: Any, field: str, expected: str = "a path") -> Path:
-    """Return the path of a file, whether it exists or not.
+    """Return the path of a file, which need not exist.
 
     Raises:
-        InputError: It is neither text nor a path, or no file can be called that.
+        InputError: The value is not a path, or not a valid one.
     """
     if not isinstance(value, str | Path):
         raise InputError("not a path", field=field, expected=expected, got=format_value(value))
@@ -82,11 +82,11 @@ def check_path(value: Any, field: str, expected: str = "a path") -> Path:
 
 
 def find_file(name_or_path: str | Path, kind: str, pattern: str, *, noun: str) -> Path:
-    """Return a file by its path (of a .yaml file, or with a slash in it), or by its name; see `find`.
+    """Return a file by its path (`Path`, slash, or .yaml) or name; see `find_resource`.
 
     Raises:
-        UnknownNameError: There is none of that name.
-        InputError: It is neither a name nor a path.
+        UnknownNameError: The name is unknown.
+        InputError: The value is not a path.
     """
     path = check_path(name_or_path, noun, f"the name of a {noun}, or a path")
     name = str(name_or_path)
@@ -95,7 +95,7 @@ def find_file(name_or_path: str | Path, kind: str, pattern: str, *, noun: str) -
 
 
 def find_example_robot_data() -> Path | None:
-    """Return the folder of example-robot-data (in the wheels of cmeel: cmeel.prefix/share), or None."""
+    """Return the folder of example-robot-data in the wheels of cmeel, or None."""
     prefixes = [Path(pin.__file__).resolve().parents[4]]
     spec = importlib.util.find_spec("cmeel")
     if spec is not None and spec.origin is not None:
@@ -109,20 +109,16 @@ def find_example_robot_data() -> Path | None:
 def choose_file_names(
     names: Iterable[str], *, fallback: str = "part", taken: Iterable[str] = ()
 ) -> list[str]:
-    """Choose a file name, without extension, for each of some names.
+    """Choose a unique, portable file name without extension for each name.
 
-    A file name has 1 to 64 ASCII letters, digits, "_" and "-", differs from all others in its
-    folder by more than upper and lower case, and is not reserved on Windows ("con"). Names that
-    satisfy this are kept. In others, "_" replaces each other character, and a number tells equal
-    results apart.
+    File names have 1 to 64 ASCII letters, digits, "_" and "-", differ in more than case, and are
+    not reserved on Windows. Valid names are kept. In others, "_" replaces invalid characters, and a
+    number distinguishes equal results.
 
     Args:
-        names: Names of links, objects or files. Equal names get different file names.
+        names: Names of links, objects or files.
         fallback: File name for names without ASCII letters and digits.
-        taken: Names of existing files in the folder, without extension.
-
-    Returns:
-        One file name for each name, in the same order.
+        taken: Existing file names in the folder.
     """
     given = list(names)
     used, numbers = {name.lower() for name in taken}, dict[str, int]()
@@ -150,7 +146,6 @@ def _is_file_name(name: str) -> bool:
 
 
 def _replace_characters(name: str, fallback: str) -> str:
-    """Return a name with "_" in place of each character that file names lack, shortened."""
     stem = re.sub(r"[^A-Za-z0-9_-]", "_", name)[:_MAX_NAME_LENGTH]
     if re.search(r"[A-Za-z0-9]", stem) is None:
         return fallback

@@ -1,4 +1,4 @@
-"""Reads SRDF files: pairs of links that may touch, named configurations, and groups of joints."""
+"""Reads SRDF files: allowed collisions, named configurations, and groups of joints."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ __all__ = ["Srdf", "SrdfGroup", "find_group_tip", "read_groups", "read_srdf"]
 
 @dataclass(frozen=True)
 class Srdf:
-    """What an SRDF says.
+    """Contents of an SRDF.
 
     Attributes:
-        allowed: Pairs of links that need not be kept apart, each sorted, with the reason.
+        allowed: Sorted pair of links that may collide → reason.
         states: Name → joint → position, [m] or [rad].
     """
 
@@ -26,7 +26,7 @@ class Srdf:
     states: dict[str, dict[str, float]]
 
     def state(self, joints: Collection[str]) -> dict[str, float]:
-        """Return the state that covers all `joints`: one called home, default or rest, else the first; {} if none does."""
+        """Return the state home, default, rest, or the first one that covers all `joints`; else {}."""
         fitting = {name: state for name, state in self.states.items() if set(joints) <= set(state)}
         for name in ("home", "default", "rest"):
             if name in fitting:
@@ -36,26 +36,17 @@ class Srdf:
 
 @dataclass(frozen=True)
 class SrdfGroup:
-    """A group of joints.
-
-    Attributes:
-        joints: Those that it names, or that lie on its chain.
-        tip: The link at its end: that of its chain, else the one that its last joint moves.
-    """
+    """A group of joints, with the link that the last one moves, or the tip of its chain."""
 
     joints: tuple[str, ...]
     tip: str
 
 
 def read_groups(path: str | Path, urdf: ElementTree.Element) -> dict[str, SrdfGroup]:
-    """Return the groups of an SRDF that have joints, by name.
-
-    Args:
-        path: The file.
-        urdf: The robot it belongs to.
+    """Return the groups with joints of an SRDF, by name.
 
     Raises:
-        InputError: It cannot be read or is no SRDF.
+        InputError: The file cannot be read or is not an SRDF.
     """
     above, moved = dict[str, tuple[str, str]](), dict[str, str]()
     for joint in urdf.findall("joint"):
@@ -81,7 +72,7 @@ def read_groups(path: str | Path, urdf: ElementTree.Element) -> dict[str, SrdfGr
 
 
 def find_group_tip(path: Path | None, urdf: ElementTree.Element, name: str) -> str:
-    """Return the link at the end of a group of an SRDF. Raises `UnknownNameError` if there is no such group, or no SRDF."""
+    """Return the tip of a group; raise `UnknownNameError` without such a group or an SRDF."""
     groups = {} if path is None else read_groups(path, urdf)
     if name not in groups:
         raise UnknownNameError("group of an SRDF", name, groups, file=path, field="arm")
@@ -93,11 +84,11 @@ def read_srdf(path: str | Path, *, links: Collection[str]) -> Srdf:
 
     Args:
         path: The file.
-        links: The links of the robot it belongs to.
+        links: Links of its robot.
 
     Raises:
-        InputError: It cannot be read or is no SRDF.
-        UnknownNameError: It names a link that the robot does not have.
+        InputError: The file cannot be read or is not an SRDF.
+        UnknownNameError: The file names an unknown link.
     """
     text, root = read_xml(path, "SRDF")
     allowed = {}

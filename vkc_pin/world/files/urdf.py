@@ -1,4 +1,4 @@
-"""Reads URDF files: what they say about geometry, and objects without a root joint as Pinocchio models."""
+"""Reads URDF files: geometry, and Pinocchio models of objects without a root joint."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ _JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed")
 
 @dataclass(frozen=True)
 class UrdfShape:
-    """One <visual> or <collision> element.
+    """A <visual> or <collision> element.
 
     Attributes:
-        link: The link it belongs to.
-        name: `<link>_<k>`, k counting the elements of that kind of the link.
-        placement: In the link's frame.
+        link: Its link.
+        name: `<link>_<k>` for the k-th element of that kind of the link.
+        placement: Placement in the link's frame.
         kind: "box", "sphere", "cylinder", "capsule" or "mesh".
-        size: Edge lengths of a box, radius of a sphere, radius and length of a cylinder or capsule,
+        size: Edge lengths of a box, radius of a sphere, radius and length of a cylinder or capsule
             [m]; scale of a mesh.
         file: The mesh file.
-        colour: Red, green, blue, opacity, or None if the URDF names none.
+        colour: Red, green, blue, opacity, or None.
     """
 
     link: str
@@ -59,10 +59,10 @@ class UrdfShape:
     colour: Colour | None = None
 
     def make_solid(self) -> coal.CollisionGeometry:
-        """Return it as a coal shape in its own frame, a mesh as its convex hull.
+        """Return the element as a coal shape in its own frame; meshes become convex hulls.
 
         Raises:
-            InputError: Its mesh cannot be read.
+            InputError: The mesh cannot be read.
         """
         if self.file is not None:
             return load_convex(self.file, self.size, about=self.link)
@@ -75,7 +75,7 @@ class UrdfShape:
         return kinds[self.kind](*self.size)
 
     def make_mesh(self) -> trimesh.Trimesh:
-        """Return its triangles in the link's frame, [m]; round shapes as circumscribed polygons of 64 sides."""
+        """Return its triangles in the link's frame [m]; round shapes have 64 circumscribed sides."""
         import trimesh
 
         if self.file is not None:
@@ -97,14 +97,7 @@ class UrdfShape:
 
 @dataclass(frozen=True, eq=False)
 class UrdfFile:
-    """A URDF file that was read.
-
-    Attributes:
-        path: The file.
-        text: What it says.
-        root: The same as XML.
-        packages: Package name → folder, for `package://` addresses.
-    """
+    """A URDF file: text, XML, and folders of packages for `package://` addresses."""
 
     path: Path
     text: str
@@ -120,13 +113,11 @@ class UrdfFile:
         """Return all elements of `kind`, "visual" or "collision".
 
         Raises:
-            InputError: One of them is not understood, or its mesh file does not exist.
+            InputError: An element is invalid, or its mesh file does not exist.
         """
         colours = {
             material.get("name", ""): colour
-            for material in reversed(
-                list(self.root.iter("material"))
-            )  # where several have one name, the first counts
+            for material in reversed(list(self.root.iter("material")))  # the first of a name counts
             if (colour := self._colour(material))
         }
         found = []
@@ -137,10 +128,10 @@ class UrdfFile:
         return found
 
     def read_shapes_for_model(self, kind: str) -> list[UrdfShape]:
-        """Return all elements of a kind for one model; see `read_shapes`.
+        """Return the elements of a kind for one model; see `read_shapes`.
 
         Raises:
-            InputError: As there, or there are too many.
+            InputError: There are too many, or one is invalid.
         """
         shapes = self.read_shapes(kind)
         if len(shapes) > _MAX_SHAPES:
@@ -153,17 +144,16 @@ class UrdfFile:
         return shapes
 
     def resolve(self, address: str) -> Path:
-        """Return the file that a mesh's address means: `package://NAME/...`, `file://...`, absolute or beside the URDF.
+        """Return the file of a mesh's address: `package://NAME/...`, `file://...`, or a path.
 
         Raises:
-            InputError: There is no such package or file.
+            InputError: The package or file does not exist.
         """
         if address.startswith("package://"):
             package, _, inside = address.removeprefix("package://").partition("/")
             folders = [self.packages[package]] if package in self.packages else []
-            around = dict.fromkeys(
-                [*self.path.parents, *self.path.resolve().parents]
-            )  # of a link to it, and of the file itself
+            # parents of a link to the file, and of the file itself
+            around = dict.fromkeys([*self.path.parents, *self.path.resolve().parents])
             folders += [folder / package for folder in around] + list(around)
             if (
                 package == "example-robot-data"
@@ -272,14 +262,11 @@ def read_urdf(
 
     Args:
         path: The file.
-        packages: Package name → folder. Other packages are looked for in the folders around the
-            file.
-        text: What it says, where that stands elsewhere: no file is read then, but meshes are looked
-            for as if `path` were one.
+        packages: Package name → folder. Others are searched in the folders above the file.
+        text: Contents, if not to be read from `path`; meshes are relative to `path` all the same.
 
     Raises:
-        InputError: The file does not exist, is no XML, no URDF, or its links and joints are no
-            tree; see `check_tree`.
+        InputError: The file cannot be read, or is not a valid URDF; see `check_tree`.
         UnknownNameError: A joint names a link that does not exist.
     """
     file = Path(path)
@@ -289,17 +276,14 @@ def read_urdf(
 
 
 def build_model(file: UrdfFile, *root: pin.JointModelPlanar | str) -> pin.Model:
-    """Return the Pinocchio model of all links and joints of a URDF.
-
-    A joint whose limit says nothing about velocity has none, as one without a limit; efforts play
-    no part here.
+    """Return the Pinocchio model of all links and joints of a URDF; it ignores effort limits.
 
     Args:
-        file: The file.
-        *root: A joint that carries all of it, and its name; without one its root stands still.
+        file: The URDF.
+        *root: A joint that carries the root link, and its name. Default: the root link is fixed.
 
     Raises:
-        InputError: It is no valid URDF.
+        InputError: The file is not a valid URDF.
     """
     text, silent = simplify_tree(file.path, file.root)
     try:
@@ -317,18 +301,16 @@ def build_model(file: UrdfFile, *root: pin.JointModelPlanar | str) -> pin.Model:
 def load_urdf(
     path: str | Path, *, text: str | None = None
 ) -> tuple[pin.Model, pin.GeometryModel, pin.GeometryModel]:
-    """Return model, collision and visual geometry of a URDF without a root joint; its root link's frame is the universe frame.
+    """Return model, collision and visual geometry of a URDF; its root link's frame is the universe.
 
-    Collision meshes become their convex hulls.
+    Collision meshes become convex hulls.
 
     Args:
         path: The file.
-        text: What it says, where that stands elsewhere; see `read_urdf`.
+        text: Contents, if they are not to be read from `path`.
 
     Raises:
-        InputError: There is no such file, it is no valid URDF, a shape is not understood, a mesh
-            cannot be read, a joint type is not supported, or a link is drawn while nothing in the
-            whole file can collide.
+        InputError: The file or a mesh is invalid, or a visible URDF has no collision shapes.
     """
     file = read_urdf(path, text=text)
     for joint in file.root.findall(
@@ -357,7 +339,7 @@ def load_urdf(
 
 
 def _build_geometry(model: pin.Model, file: UrdfFile, kind: str) -> pin.GeometryModel:
-    """Return the shapes of `kind`, "visual" or "collision", on the links of `model`, in the order of its frames."""
+    """Return the "visual" or "collision" shapes in the order of the model's frames."""
     geometry = pin.GeometryModel()
     shapes = [
         (model.getFrameId(shape.link, pin.FrameType.BODY), shape)
@@ -384,7 +366,7 @@ def _build_geometry(model: pin.Model, file: UrdfFile, kind: str) -> pin.Geometry
 
 
 def _compute_rotation(roll: float, pitch: float, yaw: float) -> Floats:
-    """Return the rotation, shape (3, 3), of angles [rad] about fixed axes, to the last bit as Pinocchio's reader has it."""
+    """Return the rotation of fixed-axis angles [rad], equal to Pinocchio's parser bit for bit."""
     (a, u), (b, v), (c, w) = (
         (math.sin(angle / 2.0), math.cos(angle / 2.0)) for angle in (roll, pitch, yaw)
     )

@@ -1,4 +1,4 @@
-"""Writes files and folders completely or not at all, and checks their names and targets first."""
+"""Writes files and folders atomically, and checks their names and targets first."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ _MAX_LISTED = 3  # files that a message names
 
 
 def write_atomically(path: str | Path, data: bytes) -> Path:
-    """Write `data` to `path` whole or not at all, making its folder if need be; return the path.
+    """Write a file completely or not at all, and return its path.
 
-    A symbolic link stays, and what it names is written. A file that is there keeps its mode. Ctrl-C
-    waits until it is done.
+    Missing folders are created, links followed, and the mode of an existing file kept. Ctrl-C is
+    deferred.
 
     Raises:
-        InputError: The path names something else than a file, or it cannot be written.
+        InputError: The path is not that of a file, or cannot be written.
     """
     with _report_path_errors(path):
         target, mode = _resolve_target(path)
@@ -60,11 +60,10 @@ def write_atomically(path: str | Path, data: bytes) -> Path:
 
 
 def check_writable(path: str | Path, *, field: str | None = None) -> Path:
-    """Return where `write_atomically` would write.
+    """Return the target of `write_atomically`.
 
     Raises:
-        InputError: It cannot: the path, which `field` names, is that of something else, or nothing
-            can be made there.
+        InputError: The path, which `field` names, cannot be written.
     """
     with _report_path_errors(path, field):
         target, _ = _resolve_target(path)
@@ -89,15 +88,14 @@ def check_writable(path: str | Path, *, field: str | None = None) -> Path:
 def check_outputs(
     files: Mapping[str, str | Path], *, inputs: Mapping[str, str | Path] | None = None
 ) -> None:
-    """Check that files can be written, and do not get in each other's way.
+    """Check that files can be written without conflicts.
 
     Args:
-        files: Option or argument → the file that it names.
-        inputs: Option or argument → a file that is read, and must not be written.
+        files: Option or argument → output file.
+        inputs: Option or argument → input file, which must not be written.
 
     Raises:
-        InputError: One of them cannot be written, names what another one does, or needs a folder
-            where another one is a file.
+        InputError: A file cannot be written, is named twice, or is needed as a folder as well.
     """
     taken = {
         Path(os.path.realpath(check_path(path, field))): field
@@ -127,18 +125,15 @@ def check_outputs(
 
 
 def check_name(name: object, field: str, *, file: str | Path | None = None) -> str:
-    """Return a name of a file or folder, to be joined to a folder that the result must not leave.
-
-    Every name that was read from a file is checked with this before it becomes part of a path.
+    """Return a name that is safe to join to a folder. All names read from files are checked.
 
     Args:
-        name: The name.
-        field: Field or argument that it comes from, for the error.
-        file: File that it was read from, for the error.
+        name: Name of a file or folder.
+        field: Field or argument of the name, for the error.
+        file: File of the name, for the error.
 
     Raises:
-        InputError: It is not text, is empty or too long, begins with a dot, or has a slash, a
-            backslash or a character that cannot be printed.
+        InputError: The name is not text, empty, too long, hidden, or has invalid characters.
     """
     plain = isinstance(name, str) and name.isprintable() and not {"/", "\\"} & set(name)
     if (
@@ -157,7 +152,7 @@ def check_inside(path: str | Path, folder: str | Path) -> None:
     """Check that a path in a folder is not a symbolic link to a place outside.
 
     Raises:
-        InputError: It is.
+        InputError: The path leads out of the folder.
     """
     root, target = (Path(os.path.realpath(place)) for place in (folder, path))
     if not target.is_relative_to(root):
@@ -168,12 +163,10 @@ def check_inside(path: str | Path, folder: str | Path) -> None:
 
 
 def check_links(folder: str | Path) -> None:
-    """Check that no symbolic link anywhere in a folder leads out of it.
-
-    Whatever is written to paths in the folder afterwards changes nothing outside.
+    """Check that no symbolic link in a folder leads out of it.
 
     Raises:
-        InputError: A link does, or the folder cannot be read.
+        InputError: A link leads out of the folder, or the folder cannot be read.
     """
     with _report_path_errors(folder):
         links = [entry.path for entry in _walk_files(folder) if entry.is_symlink()]
@@ -182,10 +175,10 @@ def check_links(folder: str | Path) -> None:
 
 
 def check_replaceable(folder: str | Path) -> None:
-    """Check that a folder has no files but those that `write_folder_atomically` wrote to it.
+    """Check that all files in a folder were written by `write_folder_atomically`.
 
     Raises:
-        InputError: It has others, or cannot be read.
+        InputError: The folder has other files, or cannot be read.
     """
     with _report_path_errors(folder):
         found = {os.path.relpath(entry.path, folder) for entry in _walk_files(folder)}
@@ -209,7 +202,7 @@ def _read_manifest(folder: Path) -> set[str]:
 
 
 def _walk_files(folder: str | Path) -> Iterator[os.DirEntry[str]]:
-    """Yield every entry below a folder that is not a folder itself. Links are not followed."""
+    """Yield the files below a folder, without following links."""
     pending = [os.fspath(folder)]
     while pending:
         with os.scandir(pending.pop()) as entries:
@@ -222,17 +215,16 @@ def _walk_files(folder: str | Path) -> Iterator[os.DirEntry[str]]:
 
 @contextlib.contextmanager
 def write_folder_atomically(path: str | Path, *, force: bool = False) -> Iterator[Path]:
-    """Yield a new folder to write into, which becomes `path` if nothing is raised, else is removed.
+    """Yield a new folder, which replaces `path` on success and is removed on failure.
 
-    A list of its files is written to it as well, so that a later call can replace it safely.
+    It gets a list of its files, so that a later call can replace it safely.
 
     Args:
-        path: The folder to create, with its parents if necessary.
-        force: Replace an existing folder if it is empty, or has only files that this wrote to it.
+        path: The folder, created with its parents.
+        force: Replace an existing folder that is empty or written by this function.
 
     Raises:
-        InputError: The folder exists and may not be replaced, it cannot be created, or `path` is
-            not a folder.
+        InputError: The folder cannot be created or may not be replaced.
     """
     target = Path(os.path.realpath(check_path(path, "path", "a folder")))
     _check_target(target, path, force)
@@ -251,7 +243,7 @@ def write_folder_atomically(path: str | Path, *, force: bool = False) -> Iterato
 
 
 def _check_target(target: Path, path: str | Path, force: bool) -> None:
-    """Check that a folder does not exist, or may be replaced. Raises InputError if not."""
+    """Check that a folder does not exist, or may be replaced."""
     if not target.exists():
         return
     if not target.is_dir():
@@ -269,7 +261,7 @@ def _write_manifest(folder: Path) -> None:
 
 
 def _replace_folder(target: Path, staging: Path) -> None:
-    """Rename a folder to `target`, and delete the one that had that name."""
+    """Rename a folder to `target`, and delete the previous one."""
     if not target.exists():
         staging.rename(target)
         return
@@ -284,7 +276,7 @@ def _replace_folder(target: Path, staging: Path) -> None:
 
 
 def _resolve_target(path: str | Path) -> tuple[Path, int | None]:
-    """Return what a path leads to, and the mode of what is there; None if nothing is."""
+    """Return the real path, and the mode of an existing file."""
     target = Path(os.path.realpath(path))
     try:
         found = os.stat(path)  # noqa: PTH116 - as text, which tells a folder by its slash
@@ -303,13 +295,11 @@ def _resolve_target(path: str | Path) -> tuple[Path, int | None]:
 
 
 def _make_temporary_path(folder: Path) -> Path:
-    """Return a new name in a folder, for a file that is renamed when it is whole."""
     return folder / f".vkc-pin-{secrets.token_hex(8)}"
 
 
 @contextlib.contextmanager
 def _report_path_errors(path: str | Path, field: str | None = None) -> Iterator[None]:
-    """Say what is wrong with a path."""
     path = (
         path if isinstance(path, str) else check_path(path, "path")
     )  # text may end with a slash, which paths forget

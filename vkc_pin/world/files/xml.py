@@ -1,4 +1,4 @@
-"""Reads XML with the line of every element, and quotes text for XML."""
+"""Parses XML with the line of every element, and quotes text for XML."""
 
 from __future__ import annotations
 
@@ -26,29 +26,28 @@ _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]"
 
 
 class _Element(ElementTree.Element):
-    """An element that knows where it begins."""
+    """An element with its line."""
 
     line: int | None = None
 
 
 def find_line(element: ElementTree.Element) -> int | None:
-    """Return the line in which an element begins, counted from 1; None if that is not known."""
+    """Return the line of an element, counted from 1, or None if it is unknown."""
     return getattr(element, "line", None)
 
 
 def read_xml(
     file: str | Path, kind: str, text: str | None = None
 ) -> tuple[str, ElementTree.Element]:
-    """Return what a URDF or SRDF file (`kind`) says, as text and as its element <robot>.
+    """Return text and root element <robot> of a URDF or SRDF file (`kind`).
 
     Args:
         file: The file.
         kind: "URDF" or "SRDF".
-        text: What it says, where that stands elsewhere: nothing is read then, and `file` is for
-            messages alone.
+        text: Contents, if they are not to be read from `file`.
 
     Raises:
-        InputError: It cannot be read, is no XML, or is about something else than a robot.
+        InputError: The file cannot be read, is not XML, or has another root element.
     """
     text = read_text(file, kind) if text is None else text
     root = parse_xml(text, Path(file))
@@ -60,15 +59,10 @@ def read_xml(
 
 
 def parse_xml(text: str, file: Path) -> ElementTree.Element:
-    """Return the root of an XML document.
-
-    Args:
-        text: What it says.
-        file: Where it stands, for messages.
+    """Return the root of an XML document; `file` is for messages.
 
     Raises:
-        InputError: It is no XML, or defines entities: with a few lines these make texts without
-            end.
+        InputError: The text is not XML, or defines entities, which can expand without bounds.
     """
     builder = ElementTree.TreeBuilder(element_factory=_Element)
     parser = expat.ParserCreate()
@@ -96,7 +90,7 @@ def parse_xml(text: str, file: Path) -> ElementTree.Element:
 
 
 def replace_forbidden(text: str) -> str:
-    """Replace characters that XML 1.0 forbids, such as most control characters, by U+FFFD."""
+    """Replace characters that XML 1.0 forbids by U+FFFD."""
     return _FORBIDDEN.sub("\ufffd", text)
 
 
@@ -106,13 +100,10 @@ def quote(text: str) -> str:
 
 
 def check_indices(file: Path) -> None:
-    """Check that the lists of indices in a COLLADA file hold whole numbers.
-
-    assimp, which reads these files, does not get past anything else in them, and takes ever more
-    memory meanwhile.
+    """Check that index lists in a COLLADA file hold integers, on which assimp would hang otherwise.
 
     Raises:
-        InputError: One holds something else, the file is no XML, or it cannot be read.
+        InputError: The file has other indices, is not XML, or cannot be read.
     """
     parser, inside = expat.ParserCreate(), list[str]()
 

@@ -125,9 +125,10 @@ class UnknownNameError(InputError):
             ", ..." if len(self.choices) > 12 else ""
         )
         hint = f"; did you mean '{self.nearest}'?" if self.nearest else ""
-        problem = f"there is no {kind} '{_shorten(name, _MAX_NAME_LENGTH)}'{hint} There are: {listed or 'none'}"
+        problem = f"there is no {kind} '{_shorten(name, _MAX_NAME_LENGTH)}'"
+        known = f"here are: {listed or 'none'}"
         super().__init__(
-            problem if hint else problem.replace(" There are", "; there are", 1),
+            f"{problem}{hint} T{known}" if hint else f"{problem}; t{known}",
             file=file,
             line=line,
             field=field,

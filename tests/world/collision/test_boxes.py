@@ -7,7 +7,6 @@ import itertools
 import coal
 import numpy as np
 import pinocchio as pin
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -93,23 +92,3 @@ def test_close_pairs_match_an_exhaustive_search(seed: int, reach: float, standin
     assert counts[pairs].all()
     close = (room.distances() < reach - 1e-6) & counts
     assert set(zip(*np.nonzero(close), strict=True)) <= set(zip(at, pairs, strict=True))
-
-
-def test_fixed_boxes_can_be_moved() -> None:
-    room, rng = Room(3), np.random.default_rng(4)
-    boxes, which = room.boxes(), np.array([MOVING + 2, MOVING + 5])
-    before = boxes.find_close_pairs(0.2, room.turned, room.moved)
-    room.rotations[which], room.centers[which] = rotations(rng, 2), rng.uniform(-1.0, 1.0, (2, 3))
-    moved = boxes.move_fixed(which, room.rotations[which], room.centers[which])
-    for one, other in zip(
-        moved.find_close_pairs(0.2, room.turned, room.moved),
-        room.boxes().find_close_pairs(0.2, room.turned, room.moved),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(one, other)
-    for one, other in zip(
-        boxes.find_close_pairs(0.2, room.turned, room.moved), before, strict=True
-    ):
-        np.testing.assert_array_equal(one, other)
-    with pytest.raises(IndexError, match="stands"):
-        boxes.move_fixed(np.array([0]), np.eye(3)[None], np.zeros((1, 3)))

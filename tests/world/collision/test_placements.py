@@ -5,11 +5,8 @@ from __future__ import annotations
 import coal
 import numpy as np
 import pinocchio as pin
-import pytest
-from helpers.small_problems import door_scene
 
 from vkc_pin.world.collision.placements import ShapePlacements, flatten_placements
-from vkc_pin.world.trajectory.world_model import World
 
 
 def test_placements_are_flattened_by_columns() -> None:
@@ -61,11 +58,3 @@ def test_all_joint_types_are_supported() -> None:
         geometry,
         np.array([pin.integrate(model, neutral, rng.normal(size=model.nv)) for _ in range(4)]),
     )
-
-
-def test_configurations_of_wrong_size_raise() -> None:
-    world = World(door_scene())
-    with pytest.raises(ValueError, match="nq"):
-        ShapePlacements(world.model, world.bodies).compute_placements(
-            np.zeros((2, world.model.nq + 1))
-        )

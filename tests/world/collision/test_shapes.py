@@ -168,24 +168,6 @@ class Room:
         return np.array(rows)
 
 
-@settings(max_examples=10, deadline=None)
-@given(SEEDS)
-def test_results_do_not_depend_on_order_or_threads(seed: int) -> None:
-    room = Room(seed)
-    expected = room.expected()
-    assert 0 < (expected[:, 0] < 0).sum() < len(expected)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shapes_module, "_MIN_PAIRS_PER_THREAD", 1)
-        for threads in (1, 2, 5):
-            shapes = room.shapes(threads)
-            np.testing.assert_array_equal(
-                table(shapes.compute_witnesses(room.where, room.states, room.pairs)), expected
-            )
-            np.testing.assert_array_equal(
-                shapes.compute_distances(room.where, room.states, room.pairs), expected[:, 0]
-            )
-
-
 @settings(max_examples=25, deadline=None)
 @given(SEEDS, st.sampled_from([None, 0, 1, 3]), st.sampled_from([0.05, 0.3, np.inf]), st.booleans())
 def test_closest_pairs_match_an_exhaustive_search(

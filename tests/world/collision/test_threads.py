@@ -20,8 +20,6 @@ def test_thread_count_respects_cores_and_environment(
     monkeypatch.setenv("OMP_NUM_THREADS", requested)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(12)), raising=False)
     assert count_threads() == expected
-    shapes = Shapes([coal.Sphere(0.1)])
-    assert [shapes._count_threads(rows) for rows in (0, 10, 10**6)] == [1, 1, expected]
-    assert Shapes([coal.Sphere(0.1)], threads=5)._count_threads(10**6) == 5
+    assert Shapes([coal.Sphere(0.1)]).threads == expected
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0}, raising=False)
     assert count_threads() == 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -56,22 +55,3 @@ def test_close_pairs_match_an_exhaustive_search(
             if moves[phases[k], [i, j]].any() and (ends - moved[k, i] - moved[k, j]) / 2 < limit:
                 expected.append((k, p))
     assert list(zip(at.tolist(), which.tolist(), strict=True)) == expected
-
-
-def test_invalid_indices_raise() -> None:
-    corner = np.zeros((2, 1, 3))
-    boxes = WorldBoxes(corner, corner + 1.0, np.full((1, 3), 3.0), np.full((1, 3), 4.0))
-    good = {
-        "moved": np.zeros((1, 2)),
-        "moves": np.ones((1, 2), bool),
-        "phases": np.zeros(1, int),
-        "limit": 9.0,
-    }
-    here, pair = np.zeros(1, int), np.array([[0, 1]])
-    for first, pairs, more in (
-        (here + 2, pair, {}),
-        (here, pair + 1, {}),
-        (here, pair, {"phases": here + 1}),
-    ):
-        with pytest.raises(IndexError, match="no such"):
-            boxes.find_close_pairs(first, here, pairs, **{**good, **more})

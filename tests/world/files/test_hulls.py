@@ -1,10 +1,5 @@
 from __future__ import annotations
 
-import shutil
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -13,9 +8,6 @@ from scipy.spatial import ConvexHull
 
 from vkc_pin.errors import InputError
 from vkc_pin.world.files.hulls import compute_hull, compute_outer_hull
-
-ROOT = Path(__file__).resolve().parents[3]
-ROBOT = ROOT / "robots" / "husky_ur5e"
 
 
 def outside(points: np.ndarray, hull: trimesh.Trimesh) -> float:
@@ -66,23 +58,3 @@ def test_outer_hulls_contain_their_points(vertices: int) -> None:
     assert len(hull.vertices) <= vertices
     assert outside(points, hull) < 1e-9
     assert 1.0 < hull.volume / tube.volume < (1.2 if vertices == 40 else 1.35)
-
-
-@pytest.mark.long
-def test_the_tool_reproduces_the_committed_meshes(tmp_path: Path) -> None:
-    folder, name = tmp_path / ROBOT.name, "wrist_3_link_0.stl"
-    shutil.copytree(ROBOT, folder)
-    (folder / "collision" / name).unlink()
-    command = [sys.executable, str(ROOT / "tools" / "make_collision.py"), str(folder)]
-    table = subprocess.run(
-        [*command, "wrist_3_link"], capture_output=True, text=True, check=True
-    ).stdout
-    assert "| `wrist_3_link` | 1 | 40 | 0.190 | 0.200 | 6 % |" in table
-    made, committed = (
-        trimesh.load_mesh(file)
-        for file in (folder / "collision" / name, ROBOT / "collision" / name)
-    )
-    np.testing.assert_allclose(made.bounds, committed.bounds, atol=1e-6)
-    assert made.volume == pytest.approx(committed.volume, rel=1e-4)
-    unknown = subprocess.run([*command, "wrist_4_link"], capture_output=True, text=True)
-    assert "wrist_4_link" in unknown.stderr

@@ -8,14 +8,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.urdf import _compute_rotation, load_urdf, read_urdf
+from vkc_pin.world.files.urdf import load_urdf, read_urdf
 
 WEDGE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
-ANGLES = st.floats(-7.0, 7.0)
 
 
 def urdf(folder: Path, shapes: str, *, name: str = "thing.urdf") -> Path:
@@ -77,20 +74,6 @@ def test_collision_meshes_become_convex_hulls(tmp_path: Path) -> None:
     assert found.make_solid().computeVolume() == pytest.approx(ring.convex_hull.volume, rel=1e-3)
     assert found.make_mesh().volume == pytest.approx(ring.volume, rel=1e-3)
     assert ring.volume < 0.9 * ring.convex_hull.volume
-
-
-@settings(max_examples=50, deadline=None)
-@given(ANGLES, ANGLES, ANGLES)
-def test_rotations_equal_those_of_pinocchio(roll: float, pitch: float, yaw: float) -> None:
-    np.testing.assert_allclose(
-        _compute_rotation(roll, pitch, yaw), pin.rpy.rpyToMatrix(roll, pitch, yaw), atol=1e-14
-    )
-    origin = f'<origin rpy="{roll} {pitch} {yaw}"/>'
-    element = f'<link name="b"/><joint name="j" type="fixed"><parent link="a"/><child link="b"/>{origin}</joint>'
-    model = pin.buildModelFromXML(f'<robot name="r"><link name="a"/>{element}</robot>')
-    np.testing.assert_array_equal(
-        _compute_rotation(roll, pitch, yaw), model.frames[model.getFrameId("b")].placement.rotation
-    )
 
 
 def test_colours_are_shared_by_name(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -90,20 +89,6 @@ def test_quaternions_interpolate_about_one_axis(angle: float) -> None:
     np.testing.assert_allclose(data.oMi[3].translation, first.translation + 0.5, atol=1e-12)
     turn = pin.log3(first.rotation.T @ data.oMi[3].rotation)
     np.testing.assert_allclose(turn, 0.5 * angle * axis, atol=1e-6)
-
-
-def test_symbolic_configurations_match_numeric_ones() -> None:
-    model = pin.Model()
-    base = model.addJoint(0, pin.JointModelPlanar(), pin.SE3.Identity(), "base")
-    model.addJoint(base, pin.JointModelRUBZ(), pin.SE3.Identity(), "wheel")
-    model.addJoint(base, pin.JointModelPZ(), pin.SE3.Identity(), "lift")
-    coordinates = Coordinates(model)
-    z = ca.SX.sym("z", coordinates.size)
-    function = ca.Function("q", [z], [coordinates.q_symbolic(z)])
-    for row in np.random.default_rng(1).uniform(-3.0, 3.0, (10, coordinates.size)):
-        np.testing.assert_allclose(
-            np.asarray(function(row)).ravel(), coordinates.q(row), atol=1e-15
-        )
 
 
 def test_invalid_arguments_raise() -> None:

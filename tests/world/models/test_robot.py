@@ -95,46 +95,6 @@ def test_collision_shapes_enclose_the_links(husky: Robot) -> None:
         assert outside.max() < 1e-6, link
 
 
-def test_collision_pairs_of_husky(husky: Robot) -> None:
-    everything = load_robot("husky_ur5e", pairs="all")
-    assert len(husky.collision.geometryObjects) == 18
-    # 4 shapes on the base, 1, 3, 2, 1, 1 on the arm's links, 6 on the hand: all but those on the
-    # same joint
-    counts = [4, 1, 3, 2, 1, 1, 6]
-    assert (
-        len(everything.collision.collisionPairs)
-        == (sum(counts) ** 2 - sum(count**2 for count in counts)) // 2
-    )
-    assert len(husky.collision.collisionPairs) == 95
-    links = {
-        frozenset((husky.link_of(pair.first), husky.link_of(pair.second)))
-        for pair in husky.collision.collisionPairs
-    }
-    assert frozenset(("base_link", "gripper_link")) in links
-    assert frozenset(("upper_arm_link", "forearm_link")) not in links
-
-
-def test_lever_matches_finite_differences(husky: Robot) -> None:
-    """Differences of the hand position at random configurations; equal for equal robots."""
-    robot = husky
-    rng, steps = np.random.default_rng(1), []
-    tool = robot.model.getFrameId(robot.tool_frame)
-    data = robot.model.createData()
-
-    def hand(z: np.ndarray) -> np.ndarray:
-        pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(z))
-        return np.array(data.oMf[tool].translation)
-
-    for z in rng.uniform(
-        np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi), (400, len(robot.lower))
-    ):
-        steps.append(
-            [np.linalg.norm(hand(z + 1e-6 * row) - hand(z)) / 1e-6 for row in np.eye(len(z))[3:]]
-        )
-    assert robot.lever == pytest.approx(np.sqrt(np.mean(np.square(steps), axis=0)).mean(), rel=0.05)
-    assert robot.lever == load_robot("husky_ur5e").lever
-
-
 def test_front_is_the_foremost_corner_of_the_hand(husky: Robot) -> None:
     """Covers all corners of touch links; without touch links it is the tool frame."""
     frame = husky.model.frames[husky.model.getFrameId(husky.tool_frame)]

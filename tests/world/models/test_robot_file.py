@@ -13,11 +13,8 @@ from helpers.arm_urdf import write_arms
 from helpers.robots import placement, small_urdf
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.files import resources
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import find_robot, load_robot
-
-FOLDER = resources.find_resource_folder("robots") / "husky_ur5e"
 
 
 @pytest.fixture(scope="module")
@@ -136,20 +133,6 @@ def test_robots_are_named_after_folder_or_file(tmp_path: Path) -> None:
     for name, called in (("robot.yaml", tmp_path.name), ("mine.yaml", "mine")):
         (tmp_path / name).write_text("urdf: small.urdf\n")
         assert load_robot(tmp_path / name, pairs="all").name == called
-
-
-def test_copied_urdfs_find_meshes_of_example_robot_data(tmp_path: Path) -> None:
-    original = load_robot("panda", pairs="all")
-    copy = tmp_path / "copy.urdf"
-    copy.write_text(original.urdf.read_text())
-    assert "package://example-robot-data/" in copy.read_text()
-    found = load_robot(copy, pairs="all")
-    assert [shape.name for shape in found.collision.geometryObjects] == [
-        s.name for s in original.collision.geometryObjects
-    ]
-    copy.write_text(original.urdf.read_text().replace("/link0.stl", "/link00.stl"))
-    with pytest.raises(InputError, match=r"link00\.stl"):
-        load_robot(copy, pairs="all")
 
 
 def test_unknown_names_raise() -> None:

@@ -14,11 +14,8 @@ from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError
 from vkc_pin.world.files.meshes import MeshPart, make_bvh
-from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.models.shapes import (
     LIMIT_SLACK,
-    LinkDistances,
-    ShapeDistances,
     clamp_to_limits,
     compute_bounding_box,
     compute_clearance,
@@ -142,44 +139,3 @@ def test_copies_are_fixed_in_the_world() -> None:
     assert compute_shape_distance(
         geometry, at, coal.Sphere(0.1), pin.SE3.Identity()
     ) == pytest.approx(np.sqrt(14) - 0.2)
-
-
-@pytest.mark.parametrize("cutoff", [0.0, 0.05, np.inf])
-def test_link_distances_match_shape_distances(cutoff: float) -> None:
-    """Distances are exact up to the cutoff, and bounds above it, after any selection."""
-    robot, rng = load_robot("husky_ur5e"), np.random.default_rng(5)
-    shapes = robot.collision.geometryObjects
-    groups: dict[tuple[str, str], list[tuple[int, int]]] = {}
-    for pair in robot.collision.collisionPairs:
-        groups.setdefault((robot.link_of(pair.first), robot.link_of(pair.second)), []).append(
-            (pair.first, pair.second)
-        )
-    distances = ShapeDistances(robot.model, robot.coordinates.q, shapes)
-    links, data = LinkDistances(distances, groups), robot.model.createData()
-    assert links.links == list(groups)
-    for _ in range(4):
-        z = rng.uniform(-2.0, 2.0, len(robot.lower))
-        distances.set_configuration(z)
-        pin.forwardKinematics(robot.model, data, robot.coordinates.q(z))
-        placed = [
-            (shape.geometry, data.oMi[shape.parentJoint] * shape.placement) for shape in shapes
-        ]
-        np.testing.assert_allclose(
-            distances.compute_lowest_points(),
-            [compute_world_box(*one)[0][2] for one in placed],
-            atol=1e-12,
-        )
-        bounds = links.compute_lower_bounds()
-        for k, name in enumerate(links.links):
-            exact = min(
-                compute_shape_distance(*placed[one], *placed[other]) for one, other in groups[name]
-            )
-            assert bounds[k] <= exact + 1e-6
-            found = links.compute_distance(k, cutoff)
-            assert found == pytest.approx(exact, abs=1e-6) if exact <= cutoff else found > cutoff
-        links.select([k % 3 > 0 for k in range(len(links.links))])
-        if not links.links:
-            break
-    links.select([False] * len(links.links))
-    assert links.links == []
-    assert links.compute_lower_bounds().shape == (0,)

@@ -22,20 +22,12 @@ class Boxes:
     """Oriented bounding boxes of G shapes: first the moving ones, then those fixed in the world.
 
     Args:
-        joints: Joint that carries each box, shape (G,); 0 for fixed boxes.
-        rotations: Box orientations in the frame of their joint or the world, shape (G, 3, 3).
-        centers: Box centres in the same frame, shape (G, 3) [m].
-        halves: Half extents along the boxes' own axes, shape (G, 3) [m].
-        pairs: Pairs of boxes to check, shape (P, 2); at least the first box of each pair moves.
+        joints: Joint of each box, shape (G,); 0 for fixed boxes.
+        rotations: Orientations in the frame of the joint or the world, shape (G, 3, 3).
+        centers: Centres in the same frame, shape (G, 3) [m].
+        halves: Half extents along the boxes' axes, shape (G, 3) [m].
+        pairs: Pairs to check, shape (P, 2); at least the first box of each pair moves.
         threads: Maximum number of threads. Default: `threads.count_threads`.
-
-    Attributes:
-        pairs: Pairs of boxes that are checked, shape (P, 2).
-
-    Raises:
-        ValueError: Moving boxes do not come first, or array shapes do not match.
-        IndexError: A pair refers to a box that does not exist.
-        BuildError: See `solids.load_compiled`.
     """
 
     def __init__(
@@ -53,12 +45,12 @@ class Boxes:
         self.compiled: Any = load_compiled().Boxes(joints, rotations, centers, halves, pairs)
 
     def move_fixed(self, which: Ints, rotations: Floats, centers: Floats) -> Boxes:
-        """Return a copy with some fixed boxes at other placements.
+        """Return a copy with some fixed boxes moved.
 
         Args:
             which: Indices of the boxes, shape (n,).
-            rotations: New orientations in the world frame, shape (n, 3, 3).
-            centers: New centres in the world frame, shape (n, 3) [m].
+            rotations: Orientations in the world frame, shape (n, 3, 3).
+            centers: Centres in the world frame, shape (n, 3) [m].
         """
         other = object.__new__(Boxes)
         other.threads, other.pairs = self.threads, self.pairs
@@ -68,24 +60,21 @@ class Boxes:
     def find_close_pairs(
         self, reach: float, rotations: Floats, translations: Floats, *, include_fixed: bool = True
     ) -> tuple[Ints, Ints, Floats]:
-        """Return all pairs that bounding volumes cannot prove to be `reach` apart.
+        """Return all pairs that bounding volumes cannot prove to be `reach` [m] apart.
 
         Bounding spheres are tested first (against boxes, for fixed shapes), then the face normals
-        of both boxes. Results do not depend on which configurations are evaluated together.
+        of both boxes.
 
         Args:
-            reach: Distance [m] below which a pair counts as close.
-            rotations: Orientations of all joints in the world frame, shape (W, J, 3, 3); joint 0 is
-                the world.
+            reach: Distance below which a pair is close [m].
+            rotations: Orientations of all joints in the world frame, shape (W, J, 3, 3); 0 is the
+                world.
             translations: Positions of all joints in the world frame, shape (W, J, 3) [m].
-            include_fixed: Whether to include pairs of a moving and a fixed shape.
+            include_fixed: Include pairs of a moving and a fixed shape.
 
         Returns:
-            Configuration index, pair index, and a lower bound of the signed distance [m], each of
-            shape (C,), sorted by configuration, then by pair.
-
-        Raises:
-            IndexError: A box is attached to a joint that is not among the J.
+            Index of the configuration, index of the pair, and a lower bound of the signed distance
+            [m], shape (C,) each, sorted by configuration, then by pair.
         """
         threads = max(1, min(self.threads, len(rotations) // _MIN_ROWS_PER_THREAD))
         rows, pairs, gaps = self.compiled.near(

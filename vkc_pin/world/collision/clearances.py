@@ -22,16 +22,15 @@ _MIN_ROWS_PER_THREAD = 16  # configurations, about 0.3 ms: fewer do not pay for 
 
 
 class ClosePairs(NamedTuple):
-    """C pairs of shapes that are close, sorted by configuration, then by distance − margin.
+    """C pairs of close shapes, sorted by configuration, then by distance − margin.
 
     Attributes:
         row: Index of the configuration, shape (C,).
         pair: Index of the pair, shape (C,).
         distance: Signed distance, shape (C,) [m].
-        margin: Clearance that the pair must keep there, shape (C,) [m].
+        margin: Required clearance, shape (C,) [m].
         normal: Unit normal from the first to the second shape, world frame, shape (C, 3).
-        first, second: Witness points (closest, or deepest) on either shape, world frame, shape
-            (C, 3) each [m].
+        first, second: Witness points (closest, or deepest), world frame, shape (C, 3) each [m].
     """
 
     row: Ints
@@ -48,12 +47,6 @@ class Clearances:
 
     Results depend neither on the number of threads nor on which configurations are evaluated
     together.
-
-    Attributes:
-        placements: Kinematics of the moving shapes.
-        boxes: Bounding boxes of all shapes, with the pairs to check.
-        shapes: All shapes.
-        margins: Clearances that the pairs must keep.
     """
 
     def __init__(
@@ -89,14 +82,12 @@ class Clearances:
 
         Args:
             q: Pinocchio configurations, shape (W, nq).
-            z: Minimal coordinates, which select the margins, shape (W, n).
-            waypoints: Waypoint indices, which select the margins, shape (W,).
-            reach: Pairs further apart are omitted [m].
+            z: Minimal coordinates, shape (W, n), which select the margins together with
+                `waypoints`.
+            waypoints: Indices of waypoints, shape (W,).
+            reach: Largest distance [m].
             max_pairs: Maximum number of pairs per configuration. Default: no limit.
-            include_fixed: Whether to include pairs of a moving and a fixed shape.
-
-        Raises:
-            ValueError: Array shapes do not match.
+            include_fixed: Include pairs of a moving and a fixed shape.
         """
         threads = max(1, min(self.shapes.threads, len(q) // _MIN_ROWS_PER_THREAD))
         limit = -1 if max_pairs is None else max_pairs
@@ -109,22 +100,14 @@ class Clearances:
     def find_first_violation(
         self, q: Floats, z: Floats, waypoint: int, *, reach: float, allowed: float
     ) -> int:
-        """Return the first configuration that violates a margin by more than `allowed`.
-
-        Evaluation stops at the first such pair.
+        """Return the first configuration that violates a margin by more than `allowed` [m], or W.
 
         Args:
             q: Pinocchio configurations, shape (W, nq).
-            z: Minimal coordinates, which select the margins, shape (W, n).
-            waypoint: Waypoint index, which selects the margins.
+            z: Minimal coordinates, shape (W, n).
+            waypoint: Index of the waypoint, which selects the margins.
             reach: Pairs further apart are ignored [m].
             allowed: Tolerated violation [m].
-
-        Returns:
-            The index, or W if no configuration violates a margin.
-
-        Raises:
-            ValueError: Array shapes do not match.
         """
         return int(
             self._find_first_violation(*self._parts, q, z, waypoint, reach, allowed, _ROUNDING)
@@ -141,23 +124,18 @@ class Clearances:
         reach: float,
         allowed: float,
     ) -> Any:
-        """Return a compiled object that checks straight lines between configurations.
+        """Return a checker of straight lines between configurations, for compiled searches.
 
-        Compiled searches take it. It stops at the first configuration that
-        `find_first_violation` would report. This object must outlive it.
+        It stops where `find_first_violation` would. This object must outlive it.
 
         Args:
-            places: Positions of the entries of z in Pinocchio's configuration; see
-                `world.models.coordinates.Coordinates.index_maps`.
-            z: A configuration, shape (n,), with the values of the coordinates that do not vary.
-            waypoint: Waypoint index, which selects the margins.
-            weights: Weights of the coordinates that vary, which are the first m of z, shape (m,).
-            step: Largest weighted change of any coordinate between successive checks.
+            places: Indices of the entries of z in q; see `Coordinates.index_maps`.
+            z: Configuration with the values of constant coordinates, shape (n,).
+            waypoint: Index of the waypoint, which selects the margins.
+            weights: Weights of the m varying coordinates, the first ones of z, shape (m,).
+            step: Largest weighted change of a coordinate between successive checks.
             reach: Pairs further apart are ignored [m].
             allowed: Tolerated violation of the margins [m].
-
-        Raises:
-            ValueError: Array shapes do not match.
         """
         maps = [np.ascontiguousarray(part, np.int64) for part in places]
         vectors = np.ascontiguousarray(z, float), np.ascontiguousarray(weights, float)

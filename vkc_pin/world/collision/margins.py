@@ -14,13 +14,13 @@ __all__ = ["MarginRegion", "Margins"]
 
 
 class MarginRegion(NamedTuple):
-    """A box in configuration space inside which some pairs have a smaller margin.
+    """A box in configuration space in which some pairs have a smaller margin.
 
     Attributes:
         pairs: Indices of the pairs, shape (k,).
-        margin: Their margin inside the region [m]; -inf disables the check.
-        columns: Indices in z of the coordinates that bound the region, shape (m,).
-        lower, upper: Bounds of these coordinates, shape (m,) each, [m] or [rad].
+        margin: Margin in the region [m]; -inf disables the check.
+        columns: Indices in z of the bounded coordinates, shape (m,).
+        lower, upper: Their bounds, shape (m,) each, [m] or [rad].
     """
 
     pairs: Ints
@@ -34,14 +34,9 @@ class Margins:
     """Margins of pairs: a default each, reduced between some waypoints and in some regions.
 
     Args:
-        default: Default margins of the pairs, shape (P,) [m].
-        relaxed: Pair → (first waypoint, last waypoint, margin [m]) of every span of waypoints with
-            a smaller margin.
+        default: Default margins, shape (P,) [m].
+        relaxed: Pair → spans of waypoints (first, last, margin [m]) with a smaller margin.
         regions: Regions with smaller margins.
-
-    Raises:
-        IndexError: A pair does not exist.
-        BuildError: See `solids.load_compiled`.
     """
 
     def __init__(
@@ -58,15 +53,12 @@ class Margins:
             self.compiled.near(*region)
 
     def compute_margins(self, pairs: Ints, waypoints: Ints, z: Floats, rows: Ints) -> Floats:
-        """Return the margins of pairs at given waypoints and configurations, shape (n,) [m].
+        """Return the margins of pairs [m], shape (n,); -inf where a pair need not be checked.
 
         Args:
             pairs: Indices of the pairs, shape (n,).
             waypoints: Waypoint of each pair, shape (n,).
             z: Minimal coordinates, shape (W, m).
             rows: Row of `z` for each pair, shape (n,).
-
-        Returns:
-            The margins; -inf where a pair need not be checked.
         """
         return np.asarray(self.compiled.at(pairs, waypoints, z, rows), float)

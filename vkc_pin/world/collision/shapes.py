@@ -24,10 +24,9 @@ class Witnesses(NamedTuple):
     """Signed distances of n pairs of shapes, with normals and witness points.
 
     Attributes:
-        distance: Signed distance, negative where shapes overlap, shape (n,) [m].
+        distance: Signed distance, shape (n,) [m].
         normal: Unit normal from the first to the second shape, world frame, shape (n, 3).
-        first, second: Witness points (closest, or deepest) on either shape, world frame, shape
-            (n, 3) each [m].
+        first, second: Witness points (closest, or deepest), world frame, shape (n, 3) each [m].
     """
 
     distance: Floats
@@ -39,21 +38,20 @@ class Witnesses(NamedTuple):
 class Shapes:
     """G shapes between which coal computes distances: first the M moving ones, then the fixed ones.
 
-    Distances equal those of `coal.distance` with a fresh result bit for bit. They depend neither on
-    the number of threads nor on earlier queries. A state is the placements of the moving shapes in
-    the world frame, shape (M, 12), in the format of `placements.flatten_placements`.
+    Distances equal those of `coal.distance` with a fresh result bit for bit, for any number of
+    threads. A state is the placements of the moving shapes in the world frame, shape (M, 12), in
+    the format of `placements.flatten_placements`.
 
     Args:
         geometries: coal's shapes, moving ones first.
-        fixed: Placements of the fixed shapes in the world frame; the others move.
+        fixed: Placements of the fixed shapes in the world frame.
         tolerance: Tolerance of GJK. With 1e-8, normals are accurate enough for gradients; with
-            coal's default of 1e-6 they are off by up to 5e-3. Both take the same time. (EPA keeps
-            its default tolerance, since below 1e-6 it fails for cylinders.)
+            coal's default of 1e-6, they are off by up to 5e-3. Both take the same time. EPA keeps
+            its default, since below 1e-6 it fails for cylinders.
         threads: Maximum number of threads. Default: `threads.count_threads`.
 
     Raises:
         InputError: A shape is of an unsupported type; see `solids.convert_solid`.
-        BuildError: See `solids.load_compiled`.
     """
 
     def __init__(
@@ -69,10 +67,10 @@ class Shapes:
         self.compiled: Any = load_compiled().Shapes(solids, flatten_placements(fixed), tolerance)
 
     def move_fixed(self, where: Mapping[int, pin.SE3]) -> Shapes:
-        """Return a copy with some fixed shapes at other placements.
+        """Return a copy with some fixed shapes moved.
 
         Args:
-            where: Shape index (among all G) → new placement in the world frame.
+            where: Index among all shapes → placement in the world frame.
         """
         other = object.__new__(Shapes)
         other.threads = self.threads
@@ -82,15 +80,12 @@ class Shapes:
         return other
 
     def compute_distances(self, moving: Floats, states: Ints, pairs: Ints) -> Floats:
-        """Return the signed distances of pairs, shape (n,) [m].
+        """Return the signed distances of pairs of shapes, shape (n,) [m].
 
         Args:
             moving: States, shape (W, M, 12).
             states: State of each pair, shape (n,).
             pairs: Pairs of shape indices, shape (n, 2).
-
-        Raises:
-            IndexError: A state or shape does not exist.
         """
         found = self.compiled.distances(
             moving, states, pairs, False, self._count_threads(len(pairs))
@@ -98,10 +93,7 @@ class Shapes:
         return np.asarray(found, float)
 
     def compute_witnesses(self, moving: Floats, states: Ints, pairs: Ints) -> Witnesses:
-        """Return the distances, normals and witness points of pairs.
-
-        Arguments and errors are those of `compute_distances`.
-        """
+        """Return distances, normals and witness points; see `compute_distances`."""
         return _to_witnesses(
             self.compiled.distances(moving, states, pairs, True, self._count_threads(len(pairs)))
         )
@@ -123,23 +115,19 @@ class Shapes:
 
         Args:
             moving: States, shape (W, M, 12).
-            edges: Index of the first pair of each state, and of the end of the last, shape
-                (W + 1,).
-            pairs: Pairs of shape indices, shape (n, 2), sorted by `bounds` within each state.
+            edges: Index of the first pair of each state, and the end of the last, shape (W + 1,).
+            pairs: Pairs of shape indices, shape (n, 2), sorted by `bounds` in each state.
             ranks: Order of pairs that tie, shape (n,).
             margins: Margins, shape (n,) [m].
-            bounds: Lower bounds of distance − margin, shape (n,) [m].
-            reach: Pairs further apart are omitted [m].
-            max_pairs: Maximum number of pairs per state. Default: no limit. Pairs that `bounds`
-                excludes are not evaluated.
-            rounding: Error of `bounds` that must be allowed for [m].
+            bounds: Lower bounds of distance − margin, shape (n,) [m]; pairs they exclude are not
+                evaluated.
+            reach: Largest distance [m].
+            max_pairs: Maximum number of pairs per state. Default: no limit.
+            rounding: Numerical error of `bounds` [m].
 
         Returns:
-            Indices of the selected pairs among the n, sorted by state, then by distance − margin;
-            and their distances and witness points.
-
-        Raises:
-            IndexError: A shape does not exist.
+            Indices of the selected pairs, sorted by state, then by distance − margin; and their
+            witnesses.
         """
         limits, limit = np.column_stack([margins, bounds]), -1 if max_pairs is None else max_pairs
         threads = self._count_threads(len(pairs))

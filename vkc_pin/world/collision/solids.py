@@ -86,10 +86,6 @@ _cache: dict[int, tuple[weakref.ref[Any], bytes, float, Any]] = {}  # by the id 
 
 
 def _convert_cached(shape: Any, points: Floats, radius: float) -> Any:
-    """Return a convex shape or mesh, from the cache if its points are the same.
-
-    Reading the faces is slow.
-    """
     key, content = id(shape), points.tobytes()
     if key in _cache:
         owner, before, swept, solid = _cache[key]

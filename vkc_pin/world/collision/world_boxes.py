@@ -16,13 +16,8 @@ class WorldBoxes:
     """Axis-aligned boxes in the world frame: of M moving shapes at W states, and of S fixed ones.
 
     Args:
-        lower: Lower corners of the moving shapes' boxes, shape (W, M, 3) [m].
-        upper: Upper corners of the moving shapes' boxes, shape (W, M, 3) [m].
-        fixed_lower: Lower corners of the fixed shapes' boxes, shape (S, 3) [m].
-        fixed_upper: Upper corners of the fixed shapes' boxes, shape (S, 3) [m].
-
-    Raises:
-        BuildError: See `solids.load_compiled`.
+        lower, upper: Corners of the moving shapes' boxes, shape (W, M, 3) [m].
+        fixed_lower, fixed_upper: Corners of the fixed shapes' boxes, shape (S, 3) [m].
     """
 
     def __init__(
@@ -51,20 +46,16 @@ class WorldBoxes:
 
         Args:
             first: State at the start of each interval, shape (K,).
-            last: State at the end of each interval, shape (K,); may equal `first` if nothing moves.
+            last: State at its end, shape (K,); equal without motion.
             pairs: Pairs of shape indices, shape (P, 2).
-            moved: Upper bound of the motion of any point of each shape in each interval, shape
-                (K, M + S) [m].
-            moves: Whether each shape moves in each phase, shape (phases, M + S). Pairs of which
-                neither shape moves are omitted.
+            moved: Largest motion of a point of each shape in each interval, shape (K, M + S) [m].
+            moves: Whether each shape moves in each phase, shape (phases, M + S). Pairs without
+                motion are omitted.
             phases: Phase of each interval, shape (K,).
             limit: Distance [m].
 
         Returns:
-            Interval index and pair index, shape (C,) each, sorted by interval, then by pair.
-
-        Raises:
-            IndexError: A state, phase or shape does not exist.
+            Indices of interval and pair, shape (C,) each, sorted by interval, then by pair.
         """
         numbers = (
             np.ascontiguousarray(part, np.int64)

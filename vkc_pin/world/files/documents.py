@@ -321,7 +321,7 @@ def _record_lines(
     file: Path,
     above: set[int],
 ) -> None:
-    """Add the lines of `node` and its descendants to `lines`; `above` has the ids of its parents."""
+    """Add the lines of `node` and its descendants; `above` has the ids of its parents."""
     lines.setdefault(path, node.start_mark.line + 1)
     if len(lines) > MAX_FIELDS:  # a few lines of aliases of aliases make any number
         raise InputError(

@@ -38,6 +38,26 @@ _XACRO_DEFINITIONS = (
 )  # of xacro's elements those that put nothing in their place
 
 
+def _make_error(
+    file: Path, element: ElementTree.Element, problem: str, **details: object
+) -> InputError:
+    return InputError(problem, file=file, line=find_line(element), **details)  # type: ignore[arg-type]
+
+
+def _check_limits(file: Path, name: str, joint: ElementTree.Element) -> None:
+    is_limited, limits = joint.get("type") in _LIMITED_TYPES, joint.findall("limit")
+    if is_limited and not limits:
+        problem = f"a {joint.get('type')} joint without limits"
+        raise _make_error(file, joint, problem, field=name, expected="<limit>")
+    for limit in limits:
+        keys = ("lower", "upper", "velocity", "effort")
+        lower, upper, _, _ = (_parse_limit(file, name, limit, key)[0] for key in keys)
+        if is_limited and lower > upper:
+            problem, got = "limits in the wrong order", f"{lower:g} and {upper:g}"
+            field, expected = f"{name}: limit", "lower ≤ upper"
+            raise _make_error(file, limit, problem, field=field, expected=expected, got=got)
+
+
 def check_tree(file: Path, root: ElementTree.Element) -> None:
     """Check that links and joints form one tree, with valid names, types and numbers.
 
@@ -47,14 +67,8 @@ def check_tree(file: Path, root: ElementTree.Element) -> None:
     """
     for element in root.iter():
         if element.tag.startswith("xacro:") and element.tag not in _XACRO_DEFINITIONS:
-            expected, line = "a plain URDF: xacro FILE > robot.urdf", find_line(element)
-            raise InputError(
-                "xacro has not been run",
-                file=file,
-                line=line,
-                expected=expected,
-                got=f"<{element.tag}>",
-            )
+            expected, got = "a plain URDF: xacro FILE > robot.urdf", f"<{element.tag}>"
+            raise _make_error(file, element, "xacro has not been run", expected=expected, got=got)
     links = _index_by_name(file, root, "link")
     if not links:
         raise InputError("there are no links", file=file, expected="<link> elements")
@@ -64,15 +78,8 @@ def check_tree(file: Path, root: ElementTree.Element) -> None:
         _check_joint(file, name, joint, joints)
         parent, child = (_find_link(file, name, joint, key, links) for key in ("parent", "child"))
         if child in above:
-            got, line = f"joints '{above[child][1]}' and '{name}'", find_line(joint)
-            raise InputError(
-                "a link with two parents",
-                file=file,
-                line=line,
-                field=child,
-                expected="one joint",
-                got=got,
-            )
+            problem, got = "a link with two parents", f"joints '{above[child][1]}' and '{name}'"
+            raise _make_error(file, joint, problem, field=child, expected="one joint", got=got)
         above[child] = parent, name
     _check_roots(file, links, above)
 
@@ -178,7 +185,7 @@ def parse_inertial(
     mass, inertia = inertial.find("mass"), inertial.find("inertia")
     if mass is None or inertia is None:
         lacks = f"an <inertial> without <{'mass' if mass is None else 'inertia'}>"
-        raise InputError(lacks, file=file, line=find_line(inertial), field=where)
+        raise _make_error(file, inertial, lacks, field=where)
     (weight,) = parse_numbers(file, mass, "value", 1, default=None, where=where)
     moments = tuple(
         parse_numbers(file, inertia, key, 1, default="0", where=where)[0] for key in MOMENTS
@@ -228,14 +235,7 @@ def parse_numbers(
         )
         if values and len(values) == count and all(map(math.isfinite, values)):
             expected = f"at most {largest:g}"
-        raise InputError(
-            "wrong numbers",
-            file=file,
-            line=find_line(element),
-            field=field,
-            expected=expected,
-            got=text,
-        )
+        raise _make_error(file, element, "wrong numbers", field=field, expected=expected, got=text)
     return values
 
 
@@ -247,17 +247,12 @@ def _index_by_name(
     for element in root.findall(tag):
         name = element.get("name", "")
         if not name.strip():
-            raise InputError(
-                f"a {tag} without a name",
-                file=file,
-                line=find_line(element),
-                expected=f'<{tag} name="...">',
+            raise _make_error(
+                file, element, f"a {tag} without a name", expected=f'<{tag} name="...">'
             )
         if name in found:
             got = f"lines {find_line(found[name])} and {find_line(element)}"
-            raise InputError(
-                f"two {tag}s of one name", file=file, line=find_line(element), field=name, got=got
-            )
+            raise _make_error(file, element, f"two {tag}s of one name", field=name, got=got)
         found[name] = element
     return found
 
@@ -272,12 +267,8 @@ def _find_link(
     """Return the link that a joint names as its "parent" or "child"."""
     element = joint.find(key)
     if element is None or element.get("link") is None:
-        raise InputError(
-            "a joint that connects nothing",
-            file=file,
-            line=find_line(joint),
-            field=name,
-            expected=f'<{key} link="...">',
+        raise _make_error(
+            file, joint, "a joint that connects nothing", field=name, expected=f'<{key} link="...">'
         )
     link = element.get("link", "")
     if link not in links:
@@ -294,44 +285,20 @@ def _parse_limit(file: Path, name: str, limit: ElementTree.Element, key: str) ->
 def _check_joint(
     file: Path, name: str, joint: ElementTree.Element, joints: Collection[str]
 ) -> None:
-    kind, line = joint.get("type"), find_line(joint)
+    kind = joint.get("type")
     if kind not in _JOINT_TYPES:
-        expected = ", ".join(_JOINT_TYPES)
-        raise InputError(
-            "this joint type is not supported",
-            file=file,
-            line=line,
-            field=name,
-            expected=expected,
-            got=kind,
-        )
+        problem, expected = "this joint type is not supported", ", ".join(_JOINT_TYPES)
+        raise _make_error(file, joint, problem, field=name, expected=expected, got=kind)
     for origin in joint.findall("origin"):
         for key in ("xyz", "rpy"):
             parse_numbers(file, origin, key, 3, default="0 0 0", where=name)
     for axis in joint.findall("axis") if kind not in _TYPES_WITHOUT_AXIS else ():
         if not math.hypot(*parse_numbers(file, axis, "xyz", 3, default="1 0 0", where=name)) > 0.0:
-            line = find_line(axis)
-            raise InputError(
-                "an axis without direction", file=file, line=line, field=name, got=axis.get("xyz")
-            )
-    limits = joint.findall("limit")
-    if kind in _LIMITED_TYPES and not limits:
-        raise InputError(
-            f"a {kind} joint without limits", file=file, line=line, field=name, expected="<limit>"
-        )
-    for limit in limits:
-        lower, upper, _, _ = (
-            _parse_limit(file, name, limit, key)[0]
-            for key in ("lower", "upper", "velocity", "effort")
-        )
-        if kind in _LIMITED_TYPES and lower > upper:
-            field, got, line = f"{name}: limit", f"{lower:g} and {upper:g}", find_line(limit)
-            problem = "limits in the wrong order"
-            raise InputError(
-                problem, file=file, line=line, field=field, expected="lower ≤ upper", got=got
-            )
+            problem, got = "an axis without direction", axis.get("xyz")
+            raise _make_error(file, axis, problem, field=name, got=got)
+    _check_limits(file, name, joint)
     for mimic in joint.findall("mimic"):
-        if (followed := mimic.get("joint", "")) not in joints:  # published robots have that
+        if (followed := mimic.get("joint", "")) not in joints:  # occurs in published robots
             warnings.warn(
                 f"{file}:{find_line(mimic)}: {name}: there is no joint '{followed}' to follow",
                 stacklevel=2,
@@ -346,29 +313,15 @@ def _check_roots(
     """Check that all links descend from one root."""
     roots = [link for link in links if link not in above]
     if len(roots) > 1:
-        got, line = ", ".join(roots[:5]), find_line(links[roots[1]])
-        raise InputError(
-            "links that nothing connects",
-            file=file,
-            line=line,
-            field=roots[1],
-            expected="one root",
-            got=got,
-        )
+        problem, got, second = "links that nothing connects", ", ".join(roots[:5]), roots[1]
+        raise _make_error(file, links[second], problem, field=second, expected="one root", got=got)
     reaches = set(roots)
     for link in links:
         path = list(_walk_to_root(link, above, reaches))
         if path and path[-1] in path[:-1]:
             circle = path[path.index(path[-1]) :]
-            line = find_line(links[link])
-            raise InputError(
-                "links in a circle",
-                file=file,
-                line=line,
-                field=link,
-                expected="a tree",
-                got=" → ".join(circle[::-1]),
-            )
+            problem, got = "links in a circle", " → ".join(circle[::-1])
+            raise _make_error(file, links[link], problem, field=link, expected="a tree", got=got)
         reaches.update(path)
 
 

@@ -308,9 +308,9 @@ def _find_colour(mesh: trimesh.Trimesh) -> tuple[float, float, float, float] | N
 def _fix_box_support() -> None:
     """Fix the support function of boxes for this process.
 
-    The first direction in which coal 3.0.3 supports a box decides whether all boxes are 1e-10 larger
-    on their negative sides: they are if a component is zero (a `static` in `getShapeSupport`).
-    These queries, without such a component, precede all others.
+    The first direction in which coal 3.0.3 supports a box decides whether all boxes are 1e-10
+    larger on their negative sides: they are if a component is zero (a `static` in
+    `getShapeSupport`). These queries, without such a component, precede all others.
     """
     turned = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
     box, here, there = (

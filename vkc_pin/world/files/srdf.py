@@ -26,7 +26,7 @@ class Srdf:
     states: dict[str, dict[str, float]]
 
     def state(self, joints: Collection[str]) -> dict[str, float]:
-        """Return the state home, default, rest, or the first one that covers all `joints`; else {}."""
+        """Return home, default, rest, or the first state that covers all `joints`; else {}."""
         fitting = {name: state for name, state in self.states.items() if set(joints) <= set(state)}
         for name in ("home", "default", "rest"):
             if name in fitting:

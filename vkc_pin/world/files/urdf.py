@@ -75,7 +75,7 @@ class UrdfShape:
         return kinds[self.kind](*self.size)
 
     def make_mesh(self) -> trimesh.Trimesh:
-        """Return its triangles in the link's frame [m]; round shapes have 64 circumscribed sides."""
+        """Return its triangles in the link's frame [m]; 64 tangent planes replace round sides."""
         import trimesh
 
         if self.file is not None:
@@ -184,10 +184,9 @@ class UrdfFile:
         geometry = element.find("geometry")
         shape = next(iter(geometry), None) if geometry is not None else None
         if shape is None:
-            raise InputError(
+            raise self._make_error(
+                element,
                 "an element without geometry",
-                file=self.path,
-                line=find_line(element),
                 field=name,
                 expected="<geometry> with a shape",
             )
@@ -221,24 +220,20 @@ class UrdfFile:
             )
         else:
             known = "box, sphere, cylinder, capsule or mesh"
-            raise InputError(
-                "this shape is not supported",
-                file=self.path,
-                line=find_line(element),
-                field=name,
-                expected=known,
-                got=shape.tag,
+            raise self._make_error(
+                element, "this shape is not supported", field=name, expected=known, got=shape.tag
             )
         if min(size) <= 0.0:
-            raise InputError(
-                "a shape without volume",
-                file=self.path,
-                line=find_line(element),
-                field=name,
-                expected="sizes above 0",
-                got=size,
+            raise self._make_error(
+                element, "a shape without volume", field=name, expected="sizes above 0", got=size
             )
         return UrdfShape(link, name, placement, shape.tag, size, colour=colour)
+
+    def _make_error(
+        self, element: ElementTree.Element, problem: str, **details: object
+    ) -> InputError:
+        line = find_line(element)
+        return InputError(problem, file=self.path, line=line, **details)  # type: ignore[arg-type]
 
     def _colour(self, material: ElementTree.Element) -> Colour | None:
         colour = material.find("color")

@@ -35,7 +35,7 @@ class MovedJoint(NamedTuple):
         coordinate: Index of the coordinate.
         joint: Index of the joint.
         factor, offset: 1 and 0, except for mimic joints.
-        slides: Whether the coordinate translates the joint rather than rotating it.
+        slides: Whether the joint is prismatic.
     """
 
     coordinate: int

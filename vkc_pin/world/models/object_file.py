@@ -222,11 +222,11 @@ def build_object(document: Document, folder: Path, name: str | None = None) -> A
 
     Args:
         document: The description.
-        folder: Folder to which paths in the description are relative.
+        folder: Base of relative paths.
         name: Name of the object. Default: the robot name in the URDF.
 
     Raises:
-        UnknownNameError: The description names a field, link or joint that does not exist.
+        UnknownNameError: The description names an unknown field, link or joint.
         InputError: The description or its URDF is invalid.
     """
     schema = parse_document(document, ObjectSchema)

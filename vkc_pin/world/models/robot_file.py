@@ -165,36 +165,7 @@ def load_robot(
             nearest name.
         InputError: A file or value is invalid, no joint can be planned, or no links can collide.
     """
-    for value, field, choices, kind in (
-        (base, "base", _BASES, "kind of base"),
-        (pairs, "pairs", _PAIRS, "source of pairs"),
-    ):
-        if not isinstance(value, str) or value not in choices:
-            raise InputError(
-                f"wrong {kind}", field=field, expected=" or ".join(choices), got=format_value(value)
-            )
-    for field, given_name, kind in (
-        ("tool_frame", tool_frame, "the name of a frame"),
-        ("arm", arm, "the name of a group"),
-    ):
-        if given_name is not None:
-            check_text(given_name, field, kind)
-    if arm is not None and tool_frame is not None:
-        raise InputError(
-            "`arm` and `tool_frame` exclude each other",
-            field="arm, tool_frame",
-            expected="one of them",
-            got=f"{arm}, {tool_frame}",
-        )
-    positions = {}
-    for field, values in (("locked_joints", locked_joints), ("home", home)):
-        checked = check_mapping(
-            {} if values is None else values, field, "joints, each with its position"
-        )
-        positions[field] = {
-            joint: check_coordinate(value, f"{field}.{joint}") for joint, value in checked.items()
-        }
-    home, locked_joints = positions["home"], positions["locked_joints"]
+    locked_joints, home = _check_arguments(base, pairs, tool_frame, arm, locked_joints, home)
     files = _read_files(
         name,
         check_mapping(
@@ -294,6 +265,47 @@ def load_robot(
     return robot
 
 
+def _check_arguments(
+    base: Base,
+    pairs: str,
+    tool_frame: str | None,
+    arm: str | None,
+    locked_joints: Mapping[str, float] | None,
+    home: Mapping[str, float] | None,
+) -> tuple[Mapping[str, float], Mapping[str, float]]:
+    """Check arguments of `load_robot`, and return locked joints and home positions."""
+    for value, field, choices, kind in (
+        (base, "base", _BASES, "kind of base"),
+        (pairs, "pairs", _PAIRS, "source of pairs"),
+    ):
+        if not isinstance(value, str) or value not in choices:
+            raise InputError(
+                f"wrong {kind}", field=field, expected=" or ".join(choices), got=format_value(value)
+            )
+    for field, given_name, kind in (
+        ("tool_frame", tool_frame, "the name of a frame"),
+        ("arm", arm, "the name of a group"),
+    ):
+        if given_name is not None:
+            check_text(given_name, field, kind)
+    if arm is not None and tool_frame is not None:
+        raise InputError(
+            "`arm` and `tool_frame` exclude each other",
+            field="arm, tool_frame",
+            expected="one of them",
+            got=f"{arm}, {tool_frame}",
+        )
+    positions = {}
+    for field, values in (("locked_joints", locked_joints), ("home", home)):
+        checked = check_mapping(
+            {} if values is None else values, field, "joints, each with its position"
+        )
+        positions[field] = {
+            joint: check_coordinate(value, f"{field}.{joint}") for joint, value in checked.items()
+        }
+    return positions["locked_joints"], positions["home"]
+
+
 @dataclass(frozen=True, eq=False)
 class _RobotFiles:
     """Parsed files of a robot; `source` is its robot.yaml, or its URDF if there is none."""
@@ -335,11 +347,7 @@ class _RobotFiles:
         )
 
     def check_names(self, joints: Collection[str]) -> None:
-        """Check that the joints and links named in robot.yaml exist.
-
-        Raises:
-            UnknownNameError: A joint or link does not exist.
-        """
+        """Check that the joints and links named in robot.yaml exist."""
         settings = self.settings
         for key in ("home", "locked_joints", "gripper", "joints"):
             for joint in getattr(settings, key):
@@ -354,11 +362,7 @@ class _RobotFiles:
                 )
 
     def check_limits(self, full: pin.Model, joint: str, position: float, field: str) -> None:
-        """Check that a home or locked position is within the joint's limits.
-
-        Raises:
-            InputError: The position is outside the limits.
-        """
+        """Check that a home or locked position is within the joint's limits."""
         moving = full.joints[full.getJointId(joint)]
         if moving.nq == 1:
             low, high = full.lowerPositionLimit[moving.idx_q], full.upperPositionLimit[moving.idx_q]
@@ -386,11 +390,7 @@ class _RobotFiles:
     def check_followers(
         self, model: pin.Model, rest: Mapping[str, float], known_positions: Collection[str]
     ) -> None:
-        """Check that given home positions agree with the couplings of joints.
-
-        Raises:
-            InputError: A home position contradicts a coupling.
-        """
+        """Check that given home positions agree with the couplings of joints."""
         coordinates = Coordinates(model)
         for move in coordinates.moves[3:]:
             joint, leader = str(model.names[move.joint]), coordinates.names[move.coordinate]

@@ -71,10 +71,10 @@ def build_planned_model(
     Args:
         full: The robot with all joints; see `build_full_model`.
         file: The robot's URDF.
-        tool_frame: Name of the tool frame.
-        rest: Position at which each joint is locked, [m] or [rad]; see `compute_rest_positions`.
-        locked: Positions of planned joints that are to be locked as well, [m] or [rad].
-        height: Height of the root link above the base joint, which moves on the floor [m].
+        tool_frame: The tool frame.
+        rest: Position of each locked joint, [m] or [rad]; see `compute_rest_positions`.
+        locked: Positions of planned joints to lock as well, [m] or [rad].
+        height: Height of the root link above the base joint [m].
 
     Raises:
         InputError: No joint is left to plan, or a follower is locked but not its leader.
@@ -129,15 +129,9 @@ def build_unlocked_model(
     rest: Mapping[str, float],
     height: float,
 ) -> pin.Model:
-    """Return a model with the joints of `model` followed by additional unlocked `joints`.
+    """Return a model with the joints of `model` followed by additional `joints`.
 
-    Args:
-        full: The robot with all joints; see `build_full_model`.
-        file: The robot's URDF.
-        model: The planned joints; see `build_planned_model`.
-        joints: Names of the additional joints; mimic joints among them become independent.
-        rest: Positions at which the other joints are locked, [m] or [rad].
-        height: Height of the root link above the base joint [m].
+    Mimic joints among them become independent. For the other arguments, see `build_planned_model`.
     """
     own, last = (
         [full.getJointId(str(name)) for name in names] for names in (list(model.names)[1:], joints)
@@ -232,8 +226,8 @@ def find_base_joints(full: pin.Model, file: UrdfFile) -> tuple[str, ...]:
     """Return the joints of a planar base in the URDF, or no joints if it has none.
 
     A planar base is a chain of the first three joints: two prismatic ones along different
-    horizontal axes and one revolute or continuous one about the vertical axis, in any order. No
-    link before the last of them has collision shapes.
+    horizontal axes and a revolute or continuous one about the vertical axis, in any order, without
+    collision shapes before the last one.
     """
     data, slides, found, joint = full.createData(), list[Floats](), list[str](), 1
     pin.computeJointJacobians(full, data, pin.neutral(full))
@@ -303,13 +297,10 @@ def find_default_tool_frame(full: pin.Model, file: UrdfFile) -> str:
 
 
 def load_collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
-    """Return the collision shapes of `file` on the joints of `model`, named `<link>_<k>`.
-
-    Meshes are replaced by their convex hulls.
+    """Return the convex collision shapes of `file` on the joints of `model`, named `<link>_<k>`.
 
     Raises:
-        InputError: A shape is not supported, a mesh cannot be read or is flat, or there are no
-            shapes.
+        InputError: A shape or mesh is invalid, or there are no shapes.
     """
     geometry = pin.GeometryModel()
     for shape in file.read_shapes_for_model("collision"):
@@ -329,9 +320,8 @@ def load_collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryMod
 def load_visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     """Return the visual geometry of `file` on the joints of `model`, one shape per colour.
 
-    Meshes are simplified for display in a browser. The shapes hold triangles
-    (`coal.BVHModelOBBRSS`) and `meshColor`; `meshPath` is empty, so that viewers do not load files
-    themselves.
+    Meshes are simplified for display in a browser. `meshPath` is empty, so that viewers draw the
+    triangles of the shapes.
 
     Raises:
         InputError: A shape is not supported, or a mesh cannot be read.
@@ -363,19 +353,7 @@ def _lock_joints(
     follows: Mapping[str, JointCoupling],
     last: Collection[int] = (),
 ) -> pin.Model:
-    """Return `full` with the joints that are not `planned` locked at `q`.
-
-    `pinocchio.buildReducedModel` fails if a link and a joint share a name, which is common. Here,
-    the frames of such joints are omitted, so that frame names are unique.
-
-    Args:
-        full: The robot with all joints.
-        planned: Indices of the joints that stay.
-        q: Configuration at which the others are locked, shape (nq,).
-        height: Height of everything on joint 1 above that joint [m].
-        follows: Follower → coupling. Followers come after their leaders.
-        last: Indices of the joints that come last.
-    """
+    """Return `full` with all joints but `planned` locked at `q`; joints in `last` come last."""
     data = full.createData()
     pin.forwardKinematics(full, data, q)
     model = pin.Model()

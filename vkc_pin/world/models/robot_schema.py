@@ -152,10 +152,9 @@ def read_wheels(
 
     Args:
         base: Type of the base.
-        turning_radius: Minimum turning radius of an "ackermann" base [m]. Default: that of
-            robot.yaml.
+        turning_radius: Minimum turning radius of an "ackermann" base [m], or None.
         settings: Contents of the robot.yaml.
-        source: Path of the robot.yaml or URDF, for error messages.
+        source: Path of the robot.yaml or URDF, for messages.
 
     Raises:
         InputError: The radius is invalid, missing for an "ackermann" base, or given for another.

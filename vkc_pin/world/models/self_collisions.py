@@ -55,7 +55,7 @@ _HOME_SEARCH_RADII, _HOME_SEARCH_SAMPLES = (
 
 
 class SelfCollisionAnalysis(NamedTuple):
-    """Results of the analysis of a robot's self-collisions.
+    """Self-collisions of a robot.
 
     Attributes:
         allowed: Sorted pair of links that need not be checked → reason.
@@ -70,12 +70,7 @@ class SelfCollisionAnalysis(NamedTuple):
 
 
 def set_collision_pairs(robot: Robot, allowed: Collection[Pair]) -> Robot:
-    """Return a copy of `robot` with all pairs of links in relative motion as collision pairs.
-
-    Args:
-        robot: The robot; its collision pairs are ignored.
-        allowed: Sorted pairs of links to leave out.
-    """
+    """Return a copy of `robot` with all pairs in relative motion but those `allowed`."""
     collision, shapes = pin.GeometryModel(), robot.collision.geometryObjects
     for shape in shapes:
         collision.addGeometryObject(shape)
@@ -91,13 +86,8 @@ def apply_self_collision_analysis(
 ) -> Robot:
     """Return a copy of `robot` with collision pairs and home from `analyze_self_collisions`.
 
-    Warns if the home was moved, or if links that are not neighbours are exempt from checks.
-
-    Args:
-        robot: The robot; its collision pairs are ignored.
-        semantics: The robot's SRDF. Without one, pairs are sampled.
-        loose: Planned joints without a stated home position.
-        samples: Number of random configurations.
+    Warns if the home was moved, or if links that are not neighbours are exempt from checks. Without
+    an SRDF (`semantics`), pairs are sampled.
     """
     listed = None if semantics is None else semantics.allowed
     found, names = (
@@ -141,14 +131,13 @@ def analyze_self_collisions(
 
     Allowed pairs are those `listed`, or else those of `sample_allowed_pairs`, and pairs that no
     motion can separate: neighbours that are always close ("Adjacent"), links that always overlap or
-    touch ("Always"), and links that overlap at home ("Home"). If links overlap at home and there
-    are `loose` joints, the home is moved to the nearest sampled configuration with the fewest
-    overlaps.
+    touch ("Always"), and links that overlap at home ("Home"). If links overlap at home, the home is
+    moved to the nearest sampled configuration with the fewest overlaps.
 
     Args:
         robot: The robot; its collision pairs are ignored.
         listed: Sorted pairs of the SRDF → reason.
-        loose: Planned joints without a stated home position.
+        loose: Planned joints without a stated home position, which may be moved.
         samples: Number of random configurations.
     """
     inputs = (
@@ -176,14 +165,14 @@ def sample_allowed_pairs(
 
     "Adjacent": a joint connects the links, or the rigid bodies they belong to if they are always
     less than 50 mm apart. "Always": they collide in all samples. "Never": they collide in no
-    sample; pairs that come closer than 50 mm do not collide either in random descents of their
-    distance from the closest samples. Samples are uniform within the joint limits (±π if there are
-    none), with the base at the origin.
+    sample; pairs closer than 50 mm do not collide in random descents from the closest samples
+    either. Samples are uniform within the joint limits (±π without limits), with the base at the
+    origin.
 
     Args:
         robot: The robot; its collision pairs are ignored.
         samples: Number of random configurations.
-        seed: Random seed; the same seed gives the same pairs.
+        seed: Random seed.
     """
     groups, (adjacent, adjacent_bodies) = (
         _group_shape_pairs(robot),
@@ -348,10 +337,7 @@ def _group_shape_pairs(robot: Robot) -> dict[Pair, Parts]:
 def _compute_max_distances(
     robot: Robot, groups: Mapping[Pair, Parts], samples: int
 ) -> dict[Pair, float]:
-    """Return the largest distances of pairs of links, at home and in random configurations [m].
-
-    Distances of 50 mm or more are lower bounds.
-    """
+    """Return the largest distances at home and in samples [m]; above 50 mm, lower bounds."""
     distances, (low, high), rng = (
         _make_shape_distances(robot),
         _find_sampling_bounds(robot),

@@ -91,12 +91,9 @@ def compute_clearance(
     """Return the smallest signed distance between two groups of shapes [m].
 
     Args:
-        first: Shapes of the first group with their placements in the world frame.
-        second: Shapes of the second group, likewise.
+        first: Shapes with their placements in the world frame.
+        second: Other shapes, likewise.
         reach: Cutoff [m]: if all distances are larger, the result is some number ≥ `reach`.
-
-    Returns:
-        The distance; negative values are penetration depths.
     """
     nearest, others = reach, list(second)
     boxes = np.array([compute_world_box(shape, placement) for shape, placement in others]).reshape(
@@ -232,14 +229,7 @@ class ShapeDistances:
         return np.asarray(self._centres[:, 2] - np.einsum("ki,ki->k", across, self._halves))
 
     def compute_lower_bounds(self, pairs: Ints) -> Floats:
-        """Return lower bounds of the distances of pairs of shapes, from bounding spheres.
-
-        Args:
-            pairs: Pairs of shape indices, shape (P, 2).
-
-        Returns:
-            Lower bounds, shape (P,) [m].
-        """
+        """Return lower bounds [m], shape (P,), of the distances of `pairs`, by bounding spheres."""
         first, second = pairs[:, 0], pairs[:, 1]
         gaps = self._centres[first] - self._centres[second]
         return np.asarray(
@@ -275,15 +265,11 @@ class ShapeDistances:
 class LinkDistances:
     """Computes distances between pairs of links, one configuration at a time.
 
-    Bounding spheres, evaluated for all pairs at once, exclude most pairs of links in most
-    configurations.
+    Bounding spheres of all pairs are evaluated at once and exclude most.
 
     Args:
         distances: Distances between the shapes.
         groups: Pair of links → pairs of their shapes.
-
-    Attributes:
-        links: The pairs of links, in the given order.
     """
 
     links: list[tuple[str, str]]

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-import pytest
 from helpers.telescopes import joint, link, write_telescope
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -17,7 +16,6 @@ from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.couplings.coupled_joints import find_followers
 from vkc_pin.world.models.couplings.limits import tighten_coupled_limits
-from vkc_pin.world.models.couplings.mimic_joints import sort_joints
 from vkc_pin.world.models.robot_model import (
     build_full_model,
     build_planned_model,
@@ -109,18 +107,6 @@ def test_dynamics_include_followers(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.array(torques).ravel(), expected, atol=1e-9)
     center, expected = cpin.center_of_mass(model)(q), pin.centerOfMass(model, data, q)
     np.testing.assert_allclose(np.array(center).ravel(), expected, atol=1e-9)
-
-
-def test_joints_are_sorted_after_their_leaders() -> None:
-    """Followers on the first branch come after their leaders on the second one."""
-    model = pin.Model()
-    first = model.addJoint(0, pin.JointModelRX(), pin.SE3.Identity(), "first")
-    model.addJoint(first, pin.JointModelRX(), pin.SE3.Identity(), "on it")
-    second = model.addJoint(0, pin.JointModelRX(), pin.SE3.Identity(), "second")
-    assert sort_joints(model, {}) == [1, 2, 3]
-    assert sort_joints(model, {first: {second}}) == [3, 1, 2]
-    with pytest.raises(vkc.InputError, match="of each other's followers"):
-        sort_joints(model, {first: {second}, second: {first}})
 
 
 def test_leaders_may_be_on_another_branch(tmp_path: Path) -> None:

@@ -204,10 +204,7 @@ def _resolve_coupling(
     *,
     any_leader: bool = False,
 ) -> JointCoupling | None:
-    """Return the coupling of a joint to the end of its chain, or None if the chain is circular.
-
-    Also None if the end of the chain cannot move, unless `any_leader` is set.
-    """
+    """Return the coupling of a joint to its leader at the end of the chain."""
     leader, factor, offset, visited = joint, 1.0, 0.0, set[str]()
     while leader in mimics and leader in movable:
         if leader in visited:

@@ -166,10 +166,7 @@ class Gripper:
 def _attach_shapes(
     shapes: Sequence[pin.GeometryObject], model: pin.Model, unlocked: pin.Model
 ) -> list[pin.GeometryObject]:
-    """Return copies of shapes on `model`, attached to `unlocked`.
-
-    The first joints of `unlocked` are those of `model`.
-    """
+    """Return copies of the shapes on the joints of the model with unlocked fingers."""
     found = []
     for shape in shapes:
         copy, old = pin.GeometryObject(shape), model.frames[shape.parentFrame]
@@ -197,20 +194,19 @@ def build_gripper(
     """Return the gripper described in a robot.yaml, or None if it describes none.
 
     Args:
-        full: The robot with all joints, see `robot_model.build_full_model`.
+        full: The robot with all joints.
         file: The robot's URDF.
-        model: The robot with only the planned joints unlocked.
-        collision: The robot's collision shapes on `model`.
-        tool_frame: The robot's tool frame.
+        model: The robot with the planned joints.
+        collision: Collision shapes on `model`.
+        tool_frame: The tool frame.
         rest: Rest positions of all joints, [m] or [rad].
-        stated: Finger joint → its closed and open positions; the joints exist.
+        stated: Finger joint → its closed and open positions.
         document: The robot.yaml.
-        height: Height of the root link above the floor [m].
+        height: Height of the root link [m].
 
     Raises:
-        InputError: A joint is not a finger joint (it belongs to the arm, mimics another joint, or
-            does not move), its positions are outside its limits, or the open gripper is not wider
-            than the closed one.
+        InputError: A joint is not a finger joint, its positions are outside its limits, or the open
+            gripper is not wider than the closed one.
     """
     if not stated:
         return None

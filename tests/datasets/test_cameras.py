@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -104,23 +103,3 @@ def test_the_digest_knows_of_cameras_and_is_as_it_was_without() -> None:
 def test_wrong_cameras(cameras: Any, said: str) -> None:
     with pytest.raises(vkc.InputError, match=said):
         load_recipe({**SEEING, "cameras": cameras})
-
-
-def test_cameras_need_physics_frames_and_opengl(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with pytest.raises(vkc.InputError, match="--simulate"):
-        generate(SMALL, 1, tmp_path / "out", cameras=True)
-    lost = [{**EYES[0], "frame": "hed_link"}]
-    monkeypatch.setattr(snapshots, "_CONTEXTS", ("no_such_context",))
-    with pytest.raises(vkc.VkcError, match="EGL or OSMesa"):
-        generate(SEEING, 1, tmp_path / "out")
-    monkeypatch.undo()
-    try:
-        with snapshots.open_gl_context((8, 8)):
-            pass
-    except vkc.VkcError as error:
-        pytest.skip(str(error))
-    with pytest.raises(vkc.UnknownNameError, match="frame of husky_ur5e"):
-        generate({**SEEING, "cameras": lost}, 1, tmp_path / "out")
-    assert not (tmp_path / "out").exists()

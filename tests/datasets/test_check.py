@@ -1,23 +1,18 @@
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
 import pytest
-from helpers.datasets import SMALL
 
 from vkc_pin.cli import main
 from vkc_pin.datasets.check import check_dataset
 from vkc_pin.datasets.dataset import Dataset
-from vkc_pin.datasets.generate import generate
+from vkc_pin.datasets.episode import compute_scene_name
 from vkc_pin.errors import InputError
 
 h5py = pytest.importorskip("h5py")
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return generate(SMALL, 4, tmp_path_factory.mktemp("made") / "out")
 
 
 @pytest.fixture
@@ -51,10 +46,6 @@ def test_a_motion_that_was_changed_is_refused(copy: Path) -> None:
 
 def test_a_scene_in_which_something_is_in_the_way(copy: Path) -> None:
     """The check builds the scenes from the files: it does not believe what planning saw."""
-    import json
-
-    from vkc_pin.datasets.episode import compute_scene_name
-
     episode = next(Dataset.open(copy).episodes())
     middle = episode.trajectory.at(episode.trajectory.times[-1] / 2.0)
     document = json.loads(json.dumps(episode.document))

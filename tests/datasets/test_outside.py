@@ -13,35 +13,14 @@ from helpers.datasets import SMALL
 
 from vkc_pin.datasets.check import check_dataset
 from vkc_pin.datasets.dataset import Dataset
-from vkc_pin.datasets.formats.hdf5 import write_shard
 from vkc_pin.datasets.generate import generate
 from vkc_pin.datasets.recipes.recipe import RobotEntry, load_recipe
 from vkc_pin.datasets.robots import prepare_robots
 from vkc_pin.errors import InputError
 
 h5py = pytest.importorskip("h5py")
-EPISODES = 2
-NOT_NAMES = [
-    "../../../evil",
-    "/evil",
-    "a/b",
-    "..",
-    ".",
-    "",
-    ".hidden",
-    "a\\b",
-    "a\nb",
-    "x" * 300,
-    "\ud800",
-    3,
-    None,
-    ["a"],
-]
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return generate(SMALL, EPISODES, tmp_path_factory.mktemp("made") / "out")
+EPISODES = 4
+NOT_NAMES = ["../../../evil", "/evil", "a/b", "..", "", ".hidden", "a\\b", "x" * 300, "\ud800", 3]
 
 
 @pytest.fixture
@@ -110,67 +89,12 @@ def test_a_scene_in_a_work_file_that_is_not_a_name(copy: Path, tmp_path: Path, n
     assert sorted((copy / "scenes").iterdir()) == scenes
 
 
-def test_names_with_dots_and_spaces_are_names(copy: Path) -> None:
-    change_journal(copy, robot="ur5e v2.1")
-    dataset = generate(SMALL, EPISODES, copy)
-    assert [shard.parent.name for shard in dataset.shards] == ["ur5e v2.1"]
-
-
-def test_a_scene_that_is_copied_from_a_shard(made: Dataset, tmp_path: Path) -> None:
-    source = tmp_path / "source.hdf5"
-    shutil.copyfile(made.shards[0], source)
-    with h5py.File(source, "r+") as opened:
-        opened["data/demo_1"].attrs["scene"] = "../evil"
-        opened["scene"] = [1, 2, 3]
-    with pytest.raises(InputError, match="demo_1: scene: not a plain file name"):
-        write_shard(tmp_path / "out" / "shard.hdf5", [(source, 1)], tmp_path / "out" / "scenes")
-    assert [path.name for path in tmp_path.iterdir()] == ["source.hdf5"]
-
-
-def test_a_robot_of_a_scene_that_is_not_a_name(made: Dataset) -> None:
-    episode = next(made.episodes())
-    document = {**episode.document, "robot": {"name": "../../elsewhere"}}
-    with pytest.raises(InputError, match=r"robot\.name: not a plain file name"):
-        dataclasses.replace(episode, document=document).scene()
-
-
 def test_a_robot_of_a_recipe_that_gives_no_name(tmp_path: Path) -> None:
     recipe = load_recipe(SMALL)
     fields = recipe.fields.model_copy(update={"robots": (RobotEntry(name=f"{tmp_path}/a/.."),)})
     with pytest.raises(InputError, match="robots: not a plain file name"):
         prepare_robots(dataclasses.replace(recipe, fields=fields), tmp_path / "out" / "robots")
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    "link",
-    [
-        "README.md",
-        "recipe.yaml",
-        "episodes.csv",
-        "failures.csv",
-        "journal.jsonl",
-        "work",
-        "shards",
-        "scenes",
-        "robots",
-        "lerobot",
-    ],
-)
-@pytest.mark.parametrize("relative", [True, False], ids=["relative", "absolute"])
-def test_links_that_lead_out_are_refused(
-    copy: Path, tmp_path: Path, link: str, relative: bool
-) -> None:
-    path, target = copy / link, tmp_path / "outside" / link
-    if path.exists():
-        path.rename(target)  # so that all is as it should be, but for the place
-    path.symlink_to(Path("../../../outside") / link if relative else target)
-    before = surroundings(copy, tmp_path)
-    with pytest.raises(InputError, match="a symbolic link leads out of the folder") as caught:
-        generate(SMALL, EPISODES, copy)
-    assert caught.value.file == str(path)
-    assert caught.value.got == target
-    assert surroundings(copy, tmp_path) == before
 
 
 def test_a_deep_link_is_refused_and_links_inside_are_not(copy: Path, tmp_path: Path) -> None:

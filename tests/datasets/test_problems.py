@@ -91,12 +91,6 @@ def test_what_is_fetched_is_put_on_another_table() -> None:
     )  # the ball's radius above it
 
 
-def test_scene_files() -> None:
-    found = drawn(0, tasks=["drive-open"], scenes=["drawer"])
-    assert found.scene.name == "drawer"
-    assert found.about["robot"] == "husky_ur5e"
-
-
 def test_nothing_is_left() -> None:
     with pytest.raises(NoProblemError, match="no free start in room_0"):
         drawn(0, tasks=["drive-open"], start={"distance": [50.0, 60.0]})

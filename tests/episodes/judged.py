@@ -49,7 +49,7 @@ def saved(episode: Episode, path: Path) -> Path:
             steps=episode.steps,
             options=episode.options,
             trajectory=episode.trajectory,
-            validation=episode.claimed,
+            report=episode.claimed,
             status="success",
             terms=episode.terms,
         )

@@ -20,7 +20,7 @@ from . import odd
 from .calls import TINY
 from .mutate import changed, data_changes, spoiled
 
-__all__ = ["case", "document_case", "options_case", "run", "run_document", "run_options"]
+__all__ = ["case", "document_case", "run", "run_document"]
 
 MESHES = {"stl": "box.stl", "obj": "box.obj", "ply": "box.ply", "dae": "box.dae"}
 PLANNED = 0.02  # the share of what loads that is planned in
@@ -32,7 +32,7 @@ def pool() -> Path:
     root = Path(tempfile.mkdtemp(prefix="vkc_fuzz_files_"))
     atexit.register(shutil.rmtree, root, ignore_errors=True)
     for kind in ("robots", "scenes"):
-        shutil.copytree(find_resource_folder(kind), root / kind)
+        shutil.copytree(find_resource_find_resource_folder(kind), root / kind)
     for name in MESHES.values():
         if not name.endswith("dae"):
             trimesh.creation.box(extents=(0.5, 0.4, 0.3)).export(root / "scenes" / name)
@@ -149,44 +149,6 @@ def run_document(given: dict[str, Any]) -> str:
         vkc.Scene.from_document(document, find_resource_folder("scenes")),
         planned=given.get("plan", False),
     )
-
-
-def options_case(rng: random.Random) -> dict[str, Any]:
-    """Return a case: options with fields at random, most of them numbers that are allowed."""
-    fields = {}
-    for name in rng.sample(tuple(vkc.Options.__dataclass_fields__), rng.choice((1, 2, 3, 6))):
-        usual = getattr(vkc.Options(), name)
-        if rng.random() < 0.5 or isinstance(usual, str):
-            fields[name] = {"odd": rng.choice(odd.VALUES)}
-        elif isinstance(usual, int):
-            fields[name] = rng.choice((1, 2, 3, 5, usual))
-        else:
-            fields[name] = usual * 10.0 ** rng.uniform(-3.0, 3.0)
-    return {"fields": fields, "plan": rng.random() < 0.15}
-
-
-def run_options(given: dict[str, Any]) -> str:
-    """Make the options, and plan with them."""
-    chosen = {
-        name: odd.value(value["odd"]) if isinstance(value, dict) else value
-        for name, value in given["fields"].items()
-    }
-    options = vkc.Options(**{**(TINY if given.get("plan") else {}), **chosen})
-    if not given.get("plan"):
-        return "made"
-    counts = (
-        options.reach_waypoints,
-        options.move_waypoints,
-        options.turn_waypoints,
-        options.contact_slots,
-    )
-    if max(counts) > 50:
-        return "made"  # as large as was asked for
-    scene = vkc.load_scene("drawer")
-    vkc.plan(
-        scene, [vkc.Actuate("drawer", {"slide": 0.2})], options=options, time_limit=0.2
-    ).summary()
-    return "planned"
 
 
 _DAE = """<?xml version="1.0"?>

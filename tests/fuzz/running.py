@@ -30,55 +30,18 @@ TESTS = Path(__file__).resolve().parents[1]
 def _kinds() -> dict[
     str, tuple[Callable[[random.Random], dict[str, Any]], Callable[[dict[str, Any]], str]]
 ]:
-    from . import calls, files, lines, plans
+    from . import calls, files, plans
 
     return {
         "files": (files.case, files.run),
         "documents": (files.document_case, files.run_document),
-        "options": (files.options_case, files.run_options),
         "calls": (calls.case, calls.run),
         "plans": (plans.case, plans.run),
-        "lines": (lines.case, lines.run),
-        "planted": (lambda rng: {"does": rng.choice(_PLANTED)}, _plant),
     }
 
 
-KINDS = {
-    "files": 0.35,
-    "documents": 0.2,
-    "options": 0.05,
-    "calls": 0.25,
-    "plans": 0.1,
-    "lines": 0.05,
-}
-"""The kinds of cases, and the share of each."""
-
-
-_PLANTED = ("refuse", "raise", "exit", "spin", "eat", "sleep", "crash")
-
-
-def _plant(case: dict[str, Any]) -> str:
-    """Go wrong in a way that must be noticed."""
-    from vkc_pin.errors import InputError
-
-    match case["does"]:
-        case "refuse":
-            raise InputError("wrong")
-        case "raise":
-            raise KeyError("planted")
-        case "exit":
-            sys.exit(3)
-        case "spin":
-            began = time.process_time()
-            while time.process_time() < began + 1.1 * SECONDS:
-                pass
-        case "eat":
-            bytearray(int(1.5e6 * MEGABYTES))
-        case "sleep":
-            time.sleep(10.0 * HUNG)
-        case "crash":
-            os.abort()
-    return "done"
+KINDS = {"files": 0.35, "documents": 0.2, "calls": 0.35, "plans": 0.1}
+"""Kind of cases → its share."""
 
 
 def made(kind: str, seed: int, number: int) -> dict[str, Any]:
@@ -157,7 +120,7 @@ def _run(does: Callable[[dict[str, Any]], str], case: dict[str, Any]) -> dict[st
 
 
 def _plans(case: dict[str, Any]) -> bool:
-    name, words = case.get("call", ""), case.get("argv", [])
+    name = case.get("call", "")
     pictures = ("Plan.to_html", "to_html", "show", "animate", "Plan.plot")
     planning = (
         *pictures,
@@ -171,7 +134,7 @@ def _plans(case: dict[str, Any]) -> bool:
         "random_room",
         "random_task",
     )
-    return bool(case.get("plan")) or name in planning or "plan" in words or "view" in words
+    return bool(case.get("plan")) or name in planning
 
 
 class Worker:

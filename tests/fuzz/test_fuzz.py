@@ -1,4 +1,4 @@
-"""Input at random: a plan, or an error of the package's own, within a few seconds and a few hundred megabytes."""
+"""Random input gives a result or an error of the package, in little time and memory."""
 
 from __future__ import annotations
 
@@ -14,35 +14,33 @@ import pytest
 from fuzz.running import BAD, KINDS, Worker
 
 CORPUS = sorted((Path(__file__).parent / "corpus").glob("*.json"))
-CASES = 300  # of all kinds, with each of the two seeds
-FIXED, FRESH = 1, int(os.environ.get("FUZZ_SEED", random.SystemRandom().randrange(10**6)))
+FRESH = int(os.environ.get("FUZZ_SEED", random.SystemRandom().randrange(10**6)))
+CASES = {1: 100, FRESH: 50}
+"""Random seed → number of cases of all kinds."""
 
 
 @pytest.fixture(scope="module")
 def worker() -> Iterator[Worker]:
-    """A process for all that follows."""
+    """Yield the process that runs the cases."""
     made = Worker()
     yield made
     made.close()
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("seed", [FIXED, "fresh"])
-def test_cases_at_random(worker: Worker, kind: str, seed: int | str) -> None:
-    number_of = round(CASES * KINDS[kind])
-    chosen = FRESH if isinstance(seed, str) else seed
+@pytest.mark.parametrize("seed", CASES, ids=["fixed", "fresh"])
+def test_random_input_gives_a_result_or_an_error(worker: Worker, kind: str, seed: int) -> None:
     bad = []
-    for number in range(number_of):
-        found = worker.run(kind=kind, seed=chosen, number=number)
+    for number in range(round(CASES[seed] * KINDS[kind])):
+        found = worker.run(kind=kind, seed=seed, number=number)
         if found["outcome"] in BAD:
-            bad.append(
-                f"{found['outcome']}, {found['error']}: python -m tests.fuzz --kind {kind} --seed {chosen} --show {number}"
-            )
+            show = f"python -m tests.fuzz --kind {kind} --seed {seed} --show {number}"
+            bad.append(f"{found['outcome']}, {found['error']}: {show}")
     assert not bad, "\n".join(bad)
 
 
 @pytest.mark.parametrize("file", CORPUS, ids=[file.stem for file in CORPUS])
-def test_what_once_broke_it(worker: Worker, file: Path) -> None:
+def test_former_faults_stay_repaired(worker: Worker, file: Path) -> None:
     kept = json.loads(file.read_text(encoding="ascii"))
     found = worker.run(kind=kept["kind"], case=kept["case"])
     assert found["outcome"] not in BAD, (
@@ -50,7 +48,7 @@ def test_what_once_broke_it(worker: Worker, file: Path) -> None:
     )
 
 
-def test_what_is_not_spoiled_works(worker: Worker) -> None:
+def test_valid_input_gives_a_result(worker: Worker) -> None:
     from fuzz import calls, files
 
     cases: list[tuple[str, Any]] = [
@@ -68,33 +66,10 @@ def test_what_is_not_spoiled_works(worker: Worker) -> None:
         cases.append(
             ("files", {"file": name, "content": content, "plan": name == "scenes/door.yaml"})
         )
-    cases += [
-        ("documents", {"scene": "household", "changes": []}),
-        ("options", {"fields": {}, "plan": True}),
-    ]
-    cases += [
-        ("plans", {"about": []}),
-        ("lines", {"argv": ["export", "NPZ", "--json", "OUT/a.json"]}),
-    ]
+    cases += [("documents", {"scene": "household", "changes": []}), ("plans", {"about": []})]
     wrong = []
     for kind, case in cases:
         found = worker.run(kind=kind, case=case)
         if found["outcome"] not in ("done", "loaded", "made", "planned"):
             wrong.append((kind, {**case, "content": ""}, found))
     assert wrong == []
-
-
-def test_what_goes_wrong_is_noticed() -> None:
-    outcomes = {
-        "raise": "raw",
-        "exit": "raw",
-        "spin": "slow",
-        "eat": "memory",
-        "sleep": "hung",
-        "crash": "crashed",
-    }
-    worker = Worker(hung=20.0)
-    for does, outcome in outcomes.items():
-        assert worker.run(kind="planted", case={"does": does})["outcome"] == outcome
-        assert worker.run(kind="planted", case={"does": "refuse"})["outcome"] == "refused"
-    worker.close()

@@ -1,9 +1,7 @@
-"""Exported motions keep every limit at 1 kHz; what does not is found; and what looks shares nothing with the package."""
+"""Exported motions keep every limit at 1 kHz, and violations are found."""
 
 from __future__ import annotations
 
-import ast
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,25 +15,22 @@ from limits.check import check
 from limits.files import Motion, limits_of, read_csv, read_npz
 from limits.plans import exported
 
-FOLDER = Path(__file__).parent
-ALLOWED = {"numpy", "yaml", *sys.stdlib_module_names}
-COUNT = 20
+COUNT = 8
 
 
 @pytest.fixture(scope="module")
 def plans(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Plans of fifteen tasks and in five random rooms, with tables."""
+    """Return plans of six tasks and in two random rooms, with tables."""
     return list(exported(tmp_path_factory.mktemp("plans"), COUNT))
 
 
-def test_no_limit_is_exceeded(plans: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
+def test_limits_are_kept(plans: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
     assert len(plans) == COUNT
     assert main([str(path) for path in plans]) == 0, capsys.readouterr().out
     assert f"{COUNT} plans" in capsys.readouterr().out
 
 
-def test_motions_are_as_fast_as_they_may_be(plans: list[Path]) -> None:
-    """Otherwise nothing said about limits means much."""
+def test_motions_reach_a_limit(plans: list[Path]) -> None:
     for path in plans:
         motion, about = read_npz(path)
         verdict = check(motion, limits_of(about, path))
@@ -43,7 +38,7 @@ def test_motions_are_as_fast_as_they_may_be(plans: list[Path]) -> None:
         assert verdict.moments > 2000
 
 
-def test_tables_say_the_same(plans: list[Path]) -> None:
+def test_tables_have_the_same_motions(plans: list[Path]) -> None:
     for path in plans:
         motion, table = read_npz(path)[0], read_csv(path.with_suffix(".csv"))
         assert table.names == motion.names
@@ -83,7 +78,7 @@ def _no_rest(motion: Motion) -> Motion:
         (_no_rest, "rest"),
     ],
 )
-def test_what_exceeds_a_limit_is_found(
+def test_violations_are_found(
     plans: list[Path], change: Callable[[Motion], Motion], what: str
 ) -> None:
     motion, about = read_npz(plans[0])
@@ -93,9 +88,7 @@ def test_what_exceeds_a_limit_is_found(
     ]
 
 
-def test_limits_of_jerk_are_kept_and_only_those_motions_keep_them(
-    plans: list[Path], tmp_path: Path
-) -> None:
+def test_jerk_limits_are_kept_with_jerk_time_alone(plans: list[Path], tmp_path: Path) -> None:
     scene, options = vkc.load_scene("drawer"), vkc.Options(jerk_time=0.1)
     plan = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.3})], options=options)
     assert plan.success
@@ -112,18 +105,3 @@ def test_limits_of_jerk_are_kept_and_only_those_motions_keep_them(
         for name, limit in limits_of(said, plans[0]).items()
     }
     assert "jerk" in {excess.what for excess in check(plain, own).found}
-
-
-def test_it_shares_nothing_with_the_package() -> None:
-    for name in ("files", "check"):
-        tree = ast.parse((FOLDER / f"{name}.py").read_text(encoding="utf-8"))
-        named = [
-            alias.name
-            for node in ast.walk(tree)
-            if isinstance(node, ast.Import)
-            for alias in node.names
-        ]
-        named += [
-            str(n.module) for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and not n.level
-        ]
-        assert {module.partition(".")[0] for module in named} <= ALLOWED

@@ -1,10 +1,8 @@
-"""The faults: one operator, constant, call or statement of a module changed."""
+"""Changes one operator, constant, call or statement of a module."""
 
 from __future__ import annotations
 
 import ast
-import dataclasses
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -31,30 +29,21 @@ class Mutant:
     """A module with one fault.
 
     Attributes:
-        module: Its path in the package, "solver/loop.py".
-        line: Where the fault is, from 1.
+        module: Path in the package, such as "planning/solver/loop.py".
+        line: Line of the fault, from 1.
         what: "kind: before → after".
-        at: The line as it stands, without the space around it.
-        lines: The lines that behave otherwise: itself, or those that use what it defines outside of
-            functions.
+        text: The unchanged line without indentation.
+        users: Lines whose behaviour changes: the line itself, or those that use the constant that
+            it defines.
         source: The whole module with the fault.
-        again: How many earlier places of the module have the same words and the same fault.
     """
 
     module: str
     line: int
     what: str
-    at: str
-    lines: tuple[int, ...]
+    text: str
+    users: tuple[int, ...]
     source: str
-    again: int = 0
-
-    @property
-    def name(self) -> str:
-        """What it is known by, wherever the line moves to."""
-        return f"{self.module}: {self.at} | {self.what}" + (
-            f" (the same, {self.again + 1})" if self.again else ""
-        )
 
 
 class _Text:
@@ -78,9 +67,9 @@ class _Text:
 
 
 def mutants(module: str, source: str) -> Iterator[Mutant]:
-    """Yield every fault of a module's source, in the order of its lines. Texts, types and what is raised are left as they are."""
+    """Yield every fault of a module, in the order of its lines; texts, types and errors are kept."""
     text, lines, tree = _Text(source), source.splitlines(), ast.parse(source)
-    users, found = _users(tree), []
+    users, found = _find_users(tree), []
     for node in _nodes(tree):
         for kind, (begin, end), piece in _faults(node, text):
             before = text.bytes[begin:end].decode()
@@ -89,53 +78,28 @@ def mutants(module: str, source: str) -> Iterator[Mutant]:
                 continue
             line = text.bytes[:begin].count(b"\n") + 1
             what = f"{kind}: {' '.join(before.split())} → {' '.join(piece.split())}"
-            found.append(
-                (
-                    begin,
-                    Mutant(
-                        module,
-                        line,
-                        what,
-                        lines[line - 1].strip(),
-                        users.get(line, (line,)),
-                        changed,
-                    ),
-                )
-            )
-    seen: Counter[str] = Counter()
-    for _, mutant in sorted(found, key=lambda pair: pair[0]):
-        yield dataclasses.replace(mutant, again=seen[mutant.name])
-        seen[mutant.name] += 1
+            own = users.get(line, (line,))
+            mutant = Mutant(module, line, what, lines[line - 1].strip(), own, changed)
+            found.append((begin, mutant))
+    yield from (mutant for _, mutant in sorted(found, key=lambda pair: pair[0]))
 
 
-def _users(tree: ast.Module) -> dict[int, tuple[int, ...]]:
-    """Return, of lines that define a constant of the module, which lines use it."""
+def _find_users(tree: ast.Module) -> dict[int, tuple[int, ...]]:
+    """Return line that defines a constant of the module → the lines that use it."""
     found: dict[int, tuple[int, ...]] = {}
-    for block in (item for item in ast.walk(tree) if isinstance(item, ast.ClassDef)):
-        for item in block.body:  # fields of a class: nobody knows who uses them
-            if not isinstance(item, ast.FunctionDef):
-                found |= dict.fromkeys(range(item.lineno, (item.end_lineno or item.lineno) + 1), ())
+    loads = [n for n in ast.walk(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Load)]
     for item in tree.body:
         if isinstance(item, ast.Assign | ast.AnnAssign):
             targets = item.targets if isinstance(item, ast.Assign) else [item.target]
-            names = {
-                node.id
-                for target in targets
-                for node in ast.walk(target)
-                if isinstance(node, ast.Name)
-            }
-            loads = (
-                node
-                for node in ast.walk(tree)
-                if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load)
-            )
+            nodes = [node for target in targets for node in ast.walk(target)]
+            names = {node.id for node in nodes if isinstance(node, ast.Name)}
             using = tuple(sorted({node.lineno for node in loads if node.id in names}))
             found |= dict.fromkeys(range(item.lineno, (item.end_lineno or item.lineno) + 1), using)
     return found
 
 
 def _nodes(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield what may be changed."""
+    """Yield the nodes that may be changed."""
     for field, value in ast.iter_fields(node):
         if field in ("annotation", "returns", "decorator_list", "type_params"):
             continue
@@ -148,7 +112,7 @@ def _nodes(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _only_text(node: ast.AST) -> bool:
-    """Return whether a statement is a docstring, names what is public, or makes a sentence for people to read."""
+    """Return whether a statement is a docstring, `__all__` or a message."""
     if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
         return True
     names = (
@@ -160,7 +124,7 @@ def _only_text(node: ast.AST) -> bool:
 
 
 def _faults(node: ast.AST, text: _Text) -> Iterator[tuple[str, tuple[int, int], str]]:
-    """Yield (kind, what is replaced, by what)."""
+    """Yield (kind, span of bytes to replace, replacement)."""
     if isinstance(node, ast.Compare):
         yield from _comparisons(node, text)
     elif isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
@@ -201,13 +165,6 @@ def _faults(node: ast.AST, text: _Text) -> Iterator[tuple[str, tuple[int, int], 
     elif isinstance(node, ast.Attribute) and node.attr in NAMES:
         begin, end = text.span(node)
         yield "name", (end - len(node.attr), end), NAMES[node.attr]
-
-
-def _can_be_left_out(node: ast.AST) -> bool:
-    """Return whether the rest still knows all its names without a statement."""
-    if isinstance(node, ast.Assign):
-        return isinstance(node.targets[0], ast.Subscript)
-    return isinstance(node, ast.AugAssign | ast.Continue | ast.Break)
 
 
 def _comparisons(node: ast.Compare, text: _Text) -> Iterator[tuple[str, tuple[int, int], str]]:

@@ -1,4 +1,4 @@
-"""The second experiment: push a door open at the end of a corridor, pull a drawer open in a narrow aisle; B1, B2 and VKC."""
+"""Second experiment: a door at the end of a corridor and a drawer in a narrow aisle."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TASKS = {
 def _draw(
     records: Sequence[Record], out: Path, tasks: Mapping[str, str], methods: Sequence[str]
 ) -> list[str]:
-    """Draw the criteria of every task as bars, <task>.png: success, efforts and planning time."""
+    """Draw the criteria of each task as bars, <task>.png."""
     compared = compared_methods(methods)
     for task, name in tasks.items():
         own = [record for record in records if record["scene"] == task]

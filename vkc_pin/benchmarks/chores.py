@@ -1,4 +1,4 @@
-"""Chores of many steps, each planned in one call, or step after step: eighteen in a home, also cluttered, and ten in an arena."""
+"""Plans chores of many steps in one call, or step by step."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -17,7 +17,17 @@ from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness import step_by_step as stepwise
 from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import Record, Solve, distribution, trial, values
-from vkc_pin.benchmarks.harness.tables import decimal, failures, foot, markdown
+from vkc_pin.benchmarks.harness.runner import Execution
+from vkc_pin.benchmarks.harness.tables import (
+    JUDGED,
+    count,
+    decimal,
+    failures,
+    markdown,
+    medians,
+    page,
+    select,
+)
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
@@ -51,7 +61,7 @@ SHELF = (-4.61, -1.0, 0.846)
 
 
 def home(scene: Scene) -> list[Step]:
-    """Return the eighteen steps of the scene `household`: a cup to the desk in the other room, and litter to the bin."""
+    """Return the 18 steps of the scene `household`: a cup to the desk, and litter to the bin."""
     return [
         Grasp("refrigerator"),
         Actuate("refrigerator", {"hinge": 1.57}),
@@ -75,7 +85,7 @@ def home(scene: Scene) -> list[Step]:
 
 
 def fetch(scene: Scene) -> list[Step]:
-    """Return the ten steps of the scene `fetch`: a ball from under a table, with a stick, into a cabinet."""
+    """Return the 10 steps of the scene `fetch`: a ball from under a table into a cabinet."""
     return [
         Grasp("stick"),
         Grasp("ball", "pull", by="stick.tip"),
@@ -91,7 +101,7 @@ def fetch(scene: Scene) -> list[Step]:
 
 
 def _box(name: str, *sides: tuple[float, float], colour: str = "white") -> dict[str, Any]:
-    """Return a box as an obstacle, by where it begins and ends along x, y and z [m]."""
+    """Return a box obstacle, given by its range along x, y and z [m]."""
     size, middle = (
         [round(high - low, 4) for low, high in sides],
         [round((low + high) / 2.0, 5) for low, high in sides],
@@ -136,7 +146,7 @@ TIGHT: tuple[dict[str, Any], ...] = (
 
 @functools.cache
 def cluttered_home() -> Scene:
-    """Return the scene `household` as full as homes are: with `TIGHT` and 300 things more there are 561 convex shapes."""
+    """Return the scene `household` with `TIGHT` and 300 more objects: 561 convex shapes."""
     home, places = load_scene("household"), (BAR_TABLE, DESK, CLEAR, BIN)
     with warnings.catch_warnings(
         action="ignore", category=UserWarning
@@ -149,20 +159,14 @@ def cluttered_home() -> Scene:
 
 @dataclass(frozen=True)
 class Chore:
-    """A chore.
-
-    Attributes:
-        scene: Returns where it is done.
-        steps: Returns what is to be done in that scene.
-        options: How it is planned.
-    """
+    """A chore: its scene, steps and options."""
 
     scene: Callable[[], Scene]
     steps: Callable[[Scene], list[Step]]
     options: Options = field(default_factory=Options)
 
     def planned(self) -> list[Step]:
-        """Return its steps."""
+        """Return the steps."""
         return self.steps(self.scene())
 
 
@@ -192,37 +196,22 @@ def run(
     trials: int,
     seed: int,
     out: str | Path,
-    jobs: int = 1,
-    scheduler: str | None = None,
     chores: Sequence[str] = tuple(CHORES),
     seeds: int = 1,
     step_by_step: bool = False,
-    progress: bool = True,
     solve: Solve = plan_trial,
+    **execution: Unpack[Execution],
 ) -> dict[str, Any]:
-    """Run the benchmark, or what is left of it, and write results.json, results.csv and table.md to `out`.
+    """Run the experiment in the folder `out`; see `runner.run`.
 
     Args:
-        trials: Number of random starts per chore; the first is the scene's own start.
-        seed: Of the starts and of planning.
-        out: The folder; if it has trials of the same settings already, they are not run again.
-        jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
-            `engine.results`.
+        out: Folder.
+        trials: Number of starts per chore; the first is that of the scene, the others are random.
+        seed: Random seed of starts, and the first one of planning.
         chores: Some of `CHORES`.
-        seeds: How many seeds of planning there are to each start: `seed` and those that follow it.
-        step_by_step: Whether to plan the steps one by one as well, each from where the one before
-            ends.
-        progress: Whether to show a progress bar.
-        solve: What plans a trial in one call.
-
-    Returns:
-        {"meta": ..., "trials": [...]}; see `runner.run`.
-
-    Raises:
-        UnknownNameError: There is no such chore.
-        InputError: No chores, or `out` has trials of other settings.
-        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+        seeds: Number of planning seeds per start.
+        step_by_step: Whether to plan the steps one by one as well.
+        solve: Plans a trial in one call.
     """
     chores, specs = runner.chosen("chore", chores, CHORES), list[dict[str, Any]]()
     methods = (ONE_CALL, *((STEP_BY_STEP,) if step_by_step else ()))
@@ -263,122 +252,67 @@ def run(
         out,
         settings=settings,
         report=report,
-        jobs=jobs,
-        scheduler=scheduler,
-        progress=progress,
+        **execution,
     )
 
 
 def report(result: Mapping[str, Any]) -> str:
-    """Return the tables of a result in Markdown, with versions and machine at the foot."""
-    about, rows = result["meta"], []
+    """Return the tables of a result in Markdown."""
+    about, records, rows = result["meta"], result["trials"], []
     seeds, methods = about.get("seeds", 1), about.get("methods", [ONE_CALL])
     for chore in about["chores"]:
-        own = [
-            record
-            for record in result["trials"]
-            if (record["scene"], record["method"]) == (chore, ONE_CALL)
-        ]
-        good = [record for record in own if record["success"]]
-        planning, late = distribution(own, "planning_time")
-        wall, _ = distribution(own, "wall_time")
-        efforts = (
-            decimal(distribution(good, field)[0])
-            for field in ("base_path_length", "arm_path_length", "duration")
+        own = select(records, scene=chore, method=ONE_CALL)
+        late = decimal(distribution(own, "planning_time")[1])
+        lengths = medians(
+            select(own, success=True), "base_path_length", "arm_path_length", "duration"
         )
-        number = str(len(about["steps"][chore]))
-        times = (decimal(value) for value in (wall, planning, late))
-        rows.append([chore, number, f"{len(good)} of {len(own)}", *times, *efforts, failures(own)])
-    head = [
-        "chore",
-        "steps",
-        "success",
-        "in all, median [s]",
-        "planning, median [s]",
-        "95th percentile [s]",
-    ]
-    head += ["base [m]", "arm [rad]", "duration [s]", "failures"]
+        steps, times = str(len(about["steps"][chore])), medians(own, "wall_time", "planning_time")
+        rows.append([chore, steps, count(own), *times, late, *lengths, failures(own)])
+    times_head = ["in all, median [s]", "planning, median [s]", "95th percentile [s]"]
+    lengths_head = ["base [m]", "arm [rad]", "duration [s]", "failures"]
     fields = ("wall_time", "planning_time", "base_path_length", "arm_path_length")
-    every = [
-        [
-            record["scene"],
-            str(record["number"]),
-            str(record["seed"]),
-            _METHODS[record["method"]],
-            record["status"],
-        ]
-        + [decimal(record.get(field) or float("nan")) for field in fields]
-        for record in result["trials"]
-    ]
+    every = []
+    for r in records:
+        cells = [r["scene"], str(r["number"]), str(r["seed"]), _METHODS[r["method"]], r["status"]]
+        every.append([*cells, *(decimal(r.get(field) or float("nan")) for field in fields)])
+    head = ["chore", "start", "seed", "planned", "status", "in all [s]", "planning [s]"]
     parts = [
         "# Chores",
-        f"Each chore in one call, from {about['starts']} starts, the first of them the scene's own, with {seeds} seeds each from "
-        f"{about['seed']} on; a window of {about['window']} actions. Success is the word of the independent validation of the "
-        "whole motion. The time in all is that of planning and of building symbolic programs; efforts and durations are medians "
-        "of successes.",
-        markdown(head, rows),
+        f"Each chore in one call, from {about['starts']} starts, the first of them the scene's "
+        f"own, with {seeds} seeds each from {about['seed']} on; a window of {about['window']} "
+        f"actions. {JUDGED} The time in all includes building symbolic programs; path lengths "
+        "and durations are medians of successes.",
+        markdown(["chore", "steps", "success", *times_head, *lengths_head], rows),
     ]
     if seeds > 1 or len(methods) > 1:
         parts += ["## Seeds", _SEEDS_ABOUT, _seeds_table(result)]
-    parts += [
-        "## Every trial",
-        markdown(
-            [
-                "chore",
-                "start",
-                "seed",
-                "planned",
-                "status",
-                "in all [s]",
-                "planning [s]",
-                "base [m]",
-                "arm [rad]",
-            ],
-            every,
-            text=5,
-        ),
-        foot(about),
-    ]
-    return "\n\n".join(parts) + "\n"
+    parts += ["## Every trial", markdown([*head, "base [m]", "arm [rad]"], every, text=5)]
+    return page(about, *parts)
 
 
 def _seeds_table(result: Mapping[str, Any]) -> str:
-    """Return what hangs on the seed of planning, per chore, start and way of planning."""
+    """Tabulate the dependence on the planning seed by chore, start and method."""
     groups = dict[tuple[str, int, str], list[Record]]()
     for record in result["trials"]:
         groups.setdefault((record["scene"], record["number"], record["method"]), []).append(record)
     rows = []
     for (chore, number, method), own in groups.items():
-        good, steps = (
-            [record for record in own if record["success"]],
-            len(result["meta"]["steps"][chore]),
-        )
-        done = (
-            ", ".join("all" if n == steps else f"{n:.0f}" for n in values(own, "steps_done")) or "–"
-        )
-        spent, spreads = values(own, "cpu_time"), list[str]()
-        for name in ("base_path_length", "arm_path_length"):
-            found = values(good, name)
+        steps, times = len(result["meta"]["steps"][chore]), values(own, "cpu_time")
+        counts = ["all" if n == steps else f"{n:.0f}" for n in values(own, "steps_done")]
+        spreads = list[str]()
+        for length in ("base_path_length", "arm_path_length"):
+            found = values(select(own, success=True), length)
             spreads += _apart(min(found), max(found)) if found else ["–"] * 3
-        cpu = (decimal(float(np.median(spent))), decimal(max(spent))) if spent else ("–", "–")
-        rows.append(
-            [
-                chore,
-                str(number),
-                _METHODS[method],
-                f"{len(good)} of {len(own)}",
-                done,
-                *cpu,
-                *spreads,
-            ]
-        )
+        cpu = (decimal(float(np.median(times))), decimal(max(times))) if times else ("–", "–")
+        done = ", ".join(counts) or "–"
+        rows.append([chore, str(number), _METHODS[method], count(own), done, *cpu, *spreads])
     head = ["chore", "start", "planned", "success", "steps done", "CPU, median [s]", "most [s]"]
     head += ["base [m]", "spread [%]", "±[%]", "arm [rad]", "spread [%]", "±[%]"]
     return markdown(head, rows, text=3)
 
 
 def _apart(low: float, high: float) -> list[str]:
-    """Return a range, by how much its end is more than its begin, and half of it over its middle, both in percent."""
+    """Return a range, its spread over the lower end, and half of it over the middle [%]."""
     shares = (high / low - 1.0, (high - low) / (high + low)) if low > 0.0 else (np.nan, np.nan)
     return [
         f"{low:.1f}–{high:.1f}",

@@ -1,4 +1,4 @@
-"""The tables of the experiments that compare planning base and arm together with planning them apart."""
+"""Tabulates comparisons of planning base and arm together and apart."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _OWN = "VKC"
 
 
 def compared_methods(methods: Sequence[str]) -> Sequence[str]:
-    """Return those whose efforts are compared: without the baselines of other waypoints, unless there are no others."""
+    """Return the methods whose motions are compared; other numbers of waypoints only if alone."""
     return [method for method in methods if method not in WAYPOINTS] or methods
 
 
@@ -51,14 +51,14 @@ def report(
     saved: Mapping[str, str] | None = None,
     pictures: Sequence[str] = (),
 ) -> str:
-    """Return the tables of a result in Markdown, with versions and machine at the foot.
+    """Return the tables of a result in Markdown.
 
     Args:
-        result: {"meta": ..., "trials": [...]}, as from `Comparison.run`.
-        tasks: Task → what is done in it.
-        title: The first line.
-        saved: Key → file, for the failures whose plans are saved.
-        pictures: What is shown below the tables, in Markdown.
+        result: Result of `Comparison.run`.
+        tasks: Task → description.
+        title: Title.
+        saved: Key → file, of failures whose plans are saved.
+        pictures: Pictures in Markdown.
     """
     about, records = result["meta"], result["trials"]
     methods = about["methods"]
@@ -151,7 +151,7 @@ def _times(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequenc
 def _calls(
     records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]
 ) -> list[str]:
-    """Return a section on the time from call to plan, if it is on record."""
+    """Return a section on the time of whole calls, if it is recorded."""
     rows = []
     for task, method in product(tasks, methods):
         own = _of(records, task, method)
@@ -181,7 +181,7 @@ def _budgets(
     tasks: Mapping[str, str],
     methods: Sequence[str],
 ) -> list[str]:
-    """Return a section on successes within shares of the budget, if there was one."""
+    """Return a section on successes with smaller budgets, if the budget was limited."""
     if "max_evaluations" not in about or not values(records, "evaluations"):
         return []
     shares = [(name, about["max_evaluations"] * share) for name, share in BUDGETS.items()]
@@ -203,14 +203,14 @@ def _budgets(
         "most, as a share",
     ]
     text = (
-        "Successes within shares of the budget. The budget only ends planning, so a success within a share is one with that "
-        "as the budget, too; two thirds and half as much again are all of it."
+        "Successes within shares of the budget. Effort only ends planning, so a success within a share is one with that as the "
+        "budget, too; two thirds and half as much again are all of it."
     )
     return ["## Had the budget been smaller", text, markdown(head, rows, text=2)]
 
 
 def _numbers(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> str:
-    """Return in how many trials of every task all methods succeed."""
+    """Return the number of trials of each task in which all methods succeed."""
     numbers = []
     for task in tasks:
         own = [record for record in records if record["scene"] == task]
@@ -223,7 +223,7 @@ def _numbers(records: Sequence[Record], tasks: Mapping[str, str], methods: Seque
 def _criteria(
     records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str], *, shared: bool
 ) -> str:
-    """Return all criteria of all methods, over the trials that they share or over each method's own successes."""
+    """Return all criteria over shared trials, or over each method's own successes."""
     rows = []
     for task in tasks:
         own = [record for record in records if record["scene"] == task]
@@ -241,7 +241,7 @@ def _criteria(
 def _pairwise(
     records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]
 ) -> list[str]:
-    """Return a section on VKC against every other method, if it is one of several."""
+    """Return a section that compares VKC with every other method."""
     others = [method for method in methods if method != _OWN]
     if _OWN not in methods or not others:
         return []

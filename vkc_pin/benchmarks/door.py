@@ -1,8 +1,7 @@
-"""Tasks at the door from random starts: reach its handle, the whole task, and pushing alone with the grasp given.
+"""Plans tasks at a door from random starts: reach, push and both together.
 
-The grasp is given twice: as the whole task's plan reaches it ("push"), and as a plan reaches it
-that only wants to grasp the turned lever ("push blind"), where the base stands wherever that was
-cheapest.
+Pushing starts from a given grasp, either as reached by the plan of the whole task ("push") or by
+a plan that only grasps the turned lever ("push blind").
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ TURNED = 0.55  # [rad] of the knob where the grasp is given
 
 
 def reach(scene: Scene, seed: int) -> Plan:
-    """Bring the tool to the door's handle, 40 waypoints, no grasp."""
+    """Bring the tool to the door's handle in 40 waypoints."""
     placed = scene.objects["door"]
     attachment = placed.object.attachment()
     pose = placed.link_placement(attachment.link) * attachment.placement
@@ -36,7 +35,7 @@ def reach(scene: Scene, seed: int) -> Plan:
 
 
 def push(scene: Scene, seed: int, before: Plan) -> Plan:
-    """Push the door open in 40 waypoints, from the grasp and the turned lever that `before` reaches before it pushes."""
+    """Push the door in 40 waypoints, from the configuration in which `before` begins to push."""
     last = before.trajectory.phases[-1]
     row = last.first if last.held else last.last
     robot = before.trajectory.positions[row, : before.trajectory.robot_size]
@@ -46,21 +45,20 @@ def push(scene: Scene, seed: int, before: Plan) -> Plan:
 
 
 def whole(scene: Scene, seed: int) -> Plan:
-    """Drive up, turn the knob and push, as one problem."""
+    """Approach, turn the knob and push, as one problem."""
     return plan(scene, [Actuate("door", GOAL)], seed=seed)
 
 
 def run(*, trials: int, seed: int, progress: bool = True) -> dict[str, Any]:
-    """Run every task from the same random starts of scenes/door.yaml.
+    """Run every task from the same random starts.
 
     Args:
         trials: Number of starts.
-        seed: Of the starts, and of planning.
+        seed: Random seed of starts and planning.
         progress: Whether to show a progress bar.
 
     Returns:
-        {"meta": ..., "trials": [...]}, one object a trial; the first trial of a task also pays for
-        the symbolic build, which is not part of its planning time.
+        {"meta": ..., "trials": [...]}; planning times exclude building symbolic programs.
 
     Raises:
         KeyboardInterrupt: Ctrl-C was pressed.
@@ -92,7 +90,7 @@ def run(*, trials: int, seed: int, progress: bool = True) -> dict[str, Any]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """Return success rates, times, efforts and their split as text; failures are listed one by one."""
+    """Return success rates, times and path lengths as text, and every failure."""
     lines = [
         f"{'task':12}{'success':>10}{'time [s] median':>18}{'p95':>8}{'seeds':>8}{'coal':>8}{'CasADi':>8}{'Ipopt':>8}"
         f"{'check':>8}{'iter.':>7}{'base [m]':>10}{'arm [rad]':>11}{'build [s]':>11}"

@@ -1,4 +1,4 @@
-"""The third experiment: six tasks of a day in a home; B1, B2 and VKC."""
+"""Third experiment: six tasks in a home."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _EDGE = 0.05  # [m] from the cup's axis, whose radius is 0.035, to the plate's e
 
 
 def on_the_coffee_table(scene: Scene, rng: np.random.Generator) -> dict[str, list[float]]:
-    """Return the cup somewhere on the coffee table, as high as it stands in the scene, at any heading."""
+    """Sample the pose of the cup on the coffee table, at any heading."""
     x, y = (float(rng.uniform(low + _EDGE, high - _EDGE)) for low, high in TABLE_TOP)
     height, yaw = (
         float(scene.objects["cup"].placement.translation[2]),
@@ -74,7 +74,7 @@ TASKS = {
 def _draw(
     records: Sequence[Record], out: Path, tasks: Mapping[str, str], methods: Sequence[str]
 ) -> list[str]:
-    """Draw success.png, base_path_length.png, arm_path_length.png and planning_time.png, each with all tasks and methods."""
+    """Draw success, path lengths and planning times of all tasks and methods."""
     shown = {task: task for task in tasks}
     success_chart(records, out / "success.png", shown, methods, title="Success")
     pictures = ["![Success, with Wilson's intervals of 95 % confidence](success.png)"]
@@ -86,7 +86,7 @@ def _draw(
         how: Any = {
             "field": name.replace(" ", "_"),
             "label": f"{name} [{unit}]",
-            "shared": name.endswith("path length"),
+            "shared": name.endswith("length"),
         }
         means_chart(records, out / f"{how['field']}.png", shown, methods, **how)
         pictures.append(
@@ -108,11 +108,10 @@ _RAIL = 0.8
 
 
 def papers_home() -> Scene:
-    """Return the scene `household` with a table as high as the paper's code puts the cup down, and a rack that comes out as far.
+    """Return the scene `household` with the table height and the rack travel of the paper's code.
 
-    A table of 1.11 is a bar table: it has the measures of that in the kitchen, 1.2 x 0.6. On one as
-    deep as the dining table, 0.8, a level hand would find no place at its middle: the forearm would
-    have to go through the plate.
+    A table of 1.11 m is a bar table, so it has the size of the one in the kitchen, 1.2 x 0.6 m. On one
+    as deep as the dining table, 0.8 m, the forearm of a level hand would pass through the plate.
     """
     home = load_scene("household")
     document = home.document
@@ -169,21 +168,20 @@ plan_trial = COMPARISON.plan_trial
 
 
 def report(result: Mapping[str, Any]) -> str:
-    """Return the tables of a result, of whichever variant, in Markdown."""
+    """Return the tables of a result of either variant in Markdown."""
     whose = PAPER if _PAPERS in result["meta"]["scenes"].values() else COMPARISON
     return whose.report(result)
 
 
 def run(*, variant: str | None = None, **how: Any) -> dict[str, Any]:
-    """Run the experiment, or what is left of it.
+    """Run the experiment.
 
     Args:
-        variant: "paper": the tasks whose numbers are other than in the paper's code, with those;
-            None: the tasks as they are.
-        **how: See `Comparison.run`; without `tasks`, the variant's are those that differ.
+        variant: "paper" for the tasks that differ in the paper's code, with its numbers.
+        **how: See `Comparison.run`.
 
     Raises:
-        UnknownNameError: There is no such variant; or as `Comparison.run`.
+        UnknownNameError: There is no such variant.
     """
     if variant is None:
         return COMPARISON.run(**how)

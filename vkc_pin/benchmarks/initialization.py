@@ -1,7 +1,7 @@
-"""Methods of initialising the trajectory, compared at a task with a tool: take a stick and touch a cube under a table with it.
+"""First experiment: initialization methods at a task with a tool.
 
-Three scenes of growing difficulty, the same random starts for every method. For comparison, the
-same steps are planned one after the other instead of as one problem.
+The robot takes a stick and touches a cube under a table with it, in three scenes of growing
+difficulty. The same steps are also planned one after the other.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import functools
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -18,10 +18,10 @@ from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import success_chart
 from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
 from vkc_pin.benchmarks.harness.record import Solve, trial
-from vkc_pin.benchmarks.harness.tables import comparison_table, foot, methods_table
+from vkc_pin.benchmarks.harness.runner import Execution
+from vkc_pin.benchmarks.harness.tables import JUDGED, comparison_table, methods_table, page
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
-from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Grasp, Touch
 
@@ -47,7 +47,7 @@ _NAMES = {"init_1": "no obstacle", "init_2": "two small obstacles", "init_3": "o
 
 
 def plan_trial(scene: Scene, spec: Mapping[str, Any]) -> Plan:
-    """Plan the task of one trial: `method`, `perturbation` and `seed` say how."""
+    """Plan one trial, given by `method`, `perturbation` and `seed`."""
     how: dict[str, Any] = {
         "initialization": "auto" if spec["method"] == STEPWISE else spec["method"],
         "simultaneous": spec["method"] != STEPWISE,
@@ -61,11 +61,10 @@ def plan_trial(scene: Scene, spec: Mapping[str, Any]) -> Plan:
 def specify(
     *, starts: int, repeats: int, seed: int, scenes: Sequence[str], methods: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Return the trials: every scene, start, repeat and method, in this order.
+    """Return the trials, ordered by scene, start, repeat and method.
 
-    A scene's starts depend on the seed and the scene alone. Repeat 0 starts from the seed
-    trajectory as it is, the others from perturbed ones. With "auto", the steps are also planned one
-    after the other, once per start.
+    Starts depend on seed and scene alone. The first repeat has an unperturbed initial guess. With
+    "auto", the steps are also planned one after the other, once per start.
     """
     trials = []
     for scene in scenes:
@@ -103,37 +102,21 @@ def run(
     repeats: int,
     seed: int,
     out: str | Path,
-    jobs: int = 1,
-    scheduler: str | None = None,
     scenes: Sequence[str] = SCENES,
     methods: Sequence[str] = COMPARED_INITIALIZATIONS,
-    progress: bool = True,
     solve: Solve = plan_trial,
+    **execution: Unpack[Execution],
 ) -> dict[str, Any]:
-    """Run the experiment, or what is left of it, and write results.json, results.csv, table.md and success.png to `out`.
+    """Run the experiment in the folder `out`; see `runner.run`.
 
     Args:
+        out: Folder.
         starts: Number of random starts per scene.
-        repeats: How often each start is tried, at least 1; all but the first with a perturbed seed
-            trajectory.
-        seed: Of the starts and of planning.
-        out: The folder; if it has trials of the same settings already, they are not run again.
-        jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
-            `engine.results`.
+        repeats: Number of trials per start; all but the first perturb the initial guess.
+        seed: Random seed of starts and planning.
         scenes: Some of `SCENES`.
         methods: Some of `COMPARED_INITIALIZATIONS`.
-        progress: Whether to show a progress bar.
-        solve: What plans a trial; another one may be given for other tasks, and then scenes may be
-            any.
-
-    Returns:
-        {"meta": ..., "trials": [...]}; see `runner.run`.
-
-    Raises:
-        UnknownNameError: There is no such scene or method.
-        InputError: No scenes or methods, or `out` has trials of other settings.
-        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+        solve: Plans a trial; other tasks may use other scenes.
     """
     scenes = runner.chosen("scene", scenes, SCENES if solve is plan_trial else scenes)
     methods = runner.chosen("method", methods, COMPARED_INITIALIZATIONS)
@@ -144,40 +127,41 @@ def run(
         "starts": starts,
         "repeats": repeats,
         "scenes": scenes,
+        "methods": methods,
+        "target": TARGET,
+        **LIMITS,
+        "perturbation": PERTURBATION,
     }
-    settings |= {"methods": methods, "target": TARGET, **LIMITS, "perturbation": PERTURBATION}
     function = functools.partial(_record, solve=solve)
-    result = runner.run(
-        trials, function, out, settings=settings, jobs=jobs, scheduler=scheduler, progress=progress
-    )
-    write_atomically(Path(out) / "table.md", report(result).encode())
-    title = f"Success by initialisation, {starts} starts{f', {repeats} trials from each' if repeats > 1 else ''}"
-    success_chart(result["trials"], Path(out) / "success.png", _shown(scenes), methods, title=title)
+    result = runner.run(trials, function, out, settings=settings, report=report, **execution)
+    title = f"Success by initialization, {starts} starts"
+    title += f", {repeats} trials from each" if repeats > 1 else ""
+    path, labels = Path(out) / "success.png", _label_scenes(scenes)
+    success_chart(result["trials"], path, labels, methods, title=title)
     return result
 
 
 def report(result: Mapping[str, Any]) -> str:
-    """Return the tables of a result in Markdown, with versions and machine at the foot."""
+    """Return the tables of a result in Markdown."""
     about, records = result["meta"], result["trials"]
-    scenes, methods = _shown(about["scenes"]), about["methods"]
-    several = (
-        f", {about['repeats']} trials from each, all but the first with a perturbed seed trajectory"
-    )
+    scenes, methods = _label_scenes(about["scenes"]), about["methods"]
+    repeats = f", {about['repeats']} trials from each, all but the first with a perturbed guess"
     parts = [
-        "# Initialising the trajectory",
-        f"{about['starts']} random starts per scene{several if about['repeats'] > 1 else ''}; seed {about['seed']}, "
-        f"{allowed(about)} per trial. Success is the word of the independent validation. "
-        "Planning times are those of all trials, efforts those of successes (medians).",
+        "# Initializing the trajectory",
+        f"{about['starts']} random starts per scene{repeats if about['repeats'] > 1 else ''}; "
+        f"seed {about['seed']}, {allowed(about)} per trial. {JUDGED} "
+        "Planning times are those of all trials, path lengths those of successes (medians).",
         methods_table(records, scenes, [*methods, STEPWISE]),
         "![Success rates](success.png)",
     ]
     if "auto" in methods:
         parts += [
             "## One problem against step after step",
-            "Efforts from starts where both find a motion, both initialised by `auto`, no perturbation.",
+            "Path lengths from starts where both find a motion, both initialized by `auto`, "
+            "without perturbation.",
             comparison_table(records, scenes, ("auto", STEPWISE), ("one problem", STEPWISE)),
         ]
-    return "\n\n".join([*parts, foot(about)]) + "\n"
+    return page(about, *parts)
 
 
 def _record(spec: dict[str, Any], solve: Solve) -> dict[str, Any]:
@@ -193,5 +177,5 @@ def _record(spec: dict[str, Any], solve: Solve) -> dict[str, Any]:
 _scene = functools.cache(load_scene)  # once per process
 
 
-def _shown(scenes: Sequence[str]) -> dict[str, str]:
+def _label_scenes(scenes: Sequence[str]) -> dict[str, str]:
     return {scene: f"{scene}: {_NAMES[scene]}" if scene in _NAMES else scene for scene in scenes}

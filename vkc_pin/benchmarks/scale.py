@@ -1,4 +1,4 @@
-"""Planning time against the number of obstacles, more and more boxes along the walls, or of segments: the same task and room."""
+"""Measures planning time against the number of obstacles or segments."""
 
 from __future__ import annotations
 
@@ -6,14 +6,25 @@ import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial
-from vkc_pin.benchmarks.harness.tables import TIMES, decimal, foot, markdown, quartiles
+from vkc_pin.benchmarks.harness.runner import Execution
+from vkc_pin.benchmarks.harness.tables import (
+    JUDGED,
+    TIMES,
+    count,
+    decimal,
+    markdown,
+    medians,
+    page,
+    quartiles,
+    select,
+)
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
@@ -31,12 +42,12 @@ __all__ = ["AXES", "Axis", "crowded", "refined", "report", "run", "scale_chart",
 
 @dataclass(frozen=True)
 class Axis:
-    """What there is more and more of.
+    """A quantity that is varied.
 
     Attributes:
-        counts: Numbers of it.
-        usual: The number to whose planning times the others are compared.
-        title: Of the chart.
+        counts: Default values.
+        usual: Value to whose planning times the others are compared.
+        title: Title of the chart.
     """
 
     counts: tuple[int, ...]
@@ -66,14 +77,9 @@ _WEST, _EAST, _SOUTH, _NORTH, _HALL, _CEILING = (
 
 
 def crowded(count: int, *, seed: int = 0) -> Scene:
-    """Return scenes/door.yaml with so many obstacles: its walls, then its furniture, then small boxes that obstruct nobody.
+    """Return scenes/door.yaml with `count` obstacles: walls, furniture, then small boxes.
 
-    These hang on walls and ceiling, stand along the walls or outside of the room. More of them come
-    after the same ones.
-
-    Args:
-        count: Number of obstacles, without the floor.
-        seed: Of where they are.
+    The boxes are on walls and ceiling or outside the room. Larger counts contain the smaller ones.
     """
     scene = load_scene("door")
     own = sorted(
@@ -88,7 +94,7 @@ def crowded(count: int, *, seed: int = 0) -> Scene:
 
 
 def _box(rng: np.random.Generator, number: int) -> dict[str, Any]:
-    """Return a small box somewhere along the walls, under the ceiling or outside."""
+    """Return a small box on a wall, under the ceiling or outside."""
     along, depth, height = rng.uniform((0.03, 0.01, 0.03), (0.15, 0.05, 0.15))
     x, y, z = rng.uniform((-2.3, -1.9, height / 2), (2.3, 1.9, _CEILING - height / 2))
     beside, sign = rng.uniform(0.8, 1.9), rng.choice([-1.0, 1.0])  # of the door
@@ -112,7 +118,7 @@ def _box(rng: np.random.Generator, number: int) -> dict[str, Any]:
 
 
 def refined(segments: int) -> Options:
-    """Return options with which the task at the door has so many segments, 4 at least, and least times as the usual ones have."""
+    """Return options with which the task at the door has `segments` segments, at least 4."""
     usual = Options()
     whole = usual.reach_waypoints + usual.turn_waypoints + usual.move_waypoints
     turn, move = (
@@ -130,9 +136,9 @@ def refined(segments: int) -> Options:
 def specify(
     *, starts: int, seed: int, counts: Sequence[int], of: str = "obstacles"
 ) -> list[dict[str, Any]]:
-    """Return the trials: from every start all numbers of one of `AXES` in turn, so that they meet the same machine.
+    """Return the trials: all counts from each start in turn, so that they meet the same machine load.
 
-    A start is free among as many obstacles as there are in any trial.
+    Starts are free among the largest number of obstacles.
     """
     most = max(*AXES["obstacles"].counts, *(counts if of == "obstacles" else ()))
     rng, scene = np.random.default_rng(seed), _crowded(most)
@@ -155,37 +161,21 @@ def run(
     starts: int,
     seed: int,
     out: str | Path,
-    jobs: int = 1,
-    scheduler: str | None = None,
     of: str = "obstacles",
     counts: Sequence[int] | None = None,
-    progress: bool = True,
+    **execution: Unpack[Execution],
 ) -> dict[str, Any]:
-    """Run the experiment, or what is left of it, and write results.json, results.csv, table.md and scale.png to `out`.
+    """Run the experiment in the folder `out`; see `runner.run`.
 
-    It is the whole task at the door: drive up, grasp, turn the knob, push, by 1.2 rad among
-    obstacles and by 0.6 rad in segments.
+    The task is to open the door by 1.2 rad among obstacles, or by 0.6 rad in segments.
 
     Args:
-        starts: Number of random starts, the same for all numbers.
-        seed: Of the starts and of planning.
-        out: The folder; if it has trials of the same settings already, they are not run again.
-        jobs: Number of processes. Several slow each other down, and times are what this is about.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
-            `engine.results`.
-        of: What there is more and more of, "obstacles" or "segments"; the latter among 30
-            obstacles.
-        counts: How many; None: those of `AXES`.
-        progress: Whether to show a progress bar.
-
-    Returns:
-        {"meta": ..., "trials": [...]}, each trial with its number of `obstacles` or `segments`; see
-        `runner.run`.
-
-    Raises:
-        InputError: `of` is unknown, a number is less than 1 (of segments: less than 4), or `out`
-            has trials of other settings.
-        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+        out: Folder.
+        starts: Number of random starts.
+        seed: Random seed of starts and planning.
+        of: "obstacles", or "segments" among 30 obstacles.
+        counts: Numbers of them. Default: those of `AXES`.
+        **execution: See `Execution`; several jobs slow each other down.
     """
     if of not in AXES:
         raise InputError("unknown", field="of", expected=" or ".join(AXES), got=of)
@@ -204,76 +194,56 @@ def run(
         "counts": counts,
         **LIMITS,
     }
-    result = runner.run(
-        trials, _record, out, settings=settings, jobs=jobs, scheduler=scheduler, progress=progress
-    )
+    result = runner.run(trials, _record, out, settings=settings, **execution)
     write_atomically(Path(out) / "table.md", report(result).encode())
     scale_chart(result["trials"], Path(out) / "scale.png", of=of, title=AXES[of].title)
     return result
 
 
 def report(result: Mapping[str, Any]) -> str:
-    """Return the table of a result in Markdown, with versions and machine at the foot."""
-    about = result["meta"]
+    """Return the table of a result in Markdown."""
+    about, records, rows = result["meta"], result["trials"], []
     of = about["of"]
     usual = AXES[of].usual
-    timed = [
-        record for record in result["trials"] if record.get("planning_time") is not None
-    ]  # all but errors
-    few = {record["number"]: record["planning_time"] for record in timed if record[of] == usual}
-    rows = []
-    for count in about["counts"]:
-        everyone, own = (
-            [r for r in records if r[of] == count] for records in (result["trials"], timed)
-        )
-        ratios = [
-            record["planning_time"] / few[record["number"]]
-            for record in own
-            if record["number"] in few
-        ]
-        numbers = (
-            *distribution(own, "planning_time"),
-            quartiles(ratios)[1],
-            *(distribution(own, part)[0] for part in TIMES),
-        )
-        success = f"{sum(record['success'] for record in everyone)} of {len(everyone)}"
+    timed = [record for record in records if record.get("planning_time") is not None]
+    few = {r["number"]: r["planning_time"] for r in select(timed, **{of: usual})}
+    for number in about["counts"]:
+        own = select(timed, **{of: number})
+        ratios = [r["planning_time"] / few[r["number"]] for r in own if r["number"] in few]
+        times = map(decimal, (*distribution(own, "planning_time"), quartiles(ratios)[1]))
         iterations = f"{distribution(own, 'iterations')[0]:.0f}" if own else "–"
-        rows.append([str(count), success, *map(decimal, numbers), iterations])
+        success = count(select(records, **{of: number}))
+        rows.append([str(number), success, *times, *medians(own, *TIMES), iterations])
     head = [of, "success", "time, median [s]", "95th percentile [s]", f"times that of {usual}"]
     head += [f"{name} [s]" for name in TIMES.values()] + ["Ipopt iterations"]
-    parts = [
+    return page(
+        about,
         f"# Planning time against the number of {of}",
-        f"{about['starts']} random starts, the same for every number of {of}; seed {about['seed']}. Success is the word of "
-        f"the independent validation. Times are those of all trials; “times that of {usual}” is the median, over starts, of the "
-        f"ratio to the time with {usual} {of}. What follows are medians of parts of the time; the rest is setting up the "
-        "problem.",
+        f"{about['starts']} random starts, the same for every number of {of}; seed "
+        f"{about['seed']}. {JUDGED} Times are those of all trials; “times that of {usual}” is the "
+        f"median, over starts, of the ratio to the time with {usual} {of}. What follows are "
+        "medians of parts of the time; the rest is setting up the problem.",
         markdown(head, rows),
         "![Planning time](scale.png)",
-    ]
-    return "\n\n".join([*parts, foot(about)]) + "\n"
+    )
 
 
 def scale_chart(
     records: Sequence[Record], path: str | Path | None, *, of: str = "obstacles", title: str = ""
 ) -> Figure:
-    """Draw planning time against the number of something, and what it is spent on: medians, and quartiles of the whole.
+    """Draw planning time and its parts against a count: medians, and quartiles of the whole.
 
     Args:
-        records: Records as `record.trial` makes them, with the field `of`; those without a planning
-            time are left out.
-        path: The file to write, .png, .svg or .pdf; None writes nothing.
-        of: What there is more and more of, one of `AXES`.
-        title: Written above.
-
-    Returns:
-        The figure.
+        path: File to write; None writes nothing.
+        records: Records of `record.trial` with the field `of`.
+        of: One of `AXES`.
+        title: Title.
     """
     records = [record for record in records if record.get("planning_time") is not None]
     counts = sorted({int(record[of]) for record in records})
     rows = [[record for record in records if record[of] == count] for count in counts]
 
     def medians(*fields: str) -> list[float]:
-        """Return, for each number of obstacles, the median of the first field less the others."""
         return [
             float(
                 np.median(
@@ -342,7 +312,7 @@ def _solve(scene: Scene, seed: int, hinge: float, options: Options) -> Plan:
 
 @functools.cache
 def _warm(seed: int) -> None:
-    """Plan once in this process, which pays for what is loaded and built only once."""
+    """Plan once in this process, to exclude one-time costs from times."""
     if (
         _solve(_crowded(AXES["obstacles"].counts[0]), seed, _OPENED["obstacles"], Options()).status
         == "interrupted"

@@ -38,22 +38,6 @@ def test_a_client_that_is_busy_limits_all() -> None:
     assert many["efficiency"] == pytest.approx(0.1, rel=0.1)
 
 
-def test_one_that_straggles_keeps_all_waiting() -> None:
-    costs = Costs((1.0,), tuple([1.0] * 99 + [200.0]), 0.0, 1.0)
-    even, straggling = (
-        simulated(Costs((1.0,), (1.0,), 0.0, 1.0), 100, 1000),
-        simulated(costs, 100, 1000),
-    )
-    assert even["efficiency"] == 1.0
-    assert straggling["efficiency"] < 0.3
-    assert straggling["in_vain"] > 0.5  # the others go on with numbers that nobody needs
-
-
-def test_the_same_numbers_give_the_same_result() -> None:
-    costs = Costs((3.0, 4.0), (1.0, 2.0, 2.5), 0.01, 4.0)
-    assert simulated(costs, 50) == simulated(costs, 50)
-
-
 def test_what_a_journal_says(tmp_path: Path) -> None:
     """Blocks of two; the first of each process is the first in the journal."""
     (tmp_path / "recipe.yaml").write_text(json.dumps(SMALL))

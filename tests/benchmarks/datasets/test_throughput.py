@@ -8,10 +8,9 @@ import yaml
 from helpers.datasets import SMALL
 
 from vkc_pin.benchmarks.datasets.simulated import WORKERS
-from vkc_pin.benchmarks.datasets.throughput import _slope, run
+from vkc_pin.benchmarks.datasets.throughput import run
 from vkc_pin.cli import main
 from vkc_pin.datasets.recipes.recipe import TASKS
-from vkc_pin.errors import InputError
 
 pytest.importorskip("h5py")
 
@@ -91,24 +90,7 @@ def test_a_curve_of_workers(tmp_path: Path) -> None:
     assert "times one" in (tmp_path / "out/table.md").read_text()
 
 
-def test_a_folder_with_other_files_is_refused(tmp_path: Path) -> None:
-    recipe = write(tmp_path)
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "table.md").write_text("mine")
-    with pytest.raises(InputError, match="there are other files in this folder"):
-        run(out=tmp_path / "out", episodes=2, recipe=recipe, progress=False)
-    assert [path.read_text() for path in (tmp_path / "out").iterdir()] == ["mine"]
-
-
 def write(folder: Path) -> str:
     recipe = folder / "small.yaml"
     recipe.write_text(yaml.safe_dump(SMALL))
     return str(recipe)
-
-
-def test_growth_is_that_of_the_process_that_grows_most() -> None:
-    filling = [100.0 + k for k in range(30)]
-    flat, growing = [*filling, *[130.0] * 30], [*filling, *[130.0 + 0.01 * k for k in range(30)]]
-    assert _slope([flat]) == 0.0
-    assert _slope([flat, growing]) == pytest.approx(10.0)
-    assert _slope([filling]) is None

@@ -1,31 +1,58 @@
-"""Records say of which commit the sources are."""
+"""Trials are recorded."""
 
 from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
+from helpers.fake_plan import fake_plan
 
-import vkc_pin as vkc
 from vkc_pin.benchmarks.harness import record
+from vkc_pin.validation.report import Report
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
-def test_the_commit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commit_needs_git(monkeypatch: pytest.MonkeyPatch) -> None:
     record.commit.cache_clear()
     found = record.commit()
     assert found is None or len(found) >= 7
-    monkeypatch.setenv("PATH", "")  # no git
+    monkeypatch.setenv("PATH", "")
     record.commit.cache_clear()
     assert record.commit() is None
     record.commit.cache_clear()
 
 
-def test_record_names_the_failed_constraint(door_plan: vkc.Plan) -> None:
-    violation = vkc.Violation("penetration", "forearm_link – sofa", detail="overlap by 30 mm")
-    plan = dataclasses.replace(door_plan, report=vkc.Report((violation,)), status="rejected")
-    trial = record.trial(plan, method="VKC", seed=0, task="whole")
-    assert (trial["success"], trial["task"]) == (False, "whole")
-    assert trial["failed_constraint"] == "penetration forearm_link – sofa"
-    assert trial["violations"] == [str(violation)]
-    late = dataclasses.replace(door_plan, status="time limit")
+def test_failure_is_recorded_with_the_first_violation() -> None:
+    plan = fake_plan()
+    found = record.trial(plan, method="VKC", seed=3, number=7)
+    assert (found["scene"], found["method"], found["seed"], found["number"]) == (
+        "door",
+        "VKC",
+        3,
+        7,
+    )
+    assert (found["success"], found["status"]) == (False, "rejected")
+    assert found["failed_constraint"] == "penetration forearm_link – sofa"
+    assert found["violations"] == [str(plan.report.violations[0])]
+    assert found["base_path_length"] == plan.metrics["base_path_length"]
+    assert found["waypoints"] == len(plan.trajectory.times)
+    np.testing.assert_allclose(found["start"], plan.scene.start, atol=1e-9)
+    late = dataclasses.replace(plan, status="time limit", report=Report())
     assert record.trial(late, method="VKC", seed=0)["failed_constraint"] == "time limit"
+
+
+def test_peaks_are_those_of_the_arm() -> None:
+    names = ("x", "y", "yaw", "shoulder", "elbow", "door.hinge")
+    positions = [  # base and object are faster than the arm
+        [0.0, 0.0, 0.0, 0.0, 1.0, 0.0],
+        [3.0, 4.0, 9.0, 0.5, 1.0, 9.0],
+        [3.0, 4.0, 0.0, 0.1, -2.0, 0.0],
+        [4.0, 3.0, 0.0, 0.1, -2.6, 0.0],
+    ]
+    times = np.array([0.0, 1.0, 3.0, 3.5])
+    motion = Trajectory(names, times, np.array(positions), (PhaseSpan("move", 0, 3),), 5)
+    # The elbow turns by -3 rad in 2 s; its velocity changes by 1.2 rad/s within 0.5 s.
+    found = record.peaks(motion)
+    assert found == pytest.approx({"peak_velocity": 1.5, "peak_acceleration": 2.4})

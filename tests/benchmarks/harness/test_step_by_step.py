@@ -1,4 +1,4 @@
-"""Steps planned one by one: each goes on where the one before ends, and the first that fails is the last."""
+"""Steps are planned one by one, until one fails."""
 
 from __future__ import annotations
 
@@ -9,33 +9,24 @@ import vkc_pin as vkc
 from vkc_pin.benchmarks.harness.step_by_step import combined, step_by_step
 
 
-@pytest.fixture(scope="module")
-def plans() -> list[vkc.Plan]:
-    """Return the plans of four steps, of which the third leads into the sofa."""
+def test_steps_are_planned_from_the_end_of_the_previous_one() -> None:
     steps = [vkc.GoTo(-0.4, 0.5), vkc.GoTo(0.6, 0.0), vkc.GoTo(-1.5, -1.45), vkc.GoTo(-0.7, 0.3)]
-    return step_by_step(vkc.load_scene("door"), steps, options=vkc.Options(), seed=3)
-
-
-def test_each_begins_where_the_one_before_ends(plans: list[vkc.Plan]) -> None:
-    assert [one.success for one in plans] == [True, True, False]
-    first, second, _ = plans
+    plans = step_by_step(vkc.load_scene("door"), steps, options=vkc.Options(), seed=3)
+    assert [one.success for one in plans] == [True, True, False], "the third leads into the sofa"
+    first, second, third = plans
     np.testing.assert_allclose(
         second.trajectory.positions[0], first.trajectory.positions[-1], atol=1e-9
     )
     assert [one.seed for one in plans] == [3, 3, 3]
 
-
-def test_the_record_is_of_all_of_them(plans: list[vkc.Plan]) -> None:
     record = combined(plans, 4, method="step by step", seed=3, number=0)
     assert (record["success"], record["steps_done"], record["number"]) == (False, 2, 0)
     assert record["base_path_length"] == pytest.approx(
         sum(one.metrics["base_path_length"] for one in plans)
     )
     assert record["clearance"] == min(one.metrics["clearance"] for one in plans)
-    assert record["status"] == plans[-1].status
+    assert record["status"] == third.status
     assert "steps[2]" in record["failed_constraint"]
 
-
-def test_all_that_succeed_are_a_success(plans: list[vkc.Plan]) -> None:
     record = combined(plans[:2], 2, method="step by step", seed=3)
     assert (record["success"], record["failed_constraint"], record["steps_done"]) == (True, None, 2)

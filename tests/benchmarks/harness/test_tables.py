@@ -71,7 +71,7 @@ def test_methods_against_numbers_by_hand() -> None:
         "failures",
     ]
     assert rows == [
-        # 95th percentile of 1, 2, 3: 2 + 0.9 · 1; efforts of successes only
+        # 95th percentile of 1, 2, 3: 2 + 0.9 · 1; path lengths of successes only
         ["easy", "auto", "3 of 3", "2.00", "2.90", "4.00", "12.00", "0", "none"],
         [
             "easy",
@@ -111,11 +111,6 @@ def test_methods_against_numbers_by_hand() -> None:
     ]
 
 
-def test_one_scene_has_no_sum() -> None:
-    _, *rows = cells(tables.methods_table(RECORDS, {"a": "easy"}, ["auto"]))
-    assert [row[0] for row in rows] == ["easy"]
-
-
 def test_comparison_against_numbers_by_hand() -> None:
     head, *rows = cells(
         tables.comparison_table(RECORDS, SCENES, ("auto", "slow"), ("one", "two")).replace(
@@ -143,19 +138,7 @@ def test_comparison_against_numbers_by_hand() -> None:
     ]
 
 
-def test_common_successes_are_of_one_start_and_repeat() -> None:
-    again = {**RECORDS[0], "repeat": 1}
-    found = tables.common([again, *RECORDS], ["auto", "slow"])
-    assert [
-        (one["number"], one["repeat"], other["number"], other["repeat"]) for one, other in found
-    ] == [
-        (0, 0, 0, 0),
-        (2, 0, 2, 0),
-    ]
-    assert all((one["method"], other["method"]) == ("auto", "slow") for one, other in found)
-
-
-def test_common_successes_of_three() -> None:
+def test_common_successes_of_three_methods() -> None:
     third = record("a", "third", 2, 1.0, 1.0, 1.0)
     del third["repeat"]  # an experiment without repeats
     found = tables.common(
@@ -166,15 +149,7 @@ def test_common_successes_of_three() -> None:
     ]
 
 
-def test_lower() -> None:
-    pairs = [
-        ({"x": a}, {"x": b})
-        for a, b in ((1.0, 2.0), (2.0, 1.0), (3.0, 3.0), (3.0, 3.0 + 1e-8), (3.0, 3.0 + 1e-4))
-    ]
-    assert tables.lower(pairs, "x") == 2
-
-
-def test_mean_and_deviation() -> None:
+def test_mean_and_deviation_of_a_sample() -> None:
     assert tables.mean_and_deviation([2.0, 4.0, 9.0]) == pytest.approx(
         (5.0, np.sqrt(13.0))
     )  # 9 + 1 + 16, by 2
@@ -193,21 +168,23 @@ def test_mean_and_deviation() -> None:
         (1, 29, 0.0061, 0.1718),
     ],
 )
-def test_wilson(good: int, number: int, low: float, high: float) -> None:
+def test_wilson_interval_against_published_values(
+    good: int, number: int, low: float, high: float
+) -> None:
     assert tables.wilson(good, number) == pytest.approx((low, high), abs=5e-5)
     assert tables.wilson(number - good, number) == pytest.approx((1.0 - high, 1.0 - low), abs=5e-5)
 
 
-def test_wilson_of_nothing() -> None:
+def test_wilson_interval_without_trials() -> None:
     assert tables.wilson(0, 0) == (0.0, 1.0)
 
 
-def test_quartiles() -> None:
+def test_quartiles_of_values() -> None:
     assert tables.quartiles([5.0, 1.0, 2.0, 3.0, 4.0]) == (2.0, 3.0, 4.0)
     assert np.isnan(tables.quartiles([])).all()
 
 
-def test_csv() -> None:
+def test_csv_has_a_column_of_each_field() -> None:
     records = [
         {"key": "x", "good": True, "values": [1.5, 2]},
         {"key": 'a "b", c\nd', "more": None, "good": False},
@@ -220,7 +197,7 @@ def test_csv() -> None:
     ]
 
 
-def test_foot() -> None:
+def test_foot_names_machine_versions_and_time() -> None:
     machine = {
         "system": "Linux",
         "machine": "x86_64",

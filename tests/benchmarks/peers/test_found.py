@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vkc_pin.benchmarks.peers.found import Clock, judged
+from vkc_pin.benchmarks.peers.found import judged
 from vkc_pin.benchmarks.peers.tasks import ends, given, problem_of
 
 
@@ -18,11 +18,3 @@ def test_a_path_through_a_wall_is_rejected() -> None:
     assert result.status == "rejected"
     assert "closure" in {violation.constraint for violation in result.report.violations}
     assert judged(own, problem, None, "timed out", name="nobody", seed=0).status == "timed out"
-
-
-def test_the_clock_counts_what_others_spend() -> None:
-    clock = Clock(100.0)
-    clock.elsewhere += 5.0
-    assert 5.0 <= clock.spent < 10.0
-    assert 0.0 <= clock.wall < 5.0 < 95.0 < clock.left <= 100.0
-    assert Clock(0.0).left == 0.0

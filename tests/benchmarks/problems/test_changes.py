@@ -41,12 +41,6 @@ def test_a_constant_changes_where_it_is_imported_too_and_comes_back_after_an_err
     assert trust_region.ACTIVE_FRACTION == loop.ACTIVE_FRACTION == before
 
 
-def test_no_change() -> None:
-    assert str(UNCHANGED) == "unchanged"
-    with UNCHANGED.applied():
-        assert UNCHANGED.options == vkc.Options()
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import numpy as np
 import pytest
 
 import vkc_pin as vkc
@@ -24,18 +23,6 @@ def test_the_objective_is_that_of_the_solver(drawn: vkc.Plan) -> None:
     assert drawn.success, drawn.summary()
     (last, *_) = [row["objective"] for row in reversed(drawn.history) if row["accepted"]]
     assert trials.objective(drawn) == pytest.approx(last, rel=1e-6)
-
-
-def test_the_objective_of_what_failed_or_is_no_single_problem(drawn: vkc.Plan) -> None:
-    assert trials.objective(dataclasses.replace(drawn, status="rejected")) is None
-    scene = vkc.load_scene("drawer")
-    apart = vkc.plan(
-        scene,
-        [vkc.Grasp("drawer"), vkc.Actuate("drawer", {"slide": 0.2}), vkc.GoTo(-0.8, 0.5)],
-        simultaneous=False,
-    )
-    found = trials.objective(apart)
-    assert found is None or np.isfinite(found)
 
 
 @pytest.mark.parametrize(

@@ -10,18 +10,12 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.robot_object_matrix import pairs
 from vkc_pin.benchmarks.robot_object_matrix.pairs import (
-    OBJECTS,
     SHARE,
     description_of,
     hall,
-    kind_of,
     pair,
 )
-from vkc_pin.planning.diagnosis.diagnosis import BlockedGoal
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.procedural.furniture.catalogue import KINDS
 from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.placed_object import make_world_shapes
@@ -38,16 +32,6 @@ def husky() -> vkc.Robot:
     return vkc.load_robot("husky_ur5e")
 
 
-def test_what_there_is() -> None:
-    assert len(set(OBJECTS)) >= 25
-    assert {kind_of(name) for name in OBJECTS} == set(KINDS), (
-        "and what scenes/objects has is of the same kinds"
-    )
-    assert [
-        kind_of(name) for name in ("oven_12", "narrow_door", "counter_drawer", "home/oven_1.yaml")
-    ] == [*("oven", "door", "drawers", "oven")]
-
-
 def test_descriptions_are_the_same_wherever_they_are_read() -> None:
     stored = find_resource_folder("scenes") / "objects" / "narrow_door.yaml"
     by_name, by_path = description_of("narrow_door"), description_of(str(stored))
@@ -57,13 +41,6 @@ def test_descriptions_are_the_same_wherever_they_are_read() -> None:
     assert description_of("oven_7") == vkc.procedural.random_object("oven", 7)
     with pytest.raises(vkc.UnknownNameError, match="did you mean 'oven_0'"):
         description_of("ofen_0")
-
-
-def test_an_object_must_say_what_it_is_made_of(tmp_path: Path) -> None:
-    file = tmp_path / "thing.yaml"
-    file.write_text("attachments: []\n", encoding="utf-8")
-    with pytest.raises(vkc.InputError, match=r"thing\.yaml.*urdf"):
-        description_of(str(file))
 
 
 @pytest.mark.parametrize("name", ["drawers_0", "faucet_0", "narrow_door", "low_drawer"])
@@ -107,40 +84,6 @@ def test_half_of_the_range_by_what_was_proposed(husky: vkc.Robot) -> None:
     assert list(item.attachments) == [name for name, value in opening.items() if value >= goal]
 
 
-def test_what_is_reached_shut_but_not_open_is_not_taken_first(
-    husky: vkc.Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What is there but for one configuration is as good as what is not there: the next one is first then."""
-    looked: list[str] = []
-    real = pairs.diagnose_goals
-
-    def diagnose_goals(problem: TrajectoryProblem, seed: int) -> list[BlockedGoal]:
-        (hold,) = problem.task.holds
-        looked.append(hold.attachment)
-        return (
-            [BlockedGoal("move it.lid: out of reach", 0.3)]
-            if len(looked) == 1
-            else real(problem, seed)
-        )
-
-    monkeypatch.setattr(pairs, "diagnose_goals", diagnose_goals)
-    found = pair(husky, "husky_ur5e", "chest_0")
-    assert found.scene is not None
-    assert found.step == vkc.Actuate("it", found.step.joints if found.step else {})
-    first, second = looked
-    assert list(found.scene.objects["it"].object.attachments)[:2] == [second, first], (
-        "it is left to planning, after the other"
-    )
-    monkeypatch.setattr(
-        pairs, "diagnose_goals", lambda *_: [BlockedGoal("move it.lid: out of reach", 0.3)]
-    )
-    nowhere = pair(husky, "husky_ur5e", "chest_0")
-    assert (nowhere.step, nowhere.because.split("; ")[0]) == (
-        None,
-        f"{first}: move it.lid: out of reach",
-    )
-
-
 @pytest.mark.parametrize(("height", "raised"), [(0.4, True), (0.8, False)])
 def test_what_is_low_stands_on_a_counter(tmp_path: Path, height: float, raised: bool) -> None:
     urdf = SMOOTH.replace("0.4 0.4 0.4", f"0.4 0.4 {height}").replace(
@@ -169,15 +112,6 @@ def test_what_no_hand_can_hold_is_out_of_reach(husky: vkc.Robot, tmp_path: Path)
     found = pair(husky, "husky_ur5e", _written(tmp_path / "smooth.yaml"))
     assert found.step is None
     assert found.because.startswith("slide: nothing of it fits between the fingers")
-
-
-def test_what_must_be_opened_further_than_the_hand_goes(
-    husky: vkc.Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pairs, "SHARE", 1.0)
-    found = pair(husky, "husky_ur5e", "dishwasher_0")
-    assert found.step is None
-    assert found.because == "door_bar ends with door at 1.31", "of 1.5"
 
 
 def test_a_robot_without_a_hand_opens_nothing() -> None:

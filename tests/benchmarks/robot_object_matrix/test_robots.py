@@ -9,16 +9,8 @@ import pytest
 from helpers.arm_urdf import write_arms
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.robot_object_matrix.robots import ROBOTS, report, run
+from vkc_pin.benchmarks.robot_object_matrix.robots import report, run
 from vkc_pin.cli import main
-from vkc_pin.world.models.robot_file import list_robots
-
-
-@pytest.fixture(autouse=True)
-def same_sources(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The sources may be worked on while the tests run."""
-    monkeypatch.setattr(runner, "_sources", lambda: "abc")
 
 
 def test_bench_robots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -107,7 +99,3 @@ def test_what_cannot_be_asked_for(tmp_path: Path) -> None:
         run(out=tmp_path, robots=[str(tmp_path / "none.urdf")])
     with pytest.raises(vkc.UnknownNameError, match="did you mean 'panda'"):
         run(out=tmp_path, robots=["pandas"])
-
-
-def test_robots_that_there_are() -> None:
-    assert set(ROBOTS) <= set(list_robots())

@@ -6,19 +6,11 @@ import json
 from pathlib import Path
 
 import pytest
-from helpers.arm_urdf import write_arms
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.robot_object_matrix.pairs import SHARE
 from vkc_pin.benchmarks.robot_object_matrix.run import run
 from vkc_pin.cli import main
-
-
-@pytest.fixture(autouse=True)
-def same_sources(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The sources may be worked on while the tests run."""
-    monkeypatch.setattr(runner, "_sources", lambda: "abc")
 
 
 def test_bench_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -68,19 +60,6 @@ def test_bench_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert main([*command, "--out", str(out)]) == 0
     again = (out / "trials.jsonl").read_bytes()
     assert again == journal, "nothing was run again"
-
-
-def test_a_robot_whose_hand_nobody_described_is_imported(tmp_path: Path) -> None:
-    file = write_arms(tmp_path / "given")
-    result = run(
-        out=tmp_path / "out", starts=1, robots=[str(file)], objects=["drawers_0"], progress=False
-    )
-    (trial,) = result["trials"]
-    made = tmp_path / "out" / "robots" / trial["robot"]
-    assert vkc.load_robot(made).touch_links
-    assert not vkc.load_robot(file).touch_links
-    assert trial["status"] != "no hand"
-    assert trial["because"] or trial["success"]
 
 
 def test_what_cannot_be_asked_for(tmp_path: Path) -> None:

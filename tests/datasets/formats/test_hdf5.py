@@ -7,21 +7,14 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.datasets import SMALL
 
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.episode import run_attempt, unpack
 from vkc_pin.datasets.formats.hdf5 import make_part, read_episodes, read_numbers, write_shard
 from vkc_pin.datasets.formats.samples import sample_episode
-from vkc_pin.datasets.generate import generate
 from vkc_pin.errors import InputError
 
 h5py = pytest.importorskip("h5py")
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return generate(SMALL, 4, tmp_path_factory.mktemp("made") / "out")
 
 
 def test_the_groups_are_those_of_robomimic(made: Dataset) -> None:
@@ -90,11 +83,6 @@ def test_samples_are_the_motion(made: Dataset) -> None:
     assert (
         np.einsum("ij,ij->i", found["hand_pose"][1:, 3:], found["hand_pose"][:-1, 3:]) > 0.0
     ).all()
-
-
-def test_small_enough(made: Dataset) -> None:
-    files = [*made.shards, *(made.folder / "scenes").iterdir()]
-    assert sum(file.stat().st_size for file in files) / len(made.numbers()) <= 40_000
 
 
 def test_the_same_episodes_give_the_same_bytes(made: Dataset, tmp_path: Path) -> None:

@@ -21,11 +21,6 @@ pq = pytest.importorskip("pyarrow.parquet")
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return generate(SMALL, 4, tmp_path_factory.mktemp("made") / "out", lerobot=True)
-
-
-@pytest.fixture(scope="module")
 def root(made: Dataset) -> Path:
     return made.folder / "lerobot" / "husky_ur5e"
 
@@ -119,77 +114,3 @@ def test_frames_a_second_are_whole(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="whole numbers of frames"):
         generate({**SMALL, "rate": 12.5}, 1, tmp_path / "out", lerobot=True)
     assert not (tmp_path / "out").exists()  # not after hours of planning
-
-
-def test_lerobot_reads_it(made: Dataset, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """LeRobot itself finds every frame, every task and the statistics as they were written."""
-    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    module = pytest.importorskip(
-        "lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed"
-    )
-    found = module.LeRobotDataset("vkc_pin/small", root=root)
-    assert (found.num_episodes, found.fps, found.meta.robot_type) == (4, 10, "husky_ur5e")
-    row = 0
-    for number, episode in enumerate(made.episodes()):
-        own = sample_episode(episode, episode.scene().robot, found.fps)
-        state = np.hstack([own[name] for name in ("base_pose", "arm_position", "gripper")])
-        for k in range(len(state)):
-            frame = found[row]
-            assert (
-                int(frame["episode_index"]),
-                int(frame["frame_index"]),
-                int(frame["index"]),
-            ) == (number, k, row)
-            assert frame["task"] == describe_task(episode.about)
-            assert np.allclose(frame["observation.state"], state[k], atol=1e-6)
-            assert np.allclose(frame["action"], own["actions"][k], atol=1e-6)
-            row += 1
-    assert row == found.num_frames == len(found)
-    assert np.allclose(
-        found.meta.stats["action"]["mean"],
-        json.loads((root / "meta/stats.json").read_text())["action"]["mean"],
-    )
-
-
-def test_lerobot_reads_ahead(root: Path, made: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Policies take the actions of several moments; some of the last ones are beyond the end and marked as such."""
-    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    module = pytest.importorskip(
-        "lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed"
-    )
-    found = module.LeRobotDataset(
-        "vkc_pin/small", root=root, episodes=[1], delta_timestamps={"action": [0.0, 0.1, 0.2]}
-    )
-    episode = list(made.episodes())[1]
-    actions = sample_episode(episode, episode.scene().robot, 10)["actions"]
-    assert len(found) == len(actions)
-    assert np.allclose(found[0]["action"], actions[:3], atol=1e-6)
-    assert np.asarray(found[len(actions) - 1]["action_is_pad"]).tolist() == [False, True, True]
-
-
-def test_lerobot_reads_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    module = pytest.importorskip(
-        "lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed"
-    )
-    pytest.importorskip("mujoco")
-    head = {
-        "name": "head",
-        "frame": "base",
-        "position": [0, 0, 1.5],
-        "target": [1.2, 0, 0.6],
-        "width": 32,
-        "height": 24,
-    }
-    seen = generate(
-        {**SMALL, "simulate": True, "cameras": [head]}, 1, tmp_path / "out", lerobot=True
-    )
-    found = module.LeRobotDataset("vkc_pin/seen", root=tmp_path / "out/lerobot/husky_ur5e")
-    pictures = next(seen.episodes()).images()
-    assert pictures is not None
-    assert found.meta.camera_keys == ["observation.images.head"]
-    for k in (0, len(found) - 1):
-        shown = np.asarray(found[k]["observation.images.head"])  # (3, height, width), from 0 to 1
-        assert np.allclose(
-            shown.transpose(1, 2, 0) * 255.0, pictures.pictures["head_image"][k], atol=1e-3
-        )

@@ -4,7 +4,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import yaml
 
@@ -62,17 +61,6 @@ def test_the_digest_is_that_of_what_episodes_depend_on(change: dict[str, Any], s
     assert (load_recipe({**SMALL, **change}).digest == load_recipe(SMALL).digest) == same
 
 
-def test_random_numbers_are_those_of_recipe_and_words() -> None:
-    recipe, other = load_recipe(SMALL), load_recipe({**SMALL, "max_evaluations": 7})
-    draws = [
-        r.rng(*words).random(4)
-        for r, words in ((recipe, ("a", 1)), (recipe, ("a", 2)), (other, ("a", 1)))
-    ]
-    assert np.array_equal(draws[0], load_recipe(dict(SMALL)).rng("a", 1).random(4))
-    assert not np.array_equal(draws[0], draws[1])
-    assert not np.array_equal(draws[0], draws[2])
-
-
 @pytest.mark.parametrize(
     ("line", "field", "said"),
     [
@@ -126,14 +114,3 @@ def test_the_documentation_has_every_field(tmp_path: Path) -> None:
         assert [name for name in schema.model_fields if f"`{name}`" not in page] == [], (
             schema.__name__
         )
-
-
-def test_no_recipe_of_that_name() -> None:
-    with pytest.raises(UnknownNameError, match="did you mean 'home'"):
-        load_recipe("hom")
-
-
-def test_every_field_has_a_default_but_the_name() -> None:
-    assert [name for name, field in RecipeSchema.model_fields.items() if field.is_required()] == [
-        "name"
-    ]

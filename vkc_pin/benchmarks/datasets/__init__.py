@@ -1,1 +1,1 @@
-"""Datasets: how fast they are made."""
+"""Measures and simulates the generation of datasets."""

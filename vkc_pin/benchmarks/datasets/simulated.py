@@ -1,11 +1,8 @@
-"""Many workers, simulated from what tasks took with few: what the one client costs, stragglers, and work in vain.
+"""Simulates many workers of dataset generation from measured task durations.
 
-A simulation of discrete events of how `utils.parallel.engine` feeds processes. Every worker has a
-task in hand and one waiting. What it returns waits for the client, which takes results one after
-the other: it writes them down, fills shards, and sends the worker another task. A dataset is the
-first numbers that become episodes, so that it ends when the last of these is there; whatever was
-begun beyond them is in vain. What tasks take is drawn from what they took, the first of a worker
-from first ones.
+A discrete-event simulation of `utils.parallel.engine`: every worker has one task in progress and
+one queued; the single client handles results one after the other. The dataset ends with the last
+of its first numbers; tasks beyond are wasted.
 """
 
 from __future__ import annotations
@@ -29,13 +26,13 @@ _SEED = 0
 
 @dataclass(frozen=True)
 class Costs:
-    """What tasks took; a task is the episodes of a room.
+    """Measured durations of tasks, each of which makes the episodes of a room.
 
     Attributes:
-        first: Processor times of the first task of each process [s].
-        later: Those of the others [s].
-        client: Processor time of the client for a task, with Dask's scheduler if there was one [s].
-        episodes: Episodes that a task gives, on average.
+        first: CPU times of the first task of each process [s].
+        later: CPU times of the other tasks [s].
+        client: CPU time of the client per task, with Dask's scheduler if there is one [s].
+        episodes: Average number of episodes per task.
     """
 
     first: tuple[float, ...]
@@ -45,12 +42,12 @@ class Costs:
 
     @property
     def mean(self) -> float:
-        """What a task takes, on average [s]."""
+        """Average duration of a task [s]."""
         return float(np.mean(self.later or self.first))
 
 
 def measured(dataset: Dataset) -> Costs:
-    """Return what a dataset's journal says of its tasks, of which there is one at least."""
+    """Return the costs in a dataset's journal."""
     kept = JournalContents.read(dataset.folder / "journal.jsonl")
     fields = dataset.recipe.fields
     size = fields.rooms.episodes * fields.variants
@@ -71,18 +68,17 @@ def measured(dataset: Dataset) -> Costs:
 
 
 def simulated(costs: Costs, workers: int, tasks: int | None = None) -> dict[str, Any]:
-    """Return what so many workers come to.
+    """Simulate a number of workers.
 
     Args:
-        costs: Of tasks.
-        workers: How many.
-        tasks: How many make the dataset; None: a hundred for each worker.
+        costs: Costs of tasks.
+        workers: Number of workers.
+        tasks: Number of tasks of the dataset. Default: 100 per worker.
 
     Returns:
-        `workers`, `tasks`; `episodes_per_hour`; `efficiency`: the share of the workers' time, from
-        the first task's sending to the end, in which they work on what becomes part of the dataset;
-        `client`: the share of the time in which the client is busy; `in_vain`: the share of the
-        workers' time in which they work on what is not needed.
+        `workers`, `tasks`, `episodes_per_hour`, `efficiency` (share of the workers' time spent on the
+        dataset), `client` (share of time in which the client is busy) and `in_vain` (share of the
+        workers' time spent on wasted tasks).
     """
     wanted = _EACH * workers if tasks is None else tasks
     rng = np.random.default_rng(_SEED)
@@ -96,7 +92,6 @@ def simulated(costs: Costs, workers: int, tasks: int | None = None) -> dict[str,
     spans: list[tuple[float, float]] = []  # of each task
 
     def send(worker: int) -> None:
-        """Send the next task to a worker."""
         nonlocal free
         free += half
         task, begins = len(spans), max(ready[worker], free)

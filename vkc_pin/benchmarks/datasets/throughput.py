@@ -1,8 +1,4 @@
-"""How many validated episodes an hour a machine makes of each task, of which share of attempts, and with how much memory.
-
-With several workers, one alone makes the same episodes as well, for the cost curve; and many are
-simulated from what tasks took.
-"""
+"""Measures how many validated episodes an hour are generated for each task."""
 
 from __future__ import annotations
 
@@ -46,32 +42,25 @@ def run(
     curve: bool = True,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Make datasets of one task each and write results.json, results.csv, table.md and workers.png to `out`.
+    """Generate a dataset of each task and write results, table and chart to a folder.
 
     Args:
-        out: The folder. What it has of the same recipe already is not made again, and not timed.
-        episodes: How many of each task, at least 1.
+        out: Folder. Existing episodes of the same recipe are neither made nor timed again.
+        episodes: Number of episodes per task, at least 1.
         jobs: Number of processes.
-        recipe: Name or path of a recipe; its own tasks make no difference.
+        recipe: Name or path of a recipe; its tasks are ignored.
         scheduler: Address of a Dask scheduler; see `generate`.
-        curve: Whether one worker, and two if `jobs` are more, make the same episodes as well, in
-            folders of their own.
+        curve: Whether one worker, and two if `jobs` is larger, make the same episodes as well.
         progress: Whether to show a progress bar.
 
     Returns:
-        {"meta": ..., "trials": [...], "curve": [...], "simulated": [...]}.
-
-        In "trials", one record a task with `task`, `episodes_per_hour`, `attempts`, `successes`,
-        `workers`, `memory_mb`, `memory_slope_mb` (growth of a process in a thousand attempts),
-        `client_ms` (processor time an attempt of the process that feeds the others, writes down
-        what comes and fills shards), `episodes_per_core_hour` and the medians of what attempts
-        take. In "curve", one a task and number of workers, with `times`: how many times as fast as
-        one worker of this run. In "simulated", one a task and number of workers, see `simulated`,
-        with `saturated_at`: the number of workers at which the client would be busy all the time.
+        {"meta": ..., "trials": records by task, "curve": records by task and number of workers,
+        "simulated": results of `simulated`, with `saturated_at`: number of workers that saturate
+        the client}.
 
     Raises:
-        InputError: No episodes, or the recipe or `out` is wrong.
-        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+        InputError: An argument is wrong, or `out` holds other files.
+        KeyboardInterrupt: Ctrl-C was pressed; the same call resumes the run.
     """
     if episodes < 1:
         raise InputError("out of range", field="episodes", expected="at least 1", got=episodes)
@@ -126,19 +115,19 @@ def run(
 
 
 def _many(task: str, costs: Costs) -> list[dict[str, Any]]:
-    """Return what numbers of workers would come to with a task."""
+    """Simulate a task with several numbers of workers."""
     full = round(costs.mean / costs.client, 1) if costs.client else None
     return [{"task": task, **simulated(costs, count), "saturated_at": full} for count in WORKERS]
 
 
 def record(task: str, dataset: Dataset, jobs: int | None, wall: float) -> dict[str, Any]:
-    """Return what the journal of a dataset says of how fast it was made.
+    """Return the generation statistics of a dataset.
 
     Args:
-        task: Which.
-        dataset: The dataset.
-        jobs: Processes of the last session; None: as many as there were.
-        wall: Time of the call [s], with what starting processes and writing takes.
+        task: Name of the task.
+        dataset: Dataset.
+        jobs: Number of processes; None for as many as the journal has.
+        wall: Wall time of the call [s].
     """
     kept = JournalContents.read(dataset.folder / "journal.jsonl")
     attempts = [record for (record,) in kept.lines.values()]
@@ -179,11 +168,9 @@ def _median(attempts: Sequence[Mapping[str, Any]], name: str) -> float:
 
 
 def _slope(memories: Iterable[Sequence[float]]) -> float | None:
-    """Return by how much the memory of a process grows in a thousand attempts [MB], by least squares; None for few attempts.
+    """Return the memory growth per 1000 attempts [MB], by least squares; None for few attempts.
 
-    Args:
-        memories: Of each process, after each of its attempts [MB]. The first half, in which caches
-            fill, does not count; of several processes the one that grows most is told.
+    The first half, which fills caches, is ignored; the largest growth of any process counts.
     """
     late = [np.asarray(one[len(one) // 2 :], float) for one in memories]
     slopes = [np.polyfit(np.arange(len(one)), one, 1)[0] for one in late if len(one) >= _LEAST]
@@ -191,13 +178,13 @@ def _slope(memories: Iterable[Sequence[float]]) -> float | None:
 
 
 def _size(dataset: Dataset) -> int:
-    """Return how much an episode takes on disk, its share of the scenes with it [bytes]."""
+    """Return the size of an episode on disk with its share of scenes [bytes]."""
     files = [*dataset.shards, *(dataset.folder / "scenes").glob("*.json")]
     return round(sum(file.stat().st_size for file in files) / max(1, len(dataset.numbers())))
 
 
 def report(result: Mapping[str, Any]) -> str:
-    """Return the table of a result in Markdown, with versions and machine at the foot."""
+    """Return the table of a result in Markdown."""
     about, records = result["meta"], result["trials"]
     head = [
         "task",
@@ -236,7 +223,7 @@ def _row(one: Record) -> list[str]:
 
 
 def _curve(curve: Sequence[Record]) -> list[str]:
-    """Return the table of what one and more workers made in one run, headed by a sentence; nothing for no curve."""
+    """Return the table of measured numbers of workers."""
     if not curve:
         return []
     rows = [
@@ -248,7 +235,7 @@ def _curve(curve: Sequence[Record]) -> list[str]:
 
 
 def _simulation(many: Sequence[Record], scheduled: bool) -> list[str]:
-    """Return the table of what many workers would come to, headed by what that is simulated from."""
+    """Return the table of simulated numbers of workers."""
     head = [
         "task",
         "workers",
@@ -276,15 +263,7 @@ def _simulation(many: Sequence[Record], scheduled: bool) -> list[str]:
 
 
 def workers_chart(result: Mapping[str, Any], path: str | Path | None) -> Figure:
-    """Draw the efficiency of many workers, simulated, and of few, measured.
-
-    Args:
-        result: Of `run`.
-        path: The file to write, .png, .svg or .pdf; None writes nothing.
-
-    Returns:
-        The figure.
-    """
+    """Draw the simulated and measured efficiency against the number of workers."""
     with use_style():
         figure = new_figure(6.4, 3.6)
         axes = figure.subplots()

@@ -1,17 +1,17 @@
-"""The door and the drawer with every kind of base that drives, from the same random starts."""
+"""Compares kinds of bases at a door and a drawer."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial
-from vkc_pin.benchmarks.harness.tables import foot, markdown
-from vkc_pin.errors import InputError
+from vkc_pin.benchmarks.harness.runner import Execution
+from vkc_pin.benchmarks.harness.tables import JUDGED, count, markdown, page, select
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
 from vkc_pin.world.scene.scene import Scene, load_scene
@@ -32,14 +32,7 @@ BASES: dict[str, dict[str, Any]] = {
 
 
 def started(task: str, base: str, seed: int, number: int) -> Scene:
-    """Return a scene with the base at a random place, the same for every kind of base.
-
-    Args:
-        task: One of `TASKS`.
-        base: One of `BASES`.
-        seed: Of the random numbers.
-        number: Which start; it does not depend on how many there are.
-    """
+    """Return a scene with a random start, which is the same for every kind of base."""
     scene = load_scene(task).sample_start(np.random.default_rng([seed, number]))
     robot = {**scene.document["robot"], "base": base, **BASES[base]}
     return Scene.from_document({**scene.document, "robot": robot}, scene.folder)
@@ -52,33 +45,18 @@ def run(
     seed: int = 0,
     tasks: Sequence[str] | None = None,
     bases: Sequence[str] | None = None,
-    jobs: int = 1,
-    scheduler: str | None = None,
-    progress: bool = True,
+    **execution: Unpack[Execution],
 ) -> dict[str, Any]:
-    """Run the experiment, or what is left of it, and write results.json, results.csv and table.md to `out`.
+    """Run the experiment in the folder `out`; see `runner.run`.
 
     Args:
-        out: The folder; if it has trials of the same settings already, they are not run again.
-        trials: Number of random starts for each task and base, at least 1.
-        seed: Of the starts and of planning.
-        tasks: Some of `TASKS`; None: all.
-        bases: Some of `BASES`; None: all.
-        jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
-            `engine.results`.
-        progress: Whether to show a progress bar.
-
-    Returns:
-        {"meta": ..., "trials": [...]}; see `runner.run`.
-
-    Raises:
-        UnknownNameError: There is no such task or base.
-        InputError: No trials, or `out` has trials of other settings.
-        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+        out: Folder.
+        trials: Number of random starts per task and base, at least 1.
+        seed: Random seed of starts and planning.
+        tasks: Some of `TASKS`. Default: all.
+        bases: Some of `BASES`. Default: all.
     """
-    if trials < 1:
-        raise InputError("out of range", field="trials", expected="at least 1", got=trials)
+    runner.check_positive(trials=trials)
     tasks = list(runner.chosen("task", TASKS if tasks is None else tasks, TASKS))
     bases = list(runner.chosen("base", BASES if bases is None else bases, BASES))
     settings = {
@@ -101,65 +79,42 @@ def run(
         for base in bases
         for number in range(trials)
     ]
-    return runner.run(
-        specs,
-        _record,
-        out,
-        settings=settings,
-        report=report,
-        jobs=jobs,
-        scheduler=scheduler,
-        progress=progress,
-    )
+    return runner.run(specs, _record, out, settings=settings, report=report, **execution)
 
 
 def report(result: Mapping[str, Any]) -> str:
-    """Return the table of a result in Markdown, with versions and machine at the foot."""
+    """Return the table of a result in Markdown."""
     about, records = result["meta"], result["trials"]
     rows = [_row(task, base, records) for task in about["tasks"] for base in about["bases"]]
-    failures = [
-        f"- {r['task']}, {r['base']}, start {r['number']}: {r['status']}; {'; '.join(r['violations']) or 'no violation'}"
+    lines = [
+        f"- {r['task']}, {r['base']}, start {r['number']}: {r['status']}; "
+        f"{'; '.join(r['violations']) or 'no violation'}"
         for r in records
         if not r["success"]
     ]
-    heads = [
-        "task",
-        "base",
-        "success",
-        "time, median [s]",
-        "95th percentile [s]",
-        "evaluations",
-        "Ipopt iterations",
-    ]
-    parts = [
+    head = ["task", "base", "success", "time, median [s]", "95th percentile [s]"]
+    head += ["evaluations", "Ipopt iterations", "base [m]", "arm [rad]", "motion [s]"]
+    return page(
+        about,
         "# Bases that drive",
-        f"{about['starts']} random starts, seed {about['seed']}; bases that are steered turn on {about['radius']:g} m or more. "
-        "Success is the word of the independent validation. Times are those of all trials, without building symbolic programs; "
-        "efforts and lengths are medians, too.",
-        markdown([*heads, "base [m]", "arm [rad]", "motion [s]"], rows),
-        *(["\n".join(["Failures:", "", *failures])] if failures else []),
-    ]
-    return "\n\n".join([*parts, foot(about)]) + "\n"
+        f"{about['starts']} random starts, seed {about['seed']}; steered bases turn with a radius "
+        f"of at least {about['radius']:g} m. {JUDGED} Times are those of all trials, without "
+        "building symbolic programs; path lengths are medians, too.",
+        markdown(head, rows),
+        *(["\n".join(["Failures:", "", *lines])] if lines else []),
+    )
 
 
 def _row(task: str, base: str, records: Sequence[Record]) -> list[str]:
-    rows = [record for record in records if (record["task"], record["base"]) == (task, base)]
-    good = [row for row in rows if row["success"]]
-    time, late = distribution(rows, "planning_time")
-    counts = [f"{distribution(rows, field)[0]:.0f}" for field in ("evaluations", "iterations")]
+    own = select(records, task=task, base=base)
+    times = [f"{value:.3f}" for value in distribution(own, "planning_time")]
+    counts = [f"{distribution(own, field)[0]:.0f}" for field in ("evaluations", "iterations")]
+    good = select(own, success=True)
     lengths = [
         f"{distribution(good, field)[0]:.2f}"
         for field in ("base_path_length", "arm_path_length", "duration")
     ]
-    return [
-        task,
-        base,
-        f"{len(good)} of {len(rows)}",
-        f"{time:.3f}",
-        f"{late:.3f}",
-        *counts,
-        *lengths,
-    ]
+    return [task, base, count(own), *times, *counts, *lengths]
 
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Charts of experiments."""
+"""Draws charts of experiments."""
 
 from __future__ import annotations
 
@@ -42,19 +42,16 @@ def success_chart(
     *,
     title: str = "",
 ) -> Figure:
-    """Draw success rates as bars, grouped by scene, with Wilson's intervals of 95 % confidence.
+    """Draw success rates as bars with Wilson's 95 % intervals, grouped by scene.
 
-    The intervals take all trials for independent, repeats from the same start too.
+    The intervals treat all trials as independent, including repeats from the same start.
 
     Args:
+        path: File to write; None writes nothing.
         records: Records with `scene`, `method` and `success`.
-        path: The file to write, .png, .svg or .pdf; None writes nothing.
-        scenes: Scene → name to show, one group each.
-        methods: One bar of each group, in this order.
-        title: Written above.
-
-    Returns:
-        The figure.
+        scenes: Scene → displayed name.
+        methods: Methods in the order of the bars.
+        title: Title.
     """
 
     def bar(scene: str, method: str) -> tuple[float, float, float] | None:
@@ -79,20 +76,17 @@ def means_chart(
     label: str,
     shared: bool,
 ) -> Figure:
-    """Draw the means of a field as bars, grouped by scene, with standard deviations (n − 1).
+    """Draw means of a field as bars with standard deviations (n − 1), grouped by scene.
 
     Args:
-        records: Records as `record.trial` makes them.
-        path: The file to write, .png, .svg or .pdf; None writes nothing.
-        scenes: Scene → name to show, one group each.
-        methods: One bar of each group, in this order.
-        field: The field.
-        label: Its name and unit.
-        shared: Over the trials in which all methods succeed, or over each method's own successes
-            where there are none; otherwise over all trials.
-
-    Returns:
-        The figure.
+        path: File to write; None writes nothing.
+        records: Records of `record.trial`.
+        scenes: Scene → displayed name.
+        methods: Methods in the order of the bars.
+        field: Field of the records.
+        label: Name and unit of the field.
+        shared: Whether to use trials in which all methods succeed, or each method's successes where
+            there are none. Otherwise all trials.
     """
     values: dict[tuple[str, str], list[float]] = {}
     names = {}
@@ -125,20 +119,16 @@ def means_chart(
 def criteria_chart(
     records: Sequence[Record], path: str | Path | None, methods: Sequence[str], *, title: str = ""
 ) -> Figure:
-    """Draw a task's success rate, base path length, arm path length and planning time as bars, side by side.
+    """Draw success rate, path lengths and planning time of a task as bars.
 
-    Rates have Wilson's intervals of 95 % confidence. The other bars are medians with quartiles:
-    times over all trials, efforts over the trials in which all methods succeed, or over each
-    method's own successes if there are no such trials.
+    Rates have Wilson's 95 % intervals; the other bars are medians with quartiles, of times over all
+    trials, of path lengths over trials in which all methods succeed, if there are any.
 
     Args:
-        records: Records of one task as `record.trial` makes them.
-        path: The file to write, .png, .svg or .pdf; None writes nothing.
-        methods: One bar each, in this order.
-        title: Written above.
-
-    Returns:
-        The figure.
+        path: File to write; None writes nothing.
+        records: Records of one task.
+        methods: Methods in the order of the bars.
+        title: Title.
     """
     both = common(records, methods)
     where = (
@@ -188,17 +178,14 @@ def criteria_chart(
 
 
 def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: str = "") -> Figure:
-    """Draw motions over time, side by side: positions and velocities of the arm's joints, velocity of the base.
+    """Draw arm positions, arm velocities and base velocities of plans over time.
 
-    Velocities are scaled to the motions that succeed, if any does; failed ones may leave the frame.
+    Velocities are scaled to successful motions, if there are any.
 
     Args:
+        path: File to write; None writes nothing.
         plans: Name → plan, one column each.
-        path: The file to write, .png, .svg or .pdf; None writes nothing.
-        title: Written above.
-
-    Returns:
-        The figure.
+        title: Title.
     """
     with use_style():
         figure = new_figure(1.2 + 4.0 * len(plans), 7.0)
@@ -264,7 +251,7 @@ def _grouped(
     form: str,
     title: str,
 ) -> Figure:
-    """Draw bars grouped by scene, one for each method: `bar` returns lower end, height and upper end, or None for no bar."""
+    """Draw grouped bars; `bar` returns lower end, height and upper end, or None."""
     with use_style():
         figure = new_figure(max(6.0, 1.0 + 0.5 * len(scenes) * (len(methods) + 1)), 3.8)
         axes = figure.subplots()
@@ -285,7 +272,7 @@ def _grouped(
 
 
 def _rate(good: Sequence[bool]) -> tuple[float, float, float]:
-    """Return a success rate between the ends of Wilson's interval: low, rate, high [%]."""
+    """Return Wilson's lower limit, success rate and upper limit [%]."""
     low, high = wilson(sum(good), len(good))
     return 100.0 * low, 100.0 * sum(good) / len(good), 100.0 * high
 
@@ -299,7 +286,7 @@ def _bar(
     *,
     width: float,
 ) -> None:
-    """Draw a bar with an error bar: an interval is its lower end, the bar's height, and its upper end."""
+    """Draw a bar with an error bar from its lower end, height and upper end."""
     low, height, high = interval
     axes.bar(place, height, width, color=colour)
     error = np.clip([[height - low], [high - height]], 0.0, None)
@@ -310,7 +297,7 @@ def _bar(
 
 
 def _name_bars(axes: Axes, names: Sequence[str], margin: float) -> None:
-    """Write names below bars, or groups of them, that stand at 0, 1, ...; leave a margin on either side."""
+    """Label bars at 0, 1, ... and leave a margin on both sides."""
     axes.set_xticks(range(len(names)), names)
     axes.set_xlim(-margin, len(names) - 1 + margin)
     axes.tick_params(axis="x", length=0.0)
@@ -319,7 +306,7 @@ def _name_bars(axes: Axes, names: Sequence[str], margin: float) -> None:
 
 
 def _number(records: Sequence[Record], scene: str, methods: Sequence[str]) -> str:
-    """Return how many trials each method has in a scene."""
+    """Return the number of trials of each method in a scene, in words."""
     shown = [
         record["method"]
         for record in records

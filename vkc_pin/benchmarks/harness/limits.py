@@ -1,4 +1,4 @@
-"""Budget of a trial: evaluations, so that verdicts are the same on every machine; the clock only ends what hangs."""
+"""Limits trials by evaluations, so that verdicts are the same on every machine."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LIMITS: Mapping[str, Any] = {"max_evaluations": MAX_EVALUATIONS, "time_limit": T
 
 
 def allowed(about: Mapping[str, Any]) -> str:
-    """Return in words what each trial of a record was allowed; older records had a limit of planning time alone."""
+    """Return the limit of a record's trials in words; old records limit planning time."""
     if "max_evaluations" in about:
         return f"at most {about['max_evaluations']:,} evaluations".replace(",", " ")
     return f"at most {about['time_limit']:g} s of planning"

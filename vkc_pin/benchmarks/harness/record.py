@@ -1,4 +1,4 @@
-"""What every benchmark writes: versions, machine and seed, then one object a trial."""
+"""Records trials, versions and machine."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Solve = Callable[[Scene, Mapping[str, Any]], Plan]
 
 
 def meta(**settings: Any) -> dict[str, Any]:
-    """Return commit, versions, machine and `settings` (seed, trials, ...)."""
+    """Return commit, versions, machine and `settings`."""
     return {
         "commit": commit(),
         "versions": find_versions(),
@@ -46,7 +46,7 @@ def meta(**settings: Any) -> dict[str, Any]:
 
 @functools.cache
 def commit() -> str | None:
-    """Return which commit the package's sources are of, `-dirty` if they are changed; None where git does not know."""
+    """Return the commit of the sources, with "-dirty" if they are changed; None without git."""
     command = [
         "git",
         "-C",
@@ -57,23 +57,19 @@ def commit() -> str | None:
         "--abbrev=12",
     ]
     try:
-        return (
-            subprocess.run(
-                command, capture_output=True, text=True, timeout=10, check=True
-            ).stdout.strip()
-            or None
-        )
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
         return None
+    return done.stdout.strip() or None
 
 
 def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
-    """Return the record of one plan; success is validation's word."""
-    m = plan.metrics
-    first = plan.report.violations[0] if plan.report.violations else None
-    failed = (
-        None if plan.success else (f"{first.constraint} {first.subject}" if first else plan.status)
-    )
+    """Return the record of a plan."""
+    m, violations = plan.metrics, plan.report.violations
+    failed: str | None = None if plan.success else plan.status
+    if violations and not plan.success:
+        failed = f"{violations[0].constraint} {violations[0].subject}"
+    lengths = ("planning_time", "base_path_length", "base_path_length_l1", "arm_path_length")
     return {
         "scene": plan.scene.name,
         "method": method,
@@ -81,18 +77,8 @@ def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
         "seed": seed,
         "success": plan.success,
         "status": plan.status,
-        **{
-            field: m[field]
-            for field in (
-                "planning_time",
-                "base_path_length",
-                "base_path_length_l1",
-                "arm_path_length",
-            )
-        },
-        "clearance": m["clearance"]
-        if np.isfinite(m["clearance"])
-        else None,  # JSON knows no infinity
+        **{field: m[field] for field in lengths},
+        "clearance": m["clearance"] if np.isfinite(m["clearance"]) else None,
         "closure_error": m["closure_error"],
         "iterations": int(m["iterations"]),
         "rounds": int(m["rounds"]),
@@ -102,14 +88,14 @@ def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
         "build_time": m["build_time"],
         **{key: value for key, value in m.items() if key.startswith("time_")},
         "failed_constraint": failed,
-        "violations": [str(v) for v in plan.report.violations],
+        "violations": [str(violation) for violation in violations],
         "commit": commit(),
         **more,
     }
 
 
 def peaks(trajectory: Trajectory) -> dict[str, float]:
-    """Return the largest velocity [rad/s] and acceleration [rad/s²] of an arm joint: peak_velocity, peak_acceleration."""
+    """Return the largest velocity [rad/s] and acceleration [rad/s²] of any arm joint."""
     arm, curve = slice(3, trajectory.robot_size), trajectory.curve
     rates = (
         (trajectory.velocities(), trajectory.accelerations())
@@ -121,15 +107,13 @@ def peaks(trajectory: Trajectory) -> dict[str, float]:
 
 
 def values(trials: Iterable[Record], field: str) -> list[float]:
-    """Return the values of a field; trials that ended with an error have none."""
+    """Return the values of a field; errors have none."""
     return [float(t[field]) for t in trials if t.get(field) is not None]
 
 
 def distribution(trials: Iterable[Record], field: str) -> tuple[float, float]:
-    """Return median and 95th percentile of a field; NaN for no values."""
+    """Return median and 95th percentile of a field; NaN without values."""
     found = values(trials, field)
-    return (
-        (float(np.median(found)), float(np.percentile(found, 95)))
-        if found
-        else (float("nan"), float("nan"))
-    )
+    if not found:
+        return float("nan"), float("nan")
+    return float(np.median(found)), float(np.percentile(found, 95))

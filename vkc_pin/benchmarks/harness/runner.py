@@ -1,4 +1,4 @@
-"""Runs the trials of an experiment on several processes; keeps each as soon as it is done, and goes on where it was stopped."""
+"""Runs the trials of an experiment in several processes, and resumes stopped runs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 from tqdm import tqdm
@@ -24,7 +24,23 @@ from vkc_pin.utils.parallel.journal import Journal
 from vkc_pin.world.files.resources import find_package_folder, find_resource_folder
 from vkc_pin.world.files.writing import check_links, check_writable, write_atomically
 
-__all__ = ["Function", "check_folder", "chosen", "run"]
+__all__ = ["Execution", "Function", "check_folder", "check_positive", "chosen", "run"]
+
+
+class Execution(TypedDict, total=False):
+    """How `run` executes trials.
+
+    Attributes:
+        jobs: Number of processes, each with one thread of BLAS. Default: this process alone.
+        scheduler: Address of a Dask scheduler whose workers run the trials instead; see
+            `engine.results`.
+        progress: Whether to show a progress bar. Default: True.
+    """
+
+    jobs: int
+    scheduler: str | None
+    progress: bool
+
 
 Function = Callable[[dict[str, Any]], Mapping[str, Any] | Sequence[Mapping[str, Any]]]
 """What runs one trial: takes its specification, returns its record, or several."""
@@ -46,40 +62,34 @@ def run(
     scheduler: str | None = None,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Run `function` on every trial, but for those that `out` has already.
+    """Run `function` on every trial that `out` does not have yet.
 
-    Every finished trial is a line of `out`/trials.jsonl at once, so a stop, of whatever kind, loses
-    only those that were running; the same call goes on from there. At the end `out` has
-    results.json and results.csv with the records in the order of their keys: neither `jobs` nor
-    stops make a difference to them, but for measured times.
+    Every finished trial is appended to `out`/trials.jsonl at once, so that the same call resumes a
+    stopped run. At the end, `out` has results.json and results.csv with the records in the order of
+    their keys, which depend neither on `jobs` nor on stops, measured times excepted.
 
     Args:
-        trials: Plain data, each with a text `key` of its own. They are begun in this order, and a
-            process keeps what it has built: put those that share a symbolic program together.
-        function: What runs a trial. It must be importable by other processes if `jobs` > 1. If it
-            raises an exception, that is printed, and the trial is recorded as a failure of status
-            "error". A record of status "interrupted" counts as Ctrl-C.
-        out: The folder, made if need be.
-        settings: Everything that the results depend on, as plain data; goes into the results'
-            "meta".
-        report: What makes of a result the text of `out`/table.md.
-        jobs: Number of processes, each with one thread of BLAS; 1 runs all trials in this process.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead; see
-            `engine.results`.
-        progress: Whether to show a progress bar.
+        trials: Plain data with a unique text `key` each, in the order of execution. Processes cache
+            symbolic programs: keep trials that share one together.
+        function: Runs a trial; importable by other processes. An exception is recorded as a failure
+            with status "error". A record with status "interrupted" counts as Ctrl-C.
+        out: Folder, created if necessary.
+        settings: Settings that determine the results, as plain data.
+        report: Makes `out`/table.md of a result.
+        jobs: See `Execution`.
+        scheduler: See `Execution`.
+        progress: See `Execution`.
 
     Returns:
-        {"meta": commit, versions, machine, settings, sessions, peak_memory_mb, "trials": records},
-        as in results.json.
+        {"meta": commit, versions, machine, settings, sessions, peak_memory_mb, "trials": records}.
 
     Raises:
         InputError: `out` has trials of other settings, versions or machines, has other files but no
-            trials, is not a folder, or is in use by another run.
+            trials, is no folder, or is used by another run.
         VkcError: A process died.
-        KeyboardInterrupt: Ctrl-C was pressed; the message says how far it came.
+        KeyboardInterrupt: Ctrl-C was pressed; the message counts the finished trials.
     """
-    if jobs < 1:
-        raise InputError("out of range", field="jobs", expected="at least 1", got=jobs)
+    check_positive(jobs=jobs)
     if scheduler is not None:
         require_dask(scheduler)
     todo = {str(trial["key"]): dict(trial) for trial in trials}
@@ -138,11 +148,11 @@ def run(
 
 
 def check_folder(out: str | Path, journals: Sequence[str] = (_JOURNAL,)) -> None:
-    """Check that writing to a folder does not overwrite files of other origin.
+    """Check that a folder holds a run or no files, so that none are overwritten.
 
     Args:
-        out: The folder. Its subfolders may have any content.
-        journals: Paths in the folder of a run, one of which exists in the folder of any run.
+        out: Folder. Its subfolders may have any content.
+        journals: Paths in the folder, one of which every run has.
 
     Raises:
         InputError: The folder has files but no journal, or a symbolic link that leads out of it.
@@ -161,11 +171,10 @@ def check_folder(out: str | Path, journals: Sequence[str] = (_JOURNAL,)) -> None
 
 
 def chosen(kind: str, names: Iterable[str], choices: Iterable[str]) -> tuple[str, ...]:
-    """Return names of a `kind` without repetition, in the order of the choices.
+    """Return distinct names in the order of the choices.
 
     Raises:
-        UnknownNameError: One of them is none of the choices.
-        InputError: There are none.
+        InputError: There are no names, or one is no choice.
     """
     names, choices = list(names), list(dict.fromkeys(choices))
     for name in names:
@@ -176,6 +185,13 @@ def chosen(kind: str, names: Iterable[str], choices: Iterable[str]) -> tuple[str
     return tuple(choice for choice in choices if choice in names)
 
 
+def check_positive(**counts: int) -> None:
+    """Raise `InputError` for counts below 1, by the names of their fields."""
+    for field, count in counts.items():
+        if count < 1:
+            raise InputError("out of range", field=field, expected="at least 1", got=count)
+
+
 def _run(
     trials: Sequence[dict[str, Any]],
     function: Function,
@@ -184,7 +200,7 @@ def _run(
     scheduler: str | None,
     bar: Any,
 ) -> None:
-    """Run `trials`, write each down as it comes, and print what went wrong."""
+    """Run trials, append each to the journal, and print errors."""
     began, told = time.perf_counter(), set[str]()
     journal.append({"session": {"jobs": jobs}})
     tasks = ((str(trial["key"]), trial) for trial in trials)
@@ -208,7 +224,7 @@ def _run(
 
 
 def _attempt(function: Function, trial: dict[str, Any]) -> dict[str, Any]:
-    """Run one trial and return its line; an exception becomes a failure on record."""
+    """Run a trial and return its line of the journal."""
     key, more = trial["key"], {}
     try:
         result = function(dict(trial))
@@ -240,21 +256,21 @@ def _given_up(key: str, died: CrashedTask) -> dict[str, Any]:
 
 
 def _commits(records: Iterable[Mapping[str, Any]]) -> str:
-    """Return the commits that trials are of: one, or several where a run went on after a change that had no part in it."""
+    """Return the distinct commits of records."""
     return ", ".join(
         dict.fromkeys(str(record["commit"]) for record in records if record.get("commit"))
     )
 
 
 def _plain(value: Any) -> Any:
-    """Return what JSON makes of a mapping, or of NumPy's types."""
+    """Convert mappings and NumPy types for JSON."""
     if not isinstance(value, Mapping | np.ndarray | np.generic):
         raise TypeError(f"Object of type {type(value).__name__} is not JSON serializable")
     return dict(value) if isinstance(value, Mapping) else value.tolist()
 
 
 def _sources() -> str:
-    """Return a digest of all that planning depends on here: the package's sources, scenes and robots."""
+    """Return a digest of the sources, scenes and robots that planning depends on."""
     package, digest = find_package_folder(), hashlib.sha256()
     named = {
         path.relative_to(package).as_posix(): path

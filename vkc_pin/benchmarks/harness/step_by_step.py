@@ -1,4 +1,4 @@
-"""Steps planned one after the other, each from where the motion of the one before ends."""
+"""Plans steps one by one, each from the end of the previous motion."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["combined", "step_by_step"]
 
 
 def step_by_step(scene: Scene, steps: Sequence[Step], *, options: Options, seed: int) -> list[Plan]:
-    """Return the plans of steps, each planned alone from where the one before ends; the last is the first that fails."""
+    """Return the plans of steps up to the first failure."""
     plans: list[Plan] = []
     for step in steps:
         plans.append(plan(scene, [step], options=options, seed=seed, **LIMITS))
@@ -30,7 +30,7 @@ def step_by_step(scene: Scene, steps: Sequence[Step], *, options: Options, seed:
 def combined(
     plans: Sequence[Plan], of: int, *, method: str, seed: int, **more: Any
 ) -> dict[str, Any]:
-    """Return the record of `of` steps of which these are the plans: what the last one says, and all that they come to."""
+    """Return one record of the plans of the first of `of` steps."""
     records = [
         trial(one, method=method, seed=seed, duration=one.trajectory.metrics()["duration"])
         for one in plans

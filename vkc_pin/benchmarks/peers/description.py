@@ -1,8 +1,7 @@
-"""The virtual kinematic chain and all that stands around it as one URDF, with an SRDF of the pairs that are not looked at.
+"""Writes a virtual kinematic chain and its surroundings as URDF and SRDF.
 
-What is held is a branch of the hand, inverted, as in the chain itself; what stands in the world is
-fixed to the root. Each shape is a link of its own, `shape_<number>`, so that pairs of shapes can be
-left out, and keep margins of their own.
+A grasped object is an inverted branch of the hand; fixed objects are attached to the root. Each
+shape is a link `shape_<number>`, so that pairs can be disabled and have own margins.
 """
 
 from __future__ import annotations
@@ -34,11 +33,11 @@ _EFFORT = 1000.0  # nobody asks
 
 @dataclass(frozen=True)
 class Description:
-    """Files, and what is called how in them.
+    """Files of a chain.
 
     Attributes:
-        urdf: The file.
-        srdf: The file.
+        urdf: URDF file.
+        srdf: SRDF file.
         joints: Names of the joints, in the order of the chain's coordinates.
         margins: (link, link) → clearance to keep [m].
     """
@@ -53,13 +52,13 @@ def describe(problem: TrajectoryProblem, folder: Path, *, inflated: bool = False
     """Write URDF, SRDF and meshes of a problem to a folder.
 
     Args:
-        problem: Of one phase.
-        folder: Where to; it exists.
-        inflated: Whether the second shape of each pair is thicker by the clearance that the pair is
-            to keep, for planners that know of none: one link for each shape and clearance.
+        problem: Problem with one phase.
+        folder: Existing folder.
+        inflated: Whether the second shape of each pair is inflated by the pair's clearance, for
+            planners without clearances.
 
     Raises:
-        InputError: The chain has a joint that a URDF cannot have.
+        InputError: The chain has a joint that URDF does not support.
     """
     chain, (part,) = problem.chain, problem.contacts.phases
     root = ET.Element("robot", {"name": "chain", "tesseract:make_convex": "true"})
@@ -149,7 +148,7 @@ def _thick(number: int, thicker: float) -> str:
 
 
 def _axis(model: Any, joint: int) -> Floats:
-    """Return the axis of a joint, shape (3,), in its own frame."""
+    """Return the axis of a joint in its own frame, shape (3,)."""
     data = model.createData()
     pin.computeJointJacobians(model, data, pin.neutral(model))
     columns = pin.getJointJacobian(model, data, joint, pin.LOCAL)[:, model.idx_vs[joint]]
@@ -168,7 +167,7 @@ def _joint(
 
 
 def _collision(link: ET.Element, shape: Any, thicker: float, file: Path) -> None:
-    """Add a shape to a link, thicker by so much [m] all around; what is no simple shape goes to a mesh, which is convex."""
+    """Add a shape, inflated by `thicker` [m], to a link, as a mesh unless it is simple."""
     collision = ET.SubElement(link, "collision", name=link.attrib["name"])
     geometry = ET.SubElement(collision, "geometry")
     if isinstance(shape, coal.Sphere):

@@ -1,4 +1,4 @@
-"""What a planner hands in, and what is made of it: a motion, judged like all others."""
+"""Times and validates the paths of other planners."""
 
 from __future__ import annotations
 
@@ -30,16 +30,14 @@ _NEAR = 0.1  # [m] up to which distances are measured
 
 @dataclass
 class Found:
-    """What a planner came to.
+    """Result of a planner.
 
     Attributes:
-        path: Its waypoints from the start on, straight lines between them, shape (K, n); None: it
-            has none.
-        own: CPU time of its solver alone [s].
-        first: CPU time from the call to its first motion, everything included [s]; None: it has
-            none.
-        status: "found", or why not: "timed out", or its own word.
-        about: What else is kept.
+        path: Waypoints from the start, shape (K, n); None if there are none.
+        own: CPU time of the solver alone [s].
+        first: CPU time from the call to the first motion [s].
+        status: "found", "timed out" or the planner's own status.
+        about: Further information.
     """
 
     path: Floats | None = None
@@ -50,10 +48,10 @@ class Found:
 
 
 class Clock:
-    """CPU time of this process and of what works for it, and when the time is up by the clock on the wall.
+    """Measures CPU time and checks a wall-time limit.
 
     Attributes:
-        elsewhere: CPU time that other processes have spent for this one [s].
+        elsewhere: CPU time of other processes [s].
     """
 
     def __init__(self, limit: float) -> None:
@@ -67,12 +65,12 @@ class Clock:
 
     @property
     def wall(self) -> float:
-        """Time since the beginning [s]."""
+        """Wall time since the beginning [s]."""
         return time.perf_counter() - self._wall
 
     @property
     def left(self) -> float:
-        """Time that is left by the clock [s], at least 0."""
+        """Remaining wall time [s], at least 0."""
         return max(0.0, self.limit - self.wall)
 
 
@@ -89,15 +87,15 @@ def judged(
     name: str,
     seed: int,
 ) -> Plan:
-    """Return a path as a plan: timed as those of this package are, and checked by the independent validation.
+    """Return a path as a retimed and validated plan.
 
     Args:
-        own: The problem.
-        problem: The same as a program.
-        path: Waypoints, shape (K, n); None: there are none, and the robot stands still.
-        status: The planner's word, which a motion that is accepted overrules.
-        name: The planner's.
-        seed: Its random seed.
+        own: Problem.
+        problem: Its program.
+        path: Waypoints, shape (K, n); None for a stationary robot.
+        status: Status without a path.
+        name: Name of the planner.
+        seed: Random seed.
     """
 
     def check(motion: Trajectory) -> Report:
@@ -129,10 +127,7 @@ def judged(
 
 
 def clearances(problem: TrajectoryProblem, trajectory: Trajectory) -> Mapping[str, float | None]:
-    """Return the least distance of any pair [m] at waypoints and between them; None: more than 0.1 m.
-
-    Pairs that have no margin, such as neighbouring links, do not count.
-    """
+    """Return the least distance of pairs at and between waypoints [m]; None above 0.1 m."""
     share = np.arange(1, _BETWEEN) / _BETWEEN
     begins, lasts = trajectory.times[:-1, None], np.diff(trajectory.times)[:, None]
     found: dict[str, float | None] = {}

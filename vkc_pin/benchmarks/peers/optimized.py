@@ -1,9 +1,7 @@
-"""trajopt (tesseract's): sequential convex optimisation on the same chain, with collisions of casts between waypoints.
+"""Plans with trajopt of tesseract: sequential convex optimization with swept collision checks.
 
-The chain goes to it as a URDF whose hand carries, inverted, what is held. That the latter's base
-stays where it stands is a constraint on its pose at every waypoint, as in the paper; the pose to
-reach is one at the last. It starts from straight lines to configurations at the goal, the nearest
-first, until a motion is accepted.
+The fixed base of a grasped object and the goal pose are pose constraints. Initial guesses are
+straight lines to goal configurations, the nearest first.
 """
 
 from __future__ import annotations
@@ -112,7 +110,7 @@ def plan_by_trajopt(
 
 
 def _goal(problem: TrajectoryProblem, column: int) -> bool:
-    """Return whether a coordinate has a value to reach, other than where it may be before."""
+    """Return whether a coordinate has a goal value."""
     last, before = (
         (limits[0][column], limits[1][column])
         for limits in ((problem.lower[-1], problem.upper[-1]), (problem.lower[0], problem.upper[0]))
@@ -122,7 +120,7 @@ def _goal(problem: TrajectoryProblem, column: int) -> bool:
 
 @cache
 def _worker() -> Callable[[dict[str, Any]], dict[str, Any]]:
-    """Return what sends a request to the other process, begun once, and waits for its answer."""
+    """Start the worker process once and return a function that sends it requests."""
     command = [sys.executable, str(Path(__file__).with_name("trajopt_worker.py"))]
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True

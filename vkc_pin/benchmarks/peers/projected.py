@@ -1,8 +1,7 @@
-"""roboplan: RRT-Connect, with its projection where something is held, and its shortcuts where nothing is.
+"""Plans with roboplan: RRT-Connect with projection, or with shortcuts if nothing is grasped.
 
-It reads the chain as a URDF, and projects onto poses by itself. It knows of no clearance, so of
-each pair one shape is thicker by what the pair is to keep. Goals are configurations, from this
-package; the next one is tried until a motion is accepted.
+It reads the chain as URDF. Since it has no clearances, shapes are inflated. Goal configurations
+are tried in turn until a motion is accepted.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`vkc-pin bench peers`: the same reaches, held doors and held drawers for other planners, the baselines, and this package."""
+"""Compares other planners, the baselines and this package at the same problems."""
 
 from __future__ import annotations
 
@@ -7,18 +7,26 @@ import functools
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Unpack, cast
 
 from vkc_pin.baselines.separate import BASELINES, plan_separately
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial, values
-from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown
+from vkc_pin.benchmarks.harness.runner import Execution
+from vkc_pin.benchmarks.harness.tables import (
+    JUDGED,
+    count,
+    decimal,
+    markdown,
+    medians,
+    page,
+    select,
+)
 from vkc_pin.benchmarks.peers.found import Clock, Found, Peer, clearances, judged
 from vkc_pin.benchmarks.peers.optimized import plan_by_trajopt
 from vkc_pin.benchmarks.peers.projected import plan_by_projection
 from vkc_pin.benchmarks.peers.sampled import plan_by_sampling
 from vkc_pin.benchmarks.peers.tasks import TASKS, Given, given, problem_of
-from vkc_pin.errors import InputError
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
 from vkc_pin.utils.arrays import Floats
@@ -57,37 +65,22 @@ def run(
     out: str | Path,
     trials: int = 20,
     seed: int = 0,
-    jobs: int = 1,
-    scheduler: str | None = None,
     tasks: Sequence[str] = tuple(TASKS),
     methods: Sequence[str] = METHODS,
     time_limit: float = TIME_LIMIT,
-    progress: bool = True,
+    **execution: Unpack[Execution],
 ) -> dict[str, Any]:
-    """Run the experiment, or what is left of it, and write results.json, results.csv, table.md and plans/*.npz to `out`.
+    """Run the experiment in the folder `out`; see `runner.run`.
 
     Args:
-        out: The folder; if it has trials of the same settings already, they are not run again.
+        out: Folder.
         trials: Number of problems per task, at least 1.
-        seed: Of the problems and of planning.
-        jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
-            `engine.results`.
+        seed: Random seed of problems and planning.
         tasks: Some of `TASKS`.
         methods: Some of `METHODS`.
-        time_limit: By the clock, for a trial [s].
-        progress: Whether to show a progress bar.
-
-    Returns:
-        {"meta": ..., "trials": [...]}; see `runner.run`.
-
-    Raises:
-        UnknownNameError: There is no such task or method.
-        InputError: No trials, a peer is not installed, or `out` has trials of other settings.
-        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+        time_limit: Wall-time limit of a trial [s].
     """
-    if trials < 1:
-        raise InputError("out of range", field="trials", expected="at least 1", got=trials)
+    runner.check_positive(trials=trials)
     names, chosen = runner.chosen("task", tasks, TASKS), runner.chosen("method", methods, METHODS)
     settings = {
         "benchmark": "peers",
@@ -111,69 +104,45 @@ def run(
         for method in chosen
     ]
     function = functools.partial(_record, folder=str(Path(out) / "plans"))
-    return runner.run(
-        specs,
-        function,
-        out,
-        settings=settings,
-        report=report,
-        jobs=jobs,
-        scheduler=scheduler,
-        progress=progress,
-    )
+    return runner.run(specs, function, out, settings=settings, report=report, **execution)
 
 
 def report(result: Mapping[str, Any]) -> str:
-    """Return the table of a result in Markdown, with versions and machine at the foot."""
+    """Return the table of a result in Markdown."""
     about, records = result["meta"], result["trials"]
     rows = [
         _row(task, method, own)
         for task in about["tasks"]
         for method in about["methods"]
-        if (own := [r for r in records if (r.get("task"), r.get("method")) == (task, method)])
+        if (own := select(records, task=task, method=method))
     ]
     listed = ", ".join(f"{name} {number}" for name, number in about["peers"].items())
-    parts = [
+    return page(
+        about,
         "# Beside other planners",
-        f"{about['starts']} problems per task, seed {about['seed']}, the same for all; at most {about['time_limit']:g} s by the "
-        f"clock. Peers: {listed or 'none'}. Success is the word of the independent validation. Times are CPU time from the call, "
-        "everything included, to the first and to the final motion; medians of all trials that have one, the percentile of the "
-        "final one. Efforts are medians of successes; clearances are the least of all successes.",
+        f"{about['starts']} problems per task, seed {about['seed']}, the same for all; at most "
+        f"{about['time_limit']:g} s by the clock. Peers: {listed or 'none'}. {JUDGED} Times are "
+        "CPU time from the call, everything included, to the first and to the final motion; "
+        "medians of all trials that have one, the percentile of the final one. Path lengths are "
+        "medians of successes; clearances are the least of all successes.",
         markdown(_HEAD, rows, text=2),
-    ]
-    return "\n\n".join([*parts, foot(about)]) + "\n"
+    )
 
 
 def _row(task: str, method: str, records: Sequence[Record]) -> list[str]:
-    good = [record for record in records if record["success"]]
+    good = select(records, success=True)
     late = sum(record["status"] in ("timed out", "time limit") for record in records)
-    final, percentile = distribution(records, "time_final")
-    times = [
-        distribution(records, "time_first")[0],
-        final,
-        percentile,
-        distribution(records, "time_own")[0],
-    ]
-    efforts = [distribution(good, field)[0] for field in ("base_path_length", "arm_path_length")]
-    least = [
-        min(values(good, f"clearance_{where}"), default=float("nan")) * 1e3
-        for where in ("at", "between")
-    ]
-    shown = [
-        f"{len(good)} of {len(records)}",
-        str(late),
-        *map(decimal, times),
-        *map(decimal, efforts),
-    ]
-    return [task, method, *shown, *(f"{value:.1f}" if value == value else "–" for value in least)]
+    percentile = decimal(distribution(records, "time_final")[1])
+    times = [*medians(records, "time_first", "time_final"), percentile]
+    clearances = [values(good, f"clearance_{where}") for where in ("at", "between")]
+    least = [f"{1e3 * min(found):.1f}" if found else "–" for found in clearances]
+    lengths = medians(good, "base_path_length", "arm_path_length")
+    own = medians(records, "time_own")
+    return [task, method, count(records), str(late), *times, *own, *lengths, *least]
 
 
 def _installed(methods: Sequence[str]) -> dict[str, str]:
-    """Return the versions of the peers' packages.
-
-    Raises:
-        InputError: One is not installed.
-    """
+    """Return the versions of the peers' packages."""
     found = {}
     for _, module, package in (PEERS[method] for method in methods if method in PEERS):
         try:
@@ -215,7 +184,7 @@ def _record(spec: dict[str, Any], *, folder: str) -> dict[str, Any]:
 
 
 def _by_peer(own: Given, method: str, seed: int, clock: Clock) -> tuple[Plan, Found]:
-    """Return the plan of a peer's path, and what it said."""
+    """Return a peer's plan and result."""
     problem = problem_of(own)
     judgements: dict[int, Plan] = {}
 
@@ -230,13 +199,12 @@ def _by_peer(own: Given, method: str, seed: int, clock: Clock) -> tuple[Plan, Fo
         accept(found.path)
     said = judgements[0]
     late = not said.success and found.status == "timed out"  # what it has by then may be no motion
-    return dataclasses.replace(
-        said, status=cast("PlanStatus", found.status)
-    ) if late else said, found
+    status = cast("PlanStatus", found.status)
+    return dataclasses.replace(said, status=status) if late else said, found
 
 
 def _by_us(own: Given, method: str, seed: int, time_limit: float) -> Plan:
-    """Return the plan of a baseline or of this package; each builds its programs anew, as a first call does."""
+    """Plan with a baseline or this package, without caches of earlier trials."""
     if method == "VKC":
         return plan(own.scene, own.steps, seed=seed, time_limit=time_limit)
     return plan_separately(own.scene, own.steps, method=method, seed=seed, time_limit=time_limit)

@@ -1,13 +1,8 @@
-"""OMPL: RRT-Connect, on the manifold on which a hand stays on its handle where something is held, then its simplifier.
+"""Plans with OMPL: RRT-Connect, on an atlas of the closure manifold if something is grasped.
 
-The manifold is an atlas of charts. `ProjectedStateSpace`, the other choice, found nothing here:
-what it samples is mostly not on the manifold, where ways to it break off, and OMPL 2.0.1 then stays
-where it was.
-
-OMPL knows neither robots nor collisions: kinematics, distances and configurations at the goal are
-this package's. Coordinates are scaled by the chain's metric, so that a turn and a metre count as in
-the other searches. Where nothing is held, motions are checked in batches, as calls from C++ to
-Python cost more than what they do.
+`ProjectedStateSpace` found no path: its samples are mostly off the manifold. Kinematics, distances
+and goal configurations are those of this package, scaled by the chain's metric. Unconstrained
+motions are checked in batches, since calls from C++ to Python are expensive.
 """
 
 from __future__ import annotations
@@ -36,7 +31,7 @@ _TURN = 2.0 * np.pi  # [rad] that a joint without limits may turn either way fro
 
 
 def ranges(problem: TrajectoryProblem) -> tuple[Floats, Floats]:
-    """Return the limits of coordinates from the start to the goal, shape (n,) each, all of them finite."""
+    """Return finite limits of the coordinates, shape (n,) each."""
     lower = np.minimum(problem.lower.min(axis=0), problem.start)
     upper = np.maximum(problem.upper.max(axis=0), problem.start)
     return np.maximum(lower, problem.start - _TURN - 20.0 * np.isfinite(lower)), np.minimum(
@@ -157,7 +152,7 @@ def plan_by_sampling(
 
 
 def dense(rows: Floats, scale: Floats, step: float = 0.2) -> Floats:
-    """Return the same straight lines with waypoints at most `step` [rad] apart, so that a curve through them stays near."""
+    """Insert waypoints so that none are more than `step` [rad] apart."""
     parts = [rows[:1]]
     for a, b in itertools.pairwise(rows):
         far = np.abs((b - a) * scale).max()

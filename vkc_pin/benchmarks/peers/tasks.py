@@ -1,4 +1,4 @@
-"""What all planners are given: reaches in random rooms, and a door and a drawer that are held at the start."""
+"""Defines problems for all planners: reaches, and a door and a drawer grasped at the start."""
 
 from __future__ import annotations
 
@@ -39,31 +39,20 @@ _ROOMS = 70_000  # numbers of rooms that nothing else is measured in begin here
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """One problem.
-
-    Attributes:
-        scene: Where it begins; in the scene of a held thing the robot holds it.
-        steps: What should change.
-    """
+    """A problem: its scene and steps; grasped objects are grasped in the scene."""
 
     scene: Scene
     steps: tuple[Step, ...]
 
 
 def given(task: str, seed: int, number: int) -> Given:
-    """Return a problem, which follows from numbers alone: no planner was asked whether it can solve it.
+    """Return problem `number` of a task, determined by numbers alone.
 
-    Nothing is closer than its margin at the start. A thing is held by a configuration drawn at
-    random of those that hold it, and from which some configuration that holds it at the goal is
-    known, so that the end, if not the way, is possible.
-
-    Args:
-        task: One of `TASKS`.
-        seed: Of the random numbers.
-        number: Which one; it does not depend on how many there are.
+    The start keeps all margins. A grasp is a random free configuration for which a free goal
+    configuration exists.
 
     Raises:
-        InputError: Nothing was found.
+        InputError: No grasp was found.
     """
     rng = np.random.default_rng([seed, list(TASKS).index(task), number])
     if task == "reach":
@@ -101,7 +90,7 @@ def given(task: str, seed: int, number: int) -> Given:
 def problem_of(
     own: Given, options: Options | None = None, cache: Cache | None = None
 ) -> TrajectoryProblem:
-    """Return a problem's chain, limits, margins and goals: what all planners are given, whatever they make of it."""
+    """Return the program of a problem, which all planners use."""
     options = Options() if options is None else options
     return TrajectoryProblem(
         own.scene, compile_task(own.scene, own.steps, options), options, cache=cache
@@ -109,11 +98,7 @@ def problem_of(
 
 
 def ends(problem: TrajectoryProblem, rng: np.random.Generator, most: int) -> Floats:
-    """Return configurations at the goal that keep their margins, the nearest to the start first, shape (K, n), K ≤ `most`.
-
-    For planners that go from configuration to configuration and have no inverse kinematics of their
-    own.
-    """
+    """Sample goal configurations that keep their margins, nearest to the start first, (K, n)."""
     found = _free(problem, rng)
     if not len(found):
         return found
@@ -124,7 +109,7 @@ def ends(problem: TrajectoryProblem, rng: np.random.Generator, most: int) -> Flo
 
 
 def beginning(problem: TrajectoryProblem) -> Floats:
-    """Return the start, shape (n,), where something is held as exactly as planners on manifolds ask for."""
+    """Return the start with an exact closure, shape (n,)."""
     if not problem.closed(problem.task.phases[0]):
         return problem.start
     found, _ = _exact(problem, problem.start[None], 0)
@@ -132,7 +117,7 @@ def beginning(problem: TrajectoryProblem) -> Floats:
 
 
 def _exact(problem: TrajectoryProblem, z: Floats, row: int) -> tuple[Floats, Bools]:
-    """Return configurations next to some, shape (B, n), with an exact pose, within the bounds of a row, and which are."""
+    """Project configurations (B, n) onto an exact pose in a row's bounds; also return which did."""
     (solver, *_), (target, *_) = problem.transcription.pose_solvers, problem.targets
     limits = {
         "lower": problem.lower[row],
@@ -143,7 +128,7 @@ def _exact(problem: TrajectoryProblem, z: Floats, row: int) -> tuple[Floats, Boo
 
 
 def _free(problem: TrajectoryProblem, rng: np.random.Generator) -> Floats:
-    """Return random configurations at the last waypoint, where it should be and free, in the order they were drawn."""
+    """Sample free configurations at the last waypoint."""
     drawn = sample_goal_configurations(problem, problem.segments, rng)
     assert drawn is not None  # all of these tasks have a pose at the end
     z, error = drawn

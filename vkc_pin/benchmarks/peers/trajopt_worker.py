@@ -1,7 +1,6 @@
-"""A process of its own that runs trajopt: reads one request a line, answers with one line, both JSON.
+"""Runs trajopt in its own process; requests and answers are lines of JSON.
 
-The wheel brings a C++ library of its own, newer than some systems', which must be loaded before any
-other is; so nothing of this package is imported here. Run as a file.
+The wheel loads its own C++ library first, so nothing of this package is imported here.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ __all__ = ["main"]
 
 
 def main() -> int:
-    """Answer requests until there are no more."""
+    """Answer requests until the input ends."""
     found = importlib.util.find_spec("tesseract_robotics")
     if found is None or found.origin is None:
         print(json.dumps({"error": "tesseract_robotics is not installed"}), flush=True)
@@ -43,7 +42,7 @@ def main() -> int:
 
 
 class _Solver:
-    """Keeps the environment of the last request's files."""
+    """Solves requests; keeps the environment of the last files."""
 
     def __init__(self) -> None:
         from tesseract_robotics import (
@@ -65,7 +64,7 @@ class _Solver:
         self.environment: Any = None
 
     def __call__(self, ask: dict[str, Any]) -> dict[str, Any]:
-        """Return waypoints, status and time of one seed's optimisation."""
+        """Return waypoints, status and time for one initial guess."""
         import numpy as np
 
         ti, sqp = self.ti, self.sqp

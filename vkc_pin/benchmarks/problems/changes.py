@@ -1,4 +1,4 @@
-"""Settings of the planner that are changed for an experiment: fields of `Options`, and constants of its modules."""
+"""Changes settings of the planner: fields of `Options`, and constants of its modules."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _PACKAGE = "vkc_pin.planning"  # whose modules have the constants
 
 @dataclass(frozen=True)
 class Change:
-    """One setting with another value.
+    """A changed setting.
 
     Attributes:
-        module: The module of a constant within `vkc_pin.planning`, such as "solver.loop"; "Options"
-            for a field of `Options`; "" for no change at all.
-        name: Of the constant or the field.
-        value: What it is to be.
+        module: Module of a constant within `vkc_pin.planning`, such as "solver.loop"; "Options" for a
+            field of `Options`; "" for no change.
+        name: Name of the constant or field.
+        value: New value.
     """
 
     module: str = ""
@@ -44,7 +44,7 @@ class Change:
 
     @property
     def options(self) -> Options:
-        """The options to plan with."""
+        """Options to plan with."""
         return (
             dataclasses.replace(Options(), **{self.name: self.value})
             if self.module == "Options"
@@ -53,11 +53,9 @@ class Change:
 
     @contextlib.contextmanager
     def applied(self) -> Iterator[None]:
-        """Let a constant have its new value meanwhile, in its module and in those that import it by name.
+        """Change the constant meanwhile, wherever it is imported by name.
 
-        What a module made of it when it was loaded, a table or a default of an argument, stays as
-        it was. Plan with a `Planner` of its own: what another has kept was built with the old
-        value.
+        Values derived from it at import stay. Plan with a new `Planner`: caches hold the old value.
         """
         places = _places(self.module, self.name) if self.module not in ("", "Options") else []
         before = [(module, name, getattr(module, name)) for module, name in places]
@@ -74,12 +72,10 @@ UNCHANGED = Change()
 
 
 def parsed(text: str) -> Change:
-    """Return the change that a text stands for: `Options.dt=0.3`, or `solver.loop:PROGRESS=0.6`.
+    """Return the change of a text, such as `Options.dt=0.3` or `solver.loop:PROGRESS=0.6`.
 
     Raises:
-        UnknownNameError: There is no such field, module or constant.
-        InputError: It is no such text, or the value is of another kind than the one that it
-            replaces.
+        InputError: The text is malformed, names no setting, or has a value of another type.
     """
     place, equals, value = text.partition("=")
     try:
@@ -130,7 +126,7 @@ def _module(name: str) -> ModuleType:
 
 
 def _places(module: str, name: str) -> list[tuple[ModuleType, str]]:
-    """Return the modules in which a constant is bound, each with the name that it has there."""
+    """Return (module, name) of all bindings of a constant."""
     importlib.import_module(
         "vkc_pin.planning.planner"
     )  # and with it all that may import the constant

@@ -1,7 +1,6 @@
-"""Problems drawn at random: rooms, or scenes that come along with more obstacles; starts; one or two steps, sensible or not.
+"""Samples random problems: rooms or crowded scenes, random starts, one or two steps.
 
-Some of them cannot be done, and nobody asks which: what a plan says of itself is to be right either
-way.
+Some of them are infeasible; what a plan claims must be right in either case.
 """
 
 from __future__ import annotations
@@ -36,14 +35,10 @@ _AIR = 1e-3  # [m] below what is put down
 
 
 def drawn(seed: int, number: int) -> Problem:
-    """Return a problem: in a random room if its number is even, else in one of the scenes that come along.
-
-    Args:
-        seed: Of all problems.
-        number: Which one; it does not depend on how many there are.
+    """Return a problem: in a random room if its number is even, else in one of the scenes.
 
     Raises:
-        InputError: No scene in some tries had a place for everything.
+        InputError: No scene had a place for everything.
     """
     rng = np.random.default_rng([3, seed, number])
     names = sorted(list_resources("scenes", "*.yaml"))
@@ -64,7 +59,7 @@ def drawn(seed: int, number: int) -> Problem:
 
 
 def _room(rng: np.random.Generator) -> Scene:
-    """Return a room with one or two things to open and something to carry."""
+    """Return a room with one or two articulated objects and something to carry."""
     count = int(rng.integers(1, 3))
     objects = tuple(str(kind) for kind in rng.choice(list(OPENABLE), count, replace=False))
     carried = tuple(str(kind) for kind in rng.choice(["cup", "ball"], int(rng.integers(1, 3))))
@@ -75,7 +70,7 @@ def _room(rng: np.random.Generator) -> Scene:
 
 
 def _crowded(name: str, rng: np.random.Generator) -> Scene:
-    """Return a scene that comes along with some obstacles more, from a random start."""
+    """Return a scene with up to six more obstacles, from a random start."""
     scene = load_scene(name)
     more = [_obstacle(scene, k, rng) for k in range(int(rng.integers(0, _OBSTACLES + 1)))]
     document = {**scene.document, "obstacles": [*scene.document["obstacles"], *more]}
@@ -84,7 +79,7 @@ def _crowded(name: str, rng: np.random.Generator) -> Scene:
 
 
 def _obstacle(scene: Scene, number: int, rng: np.random.Generator) -> dict[str, Any]:
-    """Return an obstacle somewhere in the arena: on the floor, or up to 1.5 m above it."""
+    """Return a random obstacle in the arena, on the floor or up to 1.5 m above."""
     x, y = _spot(scene, rng)
     size = [round(float(value), 3) for value in rng.uniform((0.05, 0.05, 0.05), (0.5, 0.5, 1.2))]
     up = size[2] / 2 + (0.0 if rng.random() < 0.7 else float(rng.uniform(0.0, 1.5)))
@@ -109,7 +104,7 @@ def _spot(scene: Scene, rng: np.random.Generator) -> Floats:
 
 
 def _steps(scene: Scene, rng: np.random.Generator) -> tuple[Step, ...]:
-    """Return one or two steps that can be asked for in one call."""
+    """Return one or two steps that can be compiled together."""
     while True:
         steps = tuple(_step(scene, rng) for _ in range(1 + (rng.random() < _SECOND)))
         with contextlib.suppress(InputError):  # such as two things for one hand
@@ -118,7 +113,7 @@ def _steps(scene: Scene, rng: np.random.Generator) -> tuple[Step, ...]:
 
 
 def _step(scene: Scene, rng: np.random.Generator) -> Step:
-    """Return a step of a kind that the scene has something for; to open or to carry something most of all."""
+    """Return a random step; opening and carrying are most frequent."""
     free = [name for name, placed in scene.objects.items() if placed.object.free]
     fixed = [name for name in scene.objects if name not in free]
     kinds: list[Callable[[], Step]] = [lambda: _reach(scene, rng), lambda: _go(scene, rng)]
@@ -149,7 +144,7 @@ def _go(scene: Scene, rng: np.random.Generator) -> Step:
 
 
 def _actuate(scene: Scene, name: str, rng: np.random.Generator) -> Step:
-    """Bring the joint that moves an attachment's link most directly from the base to a value between its limits."""
+    """Move the joint between the base and an attachment's link to a random value."""
     item = scene.objects[name].object
     attachment = item.attachments[str(rng.choice(list(item.attachments)))]
     joint = item.model.frames[item.link_frame(attachment.link)].parentJoint
@@ -161,7 +156,7 @@ def _actuate(scene: Scene, name: str, rng: np.random.Generator) -> Step:
 
 
 def _place(scene: Scene, name: str, rng: np.random.Generator) -> Step:
-    """Put an object on the floor, or on top of an obstacle."""
+    """Put an object on the floor or on an obstacle."""
     placed = scene.objects[name]
     below = min(
         compute_world_box(shape.geometry, shape.placement)[0][2]

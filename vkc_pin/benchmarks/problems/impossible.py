@@ -1,20 +1,20 @@
-"""Problems that cannot be done, each for one known reason: how long a failure takes, and whether its report says why."""
+"""Plans impossible problems of known cause, to measure failure times and explanations."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
 from vkc_pin.benchmarks.harness.record import distribution, trial
-from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown
+from vkc_pin.benchmarks.harness.runner import Execution
+from vkc_pin.benchmarks.harness.tables import decimal, markdown, page, select
 from vkc_pin.benchmarks.problems.ablation import every_trial
-from vkc_pin.errors import InputError
 from vkc_pin.planning.diagnosis.proofs import PROVEN
 from vkc_pin.planning.planner import plan
 from vkc_pin.procedural.rooms.random_room import sample_layout
@@ -34,92 +34,53 @@ def run(
     out: str | Path,
     problems: int = 50,
     seed: int = 0,
-    jobs: int = 1,
-    scheduler: str | None = None,
-    progress: bool = True,
+    **execution: Unpack[Execution],
 ) -> dict[str, Any]:
-    """Run the experiment, or what is left of it, and write results.json, results.csv and table.md to `out`.
+    """Run the experiment in the folder `out`; see `runner.run`.
 
     Args:
-        out: The folder; if it has trials of the same settings already, they are not run again.
-        problems: How many, at least 1; kinds take turns.
-        seed: Of the problems and of planning.
-        jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
-            `engine.results`.
-        progress: Whether to show a progress bar.
+        out: Folder.
+        problems: Number of problems, at least 1; the kinds alternate.
+        seed: Random seed of problems and planning.
 
     Returns:
-        {"meta": ..., "trials": [...]}; see `runner.run`. A trial has also `kind`, `notes`,
-        `wall_time` of the whole call without what is built once [s], `explained` (a note names a
-        cause, or a constraint that no motion could meet) and `proven`.
-
-    Raises:
-        InputError: No problems, or `out` has trials of other settings.
-        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+        See `runner.run`. Trials have `kind`, `notes`, `wall_time` without building programs [s],
+        `explained` (the report names a cause) and `proven`.
     """
-    if problems < 1:
-        raise InputError("out of range", field="problems", expected="at least 1", got=problems)
+    runner.check_positive(problems=problems)
     settings = {"benchmark": "impossible", "seed": seed, "problems": problems, **LIMITS}
     specs = [{"key": f"{number:05d}", "number": number, "seed": seed} for number in range(problems)]
-    return runner.run(
-        specs,
-        _record,
-        out,
-        settings=settings,
-        report=report,
-        jobs=jobs,
-        scheduler=scheduler,
-        progress=progress,
-    )
+    return runner.run(specs, _record, out, settings=settings, report=report, **execution)
 
 
 def report(result: Mapping[str, Any]) -> str:
-    """Return the tables of a result in Markdown, with versions and machine at the foot."""
+    """Return the tables of a result in Markdown."""
     about, records, rows = result["meta"], result["trials"], []
+    fields = ("success", "explained", "proven")
     for kind in (*KINDS, "all"):
-        own = [record for record in records if kind in (record.get("kind"), "all")]
-        counts = [
-            str(sum(bool(record.get(field)) for record in own))
-            for field in ("success", "explained", "proven")
-        ]
+        own = records if kind == "all" else select(records, kind=kind)
+        counts = [str(sum(bool(record.get(field)) for record in own)) for field in fields]
         rows.append([kind, str(len(own)), *counts, *map(decimal, distribution(own, "wall_time"))])
-    said = [
-        (f"{r['kind']}, problem {r['number']}", r["notes"] or r["violations"][:1])
+    lines = [
+        f"- {r['kind']}, problem {r['number']}: {'; '.join(r['notes'] or r['violations'][:1])}"
         for r in records
         if "notes" in r
     ]
-    parts = [
+    return page(
+        about,
         "# Impossible problems",
-        f"{about['problems']} problems that cannot be done, seed {about['seed']}, {allowed(about)} each. "
+        f"{about['problems']} impossible problems, seed {about['seed']}, {allowed(about)} each. "
         "Explained: the report names a cause. Proven: it does so for certain.",
-        markdown(
-            [
-                "kind",
-                "problems",
-                "success",
-                "explained",
-                "proven",
-                "time, median [s]",
-                "95th percentile [s]",
-            ],
-            rows,
-        ),
+        markdown(["kind", "problems", *fields, "time, median [s]", "95th percentile [s]"], rows),
         "## What the reports say",
-        "\n".join(f"- {name}: {'; '.join(why)}" for name, why in said),
+        "\n".join(lines),
         "## Every trial",
         every_trial(records),
-    ]
-    return "\n\n".join([*parts, foot(about)]) + "\n"
+    )
 
 
 def impossible(seed: int, number: int) -> _Problem:
-    """Return a scene and steps that cannot be done in it.
-
-    Args:
-        seed: Of all problems.
-        number: Which one, from 0; its kind is that of `KINDS` whose turn it is.
-    """
+    """Return scene and steps of problem `number`."""
     rng = np.random.default_rng([4, seed, number])
     return list(KINDS.values())[number % len(KINDS)](rng)
 
@@ -231,7 +192,7 @@ def _narrow(rng: np.random.Generator) -> _Problem:
 
 
 def _bend(rng: np.random.Generator) -> _Problem:
-    """Return a passage as wide as the base, round a corner that is too tight to turn in."""
+    """Return a passage as wide as the base, with a corner too tight to turn in."""
     x, width = float(rng.uniform(1.2, 1.4)), _WIDTH + 0.08
     walls = [_box("wall_low", (2.0 + width, 0.1, 1.0), (x + 1.0 + width / 2, -width / 2 - 0.05))]
     walls += [_box("wall_high", (2.0, 0.1, 1.0), (x + 1.0, width / 2 + 0.05))]
@@ -246,7 +207,7 @@ def _bend(rng: np.random.Generator) -> _Problem:
 
 
 def _low_beam(rng: np.random.Generator) -> _Problem:
-    """Return a wall under which the base fits, but not the lowest link of the arm."""
+    """Return a wall that the base fits under, but not the arm."""
     return _hall(
         _box("beam", (0.2, 2 * _HALL + 1.0, 1.5), (float(rng.uniform(1.2, 1.6)), 0.0), bottom=0.42)
     ), (_beyond(rng),)
@@ -260,7 +221,7 @@ def _taken(rng: np.random.Generator) -> _Problem:
 
 
 def _turned(rng: np.random.Generator) -> _Problem:
-    """Return a place where the base fits, but not at the heading asked for."""
+    """Return a goal where the base fits, but not at the requested heading."""
     x, y = (float(value) for value in rng.uniform((2.0, -2.0), (4.0, 2.0)))
     walls = [
         _box(f"wall_{k}", (2.0, 0.1, 1.0), (x, y + side * 0.45)) for k, side in enumerate((-1, 1))
@@ -286,7 +247,7 @@ def _outside(rng: np.random.Generator) -> _Problem:
 
 
 def _boxed(rng: np.random.Generator) -> _Problem:
-    """Return a drawer whose face stands behind a board."""
+    """Return a drawer behind a board."""
     scene = load_scene("drawer")
     return _with(scene, _box("board", (0.04, 1.0, 1.2), (float(rng.uniform(1.46, 1.5)), 0.0))), (
         Actuate("drawer", {"slide": 0.3}),
@@ -329,7 +290,7 @@ def _sides(x: float, y: float, z: float) -> list[dict[str, Any]]:
 
 
 def _occupied(rng: np.random.Generator) -> _Problem:
-    """Return a cup that is to be put where something stands."""
+    """Return a cup whose goal is occupied."""
     scene, table = _cup(rng)
     x, y = table.frame.transform_point(float(rng.uniform(-0.15, 0.0)), 0.0)
     vase = {

@@ -1,7 +1,4 @@
-"""Random configurations at which the robot touches nothing: starts, and poses of the tool to reach in a random room.
-
-So each of these poses can be reached; whether a planner finds out how is its own affair.
-"""
+"""Samples collision-free starts and reachable tool poses in random rooms."""
 
 from __future__ import annotations
 
@@ -26,13 +23,7 @@ _TRIES = 200_000  # configurations
 
 
 def pose_over(layout: Layout, scene: Scene, table: Part, rng: np.random.Generator) -> pin.SE3:
-    """Return a pose of the tool over a table, within 0.5 m of the side at which the robot can stand.
-
-    Args:
-        layout: The room.
-        scene: The same as a scene.
-        table: One of its tables.
-        rng: Where the random numbers come from.
+    """Sample a tool pose over a table, within 0.5 m of its accessible side.
 
     Raises:
         InputError: No configuration was found.
@@ -67,14 +58,9 @@ def pose_over(layout: Layout, scene: Scene, table: Part, rng: np.random.Generato
 
 
 def pose_among(layout: Layout, scene: Scene, rng: np.random.Generator) -> pin.SE3:
-    """Return a pose of the tool 0.2 to 1.4 m high, at which some of the robot is near something; see `NEAR` and `FAR`.
+    """Sample a tool pose 0.2 to 1.4 m high where some of the robot is within `NEAR` of an obstacle.
 
-    The robot can turn where it stands, and gets there from the start.
-
-    Args:
-        layout: The room.
-        scene: The same as a scene.
-        rng: Where the random numbers come from.
+    The base can turn there, and is connected with the start, at least `FAR` away.
 
     Raises:
         InputError: No configuration was found.
@@ -99,11 +85,7 @@ def pose_among(layout: Layout, scene: Scene, rng: np.random.Generator) -> pin.SE
 
 
 def random_start(scene: Scene, rng: np.random.Generator) -> Scene:
-    """Return the scene with the base at a random place of its start region and with the arm anywhere, clear of everything.
-
-    Args:
-        scene: With a start region.
-        rng: Where the random numbers come from.
+    """Return the scene with a random base pose in its start region and a random arm posture.
 
     Raises:
         InputError: There is no start region, or no configuration was found.
@@ -131,7 +113,7 @@ def random_start(scene: Scene, rng: np.random.Generator) -> Scene:
 def _drawn(
     scene: Scene, base: tuple[float, float, float], rng: np.random.Generator
 ) -> tuple[pin.SE3, Floats]:
-    """Return the tool's placement with the arm anywhere, and the configuration, shape (n,)."""
+    """Return tool placement and configuration, shape (n,), with a random arm posture."""
     robot = scene.robot
     lower, upper = np.maximum(robot.lower, -np.pi)[3:], np.minimum(robot.upper, np.pi)[3:]
     z = np.concatenate([base, rng.uniform(lower, upper)])
@@ -141,7 +123,7 @@ def _drawn(
 
 
 def _free(scene: Scene, z: Floats, near: float = np.inf) -> bool:
-    """Return whether a robot touches nothing at a configuration, itself and the floor included, and is near something."""
+    """Return whether the robot keeps `CLEAR` from everything, and is within `near` of the scene."""
     robot = scene.robot
     data, shapes = robot.model.createData(), robot.collision.createData()
     pin.updateGeometryPlacements(robot.model, data, robot.collision, shapes, robot.coordinates.q(z))

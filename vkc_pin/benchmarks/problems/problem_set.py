@@ -1,7 +1,6 @@
-"""Sixty problems by number: forty in random rooms, twenty from fixed starts of the scenes that come along.
+"""Defines sixty problems by number: forty in random rooms, twenty in scenes of the package.
 
-Which problems these are follows from numbers alone. No planner was asked whether it can solve one,
-and none is left out for that.
+The numbers alone determine the problems, whether or not a planner can solve them.
 """
 
 from __future__ import annotations
@@ -70,11 +69,11 @@ class Problem:
     """A problem.
 
     Attributes:
-        number: Which one, from 0.
-        name: Of the room or the task, and what is to be done.
+        number: Number, from 0.
+        name: Room or task, and what is to be done.
         kind: One of `KINDS`, or a task.
-        scene: Where it begins.
-        steps: What should change.
+        scene: Initial scene.
+        steps: Steps to plan.
     """
 
     number: int
@@ -101,10 +100,7 @@ def kind_of(number: int) -> str:
 
 
 def problem(number: int) -> Problem:
-    """Return a problem.
-
-    Args:
-        number: From 0 to `NUMBER` − 1.
+    """Return a problem by its number, below `NUMBER`.
 
     Raises:
         InputError: There is no such problem.
@@ -120,18 +116,12 @@ def problem(number: int) -> Problem:
 
 
 def problem_of_task(task: str, seed: int, number: int) -> Problem:
-    """Return a task from a random start as a problem, of which both are the kind and the number; see `started`."""
+    """Return a task from a random start as a problem; see `started`."""
     return Problem(number, f"{task} {number}", task, started(task, seed, number), TASKS[task].steps)
 
 
 def started(task: str, seed: int, number: int) -> Scene:
-    """Return a task's scene with a random start, and with its objects scattered if the task says so.
-
-    Args:
-        task: One of `TASKS`.
-        seed: Of the random numbers.
-        number: Which start.
-    """
+    """Return a task's scene with random start `number`, and scattered objects if there are any."""
     rng = np.random.default_rng([seed, list(TASKS).index(task), number])
     own, scene = TASKS[task], load_scene(TASKS[task].scene)
     scattered = placed(scene, {"placed": own.scatter(scene, rng)}) if own.scatter else scene
@@ -144,7 +134,7 @@ _FIXED = [
 
 
 def _clutter(number: int) -> float:
-    """Return how much furniture a problem's room has: each kind of problem has rooms from empty to crowded."""
+    """Return the clutter of a problem's room, from none to much in each kind."""
     return number % _EACH / 10.0
 
 

@@ -1,23 +1,20 @@
-"""Problems drawn at random, each planned once and its plan kept: is what a plan says of itself right?
-
-Whoever judges that judges the saved plans; `tests/oracle` does, which is not part of the package.
-"""
+"""Plans random problems and keeps the plans, to be judged by `tests/oracle`."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
-from vkc_pin.benchmarks.harness.record import Record, distribution, trial
-from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown
+from vkc_pin.benchmarks.harness.record import distribution, trial
+from vkc_pin.benchmarks.harness.runner import Execution
+from vkc_pin.benchmarks.harness.tables import JUDGED, decimal, markdown, page, select
 from vkc_pin.benchmarks.problems.ablation import every_trial
 from vkc_pin.benchmarks.problems.drawn import drawn
 from vkc_pin.benchmarks.problems.problem_set import Problem
-from vkc_pin.errors import InputError
 from vkc_pin.planning.planner import plan
 from vkc_pin.procedural.tasks import random_task
 from vkc_pin.utils.arguments import check_choice
@@ -39,32 +36,17 @@ def run(
     problems: int = 100,
     seed: int = 0,
     of: str = "anything",
-    jobs: int = 1,
-    scheduler: str | None = None,
-    progress: bool = True,
+    **execution: Unpack[Execution],
 ) -> dict[str, Any]:
-    """Run the experiment, or what is left of it, and write results.json, results.csv, table.md and plans/*.npz to `out`.
+    """Run the experiment in the folder `out`; see `runner.run`.
 
     Args:
-        out: The folder; if it has trials of the same settings already, they are not run again.
-        problems: How many, at least 1.
-        seed: Of the problems and of planning.
-        of: "anything" for steps at random, possible or not; "rooms" for `random_task`: something to
-            open in a random room.
-        jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
-            `engine.results`.
-        progress: Whether to show a progress bar.
-
-    Returns:
-        {"meta": ..., "trials": [...]}; see `runner.run`.
-
-    Raises:
-        InputError: No problems, nothing that they can be of, or `out` has trials of other settings.
-        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+        out: Folder.
+        problems: Number of problems, at least 1.
+        seed: Random seed of problems and planning.
+        of: "anything" for random steps, feasible or not; "rooms" for `random_task`.
     """
-    if problems < 1:
-        raise InputError("out of range", field="problems", expected="at least 1", got=problems)
+    runner.check_positive(problems=problems)
     check_choice(of, OF, "set of problems", "of")
     settings = {
         "benchmark": "random" if of == OF[0] else of,
@@ -77,55 +59,37 @@ def run(
         for number in range(problems)
     ]
     function = functools.partial(_record, folder=str(Path(out) / "plans"))
-    return runner.run(
-        specs,
-        function,
-        out,
-        settings=settings,
-        report=report,
-        jobs=jobs,
-        scheduler=scheduler,
-        progress=progress,
-    )
+    return runner.run(specs, function, out, settings=settings, report=report, **execution)
 
 
 def report(result: Mapping[str, Any]) -> str:
-    """Return the tables of a result in Markdown, with versions and machine at the foot."""
-    about, records = result["meta"], result["trials"]
+    """Return the tables of a result in Markdown."""
+    about, records, rows = result["meta"], result["trials"], []
     statuses = sorted({record["status"] for record in records} - {"success"})
-    rows = []
     for kind in (*sorted({record["kind"] for record in records if "kind" in record}), "all"):
-        own = [record for record in records if kind in (record.get("kind"), "all")]
-        counts = [str(_count(own, status)) for status in statuses]
+        own = records if kind == "all" else select(records, kind=kind)
+        counts = [str(len(select(own, status=status))) for status in ("success", *statuses)]
         times = map(decimal, distribution(own, "planning_time"))
-        rows.append([kind, str(len(own)), str(_count(own, "success")), *counts, *times])
-    title, possible = "# Random problems", "Not all of them can be done. "
-    if about["benchmark"] == "rooms":
-        title, possible = "# Random rooms, one task each", ""
-    parts = [
-        title,
-        f"{about['problems']} problems, seed {about['seed']}, {allowed(about)} each. {possible}"
-        "Success is the word of the independent validation.",
-        markdown(
-            ["kind", "problems", "success", *statuses, "time, median [s]", "95th percentile [s]"],
-            rows,
-        ),
+        rows.append([kind, str(len(own)), *counts, *times])
+    rooms = about["benchmark"] == "rooms"
+    head = ["kind", "problems", "success", *statuses, "time, median [s]", "95th percentile [s]"]
+    return page(
+        about,
+        "# Random rooms, one task each" if rooms else "# Random problems",
+        f"{about['problems']} problems, seed {about['seed']}, {allowed(about)} each. "
+        f"{'' if rooms else 'Some of them are infeasible. '}{JUDGED}",
+        markdown(head, rows),
         "## Every trial",
         every_trial(records),
-    ]
-    return "\n\n".join([*parts, foot(about)]) + "\n"
+    )
 
 
 def _in_a_room(seed: int, number: int) -> Problem:
-    """Return a task in a random room; with seed 0 the room has the problem's number. It is of the kind of what is moved."""
+    """Return a task in a random room, whose kind is that of the moved object."""
     scene, steps = random_task(seed * _ROOMS + number)
     name = steps[0].object if isinstance(steps[0], Actuate | Grasp) else ""
     kind = scene.objects[name].object.name
     return Problem(number, f"{scene.name}: {type(steps[0]).__name__} {name}", kind, scene, steps)
-
-
-def _count(records: list[Record], status: str) -> int:
-    return sum(record["status"] == status for record in records)
 
 
 def _record(spec: dict[str, Any], *, folder: str) -> dict[str, Any]:

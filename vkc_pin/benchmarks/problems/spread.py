@@ -1,18 +1,19 @@
-"""How much a motion depends on the random seed: the same problems, planned with several seeds."""
+"""Measures how much motions depend on the random seed."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import Record, values
-from vkc_pin.benchmarks.harness.tables import foot, markdown, quartiles
+from vkc_pin.benchmarks.harness.runner import Execution
+from vkc_pin.benchmarks.harness.tables import count, markdown, page, quartiles, select
 from vkc_pin.benchmarks.problems import trials
 from vkc_pin.benchmarks.problems.ablation import chosen, every_trial
 from vkc_pin.benchmarks.problems.problem_set import problem
@@ -33,30 +34,17 @@ def run(
     *,
     out: str | Path,
     seed: int = 0,
-    jobs: int = 1,
-    scheduler: str | None = None,
     seeds: int = 5,
     problems: Sequence[int] | None = None,
-    progress: bool = True,
+    **execution: Unpack[Execution],
 ) -> dict[str, Any]:
-    """Run the experiment, or what is left of it, and write results.json, results.csv and table.md to `out`.
+    """Run the experiment in the folder `out`; see `runner.run`.
 
     Args:
-        out: The folder; if it has trials of the same settings already, they are not run again.
-        seed: The first seed of planning; the others follow it.
-        jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
-            `engine.results`.
-        seeds: How many seeds, at least 2.
-        problems: Numbers of problems; None: all.
-        progress: Whether to show a progress bar.
-
-    Returns:
-        {"meta": ..., "trials": [...]}; see `runner.run`.
-
-    Raises:
-        InputError: Too few seeds, there is no such problem, or `out` has trials of other settings.
-        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+        out: Folder.
+        seed: First random seed of planning.
+        seeds: Number of consecutive seeds, at least 2.
+        problems: Numbers of problems. Default: all.
     """
     if isinstance(seeds, bool) or not isinstance(seeds, int) or seeds < 2:
         raise InputError(
@@ -69,80 +57,49 @@ def run(
         for number in numbers
         for own in range(seed, seed + seeds)
     ]
-    return runner.run(
-        specs,
-        _record,
-        out,
-        settings=settings,
-        report=report,
-        jobs=jobs,
-        scheduler=scheduler,
-        progress=progress,
-    )
+    return runner.run(specs, _record, out, settings=settings, report=report, **execution)
 
 
 def spread_of(records: Sequence[Record], field: str) -> float | None:
-    """Return the largest value of a field over the least, minus 1, of the successes; None for fewer than two, or a least of 0."""
+    """Return the ratio of largest to least value of successes, minus 1, if it is defined."""
     found = values([record for record in records if record["success"]], field)
     return max(found) / min(found) - 1.0 if len(found) > 1 and min(found) > 0.0 else None
 
 
 def report(result: Mapping[str, Any]) -> str:
-    """Return the tables of a result in Markdown, with versions and machine at the foot."""
+    """Return the tables of a result in Markdown."""
     about, records = result["meta"], result["trials"]
-    groups = {number: [r for r in records if r["number"] == number] for number in about["problems"]}
-    whole = {number: own for number, own in groups.items() if all(r["success"] for r in own)}
-    summary = []
+    groups = {number: select(records, number=number) for number in about["problems"]}
+    whole = [own for own in groups.values() if all(r["success"] for r in own)]
+    summary, rows = [], []
     for field, name in FIELDS.items():
-        found = [spread for own in whole.values() if (spread := spread_of(own, field)) is not None]
-        first, median, third = quartiles(found)
+        found = [spread for own in whole if (spread := spread_of(own, field)) is not None]
         late = float(np.percentile(found, 95)) if found else float("nan")
+        figures = (*quartiles(found), late, max(found, default=float("nan")))
         same = sum(spread <= WITHIN for spread in found)
-        texts = [
-            f"{100.0 * value:.1f}"
-            for value in (first, median, third, late, max(found, default=float("nan")))
-        ]
-        summary.append([name, f"{same} of {len(found)}", *texts])
-    rows = []
+        cells = [f"{100.0 * value:.1f}" for value in figures]
+        summary.append([name, f"{same} of {len(found)}", *cells])
     for number, own in groups.items():
         spreads = [spread_of(own, field) for field in FIELDS]
-        good = f"{sum(bool(r['success']) for r in own)} of {len(own)}"
-        names = next((r["problem"] for r in own if "problem" in r), "")
-        seeds = "; ".join(
-            dict.fromkeys(r["initialization"] for r in own if r.get("initialization"))
-        )
-        rows.append(
-            [
-                str(number),
-                names,
-                good,
-                *("–" if s is None else f"{100.0 * s:.1f}" for s in spreads),
-                seeds,
-            ]
-        )
+        cells = ["–" if spread is None else f"{100.0 * spread:.1f}" for spread in spreads]
+        name = next((r["problem"] for r in own if "problem" in r), "")
+        guesses = dict.fromkeys(r["initialization"] for r in own if r.get("initialization"))
+        rows.append([str(number), name, count(own), *cells, "; ".join(guesses)])
+    within = f"within {100 * WITHIN:.0f} %"
+    columns = ["of", within, "1st quartile [%]", "median", "3rd quartile", "95th", "most"]
     percent = [f"{name} [%]" for name in FIELDS.values()]
-    parts = [
+    return page(
+        about,
         "# Spread over random seeds",
-        f"{len(groups)} problems, each planned with {about['seeds']} seeds from {about['seed']} on. Spread is the largest value "
-        f"over the least, minus 1, of successes. The summary is over the {len(whole)} problems that succeed with every seed.",
-        markdown(
-            [
-                "of",
-                f"within {100 * WITHIN:.0f} %",
-                "1st quartile [%]",
-                "median",
-                "3rd quartile",
-                "95th",
-                "most",
-            ],
-            summary,
-        ),
+        f"{len(groups)} problems, each planned with {about['seeds']} seeds from {about['seed']} "
+        "on. Spread is the largest value over the least, minus 1, of successes. The summary is "
+        f"over the {len(whole)} problems that succeed with every seed.",
+        markdown(columns, summary),
         "## Every problem",
-        markdown(["number", "problem", "success", *percent, "seed trajectories"], rows, text=2),
+        markdown(["number", "problem", "success", *percent, "initial guesses"], rows, text=2),
         "## Every trial",
         every_trial(records),
-    ]
-    return "\n\n".join([*parts, foot(about)]) + "\n"
+    )
 
 
 _problem = functools.lru_cache(maxsize=2)(problem)  # once for all seeds

@@ -1,4 +1,4 @@
-"""One trial: a problem is planned and put on record, with what it took, its objective, and whether its first seed sufficed."""
+"""Plans problems and records statistics."""
 
 from __future__ import annotations
 
@@ -25,15 +25,7 @@ __all__ = ["first_seed", "objective", "tried"]
 def tried(
     scene: Scene, steps: tuple[Step, ...], *, seed: int, change: Change = UNCHANGED, **more: Any
 ) -> dict[str, Any]:
-    """Plan and return the record: `record.trial`, and `solves`, `first_seed`, `objective`, `cpu_time` and `wall_time` of it all.
-
-    Args:
-        scene: Where it begins.
-        steps: What should change.
-        seed: Of the random numbers of planning.
-        change: The setting that is another.
-        more: Further fields of the record.
-    """
+    """Plan a problem and return its record with times, solves and objective."""
     _warm()
     solves: list[int] = []
 
@@ -66,24 +58,14 @@ def tried(
 
 
 def first_seed(found: Plan, solves: int) -> bool:
-    """Return whether a plan is a success that came from the first seed.
-
-    Args:
-        found: The plan.
-        solves: How often the solver was run for it.
-    """
+    """Return whether a plan succeeded with the first of its `solves` runs of the solver."""
     return found.success and solves == 1
 
 
 def objective(found: Plan, planner: Planner | None = None) -> float | None:
-    """Return what the way costs, in the options' weights, of a plan that is a success and one problem; None for others.
+    """Return the objective of a successful plan that is one problem, without grasp freedoms.
 
-    It is that of robot and objects. Freedoms of grasps are left out: while nothing is held they
-    mean nothing, and the motion has other values for them there than the program.
-
-    Args:
-        found: The plan; without own costs.
-        planner: Keeps the symbolic program; None: the process's own.
+    Freedoms of grasps have other values in the program while nothing is grasped.
     """
     if not found.success:
         return None

@@ -1,4 +1,4 @@
-"""Robots and objects as a run is asked for them: by name, or as files, which are imported into its folder first, once."""
+"""Prepares requested robots and objects; files are imported once."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _LEVEL = 0.5  # cosine of how steep an approach may be that tells where the fron
 
 @dataclass(frozen=True)
 class Given:
-    """A robot or an object as it is asked for.
+    """A requested robot or object.
 
     Attributes:
-        called: What it is called in tables.
-        path: Its name, or the path of its file or folder.
-        link: The link of an object's file that is imported alone; None: all of it.
+        called: Displayed name.
+        path: Name, or path of a file or folder.
+        link: Link of an object's file that is imported alone; None for all of it.
     """
 
     called: str
@@ -45,20 +45,20 @@ class Given:
 
     @property
     def imported(self) -> bool:
-        """Whether it is a file that somebody else made."""
+        """Whether it is a file to import."""
         return self.path.lower().endswith(_FILES)
 
 
 def parsed(texts: Sequence[str], field: str, default: Sequence[str]) -> list[Given]:
-    """Return what some texts ask for: names and paths, each as such or as "name=...", with "#link" for one link of a file.
+    """Parse requests: names and paths, each plain or as "name=...", with "#link" for one link.
 
     Args:
-        texts: The texts.
-        field: What they are, for errors.
-        default: What "default" stands for.
+        texts: Requests.
+        field: Name of the argument, for errors.
+        default: Names that "default" stands for.
 
     Raises:
-        InputError: There are none, or two of the same name.
+        InputError: A request is malformed, or there are none or two of one name.
     """
     found = list[Given]()
     for text in (one for given in texts for one in (default if given == DEFAULT else [str(given)])):
@@ -84,15 +84,10 @@ def parsed(texts: Sequence[str], field: str, default: Sequence[str]) -> list[Giv
 
 
 def ready_robot(one: Given, folder: Path) -> str:
-    """Return what to load for a robot: what was asked for if that says what its hand is, else a folder made by importing it.
-
-    Args:
-        one: The robot.
-        folder: Where folders are made; what is there is not made again.
+    """Return name or path of a robot, imported into `folder` unless it describes its hand.
 
     Raises:
-        UnknownNameError: There is no such robot.
-        InputError: It cannot be imported, or its name in tables is not a plain file name.
+        InputError: There is no such robot, it cannot be imported, or its name is no file name.
     """
     mjcf = one.path.lower().endswith((".xml", ".mjcf"))
     made = folder / check_name(one.called, "robots")
@@ -107,16 +102,10 @@ def ready_robot(one: Given, folder: Path) -> str:
 
 
 def ready_object(one: Given, folder: Path) -> str:
-    """Return what `description_of` takes for an object; a file is imported, and turned so that it is opened from -x.
-
-    Args:
-        one: The object.
-        folder: Where folders are made; what is there is not made again.
+    """Return name or description file of an object; files are imported, their fronts towards -x.
 
     Raises:
-        UnknownNameError: There is no such object, or no such link.
-        InputError: It cannot be imported, its description cannot be read, or its name in tables is
-            not a plain file name.
+        InputError: There is no such object, it cannot be imported, or its name is no file name.
     """
     if not one.imported:
         if one.link is not None:
@@ -142,7 +131,7 @@ def ready_object(one: Given, folder: Path) -> str:
 
 
 def _name(path: str) -> str:
-    """Return what to call something without a name of its own: its name, or that of its folder or file."""
+    """Return the default name: that of the file, or of its folder for robot.yaml."""
     file = Path(path) / "robot.yaml" if Path(path).is_dir() else Path(path)
     return (
         file.resolve().parent.name
@@ -154,7 +143,7 @@ def _name(path: str) -> str:
 
 
 def _face(imported: ImportedObject) -> None:
-    """Turn an object by quarters of a turn so that the best proposed hand comes along x: files have their fronts anywhere."""
+    """Turn an object by quarter turns so that the best proposed hand approaches along x."""
     if not imported.proposals.found:
         return
     item, best = imported.proposals.object, imported.proposals.found[0].attachment

@@ -1,4 +1,4 @@
-"""What came out of robots × objects: tables in Markdown, and a chart with a cell for each combination."""
+"""Tabulates and draws the robot–object matrix."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vkc_pin.benchmarks.harness.limits import allowed
-from vkc_pin.benchmarks.harness.record import Record, distribution, values
-from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown
+from vkc_pin.benchmarks.harness.record import Record, distribution
+from vkc_pin.benchmarks.harness.tables import JUDGED, decimal, markdown, medians, page
 from vkc_pin.benchmarks.robot_object_matrix.pairs import kind_of
 from vkc_pin.visualization.plots.style import new_figure, save_figure, use_style
 
@@ -35,39 +35,35 @@ _UNREACHED = ("unreachable", "no hand")
 
 
 def report(result: Mapping[str, Any]) -> str:
-    """Return the tables of a result in Markdown, with versions and machine at the foot."""
+    """Return the tables of a result in Markdown."""
     about, records = result["meta"], result["trials"]
     groups = _groups(records)
     robots, objects = (list(dict.fromkeys(key[k] for key in groups)) for k in (0, 1))
     rows = [[name, *(_cell(groups.get((robot, name), ())) for robot in robots)] for name in objects]
-    parts = [
+    return page(
+        about,
         "# Robots × objects",
         f"{len(robots)} robots, {len(objects)} objects of {len(set(map(kind_of, objects)))} kinds, "
-        f"{about['starts']} random starts each, seed {about['seed']}, {allowed(about)} each. A joint is opened by "
-        f"{about['share']:.0%} of its range, by whichever proposed attachment leads there; within reach is what the hand gets to "
-        "both shut and open by so much. Success is the word of the independent validation. "
-        "Times are those of all plans; loading again is the median over all combinations of a robot.",
-        markdown(
-            _SUMMARY, [*(_summary(robot, groups) for robot in robots), _summary(_ALL, groups)]
-        ),
+        f"{about['starts']} random starts each, seed {about['seed']}, {allowed(about)} each. A "
+        f"joint is opened by {about['share']:.0%} of its range, by any proposed attachment; an "
+        "object is within reach if the hand gets to it both closed and open by so much. "
+        f"{JUDGED} Times are those of all plans; loading again is the median over all "
+        "combinations of a robot.",
+        markdown(_SUMMARY, [_summary(robot, groups) for robot in (*robots, _ALL)]),
         "## Every combination",
         "How many starts succeed; – is out of reach, ! could not be tried.",
         markdown(["object", *robots], rows),
         *_listed("What failed", [r for r in records if not r["success"] and _reached(r)]),
         *_listed("What is out of reach", [r for r in records if not _reached(r)]),
-    ]
-    return "\n\n".join([*parts, foot(about)]) + "\n"
+    )
 
 
 def chart(records: Sequence[Record], path: str | Path | None) -> Figure:
-    """Draw the share of starts that succeed, a row for each object and a column for each robot; grey is out of reach.
+    """Draw the share of successful starts by object and robot; unreachable combinations are grey.
 
     Args:
-        records: As `run` makes them.
-        path: The file to write, .png, .svg or .pdf; None writes nothing.
-
-    Returns:
-        The figure.
+        path: File to write; None writes nothing.
+        records: Records of `run`.
     """
     groups = _groups(records)
     robots, objects = (list(dict.fromkeys(key[k] for key in groups)) for k in (0, 1))
@@ -92,7 +88,7 @@ def chart(records: Sequence[Record], path: str | Path | None) -> Figure:
 
 
 def _groups(records: Sequence[Record]) -> dict[tuple[str, str], list[Record]]:
-    """Return the records of each combination, by robot and object; an error may have been raised before any start."""
+    """Return (robot, object) → records."""
     groups: dict[tuple[str, str], list[Record]] = {}
     for record in records:
         groups.setdefault((record["robot"], record["object"]), []).append(record)
@@ -115,40 +111,21 @@ def _summary(robot: str, groups: Mapping[tuple[str, str], Sequence[Record]]) -> 
     chosen = [own for key, own in groups.items() if robot in (key[0], _ALL)]
     reached = [own for own in chosen if all(map(_reached, own))]
     flat = [record for own in chosen for record in own]
-    some = (
-        [all(r["success"] for r in own) for own in reached],
-        [any(r["success"] for r in own) for own in reached],
-    )
-    shares = (f"{sum(good)} ({sum(good) / max(len(reached), 1):.0%})" for good in some)
-    loads = values(flat, "load_time")
-    again = decimal(float(np.median(loads))) if loads else "–"
-    return [
-        robot,
-        str(len(chosen)),
-        str(len(reached)),
-        *shares,
-        *map(decimal, distribution(flat, "planning_time")),
-        again,
-    ]
+    cells = [robot, str(len(chosen)), str(len(reached))]
+    for judge in (all, any):
+        good = sum(judge(record["success"] for record in own) for own in reached)
+        cells.append(f"{good} ({good / max(len(reached), 1):.0%})")
+    times = map(decimal, distribution(flat, "planning_time"))
+    return [*cells, *times, *medians(flat, "load_time")]
 
 
 def _listed(title: str, records: Sequence[Record]) -> list[str]:
-    """Return a table of what did not succeed, with the reason on record; alike ones of a combination are one row."""
-    if not records:
-        return []
-    rows: Counter[tuple[str, ...]] = Counter()
+    """Return a section of failures with their reasons and counts."""
+    rows = Counter[tuple[str, ...]]()
     for r in records:
         why = r.get("because") or "; ".join(r.get("violations", ())[:1])
-        rows[
-            r["robot"],
-            "every object" if r["status"] == "no hand" else r["object"],
-            str(r["status"]),
-            why,
-        ] += 1
-    body = [
-        [robot, name, status, str(count), why] for (robot, name, status, why), count in rows.items()
-    ]
-    return [
-        f"## {title}",
-        markdown(["robot", "object", "status", "trials", "because"], body, text=5),
-    ]
+        name = "every object" if r["status"] == "no hand" else r["object"]
+        rows[r["robot"], name, str(r["status"]), why] += 1
+    body = [[*place, str(number), why] for (*place, why), number in rows.items()]
+    head = ["robot", "object", "status", "trials", "because"]
+    return [f"## {title}", markdown(head, body, text=5)] if records else []

@@ -1,4 +1,4 @@
-"""A robot and a thing that opens, alone in a hall: which there are, and what is asked of the two."""
+"""Puts a robot and an articulated object into a hall."""
 
 from __future__ import annotations
 
@@ -88,12 +88,12 @@ _SAME = 1e-6  # [rad] or [m]
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """What is asked of a robot and an object.
+    """A robot, an object and the step to plan.
 
     Attributes:
-        scene: Their hall, with random starts of the base; None where the robot has no hand.
-        step: What is to be done; None where the hand can take hold nowhere, or not go along so far.
-        because: Why not.
+        scene: Their hall; None if the robot has no hand.
+        step: Step to plan; None if the object cannot be opened so far.
+        because: Reason without a step.
     """
 
     scene: Scene | None
@@ -102,21 +102,19 @@ class Pair:
 
 
 def kind_of(name: str) -> str:
-    """Return what kind of thing an object is: the last word of its name, without its number."""
+    """Return the kind of an object: the last word of its name without number."""
     last = re.sub(r"_\d+$", "", Path(name).stem).rpartition("_")[2]
     return "drawers" if last == "drawer" else last
 
 
 def description_of(name: str) -> dict[str, Any]:
-    """Return the description of an object, which does not depend on where it is read from.
+    """Return the description of an object with absolute paths.
 
     Args:
-        name: `<kind>_<seed>` of `random_object`, a name in scenes/objects, or the path of a
-            description (.yaml).
+        name: `<kind>_<seed>` of `random_object`, a name in scenes/objects, or a description file.
 
     Raises:
-        UnknownNameError: There is no such object.
-        InputError: The description cannot be read.
+        InputError: There is no such object, or the description cannot be read.
     """
     match = _of_kind(name)
     if match:
@@ -135,13 +133,7 @@ def description_of(name: str) -> dict[str, Any]:
 
 
 def hall(robot: str, name: str, description: Mapping[str, Any]) -> Scene:
-    """Return a robot and an object alone in a hall: against a wall, in it, or on a counter, as it belongs.
-
-    Args:
-        robot: The robot's name, or the path of its file.
-        name: The object's name; see `description_of`.
-        description: Of the object.
-    """
+    """Return a hall with a robot and an object, against a wall, in it, or on a counter."""
     match, floor = _of_kind(name), Floor(_SIZE, _SIZE)
     own = make_fixture(RANDOM + match[0], match[1]) if match else make_fixture(name)
     if _is_path(name) and own.high[2] - own.low[2] < _LOW:
@@ -162,16 +154,16 @@ def hall(robot: str, name: str, description: Mapping[str, Any]) -> Scene:
 
 
 def pair(robot: Robot, called: str, name: str, *, seed: int = 0) -> Pair:
-    """Return what is asked: to open the object by whichever proposed attachment leads there.
+    """Return the step that opens an object by proposed attachments.
 
-    The first is the best one that the hand gets to, shut and open by so much; the others of that
-    joint are left to planning.
+    The first attachment is the best one that the hand reaches, closed and open; planning may choose
+    others of the same joint.
 
     Args:
-        robot: The robot.
+        robot: Robot.
         called: Its name, or the path of its file.
-        name: The object; see `description_of`.
-        seed: Of the configurations that are looked for.
+        name: Object; see `description_of`.
+        seed: Random seed of configurations.
     """
     try:
         make_hand(robot)
@@ -205,7 +197,7 @@ def pair(robot: Robot, called: str, name: str, *, seed: int = 0) -> Pair:
 
 
 def _blocked(scene: Scene, step: Actuate, seed: int, cache: Cache) -> str | None:
-    """Return at the end of which phase no free configuration is found, and why not; None if there is one at all of them."""
+    """Return why no free configuration exists at the end of a phase; None if there is one."""
     options = Options()
     problem = TrajectoryProblem(
         scene, compile_task(scene, [step], options), options, (), cache=cache
@@ -214,7 +206,7 @@ def _blocked(scene: Scene, step: Actuate, seed: int, cache: Cache) -> str | None
 
 
 def _asked(scene: Scene, proposals: Proposals) -> list[Actuate]:
-    """Return the steps that open a joint on the object's base, each by another attachment, the best one first."""
+    """Return the steps that open a joint on the base, best attachment first."""
     placed = scene.objects[_IT]
     goal = {
         joint: value
@@ -232,7 +224,7 @@ def _asked(scene: Scene, proposals: Proposals) -> list[Actuate]:
 
 
 def _why_not(proposals: Proposals) -> str:
-    """Return why no joint on the base is opened by so much: what is in the way of all hands, and how far the proposals get."""
+    """Return what obstructs all hands, and how far the proposals open."""
     said = [f"{joint}: {reason}" for joint, reason in proposals.because.items()]
     for proposal in proposals.found:
         ends = [f"{joint} at {value:.3g}" for joint, value in proposal.opens.items()]
@@ -242,7 +234,7 @@ def _why_not(proposals: Proposals) -> str:
 
 
 def _on_a_counter(own: Fixture) -> Fixture:
-    """Return something low as it stands on a counter that is deep enough for it."""
+    """Return a low object on a counter that is deep enough for it."""
     setback = round(float(-own.low[0]) + _MARGIN, 3)
     depth, width = (
         max(_DEPTH, setback + float(own.high[0]) + _MARGIN),
@@ -253,7 +245,7 @@ def _on_a_counter(own: Fixture) -> Fixture:
 
 
 def _of_kind(name: str) -> tuple[str, int] | None:
-    """Return kind and seed of what is made at random, None for other objects."""
+    """Return kind and seed of a random object, None for others."""
     match = _OF_KIND.fullmatch(name)
     return (match["kind"], int(match["seed"])) if match and match["kind"] in KINDS else None
 

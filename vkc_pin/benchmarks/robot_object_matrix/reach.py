@@ -1,4 +1,4 @@
-"""Random poses that a robot can reach: those of its hand where its links keep apart, and off the floor."""
+"""Samples poses that a robot can reach."""
 
 from __future__ import annotations
 
@@ -21,17 +21,15 @@ _TRIES = 20_000
 
 
 def random_poses(robot: Robot, name: str, number: int, *, seed: int = 0) -> list[pin.SE3]:
-    """Return poses of the tool in the world, each that of a random configuration in which the robot keeps its default margins.
+    """Sample tool poses of random configurations in which the robot keeps its default margins.
 
-    Joints are within their limits, ±π where they turn without end, the base at any heading up to a
-    metre away along x and y. Links keep `Options.self_distance`, or what they can; the arm keeps
-    `Options.dist_safe` from the floor.
+    The base moves up to 1 m along x and y; unlimited joints stay within ±π.
 
     Args:
-        robot: The robot, with its collision pairs.
-        name: What it is called: other robots get other random numbers.
-        number: How many poses.
-        seed: Of the random numbers.
+        robot: Robot with collision pairs.
+        name: Name, which determines the random numbers together with `seed`.
+        number: Number of poses.
+        seed: Random seed.
 
     Raises:
         VkcError: Hardly any configuration is free.
@@ -63,7 +61,7 @@ def random_poses(robot: Robot, name: str, number: int, *, seed: int = 0) -> list
 
 
 class _Free:
-    """Whether a robot keeps its default margins at a configuration."""
+    """Checks whether a configuration keeps the robot's default margins."""
 
     def __init__(self, robot: Robot) -> None:
         options, shapes = Options(), robot.collision.geometryObjects

@@ -1,4 +1,4 @@
-"""Imports robots from their makers' files and lets them reach random poses: what works without a line written by hand?"""
+"""Imports robots from their makers' files and lets them reach random poses."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ import time
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial
-from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown
+from vkc_pin.benchmarks.harness.runner import Execution
+from vkc_pin.benchmarks.harness.tables import JUDGED, decimal, markdown, page, select
 from vkc_pin.benchmarks.robot_object_matrix.reach import random_poses
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.importing.robots.rest_configuration import Clearances
@@ -84,36 +85,21 @@ def run(
     goals: int = 20,
     seed: int = 0,
     robots: Sequence[str] = ROBOTS,
-    jobs: int = 1,
-    scheduler: str | None = None,
-    progress: bool = True,
+    **execution: Unpack[Execution],
 ) -> dict[str, Any]:
-    """Run the experiment, or what is left of it, and write results.json, results.csv and table.md to `out`.
+    """Run the experiment in the folder `out`; see `runner.run`.
 
     Args:
-        out: The folder; if it has trials of the same settings already, they are not run again.
-            Robots are imported into `out`/robots.
-        goals: How many poses each robot is to reach, at least 1.
-        seed: Of the poses, of importing and of planning.
-        robots: Names of example-robot-data, or paths of URDF, xacro and MJCF files.
-        jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
-            `engine.results`.
-        progress: Whether to show a progress bar.
+        out: Folder; see `runner.run`. Robots are imported into its subfolder.
+        goals: Number of poses per robot, at least 1.
+        seed: Random seed of poses, importing and planning.
+        robots: Names of example-robot-data, or URDF, xacro and MJCF files.
 
     Returns:
-        {"meta": ..., "trials": [...]}; see `runner.run`. A robot that cannot be imported has one
-        record, of status "not imported", one that is hardly ever free of collision one of status
-        "hardly free"; `because` says why.
-
-    Raises:
-        InputError: No goals, the same robot twice, no such file, or `out` has trials of other
-            settings.
-        UnknownNameError: There is no such robot.
-        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+        See `runner.run`. A robot that cannot be imported has one record of status "not imported",
+        one that is hardly ever free of collision one of status "hardly free".
     """
-    if goals < 1:
-        raise InputError("out of range", field="goals", expected="at least 1", got=goals)
+    runner.check_positive(goals=goals)
     files = _files(robots)
     settings = {
         "benchmark": "robots",
@@ -133,44 +119,29 @@ def run(
         }
         for name, file in files.items()
     ]
-    return runner.run(
-        specs,
-        _records,
-        out,
-        settings=settings,
-        report=report,
-        jobs=jobs,
-        scheduler=scheduler,
-        progress=progress,
-    )
+    return runner.run(specs, _records, out, settings=settings, report=report, **execution)
 
 
 def report(result: Mapping[str, Any]) -> str:
-    """Return the tables of a result in Markdown, with versions and machine at the foot."""
+    """Return the tables of a result in Markdown."""
     about, records = result["meta"], result["trials"]
-    groups: dict[str, list[Record]] = {name: [] for name in about["robots"]}
-    for record in records:
-        groups[record["robot"]].append(record)
-    lines = [_row(name, own) for name, own in groups.items()]
     failed = [
         [r["robot"], str(r["status"]), r.get("because") or "; ".join(r.get("violations", ())[:1])]
         for r in records
         if not r["success"]
     ]
-    parts = [
+    section = ["## What failed", markdown(("robot", "status", "because"), failed, text=3)]
+    return page(
+        about,
         "# Robots",
-        "Robots are imported from their makers' files, without anything written by hand; each then reaches "
-        f"{about['goals']} random poses, those of free configurations, seed {about['seed']}, {allowed(about)} each. Success is "
-        "the word of the independent validation. Importing, and loading again in a new process, are in processor time. Room at "
-        "home is the least distance between links that are not neighbours, and of the arm to the floor.",
-        markdown(_HEAD, lines),
-        *(
-            ["## What failed", markdown(("robot", "status", "because"), failed, text=3)]
-            if failed
-            else []
-        ),
-    ]
-    return "\n\n".join([*parts, foot(about)]) + "\n"
+        "Robots are imported from their makers' files alone; each then reaches "
+        f"{about['goals']} random poses of free configurations, seed {about['seed']}, "
+        f"{allowed(about)} each. {JUDGED} Importing, and loading again in a new process, are in "
+        "processor time. Room at home is the least distance between links that are not "
+        "neighbours, and of the arm to the floor.",
+        markdown(_HEAD, [_row(name, select(records, robot=name)) for name in about["robots"]]),
+        *(section if failed else []),
+    )
 
 
 def _row(name: str, own: Sequence[Record]) -> list[str]:
@@ -188,7 +159,7 @@ def _row(name: str, own: Sequence[Record]) -> list[str]:
 
 
 def _files(robots: Sequence[str]) -> dict[str, Path]:
-    """Return name → file of every robot; files of one name are called as their folders, too."""
+    """Return name → file of each robot; files of one name are prefixed by their folders."""
     known, found = list_robots(), list[tuple[str, Path]]()
     for robot in map(str, robots):
         path = Path(robot)
@@ -220,7 +191,7 @@ def _files(robots: Sequence[str]) -> dict[str, Path]:
 
 
 def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return a record of every pose; a single one of a robot that cannot be imported, or is hardly ever free."""
+    """Return a record of every pose, or one if the robot is unusable."""
     seed, name = spec["seed"], spec["robot"]
     folder = Path(spec["out"]) / "robots" / check_name(name, "robots")
     about: dict[str, Any] = {"robot": name}
@@ -272,7 +243,7 @@ def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _facts(robot: Robot, folder: Path) -> dict[str, Any]:
-    """Return what is measured of an imported robot."""
+    """Measure an imported robot."""
     said = subprocess.run(
         [sys.executable, "-c", _LOAD, str(folder)], capture_output=True, text=True, check=True
     )

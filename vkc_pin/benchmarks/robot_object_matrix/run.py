@@ -1,4 +1,4 @@
-"""Opens every object with every robot, from random starts, where the shapes say that the hand can take hold."""
+"""Opens every object with every robot, from random starts."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import time
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import trial
+from vkc_pin.benchmarks.harness.runner import Execution
 from vkc_pin.benchmarks.robot_object_matrix.given import parsed, ready_object, ready_robot
 from vkc_pin.benchmarks.robot_object_matrix.matrix import chart, report
 from vkc_pin.benchmarks.robot_object_matrix.pairs import OBJECTS, ROBOTS, SHARE, kind_of, pair
-from vkc_pin.errors import InputError
 from vkc_pin.planning.planner import plan
 from vkc_pin.world.models.robot_file import load_robot
 
@@ -30,41 +30,24 @@ def run(
     seed: int = 0,
     robots: Sequence[str] = ROBOTS,
     objects: Sequence[str] = OBJECTS,
-    jobs: int = 1,
-    scheduler: str | None = None,
-    progress: bool = True,
+    **execution: Unpack[Execution],
 ) -> dict[str, Any]:
-    """Run the experiment, or what is left of it, and write results.json, results.csv, table.md and success.png to `out`.
+    """Run the experiment in the folder `out`; see `runner.run`.
 
     Args:
-        out: The folder; if it has trials of the same settings already, they are not run again.
-        starts: How many random starts of each robot at each object, at least 1.
-        seed: Of the starts and of planning.
-        robots: What `load_robot` takes, or MJCF files, each as such or as "name=..."; "default"
-            stands for `ROBOTS`. Those without a description of their hand are imported into
-            `out`/robots first, once.
-        objects: `<kind>_<seed>` of `random_object`, names in scenes/objects, paths of descriptions,
-            or of URDF, MJCF and SDF files, each as such or as "name=..."; "...#link" is that link
-            of a file alone, "default" stands for `OBJECTS`. Files are imported into `out`/objects
-            first, once.
-        jobs: Number of processes.
-        scheduler: Address of a Dask scheduler whose workers run the trials instead, see
-            `engine.results`.
-        progress: Whether to show a progress bar.
+        out: Folder; see `runner.run`. Robots and objects are imported into its subfolders.
+        starts: Number of random starts per combination, at least 1.
+        seed: Random seed of starts and planning.
+        robots: Names and files for `load_robot`, or MJCF files; "default" stands for `ROBOTS`.
+            See `given.parsed`.
+        objects: `<kind>_<seed>` of `random_object`, names in scenes/objects, descriptions, or URDF,
+            MJCF and SDF files; "default" stands for `OBJECTS`.
 
     Returns:
-        {"meta": ..., "trials": [...]}; see `runner.run`. A combination that is out of reach has one
-        record, of status "unreachable", or "no hand" where the robot is to blame, whose `because`
-        says why.
-
-    Raises:
-        InputError: No starts, the same robot or object twice, or `out` has trials of other
-            settings.
-        UnknownNameError: There is no such robot or object.
-        KeyboardInterrupt: Ctrl-C was pressed; the same call goes on from there.
+        See `runner.run`. An unreachable combination has one record of status "unreachable" or
+        "no hand", with the reason in `because`.
     """
-    if starts < 1:
-        raise InputError("out of range", field="starts", expected="at least 1", got=starts)
+    runner.check_positive(starts=starts)
     runner.check_folder(out)
     chosen = [parsed(robots, "robots", ROBOTS), parsed(objects, "objects", OBJECTS)]
     things = {one.called: ready_object(one, Path(out) / "objects") for one in chosen[1]}
@@ -89,22 +72,13 @@ def run(
         for robot, file in ready.items()
         for thing, path in things.items()
     ]
-    result = runner.run(
-        specs,
-        _records,
-        out,
-        settings=settings,
-        report=report,
-        jobs=jobs,
-        scheduler=scheduler,
-        progress=progress,
-    )
+    result = runner.run(specs, _records, out, settings=settings, report=report, **execution)
     chart(result["trials"], Path(out) / "success.png")
     return result
 
 
 def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return a record of every start; a single one where the hand can take hold nowhere."""
+    """Return a record of every start, or one if the object is unreachable."""
     seed, (file, thing) = spec["seed"], spec["files"]
     about: dict[str, Any] = {
         "robot": spec["robot"],

@@ -1,0 +1,20 @@
+"""Runs experiments from the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from vkc_pin.cli import main
+
+
+def run_experiment(words: str, out: Path) -> tuple[str, list[dict[str, Any]]]:
+    """Run `vkc-pin bench WORDS` twice, which must add no trial; return its table and its trials."""
+    command = ["bench", *words.split(), "--quiet", "--out", str(out)]
+    assert main(command) == 0
+    journal = (out / "trials.jsonl").read_bytes()
+    assert main(command) == 0
+    assert (out / "trials.jsonl").read_bytes() == journal
+    result = json.loads((out / "results.json").read_text(encoding="utf-8"))
+    return (out / "table.md").read_text(encoding="utf-8"), result["trials"]

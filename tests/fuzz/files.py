@@ -32,7 +32,7 @@ def pool() -> Path:
     root = Path(tempfile.mkdtemp(prefix="vkc_fuzz_files_"))
     atexit.register(shutil.rmtree, root, ignore_errors=True)
     for kind in ("robots", "scenes"):
-        shutil.copytree(find_resource_find_resource_folder(kind), root / kind)
+        shutil.copytree(find_resource_folder(kind), root / kind)
     for name in MESHES.values():
         if not name.endswith("dae"):
             trimesh.creation.box(extents=(0.5, 0.4, 0.3)).export(root / "scenes" / name)

@@ -119,7 +119,7 @@ def test_comparison_against_numbers_by_hand() -> None:
     )
     assert head == [
         "scene",
-        "evaluations",
+        "path length",
         "one: median (quartiles)",
         "two: median (quartiles)",
         "lower with one",

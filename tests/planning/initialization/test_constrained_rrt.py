@@ -124,5 +124,5 @@ def test_free_phases_and_colliding_starts_are_not_obstructed() -> None:
 
 def test_extensions_and_budget_end_the_search() -> None:
     assert find_path(0, tries=0) is None
-    with Budget(max_evaluations=50).running(), pytest.raises(BudgetExhaustedError):
+    with Budget(max_evaluations=50).activate(), pytest.raises(BudgetExhaustedError):
         find_path(0)

@@ -206,7 +206,7 @@ def test_searches_get_shorter_after_failures() -> None:
     end, paths, used = p.start.copy(), rrt_paths(p), list[int]()
     end[3:ROBOT] = 0.0, 1.2, 0.0, 0.0, 0.0, 0.0  # through the floor
     for phase in (0, 0, 0, 1):
-        with Budget().running() as budget:
+        with Budget().activate() as budget:
             assert paths.find_path(phase, p.start, end, 9, turns=False, reaches=True) is None
         used.append(budget.evaluations)
     assert used[1] < 0.8 * used[0]

@@ -99,7 +99,7 @@ def test_cached_results_are_not_computed_again(problem: vkc.TrajectoryProblem) -
     samplers = [make_sampler(problem, 3), *(make_sampler(problem, 3, cache) for _ in range(2))]
     results, used = [], []
     for sampler in samplers:
-        with Budget().running() as budget:
+        with Budget().activate() as budget:
             drawn = [sampler.sample(start, grasp, "scatter") for _ in range(2)]
             z = np.concatenate([z for z, _ in drawn])
             found = np.concatenate([found for _, found in drawn])
@@ -192,3 +192,29 @@ def test_weights_are_those_of_searches(problem: vkc.TrajectoryProblem) -> None:
     assert grasp
     assert "m" in {free.unit(name) for name in grasp}
     assert set(grasp.values()) == {1.0}
+
+
+def test_pushing_frees_many_configurations_and_leaves_free_ones() -> None:
+    """Most random configurations that touch the cube under the table collide."""
+    scene = vkc.load_scene("init_1").with_held({"stick": "grip"}).with_start(base=[1.2, 1.0, 1.0])
+    p = vkc.build(scene, [vkc.Touch("stick.tip", (-1.0, 3.897, 0.1))], options=SHORT)
+    sampler, waypoint = make_sampler(p), p.segments
+
+    def are_free(z: np.ndarray) -> np.ndarray:
+        is_reached = sampler.compute_residual(z, 0) < 1e-4
+        return np.asarray((compute_shortfall(p, z, waypoint) <= 0.0) & is_reached)
+
+    z, found = sampler.sample(np.tile(p.start, (96, 1)), waypoint, "scatter")
+    z = z[found]
+    given, pushed = z.copy(), sampler.push_clear(z, waypoint)
+    np.testing.assert_array_equal(z, given)
+    assert np.count_nonzero(are_free(pushed)) >= np.count_nonzero(are_free(z)) + 5
+    np.testing.assert_array_equal(pushed[are_free(z)], z[are_free(z)])
+    assert np.all((pushed >= p.lower[-1] - 1e-12) & (pushed <= p.upper[-1] + 1e-12))
+    again = sampler.push_clear(pushed, waypoint)
+    np.testing.assert_allclose(again[are_free(pushed)], pushed[are_free(pushed)], atol=1e-4)
+    assert np.abs(again - pushed)[~are_free(pushed)].max() > 1e-3
+    heavy = make_sampler(p)
+    heavy.weights[:3] *= 100.0  # for the base
+    moved = [np.abs(one.push_clear(z, waypoint) - z)[:, :3].sum() for one in (sampler, heavy)]
+    assert moved[1] < 0.5 * moved[0]

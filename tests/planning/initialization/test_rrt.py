@@ -198,16 +198,18 @@ def test_free_sections_of_the_guide_join_trees_as_a_whole() -> None:
     assert all(find_path(seed, tries=60) is not None for seed in range(3))
     rng, ends = np.random.default_rng(0), at(problem, GOAL)[None]
     sparse = guide[[0, -1]]
-    path = connect(problem, 0, problem.start, ends, poses=sparse, arms=arms, rng=rng, tries=60)
+    path = connect(
+        problem, 0, problem.start, ends, poses=sparse, arms=arms, rng=rng, max_extensions=60
+    )
     assert path is None
 
 
 def test_a_budget_ends_the_search() -> None:
-    with Budget().running() as budget:
+    with Budget().activate() as budget:
         find_path(0)
     assert budget.evaluations > 500
     with (
-        Budget(max_evaluations=budget.evaluations // 2).running(),
+        Budget(max_evaluations=budget.evaluations // 2).activate(),
         pytest.raises(BudgetExhaustedError),
     ):
         find_path(0)

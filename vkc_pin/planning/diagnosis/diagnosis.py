@@ -40,26 +40,23 @@ class BlockedGoal(NamedTuple):
 
 def find_impossible_conditions(problem: TrajectoryProblem) -> list[Violation]:
     """Find violations that no motion can change, at the start or of goals beyond limits."""
-    found = []
-    contacts, deepest = (
-        problem.contacts.evaluate(problem.start[None], np.array([0]), reach=0.0),
-        dict[str, float](),
-    )
+    start = problem.start[None]
+    contacts = problem.contacts.evaluate(start, np.array([0]), reach=0.0)
+    labels, deepest = problem.contacts.phases[0].labels, dict[str, float]()
     for (first, second), distance, margin in zip(
         contacts.pair, contacts.distance, contacts.margin, strict=True
     ):
         # Margins may be negative where the scene allows contact.
-        if distance >= (margin if margin > CONTACT_DEPTH else margin - CONTACT_DEPTH):
-            continue
-        labels = problem.contacts.phases[0].labels
-        subject = f"{labels[first]} – {labels[second]}"
-        deepest[subject] = min(float(distance), deepest.get(subject, np.inf))
+        if distance < (margin if margin > CONTACT_DEPTH else margin - CONTACT_DEPTH):
+            subject = f"{labels[first]} – {labels[second]}"
+            deepest[subject] = min(float(distance), deepest.get(subject, np.inf))
+    found = []
     for subject, distance in deepest.items():  # links of several shapes count once
         detail = f"overlap by {-1e3 * distance:.1f} mm at the start"
         found.append(Violation("start", subject, amount=-distance, unit="m", detail=detail))
     for goal, solver in zip(problem.pose_goals, problem.transcription.pose_solvers, strict=True):
         if goal.kind == "closure" and goal.object in problem.scene.held and 1 in goal.row.waypoints:
-            error = float(np.abs(solver.evaluate(problem.start[None], goal.target)[0]).max())
+            error = float(np.abs(solver.evaluate(start, goal.target)[0]).max())
             if error > Tolerances().closure_position:
                 detail = (
                     f"it is grasped at the start, but the hand is {error:.4f} m or rad "
@@ -69,61 +66,41 @@ def find_impossible_conditions(problem: TrajectoryProblem) -> list[Violation]:
                     Violation("closure", goal.about, amount=error, unit="m", detail=detail)
                 )
     dt = problem.timing_for(problem.still).dt
-    for phase, end in zip(problem.task.phases, problem.ends, strict=True):
-        waypoint, time = int(end), float(dt[:end].sum())
-        goals = dict(phase.values)
-        if phase.base is not None:
-            goals |= {
-                n: v
-                for n, v in zip(problem.chain.names[:2], phase.base[:2], strict=True)
-                if v is not None
-            }
+    for phase, end in zip(problem.task.phases, problem.ends.tolist(), strict=True):
+        goals, base = dict(phase.values), () if phase.base is None else phase.base[:2]
+        goals |= {n: v for n, v in zip(problem.chain.names, base, strict=False) if v is not None}
         for name, value in goals.items():
             lower, upper = problem.limits(name)
             beyond = max(lower - value, value - upper)
             if beyond > 1e-9:
                 detail = f"{value:g} is beyond the limits {lower:g} to {upper:g} by {beyond:.4g}"
-                found.append(
-                    Violation(
-                        "goal",
-                        name,
-                        waypoint=waypoint,
-                        time=time,
-                        amount=beyond,
-                        unit=problem.unit(name),
-                        detail=detail,
-                    )
-                )
+                at = {"waypoint": end, "time": float(dt[:end].sum())}
+                unit = problem.unit(name)
+                found.append(Violation("goal", name, **at, amount=beyond, unit=unit, detail=detail))
     return found
 
 
 def diagnose_goals(problem: TrajectoryProblem, random_seed: int) -> list[BlockedGoal]:
-    """Explain all goals without a known collision-free configuration.
-
-    Args:
-        problem: Problem that could not be solved.
-        random_seed: Random seed.
-    """
-    found = (
-        diagnose_goal(problem, number, random_seed) for number in range(len(problem.task.phases))
-    )
+    """Explain all goals of an unsolved problem without a known collision-free configuration."""
+    numbers = range(len(problem.task.phases))
+    found = (diagnose_goal(problem, number, random_seed) for number in numbers)
     return [goal for goal in found if goal is not None]
 
 
 def diagnose_goal(problem: TrajectoryProblem, number: int, random_seed: int) -> BlockedGoal | None:
     """Explain the goal of one phase; None if it has a collision-free configuration."""
     phase, end = problem.task.phases[number], int(problem.ends[number])
-    tried = _sample_goal(problem, end, np.random.default_rng(random_seed))
-    if tried is None:
+    samples = _sample_goal(problem, end, np.random.default_rng(random_seed))
+    if samples is None:
         return None
-    z, residual = tried
+    z, residual = samples
     if residual.min() > TOLERANCE:
-        nearest = int(np.argmin(residual))
+        least = float(residual.min())
         text = (
             f"{phase.name}: out of reach, none of {len(z)} configurations tried gets there; "
-            f"the nearest stays {residual[nearest]:.3f} m or rad short"
+            f"the nearest stays {least:.3f} m or rad short"
         )
-        return BlockedGoal(text, float(residual[nearest]))
+        return BlockedGoal(text, least)
     reached = z[residual < TOLERANCE]
     contacts = problem.contacts.evaluate(
         reached, np.full(len(reached), end), reach=problem.options.largest_margin
@@ -134,11 +111,12 @@ def diagnose_goal(problem: TrajectoryProblem, number: int, random_seed: int) -> 
     best = int(np.argmin(shortfall))
     worst = int(np.flatnonzero(contacts.waypoint == best)[0])
     labels = problem.contacts.phases[problem.contacts.find_phase(end)].labels
-    first, second = contacts.pair[worst]
+    first, second = (labels[shape] for shape in contacts.pair[worst])
+    distance = 1e3 * contacts.distance[worst]
+    gap = f"overlap by {-distance:.1f} mm" if distance < 0 else f"are only {distance:.1f} mm apart"
     text = (
         f"{phase.name}: all {len(reached)} configurations found there are blocked; "
-        "in the least blocked one "
-        f"{labels[first]} – {labels[second]} {_describe_gap(contacts.distance[worst])}"
+        f"in the least blocked one {first} – {second} {gap}"
     )
     return BlockedGoal(text, float(shortfall[best]))
 
@@ -147,23 +125,14 @@ def _sample_goal(
     problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator
 ) -> tuple[Floats, Floats] | None:
     """Sample goal configurations in up to `_MAX_BATCHES` batches, until one is collision-free."""
-    found: list[tuple[Floats, Floats]] = []
+    batches: list[tuple[Floats, Floats]] = []
     for _ in range(_MAX_BATCHES):
-        tried = sample_goal_configurations(problem, waypoint, rng)
-        if tried is None:
+        samples = sample_goal_configurations(problem, waypoint, rng)
+        if samples is None:
             return None
-        found.append(tried)
-        z = tried[0][tried[1] < TOLERANCE]
+        batches.append(samples)
+        z = samples[0][samples[1] < TOLERANCE]
         if len(z) and compute_shortfall(problem, z, waypoint).min() <= CLEARANCE_TOLERANCE:
             break
-    return np.concatenate([z for z, _ in found]), np.concatenate(
-        [residual for _, residual in found]
-    )
-
-
-def _describe_gap(distance: float) -> str:
-    return (
-        f"overlap by {-1e3 * distance:.1f} mm"
-        if distance < 0
-        else f"are only {1e3 * distance:.1f} mm apart"
-    )
+    z, residual = (np.concatenate(parts) for parts in zip(*batches, strict=True))
+    return z, residual

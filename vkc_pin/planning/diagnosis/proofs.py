@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from vkc_pin.planning.base_paths.blocked_cells import make_solids
 from vkc_pin.planning.base_paths.reachable_floor import (
@@ -35,34 +36,26 @@ _MAX_NAMES = 6  # obstacles named in a message
 _CLOSED_TOLERANCE = 0.05  # [rad], [m] up to which a joint counts as closed
 _BASE = 1  # the joint of the model that is the base
 
-
+# window of cells, and a mask of those that are blocked
 _Window = tuple[tuple[slice, slice], Bools]
-"""A window of cells, and a mask of those that are blocked."""
 
 
-@dataclass(frozen=True, eq=False)
-class _BaseGoal:
-    """Where a point of the base must be at the end of a phase.
+class _BaseGoal(NamedTuple):
+    """Where a point of the base must be at the end of a phase: a disc; NaN: anywhere."""
 
-    Attributes:
-        at: Centre, shape (2,) [m]; nan: any.
-        radius: Largest distance from it [m].
-    """
-
-    at: Floats
+    center: Floats
     radius: float
 
     def allows(self, cells: CellGrid, grown: float) -> Bools:
         """Return which cell centres are within the radius plus `grown` [m], shape (X, Y)."""
         x, y = (
             np.nan_to_num(centers - at)
-            for centers, at in zip(cells.centers(), self.at, strict=True)
+            for centers, at in zip(cells.centers(), self.center, strict=True)
         )
         return np.asarray(np.hypot(x, y) <= self.radius + grown)
 
 
-@dataclass(frozen=True, eq=False)
-class _PhaseFloor:
+class _PhaseFloor(NamedTuple):
     """A phase with the goals of the base and the walls that keep it away, numbered as `names`."""
 
     phase: Phase
@@ -72,13 +65,10 @@ class _PhaseFloor:
 
 
 def find_proofs(problem: TrajectoryProblem) -> list[str]:
-    """Explain why a task is certainly impossible.
+    """Explain why a task is certainly impossible; the result is empty if nothing is proven.
 
     Attached objects are no obstacles, nor are objects that the motion itself leaves at a place of
     its choice.
-
-    Returns:
-        Explanations; none if nothing is proven.
     """
     if problem.chain.robot.base == "fixed":
         return []
@@ -88,30 +78,22 @@ def find_proofs(problem: TrajectoryProblem) -> list[str]:
         if beyond:
             return [f"{phase.name}: out of reach, {PROVEN}{text}" for text in beyond]
         goals.append(found)
-    low, high = (
-        np.array(side)
-        for side in zip(*(problem.limits(name) for name in problem.chain.names[:2]), strict=True)
-    )
+    low, high = np.array([problem.limits(name) for name in problem.chain.names[:2]]).T
     x, y, yaw = problem.start[:3].tolist()
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
     for point in _find_tracked_points(problem):
-        offset = float(np.hypot(*point))
-        start = (
-            np.array([x, y])
-            + np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ point
-        )
+        offset, start = float(np.hypot(*point)), np.array([x, y]) + turn @ point
         parts = []
         for number, phase in enumerate(problem.task.phases):
-            own = [_BaseGoal(goal.at, goal.radius + offset) for goal in goals[number]]
+            own = [_BaseGoal(goal.center, goal.radius + offset) for goal in goals[number]]
             parts.append(_PhaseFloor(phase, own, *_collect_walls(problem, number, point)))
         begin, end = low - _TOLERANCE - offset, high + _TOLERANCE + offset
         step = max(_FINE_CELL, float(np.sqrt(np.prod(end - begin) / _MAX_CELLS)))
-        if not any(part.goals for part in parts) or _finds_path(
-            start, parts, CellGrid.over(begin, end, _COARSE_CELL)
-        ):
-            continue
-        explanation = _explain_missing_path(problem, start, parts, CellGrid.over(begin, end, step))
-        if explanation:
-            return explanation
+        coarse, fine = (CellGrid.over(begin, end, size) for size in (_COARSE_CELL, step))
+        if any(part.goals for part in parts) and not _has_path(start, parts, coarse):
+            explanation = _explain_missing_path(problem, start, parts, fine)
+            if explanation:
+                return [explanation]
     return []
 
 
@@ -132,29 +114,23 @@ def _find_base_goals(problem: TrajectoryProblem, number: int) -> tuple[list[_Bas
     phase, end = problem.task.phases[number], int(problem.ends[number])
     goals, beyond = [], []
     if phase.base is not None:
-        x, y = (np.nan if value is None else float(value) for value in phase.base[:2])
-        goals.append(_BaseGoal(np.array([x, y]), _TOLERANCE))
+        goals.append(_BaseGoal(np.array(phase.base[:2], float), _TOLERANCE))
     for goal in problem.pose_goals:
-        if end in goal.row.waypoints and goal.row.kind != "level" and goal.row.shift is None:
-            shoulder, length = _compute_arm_reach(
-                problem, goal.row.joint, goal.row.local.translation
+        if end not in goal.row.waypoints or goal.row.kind == "level" or goal.row.shift is not None:
+            continue
+        frame = goal.row.joint, goal.row.local.translation
+        shoulder, length = _compute_arm_reach(problem, *frame)
+        at = goal.target.translation
+        height = abs(at[2] - shoulder[2])
+        if height > length:
+            beyond.append(
+                f"{goal.about} at z = {at[2]:.2f} m is {height - length:.2f} m too high "
+                f"or low, wherever the base is: it turns about a joint at z = {shoulder[2]:.2f} m, "
+                f"and the whole arm with it is {length:.2f} m long"
             )
-            at = goal.target.translation
-            height = abs(at[2] - shoulder[2])
-            if height > length:
-                beyond.append(
-                    f"{goal.about} at z = {at[2]:.2f} m is {height - length:.2f} m too high "
-                    "or low, wherever the base is: "
-                    f"it turns about a joint at z = {shoulder[2]:.2f} m, "
-                    f"and the whole arm with it is {length:.2f} m long"
-                )
-            elif np.isfinite(length):
-                goals.append(
-                    _BaseGoal(
-                        at[:2].copy(),
-                        float(np.hypot(*shoulder[:2]) + np.sqrt(length**2 - height**2)),
-                    )
-                )
+        elif np.isfinite(length):
+            radius = float(np.hypot(*shoulder[:2]) + np.sqrt(length**2 - height**2))
+            goals.append(_BaseGoal(at[:2].copy(), radius))
     return goals, beyond
 
 
@@ -170,15 +146,8 @@ def _compute_arm_reach(
     length += sum(float(np.linalg.norm(model.jointPlacements[k].translation)) for k in along[1:])
     for column, owner, factor, offset, slides in chain.coordinates.moves:
         if owner in along and slides:
-            length += (
-                float(
-                    max(
-                        abs(factor * bound + offset)
-                        for bound in (chain.lower[column], chain.upper[column])
-                    )
-                )
-                + _TOLERANCE
-            )
+            bounds = np.array([chain.lower[column], chain.upper[column]])
+            length += float(np.abs(factor * bounds + offset).max()) + _TOLERANCE
     return np.asarray(model.jointPlacements[along[0]].translation), length
 
 
@@ -189,32 +158,24 @@ def _collect_walls(
     part = problem.contacts.phases[number]
     robot = part.shapes[: len(problem.chain.robot.collision.geometryObjects)]
     base = [i for i, shape in enumerate(robot) if shape.parentJoint == _BASE]
-    left = {i for own in part.released.values() for i in own}
-    eased = {
+    exempt = {i for own in part.released.values() for i in own} | {
         int(part.pairs[pair, 1]) for pair in part.reduced_margins if part.pairs[pair, 0] in base
     }
     hits = np.bincount(part.pairs[np.isin(part.pairs[:, 0], base), 1], minlength=len(part.shapes))
-    solid = [
+    fixed = [
         i
         for i, (shape, label) in enumerate(zip(part.shapes, part.labels, strict=True))
-        if shape.parentJoint == 0
-        and label != FLOOR
-        and hits[i] == len(base)
-        and i not in left | eased
+        if shape.parentJoint == 0 and label != FLOOR and hits[i] == len(base) and i not in exempt
     ]
-    below, shapes = (
-        [(part.shapes[i].geometry, part.shapes[i].placement) for i in which]
-        for which in (base, solid)
-    )
-    below = [
-        (shape, pin.SE3(np.eye(3), -np.array([*point, 0.0])) * where) for shape, where in below
-    ]
-    key = ("discs", *(solid.key for solid in make_solids(below)))
-    discs = problem.cache.get(key, lambda: InscribedDiscs(below))
-    return discs.make_walls(shapes), [part.labels[i] for i in solid]
+    shift = pin.SE3(np.eye(3), -np.array([*point, 0.0]))
+    own = [(part.shapes[i].geometry, shift * part.shapes[i].placement) for i in base]
+    key = ("discs", *(solid.key for solid in make_solids(own)))
+    discs = problem.cache.get(key, lambda: InscribedDiscs(own))
+    walls = discs.make_walls([(part.shapes[i].geometry, part.shapes[i].placement) for i in fixed])
+    return walls, [part.labels[i] for i in fixed]
 
 
-def _finds_path(start: Floats, parts: Sequence[_PhaseFloor], cells: CellGrid) -> bool:
+def _has_path(start: Floats, parts: Sequence[_PhaseFloor], cells: CellGrid) -> bool:
     """Return whether the disc certainly has a path from goal to goal, over entirely free cells."""
     half = cells.step * float(np.sqrt(0.5))
     here = np.zeros(cells.shape, bool)
@@ -231,90 +192,79 @@ def _finds_path(start: Floats, parts: Sequence[_PhaseFloor], cells: CellGrid) ->
         here = flood_fill(free, here & free, corners=False)
         for goal in part.goals:
             here &= goal.allows(cells, 0.0)
-        if not here.any():
-            return False
-    return True
+    return bool(here.any())
 
 
 def _explain_missing_path(
     problem: TrajectoryProblem, start: Floats, parts: Sequence[_PhaseFloor], cells: CellGrid
-) -> list[str]:
+) -> str:
     """Explain the first phase whose goals the base certainly cannot reach, if any."""
     half = cells.step * float(np.sqrt(0.5))
     here = np.zeros(cells.shape, bool)
     here[cells.at(start)] = True
     for part in parts:
-        taking: dict[int, list[_Window]] = {}
+        blocked: dict[int, list[_Window]] = {}
         for wall in part.walls:
             window, own = find_blocked_cells(cells, wall, -half)
             if own.any():
-                taking.setdefault(wall.number, []).append((window, own))
+                blocked.setdefault(wall.number, []).append((window, own))
         goal = np.ones(cells.shape, bool)
         for one in part.goals:
             goal &= one.allows(cells, half)
-        cut = _Separation(here, goal, taking)
-        here = cut.reached & goal
-        if not here.any():
-            if not goal.any():
-                return [
-                    f"{part.phase.name}: no place for the base, {PROVEN}"
-                    "the goal is in reach from outside the arena alone"
-                ]
-            names = [part.names[number] for number in cut.obstacles()]
-            return [f"{part.phase.name}: {cut.what}{_list_names(problem, part.phase, names)}"]
-    return []
-
-
-class _Separation:
-    """What separates the base from its goals.
-
-    Attributes:
-        reached: Cells that the base may reach.
-        what: Beginning of a sentence that explains the separation.
-    """
-
-    def __init__(self, here: Bools, goal: Bools, taking: dict[int, list[_Window]]) -> None:
-        self.here, self.goal, self.taking = here, goal, taking
-        self.count = np.zeros(here.shape, np.int16)
-        for window, own in itertools.chain.from_iterable(taking.values()):
-            self.count[window] += own
-        self.reached = flood_fill(self.count == 0, here, corners=True)
-        has_free_goal = (goal & (self.count == 0)).any()
-        self.what = (
+        count = np.zeros(cells.shape, np.int16)
+        _add_windows(count, itertools.chain.from_iterable(blocked.values()), 1)
+        reached = flood_fill(count == 0, here, corners=True)
+        if (reached & goal).any():
+            here = reached & goal
+            continue
+        if not goal.any():
+            return (
+                f"{part.phase.name}: no place for the base, {PROVEN}"
+                "the goal is in reach from outside the arena alone"
+            )
+        cause = (
             f"no path for the base, {PROVEN}"
             "at any heading, with the arm anywhere, it is cut off by "
-            if has_free_goal
+            if (goal & (count == 0)).any()
             else f"no place for the base, {PROVEN}"
             "wherever it would have to be, at any heading, it hits "
         )
+        numbers = _find_separating_obstacles(here, goal, reached, blocked, count)
+        names = [part.names[number] for number in numbers]
+        return f"{part.phase.name}: {cause}{_list_names(problem, part.phase, names)}"
+    return ""
 
-    def obstacles(self) -> list[int]:
-        """Return a minimal set of obstacles that separate the base from its goals."""
-        from scipy import ndimage
 
-        beside = (
-            ndimage.binary_dilation(self.reached, structure=np.ones((3, 3), bool)) & ~self.reached
-        )
-        seen = {
-            k
-            for k, windows in self.taking.items()
-            if any((own & beside[window]).any() for window, own in windows)
-        }
-        count, kept = self.count.copy(), set(self.taking)
-        for some in (
-            kept - seen,
-            *({number} for number in sorted(seen)),
-            *({number} for number in sorted(kept - seen)),
-        ):
-            some = some & kept
-            less = count.copy()
-            for window, own in itertools.chain.from_iterable(
-                self.taking[number] for number in some
-            ):
-                less[window] -= own
-            if some and not (flood_fill(less == 0, self.here, corners=True) & self.goal).any():
-                count, kept = less, kept - some
-        return sorted(kept)
+def _add_windows(count: NDArray[np.int16], windows: Iterable[_Window], sign: int) -> None:
+    for window, own in windows:
+        count[window] += sign * own
+
+
+def _find_separating_obstacles(
+    here: Bools,
+    goal: Bools,
+    reached: Bools,
+    blocked: dict[int, list[_Window]],
+    count: NDArray[np.int16],
+) -> list[int]:
+    """Return a minimal set of obstacles that separate the base from its goals."""
+    from scipy import ndimage
+
+    border = ndimage.binary_dilation(reached, structure=np.ones((3, 3), bool)) & ~reached
+    kept = set(blocked)
+    seen = {
+        number
+        for number, windows in blocked.items()
+        if any((own & border[window]).any() for window, own in windows)
+    }
+    order = [*sorted(seen), *sorted(kept - seen)]
+    for some in (kept - seen, *({number} for number in order)):
+        some = some & kept
+        less = count.copy()
+        _add_windows(less, itertools.chain.from_iterable(blocked[number] for number in some), -1)
+        if some and not (flood_fill(less == 0, here, corners=True) & goal).any():
+            count, kept = less, kept - some
+    return sorted(kept)
 
 
 def _list_names(problem: TrajectoryProblem, phase: Phase, names: Sequence[str]) -> str:
@@ -326,14 +276,11 @@ def _list_names(problem: TrajectoryProblem, phase: Phase, names: Sequence[str]) 
         placed = problem.scene.objects.get(name)
         if placed is None or placed.object.free or not len(placed.state):
             continue
-        joints = placed.object.coordinates.names
-        state = [
-            phase.initial_values.get(f"{name}.{joint}", float(value))
-            for joint, value in zip(joints, placed.state, strict=True)
-        ]
-        ajar = ", ".join(
-            f"at {joint} = {value:.2f}" for joint, value in zip(joints, state, strict=True)
-        )
-        closed = max(map(abs, state)) < _CLOSED_TOLERANCE
-        text += f"; {name} is {'closed' if closed else ajar} meanwhile"
+        state = {
+            joint: phase.initial_values.get(f"{name}.{joint}", float(value))
+            for joint, value in zip(placed.object.coordinates.names, placed.state, strict=True)
+        }
+        is_closed = max(map(abs, state.values())) < _CLOSED_TOLERANCE
+        values = ", ".join(f"at {joint} = {value:.2f}" for joint, value in state.items())
+        text += f"; {name} is {'closed' if is_closed else values} meanwhile"
     return text

@@ -19,12 +19,9 @@ _SAMPLES = 200  # joint values between start and goal
 
 
 def find_swept_collisions(problem: TrajectoryProblem) -> list[str]:
-    """Explain which object joints certainly cannot reach their goals.
+    """Explain which object joint certainly cannot reach its goal; empty if nothing is proven.
 
     A link that depends on a single joint passes all positions between start and goal on any motion.
-
-    Returns:
-        Explanations; none if nothing is proven.
     """
     for phase in problem.task.phases:
         for coordinate in phase.values:
@@ -40,46 +37,36 @@ def _find_collision(problem: TrajectoryProblem, phase: Phase, coordinate: str) -
     placed = scene.objects[name]
     if placed.object.free:
         return ""
-    begin, end = (
-        phase.initial_values[coordinate],
-        float(np.clip(phase.values[coordinate], *problem.limits(coordinate))),
-    )
+    begin = phase.initial_values[coordinate]
+    end = float(np.clip(phase.values[coordinate], *problem.limits(coordinate)))
     values = np.linspace(begin, end, _SAMPLES)
     fixed = {owner: one for owner, one in scene.objects.items() if not one.object.free}
-    standing, known = (
-        PlacedShapes(scene, fixed),
-        find_clearance_exemptions(scene, problem.options.dist_safe),
-    )
-    links = [
-        label
-        for label in (f"{name}.{link}" for link in placed.object.links)
-        if standing.find_joints(label) == [joint]
-    ]
-    others = {
-        f"{owner}.{link}"
+    shapes = PlacedShapes(scene, fixed)
+    exemptions = find_clearance_exemptions(scene, problem.options.dist_safe)
+    links = {
+        f"{owner}.{link}": shapes.find_joints(f"{owner}.{link}")
         for owner, one in fixed.items()
-        if owner != name
         for link in one.object.links
     }
-    others = {label for label in others if not standing.find_joints(label)} | set(
-        scene.obstacle_labels
-    ) - {FLOOR}
+    swept = [f"{name}.{link}" for link in placed.object.links if links[f"{name}.{link}"] == [joint]]
+    others = {
+        label for label, joints in links.items() if not joints and label.partition(".")[0] != name
+    }
+    others |= set(scene.obstacle_labels) - {FLOOR}
     deepest, text = -_CERTAIN_OVERLAP, ""
     index = placed.object.coordinates.index(joint)
-    for label in links:
-        for other in sorted(others & standing.find_links_near_sweep(label, index, values)):
-            own, hit = standing.find_shapes([label]), standing.find_shapes([other])
-            distances = standing.compute_distances(label, index, values, hit, 0.0)
-            for one in known:
+    for label in swept:
+        for other in sorted(others & shapes.find_links_near_sweep(label, index, values)):
+            own, hit = shapes.find_shapes([label]), shapes.find_shapes([other])
+            distances = shapes.compute_distances(label, index, values, hit, 0.0)
+            for one in exemptions:
                 if not one.is_between(label, other):
                     continue
-                holds, pairs = (
-                    one.is_active([coordinate], values[:, None]),
-                    set(one.find_shape_pairs(standing.labels, standing.keys)),
-                )
+                is_active = one.is_active([coordinate], values[:, None])
+                pairs = set(one.find_shape_pairs(shapes.labels, shapes.keys))
                 for k, j in itertools.product(range(len(own)), range(len(hit))):
                     if (min(own[k], hit[j]), max(own[k], hit[j])) in pairs:
-                        distances[holds, k, j] += max(0.0, -one.margin)
+                        distances[is_active, k, j] += max(0.0, -one.margin)
             distance = distances.min(axis=(1, 2))
             worst = int(np.argmin(distance))
             if distance[worst] < deepest:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence, Sized
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -36,8 +37,7 @@ class ApproachPaths:
     def __init__(self, sampler: KeyframeSampler, *, keeps_base_fixed: bool = False) -> None:
         self.sampler, self.problem, self.chain = sampler, sampler.problem, sampler.chain
         self.keeps_base_fixed = keeps_base_fixed or sampler.curves is not None
-        joint, local = self.chain.frame(self.chain.robot.tool_frame)
-        self.joint, self.local = joint, local
+        self.joint, self.local = joint, local = self.chain.frame(self.chain.robot.tool_frame)
         model, cache = self.chain.model, self.problem.cache
         key = ("tool", model.saveToString(), joint, local.homogeneous.tobytes())
         self.solver = cache.get(key, lambda: PoseSolver(model, PoseRow(joint, local, ()), cache))
@@ -48,23 +48,20 @@ class ApproachPaths:
 
     def find_retreat_end(self, z: Floats, phase: Phase, before: Phase | None) -> Floats:
         """Return the end of the retreat from z, shape (n,), the start of a phase: (K, n), K ≤ 1."""
-        return self._find_departure(
-            z, phase.released, phase.lifted, before.frames if before else ()
-        )
+        frames = before.frames if before else ()
+        return self._find_departure(z, phase.released, phase.lifted, frames)
 
     def _find_departure(
         self, z: Floats, holds: Sequence[Hold], lifted: Sized, frames: Sequence[FrameGoal]
     ) -> Floats:
         """Return the far end of the path from a grasp, a placed object or a touched point."""
         if holds:
-            return self._move_tool(z, -self._get_approach_direction(z, self.chain.holder(holds[0])))
+            return self._move_back(z, self.chain.holder(holds[0]))
         if lifted:
             return self._move_tool(z, _UP)
         for goal in frames:
             if goal.touches:
-                return self._move_tool(
-                    z, -self._get_approach_direction(z, self.chain.frame(goal.frame, goal.hold))
-                )
+                return self._move_back(z, self.chain.frame(goal.frame, goal.hold))
         return np.empty((0, len(z)))
 
     def find_release_retreat(self, z: Floats, phase: Phase) -> Floats:
@@ -74,41 +71,33 @@ class ApproachPaths:
         load.
         """
         if phase.released:
-            return self._move_tool(
-                z,
-                -self._get_approach_direction(z, self.chain.holder(phase.released[0])),
-                drives=False,
-            )
+            return self._move_back(z, self.chain.holder(phase.released[0]), drives=False)
         return self._move_tool(z, _UP, drives=False) if phase.held else np.empty((0, len(z)))
 
-    def _get_approach_direction(self, z: Floats, frame: tuple[int, pin.SE3]) -> Floats:
-        """Return the approach direction at z, (n,): the world z axis of a frame, shape (3,)."""
+    def _move_back(self, z: Floats, frame: tuple[int, pin.SE3], *, drives: bool = True) -> Floats:
+        """Move the tool against the approach direction, the z axis of a frame."""
         joint, local = frame
         rotations, _ = self.chain.joint_placements(z[None])
-        return np.asarray((rotations[0, joint] @ local.rotation)[:, 2])
+        direction = -np.asarray((rotations[0, joint] @ local.rotation)[:, 2])
+        return self._move_tool(z, direction, drives=drives)
 
     def _move_tool(self, z: Floats, direction: Floats, *, drives: bool = True) -> Floats:
         """Move the tool by `Options.approach` along `direction`, shape (3,): (K, n), K ≤ 1."""
         rotations, translations = self.chain.joint_placements(z[None])
-        carrier = pin.SE3(rotations[0, self.joint], translations[0, self.joint])
-        tool = carrier * self.local
-        target = pin.SE3(
-            tool.rotation, tool.translation + self.problem.options.approach * direction
-        )
+        tool = pin.SE3(rotations[0, self.joint], translations[0, self.joint]) * self.local
+        offset = self.problem.options.approach * direction
+        target = pin.SE3(tool.rotation, tool.translation + offset)
         lower, upper = z.copy(), z.copy()  # only the robot moves
         for column, name in enumerate(self.chain.names[: self.sampler.robot_size]):
             if drives or column > 2:
                 lower[column], upper[column] = self.problem.limits(name)
-        fixed = np.concatenate([z[:3], lower[3:]]), np.concatenate([z[:3], upper[3:]])
-        for low, high in (fixed, (lower, upper)) if self.keeps_base_fixed else ((lower, upper),):
-            near, ok = self.solver.solve(
-                z[None],
-                target,
-                lower=low,
-                upper=high,
-                weights=self.sampler.weights,
-                tolerance=TOLERANCE,
-            )
-            if ok[0]:
+        limits = [(lower, upper)]
+        if self.keeps_base_fixed:
+            fixed = np.concatenate([z[:3], lower[3:]]), np.concatenate([z[:3], upper[3:]])
+            limits.insert(0, fixed)
+        how: dict[str, Any] = {"weights": self.sampler.weights, "tolerance": TOLERANCE}
+        for low, high in limits:
+            near, is_reached = self.solver.solve(z[None], target, lower=low, upper=high, **how)
+            if is_reached[0]:
                 return near
         return np.empty((0, len(z)))

@@ -57,9 +57,6 @@ def find_constrained_path(
     Returns:
         Collision-free waypoints, shape (steps, n), which may end at another configuration; None if
         no path was found.
-
-    Raises:
-        BudgetExhaustedError: The planning budget is exhausted.
     """
     search = _Search(sampler, phase, steps)
     path = search.run(through, max_extensions)
@@ -74,13 +71,10 @@ class _Path(NamedTuple):
 
 
 class _Tree:
-    """Tree of configurations, each with its progress and its parent."""
-
     def __init__(self, z: Floats, at: Floats) -> None:
         self.z, self.at, self.parents = z, at, np.full(len(z), -1)
 
     def add(self, z: Floats, at: Floats, parents: Ints) -> Ints:
-        """Add nodes; return their indices."""
         self.z, self.at = np.concatenate([self.z, z]), np.concatenate([self.at, at])
         self.parents = np.concatenate([self.parents, parents])
         return np.arange(len(self.z) - len(z), len(self.z))
@@ -93,8 +87,6 @@ class _Tree:
 
 
 class _Search:
-    """Searches paths through one phase, from waypoint `begin` to `end`."""
-
     def __init__(self, sampler: KeyframeSampler, phase: int, steps: int) -> None:
         self.sampler, self.problem = sampler, sampler.problem
         self.end = int(self.problem.ends[phase])

@@ -109,7 +109,7 @@ class RrtPaths:
         return path
 
     def _get_extension_limit(self, phase: int) -> int:
-        """Return the maximum number of tree extensions, which is halved after every failure."""
+        """Return the maximum number of extensions, which is halved after every failure."""
         return max(1, MAX_EXTENSIONS // 2 ** self._failures[phase])
 
     def _count_failures(self, phase: int, path: Floats | None) -> None:

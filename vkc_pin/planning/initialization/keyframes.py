@@ -9,8 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.planning.base_paths.arcs import Curves, find_nearest_arc
-from vkc_pin.planning.chain.inverse_kinematics import PoseSolver
-from vkc_pin.planning.initialization.collision_recovery import resolve_collisions
+from vkc_pin.planning.chain.inverse_kinematics import MAX_STEP, PoseSolver
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Bools, Floats
@@ -28,6 +27,8 @@ __all__ = [
 
 SIMILARITY_TOLERANCE = 0.1  # [m], [rad] within which configurations are treated as the same
 SAMPLE_COUNT = 192  # random start configurations of inverse kinematics per keyframe
+_PUSHING_STEPS = 10  # maximum number of steps out of collision
+_DAMPING = 3e-4  # added to the diagonal of their normal equations
 _RowCache = dict[tuple[int, bytes], Floats]  # by waypoint and configuration
 
 
@@ -182,7 +183,7 @@ class KeyframeSampler:
         return self.problem.closed(self.problem.task.phases[phase])
 
     def push_clear(self, z: Floats, waypoint: int) -> Floats:
-        """Push configurations, shape (B, n), out of collision; see `resolve_collisions`."""
+        """Push configurations, shape (B, n), out of collision, which may fail."""
         pose = self.find_pose(waypoint)
         if pose is None:
             return z
@@ -191,11 +192,51 @@ class KeyframeSampler:
         )
 
     def _push_clear(self, z: Floats, waypoint: int, pose: int) -> Floats:
+        """Move configurations out of collision with a few damped Gauss-Newton steps.
+
+        Each step drives the residuals of the pose to zero and violated contacts to their margins,
+        both linearized: with the witness points fixed in their bodies, the gradient of a distance
+        d = n·(b − a) is n·(∂b − ∂a). It aims at `Options.dist_safe` beyond the margins, considers
+        the `Options.contact_slots` nearest contacts, and is limited to `MAX_STEP`.
+        """
+        problem, options = self.problem, self.problem.options
         lower, upper = self.compute_limits(z, waypoint)
         if self.curves is not None and self.is_closed_at(waypoint):
             lower[:, :3] = upper[:, :3] = z[:, :3]  # the base stays on its arc
-        how: dict[str, Any] = {"lower": lower, "upper": upper, "weights": self.weights}
-        z = resolve_collisions(self.problem, z, waypoint, *self.get_pose_solver(pose), **how)
+        solver, target = self.get_pose_solver(pose)
+        z, at, margin = z.copy(), np.arange(len(z)), options.dist_safe
+        free, slots = (upper - lower > 1e-9) / self.weights, options.contact_slots
+        for _ in range(_PUSHING_STEPS):
+            if not len(at):
+                break
+            contacts = problem.contacts.evaluate(
+                z[at],
+                np.full(len(at), waypoint),
+                reach=options.largest_margin + margin,
+                nearest=slots,
+            )
+            residual, pose_rows = solver.evaluate(z[at], target)
+            is_done = (contacts.compute_shortfall(len(at)) <= 0.0) & (
+                np.abs(residual).max(axis=1) < TOLERANCE
+            )
+            # Gradients of the nearest distances, and their required increase [m].
+            rows, growth = np.zeros((len(at), slots, z.shape[1])), np.zeros((len(at), slots))
+            gradients = problem.contacts.compute_gradients(z[at], contacts)
+            rows[contacts.waypoint, contacts.slot] = gradients
+            growth[contacts.waypoint, contacts.slot] = np.maximum(
+                contacts.margin + margin - contacts.distance, 0.0
+            )
+            jacobian = np.concatenate([pose_rows, rows], axis=1)
+            wanted = np.concatenate([-residual, growth], axis=1)
+            scaled = jacobian * free[at][:, None, :]
+            system = scaled @ jacobian.transpose(0, 2, 1) + _DAMPING * np.eye(jacobian.shape[1])
+            multipliers = np.linalg.solve(system, wanted[..., None])[..., 0]
+            step = np.einsum("bij,bi->bj", scaled, multipliers)
+            size = np.abs(step).max(axis=1, keepdims=True)
+            step *= np.minimum(1.0, MAX_STEP / np.maximum(size, 1e-12))
+            step[is_done] = 0.0
+            z[at] = np.clip(z[at] + step, lower[at], upper[at])
+            at = at[~is_done]
         return self.solve_pose(z, pose, lower, upper, iterations=3)[0]
 
     def compute_limits(self, before: Floats, waypoint: int) -> tuple[Floats, Floats]:

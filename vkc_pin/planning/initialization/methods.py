@@ -160,7 +160,7 @@ def _compute_merit(problem: TrajectoryProblem, z: Floats, waypoint: int) -> floa
 
 @dataclass(frozen=True, eq=False)
 class _Shared:
-    """Data that the searches of one problem share, among it base paths and sampled keyframes."""
+    """Data that the searches of one problem share."""
 
     problem: TrajectoryProblem
     random_seed: int

@@ -143,7 +143,6 @@ class _Search:
 
     @cached_property
     def _lines(self) -> Any:
-        """Collision checker of straight lines."""
         return self.problem.contacts.make_line_checker(
             self.first,
             self.waypoint,
@@ -155,7 +154,6 @@ class _Search:
 
     @cached_property
     def _trees(self) -> Any:
-        """Compiled trees and shortcuts."""
         sections = self._find_free_sections()
         rows = np.concatenate([np.empty((0, self.size)), *sections])
         parts = map(_as_rows, (self.weights, self.lower, self.upper, self.poses, self.arms, rows))
@@ -171,13 +169,11 @@ class _Search:
         return result
 
     def _compute_shortfall(self, rows: Floats) -> Floats:
-        """Return the shortfall of overlapping pairs for robot rows, (B, m), shape (B,) [m]."""
         z = np.tile(self.first, (len(rows), 1))
         z[:, : self.size] = rows
         return compute_shortfall(self.problem, z, self.waypoint, reach=0.0)
 
     def is_free(self, path: Floats) -> bool:
-        """Return whether a path, shape (K, m), is nearly collision-free."""
         return all(self._call(self._trees.along, ends) == 1.0 for ends in itertools.pairwise(path))
 
     def straighten(self, path: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""Ipopt stops when the budget is at its end."""
+"""Tests that Ipopt stops when the budget is exhausted."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ from vkc_pin.utils.budget import Budget
     [({"seconds": 0.0}, 0), ({"max_evaluations": 30}, 3), ({}, None)],
     ids=str,
 )
-def test_ipopt_stops(budget: dict[str, Any], iterations: int | None) -> None:
-    """Of ten units an iteration, the first of which is the beginning."""
+def test_ipopt_stops_when_the_budget_is_exhausted(
+    budget: dict[str, Any], iterations: int | None
+) -> None:
+    """Each iteration, and the start, costs ten evaluations."""
     x, p = ca.MX.sym("x", 2), ca.MX.sym("p")
     program = {
         "x": x,

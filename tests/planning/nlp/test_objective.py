@@ -18,11 +18,11 @@ SMOOTHING = 4.8
 MATRICES = make_differences(ENDS[-1], STOPS)
 
 
-def effort(*, length: bool = True, smoothing: float = SMOOTHING) -> MotionCost:
-    return MotionCost(METRIC, smoothing, ENDS, STOPS, length=length)
+def make_cost(*, length: bool = True) -> MotionCost:
+    return MotionCost(METRIC, SMOOTHING, ENDS, STOPS, length=length)
 
 
-def parts(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def rates(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return steps and their changes of z_0..z_N."""
     first, second, start_first, start_second = MATRICES
     return first @ path[1:] + np.outer(start_first, path[0]), second @ path[1:] + np.outer(
@@ -31,7 +31,7 @@ def parts(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def quadratic(weights: tuple[np.ndarray, np.ndarray], path: np.ndarray) -> float:
-    return float(sum(np.sum(w * part**2) for w, part in zip(weights, parts(path), strict=True)))
+    return float(sum(np.sum(w * part**2) for w, part in zip(weights, rates(path), strict=True)))
 
 
 def random_path(seed: int, scale: float = 1.0) -> np.ndarray:
@@ -41,7 +41,7 @@ def random_path(seed: int, scale: float = 1.0) -> np.ndarray:
     )
 
 
-def by_hand(path: np.ndarray) -> float:
+def path_length(path: np.ndarray) -> float:
     """Return the path length, phase by phase, from its definition."""
     changes, at = [], []
     for begin, end in itertools.pairwise([0, *STOPS, ENDS[-1]]):
@@ -68,9 +68,9 @@ def test_squares_are_equation_1(seed: int) -> None:
         step = np.diff(path[begin : end + 1], axis=0)
         bend = np.diff(np.vstack([0 * step[:1], step, 0 * step[:1]]), axis=0)
         total += np.sum(METRIC * step**2) + SMOOTHING * np.sum(METRIC * bend**2)
-    squares = effort(length=False)
-    assert squares.value(*parts(path)) == pytest.approx(total, rel=1e-12)
-    assert quadratic(squares.weights(*parts(random_path(9))), path) == pytest.approx(
+    squares = make_cost(length=False)
+    assert squares.value(*rates(path)) == pytest.approx(total, rel=1e-12)
+    assert quadratic(squares.weights(*rates(random_path(9))), path) == pytest.approx(
         total, rel=1e-12
     )
 
@@ -78,14 +78,14 @@ def test_squares_are_equation_1(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_path_length_equals_its_definition(seed: int) -> None:
     path = random_path(seed)
-    assert effort().value(*parts(path)) == pytest.approx(by_hand(path), rel=1e-12)
+    assert make_cost().value(*rates(path)) == pytest.approx(path_length(path), rel=1e-12)
 
 
 def test_stationary_motion_costs_nothing() -> None:
     still = np.tile(random_path(0)[0], (ENDS[-1] + 1, 1))
     for length in (False, True):
-        assert effort(length=length).value(*parts(still)) == 0.0
-    assert np.isfinite(effort().weights(*parts(still))[0]).all()
+        assert make_cost(length=length).value(*rates(still)) == 0.0
+    assert np.isfinite(make_cost().weights(*rates(still))[0]).all()
 
 
 def test_motion_at_constant_speed_costs_its_length() -> None:
@@ -96,11 +96,8 @@ def test_motion_at_constant_speed_costs_its_length() -> None:
             np.interp(np.arange(41), [0, ends[0], 40], [0.0, 1.0, 4.0]), [0.6, 0.8]
         )
         path[:, 3] = np.interp(np.arange(41), [0, ends[0], 40], [0.0, 1.5, 2.0])
-        first, second, start_first, start_second = make_differences(40, ())
-        given = (
-            first @ path[1:] + np.outer(start_first, path[0]),
-            second @ path[1:] + np.outer(start_second, path[0]),
-        )
+        matrices = make_differences(40, ())
+        given = [matrices[k] @ path[1:] + np.outer(matrices[k + 2], path[0]) for k in (0, 1)]
         assert MotionCost(METRIC, 0.0, np.array(ends), (), length=True).value(
             *given
         ) == pytest.approx(4.0 + 0.1 * 2.0, abs=0.07)
@@ -110,19 +107,19 @@ def test_motion_at_constant_speed_costs_its_length() -> None:
 def test_quadratic_model_bounds_the_length_from_above(
     one: int, other: int, here: float, there: float
 ) -> None:
-    f, at, away = effort(), random_path(one, here), random_path(other, there)
-    weights = f.weights(*parts(at))
+    f, at, away = make_cost(), random_path(one, here), random_path(other, there)
+    weights = f.weights(*rates(at))
     rise = quadratic(weights, away) - quadratic(weights, at)
-    assert rise >= f.value(*parts(away)) - f.value(*parts(at)) - 1e-9
+    assert rise >= f.value(*rates(away)) - f.value(*rates(at)) - 1e-9
     direction, step = away - at, 1e-6
     slopes = [
         (of(at + step * direction) - of(at - step * direction)) / (2 * step)
-        for of in (lambda path: f.value(*parts(path)), lambda path: quadratic(weights, path))
+        for of in (lambda path: f.value(*rates(path)), lambda path: quadratic(weights, path))
     ]
     assert slopes[0] == pytest.approx(slopes[1], rel=1e-4, abs=1e-5)
 
 
 @given(st.integers(0, 10**6), st.integers(0, 10**6), st.booleans())
-def test_it_is_convex(one: int, other: int, length: bool) -> None:
-    f, a, b = effort(length=length), random_path(one), random_path(other)
-    assert f.value(*parts((a + b) / 2)) <= (f.value(*parts(a)) + f.value(*parts(b))) / 2 + 1e-12
+def test_cost_is_convex(one: int, other: int, length: bool) -> None:
+    f, a, b = make_cost(length=length), random_path(one), random_path(other)
+    assert f.value(*rates((a + b) / 2)) <= (f.value(*rates(a)) + f.value(*rates(b))) / 2 + 1e-12

@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from vkc_pin.planning.nlp.timing import Timing, compute_step_times, split_at_stops
 
 
-def test_runs_lie_between_rests() -> None:
+def test_runs_are_between_rests() -> None:
     assert list(split_at_stops([], 7)) == [(0, 7)]
     assert list(split_at_stops([2, 5], 7)) == [(0, 2), (2, 5), (5, 7)]
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 1.0, 30.0]))
-def test_the_profile_fits_into_the_time(seed: int, size: float) -> None:
+def test_profile_keeps_the_limits_in_the_time(seed: int, size: float) -> None:
     """A motion along 3s² − 2s³ in each run keeps both limits, by finite differences."""
     rng = np.random.default_rng(seed)
     rests = sorted(rng.choice(np.arange(1, 12), 2, replace=False).tolist())
@@ -31,17 +31,17 @@ def test_the_profile_fits_into_the_time(seed: int, size: float) -> None:
     profile = fine**2 * (3.0 - 2.0 * fine)
     for first, last in runs:
         assert np.ptp(times[first:last]) == 0.0
-        way, duration = (
+        distance, duration = (
             np.abs(np.diff(path[first : last + 1], axis=0)).sum(axis=0),
             times[first:last].sum(),
         )
         step = duration / 400
         speed, strength = (
-            np.abs(np.diff(profile, order)).max() / step**order * way for order in (1, 2)
+            np.abs(np.diff(profile, order)).max() / step**order * distance for order in (1, 2)
         )
         assert (speed <= limits[0]).all()
         assert (strength <= limits[1]).all()
-        if times[first] > 0.1:  # and it is not given more than it needs, but for what may be spared
+        if times[first] > 0.1:  # no longer than needed, apart from the margin
             assert (
                 max((1.15 * speed / limits[0]).max(), (1.15**2 * strength / limits[1]).max()) > 0.98
             )
@@ -56,7 +56,7 @@ def differences(path: np.ndarray, runs: list[tuple[int, int]]) -> tuple[np.ndarr
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0.2, 1.8))
-def test_stretching_gives_what_is_needed_and_no_more_than_allowed(seed: int, size: float) -> None:
+def test_runs_are_stretched_as_needed_up_to_a_limit(seed: int, size: float) -> None:
     rng, runs = np.random.default_rng(seed), [(0, 5), (5, 6), (6, 12)]
     limits, dt = (np.full(3, 1.0), np.full(3, 4.0)), np.repeat([0.5, 1.0, 0.8], [5, 1, 6])
     timing = Timing(dt, dt, runs, limits)
@@ -85,7 +85,7 @@ def test_stretching_gives_what_is_needed_and_no_more_than_allowed(seed: int, siz
     np.testing.assert_array_equal(timing.dt, dt)
 
 
-def test_a_motion_that_is_slow_enough_keeps_its_time() -> None:
+def test_slow_motions_keep_their_time() -> None:
     runs = list(itertools.pairwise([0, 4]))
     timing = Timing(np.full(4, 0.5), np.full(4, 0.5), runs, (np.ones(2), np.full(2, 4.0)))
     first, second = differences(np.linspace(0.0, 0.1, 5)[:, None] * np.ones(2), runs)

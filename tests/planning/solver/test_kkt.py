@@ -19,19 +19,19 @@ OWN = make_linear_solver_options()
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
 
 
-def lower(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def lower_triangle(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return rows, columns and values of a lower triangle, with all of its diagonal."""
     rows, columns = np.nonzero((np.tril(matrix) != 0.0) | np.eye(len(matrix), dtype=bool))
     return rows.astype(np.int32), columns.astype(np.int32), matrix[rows, columns]
 
 
-def factored(matrix: np.ndarray) -> tuple[Any, bool]:
-    rows, columns, values = lower(matrix)
+def factorize(matrix: np.ndarray) -> tuple[Any, bool]:
+    rows, columns, values = lower_triangle(matrix)
     factorization = KKT.Factorization(len(matrix), rows, columns)
     return factorization, factorization.factor(values)
 
 
-def system(seed: int, waypoints: int, size: int, equalities: int, planes: int) -> np.ndarray:
+def make_system(seed: int, waypoints: int, size: int, equalities: int, planes: int) -> np.ndarray:
     """Return a trajectory-like system: coupled blocks, their constraints, and some slacks."""
     rng = np.random.default_rng(seed)
     n, m = waypoints * size, waypoints * (equalities + planes)
@@ -72,8 +72,8 @@ def system(seed: int, waypoints: int, size: int, equalities: int, planes: int) -
 def test_trajectory_systems_are_solved_with_correct_inertia(
     seed: int, waypoints: int, size: int, equalities: int, planes: int
 ) -> None:
-    matrix = system(seed, waypoints, size, min(equalities, size), planes)
-    factorization, done = factored(matrix)
+    matrix = make_system(seed, waypoints, size, min(equalities, size), planes)
+    factorization, done = factorize(matrix)
     assert done
     assert factorization.negative == np.count_nonzero(np.linalg.eigvalsh(matrix) < 0.0)
     wanted = np.random.default_rng(seed).normal(size=len(matrix))
@@ -91,7 +91,7 @@ def test_any_matrix_is_solved_or_reported_singular(seed: int, size: int, density
     rng = np.random.default_rng(seed)
     matrix = np.where(rng.uniform(size=(size, size)) < density, rng.normal(size=(size, size)), 0.0)
     matrix += matrix.T
-    factorization, done = factored(matrix)
+    factorization, done = factorize(matrix)
     # a pivot is zero, as it is in every singular matrix and, since pivots are taken as they come,
     # in some others
     if not done:
@@ -103,13 +103,13 @@ def test_any_matrix_is_solved_or_reported_singular(seed: int, size: int, density
 
 
 def test_refactoring_does_not_depend_on_earlier_values() -> None:
-    first, second = system(1, 4, 5, 2, 2), system(1, 4, 5, 2, 2)
+    first, second = make_system(1, 4, 5, 2, 2), make_system(1, 4, 5, 2, 2)
     second[np.diag_indices(20)] += 3.0
-    rows, columns, _ = lower(first)
+    rows, columns, _ = lower_triangle(first)
     again, anew = (KKT.Factorization(len(first), rows, columns) for _ in range(2))
-    assert again.factor(lower(first)[2])
-    assert again.factor(lower(second)[2])
-    assert anew.factor(lower(second)[2])
+    assert again.factor(lower_triangle(first)[2])
+    assert again.factor(lower_triangle(second)[2])
+    assert anew.factor(lower_triangle(second)[2])
     b = np.arange(len(first), dtype=float)
     x, y = b.copy(), b.copy()
     again.solve(x)
@@ -118,10 +118,10 @@ def test_refactoring_does_not_depend_on_earlier_values() -> None:
 
 
 def test_dependent_rows_are_singular_and_the_next_system_is_solved() -> None:
-    matrix = system(2, 3, 4, 2, 0)
+    matrix = make_system(2, 3, 4, 2, 0)
     doubled = matrix.copy()
     doubled[-1], doubled[:, -1] = doubled[-2], doubled[:, -2]
-    rows, columns, values = lower(matrix)
+    rows, columns, values = lower_triangle(matrix)
     factorization = KKT.Factorization(len(matrix), rows, columns)
     assert not factorization.factor(doubled[rows, columns])
     with pytest.raises(ValueError, match="once it is factored"):
@@ -139,14 +139,14 @@ def test_pivots_of_rounding_size_are_singular(size: int) -> None:
         size=(size, size - 1)
     )  # no other pivot is small
     gram = root @ root.T
-    assert not factored(gram)[1]
-    assert factored(gram + 1e-6 * np.eye(size))[1]
+    assert not factorize(gram)[1]
+    assert factorize(gram + 1e-6 * np.eye(size))[1]
 
 
 def test_dual_rows_may_come_first() -> None:
     """Their numbering makes no difference: they follow the rows that they couple."""
-    matrix = system(5, 4, 5, 2, 3)[::-1, ::-1]
-    factorization, done = factored(matrix)
+    matrix = make_system(5, 4, 5, 2, 3)[::-1, ::-1]
+    factorization, done = factorize(matrix)
     assert done
     assert factorization.negative == np.count_nonzero(np.linalg.eigvalsh(matrix) < 0.0)
     x = matrix @ np.ones(len(matrix))
@@ -155,15 +155,15 @@ def test_dual_rows_may_come_first() -> None:
 
 
 def test_nan_is_no_pivot() -> None:
-    matrix = system(3, 2, 3, 1, 0)
-    rows, columns, values = lower(matrix)
+    matrix = make_system(3, 2, 3, 1, 0)
+    rows, columns, values = lower_triangle(matrix)
     values[0] = np.nan
     assert not KKT.Factorization(len(matrix), rows, columns).factor(values)
 
 
 def test_duplicate_and_upper_entries_are_summed() -> None:
-    matrix = system(4, 3, 4, 1, 2)[::-1, ::-1]  # dual rows first
-    rows, columns, values = lower(matrix)
+    matrix = make_system(4, 3, 4, 1, 2)[::-1, ::-1]  # dual rows first
+    rows, columns, values = lower_triangle(matrix)
     flipped = np.arange(len(rows)) % 2 == 0
     places = np.where(flipped, columns, rows), np.where(flipped, rows, columns)
     twice = [np.concatenate([part, part]) for part in places]
@@ -208,14 +208,14 @@ def test_ipopt_is_deterministic_and_thread_safe() -> None:
     program = {"x": x, "f": f, "g": x[:-1] * x[1:]}
     warm = {"ipopt.warm_start_init_point": "yes", "ipopt.mu_init": 1e-3}
 
-    def solved(_: int) -> bytes:
+    def solve(_: int) -> bytes:
         solver = ca.nlpsol("solver", "ipopt", program, {**QUIET, **OWN, **warm})
         result = solver(x0=np.linspace(-1.0, 1.0, 40), lbg=-0.5, ubg=0.5, lbx=-2.0, ubx=2.0)
         return bytes(np.ravel(result["x"]).tobytes())
 
-    alone = solved(0)
+    alone = solve(0)
     with ThreadPoolExecutor(4) as threads:
-        assert set(threads.map(solved, range(16))) == {alone}
+        assert set(threads.map(solve, range(16))) == {alone}
 
 
 @pytest.mark.parametrize(

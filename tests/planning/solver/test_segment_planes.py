@@ -1,6 +1,8 @@
+"""Tests of the contacts that represent collisions between waypoints."""
+
 from __future__ import annotations
 
-import dataclasses
+from functools import cache
 
 import numpy as np
 import pytest
@@ -8,11 +10,13 @@ from helpers.drives import hall, moved, through
 from helpers.small_problems import program_of
 
 import vkc_pin as vkc
+from vkc_pin.planning.chain.contacts import Contacts
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.solver.loop import solve
 from vkc_pin.planning.solver.segment_planes import (
+    CLEARANCE_TOLERANCE,
     REFINEMENT_RANGE,
     SEGMENT_MARGIN,
-    SegmentContacts,
     find_segment_contacts,
     merge_contacts,
 )
@@ -22,89 +26,58 @@ WIDTH = 2.0  # [m] the base drives sideways
 FEW = vkc.Options(reach_waypoints=5, dt=1.0)
 
 
-def past_a_post(reach: float = 0.02) -> vkc.Scene:
-    """Return a hall in which the hand, moving sideways, passes through a post."""
+def box(x: float, y: float, size: list[float]) -> dict[str, object]:
+    return {"name": "box", "type": "box", "size": size, "position": [x, y, size[2] / 2]}
+
+
+def problem_of(scene: vkc.Scene, **goal: float) -> tuple[TrajectoryProblem, np.ndarray]:
+    """Return a problem with few waypoints and the straight path, shape (N, n)."""
+    end = moved(scene.start, **goal)
+    problem = program_of(scene, [vkc.GoTo(*end[:3])], options=FEW)
+    return problem, through(scene, scene.start, end, steps=FEW.reach_waypoints).positions[1:]
+
+
+@cache
+def past_a_post() -> tuple[TrajectoryProblem, np.ndarray]:
+    """The hand, moving sideways, passes through a post between the second and third waypoint."""
     tool = hall().with_start(arm=ARM).tool_placement().translation
-    x, y = float(tool[0]) + reach, float(tool[1]) + WIDTH / 2
-    post = {
-        "name": "post",
-        "type": "cylinder",
-        "radius": 0.03,
-        "length": 1.6,
-        "position": [x, y, 0.8],
-    }
-    return hall(obstacles=[post]).with_start(arm=ARM)
+    post = {"name": "post", "type": "cylinder", "radius": 0.03, "length": 1.6}
+    post["position"] = [float(tool[0]) + 0.02, float(tool[1]) + WIDTH / 2, 0.8]
+    return problem_of(hall(obstacles=[post]).with_start(arm=ARM), y=WIDTH)
 
 
-def straight(scene: vkc.Scene) -> tuple[TrajectoryProblem, np.ndarray]:
-    """Return a problem with few waypoints and the straight sideways path, shape (N, n)."""
-    problem = program_of(scene, [vkc.GoTo(0.0, WIDTH, 0.0)], options=FEW)
-    return problem, through(
-        scene, scene.start, moved(scene.start, y=WIDTH), steps=FEW.reach_waypoints
-    ).positions[1:]
-
-
-def sub_states(problem: TrajectoryProblem, z: np.ndarray, segment: int, count: int) -> np.ndarray:
-    """Return states of one segment including its ends, shape (count, n)."""
+def sample_segment(
+    problem: TrajectoryProblem, z: np.ndarray, segment: int, count: int = 400
+) -> Contacts:
+    """Return the contacts at evenly spaced states of a segment, including its ends."""
     path, s = problem.waypoints(z), np.linspace(0.0, 1.0, count)[:, None]
-    return (1 - s) * path[segment] + s * path[segment + 1]
+    states = (1 - s) * path[segment] + s * path[segment + 1]
+    reach = SEGMENT_MARGIN + REFINEMENT_RANGE
+    return problem.contacts.evaluate(states, np.full(count, segment + 1), reach=reach)
 
 
-def test_thin_obstacle_between_waypoints_is_avoided(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene, steps = past_a_post(), [vkc.GoTo(0.0, WIDTH, 0.0)]
-    plan = vkc.plan(scene, steps, options=FEW)
-    assert plan.success, plan.summary()
-    assert (
-        plan.trajectory.arm_path_length() + plan.trajectory.base_path_length() > WIDTH + 0.005
-    )  # it went round the post
-
-    problem, _ = straight(scene)
-    nothing, free, passed = find_segment_contacts(
-        problem, np.tile(problem.start, (problem.segments, 1))
-    )
-    assert free
-    assert passed == []
-    assert nothing.compute_violation() == 0.0
-    nothing = nothing.select(np.zeros(0, int))
-    monkeypatch.setattr(
-        "vkc_pin.planning.solver.loop.find_segment_contacts",
-        lambda problem, z: SegmentContacts(nothing, True, []),
-    )
-    blind = vkc.plan(scene, steps, options=FEW, initialization="interpolated")
-    assert not blind.success
-    assert blind.status == "rejected"  # the solver was content, validation was not
-    assert {(v.constraint, "post" in v.subject) for v in blind.report.violations} == {
-        ("penetration", True)
-    }
-    segment = int(blind.report.violations[0].waypoint)
-    ends = problem.contacts.evaluate(
-        blind.trajectory.positions[segment : segment + 2], np.array([1, 1]), reach=0.02
-    )
-    assert len(ends.waypoint) == 0  # free at both waypoints
-
-
-def test_planes_are_placed_at_both_ends_of_the_segment() -> None:
-    problem, z = straight(past_a_post())
+def test_thin_obstacle_between_waypoints_is_avoided() -> None:
+    problem, z = past_a_post()
     assert problem.evaluate_contacts(z, reach=0.02).compute_clearance() == np.inf
-    found = find_segment_contacts(problem, z).contacts
+    assert not find_segment_contacts(problem, z).is_free
+    solution = solve(problem, z)
+    assert solution.converged
+    for segment in range(problem.segments):
+        contacts = sample_segment(problem, solution.z, segment)
+        assert not len(contacts.distance) or contacts.distance.min() > 0.0
+
+
+def test_deepest_samples_become_planes_at_both_ends() -> None:
+    """For each pair, both planes miss the clearance that the segment lacks."""
+    problem, z = past_a_post()
+    found, dense = find_segment_contacts(problem, z).contacts, sample_segment(problem, z, 2)
     labels = problem.contacts.phases[0].labels
     assert {labels[j] for j in found.pair[:, 1]} == {"post"}
-    assert all(labels[i].startswith("gripper") for i in found.pair[:, 0])
-    assert set(found.waypoint) == {1, 2}  # rows of z_2 and z_3, the segment in the middle
-    keys = np.column_stack([found.waypoint, found.pair])
-    assert len(np.unique(keys, axis=0)) == len(keys)  # one contact a pair and end
+    assert set(found.waypoint) == {1, 2}  # rows of z_2 and z_3
     np.testing.assert_allclose(np.linalg.norm(found.normal, axis=1), 1.0, atol=1e-9)
-
-
-def test_required_lift_equals_the_missing_clearance() -> None:
-    problem, z = straight(past_a_post())
-    found = find_segment_contacts(problem, z).contacts
-    states = sub_states(problem, z, 2, 400)
-    dense = problem.contacts.evaluate(
-        states, np.full(len(states), 3), reach=SEGMENT_MARGIN + REFINEMENT_RANGE
-    )
     pairs = np.unique(found.pair, axis=0)
     assert len(pairs) > 1
+    assert len(found.pair) == 2 * len(pairs)
     for pair in pairs:
         deepest = dense.distance[(dense.pair == pair).all(axis=1)].min()
         missing = (found.margin - found.distance)[(found.pair == pair).all(axis=1)]
@@ -113,65 +86,73 @@ def test_required_lift_equals_the_missing_clearance() -> None:
 
 def test_lifting_both_ends_lifts_the_segment_to_first_order() -> None:
     """Moving both waypoints by ε along the normal moves the sample's distance by ε + O(ε²)."""
-    problem, z = straight(past_a_post())
+    problem, z = past_a_post()
     found = find_segment_contacts(problem, z).contacts
     index = int(np.argmax(found.margin - found.distance))
     pair, normal = found.pair[index], found.normal[index]
 
     def depth(lift: float) -> float:
         lifted = z.copy()
-        lifted[1:3, :2] -= (
-            lift * normal[:2]
-        )  # the robot is the first of the pair, the normal points from it
-        states = sub_states(problem, lifted, 2, 2000)
-        contacts = problem.contacts.evaluate(states, np.full(len(states), 3), reach=0.1)
+        lifted[1:3, :2] -= lift * normal[:2]  # the normal points away from the robot
+        contacts = sample_segment(problem, lifted, 2, 2000)
         return float(contacts.distance[(contacts.pair == pair).all(axis=1)].min())
 
-    value = (
-        found.margin[index] - SEGMENT_MARGIN
-    )  # n·(b − a) there, lifted by what is missing: v + SEGMENT_MARGIN − d
+    value = found.margin[index] - SEGMENT_MARGIN
     assert value == pytest.approx(found.distance[index] - depth(0.0), abs=1e-3)
+    horizontal = float(normal[:2] @ normal[:2])
     for lift in (1e-3, 4e-3):
-        horizontal = float(normal[:2] @ normal[:2])
-        assert depth(lift) - depth(0.0) == pytest.approx(lift * horizontal, rel=0.15, abs=2e-4)
+        rise = depth(lift) - depth(0.0)
+        assert rise == pytest.approx(lift * horizontal, rel=0.15, abs=2e-4)
+
+
+def test_witness_points_are_fixed_in_their_bodies() -> None:
+    problem, z = problem_of(hall(obstacles=[box(0.0, 1.0, [0.04, 0.04, 1.6])]), y=WIDTH)
+    found = find_segment_contacts(problem, z).contacts
+    along = np.einsum("ci,ci->c", found.normal, found.second - found.first)
+    np.testing.assert_allclose(found.distance, along, atol=1e-12)
+    labels = problem.contacts.phases[0].labels
+    on_base = np.array([labels[i] == "base_link" for i in found.pair[:, 0]])
+    ends = [np.flatnonzero(on_base & (found.waypoint == row))[0] for row in (1, 2)]
+    np.testing.assert_allclose(np.diff(found.second[ends], axis=0), 0.0, atol=1e-12)
+    step = z[2, :2] - z[1, :2]
+    np.testing.assert_allclose(np.diff(found.first[ends], axis=0)[0], [*step, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize(("gap", "is_free"), [(0.9, False), (1.1, True)])
+def test_segments_need_some_clearance(gap: float, is_free: bool) -> None:
+    """The base passes a wall at `gap` times the tolerance."""
+    scene = hall(obstacles=[box(1.0, 1.0, [4.0, 0.1, 0.5])])
+    problem, _ = problem_of(scene, x=2.0)
+    y = scene.start_clearance() - gap * CLEARANCE_TOLERANCE
+    z = np.array([moved(scene.start, x=x, y=y) for x in (0.5, 1.0, 1.5, 2.0, 2.5)])
+    found = find_segment_contacts(problem, z)
+    assert found.is_free == is_free
+    assert found.contacts.compute_violation() > 0.0
 
 
 def test_start_close_to_an_obstacle_can_be_left() -> None:
-    wall = {"name": "wall", "type": "box", "size": [0.1, 2.0, 0.5], "position": [0.546, 0.0, 0.25]}
-    scene = hall(obstacles=[wall])
+    scene = hall(obstacles=[box(0.546, 0.0, [0.1, 2.0, 0.5])])
     assert 0.0 < scene.start_clearance() < SEGMENT_MARGIN
-    problem = program_of(scene, [vkc.GoTo(-1.0, 0.0, 0.0)], options=FEW)
-    away = through(
-        scene, scene.start, moved(scene.start, x=-1.0), steps=FEW.reach_waypoints
-    ).positions[1:]
-    assert len(find_segment_contacts(problem, away).contacts.waypoint) == 0
-    into = through(
-        scene, scene.start, moved(scene.start, x=1.0), steps=FEW.reach_waypoints
-    ).positions[1:]
-    assert 0 in find_segment_contacts(problem, into).contacts.waypoint
+    for x, is_in_collision in ((-1.0, False), (1.0, True)):
+        found = find_segment_contacts(*problem_of(scene, x=x))
+        assert (0 in found.contacts.waypoint) == is_in_collision
+        assert found.is_free != is_in_collision
 
 
-def test_merged_contacts_are_sorted() -> None:
-    problem, z = straight(past_a_post())
-    found = find_segment_contacts(problem, z).contacts
-    near = problem.evaluate_contacts(z, reach=0.3)
-    both = merge_contacts(near, found)
-    assert len(both.waypoint) == len(near.waypoint) + len(found.waypoint)
-    assert np.all(np.diff(both.waypoint) >= 0)
-    missing = both.distance - both.margin
-    for row in np.unique(both.waypoint):
-        assert np.all(np.diff(missing[both.waypoint == row]) >= 0)
-    shuffled = dataclasses.replace(both).select(np.random.default_rng(0).permutation(len(missing)))
-    np.testing.assert_array_equal(merge_contacts(shuffled).waypoint, both.waypoint)
+def test_merged_contacts_are_sorted_by_waypoint_and_violation() -> None:
+    problem, z = past_a_post()
+    parts = problem.evaluate_contacts(z, reach=0.3), find_segment_contacts(problem, z).contacts
+    both = merge_contacts(*parts)
+    assert len(both.waypoint) == sum(len(part.waypoint) for part in parts)
+    clearance = both.distance - both.margin
+    order = np.lexsort((clearance, both.waypoint))
+    np.testing.assert_array_equal(clearance[order], clearance)
+    np.testing.assert_array_equal(np.sort(both.waypoint), both.waypoint)
+    shuffled = both.select(np.random.default_rng(0).permutation(len(order)))
+    np.testing.assert_array_equal(merge_contacts(shuffled).distance, both.distance)
 
 
 def test_stationary_segments_have_no_contacts() -> None:
-    problem, _ = straight(hall().with_start(arm=ARM))
-    assert (
-        len(
-            find_segment_contacts(
-                problem, np.tile(problem.start, (problem.segments, 1))
-            ).contacts.waypoint
-        )
-        == 0
-    )
+    problem, _ = past_a_post()
+    found = find_segment_contacts(problem, problem.still)
+    assert (len(found.contacts.waypoint), found.is_free, found.crossings) == (0, True, [])

@@ -18,7 +18,7 @@ ASIDE = lifted(STICK, [0.0, 0.5, 0.0])
 
 
 @cache
-def fetching() -> TrajectoryProblem:
+def fetch_problem() -> TrajectoryProblem:
     scene = room(stand(), objects=("stick", "ball")).with_held(
         {"stick": "grip"}, at={"stick": (0.02, -0.1)}
     )
@@ -30,11 +30,11 @@ def fetching() -> TrajectoryProblem:
 
 
 @cache
-def placing() -> TrajectoryProblem:
+def place_problem() -> TrajectoryProblem:
     return program_of(room(table()), [Place("stick", ASIDE)], options=SHORT)
 
 
-def unfolded(problem: TrajectoryProblem, seed: int = 0) -> tuple[np.ndarray, Trajectory]:
+def make_random(problem: TrajectoryProblem, seed: int = 0) -> tuple[np.ndarray, Trajectory]:
     z = random_configurations(
         problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(seed)
     )
@@ -52,7 +52,7 @@ def pauses(problem: TrajectoryProblem, motion: Trajectory) -> list[int]:
 
 
 def test_phases_list_attached_objects() -> None:
-    _, motion = unfolded(fetching())
+    _, motion = make_random(fetch_problem())
     names = ["reach ball.pull by stick.tip", "place ball", "go to"]
     assert [phase.name for phase in motion.phases] == names
     both = {"stick": "grip", "ball": "pull"}
@@ -68,15 +68,15 @@ def test_phases_list_attached_objects() -> None:
         (n, 2 * n + 1),
         (2 * n + 1, 3 * n + 2),
     ]
-    assert pauses(fetching(), motion) == [n + 1, 2 * n + 2]
+    assert pauses(fetch_problem(), motion) == [n + 1, 2 * n + 2]
 
 
 def test_last_object_is_released_at_the_end() -> None:
-    _, motion = unfolded(placing())
+    _, motion = make_random(place_problem())
     assert [phase.name for phase in motion.phases] == ["reach stick.grip", "place stick", "let go"]
     assert [dict(phase.held) for phase in motion.phases] == [{}, {"stick": "grip"}, {}]
     n = SHORT.reach_waypoints
-    assert pauses(placing(), motion) == [n + 1, 2 * n + 2]
+    assert pauses(place_problem(), motion) == [n + 1, 2 * n + 2]
     assert motion.phases[-1].last == len(motion.times) - 1
 
 
@@ -94,7 +94,7 @@ def test_hand_opens_at_the_end_only_on_request(
     steps: list[Step], held: dict[str, str], last: str
 ) -> None:
     scene = door_scene().with_held(held) if steps[0] == Release() else door_scene()
-    motion = unfolded(program_of(scene, steps, options=SHORT))[1]
+    motion = make_random(program_of(scene, steps, options=SHORT))[1]
     assert motion.phases[-1].name == last
     if last == "let go":
         assert dict(motion.phases[-1].held) == {}
@@ -107,25 +107,25 @@ def test_object_grasped_at_the_start_is_released_first() -> None:
         problem = program_of(
             door_scene().with_held({"door": attachment}), [GoTo(0.0, 0.0)], options=SHORT
         )
-        motion = unfolded(problem)[1]
+        motion = make_random(problem)[1]
         assert [dict(phase.held) for phase in motion.phases] == [{}]
     assert np.all(motion.column("door.handle_free") == 0.0)
 
 
-@pytest.mark.parametrize("make", [fetching, placing])
+@pytest.mark.parametrize("make", [fetch_problem, place_problem])
 def test_robot_follows_the_waypoints(make) -> None:  # type: ignore[no-untyped-def]
     problem = make()
-    z, motion = unfolded(problem)
+    z, motion = make_random(problem)
     rows = np.delete(motion.positions, pauses(problem, motion), axis=0)
     robot = motion.robot_size
     np.testing.assert_array_equal(rows[:, :robot], problem.waypoints(z)[:, :robot])
 
 
-@pytest.mark.parametrize("make", [fetching, placing])
+@pytest.mark.parametrize("make", [fetch_problem, place_problem])
 def test_grasp_coordinates_hold_their_values(make) -> None:  # type: ignore[no-untyped-def]
     """During the grasp, values are the program's; before and after, the nearest ones."""
     problem = make()
-    z, motion = unfolded(problem)
+    z, motion = make_random(problem)
     path = problem.waypoints(z)
     rows = np.delete(motion.positions, pauses(problem, motion), axis=0)
     ends = [0, *problem.ends.tolist()]

@@ -1,116 +1,111 @@
-"""Tests of step acceptance and trust-region adaptation."""
+"""Tests of step acceptance and trust-region adaptation, on either side of every threshold."""
 
 from __future__ import annotations
 
-import dataclasses
-from typing import Any
-
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.planning.solver.trust_region import (
+    ACTIVE_FRACTION,
     CLEARANCE_TOLERANCE,
     FIRST_RADIUS,
+    NEGLIGIBLE_CHANGE,
     SETTLE_RADIUS,
-    Trial,
+    SHRINK,
     TrustRegion,
     is_step_acceptable,
 )
 
-SEGMENTS, BLOCK = 30, 10  # three blocks
 
-
-def trial(predicted_penalty: Any = 0.0, *, step: Any = 0.1) -> Trial:
-    """Return a trial with a predicted penalty and a step."""
-    rows = [
-        np.broadcast_to(np.asarray(values, float), (SEGMENTS,)).copy()
-        for values in (predicted_penalty, step)
-    ]
-    fields = dict.fromkeys(field.name for field in dataclasses.fields(Trial))
-    return Trial(**{**fields, "predicted_penalty": rows[0], "step": rows[1]})  # type: ignore[arg-type]
-
-
-@settings(max_examples=100, deadline=None)
-@given(st.floats(-1.0, 10.0), st.floats(-10.0, 10.0), st.floats(0.0, 100.0))
-def test_step_is_accepted_if_enough_of_the_prediction_is_achieved(
-    promised: float, actual: float, merit: float
+@pytest.mark.parametrize(
+    ("predicted", "actual", "step", "accepted", "factors"),
+    [
+        ((10.0, 10.0), (10.0, 10.0), (1.01 * ACTIVE_FRACTION, 0.5), True, (1.5, 1.0)),
+        ((10.0, 10.0), (10.0, 10.0), (0.99 * ACTIVE_FRACTION, 0.5), True, (1.0, 1.0)),
+        ((10.0, 10.0), (7.0 - 0.9 * NEGLIGIBLE_CHANGE, 5.0), (1.0, 1.0), True, (1.5, 1.0)),
+        ((10.0, 10.0), (7.0 - 1.1 * NEGLIGIBLE_CHANGE, 5.0), (1.0, 1.0), True, (1.0, 1.0)),
+        ((10.0, 10.0), (2.4, 2.6), (0.8, 0.8), True, (0.8 * SHRINK, 1.0)),
+        ((0.1, 0.0), (0.1 - 0.9 * NEGLIGIBLE_CHANGE, 0.0), (0.8, 0.8), True, (1.0, 1.0)),
+        ((0.1, 0.0), (0.1 - 1.1 * NEGLIGIBLE_CHANGE, 0.0), (0.8, 0.8), True, (0.8 * SHRINK, 1.0)),
+        # a step longer than the radius counts as the radius
+        ((10.0, 10.0), (0.0, 10.0), (1.2, 0.5), True, (SHRINK, 1.0)),
+        # a rejected step shrinks the blocks that were predicted poorly, or else all
+        ((10.0, 10.0), (10.0, 10.0), (1.0, 0.5), False, (SHRINK, 0.5 * SHRINK)),
+        ((10.0, 10.0), (10.0, 0.0), (1.0, 0.5), False, (1.0, 0.5 * SHRINK)),
+        ((10.0, 10.0), (10.0, 0.0), (1.0, 0.5), True, (1.5, 0.5 * SHRINK)),
+        ((10.0, 10.0), (0.0, 10.0), (0.0, 0.5), True, (1e-6 / 0.3, 1.0)),
+    ],
+)
+def test_each_block_adapts_to_its_own_prediction(
+    predicted: tuple[float, ...],
+    actual: tuple[float, ...],
+    step: tuple[float, ...],
+    accepted: bool,
+    factors: tuple[float, ...],
 ) -> None:
-    accepted = is_step_acceptable(promised, actual, merit)
-    if promised >= 1e-4 * max(1.0, merit):
-        assert accepted == (actual > 0.05 * promised)
-    else:  # nothing was to be had: it may not become worse
-        assert accepted == (actual >= -1e-4 * max(1.0, merit))
-
-
-def test_blocks_have_similar_sizes() -> None:
-    for segments in (1, 4, 9, 10, 14, 15, 16, 57, 100):
-        sizes = np.bincount(TrustRegion(segments, BLOCK).block)
-        assert sizes.sum() == segments
-        assert len(sizes) == max(1, round(segments / BLOCK))
-        assert np.ptp(sizes) <= 1
-
-
-def test_each_block_adapts_separately() -> None:
-    """The radius grows in the first block, shrinks in the second and stays in the third."""
-    region, before = TrustRegion(SEGMENTS, BLOCK), np.zeros(SEGMENTS)
-    before[:20] = 2.0
-    after, step = np.zeros(SEGMENTS), np.full(SEGMENTS, FIRST_RADIUS)
-    after[10:20], step[10:20], step[20:] = 4.0, 0.2, 0.1
-    region.adapt(before, after, trial(step=step), True)
-    np.testing.assert_allclose(region.radius[:10], 1.5 * FIRST_RADIUS)
-    np.testing.assert_allclose(region.radius[10:20], 0.4 * 0.2)
-    np.testing.assert_allclose(region.radius[20:], FIRST_RADIUS)
-
-
-def test_rejection_shrinks_the_radius() -> None:
-    region = TrustRegion(SEGMENTS, BLOCK)
-    region.adapt(np.zeros(SEGMENTS), np.zeros(SEGMENTS), trial(step=0.3), False)
-    np.testing.assert_allclose(region.radius, 0.4 * 0.3)
-
-
-def test_half_of_the_prediction_keeps_the_radius() -> None:
-    region = TrustRegion(SEGMENTS, BLOCK)
-    region.adapt(np.full(SEGMENTS, 2.0), np.ones(SEGMENTS), trial(step=FIRST_RADIUS), True)
-    np.testing.assert_array_equal(region.radius, FIRST_RADIUS)
+    """Blocks of two waypoints: reductions add up within a block, the largest step counts."""
+    given_radii = np.full(4, 0.3)
+    region = TrustRegion(4, 2, given_radii)
+    spread = np.zeros((3, 4))
+    spread[0, ::2], spread[1, 1::2], spread[2, 1::2] = predicted, actual, 0.3 * np.array(step)
+    region.adapt(*spread, accepted)
+    np.testing.assert_allclose(region.radius, np.repeat(0.3 * np.array(factors), 2))
+    np.testing.assert_array_equal(given_radii, 0.3)
 
 
 @settings(max_examples=50, deadline=None)
-@given(st.integers(0, 2**32 - 1))
-def test_radii_stay_positive_and_equal_within_a_block(seed: int) -> None:
-    rng, region = (
-        np.random.default_rng(seed),
-        TrustRegion(SEGMENTS, BLOCK, np.repeat([0.5, 1e-3, 1e-6], 10)),
-    )
-    for _ in range(20):
-        before, predicted_penalty, after, step = rng.uniform(0.0, 2.0, (4, SEGMENTS))
-        region.adapt(before, after, trial(predicted_penalty, step=step), bool(rng.integers(2)))
-        assert (region.radius >= 1e-6).all()
-        assert all(np.ptp(region.radius[region.block == b]) == 0.0 for b in range(3))
+@given(st.floats(-1.0, 10.0), st.floats(-10.0, 10.0), st.floats(-100.0, 100.0))
+def test_step_is_accepted_if_enough_of_the_prediction_is_achieved(
+    predicted: float, actual: float, merit: float
+) -> None:
+    negligible = 1e-4 * max(1.0, abs(merit))
+    for share in (0.049, 0.051):
+        assert is_step_acceptable(2 * negligible, 2 * share * negligible, merit) == (share > 0.05)
+    if predicted >= negligible:
+        assert is_step_acceptable(predicted, actual, merit) == (actual > 0.05 * predicted)
+    else:
+        assert is_step_acceptable(predicted, actual, merit) == (actual >= -negligible)
 
 
-def test_region_has_stalled_if_violated_waypoints_do_not_move() -> None:
-    region, shortfall = TrustRegion(SEGMENTS, BLOCK), np.zeros(SEGMENTS)
-    shortfall[12] = 2 * CLEARANCE_TOLERANCE
-    step = np.full(SEGMENTS, 0.1)
-    assert not region.has_stalled(trial(step=step), shortfall)
-    step[12] = CLEARANCE_TOLERANCE / 2
-    assert region.has_stalled(trial(step=step), shortfall)
-    shortfall[15] = 2 * CLEARANCE_TOLERANCE  # which moves
-    assert not region.has_stalled(trial(step=step), shortfall)
-    assert not region.has_stalled(
-        trial(step=step), np.zeros(SEGMENTS)
-    )  # nothing in the way: all must have stopped
-    assert region.has_stalled(trial(step=0.0), np.zeros(SEGMENTS))
+@pytest.mark.parametrize(
+    ("radius", "step", "shortfall", "stalled"),
+    [
+        ([9.0, 0.9, 9.0], [9.0, 9.0, 9.0], [0.0, 1.1, 0.0], True),
+        ([9.0, 9.0, 9.0], [9.0, 0.9, 9.0], [0.0, 1.1, 0.0], True),
+        ([9.0, 1.1, 9.0], [9.0, 1.1, 9.0], [0.0, 1.1, 0.0], False),
+        ([9.0, 0.9, 9.0], [9.0, 9.0, 9.0], [0.0, 1.1, 1.1], False),
+        ([9.0, 0.9, 9.0], [9.0, 9.0, 9.0], [0.0, 0.9, 0.0], False),
+        ([0.9, 0.9, 0.9], [9.0, 9.0, 9.0], [0.0, 0.9, 0.0], True),
+    ],
+)
+def test_region_has_stalled_if_violated_waypoints_do_not_move(
+    radius: list[float], step: list[float], shortfall: list[float], stalled: bool
+) -> None:
+    """All numbers are in units of the tolerance; without violation, all waypoints count."""
+    region = TrustRegion(3, 1, CLEARANCE_TOLERANCE * np.array(radius))
+    moved, missing = CLEARANCE_TOLERANCE * np.array([step, shortfall])
+    assert region.has_stalled(moved, missing) == stalled
+
+
+def test_limit_and_reset() -> None:
+    region = TrustRegion(3, 1, np.array([0.01, SETTLE_RADIUS, 0.3]))
     region.limit()
-    np.testing.assert_array_equal(region.radius, SETTLE_RADIUS)
+    np.testing.assert_array_equal(region.radius, [0.01, SETTLE_RADIUS, SETTLE_RADIUS])
     region.reset()
-    np.testing.assert_array_equal(region.radius, FIRST_RADIUS)
+    np.testing.assert_array_equal(region.radius, [FIRST_RADIUS] * 3)
 
 
-def test_given_radii_are_copied() -> None:
-    given_radii = np.full(SEGMENTS, 0.07)
-    region = TrustRegion(SEGMENTS, BLOCK, given_radii)
-    region.adapt(np.zeros(SEGMENTS), np.zeros(SEGMENTS), trial(step=0.07), False)
-    np.testing.assert_array_equal(given_radii, 0.07)
-    assert (region.radius < 0.07).all()
+@pytest.mark.parametrize(
+    ("segments", "length", "blocks"),
+    [(1, 10, 1), (4, 10, 1), (14, 10, 1), (16, 10, 2), (7, 2, 4), (5, 1, 5), (57, 10, 6)],
+)
+def test_blocks_are_consecutive_and_of_similar_size(
+    segments: int, length: int, blocks: int
+) -> None:
+    found = TrustRegion(segments, length).block
+    sizes = np.bincount(found)
+    assert (len(sizes), found[0]) == (blocks, 0)
+    assert (np.diff(found) >= 0).all()
+    assert np.ptp(sizes) <= 1

@@ -2,77 +2,89 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
-from helpers.drives import hall, moved, through
+from helpers.drives import hall, moved
 from helpers.small_problems import program_of
 
 import vkc_pin as vkc
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.solver.segment_planes import find_segment_contacts
-from vkc_pin.planning.solver.tunnelling import Crossing, find_new_crossings
+from vkc_pin.planning.solver.tunnelling import Crossing, find_crossings, find_new_crossings
 
-STEPS = 8
-FEW = vkc.Options(reach_waypoints=STEPS)
+REACH, GRAZING = 8, -0.353
 
 
-def past(x: float, *obstacles: dict[str, object]) -> tuple[TrajectoryProblem, np.ndarray]:
-    """Return a problem in a hall and the straight path ahead to `x` [m], shape (N, n)."""
-    scene = hall(obstacles=list(obstacles))
-    problem = program_of(scene, [vkc.GoTo(x, 0.0, 0.0)], options=FEW)
-    return problem, through(scene, scene.start, moved(scene.start, x=x), steps=STEPS).positions[1:]
+@cache
+def posts() -> TrajectoryProblem:
+    """Two posts at x = 2 and 4 m in the path of the base, which is a metre long."""
+    obstacles = [
+        {
+            "name": f"post_{x}",
+            "type": "cylinder",
+            "radius": 0.02,
+            "length": 1.6,
+            "position": [x, y, 0.8],
+        }
+        for x, y in ((2, 0.0), (4, 0.1))
+    ]
+    steps = [vkc.GoTo(6.0, 0.0), vkc.GoTo(0.0, 0.0)]
+    options = vkc.Options(reach_waypoints=REACH)
+    return program_of(hall(obstacles=obstacles), steps, options=options)
 
 
-def post(x: float, y: float = 0.0, radius: float = 0.02) -> dict[str, object]:
-    return {
-        "name": "post",
-        "type": "cylinder",
-        "radius": radius,
-        "length": 1.6,
-        "position": [x, y, 0.8],
-    }
-
-
-def pairs(problem: TrajectoryProblem, z: np.ndarray) -> set[tuple[str, str]]:
+def base_crossings(
+    xs: list[float], segments: list[int], y: float = 0.0
+) -> dict[str, list[tuple[int, int]]]:
+    """Return the first and last segments in which the base crosses each post."""
+    problem = posts()
+    states = np.array([moved(problem.start, x=x, y=y) for x in xs])
+    where = np.array(segments)
+    near = problem.contacts.evaluate(states, where + 1, reach=0.05)
     labels = problem.contacts.phases[0].labels
-    return {(labels[a], labels[b]) for (a, b), _, _ in find_segment_contacts(problem, z).crossings}
+    found: dict[str, list[tuple[int, int]]] = {}
+    for (a, b), first, last in find_crossings(problem.contacts, states, where, near):
+        if labels[a] == "base_link":
+            found.setdefault(labels[b], []).append((first, last))
+    return found
 
 
-@pytest.mark.parametrize("y", [0.0, 0.1, -0.2])
-def test_base_passes_through_a_post(y: float) -> None:
-    problem, z = past(4.0, post(2.0, y))
-    assert ("base_link", "post") in pairs(problem, z)
-    found = find_segment_contacts(problem, z).crossings
-    length = 4.0 / STEPS
-    for _, first, last in found:
-        assert first <= 2.0 / length <= last + 1
-        assert last - first < 1.0 / length + 2
-
-
-def test_entering_and_leaving_on_one_side_is_no_crossing() -> None:
-    """The base enters the post and leaves it on the same side."""
-    problem, z = past(1.6, post(2.0))
-    there_and_back = np.concatenate([z[1::2], z[1::2][::-1]])
-    there_and_back[-1] = problem.start
-    assert find_segment_contacts(problem, there_and_back).contacts.compute_violation() > 0.05
-    assert ("base_link", "post") not in pairs(problem, there_and_back)
+@pytest.mark.parametrize(
+    ("xs", "segments", "expected"),
+    [
+        ([0, 1.8, 2.1, 3], [0, 1, 2, 3], {"post_2": [(0, 3)]}),
+        ([3, 2.1, 1.8, 0], [0, 0, 1, 1], {"post_2": [(0, 1)]}),
+        ([0, 2.1, 3, 3.8, 4.2, 5], [0, 1, 2, 3, 4, 5], {"post_2": [(0, 2)], "post_4": [(2, 5)]}),
+        ([0, 2.1, 4.1, 5], [0, 1, 2, 3], {"post_2": [(0, 2)], "post_4": [(1, 3)]}),
+        # there and back: two crossings
+        ([0, 1.9, 3, 2.1, 0], [0, 1, 2, 3, 4], {"post_2": [(0, 2), (2, 4)]}),
+        # in and out on one side, still inside at the end, inside from the start, and free
+        ([0, 1.7, 0], [0, 1, 2], {}),
+        ([0, 1.8, 2.1], [0, 1, 2], {}),
+        ([1.8, 2.1, 3], [0, 1, 2], {}),
+        ([0, 0.5, 1.0], [0, 1, 2], {}),
+        # geometry indices are comparable only within a phase
+        ([0, 2.1, 3], [5, 6, 7], {"post_2": [(5, 7)]}),
+        ([0, 2.1, 3], [6, 7, 8], {}),
+        ([0, 2.1, 3], [8, 8, 9], {"post_2": [(8, 9)]}),
+    ],
+)
+def test_crossings_enter_and_leave_on_opposite_sides(
+    xs: list[float], segments: list[int], expected: dict[str, list[tuple[int, int]]]
+) -> None:
+    assert base_crossings(xs, segments) == expected
 
 
 def test_grazing_is_no_crossing() -> None:
-    """The post passes the front corner of the base on one side."""
-    problem, z = past(4.0, post(2.0, 0.37, radius=0.04))
-    between = find_segment_contacts(problem, z)
-    assert between.contacts.compute_violation() > 0.0
-    assert not between.is_free
-    assert ("base_link", "post") not in pairs(problem, z)
-
-
-def test_no_crossing_if_free_or_still_inside() -> None:
-    problem, z = past(4.0, post(2.0, 2.0))
-    assert pairs(problem, z) == set()
-    problem, z = past(1.6, post(2.0))
-    assert not find_segment_contacts(problem, z).is_free
-    assert ("base_link", "post") not in pairs(problem, z)
+    """The side of the base overlaps the post, and the normal turns by less than a right angle."""
+    xs = np.linspace(1.0, 3.0, 200).tolist()
+    assert base_crossings(xs, [0] * 200, y=-0.3) == {"post_2": [(0, 0)]}
+    assert base_crossings(xs, [0] * 200, y=GRAZING) == {}
+    states = np.array([moved(posts().start, x=x, y=GRAZING) for x in xs])
+    near = posts().contacts.evaluate(states, np.ones(200, int), reach=0.0)
+    labels = posts().contacts.phases[0].labels
+    assert "base_link" in {labels[pair[0]] for pair in near.pair}
 
 
 def test_new_crossings_are_of_new_pairs() -> None:
@@ -80,4 +92,3 @@ def test_new_crossings_are_of_new_pairs() -> None:
     assert find_new_crossings([moved_on], [first]) == []
     assert find_new_crossings([first, other], [moved_on]) == [other]
     assert find_new_crossings([first], []) == [first]
-    assert find_new_crossings([], [first]) == []

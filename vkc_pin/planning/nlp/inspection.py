@@ -89,15 +89,15 @@ def planes(problem: TrajectoryProblem, z: Floats, waypoint: int) -> list[Plane]:
     waypoints = np.arange(1, problem.segments + 1)
     contacts = model.evaluate(z, waypoints, reach=problem.options.contact_reach, nearest=t.slots)
     coefficients, offsets = model.compute_planes(z, contacts, slots=t.slots)
-    x = t.pack(z)
-    dt, targets = problem.timing_for(z).dt, problem.target_matrix()
-    weights, penalty = problem.motion_cost.weights(*problem.rates(z)), problem.options.penalty
     parameters = t.parameter_vector(
-        problem.start, coefficients, offsets, targets, weights=weights, penalty=penalty, dt=dt
+        planes=coefficients,
+        offsets=offsets,
+        penalty=problem.options.penalty,
+        dt=problem.timing_for(z).dt,
+        **problem.parameters_at(z),
     )
-    jacobian = (
-        ca.Function("slopes", [t.x, t.parameters], [t.jacobian])(x, parameters).sparse().tocsr()
-    )
+    slopes = ca.Function("slopes", [t.x, t.parameters], [t.jacobian])
+    jacobian = slopes(t.pack(z), parameters).sparse().tocsr()
     columns = (waypoint - 1) * t.width + np.arange(t.n)
     return [
         Plane(
@@ -127,7 +127,7 @@ def sizes(problem: TrajectoryProblem) -> dict[str, int]:
         "variables: coordinates": problem.lower.size - fixed,
         "variables: coordinates, fixed by bounds": fixed,
         "variables: slacks": t.slot_rows.size,
-        "variables: shares of what is not reached yet": t.segments,
+        "variables: relaxation": t.segments,
     }
     for goal, at in zip(problem.pose_goals, t.pose_rows, strict=True):
         kind = f"rows: {goal.name}"
@@ -136,7 +136,7 @@ def sizes(problem: TrajectoryProblem) -> dict[str, int]:
     counts["rows: rolling"] = len(t.base_rows)
     counts["rows: clamped freedoms"] = sum(last - first for _, first, last in t.structure.clamped)
     counts["rows: pushes"] = len(t.pushed_rows)
-    counts["rows: own constraints"] = len(problem.term_evaluator.rows)
+    counts["rows: user-defined constraints"] = len(problem.term_evaluator.rows)
     counts["only if needed: velocities"] = first.size
     counts["only if needed: accelerations"] = second.size
     return counts

@@ -18,26 +18,13 @@ BYTES_PER_ENTRY = 600
 
 
 class Monitor(ca.Callback):
-    """CasADi iteration callback that charges the budget.
-
-    Args:
-        variables: Number of variables of the program.
-        rows: Number of rows.
-        parameters: Number of parameters.
-        waypoints: Evaluations charged per iteration.
-    """
+    """CasADi iteration callback that records `waypoints` evaluations per iteration."""
 
     def __init__(self, variables: int, rows: int, parameters: int, waypoints: int) -> None:
         ca.Callback.__init__(self)
         self._waypoints = waypoints
-        self._sizes = {
-            "x": variables,
-            "f": 1,
-            "g": rows,
-            "lam_x": variables,
-            "lam_g": rows,
-            "lam_p": parameters,
-        }
+        self._sizes = {"f": 1, "lam_p": parameters, "g": rows, "lam_g": rows}
+        self._sizes |= {"x": variables, "lam_x": variables}
         self.construct("monitor", {})
 
     def get_n_in(self) -> int:
@@ -63,12 +50,8 @@ class Ipopt:
     CasADi converts arguments and results number by number, 0.1 ms per thousand numbers. The arrays
     are therefore shared with it once.
 
-    Args:
-        function: CasADi solver function.
-        monitor: Callback that stops it.
-        nbytes: Estimated size in memory [bytes].
-
     Attributes:
+        nbytes: Estimated size in memory [bytes].
         stats: CasADi's statistics of the last call; its times accumulate over all calls.
         evaluation_time: Time spent in the program's functions during the last call [s].
     """
@@ -78,12 +61,9 @@ class Ipopt:
         self._buffer, self._run = function.buffer()
         self.stats: dict[str, Any] = {}
         self.evaluation_time = self._total = 0.0
-        self._inputs = {
-            function.name_in(i): np.zeros(function.nnz_in(i)) for i in range(function.n_in())
-        }
-        self._outputs = {
-            function.name_out(i): np.zeros(function.nnz_out(i)) for i in range(function.n_out())
-        }
+        f = function
+        self._inputs = {f.name_in(i): np.zeros(f.nnz_in(i)) for i in range(f.n_in())}
+        self._outputs = {f.name_out(i): np.zeros(f.nnz_out(i)) for i in range(f.n_out())}
         for i, values in enumerate(self._inputs.values()):
             self._buffer.set_arg(i, values.data)
         for i, values in enumerate(self._outputs.values()):
@@ -120,27 +100,28 @@ def make_ipopt(
         lagrangian: Symbols of the weight σ of f and of the multipliers λ, and the upper triangle of
             the Hessian of σ·f + λᵀ·g.
         options: Options of CasADi's nlpsol.
-        waypoints: Evaluations charged per iteration.
+        waypoints: Evaluations recorded per iteration.
     """
     weight, multipliers, hessian = lagrangian
-    inputs, (f, g) = [x, parameters], (objective[0], rows[0])
-    functions = {
-        "grad_f": ca.Function("nlp_grad_f", inputs, list(objective), ["x", "p"], ["f", "grad_f_x"]),
-        "jac_g": ca.Function("nlp_jac_g", inputs, list(rows), ["x", "p"], ["g", "jac_g_x"]),
+    inputs, names = [x, parameters], ["x", "p"]
+    monitor = Monitor(x.numel(), multipliers.numel(), parameters.numel(), waypoints)
+    defaults = {
+        "grad_f": ca.Function("nlp_grad_f", inputs, list(objective), names, ["f", "grad_f_x"]),
+        "jac_g": ca.Function("nlp_jac_g", inputs, list(rows), names, ["g", "jac_g_x"]),
         "hess_lag": ca.Function(
             "nlp_hess_l",
             [*inputs, weight, multipliers],
             [hessian],
-            ["x", "p", "lam_f", "lam_g"],
+            [*names, "lam_f", "lam_g"],
             ["triu_hess_gamma_x_x"],
         ),
+        "iteration_callback": monitor,
+        "print_time": False,
+        "record_time": True,
+        "calc_lam_p": False,
+        "no_nlp_grad": True,
     }
-    defaults = {"print_time": False, "record_time": True, "calc_lam_p": False, "no_nlp_grad": True}
-    monitor = Monitor(x.numel(), g.numel(), parameters.numel(), waypoints)
-    callback = {"iteration_callback": monitor}
     record_evaluations()
-    program = {"x": x, "p": parameters, "f": f, "g": g}
-    solver = ca.nlpsol(
-        "trajectory", "ipopt", program, {**defaults, **functions, **callback, **options}
-    )
+    program = {"x": x, "p": parameters, "f": objective[0], "g": rows[0]}
+    solver = ca.nlpsol("trajectory", "ipopt", program, {**defaults, **options})
     return Ipopt(solver, monitor, BYTES_PER_ENTRY * (rows[1].nnz() + hessian.nnz()))

@@ -38,8 +38,8 @@ __all__ = ["TrajectoryProblem"]
 
 # Relative cost of coordinates that are chosen at the grasp and constant afterwards; it only
 # regularises the problem.
-_TOLERANCES = Tolerances()
 _CHOSEN_FREEDOM_WEIGHT = 1e-4
+_TOLERANCES = Tolerances()
 
 
 class TrajectoryProblem:
@@ -148,13 +148,8 @@ class TrajectoryProblem:
         metric = metric * coordinates.turns**2 + o.velocity_weight_base * coordinates.lengths**2
         metric[[column for column, _, _ in self.choices]] *= _CHOSEN_FREEDOM_WEIGHT
         stops = self.transcription.structure.stops
-        return MotionCost(
-            metric,
-            o.acceleration_weight / o.dt**2,
-            self.ends,
-            stops,
-            length=o.objective == "path_length",
-        )
+        smoothing, length = o.acceleration_weight / o.dt**2, o.objective == "path_length"
+        return MotionCost(metric, smoothing, self.ends, stops, length=length)
 
     def _make_start(self) -> Floats:
         start = np.zeros(self.chain.size)
@@ -386,9 +381,16 @@ class TrajectoryProblem:
             lower, upper = np.concatenate([lower, -rates]), np.concatenate([upper, rates])
         return lower, upper
 
-    def target_matrix(self) -> Floats:
-        """Return the pose targets as parameters, shape (poses, 12)."""
-        return np.array([flatten_target(t) for t in self.targets]).reshape(-1, 12)
+    def parameters_at(self, z: Floats) -> dict[str, Floats]:
+        """Return the parameters of the program that only depend on the iterate z_1..z_N."""
+        step_weights, change_weights = self.motion_cost.weights(*self.rates(z))
+        return {
+            "start": self.start,
+            "targets": np.array([flatten_target(target) for target in self.targets]),
+            "step_weights": step_weights,
+            "change_weights": change_weights,
+            "gears": self.rolling.compute_gears(self.waypoints(z)),
+        }
 
     def __repr__(self) -> str:
         t, time = self.transcription, self.timing_for(self.still).dt.sum()

@@ -29,7 +29,6 @@ from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.trajectory.wheels import RollingLimits
 
 __all__ = ["Transcription", "transcribe"]
 
@@ -44,11 +43,10 @@ class Transcription:
         rows: Number of constraint rows without the rate rows.
         slot_rows: Rows of the witness planes, shape (N, K).
         pose_rows: For each pose, waypoint → its rows; see `pose.build_pose_rows`.
-        base_rows: RollingLimits rows of a wheeled base, see `StepRows`, shape (N·rows per step,); empty
-            for other bases.
-        term_rows: For each user-defined term, waypoint → its rows; empty for costs. These are the
-            last rows.
-        term_values: Function of x, z_0 and all step durations → values of these rows, their
+        base_rows: Rows of a wheeled base, see `StepRows`, shape (N·rows per step,).
+        pushed_rows: Rows of pushed coordinates.
+        term_rows: For each user-defined term, waypoint → its rows; empty for costs.
+        term_values: Function of x, z_0 and the step durations → values of these rows, their
             Jacobian, and the sum and gradient of the costs.
         pose_solvers: Inverse kinematics of each pose.
         first_relaxed_row: First of the rows that do not come from waypoint functions: rolling,
@@ -63,11 +61,8 @@ class Transcription:
 
     def __init__(self, structure: Structure, cache: Cache) -> None:
         self.structure, self.cache = structure, cache
-        self.n, self.segments, self.slots = (
-            Coordinates(structure.model).size,
-            structure.segments,
-            structure.slots,
-        )
+        self.n = Coordinates(structure.model).size
+        self.segments, self.slots = structure.segments, structure.slots
         self.width = self.n + self.slots + 1
         self.size = self.segments * self.width
         self.uncompiled_functions: list[MachineCode] = []
@@ -89,91 +84,45 @@ class Transcription:
         joints, poses = self.structure.model.njoints - 1, max(len(self.structure.poses), 1)
         self.x = ca.MX.sym("x", self.size)
         self.waypoint_variables = ca.reshape(self.x, self.width, N)  # one column per waypoint
-        self.z, self.start, self.dt = (
-            self.waypoint_variables[:n, :],
-            ca.MX.sym("z0", n),
-            ca.MX.sym("dt", N),
-        )
+        self.z, self.start = self.waypoint_variables[:n, :], ca.MX.sym("z0", n)
         self.planes, self.offsets = ca.MX.sym("C", K * 12 * joints, N), ca.MX.sym("R", K, N)
-        self.targets, self.pose_offsets = (
-            ca.MX.sym("W", 12, poses),
-            ca.MX.sym("D", POSE_OFFSET_SIZE * poses, N),
-        )
-        self.penalty, self.relaxation_weights, self.gears = (
-            ca.MX.sym("rho"),
-            ca.MX.sym("p", N),
-            ca.MX.sym("gear", N),
-        )
+        self.targets = ca.MX.sym("W", 12, poses)
+        self.pose_offsets = ca.MX.sym("D", POSE_OFFSET_SIZE * poses, N)
+        self.penalty, self.relaxation_weights = ca.MX.sym("rho"), ca.MX.sym("p", N)
+        self.gears, self.dt = ca.MX.sym("gear", N), ca.MX.sym("dt", N)
 
-    def parameter_vector(
-        self,
-        start: Floats,
-        planes: Floats,
-        offsets: Floats,
-        targets: Floats,
-        *,
-        weights: tuple[Floats, Floats],
-        penalty: float,
-        dt: Floats | None = None,
-        pose_offsets: Floats | None = None,
-        excess: Floats | None = None,
-        relaxation_weights: Floats | None = None,
-        gears: Floats | None = None,
-    ) -> Floats:
+    def parameter_vector(self, **values: Floats | float) -> Floats:
         """Return the parameters of the program.
 
         Args:
-            start: z_0, shape (n,).
-            planes: Witness plane coefficients C, shape (N, K, 12·joints).
-            offsets: Witness plane offsets R, shape (N, K).
-            targets: Pose targets, shape (poses, 12).
-            weights: Weights of the squared steps and of their squared changes, see
-                `MotionCost.weights`.
-            penalty: Penalty weight of the clearance slacks [1/m].
-            dt: Step durations, shape (N,) [s]. Used only if a term depends on them.
-            pose_offsets: Offsets of frames from their targets at the iterate, shape (N, poses, 7),
-                see `pose.compute_pose_offsets`. Defaults to zero.
-            excess: Bound violations of the rolling, clamping and user-defined rows at the iterate,
-                shape (rows - first_relaxed_row,). Defaults to zero.
-            relaxation_weights: Penalty of each relaxation variable, shape (N,). Defaults to zero.
-            gears: Gears of a wheeled base for each step, shape (N,). Defaults to forward.
+            **values: Parameters by name; those that are not given are zero.
+
+                - start: z_0, shape (n,).
+                - planes, offsets: Witness planes C, shape (N, K, 12·joints), and R, shape (N, K).
+                - targets: Pose targets, shape (poses, 12).
+                - step_weights, change_weights: See `MotionCost.weights`.
+                - penalty: Penalty weight of the clearance slacks [1/m].
+                - pose_offsets: See `pose.compute_pose_offsets`, shape (N, poses, 7).
+                - relaxation_weights: Penalty of each relaxation variable, shape (N,).
+                - excess: Bound violations of the relaxed rows at the iterate.
+                - gears: Gear of a wheeled base in each step, shape (N,).
+                - dt: Step durations, shape (N,) [s].
         """
-        columns = planes.transpose(
-            0, 2, 1
-        ).ravel()  # each waypoint's K × 12J matrix in column-major order
-        padded = targets.ravel() if len(targets) else np.zeros(12)
-        pose_offsets = (
-            np.zeros(self.pose_offsets.numel())
-            if pose_offsets is None or not pose_offsets.size
-            else pose_offsets.ravel()
-        )
-        excess = np.zeros(self.excess.numel()) if excess is None else excess
-        relaxation_weights = (
-            np.zeros(self.segments) if relaxation_weights is None else relaxation_weights
-        )
-        times = dt if self.structure.timed and dt is not None else np.zeros(0)
-        gears = (
-            np.zeros(0)
-            if self.structure.rolling.is_omnidirectional
-            else np.ones(self.segments)
-            if gears is None
-            else gears
-        )
-        head = (start, columns, offsets.ravel(), padded, *(part.T.ravel() for part in weights))
-        return np.concatenate(
-            [*head, [penalty], pose_offsets, relaxation_weights, excess, gears, times]
-        )
+        columns = {"planes": (0, 2, 1), "step_weights": (1, 0), "change_weights": (1, 0)}
+        parts = []
+        for name, symbol in self.parameter_symbols.items():
+            value = np.asarray(values.get(name, 0.0))
+            if name in columns:  # matrices are stored column by column
+                value = value.transpose(columns[name])
+            parts.append(
+                value.ravel() if value.size == symbol.numel() else np.zeros(symbol.numel())
+            )
+        return np.concatenate(parts)
 
     def pack(
         self, z: Floats, slack: Floats | float = 0.0, relaxations: Floats | float = 0.0
     ) -> Floats:
-        """Return x for waypoints, shape (N, n), their slacks and their relaxation variables.
-
-        Args:
-            z: z_1..z_N, shape (N, n).
-            slack: Clearance slacks, shape (N, K), or one value for all [m].
-            relaxations: Relaxation variables, shape (N,), or one value for all.
-        """
+        """Return x for z, shape (N, n), slacks, shape (N, K) [m], and relaxations, shape (N,)."""
         slack = np.broadcast_to(slack, (len(z), self.slots))
         return np.column_stack([z, slack, relaxations * np.ones(len(z))]).ravel()
 
@@ -183,14 +132,13 @@ class Transcription:
         self.first, self.second, self.start_first, self.start_second = make_differences(
             N, self.structure.stops
         )
-        symbols = self.step_weights, self.change_weights = (
-            ca.MX.sym("w", N, n),
-            ca.MX.sym("v", len(self.second), n),
-        )
+        self.step_weights = ca.MX.sym("w", N, n)
+        self.change_weights = ca.MX.sym("v", len(self.second), n)
         costs = ca.vertcat(ca.repmat(self.penalty, self.slots, N), self.relaxation_weights.T)
         self.f, gradient = ca.dot(costs, self.waypoint_variables[n:, :]), ca.MX(N, n)
-        for matrix, start, weights in zip(
-            (self.first, self.second), (self.start_first, self.start_second), symbols, strict=True
+        for matrix, start, weights in (
+            (self.first, self.start_first, self.step_weights),
+            (self.second, self.start_second, self.change_weights),
         ):
             difference = make_sparse(matrix) @ self.z.T + ca.DM(start) @ self.start.T
             self.f += ca.dot(weights, difference**2)
@@ -222,19 +170,15 @@ class Transcription:
                 self.structure.model, K, tuple(self.structure.poses[k] for k in poses), self.cache
             )
             self.uncompiled_functions += kind.use_machine_code(len(at))
-            targets = ca.repmat(
-                ca.vec(self.targets[:, list(poses)] if poses else self.targets[:, 0]), 1, len(at)
+            targets = ca.vec(self.targets[:, list(poses)] if poses else self.targets[:, 0])
+            offsets = np.add.outer(
+                np.array(poses or (0,)) * POSE_OFFSET_SIZE, range(POSE_OFFSET_SIZE)
             )
-            pose_offsets = self.pose_offsets[
-                [POSE_OFFSET_SIZE * k + i for k in poses or (0,) for i in range(POSE_OFFSET_SIZE)],
-                at,
-            ]
-            inputs = [
-                self.waypoint_variables[:, at],
-                self.planes[:, at],
-                self.offsets[:, at],
-                targets,
-                pose_offsets,
+            variables = (self.waypoint_variables, self.planes, self.offsets)
+            inputs = [part[:, at] for part in variables]
+            inputs += [
+                ca.repmat(targets, 1, len(at)),
+                self.pose_offsets[offsets.ravel().tolist(), at],
             ]
             rows = first_row[at][:, None] + np.arange(kind.rows)
             multipliers = ca.reshape(self.multipliers[rows.ravel().tolist()], kind.rows, len(at))
@@ -242,30 +186,25 @@ class Transcription:
             jacobians.append(ca.vec(kind.jacobian.map(len(at))(*inputs)))
             hessians.append(ca.vec(kind.hessian.map(len(at))(*inputs, multipliers)))
             value_rows.append(rows.ravel())
-            offset = np.array(at)[:, None] * self.width
-            row, column = (np.array(part) for part in kind.jacobian_pattern)
-            jacobian_at.append(
-                np.stack([(first_row[at][:, None] + row).ravel(), (offset + column).ravel()])
-            )
-            row, column = (np.array(part) for part in kind.hessian_pattern)
+            first, offset = first_row[at][:, None], np.array(at)[:, None] * self.width
+            row, column = map(np.array, kind.jacobian_pattern)
+            jacobian_at.append(np.stack([(first + row).ravel(), (offset + column).ravel()]))
+            row, column = map(np.array, kind.hessian_pattern)
             hessian_at.append(np.stack([(offset + row).ravel(), (offset + column).ravel()]))
-            offset_in_waypoint = K
-            for index, height in zip(poses, kind.pose_rows, strict=True):
-                for t in at:
-                    self.pose_rows[index][t + 1] = (
-                        first_row[t] + offset_in_waypoint + np.arange(height)
-                    )
-                offset_in_waypoint += height
+            for t in at:
+                begin = first_row[t] + K
+                for index, height in zip(poses, kind.pose_rows, strict=True):
+                    self.pose_rows[index][t + 1] = begin + np.arange(height)
+                    begin += height
         order = np.argsort(np.concatenate(value_rows))
         self.g = ca.vertcat(*values)[order.tolist()]
         self.jacobian = assemble(jacobians, jacobian_at, self.rows, self.size)
         self.hessian = assemble(hessians, hessian_at, self.size, self.size)
         self.base_rows = np.zeros(0, int)
-        # the rows that follow do not come from waypoint functions
-        self.first_relaxed_row = self.rows
+        self.first_relaxed_row = self.rows  # these do not come from waypoint functions
         self.row_waypoints, self.remaining_rows = np.zeros(0, int), ca.MX(0, 1)
         if not self.structure.rolling.is_omnidirectional:
-            self._append_rolling_rows(self.structure.rolling)
+            self._append_rolling_rows()
         self._append_clamping_rows()
         self.term_rows: list[dict[int, Ints]] = []
         if self.structure.terms:
@@ -276,62 +215,45 @@ class Transcription:
         """Append rows with their Jacobian and waypoints (from 0); return their multipliers."""
         rows, self.row_waypoints = self.rows, np.concatenate([self.row_waypoints, row_waypoints])
         self.remaining_rows = ca.vertcat(self.remaining_rows, values)
-        self.g, self.jacobian, self.rows = (
-            ca.vertcat(self.g, values),
-            ca.vertcat(self.jacobian, jacobian),
-            rows + values.numel(),
-        )
+        self.g, self.jacobian = ca.vertcat(self.g, values), ca.vertcat(self.jacobian, jacobian)
+        self.rows += values.numel()
         multipliers = ca.MX.sym("lam_g", self.rows)
         (self.hessian,) = ca.substitute([self.hessian], [self.multipliers], [multipliers[:rows]])
         self.multipliers = multipliers
         return multipliers[rows:]
 
-    def _append_rolling_rows(self, rolling: RollingLimits) -> None:
+    def _append_rolling_rows(self) -> None:
         """Append the rolling rows of a wheeled base, step by step."""
-        self.steps = StepRows(rolling, ca.horzcat(self.start, self.z), self.gears, width=self.width)
-        self.base_rows = self.rows + np.arange(len(self.steps.waypoints))
-        multipliers = self._append_rows(
-            self.steps.values, self.steps.jacobian, self.steps.waypoints
-        )
-        self.hessian = self.hessian + self.steps.hessian(multipliers)
+        path = ca.horzcat(self.start, self.z)
+        steps = StepRows(self.structure.rolling, path, self.gears, width=self.width)
+        self.steps, self.base_rows = steps, self.rows + np.arange(len(steps.waypoints))
+        multipliers = self._append_rows(steps.values, steps.jacobian, steps.waypoints)
+        self.hessian = self.hessian + steps.hessian(multipliers)
 
     def _append_clamping_rows(self) -> None:
         """Append z_t − z_{t−1} = 0 for clamped and ±(z_t − z_{t−1}) ≥ 0 for pushed coordinates."""
-        steps = [
-            (c, t, 1)
-            for c, first, last in self.structure.clamped
-            for t in range(first + 1, last + 1)
+        pushed = [
+            (t, c, sign) for c, begin, end, sign in self.structure.pushed for t in range(begin, end)
         ]
-        pushes = [
-            (c, t, direction)
-            for c, first, last, direction in self.structure.pushed
-            for t in range(first + 1, last + 1)
-        ]
-        self.pushed_rows = self.rows + len(steps) + np.arange(len(pushes))
-        if not (steps := steps + pushes):
+        steps = [(t, c, 1) for c, begin, end in self.structure.clamped for t in range(begin, end)]
+        self.pushed_rows = self.rows + len(steps) + np.arange(len(pushed))
+        if not (steps := steps + pushed):
             return
         difference = ca.DM(len(steps), self.n + self.size)  # the start's columns come first
-        for row, (column, t, direction) in enumerate(steps):
-            difference[row, self.n + (t - 1) * self.width + column] = direction
-            difference[
-                row, self.n + (t - 2) * self.width + column if t > 1 else column
-            ] = -direction
+        for row, (t, column, sign) in enumerate(steps):  # from waypoint t to t + 1
+            difference[row, self.n + t * self.width + column] = sign
+            before = self.n + (t - 1) * self.width + column if t else column
+            difference[row, before] = -sign
         start, variables = difference[:, : self.n], difference[:, self.n :]
-        self._append_rows(
-            start @ self.start + variables @ self.x,
-            variables,
-            np.array([t - 1 for _, t, _ in steps]),
-        )
+        values = start @ self.start + variables @ self.x
+        self._append_rows(values, variables, np.array([t for t, _, _ in steps]))
 
     def _append_term_rows(self) -> None:
         """Append the user-defined constraints and add the user-defined costs to the objective."""
-        dt, terms = (
-            self.dt if self.structure.timed else ca.MX.zeros(self.segments),
-            self.structure.terms,
-        )
+        dt = self.dt if self.structure.timed else ca.MX.zeros(self.segments)
         part = TermProgram(
             self.structure.model,
-            terms,
+            self.structure.terms,
             ca.horzcat(self.start, self.z),
             dt,
             self.cache,
@@ -359,18 +281,23 @@ class Transcription:
             self.g, self.jacobian = self._subtract_relaxation(
                 self.g, self.jacobian, rows, self.row_waypoints, self.excess
             )
-        parameters = [
-            self.start,
-            self.planes,
-            self.offsets,
-            self.targets,
-            self.step_weights,
-            self.change_weights,
-            self.penalty,
-        ]
-        parameters += [self.pose_offsets, self.relaxation_weights, self.excess]
-        parameters += [] if self.structure.rolling.is_omnidirectional else [self.gears]
-        self.parameters = ca.veccat(*parameters, *([self.dt] if self.structure.timed else []))
+        self.parameter_symbols = {
+            "start": self.start,
+            "planes": self.planes,
+            "offsets": self.offsets,
+            "targets": self.targets,
+            "step_weights": self.step_weights,
+            "change_weights": self.change_weights,
+            "penalty": self.penalty,
+            "pose_offsets": self.pose_offsets,
+            "relaxation_weights": self.relaxation_weights,
+            "excess": self.excess,
+        }
+        if not self.structure.rolling.is_omnidirectional:
+            self.parameter_symbols["gears"] = self.gears
+        if self.structure.timed:
+            self.parameter_symbols["dt"] = self.dt
+        self.parameters = ca.veccat(*self.parameter_symbols.values())
 
     def _subtract_relaxation(
         self, g: ca.MX, jacobian: ca.MX, rows: Ints, row_waypoints: Ints, excess: ca.MX
@@ -382,11 +309,10 @@ class Transcription:
 
     def _make_rates(self) -> None:
         """Build the matrices of eq. 5: velocities and accelerations per step."""
-        n = self.n
-        select, identity = (
-            ca.horzcat(ca.DM.eye(n), ca.DM(n, self.slots + 1)),
-            ca.DM.eye(n),
-        )  # omits slacks and relaxation variables
+        n, identity = self.n, ca.DM.eye(self.n)
+        select = ca.horzcat(
+            identity, ca.DM(n, self.slots + 1)
+        )  # no slacks and relaxation variables
         self.rate_matrix = ca.vertcat(
             *(ca.kron(make_sparse(part), select) for part in (self.first, self.second))
         )
@@ -397,24 +323,17 @@ class Transcription:
         self.rate_start = ca.vertcat(*(ca.kron(make_sparse(part), identity) for part in starts))
 
     def solver(self, *, rates: bool, options: dict[str, Any]) -> Ipopt:
-        """Return an Ipopt solver of this program.
+        """Return an Ipopt solver of this program with the given options of CasADi's nlpsol.
 
-        Args:
-            rates: Whether velocity and acceleration rows are appended to the rows, and their excess
-                to the parameters.
-            options: Options of CasADi's nlpsol.
+        With `rates`, velocity and acceleration rows are appended to the rows, and their excess to
+        the parameters.
         """
         key = ("ipopt", self.structure.key, rates, tuple(sorted(options.items())))
         return self.cache.get(key, lambda: self._make_solver(rates, options))
 
     def _make_solver(self, rates: bool, options: dict[str, Any]) -> Ipopt:
-        g, jacobian, multipliers, parameters = (
-            self.g,
-            self.jacobian,
-            self.multipliers,
-            self.parameters,
-        )
-        weight, n_rows = ca.MX.sym("lam_f"), self.rows
+        g, jacobian, multipliers = self.g, self.jacobian, self.multipliers
+        parameters, weight, n_rows = self.parameters, ca.MX.sym("lam_f"), self.rows
         hessian = weight * self.objective_curvature + self.hessian
         if rates:
             g = ca.vertcat(g, self.rate_matrix @ self.x + self.rate_start @ self.start)
@@ -425,13 +344,12 @@ class Transcription:
             )
             parameters = ca.vertcat(parameters, excess)
             (hessian,) = ca.substitute([hessian], [self.multipliers], [multipliers[:n_rows]])
-        lagrangian = (weight, multipliers, hessian)
         return make_ipopt(
             self.x,
             parameters,
             (self.f, self.gradient),
             (g, jacobian),
-            lagrangian,
+            (weight, multipliers, hessian),
             options,
             waypoints=self.segments,
         )

@@ -41,7 +41,7 @@ class Structure:
         segments: N, the number of waypoints after the start.
         poses: Frames with a pose goal.
         slots: K, witness planes per waypoint.
-        stops: Interior waypoints at which the motion is at rest, as it is at its start and end.
+        stops: Interior waypoints at which the motion is at rest.
         rolling: Motion constraints of the base.
         clamped: (column, first, last): coordinates that are constant from waypoint `first` to
             `last`, such as the freedoms of a clamped grasp.
@@ -95,13 +95,10 @@ class WaypointFunctions:
         n, joints = Coordinates(model).size, model.njoints - 1
         z, s, relaxation = ca.SX.sym("z", n), ca.SX.sym("s", slots), ca.SX.sym("e")
         planes, offsets = ca.SX.sym("C", slots, 12 * joints), ca.SX.sym("R", slots)
-        targets, pose_offsets = (
-            ca.SX.sym("W", 12, max(len(poses), 1)),
-            ca.SX.sym("D", POSE_OFFSET_SIZE, max(len(poses), 1)),
-        )
-        sweep = cache.get(
-            ("sweep", model.saveToString(), slots), lambda: _KinematicSweep(model, slots, cache)
-        )
+        targets = ca.SX.sym("W", 12, max(len(poses), 1))
+        pose_offsets = ca.SX.sym("D", POSE_OFFSET_SIZE, max(len(poses), 1))
+        key = ("sweep", model.saveToString(), slots)
+        sweep = cache.get(key, lambda: _KinematicSweep(model, slots, cache))
         placements, coordinate_jacobian = sweep.function(z, planes)
         stacked = ca.vec(placements)
         # Every row is linear in the placements, rows = L·vec(M) + const, so one kinematic sweep
@@ -115,32 +112,26 @@ class WaypointFunctions:
         self.rows = slots + sum(self.pose_rows)
         rows = ca.vertcat(planes @ stacked - offsets + s, pose_values)
         multipliers = ca.SX.sym("lam", self.rows)
-        plane_multipliers, pose_multipliers = ca.vertsplit(
-            multipliers, [0, slots, self.rows]
-        )  # vertsplit, because slicing a scalar would give a row
+        # vertsplit, because slicing a scalar would give a row
+        plane_multipliers, pose_multipliers = ca.vertsplit(multipliers, [0, slots, self.rows])
         variables = ca.vertcat(z, s, relaxation)
         plane_jacobian = ca.horzcat(coordinate_jacobian, ca.SX.eye(slots), ca.SX(slots, 1))
         jacobian = ca.vertcat(plane_jacobian, ca.jacobian(pose_values, variables))
         record_evaluations()
         w = ca.SX.sym("w", 12 * joints)
-        hessian = ca.triu(
-            ca.hessian(ca.dot(w, stacked) + ca.dot(pose_multipliers, pose_values), variables)[0]
-        )
-        inner = ca.Function(
-            "inner", [z, relaxation, targets, pose_offsets, w, multipliers], [hessian]
-        )
-        hessian = inner(
-            z, relaxation, targets, pose_offsets, planes.T @ plane_multipliers, multipliers
-        )
+        lagrangian = ca.dot(w, stacked) + ca.dot(pose_multipliers, pose_values)
+        hessian = ca.triu(ca.hessian(lagrangian, variables)[0])
+        given = [z, relaxation, targets, pose_offsets]
+        inner = ca.Function("inner", [*given, w, multipliers], [hessian])
+        hessian = inner(*given, planes.T @ plane_multipliers, multipliers)
         inputs = [variables, ca.vec(planes), offsets, ca.vec(targets), ca.vec(pose_offsets)]
         record_evaluations()
         self.value = ca.Function("g", inputs, [rows])
         self.jacobian = ca.Function("rows_jacobian", inputs, [ca.vertcat(*jacobian.nonzeros())])
         record_evaluations()
         self.jacobian_pattern = jacobian.sparsity().get_triplet()
-        self.hessian = ca.Function(
-            "lagrangian_hessian", [*inputs, multipliers], [ca.vertcat(*hessian.nonzeros())]
-        )
+        nonzeros = ca.vertcat(*hessian.nonzeros())
+        self.hessian = ca.Function("lagrangian_hessian", [*inputs, multipliers], [nonzeros])
         self.hessian_pattern = hessian.sparsity().get_triplet()
         self.code = MachineCode(self.value, self.jacobian, self.hessian)
         self.nbytes = estimate_size(self.value, self.jacobian, self.hessian)
@@ -160,13 +151,8 @@ class StepRows:
     The rows of one step, all in metres, use its longitudinal displacement c, lateral displacement s
     and rotation δθ (see `RollingLimits.compute_steps`): s, which must be zero; for steered bases,
     gear·c ∓ radius·δθ, which must not be negative; and, if the wheel speed is limited, the wheel
-    travel c ∓ track/2·δθ.
-
-    Args:
-        rolling: Limits of the base.
-        path: z_0..z_N, shape (n, N + 1); z_1..z_N are variables.
-        gears: 1 (forward) or -1 (backward) for each step, shape (N,).
-        width: Number of variables per waypoint; the first three are the base's.
+    travel c ∓ track/2·δθ. The path z_0..z_N has shape (n, N + 1); the gear of each step is 1
+    (forward) or -1 (backward).
 
     Attributes:
         values, jacobian: Row values and their Jacobian, step by step.
@@ -174,11 +160,8 @@ class StepRows:
     """
 
     def __init__(self, rolling: RollingLimits, path: ca.MX, gears: ca.MX, *, width: int) -> None:
-        self.rolling, self.segments, self.size = (
-            rolling,
-            path.shape[1] - 1,
-            width * (path.shape[1] - 1),
-        )
+        self.rolling, self.segments = rolling, path.shape[1] - 1
+        self.size = width * self.segments
         value, jacobian, self._hessian = _make_step_functions(rolling)
         self.rows, steps = value.size1_out(0), np.arange(self.segments)
         self._inputs = [ca.vertcat(path[:3, :-1], path[:3, 1:]), gears.T]
@@ -187,7 +170,7 @@ class StepRows:
         self._columns = columns.reshape(-1, 6)
         self.waypoints = np.repeat(steps, self.rows)
         self.values = ca.vec(value.map(self.segments)(*self._inputs))
-        row, column = (np.array(part) for part in jacobian.sparsity_out(0).get_triplet())
+        row, column = map(np.array, jacobian.sparsity_out(0).get_triplet())
         slopes = jacobian.map(self.segments)(*self._inputs)
         self.jacobian = self._place_nonzeros(
             slopes, steps[:, None] * self.rows + row, self._columns[:, column], len(self.waypoints)
@@ -195,10 +178,9 @@ class StepRows:
 
     def hessian(self, multipliers: ca.MX) -> ca.MX:
         """Return the upper triangle of the Hessian of multipliers·rows."""
-        row, column = (np.array(part) for part in self._hessian.sparsity_out(0).get_triplet())
-        curvatures = self._hessian.map(self.segments)(
-            *self._inputs, ca.reshape(multipliers, self.rows, self.segments)
-        )
+        row, column = map(np.array, self._hessian.sparsity_out(0).get_triplet())
+        multipliers = ca.reshape(multipliers, self.rows, self.segments)
+        curvatures = self._hessian.map(self.segments)(*self._inputs, multipliers)
         return self._place_nonzeros(
             curvatures, self._columns[:, row], self._columns[:, column], self.size
         )
@@ -207,15 +189,10 @@ class StepRows:
         """Return the sparse matrix of all steps' nonzeros, without those of the start."""
         positions = np.stack([row.ravel(), column.ravel()])
         is_variable = (positions >= 0).all(axis=0)
-        nonzeros = ca.vertcat(
-            *(part.nz[:] for part in ca.horzsplit(parts, parts.shape[1] // self.segments))
-        )
-        return assemble(
-            [nonzeros[np.flatnonzero(is_variable).tolist()]],
-            [positions[:, is_variable]],
-            height,
-            self.size,
-        )
+        each = ca.horzsplit(parts, parts.shape[1] // self.segments)
+        nonzeros = ca.vertcat(*(part.nz[:] for part in each))
+        nonzeros = nonzeros[np.flatnonzero(is_variable).tolist()]
+        return assemble([nonzeros], [positions[:, is_variable]], height, self.size)
 
     def bounds(self, dt: Floats | None) -> tuple[Floats, Floats]:
         """Return the bounds of the rows; `dt`, shape (N,) [s], limits wheel travel if given."""
@@ -232,27 +209,19 @@ def _make_step_functions(rolling: RollingLimits) -> tuple[ca.Function, ca.Functi
     poses, gear = ca.SX.sym("b", 6), ca.SX.sym("g")
     dx, dy, turn = ca.vertsplit(poses[3:] - poses[:3])
     heading = (poses[2] + poses[5]) / 2
-    longitudinal, lateral = (
-        ca.cos(heading) * dx + ca.sin(heading) * dy,
-        ca.cos(heading) * dy - ca.sin(heading) * dx,
-    )
-    steered = (
-        [gear * longitudinal + side * rolling.turning_radius * turn for side in (-1, 1)]
-        if rolling.turning_radius
-        else []
-    )
-    wheels = (
-        [longitudinal + side * rolling.track / 2 * turn for side in (-1, 1)]
-        if rolling.has_wheel_limit
-        else []
-    )
-    rows = ca.vertcat(lateral, *steered, *wheels)
-    multipliers = ca.SX.sym("lam", rows.numel())
-    hessian = ca.triu(ca.hessian(ca.dot(multipliers, rows), poses)[0])
+    longitudinal = ca.cos(heading) * dx + ca.sin(heading) * dy
+    rows = [ca.cos(heading) * dy - ca.sin(heading) * dx]
+    if rolling.turning_radius:
+        rows += [gear * longitudinal + side * rolling.turning_radius * turn for side in (-1, 1)]
+    if rolling.has_wheel_limit:
+        rows += [longitudinal + side * rolling.track / 2 * turn for side in (-1, 1)]
+    values, multipliers = ca.vertcat(*rows), ca.SX.sym("lam", len(rows))
+    hessian = ca.triu(ca.hessian(ca.dot(multipliers, values), poses)[0])
+    inputs, options = [poses, gear], {"cse": True}
     return (
-        ca.Function("roll", [poses, gear], [rows], {"cse": True}),
-        ca.Function("roll_jacobian", [poses, gear], [ca.jacobian(rows, poses)], {"cse": True}),
-        ca.Function("roll_hessian", [poses, gear, multipliers], [hessian], {"cse": True}),
+        ca.Function("roll", inputs, [values], options),
+        ca.Function("roll_jacobian", inputs, [ca.jacobian(values, poses)], options),
+        ca.Function("roll_hessian", [*inputs, multipliers], [hessian], options),
     )
 
 
@@ -261,16 +230,11 @@ class _KinematicSweep:
 
     def __init__(self, model: pin.Model, slots: int, cache: Cache) -> None:
         coordinates = Coordinates(model)
-        z, planes = (
-            ca.SX.sym("z", coordinates.size),
-            ca.SX.sym("C", slots, 12 * (model.njoints - 1)),
-        )
+        z = ca.SX.sym("z", coordinates.size)
+        planes = ca.SX.sym("C", slots, 12 * (model.njoints - 1))
         placements = get_kinematics(model, cache).build_placements(z)
-        self.function = ca.Function(
-            "sweep",
-            [z, planes],
-            [placements, _differentiate_planes(model, coordinates, z, placements, planes)],
-        )
+        gradients = _differentiate_planes(model, coordinates, z, placements, planes)
+        self.function = ca.Function("sweep", [z, planes], [placements, gradients])
         self.nbytes = estimate_size(self.function)
 
 
@@ -301,13 +265,11 @@ def _differentiate_planes(
     for column, joint, *_ in coordinates.moves:
         placement = placements[:, joint - 1]
         derivative = ca.jacobian(placement, z[column])
-        rotation_terms = [
-            ca.cross(placement[3 * c : 3 * c + 3], derivative[3 * c : 3 * c + 3]) for c in range(3)
-        ]
-        omega = sum(rotation_terms, ca.SX(3, 1)) / 2
-        twist = twists[column, joint] = ca.vertcat(
-            omega, derivative[9:] - ca.cross(omega, placement[9:])
-        )
+        axes = [slice(3 * c, 3 * c + 3) for c in range(3)]
+        turns = [ca.cross(placement[axis], derivative[axis]) for axis in axes]
+        omega = sum(turns, ca.SX(3, 1)) / 2
+        velocity = derivative[9:] - ca.cross(omega, placement[9:])
+        twist = twists[column, joint] = ca.vertcat(omega, velocity)
         ancestors = [k for k in model.supports[joint] if (column, k) in twists and k != joint]
         relative = twist - twists[column, ancestors[-1]] if ancestors else twist
         slopes[column] = slopes[column] + (

@@ -25,7 +25,7 @@ class SegmentContacts(NamedTuple):
 
     Attributes:
         contacts: Equivalent contacts at z_1..z_N. Margin minus distance is the clearance that the
-            segment lacks; it is negative for pairs that are close but far enough apart.
+            segment lacks; it is negative for pairs that are far enough apart.
         is_free: Whether no sample is closer than `CLEARANCE_TOLERANCE`.
         crossings: Pairs that pass through each other.
     """
@@ -56,13 +56,10 @@ def find_segment_contacts(problem: TrajectoryProblem, z: Floats) -> SegmentConta
     near = contacts.evaluate(middles, waypoints, reach=SEGMENT_MARGIN + REFINEMENT_RANGE)
     crossings = find_crossings(contacts, middles, segment, near)
     rows = np.unique(near.waypoint)
-    segment, begin, length = (
-        segment[rows],
-        piece[rows] / counts[segment[rows]],
-        1 / counts[segment[rows]],
-    )
     if not len(rows):
         return SegmentContacts(make_empty_contacts(), True, [])
+    segment, piece = segment[rows], piece[rows]
+    begin, length = piece / counts[segment], 1 / counts[segment]
     segment = np.repeat(segment, REFINEMENT)
     s = (begin[:, None] + length[:, None] * (np.arange(REFINEMENT) + 0.5) / REFINEMENT).ravel()
     states, waypoints = _interpolate_states(path, segment, s)
@@ -72,41 +69,31 @@ def find_segment_contacts(problem: TrajectoryProblem, z: Floats) -> SegmentConta
     # The start may be close to something, so only collisions count in the first segment.
     found = found.select(np.flatnonzero((segment[found.waypoint] > 0) | (found.distance < 0)))
     margin = np.minimum(SEGMENT_MARGIN, found.margin)
-    joints = contacts.get_joints(found.pair)
-    rotations, translations = contacts.compute_placements(states[found.waypoint])
-    ends = problem.chain.joint_placements(path)
+    joints, contact = contacts.get_joints(found.pair).T, np.arange(len(margin))
+    R, p = contacts.compute_placements(states[found.waypoint])
+    witnesses = [  # in the frames of their bodies
+        (j, np.einsum("cji,cj->ci", R[contact, j], point - p[contact, j]))
+        for j, point in zip(joints, (found.first, found.second), strict=True)
+    ]
+    R, p = problem.chain.joint_placements(path)
     parts = []
     for offset in (0, 1):
-        waypoint = segment[found.waypoint] + offset
-        points = []
-        for column, witness in ((0, found.first), (1, found.second)):
-            j, contact = joints[:, column], np.arange(len(joints))
-            local = np.einsum(
-                "cji,cj->ci", rotations[contact, j], witness - translations[contact, j]
-            )
-            points.append(
-                np.einsum("cij,cj->ci", ends[0][waypoint, j], local) + ends[1][waypoint, j]
-            )
-        value = np.einsum("ci,ci->c", found.normal, points[1] - points[0])
-        inside = waypoint > 0  # the start is fixed
-        part = Contacts(
-            waypoint - 1,
-            found.pair,
-            value,
-            value + margin - found.distance,
-            found.normal,
-            points[0],
-            points[1],
+        t = segment[found.waypoint] + offset
+        first, second = (
+            np.einsum("cij,cj->ci", R[t, j], local) + p[t, j] for j, local in witnesses
         )
-        parts.append(part.select(np.flatnonzero(inside)))
+        value = np.einsum("ci,ci->c", found.normal, second - first)
+        required = value + margin - found.distance
+        part = Contacts(t - 1, found.pair, value, required, found.normal, first, second)
+        parts.append(part.select(np.flatnonzero(t > 0)))  # the start is fixed
     is_free = bool(np.all(found.distance >= np.minimum(CLEARANCE_TOLERANCE, margin)))
     return SegmentContacts(merge_contacts(*parts), is_free, crossings)
 
 
 def _interpolate_states(path: Floats, segment: Ints, s: Floats) -> tuple[Floats, Ints]:
     """Return states at 0 < s < 1 of segments, and the waypoints that determine their phases."""
-    share = s[:, None]
-    return (1 - share) * path[segment] + share * path[segment + 1], segment + 1
+    s = s[:, None]
+    return (1 - s) * path[segment] + s * path[segment + 1], segment + 1
 
 
 def _select_deepest(found: Contacts, segment: Ints) -> Contacts:
@@ -119,7 +106,6 @@ def _select_deepest(found: Contacts, segment: Ints) -> Contacts:
 
 def merge_contacts(*parts: Contacts) -> Contacts:
     """Concatenate contacts and sort them by waypoint, largest margin violation first."""
-    merged = Contacts(
-        *(np.concatenate(arrays) for arrays in zip(*(part.arrays() for part in parts), strict=True))
-    )
+    arrays = zip(*(part.arrays() for part in parts), strict=True)
+    merged = Contacts(*map(np.concatenate, arrays))
     return merged.select(np.lexsort((merged.distance - merged.margin, merged.waypoint)))

@@ -60,32 +60,22 @@ def make_linear_solver_options() -> dict[str, Any]:
 
 
 class Step(NamedTuple):
-    """Solution of a subproblem.
+    """Solution of a subproblem."""
 
-    Attributes:
-        z: z_1..z_N, shape (N, n).
-        slack: Clearance violation at each waypoint according to the planes, shape (N,) [m].
-        relaxation: Fraction of the other violations that remains, shape (N,).
-        succeeded: Whether Ipopt reported success.
-    """
-
-    z: Floats
-    slack: Floats
-    relaxation: Floats
-    succeeded: bool
+    z: Floats  # z_1..z_N, shape (N, n)
+    slack: Floats  # clearance violation per waypoint according to the planes, shape (N,) [m]
+    relaxation: Floats  # fraction of the other violations that remains, shape (N,)
+    succeeded: bool  # whether Ipopt reported success
 
 
 class Subproblem:
     """Solves the subproblems of one problem with Ipopt, with warm starts from round to round.
 
-    Args:
-        problem: Problem.
-        solution: Record of iterations and times.
+    It adds its iterations and times to `solution`.
     """
 
     def __init__(self, problem: TrajectoryProblem, solution: Solution) -> None:
         self.problem, self.solution = problem, solution
-        self._targets = problem.target_matrix()
         self._multipliers: dict[str, Any] = {}
 
     def reset_multipliers(self) -> None:
@@ -109,8 +99,8 @@ class Subproblem:
             z: Iterate z_1..z_N, shape (N, n).
             at: Contacts of the iterate.
             found: Constraint violations of the iterate.
-            merit: Merit function with its penalty weights.
-            timing: Time steps.
+            merit: Merit function.
+            timing: Step durations.
             radius: Trust-region radius at each waypoint, shape (N,) [m] or [rad].
             rates: Whether velocity and acceleration limits are constraints.
         """
@@ -118,51 +108,42 @@ class Subproblem:
         begin = time.perf_counter()
         planes, offsets = problem.contacts.compute_planes(z, at, slots=t.slots)
         self.solution.timings["coal"] += time.perf_counter() - begin
-        lower, upper = (
-            np.maximum(problem.lower, z - radius[:, None]),
-            np.minimum(problem.upper, z + radius[:, None]),
-        )
-        bounds = problem.row_bounds(timing if rates else None)
+        lower = np.maximum(problem.lower, z - radius[:, None])
+        upper = np.minimum(problem.upper, z + radius[:, None])
+        lbg, ubg = problem.row_bounds(timing if rates else None)
         relaxed = found.max_violation > TOLERANCE
         # While rows are relaxed, those of the last round differ and its solution need not be exact.
         if relaxed:
             self.reset_multipliers()
         mode = _ROUGH if relaxed else _WARM if self._multipliers else {}
-        options = {
-            "ipopt.max_iter": problem.options.max_iterations,
-            **make_linear_solver_options(),
-            **_IPOPT,
-            **mode,
-        }
+        iterations = {"ipopt.max_iter": problem.options.max_iterations}
+        options = {**iterations, **make_linear_solver_options(), **_IPOPT, **mode}
         solver = t.solver(rates=rates, options=options)
         penalties = merit.compute_penalty(found, clearance=False)
         relaxation = np.where(relaxed & (penalties > 0.0), 1.0, 0.0)
         parameters = t.parameter_vector(
-            problem.start,
-            planes,
-            offsets,
-            self._targets,
-            weights=problem.motion_cost.weights(*problem.rates(z)),
+            planes=planes,
+            offsets=offsets,
             penalty=merit.weights["clearance"],
             dt=timing.dt,
             pose_offsets=found.pose_offsets,
             excess=found.excess,
             relaxation_weights=penalties,
-            gears=problem.rolling.compute_gears(problem.waypoints(z)),
+            **problem.parameters_at(z),
         )
         shortfall = compute_shortfalls(at, t.segments, t.slots)
         # Planes whose margin holds get no slack: it must hold after the step, too.
         slack_limit = np.where(shortfall > 0.0, np.inf, 0.0)
-        arguments = {
-            "x0": t.pack(z, shortfall, relaxation),
-            "lbx": t.pack(lower),
-            "ubx": t.pack(upper, slack_limit, relaxation),
-            "lbg": bounds[0],
-            "ubg": bounds[1],
-            "p": np.concatenate([parameters, found.rate_excess]),
-        }
         begin = time.perf_counter()
-        result = solver(**arguments, **self._multipliers)
+        result = solver(
+            x0=t.pack(z, shortfall, relaxation),
+            lbx=t.pack(lower),
+            ubx=t.pack(upper, slack_limit, relaxation),
+            lbg=lbg,
+            ubg=ubg,
+            p=np.concatenate([parameters, found.rate_excess]),
+            **self._multipliers,
+        )
         total = time.perf_counter() - begin
         self.solution.timings["casadi"] += solver.evaluation_time
         self.solution.timings["ipopt"] += total - solver.evaluation_time

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from vkc_pin.planning.chain.contacts import Contacts
-from vkc_pin.planning.nlp.merit import Infeasibility
-from vkc_pin.planning.solver.tunnelling import Crossing
 from vkc_pin.utils.arrays import Floats
 
-__all__ = ["Trial", "TrustRegion", "is_step_acceptable"]
+__all__ = ["TrustRegion", "is_step_acceptable"]
 
 BLOCK_TIME = 2.5  # [s] of motion that share a radius, at one waypoint per `Options.dt`
 FIRST_RADIUS = 0.5  # [m], [rad] initial radius, also after the penalty weights were raised
@@ -24,37 +19,6 @@ SHRINK = 0.4  # factor on the smaller of radius and step where the prediction wa
 NEGLIGIBLE_CHANGE = 0.4
 # [m] shortfall at a waypoint, clearance within segments, and steps (also [rad]) that are negligible
 CLEARANCE_TOLERANCE = 5e-4
-
-
-@dataclass(frozen=True)
-class Trial:
-    """Trial point of a round: the solution of the subproblem with fixed planes, evaluated exactly.
-
-    Attributes:
-        z: z_1..z_N, shape (N, n).
-        predicted_penalty: Penalty at each waypoint that the subproblem predicts, shape (N,).
-        objective: f of eq. 1.
-        pose_error: Largest residual, see `TrajectoryProblem.row_error`.
-        infeasibility: Constraint violations.
-        contacts: Close pairs.
-        is_clear: Whether all clearances hold, also within segments.
-        crossings: Pairs that pass through each other between waypoints.
-        rate_excess: Largest violation of a velocity or acceleration limit, relative to the limit.
-        step: Largest coordinate change at each waypoint, shape (N,) [m] or [rad].
-        succeeded: Whether Ipopt reported success.
-    """
-
-    z: Floats
-    predicted_penalty: Floats
-    objective: float
-    pose_error: float
-    infeasibility: Infeasibility
-    contacts: Contacts
-    is_clear: bool
-    crossings: list[Crossing]
-    rate_excess: float
-    step: Floats
-    succeeded: bool
 
 
 class TrustRegion:
@@ -76,48 +40,44 @@ class TrustRegion:
         self.block = np.arange(segments) * max(1, round(segments / length)) // segments
         self.radius = np.full(segments, FIRST_RADIUS) if radius is None else radius.copy()
 
-    def adapt(self, before: Floats, after: Floats, trial: Trial, accepted: bool) -> None:
+    def adapt(self, predicted: Floats, actual: Floats, step: Floats, accepted: bool) -> None:
         """Widen blocks in which the prediction was good, shrink those in which it was poor.
 
         Args:
-            before: Penalties of the iterate, shape (N,).
-            after: Penalties of the trial, shape (N,).
-            trial: Trial point.
-            accepted: Whether the trial was accepted.
+            predicted: Predicted penalty reduction at each waypoint, shape (N,).
+            actual: Actual penalty reduction, shape (N,).
+            step: Largest coordinate change at each waypoint, shape (N,) [m] or [rad].
+            accepted: Whether the step was accepted.
         """
         blocks = int(self.block[-1]) + 1
-        predicted, actual, step = np.zeros(blocks), np.zeros(blocks), np.zeros(blocks)
-        np.add.at(predicted, self.block, before - trial.predicted_penalty)
-        np.add.at(actual, self.block, before - after)
-        np.maximum.at(step, self.block, trial.step)
-        poor = (predicted - actual > NEGLIGIBLE_CHANGE) & (actual < 0.25 * predicted)
+        gain, expected, size = np.zeros(blocks), np.zeros(blocks), np.zeros(blocks)
+        np.add.at(expected, self.block, predicted)
+        np.add.at(gain, self.block, actual)
+        np.maximum.at(size, self.block, step)
+        poor = (expected - gain > NEGLIGIBLE_CHANGE) & (gain < 0.25 * expected)
         if not accepted and not poor.any():
             poor[:] = True
         radius = np.array([self.radius[self.block == b][0] for b in range(blocks)])
-        good = (
-            (actual > 0.7 * predicted - NEGLIGIBLE_CHANGE)
-            & accepted
-            & (step > ACTIVE_FRACTION * radius)
-        )
-        factor = np.where(good, 1.5, 1.0)
-        radius = np.where(poor, SHRINK * np.minimum(radius, step), radius * factor)
+        good = (gain > 0.7 * expected - NEGLIGIBLE_CHANGE) & (size > ACTIVE_FRACTION * radius)
+        widened = np.where(good & accepted, 1.5, 1.0) * radius
+        radius = np.where(poor, SHRINK * np.minimum(radius, size), widened)
         self.radius = np.maximum(radius, 1e-6)[self.block]
 
     def limit(self) -> None:
-        """Limit the radii to `SETTLE_RADIUS`, within which the planes are accurate."""
+        """Limit the radii to `SETTLE_RADIUS`."""
         self.radius = np.minimum(self.radius, SETTLE_RADIUS)
 
-    def has_stalled(self, trial: Trial, shortfall: Floats) -> bool:
-        """Return whether the waypoints that lack clearance no longer move.
+    def has_stalled(self, step: Floats, shortfall: Floats) -> bool:
+        """Return whether the waypoints that lack clearance, or else all, no longer move.
 
         Args:
-            trial: Last trial point.
+            step: Largest coordinate change at each waypoint, shape (N,) [m] or [rad].
             shortfall: Clearance violation at each waypoint, shape (N,) [m].
         """
         violated = shortfall > CLEARANCE_TOLERANCE
         if not violated.any():
             violated[:] = True
-        return bool((np.minimum(self.radius, trial.step)[violated] < CLEARANCE_TOLERANCE).all())
+        return bool((np.minimum(self.radius, step)[violated] < CLEARANCE_TOLERANCE).all())
 
     def reset(self) -> None:
         """Reset all radii to `FIRST_RADIUS`."""

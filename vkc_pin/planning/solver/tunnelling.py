@@ -14,13 +14,7 @@ __all__ = ["Crossing", "find_crossings", "find_new_crossings"]
 
 
 class Crossing(NamedTuple):
-    """A pair of geometries that pass through each other, and the segments in which they do.
-
-    Attributes:
-        pair: Geometry indices.
-        first: First segment, from 0.
-        last: Last segment.
-    """
+    """Indices of two geometries that pass through each other in segments `first` to `last`."""
 
     pair: tuple[int, int]
     first: int
@@ -54,21 +48,20 @@ def find_crossings(
     # Geometry indices are valid within one phase only.
     inside = inside[phases[before[inside]] == phases[after[inside]]]
     before, after, pairs = before[inside], after[inside], pairs[inside]
-    normals_before, normals_after = (
+    normals = (
         contacts.compute_normals(states[rows], segments[rows] + 1, pairs)
         for rows in (before, after)
     )
-    through = np.einsum("ci,ci->c", normals_before, normals_after) < 0.0
-    parts = zip(
-        pairs[through].tolist(),
-        segments[before[through]].tolist(),
-        segments[after[through]].tolist(),
-        strict=True,
-    )
-    return [Crossing((first, second), begin, end) for (first, second), begin, end in parts]
+    through = np.flatnonzero(np.einsum("ci,ci->c", *normals) < 0.0)
+    return [
+        Crossing((int(pairs[k, 0]), int(pairs[k, 1])), int(first), int(last))
+        for k, first, last in zip(
+            through, segments[before[through]], segments[after[through]], strict=True
+        )
+    ]
 
 
 def find_new_crossings(crossings: Sequence[Crossing], before: Sequence[Crossing]) -> list[Crossing]:
-    """Return the crossings of pairs that did not pass through each other `before`."""
+    """Return the crossings of pairs without any crossing `before`."""
     known = {crossing.pair for crossing in before}
     return [crossing for crossing in crossings if crossing.pair not in known]

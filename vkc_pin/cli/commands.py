@@ -126,7 +126,7 @@ def _new_folders(arguments: argparse.Namespace) -> dict[str, str | Path]:
     for option, path in folders.items():
         if Path(path).exists():
             raise InputError(
-                "this is there already", file=path, field=f"--{option}", expected="a new folder"
+                "this already exists", file=path, field=f"--{option}", expected="a new folder"
             )
         import_rosbags()
     return {f"--{option}": Path(path, "metadata.yaml") for option, path in folders.items()}

@@ -64,9 +64,6 @@ def check_number(
         low: Smallest valid number.
         high: Largest valid number.
         strict: Exclude `low` itself.
-
-    Raises:
-        InputError: The value is not a finite number, or out of range.
     """
     if isinstance(value, np.ndarray) and value.ndim == 0 and value.dtype.kind in "iuf":
         value = value.item()
@@ -83,11 +80,7 @@ def check_number(
 
 
 def check_coordinate(value: Any, field: str) -> float:
-    """Return a length [m] or angle [rad] of magnitude up to `MAX_COORDINATE`.
-
-    Raises:
-        InputError: The value is not such a number.
-    """
+    """Return a length [m] or angle [rad] of magnitude up to `MAX_COORDINATE`."""
     expected = f"a number from {-MAX_COORDINATE:g} to {MAX_COORDINATE:g}"
     found = check_number(value, field, expected)
     if abs(found) > MAX_COORDINATE:
@@ -96,11 +89,7 @@ def check_coordinate(value: Any, field: str) -> float:
 
 
 def check_integer(value: Any, field: str, *, low: int, high: int = 2**63 - 1) -> int:
-    """Return an integer from `low` to `high`.
-
-    Raises:
-        InputError: The value is not such an integer.
-    """
+    """Return an integer from `low` to `high`."""
     is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not is_integer or not low <= value <= high:
         bounds = f"of at least {low}" if high == 2**63 - 1 else f"from {low} to {high}"
@@ -118,9 +107,6 @@ def check_array(
         field: Name of the argument.
         expected: Valid values, for the message.
         problem: Problem with other values, for the message.
-
-    Raises:
-        InputError: The value is not an array of real numbers.
     """
     try:
         array = np.asarray(value)
@@ -132,11 +118,7 @@ def check_array(
 
 
 def check_finite_array(value: Any, field: str, file: str | Path | None = None) -> Floats:
-    """Return a copy of an array of finite numbers; see `check_array`.
-
-    Raises:
-        InputError: A number is not finite, with its index, or as in `check_array`.
-    """
+    """Return a copy of an array of finite numbers; see `check_array`."""
     array = check_array(value, field)
     if not np.isfinite(array).all():
         where = np.argwhere(~np.isfinite(array))[0].tolist()
@@ -151,11 +133,7 @@ def check_finite_array(value: Any, field: str, file: str | Path | None = None) -
 
 
 def check_text(value: Any, field: str, expected: str = "text") -> str:
-    """Return text that UTF-8 can encode: half of a surrogate pair cannot be written to a file.
-
-    Raises:
-        InputError: The value is not such a text.
-    """
+    """Return text that UTF-8 can encode: half of a surrogate pair cannot be written to a file."""
     try:
         if isinstance(value, str):
             value.encode("utf-8")
@@ -173,12 +151,7 @@ def check_bool(value: Any, field: str) -> bool:
 
 
 def check_choice(value: Any, choices: Collection[str], kind: str, field: str | None = None) -> str:
-    """Return a name that is one of `choices`, which name things of a `kind`.
-
-    Raises:
-        InputError: The value is not text.
-        UnknownNameError: The name is not one of them.
-    """
+    """Return a name that is one of `choices`, the names of a `kind`."""
     name = check_text(value, field or kind, f"the name of a {kind}")
     if name not in choices:
         raise UnknownNameError(kind, name, choices, field=field)
@@ -215,9 +188,6 @@ def check_list(
         field: Its name.
         expected: Valid values, for the message.
         kind: Type of its entries. Default: any.
-
-    Raises:
-        InputError: The value is not a list, or an entry has another type.
     """
     is_list = isinstance(value, Sequence | Iterator | KeysView | ValuesView) and not isinstance(
         value, str | bytes | bytearray

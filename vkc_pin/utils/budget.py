@@ -31,7 +31,7 @@ STOP_STATUSES: tuple[StopStatus, ...] = get_args(StopStatus)
 
 
 class BudgetExhaustedError(Exception):
-    """The budget is exhausted: a limit, its `status`, is reached. Planning returns its best result."""
+    """The limit `status` of the budget is reached. Planning returns its best result."""
 
     def __init__(self, status: StopStatus) -> None:
         super().__init__(status)

@@ -179,7 +179,7 @@ def test_folders_are_written_completely_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError), write_folder_atomically(target, force=True) as staging:
         (staging / "none" / "b").write_text("2", encoding="utf-8")
     assert (target / "a").read_text() == "1"
-    with pytest.raises(InputError, match="there already"), write_folder_atomically(target):
+    with pytest.raises(InputError, match="already exists"), write_folder_atomically(target):
         pass
     with write_folder_atomically(target, force=True) as staging:
         (staging / "b").write_text("2", encoding="utf-8")

@@ -87,7 +87,7 @@ public:
     for (std::size_t k = 0; k < which.shape(0); ++k)
     {
       if (which(k) < Index(pairs_->moving) || which(k) >= Index(turns_.size()))
-        throw std::out_of_range("not a shape that stands");
+        throw std::out_of_range("not a fixed shape");
       other.turns_[which(k)] = matrix_at(rotations.data() + 9 * k);
       other.centers_[which(k)] = vector_at(centers.data() + 3 * k);
     }

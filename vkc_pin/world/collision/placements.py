@@ -33,9 +33,6 @@ class ShapePlacements:
     Args:
         model: The model.
         geometry: The M shapes on its joints.
-
-    Raises:
-        BuildError: See `solids.load_compiled`.
     """
 
     def __init__(self, model: pin.Model, geometry: pin.GeometryModel) -> None:

@@ -140,7 +140,7 @@ public:
   Shapes(const std::vector<Solid> & solids, const Numbers<2> & standing, double tolerance)
   {
     if (standing.shape(1) != PLACEMENT || standing.shape(0) > solids.size())
-      throw std::invalid_argument("placements of what stands are of shape (S, 12), S no more than there are shapes");
+      throw std::invalid_argument("placements of fixed shapes are of shape (S, 12), with at most as many shapes");
     for (const auto & solid : solids)
       shapes_.push_back(solid.geometry);
     moving_ = shapes_.size() - standing.shape(0);
@@ -157,7 +157,7 @@ public:
     for (std::size_t k = 0; k < which.shape(0); ++k)
     {
       if (which(k) < Index(moving_) || which(k) >= Index(shapes_.size()))
-        throw std::out_of_range("not a shape that stands");
+        throw std::out_of_range("not a fixed shape");
       other.standing_[which(k) - moving_] = transform(where.data() + PLACEMENT * k);
     }
     return other;
@@ -258,7 +258,7 @@ private:
   void check(const Numbers<3> & moving, const Indices<2> & pairs) const
   {
     if (moving.shape(1) != moving_ || moving.shape(2) != PLACEMENT)
-      throw std::invalid_argument("placements of what moves are of shape (W, M, 12)");
+      throw std::invalid_argument("placements of moving shapes are of shape (W, M, 12)");
     if (pairs.shape(1) != 2)
       throw std::invalid_argument("pairs are of shape (n, 2)");
     const Index * shape = pairs.data();

@@ -49,9 +49,6 @@ class Shapes:
             coal's default of 1e-6, they are off by up to 5e-3. Both take the same time. EPA keeps
             its default, since below 1e-6 it fails for cylinders.
         threads: Maximum number of threads. Default: `threads.count_threads`.
-
-    Raises:
-        InputError: A shape is of an unsupported type; see `solids.convert_solid`.
     """
 
     def __init__(

@@ -20,12 +20,7 @@ __all__ = ["convert_solid", "load_compiled"]
 
 @cache
 def load_compiled() -> Any:
-    """Return the compiled module, after importing coal and Pinocchio, whose libraries it uses.
-
-    Raises:
-        BuildError: The module is missing, or was compiled against another release of coal or
-            Pinocchio than the installed one.
-    """
+    """Return the compiled module, after importing coal and Pinocchio, whose libraries it uses."""
     module = import_compiled("vkc_pin.world.collision._distances")
     for package, version, installed in (
         ("coal", module.COAL_VERSION, coal.__version__),
@@ -45,10 +40,6 @@ def convert_solid(shape: coal.CollisionGeometry) -> Any:
     """Return a coal shape as an object of the compiled module, with its swept sphere radius.
 
     Convex shapes and meshes are cached as long as the shape lives and its points do not change.
-
-    Raises:
-        InputError: The shape is of an unsupported type.
-        BuildError: See `load_compiled`.
     """
     if isinstance(shape, coal.Convex):
         return _convert_cached(

@@ -22,9 +22,9 @@ public:
   : lower_(lower), upper_(upper), standing_lower_(standing_lower), standing_upper_(standing_upper), moving_(lower.shape(1))
   {
     if (lower.shape(2) != 3 || upper.shape(0) != lower.shape(0) || upper.shape(1) != moving_ || upper.shape(2) != 3)
-      throw std::invalid_argument("corners of what moves are of shape (W, M, 3)");
+      throw std::invalid_argument("corners of moving shapes are of shape (W, M, 3)");
     if (standing_lower.shape(1) != 3 || standing_upper.shape(0) != standing_lower.shape(0) || standing_upper.shape(1) != 3)
-      throw std::invalid_argument("corners of what stands are of shape (S, 3)");
+      throw std::invalid_argument("corners of fixed shapes are of shape (S, 3)");
   }
 
   // Returns all (interval, pair), sorted by interval, whose distance may be less than `limit` [m]
@@ -60,9 +60,9 @@ private:
   {
     const std::size_t count = stretches.shape(0), shapes = moving_ + standing_lower_.shape(0);
     if (stretches.shape(1) != 2 || phases.shape(0) != count || moved.shape(0) != count)
-      throw std::invalid_argument("a stretch is two states, with a phase and what moves how far in it");
+      throw std::invalid_argument("an interval has two states, a phase, and the motion of each shape");
     if (moves.shape(1) != shapes || moved.shape(1) != shapes || pairs.shape(1) != 2)
-      throw std::invalid_argument("what moves is told of each shape, and pairs are of two");
+      throw std::invalid_argument("moves has a column for each shape, and pairs have two shapes");
     const auto inside = [](const Index * first, const Index * last, std::size_t most) {
       return std::all_of(first, last, [most](Index i) { return i >= 0 && static_cast<std::size_t>(i) < most; });
     };
@@ -76,11 +76,11 @@ private:
   Box box(std::size_t state, std::size_t shape) const
   {
     Box found;
-    const bool stands = shape >= moving_;
+    const bool is_fixed = shape >= moving_;
     for (std::size_t axis = 0; axis < 3; ++axis)
     {
-      found.lower[axis] = stands ? standing_lower_(shape - moving_, axis) : lower_(state, shape, axis);
-      found.upper[axis] = stands ? standing_upper_(shape - moving_, axis) : upper_(state, shape, axis);
+      found.lower[axis] = is_fixed ? standing_lower_(shape - moving_, axis) : lower_(state, shape, axis);
+      found.upper[axis] = is_fixed ? standing_upper_(shape - moving_, axis) : upper_(state, shape, axis);
     }
     return found;
   }

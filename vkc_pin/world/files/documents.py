@@ -129,12 +129,7 @@ class Document:
 
 
 def read_bytes(file: str | Path, kind: str, largest: int | None = None) -> bytes:
-    """Return the contents of a file of a `kind` ("YAML", "URDF", "plan").
-
-    Raises:
-        InputError: The path is not a readable file, or the file has more than `largest` bytes
-            (default: `MAX_FILE_SIZE`).
-    """
+    """Return a file of a `kind` ("YAML", "plan"), up to `largest` or `MAX_FILE_SIZE` bytes."""
     path, expected = Path(file), f"an existing {kind} file"
     largest = MAX_FILE_SIZE if largest is None else largest
     try:
@@ -162,11 +157,7 @@ def read_bytes(file: str | Path, kind: str, largest: int | None = None) -> bytes
 
 
 def read_text(file: str | Path, kind: str, largest: int | None = None) -> str:
-    """Return the contents of a text file; see `read_bytes`.
-
-    Raises:
-        InputError: The file cannot be read, or is not encoded in UTF-8.
-    """
+    """Return the contents of a text file; see `read_bytes`."""
     try:
         return read_bytes(file, kind, largest).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -177,11 +168,7 @@ def read_text(file: str | Path, kind: str, largest: int | None = None) -> str:
 
 
 def parse_json(text: str, file: str | Path) -> Any:
-    """Return the data of a JSON text.
-
-    Raises:
-        InputError: The text is not JSON, or exceeds `MAX_FIELDS` or `MAX_DEPTH`.
-    """
+    """Return the data of a JSON text."""
     many = text.count("[") + text.count(
         "{"
     )  # before they are made: each takes twenty times its text
@@ -211,12 +198,7 @@ def parse_json(text: str, file: str | Path) -> Any:
 
 
 def read_yaml(file: str | Path) -> Document:
-    """Read a YAML file, with the line of every field.
-
-    Raises:
-        InputError: The file cannot be read, is not YAML, has a key twice, or exceeds `MAX_FIELDS`
-            or `MAX_DEPTH`.
-    """
+    """Read a YAML file, with the line of every field."""
     path = Path(file)
     text = read_text(path, "YAML")
     loader_type = getattr(
@@ -245,12 +227,7 @@ def read_yaml(file: str | Path) -> Document:
 
 
 def parse_document(document: Document, schema: type[T]) -> T:
-    """Return `document` as an instance of `schema`.
-
-    Raises:
-        InputError: A field is invalid; the error is about the first one in the file.
-        UnknownNameError: A name is unknown.
-    """
+    """Return `document` as an instance of `schema`."""
     _check_plain(document)
     try:
         return schema.model_validate(document.data)

@@ -34,9 +34,7 @@ def make_validation_error(problem: str, expected: str) -> PydanticCustomError:
 
 
 def _reject_bool(value: Any) -> Any:
-    if isinstance(
-        value, bool
-    ):  # YAML turns yes, no, on, off into booleans, and pydantic those into 1 and 0
+    if isinstance(value, bool):  # YAML reads yes and no as booleans, pydantic those as 1 and 0
         raise make_validation_error("wrong value", "a number")
     return value
 
@@ -44,12 +42,12 @@ def _reject_bool(value: Any) -> Any:
 def require(holds: Callable[[Any], object], problem: str, expected: str) -> AfterValidator:
     """Return a validator that rejects values for which `holds` is false."""
 
-    def required(value: Any) -> Any:
+    def check(value: Any) -> Any:
         if not holds(value):
             raise make_validation_error(problem, expected)
         return value
 
-    return AfterValidator(required)
+    return AfterValidator(check)
 
 
 def wrap_text(field: str) -> BeforeValidator:
@@ -60,14 +58,14 @@ def wrap_text(field: str) -> BeforeValidator:
 def require_length(number: int) -> BeforeValidator:
     """Return a validator for lists of `number` values, since pydantic's error lacks the number."""
 
-    def counted(value: Any) -> Any:
+    def check(value: Any) -> Any:
         if not isinstance(value, list | tuple):
             raise make_validation_error("wrong value", f"a list of {number} values")
         if len(value) != number:
             raise make_validation_error("wrong number of values", f"{number} values")
         return value
 
-    return BeforeValidator(counted)
+    return BeforeValidator(check)
 
 
 _IN_RANGE = require(
@@ -97,11 +95,11 @@ def _normalize_quaternion(value: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(number / norm for number in value)
 
 
-_NORM_TOLERANCE = 1e-3  # by which a quaternion may miss length 1: files have three decimals
+_NORM_TOLERANCE = 1e-3  # of lengths of quaternions: files have three decimals
 Quaternion = Annotated[
     tuple[Number, Number, Number, Number], require_length(4), AfterValidator(_normalize_quaternion)
 ]
-"""A rotation as a unit quaternion, the scalar last: [x, y, z, w]; normalised."""
+"""Unit quaternion [x, y, z, w]."""
 
 
 class Schema(BaseModel):

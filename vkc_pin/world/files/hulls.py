@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["SHEET_THICKNESS", "compute_hull", "compute_outer_hull", "thicken"]
 
 SHEET_THICKNESS = 1e-3
-"""What a part gets as thickness that has none [m]: a picture on a wall, a rug, a pane."""
+"""Thickness of flat parts, such as pictures and rugs [m]."""
 _FLATNESS_RATIO = (
     1e-5  # of the largest extent: thinner than 10 µm in a metre is drawn as a sheet, not as a solid
 )
@@ -53,9 +53,6 @@ def compute_hull(points: ArrayLike) -> trimesh.Trimesh:
     It equals `trimesh.convex.convex_hull` bit for bit, except for some thin bodies, for which Qhull
     returns overlapping triangles after scaling to the unit cube; trimesh then needs networkx and
     returns an inverted triangle. Here Qhull runs again without scaling.
-
-    Raises:
-        InputError: The points span no volume.
     """
     from scipy.spatial import ConvexHull, QhullError
 

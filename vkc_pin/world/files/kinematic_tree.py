@@ -15,7 +15,7 @@ from pathlib import Path
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.arrays import MAX_COORDINATE
-from vkc_pin.world.files.xml import find_line, replace_forbidden
+from vkc_pin.world.files.xml import find_line, make_element_error, replace_forbidden
 
 __all__ = [
     "MOMENTS",
@@ -38,37 +38,28 @@ _XACRO_DEFINITIONS = (
 )  # of xacro's elements those that put nothing in their place
 
 
-def _make_error(
-    file: Path, element: ElementTree.Element, problem: str, **details: object
-) -> InputError:
-    return InputError(problem, file=file, line=find_line(element), **details)  # type: ignore[arg-type]
-
-
 def _check_limits(file: Path, name: str, joint: ElementTree.Element) -> None:
     is_limited, limits = joint.get("type") in _LIMITED_TYPES, joint.findall("limit")
     if is_limited and not limits:
         problem = f"a {joint.get('type')} joint without limits"
-        raise _make_error(file, joint, problem, field=name, expected="<limit>")
+        raise make_element_error(file, joint, problem, field=name, expected="<limit>")
     for limit in limits:
         keys = ("lower", "upper", "velocity", "effort")
         lower, upper, _, _ = (_parse_limit(file, name, limit, key)[0] for key in keys)
         if is_limited and lower > upper:
             problem, got = "limits in the wrong order", f"{lower:g} and {upper:g}"
             field, expected = f"{name}: limit", "lower ≤ upper"
-            raise _make_error(file, limit, problem, field=field, expected=expected, got=got)
+            raise make_element_error(file, limit, problem, field=field, expected=expected, got=got)
 
 
 def check_tree(file: Path, root: ElementTree.Element) -> None:
-    """Check that links and joints form one tree, with valid names, types and numbers.
-
-    Raises:
-        InputError: A name, joint or root is invalid, or xacro has not been run.
-        UnknownNameError: A joint names a link that does not exist.
-    """
+    """Check that links and joints form one tree, with valid names, types and numbers."""
     for element in root.iter():
         if element.tag.startswith("xacro:") and element.tag not in _XACRO_DEFINITIONS:
             expected, got = "a plain URDF: xacro FILE > robot.urdf", f"<{element.tag}>"
-            raise _make_error(file, element, "xacro has not been run", expected=expected, got=got)
+            raise make_element_error(
+                file, element, "xacro has not been run", expected=expected, got=got
+            )
     links = _index_by_name(file, root, "link")
     if not links:
         raise InputError("there are no links", file=file, expected="<link> elements")
@@ -79,7 +70,9 @@ def check_tree(file: Path, root: ElementTree.Element) -> None:
         parent, child = (_find_link(file, name, joint, key, links) for key in ("parent", "child"))
         if child in above:
             problem, got = "a link with two parents", f"joints '{above[child][1]}' and '{name}'"
-            raise _make_error(file, joint, problem, field=child, expected="one joint", got=got)
+            raise make_element_error(
+                file, joint, problem, field=child, expected="one joint", got=got
+            )
         above[child] = parent, name
     _check_roots(file, links, above)
 
@@ -161,11 +154,7 @@ def _add_inertial(file: Path, link: ElementTree.Element, inertial: ElementTree.E
 def parse_origin(
     file: Path, element: ElementTree.Element, where: str
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return position [m] and roll, pitch, yaw [rad] of an element's <origin>; zeros without one.
-
-    Raises:
-        InputError: A number is invalid.
-    """
+    """Return position [m] and roll, pitch, yaw [rad] of an element's <origin>, or zeros."""
     if (origin := element.find("origin")) is None:
         return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     position, angles = (
@@ -177,15 +166,11 @@ def parse_origin(
 def parse_inertial(
     file: Path, inertial: ElementTree.Element, where: str
 ) -> tuple[float, tuple[float, ...], tuple[tuple[float, ...], tuple[float, ...]]]:
-    """Return mass [kg], moments [kg·m²] in the order of `MOMENTS`, and origin of an <inertial>.
-
-    Raises:
-        InputError: Mass or moments are missing, or a number is invalid.
-    """
+    """Return mass [kg], moments [kg·m²] in the order of `MOMENTS`, and origin of an <inertial>."""
     mass, inertia = inertial.find("mass"), inertial.find("inertia")
     if mass is None or inertia is None:
         lacks = f"an <inertial> without <{'mass' if mass is None else 'inertia'}>"
-        raise _make_error(file, inertial, lacks, field=where)
+        raise make_element_error(file, inertial, lacks, field=where)
     (weight,) = parse_numbers(file, mass, "value", 1, default=None, where=where)
     moments = tuple(
         parse_numbers(file, inertia, key, 1, default="0", where=where)[0] for key in MOMENTS
@@ -217,9 +202,6 @@ def parse_numbers(
         default: Text for a missing attribute; None: the attribute is required.
         where: Link or joint of the element, for messages.
         largest: Largest valid magnitude.
-
-    Raises:
-        InputError: The attribute has another number of values, or an invalid one.
     """
     text = element.get(key, default)
     try:
@@ -235,7 +217,9 @@ def parse_numbers(
         )
         if values and len(values) == count and all(map(math.isfinite, values)):
             expected = f"at most {largest:g}"
-        raise _make_error(file, element, "wrong numbers", field=field, expected=expected, got=text)
+        raise make_element_error(
+            file, element, "wrong numbers", field=field, expected=expected, got=text
+        )
     return values
 
 
@@ -247,12 +231,12 @@ def _index_by_name(
     for element in root.findall(tag):
         name = element.get("name", "")
         if not name.strip():
-            raise _make_error(
+            raise make_element_error(
                 file, element, f"a {tag} without a name", expected=f'<{tag} name="...">'
             )
         if name in found:
             got = f"lines {find_line(found[name])} and {find_line(element)}"
-            raise _make_error(file, element, f"two {tag}s of one name", field=name, got=got)
+            raise make_element_error(file, element, f"two {tag}s of one name", field=name, got=got)
         found[name] = element
     return found
 
@@ -267,7 +251,7 @@ def _find_link(
     """Return the link that a joint names as its "parent" or "child"."""
     element = joint.find(key)
     if element is None or element.get("link") is None:
-        raise _make_error(
+        raise make_element_error(
             file, joint, "a joint that connects nothing", field=name, expected=f'<{key} link="...">'
         )
     link = element.get("link", "")
@@ -288,14 +272,14 @@ def _check_joint(
     kind = joint.get("type")
     if kind not in _JOINT_TYPES:
         problem, expected = "this joint type is not supported", ", ".join(_JOINT_TYPES)
-        raise _make_error(file, joint, problem, field=name, expected=expected, got=kind)
+        raise make_element_error(file, joint, problem, field=name, expected=expected, got=kind)
     for origin in joint.findall("origin"):
         for key in ("xyz", "rpy"):
             parse_numbers(file, origin, key, 3, default="0 0 0", where=name)
     for axis in joint.findall("axis") if kind not in _TYPES_WITHOUT_AXIS else ():
         if not math.hypot(*parse_numbers(file, axis, "xyz", 3, default="1 0 0", where=name)) > 0.0:
             problem, got = "an axis without direction", axis.get("xyz")
-            raise _make_error(file, axis, problem, field=name, got=got)
+            raise make_element_error(file, axis, problem, field=name, got=got)
     _check_limits(file, name, joint)
     for mimic in joint.findall("mimic"):
         if (followed := mimic.get("joint", "")) not in joints:  # occurs in published robots
@@ -314,14 +298,18 @@ def _check_roots(
     roots = [link for link in links if link not in above]
     if len(roots) > 1:
         problem, got, second = "links that nothing connects", ", ".join(roots[:5]), roots[1]
-        raise _make_error(file, links[second], problem, field=second, expected="one root", got=got)
+        raise make_element_error(
+            file, links[second], problem, field=second, expected="one root", got=got
+        )
     reaches = set(roots)
     for link in links:
         path = list(_walk_to_root(link, above, reaches))
         if path and path[-1] in path[:-1]:
             circle = path[path.index(path[-1]) :]
             problem, got = "links in a circle", " → ".join(circle[::-1])
-            raise _make_error(file, links[link], problem, field=link, expected="a tree", got=got)
+            raise make_element_error(
+                file, links[link], problem, field=link, expected="a tree", got=got
+            )
         reaches.update(path)
 
 

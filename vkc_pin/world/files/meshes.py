@@ -63,9 +63,6 @@ def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.T
     Args:
         path: OBJ, STL, PLY, OFF, glTF or COLLADA file.
         scale: Factor from the file's unit to [m], or one for each axis.
-
-    Raises:
-        InputError: The file cannot be read, or has no triangles.
     """
     import trimesh
 
@@ -84,7 +81,7 @@ def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.T
             mesh = trimesh.load_mesh(file, force="mesh", skip_materials=True)
             if isinstance(mesh, trimesh.Scene):
                 mesh = mesh.to_mesh()
-    except Exception as error:  # every format's reader raises what it likes
+    except Exception as error:  # readers raise any type
         expected = "a COLLADA file" if by_coal else "an OBJ, STL, PLY, OFF, glTF or COLLADA file"
         raise InputError(f"cannot read the mesh: {error}", file=file, expected=expected) from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
@@ -121,14 +118,11 @@ def load_convex(
         path: Mesh file; see `load_mesh`.
         scale: Factor from the file's unit to [m], or one for each axis.
         about: Link or obstacle of the mesh, for warnings and errors.
-
-    Raises:
-        InputError: The mesh cannot be read, or coal's hull is wrong.
     """
     file = check_path(path, "path", "a mesh file")
     if file.is_file():
         stat = file.stat()
-        with contextlib.suppress(InputError):  # said below, with what it is a part of
+        with contextlib.suppress(InputError):  # raised below, with `about`
             kept = _load_hull(
                 file.absolute(),
                 (stat.st_mtime_ns, stat.st_size),
@@ -159,9 +153,6 @@ def make_convex_hull(
         points: The points.
         file: File of the points, for warnings and errors.
         about: Link or obstacle of the points, for warnings and errors.
-
-    Raises:
-        InputError: There are no points, or coal's volume or area is wrong.
     """
     given = np.asarray(points, float)
     if not len(given):
@@ -209,9 +200,6 @@ def load_parts(
         path: Mesh file; see `load_mesh`.
         scale: Factor from the file's unit to [m], or one for each axis.
         detail: Cell size of `simplify_mesh` [m]; 0 keeps all triangles.
-
-    Raises:
-        InputError: The file cannot be read, or has no triangles.
     """
     import trimesh
 

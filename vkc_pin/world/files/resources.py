@@ -50,11 +50,7 @@ def list_resources(kind: str, pattern: str) -> dict[str, Path]:
 
 
 def find_resource(kind: str, pattern: str, name: str, *, noun: str) -> Path:
-    """Return the path of a resource by its name; see `list_resources`.
-
-    Raises:
-        UnknownNameError: There is no such `noun` ("robot", "scene").
-    """
+    """Return the path of a resource by its name; see `list_resources`."""
     found = list_resources(kind, pattern)
     if name not in found:
         raise UnknownNameError(noun, name, found)
@@ -62,11 +58,7 @@ def find_resource(kind: str, pattern: str, name: str, *, noun: str) -> Path:
 
 
 def check_path(value: Any, field: str, expected: str = "a path") -> Path:
-    """Return the path of a file, which need not exist.
-
-    Raises:
-        InputError: The value is not a path, or not a valid one.
-    """
+    """Return the path of a file, which need not exist."""
     if not isinstance(value, str | Path):
         raise InputError("not a path", field=field, expected=expected, got=format_value(value))
     name = str(value)
@@ -82,12 +74,7 @@ def check_path(value: Any, field: str, expected: str = "a path") -> Path:
 
 
 def find_file(name_or_path: str | Path, kind: str, pattern: str, *, noun: str) -> Path:
-    """Return a file by its path (`Path`, slash, or .yaml) or name; see `find_resource`.
-
-    Raises:
-        UnknownNameError: The name is unknown.
-        InputError: The value is not a path.
-    """
+    """Return a file by its path (`Path`, slash, or .yaml) or name; see `find_resource`."""
     path = check_path(name_or_path, noun, f"the name of a {noun}, or a path")
     name = str(name_or_path)
     by_path = isinstance(name_or_path, Path) or name.endswith((".yaml", ".yml")) or "/" in name

@@ -43,11 +43,7 @@ class SrdfGroup:
 
 
 def read_groups(path: str | Path, urdf: ElementTree.Element) -> dict[str, SrdfGroup]:
-    """Return the groups with joints of an SRDF, by name.
-
-    Raises:
-        InputError: The file cannot be read or is not an SRDF.
-    """
+    """Return the groups with joints of an SRDF, by name."""
     above, moved = dict[str, tuple[str, str]](), dict[str, str]()
     for joint in urdf.findall("joint"):
         parent, child = (
@@ -85,10 +81,6 @@ def read_srdf(path: str | Path, *, links: Collection[str]) -> Srdf:
     Args:
         path: The file.
         links: Links of its robot.
-
-    Raises:
-        InputError: The file cannot be read or is not an SRDF.
-        UnknownNameError: The file names an unknown link.
     """
     text, root = read_xml(path, "SRDF")
     allowed = {}

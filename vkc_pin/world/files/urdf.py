@@ -19,7 +19,7 @@ from vkc_pin.world.files import resources
 from vkc_pin.world.files.kinematic_tree import check_tree, parse_numbers, simplify_tree
 from vkc_pin.world.files.meshes import load_convex, load_mesh, make_bvh
 from vkc_pin.world.files.resources import check_path
-from vkc_pin.world.files.xml import find_line, read_xml
+from vkc_pin.world.files.xml import make_element_error, read_xml
 
 if TYPE_CHECKING:
     import trimesh
@@ -59,11 +59,7 @@ class UrdfShape:
     colour: Colour | None = None
 
     def make_solid(self) -> coal.CollisionGeometry:
-        """Return the element as a coal shape in its own frame; meshes become convex hulls.
-
-        Raises:
-            InputError: The mesh cannot be read.
-        """
+        """Return the element as a coal shape in its own frame; meshes become convex hulls."""
         if self.file is not None:
             return load_convex(self.file, self.size, about=self.link)
         kinds = {
@@ -110,11 +106,7 @@ class UrdfFile:
         return tuple(link.get("name", "") for link in self.root.findall("link"))
 
     def read_shapes(self, kind: str) -> list[UrdfShape]:
-        """Return all elements of `kind`, "visual" or "collision".
-
-        Raises:
-            InputError: An element is invalid, or its mesh file does not exist.
-        """
+        """Return all elements of `kind`, "visual" or "collision"."""
         colours = {
             material.get("name", ""): colour
             for material in reversed(list(self.root.iter("material")))  # the first of a name counts
@@ -128,11 +120,7 @@ class UrdfFile:
         return found
 
     def read_shapes_for_model(self, kind: str) -> list[UrdfShape]:
-        """Return the elements of a kind for one model; see `read_shapes`.
-
-        Raises:
-            InputError: There are too many, or one is invalid.
-        """
+        """Return the elements of a kind for one model; see `read_shapes`."""
         shapes = self.read_shapes(kind)
         if len(shapes) > _MAX_SHAPES:
             raise InputError(
@@ -144,11 +132,7 @@ class UrdfFile:
         return shapes
 
     def resolve(self, address: str) -> Path:
-        """Return the file of a mesh's address: `package://NAME/...`, `file://...`, or a path.
-
-        Raises:
-            InputError: The package or file does not exist.
-        """
+        """Return the file of a mesh's address: `package://NAME/...`, `file://...`, or a path."""
         if address.startswith("package://"):
             package, _, inside = address.removeprefix("package://").partition("/")
             folders = [self.packages[package]] if package in self.packages else []
@@ -184,7 +168,8 @@ class UrdfFile:
         geometry = element.find("geometry")
         shape = next(iter(geometry), None) if geometry is not None else None
         if shape is None:
-            raise self._make_error(
+            raise make_element_error(
+                self.path,
                 element,
                 "an element without geometry",
                 field=name,
@@ -220,20 +205,24 @@ class UrdfFile:
             )
         else:
             known = "box, sphere, cylinder, capsule or mesh"
-            raise self._make_error(
-                element, "this shape is not supported", field=name, expected=known, got=shape.tag
+            raise make_element_error(
+                self.path,
+                element,
+                "this shape is not supported",
+                field=name,
+                expected=known,
+                got=shape.tag,
             )
         if min(size) <= 0.0:
-            raise self._make_error(
-                element, "a shape without volume", field=name, expected="sizes above 0", got=size
+            raise make_element_error(
+                self.path,
+                element,
+                "a shape without volume",
+                field=name,
+                expected="sizes above 0",
+                got=size,
             )
         return UrdfShape(link, name, placement, shape.tag, size, colour=colour)
-
-    def _make_error(
-        self, element: ElementTree.Element, problem: str, **details: object
-    ) -> InputError:
-        line = find_line(element)
-        return InputError(problem, file=self.path, line=line, **details)  # type: ignore[arg-type]
 
     def _colour(self, material: ElementTree.Element) -> Colour | None:
         colour = material.find("color")
@@ -259,10 +248,6 @@ def read_urdf(
         path: The file.
         packages: Package name → folder. Others are searched in the folders above the file.
         text: Contents, if not to be read from `path`; meshes are relative to `path` all the same.
-
-    Raises:
-        InputError: The file cannot be read, or is not a valid URDF; see `check_tree`.
-        UnknownNameError: A joint names a link that does not exist.
     """
     file = Path(path)
     text, root = read_xml(file, "URDF", text)
@@ -276,9 +261,6 @@ def build_model(file: UrdfFile, *root: pin.JointModelPlanar | str) -> pin.Model:
     Args:
         file: The URDF.
         *root: A joint that carries the root link, and its name. Default: the root link is fixed.
-
-    Raises:
-        InputError: The file is not a valid URDF.
     """
     text, silent = simplify_tree(file.path, file.root)
     try:
@@ -303,21 +285,16 @@ def load_urdf(
     Args:
         path: The file.
         text: Contents, if they are not to be read from `path`.
-
-    Raises:
-        InputError: The file or a mesh is invalid, or a visible URDF has no collision shapes.
     """
     file = read_urdf(path, text=text)
-    for joint in file.root.findall(
-        "joint"
-    ):  # what Pinocchio would accept with another meaning, or refuse without saying why
-        name, kind, line = joint.get("name"), joint.get("type"), find_line(joint)
+    for joint in file.root.findall("joint"):
+        name, kind = joint.get("name"), joint.get("type")
         if kind not in _JOINT_TYPES:
             problem, expected = "this joint type is not supported", ", ".join(_JOINT_TYPES)
-            raise InputError(problem, file=path, line=line, field=name, expected=expected, got=kind)
+            raise make_element_error(path, joint, problem, field=name, expected=expected, got=kind)
         if joint.find("mimic") is not None:  # Pinocchio's parser would let it move on its own
             problem = "joints that mimic others are not supported"
-            raise InputError(problem, file=path, line=line, field=name, expected="no <mimic>")
+            raise make_element_error(path, joint, problem, field=name, expected="no <mimic>")
     model = build_model(file)
     collision, visual = (
         _build_geometry(model, file, "collision"),

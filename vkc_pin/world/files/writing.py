@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 MANIFEST = ".vkc-pin.json"
-"""File in every folder of `write_folder_atomically` that lists its other files."""
+"""File that lists the other files in a folder of `write_folder_atomically`."""
 _MAX_NAME_LENGTH = 200  # bytes, so that an ending can be added
 _MAX_LISTED = 3  # files that a message names
 
@@ -38,9 +38,6 @@ def write_atomically(path: str | Path, data: bytes) -> Path:
 
     Missing folders are created, links followed, and the mode of an existing file kept. Ctrl-C is
     deferred.
-
-    Raises:
-        InputError: The path is not that of a file, or cannot be written.
     """
     with _report_path_errors(path):
         target, mode = _resolve_target(path)
@@ -60,11 +57,7 @@ def write_atomically(path: str | Path, data: bytes) -> Path:
 
 
 def check_writable(path: str | Path, *, field: str | None = None) -> Path:
-    """Return the target of `write_atomically`.
-
-    Raises:
-        InputError: The path, which `field` names, cannot be written.
-    """
+    """Return the target of `write_atomically`."""
     with _report_path_errors(path, field):
         target, _ = _resolve_target(path)
         place, missing = target.parent, [target.name]
@@ -93,9 +86,6 @@ def check_outputs(
     Args:
         files: Option or argument → output file.
         inputs: Option or argument → input file, which must not be written.
-
-    Raises:
-        InputError: A file cannot be written, is named twice, or is needed as a folder as well.
     """
     taken = {
         Path(os.path.realpath(check_path(path, field))): field
@@ -131,9 +121,6 @@ def check_name(name: object, field: str, *, file: str | Path | None = None) -> s
         name: Name of a file or folder.
         field: Field or argument of the name, for the error.
         file: File of the name, for the error.
-
-    Raises:
-        InputError: The name is not text, empty, too long, hidden, or has invalid characters.
     """
     plain = isinstance(name, str) and name.isprintable() and not {"/", "\\"} & set(name)
     if (
@@ -149,11 +136,7 @@ def check_name(name: object, field: str, *, file: str | Path | None = None) -> s
 
 
 def check_inside(path: str | Path, folder: str | Path) -> None:
-    """Check that a path in a folder is not a symbolic link to a place outside.
-
-    Raises:
-        InputError: The path leads out of the folder.
-    """
+    """Check that a path in a folder is not a symbolic link to a place outside."""
     root, target = (Path(os.path.realpath(place)) for place in (folder, path))
     if not target.is_relative_to(root):
         expected = f"a path inside {root}"
@@ -163,11 +146,7 @@ def check_inside(path: str | Path, folder: str | Path) -> None:
 
 
 def check_links(folder: str | Path) -> None:
-    """Check that no symbolic link in a folder leads out of it.
-
-    Raises:
-        InputError: A link leads out of the folder, or the folder cannot be read.
-    """
+    """Check that no symbolic link in a folder leads out of it."""
     with _report_path_errors(folder):
         links = [entry.path for entry in _walk_files(folder) if entry.is_symlink()]
     for link in links:
@@ -175,11 +154,7 @@ def check_links(folder: str | Path) -> None:
 
 
 def check_replaceable(folder: str | Path) -> None:
-    """Check that all files in a folder were written by `write_folder_atomically`.
-
-    Raises:
-        InputError: The folder has other files, or cannot be read.
-    """
+    """Check that all files in a folder were written by `write_folder_atomically`."""
     with _report_path_errors(folder):
         found = {os.path.relpath(entry.path, folder) for entry in _walk_files(folder)}
     if others := sorted(found - {MANIFEST} - _read_manifest(Path(folder))):
@@ -222,9 +197,6 @@ def write_folder_atomically(path: str | Path, *, force: bool = False) -> Iterato
     Args:
         path: The folder, created with its parents.
         force: Replace an existing folder that is empty or written by this function.
-
-    Raises:
-        InputError: The folder cannot be created or may not be replaced.
     """
     target = Path(os.path.realpath(check_path(path, "path", "a folder")))
     _check_target(target, path, force)
@@ -250,7 +222,7 @@ def _check_target(target: Path, path: str | Path, force: bool) -> None:
         raise InputError("this is no folder", file=path, expected="a new folder", got="a file")
     if not force:
         expected = "a new folder, or force=True (--force) to replace it"
-        raise InputError("this folder is there already", file=path, expected=expected)
+        raise InputError("this folder already exists", file=path, expected=expected)
     check_replaceable(target)
 
 

@@ -15,6 +15,7 @@ from vkc_pin.world.files.documents import read_text
 __all__ = [
     "check_indices",
     "find_line",
+    "make_element_error",
     "parse_xml",
     "quote",
     "read_xml",
@@ -36,6 +37,13 @@ def find_line(element: ElementTree.Element) -> int | None:
     return getattr(element, "line", None)
 
 
+def make_element_error(
+    file: str | Path, element: ElementTree.Element, problem: str, **details: object
+) -> InputError:
+    """Return an error with the line of an element."""
+    return InputError(problem, file=file, line=find_line(element), **details)  # type: ignore[arg-type]
+
+
 def read_xml(
     file: str | Path, kind: str, text: str | None = None
 ) -> tuple[str, ElementTree.Element]:
@@ -45,9 +53,6 @@ def read_xml(
         file: The file.
         kind: "URDF" or "SRDF".
         text: Contents, if they are not to be read from `file`.
-
-    Raises:
-        InputError: The file cannot be read, is not XML, or has another root element.
     """
     text = read_text(file, kind) if text is None else text
     root = parse_xml(text, Path(file))
@@ -59,11 +64,7 @@ def read_xml(
 
 
 def parse_xml(text: str, file: Path) -> ElementTree.Element:
-    """Return the root of an XML document; `file` is for messages.
-
-    Raises:
-        InputError: The text is not XML, or defines entities, which can expand without bounds.
-    """
+    """Return the root of an XML document; `file` is for messages."""
     builder = ElementTree.TreeBuilder(element_factory=_Element)
     parser = expat.ParserCreate()
 
@@ -100,11 +101,7 @@ def quote(text: str) -> str:
 
 
 def check_indices(file: Path) -> None:
-    """Check that index lists in a COLLADA file hold integers, on which assimp would hang otherwise.
-
-    Raises:
-        InputError: The file has other indices, is not XML, or cannot be read.
-    """
+    """Check that index lists in a COLLADA file hold integers; assimp hangs otherwise."""
     parser, inside = expat.ParserCreate(), list[str]()
 
     def start(tag: str, _: dict[str, str]) -> None:

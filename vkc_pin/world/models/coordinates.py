@@ -1,8 +1,7 @@
 """Maps minimal coordinates z of a Pinocchio model, one per degree of freedom, to its q.
 
 Pinocchio stores a planar joint as (x, y, cos θ, sin θ) and a continuous joint as (cos θ, sin θ).
-Users and the optimizer work with (x, y, θ) and θ. This module converts both ways, for numbers and
-for CasADi symbols.
+Users and the optimizer work with (x, y, θ) and θ. This module converts numbers and CasADi symbols.
 """
 
 from __future__ import annotations
@@ -66,9 +65,6 @@ class Coordinates:
         lower, upper: Position limits, shape (n,), [m] or [rad]; infinite for continuous joints and
             the planar yaw.
         velocity: Velocity limits, shape (n,), [m/s] or [rad/s].
-
-    Raises:
-        InputError: The model has a joint of another type (spherical, composite).
     """
 
     def __init__(self, model: pin.Model) -> None:
@@ -279,11 +275,7 @@ class Coordinates:
         return casadi.vertcat(*entries)
 
     def index(self, name: str) -> int:
-        """Return the index of coordinate `name` in z.
-
-        Raises:
-            UnknownNameError: The coordinate does not exist.
-        """
+        """Return the index of coordinate `name` in z."""
         return self.names.index(check_choice(name, self.names, "coordinate"))
 
 

@@ -224,10 +224,6 @@ def build_object(document: Document, folder: Path, name: str | None = None) -> A
         document: The description.
         folder: Base of relative paths.
         name: Name of the object. Default: the robot name in the URDF.
-
-    Raises:
-        UnknownNameError: The description names an unknown field, link or joint.
-        InputError: The description or its URDF is invalid.
     """
     schema = parse_document(document, ObjectSchema)
     text = schema.urdf if schema.urdf.lstrip().startswith("<") else None

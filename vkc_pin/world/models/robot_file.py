@@ -81,10 +81,6 @@ def find_robot(name: str | Path) -> Path:
     Args:
         name: A name in `list_robots`, or the path of a URDF file, a robot.yaml, or a folder with a
             robot.yaml. Strings with a slash or the suffix of such a file are paths.
-
-    Raises:
-        UnknownNameError: There is no robot of that name.
-        InputError: The file does not exist.
     """
     path = Path(name)
     if isinstance(name, Path) or path.suffix.lower() in (".urdf", ".yaml", ".yml") or "/" in name:

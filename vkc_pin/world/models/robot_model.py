@@ -46,11 +46,7 @@ _GREY = (0.6, 0.6, 0.62, 1.0)
 
 
 def build_full_model(file: UrdfFile) -> pin.Model:
-    """Return the model of all joints of `file` on a planar joint.
-
-    Raises:
-        InputError: The file is not a valid URDF.
-    """
+    """Return the model of all joints of `file` on a planar joint."""
     return build_model(file, pin.JointModelPlanar(), BASE_JOINT)
 
 
@@ -75,9 +71,6 @@ def build_planned_model(
         rest: Position of each locked joint, [m] or [rad]; see `compute_rest_positions`.
         locked: Positions of planned joints to lock as well, [m] or [rad].
         height: Height of the root link above the base joint [m].
-
-    Raises:
-        InputError: No joint is left to plan, or a follower is locked but not its leader.
     """
     follows, groups = find_followers(file.root), find_coupled_groups(full, file, tool_frame)
     groups = {leader: group for leader, group in groups.items() if leader not in locked}
@@ -297,11 +290,7 @@ def find_default_tool_frame(full: pin.Model, file: UrdfFile) -> str:
 
 
 def load_collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
-    """Return the convex collision shapes of `file` on the joints of `model`, named `<link>_<k>`.
-
-    Raises:
-        InputError: A shape or mesh is invalid, or there are no shapes.
-    """
+    """Return the convex collision shapes of `file` on the joints of `model`, named `<link>_<k>`."""
     geometry = pin.GeometryModel()
     for shape in file.read_shapes_for_model("collision"):
         geometry.addGeometryObject(
@@ -322,9 +311,6 @@ def load_visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
 
     Meshes are simplified for display in a browser. `meshPath` is empty, so that viewers draw the
     triangles of the shapes.
-
-    Raises:
-        InputError: A shape is not supported, or a mesh cannot be read.
     """
     geometry = pin.GeometryModel()
     for shape in file.read_shapes_for_model("visual"):

@@ -120,12 +120,7 @@ class RobotSchema(Schema):
 
 
 def read_robot(file: Path) -> tuple[RobotSchema, Document]:
-    """Read a robot.yaml.
-
-    Raises:
-        InputError: The file cannot be read, or a field is invalid; the error names file, line and
-            field.
-    """
+    """Read a robot.yaml."""
     document = read_yaml(file)
     if not isinstance(document.data, dict):
         raise InputError(
@@ -155,9 +150,6 @@ def read_wheels(
         turning_radius: Minimum turning radius of an "ackermann" base [m], or None.
         settings: Contents of the robot.yaml.
         source: Path of the robot.yaml or URDF, for messages.
-
-    Raises:
-        InputError: The radius is invalid, missing for an "ackermann" base, or given for another.
     """
     wheels = settings.base.wheels
     if base != "ackermann":
@@ -195,11 +187,7 @@ def read_wheels(
 
 
 def find_python_packages(names: tuple[str, ...], document: Document) -> dict[str, Path]:
-    """Return the folders of installed Python packages, without importing them.
-
-    Raises:
-        InputError: A package is not installed.
-    """
+    """Return the folders of installed Python packages, without importing them."""
     folders = {}
     for index, name in enumerate(names):
         spec = importlib.util.find_spec(name) if name.isidentifier() else None

@@ -36,11 +36,7 @@ _CIRCLE_SEGMENTS = 28  # segments of a circle
 
 
 def clamp_to_limits(value: float, lower: float, upper: float, field: str | None) -> float:
-    """Return `value`, clamped to its limits if it exceeds them by rounding only.
-
-    Raises:
-        InputError: The value is not finite, or exceeds a limit by more than `LIMIT_SLACK`.
-    """
+    """Return `value`, clamped to its limits if it exceeds them by rounding only."""
     if not np.isfinite(value):
         raise InputError("not a finite number", field=field, expected="a finite number", got=value)
     if not lower - LIMIT_SLACK <= value <= upper + LIMIT_SLACK:
@@ -130,9 +126,6 @@ def triangulate(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64
 
     Returns:
         Vertices, shape (n, 3) [m], and faces, shape (m, 3).
-
-    Raises:
-        InputError: The shape is unbounded (a plane or half-space).
     """
     import trimesh.creation as make
 

@@ -142,7 +142,7 @@ def test_existing_folder_is_kept(plan: Plan, tmp_path: Path) -> None:
     folder = plan.to_rosbag(tmp_path / "deep" / "bag")
     before = sorted((file.name, file.read_bytes()) for file in folder.iterdir())
     assert [name for name, _ in before] == [".vkc-pin.json", "bag.db3", "metadata.yaml"]
-    with pytest.raises(vkc.InputError, match="there already"):
+    with pytest.raises(vkc.InputError, match="already exists"):
         plan.to_rosbag(folder, rate=10.0)
     assert sorted((file.name, file.read_bytes()) for file in folder.iterdir()) == before
     assert (

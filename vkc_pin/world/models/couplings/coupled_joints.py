@@ -8,10 +8,9 @@ from dataclasses import dataclass
 
 import pinocchio as pin
 
-from vkc_pin.errors import InputError
 from vkc_pin.world.files.documents import Document
 from vkc_pin.world.files.urdf import UrdfFile
-from vkc_pin.world.files.xml import find_line
+from vkc_pin.world.files.xml import make_element_error
 from vkc_pin.world.models.robot_schema import CouplingSchema
 
 __all__ = [
@@ -71,12 +70,7 @@ def find_followers(root: ElementTree.Element) -> dict[str, JointCoupling]:
 
 
 def check_followers(full: pin.Model, file: UrdfFile, tool_frame: str) -> None:
-    """Check that the leaders of all joints on the path to the tool exist and can move.
-
-    Raises:
-        InputError: A joint follows one that does not exist or does not move, or couplings are
-            circular.
-    """
+    """Check that the leaders of all joints on the path to the tool exist and can move."""
     mimics, movable, found = (
         _read_mimics(file.root),
         _find_movable_joints(file.root),
@@ -92,27 +86,16 @@ def check_followers(full: pin.Model, file: UrdfFile, tool_frame: str) -> None:
             if chain[-1] in chain[:-1]:
                 problem, got = "couplings are circular", " → ".join(chain)
             else:
-                kind = next(
-                    (
-                        other.get("type")
-                        for other in file.root.findall("joint")
-                        if other.get("name") == chain[-1]
-                    ),
-                    None,
-                )
+                kinds = {j.get("name"): j.get("type") for j in file.root.findall("joint")}
+                kind = kinds.get(chain[-1])
                 problem = "this joint on the path to the tool follows one that cannot move"
                 got = (
                     f"'{chain[-1]}', which does not exist"
                     if kind is None
                     else f"'{chain[-1]}', which is {kind}"
                 )
-            raise InputError(
-                problem,
-                file=file.path,
-                line=find_line(element),
-                field=joint,
-                expected=expected,
-                got=got,
+            raise make_element_error(
+                file.path, element, problem, field=joint, expected=expected, got=got
             )
 
 
@@ -140,10 +123,6 @@ def apply_couplings(
         file: The URDF, changed in place.
         couplings: Follower → coupling.
         document: The robot.yaml, for error messages.
-
-    Raises:
-        UnknownNameError: A joint does not exist.
-        InputError: Couplings are circular.
     """
     movable = _find_movable_joints(file.root)
     for joint, coupling in couplings.items():

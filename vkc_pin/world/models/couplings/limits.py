@@ -33,9 +33,6 @@ def tighten_coupled_limits(full: pin.Model, file: UrdfFile, tool_frame: str) -> 
         full: The robot with all joints.
         file: Its URDF.
         tool_frame: Name of the tool frame.
-
-    Raises:
-        InputError: A leader does not exist or cannot move, or no position satisfies all limits.
     """
     check_followers(full, file, tool_frame)
     groups = find_coupled_groups(full, file, tool_frame)

@@ -35,9 +35,6 @@ def sort_joints(full: pin.Model, before: Mapping[int, Collection[int]]) -> list[
     Args:
         full: The model; its universe is omitted.
         before: Joint → joints that must come before it, such as its leader.
-
-    Raises:
-        InputError: The order is circular: leaders are descendants of each other's followers.
     """
     order, waiting = list[int](), list(range(1, full.njoints))
     while waiting:

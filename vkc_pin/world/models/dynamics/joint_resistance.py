@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.errors import InputError
 from vkc_pin.world.files.documents import Document
 from vkc_pin.world.files.fields import JointSchema, NonNegative, Number
 from vkc_pin.world.files.kinematic_tree import parse_numbers
-from vkc_pin.world.files.xml import find_line, read_xml
+from vkc_pin.world.files.xml import make_element_error, read_xml
 
 __all__ = ["ObjectJointSchema", "Resistance", "read_resistances"]
 
@@ -78,10 +77,6 @@ def read_resistances(
         urdf: Path of the URDF.
         text: Text of the URDF, if it is part of the description.
         names: Names of the movable joints.
-
-    Raises:
-        InputError: A value in the URDF is not a number or negative, or a joint has `springref`
-            without `stiffness`.
     """
     _, root = read_xml(urdf, "URDF", text)
     resistance = dict[str, Resistance]()
@@ -93,18 +88,10 @@ def read_resistances(
             for key in ("friction", "damping"):
                 (stated[key],) = parse_numbers(urdf, dynamics, key, 1, default="0", where=name)
                 if stated[key] < 0.0:
-                    problem, field, line = (
-                        "friction and damping must not be negative",
-                        f"{name}: dynamics {key}",
-                        find_line(dynamics),
-                    )
-                    raise InputError(
-                        problem,
-                        file=urdf,
-                        line=line,
-                        field=field,
-                        expected="0 or more",
-                        got=stated[key],
+                    problem, got = "friction and damping must not be negative", stated[key]
+                    field, expected = f"{name}: dynamics {key}", "0 or more"
+                    raise make_element_error(
+                        urdf, dynamics, problem, field=field, expected=expected, got=got
                     )
         given = joints.get(name, ObjectJointSchema())
         if given.springref is not None and given.stiffness is None:

@@ -83,9 +83,6 @@ class Gripper:
 
         Args:
             opening: Opening [m]. Default: the rest positions.
-
-        Raises:
-            InputError: The opening is out of range or not a number.
         """
         if opening is None:
             return self.rest
@@ -203,10 +200,6 @@ def build_gripper(
         stated: Finger joint → its closed and open positions.
         document: The robot.yaml.
         height: Height of the root link [m].
-
-    Raises:
-        InputError: A joint is not a finger joint, its positions are outside its limits, or the open
-            gripper is not wider than the closed one.
     """
     if not stated:
         return None

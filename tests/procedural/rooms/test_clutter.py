@@ -77,5 +77,5 @@ def test_too_much_clutter_is_rejected() -> None:
     for obstacles, things in (([shelf], 30), ([], 1)):
         with pytest.raises(InputError, match="no space"):
             add_clutter(vkc.Scene.from_document({**empty, "obstacles": obstacles}), things)
-    with pytest.raises(InputError, match="things"):
+    with pytest.raises(InputError, match="count"):
         add_clutter(home(), -1)

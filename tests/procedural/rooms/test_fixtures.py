@@ -50,8 +50,10 @@ def test_sizes_follow_from_the_seed() -> None:
 
 def test_raised_object_is_lowered_to_the_floor(tmp_path: Path) -> None:
     description = vkc.procedural.random_object("oven", 1)
-    description["urdf"] = description["urdf"].replace('<link name="body">', '<link name="root"/><joint name="up" type="fixed">'
-        '<parent link="root"/><child link="body"/><origin xyz="0 0 0.7"/></joint><link name="body">')  # fmt: skip
+    body = '<link name="body">'
+    joint = '<joint name="up" type="fixed"><parent link="root"/><child link="body"/>'
+    raised = f'<link name="root"/>{joint}<origin xyz="0 0 0.7"/></joint>{body}'
+    description["urdf"] = description["urdf"].replace(body, raised)
     assert make_fixture(description).lift == pytest.approx(-0.7, abs=1e-3)
 
 

@@ -77,8 +77,3 @@ def test_path_must_be_wide_enough_for_the_disc(width: float, expected: bool) -> 
     barrier = Frame(2.0, 0.0, 0.0).make_rectangle((-width, 0.0), (-0.1, 0.1))
     assert Floor(4.0, 6.0).is_connected([barrier], 0.65, [(0.0, -2.0), (0.0, 2.0)]) is expected
     assert Floor(4.0, 6.0).is_connected([barrier], 0.65, [(0.0, -2.0), (0.5, -2.0)])
-
-
-def test_occupied_place_is_not_connected() -> None:
-    assert not Floor(4.0, 4.0).is_connected([Rectangle(0.0, 0.0, 1.0, 1.0)], 0.5, [(0.0, 0.0)])
-    assert Floor(4.0, 4.0).is_connected([], 0.5, [])

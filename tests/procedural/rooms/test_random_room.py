@@ -141,13 +141,15 @@ def test_error_if_parts_do_not_fit() -> None:
 
 def test_imported_objects_and_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Imported objects have their frame in the middle: the floor is free in front of their face."""
-    box = '<collision><origin xyz="{} 0 0.2"/><geometry><box size="{} 0.5 0.4"/></geometry></collision>'
+    box = '<geometry><box size="{1} 0.5 0.4"/></geometry>'
+    box = f'<collision><origin xyz="{{0}} 0 0.2"/>{box}</collision>'
     body, door = box.format(0.03, 0.64), box.format(-0.3, 0.02)
     ends = (
         '<parent link="body"/><child link="door"/><axis xyz="0 0 1"/><limit lower="0" upper="1"/>'
     )
     joint = f'<joint name="hinge" type="revolute">{ends}</joint>'
-    urdf = f'<robot name="oven"><link name="body">{body}</link><link name="door">{door}</link>{joint}</robot>'
+    links = f'<link name="body">{body}</link><link name="door">{door}</link>'
+    urdf = f'<robot name="oven">{links}{joint}</robot>'
     own = make_fixture({"urdf": urdf, "attachments": []})
     assert own.face == pytest.approx(-0.29)
     assert make_fixture("dishwasher").face == pytest.approx(0.0, abs=0.03)

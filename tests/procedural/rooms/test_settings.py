@@ -45,8 +45,3 @@ def test_unknown_types(field: str, name: str, nearest: str) -> None:
     with pytest.raises(vkc.UnknownNameError) as found:
         vkc.procedural.RoomSettings(**{field: (name,)})  # type: ignore[arg-type]
     assert (found.value.field, found.value.name, found.value.nearest) == (field, name, nearest)
-
-
-def test_lists_become_tuples() -> None:
-    settings = vkc.procedural.RoomSettings(objects=["door"], width=[4, 5])  # type: ignore[arg-type]
-    assert (settings.objects, settings.width) == (("door",), (4.0, 5.0))

@@ -68,8 +68,7 @@ def test_drawer_is_exempt_from_a_panel_until_it_has_passed_it(gap: float, begin:
     assert (one.margin, one.distance) == (0.0, close.distance)
     lower, upper = one.ranges["drawer.slide"]
     assert lower == -np.inf
-    # The front's back face leaves the panel's end; then both are √(gap² + way²) apart. What is
-    # behind the front is further away.
+    # When the front's back face has left the panel's end, the distance is √(gap² + travel²).
     leaves = 1.903 - begin + np.sqrt(SAFE**2 - gap**2)
     assert upper == (
         np.inf
@@ -156,7 +155,7 @@ def test_exemption_is_active_where_every_joint_is_in_range() -> None:
 )
 def test_allowed_pairs_of_a_scene(tmp_path: Path, allow: list[Any], margin: float) -> None:
     (tmp_path / "home.srdf").write_text(
-        '<robot name="home"><disable_collisions link1="door.panel" link2="wall" reason="as built"/></robot>'
+        '<robot name="home"><disable_collisions link1="door.panel" link2="wall"/></robot>'
     )
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # allowed overlaps raise no warning
@@ -190,14 +189,14 @@ def test_missing_file_suggests_the_nearest_one(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     for name in ("door.yaml", "door.yml", "oven.yaml"):
         (tmp_path / "mine" / name).touch()
-    thing = {"name": "door", "type": "mine/dor.yaml", "position": [2.0, 0.0, 0.0]}
+    door = {"name": "door", "type": "mine/dor.yaml", "position": [2.0, 0.0, 0.0]}
     for missing, said in (
         ("mine/dor.yaml", ", perhaps mine/door.yaml, got"),
         ("none/dor.yaml", rf"a file in {tmp_path}, got"),
     ):
         with pytest.raises(InputError, match=said):
             Scene.from_document(
-                {**in_wall(-0.03).document, "objects": [{**thing, "type": missing}], "allow": []},
+                {**in_wall(-0.03).document, "objects": [{**door, "type": missing}], "allow": []},
                 tmp_path,
             )
 
@@ -246,14 +245,16 @@ def test_allowed_margin_decides_about_a_leaf_that_turns_into_its_wall() -> None:
 
 LEAF = (
     '<robot name="d"><link name="frame"/><link name="leaf">{leaf}'
-    '<collision><origin xyz="-0.07 -0.7 1"/><geometry><box size="0.02 0.02 0.2"/></geometry></collision></link>'
-    '<joint name="hinge" type="revolute"><parent link="frame"/><child link="leaf"/><axis xyz="0 0 1"/>'
+    '<collision><origin xyz="-0.07 -0.7 1"/><geometry><box size="0.02 0.02 0.2"/></geometry>'
+    '</collision></link><joint name="hinge" type="revolute"><parent link="frame"/>'
+    '<child link="leaf"/><axis xyz="0 0 1"/>'
     '<limit lower="0" upper="1.5" velocity="1" effort="1"/></joint></robot>'
 )
 
 
 def box(position: str, size: str) -> str:
-    return f'<collision><origin xyz="{position}"/><geometry><box size="{size}"/></geometry></collision>'
+    geometry = f'<geometry><box size="{size}"/></geometry>'
+    return f'<collision><origin xyz="{position}"/>{geometry}</collision>'
 
 
 def hinged_at_post(folder: Path, *, block: bool) -> Scene:

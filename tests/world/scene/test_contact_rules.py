@@ -89,7 +89,7 @@ def test_hand_frame_of_a_push_is_the_foremost_point() -> None:
 
 
 def test_gripper_openings(tmp_path: Path) -> None:
-    """For what is held, and at the start; what has no gripper rests."""
+    """At grasps, at the start, and without a gripper."""
     scene = between_cheeks(write_gripper(tmp_path / "mine"), opening=0.04, start=0.03)
     hold = Hold("drawer", "grip")
     assert compute_grasp_opening(scene, hold) == pytest.approx(0.04)

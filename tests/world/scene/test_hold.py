@@ -8,6 +8,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.drawers import drawer_scene
 
@@ -120,28 +121,22 @@ def test_approach_from_below_the_floor_is_reversed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["door", "ball", "stick"])
 def test_reversing_twice_restores_the_approach(name: str) -> None:
-    placed = next(iter(drawer_scene().objects.values()))
-    placed = vkc.PlacedObject(
-        name, load_object(name), placed.placement, np.zeros(load_object(name).coordinates.size)
-    )
-    for attachment, given in placed.object.attachments.items():
-        values = [
-            0.3 * (freedom.lower + freedom.upper) + 0.1 * freedom.upper
-            for freedom in given.freedoms
-        ]
+    item = load_object(name)
+    state = np.zeros(item.coordinates.size)
+    placed = vkc.PlacedObject(name, item, pin.SE3.Identity(), state)
+    for attachment, given in item.attachments.items():
+        values = [0.3 * freedom.lower + 0.4 * freedom.upper for freedom in given.freedoms]
         turned = placed.with_reversed(attachment)
         there, here = turned.object.attachment(attachment).tool(values), given.tool(values)
-        np.testing.assert_allclose(
-            there.rotation[:, 0], here.rotation[:, 0], atol=1e-12
-        )  # fingers close along the same line
+        closing = there.rotation[:, 0], here.rotation[:, 0]
+        np.testing.assert_allclose(*closing, atol=1e-12)
         np.testing.assert_allclose(there.rotation[:, 2], -here.rotation[:, 2], atol=1e-12)
         centre = [one.translation + given.standoff * one.rotation[:, 2] for one in (there, here)]
         np.testing.assert_allclose(*centre, atol=1e-12)
         back = turned.with_reversed(attachment)
+        again = back.object.attachment(attachment).tool(values)
+        np.testing.assert_allclose(again, here, atol=1e-12)
         assert back.reversed == ()
-        np.testing.assert_allclose(
-            back.object.attachment(attachment).tool(values), here, atol=1e-12
-        )
     with pytest.raises(UnknownNameError, match="there is no attachment"):
         placed.with_reversed("nowhere")
 

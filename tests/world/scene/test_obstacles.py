@@ -16,9 +16,11 @@ from vkc_pin.world.scene.obstacles import FLOOR, make_floor_shape, make_obstacle
 from vkc_pin.world.scene.scene_schema import ObstacleSchema
 
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 1.0), np.array([1.0, -2.0, 0.5]))
-URDF = """<robot name="r"><link name="a"><collision><origin xyz="0 0 1"/><geometry><sphere radius="0.1"/></geometry></collision>
-</link><link name="b"><collision><geometry><box size="1 2 3"/></geometry></collision></link>
-<joint name="j" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0.5 0 0" rpy="0 0 0.4"/><axis xyz="0 0 1"/>
+URDF = """<robot name="r"><link name="a"><collision><origin xyz="0 0 1"/><geometry>
+<sphere radius="0.1"/></geometry></collision></link><link name="b">
+<collision><geometry><box size="1 2 3"/></geometry></collision></link>
+<joint name="j" type="revolute"><parent link="a"/><child link="b"/>
+<origin xyz="0.5 0 0" rpy="0 0 0.4"/><axis xyz="0 0 1"/>
 <limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>"""
 
 
@@ -26,7 +28,7 @@ def described(
     folder: Path, **fields: Any
 ) -> tuple[list[pin.GeometryObject], list[pin.GeometryObject]]:
     item = pydantic.TypeAdapter(ObstacleSchema).validate_python(
-        {"name": "thing", "position": [0, 0, 0], **fields}
+        {"name": "item", "position": [0, 0, 0], **fields}
     )
     return make_obstacle_shapes(item, POSE, folder)
 
@@ -58,7 +60,7 @@ def test_every_kind_has_its_volume_and_place(
     (drawn,), (solid,) = described(tmp_path, colour=[0.1, 0.2, 0.3, 0.4], **fields)
     assert 0.95 * expected <= volume(solid) <= expected * (1 + 1e-9)
     for shape in (drawn, solid):
-        assert shape.name == "thing"
+        assert shape.name == "item"
         assert shape.parentJoint == 0
         assert shape.placement.isApprox(POSE)
         np.testing.assert_allclose(shape.meshColor, [0.1, 0.2, 0.3, 0.4])

@@ -1,4 +1,4 @@
-"""Tests that the packaged scenes have the dimensions of the experiments, and room for their motions."""
+"""Tests the dimensions of the packaged scenes, and that motions fit into them."""
 
 from __future__ import annotations
 

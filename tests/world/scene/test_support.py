@@ -68,7 +68,7 @@ def test_stacked_objects_are_supported() -> None:
     assert find_supported_objects(stacked.objects, {"plate": {"post"}}, ["cup", "upper"]) == {}
     assert (
         find_supported_objects(stacked.objects, {"plate": {"plate"}}, ["upper"]) == {}
-    )  # what is between is held by somebody
+    )  # the object between them is held
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 0.1, 1.5, 3.0])

@@ -130,7 +130,7 @@ def own(s: vkc.State) -> Any:
     [
         (lambda s: 3.0, "it does not depend on the state"),
         (lambda s: 0 * s.coordinate("base_x"), "it does not depend on the state"),
-        (lambda s: None, "no CasADi expression"),
+        (lambda s: None, "not a CasADi expression"),
         (lambda s: s.rotation("tool"), "wrong shape"),
         (lambda s: s.coordinate("base_x") >= 1.0, "a comparison"),
         (lambda s: s.coordinate("base_x") + ca.SX.sym("mine"), "it has symbols of its own"),

@@ -127,7 +127,7 @@ def test_grasp_freedoms_move_the_hand_along_the_object() -> None:
 
 
 def fetched() -> tuple[Scene, Script]:
-    """Return stick in hand, its tip by the ball; they carry it up, to the left, and down, and leave it there."""
+    """Return a motion in which a held stick lifts a ball, carries it aside and puts it down."""
     scene = room(stand(), objects=("stick", "ball"))
     south = pin.SE3(
         STICK.rotation, BALL.translation - np.array([0.0, 0.285, 0.0])

@@ -24,7 +24,7 @@ def test_missing_values_are_filled_from_their_neighbours() -> None:
     )
     expected = [[2.0, 1.0, nan], [2.0, 1.0, nan], [2.0, 1.0, nan], [3.0, 4.0, nan], [3.0, 4.0, nan]]
     np.testing.assert_array_equal(fill_missing_values(table), expected)
-    assert np.isnan(table[0, 0])  # what was given is left alone
+    assert np.isnan(table[0, 0])  # the argument is not changed
 
 
 def parts() -> tuple[Trajectory, Trajectory, Trajectory]:

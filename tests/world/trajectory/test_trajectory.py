@@ -67,7 +67,7 @@ def test_what_is_held_through_something_is_kept_too() -> None:
     data = json.loads(json.dumps(example(phases=phases).to_dict()))
     assert [phase["by"] for phase in data["phases"]] == [{}, by]
     assert Trajectory.from_dict(data).phases == phases
-    for phase in data["phases"]:  # as motions were saved before there was such a thing
+    for phase in data["phases"]:  # as in older files
         del phase["by"]
     assert [phase.holds for phase in Trajectory.from_dict(data).phases] == [(), make_holds(held)]
 

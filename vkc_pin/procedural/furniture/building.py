@@ -43,7 +43,7 @@ _EFFORT = {"revolute": 30.0, "prismatic": 40.0}  # [N·m], [N]
 
 @dataclass(frozen=True)
 class _Shape:
-    """A box (edges), cylinder (radius, length) or sphere (radius), in the link's frame [m], [rad]."""
+    """A box (edges), cylinder (radius, length) or sphere (radius) in the link's frame."""
 
     kind: str
     size: tuple[float, ...]
@@ -66,31 +66,18 @@ class _Shape:
         return f"    <{element}>{origin}{geometry}{material}</{element}>"
 
     @property
-    def mass(self) -> float:
-        """Mass [kg]."""
+    def inertia(self) -> pin.Inertia:
+        """Inertia in the link's frame."""
         if self.kind == "box":
-            return _DENSITY * math.prod(self.size)
-        radius = self.size[0]
-        volume = (
-            math.pi * radius**2 * self.size[1]
-            if self.kind == "cylinder"
-            else 4.0 / 3.0 * math.pi * radius**3
-        )
-        return _DENSITY * volume
-
-    @property
-    def inertia(self) -> Floats:
-        """Inertia about its centre along the link's axes, shape (3, 3) [kg·m²]."""
-        if self.kind == "sphere":
-            return np.eye(3) * 0.4 * self.mass * self.size[0] ** 2
-        if self.kind == "box":
-            squares = np.square(self.size)
-            return np.diag(self.mass * (squares.sum() - squares) / 12.0)
-        radius, length = self.size
-        along = 0.5 * self.mass * radius**2
-        across = self.mass * (3.0 * radius**2 + length**2) / 12.0
-        rotation = pin.rpy.rpyToMatrix(*self.rpy)
-        return np.asarray(rotation @ np.diag([across, across, along]) @ rotation.T)
+            own = pin.Inertia.FromBox(_DENSITY * math.prod(self.size), *self.size)
+        elif self.kind == "cylinder":
+            radius, length = self.size
+            own = pin.Inertia.FromCylinder(_DENSITY * math.pi * radius**2 * length, radius, length)
+        else:
+            (radius,) = self.size
+            own = pin.Inertia.FromSphere(_DENSITY * 4.0 / 3.0 * math.pi * radius**3, radius)
+        where = pin.SE3(pin.rpy.rpyToMatrix(*self.rpy), np.array(self.centre, float))
+        return where.act(own)
 
 
 @dataclass
@@ -138,21 +125,14 @@ class LinkBuilder:
 
     def make_xml(self) -> str:
         """Return the URDF element `<link>`, with mass and inertia of the shapes."""
-        masses = np.array([shape.mass for shape in self.shapes])
-        centres = np.array([shape.centre for shape in self.shapes], float)
-        middle = masses @ centres / masses.sum()
-        inertia = np.zeros((3, 3))
-        for shape, mass, offset in zip(self.shapes, masses, centres - middle, strict=True):
-            inertia += shape.inertia + mass * (
-                offset @ offset * np.eye(3) - np.outer(offset, offset)
-            )
+        whole = sum((shape.inertia for shape in self.shapes), pin.Inertia.Zero())
         entries = " ".join(
-            f'i{"xyz"[i]}{"xyz"[j]}="{_format_numbers([inertia[i, j]], 6)}"'
+            f'i{"xyz"[i]}{"xyz"[j]}="{_format_numbers([whole.inertia[i, j]], 6)}"'
             for i in range(3)
             for j in range(i, 3)
         )
-        mass = f'<mass value="{_format_numbers([masses.sum()])}"/>'
-        origin = f'<origin xyz="{_format_numbers(middle)}"/>'
+        mass = f'<mass value="{_format_numbers([whole.mass])}"/>'
+        origin = f'<origin xyz="{_format_numbers(whole.lever)}"/>'
         lines = [
             f"  <link name={quoteattr(self.name)}>",
             f"    <inertial>{origin}{mass}<inertia {entries}/></inertial>",

@@ -1,4 +1,4 @@
-"""Generates furniture and appliances of random sizes: with doors, flaps, drawers, or parts to turn."""
+"""Generates furniture and appliances of random sizes."""
 
 from __future__ import annotations
 

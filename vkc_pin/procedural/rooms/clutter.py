@@ -55,7 +55,7 @@ class _Face:
 
 
 def add_clutter(
-    scene: Scene, things: int, *, seed: int = 0, clear: Sequence[tuple[Sequence[float], float]] = ()
+    scene: Scene, count: int, *, seed: int = 0, clear: Sequence[tuple[Sequence[float], float]] = ()
 ) -> Scene:
     """Return a scene with small objects on horizontal surfaces, and pictures on its walls.
 
@@ -64,17 +64,17 @@ def add_clutter(
 
     Args:
         scene: Scene; it is not changed.
-        things: Number of objects to add.
+        count: Number of objects to add.
         seed: Random seed; the result is reproducible.
         clear: Further places that stay free: x, y, z and a radius [m] each.
 
     Raises:
         InputError: There is no space for so many objects.
     """
-    things, seed = check_integer(things, "things", low=0), check_integer(seed, "seed", low=0)
+    count, seed = check_integer(count, "count", low=0), check_integer(seed, "seed", low=0)
     faces = _Faces(check_instance(scene, Scene, "scene"), clear)
     rng = np.random.default_rng([5, seed])
-    placed = [faces.place(f"clutter_{number + 1}", rng) for number in range(things)]
+    placed = [faces.place(f"clutter_{number + 1}", rng) for number in range(count)]
     document = {**scene.document, "obstacles": [*scene.document.get("obstacles", ()), *placed]}
     return Scene.from_document(document, scene.folder)
 
@@ -126,7 +126,7 @@ class _Faces:
                     "colour": str(rng.choice(_COLOURS)),
                 }
         expected = "fewer objects, or more tables and shelves"
-        raise InputError("there is no space for so many objects", field="things", expected=expected)
+        raise InputError("there is no space for so many objects", field="count", expected=expected)
 
     def _is_free(self, box: tuple[Floats, Floats], face: _Face, sunk: float) -> bool:
         """Return whether a box overlaps nothing but the surface that it rests or hangs on."""

@@ -70,7 +70,7 @@ class Rectangle:
 class Frame:
     """A frame on the floor: x and y in the world frame [m], and yaw [rad].
 
-    x points from the user's side into the part that stands there.
+    x points from the user into the part at the frame.
     """
 
     x: float

@@ -35,7 +35,6 @@ __all__ = [
     "ClearanceExemption",
     "ClosePair",
     "PlacedShapes",
-    "SceneLike",
     "find_clearance_exemptions",
     "find_close_pairs",
     "make_shape_keys",
@@ -54,32 +53,21 @@ _MAX_NAMED = 6  # pairs that a warning names
 _MAX_CACHED = 4096  # results in a scene's cache
 
 
-class SceneLike(Protocol):
-    """The attributes of a `Scene` that are used here."""
+class _Scene(Protocol):
+    """The attributes of a `Scene` that are used here; `scene` imports this module."""
 
     @property
-    def objects(self) -> Mapping[str, PlacedObject]:
-        """Name → object."""
-
+    def objects(self) -> Mapping[str, PlacedObject]: ...
     @property
-    def obstacles(self) -> Sequence[pin.GeometryObject]:
-        """Shapes of the fixed obstacles."""
-
+    def obstacles(self) -> Sequence[pin.GeometryObject]: ...
     @property
-    def obstacle_labels(self) -> Sequence[str]:
-        """Name of the obstacle of each of these shapes."""
-
+    def obstacle_labels(self) -> Sequence[str]: ...
     @property
-    def held(self) -> Collection[str]:
-        """Names of the objects that the robot holds."""
-
+    def held(self) -> Collection[str]: ...
     @property
-    def allowed(self) -> Mapping[frozenset[str], float]:
-        """Pairs of links that may be close → margin that they keep [m]."""
-
+    def allowed(self) -> Mapping[frozenset[str], float]: ...
     @property
-    def memory(self) -> dict[Any, Any]:
-        """Cache of derived results."""
+    def memory(self) -> dict[Any, Any]: ...
 
 
 class ClosePair(NamedTuple):
@@ -170,7 +158,7 @@ def make_shape_keys(labels: Sequence[str], names: Sequence[str]) -> list[str]:
     return keys
 
 
-def find_clearance_exemptions(scene: SceneLike, dist_safe: float) -> tuple[ClearanceExemption, ...]:
+def find_clearance_exemptions(scene: _Scene, dist_safe: float) -> tuple[ClearanceExemption, ...]:
     """Return all pairs that may be closer than the clearance margin.
 
     These are the links that the scene allows, and neighbouring shapes.
@@ -195,7 +183,7 @@ def find_clearance_exemptions(scene: SceneLike, dist_safe: float) -> tuple[Clear
     )
 
 
-def find_close_pairs(scene: SceneLike, reach: float) -> list[ClosePair]:
+def find_close_pairs(scene: _Scene, reach: float) -> list[ClosePair]:
     """Return the pairs of links closer than `reach` [m] of which one can move.
 
     Held objects, pairs of links of one object, pairs that the scene allows, and fixed objects on
@@ -215,7 +203,7 @@ def find_close_pairs(scene: SceneLike, reach: float) -> list[ClosePair]:
     return sorted(found, key=lambda pair: pair.distance)
 
 
-def warn_of_overlaps(scene: SceneLike, name: str) -> None:
+def warn_of_overlaps(scene: _Scene, name: str) -> None:
     """Warn of movable links that overlap other shapes in the scene called `name`."""
     found = [pair for pair in find_close_pairs(scene, 0.0) if pair.distance < -CONTACT_DEPTH]
     if found:
@@ -227,23 +215,20 @@ def warn_of_overlaps(scene: SceneLike, name: str) -> None:
         warnings.warn(f"{name}: movable links overlap other shapes: {pairs}. {hint}", stacklevel=4)
 
 
-def _find_neighbours(scene: SceneLike, dist_safe: float) -> Iterator[ClearanceExemption]:
+def _find_neighbours(scene: _Scene, dist_safe: float) -> Iterator[ClearanceExemption]:
     """Yield exemptions of shapes of fixed objects closer than `dist_safe` to others.
 
     Two states are examined: the initial one, and that with all joints at zero.
     """
     jointed = {name: placed for name, placed in scene.objects.items() if not placed.object.free}
-    neutral = {
-        name: np.clip(0.0, placed.object.lower, placed.object.upper)
+    zero = {
+        name: dataclasses.replace(
+            placed, state=np.clip(0.0, placed.object.lower, placed.object.upper)
+        )
         for name, placed in jointed.items()
     }
-    zero = {
-        name: dataclasses.replace(placed, state=neutral[name]) for name, placed in jointed.items()
-    }
-    states = [
-        jointed,
-        *([zero] if any(np.any(zero[name].state != jointed[name].state) for name in zero) else []),
-    ]
+    differs = any(np.any(zero[name].state != placed.state) for name, placed in jointed.items())
+    states = [jointed, zero] if differs else [jointed]
     known = set[tuple[tuple[str, str], float, tuple[tuple[str, tuple[float, float]], ...]]]()
     for objects in states:
         standing = PlacedShapes(scene, objects)
@@ -270,7 +255,7 @@ class PlacedShapes:
         keys: Key of each shape, see `make_shape_keys`.
     """
 
-    def __init__(self, scene: SceneLike, objects: Mapping[str, PlacedObject]) -> None:
+    def __init__(self, scene: _Scene, objects: Mapping[str, PlacedObject]) -> None:
         self.scene, self.objects = (
             scene,
             {n: p for n, p in objects.items() if not (p.object.free and n in scene.held)},
@@ -372,7 +357,7 @@ class PlacedShapes:
 
         def distance(values: Floats) -> Floats:
             found: Floats = self.compute_distances(self.labels[own], index, values, [other], reach)[
-                :, self._index_in_link(own), 0
+                :, self.labels[:own].count(self.labels[own]), 0
             ]
             return found
 
@@ -400,10 +385,6 @@ class PlacedShapes:
                 low, high = (float(values[max(k - 1, 0)]), float(values[k]))
             ends.append((low + high) / 2.0 if left else float(np.copysign(np.inf, beyond)))
         return ends[0], ends[1], least
-
-    def _index_in_link(self, shape: int) -> int:
-        """Return the index of a shape among the shapes of its link."""
-        return self.labels[:shape].count(self.labels[shape])
 
     def find_shapes(self, labels: Collection[str]) -> list[int]:
         """Return the indices of the shapes of links or obstacles, given by their labels."""
@@ -476,7 +457,7 @@ class PlacedShapes:
         return [str(item.model.names[joint]) for joint in support if joint]
 
 
-def _get_cached(scene: SceneLike, key: Hashable, make: Callable[[], T]) -> T:
+def _get_cached(scene: _Scene, key: Hashable, make: Callable[[], T]) -> T:
     """Return the value cached under a key in a scene, computed if there is none."""
     found: T | None = scene.memory.get(key)
     if found is None:

@@ -56,9 +56,13 @@ CONTACT_WINDOW = 1.0
 """Time before and after a contact in which shapes may be close [s]."""
 
 
+def _get_attachment(scene: Scene, hold: Hold) -> Attachment:
+    return scene.objects[hold.object].object.attachments[hold.attachment]
+
+
 def find_grasped_link(scene: Scene, hold: Hold) -> str:
     """Return the label of the grasped link, "<object>.<link>"."""
-    return f"{hold.object}.{scene.objects[hold.object].object.attachments[hold.attachment].link}"
+    return f"{hold.object}.{_get_attachment(scene, hold).link}"
 
 
 def find_touch_links(scene: Scene, hold: Hold) -> Collection[str]:
@@ -71,7 +75,7 @@ def compute_hand_clearance(scene: Scene, hold: Hold, link: str, options: Options
 
     It applies during the grasp and shortly before and after.
     """
-    attachment = scene.objects[hold.object].object.attachments[hold.attachment]
+    attachment = _get_attachment(scene, hold)
     if (hold.by or attachment.contact == "push") and link == find_grasped_link(scene, hold):
         return 0.0
     return min(
@@ -85,16 +89,14 @@ def compute_hand_frame(robot: Robot, attachment: Attachment) -> pin.SE3:
 
     It is the tool frame itself, or, for a push, the foremost point of the hand.
     """
-    return (
-        robot.opened(robot.opening(attachment.opening)).front
-        if attachment.contact == "push"
-        else pin.SE3.Identity()
-    )
+    if attachment.contact != "push":
+        return pin.SE3.Identity()
+    return robot.opened(robot.opening(attachment.opening)).front
 
 
 def is_rigid_grasp(scene: Scene, hold: Hold) -> bool:
     """Return whether the grasping link does not move relative to the grasped link."""
-    attachment = scene.objects[hold.object].object.attachments[hold.attachment]
+    attachment = _get_attachment(scene, hold)
     return attachment.contact != "push" and (attachment.firm or not attachment.freedoms)
 
 
@@ -105,14 +107,12 @@ def find_gripper_hold(holds: Iterable[Hold]) -> Hold | None:
 
 def compute_grasp_opening(scene: Scene, hold: Hold) -> float | None:
     """Return the gripper opening of a hold [m]; None: as in the robot's rest configuration."""
-    return scene.robot.opening(
-        scene.objects[hold.object].object.attachments[hold.attachment].opening
-    )
+    return scene.robot.opening(_get_attachment(scene, hold).opening)
 
 
 def compute_start_opening(scene: Scene) -> float | None:
     """Return the gripper opening at the start of a scene [m]; None: as in the rest state."""
     hold = find_gripper_hold(scene.holds)
-    return (
-        scene.robot.opening(scene.opening) if hold is None else compute_grasp_opening(scene, hold)
-    )
+    if hold is None:
+        return scene.robot.opening(scene.opening)
+    return compute_grasp_opening(scene, hold)

@@ -50,7 +50,7 @@ MAX_HELD = 50
 class Hold:
     """An object held at one of its attachments, by the robot's tool or through another held object.
 
-    Holds are equal if object, attachment and grasping frame are equal, whatever the values `at`.
+    Holds are equal if object, attachment and grasping frame are equal, regardless of `at`.
 
     Attributes:
         object: Its name in the scene.
@@ -235,7 +235,7 @@ def find_reversed_approaches(
 def warn_of_openings(
     objects: Mapping[str, PlacedObject], robot: Robot, start: float | None, where: str
 ) -> None:
-    """Warn of openings out of the gripper's range, which are replaced by the nearest possible one."""
+    """Warn of openings out of the gripper's range, which are clamped to it."""
     requested = {} if start is None else {"the start": start}
     for name, placed in objects.items():
         own = placed.object.attachments.values()

@@ -112,16 +112,13 @@ def make_world_shapes(placed: PlacedObject, *, visual: bool = False) -> list[pin
     Returns:
         Shapes in the object's own order, with their names in the object (`<link>_<number>`).
     """
-    model, geometry = (
-        placed.object.model,
-        placed.object.visual if visual else placed.object.collision,
-    )
+    item = placed.object
+    model, geometry = item.model, item.visual if visual else item.collision
     data = model.createData()
-    pin.forwardKinematics(model, data, placed.object.coordinates.q(placed.state))
+    pin.forwardKinematics(model, data, item.coordinates.q(placed.state))
+    places = [placed.placement * placement for placement in data.oMi]
     return [
-        copy_shape(
-            shape, shape.name, placed.placement * data.oMi[shape.parentJoint] * shape.placement
-        )
+        copy_shape(shape, shape.name, places[shape.parentJoint] * shape.placement)
         for shape in geometry.geometryObjects
     ]
 
@@ -150,17 +147,10 @@ def sweep_link_shapes(
         Placements, shape (V, K, 12), see `placements.columns_of`, and lower and upper corners of
             the axis-aligned bounding boxes, both (V, K, 3) [m].
     """
-    model, data, own, state = (
-        placed.object.model,
-        placed.object.model.createData(),
-        find_link_shapes(placed, link),
-        placed.state.copy(),
-    )
+    model, own, state = placed.object.model, find_link_shapes(placed, link), placed.state.copy()
+    data, size = model.createData(), (len(values), len(own))
     boxes = [compute_bounding_box(shape) for shape in own]
-    where, lower, upper = (
-        np.empty((len(values), len(own), 12)),
-        *np.empty((2, len(values), len(own), 3)),
-    )
+    where, lower, upper = np.empty((*size, 12)), np.empty((*size, 3)), np.empty((*size, 3))
     for row, value in enumerate(values):
         state[index] = value
         pin.forwardKinematics(model, data, placed.object.coordinates.q(state))

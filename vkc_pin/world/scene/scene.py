@@ -159,12 +159,8 @@ class Scene:
                 continue
             given = check_array(values, part_name)
             if given.shape != start[part].shape:
-                raise InputError(
-                    "wrong number of values",
-                    field=part_name,
-                    expected=start[part].shape,
-                    got=given.shape,
-                )
+                problem, expected = "wrong number of values", start[part].shape
+                raise InputError(problem, field=part_name, expected=expected, got=given.shape)
             lower, upper = (limits[part] for limits in self.robot.start_limits)
             start[part] = [
                 clamp_to_limits(value, low, high, f"{part_name}.{name}")
@@ -259,13 +255,9 @@ class Scene:
             what = f"{hold.frame or 'the hand'} would approach {hold.object}.{hold.attachment}"
             text = f"{what} through the object or the floor, so its approach is reversed"
             hint = f"turn its approach, or set `reversed: [{hold.attachment}]` for the object"
-            warnings.warn(
-                f"{self.file or self.name}: {text}; {hint}",
-                stacklevel=stacklevel,
-            )
-        return (
-            self._with(objects=MappingProxyType(objects)) if objects != dict(self.objects) else self
-        )
+            warnings.warn(f"{self.file or self.name}: {text}; {hint}", stacklevel=stacklevel)
+        changed = objects != dict(self.objects)
+        return self._with(objects=MappingProxyType(objects)) if changed else self
 
     def _find_object(self, name: str) -> PlacedObject:
         return self.objects[check_choice(name, self.objects, "object")]
@@ -342,12 +334,8 @@ class Scene:
         check_instance(rng, np.random.Generator, "rng")
         region, file = self.start_region, self.file
         if region is None:
-            raise InputError(
-                "the scene has no start region",
-                file=file,
-                field="start_region",
-                expected="x and y intervals",
-            )
+            problem, expected = "the scene has no start region", "x and y intervals"
+            raise InputError(problem, file=file, field="start_region", expected=expected)
         for name in self.held:
             if not self.objects[name].object.free:
                 raise InputError(
@@ -360,12 +348,8 @@ class Scene:
             if candidate.start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE:
                 return candidate
         problem = f"no collision-free start of the robot in {_MAX_TRIES} attempts"
-        raise InputError(
-            problem,
-            file=file,
-            field="start_region",
-            expected=f"a clearance of {START_CLEARANCE} m somewhere",
-        )
+        expected = f"a clearance of {START_CLEARANCE} m somewhere"
+        raise InputError(problem, file=file, field="start_region", expected=expected)
 
 
 def load_scene(name_or_path: str | Path) -> Scene:

@@ -84,7 +84,7 @@ def find_push_directions(
     values: Mapping[str, float],
     where: str,
 ) -> dict[str, int]:
-    """Return the direction in which a push moves each coordinate: 1 up, -1 down; empty for a grasp."""
+    """Return the direction in which a push moves each coordinate, 1 or -1; empty for a grasp."""
     if attachment.contact != "push":
         return {}
     own = {

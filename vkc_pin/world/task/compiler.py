@@ -100,13 +100,8 @@ class _Compiler:
         )
         segments = self.options.move_waypoints if kind == "move" else self.options.turn_waypoints
         placed = self.scene.objects[hold.object]
-        directions = find_push_directions(
-            placed,
-            placed.object.attachments[hold.attachment],
-            self.state,
-            values,
-            f"{where}.joints",
-        )
+        grasp = placed.object.attachments[hold.attachment]
+        directions = find_push_directions(placed, grasp, self.state, values, f"{where}.joints")
         self._append(kind, tuple(values), segments, ranges=ranges, values=values, pushed=directions)
         self.supports.end_motion(self.state, where)
 
@@ -274,16 +269,11 @@ class _Compiler:
             for one in (*self.held, *reversed(self.holds))
             if one.object == step.object
         ]
-        hold = self.grasp(
-            step.object,
-            choose_attachment(placed, step.attachment, used, self.state, values, where),
-            where,
-        )
+        chosen = choose_attachment(placed, step.attachment, used, self.state, values, where)
+        hold = self.grasp(step.object, chosen, where)
         ranges = {coordinate: find_joint_limits(placed, coordinate) for coordinate in values}
-        path, after = (
-            find_path_joints(placed, placed.object.attachments[hold.attachment]),
-            dict[str, float](),
-        )
+        path = find_path_joints(placed, placed.object.attachments[hold.attachment])
+        after: dict[str, float] = {}
         for latch in find_engaged_latches(placed, self.state, values):
             release = f"{step.object}.{latch.released_by}"
             if latch.released_by not in path:  # and it is past the threshold
@@ -300,13 +290,8 @@ class _Compiler:
             values[release] = turned if release in after else values.get(release, turned)
         self._append_motion("move", hold, where, values, ranges)
         if after:
-            self._append_motion(
-                "turn",
-                hold,
-                where,
-                after,
-                {release: find_joint_limits(placed, release) for release in after},
-            )
+            limits = {release: find_joint_limits(placed, release) for release in after}
+            self._append_motion("turn", hold, where, after, limits)
 
     def touch(self, step: Touch, where: str) -> None:
         """Add the phase that brings a frame to its target; free held objects are carried along."""
@@ -316,11 +301,8 @@ class _Compiler:
             placed = self.scene.objects[owner]
             if not placed.object.free:
                 problem = f"'{owner}' is fixed in the world and cannot be carried"
-                raise InputError(
-                    problem,
-                    field=f"{where}.frame",
-                    expected="a link of a free object, or a frame of the robot",
-                )
+                expected = "a link of a free object, or a frame of the robot"
+                raise InputError(problem, field=f"{where}.frame", expected=expected)
             check_link(placed, link, f"{where}.frame")
             hold = self._find_hold(owner) or self.grasp(owner, None, where)
         elif dot and step.frame not in [f.name for f in self.scene.robot.model.frames]:
@@ -337,33 +319,20 @@ class _Compiler:
         """Add the phases that bring an object to its goal and release it there."""
         placed = find_object(self.scene, step.object, f"{where}.object")
         if not placed.object.free:
-            raise InputError(
-                f"'{step.object}' is fixed in the world",
-                field=f"{where}.object",
-                expected="a free object",
-            )
+            problem = f"'{step.object}' is fixed in the world"
+            raise InputError(problem, field=f"{where}.object", expected="a free object")
         hold = self._find_hold(step.object) or self.grasp(step.object, step.attachment, where)
         if step.attachment is not None and hold.attachment != step.attachment:
-            raise InputError(
-                "it is held elsewhere",
-                field=f"{where}.attachment",
-                expected=hold.attachment,
-                got=step.attachment,
-            )
+            field, expected = f"{where}.attachment", hold.attachment
+            problem = "it is held elsewhere"
+            raise InputError(problem, field=field, expected=expected, got=step.attachment)
         upright = not isinstance(step.pose, pin.SE3)
         # As it rests now; an object held from the start, with its z axis up.
-        upright_rotation = (
-            np.eye(3) if step.object in self.scene.held else placed.placement.rotation
-        )
-        pose = pin.SE3(upright_rotation, np.array(step.pose)) if upright else step.pose
+        rotation = np.eye(3) if step.object in self.scene.held else placed.placement.rotation
+        pose = pin.SE3(rotation, np.array(step.pose)) if upright else step.pose
         goal = FrameGoal(placed.object.base_link, pose, "upright" if upright else "pose", hold)
-        self._append(
-            "place",
-            (step.object,),
-            self.options.reach_waypoints,
-            frames=(goal,),
-            lowered={hold: pose},
-        )
+        about, count = (step.object,), self.options.reach_waypoints
+        self._append("place", about, count, frames=(goal,), lowered={hold: pose})
         self._release(hold, pose, nearly=upright)
 
     def release(self, step: Release, where: str) -> None:
@@ -414,12 +383,8 @@ class _Compiler:
         elif isinstance(step, Reach):
             frame = find_robot_frame(self.scene, step.frame, f"{where}.frame")
             self._release_fixed_objects()
-            self._append(
-                "reach",
-                (frame,),
-                self.options.reach_waypoints,
-                frames=(FrameGoal(frame, step.pose),),
-            )
+            goals = (FrameGoal(frame, step.pose),)
+            self._append("reach", (frame,), self.options.reach_waypoints, frames=goals)
         elif isinstance(step, GoTo):
             self._release_fixed_objects()
             self._append("go", (), self.options.reach_waypoints, base=(step.x, step.y, step.yaw))
@@ -433,29 +398,18 @@ def compile_task(
     compiler, marks = _Compiler(scene, options), list[StepBoundary]()
     for index, step in enumerate(steps, start=first):
         compiler.add(step, f"steps[{index}]")
-        marks.append(
-            StepBoundary(
-                len(compiler.phases), len(compiler.holds), len(compiler.initial), compiler.held
-            )
-        )
+        phases, holds = len(compiler.phases), len(compiler.holds)
+        marks.append(StepBoundary(phases, holds, len(compiler.initial), compiler.held))
     if not compiler.phases and not nothing:
         raise make_nothing_to_do_error()
     # Objects that are grasped later keep their initial values until then.
-    initial = compiler.initial
-    phases = tuple(
-        replace(
-            phase,
-            initial_values={
-                **initial,
-                **{name: value for name, value in phase.initial_values.items() if name in initial},
-            },
-            opening=opening,
-        )
-        for phase, opening in zip(
-            compiler.phases, compute_openings(scene, compiler.phases), strict=True
-        )
-    )
-    return Task(steps, phases, tuple(compiler.holds), compiler.initial, compiler.held, tuple(marks))
+    initial, found = compiler.initial, list[Phase]()
+    openings = compute_openings(scene, compiler.phases)
+    for phase, opening in zip(compiler.phases, openings, strict=True):
+        known = {name: value for name, value in phase.initial_values.items() if name in initial}
+        found.append(replace(phase, initial_values={**initial, **known}, opening=opening))
+    every = tuple(compiler.holds)
+    return Task(steps, tuple(found), every, initial, compiler.held, tuple(marks))
 
 
 def make_nothing_to_do_error() -> InputError:

@@ -100,12 +100,10 @@ def place_objects(
     for name, placed in scene.objects.items():
         if placed.object.free and name not in resting:
             continue
-        values = {
-            c.removeprefix(f"{name}."): v for c, v in state.items() if c.startswith(f"{name}.")
-        }
-        found[name] = replace(placed, placement=resting.get(name, placed.placement)).with_state(
-            values
-        )
+        prefix = f"{name}."
+        values = {c.removeprefix(prefix): v for c, v in state.items() if c.startswith(prefix)}
+        there = replace(placed, placement=resting.get(name, placed.placement))
+        found[name] = there.with_state(values)
     return found
 
 
@@ -131,25 +129,13 @@ def find_objects_supported_by(
     for name, label in supported.items():
         other = min(find_supports(now[name], static_shapes), default=None)
         if other is not None and not item.free:
-            problem = (
-                f"'{name}' rests both on a moving and on a fixed link: '{label}' and '{other}'"
-            )
-            raise InputError(
-                problem,
-                field=where,
-                expected="that it is removed, or rests on one of them only",
-            )
-        link = label.partition(".")[2]
-        carrier = now[hold.object]
-        found.append(
-            SupportedObject(
-                name,
-                hold,
-                link,
-                carrier.link_placement(link).actInv(now[name].placement),
-                carrier.placement,
-            )
-        )
+            both = f"'{label}' and '{other}'"
+            problem = f"'{name}' rests both on a moving and on a fixed link: {both}"
+            expected = "that it is removed, or rests on one of them only"
+            raise InputError(problem, field=where, expected=expected)
+        link, carrier = label.partition(".")[2], now[hold.object]
+        local = carrier.link_placement(link).actInv(now[name].placement)
+        found.append(SupportedObject(name, hold, link, local, carrier.placement))
     return tuple(found)
 
 
@@ -159,14 +145,7 @@ def compute_placement_after_motion(
     """Return the placement of a supported object after a joint of its support has moved."""
     link = after.link_placement(one.link)
     if (angle := compute_tilt(before.link_placement(one.link), link)) > MAX_TILT:
-        problem, got = (
-            f"'{one.object}' rests on '{one.support}', which would tilt too much",
-            f"{angle:.2f} rad",
-        )
-        raise InputError(
-            problem,
-            field=where,
-            expected=f"that it is removed before, or at most {MAX_TILT:g} rad",
-            got=got,
-        )
+        problem = f"'{one.object}' rests on '{one.support}', which would tilt too much"
+        expected = f"that it is removed before, or at most {MAX_TILT:g} rad"
+        raise InputError(problem, field=where, expected=expected, got=f"{angle:.2f} rad")
     return link * one.placement_in_link

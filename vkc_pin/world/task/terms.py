@@ -1,8 +1,7 @@
 """Defines constraints and costs of users: CasADi expressions of coordinates and frames.
 
-The user's function is called once, with symbols, and its result is stored as plain data
-(`formula`). The nonlinear program composes that with its kinematics; validation evaluates it at
-placements that it computes itself.
+The user's function is called once, with symbols, and its result is stored as plain data. The
+nonlinear program composes that with its kinematics; validation evaluates it independently.
 """
 
 from __future__ import annotations
@@ -36,6 +35,8 @@ __all__ = [
     "trace_terms_without_scene",
 ]
 
+_CONSTANT = "it does not depend on the state"
+_DEPENDENT = "an expression of symbols that the State returns"
 Numbers = float | Sequence[float] | NDArray[np.float64]
 Expression = Callable[[State], Any] | Formula
 
@@ -50,12 +51,8 @@ class _Term:
 
     def _check(self) -> None:
         if not isinstance(self.name, str) or not self.name:
-            raise InputError(
-                "not a name",
-                field=f"{type(self).__name__}.name",
-                expected="text",
-                got=format_value(self.name),
-            )
+            field, got = f"{type(self).__name__}.name", format_value(self.name)
+            raise InputError("not a name", field=field, expected="text", got=got)
         if not callable(self.expression) and not isinstance(self.expression, Formula):
             expected = "a function of a State, e.g. lambda s: s.coordinate('elbow_joint')"
             raise self.make_error(
@@ -63,17 +60,10 @@ class _Term:
             )
         if self.during is not None:
             names = (self.during,) if isinstance(self.during, str) else self.during
-            if (
-                not isinstance(names, list | tuple)
-                or not names
-                or not all(isinstance(name, str) for name in names)
-            ):
-                raise self.make_error(
-                    "not phases",
-                    "during",
-                    "names of phases, e.g. ['place cup']",
-                    format_value(self.during),
-                )
+            listed = isinstance(names, list | tuple) and len(names) > 0
+            if not listed or not all(isinstance(name, str) for name in names):
+                expected, got = "names of phases, e.g. ['place cup']", format_value(self.during)
+                raise self.make_error("not phases", "during", expected, got)
             object.__setattr__(self, "during", tuple(names))
         if self.holding is not None and not isinstance(self.holding, str):
             raise self.make_error(
@@ -140,28 +130,24 @@ class Constraint(_Term):
         self.compute_bounds(self.expression.rows if isinstance(self.expression, Formula) else None)
 
     def _check_bound(self, field: str, value: Any) -> float | tuple[float, ...]:
-        given = check_array(
-            value,
-            f"terms[{self.name!r}].{field}",
-            "a number or a list of them",
-            problem="not a number",
-        )
+        where, expected = f"terms[{self.name!r}].{field}", "a number or a list of them"
+        given = check_array(value, where, expected, problem="not a number")
         wrong = np.isnan(given) | (given == (np.inf if field == "lower" else -np.inf))
         if given.ndim > 1 or not given.size or wrong.any():
-            raise self.make_error(
-                "no such bound", field, "a number or a list of them", format_value(value)
-            )
+            raise self.make_error("no such bound", field, expected, format_value(value))
         return float(given) if given.ndim == 0 else tuple(given.tolist())
 
     def compute_bounds(self, rows: int | None) -> tuple[Floats, Floats]:
-        """Return both bounds, shape (rows,).
-
-        Args:
-            rows: Number of rows of the expression; None: as many as there are bounds.
+        """Return both bounds, shape (rows,); rows: None: as many as there are bounds.
 
         Raises:
             InputError: They do not fit the expression, or each other.
         """
+
+        def make_error(problem: str, expected: str) -> InputError:
+            got = format_value((self.lower, self.upper))
+            return self.make_error(problem, "lower, upper", expected, got)
+
         given = [
             -np.inf if self.lower is None else self.lower,
             np.inf if self.upper is None else self.upper,
@@ -172,31 +158,14 @@ class Constraint(_Term):
             else:
                 lower, upper = (np.broadcast_to(bound, (rows,)) for bound in given)
         except ValueError:
-            expected = (
-                "as many lower as upper ones"
-                if rows is None
-                else f"one number, or {rows}, like the expression"
-            )
-            raise self.make_error(
-                "wrong number of bounds",
-                "lower, upper",
-                expected,
-                format_value((self.lower, self.upper)),
-            ) from None
+            expected = f"one number, or {rows}, like the expression"
+            if rows is None:
+                expected = "as many lower as upper ones"
+            raise make_error("wrong number of bounds", expected) from None
         if not (np.isfinite(lower) | np.isfinite(upper)).all():
-            raise self.make_error(
-                "no bound",
-                "lower, upper",
-                "at least one of them, finite",
-                format_value((self.lower, self.upper)),
-            )
+            raise make_error("no bound", "at least one of them, finite")
         if (lower > upper).any():
-            raise self.make_error(
-                "lower is more than upper",
-                "lower, upper",
-                "lower <= upper",
-                format_value((self.lower, self.upper)),
-            )
+            raise make_error("lower is more than upper", "lower <= upper")
         return lower, upper
 
 
@@ -242,7 +211,7 @@ def trace_terms(scene: Scene, terms: Sequence[Term]) -> tuple[Term, ...]:
 
 
 def trace_terms_without_scene(terms: Sequence[Term]) -> tuple[Term, ...]:
-    """Return terms with their expressions as plain data, with any names of frames and coordinates."""
+    """Return terms with their expressions as plain data; all names are accepted."""
     return _trace_all(
         check_list(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost)), None, None
     )
@@ -267,12 +236,8 @@ def _trace_all(
     found: list[Term] = []
     for term in terms:
         if term.name in (other.name for other in found):
-            raise InputError(
-                "two terms share a name",
-                field="terms",
-                expected="different names",
-                got=format_value(term.name),
-            )
+            expected, got = "different names", format_value(term.name)
+            raise InputError("two terms share a name", field="terms", expected=expected, got=got)
         found.append(_trace(term, State(frames, coordinates, f"terms[{term.name!r}].expression")))
     return tuple(found)
 
@@ -290,25 +255,14 @@ def _trace(term: Term, state: State) -> Term:
             "it cannot be evaluated", "expression", "CasADi operations only", str(error)
         ) from error
     if isinstance(value, int | float | np.ndarray | np.number | ca.DM):
-        raise term.make_error(
-            "it does not depend on the state",
-            "expression",
-            "an expression of what a State returns",
-            format_value(value),
-        )
+        raise term.make_error(_CONSTANT, "expression", _DEPENDENT, format_value(value))
     if not isinstance(value, ca.SX):
-        raise term.make_error(
-            "no CasADi expression",
-            "expression",
-            "a number or a column, e.g. of ca.vertcat",
-            format_value(value),
-        )
-    if (
-        not value.is_vector()
-        or value.is_empty()
-        or (isinstance(term, Cost) and not value.is_scalar())
-    ):
-        expected = "a number" if isinstance(term, Cost) else "a number or a column"
+        expected = "a number or a column, e.g. of ca.vertcat"
+        problem, got = "not a CasADi expression", format_value(value)
+        raise term.make_error(problem, "expression", expected, got)
+    is_cost = isinstance(term, Cost)
+    if not value.is_vector() or value.is_empty() or (is_cost and not value.is_scalar()):
+        expected = "a number" if is_cost else "a number or a column"
         raise term.make_error("wrong shape", "expression", expected, f"shape {value.shape}")
     try:
         formula = state.make_formula(ca.vec(value))
@@ -317,12 +271,7 @@ def _trace(term: Term, state: State) -> Term:
             "it has symbols of its own", "expression", "only those of its State", str(error)
         ) from error
     if not formula.input_indices:
-        raise term.make_error(
-            "it does not depend on the state",
-            "expression",
-            "an expression of what a State returns",
-            str(value),
-        )
+        raise term.make_error(_CONSTANT, "expression", _DEPENDENT, str(value))
     if formula.has_comparison:
         raise term.make_error(
             "a comparison", "expression", "an expression that lower and upper bound", str(value)
@@ -364,16 +313,8 @@ def term_from_dict(data: Mapping[str, Any]) -> Term:
         formula = Formula(
             tuple(given["frames"]), tuple(given["coordinates"]), int(given["rows"]), code
         )
-        formula.function  # noqa: B018 - what cannot be built is no expression
+        formula.function  # noqa: B018 - raises an error for an invalid expression
         return kinds[fields.pop("term")](expression=formula, **fields)
-    except (
-        LookupError,
-        TypeError,
-        ValueError,
-        OverflowError,
-        NotImplementedError,
-        RuntimeError,
-    ) as error:
-        raise InputError(
-            "not a saved term", field="terms", expected="what Plan.save wrote", got=str(error)
-        ) from error
+    except (LookupError, TypeError, ValueError, OverflowError, RuntimeError) as error:
+        problem, expected = "not a saved term", "a term written by Plan.save"
+        raise InputError(problem, field="terms", expected=expected, got=str(error)) from error

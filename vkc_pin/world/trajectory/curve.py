@@ -69,7 +69,7 @@ class Curve:
             object.__setattr__(self, name, array)
 
     def at(self, time: ArrayLike) -> Floats:
-        """Return positions, shape (..., n), at times [s], shape (...,), clamped to the curve's span."""
+        """Return positions, shape (..., n), at times [s], shape (...,), clamped to the curve."""
         return self._cubic(time, 0)
 
     def velocity(self, time: ArrayLike) -> Floats:
@@ -77,7 +77,7 @@ class Curve:
         return self._cubic(time, 1)
 
     def acceleration(self, time: ArrayLike) -> Floats:
-        """Return accelerations, shape (..., n), at times [s], shape (...,); knots use the next cubic."""
+        """Return accelerations, shape (..., n), at times [s], shape (...,), right of knots."""
         return self._cubic(time, 2)
 
     def _cubic(self, time: ArrayLike, derivative: int) -> Floats:
@@ -116,12 +116,8 @@ class Curve:
         first, middle, last = c - p, d - c, q - d
         bend, sides = first - 2.0 * middle + last, [p, q]
         root = np.sqrt(np.maximum(middle**2 - first * last, 0.0))
-        for sign in (
-            -1.0,
-            1.0,
-            # where the velocity, first·(1−s)² + 2·middle·s(1−s) + last·s², is zero: bend·s² + ... +
-            # first
-        ):
+        for sign in (-1.0, 1.0):
+            # Zeros of the velocity, first·(1−s)² + 2·middle·s(1−s) + last·s².
             straight = first - middle + sign * root
             other = first - middle - sign * root
             at = np.divide(
@@ -134,7 +130,7 @@ class Curve:
         return np.asarray(np.min(sides, axis=0)), np.asarray(np.max(sides, axis=0))
 
     def compute_max_rates(self) -> tuple[Floats, Floats]:
-        """Compute the exact largest |velocity| and |acceleration| per cubic, shape (K − 1, n) each."""
+        """Compute the exact largest |velocity| and |acceleration| of cubics, (K − 1, n) each."""
         h = np.diff(self.times)[:, None]
         p, c, d, q = self._control(np.arange(len(h)))
         first, middle, last = (3.0 / h * part for part in (c - p, d - c, q - d))
@@ -142,9 +138,7 @@ class Curve:
         at = np.divide(
             first - middle, bend, out=np.full_like(bend, -1.0), where=np.abs(bend) > 1e-12
         )
-        at = np.where(
-            (at > 0.0) & (at < 1.0), at, 0.0
-        )  # where the velocity, a parabola, turns round
+        at = np.where((at > 0.0) & (at < 1.0), at, 0.0)  # vertex of the velocity, a parabola
         between = (1.0 - at) ** 2 * first + 2.0 * at * (1.0 - at) * middle + at**2 * last
         fastest = np.max(np.abs([first, last, between]), axis=0)
         strongest = np.max(np.abs([2.0 / h * (middle - first), 2.0 / h * (last - middle)]), axis=0)

@@ -52,7 +52,7 @@ class PhaseSpan:
         return {hold.object: hold.attachment for hold in self.holds}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data; `by` maps objects held through another to its link, "<object>.<link>"."""
+        """Return plain data; `by` maps objects held through another to its "<object>.<link>"."""
         by = {hold.object: hold.frame for hold in self.holds if hold.by}
         data = {
             "name": self.name,

@@ -247,7 +247,7 @@ class Trajectory:
         ]
 
     def metrics(self) -> dict[str, float]:
-        """Return duration [s], base_path_length and base_path_length_l1 [m], and arm_path_length [rad]."""
+        """Return duration [s] and path lengths of base [m] and arm [rad]."""
         return {
             "duration": float(self.times[-1] - self.times[0]),
             "base_path_length": self.base_path_length(),
@@ -293,7 +293,7 @@ class Trajectory:
         return cls(names, times, positions, tuple(phases), size, curve)
 
     def to_csv(self, path: str | Path, **options: Any) -> Path:
-        """Write a CSV table of times [s], positions [m], [rad] and phases; see `tables.write_csv`."""
+        """Write a CSV table of times, positions and phases; see `tables.write_csv`."""
         return tables.write_csv(self.to_dict(), path, **options)
 
     def to_json(self, path: str | Path) -> Path:
@@ -339,7 +339,7 @@ class Trajectory:
         like: Trajectory | None = None,
         robot_size: int | None = None,
     ) -> Trajectory:
-        """Convert data from `to_ros`, or a JSON file with them, to a trajectory; see `ros.from_ros`.
+        """Convert data from `to_ros`, or a file with them, to a trajectory; see `ros.from_ros`.
 
         Raises:
             InputError: A field is missing or invalid; the error names it.

@@ -89,7 +89,7 @@ class World:
 
     @cached_property
     def collision(self) -> pin.GeometryModel:
-        """All collision geometry; its construction takes quadratic time in the number of obstacles."""
+        """All collision geometry; its construction takes quadratic time in the obstacles."""
         geometry = self.bodies.copy()
         graft_geometry(geometry, self.scene.obstacles, joints=[0], placement=pin.SE3.Identity())
         return geometry

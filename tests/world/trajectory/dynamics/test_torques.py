@@ -1,4 +1,4 @@
-"""Torques of the arm: against energies, and against the oracle's virtual work."""
+"""Tests torques of the arm against energies and weights."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def energy(world: World, motion: Trajectory, moment: float) -> float:
 
 
 @pytest.mark.parametrize("mass", [0.0, 4.0])
-def test_motors_give_the_energy_that_arm_and_payload_gain(mass: float) -> None:
+def test_power_equals_the_change_of_energy(mass: float) -> None:
     scene, motion = swung(mass)
     world = World(scene)
     for moment in (0.35, 0.8, 1.3):
@@ -66,7 +66,7 @@ def test_motors_give_the_energy_that_arm_and_payload_gain(mass: float) -> None:
         assert power == pytest.approx(gained, rel=2e-3, abs=2e-2)
 
 
-def test_a_payload_at_rest_weighs_by_its_lever() -> None:
+def test_payload_at_rest_adds_its_weight() -> None:
     torques = []
     for mass in (0.0, 3.0):
         scene, motion = swung(mass)
@@ -87,7 +87,7 @@ def test_a_payload_at_rest_weighs_by_its_lever() -> None:
     np.testing.assert_allclose(torques[1][3:] - torques[0][3:], hand, atol=1e-6)
 
 
-def test_acceleration_of_the_base_pulls_at_the_arm() -> None:
+def test_base_acceleration_loads_the_arm() -> None:
     scene, motion = swung(2.0, base=0.4)
     _, still = swung(2.0)
     times = np.array([0.4, 0.9])

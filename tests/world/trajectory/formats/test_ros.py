@@ -88,7 +88,7 @@ def test_a_message_has_the_fields_of_a_joint_trajectory(plan: Plan) -> None:
     assert json.loads(json.dumps(message)) == message, "plain data"
     assert set(message) == {"header", "joint_names", "points"}
     assert message["header"] == {"stamp": {"sec": 1, "nanosec": 500_000_000}, "frame_id": "map"}
-    assert message["joint_names"] == list(plan.trajectory.names[:9]), "what has a motor"
+    assert message["joint_names"] == list(plan.trajectory.names[:9]), "coordinates with motors"
     for point, moment in zip(message["points"], plan.trajectory.times, strict=True):
         assert set(point) == {
             "positions",
@@ -149,9 +149,9 @@ def test_invalid_options_are_rejected(plan: Plan, options: dict[str, Any], messa
 def changed(message: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
     """Return a copy with another value at a path such as "points/0/positions"; None removes it."""
     copy = json.loads(json.dumps(message))
-    *way, last = [int(part) if part.isdigit() else part for part in path.split("/")]
+    *path_parts, last = [int(part) if part.isdigit() else part for part in path.split("/")]
     inner = copy
-    for part in way:
+    for part in path_parts:
         inner = inner[part]
     if value is None:
         del inner[last]
@@ -208,9 +208,7 @@ def test_sent_motions_can_be_validated(door_plan: Plan, smooth: bool) -> None:
     assert [phase.name for phase in sent.phases] == [
         phase.name for phase in door_plan.trajectory.phases
     ]
-    options = dataclasses.replace(
-        door_plan.options, dist_safe=0.01
-    )  # what is kept between waypoints
+    options = dataclasses.replace(door_plan.options, dist_safe=0.01)  # the margin between waypoints
     report = vkc.validate(door_plan.scene, door_plan.steps, sent, options)
     wrong = (
         {"acceleration", "closure"} if smooth else {"acceleration"}

@@ -188,7 +188,8 @@ def test_large_and_deep_files_are_rejected_in_time(
         ('{"trajectory": 3}', "bad.json: trajectory: not a trajectory"),
         ('{"names": [], "phases": 3}', "bad.json: phases: not a list"),
         (
-            '{"names": ["a"], "times": [0, 1], "positions": [[1], ["x"]], "robot_size": 3, "phases": []}',
+            '{"names": ["a"], "times": [0, 1], "positions": [[1], ["x"]],'
+            ' "robot_size": 3, "phases": []}',
             r"bad.json: Trajectory.positions: not numbers",
         ),
     ],

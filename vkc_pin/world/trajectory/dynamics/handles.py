@@ -13,10 +13,10 @@ from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 
-__all__ = ["Handle", "Riders"]
+__all__ = ["Handle", "Loads"]
 
-Riders = Sequence[tuple[int, pin.Inertia]]
-"""What rides on an object: the joint of its model that carries it, and its inertia in the frame of that."""
+Loads = Sequence[tuple[int, pin.Inertia]]
+"""Supported loads: joint of the object's model, and inertia in the frame of that joint."""
 _GRIP = 0.1  # lever arm of a hand, for the weighting of torques [m]
 _SINGULAR = 1e-9  # relative cutoff for joints that the hand cannot move
 # Velocity of a joint at rest [m/s], [rad/s], and distance from its latch or stop [m], [rad].
@@ -34,55 +34,48 @@ class Motion(NamedTuple):
 class Handle:
     """A hand at an attachment of a fixed object."""
 
-    def __init__(self, scene: Scene, hold: Hold, riders: Riders = ()) -> None:
+    def __init__(self, scene: Scene, hold: Hold, loads: Loads = ()) -> None:
         self.name, self.placed = hold.object, scene.objects[hold.object]
-        thing = self.placed.object
-        self.attachment = thing.attachment(hold.attachment)
+        item = self.placed.object
+        self.attachment = item.attachment(hold.attachment)
         self.point = compute_hand_frame(scene.robot, self.attachment)
-        own, loaded = pin.Model(thing.model), pin.Model(thing.model)
-        for joint, inertia in riders:
+        own, loaded = pin.Model(item.model), pin.Model(item.model)
+        for joint, inertia in loads:
             loaded.inertias[joint] += inertia
         own.gravity.linear = loaded.gravity.linear = (
-            self.placed.placement.rotation.T @ thing.model.gravity.linear
+            self.placed.placement.rotation.T @ item.model.gravity.linear
         )
         self._own, self._loaded = own, loaded
-        self._frame = thing.link_frame(self.attachment.link)
+        self._frame = item.link_frame(self.attachment.link)
         path = list(own.supports[own.frames[self._frame].parentJoint])
-        self._moved = [k for k, joint in enumerate(thing.coordinates.joints) if joint in path]
+        self._moved = [k for k, joint in enumerate(item.coordinates.joints) if joint in path]
 
     def wrenches(self, motion: Motion) -> Floats:
         """Compute the hand's wrenches at `point` in world axes, shape (K, 6) [N], [N·m]."""
-        thing, turn = self.placed.object, self.placed.placement.rotation
-        forces, z = (
-            self.forces(motion)[:, self._moved],
-            self._rows(motion.positions, self.placed.state),
-        )
+        item, turn = self.placed.object, self.placed.placement.rotation
+        forces = self.forces(motion)[:, self._moved]
+        z = self._rows(motion.positions, self.placed.state)
         columns = [f"{self.name}.{name}" for name in self.attachment.coordinates]
         values = np.column_stack(
             [np.zeros((len(z), 0)), *(motion.positions[name] for name in columns)]
         )
-        data, jacobians, links = (
-            self._own.createData(),
-            np.empty((len(z), 6, self._own.nv)),
-            list[pin.SE3](),
-        )
-        for k, q in enumerate(thing.coordinates.q(z)):
+        data, links = self._own.createData(), list[pin.SE3]()
+        jacobians = np.empty((len(z), 6, self._own.nv))
+        for k, q in enumerate(item.coordinates.q(z)):
             pin.computeJointJacobians(self._own, data, q)
             links.append(pin.updateFramePlacement(self._own, data, self._frame).copy())
             jacobians[k] = pin.getFrameJacobian(
                 self._own, data, self._frame, pin.LOCAL_WORLD_ALIGNED
             ).reshape(6, -1)
-        turns, origins = (
-            np.array([link.rotation for link in links]),
-            np.array([link.translation for link in links]),
-        )
+        turns = np.array([link.rotation for link in links])
+        origins = np.array([link.translation for link in links])
         points, free = self._grasp(turns, origins, values)
-        ways = np.swapaxes(jacobians[:, :, self._moved], 1, 2)
-        ways[..., :3] += np.cross(ways[..., 3:], (points - origins)[:, None])
-        maps = np.concatenate([ways, free], axis=1)
-        asked = np.pad(forces, ((0, 0), (0, maps.shape[1] - forces.shape[1])))
+        directions = np.swapaxes(jacobians[:, :, self._moved], 1, 2)
+        directions[..., :3] += np.cross(directions[..., 3:], (points - origins)[:, None])
+        maps = np.concatenate([directions, free], axis=1)
+        required = np.pad(forces, ((0, 0), (0, maps.shape[1] - forces.shape[1])))
         basis = self._bases(turns)
-        shares = np.linalg.pinv(maps @ basis, rcond=_SINGULAR) @ asked[..., None]
+        shares = np.linalg.pinv(maps @ basis, rcond=_SINGULAR) @ required[..., None]
         return np.asarray((basis @ shares)[..., 0] @ np.kron(np.eye(2), turn).T)
 
     def _grasp(self, turns: Floats, origins: Floats, values: Floats) -> tuple[Floats, Floats]:
@@ -105,34 +98,33 @@ class Handle:
                 origin = origin + axis * value[:, None]
                 axes.append((axis, None))
         points = origin - at.standoff * rotation[..., 2]
-        ways = np.zeros((len(turns), 0 if at.firm or at.contact == "push" else len(axes), 6))
-        for k, (axis, center) in enumerate(axes[: ways.shape[1]]):
-            ways[:, k, :3] = axis if center is None else np.cross(axis, points - center)
-            ways[:, k, 3:] = 0.0 if center is None else axis
-        return points, ways
+        directions = np.zeros((len(turns), 0 if at.firm or at.contact == "push" else len(axes), 6))
+        for k, (axis, center) in enumerate(axes[: directions.shape[1]]):
+            directions[:, k, :3] = axis if center is None else np.cross(axis, points - center)
+            directions[:, k, 3:] = 0.0 if center is None else axis
+        return points, directions
 
     def forces(self, motion: Motion) -> Floats:
-        """Compute the required joint forces, shape (K, joints) [N], [N·m]; springs carry the weight."""
-        thing = self.placed.object
+        """Compute the joint forces, shape (K, joints) [N], [N·m]; springs carry the weight."""
+        item = self.placed.object
         z = self._rows(motion.positions, self.placed.state)
         v, a = (
             self._rows(part, np.zeros(len(self.placed.state)))
             for part in (motion.velocities, motion.accelerations)
         )
         data, found = self._own.createData(), np.empty(z.shape)
-        for k, q in enumerate(thing.coordinates.q(z)):
+        for k, q in enumerate(item.coordinates.q(z)):
             carried = pin.computeGeneralizedGravity(self._own, data, q)
             found[k] = pin.rnea(self._loaded, data, q, v[k], a[k]) - carried
-        held = {latch.joint: latch.held_at for latch in thing.latches}
-        for k, name in enumerate(thing.coordinates.names):
-            resistance, rests = thing.resistance.get(name), np.abs(v[:, k]) <= _STILL
+        held = {latch.joint: latch.held_at for latch in item.latches}
+        for k, name in enumerate(item.coordinates.names):
+            resistance, rests = item.resistance.get(name), np.abs(v[:, k]) <= _STILL
             if resistance is not None:
                 found[:, k] += resistance.force(z[:, k], np.where(rests, 0.0, v[:, k]))
             shut = np.abs(z[:, k] - held.get(name, np.inf)) <= _STILL
-            shut |= (z[:, k] <= thing.lower[k] + _STILL) & (
-                found[:, k] > 0.0
-            )  # its stop carries that, or its bolt
-            shut |= (z[:, k] >= thing.upper[k] - _STILL) & (found[:, k] < 0.0)
+            # Its stop or its bolt carries such forces.
+            shut |= (z[:, k] <= item.lower[k] + _STILL) & (found[:, k] > 0.0)
+            shut |= (z[:, k] >= item.upper[k] - _STILL) & (found[:, k] < 0.0)
             found[rests & shut & (np.abs(a[:, k]) <= _STILL), k] = 0.0
         return found
 
@@ -147,7 +139,7 @@ class Handle:
         return np.column_stack([np.zeros((size, 0)), *columns])
 
     def _bases(self, turns: Floats) -> Floats:
-        """Compute bases of equally weighted wrenches, shape (K, 6, r); for a push, its direction."""
+        """Compute bases of equally weighted wrenches, (K, 6, r); for a push, its direction."""
         if self.attachment.contact == "push":
             return np.pad(turns @ self.attachment.placement.rotation[:, 2], ((0, 0), (0, 3)))[
                 ..., None

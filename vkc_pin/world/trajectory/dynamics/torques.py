@@ -20,9 +20,7 @@ from vkc_pin.world.trajectory.wheels import rotate_into_base_frame
 
 __all__ = ["MotionSamples", "Torques", "sample_curve", "transform_to_base_axes"]
 
-_SHARES = np.array(
-    [0.0, 0.5, 1.0]
-)  # of each cubic at which it is looked at: accelerations jump at both ends
+_SHARES = np.array([0.0, 0.5, 1.0])  # of each cubic: accelerations jump at both ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,13 +100,14 @@ class Torques:
         found = np.zeros((len(positions), self.trajectory.robot_size))
         for number in np.unique(phases).tolist():
             rows = np.flatnonzero(phases == number)
-            found[rows] = self._in_phase(
-                self._load(number), *(part[rows] for part in (positions, velocities, accelerations))
+            found[rows] = self._compute_in_phase(
+                self._get_load(number),
+                *(part[rows] for part in (positions, velocities, accelerations)),
             )
         return found
 
     def along(self, times: Floats) -> Floats:
-        """Compute torques of the robot's coordinates at times [s], shape (K,), within the motion."""
+        """Compute torques of the robot's coordinates at times [s] in the motion, shape (K,)."""
         trajectory = self.trajectory
         steps = np.clip(
             np.searchsorted(trajectory.times, times, side="right") - 1, 0, len(trajectory.times) - 2
@@ -128,11 +127,13 @@ class Torques:
     def massless_objects(self) -> tuple[str, ...]:
         """Carried objects without mass data."""
         phases = zip(self.trajectory.phases, self._free.supports, strict=True)
-        carried = dict.fromkeys(name for phase, rides in phases for name in (*phase.held, *rides))
-        things = {name: self.scene.objects[name].object for name in carried}
-        return tuple(name for name, thing in things.items() if thing.free and not thing.mass > 0.0)
+        names = dict.fromkeys(
+            name for phase, supports in phases for name in (*phase.held, *supports)
+        )
+        items = {name: self.scene.objects[name].object for name in names}
+        return tuple(name for name, item in items.items() if item.free and not item.mass > 0.0)
 
-    def _in_phase(
+    def _compute_in_phase(
         self, load: _Load, positions: Floats, velocities: Floats, accelerations: Floats
     ) -> Floats:
         robot, size = self.scene.robot, self.trajectory.robot_size
@@ -149,10 +150,8 @@ class Torques:
         )
         motion, frame = Motion(*parts), load.model.getFrameId(robot.tool_frame)
         for handle in load.handles:
-            jacobians, turns = (
-                np.empty((len(positions), 6, load.model.nv)),
-                np.empty((len(positions), 3, 3)),
-            )
+            jacobians = np.empty((len(positions), 6, load.model.nv))
+            turns = np.empty((len(positions), 3, 3))
             for k, q in enumerate(configurations):
                 jacobians[k] = pin.computeFrameJacobian(
                     load.model, data, q, frame, pin.LOCAL_WORLD_ALIGNED
@@ -164,68 +163,60 @@ class Torques:
         found[:, :3] = 0.0
         return found
 
-    def _load(self, number: int) -> _Load:
+    def _get_load(self, number: int) -> _Load:
         """Return the load of a phase."""
         if number not in self._loads:
             phase, objects = self.trajectory.phases[number], self.scene.objects
             fixed = [hold for hold in phase.holds if not objects[hold.object].object.free]
-            riders: dict[str, list[tuple[int, pin.Inertia]]] = {hold.object: [] for hold in fixed}
+            loads: dict[str, list[tuple[int, pin.Inertia]]] = {hold.object: [] for hold in fixed}
             model = pin.Model(self.scene.robot.model)
             if self._free.names:
-                self._carry(number, model, riders)
+                self._add_inertias(number, model, loads)
             moved = [hold for hold in fixed if objects[hold.object].object.coordinates.size]
             self._loads[number] = _Load(
-                model, tuple(Handle(self.scene, hold, riders[hold.object]) for hold in moved)
+                model, tuple(Handle(self.scene, hold, loads[hold.object]) for hold in moved)
             )
         return self._loads[number]
 
-    def _carry(
-        self, number: int, model: pin.Model, riders: dict[str, list[tuple[int, pin.Inertia]]]
+    def _add_inertias(
+        self, number: int, model: pin.Model, loads: dict[str, list[tuple[int, pin.Inertia]]]
     ) -> None:
-        """Add the inertias of carried objects to the hand, and of supported ones to fixed objects."""
-        phase, rides, objects = (
-            self.trajectory.phases[number],
-            self._free.supports[number],
-            self.scene.objects,
-        )
+        """Add the inertias of carried objects to the hand, of supported ones to their supports."""
+        phase, supports = self.trajectory.phases[number], self._free.supports[number]
+        objects = self.scene.objects
         middle = self.trajectory.times[[phase.first, phase.last]].mean(keepdims=True)
         carried = [hold.object for hold in phase.holds if objects[hold.object].object.free]
-        if not (carried or rides):
+        if not (carried or supports):
             return
         where, (row,) = self._free.at(middle), self.trajectory.at(middle)
-        data, values = (
-            model.createData(),
-            dict(zip(self.trajectory.names, row.tolist(), strict=True)),
-        )
+        data = model.createData()
+        values = dict(zip(self.trajectory.names, row.tolist(), strict=True))
         pin.forwardKinematics(
             model, data, self.scene.robot.coordinates.q(row[: self.trajectory.robot_size])
         )
         hand = model.frames[model.getFrameId(self.scene.robot.tool_frame)].parentJoint
-        for name in (*carried, *rides):
-            body = pin.XYZQUATToSE3(where[name][0]).act(
-                _whole(objects[name].object, objects[name].state)
-            )
-            owner, _, link = rides.get(name, "").partition(".")
+        for name in (*carried, *supports):
+            whole = _compute_inertia(objects[name].object, objects[name].state)
+            body = pin.XYZQUATToSE3(where[name][0]).act(whole)
+            owner, _, link = supports.get(name, "").partition(".")
             if name in carried or owner in carried:
                 model.inertias[hand] += data.oMi[hand].actInv(body)
-            elif owner in riders:
-                thing, own = objects[owner].object, objects[owner].placement.actInv(body)
-                joints = zip(thing.coordinates.names, objects[owner].state.tolist(), strict=True)
+            elif owner in loads:
+                item, own = objects[owner].object, objects[owner].placement.actInv(body)
+                joints = zip(item.coordinates.names, objects[owner].state.tolist(), strict=True)
                 state = np.array([values.get(f"{owner}.{joint}", value) for joint, value in joints])
-                inside = thing.model.createData()
-                pin.forwardKinematics(thing.model, inside, thing.coordinates.q(state))
-                joint = thing.model.frames[thing.link_frame(link)].parentJoint
-                riders[owner].append((joint, inside.oMi[joint].actInv(own)))
+                inside = item.model.createData()
+                pin.forwardKinematics(item.model, inside, item.coordinates.q(state))
+                joint = item.model.frames[item.link_frame(link)].parentJoint
+                loads[owner].append((joint, inside.oMi[joint].actInv(own)))
 
 
-def _whole(thing: ArticulatedObject, state: Floats) -> pin.Inertia:
-    """Compute an object's total inertia at joint positions `state`, (n,), in the base link's frame."""
-    data = thing.model.createData()
-    pin.forwardKinematics(thing.model, data, thing.coordinates.q(state))
-    return sum(
-        (data.oMi[j].act(inertia) for j, inertia in enumerate(thing.model.inertias)),
-        pin.Inertia.Zero(),
-    )
+def _compute_inertia(item: ArticulatedObject, state: Floats) -> pin.Inertia:
+    """Compute an object's total inertia in the base frame at joint values `state`, (n,)."""
+    data = item.model.createData()
+    pin.forwardKinematics(item.model, data, item.coordinates.q(state))
+    own = (data.oMi[j].act(inertia) for j, inertia in enumerate(item.model.inertias))
+    return sum(own, pin.Inertia.Zero())
 
 
 def transform_to_base_axes(

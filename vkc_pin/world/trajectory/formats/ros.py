@@ -127,7 +127,7 @@ def from_ros(
     like: Mapping[str, Any] | None = None,
     robot_size: int | None = None,
 ) -> dict[str, Any]:
-    """Return the motion in data with the fields of `trajectory_msgs/JointTrajectory`; times to 1 ns.
+    """Return the motion in data with the fields of `trajectory_msgs/JointTrajectory`.
 
     Args:
         message: Data, or a JSON file with them, with all of the robot's coordinates, base first.

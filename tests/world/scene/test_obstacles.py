@@ -71,7 +71,7 @@ def test_every_kind_has_its_volume_and_place(
 def test_a_urdf_stands_with_its_joints_at_zero(tmp_path: Path) -> None:
     (tmp_path / "r.urdf").write_text(URDF)
     _, solid = described(tmp_path, type="urdf", file="r.urdf", colour=[1, 0, 0, 1])
-    assert [shape.name for shape in solid] == ["thing_0", "thing_1"]
+    assert [shape.name for shape in solid] == ["item_0", "item_1"]
     assert all(shape.parentJoint == 0 for shape in solid)
     where = [
         pin.SE3(np.eye(3), np.array([0, 0, 1.0])),

@@ -246,7 +246,7 @@ def test_inline_object_descriptions(tmp_path: Path) -> None:
     [
         ("link: leaf,", "link: leav,", 11, "attachments[0].link"),
         ("acceleration: 3", "acceleration: -3", 9, "joints.hinge.acceleration"),
-        ('<child link="leaf"/>', '<child link="leav"/>', 7, "hinge: child"),
+        ('<child link="leaf"/>', '<child link="leav"/>', 8, "hinge: child"),
     ],
 )
 def test_errors_in_inline_descriptions_are_located(

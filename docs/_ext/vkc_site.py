@@ -100,8 +100,11 @@ def whole(app: Sphinx, thing: Any, bound: bool) -> None:
 
 
 def skip(app: Sphinx, what: str, name: str, thing: Any, skipped: bool, options: Any) -> bool | None:
-    """Leave out of a module's page what has its place among the names of `vkc_pin` itself."""
-    public = what == "module" and name in vkc.__all__ and getattr(vkc, name) is thing
+    """Leave out public names of the package and of its subpackages, which have pages of their own."""
+    public = what == "module" and any(
+        name in owner.__all__ and getattr(owner, name) is thing
+        for owner in (vkc, vkc.datasets, vkc.importing, vkc.procedural)
+    )
     return True if public else None
 
 
@@ -122,7 +125,9 @@ def resolve(
         if name.rpartition(".")[2] == last
         and known[name].objtype in ("class", "function", "exception")
     ]
-    public = [name for name in found if name == f"vkc_pin.{last}"] or found
+    owners = ("", "datasets.", "importing.", "procedural.")
+    public = [name for name in found if name in {f"vkc_pin.{owner}{last}" for owner in owners}]
+    public = public or found
     if len(public) != 1:
         return None
     entry = known[public[0]]

@@ -115,3 +115,10 @@ def test_the_stub_lists_what_the_package_gives() -> None:
     assert {name for name in names if name != "__builtins__"} == set(vkc.__all__)
     with pytest.raises(AttributeError, match="plann"):
         vkc.plann  # type: ignore[attr-defined]  # noqa: B018
+
+
+@pytest.mark.parametrize("package", ["datasets", "importing", "procedural"])
+def test_no_function_has_the_name_of_a_module_beside_it(package: str) -> None:
+    """Importing the module would replace the function as the package's attribute."""
+    owner = getattr(vkc, package)
+    assert {name for _, name, _ in pkgutil.iter_modules(owner.__path__)}.isdisjoint(owner.__all__)

@@ -6,7 +6,7 @@ import pytest
 from helpers.datasets import SMALL
 
 from vkc_pin.datasets.dataset import Dataset
-from vkc_pin.datasets.generate import generate
+from vkc_pin.datasets.generation import generate
 
 
 @pytest.fixture(scope="session")

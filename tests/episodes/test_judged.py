@@ -10,7 +10,7 @@ from helpers.datasets import SMALL
 from tests.episodes.__main__ import main
 from tests.episodes.judged import VERDICTS, judged_dataset
 from vkc_pin.datasets.dataset import Dataset
-from vkc_pin.datasets.generate import generate
+from vkc_pin.datasets.generation import generate
 
 h5py = pytest.importorskip("h5py")
 

@@ -1,7 +1,7 @@
 from .check import DatasetCheck, check_dataset
 from .dataset import Dataset
 from .episode import Episode
-from .generate import generate
+from .generation import generate
 from .recipes.recipe import Recipe, load_recipe
 
 __all__ = [

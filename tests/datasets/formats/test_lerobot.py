@@ -13,7 +13,7 @@ from helpers.datasets import SMALL
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.formats.lerobot import describe_task
 from vkc_pin.datasets.formats.samples import sample_episode
-from vkc_pin.datasets.generate import generate
+from vkc_pin.datasets.generation import generate
 from vkc_pin.errors import InputError
 
 pytest.importorskip("h5py")

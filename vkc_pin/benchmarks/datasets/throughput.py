@@ -15,7 +15,7 @@ from vkc_pin.benchmarks.harness.record import Record, meta
 from vkc_pin.benchmarks.harness.runner import check_folder
 from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown, to_csv
 from vkc_pin.datasets.dataset import Dataset
-from vkc_pin.datasets.generate import generate
+from vkc_pin.datasets.generation import generate
 from vkc_pin.datasets.recipes.recipe import TASKS, load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.utils.parallel.journal import JournalContents

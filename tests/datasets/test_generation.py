@@ -12,7 +12,7 @@ import pytest
 from helpers.datasets import SMALL
 
 from vkc_pin.datasets.dataset import Dataset, Register
-from vkc_pin.datasets.generate import generate
+from vkc_pin.datasets.generation import generate
 from vkc_pin.datasets.recipes.recipe import load_recipe
 from vkc_pin.errors import InputError, UnknownNameError, VkcError
 
@@ -88,7 +88,7 @@ def test_what_somebody_has_removed_is_made_again(
 
 def test_stopped_generation_is_resumed(made: Dataset, tmp_path: Path) -> None:
     script = (
-        f"from vkc_pin.datasets.generate import generate; generate({SMALL!r}, {EPISODES}, 'out')"
+        f"from vkc_pin.datasets.generation import generate; generate({SMALL!r}, {EPISODES}, 'out')"
     )
     command = [sys.executable, "-c", script]
     process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)

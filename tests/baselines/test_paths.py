@@ -1,4 +1,4 @@
-"""Paths of the base, bare or with the arm as it is: straight, around what stands there, or none."""
+"""Paths of the base are straight where possible, avoid obstacles, or do not exist."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from helpers.drives import hall
 from helpers.small_problems import door_scene, program_of
 
 import vkc_pin as vkc
-from vkc_pin.baselines.paths import BasePaths, headings
+from vkc_pin.baselines.paths import BasePaths, find_goal_poses
 from vkc_pin.planning.base_paths.base_path import shortest_path
 from vkc_pin.world.models.shapes import list_placed_shapes
 from vkc_pin.world.scene.obstacles import FLOOR
@@ -31,14 +31,16 @@ POST: dict[str, Any] = {
 }
 
 
-def base_paths(scene: vkc.Scene, name: str = "drawer", **joints: float) -> BasePaths:
+def make_paths(scene: vkc.Scene, name: str = "drawer", **joints: float) -> BasePaths:
     return BasePaths(
         program_of(scene, [vkc.Actuate(name, joints or {"slide": 0.3})], options=SHORT)
     )
 
 
-def room_of(scene: vkc.Scene, poses: np.ndarray, *, without: Sequence[str] = ("drawer",)) -> float:
-    """Return the least distance of the base from obstacles and objects on straight lines between poses [m], asked of coal."""
+def compute_clearance(
+    scene: vkc.Scene, poses: np.ndarray, *, without: Sequence[str] = ("drawer",)
+) -> float:
+    """Return the smallest distance of the base from obstacles and objects on straight lines between poses [m], by coal."""
     base = [
         (s.geometry, s.placement)
         for s in scene.robot.collision.geometryObjects
@@ -52,8 +54,8 @@ def room_of(scene: vkc.Scene, poses: np.ndarray, *, without: Sequence[str] = ("d
     return min(distance(base, list_placed_shapes(still), row.tolist()) for row in rows)
 
 
-def test_straight_where_that_is_free() -> None:
-    path = base_paths(open_scene(POST)).path(START, BESIDE, 10)
+def test_straight_path() -> None:
+    path = make_paths(open_scene(POST)).path(START, BESIDE, 10)
     assert path is not None
     u = np.arange(1, 11) / 10
     for column in range(3):  # from rest to rest
@@ -61,16 +63,16 @@ def test_straight_where_that_is_free() -> None:
         np.testing.assert_allclose(path[:, column], expected, atol=1e-12)
 
 
-def test_around_what_stands_there() -> None:
+def test_path_around_an_obstacle() -> None:
     scene = open_scene(POST)
-    assert room_of(scene, np.array([START, AISLE])) < 0.0
-    path = base_paths(scene).path(START, AISLE, 80)
+    assert compute_clearance(scene, np.array([START, AISLE])) < 0.0
+    path = make_paths(scene).path(START, AISLE, 80)
     assert path is not None
     assert path.shape == (80, 3)
     np.testing.assert_array_equal(path[-1, :2], AISLE[:2])
     assert np.cos(path[-1, 2] - AISLE[2]) == pytest.approx(1.0)
     # It keeps its margin, but for the corners that are cut between two waypoints.
-    assert room_of(scene, np.vstack([START, path])) >= MARGIN - BLINK - 0.01
+    assert compute_clearance(scene, np.vstack([START, path])) >= MARGIN - BLINK - 0.01
     steps = np.linalg.norm(np.diff(np.vstack([START, path])[:, :2], axis=0), axis=1)
     assert steps.sum() < 1.3 * np.hypot(*(AISLE - START)[:2])
     assert steps.max() < 0.15
@@ -94,18 +96,13 @@ def test_no_path(walls: list[tuple[list[float], list[float]]]) -> None:
         for k, (size, at) in enumerate(walls)
     ]
     scene = open_scene(*boxes)
-    assert room_of(scene, np.array([START, START])) > MARGIN
-    assert room_of(scene, np.array([AISLE, AISLE])) > MARGIN
-    assert base_paths(scene).path(START, AISLE, 10) is None
+    assert compute_clearance(scene, np.array([START, START])) > MARGIN
+    assert compute_clearance(scene, np.array([AISLE, AISLE])) > MARGIN
+    assert make_paths(scene).path(START, AISLE, 10) is None
 
 
-def test_a_blocked_end_is_not_reached() -> None:
-    scene = open_scene(POST)
-    assert base_paths(scene).path(START, np.array([-0.3, -0.1, 0.0]), 10) is None
-
-
-def test_a_differential_base_does_not_go_sideways() -> None:
-    path = base_paths(open_scene(base="differential")).path(START, BESIDE, 400)
+def test_path_of_a_differential_base() -> None:
+    path = make_paths(open_scene(base="differential")).path(START, BESIDE, 400)
     assert path is not None
     steps = np.diff(np.vstack([START, path]), axis=0)
     heading = np.vstack([START, path])[:-1, 2] + steps[:, 2] / 2
@@ -114,47 +111,29 @@ def test_a_differential_base_does_not_go_sideways() -> None:
     assert np.median(sideways) < 1e-9
 
 
-def test_other_objects_are_in_the_way_as_they_stand() -> None:
-    """A door that the hand does not hold, shut or open; the drawer is what it holds."""
+def test_other_objects_are_obstacles_in_their_state() -> None:
     scene = drawer_scene()
     door = {"name": "door", "type": "door", "position": [0.0, 0.44, 0.0]}
     both = changed(open_scene(), objects=[*scene.document["objects"], door])
     before, after = np.array([-0.9, -0.05, 0.0]), np.array([0.8, -0.05, 0.0])
     for hinge, straight in ((0.0, False), (1.5, True)):
         here = both.with_state("door", {"hinge": hinge})
-        assert (room_of(here, np.array([before, after])) > MARGIN) == straight
-        path = base_paths(here).path(before, after, 80)
+        assert (compute_clearance(here, np.array([before, after])) > MARGIN) == straight
+        path = make_paths(here).path(before, after, 80)
         assert path is not None
         assert (np.ptp(path[:, 1]) < 1e-9) == straight
-        assert room_of(here, np.vstack([before, path])) >= MARGIN - BLINK - 0.01
+        assert compute_clearance(here, np.vstack([before, path])) >= MARGIN - BLINK - 0.01
 
 
-def test_the_door_that_it_opens_is_not_in_its_way() -> None:
-    """But the walls beside it are."""
+def test_grasped_door_is_no_obstacle() -> None:
     scene = door_scene()
     before, after = np.array([1.8, -0.05, 0.0]), np.array([3.3, -0.05, 0.0])
-    assert room_of(scene, np.array([before, after]), without=()) < 0.0
-    found = base_paths(scene, "door", hinge=1.2)
+    assert compute_clearance(scene, np.array([before, after]), without=()) < 0.0
+    found = make_paths(scene, "door", hinge=1.2)
     path = found.path(before, after, 10)
     assert path is not None
     np.testing.assert_allclose(path[:, 1:], np.tile(before[1:], (10, 1)), atol=1e-12)
     assert not found.grid.is_pose_free(2.55, -0.5, 0.0)
-
-
-def test_what_stands_still_of_the_object_it_holds_is_in_its_way() -> None:
-    """The drawer's case does not move with the drawer."""
-    scene = changed(
-        open_scene(),
-        objects=[{**drawer_scene().document["objects"][0], "position": [-0.4, 0.0, 0.0]}],
-    )
-    before, after = np.array([-0.1, -1.7, np.pi / 2]), np.array([-0.1, 1.7, np.pi / 2])
-    path = base_paths(scene).path(before, after, 80)
-    assert path is not None
-    assert room_of(scene, np.vstack([before, path]), without=()) >= MARGIN - 0.02
-
-
-# --- with the arm as it is
-# ---------------------------------------------------------------------------------------------
 
 
 SHELF: dict[str, Any] = {
@@ -166,12 +145,14 @@ SHELF: dict[str, Any] = {
 ASIDE = np.array([-1.5, -1.57, 0.0, 0.0, 0.0, 0.0])  # the arm stretched out upwards
 
 
-def to(scene: vkc.Scene, x: float, y: float, yaw: float | None = None) -> vkc.TrajectoryProblem:
+def make_drive(
+    scene: vkc.Scene, x: float, y: float, yaw: float | None = None
+) -> vkc.TrajectoryProblem:
     return program_of(scene.with_start(base=START), [vkc.GoTo(x, y, yaw)], options=SHORT)
 
 
-def test_the_arm_counts_if_it_is_to() -> None:
-    problem = to(open_scene(SHELF).with_start(arm=ASIDE), 0.5, 0.6)
+def test_path_with_the_arm() -> None:
+    problem = make_drive(open_scene(SHELF).with_start(arm=ASIDE), 0.5, 0.6)
     goal = np.array([0.5, 0.6, 0.0])
     bare = BasePaths(problem).path(START, goal, 80)
     assert bare is not None
@@ -191,17 +172,18 @@ def test_the_arm_counts_if_it_is_to() -> None:
     )
 
 
-def test_what_is_held_counts_with_the_arm() -> None:
+def test_path_with_a_grasped_object() -> None:
     scene = room(objects=["stick"])
     held = scene.with_held({"stick": "grip"})
     shapes = [
-        len(BasePaths(to(one, 1.0, 1.0), whole=True).grid.base.shapes) for one in (scene, held)
+        len(BasePaths(make_drive(one, 1.0, 1.0), whole=True).grid.base.shapes)
+        for one in (scene, held)
     ]
     assert shapes[1] == shapes[0] + len(scene.objects["stick"].object.collision.geometryObjects)
 
 
-def test_of_several_goals_the_first_that_is_straight_ahead_or_else_the_nearest() -> None:
-    found = base_paths(open_scene(POST))
+def test_several_goals() -> None:
+    found = make_paths(open_scene(POST))
     blocked, free = AISLE, np.array([0.5, 1.0, 0.5])
     path = found.path(START, np.array([blocked, free]), 10)
     assert path is not None
@@ -214,10 +196,10 @@ def test_of_several_goals_the_first_that_is_straight_ahead_or_else_the_nearest()
         np.testing.assert_array_equal(path[-1, :2], near[:2])
 
 
-def test_the_seed_has_the_arm_at_rest() -> None:
-    problem = to(open_scene(POST), *AISLE[:2].tolist())
-    goals = headings(vkc.GoTo(*AISLE[:2].tolist()), 0.0)
-    (seed,) = BasePaths(problem, whole=True).seeds(problem, goals)
+def test_initial_guess_has_a_constant_arm() -> None:
+    problem = make_drive(open_scene(POST), *AISLE[:2].tolist())
+    goals = find_goal_poses(vkc.GoTo(*AISLE[:2].tolist()), 0.0)
+    (seed,) = BasePaths(problem, whole=True).make_guesses(problem, goals)
     assert seed.z.shape == (problem.segments, problem.chain.size)
     np.testing.assert_array_equal(seed.z[:, 3:], np.tile(problem.start[3:], (problem.segments, 1)))
     np.testing.assert_allclose(seed.z[-1, :2], AISLE[:2], atol=1e-12)
@@ -227,17 +209,20 @@ def test_the_seed_has_the_arm_at_rest() -> None:
         "size": [0.1, 4.6, 1.0],
         "position": [0.0, 0.0, 0.5],
     }
-    problem = to(open_scene(wall), *AISLE[:2].tolist())
-    assert list(BasePaths(problem, whole=True).seeds(problem, goals)) == []
+    problem = make_drive(open_scene(wall), *AISLE[:2].tolist())
+    assert list(BasePaths(problem, whole=True).make_guesses(problem, goals)) == []
 
 
-def test_through_a_gate_that_is_hardly_wider_than_the_base() -> None:
-    """0.73 m wide for 0.67 m: there is no path on a grid whose cells are larger than what is left."""
+def test_path_through_a_narrow_gate() -> None:
+    """The gate is 0.73 m wide, the base 0.67 m; a coarse grid has no path."""
     walls = [box(str(side), [0.2, 6.0, 1.5], [0.0, 0.09 + 3.365 * side, 0.75]) for side in (1, -1)]
     narrow = hall(obstacles=walls).with_start(
         arm=np.array([1.57, -2.2, 2.5, -1.9, -1.57, 0.0])
     )  # the arm folded
-    found, goal = BasePaths(to(narrow, 1.5, 0.5, 0.0), whole=True), np.array([1.5, 0.5, 0.0])
+    found, goal = (
+        BasePaths(make_drive(narrow, 1.5, 0.5, 0.0), whole=True),
+        np.array([1.5, 0.5, 0.0]),
+    )
     assert shortest_path(found.grid, START.tolist(), goal[None]) is None
     path = found.path(START, goal, 80)
     assert path is not None
@@ -249,13 +234,13 @@ def test_through_a_gate_that_is_hardly_wider_than_the_base() -> None:
 
 @pytest.mark.parametrize("yaw", [-3.0, 0.4, 7.0])
 def test_headings(yaw: float) -> None:
-    some = headings(vkc.GoTo(1.0, 2.0), yaw)
+    some = find_goal_poses(vkc.GoTo(1.0, 2.0), yaw)
     assert some.shape == (16, 3)
     np.testing.assert_array_equal(some[:, :2], np.tile([1.0, 2.0], (16, 1)))
     turns = np.abs(some[:, 2] - yaw)
     assert turns[0] < 1e-9
     assert np.all(np.diff(turns) > -1e-9)
     assert turns[-1] == pytest.approx(np.pi)
-    (one,) = headings(vkc.GoTo(1.0, 2.0, 1.0), yaw)
+    (one,) = find_goal_poses(vkc.GoTo(1.0, 2.0, 1.0), yaw)
     assert np.cos(one[2] - 1.0) == pytest.approx(1.0)
     assert abs(one[2] - yaw) <= np.pi, "the nearest of equal headings"

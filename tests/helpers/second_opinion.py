@@ -1,4 +1,4 @@
-"""Lets the oracle judge every motion that is planned: `planning.results` builds plans, and this keeps them."""
+"""Lets the oracle judge every motion that is planned, by keeping the plans that planners make."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from typing import Any
 
 from oracle.judge import Verdict, judge
 
-import vkc_pin.planning.results as results
+from vkc_pin.baselines import separate
+from vkc_pin.benchmarks.peers import found as peers
+from vkc_pin.planning import results, solve_task
 from vkc_pin.planning.plan import Plan
 
 __all__ = ["SecondOpinion"]
@@ -34,13 +36,14 @@ class SecondOpinion:
     def attach(self) -> None:
         """Listen from now on."""
 
-        def kept(**fields: Any) -> Plan:
-            plan = Plan(**fields)
+        def make_plan(*values: Any, **fields: Any) -> Plan:
+            plan = Plan(*values, **fields)
             if plan.success:
                 self._waiting.append(plan)
             return plan
 
-        results.Plan = kept  # type: ignore[misc, assignment]
+        for module in (results, solve_task, separate, peers):
+            module.Plan = make_plan  # type: ignore[attr-defined]
 
     def forget(self) -> None:
         """Do not judge what has been planned since `verdicts` was asked last."""

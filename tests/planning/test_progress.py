@@ -1,13 +1,13 @@
+"""One line of progress in terminals and notebooks."""
+
 from __future__ import annotations
 
 import io
 import os
 import pty
 import re
-import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +17,6 @@ from helpers.drives import hall
 
 import vkc_pin as vkc
 from vkc_pin.planning import progress as module
-from vkc_pin.planning import solve_task
 from vkc_pin.planning.progress import Progress, shown
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -50,26 +49,26 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
     return stream
 
 
-def row(**changes: Any) -> Any:
+def make_iteration(**changes: Any) -> Any:
     return SimpleNamespace(**{"round": 3, "shortfall": 0.0123, "objective": 4.5678, **changes})
 
 
-def test_it_says_what_is_done() -> None:
+def test_text_of_progress() -> None:
     seen: list[tuple[str, bool]] = []
     line = Progress(lambda text, last: seen.append((text, last)))
     line.part(3, 2, 18)
     line.begin(["reach cup.side", "place cup"])
-    line.doing("looking for a seed")
-    line(row())
+    line.doing("looking for a guess")
+    line(make_iteration())
     assert (
-        seen[-2][0] == "0 s · steps 3 to 4 of 18 · looking for a seed · reach cup.side, place cup"
+        seen[-2][0] == "0 s · steps 3 to 4 of 18 · looking for a guess · reach cup.side, place cup"
     )
     assert (
         seen[-1][0]
         == "0 s · steps 3 to 4 of 18 · round 3, 12.3 mm missing, objective 4.57 · reach cup.side, place cup"
     )
     line.part(7, 1, 18)
-    line(row(shortfall=0.0))
+    line(make_iteration(shortfall=0.0))
     assert "step 7 of 18 · round 3, clear, " in seen[-1][0]
     line.stop()
     line.stop()
@@ -78,15 +77,7 @@ def test_it_says_what_is_done() -> None:
     assert re.fullmatch(r"stopped after [\d.]+ s", seen[-1][0])
 
 
-def test_every_round_is_shown() -> None:
-    seen: list[str] = []
-    line = Progress(lambda text, last: seen.append(text))
-    for number in range(30):
-        line(row(round=number))
-    assert [int(re.findall(r"round (\d+)", text)[0]) for text in seen] == list(range(30))
-
-
-def test_a_terminal_has_one_line(terminal: Terminal) -> None:
+def test_terminal_has_one_line(terminal: Terminal) -> None:
     plan = vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=True)
     assert plan.success
     first, rest = terminal.lines()
@@ -95,11 +86,11 @@ def test_a_terminal_has_one_line(terminal: Terminal) -> None:
         r".*: success — base \d\.\d\d m, arm .* rad, planned in [\d.]+ s$|.*: success — ", first
     )
     assert all(len(part.rstrip()) < 70 for part in re.split(r"[\r\n]", terminal.getvalue()))
-    assert "looking for a seed" in terminal.getvalue()
+    assert "looking for an initial guess" in terminal.getvalue()
     assert "round 1" in terminal.getvalue()
 
 
-def test_an_error_leaves_a_line_as_well(terminal: Terminal) -> None:
+def test_errors_leave_a_line(terminal: Terminal) -> None:
     def fails(line: vkc.Iteration) -> None:
         raise ValueError("mine")
 
@@ -108,19 +99,7 @@ def test_an_error_leaves_a_line_as_well(terminal: Terminal) -> None:
     assert re.fullmatch(r"stopped after [\d.]+ s", terminal.lines()[0])
 
 
-def test_ctrl_c_leaves_a_line_as_well(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stop(*_: Any, **__: Any) -> Iterator[Any]:
-        signal.raise_signal(signal.SIGINT)
-        return iter(())
-
-    monkeypatch.setattr(solve_task, "initialize", stop)
-    plan = vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=True)
-    assert plan.status == "interrupted"
-    assert "FAILED, interrupted" in terminal.lines()[0]
-    assert terminal.lines()[1:] == [""]
-
-
-def test_a_terminal_that_goes_away_is_no_reason_to_stop(
+def test_closed_terminal_does_not_stop_planning(
     terminal: Terminal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def gone(text: str) -> int:
@@ -133,36 +112,20 @@ def test_a_terminal_that_goes_away_is_no_reason_to_stop(
     assert plan.success
 
 
-def test_a_pipe_gets_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+def test_pipe_gets_nothing(capfd: pytest.CaptureFixture[str]) -> None:
     with shown(True) as line:
         line.doing("something")
         assert line.write is None
     assert capfd.readouterr() == ("", "")
 
 
-def test_it_is_off_unless_asked_for(terminal: Terminal) -> None:
-    with shown(False) as line:
-        line.doing("something")
-    assert terminal.getvalue() == ""
-
-
 @pytest.mark.parametrize("value", [None, 1, "yes"])
-def test_true_or_false(value: Any) -> None:
+def test_progress_must_be_a_bool(value: Any) -> None:
     with pytest.raises(vkc.InputError, match="progress: wrong type of argument"):
         vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=value)
 
 
-def test_a_chore_says_which_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[str] = []
-    monkeypatch.setattr(module, "_screen", lambda: lambda text, last: seen.append(text))
-    plan = vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5), vkc.GoTo(-0.5, 0.3)], progress=True, window=2)
-    assert plan.success
-    parts = [match[0] for text in seen if (match := re.search(r"steps? \d[\w ]* of 2", text))]
-    assert list(dict.fromkeys(parts)) == ["step 1 of 2", "step 2 of 2", "steps 1 to 2 of 2"]
-    assert "success" in seen[-1]
-
-
-def test_a_real_terminal(tmp_path: Path) -> None:
+def test_real_terminal(tmp_path: Path) -> None:
     code = """
 import sys; sys.path.insert(0, "tests")
 from helpers.drives import hall

@@ -1,4 +1,4 @@
-"""Threads that plan the same structures at once: in a process of their own, which must come to its end."""
+"""Concurrent threads with shared and own planners compute equal bits, and the process ends."""
 
 from __future__ import annotations
 
@@ -39,8 +39,7 @@ print("done")
 """
 
 
-def test_eight_threads_with_one_planner_and_the_shared_one_and_their_own() -> None:
-    """The same call gives the same bits in each; a crash of the interpreter would show in what the process returns."""
+def test_eight_threads_with_shared_and_own_planners() -> None:
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM],
         cwd=ROOT,

@@ -1,4 +1,4 @@
-"""Wherever planning is when the budget is at its end, a plan comes back: at every look at the clock, and soon after."""
+"""Planning returns a plan wherever the time limit interrupts it."""
 
 from __future__ import annotations
 
@@ -17,10 +17,6 @@ from vkc_pin.utils.budget import Budget
 PULL = [vkc.Actuate("drawer", {"slide": 0.3})]
 CALLS: dict[str, Callable[[], vkc.Plan]] = {
     "plan": lambda: vkc.plan(drawer_scene(), PULL, options=SHORT, planner=vkc.Planner()),
-    "steps": lambda: vkc.plan(
-        drawer_scene(), [*PULL, vkc.GoTo(0.0, 0.0)], options=SHORT, simultaneous=False
-    ),
-    "trees": lambda: vkc.plan(drawer_scene(), PULL, initialization="rrt"),
     "chore": lambda: vkc.plan(drawer_scene(), [*PULL, vkc.GoTo(0.0, 0.0)], options=SHORT, window=2),
     "baseline": lambda: plan_separately(drawer_scene(), PULL, method="B2", retries=1),
 }
@@ -43,7 +39,7 @@ class Looks:
 
 
 @pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
-def test_a_plan_comes_back_wherever_time_is_up(
+def test_plan_is_returned_wherever_time_ends(
     call: Callable[[], vkc.Plan], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looks = Looks(monkeypatch)
@@ -52,7 +48,7 @@ def test_a_plan_comes_back_wherever_time_is_up(
     count = looks.count
     assert count > 50
     rounds = []
-    for last in [0, 1, 2, 3, 5, *np.linspace(8, count - 8, 9).astype(int).tolist()]:
+    for last in [0, 1, 2, *np.linspace(5, count - 8, 5).astype(int).tolist()]:
         plan = looks.upto(last, call)
         assert plan.success or plan.status == "time limit"
         assert plan.success == plan.report.ok
@@ -62,21 +58,8 @@ def test_a_plan_comes_back_wherever_time_is_up(
     assert rounds[0] <= rounds[-1] <= whole.metrics["rounds"]
 
 
-def test_what_is_decided_of_a_chore_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    looks, steps = Looks(monkeypatch), [*PULL, vkc.GoTo(0.0, 0.0), vkc.GoTo(0.3, 0.0)]
-    whole = looks.upto(np.inf, lambda: vkc.plan(drawer_scene(), steps, options=SHORT, window=2))
-    assert whole.success, whole.summary()
-    phases = []
-    for last in np.linspace(1, looks.count - 1, 8).astype(int).tolist():
-        plan = looks.upto(last, lambda: vkc.plan(drawer_scene(), steps, options=SHORT, window=2))
-        phases.append(len(plan.trajectory.phases))
-    assert phases == sorted(phases)
-    assert phases[0] == 1 < phases[-1]
-
-
-@pytest.mark.parametrize("limit", [0.05, 0.5, 2.0])
-def test_a_hard_task_takes_no_longer_than_it_may(limit: float) -> None:
-    """It takes a minute and more; on a machine that does something else, too, 0.3 s become more."""
+@pytest.mark.parametrize("limit", [0.05, 1.0])
+def test_hard_task_keeps_the_time_limit(limit: float) -> None:
     scene = vkc.load_scene("fetch")
     began = time.perf_counter()
     plan = vkc.plan(scene, fetch(scene), time_limit=limit, planner=vkc.Planner(), window=2)

@@ -34,6 +34,7 @@ from vkc_pin.options import Options
 from vkc_pin.validation.contact_windows import check_gripper, find_contact_windows
 from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.samples import Samples
+from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
@@ -52,7 +53,7 @@ def find_windows(
     samples = Samples(scene, motion)
     labels, found = samples.world.collision_labels, dict[tuple[str, str], list[tuple[int, int]]]()
     for window in find_contact_windows(
-        samples, CollisionShapes(samples.world), steps, Options(dist_safe=dist_safe)
+        samples, CollisionShapes(samples.world), steps, Options(dist_safe=dist_safe), Tolerances()
     ):
         named = {(labels[i], labels[j]) for i, j in window.pairs.tolist()}
         assert (np.diff(window.pairs, axis=1) > 0).all()
@@ -126,7 +127,9 @@ def test_only_rigid_grasps_move_together(attachment: str, rigid: bool) -> None:
     samples = Samples(
         scene, Trajectory(names, np.arange(2.0), rows, (PhaseSpan("hold", 0, 1, scene.holds),), 9)
     )
-    near, lever = find_contact_windows(samples, CollisionShapes(samples.world), [], Options())
+    near, lever = find_contact_windows(
+        samples, CollisionShapes(samples.world), [], Options(), Tolerances()
+    )
     assert (near.moves_together, near.margin, near.contact) == (
         False,
         0.005,
@@ -237,7 +240,9 @@ def test_windows_of_clearance_exemptions(
     samples = Samples(scene, motion)
     found = [
         window
-        for window in find_contact_windows(samples, CollisionShapes(samples.world), [], Options())
+        for window in find_contact_windows(
+            samples, CollisionShapes(samples.world), [], Options(), Tolerances()
+        )
         if len(window.pairs)
     ]
     for window in found:
@@ -269,7 +274,9 @@ def test_initial_penetration_is_exempt_once() -> None:
     samples = Samples(scene, script.motion())
     inside = [
         window
-        for window in find_contact_windows(samples, CollisionShapes(samples.world), [], Options())
+        for window in find_contact_windows(
+            samples, CollisionShapes(samples.world), [], Options(), Tolerances()
+        )
         if window.margin < 0.0
     ]
     assert inside

@@ -1,7 +1,7 @@
-"""Inverse kinematics of the arm alone: base and object stand where they were planned to, and the hand must close the chain.
+"""Inverse kinematics of the arm alone, for a given base and a given state of the object.
 
-By the differential inverse kinematics of Pink (https://github.com/stephane-caron/pink), with joint
-limits.
+It uses the differential inverse kinematics of Pink (https://github.com/stephane-caron/pink), with
+joint limits.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ from vkc_pin.utils.budget import record_evaluations
 __all__ = ["QP", "ArmKinematics"]
 
 QP = "daqp"
-"""The solver of quadratic programs, by its name in `qpsolvers`."""
+"""Solver of quadratic programs, by its name in `qpsolvers`."""
 _ITERATIONS = 30
-_FRAME = "what closes the chain"
+_FRAME = "closure"
 
 
 class ArmKinematics:
-    """Solves for the arm at waypoints of a problem at which something is held that stands fixed in the world.
+    """Closes the chain at waypoints at which a fixed object is grasped.
 
     Attributes:
-        columns: The coordinates that it decides: the arm's joints, and the freedoms of its grasps.
+        columns: Decided coordinates: the arm's joints, and the freedoms of its grasps.
     """
 
-    def __init__(self, problem: TrajectoryProblem, knots: KeyframeSampler) -> None:
-        self.problem, self.knots = problem, knots
+    def __init__(self, problem: TrajectoryProblem, sampler: KeyframeSampler) -> None:
+        self.problem, self.sampler = problem, sampler
         chain = problem.chain
         virtual = [chain.index(name) for names in chain.virtual.values() for name in names]
-        self.columns = np.array([*range(3, knots.robot_size), *virtual], int)
+        self.columns = np.array([*range(3, sampler.robot_size), *virtual], int)
         self._models: dict[int, pin.Model] = {}
 
     def solve(self, z: Floats, waypoint: int) -> tuple[Floats, bool]:
-        """Return the configuration that iterations from `z`, shape (n,), lead to, and whether it closes the chain there."""
+        """Iterate from `z`, shape (n,); return the configuration and whether the chain is closed."""
         import pink
 
-        pose = self.knots.find_pose(waypoint)
+        pose = self.sampler.find_pose(waypoint)
         if pose is None:
             return z, True
         model, chain = self._model(pose), self.problem.chain
@@ -69,26 +69,24 @@ class ArmKinematics:
         return box.z, False
 
     def _model(self, pose: int) -> pin.Model:
-        """Return the chain's model with a frame for what must be at the target of a pose."""
+        """Return the chain's model with a frame for a pose constraint."""
         if pose not in self._models:
-            row, model = (
-                self.problem.transcription.structure.poses[pose],
-                pin.Model(self.problem.chain.model),
-            )
+            row = self.problem.transcription.structure.poses[pose]
+            model = pin.Model(self.problem.chain.model)
             model.addFrame(pin.Frame(_FRAME, row.joint, row.local, pin.FrameType.OP_FRAME))
             self._models[pose] = model
         return self._models[pose]
 
 
 class _Box:
-    """A limit in Pink's sense: joint limits, no long steps, and everything but `columns` stays where it is."""
+    """A limit for Pink: joint limits, bounded steps, and fixed coordinates except `columns`."""
 
     def __init__(self, columns: Ints, lower: Floats, upper: Floats, z: Floats) -> None:
         self.columns, self.lower, self.upper, self.z = columns, lower, upper, z
         self._rows = np.vstack([np.eye(len(z)), -np.eye(len(z))])
 
     def take(self, step: Floats) -> None:
-        """Go a step, shape (n,), without what the solver of quadratic programs leaves as rounding errors."""
+        """Take a step, shape (n,), without rounding errors of the solver in fixed coordinates."""
         at, z = self.columns, self.z.copy()
         z[at] = np.clip(z[at] + step[at], self.lower[at], self.upper[at])
         self.z = z

@@ -1,4 +1,4 @@
-"""One try of a baseline: drive, reach, move, each on its own; see `separate` for what is done and why."""
+"""Makes one attempt of a baseline: drive, reach and move, each on its own; see `separate`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,13 @@ from dataclasses import replace
 import numpy as np
 
 from vkc_pin.baselines.following import FailedError, follow
-from vkc_pin.baselines.paths import BasePaths, headings
-from vkc_pin.baselines.postures import at_home, base_poses, postures, through
+from vkc_pin.baselines.paths import BasePaths, find_goal_poses
+from vkc_pin.baselines.postures import (
+    find_base_poses,
+    generate_postures,
+    interpolate_path,
+    is_at_home,
+)
 from vkc_pin.options import Options
 from vkc_pin.planning.initialization.approach_paths import ApproachPaths
 from vkc_pin.planning.initialization.initial_guess import InitialGuess
@@ -35,25 +40,21 @@ from vkc_pin.world.trajectory.splicing import concatenate_trajectories
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import compute_final_scene
 
-__all__ = ["FINER", "Attempt", "Doable"]
+__all__ = ["FINER", "Attempt", "BaselineStep"]
 
-Doable = Actuate | Place | GoTo | Reach
-"""The steps that the baselines know."""
+BaselineStep = Actuate | Place | GoTo | Reach
 
 FINER = 2
-"""How many times more waypoints than elsewhere objects are moved in, unless told: an arm that only follows needs small steps."""
-_STANDS, _ENDS = (
-    4,
-    10,
-)  # base poses that are tried in turn, the nearest first, at the handle and at the end
-_BASE = slice(3)  # its coordinates
+"""Factor of `Options.move_waypoints` for moving objects, since the arm only follows."""
+_STANDS, _ENDS = 4, 10  # numbers of base poses that are tried at the handle and at the end
+_BASE = slice(3)
 
 
 class Attempt:
-    """One try; collects the motion stage by stage.
+    """One attempt; it collects the motion stage by stage.
 
     Attributes:
-        times: What it spent on the parts of `outcome.STAGES` [s].
+        times: Times of the stages of planning [s].
     """
 
     def __init__(
@@ -63,27 +64,17 @@ class Attempt:
         *,
         refine: bool,
         seed: Sequence[int],
-        finer: int = FINER,
-        cache: Cache | None = None,
+        finer: int,
+        cache: Cache,
     ) -> None:
-        """Prepare a try.
-
-        Args:
-            scene: Where it begins.
-            options: How to plan.
-            refine: Whether arm and object are moved out of collision at each waypoint (B2).
-            seed: Of the random numbers.
-            finer: How many times `Options.move_waypoints` objects are moved in.
-            cache: Keeps what is built; None: one of its own.
-        """
         self.scene, self.options, self.refine, self.finer = scene, options, refine, finer
         self.rng = np.random.default_rng(seed)
         self.parts: list[Trajectory] = []
         self.times = dict.fromkeys([*STAGES, "following"], 0.0)
-        self.iterations, self.cache = 0, cache or Cache()
+        self.iterations, self.cache = 0, cache
 
-    def run(self, steps: Sequence[Doable]) -> tuple[Trajectory, float, str]:
-        """Return the motion, how many stages it came through (infinite: all), and why no further."""
+    def run(self, steps: Sequence[BaselineStep]) -> tuple[Trajectory, float, str]:
+        """Return the motion, the number of completed stages (infinite: all), and the cause of failure."""
         try:
             for step in steps:
                 if isinstance(step, Actuate):
@@ -92,9 +83,9 @@ class Attempt:
                     self._place(step)
                 elif isinstance(step, Reach):
                     self._drive_and_reach([step], self._poses(self._problem([step])), _STANDS)
-                else:  # drive somewhere, at whichever heading is best if none is asked for
-                    goals = headings(step, float(self.scene.start[2]))
-                    self._withdrawn(
+                else:  # without a goal heading, the best one
+                    goals = find_goal_poses(step, float(self.scene.start[2]))
+                    self._do_withdrawn(
                         functools.partial(self._drive, goals), FailedError("no base path")
                     )
         except (FailedError, BudgetExhaustedError) as error:
@@ -104,56 +95,56 @@ class Attempt:
             ]
             return (
                 concatenate_trajectories(parts, pause=self.options.grasp_time),
-                len(self.parts) + failure.came,
+                len(self.parts) + failure.progress,
                 failure.cause,
             )
         return concatenate_trajectories(self.parts, pause=self.options.grasp_time), np.inf, ""
 
     def _actuate(self, step: Actuate) -> None:
-        """Move joints of an object: drive to its handle and reach for it, unless it is held, and move it."""
+        """Move joints of an object: drive to its handle, grasp it unless it is grasped, and move it."""
         after = compile_task(self.scene, [step], self.options, nothing=True).after
         (attachment,) = (hold.attachment for hold in after if hold.object == step.object)
         if self.scene.held.get(step.object) != attachment:
-            self._take_hold([Grasp(step.object, attachment)])
+            self._grasp([Grasp(step.object, attachment)])
         self._move(step)
 
     def _place(self, step: Place) -> None:
-        """Put an object down: take it, unless it is held, carry it to where the arm can put it down, and do so."""
+        """Grasp an object unless it is grasped, carry it to a base pose, and put it down."""
         if step.object not in self.scene.held:
-            self._take_hold([Grasp(step.object, step.attachment)])
+            self._grasp([Grasp(step.object, step.attachment)])
         poses = self._poses(self._problem([step]))
         self._drive_and_reach([step], poses, _ENDS)
 
-    def _take_hold(self, steps: Sequence[Step]) -> None:
-        """Drive to the nearest base pose from which the arm reaches what is to be grasped, and reach for it."""
+    def _grasp(self, steps: Sequence[Step]) -> None:
+        """Drive to the nearest base pose from which the arm reaches the grasp, and grasp."""
         poses = self._poses(self._problem(steps, scene=self.scene.with_held({})))
         self._drive_and_reach(steps, poses, _STANDS)
 
     def _drive_and_reach(self, steps: Sequence[Step], poses: Floats, most: int) -> None:
-        """Drive to the first base poses of `poses`, shape (K, n), from where the arm then does its part; at most `most`."""
+        """Drive to one of the first `most` base poses, shape (K, n), and reach from there."""
 
         def at(pose: Floats) -> None:
             self._drive(pose[None, :3])
             self._reach(steps, pose)
 
-        def somewhere() -> None:
-            self._first(self._free(poses)[:most], at, FailedError("no base pose", share=-1.0))
+        def try_poses() -> None:
+            self._try_choices(self._free(poses)[:most], at, FailedError("no base pose", share=-1.0))
 
-        self._withdrawn(somewhere, FailedError("no base pose", share=-1.0))
+        self._do_withdrawn(try_poses, FailedError("no base pose", share=-1.0))
 
-    def _withdrawn(self, stage: Callable[[], None], failure: FailedError) -> None:
-        """Bring the arm to how it can be held while the base drives, with as little motion as will do, and go on with a stage."""
+    def _do_withdrawn(self, stage: Callable[[], None], failure: FailedError) -> None:
+        """Move the arm to a posture for driving, as near as possible, and do a stage."""
 
-        def held(path: Floats) -> None:
+        def withdraw(path: Floats) -> None:
             self._withdraw(path)
             stage()
 
-        self._first(postures(self._problem([self._here()])), held, failure)
+        self._try_choices(generate_postures(self._problem([self._here()])), withdraw, failure)
 
-    def _first(
+    def _try_choices(
         self, choices: Iterable[Floats], stage: Callable[[Floats], None], failure: FailedError
     ) -> None:
-        """Do a stage with the first choice with which it works; if there is none, raise the failure that came furthest."""
+        """Do a stage with the first choice that works; else raise the failure with most progress."""
         scene, before = self.scene, self.parts
         for choice in choices:
             self.parts = list(before)
@@ -162,59 +153,59 @@ class Attempt:
                 return
             except FailedError as error:
                 error.parts = [*self.parts[len(before) :], *error.parts]
-                failure = max(failure, error, key=lambda one: one.came)
+                failure = max(failure, error, key=lambda one: one.progress)
                 self.scene, self.parts = scene, before
         raise failure
 
     def _poses(self, problem: TrajectoryProblem) -> Floats:
         """Return configurations for the end of a problem, the nearest first."""
         began = time.perf_counter()
-        poses = base_poses(problem, problem.segments, problem.start, self.rng)
+        poses = find_base_poses(problem, problem.segments, problem.start, self.rng)
         self.times["initialization"] += time.perf_counter() - began
         if not len(poses):
             raise FailedError("no base pose")
         return poses
 
     def _free(self, poses: Floats) -> Floats:
-        """Return those whose base may stand there while the arm is still as it is."""
+        """Return the poses at which the base is free with the present arm."""
         stay = self._problem([self._here()])
         ends = np.tile(stay.start, (len(poses) + 1, 1))
         ends[:-1, :3] = poses[:, :3]
         depth = KeyframeSampler(stay, self.rng).compute_shortfall(ends, stay.segments)
-        return np.asarray(
-            poses[depth[:-1] <= min(depth[-1], CLEARANCE_TOLERANCE)]
-        )  # the arm may be as close to the robot as it is
+        # The arm may stay as close to the robot as it is.
+        return np.asarray(poses[depth[:-1] <= min(depth[-1], CLEARANCE_TOLERANCE)])
 
     def _withdraw(self, path: Floats) -> None:
-        """Move the arm along configurations, shape (K, n), to the last of them, the base stands; nothing to do if K = 0."""
+        """Move the arm along configurations, shape (K, n), while the base is stationary."""
         if not len(path):
             return
-        problem = _fixed(self._problem([self._here()]), _BASE)
+        problem = _fix_coordinates(self._problem([self._here()]), _BASE)
         arm = slice(3, problem.chain.robot.coordinates.size)
-        problem = _fixed(problem, arm, path[-1, arm], rows=-1)
-        seeds = [
-            InitialGuess("straight", through(problem, path[k:])) for k in (0, -1)[: len(path)]
-        ]  # along it, and directly
-        self._take(problem, *self._solve(problem, iter(seeds), "arm does not reach"))
+        problem = _fix_coordinates(problem, arm, path[-1, arm], rows=-1)
+        guesses = [
+            InitialGuess("straight", interpolate_path(problem, path[k:]))
+            for k in (0, -1)[: len(path)]
+        ]
+        self._append(problem, *self._solve(problem, iter(guesses), "arm does not reach"))
 
     def _drive(self, goals: Floats) -> None:
-        """Drive to where the base has to stand, or to one of several headings there, shape (G, 3), the arm as it is."""
+        """Drive to one of several poses, shape (G, 3), with the arm as it is."""
         x, y, yaw = goals[0].tolist()
         problem = self._problem([GoTo(x, y, yaw if len(goals) == 1 else None)])
-        problem = _fixed(problem, slice(3, problem.chain.robot.coordinates.size))
-        bare = at_home(problem) and not self.scene.held and len(goals) == 1
-        seeds = (
+        problem = _fix_coordinates(problem, slice(3, problem.chain.robot.coordinates.size))
+        bare = is_at_home(problem) and not self.scene.held and len(goals) == 1
+        guesses = (
             initialize(problem, "astar", self._seed())
             if bare
-            else BasePaths(problem, whole=True).seeds(problem, goals)
+            else BasePaths(problem, whole=True).make_guesses(problem, goals)
         )
-        self._take(problem, *self._solve(problem, seeds, "no base path"))
+        self._append(problem, *self._solve(problem, guesses, "no base path"))
 
     def _reach(self, steps: Sequence[Step], pose: Floats) -> None:
-        """Take hold of the object, or put it down, the base stands."""
-        problem = _fixed(self._problem(steps), _BASE)
+        """Grasp the object or put it down, while the base is stationary."""
+        problem = _fix_coordinates(self._problem(steps), _BASE)
         last = np.append(problem.start[:3], pose[3:])
-        seeds = [
+        guesses = [
             InitialGuess(
                 "straight",
                 problem.start
@@ -226,16 +217,16 @@ class Attempt:
             above = ApproachPaths(KeyframeSampler(problem, self.rng)).find_release_retreat(
                 last, phase
             )[::-1]
-            seeds = [InitialGuess("from above", through(problem, np.vstack([above, last])))] * (
-                len(above) > 0
-            ) + seeds
+            guesses = [
+                InitialGuess("from above", interpolate_path(problem, np.vstack([above, last])))
+            ] * (len(above) > 0) + guesses
         more = initialize(problem, "interpolated", self._seed())
-        self._take(
-            problem, *self._solve(problem, itertools.chain(seeds, more), "arm does not reach")
+        self._append(
+            problem, *self._solve(problem, itertools.chain(guesses, more), "arm does not reach")
         )
 
     def _move(self, step: Actuate) -> None:
-        """Move the object's joints: the base goes to the nearest pose to which the arm can follow."""
+        """Move the object's joints: the base drives to the nearest pose to which the arm can follow."""
         problem = self._problem(
             [step], replace(self.options, move_waypoints=self.finer * self.options.move_waypoints)
         )
@@ -255,7 +246,7 @@ class Attempt:
             if not cause and problem.drift(followed.z) > 1.0:
                 cause = "closure"
             if not cause:
-                self._take(problem, followed.z, timing.dt)
+                self._append(problem, followed.z, timing.dt)
                 return
             if not failure.parts or followed.share > failure.share:
                 failure = FailedError(
@@ -269,19 +260,18 @@ class Attempt:
     def _problem(
         self, steps: Sequence[Step], options: Options | None = None, scene: Scene | None = None
     ) -> TrajectoryProblem:
-        """Return the problem of steps from where the motion has come to, or from another scene."""
         options, scene = options or self.options, scene or self.scene
         return TrajectoryProblem(
             scene, compile_task(scene, steps, options), options, cache=self.cache
         )
 
     def _solve(
-        self, problem: TrajectoryProblem, seeds: Iterator[InitialGuess], cause: str
+        self, problem: TrajectoryProblem, guesses: Iterator[InitialGuess], cause: str
     ) -> tuple[Floats, Floats]:
-        """Return the first solution from a seed: z_1..z_N, shape (N, n), and the time of every step, shape (N,) [s]."""
+        """Return the first solution from an initial guess: z_1..z_N and time steps [s]."""
         failure = FailedError(cause)
-        for seed in seeds:
-            solution = solve(problem, seed.z)
+        for guess in guesses:
+            solution = solve(problem, guess.z)
             self.iterations += solution.iterations
             for key, value in solution.timings.items():
                 self.times[key] += value
@@ -292,8 +282,7 @@ class Attempt:
                 failure = FailedError(cause, make_trajectory(problem, solution.z, solution.dt))
         raise failure
 
-    def _take(self, problem: TrajectoryProblem, z: Floats, dt: Floats) -> None:
-        """Append a motion, and go on from where it ends."""
+    def _append(self, problem: TrajectoryProblem, z: Floats, dt: Floats) -> None:
         self.parts.append(make_trajectory(problem, z, dt))
         self.scene = compute_final_scene(self.scene, self.parts[-1], problem.task.after)
 
@@ -301,13 +290,13 @@ class Attempt:
         return int(self.rng.integers(2**32))
 
 
-def _fixed(
+def _fix_coordinates(
     problem: TrajectoryProblem,
     columns: slice,
     values: Floats | None = None,
     rows: slice | int = slice(None),
 ) -> TrajectoryProblem:
-    """Return a problem in which coordinates are at `values`, or else where they start, at some waypoints, by default all."""
+    """Return a problem in which coordinates are fixed, to their start by default."""
     lower, upper = problem.lower.copy(), problem.upper.copy()
     lower[rows, columns] = upper[rows, columns] = (
         problem.start[columns] if values is None else values

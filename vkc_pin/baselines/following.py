@@ -1,4 +1,4 @@
-"""The arm follows: waypoint by waypoint, while the base runs along its path and the object's joints to their goals."""
+"""Lets the arm follow base and object, waypoint by waypoint."""
 
 from __future__ import annotations
 
@@ -7,32 +7,27 @@ from dataclasses import dataclass
 import numpy as np
 
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
-from vkc_pin.baselines.refining import CLEAR, refined
+from vkc_pin.baselines.refining import CLEAR, refine_configuration
 from vkc_pin.planning.initialization.keyframes import KeyframeSampler
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["FailedError", "Followed", "follow"]
+__all__ = ["FailedError", "FollowResult", "follow"]
 
 SEEDS = 16
-"""From so many random arms inverse kinematics is tried where it leads to nothing from the waypoint before."""
-_KINDS = (
-    "",
-    "collision",
-    "no inverse kinematics",
-)  # what may be wrong with a configuration, the best first
-# [rad], of half of them about the waypoint before; the others are anywhere within the limits
-_SPREAD = 1.0
+"""Number of random arms for inverse kinematics where it fails from the waypoint before."""
+_CAUSES = ("", "collision", "no inverse kinematics")  # the best first
+_SPREAD = 1.0  # of half of the random arms around the waypoint before [rad]; others: anywhere
 
 
 class FailedError(Exception):
     """A stage failed.
 
     Attributes:
-        cause: Why; what becomes the plan's status.
-        parts: What was done before, and as much as there is of the stage.
-        share: How much of the stage works.
+        cause: Status of the plan.
+        parts: Trajectories of completed stages and of a part of this one.
+        share: Completed fraction of the stage.
     """
 
     def __init__(self, cause: str, last: Trajectory | None = None, share: float = 0.0) -> None:
@@ -41,20 +36,19 @@ class FailedError(Exception):
         self.parts = [] if last is None else [last]
 
     @property
-    def came(self) -> float:
-        """How many stages it came through."""
+    def progress(self) -> float:
+        """Number of completed stages."""
         return len(self.parts) + self.share
 
 
 @dataclass(frozen=True, eq=False)
-class Followed:
-    """Where following led.
+class FollowResult:
+    """Result of following.
 
     Attributes:
-        z: z_1..z_N, shape (N, n); if it failed, all stands still from there on, in what was nearest
-            to working.
-        share: Share of the waypoints up to which it worked.
-        cause: "", "no inverse kinematics", or "collision" if all there is is not free.
+        z: z_1..z_N, shape (N, n); constant after a failure.
+        share: Fraction of the waypoints before the failure.
+        cause: "", "no inverse kinematics" or "collision".
     """
 
     z: Floats
@@ -64,20 +58,20 @@ class Followed:
 
 def follow(
     problem: TrajectoryProblem, base: Floats, rng: np.random.Generator, *, refine: bool
-) -> Followed:
+) -> FollowResult:
     """Find the arm for every waypoint from the one before.
 
     Args:
-        problem: Moves joints of what is held, and nothing else.
+        problem: Problem that only moves joints of the grasped object.
         base: x, y, yaw [m, rad] at its waypoints, shape (N, 3).
-        rng: Draws seeds.
-        refine: Move arm and object at each waypoint out of collision (B2), instead of taking the
-            object where the time law has it and the arm as inverse kinematics finds it (B1).
+        rng: Random generator.
+        refine: Move arm and object at each waypoint out of collision (B2), instead of keeping the
+            object's time law and the result of inverse kinematics (B1).
     """
-    knots = KeyframeSampler(problem, rng)
-    z = knots.object_motion.copy()
+    sampler = KeyframeSampler(problem, rng)
+    z = sampler.object_motion.copy()
     z[:, :3] = base
-    arm = _Arm(problem, knots, refine=refine)
+    arm = _Arm(problem, sampler, refine=refine)
     before = problem.start
     for row in range(len(z)):
         z[row, arm.kinematics.columns] = before[arm.kinematics.columns]
@@ -85,35 +79,36 @@ def follow(
         z[row] = found
         if cause:
             z[row:] = found
-            return Followed(z, row / len(z), cause)
+            return FollowResult(z, row / len(z), cause)
         before = z[row]
-    return Followed(z, 1.0, "")
+    return FollowResult(z, 1.0, "")
 
 
 class _Arm:
-    """Looks for what the arm does at single waypoints."""
+    """Finds the arm at single waypoints."""
 
-    def __init__(self, problem: TrajectoryProblem, knots: KeyframeSampler, *, refine: bool) -> None:
-        self.problem, self.knots, self.refine = problem, knots, refine
-        self.kinematics = ArmKinematics(problem, knots)
+    def __init__(
+        self, problem: TrajectoryProblem, sampler: KeyframeSampler, *, refine: bool
+    ) -> None:
+        self.problem, self.sampler, self.refine = problem, sampler, refine
+        self.kinematics = ArmKinematics(problem, sampler)
 
     def at(self, z: Floats, waypoint: int) -> tuple[Floats, str]:
-        """Return the free configuration nearest to `z`, shape (n,), or the nearest that is not, and what is wrong with it."""
+        """Return the nearest free configuration to `z`, else the best one, and its failure."""
         first, cause = self._candidate(z, waypoint)
         if not cause:
             return first, ""
         found = [self._candidate(seed, waypoint) for seed in self._seeds(z)]
         found.append((first, cause))
-        # The best kind, and of these the nearest.
-        return min(found, key=lambda one: (_KINDS.index(one[1]), float(np.abs(one[0] - z).sum())))
+        return min(found, key=lambda one: (_CAUSES.index(one[1]), float(np.abs(one[0] - z).sum())))
 
     def _candidate(self, z: Floats, waypoint: int) -> tuple[Floats, str]:
-        """Return what inverse kinematics, and refinement, lead to from `z`, and what is wrong with it."""
+        """Return the result of inverse kinematics, and of refinement, from `z`, and its failure."""
         found, closed = self.kinematics.solve(z, waypoint)
         if self.refine and not (closed and self._free(found, waypoint)):
-            found, closed = refined(
+            found, closed = refine_configuration(
                 self.problem,
-                self.knots,
+                self.sampler,
                 found,
                 wanted=z,
                 waypoint=waypoint,
@@ -124,15 +119,13 @@ class _Arm:
         return found, "" if self._free(found, waypoint) else "collision"
 
     def _free(self, z: Floats, waypoint: int) -> bool:
-        return bool(self.knots.compute_shortfall(z[None], waypoint)[0] <= CLEAR)
+        return bool(self.sampler.compute_shortfall(z[None], waypoint)[0] <= CLEAR)
 
     def _seeds(self, z: Floats) -> Floats:
-        """Return `z` with other arms, shape (SEEDS, n)."""
-        columns, chain, rng = self.kinematics.columns, self.problem.chain, self.knots.rng
-        lower, upper = (
-            np.maximum(chain.lower[columns], -np.pi),
-            np.minimum(chain.upper[columns], np.pi),
-        )
+        """Return `z` with random arms, shape (SEEDS, n)."""
+        columns, chain, rng = self.kinematics.columns, self.problem.chain, self.sampler.rng
+        lower = np.maximum(chain.lower[columns], -np.pi)
+        upper = np.minimum(chain.upper[columns], np.pi)
         arms = rng.uniform(np.minimum(lower, upper), upper, (SEEDS, len(columns)))
         near = z[columns] + rng.normal(0.0, _SPREAD, (SEEDS // 2, len(columns)))
         arms[: SEEDS // 2] = np.clip(near, chain.lower[columns], chain.upper[columns])

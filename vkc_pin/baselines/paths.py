@@ -1,4 +1,4 @@
-"""Paths of the base: straight if that is free, else the shortest by A*; of the bare base, or with the arm as it is."""
+"""Finds paths of the base: straight if possible, else the shortest by A*, with or without the arm."""
 
 from __future__ import annotations
 
@@ -18,29 +18,16 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.coordinates import wrap_angle
 from vkc_pin.world.task.steps import GoTo
 
-__all__ = ["BasePaths", "headings"]
+__all__ = ["BasePaths", "find_goal_poses"]
 
-_STEPS, _STEP = (
-    25,
-    0.08,
-)  # poses on a straight path that are looked at: at least so many, and at most so far apart [m]
+_STEPS, _STEP = 25, 0.08  # least number and largest distance [m] of checked poses on a line
 
 
 class BasePaths:
-    """Paths of the base between places, around all that stands in the last phase of a problem.
-
-    Attributes:
-        grid: Where the base fits.
-    """
+    """Paths of the base around fixed obstacles in the last phase of a problem."""
 
     def __init__(self, problem: TrajectoryProblem, *, whole: bool = False) -> None:
-        """Look at the floor.
-
-        Args:
-            problem: Whose base it is.
-            whole: The arm counts as well, as it is at the start, with what it holds; otherwise the
-                bare base alone.
-        """
+        """Make the grid; `whole`: for the robot with its present arm and grasped objects."""
         self.omni = problem.chain.robot.base == "omni"
         z = problem.start.copy()
         z[:3] = 0.0
@@ -52,7 +39,7 @@ class BasePaths:
             BaseGrid, base, [], standing, arena, turning=turning, cache=problem.cache
         )
         self.grid = self._grid(margin)
-        # Without margins where an optimisation follows: it restores them.
+        # Optimisation restores the margins.
         self._fine: dict[str, Any] = {
             "margin": 0.0 if whole else margin,
             "cells": compute_fine_cell_count(arena, margin),
@@ -64,13 +51,9 @@ class BasePaths:
         return self._grid(**self._fine)
 
     def path(self, start: Floats, goals: Floats, steps: int) -> Floats | None:
-        """Return poses after the start, slow at both ends, the last at a goal, shape (steps, 3); None: there is no path.
+        """Return `steps` poses from `start` to a goal, slow at both ends, shape (steps, 3), or None.
 
-        Args:
-            start: x, y, yaw [m, rad].
-            goals: The same, shape (3,), or several of them, shape (G, 3): the first that can be
-                reached straight, else the one to which the path is the shortest.
-            steps: How many poses.
+        Of several goals, shape (G, 3), it is the first with a straight path, else the nearest.
         """
         goals = np.atleast_2d(goals)
         for goal in goals if self.omni else ():
@@ -82,22 +65,20 @@ class BasePaths:
         return None if found is None else sample_poses(found, steps, turning=self.grid.turning)
 
     def along(self, problem: TrajectoryProblem, goal: Floats) -> Floats | None:
-        """Return the base at every waypoint, shape (N, 3): it stands while a latch is released; None: there is no path."""
+        """Return the base at every waypoint, shape (N, 3), stationary while a latch is released."""
         base = [problem.start[None, :3]]
         for phase in problem.task.phases:
-            moves = phase.kind == "move"
-            part = (
-                self.path(base[-1][-1], goal, phase.segments)
-                if moves
-                else np.tile(base[-1][-1], (phase.segments, 1))
-            )
+            last = base[-1][-1]
+            part: Floats | None = np.tile(last, (phase.segments, 1))
+            if phase.kind == "move":
+                part = self.path(last, goal, phase.segments)
             if part is None:
                 return None
             base.append(part)
         return np.concatenate(base[1:])
 
-    def seeds(self, problem: TrajectoryProblem, goals: Floats) -> Iterator[InitialGuess]:
-        """Yield the path from a problem's start to one of `goals`, shape (G, 3), the arm at rest, if there is one."""
+    def make_guesses(self, problem: TrajectoryProblem, goals: Floats) -> Iterator[InitialGuess]:
+        """Yield the path from a problem's start to one of `goals`, shape (G, 3), as initial guess."""
         path = self.path(problem.start[:3], goals, problem.segments)
         if path is not None:
             z = np.tile(problem.start, (problem.segments, 1))
@@ -105,13 +86,9 @@ class BasePaths:
             yield InitialGuess("astar", problem.clip(z))
 
 
-def headings(step: GoTo, yaw: float) -> Floats:
-    """Return the poses in which a step may end, shape (G, 3): one, or one per heading, those nearest to `yaw` [rad] first."""
-    turns = (
-        np.linspace(0.0, 2.0 * np.pi, HEADINGS, endpoint=False)
-        if step.yaw is None
-        else np.array([step.yaw - yaw])
-    )
-    turns = wrap_angle(turns)
+def find_goal_poses(step: GoTo, yaw: float) -> Floats:
+    """Return the goal poses of a step, shape (G, 3), those with headings nearest to `yaw` first."""
+    turns = np.linspace(0.0, 2.0 * np.pi, HEADINGS, endpoint=False)
+    turns = wrap_angle(turns if step.yaw is None else np.array([step.yaw - yaw]))
     turns = turns[np.argsort(np.abs(turns), kind="stable")]
     return np.column_stack([np.tile([step.x, step.y], (len(turns), 1)), yaw + turns])

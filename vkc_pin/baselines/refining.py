@@ -1,4 +1,4 @@
-"""Moves arm and object out of collision at one waypoint, the base stays: a sequence of quadratic programs."""
+"""Moves arm and object out of collision at one waypoint by sequential quadratic programming."""
 
 from __future__ import annotations
 
@@ -11,53 +11,43 @@ from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
 from vkc_pin.utils.arrays import Floats, Ints
 
-__all__ = ["CLEAR", "refined"]
+__all__ = ["CLEAR", "refine_configuration"]
 
 CLEAR = CLEARANCE_TOLERANCE
-"""By so much [m] a configuration may fall short of its clearances: as much as one of the solver's."""
+"""Accepted shortfall of clearances [m], as in the solver."""
 
 _ROUNDS = 12
-_REACH = 0.05  # [m] beyond the clearance: contacts that are looked at
-_LONGEST = 0.2  # [m] and [rad] of one round in one coordinate
-# what moving the object's joints away from their time law costs, beside the arm's away from where
-# it was
-_OBJECT = 10.0
-_SLACK = 1e3  # what a metre of clearance costs that there is no room for
+_REACH = 0.05  # distance beyond the clearance up to which contacts are considered [m]
+_LONGEST = 0.2  # largest step of a coordinate in one round [m] or [rad]
+_OBJECT = 10.0  # weight of the object's deviation from its time law; that of the arm is 1
+_SLACK = 1e3  # weight of the slack
 _REGULAR = 1e-6  # makes the program strictly convex in the slack
 
 
-def refined(
+def refine_configuration(
     problem: TrajectoryProblem,
-    knots: KeyframeSampler,
+    sampler: KeyframeSampler,
     z: Floats,
     *,
     wanted: Floats,
     waypoint: int,
     columns: Ints,
 ) -> tuple[Floats, bool]:
-    """Return the configuration near `wanted` that rounds from `z` lead to, and whether the chain is closed there.
+    """Return a configuration near `wanted`, found from `z`, and whether the chain is closed.
 
     Each round minimises Σ w (z − z*)² + slack over the arm, the freedoms of its grasps and the
     object's joints, so that the linearised closure holds and the linearised distances of close
-    pairs keep their margins.
-
-    Args:
-        problem: The problem.
-        knots: Of it.
-        z: Where to begin, shape (n,).
-        wanted: z*: the arm at the waypoint before, the object where its time law has it, shape
-            (n,).
-        waypoint: The waypoint.
-        columns: The coordinates of arm and grasps.
+    pairs keep their margins. z* is `wanted`: the arm at the waypoint before, and the object by its
+    time law. `columns` are the coordinates of arm and grasps.
     """
     import qpsolvers
 
-    pose = knots.find_pose(waypoint)
+    pose = sampler.find_pose(waypoint)
     if pose is None:
         return z, True
-    solver, target = knots.get_pose_solver(pose)
+    solver, target = sampler.get_pose_solver(pose)
     lower, upper = problem.lower[waypoint - 1], problem.upper[waypoint - 1]
-    free = np.concatenate([columns, knots.object_columns])
+    free = np.concatenate([columns, sampler.object_columns])
     weights = np.where(np.isin(free, columns), 1.0, _OBJECT)
     for _ in range(_ROUNDS):
         residual, jacobian = (part[0] for part in solver.evaluate(z[None], target))

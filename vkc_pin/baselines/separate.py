@@ -1,36 +1,22 @@
-"""Plans base and arm one after the other, with the base poses found beforehand: the baselines B1 and B2 of the paper.
+"""Plans base and arm one after the other: the baselines B1 and B2 of the paper.
 
-After section IV-C of Jiao et al. (IROS 2021) and its authors' code. For a step that moves joints of
-an object:
+After section IV-C of Jiao et al. (IROS 2021) and its authors' code. A step that moves joints of an
+object has five stages:
 
-1. Base poses from which the arm reaches the handle (`base_poses`), the nearest first, that the base
-   can drive to.
-2. The base drives there, the arm as it is: A*, then optimisation.
-3. The base stands, the arm reaches the handle: optimisation.
-4. Base poses from which the arm reaches the handle when all is done, the nearest first; the base's
-   path to there.
-5. The object's joints run to their goals, the base along its path, and the arm follows
+1. Find base poses from which the arm reaches the handle, the nearest first (`find_base_poses`).
+2. Drive there with the arm as it is: A*, then optimisation.
+3. Reach the handle with a stationary base: optimisation.
+4. Find base poses from which the arm reaches the handle's final pose, and a path of the base.
+5. Move the object's joints to their goals and the base along its path; the arm follows
    (`following`): B1 by inverse kinematics, B2 moving arm and object out of collision at each
    waypoint.
 
-To put something down (`Place`), it is taken as in 1 to 3, and then:
+`Place` continues after 3 by base poses from which the arm can put the object down, lifting it (or
+moving it home, see `postures`), driving, and putting it down. `Reach` is 1 to 3 with a pose in
+place of the handle. `GoTo` drives as in 2, after withdrawing the arm if necessary. In these B1 and
+B2 are equal.
 
-4. Base poses from which the arm puts it down, the nearest first.
-5. The base stands, the arm lifts it, or goes home with it if the base gets nowhere otherwise
-   (`postures`).
-6. The base drives there, the arm as it is: A*, then optimisation.
-7. The base stands, the arm puts it down: optimisation.
-
-To bring the tool somewhere (`Reach`) is 1 to 3 with the pose in place of the handle, and nothing
-more.
-
-To drive somewhere (`GoTo`), the arm stays as it is if that will do, goes back from the handle it
-let go of, or else home, and the base drives as in 6. Neither has anything to follow, so B1 and B2
-are the same there.
-
-Where a stage fails, the next nearest base poses are tried, then all again with other random
-numbers. Scene, limits, steps of time, clearances and validation are those of `planner.plan`, and so
-is the solver of the optimisations.
+After a failed stage the next base poses are tried, then everything with other random numbers.
 """
 
 from __future__ import annotations
@@ -41,13 +27,12 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import cast
 
-from vkc_pin.baselines.attempt import FINER, Attempt, Doable
+from vkc_pin.baselines.attempt import FINER, Attempt, BaselineStep
 from vkc_pin.errors import InputError, format_value
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, acquire_cache
 from vkc_pin.planning.request import check_arguments, make_budget
-from vkc_pin.planning.results import build_plan
 from vkc_pin.planning.retime_validated import retime_validated
 from vkc_pin.planning.statistics import PlanningStatistics
 from vkc_pin.utils.arguments import check_choice, check_integer
@@ -64,8 +49,8 @@ __all__ = ["BASELINES", "RETRIES", "plan_separately"]
 
 BASELINES = ("B1", "B2")
 RETRIES = 5
-"""How often all is tried."""
-LARGEST_FINER = 16  # waypoints beyond those of so fine a motion tell nothing new
+"""Number of attempts."""
+LARGEST_FINER = 16
 
 
 def plan_separately(
@@ -81,31 +66,28 @@ def plan_separately(
     finer: int = FINER,
     planner: Planner | None = None,
 ) -> Plan:
-    """Plan as the baselines do.
+    """Plan by a baseline.
 
     Args:
         scene: Robot, objects and obstacles.
-        steps: What should change: `Actuate`, `Place`, `GoTo` and `Reach`, any number.
+        steps: Any number of `Actuate`, `Place`, `GoTo` and `Reach`.
         method: "B1" or "B2".
         options: As for `planner.plan`.
-        seed: Of the random numbers.
+        seed: Random seed.
         time_limit: As for `planner.plan`.
-        max_evaluations: As for `planner.plan`; an iteration of inverse kinematics of the arm counts 1.
-        retries: How often all is tried, with other random numbers, until validation accepts a
-            motion.
-        finer: In how many times `Options.move_waypoints` objects are moved; 1: in as many as by
-            `planner.plan`.
+        max_evaluations: As for `planner.plan`; an iteration of inverse kinematics counts 1.
+        retries: Number of attempts, with other random numbers, until a motion is valid.
+        finer: Factor of `Options.move_waypoints` for moving objects.
         planner: As for `planner.plan`.
 
     Returns:
-        The plan of the first try that validation accepts, else the one that came furthest. Its
-        status is then the cause: "no base pose", "no base path", "arm does not reach", "no inverse
-        kinematics", "collision", "too fast", "closure" or "rejected" by validation; "time limit",
-        "evaluation limit" or "interrupted" if not all tries were made. Planning time is that of all
-        tries; `rounds` is their number.
+        The plan of the first valid attempt, else of the one with most progress. Its status is then
+        the cause: "no base pose", "no base path", "arm does not reach", "no inverse kinematics",
+        "collision", "too fast", "closure" or "rejected"; "time limit", "evaluation limit" or
+        "interrupted" if not all attempts were made. `rounds` is the number of attempts.
 
     Raises:
-        InputError: Steps that cannot be done or are of another kind, or an argument is wrong.
+        InputError: A step is impossible or of another kind, or an argument is invalid.
     """
     options = Options() if options is None else options
     budget = make_budget(time_limit, max_evaluations)
@@ -114,9 +96,9 @@ def plan_separately(
     check_integer(retries, "retries", low=1)
     check_integer(finer, "finer", low=1, high=LARGEST_FINER)
     task = compile_task(scene, steps, options)
-    actions: list[Doable] = []
+    actions: list[BaselineStep] = []
     for number, step in enumerate(task.steps):
-        if not isinstance(step, Doable):
+        if not isinstance(step, BaselineStep):
             expected = "Actuate, Place, GoTo or Reach"
             raise InputError(
                 "the baselines know no such step",
@@ -137,9 +119,9 @@ def plan_separately(
                 finer=finer,
                 cache=cache,
             )
-            trajectory, came, cause = attempt.run(actions)
+            trajectory, progress, cause = attempt.run(actions)
             before_checks, checked = attempt.times["validation"], time.perf_counter()
-            trajectory, report = _timed(
+            trajectory, report = _retime(
                 scene, task.steps, trajectory, options, attempt.times, failed=cause != ""
             )
             took = time.perf_counter() - checked
@@ -148,8 +130,8 @@ def plan_separately(
             status = "success" if report.ok else cast("PlanStatus", cause or "rejected")
             iterations += attempt.iterations
             times.update(attempt.times)
-            if best is None or status == "success" or came > best[0]:
-                best = came, status, number, trajectory, report
+            if best is None or status == "success" or progress > best[0]:
+                best = progress, status, number, trajectory, report
             ended = budget.stop_status
             if status == "success" or ended:
                 break
@@ -157,7 +139,10 @@ def plan_separately(
     assert best is not None
     _, status, tried, trajectory, report = best
     if ended and status not in ("success", ended):
-        status, notes = ended, (*report.notes, f"the try that came furthest failed with: {status}")
+        status, notes = (
+            ended,
+            (*report.notes, f"the attempt with most progress failed with: {status}"),
+        )
         report = dataclasses.replace(report, notes=notes)
     statistics = PlanningStatistics(
         planning_time=time.perf_counter() - began - built,
@@ -167,7 +152,7 @@ def plan_separately(
         evaluations=budget.evaluations,
     ).with_times(times)
     name = f"{method}, try {tried + 1}"
-    return build_plan(
+    return Plan(
         scene,
         task.steps,
         options,
@@ -175,12 +160,12 @@ def plan_separately(
         report,
         status,
         statistics=statistics,
-        random_seed=int(seed),
+        seed=int(seed),
         initialization=name,
     )
 
 
-def _timed(
+def _retime(
     scene: Scene,
     steps: Sequence[Step],
     trajectory: Trajectory,
@@ -189,10 +174,7 @@ def _timed(
     *,
     failed: bool,
 ) -> tuple[Trajectory, Report]:
-    """Return a motion timed as those of `plan` are, or in its own time if only that is accepted, and what validation says.
-
-    What the checks take [s] is added to `times`.
-    """
+    """Return the motion as `plan` retimes it, or with its own times if only that is valid."""
 
     def check(motion: Trajectory) -> Report:
         began = time.perf_counter()

@@ -13,13 +13,18 @@ from vkc_pin.planning.initialization.methods import Initialization
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.progress import shown
 from vkc_pin.planning.request import make_budget, make_request
-from vkc_pin.planning.sequential import plan_sequentially, plan_simultaneously
+from vkc_pin.planning.sequential import (
+    plan_sequentially,
+    plan_simultaneously,
+    solve_with_alternatives,
+)
 from vkc_pin.planning.solver.solution import Iteration
 from vkc_pin.planning.window import plan_with_window
 from vkc_pin.utils.arguments import check_bool, check_instance, check_integer, check_number
 from vkc_pin.utils.cache import Cache, CacheInfo
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import compile_each_step
+from vkc_pin.world.task.actuation import find_shared_coordinate
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Task, summarize_phases
 from vkc_pin.world.task.steps import Step, as_steps
@@ -180,8 +185,13 @@ def plan(
             found = plan_with_window(ready, steps, window, request)
         else:
             (task,) = tasks if ready is scene else _compile(ready, steps, request.options)
-            solve = plan_simultaneously if simultaneous else plan_sequentially
-            found = solve(ready, task, request)
+            # A chain can contain a joint only once.
+            if not simultaneous or find_shared_coordinate(ready, task.holds) is not None:
+                found = plan_sequentially(ready, task, request)
+            elif len(task.steps) == 1:
+                found = solve_with_alternatives(ready, task, request).plan
+            else:
+                found = plan_simultaneously(ready, task, request)
         line.end(found)
     return found
 

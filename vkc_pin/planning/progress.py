@@ -1,4 +1,4 @@
-"""One line that says how far planning has come, and changes in its place: in a notebook, or in a terminal."""
+"""Shows the progress of planning in one line of a notebook or terminal."""
 
 from __future__ import annotations
 
@@ -21,12 +21,7 @@ __all__ = ["Progress", "shown"]
 
 
 class Progress:
-    """The line. It says nothing if nobody shows it.
-
-    Attributes:
-        write: Shows a text instead of the one before; the second argument is whether it is the
-            last.
-    """
+    """The progress line; `write` shows a text, and whether it is the last. Default: no line."""
 
     def __init__(self, write: Callable[[str, bool], None] | None = None) -> None:
         self.write = write
@@ -35,7 +30,7 @@ class Progress:
         self._ended = write is None
 
     def part(self, first: int, count: int, total: int) -> None:
-        """Tell which of many steps are planned next: `count` from number `first`, counted from 1, of `total`."""
+        """Set the next steps: `count` from number `first`, counted from 1, of `total`."""
         self._part = (
             f"step {first} of {total}"
             if count == 1
@@ -43,30 +38,30 @@ class Progress:
         )
 
     def begin(self, phases: Sequence[str]) -> None:
-        """Tell what the motion does that is planned next."""
+        """Set the phases of the next trajectory."""
         self._what = ", ".join(phases)
         self.doing("preparing")
 
     def doing(self, text: str) -> None:
-        """Tell what is being done."""
+        """Show the current activity."""
         self._doing = text
         self._show()
 
     def __call__(self, row: Iteration) -> None:
-        """Take a round of the solver."""
+        """Show a round of the solver."""
         missing = "clear" if row.shortfall <= 0.0 else f"{1e3 * row.shortfall:.1f} mm missing"
         self._doing = f"round {row.round}, {missing}, objective {row.objective:.3g}"
         self._show()
 
     def end(self, plan: Plan) -> None:
-        """Leave one line on what came out."""
+        """Show the result."""
         m, name = plan.metrics, plan.scene.name
         result = "success" if plan.success else f"FAILED, {plan.status}"
         took = f"base {m['base_path_length']:.2f} m, arm {m['arm_path_length']:.2f} rad, planned in {m['planning_time']:.2f} s"
         self._last(f"{name}: {result} — {took}")
 
     def stop(self) -> None:
-        """Leave one line that says that nothing came out, unless there is a last line already."""
+        """Show that planning has stopped, unless the result is shown."""
         self._last(f"stopped after {time.perf_counter() - self._began:.1f} s")
 
     def _show(self) -> None:
@@ -82,7 +77,6 @@ class Progress:
             self._write(text, True)
 
     def _write(self, text: str, last: bool) -> None:
-        """Show a text; a terminal that is gone is no reason to stop."""
         with contextlib.suppress(OSError, ValueError):
             if self.write is not None:
                 self.write(text, last)
@@ -90,14 +84,10 @@ class Progress:
 
 @contextlib.contextmanager
 def shown(progress: object) -> Iterator[Progress]:
-    """Yield the line, and see to it that one is left whatever happens.
+    """Yield the progress line, and finish it in any case.
 
-    Args:
-        progress: Whether to show it: in a notebook in the cell's output, in a terminal as a line of
-            standard error; where neither is there, as in a pipe, nothing is shown.
-
-    Raises:
-        InputError: `progress` is neither True nor False.
+    With `progress` it is shown in a notebook's cell, or in a terminal on standard error; elsewhere,
+    as in a pipe, nothing is shown. Raises `InputError` if `progress` is neither True nor False.
     """
     if not isinstance(progress, bool):
         raise InputError(
@@ -111,7 +101,7 @@ def shown(progress: object) -> Iterator[Progress]:
 
 
 def _screen() -> Callable[[str, bool], None] | None:
-    """Return what shows a line here; None if there is nowhere to show it."""
+    """Return the function that shows a line, or None without terminal and notebook."""
     if in_notebook():
         return _Line(sys.stdout, None)
     if sys.stderr is not None and sys.stderr.isatty():
@@ -122,7 +112,7 @@ def _screen() -> Callable[[str, bool], None] | None:
 
 
 class _Line:
-    """A bar of tqdm's that is all text: there is no telling how much is left to do."""
+    """A bar of tqdm with text only."""
 
     def __init__(self, stream: TextIO, width: int | None) -> None:
         self.stream, self.width = stream, width

@@ -24,18 +24,7 @@ MAX_PERTURBATION = 3.0
 
 @dataclass(frozen=True)
 class PlanningRequest:
-    """Arguments of one planning call; see `planner.plan`.
-
-    Attributes:
-        initialization: Initialization method.
-        options: Options of planning.
-        callback: Called after every round of the solver.
-        random_seed: Random seed.
-        perturbation: Standard deviation of noise on initial guesses, [m] and [rad].
-        terms: Constraints and costs of the user.
-        progress: Progress line.
-        cache: Symbolic programs and other results that can be reused.
-    """
+    """Checked arguments of one planning call; see `planner.plan`."""
 
     initialization: str
     options: Options
@@ -57,11 +46,7 @@ def make_request(
     perturbation: float = 0.0,
     terms: Sequence[Term] = (),
 ) -> PlanningRequest:
-    """Return the arguments of `plan` as a request.
-
-    Raises:
-        InputError: An argument is invalid.
-    """
+    """Return the arguments of `plan` as a request. Raises `InputError` for invalid ones."""
     options = Options() if options is None else options
     check_arguments(scene, options, seed)
     check_choice(initialization, INITIALIZATIONS, "initialization", "initialization")
@@ -78,21 +63,14 @@ def make_request(
 
 
 def make_budget(time_limit: object, max_evaluations: object) -> Budget:
-    """Return the budget of a planning call, which starts now; see `plan`.
-
-    Raises:
-        InputError: A limit is invalid.
-    """
+    """Return the budget of a planning call, which starts now. Raises `InputError`."""
     if time_limit is not None:
         time_limit = check_number(
             time_limit, "time_limit", "seconds, more than 0", low=0.0, strict=True
         )
-    return Budget(
-        time_limit,
-        None
-        if max_evaluations is None
-        else check_integer(max_evaluations, "max_evaluations", low=1),
-    )
+    if max_evaluations is not None:
+        max_evaluations = check_integer(max_evaluations, "max_evaluations", low=1)
+    return Budget(time_limit, max_evaluations)
 
 
 def check_arguments(scene: object, options: object, seed: object) -> None:

@@ -1,4 +1,4 @@
-"""Builds plans from trajectories and their reports, and concatenates the plans of single steps."""
+"""Builds plans from trajectories and reports, and concatenates plans of consecutive steps."""
 
 from __future__ import annotations
 
@@ -13,12 +13,10 @@ from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.statistics import PlanningStatistics
 from vkc_pin.utils.budget import STOP_STATUSES, current_ending
-from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.contact_rules import compute_start_opening
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
-from vkc_pin.world.task.terms import Term
 from vkc_pin.world.trajectory.formats.archives import PlanStatus
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.splicing import concatenate_trajectories
@@ -27,7 +25,6 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 __all__ = [
     "FINAL",
     "add_statistics",
-    "build_plan",
     "concatenate_plans",
     "make_stationary_trajectory",
     "sum_statistics",
@@ -38,57 +35,13 @@ FINAL = (*STOP_STATUSES, "infeasible")
 
 
 def sum_statistics(parts: Iterable[PlanningStatistics]) -> PlanningStatistics:
-    """Return the sum of the statistics of several plans."""
+    """Return the sum of statistics."""
     return sum(parts, start=PlanningStatistics())
 
 
 def add_statistics(plan: Plan, parts: Iterable[PlanningStatistics]) -> Plan:
-    """Return a plan with the summed statistics of several, its own among them."""
+    """Return a plan with the sum of the statistics of several plans."""
     return dataclasses.replace(plan, statistics=sum_statistics(parts))
-
-
-def build_plan(
-    scene: Scene,
-    steps: Sequence[Step],
-    options: Options,
-    trajectory: Trajectory,
-    report: Report,
-    status: PlanStatus,
-    *,
-    statistics: PlanningStatistics,
-    random_seed: int,
-    initialization: str,
-    history: Sequence[Mapping[str, float]] = (),
-    terms: tuple[Term, ...] = (),
-) -> Plan:
-    """Return the plan of a trajectory.
-
-    Args:
-        scene: Scene in which it starts.
-        steps: Steps to be done.
-        options: Options of planning.
-        trajectory: The trajectory.
-        report: Its validation.
-        status: See `Plan`.
-        statistics: Times and counts of planning.
-        random_seed: Random seed.
-        initialization: Name of the initial guess it came from.
-        history: One row per round of the solver.
-        terms: Constraints and costs of the user.
-    """
-    return Plan(
-        scene=scene,
-        steps=tuple(steps),
-        options=options,
-        trajectory=trajectory,
-        report=report,
-        status=status,
-        statistics=statistics,
-        seed=random_seed,
-        initialization=initialization,
-        history=tuple(history),
-        terms=terms,
-    )
 
 
 def concatenate_plans(
@@ -108,7 +61,7 @@ def concatenate_plans(
 
     Args:
         scene: Scene in which the first part starts.
-        steps: Steps to be done.
+        steps: Steps of all parts.
         request: Arguments of planning.
         parts: The plans, each from the end of the one before.
         began: Value of `time.perf_counter()` from which planning time counts; None: the sum of
@@ -123,9 +76,8 @@ def concatenate_plans(
     rows = [row for part in parts for row in part.history] if history is None else history
     if parts:
         request.progress.doing("checking all of it")
-        status: PlanStatus = current_ending() or (
-            "rejected" if parts[-1].success else parts[-1].status
-        )
+        failure = "rejected" if parts[-1].success else parts[-1].status
+        status: PlanStatus = current_ending() or failure
         trajectory = concatenate_trajectories(
             [part.trajectory for part in parts], pause=request.options.grasp_time
         )
@@ -143,17 +95,17 @@ def concatenate_plans(
     if began is not None:
         planning_time = time.perf_counter() - began - total.build_time
         total = dataclasses.replace(total, planning_time=planning_time)
-    return build_plan(
+    return Plan(
         scene,
-        steps,
+        tuple(steps),
         request.options,
         trajectory,
         report,
         status,
         statistics=total,
-        random_seed=request.random_seed,
+        seed=request.random_seed,
         initialization=name,
-        history=rows,
+        history=tuple(rows),
         terms=request.terms,
     )
 

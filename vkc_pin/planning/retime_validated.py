@@ -29,13 +29,7 @@ def retime_validated(
 
     Around a violation the curve is made to pass through the middles of the straight segments too,
     which the program has checked. Violated torque limits depend on no curve and are left alone.
-
-    Args:
-        scene: Robot and objects.
-        waypoints: The waypoints, with any times.
-        check: Validates a trajectory.
-        repairs: Largest number of refinements.
-        jerk_time: See `Options.jerk_time`.
+    `check` validates a trajectory, and `repairs` is the largest number of refinements.
     """
     parts = np.ones(len(waypoints.times) - 1, int)
     trajectory = retime_trajectory(scene, waypoints, jerk_time=jerk_time)

@@ -1,4 +1,4 @@
-"""What is to be said of a scene before anything is planned: what is close, what can be taken hold of, which way frames point."""
+"""Checks a scene before planning: close pairs, reachable attachments, and directions of frames."""
 
 from __future__ import annotations
 
@@ -30,22 +30,21 @@ from vkc_pin.world.task.steps import Grasp, Reach
 
 __all__ = ["ReachableAttachment", "SceneCheck", "check_scene"]
 
-_FAR = 0.25  # [m] beyond which clearances are not told
+_FAR = 0.25  # largest reported clearance [m]
 
 
 @dataclass(frozen=True, eq=False)
 class ReachableAttachment:
-    """Whether the hand can take hold somewhere.
+    """Reachability of an attachment.
 
     Attributes:
-        object, attachment: Where.
-        approach: The direction in which the hand comes, in the world frame, shape (3,); at zero of
-            the grasp's freedoms.
-        closing: The line along which its fingers close, shape (3,).
-        configuration: The robot's coordinates of the clearest grasp that was found, shape (n,);
-            None: none was found.
-        clearance: The smallest distance there of what must keep `dist_safe`, at most 0.25 [m].
-        because: Why none was found.
+        object, attachment: Names of object and attachment.
+        approach: Approach direction of the hand in the world frame, shape (3,).
+        closing: Closing direction of the fingers in the world frame, shape (3,).
+        configuration: Robot coordinates of the found grasp with the largest clearance, shape (n,);
+            None if none was found.
+        clearance: Its clearance, at most 0.25 [m].
+        because: Reason why none was found.
     """
 
     object: str
@@ -62,27 +61,23 @@ class ReachableAttachment:
         if self.configuration is None:
             return f"{head}: not reached, {self.because}"
         x, y, yaw = self.configuration[:3]
-        least = (
-            f"{1e3 * self.clearance:.0f} mm"
-            if self.clearance < _FAR
-            else f"more than {1e3 * _FAR:.0f} mm"
-        )
+        more = "" if self.clearance < _FAR else "more than "
+        least = f"{more}{1e3 * min(self.clearance, _FAR):.0f} mm"
         return f"{head}: reached from ({x:.2f}, {y:.2f}) at {yaw:.2f} rad, with {least} of air"
 
 
 @dataclass(frozen=True, eq=False)
 class SceneCheck:
-    """What a check found.
+    """Result of checking a scene.
 
     Attributes:
         scene: The scene.
-        dist_safe: What counts as close [m].
-        robot: What the robot, with what it holds, is close to at the start: itself, objects and
-            obstacles.
-        close: What else can move and is close to something.
-        allowed: Which pairs of links may be close, as the scene says or as they are built.
-        attachments: Of all objects that are not in the hand.
-        problems: What prevents every plan: the robot's start, and what it is said to hold.
+        dist_safe: Required clearance [m].
+        robot: Close pairs of the robot at the start, with itself, objects and obstacles.
+        close: Other movable links that are close to something.
+        allowed: Pairs that are exempt from clearance.
+        attachments: Attachments of all objects that are not grasped.
+        problems: Reasons why nothing can be planned.
     """
 
     scene: Scene
@@ -95,29 +90,26 @@ class SceneCheck:
 
     @property
     def ok(self) -> bool:
-        """Whether plans can begin, and every object that has attachments can be taken hold of at one at least."""
+        """Whether planning is possible, and every object with attachments can be grasped."""
         reached = {one.object for one in self.attachments if one.configuration is not None}
         return not self.problems and reached == {one.object for one in self.attachments}
 
     def lines(self) -> list[str]:
-        """Return it as lines of text."""
+        """Return the result as lines of text."""
         scene = self.scene
-        found = [
-            f"{scene.name}: {scene.robot.name}, {len(scene.objects)} objects, {len(scene.obstacle_names)} obstacles"
-        ]
-        near, stuck = (
-            [pair for pair in self.close if (pair.distance < 0.0) == inside]
-            for inside in (False, True)
+        counts = f"{len(scene.objects)} objects, {len(scene.obstacle_names)} obstacles"
+        found = [f"{scene.name}: {scene.robot.name}, {counts}"]
+        near, overlapping = (
+            [pair for pair in self.close if (pair.distance < 0.0) == overlaps]
+            for overlaps in (False, True)
         )
+        closer = f"closer than {1e3 * self.dist_safe:g} mm to"
         for title, entries in (
             ("nothing can be planned, because", self.problems),
-            (f"the robot is closer than {1e3 * self.dist_safe:g} mm to", self.robot),
-            (
-                f"closer than {1e3 * self.dist_safe:g} mm to each other",
-                near,
-            ),
-            ("one in the other", stuck),
-            ("may be close", [_said(one) for one in self.allowed]),
+            (f"the robot is {closer}", self.robot),
+            (f"{closer} each other", near),
+            ("one in the other", overlapping),
+            ("may be close", [_describe(one) for one in self.allowed]),
             ("attachments", self.attachments),
         ):
             if entries:
@@ -128,16 +120,16 @@ class SceneCheck:
         return "\n".join(self.lines())
 
     def plot(self, path: str | Path | None = None) -> Any:
-        """Draw the scene from above, with what is close and from where attachments are reached; see `plot_scene`.
+        """Draw the scene from above, with close pairs and reachable attachments; see `plot_scene`.
 
         Args:
-            path: Where to write the picture; None: nowhere.
+            path: File of the picture; None: none is written.
 
         Returns:
             The matplotlib figure.
 
         Raises:
-            InputError: The name's end is none of a picture.
+            InputError: The file name is not that of a picture.
         """
         from vkc_pin.visualization.plots.scene_view import Approach, plot_scene
 
@@ -150,29 +142,25 @@ class SceneCheck:
             arrows.append(
                 Approach(f"{one.object}.{one.attachment}", tool.translation, one.approach, base)
             )
-        stuck = [
-            label
-            for pair in (*self.robot, *self.close)
-            if pair.distance < 0.0
-            for label in (pair.first, pair.second)
-        ]
-        return plot_scene(self.scene, arrows, stuck, path)
+        overlaps = [pair for pair in (*self.robot, *self.close) if pair.distance < 0.0]
+        labels = [label for pair in overlaps for label in (pair.first, pair.second)]
+        return plot_scene(self.scene, arrows, labels, path)
 
 
 def check_scene(scene: Scene, *, options: Options | None = None, seed: int = 0) -> SceneCheck:
-    """Look at a scene as a plan would: what is close or overlaps, what can be reached, and which way frames point.
+    """Check a scene as a plan would see it: close or overlapping pairs, and reachable attachments.
 
     Args:
         scene: The scene.
-        options: Clearances; `Options()` if left out.
-        seed: Of the random configurations with which attachments are tried, as for `plan`.
+        options: Clearances. Default: `Options()`.
+        seed: Random seed of the configurations with which attachments are tried.
 
     Returns:
-        What was found. It promises nothing: what is reached need not be on any path, and what is
-        not may be all the same.
+        The result. It is no guarantee: a reachable attachment need not be on any path, and another
+        one may be reachable nevertheless.
 
     Raises:
-        InputError: An argument is wrong.
+        InputError: An argument is invalid.
     """
     check_instance(scene, Scene, "scene")
     options = Options() if options is None else check_instance(options, Options, "options")
@@ -200,22 +188,20 @@ def check_scene(scene: Scene, *, options: Options | None = None, seed: int = 0) 
         ),
         close=tuple(find_close_pairs(scene, options.dist_safe)),
         allowed=find_clearance_exemptions(scene, options.dist_safe),
-        attachments=tuple(_attachments(scene, options, seed, cache)),
+        attachments=tuple(_check_attachments(scene, options, seed, cache)),
         problems=tuple(
             f"{one.subject}: {one.detail}" for one in find_impossible_conditions(problem)
         ),
     )
 
 
-def _attachments(
+def _check_attachments(
     scene: Scene, options: Options, seed: int, cache: Cache
 ) -> Iterator[ReachableAttachment]:
-    """Yield what can be said of all attachments."""
     empty = scene.with_held({})
     for name, placed in scene.objects.items():
-        for attachment, grasp in (
-            placed.object.attachments.items() if name not in scene.held else ()
-        ):
+        attachments = placed.object.attachments if name not in scene.held else {}
+        for attachment, grasp in attachments.items():
             turned = (placed.link_placement(grasp.link) * grasp.placement).rotation
             about: dict[str, Any] = {
                 "approach": turned[:, 2].copy(),
@@ -227,11 +213,11 @@ def _attachments(
                 yield ReachableAttachment(name, attachment, **about, because=str(error))
                 continue
             problem = TrajectoryProblem(empty, task, options, (), cache=cache)
-            yield ReachableAttachment(name, attachment, **about, **_reached(problem, seed))
+            yield ReachableAttachment(name, attachment, **about, **_find_grasp(problem, seed))
 
 
-def _reached(problem: TrajectoryProblem, seed: int) -> dict[str, Any]:
-    """Return the clearest grasp among random ones, and its clearance, or why there is none."""
+def _find_grasp(problem: TrajectoryProblem, seed: int) -> dict[str, Any]:
+    """Return the sampled grasp with the largest clearance, or the reason why there is none."""
     end, safe = int(problem.ends[-1]), problem.options.dist_safe
     for draw in range(3):
         tried = sample_goal_configurations(problem, end, np.random.default_rng((seed, draw)))
@@ -251,7 +237,7 @@ def _reached(problem: TrajectoryProblem, seed: int) -> dict[str, Any]:
     return {"because": blocked[0].text if blocked else "no free configuration was found"}
 
 
-def _said(one: ClearanceExemption) -> str:
+def _describe(one: ClearanceExemption) -> str:
     kept = "at any distance" if one.margin == -np.inf else f"down to {1e3 * one.margin:.4g} mm"
     ends = {
         name: [f"{end:.3g}" if np.isfinite(end) else "its limit" for end in both]

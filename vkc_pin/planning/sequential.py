@@ -1,4 +1,4 @@
-"""Plans steps simultaneously or one after the other, with the attachments that lead to success."""
+"""Plans steps simultaneously or sequentially, and with other attachments where planning fails."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from vkc_pin.planning.solve_task import TaskResult, solve_task
 from vkc_pin.utils.budget import STOP_STATUSES, current_ending, reserve_time
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import generate_alternatives, has_open_attachment
-from vkc_pin.world.task.actuation import find_shared_coordinate
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Step
@@ -29,25 +28,14 @@ __all__ = [
 
 
 class PlannedStep(NamedTuple):
-    """A step, planned from the end of the one before.
-
-    Attributes:
-        number: Number of the step, from 0.
-        result: Result of its task.
-    """
+    """Number of a step, from 0, and the result of its task."""
 
     number: int
     result: TaskResult
 
 
 def plan_sequentially(scene: Scene, task: Task, request: PlanningRequest) -> Plan:
-    """Plan every step from the end of the one before, up to the first that fails, and concatenate the plans.
-
-    Args:
-        scene: Robot, objects and obstacles.
-        task: The task.
-        request: Arguments of planning.
-    """
+    """Plan every step from the end of the one before, up to the first failure; concatenate the plans."""
     parts = plan_each_step(scene, task, request)
     steps: list[tuple[Step, ...]] = [(step,) for step in task.steps]
     for part in parts:  # one step becomes several where an object is grasped anew
@@ -57,20 +45,10 @@ def plan_sequentially(scene: Scene, task: Task, request: PlanningRequest) -> Pla
 
 
 def plan_simultaneously(scene: Scene, task: Task, request: PlanningRequest) -> Plan:
-    """Plan all steps as one problem, in which every grasp and base pose can change in favour of later steps.
+    """Plan several steps as one problem, in which grasps and base poses depend on later steps.
 
-    If that fails, or holds move the same joint, which a chain can contain only once, the steps are
-    planned sequentially.
-
-    Args:
-        scene: Robot, objects and obstacles.
-        task: The task.
-        request: Arguments of planning.
+    If that fails, the steps are planned sequentially.
     """
-    if find_shared_coordinate(scene, task.holds) is not None:
-        return plan_sequentially(scene, task, request)
-    if len(task.steps) == 1:
-        return solve_with_alternatives(scene, task, request).plan
     plan = solve_task(scene, task, request).plan
     final = STOP_STATUSES if any(has_open_attachment(scene, step) for step in task.steps) else FINAL
     if plan.success or plan.status in final:
@@ -82,13 +60,8 @@ def plan_simultaneously(scene: Scene, task: Task, request: PlanningRequest) -> P
 def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) -> TaskResult:
     """Solve a task; if that fails, with each of the other attachments that its steps leave open.
 
-    A held object that cannot be moved with its present grasp is released and grasped anew.
+    A grasped object that cannot be moved with its present grasp is released and grasped anew.
     Attachments without a known collision-free configuration at the end of a phase are skipped.
-
-    Args:
-        scene: Robot, objects and obstacles.
-        task: The task.
-        request: Arguments of planning.
 
     Returns:
         The first success, whose steps name the attachment unless it is the default; if all fail,
@@ -116,21 +89,13 @@ def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) 
 
 
 def plan_each_step(scene: Scene, task: Task, request: PlanningRequest) -> list[PlannedStep]:
-    """Plan every step that changes the world from the end of the one before, up to the first that fails.
-
-    Args:
-        scene: Robot, objects and obstacles.
-        task: The task.
-        request: Arguments of planning.
-    """
+    """Plan every step that changes the world from the end of the one before, up to the first failure."""
     current, parts, reserved = scene, list[PlannedStep](), 0.0
     for number, step in enumerate(task.steps):
         # The end of a step is known only once it is planned; the first starts where the task does.
-        own = (
-            compile_task(current, [step], request.options, nothing=True)
-            if number
-            else task.truncate(1)
-        )
+        own = task.truncate(1)
+        if number:
+            own = compile_task(current, [step], request.options, nothing=True)
         if not own.phases:
             continue
         request.progress.part(number + 1, 1, len(task.steps))

@@ -1,4 +1,4 @@
-"""Solves a task as one nonlinear program, from initial guess to initial guess until validation accepts a trajectory."""
+"""Solves a task as one nonlinear program, from one initial guess after the other."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from vkc_pin.planning.initialization.methods import initialize
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.request import PlanningRequest
-from vkc_pin.planning.results import build_plan, make_stationary_trajectory
+from vkc_pin.planning.results import make_stationary_trajectory
 from vkc_pin.planning.retime_validated import MAX_REPAIRS, retime_validated
 from vkc_pin.planning.solver.loop import solve
 from vkc_pin.planning.solver.solution import Iteration, Solution
@@ -62,13 +62,11 @@ class TaskResult:
 
     Attributes:
         scene: Scene in which it starts.
-        task: The task.
         plan: The best plan found.
         problem: The nonlinear program; None if the budget ended before it was built.
         z: Its best waypoints z_1..z_N, shape (N, n).
         check_time: Time of the last validation [s].
-        is_grasp_independent: Whether the task fails for certain whatever the grasp: the start is
-            invalid, or a joint moves its link into an obstacle.
+        is_grasp_independent: Whether the task fails for certain whatever the grasp.
     """
 
     scene: Scene
@@ -112,7 +110,7 @@ def solve_task(
     request.progress.begin([phase.name for phase in task.phases])
     search = _Search(scene, task, request)
     try:
-        best, status = search.run(guess, check_goals_first)
+        best, status = search.run(guess, check_goals_first=check_goals_first)
     except BudgetExhaustedError as end:
         best, status = search.find_nearest() or search.make_standing(), end.status
     cache.trim()  # a chore has many problems, whose solvers grow while they are used
@@ -124,7 +122,7 @@ def solve_task(
         rounds=search.rounds,
         evaluations=count_evaluations() - evaluated,
     ).with_times(search.times)
-    plan = build_plan(
+    plan = Plan(
         scene,
         task.steps,
         request.options,
@@ -132,9 +130,9 @@ def solve_task(
         best.report,
         status,
         statistics=statistics,
-        random_seed=request.random_seed,
+        seed=request.random_seed,
         initialization=best.name,
-        history=search.history,
+        history=tuple(search.history),
         terms=request.terms,
     )
     found = search.problem, best.z, search.check_time, search.is_grasp_independent
@@ -143,15 +141,7 @@ def solve_task(
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """Trajectory found from one initial guess.
-
-    Attributes:
-        name: Name of the initial guess.
-        z: z_1..z_N, shape (N, n).
-        trajectory: The trajectory.
-        report: Its validation.
-        status: "success", "rejected" or "not converged".
-    """
+    """Trajectory found from one initial guess, with z_1..z_N, shape (N, n)."""
 
     name: str
     z: Floats
@@ -161,30 +151,18 @@ class _Candidate:
 
     @property
     def violation(self) -> float:
-        """Sum of all violations, over all units."""
         return sum(violation.amount for violation in self.report.violations)
 
     def is_better(self, other: _Candidate) -> bool:
-        """Return whether it is valid, or violates less."""
         return self.report.ok or self.violation < other.violation
 
     def with_notes(self, notes: Iterable[str]) -> _Candidate:
-        """Return the candidate with notes in its report."""
         report = dataclasses.replace(self.report, notes=tuple(notes))
         return dataclasses.replace(self, report=report)
 
 
 class _Search:
-    """State of solving one task.
-
-    Attributes:
-        problem: The nonlinear program, once it is built.
-        times: Stage → time [s].
-        rounds, iterations: Rounds of the solver, iterations of Ipopt.
-        history: One row per round.
-        check_time: Time of the last validation [s].
-        is_grasp_independent: See `TaskResult`.
-    """
+    """State of solving one task."""
 
     def __init__(self, scene: Scene, task: Task, request: PlanningRequest) -> None:
         self.scene, self.task, self.request = scene, task, request
@@ -200,47 +178,33 @@ class _Search:
         self._goals: dict[int, BlockedGoal | None] = {}
         self._proofs: list[str] | None = None
 
-    def run(self, guess: Guess | None, check_goals_first: bool) -> tuple[_Candidate, PlanStatus]:
+    def run(self, guess: Guess | None, *, check_goals_first: bool) -> tuple[_Candidate, PlanStatus]:
         """Return the best candidate and the status of the plan; see `solve_task`."""
-        options, terms, cache = self.request.options, self.request.terms, self.request.cache
-        problem = TrajectoryProblem(self.scene, self.task, options, terms, cache=cache)
-        self.problem = problem
-        reserve_time("validation", _CHECK_TIME * problem.segments, default=True)
-        reasons = find_impossible_conditions(problem)
-        if reasons:
+        problem, goals = self._build_problem(), list[BlockedGoal]()
+        if reasons := find_impossible_conditions(problem):
             self.is_grasp_independent = True
             best = self._make_stationary(problem)
             return dataclasses.replace(best, report=best.report.with_reasons(reasons)), "infeasible"
         if check_goals_first and (goals := self._find_blocked_goals(problem)):
-            return self._make_stationary(problem).with_notes(
-                goal.text for goal in goals
-            ), "infeasible"
-        guesses = self._initial_guesses(problem) if guess is None else iter([guess(problem)])
-        return self._try_guesses(problem, guesses, is_search=guess is None)
-
-    def _try_guesses(
-        self, problem: TrajectoryProblem, guesses: Iterator[InitialGuess], *, is_search: bool
-    ) -> tuple[_Candidate, PlanStatus]:
-        """Return the best candidate and the status, with notes on what prevents success."""
-        goals: list[BlockedGoal] = []
-        for number, guess in enumerate(guesses, start=1):
-            solution = self._solve(problem, guess)
-            if solution.shortfall:
-                found = (solution, guess.name)
-                known = self._infeasible or found
-                self._infeasible = min(known, found, key=lambda one: one[0].shortfall)
-            else:
-                candidate = self._evaluate(problem, solution, guess.name)
-                if self._best is None or candidate.is_better(self._best):
-                    self._best = candidate
-                if self._best.status == "success":
-                    return self._best, "success"
-                if solution.status in STOP_STATUSES:
-                    return self._best, solution.status
+            best = self._make_stationary(problem)
+            return best.with_notes(goal.text for goal in goals), "infeasible"
+        is_search = guess is None
+        guesses = iter([guess(problem)]) if guess else self._generate_guesses(problem)
+        for number, start in enumerate(guesses, start=1):
+            solution = solve(problem, start.z, callback=self._report_round, radius=start.radius)
+            self._add_solution(problem, solution, start.name)
+            if self._best is not None and self._best.status == "success":
+                return self._best, "success"
+            if (
+                self._best is not None
+                and solution.status in STOP_STATUSES
+                and not solution.shortfall
+            ):
+                return self._best, solution.status
             record_evaluations()
             if is_search and self._find_proofs(problem):
                 break
-            if number == 1 and is_search and not _has_free_ends(problem, guess):
+            if number == 1 and is_search and not _has_free_ends(problem, start):
                 goals = self._find_blocked_goals(problem)
             elif goals:  # two guesses failed, and sampling finds no free goal configuration either
                 break
@@ -248,6 +212,29 @@ class _Search:
                 break
         record_evaluations()
         return self._explain_failure(problem, [goal.text for goal in goals], is_search=is_search)
+
+    def _build_problem(self) -> TrajectoryProblem:
+        request = self.request
+        self.problem = TrajectoryProblem(
+            self.scene, self.task, request.options, request.terms, cache=request.cache
+        )
+        reserve_time("validation", _CHECK_TIME * self.problem.segments, default=True)
+        return self.problem
+
+    def _add_solution(self, problem: TrajectoryProblem, solution: Solution, name: str) -> None:
+        """Record a solution, and keep it if it is the best, or the nearest to feasibility."""
+        self.rounds += solution.rounds
+        self.iterations += solution.iterations
+        for key, value in solution.timings.items():
+            self.times[key] += value
+        self.history += [dataclasses.asdict(row) for row in solution.history]
+        if solution.shortfall:
+            if self._infeasible is None or solution.shortfall < self._infeasible[0].shortfall:
+                self._infeasible = (solution, name)
+            return
+        candidate = self._evaluate(problem, solution, name)
+        if self._best is None or candidate.is_better(self._best):
+            self._best = candidate
 
     def _explain_failure(
         self, problem: TrajectoryProblem, lines: list[str], *, is_search: bool
@@ -286,7 +273,7 @@ class _Search:
     def _find_blocked_goals(
         self, problem: TrajectoryProblem, numbers: Iterable[int] | None = None
     ) -> list[BlockedGoal]:
-        """Return the goals of some phases, None: of all, without a known collision-free configuration."""
+        """Return the goals of phases (None: all) without a known collision-free configuration."""
         found = []
         for number in range(len(problem.task.phases)) if numbers is None else numbers:
             if number not in self._goals:
@@ -294,7 +281,7 @@ class _Search:
             found.append(self._goals[number])
         return [goal for goal in found if goal is not None]
 
-    def _initial_guesses(self, problem: TrajectoryProblem) -> Iterator[InitialGuess]:
+    def _generate_guesses(self, problem: TrajectoryProblem) -> Iterator[InitialGuess]:
         request = self.request
         guesses = initialize(
             problem,
@@ -320,23 +307,13 @@ class _Search:
                 return
             yield guess
 
-    def _solve(self, problem: TrajectoryProblem, guess: InitialGuess) -> Solution:
-        """Return the solution from an initial guess."""
-        solution = solve(problem, guess.z, callback=self._report_round, radius=guess.radius)
-        self.rounds += solution.rounds
-        self.iterations += solution.iterations
-        for key, value in solution.timings.items():
-            self.times[key] += value
-        self.history += [dataclasses.asdict(row) for row in solution.history]
-        return solution
-
     def _report_round(self, row: Iteration) -> None:
         self.request.progress(row)
         if self.request.callback is not None:
             self.request.callback(row)
 
     def _evaluate(self, problem: TrajectoryProblem, solution: Solution, name: str) -> _Candidate:
-        """Retime and validate a solution; where that finds violations, retime closer to its segments."""
+        """Retime and validate a solution; around violations the curve comes closer to the segments."""
         with suspend_budget():
             waypoints = make_trajectory(problem, solution.z, solution.dt)
         began, validated = time.perf_counter(), self.times["validation"]
@@ -359,13 +336,12 @@ class _Search:
 
     @cached_property
     def _has_velocity_terms(self) -> bool:
-        """Whether user terms depend on velocities, which then are those of the program's own time."""
+        """Whether user terms depend on velocities, for which the program's own times are kept."""
         return any(
             term.formula.uses_previous for term in trace_terms(self.scene, self.request.terms)
         )
 
     def _validate(self, trajectory: Trajectory) -> Report:
-        """Validate a trajectory and measure the time."""
         began, request = time.perf_counter(), self.request
         request.progress.doing("checking")
         report = validate(self.scene, self.task.steps, trajectory, request.options, request.terms)
@@ -375,19 +351,19 @@ class _Search:
         return report
 
     def _make_stationary(self, problem: TrajectoryProblem) -> _Candidate:
-        """Return a trajectory that stays at the start for the duration of the task."""
+        """Return a trajectory that is stationary for the duration of the task."""
         timing = problem.timing_for(problem.still)
         return self._evaluate(problem, Solution(problem.still, timing.dt), "none")
 
     def make_standing(self) -> _Candidate:
-        """Return a trajectory of one time step at the start, the result before the first initial guess."""
+        """Return a stationary trajectory, the result before the first initial guess."""
         trajectory = make_stationary_trajectory(self.scene, self.request.options)
         report = self._validate(trajectory)
         return _Candidate("none", np.zeros((0, 0)), trajectory, report, "not converged")
 
 
 def _has_free_ends(problem: TrajectoryProblem, guess: InitialGuess) -> bool:
-    """Return whether the configurations of a guess at the ends of the phases are feasible."""
+    """Return whether a guess is feasible at the ends of the phases."""
     contacts = problem.evaluate_contacts(guess.z, reach=problem.options.largest_margin)
     free = contacts.compute_shortfall(problem.segments)[problem.ends - 1] <= 0.0
     return bool(free.all()) and problem.pose_error(guess.z) < 1e-2

@@ -55,7 +55,7 @@ class PlanningStatistics:
         return dataclasses.replace(self, **fields)
 
     def to_metrics(self) -> dict[str, float]:
-        """Return the statistics under the names that records of benchmarks have."""
+        """Return the statistics by the names in records of benchmarks."""
         times = {f"time_{stage}": float(getattr(self, f"{stage}_time")) for stage in STAGES}
         if self.following_time:
             times["time_following"] = self.following_time
@@ -73,7 +73,7 @@ class PlanningStatistics:
 
     @classmethod
     def from_metrics(cls, metrics: Mapping[str, float]) -> PlanningStatistics:
-        """Return the statistics that `to_metrics` wrote; names that are missing count as 0."""
+        """Return the statistics that `to_metrics` returned; missing names count as 0."""
         stages = (*STAGES, "following")
         times = {f"{stage}_time": float(metrics.get(f"time_{stage}", 0.0)) for stage in stages}
         return cls(

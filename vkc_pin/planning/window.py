@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from vkc_pin.errors import InputError
-from vkc_pin.options import Options
 from vkc_pin.planning.initialization.initial_guess import PhaseWaypoints, make_initial_guess
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.request import PlanningRequest
@@ -40,28 +40,13 @@ def plan_with_window(
     one, from the state in which that trajectory ends. So no grasp and no base pose is chosen from
     which the next action is infeasible. If it is all the same, the last decision is revoked and
     planned again with one more action in the window.
-
-    Args:
-        scene: Robot, objects and obstacles.
-        steps: What should change in the world, in this order.
-        window: Number of actions planned together.
-        request: Arguments of planning.
     """
     return _SlidingWindow(scene, tuple(steps), window, request).run()
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Trajectory of one action.
-
-    Attributes:
-        plan: Plan of the action alone, from the scene in which it starts; None if nothing is to be
-            done.
-        waypoints: Its waypoints.
-        after: Scene at its end.
-        is_at_rest: Whether the robot is at rest at its end.
-        check_time: Time of its validation [s].
-    """
+    """Plan of one action (None: nothing to do), its waypoints, and the scene at its end."""
 
     plan: Plan | None
     waypoints: PhaseWaypoints
@@ -75,9 +60,8 @@ class _SlidingWindow:
 
     Attributes:
         actions: Steps of each action, with the attachments that lead to success.
-        decided: Parts of the first actions, which are accepted.
+        decided: Accepted parts of the first actions.
         ahead: Parts of the next actions, from which the next problem starts.
-        statistics, history: Statistics of every problem, and every round of the solver.
     """
 
     def __init__(
@@ -90,6 +74,9 @@ class _SlidingWindow:
         self.statistics: list[PlanningStatistics] = []
         self.history: list[Mapping[str, float]] = []
         self.began = time.perf_counter()
+        # Number of attempts with other random seeds, and of decisions that may be revoked in all.
+        self._attempts = request.options.max_restarts
+        self._options = dataclasses.replace(request.options, max_restarts=1)
 
     def run(self) -> Plan:
         """Plan action after action until all are planned, one fails or the budget ends."""
@@ -112,20 +99,11 @@ class _SlidingWindow:
         return self._concatenate(failed)
 
     @property
-    def _attempts(self) -> int:
-        """Number of attempts with other random seeds, and of decisions that may be revoked in all."""
-        return self.request.options.max_restarts
-
-    @property
     def _current_scene(self) -> Scene:
         return self.decided[-1].after if self.decided else self.scene
 
     def _plan_window(self, window: int) -> Plan | None:
-        """Decide on the next action together with those after it.
-
-        If that fails, return the plan of the first action that could not be planned, from the end of
-        those ahead.
-        """
+        """Decide on the next action together with those after it; return the plan of a failure."""
         first = len(self.decided)
         last = self._find_last(first, window)
         self.ahead = self.ahead[: last - first]
@@ -137,12 +115,8 @@ class _SlidingWindow:
         task = self._compile(self._current_scene, first, last)
         if failed is None and sum(part.plan is not None for part in self.ahead) > 1:
             pieces = [part.waypoints for part in self.ahead]
-            result = self._solve(
-                first,
-                self._current_scene,
-                task,
-                guess=lambda problem: make_initial_guess(problem, pieces),
-            )
+            guess = functools.partial(make_initial_guess, parts=pieces)
+            result = self._solve(first, self._current_scene, task, guess=guess)
             if result.plan.success:
                 self.ahead = self._divide(result, first, last)
         for attempt in range(1, 1 + self._attempts):
@@ -181,8 +155,7 @@ class _SlidingWindow:
     def _look_ahead(self) -> Plan | None:
         """Plan one more action alone, from the end of those ahead; return its plan if it fails.
 
-        If it fails, it is planned with the other attachments that it leaves open; the first success
-        determines the attachment from then on.
+        After a failure other attachments are tried; the first success determines the attachment.
         """
         number = len(self.decided) + len(self.ahead)
         scene = self.ahead[-1].after if self.ahead else self._current_scene
@@ -229,18 +202,10 @@ class _SlidingWindow:
         guess: Guess | None = None,
         check_goals_first: bool = False,
     ) -> TaskResult:
-        """Return the result of a task that begins with the action `first`.
+        """Solve a task that begins with the action `first`.
 
         Each attempt has few initial guesses: where an action is infeasible from the end of the one
         before, all of them fail slowly, and planning both together is the solution.
-
-        Args:
-            first: Number of its first action.
-            scene: Scene in which it starts.
-            task: The task.
-            attempt: Added to the random seed.
-            guess: See `solve_task`.
-            check_goals_first: See `solve_task`.
         """
         request = dataclasses.replace(
             self.request,
@@ -257,7 +222,7 @@ class _SlidingWindow:
         return result
 
     def _divide(self, result: TaskResult, first: int, last: int) -> list[_Part]:
-        """Return the parts of a result in which the actions from `first` to before `last` are done."""
+        """Return the parts of a result in which the actions `first` to `last` − 1 are done."""
         problem = result.problem
         assert problem is not None
         scene, begin, parts, whole = result.scene, 0, list[_Part](), result.phase_waypoints()
@@ -297,12 +262,7 @@ class _SlidingWindow:
     def _steps(self, first: int, last: int) -> tuple[Step, ...]:
         return tuple(step for action in self.actions[first:last] for step in action)
 
-    @property
-    def _options(self) -> Options:
-        return dataclasses.replace(self.request.options, max_restarts=1)
-
     def _compile(self, scene: Scene, first: int, last: int) -> Task:
-        """Compile actions, whose scene is known only once those before them are planned."""
         return compile_task(scene, self._steps(first, last), self._options, nothing=True)
 
     def _concatenate(self, failed: Plan | None) -> Plan:

@@ -45,14 +45,7 @@ class Drift(NamedTuple):
 
 
 class _Lever(NamedTuple):
-    """The effect of a trajectory coordinate on a frame.
-
-    Attributes:
-        column: Column of the coordinate in the trajectory.
-        rate: Joint motion per unit of the coordinate.
-        arm: Largest distance of the frame's origin from the joint axis [m]; 1 for prismatic joints.
-        is_revolute: Whether the joint rotates the frame.
-    """
+    """The effect of a trajectory coordinate on a frame whose origin is within `arm` [m] of its axis."""
 
     column: int
     rate: float
@@ -63,14 +56,7 @@ class _Lever(NamedTuple):
 def find_drift(
     samples: Samples, phase: PhaseSpan, hold: Hold, limits: tuple[float, float]
 ) -> Drift:
-    """Find the largest drift of a grasp in a phase.
-
-    Args:
-        samples: Sampled motion.
-        phase: Phase of the motion.
-        hold: Grasp to check.
-        limits: Limits of position error [m] and angle [rad].
-    """
+    """Find the largest drift of a grasp in a phase; `limits` are those of position [m] and angle [rad]."""
     rows = samples.get_rows(phase)
     times = samples.times[rows]
     errors = samples.compute_grasp_errors(hold.object, hold.attachment, rows, hold.frame)
@@ -102,15 +88,10 @@ def _maximize(
     bound_curvature: Callable[[Floats, Floats], Floats],
     limits: Floats,
 ) -> Drift:
-    """Maximize errors over an interval by bisection (branch and bound).
+    """Maximize position and angle errors by bisection (branch and bound).
 
-    Args:
-        times: Times that divide the interval, shape (K,) [s].
-        errors: Position and angle errors at these times, shape (K, 2).
-        evaluate: Function of increasing times, shape (n,), that returns errors, shape (n, 2).
-        bound_curvature: Function that bounds second derivatives of position and angle sine on
-            intervals, shape (n, 2).
-        limits: Limits of the errors, shape (2,).
+    The errors at `times`, shape (K,), are `errors`, shape (K, 2); `evaluate` computes them at other
+    times. `bound_curvature` bounds second derivatives of position and angle sine on intervals.
     """
     begin, end, left, right = times[:-1], times[1:], errors[:-1], errors[1:]
     found, when = errors.max(axis=0), times[errors.argmax(axis=0)]
@@ -163,11 +144,6 @@ def _bound_position_acceleration(
 
     With joints numbered from the world on, |∂²p/∂i∂j| is at most the arm of the later joint, and 0
     if the earlier joint is prismatic.
-
-    Args:
-        chain: Levers of the frame, from the world on.
-        speed: Bounds of the coordinates' |velocity|, shape (N, n).
-        acceleration: Bounds of the coordinates' |acceleration|, shape (N, n).
     """
     total, turning = np.zeros(len(speed)), np.zeros(len(speed))
     for lever in chain:
@@ -185,11 +161,6 @@ def _bound_rotation_acceleration(
 
     The sine is the norm of the axial vector of the rotation R. With R̈ = ([ω̇] + [ω]²) R, the second
     derivative of that vector is at most |ω̇| + |ω|², where |ω| ≤ Σ|v| and |ω̇| ≤ Σ|a| + ½ (Σ|v|)².
-
-    Args:
-        chain: Levers of both frames.
-        speed: Bounds of the coordinates' |velocity|, shape (N, n).
-        acceleration: Bounds of the coordinates' |acceleration|, shape (N, n).
     """
     turning, change = np.zeros(len(speed)), np.zeros(len(speed))
     for lever in chain:

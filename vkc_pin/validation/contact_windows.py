@@ -68,15 +68,7 @@ def find_contact_windows(
     options: Options,
     tolerances: Tolerances,
 ) -> list[Window]:
-    """Find all pairs of a motion that may be close, and when, by the scene's contact rules.
-
-    Args:
-        samples: Sampled motion.
-        solids: Collision shapes of its world.
-        steps: Steps of the task.
-        options: Clearances and time step.
-        tolerances: Errors with which the hand counts as at its attachment.
-    """
+    """Find all pairs of a motion that may be close, and when, by the scene's contact rules."""
     return list(_WindowFinder(samples, solids, options, tolerances).find(steps))
 
 
@@ -85,59 +77,51 @@ def check_gripper(samples: Samples, options: Options) -> Iterator[Violation]:
 
     Before and during a grasp the gripper must have the opening of the attachment.
     """
-    scene, trajectory, gripper = samples.scene, samples.trajectory, samples.scene.robot.gripper
-    times, (low, high), before = trajectory.times, trajectory.ranges(), set(scene.holds)
-    low, high = low[:, : trajectory.robot_size], high[:, : trajectory.robot_size]
-    for number, phase in enumerate(trajectory.phases):
-        changed, before, at = before ^ set(phase.holds), set(phase.holds), phase.first
-        opens = number > 0 and phase.opening != trajectory.phases[number - 1].opening
-        if changed or opens:
-            here = trajectory.positions[at, : trajectory.robot_size]
-            moves = (
-                np.maximum(high - here, here - low).max(axis=1) > MOTION_TOLERANCE
-            )  # between one waypoint and the next
-            moved = np.flatnonzero(moves)
-            k = int(np.searchsorted(moved, at))
-            begin = at if opens else moved[k - 1] + 1 if k else 0  # fingers start to move here
-            end = moved[k] if k < len(moved) else len(times) - 1
-            rest = float(times[end] - times[begin])
-            if not rest >= options.grasp_time - _DWELL_TOLERANCE:
-                detail = f"the robot rests for {rest:.2f} s, {options.grasp_time:g} s are required"
-                subject, amount = (
-                    ", ".join(sorted(map(str, changed))) or "gripper",
-                    options.grasp_time - rest,
-                )
-                yield Violation(
-                    "dwell",
-                    subject,
-                    waypoint=at,
-                    time=float(times[at]),
-                    amount=amount,
-                    unit="s",
-                    detail=detail,
-                )
-        after = trajectory.phases[number + 1].holds if number + 1 < len(trajectory.phases) else ()
-        hold = find_gripper_hold(phase.holds) or find_gripper_hold(after)
-        if gripper is not None and hold is not None:
-            asked = compute_grasp_opening(scene, hold)
-            wide, right = (
-                gripper.rest_opening if opening is None else opening
-                for opening in (phase.opening, asked)
-            )
-            if not abs(wide - right) <= WIDTH_TOLERANCE:
-                detail = (
-                    f"the gripper is {1e3 * wide:.1f} mm open, {1e3 * right:.1f} mm are required"
-                )
-                time, amount = float(times[at]), abs(wide - right)
-                yield Violation(
-                    "opening",
-                    str(hold),
-                    waypoint=at,
-                    time=time,
-                    amount=amount,
-                    unit="m",
-                    detail=detail,
-                )
+    before = set(samples.scene.holds)
+    for number, phase in enumerate(samples.trajectory.phases):
+        changed, before = before ^ set(phase.holds), set(phase.holds)
+        yield from _check_rest(samples, number, changed, options.grasp_time)
+        yield from _check_opening(samples, number)
+
+
+def _check_rest(
+    samples: Samples, number: int, changed: set[Hold], required: float
+) -> Iterator[Violation]:
+    """Check that the robot rests where a phase changes holds or the gripper's opening."""
+    motion, size = samples.trajectory, samples.trajectory.robot_size
+    phase, times = motion.phases[number], motion.times
+    opens = number > 0 and phase.opening != motion.phases[number - 1].opening
+    if not (changed or opens):
+        return
+    (low, high), at = (side[:, :size] for side in samples.ranges), phase.first
+    here = motion.positions[at, :size]
+    moves = np.flatnonzero(np.maximum(high - here, here - low).max(axis=1) > MOTION_TOLERANCE)
+    k = int(np.searchsorted(moves, at))
+    begin = at if opens else moves[k - 1] + 1 if k else 0  # fingers start to move here
+    end = moves[k] if k < len(moves) else len(times) - 1
+    rest = float(times[end] - times[begin])
+    if not rest >= required - _DWELL_TOLERANCE:
+        subject = ", ".join(sorted(map(str, changed))) or "gripper"
+        detail = f"the robot rests for {rest:.2f} s, {required:g} s are required"
+        yield samples.make_violation("dwell", subject, required - rest, "s", detail, waypoint=at)
+
+
+def _check_opening(samples: Samples, number: int) -> Iterator[Violation]:
+    """Check the opening of the gripper in a phase."""
+    gripper, phases = samples.scene.robot.gripper, samples.trajectory.phases
+    phase, after = phases[number], phases[number + 1 : number + 2]
+    hold = find_gripper_hold(phase.holds) or find_gripper_hold(after[0].holds if after else ())
+    if gripper is None or hold is None:
+        return
+    wide, right = (
+        gripper.rest_opening if opening is None else opening
+        for opening in (phase.opening, compute_grasp_opening(samples.scene, hold))
+    )
+    if not abs(wide - right) <= WIDTH_TOLERANCE:
+        detail = f"the gripper is {1e3 * wide:.1f} mm open, {1e3 * right:.1f} mm are required"
+        yield samples.make_violation(
+            "opening", str(hold), abs(wide - right), "m", detail, waypoint=phase.first
+        )
 
 
 def check_pushes(samples: Samples) -> Iterator[Violation]:
@@ -152,10 +136,8 @@ def check_pushes(samples: Samples) -> Iterator[Violation]:
             if attachment.contact != "push":
                 continue
             rows = samples.get_rows(phase)
-            hands, links = (
-                samples.compute_placements(rows, tool),
-                samples.compute_placements(rows, f"{hold.object}.{attachment.link}"),
-            )
+            hands = samples.compute_placements(rows, tool)
+            links = samples.compute_placements(rows, f"{hold.object}.{attachment.link}")
             foremost = compute_hand_frame(scene.robot, attachment) * attachment.offset.inverse()
             travel = [0.0]
             for hand, link, after in zip(hands, links, links[1:], strict=False):
@@ -167,30 +149,21 @@ def check_pushes(samples: Samples) -> Iterator[Violation]:
             back = np.maximum.accumulate(travel) - travel
             worst = int(np.argmax(back))
             if not back[worst] <= CONTACT_DEPTH:
-                row, amount = int(rows[worst]), float(back[worst] - CONTACT_DEPTH)
-                at, time = samples.find_waypoint(row), float(samples.times[row])
+                amount, row = back[worst] - CONTACT_DEPTH, int(rows[worst])
                 detail = f"goes back by {1e3 * back[worst]:.2f} mm where the hand only pushes"
-                yield Violation(
-                    "push",
-                    str(hold),
-                    waypoint=at,
-                    time=time,
-                    amount=amount,
-                    unit="m",
-                    detail=detail,
-                )
+                yield samples.make_violation("push", str(hold), amount, "m", detail, row=row)
 
 
 class _WindowFinder:
     def __init__(
         self, samples: Samples, solids: CollisionShapes, options: Options, tolerances: Tolerances
     ) -> None:
-        self.samples, self.solids, self.options = samples, solids, options
         self.tolerances = tolerances
+        self.samples, self.solids, self.options = samples, solids, options
         self.scene, self.trajectory, world = samples.scene, samples.trajectory, samples.world
         self.labels, self.keys = np.array(world.collision_labels), world.collision_keys
         self.q = world.coordinates.q(samples.z[samples.waypoint_rows])
-        low, high = self.trajectory.ranges()
+        low, high = samples.ranges
         self.steps = (high - low).max(axis=1) > _MOTION_TOLERANCE
         self.robots = len(self.scene.robot.collision.geometryObjects)
         self.supports = samples.free_objects.supports
@@ -207,29 +180,23 @@ class _WindowFinder:
             self._find_spans(self._list_carried_objects()),
             key=lambda run: -1 if run[1] is None else run[1],
         ):
-            yield from self._find_carry_windows(
-                owner, first or 0, self._find_easing_end(first or 0), new=owner not in moved
-            )
-            for at in [last] if last is not None else []:
+            begin, is_new = first or 0, owner not in moved
+            yield from self._find_carry_windows(owner, begin, self._extend(begin, 1), new=is_new)
+            if last is not None:
                 yield from self._find_carry_windows(
-                    owner, at, self._find_easing_start(at), begin=False
+                    owner, last, self._extend(last, -1), begin=False
                 )
             moved.add(owner)
         for phase, riding in zip(self.trajectory.phases, self.supports, strict=True):
             for owner, label in riding.items():
-                as_one = {other for other, on in riding.items() if on == label and other != owner}
+                others = {other for other, on in riding.items() if on == label and other != owner}
                 mates = [
                     k
                     for k, one in enumerate(self.labels)
-                    if one == label or one.partition(".")[0] in as_one
+                    if one == label or one.partition(".")[0] in others
                 ]
-                yield Window(
-                    self._make_pairs(self._get_shapes(owner), mates),
-                    phase.first,
-                    phase.last,
-                    -np.inf,
-                    moves_together=True,
-                )
+                pairs = self._make_pairs(self._get_shapes(owner), mates)
+                yield Window(pairs, phase.first, phase.last, -np.inf, moves_together=True)
         yield from self._find_touch_windows([step for step in steps if isinstance(step, Touch)])
 
     def _find_exemption_windows(self, one: ClearanceExemption) -> Iterator[Window]:
@@ -252,72 +219,47 @@ class _WindowFinder:
     ) -> Iterator[Window]:
         """Yield windows of a hold from waypoint `first` to `last` (None: start, end)."""
         begin, end = 0 if first is None else first, len(self.steps) if last is None else last
-        since, until = (
-            begin if first is None else self._find_easing_start(begin),
-            end if last is None else self._find_easing_end(end),
-        )
+        since = begin if first is None else self._extend(begin, -1)
+        until = end if last is None else self._extend(end, 1)
         yield from self._find_hand_windows(hold, since, until)
-        gripped = self._pair_links(
-            find_touch_links(self.scene, hold), {find_grasped_link(self.scene, hold)}
-        )
-        if is_rigid_grasp(self.scene, hold):
-            yield Window(gripped, begin, end, 0.0, moves_together=True)
-        else:
-            yield Window(
-                gripped,
-                begin,
-                end,
-                compute_hand_clearance(
-                    self.scene, hold, find_grasped_link(self.scene, hold), self.options
-                ),
-            )
+        link, is_rigid = find_grasped_link(self.scene, hold), is_rigid_grasp(self.scene, hold)
+        clearance = compute_hand_clearance(self.scene, hold, link, self.options)
+        pairs = self._pair_links(find_touch_links(self.scene, hold), {link})
+        yield Window(pairs, begin, end, 0.0 if is_rigid else clearance, moves_together=is_rigid)
 
     def _find_hand_windows(self, hold: Hold, first: int, last: int) -> Iterator[Window]:
         """Yield windows of the grasping links with all links of the object."""
         by_clearance: dict[float, set[str]] = {}
-        for link in (
-            label for label in self.labels.tolist() if label.startswith(f"{hold.object}.")
-        ):
-            by_clearance.setdefault(
-                compute_hand_clearance(self.scene, hold, link, self.options), set()
-            ).add(link)
+        for link in self.labels.tolist():
+            if link.startswith(f"{hold.object}."):
+                least = compute_hand_clearance(self.scene, hold, link, self.options)
+                by_clearance.setdefault(least, set()).add(link)
         for least, links in by_clearance.items():
-            yield Window(
-                self._pair_links(find_touch_links(self.scene, hold), links),
-                first,
-                last,
-                least,
-                0.0 if least else CONTACT_DEPTH,
-            )
+            pairs = self._pair_links(find_touch_links(self.scene, hold), links)
+            yield Window(pairs, first, last, least, 0.0 if least else CONTACT_DEPTH)
 
     def _find_grasp_windows(self, steps: Sequence[Grasp]) -> Iterator[Window]:
         """Yield windows around phase ends at which the hand is at a grasp, held or not."""
         ends = np.array([phase.last for phase in self.trajectory.phases])
         for step in steps:
-            thing = self.scene.objects[step.object].object
-            for name in (
-                [step.attachment] if step.attachment is not None else list(thing.attachments)
-            ):
+            attachments = self.scene.objects[step.object].object.attachments
+            limits = (self.tolerances.goal_position, self.tolerances.goal_angle)
+            for name in attachments if step.attachment is None else [step.attachment]:
                 errors = self.samples.compute_grasp_errors(
                     step.object, name, self.samples.waypoint_rows[ends], step.by
                 )
-                for at in ends[
-                    (errors <= (self.tolerances.goal_position, self.tolerances.goal_angle)).all(
-                        axis=1
-                    )
-                ].tolist():
+                hold = self._make_hold(step, name)
+                for at in ends[(errors <= limits).all(axis=1)].tolist():
                     yield from self._find_hand_windows(
-                        self._make_hold(step, name),
-                        self._find_easing_start(at),
-                        self._find_easing_end(at),
+                        hold, self._extend(at, -1), self._extend(at, 1)
                     )
 
     def _make_hold(self, step: Grasp, attachment: str) -> Hold:
         """Make the hold that a step establishes; holds of the object in between are ignored."""
         owner, _, link = (step.by or "").partition(".")
-        through = (
-            Hold(owner, self.scene.objects[owner].object.attachment().name) if step.by else None
-        )
+        through = None
+        if step.by:
+            through = Hold(owner, self.scene.objects[owner].object.attachment().name)
         return Hold(step.object, attachment, through, link or None)
 
     def _find_carry_windows(
@@ -325,61 +267,37 @@ class _WindowFinder:
     ) -> Iterator[Window]:
         """Yield windows of a free object with its neighbours where carrying begins or ends.
 
-        Where it is lifted for the first time, or grasped at the start (`new`), it may penetrate its
-        neighbours as deep as it did before.
-
-        Args:
-            owner: Name of the object.
-            at: Waypoint at which carrying begins or ends.
-            other: Other end of the window.
-            begin: Whether carrying begins at `at`.
-            new: Whether the object has not moved before.
+        It begins or ends at waypoint `at`; `other` is the other end of the window. An object that has
+        not moved before (`new`) may penetrate its neighbours as deep as it did.
         """
         mine = self._get_shapes(owner)
-        pairs = self._make_pairs(
-            mine, [k for k in range(self.robots, len(self.labels)) if k not in mine]
-        )
+        others = [k for k in range(self.robots, len(self.labels)) if k not in mine]
+        pairs = self._make_pairs(mine, others)
         placed, here = self.solids.place(self.q[[at]]), np.zeros(len(pairs), int)
         pairs = pairs[placed.compute_lower_bounds(here, pairs) < self.options.dist_safe]
         distances = placed.compute_distances(here[: len(pairs)], pairs)
         first, last = (at, other) if begin else (other, at)
         yield Window(pairs[distances < self.options.dist_safe], first, last, 0.0)
         for k in np.flatnonzero(distances < -CONTACT_DEPTH).tolist() if new else ():
-            yield Window(
-                pairs[[k]], first, last, float(distances[k]), CONTACT_DEPTH - float(distances[k])
-            )
+            depth = float(distances[k])
+            yield Window(pairs[[k]], first, last, depth, CONTACT_DEPTH - depth)
 
     def _find_touch_windows(self, steps: Sequence[Touch]) -> Iterator[Window]:
         """Yield windows around touches with the shapes at their targets."""
+        ends, safe = [phase.last for phase in self.trajectory.phases], self.options.dist_safe
         for step in steps:
-            target = (
-                step.target.translation
-                if isinstance(step.target, pin.SE3)
-                else np.array(step.target)
-            )
-            ends = [phase.last for phase in self.trajectory.phases]
+            goal = step.target
+            target = goal.translation if isinstance(goal, pin.SE3) else np.array(goal)
             frames = self.samples.compute_placements(self.samples.waypoint_rows[ends], step.frame)
-            owner, links = (
-                step.frame.partition(".")[0],
-                _find_touching_links(self.scene, step.frame),
-            )
+            links = _find_touching_links(self.scene, step.frame)
             mine = [k for k, label in enumerate(self.labels) if label in links]
+            own = self._get_shapes(step.frame.partition(".")[0])
             for at, frame in zip(ends, frames, strict=True):
-                if np.linalg.norm(frame.translation - target) <= self.options.dist_safe:
-                    around = self.solids.place(self.q[[at]]).find_shapes_near(
-                        target, self.options.dist_safe
-                    )
-                    close = [
-                        k
-                        for k in around
-                        if k >= self.robots and self.labels[k].partition(".")[0] != owner
-                    ]
-                    yield Window(
-                        self._make_pairs(mine, close),
-                        self._find_easing_start(at),
-                        self._find_easing_end(at),
-                        0.0,
-                    )
+                if np.linalg.norm(frame.translation - target) <= safe:
+                    near = self.solids.place(self.q[[at]]).find_shapes_near(target, safe)
+                    others = [k for k in near if k >= self.robots and k not in own]
+                    pairs = self._make_pairs(mine, others)
+                    yield Window(pairs, self._extend(at, -1), self._extend(at, 1), 0.0)
 
     def _list_carried_objects(self) -> list[set[str]]:
         """Return the grasped or supported free objects at the start and in every phase."""
@@ -393,12 +311,9 @@ class _WindowFinder:
     def _find_spans(
         self, phases: Sequence[Collection[_T]]
     ) -> Iterator[tuple[_T, int | None, int | None]]:
-        """Yield items with the first and last waypoint of their presence.
+        """Yield items with the first and last waypoint of their presence (None: the start, the end).
 
-        None stands for the start, for items present there, and for the end.
-
-        Args:
-            phases: Items that are present at the start, and in every phase.
+        `phases` are the items that are present at the start, and in every phase.
         """
         spans, begun = self.trajectory.phases, dict[_T, int | None]()
         for number, now in enumerate(phases):
@@ -410,13 +325,10 @@ class _WindowFinder:
         yield from ((item, first, None) for item, first in begun.items())
 
     def _pair_links(self, ones: Collection[str], others: Collection[str]) -> Ints:
-        """Return the pairs of shapes of two sets of links, given by labels."""
-        return self._make_pairs(
-            *(
-                [k for k, label in enumerate(self.labels) if label in links]
-                for links in (ones, others)
-            )
+        first, second = (
+            [k for k, label in enumerate(self.labels) if label in links] for links in (ones, others)
         )
+        return self._make_pairs(first, second)
 
     def _get_shapes(self, owner: str) -> list[int]:
         return [
@@ -428,29 +340,16 @@ class _WindowFinder:
     def _make_pairs(self, ones: Iterable[int], others: Collection[int]) -> Ints:
         return np.array([(min(i, j), max(i, j)) for i in ones for j in others], int).reshape(-1, 2)
 
-    def _find_easing_end(self, at: int) -> int:
-        """Return the last exempt waypoint after a contact at `at`; see `CONTACT_WINDOW`."""
-        times, moved, last = self.trajectory.times, 0, at
-        while last < len(self.steps):
-            moved += int(self.steps[last])
-            if times[last + 1] - times[
-                at
-            ] > CONTACT_WINDOW + _MOTION_TOLERANCE and moved > self.options.steps(CONTACT_WINDOW):
+    def _extend(self, at: int, direction: int) -> int:
+        """Return the last (1) or first (−1) exempt waypoint of a contact; see `CONTACT_WINDOW`."""
+        times, moved, end = self.trajectory.times, 0, at
+        longest, most = CONTACT_WINDOW + _MOTION_TOLERANCE, self.options.steps(CONTACT_WINDOW)
+        while 0 <= (after := end + direction) < len(times):
+            moved += int(self.steps[min(end, after)])
+            if abs(times[after] - times[at]) > longest and moved > most:
                 break
-            last += 1
-        return last
-
-    def _find_easing_start(self, at: int) -> int:
-        """Return the first waypoint at which a pair in contact at `at` may be close."""
-        times, moved, first = self.trajectory.times, 0, at
-        while first > 0:
-            moved += int(self.steps[first - 1])
-            if times[at] - times[
-                first - 1
-            ] > CONTACT_WINDOW + _MOTION_TOLERANCE and moved > self.options.steps(CONTACT_WINDOW):
-                break
-            first -= 1
-        return first
+            end = after
+        return end
 
 
 def _find_touching_links(scene: Scene, frame: str) -> set[str]:

@@ -26,16 +26,10 @@ POINT_RADIUS = 1e-4  # radius of the sphere that stands for a point [m]
 
 
 class CollisionShapes:
-    """The collision shapes of a world.
+    """The G collision shapes of a world, with their bounding boxes.
 
-    Attributes:
-        world: The world, with G shapes.
-        body_count: Number of leading shapes that belong to the robot or an object; the others are
-            obstacles.
-        center, half: Centres and half extents of the bounding boxes in the shapes' own frames,
-            shape (G, 3) [m].
-        obstacle_corners: Corners of the obstacles' boxes; see `compute_corners`.
-        distance_queries: The shapes, prepared for coal's distance queries.
+    The first `body_count` belong to the robot or an object; the others are obstacles. `center` and
+    `half`, shape (G, 3) [m], are the boxes in the shapes' own frames.
     """
 
     def __init__(self, world: World) -> None:
@@ -56,9 +50,7 @@ class CollisionShapes:
     def compute_corners(self, where: Floats, which: slice) -> tuple[Floats, Floats]:
         """Compute lower and upper corners of axis-aligned boxes, shape (..., k, 3) each [m].
 
-        Args:
-            where: Placements of the shapes in the world, shape (..., k, 12).
-            which: The shapes.
+        `where` are the shapes' placements in the world, shape (..., k, 12).
         """
         rotation = where[..., :9].reshape(*where.shape[:-1], 3, 3).swapaxes(-1, -2)
         middle = np.einsum("...ij,...j->...i", rotation, self.center[which]) + where[..., 9:]
@@ -67,12 +59,7 @@ class CollisionShapes:
 
 
 class PlacedShapes:
-    """The shapes at W configurations.
-
-    Args:
-        solids: The shapes.
-        where: Placements of the robot's and objects' shapes in the world, shape (W, M, 12).
-    """
+    """The shapes at W configurations, with the bodies' placements `where`, shape (W, M, 12)."""
 
     def __init__(self, solids: CollisionShapes, where: Floats) -> None:
         self._solids, self._where = solids, where
@@ -103,14 +90,9 @@ class PlacedShapes:
         return len(self._where)
 
     def compute_lower_bounds(self, states: Ints, pairs: Ints) -> Floats:
-        """Compute lower bounds of distances; -inf where the boxes overlap.
+        """Compute lower bounds of distances of pairs, shape (n, 2), at states, shape (n,) [m].
 
-        Args:
-            states: State of each query, shape (n,).
-            pairs: Pair of shapes of each query, shape (n, 2).
-
-        Returns:
-            Lower bounds, shape (n,) [m].
+        They are -inf where the boxes overlap.
         """
         lower, upper = self.corners
         first, second = pairs.T
@@ -184,10 +166,6 @@ def bound_displacements(solids: CollisionShapes, samples: Floats) -> Floats:
     A revolute joint moves a point by at most its rotation times the point's distance from the axis.
     That distance is at most the sum of the offsets of the shape and of all joints between. A
     prismatic joint adds its travel.
-
-    Args:
-        solids: The G shapes.
-        samples: Successive configurations of their world, shape (S, n).
     """
     world = solids.world
     model, steps = world.model, np.abs(np.diff(samples, axis=0))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.errors import UnknownNameError
+from vkc_pin.utils.arguments import check_choice
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.tolerances import Tolerances
@@ -35,40 +35,33 @@ def check_steps(samples: Samples, steps: Sequence[Step]) -> None:
     Raises:
         UnknownNameError: An object, joint, attachment or frame does not exist.
     """
-    objects = samples.scene.objects
     for number, step in enumerate(steps):
         where = f"steps[{number}]"
         if isinstance(step, Actuate | Grasp | Place | Release):
-            if step.object is None:
-                continue
-            if step.object not in objects:
-                raise UnknownNameError("object", step.object, objects, field=f"{where}.object")
-            item = objects[step.object].object
-            if isinstance(step, Release):
-                continue
-            if isinstance(step, Grasp) and step.by is not None:
-                samples.check_frame(step.by, f"{where}.by")
-            if step.attachment is not None and step.attachment not in item.attachments:
-                kind = f"attachment of '{step.object}'"
-                raise UnknownNameError(
-                    kind, step.attachment, item.attachments, field=f"{where}.attachment"
-                )
-            for joint in step.joints if isinstance(step, Actuate) else ():
-                if joint not in item.coordinates.names:
-                    raise UnknownNameError(
-                        f"joint of '{step.object}'",
-                        joint,
-                        item.coordinates.names,
-                        field=f"{where}.joints",
-                    )
-        elif isinstance(step, Touch) and step.frame.partition(".")[0] in objects:
+            if step.object is not None:
+                _check_object_step(samples, step, where)
+        elif isinstance(step, Touch) and step.frame.partition(".")[0] in samples.scene.objects:
             samples.check_frame(step.frame, f"{where}.frame")
-        elif isinstance(step, Reach | Touch):
+        elif isinstance(step, Reach | Touch) and step.frame is not None:
             frames = [frame.name for frame in samples.scene.robot.model.frames]
-            if step.frame is not None and step.frame not in frames:
-                raise UnknownNameError(
-                    "frame of the robot", step.frame, frames, field=f"{where}.frame"
-                )
+            check_choice(step.frame, frames, "frame of the robot", f"{where}.frame")
+
+
+def _check_object_step(
+    samples: Samples, step: Actuate | Grasp | Place | Release, where: str
+) -> None:
+    name = step.object or ""
+    check_choice(name, samples.scene.objects, "object", f"{where}.object")
+    item = samples.scene.objects[name].object
+    if isinstance(step, Release):
+        return
+    if isinstance(step, Grasp) and step.by is not None:
+        samples.check_frame(step.by, f"{where}.by")
+    if step.attachment is not None:
+        kind = f"attachment of '{name}'"
+        check_choice(step.attachment, item.attachments, kind, f"{where}.attachment")
+    for joint in step.joints if isinstance(step, Actuate) else ():
+        check_choice(joint, item.coordinates.names, f"joint of '{name}'", f"{where}.joints")
 
 
 def check_goals(samples: Samples, steps: Sequence[Step], tolerances: Tolerances) -> list[Violation]:
@@ -99,13 +92,13 @@ def check_goals(samples: Samples, steps: Sequence[Step], tolerances: Tolerances)
                 (k for k in candidates if k), key=lambda k: max(m.amount for m in misses[number][k])
             )
             found += [
-                _violation(samples, "goal", ends[best], miss) for miss in misses[number][best]
+                samples.make_violation("goal", *miss, waypoint=ends[best])
+                for miss in misses[number][best]
             ]
         else:
             reached = fit
-    return found or _check_order(
-        samples, steps, hands, [[not missing for missing in row] for row in misses]
-    )
+    holds = [[not missing for missing in row] for row in misses]
+    return found or _check_order(samples, steps, hands, holds)
 
 
 def _find_grasped_objects(samples: Samples, steps: Sequence[Step]) -> list[set[str]]:
@@ -185,27 +178,16 @@ def _check_order(
             instead = f"when it is the turn of step {last + 1}, {type(steps[last]).__name__}"
             detail = f"moves by {amount:.4f} {unit} in '{phase.name}', {instead}"
             return [
-                _violation(samples, "order", phase.first, GoalError(name, amount, unit, detail))
+                samples.make_violation("order", name, amount, unit, detail, waypoint=phase.first)
             ]
         turns = left
     if len(steps) - 1 in turns:
         return []
-    first = max(turns)
+    first, end = max(turns), phases[-1].last
     detail = f"{type(steps[first]).__name__} is undone before the next step begins"
     return [
-        _violation(
-            samples, "order", phases[-1].last, GoalError(f"step {first + 1}", 1.0, "steps", detail)
-        )
+        samples.make_violation("order", f"step {first + 1}", 1.0, "steps", detail, waypoint=end)
     ]
-
-
-def _violation(samples: Samples, constraint: str, waypoint: int, miss: GoalError) -> Violation:
-    return Violation(
-        constraint,
-        waypoint=waypoint,
-        time=float(samples.trajectory.times[waypoint]),
-        **miss._asdict(),
-    )
 
 
 def _measure_transport(
@@ -324,7 +306,7 @@ def _compute_angle_error(placement: pin.SE3, target: pin.SE3, free: str) -> floa
 def _find_closest_grasp(samples: Samples, step: Grasp, row: int) -> tuple[str, tuple[float, float]]:
     """Return a grasp step's attachment and the tool's distance [m] and angle [rad] from it.
 
-    If the step names no attachment, it is the nearest one that is used at the start or in a phase.
+    Without a name, it is the nearest attachment that is used at the start or in a phase.
     """
     used = [samples.scene.held, *(phase.held for phase in samples.trajectory.phases)]
     names = (

@@ -21,12 +21,7 @@ _MOTION_TOLERANCE = 1e-9  # [m] or [rad]
 
 
 class PairTable:
-    """All pairs of a motion.
-
-    Attributes:
-        pairs: Indices of `world.shapes`, shape (P, 2).
-        solids: Collision shapes of the scene.
-        margins: Required clearance of each pair at the waypoints, shape (P,) [m].
+    """All pairs of a motion: indices of `world.shapes` and required clearances [m], shape (P,).
 
     Args:
         scene: Scene of the motion.
@@ -88,7 +83,7 @@ class PairTable:
         self._windows = _WindowIndex(windows, self.pairs)
 
     def _find_moving_shapes(self, rows: Floats) -> Bools:
-        """Return which shapes move in a sequence of configurations, shape (K, n): shape (G,)."""
+        """Return which shapes move in a sequence of configurations, shape (G,)."""
         world = self.world
         moved = world.coordinates.find_moved_joints(np.ptp(rows, axis=0) > _MOTION_TOLERANCE)
         for joint in range(1, len(moved)):
@@ -163,20 +158,11 @@ class PairTable:
     def find_close_pairs(
         self, placed: PlacedShapes, first: Ints, last: Ints, moved: Floats, limit: float
     ) -> tuple[Ints, Ints]:
-        """Find the pairs that may come closer than `limit` in intervals between waypoints.
+        """Find intervals and pairs that may come closer than `limit` [m] between waypoints, shape (n,).
 
-        Pairs whose boxes prove a larger distance are left out, and so are pairs of shapes that do
-        not move in the interval.
-
-        Args:
-            placed: Shapes at the waypoints.
-            first: First waypoints of the intervals, shape (K,).
-            last: Last waypoints of the intervals, shape (K,).
-            moved: Largest displacement of each shape in each interval, shape (K, G) [m].
-            limit: Distance limit [m].
-
-        Returns:
-            Intervals and pairs, shape (n,) each.
+        Pairs whose boxes prove a larger distance are left out, and so are pairs of shapes that do not
+        move in the interval. The intervals are from waypoint `first` to `last`, shape (K,); `moved` is
+        the largest displacement of each shape in them, shape (K, G) [m].
         """
         return placed.boxes.find_close_pairs(
             first,
@@ -190,12 +176,7 @@ class PairTable:
 
 
 class _WindowIndex:
-    """An index of windows for vectorized queries.
-
-    Attributes:
-        margin, contact, moves_together, is_exempt: Properties of each window, shape (K,); see
-            `Window`.
-    """
+    """An index of windows for vectorized queries, with their properties as arrays."""
 
     def __init__(self, windows: Sequence[Window], pairs: Ints) -> None:
         most = max((int(window.pairs.max()) for window in windows if len(window.pairs)), default=0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["Bound", "CheckedMotion", "Exemption", "Report", "Violation"]
 
 AGREEMENT_TOLERANCE = 1e-5  # accepted difference of two checks of one motion [m] or [rad]
+_Check = Callable[[Any, str], Any]  # checks the value of a field
 MAX_BOUNDS = 4  # limiting constraints listed in the text
 MAX_VIOLATIONS = 12  # violations listed in the text; `violations` has all of them
 
@@ -148,14 +149,11 @@ class Report:
         head = f"validation  {self.states} configurations checked: "
         if self.ok:
             return [head + "every constraint holds"]
+        more = len(self.violations) - MAX_VIOLATIONS
         return [
             head + f"{len(self.violations)} constraint(s) violated",
             *(f"  - {v}" for v in self.violations[:MAX_VIOLATIONS]),
-            *(
-                [f"  ... and {len(self.violations) - MAX_VIOLATIONS} more"]
-                if len(self.violations) > MAX_VIOLATIONS
-                else []
-            ),
+            *([f"  ... and {more} more"] if more > 0 else []),
             *(f"  because {note}" for note in self.notes),
         ]
 
@@ -170,13 +168,10 @@ class Report:
     def timing(self) -> list[str]:
         """Return limiting constraints, torques, remarks and exemptions as lines of text."""
         listed = ", ".join(map(str, self.bounds[:MAX_BOUNDS]))
+        torque = f"torques     at most {100.0 * self.torque:.0f} % of the motors' limits"
         return [
             *([f"bounded by  {listed}"] if listed else []),
-            *(
-                [f"torques     at most {100.0 * self.torque:.0f} % of the motors' limits"]
-                if self.torque > 0.0
-                else []
-            ),
+            *([torque] if self.torque > 0.0 else []),
             *(f"unknown     {remark}" for remark in self.remarks),
             *(f"exempt      {exemption}" for exemption in self.exemptions),
         ]
@@ -185,11 +180,8 @@ class Report:
         """Return a line of text per phase: time span, base and arm travel, and clearance."""
         lines, nearest = [], self.clearances or (float("inf"),) * len(trajectory.phases)
         for part, close in zip(trajectory.parts(), nearest, strict=True):
-            first, last, effort = (
-                part.times[0],
-                part.times[-1],
-                (part.base_path_length(), part.arm_path_length()),
-            )
+            first, last = part.times[0], part.times[-1]
+            effort = part.base_path_length(), part.arm_path_length()
             travel = f"base {effort[0]:5.2f} m, arm {effort[1]:5.2f} rad, {1e3 * close:6.1f} mm"
             lines.append(f"{first:6.1f} to {last:6.1f} s: {travel}, {part.phases[0].name}")
         return lines
@@ -202,11 +194,8 @@ class Report:
         """Return contradictions to another report of the same motion (to 10 µm and 1e-5 rad)."""
         lines = []
         if claimed.ok != self.ok:
-            lines.append(
-                "every constraint holds"
-                if claimed.ok
-                else f"{len(claimed.violations)} constraint(s) violated"
-            )
+            count = len(claimed.violations)
+            lines.append(f"{count} constraint(s) violated" if count else "every constraint holds")
         for name, unit in (("clearance", "m"), ("closure_error", "m"), ("closure_angle", "rad")):
             there, here = getattr(claimed, name), getattr(self, name)
             if there != here and not abs(there - here) <= AGREEMENT_TOLERANCE:
@@ -225,43 +214,14 @@ class Report:
             InputError: A field is missing or has the wrong type.
         """
         fields = dict(check_mapping(data, "report"))
-        for name in (
-            "clearance",
-            "closure_error",
-            "closure_angle",
-        ):  # infinite where nothing can collide
+        for name in ("clearance", "closure_error", "closure_angle"):
             if name in fields:
-                fields[name] = _parse_real(fields[name], name)
-        nearest: tuple[Any, ...] = check_list(
-            fields.get("clearances", ()), "clearances", "a list of distances"
-        )
-        fields["clearances"] = tuple(
-            _parse_real(one, f"clearances[{k}]") for k, one in enumerate(nearest)
-        )
+                fields[name] = _check_real(fields[name], name)
         fields["states"] = check_integer(fields.get("states", 0), "states", low=0)
-        listed: tuple[Any, ...] = check_list(
-            fields.get("violations"), "violations", "a list of violations"
-        )
-        fields["violations"] = tuple(
-            _parse_violation(one, f"violations[{k}]") for k, one in enumerate(listed)
-        )
-        notes: tuple[Any, ...] = check_list(fields.get("notes"), "notes", "a list of texts")
-        fields["notes"] = tuple(check_text(note, f"notes[{k}]") for k, note in enumerate(notes))
         fields["torque"] = check_number(fields.get("torque", 0.0), "torque", low=0.0)
-        bounds: tuple[Any, ...] = check_list(fields.get("bounds", ()), "bounds", "a list of bounds")
-        fields["bounds"] = tuple(_parse_bound(one, f"bounds[{k}]") for k, one in enumerate(bounds))
-        remarks: tuple[Any, ...] = check_list(
-            fields.get("remarks", ()), "remarks", "a list of texts"
-        )
-        fields["remarks"] = tuple(
-            check_text(remark, f"remarks[{k}]") for k, remark in enumerate(remarks)
-        )
-        exempt: tuple[Any, ...] = check_list(
-            fields.get("exemptions", ()), "exemptions", "a list of exemptions"
-        )
-        fields["exemptions"] = tuple(
-            _parse_exemption(one, f"exemptions[{k}]") for k, one in enumerate(exempt)
-        )
+        for name, (check, default, expected) in _LISTS.items():
+            values: Any = check_list(fields.get(name, default), name, expected)
+            fields[name] = tuple(check(one, f"{name}[{k}]") for k, one in enumerate(values))
         try:
             return cls(**fields)
         except TypeError as error:  # an unknown field
@@ -270,54 +230,58 @@ class Report:
             ) from None
 
 
-def _parse_real(value: Any, field: str) -> float:
+def _check_real(value: Any, field: str) -> float:
     """Return a number, possibly infinite. Raises `InputError` for anything else."""
     return value if isinstance(value, float) else check_number(value, field)
 
 
+def _parse(made: type[Any], data: Any, field: str, checks: Mapping[str, _Check]) -> Any:
+    """Return an entry of a report. Raises `InputError` for missing, wrong and unknown fields."""
+    given = check_mapping(data, field)
+    for name, check in checks.items():
+        given[name] = check(given.get(name), f"{field}.{name}")
+    try:
+        return made(**given)
+    except TypeError as error:
+        problem, expected = f"invalid {made.__name__}", "what Report.to_dict returns"
+        raise InputError(problem, field=field, expected=expected, got=str(error)) from None
+
+
 def _parse_violation(data: Any, field: str) -> Violation:
-    """Parse a violation. Raises `InputError` for missing fields and wrong types."""
-    given = check_mapping(data, field)
-    for name in ("constraint", "subject", "unit", "detail"):
-        given[name] = check_text(given.get(name), f"{field}.{name}")
-    for name in ("time", "amount"):
-        given[name] = _parse_real(given.get(name), f"{field}.{name}")
-    given["waypoint"] = check_integer(given.get("waypoint"), f"{field}.waypoint", low=0)
-    try:
-        return Violation(**given)
-    except TypeError as error:
-        raise InputError(
-            "not a violation", field=field, expected="what Report.to_dict returns", got=str(error)
-        ) from None
+    names = ("constraint", "subject", "unit", "detail")
+    checks: dict[str, _Check] = dict.fromkeys(names, check_text)
+    checks |= {"time": _check_real, "amount": _check_real, "waypoint": _check_waypoint}
+    found: Violation = _parse(Violation, data, field, checks)
+    return found
 
 
-def _parse_exemption(data: Any, field: str) -> Exemption:
-    """Parse an exemption. Raises `InputError` for missing fields and wrong types."""
-    given = check_mapping(data, field)
-    for name in ("subject", "reason"):
-        given[name] = check_text(given.get(name), f"{field}.{name}")
-    given["distance"] = check_number(given.get("distance"), f"{field}.distance")
-    try:
-        return Exemption(**given)
-    except TypeError as error:
-        raise InputError(
-            "not an exemption", field=field, expected="what Report.to_dict returns", got=str(error)
-        ) from None
+def _check_waypoint(value: Any, field: str) -> int:
+    return check_integer(value, field, low=0)
 
 
 def _parse_bound(data: Any, field: str) -> Bound:
-    """Parse a bound. Raises `InputError` for missing fields and wrong types."""
-    given = check_mapping(data, field)
-    for name in ("subject", "kind"):
-        given[name] = check_text(given.get(name), f"{field}.{name}")
-    for name in ("share", "begin", "end"):
-        given[name] = check_number(given.get(name), f"{field}.{name}")
-    try:
-        return Bound(**given)
-    except TypeError as error:
-        raise InputError(
-            "not a bound", field=field, expected="what Report.to_dict returns", got=str(error)
-        ) from None
+    checks: dict[str, _Check] = dict.fromkeys(("subject", "kind"), check_text)
+    checks |= dict.fromkeys(("share", "begin", "end"), check_number)
+    found: Bound = _parse(Bound, data, field, checks)
+    return found
+
+
+def _parse_exemption(data: Any, field: str) -> Exemption:
+    checks: dict[str, _Check] = {"subject": check_text, "reason": check_text}
+    checks["distance"] = check_number
+    found: Exemption = _parse(Exemption, data, field, checks)
+    return found
+
+
+_LISTS: dict[str, tuple[_Check, Any, str]] = {
+    "clearances": (_check_real, (), "a list of distances"),
+    "violations": (_parse_violation, None, "a list of violations"),
+    "notes": (check_text, None, "a list of texts"),
+    "bounds": (_parse_bound, (), "a list of bounds"),
+    "remarks": (check_text, (), "a list of texts"),
+    "exemptions": (_parse_exemption, (), "a list of exemptions"),
+}
+"""Fields that are lists: check of an entry, default (None: the field is required), expectation."""
 
 
 @runtime_checkable

@@ -32,30 +32,19 @@ def check_rolling(samples: Samples) -> Iterator[Violation]:
     if robot.base not in ("differential", "ackermann"):
         return
     smooth = motion.curve is not None
-    unit, per, usual = (
-        ("m/s", "", SLIP_TOLERANCE) if smooth else ("m", " in a step", STEP_TOLERANCE)
-    )
+    unit, per = ("m/s", "") if smooth else ("m", " in a step")
+    usual = SLIP_TOLERANCE if smooth else STEP_TOLERANCE
     moments, along, aside, turn = _sample_velocities(motion) if smooth else _compute_steps(motion)
     spans = np.ones(len(moments)) if smooth else np.diff(motion.times)
     for kind, excess, tolerance, text in _compute_excesses(robot, along, aside, turn, spans):
         worst = int(np.argmax(excess))
         amount, time = float(excess[worst]), float(moments[worst])
         if not amount <= (usual if tolerance is None else tolerance):
-            text_amount, text_unit = (
-                (f"{1e3 * amount:.2f} m{unit}{per}", unit)
-                if tolerance is None
-                else (f"{amount:.3f} m/s", "m/s")
-            )
-            at = min(int(np.searchsorted(motion.times, time, side="right")), len(motion.times)) - 1
-            yield Violation(
-                kind,
-                "base",
-                waypoint=at,
-                time=time,
-                amount=amount,
-                unit=text_unit,
-                detail=f"the base {text.format(text_amount)}",
-            )
+            in_text = f"{1e3 * amount:.2f} m{unit}{per}"
+            if tolerance is not None:
+                unit, in_text = "m/s", f"{amount:.3f} m/s"
+            detail = f"the base {text.format(in_text)}"
+            yield samples.make_violation(kind, "base", amount, unit, detail, time=time)
 
 
 def _compute_excesses(
@@ -63,22 +52,14 @@ def _compute_excesses(
 ) -> Iterator[tuple[str, Floats, float | None, str]]:
     """Yield constraint, excess, tolerance (None: the default) and text for each constraint.
 
-    Args:
-        robot: Robot with the base.
-        along: Longitudinal displacement [m] or velocity [m/s], shape (K,).
-        aside: Lateral displacement or velocity, shape (K,).
-        turn: Rotation [rad] or angular velocity [rad/s], shape (K,).
-        spans: Durations of displacements, or 1 for velocities, shape (K,) [s].
+    `along`, `aside` and `turn` are displacements in times `spans`, or velocities, whose `spans` are
+    1; all of shape (K,).
     """
     yield "slip", np.abs(aside), None, "slips sideways by {}"
     if robot.base == "ackermann":
         short = robot.turning_radius * np.abs(turn) - np.abs(along)
-        yield (
-            "turning",
-            short,
-            None,
-            f"drives {{}} less than its turn requires at a radius of {robot.turning_radius:g} m",
-        )
+        radius = f"a radius of {robot.turning_radius:g} m"
+        yield "turning", short, None, f"drives {{}} less than its turn requires at {radius}"
     if robot.wheels is not None:
         rim = robot.wheels.rim_speed
         fast = (np.abs(along) + robot.wheels.track / 2 * np.abs(turn)) / spans - rim
@@ -96,9 +77,8 @@ def _compute_steps(motion: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
 def _sample_velocities(motion: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
     """Return times on a curve and longitudinal, lateral [m/s] and angular velocity [rad/s]."""
     assert motion.curve is not None
-    moments = sample_intervals(
-        motion.curve.times, np.arange(_SAMPLES_PER_CUBIC) / _SAMPLES_PER_CUBIC, last=True
-    )
+    shares = np.arange(_SAMPLES_PER_CUBIC) / _SAMPLES_PER_CUBIC
+    moments = sample_intervals(motion.curve.times, shares, last=True)
     return moments, *_transform_to_base_frame(
         motion.curve.velocity(moments)[:, :3], motion.curve.at(moments)[:, 2]
     )

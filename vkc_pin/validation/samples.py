@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError
+from vkc_pin.utils.arguments import check_choice
 from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.validation.report import Violation
 from vkc_pin.world.models.articulated_object import Freedom
 from vkc_pin.world.models.grippers.bar_width import WIDTH_TOLERANCE
 from vkc_pin.world.scene.contact_rules import compute_hand_frame
@@ -37,7 +40,6 @@ class Samples:
     need more than `MAX_SAMPLES` samples is sampled at its waypoints or knots only.
 
     Attributes:
-        scene, trajectory: Scene and motion.
         world: The scene as one plain tree.
         free_objects: Free objects along the motion.
         times: Sample times, shape (S,) [s]; evenly spaced between waypoints, or knots of the curve.
@@ -48,10 +50,8 @@ class Samples:
         is_truncated: Whether only the waypoints or knots are sampled.
 
     Raises:
-        UnknownNameError: The trajectory names a coordinate, object or attachment that the scene
-            does not have.
-        InputError: The trajectory lacks coordinates of the robot or of a grasp with freedoms, or a
-            coordinate is out of range.
+        UnknownNameError: The trajectory names something that the scene does not have.
+        InputError: The trajectory lacks coordinates, or a coordinate is out of range.
     """
 
     def __init__(self, scene: Scene, trajectory: Trajectory) -> None:
@@ -64,19 +64,15 @@ class Samples:
             for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True)
         }
         self._check_names()
-        self._check_magnitudes()
+        self._check_phases()
+        far = np.argwhere(np.abs(trajectory.positions) > _MAX_COORDINATE)
+        if len(far):
+            field, expected = f"trajectory.positions{far[0].tolist()}", f"up to {_MAX_COORDINATE:g}"
+            got = trajectory.positions[tuple(far[0])]
+            raise InputError("out of range", field=field, expected=expected, got=got)
         self.times, self.waypoint_rows = self._choose_times()
         self.free_objects = FreeObjects(scene, trajectory)
         self.z = self.world.compute_positions(trajectory, self.times, self.free_objects)
-
-    def _check_magnitudes(self) -> None:
-        far = np.argwhere(np.abs(self.trajectory.positions) > _MAX_COORDINATE)
-        if len(far):
-            where, expected = far[0].tolist(), f"numbers up to {_MAX_COORDINATE:g}"
-            got = self.trajectory.positions[tuple(where)]
-            raise InputError(
-                "out of range", field=f"trajectory.positions{where}", expected=expected, got=got
-            )
 
     def _check_names(self) -> None:
         names, robot = self.trajectory.names, self.scene.robot.coordinates.names
@@ -89,28 +85,22 @@ class Samples:
             )
         known = [*self.world.coordinates.names, *self.grasp_freedoms]
         for name in names:
-            if name not in known:
-                raise UnknownNameError("coordinate", name, known, field="trajectory.names")
+            check_choice(name, known, "coordinate", "trajectory.names")
+
+    def _check_phases(self) -> None:
         for number, phase in enumerate(self.trajectory.phases):
             if phase.opening is not None:
                 self._check_opening(phase.opening, f"trajectory.phases[{number}].opening")
             for hold in phase.holds:
-                owner, attachment, field = (
-                    hold.object,
-                    hold.attachment,
-                    f"trajectory.phases[{number}].held",
-                )
-                if owner not in self.scene.objects:
-                    raise UnknownNameError("object", owner, self.scene.objects, field=field)
+                owner, attachment = hold.object, hold.attachment
+                field = f"trajectory.phases[{number}].held"
+                check_choice(owner, self.scene.objects, "object", field)
                 attachments = self.scene.objects[owner].object.attachments
-                if attachment not in attachments:
-                    raise UnknownNameError(
-                        f"attachment of '{owner}'", attachment, attachments, field=field
-                    )
+                check_choice(attachment, attachments, f"attachment of '{owner}'", field)
                 if hold.frame is not None:
                     self.check_frame(hold.frame, field.replace("held", "by"))
                 for name in attachments[attachment].coordinates:
-                    if f"{owner}.{name}" not in names:
+                    if f"{owner}.{name}" not in self.trajectory.names:
                         problem = "this grasp's coordinate is missing"
                         raise InputError(
                             problem, field="trajectory.names", expected=f"{owner}.{name}"
@@ -132,8 +122,7 @@ class Samples:
     def check_frame(self, frame: str, field: str) -> None:
         """Check that "<object>.<link>" exists. Raises `UnknownNameError` if it does not."""
         owner, _, link = frame.partition(".")
-        if owner not in self.scene.objects:
-            raise UnknownNameError("object", owner, self.scene.objects, field=field)
+        check_choice(owner, self.scene.objects, "object", field)
         item = self.scene.objects[owner].object
         if not item.free:
             raise InputError(
@@ -142,8 +131,40 @@ class Samples:
                 expected="a link of a free object",
                 got=frame,
             )
-        if link not in item.links:
-            raise UnknownNameError(f"link of '{owner}'", link, item.links, field=field)
+        check_choice(link, item.links, f"link of '{owner}'", field)
+
+    def make_violation(
+        self,
+        constraint: str,
+        subject: str,
+        amount: float,
+        unit: str,
+        detail: str,
+        *,
+        waypoint: int | None = None,
+        row: int | None = None,
+        time: float | None = None,
+    ) -> Violation:
+        """Make a violation at a waypoint, at sample `row`, or at a time [s] after its waypoint."""
+        if row is not None:
+            waypoint, time = self.find_waypoint(row), self.times[row]
+        if waypoint is None:
+            assert time is not None
+            waypoint = int(np.searchsorted(self.trajectory.times, time, side="right")) - 1
+        return Violation(
+            constraint,
+            subject,
+            waypoint=waypoint,
+            time=float(self.trajectory.times[waypoint] if time is None else time),
+            amount=float(amount),
+            unit=unit,
+            detail=detail,
+        )
+
+    @cached_property
+    def ranges(self) -> tuple[Floats, Floats]:
+        """Lower and upper ends of the coordinates in each segment; see `Trajectory.ranges`."""
+        return self.trajectory.ranges()
 
     def _choose_times(self) -> tuple[Floats, Ints]:
         """Return the sample times [s] and the rows of the waypoints."""
@@ -155,19 +176,11 @@ class Samples:
             edges, spans = curve.times, np.diff(curve.times)[:, None]
             speeds, accelerations = curve.compute_max_rates()
             steps, bends = speeds * spans, accelerations * spans**2 / 8.0
-        known = dict(
-            zip(
-                self.world.coordinates.names,
-                self.world.coordinates.compute_max_steps(LENGTH_STEP, ANGLE_STEP),
-                strict=True,
-            )
-        )
-        units = np.array(
-            [
-                known.get(n, LENGTH_STEP if self.get_unit(n) == "m" else ANGLE_STEP)
-                for n in self.trajectory.names
-            ]
-        )
+        coordinates, default = self.world.coordinates, {"m": LENGTH_STEP, "rad": ANGLE_STEP}
+        largest = coordinates.compute_max_steps(LENGTH_STEP, ANGLE_STEP)
+        known = dict(zip(coordinates.names, largest, strict=True))
+        names = self.trajectory.names
+        units = np.array([known.get(name, default[self.get_unit(name)]) for name in names])
         planar = np.linalg.norm(steps[:, :2], axis=1) / LENGTH_STEP
         bent = np.sqrt((bends / (CHORD_DEVIATION * units)).max(axis=1))
         counts = np.maximum(
@@ -200,22 +213,18 @@ class Samples:
             if i < 3 and robot.base == "fixed":
                 lower = upper = float(self.scene.start[i])
             if i < 2:
-                lower, upper = (
-                    max(lower, self.scene.arena[2 * i]),
-                    min(upper, self.scene.arena[2 * i + 1]),
-                )
+                begin, end = self.scene.arena[2 * i : 2 * i + 2]
+                lower, upper = max(lower, begin), min(upper, end)
             return lower, upper, float(robot.velocity[i]), float(robot.acceleration[i])
         if name in self.grasp_freedoms:
             return self.grasp_freedoms[name].lower, self.grasp_freedoms[name].upper, np.inf, np.inf
         owner, _, joint = name.partition(".")
         item = self.scene.objects[owner].object
-        i = item.coordinates.index(joint)
-        return (
-            float(item.lower[i]),
-            float(item.upper[i]),
-            float(item.velocity[i]),
-            float(item.acceleration[i]),
+        i, limits = item.coordinates.index(joint), (item.lower, item.upper)
+        lower, upper, velocity, acceleration = (
+            float(values[i]) for values in (*limits, item.velocity, item.acceleration)
         )
+        return lower, upper, velocity, acceleration
 
     def find_waypoint(self, row: int) -> int:
         """Return the last waypoint at or before a sample."""
@@ -239,30 +248,14 @@ class Samples:
     def compute_placements(self, rows: Iterable[int], frame: str) -> list[pin.SE3]:
         """Return the placements of a frame in the world at the given samples."""
         turns, origins = self._compute_frames(self.z[np.asarray(rows)], frame)
-        return [
-            pin.SE3(turn, origin) for turn, origin in zip(turns[:, 0], origins[:, 0], strict=True)
-        ]
+        return [pin.SE3(*both) for both in zip(turns[:, 0], origins[:, 0], strict=True)]
 
     def _compute_frames(self, z: Floats, *names: str) -> tuple[Floats, Floats]:
-        """Compute rotations and origins of F frames in the world.
-
-        Args:
-            z: Minimal coordinates of the world, shape (K, n).
-            *names: Names of the frames.
-
-        Returns:
-            Rotations, shape (K, F, 3, 3), and origins, shape (K, F, 3) [m].
-        """
+        """Compute rotations, shape (K, F, 3, 3), and origins, shape (K, F, 3) [m], of F frames."""
         model, data = self.world.model, self.world.model.createData()
-        configurations, frames = (
-            self.world.coordinates.q(z),
-            [model.getFrameId(name) for name in names],
-        )
-        turns, origins = (
-            np.empty((len(configurations), len(frames), 3, 3)),
-            np.empty((len(configurations), len(frames), 3)),
-        )
-        for k, q in enumerate(configurations):
+        frames = [model.getFrameId(name) for name in names]
+        turns, origins = np.empty((len(z), len(frames), 3, 3)), np.empty((len(z), len(frames), 3))
+        for k, q in enumerate(self.world.coordinates.q(z)):
             pin.forwardKinematics(model, data, q)
             for f, frame in enumerate(frames):
                 placed = pin.updateFramePlacement(model, data, frame)
@@ -272,13 +265,9 @@ class Samples:
     def compute_grasp_errors(
         self, owner: str, name: str, rows: Ints, by: str | None = None
     ) -> Floats:
-        """Compute the errors of a grasp at samples, shape (K, 2): position [m] and angle [rad].
+        """Compute position [m] and angle [rad] errors of a grasp at samples, shape (K, 2).
 
-        Args:
-            owner: Name of the grasped object.
-            name: Name of the attachment.
-            rows: Rows of the samples, shape (K,).
-            by: Frame that grasps instead of the tool, "<object>.<link>".
+        `by` is the frame that grasps instead of the tool, "<object>.<link>".
         """
         return self._compute_grasp_errors(owner, name, self.times[rows], self.z[rows], by)
 
@@ -297,14 +286,11 @@ class Samples:
         turns, origins = self._compute_frames(
             z, by or self.scene.robot.tool_frame, f"{owner}.{attachment.link}"
         )
-        positions, own = (
-            self.trajectory.at(times),
-            [f"{owner}.{suffix}" for suffix in attachment.coordinates],
-        )
-        values = np.zeros((len(times), len(own)))
-        for column, coordinate in enumerate(own):
-            if coordinate in self.trajectory.names:
-                values[:, column] = positions[:, self.trajectory.names.index(coordinate)]
+        positions, names = self.trajectory.at(times), self.trajectory.names
+        values = np.zeros((len(times), len(attachment.coordinates)))
+        for column, suffix in enumerate(attachment.coordinates):
+            if f"{owner}.{suffix}" in names:
+                values[:, column] = positions[:, names.index(f"{owner}.{suffix}")]
         # The freedoms of most grasps are constant.
         known, which = np.unique(values, axis=0, return_inverse=True)
         held = [attachment.tool(row) for row in known]

@@ -26,12 +26,8 @@ class Hit(NamedTuple):
     """The distance of a pair at sample `row`, or between it and the next sample.
 
     Attributes:
-        row: Row of the sample.
-        first, second: Labels of the two links or obstacles.
-        distance: Signed distance [m].
         margin: Required clearance at waypoints [m].
         contact: Overlap that counts as contact [m].
-        at_waypoint: Whether the sample is a waypoint.
         exempt_clearance: Clearance from which the pair is exempt [m]; 0 if it is not exempt.
         shapes: Indices of the two shapes in the world.
     """
@@ -50,10 +46,8 @@ class Hit(NamedTuple):
 def sweep(table: PairTable, z: Floats, waypoints: Ints) -> Iterator[Hit]:
     """Yield close pairs along a motion: at first those at waypoints, at least one at each.
 
-    Args:
-        table: Pairs of shapes.
-        z: Sampled configurations of its world, shape (S, n), evenly spaced between waypoints.
-        waypoints: Rows of `z` that are waypoints, shape (T,).
+    `z` are configurations of the world, shape (S, n), evenly spaced between `waypoints`, which are
+    rows of it, shape (T,).
     """
     return _Sweep(table).find_hits(z, waypoints)
 
@@ -101,12 +95,6 @@ class _Sweep:
         Every state s in between satisfies d(s) ≥ (d_t + d_{t+1} − relative motion) / 2, so that
         intervals with a larger bound are dropped. Without relative motion the distance is constant;
         only overlaps are followed then, to report all of their samples.
-
-        Args:
-            z: Sampled configurations of the world, shape (S, n).
-            todo: Intervals of all pairs, grouped by samples.
-            moved: Displacements; see `bound_displacements`.
-            smallest: Distance of interest [m].
         """
         while len(todo.pair):
             motion = self._bound_motion(todo, moved)
@@ -143,11 +131,6 @@ class _Sweep:
         """Yield pairs that overlap between two adjacent samples, but at neither of them.
 
         Penetrations deeper than `RESOLUTION` are never missed.
-
-        Args:
-            z: Sampled configurations of the world, shape (S, n).
-            todo: Intervals between adjacent samples.
-            moved: Displacements; see `bound_displacements`.
         """
         first, motion = self._find_interval(todo.low), self._bound_motion(todo, moved)
         overlap = self._table.get_contact_overlaps(todo.pair, first, first + 1)
@@ -205,11 +188,6 @@ class _Sweep:
 
         By the bound of `_search_intervals`, the distance at one of both ends is then less than
         `smallest` plus half the relative motion.
-
-        Args:
-            placed: Shapes at the T waypoints.
-            moved: Largest displacement of each shape between waypoints, shape (T − 1, G) [m].
-            smallest: Distance of interest [m].
         """
         return self._table.find_close_pairs(
             placed, np.arange(len(moved)), np.arange(1, len(moved) + 1), moved, smallest
@@ -222,7 +200,6 @@ class _Sweep:
     def _make_hits(
         self, rows: Ints, pairs: Ints, distances: Floats, *, at_waypoint: bool = False
     ) -> Iterator[Hit]:
-        """Yield hits for distances of pairs at or after samples, all of shape (n,)."""
         at = self._find_interval(rows)
         margins = self._table.get_margins(pairs, at)
         contacts = self._table.get_contact_overlaps(pairs, at, at if at_waypoint else at + 1)
@@ -249,7 +226,6 @@ class Intervals(NamedTuple):
     after: Floats
 
     def select(self, which: Bools) -> Intervals:
-        """Return a subset of the intervals."""
         return Intervals(
             self.low[which],
             self.high[which],

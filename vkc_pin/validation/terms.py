@@ -60,18 +60,7 @@ def check_terms(samples: Samples, terms: Sequence[Term]) -> list[Violation]:
             name = f"entry {entry}: " if len(lower) > 1 else ""
             where = " between waypoints" if which is between else ""
             detail = f"{name}{value:.6g} is {side} by {amount:.3g}{where}"
-            waypoint, time = samples.find_waypoint(row), float(samples.times[row])
-            found.append(
-                Violation(
-                    "term",
-                    term.name,
-                    waypoint=waypoint,
-                    time=time,
-                    amount=amount,
-                    unit="",
-                    detail=detail,
-                )
-            )
+            found.append(samples.make_violation("term", term.name, amount, "", detail, row=row))
     return found
 
 

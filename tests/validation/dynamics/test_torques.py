@@ -39,7 +39,7 @@ def test_torque_violation_of_a_heavy_door(tmp_path: Path) -> None:
     assert 6.0 < worst.time <= plan.trajectory.times[-1], "where the spring pulls most"
     assert "exceeds the motor's 150 N·m" in worst.detail
     assert "even at rest" in worst.detail
-    planted = dataclasses.replace(plan, scene=closer(**HEAVY), validation=report, status="rejected")
+    planted = dataclasses.replace(plan, scene=closer(**HEAVY), report=report, status="rejected")
     verdict = judge(planted.save(tmp_path / "heavy.npz"))
     assert verdict.agrees
     assert {(found.rule, found.subject) for found in verdict.found} == {

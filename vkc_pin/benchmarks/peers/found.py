@@ -12,7 +12,7 @@ import numpy as np
 from vkc_pin.benchmarks.peers.tasks import Given
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.results import build_plan, make_stationary_trajectory
+from vkc_pin.planning.results import make_stationary_trajectory
 from vkc_pin.planning.retime_validated import retime_validated
 from vkc_pin.planning.statistics import PlanningStatistics
 from vkc_pin.utils.arrays import Floats
@@ -113,7 +113,7 @@ def judged(
         )
         trajectory, report = retime_validated(own.scene, waypoints, check)
     said = "success" if report.ok else "rejected" if path is not None else status
-    return build_plan(
+    return Plan(
         own.scene,
         own.steps,
         problem.options,
@@ -121,7 +121,7 @@ def judged(
         report,
         cast("PlanStatus", said),  # a failed peer's own word
         statistics=PlanningStatistics(),
-        random_seed=seed,
+        seed=seed,
         initialization=name,
     )
 

@@ -28,18 +28,11 @@ def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
     motion, curve = samples.trajectory, samples.trajectory.curve
     jerks: tuple[Floats, Floats] | None = None
     if curve is None:
-        moments, velocities, accelerations = (
-            motion.times,
-            motion.velocities(),
-            motion.accelerations(),
-        )
-        rests = np.zeros((2, len(motion.names)))
+        moments, rests = motion.times, np.zeros((2, len(motion.names)))
+        velocities, accelerations = motion.velocities(), motion.accelerations()
     else:
-        moments, (velocities, accelerations), rests = (
-            curve.times,
-            curve.compute_max_rates(),
-            np.abs(curve.rates[[0, -1]]),
-        )
+        moments, rests = curve.times, np.abs(curve.rates[[0, -1]])
+        velocities, accelerations = curve.compute_max_rates()
         jerks = curve.compute_jerks() if options.jerk_time > 0.0 else None
     for i, name in enumerate(motion.names):
         _, _, fastest, strongest = samples.get_limits(name)
@@ -60,13 +53,6 @@ def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
             if not value <= limit * (1 + ACCEPTED_RATE_TOLERANCE) + 1e-9:
                 at = max(int(np.searchsorted(motion.times, when[worst], side="right")) - 1, 0)
                 detail = f"{value:.3f} {unit}/{per} is more than {limit:.3f} {unit}/{per}"
-                time, amount = float(motion.times[at]), float(value - limit)
-                yield Violation(
-                    kind,
-                    name,
-                    waypoint=at,
-                    time=time,
-                    amount=amount,
-                    unit=f"{unit}/{per}",
-                    detail=detail,
+                yield samples.make_violation(
+                    kind, name, value - limit, f"{unit}/{per}", detail, waypoint=at
                 )

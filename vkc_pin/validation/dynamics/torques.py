@@ -77,25 +77,16 @@ class MotorLoads:
         found = list[Violation]()
         for k in np.flatnonzero(self.torque_ratios.max(axis=0) > 1.0 + TORQUE_TOLERANCE).tolist():
             row = int(np.argmax(self.torque_ratios[:, k]))
-            name, limit, torque = (
-                self.trajectory.names[k],
-                float(self._torques.torque_limits.limits[k]),
-                abs(self.torques[row, k]),
-            )
+            name, limit = self.trajectory.names[k], float(self._torques.torque_limits.limits[k])
+            torque = abs(self.torques[row, k])
             unit = "N" if self.samples.get_unit(name) == "m" else "N·m"
             rest = abs(float(self._compute_torques(np.array([row]), 1e-2)[0, k]))
-            why = (
-                f"{rest:.4g} {unit} even at rest" if rest > limit else f"{rest:.4g} {unit} at rest"
-            )
+            why = f"{rest:.4g} {unit} {'even ' if rest > limit else ''}at rest"
+            detail = f"{torque:.4g} {unit} exceeds the motor's {limit:.4g} {unit}, {why}"
+            at, time = int(self.waypoints[row]), float(self.moments.times[row])
             found.append(
-                Violation(
-                    "torque",
-                    name,
-                    waypoint=int(self.waypoints[row]),
-                    time=float(self.moments.times[row]),
-                    amount=float(torque - limit),
-                    unit=unit,
-                    detail=f"{torque:.4g} {unit} exceeds the motor's {limit:.4g} {unit}, {why}",
+                self.samples.make_violation(
+                    "torque", name, torque - limit, unit, detail, waypoint=at, time=time
                 )
             )
         return found

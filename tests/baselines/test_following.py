@@ -1,4 +1,4 @@
-"""The arm follows base and object, waypoint by waypoint: closed, free and near the waypoint before."""
+"""The arm follows base and object, waypoint by waypoint: closed, free and continuous."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ GOAL = 0.3  # [m]
 
 
 def make_problem(lamp: float | None = None, attachment: str = "handle") -> vkc.TrajectoryProblem:
-    """Return the problem of pulling the drawer, with a lamp above the wrist at height `lamp` [m]."""
+    """Return the problem of pulling the drawer under a lamp at height `lamp` [m]."""
     scene = holding(attachment=attachment)
     if lamp is not None:
         scene = with_boxes(scene, lamp=([0.3, 0.3, 0.1], [1.44, 0.0, lamp + 0.05]))

@@ -40,7 +40,7 @@ def make_paths(scene: vkc.Scene, name: str = "drawer", **joints: float) -> BaseP
 def compute_clearance(
     scene: vkc.Scene, poses: np.ndarray, *, without: Sequence[str] = ("drawer",)
 ) -> float:
-    """Return the smallest distance of the base from obstacles and objects on straight lines between poses [m], by coal."""
+    """Return the smallest distance of the base on straight lines between poses [m]."""
     base = [
         (s.geometry, s.placement)
         for s in scene.robot.collision.geometryObjects

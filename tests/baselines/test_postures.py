@@ -37,7 +37,7 @@ def find_poses(
 
 
 def compute_distances(rows: np.ndarray, near: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-    """Return distances of rows from `near`; a metre of the base counts as what moves the hand by a metre."""
+    """Return distances of rows from `near`, with the weights of the metric."""
     lever = 0.3249  # [m/rad] of this arm
     counts = [1.0 / lever if name in ("base_x", "base_y") else 1.0 for name in names]
     return np.array(

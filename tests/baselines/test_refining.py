@@ -20,7 +20,7 @@ TILT, SLIDE = -2, -1  # columns
 
 
 class Pulling:
-    """Half-way through pulling a drawer, a lamp above the wrist; the hand may tilt about the bar."""
+    """Half-way through pulling a drawer under a lamp; the hand may tilt about the bar."""
 
     def __init__(self, bottom: float, *, waypoint: int = HALF) -> None:
         scene = holding(attachment="handle_free")

@@ -1,4 +1,4 @@
-"""Planning succeeds from poor initial guesses: stationary, perturbed, or with the tool turned around."""
+"""Planning succeeds from poor initial guesses."""
 
 from __future__ import annotations
 

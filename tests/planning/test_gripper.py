@@ -247,8 +247,8 @@ def test_opening_is_clamped_with_a_warning(robot: Path, opening: float, stands: 
     )
     said = [str(one.message) for one in told]
     if opening == 0.3:
-        text = "the gripper of 'mine' opens from 0.0 to 80.0 mm, not 300 mm as requested for drawer.grip: it opens to 80.0 mm"
-        assert said == [f"cheeks: {text}"]
+        text = "opens from 0.0 to 80.0 mm, not 300 mm as requested for drawer.grip"
+        assert said == [f"cheeks: the gripper of 'mine' {text}: it opens to 80.0 mm"]
     else:  # what is measured is not that exact
         assert said == []
 

@@ -13,7 +13,7 @@ DOOR = """
 scene = vkc.load_scene("door").with_start(base=[-0.03, 0.09, -1.19])
 steps = [vkc.Actuate("door", {"hinge": 1.2})]
 """
-TELL = "print(plan.status, plan.success, len(plan.report.violations), len(plan.summary()) > 100, flush=True)"
+TELL = "print(plan.status, plan.success, len(plan.report.violations), len(plan.summary()) > 100)"
 TOLD = r"interrupted False [1-9]\d* True\n"
 
 

@@ -22,11 +22,12 @@ STEPS = [vkc.Actuate("drawer", {"slide": 0.3}, "handle")]
 def add_ledge(
     folder: Path, *, gap: float, clearance: float | None = None, own: bool = True
 ) -> vkc.Scene:
-    """Return a room with a drawer and a ledge `gap` above the open hand: a part of the cabinet (`own`), or an obstacle."""
+    """Return the drawer with a ledge `gap` above the open hand, part of the cabinet if `own`."""
     size, at = [0.1, 0.6, 0.02], [-0.1, 0.0, BAR + FINGERS + gap + 0.01]
     urdf = (OBJECTS / "drawer.urdf").read_text()
     if own:
-        box = f'<collision><origin xyz="{at[0]} 0 {at[2]}"/><geometry><box size="0.1 0.6 0.02"/></geometry></collision>'
+        shape = '<geometry><box size="0.1 0.6 0.02"/></geometry>'
+        box = f'<collision><origin xyz="{at[0]} 0 {at[2]}"/>{shape}</collision>'
         glue = (
             '<joint name="glue" type="fixed"><parent link="cabinet"/><child link="ledge"/></joint>'
         )

@@ -60,13 +60,9 @@ def test_text_of_progress() -> None:
     line.begin(["reach cup.side", "place cup"])
     line.doing("looking for a guess")
     line(make_iteration())
-    assert (
-        seen[-2][0] == "0 s · steps 3 to 4 of 18 · looking for a guess · reach cup.side, place cup"
-    )
-    assert (
-        seen[-1][0]
-        == "0 s · steps 3 to 4 of 18 · round 3, 12.3 mm missing, objective 4.57 · reach cup.side, place cup"
-    )
+    begin, end = "0 s · steps 3 to 4 of 18 · ", " · reach cup.side, place cup"
+    assert seen[-2][0] == f"{begin}looking for a guess{end}"
+    assert seen[-1][0] == f"{begin}round 3, 12.3 mm missing, objective 4.57{end}"
     line.part(7, 1, 18)
     line(make_iteration(shortfall=0.0))
     assert "step 7 of 18 · round 3, clear, " in seen[-1][0]

@@ -30,7 +30,7 @@ def push_shut(scene: str, thing: str, joint: str, begin: float, face: str) -> vk
 
 
 def measure_gaps(plan: vkc.Plan, thing: str, face: str) -> np.ndarray:
-    """Return the distance of the hand's foremost point from the plane of the face while it pushes [m]."""
+    """Return distances of the hand's foremost point from the face while it pushes [m]."""
     scene, motion = plan.scene, plan.trajectory
     (phase,), robot, placed, found = (
         [one for one in motion.phases if one.holds],

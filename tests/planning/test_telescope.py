@@ -51,7 +51,7 @@ def test_message_has_one_coordinate(opened: vkc.Plan) -> None:
 
 @pytest.fixture(scope="module")
 def coupled(tmp_path_factory: pytest.TempPathFactory) -> vkc.Plan:
-    """The hand is brought try_poses by joints that follow backwards, at other rates, turning as another slides."""
+    """Joints follow others backwards, at other rates, and turn as another slides."""
     scene = coupled_scene(
         tmp_path_factory.mktemp("coupled"),
         more="joints: {roll_joint: {velocity: 0.9, acceleration: 0.6}}\n",
@@ -62,16 +62,19 @@ def coupled(tmp_path_factory: pytest.TempPathFactory) -> vkc.Plan:
 
 
 def test_coupled_joints_are_planned_and_judged(coupled: vkc.Plan) -> None:
+    """Joints follow backwards, at other rates, and turn as another slides."""
     assert coupled.trajectory is not None
     assert coupled.trajectory.robot_size == 6
     assert np.ptp(coupled.trajectory.positions[:, 3:], axis=0).max() > 0.05
 
 
 def compute_limit_shares(plan: vkc.Plan, motion: vkc.Trajectory) -> dict[str, float]:
-    """Return how much of its own limits every joint of the arm uses; more than 1 is a violation."""
+    """Return how much of its limits every joint uses; more than 1 is a violation."""
     file = ElementTree.parse(Path(plan.scene.folder) / "robot.urdf")
-    urdf = {str(joint.get("name")): {key: float(value) for key, value in limit.attrib.items()}
-            for joint in file.iter("joint") if (limit := joint.find("limit")) is not None}  # fmt: skip
+    urdf = {}
+    for one in file.iter("joint"):
+        if (limit := one.find("limit")) is not None:
+            urdf[one.get("name")] = {key: float(value) for key, value in limit.attrib.items()}
     times, robot, found = (
         np.arange(*motion.times[[0, -1]], 1e-3),
         plan.scene.robot,

@@ -18,12 +18,13 @@ found, raised = [], []
 
 def work(number):
     for turn in range(3):
-        options = vkc.Options(reach_waypoints=10 + (number + turn) % 3, move_waypoints=8, turn_waypoints=3)
-        planner = (None, shared, vkc.Planner())[(number + turn) % 3]
-        limit = (None, 300.0)[turn % 2]
+        kind = (number + turn) % 3
+        options = vkc.Options(reach_waypoints=10 + kind, move_waypoints=8, turn_waypoints=3)
+        planner, limit = (None, shared, vkc.Planner())[kind], (None, 300.0)[turn % 2]
+        more = {"options": options, "planner": planner, "time_limit": limit}
         try:
-            plan = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.3})], options=options, planner=planner, time_limit=limit)
-            found.append((options.reach_waypoints, plan.status, plan.trajectory.positions.tobytes()))
+            plan = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.3})], **more)
+            found.append((kind, plan.status, plan.trajectory.positions.tobytes()))
         except BaseException as error:
             raised.append(repr(error))
 

@@ -136,7 +136,7 @@ def test_four_steps(tmp_path: Path) -> None:
 
 
 def compute_weighted_length(plan: vkc.Plan) -> float:
-    """Return the path length weighted as in `Options`: 1 per metre of the base, 0.158 per radian."""
+    """Return the path length with the weights of `Options`."""
     steps = np.diff(plan.trajectory.positions[:, :9], axis=0)
     return float(
         np.linalg.norm(steps[:, :2], axis=1).sum() + np.sqrt(0.025) * np.abs(steps[:, 2:]).sum()

@@ -344,7 +344,7 @@ def test_grasp_at_the_end_of_the_motion() -> None:
 
 @cache
 def touch_wall(gap: float = 0.0) -> tuple[Scene, Script, np.ndarray]:
-    """Return a scene with a wall, a motion that brings the tip `gap` [m] in front of it and back, and the tip's position."""
+    """Return scene, motion and position of a touch, `gap` [m] in front of a wall."""
     held = room().with_held({"stick": "grip"})
     there = moved_base(held.start, y=0.4)
     tip = compute_tip_position(held, there)

@@ -49,7 +49,7 @@ HANDS = set(door_scene().robot.touch_links)
 def find_windows(
     scene: Scene, motion: Trajectory, steps: Sequence[Step] = (), dist_safe: float = 0.02
 ) -> dict[tuple[str, str], list[tuple[int, int]]]:
-    """Return the pairs that may be close, by labels, with their intervals; check margins and contact depths."""
+    """Return the pairs that may be close, by labels, with their intervals."""
     samples = Samples(scene, motion)
     labels, found = samples.world.collision_labels, dict[tuple[str, str], list[tuple[int, int]]]()
     for window in find_contact_windows(
@@ -84,7 +84,7 @@ def expect_hand_windows(
     held: tuple[int, int] | None = None,
     others: Sequence[str] = (),
 ) -> dict[tuple[str, str], list[tuple[int, int]]]:
-    """Return the windows of the hand with a grasped link, and around them those with the object's other links."""
+    """Return the windows of the hand with a grasped link and with the object's others."""
     found = {(link, other): [near] for link in HANDS for other in (label, *others)}
     return found | {(link, label): sorted({near, held or near}) for link in HANDS}
 

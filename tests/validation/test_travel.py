@@ -18,7 +18,7 @@ from vkc_pin.world.trajectory.world_model import World
 
 
 def measure_paths(world: World, z: np.ndarray, count: int) -> np.ndarray:
-    """Return the longest path of a corner of each shape between configurations, shape (S − 1, G)."""
+    """Return the longest path of a corner of each shape, shape (S − 1, G)."""
     data, shapes = world.model.createData(), pin.GeometryData(world.collision)
     corners = []
     for shape in world.shapes:

@@ -1,4 +1,4 @@
-"""The validator accepts valid motions and names each violation with its subject, place and amount."""
+"""The validator accepts valid motions and names each violation."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ class ArmKinematics:
         self._models: dict[int, pin.Model] = {}
 
     def solve(self, z: Floats, waypoint: int) -> tuple[Floats, bool]:
-        """Iterate from `z`, shape (n,); return the configuration and whether the chain is closed."""
+        """Iterate from `z`, shape (n,); return the result and whether the chain is closed."""
         import pink
 
         pose = self.sampler.find_pose(waypoint)

@@ -74,7 +74,7 @@ class Attempt:
         self.iterations, self.cache = 0, cache
 
     def run(self, steps: Sequence[BaselineStep]) -> tuple[Trajectory, float, str]:
-        """Return the motion, the number of completed stages (infinite: all), and the cause of failure."""
+        """Return the motion, the number of completed stages (infinite: all), and the cause."""
         try:
             for step in steps:
                 if isinstance(step, Actuate):
@@ -101,7 +101,7 @@ class Attempt:
         return concatenate_trajectories(self.parts, pause=self.options.grasp_time), np.inf, ""
 
     def _actuate(self, step: Actuate) -> None:
-        """Move joints of an object: drive to its handle, grasp it unless it is grasped, and move it."""
+        """Drive to an object's handle, grasp it unless it is grasped, and move the joints."""
         after = compile_task(self.scene, [step], self.options, nothing=True).after
         (attachment,) = (hold.attachment for hold in after if hold.object == step.object)
         if self.scene.held.get(step.object) != attachment:
@@ -144,7 +144,7 @@ class Attempt:
     def _try_choices(
         self, choices: Iterable[Floats], stage: Callable[[Floats], None], failure: FailedError
     ) -> None:
-        """Do a stage with the first choice that works; else raise the failure with most progress."""
+        """Do a stage with the first choice that works, or raise the failure with most progress."""
         scene, before = self.scene, self.parts
         for choice in choices:
             self.parts = list(before)
@@ -226,7 +226,7 @@ class Attempt:
         )
 
     def _move(self, step: Actuate) -> None:
-        """Move the object's joints: the base drives to the nearest pose to which the arm can follow."""
+        """Move the object's joints; the base drives to the nearest pose that suits the arm."""
         problem = self._problem(
             [step], replace(self.options, move_waypoints=self.finer * self.options.move_waypoints)
         )

@@ -1,4 +1,4 @@
-"""Finds paths of the base: straight if possible, else the shortest by A*, with or without the arm."""
+"""Finds paths of the base: straight if possible, else the shortest by A*."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class BasePaths:
     """Paths of the base around fixed obstacles in the last phase of a problem."""
 
     def __init__(self, problem: TrajectoryProblem, *, whole: bool = False) -> None:
-        """Make the grid; `whole`: for the robot with its present arm and grasped objects."""
+        """Make the grid; with `whole` for the robot with its present arm and grasped objects."""
         self.omni = problem.chain.robot.base == "omni"
         z = problem.start.copy()
         z[:3] = 0.0
@@ -51,7 +51,7 @@ class BasePaths:
         return self._grid(**self._fine)
 
     def path(self, start: Floats, goals: Floats, steps: int) -> Floats | None:
-        """Return `steps` poses from `start` to a goal, slow at both ends, shape (steps, 3), or None.
+        """Return poses from `start` to a goal, slow at both ends, shape (steps, 3), or None.
 
         Of several goals, shape (G, 3), it is the first with a straight path, else the nearest.
         """
@@ -78,7 +78,7 @@ class BasePaths:
         return np.concatenate(base[1:])
 
     def make_guesses(self, problem: TrajectoryProblem, goals: Floats) -> Iterator[InitialGuess]:
-        """Yield the path from a problem's start to one of `goals`, shape (G, 3), as initial guess."""
+        """Yield the path from a problem's start to one of `goals`, shape (G, 3), if any."""
         path = self.path(problem.start[:3], goals, problem.segments)
         if path is not None:
             z = np.tile(problem.start, (problem.segments, 1))

@@ -91,7 +91,7 @@ def is_at_home(problem: TrajectoryProblem) -> bool:
 
 
 def interpolate_path(problem: TrajectoryProblem, path: Floats) -> Floats:
-    """Return waypoints from a problem's start through configurations, shape (K, n), shape (N, n)."""
+    """Return waypoints from the start through configurations, shape (K, n): shape (N, n)."""
     points = np.vstack([problem.start, path])
     lengths = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(points, axis=0)).max(axis=1))])
     at = lengths[-1] * sample_smoothstep(problem.segments)

@@ -1,4 +1,4 @@
-"""Plan: what planning returns, with its report, and how it is saved, loaded, shown and exported."""
+"""The result of planning, and how it is saved, loaded, shown and exported."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.planning.statistics import PlanningStatistics
-from vkc_pin.utils.arguments import check_bool
+from vkc_pin.utils.arguments import check_bool, check_choice
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import check_arguments, validate
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from vkc_pin.simulation.result import SimulationResult
 
 __all__ = ["Plan"]
+
+_SUMMARIZED = ("initialization", "coal", "casadi", "ipopt", "validation")  # stages with times
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,53 +88,51 @@ class Plan:
     def metrics(self) -> dict[str, float]:
         """Metrics of the trajectory, its validation and planning, by name.
 
-        duration [s], base_path_length and base_path_length_l1 [m], arm_path_length [rad], clearance and
-        closure_error [m], torque [share of the limit], and those of `PlanningStatistics.to_metrics`.
+        duration [s], base_path_length and base_path_length_l1 [m], arm_path_length [rad], clearance
+        and closure_error [m], torque [share of the limit], and those of
+        `PlanningStatistics.to_metrics`.
         """
         statistics = self.statistics.to_metrics()
         times = {name: statistics.pop(name) for name in ("planning_time", "build_time")}
         return {**times, **_measure(self), **statistics}
 
     def end_scene(self) -> Scene:
-        """Return the scene at the end of the motion, to plan on from: robot, objects and what is held as it leaves them.
+        """Return the scene at the end of the trajectory, from which planning can continue.
 
         Raises:
-            InputError: It is no success, so that nothing ends.
+            InputError: The plan is no success.
         """
         if not self.success:
-            raise InputError(
-                "this plan is no success",
-                field="end_scene",
-                expected="a motion that is valid",
-                got=self.status,
-            )
+            problem, expected = "this plan is no success", "a motion that is valid"
+            raise InputError(problem, field="end_scene", expected=expected, got=self.status)
         after = compile_each_step(self.scene, self.steps, self.options)[-1].after
         return compute_final_scene(self.scene, self.trajectory, after)
 
     def simulate(self, **options: Any) -> SimulationResult:
-        """Execute the motion in physics, with masses and servos; see `simulation.simulate`. Needs the extra `sim`."""
+        """Execute the trajectory in physics; see `simulation.simulate`. Extra: `sim`."""
         from vkc_pin.simulation.execution import simulate
 
         return simulate(self.scene, self.steps, self.trajectory, **options)
 
     def contradictions(self) -> list[str]:
-        """Return what the file that the plan was loaded from says otherwise than the check of its motion, one line each."""
+        """Return contradictions of a loaded file's report to validation, one per line."""
         return [] if self.claimed is None else self.report.contradictions(self.claimed)
 
     def summary(self) -> str:
-        """Return a readable summary: success or the first twelve violations, path lengths, times."""
-        m = self.metrics
+        """Return a summary: success or the first twelve violations, path lengths, times."""
+        m, verdict = self.metrics, "success" if self.success else f"FAILED, {self.status}"
+        stages = zip(("seeds", "coal", "CasADi", "Ipopt", "validation"), _SUMMARIZED, strict=True)
+        times = ", ".join(f"{name} {m[f'time_{stage}']:.3f}" for name, stage in stages)
         lines = [
-            f"{self.scene.name}: {'success' if self.success else f'FAILED, {self.status}'} — "
-            + ", ".join(p.name for p in self.trajectory.phases),
+            f"{self.scene.name}: {verdict} — {', '.join(p.name for p in self.trajectory.phases)}",
             f"  motion      {m['duration']:.1f} s, {len(self.trajectory.times)} waypoints",
             *(f"  {line}" for line in self.report.timing()),
             f"  path        base {m['base_path_length']:.2f} m "
             f"(|dx|+|dy| {m['base_path_length_l1']:.2f} m), arm {m['arm_path_length']:.2f} rad",
-            f"  clearance   {1e3 * m['clearance']:.1f} mm at the closest, closure within {1e3 * m['closure_error']:.3f} mm",
-            f"  planning    {m['planning_time']:.3f} s after {m['build_time']:.2f} s of symbolic build: "
-            f"seeds {m['time_initialization']:.3f}, coal {m['time_coal']:.3f}, CasADi {m['time_casadi']:.3f}, "
-            f"Ipopt {m['time_ipopt']:.3f}, validation {m['time_validation']:.3f}; "
+            f"  clearance   {1e3 * m['clearance']:.1f} mm at the closest, "
+            f"closure within {1e3 * m['closure_error']:.3f} mm",
+            f"  planning    {m['planning_time']:.3f} s after {m['build_time']:.2f} s of symbolic "
+            f"build: {times}; "
             f"{int(m['rounds'])} rounds, {int(m['iterations'])} Ipopt iterations, "
             f"{self.statistics.evaluations} evaluations, initial guess {self.initialization}",
             *(f"  {line}" for line in self.report.by_phase(self.trajectory) if len(self.steps) > 1),
@@ -141,7 +141,7 @@ class Plan:
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return trajectory, metrics and report as plain data, e.g. for JSON; distances that do not exist are None."""
+        """Return trajectory, metrics and report as plain data; infinite distances are None."""
         return {
             "scene": self.scene.name,
             "steps": [step_to_dict(step) for step in self.steps],
@@ -161,21 +161,21 @@ class Plan:
         }
 
     def to_json(self, path: str | Path) -> Path:
-        """Write `to_dict` as JSON, whole or not at all; return the path. `Trajectory.from_json` reads the motion."""
+        """Write `to_dict` as JSON; `Trajectory.from_json` reads the trajectory."""
         return write_atomically(path, (json.dumps(self.to_dict(), indent=1) + "\n").encode("utf-8"))
 
     def to_csv(self, path: str | Path, **options: Any) -> Path:
-        """Write the motion as a table with a line a waypoint, and a unit to every column; see `tables.write_csv`."""
+        """Write the trajectory as a table with a row per waypoint; see `tables.write_csv`."""
         return self.trajectory.to_csv(
             path, **{"units": find_coordinate_units(self.scene), **options}
         )
 
     def to_ros(self, **options: Any) -> dict[str, Any]:
-        """Return the motion as plain data with the fields of ROS' `trajectory_msgs/JointTrajectory`; see `ros.to_ros`."""
+        """Return the trajectory as a `trajectory_msgs/JointTrajectory`; see `ros.to_ros`."""
         return self.trajectory.to_ros(**options)
 
     def to_rosbag(self, path: str | Path, **options: Any) -> Path:
-        """Write a recording of ROS 2 into a new folder; see `rosbag.write_rosbag`. Needs the extra `ros`."""
+        """Write a ROS 2 recording; see `rosbag.write_rosbag`. Requires the extra `ros`."""
         return self.trajectory.to_rosbag(path, **options)
 
     def __repr__(self) -> str:
@@ -191,36 +191,35 @@ class Plan:
         return motion_html(self)
 
     def show(self, **options: Any) -> Any:
-        """Show the motion with meshcat: inline in a notebook, otherwise in the browser; see `visualization.show`."""
+        """Show the trajectory with meshcat in a notebook or browser; see `visualization.show`."""
         from vkc_pin.visualization.viewer import show
 
         return show(self, **options)
 
     def animate(self, viewer: meshcat.Visualizer | None = None) -> Any:
-        """Put the motion into a meshcat viewer with play, pause and a time slider; return the viewer."""
+        """Add the trajectory to a meshcat viewer with a time slider; return the viewer."""
         from vkc_pin.visualization.viewer import animate
 
         return animate(self, viewer)
 
     def to_html(self, path: str | Path) -> Path:
-        """Write one self-contained page with the animation; return its path."""
+        """Write a self-contained page with the animation; return its path."""
         from vkc_pin.visualization.viewer import to_html
 
         return to_html(self, path)
 
     def plot(self, path: str | Path | None = None) -> Any:
-        """Draw joints, velocities, clearance and a top view; see `plotting.plot`."""
+        """Plot joints, velocities, clearance and a top view; see `plotting.plot`."""
         from vkc_pin.visualization.plots.plots import plot
 
         return plot(self, path)
 
     def save(self, path: str | Path) -> Path:
-        """Save it, with its scene, steps, options and report, as an .npz file without pickles; return the path.
+        """Save the plan with its scene and report as an .npz file without pickles; return its path.
 
-        The scene's description is in the file; the meshes and URDFs it names are not. A scene of
-        the package finds them in whatever installation loads the plan; for others the file keeps
-        where their folder is, seen from the plan and absolutely, so that plan and scene can move
-        together and the plan alone.
+        The scene's description is in the file, its meshes and URDFs are not. They are found in the
+        package, or in the scene's folder, whose relative and absolute path are saved. So the plan
+        can be moved alone or together with its scene.
         """
         about = {
             "scene": self.scene.document,
@@ -240,11 +239,10 @@ class Plan:
 
     @classmethod
     def load(cls, path: str | Path, *, validate: bool = True) -> Plan:
-        """Return the plan that `save` wrote to `path`.
+        """Return the plan that `save` wrote.
 
-        The report, the status and the metrics of the file are not trusted: the trajectory is
-        validated again, which takes as long as after planning. From the file come the statistics of
-        planning, the notes, and the reasons of an infeasible task. `claimed` is the file's report.
+        Report, status and metrics of the file are not trusted: the trajectory is validated again.
+        Statistics, notes and the reasons of an infeasible task come from the file.
 
         Args:
             path: The file.
@@ -252,8 +250,8 @@ class Plan:
                 `success` is False.
 
         Raises:
-            InputError: The file is missing, damaged, of another format or no plan, something in it
-                is inconsistent, or the scene has no such robot, object or file.
+            InputError: The file is missing, damaged, inconsistent or of another format, or the
+                scene has no such robot, object or file.
         """
         path = check_path(path, "path", "a saved plan (.npz)")
         about, arrays = read_archive(path)
@@ -286,20 +284,16 @@ class Plan:
     def _from_archive(
         cls, about: Mapping[str, Any], arrays: Mapping[str, Floats], path: Path
     ) -> Plan:
-        """Return the plan of a file as the file describes it."""
         trajectory = Trajectory.from_dict({**about["trajectory"], **arrays})
         claimed, metrics = Report.from_dict(about["validation"]), about["metrics"]
         for name, value in {**trajectory.metrics(), **claimed.measures()}.items():
-            if metrics[name] != value and not abs(metrics[name] - value) <= 1e-9 * max(
-                1.0, abs(value)
-            ):
+            got, tolerance = metrics[name], 1e-9 * max(1.0, abs(value))
+            if got != value and not abs(got - value) <= tolerance:
                 problem = "not that of motion and report"
-                got = metrics[name]
                 raise InputError(problem, field=f"metrics.{name}", expected=value, got=got)
         options = [item.name for item in fields(Options)]
         for name in about["options"]:
-            if name not in options:
-                raise UnknownNameError("option", name, options, field=f"options.{name}")
+            check_choice(name, options, "option", f"options.{name}")
         return cls(
             scene=Scene.from_document(about["scene"], resolve_folder(about["folder"], path)),
             steps=tuple(step_from_dict(step) for step in about["steps"]),
@@ -318,7 +312,6 @@ class Plan:
 
 
 def _revalidate(plan: Plan) -> Plan:
-    """Return a loaded plan with a report of its own."""
     report = validate(plan.scene, plan.steps, plan.trajectory, plan.options, plan.terms)
     status, claimed = plan.status, plan.report
     if status == "success" and not report.ok:
@@ -331,12 +324,10 @@ def _revalidate(plan: Plan) -> Plan:
 
 
 def _measure(plan: Plan) -> dict[str, float]:
-    """Return the metrics of a plan's trajectory and its validation."""
     return {**plan.trajectory.metrics(), **plan.report.measures()}
 
 
 def _saved(options: Mapping[str, Any]) -> Options:
-    """Return options that were saved: those without a clearance between the robot's links had one for all pairs."""
-    return Options(
-        **{**({"self_distance": options["dist_safe"]} if "dist_safe" in options else {}), **options}
-    )
+    """Return saved options; those without `self_distance` used `dist_safe` for all pairs."""
+    default = {"self_distance": options["dist_safe"]} if "dist_safe" in options else {}
+    return Options(**{**default, **options})

@@ -72,7 +72,7 @@ class Planner:
 
     @contextlib.contextmanager
     def acquire(self) -> Iterator[Cache]:
-        """Acquire a cache for exclusive use, the most recently used if possible; evict at the end."""
+        """Acquire a cache for exclusive use, the most recently used one; evict at the end."""
         with self._lock:
             new = (
                 None
@@ -130,9 +130,9 @@ def plan(
         callback: Called with an `Iteration` after every round of the solver.
         time_limit: Wall-clock limit of the call [s], after which the best trajectory so far is
             returned with status "time limit". Success then depends on the machine and its load.
-        max_evaluations: Limit on evaluated configurations, by searches for initial guesses and by every
-            iteration of Ipopt at each waypoint; the status is then "evaluation limit". It has the same
-            effect on every machine. 100 000 evaluations take some ten seconds;
+        max_evaluations: Limit on evaluated configurations, by searches for initial guesses and by
+            every iteration of Ipopt at each waypoint; the status is then "evaluation limit". It
+            has the same effect on every machine. 100 000 evaluations take some ten seconds;
             `plan.statistics.evaluations` counts them.
         seed: Random seed. The result is reproducible bit for bit on the same machine, unless
             `time_limit` stops planning early.

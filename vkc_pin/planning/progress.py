@@ -57,8 +57,8 @@ class Progress:
         """Show the result."""
         m, name = plan.metrics, plan.scene.name
         result = "success" if plan.success else f"FAILED, {plan.status}"
-        took = f"base {m['base_path_length']:.2f} m, arm {m['arm_path_length']:.2f} rad, planned in {m['planning_time']:.2f} s"
-        self._last(f"{name}: {result} — {took}")
+        lengths = f"base {m['base_path_length']:.2f} m, arm {m['arm_path_length']:.2f} rad"
+        self._last(f"{name}: {result} — {lengths}, planned in {m['planning_time']:.2f} s")
 
     def stop(self) -> None:
         """Show that planning has stopped, unless the result is shown."""

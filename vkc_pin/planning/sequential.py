@@ -35,7 +35,7 @@ class PlannedStep(NamedTuple):
 
 
 def plan_sequentially(scene: Scene, task: Task, request: PlanningRequest) -> Plan:
-    """Plan every step from the end of the one before, up to the first failure; concatenate the plans."""
+    """Plan every step from the end of the one before, up to the first failure; concatenate them."""
     parts = plan_each_step(scene, task, request)
     steps: list[tuple[Step, ...]] = [(step,) for step in task.steps]
     for part in parts:  # one step becomes several where an object is grasped anew
@@ -89,7 +89,7 @@ def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) 
 
 
 def plan_each_step(scene: Scene, task: Task, request: PlanningRequest) -> list[PlannedStep]:
-    """Plan every step that changes the world from the end of the one before, up to the first failure."""
+    """Plan every step that changes the world from the end of the one before, until one fails."""
     current, parts, reserved = scene, list[PlannedStep](), 0.0
     for number, step in enumerate(task.steps):
         # The end of a step is known only once it is planned; the first starts where the task does.

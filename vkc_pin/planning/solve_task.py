@@ -313,7 +313,7 @@ class _Search:
             self.request.callback(row)
 
     def _evaluate(self, problem: TrajectoryProblem, solution: Solution, name: str) -> _Candidate:
-        """Retime and validate a solution; around violations the curve comes closer to the segments."""
+        """Retime and validate a solution; around violations the curve is refined."""
         with suspend_budget():
             waypoints = make_trajectory(problem, solution.z, solution.dt)
         began, validated = time.perf_counter(), self.times["validation"]

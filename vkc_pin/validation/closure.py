@@ -45,7 +45,7 @@ class Drift(NamedTuple):
 
 
 class _Lever(NamedTuple):
-    """The effect of a trajectory coordinate on a frame whose origin is within `arm` [m] of its axis."""
+    """The effect of a trajectory coordinate on a frame within `arm` [m] of its axis."""
 
     column: int
     rate: float
@@ -56,7 +56,7 @@ class _Lever(NamedTuple):
 def find_drift(
     samples: Samples, phase: PhaseSpan, hold: Hold, limits: tuple[float, float]
 ) -> Drift:
-    """Find the largest drift of a grasp in a phase; `limits` are those of position [m] and angle [rad]."""
+    """Find the largest drift of a grasp in a phase; limits of position [m] and angle [rad]."""
     rows = samples.get_rows(phase)
     times = samples.times[rows]
     errors = samples.compute_grasp_errors(hold.object, hold.attachment, rows, hold.frame)

@@ -267,8 +267,8 @@ class _WindowFinder:
     ) -> Iterator[Window]:
         """Yield windows of a free object with its neighbours where carrying begins or ends.
 
-        It begins or ends at waypoint `at`; `other` is the other end of the window. An object that has
-        not moved before (`new`) may penetrate its neighbours as deep as it did.
+        It begins or ends at waypoint `at`; `other` is the other end of the window. An object that
+        has not moved before (`new`) may penetrate its neighbours as deep as it did.
         """
         mine = self._get_shapes(owner)
         others = [k for k in range(self.robots, len(self.labels)) if k not in mine]
@@ -311,7 +311,7 @@ class _WindowFinder:
     def _find_spans(
         self, phases: Sequence[Collection[_T]]
     ) -> Iterator[tuple[_T, int | None, int | None]]:
-        """Yield items with the first and last waypoint of their presence (None: the start, the end).
+        """Yield items with the first and last waypoint of their presence; None: start, end.
 
         `phases` are the items that are present at the start, and in every phase.
         """

@@ -158,11 +158,11 @@ class PairTable:
     def find_close_pairs(
         self, placed: PlacedShapes, first: Ints, last: Ints, moved: Floats, limit: float
     ) -> tuple[Ints, Ints]:
-        """Find intervals and pairs that may come closer than `limit` [m] between waypoints, shape (n,).
+        """Find intervals and pairs that may come closer than `limit` [m], shape (n,) each.
 
-        Pairs whose boxes prove a larger distance are left out, and so are pairs of shapes that do not
-        move in the interval. The intervals are from waypoint `first` to `last`, shape (K,); `moved` is
-        the largest displacement of each shape in them, shape (K, G) [m].
+        Pairs whose boxes prove a larger distance are left out, and so are pairs of shapes that do
+        not move. The intervals are from waypoint `first` to `last`, shape (K,); `moved` is the
+        largest displacement of each shape in them, shape (K, G) [m].
         """
         return placed.boxes.find_close_pairs(
             first,

@@ -159,7 +159,7 @@ class _Sweep:
                 stack += [(low, middle, before, between), (middle, high, between, after)]
 
     def _find_nearest(self, placed: PlacedShapes) -> tuple[Ints, Ints, Floats]:
-        """Return states, pairs and distances [m] of the closest pairs and all below their margins."""
+        """Return states, pairs and distances [m] of the closest pairs and all below margins."""
         found, todo = list[tuple[Ints, Ints, Floats]](), np.arange(len(placed))
         reach = max(self._table.margins.max(), RESOLUTION)
         while len(todo):
@@ -217,7 +217,7 @@ class _Sweep:
 
 
 class Intervals(NamedTuple):
-    """Pairs in intervals: samples `low`, `high`, distances `before`, `after` [m]; shape (n,) each."""
+    """Pairs in intervals between samples, with distances at both ends [m], shape (n,) each."""
 
     low: Ints
     high: Ints

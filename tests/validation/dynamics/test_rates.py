@@ -42,7 +42,7 @@ def test_jerk_violation() -> None:
 
 
 def move_elbow(share: float) -> Trajectory:
-    """Move the elbow from rest to rest along one cubic, whose largest acceleration is `share` of its limit, 1.4 rad/s²."""
+    """Move the elbow by one cubic, with `share` of its largest acceleration, 1.4 rad/s²."""
     plan = drawer_plan()
     motion, elbow = plan.trajectory, plan.trajectory.names.index("elbow_joint")
     rows = np.tile(motion.positions[0], (2, 1))

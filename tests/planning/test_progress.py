@@ -17,7 +17,7 @@ from helpers.drives import hall
 
 import vkc_pin as vkc
 from vkc_pin.planning import progress as module
-from vkc_pin.planning.progress import Progress, shown
+from vkc_pin.planning.progress import Progress, show_progress
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -56,19 +56,19 @@ def make_iteration(**changes: Any) -> Any:
 def test_text_of_progress() -> None:
     seen: list[tuple[str, bool]] = []
     line = Progress(lambda text, last: seen.append((text, last)))
-    line.part(3, 2, 18)
+    line.set_steps(3, 2, 18)
     line.begin(["reach cup.side", "place cup"])
-    line.doing("looking for a guess")
+    line.set_activity("looking for a guess")
     line(make_iteration())
     begin, end = "0 s · steps 3 to 4 of 18 · ", " · reach cup.side, place cup"
     assert seen[-2][0] == f"{begin}looking for a guess{end}"
     assert seen[-1][0] == f"{begin}round 3, 12.3 mm missing, objective 4.57{end}"
-    line.part(7, 1, 18)
+    line.set_steps(7, 1, 18)
     line(make_iteration(shortfall=0.0))
     assert "step 7 of 18 · round 3, clear, " in seen[-1][0]
     line.stop()
     line.stop()
-    line.doing("nothing any more")
+    line.set_activity("nothing any more")
     assert [last for _, last in seen] == [False] * (len(seen) - 1) + [True]
     assert re.fullmatch(r"stopped after [\d.]+ s", seen[-1][0])
 
@@ -109,8 +109,8 @@ def test_closed_terminal_does_not_stop_planning(
 
 
 def test_pipe_gets_nothing(capfd: pytest.CaptureFixture[str]) -> None:
-    with shown(True) as line:
-        line.doing("something")
+    with show_progress(True) as line:
+        line.set_activity("something")
         assert line.write is None
     assert capfd.readouterr() == ("", "")
 

@@ -123,12 +123,14 @@ class Attempt:
     def _drive_and_reach(self, steps: Sequence[Step], poses: Floats, most: int) -> None:
         """Drive to one of the first `most` base poses, shape (K, n), and reach from there."""
 
-        def at(pose: Floats) -> None:
+        def drive_and_reach(pose: Floats) -> None:
             self._drive(pose[None, :3])
             self._reach(steps, pose)
 
         def try_poses() -> None:
-            self._try_choices(self._free(poses)[:most], at, FailedError("no base pose", share=-1.0))
+            self._try_choices(
+                self._free(poses)[:most], drive_and_reach, FailedError("no base pose", share=-1.0)
+            )
 
         self._do_withdrawn(try_poses, FailedError("no base pose", share=-1.0))
 
@@ -195,7 +197,7 @@ class Attempt:
         problem = _fix_coordinates(problem, slice(3, problem.chain.robot.coordinates.size))
         bare = is_at_home(problem) and not self.scene.held and len(goals) == 1
         guesses = (
-            initialize(problem, "astar", self._seed())
+            initialize(problem, "astar", self._draw_seed())
             if bare
             else BasePaths(problem, whole=True).make_guesses(problem, goals)
         )
@@ -220,7 +222,7 @@ class Attempt:
             guesses = [
                 InitialGuess("from above", interpolate_path(problem, np.vstack([above, last])))
             ] * (len(above) > 0) + guesses
-        more = initialize(problem, "interpolated", self._seed())
+        more = initialize(problem, "interpolated", self._draw_seed())
         self._append(
             problem, *self._solve(problem, itertools.chain(guesses, more), "arm does not reach")
         )
@@ -232,7 +234,7 @@ class Attempt:
         )
         paths, failure = BasePaths(problem), FailedError("no base path")
         for pose in self._poses(problem)[:_ENDS]:
-            base = paths.along(problem, pose[:3])
+            base = paths.find_base_path(problem, pose[:3])
             if base is None:
                 continue
             began = time.perf_counter()
@@ -286,7 +288,7 @@ class Attempt:
         self.parts.append(make_trajectory(problem, z, dt))
         self.scene = compute_final_scene(self.scene, self.parts[-1], problem.task.after)
 
-    def _seed(self) -> int:
+    def _draw_seed(self) -> int:
         return int(self.rng.integers(2**32))
 
 

@@ -75,7 +75,7 @@ def follow(
     before = problem.start
     for row in range(len(z)):
         z[row, arm.kinematics.columns] = before[arm.kinematics.columns]
-        found, cause = arm.at(z[row], row + 1)
+        found, cause = arm.find(z[row], row + 1)
         z[row] = found
         if cause:
             z[row:] = found
@@ -93,7 +93,7 @@ class _Arm:
         self.problem, self.sampler, self.refine = problem, sampler, refine
         self.kinematics = ArmKinematics(problem, sampler)
 
-    def at(self, z: Floats, waypoint: int) -> tuple[Floats, str]:
+    def find(self, z: Floats, waypoint: int) -> tuple[Floats, str]:
         """Return the nearest free configuration to `z`, else the best one, and its failure."""
         first, cause = self._candidate(z, waypoint)
         if not cause:

@@ -64,7 +64,7 @@ class BasePaths:
         found = find(self.grid) or find(self.finer)
         return None if found is None else sample_poses(found, steps, turning=self.grid.turning)
 
-    def along(self, problem: TrajectoryProblem, goal: Floats) -> Floats | None:
+    def find_base_path(self, problem: TrajectoryProblem, goal: Floats) -> Floats | None:
         """Return the base at every waypoint, shape (N, 3), stationary while a latch is released."""
         base = [problem.start[None, :3]]
         for phase in problem.task.phases:

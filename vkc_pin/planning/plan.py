@@ -297,7 +297,7 @@ class Plan:
         return cls(
             scene=Scene.from_document(about["scene"], resolve_folder(about["folder"], path)),
             steps=tuple(step_from_dict(step) for step in about["steps"]),
-            options=_saved(about["options"]),
+            options=_parse_options(about["options"]),
             trajectory=trajectory,
             report=claimed,
             status=about["status"],
@@ -327,7 +327,7 @@ def _measure(plan: Plan) -> dict[str, float]:
     return {**plan.trajectory.metrics(), **plan.report.measures()}
 
 
-def _saved(options: Mapping[str, Any]) -> Options:
+def _parse_options(options: Mapping[str, Any]) -> Options:
     """Return saved options; those without `self_distance` used `dist_safe` for all pairs."""
     default = {"self_distance": options["dist_safe"]} if "dist_safe" in options else {}
     return Options(**{**default, **options})

@@ -11,7 +11,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.planning.initialization.methods import Initialization
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.progress import shown
+from vkc_pin.planning.progress import show_progress
 from vkc_pin.planning.request import make_budget, make_request
 from vkc_pin.planning.sequential import (
     plan_sequentially,
@@ -172,7 +172,7 @@ def plan(
         if not simultaneous:
             problem = "cannot be combined with `simultaneous=False`"
             raise InputError(problem, field="window", expected="None", got=window)
-    with acquire_cache(planner) as cache, shown(progress) as line, budget.activate():
+    with acquire_cache(planner) as cache, show_progress(progress) as line, budget.activate():
         request = dataclasses.replace(request, progress=line, cache=cache)
         tasks = _compile(scene, steps, request.options, each=window is not None)
         holds = dict.fromkeys(hold for task in tasks for hold in task.holds if hold.by is not None)

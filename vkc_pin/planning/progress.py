@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from vkc_pin.planning.plan import Plan
     from vkc_pin.planning.solver.solution import Iteration
 
-__all__ = ["Progress", "shown"]
+__all__ = ["Progress", "show_progress"]
 
 
 class Progress:
@@ -29,7 +29,7 @@ class Progress:
         self._began = time.perf_counter()
         self._ended = write is None
 
-    def part(self, first: int, count: int, total: int) -> None:
+    def set_steps(self, first: int, count: int, total: int) -> None:
         """Set the next steps: `count` from number `first`, counted from 1, of `total`."""
         self._part = (
             f"step {first} of {total}"
@@ -40,9 +40,9 @@ class Progress:
     def begin(self, phases: Sequence[str]) -> None:
         """Set the phases of the next trajectory."""
         self._what = ", ".join(phases)
-        self.doing("preparing")
+        self.set_activity("preparing")
 
-    def doing(self, text: str) -> None:
+    def set_activity(self, text: str) -> None:
         """Show the current activity."""
         self._doing = text
         self._show()
@@ -83,7 +83,7 @@ class Progress:
 
 
 @contextlib.contextmanager
-def shown(progress: object) -> Iterator[Progress]:
+def show_progress(progress: object) -> Iterator[Progress]:
     """Yield the progress line, and finish it in any case.
 
     With `progress` it is shown in a notebook's cell, or in a terminal on standard error; elsewhere,

@@ -75,7 +75,7 @@ def concatenate_plans(
     )
     rows = [row for part in parts for row in part.history] if history is None else history
     if parts:
-        request.progress.doing("checking all of it")
+        request.progress.set_activity("checking all of it")
         failure = "rejected" if parts[-1].success else parts[-1].status
         status: PlanStatus = current_ending() or failure
         trajectory = concatenate_trajectories(

@@ -98,7 +98,7 @@ def plan_each_step(scene: Scene, task: Task, request: PlanningRequest) -> list[P
             own = compile_task(current, [step], request.options, nothing=True)
         if not own.phases:
             continue
-        request.progress.part(number + 1, 1, len(task.steps))
+        request.progress.set_steps(number + 1, 1, len(task.steps))
         result = solve_with_alternatives(current, own, request)
         parts.append(PlannedStep(number, result))
         if not result.plan.success or current_ending():

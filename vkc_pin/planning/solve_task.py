@@ -297,7 +297,7 @@ class _Search:
         )
         while True:
             began, built = time.perf_counter(), request.cache.build_time
-            request.progress.doing("looking for an initial guess")
+            request.progress.set_activity("looking for an initial guess")
             try:
                 guess = next(guesses, None)
             finally:
@@ -343,7 +343,7 @@ class _Search:
 
     def _validate(self, trajectory: Trajectory) -> Report:
         began, request = time.perf_counter(), self.request
-        request.progress.doing("checking")
+        request.progress.set_activity("checking")
         report = validate(self.scene, self.task.steps, trajectory, request.options, request.terms)
         self.check_time = time.perf_counter() - began
         reserve_time("validation", self.check_time)

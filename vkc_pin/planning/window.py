@@ -213,7 +213,7 @@ class _SlidingWindow:
             random_seed=self.request.random_seed + attempt,
         )
         done = len(self._steps(0, first))
-        request.progress.part(done + 1, len(task.steps), len(self.steps))
+        request.progress.set_steps(done + 1, len(task.steps), len(self.steps))
         reserved = sum(part.check_time for part in (*self.decided, *self.ahead))
         reserve_time("planned actions", reserved)
         result = solve_task(scene, task, request, guess=guess, check_goals_first=check_goals_first)

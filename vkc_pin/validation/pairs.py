@@ -95,13 +95,13 @@ class PairTable:
 
     def get_margins(self, pairs: Ints, waypoints: Ints) -> Floats:
         """Return the required clearances of pairs at waypoints, shape (n,) each [m]; -inf: none."""
-        margins, (k, which) = self.margins[pairs], self._windows.at(pairs, waypoints, waypoints)
+        margins, (k, which) = self.margins[pairs], self._windows.find(pairs, waypoints, waypoints)
         np.minimum.at(margins, k, self._windows.margin[which])
         return margins
 
     def get_contact_overlaps(self, pairs: Ints, first: Ints, last: Ints) -> Floats:
         """Return the overlaps that count as contact from `first` to `last`, shape (n,) each [m]."""
-        overlap, (k, which) = np.zeros(len(pairs)), self._windows.at(pairs, first, last)
+        overlap, (k, which) = np.zeros(len(pairs)), self._windows.find(pairs, first, last)
         np.maximum.at(overlap, k, self._windows.contact[which])
         return overlap
 
@@ -109,14 +109,14 @@ class PairTable:
         """Return which pairs the scene exempts from clearance at waypoints, shape (n,) each."""
         exempt, (k, which) = (
             np.zeros(len(pairs), bool),
-            self._windows.at(pairs, waypoints, waypoints),
+            self._windows.find(pairs, waypoints, waypoints),
         )
         exempt[k[self._windows.is_exempt[which]]] = True
         return exempt
 
     def find_moving_together(self, pairs: Ints, first: Ints, last: Ints) -> Bools:
         """Return which pairs move rigidly together from `first` to `last`, shape (n,) each."""
-        as_one, (k, which) = np.zeros(len(pairs), bool), self._windows.at(pairs, first, last)
+        as_one, (k, which) = np.zeros(len(pairs), bool), self._windows.find(pairs, first, last)
         as_one[k[self._windows.moves_together[which]]] = True
         return as_one
 
@@ -202,7 +202,7 @@ class _WindowIndex:
             for name in ("moves_together", "is_exempt")
         )
 
-    def at(self, pairs: Ints, first: Ints, last: Ints) -> tuple[Ints, Ints]:
+    def find(self, pairs: Ints, first: Ints, last: Ints) -> tuple[Ints, Ints]:
         """Return (k, window) for all windows of pair k that cover waypoints `first` to `last`."""
         some = np.flatnonzero(self._count[pairs])
         count = self._count[pairs[some]]

@@ -30,9 +30,3 @@ def hanging(task: int) -> int:
 def where(task: int) -> tuple[int, str | None]:
     time.sleep(0.05)
     return os.getpid(), os.environ.get("OPENBLAS_NUM_THREADS")
-
-
-def slow(task: int) -> int:
-    """Return twice the task after a second."""
-    time.sleep(1.0)
-    return 2 * task

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import os
 import tempfile
@@ -56,36 +55,25 @@ def written(folder: Path, text: str) -> Path:
     return file
 
 
-def paths(data: Any, path: tuple[str | int, ...] = ()) -> dict[tuple[str | int, ...], Any]:
-    """Return every field of nested data."""
-    items: Any = (
-        data.items()
-        if isinstance(data, dict)
-        else enumerate(data)
-        if isinstance(data, list)
-        else ()
-    )
-    found = {path: data}
-    for key, value in items:
-        found.update(paths(value, (*path, key)))
-    return found
+def paths(data: Any, path: tuple[str | int, ...] = ()) -> list[tuple[str | int, ...]]:
+    """Return the paths of all fields of nested data."""
+    items = data.items() if isinstance(data, dict) else enumerate(data)
+    inner = [(key, value) for key, value in items] if isinstance(data, dict | list) else []
+    return [path, *(found for key, value in inner for found in paths(value, (*path, key)))]
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.dictionaries(NAMES, DATA, min_size=1, max_size=4))
 def test_fields_are_read_with_their_lines(data: dict[str, Any]) -> None:
+    text = yaml.safe_dump(data, default_flow_style=False, sort_keys=False)
     with tempfile.TemporaryDirectory() as folder:
-        text = yaml.safe_dump(data, default_flow_style=False, sort_keys=False)
         document = read_yaml(written(Path(folder), text))
     assert document.data == data
-    lines = text.splitlines()
-    for path, value in paths(data).items():
-        assert functools.reduce(lambda inner, key: inner[key], path, document.data) == value
+    for path in paths(data):
         assert document.find_line((*path, "nothing", 3)) == document.find_line(path)
         if path and isinstance(path[-1], str):
-            where = document.find_line(path)
-            assert where is not None
-            assert f"{path[-1]}:" in lines[where - 1].replace("'", "")
+            line = text.splitlines()[(document.find_line(path) or 0) - 1]
+            assert f"{path[-1]}:" in line.replace("'", "")
 
 
 def test_field_paths_are_formatted() -> None:

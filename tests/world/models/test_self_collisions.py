@@ -31,25 +31,11 @@ def test_committed_srdf_matches_sampling(husky: Robot) -> None:
 
 
 def test_pairs_that_always_or_never_collide(tmp_path: Path) -> None:
-    links = "".join(
-        f'<link name="{name}"><collision>'
-        f'<geometry><sphere radius="{radius}"/></geometry></collision></link>'
-        for name, radius in (("foot", 1.0), ("middle", 0.1), ("inner", 0.2), ("outer", 0.1))
-    )
-    joints = "".join(
-        f'<joint name="{child}_joint" type="revolute">'
-        f'<parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="{x} 0 0"/><axis xyz="0 0 1"/>'
-        '<limit lower="-1" upper="1" velocity="1" effort="1"/></joint>'
-        for parent, child, x in (
-            ("foot", "middle", 0.3),
-            ("middle", "inner", 0.2),
-            ("inner", "outer", 4.0),
-        )
-    )
-    (tmp_path / "odd.urdf").write_text(f'<robot name="odd">{links}{joints}</robot>')
-    robot = load_robot(tmp_path / "odd.urdf", pairs="all")
-    assert sample_allowed_pairs(robot, samples=50) == {
+    radii = {"foot": 1.0, "middle": 0.1, "inner": 0.2, "outer": 0.1}
+    parts = [ball(name, radius) for name, radius in radii.items()]
+    parts += [hinge("foot", "middle", 0.3, upper=1.0), hinge("middle", "inner", 0.2, upper=1.0)]
+    parts += [hinge("inner", "outer", 4.0, upper=1.0)]
+    assert sample_allowed_pairs(load_robot(arm(tmp_path, *parts), pairs="all"), samples=50) == {
         ("foot", "inner"): "Always",
         ("foot", "middle"): "Adjacent",
         ("foot", "outer"): "Never",

@@ -29,6 +29,7 @@ from vkc_pin.world.models.robot_model import (
     compute_rest_positions,
     find_base_joints,
     find_default_tool_frame,
+    find_joint_limits,
     find_nearest_position,
     load_collision_geometry,
 )
@@ -359,29 +360,15 @@ class _RobotFiles:
 
     def check_limits(self, full: pin.Model, joint: str, position: float, field: str) -> None:
         """Check that a home or locked position is within the joint's limits."""
-        moving = full.joints[full.getJointId(joint)]
-        if moving.nq == 1:
-            low, high = full.lowerPositionLimit[moving.idx_q], full.upperPositionLimit[moving.idx_q]
-            if not low - LIMIT_SLACK <= position <= high + LIMIT_SLACK:
-                problem, expected = (
-                    "this position is outside the joint's limits",
-                    f"between {low:g} and {high:g}",
-                )
-                for key, section in (
-                    ("locked_joints", self.settings.locked_joints),
-                    ("home", self.settings.home),
-                ):
-                    if section.get(joint) == position:
-                        raise self.document.make_error(
-                            (key, joint), problem, expected=expected, got=position
-                        )
-                raise InputError(
-                    problem,
-                    file=self.urdf.path,
-                    field=f"{field}.{joint}",
-                    expected=expected,
-                    got=position,
-                )
+        low, high = find_joint_limits(full, joint)
+        if low - LIMIT_SLACK <= position <= high + LIMIT_SLACK:
+            return
+        problem = "this position is outside the joint's limits"
+        details = {"expected": f"between {low:g} and {high:g}", "got": position}
+        for key in ("locked_joints", "home"):
+            if getattr(self.settings, key).get(joint) == position:
+                raise self.document.make_error((key, joint), problem, **details)
+        raise InputError(problem, file=self.urdf.path, field=f"{field}.{joint}", **details)
 
     def check_followers(
         self, model: pin.Model, rest: Mapping[str, float], known_positions: Collection[str]
@@ -393,21 +380,12 @@ class _RobotFiles:
             if joint != leader and joint in known_positions:
                 follows = move.factor * rest[leader] + move.offset
                 if abs(rest[joint] - follows) > LIMIT_SLACK:
-                    problem, expected = (
-                        f"this joint follows '{leader}'",
-                        f"{follows:g}, or no value",
-                    )
+                    problem = f"this joint follows '{leader}'"
+                    details = {"expected": f"{follows:g}, or no value", "got": rest[joint]}
                     if joint in self.settings.home:
-                        raise self.document.make_error(
-                            ("home", joint), problem, expected=expected, got=rest[joint]
-                        )
-                    raise InputError(
-                        problem,
-                        file=self.urdf.path,
-                        field=f"home.{joint}",
-                        expected=expected,
-                        got=rest[joint],
-                    )
+                        raise self.document.make_error(("home", joint), problem, **details)
+                    field = f"home.{joint}"
+                    raise InputError(problem, file=self.urdf.path, field=field, **details)
 
 
 def _read_files(name: str | Path, packages: Mapping[str, str | Path]) -> _RobotFiles:

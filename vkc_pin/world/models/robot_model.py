@@ -28,6 +28,7 @@ __all__ = [
     "compute_rest_positions",
     "find_base_joints",
     "find_default_tool_frame",
+    "find_joint_limits",
     "find_nearest_position",
     "find_neighbours",
     "load_collision_geometry",
@@ -148,19 +149,21 @@ def compute_rest_positions(
     rest = {}
     for j in range(2, full.njoints):
         if full.joints[j].nv == 1:
-            i = full.joints[j].idx_q
-            low, high = (
-                (-np.inf, np.inf)
-                if full.joints[j].nq == 2
-                else (full.lowerPositionLimit[i], full.upperPositionLimit[i])
-            )
-            rest[full.names[j]] = float(
-                given.get(full.names[j], 0.0 if low <= 0.0 <= high else 0.5 * (low + high))
-            )
+            low, high = find_joint_limits(full, full.names[j])
+            default = 0.0 if low <= 0.0 <= high else 0.5 * (low + high)
+            rest[full.names[j]] = float(given.get(full.names[j], default))
     for name, coupling in find_followers(file.root).items():
         if name in rest and coupling.leader in rest and name not in given:
             rest[name] = coupling.factor * rest[coupling.leader] + coupling.offset
     return rest
+
+
+def find_joint_limits(model: pin.Model, joint: str) -> tuple[float, float]:
+    """Return the position limits of a joint [m] or [rad]; infinite for continuous joints."""
+    moving = model.joints[model.getJointId(joint)]
+    if moving.nq != 1:
+        return -np.inf, np.inf
+    return model.lowerPositionLimit[moving.idx_q], model.upperPositionLimit[moving.idx_q]
 
 
 def find_nearest_position(model: pin.Model, joint: str, position: float) -> float:
@@ -171,7 +174,7 @@ def find_nearest_position(model: pin.Model, joint: str, position: float) -> floa
     moving = model.joints[model.getJointId(joint)]
     if moving.nq == 2:
         return position
-    low, high = model.lowerPositionLimit[moving.idx_q], model.upperPositionLimit[moving.idx_q]
+    low, high = find_joint_limits(model, joint)
     turns = () if "JointModelP" in moving.shortname() else (2.0 * np.pi, -2.0 * np.pi)
     for turn in (0.0, *turns):
         if low <= position + turn <= high:

@@ -27,7 +27,7 @@ from vkc_pin.world.models.grippers.bar_width import (
     check_bar_fits,
     find_widest_bar,
 )
-from vkc_pin.world.models.robot_model import build_unlocked_model
+from vkc_pin.world.models.robot_model import build_unlocked_model, find_joint_limits
 from vkc_pin.world.models.robot_schema import FingerSchema
 from vkc_pin.world.models.shapes import LIMIT_SLACK
 
@@ -221,13 +221,7 @@ def build_gripper(
             raise document.make_error(
                 where, "this is not a finger joint", expected=expected, got=joint
             )
-        joint_model = full.joints[joint_index]
-        low, high = (-np.inf, np.inf)
-        if joint_model.nq == 1:
-            low, high = (
-                full.lowerPositionLimit[joint_model.idx_q],
-                full.upperPositionLimit[joint_model.idx_q],
-            )
+        low, high = find_joint_limits(full, joint)
         for key, value in (("closed", finger.closed), ("open", finger.open)):
             if not low - LIMIT_SLACK <= value <= high + LIMIT_SLACK:
                 problem = "this finger position is outside the joint's limits"

@@ -101,7 +101,7 @@ def table(found: Witnesses) -> np.ndarray:
     return np.column_stack([found.distance, found.normal, found.first, found.second])
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(
     st.sampled_from(CONVEX),
     st.sampled_from(KINDS),

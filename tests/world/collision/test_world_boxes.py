@@ -16,7 +16,7 @@ def gap(first: tuple[Floats, Floats], second: tuple[Floats, Floats]) -> float:
     return float(np.linalg.norm(np.maximum(apart, 0.0))) if apart.max() > 0.0 else -np.inf
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     st.integers(0, 2**32 - 1),
     st.integers(1, 40),

@@ -70,7 +70,7 @@ def test_locked_joints_and_tool_frame() -> None:
 
 @pytest.mark.parametrize(
     ("name", "tool", "joints"),
-    [("panda", "panda_hand_tcp", 7), ("tiago_no_hand", "wrist_ft_tool_link", 8)],
+    [("panda", "panda_hand_tcp", 7), ("ur5", "tool0", 6)],
 )
 def test_robots_of_example_robot_data_can_be_loaded(name: str, tool: str, joints: int) -> None:
     robot = load_robot(name)

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import pinocchio as pin
@@ -364,7 +364,7 @@ class _RobotFiles:
         if low - LIMIT_SLACK <= position <= high + LIMIT_SLACK:
             return
         problem = "this position is outside the joint's limits"
-        details = {"expected": f"between {low:g} and {high:g}", "got": position}
+        details: dict[str, Any] = {"expected": f"between {low:g} and {high:g}", "got": position}
         for key in ("locked_joints", "home"):
             if getattr(self.settings, key).get(joint) == position:
                 raise self.document.make_error((key, joint), problem, **details)
@@ -381,7 +381,10 @@ class _RobotFiles:
                 follows = move.factor * rest[leader] + move.offset
                 if abs(rest[joint] - follows) > LIMIT_SLACK:
                     problem = f"this joint follows '{leader}'"
-                    details = {"expected": f"{follows:g}, or no value", "got": rest[joint]}
+                    details: dict[str, Any] = {
+                        "expected": f"{follows:g}, or no value",
+                        "got": rest[joint],
+                    }
                     if joint in self.settings.home:
                         raise self.document.make_error(("home", joint), problem, **details)
                     field = f"home.{joint}"

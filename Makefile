@@ -16,7 +16,8 @@ demo: $(VENV)/installed.stamp
 # One process a core, each with one thread; files stay whole, since their tests share problems and plans.
 PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 
-test: lint docs
+test: $(VENV)/test.stamp $(VENV)/docs.stamp
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint docs
 	$(PYTEST) -m "not long"
 
 # These leave the notebooks that they run in out/notebooks; the documentation shows them with what came out.

@@ -128,6 +128,14 @@ def test_release_of_objects_held_at_the_start() -> None:
 # -------------------------------------------------------------------------------------
 
 
+def test_held_object_is_placed_and_released_as_held() -> None:
+    with pytest.raises(InputError, match="held elsewhere") as caught:
+        phases(Grasp("stick"), Place("stick", POSE, "end"))
+    assert caught.value.field == "steps[1].attachment"
+    with pytest.raises(UnknownNameError, match="did you mean 'stick'"):
+        phases(Grasp("stick"), Release("stik"))
+
+
 def test_empty_hand_releases_nothing() -> None:
     for before in ([], [Place("stick", POSE)]):
         with pytest.raises(InputError, match="hand is empty") as caught:
@@ -301,6 +309,7 @@ def test_unknown_names_are_rejected(step: Step, field: str, nearest: str | None)
 @pytest.mark.parametrize(
     ("step", "field"),
     [
+        (Actuate("ball", {"x": 0.0}), "steps[0].joints"),
         (Touch("door.lever", POINT), "steps[0].frame"),
         (Place("door", POSE), "steps[0].object"),
         (Actuate("stick", {"tip_joint": 0.0}), "steps[0].joints"),

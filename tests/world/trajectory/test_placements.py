@@ -53,12 +53,3 @@ def test_placements_equal_those_of_the_world_model(
         assert np.allclose(motion.world[k, j], data.oMi[j].homogeneous)
         parent = motion.world[k, world.model.parents[j]]
         assert np.allclose(parent @ motion.local[j][k].homogeneous, data.oMi[j].homogeneous)
-
-
-def test_moving_joints_and_departures(motion: Motion, world: World) -> None:
-    assert motion.moving[1:].all()
-    base = np.arange(world.model.njoints) == 1
-    away = motion.away(base, 0)
-    assert not away[0]
-    assert away[-1]
-    assert motion.away(base, -1).tolist()[-1] is False

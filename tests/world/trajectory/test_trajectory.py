@@ -23,6 +23,20 @@ def test_efforts() -> None:
     )  # neither the heading nor the door counts
 
 
+def test_samples_and_velocities_of_linear_motions() -> None:
+    motion = example()
+    times, rows = motion.sample(2.0)
+    np.testing.assert_allclose(times, np.arange(14) / 2.0)
+    np.testing.assert_array_equal(rows, motion(times))
+    rates = motion.velocity([-1.0, 1.0, 7.0])
+    np.testing.assert_allclose(rates[1], [1.5, 2.0, 0.25, 0.05, -0.1, 0.0])
+    assert not rates[[0, 2]].any()
+    assert not motion.acceleration(times).any()
+    with pytest.raises(InputError, match="too many samples"):
+        motion.sample(1e6)
+    assert [part.times.tolist() for part in motion.parts()] == [[0.0, 2.0, 2.5], [2.5, 6.5]]
+
+
 def test_accelerations() -> None:
     """The step of velocity over the shorter of both neighbours' durations; from and to rest."""
     x, hinge = [1.5 / 2.0, -1.5 / 0.5, -0.25 / 0.5, 0.25 / 4.0], [0.0, 0.0, 0.3 / 0.5, -0.3 / 4.0]

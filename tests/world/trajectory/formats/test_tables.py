@@ -9,14 +9,16 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from helpers.fake_plan import fake_plan
-from helpers.written import FILES, broken, same, trajectories
+from helpers.written import FILES, ROBOT, broken, same, trajectories
 from hypothesis import given
 
 import vkc_pin as vkc
 from vkc_pin import cli
 from vkc_pin.planning.plan import Plan
+from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -36,6 +38,19 @@ def test_tables_are_exact(trajectory: Trajectory, tmp_path: Path) -> None:
 @given(trajectory=trajectories())
 def test_json_is_exact(trajectory: Trajectory, tmp_path: Path) -> None:
     assert same(Trajectory.from_json(trajectory.to_json(tmp_path / "motion.json")), trajectory)
+
+
+def test_curves_and_openings_survive_files(tmp_path: Path) -> None:
+    times, rows = np.array([0.0, 0.5, 1.0]), np.arange(9.0).reshape(3, 3)
+    curve = Curve(times, rows, 0.1 * rows)
+    phases = (PhaseSpan("go", 0, 1, opening=0.04),)
+    trajectory = Trajectory(ROBOT[:3], times[[0, 2]], rows[[0, 2]], phases, 3, curve)
+    table = trajectory.to_csv(tmp_path / "motion.csv")
+    assert same(Trajectory.from_csv(table), trajectory)
+    assert same(Trajectory.from_json(trajectory.to_json(tmp_path / "motion.json")), trajectory)
+    table.write_text(table.read_text().replace("base_y velocity", "base_z velocity"))
+    with pytest.raises(vkc.InputError, match="not the velocities of its coordinates"):
+        Trajectory.from_csv(table)
 
 
 def test_columns_have_names_and_units(plan: Plan, tmp_path: Path) -> None:

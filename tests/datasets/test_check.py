@@ -83,7 +83,7 @@ def test_the_page_shows_what_there_is(copy: Path, tmp_path: Path) -> None:
         "given-open",
         "husky_ur5e",
         "Coverage",
-        "Which way round",
+        "Homotopy classes",
         "All of them are valid",
     ):
         assert words in text, words

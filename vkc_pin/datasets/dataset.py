@@ -22,30 +22,9 @@ __all__ = ["EPISODES_A_SHARD", "Dataset", "Register", "write_table"]
 EPISODES_A_SHARD = 100
 """Episodes in one shard; the last one of each robot may have fewer."""
 _COLUMNS = (
-    *(
-        "number",
-        "task",
-        "robot",
-        "room",
-        "object",
-        "kind",
-        "attachment",
-        "joint",
-        "goal",
-        "variant",
-        "status",
-        "reason",
-    ),
-    *(
-        "duration",
-        "base_path_length",
-        "arm_path_length",
-        "clearance",
-        "waypoints",
-        "scene",
-        "seconds",
-        "planning_time",
-    ),
+    *("number", "task", "robot", "room", "object", "kind", "attachment", "joint", "goal"),
+    *("variant", "status", "reason", "duration", "base_path_length", "arm_path_length"),
+    *("clearance", "waypoints", "scene", "seconds", "planning_time"),
 )
 
 
@@ -185,7 +164,7 @@ def _row(record: Mapping[str, Any]) -> dict[str, Any]:
 def write_table(path: Path, records: Sequence[Mapping[str, Any]]) -> Path:
     """Write records as a CSV table; return the path."""
     buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    writer.writerows([record.get(name, "") for name in _COLUMNS] for record in records)
+    writer = csv.DictWriter(buffer, _COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(records)
     return write_atomically(path, buffer.getvalue().encode())

@@ -215,13 +215,9 @@ def _run_attempts(
                 yield ",".join(map(str, missing)), (document, missing, robots)
 
     journal.append({"session": {"jobs": jobs}})
-    bar = tqdm(
-        total=register.wanted,
-        initial=len(register.accepted),
-        unit="episode",
-        smoothing=0.05,
-        disable=not progress,
-    )
+    done = len(register.accepted)
+    shown: dict[str, Any] = {"unit": "episode", "smoothing": 0.05, "disable": not progress}
+    bar = tqdm(total=register.wanted, initial=done, **shown)
     outcomes = run_tasks(
         make_parts,
         tasks(),
@@ -239,11 +235,8 @@ def _run_attempts(
                 if isinstance(result, CrashedTask) and len(numbers) > 1:
                     retried.extend(numbers)
                     continue
-                for record, data in (
-                    [_make_failure(numbers[0], result)]
-                    if isinstance(result, CrashedTask)
-                    else result
-                ):
+                crashed = isinstance(result, CrashedTask)
+                for record, data in [_make_failure(numbers[0], result)] if crashed else result:
                     if record["status"] == "interrupted":
                         raise KeyboardInterrupt
                     _save(dataset, journal, record, data, clock)
@@ -256,16 +249,14 @@ def _run_attempts(
         text = f"{len(register.accepted)} of {register.wanted} episodes are in {dataset.folder}"
         raise KeyboardInterrupt(text) from None
     if not register.full:
-        reasons = "; ".join(
-            dict.fromkeys(str(record["reason"]) for record in register.failures[-200:])
-        )[:500]
-        problem = (
-            f"{register.decided} attempts gave {len(register.accepted)} "
-            f"of {register.wanted} episodes"
-        )
-        raise VkcError(
-            f"{problem}, which are kept in {dataset.folder}; the latest failures: {reasons}"
-        )
+        raise _make_shortage_error(dataset, register)
+
+
+def _make_shortage_error(dataset: Dataset, register: Register) -> VkcError:
+    reasons = dict.fromkeys(str(record["reason"]) for record in register.failures[-200:])
+    counts = f"{register.decided} attempts gave {len(register.accepted)} of {register.wanted}"
+    latest = "; ".join(reasons)[:500]
+    return VkcError(f"{counts} episodes, kept in {dataset.folder}; the latest failures: {latest}")
 
 
 class _Clock:
@@ -309,7 +300,6 @@ def _make_failure(number: int, outcome: CrashedTask) -> Made:
 
 
 def _write_card(dataset: Dataset, register: Register) -> None:
-    """Write the dataset card."""
     recipe = dataset.recipe
     about = {
         "name": recipe.fields.name,
@@ -319,10 +309,8 @@ def _write_card(dataset: Dataset, register: Register) -> None:
         "versions": find_versions(),
         "recipe": yaml.safe_dump(recipe.document, sort_keys=False, allow_unicode=True),
     }
-    write_atomically(
-        dataset.folder / "README.md",
-        make_card(about, register.accepted, register.failures).encode(),
-    )
+    card = make_card(about, register.accepted, register.failures)
+    write_atomically(dataset.folder / "README.md", card.encode())
 
 
 def _write_lerobot(dataset: Dataset) -> None:

@@ -1,4 +1,4 @@
-"""Starts at which the hand has hold of something: a base and an arm from which nothing is hit."""
+"""Samples start configurations in which the robot grasps an object."""
 
 from __future__ import annotations
 
@@ -31,17 +31,20 @@ def find_grasping_start(
     planner: Planner,
     terms: Sequence[Term] = (),
 ) -> Scene | None:
-    """Return the scene with the robot at a random free configuration that holds what a step moves; None if none is found.
+    """Return the scene with a random free configuration that grasps the object of a step.
 
-    The program that is built for it is the one that the step is planned with from there.
+    The search uses the program of the step's plan.
 
     Args:
-        scene: Whose robot and objects they are.
-        step: The step, with its attachment.
-        rng: Random numbers.
-        options: Clearances.
-        planner: Keeps what is built.
-        terms: What the motion must keep to, for the program; the start need not.
+        scene: Scene.
+        step: Step with its attachment.
+        rng: Random generator.
+        options: Options with clearances.
+        planner: Planner whose caches are used.
+        terms: Additional terms of the program; the start may violate them.
+
+    Returns:
+        The scene, or None if no configuration was found.
     """
     name, attachment = step.object, str(step.attachment)
     holding = scene.with_held(

@@ -1,4 +1,4 @@
-"""Robots of a recipe: whether they have what it names, and those that are imported into the dataset's folder first, once."""
+"""Prepares the robots of a recipe and checks their frames."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ _SAMPLES = 1000
 
 
 def check_frames(recipe: Recipe) -> None:
-    """Refuse cameras that cannot take images here, and cameras and terms that a robot of the recipe has no frame for.
+    """Check that cameras can take images and that robots have the frames of cameras and terms.
 
     Raises:
         InputError: MuJoCo is not installed.
         UnknownNameError: A robot lacks a frame.
-        VkcError: There is no OpenGL without a screen.
+        VkcError: OpenGL needs a display.
     """
     if not recipe.cameras and not recipe.terms:
         return
@@ -49,13 +49,12 @@ def check_frames(recipe: Recipe) -> None:
 
 
 def prepare_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
-    """Return name in the recipe → path of what to load, for the robots that are imported or given by path.
+    """Return name in the recipe → file, for robots that are imported or given by path.
 
     Args:
-        recipe: The recipe.
-        folder: Where folders are made; what is there is not made again. On a cluster, all workers
-            must see it. Of a robot by path that says what its hand is, there is what points to its
-            URDF.
+        recipe: Recipe.
+        folder: Folder of the dataset's robots, visible to all workers. Robots without a described
+            hand are imported once; others by path are referred to.
 
     Raises:
         InputError: A robot cannot be imported.
@@ -77,7 +76,7 @@ def prepare_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
 
 
 def _point(source: Path, folder: Path) -> None:
-    """Write a description into a folder that says what the one at `source`, a robot.yaml or a URDF beside one, says."""
+    """Write a copy of a robot's description with absolute paths into a folder."""
     beside = source if source.name == "robot.yaml" else source.parent / "robot.yaml"
     said = yaml.safe_load(read_text(beside, "YAML"))
     for field in ("urdf", "srdf"):

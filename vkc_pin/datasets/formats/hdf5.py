@@ -1,9 +1,8 @@
-"""Shards: many episodes in one HDF5 file, in groups as robomimic has them, with the exact motion beside the samples.
+"""Reads and writes shards: HDF5 files of many episodes in robomimic's layout.
 
-The groups are those of robomimic's documentation (`data/demo_<k>` with `actions`, `states`, `obs`,
-`rewards`, `dones`; the attributes `total`, `env_args` and `num_samples`; `mask`). What is sampled
-is single precision; the motion itself, which is what can be validated again, is double precision
-under `motion`.
+Groups are `data/demo_<k>` with `actions`, `states`, `obs`, `rewards` and `dones`, attributes
+`total`, `env_args` and `num_samples`, and `mask`. Samples are in single precision; the trajectory
+itself is in double precision under `motion`.
 """
 
 from __future__ import annotations
@@ -53,15 +52,14 @@ def require_h5py() -> Any:
 
 
 def write_shard(path: Path, parts: Sequence[tuple[Path, int]], scenes: Path) -> Path:
-    """Write episodes of one robot to a file, whole or not at all; the same episodes give the same bytes. Return the path.
+    """Write episodes of one robot to a file atomically and reproducibly; return the path.
 
-    They are copied as they are, which takes a fraction of a millisecond each; making a part takes
-    twenty times as long, and is done where the episode is made.
+    Episodes are copied, which is 20 times as fast as making a part.
 
     Args:
-        path: The file.
-        parts: For each episode, in order, a file of `make_part`, or a shard, and its place in there.
-        scenes: The folder of the dataset's scenes, to which those of the parts are added.
+        path: File.
+        parts: For each episode a file of `make_part` or a shard, and the episode's place in it.
+        scenes: Folder of the dataset's scenes, to which missing ones are added.
     """
     h5py = require_h5py()
     buffer = io.BytesIO()
@@ -89,13 +87,13 @@ def write_shard(path: Path, parts: Sequence[tuple[Path, int]], scenes: Path) -> 
 
 
 def make_part(episode: Episode, robot: Robot, rate: float, recipe: str) -> bytes:
-    """Return an episode as a file of its own, with its scene, of which `write_shard` makes part of a shard.
+    """Return an episode with its scene as a file for `write_shard`.
 
     Args:
-        episode: The episode.
+        episode: Episode.
         robot: Its robot.
-        rate: Samples a second.
-        recipe: The digest of what it was made of.
+        rate: Sampling rate [Hz].
+        recipe: Digest of the recipe.
     """
     h5py = require_h5py()
     buffer = io.BytesIO()
@@ -118,13 +116,12 @@ def make_part(episode: Episode, robot: Robot, rate: float, recipe: str) -> bytes
 
 
 def _keep_scene(found: h5py.File, path: Path) -> None:
-    """Write the scene that comes with an episode, under the name that its content has, unless it is there."""
+    """Write the scene of an episode unless it exists."""
     if "scene" in found and not path.is_file():
         write_atomically(path, found["scene"][:].tobytes())
 
 
 def _write(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> None:
-    """Write one episode."""
     found, motion = sample_episode(episode, robot, rate), episode.trajectory.to_dict()
     count = len(found["time"])
     for name in _OBSERVED:
@@ -174,7 +171,7 @@ def _write(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> No
 
 
 def _among(curve: Mapping[str, Floats], waypoints: Mapping[str, Floats]) -> Ints | None:
-    """Return which knots of a curve the waypoints are, shape (T,); None if they are not exactly such."""
+    """Return the indices of waypoints among the knots of a curve, shape (T,), if all match."""
     if not curve:
         return None
     at = np.minimum(np.searchsorted(curve["times"], waypoints["times"]), len(curve["times"]) - 1)
@@ -202,7 +199,7 @@ def read_numbers(path: Path) -> list[int]:
     """Return the numbers of a shard's episodes, in order.
 
     Raises:
-        InputError: It is none.
+        InputError: The file is no shard.
     """
     with _opened(path) as file:
         return [int(file["data"][f"demo_{k}"].attrs["number"]) for k in range(len(file["data"]))]
@@ -212,11 +209,11 @@ def read_episodes(path: Path, scenes: Path) -> Iterator[Episode]:
     """Yield the episodes of a shard, in order.
 
     Args:
-        path: The shard.
-        scenes: The folder of the dataset's scenes.
+        path: Shard.
+        scenes: Folder of the dataset's scenes.
 
     Raises:
-        InputError: The file is damaged or none, or something in it does not fit.
+        InputError: The file is damaged or no shard.
     """
     documents: dict[str, Any] = {}
     with _opened(path) as file:
@@ -251,11 +248,7 @@ def read_episodes(path: Path, scenes: Path) -> Iterator[Episode]:
 
 
 def _images(path: Path, k: int) -> Images:
-    """Return what cameras saw in an episode of a shard.
-
-    Raises:
-        InputError: They are not there as the episode says.
-    """
+    """Read the camera images of an episode."""
     with _opened(path) as file:
         try:
             group = file["data"][f"demo_{k}"]

@@ -1,9 +1,7 @@
-"""LeRobot's dataset layout 3.0: many episodes in one parquet file, with tables of episodes and tasks, and statistics.
+"""Writes datasets in LeRobot's layout 3.0.
 
-What each file holds is documented with LeRobot ("LeRobotDataset v3.0", huggingface/lerobot,
-src/lerobot/datasets). Features have one shape in all of a dataset, so that every robot gets a
-dataset of its own. Images are PNG files inside of the parquet files, features of the type "image";
-there are no videos.
+The layout is documented in huggingface/lerobot, src/lerobot/datasets. Each robot gets a dataset,
+since features have one shape. Images are PNG files in the parquet files; there are no videos.
 """
 
 from __future__ import annotations
@@ -41,14 +39,21 @@ _KINDS = {
     "index": "int64",
     "task_index": "int64",
 }
-_STATE = ("base_pose", "arm_position", "gripper")
+_HAND = ("hand_x", "hand_y", "hand_z", "hand_qx", "hand_qy", "hand_qz", "hand_qw")
+_COLUMNS = {
+    "observation.state": ("base_pose", "arm_position", "gripper"),
+    "observation.velocity": ("base_velocity", "arm_velocity"),
+    "observation.environment_state": ("hand_pose", "holding"),
+    "action": ("actions",),
+}
+"""Feature → its parts among the samples of an episode."""
 
 
 def require_pyarrow(rate: float) -> Any:
-    """Return pyarrow, if frames can be written at a rate [Hz].
+    """Return pyarrow.
 
     Raises:
-        InputError: It is not installed, or the rate is no whole number.
+        InputError: It is not installed, or the rate [Hz] is no whole number.
     """
     if rate != int(rate):
         raise InputError(
@@ -62,7 +67,7 @@ def require_pyarrow(rate: float) -> Any:
 
 
 def describe_task(about: Mapping[str, Any]) -> str:
-    """Return what an episode does, in words, as policies that take language are told it."""
+    """Describe an episode as an instruction for language-conditioned policies."""
     thing = str(about["kind"]).replace("_", " ")
     return (
         f"Bring the {thing} from one table to another."
@@ -72,18 +77,17 @@ def describe_task(about: Mapping[str, Any]) -> str:
 
 
 def write_lerobot(path: Path, episodes: Iterable[Episode], robot: Robot, rate: float) -> Path:
-    """Write episodes of one robot as a dataset, whole or not at all, in place of one that is there; return its folder.
+    """Write episodes of one robot atomically to a folder, which is replaced; return it.
 
-    `observation.state` is base pose, arm and gripper, `observation.velocity` their rates but for
-    the gripper's, `observation.environment_state` where the hand is and whether it holds something,
-    `action` the state of the next moment, `observation.images.<camera>` what a camera saw; LeRobot
-    has no depths and no segmentation.
+    `observation.state` is base pose, arm and gripper, `observation.velocity` base and arm velocity,
+    `observation.environment_state` hand pose and whether an object is grasped, `action` the next
+    state, and `observation.images.<camera>` an image.
 
     Args:
-        path: The folder.
-        episodes: In order.
-        robot: Theirs.
-        rate: Frames a second, a whole number.
+        path: Folder.
+        episodes: Episodes, in order.
+        robot: Their robot.
+        rate: Frames per second, a whole number.
     """
     arrow = require_pyarrow(rate)
     with write_folder_atomically(path, force=True) as folder:
@@ -95,25 +99,22 @@ def write_lerobot(path: Path, episodes: Iterable[Episode], robot: Robot, rate: f
 
 
 class _Writer:
-    """Writes frames as they come, and at the end all that is about them."""
+    """Writes frames as they come, and tables and statistics at the end."""
 
     def __init__(self, arrow: Any, folder: Path, robot: Robot, rate: float) -> None:
         self.arrow, self.folder, self.robot, self.rate = arrow, folder, robot, int(rate)
-        names = list(robot.coordinates.names)
-        hand = ["hand_x", "hand_y", "hand_z", "hand_qx", "hand_qy", "hand_qz", "hand_qw", "holding"]
+        joints = list(robot.coordinates.names)
+        names = {
+            "observation.state": [*joints, "gripper"],
+            "observation.velocity": joints,
+            "observation.environment_state": [*_HAND, "holding"],
+            "action": [*joints, "gripper"],
+        }
         self.features: dict[str, dict[str, Any]] = {
-            "observation.state": {
-                "dtype": "float32",
-                "shape": [len(names) + 1],
-                "names": [*names, "gripper"],
+            **{
+                name: {"dtype": "float32", "shape": [len(own)], "names": own}
+                for name, own in names.items()
             },
-            "observation.velocity": {"dtype": "float32", "shape": [len(names)], "names": names},
-            "observation.environment_state": {
-                "dtype": "float32",
-                "shape": [len(hand)],
-                "names": hand,
-            },
-            "action": {"dtype": "float32", "shape": [len(names) + 1], "names": [*names, "gripper"]},
             **{name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _KINDS.items()},
         }
         self.tasks: dict[str, int] = {}
@@ -129,14 +130,10 @@ class _Writer:
         count, number = len(found["time"]), len(self.rows)
         task = self.tasks.setdefault(describe_task(episode.about), len(self.tasks))
         columns: dict[str, Any] = {
-            "observation.state": np.hstack([found[name] for name in _STATE]).astype(np.float32),
-            "observation.velocity": np.hstack(
-                [found["base_velocity"], found["arm_velocity"]]
-            ).astype(np.float32),
-            "observation.environment_state": np.hstack(
-                [found["hand_pose"], found["holding"]]
-            ).astype(np.float32),
-            "action": found["actions"].astype(np.float32),
+            name: np.hstack([found[part] for part in parts]).astype(np.float32)
+            for name, parts in _COLUMNS.items()
+        }
+        columns |= {
             "timestamp": (np.arange(count) / self.rate).astype(np.float32),
             "frame_index": np.arange(count),
             "episode_index": np.full(count, number),
@@ -146,16 +143,10 @@ class _Writer:
         stats = {name: _statistics(values) for name, values in columns.items()}
         size = 0
         for name, pixels in _pictures(episode):
-            if not self.rows:
-                self.features[name] = {
-                    "dtype": "image",
-                    "shape": list(pixels.shape[1:]),
-                    "names": ["height", "width", "channels"],
-                }
-            stats[name] = _statistics(pixels.reshape(-1, 3) / 255.0)
-            stats[name] = {
-                key: value.reshape(3, 1, 1) for key, value in stats[name].items() if key != "count"
-            }
+            shape, axes = list(pixels.shape[1:]), ["height", "width", "channels"]
+            self.features[name] = {"dtype": "image", "shape": shape, "names": axes}
+            own = _statistics(pixels.reshape(-1, 3) / 255.0)
+            stats[name] = {key: value.reshape(-1, 1, 1) for key, value in own.items()}
             stats[name]["count"] = np.array([count])
             columns[name] = [
                 {"bytes": _png(one), "path": f"frame-{k:06d}.png"} for k, one in enumerate(pixels)
@@ -188,23 +179,19 @@ class _Writer:
         self.frames += count
 
     def _flush(self) -> None:
-        """Write the frames that wait to a file, a row group an episode."""
+        """Write pending frames to a file with one row group per episode."""
         arrow = self.arrow
-        path = self.folder / _DATA.format(
-            chunk_index=self.files // _CHUNK, file_index=self.files % _CHUNK
-        )
+        place = {"chunk_index": self.files // _CHUNK, "file_index": self.files % _CHUNK}
+        path = self.folder / _DATA.format(**place)
         path.parent.mkdir(parents=True, exist_ok=True)
         fields: list[Any] = []
         for name, feature in self.features.items():
-            if feature["dtype"] == "image":
-                fields.append(
-                    (name, arrow.struct([("bytes", arrow.binary()), ("path", arrow.string())]))
-                )
-                continue
             kind = arrow.float32() if feature["dtype"] == "float32" else arrow.int64()
-            fields.append(
-                (name, kind if feature["shape"] == [1] else arrow.list_(kind, feature["shape"][0]))
-            )
+            if feature["dtype"] == "image":
+                kind = arrow.struct([("bytes", arrow.binary()), ("path", arrow.string())])
+            elif feature["shape"] != [1]:
+                kind = arrow.list_(kind, feature["shape"][0])
+            fields.append((name, kind))
         schema = arrow.schema(fields)
         with arrow.parquet.ParquetWriter(path, schema, compression="snappy") as writer:
             for columns in self._waiting:
@@ -215,50 +202,24 @@ class _Writer:
                         arrays.append(arrow.array(values, kind))
                         continue
                     flat = arrow.array(values.reshape(-1))
-                    arrays.append(
-                        flat
-                        if values.ndim == 1
-                        else arrow.FixedSizeListArray.from_arrays(flat, type=kind)
-                    )
+                    rows = arrow.FixedSizeListArray.from_arrays
+                    arrays.append(flat if values.ndim == 1 else rows(flat, type=kind))
                 writer.write_table(arrow.Table.from_arrays(arrays, schema=schema))
         self._waiting, self._held, self._bytes, self.files = [], 0, 0, self.files + 1
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write pending frames, tables and statistics."""
         arrow, meta = self.arrow, self.folder / "meta"
         if self._waiting:
             self._flush()
         path = self.folder / _EPISODES.format(chunk_index=0, file_index=0)
         path.parent.mkdir(parents=True, exist_ok=True)
         arrow.parquet.write_table(arrow.Table.from_pylist(self.rows), path, compression="snappy")
-        # As pandas writes a table whose index are the tasks' texts: readers ask for the number of a
-        # text.
         columns = {
             "task_index": arrow.array(list(self.tasks.values()), arrow.int64()),
             "task": arrow.array(list(self.tasks)),
         }
-        about = {
-            "index_columns": ["task"],
-            "column_indexes": [],
-            "columns": [
-                {
-                    "name": "task_index",
-                    "field_name": "task_index",
-                    "pandas_type": "int64",
-                    "numpy_type": "int64",
-                    "metadata": None,
-                },
-                {
-                    "name": "task",
-                    "field_name": "task",
-                    "pandas_type": "unicode",
-                    "numpy_type": "object",
-                    "metadata": None,
-                },
-            ],
-            "pandas_version": "2.0.0",
-        }
-        table = arrow.table(columns).replace_schema_metadata({"pandas": json.dumps(about)})
+        table = arrow.table(columns).replace_schema_metadata({"pandas": json.dumps(_PANDAS)})
         arrow.parquet.write_table(table, meta / "tasks.parquet")
         info = {
             "codebase_version": VERSION,
@@ -275,13 +236,16 @@ class _Writer:
             "video_path": None,
             "features": self.features,
         }
-        (meta / "info.json").write_text(json.dumps(info, indent=4) + "\n", encoding="utf-8")
-        stats = {name: _together([own[name] for own in self.stats]) for name in self.features}
-        (meta / "stats.json").write_text(json.dumps(stats, indent=4) + "\n", encoding="utf-8")
+        stats = {
+            name: _merge_statistics([own[name] for own in self.stats]) for name in self.features
+        }
+        for name, content in (("info", info), ("stats", stats)):
+            text = json.dumps(content, indent=4) + "\n"
+            (meta / f"{name}.json").write_text(text, encoding="utf-8")
 
 
 def _pictures(episode: Episode) -> Iterator[tuple[str, Any]]:
-    """Yield the name of a feature and what a camera saw, shape (N, height, width, 3), camera by camera."""
+    """Yield the feature name and images of each camera, shape (N, height, width, 3)."""
     images = episode.images()
     for name, pixels in {} if images is None else images.pictures.items():
         if name.endswith(_SEEN):
@@ -289,7 +253,6 @@ def _pictures(episode: Episode) -> Iterator[tuple[str, Any]]:
 
 
 def _png(pixels: Any) -> bytes:
-    """Return an image as a PNG file."""
     from PIL import Image
 
     buffer = io.BytesIO()
@@ -298,7 +261,7 @@ def _png(pixels: Any) -> bytes:
 
 
 def _statistics(values: Any) -> dict[str, Floats]:
-    """Return least, largest, mean and deviation of every column, shape (k,) each, and how many rows there are."""
+    """Return minimum, maximum, mean and standard deviation of every column, and the row count."""
     rows = np.asarray(values, float).reshape(len(values), -1)
     return {
         "min": rows.min(axis=0),
@@ -309,13 +272,33 @@ def _statistics(values: Any) -> dict[str, Floats]:
     }
 
 
-def _together(parts: list[dict[str, Floats]]) -> dict[str, list[float]]:
-    """Return the statistics of all rows of those of some parts of them."""
-    counts = np.array([part["count"][0] for part in parts], float).reshape(
-        -1, *[1] * parts[0]["mean"].ndim
-    )
+_PANDAS = {
+    "index_columns": ["task"],
+    "column_indexes": [],
+    "columns": [
+        {
+            "name": name,
+            "field_name": name,
+            "pandas_type": pandas_type,
+            "numpy_type": numpy_type,
+            "metadata": None,
+        }
+        for name, pandas_type, numpy_type in (
+            ("task_index", "int64", "int64"),
+            ("task", "unicode", "object"),
+        )
+    ],
+    "pandas_version": "2.0.0",
+}
+"""Metadata of pandas for the table of tasks, whose texts are its index."""
+
+
+def _merge_statistics(parts: list[dict[str, Floats]]) -> dict[str, list[float]]:
+    """Merge the statistics of parts."""
+    counts = np.array([part["count"][0] for part in parts], float)
+    counts = counts.reshape(-1, *[1] * parts[0]["mean"].ndim)
     means, deviations = (np.array([part[name] for part in parts]) for name in ("mean", "std"))
-    total = counts.sum()  # images of a camera are all equally large: frames weigh as pixels do
+    total = counts.sum()  # images of a camera have one size: frames weigh as pixels do
     mean = (means * counts).sum(axis=0) / total
     variance = ((deviations**2 + (means - mean) ** 2) * counts).sum(axis=0) / total
     return {

@@ -1,4 +1,4 @@
-"""An episode sampled at a steady rate: what a robot observes and is told, as learning takes it."""
+"""Samples episodes at a constant rate as observations and actions."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ __all__ = ["sample_episode"]
 
 
 def sample_episode(episode: Episode, robot: Robot, rate: float) -> Mapping[str, Floats]:
-    """Return what is observed and told at every moment, each of shape (N, k).
+    """Return observations and actions at every sample, each of shape (N, k).
 
     Args:
-        episode: The episode.
+        episode: Episode.
         robot: Its robot.
-        rate: Moments a second.
+        rate: Sampling rate [Hz].
 
     Returns:
         `time` (N,) [s]; `base_pose` x, y [m] and yaw [rad] in the world frame; `base_velocity`;
-        `arm_position`, `arm_velocity` [rad], [rad/s]; `hand_pose`: the tool frame's position [m]
-        and quaternion x, y, z, w in the world frame; `gripper`: how far it is open [m], 0 where
-        that is not known; `holding`: 1 while something is held; `object_position`: the coordinates
-        of objects [rad] or [m]; `states`: all coordinates of robot and objects; `actions`: what
-        base, arm and gripper are at the next moment (N, n + 1).
+        `arm_position`, `arm_velocity` [rad], [rad/s]; `hand_pose`: position [m] and quaternion x, y,
+        z, w of the tool frame in the world frame; `gripper`: opening [m], 0 if unknown; `holding`: 1
+        while an object is grasped; `object_position`: coordinates of objects [rad] or [m]; `states`:
+        all coordinates of robot and objects; `actions`: base, arm and gripper at the next sample
+        (N, n + 1).
     """
     motion = episode.trajectory
     times = sample_times(motion, rate)
@@ -58,7 +58,7 @@ def sample_episode(episode: Episode, robot: Robot, rate: float) -> Mapping[str, 
 
 
 def _hands(robot: Robot, configurations: Floats) -> Floats:
-    """Return where the tool frame is at some configurations, shape (N, 7)."""
+    """Return poses of the tool frame without sign changes of the quaternion, shape (N, 7)."""
     data, frame = robot.model.createData(), robot.model.getFrameId(robot.tool_frame)
     rows = np.empty((len(configurations), 7))
     for row, configuration in zip(rows, configurations, strict=True):

@@ -1,4 +1,4 @@
-"""Recipes: what episodes of a dataset are like, as a YAML file; with a number, a recipe determines an episode."""
+"""Defines recipes of datasets; a recipe and a number determine an episode."""
 
 from __future__ import annotations
 
@@ -69,16 +69,16 @@ Names = Annotated[tuple[str, ...], require(lambda value: value, "there is nothin
 
 
 class RobotEntry(Schema):
-    """A robot by name or path, and how high its root link is, as on a stand [m]; None: as its description has it."""
+    """A robot by name or path, and the height of its root link [m]; None for its default."""
 
     name: str
     height: Number | None = None
 
 
 class RoomsSchema(Schema):
-    """Random rooms: `count` of them, the first of number `first`, or ever new ones, and ranges of what they are like.
+    """Random rooms: `count` numbers from `first`, or ever new ones, and ranges of their properties.
 
-    So many `episodes` in a row have a room and a robot in common, which makes them cheap.
+    `episodes` consecutive episodes share a room and a robot, to save time.
     """
 
     count: Whole | None = 50
@@ -91,14 +91,14 @@ class RoomsSchema(Schema):
 
 
 class StartSchema(Schema):
-    """Where episodes start: how far the base is from what it goes to [m], how far arm joints are from home [rad]."""
+    """Ranges of the distance of the base from its goal and of arm joints from home [m, rad]."""
 
     distance: Interval = (0.0, 10.0)
     arm: NonNegative = 0.0
 
 
 class GoalSchema(Schema):
-    """Where they end: by which share of its range a joint is moved, how far from a table's edge something is put [m]."""
+    """Ranges of the share of a joint's range, and of the distance from a table's edge [m]."""
 
     share: Share = (0.35, 0.65)
     edge: Interval = (0.1, 0.3)
@@ -188,12 +188,12 @@ class Recipe:
 
     @property
     def document(self) -> dict[str, Any]:
-        """All of it as plain data, from which `load_recipe` makes it again."""
+        """The recipe as plain data, which `load_recipe` accepts."""
         return self.fields.model_dump(mode="json")
 
     @property
     def digest(self) -> str:
-        """A name for what it says: the same for recipes that make the same episodes."""
+        """Digest of all that determines the episodes."""
         said = {
             key: value for key, value in self.document.items() if key not in ("name", "license")
         }
@@ -204,21 +204,21 @@ class Recipe:
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
-        """The cameras that take images."""
+        """Cameras that take images."""
         return tuple(Camera(**entry.model_dump()) for entry in self.fields.cameras)
 
     @functools.cached_property
     def terms(self) -> tuple[Term, ...]:
-        """Its own constraints and costs, in order: what every motion keeps to, about frames by words; see `terms`."""
+        """Additional constraints and costs."""
         return trace_terms_without_scene([entry.term() for entry in self.fields.terms])
 
     def select_terms(self, task: str) -> tuple[Term, ...]:
-        """Return those of its terms that a task has to keep to."""
+        """Return the terms of a task."""
         entries = zip(self.terms, self.fields.terms, strict=True)
         return tuple(term for term, entry in entries if not entry.tasks or task in entry.tasks)
 
     def rng(self, *words: object) -> np.random.Generator:
-        """Return random numbers that depend on the recipe and on some words, such as the number of an episode, alone."""
+        """Return a random generator determined by the recipe and some words, such as a number."""
         text = "/".join([self.digest, *map(str, words)])
         return np.random.default_rng(
             int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "little")
@@ -226,16 +226,15 @@ class Recipe:
 
 
 def load_recipe(recipe: str | Path | Mapping[str, Any] | Recipe, **changes: Any) -> Recipe:
-    """Return a recipe.
+    """Load and check a recipe.
 
     Args:
-        recipe: The name of one that comes with the package, the path of a YAML file, or what such a
-            file says.
-        changes: Fields that are to be otherwise; None leaves them.
+        recipe: Name of a recipe of the package, path of a YAML file, or its contents.
+        changes: Fields to replace; None keeps them.
 
     Raises:
         UnknownNameError: It, or something that it names, does not exist.
-        InputError: Something in it is wrong; the error names file, line and field.
+        InputError: A field is wrong; the error names file, line and field.
     """
     changes = {name: value for name, value in changes.items() if value is not None}
     if isinstance(recipe, Recipe):
@@ -308,7 +307,7 @@ def _options(document: Document, given: Mapping[str, Any]) -> Options:
 
 
 def get_robot_name(name: str) -> str:
-    """Return what a robot is called in a dataset: its name, or that of its file or folder."""
+    """Return the name of a robot in a dataset: its name, or that of its file or folder."""
     path = Path(name)
     return (
         (path.parent.name if path.name == "robot.yaml" else path.stem)

@@ -1,4 +1,4 @@
-"""Own constraints of recipes: what every motion of a dataset keeps to, for robots and objects that are drawn later."""
+"""Defines terms of recipes: constraints for robots and objects that are sampled later."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ Size = Annotated[tuple[Positive, Positive, Positive], require_length(3)]
 
 
 class _Entry(Schema):
-    """What all have: a name for reports, the tasks in which it holds (none: all), and whether only while the hand holds."""
+    """A term: its name, and the tasks in which it holds; all if there are none."""
 
     name: str | None = None
     tasks: tuple[str, ...] = ()
 
     def term(self) -> Term:
-        """Return it as a term about `BASE`, `HAND`, `OBJECT`, or frames by name."""
+        """Return the term with frames `BASE`, `HAND`, `OBJECT`, or frames by name."""
         raise NotImplementedError
 
 
@@ -65,24 +65,24 @@ class _Framed(_Entry):
 
     @property
     def called(self) -> str:
-        """What reports call it."""
+        """Name in reports."""
         return self.name or f"{self.type} {self.frame}"
 
     @property
     def holding(self) -> str | None:
-        """The object that must be held for it."""
+        """Object that must be grasped for it."""
         return OBJECT if self.held else None
 
 
 class UprightSchema(_Framed):
-    """An axis of a frame is never further from the vertical than an angle [rad]."""
+    """Limits the angle of a frame's axis from the vertical [rad]."""
 
     type: Literal["upright"]
     axis: Axis = (0.0, 0.0, 1.0)
     angle: Annotated[Positive, Field(lt=math.pi)] = 0.2
 
     def term(self) -> Term:
-        """Return it as a term: the vertical's share of the axis."""
+        """Return the constraint on the vertical component of the axis."""
         unit = [value / math.hypot(*self.axis) for value in self.axis]
 
         def rises(s: State) -> Any:
@@ -92,13 +92,13 @@ class UprightSchema(_Framed):
 
 
 class SpeedSchema(_Framed):
-    """The origin of a frame never moves faster than this [m/s]."""
+    """Limits the speed of a frame's origin [m/s]."""
 
     type: Literal["speed"]
     most: Positive
 
     def term(self) -> Term:
-        """Return it as a term: the speed."""
+        """Return the constraint on the speed."""
 
         def speed(s: State) -> Any:
             moved = s.velocity(self.frame)
@@ -108,14 +108,14 @@ class SpeedSchema(_Framed):
 
 
 class KeepOutSchema(_Framed):
-    """The origin of a frame is never in a box of the world, which is no obstacle otherwise."""
+    """Keeps the origin of a frame out of a box in the world frame."""
 
     type: Literal["keep-out"]
     position: Vector3
     size: Size
 
     def term(self) -> Term:
-        """Return it as a term: how far the origin is outside of the box along the axis in which that is most [m]."""
+        """Return the constraint on the largest distance outside along an axis of the box [m]."""
 
         def outside(s: State) -> Any:
             away = s.position(self.frame)
@@ -126,7 +126,7 @@ class KeepOutSchema(_Framed):
 
 
 class TracedSchema(_Entry):
-    """A constraint or cost that was a function of Python: operations, of which none runs anything but arithmetic."""
+    """A constraint or cost as recorded arithmetic operations."""
 
     type: Literal["traced"]
     traced: dict[str, Any]
@@ -143,10 +143,10 @@ Entry = UprightSchema | SpeedSchema | KeepOutSchema | TracedSchema
 
 
 def make_entries(terms: Sequence[Term]) -> list[dict[str, Any]]:
-    """Return terms as entries of a recipe: plain data.
+    """Return terms as plain entries of a recipe.
 
     Raises:
-        InputError: They are no terms, or name phases, which are called after what is drawn.
+        InputError: They are no terms, or name phases, which are not known yet.
     """
     for term in (found := trace_terms_without_scene(terms)):
         if term.during is not None:
@@ -158,11 +158,10 @@ def make_entries(terms: Sequence[Term]) -> list[dict[str, Any]]:
 
 
 def check_entries(document: Document, entries: Sequence[Entry], tasks: Sequence[str]) -> None:
-    """Refuse entries of a recipe for tasks that do not exist, two of one name, and what is no term.
+    """Check the terms of a recipe.
 
     Raises:
-        UnknownNameError: There is no such task.
-        InputError: Something else is wrong; the error names file, line and field.
+        InputError: A term is wrong, or two have the same name; the error names file, line and field.
     """
     names: list[str] = []
     for k, entry in enumerate(entries):
@@ -181,7 +180,7 @@ def check_entries(document: Document, entries: Sequence[Entry], tasks: Sequence[
 
 
 def check_robot(robot: Robot, terms: Sequence[Term]) -> None:
-    """Refuse terms about frames or coordinates that a robot lacks; those of objects ("cup.cup") are known when these are drawn.
+    """Check that a robot has the frames and coordinates of terms, except those of objects.
 
     Raises:
         UnknownNameError: It lacks one.
@@ -200,13 +199,13 @@ def check_robot(robot: Robot, terms: Sequence[Term]) -> None:
 def resolve_terms(
     terms: Sequence[Term], scene: Scene, name: str, attachment: str
 ) -> tuple[Term, ...]:
-    """Return terms about what is there.
+    """Return terms with the frames of a scene.
 
     Args:
-        terms: About `BASE`, `HAND`, `OBJECT`.
-        scene: Whose robot and objects they are about then.
-        name: The object that the episode is about.
-        attachment: Where the hand takes hold of it.
+        terms: Terms with `BASE`, `HAND` and `OBJECT`.
+        scene: Scene.
+        name: Object of the episode.
+        attachment: Attachment that is grasped.
     """
     link = scene.objects[name].object.attachments[attachment].link
     frames = {word: resolve_frame(scene.robot, word) for word in (BASE, HAND)} | {

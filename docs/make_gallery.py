@@ -17,8 +17,8 @@ from PIL import Image
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.harness.limits import LIMITS
-from vkc_pin.benchmarks.robot_object_matrix.given import parsed, ready_robot
-from vkc_pin.benchmarks.robot_object_matrix.pairs import pair
+from vkc_pin.benchmarks.robot_object_matrix.given import parse_requests, prepare_robot
+from vkc_pin.benchmarks.robot_object_matrix.pairs import make_pair
 from vkc_pin.visualization.plots.style import new_figure, save_figure, use_style
 from vkc_pin.visualization.room import load_drawn_parts
 from vkc_pin.world.trajectory.world_model import World
@@ -56,7 +56,7 @@ def opened(robot: str, file: str, thing: str, folder: Path) -> vkc.Plan:
     kept = folder / "plans" / f"{robot}_{thing}.npz"
     if kept.is_file():
         return vkc.Plan.load(kept)
-    found = pair(vkc.load_robot(file), file, thing)
+    found = make_pair(vkc.load_robot(file), file, thing)
     if found.scene is None or found.step is None:
         raise SystemExit(f"{robot} opens no {thing}: {found.because}")
     for number in range(STARTS):
@@ -190,8 +190,8 @@ def main() -> int:
     """Make it."""
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "out" / "gallery"
     ready = {
-        one.called: ready_robot(one, folder / "robots")
-        for one in parsed(list(ROBOTS), "robots", ())
+        one.called: prepare_robot(one, folder / "robots")
+        for one in parse_requests(list(ROBOTS), "robots", ())
     }
     target = ROOT / "docs" / "images" / "gallery.png"
     with use_style():

@@ -25,7 +25,7 @@ EVERY = 6  # of the waypoints that are drawn
 def main() -> int:
     """Write a picture of a narrow door on its way shut, from above: straight between knots, and as trees lead the robot."""
     scene = (
-        chores.cluttered_home()
+        chores.make_cluttered_home()
         .with_state("door", {"hinge": 1.52})
         .with_start(base=(1.2, 2.6, -1.57))
     )

@@ -116,7 +116,7 @@ def home_pictures() -> None:
 def cluttered_picture() -> None:
     """Write the picture of the home that is as full and as tight as real ones."""
     look(*HOME)
-    picture(chores.cluttered_home(), "household_cluttered", WIDE)
+    picture(chores.make_cluttered_home(), "household_cluttered", WIDE)
 
 
 def room_picture() -> None:
@@ -367,7 +367,9 @@ def main() -> int:
     )
     home = vkc.load_scene("household")
     chore = saved[2] if len(saved) > 2 else vkc.plan(home, chores.home(home), window=2)
-    through = saved[3] if len(saved) > 3 else vkc.plan(gap.started(0, SHOWN), [vkc.Reach(gap.POSE)])
+    through = (
+        saved[3] if len(saved) > 3 else vkc.plan(gap.make_start(0, SHOWN), [vkc.Reach(gap.POSE)])
+    )
     for plan in (door, stick, chore, through):
         sys.stdout.write(plan.summary() + "\n")
         if not plan.success:

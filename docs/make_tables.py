@@ -29,7 +29,7 @@ from typing import Any
 import yaml
 
 from vkc_pin.benchmarks.harness.record import distribution
-from vkc_pin.benchmarks.harness.tables import foot, markdown
+from vkc_pin.benchmarks.harness.tables import describe_run, format_table
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
@@ -99,7 +99,7 @@ def status() -> str:
         )
         median, late = distribution(own, "planning_time")
         rows.append([text, count, good(own), f"{median:.2f} s", f"{late:.2f} s"])
-    return markdown(
+    return format_table(
         ["task", "waypoints", "success", "planning time, median", "95th percentile"], rows
     )
 
@@ -131,9 +131,9 @@ def door() -> str:
     ]
     split = ["task", *(f"{name} [s]" for name in PARTS.values()), "Ipopt iterations"]
     most = max(found["meta"]["peak_memory_mb"] for found in results)
-    about = f"{foot(results[0]['meta'])} Peak memory {most:.0f} MB."
+    about = f"{describe_run(results[0]['meta'])} Peak memory {most:.0f} MB."
     return "\n\n".join(
-        [markdown([*head, "build, at most [s]"], rows), markdown(split, parts), about]
+        [format_table([*head, "build, at most [s]"], rows), format_table(split, parts), about]
     )
 
 
@@ -160,12 +160,14 @@ def drawn(name: str) -> str:
         agreed.append([said, str(own.count(False)), str(own.count(True))])
     return "\n\n".join(
         [
-            markdown(
+            format_table(
                 ["problems in", "success", *statuses, "time, median [s]", "95th percentile [s]"],
                 rows,
             ),
-            markdown(["by its own word", "the oracle finds nothing", "it finds something"], agreed),
-            foot(about),
+            format_table(
+                ["by its own word", "the oracle finds nothing", "it finds something"], agreed
+            ),
+            describe_run(about),
         ]
     )
 
@@ -236,8 +238,8 @@ def evidence() -> str:
     head = ["claim", "command", "record", "commit", "trials", "took here"]
     return "\n\n".join(
         [
-            markdown(head, rows, text=4),
-            markdown(["page", "at or after commit", "date"], rest, text=3),
+            format_table(head, rows, text=4),
+            format_table(["page", "at or after commit", "date"], rest, text=3),
         ]
     )
 

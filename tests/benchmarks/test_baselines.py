@@ -16,7 +16,7 @@ from helpers.markdown import cells
 import vkc_pin as vkc
 from vkc_pin.benchmarks import baselines
 from vkc_pin.benchmarks.baselines import COMPARED_PLANNERS
-from vkc_pin.benchmarks.comparison import shown
+from vkc_pin.benchmarks.comparison import choose_shown_trial
 from vkc_pin.benchmarks.comparison_report import report
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.planning.statistics import PlanningStatistics
@@ -207,7 +207,7 @@ def test_shown_trial_has_most_successes(good: dict[str, set[int]], expected: int
         for n in range(4)
         for m in COMPARED_PLANNERS
     ]
-    assert shown(records, COMPARED_PLANNERS) == expected
+    assert choose_shown_trial(records, COMPARED_PLANNERS) == expected
 
 
 def test_wrong_arguments_are_refused(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from helpers.fake_plan import with_metrics
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import chores
-from vkc_pin.benchmarks.harness.record import meta
+from vkc_pin.benchmarks.harness.record import describe_environment
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.scene.clearance_exemptions import find_close_pairs
 from vkc_pin.world.task.actions import compile_each_step, group_into_actions
@@ -31,7 +31,7 @@ def test_chores_have_the_papers_steps(name: str, number: int, actions: int) -> N
 
 
 def test_cluttered_home_contains_the_home() -> None:
-    home, full = vkc.load_scene("household"), chores.cluttered_home()
+    home, full = vkc.load_scene("household"), chores.make_cluttered_home()
     assert full.document["obstacles"][: len(home.document["obstacles"])] == list(
         home.document["obstacles"]
     )
@@ -51,7 +51,7 @@ def gap(scene: vkc.Scene, first: str, second: str) -> float:
 
 def test_cluttered_home_is_as_tight_as_real_ones() -> None:
     """Leaves overlap and touch walls, and handles are near obstacles."""
-    full = chores.cluttered_home()
+    full = chores.make_cluttered_home()
     opened = full.with_state("door", {"hinge": 1.52})
     assert gap(full, "door.panel", "casing_above") == pytest.approx(-0.05, abs=1e-4)
     assert gap(opened, "door.panel", "casing_above") == pytest.approx(-0.05, abs=1e-4)
@@ -107,7 +107,7 @@ def test_table_of_seeds_counts_successes_and_steps() -> None:
     trials += [record(5, "VKC", 10), record(5, "step by step", 10), record(6, "step by step", 10)]
     about = {"chores": ["fetch"], "steps": {"fetch": 10 * ["x"]}, "starts": 1, "seed": 4}
     about |= {"seeds": 3, "window": 2, "methods": ["VKC", "step by step"]}
-    text = chores.report({"meta": {**meta(), **about}, "trials": trials})
+    text = chores.report({"meta": {**describe_environment(), **about}, "trials": trials})
     assert "| fetch | 0 | in one call | 1 of 2 | all |" in text
     assert "| fetch | 0 | step by step | 2 of 3 | 1, all, all |" in text
     assert "| 8.0–9.0 | 12 | 6 |" in text, "(9 - 8) / 8 and (9 - 8) / (9 + 8)"

@@ -10,29 +10,31 @@ from helpers.experiments import run_experiment
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import gap
-from vkc_pin.benchmarks.problems.poses import CLEAR, random_start
+from vkc_pin.benchmarks.problems.poses import CLEAR, sample_random_start
 from vkc_pin.validation.validate import validate
 
 
 def test_starts_are_random_free_and_reproducible() -> None:
-    starts = [gap.started(3, number) for number in range(12)]
+    starts = [gap.make_start(3, number) for number in range(12)]
     configurations = np.array([scene.start for scene in starts])
     assert min(scene.start_clearance() for scene in starts) >= CLEAR
     assert (configurations[:, 0] < -1.0).all()
     assert (np.ptp(configurations[:, 2:], axis=0) > 3.0).all(), "any heading and arm posture"
-    np.testing.assert_array_equal(gap.started(3, 7).start, configurations[7])
-    assert not np.array_equal(gap.started(4, 7).start, configurations[7])
+    np.testing.assert_array_equal(gap.make_start(3, 7).start, configurations[7])
+    assert not np.array_equal(gap.make_start(4, 7).start, configurations[7])
 
 
 def test_random_starts_need_a_start_region() -> None:
     scene = vkc.load_scene(gap.SCENE)
     document = {key: value for key, value in scene.document.items() if key != "start_region"}
     with pytest.raises(vkc.InputError, match="start_region"):
-        random_start(vkc.Scene.from_document(document, scene.folder), np.random.default_rng(0))
+        sample_random_start(
+            vkc.Scene.from_document(document, scene.folder), np.random.default_rng(0)
+        )
 
 
 def test_robot_drives_through_the_gap_and_reaches_over_the_table() -> None:
-    plan = vkc.plan(gap.started(0, 9), [vkc.Reach(gap.POSE)])
+    plan = vkc.plan(gap.make_start(0, 9), [vkc.Reach(gap.POSE)])
     assert plan.success, plan.summary()
     assert validate(plan.scene, plan.steps, plan.trajectory, plan.options).ok
     x, y, _ = plan.trajectory.positions[:, :3].T
@@ -51,7 +53,7 @@ def test_experiment(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert table in capsys.readouterr().out
     assert record["success"] is True, record["violations"]
     assert record["first_seed"] is (record["solves"] == 1)
-    np.testing.assert_allclose(record["start"], gap.started(0, 0).start, atol=1e-8)
+    np.testing.assert_allclose(record["start"], gap.make_start(0, 0).start, atol=1e-8)
     reach = 1.4
     distance = np.linalg.norm(np.array(gap.POSE[:2]) - record["start"][:2])
     assert record["base_path_length"] > distance - reach

@@ -12,15 +12,15 @@ from helpers.experiments import run_experiment
 from helpers.small_problems import program_of
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.comparison import placed
+from vkc_pin.benchmarks.comparison import place_objects
 from vkc_pin.benchmarks.household import (
     COMPARED_PLANNERS,
     COMPARISON,
     PAPER,
     TABLE_TOP,
     TASKS,
-    on_the_coffee_table,
-    papers_home,
+    make_paper_home,
+    sample_cup_pose,
 )
 from vkc_pin.cli import main
 from vkc_pin.world.models.shapes import compute_clearance, list_placed_shapes
@@ -35,7 +35,7 @@ def test_tasks_can_be_compiled() -> None:
 
 
 def test_variant_has_the_numbers_of_the_papers_code() -> None:
-    ours, theirs = vkc.load_scene("household"), papers_home()
+    ours, theirs = vkc.load_scene("household"), make_paper_home()
     differing = {name: task.steps for name, task in PAPER.tasks.items() if task != TASKS[name]}
     assert differing == {
         "cup": (vkc.Place("cup", (-0.6, -1.6, 1.11)),),
@@ -78,7 +78,7 @@ def test_variant_is_run_and_reported(tmp_path: Path) -> None:
 def test_every_task_is_planned(name: str, method: str) -> None:
     task = TASKS[name]
     (spec,) = COMPARISON.specify(trials=1, seed=7, tasks=[name], methods=[method])
-    scene = placed(vkc.load_scene(task.scene), spec).with_start(base=spec["base"])
+    scene = place_objects(vkc.load_scene(task.scene), spec).with_start(base=spec["base"])
     plan = COMPARISON.plan_trial(scene, spec)
     if method == "VKC":
         assert plan.success, plan.summary()
@@ -96,7 +96,7 @@ def test_cup_stands_wholly_on_the_coffee_table() -> None:
     center, half = plate.placement.translation[:2], plate.geometry.halfSide[:2]
     np.testing.assert_allclose(np.transpose(TABLE_TOP), [center - half, center + half])
     others = list_placed_shapes([shape for shape in scene.obstacles if shape is not plate])
-    poses = np.array([on_the_coffee_table(scene, rng)["cup"] for _ in range(300)])
+    poses = np.array([sample_cup_pose(scene, rng)["cup"] for _ in range(300)])
     for pose in poses[:40]:
         there = scene.with_placement("cup", pin.SE3(pin.rpy.rpyToMatrix(*pose[3:]), pose[:3]))
         cup = list_placed_shapes(make_world_shapes(there.objects["cup"]))
@@ -113,8 +113,8 @@ def test_places_and_starts_depend_on_seed_and_task_alone() -> None:
     assert all(s["seed"] == 3 + s["number"] for s in specs)
     rng, scene = np.random.default_rng([3, 0]), vkc.load_scene("household")
     for number in (0, 1):
-        pose = on_the_coffee_table(scene, rng)
-        base = placed(scene, {"placed": pose}).sample_start(rng).start[:3].tolist()
+        pose = sample_cup_pose(scene, rng)
+        base = place_objects(scene, {"placed": pose}).sample_start(rng).start[:3].tolist()
         mine = [s for s in specs if (s["scene"], s["number"]) == ("cup", number)]
         assert [(s["placed"], s["base"]) for s in mine] == 2 * [(pose, base)]
     assert all("placed" not in s for s in specs if s["scene"] != "cup")

@@ -11,17 +11,17 @@ from helpers.experiments import run_experiment
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import scale
-from vkc_pin.benchmarks.scale import crowded, refined
+from vkc_pin.benchmarks.scale import make_crowded_scene, make_refined_options
 from vkc_pin.errors import InputError
 
 
 def test_more_obstacles_include_the_fewer() -> None:
-    few, some, many = (crowded(count) for count in (10, 30, 300))
+    few, some, many = (make_crowded_scene(count) for count in (10, 30, 300))
     assert [len(scene.obstacle_names) for scene in (few, some, many)] == [10, 30, 300]
     assert some.obstacle_names[:10] == few.obstacle_names
     assert many.document["obstacles"][:30] == some.document["obstacles"]
     assert many.start_clearance() == some.start_clearance()
-    assert crowded(30, seed=1).document["obstacles"] != some.document["obstacles"]
+    assert make_crowded_scene(30, seed=1).document["obstacles"] != some.document["obstacles"]
     assert set(few.obstacle_labels) >= {"wall_west", "wall_above_door", "hall_wall"}
 
 
@@ -37,7 +37,7 @@ def test_starts_are_shared_and_free_among_all_obstacles() -> None:
     assert [t["base"] for t in more] == bases[:4:2]
     assert scale.specify(starts=1, seed=5, counts=(10,))[0]["base"] != bases[0]
     for base in bases[::2]:
-        assert crowded(1000).with_start(base=base).start_clearance() >= 0.03
+        assert make_crowded_scene(1000).with_start(base=base).start_clearance() >= 0.03
 
 
 @pytest.mark.parametrize(("of", "counts"), [("obstacles", (30, 60)), ("segments", (40, 80))])
@@ -62,14 +62,16 @@ def test_experiment(of: str, counts: tuple[int, int], tmp_path: Path) -> None:
 def test_refined_options_divide_the_same_time(segments: int) -> None:
     phases = [
         np.array([o.reach_waypoints, o.turn_waypoints, o.move_waypoints])
-        for o in (refined(segments), vkc.Options())
+        for o in (make_refined_options(segments), vkc.Options())
     ]
     assert phases[0].sum() == segments
-    assert refined(segments).dt * segments == pytest.approx(vkc.Options().dt * phases[1].sum())
+    assert make_refined_options(segments).dt * segments == pytest.approx(
+        vkc.Options().dt * phases[1].sum()
+    )
     if segments >= 20:
         shares = [part / part.sum() for part in phases]
         np.testing.assert_allclose(*shares, atol=0.05)
-    assert (refined(segments) == vkc.Options()) == (segments == 76)
+    assert (make_refined_options(segments) == vkc.Options()) == (segments == 76)
 
 
 def test_errors_have_no_planning_time() -> None:

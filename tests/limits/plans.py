@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.problems.problem_set import NUMBER, TASKS, problem, started
+from vkc_pin.benchmarks.problems.problem_set import NUMBER, TASKS, make_start, problem
 
 __all__ = ["exported"]
 
@@ -32,7 +32,7 @@ def exported(folder: Path, count: int, *, first: int = 0, seed: int = 0) -> Iter
                 scene, steps = chosen.scene, chosen.steps
             else:
                 name = list(TASKS)[number % len(TASKS)]
-                scene, steps = started(name, seed, number), TASKS[name].steps
+                scene, steps = make_start(name, seed, number), TASKS[name].steps
             plan = vkc.plan(scene, steps, seed=seed, max_evaluations=1_000_000)
             if not plan.success:
                 continue

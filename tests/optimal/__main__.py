@@ -12,10 +12,10 @@ from typing import Any
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.executing.execution import TASKS
-from vkc_pin.benchmarks.harness.record import commit
-from vkc_pin.benchmarks.harness.tables import foot
+from vkc_pin.benchmarks.harness.record import find_commit
+from vkc_pin.benchmarks.harness.tables import describe_run
 from vkc_pin.benchmarks.problems.problem_set import TASKS as ALL
-from vkc_pin.benchmarks.problems.problem_set import started
+from vkc_pin.benchmarks.problems.problem_set import make_start
 from vkc_pin.utils.parallel.machine import describe_machine, find_versions, measure_peak_memory
 
 from .bound import bound
@@ -45,7 +45,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def report(result: Mapping[str, Any]) -> str:
     """Return the table of a record in Markdown, with versions and machine at the foot."""
-    return table(result["trials"]) + "\n" + foot(result["meta"]) + "\n"
+    return table(result["trials"]) + "\n" + describe_run(result["meta"]) + "\n"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -59,7 +59,7 @@ def main(arguments: list[str] | None = None) -> int:
     rows, began, known = list[dict[str, Any]](), time.perf_counter(), describe_machine()
     for name in given.tasks:
         for number in range(given.starts):
-            scene = started(name, given.seed, number)
+            scene = make_start(name, given.seed, number)
             plan = vkc.plan(scene, ALL[name].steps, seed=given.seed, max_evaluations=1_000_000)
             if plan.success:
                 least, heavy = bound(plan.scene, plan.trajectory)
@@ -71,7 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
                     "least": least,
                     "heavy": heavy,
                 }
-                rows.append({**row, "commit": commit()})
+                rows.append({**row, "commit": find_commit()})
     if given.json is not None:
         session = {"jobs": 1, "trials": len(rows), "seconds": round(time.perf_counter() - began, 1)}
         meta = {

@@ -10,7 +10,7 @@ from helpers.small_problems import SHORT, all_pairs, program_of, random_configur
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.benchmarks.scale import crowded
+from vkc_pin.benchmarks.scale import make_crowded_scene
 from vkc_pin.planning.chain.contacts import ContactModel
 from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
@@ -30,7 +30,7 @@ def test_distance_queries_hardly_depend_on_the_number_of_obstacles() -> None:
     queries, plans = [], []
     for count in (30, 1000):
         before = count_distance_queries()
-        plans.append(plan(crowded(count), [Actuate("door", {"hinge": 1.2})]))
+        plans.append(plan(make_crowded_scene(count), [Actuate("door", {"hinge": 1.2})]))
         assert plans[-1].success
         queries.append(count_distance_queries() - before)
     assert plans[1].metrics["rounds"] <= 2 * plans[0].metrics["rounds"]

@@ -24,7 +24,7 @@ from helpers.litter import AT, BIN, littered, shelf
 from helpers.small_problems import full_scene, with_objects
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.robot_object_matrix.pairs import description_of, hall
+from vkc_pin.benchmarks.robot_object_matrix.pairs import load_description, make_hall
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
@@ -170,7 +170,7 @@ def add_attachment(scene: Scene, owner: str, name: str, z: float) -> Scene:
 
 
 def make_refrigerator() -> Scene:
-    return hall("husky_ur5e", "refrigerator_0", description_of("refrigerator_0")).sample_start(
+    return make_hall("husky_ur5e", "refrigerator_0", load_description("refrigerator_0")).sample_start(
         np.random.default_rng(0)
     )
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from vkc_pin.benchmarks.comparison import COMPARED_PLANNERS, Assignment, Comparison
-from vkc_pin.benchmarks.comparison_report import compared_methods
+from vkc_pin.benchmarks.comparison_report import select_compared_methods
 from vkc_pin.benchmarks.harness.charts import criteria_chart
 from vkc_pin.benchmarks.harness.record import Record
 from vkc_pin.world.task.steps import Actuate
@@ -25,7 +25,7 @@ def _draw(
     records: Sequence[Record], out: Path, tasks: Mapping[str, str], methods: Sequence[str]
 ) -> list[str]:
     """Draw the criteria of each task as bars, <task>.png."""
-    compared = compared_methods(methods)
+    compared = select_compared_methods(methods)
     for task, name in tasks.items():
         own = [record for record in records if record["scene"] == task]
         starts = len({record["number"] for record in own})

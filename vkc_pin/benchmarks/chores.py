@@ -21,11 +21,11 @@ from vkc_pin.benchmarks.harness.runner import Execution
 from vkc_pin.benchmarks.harness.tables import (
     JUDGED,
     count,
-    decimal,
-    failures,
-    markdown,
-    medians,
-    page,
+    count_failures,
+    format_decimal,
+    format_medians,
+    format_table,
+    join_report,
     select,
 )
 from vkc_pin.options import Options
@@ -35,7 +35,7 @@ from vkc_pin.procedural.rooms.clutter import add_clutter
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step
 
-__all__ = ["CHORES", "Chore", "cluttered_home", "fetch", "home", "plan_trial", "report", "run"]
+__all__ = ["CHORES", "Chore", "fetch", "home", "make_cluttered_home", "plan_trial", "report", "run"]
 
 WINDOW = 2
 ONE_CALL, STEP_BY_STEP = "VKC", "step by step"
@@ -145,7 +145,7 @@ TIGHT: tuple[dict[str, Any], ...] = (
 
 
 @functools.cache
-def cluttered_home() -> Scene:
+def make_cluttered_home() -> Scene:
     """Return the scene `household` with `TIGHT` and 300 more objects: 561 convex shapes."""
     home, places = load_scene("household"), (BAR_TABLE, DESK, CLEAR, BIN)
     with warnings.catch_warnings(
@@ -173,7 +173,7 @@ class Chore:
 CHORES = {
     "home": Chore(functools.partial(load_scene, "household"), home),
     "fetch": Chore(functools.partial(load_scene, "fetch"), fetch),
-    "cluttered": Chore(cluttered_home, home, Options(dist_safe=0.005)),
+    "cluttered": Chore(make_cluttered_home, home, Options(dist_safe=0.005)),
 }
 """By name."""
 
@@ -213,7 +213,7 @@ def run(
         step_by_step: Whether to plan the steps one by one as well.
         solve: Plans a trial in one call.
     """
-    chores, specs = runner.chosen("chore", chores, CHORES), list[dict[str, Any]]()
+    chores, specs = runner.select_names("chore", chores, CHORES), list[dict[str, Any]]()
     methods = (ONE_CALL, *((STEP_BY_STEP,) if step_by_step else ()))
     for chore in chores:
         scene = CHORES[chore].scene()
@@ -262,19 +262,22 @@ def report(result: Mapping[str, Any]) -> str:
     seeds, methods = about.get("seeds", 1), about.get("methods", [ONE_CALL])
     for chore in about["chores"]:
         own = select(records, scene=chore, method=ONE_CALL)
-        late = decimal(distribution(own, "planning_time")[1])
-        lengths = medians(
+        late = format_decimal(distribution(own, "planning_time")[1])
+        lengths = format_medians(
             select(own, success=True), "base_path_length", "arm_path_length", "duration"
         )
-        steps, times = str(len(about["steps"][chore])), medians(own, "wall_time", "planning_time")
-        rows.append([chore, steps, count(own), *times, late, *lengths, failures(own)])
+        steps, times = (
+            str(len(about["steps"][chore])),
+            format_medians(own, "wall_time", "planning_time"),
+        )
+        rows.append([chore, steps, count(own), *times, late, *lengths, count_failures(own)])
     times_head = ["in all, median [s]", "planning, median [s]", "95th percentile [s]"]
     lengths_head = ["base [m]", "arm [rad]", "duration [s]", "failures"]
     fields = ("wall_time", "planning_time", "base_path_length", "arm_path_length")
     every = []
     for r in records:
         cells = [r["scene"], str(r["number"]), str(r["seed"]), _METHODS[r["method"]], r["status"]]
-        every.append([*cells, *(decimal(r.get(field) or float("nan")) for field in fields)])
+        every.append([*cells, *(format_decimal(r.get(field) or float("nan")) for field in fields)])
     head = ["chore", "start", "seed", "planned", "status", "in all [s]", "planning [s]"]
     parts = [
         "# Chores",
@@ -282,12 +285,12 @@ def report(result: Mapping[str, Any]) -> str:
         f"own, with {seeds} seeds each from {about['seed']} on; a window of {about['window']} "
         f"actions. {JUDGED} The time in all includes building symbolic programs; path lengths "
         "and durations are medians of successes.",
-        markdown(["chore", "steps", "success", *times_head, *lengths_head], rows),
+        format_table(["chore", "steps", "success", *times_head, *lengths_head], rows),
     ]
     if seeds > 1 or len(methods) > 1:
         parts += ["## Seeds", _SEEDS_ABOUT, _seeds_table(result)]
-    parts += ["## Every trial", markdown([*head, "base [m]", "arm [rad]"], every, text=5)]
-    return page(about, *parts)
+    parts += ["## Every trial", format_table([*head, "base [m]", "arm [rad]"], every, text=5)]
+    return join_report(about, *parts)
 
 
 def _seeds_table(result: Mapping[str, Any]) -> str:
@@ -303,12 +306,16 @@ def _seeds_table(result: Mapping[str, Any]) -> str:
         for length in ("base_path_length", "arm_path_length"):
             found = values(select(own, success=True), length)
             spreads += _apart(min(found), max(found)) if found else ["–"] * 3
-        cpu = (decimal(float(np.median(times))), decimal(max(times))) if times else ("–", "–")
+        cpu = (
+            (format_decimal(float(np.median(times))), format_decimal(max(times)))
+            if times
+            else ("–", "–")
+        )
         done = ", ".join(counts) or "–"
         rows.append([chore, str(number), _METHODS[method], count(own), done, *cpu, *spreads])
     head = ["chore", "start", "planned", "success", "steps done", "CPU, median [s]", "most [s]"]
     head += ["base [m]", "spread [%]", "±[%]", "arm [rad]", "spread [%]", "±[%]"]
-    return markdown(head, rows, text=3)
+    return format_table(head, rows, text=3)
 
 
 def _apart(low: float, high: float) -> list[str]:
@@ -328,9 +335,12 @@ def _record(spec: dict[str, Any], solve: Solve) -> dict[str, Any]:
     about = {"method": spec["method"], "seed": spec["seed"]}
     more: dict[str, Any] = {"number": spec["number"]}
     if spec["method"] == STEP_BY_STEP:
-        plans = stepwise.step_by_step(scene, steps, options=chore.options, seed=spec["seed"])
+        plans = stepwise.plan_step_by_step(scene, steps, options=chore.options, seed=spec["seed"])
         more |= {"wall_time": time.perf_counter() - began, "cpu_time": time.process_time() - before}
-        return {**stepwise.combined(plans, len(steps), **about, **more), "scene": spec["scene"]}
+        return {
+            **stepwise.combine_records(plans, len(steps), **about, **more),
+            "scene": spec["scene"],
+        }
     plan = solve(scene, spec)
     more |= {"wall_time": time.perf_counter() - began, "cpu_time": time.process_time() - before}
     more |= {

@@ -15,7 +15,14 @@ from typing import Any
 
 from vkc_pin.utils.interrupt import raise_on_interrupt
 
-__all__ = ["EXIT_INTERRUPTED", "EXIT_OK", "add_bench", "natural", "positive", "stopped"]
+__all__ = [
+    "EXIT_INTERRUPTED",
+    "EXIT_OK",
+    "add_bench",
+    "parse_natural",
+    "parse_positive",
+    "report_interruption",
+]
 
 EXIT_OK, EXIT_INTERRUPTED = 0, 130
 
@@ -61,7 +68,10 @@ def _add_comparisons(benches: Any) -> None:
         finer = "B1x1 B2x1 (as many waypoints as VKC, not twice as many) B1x3 B2x3"
         _add_choice(parser, "methods", f"B1 B2 VKC (default: these) {finer}")
         parser.add_argument(
-            "--max-evaluations", type=positive, metavar="E", help="of a trial (default 1000000)"
+            "--max-evaluations",
+            type=parse_positive,
+            metavar="E",
+            help="of a trial (default 1000000)",
         )
         if name == "household":
             about = "paper: the tasks of cup and dishwasher with the numbers of the paper's code"
@@ -93,7 +103,7 @@ def _add_scenes(benches: Any) -> None:
     of = ("obstacles", "segments")
     parser.add_argument("--of", choices=of, default=of[0], help=f"(default: {of[0]})")
     about = "numbers (default: 10 30 100 300 1000 obstacles, 20 40 80 160 320 segments)"
-    parser.add_argument("--counts", nargs="+", type=positive, metavar="N", help=about)
+    parser.add_argument("--counts", nargs="+", type=parse_positive, metavar="N", help=about)
 
     about = "open a door and a drawer with every kind of base"
     parser = _add_experiment(benches, "bases", about, module="driving.bases")
@@ -152,12 +162,12 @@ def _add_problems(benches: Any) -> None:
     _add_count(ablation, "--starts", 10, "random starts per task")
     about = "plan each of sixty problems with several random seeds"
     spread = _add_experiment(benches, "spread", about, module="problems.spread")
-    least = functools.partial(natural, least=2)
+    least = functools.partial(parse_natural, least=2)
     about = "random seeds per problem (default 5)"
     spread.add_argument("--seeds", type=least, default=5, metavar="K", help=about)
     for parser in (ablation, spread):
         about = "numbers from 0 to 59 (default: all)"
-        parser.add_argument("--problems", nargs="+", type=natural, metavar="N", help=about)
+        parser.add_argument("--problems", nargs="+", type=parse_natural, metavar="N", help=about)
 
     about = "count how often the first initial guess suffices"
     parser = _add_experiment(benches, "first-seed", about, module="problems.first_seed")
@@ -203,12 +213,12 @@ def _add_count(
     parser: argparse.ArgumentParser, option: str, default: int, about: str, metavar: str = "N"
 ) -> None:
     about = f"{about} (default {default})"
-    parser.add_argument(option, type=positive, default=default, metavar=metavar, help=about)
+    parser.add_argument(option, type=parse_positive, default=default, metavar=metavar, help=about)
 
 
 def _add_seed(parser: argparse.ArgumentParser, about: str) -> None:
     about = f"random seed {about} (default 0)"
-    parser.add_argument("--seed", type=natural, default=0, metavar="S", help=about)
+    parser.add_argument("--seed", type=parse_natural, default=0, metavar="S", help=about)
 
 
 def _add_choice(parser: argparse.ArgumentParser, names: str, choices: str) -> None:
@@ -247,14 +257,14 @@ def _bench_experiment(arguments: argparse.Namespace) -> int:
         with raise_on_interrupt():
             experiment.run(**settings, progress=not arguments.quiet)
     except KeyboardInterrupt as stop:
-        return stopped(arguments.given, stop)
+        return report_interruption(arguments.given, stop)
     table = (Path(arguments.out) / "table.md").read_text(encoding="utf-8")
     files = "This table (table.md), its pictures, results.json and results.csv"
     sys.stdout.write(f"{table}\n{files} are in {arguments.out}\n")
     return EXIT_OK
 
 
-def stopped(given: Sequence[str], stop: KeyboardInterrupt) -> int:
+def report_interruption(given: Sequence[str], stop: KeyboardInterrupt) -> int:
     """Print how to resume an interrupted command; return its exit code.
 
     Args:
@@ -267,7 +277,7 @@ def stopped(given: Sequence[str], stop: KeyboardInterrupt) -> int:
     return EXIT_INTERRUPTED
 
 
-def natural(text: str, least: int = 0) -> int:
+def parse_natural(text: str, least: int = 0) -> int:
     """Parse a whole number of at least `least`."""
     if not text.isdigit() or int(text) < least:
         raise argparse.ArgumentTypeError(
@@ -276,5 +286,5 @@ def natural(text: str, least: int = 0) -> int:
     return int(text)
 
 
-positive = functools.partial(natural, least=1)
+parse_positive = functools.partial(parse_natural, least=1)
 """Parses a whole number of at least 1."""

@@ -21,7 +21,7 @@ from vkc_pin.benchmarks.comparison_report import WAYPOINTS, report
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import motions_chart
 from vkc_pin.benchmarks.harness.limits import LIMITS, MAX_EVALUATIONS
-from vkc_pin.benchmarks.harness.record import Record, Solve, peaks, trial
+from vkc_pin.benchmarks.harness.record import Record, Solve, compute_peaks, trial
 from vkc_pin.benchmarks.harness.runner import Execution
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, plan
@@ -112,7 +112,7 @@ class Comparison:
             starts: list[dict[str, Any]] = []
             for _ in range(trials):
                 more = {"placed": task.scatter(scene, rng)} if task.scatter else {}
-                base = placed(scene, more).sample_start(rng).start[:3].tolist()
+                base = place_objects(scene, more).sample_start(rng).start[:3].tolist()
                 starts.append({"base": base, **more})
             for method in methods:
                 for number, start in enumerate(starts):
@@ -157,8 +157,8 @@ class Comparison:
         Returns:
             See `runner.run`; the `scene` of a trial is the name of its task.
         """
-        tasks = runner.chosen("task", self.tasks if tasks is None else tasks, self.tasks)
-        methods = runner.chosen("method", methods, METHODS)
+        tasks = runner.select_names("task", self.tasks if tasks is None else tasks, self.tasks)
+        methods = runner.select_names("method", methods, METHODS)
         runner.check_positive(trials=trials)
         out, progress = Path(out), execution.get("progress", True)
         specs = self.specify(
@@ -171,7 +171,7 @@ class Comparison:
             "tasks": tasks,
             "methods": methods,
             "scenes": {name: self.tasks[name].scene for name in tasks},
-            "goals": {name: goals(self.tasks[name].steps) for name in tasks},
+            "goals": {name: list_goals(self.tasks[name].steps) for name in tasks},
             **{**LIMITS, "max_evaluations": max_evaluations, "retries": RETRIES},
         }
         trials_of = _Trials(self, out, solve or self.plan_trial, timed=solve is None)
@@ -197,14 +197,14 @@ class Comparison:
         return report(result, names, title=self.title, saved=saved, pictures=pictures)
 
 
-def placed(scene: Scene, spec: Mapping[str, Any]) -> Scene:
+def place_objects(scene: Scene, spec: Mapping[str, Any]) -> Scene:
     """Return a scene with its objects at the poses of a trial."""
     for name, pose in spec.get("placed", {}).items():
         scene = scene.with_placement(name, as_placement(pose))
     return scene
 
 
-def goals(steps: Sequence[Step]) -> dict[str, Any]:
+def list_goals(steps: Sequence[Step]) -> dict[str, Any]:
     """Return the goals of steps: "<object>.<joint>" → value, object or "base" → pose."""
     found: dict[str, Any] = {}
     for step in steps:
@@ -233,7 +233,7 @@ class _Trials:
         found, times = self._plan_timed(spec)
         if save_failures and not found.success and found.status != "interrupted":
             found.save(self._file(spec, "failures"))
-        own = {"duration": found.metrics["duration"], **peaks(found.trajectory), **times}
+        own = {"duration": found.metrics["duration"], **compute_peaks(found.trajectory), **times}
         own |= {key: spec[key] for key in ("scene", "number", "placed") if key in spec}
         return trial(found, method=spec["method"], seed=spec["seed"], **own)
 
@@ -267,7 +267,9 @@ class _Trials:
         methods, pictures = tuple(dict.fromkeys(spec["method"] for spec in specs)), []
         for task in dict.fromkeys(spec["scene"] for spec in specs):
             name = self.experiment.tasks[task].name
-            number = shown([record for record in records if record["scene"] == task], methods)
+            number = choose_shown_trial(
+                [record for record in records if record["scene"] == task], methods
+            )
             if number is None:
                 continue
             chosen = [s for s in specs if (s["scene"], s["number"]) == (task, number)]
@@ -305,7 +307,7 @@ class _Trials:
 
     def _plan(self, spec: Mapping[str, Any]) -> Plan:
         name = self.experiment.tasks[spec["scene"]].scene
-        scene = placed(_load_scene_once(self.experiment.load, name), spec)
+        scene = place_objects(_load_scene_once(self.experiment.load, name), spec)
         return self.solve(scene.with_start(base=spec["base"]), spec)
 
     def _file(self, spec: Mapping[str, Any], folder: str) -> Path:
@@ -317,7 +319,7 @@ def _load_scene_once(load: Callable[[str], Scene], name: str) -> Scene:
     return load(name)
 
 
-def shown(records: Sequence[Record], methods: Sequence[str]) -> int | None:
+def choose_shown_trial(records: Sequence[Record], methods: Sequence[str]) -> int | None:
     """Return the trial with most successes, if possible one of VKC; None without any success."""
     good: dict[int, set[str]] = {}
     for record in records:

@@ -7,21 +7,21 @@ from itertools import product
 from typing import Any
 
 from vkc_pin.baselines.separate import BASELINES
-from vkc_pin.benchmarks.harness.limits import allowed
+from vkc_pin.benchmarks.harness.limits import describe_limit
 from vkc_pin.benchmarks.harness.record import Record, distribution, values
 from vkc_pin.benchmarks.harness.tables import (
     EFFORTS,
-    common,
-    decimal,
-    foot,
-    lower,
-    markdown,
-    mean_and_deviation,
-    timed_out,
-    wilson,
+    compute_mean_and_deviation,
+    compute_wilson_interval,
+    count_lower,
+    count_timeouts,
+    describe_run,
+    find_common_successes,
+    format_decimal,
+    format_table,
 )
 
-__all__ = ["BUDGETS", "CRITERIA", "WAYPOINTS", "compared_methods", "report"]
+__all__ = ["BUDGETS", "CRITERIA", "WAYPOINTS", "report", "select_compared_methods"]
 
 WAYPOINTS = {f"{method}x{finer}": (method, finer) for finer in (1, 3) for method in BASELINES}
 """Baselines with other numbers of waypoints than is best for them: name → method, multiple of VKC's number."""
@@ -38,7 +38,7 @@ BUDGETS = {"a tenth": 0.1, "a third": 1 / 3, "two thirds": 2 / 3, "all": 1.0}
 _OWN = "VKC"
 
 
-def compared_methods(methods: Sequence[str]) -> Sequence[str]:
+def select_compared_methods(methods: Sequence[str]) -> Sequence[str]:
     """Return the methods whose motions are compared; other numbers of waypoints only if alone."""
     return [method for method in methods if method not in WAYPOINTS] or methods
 
@@ -62,13 +62,13 @@ def report(
     """
     about, records = result["meta"], result["trials"]
     methods = about["methods"]
-    compared = compared_methods(methods)
+    compared = select_compared_methods(methods)
     *first, last = (f"`{task}`: {name}" for task, name in tasks.items())
     parts = [
         f"# {title}",
         f"{', '.join(first)}{' and ' * bool(first)}{last}. {about['starts']} random "
         f"start{'s' * (about['starts'] != 1)} per task, the same for all methods; seed {about['seed']}. Per "
-        f"trial {allowed(about)}, in which the baselines try up to {about['retries']} times. "
+        f"trial {describe_limit(about)}, in which the baselines try up to {about['retries']} times. "
         "Success is the word of the independent validation. Standard deviations are those of samples (n − 1).",
         "## Success",
         _success(records, tasks, methods),
@@ -94,7 +94,7 @@ def report(
             "`vkc-pin view FILE` shows them, links that come too close in red.",
             _failed(records, saved),
         ]
-    return "\n\n".join([*parts, foot(about)]) + "\n"
+    return "\n\n".join([*parts, describe_run(about)]) + "\n"
 
 
 def _success(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> str:
@@ -106,9 +106,11 @@ def _success(records: Sequence[Record], tasks: Mapping[str, str], methods: Seque
             if record["method"] == method and task in ("all", record["scene"])
         ]
         good = sum(bool(record["success"]) for record in own)
-        low, high = (f"{100.0 * end:.0f}" for end in wilson(good, len(own)))
+        low, high = (f"{100.0 * end:.0f}" for end in compute_wilson_interval(good, len(own)))
         rate = f"{100.0 * good / len(own):.0f}" if own else "–"
-        rows.append([task, method, f"{good} of {len(own)}", rate, f"{low}–{high}", *timed_out(own)])
+        rows.append(
+            [task, method, f"{good} of {len(own)}", rate, f"{low}–{high}", *count_timeouts(own)]
+        )
     head = [
         "task",
         "method",
@@ -118,7 +120,7 @@ def _success(records: Sequence[Record], tasks: Mapping[str, str], methods: Seque
         "timed out",
         "failures: cause (violated first)",
     ]
-    return markdown(head, rows, text=2)
+    return format_table(head, rows, text=2)
 
 
 def _times(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> str:
@@ -130,10 +132,10 @@ def _times(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequenc
             cells = (
                 median,
                 late,
-                *mean_and_deviation(times),
+                *compute_mean_and_deviation(times),
                 median / distribution(reference, "planning_time")[0],
             )
-            rows.append([name, task, method, str(len(times)), *map(decimal, cells)])
+            rows.append([name, task, method, str(len(times)), *map(format_decimal, cells)])
     head = [
         "over",
         "task",
@@ -145,7 +147,7 @@ def _times(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequenc
         "deviation [s]",
         f"to {_OWN}",
     ]
-    return markdown(head, rows, text=3)
+    return format_table(head, rows, text=3)
 
 
 def _calls(
@@ -156,8 +158,10 @@ def _calls(
     for task, method in product(tasks, methods):
         own = _of(records, task, method)
         if values(own, "wall_time"):
-            first = [decimal(distribution(own, field)[0]) for field in ("cold_time", "warm_time")]
-            wall = [decimal(value) for value in distribution(own, "wall_time")]
+            first = [
+                format_decimal(distribution(own, field)[0]) for field in ("cold_time", "warm_time")
+            ]
+            wall = [format_decimal(value) for value in distribution(own, "wall_time")]
             rows.append([task, method, str(len(values(own, "cold_time"))), *first, *wall])
     head = [
         "task",
@@ -172,7 +176,7 @@ def _calls(
         "By the clock, with everything. The first trials of a task are planned twice by a planner that has kept nothing: cold, "
         "with writing down the symbolic programs and loading or compiling them, and warm. All: as they come."
     )
-    return ["## From call to plan", text, markdown(head, rows, text=2)] if rows else []
+    return ["## From call to plan", text, format_table(head, rows, text=2)] if rows else []
 
 
 def _budgets(
@@ -206,7 +210,7 @@ def _budgets(
         "Successes within shares of the budget. Effort only ends planning, so a success within a share is one with that as the "
         "budget, too; two thirds and half as much again are all of it."
     )
-    return ["## Had the budget been smaller", text, markdown(head, rows, text=2)]
+    return ["## Had the budget been smaller", text, format_table(head, rows, text=2)]
 
 
 def _numbers(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> str:
@@ -215,7 +219,7 @@ def _numbers(records: Sequence[Record], tasks: Mapping[str, str], methods: Seque
     for task in tasks:
         own = [record for record in records if record["scene"] == task]
         numbers.append(
-            f"{len(common(own, methods))} of {len({record['number'] for record in own})} ({task})"
+            f"{len(find_common_successes(own, methods))} of {len({record['number'] for record in own})} ({task})"
         )
     return ", ".join(numbers)
 
@@ -229,13 +233,13 @@ def _criteria(
         own = [record for record in records if record["scene"] == task]
         good = {method: _of(own, task, method, good=True) for method in methods}
         if shared:
-            both = common(own, methods)
+            both = find_common_successes(own, methods)
             good = {method: [row[k] for row in both] for k, method in enumerate(methods)}
         if not shared:
             rows.append([task, "n", *(str(len(good[method])) for method in methods)])
         for field, name in CRITERIA.items():
             rows.append([task, name, *(_spread(good[method], field) for method in methods)])
-    return markdown(["task", "criterion", *methods], rows, text=2)
+    return format_table(["task", "criterion", *methods], rows, text=2)
 
 
 def _pairwise(
@@ -248,15 +252,19 @@ def _pairwise(
     rows = []
     for other in others:
         for task in tasks:
-            both = common([record for record in records if record["scene"] == task], (_OWN, other))
+            both = find_common_successes(
+                [record for record in records if record["scene"] == task], (_OWN, other)
+            )
             for field, name in {**CRITERIA, "planning_time": "planning time [s]"}.items():
                 medians = (
-                    decimal(distribution([row[k] for row in both], field)[0]) for k in (0, 1)
+                    format_decimal(distribution([row[k] for row in both], field)[0]) for k in (0, 1)
                 )
-                rows.append([task, name, other, *medians, f"{lower(both, field)} of {len(both)}"])
+                rows.append(
+                    [task, name, other, *medians, f"{count_lower(both, field)} of {len(both)}"]
+                )
     head = ["task", "criterion", "other", f"{_OWN}, median", "other, median", f"lower with {_OWN}"]
     text = f"Over the trials in which {_OWN} and the other method succeed, whatever the third does."
-    return [f"## {_OWN} against each baseline", text, markdown(head, rows, text=3)]
+    return [f"## {_OWN} against each baseline", text, format_table(head, rows, text=3)]
 
 
 def _failed(records: Sequence[Record], saved: Mapping[str, str]) -> str:
@@ -273,7 +281,9 @@ def _failed(records: Sequence[Record], saved: Mapping[str, str]) -> str:
                 f"`{saved[record['key']]}`",
             ]
             rows.append([str(cell) for cell in cells])
-    return markdown(["task", "trial", "method", "cause", "violated first", "file"], rows, text=6)
+    return format_table(
+        ["task", "trial", "method", "cause", "violated first", "file"], rows, text=6
+    )
 
 
 def _of(records: Sequence[Record], task: str, method: str, *, good: bool = False) -> list[Record]:
@@ -284,5 +294,7 @@ def _of(records: Sequence[Record], task: str, method: str, *, good: bool = False
 
 def _spread(records: Sequence[Record], field: str) -> str:
     found = values(records, field)
-    mean, deviation = map(decimal, mean_and_deviation(found))
-    return f"{mean} ± {deviation}; {decimal(distribution(records, field)[0])}" if found else "–"
+    mean, deviation = map(format_decimal, compute_mean_and_deviation(found))
+    return (
+        f"{mean} ± {deviation}; {format_decimal(distribution(records, field)[0])}" if found else "–"
+    )

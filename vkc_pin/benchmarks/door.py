@@ -12,7 +12,12 @@ import numpy as np
 import pinocchio as pin
 from tqdm import tqdm
 
-from vkc_pin.benchmarks.harness.record import distribution, measure_peak_memory, meta, trial
+from vkc_pin.benchmarks.harness.record import (
+    describe_environment,
+    distribution,
+    measure_peak_memory,
+    trial,
+)
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
@@ -82,7 +87,7 @@ def run(*, trials: int, seed: int, progress: bool = True) -> dict[str, Any]:
         grasp = plan(start.with_state("door", {"knob": TURNED}), [Grasp("door")], seed=seed)
         record("push blind", push(start, seed, grasp) if grasp.success else grasp)
     return {
-        "meta": meta(
+        "meta": describe_environment(
             benchmark="door", seed=seed, trials=trials, peak_memory_mb=measure_peak_memory()
         ),
         "trials": records,

@@ -9,25 +9,25 @@ from typing import Any, Unpack
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
+from vkc_pin.benchmarks.harness.limits import LIMITS, describe_limit
 from vkc_pin.benchmarks.harness.runner import Execution
-from vkc_pin.benchmarks.harness.tables import JUDGED, markdown, page
-from vkc_pin.benchmarks.problems.ablation import SUMMARIZED, SUMMARY, every_trial, summary
-from vkc_pin.benchmarks.problems.poses import random_start
-from vkc_pin.benchmarks.problems.trials import tried
+from vkc_pin.benchmarks.harness.tables import JUDGED, format_table, join_report
+from vkc_pin.benchmarks.problems.ablation import SUMMARIZED, SUMMARY, summary, tabulate_trials
+from vkc_pin.benchmarks.problems.poses import sample_random_start
+from vkc_pin.benchmarks.problems.trials import run_trial
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Reach
 
-__all__ = ["POSE", "SCENE", "report", "run", "started"]
+__all__ = ["POSE", "SCENE", "make_start", "report", "run"]
 
 SCENE = "gap_table"
 POSE = (2.5, 0.5, 0.95, np.pi, 0.0, 0.0)
 """Of the tool: x, y, z [m], roll, pitch, yaw [rad] in the world frame; 0.2 m above the table, the fingers down."""
 
 
-def started(seed: int, number: int) -> Scene:
+def make_start(seed: int, number: int) -> Scene:
     """Return the scene with start `number` of a random seed."""
-    return random_start(load_scene(SCENE), np.random.default_rng([seed, number]))
+    return sample_random_start(load_scene(SCENE), np.random.default_rng([seed, number]))
 
 
 def run(
@@ -53,19 +53,23 @@ def run(
 def report(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
     about, records = result["meta"], result["trials"]
-    return page(
+    return join_report(
         about,
         "# Through a gap to a table",
         f"{about['starts']} random starts of base and arm, seed {about['seed']}, "
-        f"{allowed(about)} each. {JUDGED} {SUMMARIZED}",
-        markdown(["scene", *SUMMARY], [[SCENE, *summary(records)]]),
+        f"{describe_limit(about)} each. {JUDGED} {SUMMARIZED}",
+        format_table(["scene", *SUMMARY], [[SCENE, *summary(records)]]),
         "## Every trial",
-        every_trial(records),
+        tabulate_trials(records),
     )
 
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:
     number, seed = spec["number"], spec["seed"]
-    return tried(
-        started(seed, number), (Reach(POSE),), seed=seed, number=number, problem=f"{SCENE} {number}"
+    return run_trial(
+        make_start(seed, number),
+        (Reach(POSE),),
+        seed=seed,
+        number=number,
+        problem=f"{SCENE} {number}",
     )

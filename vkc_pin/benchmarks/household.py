@@ -22,11 +22,11 @@ __all__ = [
     "PAPER",
     "TABLE_TOP",
     "TASKS",
-    "on_the_coffee_table",
-    "papers_home",
+    "make_paper_home",
     "plan_trial",
     "report",
     "run",
+    "sample_cup_pose",
 ]
 
 TABLE_TOP = ((2.5, 3.0), (-1.9, -0.9))
@@ -34,7 +34,7 @@ TABLE_TOP = ((2.5, 3.0), (-1.9, -0.9))
 _EDGE = 0.05  # [m] from the cup's axis, whose radius is 0.035, to the plate's edges, at least
 
 
-def on_the_coffee_table(scene: Scene, rng: np.random.Generator) -> dict[str, list[float]]:
+def sample_cup_pose(scene: Scene, rng: np.random.Generator) -> dict[str, list[float]]:
     """Sample the pose of the cup on the coffee table, at any heading."""
     x, y = (float(rng.uniform(low + _EDGE, high - _EDGE)) for low, high in TABLE_TOP)
     height, yaw = (
@@ -49,7 +49,7 @@ TASKS = {
         "household",
         (Place("cup", (-0.6, -1.6, 0.751)),),
         "carry a cup to the dining table",
-        scatter=on_the_coffee_table,
+        scatter=sample_cup_pose,
     ),
     "door": Assignment(
         "household",
@@ -107,7 +107,7 @@ _TOP = 1.109  # [m] the dining table's upper face, 1 mm below the cup
 _RAIL = 0.8
 
 
-def papers_home() -> Scene:
+def make_paper_home() -> Scene:
     """Return the scene `household` with the table height and the rack travel of the paper's code.
 
     A table of 1.11 m is a bar table, so it has the size of the one in the kitchen, 1.2 x 0.6 m. On one
@@ -144,7 +144,7 @@ def papers_home() -> Scene:
 
 
 def _load(name: str) -> Scene:
-    return papers_home() if name == _PAPERS else load_scene(name)
+    return make_paper_home() if name == _PAPERS else load_scene(name)
 
 
 PAPER = Comparison(
@@ -185,7 +185,7 @@ def run(*, variant: str | None = None, **how: Any) -> dict[str, Any]:
     """
     if variant is None:
         return COMPARISON.run(**how)
-    runner.chosen("variant", [variant], ["paper"])
+    runner.select_names("variant", [variant], ["paper"])
     return PAPER.run(
         **{"tasks": [name for name, task in PAPER.tasks.items() if task.scene == _PAPERS], **how}
     )

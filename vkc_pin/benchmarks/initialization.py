@@ -16,10 +16,10 @@ import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import success_chart
-from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
+from vkc_pin.benchmarks.harness.limits import LIMITS, describe_limit
 from vkc_pin.benchmarks.harness.record import Solve, trial
 from vkc_pin.benchmarks.harness.runner import Execution
-from vkc_pin.benchmarks.harness.tables import JUDGED, comparison_table, methods_table, page
+from vkc_pin.benchmarks.harness.tables import JUDGED, comparison_table, join_report, methods_table
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
 from vkc_pin.world.scene.scene import Scene, load_scene
@@ -118,8 +118,8 @@ def run(
         methods: Some of `COMPARED_INITIALIZATIONS`.
         solve: Plans a trial; other tasks may use other scenes.
     """
-    scenes = runner.chosen("scene", scenes, SCENES if solve is plan_trial else scenes)
-    methods = runner.chosen("method", methods, COMPARED_INITIALIZATIONS)
+    scenes = runner.select_names("scene", scenes, SCENES if solve is plan_trial else scenes)
+    methods = runner.select_names("method", methods, COMPARED_INITIALIZATIONS)
     trials = specify(starts=starts, repeats=repeats, seed=seed, scenes=scenes, methods=methods)
     settings = {
         "benchmark": "initialization",
@@ -149,7 +149,7 @@ def report(result: Mapping[str, Any]) -> str:
     parts = [
         "# Initializing the trajectory",
         f"{about['starts']} random starts per scene{repeats if about['repeats'] > 1 else ''}; "
-        f"seed {about['seed']}, {allowed(about)} per trial. {JUDGED} "
+        f"seed {about['seed']}, {describe_limit(about)} per trial. {JUDGED} "
         "Planning times are those of all trials, path lengths those of successes (medians).",
         methods_table(records, scenes, [*methods, STEPWISE]),
         "![Success rates](success.png)",
@@ -161,7 +161,7 @@ def report(result: Mapping[str, Any]) -> str:
             "without perturbation.",
             comparison_table(records, scenes, ("auto", STEPWISE), ("one problem", STEPWISE)),
         ]
-    return page(about, *parts)
+    return join_report(about, *parts)
 
 
 def _record(spec: dict[str, Any], solve: Solve) -> dict[str, Any]:

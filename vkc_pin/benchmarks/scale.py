@@ -17,12 +17,12 @@ from vkc_pin.benchmarks.harness.runner import Execution
 from vkc_pin.benchmarks.harness.tables import (
     JUDGED,
     TIMES,
+    compute_quartiles,
     count,
-    decimal,
-    markdown,
-    medians,
-    page,
-    quartiles,
+    format_decimal,
+    format_medians,
+    format_table,
+    join_report,
     select,
 )
 from vkc_pin.errors import InputError
@@ -37,7 +37,16 @@ from vkc_pin.world.task.steps import Actuate
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["AXES", "Axis", "crowded", "refined", "report", "run", "scale_chart", "specify"]
+__all__ = [
+    "AXES",
+    "Axis",
+    "make_crowded_scene",
+    "make_refined_options",
+    "report",
+    "run",
+    "scale_chart",
+    "specify",
+]
 
 
 @dataclass(frozen=True)
@@ -76,7 +85,7 @@ _WEST, _EAST, _SOUTH, _NORTH, _HALL, _CEILING = (
 )  # [m]: faces of the walls
 
 
-def crowded(count: int, *, seed: int = 0) -> Scene:
+def make_crowded_scene(count: int, *, seed: int = 0) -> Scene:
     """Return scenes/door.yaml with `count` obstacles: walls, furniture, then small boxes.
 
     The boxes are on walls and ceiling or outside the room. Larger counts contain the smaller ones.
@@ -117,7 +126,7 @@ def _box(rng: np.random.Generator, number: int) -> dict[str, Any]:
     }
 
 
-def refined(segments: int) -> Options:
+def make_refined_options(segments: int) -> Options:
     """Return options with which the task at the door has `segments` segments, at least 4."""
     usual = Options()
     whole = usual.reach_waypoints + usual.turn_waypoints + usual.move_waypoints
@@ -210,20 +219,22 @@ def report(result: Mapping[str, Any]) -> str:
     for number in about["counts"]:
         own = select(timed, **{of: number})
         ratios = [r["planning_time"] / few[r["number"]] for r in own if r["number"] in few]
-        times = map(decimal, (*distribution(own, "planning_time"), quartiles(ratios)[1]))
+        times = map(
+            format_decimal, (*distribution(own, "planning_time"), compute_quartiles(ratios)[1])
+        )
         iterations = f"{distribution(own, 'iterations')[0]:.0f}" if own else "–"
         success = count(select(records, **{of: number}))
-        rows.append([str(number), success, *times, *medians(own, *TIMES), iterations])
+        rows.append([str(number), success, *times, *format_medians(own, *TIMES), iterations])
     head = [of, "success", "time, median [s]", "95th percentile [s]", f"times that of {usual}"]
     head += [f"{name} [s]" for name in TIMES.values()] + ["Ipopt iterations"]
-    return page(
+    return join_report(
         about,
         f"# Planning time against the number of {of}",
         f"{about['starts']} random starts, the same for every number of {of}; seed "
         f"{about['seed']}. {JUDGED} Times are those of all trials; “times that of {usual}” is the "
         f"median, over starts, of the ratio to the time with {usual} {of}. What follows are "
         "medians of parts of the time; the rest is setting up the problem.",
-        markdown(head, rows),
+        format_table(head, rows),
         "![Planning time](scale.png)",
     )
 
@@ -254,7 +265,7 @@ def scale_chart(
         ]
 
     low, middle, high = (
-        np.array([quartiles([record["planning_time"] for record in own]) for own in rows])
+        np.array([compute_quartiles([record["planning_time"] for record in own]) for own in rows])
         .reshape(-1, 3)
         .T
     )
@@ -301,7 +312,7 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
     _warm(spec["seed"])
     of = next(name for name in AXES if name in spec)
     scene = _crowded(spec.get("obstacles", AXES["obstacles"].usual)).with_start(base=spec["base"])
-    options = refined(spec["segments"]) if of == "segments" else Options()
+    options = make_refined_options(spec["segments"]) if of == "segments" else Options()
     found = _solve(scene, spec["seed"], _OPENED[of], options)
     return trial(found, method="VKC", seed=spec["seed"], number=spec["number"], **{of: spec[of]})
 
@@ -320,4 +331,4 @@ def _warm(seed: int) -> None:
         raise KeyboardInterrupt
 
 
-_crowded = functools.cache(crowded)  # once per process
+_crowded = functools.cache(make_crowded_scene)  # once per process

@@ -6,7 +6,7 @@ import argparse
 import sys
 from typing import Any
 
-from vkc_pin.benchmarks.commands import natural
+from vkc_pin.benchmarks.commands import parse_natural
 from vkc_pin.errors import InputError
 from vkc_pin.world.files.writing import check_outputs
 
@@ -34,7 +34,7 @@ def add_check(commands: Any) -> None:
     )
     check.add_argument(
         "--seed",
-        type=natural,
+        type=parse_natural,
         default=0,
         help="of the random configurations that are tried (default 0)",
     )

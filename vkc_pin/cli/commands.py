@@ -12,7 +12,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.benchmarks.commands import EXIT_INTERRUPTED, EXIT_OK, add_bench, natural, positive
+from vkc_pin.benchmarks.commands import (
+    EXIT_INTERRUPTED,
+    EXIT_OK,
+    add_bench,
+    parse_natural,
+    parse_positive,
+)
 from vkc_pin.cli.checking import add_check
 from vkc_pin.cli.datasets import add_datasets
 from vkc_pin.cli.importing import add_importing
@@ -300,7 +306,9 @@ def make_parser() -> argparse.ArgumentParser:
         metavar="UNITS",
         help="return the best motion found with so much work",
     )
-    plan.add_argument("--seed", type=natural, default=0, help="of the random numbers (default 0)")
+    plan.add_argument(
+        "--seed", type=parse_natural, default=0, help="of the random numbers (default 0)"
+    )
     plan.add_argument("--quiet", action="store_true", help="no progress")
     plan.set_defaults(run=_plan)
 
@@ -344,8 +352,8 @@ def make_parser() -> argparse.ArgumentParser:
     srdf = commands.add_parser("srdf", help="regenerate allowed collisions", description=about)
     srdf.add_argument("robot", metavar="ROBOT", help="name or URDF file")
     srdf.add_argument("--output", required=True, metavar="FILE")
-    srdf.add_argument("--samples", type=positive, default=20000)
-    srdf.add_argument("--seed", type=natural, default=0)
+    srdf.add_argument("--samples", type=parse_positive, default=20000)
+    srdf.add_argument("--seed", type=parse_natural, default=0)
     srdf.set_defaults(run=_srdf)
 
     return parser

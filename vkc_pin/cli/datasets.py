@@ -6,7 +6,7 @@ import argparse
 import sys
 from typing import Any
 
-from vkc_pin.benchmarks.commands import EXIT_OK, natural, positive, stopped
+from vkc_pin.benchmarks.commands import EXIT_OK, parse_natural, parse_positive, report_interruption
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.utils.interrupt import raise_on_interrupt
 
@@ -67,14 +67,14 @@ def add_datasets(commands: Any) -> None:
     check = inner.add_parser("check", help="validate every episode again", description=about)
     check.add_argument("folder", metavar="DIR", help="folder of the dataset")
     check.add_argument(
-        "--jobs", type=positive, default=1, metavar="J", help="processes (default 1)"
+        "--jobs", type=parse_positive, default=1, metavar="J", help="processes (default 1)"
     )
     check.add_argument(
         "--html", metavar="FILE", help="where to write the page (default: DIR/statistics.html)"
     )
     check.add_argument(
         "--seed",
-        type=natural,
+        type=parse_natural,
         default=0,
         help="of the ten episodes that the page shows (default 0)",
     )
@@ -100,7 +100,7 @@ def _generate(arguments: argparse.Namespace) -> int:
                 progress=not arguments.quiet,
             )
     except KeyboardInterrupt as stop:
-        return stopped(arguments.given, stop)
+        return report_interruption(arguments.given, stop)
     except VkcError as error:
         if isinstance(error, InputError):
             raise

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.benchmarks.commands import EXIT_OK, natural, positive
+from vkc_pin.benchmarks.commands import EXIT_OK, parse_natural, parse_positive
 from vkc_pin.errors import InputError
 
 __all__ = ["EXIT_SICK", "add_importing"]
@@ -46,17 +46,19 @@ def add_importing(commands: Any) -> None:
     )
     robot.add_argument(
         "--most-pieces",
-        type=positive,
+        type=parse_positive,
         metavar="N",
         help="convex pieces of a mesh, at most; 1 keeps hulls",
     )
     robot.add_argument(
         "--samples",
-        type=positive,
+        type=parse_positive,
         metavar="N",
         help="configurations to look at for pairs that need no check",
     )
-    robot.add_argument("--seed", type=natural, default=0, help="of the random numbers (default 0)")
+    robot.add_argument(
+        "--seed", type=parse_natural, default=0, help="of the random numbers (default 0)"
+    )
     robot.add_argument(
         "--force", action="store_true", help="replace a folder that import-robot made before"
     )
@@ -92,7 +94,7 @@ def add_importing(commands: Any) -> None:
     )
     item.add_argument(
         "--most",
-        type=positive,
+        type=parse_positive,
         default=3,
         metavar="N",
         help="attachments for one joint, at most (default 3)",
@@ -128,14 +130,14 @@ def add_importing(commands: Any) -> None:
     )
     home.add_argument(
         "--most",
-        type=positive,
+        type=parse_positive,
         default=2,
         metavar="N",
         help="attachments for one joint, at most (default 2)",
     )
     home.add_argument(
         "--seed",
-        type=natural,
+        type=parse_natural,
         default=0,
         help="of the places where a start is looked for (default 0)",
     )

@@ -6,22 +6,22 @@ from pathlib import Path
 import pytest
 from helpers.datasets import SMALL
 
-from vkc_pin.benchmarks.datasets.simulated import Costs, measured, simulated
+from vkc_pin.benchmarks.datasets.simulated import Costs, measure_costs, simulate_workers
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.recipes.recipe import load_recipe
 
 
 def test_alone_with_a_client_that_costs_nothing() -> None:
-    found = simulated(Costs(first=(3.0,), later=(2.0,), client=0.0, episodes=4.0), 1, 10)
+    found = simulate_workers(Costs(first=(3.0,), later=(2.0,), client=0.0, episodes=4.0), 1, 10)
     assert found["efficiency"] == 1.0
     assert found["in_vain"] == 0.0
     assert found["episodes_per_hour"] == pytest.approx(3600.0 * 40.0 / (3.0 + 9 * 2.0), abs=0.1)
 
 
 def test_equal_tasks_leave_nothing_in_vain_but_the_last() -> None:
-    found = simulated(Costs((2.0,), (2.0,), 0.0, 1.0), 10, 100)
+    found = simulate_workers(Costs((2.0,), (2.0,), 0.0, 1.0), 10, 100)
     assert found["efficiency"] == 1.0
-    odd = simulated(
+    odd = simulate_workers(
         Costs((2.0,), (2.0,), 0.0, 1.0), 10, 91
     )  # one works on the last one, nine on others
     assert odd["efficiency"] == pytest.approx(0.91)
@@ -30,7 +30,7 @@ def test_equal_tasks_leave_nothing_in_vain_but_the_last() -> None:
 
 def test_a_client_that_is_busy_limits_all() -> None:
     costs = Costs((2.0,), (2.0,), client=0.1, episodes=1.0)
-    few, many = simulated(costs, 10), simulated(costs, 200)  # 20 workers keep it busy
+    few, many = simulate_workers(costs, 10), simulate_workers(costs, 200)  # 20 workers keep it busy
     assert few["efficiency"] > 0.95
     assert few["client"] == pytest.approx(0.5, abs=0.03)
     assert many["client"] > 0.99
@@ -59,6 +59,6 @@ def test_what_a_journal_says(tmp_path: Path) -> None:
         }
         lines.append({"key": str(key), "records": [record], **more})
     (tmp_path / "journal.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    found = measured(Dataset(tmp_path, load_recipe(SMALL)))
+    found = measure_costs(Dataset(tmp_path, load_recipe(SMALL)))
     assert found == Costs(first=(6.0, 5.0), later=(2.0,), client=0.6 / 3, episodes=4 / 3)
     assert found.mean == 2.0

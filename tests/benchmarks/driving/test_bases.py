@@ -10,16 +10,16 @@ from helpers.experiments import run_experiment
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.driving import bases
-from vkc_pin.benchmarks.harness.record import meta
+from vkc_pin.benchmarks.harness.record import describe_environment
 
 
 def test_starts_are_the_same_for_every_base() -> None:
-    scenes = [bases.started("door", base, 3, 7) for base in bases.BASES]
+    scenes = [bases.make_start("door", base, 3, 7) for base in bases.BASES]
     assert [scene.robot.base for scene in scenes] == ["omni", "differential", "ackermann"]
     assert scenes[-1].robot.turning_radius == bases.TURNING_RADIUS
     for scene in scenes[1:]:
         np.testing.assert_array_equal(scene.start, scenes[0].start)
-    assert not np.array_equal(bases.started("door", "omni", 3, 8).start, scenes[0].start)
+    assert not np.array_equal(bases.make_start("door", "omni", 3, 8).start, scenes[0].start)
 
 
 def test_experiment(tmp_path: Path) -> None:
@@ -46,7 +46,7 @@ def test_failures_are_listed() -> None:
     about = {"starts": 5, "seed": 0, "radius": 0.8, "tasks": ["door"], "bases": ["ackermann"]}
     failure = {"task": "door", "base": "ackermann", "number": 4, "success": False}
     failure |= {"status": "rejected", "violations": ["turning base"], **dict.fromkeys(fields, 1.0)}
-    text = bases.report({"meta": {**meta(), **about}, "trials": [failure]})
+    text = bases.report({"meta": {**describe_environment(), **about}, "trials": [failure]})
     assert "- door, ackermann, start 4: rejected; turning base" in text
     assert "| door | ackermann | 0 of 1 |" in text
 

@@ -14,7 +14,7 @@ from vkc_pin.benchmarks.harness.charts import (
     motions_chart,
     success_chart,
 )
-from vkc_pin.benchmarks.harness.tables import TIMES, wilson
+from vkc_pin.benchmarks.harness.tables import TIMES, compute_wilson_interval
 from vkc_pin.benchmarks.scale import scale_chart
 from vkc_pin.planning.plan import Plan
 from vkc_pin.validation.report import Report
@@ -41,7 +41,8 @@ def test_success_chart_has_rates_and_intervals() -> None:
     assert bars[0].get_facecolor() != bars[2].get_facecolor()
     intervals = [line.get_segments()[0][:, 1] for line in axes.collections]
     expected = [
-        wilson(*RATES[key]) for key in (("a", "one"), ("b", "one"), ("a", "two"), ("b", "two"))
+        compute_wilson_interval(*RATES[key])
+        for key in (("a", "one"), ("b", "one"), ("a", "two"), ("b", "two"))
     ]
     np.testing.assert_allclose(intervals, 100.0 * np.array(expected), atol=1e-9)
     assert [text.get_text() for text in axes.texts] == ["100", "25", "75", "0"]
@@ -102,7 +103,9 @@ def test_criteria_chart_against_numbers_by_hand() -> None:
     ends = [
         [line.get_segments()[0][:, 1].tolist() for line in axes.collections] for axes in figure.axes
     ]
-    assert ends[0] == [pytest.approx([100.0 * end for end in wilson(good, 3)]) for good in (3, 2)]
+    assert ends[0] == [
+        pytest.approx([100.0 * end for end in compute_wilson_interval(good, 3)]) for good in (3, 2)
+    ]
     assert ends[1:] == [
         [[3.25, 3.75], [5.25, 5.75]],
         [[32.5, 37.5], [52.5, 57.5]],

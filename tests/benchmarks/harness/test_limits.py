@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
+from vkc_pin.benchmarks.harness.limits import LIMITS, describe_limit
 
 
 def test_records_state_evaluations_or_planning_time() -> None:
-    assert allowed({**LIMITS, "seed": 3}) == "at most 1 000 000 evaluations"
-    assert allowed({"time_limit": 20.0}) == "at most 20 s of planning"
+    assert describe_limit({**LIMITS, "seed": 3}) == "at most 1 000 000 evaluations"
+    assert describe_limit({"time_limit": 20.0}) == "at most 20 s of planning"

@@ -15,13 +15,13 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def test_commit_needs_git(monkeypatch: pytest.MonkeyPatch) -> None:
-    record.commit.cache_clear()
-    found = record.commit()
+    record.find_commit.cache_clear()
+    found = record.find_commit()
     assert found is None or len(found) >= 7
     monkeypatch.setenv("PATH", "")
-    record.commit.cache_clear()
-    assert record.commit() is None
-    record.commit.cache_clear()
+    record.find_commit.cache_clear()
+    assert record.find_commit() is None
+    record.find_commit.cache_clear()
 
 
 def test_failure_is_recorded_with_the_first_violation() -> None:
@@ -54,5 +54,5 @@ def test_peaks_are_those_of_the_arm() -> None:
     times = np.array([0.0, 1.0, 3.0, 3.5])
     motion = Trajectory(names, times, np.array(positions), (PhaseSpan("move", 0, 3),), 5)
     # The elbow turns by -3 rad in 2 s; its velocity changes by 1.2 rad/s within 0.5 s.
-    found = record.peaks(motion)
+    found = record.compute_peaks(motion)
     assert found == pytest.approx({"peak_velocity": 1.5, "peak_acceleration": 2.4})

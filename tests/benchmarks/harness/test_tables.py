@@ -141,7 +141,7 @@ def test_comparison_against_numbers_by_hand() -> None:
 def test_common_successes_of_three_methods() -> None:
     third = record("a", "third", 2, 1.0, 1.0, 1.0)
     del third["repeat"]  # an experiment without repeats
-    found = tables.common(
+    found = tables.find_common_successes(
         [*RECORDS, third, record("a", "third", 1, 1.0, 1.0, 1.0)], ["third", "slow", "auto"]
     )
     assert [[(r["method"], r["number"]) for r in row] for row in found] == [
@@ -150,10 +150,10 @@ def test_common_successes_of_three_methods() -> None:
 
 
 def test_mean_and_deviation_of_a_sample() -> None:
-    assert tables.mean_and_deviation([2.0, 4.0, 9.0]) == pytest.approx(
+    assert tables.compute_mean_and_deviation([2.0, 4.0, 9.0]) == pytest.approx(
         (5.0, np.sqrt(13.0))
     )  # 9 + 1 + 16, by 2
-    one, none = tables.mean_and_deviation([2.0]), tables.mean_and_deviation([])
+    one, none = tables.compute_mean_and_deviation([2.0]), tables.compute_mean_and_deviation([])
     assert one[0] == 2.0
     assert np.isnan([one[1], *none]).all()
 
@@ -171,17 +171,19 @@ def test_mean_and_deviation_of_a_sample() -> None:
 def test_wilson_interval_against_published_values(
     good: int, number: int, low: float, high: float
 ) -> None:
-    assert tables.wilson(good, number) == pytest.approx((low, high), abs=5e-5)
-    assert tables.wilson(number - good, number) == pytest.approx((1.0 - high, 1.0 - low), abs=5e-5)
+    assert tables.compute_wilson_interval(good, number) == pytest.approx((low, high), abs=5e-5)
+    assert tables.compute_wilson_interval(number - good, number) == pytest.approx(
+        (1.0 - high, 1.0 - low), abs=5e-5
+    )
 
 
 def test_wilson_interval_without_trials() -> None:
-    assert tables.wilson(0, 0) == (0.0, 1.0)
+    assert tables.compute_wilson_interval(0, 0) == (0.0, 1.0)
 
 
 def test_quartiles_of_values() -> None:
-    assert tables.quartiles([5.0, 1.0, 2.0, 3.0, 4.0]) == (2.0, 3.0, 4.0)
-    assert np.isnan(tables.quartiles([])).all()
+    assert tables.compute_quartiles([5.0, 1.0, 2.0, 3.0, 4.0]) == (2.0, 3.0, 4.0)
+    assert np.isnan(tables.compute_quartiles([])).all()
 
 
 def test_csv_has_a_column_of_each_field() -> None:
@@ -211,11 +213,11 @@ def test_foot_names_machine_versions_and_time() -> None:
     ]
     about = {"versions": {"vkc-pin": "1.2", "pin": "4.1"}, "machine": machine}
     assert (
-        tables.foot(about)
+        tables.describe_run(about)
         == "Measured on 2 cores of Abacus 3, Linux, Python 3.12.1, vkc-pin 1.2, pin 4.1."
     )
     about["versions"]["sources"] = "abc"
-    assert tables.foot({**about, "sessions": sessions, "peak_memory_mb": 320.4}) == (
+    assert tables.describe_run({**about, "sessions": sessions, "peak_memory_mb": 320.4}) == (
         "Measured on 2 cores of Abacus 3, Linux, Python 3.12.1, vkc-pin 1.2, pin 4.1 (sources abc). "
         "12 trials, 1 or 2 at a time, took 1.5 min and up to 320 MB a process."
     )

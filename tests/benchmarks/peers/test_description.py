@@ -10,23 +10,23 @@ import pinocchio as pin
 import pytest
 
 from vkc_pin.benchmarks.peers.description import FRAME, describe
-from vkc_pin.benchmarks.peers.sampled import ranges
-from vkc_pin.benchmarks.peers.tasks import TASKS, ends, given, problem_of
+from vkc_pin.benchmarks.peers.sampled import compute_finite_limits
+from vkc_pin.benchmarks.peers.tasks import TASKS, build_program, make_problem, sample_goals
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_the_same_kinematics_and_pairs(task: str, tmp_path: Path) -> None:
-    problem = problem_of(given(task, 18, 0))
+    problem = build_program(make_problem(task, 18, 0))
     files = describe(problem, tmp_path)
     model = pin.buildModelFromUrdf(str(files.urdf))
     data, order = model.createData(), [list(model.names)[1:].index(name) for name in files.joints]
-    for row in ends(problem, np.random.default_rng(0), 3):
+    for row in sample_goals(problem, np.random.default_rng(0), 3):
         q = np.zeros(model.nq)
         q[order] = row
         pin.framesForwardKinematics(model, data, q)
         at = data.oMf[model.getFrameId(FRAME)]
         np.testing.assert_allclose(at.homogeneous, problem.targets[0].homogeneous, atol=1e-6)
-    lower, upper = ranges(problem)
+    lower, upper = compute_finite_limits(problem)
     np.testing.assert_allclose(model.lowerPositionLimit[order], lower)
     np.testing.assert_allclose(model.upperPositionLimit[order], upper)
     (part,) = problem.contacts.phases
@@ -38,7 +38,7 @@ def test_the_same_kinematics_and_pairs(task: str, tmp_path: Path) -> None:
 
 
 def test_thicker_shapes_touch_where_margins_are_not_kept(tmp_path: Path) -> None:
-    problem = problem_of(given("drawer", 18, 0))
+    problem = build_program(make_problem("drawer", 18, 0))
     files = describe(problem, tmp_path, inflated=True)
     model = pin.buildModelFromUrdf(str(files.urdf))
     shapes = pin.buildGeomFromUrdf(model, str(files.urdf), pin.GeometryType.COLLISION)
@@ -48,7 +48,7 @@ def test_thicker_shapes_touch_where_margins_are_not_kept(tmp_path: Path) -> None
     for one, other in files.margins:
         shapes.addCollisionPair(pin.CollisionPair(*sorted((numbers[one], numbers[other]))))
     order = [list(model.names)[1:].index(name) for name in files.joints]
-    rng, lower, upper = np.random.default_rng(0), *ranges(problem)
+    rng, lower, upper = np.random.default_rng(0), *compute_finite_limits(problem)
     z, agreed = rng.uniform(lower, upper, (60, len(lower))), 0
     contacts = problem.contacts.evaluate(z, np.ones(len(z), int), reach=0.1)
     for row, configuration in enumerate(z):

@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vkc_pin.benchmarks.peers.tasks import TASKS, ends, given, problem_of
+from vkc_pin.benchmarks.peers.tasks import TASKS, build_program, make_problem, sample_goals
 from vkc_pin.planning.initialization.keyframes import compute_shortfall
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_problems_are_drawn_by_number_and_free(task: str) -> None:
-    one, same, other = given(task, 3, 1), given(task, 3, 1), given(task, 3, 2)
+    one, same, other = make_problem(task, 3, 1), make_problem(task, 3, 1), make_problem(task, 3, 2)
     assert np.array_equal(one.scene.start, same.scene.start)
     assert not np.array_equal(one.scene.start, other.scene.start)
-    problem = problem_of(one)
+    problem = build_program(one)
     assert compute_shortfall(problem, problem.start[None], 1)[0] == 0.0
-    goals = ends(problem, np.random.default_rng(0), 5)
+    goals = sample_goals(problem, np.random.default_rng(0), 5)
     assert 1 <= len(goals) <= 5
     residual, _ = problem.transcription.pose_solvers[0].evaluate(goals, problem.targets[0])
     assert np.abs(residual).max() < 1e-7

@@ -9,7 +9,7 @@ import pytest
 from helpers.experiments import run_experiment
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.harness.record import meta
+from vkc_pin.benchmarks.harness.record import describe_environment
 from vkc_pin.benchmarks.problems import ablation
 
 CHANGE = "solver.loop:PROGRESS=0.6"
@@ -52,7 +52,9 @@ def test_ratios_are_of_problems_that_both_settings_solve() -> None:
     trials += [record(2, "unchanged", 2.0, False), record(2, changed, 9.0)]
     error = {"number": 3, "method": "unchanged", "seed": 0, "success": False, "status": "error"}
     about = {"changes": ["unchanged", changed], "problems": [0, 1, 2, 3], "seed": 0}
-    text = ablation.report({"meta": {**meta(time_limit=1.0), **about}, "trials": [*trials, error]})
+    text = ablation.report(
+        {"meta": {**describe_environment(time_limit=1.0), **about}, "trials": [*trials, error]}
+    )
     triple, same = "3.000 (3.000–3.000)", "1.000 (1.000–1.000)"
     assert f"| {changed} | 1 | {triple} | {same} | {same} | – | {triple} |" in text
     assert "| unchanged | 2 of 4 | 2 of 4 | 1.00 | 1.33 |" in text

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change, parsed
+from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change, parse_change
 from vkc_pin.planning.solver import loop, trust_region
 
 
 def test_an_option() -> None:
-    change = parsed("Options.dt=0.3")
+    change = parse_change("Options.dt=0.3")
     assert change == Change("Options", "dt", 0.3)
     assert str(change) == "Options.dt=0.3"
     assert change.options == vkc.Options(dt=0.3)
@@ -20,7 +20,7 @@ def test_an_option() -> None:
 
 def test_a_constant_changes_for_a_while() -> None:
     before = loop.PROGRESS
-    change = parsed("solver.loop:PROGRESS=0.6")
+    change = parse_change("solver.loop:PROGRESS=0.6")
     assert change.options == vkc.Options()
     with change.applied():
         assert loop.PROGRESS == 0.6
@@ -32,7 +32,7 @@ def test_a_constant_changes_where_it_is_imported_too_and_comes_back_after_an_err
     assert before == loop.ACTIVE_FRACTION
 
     def fail() -> None:
-        with parsed("solver.trust_region:ACTIVE_FRACTION=0.123").applied():
+        with parse_change("solver.trust_region:ACTIVE_FRACTION=0.123").applied():
             assert trust_region.ACTIVE_FRACTION == loop.ACTIVE_FRACTION == 0.123
             raise KeyError
 
@@ -57,4 +57,4 @@ def test_a_constant_changes_where_it_is_imported_too_and_comes_back_after_an_err
 )
 def test_wrong_changes(text: str, expected: str) -> None:
     with pytest.raises(vkc.InputError, match=expected):
-        parsed(text)
+        parse_change(text)

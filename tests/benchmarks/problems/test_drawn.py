@@ -11,7 +11,7 @@ from oracle.agreement import judged, recorded, written
 from oracle.plan import read_plan
 
 from vkc_pin.benchmarks.problems import random_problems
-from vkc_pin.benchmarks.problems.drawn import drawn
+from vkc_pin.benchmarks.problems.drawn import sample_problem
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.planning.plan import Plan
 from vkc_pin.procedural.tasks import random_task
@@ -21,14 +21,18 @@ from vkc_pin.world.task.steps import step_to_dict
 
 @pytest.mark.parametrize("number", [1, 6])
 def test_problems_are_determined_by_their_numbers(number: int) -> None:
-    one, same, other = drawn(4, number), drawn(4, number), drawn(5, number)
+    one, same, other = (
+        sample_problem(4, number),
+        sample_problem(4, number),
+        sample_problem(5, number),
+    )
     assert one.scene.document == same.scene.document != other.scene.document
     assert list(map(step_to_dict, one.steps)) == list(map(step_to_dict, same.steps))
     assert (one.number, one.kind) == (number, "scene" if number % 2 else "room")
 
 
 def test_problems_have_all_scenes_obstacles_and_kinds_of_steps() -> None:
-    problems = [drawn(0, number) for number in range(1, 121, 2)]
+    problems = [sample_problem(0, number) for number in range(1, 121, 2)]
     names = sorted(list_resources("scenes", "*.yaml"))
     assert [own.scene.name for own in problems[: len(names)]] == names
     steps = {type(step).__name__ for own in problems for step in own.steps}
@@ -47,7 +51,7 @@ def test_plans_are_saved_and_judged(tmp_path: Path) -> None:
     plans = tmp_path / "plans"
     for trial in trials:
         path = plans / f"{trial['key']}.npz"
-        saved, problem = Plan.load(path), drawn(0, trial["number"])
+        saved, problem = Plan.load(path), sample_problem(0, trial["number"])
         assert (saved.success, saved.status) == (trial["success"], trial["status"])
         assert saved.scene.document == problem.scene.document
         assert read_plan(path).steps == [step_to_dict(step) for step in saved.steps]

@@ -9,7 +9,7 @@ import pytest
 from helpers.experiments import run_experiment
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.problems.impossible import KINDS, impossible, run
+from vkc_pin.benchmarks.problems.impossible import KINDS, run, sample_impossible_problem
 
 
 @pytest.mark.parametrize(
@@ -25,7 +25,7 @@ def test_infeasibility_is_proven(kind: str) -> None:
 
 def test_problems_are_determined_by_their_numbers() -> None:
     for number in range(len(KINDS)):
-        one, other = impossible(7, number), impossible(7, number)
+        one, other = sample_impossible_problem(7, number), sample_impossible_problem(7, number)
         assert one[0].document == other[0].document
         assert one[1][0].__class__ is other[1][0].__class__
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.problems.problem_set import KINDS, NUMBER, kind_of, problem, started
+from vkc_pin.benchmarks.problems.problem_set import KINDS, NUMBER, get_kind, make_start, problem
 from vkc_pin.world.scene.scene import START_CLEARANCE
 from vkc_pin.world.task.compiler import compile_task
 
 
 def test_kinds() -> None:
-    assert Counter(map(kind_of, range(NUMBER))) == dict(
+    assert Counter(map(get_kind, range(NUMBER))) == dict(
         zip(KINDS, (10, 10, 10, 10, 20), strict=True)
     )
 
@@ -29,7 +29,7 @@ def test_there_are_no_others(number: int) -> None:
 @pytest.mark.parametrize("number", [0, 1, 10, 11, 20, 23, 30, 40, 44, 54, 55])
 def test_a_problem_is_the_same_every_time_and_can_be_asked_for(number: int) -> None:
     one, other = problem(number), problem(number)
-    assert (one.number, one.kind, one.name) == (number, kind_of(number), other.name)
+    assert (one.number, one.kind, one.name) == (number, get_kind(number), other.name)
     assert one.scene.document == other.scene.document
     assert [str(step) for step in one.steps] == [str(step) for step in other.steps]
     assert one.scene.start_clearance() >= START_CLEARANCE
@@ -38,13 +38,13 @@ def test_a_problem_is_the_same_every_time_and_can_be_asked_for(number: int) -> N
 
 def test_starts_depend_on_task_seed_and_number() -> None:
     starts = [
-        started(*which).start[:3].tolist()
+        make_start(*which).start[:3].tolist()
         for which in (("door", 1, 0), ("door", 1, 0), ("door", 1, 1), ("door", 2, 0))
     ]
     assert starts[0] == starts[1]
     assert len({tuple(start) for start in starts}) == 3
     cups = [
-        started("household_cup", 1, number).objects["cup"].placement.translation
+        make_start("household_cup", 1, number).objects["cup"].placement.translation
         for number in (0, 1)
     ]
     assert not np.allclose(*cups)

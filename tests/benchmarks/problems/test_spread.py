@@ -25,9 +25,9 @@ def test_spread_is_of_successes() -> None:
         {"success": False, "x": 9.0},
         {"success": True},
     ]
-    assert spread.spread_of(records, "x") == pytest.approx(0.5)
-    assert spread.spread_of(records[1:], "x") is None
-    assert spread.spread_of([{"success": True, "x": 0.0}, *records], "x") is None
+    assert spread.compute_spread(records, "x") == pytest.approx(0.5)
+    assert spread.compute_spread(records[1:], "x") is None
+    assert spread.compute_spread([{"success": True, "x": 0.0}, *records], "x") is None
 
 
 @pytest.mark.parametrize("seeds", [1, 2.0, True])

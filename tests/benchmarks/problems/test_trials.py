@@ -8,7 +8,7 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.problems import trials
-from vkc_pin.benchmarks.problems.changes import parsed
+from vkc_pin.benchmarks.problems.changes import parse_change
 from vkc_pin.benchmarks.problems.problem_set import problem
 
 
@@ -22,7 +22,7 @@ def test_the_objective_is_that_of_the_solver(drawn: vkc.Plan) -> None:
     """A grasp without freedoms: all coordinates count, and the last round that was accepted has the motion's value."""
     assert drawn.success, drawn.summary()
     (last, *_) = [row["objective"] for row in reversed(drawn.history) if row["accepted"]]
-    assert trials.objective(drawn) == pytest.approx(last, rel=1e-6)
+    assert trials.compute_objective(drawn) == pytest.approx(last, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -31,14 +31,14 @@ def test_the_objective_is_that_of_the_solver(drawn: vkc.Plan) -> None:
 )
 def test_first_seed(drawn: vkc.Plan, name: str, solves: int, expected: bool) -> None:
     plan = dataclasses.replace(drawn, initialization=name)
-    assert trials.first_seed(plan, solves) is expected
-    assert not trials.first_seed(dataclasses.replace(plan, status="rejected"), solves)
+    assert trials.is_first_guess_success(plan, solves) is expected
+    assert not trials.is_first_guess_success(dataclasses.replace(plan, status="rejected"), solves)
 
 
 def test_a_trial() -> None:
     own = problem(20)
-    record = trials.tried(
-        own.scene, own.steps, seed=3, change=parsed("Options.max_restarts=2"), number=20
+    record = trials.run_trial(
+        own.scene, own.steps, seed=3, change=parse_change("Options.max_restarts=2"), number=20
     )
     assert record["success"] is True, record["violations"]
     assert (record["method"], record["seed"], record["number"]) == ("Options.max_restarts=2", 3, 20)

@@ -9,8 +9,13 @@ import pytest
 from helpers.arm_urdf import write_arms
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.robot_object_matrix.given import Given, parsed, ready_object, ready_robot
-from vkc_pin.benchmarks.robot_object_matrix.pairs import description_of
+from vkc_pin.benchmarks.robot_object_matrix.given import (
+    Request,
+    parse_requests,
+    prepare_object,
+    prepare_robot,
+)
+from vkc_pin.benchmarks.robot_object_matrix.pairs import load_description
 
 # A box with a drawer that is pulled towards +y, and a lamp beside it.
 DESK = """<robot name="desk">
@@ -34,16 +39,16 @@ def test_what_texts_mean() -> None:
         "home/desk.yaml",
         "drawer",
     ]
-    assert parsed(texts, "objects", ("oven_0", "door")) == [
-        Given("oven_0", "oven_0"),
-        Given("door", "door"),
-        Given("my_oven", "kitchens/kitchen.xml", "oven"),
-        Given("sink top", "kitchens/kitchen.xml", "sink top"),
-        Given("desk", "home/desk.yaml"),
-        Given("drawer", "drawer"),
+    assert parse_requests(texts, "objects", ("oven_0", "door")) == [
+        Request("oven_0", "oven_0"),
+        Request("door", "door"),
+        Request("my_oven", "kitchens/kitchen.xml", "oven"),
+        Request("sink top", "kitchens/kitchen.xml", "sink top"),
+        Request("desk", "home/desk.yaml"),
+        Request("drawer", "drawer"),
     ]
     assert [
-        one.imported for one in parsed(["a.URDF", "b.sdf", "c.yaml", "urdf"], "objects", ())
+        one.imported for one in parse_requests(["a.URDF", "b.sdf", "c.yaml", "urdf"], "objects", ())
     ] == [True, True, False, False]
 
 
@@ -53,14 +58,14 @@ def test_what_texts_mean() -> None:
 )
 def test_what_is_no_choice(texts: list[str]) -> None:
     with pytest.raises(vkc.InputError, match="objects: not a choice"):
-        parsed(texts, "objects", ("oven_0",))
+        parse_requests(texts, "objects", ("oven_0",))
 
 
 def test_a_file_is_imported_once_with_its_front_to_the_robot(tmp_path: Path) -> None:
     (tmp_path / "flat.urdf").write_text(DESK, encoding="utf-8")
-    (one,) = parsed([f"desk={tmp_path / 'flat.urdf'}#case"], "objects", ())
-    made = ready_object(one, tmp_path / "objects")
-    item = vkc.load_object(description_of(made))
+    (one,) = parse_requests([f"desk={tmp_path / 'flat.urdf'}#case"], "objects", ())
+    made = prepare_object(one, tmp_path / "objects")
+    item = vkc.load_object(load_description(made))
     assert sorted(item.links) == ["case", "front", "tray"], "not the lamp"
     best = item.attachment()
     approach = (item.link_placement(best.link, [0.0]) * best.placement).rotation[:, 2]
@@ -68,7 +73,7 @@ def test_a_file_is_imported_once_with_its_front_to_the_robot(tmp_path: Path) -> 
     shut, drawn = (item.link_placement("tray", [value]).translation for value in (0.0, 0.3))
     np.testing.assert_allclose(drawn - shut, [-0.3, 0.0, 0.0], atol=1e-9)
     written = {file: file.read_bytes() for file in Path(made).parent.rglob("*") if file.is_file()}
-    assert ready_object(one, tmp_path / "objects") == made
+    assert prepare_object(one, tmp_path / "objects") == made
     assert {
         file: file.read_bytes() for file in Path(made).parent.rglob("*") if file.is_file()
     } == written
@@ -81,24 +86,24 @@ def test_a_link_whose_name_is_not_that_of_a_file(tmp_path: Path, link: str) -> N
     (tmp_path / "evil" / "letter.txt").write_text("mine")
     desk = DESK.replace("case", link)
     (tmp_path / "flat.urdf").write_text(desk, encoding="utf-8")
-    (one,) = parsed([f"{tmp_path / 'flat.urdf'}#{link}"], "objects", ())
+    (one,) = parse_requests([f"{tmp_path / 'flat.urdf'}#{link}"], "objects", ())
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(vkc.InputError, match="objects: not a plain file name"):
-        ready_object(one, tmp_path / "a" / "objects")
+        prepare_object(one, tmp_path / "a" / "objects")
     with pytest.raises(vkc.InputError, match="robots: not a plain file name"):
-        ready_robot(Given(link, "husky_ur5e"), tmp_path / "a" / "robots")
+        prepare_robot(Request(link, "husky_ur5e"), tmp_path / "a" / "robots")
     assert sorted(tmp_path.rglob("*")) == before
-    (one,) = parsed([f"desk={tmp_path / 'flat.urdf'}#{link}"], "objects", ())
-    assert ready_object(one, tmp_path / "objects") == str(tmp_path / "objects/desk/desk.yaml")
+    (one,) = parse_requests([f"desk={tmp_path / 'flat.urdf'}#{link}"], "objects", ())
+    assert prepare_object(one, tmp_path / "objects") == str(tmp_path / "objects/desk/desk.yaml")
 
 
 def test_a_robot_that_says_what_its_hand_is_stays_as_it_is(tmp_path: Path) -> None:
-    assert ready_robot(Given("husky", "husky_ur5e"), tmp_path) == "husky_ur5e"
+    assert prepare_robot(Request("husky", "husky_ur5e"), tmp_path) == "husky_ur5e"
     assert not list(tmp_path.iterdir())
     file = write_arms(tmp_path / "given")
-    made = Path(ready_robot(Given("two_arms", str(file)), tmp_path / "robots"))
+    made = Path(prepare_robot(Request("two_arms", str(file)), tmp_path / "robots"))
     assert made == tmp_path / "robots" / "two_arms"
     assert vkc.load_robot(made).touch_links
     changed = (made / "robot.yaml").stat().st_mtime_ns
-    ready_robot(Given("two_arms", str(file)), tmp_path / "robots")
+    prepare_robot(Request("two_arms", str(file)), tmp_path / "robots")
     assert (made / "robot.yaml").stat().st_mtime_ns == changed

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.benchmarks.harness.record import meta
+from vkc_pin.benchmarks.harness.record import describe_environment
 from vkc_pin.benchmarks.robot_object_matrix.matrix import chart, report
 
 
@@ -44,7 +44,10 @@ RECORDS = [
 
 def test_report() -> None:
     text = report(
-        {"meta": {**meta(starts=2, seed=0, share=0.5, max_evaluations=1000)}, "trials": RECORDS}
+        {
+            "meta": {**describe_environment(starts=2, seed=0, share=0.5, max_evaluations=1000)},
+            "trials": RECORDS,
+        }
     )
     assert "3 robots, 3 objects of 3 kinds, 2 random starts each" in text
     assert "A joint is opened by 50% of its range" in text

@@ -12,9 +12,9 @@ import pytest
 import vkc_pin as vkc
 from vkc_pin.benchmarks.robot_object_matrix.pairs import (
     SHARE,
-    description_of,
-    hall,
-    pair,
+    load_description,
+    make_hall,
+    make_pair,
 )
 from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.models.shapes import compute_world_box
@@ -34,18 +34,18 @@ def husky() -> vkc.Robot:
 
 def test_descriptions_are_the_same_wherever_they_are_read() -> None:
     stored = find_resource_folder("scenes") / "objects" / "narrow_door.yaml"
-    by_name, by_path = description_of("narrow_door"), description_of(str(stored))
+    by_name, by_path = load_description("narrow_door"), load_description(str(stored))
     assert by_name == by_path
     assert Path(by_name["urdf"]).is_absolute()
     assert vkc.load_object(by_name).name == "narrow_door"
-    assert description_of("oven_7") == vkc.procedural.random_object("oven", 7)
+    assert load_description("oven_7") == vkc.procedural.random_object("oven", 7)
     with pytest.raises(vkc.UnknownNameError, match="did you mean 'oven_0'"):
-        description_of("ofen_0")
+        load_description("ofen_0")
 
 
 @pytest.mark.parametrize("name", ["drawers_0", "faucet_0", "narrow_door", "low_drawer"])
 def test_everything_stands_where_it_belongs(name: str) -> None:
-    scene = hall("husky_ur5e", name, description_of(name))
+    scene = make_hall("husky_ur5e", name, load_description(name))
     boxes = np.array(
         [
             compute_world_box(shape.geometry, shape.placement)
@@ -66,7 +66,7 @@ def test_everything_stands_where_it_belongs(name: str) -> None:
 
 
 def test_half_of_the_range_by_what_was_proposed(husky: vkc.Robot) -> None:
-    found = pair(husky, "husky_ur5e", "drawers_0")
+    found = make_pair(husky, "husky_ur5e", "drawers_0")
     assert found.scene is not None
     assert found.step is not None
     item = found.scene.objects["it"].object
@@ -90,7 +90,7 @@ def test_what_is_low_stands_on_a_counter(tmp_path: Path, height: float, raised: 
         "0 0 0.5", f"0 0 {height / 2}"
     )
     file = _written(tmp_path / "box.yaml", urdf=urdf)
-    scene = hall("husky_ur5e", file, description_of(file))
+    scene = make_hall("husky_ur5e", file, load_description(file))
     boxes = np.array(
         [
             compute_world_box(shape.geometry, shape.placement)
@@ -109,13 +109,13 @@ def _written(path: Path, **more: Any) -> str:
 
 
 def test_what_no_hand_can_hold_is_out_of_reach(husky: vkc.Robot, tmp_path: Path) -> None:
-    found = pair(husky, "husky_ur5e", _written(tmp_path / "smooth.yaml"))
+    found = make_pair(husky, "husky_ur5e", _written(tmp_path / "smooth.yaml"))
     assert found.step is None
     assert found.because.startswith("slide: nothing of it fits between the fingers")
 
 
 def test_a_robot_without_a_hand_opens_nothing() -> None:
-    found = pair(vkc.load_robot("ur5"), "ur5", "drawers_0")
+    found = make_pair(vkc.load_robot("ur5"), "ur5", "drawers_0")
     assert (found.scene, found.step) == (None, None)
     assert "the hand of 'ur5_robot' is undefined" in found.because
 
@@ -128,7 +128,7 @@ def test_what_the_arm_does_not_get_to_is_out_of_reach(husky: vkc.Robot, tmp_path
     bar = '<link name="bar"><collision><geometry><box size="0.02 0.2 0.02"/></geometry></collision></link>'
     fixed = '<joint name="on" type="fixed"><parent link="block"/><child link="bar"/><origin xyz="-0.26 0 0"/></joint>'
     high = SMOOTH.replace("0 0 0.5", "0 0 3.5").replace('<link name="frame"/>', foot)
-    found = pair(
+    found = make_pair(
         husky,
         "husky_ur5e",
         _written(tmp_path / "high.yaml", urdf=high.replace("</robot>", f"{bar}{fixed}</robot>")),

@@ -4,7 +4,7 @@ import pytest
 from helpers.arm_urdf import write_arms
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.robot_object_matrix.reach import random_poses
+from vkc_pin.benchmarks.robot_object_matrix.reach import sample_reachable_poses
 
 
 @pytest.fixture(scope="module")
@@ -14,15 +14,16 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> vkc.Robot:
 
 
 def test_poses_are_above_the_floor_and_the_seed_and_the_name_make_them(robot: vkc.Robot) -> None:
-    poses = random_poses(robot, "one", 8)
+    poses = sample_reachable_poses(robot, "one", 8)
     assert all(pose.translation[2] > vkc.Options().dist_safe for pose in poses)
     again, other, later = (
-        random_poses(robot, *given, seed=seed)
+        sample_reachable_poses(robot, *given, seed=seed)
         for *given, seed in (("one", 8, 0), ("two", 8, 0), ("one", 8, 1))
     )
     assert all(a.isApprox(b, 0.0) for a, b in zip(poses, again, strict=True))
     for others in (other, later):
         assert not any(a.isApprox(b, 1e-3) for a in poses for b in others)
     assert all(
-        a.isApprox(b, 0.0) for a, b in zip(poses, random_poses(robot, "one", 3), strict=False)
+        a.isApprox(b, 0.0)
+        for a, b in zip(poses, sample_reachable_poses(robot, "one", 3), strict=False)
     ), "more of them begin alike"

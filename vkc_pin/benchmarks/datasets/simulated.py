@@ -16,7 +16,7 @@ import numpy as np
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.utils.parallel.journal import JournalContents
 
-__all__ = ["WORKERS", "Costs", "measured", "simulated"]
+__all__ = ["WORKERS", "Costs", "measure_costs", "simulate_workers"]
 
 WORKERS = (1, 2, 10, 100, 1000)
 _AHEAD = 2  # tasks in hand or waiting at a worker, as the engine has them
@@ -46,7 +46,7 @@ class Costs:
         return float(np.mean(self.later or self.first))
 
 
-def measured(dataset: Dataset) -> Costs:
+def measure_costs(dataset: Dataset) -> Costs:
     """Return the costs in a dataset's journal."""
     kept = JournalContents.read(dataset.folder / "journal.jsonl")
     fields = dataset.recipe.fields
@@ -67,7 +67,7 @@ def measured(dataset: Dataset) -> Costs:
     return Costs(tuple(first), tuple(later), client / len(tasks), good / len(tasks))
 
 
-def simulated(costs: Costs, workers: int, tasks: int | None = None) -> dict[str, Any]:
+def simulate_workers(costs: Costs, workers: int, tasks: int | None = None) -> dict[str, Any]:
     """Simulate a number of workers.
 
     Args:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vkc_pin.benchmarks.datasets.simulated import WORKERS, Costs, measured, simulated
-from vkc_pin.benchmarks.harness.record import Record, meta
+from vkc_pin.benchmarks.datasets.simulated import WORKERS, Costs, measure_costs, simulate_workers
+from vkc_pin.benchmarks.harness.record import Record, describe_environment
 from vkc_pin.benchmarks.harness.runner import check_folder
-from vkc_pin.benchmarks.harness.tables import decimal, foot, markdown, to_csv
+from vkc_pin.benchmarks.harness.tables import describe_run, format_decimal, format_table, to_csv
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generation import generate
 from vkc_pin.datasets.recipes.recipe import TASKS, load_recipe
@@ -55,7 +55,7 @@ def run(
 
     Returns:
         {"meta": ..., "trials": records by task, "curve": records by task and number of workers,
-        "simulated": results of `simulated`, with `saturated_at`: number of workers that saturate
+        "simulated": results of `simulate_workers`, with `saturated_at`: number of workers that saturate
         the client}.
 
     Raises:
@@ -86,7 +86,7 @@ def run(
             rates[count] = found["episodes_per_hour"]
             if count == jobs:
                 records.append(found)
-                many += _many(task, measured(dataset))
+                many += _many(task, measure_costs(dataset))
         if len(rates) > 1:
             curves += [
                 {
@@ -97,7 +97,7 @@ def run(
                 }
                 for count, rate in rates.items()
             ]
-    about = meta(
+    about = describe_environment(
         benchmark="throughput", recipe=made.digest, episodes=episodes, jobs=jobs, sessions=[]
     )
     about |= {
@@ -117,7 +117,9 @@ def run(
 def _many(task: str, costs: Costs) -> list[dict[str, Any]]:
     """Simulate a task with several numbers of workers."""
     full = round(costs.mean / costs.client, 1) if costs.client else None
-    return [{"task": task, **simulated(costs, count), "saturated_at": full} for count in WORKERS]
+    return [
+        {"task": task, **simulate_workers(costs, count), "saturated_at": full} for count in WORKERS
+    ]
 
 
 def record(task: str, dataset: Dataset, jobs: int | None, wall: float) -> dict[str, Any]:
@@ -206,11 +208,11 @@ def report(result: Mapping[str, Any]) -> str:
         "time, without what else ran on the machine. Growth is that of a process in a thousand attempts, once half of its "
         "attempts have filled its caches; the client feeds the processes and writes down what comes, and takes so much "
         "processor time an attempt. Medians of an attempt, of what sets it up (room, start, grasp) and of planning it.",
-        markdown(head, [_row(one) for one in records]),
+        format_table(head, [_row(one) for one in records]),
         *_curve(result["curve"]),
         *_simulation(result["simulated"], bool(about["scheduled"])),
     ]
-    return "\n\n".join([*parts, foot(about)]) + "\n"
+    return "\n\n".join([*parts, describe_run(about)]) + "\n"
 
 
 def _row(one: Record) -> list[str]:
@@ -219,7 +221,7 @@ def _row(one: Record) -> list[str]:
     share = f"{one['successes']} of {one['attempts']}"
     growth = "–" if one["memory_slope_mb"] is None else f"{one['memory_slope_mb']:.0f}"
     paid = (f"{one['memory_mb']:.0f}", growth, f"{one['client_ms']:.1f}")
-    return [one["task"], *rates, share, str(one["workers"]), *paid, *map(decimal, times)]
+    return [one["task"], *rates, share, str(one["workers"]), *paid, *map(format_decimal, times)]
 
 
 def _curve(curve: Sequence[Record]) -> list[str]:
@@ -227,11 +229,16 @@ def _curve(curve: Sequence[Record]) -> list[str]:
     if not curve:
         return []
     rows = [
-        [one["task"], str(one["workers"]), f"{one['episodes_per_hour']:.0f}", decimal(one["times"])]
+        [
+            one["task"],
+            str(one["workers"]),
+            f"{one['episodes_per_hour']:.0f}",
+            format_decimal(one["times"]),
+        ]
         for one in curve
     ]
     text = "The same episodes by fewer workers, in this run too. One works in the client's own process, without Dask."
-    return [text, markdown(["task", "workers", "episodes an hour", "times one"], rows)]
+    return [text, format_table(["task", "workers", "episodes an hour", "times one"], rows)]
 
 
 def _simulation(many: Sequence[Record], scheduled: bool) -> list[str]:
@@ -259,7 +266,7 @@ def _simulation(many: Sequence[Record], scheduled: bool) -> list[str]:
         "of the workers' time that goes into the dataset, and work in vain is what was begun beyond its last number. Nothing is "
         "said of network and disk."
     )
-    return [text, markdown(head, rows), "![Efficiency of many workers, simulated](workers.png)"]
+    return [text, format_table(head, rows), "![Efficiency of many workers, simulated](workers.png)"]
 
 
 def workers_chart(result: Mapping[str, Any], path: str | Path | None) -> Figure:

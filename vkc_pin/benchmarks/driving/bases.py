@@ -11,13 +11,13 @@ import numpy as np
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial
 from vkc_pin.benchmarks.harness.runner import Execution
-from vkc_pin.benchmarks.harness.tables import JUDGED, count, markdown, page, select
+from vkc_pin.benchmarks.harness.tables import JUDGED, count, format_table, join_report, select
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate
 
-__all__ = ["BASES", "TASKS", "TURNING_RADIUS", "report", "run", "started"]
+__all__ = ["BASES", "TASKS", "TURNING_RADIUS", "make_start", "report", "run"]
 
 TASKS = {"door": {"hinge": 1.2}, "drawer": {"slide": 0.35}}
 """Scene → what is opened how far: its object of the same name."""
@@ -31,7 +31,7 @@ BASES: dict[str, dict[str, Any]] = {
 """Kind of base → what else the scene says of the robot."""
 
 
-def started(task: str, base: str, seed: int, number: int) -> Scene:
+def make_start(task: str, base: str, seed: int, number: int) -> Scene:
     """Return a scene with a random start, which is the same for every kind of base."""
     scene = load_scene(task).sample_start(np.random.default_rng([seed, number]))
     robot = {**scene.document["robot"], "base": base, **BASES[base]}
@@ -57,8 +57,8 @@ def run(
         bases: Some of `BASES`. Default: all.
     """
     runner.check_positive(trials=trials)
-    tasks = list(runner.chosen("task", TASKS if tasks is None else tasks, TASKS))
-    bases = list(runner.chosen("base", BASES if bases is None else bases, BASES))
+    tasks = list(runner.select_names("task", TASKS if tasks is None else tasks, TASKS))
+    bases = list(runner.select_names("base", BASES if bases is None else bases, BASES))
     settings = {
         "benchmark": "bases",
         "seed": seed,
@@ -94,13 +94,13 @@ def report(result: Mapping[str, Any]) -> str:
     ]
     head = ["task", "base", "success", "time, median [s]", "95th percentile [s]"]
     head += ["evaluations", "Ipopt iterations", "base [m]", "arm [rad]", "motion [s]"]
-    return page(
+    return join_report(
         about,
         "# Bases that drive",
         f"{about['starts']} random starts, seed {about['seed']}; steered bases turn with a radius "
         f"of at least {about['radius']:g} m. {JUDGED} Times are those of all trials, without "
         "building symbolic programs; path lengths are medians, too.",
-        markdown(head, rows),
+        format_table(head, rows),
         *(["\n".join(["Failures:", "", *lines])] if lines else []),
     )
 
@@ -119,7 +119,9 @@ def _row(task: str, base: str, records: Sequence[Record]) -> list[str]:
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:
     task, base, seed, number = (spec[field] for field in ("task", "base", "seed", "number"))
-    found: Plan = plan(started(task, base, seed, number), [Actuate(task, TASKS[task])], seed=seed)
+    found: Plan = plan(
+        make_start(task, base, seed, number), [Actuate(task, TASKS[task])], seed=seed
+    )
     if found.status == "interrupted":
         raise KeyboardInterrupt
     about = {"task": task, "base": base, "number": number, "duration": found.metrics["duration"]}

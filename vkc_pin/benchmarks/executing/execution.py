@@ -12,12 +12,18 @@ from typing import Any, Unpack
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
+from vkc_pin.benchmarks.harness.limits import LIMITS, describe_limit
 from vkc_pin.benchmarks.harness.record import Record, trial, values
 from vkc_pin.benchmarks.harness.runner import Execution
-from vkc_pin.benchmarks.harness.tables import count, markdown, page, select, wilson
+from vkc_pin.benchmarks.harness.tables import (
+    compute_wilson_interval,
+    count,
+    format_table,
+    join_report,
+    select,
+)
 from vkc_pin.benchmarks.problems.problem_set import TASKS as ALL
-from vkc_pin.benchmarks.problems.problem_set import started
+from vkc_pin.benchmarks.problems.problem_set import make_start
 from vkc_pin.planning.planner import plan
 from vkc_pin.simulation.execution import GRASPS, simulate
 from vkc_pin.simulation.physics import Physics, import_mujoco
@@ -72,7 +78,7 @@ def run(
     """
     import_mujoco()
     runner.check_positive(trials=trials)
-    names = runner.chosen("task", tasks, TASKS)
+    names = runner.select_names("task", tasks, TASKS)
     settings = {
         "benchmark": "execution",
         "seed": seed,
@@ -105,15 +111,15 @@ def report(result: Mapping[str, Any]) -> str:
         f"{r.get('task')}: {text}" for r in records for text in r.get("problems", ())
     )
     lines = [f"- {text}" + f" ({n} times)" * (n > 1) for text, n in problems.items()]
-    return page(
+    return join_report(
         about,
         "# Plans in physics" + ", held by friction" * (about.get("grasp") == "friction"),
-        f"{about['starts']} random starts per task, seed {about['seed']}, {allowed(about)} each. "
+        f"{about['starts']} random starts per task, seed {about['seed']}, {describe_limit(about)} each. "
         "Plans are counted by the independent validation, and executed if they end within 10 mm "
         "and 0.02 rad of the goal, nothing is pulled out of the hand, and no contact is deeper "
         "than planned by more than 1 mm; beside it Wilson's interval of 95 %. Errors of arm and "
         "base, misses of goals, forces, torques and slips are the largest of all trials.",
-        markdown(_HEAD, rows),
+        format_table(_HEAD, rows),
         "## What went wrong",
         "\n".join(lines) or "Nothing.",
     )
@@ -122,7 +128,7 @@ def report(result: Mapping[str, Any]) -> str:
 def _row(name: str, records: Sequence[Record]) -> list[str]:
     planned = select(records, success=True)
     good = sum(bool(record.get("executed")) for record in planned)
-    low, high = wilson(good, len(planned))
+    low, high = compute_wilson_interval(good, len(planned))
     interval = f"{100.0 * low:.0f}–{100.0 * high:.0f}" if planned else "–"
     cells = [name, count(records), count(planned, "executed"), interval]
     for field, (factor, digits) in _FIGURES.items():
@@ -144,7 +150,7 @@ _FIGURES = {
 
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:
-    scene, steps = started(spec["task"], spec["seed"], spec["number"]), ALL[spec["task"]].steps
+    scene, steps = make_start(spec["task"], spec["seed"], spec["number"]), ALL[spec["task"]].steps
     found = plan(scene, steps, seed=spec["seed"], **LIMITS)
     more: dict[str, Any] = {"task": spec["task"], "number": spec["number"], "executed": False}
     if found.success:

@@ -10,7 +10,12 @@ import numpy as np
 
 from vkc_pin.benchmarks.harness.record import Record
 from vkc_pin.benchmarks.harness.record import values as numbers
-from vkc_pin.benchmarks.harness.tables import common, mean_and_deviation, quartiles, wilson
+from vkc_pin.benchmarks.harness.tables import (
+    compute_mean_and_deviation,
+    compute_quartiles,
+    compute_wilson_interval,
+    find_common_successes,
+)
 from vkc_pin.planning.plan import Plan
 from vkc_pin.visualization.plots.style import (
     COLOURS,
@@ -92,7 +97,7 @@ def means_chart(
     names = {}
     for scene, name in scenes.items():
         own = [record for record in records if record["scene"] == scene]
-        both = common(own, methods) if shared else []
+        both = find_common_successes(own, methods) if shared else []
         for k, method in enumerate(methods):
             mine = [record for record in own if record["method"] == method]
             if shared:
@@ -104,7 +109,7 @@ def means_chart(
     def bar(scene: str, method: str) -> tuple[float, float, float] | None:
         if not values[scene, method]:
             return None
-        mean, deviation = mean_and_deviation(values[scene, method])
+        mean, deviation = compute_mean_and_deviation(values[scene, method])
         spread = deviation if np.isfinite(deviation) else 0.0
         return mean - spread, mean, mean + spread
 
@@ -130,7 +135,7 @@ def criteria_chart(
         methods: Methods in the order of the bars.
         title: Title.
     """
-    both = common(records, methods)
+    both = find_common_successes(records, methods)
     where = (
         f"the\n{len(both)} trial{'s' * (len(both) != 1)} where all succeed"
         if both
@@ -159,7 +164,7 @@ def criteria_chart(
                     interval = (
                         _rate([value > 0.0 for value in values])
                         if field == "success"
-                        else quartiles(values)
+                        else compute_quartiles(values)
                     )
                     _bar(
                         axes,
@@ -273,7 +278,7 @@ def _grouped(
 
 def _rate(good: Sequence[bool]) -> tuple[float, float, float]:
     """Return Wilson's lower limit, success rate and upper limit [%]."""
-    low, high = wilson(sum(good), len(good))
+    low, high = compute_wilson_interval(sum(good), len(good))
     return 100.0 * low, 100.0 * sum(good) / len(good), 100.0 * high
 
 

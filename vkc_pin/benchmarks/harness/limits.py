@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["LIMITS", "MAX_EVALUATIONS", "TIME_LIMIT", "allowed"]
+__all__ = ["LIMITS", "MAX_EVALUATIONS", "TIME_LIMIT", "describe_limit"]
 
 MAX_EVALUATIONS = 1_000_000
 """Units, several times what trials take: what can be done is done with less."""
@@ -15,7 +15,7 @@ LIMITS: Mapping[str, Any] = {"max_evaluations": MAX_EVALUATIONS, "time_limit": T
 """Both, as arguments of planners, and for the record."""
 
 
-def allowed(about: Mapping[str, Any]) -> str:
+def describe_limit(about: Mapping[str, Any]) -> str:
     """Return the limit of a record's trials in words; old records limit planning time."""
     if "max_evaluations" in about:
         return f"at most {about['max_evaluations']:,} evaluations".replace(",", " ")

@@ -18,12 +18,12 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 __all__ = [
     "Record",
     "Solve",
-    "commit",
+    "compute_peaks",
+    "describe_environment",
     "distribution",
+    "find_commit",
     "find_versions",
     "measure_peak_memory",
-    "meta",
-    "peaks",
     "trial",
     "values",
 ]
@@ -34,10 +34,10 @@ Solve = Callable[[Scene, Mapping[str, Any]], Plan]
 """What plans a trial: takes its scene and its specification."""
 
 
-def meta(**settings: Any) -> dict[str, Any]:
+def describe_environment(**settings: Any) -> dict[str, Any]:
     """Return commit, versions, machine and `settings`."""
     return {
-        "commit": commit(),
+        "commit": find_commit(),
         "versions": find_versions(),
         "machine": describe_machine(),
         **settings,
@@ -45,7 +45,7 @@ def meta(**settings: Any) -> dict[str, Any]:
 
 
 @functools.cache
-def commit() -> str | None:
+def find_commit() -> str | None:
     """Return the commit of the sources, with "-dirty" if they are changed; None without git."""
     command = [
         "git",
@@ -89,12 +89,12 @@ def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
         **{key: value for key, value in m.items() if key.startswith("time_")},
         "failed_constraint": failed,
         "violations": [str(violation) for violation in violations],
-        "commit": commit(),
+        "commit": find_commit(),
         **more,
     }
 
 
-def peaks(trajectory: Trajectory) -> dict[str, float]:
+def compute_peaks(trajectory: Trajectory) -> dict[str, float]:
     """Return the largest velocity [rad/s] and acceleration [rad/s²] of any arm joint."""
     arm, curve = slice(3, trajectory.robot_size), trajectory.curve
     rates = (

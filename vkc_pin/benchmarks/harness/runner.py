@@ -16,7 +16,7 @@ from typing import Any, TypedDict
 import numpy as np
 from tqdm import tqdm
 
-from vkc_pin.benchmarks.harness.record import measure_peak_memory, meta
+from vkc_pin.benchmarks.harness.record import describe_environment, measure_peak_memory
 from vkc_pin.benchmarks.harness.tables import to_csv
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.parallel.engine import CrashedTask, require_dask, run_tasks
@@ -24,7 +24,7 @@ from vkc_pin.utils.parallel.journal import Journal
 from vkc_pin.world.files.resources import find_package_folder, find_resource_folder
 from vkc_pin.world.files.writing import check_links, check_writable, write_atomically
 
-__all__ = ["Execution", "Function", "check_folder", "check_positive", "chosen", "run"]
+__all__ = ["Execution", "Function", "check_folder", "check_positive", "run", "select_names"]
 
 
 class Execution(TypedDict, total=False):
@@ -102,7 +102,7 @@ def run(
     except (FileExistsError, NotADirectoryError):
         raise InputError("this is no folder", file=out, field="out") from None
     check_writable(out / _JOURNAL)
-    about = meta()
+    about = describe_environment()
     made = about.pop(
         "commit"
     )  # what the sources are says more than it about whether trials go together
@@ -170,7 +170,7 @@ def check_folder(out: str | Path, journals: Sequence[str] = (_JOURNAL,)) -> None
     check_links(out)
 
 
-def chosen(kind: str, names: Iterable[str], choices: Iterable[str]) -> tuple[str, ...]:
+def select_names(kind: str, names: Iterable[str], choices: Iterable[str]) -> tuple[str, ...]:
     """Return distinct names in the order of the choices.
 
     Raises:

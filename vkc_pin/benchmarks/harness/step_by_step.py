@@ -13,10 +13,12 @@ from vkc_pin.planning.planner import plan
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
 
-__all__ = ["combined", "step_by_step"]
+__all__ = ["combine_records", "plan_step_by_step"]
 
 
-def step_by_step(scene: Scene, steps: Sequence[Step], *, options: Options, seed: int) -> list[Plan]:
+def plan_step_by_step(
+    scene: Scene, steps: Sequence[Step], *, options: Options, seed: int
+) -> list[Plan]:
     """Return the plans of steps up to the first failure."""
     plans: list[Plan] = []
     for step in steps:
@@ -27,7 +29,7 @@ def step_by_step(scene: Scene, steps: Sequence[Step], *, options: Options, seed:
     return plans
 
 
-def combined(
+def combine_records(
     plans: Sequence[Plan], of: int, *, method: str, seed: int, **more: Any
 ) -> dict[str, Any]:
     """Return one record of the plans of the first of `of` steps."""

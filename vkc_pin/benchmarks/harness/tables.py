@@ -17,23 +17,23 @@ __all__ = [
     "EFFORTS",
     "JUDGED",
     "TIMES",
-    "common",
     "comparison_table",
+    "compute_mean_and_deviation",
+    "compute_quartiles",
+    "compute_wilson_interval",
     "count",
-    "decimal",
-    "failures",
-    "foot",
-    "lower",
-    "markdown",
-    "mean_and_deviation",
-    "medians",
+    "count_failures",
+    "count_lower",
+    "count_timeouts",
+    "describe_run",
+    "find_common_successes",
+    "format_decimal",
+    "format_medians",
+    "format_table",
+    "join_report",
     "methods_table",
-    "page",
-    "quartiles",
     "select",
-    "timed_out",
     "to_csv",
-    "wilson",
 ]
 
 EFFORTS = {
@@ -71,7 +71,7 @@ def _to_text(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def markdown(head: Sequence[str], rows: Iterable[Sequence[str]], *, text: int = 1) -> str:
+def format_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, text: int = 1) -> str:
     """Return a Markdown table whose first `text` columns are aligned left."""
     rule = ["---" if column < text else "---:" for column in range(len(head))]
     return "\n".join(
@@ -80,7 +80,7 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]], *, text: int = 
     )
 
 
-def wilson(good: int, number: int) -> tuple[float, float]:
+def compute_wilson_interval(good: int, number: int) -> tuple[float, float]:
     """Return Wilson's 95 % confidence interval of a success rate; (0, 1) without trials."""
     if number == 0:
         return 0.0, 1.0
@@ -90,7 +90,7 @@ def wilson(good: int, number: int) -> tuple[float, float]:
     return float(interval.low), float(interval.high)
 
 
-def quartiles(values: Sequence[float]) -> tuple[float, float, float]:
+def compute_quartiles(values: Sequence[float]) -> tuple[float, float, float]:
     """Return first quartile, median and third quartile; NaN without values."""
     found = np.percentile(values, (25, 50, 75)) if len(values) else np.full(3, np.nan)
     first, median, third = found.tolist()
@@ -108,28 +108,28 @@ def count(records: Sequence[Record], field: str = "success") -> str:
     return f"{sum(bool(record.get(field)) for record in records)} of {len(records)}"
 
 
-def medians(records: Sequence[Record], *fields: str) -> list[str]:
+def format_medians(records: Sequence[Record], *fields: str) -> list[str]:
     """Format the medians of fields."""
-    return [decimal(distribution(records, field)[0]) for field in fields]
+    return [format_decimal(distribution(records, field)[0]) for field in fields]
 
 
-def page(about: Mapping[str, Any], *parts: str) -> str:
+def join_report(about: Mapping[str, Any], *parts: str) -> str:
     """Join the parts of a report, followed by machine and versions."""
-    return "\n\n".join([*parts, foot(about)]) + "\n"
+    return "\n\n".join([*parts, describe_run(about)]) + "\n"
 
 
-def decimal(value: float) -> str:
+def format_decimal(value: float) -> str:
     """Format a number with two decimals, or a dash for NaN and infinity."""
     return f"{value:.2f}" if np.isfinite(value) else "–"
 
 
-def mean_and_deviation(values: Sequence[float]) -> tuple[float, float]:
+def compute_mean_and_deviation(values: Sequence[float]) -> tuple[float, float]:
     """Return mean and sample standard deviation (n − 1); NaN for too few values."""
     mean = float(np.mean(values)) if len(values) else float("nan")
     return mean, float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
 
 
-def failures(records: Iterable[Record]) -> str:
+def count_failures(records: Iterable[Record]) -> str:
     """Return the kinds of failures and their counts, most frequent first."""
     kinds = Counter[str]()
     for record in records:
@@ -140,10 +140,10 @@ def failures(records: Iterable[Record]) -> str:
     return ", ".join(f"{kind} {number}" for kind, number in order) or "none"
 
 
-def timed_out(records: Sequence[Record]) -> list[str]:
+def count_timeouts(records: Sequence[Record]) -> list[str]:
     """Return the number of trials that ended with the time limit, and the other failures."""
     others = [record for record in records if record["status"] != "time limit"]
-    return [str(len(records) - len(others)), failures(others)]
+    return [str(len(records) - len(others)), count_failures(others)]
 
 
 def methods_table(
@@ -157,14 +157,18 @@ def methods_table(
     for name, group in _groups(records, scenes):
         for method in methods:
             if own := select(group, method=method):
-                times = map(decimal, distribution(own, "planning_time"))
-                lengths = medians(select(own, success=True), "base_path_length", "arm_path_length")
-                rows.append([name, method, count(own), *times, *lengths, *timed_out(own)])
+                times = map(format_decimal, distribution(own, "planning_time"))
+                lengths = format_medians(
+                    select(own, success=True), "base_path_length", "arm_path_length"
+                )
+                rows.append([name, method, count(own), *times, *lengths, *count_timeouts(own)])
     head = ["scene", "method", "success", "time, median [s]", "95th percentile [s]"]
-    return markdown([*head, "base [m]", "arm [rad]", "timed out", "failures"], rows, text=2)
+    return format_table([*head, "base [m]", "arm [rad]", "timed out", "failures"], rows, text=2)
 
 
-def common(records: Iterable[Record], methods: Sequence[str]) -> list[tuple[Record, ...]]:
+def find_common_successes(
+    records: Iterable[Record], methods: Sequence[str]
+) -> list[tuple[Record, ...]]:
     """Return the records of methods at the same scene, start and repeat where all succeed."""
     found: dict[str, dict[tuple[Any, ...], Record]] = {method: {} for method in methods}
     for record in records:
@@ -175,7 +179,7 @@ def common(records: Iterable[Record], methods: Sequence[str]) -> list[tuple[Reco
     return [tuple(found[method][place] for method in methods) for place in places]
 
 
-def lower(pairs: Sequence[tuple[Record, ...]], field: str) -> int:
+def count_lower(pairs: Sequence[tuple[Record, ...]], field: str) -> int:
     """Count pairs whose first value is lower than the second, beyond rounding."""
     return sum(float(one[field]) < float(other[field]) - _LEAST for one, other in pairs)
 
@@ -189,15 +193,15 @@ def comparison_table(
     """Compare path lengths of two methods, with displayed names, where both succeed."""
     rows = []
     for name, group in _groups(records, scenes):
-        both = common(group, methods)
+        both = find_common_successes(group, methods)
         for field, shown in EFFORTS.items():
             spreads = [_spread([float(pair[k][field]) for pair in both]) for k in (0, 1)]
-            rows.append([name, shown, *spreads, f"{lower(both, field)} of {len(both)}"])
+            rows.append([name, shown, *spreads, f"{count_lower(both, field)} of {len(both)}"])
     head = ["scene", "path length", *(f"{name}: median (quartiles)" for name in names)]
-    return markdown([*head, f"lower with {names[0]}"], rows, text=2)
+    return format_table([*head, f"lower with {names[0]}"], rows, text=2)
 
 
-def foot(about: Mapping[str, Any]) -> str:
+def describe_run(about: Mapping[str, Any]) -> str:
     """Return machine, versions and duration of a run in sentences."""
     machine, versions = about["machine"], {**about["versions"]}
     sources = versions.pop("sources", None)
@@ -220,5 +224,5 @@ def _groups(records: Sequence[Record], scenes: Mapping[str, str]) -> list[tuple[
 
 
 def _spread(values: Sequence[float]) -> str:
-    first, median, third = quartiles(values)
+    first, median, third = compute_quartiles(values)
     return f"{median:.2f} ({first:.2f}–{third:.2f})" if values else "–"

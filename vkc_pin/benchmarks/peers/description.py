@@ -16,7 +16,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.benchmarks.peers.sampled import ranges
+from vkc_pin.benchmarks.peers.sampled import compute_finite_limits
 from vkc_pin.errors import InputError
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
@@ -64,7 +64,7 @@ def describe(problem: TrajectoryProblem, folder: Path, *, inflated: bool = False
     root = ET.Element("robot", {"name": "chain", "tesseract:make_convex": "true"})
     ET.SubElement(root, "link", name="world")
     names = tuple(name.replace(".", "_") for name in chain.names)
-    lower, upper = ranges(problem)
+    lower, upper = compute_finite_limits(problem)
     model, at = chain.model, 0
     for j in range(1, model.njoints):
         parent, kind = (

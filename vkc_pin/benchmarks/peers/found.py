@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from vkc_pin.benchmarks.peers.tasks import Given
+from vkc_pin.benchmarks.peers.tasks import PeerProblem
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.results import make_stationary_trajectory
@@ -22,14 +22,14 @@ from vkc_pin.world.trajectory.formats.archives import PlanStatus
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["Clock", "Found", "Peer", "clearances", "judged"]
+__all__ = ["Clock", "Peer", "PeerResult", "compute_clearances", "validate_path"]
 
 _BETWEEN = 10  # moments that are looked at between two waypoints
 _NEAR = 0.1  # [m] up to which distances are measured
 
 
 @dataclass
-class Found:
+class PeerResult:
     """Result of a planner.
 
     Attributes:
@@ -74,12 +74,12 @@ class Clock:
         return max(0.0, self.limit - self.wall)
 
 
-Peer = Callable[[Given, TrajectoryProblem, int, Clock, Callable[[Floats], bool]], Found]
+Peer = Callable[[PeerProblem, TrajectoryProblem, int, Clock, Callable[[Floats], bool]], PeerResult]
 """What plans: takes a problem, the same as a program, a random seed, the clock, and what tells whether a path is accepted."""
 
 
-def judged(
-    own: Given,
+def validate_path(
+    own: PeerProblem,
     problem: TrajectoryProblem,
     path: Floats | None,
     status: str,
@@ -126,7 +126,9 @@ def judged(
     )
 
 
-def clearances(problem: TrajectoryProblem, trajectory: Trajectory) -> Mapping[str, float | None]:
+def compute_clearances(
+    problem: TrajectoryProblem, trajectory: Trajectory
+) -> Mapping[str, float | None]:
     """Return the least distance of pairs at and between waypoints [m]; None above 0.1 m."""
     share = np.arange(1, _BETWEEN) / _BETWEEN
     begins, lasts = trajectory.times[:-1, None], np.diff(trajectory.times)[:, None]

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.benchmarks.peers.description import FRAME, GROUP, describe
-from vkc_pin.benchmarks.peers.found import Clock, Found
-from vkc_pin.benchmarks.peers.sampled import ranges
-from vkc_pin.benchmarks.peers.tasks import Given, ends
+from vkc_pin.benchmarks.peers.found import Clock, PeerResult
+from vkc_pin.benchmarks.peers.sampled import compute_finite_limits
+from vkc_pin.benchmarks.peers.tasks import PeerProblem, sample_goals
 from vkc_pin.errors import InputError
 from vkc_pin.planning.initialization.keyframes import sample_smoothstep
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
@@ -43,19 +43,19 @@ _PARAMETERS = {
 
 
 def plan_by_trajopt(
-    own: Given,
+    own: PeerProblem,
     problem: TrajectoryProblem,
     seed: int,
     clock: Clock,
     accept: Callable[[Floats], bool],
-) -> Found:
+) -> PeerResult:
     """Plan with trajopt; see `found.Peer`."""
     worker = _worker()
-    goals = ends(problem, np.random.default_rng([seed, 1]), _ENDS)
+    goals = sample_goals(problem, np.random.default_rng([seed, 1]), _ENDS)
     if not len(goals):
-        return Found(status="no configuration at the goal")
-    segments, found = problem.segments, Found(status="not converged")
-    lower, upper = ranges(problem)
+        return PeerResult(status="no configuration at the goal")
+    segments, found = problem.segments, PeerResult(status="not converged")
+    lower, upper = compute_finite_limits(problem)
     goal = problem.pose_goals[0].row
     asked = {
         n.replace(".", "_"): float(problem.lower[-1, k])

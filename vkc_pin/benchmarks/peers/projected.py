@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from vkc_pin.benchmarks.peers.description import FRAME, GROUP, describe
-from vkc_pin.benchmarks.peers.found import Clock, Found
-from vkc_pin.benchmarks.peers.sampled import dense
-from vkc_pin.benchmarks.peers.tasks import Given, beginning, ends
+from vkc_pin.benchmarks.peers.found import Clock, PeerResult
+from vkc_pin.benchmarks.peers.sampled import subdivide
+from vkc_pin.benchmarks.peers.tasks import PeerProblem, find_exact_start, sample_goals
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import import_optional
@@ -30,18 +30,18 @@ _SHARE = 0.2  # of the time that is left, at most, for one configuration at the 
 
 
 def plan_by_projection(
-    own: Given,
+    own: PeerProblem,
     problem: TrajectoryProblem,
     seed: int,
     clock: Clock,
     accept: Callable[[Floats], bool],
-) -> Found:
+) -> PeerResult:
     """Plan with roboplan; see `found.Peer`."""
     core = import_optional("roboplan.core", "peers", purpose="bench peers")
     rrt = import_optional("roboplan.rrt", "peers", purpose="bench peers")
-    goals = ends(problem, np.random.default_rng([seed, 1]), _ENDS)
+    goals = sample_goals(problem, np.random.default_rng([seed, 1]), _ENDS)
     if not len(goals):
-        return Found(status="no configuration at the goal")
+        return PeerResult(status="no configuration at the goal")
     held = problem.closed(problem.task.phases[0])
     with tempfile.TemporaryDirectory() as folder:
         files = describe(problem, Path(folder), inflated=True)
@@ -61,9 +61,9 @@ def plan_by_projection(
         zeros, target = np.zeros(6), np.asfortranarray(problem.targets[0].homogeneous)
         pose = rrt.PoseConstraint(scene, GROUP, FRAME, zeros, zeros, target, "", **tight)
         constraints.append(pose)
-    found = Found(status="no path")
+    found = PeerResult(status="no path")
     names = list(scene.getJointNames())
-    start = core.JointConfiguration(names, there(beginning(problem)))
+    start = core.JointConfiguration(names, there(find_exact_start(problem)))
     for row in goals:
         if clock.left <= 0.0:
             found.status = "timed out"
@@ -98,7 +98,7 @@ def plan_by_projection(
             found.own += time.process_time() - began
         rows = np.array(path.positions)[:, order]
         rows[0] = problem.start
-        found.path, found.status = dense(rows, problem.chain.metric), "found"
+        found.path, found.status = subdivide(rows, problem.chain.metric), "found"
         if accept(found.path):
             break
     return found

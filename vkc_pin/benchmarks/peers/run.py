@@ -16,17 +16,23 @@ from vkc_pin.benchmarks.harness.runner import Execution
 from vkc_pin.benchmarks.harness.tables import (
     JUDGED,
     count,
-    decimal,
-    markdown,
-    medians,
-    page,
+    format_decimal,
+    format_medians,
+    format_table,
+    join_report,
     select,
 )
-from vkc_pin.benchmarks.peers.found import Clock, Found, Peer, clearances, judged
+from vkc_pin.benchmarks.peers.found import (
+    Clock,
+    Peer,
+    PeerResult,
+    compute_clearances,
+    validate_path,
+)
 from vkc_pin.benchmarks.peers.optimized import plan_by_trajopt
 from vkc_pin.benchmarks.peers.projected import plan_by_projection
 from vkc_pin.benchmarks.peers.sampled import plan_by_sampling
-from vkc_pin.benchmarks.peers.tasks import TASKS, Given, given, problem_of
+from vkc_pin.benchmarks.peers.tasks import TASKS, PeerProblem, build_program, make_problem
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
 from vkc_pin.utils.arrays import Floats
@@ -81,7 +87,10 @@ def run(
         time_limit: Wall-time limit of a trial [s].
     """
     runner.check_positive(trials=trials)
-    names, chosen = runner.chosen("task", tasks, TASKS), runner.chosen("method", methods, METHODS)
+    names, chosen = (
+        runner.select_names("task", tasks, TASKS),
+        runner.select_names("method", methods, METHODS),
+    )
     settings = {
         "benchmark": "peers",
         "seed": seed,
@@ -117,7 +126,7 @@ def report(result: Mapping[str, Any]) -> str:
         if (own := select(records, task=task, method=method))
     ]
     listed = ", ".join(f"{name} {number}" for name, number in about["peers"].items())
-    return page(
+    return join_report(
         about,
         "# Beside other planners",
         f"{about['starts']} problems per task, seed {about['seed']}, the same for all; at most "
@@ -125,19 +134,19 @@ def report(result: Mapping[str, Any]) -> str:
         "CPU time from the call, everything included, to the first and to the final motion; "
         "medians of all trials that have one, the percentile of the final one. Path lengths are "
         "medians of successes; clearances are the least of all successes.",
-        markdown(_HEAD, rows, text=2),
+        format_table(_HEAD, rows, text=2),
     )
 
 
 def _row(task: str, method: str, records: Sequence[Record]) -> list[str]:
     good = select(records, success=True)
     late = sum(record["status"] in ("timed out", "time limit") for record in records)
-    percentile = decimal(distribution(records, "time_final")[1])
-    times = [*medians(records, "time_first", "time_final"), percentile]
-    clearances = [values(good, f"clearance_{where}") for where in ("at", "between")]
-    least = [f"{1e3 * min(found):.1f}" if found else "–" for found in clearances]
-    lengths = medians(good, "base_path_length", "arm_path_length")
-    own = medians(records, "time_own")
+    percentile = format_decimal(distribution(records, "time_final")[1])
+    times = [*format_medians(records, "time_first", "time_final"), percentile]
+    compute_clearances = [values(good, f"clearance_{where}") for where in ("at", "between")]
+    least = [f"{1e3 * min(found):.1f}" if found else "–" for found in compute_clearances]
+    lengths = format_medians(good, "base_path_length", "arm_path_length")
+    own = format_medians(records, "time_own")
     return [task, method, count(records), str(late), *times, *own, *lengths, *least]
 
 
@@ -155,9 +164,9 @@ def _installed(methods: Sequence[str]) -> dict[str, str]:
 
 def _record(spec: dict[str, Any], *, folder: str) -> dict[str, Any]:
     task, number, method, seed = (spec[name] for name in ("task", "number", "method", "seed"))
-    own = given(task, seed, number)
+    own = make_problem(task, seed, number)
     clock = Clock(spec["time_limit"])
-    found = Found()
+    found = PeerResult()
     if method in PEERS:
         plan_of, found = _by_peer(own, method, number, clock)
     else:
@@ -179,22 +188,22 @@ def _record(spec: dict[str, Any], *, folder: str) -> dict[str, Any]:
         "wall": wall,
         "about": found.about,
     }
-    more |= clearances(problem_of(own), plan_of.trajectory) if plan_of.success else {}
+    more |= compute_clearances(build_program(own), plan_of.trajectory) if plan_of.success else {}
     return trial(plan_of, method=method, seed=seed, **more)
 
 
-def _by_peer(own: Given, method: str, seed: int, clock: Clock) -> tuple[Plan, Found]:
+def _by_peer(own: PeerProblem, method: str, seed: int, clock: Clock) -> tuple[Plan, PeerResult]:
     """Return a peer's plan and result."""
-    problem = problem_of(own)
+    problem = build_program(own)
     judgements: dict[int, Plan] = {}
 
     def accept(path: Floats) -> bool:
-        judgements[0] = judged(own, problem, path, "rejected", name=method, seed=seed)
+        judgements[0] = validate_path(own, problem, path, "rejected", name=method, seed=seed)
         return judgements[0].success
 
     found = PEERS[method][0](own, problem, seed, clock, accept)
     if found.path is None:
-        return judged(own, problem, None, found.status, name=method, seed=seed), found
+        return validate_path(own, problem, None, found.status, name=method, seed=seed), found
     if not judgements:
         accept(found.path)
     said = judgements[0]
@@ -203,7 +212,7 @@ def _by_peer(own: Given, method: str, seed: int, clock: Clock) -> tuple[Plan, Fo
     return dataclasses.replace(said, status=status) if late else said, found
 
 
-def _by_us(own: Given, method: str, seed: int, time_limit: float) -> Plan:
+def _by_us(own: PeerProblem, method: str, seed: int, time_limit: float) -> Plan:
     """Plan with a baseline or this package, without caches of earlier trials."""
     if method == "VKC":
         return plan(own.scene, own.steps, seed=seed, time_limit=time_limit)

@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.benchmarks.peers.found import Clock, Found
-from vkc_pin.benchmarks.peers.tasks import Given, beginning, ends
+from vkc_pin.benchmarks.peers.found import Clock, PeerResult
+from vkc_pin.benchmarks.peers.tasks import PeerProblem, find_exact_start, sample_goals
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import import_optional
 
-__all__ = ["dense", "plan_by_sampling", "ranges"]
+__all__ = ["compute_finite_limits", "plan_by_sampling", "subdivide"]
 
 _ENDS = 20  # configurations at the goal
 _STEP = 0.05  # [rad] between configurations that are looked at
@@ -30,7 +30,7 @@ _SIMPLIFYING = 10.0  # [s] at most
 _TURN = 2.0 * np.pi  # [rad] that a joint without limits may turn either way from the start
 
 
-def ranges(problem: TrajectoryProblem) -> tuple[Floats, Floats]:
+def compute_finite_limits(problem: TrajectoryProblem) -> tuple[Floats, Floats]:
     """Return finite limits of the coordinates, shape (n,) each."""
     lower = np.minimum(problem.lower.min(axis=0), problem.start)
     upper = np.maximum(problem.upper.max(axis=0), problem.start)
@@ -40,12 +40,12 @@ def ranges(problem: TrajectoryProblem) -> tuple[Floats, Floats]:
 
 
 def plan_by_sampling(
-    own: Given,
+    own: PeerProblem,
     problem: TrajectoryProblem,
     seed: int,
     clock: Clock,
     accept: Callable[[Floats], bool],
-) -> Found:
+) -> PeerResult:
     """Plan with OMPL; see `found.Peer`."""
     ob, og, ou = (
         import_optional(f"ompl.{part}", "peers", purpose="bench peers")
@@ -53,12 +53,12 @@ def plan_by_sampling(
     )
     ou.setLogLevel(ou.LogLevel.LOG_NONE)
     ou.RNG.setSeed(seed + 1)
-    goals = ends(problem, np.random.default_rng([seed, 1]), _ENDS)
+    goals = sample_goals(problem, np.random.default_rng([seed, 1]), _ENDS)
     if not len(goals):
-        return Found(status="no configuration at the goal")
+        return PeerResult(status="no configuration at the goal")
     scale, held = problem.chain.metric, problem.closed(problem.task.phases[0])
     size, middle = problem.chain.size, 1
-    lower, upper = ranges(problem)
+    lower, upper = compute_finite_limits(problem)
     space = ob.RealVectorStateSpace(size)
     bounds = ob.RealVectorBounds(size)
     for k in range(size):
@@ -118,7 +118,7 @@ def plan_by_sampling(
 
     if held:
         information.setup()
-    start, states = state_of(beginning(problem)), [state_of(row) for row in goals]
+    start, states = state_of(find_exact_start(problem)), [state_of(row) for row in goals]
     if held:
         for state in (start, *states):
             used.anchorChart(state)
@@ -134,7 +134,7 @@ def plan_by_sampling(
     setup.setup()
     began = time.process_time()
     setup.solve(float(max(clock.left - _SIMPLIFYING, 1.0)))
-    found = Found(own=time.process_time() - began, status="timed out")
+    found = PeerResult(own=time.process_time() - began, status="timed out")
     if not setup.haveExactSolutionPath():
         return found
     path = setup.getSolutionPath()
@@ -147,11 +147,11 @@ def plan_by_sampling(
         path.interpolate()
     rows = np.array([values(path.getState(k)) for k in range(path.getStateCount())])
     rows[0] = problem.start
-    found.path, found.status = dense(rows, scale), "found"
+    found.path, found.status = subdivide(rows, scale), "found"
     return found
 
 
-def dense(rows: Floats, scale: Floats, step: float = 0.2) -> Floats:
+def subdivide(rows: Floats, scale: Floats, step: float = 0.2) -> Floats:
     """Insert waypoints so that none are more than `step` [rad] apart."""
     parts = [rows[:1]]
     for a, b in itertools.pairwise(rows):

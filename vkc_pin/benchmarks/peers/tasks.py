@@ -7,7 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vkc_pin.benchmarks.problems.poses import pose_among, pose_over, random_start
+from vkc_pin.benchmarks.problems.poses import (
+    sample_pose_among,
+    sample_pose_over,
+    sample_random_start,
+)
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.planning.initialization.keyframes import compute_shortfall, sample_goal_configurations
@@ -20,7 +24,14 @@ from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate, Grasp, Reach, Step
 
-__all__ = ["TASKS", "Given", "beginning", "ends", "given", "problem_of"]
+__all__ = [
+    "TASKS",
+    "PeerProblem",
+    "build_program",
+    "find_exact_start",
+    "make_problem",
+    "sample_goals",
+]
 
 TASKS: Mapping[str, str] = {
     "reach": "bring the tool to a pose, base and arm, in a random room",
@@ -38,14 +49,14 @@ _ROOMS = 70_000  # numbers of rooms that nothing else is measured in begin here
 
 
 @dataclass(frozen=True, eq=False)
-class Given:
+class PeerProblem:
     """A problem: its scene and steps; grasped objects are grasped in the scene."""
 
     scene: Scene
     steps: tuple[Step, ...]
 
 
-def given(task: str, seed: int, number: int) -> Given:
+def make_problem(task: str, seed: int, number: int) -> PeerProblem:
     """Return problem `number` of a task, determined by numbers alone.
 
     The start keeps all margins. A grasp is a random free configuration for which a free goal
@@ -60,23 +71,25 @@ def given(task: str, seed: int, number: int) -> Given:
         scene = layout.make_scene()
         over = number % 2 == 0
         pose = (
-            pose_over(layout, scene, layout.find_part("table_1"), rng)
+            sample_pose_over(layout, scene, layout.find_part("table_1"), rng)
             if over
-            else pose_among(layout, scene, rng)
+            else sample_pose_among(layout, scene, rng)
         )
-        return Given(random_start(scene, rng) if scene.start_region else scene, (Reach(pose),))
+        return PeerProblem(
+            sample_random_start(scene, rng) if scene.start_region else scene, (Reach(pose),)
+        )
     joint, goal, state = _HELD[task]
     steps = (Actuate(task, {joint: goal}),)
     for _ in range(_DRAWS):
         scene = load_scene(task).sample_start(rng).with_state(task, dict(state))
-        problem = problem_of(Given(scene, (Grasp(task),)))
+        problem = build_program(PeerProblem(scene, (Grasp(task),)))
         for row in _free(problem, rng)[:10]:
             robot = row[: problem.chain.robot.coordinates.size]
             attachment = scene.objects[task].object.attachment().name
-            own = Given(
+            own = PeerProblem(
                 scene.with_start(base=robot[:3], arm=robot[3:]).with_held({task: attachment}), steps
             )
-            held = problem_of(own)
+            held = build_program(own)
             if compute_shortfall(held, held.start[None], 1)[0] <= 0.0 and len(_free(held, rng)):
                 return own
     raise InputError(
@@ -87,8 +100,8 @@ def given(task: str, seed: int, number: int) -> Given:
     )
 
 
-def problem_of(
-    own: Given, options: Options | None = None, cache: Cache | None = None
+def build_program(
+    own: PeerProblem, options: Options | None = None, cache: Cache | None = None
 ) -> TrajectoryProblem:
     """Return the program of a problem, which all planners use."""
     options = Options() if options is None else options
@@ -97,7 +110,7 @@ def problem_of(
     )
 
 
-def ends(problem: TrajectoryProblem, rng: np.random.Generator, most: int) -> Floats:
+def sample_goals(problem: TrajectoryProblem, rng: np.random.Generator, most: int) -> Floats:
     """Sample goal configurations that keep their margins, nearest to the start first, (K, n)."""
     found = _free(problem, rng)
     if not len(found):
@@ -108,7 +121,7 @@ def ends(problem: TrajectoryProblem, rng: np.random.Generator, most: int) -> Flo
     return found[np.argsort(far)][:most]
 
 
-def beginning(problem: TrajectoryProblem) -> Floats:
+def find_exact_start(problem: TrajectoryProblem) -> Floats:
     """Return the start with an exact closure, shape (n,)."""
     if not problem.closed(problem.task.phases[0]):
         return problem.start

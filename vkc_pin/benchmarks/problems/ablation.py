@@ -10,34 +10,34 @@ from typing import Any, Unpack
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
+from vkc_pin.benchmarks.harness.limits import LIMITS, describe_limit
 from vkc_pin.benchmarks.harness.record import Record, distribution, values
 from vkc_pin.benchmarks.harness.runner import Execution
 from vkc_pin.benchmarks.harness.tables import (
     JUDGED,
+    compute_quartiles,
     count,
-    decimal,
-    failures,
-    markdown,
-    medians,
-    page,
-    quartiles,
+    count_failures,
+    format_decimal,
+    format_medians,
+    format_table,
+    join_report,
     select,
 )
 from vkc_pin.benchmarks.problems import trials
-from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change, parsed
+from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change, parse_change
 from vkc_pin.benchmarks.problems.problem_set import (
     KINDS,
     NUMBER,
     TASKS,
     Problem,
-    kind_of,
+    get_kind,
+    make_task_problem,
     problem,
-    problem_of_task,
 )
 from vkc_pin.errors import InputError
 
-__all__ = ["SUMMARIZED", "SUMMARY", "every_trial", "report", "run", "specify", "summary"]
+__all__ = ["SUMMARIZED", "SUMMARY", "report", "run", "specify", "summary", "tabulate_trials"]
 
 PAIRED = {
     "planning_time": "time",
@@ -84,7 +84,7 @@ def specify(
         ]
     else:
         own = [
-            (f"{number:02d}", {"number": number, "kind": kind_of(number)}) for number in problems
+            (f"{number:02d}", {"number": number, "kind": get_kind(number)}) for number in problems
         ]
     return [
         {"key": f"{key}/{setting:03d}", **what, "method": str(change), "seed": seed}
@@ -108,7 +108,7 @@ def run(
     Args:
         out: Folder.
         seed: Random seed of planning, and of the starts of tasks.
-        changes: Changed settings; see `changes.parsed`.
+        changes: Changed settings; see `changes.parse_change`.
         problems: Numbers of problems. Default: all.
         tasks: Some of `TASKS`, from random starts, instead of the sixty problems.
         starts: Random starts per task, at least 1.
@@ -125,9 +125,9 @@ def run(
             got=problems,
         )
     runner.check_positive(starts=starts)
-    names = runner.chosen("task", tasks, TASKS) if tasks else ()
-    numbers = [] if tasks else chosen(problems)
-    chosen_changes = list(dict.fromkeys([UNCHANGED, *(parsed(text) for text in changes)]))
+    names = runner.select_names("task", tasks, TASKS) if tasks else ()
+    numbers = [] if tasks else select_problems(problems)
+    chosen_changes = list(dict.fromkeys([UNCHANGED, *(parse_change(text) for text in changes)]))
     what: dict[str, Any] = {"tasks": names, "starts": starts} if tasks else {"problems": numbers}
     settings = {
         "benchmark": "ablation",
@@ -140,13 +140,14 @@ def run(
     return runner.run(specs, _record, out, settings=settings, report=report, **execution)
 
 
-def chosen(problems: Sequence[int] | None) -> list[int]:
+def select_problems(problems: Sequence[int] | None) -> list[int]:
     """Return distinct numbers of problems; all for None."""
     numbers = sorted(set(range(NUMBER) if problems is None else problems))
     for number in numbers:
-        kind_of(number)
+        get_kind(number)
     return [
-        int(number) for number in runner.chosen("problem", map(str, numbers), map(str, numbers))
+        int(number)
+        for number in runner.select_names("problem", map(str, numbers), map(str, numbers))
     ]
 
 
@@ -169,23 +170,23 @@ def report(result: Mapping[str, Any]) -> str:
     problems = f"{len(about.get('problems', ()))} problems"
     if "tasks" in about:
         problems = f"{about['starts']} random starts a task"
-    return page(
+    return join_report(
         about,
         "# One setting changed at a time",
-        f"{problems}, planning seed {about['seed']}, {allowed(about)} each. {JUDGED} {SUMMARIZED}",
-        markdown(["setting", *SUMMARY], rows),
+        f"{problems}, planning seed {about['seed']}, {describe_limit(about)} each. {JUDGED} {SUMMARIZED}",
+        format_table(["setting", *SUMMARY], rows),
         "## Against the unchanged planner",
         "Median (quartiles) of the ratio to the unchanged planner, over the problems at which "
         "both succeed.",
-        markdown(["setting", "problems", *PAIRED.values()], paired),
+        format_table(["setting", "problems", *PAIRED.values()], paired),
         "## By kind of problem",
-        markdown(["setting", "kind", *SUMMARY], kinds, text=2),
+        format_table(["setting", "kind", *SUMMARY], kinds, text=2),
         "## Every trial",
-        every_trial(records),
+        tabulate_trials(records),
     )
 
 
-def every_trial(records: Sequence[Record]) -> str:
+def tabulate_trials(records: Sequence[Record]) -> str:
     """Tabulate all trials."""
     fields = ("planning_time", "cpu_time", "base_path_length", "arm_path_length", "objective")
     rows = []
@@ -193,9 +194,9 @@ def every_trial(records: Sequence[Record]) -> str:
         numbers = (float("nan") if r.get(field) is None else float(r[field]) for field in fields)
         texts = [r["number"], *(r.get(f, "") for f in ("problem", "method", "seed", "status"))]
         cells = [str(text) for text in (*texts, r.get("solves", ""))]
-        rows.append([*cells, *map(decimal, numbers), r.get("failed_constraint") or ""])
+        rows.append([*cells, *map(format_decimal, numbers), r.get("failed_constraint") or ""])
     head = ["number", "problem", "setting", "seed", "status", "solves", "time [s]", "CPU [s]"]
-    return markdown([*head, "base [m]", "arm [rad]", "objective", "failed"], rows, text=5)
+    return format_table([*head, "base [m]", "arm [rad]", "objective", "failed"], rows, text=5)
 
 
 def summary(own: Sequence[Record]) -> list[str]:
@@ -205,9 +206,9 @@ def summary(own: Sequence[Record]) -> list[str]:
         median, late = distribution(own, field)
         times += [median, _mean(own, field), late]
     means = [f"{_mean(own, field):.1f}" for field in ("rounds", "iterations")]
-    lengths = medians(select(own, success=True), "base_path_length", "arm_path_length")
+    lengths = format_medians(select(own, success=True), "base_path_length", "arm_path_length")
     first = count(own, "first_seed")
-    return [count(own), first, *map(decimal, times), *means, *lengths, failures(own)]
+    return [count(own), first, *map(format_decimal, times), *means, *lengths, count_failures(own)]
 
 
 def _which(record: Record) -> tuple[Any, ...]:
@@ -227,19 +228,19 @@ def _ratio(pairs: Sequence[tuple[Record, Record]], field: str) -> str:
         for old, new in pairs
         if old.get(field) and new.get(field) is not None
     ]
-    first, median, third = quartiles(ratios)
+    first, median, third = compute_quartiles(ratios)
     return f"{median:.3f} ({first:.3f}–{third:.3f})" if ratios else "–"
 
 
 @functools.lru_cache(maxsize=2)  # settings take turns at it
 def _problem(task: str | None, seed: int, number: int) -> Problem:
-    return problem(number) if task is None else problem_of_task(task, seed, number)
+    return problem(number) if task is None else make_task_problem(task, seed, number)
 
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:
     own = _problem(spec.get("task"), spec["seed"], spec["number"])
-    change = UNCHANGED if spec["method"] == str(UNCHANGED) else parsed(spec["method"])
+    change = UNCHANGED if spec["method"] == str(UNCHANGED) else parse_change(spec["method"])
     more = {"number": own.number, "problem": own.name, "kind": own.kind} | (
         {"task": spec["task"]} if "task" in spec else {}
     )
-    return trials.tried(own.scene, own.steps, seed=spec["seed"], change=change, **more)
+    return trials.run_trial(own.scene, own.steps, seed=spec["seed"], change=change, **more)

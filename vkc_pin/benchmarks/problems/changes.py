@@ -16,7 +16,7 @@ from typing import Any
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
 
-__all__ = ["UNCHANGED", "Change", "parsed"]
+__all__ = ["UNCHANGED", "Change", "parse_change"]
 
 _FORM = "Options.field=value, or module:NAME=value such as solver.loop:PROGRESS=0.6"
 _PACKAGE = "vkc_pin.planning"  # whose modules have the constants
@@ -71,7 +71,7 @@ class Change:
 UNCHANGED = Change()
 
 
-def parsed(text: str) -> Change:
+def parse_change(text: str) -> Change:
     """Return the change of a text, such as `Options.dt=0.3` or `solver.loop:PROGRESS=0.6`.
 
     Raises:

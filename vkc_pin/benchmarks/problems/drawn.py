@@ -26,7 +26,7 @@ from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step, Touch
 
-__all__ = ["drawn"]
+__all__ = ["sample_problem"]
 
 _TRIES = 50  # rooms or obstacles in which something finds no place
 _OBSTACLES = 6  # at most
@@ -34,7 +34,7 @@ _SECOND = 0.3  # share of problems of two steps
 _AIR = 1e-3  # [m] below what is put down
 
 
-def drawn(seed: int, number: int) -> Problem:
+def sample_problem(seed: int, number: int) -> Problem:
     """Return a problem: in a random room if its number is even, else in one of the scenes.
 
     Raises:

@@ -12,17 +12,17 @@ from vkc_pin.benchmarks.harness.record import distribution
 from vkc_pin.benchmarks.harness.runner import Execution
 from vkc_pin.benchmarks.harness.tables import (
     JUDGED,
+    compute_wilson_interval,
     count,
-    decimal,
-    failures,
-    markdown,
-    page,
+    count_failures,
+    format_decimal,
+    format_table,
+    join_report,
     select,
-    wilson,
 )
-from vkc_pin.benchmarks.problems.ablation import every_trial
-from vkc_pin.benchmarks.problems.problem_set import TASKS, problem_of_task
-from vkc_pin.benchmarks.problems.trials import tried
+from vkc_pin.benchmarks.problems.ablation import tabulate_trials
+from vkc_pin.benchmarks.problems.problem_set import TASKS, make_task_problem
+from vkc_pin.benchmarks.problems.trials import run_trial
 
 __all__ = ["report", "run"]
 
@@ -44,7 +44,7 @@ def run(
         tasks: Some of `TASKS`.
     """
     runner.check_positive(trials=trials)
-    names = runner.chosen("task", tasks, TASKS)
+    names = runner.select_names("task", tasks, TASKS)
     settings = {"benchmark": "first-seed", "seed": seed, "starts": trials, "tasks": names, **LIMITS}
     specs = [
         {
@@ -65,24 +65,26 @@ def report(result: Mapping[str, Any]) -> str:
     for task in (*about["tasks"], "all"):
         own = records if task == "all" else select(records, task=task)
         first = sum(bool(record.get("first_seed")) for record in own)
-        low, high = wilson(first, len(own))
+        low, high = compute_wilson_interval(first, len(own))
         interval = f"{100.0 * low:.0f}–{100.0 * high:.0f}"
-        times = map(decimal, distribution(own, "planning_time"))
-        rows.append([task, count(own), count(own, "first_seed"), interval, *times, failures(own)])
+        times = map(format_decimal, distribution(own, "planning_time"))
+        rows.append(
+            [task, count(own), count(own, "first_seed"), interval, *times, count_failures(own)]
+        )
     head = ["task", "success", "with the first seed", "of all [%]", "time, median [s]"]
-    return page(
+    return join_report(
         about,
         "# Success with the first initial guess",
         f"{about['starts']} random starts per task, seed {about['seed']}. {JUDGED} The first "
         "guess sufficed where the solver ran once; beside it Wilson's interval of 95 % confidence.",
-        markdown([*head, "95th percentile [s]", "failures"], rows),
+        format_table([*head, "95th percentile [s]", "failures"], rows),
         "## Every trial",
-        every_trial(records),
+        tabulate_trials(records),
     )
 
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:
-    own = problem_of_task(spec["task"], spec["seed"], spec["number"])
-    return tried(
+    own = make_task_problem(spec["task"], spec["seed"], spec["number"])
+    return run_trial(
         own.scene, own.steps, seed=spec["seed"], number=own.number, task=own.kind, problem=own.name
     )

@@ -10,18 +10,18 @@ from typing import Any, Unpack
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
+from vkc_pin.benchmarks.harness.limits import LIMITS, describe_limit
 from vkc_pin.benchmarks.harness.record import distribution, trial
 from vkc_pin.benchmarks.harness.runner import Execution
-from vkc_pin.benchmarks.harness.tables import decimal, markdown, page, select
-from vkc_pin.benchmarks.problems.ablation import every_trial
+from vkc_pin.benchmarks.harness.tables import format_decimal, format_table, join_report, select
+from vkc_pin.benchmarks.problems.ablation import tabulate_trials
 from vkc_pin.planning.diagnosis.proofs import PROVEN
 from vkc_pin.planning.planner import plan
 from vkc_pin.procedural.rooms.random_room import sample_layout
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step
 
-__all__ = ["KINDS", "impossible", "report", "run"]
+__all__ = ["KINDS", "report", "run", "sample_impossible_problem"]
 
 _WIDTH = 0.67  # [m] of the robot's base
 _HALL = 6.0  # [m] from the middle of the hall to its edges
@@ -60,26 +60,30 @@ def report(result: Mapping[str, Any]) -> str:
     for kind in (*KINDS, "all"):
         own = records if kind == "all" else select(records, kind=kind)
         counts = [str(sum(bool(record.get(field)) for record in own)) for field in fields]
-        rows.append([kind, str(len(own)), *counts, *map(decimal, distribution(own, "wall_time"))])
+        rows.append(
+            [kind, str(len(own)), *counts, *map(format_decimal, distribution(own, "wall_time"))]
+        )
     lines = [
         f"- {r['kind']}, problem {r['number']}: {'; '.join(r['notes'] or r['violations'][:1])}"
         for r in records
         if "notes" in r
     ]
-    return page(
+    return join_report(
         about,
         "# Impossible problems",
-        f"{about['problems']} impossible problems, seed {about['seed']}, {allowed(about)} each. "
+        f"{about['problems']} impossible problems, seed {about['seed']}, {describe_limit(about)} each. "
         "Explained: the report names a cause. Proven: it does so for certain.",
-        markdown(["kind", "problems", *fields, "time, median [s]", "95th percentile [s]"], rows),
+        format_table(
+            ["kind", "problems", *fields, "time, median [s]", "95th percentile [s]"], rows
+        ),
         "## What the reports say",
         "\n".join(lines),
         "## Every trial",
-        every_trial(records),
+        tabulate_trials(records),
     )
 
 
-def impossible(seed: int, number: int) -> _Problem:
+def sample_impossible_problem(seed: int, number: int) -> _Problem:
     """Return scene and steps of problem `number`."""
     rng = np.random.default_rng([4, seed, number])
     return list(KINDS.values())[number % len(KINDS)](rng)
@@ -88,7 +92,7 @@ def impossible(seed: int, number: int) -> _Problem:
 def _record(spec: dict[str, Any]) -> dict[str, Any]:
     number, seed = spec["number"], spec["seed"]
     kind = list(KINDS)[number % len(KINDS)]
-    scene, steps = impossible(seed, number)
+    scene, steps = sample_impossible_problem(seed, number)
     began = time.perf_counter()
     found = plan(scene, steps, seed=seed, **LIMITS)
     took = time.perf_counter() - began - found.metrics["build_time"]

@@ -14,7 +14,7 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box
 from vkc_pin.world.scene.scene import Scene
 
-__all__ = ["pose_among", "pose_over", "random_start"]
+__all__ = ["sample_pose_among", "sample_pose_over", "sample_random_start"]
 
 CLEAR = 0.03  # [m] from everything, the robot itself too
 NEAR = 0.15  # [m] from something, at most, for a pose among furniture
@@ -22,7 +22,9 @@ FAR = 1.5  # [m] from the start to where the robot stands, at least, for the sam
 _TRIES = 200_000  # configurations
 
 
-def pose_over(layout: Layout, scene: Scene, table: Part, rng: np.random.Generator) -> pin.SE3:
+def sample_pose_over(
+    layout: Layout, scene: Scene, table: Part, rng: np.random.Generator
+) -> pin.SE3:
     """Sample a tool pose over a table, within 0.5 m of its accessible side.
 
     Raises:
@@ -57,7 +59,7 @@ def pose_over(layout: Layout, scene: Scene, table: Part, rng: np.random.Generato
     )
 
 
-def pose_among(layout: Layout, scene: Scene, rng: np.random.Generator) -> pin.SE3:
+def sample_pose_among(layout: Layout, scene: Scene, rng: np.random.Generator) -> pin.SE3:
     """Sample a tool pose 0.2 to 1.4 m high where some of the robot is within `NEAR` of an obstacle.
 
     The base can turn there, and is connected with the start, at least `FAR` away.
@@ -84,7 +86,7 @@ def pose_among(layout: Layout, scene: Scene, rng: np.random.Generator) -> pin.SE
     )
 
 
-def random_start(scene: Scene, rng: np.random.Generator) -> Scene:
+def sample_random_start(scene: Scene, rng: np.random.Generator) -> Scene:
     """Return the scene with a random base pose in its start region and a random arm posture.
 
     Raises:

@@ -13,8 +13,8 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.benchmarks import baselines, door, household, initialization
-from vkc_pin.benchmarks.comparison import Assignment, placed
-from vkc_pin.benchmarks.problems.poses import pose_among, pose_over
+from vkc_pin.benchmarks.comparison import Assignment, place_objects
+from vkc_pin.benchmarks.problems.poses import sample_pose_among, sample_pose_over
 from vkc_pin.errors import InputError
 from vkc_pin.procedural.rooms.random_room import sample_layout
 from vkc_pin.world.scene.scene import Scene, load_scene
@@ -25,10 +25,10 @@ __all__ = [
     "NUMBER",
     "TASKS",
     "Problem",
-    "kind_of",
+    "get_kind",
+    "make_start",
+    "make_task_problem",
     "problem",
-    "problem_of_task",
-    "started",
 ]
 
 KINDS = ("reach", "door", "pull", "carry", "scene")
@@ -83,7 +83,7 @@ class Problem:
     steps: tuple[Step, ...]
 
 
-def kind_of(number: int) -> str:
+def get_kind(number: int) -> str:
     """Return the kind of a problem.
 
     Raises:
@@ -105,26 +105,30 @@ def problem(number: int) -> Problem:
     Raises:
         InputError: There is no such problem.
     """
-    kind = kind_of(number)
+    kind = get_kind(number)
     if kind == "scene":
         name, start = _FIXED[number - (len(KINDS) - 1) * _EACH]
-        return dataclasses.replace(problem_of_task(name, _STARTS, start), number=number, kind=kind)
+        return dataclasses.replace(
+            make_task_problem(name, _STARTS, start), number=number, kind=kind
+        )
     scene, step, about = {"reach": _reach, "door": _door, "pull": _pull, "carry": _carry}[kind](
         number
     )
     return Problem(number, f"{scene.name} {about}", kind, scene, (step,))
 
 
-def problem_of_task(task: str, seed: int, number: int) -> Problem:
-    """Return a task from a random start as a problem; see `started`."""
-    return Problem(number, f"{task} {number}", task, started(task, seed, number), TASKS[task].steps)
+def make_task_problem(task: str, seed: int, number: int) -> Problem:
+    """Return a task from a random start as a problem; see `make_start`."""
+    return Problem(
+        number, f"{task} {number}", task, make_start(task, seed, number), TASKS[task].steps
+    )
 
 
-def started(task: str, seed: int, number: int) -> Scene:
+def make_start(task: str, seed: int, number: int) -> Scene:
     """Return a task's scene with random start `number`, and scattered objects if there are any."""
     rng = np.random.default_rng([seed, list(TASKS).index(task), number])
     own, scene = TASKS[task], load_scene(TASKS[task].scene)
-    scattered = placed(scene, {"placed": own.scatter(scene, rng)}) if own.scatter else scene
+    scattered = place_objects(scene, {"placed": own.scatter(scene, rng)}) if own.scatter else scene
     return scattered.sample_start(rng)
 
 
@@ -143,9 +147,9 @@ def _reach(number: int) -> tuple[Scene, Step, str]:
     scene, rng = layout.make_scene(), np.random.default_rng([2, number])
     over = number % 2 == 0
     pose: pin.SE3 = (
-        pose_over(layout, scene, layout.find_part("table_1"), rng)
+        sample_pose_over(layout, scene, layout.find_part("table_1"), rng)
         if over
-        else pose_among(layout, scene, rng)
+        else sample_pose_among(layout, scene, rng)
     )
     return scene, Reach(pose), f"reach {'over a table' if over else 'among furniture'}"
 

@@ -8,12 +8,18 @@ from pathlib import Path
 from typing import Any, Unpack
 
 from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
+from vkc_pin.benchmarks.harness.limits import LIMITS, describe_limit
 from vkc_pin.benchmarks.harness.record import distribution, trial
 from vkc_pin.benchmarks.harness.runner import Execution
-from vkc_pin.benchmarks.harness.tables import JUDGED, decimal, markdown, page, select
-from vkc_pin.benchmarks.problems.ablation import every_trial
-from vkc_pin.benchmarks.problems.drawn import drawn
+from vkc_pin.benchmarks.harness.tables import (
+    JUDGED,
+    format_decimal,
+    format_table,
+    join_report,
+    select,
+)
+from vkc_pin.benchmarks.problems.ablation import tabulate_trials
+from vkc_pin.benchmarks.problems.drawn import sample_problem
 from vkc_pin.benchmarks.problems.problem_set import Problem
 from vkc_pin.planning.planner import plan
 from vkc_pin.procedural.tasks import random_task
@@ -69,18 +75,18 @@ def report(result: Mapping[str, Any]) -> str:
     for kind in (*sorted({record["kind"] for record in records if "kind" in record}), "all"):
         own = records if kind == "all" else select(records, kind=kind)
         counts = [str(len(select(own, status=status))) for status in ("success", *statuses)]
-        times = map(decimal, distribution(own, "planning_time"))
+        times = map(format_decimal, distribution(own, "planning_time"))
         rows.append([kind, str(len(own)), *counts, *times])
     rooms = about["benchmark"] == "rooms"
     head = ["kind", "problems", "success", *statuses, "time, median [s]", "95th percentile [s]"]
-    return page(
+    return join_report(
         about,
         "# Random rooms, one task each" if rooms else "# Random problems",
-        f"{about['problems']} problems, seed {about['seed']}, {allowed(about)} each. "
+        f"{about['problems']} problems, seed {about['seed']}, {describe_limit(about)} each. "
         f"{'' if rooms else 'Some of them are infeasible. '}{JUDGED}",
-        markdown(head, rows),
+        format_table(head, rows),
         "## Every trial",
-        every_trial(records),
+        tabulate_trials(records),
     )
 
 
@@ -94,7 +100,7 @@ def _in_a_room(seed: int, number: int) -> Problem:
 
 def _record(spec: dict[str, Any], *, folder: str) -> dict[str, Any]:
     number, seed = spec["number"], spec["seed"]
-    own = drawn(seed, number) if spec["of"] == OF[0] else _in_a_room(seed, number)
+    own = sample_problem(seed, number) if spec["of"] == OF[0] else _in_a_room(seed, number)
     found = plan(own.scene, own.steps, seed=seed, **_LIMITS)
     if found.status != "interrupted":
         Path(folder).mkdir(parents=True, exist_ok=True)

@@ -13,13 +13,19 @@ from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import Record, values
 from vkc_pin.benchmarks.harness.runner import Execution
-from vkc_pin.benchmarks.harness.tables import count, markdown, page, quartiles, select
+from vkc_pin.benchmarks.harness.tables import (
+    compute_quartiles,
+    count,
+    format_table,
+    join_report,
+    select,
+)
 from vkc_pin.benchmarks.problems import trials
-from vkc_pin.benchmarks.problems.ablation import chosen, every_trial
+from vkc_pin.benchmarks.problems.ablation import select_problems, tabulate_trials
 from vkc_pin.benchmarks.problems.problem_set import problem
 from vkc_pin.errors import InputError
 
-__all__ = ["report", "run", "spread_of"]
+__all__ = ["compute_spread", "report", "run"]
 
 FIELDS = {
     "objective": "objective",
@@ -50,7 +56,7 @@ def run(
         raise InputError(
             "out of range", field="seeds", expected="a whole number of at least 2", got=repr(seeds)
         )
-    numbers = chosen(problems)
+    numbers = select_problems(problems)
     settings = {"benchmark": "spread", "seed": seed, "seeds": seeds, "problems": numbers, **LIMITS}
     specs = [
         {"key": f"{number:02d}/{own:04d}", "number": number, "seed": own}
@@ -60,7 +66,7 @@ def run(
     return runner.run(specs, _record, out, settings=settings, report=report, **execution)
 
 
-def spread_of(records: Sequence[Record], field: str) -> float | None:
+def compute_spread(records: Sequence[Record], field: str) -> float | None:
     """Return the ratio of largest to least value of successes, minus 1, if it is defined."""
     found = values([record for record in records if record["success"]], field)
     return max(found) / min(found) - 1.0 if len(found) > 1 and min(found) > 0.0 else None
@@ -73,14 +79,14 @@ def report(result: Mapping[str, Any]) -> str:
     whole = [own for own in groups.values() if all(r["success"] for r in own)]
     summary, rows = [], []
     for field, name in FIELDS.items():
-        found = [spread for own in whole if (spread := spread_of(own, field)) is not None]
+        found = [spread for own in whole if (spread := compute_spread(own, field)) is not None]
         late = float(np.percentile(found, 95)) if found else float("nan")
-        figures = (*quartiles(found), late, max(found, default=float("nan")))
+        figures = (*compute_quartiles(found), late, max(found, default=float("nan")))
         same = sum(spread <= WITHIN for spread in found)
         cells = [f"{100.0 * value:.1f}" for value in figures]
         summary.append([name, f"{same} of {len(found)}", *cells])
     for number, own in groups.items():
-        spreads = [spread_of(own, field) for field in FIELDS]
+        spreads = [compute_spread(own, field) for field in FIELDS]
         cells = ["–" if spread is None else f"{100.0 * spread:.1f}" for spread in spreads]
         name = next((r["problem"] for r in own if "problem" in r), "")
         guesses = dict.fromkeys(r["initialization"] for r in own if r.get("initialization"))
@@ -88,17 +94,17 @@ def report(result: Mapping[str, Any]) -> str:
     within = f"within {100 * WITHIN:.0f} %"
     columns = ["of", within, "1st quartile [%]", "median", "3rd quartile", "95th", "most"]
     percent = [f"{name} [%]" for name in FIELDS.values()]
-    return page(
+    return join_report(
         about,
         "# Spread over random seeds",
         f"{len(groups)} problems, each planned with {about['seeds']} seeds from {about['seed']} "
         "on. Spread is the largest value over the least, minus 1, of successes. The summary is "
         f"over the {len(whole)} problems that succeed with every seed.",
-        markdown(columns, summary),
+        format_table(columns, summary),
         "## Every problem",
-        markdown(["number", "problem", "success", *percent, "initial guesses"], rows, text=2),
+        format_table(["number", "problem", "success", *percent, "initial guesses"], rows, text=2),
         "## Every trial",
-        every_trial(records),
+        tabulate_trials(records),
     )
 
 
@@ -108,4 +114,4 @@ _problem = functools.lru_cache(maxsize=2)(problem)  # once for all seeds
 def _record(spec: dict[str, Any]) -> dict[str, Any]:
     own = _problem(spec["number"])
     more: dict[str, Any] = {"number": own.number, "problem": own.name, "kind": own.kind}
-    return trials.tried(own.scene, own.steps, seed=spec["seed"], **more)
+    return trials.run_trial(own.scene, own.steps, seed=spec["seed"], **more)

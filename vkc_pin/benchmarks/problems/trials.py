@@ -19,10 +19,10 @@ from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Reach, Step
 
-__all__ = ["first_seed", "objective", "tried"]
+__all__ = ["compute_objective", "is_first_guess_success", "run_trial"]
 
 
-def tried(
+def run_trial(
     scene: Scene, steps: tuple[Step, ...], *, seed: int, change: Change = UNCHANGED, **more: Any
 ) -> dict[str, Any]:
     """Plan a problem and return its record with times, solves and objective."""
@@ -50,19 +50,19 @@ def tried(
     own: dict[str, Any] = {
         **took,
         "solves": len(solves),
-        "first_seed": first_seed(found, len(solves)),
-        "objective": objective(found, planner),
+        "first_seed": is_first_guess_success(found, len(solves)),
+        "objective": compute_objective(found, planner),
         "duration": found.metrics["duration"],
     }
     return trial(found, method=str(change), seed=seed, **own, **more)
 
 
-def first_seed(found: Plan, solves: int) -> bool:
+def is_first_guess_success(found: Plan, solves: int) -> bool:
     """Return whether a plan succeeded with the first of its `solves` runs of the solver."""
     return found.success and solves == 1
 
 
-def objective(found: Plan, planner: Planner | None = None) -> float | None:
+def compute_objective(found: Plan, planner: Planner | None = None) -> float | None:
     """Return the objective of a successful plan that is one problem, without grasp freedoms.
 
     Freedoms of grasps have other values in the program while nothing is grasped.

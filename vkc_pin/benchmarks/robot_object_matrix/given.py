@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from vkc_pin.benchmarks.robot_object_matrix.pairs import description_of
+from vkc_pin.benchmarks.robot_object_matrix.pairs import load_description
 from vkc_pin.errors import InputError
 from vkc_pin.importing.objects.object_import import ImportedObject, import_object
 from vkc_pin.importing.robots.robot_import import import_robot
 from vkc_pin.world.files.writing import check_name, write_atomically, write_folder_atomically
 from vkc_pin.world.models.robot_file import find_robot, load_robot
 
-__all__ = ["DEFAULT", "Given", "parsed", "ready_object", "ready_robot"]
+__all__ = ["DEFAULT", "Request", "parse_requests", "prepare_object", "prepare_robot"]
 
 DEFAULT = "default"
 """The word that stands for all names that are there by default."""
@@ -30,7 +30,7 @@ _LEVEL = 0.5  # cosine of how steep an approach may be that tells where the fron
 
 
 @dataclass(frozen=True)
-class Given:
+class Request:
     """A requested robot or object.
 
     Attributes:
@@ -49,7 +49,7 @@ class Given:
         return self.path.lower().endswith(_FILES)
 
 
-def parsed(texts: Sequence[str], field: str, default: Sequence[str]) -> list[Given]:
+def parse_requests(texts: Sequence[str], field: str, default: Sequence[str]) -> list[Request]:
     """Parse requests: names and paths, each plain or as "name=...", with "#link" for one link.
 
     Args:
@@ -60,7 +60,7 @@ def parsed(texts: Sequence[str], field: str, default: Sequence[str]) -> list[Giv
     Raises:
         InputError: A request is malformed, or there are none or two of one name.
     """
-    found = list[Given]()
+    found = list[Request]()
     for text in (one for given in texts for one in (default if given == DEFAULT else [str(given)])):
         match = _GIVEN.fullmatch(text)
         if match is None:
@@ -71,7 +71,7 @@ def parsed(texts: Sequence[str], field: str, default: Sequence[str]) -> list[Giv
                 got=text,
             )
         called, path, link = match["called"], match["path"], match["link"]
-        found.append(Given(called or link or _name(path), path, link))
+        found.append(Request(called or link or _name(path), path, link))
     names = [one.called for one in found]
     if not names or len(set(names)) < len(names):
         raise InputError(
@@ -83,7 +83,7 @@ def parsed(texts: Sequence[str], field: str, default: Sequence[str]) -> list[Giv
     return found
 
 
-def ready_robot(one: Given, folder: Path) -> str:
+def prepare_robot(one: Request, folder: Path) -> str:
     """Return name or path of a robot, imported into `folder` unless it describes its hand.
 
     Raises:
@@ -101,7 +101,7 @@ def ready_robot(one: Given, folder: Path) -> str:
     return str(made)
 
 
-def ready_object(one: Given, folder: Path) -> str:
+def prepare_object(one: Request, folder: Path) -> str:
     """Return name or description file of an object; files are imported, their fronts towards -x.
 
     Raises:
@@ -115,7 +115,7 @@ def ready_object(one: Given, folder: Path) -> str:
                 expected=" ".join(_FILES),
                 got=one.path,
             )
-        description_of(one.path)
+        load_description(one.path)
         return one.path
     name = check_name(one.called, "objects")
     made = folder / name / f"{name}.yaml"

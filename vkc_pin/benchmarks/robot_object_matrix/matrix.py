@@ -9,10 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vkc_pin.benchmarks.harness.limits import allowed
+from vkc_pin.benchmarks.harness.limits import describe_limit
 from vkc_pin.benchmarks.harness.record import Record, distribution
-from vkc_pin.benchmarks.harness.tables import JUDGED, decimal, markdown, medians, page
-from vkc_pin.benchmarks.robot_object_matrix.pairs import kind_of
+from vkc_pin.benchmarks.harness.tables import (
+    JUDGED,
+    format_decimal,
+    format_medians,
+    format_table,
+    join_report,
+)
+from vkc_pin.benchmarks.robot_object_matrix.pairs import get_kind
 from vkc_pin.visualization.plots.style import new_figure, save_figure, use_style
 
 if TYPE_CHECKING:
@@ -40,19 +46,19 @@ def report(result: Mapping[str, Any]) -> str:
     groups = _groups(records)
     robots, objects = (list(dict.fromkeys(key[k] for key in groups)) for k in (0, 1))
     rows = [[name, *(_cell(groups.get((robot, name), ())) for robot in robots)] for name in objects]
-    return page(
+    return join_report(
         about,
         "# Robots × objects",
-        f"{len(robots)} robots, {len(objects)} objects of {len(set(map(kind_of, objects)))} kinds, "
-        f"{about['starts']} random starts each, seed {about['seed']}, {allowed(about)} each. A "
+        f"{len(robots)} robots, {len(objects)} objects of {len(set(map(get_kind, objects)))} kinds, "
+        f"{about['starts']} random starts each, seed {about['seed']}, {describe_limit(about)} each. A "
         f"joint is opened by {about['share']:.0%} of its range, by any proposed attachment; an "
         "object is within reach if the hand gets to it both closed and open by so much. "
         f"{JUDGED} Times are those of all plans; loading again is the median over all "
         "combinations of a robot.",
-        markdown(_SUMMARY, [_summary(robot, groups) for robot in (*robots, _ALL)]),
+        format_table(_SUMMARY, [_summary(robot, groups) for robot in (*robots, _ALL)]),
         "## Every combination",
         "How many starts succeed; – is out of reach, ! could not be tried.",
-        markdown(["object", *robots], rows),
+        format_table(["object", *robots], rows),
         *_listed("What failed", [r for r in records if not r["success"] and _reached(r)]),
         *_listed("What is out of reach", [r for r in records if not _reached(r)]),
     )
@@ -115,8 +121,8 @@ def _summary(robot: str, groups: Mapping[tuple[str, str], Sequence[Record]]) -> 
     for judge in (all, any):
         good = sum(judge(record["success"] for record in own) for own in reached)
         cells.append(f"{good} ({good / max(len(reached), 1):.0%})")
-    times = map(decimal, distribution(flat, "planning_time"))
-    return [*cells, *times, *medians(flat, "load_time")]
+    times = map(format_decimal, distribution(flat, "planning_time"))
+    return [*cells, *times, *format_medians(flat, "load_time")]
 
 
 def _listed(title: str, records: Sequence[Record]) -> list[str]:
@@ -128,4 +134,4 @@ def _listed(title: str, records: Sequence[Record]) -> list[str]:
         rows[r["robot"], name, str(r["status"]), why] += 1
     body = [[*place, str(number), why] for (*place, why), number in rows.items()]
     head = ["robot", "object", "status", "trials", "because"]
-    return [f"## {title}", markdown(head, body, text=5)] if records else []
+    return [f"## {title}", format_table(head, body, text=5)] if records else []

@@ -31,7 +31,16 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate
 
-__all__ = ["OBJECTS", "ROBOTS", "SHARE", "Pair", "description_of", "hall", "kind_of", "pair"]
+__all__ = [
+    "OBJECTS",
+    "ROBOTS",
+    "SHARE",
+    "Pair",
+    "get_kind",
+    "load_description",
+    "make_hall",
+    "make_pair",
+]
 
 ROBOTS = (
     "husky_ur5e",
@@ -101,13 +110,13 @@ class Pair:
     because: str = ""
 
 
-def kind_of(name: str) -> str:
+def get_kind(name: str) -> str:
     """Return the kind of an object: the last word of its name without number."""
     last = re.sub(r"_\d+$", "", Path(name).stem).rpartition("_")[2]
     return "drawers" if last == "drawer" else last
 
 
-def description_of(name: str) -> dict[str, Any]:
+def load_description(name: str) -> dict[str, Any]:
     """Return the description of an object with absolute paths.
 
     Args:
@@ -132,7 +141,7 @@ def description_of(name: str) -> dict[str, Any]:
     return data if plain else {**data, "urdf": str((file.parent / data["urdf"]).resolve())}
 
 
-def hall(robot: str, name: str, description: Mapping[str, Any]) -> Scene:
+def make_hall(robot: str, name: str, description: Mapping[str, Any]) -> Scene:
     """Return a hall with a robot and an object, against a wall, in it, or on a counter."""
     match, floor = _of_kind(name), Floor(_SIZE, _SIZE)
     own = make_fixture(RANDOM + match[0], match[1]) if match else make_fixture(name)
@@ -153,7 +162,7 @@ def hall(robot: str, name: str, description: Mapping[str, Any]) -> Scene:
     return Scene.from_document(document, find_resource_folder("scenes"))
 
 
-def pair(robot: Robot, called: str, name: str, *, seed: int = 0) -> Pair:
+def make_pair(robot: Robot, called: str, name: str, *, seed: int = 0) -> Pair:
     """Return the step that opens an object by proposed attachments.
 
     The first attachment is the best one that the hand reaches, closed and open; planning may choose
@@ -162,17 +171,17 @@ def pair(robot: Robot, called: str, name: str, *, seed: int = 0) -> Pair:
     Args:
         robot: Robot.
         called: Its name, or the path of its file.
-        name: Object; see `description_of`.
+        name: Object; see `load_description`.
         seed: Random seed of configurations.
     """
     try:
         make_hand(robot)
     except InputError as error:
         return Pair(None, None, str(error))
-    description = description_of(name)
+    description = load_description(name)
     proposals = propose_attachments(load_object(description), robot)
     taken = [proposal.description() for proposal in proposals.found]
-    scene = hall(called, name, {**description, "attachments": taken})
+    scene = make_hall(called, name, {**description, "attachments": taken})
     asked = _asked(scene, proposals)
     if not asked:
         return Pair(scene, None, _why_not(proposals))
@@ -191,7 +200,7 @@ def pair(robot: Robot, called: str, name: str, *, seed: int = 0) -> Pair:
         entries = {entry["name"]: entry for entry in taken}
         left = [entries[attachment] for attachment in (first, *others)]
         return Pair(
-            hall(called, name, {**description, "attachments": left}), Actuate(_IT, step.joints)
+            make_hall(called, name, {**description, "attachments": left}), Actuate(_IT, step.joints)
         )
     return Pair(scene, None, "; ".join(said))
 

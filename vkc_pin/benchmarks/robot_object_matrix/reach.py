@@ -13,14 +13,14 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import ShapeDistances
 
-__all__ = ["random_poses"]
+__all__ = ["sample_reachable_poses"]
 
 _AWAY = 1.0  # [m] from the start, along x and along y, that the base drives at most
 # configurations for each pose: some of an arm folded tightly are free in one of a hundred
 _TRIES = 20_000
 
 
-def random_poses(robot: Robot, name: str, number: int, *, seed: int = 0) -> list[pin.SE3]:
+def sample_reachable_poses(robot: Robot, name: str, number: int, *, seed: int = 0) -> list[pin.SE3]:
     """Sample tool poses of random configurations in which the robot keeps its default margins.
 
     The base moves up to 1 m along x and y; unlimited joints stay within ±π.

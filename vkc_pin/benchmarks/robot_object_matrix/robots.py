@@ -11,11 +11,17 @@ from pathlib import Path
 from typing import Any, Unpack
 
 from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.harness.limits import LIMITS, allowed
+from vkc_pin.benchmarks.harness.limits import LIMITS, describe_limit
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial
 from vkc_pin.benchmarks.harness.runner import Execution
-from vkc_pin.benchmarks.harness.tables import JUDGED, decimal, markdown, page, select
-from vkc_pin.benchmarks.robot_object_matrix.reach import random_poses
+from vkc_pin.benchmarks.harness.tables import (
+    JUDGED,
+    format_decimal,
+    format_table,
+    join_report,
+    select,
+)
+from vkc_pin.benchmarks.robot_object_matrix.reach import sample_reachable_poses
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.importing.robots.rest_configuration import Clearances
 from vkc_pin.importing.robots.robot_import import import_robot
@@ -130,16 +136,16 @@ def report(result: Mapping[str, Any]) -> str:
         for r in records
         if not r["success"]
     ]
-    section = ["## What failed", markdown(("robot", "status", "because"), failed, text=3)]
-    return page(
+    section = ["## What failed", format_table(("robot", "status", "because"), failed, text=3)]
+    return join_report(
         about,
         "# Robots",
         "Robots are imported from their makers' files alone; each then reaches "
         f"{about['goals']} random poses of free configurations, seed {about['seed']}, "
-        f"{allowed(about)} each. {JUDGED} Importing, and loading again in a new process, are in "
+        f"{describe_limit(about)} each. {JUDGED} Importing, and loading again in a new process, are in "
         "processor time. Room at home is the least distance between links that are not "
         "neighbours, and of the arm to the floor.",
-        markdown(_HEAD, [_row(name, select(records, robot=name)) for name in about["robots"]]),
+        format_table(_HEAD, [_row(name, select(records, robot=name)) for name in about["robots"]]),
         *(section if failed else []),
     )
 
@@ -150,8 +156,8 @@ def _row(name: str, own: Sequence[Record]) -> list[str]:
         return [name, *["–"] * (len(_HEAD) - 1)]
     good = sum(bool(record["success"]) for record in own)
     reached = "–" if first["status"] in _NOT_IMPORTED else f"{good}/{len(own)}"
-    times = map(decimal, distribution(own, "planning_time"))
-    loads = (decimal(first[field]) for field in ("import_time", "load_time"))
+    times = map(format_decimal, distribution(own, "planning_time"))
+    loads = (format_decimal(first[field]) for field in ("import_time", "load_time"))
     room = (
         "–" if first["home_room"] is None else f"{1e3 * first['home_room']:.0f}"
     )  # nothing that could come close
@@ -174,7 +180,7 @@ def _files(robots: Sequence[str]) -> dict[str, Path]:
             found.append((path.name.split(".")[0], path.resolve()))
         else:
             names = {name: file for name, file in known.items() if file.suffix == ".urdf"}
-            found += [(name, names[name]) for name in runner.chosen("robot", [robot], names)]
+            found += [(name, names[name]) for name in runner.select_names("robot", [robot], names)]
     stems = [name for name, _ in found]
     named = {
         name if stems.count(name) == 1 else f"{file.parent.name}_{name}": file
@@ -216,7 +222,7 @@ def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
             ]
         about |= _facts(imported.robot, folder)
         try:
-            poses = random_poses(imported.robot, name, spec["goals"], seed=seed)
+            poses = sample_reachable_poses(imported.robot, name, spec["goals"], seed=seed)
         except VkcError as error:
             return [
                 {

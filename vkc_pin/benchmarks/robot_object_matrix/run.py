@@ -14,9 +14,13 @@ from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import trial
 from vkc_pin.benchmarks.harness.runner import Execution
-from vkc_pin.benchmarks.robot_object_matrix.given import parsed, ready_object, ready_robot
+from vkc_pin.benchmarks.robot_object_matrix.given import (
+    parse_requests,
+    prepare_object,
+    prepare_robot,
+)
 from vkc_pin.benchmarks.robot_object_matrix.matrix import chart, report
-from vkc_pin.benchmarks.robot_object_matrix.pairs import OBJECTS, ROBOTS, SHARE, kind_of, pair
+from vkc_pin.benchmarks.robot_object_matrix.pairs import OBJECTS, ROBOTS, SHARE, get_kind, make_pair
 from vkc_pin.planning.planner import plan
 from vkc_pin.world.models.robot_file import load_robot
 
@@ -39,7 +43,7 @@ def run(
         starts: Number of random starts per combination, at least 1.
         seed: Random seed of starts and planning.
         robots: Names and files for `load_robot`, or MJCF files; "default" stands for `ROBOTS`.
-            See `given.parsed`.
+            See `given.parse_requests`.
         objects: `<kind>_<seed>` of `random_object`, names in scenes/objects, descriptions, or URDF,
             MJCF and SDF files; "default" stands for `OBJECTS`.
 
@@ -49,9 +53,9 @@ def run(
     """
     runner.check_positive(starts=starts)
     runner.check_folder(out)
-    chosen = [parsed(robots, "robots", ROBOTS), parsed(objects, "objects", OBJECTS)]
-    things = {one.called: ready_object(one, Path(out) / "objects") for one in chosen[1]}
-    ready = {one.called: ready_robot(one, Path(out) / "robots") for one in chosen[0]}
+    chosen = [parse_requests(robots, "robots", ROBOTS), parse_requests(objects, "objects", OBJECTS)]
+    things = {one.called: prepare_object(one, Path(out) / "objects") for one in chosen[1]}
+    ready = {one.called: prepare_robot(one, Path(out) / "robots") for one in chosen[0]}
     settings = {
         "benchmark": "anything",
         "seed": seed,
@@ -83,7 +87,7 @@ def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
     about: dict[str, Any] = {
         "robot": spec["robot"],
         "object": spec["object"],
-        "kind": kind_of(spec["object"]),
+        "kind": get_kind(spec["object"]),
     }
     with warnings.catch_warnings():
         warnings.simplefilter(
@@ -93,7 +97,7 @@ def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
         robot = load_robot(file)
         about["load_time"] = time.perf_counter() - began
         began = time.perf_counter()
-        found = pair(robot, file, thing, seed=seed)
+        found = make_pair(robot, file, thing, seed=seed)
         about["look_time"] = time.perf_counter() - began
         if found.scene is None or found.step is None:
             status = "no hand" if found.scene is None else "unreachable"

@@ -170,9 +170,9 @@ def add_attachment(scene: Scene, owner: str, name: str, z: float) -> Scene:
 
 
 def make_refrigerator() -> Scene:
-    return make_hall("husky_ur5e", "refrigerator_0", load_description("refrigerator_0")).sample_start(
-        np.random.default_rng(0)
-    )
+    return make_hall(
+        "husky_ur5e", "refrigerator_0", load_description("refrigerator_0")
+    ).sample_start(np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("planned", [vkc.plan, functools.partial(vkc.plan, window=2)])

@@ -78,17 +78,10 @@ class Curves:
         )
 
     def fit(self, path: Floats, free: Callable[[Floats], bool]) -> Floats:
-        """Return the corners of collision-free curves along a path with turns in place.
+        """Return the corners, (K, 3), of collision-free curves along a path with turns in place.
 
-        Each curve leads to the furthest place on the path to which one is free, or else to the
-        next place, free or not. Places are on the straight parts of the path.
-
-        Args:
-            path: Corners of the path, shape (L, 3).
-            free: Function that returns whether a pose, shape (3,), is free.
-
-        Returns:
-            Corners of the curves, shape (K, 3); the first is that of the path.
+        Each curve leads to the furthest place on the path's straight parts to which all poses are
+        `free`, or else to the next place.
         """
         lengths = np.hypot(*np.diff(path[:, :2], axis=0).T)
         places = [
@@ -128,13 +121,7 @@ def advance(pose: Floats, length: float, turn: float) -> Floats:
 
 
 def interpolate_arcs(first: Floats, last: Floats, share: Floats) -> Floats:
-    """Interpolate between poses with constant twists.
-
-    Args:
-        first: First poses, shape (B, 3).
-        last: Last poses, shape (B, 3).
-        share: Interpolation parameters from 0 to 1, shape (B,).
-    """
+    """Return poses on arcs between `first` and `last`, (B, 3) each, at shares from 0 to 1, (B,)."""
     turn = (last - first)[:, 2]
     # The chord of a share s of an arc that turns by δ is sin(s·δ/2) / sin(δ/2) times the arc's own,
     # turned by (s − 1)·δ/2.
@@ -151,13 +138,9 @@ def interpolate_arcs(first: Floats, last: Floats, share: Floats) -> Floats:
 
 
 def find_nearest_arc(first: Floats, last: Floats, *, radius: float, turning: float) -> Floats:
-    """Find the poses nearest to `last` that an arc from `first` reaches, shape (B, 3).
+    """Return the poses nearest to `last` that an arc from `first`, (B, 3) each, reaches.
 
-    Args:
-        first: Start poses, shape (B, 3).
-        last: Desired poses, shape (B, 3).
-        radius: Smallest turning radius [m].
-        turning: Weight of heading errors [m/rad].
+    `radius` [m] is the smallest one, `turning` the weight of heading errors [m/rad].
     """
     asked = (last - first)[:, 2:]
     off = np.linspace(-_MAX_TURN_CHANGE, _MAX_TURN_CHANGE, _TURN_SAMPLES)
@@ -179,15 +162,9 @@ def find_nearest_arc(first: Floats, last: Floats, *, radius: float, turning: flo
 
 
 def sample_path(corners: Floats, steps: int, *, turning: float) -> Floats:
-    """Sample poses along a path of arcs, slow at both ends, with one at each corner if possible.
+    """Return poses along a path of arcs without its start, slow at both ends, shape (steps, 3).
 
-    Args:
-        corners: Corners of the path, shape (K, 3).
-        steps: Number of poses.
-        turning: Cost of turning, relative to driving [m/rad].
-
-    Returns:
-        Poses without the first corner, shape (steps, 3).
+    One is at each of the corners, (K, 3), if possible. `turning` is relative to driving [m/rad].
     """
     change = np.diff(corners, axis=0)
     if not len(change):

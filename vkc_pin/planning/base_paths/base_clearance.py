@@ -55,10 +55,8 @@ class Obstacles:
 
     def __init__(self, shapes: Sequence[Shape]) -> None:
         self.shapes = [(shape, _transform(placement)) for shape, placement in shapes]
-        self.support, self.height = (
-            np.empty((len(shapes), len(DIRECTIONS))),
-            np.empty((len(shapes), 2)),
-        )
+        self.support = np.empty((len(shapes), len(DIRECTIONS)))
+        self.height = np.empty((len(shapes), 2))
         for s, (shape, placement) in enumerate(shapes):
             points, radius = compute_hull_points(shape, placement, outer=True)
             self.support[s] = (points[:, :2] @ DIRECTIONS.T).max(axis=0) + radius
@@ -77,9 +75,7 @@ class MovingShapes:
     def __init__(self, shapes: Sequence[Shape], world: Obstacles, margin: float) -> None:
         self.world, self.margin = world, margin
         self.shapes = [(shape, _transform(placement)) for shape, placement in shapes]
-        outlines = [
-            compute_hull_points(shape, placement, outer=True) for shape, placement in shapes
-        ]
+        outlines = [compute_hull_points(*placed, outer=True) for placed in shapes]
         radius = np.array([radius for _, radius in outlines])
         low = np.array([points[:, 2].min() for points, _ in outlines]) - radius
         high = np.array([points[:, 2].max() for points, _ in outlines]) + radius
@@ -88,21 +84,16 @@ class MovingShapes:
         self.moving, self.standing = np.nonzero(gaps < margin)
         self.exclusion_radius = np.full(len(world.shapes), -np.inf)
         np.maximum.at(self.exclusion_radius, self.standing, self.reach[self.moving] + margin)
-        self._points = (
-            np.concatenate([points[:, :2] for points, _ in outlines])
-            if outlines
-            else np.empty((0, 2))
+        self._points = np.concatenate(
+            [np.empty((0, 2)), *(points[:, :2] for points, _ in outlines)]
         )
-        self._first_point = np.concatenate(
-            [[0], np.cumsum([len(points) for points, _ in outlines])[:-1]]
-        ).astype(int)
+        self._first_point = np.cumsum([0, *(len(points) for points, _ in outlines)])[:-1]
         self._radius = radius[:, None]
         self._tables: dict[tuple[float, float], Floats] = {}
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
         order = np.argsort(self.standing, kind="stable")
-        self._pairs_by_obstacle = np.split(
-            order, np.searchsorted(self.standing[order], np.arange(1, len(world.shapes)))
-        )
+        edges = np.searchsorted(self.standing[order], np.arange(1, len(world.shapes)))
+        self._pairs_by_obstacle = np.split(order, edges)
         self._margins = np.full(len(world.shapes), margin)
 
     def is_drive_free(
@@ -125,9 +116,8 @@ class MovingShapes:
             return True
         along = DIRECTIONS @ at
         rows = self._find_close_pairs(along)
-        yaws = np.linspace(
-            start, end, 1 + max(1, int(np.ceil(abs(end - start) / _LONG_ARC)))
-        ).tolist()
+        parts = max(1, int(np.ceil(abs(end - start) / _LONG_ARC)))
+        yaws = np.linspace(start, end, 1 + parts).tolist()
         margins = self._margins if margins is None else margins
         return not len(rows) or all(
             self._check_turn(at, along, p, q, rows=rows, margins=margins)
@@ -148,23 +138,17 @@ class MovingShapes:
         world = self.world
         near = np.flatnonzero((along[_AXES] - world.extent).max(axis=1) < self.exclusion_radius)
         near = near[(along - world.support[near]).max(axis=1) < self.exclusion_radius[near]]
-        return (
-            np.sort(np.concatenate([self._pairs_by_obstacle[s] for s in near.tolist()]))
-            if len(near)
-            else near
-        )
+        if not len(near):
+            return near
+        return np.sort(np.concatenate([self._pairs_by_obstacle[s] for s in near.tolist()]))
 
     def _compute_extents(self, start: float, end: float, rows: Ints) -> Floats:
         """Return upper bounds of the extents of pairs against `DIRECTIONS`, shape (n, 32) [m]."""
-        moving = self.moving[rows]
-        extents = (
-            self._get_extent_table(start, end)[moving] + self.world.support[self.standing[rows]]
-        )
-        return (
-            extents
-            if start == end
-            else extents + (self.reach * (1.0 - np.cos((end - start) / 4)))[moving, None]
-        )
+        moving, support = self.moving[rows], self.world.support[self.standing[rows]]
+        extents = self._get_extent_table(start, end)[moving] + support
+        if start == end:
+            return extents
+        return extents + (self.reach * (1.0 - np.cos((end - start) / 4)))[moving, None]
 
     def _get_extent_table(self, start: float, end: float) -> Floats:
         """Return upper bounds of the shapes' extents between two yaws, shape (M, 32) [m]."""
@@ -172,19 +156,13 @@ class MovingShapes:
         if key not in self._tables:
             if start == end:
                 cosine, sine = np.cos(start), np.sin(start)
-                turned = DIRECTIONS @ np.array(
-                    [[-cosine, sine], [-sine, -cosine]]
-                )  # against u, in the base's frame
-                table = (
-                    np.maximum.reduceat(self._points @ turned.T, self._first_point, axis=0)
-                    + self._radius
-                )
+                # against u, in the base's frame
+                turned = DIRECTIONS @ np.array([[-cosine, sine], [-sine, -cosine]])
+                along = self._points @ turned.T
+                table = np.maximum.reduceat(along, self._first_point, axis=0) + self._radius
             else:
-                middle = (start + end) / 2
-                table = np.maximum(
-                    self._get_extent_table(start, start), self._get_extent_table(end, end)
-                )
-                table = np.maximum(table, self._get_extent_table(middle, middle))
+                yaws = (start, end, (start + end) / 2)
+                table = np.maximum.reduce([self._get_extent_table(yaw, yaw) for yaw in yaws])
             if len(self._tables) >= _CACHE_SIZE:
                 self._tables.clear()
             self._tables[key] = table
@@ -194,9 +172,8 @@ class MovingShapes:
         self, a: Floats, b: Floats, yaw: float, *, extents: Floats, rows: Ints, margins: Floats
     ) -> bool:
         """Return whether pairs `rows` keep their margins along a line, given their extents."""
-        near = (np.minimum(DIRECTIONS @ a, DIRECTIONS @ b) - extents).max(axis=1) < margins[
-            self.standing[rows]
-        ]
+        gaps = (np.minimum(DIRECTIONS @ a, DIRECTIONS @ b) - extents).max(axis=1)
+        near = gaps < margins[self.standing[rows]]
         rows, extents = rows[near], extents[near]
         if not len(rows):
             return True
@@ -237,11 +214,10 @@ class MovingShapes:
             distance, normal = self._compute_distance(row, at, yaw)
             return distance, float(self.reach[self.moving[row]] * np.hypot(*normal))
 
+        advances = _MIN_ADVANCE / self.reach[self.moving[rows]]
         return all(
-            self._keeps_margin(
-                row, query, angle, _MIN_ADVANCE / self.reach[self.moving[row]], margins
-            )
-            for row in rows.tolist()
+            self._keeps_margin(row, query, angle, advance, margins)
+            for row, advance in zip(rows.tolist(), advances, strict=True)
         )
 
     def _keeps_margin(
@@ -252,9 +228,9 @@ class MovingShapes:
         advance: float,
         margins: Floats,
     ) -> bool:
-        """Return whether a pair keeps its margin by conservative advancement.
+        """Return whether a pair keeps its margin, by conservative advancement.
 
-        The plane between two convex shapes separates them until one has moved through it.
+        `query` returns the distance [m] and a bound of the closing speed at some progress.
         """
         at, margin = 0.0, margins[self.standing[row]]
         while True:
@@ -287,30 +263,19 @@ def compute_hull_points(
 ) -> tuple[Floats, float]:
     """Return points, shape (n, 3), and a radius around them that bound a convex shape [m].
 
-    Args:
-        shape: Convex shape.
-        placement: Its placement.
-        outer: Whether the hull of the points contains the shape; otherwise it is inside.
+    `outer`: their hull contains the shape; otherwise it is inside.
     """
-    rim = np.column_stack(
-        [np.cos(_RIM_ANGLES), np.sin(_RIM_ANGLES), np.zeros(len(_RIM_ANGLES))]
-    ) / (np.cos(_RIM_ANGLES[1] / 2) if outer else 1.0)
+    rim = np.column_stack([np.cos(_RIM_ANGLES), np.sin(_RIM_ANGLES), 0.0 * _RIM_ANGLES])
+    rim = rim / (np.cos(_RIM_ANGLES[1] / 2) if outer else 1.0)
     radius = shape.getSweptSphereRadius() if outer else 0.0
     if isinstance(shape, coal.Cylinder | coal.Cone):
         top = np.array([0.0, 0.0, shape.halfLength])
-        points = np.concatenate(
-            [
-                shape.radius * rim - top,
-                shape.radius * rim + top if isinstance(shape, coal.Cylinder) else top[None],
-            ]
-        )
+        upper = shape.radius * rim + top if isinstance(shape, coal.Cylinder) else top[None]
+        points = np.concatenate([shape.radius * rim - top, upper])
     elif isinstance(shape, coal.Sphere | coal.Capsule):
         top = np.array([0.0, 0.0, shape.halfLength if isinstance(shape, coal.Capsule) else 0.0])
-        balls = (
-            np.zeros((1, 3))
-            if outer
-            else shape.radius * np.concatenate([rim, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
-        )
+        poles = [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]
+        balls = np.zeros((1, 3)) if outer else shape.radius * np.concatenate([rim, poles])
         points = np.concatenate([balls - top, balls + top])
         radius += shape.radius if outer else 0.0
     elif isinstance(shape, coal.ConvexBase):

@@ -21,15 +21,13 @@ _SAME = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class BasePath:
-    """Base path of straight drives, forwards or backwards, with turns in place between them.
+    """Base path of straight drives with turns in place between them.
 
     Attributes:
-        poses: x, y [m] and continuous yaw [rad] at the ends of drives and turns, from the start to
-            the goal, shape (K, 3).
+        poses: x, y [m] and continuous yaw [rad] at the ends of drives and turns, shape (K, 3).
         goal: Number of the goal that it reaches.
-        cost: Length driven, backwards times `BACKWARDS`, sideways next to start or goal times
-            `SIDEWAYS`, plus the angle turned times `BaseGrid.turning`, plus the goal's additional
-            cost [m].
+        cost: Length driven, weighted by `BACKWARDS` and `SIDEWAYS`, angle turned times
+            `BaseGrid.turning`, and the goal's additional cost [m].
     """
 
     poses: Floats
@@ -45,17 +43,11 @@ def shortest_path(
     costs: Sequence[float] | Floats | None = None,
     smooth: bool = True,
 ) -> BasePath | None:
-    """Find the cheapest path from the start to one of the goals, or None if there is none.
+    """Return the cheapest path from the start, (3,), to one of the goals, (G, 3), or None.
 
-    A blocked start can be left; blocked goals are not reached. The result is deterministic.
-
-    Args:
-        grid: Grid of free base poses.
-        start: x, y [m] and yaw [rad].
-        goals: Goal poses, shape (G, 3).
-        costs: Additional cost of each goal, shape (G,) [m]. Default: none.
-        smooth: Whether to shorten the path where it turns more often than necessary.
-
+    A blocked start can be left; blocked goals are not reached. `costs`, shape (G,) [m], are
+    additional costs of the goals. `smooth`: shorten the path where it turns more often than
+    necessary.
     """
     begin, ends = np.asarray(start, float), np.asarray(goals, float)
     extra = np.zeros(len(ends)) if costs is None else np.asarray(costs, float)
@@ -72,10 +64,7 @@ def shortest_path(
 def sample_poses(path: BasePath, steps: int, *, turning: float) -> Floats:
     """Return poses along a path without its start, slow at both ends, shape (steps, 3).
 
-    Args:
-        path: Base path.
-        steps: Number of poses, at least 1.
-        turning: Cost of turning, relative to driving [m/rad].
+    `turning` is the cost of turning, relative to driving [m/rad].
     """
     change = np.diff(path.poses, axis=0)
     passed = np.concatenate(

@@ -80,19 +80,10 @@ def find_colliding_cells(
     *,
     views: SupportCache | None = None,
 ) -> tuple[Bools, Bools]:
-    """Find cells and headings at which base or load certainly violate the margin.
+    """Return masks, shape (cells, cells, H), of where base and load certainly violate the margin.
 
-    Args:
-        base: Shapes of the base, in its frame.
-        carried: Shapes of arm and load, in the base's frame.
-        standing: Obstacles in the world.
-        lattice: Cells and headings.
-        margin: Clearance to keep [m].
-        views: Cache of support functions. Default: none.
-
-    Returns:
-        Masks for base and load, shape (cells, cells, H) each. Loads within the outline of the base
-        are checked only against obstacles that the base passes under.
+    Shapes of base and load are in the base's frame. Loads within the outline of the base are
+    checked only against obstacles that the base passes under. `views` caches support functions.
     """
     obstacles, below, above = make_solids(standing), make_solids(base), make_solids(carried)
     pairs, over = _find_height_overlaps(below, obstacles), _find_height_overlaps(above, obstacles)
@@ -164,15 +155,10 @@ class SupportCache:
         return sum(support.nbytes + overshoot.nbytes for support, overshoot in self._known.values())
 
     def get(self, parts: Sequence[_Slice], directions: Floats) -> _Supports:
-        """Return support functions of slices in the plan view.
+        """Return support functions of M slices in the plan view, shape (M, D, K) [m].
 
-        Args:
-            parts: M solids with two heights each.
-            directions: Unit vectors in counter-clockwise order, shape (D, K, 2).
-
-        Returns:
-            Support functions, shape (M, D, K) [m]; largest distance by which the polygons that they
-            bound exceed the hulls, shape (M, D) [m].
+        `directions` are unit vectors in counter-clockwise order, shape (D, K, 2). The second result
+        is by how much the polygons that they bound exceed the hulls, shape (M, D) [m].
         """
         turned = directions.tobytes() if len(directions) > 1 else b""
         keys = [(solid.key, low, high, turned) for solid, low, high in parts]
@@ -292,7 +278,10 @@ def _fill_cells(
 
 
 def _rasterize(reach: NDArray[np.float32], heading: Ints, lattice: Lattice) -> Bools:
-    """Return the cells inside any of many polygons, by heading, shape (cells, cells, H)."""
+    """Return the cells inside any of Q polygons, by heading (Q,), shape (cells, cells, H).
+
+    `reach`, shape (Q, 32) [m], are their support functions along `DIRECTIONS`.
+    """
     cells, quarter = lattice.cells, len(DIRECTIONS) // 4
     (x0, y0), (dx, dy) = lattice.origin, lattice.step
     begin = np.clip(np.floor((-reach[:, 2 * quarter] - x0) / dx) + 1, 0, cells).astype(int)

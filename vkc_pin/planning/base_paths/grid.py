@@ -44,18 +44,17 @@ class BaseGrid:
 
     Attributes:
         cells: Number of cells along each side.
-        origin: Centre of cell (0, 0) in the world, shape (2,) [m].
-        step: Size of a cell, shape (2,) [m].
+        origin, step: Centre of cell (0, 0), and size of a cell, shape (2,) [m].
         moves: Cells that a forward move advances at each heading, shape (HEADINGS, 2).
         yaws: Headings, ascending from 0, shape (HEADINGS,) [rad].
         lengths: Lengths of the moves, shape (HEADINGS,) [m].
-        near: Radius around the start and goals of a search in which only the base counts [m].
+        near: Radius around start and goals in which only the base counts, since the arm approaches
+            or retreats there [m].
         turning: Cost of turning, relative to driving [m/rad].
         base, carried: Shapes of the base, and of arm and load.
-        blocked: Where the base certainly collides, shape (cells, cells, HEADINGS).
-        carried_blocked: Where arm or load certainly collide, shape (cells, cells, HEADINGS).
-        turn_limits: Cached turning ranges at starts and goals, by pose; see
-            `SearchSpace.find_turnable`.
+        blocked, carried_blocked: Where base, or arm and load, certainly collide, shape (cells,
+            cells, HEADINGS).
+        turn_limits: Cache of `SearchSpace.find_turnable`.
     """
 
     def __init__(
@@ -265,16 +264,10 @@ class BaseGrid:
         return [room.tolist() for room in rooms]
 
     def compute_distances(self, starts: Floats, *, threads: int = 1) -> Floats:
-        """Return lower bounds of the driving distance from places to every cell.
+        """Return lower bounds of the driving distance from places, (W, 2), to every cell.
 
-        Turning is free, and only certain collisions of the base count.
-
-        Args:
-            starts: Places, shape (W, 2) [m].
-            threads: Number of threads; it does not change the result.
-
-        Returns:
-            Distances, shape (W, cells, cells) [m]; infinite: there is no path.
+        Turning is free, and only certain collisions of the base count. `threads` do not change the
+        result.
         """
         blocked = np.asarray(self.blocked.all(axis=2))
         entries: list[tuple[Ints, Floats]] = []

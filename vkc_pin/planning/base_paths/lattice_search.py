@@ -38,14 +38,12 @@ _NONE = 2**60  # [UNIT] more than any path costs
 
 
 class _EndConnections:
-    """Connections of start and goals, with their costs.
+    """Connections of start and free goals with the cells around them and with each other.
 
     Attributes:
-        starts: Connections of the start with the cells around it.
-        ends: Connections of all free goals, one goal after the other; costs include the goals' own.
+        starts, ends: Connections of the start and of all goals, whose costs include the goals' own.
         goal: Goal of each of the `ends`.
-        direct: Straight drives from the start to goals as cost [UNIT], goal and kind (see
-            `SearchSpace.get_direct_drive`), the cheapest last.
+        direct: Straight drives to goals as cost [UNIT], goal and kind, the cheapest last.
     """
 
     def __init__(self, space: SearchSpace, extra: Floats) -> None:
@@ -106,14 +104,9 @@ class _EndConnections:
 def find_cheapest_path(
     space: SearchSpace, extra: Floats
 ) -> tuple[float, int, list[Drive], float] | None:
-    """Find the cheapest path to a free goal, or None if there is none.
+    """Return cost [m], goal, drives and last yaw [rad] of the cheapest path to a free goal, or None.
 
-    Args:
-        space: Search space with start and goals.
-        extra: Additional cost of each goal, shape (G,) [m].
-
-    Returns:
-        Cost [m], goal, drives with continuous yaws, and the yaw at the goal [rad].
+    `extra`, shape (G,) [m], are additional costs of the goals.
     """
     ends = _EndConnections(space, extra)
     if not len(ends.goal):
@@ -137,10 +130,7 @@ def find_cheapest_path(
 
 
 class _Search:
-    """Moves of one search, from which blocked ones are removed.
-
-    Nodes are numbered (i·cells + j)·HEADINGS + heading.
-    """
+    """Moves of one search, without blocked ones; nodes are (i·cells + j)·HEADINGS + heading."""
 
     def __init__(self, connections: _EndConnections) -> None:
         self.connections = connections

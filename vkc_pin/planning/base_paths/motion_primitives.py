@@ -77,15 +77,12 @@ class Connections:
 
 
 class SearchSpace:
-    """Free space of one search.
-
-    Near the start and the goals only the base counts, elsewhere also arm and load.
+    """Free space of one search. Near start and goals only the base counts.
 
     Attributes:
-        near: For each cell, a place (0: start, then the goals) that it is near, shape (cells,
-            cells); -1: none.
-        blocked: Where the base, or the relevant part of its load, is known to be blocked, shape
-            (cells, cells, HEADINGS).
+        near: Place (0: start, then the goals) that each cell is near, shape (cells, cells); -1:
+            none.
+        blocked: Where base or load are known to be blocked, shape (cells, cells, HEADINGS).
         exit_margins: Margins kept when leaving a blocked start; see
             `BaseGrid.compute_exit_margins`.
         exit_cost: Cost of a metre when leaving the start.
@@ -111,9 +108,8 @@ class SearchSpace:
         self, at: Floats, start: float, end: float, margins: Floats | None = None
     ) -> bool:
         """Return whether the base can turn in place from one yaw to another."""
-        return self.grid.is_turn_free(
-            at, start, end, reaching=self._is_near_end(at), margins=margins
-        )
+        reaching = self._is_near_end(at)
+        return self.grid.is_turn_free(at, start, end, reaching=reaching, margins=margins)
 
     def is_drive_free(self, drive: Drive, margins: Floats | None = None) -> bool:
         """Return whether a straight drive is free."""
@@ -125,13 +121,9 @@ class SearchSpace:
     def is_sweep_free(
         self, before: float, drive: Drive, after: float, margins: Floats | None = None
     ) -> bool:
-        """Return whether a drive and the turns before and after it are free.
+        """Return whether a drive and the turns from yaw `before` and to `after` [rad] are free.
 
-        Args:
-            before: Yaw before the first turn [rad].
-            drive: Straight drive.
-            after: Yaw after the last turn [rad].
-            margins: Margins of the first turn and the drive, shape (S,) [m]. Default: the grid's.
+        `margins`, shape (S,) [m], are those of first turn and drive. Default: the grid's.
         """
         return (
             self.is_turn_free(drive.a, before, drive.yaw, margins)
@@ -143,11 +135,8 @@ class SearchSpace:
         """Return whether no cell along a drive is known to be blocked near its heading."""
         grid = self.grid
         count = int(np.hypot(*((drive.b - drive.a) / grid.step))) + 2
-        cells = (
-            np.rint((np.linspace(drive.a, drive.b, count)[1:-1] - grid.origin) / grid.step)
-            .astype(int)
-            .clip(0, grid.cells - 1)
-        )
+        cells = (np.linspace(drive.a, drive.b, count)[1:-1] - grid.origin) / grid.step
+        cells = np.rint(cells).astype(int).clip(0, grid.cells - 1)
         heading = int(np.abs(wrap_angle(grid.yaws - drive.yaw)).argmin())
         return not self.blocked[cells[:, 0], cells[:, 1], heading].any()
 
@@ -166,24 +155,17 @@ class SearchSpace:
             return
         meets = mixed**2 > square * rest
         root = np.sqrt(mixed[meets] ** 2 - square * rest[meets])
-        inside = sorted(
-            zip(
-                ((-mixed[meets] - root) / square).tolist(),
-                ((-mixed[meets] + root) / square).tolist(),
-                strict=True,
-            )
-        )
+        inside = np.column_stack([-mixed[meets] - root, -mixed[meets] + root]) / square
         done = 0.0
-        for begin, end in [*inside, (1.0, np.inf)]:
+        for begin, end in [*sorted(inside.tolist()), (1.0, np.inf)]:
             if done < min(begin, 1.0):
                 yield drive.a + done * along, drive.a + min(begin, 1.0) * along
             done = max(done, end)
 
     def get_starts(self) -> Connections:
         """Return the connections from the start to the cells around it."""
-        found = self._connections(
-            self.start, 1.0, _EXIT_RANGE if self.exit_cost > 1.0 else _ENTRY, self.exit_cost
-        )
+        radius = _EXIT_RANGE if self.exit_cost > 1.0 else _ENTRY
+        found = self._connections(self.start, 1.0, radius, self.exit_cost)
         # Checked first: a search from the goals would find out last.
         return found.select(self.find_turnable(self.start, found, self.exit_margins))
 
@@ -197,22 +179,17 @@ class SearchSpace:
         """Return connections from a pose (`sign` 1) or to it (-1)."""
         grid = self.grid
         step = float(grid.step.max())
-        cells = grid.find_cells_within(
-            float(pose[0]), float(pose[1]), max(radius * min(1.0, step / _FULL_CELL), 1.5 * step)
-        )
+        radius = max(radius * min(1.0, step / _FULL_CELL), 1.5 * step)
+        cells = grid.find_cells_within(float(pose[0]), float(pose[1]), radius)
         offset = sign * (grid.origin + cells * grid.step - pose[:2])
         length = np.hypot(*offset.T)
         ahead = np.where(length > _SAME, np.arctan2(offset[:, 1], offset[:, 0]), pose[2])
         yaw = np.concatenate([ahead, ahead + np.pi, np.full(len(cells), pose[2])])
         heading = np.abs(wrap_angle(yaw[:, None] - grid.yaws)).argmin(axis=1)
         turned = np.abs(wrap_angle(yaw - pose[2])) + np.abs(wrap_angle(yaw - grid.yaws[heading]))
-        cost = (
-            cost_factor * np.concatenate([length, BACKWARDS * length, SIDEWAYS * length])
-            + grid.turning * turned
-        )
-        found = Connections(
-            np.tile(cells @ [grid.cells, 1], 3), heading, yaw, np.rint(cost / UNIT).astype(int)
-        )
+        driven = np.concatenate([length, BACKWARDS * length, SIDEWAYS * length])
+        cost = np.rint((cost_factor * driven + grid.turning * turned) / UNIT).astype(int)
+        found = Connections(np.tile(cells @ [grid.cells, 1], 3), heading, yaw, cost)
         return found.select(~self.blocked.reshape(-1, len(grid.yaws))[found.cell, heading])
 
     def find_turnable(
@@ -222,11 +199,8 @@ class SearchSpace:
 
         The turning range is overestimated by at most a few degrees.
         """
-        key = (
-            pose.tobytes(),
-            self._is_near_end(pose[:2]),
-            None if margins is None else margins.tobytes(),
-        )
+        margins_key = None if margins is None else margins.tobytes()
+        key = pose.tobytes(), self._is_near_end(pose[:2]), margins_key
         if key not in self.grid.turn_limits:  # a start or goal belongs to many searches
             self.grid.turn_limits[key] = (
                 self._measure_turn(pose, 1.0, margins) + _TURN_STEP,
@@ -239,9 +213,10 @@ class SearchSpace:
     def _measure_turn(self, pose: Floats, side: float, margins: Floats | None) -> float:
         """Return how far the base can turn left (`side` 1) or right (-1), at most π [rad]."""
         turned = 0.0
-        while turned < np.pi and self.is_turn_free(
-            pose[:2], pose[2] + side * turned, pose[2] + side * (turned + _TURN_STEP), margins
-        ):
+        while turned < np.pi:
+            yaws = pose[2] + side * turned, pose[2] + side * (turned + _TURN_STEP)
+            if not self.is_turn_free(pose[:2], *yaws, margins):
+                break
             turned += _TURN_STEP
         return turned
 
@@ -249,31 +224,21 @@ class SearchSpace:
         """Return the drive of a connection from the start, and the yaw in its cell [rad]."""
         yaw = float(self.start[2] + wrap_angle(connections.yaw[number] - self.start[2]))
         drive = Drive(self.start[:2], self.center(connections.cell[number]), yaw)
-        return drive, float(
-            drive.yaw + wrap_angle(self.grid.yaws[connections.heading[number]] - drive.yaw)
-        )
+        return drive, float(yaw + wrap_angle(self.grid.yaws[connections.heading[number]] - yaw))
 
     def get_goal_drive(
         self, connections: Connections, number: int, goal: int, yaw: float
     ) -> tuple[Drive, float]:
         """Return the drive of a connection to a goal from a yaw in its cell, and the last yaw."""
-        pose = self.goals[goal]
-        drive = Drive(
-            self.center(connections.cell[number]),
-            pose[:2],
-            float(yaw + wrap_angle(connections.yaw[number] - yaw)),
-        )
-        return drive, float(drive.yaw + wrap_angle(pose[2] - drive.yaw))
+        yaw = float(yaw + wrap_angle(connections.yaw[number] - yaw))
+        drive = Drive(self.center(connections.cell[number]), self.goals[goal, :2], yaw)
+        return drive, float(yaw + wrap_angle(self.goals[goal, 2] - yaw))
 
     def get_direct_drive(self, goal: int, how: int) -> tuple[Drive, float] | None:
-        """Return the straight drive from the start to a goal, and the yaw at the goal.
+        """Return the straight drive from the start to a goal, and the yaw at the goal [rad].
 
-        Args:
-            goal: Number of the goal.
-            how: 0: ahead, 1: backwards, 2: sideways.
-
-        Returns:
-            Drive and yaw [rad]; None if it is too long, sideways or from a blocked start.
+        `how`: 0: ahead, 1: backwards, 2: sideways. None: too long, sideways or from a blocked
+        start.
         """
         a, b, yaw = self.start[:2], self.goals[goal, :2], float(self.start[2])
         if how < 2 and np.hypot(*(b - a)) > _SAME:

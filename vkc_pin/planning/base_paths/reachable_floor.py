@@ -25,11 +25,10 @@ _CACHE_SIZE = 4096  # slices
 
 
 class Wall(NamedTuple):
-    """Part of an obstacle at some height, and its distance from the base's origin.
+    """Convex polygon inside an obstacle at some height, and its distance from the base's origin.
 
     Attributes:
-        outline: Corners of a convex polygon inside the obstacle, counter-clockwise, shape (n, 2)
-            [m].
+        outline: Corners, counter-clockwise, shape (n, 2) [m].
         radius: Radius of a disc inside the base at the same height [m].
         number: Number of the obstacle.
     """
@@ -194,12 +193,8 @@ def find_blocked_cells(
 ) -> tuple[tuple[slice, slice], Bools]:
     """Return a window of cells, and a mask of the cells in it that a wall blocks.
 
-    Args:
-        cells: Cells of the floor.
-        wall: Wall that keeps the base's origin away.
-        grown: Addition to the wall's radius, within which the centre of a blocked cell lies [m].
-            Minus half a cell's diagonal: blocked cells are blocked entirely. Plus: other cells are
-            free entirely.
+    The centre of a blocked cell is within the wall's radius plus `grown` [m]. Minus half a cell's
+    diagonal: blocked cells are blocked entirely. Plus: other cells are free entirely.
     """
     outline, reach = wall.outline, wall.radius + grown
     low = np.ceil((outline.min(axis=0) - max(reach, 0.0) - cells.origin) / cells.step)
@@ -227,12 +222,9 @@ def _compute_signed_distance(outline: Floats, x: Floats, y: Floats) -> Floats:
 
 
 def flood_fill(free: Bools, begin: Bools, *, corners: bool) -> Bools:
-    """Return the cells that are connected with the starting cells over free ones.
+    """Return the cells that free ones connect with the starting ones, which may be blocked.
 
-    Args:
-        free: Mask of free cells, shape (X, Y).
-        begin: Mask of starting cells, which need not be free, shape (X, Y).
-        corners: Whether cells that share only a corner are connected.
+    `corners`: cells that share only a corner are connected.
     """
     from scipy import ndimage
 

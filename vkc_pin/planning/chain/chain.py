@@ -36,12 +36,10 @@ FREEDOM_ACCELERATION = 2.0
 class Closure:
     """h_chain of eq. 2: target pose of a held object's base link.
 
-    For a fixed object, that is where its base link must stay; for a free one, where it is grasped.
-
     Attributes:
-        joint: Joint of the chain that carries the object's base link.
+        joint: Joint of the chain that carries the base link.
         local: Placement of the base link on that joint.
-        target: Placement of the base link in the world.
+        target: Placement in the world: where a fixed object stays, or a free one is grasped.
     """
 
     joint: int
@@ -56,20 +54,16 @@ class VirtualKinematicChain:
     Attributes:
         robot: The robot at its root.
         model: Joint 1 is the planar virtual base, followed by the arm and, for each grasp, the
-            virtual joint of the attachment and the object's joints from the attachable link to its
-            base, inverted.
+            virtual joint of the attachment and the object's joints down to its base, inverted.
         coordinates: Minimal coordinates z of `model`.
-        names: Coordinate names, shape (n,); `<object>.<joint>` for objects, `<object>.<attachment>`
-            for virtual joints.
+        names: Coordinate names, shape (n,); `<object>.<joint>` or `<object>.<attachment>`.
         lower, upper, velocity, acceleration: Limits, shape (n,), SI units.
-        collision: Collision geometry of the robot (first, in the robot's order) and of the moving
-            parts of objects.
-        held_geometries: Hold → indices in `collision` of the object's geometry that moves when
-            held.
-        ride_geometries: Ride → indices in `collision` of the geometry of the supported object.
+        collision: Collision geometry of the robot, then of the moving parts of objects.
+        held_geometries: Hold → indices in `collision` of the geometry that moves with it.
+        ride_geometries: Ride → indices in `collision` of the supported object's geometry.
         closures: Hold → closure of the object's base link.
         virtual: Hold → names of the coordinates of its attachment's virtual joint.
-        added: Hold → names of all coordinates that it adds: virtual joint and object joints.
+        added: Hold → names of all its coordinates: virtual joint and object joints.
         prefixes: Hold → prefix of the object's frames and joints in `model`.
         cache: Cache of functions built for the chain, shared with others.
     """
@@ -133,11 +127,10 @@ class VirtualKinematicChain:
 
     @cached_property
     def motions(self) -> tuple[Ints, Ints, Floats, Floats, Bools]:
-        """Motion of joints per coordinate, one row for each of `Coordinates.moves`.
+        """Coordinate and joint, (m,), of each of `Coordinates.moves`, and the joint's velocity.
 
-        These are coordinate and joint, shape (m,) each, linear and angular velocity in the joint's
-        frame, shape (m, 3) each, and a mask of rows whose linear velocity is along the world's
-        axes, shape (m,): x and y of a planar joint.
+        Linear and angular velocity, shape (m, 3), are in the joint's frame, but the linear velocity
+        of planar joints is along the world's axes: a mask, shape (m,).
         """
         data, moves = self.model.createData(), self.coordinates.moves
         pin.forwardKinematics(self.model, data, pin.neutral(self.model))
@@ -205,13 +198,10 @@ class VirtualKinematicChain:
     def frame(
         self, name: str, hold: Hold | None = None, *, opening: float | None = None
     ) -> tuple[int, pin.SE3]:
-        """Return the joint that carries a frame, and the frame's placement on it.
+        """Return the joint that carries a frame or a link of `hold`, and its placement on it.
 
-        Args:
-            name: Frame of the robot, or link of a held object.
-            hold: Hold of that object; None for a frame of the robot.
-            opening: Opening of the robot's gripper [m], which determines the frames of its fingers.
-                Defaults to that of the home configuration.
+        `opening` [m] of the gripper determines the frames of its fingers. Default: home
+        configuration.
         """
         if hold is None:
             model = self.robot.opened(opening).model  # the chain starts with the robot's joints
@@ -230,22 +220,18 @@ def consolidate(
 ) -> VirtualKinematicChain:
     """Merge the scene's robot with the objects it holds into one model (section III of the paper).
 
+    Branches of an object that are not on the path from grasp to base are locked.
+
     Args:
         scene: Robot and placed objects.
         holds: All holds at any time, each after the hold it depends on; or object → attachment, all
-            held by the tool. Several holds become branches of one tree. A branch is closed only at
-            waypoints where its object is held and fixed in the world.
+            held by the tool. Several holds become branches of one tree.
         rides: Objects supported by links of held objects at any time.
         cache: Cache of the chain's kinematics. Defaults to one of its own.
 
-    Returns:
-        The chain. Branches of an object that are not on the path from grasp to base are locked at
-        their present state.
-
     Raises:
         UnknownNameError: The scene has no such object, or the object no such attachment.
-        InputError: Two grasps move the same joint, or a freedom of a grasp has the name of a joint
-            of its object.
+        InputError: Two grasps move the same joint, or a freedom of a grasp has the name of a joint.
     """
     robot = check_instance(scene, Scene, "scene").robot
     holds = resolve_holds(scene.objects, make_holds(holds) if isinstance(holds, Mapping) else holds)

@@ -40,12 +40,6 @@ def build_phase_geometries(
 ) -> list[PhaseGeometry]:
     """Return the geometry of each phase of a task, with the pairs that can collide.
 
-    Args:
-        scene: Robot, objects and obstacles.
-        chain: Virtual kinematic chain.
-        task: Phases of the task.
-        options: Options; the clearances.
-
     Raises:
         InputError: In some phase there is no pair that can collide.
     """

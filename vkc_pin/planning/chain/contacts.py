@@ -46,8 +46,7 @@ class Contacts:
     Attributes:
         waypoint: Row of the configuration, shape (C,).
         pair: Geometry indices, shape (C, 2).
-        distance: Signed distance, shape (C,) [m].
-        margin: Required clearance, shape (C,) [m].
+        distance, margin: Signed distance and required clearance, shape (C,) [m].
         normal: Unit normal from the first to the second in the world, shape (C, 3).
         first, second: Witness points in the world, shape (C, 3) [m].
     """
@@ -280,13 +279,7 @@ class ContactModel:
         return np.asarray(np.einsum("ci,cij->cj", contacts.normal, second - first))
 
     def compute_normals(self, z: Floats, waypoints: Ints, pairs: Ints) -> Floats:
-        """Return the normal, from first to second, of one pair per configuration, shape (B, 3).
-
-        Args:
-            z: Configurations, shape (B, n).
-            waypoints: Waypoint whose phase each configuration belongs to, shape (B,).
-            pairs: Geometries of these phases, shape (B, 2).
-        """
+        """Return the normal, from first to second, of one pair per configuration, shape (B, 3)."""
         found, phase_of = np.empty((len(z), 3)), self.find_phases(waypoints)
         for number in set(phase_of.tolist()):
             members = np.flatnonzero(phase_of == number)
@@ -299,8 +292,8 @@ class ContactModel:
     def compute_planes(self, z: Floats, contacts: Contacts, *, slots: int) -> tuple[Floats, Floats]:
         """Return the witness planes of the nearest contacts, C·vec(M(z)) − R ≥ 0.
 
-        A plane states that its contact keeps the margin; M are the placements of all joints (see
-        `cpin`). Unused slots have C = 0, R = −1.
+        A plane states that its contact keeps the margin; M are the placements of all joints. Unused
+        slots have C = 0, R = −1.
 
         Args:
             z: Configurations, shape (W, n).
@@ -308,7 +301,7 @@ class ContactModel:
             slots: Planes per configuration; further contacts are ignored.
 
         Returns:
-            Coefficients C, shape (W, slots, 12·joints), and offsets R, shape (W, slots).
+            C, shape (W, slots, 12·joints), and R, shape (W, slots).
         """
         joints = self.chain.model.njoints - 1
         # for each joint the columns of R, then t

@@ -41,20 +41,11 @@ def find_reduced_margins(
 ) -> ReducedMargins:
     """Return pair → (first waypoint, last waypoint, margin [m]) of temporarily reduced margins.
 
-    A hand keeps the attachment's clearance from the object that it grasps or releases. A free
-    object rests on something where it is lifted and where it is placed, and possibly in the hand at
-    the start, with the objects it supports. A frame that touches a target may come close to the
-    surface around the target. In these cases the margin is half the distance at the contact. A
-    penetration of a grasped object in the initial scene is allowed at the start. See
+    A hand keeps the attachment's clearance from what it grasps or releases. A free object is close
+    to its support where it is lifted and placed, and so are the objects it supports; a frame that
+    touches a target is close to the surface there. The margin then is half the distance at the
+    contact. An initial penetration of a grasped object is allowed at the start. See
     `world.scene.contact_rules`.
-
-    Args:
-        scene: Robot, objects and obstacles.
-        chain: Virtual kinematic chain.
-        task: Phases of the task.
-        number: Number of the phase.
-        part: Geometry and pairs of the phase.
-        options: Options; waypoint spacing and clearances.
     """
     phase, before = task.phases[number], task.phases[number - 1] if number else None
     first = sum(earlier.segments for earlier in task.phases[:number])

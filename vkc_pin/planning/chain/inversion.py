@@ -23,16 +23,15 @@ def invert(
     """Re-root an object at a link, whose frame becomes the universe frame.
 
     With placement P and motion J(q) of a joint, parent → child is P·J(q), so child → parent is
-    J(q)⁻¹·P⁻¹. For revolute and prismatic joints J(q)⁻¹ is the same joint with a negated axis. A
-    constant rotation R then aligns the axis with z, J(q)⁻¹ = R·J_z(q)·R⁻¹, and is absorbed into the
-    adjacent placements. All joints of the result are z-aligned Pinocchio joints, whose symbolic
-    expressions are the shortest.
+    J(q)⁻¹·P⁻¹, where J(q)⁻¹ is the same joint with a negated axis. A constant rotation aligns it
+    with z and is absorbed into the adjacent placements; z-aligned joints have the shortest
+    expressions.
 
     Args:
         obj: The object.
         link: The new root link.
-        state: Joint positions, shape (n,), [rad] or [m], at which joints that are not on the path
-            from `link` to the base link are locked.
+        state: Joint positions, shape (n,), at which joints off the path to the base link are
+            locked.
 
     Returns:
         Joints on the path from the link to the base link, with their names and limits, and a body

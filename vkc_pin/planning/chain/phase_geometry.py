@@ -21,22 +21,17 @@ class PhaseGeometry:
     """Geometry and collision pairs of one phase.
 
     Attributes:
-        shapes: Geometry of the robot, of attached links, then of everything fixed in the world
-            (parent joint 0).
+        shapes: Geometry of the robot, of attached links, then of all that is fixed in the world.
         labels: Link or obstacle of each geometry, e.g. "wrist_3_link", "door.panel", "sofa".
         pairs: Geometry indices, shape (P, 2); at least the first of each pair moves.
         margins: Required clearance of each pair, shape (P,) [m].
-        joint: Parent joint of each geometry, shape (G,).
-        center, half: Bounding box of each geometry in its own frame: centre and half extents, shape
-            (G, 3) [m].
-        rotation, translation: Placement of each geometry in its joint's frame, shapes (G, 3, 3) and
-            (G, 3).
-        reduced_margins: Pair → (first waypoint, last waypoint, margin [m]): between these waypoints
-            this margin replaces the pair's own.
-        margin_regions: Joint ranges in which pairs are exempt from their margins; see
-            `world.scene.clearance_exemptions`.
-        released: Object → its geometries, for objects released at a placement that the motion
-            chooses.
+        joint: Parent joint of each geometry, shape (G,); 0: fixed in the world.
+        center, half: Bounding boxes in the geometries' frames, shape (G, 3) [m].
+        rotation, translation: Placements on the joints, shapes (G, 3, 3) and (G, 3).
+        reduced_margins: Pair → (first waypoint, last waypoint, margin [m] that applies between
+            them).
+        margin_regions: Joint ranges in which pairs are exempt from their margins.
+        released: Object → its geometries, for objects released where the motion chooses.
     """
 
     shapes: Sequence[pin.GeometryObject]

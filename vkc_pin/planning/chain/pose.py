@@ -49,9 +49,8 @@ class PoseRow:
         local: Placement of the frame on the joint.
         waypoints: Waypoints at which the goal applies, counted from 1.
         kind: "pose", "point", "upright" or "level"; see `pose`.
-        shift: (joint, vector): vector [m], fixed in the frame of another joint, that is added to
-            the frame's translation. It keeps a hand at a given distance from a grasp along its
-            approach direction, whatever the freedoms of the grasp.
+        shift: (joint, vector): vector [m] in that joint's frame that is added to the translation.
+            It keeps a hand at a distance from a grasp along its approach direction.
     """
 
     joint: int
@@ -66,14 +65,7 @@ class PoseRow:
         return len(ROW_BOUNDS[self.kind][0])
 
     def build_placement(self, placements: Any) -> tuple[Any, Any]:
-        """Return the symbolic placement of the frame, given those of all joints (see `cpin`).
-
-        Args:
-            placements: Placements of all joints, shape (12, J − 1).
-
-        Returns:
-            Rotation, shape (3, 3), and translation, shape (3, 1).
-        """
+        """Return the frame's rotation and translation, given all joint placements, (12, J − 1)."""
         column = placements[:, self.joint - 1]
         rotation = ca.reshape(column[:9], 3, 3)
         translation = rotation @ self.local.translation + column[9:]
@@ -83,15 +75,7 @@ class PoseRow:
         return rotation @ self.local.rotation, translation
 
     def compute_placements(self, rotations: Floats, translations: Floats) -> tuple[Floats, Floats]:
-        """Return numeric placements of the frame, given those of all joints.
-
-        Args:
-            rotations: Rotations of all joints, shape (B, J, 3, 3).
-            translations: Their translations, shape (B, J, 3) [m].
-
-        Returns:
-            Rotations, shape (B, 3, 3), and translations, shape (B, 3) [m].
-        """
+        """Return rotations and translations of the frame, (B, ...), given those of all joints."""
         rotation = rotations[:, self.joint]
         translation = rotation @ self.local.translation + translations[:, self.joint]
         if self.shift is not None:
@@ -106,14 +90,13 @@ _GENERIC_VECTOR = ca.DM([0.3, 0.55, 0.78])  # not perpendicular to any axis that
 
 
 def build_pose_residual(kind: str, rotation: Any, translation: Any, target: Any) -> Any:
-    """Return the residual (p − p*, 2 sin(θ/2)·a) of a placement to `target` = (R*, p*).
+    """Return the residual (p − p*, 2 sin(θ/2)·a) of a placement to `target` = (R*, p*), (12, 1).
 
-    The target has shape (12, 1), with R* column by column. For a "pose" the residual has shape (6,
-    1); θ and a are angle and axis of E = R*ᵀR. Unlike ½ vee(E − Eᵀ), which vanishes at θ = π too,
-    it increases up to π, where the sign of the axis is ambiguous. Within 1e-3 of π it is computed
-    from E + I = 2aaᵀ instead, with a gradient that leads away from π. For a "point" the residual is
-    p − p*, shape (3, 1). For "upright", shape (5, 1), θ is the angle between the two verticals, and
-    a has two components; "level", shape (2, 1), has only these.
+    For a "pose", shape (6, 1), θ and a are angle and axis of E = R*ᵀR. Unlike ½ vee(E − Eᵀ), which
+    vanishes at θ = π too, it increases up to π; within 1e-3 of π, where the axis is ambiguous, it
+    is computed from E + I = 2aaᵀ, with a gradient that leads away. A "point" has only p − p*; for
+    "upright", shape (5, 1), θ is the angle between the verticals; "level", (2, 1), has only this
+    part.
     """
     offset = translation - target[9:]
     if kind == "point":
@@ -145,11 +128,9 @@ def build_pose_rows(kind: str, rotation: Any, translation: Any, target: Any) -> 
     """Return constraint rows that lie within `ROW_BOUNDS` if and only if the goal holds.
 
     A "pose" gives (p − p*, ½ vee(E − Eᵀ), trace E) with E = R*ᵀR, shape (7, 1); the trace excludes
-    half turns, where the antisymmetric part vanishes too. "level" gives the components of the
-    vertical across the target's vertical and along it, shape (3, 1); the last one excludes the
-    upside-down orientation. "upright" gives p − p* and these, shape (6, 1). The rows are linear in
-    (R, p) and therefore add nothing to the second derivatives of the kinematics, as
-    `build_pose_residual` would.
+    half turns. "level" gives the vertical across the target's and along it, shape (3, 1); "upright"
+    p − p* and these. The rows are linear in (R, p) and add nothing to the kinematics' second
+    derivatives.
     """
     offset = translation - target[9:]
     if kind == "point":
@@ -173,12 +154,10 @@ POSE_OFFSET_SIZE = 7
 def compute_pose_offsets(
     kind: str, rotations: Floats, translations: Floats, target: pin.SE3
 ) -> Floats:
-    """Return the offsets of frames from their target, shape (B, 7).
+    """Return the offsets of frames from their target, shape (B, 7): p − p*, axis a and angle θ.
 
-    An offset consists of p − p* [m], and axis a and angle θ [rad] of exp(θa) = R*ᵀR. For "upright"
-    and "level" the rotation is the shortest one that aligns the verticals; for "point" there is
-    none, and for "level" there is no translation; see `relax_target`. Unlike `build_pose_residual`,
-    offsets are accurate near half turns, too.
+    exp(θa) = R*ᵀR; for "upright" and "level" it is the shortest rotation that aligns the verticals.
+    A "point" has none, and "level" no translation. Offsets are accurate near half turns, too.
 
     Args:
         kind: Kind of the goal.
@@ -220,9 +199,8 @@ def compute_pose_offsets(
 def relax_target(target: Any, pose_offset: Any, relaxation: Any) -> Any:
     """Return a target moved towards a frame: R*·exp(e·θ·a) and p* + e·(p − p*), shape (12, 1).
 
-    With relaxation e = 1 it is where the frame was when `pose_offset`, shape (7, 1), was computed,
-    see `compute_pose_offsets`; with e = 0 it is the target itself. Orientations in between follow a
-    geodesic, so that half turns need no special treatment.
+    With relaxation e = 1 it is where the frame was at `compute_pose_offsets`, with e = 0 the
+    target.
     """
     skew = ca.skew(pose_offset[3:6])
     turn = (

@@ -96,19 +96,15 @@ def build_upstream(name: str, model: pin.Model, *arguments: Any) -> casadi.Funct
         frame, reference = arguments
         cpin.computeJointJacobians(symbolic, data, q)
         cpin.updateFramePlacements(symbolic, data)
-        output, result = (
-            cpin.getFrameJacobian(symbolic, data, frame, pin.ReferenceFrame.values[reference]),
-            "J",
-        )
+        axes = pin.ReferenceFrame.values[reference]
+        output, result = cpin.getFrameJacobian(symbolic, data, frame, axes), "J"
     else:
         cpin.forwardKinematics(symbolic, data, q)
         cpin.updateFramePlacements(symbolic, data)
-        joints = name == "joint_placements"
-        placements = (
-            [data.oMi[i] for i in range(1, model.njoints)]
-            if joints
-            else [data.oMf[i] for i in arguments[0]]
-        )
+        if name == "joint_placements":
+            placements = [data.oMi[i] for i in range(1, model.njoints)]
+        else:
+            placements = [data.oMf[i] for i in arguments[0]]
         columns = [
             casadi.vertcat(casadi.vec(casadi.SX(m.rotation)), casadi.SX(m.translation))
             for m in placements

@@ -17,9 +17,7 @@ _MAX_BUFFERS = 16  # batch sizes with cached buffers
 _BATCH_MULTIPLE = 16  # batch sizes are rounded up to multiples of this
 # Executed instructions (20 ms) after which machine code of a function is requested.
 _MIN_INSTRUCTIONS_TO_COMPILE = 2_000_000
-_BYTES_PER_INSTRUCTION = (
-    70  # Memory per instruction of a function [bytes], measured on waypoint functions.
-)
+_BYTES_PER_INSTRUCTION = 70  # measured on waypoint functions
 
 
 class BatchFunction:
@@ -32,11 +30,8 @@ class BatchFunction:
     def __init__(self, function: ca.Function) -> None:
         self.function = function
         self._buffers: OrderedDict[int, tuple[Any, Any, list[Floats], list[Floats]]] = OrderedDict()
-        self._code, self._instructions, self._executed_instructions = (
-            MachineCode(function),
-            function.n_instructions(),
-            0,
-        )
+        self._code, self._executed_instructions = MachineCode(function), 0
+        self._instructions = function.n_instructions()
 
     def __call__(self, *inputs: Floats) -> list[Floats]:
         """Return one array per output, shape (B, numel), each row in column-major order.
@@ -47,10 +42,8 @@ class BatchFunction:
         """
         rows = len(inputs[0])
         self._executed_instructions += rows * self._instructions
-        if (
-            self._executed_instructions > _MIN_INSTRUCTIONS_TO_COMPILE
-            and not self._code.is_compiled
-        ):
+        is_frequent = self._executed_instructions > _MIN_INSTRUCTIONS_TO_COMPILE
+        if is_frequent and not self._code.is_compiled:
             self._executed_instructions = 0
             if self._code.try_load():
                 self._buffers.clear()
@@ -65,14 +58,10 @@ class BatchFunction:
         return [result[:rows].copy() for result in results]
 
     def _allocate(self, batch_size: int) -> None:
-        mapped = self._code.functions[0].map(batch_size)
-        buffer, trigger = mapped.buffer()
-        arguments = [
-            np.zeros((batch_size, self.function.nnz_in(i))) for i in range(self.function.n_in())
-        ]
-        results = [
-            np.zeros((batch_size, self.function.nnz_out(i))) for i in range(self.function.n_out())
-        ]
+        buffer, trigger = self._code.functions[0].map(batch_size).buffer()
+        f = self.function
+        arguments = [np.zeros((batch_size, f.nnz_in(i))) for i in range(f.n_in())]
+        results = [np.zeros((batch_size, f.nnz_out(i))) for i in range(f.n_out())]
         for index, argument in enumerate(arguments):
             buffer.set_arg(index, argument.data)
         for index, result in enumerate(results):

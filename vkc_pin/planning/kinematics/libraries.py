@@ -10,6 +10,7 @@ import shutil
 import stat
 import time
 from pathlib import Path
+from typing import BinaryIO
 
 from vkc_pin.utils.disk_cache import (
     CACHE_VARIABLE,
@@ -24,10 +25,8 @@ __all__ = ["BUILD", "CACHE_VARIABLE", "Libraries"]
 BUILD = ".build-"
 """Start of the names of folders in which libraries are compiled."""
 
-_MAX_FILES, _MAX_BYTES = (
-    256,
-    512 * 2**20,
-)  # Maximum number and size of libraries and records; a waypoint's functions take 0.1 MB.
+# maximum number and size of libraries and records; a waypoint's functions take 0.1 MB
+_MAX_FILES, _MAX_BYTES = 256, 512 * 2**20
 _MAX_JOBS = 64  # maximum number of pending jobs
 # [s] after which a failed compilation is retried and the files of dead processes are removed
 _RETRY_DELAY = 86400.0
@@ -43,12 +42,8 @@ _DIGEST_SIZE = hashlib.sha256().digest_size  # bytes appended to a library; load
 class Libraries:
     """A folder with libraries `KEY.so`, requests `KEY.job` and failure marks `KEY.failed`.
 
-    A library ends in a digest of its contents, so that a truncated one, which could crash the
-    process, is never loaded. Files are written atomically. Any number of processes may use the
-    folder at once. Operations that fail raise OSError.
-
-    Attributes:
-        path: The folder.
+    A library ends in a digest, so that a truncated one, which could crash the process, is never
+    loaded. Any number of processes may use the folder at once. Operations that fail raise OSError.
     """
 
     def __init__(self, path: Path) -> None:
@@ -71,9 +66,7 @@ class Libraries:
         """Return the path of a valid library, or None; a damaged one is removed."""
         path = self.path / f"{key}.so"
         try:
-            with os.fdopen(
-                os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb"
-            ) as stream:
+            with _open(path) as stream:
                 status = os.fstat(stream.fileno())
                 if not stat.S_ISREG(status.st_mode) or not is_private(status):
                     return None
@@ -105,7 +98,7 @@ class Libraries:
     def read_job(self, key: str) -> bytes:
         """Return the contents of a pending job."""
         path = self.path / f"{key}.job"
-        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as stream:
+        with _open(path) as stream:
             if not is_private(os.fstat(stream.fileno())):
                 raise PermissionError(f"others may have written {path}")
             return stream.read()
@@ -160,9 +153,8 @@ class Libraries:
 
         A process that inherits the handle holds the lock too, as long as either has it open.
         """
-        handle = os.open(
-            self.path / "lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600
-        )
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+        handle = os.open(self.path / "lock", flags, 0o600)
         try:
             if self.acquire(handle):
                 return handle
@@ -190,3 +182,8 @@ class Libraries:
 
     def _write(self, name: str, data: bytes) -> None:
         write_private_file(self.path / name, data)
+
+
+def _open(path: Path) -> BinaryIO:
+    """Open a file, but no symbolic link, for reading."""
+    return os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb")

@@ -31,7 +31,7 @@ __all__ = ["MachineCode", "compile_jobs", "wait"]
 # No fused multiply-add, the interpreter's own sine and cosine, and no instructions that another
 # machine with the same home may lack: results are equal bit for bit. -O2 took 1.4 times as long to
 # compile without making the code faster.
-_FLAGS = (
+_FLAGS = [
     "-O1",
     "-ffp-contract=off",
     "-fno-builtin-sin",
@@ -39,7 +39,7 @@ _FLAGS = (
     "-w",
     "-fPIC",
     "-shared",
-)
+]
 _COMPILER_TIMEOUT = 600.0  # [s], timeout of the compiler, which takes 1 to 2 s on an idle processor
 # Samples at which a library is compared with the interpreter before it is stored. Each time it is
 # loaded, one sample is compared (1 ms).
@@ -59,12 +59,8 @@ class MachineCode:
     """Functions that are compiled together; not thread-safe."""
 
     def __init__(self, *functions: ca.Function) -> None:
-        self._interpreted, self._functions, self._key, self._is_final = (
-            functions,
-            functions,
-            "",
-            False,
-        )
+        self._interpreted = self._functions = functions
+        self._key, self._is_final = "", False
 
     @property
     def functions(self) -> tuple[ca.Function, ...]:
@@ -83,26 +79,21 @@ class MachineCode:
         """
         if self._is_final:
             return self.is_compiled
-        with contextlib.suppress(
-            OSError, RuntimeError, ValueError
-        ):  # RuntimeError: from CasADi, or no thread can be started
-            if (folder := Libraries.open_default()) is None or (
-                compiler := _find_compiler()
-            ) is None:
+        # RuntimeError: from CasADi, or no thread can be started
+        with contextlib.suppress(OSError, RuntimeError, ValueError):
+            folder, compiler = Libraries.open_default(), _find_compiler()
+            if folder is None or compiler is None:
                 return False
             if not self._key:
                 texts = [function.serialize() for function in self._interpreted]
                 self._key = _compute_key(compiler, texts)
-                if not folder.exists(self._key) and folder.request(
-                    self._key, json.dumps([compiler, texts]).encode()
-                ):
+                job = json.dumps([compiler, texts]).encode()
+                if not folder.exists(self._key) and folder.request(self._key, job):
                     _start_worker_if_idle(folder)
             if folder.exists(self._key):
                 self._is_final = True  # loading is attempted only once
-                if (path := folder.find(self._key)) is not None and (
-                    loaded := _load_library(path, self._interpreted)
-                ):
-                    self._functions = loaded
+                if (path := folder.find(self._key)) is not None:
+                    self._functions = _load_library(path, self._interpreted) or self._functions
         return self.is_compiled
 
 
@@ -125,14 +116,9 @@ def wait(timeout: float = 600.0) -> bool:
         while jobs := folder.list_jobs():
             remaining = deadline - time.monotonic()
             process = _start_worker_if_idle(folder)
-            if (
-                process is not None
-                and process.wait(max(remaining, 0.0))
-                and not any(map(folder.has_failed, jobs))
-            ):
-                # the worker does not start; if it dies of one library, the next worker continues
-                # with the others
-                return False
+            has_died = process is not None and process.wait(max(remaining, 0.0))
+            if has_died and not any(map(folder.has_failed, jobs)):
+                return False  # it cannot start; if one library kills it, the next one continues
             if remaining < 0.0 or not _has_python():
                 return False
             time.sleep(0.02)  # another process may be compiling
@@ -141,12 +127,7 @@ def wait(timeout: float = 600.0) -> bool:
 
 
 def compile_jobs(path: str, lock: int) -> None:
-    """Compile the jobs of a folder until none is left; the main function of a background process.
-
-    Args:
-        path: The folder.
-        lock: Handle of its lock, which this process holds; see `Libraries.lock`.
-    """
+    """Compile the jobs of a folder until none is left; `lock` is that of `Libraries.lock`."""
     folder, finished = Libraries(Path(path)), set[str]()
     while keys := set(folder.list_jobs()) - finished:
         for key in sorted(keys):
@@ -198,11 +179,8 @@ def _load_library(
     try:
         with _LOAD_LOCK:
             loaded = tuple(ca.external(function.name(), str(path)) for function in functions)
-        return (
-            loaded
-            if all(_is_identical(*pair, samples) for pair in zip(functions, loaded, strict=True))
-            else ()
-        )
+        pairs = zip(functions, loaded, strict=True)
+        return loaded if all(_is_identical(*pair, samples) for pair in pairs) else ()
     except RuntimeError:  # not a library for this machine, or different functions
         return ()
 
@@ -244,13 +222,8 @@ def _compute_key(compiler: tuple[str, ...], texts: list[str]) -> str:
     with contextlib.suppress(OSError, ValueError):  # no GNU C library
         libc = os.confstr("CS_GNU_LIBC_VERSION")
     machine = (platform.system(), platform.machine(), libc)
-    toolchain = (
-        *compiler,
-        str(Path(compiler[0]).resolve()),
-        status.st_size,
-        status.st_mtime_ns,
-        *_FLAGS,
-    )
+    resolved = str(Path(compiler[0]).resolve())
+    toolchain = (*compiler, resolved, status.st_size, status.st_mtime_ns, *_FLAGS)
     digest = hashlib.sha256(json.dumps([toolchain, ca.CasadiMeta.version(), machine]).encode())
     for text in texts:
         digest.update(hashlib.sha256(text.encode()).digest())
@@ -266,16 +239,8 @@ def _start_worker_if_idle(folder: Libraries) -> subprocess.Popen[bytes] | None:
         return None
     try:  # the process inherits the lock
         nice = _NICE_COMMAND if shutil.which(_NICE_COMMAND[0]) else ()
-        command = [
-            *nice,
-            sys.executable,
-            "-P",
-            "-c",
-            _WORKER_SCRIPT,
-            str(folder.path),
-            str(lock),
-            *map(os.path.abspath, sys.path),
-        ]
+        arguments = (str(folder.path), str(lock), *map(os.path.abspath, sys.path))
+        command = [*nice, sys.executable, "-P", "-c", _WORKER_SCRIPT, *arguments]
         process = _start_process(command, folder.path, lock)
     finally:
         os.close(lock)
@@ -289,11 +254,8 @@ def _has_python() -> bool:
 
 
 def _start_process(command: list[str], folder: Path, *handles: int) -> subprocess.Popen[bytes]:
-    """Start a silent process in a process group of its own, so that Ctrl-C does not reach it.
-
-    It does not get a session of its own: Linux first divides processor time among sessions, so that
-    low priority would have no effect in another one.
-    """
+    """Start a silent process in a process group of its own, so that Ctrl-C does not reach it."""
+    # Not in a session of its own: there low priority would have no effect on Linux.
     null = subprocess.DEVNULL
     return subprocess.Popen(
         command, cwd=folder, process_group=0, stdin=null, stdout=null, stderr=null, pass_fds=handles

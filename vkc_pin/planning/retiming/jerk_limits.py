@@ -15,29 +15,24 @@ if TYPE_CHECKING:
 
 __all__ = ["limit_jerk"]
 
-_SPAN_FACTORS = np.geomspace(
-    0.25, 4.0, 9
-)  # Averaging intervals, as multiples of the time in which an acceleration may build up.
-_MIN_CUBICS_PER_STEP = 4  # minimum number of cubics per step
-_MAX_CUBIC_DURATION = 0.5  # maximum duration of a cubic, relative to the averaging interval
-_SAMPLES_PER_CUBIC = 8  # samples per cubic to bracket the time of a waypoint
-_NEWTON_ITERATIONS = 6  # iterations of Newton's method
+# averaging intervals, as multiples of the time in which an acceleration may build up
+_SPAN_FACTORS = np.geomspace(0.25, 4.0, 9)
+_MIN_CUBICS_PER_STEP = 4
+_MAX_CUBIC_DURATION = 0.5  # relative to the averaging interval
+_SAMPLES_PER_CUBIC = 8  # to bracket the time of a waypoint
+_NEWTON_ITERATIONS = 6
 
 
 def limit_jerk(path: CubicHermiteSpline, pace: Curve, steps: int, limits: Limits) -> Curve:
     """Return a curve along a path with limited jerk, and zero acceleration at both ends.
 
-    The progress s(t) along the path is replaced by its moving average, which is smoother by one
-    order and moves neither backwards nor faster. Twice differentiable cubics, each of constant
-    jerk, interpolate the path at the resulting times; at the second point and the last but one they
-    are free, so that the acceleration can vanish at both ends. They are then slowed down until all
-    limits are kept. Several averaging intervals are tried, and the fastest result is returned.
+    The progress along the path is replaced by its moving average, which is smoother by one order.
+    Twice differentiable cubics interpolate the path; they are slowed down until all limits are
+    kept. The fastest result of several averaging intervals is returned.
 
     Args:
-        path: The path, with knots at the ends of each step and the same number of knots in every
-            step.
-        pace: Progress along the path over time, one coordinate, from rest to rest, starting with 0
-            at 0 s.
+        path: The path, with the same number of knots in every step.
+        pace: Progress along the path over time, one coordinate, from rest to rest, from 0 at 0 s.
         steps: Number of steps.
         limits: Limits of the path's coordinates.
     """
@@ -55,11 +50,7 @@ def _average_pace(path: CubicHermiteSpline, pace: Curve, steps: int, span: float
     from scipy.interpolate import make_interp_spline
 
     progress = Hermite(pace.times, pace.positions[:, 0], pace.rates[:, 0])
-    area, last, length = (
-        progress.antiderivative(),
-        float(pace.times[-1]),
-        float(pace.positions[-1, 0]),
-    )
+    area, last, length = progress.antiderivative(), pace.times[-1], pace.positions[-1, 0]
 
     def compute_progress(times: Floats) -> Floats:
         now, before = (
@@ -76,17 +67,12 @@ def _average_pace(path: CubicHermiteSpline, pace: Curve, steps: int, span: float
     coarse = np.linspace(0.0, last + span, _SAMPLES_PER_CUBIC * len(pace.times))
     waypoint_times = np.interp(waypoint_positions, compute_progress(coarse), coarse)
     for _ in range(_NEWTON_ITERATIONS):
-        waypoint_times[1:-1] -= np.clip(
-            (compute_progress(waypoint_times) - waypoint_positions)
-            / np.maximum(compute_speed(waypoint_times), 1e-12),
-            -span,
-            span,
-        )[1:-1]
+        gaps = compute_progress(waypoint_times) - waypoint_positions
+        steps_back = gaps / np.maximum(compute_speed(waypoint_times), 1e-12)
+        waypoint_times[1:-1] -= np.clip(steps_back, -span, span)[1:-1]
     waypoint_times[0], waypoint_times[-1] = 0.0, last + span
-    parts = max(
-        _MIN_CUBICS_PER_STEP,
-        int(np.ceil(np.diff(waypoint_times).max() / (_MAX_CUBIC_DURATION * span))),
-    )
+    parts = int(np.ceil(np.diff(waypoint_times).max() / (_MAX_CUBIC_DURATION * span)))
+    parts = max(_MIN_CUBICS_PER_STEP, parts)
     times = sample_intervals(waypoint_times, np.arange(parts) / parts, last=True)
     rows = path(np.clip(compute_progress(times), 0.0, length))
     rows[::parts] = path(waypoint_positions)

@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.models.articulated_object import ArticulatedObject
+from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.wheels import RollingLimits
@@ -35,32 +37,17 @@ class Limits(NamedTuple):
             names: Coordinate names of the robot, and "<object>.<joint>".
             jerk_time: See `Options.jerk_time`.
         """
-        robot, limits_by_name = scene.robot, dict[str, tuple[float, ...]]()
-        sources = [
-            (
-                "",
-                robot.coordinates.names,
-                (robot.lower, robot.upper, robot.velocity, robot.acceleration),
-            )
-        ]
-        for owner, placed in scene.objects.items():
-            item = placed.object
-            sources.append(
-                (
-                    f"{owner}.",
-                    item.coordinates.names,
-                    (item.lower, item.upper, item.velocity, item.acceleration),
-                )
-            )
-        for prefix, coordinate_names, values in sources:
-            limits_by_name |= {
-                prefix + name: tuple(row)
-                for name, row in zip(coordinate_names, np.transpose(values).tolist(), strict=True)
-            }
-        rows = np.array(
-            [limits_by_name.get(name, (-np.inf, np.inf, np.inf, np.inf)) for name in names]
-        )
-        lower, upper, velocity, acceleration = rows.T
+        limits_by_name = dict[str, tuple[float, ...]]()
+        owners: list[tuple[str, Robot | ArticulatedObject]] = [("", scene.robot)]
+        owners += [(f"{name}.", placed.object) for name, placed in scene.objects.items()]
+        for prefix, owner in owners:
+            sides = (owner.lower, owner.upper, owner.velocity, owner.acceleration)
+            rows = map(tuple, np.transpose(sides).tolist())
+            names_of_owner = (prefix + name for name in owner.coordinates.names)
+            limits_by_name |= zip(names_of_owner, rows, strict=True)
+        unlimited = (-np.inf, np.inf, np.inf, np.inf)
+        rows_of_names = np.array([limits_by_name.get(name, unlimited) for name in names])
+        lower, upper, velocity, acceleration = rows_of_names.T
         jerk = acceleration / jerk_time if jerk_time > 0.0 else np.full(len(names), np.inf)
         return cls(lower, upper, velocity, acceleration, jerk)
 

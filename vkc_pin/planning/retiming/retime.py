@@ -36,14 +36,11 @@ _WAIT_DURATION = 1e-3  # [s], duration of a step without motion, unless a hand o
 _ROUNDING = 1e-9  # relative
 # jump in acceleration that is allowed with jerk limits, relative to the acceleration limit
 _JUMP_RATIO = 1e-4
-_TORQUE_ITERATIONS, _TORQUE_TOLERANCE = (
-    4,
-    0.02,
-)  # Iterations of the search for speeds within torque limits, and relative change at convergence.
-# [m/s], lateral velocity below which a wheeled base needs no more knots, a fifth of what counts as
-# slip
+# search for speeds within torque limits: iterations, and relative change at convergence
+_TORQUE_ITERATIONS, _TORQUE_TOLERANCE = 4, 0.02
+# [m/s], lateral velocity of a wheeled base that needs no more knots, a fifth of what counts as slip
 _MAX_SLIP = 2e-4
-_MAX_REFINEMENT = 8  # maximum refinement of the knots
+_MAX_REFINEMENT = 8  # of the knots
 
 
 def retime_trajectory(
@@ -51,31 +48,25 @@ def retime_trajectory(
 ) -> Trajectory:
     """Return a smooth trajectory through the same waypoints, as fast as its limits allow.
 
-    It starts and ends at rest, and rests during steps without motion; if a phase begins with such a
-    step, as when a hand opens or closes, the step keeps its duration. It also stops where a joint
-    of an object starts or ceases to move, since the hand changes direction there. Between two stops
-    it follows one path, see `fit_path`, at the speeds of `compute_speeds`; if these cannot be
-    computed, it moves straight from waypoint to waypoint and stops at each. A wheeled base follows
-    `fit_rolling_paths`. The resulting cubics in time are slowed down until they keep the velocity
-    and acceleration limits exactly, and the torque limits if possible. With jerk limits, they are
-    computed by `limit_jerk`.
+    It starts and ends at rest, rests during steps without motion, and stops where a joint of an
+    object starts or ceases to move, since the hand changes direction there. A step without motion
+    at the begin of a phase, as when a hand opens, keeps its duration. Between stops it follows
+    `fit_path` at the speeds of `compute_speeds`, or else straight lines with stops at all
+    waypoints; a wheeled base follows `fit_rolling_paths`. The resulting cubics are slowed down
+    until they keep the velocity and acceleration limits exactly, and the torque limits if possible.
+    `limit_jerk` limits their jerk.
 
     Args:
         scene: Robot and objects.
         trajectory: Trajectory whose waypoints are kept; its times matter only for waits.
-        parts: Number of parts into which each straight line between waypoints is divided, shape (T
-            − 1,). The path passes through the ends of all parts, so that more parts keep it closer
-            to the straight line. Defaults to one.
+        parts: Number of parts of each straight line between waypoints, shape (T − 1,). The path
+            passes through the ends of all parts. Defaults to one.
         jerk_time: See `Options.jerk_time`.
     """
-    limits, parts = (
-        Limits.from_scene(scene, trajectory.names, jerk_time),
-        np.ones(len(trajectory.times) - 1, int) if parts is None else parts,
-    )
+    limits = Limits.from_scene(scene, trajectory.names, jerk_time)
+    parts = np.ones(len(trajectory.times) - 1, int) if parts is None else parts
     rolling = make_rolling_limits(scene.robot)
-    places = np.concatenate(
-        [[0], np.cumsum(parts)]
-    )  # indices of the waypoints among all points of the path
+    places = np.concatenate([[0], np.cumsum(parts)])  # indices of the waypoints among all points
     positions = _subdivide(trajectory.positions, places, rolling)
     scale = 1.0 / np.where(np.isfinite(limits.velocity), limits.velocity, 1.0)
     is_still = np.linalg.norm(np.diff(positions, axis=0) * scale, axis=1) <= _MIN_STEP_DURATION
@@ -84,22 +75,17 @@ def retime_trajectory(
         for phase in trajectory.phases
     }
     pieces, ends, torques = list[Curve](), [0], Torques(scene, trajectory)
+    moving_joints = np.abs(np.diff(positions[:, trajectory.robot_size :], axis=0)) > _MIN_JOINT_STEP
     phases = torques.phases_of(np.searchsorted(places, np.arange(places[-1]), side="right") - 1)
-    for steps in _split_into_runs(
-        is_still, np.abs(np.diff(positions[:, trajectory.robot_size :], axis=0)) > _MIN_JOINT_STEP
-    ):
+    for steps in _split_into_runs(is_still, moving_joints):
         points = positions[steps[0] : steps[-1] + 2]
         if is_still[steps[0]]:
             least = np.array([wait_durations.get(step, _WAIT_DURATION) for step in steps])
             curves = [(_make_straight_curve(points, limits, least), np.arange(1, len(points)))]
         else:
-            curves = _follow_waypoints(
-                points,
-                limits,
-                scale,
-                rolling,
-                TorqueBounds(torques, phases[steps]) if torques.torque_limits.is_known else None,
-            )
+            is_known = torques.torque_limits.is_known
+            torque_bounds = TorqueBounds(torques, phases[steps]) if is_known else None
+            curves = _follow_waypoints(points, limits, scale, rolling, torque_bounds)
         for piece, at in curves:
             ends += (ends[-1] + at).tolist()
             pieces.append(piece)
@@ -109,10 +95,9 @@ def retime_trajectory(
 
 def _subdivide(positions: Floats, places: Ints, rolling: RollingLimits) -> Floats:
     """Return waypoints, shape (T, n), and points on the lines (wheeled bases: arcs) between them."""
-    at = np.interp(np.arange(places[-1] + 1), places, np.arange(len(places)))
-    points = np.stack(
-        [np.interp(np.arange(places[-1] + 1), places, column) for column in positions.T], axis=-1
-    )
+    every = np.arange(places[-1] + 1)
+    at = np.interp(every, places, np.arange(len(places)))
+    points = np.stack([np.interp(every, places, column) for column in positions.T], axis=-1)
     if rolling.is_omnidirectional or len(points) == len(positions):
         return points
     step = np.minimum(at.astype(int), len(positions) - 2)
@@ -146,26 +131,14 @@ def _follow_waypoints(
     if result is not None:
         return [result]
     if not limits.has_unlimited_jerk:
-        steps = [
-            _follow_step(fit_path(step, scale, bounds), step, limits)
-            for step in map(np.array, itertools.pairwise(points))
-        ]
+        steps = map(np.array, itertools.pairwise(points))
         return [
-            (
-                curve
-                if torque_bounds is None
-                else torque_bounds.select_steps(k, 1).slow_down(curve),
-                at,
-            )
-            for k, (curve, at) in enumerate(steps)
+            _follow_step(fit_path(step, scale, bounds), step, limits, torque_bounds, k)
+            for k, step in enumerate(steps)
         ]
     straight = _make_straight_curve(points, limits, np.zeros(len(points) - 1))
-    return [
-        (
-            straight if torque_bounds is None else torque_bounds.slow_down(straight),
-            np.arange(1, len(points)),
-        )
-    ]
+    straight = straight if torque_bounds is None else torque_bounds.slow_down(straight)
+    return [(straight, np.arange(1, len(points)))]
 
 
 def _follow_rolling_paths(
@@ -192,13 +165,7 @@ def _follow_rolling_paths(
                 ((path, step),) = fit_rolling_paths(
                     waypoints[k : k + 2], scale, bounds, rolling, _MAX_REFINEMENT
                 )
-                curve, at = _follow_step(path, step, limits)
-                yield (
-                    curve
-                    if bounds_of_path is None
-                    else bounds_of_path.select_steps(k, 1).slow_down(curve),
-                    at,
-                )
+                yield _follow_step(path, step, limits, bounds_of_path, k)
         elif refinement < _MAX_REFINEMENT and compute_slip(result[0]) > _MAX_SLIP:
             yield from _follow_rolling_paths(
                 waypoints, limits, scale, rolling, bounds_of_path, 2 * refinement
@@ -210,11 +177,9 @@ def _follow_rolling_paths(
 def _retime_path(
     path: CubicHermiteSpline, points: Floats, limits: Limits, torque_bounds: TorqueBounds | None
 ) -> tuple[Curve, Ints] | None:
-    """Return a curve along a path through waypoints, shape (m, n), and the waypoints' knots.
+    """Return a curve along a path through waypoints, (m, n), and the waypoints' knots, or None.
 
-    Path and limits may have additional columns that are not part of the trajectory. Torques are
-    checked only for the fastest curve within velocity and acceleration limits, since few exceed
-    them. Returns None if the speeds cannot be computed.
+    Torques are checked only for the fastest curve within the other limits, since few exceed them.
     """
     knots = (len(path.x) - 1) // (len(points) - 1)  # a step
     parts = knots * max(_MIN_PIECES // knots, 1)
@@ -229,10 +194,7 @@ def _retime_path(
         or np.abs(torque_bounds.decompose(curve)[0]).max() >= 1.0
     ):
         return curve, waypoints  # torques are kept, or exceeded even at rest
-    for _ in range(
-        _TORQUE_ITERATIONS
-        # viscous torques are linearised around the previous speeds
-    ):
+    for _ in range(_TORQUE_ITERATIONS):  # viscous torques are linearised around the last speeds
         linear = partial(torque_bounds.linearize, path, places, speeds)
         slower = compute_speeds(path, places, limits.velocity, limits.acceleration, linear)
         if slower is None:
@@ -267,16 +229,22 @@ def _follow_at_pace(
     return Curve(curve.times, positions, curve.rates[:, :size]), np.arange(1, len(points)) * parts
 
 
-def _follow_step(path: CubicHermiteSpline, points: Floats, limits: Limits) -> tuple[Curve, Ints]:
-    """Return the curve from one waypoint to the next, shape (2, n), with progress 3s² − 2s³."""
+def _follow_step(
+    path: CubicHermiteSpline,
+    points: Floats,
+    limits: Limits,
+    torque_bounds: TorqueBounds | None,
+    number: int,
+) -> tuple[Curve, Ints]:
+    """Return the curve of step `number` between waypoints, shape (2, n), with progress 3s² − 2s³."""
     length, share = path.x[-1], np.linspace(0.0, 1.0, len(path.x))
-    places, speeds = (
-        length * (3.0 - 2.0 * share) * share**2,
-        length * 6.0 * (share - share**2) / _WAIT_DURATION,
-    )
-    return _follow_at_pace(
-        path, Curve(share * _WAIT_DURATION, places[:, None], speeds[:, None]), points, limits
-    )
+    places = length * (3.0 - 2.0 * share) * share**2
+    speeds = length * 6.0 * (share - share**2) / _WAIT_DURATION
+    pace = Curve(share * _WAIT_DURATION, places[:, None], speeds[:, None])
+    curve, at = _follow_at_pace(path, pace, points, limits)
+    if torque_bounds is not None:
+        curve = torque_bounds.select_steps(number, 1).slow_down(curve)
+    return curve, at
 
 
 def _make_straight_curve(points: Floats, limits: Limits, least: Floats) -> Curve:

@@ -18,9 +18,8 @@ __all__ = ["fit_path"]
 def fit_path(points: Floats, scale: Floats, limits: tuple[Floats, Floats]) -> CubicHermiteSpline:
     """Return a cubic spline through waypoints, parametrised by the length of the polyline.
 
-    It is twice differentiable and linear in the waypoints. Linear constraints that hold at all
-    waypoints hold along it, and others, such as a closed chain, up to their curvature. If a
-    coordinate would leave its limits between waypoints, its slopes are limited so that it stays
+    It is twice differentiable and linear in the waypoints, so that linear constraints that hold at
+    all waypoints hold along it. If a coordinate would leave its limits between waypoints, it stays
     between the values at consecutive waypoints (Hyman, Accurate monotonicity preserving cubic
     interpolation, 1983).
 
@@ -54,13 +53,6 @@ def _find_overshoots(
 ) -> Bools:
     """Return a mask of coordinates whose cubics exceed limits between two points, shape (n,)."""
     low, high = Curve(np.concatenate([[0.0], np.cumsum(lengths)]), points, slopes).compute_extrema()
-    segment_lower, segment_upper = (
-        np.minimum(points[:-1], points[1:]),
-        np.maximum(points[:-1], points[1:]),
-    )
-    return np.asarray(
-        (
-            (low < np.minimum(limits[0], segment_lower))
-            | (high > np.maximum(limits[1], segment_upper))
-        ).any(axis=0)
-    )
+    is_low = low < np.minimum(limits[0], np.minimum(points[:-1], points[1:]))
+    is_high = high > np.maximum(limits[1], np.maximum(points[:-1], points[1:]))
+    return np.asarray((is_low | is_high).any(axis=0))

@@ -44,11 +44,8 @@ class PathTorques(NamedTuple):
         around = np.maximum(speeds, 1e-3 * max(float(speeds.max()), 1e-9))[:, None]
         static = self.static + 0.5 * self.viscous * around
         scale = 1.0 / np.maximum(1.0, np.abs(self.static) * 1.01)
-        return (
-            self.inertial * scale,
-            (self.quadratic + 0.5 * self.viscous / around) * scale,
-            static * scale,
-        )
+        quadratic = self.quadratic + 0.5 * self.viscous / around
+        return self.inertial * scale, quadratic * scale, static * scale
 
 
 class TorqueBounds:
@@ -78,24 +75,16 @@ class TorqueBounds:
         accelerations: Floats,
     ) -> Floats:
         """Return the torques relative to their limits, shape (K, m)."""
-        torques = self._torques.at(
-            self._phases[pieces // (n_pieces // len(self._phases))],
-            positions,
-            velocities,
-            accelerations,
-        )
+        phases = self._phases[pieces // (n_pieces // len(self._phases))]
+        torques = self._torques.at(phases, positions, velocities, accelerations)
         return torques[:, self._limited] / self._torques.torque_limits.limits[self._limited]
 
     def linearize(
         self, path: CubicHermiteSpline, speed_positions: Floats, speeds: Floats, positions: Floats
     ) -> tuple[Floats, Floats, Floats]:
-        """Return the coefficients of `PathTorques.linearize` at some positions of a path.
+        """Return the coefficients of `PathTorques.linearize` at positions of a path, shape (K,).
 
-        Args:
-            path: The path.
-            speed_positions: Path positions with known speeds, shape (J,).
-            speeds: Approximate speeds there, shape (J,).
-            positions: Path positions of the result, shape (K,).
+        `speeds` are those at `speed_positions`, shape (J,) each.
         """
         key = positions.tobytes()
         if key not in self._rows:
@@ -110,14 +99,13 @@ class TorqueBounds:
             self._compute_ratios(pieces, n_pieces, points, w * tangents, w**2 * curvatures)
             for w in (1.0, 2.0, 3.0)
         ]
-        static, viscous = (
-            3.0 * at[0] - 3.0 * at[1] + at[2],
-            0.5 * (8.0 * at[1] - 5.0 * at[0] - 3.0 * at[2]),
+        pushed = self._compute_ratios(pieces, n_pieces, points, tangents, curvatures + tangents)
+        return PathTorques(
+            static=3.0 * at[0] - 3.0 * at[1] + at[2],
+            viscous=0.5 * (8.0 * at[1] - 5.0 * at[0] - 3.0 * at[2]),
+            quadratic=0.5 * (at[2] - 2.0 * at[1] + at[0]),
+            inertial=pushed - at[0],
         )
-        inertial = (
-            self._compute_ratios(pieces, n_pieces, points, tangents, curvatures + tangents) - at[0]
-        )
-        return PathTorques(static, viscous, 0.5 * (at[2] - 2.0 * at[1] + at[0]), inertial)
 
     def evaluate(self, curve: Curve) -> Floats:
         """Return the torque ratios at the ends and in the middle of each cubic, shape (K, m)."""
@@ -130,12 +118,8 @@ class TorqueBounds:
 
         A curve slowed down by k has the torques static + viscous / k + quadratic / k².
         """
-        at = np.array(
-            [
-                self.evaluate(Curve(curve.times * k, curve.positions, curve.rates / k))
-                for k in _SLOWDOWNS
-            ]
-        )
+        slowed = (Curve(curve.times * k, curve.positions, curve.rates / k) for k in _SLOWDOWNS)
+        at = np.array([self.evaluate(curve) for curve in slowed])
         matrix = np.array([[1.0, 1.0 / k, 1.0 / k**2] for k in _SLOWDOWNS])
         static, viscous, quadratic = np.tensordot(np.linalg.inv(matrix), at, axes=1)
         return static, viscous, quadratic

@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 __all__ = ["compute_slip", "fit_rolling_paths"]
 
-_MIN_PIECES = 3  # minimum number of pieces per step
-_MAX_TURN_PER_PIECE = 0.05  # [rad], maximum rotation within a piece
-_NEWTON_ITERATIONS = 12  # iterations of Newton's method
+_MIN_PIECES = 3  # per step
+_MAX_TURN_PER_PIECE = 0.05  # [rad]
+_NEWTON_ITERATIONS = 12
 # Position error that costs as much as a unit bump of the distance; it keeps rounding errors from
 # causing bumps where the base stands still.
 _CLOSURE_SCALE = 1e-3
 _HEADING_LEVER = 0.5  # [m/rad], ratio of the costs of heading and distance bumps
-_SAMPLES_PER_CUBIC = 8  # samples per cubic of a curve
+_SAMPLES_PER_CUBIC = 8
 _MIN_DISTANCE = 1e-9  # [m], shorter distances count as standing still
 _MAX_GAP = 1e-5  # [m], allowed position error; it is distributed over the step
 # [m], position error that does not justify a bump that makes a turn too tight
@@ -42,13 +42,10 @@ def fit_rolling_paths(
     """Return paths through waypoints on which a base rolls, one from each stop to the next.
 
     The distance driven ℓ, the heading θ and all other coordinates are cubic between waypoints; the
-    position is the integral of (cos θ, sin θ) dℓ. To reach the next waypoint, the step length and
-    bumps of ℓ and θ within the step, multiples of 16s²(1 − s)², are found by Newton's method. They
-    are kept small, since the arc between the waypoints is a close approximation. The knots are so
-    close that cubics through them roll, too.
-
-    A steered base stops and turns its wheels where it cannot pass from arc to arc without exceeding
-    its curvature limit. A path of a single step is the arc itself.
+    position is the integral of (cos θ, sin θ) dℓ. To reach the next waypoint, Newton's method
+    adjusts the step length and bumps of ℓ and θ, multiples of 16s²(1 − s)². The knots are so close
+    that cubics through them roll, too. A steered base stops where passing from arc to arc would
+    exceed its curvature limit. A path of a single step is the arc itself.
 
     Args:
         points: (x, y, yaw) of the base, and other coordinates, shape (m, n), m ≥ 2; the base can
@@ -59,9 +56,8 @@ def fit_rolling_paths(
         refinement: Factor for the number of knots.
 
     Returns:
-        Paths with their waypoints, see `fit_path`, with the same number of knots in every step. Two
-            columns follow the n coordinates: the travel of left and right wheels [m], which have
-            limits of their own.
+        Paths with their waypoints; the travel of left and right wheels [m] follows the n
+        coordinates.
     """
     if rolling.turning_radius > 0.0 and (
         direction_changes := _find_direction_changes(points, rolling)
@@ -117,28 +113,23 @@ def _fit_without_stops(
     from scipy.interpolate import CubicHermiteSpline
 
     along, _, turn = rolling.compute_steps(points)
-    compute_distance = np.concatenate([[0.0], np.cumsum(along / np.sinc(turn / (2 * np.pi)))])
-    bounds = (
-        np.append(limits[0], np.inf),
-        np.append(limits[1], -np.inf),
-    )  # it reverses only where its driving direction changes
-    path = fit_path(np.column_stack([points, compute_distance]), np.append(scale, 0.0), bounds)
+    distance = np.concatenate([[0.0], np.cumsum(along / np.sinc(turn / (2 * np.pi)))])
+    # it reverses only where its driving direction changes
+    bounds = np.append(limits[0], np.inf), np.append(limits[1], -np.inf)
+    path = fit_path(np.column_stack([points, distance]), np.append(scale, 0.0), bounds)
     parts = refinement * max(_MIN_PIECES, int(np.ceil(np.abs(turn).max() / _MAX_TURN_PER_PIECE)))
     slopes = path(path.x, 1)[:, [2, -1]]
     if rolling.turning_radius > 0.0:
-        slopes[:, 0] = (
-            _compute_curvatures(turn, np.diff(compute_distance), rolling.turning_radius)
-            * slopes[:, 1]
-        )
-    steps = _StepFitter(points[:, :3], slopes, np.diff(path.x), np.diff(compute_distance), parts)
+        curvatures = _compute_curvatures(turn, np.diff(distance), rolling.turning_radius)
+        slopes[:, 0] = curvatures * slopes[:, 1]
+    steps = _StepFitter(points[:, :3], slopes, np.diff(path.x), np.diff(distance), parts)
     # A single arc reaches its end up to rounding; bumps that correct this would make short steps
     # turn too tightly.
     gaps = steps.compute_gap() if len(points) == 2 else steps.fit()
-    if (
-        rolling.turning_radius > 0.0
-        and (tight := steps.find_tight_steps(rolling.turning_radius)).any()
-    ):
+    tight = steps.find_tight_steps(rolling.turning_radius)
+    if rolling.turning_radius > 0.0 and tight.any():
         gaps = steps.restore_arcs(tight)
+        tight = steps.find_tight_steps(rolling.turning_radius)
     at = sample_intervals(path.x, np.arange(parts) / parts, last=True)
     base, slopes, wheels = steps.evaluate_knots(gaps)
     half = rolling.track / 2 * np.array([-1.0, 1.0])
@@ -146,17 +137,14 @@ def _fit_without_stops(
     rates = np.column_stack(
         [slopes, path(at, 1)[:, 3:-1], wheels[1][:, None] + half * slopes[:, 2:]]
     )
-    return CubicHermiteSpline(at, values, rates), (
-        np.abs(gaps) > _MAX_GAP
-    ) | steps.find_tight_steps(rolling.turning_radius)
+    return CubicHermiteSpline(at, values, rates), (np.abs(gaps) > _MAX_GAP) | tight
 
 
 def _compute_curvatures(turns: Floats, distances: Floats, radius: float) -> Floats:
     """Return path curvatures at waypoints, shape (m,) [rad/m], that avoid tight turns between them.
 
-    A step with curvature κ in the middle of the arc, and a and b at its ends, has curvature 3/2·κ −
-    (a + b)/4 half-way. This is at most 1/r if both are at least 3κ − 2/r. Otherwise the curvature
-    is the mean of the adjacent steps'.
+    A step of mean curvature κ, with a and b at its ends, has 3/2·κ − (a + b)/4 half-way: at most
+    1/r if both are at least 3κ − 2/r. Otherwise the curvature is the mean of the adjacent steps'.
     """
     curvatures = radius * turns / np.where(np.abs(distances) > _MIN_DISTANCE, distances, np.inf)
     lower, upper = np.minimum(3.0 * curvatures - 2.0, 1.0), np.maximum(3.0 * curvatures + 2.0, -1.0)
@@ -169,7 +157,10 @@ def _compute_curvatures(turns: Floats, distances: Floats, radius: float) -> Floa
 
 
 class _StepFitter:
-    """Fits the steps of a base from pose to pose, each parametrised by s from 0 to 1."""
+    """Fits the steps of a base between poses (N + 1, 3), each parametrised by s from 0 to 1.
+
+    `slopes`, shape (N + 1, 2), are derivatives of yaw and distance along the path.
+    """
 
     def __init__(
         self, poses: Floats, slopes: Floats, spans: Floats, distances: Floats, parts: int
@@ -179,10 +170,7 @@ class _StepFitter:
             [column[:-1, None] * self.spans, column[1:, None] * self.spans] for column in slopes.T
         )
         self.distances = self._initial_distances = distances[:, None]
-        self.distance_bumps, self.heading_bumps = (
-            np.zeros((len(distances), 1)),
-            np.zeros((len(distances), 1)),
-        )
+        self.distance_bumps, self.heading_bumps = np.zeros((2, len(distances), 1))
         nodes, weights = np.polynomial.legendre.leggauss(5)
         self._nodes = ((np.arange(parts)[:, None] + (nodes + 1) / 2) / parts).ravel()
         self._weights = np.tile(weights / (2 * parts), parts)
@@ -191,16 +179,14 @@ class _StepFitter:
         """Return the yaw and its derivative at s, shape (K,): shape (N, K) each."""
         before, change = self.poses[:-1, 2:], np.diff(self.poses[:, 2:], axis=0)
         value, slope = _evaluate_hermite(s, change, *self.yaw_slopes)
-        return before + value + self.heading_bumps * _evaluate_bump(s)[
-            0
-        ], slope + self.heading_bumps * _evaluate_bump(s)[1]
+        bump, bump_slope = _evaluate_bump(s)
+        yaw = before + value + self.heading_bumps * bump
+        return yaw, slope + self.heading_bumps * bump_slope
 
     def compute_distance(self, s: Floats) -> tuple[Floats, Floats]:
         """Return the distance driven in each step and its derivative at s, shape (N, K) each."""
-        (value, slope), (bump, bump_slope) = (
-            _evaluate_hermite(s, self.distances, *self.distance_slopes),
-            _evaluate_bump(s),
-        )
+        value, slope = _evaluate_hermite(s, self.distances, *self.distance_slopes)
+        bump, bump_slope = _evaluate_bump(s)
         return value + self.distance_bumps * bump, slope + self.distance_bumps * bump_slope
 
     def fit(self) -> Floats:
@@ -209,46 +195,33 @@ class _StepFitter:
         cost = np.array([0.0, _CLOSURE_SCALE**2, (_CLOSURE_SCALE * _HEADING_LEVER) ** 2])
         for _ in range(_NEWTON_ITERATIONS):
             direction, gap = np.exp(1j * self.compute_heading(s)[0]), self.compute_gap()
-            length_effect, distance_effect = (
+            bump, bump_slope = _evaluate_bump(s)
+            columns = [
                 direction @ (w * 6.0 * (s - s**2)),
-                direction @ (w * _evaluate_bump(s)[1]),
-            )
-            heading_effect = (
-                1j * (self.compute_distance(s)[1] * direction) @ (w * _evaluate_bump(s)[0])
-            )
-            effects = np.stack([length_effect, distance_effect, heading_effect], axis=1)
+                direction @ (w * bump_slope),
+                1j * (self.compute_distance(s)[1] * direction) @ (w * bump),
+            ]
+            effects = np.stack(columns, axis=1)
             slopes = np.stack([effects.real, effects.imag], axis=1)
-            bumps = np.stack(
-                [0.0 * self.distances, self.distance_bumps, self.heading_bumps], axis=1
-            )[..., 0]
-            transposed = np.swapaxes(slopes, 1, 2)
-            residual = (transposed @ np.stack([gap.real, gap.imag], axis=1)[..., None])[
+            bumps = [0.0 * self.distances, self.distance_bumps, self.heading_bumps]
+            transposed, gap = np.swapaxes(slopes, 1, 2), np.stack([gap.real, gap.imag], axis=1)
+            residual = (transposed @ gap[..., None])[..., 0] - cost * np.stack(bumps, axis=1)[
                 ..., 0
-            ] - cost * bumps
+            ]
             change = np.linalg.solve(transposed @ slopes + np.diag(cost), residual[..., None])
-            self.distances, self.distance_bumps, self.heading_bumps = (
-                self.distances + change[:, 0],
-                self.distance_bumps + change[:, 1],
-                self.heading_bumps + change[:, 2],
-            )
+            self.distances = self.distances + change[:, 0]
+            self.distance_bumps = self.distance_bumps + change[:, 1]
+            self.heading_bumps = self.heading_bumps + change[:, 2]
             if np.abs(change).max() < 1e-12:
                 break
         return self.compute_gap()
 
     def restore_arcs(self, which: Bools) -> Floats:
-        """Undo `fit` for the given steps, shape (N,), where the arc is accurate enough.
-
-        A bump that only corrects rounding increases the curvature of a short step as much as a
-        turn.
-        """
+        """Undo `fit` for a mask of steps, (N,), whose arcs are accurate enough; return the gaps."""
         fitted = self.distances, self.distance_bumps, self.heading_bumps
-        self.distances, self.distance_bumps, self.heading_bumps = (
-            self._initial_distances,
-            0.0 * self.distance_bumps,
-            0.0 * self.heading_bumps,
-        )
+        arcs = self._initial_distances, 0.0 * self.distance_bumps, 0.0 * self.heading_bumps
+        self.distances, self.distance_bumps, self.heading_bumps = arcs
         restored = (which & (np.abs(self.compute_gap()) < _MAX_GAP_OF_ARC))[:, None]
-        arcs = self.distances, self.distance_bumps, self.heading_bumps
         self.distances, self.distance_bumps, self.heading_bumps = (
             np.where(restored, new, old) for new, old in zip(arcs, fitted, strict=True)
         )
@@ -260,47 +233,32 @@ class _StepFitter:
         return np.asarray(dx + 1j * dy - self._compute_velocity() @ self._weights)
 
     def _compute_velocity(self) -> Floats:
-        return np.asarray(
-            self.compute_distance(self._nodes)[1]
-            * np.exp(1j * self.compute_heading(self._nodes)[0])
-        )
+        direction = np.exp(1j * self.compute_heading(self._nodes)[0])
+        return np.asarray(self.compute_distance(self._nodes)[1] * direction)
 
     def evaluate_knots(self, gaps: Floats) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
         """Return poses and distances at the knots, with their derivatives, gaps distributed."""
         s = np.arange(self.parts + 1) / self.parts
-        pieces = (
-            (self._compute_velocity() * self._weights)
-            .reshape(len(self.spans), self.parts, -1)
-            .sum(axis=2)
-        )
-        travelled = np.concatenate([np.zeros((len(pieces), 1)), np.cumsum(pieces, axis=1)], axis=1)
-        place = (
-            (self.poses[:-1, :1] + 1j * self.poses[:-1, 1:2])
-            + travelled
-            + gaps[:, None] * (3.0 - 2.0 * s) * s**2
-        )
+        pieces = (self._compute_velocity() * self._weights).reshape(len(gaps), self.parts, -1)
+        travelled = np.cumsum(pieces.sum(axis=2), axis=1)
+        travelled = np.concatenate([np.zeros((len(gaps), 1)), travelled], axis=1)
+        begin = self.poses[:-1, :1] + 1j * self.poses[:-1, 1:2]
+        place = begin + travelled + gaps[:, None] * (3.0 - 2.0 * s) * s**2
         (yaw, yaw_rate), (distance, speed) = self.compute_heading(s), self.compute_distance(s)
         start_distance = np.concatenate([[[0.0]], np.cumsum(self.distances, axis=0)[:-1]])
         velocity = speed * np.exp(1j * yaw)
-        values = [
-            _concatenate_steps(part)
-            for part in (place.real, place.imag, yaw, start_distance + distance)
-        ]
-        slopes = [
-            _concatenate_steps(part / self.spans)
-            for part in (velocity.real, velocity.imag, yaw_rate, speed)
-        ]
+        parts = (place.real, place.imag, yaw, start_distance + distance)
+        values = [_concatenate_steps(part) for part in parts]
+        rates = (velocity.real, velocity.imag, yaw_rate, speed)
+        slopes = [_concatenate_steps(part / self.spans) for part in rates]
         return np.column_stack(values[:3]), np.column_stack(slopes[:3]), (values[3], slopes[3])
 
     def find_tight_steps(self, radius: float) -> Bools:
         """Return a mask of steps with a turning radius below `radius` [m], shape (N,)."""
         s = np.linspace(0.0, 1.0, 8 * self.parts + 1)
         (_, yaw_rate), (_, speed) = self.compute_heading(s), self.compute_distance(s)
-        return np.asarray(
-            (radius * np.abs(yaw_rate) > (1.0 + _RADIUS_TOLERANCE) * np.abs(speed) + 1e-9).any(
-                axis=1
-            )
-        )
+        allowed = (1.0 + _RADIUS_TOLERANCE) * np.abs(speed) + 1e-9
+        return np.asarray((radius * np.abs(yaw_rate) > allowed).any(axis=1))
 
 
 def _evaluate_hermite(

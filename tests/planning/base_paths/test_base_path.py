@@ -257,24 +257,6 @@ def test_tasks_without_a_path() -> None:
     )
 
 
-def test_search_is_deterministic() -> None:
-    rng = np.random.default_rng(3)
-    for _ in range(2):
-        start, goals = (
-            rng.uniform([-4, -4, -3], [4, 4, 3]),
-            rng.uniform([-4, -4, -3], [4, 4, 3], size=(5, 3)),
-        )
-        grid = BaseGrid(chassis(), arm(), [*furniture(), *clutter(1, 10)], HALL, MARGIN)
-        again = BaseGrid(chassis(), arm(), [*furniture(), *clutter(1, 10)], HALL, MARGIN)
-        shortest_path(again, goals[0], goals[1:])  # fills its caches
-        paths = [shortest_path(g, start, goals) for g in (grid, grid, again)]
-        for other in paths[1:]:
-            assert (paths[0] is None) == (other is None)
-            if paths[0] is not None and other is not None:
-                np.testing.assert_array_equal(paths[0].poses, other.poses)
-                assert (paths[0].goal, paths[0].cost) == (other.goal, other.cost)
-
-
 @pytest.fixture(scope="module")
 def around_the_block() -> BasePath:
     path = find(furniture(), [2.0, -4.3, 1.0], [[2.5, 2.8, 0.0], [1.3, 1.0, 0.0]])
@@ -305,11 +287,3 @@ def test_poses_are_sampled_along_a_path(around_the_block: BasePath, steps: int) 
     if steps == 40:  # it starts and ends slowly
         progress = np.diff(dense[[0, *nearest]])
         assert max(progress[0], progress[-1]) < 0.2 * progress.max()
-
-
-def test_turns_take_poses() -> None:
-    path = find([], [0.0, 0.0, 0.0], [[1.0, 0.0, 3.0]])
-    assert path is not None
-    waypoints = sample_poses(path, 50, turning=TURNING)
-    assert np.sum(waypoints[:, 0] > 1.0 - 1e-9) > 20
-    assert np.sum(sample_poses(path, 50, turning=0.01)[:, 0] > 1.0 - 1e-9) < 12

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import coal
 import numpy as np
 import pytest
@@ -26,6 +28,57 @@ CELLS, ROOM = 13, (-2.0, 2.0, -2.0, 2.0)
 ENTRY = 0.6  # [m], maximum distance of start or goal to connected cells
 
 
+def number(grid: BaseGrid, i: int, j: int, heading: int) -> int:
+    return (i * grid.cells + j) * HEADINGS + heading % HEADINGS
+
+
+def add_moves(grid: BaseGrid, edge: Callable[[int, int, float], None]) -> None:
+    """Add the free moves between cells and the free turns."""
+    for i, j, heading in np.ndindex(grid.cells, grid.cells, HEADINGS):
+        k, m = np.add((i, j), grid.moves[heading])
+        here, length = number(grid, i, j, heading), grid.lengths[heading]
+        if 0 <= k < grid.cells and 0 <= m < grid.cells and grid.is_move_free(i, j, heading):
+            edge(here, number(grid, k, m, heading), length)
+            edge(number(grid, k, m, heading), here, BACKWARDS * length)
+        if grid.is_left_turn_free(i, j, heading):
+            turn = TURNING * abs(
+                wrap_angle(grid.yaws[(heading + 1) % HEADINGS] - grid.yaws[heading])
+            )
+            edge(here, number(grid, i, j, heading + 1), turn)
+            edge(number(grid, i, j, heading + 1), here, turn)
+
+
+def find_heading(
+    a: NDArray[np.float64], b: NDArray[np.float64], how: int, otherwise: float
+) -> float:
+    ahead = np.arctan2(*(b - a)[::-1]) if np.hypot(*(b - a)) > 1e-9 else otherwise
+    return float(ahead + np.pi * how if how < 2 else otherwise)
+
+
+def compute_cost(
+    grid: BaseGrid,
+    a: NDArray[np.float64],
+    b: NDArray[np.float64],
+    before: float,
+    yaw: float,
+    after: float,
+    how: int,
+) -> float:
+    """Return the cost of a drive with its turns, infinite if it is blocked."""
+    length = np.hypot(*(b - a))
+    yaw = before + wrap_angle(yaw - before)
+    after = yaw + wrap_angle(after - yaw)
+    free = (
+        grid.is_turn_free(a, before, yaw)
+        and grid.is_drive_free(a, b, yaw)
+        and grid.is_turn_free(b, yaw, after)
+    )
+    cost = length * (1.0, BACKWARDS, SIDEWAYS)[how] + TURNING * (
+        abs(yaw - before) + abs(after - yaw)
+    )
+    return float(cost) if free else np.inf
+
+
 def reference(
     grid: BaseGrid,
     start: NDArray[np.float64],
@@ -41,47 +94,7 @@ def reference(
         columns.append(b)
         costs.append(max(cost, 1e-12))
 
-    def node(i: int, j: int, heading: int) -> int:
-        return (i * grid.cells + j) * HEADINGS + heading % HEADINGS
-
-    for i, j, heading in np.ndindex(grid.cells, grid.cells, HEADINGS):
-        k, m = np.add((i, j), grid.moves[heading])
-        here, length = node(i, j, heading), grid.lengths[heading]
-        if 0 <= k < grid.cells and 0 <= m < grid.cells and grid.is_move_free(i, j, heading):
-            edge(here, node(k, m, heading), length)
-            edge(node(k, m, heading), here, BACKWARDS * length)
-        if grid.is_left_turn_free(i, j, heading):
-            turn = TURNING * abs(
-                wrap_angle(grid.yaws[(heading + 1) % HEADINGS] - grid.yaws[heading])
-            )
-            edge(here, node(i, j, heading + 1), turn)
-            edge(node(i, j, heading + 1), here, turn)
-
-    def toward(a: NDArray[np.float64], b: NDArray[np.float64], how: int, otherwise: float) -> float:
-        ahead = np.arctan2(*(b - a)[::-1]) if np.hypot(*(b - a)) > 1e-9 else otherwise
-        return float(ahead + np.pi * how if how < 2 else otherwise)
-
-    def way(
-        a: NDArray[np.float64],
-        b: NDArray[np.float64],
-        before: float,
-        yaw: float,
-        after: float,
-        how: int,
-    ) -> float:
-        """Return the cost of a drive with its turns, infinite if it is blocked."""
-        length = np.hypot(*(b - a))
-        yaw = before + wrap_angle(yaw - before)
-        after = yaw + wrap_angle(after - yaw)
-        free = (
-            grid.is_turn_free(a, before, yaw)
-            and grid.is_drive_free(a, b, yaw)
-            and grid.is_turn_free(b, yaw, after)
-        )
-        cost = length * (1.0, BACKWARDS, SIDEWAYS)[how] + TURNING * (
-            abs(yaw - before) + abs(after - yaw)
-        )
-        return float(cost) if free else np.inf
+    add_moves(grid, edge)
 
     first, last = count, count + 1
     radius = max(ENTRY, 1.5 * grid.step.max())
@@ -89,25 +102,28 @@ def reference(
         center = np.array(grid.center(i, j))
         for how in range(3):
             if np.hypot(*(center - start[:2])) <= radius:
-                yaw = toward(start[:2], center, how, start[2])
+                yaw = find_heading(start[:2], center, how, start[2])
                 heading = int(np.abs(wrap_angle(grid.yaws - yaw)).argmin())
-                cost = way(start[:2], center, start[2], yaw, grid.yaws[heading], how)
+                cost = compute_cost(grid, start[:2], center, start[2], yaw, grid.yaws[heading], how)
                 if cost < np.inf:
-                    edge(first, node(i, j, heading), cost)
+                    edge(first, number(grid, i, j, heading), cost)
             for goal, more in zip(goals, extra, strict=True):
                 if np.hypot(*(center - goal[:2])) <= radius and grid.is_pose_free(*goal):
-                    yaw = toward(center, goal[:2], how, goal[2])
+                    yaw = find_heading(center, goal[:2], how, goal[2])
                     heading = int(np.abs(wrap_angle(grid.yaws - yaw)).argmin())
-                    cost = way(center, goal[:2], grid.yaws[heading], yaw, goal[2], how)
+                    cost = compute_cost(
+                        grid, center, goal[:2], grid.yaws[heading], yaw, goal[2], how
+                    )
                     if cost < np.inf:
-                        edge(node(i, j, heading), last, cost + more)
+                        edge(number(grid, i, j, heading), last, cost + more)
     for goal, more in zip(goals, extra, strict=True):
         for how in range(3):
-            cost = way(
+            cost = compute_cost(
+                grid,
                 start[:2],
                 goal[:2],
                 start[2],
-                toward(start[:2], goal[:2], how, start[2]),
+                find_heading(start[:2], goal[:2], how, start[2]),
                 goal[2],
                 how,
             )

@@ -13,7 +13,6 @@ from vkc_pin.planning.base_paths.motion_primitives import (
     BACKWARDS,
     SIDEWAYS,
     UNIT,
-    Connections,
     Drive,
     SearchSpace,
     wrap_angle,
@@ -125,24 +124,3 @@ def test_load_counts_away_from_start_and_goals() -> None:
     assert not places.is_turn_free(np.array([2.0, 0.0]), 0.3, 3.3)
     assert not places.looks_free(Drive(np.array([0.5, 0.0]), np.array([3.5, 0.0]), 0.0))
     assert places.looks_free(Drive(np.array([-0.5, 0.0]), np.array([0.5, 0.0]), 0.0))
-
-
-def test_turn_limits_are_cached_per_place_and_margins() -> None:
-    """The turning range depends on place and margins, not on the order of the queries."""
-    walls: list[Shape] = [(coal.Box(2.0, 0.1, 1.0), at(0.0, sign * 0.5, 0.5)) for sign in (-1, 1)]
-    places = [START, np.array([3.5, 0.0, 0.0])]
-
-    def turns(grid: BaseGrid, place: np.ndarray, margins: np.ndarray | None = None) -> list[bool]:
-        one = SearchSpace(grid, place, np.array([[3.5, 3.0, 0.0]]))
-        yaws = np.linspace(-3.0, 3.0, 41)
-        every = Connections(np.zeros(41, int), np.zeros(41, int), yaws, np.zeros(41, int))
-        return one.find_turnable(place, every, margins).tolist()
-
-    alone = [turns(BaseGrid(chassis(), [], walls, HALL, MARGIN), place) for place in places]
-    assert 0 < sum(alone[0]) < 41 == sum(alone[1])
-    for order in ((0, 1), (1, 0), (0, 1, 0, 1)):
-        shared = BaseGrid(chassis(), [], walls, HALL, MARGIN)
-        for k in order:
-            assert turns(shared, places[k]) == alone[k]
-    wide = turns(shared, places[0], np.full(2, -np.inf))
-    assert sum(wide) == 41

@@ -28,7 +28,6 @@ from vkc_pin.planning.chain.chain import (
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.trajectory.world_model import World
 
 GRASPS = [
     {"door": "handle"},
@@ -43,7 +42,6 @@ GRASPS = [
     {"cabinet": "face"},
     {"door": "handle", "drawer": "handle_free", "cabinet": "ball"},
 ]
-IDS = [" ".join(f"{name}.{grasp}" for name, grasp in grasps.items()) for grasps in GRASPS]
 
 
 def frames(model: pin.Model, q: np.ndarray) -> list[pin.SE3]:
@@ -126,62 +124,9 @@ def test_the_chain_begins_with_the_robot() -> None:
             assert_same(one, other)
 
 
-@pytest.mark.parametrize("grasps", GRASPS, ids=IDS)
-def test_closed_chains_equal_the_world_model(grasps: dict[str, str]) -> None:
-    scene, size = full_scene(), full_scene().robot.coordinates.size
-    chain = consolidate(scene, grasps)
-    for z in random_configurations(chain.lower, chain.upper, 3, np.random.default_rng(1)):
-        q = chain.coordinates.q(z)
-        of_chain = frames(chain.model, q)
-        moved = {}
-        for name in grasps:
-            placed = scene.objects[name]
-            base = of_chain[chain.model.getFrameId(f"{name}.{placed.object.base_link}")]
-            state = object_state(chain, scene, name, z)
-            moved[name] = dataclasses.replace(placed, placement=base, state=state)
-        there = with_objects(scene, moved)
-        world, closed = World(there), consolidate(there, grasps)
-        values = dict(zip(world.coordinates.names, world.start, strict=True)) | dict(
-            zip(world.coordinates.names[:size], z[:size], strict=True)
-        )
-        expected = frames(
-            world.model,
-            world.coordinates.q(np.array([values[name] for name in world.coordinates.names])),
-        )
-        of_chain = frames(closed.model, closed.coordinates.q(z))
-        joints = closed.model.createData()
-        pin.forwardKinematics(closed.model, joints, closed.coordinates.q(z))
-        for name, grasp in grasps.items():
-            closure = closed.closures[Hold(name, grasp)]
-            assert_same(joints.oMi[closure.joint] * closure.local, closure.target)
-            compared = [
-                i
-                for i, frame in enumerate(closed.model.frames)
-                if frame.name.startswith(f"{name}.")
-            ]
-            assert compared
-            for index in compared:
-                assert_same(
-                    of_chain[index],
-                    expected[
-                        world.model.getFrameId(closed.model.frames[index].name, pin.FrameType.BODY)
-                    ],
-                )
-
-
 @pytest.mark.parametrize(
     ("grasps", "added", "limits"),
     [
-        (
-            {"cabinet": "sleeve"},
-            ["cabinet.sleeve_turn", "cabinet.sleeve_slide", "cabinet.slide", "cabinet.swing"],
-            [
-                (-0.5, 0.9, FREEDOM_VELOCITY, FREEDOM_ACCELERATION),
-                (-0.05, 0.08, FREEDOM_VELOCITY, FREEDOM_ACCELERATION),
-                (0.0, 0.3, 0.4, 0.7),
-                (-1.0, 2.0, 1.5, 3.0),
-            ],
-        ),
         (
             {"drawer": "handle", "cabinet": "rail"},
             ["drawer.slide", "cabinet.rail", "cabinet.slide", "cabinet.swing"],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from functools import cache
 
 import numpy as np
@@ -12,7 +11,6 @@ from helpers.small_problems import SHORT, margins_at, program_of, random_configu
 
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import GoTo, Grasp, Place, Reach, Release
 
@@ -111,36 +109,6 @@ def expected_placement(problem: TrajectoryProblem, name: str, row: np.ndarray) -
     closure, data = problem.chain.closures[hold], problem.chain.model.createData()
     pin.forwardKinematics(problem.chain.model, data, problem.chain.coordinates.q(row))
     return data.oMi[closure.joint] * closure.local
-
-
-def test_released_object_is_where_the_motion_released_it() -> None:
-    """Planes, bounding volumes and distances of later phases refer to that placement."""
-    problem = fetching()
-    names = [phase.name for phase in problem.task.phases]
-    assert names[3:] == ["go to", "place stick", "go to"]
-    z = random_configurations(
-        problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(0)
-    )
-    contacts = problem.contacts.with_released_objects(z)
-    left = {"ball": (problem.ends[2], (3, 4, 5)), "stick": (problem.ends[4], (5,))}
-    for name, (end, later) in left.items():
-        where = expected_placement(problem, name, z[end - 1])
-        there = make_world_shapes(dataclasses.replace(scene().objects[name], placement=where))
-        for number in later:
-            part = contacts.phases[number]
-            index = {
-                str(shape.name): i for i, shape in enumerate(part.shapes) if part.joint[i] == 0
-            }
-            for shape in there:
-                i = index[f"{name}.{shape.name}"]
-                expected = shape.placement.homogeneous
-                np.testing.assert_allclose(
-                    part.shapes[i].placement.homogeneous, expected, rtol=0.0, atol=1e-9
-                )
-                np.testing.assert_allclose(part.rotation[i], expected[:3, :3], rtol=0.0, atol=1e-9)
-                np.testing.assert_allclose(
-                    part.translation[i], expected[:3, 3], rtol=0.0, atol=1e-9
-                )
 
 
 def test_released_placements_do_not_depend_on_earlier_queries() -> None:

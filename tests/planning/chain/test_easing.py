@@ -216,21 +216,3 @@ def test_margins_are_reduced_for_touches_but_not_for_poses() -> None:
     found = margins(problem(scene, reach), 0)
     assert {first for first, _ in found} == {"forearm_link"}
     assert margins(problem(scene, Reach(pin.SE3(np.eye(3), np.array([0.8, 0.0, TOP])))), 0) == {}
-
-
-def test_motion_that_lifts_and_places_keeps_its_margins() -> None:
-    p = problem(room(table(gap=GAP)), Place("stick", ASIDE))
-    up, down = np.array(p.scene.start), reaching(tool_at(STICK), above(STICK))
-    corners = np.array([down, up, moved_base(up, y=0.5), moved_base(down, y=0.5)])
-    at = np.linspace(0.0, 3.0, N + 1)[1:]
-    z = np.zeros((p.segments, p.chain.size))
-    z[:N, :9] = np.linspace(up, down, N + 1)[1:]
-    z[N:, :9] = np.transpose([np.interp(at, np.arange(4.0), column) for column in corners.T])
-    contacts = p.evaluate_contacts(z, reach=0.05)
-    contacts = contacts.select(np.flatnonzero(contacts.waypoint >= N))
-    links = np.array(p.contacts.phases[1].labels)[contacts.pair]
-    own = contacts.select(np.flatnonzero((links == ("stick.stick", "table")).all(axis=1)))
-    assert own.compute_violation() == 0.0
-    last = own.select(np.flatnonzero(own.waypoint == 2 * N - 1))
-    assert last.distance.min() == pytest.approx(GAP, abs=1e-6)
-    assert last.margin.min() == pytest.approx(REDUCED_MARGIN_RATIO * GAP, abs=1e-7)

@@ -1,11 +1,10 @@
-"""Compares bounding volumes with coal's distances of random shapes on random joints."""
+"""Compares static geometry near a box, and moved geometry, with coal."""
 
 from __future__ import annotations
 
 import coal
 import numpy as np
 import pinocchio as pin
-from helpers.small_problems import margins_at
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -82,31 +81,6 @@ def all_distances(
     return out
 
 
-@settings(max_examples=15, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.02, 0.3]), st.booleans())
-def test_all_close_pairs_are_found(seed: int, reach: float, standing: bool) -> None:
-    rng = np.random.default_rng(seed)
-    part, joints = random_geometry(rng), random_joints(rng, 5)
-    distances = all_distances(part, *joints)
-    at, pairs, bounds = part.boxes.find_close_pairs(reach, *joints, include_fixed=standing)
-    assert (bounds <= distances[at, pairs] + COAL).all()
-    assert (bounds < reach).all()
-    assert (np.diff(at * len(part.pairs) + pairs) > 0).all()
-    counts = np.ones(len(part.pairs), bool) if standing else part.joint[part.pairs[:, 1]] != 0
-    close = {(w, k) for w, k in np.argwhere(distances < reach - COAL).tolist() if counts[k]}
-    assert close <= set(zip(at.tolist(), pairs.tolist(), strict=True))
-    assert counts[pairs].all()
-
-
-def test_distant_pairs_are_culled() -> None:
-    rng = np.random.default_rng(0)
-    part, joints = random_geometry(rng, 12, 60), random_joints(rng, 20)
-    distances = all_distances(part, *joints)
-    at, pairs, _ = part.boxes.find_close_pairs(0.05, *joints)
-    assert 0 < (distances < 0.05).sum() <= len(at) < 0.05 * distances.size
-    assert (distances[at, pairs] < 0.4).all()
-
-
 @settings(max_examples=8, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_static_geometry_can_be_moved(seed: int) -> None:
@@ -143,15 +117,3 @@ def test_static_geometry_near_a_box(seed: int) -> None:
         assert [listed[k] for k in numbers] == [
             [first, b] for b in range(7, 16) if [first, b] in listed
         ]
-
-
-def test_margins_are_reduced_between_waypoints() -> None:
-    part = random_geometry(np.random.default_rng(2))
-    object.__setattr__(
-        part, "reduced_margins", {3: [(2, 4, 0.001), (4, 6, 0.004)], 5: [(0, 1, 1.0)]}
-    )
-    pairs, waypoints = (grid.ravel() for grid in np.meshgrid([2, 3, 5], np.arange(8)))
-    expected = part.margins[pairs].copy()
-    expected[(pairs == 3) & (waypoints >= 2) & (waypoints <= 4)] = 0.001
-    expected[(pairs == 3) & (waypoints >= 5) & (waypoints <= 6)] = 0.004
-    np.testing.assert_array_equal(margins_at(part, pairs, waypoints), expected)  # and never widened

@@ -250,34 +250,6 @@ def test_hanging_compiler_is_killed(
     until(lambda: ended(int(pid.read_text())))
 
 
-def test_wait_times_out(folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(
-        "CC",
-        script(
-            tmp_path / "slow", f'while [ ! -e {tmp_path}/go ]; do sleep 0.05; done; exec cc "$@"'
-        ),
-    )
-    code = MachineCode(make())
-    code.try_load()
-    assert not wait(0.2)
-    (tmp_path / "go").touch()
-    assert wait()
-    assert code.try_load()
-
-
-def test_truncated_library_is_rebuilt(folder: Libraries) -> None:
-    MachineCode(make()).try_load()
-    assert wait()
-    (path,) = folder.path.glob("*.so")
-    path.write_bytes(path.read_bytes()[:5000])
-    code = MachineCode(make())
-    assert not code.try_load()
-    assert not code.try_load()
-    assert not MachineCode(make()).try_load()
-    assert wait()
-    assert MachineCode(make()).try_load()
-
-
 @pytest.mark.parametrize("executable", ["", "/usr/bin/blender"])
 def test_embedding_program_is_not_started_as_worker(
     executable: str, folder: Libraries, monkeypatch: pytest.MonkeyPatch

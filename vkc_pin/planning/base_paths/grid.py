@@ -162,7 +162,7 @@ class BaseGrid:
         reaching: bool = False,
         margins: Floats | None = None,
     ) -> bool:
-        """Return whether the margins are kept while turning at a place, (2,) [m], between yaws [rad].
+        """Return whether the margins are kept while turning at a place [m] between yaws [rad].
 
         `margins`: those of the base from each obstacle, shape (S,) [m]. Default: the grid's.
         """

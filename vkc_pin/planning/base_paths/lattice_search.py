@@ -104,7 +104,7 @@ class _EndConnections:
 def find_cheapest_path(
     space: SearchSpace, extra: Floats
 ) -> tuple[float, int, list[Drive], float] | None:
-    """Return cost [m], goal, drives and last yaw [rad] of the cheapest path to a free goal, or None.
+    """Return cost [m], goal, drives and last yaw [rad] of the cheapest path, or None.
 
     `extra`, shape (G,) [m], are additional costs of the goals.
     """

@@ -218,7 +218,7 @@ class _PairBuilder:
     def _apply_exemptions(
         self, phase: Phase, table: Floats, labels: Sequence[str], keys: Sequence[str]
     ) -> tuple[Floats, list[MarginRegion]]:
-        """Return pairs with the margins that the scene allows, and the joint-dependent exemptions."""
+        """Return pairs with the scene's margins, and the joint-dependent exemptions."""
         if not self._allowances:
             return table, []
         base = len(labels)

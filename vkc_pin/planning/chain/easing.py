@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 
 import coal
@@ -26,9 +27,12 @@ from vkc_pin.world.task.phases import Task
 
 __all__ = ["REDUCED_MARGIN_RATIO", "find_reduced_margins"]
 
-REDUCED_MARGIN_RATIO = 0.5  # Margin relative to the distance at the contact itself.
+REDUCED_MARGIN_RATIO = 0.5  # margin relative to the distance at the contact
 
 ReducedMargins = dict[int, list[tuple[int, int, float]]]
+# geometry of the chain, shape and placement at a contact, whether it is at the begin of the phase,
+# and whether the shapes may overlap
+_Contact = tuple[int, coal.CollisionGeometry, pin.SE3, bool, bool]
 
 
 def find_reduced_margins(
@@ -47,73 +51,61 @@ def find_reduced_margins(
     contact. An initial penetration of a grasped object is allowed at the start. See
     `world.scene.contact_rules`.
     """
-    phase, before = task.phases[number], task.phases[number - 1] if number else None
-    first = sum(earlier.segments for earlier in task.phases[:number])
-    last, steps = first + phase.segments, options.steps(CONTACT_WINDOW)
-    shapes, reduced = part.shapes, ReducedMargins()
-
-    def reduce_margins(
-        moving: int,
-        shape: coal.CollisionGeometry,
-        where: pin.SE3,
-        begin: int,
-        end: int,
-        *,
-        inside: bool = False,
-    ) -> None:
-        """Reduce the margins of a moving geometry with static ones close to `shape`."""
-        nearby = part.find_static_near(float(part.margins.max()), *compute_world_box(shape, where))
-        for k in part.find_pairs(moving, nearby).tolist():
-            other = shapes[int(part.pairs[k, 1])]
-            distance = compute_shape_distance(shape, where, other.geometry, other.placement)
-            resting_margin = REDUCED_MARGIN_RATIO * max(distance, 0.0)
-            if distance < part.margins[k]:
-                reduced.setdefault(k, []).append(
-                    (
-                        begin,
-                        end,
-                        distance if inside and distance < -CONTACT_DEPTH else resting_margin,
-                    )
-                )
-
-    for holds, begin, end in (
-        (phase.released, first, first + steps),
-        (phase.grasps, last - steps, last),
-    ):
+    phase, reduced = task.phases[number], ReducedMargins()
+    first, steps = sum(p.segments for p in task.phases[:number]), options.steps(CONTACT_WINDOW)
+    last = first + phase.segments
+    windows = {True: (first, first + steps), False: (last - steps, last)}
+    for holds, begins in ((phase.released, True), (phase.grasps, False)):
         for hold in holds:
             is_hand = np.isin(part.labels, list(find_touch_links(scene, hold)))
             is_object = np.array([label.startswith(f"{hold.object}.") for label in part.labels])
-            for k in np.flatnonzero(
-                is_hand[part.pairs[:, 0]] & is_object[part.pairs[:, 1]]
-            ).tolist():
+            found = np.flatnonzero(is_hand[part.pairs[:, 0]] & is_object[part.pairs[:, 1]])
+            for k in found.tolist():
                 margin = compute_hand_clearance(scene, hold, part.labels[part.pairs[k, 1]], options)
-                reduced.setdefault(k, []).append((begin, end, margin))
-    for geometries, placed, begins in _find_lift_and_place_moments(scene, chain, task, number):
-        stands = {shape.name: shape.placement for shape in make_world_shapes(placed)}
-        for i in geometries:
-            begin, end = (first, first + steps) if begins else (last - steps, last)
-            new = begins and placed.name not in {
-                hold.object for earlier in task.phases[:number] for hold in earlier.held
-            }
-            reduce_margins(
-                i,
-                shapes[i].geometry,
-                stands[get_local_name(shapes[i].name)],
-                begin,
-                end,
-                inside=new,
-            )
-    touch_goals = [(goal, last - steps, last) for goal in phase.frames]
-    touch_goals += [(goal, first, first + steps) for goal in (before.frames if before else ())]
-    for goal, begin, end in touch_goals:
+                reduced.setdefault(k, []).append((*windows[begins], margin))
+    reach = float(part.margins.max())
+    for moving, shape, where, begins, may_overlap in itertools.chain(
+        _find_supports(scene, chain, task, number, part), _find_touches(chain, task, number, part)
+    ):
+        nearby = part.find_static_near(reach, *compute_world_box(shape, where))
+        for k in part.find_pairs(moving, nearby).tolist():
+            other = part.shapes[int(part.pairs[k, 1])]
+            distance = compute_shape_distance(shape, where, other.geometry, other.placement)
+            margin = REDUCED_MARGIN_RATIO * max(distance, 0.0)
+            if may_overlap and distance < -CONTACT_DEPTH:
+                margin = distance
+            if distance < part.margins[k]:
+                reduced.setdefault(k, []).append((*windows[begins], margin))
+    return reduced
+
+
+def _find_touches(
+    chain: VirtualKinematicChain, task: Task, number: int, part: PhaseGeometry
+) -> Iterator[_Contact]:
+    """Yield geometry that touches a target at the end or the begin of a phase."""
+    before = task.phases[number - 1].frames if number else ()
+    goals = [(goal, False) for goal in task.phases[number].frames]
+    for goal, begins in (*goals, *((goal, True) for goal in before)):
         if not goal.touches:
             continue
         point, where = coal.Sphere(1e-4), pin.SE3(np.eye(3), goal.placement.translation)
         joint, _ = chain.frame(goal.frame, goal.hold)
         for i in range(len(chain.collision.geometryObjects)):
-            if part.labels[i] == str(goal) if goal.hold else shapes[i].parentJoint == joint:
-                reduce_margins(i, point, where, begin, end)
-    return reduced
+            if part.labels[i] == str(goal) if goal.hold else part.shapes[i].parentJoint == joint:
+                yield i, point, where, begins, False
+
+
+def _find_supports(
+    scene: Scene, chain: VirtualKinematicChain, task: Task, number: int, part: PhaseGeometry
+) -> Iterator[_Contact]:
+    """Yield geometry of objects that are lifted or placed; initially they may overlap others."""
+    earlier = {hold.object for phase in task.phases[:number] for hold in phase.held}
+    for geometries, placed, begins in _find_lift_and_place_moments(scene, chain, task, number):
+        placements = {shape.name: shape.placement for shape in make_world_shapes(placed)}
+        for i in geometries:
+            where = placements[get_local_name(part.shapes[i].name)]
+            may_overlap = begins and placed.name not in earlier
+            yield i, part.shapes[i].geometry, where, begins, may_overlap
 
 
 def _find_lift_and_place_moments(
@@ -138,27 +130,17 @@ def _find_lift_and_place_moments(
             yield chain.held_geometries[hold], placed, begins
             for ride in phase.supported:
                 if ride.hold == hold:
-                    yield (
-                        chain.ride_geometries[ride],
-                        _place_supported_object(scene, ride, placed),
-                        begins,
-                    )
+                    supported = _place_supported_object(scene, ride, placed)
+                    yield chain.ride_geometries[ride], supported, begins
     for ride in phase.supported:
         carrier = scene.objects[ride.hold.object]
         if not carrier.object.free:
-            goals = {
-                name: float(np.clip(value, *phase.ranges[name]))
-                for name, value in phase.values.items()
-            }
-            for state, begins in (
-                (phase.initial_values, True),
-                ({**phase.initial_values, **goals}, False),
-            ):
-                yield (
-                    chain.ride_geometries[ride],
-                    _place_supported_object(scene, ride, _with_joint_positions(carrier, state)),
-                    begins,
-                )
+            goals = {c: float(np.clip(v, *phase.ranges[c])) for c, v in phase.values.items()}
+            final_values = {**phase.initial_values, **goals}
+            for state, begins in ((phase.initial_values, True), (final_values, False)):
+                placed = _with_joint_positions(carrier, state)
+                placed = _place_supported_object(scene, ride, placed)
+                yield chain.ride_geometries[ride], placed, begins
 
 
 def _place_supported_object(

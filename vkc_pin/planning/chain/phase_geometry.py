@@ -65,7 +65,7 @@ class PhaseGeometry:
         return moved
 
     def find_static_near(self, reach: float, lower: Floats, upper: Floats) -> Ints:
-        """Return static geometries within `reach` [m] of a box with corners lower and upper, (3,)."""
+        """Return static geometries within `reach` [m] of a box with given corners, (3,)."""
         lows, highs = self._static_boxes
         near = (lows < (upper + reach)[:, None]) & (highs > (lower - reach)[:, None])
         return np.flatnonzero(near.all(axis=0)) + self._n_moving

@@ -94,7 +94,7 @@ def retime_trajectory(
 
 
 def _subdivide(positions: Floats, places: Ints, rolling: RollingLimits) -> Floats:
-    """Return waypoints, shape (T, n), and points on the lines (wheeled bases: arcs) between them."""
+    """Return waypoints, (T, n), and points on the lines (wheeled bases: arcs) between them."""
     every = np.arange(places[-1] + 1)
     at = np.interp(every, places, np.arange(len(places)))
     points = np.stack([np.interp(every, places, column) for column in positions.T], axis=-1)
@@ -236,7 +236,7 @@ def _follow_step(
     torque_bounds: TorqueBounds | None,
     number: int,
 ) -> tuple[Curve, Ints]:
-    """Return the curve of step `number` between waypoints, shape (2, n), with progress 3s² − 2s³."""
+    """Return the curve of step `number` between waypoints, (2, n), with progress 3s² − 2s³."""
     length, share = path.x[-1], np.linspace(0.0, 1.0, len(path.x))
     places = length * (3.0 - 2.0 * share) * share**2
     speeds = length * 6.0 * (share - share**2) / _WAIT_DURATION

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["compute_speeds"]
 
-# Offsets of constrained points from the ends of a segment, where accelerations jump, relative to its
+# Offsets of constrained points from the ends of segments, where accelerations jump, relative to the
 # length; the second one is tried if the first fails.
 _KNOT_OFFSETS = (1e-3, 1e-2)
 

@@ -1,8 +1,8 @@
 """Computes paths that a base on wheels can drive: corners connected by arcs.
 
-Straight drives and turns in place are arcs, too. From one corner to the next a pose (x, y, yaw)
-moves with a constant twist. The chord between two poses of an arc points along the heading half-way
-between them, so steps of any size neither slip nor turn by more than the arc itself.
+From one corner to the next a pose (x, y, yaw) moves with a constant twist. The chord between two
+poses of an arc points along the heading half-way between them, so that steps of any size do not
+slip.
 """
 
 from __future__ import annotations

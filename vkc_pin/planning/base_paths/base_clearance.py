@@ -1,10 +1,8 @@
 """Checks whether shapes on the base keep their margins along a straight drive or a turn in place.
 
-Turning and driving preserve the height of every shape, so shapes at different heights never meet.
-For the others, the plan view bounds the distance from below: along a direction u, they are
-u·p − h(u) apart, where p is the base position and h the sum of both support functions. One
-direction that separates them during the whole motion is sufficient. Only pairs without one need
-coal, whose normal bounds how far the motion may continue until the next query.
+Shapes at different heights never meet. For the others, support functions of the plan view bound the
+distance from below; one direction that separates them during the whole motion is sufficient. Only
+pairs without one need coal, by conservative advancement.
 """
 
 from __future__ import annotations

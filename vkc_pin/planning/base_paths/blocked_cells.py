@@ -1,10 +1,8 @@
 """Finds cells and headings at which the base certainly collides, without exact collision checks.
 
-At one heading, a convex shape of the base hits a convex obstacle at the places of a convex region
-of the plan view. Its support function is the sum of both, taken of the parts at the same height;
-the region is rasterized row by row. It is reduced by the uncertainty that the few `DIRECTIONS`
-leave, so that no free cell is marked. Most blocked cells are found, so that a search knows in
-advance where it need not check.
+At one heading, a convex shape hits a convex obstacle in a convex region of the plan view, whose
+support function is the sum of both, of the parts at the same height. It is rasterized row by row,
+reduced by the uncertainty that the few `DIRECTIONS` leave, so that no free cell is marked.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Defines how the base moves between two places, what that costs, and where it is free.
 
-The base turns, drives straight ahead or backwards, and turns. Only next to the start and the goals,
-where furniture may leave no space to turn, it may drive sideways.
+The base turns, drives straight ahead or backwards, and turns; near start and goals, where furniture
+may leave no space to turn, it may drive sideways.
 """
 
 from __future__ import annotations

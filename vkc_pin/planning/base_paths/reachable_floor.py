@@ -1,8 +1,7 @@
 """Finds floor that the base certainly cannot reach at any heading.
 
-Whatever its heading, the base covers a disc around a point of it. The point cannot be within the
-disc's radius of an obstacle. A cell counts as blocked only if all of it is; no motion reaches the
-cells that a flood fill over the others, including diagonal neighbours, does not reach.
+Whatever its heading, the base covers a disc around its origin, which no obstacle may enter. A cell
+is blocked only if all of it is; a flood fill over the others finds what can be reached.
 """
 
 from __future__ import annotations

@@ -1,11 +1,8 @@
 """Computes the shortest paths of a car that drives forwards and backwards, in closed form.
 
 J. A. Reeds and L. A. Shepp, Optimal paths for a car that goes both forwards and backwards, Pacific
-Journal of Mathematics 145 (2), 1990: they are among 48 words of at most five pieces, arcs of the
-smallest radius and straight lines. Each formula gives the pieces of some (8.1 to 8.4 and 8.7 to
-8.11); time reversal, mirroring and reversed order give the others. The formulas are compiled
-(`reeds_shepp.hpp`), since a search for initial guesses needs thousands of lengths. Goals are
-relative to the start, in units of the radius.
+Journal of Mathematics 145 (2), 1990 (formulas 8.1 to 8.4 and 8.7 to 8.11). They are compiled, since
+a search for initial guesses needs thousands of lengths. Goals are relative to the start, in radii.
 """
 
 from __future__ import annotations

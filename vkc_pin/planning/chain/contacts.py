@@ -1,8 +1,7 @@
-"""Computes signed distances of collision pairs (coal) and witness planes, linearising eqs. 6 and 7.
+"""Computes signed distances of collision pairs and witness planes, linearising eqs. 6 and 7.
 
-For a pair (A, B) coal gives the witness points a, b and the normal n of the signed distance d =
-n·(b − a). With a fixed in body A, b in body B and n in the world, n·(b(z) − a(z)) is smooth in z,
-and its value and gradient equal those of the signed distance at the linearisation point. It is
+For a pair (A, B) coal gives witness points a, b and the normal n of the distance n·(b − a). With a
+fixed in A, b in B and n in the world, n·(b(z) − a(z)) has the distance's value and gradient, and is
 linear in the joint placements: C·vec(M(z)) − R.
 """
 

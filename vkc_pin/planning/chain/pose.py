@@ -1,8 +1,8 @@
 """Builds symbolic residuals between placements: h_chain of eq. 2 and f_task of eq. 3.
 
-There are four kinds of goals: "pose" prescribes the whole placement; "point" only the translation;
-"level" the direction of the world's vertical seen from the frame, at any position and heading;
-"upright" that and the translation.
+There are four kinds of goals: "pose" prescribes the placement; "point" only the translation;
+"level" the direction of the world's vertical seen from the frame; "upright" that and the
+translation.
 """
 
 from __future__ import annotations

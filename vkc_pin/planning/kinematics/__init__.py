@@ -1,12 +1,10 @@
 """Provides Pinocchio's algorithms as CasADi functions of a model's q, v and a.
 
-Every function here takes a numeric `pinocchio.Model` and returns a `casadi.Function` built from SX
-expressions, with exact derivatives of any order. q is Pinocchio's configuration (a planar joint has
-x, y, cos θ, sin θ); v and a are in its tangent space. Entries that vanish at every configuration
-are structural zeros of the result.
-
-If upstream's `pinocchio.casadi` can be imported (conda-forge), it builds the functions; otherwise a
-small module does, which is compiled when this package is installed.
+Every function takes a numeric `pinocchio.Model` and returns a `casadi.Function` of SX expressions.
+q is Pinocchio's configuration (a planar joint has x, y, cos θ, sin θ); v and a are in its tangent
+space. Entries that vanish at every configuration are structural zeros. Upstream's
+`pinocchio.casadi` builds the functions if it can be imported, otherwise a small compiled module;
+`BuildError` says if that is missing or does not fit the installed packages.
 """
 
 from __future__ import annotations
@@ -67,9 +65,6 @@ def joint_placements(model: pin.Model) -> casadi.Function:
         q, shape (nq, 1) → M, shape (12, njoints - 1). Column i belongs to joint i + 1 (the universe
         is omitted) and stacks the columns of the rotation matrix and the translation [m]: [R[:, 0];
         R[:, 1]; R[:, 2]; t].
-
-    Raises:
-        BuildError: The compiled module is missing or does not fit the installed packages.
     """
     return _get_backend()("joint_placements", _round_quarter_turns(model))
 
@@ -87,7 +82,6 @@ def frame_placements(model: pin.Model, frames: Sequence[str | int]) -> casadi.Fu
     Raises:
         UnknownNameError: The model has no such frame.
         InputError: Several different frames of the model have this name.
-        BuildError: The compiled module is missing or does not fit the installed packages.
     """
     listed: tuple[Any, ...] = check_list(
         [frames] if isinstance(frames, str) else frames, "frames", "a list of frames"
@@ -117,7 +111,6 @@ def frame_jacobian(
     Raises:
         UnknownNameError: The model has no such frame, or there is no such reference.
         InputError: Several different frames of the model have this name.
-        BuildError: The compiled module is missing or does not fit the installed packages.
     """
     check_choice(reference, _REFERENCE_FRAMES, "reference", "reference")
     index = _find_frame(model, frame, "frame")
@@ -135,9 +128,6 @@ def rnea(model: pin.Model) -> casadi.Function:
     Returns:
         q, shape (nq, 1), v [rad/s, m/s] and a [rad/s², m/s²], shape (nv, 1) → tau [N·m, N], shape
         (nv, 1).
-
-    Raises:
-        BuildError: The compiled module is missing or does not fit the installed packages.
     """
     return _get_backend()("rnea", _round_quarter_turns(model))
 
@@ -150,9 +140,6 @@ def center_of_mass(model: pin.Model) -> casadi.Function:
 
     Returns:
         q, shape (nq, 1) → com [m] in the world frame, shape (3, 1).
-
-    Raises:
-        BuildError: The compiled module is missing or does not fit the installed packages.
     """
     return _get_backend()("center_of_mass", _round_quarter_turns(model))
 

@@ -1,7 +1,4 @@
-"""Builds CasADi functions of Pinocchio's algorithms with one of two backends.
-
-These are the compiled module `_cpin` and upstream's `pinocchio.casadi`.
-"""
+"""Builds CasADi functions of Pinocchio's algorithms with `_cpin` or `pinocchio.casadi`."""
 
 from __future__ import annotations
 

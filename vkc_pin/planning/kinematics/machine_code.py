@@ -1,7 +1,6 @@
 """Compiles CasADi functions in the background; results equal the interpreter's bit for bit.
 
-Callers never wait for a compiler and never fail without one: until a library is available, the
-functions are interpreted.
+Until a library is available, or without a compiler, functions are interpreted.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 The cheapest path among all moves not known to be blocked is checked, from the goal on, and its
 blocked moves are removed, until a path is free (LazySP, Dellin and Srinivasa 2016). Compiled code
-(`_driving.cpp`) repairs the path after each change (LPA*). SciPy's `dijkstra` takes about 20
-times as long, which would multiply the planning time of homes. Results of earlier searches in the same grid
-are reused and make no difference.
+(`_driving.cpp`) repairs the path after each change (LPA*). SciPy's `dijkstra` takes about 20 times
+as long, which would multiply the planning time of homes. Results of earlier searches in the same
+grid are reused and make no difference.
 """
 
 from __future__ import annotations

@@ -124,19 +124,6 @@ def test_equal_random_seeds_give_equal_guesses_and_several_differ() -> None:
     assert not np.array_equal(guesses("interpolated", 1)[0].z, found[0].z)
 
 
-@pytest.mark.parametrize("deviation", [0.05, 0.2])
-def test_perturbation_is_smooth_noise_of_the_robot(deviation: float) -> None:
-    plain, noisy = (
-        next(initialize(problem(), "stationary", 0, perturbation=each)).z
-        for each in (0.0, deviation)
-    )
-    noise = (noisy - plain)[:, :9]
-    np.testing.assert_array_equal(noisy[:, 9:], plain[:, 9:])
-    assert 0.3 * deviation < np.sqrt(np.mean(noise**2)) < 2.0 * deviation
-    steps = np.diff(np.vstack([np.zeros(9), noise, np.zeros(9)]), axis=0)
-    assert np.abs(np.diff(steps, axis=0)).max() < 0.5 * np.abs(noise).max()
-
-
 def test_stationary_guesses_move_the_base_straight_or_not_at_all() -> None:
     still, *others = (guess.z for guess in guesses("stationary"))
     assert len(others) == 4

@@ -325,7 +325,7 @@ def test_free_objects_are_grasped_at_their_resting_poses() -> None:
         ("approach stick.grip", aside, (ends[4] - APPROACH,), "pose"),
     ]
     assert problem.transcription.structure.stops == (ends[0], ends[2])
-    assert not any(problem.closed(phase) for phase in problem.task.phases)
+    assert not any(problem.is_closed(phase) for phase in problem.task.phases)
 
 
 def test_initially_held_object_stays_in_the_hand(fetching: TrajectoryProblem) -> None:

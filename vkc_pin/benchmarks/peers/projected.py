@@ -42,7 +42,7 @@ def plan_by_projection(
     goals = sample_goals(problem, np.random.default_rng([seed, 1]), _ENDS)
     if not len(goals):
         return PeerResult(status="no configuration at the goal")
-    held = problem.closed(problem.task.phases[0])
+    held = problem.is_closed(problem.task.phases[0])
     with tempfile.TemporaryDirectory() as folder:
         files = describe(problem, Path(folder), inflated=True)
         scene = core.Scene("chain", core.loadUrdfSceneDescription(str(files.urdf)))

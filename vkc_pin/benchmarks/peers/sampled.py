@@ -56,7 +56,7 @@ def plan_by_sampling(
     goals = sample_goals(problem, np.random.default_rng([seed, 1]), _ENDS)
     if not len(goals):
         return PeerResult(status="no configuration at the goal")
-    scale, held = problem.chain.metric, problem.closed(problem.task.phases[0])
+    scale, held = problem.chain.metric, problem.is_closed(problem.task.phases[0])
     size, middle = problem.chain.size, 1
     lower, upper = compute_finite_limits(problem)
     space = ob.RealVectorStateSpace(size)

@@ -123,7 +123,7 @@ def sample_goals(problem: TrajectoryProblem, rng: np.random.Generator, most: int
 
 def find_exact_start(problem: TrajectoryProblem) -> Floats:
     """Return the start with an exact closure, shape (n,)."""
-    if not problem.closed(problem.task.phases[0]):
+    if not problem.is_closed(problem.task.phases[0]):
         return problem.start
     found, _ = _exact(problem, problem.start[None], 0)
     return np.asarray(found[0])

@@ -62,7 +62,7 @@ def diagnose_paths(
             for v in report.violations
         )
         begin = end
-        if problem.closed(phase) or not (own or is_hit):
+        if problem.is_closed(phase) or not (own or is_hit):
             lines += own
             continue
         goals, where = _find_base_goals(problem, number, last, random_seed)

@@ -117,7 +117,7 @@ class BeamSearch:
         backwards = backwards and not any(map(self.sampler.is_closed_at, chosen))
         mode = _Mode(thorough, backwards, keep_headings)
         found = SearchResult(problem.start[None, None, :], np.zeros(1), np.zeros(1), [0])
-        closed = [problem.closed(phase) for phase in problem.task.phases]
+        closed = [problem.is_closed(phase) for phase in problem.task.phases]
         number = 0
         while number < len(closed):
             last = number
@@ -143,7 +143,7 @@ class BeamSearch:
         return bool(found.collision_cost[best] <= _ACCEPTABLE_COST) and not has_jumps
 
     def _is_closed(self, phase: int) -> bool:
-        return self.problem.closed(self.problem.task.phases[phase])
+        return self.problem.is_closed(self.problem.task.phases[phase])
 
     def _place_keyframes(self, phase: int) -> list[int]:
         """Return the waypoints of a phase's keyframes."""

@@ -167,7 +167,7 @@ class Interpolator:
         ):
             inside = [k for k, waypoint in enumerate(at) if begin <= waypoint <= end]
             rows = z[begin:end]
-            if problem.closed(phase):
+            if problem.is_closed(phase):
                 self._fill_straight(rows, keyframes[inside], [at[k] - begin for k in inside])
                 path = (
                     self.paths.find_constrained_path(number, keyframes[inside], rows)

@@ -180,7 +180,7 @@ class KeyframeSampler:
     def is_closed_at(self, waypoint: int) -> bool:
         """Return whether the chain is closed in the phase of a waypoint."""
         phase = self.problem.contacts.find_phase(waypoint)
-        return self.problem.closed(self.problem.task.phases[phase])
+        return self.problem.is_closed(self.problem.task.phases[phase])
 
     def push_clear(self, z: Floats, waypoint: int) -> Floats:
         """Push configurations, shape (B, n), out of collision, which may fail."""

@@ -76,7 +76,7 @@ def has_arm_detour(problem: TrajectoryProblem, z: Floats) -> bool:
     size, metric = problem.chain.robot.coordinates.size, problem.chain.metric
     rows = problem.waypoints(z)[:, :size]
     spans = zip(problem.task.phases, itertools.pairwise([0, *problem.ends.tolist()]), strict=True)
-    paths = [rows[begin : end + 1] for phase, (begin, end) in spans if not problem.closed(phase)]
+    paths = [rows[begin : end + 1] for phase, (begin, end) in spans if not problem.is_closed(phase)]
     return any(_compute_detour(path, metric[:size]) > _MAX_DETOUR for path in paths)
 
 

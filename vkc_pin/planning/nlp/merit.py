@@ -56,33 +56,25 @@ class Infeasibility:
     @property
     def max_violation(self) -> float:
         """Largest violation of one kind at a waypoint, except clearance."""
-        return float(
-            np.max([amount for kind, amount in self.amounts.items() if kind != "clearance"])
-        )
+        others = [amount for kind, amount in self.amounts.items() if kind != "clearance"]
+        return float(np.max(others))
 
 
 def compute_shortfalls(contacts: Contacts, segments: int, slots: int) -> Floats:
     """Return the clearance shortfall of the pairs with witness planes, shape (N, K) [m]."""
-    plane = contacts.slot
-    has_plane = plane < slots
-    shortfalls = np.zeros((segments, slots))
-    shortfalls[contacts.waypoint[has_plane], plane[has_plane]] = np.maximum(
-        contacts.margin[has_plane] - contacts.distance[has_plane], 0.0
-    )
+    shortfalls, slot = np.zeros((segments, slots)), contacts.slot
+    near = slot < slots
+    amounts = np.maximum((contacts.margin - contacts.distance)[near], 0.0)
+    shortfalls[contacts.waypoint[near], slot[near]] = amounts
     return shortfalls
 
 
 def measure_infeasibility(
     problem: TrajectoryProblem, z: Floats, timing: Timing, contacts: Contacts, *, rates: bool
 ) -> Infeasibility:
-    """Return the constraint violations at z_1..z_N, shape (N, n).
+    """Return the constraint violations at z_1..z_N, shape (N, n), with their contacts.
 
-    Args:
-        problem: The planning problem.
-        z: The waypoints.
-        timing: Step durations.
-        contacts: Close pairs at the waypoints.
-        rates: Whether velocity and acceleration limits count.
+    Velocity and acceleration limits count only with `rates`.
     """
     t = problem.transcription
     amounts = {kind: np.zeros(len(z)) for kind in ("poses", "rolling", "clamped", "terms", "rates")}
@@ -92,14 +84,10 @@ def measure_infeasibility(
     for k, goal in enumerate(problem.pose_goals):
         if goal.row.waypoints:
             at = np.array(goal.row.waypoints) - 1
-            pose_offsets[at, k] = compute_pose_offsets(
-                goal.row.kind,
-                *goal.row.compute_placements(rotations[at], translations[at]),
-                goal.target,
-            )
-    amounts["poses"] = np.linalg.norm(pose_offsets[:, :, :3], axis=2).sum(axis=1) + pose_offsets[
-        :, :, 6
-    ].sum(axis=1)
+            placements = goal.row.compute_placements(rotations[at], translations[at])
+            pose_offsets[at, k] = compute_pose_offsets(goal.row.kind, *placements, goal.target)
+    distances = np.linalg.norm(pose_offsets[:, :, :3], axis=2)
+    amounts["poses"] = distances.sum(axis=1) + pose_offsets[:, :, 6].sum(axis=1)
     excess = problem.excess(z, timing, rates=rates)
     for kind, scale in problem.row_kinds.items():
         np.add.at(amounts[kind], t.row_waypoints, scale * np.abs(excess))
@@ -134,11 +122,8 @@ class Merit:
 
     def increase_weights(self, infeasibility: Infeasibility, tolerance: float) -> bool:
         """Increase the weights of kinds violated by more than `tolerance`; return whether any."""
-        violated = [
-            kind
-            for kind in self.weights
-            if infeasibility.amounts[kind].max(initial=0.0) > tolerance
-        ]
+        amounts = infeasibility.amounts
+        violated = [kind for kind in self.weights if amounts[kind].max(initial=0.0) > tolerance]
         for kind in violated:
             self.weights[kind] *= GROWTH
         return bool(violated)

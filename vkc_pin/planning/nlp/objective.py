@@ -19,11 +19,7 @@ SMOOTHING_LENGTH = 0.03
 def find_change_steps(stops: Sequence[int], segments: int) -> list[int]:
     """Return the step (from 0) to which each change of the step belongs, shape (N + 1 + stops,).
 
-    That is the step before the change, or the first step of a run.
-
-    Args:
-        stops: Interior waypoints at which the motion is at rest, as it is at its start and end.
-        segments: Number of steps.
+    That is the step before the change, or the first step of a run between two stops.
     """
     runs = itertools.pairwise([0, *stops, segments])
     return [max(waypoint, 1) - 1 for begin, end in runs for waypoint in range(begin, end + 1)]
@@ -56,51 +52,30 @@ class MotionCost:
         self.metric, self.smoothing, self.length = metric, smoothing, length
         self._counts = np.diff(ends, prepend=0)
         phase = np.repeat(np.arange(len(self._counts)), self._counts)
-        self._phases = (
-            phase,
-            phase[find_change_steps(stops, len(phase))],
-        )  # phases of the steps, and of their changes
+        # phases of the steps, and of their changes
+        self._phases = phase, phase[find_change_steps(stops, len(phase))]
 
     def value(self, steps: Floats, changes: Floats) -> float:
-        """Return the cost f.
-
-        Args:
-            steps: Steps δz, shape (N, n).
-            changes: Changes δδz, shape (N + 1 + number of stops, n).
-        """
+        """Return f for steps δz, shape (N, n), and changes δδz, shape (N + 1 + stops, n)."""
         energies = self._compute_energies(steps, changes)
         if not self.length:
             return float(energies.sum())
         epsilon = self._smoothing_lengths
-        return float(
-            (np.sqrt(epsilon**2 + self._counts[:, None] * energies) - epsilon)[
-                :, self._group_representatives
-            ].sum()
-        )
+        lengths = np.sqrt(epsilon**2 + self._counts[:, None] * energies) - epsilon
+        groups = np.delete(np.arange(len(self.metric)), 1)  # x represents x and y
+        return float(lengths[:, groups].sum())
 
     def weights(self, steps: Floats, changes: Floats) -> tuple[Floats, Floats]:
         """Return the weights of a quadratic model of f, for squared steps and for squared changes.
 
         The model has the value (up to a constant) and the gradient of f at the given steps, and
         bounds f from above: √q ≤ (q/√q̄ + √q̄)/2 (iteratively reweighted least squares; Hunter and
-        Lange, A tutorial on MM algorithms, 2004).
-
-        Args:
-            steps: Steps δz, shape (N, n).
-            changes: Changes δδz, shape (N + 1 + number of stops, n).
-
-        Returns:
-            Weights, shapes (N, n) and (N + 1 + number of stops, n).
+        Lange, A tutorial on MM algorithms, 2004). The weights have the shapes of the arguments.
         """
         scale = np.ones((len(self._counts), len(self.metric)))
         if self.length:
-            counts = self._counts[:, None]
-            scale = counts / (
-                2.0
-                * np.sqrt(
-                    self._smoothing_lengths**2 + counts * self._compute_energies(steps, changes)
-                )
-            )
+            counts, energies = self._counts[:, None], self._compute_energies(steps, changes)
+            scale = counts / (2.0 * np.sqrt(self._smoothing_lengths**2 + counts * energies))
         step_weights, change_weights = (scale[phase] * self.metric for phase in self._phases)
         return step_weights, self.smoothing * change_weights
 
@@ -108,11 +83,6 @@ class MotionCost:
     def _smoothing_lengths(self) -> Floats:
         """ε of each coordinate's group, shape (n,)."""
         return SMOOTHING_LENGTH * np.sqrt(self.metric)
-
-    @property
-    def _group_representatives(self) -> Ints:
-        """One coordinate of each group: x represents x and y."""
-        return np.delete(np.arange(len(self.metric)), 1)
 
     def _compute_energies(self, steps: Floats, changes: Floats) -> Floats:
         """Return E_pg of each coordinate's group (for squares, of the coordinate), shape (P, n)."""

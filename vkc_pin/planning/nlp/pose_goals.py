@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
 import pinocchio as pin
 
 from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain
 from vkc_pin.planning.chain.pose import PoseRow
+from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.phases import Task
+from vkc_pin.world.task.phases import Phase, Task
 
-__all__ = ["PoseGoal", "find_approach_waypoint", "find_chosen_freedoms", "make_pose_goals"]
+__all__ = [
+    "PoseGoal",
+    "find_approach_waypoint",
+    "find_chosen_freedoms",
+    "find_phase_spans",
+    "find_pushed_coordinates",
+    "make_pose_goals",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,76 +51,65 @@ class PoseGoal:
         return f"{self.kind} {self.about}"
 
 
+def find_phase_spans(task: Task) -> list[tuple[Phase, int, int]]:
+    """Return each phase with its first and last waypoint."""
+    ends = list(itertools.accumulate(phase.segments for phase in task.phases))
+    return list(zip(task.phases, [0, *ends[:-1]], ends, strict=True))
+
+
 def make_pose_goals(
     scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options
 ) -> tuple[PoseGoal, ...]:
-    """Return the pose goals of a task: grasps and closures, then approaches and goals of steps.
-
-    Args:
-        scene: Scene with the objects.
-        chain: Virtual kinematic chain.
-        task: Grasps and goals of each phase.
-        options: Options; the length of the straight approach.
-    """
-    goals: list[PoseGoal] = []
-    ends = np.cumsum([phase.segments for phase in task.phases])
-    starts = np.concatenate([[0], ends[:-1]])
-    for hold in task.holds:
-        closure, waypoints = chain.closures[hold], []
-        for phase, first, last in zip(task.phases, starts, ends, strict=True):
-            if hold in phase.grasps and scene.objects[hold.object].object.free:
-                row = PoseRow(closure.joint, closure.local, (int(last),))
-                goals.append(
-                    PoseGoal(row, phase.resting[hold.object], "grasp", str(hold), hold.object)
-                )
-            elif hold in phase.grasps:
-                waypoints.append(last)
-            elif hold in phase.held:
-                waypoints += range(first + 1, last + 1)
-        if waypoints and not scene.objects[hold.object].object.free:
-            row = PoseRow(closure.joint, closure.local, tuple(int(t) for t in waypoints))
-            goals.append(PoseGoal(row, closure.target, "closure", hold.object, hold.object))
-    for phase, first, last in zip(task.phases, starts, ends, strict=True):
+    """Return the pose goals of a task: grasps and closures, then approaches and goals of steps."""
+    spans = find_phase_spans(task)
+    goals = [goal for hold in task.holds for goal in _make_grasp_goals(scene, chain, hold, spans)]
+    for phase, first, last in spans:
         # retreat from the grasp, straight back along the approach direction
         for hold in phase.grasps:
-            closure, target = (
-                chain.closures[hold],
-                phase.resting.get(hold.object, chain.closures[hold].target),
-            )
+            closure = chain.closures[hold]
+            target = phase.resting.get(hold.object, closure.target)
             joint, frame = chain.holder(hold)
             x, y, z = (options.approach * frame.rotation[:, 2]).tolist()
-            at = find_approach_waypoint(int(first), int(last), options)
-            if at == last:  # the phase is too short for an approach
-                continue
-            row = PoseRow(closure.joint, closure.local, (at,), shift=(joint, (x, y, z)))
-            goals.append(PoseGoal(row, target, "approach", str(hold), hold.object))
+            at = find_approach_waypoint(first, last, options)
+            if at < last:  # otherwise the phase is too short for an approach
+                row = PoseRow(closure.joint, closure.local, (at,), shift=(joint, (x, y, z)))
+                goals.append(PoseGoal(row, target, "approach", str(hold), hold.object))
         for hold, ride in {ride.hold: ride for ride in phase.supported}.items():
             carrier = scene.objects[hold.object].object
             if carrier.free:
-                row = PoseRow(
-                    *chain.frame(carrier.base_link, hold),
-                    tuple(range(int(first) + 1, int(last) + 1)),
-                    "level",
-                )
-                goals.append(
-                    PoseGoal(row, ride.carrier_placement, "level", hold.object, hold.object)
-                )
+                waypoints = tuple(range(first + 1, last + 1))
+                row = PoseRow(*chain.frame(carrier.base_link, hold), waypoints, "level")
+                level = ride.carrier_placement
+                goals.append(PoseGoal(row, level, "level", hold.object, hold.object))
         for goal in phase.frames:
-            row = PoseRow(
-                *chain.frame(goal.frame, goal.hold, opening=phase.opening), (int(last),), goal.kind
-            )
+            frame = chain.frame(goal.frame, goal.hold, opening=phase.opening)
+            row = PoseRow(*frame, (last,), goal.kind)
             goals.append(PoseGoal(row, goal.placement, "goal", str(goal)))
     return tuple(goals)
 
 
-def find_approach_waypoint(first: int, last: int, options: Options) -> int:
-    """Return the waypoint at which the straight approach to a grasp begins.
+def _make_grasp_goals(
+    scene: Scene, chain: VirtualKinematicChain, hold: Hold, spans: list[tuple[Phase, int, int]]
+) -> list[PoseGoal]:
+    """Return the goals of the grasps of a free object, or the closure of another one."""
+    closure, waypoints, goals = chain.closures[hold], list[int](), list[PoseGoal]()
+    is_free, name = scene.objects[hold.object].object.free, hold.object
+    for phase, first, last in spans:
+        if hold in phase.grasps and is_free:
+            row = PoseRow(closure.joint, closure.local, (last,))
+            goals.append(PoseGoal(row, phase.resting[name], "grasp", str(hold), name))
+        elif hold in phase.grasps:
+            waypoints.append(last)
+        elif hold in phase.held:
+            waypoints += range(first + 1, last + 1)
+    if waypoints and not is_free:
+        row = PoseRow(closure.joint, closure.local, tuple(waypoints))
+        goals.append(PoseGoal(row, closure.target, "closure", name, name))
+    return goals
 
-    Args:
-        first: First waypoint of the phase.
-        last: Last waypoint of the phase, at which the hand grasps.
-        options: Options; the duration of the approach.
-    """
+
+def find_approach_waypoint(first: int, last: int, options: Options) -> int:
+    """Return the waypoint at which the straight approach to a grasp at waypoint `last` begins."""
     return max(first + 1, last - options.steps(options.approach_time))
 
 
@@ -120,11 +117,9 @@ def find_pushed_coordinates(
     chain: VirtualKinematicChain, task: Task
 ) -> tuple[tuple[int, int, int, int], ...]:
     """Return (column, first waypoint, last waypoint, direction ±1) of each pushed coordinate."""
-    ends = np.cumsum([phase.segments for phase in task.phases]).tolist()
-    phases = zip(task.phases, [0, *ends[:-1]], ends, strict=True)
     return tuple(
         (chain.index(name), first, last, direction)
-        for phase, first, last in phases
+        for phase, first, last in find_phase_spans(task)
         for name, direction in phase.pushed.items()
     )
 
@@ -132,21 +127,16 @@ def find_pushed_coordinates(
 def find_chosen_freedoms(
     scene: Scene, chain: VirtualKinematicChain, task: Task
 ) -> tuple[tuple[int, int, int], ...]:
-    """Return (column, grasp waypoint, last waypoint held) of each freedom chosen when clamping.
-
-    Args:
-        scene: Scene with the objects.
-        chain: Virtual kinematic chain.
-        task: Grasps of each phase.
-    """
-    freedoms, ends = [], np.cumsum([phase.segments for phase in task.phases])
+    """Return (column, grasp waypoint, last waypoint held) of each freedom chosen when clamping."""
+    freedoms, spans = [], find_phase_spans(task)
     for hold, names in chain.virtual.items():
         attachment = scene.objects[hold.object].object.attachments[hold.attachment]
-        for number, phase in enumerate(task.phases):
-            if not attachment.firm or hold not in phase.grasps:
-                continue
-            last = number
-            while last + 1 < len(task.phases) and hold in task.phases[last + 1].held:
-                last += 1
-            freedoms += [(chain.index(name), int(ends[number]), int(ends[last])) for name in names]
+        for number, (phase, _, grasp) in enumerate(spans):
+            if attachment.firm and hold in phase.grasps:
+                last = grasp
+                for after, _, end in spans[number + 1 :]:
+                    if hold not in after.held:
+                        break
+                    last = end
+                freedoms += [(chain.index(name), grasp, last) for name in names]
     return tuple(freedoms)

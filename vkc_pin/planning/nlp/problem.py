@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 
@@ -16,6 +17,7 @@ from vkc_pin.planning.nlp.objective import MotionCost
 from vkc_pin.planning.nlp.pose_goals import (
     find_approach_waypoint,
     find_chosen_freedoms,
+    find_phase_spans,
     find_pushed_coordinates,
     make_pose_goals,
 )
@@ -115,18 +117,20 @@ class TrajectoryProblem:
 
     def _make_structure(self, terms: tuple[TermRow, ...]) -> Structure:
         """Return the structure of the program: pose goals, stops, clamped coordinates, etc."""
-        o = self.options
+        o, spans = self.options, find_phase_spans(self.task)
         # Clamped freedoms are constant from the start of the straight approach, because the hand
         # already has to be where it will close.
-        starts = np.concatenate([[0], self.ends[:-1]])
-        phase_starts = {int(end): int(start) for start, end in zip(starts, self.ends, strict=True)}
+        starts = {end: start for _, start, end in spans}
         clamped = tuple(
-            (column, find_approach_waypoint(phase_starts[grasp], grasp, o), last)
+            (column, find_approach_waypoint(starts[grasp], grasp, o), last)
             for column, grasp, last in self.choices
         )
         # The robot is at rest while its gripper closes or opens.
-        phases = zip(self.ends[:-1], self.task.phases[:-1], self.task.phases[1:], strict=True)
-        stops = tuple(int(end) for end, phase, after in phases if phase.grasps or after.released)
+        stops = tuple(
+            end
+            for (phase, _, end), (after, _, _) in itertools.pairwise(spans)
+            if phase.grasps or after.released
+        )
         return Structure(
             model=self.chain.model,
             segments=self.segments,
@@ -147,8 +151,8 @@ class TrajectoryProblem:
         coordinates = self.chain.coordinates  # the displacements of coupled joints add up
         metric = metric * coordinates.turns**2 + o.velocity_weight_base * coordinates.lengths**2
         metric[[column for column, _, _ in self.choices]] *= _CHOSEN_FREEDOM_WEIGHT
-        stops = self.transcription.structure.stops
         smoothing, length = o.acceleration_weight / o.dt**2, o.objective == "path_length"
+        stops = self.transcription.structure.stops
         return MotionCost(metric, smoothing, self.ends, stops, length=length)
 
     def _make_start(self) -> Floats:
@@ -156,64 +160,50 @@ class TrajectoryProblem:
         start[: len(self.scene.start)] = self.scene.start
         for name, value in self.task.state.items():
             start[self.chain.index(name)] = value
-        for hold in self._find_initial_holds():
+        for hold in self._continued_holds:
             names = self.scene.objects[hold.object].object.attachment(hold.attachment).coordinates
             for name, value in zip(names, hold.at, strict=True):
                 start[self.chain.index(f"{hold.object}.{name}")] = value
         return start
 
-    def _find_initial_holds(self) -> list[Hold]:
-        """Return the holds at the start that the task continues, not those it releases at once."""
+    @property
+    def _continued_holds(self) -> list[Hold]:
+        """Holds at the start that the task does not release at once."""
         return [hold for hold in self.scene.holds if hold in self.task.holds]
 
     def _make_bounds(self) -> tuple[Floats, Floats]:
         """Return the joint limits (eq. 4) per waypoint, narrowed by phases and clamped grasps."""
-        lower, upper = (
-            np.tile(self.chain.lower, (self.segments, 1)),
-            np.tile(self.chain.upper, (self.segments, 1)),
-        )
+        bounds = np.empty((self.segments, self.chain.size, 2))
+        bounds[:] = np.column_stack([self.chain.lower, self.chain.upper])
         for column, name in enumerate(self.chain.names[:3]):
-            lower[:, column], upper[:, column] = self.limits(name)
-        first = 0
-        for phase, end in zip(self.task.phases, self.ends, strict=True):
+            bounds[:, column] = self.limits(name)
+        robot = slice(self.chain.robot.coordinates.size)
+        for phase, first, end in find_phase_spans(self.task):
             inside = slice(first, end)  # row t belongs to waypoint t + 1
-            if phase.kind == "stand" and not self.closed(
-                phase
-            ):  # a released object stays where it is
-                robot_columns = slice(0, self.chain.robot.coordinates.size)
-                lower[inside, robot_columns] = upper[inside, robot_columns] = self.start[
-                    robot_columns
-                ]
+            if phase.kind == "stand" and not self.is_closed(phase):
+                bounds[inside, robot] = self.start[robot, None]  # a released object does not move
             for name, value in phase.initial_values.items():
-                column = self.chain.index(name)
-                low, high = phase.ranges.get(name, (value, value))
-                lower[inside, column], upper[inside, column] = low, high
+                low_high = phase.ranges.get(name, (value, value))
+                bounds[inside, self.chain.index(name)] = low_high
             for name, value in phase.values.items():
                 column = self.chain.index(name)
                 nearest = np.clip(value, self.chain.lower[column], self.chain.upper[column])
-                lower[end - 1, column] = upper[end - 1, column] = nearest
-            if phase.base is not None:
-                for column, goal in enumerate(phase.base):
-                    if goal is not None:
-                        # the equivalent heading nearest to the start
-                        turn = wrap_angle(goal - self.start[2])
-                        lower[end - 1, column] = upper[end - 1, column] = (
-                            self.start[2] + turn if column == 2 else goal
-                        )
-            first = end
-        for (
-            hold
-            # clamped freedoms are constant until the object is released
-        ) in self._find_initial_holds():
+                bounds[end - 1, column] = nearest
+            for column, goal in enumerate(phase.base or ()):
+                if goal is not None and column == 2:  # the equivalent heading nearest to the start
+                    goal = self.start[2] + wrap_angle(goal - self.start[2])
+                if goal is not None:
+                    bounds[end - 1, column] = goal
+        # Clamped freedoms are constant until the object is released.
+        for hold in self._continued_holds:
             if self.scene.objects[hold.object].object.attachments[hold.attachment].firm:
-                held = [hold in phase.held for phase in self.task.phases]
-                until = (
-                    int(self.ends[(held.index(False) if False in held else len(held)) - 1])
-                    if held[0]
-                    else 0
+                held = itertools.takewhile(
+                    lambda span, hold=hold: hold in span[0].held, find_phase_spans(self.task)
                 )
+                until = max((end for _, _, end in held), default=0)
                 for column in map(self.chain.index, self.chain.virtual[hold]):
-                    lower[:until, column] = upper[:until, column] = self.start[column]
+                    bounds[:until, column] = self.start[column]
+        lower, upper = bounds.transpose(2, 0, 1).copy()
         return lower, upper
 
     def timing_for(self, z: Floats) -> Timing:
@@ -221,20 +211,18 @@ class TrajectoryProblem:
 
         See `compute_step_times`. User-defined terms may require longer steps.
         """
-        structure, limits = (
-            self.transcription.structure,
-            (self.chain.velocity, self.chain.acceleration),
+        structure, path = self.transcription.structure, self.waypoints(z)
+        limits = self.chain.velocity, self.chain.acceleration
+        runs, least = (
+            split_at_stops(structure.stops, self.segments),
+            self.rolling.compute_min_times(path),
         )
-        runs = split_at_stops(structure.stops, self.segments)
-        path = self.waypoints(z)
-        dt = compute_step_times(
-            path, self.options.dt, runs, limits, self.rolling.compute_min_times(path)
-        )
-        if structure.timed:
+        dt = compute_step_times(path, self.options.dt, runs, limits, least)
+        if structure.is_timed:
             dt = self.term_evaluator.lengthen_steps(z, dt, runs)
         return Timing(dt, dt, runs, limits)
 
-    def closed(self, phase: Phase) -> bool:
+    def is_closed(self, phase: Phase) -> bool:
         """Return whether the chain is closed, by a grasp of an object fixed in the world."""
         return any(not self.scene.objects[hold.object].object.free for hold in phase.held)
 
@@ -248,10 +236,8 @@ class TrajectoryProblem:
             return float(self.start[column]), float(self.start[column])
         lower, upper = float(self.chain.lower[column]), float(self.chain.upper[column])
         if column < 2:
-            lower, upper = (
-                max(lower, self.scene.arena[2 * column]),
-                min(upper, self.scene.arena[2 * column + 1]),
-            )
+            low, high = self.scene.arena[2 * column : 2 * column + 2]
+            lower, upper = max(lower, low), min(upper, high)
         return lower, upper
 
     def unit(self, name: str) -> str:
@@ -289,12 +275,7 @@ class TrajectoryProblem:
         return *self.rates(z), self.rolling.compute_min_times(self.waypoints(z))
 
     def objective(self, z: Floats, dt: Floats) -> float:
-        """Return the cost of z_1..z_N, shape (N, n), including user-defined costs.
-
-        Args:
-            z: z_1..z_N.
-            dt: Step durations, shape (N,) [s].
-        """
+        """Return the cost of z_1..z_N, shape (N, n), with step durations dt, shape (N,) [s]."""
         return self.motion_cost.value(*self.rates(z)) + self.term_evaluator.compute_cost(z, dt)
 
     def pose_error(self, z: Floats) -> float:
@@ -313,24 +294,17 @@ class TrajectoryProblem:
     def excess(self, z: Floats, timing: Timing, *, rates: bool = False) -> Floats:
         """Return the signed bound violations of the rolling, clamping and user-defined rows.
 
-        Args:
-            z: z_1..z_N, shape (N, n).
-            timing: Step durations.
-            rates: Whether the wheel speed limits count.
+        Wheel speed limits count only with `rates`.
         """
         t = self.transcription
         if t.rows == t.first_relaxed_row:
             return np.zeros(0)
-        values = np.asarray(
-            t.relaxed_row_values(
-                t.pack(z), self.start, timing.dt, self.rolling.compute_gears(self.waypoints(z))
-            )
-        ).ravel()
-        lower, upper = (
-            bound[t.first_relaxed_row : t.rows]
-            for bound in self.row_bounds(timing if rates else None)
-        )
-        return np.asarray(values - np.clip(values, lower, upper))
+        gears = self.rolling.compute_gears(self.waypoints(z))
+        values = t.relaxed_row_values(t.pack(z), self.start, timing.dt, gears)
+        values = np.asarray(values).ravel()
+        lower, upper = self.row_bounds(timing if rates else None)
+        relaxed = slice(t.first_relaxed_row, t.rows)
+        return np.asarray(values - np.clip(values, lower[relaxed], upper[relaxed]))
 
     @cached_property
     def row_kinds(self) -> Mapping[str, Floats]:
@@ -340,10 +314,8 @@ class TrajectoryProblem:
         rolling[t.base_rows] = 1.0
         terms[self.term_evaluator.rows] = self.term_evaluator.scale
         clamped = np.where((rolling == 0.0) & (terms == 0.0), 1.0, 0.0)
-        return {
-            kind: own[t.first_relaxed_row :]
-            for kind, own in (("rolling", rolling), ("clamped", clamped), ("terms", terms))
-        }
+        kinds = {"rolling": rolling, "clamped": clamped, "terms": terms}
+        return {kind: factors[t.first_relaxed_row :] for kind, factors in kinds.items()}
 
     def drift(self, z: Floats) -> float:
         """Return the largest closure error between waypoints, relative to the tolerances.
@@ -354,10 +326,9 @@ class TrajectoryProblem:
         midpoints = (path[1:] + path[:-1]) / 2
         allowed = np.array([_TOLERANCES.closure_position, _TOLERANCES.closure_angle])
         for goal, solver in zip(self.pose_goals, self.transcription.pose_solvers, strict=True):
-            closed = np.array(
-                [t - 1 for t in goal.row.waypoints if t - 1 in goal.row.waypoints], int
-            )
-            if len(closed) and goal.kind == "closure":
+            at = goal.row.waypoints
+            closed = [t - 1 for t in at if t - 1 in at]
+            if closed and goal.kind == "closure":
                 residual, _ = solver.evaluate(midpoints[closed], goal.target)
                 amounts = np.linalg.norm(residual.reshape(len(closed), 2, 3), axis=2)
                 worst = max(worst, float((amounts / allowed).max()))
@@ -373,9 +344,8 @@ class TrajectoryProblem:
                 lower[rows], upper[rows] = ROW_BOUNDS[pose.kind]
         lower[terms.rows], upper[terms.rows] = terms.lower, terms.upper
         if not self.rolling.is_omnidirectional:
-            lower[t.base_rows], upper[t.base_rows] = t.steps.bounds(
-                None if timing is None else timing.dt
-            )
+            dt = None if timing is None else timing.dt
+            lower[t.base_rows], upper[t.base_rows] = t.steps.bounds(dt)
         if timing is not None:
             rates = np.concatenate([timing.velocity.ravel(), timing.acceleration.ravel()])
             lower, upper = np.concatenate([lower, -rates]), np.concatenate([upper, rates])

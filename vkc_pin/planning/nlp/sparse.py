@@ -16,20 +16,12 @@ __all__ = ["assemble", "make_curvature", "make_differences", "make_sparse"]
 def make_sparse(matrix: Floats) -> ca.DM:
     """Return a matrix as a sparse one without its zeros."""
     column, row = np.nonzero(matrix.T)
-    return ca.DM(
-        ca.Sparsity.triplet(*matrix.shape, row.tolist(), column.tolist()), matrix[row, column]
-    )
+    pattern = ca.Sparsity.triplet(*matrix.shape, row.tolist(), column.tolist())
+    return ca.DM(pattern, matrix[row, column])
 
 
 def assemble(parts: list[ca.MX], at: list[Ints], rows: int, columns: int) -> ca.MX:
-    """Return the sparse matrix with nonzeros `parts` at (row, column) `at`; duplicates are summed.
-
-    Args:
-        parts: Columns of nonzeros.
-        at: Rows and columns of each part, shape (2, number of nonzeros).
-        rows: Number of rows of the matrix.
-        columns: Number of its columns.
-    """
+    """Return a sparse matrix of nonzeros `parts` at (row, column) `at`; duplicates are summed."""
     positions = np.concatenate(at, axis=1)
     order = np.lexsort((positions[0], positions[1]))
     values = ca.vertcat(*parts)
@@ -39,16 +31,9 @@ def assemble(parts: list[ca.MX], at: list[Ints], rows: int, columns: int) -> ca.
     else:
         target = np.empty(len(order), int)
         target[order] = np.cumsum(is_first) - 1
-        values = (
-            ca.DM.triplet(
-                target.tolist(),
-                list(range(len(order))),
-                ca.DM.ones(len(order)),
-                int(is_first.sum()),
-                len(order),
-            )
-            @ values
-        )
+        n, columns_of_sums, ones = len(order), list(range(len(order))), ca.DM.ones(len(order))
+        sums = ca.DM.triplet(target.tolist(), columns_of_sums, ones, int(is_first.sum()), n)
+        values = sums @ values
     row, column = positions[0][order][is_first], positions[1][order][is_first]
     pointers = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=columns))])
     pattern = ca.Sparsity(rows, columns, pointers.tolist(), row.tolist())
@@ -59,33 +44,20 @@ def make_differences(segments: int, stops: Sequence[int]) -> tuple[Floats, Float
     """Return matrices D, E and vectors d, e that map z_1..z_N and z_0 to steps and their changes.
 
     D·z + d·z_0 are the steps, E·z + e·z_0 their changes: between steps, and from and to rest where
-    the motion starts, pauses and ends.
-
-    Args:
-        segments: N.
-        stops: Interior waypoints at which the motion pauses.
+    the motion starts, stops and ends.
     """
     first = np.eye(segments) - np.eye(segments, k=-1)  # δz_t = z_t − z_{t−1}
     start = np.zeros(segments)
     start[0] = -1.0
-    ends = itertools.pairwise([0, *stops, segments])
-    changes = np.vstack(
-        [
-            np.diff(np.eye(segments)[begin:end], axis=0, prepend=0.0, append=0.0)
-            for begin, end in ends
-        ]
-    )
+    runs = [np.eye(segments)[a:b] for a, b in itertools.pairwise([0, *stops, segments])]
+    changes = np.vstack([np.diff(run, axis=0, prepend=0.0, append=0.0) for run in runs])
     return first, changes @ first, start, changes @ start
 
 
 def make_curvature(parts: Sequence[Floats]) -> tuple[tuple[Ints, Ints], list[ca.DM]]:
     """Return the pattern of ∇²Σ_k Σ_r w_kr (A_k z)_r², upper triangle, and its matrices.
 
-    Args:
-        parts: The matrices A_k, shape (R_k, N) each.
-
-    Returns:
-        Rows and columns of the possible nonzeros, and for each k the matrix that maps w_k to them.
+    That is rows and columns of the nonzeros, and for each A_k the matrix that maps w_k to them.
     """
     row, column = np.triu(sum(np.abs(part).T @ np.abs(part) for part in parts)).nonzero()
     return (row, column), [make_sparse(2 * (part[:, row] * part[:, column]).T) for part in parts]

@@ -11,19 +11,19 @@ import pinocchio as pin
 from vkc_pin.errors import InputError
 from vkc_pin.planning.chain.chain import VirtualKinematicChain
 from vkc_pin.planning.chain.pose import flatten_target
+from vkc_pin.planning.nlp.pose_goals import find_phase_spans
 from vkc_pin.planning.nlp.term_rows import FrameLocation, TermLocation, TermRow, Tree, Value
 from vkc_pin.planning.nlp.transcription import Transcription
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task, summarize_phases
 from vkc_pin.world.task.terms import Cost, Term
 
 __all__ = ["TermEvaluator", "locate_terms"]
 
-_STRETCH_FACTOR, _MAX_STRETCH = (
-    1.2,
-    8.0,
-)  # Factor by which steps are lengthened at a time, and its maximum in total.
+# factor by which steps are lengthened at a time, and its maximum in total
+_STRETCH_FACTOR, _MAX_STRETCH = 1.2, 8.0
 # Scaled violation of a term that is violated by its tolerance, comparable to pose residuals.
 _TOLERANCE_SCALE = 1e-3
 
@@ -31,52 +31,38 @@ _TOLERANCE_SCALE = 1e-3
 def locate_terms(
     scene: Scene, chain: VirtualKinematicChain, task: Task, terms: Sequence[Term]
 ) -> tuple[tuple[TermRow, ...], tuple[Term, ...]]:
-    """Return the program rows of the terms that can change something in this task, and these terms.
-
-    Args:
-        scene: Scene with the objects.
-        chain: Virtual kinematic chain.
-        task: Phases of the task.
-        terms: Traced terms.
-    """
+    """Return the program rows of traced terms that can change something, and these terms."""
     locator = _FrameLocator(scene, chain, task)
     rows, used_terms = [], []
     for term in terms:
-        formula, at = term.formula, []
-        values = tuple(locator.resolve_coordinate(name) for name in formula.coordinates)
+        formula, locations = term.formula, []
         for number, (name, held) in enumerate(summarize_phases(task)):
             if not term.is_active(name, held):
                 continue
-            for waypoint in range(locator.starts[number] + 1, locator.ends[number] + 1):
-                earlier = number if waypoint - 1 > locator.starts[number] else max(number - 1, 0)
-                now = tuple(
-                    locator.locate_frame(frame, number, waypoint) for frame in formula.frames
+            _, first, last = locator.spans[number]
+            for waypoint in range(first + 1, last + 1):
+                earlier = number if waypoint - 1 > first else max(number - 1, 0)
+                now, before = (
+                    tuple(locator.locate_frame(frame, phase, t) for frame in formula.frames)
+                    for phase, t in ((number, waypoint), (earlier, waypoint - 1))
                 )
-                before = tuple(
-                    locator.locate_frame(frame, earlier, waypoint - 1) for frame in formula.frames
-                )
-                at.append(TermLocation(waypoint, now, before))
-        row = TermRow(formula, term.weight if isinstance(term, Cost) else None, values, tuple(at))
-        at = [
-            item for item in at if any(waypoint > 0 for waypoint in row.kind(item)[0])
-        ]  # others are constant
-        if at:
-            rows.append(TermRow(formula, row.weight, values, tuple(at)))
+                locations.append(TermLocation(waypoint, now, before))
+        values = tuple(locator.resolve_coordinate(name) for name in formula.coordinates)
+        weight = term.weight if isinstance(term, Cost) else None
+        row = TermRow(formula, weight, values, ())
+        # the others are constant
+        locations = [at for at in locations if any(waypoint > 0 for waypoint in row.kind(at)[0])]
+        if locations:
+            rows.append(TermRow(formula, weight, values, tuple(locations)))
             used_terms.append(term)
     return tuple(rows), tuple(used_terms)
 
 
 class _FrameLocator:
-    """Locates frames and coordinates at the waypoints of a task.
-
-    Attributes:
-        starts, ends: First and last waypoint of each phase.
-    """
+    """Locates frames and coordinates at the waypoints of a task."""
 
     def __init__(self, scene: Scene, chain: VirtualKinematicChain, task: Task) -> None:
-        self.scene, self.chain, self.phases = scene, chain, task.phases
-        self.ends = [int(end) for end in np.cumsum([phase.segments for phase in task.phases])]
-        self.starts = [0, *self.ends[:-1]]
+        self.scene, self.chain, self.spans = scene, chain, find_phase_spans(task)
 
     def resolve_coordinate(self, name: str) -> Value:
         """Return a coordinate of the scene as a column of the chain or a constant."""
@@ -89,35 +75,33 @@ class _FrameLocator:
     def locate_frame(self, frame: str, number: int, waypoint: int) -> FrameLocation:
         """Return the location of a frame at a waypoint of phase `number`."""
         owner, dot, link = frame.partition(".")
+        phase = self.spans[number][0]
         if not dot or owner not in self.scene.objects:
-            return self._locate_on_chain(
-                self.chain.frame(frame, opening=self.phases[number].opening), waypoint
-            )
-        placed, phase = self.scene.objects[owner], self.phases[number]
-        item = placed.object
-        if not item.free:  # independent of holds: if the object is held, the chain is closed
-            found = item.model.frames[item.model.getFrameId(link, pin.FrameType.BODY)]
-            values = tuple(
-                self.resolve_coordinate(f"{owner}.{name}") for name in item.coordinates.names
-            )
-            tree = Tree(item.model.saveToString(), _flatten_placement(placed.placement), values)
-            moves = found.parentJoint > 0 and any(value.column is not None for value in values)
-            return FrameLocation(
-                _flatten_placement(found.placement),
-                found.parentJoint,
-                waypoint if moves else -1,
-                tree,
-            )
+            return self._locate_on_chain(waypoint, self.chain.frame(frame, opening=phase.opening))
+        placed = self.scene.objects[owner]
+        if not placed.object.free:  # independent of holds: if it is held, the chain is closed
+            return self._locate_in_tree(placed, link, waypoint)
         hold = next((hold for hold in phase.held if hold.object == owner), None)
-        if hold is not None:
-            return self._locate_on_chain(self.chain.frame(link, hold), waypoint)
-        if owner in phase.released_by:  # the object is where the hand released it
+        if hold is None and owner in phase.released_by:  # it is where the hand released it
             hold, last = phase.released_by[owner]
-            return self._locate_on_chain(self.chain.frame(link, hold), self.ends[last])
-        stands = phase.resting.get(owner, placed.placement)
-        return FrameLocation(_flatten_placement(stands * item.link_placement(link, placed.state)))
+            waypoint = self.spans[last][2]
+        if hold is not None:
+            return self._locate_on_chain(waypoint, self.chain.frame(link, hold))
+        resting = phase.resting.get(owner, placed.placement)
+        placement = resting * placed.object.link_placement(link, placed.state)
+        return FrameLocation(_flatten_placement(placement))
 
-    def _locate_on_chain(self, at: tuple[int, pin.SE3], waypoint: int) -> FrameLocation:
+    def _locate_in_tree(self, placed: PlacedObject, link: str, waypoint: int) -> FrameLocation:
+        model = placed.object.model
+        frame = model.frames[model.getFrameId(link, pin.FrameType.BODY)]
+        names = [f"{placed.name}.{name}" for name in placed.object.coordinates.names]
+        values = tuple(map(self.resolve_coordinate, names))
+        tree = Tree(model.saveToString(), _flatten_placement(placed.placement), values)
+        moves = frame.parentJoint > 0 and any(value.column is not None for value in values)
+        at, local = waypoint if moves else -1, _flatten_placement(frame.placement)
+        return FrameLocation(local, frame.parentJoint, at, tree)
+
+    def _locate_on_chain(self, waypoint: int, at: tuple[int, pin.SE3]) -> FrameLocation:
         joint, local = at
         return FrameLocation(_flatten_placement(local), joint, waypoint if joint else -1)
 
@@ -165,17 +149,12 @@ class TermEvaluator:
     def lengthen_steps(self, z: Floats, dt: Floats, runs: Sequence[tuple[int, int]]) -> Floats:
         """Return step durations that satisfy the time-dependent constraints, as far as possible.
 
-        Args:
-            z: z_1..z_N, shape (N, n).
-            dt: Current step durations, shape (N,) [s].
-            runs: First and last waypoint of each run; all steps of a run take the same time.
+        All steps of a run, given by its first and last waypoint, take the same time.
         """
-        waypoint = np.zeros(len(self.rows), int)
-        for at in self.transcription.term_rows:
-            for number, rows in at.items():
-                waypoint[np.searchsorted(self.rows, rows)] = number
+        t = self.transcription
+        waypoint = t.row_waypoints[self.rows - t.first_relaxed_row]  # counted from 0
         for begin, end in runs:
-            depends_on_time = self._timed & (waypoint > begin) & (waypoint <= end)
+            depends_on_time = self._timed & (waypoint >= begin) & (waypoint < end)
             best, least = 1.0, np.inf
             trial, factor = dt.copy(), 1.0
             while depends_on_time.any() and factor <= _MAX_STRETCH and least > _TOLERANCE_SCALE:
@@ -188,33 +167,22 @@ class TermEvaluator:
         return dt
 
     def check(self, z: Floats, dt: Floats) -> None:
-        """Check that values and derivatives of the terms are finite at z_1..z_N.
-
-        Raises:
-            InputError: A term or its derivative is not finite.
-        """
+        """Raise an InputError unless values and derivatives of the terms are finite at z_1..z_N."""
         if not self.terms:
             return
         values, jacobian, cost, gradient = self._evaluate(z, dt)
-        row, entries = (
-            np.array(jacobian.sparsity().get_triplet()[0], int),
-            np.array(jacobian.nonzeros(), float),
-        )
+        row, _ = jacobian.sparsity().get_triplet()
         undefined_rows = ~np.isfinite(values)
-        undefined_rows[row[~np.isfinite(entries)]] = True
+        undefined_rows[np.array(row, int)[~np.isfinite(jacobian.nonzeros())]] = True
         names = {name for name, bad in zip(self._names, undefined_rows, strict=True) if bad}
         if not (np.isfinite(cost) and np.isfinite(gradient).all()):
             names |= {term.name for term in self.terms if isinstance(term, Cost)}
         if names:
-            name = min(names)
-            expected = (
-                "a smooth expression, e.g. cos(a) >= 0.98 instead of a <= 0.2, "
-                "or squares instead of roots"
-            )
             raise InputError(
                 "its value or derivative is not finite at the start",
-                field=f"terms[{name!r}].expression",
-                expected=expected,
+                field=f"terms[{min(names)!r}].expression",
+                expected="a smooth expression, e.g. cos(a) >= 0.98 instead of a <= 0.2, "
+                "or squares instead of roots",
             )
 
     def _compute_excess(self, z: Floats, dt: Floats) -> Floats:
@@ -227,9 +195,4 @@ class TermEvaluator:
     def _evaluate(self, z: Floats, dt: Floats) -> tuple[Floats, Any, float, Any]:
         x = self.transcription.pack(z)
         values, jacobian, cost, gradient = self.transcription.term_values(x, self.start, dt)
-        return (
-            np.asarray(values).ravel(),
-            jacobian,
-            float(cost),
-            np.asarray(gradient.nonzeros()),
-        )
+        return np.asarray(values).ravel(), jacobian, float(cost), np.asarray(gradient.nonzeros())

@@ -34,17 +34,11 @@ class Value:
 
 @dataclass(frozen=True)
 class Tree:
-    """The kinematic tree of an object in the world.
+    """The kinematic tree of an object in the world."""
 
-    Attributes:
-        model: Its `pinocchio.Model`, as text.
-        base: Placement of its root in the world: R column by column and p, 12 numbers.
-        values: Its minimal coordinates.
-    """
-
-    model: str
-    base: tuple[float, ...]
-    values: tuple[Value, ...]
+    model: str  # `pinocchio.Model` as text
+    base: tuple[float, ...]  # placement of its root: R column by column and p, 12 numbers
+    values: tuple[Value, ...]  # minimal coordinates
 
 
 @dataclass(frozen=True)
@@ -76,14 +70,7 @@ class TermLocation:
 
 @dataclass(frozen=True)
 class TermRow:
-    """A constraint or cost at some waypoints.
-
-    Attributes:
-        formula: Its expression.
-        weight: Weight of a cost; None for a constraint.
-        values: Coordinates that it depends on.
-        locations: Locations at the waypoints at which it depends on a variable.
-    """
+    """A constraint (without weight) or cost at the waypoints at which it depends on a variable."""
 
     formula: Formula
     weight: float | None
@@ -97,24 +84,22 @@ class TermRow:
         and the position of the previous waypoint if the formula depends on it; terms with equal
         keys share a function.
         """
-        frames = (*at.now, *(at.before if self.formula.uses_previous else ()))
+        uses_previous = self.formula.uses_previous
+        frames = (*at.now, *(at.before if uses_previous else ()))
         involved = {frame.waypoint for frame in frames if frame.waypoint >= 0}
         if any(value.column is not None for value in self.values):
-            involved |= (
-                {at.waypoint, at.waypoint - 1} if self.formula.uses_previous else {at.waypoint}
-            )
+            involved |= {at.waypoint, at.waypoint - 1} if uses_previous else {at.waypoint}
         waypoints = tuple(sorted(involved))
 
         def position(waypoint: int) -> int:
             return waypoints.index(waypoint) if waypoint in waypoints else -1
 
-        now = tuple(replace(frame, waypoint=position(frame.waypoint)) for frame in at.now)
-        before = (
-            tuple(replace(frame, waypoint=position(frame.waypoint)) for frame in at.before)
-            if self.formula.uses_previous
-            else now
-        )
-        last = position(at.waypoint - 1) if self.formula.uses_previous else position(at.waypoint)
+        def relocate(frames: tuple[FrameLocation, ...]) -> tuple[FrameLocation, ...]:
+            return tuple(replace(frame, waypoint=position(frame.waypoint)) for frame in frames)
+
+        now = relocate(at.now)
+        before = relocate(at.before) if uses_previous else now
+        last = position(at.waypoint - 1 if uses_previous else at.waypoint)
         return waypoints, (TermLocation(position(at.waypoint), now, before), last)
 
 
@@ -136,74 +121,60 @@ class TermFunctions:
         waypoints: int,
         cache: Cache,
     ) -> None:
-        coordinates, formula = Coordinates(model), row.formula
-        z, dt, multipliers = (
-            ca.SX.sym("z", coordinates.size * waypoints),
-            ca.SX.sym("dt"),
-            ca.SX.sym("lam", formula.rows),
-        )
-        points = ca.vertsplit(z, coordinates.size) if waypoints else []
+        n, formula = Coordinates(model).size, row.formula
+        z, dt = ca.SX.sym("z", n * waypoints), ca.SX.sym("dt")
+        multipliers = ca.SX.sym("lam", formula.rows)
+        points = ca.vertsplit(z, n) if waypoints else []
         chain: dict[int, Any] = {}
 
         def column(frame: FrameLocation) -> Any:
             local = _to_matrix(ca.DM(frame.local))
             if frame.tree is not None:
-                return _to_column(_place_in_tree(frame, points, cache) @ local)
+                return _to_column(_place_in_tree(frame, frame.tree, points, cache) @ local)
             if frame.joint == 0:
                 return ca.DM(frame.local)
             if frame.waypoint not in chain:
-                chain[frame.waypoint] = get_kinematics(model, cache).build_placements(
-                    points[frame.waypoint]
-                )
+                kinematics = get_kinematics(model, cache)
+                chain[frame.waypoint] = kinematics.build_placements(points[frame.waypoint])
             return _to_column(_to_matrix(chain[frame.waypoint][:, frame.joint - 1]) @ local)
 
         inputs = []
         for frames, position in ((at.now, at.waypoint), (at.before, before)):
             inputs += [column(frame) for frame in frames]
-            inputs += [
-                points[position][v.column] if v.column is not None else ca.SX(v.number)
-                for v in row.values
-            ]
+            inputs += [_get_value(value, points, position) for value in row.values]
         value = formula.function(ca.vertcat(*inputs, dt))
-        jacobian, hessian = (
-            ca.jacobian(value, z),
-            ca.triu(ca.hessian(ca.dot(multipliers, value), z)[0]),
-        )
+        jacobian = ca.jacobian(value, z)
+        hessian = ca.triu(ca.hessian(ca.dot(multipliers, value), z)[0])
+        slopes, curvatures = (ca.vertcat(*part.nonzeros()) for part in (jacobian, hessian))
         options = {"cse": True}
         self.value = ca.Function("term", [z, dt], [value], options)
-        self.jacobian = ca.Function(
-            "term_jacobian", [z, dt], [ca.vertcat(*jacobian.nonzeros())], options
-        )
-        self.hessian = ca.Function(
-            "term_hessian", [z, dt, multipliers], [ca.vertcat(*hessian.nonzeros())], options
-        )
+        self.jacobian = ca.Function("term_jacobian", [z, dt], [slopes], options)
+        self.hessian = ca.Function("term_hessian", [z, dt, multipliers], [curvatures], options)
         self.jacobian_pattern = [np.array(part, int) for part in jacobian.sparsity().get_triplet()]
         self.hessian_pattern = [np.array(part, int) for part in hessian.sparsity().get_triplet()]
         self.nbytes = estimate_size(self.value, self.jacobian, self.hessian)
 
 
-def _place_in_tree(frame: FrameLocation, points: list[Any], cache: Cache) -> Any:
+def _get_value(value: Value, points: list[Any], waypoint: int) -> Any:
+    return ca.SX(value.number) if value.column is None else points[waypoint][value.column]
+
+
+def _place_in_tree(frame: FrameLocation, tree: Tree, points: list[Any], cache: Cache) -> Any:
     """Return the world placement of the joint of a frame in an object's tree, shape (4, 4)."""
-    tree = frame.tree
-    assert tree is not None
     base = _to_matrix(ca.DM(tree.base))
     if frame.joint == 0:
         return base
     model = pin.Model()
     model.loadFromString(tree.model)
-    values = [
-        points[frame.waypoint][v.column] if v.column is not None else ca.SX(v.number)
-        for v in tree.values
-    ]
+    values = [_get_value(value, points, frame.waypoint) for value in tree.values]
     placements = get_kinematics(model, cache).build_placements(ca.vertcat(*values))
     return base @ _to_matrix(placements[:, frame.joint - 1])
 
 
 def _to_matrix(column: Any) -> Any:
     """Return R (column by column) and p as a homogeneous matrix."""
-    return ca.vertcat(
-        ca.horzcat(ca.reshape(column[:9], 3, 3), column[9:]), ca.DM([[0.0, 0.0, 0.0, 1.0]])
-    )
+    top = ca.horzcat(ca.reshape(column[:9], 3, 3), column[9:])
+    return ca.vertcat(top, ca.DM([[0.0, 0.0, 0.0, 1.0]]))
 
 
 def _to_column(matrix: Any) -> Any:
@@ -229,8 +200,7 @@ class TermProgram:
         z: Any,
         dt: Any,
         cache: Cache,
-        *,
-        width: int | None = None,
+        width: int,
     ) -> None:
         """Assemble the terms.
 
@@ -240,17 +210,18 @@ class TermProgram:
             z: z_0..z_N as columns, shape (n, N + 1).
             dt: Step durations, shape (N, 1).
             cache: Cache of the functions.
-            width: Number of variables per waypoint, z first. Defaults to n.
+            width: Number of variables per waypoint, z first.
         """
-        self._n = z.shape[0]
-        self._width = width or self._n
-        self._size = (z.shape[1] - 1) * self._width
+        self._n, self._width = z.shape[0], width
+        self._size = (z.shape[1] - 1) * width
         self._hessians: list[tuple[ca.Function, list[Any], Ints, Ints, Any]] = []
         self.rows, self.rows_by_waypoint = 0, [dict[int, Ints]() for _ in terms]
         text = model.saveToString()
         self.cost: Any = ca.MX(0)
-        values, jacobians, jacobian_positions = [], [], []
-        gradients, gradient_positions, curvatures, curvature_positions = [], [], [], []
+        values = [ca.MX(0, 1)]
+        # nonzeros and positions of constraint Jacobian, cost gradient and cost Hessian
+        jacobians, gradients, curvatures = (list[tuple[Any, Ints]]() for _ in range(3))
+        row_waypoints = [np.zeros(0, int)]
         for term, rows_at in zip(terms, self.rows_by_waypoint, strict=True):
             kinds: dict[tuple[TermLocation, int], list[tuple[int, tuple[int, ...]]]] = {}
             for at in term.locations:
@@ -263,84 +234,46 @@ class TermProgram:
                     key, functools.partial(TermFunctions, model, *arguments, cache)
                 )
                 involved = np.array([waypoints for _, waypoints in locations])
-                steps = [waypoint - 1 for waypoint, _ in locations]
-                inputs = [
-                    ca.vertcat(*(z[:, columns.tolist()] for columns in involved.T)),
-                    dt[steps].T,
-                ]
+                steps = np.array([waypoint - 1 for waypoint, _ in locations])
+                points = ca.vertcat(*(z[:, columns.tolist()] for columns in involved.T))
+                inputs = [points, dt[steps.tolist()].T]
                 height, count = term.formula.rows, len(locations)
-                first = self.rows + height * np.arange(count)
+                rows = self.rows + height * np.arange(count)[:, None] + np.arange(height)
                 value = ca.vec(functions.value.map(count)(*inputs))
-                jacobian_entries = ca.vec(functions.jacobian.map(count)(*inputs))
                 row, column = functions.jacobian_pattern
-                positions = np.stack(
-                    [(first[:, None] + row).ravel(), self._find_variables(involved, column)]
+                variables = self._find_variables(involved, column)
+                slopes, positions = _select_variables(
+                    ca.vec(functions.jacobian.map(count)(*inputs)), rows[:, row].ravel(), variables
                 )
-                is_variable = positions[1] >= 0  # the others belong to the start
-                positions, jacobian_entries = (
-                    positions[:, is_variable],
-                    jacobian_entries[np.flatnonzero(is_variable).tolist()],
-                )
+                hessian = (functions.hessian, inputs, involved)
                 if term.weight is None:
                     values.append(value)
-                    jacobians.append(jacobian_entries)
-                    jacobian_positions.append(positions)
-                    rows = first[:, None] + np.arange(height)
-                    rows_at.update(zip((waypoint for waypoint, _ in locations), rows, strict=True))
-                    self._hessians.append(
-                        (functions.hessian, inputs, involved, rows, functions.hessian_pattern)
-                    )
+                    jacobians.append((slopes, positions))
+                    rows_at.update(zip(steps + 1, rows, strict=True))
+                    row_waypoints.append(np.repeat(steps, height))
+                    self._hessians.append((*hessian, rows, functions.hessian_pattern))
                     self.rows += height * count
                 else:
                     self.cost += term.weight * ca.sum1(value)
-                    gradients.append(term.weight * jacobian_entries)
-                    gradient_positions.append(np.stack([positions[1], np.zeros_like(positions[1])]))
-                    weights, pattern = ca.DM.ones(1, count) * term.weight, functions.hessian_pattern
-                    curvature, entry_positions = self._weight_hessians(
-                        functions.hessian, inputs, involved, pattern, weights
+                    positions = np.stack([positions[1], np.zeros_like(positions[1])])
+                    gradients.append((term.weight * slopes, positions))
+                    weights = ca.DM.ones(1, count) * term.weight
+                    curvatures.append(
+                        self._weight_hessians(*hessian, functions.hessian_pattern, weights)
                     )
-                    curvatures.append(curvature)
-                    curvature_positions.append(entry_positions)
-        self.row_waypoints = np.zeros(self.rows, int)
-        for waypoint, rows in (
-            (waypoint, rows)
-            for rows_at in self.rows_by_waypoint
-            for waypoint, rows in rows_at.items()
-        ):
-            self.row_waypoints[rows] = waypoint - 1
-        self.values = ca.vertcat(*values) if values else ca.MX(0, 1)
-        self.jacobian = (
-            assemble(jacobians, jacobian_positions, self.rows, self._size)
-            if jacobians
-            else ca.MX(self.rows, self._size)
-        )
-        self.gradient = (
-            assemble(gradients, gradient_positions, self._size, 1)
-            if gradients
-            else ca.MX(self._size, 1)
-        )
-        empty = ca.MX(self._size, self._size)
-        self.cost_hessian = (
-            assemble(curvatures, curvature_positions, self._size, self._size)
-            if curvatures
-            else empty
-        )
+        self.row_waypoints = np.concatenate(row_waypoints)
+        self.values = ca.vertcat(*values)
+        self.jacobian = _assemble(jacobians, self.rows, self._size)
+        self.gradient = _assemble(gradients, self._size, 1)
+        self.cost_hessian = _assemble(curvatures, self._size, self._size)
 
     def hessian(self, multipliers: Any) -> Any:
         """Return the upper triangle of the Hessian of multipliers·values."""
-        parts, at = [], []
+        parts = []
         for function, inputs, involved, rows, pattern in self._hessians:
-            row_multipliers = ca.reshape(
-                multipliers[rows.ravel().tolist()], rows.shape[1], rows.shape[0]
-            )
-            part, positions = self._weight_hessians(
-                function, inputs, involved, pattern, row_multipliers
-            )
-            parts.append(part)
-            at.append(positions)
-        return (
-            assemble(parts, at, self._size, self._size) if parts else ca.MX(self._size, self._size)
-        )
+            own = ca.reshape(multipliers[rows.ravel().tolist()], *rows.shape[::-1])
+            parts.append(self._weight_hessians(function, inputs, involved, pattern, own))
+        return _assemble(parts, self._size, self._size)
 
     def _weight_hessians(
         self,
@@ -349,19 +282,24 @@ class TermProgram:
         involved: Ints,
         pattern: Any,
         multipliers: Any,
-    ) -> Any:
-        """Return the nonzeros of the Hessians of all waypoints of a kind, and their positions.
-
-        Entries that belong to the start are omitted.
-        """
+    ) -> tuple[Any, Ints]:
+        """Return nonzeros and positions of the Hessians of all waypoints of a kind."""
         part = ca.vec(function.map(len(involved))(*inputs, multipliers))
-        row, column = (self._find_variables(involved, index) for index in pattern)
-        is_variable = (row >= 0) & (column >= 0)
-        return part[np.flatnonzero(is_variable).tolist()], np.stack(
-            [row[is_variable], column[is_variable]]
-        )
+        return _select_variables(part, *(self._find_variables(involved, k) for k in pattern))
 
     def _find_variables(self, involved: Ints, index: Ints) -> Ints:
         """Return the variables of entries `index` of z for all waypoints of a kind; -1: start."""
         waypoint, coordinate = involved[:, index // self._n], index % self._n
         return np.where(waypoint > 0, (waypoint - 1) * self._width + coordinate, -1).ravel()
+
+
+def _select_variables(nonzeros: Any, row: Ints, column: Ints) -> tuple[Any, Ints]:
+    """Return nonzeros and their positions, without those of the start."""
+    at = np.flatnonzero((row >= 0) & (column >= 0))
+    return nonzeros[at.tolist()], np.stack([row[at], column[at]])
+
+
+def _assemble(parts: list[tuple[Any, Ints]], rows: int, columns: int) -> Any:
+    if not parts:
+        return ca.MX(rows, columns)
+    return assemble([part for part, _ in parts], [at for _, at in parts], rows, columns)

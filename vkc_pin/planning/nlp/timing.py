@@ -44,41 +44,31 @@ class Timing:
     @cached_property
     def acceleration(self) -> Floats:
         """Bounds of the changes δδz, shape (N + 1 + stops, n): acceleration limits times dt²."""
-        row_durations = np.concatenate(
-            [np.full(last - first + 1, self.dt[first]) for first, last in self.runs]
-        )
+        runs = [np.full(last - first + 1, self.dt[first]) for first, last in self.runs]
+        row_durations = np.concatenate(runs)
         return np.asarray(self.limits[1] * row_durations[:, None] ** 2)
 
     def compute_violation(
         self, first: Floats, second: Floats, needed: Floats | float = 0.0
     ) -> float:
-        """Return the largest bound violation of steps and their changes, relative to the bounds.
+        """Return the largest bound violation of a `pace`, relative to the bounds.
 
         Args:
             first: Steps δz, shape (N, n); see `TrajectoryProblem.pace`.
             second: Changes δδz, shape (N + 1 + stops, n).
             needed: Minimum duration of each step for other reasons, shape (N,) [s].
         """
-        velocity_ratio, acceleration_ratio = (
-            np.max(np.abs(first) / self.velocity),
-            np.max(np.abs(second) / self.acceleration),
-        )
+        velocity_ratio = np.max(np.abs(first) / self.velocity)
+        acceleration_ratio = np.max(np.abs(second) / self.acceleration)
         return float(max(velocity_ratio, acceleration_ratio, np.max(needed / self.dt)) - 1.0)
 
     def stretch(self, first: Floats, second: Floats, needed: Floats | float = 0.0) -> Timing:
-        """Return a timing with longer steps in the runs that exceed a bound.
+        """Return a timing with longer steps in runs whose `pace` exceeds a bound.
 
-        Args:
-            first: Steps δz, shape (N, n); see `TrajectoryProblem.pace`.
-            second: Changes δδz, shape (N + 1 + stops, n).
-            needed: Minimum duration of each step for other reasons, shape (N,) [s].
-
-        Returns:
-            The timing, in which no step takes more than `_MAX_STRETCH` times `least`.
+        No step takes more than `_MAX_STRETCH` times `least`.
         """
-        velocity_ratios = np.maximum(
-            np.max(np.abs(first) / self.velocity, axis=1), needed / self.dt
-        )
+        velocity_ratios = np.max(np.abs(first) / self.velocity, axis=1)
+        velocity_ratios = np.maximum(velocity_ratios, needed / self.dt)
         acceleration_ratios = np.max(np.abs(second) / self.acceleration, axis=1)
         dt = self.dt.copy()
         for number, (begin, end) in enumerate(self.runs):
@@ -118,12 +108,9 @@ def compute_step_times(
     times, least = np.full(len(steps), dt), np.zeros(len(steps)) if least is None else least
     for first, last in runs:
         distance = steps[first:last].sum(axis=0)
-        velocity_time, acceleration_time = (
-            np.max(1.5 * distance / velocity),
-            np.sqrt(np.max(6.0 * distance / acceleration)),
-        )
+        velocity_time = np.max(1.5 * distance / velocity)
+        acceleration_time = np.sqrt(np.max(6.0 * distance / acceleration))
         duration = max(velocity_time, acceleration_time, 1.5 * least[first:last].sum())
-        times[first:last] = np.maximum(
-            times[first:last], _DURATION_MARGIN * duration / (last - first)
-        )
+        step_time = _DURATION_MARGIN * duration / (last - first)
+        times[first:last] = np.maximum(times[first:last], step_time)
     return times

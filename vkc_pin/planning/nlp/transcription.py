@@ -250,14 +250,14 @@ class Transcription:
 
     def _append_term_rows(self) -> None:
         """Append the user-defined constraints and add the user-defined costs to the objective."""
-        dt = self.dt if self.structure.timed else ca.MX.zeros(self.segments)
+        dt = self.dt if self.structure.is_timed else ca.MX.zeros(self.segments)
         part = TermProgram(
             self.structure.model,
             self.structure.terms,
             ca.horzcat(self.start, self.z),
             dt,
             self.cache,
-            width=self.width,
+            self.width,
         )
         self.term_rows = [
             {waypoint: self.rows + rows for waypoint, rows in at.items()}
@@ -295,7 +295,7 @@ class Transcription:
         }
         if not self.structure.rolling.is_omnidirectional:
             self.parameter_symbols["gears"] = self.gears
-        if self.structure.timed:
+        if self.structure.is_timed:
             self.parameter_symbols["dt"] = self.dt
         self.parameters = ca.veccat(*self.parameter_symbols.values())
 

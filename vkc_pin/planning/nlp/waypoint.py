@@ -61,7 +61,7 @@ class Structure:
     terms: tuple[TermRow, ...] = ()
 
     @property
-    def timed(self) -> bool:
+    def is_timed(self) -> bool:
         """Whether any term depends on the step duration."""
         return any(term.formula.uses_time_step for term in self.terms)
 

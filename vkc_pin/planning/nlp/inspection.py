@@ -31,8 +31,7 @@ class Plane:
     """The witness plane of a pair at a waypoint, which models their distance (eqs. 6 and 7).
 
     Attributes:
-        problem: The program.
-        contacts: Collision model of the motion that the plane belongs to.
+        problem, contacts: The program, and the collision model of the motion.
         waypoint: Waypoint, counted from 1.
         names: The two links or obstacles.
         pair: Their geometries, shape (2,).
@@ -56,13 +55,9 @@ class Plane:
 
     def values(self, z: Floats) -> Floats:
         """Return the distance predicted by the plane at z, shape (W, n): shape (W,) [m]."""
-        rotations, translations = self.problem.chain.joint_placements(z)
-        columns = np.concatenate(
-            [rotations[:, 1:].swapaxes(2, 3), translations[:, 1:, None]], axis=2
-        )
-        return np.asarray(
-            self.margin + columns.reshape(len(z), -1) @ self.coefficients - self.offset
-        )
+        R, p = (part[:, 1:] for part in self.problem.chain.joint_placements(z))
+        columns = np.concatenate([R.swapaxes(2, 3), p[:, :, None]], axis=2).reshape(len(z), -1)
+        return np.asarray(self.margin + columns @ self.coefficients - self.offset)
 
     def distances(self, z: Floats) -> Floats:
         """Return the distance from coal at z, shape (W, n): shape (W,) [m]; NaN if out of reach."""
@@ -81,10 +76,8 @@ def planes(problem: TrajectoryProblem, z: Floats, waypoint: int) -> list[Plane]:
         z: z_1..z_N, shape (N, n).
         waypoint: Waypoint, counted from 1.
     """
-    t, labels = (
-        problem.transcription,
-        problem.contacts.phases[problem.contacts.find_phase(waypoint)].labels,
-    )
+    t, phase = problem.transcription, problem.contacts.find_phase(waypoint)
+    labels = problem.contacts.phases[phase].labels
     model = problem.contacts.with_released_objects(z)
     waypoints = np.arange(1, problem.segments + 1)
     contacts = model.evaluate(z, waypoints, reach=problem.options.contact_reach, nearest=t.slots)
@@ -132,14 +125,15 @@ def sizes(problem: TrajectoryProblem) -> dict[str, int]:
     for goal, at in zip(problem.pose_goals, t.pose_rows, strict=True):
         kind = f"rows: {goal.name}"
         counts[kind] = counts.get(kind, 0) + sum(len(rows) for rows in at.values())
-    counts["rows: witness planes"] = t.slot_rows.size
-    counts["rows: rolling"] = len(t.base_rows)
-    counts["rows: clamped freedoms"] = sum(last - first for _, first, last in t.structure.clamped)
-    counts["rows: pushes"] = len(t.pushed_rows)
-    counts["rows: user-defined constraints"] = len(problem.term_evaluator.rows)
-    counts["only if needed: velocities"] = first.size
-    counts["only if needed: accelerations"] = second.size
-    return counts
+    return counts | {
+        "rows: witness planes": t.slot_rows.size,
+        "rows: rolling": len(t.base_rows),
+        "rows: clamped freedoms": sum(last - first for _, first, last in t.structure.clamped),
+        "rows: pushes": len(t.pushed_rows),
+        "rows: user-defined constraints": len(problem.term_evaluator.rows),
+        "only if needed: velocities": first.size,
+        "only if needed: accelerations": second.size,
+    }
 
 
 def patterns(problem: TrajectoryProblem) -> tuple[Any, Any]:

@@ -37,14 +37,12 @@ class Transcription:
     """Symbols, functions and Ipopt solvers of the program of one `Structure`, reused between tasks.
 
     Attributes:
-        structure: Structure that the program was built for.
         n, segments, slots: Sizes n, N and K.
         width, size: Number of variables per waypoint, n + K + 1, and in total, N·(n + K + 1).
         rows: Number of constraint rows without the rate rows.
         slot_rows: Rows of the witness planes, shape (N, K).
         pose_rows: For each pose, waypoint → its rows; see `pose.build_pose_rows`.
-        base_rows: Rows of a wheeled base, see `StepRows`, shape (N·rows per step,).
-        pushed_rows: Rows of pushed coordinates.
+        base_rows, pushed_rows: Rows of a wheeled base, see `StepRows`, and of pushed coordinates.
         term_rows: For each user-defined term, waypoint → its rows; empty for costs.
         term_values: Function of x, z_0 and the step durations → values of these rows, their
             Jacobian, and the sum and gradient of the costs.
@@ -54,7 +52,6 @@ class Transcription:
         row_waypoints, rate_waypoints: Waypoint, counted from 0, whose relaxation variable widens
             the bounds of each of these rows and of the rate rows.
         relaxed_row_values: Function of x, z_0, step durations and gears → values of these rows.
-        uncompiled_functions: Waypoint functions that were not yet machine code at construction.
         rate_matrix, rate_start: Velocities and accelerations per step are rate_matrix·x +
             rate_start·z_0.
     """
@@ -111,12 +108,12 @@ class Transcription:
         columns = {"planes": (0, 2, 1), "step_weights": (1, 0), "change_weights": (1, 0)}
         parts = []
         for name, symbol in self.parameter_symbols.items():
-            value = np.asarray(values.get(name, 0.0))
-            if name in columns:  # matrices are stored column by column
+            value = np.asarray(values.get(name, ()))
+            if not value.size:
+                value = np.zeros(symbol.numel())
+            elif name in columns:  # matrices are stored column by column
                 value = value.transpose(columns[name])
-            parts.append(
-                value.ravel() if value.size == symbol.numel() else np.zeros(symbol.numel())
-            )
+            parts.append(value.ravel())
         return np.concatenate(parts)
 
     def pack(
@@ -171,15 +168,11 @@ class Transcription:
             )
             self.uncompiled_functions += kind.use_machine_code(len(at))
             targets = ca.vec(self.targets[:, list(poses)] if poses else self.targets[:, 0])
-            offsets = np.add.outer(
-                np.array(poses or (0,)) * POSE_OFFSET_SIZE, range(POSE_OFFSET_SIZE)
-            )
-            variables = (self.waypoint_variables, self.planes, self.offsets)
-            inputs = [part[:, at] for part in variables]
-            inputs += [
-                ca.repmat(targets, 1, len(at)),
-                self.pose_offsets[offsets.ravel().tolist(), at],
-            ]
+            size = POSE_OFFSET_SIZE
+            offsets = [size * k + i for k in poses or (0,) for i in range(size)]
+            parts = (self.waypoint_variables, self.planes, self.offsets)
+            inputs = [part[:, at] for part in parts]
+            inputs += [ca.repmat(targets, 1, len(at)), self.pose_offsets[offsets, at]]
             rows = first_row[at][:, None] + np.arange(kind.rows)
             multipliers = ca.reshape(self.multipliers[rows.ravel().tolist()], kind.rows, len(at))
             values.append(ca.vec(kind.value.map(len(at))(*inputs)))
@@ -273,9 +266,8 @@ class Transcription:
     def _relax_remaining_rows(self) -> None:
         """Relax the rows that do not come from waypoint functions, and collect all parameters."""
         self.excess = ca.MX.sym("r", self.rows - self.first_relaxed_row)
-        self.relaxed_row_values = ca.Function(
-            "others", [self.x, self.start, self.dt, self.gears], [self.remaining_rows]
-        )
+        inputs = [self.x, self.start, self.dt, self.gears]
+        self.relaxed_row_values = ca.Function("others", inputs, [self.remaining_rows])
         if len(self.row_waypoints):
             rows = np.arange(self.first_relaxed_row, self.rows)
             self.g, self.jacobian = self._subtract_relaxation(
@@ -310,15 +302,12 @@ class Transcription:
     def _make_rates(self) -> None:
         """Build the matrices of eq. 5: velocities and accelerations per step."""
         n, identity = self.n, ca.DM.eye(self.n)
-        select = ca.horzcat(
-            identity, ca.DM(n, self.slots + 1)
-        )  # no slacks and relaxation variables
-        self.rate_matrix = ca.vertcat(
-            *(ca.kron(make_sparse(part), select) for part in (self.first, self.second))
-        )
-        self.rate_waypoints = np.repeat(
-            [*range(self.segments), *find_change_steps(self.structure.stops, self.segments)], n
-        )
+        # omits slacks and relaxation variables
+        select = ca.horzcat(identity, ca.DM(n, self.slots + 1))
+        parts = (self.first, self.second)
+        self.rate_matrix = ca.vertcat(*(ca.kron(make_sparse(part), select) for part in parts))
+        steps = find_change_steps(self.structure.stops, self.segments)
+        self.rate_waypoints = np.repeat([*range(self.segments), *steps], n)
         starts = (self.start_first[:, None], self.start_second[:, None])
         self.rate_start = ca.vertcat(*(ca.kron(make_sparse(part), identity) for part in starts))
 

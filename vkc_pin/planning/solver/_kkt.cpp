@@ -1,19 +1,21 @@
-// Linear solver for Ipopt's systems. Ipopt loads it at run time (options `hsllib` and `linear_solver`) through the interface of
-// HSL's MA27, as far as Ipopt uses it: https://www.hsl.rl.ac.uk/archive/specs/ma27.pdf.
+// Linear solver for Ipopt's systems. Ipopt loads it at run time (options `hsllib` and
+// `linear_solver`) through the interface of HSL's MA27, as far as Ipopt uses it:
+// https://www.hsl.rl.ac.uk/archive/specs/ma27.pdf.
 
 #include <algorithm>
 #include <limits>
 #include <memory>
 #include <new>
-#include <stdexcept>
 
-#include "../../world/collision/arrays.hpp"
+#include <nanobind/nanobind.h>
+
 #include "factorization.hpp"
 
 namespace
 {
 
-// MA27 stores its state in the caller's arrays. Here they hold only the number of a system: each thread has one at a time.
+// MA27 stores its state in the caller's arrays. Here they hold only the number of a system: each
+// thread has one at a time.
 struct System
 {
   int number = 0;
@@ -43,7 +45,7 @@ enum Flag
 
 // Calls a function and stores its result in `info`; catches allocation failures.
 template<typename Work>
-void noted(int * info, const Work & work)
+void report(int * info, const Work & work)
 {
   std::fill(info, info + FIELDS, 0);
   try
@@ -86,9 +88,8 @@ EXPORTED void ma27ad_(
   int * info,
   double * operations)
 {
-  noted(info, [&] {
-    current.factorization =
-      std::make_unique<Factorization>(std::size_t(*size), std::size_t(*entries), rows, columns, 1);
+  report(info, [&] {
+    current.factorization = std::make_unique<Factorization>(*size, *entries, rows, columns);
     keep[0] = current.number = current.number % std::numeric_limits<int>::max() + 1;
     return DONE;
   });
@@ -117,7 +118,7 @@ EXPORTED void ma27bd_(
   int * info)
 {
   Factorization * const found = system(keep[0]);
-  noted(info, [&] { return !found ? NO_SYSTEM : found->factor(values) ? DONE : SINGULAR; });
+  report(info, [&] { return !found ? NO_SYSTEM : found->factor(values) ? DONE : SINGULAR; });
   kept[0] = keep[0];
   *front = 1;
   if (found)
@@ -146,45 +147,7 @@ EXPORTED void ma27cd_(
 }
 }
 
-namespace
-{
-
-using Places = nb::ndarray<const int, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-
-void check(bool fits, const char * message)
-{
-  if (!fits)
-    throw std::invalid_argument(message);
-}
-
-} // namespace
-
 NB_MODULE(_kkt, module)
 {
-  module.doc() = "The linear solver of Ipopt's systems.";
-  nb::set_leak_warnings(false);
-  nb::class_<Factorization>(module, "Factorization")
-    .def(
-      "__init__",
-      [](Factorization * self, int size, const Places & rows, const Places & columns) {
-        check(size > 0, "there are rows");
-        check(rows.shape(0) == columns.shape(0), "as many rows as columns");
-        for (const Places * places : {&rows, &columns})
-          for (std::size_t p = 0; p < places->shape(0); ++p)
-            check((*places)(p) >= 0 && (*places)(p) < size, "places are in the matrix");
-        new (self) Factorization(std::size_t(size), rows.shape(0), rows.data(), columns.data(), 0);
-      })
-    .def(
-      "factor",
-      [](Factorization & self, const Numbers<1> & values) {
-        check(values.shape(0) == self.entries(), "one value for each entry");
-        return self.factor(values.data());
-      })
-    .def(
-      "solve",
-      [](Factorization & self, nb::ndarray<double, nb::ndim<1>, nb::c_contig, nb::device::cpu> x) {
-        check(x.shape(0) == self.size() && self.factored(), "as many numbers as the matrix has rows, once it is factored");
-        self.solve(x.data());
-      })
-    .def_prop_ro("negative", &Factorization::negative);
+  module.doc() = "The linear solver of Ipopt's systems, which Ipopt loads as a library.";
 }

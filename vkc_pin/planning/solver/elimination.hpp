@@ -26,12 +26,12 @@ struct Order
   int alone = 0; // number of leading rows without coupling among them: slacks, and dual rows with one
 };
 
-// Primal rows of an interior-point method have diagonals that are positive at first, dual rows zero diagonals. There is no
-// pivoting, so the order must avoid zero pivots (Bridson, "An Ordering Method for the Direct Solution of Saddle-Point Matrices",
-// 2007):
+// Primal rows of an interior-point method have diagonals that are positive at first, dual rows zero
+// diagonals. There is no pivoting, so the order must avoid zero pivots (Bridson, "An Ordering Method
+// for the Direct Solution of Saddle-Point Matrices", 2007):
 //   1. primal rows coupled with a single dual row, such as slacks: they cause no fill-in;
-//   2. dual rows coupled with one of these, which now have a pivot; the remaining matrix only gets additions to the Hessian;
-//   3. other primal rows in the order of the program, which is that of time: couplings are local, and the fill-in is a band;
+//   2. dual rows coupled with one of these, which now have a pivot;
+//   3. other primal rows in the order of the program, which is that of time: the fill-in is a band;
 //   4. each other dual row after the last primal row that it is coupled with.
 inline Order elimination_order(int size, const Entries & entries, const double * values)
 {

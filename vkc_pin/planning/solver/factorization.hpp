@@ -8,28 +8,28 @@
 
 #include "elimination.hpp"
 
-// Factors P·A·Pᵀ = L·D·Lᵀ with a diagonal D, by panels of a few neighbouring columns. A panel of L is dense, has only the rows in
-// which one of its columns has an entry, and updates the columns to its right when it is done (right-looking supernodes: Ng and
-// Peyton, "Block Sparse Cholesky Algorithms on Advanced Uniprocessor Computers", 1993).
+// Factors P·A·Pᵀ = L·D·Lᵀ with a diagonal D, by panels of a few neighbouring columns. A panel of L
+// is dense, has only the rows in which one of its columns has an entry, and updates the columns to
+// its right when it is done (right-looking supernodes: Ng and Peyton, "Block Sparse Cholesky
+// Algorithms on Advanced Uniprocessor Computers", 1993).
 class Factorization
 {
 public:
-  // Takes positions of entries, each above or below the diagonal, counted from `base`; duplicates are summed.
-  Factorization(std::size_t size, std::size_t entries, const int * rows, const int * columns, int base) : size_(int(size))
+  // Takes positions of entries, each above or below the diagonal, counted from 1; duplicates are
+  // summed.
+  Factorization(int size, int entries, const int * rows, const int * columns) : size_(size)
   {
-    for (std::size_t p = 0; p < entries; ++p)
-      entries_.emplace_back(rows[p] - base, columns[p] - base);
+    for (int p = 0; p < entries; ++p)
+      entries_.emplace_back(rows[p] - 1, columns[p] - 1);
   }
 
-  std::size_t size() const { return std::size_t(size_); }
-  std::size_t entries() const { return entries_.size(); }
   // Number of negative pivots, by Sylvester's law that of negative eigenvalues.
   int negative() const { return negative_; }
   // Whether the last call of `factor` succeeded.
   bool factored() const { return factored_; }
 
-  // Factors the matrix with these entries; returns false if it is singular. The first call decides by the diagonal which rows are
-  // dual.
+  // Factors the matrix with these entries; returns false if it is singular. The first call decides
+  // by the diagonal which rows are dual.
   bool factor(const double * values)
   {
     factored_ = false;
@@ -88,16 +88,16 @@ public:
 private:
   static constexpr int WIDTH = 8; // maximum number of columns of a panel
 
-  // Neighbouring columns of L: `width` from `first` on, with `height` entries each, the panel's own rows first; offsets of their
-  // rows, values and updates.
+  // Columns of L: `width` from `first` on, with `height` entries each, the panel's own rows first;
+  // offsets of their rows, values and updates.
   struct Panel
   {
     int first, width, height;
     std::size_t rows, values, updates, last_update;
   };
 
-  // Update of another panel: rows `begin` to `end` of this panel are columns of the other; their positions there, and those of
-  // later rows, are in `updated_` from `places` on.
+  // Update of another panel: rows `begin` to `end` of this panel are columns of the other; their
+  // positions there, and those of later rows, are in `updated_` from `places` on.
   struct Update
   {
     int panel, begin, end;

@@ -167,7 +167,7 @@ class _Loop:
         )
 
     def _judge(self, step: Step, trial: _Point) -> tuple[Floats, Floats, bool]:
-        """Return predicted and actual penalty reduction per waypoint; whether to accept the step.
+        """Return predicted and actual penalty reduction per waypoint, and whether to accept.
 
         The trial's penalty is infinite where a pair newly passes through each other, once the poses
         are nearly feasible. Before, the waypoints do not describe a motion yet.

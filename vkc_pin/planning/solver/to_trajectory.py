@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from vkc_pin.planning.nlp.pose_goals import find_phase_spans
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
@@ -13,46 +14,38 @@ __all__ = ["make_trajectory"]
 
 
 def make_trajectory(problem: TrajectoryProblem, z: Floats, dt: Floats) -> Trajectory:
-    """Convert waypoints to a trajectory with pauses for grasping and releasing.
+    """Convert z_1..z_N, shape (N, n), with step durations dt, shape (N,) [s], to a trajectory.
 
-    Args:
-        problem: Problem of the waypoints.
-        z: z_1..z_N, shape (N, n).
-        dt: Time steps, shape (N,) [s].
+    It pauses for grasping and releasing.
     """
-    waypoints, wait = problem.waypoints(z), problem.options.grasp_time
+    task, waypoints, wait = problem.task, problem.waypoints(z), problem.options.grasp_time
     _hold_grasp_coordinates(problem, waypoints)
-    rows, times = [0], [0.0]
-    phases: list[PhaseSpan] = []
-    begin = 0
-    for phase, end in zip(problem.task.phases, problem.ends, strict=True):
+    rows, steps, phases = [0], [0.0], list[PhaseSpan]()
+    for phase, begin, end in find_phase_spans(task):
         first = len(rows) - 1
-        if phase.released or (begin and problem.task.phases[len(phases) - 1].grasps):
+        if phase.released or (phases and task.phases[len(phases) - 1].grasps):
             rows.append(rows[-1])
-            times.append(times[-1] + wait)
-        for row in range(begin + 1, int(end) + 1):
-            rows.append(row)
-            times.append(times[-1] + dt[row - 1])
+            steps.append(wait)
+        rows += range(begin + 1, end + 1)
+        steps += dt[begin:end].tolist()
         phases.append(PhaseSpan(phase.name, first, len(rows) - 1, phase.held, phase.opening))
-        begin = int(end)
-    last = problem.task.phases[-1]
-    if set(problem.task.after) < {*last.held, *last.grasps}:
+    last = task.phases[-1]
+    if set(task.after) < {*last.held, *last.grasps}:
         rows.append(rows[-1])
-        times.append(times[-1] + wait)
-        phases.append(
-            PhaseSpan("let go", len(rows) - 2, len(rows) - 1, problem.task.after, last.opening)
-        )
+        steps.append(wait)
+        span = len(rows) - 2, len(rows) - 1
+        phases.append(PhaseSpan("let go", *span, task.after, last.opening))
     robot = problem.chain.robot.coordinates.size
-    return Trajectory(problem.chain.names, np.array(times), waypoints[rows], tuple(phases), robot)
+    times = np.cumsum(steps)
+    return Trajectory(problem.chain.names, times, waypoints[rows], tuple(phases), robot)
 
 
 def _hold_grasp_coordinates(problem: TrajectoryProblem, waypoints: Floats) -> None:
     """Set grasp coordinates that are inactive to their next active value, or else their last."""
-    starts = [0, *problem.ends[:-1]]
     for hold, names in problem.chain.virtual.items():
         active = np.zeros(len(waypoints), bool)
         active[0] = hold in problem.scene.holds
-        for phase, first, last in zip(problem.task.phases, starts, problem.ends, strict=True):
+        for phase, first, last in find_phase_spans(problem.task):
             active[first : last + 1] |= hold in phase.held
             active[last] |= hold in phase.grasps
         at = np.flatnonzero(active)

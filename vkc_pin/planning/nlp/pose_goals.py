@@ -19,6 +19,7 @@ __all__ = [
     "PoseGoal",
     "find_approach_waypoint",
     "find_chosen_freedoms",
+    "find_end_of_hold",
     "find_phase_spans",
     "find_pushed_coordinates",
     "make_pose_goals",
@@ -113,6 +114,15 @@ def find_approach_waypoint(first: int, last: int, options: Options) -> int:
     return max(first + 1, last - options.steps(options.approach_time))
 
 
+def find_end_of_hold(hold: Hold, spans: list[tuple[Phase, int, int]], end: int) -> int:
+    """Return the last waypoint of the first phases, all of which hold; without any, `end`."""
+    for phase, _, last in spans:
+        if hold not in phase.held:
+            break
+        end = last
+    return end
+
+
 def find_pushed_coordinates(
     chain: VirtualKinematicChain, task: Task
 ) -> tuple[tuple[int, int, int, int], ...]:
@@ -133,10 +143,6 @@ def find_chosen_freedoms(
         attachment = scene.objects[hold.object].object.attachments[hold.attachment]
         for number, (phase, _, grasp) in enumerate(spans):
             if attachment.firm and hold in phase.grasps:
-                last = grasp
-                for after, _, end in spans[number + 1 :]:
-                    if hold not in after.held:
-                        break
-                    last = end
+                last = find_end_of_hold(hold, spans[number + 1 :], grasp)
                 freedoms += [(chain.index(name), grasp, last) for name in names]
     return tuple(freedoms)

@@ -17,6 +17,7 @@ from vkc_pin.planning.nlp.objective import MotionCost
 from vkc_pin.planning.nlp.pose_goals import (
     find_approach_waypoint,
     find_chosen_freedoms,
+    find_end_of_hold,
     find_phase_spans,
     find_pushed_coordinates,
     make_pose_goals,
@@ -197,10 +198,7 @@ class TrajectoryProblem:
         # Clamped freedoms are constant until the object is released.
         for hold in self._continued_holds:
             if self.scene.objects[hold.object].object.attachments[hold.attachment].firm:
-                held = itertools.takewhile(
-                    lambda span, hold=hold: hold in span[0].held, find_phase_spans(self.task)
-                )
-                until = max((end for _, _, end in held), default=0)
+                until = find_end_of_hold(hold, find_phase_spans(self.task), 0)
                 for column in map(self.chain.index, self.chain.virtual[hold]):
                     bounds[:until, column] = self.start[column]
         lower, upper = bounds.transpose(2, 0, 1).copy()

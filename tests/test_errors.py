@@ -29,8 +29,8 @@ def test_unknown_names_have_suggestions() -> None:
         "link", "wrst", ["base", "wrist", "hand"], file="r.yaml", line=2, field="tool"
     )
     assert (
-        str(error)
-        == "r.yaml:2: tool: there is no link 'wrst'; did you mean 'wrist'? There are: base, wrist, hand"
+        str(error) == "r.yaml:2: tool: there is no link 'wrst'; did you mean 'wrist'? "
+        "There are: base, wrist, hand"
     )
     assert (error.nearest, error.choices) == ("wrist", ("base", "wrist", "hand"))
     assert str(UnknownNameError("link", "xyz", [])) == "there is no link 'xyz'; there are: none"

@@ -13,7 +13,7 @@ PAIRS, COORDINATES = 12, 4
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_the_least_that_holds_there(seed: int) -> None:
+def test_the_smallest_margin_applies(seed: int) -> None:
     rng = np.random.default_rng(seed)
     usual = rng.uniform(0.0, 0.05, PAIRS)
     eased = {

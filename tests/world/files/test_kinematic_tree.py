@@ -14,7 +14,8 @@ SHAPE = "<collision><geometry><sphere radius='0.1'/></geometry></collision>"
 
 
 def joint(name: str, parent: str, child: str, *, kind: str = "fixed", inside: str = "") -> str:
-    return f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>{inside}</joint>'
+    ends = f'<parent link="{parent}"/><child link="{child}"/>'
+    return f'<joint name="{name}" type="{kind}">{ends}{inside}</joint>'
 
 
 def written(folder: Path, *lines: str) -> Path:

@@ -115,12 +115,15 @@ def test_mesh_addresses_are_resolved(tmp_path: Path) -> None:
 
 
 def test_trees_equal_those_of_pinocchio(tmp_path: Path) -> None:
-    text = """<robot name="r"><link name="a"/><link name="b"><collision><origin xyz="0.1 0 0" rpy="0 0 1"/><geometry>
-    <box size="1 2 3"/></geometry></collision></link><link name="c"><collision><geometry><sphere radius="0.5"/></geometry>
-    </collision></link><joint name="turn" type="revolute"><parent link="a"/><child link="b"/><origin xyz="1 2 3" rpy="1 0.5 0"/>
-    <axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="2" effort="1"/></joint><joint name="slide" type="prismatic">
-    <parent link="b"/><child link="c"/><origin xyz="0 0 1"/><axis xyz="1 0 0"/><limit lower="0" upper="1" velocity="1"
-    effort="1"/></joint></robot>"""
+    text = """<robot name="r"><link name="a"/><link name="b"><collision>
+    <origin xyz="0.1 0 0" rpy="0 0 1"/><geometry><box size="1 2 3"/></geometry></collision></link>
+    <link name="c"><collision><geometry><sphere radius="0.5"/></geometry></collision></link>
+    <joint name="turn" type="revolute"><parent link="a"/><child link="b"/>
+    <origin xyz="1 2 3" rpy="1 0.5 0"/><axis xyz="0 1 0"/>
+    <limit lower="-1" upper="1" velocity="2" effort="1"/></joint>
+    <joint name="slide" type="prismatic"><parent link="b"/><child link="c"/>
+    <origin xyz="0 0 1"/><axis xyz="1 0 0"/>
+    <limit lower="0" upper="1" velocity="1" effort="1"/></joint></robot>"""
     (tmp_path / "t.urdf").write_text(text)
     (own, collision, _), model = load_urdf(tmp_path / "t.urdf"), pin.buildModelFromXML(text)
     assert own == model

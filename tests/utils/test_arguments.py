@@ -16,6 +16,7 @@ from vkc_pin.utils.arguments import (
     check_bool,
     check_choice,
     check_coordinate,
+    check_finite_array,
     check_instance,
     check_integer,
     check_list,
@@ -69,6 +70,9 @@ def test_arrays_hold_real_numbers_and_are_copies() -> None:
     given[0] = 7.0
     assert found.tolist() == [0.0, 1.0, 2.0]
     assert check_array([], "it").shape == (0,)
+    assert check_finite_array([[1, 2]], "it").tolist() == [[1.0, 2.0]]
+    with pytest.raises(InputError, match=r"it\[0, 1\]: not finite"):
+        check_finite_array([[1, np.nan]], "it")
     for value in (["1", "2"], [1j], [True, False], [[1], [1, 2]], [10**5000], b"12"):
         with pytest.raises(InputError, match="it: not numbers"):
             check_array(value, "it")

@@ -57,8 +57,9 @@ def written(folder: Path, text: str) -> Path:
 
 def paths(data: Any, path: tuple[str | int, ...] = ()) -> list[tuple[str | int, ...]]:
     """Return the paths of all fields of nested data."""
-    items = data.items() if isinstance(data, dict) else enumerate(data)
-    inner = [(key, value) for key, value in items] if isinstance(data, dict | list) else []
+    inner: Any = ()
+    if isinstance(data, dict | list):
+        inner = data.items() if isinstance(data, dict) else enumerate(data)
     return [path, *(found for key, value in inner for found in paths(value, (*path, key)))]
 
 

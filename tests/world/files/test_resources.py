@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from vkc_pin.errors import UnknownNameError
 from vkc_pin.world.files.resources import (
     choose_file_names,
+    find_file,
     find_resource,
     find_resource_folder,
     list_resources,
@@ -24,6 +25,12 @@ def test_resources_of_the_package_exist() -> None:
             assert path.exists()
             assert path.stem == name
             assert path.parent == find_resource_folder(kind)
+
+
+def test_files_are_found_by_name_or_path() -> None:
+    door = find_resource("scenes", "*.yaml", "door", noun="scene")
+    for name, found in (("door", door), ("a/b", "a/b"), ("b.yaml", "b.yaml"), (Path("b"), "b")):
+        assert find_file(name, "scenes", "*.yaml", noun="scene") == Path(found)
 
 
 def test_unknown_resources_raise() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -89,6 +90,15 @@ def test_quaternions_interpolate_about_one_axis(angle: float) -> None:
     np.testing.assert_allclose(data.oMi[3].translation, first.translation + 0.5, atol=1e-12)
     turn = pin.log3(first.rotation.T @ data.oMi[3].rotation)
     np.testing.assert_allclose(turn, 0.5 * angle * axis, atol=1e-6)
+
+
+def test_symbolic_configurations_match_numeric_ones() -> None:
+    model = pin.Model()
+    base = model.addJoint(0, pin.JointModelPlanar(), pin.SE3.Identity(), "base")
+    model.addJoint(base, pin.JointModelRUBZ(), pin.SE3.Identity(), "wheel")
+    coordinates, z = Coordinates(model), ca.SX.sym("z", 4)
+    function, row = ca.Function("q", [z], [coordinates.q_symbolic(z)]), [0.3, -2.0, 1.2, -0.7]
+    np.testing.assert_allclose(np.array(function(row)).ravel(), coordinates.q(row), atol=1e-15)
 
 
 def test_invalid_arguments_raise() -> None:

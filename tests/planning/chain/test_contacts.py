@@ -208,8 +208,8 @@ def test_evaluations_are_charged_to_the_budget() -> None:
     inside[2:, :2] = door_scene().objects["door"].placement.translation[:2]
     for evaluate, expected in (
         (lambda: problem.contacts.evaluate(z, np.ones(5, int), reach=0.1), 5),
-        (lambda: problem.contacts.first_blocked(z, 1, reach=0.0, allowed=1.0), 5),
-        (lambda: problem.contacts.first_blocked(inside, 1, reach=0.1, allowed=0.01), 3),
+        (lambda: problem.contacts.find_first_collision(z, 1, reach=0.0, allowed=1.0), 5),
+        (lambda: problem.contacts.find_first_collision(inside, 1, reach=0.1, allowed=0.01), 3),
     ):
         with Budget().activate() as budget:
             found = evaluate()

@@ -71,14 +71,14 @@ def placements(
 @given(trees(), st.integers(0, 2**32 - 1))
 def test_inverted_trees_keep_all_frames_and_shapes(tree: tuple[str, int], seed: int) -> None:
     urdf, root = tree
-    thing = load_text(urdf, "urdf: thing.urdf\nattachments: [{name: a, link: l0}]")
-    link, z = f"l{root}", np.random.default_rng(seed).uniform(-3.0, 3.0, thing.coordinates.size)
-    model, collision = invert(thing, link, z)
+    item = load_text(urdf, "urdf: thing.urdf\nattachments: [{name: a, link: l0}]")
+    link, z = f"l{root}", np.random.default_rng(seed).uniform(-3.0, 3.0, item.coordinates.size)
+    model, collision = invert(item, link, z)
     coordinates = Coordinates(model)
     moving = coordinates.names
-    assert set(moving) <= set(thing.coordinates.names)
-    q = coordinates.q(np.array([z[thing.coordinates.index(name)] for name in moving]))
-    bodies, shapes = placements(thing.model, thing.collision, thing.coordinates.q(z))
+    assert set(moving) <= set(item.coordinates.names)
+    q = coordinates.q(np.array([z[item.coordinates.index(name)] for name in moving]))
+    bodies, shapes = placements(item.model, item.collision, item.coordinates.q(z))
     new_bodies, new_shapes = placements(model, collision, q)
     assert new_bodies.keys() == bodies.keys()
     assert new_shapes.keys() == shapes.keys()
@@ -89,13 +89,11 @@ def test_inverted_trees_keep_all_frames_and_shapes(tree: tuple[str, int], seed: 
                 new[name].homogeneous, (to_root * old[name]).homogeneous, atol=1e-12, rtol=0.0
             )
     for name in moving:
-        old, new = thing.coordinates.index(name), coordinates.index(name)
+        old, new = item.coordinates.index(name), coordinates.index(name)
         for attribute in ("lower", "upper", "velocity"):
-            assert (
-                getattr(coordinates, attribute)[new] == getattr(thing.coordinates, attribute)[old]
-            )
+            assert getattr(coordinates, attribute)[new] == getattr(item.coordinates, attribute)[old]
     assert sum(i.mass for i in model.inertias) == pytest.approx(
-        sum(i.mass for i in thing.model.inertias)
+        sum(i.mass for i in item.model.inertias)
     )
     for shape in collision.geometryObjects:
         frame = model.frames[shape.parentFrame]
@@ -112,9 +110,9 @@ def test_only_joints_on_the_path_to_the_base_move() -> None:
         + joint("lid", "revolute", "base", "back", "1 0 0")
     )
     urdf = f'<robot name="t">{links}{joints}</robot>'
-    thing = load_text(urdf, "urdf: thing.urdf\nattachments: [{name: a, link: hand}]")
-    assert [*invert(thing, "hand", np.zeros(4))[0].names[1:]] == ["wrist", "shoulder"]
-    assert invert(thing, "base", np.zeros(4))[0].nq == 0
+    item = load_text(urdf, "urdf: thing.urdf\nattachments: [{name: a, link: hand}]")
+    assert [*invert(item, "hand", np.zeros(4))[0].names[1:]] == ["wrist", "shoulder"]
+    assert invert(item, "base", np.zeros(4))[0].nq == 0
 
 
 def test_inverting_aligned_joints_leaves_exact_zeros_and_ones() -> None:

@@ -115,11 +115,11 @@ def test_program_is_rebuilt_when_machine_code_is_available(folder: Libraries) ->
     assert not second.uncompiled_functions
     rng = np.random.default_rng(0)
     x, parameters = rng.normal(size=first.size), rng.normal(size=first.parameters.numel())
-    rows, others = (evaluated(program, x, parameters) for program in (first, second))
+    rows, others = (evaluate(program, x, parameters) for program in (first, second))
     assert rows == others
 
 
-def evaluated(program: Transcription, x: np.ndarray, parameters: np.ndarray) -> tuple[bytes, bytes]:
+def evaluate(program: Transcription, x: np.ndarray, parameters: np.ndarray) -> tuple[bytes, bytes]:
     function = ca.Function("rows", [program.x, program.parameters], [program.g, program.jacobian])
     values, jacobian = function(x, parameters)
     return np.array(values.nonzeros()).tobytes(), np.array(jacobian.nonzeros()).tobytes()
@@ -247,7 +247,7 @@ def test_hanging_compiler_is_killed(
     compile_here(folder)
     assert folder.list_jobs() == []
     assert len(list(folder.path.glob("*.failed"))) == 1
-    until(lambda: ended(int(pid.read_text())))
+    until(lambda: has_ended(int(pid.read_text())))
 
 
 @pytest.mark.parametrize("executable", ["", "/usr/bin/blender"])
@@ -268,7 +268,7 @@ def until(done: Callable[[], bool]) -> None:
     raise AssertionError("time is up")
 
 
-def ended(pid: int) -> bool:
+def has_ended(pid: int) -> bool:
     """Whether a process is no more, but for its entry."""
     try:
         return (
@@ -279,7 +279,7 @@ def ended(pid: int) -> bool:
         return True
 
 
-def planned(planner: vkc.Planner | None = None) -> list[bytes]:
+def plan_door(planner: vkc.Planner | None = None) -> list[bytes]:
     """Return a plan by the given planner, or by a new one without caches."""
     steps, options = [Grasp("door")], vkc.Options(reach_waypoints=10)
     plan = vkc.plan(door_scene(), steps, options=options, planner=planner or vkc.Planner())
@@ -291,7 +291,7 @@ def planned(planner: vkc.Planner | None = None) -> list[bytes]:
 def expected() -> list[bytes]:
     """Return the motion that is found without libraries."""
     assert os.environ[CACHE_VARIABLE] == "off"
-    return planned()
+    return plan_door()
 
 
 def test_plans_are_equal_bit_for_bit(
@@ -299,17 +299,17 @@ def test_plans_are_equal_bit_for_bit(
 ) -> None:
     monkeypatch.setattr(batch, "_MIN_INSTRUCTIONS_TO_COMPILE", 0)  # all that can be compiled is
     planner = vkc.Planner()
-    assert planned(planner) == expected
+    assert plan_door(planner) == expected
     assert wait()
     monkeypatch.setattr(machine_code, "_has_python", lambda: False)
     assert list(folder.path.glob("*.failed")) == []
     loaded: list[Any] = []
     external = ca.external
     monkeypatch.setattr(ca, "external", lambda *a: loaded.append(a) or external(*a))
-    assert planned(planner) == expected
+    assert plan_door(planner) == expected
     assert len(loaded) > 2
     loaded.clear()
-    assert planned() == expected
+    assert plan_door() == expected
     assert len(loaded) > 2
 
 
@@ -332,7 +332,7 @@ def test_planning_works_without_a_compiler(
     else:
         monkeypatch.setenv(CACHE_VARIABLE, "/proc/nowhere")
     planner = vkc.Planner()
-    assert planned(planner) == expected
+    assert plan_door(planner) == expected
     assert wait() == (trouble != "no folder")
-    assert planned(planner) == expected
+    assert plan_door(planner) == expected
     assert list(folder.path.glob("*.so")) == []

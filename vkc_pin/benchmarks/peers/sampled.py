@@ -67,7 +67,7 @@ def plan_by_sampling(
     space.setBounds(bounds)
 
     def blocked(z: Floats) -> int:
-        return problem.contacts.first_blocked(
+        return problem.contacts.find_first_collision(
             z, middle, reach=problem.options.largest_margin, allowed=0.0
         )
 

@@ -167,7 +167,7 @@ class VirtualKinematicChain:
         firsts = np.searchsorted(coordinate, np.arange(self.size))
         return np.asarray(np.add.reduceat(motion, firsts, axis=1).swapaxes(1, 2))
 
-    def opened(self, opening: float | None) -> pin.GeometryModel:
+    def get_collision_geometry(self, opening: float | None) -> pin.GeometryModel:
         """Return the collision geometry with the robot's gripper at an opening [m].
 
         If `opening` is None, the gripper is as in the robot's home configuration.

@@ -75,7 +75,10 @@ class _PairBuilder:
     def build_phase(self, number: int) -> PhaseGeometry:
         phase, scene, chain = self.task.phases[number], self.scene, self.chain
         holds = {hold.object: hold for hold in phase.held}
-        shapes, labels = list(chain.opened(phase.opening).geometryObjects), list(self._labels)
+        shapes, labels = (
+            list(chain.get_collision_geometry(phase.opening).geometryObjects),
+            list(self._labels),
+        )
         of_chain = self._compute_boxes[0] if phase.opening is None else _compute_boxes(shapes)
         robots, own, margin = (
             range(len(scene.robot.collision.geometryObjects)),

@@ -108,7 +108,7 @@ class ContactModel:
             [[0], np.cumsum([phase.segments for phase in task.phases])]
         )
         placed = {
-            opening: ShapePlacements(chain.model, chain.opened(opening))
+            opening: ShapePlacements(chain.model, chain.get_collision_geometry(opening))
             for opening in dict.fromkeys(phase.opening for phase in task.phases)
         }
         self.phases = build_phase_geometries(scene, chain, task, options)
@@ -216,7 +216,9 @@ class ContactModel:
         columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
         return Contacts(*columns).select(np.argsort(columns[0], kind="stable"))
 
-    def first_blocked(self, z: Floats, waypoint: int, *, reach: float, allowed: float) -> int:
+    def find_first_collision(
+        self, z: Floats, waypoint: int, *, reach: float, allowed: float
+    ) -> int:
         """Return the first configuration with a shortfall of more than `allowed` [m]; W if none.
 
         Args:

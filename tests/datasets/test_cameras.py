@@ -33,7 +33,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return generate(SEEING, 2, tmp_path_factory.mktemp("made") / "out", lerobot=True)
 
 
-def test_images_are_observed_at_every_sample(made: Dataset) -> None:
+def test_every_sample_has_images(made: Dataset) -> None:
     with h5py.File(made.shards[0]) as file:
         for group in file["data"].values():
             count = group.attrs["num_samples"]
@@ -45,7 +45,7 @@ def test_images_are_observed_at_every_sample(made: Dataset) -> None:
                 assert group[f"obs/{camera}_image"][0].std() > 5.0
 
 
-def test_read_back(made: Dataset) -> None:
+def test_images_are_read_back(made: Dataset) -> None:
     for episode in made.episodes():
         images = episode.images()
         assert images is not None
@@ -55,7 +55,7 @@ def test_read_back(made: Dataset) -> None:
     assert check_dataset(made.folder).ok
 
 
-def test_lerobots_layout_has_the_colours(made: Dataset) -> None:
+def test_lerobot_layout_has_colour_images(made: Dataset) -> None:
     image = pytest.importorskip("PIL.Image")
     root = made.folder / "lerobot/husky_ur5e"
     features = json.loads((root / "meta/info.json").read_text())["features"]
@@ -83,7 +83,7 @@ def test_lerobots_layout_has_the_colours(made: Dataset) -> None:
         assert stats[name]["count"] == [len(told)]
 
 
-def test_the_digest_knows_of_cameras_and_is_as_it_was_without() -> None:
+def test_digest_depends_on_cameras() -> None:
     blind, seeing = load_recipe({**SMALL, "simulate": True}), load_recipe(SEEING)
     moved = load_recipe({**SEEING, "cameras": [{**EYES[0], "fov": 61.0}, EYES[1]]})
     assert len({blind.digest, seeing.digest, moved.digest}) == 3
@@ -100,6 +100,6 @@ def test_the_digest_knows_of_cameras_and_is_as_it_was_without() -> None:
         ([{**EYES[0], "wdth": 64}], "did you mean 'width'"),
     ],
 )
-def test_wrong_cameras(cameras: Any, said: str) -> None:
+def test_wrong_cameras_are_refused(cameras: Any, said: str) -> None:
     with pytest.raises(vkc.InputError, match=said):
         load_recipe({**SEEING, "cameras": cameras})

@@ -25,14 +25,14 @@ def shard(folder: Path) -> Path:
     return Dataset.open(folder).shards[0]
 
 
-def test_all_are_valid(copy: Path) -> None:
+def test_valid_dataset_passes(copy: Path) -> None:
     found = check_dataset(copy)
     assert found.ok, found.lines()
     assert found.episodes == len(found.records) == 4
     assert "4 of 4 episodes are valid" in str(found)
 
 
-def test_a_motion_that_was_changed_is_refused(copy: Path) -> None:
+def test_changed_motion_is_invalid(copy: Path) -> None:
     with h5py.File(shard(copy), "r+") as file:
         group = file["data/demo_2"]
         positions = group["motion/knot_positions"]
@@ -44,7 +44,7 @@ def test_a_motion_that_was_changed_is_refused(copy: Path) -> None:
     assert str(number) in str(found)
 
 
-def test_a_scene_in_which_something_is_in_the_way(copy: Path) -> None:
+def test_added_obstacle_makes_the_episode_invalid(copy: Path) -> None:
     """The check builds the scenes from the files: it does not believe what planning saw."""
     episode = next(Dataset.open(copy).episodes())
     middle = episode.trajectory.at(episode.trajectory.times[-1] / 2.0)
@@ -64,7 +64,7 @@ def test_a_scene_in_which_something_is_in_the_way(copy: Path) -> None:
     assert "block" in found.refused[episode.number]
 
 
-def test_an_episode_that_is_there_twice(copy: Path) -> None:
+def test_repeated_episode_is_a_problem(copy: Path) -> None:
     with h5py.File(shard(copy), "r+") as file:
         numbers = [int(file[f"data/demo_{k}"].attrs["number"]) for k in range(4)]
         del file["data/demo_3"]
@@ -74,7 +74,7 @@ def test_an_episode_that_is_there_twice(copy: Path) -> None:
     assert any("episodes.csv" in problem for problem in found.problems)
 
 
-def test_the_page_shows_what_there_is(copy: Path, tmp_path: Path) -> None:
+def test_page_shows_statistics_and_pictures(copy: Path, tmp_path: Path) -> None:
     found = check_dataset(copy, page=tmp_path / "page.html", seed=3)
     assert found.page == tmp_path / "page.html"
     text = found.page.read_text(encoding="utf-8")
@@ -96,17 +96,17 @@ def test_the_page_shows_what_there_is(copy: Path, tmp_path: Path) -> None:
     )  # type: ignore[union-attr]
 
 
-def test_other_processes_find_the_same(copy: Path) -> None:
+def test_jobs_do_not_affect_the_check(copy: Path) -> None:
     one, two = check_dataset(copy), check_dataset(copy, jobs=2)
     assert one.records == two.records
 
 
-def test_no_dataset(tmp_path: Path) -> None:
+def test_other_folder_is_no_dataset(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="the folder holds no dataset"):
         check_dataset(tmp_path)
 
 
-def test_the_command(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_prints_the_result(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["dataset", "check", str(copy), "--quiet"]) == 0
     assert "4 of 4 episodes are valid" in capsys.readouterr().out
     shard(copy).write_bytes(b"no")

@@ -47,7 +47,7 @@ def scene() -> Scene:
     return Scene.from_document(document, load_scene("door").folder)
 
 
-def test_which_way_round(scene: Scene) -> None:
+def test_winding_numbers_of_known_paths(scene: Scene) -> None:
     right, left = along((-2, -0.1), (0, -1), (2, -0.1)), along((-2, -0.1), (0, 1), (2, -0.1))
     assert compute_winding_numbers(scene, right) == {}  # as the straight line goes
     assert compute_winding_numbers(scene, left) == {"post": -1}  # clockwise round it
@@ -56,7 +56,7 @@ def test_which_way_round(scene: Scene) -> None:
 
 
 @given(st.lists(st.tuples(st.floats(-3, 3), st.floats(0.5, 3)), min_size=1, max_size=6))
-def test_paths_on_one_side_are_of_one_class(
+def test_paths_on_one_side_have_no_winding_number(
     scene: Scene, points: list[tuple[float, float]]
 ) -> None:
     assert compute_winding_numbers(scene, along((-2.0, 0.5), *points, (2.0, 0.5))) == {}
@@ -74,7 +74,7 @@ def record(number: int, motion: Trajectory, **changes: object) -> dict[str, obje
     }
 
 
-def test_near_duplicates() -> None:
+def test_near_duplicates_are_found() -> None:
     seen, straight = DuplicateFinder(), along((0, 0), (1, 0), (2, 0))
     assert seen.find_duplicate(record(3, straight)) is None
     assert seen.find_duplicate(record(5, along((0, 0), (1, 0.9 * NEAR), (2, 0)))) == 3
@@ -83,7 +83,7 @@ def test_near_duplicates() -> None:
     assert seen.find_duplicate(record(8, straight, object="another")) is None
 
 
-def test_spread() -> None:
+def test_coverage_of_an_interval() -> None:
     assert compute_coverage([], 0.0, 1.0) == 0.0
     assert compute_coverage([0.05, 0.06, 0.95, 1.0], 0.0, 1.0) == 0.2
     assert compute_coverage(np.linspace(0, 1, 50).tolist(), 0.0, 1.0) == 1.0

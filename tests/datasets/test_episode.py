@@ -15,7 +15,7 @@ from vkc_pin.world.task.steps import Actuate
 DOCUMENT = load_recipe(SMALL).document
 
 
-def test_read_back_and_replayed() -> None:
+def test_packed_episode_is_read_back() -> None:
     """All that was planned is there again, to 1e-9 at every moment."""
     found = plan(load_scene("drawer"), [Actuate("drawer", {"slide": 0.2})])
     data, record = pack(7, {"robot": "husky_ur5e", "task": "drive-open"}, found)
@@ -50,7 +50,7 @@ def test_attempts_are_determined_by_their_number() -> None:
     json.dumps(record)
 
 
-def test_scenes_are_called_by_what_they_say() -> None:
+def test_scene_name_is_a_digest() -> None:
     found = unpack(run_attempt(DOCUMENT, 0, {})[1])
     assert "start" not in found.document
     name = compute_scene_name(found.document)
@@ -58,14 +58,14 @@ def test_scenes_are_called_by_what_they_say() -> None:
     assert name != compute_scene_name({**found.document, "floor": False})
 
 
-def test_a_plan_that_fails_is_a_failure_with_its_reason() -> None:
+def test_failed_plan_has_a_reason() -> None:
     record, data = run_attempt({**DOCUMENT, "max_evaluations": 1}, 0, {})
     assert (record["success"], data) == (False, b"")
     assert record["status"] == "evaluation limit"
     assert record["reason"]
 
 
-def test_simulated_only_where_physics_agrees() -> None:
+def test_simulation_decides_success() -> None:
     pytest.importorskip("mujoco")
     record, _ = run_attempt({**DOCUMENT, "simulate": True}, 0, {})
     assert record["simulated"]

@@ -26,7 +26,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {file.relative_to(folder).as_posix(): file.read_bytes() for file in kept}
 
 
-def test_the_first_numbers_that_succeed(made: Dataset) -> None:
+def test_episodes_are_the_first_successful_numbers(made: Dataset) -> None:
     numbers = made.numbers()
     lines = [
         json.loads(line) for line in (made.folder / "journal.jsonl").read_text().splitlines()[1:]
@@ -40,7 +40,7 @@ def test_the_first_numbers_that_succeed(made: Dataset) -> None:
     assert len((made.folder / "episodes.csv").read_text().splitlines()) == 1 + EPISODES
 
 
-def test_every_episode_is_valid_and_what_it_says(made: Dataset) -> None:
+def test_episodes_are_valid_and_reach_their_goals(made: Dataset) -> None:
     starts = set()
     for episode in made.episodes():
         report = episode.validate()
@@ -53,13 +53,13 @@ def test_every_episode_is_valid_and_what_it_says(made: Dataset) -> None:
     assert len(starts) == EPISODES
 
 
-def test_processes_make_no_difference(made: Dataset, tmp_path: Path) -> None:
+def test_jobs_do_not_affect_the_dataset(made: Dataset, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     other = generate(SMALL, EPISODES, tmp_path / "out", jobs=2)
     assert contents(other.folder) == contents(made.folder)
 
 
-def test_adding_to_a_dataset(made: Dataset, tmp_path: Path) -> None:
+def test_dataset_is_extended(made: Dataset, tmp_path: Path) -> None:
     """What was made is not made again, and becomes what it would have been at once."""
     generate(SMALL, 2, tmp_path / "out")
     before = (tmp_path / "out/journal.jsonl").read_text()
@@ -77,9 +77,7 @@ def test_finished_dataset_is_left_unchanged(made: Dataset) -> None:
 
 
 @pytest.mark.parametrize("removed", ["work/*", "shards/*/*"])
-def test_what_somebody_has_removed_is_made_again(
-    made: Dataset, tmp_path: Path, removed: str
-) -> None:
+def test_removed_files_are_made_again(made: Dataset, tmp_path: Path, removed: str) -> None:
     generate(SMALL, 3, tmp_path / "out")
     for file in (tmp_path / "out").glob(removed):
         shutil.rmtree(file) if file.is_dir() else file.unlink()
@@ -102,7 +100,7 @@ def test_stopped_generation_is_resumed(made: Dataset, tmp_path: Path) -> None:
     assert contents(generate(SMALL, EPISODES, tmp_path / "out").folder) == contents(made.folder)
 
 
-def test_nothing_is_written_into_what_is_something_else(made: Dataset, tmp_path: Path) -> None:
+def test_other_folders_and_recipes_are_refused(made: Dataset, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/thesis.tex").write_text("x")
     with pytest.raises(InputError, match="the folder holds other files"):
@@ -144,7 +142,7 @@ def record(
     }
 
 
-def test_what_is_accepted_does_not_depend_on_the_order(tmp_path: Path) -> None:
+def test_accepted_episodes_do_not_depend_on_the_order(tmp_path: Path) -> None:
     records = [
         record(k, success=k % 3 != 1, at=float(k // 4)) for k in range(12)
     ]  # every fourth place is new

@@ -26,7 +26,7 @@ def off(scene: Scene, name: str) -> float:
 
 
 @pytest.mark.parametrize("name", ["drawer", "door"])
-def test_the_hand_is_where_it_holds(name: str) -> None:
+def test_hand_is_at_the_attachment(name: str) -> None:
     scene = load_scene(name)
     step = Actuate(name, STEPS[name].joints, next(iter(scene.objects[name].object.attachments)))
     rng, planner = np.random.default_rng(0), Planner()
@@ -41,7 +41,7 @@ def test_the_hand_is_where_it_holds(name: str) -> None:
     assert plan(found, [step], planner=planner).success
 
 
-def test_none_where_there_is_none() -> None:
+def test_blocked_grasp_has_no_start() -> None:
     scene = load_scene("drawer")
     document = scene.document
     attachment, placed = (

@@ -60,7 +60,7 @@ def change_journal(folder: Path, **changes: Any) -> None:
 
 
 @pytest.mark.parametrize("name", NOT_NAMES, ids=repr)
-def test_a_robot_in_the_journal_that_is_not_a_name(copy: Path, tmp_path: Path, name: Any) -> None:
+def test_robot_name_in_the_journal_is_checked(copy: Path, tmp_path: Path, name: Any) -> None:
     change_journal(copy, robot=name)
     before = surroundings(copy, tmp_path)
     with pytest.raises(InputError, match="robot: not a plain file name") as caught:
@@ -77,7 +77,7 @@ def test_a_robot_in_the_journal_that_is_not_a_name(copy: Path, tmp_path: Path, n
 
 
 @pytest.mark.parametrize("name", ["../../evil", "/evil", "a/b", "..", "", 3], ids=repr)
-def test_a_scene_in_a_work_file_that_is_not_a_name(copy: Path, tmp_path: Path, name: Any) -> None:
+def test_scene_name_in_a_work_file_is_checked(copy: Path, tmp_path: Path, name: Any) -> None:
     file = sorted((copy / "work").iterdir())[0]
     with h5py.File(file, "r+") as opened:
         opened["data/demo_0"].attrs["scene"] = str(tmp_path / "evil") if name == "/evil" else name
@@ -89,7 +89,7 @@ def test_a_scene_in_a_work_file_that_is_not_a_name(copy: Path, tmp_path: Path, n
     assert sorted((copy / "scenes").iterdir()) == scenes
 
 
-def test_a_robot_of_a_recipe_that_gives_no_name(tmp_path: Path) -> None:
+def test_robot_name_of_a_recipe_is_checked(tmp_path: Path) -> None:
     recipe = load_recipe(SMALL)
     fields = recipe.fields.model_copy(update={"robots": (RobotEntry(name=f"{tmp_path}/a/.."),)})
     with pytest.raises(InputError, match="robots: not a plain file name"):
@@ -97,7 +97,7 @@ def test_a_robot_of_a_recipe_that_gives_no_name(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_deep_link_is_refused_and_links_inside_are_not(copy: Path, tmp_path: Path) -> None:
+def test_links_out_of_the_folder_are_refused(copy: Path, tmp_path: Path) -> None:
     (copy / "shards").mkdir()
     (copy / "shards" / "husky_ur5e").symlink_to(tmp_path / "outside")
     before = surroundings(copy, tmp_path)
@@ -112,7 +112,7 @@ def test_a_deep_link_is_refused_and_links_inside_are_not(copy: Path, tmp_path: P
     assert [path.name for path in (copy / "elsewhere").iterdir()] == ["shard-00000.hdf5"]
 
 
-def test_the_page_of_a_check_is_written_inside(copy: Path, tmp_path: Path) -> None:
+def test_page_of_a_check_is_not_written_through_a_link(copy: Path, tmp_path: Path) -> None:
     generate(SMALL, EPISODES, copy)
     (tmp_path / "profile").write_text("mine")
     (copy / "statistics.html").symlink_to(tmp_path / "profile")
@@ -122,7 +122,7 @@ def test_the_page_of_a_check_is_written_inside(copy: Path, tmp_path: Path) -> No
     assert check_dataset(copy, page=tmp_path / "page.html").page == tmp_path / "page.html"
 
 
-def test_files_of_others_in_the_folder_of_lerobot_remain(copy: Path) -> None:
+def test_other_files_in_the_lerobot_folder_are_kept(copy: Path) -> None:
     pytest.importorskip("pyarrow")
     generate(SMALL, EPISODES, copy, lerobot=True)
     own = copy / "lerobot" / "husky_ur5e"

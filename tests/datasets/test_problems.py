@@ -29,7 +29,7 @@ def said(found: Any) -> Any:
 
 
 @pytest.mark.parametrize("task", ["given-open", "drive-open", "fetch-place"])
-def test_recipe_and_number_determine_it(task: str) -> None:
+def test_problem_is_determined_by_recipe_and_number(task: str) -> None:
     for number in range(3):
         one = said(drawn(number, tasks=[task]))
         said(drawn(number + 5, tasks=[task]))  # what was drawn before makes no difference
@@ -37,25 +37,25 @@ def test_recipe_and_number_determine_it(task: str) -> None:
     assert said(drawn(0, tasks=[task])) != said(drawn(1, tasks=[task]))
 
 
-def test_numbers_in_a_row_share_a_room() -> None:
+def test_consecutive_numbers_share_a_room() -> None:
     rooms = [drawn(number).about["room"] for number in range(8)]
     assert rooms == ["room_0", "room_0", "room_1", "room_1"] * 2
 
 
-def test_robots_take_turns() -> None:
+def test_robots_alternate() -> None:
     robots = [{"name": "husky_ur5e"}, {"name": "husky_ur5e", "height": 0.4}]
     heights = [drawn(number, robots=robots).scene.described.start.z for number in range(0, 8, 2)]
     assert heights == [None, 0.4, 0.4, None]  # in every room both
 
 
-def test_variants_share_all_but_the_seed() -> None:
+def test_variants_differ_in_the_seed() -> None:
     first, second, other = (drawn(number, variants=2) for number in range(3))
     assert said(first)[:2] == said(second)[:2]
     assert [one.seed for one in (first, second, other)] == [0, 1, 0]
     assert said(first)[:2] != said(other)[:2]
 
 
-def test_what_is_opened() -> None:
+def test_open_task_keeps_to_the_ranges() -> None:
     for number in range(6):
         found = drawn(
             number, tasks=["drive-open"], goal={"share": [0.2, 0.3]}, start={"distance": [1.0, 4.0]}
@@ -74,7 +74,7 @@ def test_what_is_opened() -> None:
         assert found.scene.held == {}
 
 
-def test_what_is_fetched_is_put_on_another_table() -> None:
+def test_fetched_object_is_placed_on_another_table() -> None:
     found = drawn(0, tasks=["fetch-place"])
     grasp, place = found.steps
     assert isinstance(grasp, Grasp)
@@ -91,7 +91,7 @@ def test_what_is_fetched_is_put_on_another_table() -> None:
     )  # the ball's radius above it
 
 
-def test_nothing_is_left() -> None:
+def test_impossible_ranges_are_reported() -> None:
     with pytest.raises(NoProblemError, match="no free start in room_0"):
         drawn(0, tasks=["drive-open"], start={"distance": [50.0, 60.0]})
     crowded = {"objects": 3, "width": [4.0, 4.0], "front": 3.0, "clutter": [1.0, 1.0]}
@@ -113,5 +113,5 @@ def test_nothing_is_left() -> None:
         ("/a/panda", "panda"),
     ],
 )
-def test_what_robots_are_called(name: str, called: str) -> None:
+def test_robot_names(name: str, called: str) -> None:
     assert get_robot_name(name) == called

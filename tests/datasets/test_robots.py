@@ -14,7 +14,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.world.models.robot_file import find_robot, load_robot
 
 
-def test_a_robot_without_a_hand_is_imported_once(
+def test_robot_without_a_hand_is_imported_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("coacd")
@@ -27,7 +27,7 @@ def test_a_robot_without_a_hand_is_imported_once(
 
 
 @pytest.mark.parametrize("given", ["robot.yaml", "husky_ur5e.urdf"])
-def test_a_robot_by_path_is_found_again(tmp_path: Path, given: str) -> None:
+def test_robot_by_path_is_found_again(tmp_path: Path, given: str) -> None:
     """The dataset says where its URDF is, since its name alone would not."""
     pytest.importorskip("h5py")
     shutil.copytree(find_robot("husky_ur5e").parent, tmp_path / "mine/rover")
@@ -39,7 +39,7 @@ def test_a_robot_by_path_is_found_again(tmp_path: Path, given: str) -> None:
     assert check_dataset(made.folder).ok
 
 
-def test_two_robots_of_one_name_are_refused(tmp_path: Path) -> None:
+def test_robots_of_one_name_are_refused(tmp_path: Path) -> None:
     for folder in ("a", "b"):
         shutil.copytree(find_robot("husky_ur5e").parent, tmp_path / folder / "rover")
     paths = [str(tmp_path / folder / "rover/robot.yaml") for folder in ("a", "b")]

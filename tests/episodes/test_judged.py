@@ -20,7 +20,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return generate(SMALL, 2, tmp_path_factory.mktemp("judged") / "out")
 
 
-def test_all_are_judged_once(made: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+def test_episodes_are_judged_once(made: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(made.folder)]) == 0
     assert "2 plans" in capsys.readouterr().out
     kept = (made.folder / VERDICTS).read_text(encoding="utf-8")
@@ -29,7 +29,7 @@ def test_all_are_judged_once(made: Dataset, capsys: pytest.CaptureFixture[str]) 
     assert (made.folder / VERDICTS).read_text(encoding="utf-8") == kept, "nothing is judged twice"
 
 
-def test_a_motion_that_was_changed_is_refused(made: Dataset, tmp_path: Path) -> None:
+def test_changed_motion_is_invalid(made: Dataset, tmp_path: Path) -> None:
     shutil.copytree(made.folder, tmp_path / "copy")
     (tmp_path / "copy" / VERDICTS).unlink(missing_ok=True)
     (shard,) = Dataset.open(tmp_path / "copy").shards

@@ -15,11 +15,13 @@ __all__ = ["WIDEST", "between_cheeks", "cheeky_drawer", "write_gripper"]
 WIDEST = 0.08  # [m] between the faces of the fingers
 _GRIPPER = "gripper:\n  finger_a_joint: {closed: 0.0, open: 0.04}\n"
 _FLOOR = (
-    "<link name='floor'/><joint name='floor_joint' type='fixed'><parent link='floor'/><child link='body'/>"
+    "<link name='floor'/><joint name='floor_joint' type='fixed'><parent link='floor'/><child "
+    "link='body'/>"
     f"<origin xyz='0 0 {HEIGHT}'/></joint>"
 )
 _TOOL = (
-    "<link name='tool'/><joint name='tool_joint' type='fixed'><parent link='hand'/><child link='tool'/>"
+    "<link name='tool'/><joint name='tool_joint' type='fixed'><parent link='hand'/><child "
+    "link='tool'/>"
     "<origin xyz='0 0 0.125' rpy='0 0 1.5707963267948966'/></joint>"
 )
 
@@ -67,7 +69,8 @@ def write_gripper(folder: Path, *, gripper: str = _GRIPPER, more: str = "") -> P
         "touch_links: [hand, finger_a, finger_b]",
     ]
     lines += [
-        "home: {arm_1_joint: 0.0, arm_2_joint: -0.4, arm_3_joint: 1.0, arm_4_joint: 0.0, arm_5_joint: 0.97}"
+        "home: {arm_1_joint: 0.0, arm_2_joint: -0.4, arm_3_joint: 1.0, arm_4_joint: 0.0, "
+        "arm_5_joint: 0.97}"
     ]
     yaml = folder / "robot.yaml"
     yaml.write_text("\n".join(lines) + f"\n{gripper}{more}", encoding="utf-8")

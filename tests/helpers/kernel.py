@@ -74,7 +74,8 @@ def kernel() -> Iterator[Kernel]:
     try:
         started = Kernel(manager, client)
         started.run(
-            f"import sys; sys.path[:0] = [{str(ROOT)!r}, {str(ROOT / 'tests')!r}]\nimport vkc_pin as vkc"
+            f"import sys; sys.path[:0] = [{str(ROOT)!r}, {str(ROOT / 'tests')!r}]\nimport vkc_pin "
+            "as vkc"
         )
         yield started
     finally:

@@ -27,7 +27,8 @@ NAMES = tuple(dict.fromkeys([*TASKS, *(name for name in ALL if name.startswith("
 def table(rows: list[dict[str, Any]]) -> str:
     """Return the table, a line a task, in Markdown."""
     lines = [
-        "| task | plans | duration [s] | least along its path [s] | worst ratio | bounded by torques |",
+        "| task | plans | duration [s] | least along its path [s] | worst ratio | bounded by "
+        "torques |",
         "| --- | ---: | ---: | ---: | ---: | ---: |",
     ]
     for task in dict.fromkeys(row["task"] for row in rows):

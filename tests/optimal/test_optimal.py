@@ -13,21 +13,21 @@ from vkc_pin.planning.retiming.retime import retime_trajectory
 
 
 @pytest.mark.parametrize("made", [door_plan, drawer_plan])
-def test_motions_take_hardly_longer_than_they_have_to(made: object) -> None:
+def test_durations_are_near_the_bound(made: object) -> None:
     plan: vkc.Plan = made()  # type: ignore[operator]
     least, heavy = bound(plan.scene, plan.trajectory)
     assert least <= plan.trajectory.times[-1] <= 1.05 * least
     assert heavy == 0
 
 
-def test_the_bound_is_what_finer_and_finer_grids_come_to() -> None:
+def test_bound_converges_with_the_grid() -> None:
     plan = drawer_plan()
     coarse, fine, finest = (bound(plan.scene, plan.trajectory, places)[0] for places in (5, 40, 80))
     assert finest < fine < coarse
     assert fine - finest < 0.1 * (coarse - fine)
 
 
-def test_the_bound_obeys_limits() -> None:
+def test_bound_depends_on_limits() -> None:
     """With a quarter of the acceleration, and twice the time, no velocity is the same share of its limit."""
     plan = drawer_plan()
     robot = plan.scene.robot

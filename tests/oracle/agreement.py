@@ -70,7 +70,8 @@ def table(verdicts: Sequence[Verdict]) -> str:
         if not one.agrees:
             rows += [
                 "",
-                f"- {one.path.name}: {one.status}; the plan finds {', '.join(one.says) or 'nothing'}",
+                f"- {one.path.name}: {one.status}; the plan finds "
+                f"{', '.join(one.says) or 'nothing'}",
             ]
             rows += [f"  - {violation}" for violation in one.found]
     for reason, count in Counter(one.unjudged for one in verdicts if one.unjudged).items():

@@ -48,8 +48,10 @@ _LIMITS = {
 
 _METHODS = {ONE_CALL: "in one call", STEP_BY_STEP: "step by step"}
 _SEEDS_ABOUT = (
-    "Spread is the largest value of the successes over the least, minus 1; ± is half their range over its middle. Step by step, "
-    "each begins where the motion of the one before ends, and nothing comes after the first that fails."
+    "Spread is the largest value of the successes over the least, minus 1; ± is half their range "
+    "over its middle. Step by step, "
+    "each begins where the motion of the one before ends, and nothing comes after the first that "
+    "fails."
 )
 
 BAR_TABLE = (-3.0, 1.3, 1.051)  # [m], where the cup stands in between

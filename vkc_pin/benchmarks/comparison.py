@@ -78,7 +78,7 @@ class Comparison:
     load: Callable[[str], Scene] = load_scene
 
     def plan_trial(self, scene: Scene, spec: Mapping[str, Any]) -> Plan:
-        """Plan one trial, given by task (`scene`), `method`, `seed`, `max_evaluations` and `planner`."""
+        """Plan a trial with its task (`scene`), `method`, `seed` and other settings."""
         steps = self.tasks[spec["scene"]].steps
         how: dict[str, Any] = {
             **LIMITS,

@@ -24,7 +24,7 @@ from vkc_pin.benchmarks.harness.tables import (
 __all__ = ["BUDGETS", "CRITERIA", "WAYPOINTS", "report", "select_compared_methods"]
 
 WAYPOINTS = {f"{method}x{finer}": (method, finer) for finer in (1, 3) for method in BASELINES}
-"""Baselines with other numbers of waypoints than is best for them: name → method, multiple of VKC's number."""
+"""Baselines with other numbers of waypoints: name → method, multiple of VKC's number."""
 
 CRITERIA = {
     **EFFORTS,
@@ -34,7 +34,7 @@ CRITERIA = {
 }
 """What motions are compared by: field → name."""
 BUDGETS = {"a tenth": 0.1, "a third": 1 / 3, "two thirds": 2 / 3, "all": 1.0}
-"""Shares of the budget that are compared, by name; of the last two the larger one is half as much again."""
+"""Name → share of the budget."""
 _OWN = "VKC"
 
 
@@ -67,9 +67,12 @@ def report(
     parts = [
         f"# {title}",
         f"{', '.join(first)}{' and ' * bool(first)}{last}. {about['starts']} random "
-        f"start{'s' * (about['starts'] != 1)} per task, the same for all methods; seed {about['seed']}. Per "
-        f"trial {describe_limit(about)}, in which the baselines try up to {about['retries']} times. "
-        "Success is the word of the independent validation. Standard deviations are those of samples (n − 1).",
+        f"start{'s' * (about['starts'] != 1)} per task, the same for all methods; seed "
+        f"{about['seed']}. Per "
+        f"trial {describe_limit(about)}, in which the baselines try up to {about['retries']} "
+        "times. "
+        "Success is the word of the independent validation. Standard deviations are those of "
+        "samples (n − 1).",
         "## Success",
         _success(records, tasks, methods),
         "## Planning time",
@@ -84,7 +87,8 @@ def report(
         _criteria(records, tasks, compared, shared=True),
         *_pairwise(records, tasks, methods),
         "## Efforts, peaks and durations over each method's own successes",
-        "Mean ± standard deviation; median. The methods have succeeded in different trials, so harder ones count for some only.",
+        "Mean ± standard deviation; median. The methods have succeeded in different trials, so "
+        "harder ones count for some only.",
         _criteria(records, tasks, methods, shared=False),
         *pictures,
     ]
@@ -173,8 +177,10 @@ def _calls(
         "95th percentile [s]",
     ]
     text = (
-        "By the clock, with everything. The first trials of a task are planned twice by a planner that has kept nothing: cold, "
-        "with writing down the symbolic programs and loading or compiling them, and warm. All: as they come."
+        "By the clock, with everything. The first trials of a task are planned twice by a planner "
+        "that has kept nothing: cold, "
+        "with writing down the symbolic programs and loading or compiling them, and warm. All: as "
+        "they come."
     )
     return ["## From call to plan", text, format_table(head, rows, text=2)] if rows else []
 
@@ -207,7 +213,8 @@ def _budgets(
         "most, as a share",
     ]
     text = (
-        "Successes within shares of the budget. Effort only ends planning, so a success within a share is one with that as the "
+        "Successes within shares of the budget. The budget only ends planning, so a success within "
+        "a share is one with that as the "
         "budget, too; two thirds and half as much again are all of it."
     )
     return ["## Had the budget been smaller", text, format_table(head, rows, text=2)]
@@ -219,7 +226,8 @@ def _numbers(records: Sequence[Record], tasks: Mapping[str, str], methods: Seque
     for task in tasks:
         own = [record for record in records if record["scene"] == task]
         numbers.append(
-            f"{len(find_common_successes(own, methods))} of {len({record['number'] for record in own})} ({task})"
+            f"{len(find_common_successes(own, methods))} of "
+            f"{len({record['number'] for record in own})} ({task})"
         )
     return ", ".join(numbers)
 

@@ -96,30 +96,28 @@ def run(*, trials: int, seed: int, progress: bool = True) -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> str:
     """Return success rates, times and path lengths as text, and every failure."""
-    lines = [
-        f"{'task':12}{'success':>10}{'time [s] median':>18}{'p95':>8}{'seeds':>8}{'coal':>8}{'CasADi':>8}{'Ipopt':>8}"
-        f"{'check':>8}{'iter.':>7}{'base [m]':>10}{'arm [rad]':>11}{'build [s]':>11}"
-    ]
+    parts = {"initialization": "seeds", "coal": "coal", "casadi": "CasADi", "ipopt": "Ipopt"}
+    parts["validation"] = "check"
+    names = "".join(f"{name:>8}" for name in ("p95", *parts.values()))
+    head = f"{'task':12}{'success':>10}{'time [s] median':>18}{names}"
+    lines = [f"{head}{'iter.':>7}{'base [m]':>10}{'arm [rad]':>11}{'build [s]':>11}"]
     for task in TASKS:
         rows = [t for t in result["trials"] if t["task"] == task]
         if not rows:
             continue
-        good = sum(t["success"] for t in rows)
         time, late = distribution(rows, "planning_time")
-        split = (
-            distribution(rows, f"time_{part}")[0]
-            for part in ("initialization", "coal", "casadi", "ipopt", "validation")
+        seconds = (late, *(distribution(rows, f"time_{part}")[0] for part in parts))
+        iterations, base, arm = (
+            distribution(rows, field)[0]
+            for field in ("iterations", "base_path_length", "arm_path_length")
         )
-        lines.append(
-            f"{task:12}{f'{good}/{len(rows)}':>10}{time:>18.3f}{late:>8.3f}"
-            + "".join(f"{part:>8.3f}" for part in split)
-            + f"{distribution(rows, 'iterations')[0]:>7.0f}{distribution(rows, 'base_path_length')[0]:>10.2f}"
-            + f"{distribution(rows, 'arm_path_length')[0]:>11.2f}{max(t['build_time'] for t in rows):>11.2f}"
-        )
+        success = f"{sum(t['success'] for t in rows)}/{len(rows)}"
+        line = f"{task:12}{success:>10}{time:>18.3f}" + "".join(f"{s:>8.3f}" for s in seconds)
+        build = max(t["build_time"] for t in rows)
+        lines.append(f"{line}{iterations:>7.0f}{base:>10.2f}{arm:>11.2f}{build:>11.2f}")
     lines.append(f"peak memory {result['meta']['peak_memory_mb']:.0f} MB")
     for t in result["trials"]:
         if not t["success"]:
-            lines.append(
-                f"start {t['number']}, {t['task']}: {t['status']}; {'; '.join(t['violations']) or 'no violation'}"
-            )
+            reason = "; ".join(t["violations"]) or "no violation"
+            lines.append(f"start {t['number']}, {t['task']}: {t['status']}; {reason}")
     return "\n".join(lines)

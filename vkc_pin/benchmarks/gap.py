@@ -22,7 +22,7 @@ __all__ = ["POSE", "SCENE", "make_start", "report", "run"]
 
 SCENE = "gap_table"
 POSE = (2.5, 0.5, 0.95, np.pi, 0.0, 0.0)
-"""Of the tool: x, y, z [m], roll, pitch, yaw [rad] in the world frame; 0.2 m above the table, the fingers down."""
+"""Tool pose (x, y, z, roll, pitch, yaw) [m, rad] in the world frame, 0.2 m above the table."""
 
 
 def make_start(seed: int, number: int) -> Scene:

@@ -110,8 +110,8 @@ _RAIL = 0.8
 def make_paper_home() -> Scene:
     """Return the scene `household` with the table height and the rack travel of the paper's code.
 
-    A table of 1.11 m is a bar table, so it has the size of the one in the kitchen, 1.2 x 0.6 m. On one
-    as deep as the dining table, 0.8 m, the forearm of a level hand would pass through the plate.
+    A table of 1.11 m is a bar table, so it has the size of the kitchen's, 1.2 x 0.6 m. On one as
+    deep as the dining table, 0.8 m, the forearm of a level hand would pass through the plate.
     """
     home = load_scene("household")
     document = home.document

@@ -41,7 +41,7 @@ COMPARED_INITIALIZATIONS = ("stationary", "interpolated", "astar", "rrt", "auto"
 STEPWISE = "step after step"
 """The method that plans the steps one after the other, initialised as by "auto"."""
 TARGET = (-1.0, 3.897, 0.1)
-"""Where the stick's tip has to be, in the world frame [m]: 3 mm before the middle of the cube's south face."""
+"""Goal of the stick's tip in the world frame [m], 3 mm before the cube's south face."""
 PERTURBATION = 0.05  # of the seed trajectory, in all repeats but the first
 _NAMES = {"init_1": "no obstacle", "init_2": "two small obstacles", "init_3": "one large obstacle"}
 

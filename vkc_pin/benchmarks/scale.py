@@ -145,7 +145,7 @@ def make_refined_options(segments: int) -> Options:
 def specify(
     *, starts: int, seed: int, counts: Sequence[int], of: str = "obstacles"
 ) -> list[dict[str, Any]]:
-    """Return the trials: all counts from each start in turn, so that they meet the same machine load.
+    """Return the trials: all counts from each start in turn, to meet the same machine load.
 
     Starts are free among the largest number of obstacles.
     """

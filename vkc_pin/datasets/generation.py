@@ -95,21 +95,11 @@ def generate(
             without a display.
         KeyboardInterrupt: Ctrl-C was pressed; the same call continues the run.
     """
-    wanted, jobs = (
-        check_integer(episodes, "episodes", low=1),
-        check_integer(jobs, "jobs", low=1, high=4096),
-    )
-    loaded = load_recipe(recipe, variants=variants, simulate=simulate)
-    if check_bool(cameras, "cameras") and not loaded.fields.cameras:
-        loaded = load_recipe(loaded, cameras=CAMERAS)
-    if entries := make_entries(terms):
-        loaded = load_recipe(loaded, terms=[*loaded.document["terms"], *entries])
-    hdf5.require_h5py()
+    wanted = check_integer(episodes, "episodes", low=1)
+    jobs = check_integer(jobs, "jobs", low=1, high=4096)
+    loaded = _load_recipe(recipe, terms, variants=variants, simulate=simulate, cameras=cameras)
     if check_bool(lerobot, "lerobot"):
         lerobot_layout.require_pyarrow(loaded.fields.rate)
-    if loaded.fields.simulate:
-        import_mujoco()
-    check_frames(loaded)
     if jobs > 1 or scheduler is not None:
         require_dask(scheduler)
     folder = check_path(out, "out", "a folder")
@@ -140,6 +130,26 @@ def generate(
         if lerobot:
             _write_lerobot(dataset)
     return dataset
+
+
+def _load_recipe(
+    recipe: str | Path | Mapping[str, Any] | Recipe,
+    terms: Sequence[Term],
+    *,
+    cameras: bool,
+    **changes: Any,
+) -> Recipe:
+    """Return the recipe with changes; check that its robots and dependencies are available."""
+    loaded = load_recipe(recipe, **changes)
+    if check_bool(cameras, "cameras") and not loaded.fields.cameras:
+        loaded = load_recipe(loaded, cameras=CAMERAS)
+    if entries := make_entries(terms):
+        loaded = load_recipe(loaded, terms=[*loaded.document["terms"], *entries])
+    hdf5.require_h5py()
+    if loaded.fields.simulate:
+        import_mujoco()
+    check_frames(loaded)
+    return loaded
 
 
 @contextlib.contextmanager

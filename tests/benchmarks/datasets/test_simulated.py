@@ -11,14 +11,14 @@ from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.recipes.recipe import load_recipe
 
 
-def test_alone_with_a_client_that_costs_nothing() -> None:
+def test_one_worker_and_a_free_client() -> None:
     found = simulate_workers(Costs(first=(3.0,), later=(2.0,), client=0.0, episodes=4.0), 1, 10)
     assert found["efficiency"] == 1.0
     assert found["in_vain"] == 0.0
     assert found["episodes_per_hour"] == pytest.approx(3600.0 * 40.0 / (3.0 + 9 * 2.0), abs=0.1)
 
 
-def test_equal_tasks_leave_nothing_in_vain_but_the_last() -> None:
+def test_equal_tasks_waste_only_the_last() -> None:
     found = simulate_workers(Costs((2.0,), (2.0,), 0.0, 1.0), 10, 100)
     assert found["efficiency"] == 1.0
     odd = simulate_workers(
@@ -28,7 +28,7 @@ def test_equal_tasks_leave_nothing_in_vain_but_the_last() -> None:
     assert odd["in_vain"] == pytest.approx(0.09)
 
 
-def test_a_client_that_is_busy_limits_all() -> None:
+def test_busy_client_limits_the_workers() -> None:
     costs = Costs((2.0,), (2.0,), client=0.1, episodes=1.0)
     few, many = simulate_workers(costs, 10), simulate_workers(costs, 200)  # 20 workers keep it busy
     assert few["efficiency"] > 0.95
@@ -38,7 +38,7 @@ def test_a_client_that_is_busy_limits_all() -> None:
     assert many["efficiency"] == pytest.approx(0.1, rel=0.1)
 
 
-def test_what_a_journal_says(tmp_path: Path) -> None:
+def test_costs_are_read_from_the_journal(tmp_path: Path) -> None:
     """Blocks of two; the first of each process is the first in the journal."""
     (tmp_path / "recipe.yaml").write_text(json.dumps(SMALL))
     lines: list[object] = [{"settings": {}}, {"session": {"jobs": 2}}]

@@ -15,7 +15,7 @@ from vkc_pin.datasets.recipes.recipe import TASKS
 pytest.importorskip("h5py")
 
 
-def test_one_record_a_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_task_has_a_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recipe = write(tmp_path)
     out = tmp_path / "out"
     assert (
@@ -70,7 +70,7 @@ def test_one_record_a_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert [r["attempts"] for r in again["trials"]] == [r["attempts"] for r in records]
 
 
-def test_a_curve_of_workers(tmp_path: Path) -> None:
+def test_more_workers_make_the_same_episodes(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     result = run(out=tmp_path / "out", episodes=2, jobs=2, recipe=write(tmp_path), progress=False)
     assert [(one["task"], one["workers"]) for one in result["curve"]] == [

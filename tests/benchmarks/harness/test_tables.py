@@ -218,6 +218,7 @@ def test_foot_names_machine_versions_and_time() -> None:
     )
     about["versions"]["sources"] = "abc"
     assert tables.describe_run({**about, "sessions": sessions, "peak_memory_mb": 320.4}) == (
-        "Measured on 2 cores of Abacus 3, Linux, Python 3.12.1, vkc-pin 1.2, pin 4.1 (sources abc). "
+        "Measured on 2 cores of Abacus 3, Linux, Python 3.12.1, vkc-pin 1.2, pin 4.1 (sources "
+        "abc). "
         "12 trials, 1 or 2 at a time, took 1.5 min and up to 320 MB a process."
     )

@@ -15,7 +15,7 @@ from vkc_pin.benchmarks.peers.tasks import TASKS, build_program, make_problem, s
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_the_same_kinematics_and_pairs(task: str, tmp_path: Path) -> None:
+def test_description_has_the_same_kinematics_and_pairs(task: str, tmp_path: Path) -> None:
     problem = build_program(make_problem(task, 18, 0))
     files = describe(problem, tmp_path)
     model = pin.buildModelFromUrdf(str(files.urdf))
@@ -37,7 +37,7 @@ def test_the_same_kinematics_and_pairs(task: str, tmp_path: Path) -> None:
     )
 
 
-def test_thicker_shapes_touch_where_margins_are_not_kept(tmp_path: Path) -> None:
+def test_inflated_shapes_collide_where_margins_are_violated(tmp_path: Path) -> None:
     problem = build_program(make_problem("drawer", 18, 0))
     files = describe(problem, tmp_path, inflated=True)
     model = pin.buildModelFromUrdf(str(files.urdf))

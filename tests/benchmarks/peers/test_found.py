@@ -8,7 +8,7 @@ from vkc_pin.benchmarks.peers.found import validate_path
 from vkc_pin.benchmarks.peers.tasks import build_program, make_problem, sample_goals
 
 
-def test_a_path_through_a_wall_is_rejected() -> None:
+def test_path_through_a_wall_is_rejected() -> None:
     own = make_problem("door", 18, 0)
     problem = build_program(own)
     (goal, *_) = sample_goals(problem, np.random.default_rng(0), 1)

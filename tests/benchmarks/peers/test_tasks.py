@@ -10,7 +10,7 @@ from vkc_pin.planning.initialization.keyframes import compute_shortfall
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_problems_are_drawn_by_number_and_free(task: str) -> None:
+def test_problems_are_determined_by_number_and_free(task: str) -> None:
     one, same, other = make_problem(task, 3, 1), make_problem(task, 3, 1), make_problem(task, 3, 2)
     assert np.array_equal(one.scene.start, same.scene.start)
     assert not np.array_equal(one.scene.start, other.scene.start)

@@ -15,7 +15,7 @@ from vkc_pin.benchmarks.peers import trajopt_worker
 FILE = Path(trajopt_worker.__file__)
 
 
-def test_it_says_what_is_not_installed() -> None:
+def test_worker_reports_a_missing_package() -> None:
     command = [sys.executable, "-S", str(FILE)]  # without what is installed
     done = subprocess.run(command, input="", capture_output=True, text=True, timeout=60)
     assert json.loads(done.stdout) == {"error": "tesseract_robotics is not installed"}
@@ -26,7 +26,7 @@ def test_it_says_what_is_not_installed() -> None:
     find_spec("tesseract_robotics") is None,
     reason='needs tesseract-robotics-nanobind: pip install "vkc-pin[peers]"',
 )
-def test_a_request_that_is_wrong_ends_nothing() -> None:
+def test_wrong_request_does_not_end_the_worker() -> None:
     asked = json.dumps({"urdf": "/nowhere", "srdf": "/nowhere"})
     done = subprocess.run(
         [sys.executable, str(FILE)],

@@ -9,7 +9,7 @@ from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change, parse_change
 from vkc_pin.planning.solver import loop, trust_region
 
 
-def test_an_option() -> None:
+def test_option_is_changed() -> None:
     change = parse_change("Options.dt=0.3")
     assert change == Change("Options", "dt", 0.3)
     assert str(change) == "Options.dt=0.3"
@@ -18,7 +18,7 @@ def test_an_option() -> None:
         assert vkc.Options() == UNCHANGED.options
 
 
-def test_a_constant_changes_for_a_while() -> None:
+def test_constant_is_changed_for_a_while() -> None:
     before = loop.PROGRESS
     change = parse_change("solver.loop:PROGRESS=0.6")
     assert change.options == vkc.Options()
@@ -27,7 +27,7 @@ def test_a_constant_changes_for_a_while() -> None:
     assert before == loop.PROGRESS
 
 
-def test_a_constant_changes_where_it_is_imported_too_and_comes_back_after_an_error() -> None:
+def test_constant_is_changed_where_it_is_imported_and_restored() -> None:
     before = trust_region.ACTIVE_FRACTION
     assert before == loop.ACTIVE_FRACTION
 
@@ -55,6 +55,6 @@ def test_a_constant_changes_where_it_is_imported_too_and_comes_back_after_an_err
         ("solver.loop:PROGRESS='1'", "0.7"),
     ],
 )
-def test_wrong_changes(text: str, expected: str) -> None:
+def test_wrong_changes_are_refused(text: str, expected: str) -> None:
     with pytest.raises(vkc.InputError, match=expected):
         parse_change(text)

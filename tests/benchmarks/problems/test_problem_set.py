@@ -20,14 +20,14 @@ def test_kinds() -> None:
 
 
 @pytest.mark.parametrize("number", [-1, 60, 1.0, True])
-def test_there_are_no_others(number: int) -> None:
+def test_other_numbers_are_refused(number: int) -> None:
     with pytest.raises(vkc.InputError) as found:
         problem(number)
     assert (found.value.expected, found.value.got) == ("0 to 59", repr(number))
 
 
 @pytest.mark.parametrize("number", [0, 1, 10, 11, 20, 23, 30, 40, 44, 54, 55])
-def test_a_problem_is_the_same_every_time_and_can_be_asked_for(number: int) -> None:
+def test_problems_are_reproducible_and_can_be_compiled(number: int) -> None:
     one, other = problem(number), problem(number)
     assert (one.number, one.kind, one.name) == (number, get_kind(number), other.name)
     assert one.scene.document == other.scene.document

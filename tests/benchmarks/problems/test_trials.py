@@ -18,7 +18,7 @@ def drawn() -> vkc.Plan:
     return vkc.plan(own.scene, own.steps)
 
 
-def test_the_objective_is_that_of_the_solver(drawn: vkc.Plan) -> None:
+def test_objective_is_that_of_the_solver(drawn: vkc.Plan) -> None:
     """A grasp without freedoms: all coordinates count, and the last round that was accepted has the motion's value."""
     assert drawn.success, drawn.summary()
     (last, *_) = [row["objective"] for row in reversed(drawn.history) if row["accepted"]]
@@ -35,7 +35,7 @@ def test_first_seed(drawn: vkc.Plan, name: str, solves: int, expected: bool) -> 
     assert not trials.is_first_guess_success(dataclasses.replace(plan, status="rejected"), solves)
 
 
-def test_a_trial() -> None:
+def test_record_of_a_trial() -> None:
     own = problem(20)
     record = trials.run_trial(
         own.scene, own.steps, seed=3, change=parse_change("Options.max_restarts=2"), number=20

@@ -31,7 +31,7 @@ DESK = """<robot name="desk">
 </robot>"""
 
 
-def test_what_texts_mean() -> None:
+def test_requests_are_parsed() -> None:
     texts = [
         "default",
         "my_oven=kitchens/kitchen.xml#oven",
@@ -56,12 +56,12 @@ def test_what_texts_mean() -> None:
     "texts",
     [[], ["oven_0", "oven_0"], ["default", "oven_0"], ["a=oven_0", "a=oven_1"], [""], ["#link"]],
 )
-def test_what_is_no_choice(texts: list[str]) -> None:
+def test_malformed_requests_are_refused(texts: list[str]) -> None:
     with pytest.raises(vkc.InputError, match="objects: not a choice"):
         parse_requests(texts, "objects", ("oven_0",))
 
 
-def test_a_file_is_imported_once_with_its_front_to_the_robot(tmp_path: Path) -> None:
+def test_file_is_imported_once_facing_the_robot(tmp_path: Path) -> None:
     (tmp_path / "flat.urdf").write_text(DESK, encoding="utf-8")
     (one,) = parse_requests([f"desk={tmp_path / 'flat.urdf'}#case"], "objects", ())
     made = prepare_object(one, tmp_path / "objects")
@@ -81,7 +81,7 @@ def test_a_file_is_imported_once_with_its_front_to_the_robot(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("link", ["../../evil", "..", "a/b", "/evil", ".hidden"])
-def test_a_link_whose_name_is_not_that_of_a_file(tmp_path: Path, link: str) -> None:
+def test_link_name_must_be_a_file_name(tmp_path: Path, link: str) -> None:
     (tmp_path / "evil").mkdir()
     (tmp_path / "evil" / "letter.txt").write_text("mine")
     desk = DESK.replace("case", link)
@@ -97,7 +97,7 @@ def test_a_link_whose_name_is_not_that_of_a_file(tmp_path: Path, link: str) -> N
     assert prepare_object(one, tmp_path / "objects") == str(tmp_path / "objects/desk/desk.yaml")
 
 
-def test_a_robot_that_says_what_its_hand_is_stays_as_it_is(tmp_path: Path) -> None:
+def test_robot_with_a_hand_is_not_imported(tmp_path: Path) -> None:
     assert prepare_robot(Request("husky", "husky_ur5e"), tmp_path) == "husky_ur5e"
     assert not list(tmp_path.iterdir())
     file = write_arms(tmp_path / "given")

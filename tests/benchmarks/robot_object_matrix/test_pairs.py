@@ -32,7 +32,7 @@ def husky() -> vkc.Robot:
     return vkc.load_robot("husky_ur5e")
 
 
-def test_descriptions_are_the_same_wherever_they_are_read() -> None:
+def test_description_does_not_depend_on_its_source() -> None:
     stored = find_resource_folder("scenes") / "objects" / "narrow_door.yaml"
     by_name, by_path = load_description("narrow_door"), load_description(str(stored))
     assert by_name == by_path
@@ -44,7 +44,7 @@ def test_descriptions_are_the_same_wherever_they_are_read() -> None:
 
 
 @pytest.mark.parametrize("name", ["drawers_0", "faucet_0", "narrow_door", "low_drawer"])
-def test_everything_stands_where_it_belongs(name: str) -> None:
+def test_objects_are_placed_by_kind(name: str) -> None:
     scene = make_hall("husky_ur5e", name, load_description(name))
     boxes = np.array(
         [
@@ -65,7 +65,7 @@ def test_everything_stands_where_it_belongs(name: str) -> None:
     assert not np.array_equal(start.start, scene.start)
 
 
-def test_half_of_the_range_by_what_was_proposed(husky: vkc.Robot) -> None:
+def test_joint_is_opened_by_half_its_range(husky: vkc.Robot) -> None:
     found = make_pair(husky, "husky_ur5e", "drawers_0")
     assert found.scene is not None
     assert found.step is not None
@@ -85,7 +85,7 @@ def test_half_of_the_range_by_what_was_proposed(husky: vkc.Robot) -> None:
 
 
 @pytest.mark.parametrize(("height", "raised"), [(0.4, True), (0.8, False)])
-def test_what_is_low_stands_on_a_counter(tmp_path: Path, height: float, raised: bool) -> None:
+def test_low_objects_are_on_a_counter(tmp_path: Path, height: float, raised: bool) -> None:
     urdf = SMOOTH.replace("0.4 0.4 0.4", f"0.4 0.4 {height}").replace(
         "0 0 0.5", f"0 0 {height / 2}"
     )
@@ -108,19 +108,19 @@ def _written(path: Path, **more: Any) -> str:
     return str(vkc.procedural.write_object(description, path))
 
 
-def test_what_no_hand_can_hold_is_out_of_reach(husky: vkc.Robot, tmp_path: Path) -> None:
+def test_object_without_a_grasp_is_unreachable(husky: vkc.Robot, tmp_path: Path) -> None:
     found = make_pair(husky, "husky_ur5e", _written(tmp_path / "smooth.yaml"))
     assert found.step is None
     assert found.because.startswith("slide: nothing of it fits between the fingers")
 
 
-def test_a_robot_without_a_hand_opens_nothing() -> None:
+def test_robot_without_a_hand_has_no_step() -> None:
     found = make_pair(vkc.load_robot("ur5"), "ur5", "drawers_0")
     assert (found.scene, found.step) == (None, None)
     assert "the hand of 'ur5_robot' is undefined" in found.because
 
 
-def test_what_the_arm_does_not_get_to_is_out_of_reach(husky: vkc.Robot, tmp_path: Path) -> None:
+def test_high_object_is_unreachable(husky: vkc.Robot, tmp_path: Path) -> None:
     foot = (
         '<link name="frame"><collision><origin xyz="0 0 0.1"/>'
         '<geometry><box size="0.2 0.2 0.2"/></geometry></collision></link>'

@@ -13,7 +13,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> vkc.Robot:
     return vkc.load_robot(write_arms(folder), tool_frame="hand", height=0.35)
 
 
-def test_poses_are_above_the_floor_and_the_seed_and_the_name_make_them(robot: vkc.Robot) -> None:
+def test_poses_are_above_the_floor_and_reproducible(robot: vkc.Robot) -> None:
     poses = sample_reachable_poses(robot, "one", 8)
     assert all(pose.translation[2] > vkc.Options().dist_safe for pose in poses)
     again, other, later = (

@@ -58,7 +58,7 @@ def test_bench_robots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert (out / "trials.jsonl").read_bytes() == journal, "nothing was run again"
 
 
-def test_what_fails_is_told_by_robot() -> None:
+def test_report_lists_failures_by_robot() -> None:
     about = {"robots": ["one", "two"], "goals": 2, "seed": 0, "time_limit": 5.0, "versions": {}}
     about["machine"] = {"cores": 2, "processor": "x", "machine": "x", "system": "x", "python": "3"}
     facts = {"import_time": 4.0, "load_time": 0.5, "joints": 6, "pairs": 7, "home_room": -0.004}
@@ -88,7 +88,7 @@ def test_what_fails_is_told_by_robot() -> None:
     assert "| two | hardly free | only 1 of 9 |" in text
 
 
-def test_what_cannot_be_asked_for(tmp_path: Path) -> None:
+def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
     with pytest.raises(vkc.InputError, match="goals: out of range"):
         run(out=tmp_path, goals=0)
     with pytest.raises(vkc.InputError, match="robots: not a choice"):

@@ -62,7 +62,7 @@ def test_bench_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert again == journal, "nothing was run again"
 
 
-def test_what_cannot_be_asked_for(tmp_path: Path) -> None:
+def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
     with pytest.raises(vkc.InputError, match="starts: out of range"):
         run(out=tmp_path, starts=0)
     with pytest.raises(vkc.InputError, match="robots: not a choice"):

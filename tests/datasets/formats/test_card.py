@@ -5,7 +5,7 @@ import yaml
 from vkc_pin.datasets.formats.card import make_card
 
 
-def test_what_a_card_says() -> None:
+def test_card_has_counts_and_failures() -> None:
     about = {
         "name": "home",
         "license": "CC-BY-4.0",

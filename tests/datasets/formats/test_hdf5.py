@@ -17,7 +17,7 @@ from vkc_pin.errors import InputError
 h5py = pytest.importorskip("h5py")
 
 
-def test_the_groups_are_those_of_robomimic(made: Dataset) -> None:
+def test_groups_have_robomimics_layout(made: Dataset) -> None:
     (shard,) = made.shards
     with h5py.File(shard) as file:
         data = file["data"]
@@ -43,7 +43,7 @@ def test_the_groups_are_those_of_robomimic(made: Dataset) -> None:
             assert np.array_equal(told[:-1], robot[1:])  # what it is told is where it is next
 
 
-def test_read_back_to_1e_9(made: Dataset) -> None:
+def test_episodes_are_read_back_to_1e_9(made: Dataset) -> None:
     for episode in read_episodes(made.shards[0], made.folder / "scenes"):
         record, data = run_attempt(made.recipe.document, episode.number, {})
         fresh = unpack(data)
@@ -60,7 +60,7 @@ def test_read_back_to_1e_9(made: Dataset) -> None:
         assert np.array_equal(episode.scene().start, fresh.scene().start)
 
 
-def test_samples_are_the_motion(made: Dataset) -> None:
+def test_samples_lie_on_the_trajectory(made: Dataset) -> None:
     episode = next(made.episodes())
     robot = episode.scene().robot
     found = sample_episode(episode, robot, 25.0)
@@ -85,7 +85,7 @@ def test_samples_are_the_motion(made: Dataset) -> None:
     ).all()
 
 
-def test_the_same_episodes_give_the_same_bytes(made: Dataset, tmp_path: Path) -> None:
+def test_shards_are_reproducible(made: Dataset, tmp_path: Path) -> None:
     """Made anew of what was read back, and copied from the shard itself."""
     files = []
     for episode in made.episodes():
@@ -106,7 +106,7 @@ def test_the_same_episodes_give_the_same_bytes(made: Dataset, tmp_path: Path) ->
     assert scenes[0] == scenes[1]
 
 
-def test_damage_is_told(made: Dataset, tmp_path: Path) -> None:
+def test_damaged_files_are_errors(made: Dataset, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(made.folder, copy)
     shard = Dataset.open(copy).shards[0]
@@ -123,7 +123,7 @@ def test_damage_is_told(made: Dataset, tmp_path: Path) -> None:
         list(Dataset.open(copy).episodes())
 
 
-def test_a_scene_that_is_another(made: Dataset, tmp_path: Path) -> None:
+def test_changed_scene_is_an_error(made: Dataset, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(made.folder, copy)
     for file in (copy / "scenes").iterdir():

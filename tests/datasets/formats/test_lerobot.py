@@ -29,7 +29,7 @@ def info(root: Path) -> Any:
     return json.loads((root / "meta/info.json").read_text())
 
 
-def test_info_names_what_there_is(root: Path) -> None:
+def test_info_describes_the_features(root: Path) -> None:
     said = info(root)
     assert said["codebase_version"] == "v3.0"
     assert (said["total_episodes"], said["fps"], said["robot_type"]) == (4, 10, "husky_ur5e")
@@ -47,7 +47,7 @@ def test_info_names_what_there_is(root: Path) -> None:
         assert said["features"][name]["shape"] == [len(said["features"][name]["names"])]
 
 
-def test_frames_are_the_samples(made: Dataset, root: Path) -> None:
+def test_frames_are_samples_of_episodes(made: Dataset, root: Path) -> None:
     said = info(root)
     table = pq.read_table(root / said["data_path"].format(chunk_index=0, file_index=0))
     assert table.column_names == list(said["features"])
@@ -73,7 +73,7 @@ def test_frames_are_the_samples(made: Dataset, root: Path) -> None:
     )  # one an episode
 
 
-def test_episodes_and_tasks(made: Dataset, root: Path) -> None:
+def test_tables_of_episodes_and_tasks(made: Dataset, root: Path) -> None:
     rows = pq.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
     frames = info(root)["total_frames"]
     assert [row["episode_index"] for row in rows] == [0, 1, 2, 3]
@@ -110,7 +110,7 @@ def test_statistics_are_those_of_all_frames(root: Path) -> None:
     assert own["count"] == [len(values)]
 
 
-def test_frames_a_second_are_whole(tmp_path: Path) -> None:
+def test_rate_must_be_whole(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="whole numbers of frames"):
         generate({**SMALL, "rate": 12.5}, 1, tmp_path / "out", lerobot=True)
     assert not (tmp_path / "out").exists()  # not after hours of planning

@@ -13,7 +13,7 @@ from vkc_pin.datasets.recipes.recipe import load_recipe
 pytest.importorskip("h5py")
 
 
-def test_attempts_come_as_parts_of_a_shard(tmp_path: Path) -> None:
+def test_attempts_are_parts_of_a_shard(tmp_path: Path) -> None:
     document = load_recipe({**SMALL, "tasks": ["given-open"]}).document
     made, plain = make_parts((document, [0, 1], {})), run_attempts((document, [0, 1], {}))
     assert [record["success"] for record, _ in made] == [True, True]
@@ -31,7 +31,7 @@ def test_attempts_come_as_parts_of_a_shard(tmp_path: Path) -> None:
     assert all(episode.validate().ok for episode in read_episodes(shard, tmp_path / "scenes"))
 
 
-def test_failures_have_nothing(tmp_path: Path) -> None:
+def test_failures_have_no_data(tmp_path: Path) -> None:
     document = load_recipe(
         {**SMALL, "tasks": ["drive-open"], "start": {"distance": [90.0, 91.0]}}
     ).document

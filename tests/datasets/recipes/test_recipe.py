@@ -30,7 +30,7 @@ def write(folder: Path, text: str) -> Path:
     return path
 
 
-def test_what_comes_with_the_package() -> None:
+def test_packaged_recipe() -> None:
     recipe = load_recipe("home")
     assert recipe.fields.rooms.count == 50
     assert set(recipe.fields.tasks) == {"given-open", "drive-open", "fetch-place"}
@@ -38,7 +38,7 @@ def test_what_comes_with_the_package() -> None:
     assert len(recipe.fields.robots) >= 3
 
 
-def test_a_document_makes_the_same_recipe(tmp_path: Path) -> None:
+def test_document_makes_the_same_recipe(tmp_path: Path) -> None:
     recipe = load_recipe({**SMALL, "options": {"dist_safe": 0.03}, "goal": {"share": [0.2, 0.3]}})
     file = write(tmp_path, yaml.safe_dump(recipe.document))
     again = load_recipe(file)
@@ -57,7 +57,7 @@ def test_a_document_makes_the_same_recipe(tmp_path: Path) -> None:
         ({"variants": 2}, False),
     ],
 )
-def test_the_digest_is_that_of_what_episodes_depend_on(change: dict[str, Any], same: bool) -> None:
+def test_digest_depends_on_what_determines_episodes(change: dict[str, Any], same: bool) -> None:
     assert (load_recipe({**SMALL, **change}).digest == load_recipe(SMALL).digest) == same
 
 
@@ -73,7 +73,7 @@ def test_the_digest_is_that_of_what_episodes_depend_on(change: dict[str, Any], s
         ("options: {dist_saf: 0.1}", "options.dist_saf", "did you mean 'dist_safe'"),
     ],
 )
-def test_names_that_do_not_exist(tmp_path: Path, line: str, field: str, said: str) -> None:
+def test_unknown_names_are_refused(tmp_path: Path, line: str, field: str, said: str) -> None:
     file = write(tmp_path, f"name: small\n{line}\n")
     with pytest.raises(UnknownNameError) as caught:
         load_recipe(file)
@@ -98,7 +98,7 @@ def test_names_that_do_not_exist(tmp_path: Path, line: str, field: str, said: st
         ("scenes: [missing.yaml]\ntasks: [drive-open]", "scenes[0]"),
     ],
 )
-def test_values_that_make_no_sense(tmp_path: Path, line: str, field: str) -> None:
+def test_wrong_values_are_refused(tmp_path: Path, line: str, field: str) -> None:
     file = write(tmp_path, f"name: small\n{line}\n")
     with pytest.raises(InputError) as caught:
         load_recipe(file)
@@ -106,7 +106,7 @@ def test_values_that_make_no_sense(tmp_path: Path, line: str, field: str) -> Non
     assert caught.value.field == field
 
 
-def test_the_documentation_has_every_field(tmp_path: Path) -> None:
+def test_every_field_is_documented(tmp_path: Path) -> None:
     page = (Path(__file__).parents[3] / "docs/datasets.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"^```yaml\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
     assert load_recipe(write(tmp_path, block)).fields.name == "home"

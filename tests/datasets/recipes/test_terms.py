@@ -40,7 +40,7 @@ def inputs(now: pin.SE3, before: pin.SE3, dt: float) -> np.ndarray:
     return np.concatenate([*columns, [dt]])[None]
 
 
-def test_what_each_kind_says() -> None:
+def test_terms_agree_with_numbers() -> None:
     rng = np.random.default_rng(3)
     axis = np.array([1.0, 2.0, -0.5])
     upright, speed, away = recipe(
@@ -76,7 +76,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return generate(RECIPE, 3, tmp_path_factory.mktemp("made") / "out", terms=[low()])
 
 
-def test_episodes_keep_to_them_and_say_so(made: Dataset) -> None:
+def test_episodes_satisfy_their_terms(made: Dataset) -> None:
     assert [entry.type for entry in made.recipe.fields.terms] == ["speed", "traced"]
     for episode in made.episodes():
         assert [term.name for term in episode.terms] == ["speed base", "low"]
@@ -108,7 +108,7 @@ def said(folder: Path, change: Any) -> int:
         return int(group.attrs["number"])
 
 
-def test_a_motion_that_breaks_one_is_refused(copy: Path) -> None:
+def test_violated_term_is_found(copy: Path) -> None:
     def stricter(words: Any) -> None:
         words["terms"][0]["upper"] = 0.01
 
@@ -118,14 +118,14 @@ def test_a_motion_that_breaks_one_is_refused(copy: Path) -> None:
     assert "speed base" in found.refused[number]
 
 
-def test_terms_that_are_not_the_recipe_s_are_noticed(copy: Path) -> None:
+def test_terms_other_than_the_recipes_are_found(copy: Path) -> None:
     number = said(copy, lambda words: words.pop("terms"))
     found = check_dataset(copy)
     assert list(found.refused) == [number]
     assert "terms differ from those of the recipe" in found.refused[number]
 
 
-def test_they_are_part_of_what_determines_episodes(made: Dataset) -> None:
+def test_digest_depends_on_terms(made: Dataset) -> None:
     plain, slow = load_recipe(SMALL), load_recipe(RECIPE)
     assert len({plain.digest, slow.digest, made.recipe.digest}) == 3
     assert load_recipe(made.recipe.document).digest == made.recipe.digest
@@ -135,7 +135,7 @@ def test_they_are_part_of_what_determines_episodes(made: Dataset) -> None:
     assert generate(RECIPE, 3, made.folder, terms=[low()]).numbers() == made.numbers()
 
 
-def test_tasks_have_those_of_their_own(made: Dataset) -> None:
+def test_terms_may_hold_in_some_tasks(made: Dataset) -> None:
     own = load_recipe(
         {
             **SMALL,
@@ -180,7 +180,7 @@ def test_tasks_have_those_of_their_own(made: Dataset) -> None:
         ("{type: python, expression: os.getcwd()}", "terms[0].type", "traced"),
     ],
 )
-def test_what_is_no_term(tmp_path: Path, entry: str, field: str, text: str) -> None:
+def test_wrong_terms_are_refused(tmp_path: Path, entry: str, field: str, text: str) -> None:
     file = tmp_path / "recipe.yaml"
     file.write_text(f"name: small\nterms:\n  - {entry}\n", encoding="utf-8")
     with pytest.raises(InputError) as caught:
@@ -206,16 +206,14 @@ def test_what_is_no_term(tmp_path: Path, entry: str, field: str, text: str) -> N
         (3, "not a list"),
     ],
 )
-def test_nothing_is_written_for_terms_that_cannot_hold(
-    tmp_path: Path, terms: Any, text: str
-) -> None:
+def test_wrong_terms_write_nothing(tmp_path: Path, terms: Any, text: str) -> None:
     with pytest.raises(InputError) as caught:
         generate(SMALL, 1, tmp_path / "out", terms=terms)
     assert text in str(caught.value)
     assert not (tmp_path / "out").exists()
 
 
-def test_the_documentation_has_every_field() -> None:
+def test_every_field_is_documented() -> None:
     page = (Path(__file__).parents[3] / "docs/datasets.md").read_text(encoding="utf-8")
     for schema in (UprightSchema, SpeedSchema, KeepOutSchema, TracedSchema):
         assert [name for name in schema.model_fields if f"`{name}`" not in page] == [], (

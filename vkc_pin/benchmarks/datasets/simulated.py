@@ -76,8 +76,8 @@ def simulate_workers(costs: Costs, workers: int, tasks: int | None = None) -> di
         tasks: Number of tasks of the dataset. Default: 100 per worker.
 
     Returns:
-        `workers`, `tasks`, `episodes_per_hour`, `efficiency` (share of the workers' time spent on the
-        dataset), `client` (share of time in which the client is busy) and `in_vain` (share of the
+        `workers`, `tasks`, `episodes_per_hour`, `efficiency` (share of the workers' time spent on
+        the dataset), `client` (share of time in which it is busy) and `in_vain` (share of the
         workers' time spent on wasted tasks).
     """
     wanted = _EACH * workers if tasks is None else tasks

@@ -55,7 +55,7 @@ def run(
 
     Returns:
         {"meta": ..., "trials": records by task, "curve": records by task and number of workers,
-        "simulated": results of `simulate_workers`, with `saturated_at`: number of workers that saturate
+        "simulated": results of `simulate_workers`, with `saturated_at`: workers that saturate
         the client}.
 
     Raises:
@@ -203,11 +203,16 @@ def report(result: Mapping[str, Any]) -> str:
     ]
     parts = [
         "# Throughput",
-        f"{about['episodes']} validated episodes of each task, with {about['jobs']} processes, recipe {about['recipe']}. "
-        "The time counts from when the processes are there to the last attempt; an hour of one core is of processor "
-        "time, without what else ran on the machine. Growth is that of a process in a thousand attempts, once half of its "
-        "attempts have filled its caches; the client feeds the processes and writes down what comes, and takes so much "
-        "processor time an attempt. Medians of an attempt, of what sets it up (room, start, grasp) and of planning it.",
+        f"{about['episodes']} validated episodes of each task, with {about['jobs']} processes, "
+        f"recipe {about['recipe']}. "
+        "The time counts from when the processes are there to the last attempt; an hour of one "
+        "core is of processor "
+        "time, without what else ran on the machine. Growth is that of a process in a thousand "
+        "attempts, once half of its "
+        "attempts have filled its caches; the client feeds the processes and writes down what "
+        "comes, and takes so much "
+        "processor time an attempt. Medians of an attempt, of what sets it up (room, start, "
+        "grasp) and of planning it.",
         format_table(head, [_row(one) for one in records]),
         *_curve(result["curve"]),
         *_simulation(result["simulated"], bool(about["scheduled"])),
@@ -237,7 +242,8 @@ def _curve(curve: Sequence[Record]) -> list[str]:
         ]
         for one in curve
     ]
-    text = "The same episodes by fewer workers, in this run too. One works in the client's own process, without Dask."
+    text = "The same episodes by fewer workers, in this run too. "
+    text += "One works in the client's own process, without Dask."
     return [text, format_table(["task", "workers", "episodes an hour", "times one"], rows)]
 
 
@@ -261,9 +267,12 @@ def _simulation(many: Sequence[Record], scheduled: bool) -> list[str]:
         for one in many
     ]
     text = (
-        "Many workers, simulated from what these tasks took, a hundred tasks for each. Every result waits for the one client, "
-        f"which takes its processor time {'with' if scheduled else 'but not'} that of Dask's scheduler; efficiency is the share "
-        "of the workers' time that goes into the dataset, and work in vain is what was begun beyond its last number. Nothing is "
+        "Many workers, simulated from what these tasks took, a hundred tasks for each. Every "
+        "result waits for the one client, "
+        f"which takes its processor time {'with' if scheduled else 'but not'} that of Dask's "
+        "scheduler; efficiency is the share "
+        "of the workers' time that goes into the dataset, and work in vain is what was begun "
+        "beyond its last number. Nothing is "
         "said of network and disk."
     )
     return [text, format_table(head, rows), "![Efficiency of many workers, simulated](workers.png)"]

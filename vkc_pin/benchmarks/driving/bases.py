@@ -22,7 +22,7 @@ __all__ = ["BASES", "TASKS", "TURNING_RADIUS", "make_start", "report", "run"]
 TASKS = {"door": {"hinge": 1.2}, "drawer": {"slide": 0.35}}
 """Scene → what is opened how far: its object of the same name."""
 TURNING_RADIUS = 0.8
-"""[m] of bases that are steered. The Husky is not: the figure is ours, a little less than its length of 0.99 m."""
+"""Turning radius of steered bases [m], an own choice: a little less than the Husky's length."""
 BASES: dict[str, dict[str, Any]] = {
     "omni": {},
     "differential": {},

@@ -114,7 +114,8 @@ def report(result: Mapping[str, Any]) -> str:
     return join_report(
         about,
         "# Plans in physics" + ", held by friction" * (about.get("grasp") == "friction"),
-        f"{about['starts']} random starts per task, seed {about['seed']}, {describe_limit(about)} each. "
+        f"{about['starts']} random starts per task, seed {about['seed']}, {describe_limit(about)} "
+        "each. "
         "Plans are counted by the independent validation, and executed if they end within 10 mm "
         "and 0.02 rad of the goal, nothing is pulled out of the hand, and no contact is deeper "
         "than planned by more than 1 mm; beside it Wilson's interval of 95 %. Errors of arm and "

@@ -1,1 +1,1 @@
-"""Running experiments: trials on several processes, their records, and tables and charts of these."""
+"""Runs experiments and makes their records, tables and charts."""

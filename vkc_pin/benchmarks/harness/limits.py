@@ -10,7 +10,7 @@ __all__ = ["LIMITS", "MAX_EVALUATIONS", "TIME_LIMIT", "describe_limit"]
 MAX_EVALUATIONS = 1_000_000
 """Units, several times what trials take: what can be done is done with less."""
 TIME_LIMIT = 1800.0
-"""[s] Of a whole call. Trials that end with it have the status "time limit": such a result is none of the method's."""
+"""Wall time of a call [s]; trials that it ends are no results of the method."""
 LIMITS: Mapping[str, Any] = {"max_evaluations": MAX_EVALUATIONS, "time_limit": TIME_LIMIT}
 """Both, as arguments of planners, and for the record."""
 

@@ -49,7 +49,7 @@ TIMES = {
     "time_ipopt": "Ipopt",
     "time_validation": "validation",
 }
-"""What planning time is spent on: field → name. The rest is setting up the problem, and retiming."""
+"""Parts of planning time: field → name. The rest is setting up the problem and retiming."""
 JUDGED = "Success is the word of the independent validation."
 _LEAST = 1e-6  # in any unit, by which a value must be less to be called lower
 

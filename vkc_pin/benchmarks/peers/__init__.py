@@ -1,1 +1,1 @@
-"""The same problems for other planners: trajopt, OMPL, roboplan, the two baselines, and this package."""
+"""Compares this package with trajopt, OMPL, roboplan and both baselines."""

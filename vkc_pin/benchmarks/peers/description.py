@@ -67,22 +67,8 @@ def describe(problem: TrajectoryProblem, folder: Path, *, inflated: bool = False
     lower, upper = compute_finite_limits(problem)
     model, at = chain.model, 0
     for j in range(1, model.njoints):
-        parent, kind = (
-            ("world" if model.parents[j] == 0 else f"body_{model.parents[j]}"),
-            model.joints[j],
-        )
-        placement, short = (
-            model.jointPlacements[j],
-            str(kind.shortname()).removeprefix("JointModel"),
-        )
-        if short == "Planar":
-            moves = [("prismatic", _AXES["X"]), ("prismatic", _AXES["Y"]), ("revolute", _AXES["Z"])]
-        elif short[-1] in _AXES and short[0] in "RP":
-            moves = [("prismatic" if short[0] == "P" else "revolute", _AXES[short[-1]])]
-        elif short in ("RevoluteUnaligned", "RevoluteUnboundedUnaligned", "PrismaticUnaligned"):
-            moves = [("prismatic" if short[0] == "P" else "revolute", tuple(_axis(model, j)))]
-        else:
-            raise InputError("no joint of a URDF", field=str(model.names[j]), got=short)
+        parent = f"body_{model.parents[j]}" if model.parents[j] else "world"
+        placement, moves = model.jointPlacements[j], _list_moves(model, j)
         for k, (form, axis) in enumerate(moves):
             child = f"body_{j}" + (f"_{k}" if k + 1 < len(moves) else "")
             ET.SubElement(root, "link", name=child)
@@ -141,6 +127,19 @@ def describe(problem: TrajectoryProblem, folder: Path, *, inflated: bool = False
     return Description(
         *files, names, {(one, other): kept[pair] for pair in kept for one, other in [sorted(pair)]}
     )
+
+
+def _list_moves(model: Any, joint: int) -> list[tuple[str, tuple[float, ...]]]:
+    """Return type and axis of the URDF joints that a joint is made of."""
+    short = str(model.joints[joint].shortname()).removeprefix("JointModel")
+    if short == "Planar":
+        return [("prismatic", _AXES["X"]), ("prismatic", _AXES["Y"]), ("revolute", _AXES["Z"])]
+    form = "prismatic" if short[0] == "P" else "revolute"
+    if short[-1] in _AXES and short[0] in "RP":
+        return [(form, _AXES[short[-1]])]
+    if short in ("RevoluteUnaligned", "RevoluteUnboundedUnaligned", "PrismaticUnaligned"):
+        return [(form, tuple(_axis(model, joint)))]
+    raise InputError("no joint of a URDF", field=str(model.names[joint]), got=short)
 
 
 def _thick(number: int, thicker: float) -> str:

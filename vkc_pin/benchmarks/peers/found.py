@@ -75,7 +75,7 @@ class Clock:
 
 
 Peer = Callable[[PeerProblem, TrajectoryProblem, int, Clock, Callable[[Floats], bool]], PeerResult]
-"""What plans: takes a problem, the same as a program, a random seed, the clock, and what tells whether a path is accepted."""
+"""Plans a problem, given its program, a random seed, a clock and a check of paths."""
 
 
 def validate_path(

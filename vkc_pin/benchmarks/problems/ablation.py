@@ -173,7 +173,8 @@ def report(result: Mapping[str, Any]) -> str:
     return join_report(
         about,
         "# One setting changed at a time",
-        f"{problems}, planning seed {about['seed']}, {describe_limit(about)} each. {JUDGED} {SUMMARIZED}",
+        f"{problems}, planning seed {about['seed']}, {describe_limit(about)} each. {JUDGED} "
+        f"{SUMMARIZED}",
         format_table(["setting", *SUMMARY], rows),
         "## Against the unchanged planner",
         "Median (quartiles) of the ratio to the unchanged planner, over the problems at which "

@@ -27,8 +27,8 @@ class Change:
     """A changed setting.
 
     Attributes:
-        module: Module of a constant within `vkc_pin.planning`, such as "solver.loop"; "Options" for a
-            field of `Options`; "" for no change.
+        module: Module of a constant within `vkc_pin.planning`, such as "solver.loop"; "Options"
+            for a field of `Options`; "" for no change.
         name: Name of the constant or field.
         value: New value.
     """

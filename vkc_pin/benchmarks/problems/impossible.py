@@ -71,7 +71,8 @@ def report(result: Mapping[str, Any]) -> str:
     return join_report(
         about,
         "# Impossible problems",
-        f"{about['problems']} impossible problems, seed {about['seed']}, {describe_limit(about)} each. "
+        f"{about['problems']} impossible problems, seed {about['seed']}, {describe_limit(about)} "
+        "each. "
         "Explained: the report names a cause. Proven: it does so for certain.",
         format_table(
             ["kind", "problems", *fields, "time, median [s]", "95th percentile [s]"], rows

@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 KINDS = ("reach", "door", "pull", "carry", "scene")
-"""Kinds of problems: ten of each of the first four, in random rooms, then twenty in scenes that come along."""
+"""Kinds of problems: ten of each of the first four in random rooms, then twenty in scenes."""
 NUMBER = 60
 _EACH = 10
 _STARTS = 60  # the random seed of the starts; the experiments' own figures are of other seeds

@@ -92,7 +92,7 @@ def compute_objective(found: Plan, planner: Planner | None = None) -> float | No
 
 @functools.cache
 def _planner(change: Change) -> Planner:
-    """Return a planner for each change, once per process: what one keeps was built with its own constants."""
+    """Return the planner of a change, whose caches hold its own constants."""
     return Planner()
 
 

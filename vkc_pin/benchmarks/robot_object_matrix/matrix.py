@@ -49,8 +49,10 @@ def report(result: Mapping[str, Any]) -> str:
     return join_report(
         about,
         "# Robots × objects",
-        f"{len(robots)} robots, {len(objects)} objects of {len(set(map(get_kind, objects)))} kinds, "
-        f"{about['starts']} random starts each, seed {about['seed']}, {describe_limit(about)} each. A "
+        f"{len(robots)} robots, {len(objects)} objects of {len(set(map(get_kind, objects)))} "
+        "kinds, "
+        f"{about['starts']} random starts each, seed {about['seed']}, {describe_limit(about)} "
+        "each. A "
         f"joint is opened by {about['share']:.0%} of its range, by any proposed attachment; an "
         "object is within reach if the hand gets to it both closed and open by so much. "
         f"{JUDGED} Times are those of all plans; loading again is the median over all "

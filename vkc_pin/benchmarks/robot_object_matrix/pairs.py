@@ -54,7 +54,7 @@ ROBOTS = (
     "tiago_dual",
     "baxter",
 )
-"""Mobile manipulators, and arms that ride on the virtual base, by the names that `load_robot` knows."""
+"""Mobile manipulators, and arms on the virtual base, by names of `load_robot`."""
 OBJECTS = (
     *(f"{kind}_{number}" for kind in KINDS for number in range(2)),
     *(
@@ -69,7 +69,7 @@ OBJECTS = (
         "refrigerator",
     ),
 )
-"""Two of every kind of `random_object`, as `<kind>_<seed>`, and what stands fixed in scenes/objects."""
+"""Two of every kind of `random_object`, as `<kind>_<seed>`, and those in scenes/objects."""
 SHARE = 0.5
 """Of a joint's range by which it is opened: the middle of what `random_task` draws."""
 

@@ -56,7 +56,8 @@ def sample_reachable_poses(robot: Robot, name: str, number: int, *, seed: int = 
             if pose.translation[2] > Options().dist_safe:
                 poses.append(pose.copy())
     raise VkcError(
-        f"{name}: only {len(poses)} of {number * _TRIES} random configurations are free of collision"
+        f"{name}: only {len(poses)} of {number * _TRIES} random configurations are free of "
+        "collision"
     )
 
 

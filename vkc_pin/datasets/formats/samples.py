@@ -24,11 +24,11 @@ def sample_episode(episode: Episode, robot: Robot, rate: float) -> Mapping[str, 
 
     Returns:
         `time` (N,) [s]; `base_pose` x, y [m] and yaw [rad] in the world frame; `base_velocity`;
-        `arm_position`, `arm_velocity` [rad], [rad/s]; `hand_pose`: position [m] and quaternion x, y,
-        z, w of the tool frame in the world frame; `gripper`: opening [m], 0 if unknown; `holding`: 1
-        while an object is grasped; `object_position`: coordinates of objects [rad] or [m]; `states`:
-        all coordinates of robot and objects; `actions`: base, arm and gripper at the next sample
-        (N, n + 1).
+        `arm_position`, `arm_velocity` [rad], [rad/s]; `hand_pose`: position [m] and quaternion
+        x, y, z, w of the tool frame in the world frame; `gripper`: opening [m], 0 if unknown;
+        `holding`: 1 while an object is grasped; `object_position`: coordinates of objects [rad]
+        or [m]; `states`: all coordinates of robot and objects; `actions`: base, arm and gripper
+        at the next sample (N, n + 1).
     """
     motion = episode.trajectory
     times = sample_times(motion, rate)

@@ -52,8 +52,8 @@ __all__ = [
 ]
 
 TASKS = ("given-open", "drive-open", "fetch-place")
-"""What an episode can be: something is opened by a hand that has hold of it, or by a robot that first drives there; something is
-taken from one table to another."""
+"""Tasks of episodes: open an object from a given grasp, drive there and open it, or move an object
+to another table."""
 
 _increasing = require(
     lambda value: value[0] <= value[1], "the interval is empty", "[lowest, highest]"
@@ -134,7 +134,7 @@ CAMERAS = (
         "fov": 75.0,
     },
 )
-"""The cameras of recipes that are asked for images and name none: one above the base, one beside the fingers."""
+"""Default cameras: one above the base, one beside the fingers."""
 
 _some = require(lambda value: value, "there is nothing", "at least one")
 Robots = Annotated[tuple[Annotated[RobotEntry, wrap_text("name")], ...], _some]

@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 OBJECT = "object"
-"""The link that an episode takes hold of, as a frame, and the object that it belongs to, in `holding`."""
+"""Frame of the grasped link, and the grasped object in `holding`."""
 
 Axis = Annotated[
     Vector3,
@@ -161,7 +161,7 @@ def check_entries(document: Document, entries: Sequence[Entry], tasks: Sequence[
     """Check the terms of a recipe.
 
     Raises:
-        InputError: A term is wrong, or two have the same name; the error names file, line and field.
+        InputError: A term is wrong, or two have one name; the error names file, line and field.
     """
     names: list[str] = []
     for k, entry in enumerate(entries):

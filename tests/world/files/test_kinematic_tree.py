@@ -113,6 +113,7 @@ def test_velocity_and_effort_limits_are_optional(tmp_path: Path) -> None:
     np.testing.assert_array_equal(model.upperPositionLimit, [0.5, 2.0])
 
 
+@pytest.mark.filterwarnings("error")
 def test_extensions_are_ignored(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """Elements of simulators and undeclared prefixes change nothing, and no parser complains."""
     lines = two("continuous", '<axis xyz="0 0 1"/><limit effort="3"/>')

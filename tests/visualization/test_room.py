@@ -18,15 +18,17 @@ def room(scene: Scene) -> Room:
 
 
 def test_obstacles_are_drawn_as_walls_or_furniture(room: Room, scene: Scene) -> None:
-    names = {name for part in room.parts() for name in part.name.split("/")}
+    names = {name for part in room.make_parts() for name in part.name.split("/")}
     assert {*scene.obstacle_names, "floor"} <= names
-    walls = {part.name.split("/")[1] for part in room.parts() if part.name.startswith("walls/")}
+    walls = {
+        part.name.split("/")[1] for part in room.make_parts() if part.name.startswith("walls/")
+    }
     beside_the_door = {"wall_left_of_door", "wall_right_of_door", "wall_above_door"}
     assert walls == beside_the_door | {"wall_west", "wall_north", "wall_south", "hall_wall"}
 
 
 def test_walls_are_visible_from_inside_only(room: Room) -> None:
-    inside = {part.name: part for part in room.parts() if part.name.endswith("/inside")}
+    inside = {part.name: part for part in room.make_parts() if part.name.endswith("/inside")}
     normals = {
         "wall_west": [1, 0, 0],
         "wall_south": [0, 1, 0],
@@ -42,7 +44,7 @@ def test_walls_are_visible_from_inside_only(room: Room) -> None:
 
 
 def test_walls_obstruct_the_view_less_than_furniture(room: Room, scene: Scene) -> None:
-    boxes = room.obstructions()
+    boxes = room.find_obstructions()
     assert len(boxes) == len(scene.obstacle_visual)
     sofa = [o for low, high, o in boxes if np.allclose(low, [-2.4, -1.775, 0.0], atol=1e-6)]
     assert sofa == [1.0]

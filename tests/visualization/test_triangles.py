@@ -6,15 +6,15 @@ import pinocchio as pin
 import pytest
 import trimesh
 
-from vkc_pin.visualization.plots.top_view import outline
+from vkc_pin.visualization.plots.top_view import compute_outline
 from vkc_pin.visualization.triangles import (
     Solid,
-    box_solid,
-    coarse,
+    make_box,
+    make_tube,
     merge_solids,
     shade,
+    simplify,
     to_solid,
-    tube,
 )
 
 
@@ -42,10 +42,10 @@ def test_boxes_are_shaded_flat_and_balls_smooth() -> None:
 
 def test_sides_of_a_box_face_outwards() -> None:
     lower, upper = np.array([-1.0, 0.0, 2.0]), np.array([1.0, 3.0, 4.0])
-    whole = box_solid(lower, upper)
+    whole = make_box(lower, upper)
     assert as_mesh(whole).volume == pytest.approx(12.0)
     for side in range(6):
-        solid = box_solid(lower, upper, (side,))
+        solid = make_box(lower, upper, (side,))
         axis, positive = divmod(side, 2)
         assert np.allclose(solid.vertices[:, axis], (lower, upper)[positive][axis])
         assert np.allclose(solid.normals, (2 * positive - 1) * np.eye(3)[axis])
@@ -56,14 +56,14 @@ def test_sides_of_a_box_face_outwards() -> None:
 
 def test_coarse_copy_has_fewer_faces_and_the_same_volume() -> None:
     fine = shade(*ball())
-    light = coarse(fine, 0.1)
+    light = simplify(fine, 0.1)
     assert len(light.faces) < 0.8 * len(fine.faces)
     assert as_mesh(light).volume == pytest.approx(as_mesh(fine).volume, rel=0.1)
 
 
 def test_solids_are_moved_and_merged() -> None:
-    solid = box_solid(np.zeros(3), np.ones(3))
-    moved = solid.moved(
+    solid = make_box(np.zeros(3), np.ones(3))
+    moved = solid.transform(
         pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, np.pi / 2), np.array([5.0, 0.0, 0.0]))
     )
     assert np.allclose(moved.vertices.min(axis=0), [4.0, 0.0, 0.0], atol=1e-6)
@@ -75,7 +75,7 @@ def test_solids_are_moved_and_merged() -> None:
 def test_tube_follows_its_line() -> None:
     angle = np.linspace(0.0, 3.0, 60)
     line = np.column_stack([np.cos(angle), np.sin(angle), 0.2 * angle])
-    solid = tube(line, 0.01)
+    solid = make_tube(line, 0.01)
     assert solid is not None
     away = np.linalg.norm(solid.vertices[:, None] - line[None], axis=2).min(axis=1)
     assert np.allclose(away, 0.01, atol=1e-3)
@@ -84,10 +84,12 @@ def test_tube_follows_its_line() -> None:
     assert (np.einsum("ij,ij->i", turn, solid.normals[solid.faces[:, 0]]) > 0).all(), (
         "wound outwards"
     )
-    assert tube(np.zeros((5, 3)), 0.01) is None, "nothing moves"
+    assert make_tube(np.zeros((5, 3)), 0.01) is None, "nothing moves"
 
 
 def test_outline_of_points_from_above() -> None:
-    corners = outline(np.array([[0, 0, 1], [2, 0, 5], [2, 1, 0], [0, 1, 0], [1, 0.5, 9]], float))
+    corners = compute_outline(
+        np.array([[0, 0, 1], [2, 0, 5], [2, 1, 0], [0, 1, 0], [1, 0.5, 9]], float)
+    )
     assert {tuple(c) for c in corners} == {(0, 0), (2, 0), (2, 1), (0, 1)}
-    assert len(outline(np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]))) == 2
+    assert len(compute_outline(np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]))) == 2

@@ -1,4 +1,4 @@
-"""`python -m vkc_pin.cli` is `vkc-pin`."""
+"""Runs `vkc-pin` for `python -m vkc_pin.cli`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""The commands of `vkc-pin`: plan, view, export, srdf, and those of other modules. Files are written before reports."""
+"""Defines the commands plan, check, simulate, view, export and srdf, and runs all commands."""
 
 from __future__ import annotations
 
@@ -12,17 +12,20 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.benchmarks.commands import (
-    EXIT_INTERRUPTED,
-    EXIT_OK,
-    add_bench,
-    parse_natural,
-    parse_positive,
-)
-from vkc_pin.cli.checking import add_check
+from vkc_pin.benchmarks.commands import add_bench
 from vkc_pin.cli.datasets import add_datasets
 from vkc_pin.cli.importing import add_importing
-from vkc_pin.cli.simulating import add_simulate
+from vkc_pin.cli.options import (
+    EXIT_FAILED,
+    EXIT_INFEASIBLE,
+    EXIT_INTERRUPTED,
+    EXIT_MISUSE,
+    EXIT_OK,
+    add_command,
+    add_option,
+    add_seed,
+    parse_positive,
+)
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.world.files.writing import check_outputs, write_atomically
 from vkc_pin.world.trajectory.formats.rosbag import import_rosbags
@@ -30,26 +33,36 @@ from vkc_pin.world.trajectory.formats.tables import GROUPS
 
 __all__ = ["EXIT_MISUSE", "make_parser", "parse_settings", "run"]
 
-EXIT_FAILED, EXIT_MISUSE, EXIT_INFEASIBLE = 1, 2, 3
-_FAILURES = {
-    "infeasible": EXIT_INFEASIBLE,
-    "interrupted": EXIT_INTERRUPTED,
-}  # by a plan's status; others have failed
-_CODES = """exit codes:
-  0    success: a motion that the validation finds nothing wrong with, and all that was asked for is written and printed
-  1    failed: no valid motion came out, a saved one is none or not what its file says, or a scene has a fault
-  2    wrong input, or something that cannot be read, written or printed
-  3    infeasible: the task cannot be done, and the report says why
+# Exit codes by the status of a plan; others mean failure
+_STATUS_CODES = {"infeasible": EXIT_INFEASIBLE, "interrupted": EXIT_INTERRUPTED}
+_EPILOG = """exit codes:
+  0    success: the motion is valid, and all outputs are written
+  1    failed: no valid motion was found, a saved one is invalid, or a scene or robot has faults
+  2    wrong input, or something cannot be read, written or printed
+  3    infeasible: the report says why
   130  Ctrl-C"""
-_FILES = ("save", "json", "csv", "ros", "html")
 _FOLDERS = ("rosbag",)
+_OUTPUTS = {
+    "--html FILE": "write the animation as one self-contained page",
+    "--save FILE": "save the plan (.npz)",
+    "--plots FOLDER": "write plots",
+}
+_EXPORTS = {
+    "--json FILE": "write trajectory, metrics and report as JSON",
+    "--csv FILE": "write a table with a line per waypoint",
+    "--ros FILE": "write JSON with the fields of trajectory_msgs/JointTrajectory",
+    "--rosbag FOLDER": "write a recording of ROS 2 (rosbag2); needs the extra `ros`",
+}
+Writers = Mapping[str, Callable[[str], object]]
 
 
 def parse_settings(settings: Sequence[str]) -> list[Any]:
-    """Return `Actuate` steps of "object.joint=value" texts; neighbours of one object become one step.
+    """Return `Actuate` steps of texts "object.joint=value".
+
+    Consecutive settings of different joints of one object become one step.
 
     Raises:
-        InputError: A text is not of that form.
+        InputError: A text has another form.
     """
     from vkc_pin.world.task.steps import Actuate
 
@@ -73,10 +86,11 @@ def parse_settings(settings: Sequence[str]) -> list[Any]:
     return [Actuate(owner, joints) for owner, joints in grouped]
 
 
-def _progress(row: Any) -> None:
+def _print_progress(row: Any) -> None:
     sys.stderr.write(
-        f"  round {row.round:2d}  Ipopt {row.iterations:4d}  clearance {1e3 * row.clearance:7.1f} mm"
-        f"  short of it {1e3 * row.shortfall:6.2f} mm  pose error {row.pose_error:.1e}  step {row.step:.3f}  {row.time:.2f} s\n"
+        f"  round {row.round:2d}  Ipopt {row.iterations:4d}"
+        f"  clearance {1e3 * row.clearance:7.1f} mm  shortfall {1e3 * row.shortfall:6.2f} mm"
+        f"  pose error {row.pose_error:.1e}  step {row.step:.3f}  {row.time:.2f} s\n"
     )
 
 
@@ -84,88 +98,83 @@ def _plan(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
     from vkc_pin.visualization.plots.plots import PICTURES
 
-    steps, outputs = parse_settings(arguments.set), _options(_chosen(arguments, _FILES))
-    if (folder := arguments.plots) is not None:
+    steps = parse_settings(arguments.set)
+    files = _get_given(arguments, "save", "json", "csv", "ros", "html", "rosbag", "plots")
+    outputs: dict[str, str] = dict(files)
+    if (folder := files.get("plots")) is not None:
         if Path(folder).suffix.lower() in PICTURES:
             raise InputError(
                 "this is the name of a picture", field="--plots", expected="a folder", got=folder
             )
-        outputs["--plots"] = Path(folder, "joints.png")
-    check_outputs(outputs | _new_folders(arguments), inputs={"SCENE": arguments.scene})
-    scene = vkc.load_scene(arguments.scene)
+        outputs["plots"] = str(Path(folder, "joints.png"))
+    _check_outputs(outputs, SCENE=arguments.scene)
     plan = vkc.plan(
-        scene,
+        vkc.load_scene(arguments.scene),
         steps,
         initialization=arguments.initialization,
         time_limit=arguments.time_limit,
         max_evaluations=arguments.max_evaluations,
         seed=arguments.seed,
-        callback=None if arguments.quiet else _progress,
+        callback=None if arguments.quiet else _print_progress,
     )
-    ros = functools.partial(_write_ros, plan)
-    writers: dict[str, Callable[[str], object]] = {
-        "save": plan.save,
-        "json": plan.to_json,
-        "csv": plan.to_csv,
-        "ros": ros,
-        "rosbag": plan.to_rosbag,
-        "html": plan.to_html,
-        "plots": plan.plot,
-    }
-    if not _write(
-        _chosen(arguments, (*_FILES, *_FOLDERS, "plots")), writers, plan.summary() + "\n"
-    ):
+    writers = {**_make_exporters(plan), "save": plan.save, "html": plan.to_html, "plots": plan.plot}
+    if not _write(files, writers, f"{plan.summary()}\n"):
         return EXIT_MISUSE
-    return EXIT_OK if plan.success else _FAILURES.get(plan.status, EXIT_FAILED)
+    return EXIT_OK if plan.success else _STATUS_CODES.get(plan.status, EXIT_FAILED)
 
 
-def _chosen(arguments: argparse.Namespace, options: Sequence[str]) -> dict[str, str]:
-    """Return what options name, of those that are given."""
-    return {
-        option: value for option in options if (value := getattr(arguments, option)) is not None
-    }
+def _get_given(arguments: argparse.Namespace, *options: str) -> dict[str, str]:
+    """Return the values of those options that are given."""
+    values = {option: getattr(arguments, option) for option in options}
+    return {option: value for option, value in values.items() if value is not None}
 
 
-def _new_folders(arguments: argparse.Namespace) -> dict[str, str | Path]:
-    """Return a file in each folder that options have made, by option, if these can be made."""
-    folders = _chosen(arguments, _FOLDERS)
-    for option, path in folders.items():
-        if Path(path).exists():
-            raise InputError(
-                "this already exists", file=path, field=f"--{option}", expected="a new folder"
-            )
-        import_rosbags()
-    return {f"--{option}": Path(path, "metadata.yaml") for option, path in folders.items()}
+def _check_outputs(outputs: Mapping[str, str], **inputs: str) -> None:
+    """Check that outputs can be written and do not overwrite inputs."""
+    files: dict[str, str | Path] = {}
+    for option, path in outputs.items():
+        if option in _FOLDERS:
+            if Path(path).exists():
+                raise InputError(
+                    "this already exists", file=path, field=f"--{option}", expected="a new folder"
+                )
+            import_rosbags()
+        files[f"--{option}"] = Path(path, "metadata.yaml") if option in _FOLDERS else path
+    check_outputs(files, inputs={name.replace("_", "|"): path for name, path in inputs.items()})
 
 
-def _options(files: Mapping[str, str]) -> dict[str, str | Path]:
-    return {f"--{option}": path for option, path in files.items()}
-
-
-def _write(
-    files: Mapping[str, str], writers: Mapping[str, Callable[[str], object]], report: str = ""
-) -> bool:
-    """Write files by option, then print a report and what was written; return whether all of them were."""
-    said, failed = [report], []
+def _write(files: Mapping[str, str], writers: Writers, report: str = "") -> bool:
+    """Write files by option, print the report and their names; return whether all are written."""
+    lines, errors = [report], []
     for option, path in files.items():
         try:
             writers[option](path)
-            said.append(f"wrote {path}\n")
+            lines.append(f"wrote {path}\n")
         except (VkcError, OSError) as error:  # the others are written all the same
-            failed.append(f"vkc-pin: {error}\n")
-    sys.stdout.write("".join(said))
-    sys.stderr.write("".join(failed))
-    return not failed
+            errors.append(f"vkc-pin: {error}\n")
+    sys.stdout.write("".join(lines))
+    sys.stderr.write("".join(errors))
+    return not errors
 
 
-def _write_ros(plan: Any, path: str, **options: Any) -> None:
-    write_atomically(path, (json.dumps(plan.to_ros(**options)) + "\n").encode("utf-8"))
+def _make_exporters(plan: Any, rate: float | None = None, **joints: Any) -> dict[str, Any]:
+    """Return the functions that write a plan for other programs, by option."""
+
+    def write_ros(path: str) -> None:
+        write_atomically(path, f"{json.dumps(plan.to_ros(**joints, rate=rate))}\n".encode())
+
+    return {
+        "csv": functools.partial(plan.to_csv, **joints),
+        "json": plan.to_json,
+        "ros": write_ros,
+        "rosbag": functools.partial(plan.to_rosbag, rate=rate),
+    }
 
 
 def _export(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
 
-    files = _chosen(arguments, ("csv", "json", "ros", *_FOLDERS))
+    files = _get_given(arguments, "csv", "json", "ros", *_FOLDERS)
     if not files:
         expected = "--csv FILE, --json FILE, --ros FILE or --rosbag FOLDER"
         raise InputError("nothing to write", field="export", expected=expected)
@@ -173,46 +182,81 @@ def _export(arguments: argparse.Namespace) -> int:
         expected = "--ros FILE or --rosbag FOLDER as well"
         raise InputError("only ROS' points can be resampled", field="--rate", expected=expected)
     if arguments.joints is not None and files.keys() == {"rosbag"}:
-        raise InputError(
-            "recordings have all joints",
-            field="--joints",
-            expected="--csv FILE or --ros FILE as well",
-        )
-    plain = {option: path for option, path in files.items() if option not in _FOLDERS}
-    check_outputs(_options(plain) | _new_folders(arguments), inputs={"PLAN": arguments.plan})
+        expected = "--csv FILE or --ros FILE as well"
+        raise InputError("recordings have all joints", field="--joints", expected=expected)
+    _check_outputs(files, PLAN=arguments.plan)
     plan = vkc.Plan.load(arguments.plan)
     names = arguments.joints.split(",") if arguments.joints else None
     joints = names[0] if names is not None and len(names) == 1 and names[0] in GROUPS else names
     chosen = {} if joints is None else {"joints": joints}
-    ros = functools.partial(_write_ros, plan, **chosen, rate=arguments.rate)
-    bag = functools.partial(plan.to_rosbag, rate=arguments.rate)
-    writers: dict[str, Callable[[str], object]] = {
-        "csv": functools.partial(plan.to_csv, **chosen),
-        "json": plan.to_json,
-        "ros": ros,
-        "rosbag": bag,
+    writers = _make_exporters(plan, arguments.rate, **chosen)
+    return EXIT_OK if _write(files, writers) else EXIT_MISUSE
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    import vkc_pin as vkc
+    from vkc_pin.visualization.plots.plots import PICTURES
+
+    files = _get_given(arguments, "plot")
+    if str(arguments.what).endswith(".npz"):
+        if files:
+            raise InputError(
+                "a plan has plots of its own",
+                field="--plot",
+                expected="a scene",
+                got=arguments.what,
+            )
+        plan = vkc.Plan.load(arguments.what)
+        contradictions = plan.contradictions()
+        for line in plan.report.lines():
+            sys.stdout.write(f"{line}\n")
+        for line in contradictions:
+            sys.stdout.write(f"  the file says otherwise: {line}\n")
+        return EXIT_OK if plan.report.ok and not contradictions else EXIT_FAILED
+    if files and not arguments.plot.lower().endswith(PICTURES):
+        expected = f"a name that ends with {', '.join(PICTURES)}"
+        raise InputError(
+            "not the name of a picture", field="--plot", expected=expected, got=arguments.plot
+        )
+    _check_outputs(files, SCENE=arguments.what)
+    found = vkc.check_scene(vkc.load_scene(arguments.what), seed=arguments.seed)
+    if not _write(files, {"plot": found.plot}, f"{found}\n"):
+        return EXIT_MISUSE
+    return EXIT_OK if found.ok else EXIT_FAILED
+
+
+def _simulate(arguments: argparse.Namespace) -> int:
+    import vkc_pin as vkc
+
+    files = _get_given(arguments, "html", "picture", "video", "json")
+    _check_outputs(files, PLAN=arguments.plan)
+    plan = vkc.Plan.load(arguments.plan)
+    actual = None
+    if arguments.actual is not None:
+        start = plan.scene.start
+        actual = vkc.load_scene(arguments.actual).with_start(base=start[:3], arm=start[3:])
+    result = plan.simulate(actual=actual, grasp=arguments.grasp)
+    writers: Writers = {
+        "html": result.to_html,
+        "picture": result.plot,
+        "video": result.to_mp4,
+        "json": result.to_json,
     }
-    whole = _write(files, writers)
-    return EXIT_OK if whole else EXIT_MISUSE
+    if not _write(files, writers, f"{result.summary()}\n"):
+        return EXIT_MISUSE
+    return EXIT_OK if result.ok else EXIT_FAILED
 
 
 def _view(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
-    from vkc_pin.visualization import viewer as visualization
+    from vkc_pin import visualization
 
-    files = _chosen(arguments, ("html",))
-    check_outputs(_options(files), inputs={"SCENE|PLAN": arguments.what})
-    shown: Any = (
-        vkc.Plan.load(arguments.what)
-        if str(arguments.what).endswith(".npz")
-        else vkc.load_scene(arguments.what)
-    )
+    files, what = _get_given(arguments, "html"), str(arguments.what)
+    _check_outputs(files, SCENE_PLAN=what)
+    shown: Any = vkc.Plan.load(what) if what.endswith(".npz") else vkc.load_scene(what)
     if files:
-        return (
-            EXIT_OK
-            if _write(files, {"html": functools.partial(visualization.to_html, shown)})
-            else EXIT_MISUSE
-        )
+        writers = {"html": functools.partial(visualization.to_html, shown)}
+        return EXIT_OK if _write(files, writers) else EXIT_MISUSE
     visualization.show(shown)
     sys.stdout.write("press Enter to end\n")
     sys.stdout.flush()
@@ -225,138 +269,116 @@ def _srdf(arguments: argparse.Namespace) -> int:
     from vkc_pin.world.models.robot_file import load_robot
     from vkc_pin.world.models.self_collisions import write_srdf
 
-    check_outputs({"--output": arguments.output}, inputs={"ROBOT": arguments.robot})
-    written = write_srdf(
-        load_robot(arguments.robot),
-        arguments.output,
-        samples=arguments.samples,
-        seed=arguments.seed,
-    )
+    _check_outputs({"output": arguments.output}, ROBOT=arguments.robot)
+    robot = load_robot(arguments.robot)
+    samples, seed = arguments.samples, arguments.seed
+    written = write_srdf(robot, arguments.output, samples=samples, seed=seed)
     sys.stdout.write(f"wrote {written}\n")
     return EXIT_OK
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return what understands the command line; each command sets `run`, which takes what was understood."""
+    """Return the parser of the command line; each command sets `run`, a function of the arguments."""
     from vkc_pin.benchmarks.harness.record import find_versions
 
     parser = argparse.ArgumentParser(
         prog="vkc-pin",
         description="Whole-body planning on virtual kinematic chains.",
-        epilog=_CODES,
+        epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    listed = ", ".join(
-        f"{name} {number}"
-        for name, number in {**find_versions(), "Python": platform.python_version()}.items()
-    )
-    parser.add_argument(
-        "--version",
-        action="version",
-        version=listed,
-        help="show versions, also of what motions depend on",
+    versions = {**find_versions(), "Python": platform.python_version()}
+    listed = ", ".join(f"{name} {number}" for name, number in versions.items())
+    add_option(
+        parser, "--version", "show versions, also of dependencies", action="version", version=listed
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-
-    plan = commands.add_parser(
-        "plan",
-        help="plan a motion",
-        description="Plan a motion that brings joints of objects to values.",
-    )
-    plan.add_argument(
-        "scene", metavar="SCENE", help="name of a scene that comes with the package, or a YAML file"
-    )
-    form = "OBJECT.JOINT=VALUE"
-    plan.add_argument(
-        "--set",
-        action="append",
-        required=True,
-        metavar=form,
-        help="what should change, in this order",
-    )
-    plan.add_argument("--html", metavar="FILE", help="write the animation, one self-contained page")
-    plan.add_argument("--save", metavar="FILE", help="save the plan (.npz)")
-    plan.add_argument("--json", metavar="FILE", help="write trajectory, metrics and report as JSON")
-    plan.add_argument(
-        "--csv", metavar="FILE", help="write the motion as a table, a line a waypoint"
-    )
-    plan.add_argument(
-        "--ros",
-        metavar="FILE",
-        help="write base and arm with the fields of trajectory_msgs/JointTrajectory",
-    )
-    plan.add_argument(
-        "--rosbag",
-        metavar="FOLDER",
-        help="write a recording of ROS 2 (rosbag2); needs the extra `ros`",
-    )
-    plan.add_argument("--plots", metavar="FOLDER", help="write plots")
-    plan.add_argument(
-        "--initialization",
-        default="auto",
-        metavar="METHOD",
-        help="auto, interpolated, astar, rrt or stationary",
-    )
-    plan.add_argument(
-        "--time-limit", type=float, metavar="SECONDS", help="return the best motion found by then"
-    )
-    plan.add_argument(
-        "--max-evaluations",
-        type=int,
-        metavar="UNITS",
-        help="return the best motion found with so much work",
-    )
-    plan.add_argument(
-        "--seed", type=parse_natural, default=0, help="of the random numbers (default 0)"
-    )
-    plan.add_argument("--quiet", action="store_true", help="no progress")
-    plan.set_defaults(run=_plan)
-
-    add_check(commands)
-    add_simulate(commands)
-
-    view = commands.add_parser(
-        "view",
-        help="look at a scene or plan",
-        description="Show a scene or a saved plan in the browser.",
-    )
-    view.add_argument("what", metavar="SCENE|PLAN")
-    view.add_argument("--html", metavar="FILE", help="write a page instead of starting a server")
-    view.set_defaults(run=_view)
-
-    about = "Write the motion of a saved plan for other programs."
-    export = commands.add_parser(
-        "export", help="write a saved plan for other programs", description=about
-    )
-    export.add_argument("plan", metavar="PLAN", help="a plan saved with --save or Plan.save")
-    export.add_argument("--csv", metavar="FILE", help="a table, a line a waypoint")
-    export.add_argument("--json", metavar="FILE", help="trajectory, metrics and report as JSON")
-    export.add_argument(
-        "--ros", metavar="FILE", help="JSON with the fields of trajectory_msgs/JointTrajectory"
-    )
-    export.add_argument(
-        "--rosbag", metavar="FOLDER", help="a recording of ROS 2 (rosbag2); needs the extra `ros`"
-    )
-    which = f"{', '.join(GROUPS)}, or names of coordinates with commas between; without it all in a table, robot for ROS"
-    export.add_argument("--joints", metavar="WHICH", help=which)
-    export.add_argument(
-        "--rate", type=float, metavar="HZ", help="points a second for ROS; without it the waypoints"
-    )
-    export.set_defaults(run=_export)
-
+    _add_plan(commands)
+    _add_check_and_simulate(commands)
+    _add_view_and_export(commands)
     add_datasets(commands)
     add_bench(commands)
     add_importing(commands)
-
-    about = "Sample which links of a robot can never collide."
-    srdf = commands.add_parser("srdf", help="regenerate allowed collisions", description=about)
-    srdf.add_argument("robot", metavar="ROBOT", help="name or URDF file")
-    srdf.add_argument("--output", required=True, metavar="FILE")
-    srdf.add_argument("--samples", type=parse_positive, default=20000)
-    srdf.add_argument("--seed", type=parse_natural, default=0)
-    srdf.set_defaults(run=_srdf)
-
+    srdf = add_command(
+        commands,
+        "srdf",
+        "regenerate allowed collisions",
+        _srdf,
+        "Sample which links of a robot can never collide.",
+    )
+    add_option(srdf, "robot ROBOT", "name or URDF file")
+    add_option(srdf, "--output FILE", "SRDF to write", required=True)
+    add_option(srdf, "--samples", "number of configurations", type=parse_positive, default=20000)
+    add_seed(srdf)
     return parser
+
+
+def _add_plan(commands: Any) -> None:
+    about = "Plan a motion that brings joints of objects to values."
+    plan = add_command(commands, "plan", "plan a motion", _plan, about)
+    add_option(plan, "scene SCENE", "name of an included scene, or a YAML file")
+    add_option(
+        plan, "--set OBJECT.JOINT=VALUE", "goals, in this order", action="append", required=True
+    )
+    for form, text in (_OUTPUTS | _EXPORTS).items():
+        add_option(plan, form, text)
+    methods = "auto, interpolated, astar, rrt or stationary"
+    add_option(plan, "--initialization METHOD", methods, default="auto")
+    add_option(plan, "--time-limit SECONDS", "return the best motion found by then", type=float)
+    about = "return the best motion found with this number of evaluations"
+    add_option(plan, "--max-evaluations COUNT", about, type=int)
+    add_seed(plan)
+    add_option(plan, "--quiet", "print no progress")
+
+
+def _add_check_and_simulate(commands: Any) -> None:
+    about = (
+        "Validate a saved plan, and report what its file states otherwise. Or examine a scene: "
+        "pairs closer than Options.dist_safe, overlaps, and reachable attachments."
+    )
+    check = add_command(
+        commands, "check", "validate a saved plan or examine a scene", _check, about
+    )
+    add_option(check, "what SCENE|PLAN", "a scene, or a saved plan (.npz)")
+    add_option(check, "--plot FILE", "write a top view of the scene (.png, .svg, .pdf)")
+    add_seed(check)
+
+    about = (
+        "Execute a saved plan in MuJoCo, with masses, friction, servos and a hand that can lose "
+        "its hold, and report the outcome. Needs the extra `sim`."
+    )
+    simulate = add_command(
+        commands, "simulate", "execute a saved plan in physics", _simulate, about
+    )
+    add_option(simulate, "plan PLAN", "a saved plan (.npz)")
+    add_option(simulate, "--actual SCENE", "scene of the execution (default: that of the plan)")
+    about = "grasp model: weld (default), or friction of closing fingers"
+    add_option(simulate, "--grasp MODEL", about, default="weld")
+    add_option(simulate, "--html FILE", "write executed and planned motion as one page")
+    add_option(simulate, "--picture FILE", "write snapshots (.png)")
+    about = "write a video (.mp4); needs ffmpeg or the package imageio-ffmpeg"
+    add_option(simulate, "--video FILE", about)
+    add_option(simulate, "--json FILE", "write the result as JSON")
+
+
+def _add_view_and_export(commands: Any) -> None:
+    about = "Show a scene or a saved plan in the browser."
+    view = add_command(commands, "view", "show a scene or plan", _view, about)
+    add_option(view, "what SCENE|PLAN", "a scene, or a saved plan (.npz)")
+    add_option(view, "--html FILE", "write a page instead of starting a server")
+
+    about = "Write the motion of a saved plan for other programs."
+    export = add_command(
+        commands, "export", "write a saved plan for other programs", _export, about
+    )
+    add_option(export, "plan PLAN", "a saved plan (.npz)")
+    for form, text in _EXPORTS.items():
+        add_option(export, form, text)
+    groups = ", ".join(GROUPS)
+    about = f"{groups}, or names separated by commas (default: all; for ROS the robot's)"
+    add_option(export, "--joints WHICH", about)
+    about = "frequency of the points for ROS (default: waypoints)"
+    add_option(export, "--rate HZ", about, type=float)
 
 
 def run(argv: Sequence[str]) -> int:
@@ -367,6 +389,6 @@ def run(argv: Sequence[str]) -> int:
         return int(arguments.run(arguments))
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
-    except (VkcError, OSError) as error:  # or a file that cannot be written, a full disk
+    except (VkcError, OSError) as error:  # e.g. an unwritable file or a full disk
         sys.stderr.write(f"vkc-pin: {error}\n")
         return EXIT_MISUSE

@@ -1,4 +1,4 @@
-"""The commands of datasets: `generate` makes one, `dataset check` validates one again."""
+"""Defines the commands `generate`, which makes a dataset, and `dataset check`, which validates one."""
 
 from __future__ import annotations
 
@@ -6,80 +6,56 @@ import argparse
 import sys
 from typing import Any
 
-from vkc_pin.benchmarks.commands import EXIT_OK, parse_natural, parse_positive, report_interruption
+from vkc_pin.benchmarks.commands import report_interruption
+from vkc_pin.cli.options import (
+    EXIT_FAILED,
+    EXIT_OK,
+    add_command,
+    add_option,
+    add_seed,
+    parse_positive,
+)
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.utils.interrupt import raise_on_interrupt
 
 __all__ = ["add_datasets"]
 
-_FAILED = 1
-
 
 def add_datasets(commands: Any) -> None:
     """Add the commands to those of a parser."""
     about = (
-        "Make a dataset of a recipe: episodes, each a scene with a timed motion that the independent validation accepts. The "
-        "same command goes on where it was stopped, and with more episodes adds to them."
+        "Generate a dataset from a recipe: episodes, each a scene with a timed motion that the "
+        "independent validation accepts. The same command continues an interrupted run, and adds "
+        "episodes if their number is larger."
     )
-    generate = commands.add_parser(
-        "generate", help="make a dataset of checked motions", description=about
-    )
-    generate.add_argument(
-        "recipe",
-        metavar="RECIPE",
-        help="name of a recipe that comes with the package, or a YAML file",
-    )
-    # Looked at by generate(), which says what is wrong with it as with the recipe.
-    generate.add_argument(
-        "--episodes", type=int, required=True, metavar="N", help="how many episodes"
-    )
-    generate.add_argument("--out", required=True, metavar="DIR", help="folder of the dataset")
-    generate.add_argument(
-        "--jobs", type=int, default=1, metavar="J", help="processes on this machine (default 1)"
-    )
-    shown = "address of a Dask scheduler, tcp://HOST:PORT, whose workers are used instead"
-    generate.add_argument("--scheduler", metavar="ADDRESS", help=shown)
-    generate.add_argument(
-        "--variants",
-        type=int,
-        metavar="K",
-        help="motions for each problem, instead of the recipe's number",
-    )
-    shown = "keep only episodes that physics confirms (needs the extra `sim`)"
-    generate.add_argument("--simulate", action="store_true", default=None, help=shown)
-    shown = "keep what cameras on the robot see of it, those of the recipe or of the head and the hand (with --simulate)"
-    generate.add_argument("--cameras", action="store_true", help=shown)
-    generate.add_argument(
-        "--lerobot",
-        action="store_true",
-        help="write LeRobot's layout as well, a dataset for each robot",
-    )
-    generate.add_argument("--quiet", action="store_true", help="no progress bar")
-    generate.set_defaults(run=_generate)
+    summary = "generate a dataset of validated motions"
+    generate = add_command(commands, "generate", summary, _generate, about)
+    add_option(generate, "recipe RECIPE", "name of an included recipe, or a YAML file")
+    # generate() checks these numbers, with errors like those of the recipe.
+    add_option(generate, "--episodes N", "number of episodes", type=int, required=True)
+    add_option(generate, "--out DIR", "folder of the dataset", required=True)
+    add_option(generate, "--jobs J", "processes on this machine (default 1)", type=int, default=1)
+    about = "address of a Dask scheduler, tcp://HOST:PORT, whose workers are used instead"
+    add_option(generate, "--scheduler ADDRESS", about)
+    about = "motions for each problem, instead of the recipe's number"
+    add_option(generate, "--variants K", about, type=int)
+    about = "keep only episodes that the simulation confirms (needs the extra `sim`)"
+    add_option(generate, "--simulate", about, action="store_true", default=None)
+    about = "store images of the recipe's cameras, or of head and hand (with --simulate)"
+    add_option(generate, "--cameras", about)
+    add_option(generate, "--lerobot", "write LeRobot's layout as well, a dataset for each robot")
+    add_option(generate, "--quiet", "show no progress bar")
 
-    dataset = commands.add_parser(
-        "dataset",
-        help="look at a dataset",
-        description="Look at a dataset that `generate` has made.",
-    )
+    about = "Examine a dataset that `generate` has made."
+    dataset = commands.add_parser("dataset", help="examine a dataset", description=about)
     inner = dataset.add_subparsers(required=True, metavar="WHAT")
     about = "Validate every episode again, from the files alone, and write a page of statistics."
-    check = inner.add_parser("check", help="validate every episode again", description=about)
-    check.add_argument("folder", metavar="DIR", help="folder of the dataset")
-    check.add_argument(
-        "--jobs", type=parse_positive, default=1, metavar="J", help="processes (default 1)"
-    )
-    check.add_argument(
-        "--html", metavar="FILE", help="where to write the page (default: DIR/statistics.html)"
-    )
-    check.add_argument(
-        "--seed",
-        type=parse_natural,
-        default=0,
-        help="of the ten episodes that the page shows (default 0)",
-    )
-    check.add_argument("--quiet", action="store_true", help="no progress bar")
-    check.set_defaults(run=_check)
+    check = add_command(inner, "check", "validate every episode again", _check, about)
+    add_option(check, "folder DIR", "folder of the dataset")
+    add_option(check, "--jobs J", "processes (default 1)", type=parse_positive, default=1)
+    add_option(check, "--html FILE", "page to write (default: DIR/statistics.html)")
+    add_seed(check, "random seed of the ten episodes on the page (default 0)")
+    add_option(check, "--quiet", "show no progress bar")
 
 
 def _generate(arguments: argparse.Namespace) -> int:
@@ -105,10 +81,9 @@ def _generate(arguments: argparse.Namespace) -> int:
         if isinstance(error, InputError):
             raise
         sys.stderr.write(f"vkc-pin: {error}\n")
-        return _FAILED
-    sys.stdout.write(
-        f"{len(dataset.numbers())} episodes are in {dataset.folder}; README.md there says what they are\n"
-    )
+        return EXIT_FAILED
+    count = len(dataset.numbers())
+    sys.stdout.write(f"{count} episodes are in {dataset.folder}; its README.md describes them\n")
     return EXIT_OK
 
 
@@ -124,4 +99,4 @@ def _check(arguments: argparse.Namespace) -> int:
             progress=not arguments.quiet,
         )
     sys.stdout.write(f"{found}\n")
-    return EXIT_OK if found.ok else _FAILED
+    return EXIT_OK if found.ok else EXIT_FAILED

@@ -1,4 +1,4 @@
-"""The commands that bring descriptions from elsewhere: import-robot, -object, -home, and doctor, which examines robots."""
+"""Defines the commands import-robot, import-object, import-home and doctor."""
 
 from __future__ import annotations
 
@@ -7,156 +7,89 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.benchmarks.commands import EXIT_OK, parse_natural, parse_positive
+from vkc_pin.cli.options import (
+    EXIT_FAILED,
+    EXIT_OK,
+    add_command,
+    add_option,
+    add_seed,
+    parse_positive,
+)
 from vkc_pin.errors import InputError
 
-__all__ = ["EXIT_SICK", "add_importing"]
-
-EXIT_SICK = 1
+__all__ = ["add_importing"]
 
 
 def add_importing(commands: Any) -> None:
-    """Add the commands to the parser's."""
-    about = "Make a robot's folder of a URDF, xacro or MJCF file, and say what was guessed."
-    robot = commands.add_parser(
-        "import-robot", help="make a robot's folder of a file", description=about
-    )
-    robot.add_argument("file", metavar="FILE", help="URDF, xacro or MJCF")
-    robot.add_argument(
-        "--output",
-        metavar="FOLDER",
-        help="where to write (default: a folder of the file's name here)",
-    )
-    robot.add_argument(
-        "--arm", metavar="NAME", help="which arm to plan, or a part of its name, e.g. left"
-    )
-    robot.add_argument(
-        "--tool-frame", metavar="FRAME", help="the frame that grasps, if it is not to be guessed"
-    )
-    robot.add_argument("--srdf", metavar="FILE", help="an SRDF (default: the one beside the file)")
-    robot.add_argument(
-        "--package",
-        action="append",
-        default=[],
-        metavar="NAME=FOLDER",
-        help="for package:// and $(find NAME)",
-    )
-    robot.add_argument(
-        "--argument", action="append", default=[], metavar="NAME=VALUE", help="of a xacro file"
-    )
-    robot.add_argument(
-        "--most-pieces",
-        type=parse_positive,
-        metavar="N",
-        help="convex pieces of a mesh, at most; 1 keeps hulls",
-    )
-    robot.add_argument(
-        "--samples",
-        type=parse_positive,
-        metavar="N",
-        help="configurations to look at for pairs that need no check",
-    )
-    robot.add_argument(
-        "--seed", type=parse_natural, default=0, help="of the random numbers (default 0)"
-    )
-    robot.add_argument(
-        "--force", action="store_true", help="replace a folder that import-robot made before"
-    )
-    robot.set_defaults(run=_import_robot)
+    """Add the commands to those of a parser."""
+    about = "Import a robot from a URDF, xacro or MJCF file as a folder, and report all guesses."
+    robot = add_command(commands, "import-robot", "import a robot", _import_robot, about)
+    add_option(robot, "file FILE", "URDF, xacro or MJCF")
+    _add_output(robot, "import-robot")
+    add_option(robot, "--arm NAME", "the arm to plan for, or a part of its name, e.g. left")
+    add_option(robot, "--tool-frame FRAME", "the tool frame, if it is not to be guessed")
+    add_option(robot, "--srdf FILE", "an SRDF (default: the one beside the file)")
+    about = "folder of a package, for package:// and $(find NAME)"
+    add_option(robot, "--package NAME=FOLDER", about, action="append", default=[])
+    about = "argument of a xacro file"
+    add_option(robot, "--argument NAME=VALUE", about, action="append", default=[])
+    about = "largest number of convex pieces of a mesh; 1 keeps hulls"
+    add_option(robot, "--most-pieces N", about, type=parse_positive)
+    about = "number of configurations for finding pairs that need no check"
+    add_option(robot, "--samples N", about, type=parse_positive)
+    add_seed(robot)
 
-    about = """Make an object that can be planned with of a URDF, MJCF or SDF file: convex pieces, limits, attachments that are
-    proposed from its shapes, and a picture of these. The report says what was changed, and which joints no hand can open."""
-    item = commands.add_parser(
-        "import-object", help="make an object of a downloaded file", description=about
+    about = (
+        "Import an object from a URDF, MJCF or SDF file: convex pieces, joint limits, attachments "
+        "proposed from its shapes, and a picture of them. The report lists changes, and joints "
+        "that no hand can open."
     )
-    item.add_argument("file", metavar="FILE", help="URDF, MJCF or SDF")
-    item.add_argument(
-        "--output", metavar="FOLDER", help="a new folder for the object (default: its name)"
-    )
+    item = add_command(commands, "import-object", "import an object", _import_object, about)
+    add_option(item, "file FILE", "URDF, MJCF or SDF")
+    _add_output(item, "import-object")
     size = item.add_mutually_exclusive_group()
-    size.add_argument(
-        "--height",
-        type=float,
-        metavar="METRES",
-        help="how high it is, for files without a unit (PartNet-Mobility)",
-    )
-    size.add_argument(
-        "--scale", type=float, metavar="FACTOR", help="by what to multiply the file's lengths"
-    )
-    item.add_argument(
-        "--up", choices=("z", "y"), default="z", help="which axis of the file points up (default z)"
-    )
-    item.add_argument("--link", metavar="NAME", help="import this link and what hangs on it alone")
-    item.add_argument(
-        "--robot",
-        default="husky_ur5e",
-        help="whose hand shall open it: name, file or folder (default husky_ur5e)",
-    )
-    item.add_argument(
-        "--most",
-        type=parse_positive,
-        default=3,
-        metavar="N",
-        help="attachments for one joint, at most (default 3)",
-    )
-    item.add_argument(
-        "--force", action="store_true", help="replace a folder that import-object made before"
-    )
-    item.set_defaults(run=_import_object)
-    about = """Make a scene of a URDF or MJCF file of a whole home: what stands fixed becomes obstacles in convex pieces, what has
-    joints becomes objects with proposed attachments, what moves freely becomes objects to carry, and the robot starts at a free
-    place. The report says what was changed, and what no hand can open."""
-    home = commands.add_parser(
-        "import-home", help="make a scene of a file of a whole home", description=about
-    )
-    home.add_argument("file", metavar="FILE", help="URDF or MJCF")
-    home.add_argument(
-        "--output", metavar="FOLDER", help="a new folder for the scene (default: the file's name)"
-    )
-    home.add_argument(
-        "--force", action="store_true", help="replace a folder that import-home made before"
-    )
-    home.add_argument(
-        "--floor",
-        type=float,
-        default=0.0,
-        metavar="METRES",
-        help="height of the floor in the file (default 0)",
-    )
-    home.add_argument(
-        "--robot",
-        default="husky_ur5e",
-        help="the robot that is there: name, file or folder (default husky_ur5e)",
-    )
-    home.add_argument(
-        "--most",
-        type=parse_positive,
-        default=2,
-        metavar="N",
-        help="attachments for one joint, at most (default 2)",
-    )
-    home.add_argument(
-        "--seed",
-        type=parse_natural,
-        default=0,
-        help="of the places where a start is looked for (default 0)",
-    )
-    home.set_defaults(run=_import_home)
+    about = "height, for files without a unit (PartNet-Mobility)"
+    add_option(size, "--height METRES", about, type=float)
+    add_option(size, "--scale FACTOR", "factor for the file's lengths", type=float)
+    about = "axis of the file that points up (default z)"
+    add_option(item, "--up", about, choices=("z", "y"), default="z")
+    add_option(item, "--link NAME", "import only this link and its descendants")
+    _add_hand(item, most=3)
 
-    about = "Examine a robot's description: home, pairs, limits, hand, shapes. Exit code 1 if plans would fail for it."
-    doctor = commands.add_parser("doctor", help="examine a robot's description", description=about)
-    doctor.add_argument(
-        "robot",
-        metavar="ROBOT",
-        help="a robot's name, or the path of a URDF, a robot.yaml or a folder",
+    about = (
+        "Import a whole home from a URDF or MJCF file as a scene: fixed parts become obstacles of "
+        "convex pieces, parts with joints become objects with proposed attachments, and free "
+        "parts become objects to carry. The robot starts at a free pose. The report lists "
+        "changes, and parts that no hand can move."
     )
-    doctor.add_argument(
-        "--margin",
-        type=float,
-        metavar="METRES",
-        help="clearance that motions keep (default: that of plans)",
+    home = add_command(commands, "import-home", "import a whole home", _import_home, about)
+    add_option(home, "file FILE", "URDF or MJCF")
+    _add_output(home, "import-home")
+    about = "height of the floor in the file (default 0)"
+    add_option(home, "--floor METRES", about, type=float, default=0.0)
+    _add_hand(home, most=2)
+    add_seed(home, "random seed of the search for a start pose (default 0)")
+
+    about = (
+        "Examine a robot's description: home, pairs, limits, hand, shapes. "
+        "The exit code is 1 if planning would fail."
     )
-    doctor.set_defaults(run=_doctor)
+    doctor = add_command(commands, "doctor", "examine a robot's description", _doctor, about)
+    add_option(doctor, "robot ROBOT", "name, or path of a URDF, a robot.yaml or a folder")
+    about = "clearance of motions (default: that of plans)"
+    add_option(doctor, "--margin METRES", about, type=float)
+
+
+def _add_output(parser: argparse.ArgumentParser, command: str) -> None:
+    add_option(parser, "--output FOLDER", "a new folder (default: one named like the file)")
+    add_option(parser, "--force", f"replace an earlier output of {command}")
+
+
+def _add_hand(parser: argparse.ArgumentParser, *, most: int) -> None:
+    about = "robot with the hand: name, file or folder (default husky_ur5e)"
+    add_option(parser, "--robot", about, default="husky_ur5e")
+    about = f"largest number of attachments of one joint (default {most})"
+    add_option(parser, "--most N", about, type=parse_positive, default=most)
 
 
 def _import_robot(arguments: argparse.Namespace) -> int:
@@ -173,14 +106,14 @@ def _import_robot(arguments: argparse.Namespace) -> int:
         arm=arguments.arm,
         tool_frame=arguments.tool_frame,
         srdf=arguments.srdf,
-        packages=_pairs(arguments.package, "--package", "NAME=FOLDER"),
-        arguments=_pairs(arguments.argument, "--argument", "NAME=VALUE"),
+        packages=_parse_pairs(arguments.package, "--package", "NAME=FOLDER"),
+        arguments=_parse_pairs(arguments.argument, "--argument", "NAME=VALUE"),
         seed=arguments.seed,
         force=arguments.force,
         **chosen,
     )
     sys.stdout.write(f"{made}\n")
-    return EXIT_OK if made.diagnosis.healthy else EXIT_SICK
+    return EXIT_OK if made.diagnosis.healthy else EXIT_FAILED
 
 
 def _import_object(arguments: argparse.Namespace) -> int:
@@ -193,7 +126,7 @@ def _import_object(arguments: argparse.Namespace) -> int:
         scale=arguments.scale,
         up=arguments.up,
         link=arguments.link,
-        robot=_robot(arguments.robot),
+        robot=_find_robot(arguments.robot),
         most=arguments.most,
         force=arguments.force,
     )
@@ -208,7 +141,7 @@ def _import_home(arguments: argparse.Namespace) -> int:
         arguments.file,
         arguments.output,
         floor=arguments.floor,
-        robot=_robot(arguments.robot),
+        robot=_find_robot(arguments.robot),
         most=arguments.most,
         seed=arguments.seed,
         force=arguments.force,
@@ -220,17 +153,17 @@ def _import_home(arguments: argparse.Namespace) -> int:
 def _doctor(arguments: argparse.Namespace) -> int:
     from vkc_pin.importing.robots.doctor import doctor
 
-    found = doctor(_robot(arguments.robot), margin=arguments.margin)
+    found = doctor(_find_robot(arguments.robot), margin=arguments.margin)
     sys.stdout.write(f"{found}\n")
-    return EXIT_OK if found.healthy else EXIT_SICK
+    return EXIT_OK if found.healthy else EXIT_FAILED
 
 
-def _robot(name: str) -> str | Path:
-    """Return what is meant by a robot's name: a folder here that import-robot has made, or else what `load_robot` takes."""
+def _find_robot(name: str) -> str | Path:
+    """Return a folder with a robot.yaml, or else the argument of `load_robot`."""
     return Path(name) if name and (Path(name) / "robot.yaml").is_file() else name
 
 
-def _pairs(texts: list[str], field: str, form: str) -> dict[str, str]:
+def _parse_pairs(texts: list[str], field: str, form: str) -> dict[str, str]:
     found = {}
     for text in texts:
         name, equals, value = text.partition("=")

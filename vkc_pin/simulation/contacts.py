@@ -131,7 +131,7 @@ def find_contact_pairs(world: World, holds: Iterable[Hold]) -> Pairs:
 
 
 def _iterate_planner_pairs(world: World) -> Iterable[tuple[int, int]]:
-    """Yield the pairs of shapes that the planner checks, regardless of what moves."""
+    """Yield the pairs of shapes that the planner checks, moving or not."""
     scene, labels = world.scene, world.collision_labels
     robots, bodies = len(scene.robot.collision.geometryObjects), len(world.bodies.geometryObjects)
     owners = [label.partition(".")[0] for label in labels]

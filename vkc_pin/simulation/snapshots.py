@@ -154,7 +154,7 @@ class RenderedScene:
             yield pixels[::-1]
 
     def find_viewpoint(self) -> tuple[Floats, Floats]:
-        """Return a viewpoint that sees the whole motion; see `Drawing.viewpoint`."""
+        """Return a viewpoint that sees the whole motion; see `Drawing.find_viewpoint`."""
         import meshcat
 
         from vkc_pin.visualization.drawing import Drawing
@@ -164,7 +164,7 @@ class RenderedScene:
         times = np.linspace(executed.trajectory.times[0], executed.trajectory.times[-1], 60)
         return Drawing(
             viewer, executed.scene, executed.trajectory, world=self._world, times=times
-        ).viewpoint()
+        ).find_viewpoint()
 
 
 def write_snapshots(executed: Execution, path: str | Path, *, count: int = 6) -> Path:

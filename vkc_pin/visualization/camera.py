@@ -33,20 +33,20 @@ def choose_viewpoint(
     scores = []
     flat = np.ascontiguousarray(points.T)
     for azimuth in _AZIMUTHS:
-        towards = _direction(azimuth)
+        towards = _compute_direction(azimuth)
         hidden = np.zeros(len(points))
         last = float((points @ towards).min())
         for low, high, opacity in boxes:
             # Other boxes are behind all points.
             if np.maximum(low * towards, high * towards).sum() > last:
-                np.maximum(hidden, opacity * _crosses(flat, towards, low, high), out=hidden)
+                np.maximum(hidden, opacity * _find_hidden(flat, towards, low, high), out=hidden)
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         breadth = np.ptp(points @ right) / max(
             1e-9, float(np.linalg.norm(np.ptp(points[:, :2], axis=0)))
         )
         scores.append(breadth - 3.0 * hidden.mean() - 0.10 * (1.0 - np.cos(azimuth - _AZIMUTHS[0])))
     azimuth = float(_AZIMUTHS[int(np.argmax(np.round(scores, 6)))])
-    towards = _direction(azimuth)
+    towards = _compute_direction(azimuth)
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     up = np.cross(towards, right)
     offsets = points - target
@@ -60,7 +60,7 @@ def choose_viewpoint(
     return target, target + towards * max(1.0, float(needed.max()))
 
 
-def _direction(azimuth: float) -> Floats:
+def _compute_direction(azimuth: float) -> Floats:
     return np.array(
         [
             np.cos(azimuth) * np.cos(_ELEVATION),
@@ -70,7 +70,7 @@ def _direction(azimuth: float) -> Floats:
     )
 
 
-def _crosses(points: Floats, direction: Floats, lower: Floats, upper: Floats) -> Bools:
+def _find_hidden(points: Floats, direction: Floats, lower: Floats, upper: Floats) -> Bools:
     """Return which points, shape (3, n), have rays along `direction` that meet the box."""
     enter, leave = np.full(points.shape[1], -np.inf), np.full(points.shape[1], np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -29,10 +29,10 @@ from vkc_pin.visualization.threejs import (
     Triangles,
     Unshadow,
     add_node,
-    hexadecimal,
-    material,
+    encode_colour,
+    make_material,
 )
-from vkc_pin.visualization.triangles import Solid, coarse, merge_solids, to_solid, tube
+from vkc_pin.visualization.triangles import Solid, make_tube, merge_solids, simplify, to_solid
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.placements import Motion, sample_motion
@@ -95,10 +95,10 @@ class Drawing:
         self.motion: Motion = sample_motion(self.world, trajectory, times)
         self.room = Room(scene)
         self.taken: set[str] = set()  # paths in the tree
-        self.nodes = self._nodes()
-        self.movers = self._movers()
-        self.items = [*self._robot_items(), *self._object_items()]
-        self.light: list[Solid | None] = []  # of what moves, for ghosts
+        self.nodes = self._find_nodes()
+        self.movers = self._find_movers()
+        self.items = [*self._make_robot_items(), *self._make_object_items()]
+        self.light: list[Solid | None] = []  # coarse meshes of moving bodies, for ghosts
 
     def draw(self, *, play: bool = True, frames: Mapping[str, pin.SE3] | None = None) -> None:
         """Draw everything into the viewer, and replace its content.
@@ -108,38 +108,40 @@ class Drawing:
             frames: Name → placement in the world of static frames to draw.
         """
         self.viewer.delete()
-        self._surroundings()
+        self._set_surroundings()
         for item in self.items:
             opacity = item.colour[3] if len(item.colour) > 3 else 1.0
-            self._solid(Part(item.path, item.solid, item.colour, opacity, shadow=opacity >= 1.0))
+            self._draw_part(
+                Part(item.path, item.solid, item.colour, opacity, shadow=opacity >= 1.0)
+            )
             self.viewer[item.path].set_transform(item.placement.homogeneous)
         for joint in range(1, self.world.model.njoints):
             self.viewer[self.nodes[joint]].set_transform(self.motion.local[joint][0].homogeneous)
-        for part in self.room.parts():
-            self._solid(replace(part, name=f"room/{part.name}"))
-        for name, points, grey in self.room.lines():
-            thin = g.LineBasicMaterial(color=hexadecimal((grey, grey, grey)))
-            self._unshadowed(
+        for part in self.room.make_parts():
+            self._draw_part(replace(part, name=f"room/{part.name}"))
+        for name, points, grey in self.room.make_lines():
+            thin = g.LineBasicMaterial(color=encode_colour((grey, grey, grey)))
+            self._draw_without_shadow(
                 f"room/{name}", g.LineSegments(g.PointsGeometry(points.astype(np.float32).T), thin)
             )
-        self._frames(frames or {}, set())
+        self._draw_frames(frames or {}, set())
         if self.trajectory is not None:
-            self._paths()
+            self._draw_paths()
             moving = np.any(
                 [*self.movers.values(), np.zeros(self.world.model.njoints, bool)], axis=0
             )
             self.light = [
-                coarse(item.solid, _GHOST_DETAIL) if moving[item.joint] else None
+                simplify(item.solid, _GHOST_DETAIL) if moving[item.joint] else None
                 for item in self.items
             ]
             if self.beside is None:
-                self._ghosts("start", 0, _START)
-                self._ghosts("end", -1, _END)
+                self._draw_ghosts("start", 0, _START)
+                self._draw_ghosts("end", -1, _END)
             else:
-                self._other(self.beside)
-        self.viewer.window.send(SetAnimation(self._animation(), play=play, repetitions=1))
+                self._draw_second_motion(self.beside)
+        self.viewer.window.send(SetAnimation(self._make_animation(), play=play, repetitions=1))
 
-    def viewpoint(self) -> tuple[Floats, Floats]:
+    def find_viewpoint(self) -> tuple[Floats, Floats]:
         """Choose target and position of the camera so that motion and objects are in the picture."""
         motion, high = self.motion, np.array([0.0, 0.0, 1.0])
         around = np.array([[x, y, 0.0] for x in (-0.6, 0.6) for y in (-0.6, 0.6)])
@@ -148,17 +150,17 @@ class Drawing:
             motion.base + high,
             motion.tool,
         ]
-        boxes = self.room.obstructions()
+        boxes = self.room.find_obstructions()
         for item in self.items:
             if item.path.startswith("objects"):
-                local = item.solid.moved(item.placement).vertices
+                local = item.solid.transform(item.placement).vertices
                 for placement in motion.world[[0, len(motion.times) // 2, -1], item.joint]:
                     points.append(local @ placement[:3, :3].T + placement[:3, 3])
                     boxes.append((points[-1].min(axis=0), points[-1].max(axis=0), 0.3))
         cloud = np.concatenate([p[:: max(1, len(p) // 60)] for p in points])
         return choose_viewpoint(cloud, boxes)
 
-    def _nodes(self) -> list[str]:
+    def _find_nodes(self) -> list[str]:
         """Return the path of every joint in the tree."""
         model, nodes = self.world.model, ["robot"]
         for j in range(1, model.njoints):
@@ -169,7 +171,7 @@ class Drawing:
             nodes.append(add_node(self.taken, above, rest if placed else str(model.names[j])))
         return nodes
 
-    def _robot_items(self) -> list[Item]:
+    def _make_robot_items(self) -> list[Item]:
         robot = self.scene.robot
         if robot not in _meshes:
             _meshes[robot] = [to_solid(shape.geometry) for shape in robot.visual.geometryObjects]
@@ -188,7 +190,7 @@ class Drawing:
             )
         return items
 
-    def _object_items(self) -> list[Item]:
+    def _make_object_items(self) -> list[Item]:
         items: list[Item] = []
         shapes, labels = list(self.world.visual.geometryObjects), self.world.visual_labels
         first = len(self.scene.robot.visual.geometryObjects)
@@ -206,33 +208,33 @@ class Drawing:
                 )
         return items
 
-    def _solid(self, part: Part) -> None:
-        paint = material(part.colour, part.opacity, one_sided=part.one_sided)
+    def _draw_part(self, part: Part) -> None:
+        paint = make_material(part.colour, part.opacity, one_sided=part.one_sided)
         if part.shadow:
             self.viewer[part.name].set_object(Triangles(part.solid), paint)
         else:
-            self._unshadowed(part.name, Triangles(part.solid), paint)
+            self._draw_without_shadow(part.name, Triangles(part.solid), paint)
 
-    def _unshadowed(self, path: str, *what: Any) -> None:
+    def _draw_without_shadow(self, path: str, *what: Any) -> None:
         """Draw an object, or a geometry and its material, that casts no shadow."""
         self.viewer[path].set_object(*what)
         self.viewer.window.send(Unshadow(self.viewer[path].path))
 
-    def _frames(self, frames: Mapping[str, pin.SE3], taken: set[str]) -> None:
+    def _draw_frames(self, frames: Mapping[str, pin.SE3], taken: set[str]) -> None:
         """Draw the axes of frames in front of everything, since they may lie inside of bodies."""
         for name, placement in frames.items():
             where = add_node(taken, "frames", name)
             for (axis, colour), end in zip(_AXES.items(), np.eye(3), strict=True):
-                solid = tube(np.stack([np.zeros(3), _AXIS_LENGTH * end]), _AXIS_RADIUS)
+                solid = make_tube(np.stack([np.zeros(3), _AXIS_LENGTH * end]), _AXIS_RADIUS)
                 assert solid is not None
                 # Only what counts as translucent is drawn after the bodies.
                 seen = g.MeshBasicMaterial(
-                    color=hexadecimal(colour), transparent=True, depthTest=False
+                    color=encode_colour(colour), transparent=True, depthTest=False
                 )
-                self._unshadowed(f"{where}/{axis}", Triangles(solid), seen)
+                self._draw_without_shadow(f"{where}/{axis}", Triangles(solid), seen)
             self.viewer[where].set_transform(placement.homogeneous)
 
-    def _paths(self) -> None:
+    def _draw_paths(self) -> None:
         assert self.trajectory is not None
         own = self.trajectory.times
         times = np.linspace(own[0], own[-1], max(2, int(20 * own[-1])))
@@ -242,16 +244,16 @@ class Drawing:
             ("tool", motion.tool, 0.008, _TOOL),
             ("base", motion.base * [1.0, 1.0, 0.0] + [0.0, 0.0, 0.006], 0.014, _BASE),
         ):
-            solid = tube(points, radius)
+            solid = make_tube(points, radius)
             if solid is not None:
-                flat = g.MeshBasicMaterial(color=hexadecimal(colour))
-                self._unshadowed(f"paths/{name}", Triangles(solid), flat)
+                flat = g.MeshBasicMaterial(color=encode_colour(colour))
+                self._draw_without_shadow(f"paths/{name}", Triangles(solid), flat)
 
-    def _ghosts(self, name: str, row: int, colour: tuple[float, float, float]) -> None:
+    def _draw_ghosts(self, name: str, row: int, colour: tuple[float, float, float]) -> None:
         """Draw moving bodies at `row` as ghosts, one each for the robot and every object."""
         for owner, joints in self.movers.items():
             solids = [
-                light.moved(pin.SE3(self.motion.world[row, item.joint]) * item.placement)
+                light.transform(pin.SE3(self.motion.world[row, item.joint]) * item.placement)
                 for item, light in zip(self.items, self.light, strict=True)
                 if light is not None and joints[item.joint]
             ]
@@ -260,7 +262,7 @@ class Drawing:
                     Ghost(merge_solids(solids), colour)
                 )
 
-    def _other(self, beside: Motion) -> None:
+    def _draw_second_motion(self, beside: Motion) -> None:
         """Draw the ghosts of the second motion."""
         for item, light in zip(self.items, self.light, strict=True):
             if light is not None:
@@ -271,7 +273,7 @@ class Drawing:
             node = self.viewer[f"{_BESIDE}/{self.nodes[joint]}"]
             node.set_transform(beside.local[joint][0].homogeneous)
 
-    def _movers(self) -> dict[str, Bools]:
+    def _find_movers(self) -> dict[str, Bools]:
         """Return the masks of moving joints, shape (joints,), of the robot and of every object."""
         model, moves = self.world.model, self.motion.moving.copy()
         owners: dict[str, Bools] = {}
@@ -284,9 +286,9 @@ class Drawing:
                 owners.setdefault(owner, np.zeros(model.njoints, bool))[j] = True
         return owners
 
-    def _surroundings(self) -> None:
+    def _set_surroundings(self) -> None:
         """Set up camera, lights and background, and hide meshcat's own grid and axes."""
-        (target, position), place = self.viewpoint(), self.viewer
+        (target, position), place = self.find_viewpoint(), self.viewer
         # meshcat's camera turns about the origin of its world, so the drawing moves there, not the
         # camera.
         place.set_transform(pin.SE3(np.eye(3), -target).homogeneous)
@@ -304,7 +306,7 @@ class Drawing:
         place["/Background"].set_property("top_color", [0.93, 0.95, 0.97])
         place["/Background"].set_property("bottom_color", [0.99, 0.99, 0.99])
 
-    def _animation(self) -> Animation:
+    def _make_animation(self) -> Animation:
         """Make the animation, with key frames in seconds, since the frame rate is 1."""
         movie = Animation(default_framerate=1)
         if self.trajectory is None:
@@ -323,20 +325,22 @@ class Drawing:
                 positions = [placement.translation.tolist() for placement in local]
                 if np.ptp(positions, axis=0).max() > 1e-9:
                     tracks.append(Track("position", "vector3", times, positions))
-                self._clip(movie, above + self.nodes[j], tracks)
+                self._add_clip(movie, above + self.nodes[j], tracks)
         for name, row in (("start", 0), ("end", -1)) if self.beside is None else ():
             for owner, joints in self.movers.items():
                 away = self.motion.away(joints, row).tolist()
-                self._clip(movie, f"ghosts/{name}/{owner}", [Track("visible", "bool", times, away)])
+                self._add_clip(
+                    movie, f"ghosts/{name}/{owner}", [Track("visible", "bool", times, away)]
+                )
         found = self.report.violations if self.report is not None else ()
         collisions = [v for v in found if v.constraint in ("clearance", "penetration")]
         for item in self.items:
             moments = [v.time for v in collisions if item.label in v.subject.split(" – ")]
             if moments:
-                self._clip(movie, f"{item.path}/<object>", [self._alarm(item, moments)])
+                self._add_clip(movie, f"{item.path}/<object>", [self._make_alarm(item, moments)])
         return movie
 
-    def _alarm(self, item: Item, moments: list[float]) -> Track:
+    def _make_alarm(self, item: Item, moments: list[float]) -> Track:
         """Make a track that colours an item red around `moments` [s]."""
         first, last = self.motion.times[0], self.motion.times[-1]
         edges = (
@@ -350,6 +354,6 @@ class Drawing:
         colours = [[float(c) for c in (_ALARM if alarm else item.colour[:3])] for alarm in red]
         return Track("material.color", "color", [float(t - first) for t in times], colours)
 
-    def _clip(self, movie: Animation, path: str, tracks: list[Track]) -> None:
+    def _add_clip(self, movie: Animation, path: str, tracks: list[Track]) -> None:
         where = self.viewer[path].path
         movie.clips[where] = AnimationClip({track.name: track for track in tracks}, fps=1)

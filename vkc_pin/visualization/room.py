@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.visualization.triangles import Solid, box_solid, shade, to_solid
+from vkc_pin.visualization.triangles import Solid, make_box, shade, to_solid
 from vkc_pin.world.files.meshes import load_parts
 from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.scene import Scene
@@ -63,12 +63,12 @@ class Room:
         for shape in scene.obstacle_visual:
             (self._walls if is_wall(shape) else self._furniture).append(shape)
 
-    def parts(self) -> list[Part]:
+    def make_parts(self) -> list[Part]:
         """Return the meshes to draw."""
         parts = []
         if self.scene.floor:
             x_min, x_max, y_min, y_max = self.scene.arena
-            floor = box_solid(np.array([x_min, y_min, -0.03]), np.array([x_max, y_max, 0.0]))
+            floor = make_box(np.array([x_min, y_min, -0.03]), np.array([x_max, y_max, 0.0]))
             parts.append(Part("floor", floor, _FLOOR_COLOUR, shadow=False))
         for shape in self._furniture:
             drawn = load_drawn_parts(shape)
@@ -76,13 +76,19 @@ class Room:
                 name = f"{shape.name}/{k}" if len(drawn) > 1 else str(shape.name)
                 opacity = colour[3] if len(colour) > 3 else 1.0
                 parts.append(
-                    Part(name, solid.moved(shape.placement), colour, opacity, shadow=opacity >= 1.0)
+                    Part(
+                        name,
+                        solid.transform(shape.placement),
+                        colour,
+                        opacity,
+                        shadow=opacity >= 1.0,
+                    )
                 )
         for shape in self._walls:
-            parts += self._wall_parts(shape)
+            parts += self._make_wall_parts(shape)
         return parts
 
-    def lines(self) -> list[tuple[str, Floats, float]]:
+    def make_lines(self) -> list[tuple[str, Floats, float]]:
         """Return name, segments, shape (2·k, 3) [m], and brightness of floor grid and wall edges."""
         drawn = []
         if self.scene.floor:
@@ -94,15 +100,17 @@ class Room:
             ends = [[(x, y_min), (x, y_max)] for x in xs] + [[(x_min, y), (x_max, y)] for y in ys]
             flat = np.array(ends, float).reshape(-1, 2)
             drawn.append(("grid", np.column_stack([flat, np.full(len(flat), 0.002)]), 0.78))
-        edges = [shape.placement.act(corner) for shape in self._walls for corner in _edges(shape)]
+        edges = [
+            shape.placement.act(corner) for shape in self._walls for corner in _find_edges(shape)
+        ]
         if edges:
             drawn.append(("wall_edges", np.array(edges), 0.55))
         return drawn
 
-    def obstructions(self) -> list[tuple[Floats, Floats, float]]:
+    def find_obstructions(self) -> list[tuple[Floats, Floats, float]]:
         """Return the boxes of obstacles: lower and upper corner, shape (3,) each [m], and opacity."""
         opacities = [
-            *((wall, 0.6 if self._divides(wall) else 0.0) for wall in self._walls),
+            *((wall, 0.6 if self._is_divider(wall) else 0.0) for wall in self._walls),
             *((one, 1.0) for one in self._furniture),
         ]
         return [
@@ -110,36 +118,36 @@ class Room:
             for shape, opacity in opacities
         ]
 
-    def _inside(self, shape: pin.GeometryObject) -> tuple[int, float]:
+    def _find_inside(self, shape: pin.GeometryObject) -> tuple[int, float]:
         """Return a wall's thin axis in its own frame, and the sign of its side facing the centre."""
         axis = int(np.argmin(np.asarray(shape.geometry.halfSide)[:2]))
         towards = shape.placement.actInv(self.centre)[axis]
         return axis, 1.0 if towards > 0.0 else -1.0
 
-    def _divides(self, shape: pin.GeometryObject) -> bool:
-        axis, sign = self._inside(shape)
+    def _is_divider(self, shape: pin.GeometryObject) -> bool:
+        axis, sign = self._find_inside(shape)
         behind = np.zeros(3)
         behind[axis] = -sign * (float(shape.geometry.halfSide[axis]) + _BEYOND)
         x, y, _ = shape.placement.act(behind)
         x_min, x_max, y_min, y_max = self.scene.arena
         return bool(x_min < x < x_max and y_min < y < y_max)
 
-    def _wall_parts(self, shape: pin.GeometryObject) -> list[Part]:
+    def _make_wall_parts(self, shape: pin.GeometryObject) -> list[Part]:
         half, colour = np.asarray(shape.geometry.halfSide), tuple(map(float, shape.meshColor))
 
-        def part(name: str, opacity: float, sides: tuple[int, ...]) -> Part:
-            solid = box_solid(-half, half, sides).moved(shape.placement)
+        def make_part(name: str, opacity: float, sides: tuple[int, ...]) -> Part:
+            solid = make_box(-half, half, sides).transform(shape.placement)
             return Part(
                 f"walls/{shape.name}/{name}", solid, colour, opacity, shadow=False, one_sided=True
             )
 
-        if self._divides(shape):
-            return [part("sides", _DIVIDER, (0, 1, 2, 3, 5))]
-        axis, sign = self._inside(shape)
+        if self._is_divider(shape):
+            return [make_part("sides", _DIVIDER, (0, 1, 2, 3, 5))]
+        axis, sign = self._find_inside(shape)
         inside = 2 * axis + (sign > 0)
         return [
-            part("inside", 1.0, (inside,)),
-            part("outside", _VEIL, tuple(s for s in range(4) if s != inside)),
+            make_part("inside", 1.0, (inside,)),
+            make_part("outside", _VEIL, tuple(s for s in range(4) if s != inside)),
         ]
 
 
@@ -171,7 +179,7 @@ def is_wall(shape: pin.GeometryObject) -> bool:
     )
 
 
-def _edges(shape: pin.GeometryObject) -> Floats:
+def _find_edges(shape: pin.GeometryObject) -> Floats:
     """Return the twelve edges of a box, shape (24, 3) [m]."""
     half = np.asarray(shape.geometry.halfSide)
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)

@@ -13,7 +13,7 @@ from meshcat.path import Path
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.visualization.triangles import Solid
 
-__all__ = ["Ghost", "Sun", "Triangles", "Unshadow", "add_node", "hexadecimal", "material"]
+__all__ = ["Ghost", "Sun", "Triangles", "Unshadow", "add_node", "encode_colour", "make_material"]
 
 _GHOST_OPACITY = 0.30
 
@@ -37,7 +37,7 @@ class Ghost(g.Object):
 
     def __init__(self, solid: Solid, colour: Sequence[float]) -> None:
         flat = g.MeshLambertMaterial(
-            color=hexadecimal(colour), opacity=_GHOST_OPACITY, transparent=True, side=2
+            color=encode_colour(colour), opacity=_GHOST_OPACITY, transparent=True, side=2
         )
         super().__init__(Triangles(solid), flat)
         self.depth = g.MeshBasicMaterial(transparent=True, side=2, colorWrite=False)
@@ -125,17 +125,17 @@ class Unshadow:
         return {"type": "set_property", "path": where, "property": "castShadow", "value": False}
 
 
-def material(
+def make_material(
     colour: Sequence[float], opacity: float = 1.0, *, one_sided: bool = False
 ) -> g.Material:
     """Make a slightly shiny material; translucent ones do not write to the depth buffer."""
     options = {"shininess": 25, "specular": 0x1A1A1A, "side": 0 if one_sided else 2}
     return g.MeshPhongMaterial(
-        color=hexadecimal(colour), opacity=opacity, depthWrite=opacity >= 1.0, **options
+        color=encode_colour(colour), opacity=opacity, depthWrite=opacity >= 1.0, **options
     )
 
 
-def hexadecimal(colour: Sequence[float]) -> int:
+def encode_colour(colour: Sequence[float]) -> int:
     """Encode red, green and blue in [0, 1] as one integer."""
     red, green, blue = (round(255.0 * min(1.0, max(0.0, float(c)))) for c in colour[:3])
     return (red << 16) + (green << 8) + blue

@@ -14,7 +14,7 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.meshes import MeshPart, simplify_mesh
 from vkc_pin.world.models.shapes import triangulate
 
-__all__ = ["Solid", "box_solid", "coarse", "merge_solids", "shade", "to_solid", "tube"]
+__all__ = ["Solid", "make_box", "make_tube", "merge_solids", "shade", "simplify", "to_solid"]
 
 _CREASE = np.radians(35.0)  # faces that meet at a larger angle keep an edge between them
 _SIDES = 8  # of a tube
@@ -35,7 +35,7 @@ class Solid:
     faces: NDArray[np.uint32]
     normals: NDArray[np.float32]
 
-    def moved(self, placement: pin.SE3) -> Solid:
+    def transform(self, placement: pin.SE3) -> Solid:
         """Return the mesh transformed by `placement`."""
         rotation = np.asarray(placement.rotation)
         vertices = self.vertices @ rotation.T + np.asarray(placement.translation)
@@ -61,7 +61,7 @@ def shade(vertices: Floats, faces: NDArray[np.int64]) -> Solid:
     return Solid(points, np.asarray(mesh.faces, np.uint32), normals)
 
 
-def coarse(solid: Solid, width: float) -> Solid:
+def simplify(solid: Solid, width: float) -> Solid:
     """Simplify a mesh by merging the vertices in each cell of a grid of `width` [m]."""
     part = simplify_mesh(
         MeshPart(solid.vertices.astype(float), solid.faces.astype(np.int64)), width
@@ -80,7 +80,7 @@ def merge_solids(solids: list[Solid]) -> Solid:
     )
 
 
-def box_solid(lower: Floats, upper: Floats, sides: tuple[int, ...] = (0, 1, 2, 3, 4, 5)) -> Solid:
+def make_box(lower: Floats, upper: Floats, sides: tuple[int, ...] = (0, 1, 2, 3, 4, 5)) -> Solid:
     """Build sides of the box between two corners: 0, 1: −x, +x; 2, 3: −y, +y; 4, 5: −z, +z."""
     vertices: list[Floats] = []
     faces: list[NDArray[np.int64]] = []
@@ -98,7 +98,7 @@ def box_solid(lower: Floats, upper: Floats, sides: tuple[int, ...] = (0, 1, 2, 3
     return _solid(np.concatenate(vertices), np.concatenate(faces), np.concatenate(normals))
 
 
-def tube(points: Floats, radius: float) -> Solid | None:
+def make_tube(points: Floats, radius: float) -> Solid | None:
     """Build a tube of `radius` [m] along `points`, shape (n, 3) [m]; browsers draw lines too thin.
 
     Returns:

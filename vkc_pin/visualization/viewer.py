@@ -64,14 +64,14 @@ def show(
         InputError: Neither a plan nor a scene, or something that cannot be drawn.
         VkcError: The server does not start.
     """
-    scene, plan = _parts(plan_or_scene)
+    scene, plan = _split(plan_or_scene)
     height = check_integer(height, "height", low=1, high=100_000)
     if open_browser is not None:
         check_bool(open_browser, "open_browser")
     if in_notebook():
         from IPython.display import HTML
 
-        page, name = html.escape(_page(scene, plan, frames)), html.escape(scene.name)
+        page, name = html.escape(_make_page(scene, plan, frames)), html.escape(scene.name)
         style = f"width: 100%; height: {height}px; border: none"
         return cast(Any, HTML)(
             f'<div><iframe srcdoc="{page}" style="{style}" title="{name}"></iframe></div>'
@@ -105,15 +105,15 @@ def animate(plan: CheckedMotion, viewer: meshcat.Visualizer | None = None) -> me
     """
     import meshcat
 
-    scene, known = _parts(plan)
-    if known is None:
+    scene, checked = _split(plan)
+    if checked is None:
         raise InputError(
             "a scene has no motion", field="plan", expected="a Plan", got=type(plan).__name__
         )
     viewer = (
         open_viewer() if viewer is None else check_instance(viewer, meshcat.Visualizer, "viewer")
     )
-    _draw(viewer, scene, known)
+    _draw(viewer, scene, checked)
     return viewer
 
 
@@ -138,7 +138,7 @@ def to_html(
     Raises:
         InputError: Neither a plan nor a scene, or something that cannot be drawn.
     """
-    return write_atomically(path, _page(*_parts(plan_or_scene), frames).encode("utf-8"))
+    return write_atomically(path, _make_page(*_split(plan_or_scene), frames).encode("utf-8"))
 
 
 def open_viewer() -> meshcat.Visualizer:
@@ -182,7 +182,7 @@ def _start_server() -> tuple[subprocess.Popen[bytes], str, str]:
     return process, addresses[0], addresses[1]
 
 
-def _parts(plan_or_scene: Any) -> tuple[Scene, CheckedMotion | None]:
+def _split(plan_or_scene: Any) -> tuple[Scene, CheckedMotion | None]:
     if isinstance(plan_or_scene, Scene):
         return plan_or_scene, None
     if isinstance(plan_or_scene, CheckedMotion):
@@ -211,17 +211,17 @@ def _draw(
     Drawing(viewer, scene, *motion).draw(play=play, frames=placed)
 
 
-def _page(
+def _make_page(
     scene: Scene, plan: CheckedMotion | None, frames: Mapping[str, pin.SE3] | None = None
 ) -> str:
     import meshcat
 
     recorder = Recorder()
     _draw(meshcat.Visualizer(window=recorder), scene, plan, play=False, frames=frames)
-    return render_page(recorder, title=f"{scene.name} – vkc_pin", film=_film(scene, plan))
+    return render_page(recorder, title=f"{scene.name} – vkc_pin", film=_describe_film(scene, plan))
 
 
-def _film(scene: Scene, plan: CheckedMotion | None) -> dict[str, Any]:
+def _describe_film(scene: Scene, plan: CheckedMotion | None) -> dict[str, Any]:
     if plan is None:
         return {"duration": 0.0, "phases": [], "notes": [], "headline": scene.name}
     times = plan.trajectory.times - plan.trajectory.times[0]
@@ -271,8 +271,8 @@ def render_page(recorder: Recorder, *, title: str, film: dict[str, Any]) -> str:
     pieces = {
         "TITLE": html.escape(title),
         "FILM": json.dumps(film).replace("<", "\\u003c"),
-        "VIEWER": _packed_file(viewer),
-        "COMMANDS": _packed(
+        "VIEWER": _pack_file(viewer),
+        "COMMANDS": _pack(
             b"".join(struct.pack("<I", len(command)) + command for command in packed)
         ),
     }
@@ -280,9 +280,9 @@ def render_page(recorder: Recorder, *, title: str, film: dict[str, Any]) -> str:
 
 
 @lru_cache(maxsize=1)
-def _packed_file(file: Path) -> str:
-    return _packed(file.read_bytes())
+def _pack_file(file: Path) -> str:
+    return _pack(file.read_bytes())
 
 
-def _packed(data: bytes) -> str:
+def _pack(data: bytes) -> str:
     return base64.b64encode(gzip.compress(data, 9, mtime=0)).decode("ascii")

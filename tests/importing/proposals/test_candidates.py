@@ -97,12 +97,12 @@ def test_axes_of_a_turned_box_are_its_own(roll: float, pitch: float, yaw: float)
 def test_section_of_a_turned_box() -> None:
     turn = pin.rpy.rpyToMatrix(0.0, 0.0, 0.7)
     box = piece(coal.Box(0.5, 0.2, 0.05), pin.SE3(turn, np.array([1.0, 0.0, 0.0])))
-    section = box.cut(0, float(box.extents[0].mean()))
+    section = box.compute_section(0, float(box.extents[0].mean()))
     assert section is not None
     assert np.allclose(section.centre, [1.0, 0.0, 0.0], atol=1e-9)
     widths = sorted(np.ptp(section.polygon, axis=0))
     assert widths == pytest.approx([0.05, 0.2])
-    assert box.cut(0, float(box.extents[0, 1]) + 0.01) is None
+    assert box.compute_section(0, float(box.extents[0, 1]) + 0.01) is None
 
 
 SQUARE = Section(

@@ -39,7 +39,7 @@ def test_descriptions_load_as_the_same_attachments(
 
 
 def test_applied_object_has_the_best_attachment_first(found: vkc.importing.Proposals) -> None:
-    item = found.applied()
+    item = found.make_object()
     assert item.attachment().name == found.found[0].attachment.name == "flap_bar"
     assert found.opening("hinge") == found.found
     assert "flap_bar" in repr(found)

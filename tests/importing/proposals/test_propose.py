@@ -85,7 +85,7 @@ def test_thick_object_has_no_attachment(tmp_path: Path) -> None:
     assert "nothing of it fits between the fingers, 86 mm apart" in found.because["hinge"]
     assert "120 mm at its thinnest" in found.because["hinge"]
     assert found.because["hinge"] in found.summary()
-    assert dict(found.applied().attachments) == {}
+    assert dict(found.make_object().attachments) == {}
 
 
 def test_bar_without_clearance_behind_it_is_rejected(tmp_path: Path) -> None:

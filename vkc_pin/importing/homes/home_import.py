@@ -54,7 +54,7 @@ class ImportedHome:
     Attributes:
         file: Scene file for `load_scene`.
         scene: The loaded scene.
-        things: Movable objects, in the order of the scene's objects.
+        objects: Movable objects, in the order of the scene's objects.
         shapes: Number of collision shapes of the file that became "floor", "obstacles" and
             "objects"; "file" is their sum unless some were left out.
         reached: Number of objects to which the floor is free from the robot's start.
@@ -63,7 +63,7 @@ class ImportedHome:
 
     file: Path
     scene: Scene
-    things: tuple[ImportedHomeObject, ...]
+    objects: tuple[ImportedHomeObject, ...]
     shapes: Mapping[str, int]
     reached: int
     notes: tuple[str, ...]
@@ -72,10 +72,10 @@ class ImportedHome:
         """Return a readable report."""
         x_low, x_high, y_low, y_high = self.scene.arena
         size = f"{x_high - x_low:.1f} × {y_high - y_low:.1f} m"
-        free = sum(thing.free for thing in self.things)
+        free = sum(item.free for item in self.objects)
         counts = (
             f"{len(self.scene.obstacle_names)} obstacles, "
-            f"{len(self.things) - free} articulated objects, {free} free objects"
+            f"{len(self.objects) - free} articulated objects, {free} free objects"
         )
         parts = ", ".join(f"{self.shapes[key]} {key}" for key in ("obstacles", "objects", "floor"))
         base = ", ".join(f"{value:.2f}" for value in self.scene.start[:3])
@@ -85,7 +85,7 @@ class ImportedHome:
                 f"  {self.shapes['file']} shapes in the file: {parts}",
                 *(f"  {note}" for note in self.notes),
                 f"start at ({base}), with free floor to {self.reached} of these objects",
-                *(f"  {thing.summary()}" for thing in self.things),
+                *(f"  {item.summary()}" for item in self.objects),
             ]
         )
 
@@ -158,15 +158,15 @@ def import_home(
     with write_folder_atomically(
         target, force=True
     ) as staging:  # `check_target` allowed replacing it
-        known: PieceCache = {}
-        names = [thing.name for thing in home.objects]
+        cache: PieceCache = {}
+        names = [item.name for item in home.objects]
         taken = {FLOOR, *names}
         clearances = {"dist_safe": options.dist_safe, "grasp_clearance": options.grasp_clearance}
-        things = tuple(
-            write_object(thing, hand, staging, known, stem=stem, most=most, **clearances)
-            for thing, stem in zip(home.objects, choose_file_names(names), strict=True)
+        objects = tuple(
+            write_object(item, hand, staging, cache, stem=stem, most=most, **clearances)
+            for item, stem in zip(home.objects, choose_file_names(names), strict=True)
         )
-        obstacles, obstacle_notes = write_obstacles(home, path, staging, taken, known)
+        obstacles, obstacle_notes = write_obstacles(home, path, staging, taken, cache)
         document: dict[str, Any] = {
             "name": _choose_name(path),
             "robot": _resolve_robot(robot),
@@ -174,25 +174,25 @@ def import_home(
             "arena": {axis: _round_interval(low[k], high[k]) for k, axis in enumerate("xy")},
             "start_region": {axis: _round_interval(low[k], high[k]) for k, axis in enumerate("xy")},
             "obstacles": obstacles,
-            "objects": [thing.entry for thing in things],
+            "objects": [item.entry for item in objects],
         }
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they are repeated when the scene is loaded
             scene, reached = find_free_start(Scene.from_document(document, staging), rng, path)
         document["start"] = {"base": scene.start[:3].tolist()}
         _write_scene(staging / "scene.yaml", path, document)
-    weight = (WEIGHTLESS,) if all(thing.description.is_massless for thing in home.objects) else ()
+    weight = (WEIGHTLESS,) if all(item.description.is_massless for item in home.objects) else ()
     notes = (
         *home.notes,
         *weight,
         *_note_floor_shapes(home),
         *obstacle_notes,
-        *(note for thing in things for note in thing.notes),
+        *(note for item in objects for note in item.notes),
     )
     return ImportedHome(
         target / "scene.yaml",
         load_scene(target / "scene.yaml"),
-        things,
+        objects,
         _count_shapes(home),
         reached,
         notes,
@@ -231,7 +231,7 @@ def _note_floor_shapes(home: Home) -> list[str]:
 def _count_shapes(home: Home) -> dict[str, int]:
     """Return the number of collision shapes by their role."""
     objects = sum(
-        len(link.solid) for thing in home.objects for link in thing.description.links.values()
+        len(link.solid) for item in home.objects for link in item.description.links.values()
     )
     obstacles = sum(len(link.solid) for link in (*home.building, *home.furniture))
     shapes = {"file": home.shapes, "obstacles": obstacles, "objects": objects}

@@ -76,7 +76,7 @@ def write_object(
     item: HomeObject,
     robot: Robot,
     folder: Path,
-    known: PieceCache,
+    cache: PieceCache,
     *,
     stem: str,
     most: int,
@@ -90,7 +90,7 @@ def write_object(
         item: The object.
         robot: Robot whose hand the attachments are for.
         folder: Folder of the scene.
-        known: Cache of pieces of mesh files; new ones are added.
+        cache: Cache of pieces of mesh files; new ones are added.
         stem: Name of the object's folder and files, without extension.
         most: Largest number of attachments of one joint.
         clearances: Clearances as in `propose_attachments`.
@@ -99,7 +99,7 @@ def write_object(
     if item.free:
         description = _add_lift_joint(description)
     description = add_missing_limits(description, load_surfaces(description))
-    description = decompose_links(description, load_surfaces(description), known)
+    description = decompose_links(description, load_surfaces(description), cache)
     address = f"objects/{stem}/{stem}.yaml"
     yaml, urdf = folder / address, (folder / address).with_suffix(".urdf")
     with tempfile.TemporaryDirectory() as scratch:
@@ -155,7 +155,7 @@ _ALIKE = 1e-4
 
 
 def write_obstacles(
-    home: Home, source: Path, folder: Path, taken: set[str], known: PieceCache
+    home: Home, source: Path, folder: Path, taken: set[str], cache: PieceCache
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Write the fixed parts of a home, and return the scene's obstacle entries and notes.
 
@@ -175,7 +175,7 @@ def write_obstacles(
         low, high = compute_bounds(description, load_surfaces(description))
         origin = np.array([*((low + high) / 2.0)[:2], 0.0]).round(6)
         description = move_root(description, pin.SE3(np.eye(3), -origin))
-        description = decompose_links(description, load_surfaces(description), known)
+        description = decompose_links(description, load_surfaces(description), cache)
         notes += description.notes
         address = f"obstacles/{stems[name]}/{stems[name]}.urdf"
         write_urdf(description, folder / address)

@@ -76,7 +76,7 @@ def find_candidates(
         low, high = piece.extents[axis].tolist()
         for fraction in _POSITIONS if high - low > _LONG else _POSITIONS[:1]:
             at = low + fraction * (high - low)
-            section = piece.cut(axis, at)
+            section = piece.compute_section(axis, at)
             if section is None:
                 continue
             for turn in np.arange(_DIRECTIONS) * 2.0 * np.pi / _DIRECTIONS:
@@ -264,7 +264,7 @@ class Piece:
         )
         return np.unique(pairs, axis=0)
 
-    def cut(self, axis: int, at: float) -> Section | None:
+    def compute_section(self, axis: int, at: float) -> Section | None:
         """Return the cross-section normal to `axes[axis]` at `at` [m]; None if there is none."""
         normal, plane = self.axes[axis], np.delete(self.axes, axis, axis=0)
         height = self.vertices @ normal - at

@@ -80,16 +80,16 @@ class HandClearance:
         return self._data.oMi[number]
 
     def find_obstruction(
-        self, tool: pin.SE3, held: str, *, extra_clearance: float = 0.0
+        self, tool: pin.SE3, link: str, *, extra_clearance: float = 0.0
     ) -> Obstruction | None:
         """Return what obstructs a hand at `tool`, in the object's base frame; None if nothing does.
 
         Args:
             tool: Placement of the tool frame.
-            held: The grasped link.
+            link: The grasped link.
             extra_clearance: Clearance in excess of the required one from other links [m].
         """
-        is_held = self.links == held
+        is_held = self.links == link
         for (shape, where), box, touches in zip(
             self._hand, self._hand_boxes, self._touch, strict=True
         ):
@@ -144,10 +144,10 @@ class GraspMotion:
         self._angles = self._angles[np.abs(self._angles) <= grasp.round + 1e-9]
         half = clearance.hand.width / 2.0
         self._low = 0.0 - _march(
-            lambda way: self._is_free(-way, 0.0), min(_LONGEST, -grasp.span[0] - half)
+            lambda distance: self._is_free(-distance, 0.0), min(_LONGEST, -grasp.span[0] - half)
         )
         self._high = _march(
-            lambda way: self._is_free(way, 0.0), min(_LONGEST, grasp.span[1] - half)
+            lambda distance: self._is_free(distance, 0.0), min(_LONGEST, grasp.span[1] - half)
         )
         self._turned = self._grow(self._find_free_angles(), self._angles == 0.0)
 

@@ -38,7 +38,7 @@ _STATIC_COLOUR, _MOVING_COLOUR, _HELD_COLOUR = (
 def plot_attachments(proposals: Proposals, path: str | Path | None = None) -> Figure:
     """Draw the hand at every proposed attachment, and list the joints that no hand can open.
 
-    Each joint is drawn a third of the way open.
+    Joints are drawn a third open.
 
     Args:
         proposals: Result of `propose_attachments`.

@@ -86,7 +86,7 @@ class Proposals:
         """Return the attachments with which a joint can be opened, best first."""
         return tuple(proposal for proposal in self.found if joint in proposal.opens)
 
-    def applied(self) -> ArticulatedObject:
+    def make_object(self) -> ArticulatedObject:
         """Return the object with these attachments instead of its own, best first."""
         attachments = {proposal.attachment.name: proposal.attachment for proposal in self.found}
         return dataclasses.replace(self.object, attachments=MappingProxyType(attachments))

@@ -130,26 +130,28 @@ class _Search:
 
     def propose_for_joint(self, number: int) -> list[Proposal]:
         """Return the proposals for the links that joint `number` moves directly, best first."""
-        found = self._propose_at(number, {})
+        found = self._propose_in_state(number, {})
         if not found:
             links = {
                 blocked.link for blocked in self.tallies[number].blocked if blocked.what == "others"
             }
-            above = {k for link in links for k in self.item.model.supports[self._joint_of(link)]}
+            above = {k for link in links for k in self.item.model.supports[self._find_joint(link)]}
             own = {k for k in self.openings if number in self.item.model.supports[k]} | set(
                 self.item.model.supports[number]
             )
             others = [self.openings[k] for k in sorted(above - own - {0})]
             if others:
                 before = self.tallies[number]
-                found = self._propose_at(number, {other.joint: other.opened for other in others})
+                found = self._propose_in_state(
+                    number, {other.joint: other.opened for other in others}
+                )
                 self.tallies[number] = self.tallies[number] if found else before
         return found
 
-    def _joint_of(self, link: str) -> int:
+    def _find_joint(self, link: str) -> int:
         return int(self.item.model.frames[self.item.link_frame(link)].parentJoint)
 
-    def _propose_at(self, number: int, when: dict[str, float]) -> list[Proposal]:
+    def _propose_in_state(self, number: int, when: dict[str, float]) -> list[Proposal]:
         """Return the proposals for a joint with other joints at positions `when`."""
         tally = self.tallies[number] = _Tally(pieces=len(self.pieces.get(number, ())))
         state = self.closed.copy()

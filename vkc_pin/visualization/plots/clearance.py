@@ -72,7 +72,7 @@ def compute_clearance_curves(
         for hold in holds
         for link in find_touch_links(scene, hold)
     }
-    kinds = np.array([_kind(table, pair, gripped) for pair in table.pairs])
+    kinds = np.array([_find_kind(table, pair, gripped) for pair in table.pairs])
     asked = np.array([(min(pair), max(pair)) not in silent for pair in table.pairs.tolist()], bool)
     groups = {
         kind: table.pairs[(kinds == kind) & asked]
@@ -101,7 +101,7 @@ _KINDS = (
 )
 
 
-def _kind(table: PairTable, pair: Ints, gripped: Set[tuple[str, str]]) -> str:
+def _find_kind(table: PairTable, pair: Ints, gripped: Set[tuple[str, str]]) -> str:
     first, second = (table.groups[int(i)] for i in pair)
     one, other = (table.world.collision_labels[int(i)] for i in pair)
     if first == "robot" and (one, other) in gripped:

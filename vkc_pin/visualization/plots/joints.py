@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-__all__ = ["DASHES", "SAMPLES", "draw_joints", "groups_of", "name_phases"]
+__all__ = ["DASHES", "SAMPLES", "draw_joints", "find_groups", "name_phases"]
 
 SAMPLES = 240
 """Number of times at which a motion is drawn, besides its waypoints and knots."""
@@ -46,7 +46,7 @@ class _Quantity:
     style: Callable[[Trajectory], Mapping[str, Any]]
 
 
-def _limit(kind: str) -> Callable[[CheckedMotion, str], float]:
+def _find_limit(kind: str) -> Callable[[CheckedMotion, str], float]:
     """Return a function that finds a limit, "velocity" or "acceleration"; grasps have none."""
 
     def limit(plan: CheckedMotion, name: str) -> float:
@@ -61,7 +61,7 @@ def _limit(kind: str) -> Callable[[CheckedMotion, str], float]:
     return limit
 
 
-def _accelerations(plan: CheckedMotion, times: Floats) -> tuple[Floats, Floats]:
+def _sample_accelerations(plan: CheckedMotion, times: Floats) -> tuple[Floats, Floats]:
     motion = plan.trajectory
     return (
         (times, motion.acceleration(times))
@@ -82,20 +82,20 @@ _QUANTITIES: tuple[_Quantity, ...] = (
         "velocity",
         {"m": "m/s", "rad": "rad/s"},
         lambda plan, times: (times, plan.trajectory.velocity(times)),
-        _limit("velocity"),
+        _find_limit("velocity"),
         lambda motion: {"drawstyle": "default" if motion.curve is not None else "steps-post"},
     ),
     _Quantity(
         "acceleration",
         {"m": "m/s²", "rad": "rad/s²"},
-        _accelerations,
-        _limit("acceleration"),
+        _sample_accelerations,
+        _find_limit("acceleration"),
         lambda motion: {} if motion.curve is not None else {"marker": ".", "linestyle": "none"},
     ),
 )
 
 
-def _jerk() -> _Quantity:
+def _make_jerk() -> _Quantity:
     """Return the jerk, constant on each cubic of a curve; it is drawn where jerks are limited."""
 
     def values(plan: CheckedMotion, times: Floats) -> tuple[Floats, Floats]:
@@ -108,7 +108,7 @@ def _jerk() -> _Quantity:
         return curve.times, np.concatenate([jerks, jerks[-1:]])
 
     def limit(plan: CheckedMotion, name: str) -> float:
-        return _limit("acceleration")(plan, name) / plan.options.jerk_time
+        return _find_limit("acceleration")(plan, name) / plan.options.jerk_time
 
     return _Quantity(
         "jerk",
@@ -119,7 +119,7 @@ def _jerk() -> _Quantity:
     )
 
 
-def groups_of(trajectory: Trajectory) -> dict[str, list[int]]:
+def find_groups(trajectory: Trajectory) -> dict[str, list[int]]:
     """Return the columns of a trajectory that belong to base, arm and objects."""
     names, robot = trajectory.names, trajectory.robot_size
     groups = {
@@ -132,9 +132,9 @@ def groups_of(trajectory: Trajectory) -> dict[str, list[int]]:
 
 def draw_joints(figure: FigureBase, plan: CheckedMotion) -> None:
     """Draw all quantities, with one row each for base, arm and objects."""
-    groups, motion = groups_of(plan.trajectory), plan.trajectory
+    groups, motion = find_groups(plan.trajectory), plan.trajectory
     eased = motion.curve is not None and plan.options.jerk_time > 0.0
-    drawn = (*_QUANTITIES, _jerk()) if eased else _QUANTITIES
+    drawn = (*_QUANTITIES, _make_jerk()) if eased else _QUANTITIES
     axes: Any = figure.subplots(len(groups), len(drawn), sharex=True, squeeze=False)
     parts = [np.linspace(motion.times[0], motion.times[-1], SAMPLES), motion.times]
     if motion.curve is not None:

@@ -46,8 +46,9 @@ def scene_html(scene: Scene) -> str:
         ("objects", escape(", ".join(objects) or "none")),
         ("obstacles", str(len(scene.obstacle_names))),
     ]
-    return _beside(
-        f"<b>{escape(scene.name)}</b>{_table(rows)}", _picture(scene, None, "the scene from above")
+    return _arrange(
+        f"<b>{escape(scene.name)}</b>{_render_table(rows)}",
+        _render_picture(scene, None, "the scene from above"),
     )
 
 
@@ -59,11 +60,11 @@ def motion_html(plan: CheckedMotion) -> str:
     head = f'<b>{escape(plan.scene.name)}: <span style="color: {_GOOD if good else _BAD}">{escape(status)}</span></b>'
     phases = escape(", ".join(phase.name for phase in plan.trajectory.phases))
     rows = [
-        ("base", _value(m, "base_path_length", "m", 2)),
-        ("arm", _value(m, "arm_path_length", "rad", 2)),
-        ("clearance", _value(m, "clearance", "mm", 1, 1e3)),
-        ("duration", _value(m, "duration", "s", 1)),
-        ("planned in", _value(m, "planning_time", "s", 2)),
+        ("base", _format_metric(m, "base_path_length", "m", 2)),
+        ("arm", _format_metric(m, "arm_path_length", "rad", 2)),
+        ("clearance", _format_metric(m, "clearance", "mm", 1, 1e3)),
+        ("duration", _format_metric(m, "duration", "s", 1)),
+        ("planned in", _format_metric(m, "planning_time", "s", 2)),
         ("seed", escape(f"{plan.initialization or 'unknown'}, random numbers {plan.seed}")),
     ]
     found = [str(violation) for violation in plan.report.violations] + list(plan.report.notes)
@@ -73,11 +74,11 @@ def motion_html(plan: CheckedMotion) -> str:
     ]
     listed = "".join(f"<li>{escape(line)}</li>" for line in lines)
     problems = f'<ul style="color: {_BAD}; margin: 4px 0">{listed}</ul>' if lines else ""
-    view = _picture(plan.scene, plan.trajectory, "the motion from above")
-    return _beside(f"{head}<div>{phases}</div>{_table(rows)}{problems}", view)
+    view = _render_picture(plan.scene, plan.trajectory, "the motion from above")
+    return _arrange(f"{head}<div>{phases}</div>{_render_table(rows)}{problems}", view)
 
 
-def _table(rows: list[tuple[str, str]]) -> str:
+def _render_table(rows: list[tuple[str, str]]) -> str:
     """Render a table whose values are HTML."""
     cell = "text-align: left; padding: 1px 10px 1px 0; background: none"
     body = "".join(
@@ -87,13 +88,13 @@ def _table(rows: list[tuple[str, str]]) -> str:
     return f'<table style="border: none; margin: 6px 0">{body}</table>'
 
 
-def _beside(text: str, picture: str) -> str:
+def _arrange(text: str, picture: str) -> str:
     """Render a text and a picture side by side."""
     style = "display: flex; flex-wrap: wrap; gap: 16px; align-items: flex-start"
     return f'<div style="{style}"><div style="max-width: 34em">{text}</div>{picture}</div>'
 
 
-def _picture(scene: Scene, trajectory: Trajectory | None, title: str) -> str:
+def _render_picture(scene: Scene, trajectory: Trajectory | None, title: str) -> str:
     """Render a top view without pyplot, so that no backend is selected and no figure stays open."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -119,7 +120,7 @@ def _picture(scene: Scene, trajectory: Trajectory | None, title: str) -> str:
     return f'<img alt="{escape(title)}" style="max-width: 100%" src="data:image/png;base64,{data}">'
 
 
-def _value(
+def _format_metric(
     metrics: Mapping[str, float], name: str, unit: str, digits: int, factor: float = 1.0
 ) -> str:
     value = metrics.get(name)

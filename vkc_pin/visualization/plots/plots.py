@@ -13,7 +13,13 @@ import numpy as np
 from vkc_pin.errors import InputError
 from vkc_pin.validation.report import CheckedMotion
 from vkc_pin.visualization.plots.clearance import compute_clearance_curves
-from vkc_pin.visualization.plots.joints import DASHES, SAMPLES, draw_joints, groups_of, name_phases
+from vkc_pin.visualization.plots.joints import (
+    DASHES,
+    SAMPLES,
+    draw_joints,
+    find_groups,
+    name_phases,
+)
 from vkc_pin.visualization.plots.style import (
     COLOURS,
     new_figure,
@@ -50,10 +56,10 @@ def plot(plan: CheckedMotion, path: str | Path | None = None) -> Figure | dict[s
     Raises:
         InputError: `plan` is not a plan, or `path` is a file of another type.
     """
-    _check(plan)
+    _check_plan(plan)
     target = None if path is None else check_path(path, "path")
     if target is None or target.suffix.lower() in PICTURES:
-        return save_figure(_combined(plan), target)
+        return save_figure(_plot_all(plan), target)
     if target.is_file():
         expected = f"a folder, or a name ending with {', '.join(PICTURES)}"
         raise InputError("path is a file", field="path", file=target, expected=expected)
@@ -69,16 +75,16 @@ def plot(plan: CheckedMotion, path: str | Path | None = None) -> Figure | dict[s
 
 def plot_joints(plan: CheckedMotion) -> Figure:
     """Plot positions, velocities and accelerations over time with their limits; see `joints`."""
-    _check(plan)
+    _check_plan(plan)
     with use_style():
-        figure = new_figure(16.0, 2.5 * len(groups_of(plan.trajectory)) + 0.4)
+        figure = new_figure(16.0, 2.5 * len(find_groups(plan.trajectory)) + 0.4)
         draw_joints(figure, plan)
     return figure
 
 
 def plot_clearance(plan: CheckedMotion) -> Figure:
     """Plot the smallest distances over time; the legend names the closest pairs."""
-    _check(plan)
+    _check_plan(plan)
     with use_style():
         figure = new_figure(9.0, 4.2)
         _draw_clearance(figure, plan)
@@ -87,7 +93,7 @@ def plot_clearance(plan: CheckedMotion) -> Figure:
 
 def plot_top_view(plan: CheckedMotion) -> Figure:
     """Plot the top view: obstacles, objects, the base at several times, paths of base and tool."""
-    _check(plan)
+    _check_plan(plan)
     x_min, x_max, y_min, y_max = plan.scene.arena
     with use_style():
         figure = new_figure(
@@ -97,14 +103,14 @@ def plot_top_view(plan: CheckedMotion) -> Figure:
     return figure
 
 
-def _check(plan: CheckedMotion) -> None:
+def _check_plan(plan: CheckedMotion) -> None:
     if not isinstance(plan, CheckedMotion):
         raise InputError(
             "cannot be plotted", field="plan", expected="a Plan", got=type(plan).__name__
         )
 
 
-def _combined(plan: CheckedMotion) -> Figure:
+def _plot_all(plan: CheckedMotion) -> Figure:
     with use_style():
         figure = new_figure(16.0, 11.0)
         parts: Any = figure.subfigures(2, 1, height_ratios=(1.15, 1.0))

@@ -13,7 +13,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.visualization.plots.plots import PICTURES
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
-from vkc_pin.visualization.plots.top_view import draw_top_view, outline
+from vkc_pin.visualization.plots.top_view import compute_outline, draw_top_view
 from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.scene.obstacles import FLOOR
@@ -84,7 +84,9 @@ def plot_scene(
                 where = data.oMi[shape.parentJoint] * shape.placement
                 corners = triangulate(shape.geometry)[0] @ where.rotation.T + where.translation
                 axes.add_patch(
-                    Polygon(outline(corners), fill=False, edgecolor=red, linewidth=2.0, zorder=6)
+                    Polygon(
+                        compute_outline(corners), fill=False, edgecolor=red, linewidth=2.0, zorder=6
+                    )
                 )
         names: list[tuple[str, tuple[float, float], tuple[str, str]]] = []
         for name, at, direction, base in approaches:

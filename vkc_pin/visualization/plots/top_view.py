@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-__all__ = ["draw_top_view", "outline"]
+__all__ = ["compute_outline", "draw_top_view"]
 
 _STEP = 0.55  # travel between two drawn footprints [m]
 _ROBOT_HEIGHT = 1.8  # obstacles above this height are drawn dashed [m]
@@ -42,11 +42,13 @@ def draw_top_view(
     for i, shape in enumerate(world.shapes):
         if shape.parentJoint or world.collision_labels[i] == FLOOR:
             continue
-        points = _corners(world, i, np.eye(4), {})
+        points = _place_vertices(world, i, np.eye(4), {})
         high = points[:, 2].min() > _ROBOT_HEIGHT
         paint = (*np.clip(shape.meshColor[:3], 0.0, 1.0), 0.75)
         style: dict[str, Any] = {"fill": False, "linestyle": "--"} if high else {"facecolor": paint}
-        axes.add_patch(Polygon(outline(points), edgecolor="0.45", linewidth=0.7, zorder=1, **style))
+        axes.add_patch(
+            Polygon(compute_outline(points), edgecolor="0.45", linewidth=0.7, zorder=1, **style)
+        )
 
     _draw_motion(axes, world, trajectory)
     x_min, x_max, y_min, y_max = world.scene.arena
@@ -64,13 +66,13 @@ def _draw_motion(axes: Axes, world: World, trajectory: Trajectory | None) -> Non
     from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.patches import Polygon
 
-    times = np.zeros(1) if trajectory is None else _moments(trajectory)
+    times = np.zeros(1) if trajectory is None else _choose_times(trajectory)
     motion = sample_motion(world, trajectory, times)
     shades = LinearSegmentedColormap.from_list("time", [_START, _END])(
         np.linspace(0.0, 1.0, len(times))
     )
     robot, moving = [], []
-    known: dict[int, Floats] = {}
+    cache: dict[int, Floats] = {}
     for i, shape in enumerate(world.shapes):
         if shape.parentJoint == 1:
             robot.append(i)
@@ -78,12 +80,15 @@ def _draw_motion(axes: Axes, world: World, trajectory: Trajectory | None) -> Non
             moving.append(i)
     for k, colour in enumerate(shades):
         ends = k in (0, len(times) - 1)
-        base = np.concatenate([_corners(world, i, motion.world[k, 1], known) for i in robot])
+        base = np.concatenate([_place_vertices(world, i, motion.world[k, 1], cache) for i in robot])
         drawn = {"edgecolor": colour, "linewidth": 1.6 if ends else 0.8, "zorder": 3}
         label = "start" if k == 0 else "end" if k == len(times) - 1 else None
         axes.add_patch(
             Polygon(
-                outline(base), facecolor=(*colour[:3], 0.22 if ends else 0.05), label=label, **drawn
+                compute_outline(base),
+                facecolor=(*colour[:3], 0.22 if ends else 0.05),
+                label=label,
+                **drawn,
             )
         )
         if ends:
@@ -98,9 +103,13 @@ def _draw_motion(axes: Axes, world: World, trajectory: Trajectory | None) -> Non
                 motion.world[k, joint], motion.world[k - 1, joint], atol=1e-3
             ):
                 continue
-            corners = _corners(world, i, motion.world[k, joint], known)
+            corners = _place_vertices(world, i, motion.world[k, joint], cache)
             axes.add_patch(
-                Polygon(outline(corners), facecolor=(*colour[:3], 0.35 if ends else 0.1), **drawn)
+                Polygon(
+                    compute_outline(corners),
+                    facecolor=(*colour[:3], 0.35 if ends else 0.1),
+                    **drawn,
+                )
             )
     if trajectory is None:
         return
@@ -116,7 +125,7 @@ def _draw_motion(axes: Axes, world: World, trajectory: Trajectory | None) -> Non
         axes.plot(*path[-1, :2], "s", color=colour, markersize=4.5, zorder=5)
 
 
-def _moments(trajectory: Trajectory) -> Floats:
+def _choose_times(trajectory: Trajectory) -> Floats:
     """Choose times at equal steps of the travel of base and objects."""
     fine = np.linspace(trajectory.times[0], trajectory.times[-1], 400)
     rows = trajectory.at(fine)
@@ -135,16 +144,16 @@ def _moments(trajectory: Trajectory) -> Floats:
     )
 
 
-def _corners(world: World, index: int, joint: Floats, known: dict[int, Floats]) -> Floats:
-    """Return a shape's vertices, shape (n, 3) [m], for joint placement (4, 4); `known` is a cache."""
+def _place_vertices(world: World, index: int, joint: Floats, cache: dict[int, Floats]) -> Floats:
+    """Return a shape's vertices, shape (n, 3) [m], for joint placement (4, 4); `cache` holds triangulations."""
     shape = world.shapes[index]
-    if index not in known:
-        known[index] = triangulate(shape.geometry)[0]
+    if index not in cache:
+        cache[index] = triangulate(shape.geometry)[0]
     placed = pin.SE3(joint) * shape.placement
-    return np.asarray(known[index] @ np.asarray(placed.rotation).T + placed.translation)
+    return np.asarray(cache[index] @ np.asarray(placed.rotation).T + placed.translation)
 
 
-def outline(points: Floats) -> Floats:
+def compute_outline(points: Floats) -> Floats:
     """Compute the convex hull, shape (k, 2), of the x and y of points, shape (n, ≥ 2)."""
     from scipy.spatial import ConvexHull, QhullError
 

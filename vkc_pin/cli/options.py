@@ -1,0 +1,61 @@
+"""Defines exit codes, and adds commands and options to parsers."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import Any
+
+from vkc_pin.benchmarks.commands import EXIT_INTERRUPTED, EXIT_OK, parse_natural, parse_positive
+
+__all__ = [
+    "EXIT_FAILED",
+    "EXIT_INFEASIBLE",
+    "EXIT_INTERRUPTED",
+    "EXIT_MISUSE",
+    "EXIT_OK",
+    "add_command",
+    "add_option",
+    "add_seed",
+    "parse_natural",
+    "parse_positive",
+]
+
+EXIT_FAILED, EXIT_MISUSE, EXIT_INFEASIBLE = 1, 2, 3
+
+
+def add_command(
+    commands: Any,
+    name: str,
+    summary: str,
+    run: Callable[[argparse.Namespace], int],
+    description: str | None = None,
+) -> argparse.ArgumentParser:
+    """Add a command to a parser's commands, and return the command's parser."""
+    text = description or f"{summary[0].upper()}{summary[1:]}."
+    command: argparse.ArgumentParser = commands.add_parser(name, help=summary, description=text)
+    command.set_defaults(run=run)
+    return command
+
+
+def add_option(parser: Any, form: str, text: str, **settings: Any) -> None:
+    """Add an option or argument.
+
+    Args:
+        parser: Parser or group of options.
+        form: Name and placeholder, e.g. "--save FILE" or "plan PLAN". An option without a
+            placeholder or settings is a flag.
+        text: Help.
+        settings: Further arguments of `add_argument`.
+    """
+    name, _, metavar = form.partition(" ")
+    if metavar:
+        settings["metavar"] = metavar
+    elif not settings:
+        settings["action"] = "store_true"
+    parser.add_argument(name, help=text, **settings)
+
+
+def add_seed(parser: Any, text: str = "random seed (default 0)") -> None:
+    """Add the option `--seed`."""
+    add_option(parser, "--seed", text, type=parse_natural, default=0)

@@ -8,10 +8,9 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial import ConvexHull
 
 import vkc_pin as vkc
-from vkc_pin.importing.convex import compute_concavity, compute_solid_volume, decompose, slice_mesh
+from vkc_pin.importing.convex import compute_concavity, compute_solid_volume, decompose
 from vkc_pin.utils import disk_cache
 
 box = trimesh.creation.box
@@ -76,7 +75,7 @@ def test_bin_becomes_hollow_the_same_way_every_time(
     assert len(decompose(mesh, most_pieces=6).meshes) <= 6
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(st.integers(0, 2**31))
 def test_pieces_contain_the_corners_of_the_mesh(seed: int) -> None:
     """An angle of random arms; every second one has a triangle missing, and is cut by planes."""
@@ -124,17 +123,3 @@ def test_invalid_meshes_and_arguments_are_named(
     assert len(decompose(box((1, 1, 1))).meshes) == 1  # nothing to cut
     with pytest.raises(vkc.InputError, match=r"vkc-pin\[import\]"):
         decompose(tray())
-
-
-def test_open_angle_is_cut_into_its_arms() -> None:
-    """Two plates without ends, at a right angle: cut near where they meet."""
-    plates = [trimesh.creation.box((1.0, 0.02, 0.5)), trimesh.creation.box((0.02, 1.0, 0.5))]
-    mesh = trimesh.util.concatenate(
-        [plates[0].apply_translation((0.5, 0, 0)), plates[1].apply_translation((0, 0.5, 0))]
-    )
-    mesh.update_faces(np.abs(mesh.face_normals[:, 2]) < 0.5)
-    parts = slice_mesh(mesh, 4)
-    assert 2 <= len(parts) <= 4
-    assert sum(ConvexHull(part).volume for part in parts) < 0.3 * ConvexHull(mesh.vertices).volume
-    for corner in mesh.vertices:
-        assert any(np.abs(part - corner).max(axis=1).min() < 1e-12 for part in parts)

@@ -96,32 +96,6 @@ def test_masses_agree_with_pinocchio() -> None:
         np.testing.assert_allclose(np.sort(physical.model.body_inertia[body]), principal, rtol=1e-3)
 
 
-def test_coupled_joints_contribute_to_the_mass_matrix(tmp_path: Path) -> None:
-    """MuJoCo's inertia of independent joints agrees when one motor moves several of them."""
-    physical = build_model(coupled_scene(tmp_path), has_notes=True)
-    world, model = physical.world, physical.model
-    data, robot = mujoco.MjData(model), world.scene.robot.coordinates
-    slopes = np.zeros((model.nv, robot.size))
-    for move in robot.moves:
-        own = model.body_dofadr[physical.bodies[move.joint]] + (
-            move.coordinate if move.coordinate < 3 else 0
-        )
-        slopes[own, move.coordinate] = move.factor
-    for row in random_rows(world, 5):
-        data.qpos[:] = physical.to_qpos(row)
-        mujoco.mj_forward(model, data)
-        assert np.abs(data.efc_pos[: data.ne]).max() < 1e-9
-        masses = np.zeros((model.nv, model.nv))
-        mujoco.mj_fullM(model, data, masses)
-        masses -= np.diag(model.dof_armature)
-        theirs = pin.crba(world.model, world.model.createData(), world.coordinates.q(row))
-        theirs = np.triu(theirs) + np.triu(theirs, 1).T
-        turned = np.eye(robot.size)  # the base's velocity is in its own frame there
-        turned[:2, :2] = [[np.cos(row[2]), np.sin(row[2])], [-np.sin(row[2]), np.cos(row[2])]]
-        expected = turned.T @ theirs[: robot.size, : robot.size] @ turned
-        np.testing.assert_allclose(slopes.T @ masses @ slopes, expected, atol=1e-9)
-
-
 def test_objects_have_the_described_joint_resistance() -> None:
     """Joint friction adds to the pulling force, and a spring pulls the drawer back."""
     plan = drawer_plan()

@@ -22,20 +22,6 @@ from vkc_pin.simulation.servos import (
 from vkc_pin.world.trajectory.world_model import World
 
 
-def test_servos_are_designed_for_their_load_inertia() -> None:
-    plan = door_plan()
-    world = World(plan.scene)
-    own = make_servos(world, world.compute_positions(plan.trajectory), Physics())
-    assert [servo.coordinate for servo in own] == list(plan.scene.robot.coordinates.names)
-    assert own[0].stiffness == pytest.approx(
-        20.0**2 * sum(i.mass for i in plan.scene.robot.model.inertias[1:]), rel=1e-6
-    )
-    assert [servo.limit for servo in own] == [np.inf] * 3 + [150.0] * 3 + [28.0] * 3
-    for servo in own[3:]:
-        assert servo.stiffness * 0.05 >= servo.limit * (1.0 - 1e-9)
-        assert servo.armature == pytest.approx(servo.limit / 1500.0)
-
-
 def test_reference_contains_positions_velocities_and_accelerations() -> None:
     motion = door_plan().trajectory
     middles = (motion.times[:-1] + motion.times[1:]) / 2.0

@@ -38,9 +38,3 @@ def test_motion_along_x_is_seen_from_its_side() -> None:
 def test_camera_avoids_opaque_obstructions(opacity: float, behind: bool) -> None:
     cupboard = (np.array([-2.0, -1.6, 0.0]), np.array([4.0, -1.0, 4.0]), opacity)
     assert bool(choose_viewpoint(MOTION, [cupboard])[1][1] < -1.6) is behind
-
-
-def test_single_point_has_a_viewpoint() -> None:
-    _, position = choose_viewpoint(np.zeros((1, 3)), [])
-    assert np.isfinite(position).all()
-    assert np.linalg.norm(position) >= 1.0

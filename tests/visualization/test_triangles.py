@@ -6,7 +6,6 @@ import pinocchio as pin
 import pytest
 import trimesh
 
-from vkc_pin.visualization.plots.top_view import compute_outline
 from vkc_pin.visualization.triangles import (
     Solid,
     make_box,
@@ -85,11 +84,3 @@ def test_tube_follows_its_line() -> None:
         "wound outwards"
     )
     assert make_tube(np.zeros((5, 3)), 0.01) is None, "nothing moves"
-
-
-def test_outline_of_points_from_above() -> None:
-    corners = compute_outline(
-        np.array([[0, 0, 1], [2, 0, 5], [2, 1, 0], [0, 1, 0], [1, 0.5, 9]], float)
-    )
-    assert {tuple(c) for c in corners} == {(0, 0), (2, 0), (2, 1), (0, 1)}
-    assert len(compute_outline(np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]))) == 2

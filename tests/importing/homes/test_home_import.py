@@ -141,7 +141,6 @@ def test_mjcf_home_is_imported(tmp_path: Path) -> None:
 
 
 def test_folder_and_file_name_are_respected(tmp_path: Path) -> None:
-    """A floor at another height, a file name with line breaks, and files of the user in the folder."""
     pytest.importorskip("mujoco")
     file, out = tmp_path / "x\nfloor: false\n#\x01.xml", tmp_path / "out"
     file.write_text(
@@ -173,7 +172,8 @@ def test_folder_and_file_name_are_respected(tmp_path: Path) -> None:
 def test_invalid_homes_and_arguments_are_refused(tmp_path: Path) -> None:
     still = tmp_path / "still.urdf"
     still.write_text(
-        '<robot name="s"><link name="a"><collision><geometry><box size="1 1 1"/></geometry></collision></link></robot>'
+        '<robot name="s"><link name="a"><collision><geometry><box size="1 1 1"/></geometry>'
+        "</collision></link></robot>"
     )
     (tmp_path / "box.sdf").write_text(SDF)
     for file, wrong, word in (

@@ -58,20 +58,21 @@ def test_visual_boxes_replace_missing_collision_geometry() -> None:
 
 
 def test_repeated_mesh_is_decomposed_once(tmp_path: Path) -> None:
-    trimesh.creation.annulus(0.3, 0.5, 0.2).export(tmp_path / "ring.stl")
+    bodies = [trimesh.creation.box((0.3, 0.3, 0.3)).apply_translation((k, 0, 0)) for k in (0, 1)]
+    trimesh.util.concatenate(bodies).export(tmp_path / "twins.stl")
     places = [
         pin.SE3(pin.rpy.rpyToMatrix(0.2, 0.3, k), np.array([float(k), 0.0, 0.5])) for k in range(2)
     ]
     parts = tuple(
-        Part(name="", placement=at, kind="mesh", size=(1.0, 1.0, 1.0), file=tmp_path / "ring.stl")
+        Part(name="", placement=at, kind="mesh", size=(1.0, 1.0, 1.0), file=tmp_path / "twins.stl")
         for at in places
     )
     known: PieceCache = {}
     found = []
     for part in parts:
-        description = Description(tmp_path / "t.urdf", {"ring": Link("ring", (), (part,))}, {})
+        description = Description(tmp_path / "t.urdf", {"twins": Link("twins", (), (part,))}, {})
         found.append(
-            decompose_links(description, load_surfaces(description), known).links["ring"].collision
+            decompose_links(description, load_surfaces(description), known).links["twins"].collision
         )
     assert len(known) == 1
     (cut,) = known.values()

@@ -29,7 +29,8 @@ def test_missing_values_of_partnet_are_none(tmp_path: Path) -> None:
 
 def test_swapped_limits_and_unsupported_joints_are_noted(tmp_path: Path) -> None:
     text = """<robot name="t"><link name="a"/><link name="b"/><link name="c"/>
-    <joint name="j" type="revolute"><parent link="a"/><child link="b"/><limit lower="1" upper="-0.5"/>
+    <joint name="j" type="revolute"><parent link="a"/><child link="b"/>
+      <limit lower="1" upper="-0.5"/>
       <mimic joint="k"/><dynamics damping="0.4" friction="-1"/></joint>
     <joint name="k" type="floating"><parent link="a"/><child link="c"/></joint></robot>"""
     (tmp_path / "t.urdf").write_text(text)
@@ -50,7 +51,8 @@ def test_swapped_limits_and_unsupported_joints_are_noted(tmp_path: Path) -> None
 def test_errors_name_file_and_element(tmp_path: Path) -> None:
     file = tmp_path / "t.urdf"
     file.write_text(
-        '<robot name="t"><link name="a"/><joint name="j" type="fixed"><parent link="a"/><child link="d"/></joint></robot>'
+        '<robot name="t"><link name="a"/><joint name="j" type="fixed">'
+        '<parent link="a"/><child link="d"/></joint></robot>'
     )
     with pytest.raises(UnknownNameError, match=r"t\.urdf"):
         read_object_urdf(file)
@@ -64,12 +66,14 @@ def test_errors_name_file_and_element(tmp_path: Path) -> None:
 
 def test_inertia_is_read(tmp_path: Path) -> None:
     placed = '<origin xyz="0.1 0.2 0.3" rpy="0 0 1.5707963267948966"/>'
-    whole = f'<inertial>{placed}<mass value="2"/><inertia ixx="0.1" iyy="0.2" izz="0.25" ixy="0.01"/></inertial>'
-    text = f"""<robot name="t"><link name="a">{whole}</link><link name="b"/>
+    moments = '<inertia ixx="0.1" iyy="0.2" izz="0.25" ixy="0.01"/>'
+    unit = '<inertia ixx="1" iyy="1" izz="1"/>'
+    impossible = '<inertia ixx="1" iyy="1" izz="1" ixy="3"/>'
+    text = f"""<robot name="t"><link name="a"><inertial>{placed}<mass value="2"/>{moments}</inertial></link><link name="b"/>
     <link name="c"><inertial><mass value="1"/></inertial></link>
-    <link name="d"><inertial><mass value="-1"/><inertia ixx="1" iyy="1" izz="1"/></inertial></link>
-    <link name="e"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="3"/></inertial></link>
-    <link name="f"><inertial><mass value="heavy"/><inertia ixx="1" iyy="1" izz="1"/></inertial></link>
+    <link name="d"><inertial><mass value="-1"/>{unit}</inertial></link>
+    <link name="e"><inertial><mass value="1"/>{impossible}</inertial></link>
+    <link name="f"><inertial><mass value="heavy"/>{unit}</inertial></link>
     """ + "".join(
         f'<joint name="{c}" type="fixed"><parent link="a"/><child link="{c}"/></joint>'
         for c in "bcdef"

@@ -110,19 +110,3 @@ def test_links_with_similar_names_keep_their_own_meshes(
         names = {shape.file.name for shape in found if shape.file is not None}
         assert len(names) == 2
         assert max(map(len, names)) < 80
-
-
-def test_text_cannot_end_a_comment_or_an_attribute(tmp_path: Path) -> None:
-    part = Part(name='a"\n\x01<b/>', placement=pin.SE3.Identity(), kind="box", size=(0.1, 0.1, 0.1))
-    write_urdf(
-        Description(tmp_path / "x", {"a": Link("a", (part,), (part,))}, {}), tmp_path / "thing.urdf"
-    )
-    about = ["Made of x\nfree: true\n#.urdf", "\x85\u2028\x00mass: 3"]
-    write_description(tmp_path / "thing.yaml", "thing.urdf", (), about=about)
-    assert yaml.safe_load((tmp_path / "thing.yaml").read_text()) == {
-        "urdf": "thing.urdf",
-        "attachments": [],
-    }
-    assert not vkc.load_object(tmp_path / "thing.yaml").free
-    (element,) = read_urdf(tmp_path / "thing.urdf").root.iter("collision")
-    assert element.get("name") == 'a"\n\ufffd<b/>'

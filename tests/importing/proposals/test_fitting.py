@@ -42,19 +42,8 @@ def test_obstruction_is_named(fitting: HandClearance) -> None:
     assert fitting.find_obstruction(below, "flap") == Obstruction("floor")
 
 
-def test_object_is_placed_at_its_joint_positions(fitting: HandClearance) -> None:
-    tool = pin.SE3(FRONT, np.array([-0.08, 0.5, 0.5]))
-    fitting.place(np.array([1.2]))
-    assert (
-        fitting.find_obstruction(pin.SE3(FRONT, np.array([-0.14, 0.5, 0.5])), "case") is None
-    )  # the flap has gone
-    hinge = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.5]))
-    turned = hinge * pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, 1.2), np.zeros(3)) * hinge.inverse()
-    assert fitting.find_obstruction(turned * tool, "flap") is None
-
-
 def test_clearance_agrees_with_coal(fitting: HandClearance) -> None:
-    """A hand at places on a line: blocked if and only if coal finds it closer than the options allow."""
+    """The hand moves on a line."""
     shapes, hand = fitting.item.collision.geometryObjects, fitting.hand
     data = fitting.item.model.createData()
     pin.forwardKinematics(fitting.item.model, data, fitting.item.coordinates.q(np.zeros(1)))
@@ -116,6 +105,11 @@ def grip(folder: Path, **what: str) -> tuple[GraspMotion, Opening, HandClearance
     return GraspMotion(fitting, front, 0.0), find_openings(fitting.item, pieces)[1], fitting
 
 
+def make_box(position: str, size: str) -> str:
+    shape = f'<geometry><box size="{size}"/></geometry>'
+    return f'<collision><origin xyz="{position}"/>{shape}</collision>'
+
+
 def test_free_bar_permits_sliding_and_turning(tmp_path: Path) -> None:
     hand, opening, fitting = grip(tmp_path)
     assert hand.follow(opening) == pytest.approx(1.5)
@@ -130,15 +124,15 @@ def test_free_bar_permits_sliding_and_turning(tmp_path: Path) -> None:
 
 
 def test_obstacles_limit_slide_and_opening(tmp_path: Path) -> None:
-    above = '<collision><origin xyz="-0.15 0.5 0.68"/><geometry><box size="0.3 0.6 0.02"/></geometry></collision>'
+    above = make_box("-0.15 0.5 0.68", "0.3 0.6 0.02")
     hand, opening, _ = grip(tmp_path, before=above)
     hand.follow(opening)
     slide = hand.freedoms()[1][0]
     assert slide.upper - slide.lower < 0.25
     assert hand.slack < 0.13
-    wall = '<collision><origin xyz="-0.5 -0.3 0.5"/><geometry><box size="0.4 0.02 1.0"/></geometry></collision>'
+    wall = make_box("-0.5 -0.3 0.5", "0.4 0.02 1.0")
     hand, opening, _ = grip(tmp_path, before=wall)
     assert 0.5 < hand.follow(opening) <= 1.5
-    shelf = '<collision><origin xyz="-0.7 0.3 0.5"/><geometry><box size="0.4 0.8 1.0"/></geometry></collision>'
+    shelf = make_box("-0.7 0.3 0.5", "0.4 0.8 1.0")
     hand, opening, _ = grip(tmp_path, before=shelf)
     assert hand.follow(opening) < 1.0

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-import pytest
 from helpers.furniture import BAR, flap
 
 import vkc_pin as vkc
@@ -29,18 +28,6 @@ def opening_of(name_or_path: str | Path) -> Opening:
     for shape in item.collision.geometryObjects:
         pieces.setdefault(shape.parentJoint, []).append(Piece.from_shape(shape))
     return find_openings(item, pieces)[1]
-
-
-def test_openings_of_hinge_and_slide(tmp_path: Path) -> None:
-    flap(tmp_path, BAR.format(""))
-    hinge = opening_of(tmp_path / "flap.yaml")
-    assert (hinge.turns, hinge.closed, hinge.opened) == (True, 0.0, 1.5)
-    assert np.allclose(hinge.axis, [0.0, 0.0, 1.0])
-    assert hinge.reach == pytest.approx(np.hypot(0.6, 0.01))
-    slide = opening_of("drawer")
-    assert not slide.turns
-    assert np.allclose(slide.axis, [-1.0, 0.0, 0.0])
-    assert slide.low[0] < -0.12
 
 
 def test_score_depends_on_leverage_side_and_name(tmp_path: Path) -> None:

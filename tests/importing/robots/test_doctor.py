@@ -83,7 +83,8 @@ def test_hand_in_front_of_its_tool_frame_is_reported(tmp_path: Path) -> None:
     ]
     text = path.read_text(encoding="utf-8").replace(
         "</robot>",
-        '<link name="back"/><joint name="back_joint" type="fixed"><origin xyz="0 0 -0.1"/><parent link="hand"/>'
+        '<link name="back"/><joint name="back_joint" type="fixed"><origin xyz="0 0 -0.1"/>'
+        '<parent link="hand"/>'
         '<child link="back"/></joint></robot>',
     )
     path.write_text(text, encoding="utf-8")

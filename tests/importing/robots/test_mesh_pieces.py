@@ -16,7 +16,8 @@ TEXT = """<robot name="r">
     <visual><geometry><mesh filename="seen.obj" scale="2 2 2"/></geometry></visual>
     <visual><geometry><mesh filename="gone.obj"/></geometry></visual>
     <collision><geometry><box size="1 1 1"/></geometry></collision>
-    <collision><origin xyz="0 0 3"/><geometry><mesh filename="angle.stl" scale="0.5 0.5 0.5"/></geometry></collision>
+    <collision><origin xyz="0 0 3"/><geometry>
+      <mesh filename="angle.stl" scale="0.5 0.5 0.5"/></geometry></collision>
     <collision><geometry><mesh filename="sheet.stl"/></geometry></collision>
   </link></robot>"""
 

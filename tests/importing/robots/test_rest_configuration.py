@@ -3,7 +3,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from helpers.arm_urdf import HEIGHT, write_arms
 
@@ -20,22 +19,6 @@ from vkc_pin.importing.robots.rest_configuration import (
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> vkc.Robot:
     return vkc.load_robot(write_arms(tmp_path_factory.mktemp("robot")))
-
-
-def test_clearances_agree_with_coal(robot: vkc.Robot) -> None:
-    look, rng = Clearances(robot), np.random.default_rng(2)
-    data, geometry = robot.model.createData(), robot.collision.createData()
-    for _ in range(4):
-        arm = rng.uniform(robot.lower[3:], robot.upper[3:])
-        look.place(arm)
-        q = robot.coordinates.q(np.concatenate([np.zeros(3), arm]))
-        pin.computeDistances(robot.model, data, robot.collision, geometry, q)
-        least = min(result.min_distance for result in geometry.distanceResults)
-        lowest = min(height for _, height in look.floor())
-        assert look.least() == pytest.approx(min(least, lowest), abs=1e-6)
-        assert look.least(0.05) == pytest.approx(min(least, lowest, 0.05), abs=1e-6)
-        close = look.links(0.05)
-        assert [distance for *_, distance in close] == sorted(distance for *_, distance in close)
 
 
 def test_first_state_with_clearance_is_home(robot: vkc.Robot) -> None:

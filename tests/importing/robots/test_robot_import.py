@@ -20,7 +20,7 @@ SAMPLES = 150
 
 @pytest.fixture(scope="module")
 def imported(tmp_path_factory: pytest.TempPathFactory) -> vkc.importing.ImportedRobot:
-    """Two arms on a base of their own, 0.35 m up, the base an open bin; imported without anything written by hand."""
+    """A robot with two arms on a mobile base, which is an open bin 0.35 m above the floor."""
     folder = tmp_path_factory.mktemp("imported")
     walls = [trimesh.creation.box((0.5, 0.4, 0.05)).apply_translation((0, 0, -0.325))]
     walls += [
@@ -83,8 +83,9 @@ def test_base_is_hollow_and_stands_on_the_floor(imported: vkc.importing.Imported
 def test_gripper_that_does_not_open_is_locked(tmp_path: Path) -> None:
     """A bar across the fingertips leaves no room between the fingers, wherever they are."""
     file = write_arms(tmp_path / "given")
-    bar = '<link name="bar"><collision><geometry><box size="0.02 0.02 0.09"/></geometry></collision></link>'
-    joint = '<joint name="bar_joint" type="fixed"><parent link="hand"/><child link="bar"/><origin xyz="0 0 0.1"/></joint>'
+    shape = '<collision><geometry><box size="0.02 0.02 0.09"/></geometry></collision>'
+    bar = f'<link name="bar">{shape}</link><joint name="bar_joint" type="fixed">'
+    joint = '<parent link="hand"/><child link="bar"/><origin xyz="0 0 0.1"/></joint>'
     file.write_text(
         file.read_text(encoding="utf-8").replace("</robot>", bar + joint + "</robot>"),
         encoding="utf-8",
@@ -124,7 +125,6 @@ def test_reachable_poses_are_planned(imported: vkc.importing.ImportedRobot, tmp_
 
 
 def test_links_that_overlap_at_zero_are_separated_at_home(tmp_path: Path) -> None:
-    """Folded at 0, so that its links are in each other there: these pairs are kept apart all the same, and home is elsewhere."""
     file = write_arms(tmp_path / "given")
     text = file.read_text(encoding="utf-8")
     for joint in ("arm_2_joint", "arm_3_joint"):
@@ -190,7 +190,7 @@ def test_invalid_robots_are_named(tmp_path: Path, text: str, said: str) -> None:
 
 
 def test_telescope_is_proposed_as_one_coordinate(tmp_path: Path) -> None:
-    """Where the file does not say so, with what to do if it is none; where it does, nothing is proposed."""
+    """Nothing is proposed if the file states it."""
     for mimics, told in (("", True), ("chain", False)):
         file = (
             write_telescope(tmp_path / f"given{mimics}", couplings="", mimics=mimics).parent

@@ -55,7 +55,8 @@ TEXT = """<?xml version="1.0"?>
 PART = """<?xml version="1.0"?>
 <robot xmlns:xacro="http://www.ros.org/wiki/xacro">
   <xacro:macro name="stick" params="name length">
-    <link name="${name}"><collision><geometry><box size="${2*length} 0.1 0.1"/></geometry></collision></link>
+    <link name="${name}"><collision><geometry>
+      <box size="${2*length} 0.1 0.1"/></geometry></collision></link>
   </xacro:macro>
 </robot>
 """

@@ -67,9 +67,10 @@ def test_errors_name_file_and_element(tmp_path: Path) -> None:
 def test_inertia_is_read(tmp_path: Path) -> None:
     placed = '<origin xyz="0.1 0.2 0.3" rpy="0 0 1.5707963267948966"/>'
     moments = '<inertia ixx="0.1" iyy="0.2" izz="0.25" ixy="0.01"/>'
+    whole = f'<inertial>{placed}<mass value="2"/>{moments}</inertial>'
     unit = '<inertia ixx="1" iyy="1" izz="1"/>'
     impossible = '<inertia ixx="1" iyy="1" izz="1" ixy="3"/>'
-    text = f"""<robot name="t"><link name="a"><inertial>{placed}<mass value="2"/>{moments}</inertial></link><link name="b"/>
+    text = f"""<robot name="t"><link name="a">{whole}</link><link name="b"/>
     <link name="c"><inertial><mass value="1"/></inertial></link>
     <link name="d"><inertial><mass value="-1"/>{unit}</inertial></link>
     <link name="e"><inertial><mass value="1"/>{impossible}</inertial></link>

@@ -60,14 +60,6 @@ def measure_goal_errors(
 
     Each step is measured when the plan completes it for the first time, in order; the last step is
     measured at the end.
-
-    Args:
-        scene: Scene of the plan.
-        steps: Steps of the task.
-        trajectory: The plan.
-        world: Tree of the executed scene.
-        times: Sampling times of the execution, shape (K,) [s].
-        rows: Executed world coordinates, shape (K, n).
     """
     planned = World(scene)
     edges = [0, *(phase.last for phase in trajectory.phases)]

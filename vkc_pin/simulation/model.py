@@ -118,17 +118,7 @@ class Builder:
         add_bodies: Callable[[Builder], None] | None = None,
         add_extras: Callable[[Builder], None] | None = None,
     ) -> PhysicalWorld:
-        """Build the model.
-
-        Args:
-            pairs: Shapes that may touch.
-            servos: Servos of the driven coordinates.
-            holds: All holds that are ever welded. Each gets an inactive weld, in this order.
-            latches: Coordinates and the values at which they latch. Each gets an inactive equality
-                after the welds.
-            add_bodies: Called before the shapes are added, to add bodies.
-            add_extras: Called last, to add lights or actuators, for example.
-        """
+        """Build the model."""
         mj, spec, option = self.mj, self.spec, self.spec.option
         option.timestep = self.physics.timestep
         option.integrator = mj.mjtIntegrator.mjINT_IMPLICITFAST

@@ -72,12 +72,6 @@ def write_page(
 ) -> Path:
     """Write a self-contained web page with the executed motion and the plan as a ghost.
 
-    Args:
-        executed: The executed motion.
-        path: Output file, written atomically.
-        headline: Headline of the page.
-        notes: Texts with the times [s] at which they appear.
-
     Returns:
         The path.
     """

@@ -58,15 +58,7 @@ class Tracking:
     def from_samples(
         cls, times: Floats, errors: Floats, efforts: Floats, servos: Sequence[Servo], size: int
     ) -> Tracking:
-        """Compute the tracking errors from samples.
-
-        Args:
-            times: Sampling times [s].
-            errors: Errors, shape (K, servos).
-            efforts: Forces, shape (K, servos).
-            servos: The servos.
-            size: Number of robot coordinates; those after it are fingers.
-        """
+        """Compute the tracking errors from samples."""
 
         def compute_max_and_rms(values: Floats) -> tuple[float, float]:
             return float(np.abs(values).max(initial=0.0)), float(

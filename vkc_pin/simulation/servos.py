@@ -154,10 +154,6 @@ def sample_reference(trajectory: Trajectory, times: Floats) -> tuple[Floats, Flo
     """Return positions, velocities and accelerations of the robot, shape (K, robot's) each.
 
     Without a curve, velocities are discontinuous and accelerations are zero.
-
-    Args:
-        trajectory: The plan.
-        times: Sampling times, shape (K,) [s].
     """
     robot = slice(0, trajectory.robot_size)
     if trajectory.curve is not None:

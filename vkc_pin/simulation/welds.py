@@ -72,15 +72,6 @@ def _is_push(scene: Scene, hold: Hold) -> bool:
 class Grips:
     """Activates and releases welds according to a schedule.
 
-    Args:
-        physical: The model, whose first equalities are the welds of `holds`.
-        holds: Holds in the order of their welds.
-        schedule: Holds with begin and end; see `find_hold_spans`.
-        pairs: Shapes that may touch.
-        trajectory: The plan, which gives the degrees of freedom of a grasp when it begins.
-        physics: Settings with the strength of grasps.
-        touching: Holds whose holder and link collide even while held.
-
     Attributes:
         grips: Grips so far.
     """
@@ -213,14 +204,7 @@ def find_latches(scene: Scene) -> list[tuple[str, float, str, float]]:
 
 
 class Latches:
-    """Latches that engage at their joint's latched position and are released by another joint.
-
-    Args:
-        physical: The model.
-        latches: Latches as returned by `find_latches`.
-        first: Index of the first latch's equality.
-        physics: Settings with the play of latches.
-    """
+    """Latches that engage at their joint's latched position and are released by another joint."""
 
     def __init__(
         self,

@@ -254,14 +254,7 @@ class Recorder:
 
 
 def render_page(recorder: Recorder, *, title: str, film: dict[str, Any]) -> str:
-    """Render a web page with meshcat's viewer, a drawing's commands and playback controls.
-
-    Args:
-        recorder: Commands of the drawing.
-        title: Title of the page.
-        film: Content of the controls: "duration" [s], "phases" ("name", "last" [s]), "notes"
-            ("text", "time" [s]), "headline".
-    """
+    """Render a web page with meshcat's viewer, a drawing's commands and playback controls."""
     import meshcat
     import umsgpack  # type: ignore[import-untyped]
 

@@ -85,15 +85,6 @@ def write_object(
     """Write an object, and return its entry in the scene.
 
     Attachments of a free object are proposed as if it slid upwards from its place.
-
-    Args:
-        item: The object.
-        robot: Robot whose hand the attachments are for.
-        folder: Folder of the scene.
-        cache: Cache of pieces of mesh files; new ones are added.
-        stem: Name of the object's folder and files, without extension.
-        most: Largest number of attachments of one joint.
-        clearances: Clearances as in `propose_attachments`.
     """
     description = merge_fixed_links(item.description)
     if item.free:

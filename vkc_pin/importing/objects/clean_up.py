@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -123,11 +123,8 @@ def merge_fixed_links(description: Description) -> Description:
     Joints that move no shape are left out with their links, and noted. Joints with a single value
     become fixed.
     """
-    links, joints, notes = (
-        dict(description.links),
-        dict(description.joints),
-        list(description.notes),
-    )
+    links, joints = dict(description.links), dict(description.joints)
+    notes = list(description.notes)
     for child in list(joints):
         below = description.subtree(child)
         if not any(links[name].solid for name in below if name in links):
@@ -152,17 +149,14 @@ def merge_fixed_links(description: Description) -> Description:
             notes.append(f"joint '{joint.name}' has a single value: fixed")
         if joint.kind == "fixed" or is_single_valued:
             parent, removed = links[joint.parent], links.pop(child)
-            transformed = (
+            visual, collision = (
                 _transform_parts(removed, parts, joint.placement)
                 for parts in (removed.visual, removed.collision)
             )
-            visual, collision = transformed
             # If only one of them has collision shapes, the other collides with its visual ones.
             if bool(parent.collision) != bool(removed.collision):
-                parent, collision = (
-                    dataclasses.replace(parent, collision=parent.solid),
-                    collision or visual,
-                )
+                parent = dataclasses.replace(parent, collision=parent.solid)
+                collision = collision or visual
             inertia = parent.inertia + joint.placement.act(removed.inertia)
             links[joint.parent] = Link(
                 parent.name, (*parent.visual, *visual), (*parent.collision, *collision), inertia
@@ -200,12 +194,7 @@ def compute_bounds(
 ) -> tuple[Floats, Floats]:
     """Return the bounding box of the collision geometry in the root's frame [m]."""
     placements = description.compute_placements(values)
-    points = [
-        np.asarray(meshes[id(part)].vertices) @ placements[name].rotation.T
-        + placements[name].translation
-        for name, link in description.links.items()
-        for part in link.solid
-    ]
+    points = _place_vertices(description, meshes, placements, description.links)
     if not points:
         raise InputError(
             "the file has no shapes",
@@ -214,6 +203,21 @@ def compute_bounds(
         )
     vertices = np.vstack(points)
     return vertices.min(axis=0), vertices.max(axis=0)
+
+
+def _place_vertices(
+    description: Description,
+    meshes: Surfaces,
+    placements: Mapping[str, pin.SE3],
+    links: Iterable[str],
+) -> list[Floats]:
+    """Return the vertices of the links' parts in the root's frame, shape (n, 3) [m] each."""
+    return [
+        np.asarray(meshes[id(part)].vertices) @ placements[name].rotation.T
+        + placements[name].translation
+        for name in links
+        for part in description.links[name].solid
+    ]
 
 
 def find_closed_positions(description: Description) -> dict[str, float]:
@@ -292,23 +296,11 @@ def add_missing_limits(description: Description, meshes: Surfaces) -> Descriptio
         if joint.kind not in ("revolute", "prismatic") or joint.limits is not None:
             continue
         below = description.subtree(child)
-        points = np.vstack(
-            [
-                np.asarray(meshes[id(part)].vertices) @ placements[name].rotation.T
-                + placements[name].translation
-                for name in below
-                for part in description.links[name].solid
-            ]
-        )
-        centre, axis = (
-            (points.min(axis=0) + points.max(axis=0)) / 2.0,
-            placements[child].rotation @ joint.axis,
-        )
-        direction = (
-            axis
-            if joint.kind == "prismatic"
-            else np.cross(axis, centre - placements[child].translation)
-        )
+        points = np.vstack(_place_vertices(description, meshes, placements, below))
+        centre = (points.min(axis=0) + points.max(axis=0)) / 2.0
+        direction = axis = placements[child].rotation @ joint.axis
+        if joint.kind == "revolute":
+            direction = np.cross(axis, centre - placements[child].translation)
         sign = 1.0 if direction @ (centre - (low + high) / 2.0) >= 0.0 else -1.0
         travel = _OPEN if joint.kind == "revolute" else _PULLED * float(np.ptp(points @ axis))
         limits = (0.0, travel) if sign > 0.0 else (-travel, 0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -149,11 +150,8 @@ class _Reader:
     def _read_joint(
         self, child: str, joint: ElementTree.Element, frames: dict[str, pin.SE3]
     ) -> Joint:
-        name, kind, parent = (
-            joint.get("name", ""),
-            joint.get("type", ""),
-            self._read_text(joint, "parent"),
-        )
+        name, kind = joint.get("name", ""), joint.get("type", "")
+        parent = self._read_text(joint, "parent")
         axis, limits, velocity = np.array([0.0, 0.0, 1.0]), None, None
         resistance = dict.fromkeys(("damping", "friction"), 0.0)
         if kind not in ("fixed", "revolute", "continuous", "prismatic"):
@@ -162,18 +160,14 @@ class _Reader:
         element = joint.find("axis")
         if element is not None and kind != "fixed":
             axis = np.array(self._read_numbers(element, "xyz", 3, "0 0 1", name))
-            axis_element, uses_model_frame = (
-                element.find("xyz"),
-                self.version < 7
-                and (element.findtext("use_parent_model_frame") or "").strip() in ("1", "true"),
-            )
-            expressed = (
-                "__model__"
-                if uses_model_frame
-                else axis_element.get("expressed_in", name)
-                if axis_element is not None
-                else name
-            )
+            xyz, expressed = element.find("xyz"), name
+            if self.version < 7 and self._read_text(element, "use_parent_model_frame") in (
+                "1",
+                "true",
+            ):
+                expressed = "__model__"
+            elif xyz is not None:
+                expressed = xyz.get("expressed_in", name)
             axis = frames[child].rotation.T @ self.pose(expressed).rotation @ axis
             axis /= np.linalg.norm(axis)
             if (limit := element.find("limit")) is not None:
@@ -181,11 +175,8 @@ class _Reader:
                     self._read_numbers(limit, key, 1, default, name)[0]
                     for key, default in (("lower", "-1e16"), ("upper", "1e16"))
                 )
-                limits = (
-                    (min(low, high), max(low, high))
-                    if max(abs(low), abs(high)) < _NO_LIMIT
-                    else None
-                )
+                if max(abs(low), abs(high)) < _NO_LIMIT:
+                    limits = min(low, high), max(low, high)
                 velocity = self._read_numbers(limit, "velocity", 1, "-1", name)[0]
             if (dynamics := element.find("dynamics")) is not None:
                 resistance = {
@@ -214,35 +205,24 @@ class _Reader:
             placement = frame.inverse() * self._read_pose(element, link)
             colour = self._read_colour(element, name)
             if shape is not None and shape.tag == "mesh":
-                file, scale = (
-                    self._find_mesh(shape, name),
-                    self._read_numbers(shape, "scale", 3, "1 1 1", name),
-                )
-                parts.append(
-                    Part(
-                        name=name,
-                        placement=placement,
-                        kind="mesh",
-                        size=scale,
-                        file=file,
-                        colour=colour,
-                    )
-                )
+                file = self._find_mesh(shape, name)
+                size = self._read_numbers(shape, "scale", 3, "1 1 1", name)
             elif shape is not None and shape.tag in ("box", "sphere", "cylinder", "capsule"):
                 keys = {"box": (("size", 3),), "sphere": (("radius", 1),)}.get(
                     shape.tag, (("radius", 1), ("length", 1))
                 )
+                file = None
                 size = tuple(
                     value
                     for key, count in keys
                     for value in self._read_numbers(shape, key, count, None, name)
                 )
-                parts.append(
-                    Part(name=name, placement=placement, kind=shape.tag, size=size, colour=colour)
-                )
             else:
                 content = "empty" if shape is None else shape.tag
                 self.notes.append(f"{kind} '{name}' of link '{link}' is {content}: left out")
+                continue
+            settings: dict[str, Any] = {"size": size, "file": file, "colour": colour}
+            parts.append(Part(name=name, placement=placement, kind=shape.tag, **settings))
         return tuple(parts)
 
     def _read_inertia(self, link: str, frame: pin.SE3) -> pin.Inertia:

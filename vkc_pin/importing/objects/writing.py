@@ -62,15 +62,7 @@ def write_description(
     about: Sequence[str],
     free: bool = False,
 ) -> None:
-    """Write the description of an object.
-
-    Args:
-        file: Output YAML file.
-        urdf: The object's URDF, relative to the folder of `file`.
-        attachments: Attachments as plain data, best first.
-        about: Lines of comments at the top.
-        free: Whether the object can be carried.
-    """
+    """Write the description of an object."""
     head = "".join(map(format_comment, about))
     data = {
         "urdf": urdf,
@@ -128,13 +120,10 @@ def _format_shape(
     lines = [f"    <{kind}{f' name={quote(name)}' if name else ''}>"]
     if part is not None and mesh_file is None:
         lines.append(f"      {_format_origin(part.placement)}")
-        keys = {
-            "box": f'size="{_format_numbers(part.size)}"',
-            "sphere": f'radius="{_format_numbers(part.size)}"',
-        }
-        size = (
-            keys.get(part.kind)
-            or f'radius="{_format_numbers(part.size[:1])}" length="{_format_numbers(part.size[1:])}"'
+        names = ("size",) if part.kind == "box" else ("radius", "length")
+        values = (part.size,) if part.kind == "box" else zip(part.size)
+        size = " ".join(
+            f'{name}="{_format_numbers(value)}"' for name, value in zip(names, values, strict=False)
         )
         lines.append(f"      <geometry><{part.kind} {size}/></geometry>")
     else:

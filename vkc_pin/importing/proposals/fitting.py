@@ -34,14 +34,7 @@ class Obstruction:
 
 
 class HandClearance:
-    """Clearance between a hand and an object at some joint positions.
-
-    Args:
-        item: The object.
-        hand: The hand.
-        dist_safe: Clearance between hand and object [m].
-        grasp_clearance: Clearance between the touch links and the grasped link [m].
-    """
+    """Clearance between a hand and an object at some joint positions."""
 
     def __init__(
         self, item: ArticulatedObject, hand: Hand, dist_safe: float, grasp_clearance: float
@@ -82,13 +75,7 @@ class HandClearance:
     def find_obstruction(
         self, tool: pin.SE3, link: str, *, extra_clearance: float = 0.0
     ) -> Obstruction | None:
-        """Return what obstructs a hand at `tool`, in the object's base frame; None if nothing does.
-
-        Args:
-            tool: Placement of the tool frame.
-            link: The grasped link.
-            extra_clearance: Clearance in excess of the required one from other links [m].
-        """
+        """Return what obstructs a hand at `tool`, in the object's base frame; None if nothing does."""
         is_held = self.links == link
         for (shape, where), box, touches in zip(
             self._hand, self._hand_boxes, self._touch, strict=True
@@ -125,13 +112,7 @@ _BAR = np.array([0.0, 1.0, 0.0])  # direction of the bar in the tool frame
 
 
 class GraspMotion:
-    """Motion of a hand that grasps an object.
-
-    Args:
-        fitting: Clearance of the hand, with the object's joints at their positions when grasped.
-        grasp: The grasp.
-        standoff: Distance of the tool from the grasp's centre [m].
-    """
+    """Motion of a hand that grasps an object."""
 
     def __init__(self, clearance: HandClearance, grasp: Candidate, standoff: float) -> None:
         self._clearance, self._grasp = clearance, grasp

@@ -138,10 +138,6 @@ def find_own_base(root: Body, solid: Set[str]) -> tuple[str, ...]:
 
     These are at least two joints in sequence from the root whose parent links have no shapes, and
     that are prismatic or rotate about the vertical.
-
-    Args:
-        root: Root of the tree of bodies.
-        solid: Links that have shapes.
     """
     joints, body = [], root
     while len(body.children) == 1 and not solid & set(body.links):
@@ -185,12 +181,6 @@ def find_arms(
     A hand is a body below at least three joints with fingers: at least two of at most seven joints
     each, or one that is named as a jaw. Chains without a hand are arms if they have four joints and
     are not named as legs, heads or wheels.
-
-    Args:
-        file: The robot.
-        root: Root of the tree of bodies.
-        groups: Groups of an SRDF, which name arms.
-        solid: Links that have shapes.
     """
     base = find_own_base(root, solid)
     everything, arms = root.subtree(), []
@@ -243,15 +233,7 @@ def find_arms(
 def choose_arm(
     arms: Sequence[Arm], name: str | None, file: UrdfFile, groups: Mapping[str, Sequence[str]]
 ) -> Arm:
-    """Choose the arm with a name, of an SRDF group, whose name contains it, or the best one.
-
-    Args:
-        arms: Arms, best first.
-        name: Name of an arm or part of it, or of a group with the arm's last joints; None for the
-            best arm.
-        file: The robot.
-        groups: Groups of an SRDF.
-    """
+    """Choose the arm with a name, of an SRDF group, whose name contains it, or the best one."""
     if not arms:
         expected = (
             "at least four joints in a chain, or a hand after three; or the name of a tool_frame"

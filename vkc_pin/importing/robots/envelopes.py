@@ -24,10 +24,6 @@ def find_envelopes(robot: Robot) -> dict[str, float]:
     Such links are fixed to the tool frame, have no visual shape although other links of the hand
     have one, and enclose most of the hand. They are safety boxes for programs that do not know the
     fingers.
-
-    Args:
-        robot: The robot. Its hand consists of its `touch_links`, or else of all links fixed to its
-            tool frame.
     """
     joint = robot.model.frames[robot.model.getFrameId(robot.tool_frame)].parentJoint
     visible = {shape.link for shape in robot.file.read_shapes("visual")}

@@ -46,11 +46,7 @@ class Home:
 
 
 class Clearances:
-    """Distances between the links of a robot, and of the arm's links to the floor.
-
-    Args:
-        robot: The robot, with its collision pairs.
-    """
+    """Distances between the links of a robot, and of the arm's links to the floor."""
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
@@ -128,11 +124,6 @@ def find_home(robot: Robot, named: Iterable[tuple[str, Floats]], *, seed: int = 
     It is the first of the `named` configurations with sufficient clearance, else the best random
     one: with clearance first, then near the centre of the joints' ranges, and with the hand above
     the base rather than far from it.
-
-    Args:
-        robot: The robot, with its collision pairs.
-        named: Descriptions and configurations to try first, shape (n − 3,) each.
-        seed: Random seed.
     """
     clearances = Clearances(robot)
     best = None

@@ -53,15 +53,7 @@ def read_source(
     arguments: Mapping[str, str],
     srdf: Path | None = None,
 ) -> Source:
-    """Read a URDF, xacro or MJCF file, whose first element tells its format.
-
-    Args:
-        file: The file.
-        scratch: Folder for meshes of MJCF files.
-        packages: Maps package names to folders, for `package://` and `$(find NAME)`.
-        arguments: Arguments of a xacro file.
-        srdf: The SRDF; defaults to the one beside the file or in `../srdf`.
-    """
+    """Read a URDF, xacro or MJCF file, whose first element tells its format."""
     text = read_text(file, "robot")
     root = parse_xml(text, file)
     notes: list[str] = []
@@ -143,14 +135,7 @@ def _find_srdf(file: Path) -> Path | None:
 
 
 def expand_xacro(file: Path, packages: Mapping[str, Path], arguments: Mapping[str, str]) -> str:
-    """Return the URDF of a xacro file.
-
-    Args:
-        file: The file.
-        packages: Maps package names to folders, for `$(find NAME)`; others are searched for in the
-            folders around the file.
-        arguments: Values of `<xacro:arg>` elements, instead of their defaults.
-    """
+    """Return the URDF of a xacro file."""
     xacro = import_optional("xacro", "import", purpose="a xacro file", file=file)
     substitution = import_optional(
         "xacro.substitution_args", "import", purpose="a xacro file", file=file

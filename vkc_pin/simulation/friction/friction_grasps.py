@@ -67,16 +67,7 @@ class _Squeeze:
 
 
 class Squeezes:
-    """Grasps by friction that follow a schedule.
-
-    Args:
-        physical: The model.
-        fingers: Fingers of the robot's own hand.
-        spans: Schedule of holds, all by the robot's own hand.
-        trajectory: The trajectory.
-        physics: Settings with the time that fingers take.
-        period: Sampling period [s].
-    """
+    """Grasps by friction that follow a schedule."""
 
     def __init__(
         self,

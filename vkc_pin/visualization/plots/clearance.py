@@ -50,11 +50,6 @@ def compute_clearance_curves(
 
     The kinds are: robot and itself, robot and objects, robot and obstacles, objects and their
     surroundings, and gripper and grasped objects, which may touch.
-
-    Args:
-        scene: Scene of the motion.
-        trajectory: Motion.
-        times: Evaluation times, shape (K,) [s].
     """
     world = World(scene)
     solids = CollisionShapes(world)

@@ -1,11 +1,11 @@
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import io
 import json
 import os
 import platform
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -41,33 +41,17 @@ class Run:
 
 @pytest.fixture(scope="module")
 def planned(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """The plan of the demo, with all outputs, in folders that do not exist yet."""
+    """A plan of the door with outputs in folders that do not exist yet."""
     folder = tmp_path_factory.mktemp("cli") / "new" / "out"
     files = [
         part
         for kind in ("html", "save", "json", "plots")
         for part in (f"--{kind}", str(folder / NAMES[kind]))
     ]
-    command = [
-        sys.executable,
-        "-m",
-        "vkc_pin.cli",
-        "plan",
-        "door",
-        "--set",
-        "door.hinge=1.2",
-        *files,
-    ]
-    path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
-    done = subprocess.run(
-        command,
-        cwd=folder.parent.parent,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        env={**os.environ, "PYTHONPATH": path},
-    )
-    return Run(done.returncode, done.stdout, done.stderr, folder)
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = cli.main(["plan", "door", "--set", "door.hinge=1.2", *files])
+    return Run(code, out.getvalue(), err.getvalue(), folder)
 
 
 NAMES = {"html": "door.html", "save": "door.npz", "json": "door.json", "plots": "plots"}

@@ -101,6 +101,14 @@ def test_hand_opens_at_the_end_only_on_request(
         assert motion.phases[-1].last - motion.phases[-1].first == 1
 
 
+def test_robot_waits_only_for_the_gripper() -> None:
+    """It does not pause between turning the knob and moving the door."""
+    steps: list[Step] = [Actuate("door", {"hinge": 1.2}), GoTo(0.0, 0.0)]
+    problem = program_of(door_scene(), steps, options=SHORT)
+    grasp, _, release, _ = problem.ends.tolist()
+    assert pauses(problem, make_random(problem)[1]) == [grasp + 1, release + 2]
+
+
 def test_object_grasped_at_the_start_is_released_first() -> None:
     """A door grasped at the start is attached in no phase; its grasp keeps its value."""
     for attachment in ("handle", "handle_free"):

@@ -54,7 +54,7 @@ _meshes: weakref.WeakKeyDictionary[Robot, list[Solid]] = weakref.WeakKeyDictiona
 
 @dataclass(frozen=True, eq=False)
 class Item:
-    """A drawn shape: path in the viewer's tree, joint, placement in its frame, mesh, colour, label."""
+    """A drawn shape: path in the viewer, joint, placement in its frame, mesh, colour, label."""
 
     path: str
     joint: int
@@ -142,7 +142,7 @@ class Drawing:
         self.viewer.window.send(SetAnimation(self._make_animation(), play=play, repetitions=1))
 
     def find_viewpoint(self) -> tuple[Floats, Floats]:
-        """Choose target and position of the camera so that motion and objects are in the picture."""
+        """Choose target and position of the camera so that motion and objects are visible."""
         motion, high = self.motion, np.array([0.0, 0.0, 1.0])
         around = np.array([[x, y, 0.0] for x in (-0.6, 0.6) for y in (-0.6, 0.6)])
         points = [

@@ -89,7 +89,7 @@ class Room:
         return parts
 
     def make_lines(self) -> list[tuple[str, Floats, float]]:
-        """Return name, segments, shape (2·k, 3) [m], and brightness of floor grid and wall edges."""
+        """Return name, segments, shape (2·k, 3) [m], and brightness of grid and wall edges."""
         drawn = []
         if self.scene.floor:
             x_min, x_max, y_min, y_max = self.scene.arena
@@ -108,7 +108,7 @@ class Room:
         return drawn
 
     def find_obstructions(self) -> list[tuple[Floats, Floats, float]]:
-        """Return the boxes of obstacles: lower and upper corner, shape (3,) each [m], and opacity."""
+        """Return boxes of obstacles: lower and upper corner, shape (3,) each [m], and opacity."""
         opacities = [
             *((wall, 0.6 if self._is_divider(wall) else 0.0) for wall in self._walls),
             *((one, 1.0) for one in self._furniture),
@@ -119,7 +119,7 @@ class Room:
         ]
 
     def _find_inside(self, shape: pin.GeometryObject) -> tuple[int, float]:
-        """Return a wall's thin axis in its own frame, and the sign of its side facing the centre."""
+        """Return a wall's thin axis in its frame, and the sign of its side facing the centre."""
         axis = int(np.argmin(np.asarray(shape.geometry.halfSide)[:2]))
         towards = shape.placement.actInv(self.centre)[axis]
         return axis, 1.0 if towards > 0.0 else -1.0
@@ -152,7 +152,7 @@ class Room:
 
 
 def load_drawn_parts(shape: pin.GeometryObject) -> list[tuple[Solid, tuple[float, ...]]]:
-    """Load meshes, in the shape's frame, and colours of a shape, from its mesh file if available."""
+    """Load meshes, in the shape's frame, and colours of a shape, from its file if available."""
     colour = tuple(float(c) for c in shape.meshColor)
     if shape.meshPath and Path(shape.meshPath).is_file():
         parts = load_parts(shape.meshPath, np.asarray(shape.meshScale).ravel(), detail=_DETAIL)

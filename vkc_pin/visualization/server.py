@@ -41,7 +41,7 @@ class LoopbackBridge(ZMQWebSocketBridge):
         return app
 
     def forward_to_websockets(self, frames):  # type: ignore[no-untyped-def]
-        """Send a command to all open pages; closed ones are skipped, so that the sender gets an answer."""
+        """Send a command to all open pages; skip closed ones, so that the sender gets an answer."""
         for page in tuple(self.websocket_pool):
             with contextlib.suppress(tornado.websocket.WebSocketClosedError):
                 page.write_message(frames[2], binary=True)

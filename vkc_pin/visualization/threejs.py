@@ -114,7 +114,7 @@ class Sun(g.Object):
 
 
 class Unshadow:
-    """A command that disables the shadow at `path`; meshcat's SetProperty lowers the case of names."""
+    """A command that disables the shadow at `path`; meshcat's SetProperty lowers names."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

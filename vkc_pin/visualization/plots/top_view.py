@@ -145,7 +145,7 @@ def _choose_times(trajectory: Trajectory) -> Floats:
 
 
 def _place_vertices(world: World, index: int, joint: Floats, cache: dict[int, Floats]) -> Floats:
-    """Return a shape's vertices, shape (n, 3) [m], for joint placement (4, 4); `cache` holds triangulations."""
+    """Return a shape's vertices, (n, 3) [m], for joint placement (4, 4); cache triangulations."""
     shape = world.shapes[index]
     if index not in cache:
         cache[index] = triangulate(shape.geometry)[0]

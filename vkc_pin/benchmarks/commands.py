@@ -42,9 +42,9 @@ def add_bench(commands: Any) -> None:
 def _add_door(benches: Any) -> None:
     door = benches.add_parser("door", help="reach, push and whole task at the door")
     _add_count(door, "--trials", 50, "random starts")
-    _add_seed(door, "of starts and planning")
+    _add_seed_option(door)
     door.add_argument("--json", metavar="FILE", help="write every trial")
-    door.add_argument("--quiet", action="store_true", help="no progress bar")
+    door.add_argument("--quiet", action="store_true", help="hide the progress bar")
     door.set_defaults(run=_bench_door)
 
 
@@ -61,7 +61,7 @@ def _add_comparisons(benches: Any) -> None:
         "household": (20, "in a home", "cup door drawer dishwasher refrigerator cabinet"),
     }
     for name, (trials, where, names) in tasks.items():
-        about = f"compare planning base and arm together and apart, {where}"
+        about = f"compare simultaneous with separate planning of base and arm, {where}"
         parser = _add_experiment(benches, name, about, jobs=os.cpu_count() or 1)
         _add_count(parser, "--trials", trials, "random starts per task")
         _add_choice(parser, "tasks", f"{names} (default: all)")
@@ -71,7 +71,7 @@ def _add_comparisons(benches: Any) -> None:
             "--max-evaluations",
             type=parse_positive,
             metavar="E",
-            help="of a trial (default 1000000)",
+            help="evaluation budget per trial (default 1000000)",
         )
         if name == "household":
             about = "paper: the tasks of cup and dishwasher with the numbers of the paper's code"
@@ -84,7 +84,7 @@ def _add_comparisons(benches: Any) -> None:
     _add_count(parser, "--trials", 20, "problems per task")
     _add_choice(parser, "tasks", "reach door drawer (default: all)")
     _add_choice(parser, "methods", "trajopt OMPL roboplan B1 B2 VKC (default: all)")
-    about = "wall-time limit of a trial (default 60)"
+    about = "wall-clock limit of a trial (default 60)"
     parser.add_argument("--time-limit", type=float, default=60.0, metavar="SECONDS", help=about)
 
 
@@ -92,17 +92,18 @@ def _add_scenes(benches: Any) -> None:
     about = "plan chores of many steps, each in one call"
     parser = _add_experiment(benches, "chores", about)
     _add_count(parser, "--trials", 5, "random starts per chore")
-    _add_count(parser, "--seeds", 1, "seeds of planning per start", metavar="K")
+    _add_count(parser, "--seeds", 1, "random seeds of planning per start", metavar="K")
     _add_choice(parser, "chores", "home fetch cluttered (default: all)")
-    about = "plan the steps one by one as well"
+    about = "also plan the steps one by one"
     parser.add_argument("--step-by-step", action="store_true", help=about)
 
     about = "measure planning time against the number of obstacles or segments"
     parser = _add_experiment(benches, "scale", about)
     _add_count(parser, "--starts", 50, "random starts per scene")
     of = ("obstacles", "segments")
-    parser.add_argument("--of", choices=of, default=of[0], help=f"(default: {of[0]})")
-    about = "numbers (default: 10 30 100 300 1000 obstacles, 20 40 80 160 320 segments)"
+    about = f"varied quantity (default: {of[0]})"
+    parser.add_argument("--of", choices=of, default=of[0], help=about)
+    about = "numbers of them (default: 10 30 100 300 1000 obstacles, 20 40 80 160 320 segments)"
     parser.add_argument("--counts", nargs="+", type=parse_positive, metavar="N", help=about)
 
     about = "open a door and a drawer with every kind of base"
@@ -122,14 +123,14 @@ def _add_scenes(benches: Any) -> None:
     about = "weld (default), or friction"
     parser.add_argument("--grasp", default="weld", metavar="HOW", help=about)
 
-    about = "measure validated episodes an hour of each dataset task"
+    about = "measure validated episodes per hour of each dataset task"
     parser = _add_experiment(
         benches, "throughput", about, module="datasets.throughput", seeded=False
     )
     _add_count(parser, "--episodes", 200, "episodes per task")
     about = "robots, objects and rooms (default: home)"
     parser.add_argument("--recipe", metavar="RECIPE", help=about)
-    about = "do not generate the same episodes with one and two workers as well"
+    about = "do not repeat the episodes with one and two workers"
     parser.add_argument("--no-curve", dest="curve", action="store_false", help=about)
 
 
@@ -138,12 +139,12 @@ def _add_matrix(benches: Any) -> None:
     parser = _add_experiment(benches, "anything", about, module="robot_object_matrix.run")
     _add_count(parser, "--starts", 5, "random starts per combination")
     _add_choice(
-        parser, "robots", "names and files for `load_robot`, name=path, and the word default (ten)"
+        parser, "robots", "names and files for `load_robot`, name=path, and default (ten robots)"
     )
     objects = "<kind>_<seed> of random_object, names in scenes/objects, paths, name=path#link"
-    _add_choice(parser, "objects", f"{objects}, and the word default (29 of ten)")
+    _add_choice(parser, "objects", f"{objects}, and default (29 objects of ten kinds)")
 
-    about = "import robots from their makers' files and reach random poses"
+    about = "import robots from their manufacturers' files and reach random poses"
     parser = _add_experiment(benches, "robots", about, module="robot_object_matrix.robots")
     _add_count(parser, "--goals", 20, "poses per robot")
     robots = "names of example-robot-data, and paths of URDF, xacro and MJCF files"
@@ -154,7 +155,7 @@ def _add_problems(benches: Any) -> None:
     ablation = _add_experiment(
         benches, "ablation", "change one setting at a time", module="problems.ablation"
     )
-    about = "changed settings: Options.FIELD=VALUE or MODULE:NAME=VALUE"
+    about = "settings to change, one at a time: Options.FIELD=VALUE or MODULE:NAME=VALUE"
     about += ", e.g. solver.loop:PROGRESS=0.6"
     ablation.add_argument("--changes", nargs="+", metavar="CHANGE", help=about)
     tasks = "door drawer init_1 init_2 init_3 corridor_door ..."
@@ -174,13 +175,13 @@ def _add_problems(benches: Any) -> None:
     _add_count(parser, "--trials", 10, "random starts per task")
     _add_choice(parser, "tasks", f"{tasks} (default: all)")
 
-    about = "plan random problems and keep the plans"
+    about = "plan random problems and save the plans"
     parser = _add_experiment(benches, "random", about, module="problems.random_problems")
     _add_count(parser, "--problems", 100, "problems")
     about = "anything (default): random steps, feasible or not; rooms: one task in each random room"
     parser.add_argument("--of", choices=("anything", "rooms"), default="anything", help=about)
 
-    about = "plan impossible problems of known cause"
+    about = "plan impossible problems with known reasons"
     parser = _add_experiment(benches, "impossible", about, module="problems.impossible")
     _add_count(parser, "--problems", 50, "problems")
 
@@ -194,17 +195,17 @@ def _add_experiment(
     jobs: int = 1,
     seeded: bool = True,
 ) -> argparse.ArgumentParser:
-    """Add an experiment with the options that all have."""
+    """Add an experiment with the common options."""
     description = f"{about[0].upper()}{about[1:]}."
     parser: argparse.ArgumentParser = benches.add_parser(name, help=about, description=description)
     if seeded:
-        _add_seed(parser, "of starts and planning")
+        _add_seed_option(parser)
     _add_count(parser, "--jobs", jobs, "processes", metavar="J")
-    about = "address of a Dask scheduler, tcp://HOST:PORT, whose workers are used instead"
+    about = "address of a Dask scheduler, tcp://HOST:PORT, whose workers run the trials"
     parser.add_argument("--scheduler", metavar="ADDRESS", help=about)
-    about = "folder for results, tables and charts; its trials are not run again"
+    about = "folder for results, tables and charts; completed trials are not repeated"
     parser.add_argument("--out", required=True, metavar="DIR", help=about)
-    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    parser.add_argument("--quiet", action="store_true", help="hide the progress bar")
     parser.set_defaults(run=_bench_experiment, benchmark=module or name)
     return parser
 
@@ -216,8 +217,8 @@ def _add_count(
     parser.add_argument(option, type=parse_positive, default=default, metavar=metavar, help=about)
 
 
-def _add_seed(parser: argparse.ArgumentParser, about: str) -> None:
-    about = f"random seed {about} (default 0)"
+def _add_seed_option(parser: argparse.ArgumentParser) -> None:
+    about = "random seed of starts and planning (default 0)"
     parser.add_argument("--seed", type=parse_natural, default=0, metavar="S", help=about)
 
 
@@ -268,12 +269,14 @@ def report_interruption(given: Sequence[str], stop: KeyboardInterrupt) -> int:
     """Print how to resume an interrupted command; return its exit code.
 
     Args:
-        given: Words of the command after `vkc-pin`.
-        stop: The interruption, whose text is printed as well.
+        given: Arguments of `vkc-pin`.
+        stop: The interruption; its text is also printed.
     """
     again = shlex.join(["vkc-pin", *given])
     detail = f"; {stop}" if str(stop) else ""
-    sys.stderr.write(f"\nvkc-pin: stopped{detail}. The same command goes on from there:\n{again}\n")
+    sys.stderr.write(
+        f"\nvkc-pin: stopped{detail}. The same command resumes the experiment:\n{again}\n"
+    )
     return EXIT_INTERRUPTED
 
 

@@ -121,7 +121,7 @@ def _add_scenes(benches: Any) -> None:
     tasks = "door corridor_door drawer household_refrigerator household_dishwasher"
     _add_choice(parser, "tasks", f"{tasks} household_cabinet household_cup init_1 (default: all)")
     about = "weld (default), or friction"
-    parser.add_argument("--grasp", default="weld", metavar="HOW", help=about)
+    parser.add_argument("--grasp", default="weld", metavar="MODEL", help=about)
 
     about = "measure validated episodes per hour of each dataset task"
     parser = _add_experiment(

@@ -1,4 +1,6 @@
-"""Draws docs/images/architecture.svg from the package's imports: `python docs/make_architecture.py`. Needs nothing but Python.
+"""Draws docs/images/architecture.svg from the package's imports with the standard library alone.
+
+Usage: python docs/make_architecture.py
 
 Rows are the layers of the import contract in pyproject.toml. An arrow leads from a package to one
 that it imports, unless others lead there too. Packages that all others import have no arrows.
@@ -41,7 +43,7 @@ def layers() -> list[list[str]]:
 
 
 def find_imports() -> dict[str, set[str]]:
-    """Return package → packages that its modules import at the top; imports inside functions may lead up."""
+    """Return package → packages imported at the top of its modules, not inside functions."""
     known = {name for layer in layers() for name in layer}
     found: dict[str, set[str]] = {name: set() for name in known}
     for file in PACKAGE.rglob("*.py"):
@@ -58,7 +60,7 @@ def find_imports() -> dict[str, set[str]]:
 
 
 def find_arrows() -> list[tuple[str, str]]:
-    """Return the imports between packages, without those that also lead there through another package."""
+    """Return the imports between packages, without those that follow from others."""
     imports = find_imports().items()
     graph = {
         package: others - FOUNDATION for package, others in imports if package not in FOUNDATION
@@ -76,7 +78,7 @@ def find_arrows() -> list[tuple[str, str]]:
 
 
 def summarize(package: str) -> list[str]:
-    """Return the first sentence of a package's docstring in two lines, shortened at a colon or comma if necessary."""
+    """Return the first sentence of a package's docstring in two lines, shortened if necessary."""
     file = PACKAGE / package / "__init__.py"
     source = (file if file.is_file() else PACKAGE / f"{package}.py").read_text(encoding="utf-8")
     text = (ast.get_docstring(ast.parse(source)) or "").splitlines()[0]
@@ -114,7 +116,8 @@ def draw_arrow(
     )
     line = f"M{x0:.0f} {top:.0f}"
     for left, right, begin, end in bends:
-        line += f" L{left:.0f} {begin:.0f} C{left:.0f} {end:.0f} {right:.0f} {begin:.0f} {right:.0f} {end:.0f}"
+        line += f" L{left:.0f} {begin:.0f} C{left:.0f} {end:.0f}"
+        line += f" {right:.0f} {begin:.0f} {right:.0f} {end:.0f}"
     return f'<path d="{line}"/>'
 
 
@@ -123,7 +126,10 @@ def draw_box(package: str, x: float, y: float) -> str:
     kind = "check" if package in CHECKS else "open" if package in FOUNDATION else "own"
     lines = summarize(package)
     first = y - 14 if len(lines) > 1 else y - 8
-    corner = f'x="{x - BOX_WIDTH / 2:.0f}" y="{y - BOX_HEIGHT / 2:.0f}" width="{BOX_WIDTH}" height="{BOX_HEIGHT}"'
+    corner = (
+        f'x="{x - BOX_WIDTH / 2:.0f}" y="{y - BOX_HEIGHT / 2:.0f}" '
+        f'width="{BOX_WIDTH}" height="{BOX_HEIGHT}"'
+    )
     texts = [f'<text x="{x:.0f}" y="{first + 4:.0f}" class="name">{package}</text>']
     texts += [
         f'<text x="{x:.0f}" y="{first + 20 + 14 * k:.0f}" class="more">{escape(text)}</text>'
@@ -139,18 +145,22 @@ def main() -> str:
     boxes = list(centres.values())
     height = 2 * MARGIN + ROW * (len(rows) - 1)
     style = (
-        "text { font-family: system-ui, sans-serif; text-anchor: middle; fill: #1f2933; } .name { font-size: 14px; } "
+        "text { font-family: system-ui, sans-serif; text-anchor: middle; fill: #1f2933; } "
+        ".name { font-size: 14px; } "
         ".more { font-size: 11px; fill: #52606d; } .own { fill: #e3edf7; stroke: #4c78a8; } "
         ".check { fill: #fdebd9; stroke: #d9822b; } .open { fill: #ffffff; stroke: #8a94a3; } "
         "path { fill: none; stroke: #7b8794; stroke-width: 1.3; marker-end: url(#tip); }"
     )
     tip = (
-        '<marker id="tip" viewBox="0 0 8 8" refX="6" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
+        '<marker id="tip" viewBox="0 0 8 8" refX="6" refY="4" '
+        'markerWidth="7" markerHeight="7" orient="auto">'
         '<polygon points="0,0 8,4 0,8" fill="#7b8794"/></marker>'
     )
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" width="{WIDTH}" height="{height}">',
-        f'<style>{style}</style><defs>{tip}</defs><rect width="{WIDTH}" height="{height}" rx="10" fill="#fbfcfd"/>',
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" '
+        f'width="{WIDTH}" height="{height}">',
+        f"<style>{style}</style><defs>{tip}</defs>"
+        f'<rect width="{WIDTH}" height="{height}" rx="10" fill="#fbfcfd"/>',
         *(draw_arrow(centres[one], centres[other], boxes) for one, other in find_arrows()),
         *(draw_box(package, *centre) for package, centre in centres.items()),
         "</svg>",

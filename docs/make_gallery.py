@@ -1,4 +1,4 @@
-"""Makes docs/images/gallery.png: robots with things that were not made for them, at the end of plans that open these.
+"""Makes docs/images/gallery.png: robots from several sources that open objects from others.
 
 Usage: make_gallery.py [FOLDER]: where imported robots and plans are kept, and not made again
 (default: out/gallery). The pictures are drawn here, point by point, as they need no more than
@@ -37,12 +37,8 @@ SIDE, FINER, COLOURS = (
 )  # [pixels] of a picture in the grid; in each of these so many; of the palette
 AWAY = np.array([-0.85, -0.85, 0.62])  # from what is looked at to the camera, before it is scaled
 FIELD = 0.62  # half of what is seen, at 1 m
-PIECE, NEAR = (
-    0.4,
-    1.0,
-    # [m] longest edges of triangles that are drawn or left out whole; how far before the camera they
-    # are
-)
+PIECE = 0.4  # [m] longest edge of a drawn triangle
+NEAR = 1.0  # [m] triangles closer to the camera are omitted
 DOTS, PARTS = (
     (0.7, 1.5),
     (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256),
@@ -52,7 +48,7 @@ FLOOR, SKY, SHADOW = np.array([0.90, 0.89, 0.87]), np.array([0.97, 0.97, 0.98]),
 
 
 def opened(robot: str, file: str, thing: str, folder: Path) -> vkc.Plan:
-    """Return the plan of a robot that opens a thing, from the first random start from which it does."""
+    """Return the plan of a robot opening an object, from the first random start that succeeds."""
     kept = folder / "plans" / f"{robot}_{thing}.npz"
     if kept.is_file():
         return vkc.Plan.load(kept)
@@ -71,7 +67,7 @@ def opened(robot: str, file: str, thing: str, folder: Path) -> vkc.Plan:
 
 
 def triangles_of(scene: vkc.Scene) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield triangles in the world, shape (n, 3, 3), in pieces of `PIECE` at most, and the colour of each, shape (n, 3)."""
+    """Yield triangles in the world, shape (n, 3, 3), edges at most `PIECE`, and colours (n, 3)."""
     world = World(scene)
     data = world.model.createData()
     pin.forwardKinematics(world.model, data, world.coordinates.q(world.start))
@@ -110,13 +106,13 @@ class Camera:
         )
 
     def seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return columns and rows in the picture, shape (..., 2), and the distances along the view [m]."""
+        """Return pixel columns and rows, shape (..., 2), and depths along the view [m]."""
         own = (points - self.position) @ self.axes.T
         ahead = np.maximum(own[..., 2], 1e-6)
         return (own[..., :2] / ahead[..., None] / FIELD + 1.0) * self.size / 2.0, own[..., 2]
 
     def on_floor(self) -> np.ndarray:
-        """Return for every pixel how far along the view the floor is [m], shape (size, size); infinite above the horizon."""
+        """Return each pixel's depth to the floor [m], (size, size); inf above the horizon."""
         along = (np.arange(self.size) + 0.5) / self.size * 2.0 - 1.0
         down = -(
             self.axes[0, 2] * along[None] * FIELD
@@ -129,7 +125,7 @@ class Camera:
 def dotted(
     corners: np.ndarray, pixels: np.ndarray, apart: float
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield which triangles points belong to, and the points, shape (k, 3), no further `apart` in the picture [pixels]."""
+    """Yield indices of triangles and points on them, shape (k, 3), at most `apart` [pixels]."""
     longest = np.linalg.norm(pixels - np.roll(pixels, -1, axis=1), axis=2).max(axis=1)
     parts = np.array(PARTS)[np.searchsorted(PARTS[:-1], longest / apart)]
     for count in np.unique(parts):

@@ -1,4 +1,4 @@
-"""Makes docs/images/held.png: a narrow door on its way shut, held, from above, as seeds lead the robot."""
+"""Makes docs/images/held.png: initial guesses for closing a narrow door, seen from above."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ EVERY = 6  # of the waypoints that are drawn
 
 
 def main() -> int:
-    """Write a picture of a narrow door on its way shut, from above: straight between knots, and as trees lead the robot."""
+    """Draw a narrow door being closed: interpolated between keyframes, and by constrained RRT."""
     scene = (
         chores.make_cluttered_home()
         .with_state("door", {"hinge": 1.52})
@@ -71,7 +71,7 @@ def main() -> int:
 
 
 def draw_held(axes: Any, problem: TrajectoryProblem, way: np.ndarray, worst: int | None) -> None:
-    """Draw walls, and the arm and the door's leaf at some of the waypoints; at the worst in another colour."""
+    """Draw walls, arm and door leaf at some waypoints, the worst one in another colour."""
     from matplotlib.colors import to_rgb
     from scipy.spatial import ConvexHull
 

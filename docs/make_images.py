@@ -1,4 +1,4 @@
-"""Makes docs/images and docs/animations: plans the door, the use of a stick, a chore and a gap, looks at them, and at scenes.
+"""Makes docs/images and docs/animations: plans, scenes, imports and bases.
 
 Needs Chromium. Usage: make_images.py [DOOR [STICK [CHORE [GAP]]]]: saved plans (.npz) to show
 instead of planning them.
@@ -183,7 +183,7 @@ def furniture_picture() -> None:
 
 
 def finer(face: np.ndarray, longest: float = 0.06) -> list[np.ndarray]:
-    """Return a triangle as triangles whose edges are not longer than that [m]: the picture is sorted by their middles."""
+    """Split a triangle until no edge is longer [m]: the picture sorts triangles by depth."""
     edges = [np.linalg.norm(face[k] - face[k - 1]) for k in range(3)]
     k = int(np.argmax(edges))
     if edges[k] <= longest:
@@ -211,7 +211,7 @@ def check_picture() -> None:
 
 
 def import_picture() -> None:
-    """A home of three rooms that was one URDF, and the motion that opens its refrigerator, from above."""
+    """Draw a home of three rooms imported from one URDF, and a motion that opens its fridge."""
     with tempfile.TemporaryDirectory() as folder:
         file, _ = home_urdf(Path(folder))
         scene = vkc.importing.import_home(file, Path(folder) / "out").scene
@@ -259,7 +259,7 @@ def push_picture() -> None:
 
 
 def bases_picture() -> None:
-    """Write a picture of the door from above, opened by a robot that drives as a tank, and by one that is steered."""
+    """Draw the door opened by a differential drive and by a car-like base, seen from above."""
     scene, shown = (
         vkc.load_scene("door"),
         ({"base": "differential"}, {"base": "ackermann", "turning_radius": 0.8}),
@@ -279,7 +279,7 @@ def bases_picture() -> None:
 
 
 def opening_picture() -> None:
-    """Write a picture of fingers between two cheeks, from above: fully open, and as far as the attachment says."""
+    """Draw fingers between two cheeks, from above: fully open, and at the attachment's opening."""
     from scipy.spatial import ConvexHull
 
     with tempfile.TemporaryDirectory() as folder, use_style():
@@ -324,7 +324,7 @@ def opening_picture() -> None:
 
 
 def torque_picture() -> None:
-    """Write what the motors do while a door with a closer is opened, against what they have, over time."""
+    """Draw the motor torques over time, with their limits, while opening a door with a closer."""
     scenes = vkc.load_scene("door"), closer(damping=400.0, stiffness=5.0, springref=-2.0)
     plans = [vkc.plan(scene, [vkc.Actuate("door", {"hinge": 1.2}, "handle")]) for scene in scenes]
     with use_style():

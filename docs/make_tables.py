@@ -1,4 +1,6 @@
-"""Writes the tables of experiments in README.md and docs anew, from the results on record: `python docs/make_tables.py`.
+"""Updates the tables of experiments in README.md and docs from the results on record.
+
+Usage: python docs/make_tables.py
 
 In a page, what stands between `<!-- figures: NAME -->` and `<!-- /figures: NAME -->` is of
 docs/results/NAME.json: each table is replaced by the one of the experiment's own report that has
@@ -51,7 +53,8 @@ STATUS: list[tuple[str, str, dict[str, str]]] = [
     ("push the door, grasp given", "door_seed_0", {"task": "push"}),
     ("drive up, turn the knob, push: one problem", "door_seed_0", {"task": "whole"}),
     (
-        "fetch a stick and touch a cube under a table with it, [three scenes](docs/initialization.md)",
+        "fetch a stick and touch a cube under a table with it, "
+        "[three scenes](docs/initialization.md)",
         "initialization",
         {"method": "auto"},
     ),
@@ -138,7 +141,7 @@ def door() -> str:
 
 
 def drawn(name: str) -> str:
-    """Return the tables of random problems on record: what came of them, and whether the oracle agrees."""
+    """Return the tables of recorded random problems: outcomes, and agreement with the oracle."""
     found = result(name)
     about, trials = found["meta"], found["trials"]
     statuses = sorted({trial["status"] for trial in trials} - {"success"})
@@ -260,9 +263,11 @@ FIGURES: dict[str, Callable[[Sequence[Mapping[str, Any]], str], float | str]] = 
     ),
     "slowdown": lambda trials, field: _slowdown(trials, field),
 }
-"""What may be asked of trials, of a field of theirs after a colon. The 95th percentile is `late`; `steady` counts starts of which
-every trial succeeds; `slowdown:1000` is the median, over the starts, of the ratio of times among so
-many obstacles and 30."""
+"""Statistics of trials, of the field named after a colon.
+
+`late` is the 95th percentile, `steady` counts starts of which every trial succeeds.
+`slowdown:1000` is the median over starts of the ratio of times with 1000 and 30 obstacles.
+"""
 
 
 def _steady(trials: Sequence[Mapping[str, Any]]) -> str:
@@ -281,7 +286,7 @@ def _slowdown(trials: Sequence[Mapping[str, Any]], count: str) -> float:
 
 
 def figure(asked: str, before: str) -> str:
-    """Return one figure, as `asked` for between its marks, with as many decimals as there were before."""
+    """Return the figure that a mark's text requests, with as many decimals as `before`."""
     name, what, *conditions = asked.split()
     what, _, field = what.partition(":")
     trials = of(

@@ -22,13 +22,13 @@ FIELD = "velocity_weight_base"
 
 
 def weight(method: str) -> float:
-    """Return the weight of the base that a setting stands for; the usual one where it changes nothing."""
+    """Return the base weight of a setting; the default where the setting does not change it."""
     name, _, value = method.rpartition("=")
     return float(value) if name == f"Options.{FIELD}" else getattr(Options(), FIELD)
 
 
 def points(trials: Sequence[Mapping[str, Any]]) -> list[tuple[float, float, float, int]]:
-    """Return weight, mean way of the base [m] and of the arm [rad], and how many problems they are of, by weight."""
+    """Return weight, mean base path [m], mean arm path [rad] and number of problems, by weight."""
     found = {(weight(trial["method"]), trial["number"]): trial for trial in trials}
     weights, numbers = (sorted({key[k] for key in found}) for k in (0, 1))
     whole = [number for number in numbers if all(found[w, number]["success"] for w in weights)]

@@ -34,7 +34,7 @@ OPINIONS: dict[str, dict[str, Any]] = {}  # of the processes that tests run in
 def second_opinion(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[None]:
-    """Fail where the oracle finds something wrong with a motion that the test's planner was content with."""
+    """Fail the test if the oracle contradicts a plan that its planner called successful."""
     yield
     if request.node.get_closest_marker("made_up"):
         OPINION.forget()
@@ -76,7 +76,7 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
 
 @pytest.fixture(scope="session")
 def door_plan() -> vkc.Plan:
-    """A motion that drives up to the door, turns its knob and pushes it open to 1.2 rad, as planned."""
+    """Return a plan that drives up to the door, turns its knob and pushes it open to 1.2 rad."""
     scene = vkc.load_scene("door").with_start(base=[-0.03, 0.09, -1.19])
     plan = vkc.plan(scene, [vkc.Actuate("door", {"hinge": 1.2})])
     assert plan.success, plan.summary()

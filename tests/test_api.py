@@ -91,7 +91,8 @@ def test_the_package_loads_what_is_asked_for_and_nothing_else() -> None:
         "tqdm",
     )
     loaded = f"[m for m in {heavy} if m in sys.modules]"
-    code = f"import sys, vkc_pin as vkc; print({loaded}); vkc.VkcError; print({loaded}); vkc.plan; print({loaded})"
+    steps = (f"print({loaded})", "vkc.VkcError", f"print({loaded})", "vkc.plan", f"print({loaded})")
+    code = f"import sys, vkc_pin as vkc; {'; '.join(steps)}"
     done = subprocess.run(
         [sys.executable, "-c", code],
         cwd=ROOT,

@@ -1,4 +1,4 @@
-"""The layout keeps to its rules: imports go down, modules are named in full, and the documentation shows what is there."""
+"""The layout follows its rules: imports go down, names are complete, all is documented."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ PACKAGE = ROOT / "vkc_pin"
 SCRIPTS = {"vkc_pin.visualization.server", "vkc_pin.cli.__main__"}  # run, and imported by nothing
 # The import linter as a command, blind to where an editable installation says that the package is.
 LINT = (
-    "import sys; sys.meta_path = [one for one in sys.meta_path if 'vkc_pin' not in getattr(type(one), '__module__', '')]; "
-    "sys.path.insert(0, '.'); from importlinter.cli import lint_imports_command; lint_imports_command()"
+    "import sys; sys.meta_path = [one for one in sys.meta_path "
+    "if 'vkc_pin' not in getattr(type(one), '__module__', '')]; "
+    "sys.path.insert(0, '.'); from importlinter.cli import lint_imports_command; "
+    "lint_imports_command()"
 )
 
 

@@ -1,4 +1,4 @@
-"""The documentation says what is so: its code runs, its links lead somewhere, and it names what there is."""
+"""The documentation is correct: its code runs, its links work, and its names exist."""
 
 from __future__ import annotations
 
@@ -253,7 +253,7 @@ def test_every_page_is_in_the_contents() -> None:
 
 
 def documented(directive: str) -> set[str]:
-    """Return what the pages of the reference document by this directive, "auto*" for all of them but modules."""
+    """Return the names documented by a directive, "auto*" for all directives but modules."""
     pages = (page.read_text(encoding="utf-8") for page in (ROOT / "docs/api").glob("*.md"))
     found = [
         pair

@@ -63,7 +63,7 @@ def test_declared_dependencies_suffice(extra: str, script: str, tmp_path: Path) 
 
 
 def test_compiled_against_what_is_required(project: dict[str, Any]) -> None:
-    """The ranges to build against and to run with are the same, so that pip cannot choose releases that do not fit."""
+    """Versions for building and for running have the same ranges, so that pip picks a match."""
     build = {r.name: r.specifier for r in map(Requirement, project["build-system"]["requires"])}
     run = {r.name: r.specifier for r in map(Requirement, project["project"]["dependencies"])}
     assert build["libpinocchio"] == run["pin"]
@@ -77,9 +77,10 @@ def test_package_is_typed_and_licensed() -> None:
 
 
 def test_wheel_carries_robots_and_scenes(tmp_path: Path) -> None:
-    """Robots, scenes and `py.typed` are in the wheel (built without the compiled modules: they take a minute)."""
+    """Robots, scenes and `py.typed` are in the wheel, built here without compiled modules."""
     settings = {f"cmake.define.VKC_PIN_BUILD_{module}": "OFF" for module in ("CPIN", "DISTANCES")}
-    code = f"from scikit_build_core.build import build_wheel; build_wheel({str(tmp_path)!r}, {settings})"
+    build = f"build_wheel({str(tmp_path)!r}, {settings})"
+    code = f"from scikit_build_core.build import build_wheel; {build}"
     done = subprocess.run(
         [sys.executable, "-c", code],
         cwd=CHECKOUT,

@@ -1,4 +1,4 @@
-"""Cuts the mesh of a link into few parts whose hulls are small, and measures what such hulls add to the link."""
+"""Cuts a link's mesh into few parts with small hulls, and measures the volume that hulls add."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["cut", "solid_volume"]
 def cut(
     mesh: trimesh.Trimesh, pieces: int, *, axis: ArrayLike, steps: int = 24
 ) -> list[NDArray[np.float64]]:
-    """Cut `mesh` by `pieces` − 1 planes across `axis` so that the volume of the pieces' hulls is smallest.
+    """Cut `mesh` by `pieces` − 1 planes across `axis` that minimize the volume of the hulls.
 
     Args:
         mesh: Any triangles; they need not be closed.

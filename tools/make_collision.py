@@ -1,4 +1,4 @@
-"""Writes a robot's collision/*.stl from the visual geometry of its URDF, and prints the table of its README.md.
+"""Writes a robot's collision/*.stl from its visual geometry, and prints the README's table.
 
 Usage: python tools/make_collision.py robots/husky_ur5e [LINK ...]
 
@@ -77,7 +77,8 @@ def main() -> None:
     settings, document = read_robot(folder / "robot.yaml")
     file = read_urdf(folder / settings.urdf, find_python_packages(settings.packages, document))
     print(
-        "| link | pieces | corners | solid [l] | pieces' volume [l] | overhead |\n| --- | --- | --- | --- | --- | --- |"
+        "| link | pieces | corners | solid [l] | pieces' volume [l] | overhead |\n"
+        "| --- | --- | --- | --- | --- | --- |"
     )
     for link in given.links or links:
         meshes = visual_meshes(file, link)
@@ -100,7 +101,8 @@ def main() -> None:
             100 * (union / solid - 1),
         )
         print(
-            f"| `{link}` | {len(pieces)} | {corners} | {1e3 * solid:.3f} | {1e3 * union:.3f} | {excess:.0f} % |",
+            f"| `{link}` | {len(pieces)} | {corners} | {1e3 * solid:.3f} "
+            f"| {1e3 * union:.3f} | {excess:.0f} % |",
             flush=True,
         )
 

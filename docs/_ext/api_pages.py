@@ -1,4 +1,4 @@
-"""Writes the reference pages of all packages, docs/api/packages/*.md, from their modules when the site is built."""
+"""Writes the reference pages of all packages, docs/api/packages/*.md, from their modules."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ PACKAGE, FOLDER = ROOT / "vkc_pin", ROOT / "docs" / "api" / "packages"
 
 
 def packages() -> dict[str, dict[str, Path]]:
-    """Return package → full name → file of its modules, itself first; "package" stands for the top-level modules."""
+    """Return package → full module name → file; "package" stands for the top-level modules."""
     found: dict[str, dict[str, Path]] = {}
     for file in sorted(
         PACKAGE.rglob("*.py"), key=lambda file: (file.parent, file.name != "__init__.py", file.name)
@@ -23,7 +23,7 @@ def packages() -> dict[str, dict[str, Path]]:
 
 
 def taken(file: Path) -> dict[str, list[str]]:
-    """Return module → names that a package's `__init__.py` imports from it: they are documented as the package's own."""
+    """Return module → names that a package's `__init__.py` imports from it and documents."""
     tree = ast.parse(file.read_text(encoding="utf-8"))
     return {
         node.module: [a.name for a in node.names]
@@ -46,7 +46,7 @@ def page(package: str, files: dict[str, Path]) -> str:
 
 
 def write() -> None:
-    """Write a page for every package whose page is missing or stale, and delete those of removed packages."""
+    """Write missing and outdated pages of packages, and delete those of removed packages."""
     FOLDER.mkdir(exist_ok=True)
     pages = {
         FOLDER / f"{package}.md": page(package, files) for package, files in packages().items()

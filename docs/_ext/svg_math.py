@@ -1,4 +1,4 @@
-"""Formulas as SVG pictures, drawn while the site is built: pages need no script, no font and no network to show them."""
+"""Draws formulas as SVG pictures when the site is built: pages need no script and no font."""
 
 from __future__ import annotations
 
@@ -19,14 +19,16 @@ SCALE = (
 
 @cache
 def drawn(latex: str, inline: bool) -> str:
-    """Return the picture of a formula, as wide and high as the text around it asks for, its baseline on that of the text."""
+    """Return the SVG picture of a formula, scaled to the text and aligned with its baseline."""
     picture = str(ziamath.Latex(latex, size=SIZE, inline=inline, color="currentColor").svg())
     found = re.search(r'viewBox="([-\d.]+) ([-\d.]+) ([-\d.]+) ([-\d.]+)"', picture)
     if found is None:
         raise RuntimeError(f"no picture came of {latex}")
     _, top, width, height = map(float, found.groups())
-    place = f"width:{width * SCALE:.3f}em;height:{height * SCALE:.3f}em;vertical-align:{-(top + height) * SCALE:.3f}em"
-    about = f'class="formula" role="img" aria-label="{html.escape(latex.strip(), quote=True)}" style="{place}"'
+    size = f"width:{width * SCALE:.3f}em;height:{height * SCALE:.3f}em"
+    style = f"{size};vertical-align:{-(top + height) * SCALE:.3f}em"
+    label = html.escape(latex.strip(), quote=True)
+    about = f'class="formula" role="img" aria-label="{label}" style="{style}"'
     return picture.replace("<svg ", f"<svg {about} ", 1)
 
 

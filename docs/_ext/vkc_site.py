@@ -1,4 +1,4 @@
-"""What the site has that the pages in the repository have not: contents, outputs of notebooks, a film, cross references."""
+"""Adds to the site: contents, outputs of notebooks, animations and cross references."""
 
 from __future__ import annotations
 
@@ -21,11 +21,14 @@ import vkc_pin as vkc
 ROOT = Path(__file__).resolve().parents[2]
 START = "docs/index"
 EXECUTED = ROOT / "out" / "notebooks"  # where the tests leave the notebooks that they have run
-REDIRECT = '<!DOCTYPE html>\n<meta charset="utf-8">\n<title>vkc_pin</title>\n<meta http-equiv="refresh" content="0; url={}">\n'
+REDIRECT = (
+    '<!DOCTYPE html>\n<meta charset="utf-8">\n<title>vkc_pin</title>\n'
+    '<meta http-equiv="refresh" content="0; url={}">\n'
+)
 
 
 def read(app: Sphinx, name: str, source: list[str]) -> None:
-    """Change what is read: notebooks with their outputs, if they have been run; contents and films where they belong."""
+    """Insert contents and animations, and replace notebooks by their executed versions."""
     if name.startswith("notebooks/"):
         run = EXECUTED / f"{Path(name).name}.ipynb"
         if run.is_file():
@@ -58,7 +61,7 @@ def generate(app: Sphinx) -> None:
 def outdated(
     app: Sphinx, env: BuildEnvironment, added: set[str], changed: set[str], removed: set[str]
 ) -> list[str]:
-    """Return the notebooks that have been run since they were read: their outputs are not in the repository."""
+    """Return the notebooks executed since they were read: the repository has no outputs."""
     notebooks = [
         name for name in env.found_docs if name.startswith("notebooks/") and name in env.all_docs
     ]
@@ -71,7 +74,7 @@ def outdated(
 
 
 def films(app: Sphinx, problem: Exception | None) -> None:
-    """Add the films, one of them of a motion that is planned now, and a page at the root that leads to the first."""
+    """Add the animations, one of them planned now, and a page at the root that redirects."""
     if problem is not None or app.builder.name != "html":
         return
     folder = Path(app.outdir) / "docs" / "animations"
@@ -84,7 +87,7 @@ def films(app: Sphinx, problem: Exception | None) -> None:
 
 
 def plain(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
-    """Make reStructuredText of a docstring: outside of `code`, marks such as * and | mean themselves."""
+    """Convert a docstring to reStructuredText: outside of `code`, * and | are plain characters."""
     for number, line in enumerate(lines):
         parts = re.split(r"(``[^`]*``|(?::[\w:]+:)?`[^`]*`)", line)
         for i in range(0, len(parts), 2):
@@ -94,13 +97,13 @@ def plain(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: li
 
 
 def whole(app: Sphinx, thing: Any, bound: bool) -> None:
-    """Undo what `autodoc_preserve_defaults` does to a bound method: it takes the first parameter of its function, every time."""
+    """Restore the first parameter, which `autodoc_preserve_defaults` removes from bound methods."""
     if inspect.ismethod(thing):
         vars(thing.__func__).pop("__signature__", None)
 
 
 def skip(app: Sphinx, what: str, name: str, thing: Any, skipped: bool, options: Any) -> bool | None:
-    """Leave out public names of the package and of its subpackages, which have pages of their own."""
+    """Leave out public names of the package and its subpackages, which have their own pages."""
     public = what == "module" and any(
         name in owner.__all__ and getattr(owner, name) is thing
         for owner in (vkc, vkc.datasets, vkc.importing, vkc.procedural)
@@ -111,7 +114,7 @@ def skip(app: Sphinx, what: str, name: str, thing: Any, skipped: bool, options: 
 def resolve(
     app: Sphinx, env: BuildEnvironment, node: addnodes.pending_xref, content: nodes.Node
 ) -> nodes.Node | None:
-    """Find own names by their last part: a class is documented as `vkc_pin.Plan` and lives in `vkc_pin.planning.plan`."""
+    """Resolve names by their last part: `vkc_pin.Plan` is defined in `vkc_pin.planning.plan`."""
     if node.get("refdomain") != "py":
         return None
     target = str(node["reftarget"])

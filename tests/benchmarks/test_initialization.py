@@ -1,4 +1,4 @@
-"""Initialization methods are compared; a stand-in for the planner returns plans that nobody planned."""
+"""Initialization methods are compared on plans that a fake planner returns."""
 
 from __future__ import annotations
 

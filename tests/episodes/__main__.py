@@ -1,4 +1,7 @@
-"""`python -m tests.episodes DATASET --jobs N`: judges all episodes by the oracle, and goes on where it was stopped."""
+"""Judges all episodes of a dataset by the oracle, and resumes an interrupted run.
+
+Usage: python -m tests.episodes DATASET --jobs N
+"""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ VERDICTS = "oracle.jsonl"
 
 
 def judged_dataset(folder: Path, *, jobs: int = 1) -> list[Verdict]:
-    """Judge the episodes of a dataset; every shard's verdicts are kept in its folder, and are not found again."""
+    """Judge the episodes of a dataset; each shard's verdicts are saved in its folder and reused."""
     dataset = Dataset.open(folder)
     kept = _kept(folder / VERDICTS)
     left = [shard for shard in dataset.shards if _name(dataset, shard) not in kept]

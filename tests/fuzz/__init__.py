@@ -1,1 +1,1 @@
-"""Input of all kinds that was never meant to work: what comes of it must be a result, or an error of the package's own."""
+"""Fuzzes the public API: invalid input must yield a result or one of the package's errors."""

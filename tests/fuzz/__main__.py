@@ -1,4 +1,7 @@
-"""`python -m tests.fuzz --cases 20000 --seed 1`: cases of all kinds, and a table of what came of them."""
+"""Runs fuzz cases of all kinds and prints a table of their outcomes.
+
+Usage: python -m tests.fuzz --cases 20000 --seed 1
+"""
 
 from __future__ import annotations
 
@@ -51,7 +54,8 @@ def main() -> int:
             if found["outcome"] not in BAD:
                 continue
             bad += 1
-            key = f"{kind} {found['outcome']} {found['error'].partition(': ')[0] if found['outcome'] == 'raw' else ''}"
+            error = found["error"].partition(": ")[0] if found["outcome"] == "raw" else ""
+            key = f"{kind} {found['outcome']} {error}"
             seen[key] += 1
             if seen[key] == 1:
                 sys.stdout.write(

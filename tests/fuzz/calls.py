@@ -90,7 +90,7 @@ def saved() -> vkc.Plan:
 
 @functools.cache
 def folder() -> Path:
-    """Where files may be written: nothing else is, since a name that is not in it is no valid one."""
+    """Return the only folder that cases may write to."""
     root = Path(tempfile.mkdtemp(prefix="vkc_fuzz_"))
     atexit.register(shutil.rmtree, root, ignore_errors=True)
     return root
@@ -121,7 +121,7 @@ def _planning() -> dict[str, Any]:
 
 
 def _written(does: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that writes into `folder` what is to be written there by a relative name."""
+    """Return a function that writes relative file names into `folder`."""
 
     def inside(path: Any = None, **arguments: Any) -> Any:
         if isinstance(path, str | Path) and path and not Path(path).is_absolute():

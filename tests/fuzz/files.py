@@ -1,4 +1,4 @@
-"""Description files, changed at random where they stand: a copy of all robots and scenes, with one file spoiled."""
+"""Mutates description files: a copy of all robots and scenes in which one file is corrupted."""
 
 from __future__ import annotations
 
@@ -42,7 +42,10 @@ def pool() -> Path:
         for k, (kind, name) in enumerate(MESHES.items())
     ]
     shown = "\n".join(entries)
-    text = "robot: ../robots/husky_ur5e/robot.yaml\nstart: {base: [0, 0, 0]}\narena: {x: [-9, 9], y: [-9, 9]}\nobstacles:\n"
+    text = (
+        "robot: ../robots/husky_ur5e/robot.yaml\nstart: {base: [0, 0, 0]}\n"
+        "arena: {x: [-9, 9], y: [-9, 9]}\nobstacles:\n"
+    )
     (root / "scenes" / "meshes.yaml").write_text(f"{text}{shown}\n", encoding="utf-8")
     return root
 
@@ -154,10 +157,13 @@ def run_document(given: dict[str, Any]) -> str:
 _DAE = """<?xml version="1.0"?>
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
 <asset><unit meter="1"/><up_axis>Z_UP</up_axis></asset>
-<library_geometries><geometry id="g"><mesh><source id="p"><float_array id="a" count="12">0 0 0 1 0 0 0 1 0 0 0 1</float_array>
-<technique_common><accessor source="#a" count="4" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
-<param name="Z" type="float"/></accessor></technique_common></source><vertices id="v"><input semantic="POSITION" source="#p"/>
-</vertices><triangles count="4"><input semantic="VERTEX" source="#v" offset="0"/><p>0 2 1 0 1 3 0 3 2 1 2 3</p></triangles></mesh>
+<library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="a" count="12">0 0 0 1 0 0 0 1 0 0 0 1</float_array>
+<technique_common><accessor source="#a" count="4" stride="3"><param name="X" type="float"/>
+<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<triangles count="4"><input semantic="VERTEX" source="#v" offset="0"/>
+<p>0 2 1 0 1 3 0 3 2 1 2 3</p></triangles></mesh>
 </geometry></library_geometries><library_visual_scenes><visual_scene id="s">
 <node><instance_geometry url="#g"/></node></visual_scene>
 </library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>

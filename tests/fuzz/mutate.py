@@ -179,7 +179,8 @@ def _around(rng: random.Random, data: bytes) -> bytes:
             b"{a: " * 3000,
             b"<robot name='x'>" * 3000,
             data * 20,
-            b'<?xml version="1.0"?><!DOCTYPE r [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;">]><robot name="&b;"/>',
+            b'<?xml version="1.0"?><!DOCTYPE r [<!ENTITY a "aaaaaaaaaa">'
+            b'<!ENTITY b "&a;&a;&a;&a;">]><robot name="&b;"/>',
             b"a: &a [x, x]\nb: &b [*a, *a]\nc: &c [*b, *b]\n" + data,
             b"---\n" + data + b"\n---\n" + data,
         )
@@ -215,7 +216,7 @@ def places(data: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 def data_changes(
     rng: random.Random, data: Any, values: tuple[str, ...] = tuple(odd.JSON_VALUES)
 ) -> list[list[Any]]:
-    """Return one to a few changes for `changed`: a path, what happens there, and an odd value's name, key or path."""
+    """Return one to three changes for `changed`: a path, an operation, and a value, key or path."""
     everywhere = [path for path in places(data) if path]
     made: list[list[Any]] = []
     for _ in range(rng.choice((1, 1, 1, 2, 3))):

@@ -20,7 +20,7 @@ __all__ = ["JSON_VALUES", "RAISING", "USUAL", "VALUES", "pipe", "value", "within
 
 @functools.cache
 def pipe() -> Path:
-    """Return a pipe that nobody reads or writes; devices are not played with: a fault would break the machine's own."""
+    """Return a pipe that nobody reads or writes; real devices could damage the machine."""
     made = Path(tempfile.mkdtemp())
     atexit.register(shutil.rmtree, made, ignore_errors=True)
     os.mkfifo(made / "pipe")
@@ -252,7 +252,7 @@ def value(name: str) -> Any:
 
 
 def within(given: Any, odd: Any, at: int) -> Any:
-    """Return a copy of a list or dictionary with one of its entries odd, or odd itself where there is nothing to change."""
+    """Return a copy of a list or dictionary with one odd entry, or `odd` itself if it is empty."""
     if isinstance(given, dict) and given:
         keys = list(given)
         key = keys[at % len(keys)]

@@ -57,7 +57,7 @@ def _archive(about: Any, arrays: dict[str, Any]) -> bytes:
 
 
 def case(rng: random.Random) -> dict[str, Any]:
-    """Return a case: changes of what is said, of arrays, of the members of the archive, or of bytes."""
+    """Return a case: changes of the metadata, of arrays, of the archive's members, or of bytes."""
     about, _ = _base()
     match rng.randrange(8):
         case 0 | 1 | 2 | 3:

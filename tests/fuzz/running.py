@@ -1,4 +1,4 @@
-"""Runs cases in a process of their own that is watched: what crashes, hangs, or takes too much is known by its case."""
+"""Runs cases in a watched process, so that crashes, hangs and memory use are assigned to a case."""
 
 from __future__ import annotations
 
@@ -149,7 +149,10 @@ class Worker:
         if self.process is None or self.count >= FRESH:
             self.close()
             self.folder = tempfile.TemporaryDirectory(prefix="vkc_fuzz_")
-            code = f"import sys; sys.path.insert(0, {str(TESTS)!r}); from fuzz.running import serve; serve()"
+            code = (
+                f"import sys; sys.path.insert(0, {str(TESTS)!r}); "
+                "from fuzz.running import serve; serve()"
+            )
             environment = {
                 **os.environ,
                 "OMP_NUM_THREADS": "1",

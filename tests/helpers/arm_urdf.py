@@ -1,4 +1,4 @@
-"""A URDF of one or two arms with grippers, as somebody else might have written it: no SRDF, no robot.yaml, fingers shut."""
+"""Writes a URDF of one or two arms with closed grippers, without SRDF and robot.yaml."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ def _joint(
 ) -> str:
     limit = f'<limit lower="{limits[0]}" upper="{limits[1]}" effort="10" velocity="1.5"/>'
     return (
-        f'<joint name="{name}" type="{kind}"><origin xyz="{at}"/><parent link="{parent}"/><child link="{child}"/>'
+        f'<joint name="{name}" type="{kind}"><origin xyz="{at}"/>'
+        f'<parent link="{parent}"/><child link="{child}"/>'
         f'<axis xyz="{axis}"/>{limit}</joint>'
     )
 

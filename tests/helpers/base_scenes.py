@@ -27,7 +27,7 @@ def chassis(length: float = 1.0, width: float = 0.67) -> list[Shape]:
 
 
 def arm() -> list[Shape]:
-    """Ten convex shapes between 0.4 and 1.1 above the floor that reach a little beyond the chassis."""
+    """Return ten convex shapes 0.4 to 1.1 m above the floor that overhang the chassis a little."""
     rng = np.random.default_rng(1)
     shapes = []
     for k in range(10):
@@ -82,7 +82,7 @@ def clutter(seed: int, count: int, *, reach: float = 4.5) -> list[Shape]:
 
 
 def distance(shapes: Sequence[Shape], standing: Sequence[Shape], pose: Sequence[float]) -> float:
-    """Return coal's smallest signed distance [m] of shapes on a base at (x, y, yaw) from what stands in the world."""
+    """Return coal's smallest distance [m] of shapes on a base at (x, y, yaw) to fixed shapes."""
     base = at(pose[0], pose[1], 0.0, pose[2])
     nearest = np.inf
     for shape, placement in shapes:
@@ -103,7 +103,7 @@ def distance(shapes: Sequence[Shape], standing: Sequence[Shape], pose: Sequence[
 def between(
     a: Sequence[float], b: Sequence[float], *, length: float = 0.01, angle: float = 0.02
 ) -> NDArray[np.float64]:
-    """Return poses on the straight line between two, at most so far apart [m], [rad]; shape (N, 3)."""
+    """Return poses on the straight line between two, at most a step [m], [rad] apart; (N, 3)."""
     change = np.subtract(b, a)
     count = 2 + int(max(np.hypot(change[0], change[1]) / length, abs(change[2]) / angle))
     return np.linspace(a, b, count)

@@ -33,7 +33,7 @@ def screenshot(
     size: tuple[int, int] = (1280, 720),
     budget: float = 6.0,
 ) -> Path:
-    """Write a PNG of a local page; `time` [s] is where its film stands, `budget` [s] how long the page may take by its clock."""
+    """Write a PNG of a local page at `time` [s] of its animation, after at most `budget` [s]."""
     _run(page, time, budget, f"--screenshot={picture}", f"--window-size={size[0]},{size[1]}")
     assert picture.is_file(), f"Chromium wrote no picture of {page}"
     return picture

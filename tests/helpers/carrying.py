@@ -49,7 +49,7 @@ def stand(name: str = "stand", *, aside: float = 0.0, gap: float = 1e-3) -> dict
 def room(
     *obstacles: Mapping[str, Any], objects: Sequence[str] = ("stick",), base: str = "omni"
 ) -> Scene:
-    """Return a hall with obstacles and free objects in it; the robot's hand is 0.2 m above where it takes the stick."""
+    """Return a hall with obstacles and free objects; the hand is 0.2 m above the stick's grasp."""
     scene = hall(base=base, obstacles=obstacles)
     document = {
         **scene.document,
@@ -74,7 +74,7 @@ def tool_at(
     attachment: str = "grip",
     values: Sequence[float] = (0.0, 0.0),
 ) -> pin.SE3:
-    """Return where the hand is that holds an object, whose base link is its only one, at `object_at`; by definition."""
+    """Return, by definition, the hand's pose that grasps a one-link object at `object_at`."""
     grasp = load_object(name).attachment(attachment)
     return (
         object_at
@@ -98,7 +98,7 @@ def freedom(attachment: str, values: Sequence[float]) -> pin.SE3:
 
 
 def reaching(tool: pin.SE3, guess: np.ndarray = GUESS) -> np.ndarray:
-    """Return the robot's coordinates, shape (9,), near `guess` and with its base there, at which the tool is at `tool`.
+    """Return robot coordinates, shape (9,), that reach `tool`, near `guess` and with its base.
 
     Newton steps on numeric Pinocchio, from `guess` and then from around it.
     """
@@ -131,7 +131,7 @@ def _above() -> np.ndarray:
 
 
 def above(stick: pin.SE3, **grasp: Any) -> np.ndarray:
-    """Return the robot's coordinates with the hand 0.2 m above where it takes the stick at `stick`."""
+    """Return robot coordinates with the hand 0.2 m above the grasp of the stick at `stick`."""
     return reaching(tool_at(lifted(stick), **grasp), _above())
 
 
@@ -195,7 +195,7 @@ class Script:
         return self
 
     def motion(self, *, dt: float = DT, **columns: Sequence[float]) -> Trajectory:
-        """Return the motion; some coordinates of grasps may change over the waypoints as `columns` say."""
+        """Return the motion; `columns` gives values of grasp coordinates over the waypoints."""
         robot, shape = self.scene.robot.coordinates.names, len(self.rows)
         extra = [np.full(shape, value) for value in self.values.values()]
         rows = np.column_stack([np.array(self.rows), *extra])
@@ -220,7 +220,7 @@ def carried_over(
     values: Sequence[float] = (0.0, 0.0),
     off: pin.SE3 | None = None,
 ) -> Script:
-    """Take the stick from the table, carry it `aside` [m] along y, put it down, let go of it and rise.
+    """Take the stick from the table, move it `aside` [m] along y, put it down and retreat.
 
     With `off` the hand closes that far beside the attachment, in the tool's frame.
     """

@@ -13,7 +13,7 @@ __all__ = ["changed", "closer", "loaded"]
 
 
 def changed(scene: vkc.Scene, name: str, **fields: Any) -> vkc.Scene:
-    """Return a scene in which the description of an object says something else: fields, or joint → its fields."""
+    """Return a scene with another description of an object: its fields, or joint → fields."""
     document = copy.deepcopy(dict(scene.document))
     item = next(item for item in document["objects"] if item["name"] == name)
     file = vkc.load_object(item["type"]).urdf

@@ -1,4 +1,4 @@
-"""Random scenes full of obstacles of all kinds, sizes and tilts, in which culling has to be right."""
+"""Makes random scenes full of obstacles of all kinds, sizes and tilts, to test culling."""
 
 from __future__ import annotations
 

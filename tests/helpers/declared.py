@@ -53,7 +53,7 @@ def find_undeclared(extra: str = "") -> list[str]:
 
 
 def run_without(modules: list[str], script: Path, folder: Path) -> None:
-    """Run a script in a process that cannot import some modules, with `folder` as its current one."""
+    """Run a script in `folder` in a process that cannot import some modules."""
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join(map(str, (CHECKOUT, CHECKOUT / "tests")))
     }

@@ -23,7 +23,8 @@ def partnet(folder: Path) -> Path:
 
     def elements(parts: dict[str, str], xyz: str = "0 0 0") -> str:
         shapes = {
-            file: f'<origin xyz="{xyz}"/><geometry><mesh filename="textured_objs/{file}.obj"/></geometry>'
+            file: f'<origin xyz="{xyz}"/><geometry>'
+            f'<mesh filename="textured_objs/{file}.obj"/></geometry>'
             for file in parts
         }
         seen = "".join(
@@ -61,7 +62,8 @@ def partnet(folder: Path) -> Path:
   <joint name="joint_2" type="fixed"><origin rpy="1.570796326794897 0 -1.570796326794897"/>
     <child link="link_2"/><parent link="base"/></joint>
   <link name="link_0">{elements(drawer)}</link>
-  <joint name="joint_0" type="prismatic"><origin xyz="0 0 0"/><axis xyz="0 0 1"/><child link="link_0"/><parent link="link_2"/>
+  <joint name="joint_0" type="prismatic">
+    <origin xyz="0 0 0"/><axis xyz="0 0 1"/><child link="link_0"/><parent link="link_2"/>
     <limit lower="0" upper="0.36"/></joint>
   <link name="link_1">{elements(door, "0.38 0 -0.3")}</link>
   <joint name="joint_1" type="revolute"><origin xyz="-0.38 0 0.3"/><axis xyz="0 -1 0"/>
@@ -96,12 +98,14 @@ SDF = """<?xml version="1.0"?>
 <sdf version="1.7">
   <model name="box">
     <link name="case"><pose>1 0 0.4 0 0 0</pose>
-      <collision name="body"><geometry><box><size>0.4 0.6 0.8</size></box></geometry></collision></link>
+      <collision name="body">
+        <geometry><box><size>0.4 0.6 0.8</size></box></geometry></collision></link>
     <link name="door"><pose relative_to="case">-0.25 0 0 0 0 0</pose>
       <collision name="leaf"><geometry><box><size>0.02 0.6 0.8</size></box></geometry></collision>
       <collision name="handle"><pose>-0.08 0.2 0 0 0 0</pose>
         <geometry><cylinder><radius>0.01</radius><length>0.3</length></cylinder></geometry></collision></link>
-    <joint name="hinge" type="revolute"><pose>0 -0.3 0 0 0 1.0</pose><parent>case</parent><child>door</child>
+    <joint name="hinge" type="revolute">
+      <pose>0 -0.3 0 0 0 1.0</pose><parent>case</parent><child>door</child>
       <axis><xyz>0 0 -1</xyz><limit><lower>-1.5</lower><upper>0</upper></limit></axis></joint>
   </model>
 </sdf>"""

@@ -1,4 +1,4 @@
-"""The drawer's room: where the handle is, a robot that holds it, and what coal says about that, asked pair by pair."""
+"""Provides the drawer's room: the handle's pose, a robot that grasps it, and coal's distances."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def open_scene(*obstacles: dict[str, Any], base: str = "omni") -> Scene:
 
 
 def handle(slide: float = 0.0, *, tilt: float = 0.0) -> pin.SE3:
-    """Return where a tool holds the handle: from the drawer's URDF, its place in the scene and its grasp, by hand."""
+    """Return the tool's pose that grasps the handle, from the drawer's URDF, by hand."""
     # The tool's z axis, along which it comes, along x; its x axis, in which the fingers close,
     # upwards.
     grasp = pin.SE3(
@@ -62,12 +62,12 @@ def handle(slide: float = 0.0, *, tilt: float = 0.0) -> pin.SE3:
 
 
 def tool(scene: Scene, row: np.ndarray) -> pin.SE3:
-    """Return the tool's placement in the world, by numeric Pinocchio; `row` begins with the robot's coordinates."""
+    """Return the tool's pose by numeric Pinocchio; `row` begins with the robot's coordinates."""
     return dataclasses.replace(scene, start=np.array(row[: len(scene.start)])).tool_placement()
 
 
 def off(scene: Scene, row: np.ndarray, target: pin.SE3) -> float:
-    """Return the largest coordinate of the error between the tool and where it should be, [m] or [rad]."""
+    """Return the largest coordinate of the error between the tool and its target, [m] or [rad]."""
     error = tool(scene, row).inverse() * target
     return float(np.abs(np.concatenate([error.translation, pin.log3(error.rotation)])).max())
 
@@ -84,7 +84,7 @@ def holding(scene: Scene | None = None, attachment: str = "handle") -> Scene:
 
 
 def spare(scene: Scene, row: np.ndarray, *, slide: float = 0.0, held: bool = False) -> float:
-    """Return by how much the pair that comes closest to its margin keeps it [m]; `row` begins with the robot's coordinates.
+    """Return the smallest distance minus margin of all pairs [m]; `row` begins with the robot's z.
 
     The robot's own pairs, the robot and everything, and what it holds and everything but what that
     is part of.

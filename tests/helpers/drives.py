@@ -17,7 +17,7 @@ DT = 0.25  # [s]
 
 
 def hall(*, base: str = "omni", obstacles: Sequence[Mapping[str, Any]] = (), **robot: Any) -> Scene:
-    """Return a hall of 12 m x 12 m with the Husky in its middle, heading along x; `robot` is said of it, too."""
+    """Return a hall of 12 m x 12 m with the Husky at its centre, and more fields of `robot`."""
     return Scene.from_document(
         {
             "robot": {"name": "husky_ur5e", "base": base, **robot},
@@ -29,7 +29,7 @@ def hall(*, base: str = "omni", obstacles: Sequence[Mapping[str, Any]] = (), **r
 
 
 def through(scene: Scene, *stops: np.ndarray, steps: int = 40, dt: float = DT) -> Trajectory:
-    """Return a motion from rest to rest between `stops`, shape (n,) each, the first being the start; a phase each."""
+    """Return a motion from the start through `stops`, shape (n,) each, at rest at all of them."""
     share = np.linspace(0.0, 1.0, steps + 1)[1:, None]
     smooth = share**2 * (3.0 - 2.0 * share)
     rows = [stops[0][None]]

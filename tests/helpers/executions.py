@@ -63,7 +63,7 @@ def still(scene: Scene, seconds: float = 1.0) -> Trajectory:
 
 
 def with_mass(scene: Scene, name: str, mass: float) -> Scene:
-    """Return a scene in which the last body of an object has another mass [kg]; its inertia grows alike."""
+    """Return a scene in which the last body of an object has another mass [kg] and inertia."""
     placed = scene.objects[name]
     model = pin.Model(placed.object.model)
     last = len(model.inertias) - 1

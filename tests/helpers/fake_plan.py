@@ -1,4 +1,4 @@
-"""A plan that nobody planned: the base drives, the arm turns, the door opens by itself. For tests of pictures and plots."""
+"""Makes a plan without planning, for tests of plots: base, arm and door move independently."""
 
 from __future__ import annotations
 

@@ -7,7 +7,10 @@ from pathlib import Path
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.world.models.object_file import load_object
 
-BAR = '<collision{}><origin xyz="-0.08 0.5 0" /><geometry><box size="0.02 0.02 0.3"/></geometry></collision>'
+BAR = (
+    '<collision{}><origin xyz="-0.08 0.5 0" />'
+    '<geometry><box size="0.02 0.02 0.3"/></geometry></collision>'
+)
 """Upright, 70 mm before a flap that is hinged at y = 0."""
 
 
@@ -20,7 +23,7 @@ def flap(
     behind: float = 0.03,
     attachments: str = "[]",
 ) -> ArticulatedObject:
-    """Return a cabinet, 0.6 wide and 0.8 high, closed by a flap that opens towards -x, with collision elements as its handle.
+    """Return a cabinet, 0.6 m wide and 0.8 m high, with a flap that opens towards -x.
 
     Args:
         folder: Where its files are to be.
@@ -33,10 +36,14 @@ def flap(
     middle = 0.2 + behind + thick / 2.0
     text = f"""<robot name="flap">
   <link name="case">
-    <collision><geometry><box size="0.4 0.6 0.8"/></geometry><origin xyz="{middle} 0.3 0.5"/></collision>{before}
+    <collision>
+      <geometry><box size="0.4 0.6 0.8"/></geometry><origin xyz="{middle} 0.3 0.5"/>
+    </collision>{before}
   </link>
   <link name="flap">
-    <collision><geometry><box size="{thick} 0.6 0.8"/></geometry><origin xyz="0 0.3 0"/></collision>{handle}
+    <collision>
+      <geometry><box size="{thick} 0.6 0.8"/></geometry><origin xyz="0 0.3 0"/>
+    </collision>{handle}
   </link>
   <joint name="hinge" type="revolute">
     <parent link="case"/><child link="flap"/><origin xyz="0 0 0.5"/><axis xyz="0 0 1"/>

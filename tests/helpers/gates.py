@@ -1,4 +1,4 @@
-"""A hall with a wall across it: beside the wall, or through a gate in it, the base passes or does not."""
+"""Makes halls with a wall across, which the base passes at its end or through a gate, or not."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def walled(gap: float) -> vkc.TrajectoryProblem:
 
 
 def gated(width: float, *, height: float = 1.5) -> vkc.TrajectoryProblem:
-    """Return the problem of driving through a gate of some width [m] in a wall from side to side."""
+    """Return the problem of driving through a gate of some width [m] in a wall across the hall."""
     size = (6.4 - width) / 2
     return _across(
         [

@@ -1,4 +1,4 @@
-"""A robot with a gripper that opens, written to files: five joints, two fingers, one of which follows the other."""
+"""Writes a robot with a gripper: five joints and two fingers, one of which mimics the other."""
 
 from __future__ import annotations
 
@@ -89,7 +89,8 @@ _DRAWER = """<robot name="drawer">
     <collision><origin xyz="-0.05 0 0"/><geometry><box size="0.02 0.02 0.1"/></geometry></collision>
   </link>
   <joint name="slide" type="prismatic">
-    <parent link="frame"/><child link="front"/><axis xyz="-1 0 0"/><limit lower="0" upper="0.2" velocity="0.5" effort="10"/>
+    <parent link="frame"/><child link="front"/><axis xyz="-1 0 0"/>
+    <limit lower="0" upper="0.2" velocity="0.5" effort="10"/>
   </joint>
 </robot>"""
 
@@ -103,7 +104,7 @@ def between_cheeks(
     other: tuple[float, ...] | None = None,
     height: float = 1.1,
 ) -> Scene:
-    """Return a scene: a drawer's handle, 20 mm thick, half way between two cheeks that are no part of it.
+    """Return a scene with a drawer's handle, 20 mm thick, between two separate cheeks.
 
     Args:
         robot: The robot's robot.yaml.
@@ -148,9 +149,10 @@ def between_cheeks(
 
 
 def cheeky_drawer(gap: float = 0.06) -> dict[str, Any]:
-    """Return the description of a drawer without attachments whose frame has posts so far from the middle of its handle [m]."""
+    """Return a drawer without attachments; `gap` is between its handle's middle and posts [m]."""
     posts = "".join(
-        f'<collision><origin xyz="-0.04 {side * (gap + 0.02)} 0"/><geometry><box size="0.08 0.04 0.2"/></geometry></collision>'
+        f'<collision><origin xyz="-0.04 {side * (gap + 0.02)} 0"/>'
+        '<geometry><box size="0.08 0.04 0.2"/></geometry></collision>'
         for side in (1.0, -1.0)
     )
     return {

@@ -1,4 +1,4 @@
-"""Files of whole homes as others make them: one URDF, or one MJCF, with rooms, furniture, and things to carry."""
+"""Writes files of whole homes: one URDF or MJCF with rooms, furniture and free objects."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PLACES = {  # kind of furniture → x, y, yaw of its base in the world, and its 
     "dishwasher": (3.9, -1.4, 0.0, 2),
     "door": (0.0, 3.0, np.pi / 2.0, 2),
 }
-"""Their backs are to the wall in the east; the door is in the wall between the living room and the bedroom."""
+"""Furniture is against the east wall; the door is between the living room and the bedroom."""
 WALLS = {  # name → x from, to; y from, to [m]
     "wall_east": (4.7, 4.8, -4.0, 6.0),
     "wall_west": (-4.8, -4.7, -4.0, 6.0),
@@ -97,7 +97,7 @@ HOME_MJCF = """<mujoco>
 
 
 def _beside_the_door() -> dict[str, tuple[float, float, float, float]]:
-    """Return the two walls beside the door's leaf, which starts at its hinge, and goes along x or against it."""
+    """Return the walls on both sides of the door leaf, which extends from its hinge."""
     door = vkc.load_object(vkc.procedural.random_object("door", PLACES["door"][3]))
     import pinocchio as pin
 

@@ -1,4 +1,4 @@
-"""A real Jupyter kernel, in which tests run cells and which they interrupt as the stop button does."""
+"""Runs cells in a real Jupyter kernel, and interrupts them as the stop button does."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Kernel:
     def run(
         self, code: str, *, interrupt: str | None = None, delay: float = 0.0, timeout: float = 120.0
     ) -> list[dict[str, Any]]:
-        """Run a cell; return what it put out, as in a saved notebook, with updates where the first output stood.
+        """Run a cell and return its outputs as in a saved notebook, with updates in place.
 
         Args:
             code: The cell.

@@ -1,4 +1,4 @@
-"""What this process has allocated and not freed, which what is resident does not tell: that has what was freed in it, too."""
+"""Measures the memory that this process has allocated and not freed, unlike its resident size."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def wander(scene: Scene, seed: int, *, size: float) -> Trajectory:
-    """Return a random motion of robot and door near the door, four waypoints; joints change by up to `size` a step."""
+    """Return a random motion near the door, four waypoints; steps of joints are up to `size`."""
     rng = np.random.default_rng(seed)
     door = scene.objects["door"].object
     first = np.concatenate([scene.start, [0.6, 0.3]])
@@ -35,7 +35,7 @@ def wander(scene: Scene, seed: int, *, size: float) -> Trajectory:
 
 
 def brute_force(table: PairTable, z: np.ndarray) -> np.ndarray:
-    """Return the distance of every pair at every configuration, shape (S, P), by Pinocchio and coal without culling."""
+    """Return the distances of all pairs, shape (S, P), by Pinocchio and coal without culling."""
     geometry = table.world.collision.copy()
     for first, second in table.pairs.tolist():
         geometry.addCollisionPair(pin.CollisionPair(first, second))
@@ -58,7 +58,7 @@ def pair_names(table: PairTable, k: int) -> tuple[str, str]:
 
 
 def whirl(seed: int, *, size: float, scene: Scene | None = None) -> tuple[Scene, Trajectory]:
-    """Return a random motion with a stick in the hand and a ball on its tip, five waypoints, in two phases."""
+    """Return a random motion with a stick and a ball on its tip, five waypoints, two phases."""
     rng = np.random.default_rng(seed)
     scene = room(table(), objects=("stick", "ball")) if scene is None else scene
     scene = scene.with_held({"stick": "grip", "ball": "pull"}, by={"ball": "stick.tip"})

@@ -31,5 +31,6 @@ def load_text(urdf: str, yaml: str) -> ArticulatedObject:
 URDF = (
     '<robot name="t"><link name="frame"/><link name="panel"/><link name="lever"/>'
     + joint("hinge", "revolute", "frame", "panel", "0 0 1")
-    + '<joint name="knob" type="continuous"><parent link="panel"/><child link="lever"/><axis xyz="1 0 0"/></joint></robot>'
+    + '<joint name="knob" type="continuous"><parent link="panel"/><child link="lever"/>'
+    '<axis xyz="1 0 0"/></joint></robot>'
 )

@@ -1,4 +1,4 @@
-"""A program set up at an iterate, as the solver does, evaluated there for any relaxation variables."""
+"""Sets up a program at an iterate as the solver does, and evaluates it at any relaxation."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Relaxed:
 
 
 def iterates(problem: TrajectoryProblem, count: int = 3) -> list[np.ndarray]:
-    """Return z_1..z_N, shape (N, n): random ones within and outside the limits, and stationary ones."""
+    """Return z_1..z_N, shape (N, n): random, some outside the limits, or constant."""
     rng = np.random.default_rng(20)
     lower, upper = problem.chain.lower, problem.chain.upper
     inside = [random_configurations(lower, upper, problem.segments, rng) for _ in range(count)]

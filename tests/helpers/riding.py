@@ -18,24 +18,34 @@ from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 TOP = 0.67  # [m] of the plate
-POST = '<link name="post"><collision><origin xyz="0 0 0.3"/><geometry><box size="0.3 0.3 0.6"/></geometry></collision></link>'
+POST = (
+    '<link name="post"><collision><origin xyz="0 0 0.3"/>'
+    '<geometry><box size="0.3 0.3 0.6"/></geometry></collision></link>'
+)
 GRIP = (
-    '<collision><origin xyz="-0.27 0 {z}" rpy="1.5707963267948966 0 0"/><geometry><cylinder radius="0.01" length="0.2"/>'
-    "</geometry></collision>"
-    '<collision><origin xyz="-0.23 0.09 {z}"/><geometry><box size="0.07 0.01 0.01"/></geometry></collision>'
-    '<collision><origin xyz="-0.23 -0.09 {z}"/><geometry><box size="0.07 0.01 0.01"/></geometry></collision>'
+    '<collision><origin xyz="-0.27 0 {z}" rpy="1.5707963267948966 0 0"/>'
+    '<geometry><cylinder radius="0.01" length="0.2"/></geometry></collision>'
+    '<collision><origin xyz="-0.23 0.09 {z}"/>'
+    '<geometry><box size="0.07 0.01 0.01"/></geometry></collision>'
+    '<collision><origin xyz="-0.23 -0.09 {z}"/>'
+    '<geometry><box size="0.07 0.01 0.01"/></geometry></collision>'
 )
 BOARD = (
     '<collision><origin xyz="0 0 0.01"/><geometry><box size="0.4 0.4 0.02"/></geometry></collision>'
 )
 JOINT = (
-    '<joint name="{name}" type="{kind}"><parent link="post"/><child link="plate"/><origin xyz="0 0 0.65"/><axis xyz="{axis}"/>'
+    '<joint name="{name}" type="{kind}"><parent link="post"/><child link="plate"/>'
+    '<origin xyz="0 0 0.65"/><axis xyz="{axis}"/>'
     '<limit lower="0" upper="0.5" effort="10" velocity="1"/></joint>'
 )
 OBJECT = """urdf: {name}.urdf
 free: {free}
 attachments:
-  - {{name: handle, link: {link}, position: [-0.27, 0, {z}], approach: [1, 0, 0], closing: [0, 0, 1]}}
+  - name: handle
+    link: {link}
+    position: [-0.27, 0, {z}]
+    approach: [1, 0, 0]
+    closing: [0, 0, 1]
 """
 JOINTS = {
     "plate": ("slide", "prismatic", "-1 0 0"),
@@ -84,7 +94,7 @@ def cup(name: str = "cup", *, at: Sequence[float] = (0.8, 0.05, TOP)) -> dict[st
 def plates(
     kind: str = "plate", *, cups: int = 1, gap: float = 0.0, wall: float | None = None
 ) -> Scene:
-    """Return a plate with cups on it, `gap` above it; and maybe a wall so far behind the first [m]."""
+    """Return a plate with cups `gap` above it, and optionally a wall behind the first cup [m]."""
     objects = [{"name": "plate", "type": f"{kind}.yaml", "position": [0.8, 0.0, 0.0]}]
     objects += [
         cup(f"cup_{k}" if k else "cup", at=(0.8, 0.05 - 0.12 * k, TOP + gap)) for k in range(cups)
@@ -105,7 +115,7 @@ def plates(
 
 
 def slid(scene: Scene, value: float, *, steps: int = 30) -> Trajectory:
-    """Return a motion in which the plate's joint goes to a value, held by a hand that is not there."""
+    """Return a motion of the plate's joint to a value, grasped by no hand."""
     joint = scene.objects["plate"].object.coordinates.names[0]
     rows = np.column_stack(
         [np.tile(scene.start, (steps + 1, 1)), np.linspace(0.0, value, steps + 1)]

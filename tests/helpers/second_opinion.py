@@ -50,7 +50,7 @@ class SecondOpinion:
         self._waiting.clear()
 
     def verdicts(self, folder: Path) -> list[Verdict]:
-        """Judge what has been planned since this was asked last, each motion once; return the verdicts that do not agree."""
+        """Judge the motions planned since the last call; return the verdicts that disagree."""
         found, waiting, self._waiting = [], self._waiting, []
         self.planned += len(waiting)
         for plan in waiting:

@@ -40,14 +40,19 @@ _CABINET = """
   <link name="knob"/>
   <link name="flap"><collision><geometry><sphere radius="0.02"/></geometry></collision></link>
   <link name="lid"><collision><geometry><box size="0.5 0.5 0.01"/></geometry></collision></link>
-  <joint name="swing" type="revolute"><parent link="case"/><child link="arm"/><origin xyz="0.3 0.1 0.2" rpy="0.1 0.2 0.3"/>
+  <joint name="swing" type="revolute"><parent link="case"/><child link="arm"/>
+    <origin xyz="0.3 0.1 0.2" rpy="0.1 0.2 0.3"/>
     <axis xyz="0.6 0 0.8"/><limit lower="-1" upper="2" velocity="1.5" effort="1"/></joint>
-  <joint name="slide" type="prismatic"><parent link="arm"/><child link="tray"/><origin xyz="0.2 0 0.1" rpy="0.4 0 0"/>
+  <joint name="slide" type="prismatic"><parent link="arm"/><child link="tray"/>
+    <origin xyz="0.2 0 0.1" rpy="0.4 0 0"/>
     <axis xyz="0 -1 0"/><limit lower="0" upper="0.3" velocity="0.4" effort="1"/></joint>
-  <joint name="pin" type="fixed"><parent link="tray"/><child link="knob"/><origin xyz="0.15 0 0.05" rpy="0 0.3 0"/></joint>
-  <joint name="flap_hinge" type="revolute"><parent link="arm"/><child link="flap"/><origin xyz="0 0 0.2"/>
+  <joint name="pin" type="fixed"><parent link="tray"/><child link="knob"/>
+    <origin xyz="0.15 0 0.05" rpy="0 0.3 0"/></joint>
+  <joint name="flap_hinge" type="revolute"><parent link="arm"/><child link="flap"/>
+    <origin xyz="0 0 0.2"/>
     <axis xyz="1 0 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
-  <joint name="lid_hinge" type="revolute"><parent link="case"/><child link="lid"/><origin xyz="0 0 0.3"/>
+  <joint name="lid_hinge" type="revolute"><parent link="case"/><child link="lid"/>
+    <origin xyz="0 0 0.3"/>
     <axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
 </robot>"""
 _CABINET_FILE = """
@@ -87,7 +92,7 @@ def with_attachment(placed: PlacedObject, attachment: Attachment) -> PlacedObjec
 
 @cache
 def full_scene() -> Scene:
-    """Return the door's room with a drawer and a cabinet in it too, all of which can be grasped in every way there is."""
+    """Return the door's room with a drawer and a cabinet, with grasps of every kind."""
     scene, drawer = door_scene(), load_scene("drawer").objects["drawer"]
     state = np.array([CABINET_STATE[name] for name in cabinet().coordinates.names])
     case = PlacedObject(
@@ -148,14 +153,14 @@ def random_configurations(
     *,
     arena: float = 2.0,
 ) -> np.ndarray:
-    """Return configurations between limits, shape (count, n); the base within `arena` of the origin, at any heading."""
+    """Return configurations within limits, (count, n), the base within `arena`, at any heading."""
     low, high = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
     low[:2], high[:2] = -arena, arena
     return rng.uniform(low, high, (count, len(low)))
 
 
 def all_pairs(part: PhaseGeometry) -> pin.GeometryModel:
-    """Return the geometry of a phase as Pinocchio's own, with every pair, to ask for all distances without culling."""
+    """Return a phase's geometry as Pinocchio's own with all pairs, without culling."""
     geometry = pin.GeometryModel()
     for shape in part.shapes:
         geometry.addGeometryObject(shape)
@@ -165,7 +170,7 @@ def all_pairs(part: PhaseGeometry) -> pin.GeometryModel:
 
 
 def hand_off_the_handle(scene: Scene, row: np.ndarray, hinge: float, knob: float) -> float:
-    """Return the largest coordinate of the error between tool and grasp, [m] or [rad], by numeric Pinocchio."""
+    """Return the largest coordinate of the error between tool and grasp, by numeric Pinocchio."""
     placed = scene.objects["door"].with_state({"hinge": hinge, "knob": knob})
     attachment = placed.object.attachment("handle")
     tool = dataclasses.replace(scene, start=row[:9]).tool_placement()

@@ -1,4 +1,4 @@
-"""A robot with a telescope, written to files: a lift, four segments that one motor moves, a wrist, a hand that stands open."""
+"""Writes a robot with a telescope: a lift, four coupled segments, a wrist and an open hand."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ __all__ = [
 SEGMENT = 0.15  # [m] that each segment comes out
 FOLLOWERS = {f"out_{k}": "out_1" for k in (2, 3, 4)}
 _TOOL = (
-    '<joint name="tool_joint" type="fixed"><origin xyz="0.13 0 0" rpy="1.5707963267948966 0 1.5707963267948966"/>'
+    '<joint name="tool_joint" type="fixed">'
+    '<origin xyz="0.13 0 0" rpy="1.5707963267948966 0 1.5707963267948966"/>'
     '<parent link="hand"/><child link="tool"/></joint>'
 )
 
@@ -47,7 +48,8 @@ def joint(
     """Return a joint, with something inside it."""
     limit = "" if kind == "continuous" else f'lower="{limits[0]}" upper="{limits[1]}" '
     return (
-        f'<joint name="{name}" type="{kind}"><origin xyz="{at}"/><parent link="{parent}"/><child link="{child}"/>'
+        f'<joint name="{name}" type="{kind}"><origin xyz="{at}"/>'
+        f'<parent link="{parent}"/><child link="{child}"/>'
         f'<axis xyz="{axis}"/><limit {limit}velocity="{velocity}" effort="10"/>{inside}</joint>'
     )
 
@@ -160,16 +162,20 @@ def telescope_scene(folder: Path, *, base: str = "omni") -> Scene:
 
 
 def coupled_scene(folder: Path, *, base: str = "omni", more: str = "") -> Scene:
-    """Return a scene with a drawer and a robot whose joints follow each other backwards, faster, and turn as others slide.
+    """Return a scene with a drawer and a robot with several kinds of coupled joints.
 
     Args:
         folder: Where to write the robot.
         base: How it moves.
         more: Lines of its robot.yaml.
     """
-    said = "out_2: {joint: out_1, multiplier: 0.5}, out_3: {joint: out_1, multiplier: -0.5, offset: 0.15}, out_4: {joint: out_2}"
-    said += ", pitch_joint: {joint: lift, multiplier: 1.5, offset: -0.6}, roll_joint: {joint: yaw_joint, multiplier: -3.0}"
-    robot = write_telescope(folder, couplings=said, more=more)
+    couplings = (
+        "out_2: {joint: out_1, multiplier: 0.5}, "
+        "out_3: {joint: out_1, multiplier: -0.5, offset: 0.15}, out_4: {joint: out_2}, "
+        "pitch_joint: {joint: lift, multiplier: 1.5, offset: -0.6}, "
+        "roll_joint: {joint: yaw_joint, multiplier: -3.0}"
+    )
+    robot = write_telescope(folder, couplings=couplings, more=more)
     document = between_cheeks(robot, height=0.9, gap=0.1).document
     document["robot"] = {"name": robot.name, "base": base}
     return Scene.from_document(document, folder)

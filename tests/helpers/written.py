@@ -21,7 +21,7 @@ ROBOT = ("base_x", "base_y", "base_yaw", "lift", "elbow")
 
 @st.composite
 def trajectories(draw: st.DrawFn, largest: float | None = None) -> Trajectory:
-    """Return trajectories whose robot has up to five coordinates, with things held and carried through others."""
+    """Return trajectories of robots with up to five coordinates that grasp and carry objects."""
     robot, things = (
         draw(st.integers(3, 5)),
         draw(st.lists(st.sampled_from("abcde"), max_size=4, unique=True)),

@@ -1,4 +1,4 @@
-"""Limits of motions, by numbers alone: exported files are sampled at 1 kHz and compared with what URDFs and YAML files say.
+"""Checks limits of exported motions, sampled at 1 kHz, against URDF and YAML files.
 
 `files` and `check` share nothing with the package: they read a plan's .npz or CSV, scene, URDF and
 YAML files by themselves, with numpy and PyYAML. `plans` has plans made. `python -m tests.limits

@@ -1,4 +1,7 @@
-"""`python -m tests.limits FOLDER_OR_FILE ...`: judges saved plans and the tables beside them; `--make N` has them made first."""
+"""Judges saved plans and the tables beside them; `--make N` plans first.
+
+Usage: python -m tests.limits FOLDER_OR_FILE ...
+"""
 
 from __future__ import annotations
 
@@ -45,8 +48,10 @@ def main(arguments: list[str] | None = None) -> int:
             plans += 1
             wrong += bool(found)
             sys.stdout.write("".join(f"{file}: {excess}\n" for excess in found))
-    told = f"{plans} plans, {moments} moments, {wrong} plans with an excess; velocities up to {shares[0]:.9f} of their limits"
-    sys.stdout.write(f"{told}, accelerations up to {shares[1]:.9f}\n")
+    sys.stdout.write(
+        f"{plans} plans, {moments} moments, {wrong} plans with an excess; "
+        f"velocities up to {shares[0]:.9f} of their limits, accelerations up to {shares[1]:.9f}\n"
+    )
     return 1 if wrong else 0
 
 

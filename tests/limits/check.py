@@ -1,4 +1,4 @@
-"""Samples a motion at 1 kHz and compares positions, velocities, accelerations and jerks with limits."""
+"""Samples a motion at 1 kHz and compares it and its derivatives with limits."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ REST = 1e-6  # [m/s] or [rad/s] at both ends
 
 @dataclass(frozen=True)
 class Excess:
-    """A limit that is not kept: of what, by which coordinate, when [s], and what there is instead."""
+    """A violated limit: kind of quantity, coordinate, time [s] and value."""
 
     what: str
     name: str
@@ -28,12 +28,13 @@ class Excess:
     limit: float
 
     def __str__(self) -> str:
-        return f"{self.what} of {self.name} at {self.time:.3f} s: {self.value:.9g}, limit {self.limit:.9g}"
+        where = f"{self.what} of {self.name} at {self.time:.3f} s"
+        return f"{where}: {self.value:.9g}, limit {self.limit:.9g}"
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What came out: how many moments were looked at, what exceeds its limit, and how close rates come to theirs, as shares."""
+    """The number of samples, the violated limits, and the largest rates relative to limits."""
 
     moments: int
     found: list[Excess]
@@ -87,7 +88,7 @@ def _worst(
 
 
 def _sampled(motion: Motion, times: np.ndarray, order: int) -> np.ndarray:
-    """Return positions (0), velocities (1) or accelerations (2) at some times, shape (K, n), by Hermite's polynomials."""
+    """Return positions (0), velocities (1) or accelerations (2) at some times, shape (K, n)."""
     k = np.clip(np.searchsorted(motion.times, times, side="right") - 1, 0, len(motion.times) - 2)
     span = np.diff(motion.times)[k][:, None]
     s = (times - motion.times[k])[:, None] / span

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @dataclass(frozen=True)
 class Motion:
-    """KeyframeSampler of cubics in time: times (K,) [s], positions and velocities (K, n), by the names of the coordinates."""
+    """Cubics in time: times (K,) [s], positions and velocities (K, n), names of coordinates."""
 
     names: list[str]
     times: np.ndarray

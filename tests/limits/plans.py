@@ -14,7 +14,7 @@ _ROOMS = NUMBER - 20  # of the problems, those in random rooms
 
 
 def exported(folder: Path, count: int, *, first: int = 0, seed: int = 0) -> Iterator[Path]:
-    """Plan, and yield the .npz of every plan that succeeds; its table lies beside it. Files that are there are not made again.
+    """Plan, export a table, and yield the .npz of each success; existing files are reused.
 
     Args:
         folder: Where to write.

@@ -14,11 +14,13 @@ COMPARISONS: dict[type[ast.cmpop], str] = {
 }  # fmt: skip
 REVERSED: dict[type[ast.cmpop], str] = {ast.Lt: ">=", ast.LtE: ">", ast.Gt: "<=", ast.GtE: "<"}
 OPERATORS: dict[type[ast.operator], str] = {
-    ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*", ast.FloorDiv: "*", ast.Mod: "*", ast.Pow: "*",
+    ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*", ast.FloorDiv: "*", ast.Mod: "*",
+    ast.Pow: "*",
     ast.BitAnd: "|", ast.BitOr: "&",
 }  # fmt: skip
 NAMES = {
-    "min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum", "argmin": "argmax", "argmax": "argmin",
+    "min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum",
+    "argmin": "argmax", "argmax": "argmin",
     "any": "all", "all": "any", "floor": "ceil", "ceil": "floor", "first": "last", "last": "first",
     "lower": "upper", "upper": "lower",
 }  # fmt: skip
@@ -67,7 +69,7 @@ class _Text:
 
 
 def mutants(module: str, source: str) -> Iterator[Mutant]:
-    """Yield every fault of a module, in the order of its lines; texts, types and errors are kept."""
+    """Yield every fault of a module in the order of lines, except in texts, types and errors."""
     text, lines, tree = _Text(source), source.splitlines(), ast.parse(source)
     users, found = _find_users(tree), []
     for node in _nodes(tree):

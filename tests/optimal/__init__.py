@@ -1,1 +1,1 @@
-"""How much longer motions take than the fastest along the same paths, which TOPP-RA finds on a fine grid."""
+"""Compares durations of motions with the fastest along the same paths, by TOPP-RA."""

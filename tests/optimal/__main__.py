@@ -1,4 +1,7 @@
-"""`python -m tests.optimal --starts N --json FILE`: durations of plans beside the least ones along the same paths, as a table."""
+"""Prints a table of durations of plans beside the least ones along the same paths.
+
+Usage: python -m tests.optimal --starts N --json FILE
+"""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ _SAME = 1e-6  # [s] by which the motion, timed anew, may take another time
 
 
 def bound(scene: Scene, motion: Trajectory, fine: int = FINE) -> tuple[float, int]:
-    """Return the least time [s] under the limits of velocity, acceleration and torque, and in how many runs torques bound it.
+    """Return the least duration [s] under all limits, and the number of runs bound by torques.
 
     The motion is timed anew, which must come to the same. Whatever path TOPP-RA is asked about on
     the way, it is asked about again, at many more places. Stops and rests are those of the motion.

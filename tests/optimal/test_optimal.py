@@ -28,7 +28,7 @@ def test_bound_converges_with_the_grid() -> None:
 
 
 def test_bound_depends_on_limits() -> None:
-    """With a quarter of the acceleration, and twice the time, no velocity is the same share of its limit."""
+    """A quarter of the acceleration and half the velocity increase the least duration."""
     plan = drawer_plan()
     robot = plan.scene.robot
     weak = dataclasses.replace(

@@ -1,4 +1,7 @@
-"""`python -m tests.oracle FOLDER_OR_PLAN ...`: judges saved plans, and writes verdicts.jsonl and agreement.md into a folder."""
+"""Judges saved plans, and writes verdicts.jsonl and agreement.md into a folder.
+
+Usage: python -m tests.oracle FOLDER_OR_PLAN ...
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What plans say of themselves against what the oracle says: verdicts as lines of JSON, and a table."""
+"""Compares the plans' own verdicts with those of the oracle: JSON lines and a table."""
 
 from __future__ import annotations
 
@@ -34,7 +34,9 @@ def written(verdicts: Iterable[Verdict], folder: Path) -> None:
 
 
 def recorded(verdicts: Iterable[Verdict], record: Path) -> None:
-    """Write into a record of trials, as `oracle` of each, how many violations were found in its plan, the one named by its key.
+    """Add the number of violations in each trial's plan to a record of trials, as its `oracle`.
+
+    Plans are matched to trials by key.
 
     Raises:
         ValueError: Trials and plans are not the same, or a plan was not judged; nothing is written.

@@ -83,12 +83,12 @@ class Pairs:
         return self.world.things[one.owner].free
 
     def arcs(self, i: int) -> np.ndarray:
-        """How far a moving shape has moved, and against every one before it, from the first sample on, shape (1 + i, S)."""
+        """Return path lengths of a shape, alone and relative to earlier ones, shape (1 + i, S)."""
         steps = [self.gone[i][0], *((self.gone[i] + self.gone[j]).min(axis=0) for j in range(i))]
         return np.concatenate([np.zeros((1 + i, 1)), np.cumsum(steps, axis=1)], axis=1)
 
     def standing_bounds(self, i: int, rows: np.ndarray) -> np.ndarray:
-        """Lower bounds of distances of a moving shape to all that stands, at samples: shape (rows, standing)."""
+        """Return lower bounds of distances to all fixed shapes, shape (rows, fixed shapes)."""
         local = np.einsum("kba,rkb->rka", self.turns, self.centres[i][rows][:, None] - self.middles)
         outside = np.maximum(np.abs(local) - self.halves, 0.0)
         return np.sqrt(np.einsum("rka,rka->rk", outside, outside)) - self.moving[i].shape.radius
@@ -161,7 +161,9 @@ def check_collisions(
 def _deepest(
     one: Solid, other: Solid, arc: np.ndarray, active: np.ndarray, slack: np.ndarray
 ) -> tuple[float, int]:
-    """Return by how much two shapes overlap more than they may [m], negative if they never do as far as is known, and where.
+    """Return the largest excess of penetration over its limit [m], and its sample.
+
+    The excess is negative where the shapes provably keep the limit.
 
     Args:
         one: A shape.

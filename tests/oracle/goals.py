@@ -1,4 +1,4 @@
-"""What the steps ask for: reached at ends of phases, one after the other, the last at the end of the motion."""
+"""Checks that each step's goal is reached at the end of a phase, the last at the motion's end."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def _grasp(
 
 
 def touched(world: World, stage: Stage) -> Iterator[tuple[set[str], set[str]]]:
-    """Yield, for every `Touch` that is done at the end of a phase, the links that are brought there and what is there."""
+    """Yield the brought links and the targets of every `Touch` done at the end of a phase."""
     row = len(stage.times) - 1
     for step in world.plan.steps:
         if step["step"] != "Touch" or misses(world, step, End(world, [stage], 1)):
@@ -175,7 +175,7 @@ def touched(world: World, stage: Stage) -> Iterator[tuple[set[str], set[str]]]:
 
 
 def check_goals(world: World, stages: list[Stage]) -> Iterator[Violation]:
-    """Check that there are ends of phases, in order, at which the steps are done, and that nothing moves out of turn."""
+    """Check that the steps are done at ends of phases, in order, and nothing moves out of turn."""
     steps, ends = (
         world.plan.steps,
         [End(world, stages, number) for number in range(len(stages) + 1)],

@@ -1,4 +1,4 @@
-"""Fingers: where they are when the gripper is so far open, by the shapes of the hand, and how far open it has to be when."""
+"""Computes finger positions from the hand's shapes, and checks the gripper's opening."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Fingers:
         }
 
     def room(self, width: float, at: dict[str, float]) -> bool:
-        """Whether a bar of some width fits between the fingers where the tool is, along its x axis."""
+        """Return whether a bar of some width fits between the fingers along the tool's x axis."""
         bar, robot = coal.Box(width, THICK, THICK), self.robot
         links = robot.tree.links(
             {**robot.locked, **at},
@@ -100,7 +100,7 @@ def required(world: World, hold: Hold) -> float | None:
 
 
 def check_openings(world: World) -> Iterator[Violation]:
-    """While the hand holds, and on the way to what it holds next, it is as far open as the attachment says."""
+    """Check that the gripper is as far open as the attachment says, in a grasp and before it."""
     plan, fingers = world.plan, world.fingers
     for number, phase in enumerate(plan.phases):
         later = plan.phases[number + 1].holds if number + 1 < len(plan.phases) else ()

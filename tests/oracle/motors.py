@@ -1,4 +1,4 @@
-"""Torques of the arm, by what every body needs to move as it does: accelerations are differences of where it is, three at a time.
+"""Computes torques of the arm from the accelerations of all bodies, by central differences.
 
 A joint's torque is the work that the forces on all bodies do when that joint alone moves a little
 (virtual work). Nothing of rigid body algorithms is used: only where links are.
@@ -30,7 +30,7 @@ _NUDGE = 1e-6  # [m] or [rad]
 
 
 class Body(NamedTuple):
-    """What moves with a link: mass [kg], its centre in the frame of the link [m], inertia about that in its axes [kg·m²]."""
+    """A body fixed to a link: mass [kg], centre in the link's frame [m], inertia [kg·m²]."""
 
     link: str
     mass: float
@@ -103,7 +103,7 @@ def _needed(
     columns: list[int],
     gravity: np.ndarray,
 ) -> np.ndarray:
-    """Return what must be applied to some coordinates so that bodies move as they do, shape (S, k)."""
+    """Return the generalized forces for which bodies move as they do, shape (S, k)."""
     before, now, after = (places(part) for part in rows)
     found = np.zeros((len(h), len(columns)))
     nudges = [
@@ -183,8 +183,12 @@ def _in_hand(world: World, stage: Stage) -> Iterator[tuple[float, np.ndarray, np
     held = {hold.object for hold in stage.phase.holds if world.things[hold.object].free}
     held |= {name for name, (owner, _) in stage.riding.items() if owner in held}
     for name in sorted(held):
-        yield from _weights(world.things[name], {link: stage.tool.row(0).inverse() @ place.row(0)
-                            for (owner, link), place in stage.links.items() if owner == name})  # fmt: skip
+        places = {
+            link: stage.tool.row(0).inverse() @ place.row(0)
+            for (owner, link), place in stage.links.items()
+            if owner == name
+        }
+        yield from _weights(world.things[name], places)
 
 
 def _weights(
@@ -203,7 +207,7 @@ def _weights(
 def _pull(
     world: World, stage: Stage, thing: Thing, attachment: str, rows: list[np.ndarray], h: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least wrenches that move an object's joints as they move, shape (S, 6), and where the hand has it, (S, 3)."""
+    """Return least wrenches that move an object's joints, (S, 6), and the grasp's place, (S, 3)."""
     plan, grasp = world.plan, thing.grasps[attachment]
     names = list(thing.limits)
 
@@ -221,9 +225,19 @@ def _pull(
     z = [state(part) for part in rows]
     own = [Body(link, *thing.tree.urdf.weight(link)) for link in thing.tree.urdf.links]
     asked = _needed(places, own, z, h, list(range(len(names))), np.zeros(3))
-    riders = [Body(link, *weight) for name, (owner, link) in stage.riding.items() if owner == thing.name
-              for weight in _weights(world.things[name], {part: stage.links[owner, link].row(0).inverse() @ place.row(0)
-              for (one, part), place in stage.links.items() if one == name})]  # fmt: skip
+    riders = []
+    for name, (owner, link) in stage.riding.items():
+        if owner != thing.name:
+            continue
+        for weight in _weights(
+            world.things[name],
+            {
+                part: stage.links[owner, link].row(0).inverse() @ place.row(0)
+                for (one, part), place in stage.links.items()
+                if one == name
+            },
+        ):
+            riders.append(Body(link, *weight))
     asked += _needed(places, riders, z, h, list(range(len(names))), GRAVITY) if riders else 0.0
     speed, change = (z[2] - z[0]) / (2.0 * h[:, None]), (z[0] - 2.0 * z[1] + z[2]) / h[:, None] ** 2
     bolts = {latch["joint"]: latch["held_at"] for latch in thing.latches}
@@ -278,7 +292,7 @@ def _pull(
 
 
 def _carries(world: World, bodies: list[Body], places: Places, column: int, limit: float) -> bool:
-    """Whether a motor holds the arm itself wherever it is: if not, its effort is a placeholder, or a spring helps it."""
+    """Return whether a motor holds the arm everywhere; if not, its limit is a placeholder."""
     names = world.plan.names[: world.plan.robot_size]
     spans = [world.robot.limits[name][:2] for name in names]
     low, high = (np.clip([span[k] for span in spans], -np.pi, np.pi) for k in (0, 1))

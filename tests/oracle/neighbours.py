@@ -1,4 +1,4 @@
-"""Pairs that may be close for longer than a moment: those that a scene allows, and what is built as close as that.
+"""Finds pairs that may stay close: those that a scene allows, and those close by construction.
 
 A shape of an object that no hand can carry away, and another that is fixed there, are neighbours if
 they are closer than the clearance at the start or with every joint at zero: for as long as each of
@@ -31,7 +31,7 @@ VALUES = 150  # of a joint on its way to a limit
 
 @dataclass(frozen=True)
 class Pair:
-    """Two shapes; how deep they may overlap [m]; and joint, as "<object>.<joint>" → between which values."""
+    """Two shapes, their penetration limit [m], and "<object>.<joint>" → interval of the joint."""
 
     shapes: frozenset[tuple[str, int]]
     depth: float
@@ -39,7 +39,7 @@ class Pair:
 
 
 class Neighbours:
-    """All of a world."""
+    """The neighbouring pairs of a world."""
 
     def __init__(self, world: World) -> None:
         self.world, self.safe = world, float(world.plan.options["dist_safe"])
@@ -84,7 +84,7 @@ class Neighbours:
         )
 
     def during(self, stage: Stage, one: Solid, other: Solid) -> tuple[np.ndarray, np.ndarray]:
-        """Return at which samples two shapes need no clearance, and how deep they may overlap there [m]."""
+        """Return the samples at which shapes need no clearance, and their penetration limit."""
         close, depth = np.zeros(len(stage.times), bool), np.zeros(len(stage.times))
         shapes = frozenset((part.label, id(part.shape)) for part in (one, other))
         for pair in self.pairs:
@@ -103,7 +103,7 @@ class Neighbours:
         return close, depth
 
     def _found(self, state: dict[str, dict[str, float]]) -> list[Pair]:
-        """Return what is close where all objects that no hand carries away are in some state."""
+        """Return the close pairs in a state of all objects that no hand carries away."""
         links = {
             name: thing.tree.links(state[name], None, thing.tree.urdf.links)
             for name, thing in self.fixed.items()
@@ -167,7 +167,7 @@ class Neighbours:
         state: dict[str, float],
         other: tuple[Shape, Poses],
     ) -> tuple[tuple[float, float], float]:
-        """Return between which values of a joint a shape stays closer to another than the clearance, and how deep it gets."""
+        """Return the joint interval in which a shape violates the clearance, and the depth."""
         owner, _, link = label.partition(".")
         thing, deepest = self.fixed[owner], 0.0
 

@@ -1,4 +1,4 @@
-"""Reads a saved plan: an .npz with a JSON text `about`, `times` and `positions`, and with the knots of a curve if it has one."""
+"""Reads a saved plan: an .npz with JSON `about`, `times`, `positions`, and optionally a curve."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Hold:
 
 @dataclass(frozen=True)
 class Phase:
-    """A stretch of the motion, from waypoint `first` to waypoint `last`; `opening` of the gripper [m], or None: it rests."""
+    """A phase from waypoint `first` to `last`; `opening` of the gripper [m], None: at rest."""
 
     name: str
     first: int
@@ -74,7 +74,7 @@ class Curve:
     def derivative(
         self, moments: np.ndarray, order: int, number: np.ndarray | None = None
     ) -> np.ndarray:
-        """The positions (0), velocities (1) or accelerations (2) at some moments, of the cubics with these numbers."""
+        """Return values (0), velocities (1) or accelerations (2) of the cubics at some times."""
         k = (
             np.clip(np.searchsorted(self.times, moments, side="right") - 1, 0, len(self.times) - 2)
             if number is None
@@ -93,7 +93,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class SavedPlan:
-    """What a file says; `says` is the plan's own verdict: its violated constraints, by name and subject."""
+    """A plan's file; `says` is its own verdict: violated constraints by name and subject."""
 
     scene: dict[str, Any]
     folder: Path
@@ -122,7 +122,7 @@ class SavedPlan:
         )
 
     def fine(self) -> np.ndarray:
-        """Where all coordinates are all along: at the waypoints, and so often between them that nothing is missed."""
+        """Return the coordinates at the waypoints and at samples between them."""
         if self.curve is None:
             return self.positions
         return self.at(np.concatenate([self.curve.inside(_FINE).ravel(), self.times]))

@@ -1,4 +1,4 @@
-"""Placements at many moments at once: rotations, shape (S, 3, 3), and translations, shape (S, 3) [m]; S = 1 stands for all."""
+"""Placements at many samples: rotations (S, 3, 3) and translations (S, 3) [m]; S = 1: constant."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _alike(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    """Return the rotation by roll about x, then pitch about y, then yaw about z, axes fixed, shape (3, 3)."""
+    """Return the rotation by roll about x, then pitch about y, then yaw about z, shape (3, 3)."""
     (a, b, c), (u, v, w) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
     about_x = np.array([[1, 0, 0], [0, a, -u], [0, u, a]])
     about_y = np.array([[b, 0, v], [0, 1, 0], [-v, 0, b]])

@@ -30,7 +30,7 @@ def distance(one: object, here: Poses, other: object, there: Poses, k: int = 0) 
 def stands_on(
     world: World, links: dict[tuple[str, str], Poses], name: str, support: tuple[str, str]
 ) -> bool:
-    """Whether an object, lowered by 5 mm, overlaps a link by more than 2.5 mm, and, lifted as much, does not."""
+    """Return whether an object overlaps a link by over 2.5 mm at 5 mm lower, not 5 mm higher."""
     ours = world.things[name].tree.urdf.shapes
     theirs = [
         shape for shape in world.things[support[0]].tree.urdf.shapes if shape.link == support[1]
@@ -59,7 +59,7 @@ def riders(
     moving: set[tuple[str, str]],
     waiting: list[str],
 ) -> dict[str, tuple[str, str]]:
-    """Return what of some free objects nobody holds stands on a moving link, or on what does: object → (owner, link)."""
+    """Return object → (owner, link) of ungrasped free objects that rest on a moving link."""
     found: dict[str, tuple[str, str]] = {}
     below = sorted(moving)
     while below:

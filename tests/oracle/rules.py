@@ -72,7 +72,7 @@ def check_motion(world: World) -> Iterator[Violation]:
 
 
 def _rolling(world: World) -> Iterator[Violation]:
-    """Wheels do not go sideways; one that is steered lies on a circle that is wide enough; none is too fast.
+    """Check that wheels do not slip, exceed their speed, or turn more tightly than they can.
 
     Along a curve that is asked of velocities [m/s], at moments inside every cubic; otherwise of
     steps [m], of whose arc the chord points where the base heads half-way.
@@ -239,7 +239,7 @@ def _latches(world: World, stage: Stage) -> Iterator[Violation]:
 
 
 def _push(world: World, stage: Stage, hold: Hold) -> Iterator[Violation]:
-    """What is pushed goes ahead of the hand: where they touch, the link does not come back by more than rounding."""
+    """Check that a pushed link stays ahead of the hand at the contact, up to rounding."""
     grasp = world.things[hold.object].grasps[hold.attachment]
     if not grasp.pushed:
         return

@@ -27,7 +27,7 @@ _PARTS = 16  # of a step between two waypoints, to see how far it goes
 
 @dataclass(frozen=True)
 class Solid:
-    """A shape that belongs to a link of an owner ("robot", an object or an obstacle), and where it is."""
+    """A shape of an owner's link, and its poses; owners: "robot", an object or an obstacle."""
 
     owner: str
     link: str
@@ -86,8 +86,9 @@ class World:
             part for item in scene.get("obstacles") or () for part in self._obstacle(item)
         ]
         if scene.get("floor", True):
-            ground = Shape(FLOOR, coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0), IDENTITY, np.array([0.0, 0.0, -50.0]),
-                           np.array([1e3, 1e3, 50.0]), 1e3)  # fmt: skip
+            half_space = coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
+            middle, half = np.array([0.0, 0.0, -50.0]), np.array([1e3, 1e3, 50.0])
+            ground = Shape(FLOOR, half_space, IDENTITY, middle, half, 1e3)
             self.obstacles.append(Solid(FLOOR, "", ground, IDENTITY))
         start = scene["start"]
         arm = start.get("arm", "home")
@@ -150,7 +151,7 @@ class World:
         return next(f[1] for grasp in thing.grasps.values() for f in grasp.freedoms if f[0] == own)
 
     def front(self, opening: float | None) -> Poses:
-        """The hand's foremost point, in the tool's frame: as far ahead as any of its touch links reaches, so far open."""
+        """Return the foremost point of the touch links in the tool's frame, at an opening [m]."""
         robot, wall = (
             self.robot,
             coal.Halfspace(np.array([0.0, 0.0, -1.0]), -1.0),
@@ -169,7 +170,7 @@ class World:
 
     @cached_property
     def resting(self) -> np.ndarray:
-        """For every step between waypoints, whether robot and objects stand still; freedoms of grasps are not looked at."""
+        """Return for every step between waypoints whether robot and objects stand still."""
         things = {
             f"{name}.{joint}" for name, thing in self.things.items() for joint in thing.limits
         }
@@ -199,7 +200,7 @@ class World:
         )
 
     def opened(self, number: int) -> np.ndarray:
-        """Return where the fingers' joints are at a phase's waypoints, shape (T, k): they move from the first to the second."""
+        """Return the fingers' joints at a phase's waypoints, (T, k); only the first step moves."""
         phases, fingers = self.plan.phases, self.fingers
         phase = phases[number]
         here = fingers.at(phase.opening)
@@ -216,7 +217,7 @@ class World:
     def samples(
         self, number: int, length: float = LENGTH, angle: float = ANGLE
     ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], np.ndarray]:
-        """Return times, coordinates, where the fingers' joints are, and which rows are waypoints, of a phase.
+        """Return times, coordinates, finger joints and a mask of waypoints of a phase's samples.
 
         From one sample to the next no coordinate changes by more than `length` [m] or `angle`
         [rad].
@@ -269,7 +270,7 @@ class World:
         )
 
     def stages(self) -> Iterator[Stage]:
-        """Yield the phases, one after the other; free objects stay where the phase before has left them."""
+        """Yield the phases in order; free objects keep the poses of the phase before."""
         free = {name: thing.at for name, thing in self.things.items() if thing.free}
         upright: dict[str, np.ndarray] = {}
         robot, plan = self.robot, self.plan
@@ -382,7 +383,7 @@ class World:
         links: dict[tuple[str, str], Poses],
         free: dict[str, Poses],
     ) -> list[str]:
-        """Move what is held with what holds it, from where it was when that took hold; return what that is."""
+        """Move attached objects with the links that carry them; return the objects' names."""
         carried = []
         for hold in phase.holds:
             if not self.things[hold.object].free:

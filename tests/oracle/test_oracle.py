@@ -1,4 +1,4 @@
-"""The oracle finds what is wrong with changed plans, nothing with good ones, and shares nothing with the package."""
+"""The oracle finds the faults of changed plans, none in good ones, and imports no vkc_pin."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ def test_changes_are_found(
 
 @pytest.mark.parametrize("base", ["differential", "ackermann"])
 def test_bases_on_wheels(base: str, tmp_path: Path) -> None:
-    """Good plans pass; one on which the base slips, turns in place where it cannot, or whose wheels are too fast, does not."""
+    """Good plans pass; those whose base slips, turns against its kinematics or is too fast fail."""
     robot = {"base": base, **({"turning_radius": 0.8} if base == "ackermann" else {})}
     plan = vkc.plan(hall(**robot), [vkc.GoTo(1.5, 0.8, 0.3)])
     assert plan.success, plan.summary()
@@ -213,7 +213,7 @@ def test_bases_on_wheels(base: str, tmp_path: Path) -> None:
 
 
 def test_clearance_is_measured(plans: dict[str, Path], tmp_path: Path) -> None:
-    """A ball 15 mm above the robot's top plate, at the highest of its shapes there, is too close, and at 25 mm it is not."""
+    """A ball 15 mm above the robot's highest shape is too close; at 25 mm it is not."""
 
     def ball(height: float) -> Callable[[Content], None]:
         def change(c: Content) -> None:
@@ -239,7 +239,7 @@ def test_clearance_is_measured(plans: dict[str, Path], tmp_path: Path) -> None:
 
 
 def test_what_stands_in_a_drawer_goes_with_it(plans: dict[str, Path], tmp_path: Path) -> None:
-    """A cup in the drawer's tray is 0.3 m further out at the end, towards the robot; nothing says that its place has changed."""
+    """A cup in the drawer's tray moves 0.3 m with it, although the plan does not mention it."""
     path = changed(plans["drawer"], tmp_path / "changed.npz", _with_cup)
     stages = list(World(read_plan(path)).stages())
     assert [stage.riding for stage in stages[:-1]] == [{}] * (len(stages) - 1)
@@ -257,7 +257,10 @@ def _with_cup(c: Content) -> None:
 
 
 def test_what_stands_on_something_that_tilts_tips(plans: dict[str, Path], tmp_path: Path) -> None:
-    """A cup on the open door of a dishwasher, which is closed a little in another plan; nobody holds it, as is found, too."""
+    """A cup on a dishwasher's door tips over when another plan closes the door a little.
+
+    Nobody grasps the cup; the oracle finds that too.
+    """
 
     def change(c: Content) -> None:
         washer = next(item for item in c["scene"]["objects"] if item["type"] == "dishwasher")

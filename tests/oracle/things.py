@@ -1,4 +1,4 @@
-"""The robot and the objects of a scene, as their files describe them: kinematics, limits, grasps, latches."""
+"""Reads the robot and the objects of a scene: kinematics, limits, grasps and latches."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["Grasp", "Robot", "Thing", "Tree", "load_robot", "load_thing"]
 
 
 class Tree:
-    """The kinematics of a URDF, by Pinocchio, on a planar joint if it drives, so high above the floor [m]."""
+    """The kinematics of a URDF, by Pinocchio, on a planar joint at a height [m] if it drives."""
 
     def __init__(self, urdf: Urdf, *, drives: bool, height: float = 0.0) -> None:
         self.urdf = urdf
@@ -85,7 +85,7 @@ class Tree:
 
 @dataclass(frozen=True)
 class Grasp:
-    """An attachment: the tool in a link's frame is place · J(v) · standoff back along the tool's z axis.
+    """An attachment: the tool's pose in a link is place · J(v) · standoff along the tool's −z.
 
     `freedoms` are (name of the coordinate in the object, slides or not, axis, lower, upper); those
     that turn do so about an axis through a point of `through`. Of a grasp that is `pushed`, the
@@ -118,7 +118,7 @@ class Grasp:
 
 @dataclass(frozen=True)
 class Thing:
-    """An object: where it stands, its kinematics and joint limits (lower, upper, velocity, acceleration), grasps, latches."""
+    """An object: placement, kinematics, joint limits (lower, upper, velocity, acceleration)."""
 
     name: str
     tree: Tree
@@ -140,7 +140,7 @@ class Thing:
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot: `arm` are its planned joints; `exempt` pairs of links that need no check; `gripper` where fingers close, open.
+    """A robot: planned joints `arm`; pairs of links `exempt` from checks; finger joints `gripper`.
 
     `coupled` joints move with one of `arm`: joint → (that one, factor, offset).
     """
@@ -308,7 +308,7 @@ def _grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[str]) -
 def load_robot(
     item: Mapping[str, Any] | str, folder: Path, arm: list[str], height: float | None
 ) -> Robot:
-    """Return the robot of a scene's `robot`; `arm` are its planned joints, which a saved motion names."""
+    """Return a scene's robot; `arm` are its planned joints, which a saved plan names."""
     about = {"name": item} if isinstance(item, str) else dict(item)
     file = _robot_file(about["name"], folder)
     own: dict[str, Any] = {"urdf": file.name}
@@ -410,7 +410,7 @@ def load_robot(
 def _coupled(
     urdf: Urdf, stated: Mapping[str, Any], arm: list[str]
 ) -> dict[str, tuple[str, float, float]]:
-    """Return the joints that move with a planned one, and how: what leads both may be either, or a third."""
+    """Return mimicking joint → (planned joint, factor, offset)."""
     follows = {joint: how for joint in urdf.joints if (how := urdf.mimics(joint)) is not None}
     for joint, said in stated.items():
         about = {"joint": said} if isinstance(said, str) else said

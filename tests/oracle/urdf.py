@@ -158,7 +158,7 @@ class Urdf:
         return 0.0 if limit is None else float(limit.get("effort", 0.0))
 
     def weight(self, link: str) -> tuple[float, np.ndarray, np.ndarray]:
-        """Return mass [kg], centre of mass [m] and inertia about that [kg·m²] of a link, in its frame."""
+        """Return mass [kg], centre of mass [m] and central inertia [kg·m²] in the link's frame."""
         inertial = next(
             item for item in self.root.findall("link") if item.get("name") == link
         ).find("inertial")

@@ -22,7 +22,7 @@ def record(
     arm: float,
     blame: str = "",
 ) -> dict[str, Any]:
-    """Return a record; `blame` is "status" or "status: constraint subject", nothing for a success."""
+    """Return a record; `blame` is "status" or "status: constraint subject", None for a success."""
     status, _, constraint = (blame or "success").partition(": ")
     found = {
         "scene": scene,

@@ -1,4 +1,4 @@
-"""The sixty problems: the same every time, and none that cannot be done for want of room or reach."""
+"""The sixty problems are reproducible, and none is infeasible for lack of space or reach."""
 
 from __future__ import annotations
 

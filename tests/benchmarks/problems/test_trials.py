@@ -19,7 +19,7 @@ def drawn() -> vkc.Plan:
 
 
 def test_objective_is_that_of_the_solver(drawn: vkc.Plan) -> None:
-    """A grasp without freedoms: all coordinates count, and the last round that was accepted has the motion's value."""
+    """Without freedoms of the grasp, all coordinates count, and the last accepted round agrees."""
     assert drawn.success, drawn.summary()
     (last, *_) = [row["objective"] for row in reversed(drawn.history) if row["accepted"]]
     assert trials.compute_objective(drawn) == pytest.approx(last, rel=1e-6)

@@ -20,13 +20,20 @@ from vkc_pin.benchmarks.robot_object_matrix.pairs import load_description
 # A box with a drawer that is pulled towards +y, and a lamp beside it.
 DESK = """<robot name="desk">
   <link name="room"/>
-  <link name="case"><collision><origin xyz="0 0 0.4"/><geometry><box size="0.5 0.5 0.8"/></geometry></collision></link>
+  <link name="case">
+    <collision><origin xyz="0 0 0.4"/><geometry><box size="0.5 0.5 0.8"/></geometry></collision>
+  </link>
   <link name="tray"><collision><geometry><box size="0.3 0.02 0.1"/></geometry></collision>
-    <collision name="handle"><origin xyz="0 0.08 0"/><geometry><box size="0.3 0.02 0.02"/></geometry></collision></link>
-  <link name="lamp"><collision><origin xyz="1 0 0.5"/><geometry><box size="0.2 0.2 1.0"/></geometry></collision></link>
+    <collision name="handle">
+      <origin xyz="0 0.08 0"/><geometry><box size="0.3 0.02 0.02"/></geometry>
+    </collision></link>
+  <link name="lamp">
+    <collision><origin xyz="1 0 0.5"/><geometry><box size="0.2 0.2 1.0"/></geometry></collision>
+  </link>
   <joint name="stands" type="fixed"><parent link="room"/><child link="case"/></joint>
   <joint name="beside" type="fixed"><parent link="room"/><child link="lamp"/></joint>
-  <joint name="slide" type="prismatic"><parent link="case"/><child link="tray"/><origin xyz="0 0.28 0.6"/><axis xyz="0 1 0"/>
+  <joint name="slide" type="prismatic">
+    <parent link="case"/><child link="tray"/><origin xyz="0 0.28 0.6"/><axis xyz="0 1 0"/>
     <limit lower="0" upper="0.3" effort="1" velocity="1"/></joint>
 </robot>"""
 

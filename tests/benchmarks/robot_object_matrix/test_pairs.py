@@ -23,7 +23,8 @@ from vkc_pin.world.scene.scene import START_CLEARANCE
 
 SMOOTH = """<robot name="smooth"><link name="frame"/>
 <link name="block"><collision><geometry><box size="0.4 0.4 0.4"/></geometry></collision></link>
-<joint name="slide" type="prismatic"><parent link="frame"/><child link="block"/><origin xyz="0 0 0.5"/><axis xyz="-1 0 0"/>
+<joint name="slide" type="prismatic">
+<parent link="frame"/><child link="block"/><origin xyz="0 0 0.5"/><axis xyz="-1 0 0"/>
 <limit lower="0" upper="0.3" effort="1" velocity="1"/></joint></robot>"""
 
 
@@ -125,8 +126,14 @@ def test_high_object_is_unreachable(husky: vkc.Robot, tmp_path: Path) -> None:
         '<link name="frame"><collision><origin xyz="0 0 0.1"/>'
         '<geometry><box size="0.2 0.2 0.2"/></geometry></collision></link>'
     )
-    bar = '<link name="bar"><collision><geometry><box size="0.02 0.2 0.02"/></geometry></collision></link>'
-    fixed = '<joint name="on" type="fixed"><parent link="block"/><child link="bar"/><origin xyz="-0.26 0 0"/></joint>'
+    bar = (
+        '<link name="bar"><collision><geometry><box size="0.02 0.2 0.02"/></geometry></collision>'
+        "</link>"
+    )
+    fixed = (
+        '<joint name="on" type="fixed"><parent link="block"/><child link="bar"/>'
+        '<origin xyz="-0.26 0 0"/></joint>'
+    )
     high = SMOOTH.replace("0 0 0.5", "0 0 3.5").replace('<link name="frame"/>', foot)
     found = make_pair(
         husky,

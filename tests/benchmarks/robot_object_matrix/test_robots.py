@@ -1,4 +1,4 @@
-"""Robots from their files from the command line: one that reaches its poses, and one that is none."""
+"""Robots are checked from the command line: one reaches its poses, one is no robot."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Own terms of recipes: what each kind says, against numbers; episodes that keep to them and say so; what is refused."""
+"""Terms of recipes: the value of each kind, episodes that satisfy them, and error messages."""
 
 from __future__ import annotations
 

@@ -278,7 +278,7 @@ def _srdf(arguments: argparse.Namespace) -> int:
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of the command line; each command sets `run`, a function of the arguments."""
+    """Return the command line parser; each command sets `run`, a function of the arguments."""
     from vkc_pin.benchmarks.harness.record import find_versions
 
     parser = argparse.ArgumentParser(

@@ -1,4 +1,4 @@
-"""Defines the commands `generate`, which makes a dataset, and `dataset check`, which validates one."""
+"""Defines the commands `generate` and `dataset check`, which make and validate a dataset."""
 
 from __future__ import annotations
 

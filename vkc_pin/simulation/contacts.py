@@ -159,7 +159,8 @@ def find_unplanned_contacts(
 ) -> tuple[Contact, ...]:
     """Return the contacts that the plan does not have.
 
-    A contact is unplanned if the links stay apart in the plan for `CONTACT_WINDOW` before and after it.
+    A contact is unplanned if the links stay apart in the plan for `CONTACT_WINDOW` before and
+    after it.
 
     Args:
         scene: Scene of the plan.

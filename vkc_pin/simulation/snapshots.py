@@ -105,7 +105,7 @@ class RenderedScene:
     def iterate_states(
         self, times: Floats, size: tuple[int, int]
     ) -> Iterator[tuple[Any, Any, Any]]:
-        """Yield `MjData`, `MjvScene` and `MjrContext` for images of a size at times [s], shape (K,).
+        """Yield `MjData`, `MjvScene` and `MjrContext` for images at times [s], shape (K,).
 
         Raises:
             VkcError: OpenGL is not available without a display.

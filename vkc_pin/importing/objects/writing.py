@@ -160,17 +160,17 @@ def _format_joint(joint: Joint) -> list[str]:
         f'    <axis xyz="{_format_numbers(joint.axis)}"/>',
     ]
     velocity = joint.velocity or DEFAULT_VELOCITY
-    ends = (
-        ""
-        if joint.limits is None
-        else f'lower="{_format_numbers(joint.limits[:1])}" upper="{_format_numbers(joint.limits[1:])}" '
-    )
+    ends = ""
+    if joint.limits is not None:
+        lower, upper = _format_numbers(joint.limits[:1]), _format_numbers(joint.limits[1:])
+        ends = f'lower="{lower}" upper="{upper}" '
     if joint.damping or joint.friction:
         damping, friction = _format_numbers([joint.damping]), _format_numbers([joint.friction])
         lines.append(f'    <dynamics damping="{damping}" friction="{friction}"/>')
     return [
         *lines,
-        f'    <limit {ends}velocity="{_format_numbers([velocity])}" effort="{_format_numbers([_EFFORT])}"/>',
+        f'    <limit {ends}velocity="{_format_numbers([velocity])}" '
+        f'effort="{_format_numbers([_EFFORT])}"/>',
         "  </joint>",
     ]
 

@@ -75,7 +75,7 @@ class HandClearance:
     def find_obstruction(
         self, tool: pin.SE3, link: str, *, extra_clearance: float = 0.0
     ) -> Obstruction | None:
-        """Return what obstructs a hand at `tool`, in the object's base frame; None if nothing does."""
+        """Return what obstructs a hand at `tool`, in the object's base frame, or None."""
         is_held = self.links == link
         for (shape, where), box, touches in zip(
             self._hand, self._hand_boxes, self._touch, strict=True
@@ -98,7 +98,7 @@ class HandClearance:
 
 
 def _transform_box(box: tuple[Floats, Floats], where: pin.SE3) -> tuple[Floats, Floats]:
-    """Return the lower and upper corner of a box, given by centre and half extents, in the world."""
+    """Return the lower and upper corner, in the world, of a box (centre, half extents)."""
     centre, extent = where.rotation @ box[0] + where.translation, np.abs(where.rotation) @ box[1]
     return centre - extent, centre + extent
 

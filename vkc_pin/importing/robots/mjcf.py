@@ -147,9 +147,8 @@ class _Converter:
             kind = int(model.jnt_type[joint])
             if kind not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
                 if not root:
-                    self._result.notes.append(
-                        f"joint {self._get_name('joint', joint)} is locked: a URDF has no such joint"
-                    )
+                    name = self._get_name("joint", joint)
+                    self._result.notes.append(f"joint {name} is locked: a URDF has no such joint")
                 elif kind == kinds.mjJNT_FREE:
                     placement = pin.SE3.Identity()  # a mobile robot, independent of its pose
                 continue

@@ -310,7 +310,8 @@ class _Importer:
             if key != "srdf" or (self._folder / value).is_file()
         }
         ElementTree.indent(self._file.root)
-        source = f"{self._source.file.path.name} ({self._source.kind}) {get_origin_marker('import-robot')}"
+        file, marker = self._source.file.path.name, get_origin_marker("import-robot")
+        source = f"{file} ({self._source.kind}) {marker}"
         head = format_comment(f"Made of {source}. Units: m, rad, s.")
         body = yaml.safe_dump(settings, sort_keys=False, default_flow_style=None, width=120)
         (self._folder / "robot.yaml").write_text(head + body, encoding="utf-8")

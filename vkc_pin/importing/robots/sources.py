@@ -73,9 +73,8 @@ def read_source(
         kind = "URDF"
     root = parse_xml(text, file)
     if dropped := sorted({element.tag for element in root if element.tag not in _KEPT}):
-        notes.append(
-            f"left out elements that a URDF does not have: {', '.join(f'<{tag}>' for tag in dropped)}"
-        )
+        tags = ", ".join(f"<{tag}>" for tag in dropped)
+        notes.append(f"left out elements that a URDF does not have: {tags}")
         root[:] = [element for element in root if element.tag in _KEPT]
     notes += _complete_limits(root)
     check_tree(file, root)

@@ -158,7 +158,7 @@ class Squeezes:
         return np.asarray(where), np.asarray(turn.T @ (where - data.xpos[body]))
 
     def _compute_wrench(self, data: Any, squeeze: _Squeeze, tool: Floats) -> Floats | None:
-        """Return the hand's force and torque on the grasped link, shape (6,), at the tool's origin."""
+        """Return the hand's wrench on the grasped link at the tool's origin, shape (6,)."""
         pairs = np.asarray(data.contact.geom).reshape(-1, 2)
         ahead = squeeze.hand[pairs[:, 0]] & squeeze.link[pairs[:, 1]]
         back = squeeze.link[pairs[:, 0]] & squeeze.hand[pairs[:, 1]]

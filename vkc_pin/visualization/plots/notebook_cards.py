@@ -57,7 +57,8 @@ def motion_html(plan: CheckedMotion) -> str:
     m = plan.metrics
     good = plan.success
     status = "success" if good else f"FAILED, {plan.status}"
-    head = f'<b>{escape(plan.scene.name)}: <span style="color: {_GOOD if good else _BAD}">{escape(status)}</span></b>'
+    mark = f'<span style="color: {_GOOD if good else _BAD}">{escape(status)}</span>'
+    head = f"<b>{escape(plan.scene.name)}: {mark}</b>"
     phases = escape(", ".join(phase.name for phase in plan.trajectory.phases))
     rows = [
         ("base", _format_metric(m, "base_path_length", "m", 2)),
@@ -82,7 +83,8 @@ def _render_table(rows: list[tuple[str, str]]) -> str:
     """Render a table whose values are HTML."""
     cell = "text-align: left; padding: 1px 10px 1px 0; background: none"
     body = "".join(
-        f'<tr><td style="{cell}; white-space: nowrap">{escape(name)}</td><td style="{cell}">{value}</td></tr>'
+        f'<tr><td style="{cell}; white-space: nowrap">{escape(name)}</td>'
+        f'<td style="{cell}">{value}</td></tr>'
         for name, value in rows
     )
     return f'<table style="border: none; margin: 6px 0">{body}</table>'

@@ -133,13 +133,22 @@ class Recorder:
         self.record.write_text(json.dumps(sorted(self.lines)), encoding="utf-8")
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    """Act as a plugin in the process that runs the tests."""
+def start_plugin() -> Recorder | None:
+    """Replace a module or record lines, before `tests/conftest.py` imports the package."""
     does, *arguments = json.loads(os.environ["MUTANTS"])
-    if does == "replace":
-        sys.meta_path.insert(0, Replacer(*arguments))
-    else:
-        config.pluginmanager.register(Recorder(*arguments))
+    if does == "record":
+        return Recorder(*arguments)
+    sys.meta_path.insert(0, Replacer(*arguments))
+    return None
+
+
+PLUGIN = start_plugin() if __name__ != "__main__" and "MUTANTS" in os.environ else None
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Register the recorder in the process that runs the tests."""
+    if PLUGIN is not None:
+        config.pluginmanager.register(PLUGIN)
 
 
 def main() -> int:

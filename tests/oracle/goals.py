@@ -50,62 +50,19 @@ def _target(goal: Any) -> Poses:
     return pose(array) if array.shape == (3,) else pose(array[:3, 3], array[:3, :3])
 
 
-def misses(world: World, step: dict[str, Any], end: End) -> list[tuple[str, float, str]]:
-    """Return what of a step is not done at the end of a phase: subject, by how much, detail."""
-    far, turn = 1e-3, 1e-3  # [m], [rad]
-    kind, found = step["step"], []
+FAR, TURN = 1e-3, 1e-3  # [m], [rad]
+Miss = tuple[str, float, str]
+"""Subject, excess over the tolerance, detail."""
 
-    def expect(subject: str, error: float, limit: float, what: str) -> None:
+
+def misses(world: World, step: dict[str, Any], end: End) -> list[Miss]:
+    """Return the parts of a step's goal that are not reached at the end of a phase."""
+    kind, found = step["step"], []
+    for subject, error, limit, what in _errors(world, step, end):
         if not error <= limit + 1e-7:
             found.append((subject, error - limit, f"{kind}: {what} off by {error:.5f}"))
-
-    if kind == "Actuate":
-        for joint, goal in step["joints"].items():
-            limit = far if world.things[step["object"]].slides(joint) else turn
-            expect(
-                f"{step['object']}.{joint}",
-                abs(end.value(f"{step['object']}.{joint}") - goal),
-                limit,
-                "value",
-            )
-    elif kind == "GoTo":
-        expect(
-            "base",
-            float(np.hypot(end.value("base_x") - step["x"], end.value("base_y") - step["y"])),
-            far,
-            "place",
-        )
-        if step["yaw"] is not None:
-            off = abs((end.value("base_yaw") - step["yaw"] + np.pi) % (2 * np.pi) - np.pi)
-            expect("base heading", off, turn, "heading")
-    elif kind in ("Reach", "Touch", "Place"):
-        base = (
-            f"{step['object']}.{world.things[step['object']].tree.urdf.base}"
-            if kind == "Place"
-            else step["frame"]
-        )
-        here, there = end.frame(base), _target(step.get("pose", step.get("target")))
-        expect(base or "tool", float(np.linalg.norm(here.at - there.at)), far, "place")
-        if np.shape(step.get("pose", step.get("target"))) == (4, 4):
-            expect(
-                base or "tool", float(turn_between(here.turn, there.turn)[0]), turn, "orientation"
-            )
-        elif kind == "Place":
-            stood = world.things[step["object"]].at.turn[0]
-            up = (
-                np.array([0.0, 0.0, 1.0])
-                if step["object"] in {hold.object for hold in world.held}
-                else stood[2]
-            )
-            now = here.turn[0, 2]  # the world's vertical, seen from the object
-            expect(
-                base or "",
-                float(np.arctan2(np.linalg.norm(np.cross(up, now)), up @ now)),
-                turn,
-                "vertical",
-            )
     if kind == "Grasp":
-        found += _grasp(world, step, end, far, turn)
+        found += _grasp(world, step, end)
     if kind in ("Place", "Release"):
         for hold in end.after:
             if step["object"] in (None, hold.object):
@@ -113,9 +70,49 @@ def misses(world: World, step: dict[str, Any], end: End) -> list[tuple[str, floa
     return found
 
 
-def _grasp(
-    world: World, step: dict[str, Any], end: End, far: float, turn: float
-) -> list[tuple[str, float, str]]:
+def _errors(
+    world: World, step: dict[str, Any], end: End
+) -> Iterator[tuple[str, float, float, str]]:
+    """Yield the subjects, errors, tolerances and names of what a step sets by value or pose."""
+    kind = step["step"]
+    if kind == "Actuate":
+        for joint, goal in step["joints"].items():
+            name = f"{step['object']}.{joint}"
+            limit = FAR if world.things[step["object"]].slides(joint) else TURN
+            yield name, abs(end.value(name) - goal), limit, "value"
+    elif kind == "GoTo":
+        x, y = end.value("base_x") - step["x"], end.value("base_y") - step["y"]
+        yield "base", float(np.hypot(x, y)), FAR, "place"
+        if step["yaw"] is not None:
+            off = abs((end.value("base_yaw") - step["yaw"] + np.pi) % (2 * np.pi) - np.pi)
+            yield "base heading", off, TURN, "heading"
+    elif kind in ("Reach", "Touch", "Place"):
+        yield from _pose_errors(world, step, end)
+
+
+def _pose_errors(
+    world: World, step: dict[str, Any], end: End
+) -> Iterator[tuple[str, float, float, str]]:
+    """Yield the errors of a frame that a step brings to a pose or point."""
+    frame, goal = step.get("frame"), step.get("pose", step.get("target"))
+    if step["step"] == "Place":
+        frame = f"{step['object']}.{world.things[step['object']].tree.urdf.base}"
+    here, there = end.frame(frame), _target(goal)
+    yield frame or "tool", float(np.linalg.norm(here.at - there.at)), FAR, "place"
+    if np.shape(goal) == (4, 4):
+        angle = float(turn_between(here.turn, there.turn)[0])
+        yield frame or "tool", angle, TURN, "orientation"
+    elif step["step"] == "Place":
+        held = step["object"] in {hold.object for hold in world.held}
+        stood = world.things[step["object"]].at.turn[0]
+        up = np.array([0.0, 0.0, 1.0]) if held else stood[2]
+        now = here.turn[0, 2]  # the world's vertical, seen from the object
+        tilt = float(np.arctan2(np.linalg.norm(np.cross(up, now)), up @ now))
+        yield frame or "", tilt, TURN, "vertical"
+
+
+def _grasp(world: World, step: dict[str, Any], end: End) -> list[Miss]:
+    """Return the distance and the angle between the hand and the grasp, if they are too large."""
     thing = world.things[step["object"]]
     used = [hold.attachment for hold in (*end.before, *end.after) if hold.object == step["object"]]
     name = step["attachment"] or next(iter(used), None)
@@ -124,25 +121,17 @@ def _grasp(
     for freedom, *_ in grasp.freedoms:
         index = world.plan.index(f"{step['object']}.{freedom}")
         values[freedom] = np.array([0.0 if index is None else end.stage.columns[row, index]])
-    right, hand = (
-        end.frame(f"{step['object']}.{grasp.link}") @ grasp.tool(values),
-        end.frame(step["by"]),
-    )
+    right = end.frame(f"{step['object']}.{grasp.link}") @ grasp.tool(values)
+    hand = end.frame(step["by"])
     hand = hand @ world.front(grasp.opening) if grasp.pushed else hand
-    off, angle = (
-        float(np.linalg.norm(hand.at - right.at)),
-        float(turn_between(hand.turn, right.turn)[0]),
-    )
-    subject = f"{step['object']}.{grasp.name}"
-    found = [(subject, off - far, f"Grasp: {off:.5f} m away")] if off > far + 1e-7 else []
-    return [
-        *found,
-        *(
-            [(subject, angle - turn, f"Grasp: turned by {angle:.5f} rad")]
-            if angle > turn + 1e-7
-            else []
-        ),
-    ]
+    off = float(np.linalg.norm(hand.at - right.at))
+    angle = float(turn_between(hand.turn, right.turn)[0])
+    subject, found = f"{step['object']}.{grasp.name}", []
+    if off > FAR + 1e-7:
+        found.append((subject, off - FAR, f"Grasp: {off:.5f} m away"))
+    if angle > TURN + 1e-7:
+        found.append((subject, angle - TURN, f"Grasp: turned by {angle:.5f} rad"))
+    return found
 
 
 def touched(world: World, stage: Stage) -> Iterator[tuple[set[str], set[str]]]:

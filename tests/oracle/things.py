@@ -305,20 +305,61 @@ def _grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[str]) -
     return Grasp(name, entry["link"], place, tuple(freedoms), tuple(through), standoff, firm, *own)
 
 
+def _robot_settings(file: Path) -> tuple[dict[str, Any], Path]:
+    """Return the contents of a robot.yaml, and it, or of the one beside a URDF that names it."""
+    if file.suffix == ".yaml":
+        return yaml.safe_load(file.read_text(encoding="utf-8")), file
+    settings = file.parent / "robot.yaml"
+    if settings.is_file():
+        beside = yaml.safe_load(settings.read_text(encoding="utf-8"))
+        if beside["urdf"] == file.name:
+            return beside, settings
+    return {"urdf": file.name}, file
+
+
+def _joint_limits(
+    urdf: Urdf,
+    joint: str,
+    coupled: Mapping[str, tuple[str, float, float]],
+    joints: Mapping[str, Any],
+) -> tuple[float, float, float, float]:
+    """Return lower, upper, velocity and acceleration of a joint and of those that follow it."""
+    members = {joint: (joint, 1.0, 0.0)} | {
+        name: how for name, how in coupled.items() if how[0] == joint
+    }
+    low, high, fastest, strongest = -np.inf, np.inf, np.inf, np.inf
+    for name, (_, factor, offset) in members.items():
+        least, most, fast = urdf.limits(name)
+        ends = [(end - offset) / factor for end in (least, most)]
+        low, high, said = max(low, min(ends)), min(high, max(ends)), joints.get(name, {})
+        fast = said.get("velocity", fast if 0.0 < fast < 1e3 else np.inf)
+        fastest = min(fastest, fast / abs(factor))
+        strongest = min(strongest, said.get("acceleration", np.inf) / abs(factor))
+    most = max(abs(factor) for _, factor, _ in members.values())
+    fastest = fastest if fastest < np.inf else np.pi / most
+    strongest = strongest if strongest < np.inf else 1.4 / most
+    return low, high, fastest, strongest
+
+
+def _rest(urdf: Urdf, joints: list[str], locked: Mapping[str, float]) -> dict[str, float]:
+    """Return the values at which joints are locked."""
+    rest = {}
+    for joint in joints:
+        low, high, _ = urdf.limits(joint)
+        rest[joint] = locked.get(joint, 0.0 if low <= 0.0 <= high else (low + high) / 2)
+    for joint in rest:
+        if (mimic := urdf.mimics(joint)) is not None and joint not in locked and mimic[0] in rest:
+            rest[joint] = mimic[1] * rest[mimic[0]] + mimic[2]
+    return rest
+
+
 def load_robot(
     item: Mapping[str, Any] | str, folder: Path, arm: list[str], height: float | None
 ) -> Robot:
     """Return a scene's robot; `arm` are its planned joints, which a saved plan names."""
     about = {"name": item} if isinstance(item, str) else dict(item)
     file = _robot_file(about["name"], folder)
-    own: dict[str, Any] = {"urdf": file.name}
-    if file.suffix != ".yaml" and (file.parent / "robot.yaml").is_file():
-        beside = yaml.safe_load((file.parent / "robot.yaml").read_text(encoding="utf-8"))
-        own, file = (
-            (beside, file.parent / "robot.yaml") if beside["urdf"] == file.name else (own, file)
-        )
-    elif file.suffix == ".yaml":
-        own = yaml.safe_load(file.read_text(encoding="utf-8"))
+    own, file = _robot_settings(file)
     urdf = read_urdf(file.parent / own["urdf"])
     tool = about.get("tool_frame") or own.get("tool_frame")
     if tool is None:
@@ -342,39 +383,14 @@ def load_robot(
     }
     coupled = _coupled(urdf, own.get("couplings") or {}, arm)
     for joint in arm:
-        members = {joint: (joint, 1.0, 0.0)} | {
-            name: how for name, how in coupled.items() if how[0] == joint
-        }
-        low, high, fastest, strongest = -np.inf, np.inf, np.inf, np.inf
-        for name, (_, factor, offset) in members.items():
-            least, most, fast = urdf.limits(name)
-            ends = [(end - offset) / factor for end in (least, most)]
-            low, high, said = max(low, min(ends)), min(high, max(ends)), joints.get(name, {})
-            fast = said.get("velocity", fast if 0.0 < fast < 1e3 else np.inf)
-            fastest, strongest = (
-                min(fastest, fast / abs(factor)),
-                min(strongest, said.get("acceleration", np.inf) / abs(factor)),
-            )
-        most = max(abs(factor) for _, factor, _ in members.values())
-        fastest, strongest = (
-            said if said < np.inf else unsaid / most
-            for said, unsaid in ((fastest, np.pi), (strongest, 1.4))
-        )
-        limits[joint] = (low, high, fastest, strongest)
+        limits[joint] = _joint_limits(urdf, joint, coupled, joints)
     gripper = {
         joint: (said["closed"], said["open"]) for joint, said in (own.get("gripper") or {}).items()
     }
     wide = {joint: opened for joint, (_, opened) in gripper.items()}
     locked = {**own.get("home", {}), **wide, **own.get("locked_joints", {})}
-    rest = {}
-    for joint in (
-        name for name in urdf.joints if urdf.moves(name) and name not in arm and name not in coupled
-    ):
-        low, high, _ = urdf.limits(joint)
-        rest[joint] = locked.get(joint, 0.0 if low <= 0.0 <= high else (low + high) / 2)
-    for joint in rest:
-        if (mimic := urdf.mimics(joint)) is not None and joint not in locked and mimic[0] in rest:
-            rest[joint] = mimic[1] * rest[mimic[0]] + mimic[2]
+    others = [j for j in urdf.joints if urdf.moves(j) and j not in arm and j not in coupled]
+    rest = _rest(urdf, others, locked)
     for joint, (master, factor, offset) in (
         (joint, urdf.mimics(joint) or ("", 0.0, 0.0)) for joint in rest
     ):

@@ -46,7 +46,7 @@ _MIN_ATTEMPTS = 40  # attempts before generation may fail
 _WATCHDOG = 3.0  # multiple of the planning time limit after which a process is terminated
 
 
-def generate(
+def generate(  # noqa: PLR0913 - keyword options of a public call
     recipe: str | Path | Mapping[str, Any] | Recipe,
     episodes: int,
     out: str | Path,
@@ -206,31 +206,16 @@ def _run_attempts(
     progress: bool,
 ) -> None:
     """Run attempts in the order of their numbers until there are enough episodes."""
-    document, fields = dataset.recipe.document, dataset.recipe.fields
-    clock, max_attempts = _Clock(), max(_MIN_ATTEMPTS, _MAX_ATTEMPTS_PER_EPISODE * register.wanted)
-    size, retried = fields.rooms.episodes * fields.variants, deque[int]()
+    fields, clock, retried = dataset.recipe.fields, _Clock(), deque[int]()
+    size = fields.rooms.episodes * fields.variants
     robots = prepare_robots(dataset.recipe, dataset.folder / "robots")
-
-    def tasks() -> Iterator[tuple[str, Any]]:
-        clock.start()  # the processes are running now
-        for block in itertools.count():
-            while retried:
-                number = retried.popleft()
-                yield str(number), (document, [number], robots)
-            if register.full or register.decided >= max_attempts:
-                return
-            numbers = range(block * size, (block + 1) * size)
-            missing = [number for number in numbers if str(number) not in journal.lines]
-            if missing:
-                yield ",".join(map(str, missing)), (document, missing, robots)
-
     journal.append({"session": {"jobs": jobs}})
     done = len(register.accepted)
     shown: dict[str, Any] = {"unit": "episode", "smoothing": 0.05, "disable": not progress}
     bar = tqdm(total=register.wanted, initial=done, **shown)
     outcomes = run_tasks(
         make_parts,
-        tasks(),
+        _iterate_tasks(dataset, register, journal, clock, retried, robots),
         jobs=jobs,
         scheduler=scheduler,
         dask=True,
@@ -260,6 +245,31 @@ def _run_attempts(
         raise KeyboardInterrupt(text) from None
     if not register.full:
         raise _make_shortage_error(dataset, register)
+
+
+def _iterate_tasks(
+    dataset: Dataset,
+    register: Register,
+    journal: Journal,
+    clock: _Clock,
+    retried: deque[int],
+    robots: Mapping[str, str],
+) -> Iterator[tuple[str, Any]]:
+    """Yield keys and tasks of blocks of attempts until there are enough; `retried` come first."""
+    document, fields = dataset.recipe.document, dataset.recipe.fields
+    max_attempts = max(_MIN_ATTEMPTS, _MAX_ATTEMPTS_PER_EPISODE * register.wanted)
+    size = fields.rooms.episodes * fields.variants
+    clock.start()  # the processes are running now
+    for block in itertools.count():
+        while retried:
+            number = retried.popleft()
+            yield str(number), (document, [number], robots)
+        if register.full or register.decided >= max_attempts:
+            return
+        numbers = range(block * size, (block + 1) * size)
+        missing = [number for number in numbers if str(number) not in journal.lines]
+        if missing:
+            yield ",".join(map(str, missing)), (document, missing, robots)
 
 
 def _make_shortage_error(dataset: Dataset, register: Register) -> VkcError:

@@ -101,7 +101,7 @@ def acquire_cache(planner: Planner | None) -> contextlib.AbstractContextManager[
     return (_shared if planner is None else check_instance(planner, Planner, "planner")).acquire()
 
 
-def plan(
+def plan(  # noqa: PLR0913 - keyword options of a public call
     scene: Scene,
     steps: Sequence[Step],
     *,

@@ -39,7 +39,7 @@ def compute_finite_limits(problem: TrajectoryProblem) -> tuple[Floats, Floats]:
     )
 
 
-def plan_by_sampling(
+def plan_by_sampling(  # noqa: C901, PLR0915 - sets up one planner, step by step
     own: PeerProblem,
     problem: TrajectoryProblem,
     seed: int,

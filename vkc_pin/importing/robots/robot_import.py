@@ -86,7 +86,7 @@ class ImportedRobot:
         return f"{self.diagnosis}\nwrote {self.folder}"
 
 
-def import_robot(
+def import_robot(  # noqa: PLR0913 - keyword options of a public call
     file: str | Path,
     folder: str | Path | None = None,
     *,

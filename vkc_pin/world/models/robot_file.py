@@ -99,7 +99,7 @@ def find_robot(name: str | Path) -> Path:
     return known[str(name)]
 
 
-def load_robot(
+def load_robot(  # noqa: PLR0913 - keyword options of a public call
     name: str | Path,
     *,
     base: Base = "omni",

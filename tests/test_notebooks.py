@@ -47,7 +47,7 @@ EXPECTED: dict[str, dict[str, tuple[str, ...]]] = {
         "spy": (PICTURE,),
         "along": (PICTURE,),
         "convergence": (PICTURE,),
-        "start": (r"seed: [1-9]\d* violations",),
+        "start": (r"guess: [1-9]\d* violations",),
         "solve": (r"accepted\n", r"\nconverged"),
         "validation": (VALID, "True"),
     },

@@ -41,7 +41,7 @@ TABLE = re.compile(r"(?:^\|.*\n)+", re.MULTILINE)
 DOOR = ("door_seed_0", "door_seed_1")
 TASKS = ("reach", "push", "push blind", "whole")
 PARTS = {
-    "initialization": "seeds",
+    "initialization": "initial guesses",
     "coal": "coal",
     "casadi": "CasADi",
     "ipopt": "Ipopt",
@@ -108,7 +108,7 @@ def status() -> str:
 
 
 def door() -> str:
-    """Return the tables of the door: of both seeds, and of where the time goes."""
+    """Return the tables of the door: of both seeds, and of the parts of the planning time."""
     rows, parts, results = [], [], [result(name) for name in DOOR]
     for task in TASKS:
         for found in results:
@@ -136,7 +136,7 @@ def door() -> str:
     most = max(found["meta"]["peak_memory_mb"] for found in results)
     about = f"{describe_run(results[0]['meta'])} Peak memory {most:.0f} MB."
     return "\n\n".join(
-        [format_table([*head, "build, at most [s]"], rows), format_table(split, parts), about]
+        [format_table([*head, "largest build time [s]"], rows), format_table(split, parts), about]
     )
 
 
@@ -168,7 +168,7 @@ def drawn(name: str) -> str:
                 rows,
             ),
             format_table(
-                ["by its own word", "the oracle finds nothing", "it finds something"], agreed
+                ["planner's result", "no fault found by the oracle", "fault found"], agreed
             ),
             describe_run(about),
         ]
@@ -238,7 +238,7 @@ def evidence() -> str:
         ):
             where = "../README.md" if page.name == "README.md" else page.name
             rest.append([f"[{page.name}]({where})", f"`{commit}`", date])
-    head = ["claim", "command", "record", "commit", "trials", "took here"]
+    head = ["claim", "command", "record", "commit", "trials", "wall time"]
     return "\n\n".join(
         [
             format_table(head, rows, text=4),

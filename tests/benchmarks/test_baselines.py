@@ -132,7 +132,7 @@ def test_tables_against_numbers_by_hand(out: Path) -> None:
     times = table_of(text, "Planning time")
     assert times[0] == ["all trials", "door", "B1", "3", "2.00", "2.90", "2.00", "1.00", "0.50"]
     assert times[4] == ["successes", "door", "B2", "2", "3.50", "3.95", "3.50", "0.71", "0.88"]
-    common = "Efforts, peaks and durations where all methods succeed"
+    common = "Path lengths, peaks and durations where all methods succeed"
     assert "all methods succeed: 1 of 3 (door)." in text
     base = ["door", "base [m]", "6.00 ± –; 6.00", "5.00 ± –; 5.00", "4.00 ± –; 4.00"]
     assert table_of(text, common)[0] == base
@@ -140,7 +140,7 @@ def test_tables_against_numbers_by_hand(out: Path) -> None:
     assert pairs[0] == ["door", "base [m]", "B1", "4.00", "6.00", "1 of 1"]
     assert pairs[6] == ["door", "planning time [s]", "B1", "5.00", "3.00", "0 of 1"]
     assert pairs[7] == ["door", "base [m]", "B2", "3.50", "4.50", "2 of 2"]
-    own = table_of(text, "Efforts, peaks and durations over each method's own successes")
+    own = table_of(text, "Path lengths, peaks and durations over each method's own successes")
     assert own[0] == ["door", "n", "1", "2", "3"]
     assert own[1][2:] == ["6.00 ± –; 6.00", "4.50 ± 0.71; 4.50", "3.00 ± 1.00; 3.00"]
     assert [(row[1], row[2], row[5]) for row in table_of(text, "Failures")] == [

@@ -54,7 +54,7 @@ def test_experiment(of: str, counts: tuple[int, int], tmp_path: Path) -> None:
         )
         time = t["planning_time"]
         assert f"| {t[of]} | 1 of 1 | {time:.2f} | {time:.2f} | {time / reference:.2f} |" in table
-    assert f"times that of {usual}" in table
+    assert f"ratio to {usual}" in table
     assert (tmp_path / "scale.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -33,7 +33,7 @@ CRITERIA = {
     "duration": "duration [s]",
 }
 """What motions are compared by: field → name."""
-BUDGETS = {"a tenth": 0.1, "a third": 1 / 3, "two thirds": 2 / 3, "all": 1.0}
+BUDGETS = {"1/10": 0.1, "1/3": 1 / 3, "2/3": 2 / 3, "whole budget": 1.0}
 """Name → share of the budget."""
 _OWN = "VKC"
 
@@ -71,31 +71,31 @@ def report(
         f"{about['seed']}. Per "
         f"trial {describe_limit(about)}, in which the baselines try up to {about['retries']} "
         "times. "
-        "Success is the word of the independent validation. Standard deviations are those of "
+        "Success is the result of the independent validation. Standard deviations are those of "
         "samples (n − 1).",
         "## Success",
         _success(records, tasks, methods),
         "## Planning time",
-        "Without imports and symbolic build. The last column is the median over that of VKC.",
+        "Without imports and symbolic build. The last column is the ratio of medians to VKC.",
         _times(records, tasks, methods),
         *_calls(records, tasks, methods),
         *_budgets(about, records, tasks, methods),
-        "## Efforts, peaks and durations where all methods succeed",
+        "## Path lengths, peaks and durations where all methods succeed",
         "Mean ± standard deviation; median. Trials in which all methods succeed: "
         + _numbers(records, tasks, compared)
         + ".",
         _criteria(records, tasks, compared, shared=True),
         *_pairwise(records, tasks, methods),
-        "## Efforts, peaks and durations over each method's own successes",
-        "Mean ± standard deviation; median. The methods have succeeded in different trials, so "
-        "harder ones count for some only.",
+        "## Path lengths, peaks and durations over each method's own successes",
+        "Mean ± standard deviation; median. The methods succeed in different trials, so that "
+        "harder trials count for some methods only.",
         _criteria(records, tasks, methods, shared=False),
         *pictures,
     ]
     if saved:
         parts += [
             "## Failures",
-            "`vkc-pin view FILE` shows them, links that come too close in red.",
+            "`vkc-pin view FILE` shows them, with violated clearances in red.",
             _failed(records, saved),
         ]
     return "\n\n".join([*parts, describe_run(about)]) + "\n"
@@ -149,7 +149,7 @@ def _times(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequenc
         "95th percentile [s]",
         "mean [s]",
         "deviation [s]",
-        f"to {_OWN}",
+        f"ratio to {_OWN}",
     ]
     return format_table(head, rows, text=3)
 
@@ -170,19 +170,18 @@ def _calls(
     head = [
         "task",
         "method",
-        "calls twice",
+        "repeated calls",
         "cold, median [s]",
         "warm, median [s]",
         "all, median [s]",
         "95th percentile [s]",
     ]
     text = (
-        "By the clock, with everything. The first trials of a task are planned twice by a planner "
-        "that has kept nothing: cold, "
-        "with writing down the symbolic programs and loading or compiling them, and warm. All: as "
-        "they come."
+        "Wall-clock time of whole calls. The first trials of a task are planned twice by a planner "
+        "with empty caches: cold, including construction of the symbolic programs and loading or "
+        "compiling them, and warm. All: every trial, in order."
     )
-    return ["## From call to plan", text, format_table(head, rows, text=2)] if rows else []
+    return ["## Wall-clock time of calls", text, format_table(head, rows, text=2)] if rows else []
 
 
 def _budgets(
@@ -209,15 +208,15 @@ def _budgets(
         "task",
         "method",
         *(name for name, _ in shares),
-        "half as much again [points]",
-        "most, as a share",
+        "gain from 2/3 [points]",
+        "largest fraction used",
     ]
     text = (
-        "Successes within shares of the budget. The budget only ends planning, so a success within "
-        "a share is one with that as the "
-        "budget, too; two thirds and half as much again are all of it."
+        "Successes within fractions of the budget. The budget only ends planning, so that these are "
+        "the successes with smaller budgets. The gain is that of half as much again, from 2/3 to the "
+        "whole budget."
     )
-    return ["## Had the budget been smaller", text, format_table(head, rows, text=2)]
+    return ["## Success with smaller budgets", text, format_table(head, rows, text=2)]
 
 
 def _numbers(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> str:
@@ -271,7 +270,7 @@ def _pairwise(
                     [task, name, other, *medians, f"{count_lower(both, field)} of {len(both)}"]
                 )
     head = ["task", "criterion", "other", f"{_OWN}, median", "other, median", f"lower with {_OWN}"]
-    text = f"Over the trials in which {_OWN} and the other method succeed, whatever the third does."
+    text = f"Over the trials in which {_OWN} and the other method succeed."
     return [f"## {_OWN} against each baseline", text, format_table(head, rows, text=3)]
 
 

@@ -96,7 +96,7 @@ def run(*, trials: int, seed: int, progress: bool = True) -> dict[str, Any]:
 
 def table(result: dict[str, Any]) -> str:
     """Return success rates, times and path lengths as text, and every failure."""
-    parts = {"initialization": "seeds", "coal": "coal", "casadi": "CasADi", "ipopt": "Ipopt"}
+    parts = {"initialization": "guesses", "coal": "coal", "casadi": "CasADi", "ipopt": "Ipopt"}
     parts["validation"] = "check"
     names = "".join(f"{name:>8}" for name in ("p95", *parts.values()))
     head = f"{'task':12}{'success':>10}{'time [s] median':>18}{names}"

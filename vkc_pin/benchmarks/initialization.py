@@ -156,7 +156,7 @@ def report(result: Mapping[str, Any]) -> str:
     ]
     if "auto" in methods:
         parts += [
-            "## One problem against step after step",
+            "## Simultaneous and stepwise planning",
             "Path lengths from starts where both find a motion, both initialized by `auto`, "
             "without perturbation.",
             comparison_table(records, scenes, ("auto", STEPWISE), ("one problem", STEPWISE)),

@@ -225,15 +225,15 @@ def report(result: Mapping[str, Any]) -> str:
         iterations = f"{distribution(own, 'iterations')[0]:.0f}" if own else "–"
         success = count(select(records, **{of: number}))
         rows.append([str(number), success, *times, *format_medians(own, *TIMES), iterations])
-    head = [of, "success", "time, median [s]", "95th percentile [s]", f"times that of {usual}"]
+    head = [of, "success", "time, median [s]", "95th percentile [s]", f"ratio to {usual}"]
     head += [f"{name} [s]" for name in TIMES.values()] + ["Ipopt iterations"]
     return join_report(
         about,
         f"# Planning time against the number of {of}",
         f"{about['starts']} random starts, the same for every number of {of}; seed "
-        f"{about['seed']}. {JUDGED} Times are those of all trials; “times that of {usual}” is the "
-        f"median, over starts, of the ratio to the time with {usual} {of}. What follows are "
-        "medians of parts of the time; the rest is setting up the problem.",
+        f"{about['seed']}. {JUDGED} Times are those of all trials; “ratio to {usual}” is the "
+        f"median, over starts, of the ratio to the time with {usual} {of}. The other columns are "
+        "medians of parts of the time; the rest is problem setup.",
         format_table(head, rows),
         "![Planning time](scale.png)",
     )

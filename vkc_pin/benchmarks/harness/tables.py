@@ -41,17 +41,17 @@ EFFORTS = {
     "base_path_length_l1": "base |dx|+|dy| [m]",
     "arm_path_length": "arm [rad]",
 }
-"""What motions are compared by: field → name."""
+"""Compared path lengths: field → name."""
 TIMES = {
-    "time_initialization": "seeds",
+    "time_initialization": "initial guesses",
     "time_coal": "coal",
     "time_casadi": "CasADi",
     "time_ipopt": "Ipopt",
     "time_validation": "validation",
 }
-"""Parts of planning time: field → name. The rest is setting up the problem and retiming."""
-JUDGED = "Success is the word of the independent validation."
-_LEAST = 1e-6  # in any unit, by which a value must be less to be called lower
+"""Parts of planning time: field → name. The rest is problem setup and retiming."""
+JUDGED = "Success is the result of the independent validation."
+_LEAST = 1e-6  # smallest difference, in any unit, of a lower value
 
 
 def to_csv(records: Sequence[Record]) -> str:

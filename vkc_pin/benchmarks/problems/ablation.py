@@ -48,13 +48,13 @@ PAIRED = {
 }
 """What is compared with the unchanged planner, problem by problem: field → name."""
 SUMMARY = (
-    *("success", "first seed", "time, median [s]", "mean [s]", "95th percentile [s]"),
+    *("success", "first guess", "time, median [s]", "mean [s]", "95th percentile [s]"),
     *("CPU, median [s]", "mean [s]", "95th percentile [s]", "rounds", "iterations"),
     *("base [m]", "arm [rad]", "failures"),
 )
 """Columns of `summary`."""
 SUMMARIZED = (
-    "The first seed sufficed where the solver ran once. Times are those of all trials, CPU time "
+    "First guess: trials that ran the solver once. Times are those of all trials, CPU time "
     "with building symbolic programs. Rounds and iterations are means, path lengths medians of "
     "successes."
 )

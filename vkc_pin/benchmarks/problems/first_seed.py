@@ -71,12 +71,12 @@ def report(result: Mapping[str, Any]) -> str:
         rows.append(
             [task, count(own), count(own, "first_seed"), interval, *times, count_failures(own)]
         )
-    head = ["task", "success", "with the first seed", "of all [%]", "time, median [s]"]
+    head = ["task", "success", "first guess only", "of all [%]", "time, median [s]"]
     return join_report(
         about,
         "# Success with the first initial guess",
         f"{about['starts']} random starts per task, seed {about['seed']}. {JUDGED} The first "
-        "guess sufficed where the solver ran once; beside it Wilson's interval of 95 % confidence.",
+        "guess sufficed if the solver ran once; its interval is Wilson's of 95 % confidence.",
         format_table([*head, "95th percentile [s]", "failures"], rows),
         "## Every trial",
         tabulate_trials(records),

@@ -92,7 +92,15 @@ def report(result: Mapping[str, Any]) -> str:
         guesses = dict.fromkeys(r["initialization"] for r in own if r.get("initialization"))
         rows.append([str(number), name, count(own), *cells, "; ".join(guesses)])
     within = f"within {100 * WITHIN:.0f} %"
-    columns = ["of", within, "1st quartile [%]", "median", "3rd quartile", "95th", "most"]
+    columns = [
+        "of",
+        within,
+        "1st quartile [%]",
+        "median",
+        "3rd quartile",
+        "95th percentile",
+        "largest",
+    ]
     percent = [f"{name} [%]" for name in FIELDS.values()]
     return join_report(
         about,

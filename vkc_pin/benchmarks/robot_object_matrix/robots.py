@@ -70,7 +70,7 @@ _HEAD = (
         "pairs",
         "import [s]",
         "load again [s]",
-        "room at home [mm]",
+        "clearance at home [mm]",
         "reached",
     ),
     *("time, median [s]", "95th percentile [s]"),

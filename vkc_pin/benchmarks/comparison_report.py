@@ -212,9 +212,9 @@ def _budgets(
         "largest fraction used",
     ]
     text = (
-        "Successes within fractions of the budget. The budget only ends planning, so that these are "
-        "the successes with smaller budgets. The gain is that of half as much again, from 2/3 to the "
-        "whole budget."
+        "Successes within fractions of the budget. The budget only ends planning, so that these "
+        "are the successes with smaller budgets. The gain is that of half as much again, from 2/3 "
+        "to the whole budget."
     )
     return ["## Success with smaller budgets", text, format_table(head, rows, text=2)]
 

@@ -1,5 +1,6 @@
 // Searches cheapest paths over cells and headings, and repairs them after moves turn out to be blocked, by LPA* (Koenig,
 // Likhachev and Furcy 2004). Costs are integers, so that sums are exact.
+// Why not SciPy: docs/decisions/0011.
 
 #include <algorithm>
 #include <queue>

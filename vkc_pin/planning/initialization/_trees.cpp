@@ -1,4 +1,5 @@
 // Grows two random trees towards each other (RRT-Connect, Kuffner and LaValle, ICRA 2000); see rrt.py.
+// Why not OMPL: docs/decisions/0012.
 
 #include <algorithm>
 #include <cmath>

@@ -1,6 +1,7 @@
 """Compiles CasADi functions in the background; results equal the interpreter's bit for bit.
 
-Until a library is available, or without a compiler, functions are interpreted.
+Until a library is available, or without a compiler, functions are interpreted. What that
+costs: docs/decisions/0008.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 // Linear solver for Ipopt's systems. Ipopt loads it at run time (options `hsllib` and
 // `linear_solver`) through the interface of HSL's MA27, as far as Ipopt uses it:
-// https://www.hsl.rl.ac.uk/archive/specs/ma27.pdf.
+// https://www.hsl.rl.ac.uk/archive/specs/ma27.pdf. Why not MUMPS: docs/decisions/0009.
 
 #include <algorithm>
 #include <limits>

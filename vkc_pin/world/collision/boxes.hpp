@@ -3,7 +3,7 @@
 //
 // There are tens of moving shapes, but possibly thousands of fixed ones. Therefore an axis-aligned
 // box around all shapes of each joint is compared with those of all fixed shapes first. Only the
-// remaining pairs are tested one by one.
+// remaining pairs are tested one by one. Why not coal's broadphase: docs/decisions/0010.
 #pragma once
 
 #include <array>

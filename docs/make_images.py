@@ -56,10 +56,10 @@ OPENED = {
 }
 
 sys.path.insert(0, str(ROOT / "tests"))
-from helpers.browser import screenshot  # noqa: E402
-from helpers.closers import closer  # noqa: E402
-from helpers.grippers import between_cheeks, write_gripper  # noqa: E402
-from helpers.homes import home_urdf  # noqa: E402
+from helpers.browser import save_screenshot  # noqa: E402
+from helpers.closers import load_door_with_closer  # noqa: E402
+from helpers.grippers import write_cheeks_scene, write_gripper  # noqa: E402
+from helpers.homes import write_home_urdf  # noqa: E402
 
 
 def look(target: tuple[float, ...], position: tuple[float, ...]) -> None:
@@ -76,7 +76,7 @@ def picture(
         assert isinstance(shown, vkc.Plan)
         time = share * float(shown.trajectory.times[-1])
     with tempfile.TemporaryDirectory() as folder:
-        screenshot(
+        save_screenshot(
             visualization.to_html(shown, Path(folder) / "page.html"),
             IMAGES / f"{name}.png",
             time=time,
@@ -213,7 +213,7 @@ def check_picture() -> None:
 def import_picture() -> None:
     """Draw a home of three rooms imported from one URDF, and a motion that opens its fridge."""
     with tempfile.TemporaryDirectory() as folder:
-        file, _ = home_urdf(Path(folder))
+        file, _ = write_home_urdf(Path(folder))
         scene = vkc.importing.import_home(file, Path(folder) / "out").scene
         plan = vkc.plan(scene, [vkc.Actuate("refrigerator_body", {"refrigerator_hinge": 0.94})])
         sys.stdout.write(plan.summary() + "\n")
@@ -283,7 +283,7 @@ def opening_picture() -> None:
     from scipy.spatial import ConvexHull
 
     with tempfile.TemporaryDirectory() as folder, use_style():
-        scene = between_cheeks(write_gripper(Path(folder)), opening=FINGERS)
+        scene = write_cheeks_scene(write_gripper(Path(folder)), opening=FINGERS)
         plan = vkc.plan(scene, [vkc.Grasp("drawer")])
         sys.stdout.write(plan.summary() + "\n")
         world, figure = World(scene), new_figure(8.0, 3.4)
@@ -325,7 +325,10 @@ def opening_picture() -> None:
 
 def torque_picture() -> None:
     """Draw the motor torques over time, with their limits, while opening a door with a closer."""
-    scenes = vkc.load_scene("door"), closer(damping=400.0, stiffness=5.0, springref=-2.0)
+    scenes = (
+        vkc.load_scene("door"),
+        load_door_with_closer(damping=400.0, stiffness=5.0, springref=-2.0),
+    )
     plans = [vkc.plan(scene, [vkc.Actuate("door", {"hinge": 1.2}, "handle")]) for scene in scenes]
     with use_style():
         figure = new_figure(9.0, 3.4)

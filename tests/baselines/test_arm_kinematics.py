@@ -6,8 +6,15 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.drawers import SHORT, drawer_scene, handle, holding, off, open_scene
-from helpers.small_problems import program_of
+from helpers.drawers import (
+    SHORT,
+    compute_handle_pose,
+    compute_pose_error,
+    load_drawer_scene,
+    make_grasping_scene,
+    make_open_scene,
+)
+from helpers.small_problems import make_program
 
 import vkc_pin as vkc
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
@@ -20,8 +27,8 @@ STILL = 0.0
 
 
 def make_problem(attachment: str = "handle") -> tuple[vkc.TrajectoryProblem, ArmKinematics]:
-    problem = program_of(
-        holding(attachment=attachment), [vkc.Actuate("drawer", SLIDE)], options=SHORT
+    problem = make_program(
+        make_grasping_scene(attachment=attachment), [vkc.Actuate("drawer", SLIDE)], options=SHORT
     )
     return problem, ArmKinematics(problem, KeyframeSampler(problem, np.random.default_rng(0)))
 
@@ -43,7 +50,7 @@ def test_arm_closes_the_chain(waypoint: int, seed: int) -> None:
     z, closed = arm.solve(seeds, waypoint)
     np.testing.assert_array_equal(seeds, given)
     assert closed
-    assert off(problem.scene, z, handle(z[-1])) <= EXACT
+    assert compute_pose_error(problem.scene, z, compute_handle_pose(z[-1])) <= EXACT
     np.testing.assert_allclose(z[[0, 1, 2, 9]], given[[0, 1, 2, 9]], rtol=0.0, atol=STILL)
     assert np.all((z >= problem.chain.lower - STILL) & (z <= problem.chain.upper + STILL))
     assert np.abs(z - given).max() > 0.05
@@ -67,14 +74,17 @@ def test_freedoms_of_a_grasp_are_decided_too() -> None:
     for waypoint in (2, 5, 8):
         z, closed = arm.solve(arm.sampler.object_motion[waypoint - 1], waypoint)
         assert closed
-        assert off(problem.scene, z, handle(z[slide], tilt=z[tilt])) <= EXACT
+        assert (
+            compute_pose_error(problem.scene, z, compute_handle_pose(z[slide], tilt=z[tilt]))
+            <= EXACT
+        )
         tilts.append(z[tilt])
     assert np.ptp(tilts) > 0.02
     assert np.abs(tilts).max() <= 0.6
 
 
 def test_waypoints_without_closure_are_unchanged() -> None:
-    problem = program_of(drawer_scene(), [vkc.Grasp("drawer")])
+    problem = make_program(load_drawer_scene(), [vkc.Grasp("drawer")])
     arm = ArmKinematics(problem, KeyframeSampler(problem, np.random.default_rng(0)))
     z, closed = arm.solve(problem.start, 1)
     assert closed
@@ -96,7 +106,7 @@ def test_joint_limits_hold(side: float) -> None:
     z, closed = arm.solve(start, 4)
     assert not closed
     assert np.all((z >= chain.lower - STILL) & (z <= chain.upper + STILL))
-    assert off(problem.scene, z, handle(z[-1])) > 1e-3
+    assert compute_pose_error(problem.scene, z, compute_handle_pose(z[-1])) > 1e-3
     # With just enough room it is.
     chain.lower[pan], chain.upper[pan] = np.sort([free[pan] + side * 1e-4, free[pan] - side * 0.6])
     z, closed = arm.solve(start, 4)
@@ -112,8 +122,10 @@ def test_start_may_exceed_limits_by_rounding() -> None:
 
 
 def test_base_too_far_away() -> None:
-    scene = open_scene()
-    problem = program_of(holding(scene), [vkc.Actuate("drawer", SLIDE)], options=SHORT)
+    scene = make_open_scene()
+    problem = make_program(
+        make_grasping_scene(scene), [vkc.Actuate("drawer", SLIDE)], options=SHORT
+    )
     arm = ArmKinematics(problem, KeyframeSampler(problem, np.random.default_rng(0)))
     away = problem.start.copy()
     away[0] -= 1.5

@@ -8,10 +8,16 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.carrying import box
-from helpers.drawers import drawer_scene, handle, holding, off, open_scene
-from helpers.drives import hall
-from helpers.small_problems import program_of
+from helpers.carrying import describe_box
+from helpers.drawers import (
+    compute_handle_pose,
+    compute_pose_error,
+    load_drawer_scene,
+    make_grasping_scene,
+    make_open_scene,
+)
+from helpers.drives import make_hall
+from helpers.small_problems import make_program
 
 import vkc_pin as vkc
 from vkc_pin.baselines import plan_separately
@@ -38,10 +44,10 @@ PULL = vkc.Actuate("drawer", {"slide": 0.15})
 def make_room(*more: dict[str, Any], arm: np.ndarray | None = None) -> vkc.Scene:
     """Return a hall with two tables, and a cup on one of them."""
     tables = [
-        box("table", [0.6, 0.8, 0.02], [1.7, 0.1, 0.49]),
-        box("other", [0.8, 0.6, 0.02], [-0.2, 1.9, 0.69]),
+        describe_box("table", [0.6, 0.8, 0.02], [1.7, 0.1, 0.49]),
+        describe_box("other", [0.8, 0.6, 0.02], [-0.2, 1.9, 0.69]),
     ]
-    scene = hall(obstacles=[*tables, *more])
+    scene = make_hall(obstacles=[*tables, *more])
     cup = {"name": "cup", "type": "cup", "position": list(CUP), "yaw": 0.4}
     scene = vkc.Scene.from_document({**scene.document, "objects": [cup]}, scene.folder)
     return scene if arm is None else scene.with_start(arm=arm)
@@ -58,7 +64,7 @@ def carry_cup(method: str = "B1") -> vkc.Plan:
 
 @cache
 def pull_and_drive() -> vkc.Plan:
-    return plan(open_scene(), PULL, vkc.GoTo(-1.0, 1.0))
+    return plan(make_open_scene(), PULL, vkc.GoTo(-1.0, 1.0))
 
 
 def list_phase_names(found: vkc.Plan) -> list[str]:
@@ -140,7 +146,7 @@ def test_drive_after_an_actuation() -> None:
 
 @pytest.mark.parametrize("yaw", [None, 2.0, -2.0])
 def test_drive(yaw: float | None) -> None:
-    found = plan(open_scene(), vkc.GoTo(-1.0, 1.0, yaw))
+    found = plan(make_open_scene(), vkc.GoTo(-1.0, 1.0, yaw))
     assert found.success, found.summary()
     assert list_phase_names(found) == ["go to"]
     assert np.ptp(found.trajectory.positions[:, 3:9], axis=0).max() == 0.0
@@ -152,18 +158,18 @@ def test_drive(yaw: float | None) -> None:
 
 
 def test_no_base_path() -> None:
-    scene = open_scene(box("wall", [0.1, 4.6, 2.4], [0.15, 0.0, 1.2]))
+    scene = make_open_scene(describe_box("wall", [0.1, 4.6, 2.4], [0.15, 0.0, 1.2]))
     found = plan(scene, vkc.GoTo(1.0, 0.0))
     assert (found.success, found.status) == (False, "no base path")
     assert np.ptp(found.trajectory.positions[:, :3], axis=0).max() == 0.0, "it stands at its start"
 
 
 def make_drive(scene: vkc.Scene) -> vkc.TrajectoryProblem:
-    return program_of(scene, [vkc.GoTo(*scene.start[:3].tolist())], options=OPTIONS)
+    return make_program(scene, [vkc.GoTo(*scene.start[:3].tolist())], options=OPTIONS)
 
 
 def test_postures_of_an_arm_at_home() -> None:
-    scene = drawer_scene()
+    scene = load_drawer_scene()
     first, second = generate_postures(make_drive(scene))
     assert len(first) == 0
     np.testing.assert_allclose(second[:, :3], [scene.start[:3]], atol=1e-12)
@@ -171,12 +177,12 @@ def test_postures_of_an_arm_at_home() -> None:
 
 
 def test_postures_after_a_release() -> None:
-    scene = holding(open_scene())
+    scene = make_grasping_scene(make_open_scene())
     *_, back, home, compact = generate_postures(make_drive(scene))
     np.testing.assert_allclose(compact[:-1], home, atol=1e-12)
     assert len(back) == 1
-    away = pin.SE3(np.eye(3), np.array([-vkc.Options().approach, 0.0, 0.0])) * handle()
-    assert off(scene, back[0], away) < 1e-3
+    away = pin.SE3(np.eye(3), np.array([-vkc.Options().approach, 0.0, 0.0])) * compute_handle_pose()
+    assert compute_pose_error(scene, back[0], away) < 1e-3
     np.testing.assert_allclose(back[0, :3], scene.start[:3], atol=1e-12)
     np.testing.assert_allclose(home[:-1], back, atol=1e-12)
     np.testing.assert_allclose(home[-1, 3:9], scene.robot.home, atol=1e-12)

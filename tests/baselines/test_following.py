@@ -6,8 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from helpers.drawers import SHORT, handle, holding, off, spare, with_boxes
-from helpers.small_problems import program_of
+from helpers.drawers import (
+    SHORT,
+    add_boxes,
+    compute_handle_pose,
+    compute_pose_error,
+    compute_spare_clearance,
+    make_grasping_scene,
+)
+from helpers.small_problems import make_program
 
 import vkc_pin as vkc
 from vkc_pin.baselines.following import FollowResult, follow
@@ -23,10 +30,10 @@ GOAL = 0.3  # [m]
 
 def make_problem(lamp: float | None = None, attachment: str = "handle") -> vkc.TrajectoryProblem:
     """Return the problem of pulling the drawer under a lamp at height `lamp` [m]."""
-    scene = holding(attachment=attachment)
+    scene = make_grasping_scene(attachment=attachment)
     if lamp is not None:
-        scene = with_boxes(scene, lamp=([0.3, 0.3, 0.1], [1.44, 0.0, lamp + 0.05]))
-    return program_of(scene, [vkc.Actuate("drawer", {"slide": GOAL})], options=SHORT)
+        scene = add_boxes(scene, lamp=([0.3, 0.3, 0.1], [1.44, 0.0, lamp + 0.05]))
+    return make_program(scene, [vkc.Actuate("drawer", {"slide": GOAL})], options=SHORT)
 
 
 def make_base_path(problem: vkc.TrajectoryProblem, *change: float) -> np.ndarray:
@@ -45,8 +52,14 @@ def check_closed_and_free(problem: vkc.TrajectoryProblem, rows: np.ndarray) -> N
     slide = problem.chain.index("drawer.slide")
     for row in rows:
         tilt = row[slide - 1] if len(row) == 11 else 0.0
-        assert off(problem.scene, row, handle(row[slide], tilt=tilt)) < CLOSED
-        assert spare(problem.scene, row, slide=row[slide], held=True) >= -CLEAR - ROUNDING
+        assert (
+            compute_pose_error(problem.scene, row, compute_handle_pose(row[slide], tilt=tilt))
+            < CLOSED
+        )
+        assert (
+            compute_spare_clearance(problem.scene, row, slide=row[slide], held=True)
+            >= -CLEAR - ROUNDING
+        )
         assert np.all(
             (row >= problem.lower.min(axis=0) - STILL) & (row <= problem.upper.max(axis=0) + STILL)
         )
@@ -87,7 +100,10 @@ def test_base_out_of_reach() -> None:
     np.testing.assert_allclose(found.z[:done, :3], way[:done], rtol=0.0, atol=STILL)
     # From there on all stands still, in what was not at the handle.
     np.testing.assert_array_equal(found.z[done:], np.tile(found.z[done], (8 - done, 1)))
-    assert off(problem.scene, found.z[done], handle(found.z[done, -1])) > 1e-3
+    assert (
+        compute_pose_error(problem.scene, found.z[done], compute_handle_pose(found.z[done, -1]))
+        > 1e-3
+    )
 
 
 @pytest.mark.parametrize(("refine", "least"), [(False, 0.5), (True, 0.5)], ids=["B1", "B2"])
@@ -100,8 +116,10 @@ def test_unavoidable_collision(refine: bool, least: float) -> None:
     assert least <= found.share < 1.0
     check_closed_and_free(problem, found.z[:done])
     wrong = found.z[done]
-    assert off(problem.scene, wrong, handle(wrong[-1])) < CLOSED, "the chain is closed all the same"
-    assert spare(problem.scene, wrong, slide=wrong[-1], held=True) < -1e-3
+    assert compute_pose_error(problem.scene, wrong, compute_handle_pose(wrong[-1])) < CLOSED, (
+        "the chain is closed all the same"
+    )
+    assert compute_spare_clearance(problem.scene, wrong, slide=wrong[-1], held=True) < -1e-3
     np.testing.assert_array_equal(found.z[done:], np.tile(wrong, (8 - done, 1)))
 
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.base_scenes import BLINK, MARGIN, between, distance
-from helpers.carrying import box, room
-from helpers.drawers import SHORT, changed, drawer_scene, open_scene
-from helpers.drives import hall
-from helpers.small_problems import door_scene, program_of
+from helpers.base_scenes import BLINK, MARGIN, compute_distance, interpolate_poses
+from helpers.carrying import describe_box, make_room
+from helpers.drawers import SHORT, load_drawer_scene, make_open_scene, replace_drawer_fields
+from helpers.drives import make_hall
+from helpers.small_problems import load_door_scene, make_program
 
 import vkc_pin as vkc
 from vkc_pin.baselines.paths import BasePaths, find_goal_poses
@@ -33,7 +33,7 @@ POST: dict[str, Any] = {
 
 def make_paths(scene: vkc.Scene, name: str = "drawer", **joints: float) -> BasePaths:
     return BasePaths(
-        program_of(scene, [vkc.Actuate(name, joints or {"slide": 0.3})], options=SHORT)
+        make_program(scene, [vkc.Actuate(name, joints or {"slide": 0.3})], options=SHORT)
     )
 
 
@@ -50,12 +50,14 @@ def compute_clearance(
     still = [shape for label, shape in labels if label != FLOOR]
     for name, placed in scene.objects.items():
         still += make_world_shapes(placed) if name not in without else []
-    rows = np.vstack([between(a, b, length=0.05, angle=0.1) for a, b in itertools.pairwise(poses)])
-    return min(distance(base, list_placed_shapes(still), row.tolist()) for row in rows)
+    rows = np.vstack(
+        [interpolate_poses(a, b, length=0.05, angle=0.1) for a, b in itertools.pairwise(poses)]
+    )
+    return min(compute_distance(base, list_placed_shapes(still), row.tolist()) for row in rows)
 
 
 def test_straight_path() -> None:
-    path = make_paths(open_scene(POST)).path(START, BESIDE, 10)
+    path = make_paths(make_open_scene(POST)).path(START, BESIDE, 10)
     assert path is not None
     u = np.arange(1, 11) / 10
     for column in range(3):  # from rest to rest
@@ -64,7 +66,7 @@ def test_straight_path() -> None:
 
 
 def test_path_around_an_obstacle() -> None:
-    scene = open_scene(POST)
+    scene = make_open_scene(POST)
     assert compute_clearance(scene, np.array([START, AISLE])) < 0.0
     path = make_paths(scene).path(START, AISLE, 80)
     assert path is not None
@@ -95,14 +97,14 @@ def test_no_path(walls: list[tuple[list[float], list[float]]]) -> None:
         {"name": f"wall_{k}", "type": "box", "size": size, "position": at}
         for k, (size, at) in enumerate(walls)
     ]
-    scene = open_scene(*boxes)
+    scene = make_open_scene(*boxes)
     assert compute_clearance(scene, np.array([START, START])) > MARGIN
     assert compute_clearance(scene, np.array([AISLE, AISLE])) > MARGIN
     assert make_paths(scene).path(START, AISLE, 10) is None
 
 
 def test_path_of_a_differential_base() -> None:
-    path = make_paths(open_scene(base="differential")).path(START, BESIDE, 400)
+    path = make_paths(make_open_scene(base="differential")).path(START, BESIDE, 400)
     assert path is not None
     steps = np.diff(np.vstack([START, path]), axis=0)
     heading = np.vstack([START, path])[:-1, 2] + steps[:, 2] / 2
@@ -112,9 +114,9 @@ def test_path_of_a_differential_base() -> None:
 
 
 def test_other_objects_are_obstacles_in_their_state() -> None:
-    scene = drawer_scene()
+    scene = load_drawer_scene()
     door = {"name": "door", "type": "door", "position": [0.0, 0.44, 0.0]}
-    both = changed(open_scene(), objects=[*scene.document["objects"], door])
+    both = replace_drawer_fields(make_open_scene(), objects=[*scene.document["objects"], door])
     before, after = np.array([-0.9, -0.05, 0.0]), np.array([0.8, -0.05, 0.0])
     for hinge, straight in ((0.0, False), (1.5, True)):
         here = both.with_state("door", {"hinge": hinge})
@@ -126,7 +128,7 @@ def test_other_objects_are_obstacles_in_their_state() -> None:
 
 
 def test_grasped_door_is_no_obstacle() -> None:
-    scene = door_scene()
+    scene = load_door_scene()
     before, after = np.array([1.8, -0.05, 0.0]), np.array([3.3, -0.05, 0.0])
     assert compute_clearance(scene, np.array([before, after]), without=()) < 0.0
     found = make_paths(scene, "door", hinge=1.2)
@@ -148,11 +150,11 @@ ASIDE = np.array([-1.5, -1.57, 0.0, 0.0, 0.0, 0.0])  # the arm stretched out upw
 def make_drive(
     scene: vkc.Scene, x: float, y: float, yaw: float | None = None
 ) -> vkc.TrajectoryProblem:
-    return program_of(scene.with_start(base=START), [vkc.GoTo(x, y, yaw)], options=SHORT)
+    return make_program(scene.with_start(base=START), [vkc.GoTo(x, y, yaw)], options=SHORT)
 
 
 def test_path_with_the_arm() -> None:
-    problem = make_drive(open_scene(SHELF).with_start(arm=ASIDE), 0.5, 0.6)
+    problem = make_drive(make_open_scene(SHELF).with_start(arm=ASIDE), 0.5, 0.6)
     goal = np.array([0.5, 0.6, 0.0])
     bare = BasePaths(problem).path(START, goal, 80)
     assert bare is not None
@@ -173,7 +175,7 @@ def test_path_with_the_arm() -> None:
 
 
 def test_path_with_a_grasped_object() -> None:
-    scene = room(objects=["stick"])
+    scene = make_room(objects=["stick"])
     held = scene.with_held({"stick": "grip"})
     shapes = [
         len(BasePaths(make_drive(one, 1.0, 1.0), whole=True).grid.base.shapes)
@@ -183,7 +185,7 @@ def test_path_with_a_grasped_object() -> None:
 
 
 def test_several_goals() -> None:
-    found = make_paths(open_scene(POST))
+    found = make_paths(make_open_scene(POST))
     blocked, free = AISLE, np.array([0.5, 1.0, 0.5])
     path = found.path(START, np.array([blocked, free]), 10)
     assert path is not None
@@ -197,7 +199,7 @@ def test_several_goals() -> None:
 
 
 def test_initial_guess_has_a_constant_arm() -> None:
-    problem = make_drive(open_scene(POST), *AISLE[:2].tolist())
+    problem = make_drive(make_open_scene(POST), *AISLE[:2].tolist())
     goals = find_goal_poses(vkc.GoTo(*AISLE[:2].tolist()), 0.0)
     (seed,) = BasePaths(problem, whole=True).make_guesses(problem, goals)
     assert seed.z.shape == (problem.segments, problem.chain.size)
@@ -209,14 +211,17 @@ def test_initial_guess_has_a_constant_arm() -> None:
         "size": [0.1, 4.6, 1.0],
         "position": [0.0, 0.0, 0.5],
     }
-    problem = make_drive(open_scene(wall), *AISLE[:2].tolist())
+    problem = make_drive(make_open_scene(wall), *AISLE[:2].tolist())
     assert list(BasePaths(problem, whole=True).make_guesses(problem, goals)) == []
 
 
 def test_path_through_a_narrow_gate() -> None:
     """The gate is 0.73 m wide, the base 0.67 m; a coarse grid has no path."""
-    walls = [box(str(side), [0.2, 6.0, 1.5], [0.0, 0.09 + 3.365 * side, 0.75]) for side in (1, -1)]
-    narrow = hall(obstacles=walls).with_start(
+    walls = [
+        describe_box(str(side), [0.2, 6.0, 1.5], [0.0, 0.09 + 3.365 * side, 0.75])
+        for side in (1, -1)
+    ]
+    narrow = make_hall(obstacles=walls).with_start(
         arm=np.array([1.57, -2.2, 2.5, -1.9, -1.57, 0.0])
     )  # the arm folded
     found, goal = (

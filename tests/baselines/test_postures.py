@@ -7,8 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.drawers import SHORT, changed, drawer_scene, handle, holding, off, spare, with_boxes
-from helpers.small_problems import program_of
+from helpers.drawers import (
+    SHORT,
+    add_boxes,
+    compute_handle_pose,
+    compute_pose_error,
+    compute_spare_clearance,
+    load_drawer_scene,
+    make_grasping_scene,
+    replace_drawer_fields,
+)
+from helpers.small_problems import make_program
 
 import vkc_pin as vkc
 from vkc_pin.baselines import postures as module
@@ -16,12 +25,14 @@ from vkc_pin.baselines.postures import find_base_poses
 
 
 def make_reach(scene: vkc.Scene, attachment: str = "handle") -> vkc.TrajectoryProblem:
-    return program_of(scene, [vkc.Grasp("drawer", attachment)], options=SHORT)
+    return make_program(scene, [vkc.Grasp("drawer", attachment)], options=SHORT)
 
 
 @cache
 def make_pull() -> vkc.TrajectoryProblem:
-    return program_of(holding(), [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT)
+    return make_program(
+        make_grasping_scene(), [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT
+    )
 
 
 def find_poses(
@@ -47,11 +58,13 @@ def compute_distances(rows: np.ndarray, near: np.ndarray, names: tuple[str, ...]
 
 @pytest.mark.parametrize("seed", range(2))
 def test_poses_from_which_the_arm_reaches_a_handle(seed: int) -> None:
-    scene, problem = drawer_scene(), make_reach(drawer_scene())
+    scene, problem = load_drawer_scene(), make_reach(load_drawer_scene())
     rows = find_poses(problem, seed=seed)
     assert rows.shape == (module.ENOUGH, problem.chain.size)
-    assert max(off(scene, row, handle()) for row in rows) < 1e-4 * np.sqrt(3)
-    assert min(spare(scene, row) for row in rows) >= -1e-6
+    assert max(
+        compute_pose_error(scene, row, compute_handle_pose()) for row in rows
+    ) < 1e-4 * np.sqrt(3)
+    assert min(compute_spare_clearance(scene, row) for row in rows) >= -1e-6
     assert np.all((rows >= problem.lower[-1]) & (rows <= problem.upper[-1]))
     assert np.all(rows[:, -1] == 0.0), "the drawer is still shut"
     assert np.ptp(rows[:, 0]) > 0.3, "they are from all over"
@@ -62,13 +75,18 @@ def test_poses_from_which_the_arm_reaches_a_moved_handle() -> None:
     problem = make_pull()
     rows = find_poses(problem)
     assert len(rows) > 10
-    assert max(off(problem.scene, row, handle(0.3)) for row in rows) < 1e-4 * np.sqrt(3)
-    assert min(spare(problem.scene, row, slide=0.3, held=True) for row in rows) >= -1e-6
+    assert max(
+        compute_pose_error(problem.scene, row, compute_handle_pose(0.3)) for row in rows
+    ) < 1e-4 * np.sqrt(3)
+    assert (
+        min(compute_spare_clearance(problem.scene, row, slide=0.3, held=True) for row in rows)
+        >= -1e-6
+    )
     assert np.all(rows[:, -1] == 0.3)
 
 
 def test_poses_are_sorted_by_distance() -> None:
-    problem = make_reach(drawer_scene(), "handle_free")
+    problem = make_reach(load_drawer_scene(), "handle_free")
     near = problem.start.copy()
     near[:3] = [0.8, -0.6, 0.3]
     for rows, from_there in (
@@ -82,12 +100,14 @@ def test_poses_are_sorted_by_distance() -> None:
 
 
 def raise_drawer() -> vkc.Scene:
-    scene = drawer_scene()
-    return changed(scene, objects=[{**scene.document["objects"][0], "position": [1.93, 0.0, 2.0]}])
+    scene = load_drawer_scene()
+    return replace_drawer_fields(
+        scene, objects=[{**scene.document["objects"][0], "position": [1.93, 0.0, 2.0]}]
+    )
 
 
 def add_board() -> vkc.Scene:
-    return with_boxes(drawer_scene(), board=([0.02, 1.0, 1.2], [1.7, 0.0, 0.6]))
+    return add_boxes(load_drawer_scene(), board=([0.02, 1.0, 1.2], [1.7, 0.0, 0.6]))
 
 
 @pytest.mark.parametrize("scene", [raise_drawer(), add_board()], ids=["out of reach", "collision"])

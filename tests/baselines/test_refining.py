@@ -6,8 +6,16 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.drawers import SHORT, drawer_scene, handle, holding, off, spare, with_boxes
-from helpers.small_problems import program_of
+from helpers.drawers import (
+    SHORT,
+    add_boxes,
+    compute_handle_pose,
+    compute_pose_error,
+    compute_spare_clearance,
+    load_drawer_scene,
+    make_grasping_scene,
+)
+from helpers.small_problems import make_program
 
 import vkc_pin as vkc
 from vkc_pin.baselines.arm_kinematics import ArmKinematics
@@ -23,9 +31,9 @@ class Pulling:
     """Half-way through pulling a drawer under a lamp; the hand may tilt about the bar."""
 
     def __init__(self, bottom: float, *, waypoint: int = HALF) -> None:
-        scene = holding(attachment="handle_free")
-        self.scene = with_boxes(scene, lamp=([0.3, 0.3, 0.1], [1.44, 0.0, bottom + 0.05]))
-        self.problem = program_of(
+        scene = make_grasping_scene(attachment="handle_free")
+        self.scene = add_boxes(scene, lamp=([0.3, 0.3, 0.1], [1.44, 0.0, bottom + 0.05]))
+        self.problem = make_program(
             self.scene, [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT
         )
         self.sampler = KeyframeSampler(self.problem, np.random.default_rng(0))
@@ -48,10 +56,10 @@ class Pulling:
         )
 
     def spare(self, z: np.ndarray) -> float:
-        return spare(self.scene, z, slide=z[SLIDE], held=True)
+        return compute_spare_clearance(self.scene, z, slide=z[SLIDE], held=True)
 
     def off(self, z: np.ndarray) -> float:
-        return off(self.scene, z, handle(z[SLIDE], tilt=z[TILT]))
+        return compute_pose_error(self.scene, z, compute_handle_pose(z[SLIDE], tilt=z[TILT]))
 
 
 @cache
@@ -130,7 +138,7 @@ def test_base_out_of_reach() -> None:
 
 
 def test_waypoints_without_closure_are_unchanged() -> None:
-    problem = program_of(drawer_scene(), [vkc.Grasp("drawer")])
+    problem = make_program(load_drawer_scene(), [vkc.Grasp("drawer")])
     knots = KeyframeSampler(problem, np.random.default_rng(0))
     z, closed = refine_configuration(
         problem, knots, problem.start, wanted=problem.start, waypoint=1, columns=np.arange(3, 9)

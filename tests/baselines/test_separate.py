@@ -14,8 +14,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.drawers import changed, drawer_scene, handle, holding, off, open_scene, with_boxes
-from helpers.small_problems import door_scene
+from helpers.drawers import (
+    add_boxes,
+    compute_handle_pose,
+    compute_pose_error,
+    load_drawer_scene,
+    make_grasping_scene,
+    make_open_scene,
+    replace_drawer_fields,
+)
+from helpers.small_problems import load_door_scene
 
 import vkc_pin as vkc
 from vkc_pin.baselines import BASELINES, attempt, plan_separately, separate
@@ -31,13 +39,13 @@ OPTIONS = vkc.Options(reach_waypoints=20, move_waypoints=15)
 
 @cache
 def open_drawer(method: str) -> vkc.Plan:
-    return plan_separately(drawer_scene(), [PULL], method=method, retries=1)
+    return plan_separately(load_drawer_scene(), [PULL], method=method, retries=1)
 
 
 @cache
 def open_door(method: str) -> vkc.Plan:
     return plan_separately(
-        door_scene(), [vkc.Actuate("door", {"hinge": 0.3})], method=method, retries=1
+        load_door_scene(), [vkc.Actuate("door", {"hinge": 0.3})], method=method, retries=1
     )
 
 
@@ -132,11 +140,18 @@ def test_b1_follows_the_time_law_of_the_object() -> None:
     share = np.linspace(0.0, 1.0, FINER * plan.options.move_waypoints + 1)
     np.testing.assert_allclose(slide[-len(share) :], 0.3 * (3 * share**2 - 2 * share**3), atol=2e-6)
     for row in plan.trajectory.positions[span.first : span.last + 1 : 7]:
-        assert off(plan.scene, row, handle(row[plan.trajectory.names.index("drawer.slide")])) < 1e-3
+        assert (
+            compute_pose_error(
+                plan.scene,
+                row,
+                compute_handle_pose(row[plan.trajectory.names.index("drawer.slide")]),
+            )
+            < 1e-3
+        )
 
 
 def test_differential_base() -> None:
-    scene = open_scene(base="differential")
+    scene = make_open_scene(base="differential")
     plan = plan_separately(scene, [PULL], options=OPTIONS)
     assert plan.success, plan.summary()
     x, y, yaw = plan.trajectory.positions[:, :3].T
@@ -172,7 +187,7 @@ def test_result_is_reproducible_in_another_process() -> None:
 def test_no_base_pose_in_a_narrow_aisle(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     limit_search(monkeypatch)
     plan = plan_failure(
-        with_boxes(drawer_scene(), counter_2=([0.9, 4.4, 1.2], [1.0, 0.0, 0.6])), method=method
+        add_boxes(load_drawer_scene(), counter_2=([0.9, 4.4, 1.2], [1.0, 0.0, 0.6])), method=method
     )
     assert plan.status == "no base pose"
     assert [phase.name for phase in plan.trajectory.phases] == ["stand"]
@@ -182,11 +197,11 @@ def test_no_base_pose_in_a_narrow_aisle(method: str, monkeypatch: pytest.MonkeyP
 
 def test_no_base_pose_for_the_open_drawer(monkeypatch: pytest.MonkeyPatch) -> None:
     limit_search(monkeypatch)
-    plan = plan_failure(with_boxes(open_scene(), post=([0.05, 0.05, 1.0], [1.65, 0.25, 0.5])))
+    plan = plan_failure(add_boxes(make_open_scene(), post=([0.05, 0.05, 1.0], [1.65, 0.25, 0.5])))
     assert plan.status == "no base pose"
     assert [phase.name for phase in plan.trajectory.phases] == ["go to", "reach drawer.handle"]
     last = plan.trajectory.positions[-1]
-    assert off(plan.scene, last, handle()) < 1e-3
+    assert compute_pose_error(plan.scene, last, compute_handle_pose()) < 1e-3
     kinds = {v.constraint for v in plan.report.violations}
     assert "goal" in kinds
     # A motion that ends before the grasp has no leave to be as close to the tray as a grasp is.
@@ -206,7 +221,7 @@ def test_arm_does_not_reach(monkeypatch: pytest.MonkeyPatch) -> None:
         for name, z in (("above", 0.15), ("below", -0.15))
     }
     options = dataclasses.replace(OPTIONS, max_restarts=1, max_iterations=20)
-    plan = plan_failure(with_boxes(open_scene(), **shelves), options=options)
+    plan = plan_failure(add_boxes(make_open_scene(), **shelves), options=options)
     assert plan.status == "arm does not reach"
     assert [phase.name for phase in plan.trajectory.phases][-2:] == ["go to", "reach drawer.handle"]
     assert {"goal", "clearance"} & {v.constraint for v in plan.report.violations}
@@ -251,7 +266,7 @@ def test_ctrl_c(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
         return done(*arguments, **given)
 
     monkeypatch.setattr(attempt, stage, pressed)
-    plan = plan_failure(open_scene(), retries=3)
+    plan = plan_failure(make_open_scene(), retries=3)
     assert plan.status == "interrupted"
     assert calls == [stage]
     before = {
@@ -302,7 +317,7 @@ def test_invalid_arguments(case: tuple[dict[str, Any], str, str]) -> None:
     arguments, field, text = case
     call: dict[str, Any] = {"steps": [PULL], **arguments}
     with pytest.raises(vkc.InputError) as caught:
-        plan_separately(drawer_scene(), call.pop("steps"), **call)
+        plan_separately(load_drawer_scene(), call.pop("steps"), **call)
     assert caught.value.field == field
     assert text in str(caught.value)
 
@@ -310,7 +325,7 @@ def test_invalid_arguments(case: tuple[dict[str, Any], str, str]) -> None:
 @pytest.mark.parametrize("method", ["B1", "B2"])
 def test_reach(method: str) -> None:
     steps = [vkc.Reach((1.2, 0.4, 0.9, 0.0, 1.2, 0.3))]
-    plan = plan_separately(drawer_scene(), steps, method=method, options=OPTIONS)
+    plan = plan_separately(load_drawer_scene(), steps, method=method, options=OPTIONS)
     assert plan.success
     assert vkc.validate(plan.scene, steps, plan.trajectory, OPTIONS).ok
     assert not plan.trajectory.phases[-1].held
@@ -318,7 +333,9 @@ def test_reach(method: str) -> None:
 
 def test_two_objects() -> None:
     second = {"name": "second", "type": "drawer", "position": [1.93, -1.4, 0.0]}
-    scene = changed(open_scene(), objects=[*drawer_scene().document["objects"], second])
+    scene = replace_drawer_fields(
+        make_open_scene(), objects=[*load_drawer_scene().document["objects"], second]
+    )
     plan = plan_separately(scene, [PULL, vkc.Actuate("second", {"slide": 0.2})], options=OPTIONS)
     assert plan.success, plan.summary()
     names = [phase.name for phase in plan.trajectory.phases]
@@ -328,7 +345,7 @@ def test_two_objects() -> None:
 
 def test_grasped_object_is_not_grasped_again() -> None:
     plan = plan_separately(
-        open_scene(), [vkc.Actuate("drawer", {"slide": 0.15}), PULL], options=OPTIONS
+        make_open_scene(), [vkc.Actuate("drawer", {"slide": 0.15}), PULL], options=OPTIONS
     )
     assert plan.success, plan.summary()
     names = [phase.name for phase in plan.trajectory.phases]
@@ -336,21 +353,21 @@ def test_grasped_object_is_not_grasped_again() -> None:
 
 
 def test_object_grasped_at_the_start() -> None:
-    plan = plan_separately(holding(open_scene()), [PULL], options=OPTIONS)
+    plan = plan_separately(make_grasping_scene(make_open_scene()), [PULL], options=OPTIONS)
     assert plan.success, plan.summary()
     assert [phase.name for phase in plan.trajectory.phases] == ["move drawer.slide"]
 
 
 def test_no_base_path(monkeypatch: pytest.MonkeyPatch) -> None:
     limit_search(monkeypatch, stands=3)
-    plan = plan_failure(with_boxes(open_scene(), wall=([0.1, 4.6, 2.4], [0.15, 0.0, 1.2])))
+    plan = plan_failure(add_boxes(make_open_scene(), wall=([0.1, 4.6, 2.4], [0.15, 0.0, 1.2])))
     assert plan.status == "no base path"
     assert [phase.name for phase in plan.trajectory.phases] == ["go to"]
 
 
 def test_time_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     limit_search(monkeypatch, stands=4)
-    plan = plan_failure(open_scene(), time_limit=1e-6, retries=5)
+    plan = plan_failure(make_open_scene(), time_limit=1e-6, retries=5)
     assert plan.status == "time limit"
     assert plan.metrics["rounds"] == 1.0
 
@@ -359,10 +376,10 @@ def test_limit_of_evaluations() -> None:
     whole = open_drawer("B1")
     used = int(whole.metrics["evaluations"])
     assert compute_hash(
-        plan_separately(drawer_scene(), [PULL], max_evaluations=used)
+        plan_separately(load_drawer_scene(), [PULL], max_evaluations=used)
     ) == compute_hash(whole)
     short = [
-        plan_separately(drawer_scene(), [PULL], max_evaluations=2 * used // 3, planner=planner)
+        plan_separately(load_drawer_scene(), [PULL], max_evaluations=2 * used // 3, planner=planner)
         for planner in (None, vkc.Planner())
     ]
     assert [plan.status for plan in short] == ["evaluation limit"] * 2
@@ -381,7 +398,7 @@ def test_limit_of_evaluations() -> None:
     ids=str,
 )
 def test_arguments_are_checked_as_those_of_plan(arguments: dict[str, Any], field: str) -> None:
-    call = {"scene": drawer_scene(), **arguments}
+    call = {"scene": load_drawer_scene(), **arguments}
     with pytest.raises(vkc.InputError) as caught:
         plan_separately(call.pop("scene"), [PULL], **{"retries": 1, **call})
     assert caught.value.field == field

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.experiments import run_experiment
-from helpers.fake_plan import fake_plan, with_metrics
-from helpers.markdown import cells
+from helpers.fake_plan import make_fake_plan, replace_metrics
+from helpers.markdown import parse_cells
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import baselines
@@ -29,7 +29,7 @@ GOOD = {"B1": {2, 3}, "B2": {1, 2}, "VKC": {0, 1, 2}}
 def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     method, number = spec["method"], spec["number"]
     good, k = number in GOOD[method], COMPARED_PLANNERS.index(method)
-    plan = fake_plan(scene)
+    plan = make_fake_plan(scene)
     metrics = {
         **plan.trajectory.metrics(),
         **PlanningStatistics(1.0 + number + k, 0.5, 12, 3).to_metrics(),
@@ -40,7 +40,7 @@ def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     }
     outcome = Report() if good else plan.report
     status = "success" if good else "collision"
-    return with_metrics(plan, metrics, status=status, report=outcome, seed=spec["seed"])
+    return replace_metrics(plan, metrics, status=status, report=outcome, seed=spec["seed"])
 
 
 def run(out: Path, **changes: Any) -> dict[str, Any]:
@@ -118,7 +118,7 @@ def test_methods_are_planned_from_the_same_start(tmp_path: Path) -> None:
 def table_of(text: str, title: str) -> list[list[str]]:
     """Return the rows of the table in a section."""
     section = text.split(f"## {title}\n")[1].split("\n## ")[0].replace("\\|", "/")
-    return cells("\n".join(line for line in section.splitlines() if line.startswith("|")))[1:]
+    return parse_cells("\n".join(line for line in section.splitlines() if line.startswith("|")))[1:]
 
 
 def test_tables_against_numbers_by_hand(out: Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.fake_plan import with_metrics
+from helpers.fake_plan import replace_metrics
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import chores
@@ -76,7 +76,7 @@ def stay(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     """Return a plan that succeeds unless the number of the trial is 0."""
     plan = vkc.plan(scene, [vkc.GoTo(*scene.start[:2])], seed=spec["seed"])
     status = "success" if spec["number"] else "not converged"
-    return with_metrics(plan, {"planning_time": 1.0 + spec["number"]}, status=status)
+    return replace_metrics(plan, {"planning_time": 1.0 + spec["number"]}, status=status)
 
 
 def test_trials_are_recorded(tmp_path: Path) -> None:

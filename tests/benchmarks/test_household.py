@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.experiments import run_experiment
-from helpers.small_problems import program_of
+from helpers.small_problems import make_program
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.comparison import place_objects
@@ -31,7 +31,7 @@ def test_tasks_can_be_compiled() -> None:
     scene = vkc.load_scene("household")
     for task in TASKS.values():
         assert task.scene == "household"
-        assert program_of(scene, task.steps).segments > 0
+        assert make_program(scene, task.steps).segments > 0
 
 
 def test_variant_has_the_numbers_of_the_papers_code() -> None:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.experiments import run_experiment
-from helpers.fake_plan import fake_plan, with_metrics
-from helpers.markdown import cells
+from helpers.fake_plan import make_fake_plan, replace_metrics
+from helpers.markdown import parse_cells
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import initialization
@@ -32,9 +32,9 @@ def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
         "base_path_length_l1": 6.0 + number,
         "arm_path_length": 7.0 + number * stepwise,
     }
-    plan = fake_plan(scene)
+    plan = make_fake_plan(scene)
     status, report = ("success", Report()) if good else ("rejected", plan.report)
-    return with_metrics(plan, metrics, status=status, report=report, seed=spec["seed"])
+    return replace_metrics(plan, metrics, status=status, report=report, seed=spec["seed"])
 
 
 def run(out: Path, **changes: Any) -> dict[str, Any]:
@@ -85,7 +85,7 @@ def test_tables_against_numbers_by_hand(out: Path, result: dict[str, Any]) -> No
     text = (out / "table.md").read_text(encoding="utf-8")
     assert text == initialization.report(result)
     blocks = [block for block in text.split("\n\n") if block.startswith("|")]
-    methods, compared = (cells(block.replace("\\|", "/"))[1:] for block in blocks)
+    methods, compared = (parse_cells(block.replace("\\|", "/"))[1:] for block in blocks)
     # Starts 0, 1, 2, each twice: "stationary" takes 1, 1, 2, 2, 3, 3 s.
     failed = "rejected (penetration)"
     assert methods == [

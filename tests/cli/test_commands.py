@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from helpers.executions import drawer_plan
+from helpers.executions import plan_drawer
 
 import vkc_pin as vkc
 from vkc_pin import cli
@@ -310,7 +310,7 @@ def test_bench_door_records_every_trial(tmp_path: Path) -> None:
 
 @pytest.fixture
 def plan(tmp_path: Path) -> str:
-    return str(drawer_plan().save(tmp_path / "plan.npz"))
+    return str(plan_drawer().save(tmp_path / "plan.npz"))
 
 
 def test_saved_plan_is_executed(

@@ -9,7 +9,7 @@ __all__ = ["HEIGHT", "write_arms"]
 HEIGHT = 0.35  # [m] of the root above the floor
 
 
-def _link(name: str, size: str = "", at: str = "0 0 0", mesh: str = "") -> str:
+def _format_link(name: str, size: str = "", at: str = "0 0 0", mesh: str = "") -> str:
     geometry = f'<mesh filename="{mesh}"/>' if mesh else f'<box size="{size}"/>'
     shape = (
         f'<collision><origin xyz="{at}"/><geometry>{geometry}</geometry></collision>'
@@ -19,7 +19,7 @@ def _link(name: str, size: str = "", at: str = "0 0 0", mesh: str = "") -> str:
     return f'<link name="{name}">{shape}</link>'
 
 
-def _joint(
+def _format_joint(
     name: str,
     kind: str,
     parent: str,
@@ -52,12 +52,16 @@ def write_arms(
     """
     parts = []
     if own_base:
-        parts += [_link("odom"), _link("slider"), _link("column")]
-        parts += [_joint("drive_x", "prismatic", "odom", "slider", "0 0 0", "1 0 0", (-9, 9))]
-        parts += [_joint("drive_y", "prismatic", "slider", "column", "0 0 0", "0 1 0", (-9, 9))]
-        parts += [_joint("drive_yaw", "continuous", "column", "body", "0 0 0")]
+        parts += [_format_link("odom"), _format_link("slider"), _format_link("column")]
+        parts += [
+            _format_joint("drive_x", "prismatic", "odom", "slider", "0 0 0", "1 0 0", (-9, 9))
+        ]
+        parts += [
+            _format_joint("drive_y", "prismatic", "slider", "column", "0 0 0", "0 1 0", (-9, 9))
+        ]
+        parts += [_format_joint("drive_yaw", "continuous", "column", "body", "0 0 0")]
     parts.append(
-        _link("body", "" if mesh else "0.5 0.4 0.5", "0 0 0" if mesh else "0 0 -0.1", mesh)
+        _format_link("body", "" if mesh else "0.5 0.4 0.5", "0 0 0" if mesh else "0 0 -0.1", mesh)
     )
     for side in sides:
         y = {"left_": 0.3, "right_": -0.3}.get(side, 0.0)
@@ -65,18 +69,18 @@ def write_arms(
         for k, axis in enumerate(("0 0 1", "0 1 0", "0 1 0", "0 0 1", "0 1 0")):
             name = f"{side}arm_{k + 1}"
             parts += [
-                _link(name, "0.06 0.06 0.16", "0 0 0.1"),
-                _joint(f"{name}_joint", "revolute", below, name, at, axis),
+                _format_link(name, "0.06 0.06 0.16", "0 0 0.1"),
+                _format_joint(f"{name}_joint", "revolute", below, name, at, axis),
             ]
             below, at = name, "0 0 0.2"
         parts += [
-            _link(f"{side}hand", "0.05 0.14 0.06", "0 0 0.03"),
-            _joint(f"{side}wrist", "fixed", below, f"{side}hand", at),
+            _format_link(f"{side}hand", "0.05 0.14 0.06", "0 0 0.03"),
+            _format_joint(f"{side}wrist", "fixed", below, f"{side}hand", at),
         ]
         for finger, sign in (("a", 1), ("b", -1)):
             name = f"{side}finger_{finger}"
-            parts.append(_link(name, "0.02 0.01 0.08", f"0 {sign * 0.005} 0.04"))
-            joint = _joint(
+            parts.append(_format_link(name, "0.02 0.01 0.08", f"0 {sign * 0.005} 0.04"))
+            joint = _format_joint(
                 f"{name}_joint",
                 "prismatic",
                 f"{side}hand",

@@ -18,15 +18,15 @@ MARGIN = 0.02
 BLINK = 1.1e-3
 
 
-def at(x: float, y: float, z: float, yaw: float = 0.0) -> pin.SE3:
+def make_pose(x: float, y: float, z: float, yaw: float = 0.0) -> pin.SE3:
     return pin.SE3(pin.utils.rotate("z", yaw), np.array([x, y, z], float))
 
 
-def chassis(length: float = 1.0, width: float = 0.67) -> list[Shape]:
-    return [(coal.Box(length, width, 0.4), at(0.0, 0.0, 0.2))]
+def make_chassis(length: float = 1.0, width: float = 0.67) -> list[Shape]:
+    return [(coal.Box(length, width, 0.4), make_pose(0.0, 0.0, 0.2))]
 
 
-def arm() -> list[Shape]:
+def make_arm_shapes() -> list[Shape]:
     """Return ten convex shapes 0.4 to 1.1 m above the floor that overhang the chassis a little."""
     rng = np.random.default_rng(1)
     shapes = []
@@ -37,29 +37,29 @@ def arm() -> list[Shape]:
     return shapes
 
 
-def wedge() -> coal.Convex:
+def make_wedge() -> coal.Convex:
     """Return a convex mesh: a prism with a triangle as its base, lower at one end."""
     return make_convex_hull(
         [(0, 0, 0), (0.6, 0, 0), (0, 0.4, 0), (0, 0, 0.5), (0.6, 0, 0.2), (0, 0.4, 0.5)]
     )
 
 
-def furniture() -> list[Shape]:
+def make_furniture() -> list[Shape]:
     """A table, a table top on four legs, and a block in the way."""
     legs = [
-        (coal.Box(0.08, 0.08, 0.75), at(-0.5 + 1.4 * a, 3.5 + 0.7 * b, 0.375))
+        (coal.Box(0.08, 0.08, 0.75), make_pose(-0.5 + 1.4 * a, 3.5 + 0.7 * b, 0.375))
         for a in (-1, 1)
         for b in (-1, 1)
     ]
     return [
-        (coal.Box(1.0, 2.0, 0.72), at(2.5, 1.0, 0.36)),
-        (coal.Box(3.0, 1.6, 0.05), at(-0.5, 3.5, 0.775)),
-        (coal.Box(2.0, 3.0, 2.1), at(2.0, -2.0, 1.05)),
+        (coal.Box(1.0, 2.0, 0.72), make_pose(2.5, 1.0, 0.36)),
+        (coal.Box(3.0, 1.6, 0.05), make_pose(-0.5, 3.5, 0.775)),
+        (coal.Box(2.0, 3.0, 2.1), make_pose(2.0, -2.0, 1.05)),
         *legs,
     ]
 
 
-def clutter(seed: int, count: int, *, reach: float = 4.5) -> list[Shape]:
+def make_clutter(seed: int, count: int, *, reach: float = 4.5) -> list[Shape]:
     """Boxes, cylinders, spheres, and lying capsules at random."""
     rng = np.random.default_rng(seed)
     shapes: list[Shape] = []
@@ -67,11 +67,17 @@ def clutter(seed: int, count: int, *, reach: float = 4.5) -> list[Shape]:
         x, y = rng.uniform(-reach, reach, 2)
         height, yaw = rng.uniform(0.2, 2.0), rng.uniform(0.0, np.pi)
         if k % 4 == 0:
-            shapes.append((coal.Box(*rng.uniform(0.1, 0.8, 2), height), at(x, y, height / 2, yaw)))
+            shapes.append(
+                (coal.Box(*rng.uniform(0.1, 0.8, 2), height), make_pose(x, y, height / 2, yaw))
+            )
         elif k % 4 == 1:
-            shapes.append((coal.Cylinder(rng.uniform(0.05, 0.3), height), at(x, y, height / 2)))
+            shapes.append(
+                (coal.Cylinder(rng.uniform(0.05, 0.3), height), make_pose(x, y, height / 2))
+            )
         elif k % 4 == 2:
-            shapes.append((coal.Sphere(rng.uniform(0.1, 0.4)), at(x, y, rng.uniform(0.2, 1.0))))
+            shapes.append(
+                (coal.Sphere(rng.uniform(0.1, 0.4)), make_pose(x, y, rng.uniform(0.2, 1.0)))
+            )
         else:
             lying = pin.SE3(
                 pin.utils.rotate("z", yaw) @ pin.utils.rotate("x", np.pi / 2 - 0.2),
@@ -81,9 +87,11 @@ def clutter(seed: int, count: int, *, reach: float = 4.5) -> list[Shape]:
     return shapes
 
 
-def distance(shapes: Sequence[Shape], standing: Sequence[Shape], pose: Sequence[float]) -> float:
+def compute_distance(
+    shapes: Sequence[Shape], standing: Sequence[Shape], pose: Sequence[float]
+) -> float:
     """Return coal's smallest distance [m] of shapes on a base at (x, y, yaw) to fixed shapes."""
-    base = at(pose[0], pose[1], 0.0, pose[2])
+    base = make_pose(pose[0], pose[1], 0.0, pose[2])
     nearest = np.inf
     for shape, placement in shapes:
         where = _transform(base * placement)
@@ -100,7 +108,7 @@ def distance(shapes: Sequence[Shape], standing: Sequence[Shape], pose: Sequence[
     return nearest
 
 
-def between(
+def interpolate_poses(
     a: Sequence[float], b: Sequence[float], *, length: float = 0.01, angle: float = 0.02
 ) -> NDArray[np.float64]:
     """Return poses on the straight line between two, at most a step [m], [rad] apart; (N, 3)."""

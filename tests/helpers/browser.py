@@ -25,7 +25,7 @@ FLAGS = (
 )
 
 
-def screenshot(
+def save_screenshot(
     page: Path,
     picture: Path,
     *,
@@ -42,7 +42,7 @@ def screenshot(
 READY = 'data-ready="yes"'  # what a page says of itself once it has drawn its first picture
 
 
-def document(
+def read_document(
     page: Path,
     *,
     time: float | None = None,

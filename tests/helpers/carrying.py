@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from helpers.drives import DT, hall
+from helpers.drives import DT, make_hall
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.scene.hold import make_holds
 from vkc_pin.world.scene.placed_object import PlacedObject
@@ -32,43 +32,43 @@ UP = np.array([0.0, 0.0, 0.2])
 FREE = {"stick": STICK, "ball": BALL}
 
 
-def box(name: str, size: Sequence[float], position: Sequence[float]) -> dict[str, Any]:
+def describe_box(name: str, size: Sequence[float], position: Sequence[float]) -> dict[str, Any]:
     return {"name": name, "type": "box", "size": list(size), "position": list(position)}
 
 
-def table(*, gap: float = 1e-3) -> dict[str, Any]:
+def describe_table(*, gap: float = 1e-3) -> dict[str, Any]:
     """Return a table of 0.5 m x 2.4 m whose top is `gap` below the stick's discs."""
-    return box("table", [0.5, 2.4, 0.02], [0.8, 0.3, TOP - gap - 0.01])
+    return describe_box("table", [0.5, 2.4, 0.02], [0.8, 0.3, TOP - gap - 0.01])
 
 
-def stand(name: str = "stand", *, aside: float = 0.0, gap: float = 1e-3) -> dict[str, Any]:
+def describe_stand(name: str = "stand", *, aside: float = 0.0, gap: float = 1e-3) -> dict[str, Any]:
     """Return a post under the ball, or `aside` [m] along y from it, its top `gap` below it."""
-    return box(name, [0.06, 0.06, 0.5], [0.8, 0.285 + aside, 0.665 - gap - 0.25])
+    return describe_box(name, [0.06, 0.06, 0.5], [0.8, 0.285 + aside, 0.665 - gap - 0.25])
 
 
-def room(
+def make_room(
     *obstacles: Mapping[str, Any], objects: Sequence[str] = ("stick",), base: str = "omni"
 ) -> Scene:
     """Return a hall with obstacles and free objects; the hand is 0.2 m above the stick's grasp."""
-    scene = hall(base=base, obstacles=obstacles)
+    scene = make_hall(base=base, obstacles=obstacles)
     document = {
         **scene.document,
-        "objects": [{"name": n, "type": n, "position": _place(n)} for n in objects],
+        "objects": [{"name": n, "type": n, "position": _get_position(n)} for n in objects],
     }
     scene = Scene.from_document(document)
-    return scene.with_start(arm=above(STICK)[3:]) if "stick" in objects else scene
+    return scene.with_start(arm=solve_above(STICK)[3:]) if "stick" in objects else scene
 
 
-def _place(name: str) -> list[float]:
+def _get_position(name: str) -> list[float]:
     return [float(value) for value in FREE[name].translation]
 
 
-def lifted(placement: pin.SE3, shift: Sequence[float] | np.ndarray = UP) -> pin.SE3:
+def lift(placement: pin.SE3, shift: Sequence[float] | np.ndarray = UP) -> pin.SE3:
     """Return `placement` moved by `shift` in the world [m]."""
     return pin.SE3(placement.rotation, placement.translation + np.asarray(shift))
 
 
-def tool_at(
+def compute_grasp_pose(
     object_at: pin.SE3,
     name: str = "stick",
     attachment: str = "grip",
@@ -79,12 +79,12 @@ def tool_at(
     return (
         object_at
         * grasp.placement
-        * freedom(attachment, values)
+        * compute_freedom(attachment, values)
         * pin.SE3(np.eye(3), np.array([0.0, 0.0, -grasp.standoff]))
     )
 
 
-def freedom(attachment: str, values: Sequence[float]) -> pin.SE3:
+def compute_freedom(attachment: str, values: Sequence[float]) -> pin.SE3:
     """Return J(v) of the attachments of stick and ball, from their files."""
     if attachment == "end":
         return pin.SE3.Identity()
@@ -97,12 +97,12 @@ def freedom(attachment: str, values: Sequence[float]) -> pin.SE3:
     )
 
 
-def reaching(tool: pin.SE3, guess: np.ndarray = GUESS) -> np.ndarray:
+def solve_reach(tool: pin.SE3, guess: np.ndarray = GUESS) -> np.ndarray:
     """Return robot coordinates, shape (9,), that reach `tool`, near `guess` and with its base.
 
     Newton steps on numeric Pinocchio, from `guess` and then from around it.
     """
-    robot, rng = hall().robot, np.random.default_rng(0)
+    robot, rng = make_hall().robot, np.random.default_rng(0)
     model, data = robot.model, robot.model.createData()
     frame = model.getFrameId(robot.tool_frame)
     found = []
@@ -126,13 +126,13 @@ def reaching(tool: pin.SE3, guess: np.ndarray = GUESS) -> np.ndarray:
 
 
 @cache
-def _above() -> np.ndarray:
-    return reaching(tool_at(lifted(STICK)))
+def _make_guess_above() -> np.ndarray:
+    return solve_reach(compute_grasp_pose(lift(STICK)))
 
 
-def above(stick: pin.SE3, **grasp: Any) -> np.ndarray:
+def solve_above(stick: pin.SE3, **grasp: Any) -> np.ndarray:
     """Return robot coordinates with the hand 0.2 m above the grasp of the stick at `stick`."""
-    return reaching(tool_at(lifted(stick), **grasp), _above())
+    return solve_reach(compute_grasp_pose(lift(stick), **grasp), _make_guess_above())
 
 
 @dataclasses.dataclass
@@ -205,7 +205,7 @@ class Script:
         return Trajectory(names, dt * np.arange(shape), rows, tuple(self.phases), len(robot))
 
 
-def moved_base(row: np.ndarray, **values: float) -> np.ndarray:
+def move_base(row: np.ndarray, **values: float) -> np.ndarray:
     """Return a row with the base further: x, y and yaw by name."""
     out = np.array(row)
     for name, value in values.items():
@@ -213,7 +213,7 @@ def moved_base(row: np.ndarray, **values: float) -> np.ndarray:
     return out
 
 
-def carried_over(
+def carry_over(
     scene: Scene,
     *,
     aside: float = 0.5,
@@ -225,20 +225,20 @@ def carried_over(
     With `off` the hand closes that far beside the attachment, in the tool's frame.
     """
     off = pin.SE3.Identity() if off is None else off
-    up = reaching(tool_at(lifted(STICK), values=values) * off, _above())
-    down = reaching(tool_at(STICK, values=values) * off, up)
+    up = solve_reach(compute_grasp_pose(lift(STICK), values=values) * off, _make_guess_above())
+    down = solve_reach(compute_grasp_pose(STICK, values=values) * off, up)
     script = Script(scene).go(up).go(down).take("stick", values=values).go(up)
-    script.go(moved_base(up, y=aside)).go(moved_base(down, y=aside)).let_go()
-    return script.go(moved_base(up, y=aside))
+    script.go(move_base(up, y=aside)).go(move_base(down, y=aside)).let_go()
+    return script.go(move_base(up, y=aside))
 
 
-def with_object(scene: Scene, name: str, placement: pin.SE3) -> Scene:
+def place_object(scene: Scene, name: str, placement: pin.SE3) -> Scene:
     """Return the scene with a free object elsewhere."""
     placed: PlacedObject = dataclasses.replace(scene.objects[name], placement=placement)
     return dataclasses.replace(scene, objects={**scene.objects, name: placed})
 
 
-def with_grasp(scene: Scene, name: str, attachment: str, **fields: Any) -> Scene:
+def replace_grasp(scene: Scene, name: str, attachment: str, **fields: Any) -> Scene:
     """Return the scene with other fields of an object's attachment."""
     placed = scene.objects[name]
     attachments = {**placed.object.attachments}

@@ -9,10 +9,10 @@ import yaml
 
 import vkc_pin as vkc
 
-__all__ = ["changed", "closer", "loaded"]
+__all__ = ["load_door_with_closer", "load_tray_scene", "replace_object_fields"]
 
 
-def changed(scene: vkc.Scene, name: str, **fields: Any) -> vkc.Scene:
+def replace_object_fields(scene: vkc.Scene, name: str, **fields: Any) -> vkc.Scene:
     """Return a scene with another description of an object: its fields, or joint → fields."""
     document = copy.deepcopy(dict(scene.document))
     item = next(item for item in document["objects"] if item["name"] == name)
@@ -26,11 +26,11 @@ def changed(scene: vkc.Scene, name: str, **fields: Any) -> vkc.Scene:
     return vkc.Scene.from_document(document, scene.folder)
 
 
-def closer(**resistance: float) -> vkc.Scene:
+def load_door_with_closer(**resistance: float) -> vkc.Scene:
     """Return the scene with the door, whose hinge resists."""
-    return changed(vkc.load_scene("door"), "door", joints={"hinge": resistance})
+    return replace_object_fields(vkc.load_scene("door"), "door", joints={"hinge": resistance})
 
 
-def loaded(mass: float) -> vkc.Scene:
+def load_tray_scene(mass: float) -> vkc.Scene:
     """Return the scene with the tray, which weighs so much [kg]."""
-    return changed(vkc.load_scene("tray"), "tray", mass=mass)
+    return replace_object_fields(vkc.load_scene("tray"), "tray", mass=mass)

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from helpers.carrying import room
-from helpers.small_problems import door_scene
+from helpers.carrying import make_room
+from helpers.small_problems import load_door_scene
 from vkc_pin.world.scene.scene import Scene
 
 
-def things(seed: int, count: int) -> list[dict[str, Any]]:
+def describe_random_obstacles(seed: int, count: int) -> list[dict[str, Any]]:
     """Return `count` random obstacles: near and far, from 1 cm to 3 m, turned anyhow."""
     rng, obstacles = np.random.default_rng(seed), []
     for number in range(count):
@@ -29,12 +29,14 @@ def things(seed: int, count: int) -> list[dict[str, Any]]:
     return obstacles
 
 
-def cluttered(seed: int, count: int) -> Scene:
+def make_cluttered_scene(seed: int, count: int) -> Scene:
     """Return the door's scene with `count` random obstacles instead of its own."""
-    scene = door_scene()
-    return Scene.from_document({**scene.document, "obstacles": things(seed, count)}, scene.folder)
+    scene = load_door_scene()
+    return Scene.from_document(
+        {**scene.document, "obstacles": describe_random_obstacles(seed, count)}, scene.folder
+    )
 
 
-def cluttered_room(seed: int, count: int) -> Scene:
+def make_cluttered_room(seed: int, count: int) -> Scene:
     """Return a hall with a stick and a ball that can be carried, among `count` random obstacles."""
-    return room(*things(seed, count), objects=("stick", "ball"))
+    return make_room(*describe_random_obstacles(seed, count), objects=("stick", "ball"))

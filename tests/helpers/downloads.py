@@ -7,7 +7,7 @@ from pathlib import Path
 import trimesh
 
 
-def partnet(folder: Path) -> Path:
+def write_partnet_object(folder: Path) -> Path:
     """Write a cabinet as PartNet-Mobility has them, and return its `mobility.urdf`.
 
     About one unit high, y up, set upright by a fixed joint below a link `base` without shapes; many

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from helpers.carrying import reaching
+from helpers.carrying import solve_reach
 from vkc_pin.options import Options
 from vkc_pin.world.models.shapes import compute_shape_distance, get_link_name
 from vkc_pin.world.scene.obstacles import FLOOR
@@ -25,32 +25,32 @@ STANDING = np.array(
 
 
 @cache
-def drawer_scene() -> Scene:
+def load_drawer_scene() -> Scene:
     return load_scene("drawer")
 
 
-def with_boxes(scene: Scene, **boxes: tuple[Sequence[float], Sequence[float]]) -> Scene:
+def add_boxes(scene: Scene, **boxes: tuple[Sequence[float], Sequence[float]]) -> Scene:
     """Return the scene with more boxes in it, each by its size and the place of its centre."""
     added = [
         {"name": n, "type": "box", "size": list(size), "position": list(at)}
         for n, (size, at) in boxes.items()
     ]
-    return changed(scene, obstacles=[*scene.document["obstacles"], *added])
+    return replace_drawer_fields(scene, obstacles=[*scene.document["obstacles"], *added])
 
 
-def changed(scene: Scene, **fields: Any) -> Scene:
+def replace_drawer_fields(scene: Scene, **fields: Any) -> Scene:
     """Return the scene with other fields of its document."""
     return Scene.from_document({**scene.document, **fields}, scene.folder)
 
 
-def open_scene(*obstacles: dict[str, Any], base: str = "omni") -> Scene:
+def make_open_scene(*obstacles: dict[str, Any], base: str = "omni") -> Scene:
     """Return the drawer's arena without what stands about in it."""
-    return changed(
-        drawer_scene(), obstacles=list(obstacles), robot={"name": "husky_ur5e", "base": base}
+    return replace_drawer_fields(
+        load_drawer_scene(), obstacles=list(obstacles), robot={"name": "husky_ur5e", "base": base}
     )
 
 
-def handle(slide: float = 0.0, *, tilt: float = 0.0) -> pin.SE3:
+def compute_handle_pose(slide: float = 0.0, *, tilt: float = 0.0) -> pin.SE3:
     """Return the tool's pose that grasps the handle, from the drawer's URDF, by hand."""
     # The tool's z axis, along which it comes, along x; its x axis, in which the fingers close,
     # upwards.
@@ -61,29 +61,31 @@ def handle(slide: float = 0.0, *, tilt: float = 0.0) -> pin.SE3:
     return grasp * pin.SE3(pin.utils.rotate("y", tilt), np.zeros(3))
 
 
-def tool(scene: Scene, row: np.ndarray) -> pin.SE3:
+def compute_tool_pose(scene: Scene, row: np.ndarray) -> pin.SE3:
     """Return the tool's pose by numeric Pinocchio; `row` begins with the robot's coordinates."""
     return dataclasses.replace(scene, start=np.array(row[: len(scene.start)])).tool_placement()
 
 
-def off(scene: Scene, row: np.ndarray, target: pin.SE3) -> float:
+def compute_pose_error(scene: Scene, row: np.ndarray, target: pin.SE3) -> float:
     """Return the largest coordinate of the error between the tool and its target, [m] or [rad]."""
-    error = tool(scene, row).inverse() * target
+    error = compute_tool_pose(scene, row).inverse() * target
     return float(np.abs(np.concatenate([error.translation, pin.log3(error.rotation)])).max())
 
 
 @cache
-def _arm() -> np.ndarray:
-    return reaching(handle(), STANDING)
+def _solve_grasp() -> np.ndarray:
+    return solve_reach(compute_handle_pose(), STANDING)
 
 
-def holding(scene: Scene | None = None, attachment: str = "handle") -> Scene:
+def make_grasping_scene(scene: Scene | None = None, attachment: str = "handle") -> Scene:
     """Return the scene with the robot holding the shut drawer, from 1.2 m before it."""
-    scene, row = scene or drawer_scene(), _arm()
+    scene, row = scene or load_drawer_scene(), _solve_grasp()
     return scene.with_start(base=row[:3], arm=row[3:]).with_held({"drawer": attachment})
 
 
-def spare(scene: Scene, row: np.ndarray, *, slide: float = 0.0, held: bool = False) -> float:
+def compute_spare_clearance(
+    scene: Scene, row: np.ndarray, *, slide: float = 0.0, held: bool = False
+) -> float:
     """Return the smallest distance minus margin of all pairs [m]; `row` begins with the robot's z.
 
     The robot's own pairs, the robot and everything, and what it holds and everything but what that
@@ -96,14 +98,16 @@ def spare(scene: Scene, row: np.ndarray, *, slide: float = 0.0, held: bool = Fal
     )
     links = list(robot.collision.geometryObjects)
     own = [(pair.first, pair.second) for pair in robot.collision.collisionPairs]
-    found = [_gap(links[i], shapes.oMg[i], links[j], shapes.oMg[j]) - MARGIN for i, j in own]
-    things = _things(scene, state)
+    found = [
+        _compute_gap(links[i], shapes.oMg[i], links[j], shapes.oMg[j]) - MARGIN for i, j in own
+    ]
+    things = _get_shapes(scene, state)
     for i, link in enumerate(links):
         for label, shape in things:
             wheels = label == FLOOR and link.parentJoint == 1
             touching = label == "drawer.tray" and get_link_name(link.name) in robot.touch_links
             if not wheels and not (touching and held):
-                gap = _gap(link, shapes.oMg[i], shape, shape.placement)
+                gap = _compute_gap(link, shapes.oMg[i], shape, shape.placement)
                 found.append(gap - (BESIDE_HANDLE if touching else MARGIN))
     if held:
         tray = [shape for label, shape in things if label == "drawer.tray"]
@@ -111,14 +115,14 @@ def spare(scene: Scene, row: np.ndarray, *, slide: float = 0.0, held: bool = Fal
             shape for label, shape in things if not label.startswith("drawer.") and label != FLOOR
         ]
         found += [
-            _gap(one, one.placement, other, other.placement) - MARGIN
+            _compute_gap(one, one.placement, other, other.placement) - MARGIN
             for one in tray
             for other in others
         ]
     return min(found)
 
 
-def _things(
+def _get_shapes(
     scene: Scene, state: Mapping[str, Mapping[str, float]]
 ) -> list[tuple[str, pin.GeometryObject]]:
     things = list(zip(scene.obstacle_labels, scene.obstacles, strict=True))
@@ -130,7 +134,7 @@ def _things(
     return things
 
 
-def _gap(
+def _compute_gap(
     first: pin.GeometryObject, where: pin.SE3, second: pin.GeometryObject, there: pin.SE3
 ) -> float:
     return compute_shape_distance(first.geometry, where, second.geometry, there)

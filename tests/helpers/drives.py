@@ -16,7 +16,9 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 DT = 0.25  # [s]
 
 
-def hall(*, base: str = "omni", obstacles: Sequence[Mapping[str, Any]] = (), **robot: Any) -> Scene:
+def make_hall(
+    *, base: str = "omni", obstacles: Sequence[Mapping[str, Any]] = (), **robot: Any
+) -> Scene:
     """Return a hall of 12 m x 12 m with the Husky at its centre, and more fields of `robot`."""
     return Scene.from_document(
         {
@@ -28,7 +30,7 @@ def hall(*, base: str = "omni", obstacles: Sequence[Mapping[str, Any]] = (), **r
     )
 
 
-def through(scene: Scene, *stops: np.ndarray, steps: int = 40, dt: float = DT) -> Trajectory:
+def drive_through(scene: Scene, *stops: np.ndarray, steps: int = 40, dt: float = DT) -> Trajectory:
     """Return a motion from the start through `stops`, shape (n,) each, at rest at all of them."""
     share = np.linspace(0.0, 1.0, steps + 1)[1:, None]
     smooth = share**2 * (3.0 - 2.0 * share)
@@ -38,10 +40,10 @@ def through(scene: Scene, *stops: np.ndarray, steps: int = 40, dt: float = DT) -
     phases = tuple(
         PhaseSpan(f"drive {k + 1}", k * steps, (k + 1) * steps) for k in range(len(stops) - 1)
     )
-    return of_rows(scene, np.vstack(rows), dt=dt, phases=phases)
+    return make_trajectory(scene, np.vstack(rows), dt=dt, phases=phases)
 
 
-def of_rows(
+def make_trajectory(
     scene: Scene, rows: np.ndarray, *, dt: float = DT, phases: tuple[PhaseSpan, ...] = ()
 ) -> Trajectory:
     """Return the motion through `rows`, shape (T, n), of the robot alone, `dt` apart."""
@@ -50,7 +52,7 @@ def of_rows(
     return Trajectory(names, dt * np.arange(len(rows)), rows, phases, len(names))
 
 
-def moved(start: np.ndarray, **values: float) -> np.ndarray:
+def move_start(start: np.ndarray, **values: float) -> np.ndarray:
     """Return `start` with the base elsewhere: x, y and yaw by name."""
     out = np.array(start)
     for name, value in values.items():
@@ -58,6 +60,6 @@ def moved(start: np.ndarray, **values: float) -> np.ndarray:
     return out
 
 
-def with_positions(trajectory: Trajectory, positions: np.ndarray) -> Trajectory:
+def replace_positions(trajectory: Trajectory, positions: np.ndarray) -> Trajectory:
     """Return the motion with other waypoints."""
     return dataclasses.replace(trajectory, positions=positions)

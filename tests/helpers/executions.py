@@ -14,11 +14,18 @@ from vkc_pin.simulation.result import SimulationResult
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import PhaseSpan, Trajectory
 
-__all__ = ["door_plan", "drawer_plan", "drawer_result", "holding", "still", "with_mass"]
+__all__ = [
+    "make_grasping_scene",
+    "make_stationary_motion",
+    "plan_door",
+    "plan_drawer",
+    "replace_mass",
+    "simulate_drawer",
+]
 
 
 @cache
-def drawer_plan() -> Plan:
+def plan_drawer() -> Plan:
     """Return a plan that pulls the drawer."""
     plan = vkc.plan(vkc.load_scene("drawer"), [vkc.Actuate("drawer", {"slide": 0.3})])
     assert plan.success
@@ -26,7 +33,7 @@ def drawer_plan() -> Plan:
 
 
 @cache
-def door_plan() -> Plan:
+def plan_door() -> Plan:
     """Return a plan that turns the door's lever and pushes it open."""
     plan = vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 1.2})])
     assert plan.success
@@ -34,17 +41,17 @@ def door_plan() -> Plan:
 
 
 @cache
-def drawer_result() -> SimulationResult:
+def simulate_drawer() -> SimulationResult:
     """Return the execution of the plan that pulls the drawer."""
-    return drawer_plan().simulate()
+    return plan_drawer().simulate()
 
 
-def holding() -> Scene:
+def make_grasping_scene() -> Scene:
     """Return a scene with the stick in the hand."""
     return vkc.load_scene("init_1").with_held({"stick": "grip"})
 
 
-def still(scene: Scene, seconds: float = 1.0) -> Trajectory:
+def make_stationary_motion(scene: Scene, seconds: float = 1.0) -> Trajectory:
     """Return the motion in which nothing moves and what is held stays so."""
     names = list(scene.robot.coordinates.names)
     values = scene.start.tolist()
@@ -62,7 +69,7 @@ def still(scene: Scene, seconds: float = 1.0) -> Trajectory:
     )
 
 
-def with_mass(scene: Scene, name: str, mass: float) -> Scene:
+def replace_mass(scene: Scene, name: str, mass: float) -> Scene:
     """Return a scene in which the last body of an object has another mass [kg] and inertia."""
     placed = scene.objects[name]
     model = pin.Model(placed.object.model)

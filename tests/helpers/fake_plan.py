@@ -31,13 +31,13 @@ class PlanWithMetrics(Plan):
         return {**super().metrics, **self.replaced}
 
 
-def with_metrics(plan: Plan, metrics: Mapping[str, float], **changes: Any) -> Plan:
+def replace_metrics(plan: Plan, metrics: Mapping[str, float], **changes: Any) -> Plan:
     """Return a plan with other metrics, and other fields."""
     fields = {name: value for name, value in vars(plan).items() if name != "replaced"}
     return PlanWithMetrics(**{**fields, **changes}, replaced=metrics)
 
 
-def fake_plan(scene: Scene | None = None) -> Plan:
+def make_fake_plan(scene: Scene | None = None) -> Plan:
     """Return a plan of 6 s in two phases, whose report blames the forearm and the sofa at 4 s."""
     scene = load_scene("door") if scene is None else scene
     robot = scene.robot.coordinates.names

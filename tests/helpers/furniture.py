@@ -14,7 +14,7 @@ BAR = (
 """Upright, 70 mm before a flap that is hinged at y = 0."""
 
 
-def flap(
+def write_flap(
     folder: Path,
     handle: str = "",
     *,

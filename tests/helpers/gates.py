@@ -8,21 +8,23 @@ from typing import Any
 import numpy as np
 
 import vkc_pin as vkc
-from helpers.drives import hall
-from helpers.small_problems import program_of
+from helpers.drives import make_hall
+from helpers.small_problems import make_program
 
 NARROW = 0.73  # [m] the base is 0.67 wide and the arm at home 0.72; both want 0.02 on either side
 TIGHT = 0.70  # [m] here the arm at home does not fit, not even if it may graze
 GOAL = (4.0, 0.5, 0.0)
 
 
-def _across(obstacles: Sequence[dict[str, Any]], goal: Sequence[float]) -> vkc.TrajectoryProblem:
-    scene = hall(obstacles=obstacles)
+def _make_problem(
+    obstacles: Sequence[dict[str, Any]], goal: Sequence[float]
+) -> vkc.TrajectoryProblem:
+    scene = make_hall(obstacles=obstacles)
     document = {**scene.document, "arena": {"x": [-3.0, 6.0], "y": [-3.0, 3.0]}}
-    return program_of(vkc.Scene.from_document(document, scene.folder), [vkc.GoTo(*goal)])
+    return make_program(vkc.Scene.from_document(document, scene.folder), [vkc.GoTo(*goal)])
 
 
-def walled(gap: float) -> vkc.TrajectoryProblem:
+def make_wall_problem(gap: float) -> vkc.TrajectoryProblem:
     """Return the problem of driving past a wall across the hall that leaves a gap beside it [m]."""
     wall = {
         "name": "wall",
@@ -30,13 +32,13 @@ def walled(gap: float) -> vkc.TrajectoryProblem:
         "size": [0.2, 6.0 - gap, 1.5],
         "position": [2.0, gap / 2, 0.75],
     }
-    return _across([wall], (4.0, 1.5, 0.0))
+    return _make_problem([wall], (4.0, 1.5, 0.0))
 
 
-def gated(width: float, *, height: float = 1.5) -> vkc.TrajectoryProblem:
+def make_gate_problem(width: float, *, height: float = 1.5) -> vkc.TrajectoryProblem:
     """Return the problem of driving through a gate of some width [m] in a wall across the hall."""
     size = (6.4 - width) / 2
-    return _across(
+    return _make_problem(
         [
             {
                 "name": name,
@@ -50,6 +52,6 @@ def gated(width: float, *, height: float = 1.5) -> vkc.TrajectoryProblem:
     )
 
 
-def at(problem: vkc.TrajectoryProblem, pose: Sequence[float]) -> np.ndarray:
+def make_waypoint(problem: vkc.TrajectoryProblem, pose: Sequence[float]) -> np.ndarray:
     """Return the problem's start with the base elsewhere, shape (n,)."""
     return np.concatenate([pose, problem.start[3:]])

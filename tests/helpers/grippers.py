@@ -10,7 +10,7 @@ from typing import Any
 from helpers.arm_urdf import HEIGHT, write_arms
 from vkc_pin.world.scene.scene import Scene
 
-__all__ = ["WIDEST", "between_cheeks", "cheeky_drawer", "write_gripper"]
+__all__ = ["WIDEST", "describe_cheeks_drawer", "write_cheeks_scene", "write_gripper"]
 
 WIDEST = 0.08  # [m] between the faces of the fingers
 _GRIPPER = "gripper:\n  finger_a_joint: {closed: 0.0, open: 0.04}\n"
@@ -95,7 +95,7 @@ _DRAWER = """<robot name="drawer">
 </robot>"""
 
 
-def between_cheeks(
+def write_cheeks_scene(
     robot: Path,
     *,
     opening: Any = None,
@@ -148,7 +148,7 @@ def between_cheeks(
     return Scene.from_document(document, robot.parent)
 
 
-def cheeky_drawer(gap: float = 0.06) -> dict[str, Any]:
+def describe_cheeks_drawer(gap: float = 0.06) -> dict[str, Any]:
     """Return a drawer without attachments; `gap` is between its handle's middle and posts [m]."""
     posts = "".join(
         f'<collision><origin xyz="-0.04 {side * (gap + 0.02)} 0"/>'

@@ -27,7 +27,7 @@ WALLS = {  # name → x from, to; y from, to [m]
 }
 
 
-def home_urdf(folder: Path) -> tuple[Path, int]:
+def write_home_urdf(folder: Path) -> tuple[Path, int]:
     """Write a home of three rooms as one URDF, and return it and how many shapes collide in it.
 
     Its walls are shapes of the root; refrigerator, drawers and dishwasher are fixed links with
@@ -37,9 +37,9 @@ def home_urdf(folder: Path) -> tuple[Path, int]:
     folder.mkdir(parents=True, exist_ok=True)
     robot = ElementTree.Element("robot", name="home")
     world = ElementTree.SubElement(robot, "link", name="world")
-    for name, (x0, x1, y0, y1) in (WALLS | _beside_the_door()).items():
-        _box(world, (x1 - x0, y1 - y0, 2.5), ((x0 + x1) / 2, (y0 + y1) / 2, 1.25), name)
-    _box(world, (9.6, 10.2, 0.1), (0.0, 1.0, -0.05), "slab")
+    for name, (x0, x1, y0, y1) in (WALLS | _compute_walls_beside_door()).items():
+        _add_box(world, (x1 - x0, y1 - y0, 2.5), ((x0 + x1) / 2, (y0 + y1) / 2, 1.25), name)
+    _add_box(world, (9.6, 10.2, 0.1), (0.0, 1.0, -0.05), "slab")
     for kind, (x, y, yaw, seed) in PLACES.items():
         source = ElementTree.fromstring(str(vkc.procedural.random_object(kind, seed)["urdf"]))
         own = [link.get("name", "") for link in source.findall("link")]
@@ -49,11 +49,11 @@ def home_urdf(folder: Path) -> tuple[Path, int]:
                     if name.get(key) is not None:
                         name.set(key, f"{kind}_{name.get(key)}")
             robot.append(element)
-        _joint(robot, f"{kind}_stands", "fixed", "world", f"{kind}_{own[0]}", (x, y, 0.0), yaw)
-    table = _link(robot, "table", "fixed", (0.0, 0.5, 0.0))
-    _box(table, (0.8, 1.2, 0.04), (0.0, 0.0, 0.73))
+        _add_joint(robot, f"{kind}_stands", "fixed", "world", f"{kind}_{own[0]}", (x, y, 0.0), yaw)
+    table = _add_link(robot, "table", "fixed", (0.0, 0.5, 0.0))
+    _add_box(table, (0.8, 1.2, 0.04), (0.0, 0.0, 0.73))
     for k, (x, y) in enumerate(((-0.35, -0.55), (-0.35, 0.55), (0.35, -0.55), (0.35, 0.55))):
-        _box(table, (0.05, 0.05, 0.71), (x, y, 0.355), f"leg_{k}")
+        _add_box(table, (0.05, 0.05, 0.71), (x, y, 0.355), f"leg_{k}")
     sofa = trimesh.util.concatenate(
         [
             trimesh.creation.box((0.9, 2.0, 0.4)).apply_translation((0.0, 0.0, 0.2)),
@@ -61,14 +61,18 @@ def home_urdf(folder: Path) -> tuple[Path, int]:
         ]
     )
     sofa.export(folder / "sofa.stl")
-    seat = ElementTree.SubElement(_link(robot, "sofa", "fixed", (-4.1, 1.0, 0.0)), "collision")
+    seat = ElementTree.SubElement(_add_link(robot, "sofa", "fixed", (-4.1, 1.0, 0.0)), "collision")
     ElementTree.SubElement(ElementTree.SubElement(seat, "geometry"), "mesh", filename="sofa.stl")
-    _box(_link(robot, "carpet", "fixed", (0.0, -1.5, 0.0)), (2.0, 1.0, 0.01), (0.0, 0.0, 0.005))
+    _add_box(
+        _add_link(robot, "carpet", "fixed", (0.0, -1.5, 0.0)), (2.0, 1.0, 0.01), (0.0, 0.0, 0.005)
+    )
     for k, y in enumerate((0.2, 0.6)):
-        _cylinder(
-            _link(robot, f"cup_{k}", "floating", (0.25, y, 0.749)), 0.03, 0.1
+        _add_cylinder(
+            _add_link(robot, f"cup_{k}", "floating", (0.25, y, 0.749)), 0.03, 0.1
         )  # one millimetre deep in the table
-    _box(_link(robot, "lump", "floating", (2.0, 5.0, 0.0)), (0.4, 0.4, 0.4), (0.0, 0.0, 0.2))
+    _add_box(
+        _add_link(robot, "lump", "floating", (2.0, 5.0, 0.0)), (0.4, 0.4, 0.4), (0.0, 0.0, 0.2)
+    )
     file = folder / "flat.urdf"
     ElementTree.ElementTree(robot).write(file)
     return file, len(robot.findall("link/collision"))
@@ -96,7 +100,7 @@ HOME_MJCF = """<mujoco>
 </mujoco>"""
 
 
-def _beside_the_door() -> dict[str, tuple[float, float, float, float]]:
+def _compute_walls_beside_door() -> dict[str, tuple[float, float, float, float]]:
     """Return the walls on both sides of the door leaf, which extends from its hinge."""
     door = vkc.load_object(vkc.procedural.random_object("door", PLACES["door"][3]))
     import pinocchio as pin
@@ -122,14 +126,14 @@ def _beside_the_door() -> dict[str, tuple[float, float, float, float]]:
     }
 
 
-def _link(
+def _add_link(
     robot: ElementTree.Element, name: str, kind: str, at: tuple[float, ...]
 ) -> ElementTree.Element:
-    _joint(robot, f"{name}_stands", kind, "world", name, at)
+    _add_joint(robot, f"{name}_stands", kind, "world", name, at)
     return ElementTree.SubElement(robot, "link", name=name)
 
 
-def _joint(
+def _add_joint(
     robot: ElementTree.Element,
     name: str,
     kind: str,
@@ -144,7 +148,7 @@ def _joint(
     ElementTree.SubElement(joint, "origin", xyz=" ".join(map(str, at)), rpy=f"0 0 {yaw}")
 
 
-def _box(
+def _add_box(
     link: ElementTree.Element, size: tuple[float, ...], at: tuple[float, ...], name: str = ""
 ) -> None:
     shape = ElementTree.SubElement(link, "collision", **({"name": name} if name else {}))
@@ -154,7 +158,7 @@ def _box(
     )
 
 
-def _cylinder(link: ElementTree.Element, radius: float, length: float) -> None:
+def _add_cylinder(link: ElementTree.Element, radius: float, length: float) -> None:
     shape = ElementTree.SubElement(link, "collision")
     ElementTree.SubElement(shape, "origin", xyz=f"0 0 {length / 2}")
     ElementTree.SubElement(

@@ -15,13 +15,13 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
-def only(report: Report) -> Violation:
+def get_only_violation(report: Report) -> Violation:
     """Return the one violation there is."""
     assert len(report.violations) == 1, "\n".join(report.lines())
     return report.violations[0]
 
 
-def names(report: Report) -> set[tuple[str, str]]:
+def get_violation_names(report: Report) -> set[tuple[str, str]]:
     return {(violation.constraint, violation.subject) for violation in report.violations}
 
 
@@ -41,7 +41,7 @@ def check(
     )
 
 
-def with_object(
+def replace_object(
     scene: Scene, name: str = "door", *, placement: pin.SE3 | None = None, **fields: object
 ) -> Scene:
     """Return `scene` with an object that stands elsewhere or has other fields."""
@@ -52,10 +52,10 @@ def with_object(
     return dataclasses.replace(scene, objects={**scene.objects, name: changed})
 
 
-def with_attachments(scene: Scene, change: Mapping[str, Attachment]) -> Scene:
-    return with_object(scene, attachments={**scene.objects["door"].object.attachments, **change})
+def replace_attachments(scene: Scene, change: Mapping[str, Attachment]) -> Scene:
+    return replace_object(scene, attachments={**scene.objects["door"].object.attachments, **change})
 
 
-def until_the_grasp(plan: vkc.Plan) -> Trajectory:
+def cut_at_grasp(plan: vkc.Plan) -> Trajectory:
     """Return the first phase of the planned motion."""
     return plan.trajectory.parts()[0]

@@ -68,7 +68,7 @@ class Kernel:
 
 
 @contextmanager
-def kernel() -> Iterator[Kernel]:
+def start_kernel() -> Iterator[Kernel]:
     """Start a kernel in which the package of this checkout is imported as `vkc`, and end it."""
     manager, client = start_new_kernel(kernel_name="python3", cwd=str(ROOT))
     try:

@@ -10,12 +10,12 @@ from vkc_pin.world.scene.scene import Scene
 AT, BIN, BELOW = (1.0, 0.0, 0.036), (0.0, 2.0, 0.16), (-1.0, 0.0, 0.037)
 
 
-def shelf(x: float, y: float) -> dict[str, Any]:
+def describe_shelf(x: float, y: float) -> dict[str, Any]:
     """Return a shelf so low that nothing under it can be taken from above."""
     return {"name": "shelf", "type": "box", "size": [0.6, 0.6, 0.02], "position": [x, y, 0.22]}
 
 
-def littered(*obstacles: dict[str, Any]) -> Scene:
+def make_littered_scene(*obstacles: dict[str, Any]) -> Scene:
     """Return the scene with obstacles and, always, the bin."""
     inside = {
         "name": "bin",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 
-def cells(text: str) -> list[list[str]]:
+def parse_cells(text: str) -> list[list[str]]:
     """Return the rows of a table in Markdown, without the rule."""
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()]
     assert all(set(cell) <= set("-:") for cell in rows[1])

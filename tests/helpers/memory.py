@@ -29,7 +29,9 @@ class _Mallinfo(ctypes.Structure):
     ]
 
 
-def growth(run: Callable[[], object], *, warm: int = 3, times: int = 6) -> tuple[float, float]:
+def measure_growth(
+    run: Callable[[], object], *, warm: int = 3, times: int = 6
+) -> tuple[float, float]:
     """Return what a call leaves behind: bytes of compiled code, and blocks of Python's objects.
 
     It is the least of several calls: caches fill now and then, but what leaks does so every time.

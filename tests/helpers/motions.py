@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from helpers.carrying import Script, room, table
+from helpers.carrying import Script, describe_table, make_room
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
@@ -13,7 +13,7 @@ from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
-def wander(scene: Scene, seed: int, *, size: float) -> Trajectory:
+def make_random_door_motion(scene: Scene, seed: int, *, size: float) -> Trajectory:
     """Return a random motion near the door, four waypoints; steps of joints are up to `size`."""
     rng = np.random.default_rng(seed)
     door = scene.objects["door"].object
@@ -34,7 +34,7 @@ def wander(scene: Scene, seed: int, *, size: float) -> Trajectory:
     )
 
 
-def brute_force(table: PairTable, z: np.ndarray) -> np.ndarray:
+def compute_all_distances(table: PairTable, z: np.ndarray) -> np.ndarray:
     """Return the distances of all pairs, shape (S, P), by Pinocchio and coal without culling."""
     geometry = table.world.collision.copy()
     for first, second in table.pairs.tolist():
@@ -52,15 +52,17 @@ def brute_force(table: PairTable, z: np.ndarray) -> np.ndarray:
     return out
 
 
-def pair_names(table: PairTable, k: int) -> tuple[str, str]:
+def get_pair_names(table: PairTable, k: int) -> tuple[str, str]:
     first, second = table.pairs[k]
     return table.world.collision_labels[first], table.world.collision_labels[second]
 
 
-def whirl(seed: int, *, size: float, scene: Scene | None = None) -> tuple[Scene, Trajectory]:
+def make_random_stick_motion(
+    seed: int, *, size: float, scene: Scene | None = None
+) -> tuple[Scene, Trajectory]:
     """Return a random motion with a stick and a ball on its tip, five waypoints, two phases."""
     rng = np.random.default_rng(seed)
-    scene = room(table(), objects=("stick", "ball")) if scene is None else scene
+    scene = make_room(describe_table(), objects=("stick", "ball")) if scene is None else scene
     scene = scene.with_held({"stick": "grip", "ball": "pull"}, by={"ball": "stick.tip"})
     script = Script(scene)
     for phase in range(2):

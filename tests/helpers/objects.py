@@ -15,7 +15,7 @@ SHAPES = (
 )
 
 
-def joint(name: str, kind: str, parent: str, child: str, axis: str) -> str:
+def format_joint(name: str, kind: str, parent: str, child: str, axis: str) -> str:
     limit = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'
     links = f'<parent link="{parent}"/><child link="{child}"/>'
     return f'<joint name="{name}" type="{kind}">{links}<axis xyz="{axis}"/>{limit}</joint>'
@@ -30,7 +30,7 @@ def load_text(urdf: str, yaml: str) -> ArticulatedObject:
 
 URDF = (
     '<robot name="t"><link name="frame"/><link name="panel"/><link name="lever"/>'
-    + joint("hinge", "revolute", "frame", "panel", "0 0 1")
+    + format_joint("hinge", "revolute", "frame", "panel", "0 0 1")
     + '<joint name="knob" type="continuous"><parent link="panel"/><child link="lever"/>'
     '<axis xyz="1 0 0"/></joint></robot>'
 )

@@ -11,7 +11,7 @@ from typing import Any
 import umsgpack
 
 
-def commands_of(text: str) -> list[dict[str, Any]]:
+def read_commands(text: str) -> list[dict[str, Any]]:
     match = re.search(r'id="commands">([^<]*)<', text)
     assert match
     data, at, found = gzip.decompress(base64.b64decode(match[1])), 0, []
@@ -22,6 +22,6 @@ def commands_of(text: str) -> list[dict[str, Any]]:
     return found
 
 
-def clips(commands: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+def read_clips(commands: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     (animation,) = (c for c in commands if c["type"] == "set_animation")
     return {a["path"]: a["clip"] for a in animation["animations"]}

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from helpers.small_problems import random_configurations
+from helpers.small_problems import sample_configurations
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes"}
@@ -107,7 +107,7 @@ class ProgramPoint:
                 np.testing.assert_allclose(found, expected, rtol=1e-5, atol=atol)
 
 
-def random_point(p: TrajectoryProblem, seed: int = 0) -> ProgramPoint:
+def make_random_point(p: TrajectoryProblem, seed: int = 0) -> ProgramPoint:
     """Return a point with relaxation variables between 0 and 1, and random excess."""
     rng, t = np.random.default_rng(seed), p.transcription
     N, K, poses = t.segments, t.slots, len(p.pose_goals)
@@ -116,7 +116,7 @@ def random_point(p: TrajectoryProblem, seed: int = 0) -> ProgramPoint:
     turns = rng.uniform(0.0, np.pi, (N, poses, 1))
     return ProgramPoint(
         problem=p,
-        z=random_configurations(p.chain.lower, p.chain.upper, N, rng),
+        z=sample_configurations(p.chain.lower, p.chain.upper, N, rng),
         slack=rng.uniform(0.0, 1.0, (N, K)),
         relaxation=rng.uniform(0.05, 0.95, N),
         planes=rng.normal(size=(N, K, 12 * (p.chain.model.njoints - 1))),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from helpers.small_problems import random_configurations
+from helpers.small_problems import sample_configurations
 from vkc_pin.planning.nlp.merit import Merit, compute_shortfalls, measure_infeasibility
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 
@@ -66,11 +66,11 @@ class Relaxed:
         return np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0)
 
 
-def iterates(problem: TrajectoryProblem, count: int = 3) -> list[np.ndarray]:
+def make_iterates(problem: TrajectoryProblem, count: int = 3) -> list[np.ndarray]:
     """Return z_1..z_N, shape (N, n): random, some outside the limits, or constant."""
     rng = np.random.default_rng(20)
     lower, upper = problem.chain.lower, problem.chain.upper
-    inside = [random_configurations(lower, upper, problem.segments, rng) for _ in range(count)]
+    inside = [sample_configurations(lower, upper, problem.segments, rng) for _ in range(count)]
     return [*inside, rng.normal(scale=10.0, size=problem.still.shape), problem.still]
 
 

@@ -55,7 +55,7 @@ JOINTS = {
 
 
 @cache
-def folder() -> Path:
+def write_objects() -> Path:
     """Return a folder with descriptions of these objects."""
     made = Path(tempfile.mkdtemp())
     atexit.register(shutil.rmtree, made, ignore_errors=True)
@@ -73,7 +73,7 @@ def folder() -> Path:
     return made
 
 
-def scene_of(
+def make_scene(
     objects: Sequence[Mapping[str, Any]], obstacles: Sequence[Mapping[str, Any]] = ()
 ) -> Scene:
     """Return a hall with objects and obstacles."""
@@ -84,20 +84,21 @@ def scene_of(
         "objects": list(objects),
         "obstacles": list(obstacles),
     }
-    return Scene.from_document(document, folder())
+    return Scene.from_document(document, write_objects())
 
 
-def cup(name: str = "cup", *, at: Sequence[float] = (0.8, 0.05, TOP)) -> dict[str, Any]:
+def describe_cup(name: str = "cup", *, at: Sequence[float] = (0.8, 0.05, TOP)) -> dict[str, Any]:
     return {"name": name, "type": "cup", "position": list(at)}
 
 
-def plates(
+def make_plate_scene(
     kind: str = "plate", *, cups: int = 1, gap: float = 0.0, wall: float | None = None
 ) -> Scene:
     """Return a plate with cups `gap` above it, and optionally a wall behind the first cup [m]."""
     objects = [{"name": "plate", "type": f"{kind}.yaml", "position": [0.8, 0.0, 0.0]}]
     objects += [
-        cup(f"cup_{k}" if k else "cup", at=(0.8, 0.05 - 0.12 * k, TOP + gap)) for k in range(cups)
+        describe_cup(f"cup_{k}" if k else "cup", at=(0.8, 0.05 - 0.12 * k, TOP + gap))
+        for k in range(cups)
     ]
     behind = (
         []
@@ -111,10 +112,10 @@ def plates(
             }
         ]
     )
-    return scene_of(objects, behind)
+    return make_scene(objects, behind)
 
 
-def slid(scene: Scene, value: float, *, steps: int = 30) -> Trajectory:
+def slide_plate(scene: Scene, value: float, *, steps: int = 30) -> Trajectory:
     """Return a motion of the plate's joint to a value, grasped by no hand."""
     joint = scene.objects["plate"].object.coordinates.names[0]
     rows = np.column_stack(
@@ -130,14 +131,14 @@ def slid(scene: Scene, value: float, *, steps: int = 30) -> Trajectory:
     )
 
 
-def trays() -> Scene:
+def make_tray_scene() -> Scene:
     """Return a tray with a cup on it on one table, and another table."""
     objects = [
         {"name": "tray", "type": "tray.yaml", "position": [0.8, 0.0, 0.7]},
-        cup(at=(0.82, 0.05, 0.72)),
+        describe_cup(at=(0.82, 0.05, 0.72)),
     ]
     tables = [
         {"name": name, "type": "box", "size": [0.36, 0.5, 0.1], "position": list(at)}
         for name, at in (("table", (0.8, 0.0, 0.65)), ("other", (-0.5, -1.5, 0.65)))
     ]
-    return scene_of(objects, tables)
+    return make_scene(objects, tables)

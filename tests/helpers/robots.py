@@ -10,17 +10,19 @@ import pinocchio as pin
 from vkc_pin.world.models.robot import Robot
 
 
-def at_rest(robot: Robot) -> np.ndarray:
+def get_rest(robot: Robot) -> np.ndarray:
     return np.concatenate([np.zeros(3), robot.home])
 
 
-def placement(robot: Robot, frame: str, z: np.ndarray) -> pin.SE3:
+def compute_placement(robot: Robot, frame: str, z: np.ndarray) -> pin.SE3:
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(z))
     return data.oMf[robot.model.getFrameId(frame)].copy()
 
 
-def small_urdf(folder: Path, *, joints: str = "", links: str = "", name: str = "small") -> Path:
+def write_small_urdf(
+    folder: Path, *, joints: str = "", links: str = "", name: str = "small"
+) -> Path:
     shape = "<collision><geometry><box size='0.1 0.1 0.1'/></geometry></collision>"
     chain = "".join(
         f'<joint name="j{k}" type="revolute"><parent link="l{k}"/><child link="l{k + 1}"/>'

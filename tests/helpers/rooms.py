@@ -33,7 +33,7 @@ obstacles:
 """
 
 
-def load(folder: Path, text: str) -> Scene:
+def load_scene_text(folder: Path, text: str) -> Scene:
     file = folder / "room.yaml"
     file.write_text(text)
     return load_scene(file)

@@ -65,24 +65,24 @@ CABINET_STATE = {"swing": 0.3, "slide": 0.1, "flap_hinge": 0.7, "lid_hinge": -0.
 
 
 @cache
-def door_scene() -> Scene:
+def load_door_scene() -> Scene:
     return load_scene("door")
 
 
 @cache
-def cabinet() -> ArticulatedObject:
+def load_cabinet() -> ArticulatedObject:
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "cabinet.urdf").write_text(_CABINET)
         (Path(folder) / "cabinet.yaml").write_text(_CABINET_FILE)
         return load_object(Path(folder) / "cabinet.yaml")
 
 
-def with_objects(scene: Scene, objects: Mapping[str, PlacedObject]) -> Scene:
+def replace_objects(scene: Scene, objects: Mapping[str, PlacedObject]) -> Scene:
     """Return `scene` with `objects` added to its own, or in their place."""
     return dataclasses.replace(scene, objects={**scene.objects, **objects})
 
 
-def with_attachment(placed: PlacedObject, attachment: Attachment) -> PlacedObject:
+def replace_attachment(placed: PlacedObject, attachment: Attachment) -> PlacedObject:
     """Return `placed` with one more attachment."""
     attachments = {**placed.object.attachments, attachment.name: attachment}
     return dataclasses.replace(
@@ -91,17 +91,17 @@ def with_attachment(placed: PlacedObject, attachment: Attachment) -> PlacedObjec
 
 
 @cache
-def full_scene() -> Scene:
+def make_full_scene() -> Scene:
     """Return the door's room with a drawer and a cabinet, with grasps of every kind."""
-    scene, drawer = door_scene(), load_scene("drawer").objects["drawer"]
-    state = np.array([CABINET_STATE[name] for name in cabinet().coordinates.names])
+    scene, drawer = load_door_scene(), load_scene("drawer").objects["drawer"]
+    state = np.array([CABINET_STATE[name] for name in load_cabinet().coordinates.names])
     case = PlacedObject(
         "cabinet",
-        cabinet(),
+        load_cabinet(),
         pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, 0.8), np.array([-1.0, 1.2, 0.4])),
         state,
     )
-    grip = cabinet().attachments["grip"]
+    grip = load_cabinet().attachments["grip"]
     axis = np.array([2.0, -1.0, 2.0]) / 3.0
     turns = tuple(
         Freedom(f"_{name}", "revolute", unit, -0.7, 0.6)
@@ -141,11 +141,11 @@ def full_scene() -> Scene:
         dataclasses.replace(grip, name="wheel", joint="listed", freedoms=wheel, standoff=0.02),
         dataclasses.replace(grip, name="face", joint="listed", freedoms=face, standoff=0.01),
     ):
-        case = with_attachment(case, freer)
-    return with_objects(scene, {"drawer": drawer, "cabinet": case})
+        case = replace_attachment(case, freer)
+    return replace_objects(scene, {"drawer": drawer, "cabinet": case})
 
 
-def random_configurations(
+def sample_configurations(
     lower: np.ndarray,
     upper: np.ndarray,
     count: int,
@@ -159,7 +159,7 @@ def random_configurations(
     return rng.uniform(low, high, (count, len(low)))
 
 
-def all_pairs(part: PhaseGeometry) -> pin.GeometryModel:
+def make_all_pairs(part: PhaseGeometry) -> pin.GeometryModel:
     """Return a phase's geometry as Pinocchio's own with all pairs, without culling."""
     geometry = pin.GeometryModel()
     for shape in part.shapes:
@@ -169,7 +169,7 @@ def all_pairs(part: PhaseGeometry) -> pin.GeometryModel:
     return geometry
 
 
-def hand_off_the_handle(scene: Scene, row: np.ndarray, hinge: float, knob: float) -> float:
+def compute_grasp_error(scene: Scene, row: np.ndarray, hinge: float, knob: float) -> float:
     """Return the largest coordinate of the error between tool and grasp, by numeric Pinocchio."""
     placed = scene.objects["door"].with_state({"hinge": hinge, "knob": knob})
     attachment = placed.object.attachment("handle")
@@ -178,7 +178,7 @@ def hand_off_the_handle(scene: Scene, row: np.ndarray, hinge: float, knob: float
     return float(np.abs(pin.log6(error).vector).max())
 
 
-def program_of(
+def make_program(
     scene: Scene,
     steps: Sequence[Step],
     *,
@@ -189,7 +189,7 @@ def program_of(
     return build(scene, steps, options=options, terms=terms, cache=CACHE)
 
 
-def margins_at(part: PhaseGeometry, pairs: np.ndarray, waypoints: np.ndarray) -> np.ndarray:
+def get_margins(part: PhaseGeometry, pairs: np.ndarray, waypoints: np.ndarray) -> np.ndarray:
     """Return margins of pairs at waypoints, shape (n,) [m], without `margin_regions`."""
     margins = Margins(part.margins, part.reduced_margins)
     return margins.compute_margins(pairs, waypoints, np.empty((1, 0)), np.zeros(len(pairs), int))

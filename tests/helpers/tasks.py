@@ -12,7 +12,7 @@ def double(task: int) -> int:
     return 2 * task
 
 
-def fatal_once(task: tuple[str, int]) -> int:
+def crash_once(task: tuple[str, int]) -> int:
     """Kill the process the first time that a task is run, as the system does for want of memory."""
     mark = Path(task[0]) / str(task[1])
     if task[1] == 2 and not mark.exists():
@@ -21,12 +21,12 @@ def fatal_once(task: tuple[str, int]) -> int:
     return 2 * task[1]
 
 
-def hanging(task: int) -> int:
+def hang(task: int) -> int:
     if task == 1:
         time.sleep(600.0)
     return 2 * task
 
 
-def where(task: int) -> tuple[int, str | None]:
+def identify_worker(task: int) -> tuple[int, str | None]:
     time.sleep(0.05)
     return os.getpid(), os.environ.get("OPENBLAS_NUM_THREADS")

@@ -5,17 +5,17 @@ from __future__ import annotations
 import itertools
 from pathlib import Path
 
-from helpers.grippers import between_cheeks
+from helpers.grippers import write_cheeks_scene
 from vkc_pin.world.scene.scene import Scene
 
 __all__ = [
     "FOLLOWERS",
     "SEGMENT",
-    "coupled_scene",
-    "joint",
-    "link",
-    "telescope_scene",
+    "format_joint",
+    "format_link",
+    "write_coupled_scene",
     "write_telescope",
+    "write_telescope_scene",
 ]
 
 SEGMENT = 0.15  # [m] that each segment comes out
@@ -27,13 +27,13 @@ _TOOL = (
 )
 
 
-def link(name: str, size: str = "", at: str = "0 0 0") -> str:
+def format_link(name: str, size: str = "", at: str = "0 0 0") -> str:
     """Return a link, with a box of some size if one is named."""
     shape = f'<origin xyz="{at}"/><geometry><box size="{size}"/></geometry>' if size else ""
     return f'<link name="{name}">{f"<collision>{shape}</collision>" if size else ""}</link>'
 
 
-def joint(
+def format_joint(
     name: str,
     kind: str,
     parent: str,
@@ -70,20 +70,23 @@ def write_telescope(
             each the one before it.
         more: Lines of robot.yaml beyond that.
     """
-    parts = [link("body", "0.44 0.4 0.3", "0 0 0.2"), link("mast", "0.06 0.06 1.3", "0 0 0.65")]
-    parts.append(joint("mast_joint", "fixed", "body", "mast", "0 0 0.36"))
+    parts = [
+        format_link("body", "0.44 0.4 0.3", "0 0 0.2"),
+        format_link("mast", "0.06 0.06 1.3", "0 0 0.65"),
+    ]
+    parts.append(format_joint("mast_joint", "fixed", "body", "mast", "0 0 0.36"))
     parts += [
-        link("carriage", "0.06 0.12 0.1"),
-        joint("lift", "prismatic", "mast", "carriage", "0.08 0 0.1", "0 0 1", (0.0, 1.0)),
+        format_link("carriage", "0.06 0.12 0.1"),
+        format_joint("lift", "prismatic", "mast", "carriage", "0.08 0 0.1", "0 0 1", (0.0, 1.0)),
     ]
     below, at = "carriage", "0.05 0 0"
     for k in range(1, 5):
         width = 0.1 - 0.018 * k
         followed = {"first": "out_1", "chain": f"out_{k - 1}"}.get(mimics, "") if k > 1 else ""
         inside = f'<mimic joint="{followed}"/>' if followed else ""
-        parts += [link(f"segment_{k}", f"0.2 {width} {width}", "0.1 0 0")]
+        parts += [format_link(f"segment_{k}", f"0.2 {width} {width}", "0.1 0 0")]
         parts.append(
-            joint(
+            format_joint(
                 f"out_{k}",
                 "prismatic",
                 below,
@@ -101,19 +104,19 @@ def write_telescope(
         ("roll", "1 0 0", "0.05 0 0"),
     ):
         parts += [
-            link(name, "0.03 0.03 0.03", "0.02 0 0"),
-            joint(f"{name}_joint", "revolute", below, name, at, axis, (-3.0, 3.0)),
+            format_link(name, "0.03 0.03 0.03", "0.02 0 0"),
+            format_joint(f"{name}_joint", "revolute", below, name, at, axis, (-3.0, 3.0)),
         ]
         below = name
     parts += [
-        link("hand", "0.03 0.12 0.03", "0.03 0 0"),
-        joint("hand_joint", "fixed", below, "hand", "0.03 0 0"),
-        link("tool"),
+        format_link("hand", "0.03 0.12 0.03", "0.03 0 0"),
+        format_joint("hand_joint", "fixed", below, "hand", "0.03 0 0"),
+        format_link("tool"),
         _TOOL,
     ]
     for name, side in (("finger_a", 1), ("finger_b", -1)):
-        parts += [link(name, "0.1 0.01 0.02", f"0.05 {side * 0.005} 0")]
-        parts.append(joint(f"{name}_joint", "fixed", "hand", name, f"0.045 {side * 0.04} 0"))
+        parts += [format_link(name, "0.1 0.01 0.02", f"0.05 {side * 0.005} 0")]
+        parts.append(format_joint(f"{name}_joint", "fixed", "hand", name, f"0.045 {side * 0.04} 0"))
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "robot.urdf").write_text(
         f'<robot name="robot">{"".join(parts)}</robot>', encoding="utf-8"
@@ -148,7 +151,7 @@ def write_telescope(
     return folder / "robot.yaml"
 
 
-def telescope_scene(folder: Path, *, base: str = "omni") -> Scene:
+def write_telescope_scene(folder: Path, *, base: str = "omni") -> Scene:
     """Return a scene: the robot in front of a drawer that it reaches from where it stands.
 
     Args:
@@ -156,12 +159,12 @@ def telescope_scene(folder: Path, *, base: str = "omni") -> Scene:
         base: How it moves.
     """
     robot = write_telescope(folder, more="home: {out_1: 0.05, lift: 0.4}\n")
-    document = between_cheeks(robot, height=0.9, gap=0.1).document
+    document = write_cheeks_scene(robot, height=0.9, gap=0.1).document
     document |= {"robot": {"name": robot.name, "base": base}, "start": {"base": [0.1, 0.0, 0.0]}}
     return Scene.from_document(document, folder)
 
 
-def coupled_scene(folder: Path, *, base: str = "omni", more: str = "") -> Scene:
+def write_coupled_scene(folder: Path, *, base: str = "omni", more: str = "") -> Scene:
     """Return a scene with a drawer and a robot with several kinds of coupled joints.
 
     Args:
@@ -176,6 +179,6 @@ def coupled_scene(folder: Path, *, base: str = "omni", more: str = "") -> Scene:
         "roll_joint: {joint: yaw_joint, multiplier: -3.0}"
     )
     robot = write_telescope(folder, couplings=couplings, more=more)
-    document = between_cheeks(robot, height=0.9, gap=0.1).document
+    document = write_cheeks_scene(robot, height=0.9, gap=0.1).document
     document["robot"] = {"name": robot.name, "base": base}
     return Scene.from_document(document, folder)

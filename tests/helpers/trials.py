@@ -12,12 +12,12 @@ import numpy as np
 SETTINGS = {"benchmark": "squares", "seed": 3, "scenes": ("a", "b")}
 
 
-def trials(number: int = 6, **more: Any) -> list[dict[str, Any]]:
+def make_trials(number: int = 6, **more: Any) -> list[dict[str, Any]]:
     """Return trials that are not in the order of their keys."""
     return [{"key": f"{k:03d}", "number": k, **more} for k in reversed(range(number))]
 
 
-def square(spec: dict[str, Any]) -> dict[str, Any]:
+def solve_square(spec: dict[str, Any]) -> dict[str, Any]:
     """A deterministic trial, with the fields and types that records have."""
     k = spec["number"]
     values = {
@@ -35,23 +35,23 @@ def square(spec: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def mistaken(spec: dict[str, Any]) -> dict[str, Any]:
+def divide_by_zero(spec: dict[str, Any]) -> dict[str, Any]:
     if spec["number"] == 2:
         raise ZeroDivisionError("nothing to divide by")
-    return square(spec)
+    return solve_square(spec)
 
 
-def fatal(spec: dict[str, Any]) -> dict[str, Any]:
+def crash(spec: dict[str, Any]) -> dict[str, Any]:
     if spec["number"] == 2:
         os.kill(os.getpid(), signal.SIGKILL)
-    return square(spec)
+    return solve_square(spec)
 
 
-def where(spec: dict[str, Any]) -> dict[str, Any]:
+def identify_worker(spec: dict[str, Any]) -> dict[str, Any]:
     time.sleep(0.2)
     return {"process": os.getpid(), "threads": os.environ.get("OPENBLAS_NUM_THREADS")}
 
 
-def slow(spec: dict[str, Any]) -> dict[str, Any]:
+def solve_slowly(spec: dict[str, Any]) -> dict[str, Any]:
     time.sleep(0.5)
-    return square(spec)
+    return solve_square(spec)

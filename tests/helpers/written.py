@@ -58,11 +58,11 @@ def trajectories(draw: st.DrawFn, largest: float | None = None) -> Trajectory:
     return Trajectory(names, times, rows, tuple(phases), robot)
 
 
-def same(one: Trajectory, other: Trajectory) -> bool:
+def are_equal(one: Trajectory, other: Trajectory) -> bool:
     return one.to_dict() == other.to_dict()
 
 
-def broken(path: Path, text: str) -> Path:
+def write_broken(path: Path, text: str) -> Path:
     path.write_text(text, encoding="utf-8")
     return path
 
@@ -83,7 +83,7 @@ PHASES = (
 )
 
 
-def example(**changes: Any) -> Trajectory:
+def make_example(**changes: Any) -> Trajectory:
     fields = {
         "names": NAMES,
         "times": TIMES,

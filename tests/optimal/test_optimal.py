@@ -5,14 +5,14 @@ from __future__ import annotations
 import dataclasses
 
 import pytest
-from helpers.executions import door_plan, drawer_plan
+from helpers.executions import plan_door, plan_drawer
 
 import vkc_pin as vkc
 from optimal.bound import bound
 from vkc_pin.planning.retiming.retime import retime_trajectory
 
 
-@pytest.mark.parametrize("made", [door_plan, drawer_plan])
+@pytest.mark.parametrize("made", [plan_door, plan_drawer])
 def test_durations_are_near_the_bound(made: object) -> None:
     plan: vkc.Plan = made()  # type: ignore[operator]
     least, heavy = bound(plan.scene, plan.trajectory)
@@ -21,7 +21,7 @@ def test_durations_are_near_the_bound(made: object) -> None:
 
 
 def test_bound_converges_with_the_grid() -> None:
-    plan = drawer_plan()
+    plan = plan_drawer()
     coarse, fine, finest = (bound(plan.scene, plan.trajectory, places)[0] for places in (5, 40, 80))
     assert finest < fine < coarse
     assert fine - finest < 0.1 * (coarse - fine)
@@ -29,7 +29,7 @@ def test_bound_converges_with_the_grid() -> None:
 
 def test_bound_depends_on_limits() -> None:
     """A quarter of the acceleration and half the velocity increase the least duration."""
-    plan = drawer_plan()
+    plan = plan_drawer()
     robot = plan.scene.robot
     weak = dataclasses.replace(
         robot, acceleration=robot.acceleration / 4.0, velocity=robot.velocity / 2.0

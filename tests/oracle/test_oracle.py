@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.drives import hall
+from helpers.drives import make_hall
 
 import vkc_pin as vkc
 from oracle.__main__ import main
@@ -186,7 +186,7 @@ def test_changes_are_found(
 def test_bases_on_wheels(base: str, tmp_path: Path) -> None:
     """Good plans pass; those whose base slips, turns against its kinematics or is too fast fail."""
     robot = {"base": base, **({"turning_radius": 0.8} if base == "ackermann" else {})}
-    plan = vkc.plan(hall(**robot), [vkc.GoTo(1.5, 0.8, 0.3)])
+    plan = vkc.plan(make_hall(**robot), [vkc.GoTo(1.5, 0.8, 0.3)])
     assert plan.success, plan.summary()
     path = plan.save(tmp_path / "plan.npz")
     assert judge(path).agrees

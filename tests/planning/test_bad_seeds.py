@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.drawers import drawer_scene
-from helpers.drives import hall
-from helpers.small_problems import door_scene
+from helpers.drawers import load_drawer_scene
+from helpers.drives import make_hall
+from helpers.small_problems import load_door_scene
 
 import vkc_pin as vkc
 
@@ -22,7 +22,7 @@ PILLAR = {
 
 @pytest.mark.parametrize("seed", range(1))
 def test_reach_from_a_stationary_guess(seed: int) -> None:
-    start = door_scene().sample_start(np.random.default_rng(seed))
+    start = load_door_scene().sample_start(np.random.default_rng(seed))
     placed = start.objects["door"]
     attachment = placed.object.attachment()
     pose = placed.link_placement(attachment.link) * attachment.placement
@@ -34,7 +34,7 @@ def test_reach_from_a_stationary_guess(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(1))
 def test_actuation_from_a_stationary_guess(seed: int) -> None:
     plan = vkc.plan(
-        drawer_scene(),
+        load_drawer_scene(),
         [vkc.Actuate("drawer", {"slide": 0.3})],
         initialization="stationary",
         seed=seed,
@@ -46,7 +46,11 @@ def test_actuation_from_a_stationary_guess(seed: int) -> None:
 def test_perturbed_guess(seed: int) -> None:
     options = vkc.Options(reach_waypoints=20)
     plan = vkc.plan(
-        hall(obstacles=[PILLAR]), [vkc.GoTo(2.4, 0.0)], perturbation=0.5, seed=seed, options=options
+        make_hall(obstacles=[PILLAR]),
+        [vkc.GoTo(2.4, 0.0)],
+        perturbation=0.5,
+        seed=seed,
+        options=options,
     )
     assert plan.success, plan.summary()
 
@@ -57,7 +61,7 @@ def test_perturbed_guess(seed: int) -> None:
 )
 def test_tool_turns_around(axis: list[float], angle: float) -> None:
     """From a stationary guess the residual's gradient vanishes, or points the long way round."""
-    scene = hall()
+    scene = make_hall()
     tool = scene.tool_placement()
     shift = np.array([0.1, 0.1, 0.0])
     turned = pin.SE3(tool.rotation @ pin.exp3(angle * np.array(axis)), tool.translation + shift)

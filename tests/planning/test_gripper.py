@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.grippers import WIDEST, between_cheeks, write_gripper
-from helpers.judging import names
+from helpers.grippers import WIDEST, write_cheeks_scene, write_gripper
+from helpers.judging import get_violation_names
 
 import vkc_pin as vkc
 from vkc_pin.planning.chain.chain import consolidate
@@ -37,7 +37,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def plan(robot: Path) -> vkc.Plan:
-    found = vkc.plan(between_cheeks(robot, opening=NARROW), PULL)
+    found = vkc.plan(write_cheeks_scene(robot, opening=NARROW), PULL)
     assert found.success, found.summary()
     return found
 
@@ -51,11 +51,12 @@ def with_openings(motion: Trajectory, *openings: float | None) -> Trajectory:
 
 def test_narrow_opening_avoids_a_collision(robot: Path, plan: vkc.Plan) -> None:
     """Fully open fingers are 10 mm from the cheeks, which must keep 20 mm."""
-    wide = vkc.plan(between_cheeks(robot), PULL)
+    wide = vkc.plan(write_cheeks_scene(robot), PULL)
     assert not wide.success
-    assert {("clearance", "finger_a – left"), ("clearance", "finger_b – right")} & names(
-        wide.report
-    )
+    assert {
+        ("clearance", "finger_a – left"),
+        ("clearance", "finger_b – right"),
+    } & get_violation_names(wide.report)
     assert [phase.opening for phase in wide.trajectory.phases] == [None, None, None]
     assert [phase.opening for phase in plan.trajectory.phases] == [NARROW, NARROW, NARROW]
 
@@ -63,7 +64,7 @@ def test_narrow_opening_avoids_a_collision(robot: Path, plan: vkc.Plan) -> None:
 def test_validation_uses_the_opening_of_each_phase(robot: Path, plan: vkc.Plan) -> None:
     motion = plan.trajectory
     open_ = with_openings(motion, None, None, None)
-    found = names(validate(plan.scene, PULL, open_, plan.options))
+    found = get_violation_names(validate(plan.scene, PULL, open_, plan.options))
     assert ("opening", "drawer.grip") in found
     assert ("clearance", "finger_a – left") in found
     report = validate(plan.scene, PULL, with_openings(motion, 0.05, 0.05, 0.05), plan.options)
@@ -75,7 +76,7 @@ def test_validation_uses_the_opening_of_each_phase(robot: Path, plan: vkc.Plan) 
 
 def test_opening_fingers_must_not_collide(robot: Path, plan: vkc.Plan) -> None:
     """The hand releases between narrower cheeks, and opens there."""
-    near = between_cheeks(robot, opening=NARROW, gap=0.055)
+    near = write_cheeks_scene(robot, opening=NARROW, gap=0.055)
     asked = [vkc.Grasp("drawer"), vkc.Release()]
     found = vkc.plan(near, asked)
     assert found.success, found.summary()
@@ -84,8 +85,11 @@ def test_opening_fingers_must_not_collide(robot: Path, plan: vkc.Plan) -> None:
     assert last.last - last.first == 1  # one step of time, in which the robot rests
     widened = with_openings(motion, *[phase.opening for phase in motion.phases[:-1]], WIDEST)
     close = validate(near, asked, widened, found.options)
-    assert {("clearance", "finger_a – left"), ("clearance", "finger_b – right")} <= names(close)
-    inside = between_cheeks(robot, opening=NARROW, gap=0.045)
+    assert {
+        ("clearance", "finger_a – left"),
+        ("clearance", "finger_b – right"),
+    } <= get_violation_names(close)
+    inside = write_cheeks_scene(robot, opening=NARROW, gap=0.045)
     deep = [
         one
         for one in validate(inside, asked, widened, found.options).violations
@@ -114,11 +118,11 @@ def test_robot_must_rest_while_fingers_move(plan: vkc.Plan) -> None:
         let_go,
     )
     report = validate(plan.scene, PULL, dataclasses.replace(motion, phases=phases), plan.options)
-    assert ("dwell", "gripper") in names(report)
+    assert ("dwell", "gripper") in get_violation_names(report)
 
 
 def test_planner_and_validator_place_the_fingers_alike(robot: Path) -> None:
-    scene = between_cheeks(robot, opening=0.03)
+    scene = write_cheeks_scene(robot, opening=0.03)
     options = vkc.Options()
     task = compile_task(scene, PULL, options)
     chain = consolidate(scene, task.holds)
@@ -149,7 +153,7 @@ def test_planner_and_validator_place_the_fingers_alike(robot: Path) -> None:
 
 def test_opening_changes_at_release_and_grasp(robot: Path) -> None:
     """The second drawer requires no opening."""
-    scene = between_cheeks(robot, opening=NARROW, other=(1.2, -1.5, 1.1))
+    scene = write_cheeks_scene(robot, opening=NARROW, other=(1.2, -1.5, 1.1))
     steps = [
         vkc.Actuate("drawer", {"slide": 0.1}),
         vkc.Actuate("other", {"slide": 0.1}),
@@ -176,7 +180,7 @@ def test_opening_changes_at_release_and_grasp(robot: Path) -> None:
 
 @pytest.mark.parametrize("opening", [None, 0.0, 0.03])
 def test_finger_frames_depend_on_the_opening(robot: Path, opening: float | None) -> None:
-    scene, finger = between_cheeks(robot, start=opening), "finger_a"
+    scene, finger = write_cheeks_scene(robot, start=opening), "finger_a"
     opened = scene.robot.opened(opening)
     bent = opened.coordinates.q(scene.start + np.array([0.2, 0.1, 0.3, 0.1, 0.2, -0.1, 0.1, 0.1]))
     data = opened.model.createData()
@@ -195,7 +199,7 @@ def test_finger_frames_depend_on_the_opening(robot: Path, opening: float | None)
 
 def test_rest_between_actions_that_change_the_opening(robot: Path) -> None:
     found = vkc.plan(
-        between_cheeks(robot, opening=NARROW), [vkc.GoTo(-0.3, 0.2), PULL[0]], window=1
+        write_cheeks_scene(robot, opening=NARROW), [vkc.GoTo(-0.3, 0.2), PULL[0]], window=1
     )
     assert found.success, found.summary()
     go, reach, _ = found.trajectory.phases
@@ -217,8 +221,8 @@ def test_planning_continues_with_the_opening(robot: Path, plan: vkc.Plan) -> Non
     assert world.start[world.coordinates.index("finger_a_joint")] == pytest.approx(
         NARROW / 2.0, abs=1e-5
     )
-    assert compute_start_opening(between_cheeks(robot)) is None
-    assert "opening" not in between_cheeks(robot).document["start"]
+    assert compute_start_opening(write_cheeks_scene(robot)) is None
+    assert "opening" not in write_cheeks_scene(robot).document["start"]
 
 
 def test_openings_are_saved(plan: vkc.Plan, tmp_path: Path) -> None:
@@ -241,7 +245,7 @@ def test_openings_are_saved(plan: vkc.Plan, tmp_path: Path) -> None:
 def test_opening_is_clamped_with_a_warning(robot: Path, opening: float, stands: float) -> None:
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        scene = between_cheeks(robot, opening=opening)
+        scene = write_cheeks_scene(robot, opening=opening)
     assert compile_task(scene, PULL, vkc.Options()).phases[0].opening == pytest.approx(
         stands, abs=2e-4
     )
@@ -259,7 +263,7 @@ def test_warning_without_a_gripper(tmp_path: Path) -> None:
         UserWarning,
         match=r"'plain' cannot open as requested \(the start 20 mm, drawer.grip 40 mm\).*`gripper`",
     ):
-        scene = between_cheeks(robot, opening=NARROW, start=0.02)
+        scene = write_cheeks_scene(robot, opening=NARROW, start=0.02)
     assert [phase.opening for phase in compile_task(scene, PULL, vkc.Options()).phases] == [
         None,
         None,
@@ -281,8 +285,8 @@ def test_warning_without_a_gripper(tmp_path: Path) -> None:
 )
 def test_invalid_openings(robot: Path, opening: Any, problem: str) -> None:
     with pytest.raises(vkc.InputError, match=problem) as caught:
-        between_cheeks(robot, opening=opening)
+        write_cheeks_scene(robot, opening=opening)
     assert "attachments[0].opening" in str(caught.value)
     with pytest.raises(vkc.InputError, match=problem) as caught:
-        between_cheeks(robot, start=opening)
+        write_cheeks_scene(robot, start=opening)
     assert caught.value.field == "start.opening"

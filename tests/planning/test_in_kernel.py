@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from helpers.kernel import Kernel, kernel
+from helpers.kernel import Kernel, start_kernel
 
 DOOR = """
 scene = vkc.load_scene("door").with_start(base=[-0.03, 0.09, -1.19])
@@ -19,7 +19,7 @@ TOLD = r"interrupted False [1-9]\d* True\n"
 
 @pytest.fixture(scope="module")
 def jupyter() -> Iterator[Kernel]:
-    with kernel() as started:
+    with start_kernel() as started:
         started.run(DOOR)
         yield started
 
@@ -34,7 +34,7 @@ def get_output(outputs: list[dict[str, Any]]) -> str:
 
 
 def test_show_is_part_of_the_notebook(jupyter: Kernel) -> None:
-    (output,) = jupyter.run("from helpers.fake_plan import fake_plan\nfake_plan().show()")
+    (output,) = jupyter.run("from helpers.fake_plan import make_fake_plan\nmake_fake_plan().show()")
     page = output["data"]["text/html"]
     assert "iframe srcdoc=" in page
     assert 500_000 < len(page) < 5_000_000

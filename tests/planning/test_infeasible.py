@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.drives import hall
+from helpers.drives import make_hall
 
 import vkc_pin as vkc
 
@@ -76,7 +76,7 @@ def test_goal_beyond_a_joint_limit(joints: dict[str, float], name: str, beyond: 
 
 
 def test_goal_outside_the_arena() -> None:
-    plan = vkc.plan(hall(), [vkc.GoTo(9.0, -6.5)], options=QUICK)
+    plan = vkc.plan(make_hall(), [vkc.GoTo(9.0, -6.5)], options=QUICK)
     assert plan.status == "infeasible"
     check_explanation(
         plan,
@@ -87,7 +87,7 @@ def test_goal_outside_the_arena() -> None:
 
 
 def test_target_out_of_reach() -> None:
-    plan = vkc.plan(hall(), [vkc.Reach((1.5, 0.0, 3.0, 0.0, 0.0, 0.0))], options=QUICK)
+    plan = vkc.plan(make_hall(), [vkc.Reach((1.5, 0.0, 3.0, 0.0, 0.0, 0.0))], options=QUICK)
     assert plan.status == "infeasible"
     check_explanation(
         plan,
@@ -102,7 +102,7 @@ def test_target_out_of_reach() -> None:
 
 def test_start_in_collision() -> None:
     plan = vkc.plan(
-        hall(obstacles=[box("crate", (0.4, 0.4, 0.4), (0.5, 0.0, 0.2))]),
+        make_hall(obstacles=[box("crate", (0.4, 0.4, 0.4), (0.5, 0.0, 0.2))]),
         [vkc.GoTo(-1.0, 0.0)],
         options=QUICK,
     )
@@ -124,7 +124,7 @@ WALLS = [box("fence", (0.1, 12.0, 2.4), (1.2, 0.0, 1.2))]
     ids=["base", "reach"],
 )
 def test_closed_gap(step: Any) -> None:
-    plan = vkc.plan(hall(obstacles=WALLS), [step], options=QUICK)
+    plan = vkc.plan(make_hall(obstacles=WALLS), [step], options=QUICK)
     assert plan.status == "infeasible"
     check_explanation(
         plan,
@@ -136,19 +136,19 @@ def test_closed_gap(step: Any) -> None:
 
 def test_base_goal_inside_furniture() -> None:
     crate = box("crate", (0.6, 0.6, 0.4), (1.5, 0.0, 0.2))
-    plan = vkc.plan(hall(obstacles=[crate]), [vkc.GoTo(1.5, 0.0, 0.0)], options=QUICK)
+    plan = vkc.plan(make_hall(obstacles=[crate]), [vkc.GoTo(1.5, 0.0, 0.0)], options=QUICK)
     assert plan.status == "infeasible"
     check_explanation(plan, "because go to: no place for the base, proven: ", "it hits crate")
 
 
 def test_all_reasons_are_given() -> None:
-    scene = hall(obstacles=[box("crate", (0.4, 0.4, 0.4), (0.5, 0.0, 0.2))])
+    scene = make_hall(obstacles=[box("crate", (0.4, 0.4, 0.4), (0.5, 0.0, 0.2))])
     plan = vkc.plan(scene, [vkc.GoTo(9.0, 0.0)], options=QUICK)
     check_explanation(plan, "start base_link – crate", "goal base_x")
 
 
 def test_failed_plan_is_saved_with_its_reasons(tmp_path: Any) -> None:
-    plan = vkc.plan(hall(), [vkc.Reach((1.5, 0.0, 3.0, 0.0, 0.0, 0.0))], options=QUICK)
+    plan = vkc.plan(make_hall(), [vkc.Reach((1.5, 0.0, 3.0, 0.0, 0.0, 0.0))], options=QUICK)
     loaded = vkc.Plan.load(plan.save(tmp_path / "failed.npz"))
     assert not loaded.success
     assert loaded.summary() == plan.summary()

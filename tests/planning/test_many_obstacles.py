@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.clutter import cluttered, cluttered_room
-from helpers.small_problems import SHORT, all_pairs, program_of, random_configurations
+from helpers.clutter import make_cluttered_room, make_cluttered_scene
+from helpers.small_problems import SHORT, make_all_pairs, make_program, sample_configurations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -36,14 +36,14 @@ def test_distance_queries_hardly_depend_on_the_number_of_obstacles() -> None:
     assert plans[1].metrics["rounds"] <= 2 * plans[0].metrics["rounds"]
     assert queries[0] > 1000
     assert queries[1] <= 2 * queries[0]
-    phases = program_of(plans[1].scene, plans[1].steps).contacts.phases
+    phases = make_program(plans[1].scene, plans[1].steps).contacts.phases
     assert queries[1] < sum(len(part.pairs) for part in phases)  # at hundreds of configurations
 
 
 def compute_all_distances(
     problem: TrajectoryProblem, part: PhaseGeometry, z: np.ndarray
 ) -> np.ndarray:
-    geometry, model = all_pairs(part), problem.chain.model
+    geometry, model = make_all_pairs(part), problem.chain.model
     data, placed = model.createData(), pin.GeometryData(geometry)
     for request in placed.distanceRequests:
         request.gjk_tolerance = 1e-8
@@ -65,7 +65,7 @@ def check_contacts(
     nearest: int | None,
 ) -> None:
     """Compare contacts within `reach`, or the nearest of them, with the distances of all pairs."""
-    z = random_configurations(problem.chain.lower, problem.chain.upper, 8, rng)
+    z = sample_configurations(problem.chain.lower, problem.chain.upper, 8, rng)
     part, waypoints = model.phases[phase], np.full(len(z), problem.ends[phase])
     distances = compute_all_distances(problem, part, z)
     contacts = model.evaluate(z, waypoints, reach=reach, nearest=nearest)
@@ -105,7 +105,9 @@ REACHES, NUMBERS = st.sampled_from([0.0, 0.02, 0.25, 1.0]), st.sampled_from([Non
 def test_contacts_are_those_among_all_pairs(
     seed: int, count: int, reach: float, nearest: int | None
 ) -> None:
-    problem = program_of(cluttered(seed, count), [Actuate("door", {"hinge": 1.2})], options=SHORT)
+    problem = make_program(
+        make_cluttered_scene(seed, count), [Actuate("door", {"hinge": 1.2})], options=SHORT
+    )
     rng = np.random.default_rng(seed)
     for phase in (0, 2):
         check_contacts(problem, problem.contacts, phase, rng, reach=reach, nearest=nearest)
@@ -123,9 +125,9 @@ def test_contacts_of_grasped_objects_are_those_among_all_pairs(
         Release("ball"),
         GoTo(0.0, 0.0),
     ]
-    problem = program_of(cluttered_room(seed, count), steps, options=SHORT)
+    problem = make_program(make_cluttered_room(seed, count), steps, options=SHORT)
     rng = np.random.default_rng(seed)
-    z = random_configurations(problem.chain.lower, problem.chain.upper, problem.segments, rng)
+    z = sample_configurations(problem.chain.lower, problem.chain.upper, problem.segments, rng)
     model = problem.contacts.with_released_objects(z)
     assert [len(phase.held) for phase in problem.task.phases] == [0, 1, 2, 1]
     for phase in range(4):
@@ -135,8 +137,10 @@ def test_contacts_of_grasped_objects_are_those_among_all_pairs(
 @settings(max_examples=8, deadline=None)
 @given(SEEDS, st.sampled_from([3, 60]))
 def test_distances_do_not_depend_on_earlier_queries(seed: int, count: int) -> None:
-    problem = program_of(cluttered(seed, count), [Actuate("door", {"hinge": 1.2})], options=SHORT)
-    z = random_configurations(
+    problem = make_program(
+        make_cluttered_scene(seed, count), [Actuate("door", {"hinge": 1.2})], options=SHORT
+    )
+    z = sample_configurations(
         problem.chain.lower, problem.chain.upper, 6, np.random.default_rng(seed)
     )
     waypoints = np.full(len(z), problem.ends[2])
@@ -151,7 +155,7 @@ def test_distances_do_not_depend_on_earlier_queries(seed: int, count: int) -> No
 @settings(max_examples=10, deadline=None)
 @given(SEEDS, st.sampled_from([1, 5, 60]), st.sampled_from([np.inf, 0.3, 0.03]))
 def test_start_clearance_is_that_of_all_pairs(seed: int, count: int, reach: float) -> None:
-    scene = cluttered(seed, count)
+    scene = make_cluttered_scene(seed, count)
     model, geometry = scene.robot.model, scene.robot.collision
     data, shapes = model.createData(), geometry.createData()
     pin.updateGeometryPlacements(

@@ -12,9 +12,9 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.carrying import box
-from helpers.drawers import open_scene
-from helpers.drives import hall
+from helpers.carrying import describe_box
+from helpers.drawers import make_open_scene
+from helpers.drives import make_hall
 
 import vkc_pin as vkc
 from vkc_pin.cli import main
@@ -38,10 +38,12 @@ ELBOW = vkc.Cost("elbow", lambda s: (s.coordinate("elbow_joint") - 1.5) ** 2, we
 @cache
 def make_room() -> vkc.Scene:
     obstacles = [
-        box("table", [0.6, 0.6, 0.02], [1.4, 0.0, 0.49]),
-        box("other", [0.6, 0.6, 0.02], [1.4, 1.2, 0.49]),
+        describe_box("table", [0.6, 0.6, 0.02], [1.4, 0.0, 0.49]),
+        describe_box("other", [0.6, 0.6, 0.02], [1.4, 1.2, 0.49]),
     ]
-    scene = hall(obstacles=[*obstacles, box("wall", [1.0, 0.05, 0.9], [1.5, 0.6, 0.45])])
+    scene = make_hall(
+        obstacles=[*obstacles, describe_box("wall", [1.0, 0.05, 0.9], [1.5, 0.6, 0.45])]
+    )
     return vkc.Scene.from_document(
         {
             **scene.document,
@@ -124,11 +126,11 @@ def test_constraint_on_a_link_of_a_fixed_object() -> None:
         [vkc.Actuate("drawer", {"slide": 0.3}, "handle_free")],
         vkc.Options(reach_waypoints=16, move_waypoints=12),
     )
-    plan = check_success(vkc.plan(open_scene(), steps, options=options, terms=[gently]))
+    plan = check_success(vkc.plan(make_open_scene(), steps, options=options, terms=[gently]))
     fast = vkc.Constraint(
         "fast", lambda s: ca.norm_2(s.velocity("drawer.tray")), upper=9.0
     )  # in the program's own time, too
-    usual = check_success(vkc.plan(open_scene(), steps, options=options, terms=[fast]))
+    usual = check_success(vkc.plan(make_open_scene(), steps, options=options, terms=[fast]))
     assert compute_speeds(usual, "drawer.tray")[0].max() > 0.1
     assert compute_speeds(plan, "drawer.tray")[0].max() <= 0.031
     assert compute_speeds(plan, "tool")[0].max() > 0.5
@@ -150,11 +152,11 @@ def test_constraint_on_a_link_of_a_fixed_object() -> None:
 def test_terms_hold_for_several_steps(planner: Callable[..., vkc.Plan]) -> None:
     """`during` names a phase of one step only."""
     obstacles = [
-        box("table", [0.6, 0.6, 0.02], [1.4, 0.0, 0.49]),
-        box("other", [0.6, 0.6, 0.02], [-0.5, 2.2, 0.79]),
+        describe_box("table", [0.6, 0.6, 0.02], [1.4, 0.0, 0.49]),
+        describe_box("other", [0.6, 0.6, 0.02], [-0.5, 2.2, 0.79]),
     ]
     document = {
-        **hall(obstacles=obstacles).document,
+        **make_hall(obstacles=obstacles).document,
         "objects": [{"name": "cup", "type": "cup", "position": [1.35, 0.0, 0.501]}],
     }
     steps = [vkc.Place("cup", [-0.5, 2.1, 0.801]), vkc.GoTo(0.0, 0.0)]
@@ -196,7 +198,7 @@ def test_initial_guess_may_violate_a_constraint() -> None:
     around = vkc.Constraint(
         "around", lambda s: ca.sumsqr(s.position("base_link")[:2] - middle), lower=0.8**2
     )
-    plan = check_success(vkc.plan(hall(), [vkc.GoTo(2.0, 0.0)], options=SHORT, terms=[around]))
+    plan = check_success(vkc.plan(make_hall(), [vkc.GoTo(2.0, 0.0)], options=SHORT, terms=[around]))
     assert np.linalg.norm(plan.trajectory.positions[:, :2] - middle, axis=1).min() >= 0.799
     assert plan.trajectory.base_path_length() > 2.2
 
@@ -204,7 +206,7 @@ def test_initial_guess_may_violate_a_constraint() -> None:
 def test_infeasible_constraint_is_reported() -> None:
     never = vkc.Constraint("never", lambda s: s.position("tool")[2], lower=9.0)
     plan = vkc.plan(
-        hall(),
+        make_hall(),
         [vkc.GoTo(0.5, 0.0)],
         options=vkc.Options(reach_waypoints=5, max_restarts=1, max_outer=4),
         terms=[never],

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from helpers.drives import hall
+from helpers.drives import make_hall
 
 import vkc_pin as vkc
 from vkc_pin.planning import progress as module
@@ -74,7 +74,7 @@ def test_text_of_progress() -> None:
 
 
 def test_terminal_has_one_line(terminal: Terminal) -> None:
-    plan = vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=True)
+    plan = vkc.plan(make_hall(), [vkc.GoTo(-1.0, 0.5)], progress=True)
     assert plan.success
     first, rest = terminal.lines()
     assert rest == ""
@@ -91,7 +91,7 @@ def test_errors_leave_a_line(terminal: Terminal) -> None:
         raise ValueError("mine")
 
     with pytest.raises(ValueError, match="mine"):
-        vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=True, callback=fails)
+        vkc.plan(make_hall(), [vkc.GoTo(-1.0, 0.5)], progress=True, callback=fails)
     assert re.fullmatch(r"stopped after [\d.]+ s", terminal.lines()[0])
 
 
@@ -103,7 +103,7 @@ def test_closed_terminal_does_not_stop_planning(
 
     monkeypatch.setattr(terminal, "write", gone)
     plan = vkc.plan(
-        hall(), [vkc.GoTo(0.3, 0.2)], options=vkc.Options(reach_waypoints=8), progress=True
+        make_hall(), [vkc.GoTo(0.3, 0.2)], options=vkc.Options(reach_waypoints=8), progress=True
     )
     assert plan.success
 
@@ -118,7 +118,7 @@ def test_pipe_gets_nothing(capfd: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize("value", [None, 1, "yes"])
 def test_progress_must_be_a_bool(value: Any) -> None:
     with pytest.raises(vkc.InputError, match="progress: wrong type of argument"):
-        vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=value)
+        vkc.plan(make_hall(), [vkc.GoTo(-1.0, 0.5)], progress=value)
 
 
 def test_real_terminal(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from helpers.carrying import room, table
+from helpers.carrying import describe_table, make_room
 
 import vkc_pin as vkc
 from vkc_pin.planning.request import PlanningRequest
@@ -30,7 +30,7 @@ def test_stationary_plan(name: str) -> None:
 
 
 def test_stationary_plan_with_a_grasped_object() -> None:
-    scene = room(table())
+    scene = make_room(describe_table())
     attachment = next(iter(scene.objects["stick"].object.attachments))
     held = scene.with_held({"stick": attachment})
     plan = concatenate_plans(held, [vkc.GoTo(0.3, 0.2)], PlanningRequest("auto", vkc.Options()), [])

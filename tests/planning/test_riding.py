@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.judging import names
-from helpers.riding import TOP, plates, slid, trays
+from helpers.judging import get_violation_names
+from helpers.riding import TOP, make_plate_scene, make_tray_scene, slide_plate
 
 import vkc_pin as vkc
 from vkc_pin.options import Options
@@ -24,7 +24,7 @@ def compute_placements(plan: vkc.Plan, name: str = "cup") -> list[pin.SE3]:
 
 def test_supported_object_moves_with_its_support() -> None:
     plan = vkc.plan(
-        plates(wall=0.03),
+        make_plate_scene(wall=0.03),
         [vkc.Actuate("plate", {"slide": 0.4}), vkc.Place("cup", [0.2, -1.0, 0.0])],
     )
     assert plan.success, plan.summary()
@@ -43,7 +43,7 @@ def test_supported_object_moves_with_its_support() -> None:
 
 
 def test_tray_is_carried_level() -> None:
-    plan = vkc.plan(trays(), [vkc.Place("tray", [-0.5, -1.5, 0.7])])
+    plan = vkc.plan(make_tray_scene(), [vkc.Place("tray", [-0.5, -1.5, 0.7])])
     assert plan.success, plan.summary()
     assert (
         max(
@@ -57,7 +57,7 @@ def test_tray_is_carried_level() -> None:
 
 
 def test_support_grasped_at_the_start() -> None:
-    first = vkc.plan(trays(), [vkc.Grasp("tray"), vkc.GoTo(-1.0, 0.3)])
+    first = vkc.plan(make_tray_scene(), [vkc.Grasp("tray"), vkc.GoTo(-1.0, 0.3)])
     assert first.success, first.summary()
     after = compute_final_scene(first.scene, first.trajectory, first.trajectory.phases[-1].holds)
     second = vkc.plan(after, [vkc.Place("tray", [-0.5, -1.5, 0.7])])
@@ -69,13 +69,13 @@ def test_support_grasped_at_the_start() -> None:
 
 
 def test_tilt_and_collision_of_supported_objects() -> None:
-    flap, options = plates("flap"), Options()
-    tipped = validate(flap, [vkc.Actuate("plate", {"tip": 0.4})], slid(flap, 0.4), options)
-    assert ("tips", "cup") in names(tipped)
-    assert ("tips", "cup") not in names(
-        validate(flap, [vkc.Actuate("plate", {"tip": 0.05})], slid(flap, 0.05), options)
+    flap, options = make_plate_scene("flap"), Options()
+    tipped = validate(flap, [vkc.Actuate("plate", {"tip": 0.4})], slide_plate(flap, 0.4), options)
+    assert ("tips", "cup") in get_violation_names(tipped)
+    assert ("tips", "cup") not in get_violation_names(
+        validate(flap, [vkc.Actuate("plate", {"tip": 0.05})], slide_plate(flap, 0.05), options)
     )
-    ahead = plates()
+    ahead = make_plate_scene()
     post = {
         "name": "post",
         "type": "box",
@@ -83,12 +83,12 @@ def test_tilt_and_collision_of_supported_objects() -> None:
         "position": [0.55, 0.05, TOP + 0.06],
     }
     ahead = vkc.Scene.from_document({**ahead.document, "obstacles": [post]}, ahead.folder)
-    hit = validate(ahead, [vkc.Actuate("plate", {"slide": 0.4})], slid(ahead, 0.4), options)
-    assert ("penetration", "cup.cup – post") in names(hit)
+    hit = validate(ahead, [vkc.Actuate("plate", {"slide": 0.4})], slide_plate(ahead, 0.4), options)
+    assert ("penetration", "cup.cup – post") in get_violation_names(hit)
 
 
 def test_rest_for_the_gripper() -> None:
-    plan = vkc.plan(plates(), [vkc.Actuate("plate", {"slide": 0.2})])
+    plan = vkc.plan(make_plate_scene(), [vkc.Actuate("plate", {"slide": 0.2})])
     assert plan.success, plan.summary()
     begin = plan.trajectory.phases[1].first
     times = plan.trajectory.times.copy()
@@ -100,7 +100,7 @@ def test_rest_for_the_gripper() -> None:
         plan.trajectory, times=times, curve=dataclasses.replace(curve, times=knots)
     )
     hasty = validate(plan.scene, plan.steps, hurried, plan.options)
-    assert names(hasty) == {("dwell", "plate.handle")}
+    assert get_violation_names(hasty) == {("dwell", "plate.handle")}
     (found,) = hasty.violations
     assert found.amount == pytest.approx(0.4, abs=1e-6)
     assert found.waypoint == begin

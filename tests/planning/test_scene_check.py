@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.drawers import changed, drawer_scene, with_boxes
+from helpers.drawers import add_boxes, load_drawer_scene, replace_drawer_fields
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
@@ -17,14 +17,14 @@ from vkc_pin.world.scene.scene import Scene
 
 @pytest.fixture(scope="module")
 def found() -> SceneCheck:
-    return check_scene(drawer_scene())
+    return check_scene(load_drawer_scene())
 
 
 def test_free_scene(found: SceneCheck) -> None:
     assert found.ok
     assert (found.robot, found.close, found.allowed, found.problems) == ((), (), (), ())
     assert [one.attachment for one in found.attachments] == list(
-        drawer_scene().objects["drawer"].object.attachments
+        load_drawer_scene().objects["drawer"].object.attachments
     )
     for one in found.attachments:
         np.testing.assert_allclose(one.approach, [1.0, 0.0, 0.0], atol=1e-9)
@@ -32,7 +32,7 @@ def test_free_scene(found: SceneCheck) -> None:
 
 
 def test_reachable_configurations_are_valid(found: SceneCheck) -> None:
-    scene = drawer_scene()
+    scene = load_drawer_scene()
     grasps = {
         name
         for name, one in scene.objects["drawer"].object.attachments.items()
@@ -58,24 +58,30 @@ def test_reachable_configurations_are_valid(found: SceneCheck) -> None:
 
 
 def test_blocked_attachments_name_the_obstacle() -> None:
-    blocked = check_scene(with_boxes(drawer_scene(), box=((0.2, 1.6, 1.2), (1.66, 0.0, 0.6))))
+    blocked = check_scene(add_boxes(load_drawer_scene(), box=((0.2, 1.6, 1.2), (1.66, 0.0, 0.6))))
     assert not blocked.ok
     assert all(one.configuration is None and "box" in one.because for one in blocked.attachments)
     assert any("not reached" in line for line in blocked.lines())
 
 
 def test_unreachable_attachments() -> None:
-    (drawer,) = drawer_scene().document["objects"]
-    high = check_scene(changed(drawer_scene(), objects=[{**drawer, "position": [1.93, 0.0, 2.0]}]))
+    (drawer,) = load_drawer_scene().document["objects"]
+    high = check_scene(
+        replace_drawer_fields(
+            load_drawer_scene(), objects=[{**drawer, "position": [1.93, 0.0, 2.0]}]
+        )
+    )
     assert not high.ok
     assert [one.configuration for one in high.attachments] == [None] * len(
-        drawer_scene().objects["drawer"].object.attachments
+        load_drawer_scene().objects["drawer"].object.attachments
     )
 
 
 def test_grasped_objects_are_not_checked() -> None:
     cup = {"name": "cup", "type": "cup", "position": [0.0, 0.0, 1.5]}
-    scene = changed(drawer_scene(), objects=[*drawer_scene().document["objects"], cup])
+    scene = replace_drawer_fields(
+        load_drawer_scene(), objects=[*load_drawer_scene().document["objects"], cup]
+    )
     held = check_scene(
         scene.with_held({"cup": next(iter(scene.objects["cup"].object.attachments))})
     )
@@ -84,10 +90,14 @@ def test_grasped_objects_are_not_checked() -> None:
 
 
 def test_overlaps_and_close_pairs_are_reported(tmp_path: Path) -> None:
-    scene = with_boxes(drawer_scene(), side=((0.6, 0.1, 0.9), (2.0, 0.295 + 0.05 + 0.004, 0.45)))
+    scene = add_boxes(
+        load_drawer_scene(), side=((0.6, 0.1, 0.9), (2.0, 0.295 + 0.05 + 0.004, 0.45))
+    )
     x, y, _ = scene.start[:3]
     post = {"name": "post", "type": "box", "size": [0.1, 0.1, 1.0], "position": [x, y, 0.5]}
-    found = check_scene(changed(scene, obstacles=[*scene.document["obstacles"], post]))
+    found = check_scene(
+        replace_drawer_fields(scene, obstacles=[*scene.document["obstacles"], post])
+    )
     assert not found.ok
     assert found.problems
     assert all("post" in line and "overlap" in line for line in found.problems)
@@ -107,11 +117,11 @@ def test_invalid_arguments() -> None:
     with pytest.raises(InputError, match="scene"):
         check_scene("drawer")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="seed"):
-        check_scene(drawer_scene(), seed=-1)
+        check_scene(load_drawer_scene(), seed=-1)
 
 
 def test_planning_continues_from_the_end_scene() -> None:
-    scene: Scene = drawer_scene()
+    scene: Scene = load_drawer_scene()
     grasp = vkc.plan(scene, [vkc.Grasp("drawer")])
     held = grasp.end_scene()
     assert held.held == {"drawer": "handle"}

@@ -12,16 +12,16 @@ import pytest
 from helpers.carrying import (
     STICK,
     Script,
-    above,
-    carried_over,
-    lifted,
-    moved_base,
-    room,
-    table,
-    tool_at,
+    carry_over,
+    compute_grasp_pose,
+    describe_table,
+    lift,
+    make_room,
+    move_base,
+    solve_above,
 )
-from helpers.litter import AT, BIN, littered, shelf
-from helpers.small_problems import full_scene, with_objects
+from helpers.litter import AT, BIN, describe_shelf, make_littered_scene
+from helpers.small_problems import make_full_scene, replace_objects
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.robot_object_matrix.pairs import load_description, make_hall
@@ -44,7 +44,7 @@ def end_motion(scene: Scene, base: list[float], arm: np.ndarray, **objects: floa
 
 
 def test_final_coordinates() -> None:
-    scene = full_scene().with_state("door", {"knob": 0.2})
+    scene = make_full_scene().with_state("door", {"knob": 0.2})
     arm = np.linspace(-0.5, 0.5, len(scene.start) - 3)
     after = compute_final_scene(
         scene, end_motion(scene, [0.1, -0.2, 4.0], arm, door__hinge=0.4), []
@@ -57,7 +57,7 @@ def test_final_coordinates() -> None:
 
 
 def test_final_coordinates_are_clamped_to_their_limits() -> None:
-    scene, off = full_scene(), 1e-4
+    scene, off = make_full_scene(), 1e-4
     robot, door = scene.robot, scene.objects["door"].object
     sleeve = scene.objects["cabinet"].object.attachment("sleeve")
     motion = end_motion(
@@ -82,10 +82,10 @@ def test_final_coordinates_are_clamped_to_their_limits() -> None:
 
 
 def test_final_placement_of_a_grasped_object() -> None:
-    scene, values = room(table()), (0.03, 0.2)
-    down = above(STICK, values=values)
+    scene, values = make_room(describe_table()), (0.03, 0.2)
+    down = solve_above(STICK, values=values)
     script = (
-        Script(scene).go(down).take("stick", values=values).go(moved_base(down, x=-0.4, yaw=0.5))
+        Script(scene).go(down).take("stick", values=values).go(move_base(down, x=-0.4, yaw=0.5))
     )
     after = compute_final_scene(scene, script.motion(), [Hold("stick", "grip")])
     assert [(hold, hold.at) for hold in after.holds] == [(Hold("stick", "grip"), values)]
@@ -94,18 +94,18 @@ def test_final_placement_of_a_grasped_object() -> None:
     tool = data.oMf[scene.robot.model.getFrameId(scene.robot.tool_frame)]
     placed = after.objects["stick"].placement
     np.testing.assert_allclose(
-        tool_at(placed, values=values).homogeneous, tool.homogeneous, atol=1e-9
+        compute_grasp_pose(placed, values=values).homogeneous, tool.homogeneous, atol=1e-9
     )
 
 
 def test_final_placement_of_a_released_object() -> None:
-    scene = room(table())
-    script = carried_over(scene, values=(0.03, 0.2))
+    scene = make_room(describe_table())
+    script = carry_over(scene, values=(0.03, 0.2))
     after = compute_final_scene(scene, script.motion(), [])
     assert dict(after.held) == {}
     np.testing.assert_allclose(
         after.objects["stick"].placement.homogeneous,
-        lifted(STICK, [0.0, 0.5, 0.0]).homogeneous,
+        lift(STICK, [0.0, 0.5, 0.0]).homogeneous,
         atol=1e-9,
     )
     assert (
@@ -116,13 +116,11 @@ def test_final_placement_of_a_released_object() -> None:
 
 
 def test_final_holds_by_a_tool() -> None:
-    scene = room(table(), objects=("stick", "ball")).with_held({"stick": "grip"})
+    scene = make_room(describe_table(), objects=("stick", "ball")).with_held({"stick": "grip"})
     turns = scene.objects["ball"].object.attachment("pull").freedoms
     values = [0.5 * (turn.lower + turn.upper) for turn in turns]
     script = (
-        Script(scene)
-        .take("ball", "pull", values, by="stick.tip")
-        .go(moved_base(scene.start, y=0.3))
+        Script(scene).take("ball", "pull", values, by="stick.tip").go(move_base(scene.start, y=0.3))
     )
     stick = Hold("stick", "grip")
     holds = (stick, Hold("ball", "pull", stick, "tip"))
@@ -133,10 +131,10 @@ def test_final_holds_by_a_tool() -> None:
 
 def test_object_is_regrasped_to_be_placed() -> None:
     """An object grasped from the side is regrasped from above, to be put into a bin."""
-    shelved = littered(shelf(*AT[:2]))
+    shelved = make_littered_scene(describe_shelf(*AT[:2]))
     taken = vkc.plan(shelved, [vkc.Grasp("litter", "grip")])
     assert taken.success
-    free = compute_final_scene(littered(), taken.trajectory, taken.end_scene().holds)
+    free = compute_final_scene(make_littered_scene(), taken.trajectory, taken.end_scene().holds)
     plan = vkc.plan(free, [vkc.Place("litter", BIN)])
     assert plan.success
     assert plan.steps == (vkc.Release("litter"), vkc.Place("litter", BIN, "grip"))
@@ -159,7 +157,7 @@ def add_attachment(scene: Scene, owner: str, name: str, z: float) -> Scene:
         name: dataclasses.replace(grip, name=name, placement=lifted),
         **placed.object.attachments,
     }
-    return with_objects(
+    return replace_objects(
         scene,
         {
             owner: dataclasses.replace(
@@ -200,7 +198,7 @@ def test_failed_attachments_are_noted() -> None:
     thing = scene.objects["drawer"]
     attachments = {name: one for name, one in thing.object.attachments.items() if name == "ceiling"}
     attachments["roof"] = dataclasses.replace(attachments["ceiling"], name="roof")
-    scene = with_objects(
+    scene = replace_objects(
         scene,
         {
             "drawer": dataclasses.replace(

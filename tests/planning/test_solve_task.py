@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.drawers import SHORT, drawer_scene
-from helpers.drives import hall
-from helpers.small_problems import door_scene, program_of
+from helpers.drawers import SHORT, load_drawer_scene
+from helpers.drives import make_hall
+from helpers.small_problems import load_door_scene, make_program
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.problems.problem_set import problem as make_drawn_problem
@@ -39,7 +39,7 @@ def test_guesses_are_tried_until_a_trajectory_is_valid(number: int, seed: int) -
 
 
 def test_own_guess_is_the_only_one() -> None:
-    scene = hall()
+    scene = make_hall()
     task = compile_task(scene, [vkc.GoTo(1.0, 0.0)], SHORT)
     request, asked = PlanningRequest("auto", SHORT), []
 
@@ -56,7 +56,7 @@ def test_own_guess_is_the_only_one() -> None:
 def test_infeasible_solution_of_the_least_shortfall_is_returned() -> None:
     """A wall from side to side, to pass which no time is left."""
     wall = {"name": "wall", "type": "box", "size": [0.6, 9.0, 2.0], "position": [2.0, 0.0, 1.0]}
-    scene, options = hall(obstacles=[wall]), vkc.Options(max_restarts=1)
+    scene, options = make_hall(obstacles=[wall]), vkc.Options(max_restarts=1)
     task = compile_task(scene, [vkc.GoTo(4.0, 0.0)], options)
     request = PlanningRequest("interpolated", options)
     plan = solve_task(scene, task, request, guess=interpolate).plan
@@ -81,7 +81,10 @@ def test_budget_may_end_before_the_first_guess() -> None:
     ]
     for budget, status in budgets:
         plan = vkc.plan(
-            door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], planner=vkc.Planner(), **budget
+            load_door_scene(),
+            [vkc.Actuate("door", {"hinge": 1.2})],
+            planner=vkc.Planner(),
+            **budget,
         )
         assert (plan.status, plan.initialization, plan.metrics["rounds"]) == (status, "none", 0)
         assert plan.report.violations
@@ -90,7 +93,7 @@ def test_budget_may_end_before_the_first_guess() -> None:
 
 
 def test_sufficient_budget_changes_nothing() -> None:
-    scene, steps = door_scene(), [vkc.Actuate("door", {"hinge": 1.2})]
+    scene, steps = load_door_scene(), [vkc.Actuate("door", {"hinge": 1.2})]
     whole = vkc.plan(scene, steps, planner=vkc.Planner())
     assert whole.success
     used = int(whole.metrics["evaluations"])
@@ -114,7 +117,7 @@ def test_control_effort_of_a_turn() -> None:
         velocity_weight_heading=0.7,
         dt=0.5,
     )
-    problem = program_of(hall(), [vkc.GoTo(0.0, 0.0, 1.0)], options=options)
+    problem = make_program(make_hall(), [vkc.GoTo(0.0, 0.0, 1.0)], options=options)
     z = np.tile(problem.start, (problem.segments, 1))
     z[:, 2] = np.linspace(0.0, 1.0, problem.segments + 1)[1:] ** 2
     first = np.diff(np.concatenate([[0.0], z[:, 2]]))
@@ -124,7 +127,7 @@ def test_control_effort_of_a_turn() -> None:
 
 
 def test_cache_is_trimmed_after_each_task() -> None:
-    scene, cache = drawer_scene(), Cache(max_nbytes=1.0)
+    scene, cache = load_drawer_scene(), Cache(max_nbytes=1.0)
     request = PlanningRequest("auto", SHORT, cache=cache)
     assert solve_task(scene, compile_task(scene, PULL, SHORT), request).plan.success
     assert cache.info().entries == 1

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.telescopes import FOLLOWERS, SEGMENT, coupled_scene, telescope_scene
+from helpers.telescopes import FOLLOWERS, SEGMENT, write_coupled_scene, write_telescope_scene
 from oracle.judge import judge
 
 import vkc_pin as vkc
@@ -21,7 +21,7 @@ NAMES = ("base_x", "base_y", "base_yaw", "lift", "out_1", "yaw_joint", "pitch_jo
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory: pytest.TempPathFactory) -> vkc.Plan:
     """A drawer is pulled open, between two cheeks, by a robot whose base stands still."""
-    scene = telescope_scene(tmp_path_factory.mktemp("telescope"), base="fixed")
+    scene = write_telescope_scene(tmp_path_factory.mktemp("telescope"), base="fixed")
     return vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.15})], seed=0)
 
 
@@ -52,7 +52,7 @@ def test_message_has_one_coordinate(opened: vkc.Plan) -> None:
 @pytest.fixture(scope="module")
 def coupled(tmp_path_factory: pytest.TempPathFactory) -> vkc.Plan:
     """Joints follow others backwards, at other rates, and turn as another slides."""
-    scene = coupled_scene(
+    scene = write_coupled_scene(
         tmp_path_factory.mktemp("coupled"),
         more="joints: {roll_joint: {velocity: 0.9, acceleration: 0.6}}\n",
     )

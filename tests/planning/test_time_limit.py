@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from helpers.drawers import SHORT, drawer_scene
+from helpers.drawers import SHORT, load_drawer_scene
 
 import vkc_pin as vkc
 from vkc_pin.baselines import plan_separately
@@ -16,9 +16,11 @@ from vkc_pin.utils.budget import Budget
 
 PULL = [vkc.Actuate("drawer", {"slide": 0.3})]
 CALLS: dict[str, Callable[[], vkc.Plan]] = {
-    "plan": lambda: vkc.plan(drawer_scene(), PULL, options=SHORT, planner=vkc.Planner()),
-    "chore": lambda: vkc.plan(drawer_scene(), [*PULL, vkc.GoTo(0.0, 0.0)], options=SHORT, window=2),
-    "baseline": lambda: plan_separately(drawer_scene(), PULL, method="B2", retries=1),
+    "plan": lambda: vkc.plan(load_drawer_scene(), PULL, options=SHORT, planner=vkc.Planner()),
+    "chore": lambda: vkc.plan(
+        load_drawer_scene(), [*PULL, vkc.GoTo(0.0, 0.0)], options=SHORT, window=2
+    ),
+    "baseline": lambda: plan_separately(load_drawer_scene(), PULL, method="B2", retries=1),
 }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from helpers.executions import door_plan, holding, still
+from helpers.executions import make_grasping_scene, make_stationary_motion, plan_door
 
 import vkc_pin as vkc
 from vkc_pin.options import Options
@@ -17,7 +17,7 @@ from vkc_pin.world.trajectory.world_model import World
 
 
 def test_contact_pairs_include_all_pairs_of_the_planner() -> None:
-    plan = door_plan()
+    plan = plan_door()
     world = World(plan.scene)
     labels = world.collision_labels
     holds = [hold for phase in plan.trajectory.phases for hold in phase.holds][:1]
@@ -54,7 +54,7 @@ def test_contact_pairs_include_all_pairs_of_the_planner() -> None:
 
 
 def test_free_objects_but_not_wheels_collide_with_the_floor() -> None:
-    scene = holding()
+    scene = make_grasping_scene()
     world = World(scene)
     labels = world.collision_labels
     below = [
@@ -71,7 +71,7 @@ def test_free_objects_but_not_wheels_collide_with_the_floor() -> None:
 
 
 def test_unplanned_contacts_are_found() -> None:
-    plan = door_plan()
+    plan = plan_door()
     samples = {
         ("door.lever", "gripper_left_finger"): [(1.0, 2e-3), (1.01, 4e-3)],
         ("floor", "nowhere"): [(3.0, 5e-3)],
@@ -88,4 +88,4 @@ def test_unplanned_contacts_are_found() -> None:
 def test_contact_of_supported_object_with_its_support_is_planned() -> None:
     scene = vkc.load_scene("household")
     samples = {("coffee_table", "cup.cup"): [(0.5, 2e-3)]}
-    assert find_unplanned_contacts(scene, still(scene), samples, 0.01) == ()
+    assert find_unplanned_contacts(scene, make_stationary_motion(scene), samples, 0.01) == ()

@@ -7,7 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.executions import door_plan, drawer_plan, drawer_result, holding, still, with_mass
+from helpers.executions import (
+    make_grasping_scene,
+    make_stationary_motion,
+    plan_door,
+    plan_drawer,
+    replace_mass,
+    simulate_drawer,
+)
 
 import vkc_pin as vkc
 from vkc_pin.simulation.execution import simulate
@@ -15,7 +22,7 @@ from vkc_pin.world.scene.scene import Scene
 
 
 def test_drawer_is_pulled() -> None:
-    result = drawer_result()
+    result = simulate_drawer()
     assert result.ok, result.summary()
     (miss,) = result.misses
     assert (miss.subject, miss.unit) == ("drawer.slide", "m")
@@ -29,14 +36,14 @@ def test_drawer_is_pulled() -> None:
     assert grip.what == "drawer.handle"
     assert grip.broken is None
     # Lower bound: the drawer's mass times the plan's largest acceleration.
-    plan = drawer_plan().trajectory
+    plan = plan_drawer().trajectory
     column = plan.names.index("drawer.slide")
     assert grip.force > 0.3 * 5.0 * np.abs(plan.accelerations()[:, column]).max()
     assert result.contacts == ()
 
 
 def test_latched_door_opens_when_its_lever_is_turned() -> None:
-    result = door_plan().simulate()
+    result = plan_door().simulate()
     assert result.ok, result.summary()
     before = result.trajectory.times < result.grips[0].begin
     assert np.abs(result.trajectory.column("door.hinge")[before]).max() < 1e-3
@@ -47,9 +54,12 @@ def test_latched_door_opens_when_its_lever_is_turned() -> None:
 
 
 def test_hand_loses_heavy_object() -> None:
-    scene = holding()
+    scene = make_grasping_scene()
     heavy = simulate(
-        scene, [vkc.Grasp("stick")], still(scene), actual=with_mass(scene, "stick", 60.0)
+        scene,
+        [vkc.Grasp("stick")],
+        make_stationary_motion(scene),
+        actual=replace_mass(scene, "stick", 60.0),
     )
     assert heavy.grips[0].broken is not None
     assert "stick.grip was pulled out of the hand" in heavy.summary()
@@ -57,7 +67,7 @@ def test_hand_loses_heavy_object() -> None:
 
 
 def test_contact_with_unplanned_obstacle_is_reported() -> None:
-    plan = drawer_plan()
+    plan = plan_drawer()
     middle = plan.trajectory.at(10.0)[:2]
     document = dict(plan.scene.document)
     crate = {
@@ -82,7 +92,7 @@ def test_contact_with_unplanned_obstacle_is_reported() -> None:
 def test_diverged_simulation_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     wild = vkc.Physics(timestep=0.01, base_bandwidth=1e7, arm_bandwidth=1e7)
-    result = drawer_plan().simulate(physics=wild)
+    result = plan_drawer().simulate(physics=wild)
     assert result.diverged is not None
     assert result.diverged < 10.0
     assert not result.ok
@@ -93,11 +103,11 @@ def test_diverged_simulation_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def test_simulation_is_deterministic() -> None:
-    np.testing.assert_array_equal(drawer_plan().simulate().rows, drawer_result().rows)
+    np.testing.assert_array_equal(plan_drawer().simulate().rows, simulate_drawer().rows)
 
 
 def test_result_round_trips_through_json(tmp_path: Path) -> None:
-    result = drawer_result()
+    result = simulate_drawer()
     data = json.loads(result.to_json(tmp_path / "result.json").read_text(encoding="utf-8"))
     assert data["ok"] is True
     assert data["misses"][0]["subject"] == "drawer.slide"
@@ -116,5 +126,5 @@ def test_result_round_trips_through_json(tmp_path: Path) -> None:
 )
 def test_invalid_argument_is_named(options: dict[str, object], field: str) -> None:
     with pytest.raises(vkc.InputError) as caught:
-        drawer_plan().simulate(**options)
+        plan_drawer().simulate(**options)
     assert caught.value.field == field

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.executions import drawer_plan, still
-from helpers.telescopes import coupled_scene
+from helpers.executions import make_stationary_motion, plan_drawer
+from helpers.telescopes import write_coupled_scene
 
 import vkc_pin as vkc
 from vkc_pin.simulation.contacts import find_contact_pairs
@@ -28,7 +28,7 @@ from vkc_pin.world.trajectory.world_model import World
 def build_model(scene: Scene, *, has_notes: bool = False) -> PhysicalWorld:
     physics, world, holds = Physics(), World(scene), scene.holds
     assert bool(complete_inertias(world, physics)) == has_notes
-    driven = make_servos(world, world.compute_positions(still(scene)), physics)
+    driven = make_servos(world, world.compute_positions(make_stationary_motion(scene)), physics)
     latches = [(joint, at) for joint, at, _, _ in find_latches(scene)]
     return Builder(world, physics).build(find_contact_pairs(world, holds), driven, holds, latches)
 
@@ -48,7 +48,7 @@ def random_rows(world: World, count: int) -> np.ndarray:
 @pytest.mark.parametrize("name", ["door", "household", "coupled"])
 def test_placements_agree_with_pinocchio(name: str, tmp_path: Path) -> None:
     coupled = name == "coupled"
-    scene = coupled_scene(tmp_path) if coupled else vkc.load_scene(name)
+    scene = write_coupled_scene(tmp_path) if coupled else vkc.load_scene(name)
     physical = build_model(scene, has_notes=coupled)
     world, model = physical.world, physical.model
     data, tree = mujoco.MjData(model), world.model.createData()
@@ -98,7 +98,7 @@ def test_masses_agree_with_pinocchio() -> None:
 
 def test_objects_have_the_described_joint_resistance() -> None:
     """Joint friction adds to the pulling force, and a spring pulls the drawer back."""
-    plan = drawer_plan()
+    plan = plan_drawer()
     placed = plan.scene.objects["drawer"]
 
     def simulate_with(**resistance: float) -> SimulationResult:

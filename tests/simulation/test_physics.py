@@ -8,7 +8,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.executions import drawer_plan, holding
+from helpers.executions import make_grasping_scene, plan_drawer
 
 import vkc_pin as vkc
 from vkc_pin.simulation.physics import complete_inertias, import_mujoco
@@ -16,7 +16,7 @@ from vkc_pin.world.trajectory.world_model import World
 
 
 def test_missing_mujoco_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = drawer_plan()
+    plan = plan_drawer()
     monkeypatch.setitem(sys.modules, "mujoco", None)
     for call in (import_mujoco, plan.simulate):
         with pytest.raises(vkc.InputError, match="mujoco") as caught:
@@ -41,7 +41,7 @@ def test_out_of_range_setting_is_named(name: str, value: object) -> None:
 
 
 def test_impossible_inertia_is_corrected_with_a_note() -> None:
-    world = World(holding())
+    world = World(make_grasping_scene())
     joint = world.model.getJointId("stick.placement")
     world.model.inertias[joint] = pin.Inertia(1.0, np.zeros(3), np.diag([0.01, 0.01, 0.04]))
     (note,) = complete_inertias(world, vkc.Physics())
@@ -53,7 +53,7 @@ def test_impossible_inertia_is_corrected_with_a_note() -> None:
 
 
 def test_missing_mass_is_estimated_from_volume_with_a_note() -> None:
-    world = World(holding())
+    world = World(make_grasping_scene())
     joint = world.model.getJointId("base")
     world.model.inertias[joint] = pin.Inertia.Zero()
     (note,) = complete_inertias(world, vkc.Physics(density=500.0))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from helpers.executions import drawer_result, holding, still
+from helpers.executions import make_grasping_scene, make_stationary_motion, simulate_drawer
 
 import vkc_pin as vkc
 from vkc_pin.simulation.execution import simulate
@@ -13,8 +13,8 @@ from vkc_pin.simulation.replay import Replay
 
 
 def test_replay_reproduces_executed_coordinates() -> None:
-    scene = holding()
-    result = simulate(scene, [vkc.Grasp("stick")], still(scene))
+    scene = make_grasping_scene()
+    result = simulate(scene, [vkc.Grasp("stick")], make_stationary_motion(scene))
     world = Replay(scene, result.trajectory.times, result.rows)
     rows = world.compute_positions(result.trajectory, result.trajectory.times)
     np.testing.assert_allclose(np.abs(rows), np.abs(result.rows), atol=1e-12)
@@ -22,7 +22,7 @@ def test_replay_reproduces_executed_coordinates() -> None:
 
 
 def test_page_contains_motion_and_ghost(tmp_path: Path) -> None:
-    result = drawer_result()
+    result = simulate_drawer()
     text = result.to_html(tmp_path / "page.html").read_text(encoding="utf-8")
     assert "drawer in physics: ok" in text
     assert "as planned" in text

@@ -7,8 +7,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from helpers.executions import door_plan, still
-from helpers.telescopes import coupled_scene
+from helpers.executions import make_stationary_motion, plan_door
+from helpers.telescopes import write_coupled_scene
 
 import vkc_pin as vkc
 from vkc_pin.simulation.contacts import find_contact_pairs
@@ -23,7 +23,7 @@ from vkc_pin.world.trajectory.world_model import World
 
 
 def test_reference_contains_positions_velocities_and_accelerations() -> None:
-    motion = door_plan().trajectory
+    motion = plan_door().trajectory
     middles = (motion.times[:-1] + motion.times[1:]) / 2.0
     positions, velocities, accelerations = sample_reference(motion, middles)
     np.testing.assert_allclose(accelerations, motion.acceleration(middles)[:, : motion.robot_size])
@@ -38,10 +38,10 @@ def test_reference_contains_positions_velocities_and_accelerations() -> None:
 @pytest.mark.parametrize("name", ["door", "coupled"])
 def test_feedforward_agrees_with_inverse_dynamics_of_mujoco(name: str, tmp_path: Path) -> None:
     """MuJoCo's joints are independent; one motor may move several of them."""
-    scene = coupled_scene(tmp_path) if name == "coupled" else vkc.load_scene(name)
+    scene = write_coupled_scene(tmp_path) if name == "coupled" else vkc.load_scene(name)
     world, physics, robot = World(scene), Physics(), scene.robot.coordinates
     complete_inertias(world, physics)
-    driven = make_servos(world, world.compute_positions(still(scene)), physics)
+    driven = make_servos(world, world.compute_positions(make_stationary_motion(scene)), physics)
     physical = Builder(world, physics).build(find_contact_pairs(world, ()), driven, (), ())
     rng, count = np.random.default_rng(3), 6
     rows = np.tile(world.start, (count, 1))

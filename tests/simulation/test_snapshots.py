@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.executions import drawer_result
+from helpers.executions import simulate_drawer
 
 import vkc_pin as vkc
 from vkc_pin.simulation import snapshots
@@ -15,7 +15,7 @@ from vkc_pin.simulation.snapshots import RenderedScene
 
 
 def test_snapshots_differ_where_objects_move(tmp_path: Path) -> None:
-    result = drawer_result()
+    result = simulate_drawer()
     stage = RenderedScene(result)
     try:
         first, again, last = stage.render(
@@ -32,7 +32,7 @@ def test_snapshots_differ_where_objects_move(tmp_path: Path) -> None:
 
 
 def test_missing_opengl_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    result = drawer_result()
+    result = simulate_drawer()
     monkeypatch.setattr(snapshots, "_CONTEXTS", ("no_such_context",))
     with pytest.raises(vkc.VkcError, match="EGL or OSMesa"):
         result.plot(tmp_path / "strip.png")
@@ -42,7 +42,7 @@ def test_missing_opengl_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: P
 
 
 def test_video_has_the_duration_of_the_motion(tmp_path: Path) -> None:
-    result = drawer_result()
+    result = simulate_drawer()
     try:
         file = result.to_mp4(tmp_path / "deep" / "film.mp4", rate=5.0)
     except vkc.VkcError as error:  # no OpenGL or no ffmpeg on this machine
@@ -56,7 +56,7 @@ def test_video_has_the_duration_of_the_motion(tmp_path: Path) -> None:
 
 
 def test_missing_ffmpeg_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    result = drawer_result()
+    result = simulate_drawer()
     monkeypatch.setattr(snapshots.shutil, "which", lambda name: None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(vkc.InputError, match="ffmpeg") as caught:

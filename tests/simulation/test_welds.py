@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.executions import door_plan, holding, still, with_mass
+from helpers.executions import make_grasping_scene, make_stationary_motion, plan_door, replace_mass
 
 import vkc_pin as vkc
 from vkc_pin.simulation.execution import simulate
@@ -15,8 +15,8 @@ from vkc_pin.world.trajectory.world_model import World
 
 def test_load_of_a_grip_is_the_object_weight() -> None:
     mass = 3.0
-    scene = with_mass(holding(), "stick", mass)
-    result = simulate(scene, [vkc.Grasp("stick")], still(scene, 2.0))
+    scene = replace_mass(make_grasping_scene(), "stick", mass)
+    result = simulate(scene, [vkc.Grasp("stick")], make_stationary_motion(scene, 2.0))
     (grip,) = result.grips
     world = World(scene)
     model, data = world.model, world.model.createData()
@@ -36,18 +36,18 @@ def test_load_of_a_grip_is_the_object_weight() -> None:
 
 
 def test_hold_spans_follow_the_plan() -> None:
-    plan = door_plan()
+    plan = plan_door()
     ((hold, begin, end),) = find_hold_spans(plan.scene, plan.trajectory)
     first = next(phase for phase in plan.trajectory.phases if phase.holds)
     assert str(hold) == "door.handle"
     assert begin == plan.trajectory.times[first.first]
     assert end == np.inf
-    scene = holding()
-    ((hold, begin, _),) = find_hold_spans(scene, still(scene))
+    scene = make_grasping_scene()
+    ((hold, begin, _),) = find_hold_spans(scene, make_stationary_motion(scene))
     assert hold.object == "stick"
     assert begin == -np.inf
 
 
 def test_pushes_are_not_held() -> None:
     scene = vkc.load_scene("door").with_held({"door": "push"})
-    assert find_hold_spans(scene, still(scene)) == []
+    assert find_hold_spans(scene, make_stationary_motion(scene)) == []

@@ -14,20 +14,20 @@ from helpers.carrying import (
     STICK,
     UP,
     Script,
-    above,
-    box,
-    carried_over,
-    lifted,
-    moved_base,
-    reaching,
-    room,
-    stand,
-    table,
-    tool_at,
-    with_grasp,
-    with_object,
+    carry_over,
+    compute_grasp_pose,
+    describe_box,
+    describe_stand,
+    describe_table,
+    lift,
+    make_room,
+    move_base,
+    place_object,
+    replace_grasp,
+    solve_above,
+    solve_reach,
 )
-from helpers.judging import names, only
+from helpers.judging import get_only_violation, get_violation_names
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
@@ -39,14 +39,14 @@ from vkc_pin.world.task.steps import Step
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-ASIDE = lifted(STICK, [0.0, 0.5, 0.0])
+ASIDE = lift(STICK, [0.0, 0.5, 0.0])
 PLACED = vkc.Place("stick", ASIDE)
 SIDES = np.diag([1.0, -1.0, 1.0])
 
 
 @cache
 def hall() -> Scene:
-    return room(table())
+    return make_room(describe_table())
 
 
 def judge(scene: Scene, steps: Sequence[Step], motion: Trajectory) -> Report:
@@ -62,7 +62,7 @@ def compute_tip_position(scene: Scene, row: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("values", [(0.0, 0.0), (0.06, 0.0), (-0.05, 0.3), (0.09, -0.3)])
 def test_pick_and_place_is_valid(values: tuple[float, float]) -> None:
-    motion = carried_over(hall(), values=values).motion()
+    motion = carry_over(hall(), values=values).motion()
     for steps in (
         [PLACED],
         [vkc.Place("stick", ASIDE.translation)],
@@ -78,32 +78,34 @@ def test_pick_and_place_is_valid(values: tuple[float, float]) -> None:
 
 
 def test_object_grasped_at_the_start_may_leave_its_support_within_a_second() -> None:
-    up, down = above(STICK), reaching(tool_at(STICK), above(STICK))
+    up, down = solve_above(STICK), solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
     for gap in (1e-3, 0.0, -2e-3):
         held = (
-            room(table(gap=gap))
+            make_room(describe_table(gap=gap))
             .with_start(base=down[:3], arm=down[3:])
             .with_held({"stick": "grip"})
         )
         report = judge(
-            held, [vkc.GoTo(0.0, 0.5)], Script(held).go(up).go(moved_base(up, y=0.5)).motion()
+            held, [vkc.GoTo(0.0, 0.5)], Script(held).go(up).go(move_base(up, y=0.5)).motion()
         )
         assert report.ok, "\n".join(report.lines())
         late = (
             Script(held)
-            .go(moved_base(down, y=0.1), steps=60)
+            .go(move_base(down, y=0.1), steps=60)
             .go(up)
-            .go(moved_base(up, y=0.5))
+            .go(move_base(up, y=0.5))
             .motion()
         )
         what = "penetration" if gap < 0.0 else "clearance"
-        assert names(judge(held, [vkc.GoTo(0.0, 0.5)], late)) == {(what, "stick.stick – table")}
+        assert get_violation_names(judge(held, [vkc.GoTo(0.0, 0.5)], late)) == {
+            (what, "stick.stick – table")
+        }
 
 
 def test_fetching_with_a_tool_is_valid() -> None:
     for steps in (
-        [vkc.Place("ball", lifted(BALL, [0.0, 0.3, 0.0]))],
-        [vkc.Grasp("ball", "pull", "stick.tip"), vkc.Place("ball", lifted(BALL, [0.0, 0.3, 0.0]))],
+        [vkc.Place("ball", lift(BALL, [0.0, 0.3, 0.0]))],
+        [vkc.Grasp("ball", "pull", "stick.tip"), vkc.Place("ball", lift(BALL, [0.0, 0.3, 0.0]))],
         [vkc.Grasp("ball", by="stick.tip"), vkc.Release("ball")],
     ):
         report = judge(fetch_ball().scene, steps, fetch_ball().motion())
@@ -112,29 +114,29 @@ def test_fetching_with_a_tool_is_valid() -> None:
 
 @pytest.mark.parametrize("side", SIDES, ids=str)
 def test_position_error_of_a_grasp(side: np.ndarray) -> None:
-    motion = carried_over(hall(), off=pin.SE3(np.eye(3), 2e-3 * side)).motion()
+    motion = carry_over(hall(), off=pin.SE3(np.eye(3), 2e-3 * side)).motion()
     report = judge(hall(), [PLACED], motion)
-    found = only(report)
+    found = get_only_violation(report)
     assert (found.constraint, found.subject, found.unit) == ("closure", "stick.grip", "m")
     assert found.amount == pytest.approx(1e-3, abs=1e-9)
     assert found.waypoint >= motion.phases[2].first
     assert report.closure_error == pytest.approx(2e-3, abs=1e-9)
     grasped = judge(hall(), [vkc.Grasp("stick"), PLACED], motion)
-    assert names(grasped) == {("closure", "stick.grip"), ("goal", "stick.grip")}
-    within = carried_over(hall(), off=pin.SE3(np.eye(3), 9e-4 * side)).motion()
+    assert get_violation_names(grasped) == {("closure", "stick.grip"), ("goal", "stick.grip")}
+    within = carry_over(hall(), off=pin.SE3(np.eye(3), 9e-4 * side)).motion()
     assert judge(hall(), [vkc.Grasp("stick"), PLACED], within).ok
 
 
 @pytest.mark.parametrize("side", SIDES, ids=str)
 def test_orientation_error_of_a_grasp(side: np.ndarray) -> None:
-    motion = carried_over(hall(), off=pin.SE3(pin.exp3(4e-3 * side), np.zeros(3))).motion()
-    found = only(judge(hall(), [PLACED], motion))
+    motion = carry_over(hall(), off=pin.SE3(pin.exp3(4e-3 * side), np.zeros(3))).motion()
+    found = get_only_violation(judge(hall(), [PLACED], motion))
     assert (found.constraint, found.subject, found.unit) == ("closure", "stick.grip", "rad")
     assert found.amount == pytest.approx(3e-3, abs=1e-6)
 
 
 def test_grasp_coordinates_must_match_the_tool() -> None:
-    script = carried_over(hall(), values=(0.05, 0.0))
+    script = carry_over(hall(), values=(0.05, 0.0))
     for column, value, unit in (
         ("stick__grip_slide", 0.053, "m"),
         ("stick__grip_turn", 0.01, "rad"),
@@ -142,7 +144,7 @@ def test_grasp_coordinates_must_match_the_tool() -> None:
         report = judge(
             hall(), [PLACED], script.motion(**{column: np.full(len(script.rows), value)})
         )
-        assert names(report) == {("closure", "stick.grip")}
+        assert get_violation_names(report) == {("closure", "stick.grip")}
         assert unit in {found.unit for found in report.violations}
 
 
@@ -150,11 +152,13 @@ def test_grasp_coordinates_must_match_the_tool() -> None:
     ("values", "subject"), [((0.1, 0.0), "stick.grip_slide"), ((0.0, -1.25), "stick.grip_turn")]
 )
 def test_limits_of_grasp_coordinates(values: tuple[float, float], subject: str) -> None:
-    down = reaching(tool_at(lifted(STICK, 0.3 * UP), values=values), GUESS)
+    down = solve_reach(compute_grasp_pose(lift(STICK, 0.3 * UP), values=values), GUESS)
     scene = hall().with_held({"stick": "grip"}).with_start(arm=down[3:])
-    script = Script(scene).go(moved_base(scene.start, y=0.5))
+    script = Script(scene).go(move_base(scene.start, y=0.5))
     script.values |= dict(zip(("stick.grip_slide", "stick.grip_turn"), values, strict=True))
-    assert ("limit", subject) in names(judge(scene, [vkc.GoTo(0.0, 0.5)], script.motion()))
+    assert ("limit", subject) in get_violation_names(
+        judge(scene, [vkc.GoTo(0.0, 0.5)], script.motion())
+    )
 
 
 def make_slide(script: Script, *, begin: int, end: int, by: float) -> np.ndarray:
@@ -167,26 +171,29 @@ def make_slide(script: Script, *, begin: int, end: int, by: float) -> np.ndarray
     [("grip_slide", 0.02, "m"), ("grip_turn", 0.1, "rad"), ("grip_slide", 1e-4, "m")],
 )
 def test_firm_grasps_must_not_slide(column: str, by: float, unit: str) -> None:
-    script = carried_over(hall())
+    script = carry_over(hall())
     phase = script.phases[3]  # half-way, in the air
     motion = script.motion(
         **{f"stick__{column}": make_slide(script, begin=phase.first + 3, end=phase.last - 3, by=by)}
     )
     report = judge(hall(), [vkc.Release()], motion)
     found = next(v for v in report.violations if v.constraint == "slide")
-    assert names(report) <= {("slide", f"stick.{column}"), ("penetration", "stick.stick – table")}
+    assert get_violation_names(report) <= {
+        ("slide", f"stick.{column}"),
+        ("penetration", "stick.stick – table"),
+    }
     assert (found.subject, found.unit) == (f"stick.{column}", unit)
     assert found.amount == pytest.approx(by)
     assert phase.first < found.waypoint <= phase.last
     assert (
         report.closure_error < 1e-9
     )  # the hand is where the coordinates say, so nothing else would notice
-    loose = with_grasp(hall(), "stick", "grip", firm=False)
+    loose = replace_grasp(hall(), "stick", "grip", firm=False)
     assert "slide" not in {v.constraint for v in judge(loose, [vkc.Release()], motion).violations}
 
 
 def test_grasp_coordinates_are_free_before_the_grasp() -> None:
-    script = carried_over(hall(), values=(0.0, 0.0))
+    script = carry_over(hall(), values=(0.0, 0.0))
     before = make_slide(script, begin=0, end=script.phases[1].last - 1, by=0.05)[::1] - 0.05
     motion = script.motion(stick__grip_slide=before)
     report = judge(hall(), [PLACED], motion)
@@ -194,7 +201,7 @@ def test_grasp_coordinates_are_free_before_the_grasp() -> None:
 
 
 def test_slide_in_the_last_segment_of_a_grasp() -> None:
-    script = carried_over(hall())
+    script = carry_over(hall())
     last = script.phases[4].last
     for begin, end, slides in ((last - 1, last, True), (last, last + 1, False)):
         motion = script.motion(stick__grip_slide=make_slide(script, begin=begin, end=end, by=0.01))
@@ -216,8 +223,8 @@ def test_slide_in_the_last_segment_of_a_grasp() -> None:
 )
 def test_pose_error_of_a_placed_object(off: pin.SE3, subject_unit: str, amount: float) -> None:
     goal = pin.SE3(ASIDE.rotation @ off.rotation.T, ASIDE.translation - off.translation)
-    motion = carried_over(hall()).motion()
-    found = only(judge(hall(), [vkc.Place("stick", goal)], motion))
+    motion = carry_over(hall()).motion()
+    found = get_only_violation(judge(hall(), [vkc.Place("stick", goal)], motion))
     assert (found.constraint, found.subject, found.unit) == ("goal", "stick.stick", subject_unit)
     assert found.amount == pytest.approx(amount, abs=1e-8)
     assert found.waypoint == motion.phases[-1].last
@@ -229,10 +236,12 @@ def test_pose_error_of_a_placed_object(off: pin.SE3, subject_unit: str, amount: 
 )
 def test_placing_at_a_point_leaves_only_the_heading_free(axis: int, wrong: bool) -> None:
     turn = pin.exp3(0.02 * np.eye(3)[axis])
-    scene = room(box("table", [0.5, 2.4, 0.02], [0.8, 0.3, 0.46]))  # lower: an end may hang down
+    scene = make_room(
+        describe_box("table", [0.5, 2.4, 0.02], [0.8, 0.3, 0.46])
+    )  # lower: an end may hang down
     put = pin.SE3(turn @ STICK.rotation, ASIDE.translation)
-    up, down = above(STICK), reaching(tool_at(STICK), above(STICK))
-    there = reaching(tool_at(put), moved_base(down, y=0.5))
+    up, down = solve_above(STICK), solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
+    there = solve_reach(compute_grasp_pose(put), move_base(down, y=0.5))
     script = (
         Script(scene)
         .go(up)
@@ -241,14 +250,14 @@ def test_placing_at_a_point_leaves_only_the_heading_free(axis: int, wrong: bool)
         .go(up)
         .go(there)
         .let_go()
-        .go(moved_base(up, y=0.5))
+        .go(move_base(up, y=0.5))
     )
     motion = script.motion()
     report = judge(scene, [vkc.Place("stick", ASIDE.translation)], motion)
     if not wrong:
         assert report.ok, "\n".join(report.lines())
         return
-    found = only(report)
+    found = get_only_violation(report)
     assert (found.constraint, found.subject, found.unit) == ("goal", "stick.stick", "rad")
     assert found.amount == pytest.approx(0.02 - 1e-3, abs=1e-7)
     assert judge(scene, [vkc.Place("stick", put)], motion).ok
@@ -256,35 +265,50 @@ def test_placing_at_a_point_leaves_only_the_heading_free(axis: int, wrong: bool)
 
 def test_object_grasped_at_the_start_is_placed_upright() -> None:
     aslant = pin.SE3(pin.exp3(np.array([0.5, 0.2, 0.0])), np.array([0.8, 0.0, 0.75]))
-    held = room().with_held({"stick": "grip"}).with_start(arm=reaching(tool_at(aslant), GUESS)[3:])
-    level = Script(held).go(reaching(tool_at(lifted(STICK)), np.array(held.start))).let_go().wait()
-    report = judge(held, [vkc.Place("stick", lifted(STICK).translation)], level.motion())
+    held = (
+        make_room()
+        .with_held({"stick": "grip"})
+        .with_start(arm=solve_reach(compute_grasp_pose(aslant), GUESS)[3:])
+    )
+    level = (
+        Script(held)
+        .go(solve_reach(compute_grasp_pose(lift(STICK)), np.array(held.start)))
+        .let_go()
+        .wait()
+    )
+    report = judge(held, [vkc.Place("stick", lift(STICK).translation)], level.motion())
     assert report.ok, "\n".join(report.lines())
-    script = Script(held).go(moved_base(held.start, x=-0.5, yaw=1.2)).let_go().wait()
+    script = Script(held).go(move_base(held.start, x=-0.5, yaw=1.2)).let_go().wait()
     there = held.with_start(base=script.rows[-1][:3]).objects["stick"].placement
-    tilted = only(judge(held, [vkc.Place("stick", there.translation)], script.motion()))
+    tilted = get_only_violation(
+        judge(held, [vkc.Place("stick", there.translation)], script.motion())
+    )
     assert (tilted.constraint, tilted.subject, tilted.unit) == ("goal", "stick.stick", "rad")
     assert tilted.amount == pytest.approx(np.arccos(aslant.rotation[2, 2]) - 1e-3, abs=1e-6)
 
 
 def test_upside_down_is_not_upright() -> None:
-    scene = with_object(hall(), "stick", pin.SE3(pin.utils.rotate("y", np.pi), ASIDE.translation))
-    stands = Script(scene).go(moved_base(scene.start, x=-0.5)).motion()
+    scene = place_object(hall(), "stick", pin.SE3(pin.utils.rotate("y", np.pi), ASIDE.translation))
+    stands = Script(scene).go(move_base(scene.start, x=-0.5)).motion()
     assert judge(scene, [vkc.Place("stick", ASIDE.translation)], stands).ok
-    assert only(judge(scene, [PLACED], stands)).amount == pytest.approx(np.pi - 1e-3, abs=1e-6)
-    lying = carried_over(hall()).motion()
-    turned = with_object(
+    assert get_only_violation(judge(scene, [PLACED], stands)).amount == pytest.approx(
+        np.pi - 1e-3, abs=1e-6
+    )
+    lying = carry_over(hall()).motion()
+    turned = place_object(
         hall(), "stick", pin.SE3(pin.utils.rotate("y", np.pi) @ STICK.rotation, STICK.translation)
     )
     report = judge(turned, [vkc.Place("stick", (0.8, 0.5, 0.55))], lying)
-    assert ("goal", "stick.stick") not in names(
+    assert ("goal", "stick.stick") not in get_violation_names(
         report
     )  # it stands as it stood, wherever its top is
-    assert ("closure", "stick.grip") in names(report)  # but nobody can take it from there
+    assert ("closure", "stick.grip") in get_violation_names(
+        report
+    )  # but nobody can take it from there
 
 
 def test_object_must_be_released() -> None:
-    script = carried_over(hall())
+    script = carry_over(hall())
     script.phases[5] = PhaseSpan(
         "stay", script.phases[4].last, script.phases[4].last + 2, script.phases[4].holds
     )
@@ -299,57 +323,57 @@ def test_object_must_be_released() -> None:
 
 
 def test_placed_object_must_not_be_moved_again() -> None:
-    script = carried_over(hall())
+    script = carry_over(hall())
     down = script.rows[script.phases[4].last]
-    script.go(down).take("stick").go(moved_base(down, y=-0.3)).let_go()
-    motion = script.go(moved_base(above(STICK), y=0.2)).motion()
-    further = vkc.Place("stick", lifted(STICK, [0.0, 0.2, 0.0]))
+    script.go(down).take("stick").go(move_base(down, y=-0.3)).let_go()
+    motion = script.go(move_base(solve_above(STICK), y=0.2)).motion()
+    further = vkc.Place("stick", lift(STICK, [0.0, 0.2, 0.0]))
     assert judge(hall(), [PLACED, further], motion).ok
-    assert ("goal", "stick.stick") in names(judge(hall(), [PLACED], motion))
-    assert ("goal", "stick.stick") in names(judge(hall(), [further, PLACED], motion))
+    assert ("goal", "stick.stick") in get_violation_names(judge(hall(), [PLACED], motion))
+    assert ("goal", "stick.stick") in get_violation_names(judge(hall(), [further, PLACED], motion))
     end = vkc.GoTo(*map(float, motion.positions[-1, :2]))
-    undone = only(judge(hall(), [PLACED, end], motion))
+    undone = get_only_violation(judge(hall(), [PLACED, end], motion))
     assert (undone.constraint, undone.subject) == ("order", "step 1")
 
 
 def test_object_must_not_be_moved_before_its_step() -> None:
-    script = carried_over(hall())
-    motion = script.go(moved_base(hall().start, y=1.0)).motion()
+    script = carry_over(hall())
+    motion = script.go(move_base(hall().start, y=1.0)).motion()
     assert judge(hall(), [PLACED, vkc.GoTo(0.0, 1.0)], motion).ok
-    back = carried_over(hall()).motion()
+    back = carry_over(hall()).motion()
     (x, y) = back.positions[-1, :2]
-    assert names(judge(hall(), [vkc.GoTo(float(x), float(y)), PLACED], back)) == {
+    assert get_violation_names(judge(hall(), [vkc.GoTo(float(x), float(y)), PLACED], back)) == {
         ("order", "stick")
     }
 
 
 def test_grasped_object_must_stay_grasped() -> None:
-    motion = carried_over(hall()).motion()
+    motion = carry_over(hall()).motion()
     goto = vkc.GoTo(*map(float, motion.positions[-1, :2]))
     assert judge(hall(), [vkc.Grasp("stick"), vkc.Release(), goto], motion).ok
-    found = only(judge(hall(), [vkc.Grasp("stick"), goto], motion))
+    found = get_only_violation(judge(hall(), [vkc.Grasp("stick"), goto], motion))
     assert (found.constraint, found.subject) == ("goal", "stick")
     assert "not grasped" in found.detail
 
 
 def test_grasp_at_the_end_of_the_motion() -> None:
-    up = above(STICK)
-    motion = Script(hall()).go(up).go(reaching(tool_at(STICK), up)).motion()
+    up = solve_above(STICK)
+    motion = Script(hall()).go(up).go(solve_reach(compute_grasp_pose(STICK), up)).motion()
     grasp, here = vkc.Grasp("stick"), vkc.GoTo(*map(float, motion.positions[-1, :2]))
     for steps in ([grasp], [grasp, grasp], [here, grasp, grasp]):
         assert judge(hall(), steps, motion).ok, steps
-    found = only(judge(hall(), [grasp, grasp, here], motion))
+    found = get_only_violation(judge(hall(), [grasp, grasp, here], motion))
     assert (found.constraint, found.subject) == ("goal", "stick")
 
 
 @cache
 def touch_wall(gap: float = 0.0) -> tuple[Scene, Script, np.ndarray]:
     """Return scene, motion and position of a touch, `gap` [m] in front of a wall."""
-    held = room().with_held({"stick": "grip"})
-    there = moved_base(held.start, y=0.4)
+    held = make_room().with_held({"stick": "grip"})
+    there = move_base(held.start, y=0.4)
     tip = compute_tip_position(held, there)
-    wall = box("wall", [0.3, 0.1, 0.3], tip + np.array([0.0, gap + 0.05, 0.0]))
-    scene = room(wall).with_held({"stick": "grip"})
+    wall = describe_box("wall", [0.3, 0.1, 0.3], tip + np.array([0.0, gap + 0.05, 0.0]))
+    scene = make_room(wall).with_held({"stick": "grip"})
     return scene, Script(scene).go(there).go(np.array(scene.start)), tip
 
 
@@ -364,16 +388,16 @@ def test_touch_permits_contact(gap: float) -> None:
     report = judge_touch(gap, [vkc.Touch("stick.tip", tip)])
     assert report.ok, "\n".join(report.lines())
     unasked = judge_touch(gap, [vkc.GoTo(0.0, 0.4)])
-    assert names(unasked) <= {
+    assert get_violation_names(unasked) <= {
         ("clearance", "stick.tip – wall"),
         ("penetration", "stick.tip – wall"),
     }
-    assert names(unasked)
+    assert get_violation_names(unasked)
 
 
 def test_touch_permits_no_penetration() -> None:
     _, _, tip = touch_wall(-1e-3)
-    found = only(judge_touch(-1e-3, [vkc.Touch("stick.tip", tip)]))
+    found = get_only_violation(judge_touch(-1e-3, [vkc.Touch("stick.tip", tip)]))
     assert (found.constraint, found.subject) == ("penetration", "stick.tip – wall")
     assert found.amount == pytest.approx(1e-3, abs=1e-6)
     assert found.time == pytest.approx(touch_wall(-1e-3)[1].motion().times[20])
@@ -382,13 +406,13 @@ def test_touch_permits_no_penetration() -> None:
 def test_touch_permits_contact_of_its_link_only() -> None:
     _, _, tip = touch_wall(0.0)
     report = judge_touch(-0.03, [vkc.Touch("stick.stick", tip - np.array([0.0, 0.25, 0.0]))])
-    assert ("penetration", "stick.tip – wall") in names(report)
+    assert ("penetration", "stick.tip – wall") in get_violation_names(report)
 
 
 @pytest.mark.parametrize("side", SIDES, ids=str)
 def test_position_error_of_a_touch(side: np.ndarray) -> None:
     _, _, tip = touch_wall(1e-3)
-    found = only(judge_touch(1e-3, [vkc.Touch("stick.tip", tip + 1.5e-3 * side)]))
+    found = get_only_violation(judge_touch(1e-3, [vkc.Touch("stick.tip", tip + 1.5e-3 * side)]))
     assert (found.constraint, found.subject, found.unit) == ("goal", "stick.tip", "m")
     assert found.amount == pytest.approx(0.5e-3, abs=1e-8)
     assert judge_touch(1e-3, [vkc.Touch("stick.tip", tip + 0.9e-3 * side)]).ok
@@ -399,13 +423,13 @@ def test_orientation_error_of_a_touch() -> None:
     looking = pin.SE3(pin.utils.rotate("x", -np.pi / 2), tip)  # z along y, as the stick lies
     assert judge_touch(1e-3, [vkc.Touch("stick.tip", looking)]).ok
     turned = looking * pin.SE3(pin.exp3(np.array([0.0, 0.0, 0.01])), np.zeros(3))
-    found = only(judge_touch(1e-3, [vkc.Touch("stick.tip", turned)]))
+    found = get_only_violation(judge_touch(1e-3, [vkc.Touch("stick.tip", turned)]))
     assert (found.constraint, found.subject, found.unit) == ("goal", "stick.tip", "rad")
     assert found.amount == pytest.approx(9e-3, abs=1e-6)
     far, there, _ = touch_wall(0.1)
     tool = far.with_start(base=there.rows[20][:3]).tool_placement()
     assert judge(far, [vkc.Touch("tool", tool), vkc.GoTo(0.0, 0.0)], there.motion()).ok
-    assert names(
+    assert get_violation_names(
         judge(far, [vkc.Touch("tool", tool * looking), vkc.GoTo(0.0, 0.0)], there.motion())
     ) == {("goal", "tool")}
 
@@ -419,10 +443,10 @@ def test_touch_must_hold_at_a_phase_end() -> None:
 
 def test_free_objects_may_be_touched() -> None:
     beside = pin.SE3(STICK.rotation, BALL.translation - np.array([0.0, 0.285, 0.0]))
-    there = reaching(tool_at(beside), above(STICK))
-    start = moved_base(there, y=-0.1)
+    there = solve_reach(compute_grasp_pose(beside), solve_above(STICK))
+    start = move_base(there, y=-0.1)
     scene = (
-        room(stand(), objects=("stick", "ball"))
+        make_room(describe_stand(), objects=("stick", "ball"))
         .with_held({"stick": "grip"})
         .with_start(base=start[:3], arm=start[3:])
     )
@@ -430,7 +454,7 @@ def test_free_objects_may_be_touched() -> None:
     side = BALL.translation - np.array([0.0, 0.035, 0.0])
     report = judge(scene, [vkc.Touch("stick.tip", side)], motion)
     assert report.ok, "\n".join(report.lines())
-    assert names(judge(scene, [vkc.GoTo(0.0, 0.0)], motion)) & {
+    assert get_violation_names(judge(scene, [vkc.GoTo(0.0, 0.0)], motion)) & {
         ("clearance", "stick.tip – ball.ball"),
         ("penetration", "stick.tip – ball.ball"),
     }
@@ -441,50 +465,51 @@ def test_free_objects_may_be_touched() -> None:
     [(0.01, True), (1e-3, True), (0.0, True), (-5e-5, True), (-2e-4, False), (-1e-3, False)],
 )
 def test_object_may_rest_on_a_table_but_not_penetrate_it(gap: float, ok: bool) -> None:
-    scene = room(table(gap=gap))
-    report = judge(scene, [PLACED], carried_over(scene).motion())
+    scene = make_room(describe_table(gap=gap))
+    report = judge(scene, [PLACED], carry_over(scene).motion())
     assert report.ok == ok, "\n".join(report.lines())
     if not ok:
-        found = only(report)
+        found = get_only_violation(report)
         assert (found.constraint, found.subject) == ("penetration", "stick.stick – table")
         assert found.amount == pytest.approx(-gap, abs=1e-6)
 
 
 def test_only_supports_may_be_close() -> None:
-    down = reaching(tool_at(STICK), above(STICK))
+    down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
     passing = (
         Script(hall())
         .go(down)
         .take("stick")
         .go(np.array(hall().start))
-        .go(moved_base(hall().start, y=1.0))
+        .go(move_base(hall().start, y=1.0))
     )
-    passing.go(moved_base(down, y=1.0)).let_go().go(moved_base(hall().start, y=1.0))
-    motion, steps = passing.motion(), [vkc.Place("stick", lifted(STICK, [0.0, 1.0, 0.0]))]
+    passing.go(move_base(down, y=1.0)).let_go().go(move_base(hall().start, y=1.0))
+    motion, steps = passing.motion(), [vkc.Place("stick", lift(STICK, [0.0, 1.0, 0.0]))]
     assert judge(hall(), steps, motion).ok
-    shelf = box(
+    shelf = describe_box(
         "shelf", [0.1, 0.2, 0.1], [0.8, 0.6, 0.7 - 0.05 - 0.01]
     )  # the discs' lowest points pass at 0.7
-    report = judge(room(table(), shelf), steps, motion)
-    assert names(report) == {("clearance", "stick.stick – shelf")}
-    assert only(report).amount == pytest.approx(0.01 - 1e-3, abs=1e-4)
+    report = judge(make_room(describe_table(), shelf), steps, motion)
+    assert get_violation_names(report) == {("clearance", "stick.stick – shelf")}
+    assert get_only_violation(report).amount == pytest.approx(0.01 - 1e-3, abs=1e-4)
 
 
 def test_neighbour_at_the_grasp_may_be_close_but_not_passed() -> None:
-    fence = box("fence", [0.6, 0.001, 0.1], [0.8, 0.262, 0.56])
-    scene = room(table(), fence)
-    down = reaching(tool_at(STICK), above(STICK))
-    through = Script(scene).go(down).take("stick").go(moved_base(down, y=0.6)).motion()
+    fence = describe_box("fence", [0.6, 0.001, 0.1], [0.8, 0.262, 0.56])
+    scene = make_room(describe_table(), fence)
+    down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
+    through = Script(scene).go(down).take("stick").go(move_base(down, y=0.6)).motion()
     report = judge(scene, [vkc.GoTo(0.0, 0.6)], through)
-    assert {("penetration", "stick.tip – fence"), ("penetration", "stick.stick – fence")} <= names(
-        report
-    )
+    assert {
+        ("penetration", "stick.tip – fence"),
+        ("penetration", "stick.stick – fence"),
+    } <= get_violation_names(report)
     over = (
         Script(scene)
         .go(down)
         .take("stick")
         .go(np.array(scene.start))
-        .go(moved_base(scene.start, y=0.6))
+        .go(move_base(scene.start, y=0.6))
         .motion()
     )
     assert judge(scene, [vkc.GoTo(0.0, 0.6)], over).ok
@@ -494,11 +519,15 @@ def test_grasped_object_must_not_hit_the_floor() -> None:
     hanging = pin.utils.rotate("x", -np.pi / 2)  # the stick's y points down
     heights = (0.3, 0.24)  # of its middle: the tip is 0.25 below
     rows = [
-        reaching(tool_at(pin.SE3(hanging, np.array([0.9, 0.0, z])), values=(0.0, 0.0)))
+        solve_reach(
+            compute_grasp_pose(pin.SE3(hanging, np.array([0.9, 0.0, z])), values=(0.0, 0.0))
+        )
         for z in heights
     ]
-    rows[1] = reaching(tool_at(pin.SE3(hanging, np.array([0.9, 0.0, heights[1]]))), rows[0])
-    scene = room().with_held({"stick": "grip"}).with_start(arm=rows[0][3:])
+    rows[1] = solve_reach(
+        compute_grasp_pose(pin.SE3(hanging, np.array([0.9, 0.0, heights[1]]))), rows[0]
+    )
+    scene = make_room().with_held({"stick": "grip"}).with_start(arm=rows[0][3:])
     motion = Script(scene).go(rows[1]).motion()
     report = judge(scene, [vkc.GoTo(0.0, 0.0)], motion)
     found = next(v for v in report.violations if v.subject.endswith(" – floor"))
@@ -507,7 +536,7 @@ def test_grasped_object_must_not_hit_the_floor() -> None:
     assert found.waypoint == len(motion.times) - 1
     higher = (
         Script(scene)
-        .go(reaching(tool_at(pin.SE3(hanging, np.array([0.9, 0.0, 0.275]))), rows[0]))
+        .go(solve_reach(compute_grasp_pose(pin.SE3(hanging, np.array([0.9, 0.0, 0.275]))), rows[0]))
         .motion()
     )
     assert not {
@@ -518,38 +547,40 @@ def test_grasped_object_must_not_hit_the_floor() -> None:
 
 
 def test_grasped_object_must_not_hit_the_robot() -> None:
-    scene = room().with_held({"stick": "grip"})
+    scene = make_room().with_held({"stick": "grip"})
     bent = np.array(scene.start)
     bent[6] -= 2.36  # the wrist, so that the dowel comes back to the forearm
     report = judge(scene, [vkc.GoTo(0.0, 0.0)], Script(scene).go(bent).motion())
-    assert names(report) == {("penetration", "forearm_link – stick.stick")}
+    assert get_violation_names(report) == {("penetration", "forearm_link – stick.stick")}
     assert judge(
-        room(), [vkc.GoTo(0.0, 0.0)], Script(room()).go(bent).motion()
+        make_room(), [vkc.GoTo(0.0, 0.0)], Script(make_room()).go(bent).motion()
     ).ok  # the robot alone
 
 
 def test_grasped_object_must_not_hit_free_objects() -> None:
-    scene = room(stand(), objects=("stick", "ball")).with_held({"stick": "grip"})
-    start = reaching(
-        tool_at(pin.SE3(STICK.rotation, BALL.translation - np.array([0.0, 0.4, 0.0]))), above(STICK)
+    scene = make_room(describe_stand(), objects=("stick", "ball")).with_held({"stick": "grip"})
+    start = solve_reach(
+        compute_grasp_pose(pin.SE3(STICK.rotation, BALL.translation - np.array([0.0, 0.4, 0.0]))),
+        solve_above(STICK),
     )
     scene = scene.with_start(arm=start[3:])
     for forward, constraint in ((0.08, None), (0.1, "clearance"), (0.125, "penetration")):
-        motion = Script(scene).go(moved_base(start, y=forward)).motion()
+        motion = Script(scene).go(move_base(start, y=forward)).motion()
         report = judge(scene, [vkc.GoTo(0.0, forward)], motion)
-        assert names(report) == (
+        assert get_violation_names(report) == (
             {(constraint, "stick.tip – ball.ball")} if constraint else set()
         ), "\n".join(report.lines())
 
 
 def test_fingers_must_not_penetrate_the_grasped_object() -> None:
     """The grasp lies 3 cm deeper in the hand, so that the palm overlaps the stick."""
-    deep = with_grasp(hall(), "stick", "grip", standoff=-0.03)
-    up = reaching(
-        tool_at(lifted(STICK)) * pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.04])), above(STICK)
+    deep = replace_grasp(hall(), "stick", "grip", standoff=-0.03)
+    up = solve_reach(
+        compute_grasp_pose(lift(STICK)) * pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.04])),
+        solve_above(STICK),
     )
     scene = deep.with_held({"stick": "grip"}).with_start(arm=up[3:])
-    report = judge(scene, [vkc.GoTo(0.0, 0.3)], Script(scene).go(moved_base(up, y=0.3)).motion())
+    report = judge(scene, [vkc.GoTo(0.0, 0.3)], Script(scene).go(move_base(up, y=0.3)).motion())
     assert {v.constraint for v in report.violations} == {"penetration"}
     assert {v.subject.split(" – ")[0] for v in report.violations} <= set(hall().robot.touch_links)
     assert {v.subject.split(" – ")[1] for v in report.violations} == {"stick.stick"}
@@ -558,25 +589,27 @@ def test_fingers_must_not_penetrate_the_grasped_object() -> None:
 @cache
 def fetch_ball(off: float = 0.0) -> Script:
     """Bring the tip to `off` [m] before the ball, and carry the ball to the second stand."""
-    scene = room(stand(), stand("stand_2", aside=0.3), objects=("stick", "ball"))
+    scene = make_room(
+        describe_stand(), describe_stand("stand_2", aside=0.3), objects=("stick", "ball")
+    )
     beside = pin.SE3(STICK.rotation, BALL.translation - np.array([0.0, 0.285 + off, 0.0]))
-    touch = reaching(tool_at(beside), above(STICK))
-    up = reaching(tool_at(lifted(beside, UP / 4)), touch)
-    start = moved_base(touch, y=-0.1)
+    touch = solve_reach(compute_grasp_pose(beside), solve_above(STICK))
+    up = solve_reach(compute_grasp_pose(lift(beside, UP / 4)), touch)
+    start = move_base(touch, y=-0.1)
     scene = scene.with_held({"stick": "grip"}).with_start(base=start[:3], arm=start[3:])
     script = (
         Script(scene).go(touch).take("ball", "pull", (np.pi / 2, 0.0, 0.0), by="stick.tip").go(up)
     )
-    script.go(moved_base(up, y=0.3)).go(moved_base(touch, y=0.3)).let_go("ball")
-    return script.go(moved_base(touch, y=0.26))
+    script.go(move_base(up, y=0.3)).go(move_base(touch, y=0.3)).let_go("ball")
+    return script.go(move_base(touch, y=0.26))
 
 
-FETCHED = vkc.Place("ball", lifted(BALL, [0.0, 0.3, 0.0]))
+FETCHED = vkc.Place("ball", lift(BALL, [0.0, 0.3, 0.0]))
 
 
 def test_position_error_of_a_grasp_by_a_tool() -> None:
     report = judge(fetch_ball(2e-3).scene, [FETCHED], fetch_ball(2e-3).motion())
-    found = only(report)
+    found = get_only_violation(report)
     assert (found.constraint, found.subject, found.unit) == ("closure", "ball.pull", "m")
     assert found.amount == pytest.approx(1e-3, abs=1e-8)
     grasped = judge(
@@ -584,15 +617,15 @@ def test_position_error_of_a_grasp_by_a_tool() -> None:
         [vkc.Grasp("ball", "pull", "stick.tip"), FETCHED],
         fetch_ball(2e-3).motion(),
     )
-    assert ("goal", "ball.pull") in names(grasped)
+    assert ("goal", "ball.pull") in get_violation_names(grasped)
     by_hand = judge(fetch_ball().scene, [vkc.Grasp("ball", "pull"), FETCHED], fetch_ball().motion())
-    assert ("goal", "ball.pull") in names(by_hand)  # the hand itself never was there
+    assert ("goal", "ball.pull") in get_violation_names(by_hand)  # the hand itself never was there
 
 
 def test_tool_must_not_penetrate_what_it_grasps() -> None:
     assert judge(fetch_ball(-5e-5).scene, [FETCHED], fetch_ball(-5e-5).motion()).ok
     report = judge(fetch_ball(-5e-4).scene, [FETCHED], fetch_ball(-5e-4).motion())
-    assert names(report) == {("penetration", "stick.tip – ball.ball")}
+    assert get_violation_names(report) == {("penetration", "stick.tip – ball.ball")}
 
 
 def test_object_grasped_by_a_tool_requires_the_tool() -> None:
@@ -620,12 +653,12 @@ def test_object_grasped_by_a_tool_requires_the_tool() -> None:
 )
 def test_steps_with_unknown_names_are_refused(step: object, field: str, nearest: str) -> None:
     with pytest.raises(UnknownNameError) as caught:
-        judge(hall(), [step], carried_over(hall()).motion())
+        judge(hall(), [step], carry_over(hall()).motion())
     assert (caught.value.field, caught.value.nearest) == (field, nearest)
 
 
 def test_trajectories_with_missing_columns_or_frames_are_refused() -> None:
-    full = carried_over(hall()).motion()
+    full = carry_over(hall()).motion()
     names_without = tuple(name for name in full.names if name != "stick.grip_slide")
     kept = [full.names.index(name) for name in names_without]
     lacking = Trajectory(

@@ -14,21 +14,21 @@ from helpers.carrying import (
     STICK,
     TOP,
     Script,
-    above,
-    box,
-    moved_base,
-    reaching,
-    room,
-    stand,
-    table,
-    tool_at,
-    with_object,
+    compute_grasp_pose,
+    describe_box,
+    describe_stand,
+    describe_table,
+    make_room,
+    move_base,
+    place_object,
+    solve_above,
+    solve_reach,
 )
-from helpers.drawers import changed, drawer_scene, with_boxes
-from helpers.drives import of_rows, through
-from helpers.grippers import between_cheeks, write_gripper
-from helpers.riding import plates, slid
-from helpers.small_problems import door_scene
+from helpers.drawers import add_boxes, load_drawer_scene, replace_drawer_fields
+from helpers.drives import drive_through, make_trajectory
+from helpers.grippers import write_cheeks_scene, write_gripper
+from helpers.riding import make_plate_scene, slide_plate
+from helpers.small_problems import load_door_scene
 
 from vkc_pin.options import Options
 from vkc_pin.validation.contact_windows import check_gripper, find_contact_windows
@@ -43,7 +43,7 @@ from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 STEPS = 4  # moving time steps in a window
-HANDS = set(door_scene().robot.touch_links)
+HANDS = set(load_door_scene().robot.touch_links)
 
 
 def find_windows(
@@ -72,7 +72,7 @@ def find_windows(
 
 
 def stand_still(scene: Scene) -> Trajectory:
-    return of_rows(scene, np.tile(scene.start, (11, 1)))
+    return make_trajectory(scene, np.tile(scene.start, (11, 1)))
 
 
 DOOR, TIP = ("door.frame", "door.panel"), ("stick.tip",)
@@ -90,7 +90,7 @@ def expect_hand_windows(
 
 
 def test_windows_of_a_grasp() -> None:
-    door = door_scene()
+    door = load_door_scene()
     assert find_windows(door, stand_still(door)) == {}
     assert (
         find_windows(door, stand_still(door), [Actuate("door", {"hinge": 1.0})]) == {}
@@ -99,7 +99,7 @@ def test_windows_of_a_grasp() -> None:
         door.with_held({"door": "handle"}), stand_still(door)
     ) == expect_hand_windows("door.lever", (0, 10), (0, 0), DOOR)  # let go of at once
     motion, hold = (
-        through(door, door.start, moved_base(door.start, y=0.3)),
+        drive_through(door, door.start, move_base(door.start, y=0.3)),
         (Hold("door", "handle"),),
     )
     spans = (PhaseSpan("reach", 0, 15), PhaseSpan("hold", 15, 30, hold), PhaseSpan("leave", 30, 40))
@@ -110,8 +110,12 @@ def test_windows_of_a_grasp() -> None:
 
 
 def test_windows_of_a_grasp_step_without_hold() -> None:
-    scene = room(table())
-    there = Script(scene).go(reaching(tool_at(STICK), above(STICK))).go(np.array(scene.start))
+    scene = make_room(describe_table())
+    there = (
+        Script(scene)
+        .go(solve_reach(compute_grasp_pose(STICK), solve_above(STICK)))
+        .go(np.array(scene.start))
+    )
     assert find_windows(scene, there.motion()) == {}
     assert find_windows(scene, there.motion(), [Grasp("stick")]) == expect_hand_windows(
         "stick.stick", (20 - STEPS, 20 + STEPS), others=TIP
@@ -120,7 +124,7 @@ def test_windows_of_a_grasp_step_without_hold() -> None:
 
 @pytest.mark.parametrize(("attachment", "rigid"), [("handle", True), ("handle_free", False)])
 def test_only_rigid_grasps_move_together(attachment: str, rigid: bool) -> None:
-    scene = door_scene().with_held({"door": attachment})
+    scene = load_door_scene().with_held({"door": attachment})
     freedoms = scene.objects["door"].object.attachment(attachment).coordinates
     names = (*scene.robot.coordinates.names, *(f"door.{name}" for name in freedoms))
     rows = np.column_stack([np.tile(scene.start, (2, 1)), np.zeros((2, len(names) - 9))])
@@ -141,28 +145,28 @@ def test_only_rigid_grasps_move_together(attachment: str, rigid: bool) -> None:
 
 
 def carry_stick(scene: Scene, *, aside: float = 0.5) -> Script:
-    down = reaching(tool_at(STICK), above(STICK))
+    down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
     script = (
         Script(scene)
         .go(down)
         .take("stick")
         .go(np.array(scene.start))
-        .go(moved_base(scene.start, y=aside))
+        .go(move_base(scene.start, y=aside))
     )
-    return script.go(moved_base(down, y=aside)).let_go().go(moved_base(scene.start, y=aside))
+    return script.go(move_base(down, y=aside)).let_go().go(move_base(scene.start, y=aside))
 
 
 def test_windows_of_a_carried_object_with_its_supports() -> None:
-    short = box("board", [0.5, 0.6, 0.02], [0.8, 0.0, TOP - 0.011])
-    other = box("other", [0.5, 0.6, 0.02], [0.8, 1.0, TOP - 0.011])
-    between = box(
+    short = describe_box("board", [0.5, 0.6, 0.02], [0.8, 0.0, TOP - 0.011])
+    other = describe_box("other", [0.5, 0.6, 0.02], [0.8, 1.0, TOP - 0.011])
+    between = describe_box(
         "between", [0.3, 0.1, 0.05], [0.8, 0.5, TOP + 0.125]
     )  # 5 cm below the discs when they pass
     beside, far = (
-        box("near", [0.02, 0.1, 0.1], [0.875, 0.0, TOP + 0.05]),
-        box("far", [0.02, 0.1, 0.1], [0.885, 0.0, TOP + 0.05]),
+        describe_box("near", [0.02, 0.1, 0.1], [0.875, 0.0, TOP + 0.05]),
+        describe_box("far", [0.02, 0.1, 0.1], [0.885, 0.0, TOP + 0.05]),
     )
-    scene = room(short, other, between, beside, far)
+    scene = make_room(short, other, between, beside, far)
     taken, left = (20, 20 + STEPS), (80 - STEPS, 80)
     assert find_windows(scene, carry_stick(scene, aside=1.0).motion(), dist_safe=0.055) == {
         **expect_hand_windows("stick.stick", (20 - STEPS, 80 + STEPS), (20, 80), TIP),
@@ -185,18 +189,18 @@ def test_windows_of_a_carried_object_with_its_supports() -> None:
 
 
 def test_windows_of_an_object_grasped_at_the_start() -> None:
-    scene = room(table()).with_held({"stick": "grip"})
-    low = scene.with_start(arm=reaching(tool_at(STICK), above(STICK))[3:])
-    drive = Script(low).go(moved_base(low.start, y=0.3)).motion()
+    scene = make_room(describe_table()).with_held({"stick": "grip"})
+    low = scene.with_start(arm=solve_reach(compute_grasp_pose(STICK), solve_above(STICK))[3:])
+    drive = Script(low).go(move_base(low.start, y=0.3)).motion()
     assert find_windows(low, drive) == {
         **expect_hand_windows("stick.stick", (0, 20), others=TIP),
         ("stick.stick", "table"): [(0, STEPS)],
     }
     left = (
         Script(low)
-        .go(moved_base(low.start, y=0.3))
+        .go(move_base(low.start, y=0.3))
         .let_go()
-        .go(moved_base(low.start, y=0.3, x=-0.1))
+        .go(move_base(low.start, y=0.3, x=-0.1))
         .motion()
     )
     assert find_windows(low, left) == {
@@ -226,8 +230,10 @@ def test_windows_of_clearance_exemptions(
 ) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        side = with_boxes(drawer_scene(), side=((0.4, 0.1, 0.9), (2.085, 0.295 + gap + 0.05, 0.45)))
-        scene = changed(side, allow=allow).with_state("drawer", {"slide": 0.3})
+        side = add_boxes(
+            load_drawer_scene(), side=((0.4, 0.1, 0.9), (2.085, 0.295 + gap + 0.05, 0.45))
+        )
+        scene = replace_drawer_fields(side, allow=allow).with_state("drawer", {"slide": 0.3})
     slide = np.array([0.3, 0.1, 0.03, 0.0, 0.0, 0.0, 0.03, 0.1, 0.3])
     rows = np.column_stack([np.tile(scene.start, (9, 1)), slide])
     motion = Trajectory(
@@ -257,8 +263,8 @@ def test_windows_of_clearance_exemptions(
 def test_initial_penetration_is_exempt_once() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        scene = room(table(gap=-0.002))
-    down, up = reaching(tool_at(STICK), above(STICK)), np.array(scene.start)
+        scene = make_room(describe_table(gap=-0.002))
+    down, up = solve_reach(compute_grasp_pose(STICK), solve_above(STICK)), np.array(scene.start)
     script = (
         Script(scene)
         .go(down)
@@ -292,11 +298,11 @@ def test_initial_penetration_is_exempt_once() -> None:
 
 
 def test_windows_of_a_grasp_by_a_tool() -> None:
-    scene = room(stand(), objects=("stick", "ball")).with_held({"stick": "grip"})
+    scene = make_room(describe_stand(), objects=("stick", "ball")).with_held({"stick": "grip"})
     script = (
         Script(scene)
         .take("ball", "pull", (0.0, 0.0, 0.0), by="stick.tip")
-        .go(moved_base(scene.start, y=0.5))
+        .go(move_base(scene.start, y=0.5))
     )
     found = find_windows(scene, script.motion())
     assert found == {
@@ -307,15 +313,17 @@ def test_windows_of_a_grasp_by_a_tool() -> None:
 
 
 def test_windows_of_a_touch() -> None:
-    wall = box("wall", [0.3, 0.1, 0.3], [0.8, 0.95, 0.75])  # its near side is at y = 0.9
-    scene = room(table(), wall).with_held({"stick": "grip"})
+    wall = describe_box("wall", [0.3, 0.1, 0.3], [0.8, 0.95, 0.75])  # its near side is at y = 0.9
+    scene = make_room(describe_table(), wall).with_held({"stick": "grip"})
     tip = scene.objects["stick"].link_placement("tip").translation
     for gap, touches in ((0.0, True), (0.019, True), (0.021, False), (-0.05, True)):
         aside = 0.9 - gap - tip[1]
         there = Script(
-            room(table(), {**wall, "position": [tip[0], 0.95, tip[2]]}).with_held({"stick": "grip"})
+            make_room(describe_table(), {**wall, "position": [tip[0], 0.95, tip[2]]}).with_held(
+                {"stick": "grip"}
+            )
         )
-        there.go(moved_base(scene.start, y=aside)).go(np.array(scene.start))
+        there.go(move_base(scene.start, y=aside)).go(np.array(scene.start))
         target = tip + np.array([0.0, aside, 0.0])
         for goal in (tuple(target), pin.SE3(np.eye(3), target)):
             found = find_windows(there.scene, there.motion(), [Touch("stick.tip", goal)])
@@ -327,7 +335,9 @@ def test_windows_of_a_touch() -> None:
 
 
 def test_supported_objects_move_with_their_support() -> None:
-    found = find_windows(plates(cups=2, wall=0.01), slid(plates(cups=2, wall=0.01), 0.3))
+    found = find_windows(
+        make_plate_scene(cups=2, wall=0.01), slide_plate(make_plate_scene(cups=2, wall=0.01), 0.3)
+    )
     assert {pair: at for pair, at in found.items() if pair[0] not in HANDS} == {
         ("plate.plate", "cup.cup"): [(0, STEPS), (0, 30)],
         ("plate.plate", "cup_1.cup"): [(0, STEPS), (0, 30)],
@@ -343,22 +353,24 @@ def test_supported_objects_move_with_their_support() -> None:
 def test_gripper_must_be_open_as_required(
     tmp_path: Path, openings: tuple[float | None, ...], told: int
 ) -> None:
-    scene = between_cheeks(write_gripper(tmp_path / "mine"), opening=0.04, start=0.04)
+    scene = write_cheeks_scene(write_gripper(tmp_path / "mine"), opening=0.04, start=0.04)
     rows, hold = np.tile(scene.start, (61, 1)), (Hold("drawer", "grip"),)
     spans = [("reach", 0, 20, ()), ("move", 20, 40, hold), ("release", 40, 60, ())]
     phases = tuple(PhaseSpan(*span, opening) for span, opening in zip(spans, openings, strict=True))
-    found = list(check_gripper(Samples(scene, of_rows(scene, rows, phases=phases)), Options()))
+    found = list(
+        check_gripper(Samples(scene, make_trajectory(scene, rows, phases=phases)), Options())
+    )
     assert [(one.constraint, one.subject) for one in found] == [("opening", "drawer.grip")] * told
 
 
 def test_windows_of_a_touch_of_a_free_object() -> None:
-    scene = room(table(), objects=("stick", "ball")).with_held({"stick": "grip"})
+    scene = make_room(describe_table(), objects=("stick", "ball")).with_held({"stick": "grip"})
     tip = scene.objects["stick"].link_placement("tip").translation
-    beside = with_object(scene, "ball", pin.SE3(np.eye(3), tip + np.array([0.0, 0.035, 0.0])))
+    beside = place_object(scene, "ball", pin.SE3(np.eye(3), tip + np.array([0.0, 0.035, 0.0])))
     for there, touched in ((beside, True), (scene, False)):
         script = (
             Script(there)
-            .go(moved_base(there.start, x=-0.1), steps=2 * STEPS)
+            .go(move_base(there.start, x=-0.1), steps=2 * STEPS)
             .go(there.start, steps=2 * STEPS)
         )
         found = find_windows(there, script.motion(), [Touch("stick.tip", tuple(tip))]).get(
@@ -375,9 +387,9 @@ def test_windows_of_a_touch_of_a_free_object() -> None:
 
 @pytest.mark.parametrize(("dt", "last"), [(0.25, 4), (1.0, 4), (0.125, 8)])
 def test_window_lasts_a_second_or_as_many_moving_steps(dt: float, last: int) -> None:
-    scene = room(table()).with_held({"stick": "grip"})
-    low = scene.with_start(arm=reaching(tool_at(STICK), above(STICK))[3:])
-    there, pair = moved_base(low.start, y=0.3), ("stick.stick", "table")
+    scene = make_room(describe_table()).with_held({"stick": "grip"})
+    low = scene.with_start(arm=solve_reach(compute_grasp_pose(STICK), solve_above(STICK))[3:])
+    there, pair = move_base(low.start, y=0.3), ("stick.stick", "table")
     assert find_windows(low, Script(low).go(there).motion(dt=dt))[pair] == [(0, last)]
     if dt == 1.0:  # two steps in which nothing moves do not count
         assert find_windows(low, Script(low).wait().go(there).motion(dt=dt))[pair] == [(0, 6)]
@@ -396,7 +408,7 @@ def test_window_lasts_a_second_or_as_many_moving_steps(dt: float, last: int) -> 
 )
 def test_robot_must_rest_where_it_grasps(way: list[float], rest: float) -> None:
     """The door may move meanwhile."""
-    scene, hold = door_scene(), (Hold("door", "handle"),)
+    scene, hold = load_door_scene(), (Hold("door", "handle"),)
     rows = np.column_stack([np.tile(scene.start, (7, 1)), 0.01 * np.arange(7), np.zeros(7)])
     rows[:, 0] += 0.01 * np.array(way)
     names = (*scene.robot.coordinates.names, "door.hinge", "door.knob")
@@ -414,11 +426,11 @@ def test_robot_must_rest_where_it_grasps(way: list[float], rest: float) -> None:
 )
 def test_robot_must_rest_while_fingers_move(tmp_path: Path, way: list[float], rest: float) -> None:
     """Fingers begin to move where the phase begins."""
-    scene = between_cheeks(write_gripper(tmp_path / "mine"), start=0.05)
+    scene = write_cheeks_scene(write_gripper(tmp_path / "mine"), start=0.05)
     rows = np.tile(scene.start, (7, 1))
     rows[:, 0] += 0.01 * np.array(way)
     phases = (PhaseSpan("one", 0, 3, (), 0.05), PhaseSpan("two", 3, 6, (), 0.02))
-    motion = of_rows(scene, rows, dt=1.0, phases=phases)
+    motion = make_trajectory(scene, rows, dt=1.0, phases=phases)
     found = list(check_gripper(Samples(scene, motion), Options(grasp_time=2.0)))
     assert [(one.subject, one.amount) for one in found] == (
         [("gripper", pytest.approx(2.0))] if rest < 2.0 else []

@@ -9,7 +9,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.small_problems import full_scene, random_configurations
+from helpers.small_problems import make_full_scene, sample_configurations
 
 from vkc_pin.validation.distances import POINT_RADIUS, CollisionShapes
 from vkc_pin.world.models.shapes import compute_shape_distance
@@ -20,13 +20,13 @@ COAL = 1e-5  # [m]
 
 @cache
 def make_shapes() -> CollisionShapes:
-    return CollisionShapes(World(full_scene()))
+    return CollisionShapes(World(make_full_scene()))
 
 
 def sample_configuration(seed: int) -> np.ndarray:
     world, rng = make_shapes().world, np.random.default_rng(seed)
     lower, upper = (np.full(world.coordinates.size, limit) for limit in (-1.0, 1.0))
-    return np.asarray(world.coordinates.q(random_configurations(lower, upper, 1, rng)[0]))
+    return np.asarray(world.coordinates.q(sample_configurations(lower, upper, 1, rng)[0]))
 
 
 def place_shapes(q: np.ndarray) -> list[pin.SE3]:

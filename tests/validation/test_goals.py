@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.drives import hall, moved, through
-from helpers.executions import holding, still
-from helpers.judging import names, only, until_the_grasp, with_object
+from helpers.drives import drive_through, make_hall, move_start
+from helpers.executions import make_grasping_scene, make_stationary_motion
+from helpers.judging import cut_at_grasp, get_only_violation, get_violation_names, replace_object
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
@@ -20,13 +20,13 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 @pytest.fixture(scope="module")
 def empty() -> Scene:
-    return hall()
+    return make_hall()
 
 
 @pytest.fixture(scope="module")
 def drive(empty: Scene) -> Trajectory:
     """Two metres ahead and a quarter turn."""
-    return through(empty, empty.start, moved(empty.start, x=2.0, yaw=np.pi / 2))
+    return drive_through(empty, empty.start, move_start(empty.start, x=2.0, yaw=np.pi / 2))
 
 
 ARRIVED = vkc.GoTo(2.0, 0.0, np.pi / 2)
@@ -34,14 +34,16 @@ ARRIVED = vkc.GoTo(2.0, 0.0, np.pi / 2)
 
 def test_goal_of_an_object_joint(door_plan: vkc.Plan) -> None:
     steps = [vkc.Actuate("door", {"hinge": 1.25})]
-    found = only(validate(door_plan.scene, steps, door_plan.trajectory, door_plan.options))
+    found = get_only_violation(
+        validate(door_plan.scene, steps, door_plan.trajectory, door_plan.options)
+    )
     assert (found.constraint, found.subject, found.unit) == ("goal", "door.hinge", "rad")
     assert found.waypoint == len(door_plan.trajectory.times) - 1
     assert found.amount == pytest.approx(0.05 - vkc.Tolerances().goal_angle, abs=1e-6)
 
 
 def test_goal_of_a_grasp(door_plan: vkc.Plan) -> None:
-    motion = until_the_grasp(door_plan)
+    motion = cut_at_grasp(door_plan)
     loose = dataclasses.replace(door_plan.options)
     for step in (vkc.Grasp("door"), vkc.Grasp("door", "handle"), vkc.Grasp("door", "handle_free")):
         report = validate(door_plan.scene, [step], motion, loose)
@@ -49,7 +51,7 @@ def test_goal_of_a_grasp(door_plan: vkc.Plan) -> None:
             report.lines()
         )
     here = door_plan.scene.objects["door"].placement
-    away = with_object(
+    away = replace_object(
         door_plan.scene,
         placement=pin.SE3(here.rotation, here.translation + np.array([0.0, 0.0, 0.003])),
     )
@@ -76,7 +78,7 @@ def test_grasp_without_attachment_may_use_any(door_plan: vkc.Plan) -> None:
         "decoy": dataclasses.replace(grasps["handle"], name="decoy", placement=elsewhere),
         **grasps,
     }
-    scene = with_object(door_plan.scene, attachments=first)
+    scene = replace_object(door_plan.scene, attachments=first)
     steps = [vkc.Grasp("door"), *door_plan.steps]
     assert validate(scene, steps, door_plan.trajectory, door_plan.options).ok
     steps = [vkc.Grasp("door", "decoy"), *door_plan.steps]
@@ -99,11 +101,11 @@ def test_goal_of_a_reach(empty: Scene, drive: Trajectory, frame: str | None) -> 
     pose = compute_final_placement(empty, drive, name)
     assert validate(empty, [vkc.Reach(pose, frame)], drive).ok
     beside = pin.SE3(pose.rotation, pose.translation + np.array([0.0, 0.003, 0.004]))
-    found = only(validate(empty, [vkc.Reach(beside, frame)], drive))
+    found = get_only_violation(validate(empty, [vkc.Reach(beside, frame)], drive))
     assert (found.constraint, found.subject, found.waypoint, found.unit) == ("goal", name, 40, "m")
     assert found.amount == pytest.approx(0.005 - 1e-3)
     turned = pose * pin.SE3(pin.exp3(np.array([0.0, 0.01, 0.0])), np.zeros(3))
-    found = only(validate(empty, [vkc.Reach(turned, frame)], drive))
+    found = get_only_violation(validate(empty, [vkc.Reach(turned, frame)], drive))
     assert (found.constraint, found.subject, found.waypoint, found.unit) == (
         "goal",
         name,
@@ -112,13 +114,13 @@ def test_goal_of_a_reach(empty: Scene, drive: Trajectory, frame: str | None) -> 
     )
     assert found.amount == pytest.approx(0.01 - 1e-3)
     half_round = pose * pin.SE3(pin.exp3(np.array([np.pi, 0.0, 0.0])), np.zeros(3))
-    assert only(validate(empty, [vkc.Reach(half_round, frame)], drive)).amount == pytest.approx(
-        np.pi - 1e-3, abs=1e-6
-    )
+    assert get_only_violation(
+        validate(empty, [vkc.Reach(half_round, frame)], drive)
+    ).amount == pytest.approx(np.pi - 1e-3, abs=1e-6)
 
 
 def test_goal_of_a_drive(empty: Scene, drive: Trajectory) -> None:
-    found = only(validate(empty, [vkc.GoTo(2.003, 0.004, np.pi / 2)], drive))
+    found = get_only_violation(validate(empty, [vkc.GoTo(2.003, 0.004, np.pi / 2)], drive))
     assert (found.constraint, found.subject, found.waypoint, found.unit) == (
         "goal",
         "base",
@@ -126,7 +128,9 @@ def test_goal_of_a_drive(empty: Scene, drive: Trajectory) -> None:
         "m",
     )
     assert found.amount == pytest.approx(0.005 - 1e-3)
-    found = only(validate(empty, [vkc.GoTo(2.0, 0.0, np.pi / 2 + 2 * np.pi - 0.02)], drive))
+    found = get_only_violation(
+        validate(empty, [vkc.GoTo(2.0, 0.0, np.pi / 2 + 2 * np.pi - 0.02)], drive)
+    )
     assert (found.constraint, found.subject, found.waypoint, found.unit) == (
         "goal",
         "base heading",
@@ -137,21 +141,25 @@ def test_goal_of_a_drive(empty: Scene, drive: Trajectory) -> None:
 
 
 def test_goals_must_hold_in_order_at_phase_ends(empty: Scene) -> None:
-    one, two = moved(empty.start, x=1.0), moved(empty.start, x=1.0, y=1.0)
-    motion = through(empty, empty.start, one, two)
+    one, two = move_start(empty.start, x=1.0), move_start(empty.start, x=1.0, y=1.0)
+    motion = drive_through(empty, empty.start, one, two)
     first, second = vkc.GoTo(1.0, 0.0), vkc.GoTo(1.0, 1.0)
     assert validate(empty, [first, second], motion).ok
-    found = only(validate(empty, [second, first], motion))
+    found = get_only_violation(validate(empty, [second, first], motion))
     assert (found.constraint, found.subject) == ("goal", "base")
     assert found.amount == pytest.approx(1.0 - 1e-3)
-    assert ("goal", "base") in names(
+    assert ("goal", "base") in get_violation_names(
         validate(empty, [vkc.GoTo(0.5, 0.0), second], motion)
     )  # passed, but not at an end
-    assert names(validate(empty, [first], motion)) == {("goal", "base")}  # it does not stay there
-    further = through(empty, empty.start, one, two, empty.start)
+    assert get_violation_names(validate(empty, [first], motion)) == {
+        ("goal", "base")
+    }  # it does not stay there
+    further = drive_through(empty, empty.start, one, two, empty.start)
     home = vkc.GoTo(0.0, 0.0)
     assert validate(empty, [first, second, home], further).ok
-    assert names(validate(empty, [second, first, home], further)) == {("goal", "base")}
+    assert get_violation_names(validate(empty, [second, first, home], further)) == {
+        ("goal", "base")
+    }
 
 
 def test_object_must_not_move_before_its_step(door_plan: vkc.Plan) -> None:
@@ -159,7 +167,7 @@ def test_object_must_not_move_before_its_step(door_plan: vkc.Plan) -> None:
     x, y, yaw = door_plan.trajectory.positions[-1, :3]
     there, open_it = vkc.GoTo(x, y, yaw), door_plan.steps[0]
     assert validate(door_plan.scene, [open_it, there], door_plan.trajectory, door_plan.options).ok
-    found = only(
+    found = get_only_violation(
         validate(door_plan.scene, [there, open_it], door_plan.trajectory, door_plan.options)
     )
     assert (found.constraint, found.subject) == ("order", "door")
@@ -205,7 +213,11 @@ def test_steps_must_be_a_list_of_steps(door_plan: vkc.Plan) -> None:
 
 
 def test_release_requires_an_empty_hand() -> None:
-    found = only(validate(holding(), [vkc.Release()], still(holding())))
+    found = get_only_violation(
+        validate(
+            make_grasping_scene(), [vkc.Release()], make_stationary_motion(make_grasping_scene())
+        )
+    )
     assert (found.constraint, found.subject, found.amount, found.unit) == (
         "goal",
         "stick",

@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers.carrying import Script, moved_base, room, stand, table
-from helpers.motions import pair_names, wander
-from helpers.small_problems import door_scene, full_scene, program_of
+from helpers.carrying import Script, describe_stand, describe_table, make_room, move_base
+from helpers.motions import get_pair_names, make_random_door_motion
+from helpers.small_problems import load_door_scene, make_full_scene, make_program
 
 from vkc_pin.options import Options
 from vkc_pin.validation.contact_windows import Window
@@ -26,11 +26,11 @@ from vkc_pin.world.trajectory.world_model import World
 
 @pytest.fixture(scope="module")
 def door() -> Scene:
-    return door_scene()
+    return load_door_scene()
 
 
 def test_pairs_of_robot_objects_and_walls(door: Scene) -> None:
-    motion = wander(door, 0, size=0.1)
+    motion = make_random_door_motion(door, 0, size=0.1)
     table = PairTable(door, CollisionShapes(World(door)), motion, 0.02)
     robot, things = door.robot.collision, door.objects["door"].object.collision.geometryObjects
     walls = [label for label in door.obstacle_labels if label != FLOOR]
@@ -48,7 +48,7 @@ def test_pairs_of_robot_objects_and_walls(door: Scene) -> None:
 
 
 def test_windows_change_margin_and_contact_of_their_pairs(door: Scene) -> None:
-    motion = wander(door, 0, size=0.1)
+    motion = make_random_door_motion(door, 0, size=0.1)
     plain = PairTable(door, CollisionShapes(World(door)), motion, 0.02)
     every = np.arange(len(plain.pairs))
     first, second = plain.pairs[[3]], plain.pairs[[3, 70]]
@@ -74,7 +74,7 @@ def test_windows_change_margin_and_contact_of_their_pairs(door: Scene) -> None:
 
 
 def test_windows_of_unlisted_pairs_have_no_effect(door: Scene) -> None:
-    motion = wander(door, 0, size=0.1)
+    motion = make_random_door_motion(door, 0, size=0.1)
     plain = PairTable(door, CollisionShapes(World(door)), motion, 0.02)
     known, count = {(min(pair), max(pair)) for pair in plain.pairs.tolist()}, len(plain.groups)
     absent = np.array(
@@ -94,7 +94,7 @@ def test_windows_of_unlisted_pairs_have_no_effect(door: Scene) -> None:
 
 
 def test_links_that_never_move_are_not_paired_with_obstacles() -> None:
-    scene = full_scene()
+    scene = make_full_scene()
     names = (*scene.robot.coordinates.names, "cabinet.slide", "cabinet.swing")
     positions = np.vstack(
         [np.concatenate([scene.start, values]) for values in ([0.1, 0.3], [0.11, 0.31])]
@@ -117,14 +117,14 @@ def test_links_that_never_move_are_not_paired_with_obstacles() -> None:
 
 
 def test_pairs_of_free_objects() -> None:
-    scene = room(table(), stand(), objects=("stick", "ball"))
-    still = Script(scene).go(moved_base(scene.start, y=0.1)).motion()
-    carried = Script(scene).take("stick").go(moved_base(scene.start, y=0.1)).motion()
+    scene = make_room(describe_table(), describe_stand(), objects=("stick", "ball"))
+    still = Script(scene).go(move_base(scene.start, y=0.1)).motion()
+    carried = Script(scene).take("stick").go(move_base(scene.start, y=0.1)).motion()
 
     def paired(motion: Trajectory) -> dict[str, set[str]]:
         found = PairTable(scene, CollisionShapes(World(scene)), motion, 0.02)
         names: dict[str, set[str]] = {}
-        for first, second in (pair_names(found, k) for k in range(len(found.pairs))):
+        for first, second in (get_pair_names(found, k) for k in range(len(found.pairs))):
             for one, other in ((first, second), (second, first)):
                 names.setdefault(one, set()).add(other)
         return names
@@ -141,22 +141,22 @@ def test_pairs_of_free_objects() -> None:
 
 def test_close_pairs_move_in_their_phase() -> None:
     """The stick lies on a table, is carried, and lies there again."""
-    scene = room(table())
+    scene = make_room(describe_table())
     script = (
         Script(scene)
-        .go(moved_base(scene.start, y=0.1))
+        .go(move_base(scene.start, y=0.1))
         .take("stick")
-        .go(moved_base(scene.start, y=0.3))
+        .go(move_base(scene.start, y=0.3))
         .let_go()
     )
-    motion = script.go(moved_base(scene.start, y=0.5)).motion()
+    motion = script.go(move_base(scene.start, y=0.5)).motion()
     samples = Samples(scene, motion)
     solids = CollisionShapes(samples.world)
     found = PairTable(scene, solids, motion, 0.02)
     lies = [
         k
         for k in range(len(found.pairs))
-        if {name.partition(".")[0] for name in pair_names(found, k)} == {"stick", "table"}
+        if {name.partition(".")[0] for name in get_pair_names(found, k)} == {"stick", "table"}
     ]
     assert lies
     still = np.zeros((1, len(found.groups)))
@@ -188,7 +188,7 @@ def test_self_collision_of_an_object() -> None:
     table = PairTable(scene, CollisionShapes(World(scene)), motion, 0.02)
     own = {
         pair
-        for pair in (pair_names(table, k) for k in range(len(table.pairs)))
+        for pair in (get_pair_names(table, k) for k in range(len(table.pairs)))
         if all("dishwasher." in name for name in pair)
     }
     assert own == {("dishwasher.door", "dishwasher.rack")}
@@ -200,14 +200,14 @@ def test_self_clearance_of_the_robot(door: Scene) -> None:
     scene = dataclasses.replace(
         door, robot=dataclasses.replace(door.robot, tight={(one, other): 0.006})
     )
-    motion = wander(scene, 0, size=0.1)
+    motion = make_random_door_motion(scene, 0, size=0.1)
     table = PairTable(scene, CollisionShapes(World(scene)), motion, 0.02, 0.01)
     margins = table.get_margins(np.arange(len(table.pairs)), np.zeros(len(table.pairs), int))
     by_pair = {
         frozenset(pair): float(margin)
         for pair, margin in zip(table.pairs.tolist(), margins, strict=True)
     }
-    problem = program_of(scene, [GoTo(1.0, 0.0)], options=Options(self_distance=0.01))
+    problem = make_program(scene, [GoTo(1.0, 0.0)], options=Options(self_distance=0.01))
     robots = len(scene.robot.collision.geometryObjects)
     part, own = problem.contacts.phases[0], 0
     for pair, margin in zip(part.pairs.tolist(), part.margins.tolist(), strict=True):

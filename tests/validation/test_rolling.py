@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.drives import hall, moved, of_rows, through
-from helpers.judging import only
+from helpers.drives import drive_through, make_hall, make_trajectory, move_start
+from helpers.judging import get_only_violation
 
 import vkc_pin as vkc
 from vkc_pin.validation.validate import validate
@@ -18,9 +18,9 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def test_slip_of_a_differential_base_in_steps() -> None:
-    scene = hall(base="differential")
-    ahead = through(
-        scene, scene.start, moved(scene.start, x=2.0), moved(scene.start, x=2.0, yaw=1.0)
+    scene = make_hall(base="differential")
+    ahead = drive_through(
+        scene, scene.start, move_start(scene.start, x=2.0), move_start(scene.start, x=2.0, yaw=1.0)
     )
     assert validate(scene, [vkc.GoTo(2.0, 0.0, 1.0)], ahead).ok
     heading = np.linspace(0.0, 1.5, 41)
@@ -30,31 +30,33 @@ def test_slip_of_a_differential_base_in_steps() -> None:
     curve[:, 0], curve[:, 1], curve[:, 2] = np.sin(heading), 1.0 - np.cos(heading), heading
     assert "slip" not in {
         v.constraint
-        for v in validate(scene, [vkc.GoTo(1.0, 1.0)], of_rows(scene, curve)).violations
+        for v in validate(scene, [vkc.GoTo(1.0, 1.0)], make_trajectory(scene, curve)).violations
     }
-    sideways = through(scene, scene.start, moved(scene.start, x=2.0, y=0.1))
-    found = only(validate(scene, [vkc.GoTo(2.0, 0.1, 0.0)], sideways))
+    sideways = drive_through(scene, scene.start, move_start(scene.start, x=2.0, y=0.1))
+    found = get_only_violation(validate(scene, [vkc.GoTo(2.0, 0.1, 0.0)], sideways))
     assert (found.constraint, found.subject, found.unit) == ("slip", "base", "m")
     steps = np.diff(sideways.positions[:, 1])
     assert found.amount == pytest.approx(steps.max())
     assert found.waypoint == steps.argmax()
     assert found.time == pytest.approx(sideways.times[found.waypoint])
     for step, right in ((0.9e-4, True), (1.5e-4, False)):  # 0.1 mm aside in a step is all right
-        aside = through(scene, scene.start, moved(scene.start, x=2.0, y=0.1 * step / found.amount))
+        aside = drive_through(
+            scene, scene.start, move_start(scene.start, x=2.0, y=0.1 * step / found.amount)
+        )
         assert (
             "slip"
             not in {v.constraint for v in validate(scene, [vkc.GoTo(2.0, 0.0)], aside).violations}
         ) == right
-    assert validate(hall(), [vkc.GoTo(2.0, 0.1, 0.0)], sideways).ok
+    assert validate(make_hall(), [vkc.GoTo(2.0, 0.1, 0.0)], sideways).ok
 
 
 @pytest.mark.parametrize(("radius", "ok"), [(0.99, True), (1.01, False)])
 def test_turning_radius_in_steps(radius: float, ok: bool) -> None:
-    scene = hall(base="ackermann", turning_radius=radius)
+    scene = make_hall(base="ackermann", turning_radius=radius)
     heading = np.concatenate([np.linspace(0.0, 1.5, 41), np.linspace(1.5, 0.3, 33)[1:]])
     rows = np.tile(scene.start, (len(heading), 1))
     rows[:, 0], rows[:, 1], rows[:, 2] = np.sin(heading), 1.0 - np.cos(heading), heading
-    motion = of_rows(scene, rows)
+    motion = make_trajectory(scene, rows)
     found = {v.constraint: v for v in validate(scene, [vkc.GoTo(*rows[-1, :3])], motion).violations}
     assert "slip" not in found
     assert ("turning" not in found) == ok
@@ -67,11 +69,11 @@ def test_turning_radius_in_steps(radius: float, ok: bool) -> None:
 
 
 def test_steered_base_must_not_turn_in_place() -> None:
-    scene = hall(base="ackermann", turning_radius=0.8)
-    motion = through(
-        scene, scene.start, moved(scene.start, x=2.0), moved(scene.start, x=2.0, yaw=1.0)
+    scene = make_hall(base="ackermann", turning_radius=0.8)
+    motion = drive_through(
+        scene, scene.start, move_start(scene.start, x=2.0), move_start(scene.start, x=2.0, yaw=1.0)
     )
-    found = only(validate(scene, [vkc.GoTo(2.0, 0.0, 1.0)], motion))
+    found = get_only_violation(validate(scene, [vkc.GoTo(2.0, 0.0, 1.0)], motion))
     assert (found.constraint, found.subject, found.unit) == ("turning", "base", "m")
     assert found.amount == pytest.approx(0.8 * np.diff(motion.positions[:, 2]).max())
     assert "radius of 0.8 m" in found.detail
@@ -80,7 +82,7 @@ def test_steered_base_must_not_turn_in_place() -> None:
 @pytest.mark.parametrize("base", ["differential", "ackermann"])
 def test_wheel_speed_in_steps(base: str) -> None:
     """On a circle of 1 m the outer wheels go 1 + track / 2 times as fast as the base."""
-    scene = hall(base=base, **({"turning_radius": 0.8} if base == "ackermann" else {}))
+    scene = make_hall(base=base, **({"turning_radius": 0.8} if base == "ackermann" else {}))
     wheels = scene.robot.wheels
     assert wheels is not None
     assert wheels.rim_speed == pytest.approx(
@@ -95,7 +97,7 @@ def test_wheel_speed_in_steps(base: str) -> None:
     rows = np.tile(scene.start, (len(heading), 1))
     rows[:, 0], rows[:, 1], rows[:, 2] = np.sin(heading), 1.0 - np.cos(heading), heading
     goal = [vkc.GoTo(*rows[-1, :3])]
-    found = only(validate(scene, goal, of_rows(scene, rows, dt=0.05)))
+    found = get_only_violation(validate(scene, goal, make_trajectory(scene, rows, dt=0.05)))
     assert (found.constraint, found.subject, found.unit) == ("wheels", "base", "m/s")
     turn = np.diff(heading).max()
     fastest = (2.0 * np.sin(turn / 2) + turn * wheels.track / 2) / 0.05
@@ -105,11 +107,11 @@ def test_wheel_speed_in_steps(base: str) -> None:
         (2.0, False),
     ):  # times what is all right, a thousandth of what the wheels can
         dt = 0.05 * fastest / (wheels.rim_speed * (1.0 + excess * 1e-3))
-        assert validate(scene, goal, of_rows(scene, rows, dt=dt)).ok == right
-    assert validate(scene, goal, of_rows(scene, rows, dt=0.05 * fastest)).ok
-    everywhere = hall()
-    assert validate(everywhere, goal, of_rows(everywhere, rows, dt=0.05)).ok
-    straight = through(scene, scene.start, moved(scene.start, x=1.0), dt=1.5 / 40 / 0.99)
+        assert validate(scene, goal, make_trajectory(scene, rows, dt=dt)).ok == right
+    assert validate(scene, goal, make_trajectory(scene, rows, dt=0.05 * fastest)).ok
+    everywhere = make_hall()
+    assert validate(everywhere, goal, make_trajectory(everywhere, rows, dt=0.05)).ok
+    straight = drive_through(scene, scene.start, move_start(scene.start, x=1.0), dt=1.5 / 40 / 0.99)
     assert validate(scene, [vkc.GoTo(1.0, 0.0)], straight).ok
 
 
@@ -135,16 +137,18 @@ def circle(
     rates[:, 2] = turning
     rows[1:, 0] -= np.cumsum((slide[1:] + slide[:-1]) / 2 * np.diff(times))
     rates[:, 0] -= slide
-    motion = dataclasses.replace(of_rows(scene, rows), times=times, curve=Curve(times, rows, rates))
+    motion = dataclasses.replace(
+        make_trajectory(scene, rows), times=times, curve=Curve(times, rows, rates)
+    )
     return [vkc.GoTo(*rows[-1, :3])], motion
 
 
 def test_slip_along_a_curve() -> None:
     """At heading θ, the velocity along −x is lateral by a factor of sin θ."""
-    scene = hall(base="differential")
+    scene = make_hall(base="differential")
     assert validate(scene, *circle(scene)).ok
     goal, motion = circle(scene, aside=0.01)
-    found = only(validate(scene, goal, motion))
+    found = get_only_violation(validate(scene, goal, motion))
     assert (found.constraint, found.subject, found.unit) == ("slip", "base", "m/s")
     moments = np.linspace(0.0, motion.times[-1], 5000)
     (vx, vy), yaw = motion.velocity(moments)[:, :2].T, motion(moments)[:, 2]
@@ -153,7 +157,7 @@ def test_slip_along_a_curve() -> None:
     assert found.time == pytest.approx(moments[slip.argmax()], abs=0.05)
     assert motion.times[found.waypoint] <= found.time <= motion.times[found.waypoint + 1]
     assert "mm/s" in found.detail
-    assert validate(hall(), goal, motion).ok
+    assert validate(make_hall(), goal, motion).ok
     for allowed, right in ((0.95e-3, True), (1.1e-3, False)):
         report = validate(scene, *circle(scene, aside=0.01 * allowed / found.amount))
         assert report.ok == right
@@ -161,20 +165,20 @@ def test_slip_along_a_curve() -> None:
 
 @pytest.mark.parametrize(("radius", "ok"), [(0.997, True), (1.01, False)])
 def test_turning_radius_along_a_curve(radius: float, ok: bool) -> None:
-    scene = hall(base="ackermann", turning_radius=radius)
+    scene = make_hall(base="ackermann", turning_radius=radius)
     report = validate(scene, *circle(scene))
     assert report.ok == ok
     if not ok:
-        found = only(report)
+        found = get_only_violation(report)
         assert (found.constraint, found.unit) == ("turning", "m/s")
         assert found.amount == pytest.approx((radius - 1.0) * 0.4, rel=1e-2)
 
 
 def test_wheel_speed_along_a_curve() -> None:
-    scene = hall(base="differential")
+    scene = make_hall(base="differential")
     assert scene.robot.wheels is not None
     peak = scene.robot.wheels.rim_speed / (1.0 + scene.robot.wheels.track / 2)
     assert validate(scene, *circle(scene, peak=0.999 * peak)).ok
-    found = only(validate(scene, *circle(scene, peak=1.02 * peak)))
+    found = get_only_violation(validate(scene, *circle(scene, peak=1.02 * peak)))
     assert (found.constraint, found.subject, found.unit) == ("wheels", "base", "m/s")
     assert found.amount == pytest.approx(0.02 * scene.robot.wheels.rim_speed, rel=0.02)

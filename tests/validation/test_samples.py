@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.carrying import Script, room
-from helpers.drives import hall, moved, of_rows
-from helpers.small_problems import door_scene, full_scene, with_objects
-from helpers.telescopes import coupled_scene
+from helpers.carrying import Script, make_room
+from helpers.drives import make_hall, make_trajectory, move_start
+from helpers.small_problems import load_door_scene, make_full_scene, replace_objects
+from helpers.telescopes import write_coupled_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -56,7 +56,7 @@ def sample_motion(scene: Scene, seed: int, *, grasp: str = "grip", number: int =
 
 
 def test_density_of_coupled_joints(tmp_path: Path) -> None:
-    scene = coupled_scene(tmp_path)
+    scene = write_coupled_scene(tmp_path)
     rows = np.tile(scene.start, (3, 1))
     rows[1:, 3:] += [[0.4, 0.0, 0.0], [0.4, 0.1, 0.9]]
     names, phases = scene.robot.coordinates.names, (PhaseSpan("all", 0, 2, ()),)
@@ -76,8 +76,8 @@ def test_density_of_coupled_joints(tmp_path: Path) -> None:
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(sorted(VIRTUAL)))
 def test_samples_are_dense(seed: int, grasp: str) -> None:
-    trajectory = sample_motion(full_scene(), seed, grasp=grasp)
-    samples = Samples(full_scene(), trajectory)
+    trajectory = sample_motion(make_full_scene(), seed, grasp=grasp)
+    samples = Samples(make_full_scene(), trajectory)
     steps = np.abs(np.diff(trajectory.at(samples.times), axis=0))
     of_objects = ("drawer.slide", "cabinet.slide", "cabinet.rail", "cabinet.sleeve_slide")
     lengths = np.array([name in ("base_x", "base_y", *of_objects) for name in trajectory.names])
@@ -102,7 +102,7 @@ def test_samples_are_dense(seed: int, grasp: str) -> None:
 @given(st.integers(0, 2**32 - 1), st.sampled_from(sorted(VIRTUAL)))
 def test_grasp_errors(seed: int, grasp: str) -> None:
     """The cabinet is placed where the tool grasps it exactly, then displaced."""
-    scene = full_scene()
+    scene = make_full_scene()
     trajectory, rng = sample_motion(scene, seed, grasp=grasp, number=2), np.random.default_rng(seed)
     robot, placed = scene.robot, scene.objects["cabinet"]
     attachment, z = placed.object.attachments[grasp], trajectory.positions[0]
@@ -127,7 +127,7 @@ def test_grasp_errors(seed: int, grasp: str) -> None:
         [trajectory.column(f"cabinet.{joint}")[0] for joint in placed.object.coordinates.names]
     )
     hand = placed.object.link_placement(attachment.link, state) * attachment.placement * freedom
-    here = with_objects(
+    here = replace_objects(
         scene, {"cabinet": dataclasses.replace(placed, placement=tool * hand.inverse())}
     )
     np.testing.assert_allclose(
@@ -137,7 +137,7 @@ def test_grasp_errors(seed: int, grasp: str) -> None:
     )
     shift, turn = rng.normal(size=3), rng.uniform(-1.0, 1.0, 3)
     off = tool * pin.SE3(pin.exp3(turn), shift)
-    there = with_objects(
+    there = replace_objects(
         scene, {"cabinet": dataclasses.replace(placed, placement=off * hand.inverse())}
     )
     (errors,) = Samples(there, trajectory).compute_grasp_errors("cabinet", grasp, np.array([0]))
@@ -146,7 +146,7 @@ def test_grasp_errors(seed: int, grasp: str) -> None:
 
 
 def test_driven_coordinates() -> None:
-    samples = Samples(full_scene(), sample_motion(full_scene(), 0))
+    samples = Samples(make_full_scene(), sample_motion(make_full_scene(), 0))
     assert samples.find_driven_coordinates(()) == set()
     assert samples.find_driven_coordinates(make_holds({"cabinet": "grip"})) == {
         "cabinet.swing",
@@ -160,11 +160,11 @@ def test_driven_coordinates() -> None:
 
 
 def stand_still(scene: Scene) -> Samples:
-    return Samples(scene, of_rows(scene, np.tile(scene.start, (2, 1))))
+    return Samples(scene, make_trajectory(scene, np.tile(scene.start, (2, 1))))
 
 
 def test_limits_of_robot_coordinates() -> None:
-    scene = dataclasses.replace(hall(), arena=(-5.0, 6.0, -7.0, 8.0))
+    scene = dataclasses.replace(make_hall(), arena=(-5.0, 6.0, -7.0, 8.0))
     robot = scene.robot
     lower, upper = robot.lower.copy(), robot.upper.copy()
     lower[:3], upper[:3] = [-1.0, -9.0, -2.0], [9.0, 1.0, 3.0]
@@ -179,7 +179,7 @@ def test_limits_of_robot_coordinates() -> None:
 
 
 def test_limits_of_a_fixed_base() -> None:
-    scene = hall(base="fixed").with_start(base=[1.0, -2.0, 0.5])
+    scene = make_hall(base="fixed").with_start(base=[1.0, -2.0, 0.5])
     samples, robot = stand_still(scene), scene.robot
     limits = np.array([samples.get_limits(name)[:2] for name in robot.coordinates.names])
     np.testing.assert_array_equal(limits[:3], [(1.0, 1.0), (-2.0, -2.0), (0.5, 0.5)])
@@ -187,23 +187,23 @@ def test_limits_of_a_fixed_base() -> None:
 
 
 def test_limits_of_objects_and_grasps() -> None:
-    scene = room()
+    scene = make_room()
     samples = Samples(scene, Script(scene).take("stick").wait().motion())
     freedoms = scene.objects["stick"].object.attachment("grip").freedoms
     for freedom, name in zip(freedoms, ("slide", "turn"), strict=True):
         limits = samples.get_limits(f"stick.grip_{name}")
         assert limits == (freedom.lower, freedom.upper, np.inf, np.inf)
         assert samples.get_unit(f"stick.grip_{name}") == freedom.unit
-    item = door_scene().objects["door"].object
+    item = load_door_scene().objects["door"].object
     for i, joint in enumerate(item.coordinates.names):
         arrays = (item.lower, item.upper, item.velocity, item.acceleration)
-        assert stand_still(door_scene()).get_limits(f"door.{joint}") == tuple(
+        assert stand_still(load_door_scene()).get_limits(f"door.{joint}") == tuple(
             float(values[i]) for values in arrays
         )
 
 
 def test_number_of_samples_per_step() -> None:
-    scene, wrist = hall(), 8
+    scene, wrist = make_hall(), 8
     steps = [
         ({0: 0.05}, 10),
         ({0: -0.051}, 11),
@@ -219,7 +219,7 @@ def test_number_of_samples_per_step() -> None:
         rows.append(rows[-1].copy())
         for column, change in step.items():
             rows[-1][column] += change
-    samples = Samples(scene, of_rows(scene, np.array(rows)))
+    samples = Samples(scene, make_trajectory(scene, np.array(rows)))
     counts = np.array([count for _, count in steps])
     np.testing.assert_array_equal(np.diff(samples.waypoint_rows), counts)
     assert samples.required_count == counts.sum()
@@ -229,11 +229,11 @@ def test_number_of_samples_per_step() -> None:
 
 def test_number_of_samples_along_a_curve() -> None:
     """Half a metre from rest to rest has 0.75 m at its largest speed; knots are samples, too."""
-    scene = hall()
-    rows = np.array([moved(scene.start, x=x) for x in (0.0, 0.25, 0.5)])
+    scene = make_hall()
+    rows = np.array([move_start(scene.start, x=x) for x in (0.0, 0.25, 0.5)])
     for knots, way in ((np.array([0.0, 2.0]), rows[[0, 2]]), (np.array([0.0, 1.0, 2.0]), rows)):
         curve = Curve(knots, way, np.zeros_like(way))
-        motion = dataclasses.replace(of_rows(scene, rows[[0, 2]], dt=2.0), curve=curve)
+        motion = dataclasses.replace(make_trajectory(scene, rows[[0, 2]], dt=2.0), curve=curve)
         samples = Samples(scene, motion)
         assert np.diff(samples.waypoint_rows).tolist() == [150]
         assert set(knots.tolist()) <= set(samples.times.tolist())
@@ -241,8 +241,8 @@ def test_number_of_samples_along_a_curve() -> None:
 
 @pytest.mark.parametrize(("size", "right"), [(0.99e12, True), (1.01e12, False)])
 def test_coordinates_out_of_range_are_refused(size: float, right: bool) -> None:
-    scene = hall()
-    motion = of_rows(scene, np.array([scene.start, moved(scene.start, y=-size)]))
+    scene = make_hall()
+    motion = make_trajectory(scene, np.array([scene.start, move_start(scene.start, y=-size)]))
     if right:
         samples = Samples(scene, motion)
         assert samples.required_count > MAX_SAMPLES
@@ -254,11 +254,11 @@ def test_coordinates_out_of_range_are_refused(size: float, right: bool) -> None:
 
 
 def test_frames_must_be_links_of_free_objects() -> None:
-    samples = stand_still(room())
+    samples = stand_still(make_room())
     samples.check_frame("stick.tip", "by")
     for frame in ("stik.tip", "stick.tap"):
         with pytest.raises(UnknownNameError) as caught:
             samples.check_frame(frame, "by")
         assert caught.value.field == "by"
     with pytest.raises(InputError, match="stands fixed"):
-        stand_still(door_scene()).check_frame("door.panel", "by")
+        stand_still(load_door_scene()).check_frame("door.panel", "by")

@@ -7,11 +7,26 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.carrying import STICK, Script, above, box, moved_base, reaching, room, table, tool_at
-from helpers.clutter import cluttered_room
-from helpers.drives import hall, moved, of_rows
-from helpers.motions import brute_force, pair_names, wander, whirl
-from helpers.small_problems import door_scene
+from helpers.carrying import (
+    STICK,
+    Script,
+    compute_grasp_pose,
+    describe_box,
+    describe_table,
+    make_room,
+    move_base,
+    solve_above,
+    solve_reach,
+)
+from helpers.clutter import make_cluttered_room
+from helpers.drives import make_hall, make_trajectory, move_start
+from helpers.motions import (
+    compute_all_distances,
+    get_pair_names,
+    make_random_door_motion,
+    make_random_stick_motion,
+)
+from helpers.small_problems import load_door_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -28,10 +43,10 @@ COAL = 2e-5  # accuracy of coal's distances [m]
 
 
 def test_closest_pair_of_every_waypoint() -> None:
-    door = door_scene()
-    parts = [wander(door, seed, size=0.5).positions for seed in range(8)]
+    door = load_door_scene()
+    parts = [make_random_door_motion(door, seed, size=0.5).positions for seed in range(8)]
     rows = np.concatenate([*parts, parts[0] + 30.0 * np.eye(parts[0].shape[1])[0]])
-    one = wander(door, 0, size=0.5)
+    one = make_random_door_motion(door, 0, size=0.5)
     phases = (replace(one.phases[0], last=len(rows) - 1),)
     motion = replace(one, times=np.arange(len(rows)), positions=rows, phases=phases)
     world = World(door)
@@ -48,7 +63,7 @@ def test_closest_pair_of_every_waypoint() -> None:
     for hit in sweep(table, z, np.arange(len(z))):
         if hit.at_waypoint:
             least[hit.row] = min(least[hit.row], hit.distance)
-    np.testing.assert_allclose(least, brute_force(table, z).min(axis=1), atol=1e-5)
+    np.testing.assert_allclose(least, compute_all_distances(table, z).min(axis=1), atol=1e-5)
     assert least.min() < 0.0 < 10.0 < least.max()
 
 
@@ -62,46 +77,49 @@ def check_sweep(scene: Scene, motion: Trajectory) -> None:
     """Compare the hits with the distances of all pairs, five times as finely."""
     table, samples, hits = sweep_motion(scene, motion)
     robot = np.array([group == "robot" for group in table.groups])[table.pairs].any(axis=1)
-    distances = brute_force(table, samples.z)
+    distances = compute_all_distances(table, samples.z)
     for rows in map(samples.get_rows, motion.phases):  # pairs at rest are not checked
         distances[np.ix_(rows, ~robot & (np.ptp(distances[rows], axis=0) == 0.0))] = np.inf
     found = {(hit.row, hit.first, hit.second) for hit in hits}
     for row, k in np.argwhere(distances < -COAL):
-        assert (row, *pair_names(table, k)) in found
+        assert (row, *get_pair_names(table, k)) in found
     for t, k in np.argwhere(distances[samples.waypoint_rows] < 0.02 - COAL):
-        assert (samples.waypoint_rows[t], *pair_names(table, k)) in found
+        assert (samples.waypoint_rows[t], *get_pair_names(table, k)) in found
     assert all(hit.row in samples.waypoint_rows for hit in hits if hit.at_waypoint)
     grid = [np.linspace(a, b, 6) for a, b in itertools.pairwise(samples.times)]
-    fine = brute_force(
+    fine = compute_all_distances(
         table, samples.world.compute_positions(motion, np.unique(np.concatenate(grid)))
     )
     least = min(hit.distance for hit in hits)
     assert min(fine.min() - 2e-3, 0.0) <= least <= distances.min() + COAL
     touched = {(hit.first, hit.second) for hit in hits if hit.distance < 0}
     deep = {
-        pair_names(table, k)
+        get_pair_names(table, k)
         for k in np.flatnonzero((fine.min(axis=0) < -1.001e-3) & (distances.min(axis=0) < np.inf))
     }
-    near = {pair_names(table, k) for k in np.flatnonzero(fine.min(axis=0) < 2e-3)}
+    near = {get_pair_names(table, k) for k in np.flatnonzero(fine.min(axis=0) < 2e-3)}
     assert deep <= touched <= near
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_hits_are_those_of_brute_force(seed: int) -> None:
-    check_sweep(door_scene(), wander(door_scene(), seed, size=(0.1, 0.5)[seed % 2]))
+    check_sweep(
+        load_door_scene(),
+        make_random_door_motion(load_door_scene(), seed, size=(0.1, 0.5)[seed % 2]),
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_hits_of_grasped_objects_among_obstacles_are_those_of_brute_force(seed: int) -> None:
-    scene = cluttered_room(seed, (0, 40)[seed % 2])
-    check_sweep(*whirl(seed, size=(0.1, 0.5)[seed // 2], scene=scene))
+    scene = make_cluttered_room(seed, (0, 40)[seed % 2])
+    check_sweep(*make_random_stick_motion(seed, size=(0.1, 0.5)[seed // 2], scene=scene))
 
 
 @settings(max_examples=4, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.1, 0.6]))
 def test_no_penetration_is_missed_between_sparse_samples(seed: int, size: float) -> None:
-    door = door_scene()
-    motion = wander(door, seed, size=size)
+    door = load_door_scene()
+    motion = make_random_door_motion(door, seed, size=size)
     samples = Samples(door, motion)
     table = PairTable(door, CollisionShapes(samples.world), motion, 0.02)
     found = {
@@ -109,11 +127,11 @@ def test_no_penetration_is_missed_between_sparse_samples(seed: int, size: float)
         for hit in sweep(table, samples.z[samples.waypoint_rows], np.arange(4))
         if hit.distance < 0
     }
-    distances = brute_force(table, samples.z)
+    distances = compute_all_distances(table, samples.z)
     for t, (first, last) in enumerate(itertools.pairwise(samples.waypoint_rows)):
         within = distances[first : last + 1].min(axis=0)
         for k in np.flatnonzero(within < -1.001e-3):
-            assert {(t, *pair_names(table, k)), (t + 1, *pair_names(table, k))} & found
+            assert {(t, *get_pair_names(table, k)), (t + 1, *get_pair_names(table, k))} & found
 
 
 def test_wire_between_two_samples() -> None:
@@ -124,8 +142,10 @@ def test_wire_between_two_samples() -> None:
         "length": 0.2,
         "position": [2.0, 0.0, 0.1],
     }
-    scene = hall(obstacles=[wire])
-    motion = of_rows(scene, np.vstack([scene.start, moved(scene.start, x=4.0)]), dt=20.0)
+    scene = make_hall(obstacles=[wire])
+    motion = make_trajectory(
+        scene, np.vstack([scene.start, move_start(scene.start, x=4.0)]), dt=20.0
+    )
     samples = Samples(scene, motion)
     table = PairTable(scene, CollisionShapes(samples.world), motion, 0.02)
     hits = list(sweep(table, samples.z[[0, -1]], np.array([0, 1])))
@@ -141,11 +161,11 @@ def test_windows_permit_contact_but_no_passing_through(
     overlap: float | None, together: bool, before: int
 ) -> None:
     """A stick passes a fence beside which it lay; no sample touches the fence."""
-    fence = box("fence", [0.6, 0.001, 0.1], [0.8, 0.262, 0.56])
-    scene = room(fence)
-    down = reaching(tool_at(STICK), above(STICK))
+    fence = describe_box("fence", [0.6, 0.001, 0.1], [0.8, 0.262, 0.56])
+    scene = make_room(fence)
+    down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
     motion = (
-        Script(scene).go(down).take("stick").go(moved_base(down, y=1.0), steps=1).motion(dt=10.0)
+        Script(scene).go(down).take("stick").go(move_base(down, y=1.0), steps=1).motion(dt=10.0)
     )
     world = World(scene)
     labels = world.collision_labels
@@ -167,10 +187,10 @@ def test_windows_permit_contact_but_no_passing_through(
 
 
 def test_constant_penetration_is_reported_at_every_sample() -> None:
-    scene = hall(obstacles=[box("box", [0.4, 0.4, 0.6], [2.0, 0.0, 0.3])])
-    inside = moved(scene.start, x=1.5)
+    scene = make_hall(obstacles=[describe_box("box", [0.4, 0.4, 0.6], [2.0, 0.0, 0.3])])
+    inside = move_start(scene.start, x=1.5)
     turned = inside + np.append(np.zeros(len(inside) - 1), 1.0)
-    motion = of_rows(scene, np.vstack([scene.start, inside, turned, scene.start]), dt=4.0)
+    motion = make_trajectory(scene, np.vstack([scene.start, inside, turned, scene.start]), dt=4.0)
     _, samples, hits = sweep_motion(scene, motion)
     first, last = samples.waypoint_rows[1:3]
     assert last - first > 3, "there is nothing to look at: turn the arm further"
@@ -183,17 +203,17 @@ def test_constant_penetration_is_reported_at_every_sample() -> None:
 
 
 def test_objects_at_rest_are_not_checked_again() -> None:
-    scene = room(table(gap=5e-4))
-    down = reaching(tool_at(STICK), above(STICK))
+    scene = make_room(describe_table(gap=5e-4))
+    down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
     script = (
         Script(scene)
         .go(down)
         .take("stick")
-        .go(moved_base(down, y=0.05), steps=1)
+        .go(move_base(down, y=0.05), steps=1)
         .go(down, steps=1)
         .let_go("stick")
     )
-    motion = script.go(moved_base(down, x=-1.0), steps=3).motion()
+    motion = script.go(move_base(down, x=-1.0), steps=3).motion()
     resting = sweep_motion(scene, motion)[2]
     last = motion.phases[-1]
     pair = {frozenset((hit.first, hit.second)) for hit in resting if hit.distance < 1e-3} & {

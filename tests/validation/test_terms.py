@@ -8,13 +8,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.carrying import STICK, TOP, carried_over, room, table
-from helpers.drives import DT, hall, moved, of_rows, through
+from helpers.carrying import STICK, TOP, carry_over, describe_table, make_room
+from helpers.drives import DT, drive_through, make_hall, make_trajectory, move_start
 
 import vkc_pin as vkc
 from vkc_pin.validation.terms import INTERMEDIATE_FACTOR
 
-START = hall().start
+START = make_hall().start
 
 
 def find_violations(
@@ -31,8 +31,8 @@ def limit_tip(upper: float, **fields: Any) -> vkc.Constraint:
 
 
 def test_constraint_on_a_grasped_object() -> None:
-    scene = room(table())
-    motion, place = carried_over(scene, aside=0.3).motion(), [vkc.Place("stick", (0.8, 0.3, 0.551))]
+    scene = make_room(describe_table())
+    motion, place = carry_over(scene, aside=0.3).motion(), [vkc.Place("stick", (0.8, 0.3, 0.551))]
     link = scene.objects["stick"].object.link_placement("tip", [])
     highest = (STICK * link).translation[2] + 0.2
     assert find_violations(scene, motion, limit_tip(highest + 1e-4), place) == []
@@ -56,8 +56,8 @@ def test_constraint_on_a_grasped_object() -> None:
 
 
 def test_worst_violation_is_reported_with_entry_and_time() -> None:
-    scene = hall()
-    motion = through(scene, START, moved(START, x=2.0), moved(START, x=2.0, y=1.0))
+    scene = make_hall()
+    motion = drive_through(scene, START, move_start(START, x=2.0), move_start(START, x=2.0, y=1.0))
     within = vkc.Constraint(
         "within",
         lambda s: ca.vertcat(s.coordinate("base_x"), s.position("base_link")[1]),
@@ -78,9 +78,9 @@ def test_worst_violation_is_reported_with_entry_and_time() -> None:
 
 
 def test_costs_are_ignored() -> None:
-    motion = through(hall(), START, moved(START, x=2.0))
+    motion = drive_through(make_hall(), START, move_start(START, x=2.0))
     assert vkc.validate(
-        hall(),
+        make_hall(),
         [vkc.GoTo(2.0, 0.0)],
         motion,
         terms=[vkc.Cost("far", lambda s: s.coordinate("base_x"))],
@@ -92,7 +92,7 @@ def test_costs_are_ignored() -> None:
     [("lower", 5e-4, False), ("upper", 5e-4, False), ("upper", 2e-3, True)],
 )
 def test_tolerance_at_waypoints(bound: str, excess: float, wrong: bool) -> None:
-    motion = through(hall(), START, moved(START, x=2.0))
+    motion = drive_through(make_hall(), START, move_start(START, x=2.0))
     limit = 2.0 - excess if bound == "upper" else excess
     fields = {bound: limit, "during": "drive 1"}
     term = vkc.Constraint(
@@ -100,18 +100,20 @@ def test_tolerance_at_waypoints(bound: str, excess: float, wrong: bool) -> None:
         lambda s: s.coordinate("base_x") if bound == "upper" else 2 - s.coordinate("base_x"),
         **fields,
     )
-    assert len(find_violations(hall(), motion, term)) == wrong
-    assert find_violations(hall(), motion, dataclasses.replace(term, tolerance=2 * excess)) == []
+    assert len(find_violations(make_hall(), motion, term)) == wrong
+    assert (
+        find_violations(make_hall(), motion, dataclasses.replace(term, tolerance=2 * excess)) == []
+    )
 
 
 @pytest.mark.parametrize(("turn", "wrong"), [(0.2, False), (0.6, True)])
 def test_tolerance_between_waypoints(turn: float, wrong: bool) -> None:
     """The hand swings out by r·(1 − cos(turn/2)) in the middle of a turn of the base."""
-    scene, steps = hall(), 2
+    scene, steps = make_hall(), 2
     arm = scene.tool_placement().translation
     ahead, away = np.arctan2(arm[1], arm[0]), float(np.hypot(*arm[:2]))
-    rows = [START, *(moved(START, yaw=-ahead + sign * turn / 2) for sign in (-1.0, 1.0))]
-    motion = of_rows(scene, np.array(rows), dt=5.0)
+    rows = [START, *(move_start(START, yaw=-ahead + sign * turn / 2) for sign in (-1.0, 1.0))]
+    motion = make_trajectory(scene, np.array(rows), dt=5.0)
     assert len(motion.times) == steps + 1
     edge = away * np.cos(turn / 2)
     term = vkc.Constraint("behind", lambda s: s.position("tool")[0], upper=edge)
@@ -135,8 +137,8 @@ def test_tolerance_between_waypoints(turn: float, wrong: bool) -> None:
 
 
 def test_velocities_are_those_of_the_segment() -> None:
-    scene = hall()
-    motion = through(scene, START, moved(START, x=2.0))
+    scene = make_hall()
+    motion = drive_through(scene, START, move_start(START, x=2.0))
     speeds = np.abs(np.diff(motion.positions[:, 0])) / DT
     fastest = float(speeds.max())
     for frame in ("tool", "base_link"):
@@ -162,8 +164,8 @@ def test_velocities_are_those_of_the_segment() -> None:
 
 
 def test_constraint_holds_after_the_first_waypoint_of_its_phases() -> None:
-    scene = hall()
-    motion = through(scene, START, moved(START, x=2.0), moved(START, x=2.5))
+    scene = make_hall()
+    motion = drive_through(scene, START, move_start(START, x=2.0), move_start(START, x=2.5))
     ahead = vkc.Constraint("ahead", lambda s: s.coordinate("base_x"), lower=2.0)
     assert len(find_violations(scene, motion, ahead)) == 1
     assert find_violations(scene, motion, dataclasses.replace(ahead, during="drive 2")) == []
@@ -182,11 +184,13 @@ def test_constraint_holds_after_the_first_waypoint_of_its_phases() -> None:
 
 
 def test_constraint_holds_after_the_wait_for_the_gripper() -> None:
-    scene = hall()
-    driven = through(scene, START, moved(START, x=1.0), moved(START, x=2.0), steps=10)
+    scene = make_hall()
+    driven = drive_through(
+        scene, START, move_start(START, x=1.0), move_start(START, x=2.0), steps=10
+    )
     rows = np.vstack([driven.positions[:11], driven.positions[10:]])  # stands still for a step
     phases = (vkc.PhaseSpan("drive 1", 0, 10), vkc.PhaseSpan("drive 2", 10, 21))
-    motion = of_rows(scene, rows, dt=0.5, phases=phases)
+    motion = make_trajectory(scene, rows, dt=0.5, phases=phases)
     ahead = vkc.Constraint(
         "ahead", lambda s: s.coordinate("base_x"), lower=rows[12, 0], during="drive 2"
     )
@@ -201,8 +205,8 @@ def test_constraint_holds_after_the_wait_for_the_gripper() -> None:
 
 
 def test_nan_is_a_violation() -> None:
-    motion = through(hall(), START, moved(START, x=2.0))
+    motion = drive_through(make_hall(), START, move_start(START, x=2.0))
     term = vkc.Constraint("log", lambda s: ca.log(s.coordinate("base_x") - 1.0), lower=-100.0)
-    (violation,) = find_violations(hall(), motion, term)
+    (violation,) = find_violations(make_hall(), motion, term)
     assert violation.amount == np.inf
     assert "nan" in violation.detail

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.motions import whirl
-from helpers.small_problems import full_scene
-from helpers.telescopes import coupled_scene
+from helpers.motions import make_random_stick_motion
+from helpers.small_problems import make_full_scene
+from helpers.telescopes import write_coupled_scene
 
 from vkc_pin.validation.distances import CollisionShapes, bound_displacements
 from vkc_pin.validation.samples import Samples
@@ -41,7 +41,7 @@ def measure_paths(world: World, z: np.ndarray, count: int) -> np.ndarray:
 @pytest.mark.parametrize("size", [0.1, 1.0])
 @pytest.mark.parametrize("seed", range(3))
 def test_bounds_for_revolute_and_prismatic_joints(seed: int, size: float) -> None:
-    world, rng = World(full_scene()), np.random.default_rng(seed)
+    world, rng = World(make_full_scene()), np.random.default_rng(seed)
     z = rng.uniform(-1.0, 1.0, (1, world.coordinates.size)) + size * rng.uniform(
         -1.0, 1.0, (4, world.coordinates.size)
     ) * rng.choice([0.0, 1.0], world.coordinates.size)
@@ -53,7 +53,7 @@ def test_bounds_for_revolute_and_prismatic_joints(seed: int, size: float) -> Non
 
 @pytest.mark.parametrize("seed", range(3))
 def test_bounds_for_coupled_joints(seed: int, tmp_path: Path) -> None:
-    world, rng = World(coupled_scene(tmp_path)), np.random.default_rng(seed)
+    world, rng = World(write_coupled_scene(tmp_path)), np.random.default_rng(seed)
     low, high = (
         np.nan_to_num(bound, posinf=1.0, neginf=-1.0)
         for bound in (world.coordinates.lower, world.coordinates.upper)
@@ -67,7 +67,7 @@ def test_bounds_for_coupled_joints(seed: int, tmp_path: Path) -> None:
 @pytest.mark.parametrize("size", [0.1, 1.0])
 @pytest.mark.parametrize("seed", range(3))
 def test_bounds_for_grasped_objects(seed: int, size: float) -> None:
-    scene, motion = whirl(seed, size=size)
+    scene, motion = make_random_stick_motion(seed, size=size)
     samples = Samples(scene, motion)
     world = samples.world
     bounds = np.diff(bound_displacements(CollisionShapes(world), samples.z), axis=0)

@@ -8,8 +8,22 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.drives import DT, hall, moved, of_rows, through, with_positions
-from helpers.judging import check, names, only, until_the_grasp, with_attachments, with_object
+from helpers.drives import (
+    DT,
+    drive_through,
+    make_hall,
+    make_trajectory,
+    move_start,
+    replace_positions,
+)
+from helpers.judging import (
+    check,
+    cut_at_grasp,
+    get_only_violation,
+    get_violation_names,
+    replace_attachments,
+    replace_object,
+)
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
@@ -28,13 +42,13 @@ WRIST = "wrist_3_joint"
 
 @pytest.fixture(scope="module")
 def empty() -> Scene:
-    return hall()
+    return make_hall()
 
 
 @pytest.fixture(scope="module")
 def drive(empty: Scene) -> Trajectory:
     """Two metres ahead and a quarter turn."""
-    return through(empty, empty.start, moved(empty.start, x=2.0, yaw=np.pi / 2))
+    return drive_through(empty, empty.start, move_start(empty.start, x=2.0, yaw=np.pi / 2))
 
 
 ARRIVED = vkc.GoTo(2.0, 0.0, np.pi / 2)
@@ -62,8 +76,8 @@ def test_heading_goal_is_periodic(empty: Scene, drive: Trajectory) -> None:
 @pytest.mark.parametrize("error", [0.01, 1e-8, -1e-8])
 def test_motion_must_begin_at_the_start(empty: Scene, drive: Trajectory, error: float) -> None:
     positions = drive.positions + error * (np.arange(drive.positions.shape[1]) == 1)
-    found = only(
-        validate(empty, [vkc.GoTo(2.0, error, np.pi / 2)], with_positions(drive, positions))
+    found = get_only_violation(
+        validate(empty, [vkc.GoTo(2.0, error, np.pi / 2)], replace_positions(drive, positions))
     )
     assert (found.constraint, found.subject, found.waypoint, found.unit) == (
         "start",
@@ -75,7 +89,9 @@ def test_motion_must_begin_at_the_start(empty: Scene, drive: Trajectory, error: 
 
 
 def test_objects_must_begin_at_their_state(door_plan: vkc.Plan) -> None:
-    found = only(check(door_plan, scene=door_plan.scene.with_state("door", {"knob": 0.1})))
+    found = get_only_violation(
+        check(door_plan, scene=door_plan.scene.with_state("door", {"knob": 0.1}))
+    )
     assert (found.constraint, found.subject, found.waypoint, found.unit) == (
         "start",
         "door.knob",
@@ -99,8 +115,8 @@ def test_limit_violation_names_coordinate_waypoint_and_excess(
 ) -> None:
     there = np.array(empty.start)
     there[empty.robot.coordinates.index(subject)] = value
-    motion = through(empty, empty.start, there, empty.start, steps=60)
-    found = only(validate(empty, [vkc.GoTo(0.0, 0.0)], motion))
+    motion = drive_through(empty, empty.start, there, empty.start, steps=60)
+    found = get_only_violation(validate(empty, [vkc.GoTo(0.0, 0.0)], motion))
     assert (found.constraint, found.subject, found.waypoint, found.unit) == (
         "limit",
         subject,
@@ -113,11 +129,13 @@ def test_limit_violation_names_coordinate_waypoint_and_excess(
 
 def test_limit_violation_between_waypoints(empty: Scene) -> None:
     """The curve overshoots the limit by 0.1 m after the second waypoint."""
-    rows = np.array([moved(empty.start, x=x) for x in (0.0, 5.9, 5.9)])
+    rows = np.array([move_start(empty.start, x=x) for x in (0.0, 5.9, 5.9)])
     rates = np.zeros_like(rows)
     rates[1:, 0] = [0.8, -0.8]
     times = np.array([0.0, 20.0, 21.0])
-    motion = dataclasses.replace(of_rows(empty, rows), times=times, curve=Curve(times, rows, rates))
+    motion = dataclasses.replace(
+        make_trajectory(empty, rows), times=times, curve=Curve(times, rows, rates)
+    )
     report = validate(empty, [vkc.GoTo(5.9, 0.0)], motion)
     (found,) = [one for one in report.violations if one.constraint == "limit"]
     assert (found.subject, found.waypoint) == ("base_x", 1)
@@ -128,9 +146,9 @@ def test_start_may_exceed_limits_slightly(empty: Scene) -> None:
     for outside, constraints in ((1e-8, []), (5e-3, []), (0.02, ["limit"])):
         start = np.array(empty.start)
         start[-1] = empty.robot.upper[-1] + outside
-        end = moved(start, x=1.0)
+        end = move_start(start, x=1.0)
         end[-1] = empty.robot.upper[-1]
-        motion = of_rows(empty, np.vstack([start, end]), dt=10.0)
+        motion = make_trajectory(empty, np.vstack([start, end]), dt=10.0)
         report = validate(dataclasses.replace(empty, start=start), [vkc.GoTo(1.0, 0.0)], motion)
         assert [violation.constraint for violation in report.violations] == constraints, "\n".join(
             report.lines()
@@ -138,21 +156,25 @@ def test_start_may_exceed_limits_slightly(empty: Scene) -> None:
 
 
 def test_fixed_base_must_not_move() -> None:
-    scene = hall(base="fixed").with_start(base=[1.0, -2.0, 0.5])
+    scene = make_hall(base="fixed").with_start(base=[1.0, -2.0, 0.5])
     turned = np.array(scene.start)
     turned[-1] += 1.0
-    assert validate(scene, [vkc.GoTo(1.0, -2.0)], through(scene, scene.start, turned)).ok
+    assert validate(scene, [vkc.GoTo(1.0, -2.0)], drive_through(scene, scene.start, turned)).ok
     found = validate(
-        scene, [vkc.GoTo(1.1, -2.0)], through(scene, scene.start, moved(scene.start, x=1.1))
+        scene,
+        [vkc.GoTo(1.1, -2.0)],
+        drive_through(scene, scene.start, move_start(scene.start, x=1.1)),
     )
-    assert ("limit", "base_x") in names(found)
+    assert ("limit", "base_x") in get_violation_names(found)
 
 
 def test_velocity_violation(empty: Scene) -> None:
     speed = np.concatenate([np.linspace(0.3, 1.2, 4), np.linspace(0.9, 0.3, 3)])
     rows = np.tile(empty.start, (len(speed) + 1, 1))
     rows[1:, 0] += np.cumsum(speed) * DT
-    found = only(validate(empty, [vkc.GoTo(rows[-1, 0], 0.0)], of_rows(empty, rows)))
+    found = get_only_violation(
+        validate(empty, [vkc.GoTo(rows[-1, 0], 0.0)], make_trajectory(empty, rows))
+    )
     assert (found.constraint, found.subject, found.waypoint, found.unit) == (
         "velocity",
         "base_x",
@@ -173,7 +195,9 @@ def test_velocity_violation(empty: Scene) -> None:
 def test_acceleration_violation(empty: Scene, speed: list[float], waypoint: int) -> None:
     rows = np.tile(empty.start, (len(speed) + 1, 1))
     rows[1:, 0] += np.cumsum(speed) * DT
-    found = only(validate(empty, [vkc.GoTo(rows[-1, 0], 0.0)], of_rows(empty, rows)))
+    found = get_only_violation(
+        validate(empty, [vkc.GoTo(rows[-1, 0], 0.0)], make_trajectory(empty, rows))
+    )
     assert (found.constraint, found.subject, found.waypoint, found.unit) == (
         "acceleration",
         "base_x",
@@ -185,16 +209,16 @@ def test_acceleration_violation(empty: Scene, speed: list[float], waypoint: int)
 
 def test_objects_have_limits_of_position_and_velocity(door_plan: vkc.Plan) -> None:
     door = door_plan.scene.objects["door"].object
-    scene = with_object(door_plan.scene, upper=np.array([1.1, 0.8]))
-    found = only(check(door_plan, scene=scene))
+    scene = replace_object(door_plan.scene, upper=np.array([1.1, 0.8]))
+    found = get_only_violation(check(door_plan, scene=scene))
     assert (found.constraint, found.subject, found.unit) == ("limit", "door.hinge", "rad")
     assert found.amount == pytest.approx(0.1, abs=1e-4)
     assert door_plan.trajectory.curve is not None
     fastest = door_plan.trajectory.curve.compute_max_rates()[0][
         :, door_plan.trajectory.names.index("door.hinge")
     ].max()
-    scene = with_object(door_plan.scene, velocity=np.array([0.5 * fastest, door.velocity[1]]))
-    found = only(check(door_plan, scene=scene))
+    scene = replace_object(door_plan.scene, velocity=np.array([0.5 * fastest, door.velocity[1]]))
+    found = get_only_violation(check(door_plan, scene=scene))
     assert (found.constraint, found.subject, found.unit) == ("velocity", "door.hinge", "rad/s")
     assert found.amount == pytest.approx(0.5 * fastest)
 
@@ -209,9 +233,11 @@ def test_closure_violation(door_plan: vkc.Plan, shift: float, turn: float, units
     off = grasp.placement * pin.SE3(
         pin.exp3(np.array([0.0, 0.0, turn])), np.array([0.0, 0.0, shift])
     )
-    scene = with_attachments(door_plan.scene, {"handle": dataclasses.replace(grasp, placement=off)})
+    scene = replace_attachments(
+        door_plan.scene, {"handle": dataclasses.replace(grasp, placement=off)}
+    )
     report, planned = check(door_plan, scene=scene), check(door_plan)
-    assert names(report) == {("closure", "door.handle")}
+    assert get_violation_names(report) == {("closure", "door.handle")}
     assert {found.unit for found in report.violations} == units
     for found in report.violations:
         size, drift, largest = (
@@ -251,14 +277,14 @@ def test_latch_violation_of_a_planned_motion(door_plan: vkc.Plan) -> None:
     )
     leaving = np.flatnonzero((hinge[1:] > 1e-4) & (hinge[:-1] <= latch.engaged_within))
     turned = min(knob[leaving].min(), knob[leaving + 1].min())
-    scene = with_object(
+    scene = replace_object(
         door_plan.scene, latches=(dataclasses.replace(latch, threshold=turned + 0.05),)
     )
-    found = only(check(door_plan, scene=scene))
+    found = get_only_violation(check(door_plan, scene=scene))
     assert (found.constraint, found.subject, found.unit) == ("latch", "door.hinge", "rad")
     assert found.waypoint in leaving
     assert 0.0 < found.amount <= 0.05 + 1e-9
-    scene = with_object(
+    scene = replace_object(
         door_plan.scene, latches=(dataclasses.replace(latch, threshold=turned - 1e-6),)
     )
     assert check(door_plan, scene=scene).ok
@@ -321,7 +347,7 @@ def latch_shortfall(
 ) -> float:
     """Return the amount of the latch violation, 0 without one."""
     (latch,) = base.objects["door"].object.latches
-    scene = with_object(base, latches=(dataclasses.replace(latch, engaged_within=reach),))
+    scene = replace_object(base, latches=(dataclasses.replace(latch, engaged_within=reach),))
     scene = scene.with_state("door", {"hinge": hinge[0], "knob": knob[0]})
     steps = [vkc.Actuate("door", {"hinge": hinge[-1]})]
     report = validate(scene, steps, move_door_alone(scene, hinge, knob))
@@ -333,7 +359,7 @@ def latch_shortfall(
 def test_rest_too_short_for_the_gripper(door_plan: vkc.Plan) -> None:
     rests = door_plan.options.grasp_time
     assert check(door_plan, grasp_time=rests - 1e-9).ok
-    found = only(check(door_plan, grasp_time=rests + 0.25))
+    found = get_only_violation(check(door_plan, grasp_time=rests + 0.25))
     grasp = door_plan.trajectory.phases[1].first
     assert (found.constraint, found.subject, found.unit, found.waypoint) == (
         "dwell",
@@ -364,12 +390,12 @@ def test_joints_must_not_move_without_a_grasp(door_plan: vkc.Plan) -> None:
 def drive_beside_a_crate(gap: float) -> tuple[Scene, Trajectory]:
     """Return a hall with a crate, and a drive that ends `gap` in front of it."""
     crate = {"name": "crate", "type": "box", "size": [0.4, 2.0, 0.3], "position": [2.5, 0.0, 0.15]}
-    scene = hall(obstacles=[crate])
-    there = moved(scene.start, x=1.0)
+    scene = make_hall(obstacles=[crate])
+    there = move_start(scene.start, x=1.0)
     crate["position"] = [2.5 - scene.with_start(base=there[:3]).start_clearance() + gap, 0.0, 0.15]
-    scene = hall(obstacles=[crate])
+    scene = make_hall(obstacles=[crate])
     assert scene.with_start(base=there[:3]).start_clearance() == pytest.approx(gap, abs=1e-6)
-    return scene, through(scene, scene.start, there)
+    return scene, drive_through(scene, scene.start, there)
 
 
 @pytest.mark.parametrize(
@@ -382,7 +408,7 @@ def test_clearance_violation_at_a_waypoint(gap: float, short: float) -> None:
     if not short:
         assert report.ok, "\n".join(report.lines())
         return
-    found = only(report)
+    found = get_only_violation(report)
     assert (found.constraint, found.subject, found.waypoint, found.unit) == (
         "clearance",
         "base_link – crate",
@@ -394,7 +420,7 @@ def test_clearance_violation_at_a_waypoint(gap: float, short: float) -> None:
 
 def test_penetration_at_a_waypoint() -> None:
     scene, motion = drive_beside_a_crate(-0.03)
-    found = only(validate(scene, [vkc.GoTo(1.0, 0.0)], motion))
+    found = get_only_violation(validate(scene, [vkc.GoTo(1.0, 0.0)], motion))
     assert (found.constraint, found.subject, found.waypoint) == (
         "penetration",
         "base_link – crate",
@@ -405,9 +431,9 @@ def test_penetration_at_a_waypoint() -> None:
 
 def test_penetration_between_waypoints() -> None:
     board = {"name": "board", "type": "box", "size": [0.005, 1.0, 0.2], "position": [2.0, 0.0, 0.1]}
-    scene = hall(obstacles=[board])
-    rows = np.array([scene.start, moved(scene.start, x=4.0)])
-    motion = of_rows(scene, rows, dt=20.0)
+    scene = make_hall(obstacles=[board])
+    rows = np.array([scene.start, move_start(scene.start, x=4.0)])
+    motion = make_trajectory(scene, rows, dt=20.0)
     for row in rows:
         assert scene.with_start(base=row[:3]).start_clearance() > 1.0
     report = validate(scene, [vkc.GoTo(4.0, 0.0)], motion)
@@ -420,7 +446,7 @@ def test_penetration_between_waypoints() -> None:
         there = scene.with_start(base=motion.at(found.time)[:3])
         assert there.start_clearance() <= -found.amount + 1e-6
     assert report.clearance == pytest.approx(-max(found.amount for found in report.violations))
-    assert validate(hall(), [vkc.GoTo(4.0, 0.0)], motion).ok
+    assert validate(make_hall(), [vkc.GoTo(4.0, 0.0)], motion).ok
 
 
 def test_grasped_objects_must_keep_clear(door_plan: vkc.Plan) -> None:
@@ -431,7 +457,9 @@ def test_grasped_objects_must_keep_clear(door_plan: vkc.Plan) -> None:
     obstacles = (*door_plan.scene.obstacles, pin.GeometryObject("pillar", 0, place, shape))
     labels = (*door_plan.scene.obstacle_labels, "pillar")
     scene = dataclasses.replace(door_plan.scene, obstacles=obstacles, obstacle_labels=labels)
-    assert ("penetration", "door.panel – pillar") in names(check(door_plan, scene=scene))
+    assert ("penetration", "door.panel – pillar") in get_violation_names(
+        check(door_plan, scene=scene)
+    )
 
 
 @pytest.mark.parametrize("name", ["base_x", "shoulder_pan_joint", "door.hinge"])
@@ -458,7 +486,7 @@ def thicken_lever(scene: Scene, by: float) -> Scene:
         if shape.name.startswith("lever"):
             cylinder = shape.geometry
             shape.geometry = coal.Cylinder(cylinder.radius + by, 2 * cylinder.halfLength)
-    return with_object(scene, collision=collision)
+    return replace_object(scene, collision=collision)
 
 
 def test_fingers_may_be_close_to_the_grasped_link(door_plan: vkc.Plan) -> None:
@@ -469,9 +497,9 @@ def test_fingers_may_be_close_to_the_grasped_link(door_plan: vkc.Plan) -> None:
         curve for curve in curves if curve.name == "gripper – what it grasps"
     ).distances.min()
     near = check(door_plan, scene=thicken_lever(door_plan.scene, gap - 0.008))
-    assert not {subject for _, subject in names(near) if subject.split(" – ")[0] in hand}, (
-        "\n".join(near.lines())
-    )
+    assert not {
+        subject for _, subject in get_violation_names(near) if subject.split(" – ")[0] in hand
+    }, "\n".join(near.lines())
     assert near.clearance < 0.0085
     inside = check(door_plan, scene=thicken_lever(door_plan.scene, gap + 0.008))
     found = [v for v in inside.violations if v.subject.split(" – ")[0] in hand]
@@ -479,7 +507,7 @@ def test_fingers_may_be_close_to_the_grasped_link(door_plan: vkc.Plan) -> None:
     assert {v.subject.split(" – ")[1] for v in found} == {"door.lever"}
     assert max(v.amount for v in found) == pytest.approx(0.008, abs=1e-3)
     grasp = validate(
-        thicken_lever(door_plan.scene, gap - 0.008), [vkc.Grasp("door")], until_the_grasp(door_plan)
+        thicken_lever(door_plan.scene, gap - 0.008), [vkc.Grasp("door")], cut_at_grasp(door_plan)
     )
     assert {v.constraint for v in grasp.violations if v.subject.split(" – ")[0] in hand} == set()
 

@@ -16,8 +16,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers import browser
-from helpers.fake_plan import HINGE, fake_plan
-from helpers.pages import clips, commands_of
+from helpers.fake_plan import HINGE, make_fake_plan
+from helpers.pages import read_clips, read_commands
 
 from vkc_pin.errors import InputError
 from vkc_pin.planning.plan import Plan
@@ -30,7 +30,7 @@ needs_chromium = pytest.mark.skipif(browser.CHROMIUM is None, reason="Chromium i
 
 @pytest.fixture(scope="module")
 def plan() -> Plan:
-    return fake_plan()
+    return make_fake_plan()
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def page(plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def commands(page: Path) -> list[dict[str, Any]]:
-    return commands_of(page.read_text(encoding="utf-8"))
+    return read_commands(page.read_text(encoding="utf-8"))
 
 
 def drawn(commands: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -78,7 +78,7 @@ def test_page_has_robot_door_walls_paths_and_ghosts(
         for owner in ("robot", "door"):
             path = f"/meshcat/ghosts/{name}/{owner}"
             assert path in shapes
-            (track,) = clips(commands)[path]["tracks"]
+            (track,) = read_clips(commands)[path]["tracks"]
             keys = track["keys"]
             assert [keys[0]["value"], keys[-1]["value"]] == shown
             assert [keys[0]["time"], keys[-1]["time"]] == [0.0, plan.trajectory.times[-1]]
@@ -110,8 +110,8 @@ def test_scene_is_drawn_with_frames_and_without_markup_from_its_name(tmp_path: P
     text = file.read_text(encoding="utf-8")
     assert "<b>" not in text
     assert "<title>&lt;/script&gt;&lt;b&gt;%FILM%" in text
-    commands = commands_of(text)
-    assert not clips(commands)
+    commands = read_commands(text)
+    assert not read_clips(commands)
     assert any("drawer" in path for path in drawn(commands))
     assert not any("ghosts" in path or "paths" in path for path in drawn(commands))
     things = {
@@ -141,7 +141,7 @@ def test_interpolated_animation_agrees_with_the_motion(
     world = World(plan.scene)
     data = world.model.createData()
     moving, still = (
-        clips(commands),
+        read_clips(commands),
         {c["path"]: c["matrix"] for c in commands if c["type"] == "set_transform"},
     )
     shift = pin.SE3(np.array(still["/meshcat"]).reshape(4, 4).T)
@@ -190,7 +190,7 @@ def test_violating_links_turn_red_at_the_time_of_the_violation(
 ) -> None:
     red = {
         path: clip["tracks"][0]
-        for path, clip in clips(commands).items()
+        for path, clip in read_clips(commands).items()
         if clip["tracks"][0]["type"] == "color"
     }
     assert red
@@ -298,7 +298,7 @@ def test_animate_uses_a_given_viewer(plan: Plan) -> None:
     mine = meshcat.Visualizer(window=recorder)["mine"]
     assert visualization.animate(plan, mine) is mine
     assert "/meshcat/mine/paths/tool" in drawn(recorder.commands)
-    assert all(path.startswith("/meshcat/mine/") for path in clips(recorder.commands))
+    assert all(path.startswith("/meshcat/mine/") for path in read_clips(recorder.commands))
 
 
 def test_server_ends_with_its_process() -> None:
@@ -321,7 +321,7 @@ def take_picture(page: Path, moment: float) -> np.ndarray:
 
     for budget in (6.0, 20.0):  # a busy browser may end before it has drawn anything
         file = page.with_name(f"{moment}.png")
-        browser.screenshot(page, file, time=moment, size=(800, 500), budget=budget)
+        browser.save_screenshot(page, file, time=moment, size=(800, 500), budget=budget)
         pixels = np.asarray(Image.open(file).convert("RGB"), int)
         if len(np.unique(pixels.reshape(-1, 3), axis=0)) > 100:
             break
@@ -363,7 +363,7 @@ def test_browser_shows_links_at_their_placements(page: Path, plan: Plan) -> None
     probed = page.with_name("probed.htm")
     probed.write_text(page.read_text(encoding="utf-8").replace("</body>", probe), encoding="utf-8")
     moment = 4.4
-    text = browser.document(probed, time=moment, until='<pre id="seen">')
+    text = browser.read_document(probed, time=moment, until='<pre id="seen">')
     assert 'data-ready="yes"' in text
     assert "data-refused" not in text
     assert "data-error" not in text

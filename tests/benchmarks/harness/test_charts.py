@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.fake_plan import fake_plan
+from helpers.fake_plan import make_fake_plan
 
 from vkc_pin.benchmarks.harness.charts import (
     criteria_chart,
@@ -175,7 +175,7 @@ def fastest(plan: Plan) -> float:
 def test_motions_chart_shows_the_plans(tmp_path: Path) -> None:
     from matplotlib.image import imread
 
-    plan = fake_plan()
+    plan = make_fake_plan()
     slow = dataclasses.replace(
         plan,
         status="success",

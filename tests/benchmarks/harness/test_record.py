@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers.fake_plan import fake_plan
+from helpers.fake_plan import make_fake_plan
 
 from vkc_pin.benchmarks.harness import record
 from vkc_pin.validation.report import Report
@@ -25,7 +25,7 @@ def test_commit_needs_git(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_failure_is_recorded_with_the_first_violation() -> None:
-    plan = fake_plan()
+    plan = make_fake_plan()
     found = record.trial(plan, method="VKC", seed=3, number=7)
     assert (found["scene"], found["method"], found["seed"], found["number"]) == (
         "door",

@@ -11,7 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.trials import SETTINGS, fatal, mistaken, square, trials, where
+from helpers.trials import (
+    SETTINGS,
+    crash,
+    divide_by_zero,
+    identify_worker,
+    make_trials,
+    solve_square,
+)
 
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.errors import InputError, VkcError
@@ -28,19 +35,19 @@ class Counting:
         if len(self.asked) == self.until:
             raise KeyboardInterrupt
         self.asked.append(spec["key"])
-        return square(spec)
+        return solve_square(spec)
 
 
 def run(
     out: Path,
-    function: Any = square,
+    function: Any = solve_square,
     number: int = 6,
     jobs: int = 1,
     scheduler: str | None = None,
     **settings: Any,
 ) -> dict[str, Any]:
     how: dict[str, Any] = {"jobs": jobs, "scheduler": scheduler, "progress": False}
-    return runner.run(trials(number), function, out, settings={**SETTINGS, **settings}, **how)
+    return runner.run(make_trials(number), function, out, settings={**SETTINGS, **settings}, **how)
 
 
 def read(out: Path) -> dict[str, Any]:
@@ -73,7 +80,7 @@ def test_results_are_records_and_settings(tmp_path: Path) -> None:
 
 
 def test_csv_has_the_records_of_json(tmp_path: Path) -> None:
-    result = run(tmp_path, mistaken)  # the failure has other fields than the rest
+    result = run(tmp_path, divide_by_zero)  # the failure has other fields than the rest
     with (tmp_path / "results.csv").open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == len(result["trials"]) == 6
@@ -104,9 +111,9 @@ def test_interrupted_run_is_resumed(tmp_path: Path, until: int) -> None:
         run(tmp_path / "stopped", first)
     assert not (tmp_path / "stopped" / "results.json").exists()
     resumed = run(tmp_path / "stopped", second)
-    assert sorted(first.asked + second.asked) == [t["key"] for t in trials()][::-1]
+    assert sorted(first.asked + second.asked) == [t["key"] for t in make_trials()][::-1]
     assert (
-        first.asked == [t["key"] for t in trials()][:until]
+        first.asked == [t["key"] for t in make_trials()][:until]
     )  # in the order given, not that of the keys
     assert [s["trials"] for s in resumed["meta"]["sessions"]] == [until, 6 - until]
     assert resumed["trials"] == run(tmp_path / "whole")["trials"]
@@ -117,7 +124,7 @@ def test_interrupted_run_is_resumed(tmp_path: Path, until: int) -> None:
 
 def test_interrupted_record_interrupts_the_run(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt, match="0 of 6"):
-        run(tmp_path, lambda spec: {**square(spec), "status": "interrupted"})
+        run(tmp_path, lambda spec: {**solve_square(spec), "status": "interrupted"})
     assert run(tmp_path)["trials"][0]["status"] == "success"
 
 
@@ -133,7 +140,7 @@ def test_torn_last_line_is_run_again(tmp_path: Path) -> None:
         file.write_bytes(b"".join(lines[:kept]) + lines[kept][:cut])
         again = Counting()
         assert run(tmp_path, again)["trials"] == whole["trials"]
-        assert again.asked == [t["key"] for t in trials()][max(kept - 2, 0) :]
+        assert again.asked == [t["key"] for t in make_trials()][max(kept - 2, 0) :]
         assert [
             json.loads(line) for line in file.read_bytes().splitlines()
         ]  # nothing of the torn line is left
@@ -206,7 +213,7 @@ def test_other_settings_and_versions_are_refused(tmp_path: Path) -> None:
         assert part in text
     assert caught.value.field == "seed, methods"
     with pytest.raises(InputError, match="specification"):  # the same settings, yet other trials
-        runner.run(trials(5), square, tmp_path, settings=SETTINGS, progress=False)
+        runner.run(make_trials(5), solve_square, tmp_path, settings=SETTINGS, progress=False)
     assert (tmp_path / "trials.jsonl").read_bytes() == before
     (tmp_path / "trials.jsonl").write_bytes(before.replace(b'"sources": "', b'"sources": "x'))
     with pytest.raises(InputError, match=r"versions\.sources.*expected sources x"):
@@ -218,7 +225,7 @@ def test_workers_of_a_scheduler_run_the_trials(tmp_path: Path) -> None:
     options = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
     with distributed.LocalCluster(host="127.0.0.1", **options) as cluster:
         address = cluster.scheduler_address
-        there = run(tmp_path / "there", where, number=2, scheduler=address)["trials"]
+        there = run(tmp_path / "there", identify_worker, number=2, scheduler=address)["trials"]
     assert {t["process"] for t in there}.isdisjoint({os.getpid()})
 
 
@@ -233,7 +240,7 @@ def test_results_are_the_same_for_any_number_of_jobs(tmp_path: Path) -> None:
 def test_error_is_recorded_as_failure(
     tmp_path: Path, jobs: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    records = run(tmp_path, mistaken, jobs=jobs)["trials"]
+    records = run(tmp_path, divide_by_zero, jobs=jobs)["trials"]
     assert records[2] == {
         "key": "002",
         "number": 2,
@@ -251,7 +258,7 @@ def test_error_is_recorded_as_failure(
 
 def test_dead_process_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(VkcError, match="a process died"):
-        run(tmp_path, fatal, jobs=2)
+        run(tmp_path, crash, jobs=2)
     assert run(tmp_path)["trials"] == run(tmp_path / "whole")["trials"]
 
 
@@ -262,7 +269,7 @@ def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no folder"):
         run(tmp_path / "file" / "out")
     with pytest.raises(InputError, match="same key"):
-        runner.run([*trials(2), *trials(1)], square, tmp_path, settings=SETTINGS)
+        runner.run([*make_trials(2), *make_trials(1)], solve_square, tmp_path, settings=SETTINGS)
     with pytest.raises(InputError, match="jobs"):
         run(tmp_path, jobs=0)
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.markdown import cells
+from helpers.markdown import parse_cells
 
 from vkc_pin.benchmarks.harness import tables
 
@@ -58,7 +58,7 @@ RECORDS = [
 
 
 def test_methods_against_numbers_by_hand() -> None:
-    head, *rows = cells(tables.methods_table(RECORDS, SCENES, ["auto", "slow", "unused"]))
+    head, *rows = parse_cells(tables.methods_table(RECORDS, SCENES, ["auto", "slow", "unused"]))
     times = ["time, median [s]", "95th percentile [s]"]
     assert head == [
         "scene",
@@ -112,7 +112,7 @@ def test_methods_against_numbers_by_hand() -> None:
 
 
 def test_comparison_against_numbers_by_hand() -> None:
-    head, *rows = cells(
+    head, *rows = parse_cells(
         tables.comparison_table(RECORDS, SCENES, ("auto", "slow"), ("one", "two")).replace(
             "\\|", "/"
         )

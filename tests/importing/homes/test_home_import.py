@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.downloads import SDF
-from helpers.homes import HOME_MJCF, PLACES, WALLS, home_urdf
+from helpers.homes import HOME_MJCF, PLACES, WALLS, write_home_urdf
 
 import vkc_pin as vkc
 from vkc_pin.importing.homes.home_import import find_free_start
@@ -21,14 +21,14 @@ pytestmark = pytest.mark.filterwarnings(
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> vkc.importing.ImportedHome:
     folder = tmp_path_factory.mktemp("home")
-    file, _ = home_urdf(folder)
+    file, _ = write_home_urdf(folder)
     return vkc.importing.import_home(file, folder / "out")
 
 
 def test_every_shape_of_the_file_is_imported(
     home: vkc.importing.ImportedHome, tmp_path: Path
 ) -> None:
-    _, shapes = home_urdf(tmp_path)
+    _, shapes = write_home_urdf(tmp_path)
     assert home.shapes["file"] == shapes
     assert home.shapes["floor"] == 2
     assert sum(home.shapes[key] for key in ("floor", "obstacles", "objects")) == shapes

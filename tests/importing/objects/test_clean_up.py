@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.downloads import partnet
+from helpers.downloads import write_partnet_object
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
@@ -31,7 +31,7 @@ from vkc_pin.world.files.fields import Name
 
 @pytest.fixture
 def cabinet(tmp_path: Path) -> Description:
-    return read_object_urdf(partnet(tmp_path))
+    return read_object_urdf(write_partnet_object(tmp_path))
 
 
 def test_fixed_links_are_merged(cabinet: Description) -> None:
@@ -52,7 +52,7 @@ def test_fixed_links_are_merged(cabinet: Description) -> None:
 def test_scaling_scales_shapes_and_limits(
     factor: float, slide: float, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    cabinet = read_object_urdf(partnet(tmp_path_factory.mktemp("p") / "x"))
+    cabinet = read_object_urdf(write_partnet_object(tmp_path_factory.mktemp("p") / "x"))
     large = scale_object(cabinet, factor)
     one = compute_bounds(cabinet, load_surfaces(cabinet), {"joint_0": slide})
     other = compute_bounds(large, load_surfaces(large), {"joint_0": factor * slide})

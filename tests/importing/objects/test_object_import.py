@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import yaml
-from helpers.downloads import SDF, partnet
+from helpers.downloads import SDF, write_partnet_object
 
 import vkc_pin as vkc
 from vkc_pin.importing.objects.object_import import read_description
@@ -16,7 +16,9 @@ from vkc_pin.importing.objects.object_import import read_description
 @pytest.fixture(scope="module")
 def cabinet(tmp_path_factory: pytest.TempPathFactory) -> vkc.importing.ImportedObject:
     folder = tmp_path_factory.mktemp("partnet")
-    return vkc.importing.import_object(partnet(folder / "45427"), folder / "out", height=0.8)
+    return vkc.importing.import_object(
+        write_partnet_object(folder / "45427"), folder / "out", height=0.8
+    )
 
 
 def test_import_finds_handles_and_reports_changes(cabinet: vkc.importing.ImportedObject) -> None:
@@ -75,7 +77,7 @@ def test_imported_object_can_be_opened(
 
 @pytest.mark.parametrize(("link", "name"), [("+", "object")])
 def test_single_link_is_imported_under_its_name(link: str, name: str, tmp_path: Path) -> None:
-    file = partnet(tmp_path / "in")
+    file = write_partnet_object(tmp_path / "in")
     file.write_text(file.read_text().replace('"link_2"', f'"{link}"'))
     done = vkc.importing.import_object(file, tmp_path / "out", link=link, up="y", most=1)
     assert done.file.name == f"{name}.yaml"
@@ -102,7 +104,7 @@ def test_invalid_objects_and_arguments_are_refused(tmp_path: Path) -> None:
     (tmp_path / "page.xml").write_text("<html/>")
     with pytest.raises(vkc.InputError, match=r"page\.xml.*<html>"):
         read_description(tmp_path / "page.xml")
-    file = partnet(tmp_path / "in")
+    file = write_partnet_object(tmp_path / "in")
     for wrong, word in (
         ({"height": 0.0}, "height"),
         ({"height": 1.0, "scale": 2.0}, "scale"),

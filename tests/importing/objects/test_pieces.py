@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import trimesh
-from helpers.downloads import partnet
+from helpers.downloads import write_partnet_object
 
 from vkc_pin.importing.objects.clean_up import load_surfaces, merge_fixed_links
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
@@ -32,7 +32,7 @@ def pieces(description: Description) -> tuple[tuple[Part, ...], tuple[str, ...]]
 
 
 def test_flat_shapes_are_thickened_and_noted(tmp_path: Path) -> None:
-    found = merge_fixed_links(read_object_urdf(partnet(tmp_path)))
+    found = merge_fixed_links(read_object_urdf(write_partnet_object(tmp_path)))
     done = decompose_links(found, load_surfaces(found))
     decoration = next(
         part for part in done.links["link_0"].collision if part.name == "decoration-6"

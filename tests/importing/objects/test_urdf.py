@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.downloads import partnet
+from helpers.downloads import write_partnet_object
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.importing.objects.description import Link
@@ -12,7 +12,7 @@ from vkc_pin.importing.objects.urdf import read_object_urdf
 
 
 def test_missing_values_of_partnet_are_none(tmp_path: Path) -> None:
-    found = read_object_urdf(partnet(tmp_path))
+    found = read_object_urdf(write_partnet_object(tmp_path))
     assert found.root == "base"
     joints = {joint.name: joint for joint in found.joints.values()}
     assert joints["joint_0"].limits == (0.0, 0.36)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.furniture import BAR, flap
+from helpers.furniture import BAR, write_flap
 
 import vkc_pin as vkc
 from vkc_pin.importing.proposals.candidates import Piece, Thickness, find_candidates
@@ -23,7 +23,7 @@ FRONT = np.column_stack(
 @pytest.fixture
 def fitting(tmp_path: Path) -> HandClearance:
     return HandClearance(
-        flap(tmp_path, BAR.format("")), make_hand(vkc.load_robot("husky_ur5e")), 0.02, 0.005
+        write_flap(tmp_path, BAR.format("")), make_hand(vkc.load_robot("husky_ur5e")), 0.02, 0.005
     )
 
 
@@ -82,7 +82,10 @@ def test_clearance_agrees_with_coal(fitting: HandClearance) -> None:
 def grip(folder: Path, **what: str) -> tuple[GraspMotion, Opening, HandClearance]:
     """Return the hand at the middle of the bar, from the front."""
     fitting = HandClearance(
-        flap(folder, BAR.format(""), **what), make_hand(vkc.load_robot("husky_ur5e")), 0.02, 0.005
+        write_flap(folder, BAR.format(""), **what),
+        make_hand(vkc.load_robot("husky_ur5e")),
+        0.02,
+        0.005,
     )
     pieces = {
         1: [

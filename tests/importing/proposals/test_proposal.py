@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from helpers.furniture import BAR, flap
+from helpers.furniture import BAR, write_flap
 
 import vkc_pin as vkc
 
@@ -14,7 +14,7 @@ import vkc_pin as vkc
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> vkc.importing.Proposals:
     return vkc.importing.propose_attachments(
-        flap(tmp_path_factory.mktemp("flap"), BAR.format(' name="handle"'))
+        write_flap(tmp_path_factory.mktemp("flap"), BAR.format(' name="handle"'))
     )
 
 
@@ -22,7 +22,7 @@ def test_descriptions_load_as_the_same_attachments(
     found: vkc.importing.Proposals, tmp_path: Path
 ) -> None:
     written = yaml.safe_dump([proposal.description() for proposal in found.found])
-    loaded = flap(
+    loaded = write_flap(
         tmp_path,
         BAR.format(""),
         attachments=yaml.safe_dump(yaml.safe_load(written), default_flow_style=True).strip(),

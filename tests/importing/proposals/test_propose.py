@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.furniture import BAR, flap
-from helpers.grippers import cheeky_drawer, write_gripper
+from helpers.furniture import BAR, write_flap
+from helpers.grippers import describe_cheeks_drawer, write_gripper
 
 import vkc_pin as vkc
 from vkc_pin.importing.proposals.fitting import HandClearance
@@ -48,7 +48,7 @@ def test_obstructing_door_is_opened_first() -> None:
 
 
 def test_without_handle_the_free_edge_is_grasped(tmp_path: Path) -> None:
-    best = vkc.importing.propose_attachments(flap(tmp_path, behind=0.1)).found[0]
+    best = vkc.importing.propose_attachments(write_flap(tmp_path, behind=0.1)).found[0]
     assert best.kind == "edge"
     assert best.thickness == pytest.approx(0.02)
     assert best.attachment.placement.translation[1] > 0.5
@@ -56,16 +56,16 @@ def test_without_handle_the_free_edge_is_grasped(tmp_path: Path) -> None:
 
 def test_named_handle_is_preferred(tmp_path: Path) -> None:
     other = BAR.replace("-0.08 0.5 0", "-0.08 0.4 0").format(' name="handle"')
-    first = vkc.importing.propose_attachments(flap(tmp_path, BAR.format(""))).found[0]
+    first = vkc.importing.propose_attachments(write_flap(tmp_path, BAR.format(""))).found[0]
     assert not first.named
     assert first.attachment.placement.translation[1] == pytest.approx(0.5)
-    named = vkc.importing.propose_attachments(flap(tmp_path, BAR.format("") + other)).found[0]
+    named = vkc.importing.propose_attachments(write_flap(tmp_path, BAR.format("") + other)).found[0]
     assert named.named
     assert named.attachment.placement.translation[1] == pytest.approx(0.4)
 
 
 def test_thick_object_has_no_attachment(tmp_path: Path) -> None:
-    found = vkc.importing.propose_attachments(flap(tmp_path, thick=0.12))
+    found = vkc.importing.propose_attachments(write_flap(tmp_path, thick=0.12))
     assert found.found == ()
     assert "nothing of it fits between the fingers, 86 mm apart" in found.because["hinge"]
     assert "120 mm at its thinnest" in found.because["hinge"]
@@ -75,16 +75,16 @@ def test_thick_object_has_no_attachment(tmp_path: Path) -> None:
 
 def test_bar_without_clearance_behind_it_is_rejected(tmp_path: Path) -> None:
     flush = BAR.replace("-0.08", "-0.03").format(' name="handle"')
-    found = vkc.importing.propose_attachments(flap(tmp_path, flush, thick=0.09))
+    found = vkc.importing.propose_attachments(write_flap(tmp_path, flush, thick=0.09))
     assert "are not 5 mm from flap" in found.because["hinge"]
 
 
 def test_bar_close_to_the_flap_is_grasped_with_the_fingertips(tmp_path: Path) -> None:
     close = BAR.replace("-0.08", "-0.03").format(' name="handle"')
-    best = vkc.importing.propose_attachments(flap(tmp_path, close)).found[0]
+    best = vkc.importing.propose_attachments(write_flap(tmp_path, close)).found[0]
     assert best.kind == "bar"
     assert best.attachment.standoff > 0.0
-    tight = vkc.importing.propose_attachments(flap(tmp_path, close), grasp_clearance=0.02)
+    tight = vkc.importing.propose_attachments(write_flap(tmp_path, close), grasp_clearance=0.02)
     assert all(proposal.kind != "bar" for proposal in tight.found)
 
 
@@ -101,7 +101,7 @@ def test_invalid_arguments_are_named() -> None:
 
 def test_fingers_close_partly_where_space_is_narrow(tmp_path: Path) -> None:
     """Posts of the drawer's frame stand 60 mm from the middle of its handle, on both sides."""
-    item, robot = vkc.load_object(cheeky_drawer()), vkc.load_robot(write_gripper(tmp_path))
+    item, robot = vkc.load_object(describe_cheeks_drawer()), vkc.load_robot(write_gripper(tmp_path))
     found = vkc.importing.propose_attachments(item, robot)
     best = found.opening("slide")[0]
     assert best.thickness == pytest.approx(0.02)
@@ -114,7 +114,9 @@ def test_fingers_close_partly_where_space_is_narrow(tmp_path: Path) -> None:
     )
     assert fitting.find_obstruction(tool, "front") is None
     assert HandClearance(item, found.hand, 0.02, 0.005).find_obstruction(tool, "front") is not None
-    wide = vkc.importing.propose_attachments(vkc.load_object(cheeky_drawer(gap=0.15)), robot)
+    wide = vkc.importing.propose_attachments(
+        vkc.load_object(describe_cheeks_drawer(gap=0.15)), robot
+    )
     assert wide.found[0].attachment.opening is None
     still = dataclasses.replace(robot, gripper=None)
     assert best.kind not in {

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-from helpers.furniture import BAR, flap
+from helpers.furniture import BAR, write_flap
 
 import vkc_pin as vkc
 from vkc_pin.importing.proposals.candidates import Candidate, Piece
@@ -31,7 +31,7 @@ def opening_of(name_or_path: str | Path) -> Opening:
 
 
 def test_score_depends_on_leverage_side_and_name(tmp_path: Path) -> None:
-    flap(tmp_path, BAR.format(""))
+    write_flap(tmp_path, BAR.format(""))
     hinge = opening_of(tmp_path / "flap.yaml")
     bar = Candidate(
         Piece("flap", "flap_1", np.zeros((0, 3)), np.zeros((0, 3), int)),

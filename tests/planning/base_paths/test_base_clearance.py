@@ -9,13 +9,13 @@ import pytest
 from helpers.base_scenes import (
     BLINK,
     MARGIN,
-    arm,
-    at,
-    between,
-    chassis,
-    clutter,
-    distance,
-    wedge,
+    compute_distance,
+    interpolate_poses,
+    make_arm_shapes,
+    make_chassis,
+    make_clutter,
+    make_pose,
+    make_wedge,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -34,10 +34,14 @@ SEEDS = st.integers(0, 2**32 - 1)
 def scene(seed: int) -> tuple[list[Shape], list[Shape], MovingShapes]:
     """Return random shapes on the base, obstacles, and the moving shapes."""
     rng = np.random.default_rng(seed)
-    shapes = [*chassis(), *arm()[:3], (wedge(), at(0.3, -0.1, 0.6, 0.4))]
+    shapes = [
+        *make_chassis(),
+        *make_arm_shapes()[:3],
+        (make_wedge(), make_pose(0.3, -0.1, 0.6, 0.4)),
+    ]
     standing = [
-        *clutter(int(rng.integers(1000)), 8, reach=1.5),
-        (wedge(), at(*rng.uniform(-1.5, 1.5, 2), 0.3, 1.0)),
+        *make_clutter(int(rng.integers(1000)), 8, reach=1.5),
+        (make_wedge(), make_pose(*rng.uniform(-1.5, 1.5, 2), 0.3, 1.0)),
     ]
     return shapes, standing, MovingShapes(shapes, Obstacles(standing), MARGIN)
 
@@ -50,42 +54,42 @@ def test_drives_and_turns_agree_with_coal() -> None:
         a, yaw = rng.uniform(-2.0, 2.0, 2), rng.uniform(-4.0, 4.0)
         b, end = a + rng.uniform(-1.0, 1.0, 2), yaw + rng.uniform(-2.0, 2.0) * rng.uniform()
         for is_free, poses in (
-            (body.is_drive_free(a, b, yaw), between([*a, yaw], [*b, yaw], length=0.004)),
-            (body.is_turn_free(a, yaw, end), between([*a, yaw], [*a, end], angle=0.004)),
+            (body.is_drive_free(a, b, yaw), interpolate_poses([*a, yaw], [*b, yaw], length=0.004)),
+            (body.is_turn_free(a, yaw, end), interpolate_poses([*a, yaw], [*a, end], angle=0.004)),
         ):
-            nearest = min(distance(shapes, standing, pose) for pose in poses)
+            nearest = min(compute_distance(shapes, standing, pose) for pose in poses)
             assert nearest >= MARGIN - BLINK if is_free else nearest < MARGIN + 0.004
             answers.append(is_free)
     assert 0.2 < np.mean(answers) < 0.8
 
 
 def test_shapes_at_different_heights_form_no_pairs() -> None:
-    table = [(coal.Box(2.0, 2.0, 0.05), at(0.0, 0.0, 0.775))]
-    body = MovingShapes([*chassis(), *arm()], Obstacles(table), MARGIN)
+    table = [(coal.Box(2.0, 2.0, 0.05), make_pose(0.0, 0.0, 0.775))]
+    body = MovingShapes([*make_chassis(), *make_arm_shapes()], Obstacles(table), MARGIN)
     assert 0 not in body.moving
     assert len(body.moving) > 0
-    assert MovingShapes(chassis(), Obstacles(table), MARGIN).is_drive_free(
+    assert MovingShapes(make_chassis(), Obstacles(table), MARGIN).is_drive_free(
         np.zeros(2), np.ones(2), 0.3
     )
 
 
 def test_all_motions_are_free_without_obstacles() -> None:
     for body in (
-        MovingShapes([], Obstacles(clutter(0, 5)), MARGIN),
-        MovingShapes(chassis(), Obstacles([]), MARGIN),
+        MovingShapes([], Obstacles(make_clutter(0, 5)), MARGIN),
+        MovingShapes(make_chassis(), Obstacles([]), MARGIN),
     ):
         assert body.is_drive_free(np.zeros(2), np.ones(2), 0.0)
         assert body.is_turn_free(np.zeros(2), 0.0, 6.0)
 
 
 def test_exit_margins_keep_the_initial_distance() -> None:
-    box = (coal.Box(1.0, 1.0, 1.0), at(1.01, 0.0, 0.5))
+    box = (coal.Box(1.0, 1.0, 1.0), make_pose(1.01, 0.0, 0.5))
     near, far = (
-        (coal.Box(1.0, 1.0, 1.0), at(0.0, 0.845, 0.5)),
-        (coal.Box(1.0, 1.0, 1.0), at(-3.0, 0.0, 0.5)),
+        (coal.Box(1.0, 1.0, 1.0), make_pose(0.0, 0.845, 0.5)),
+        (coal.Box(1.0, 1.0, 1.0), make_pose(-3.0, 0.0, 0.5)),
     )
     body = MovingShapes(
-        [(coal.Box(1.0, 0.67, 0.4), at(0.0, 0.0, 0.2))], Obstacles([box, near, far]), MARGIN
+        [(coal.Box(1.0, 0.67, 0.4), make_pose(0.0, 0.0, 0.2))], Obstacles([box, near, far]), MARGIN
     )
     margins = body.compute_exit_margins(np.zeros(2), 0.0)
     assert margins == pytest.approx([0.01, 0.01, MARGIN], abs=1e-5)
@@ -103,7 +107,7 @@ SHAPES = [
     coal.Capsule(0.2, 0.6),
     coal.Cone(0.3, 0.7),
     coal.Ellipsoid(0.2, 0.3, 0.5),
-    wedge(),
+    make_wedge(),
 ]
 
 

@@ -11,13 +11,13 @@ from helpers.base_scenes import (
     BLINK,
     HALL,
     MARGIN,
-    arm,
-    at,
-    between,
-    chassis,
-    clutter,
-    distance,
-    furniture,
+    compute_distance,
+    interpolate_poses,
+    make_arm_shapes,
+    make_chassis,
+    make_clutter,
+    make_furniture,
+    make_pose,
 )
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -37,7 +37,7 @@ def wall_with_a_gap(width: float, *, height: float = 1.0) -> list[Shape]:
     """A wall along x = 0 from one side of the hall to the other, with a gap around y = 0."""
     side = 5.5 - width / 2
     return [
-        (coal.Box(0.2, side, height), at(0.0, sign * (width + side) / 2, height / 2))
+        (coal.Box(0.2, side, height), make_pose(0.0, sign * (width + side) / 2, height / 2))
         for sign in (-1, 1)
     ]
 
@@ -74,10 +74,10 @@ def check(
                 cost += SIDEWAYS * length
         else:
             cost += TURNING * abs(b[2] - a[2])
-        for pose in between(a, b):
-            assert distance(base, standing, pose) >= MARGIN - BLINK
+        for pose in interpolate_poses(a, b):
+            assert compute_distance(base, standing, pose) >= MARGIN - BLINK
             if min(np.hypot(*(pose[:2] - place[:2])) for place in [start, *goals]) > NEAR + 1e-9:
-                assert distance(carried, standing, pose) >= MARGIN - BLINK
+                assert compute_distance(carried, standing, pose) >= MARGIN - BLINK
     assert path.cost == pytest.approx(cost, abs=1e-9)
 
 
@@ -90,7 +90,7 @@ def find(
     **options: object,
 ) -> BasePath | None:
     """Return the path of a bare base."""
-    grid = BaseGrid(base or chassis(), [], standing, HALL, MARGIN)
+    grid = BaseGrid(base or make_chassis(), [], standing, HALL, MARGIN)
     return shortest_path(grid, start, np.array(goals), **options)  # type: ignore[arg-type]
 
 
@@ -100,8 +100,8 @@ def find(
 @example(955485)  # a move from near the start to near a goal, which in between is near neither
 def test_paths_are_collision_free(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    standing = [*furniture(), *clutter(int(rng.integers(10_000)), 12)]
-    grid = BaseGrid(chassis(), arm(), standing, HALL, MARGIN, near=NEAR)
+    standing = [*make_furniture(), *make_clutter(int(rng.integers(10_000)), 12)]
+    grid = BaseGrid(make_chassis(), make_arm_shapes(), standing, HALL, MARGIN, near=NEAR)
     poses = rng.uniform([-4.5, -4.5, -7.0], [4.5, 4.5, 7.0], size=(100, 3))
     start = next(pose for pose in poses if grid.is_pose_free(*pose))
     goals = poses[-4:]
@@ -109,8 +109,8 @@ def test_paths_are_collision_free(seed: int) -> None:
     assert (path is None) == (plain is None)
     if path is not None and plain is not None:
         assert path.cost <= plain.cost + 1e-9
-        check(path, start, goals, chassis(), arm(), standing)
-        check(plain, start, goals, chassis(), arm(), standing)
+        check(path, start, goals, make_chassis(), make_arm_shapes(), standing)
+        check(plain, start, goals, make_chassis(), make_arm_shapes(), standing)
 
 
 AHEAD = np.arctan2(3.7, 6.1)
@@ -138,12 +138,12 @@ def test_shortest_paths_without_obstacles(poses: list[list[float]], cost: float)
 
 def test_base_drives_sideways_along_a_wall() -> None:
     """In the open it turns instead."""
-    walls: list[Shape] = [(coal.Box(3.0, 0.1, 1.0), at(x, 0.0, 0.5)) for x in (-2.0, 2.0)]
+    walls: list[Shape] = [(coal.Box(3.0, 0.1, 1.0), make_pose(x, 0.0, 0.5)) for x in (-2.0, 2.0)]
     y = 0.05 + 0.335 + 0.03
     start, goals = np.array([-2.0, y, 0.0]), np.array([[2.0, y, 0.0]])
     path = find(walls, start, goals)  # type: ignore[arg-type]
     assert path is not None
-    check(path, start, goals, chassis(), [], walls)
+    check(path, start, goals, make_chassis(), [], walls)
     free = find([], [0.0, 0.0, 0.0], [[0.0, 2.0, 0.0]])
     assert free is not None
     assert free.cost == pytest.approx(2.0 + TURNING * np.pi)
@@ -153,9 +153,9 @@ def test_narrow_gap_is_passed_lengthwise() -> None:
     standing, start, goals = wall_with_a_gap(0.85), [-2.5, 1.0, np.pi / 2], [[2.5, -1.0, np.pi / 2]]
     path = find(standing, start, goals)
     assert path is not None
-    check(path, np.array(start), np.array(goals), chassis(), [], standing)
-    assert find(standing, start, goals, base=chassis(1.0, 0.85)) is None
-    assert find(wall_with_a_gap(1.2), start, goals, base=chassis(1.0, 0.85)) is not None
+    check(path, np.array(start), np.array(goals), make_chassis(), [], standing)
+    assert find(standing, start, goals, base=make_chassis(1.0, 0.85)) is None
+    assert find(wall_with_a_gap(1.2), start, goals, base=make_chassis(1.0, 0.85)) is not None
 
 
 def test_load_does_not_fit_through_a_gap() -> None:
@@ -164,35 +164,39 @@ def test_load_does_not_fit_through_a_gap() -> None:
         np.array([-2.5, 0.0, 0.0]),
         np.array([[2.5, 0.0, 0.0]]),
     )
-    across: list[Shape] = [(coal.Box(0.05, 1.4, 0.05), at(0.4, 0.0, 0.8))]
-    along_it: list[Shape] = [(coal.Box(1.4, 0.05, 0.05), at(0.4, 0.0, 0.8))]
+    across: list[Shape] = [(coal.Box(0.05, 1.4, 0.05), make_pose(0.4, 0.0, 0.8))]
+    along_it: list[Shape] = [(coal.Box(1.4, 0.05, 0.05), make_pose(0.4, 0.0, 0.8))]
     for carried, fits in (([], True), (along_it, True), (across, False)):
-        path = shortest_path(BaseGrid(chassis(), carried, standing, HALL, MARGIN), start, goals)
+        path = shortest_path(
+            BaseGrid(make_chassis(), carried, standing, HALL, MARGIN), start, goals
+        )
         assert (path is not None) == fits
     low = shortest_path(
-        BaseGrid(chassis(), across, wall_with_a_gap(1.0, height=0.6), HALL, MARGIN), start, goals
+        BaseGrid(make_chassis(), across, wall_with_a_gap(1.0, height=0.6), HALL, MARGIN),
+        start,
+        goals,
     )
     assert low is not None  # it passes over
 
 
 def test_only_the_base_counts_near_start_and_goals() -> None:
     """The arm reaches over tables at either end, but does not pass under a third."""
-    rod: list[Shape] = [(coal.Box(0.4, 0.05, 0.4), at(0.6, 0.0, 0.8))]
-    tables = [(coal.Box(1.0, 2.0, 0.1), at(x, 0.0, 0.85)) for x in (-3.5, 3.5)]
+    rod: list[Shape] = [(coal.Box(0.4, 0.05, 0.4), make_pose(0.6, 0.0, 0.8))]
+    tables = [(coal.Box(1.0, 2.0, 0.1), make_pose(x, 0.0, 0.85)) for x in (-3.5, 3.5)]
     start, goals = np.array([-2.5, 0.0, np.pi]), np.array([[2.5, 0.0, 0.0]])
-    grid = BaseGrid(chassis(), rod, tables, HALL, MARGIN, near=NEAR)
+    grid = BaseGrid(make_chassis(), rod, tables, HALL, MARGIN, near=NEAR)
     assert not grid.is_pose_free(*start)
     assert not grid.is_pose_free(*goals[0])
     path = shortest_path(grid, start, goals)
     assert path is not None
-    check(path, start, goals, chassis(), rod, tables)
-    between_them = [*tables, (coal.Box(0.4, 20.0, 0.1), at(0.0, 0.0, 0.85))]
+    check(path, start, goals, make_chassis(), rod, tables)
+    between_them = [*tables, (coal.Box(0.4, 20.0, 0.1), make_pose(0.0, 0.0, 0.85))]
     for standing, near, is_free in (
         (between_them, NEAR, False),
         (between_them, 3.0, True),
         (tables, 0.0, False),
     ):
-        grid = BaseGrid(chassis(), rod, standing, HALL, MARGIN, near=near)
+        grid = BaseGrid(make_chassis(), rod, standing, HALL, MARGIN, near=near)
         assert (shortest_path(grid, start, goals) is not None) == is_free
 
 
@@ -210,11 +214,11 @@ def test_blocked_start_is_left_the_short_way(
     clearance: float,
 ) -> None:
     """The base does not cross the obstacle."""
-    standing: list[Shape] = [(coal.Box(*block, 1.0), at(0.0, 0.0, 0.5))]
+    standing: list[Shape] = [(coal.Box(*block, 1.0), make_pose(0.0, 0.0, 0.5))]
     path = find(standing, [*start, 0.0], [[*goal, 0.0]])
     assert path is not None
-    poses = np.concatenate([between(a, b) for a, b in itertools.pairwise(path.poses)])
-    distances = np.array([distance(chassis(), standing, pose) for pose in poses])
+    poses = np.concatenate([interpolate_poses(a, b) for a, b in itertools.pairwise(path.poses)])
+    distances = np.array([compute_distance(make_chassis(), standing, pose) for pose in poses])
     assert distances[0] == pytest.approx(clearance, abs=0.01)
     assert clearance < 0.0 or distances.min() >= distances[0] - BLINK
     blocked = np.flatnonzero(distances < MARGIN - BLINK)
@@ -226,7 +230,7 @@ def test_blocked_start_is_left_the_short_way(
 
 
 def test_blocked_goals_are_skipped() -> None:
-    block: list[Shape] = [(coal.Box(1.0, 1.0, 1.0), at(2.0, 0.0, 0.5))]
+    block: list[Shape] = [(coal.Box(1.0, 1.0, 1.0), make_pose(2.0, 0.0, 0.5))]
     path = find(block, [0.0, 0.0, 0.0], [[2.0, 0.2, 0.0], [-4.0, 0.0, 1.0]])
     assert path is not None
     assert path.goal == 1
@@ -243,9 +247,9 @@ def test_additional_goal_costs_count() -> None:
 
 def test_tasks_without_a_path() -> None:
     """Goals or start are blocked, or one of them is in a closed room."""
-    block: list[Shape] = [(coal.Box(6.0, 6.0, 1.0), at(0.0, 0.0, 0.5))]
-    room: list[Shape] = [(coal.Box(3.0, 0.1, 1.0), at(0.0, y, 0.5)) for y in (-1.5, 1.5)]
-    room += [(coal.Box(0.1, 3.0, 1.0), at(x, 0.0, 0.5)) for x in (-1.5, 1.5)]
+    block: list[Shape] = [(coal.Box(6.0, 6.0, 1.0), make_pose(0.0, 0.0, 0.5))]
+    room: list[Shape] = [(coal.Box(3.0, 0.1, 1.0), make_pose(0.0, y, 0.5)) for y in (-1.5, 1.5)]
+    room += [(coal.Box(0.1, 3.0, 1.0), make_pose(x, 0.0, 0.5)) for x in (-1.5, 1.5)]
     inside, outside = [0.0, 0.0, 0.0], [4.0, 4.0, 0.0]
     for standing in (block, room):
         assert find(standing, inside, [outside]) is None
@@ -253,13 +257,14 @@ def test_tasks_without_a_path() -> None:
     assert find(room, [0.3, 0.0, 0.0], [[-0.3, 0.0, 2.0]]) is not None
     assert find([], [20.0, 0.0, 0.0], [outside]) is not None  # from outside the arena
     assert (
-        shortest_path(BaseGrid(chassis(), [], [], HALL, MARGIN), inside, np.empty((0, 3))) is None
+        shortest_path(BaseGrid(make_chassis(), [], [], HALL, MARGIN), inside, np.empty((0, 3)))
+        is None
     )
 
 
 @pytest.fixture(scope="module")
 def around_the_block() -> BasePath:
-    path = find(furniture(), [2.0, -4.3, 1.0], [[2.5, 2.8, 0.0], [1.3, 1.0, 0.0]])
+    path = find(make_furniture(), [2.0, -4.3, 1.0], [[2.5, 2.8, 0.0], [1.3, 1.0, 0.0]])
     assert path is not None
     return path
 

@@ -5,24 +5,34 @@ from __future__ import annotations
 import coal
 import numpy as np
 import pytest
-from helpers.base_scenes import HALL, MARGIN, arm, at, chassis, clutter, distance, furniture, wedge
+from helpers.base_scenes import (
+    HALL,
+    MARGIN,
+    compute_distance,
+    make_arm_shapes,
+    make_chassis,
+    make_clutter,
+    make_furniture,
+    make_pose,
+    make_wedge,
+)
 
 from vkc_pin.planning.base_paths.base_clearance import Shape
 from vkc_pin.planning.base_paths.blocked_cells import Lattice, find_colliding_cells
 from vkc_pin.planning.base_paths.grid import BaseGrid
 
 CARRIED = [
-    *arm(),
-    (wedge(), at(0.4, 0.4, 0.6, 0.4)),
-    (coal.Box(0.05, 1.4, 0.05), at(0.3, 0.0, 0.8)),
+    *make_arm_shapes(),
+    (make_wedge(), make_pose(0.4, 0.4, 0.6, 0.4)),
+    (coal.Box(0.05, 1.4, 0.05), make_pose(0.3, 0.0, 0.8)),
 ]
 SCENES = {
-    "furniture": furniture(),
+    "furniture": make_furniture(),
     "clutter": [
-        *furniture(),
-        *clutter(3, 30),
-        (wedge(), at(-3.0, -3.0, 0.4, 1.0)),
-        (coal.Ellipsoid(0.3, 0.2, 0.5), at(0.0, 0.0, 0.5)),
+        *make_furniture(),
+        *make_clutter(3, 30),
+        (make_wedge(), make_pose(-3.0, -3.0, 0.4, 1.0)),
+        (coal.Ellipsoid(0.3, 0.2, 0.5), make_pose(0.0, 0.0, 0.5)),
     ],
 }
 
@@ -30,14 +40,14 @@ SCENES = {
 @pytest.mark.parametrize("name", SCENES)
 def test_found_cells_collide_and_few_are_missed(name: str) -> None:
     standing, rng = SCENES[name], np.random.default_rng(0)
-    grid = BaseGrid(chassis(), CARRIED, standing, HALL, MARGIN)
+    grid = BaseGrid(make_chassis(), CARRIED, standing, HALL, MARGIN)
     blocked, known = np.zeros(2), np.zeros(2)
     for i, j, heading in rng.integers([100, 100, 16], size=(400, 3)).tolist():
         pose = [*grid.center(i, j), grid.yaws[heading]]
         for body, (shapes, mask) in enumerate(
-            ((chassis(), grid.blocked), (CARRIED, grid.carried_blocked))
+            ((make_chassis(), grid.blocked), (CARRIED, grid.carried_blocked))
         ):
-            hit = distance(shapes, standing, pose) < MARGIN
+            hit = compute_distance(shapes, standing, pose) < MARGIN
             assert hit or not mask[i, j, heading]
             blocked[body] += hit
             known[body] += mask[i, j, heading]
@@ -49,9 +59,9 @@ def test_found_cells_collide_and_few_are_missed(name: str) -> None:
 def test_cells_of_a_box_before_a_wall() -> None:
     """Cells are found whose centres are within half the box and the margin."""
     lattice = Lattice(np.array([0.05, 0.05]), np.array([0.1, 0.1]), 20, np.array([0.0, np.pi / 2]))
-    wall: list[Shape] = [(coal.Box(0.2, 10.0, 1.0), at(1.0, 1.0, 0.5))]
+    wall: list[Shape] = [(coal.Box(0.2, 10.0, 1.0), make_pose(1.0, 1.0, 0.5))]
     base, carried = find_colliding_cells(
-        [(coal.Box(0.6, 0.3, 0.4), at(0.0, 0.0, 0.2))], [], wall, lattice, MARGIN
+        [(coal.Box(0.6, 0.3, 0.4), make_pose(0.0, 0.0, 0.2))], [], wall, lattice, MARGIN
     )
     x = 0.05 + 0.1 * np.arange(20)
     for heading, half in ((0, 0.3), (1, 0.15)):
@@ -62,16 +72,16 @@ def test_cells_of_a_box_before_a_wall() -> None:
 
 def test_only_shapes_of_common_heights_collide() -> None:
     lattice = Lattice(np.zeros(2), np.full(2, 0.1), 10, np.array([0.0, np.pi]))
-    table: list[Shape] = [(coal.Box(5.0, 5.0, 0.05), at(0.5, 0.5, 0.775))]
+    table: list[Shape] = [(coal.Box(5.0, 5.0, 0.05), make_pose(0.5, 0.5, 0.775))]
     low, high = (
-        [(coal.Box(0.5, 0.5, 0.4), at(0.0, 0.0, 0.2))],
-        [(coal.Box(0.1, 0.1, 0.4), at(0.0, 0.0, 0.7))],
+        [(coal.Box(0.5, 0.5, 0.4), make_pose(0.0, 0.0, 0.2))],
+        [(coal.Box(0.1, 0.1, 0.4), make_pose(0.0, 0.0, 0.7))],
     )
     base, carried = find_colliding_cells(low, high, table, lattice, MARGIN)
     assert not base.any()
     assert carried.all()
     both, over = find_colliding_cells(
-        low, high, [(coal.Box(5.0, 5.0, 2.0), at(0.5, 0.5, 1.0))], lattice, MARGIN
+        low, high, [(coal.Box(5.0, 5.0, 2.0), make_pose(0.5, 0.5, 1.0))], lattice, MARGIN
     )
     assert both.all()
     assert not over.any()  # within the outline of the base, which collides
@@ -80,11 +90,11 @@ def test_only_shapes_of_common_heights_collide() -> None:
 def test_flat_shapes_and_unknown_ones_are_ignored() -> None:
     lattice = Lattice(np.zeros(2), np.full(2, 0.1), 10, np.array([0.0, np.pi]))
     odd: list[Shape] = [
-        (coal.Ellipsoid(1.0, 1.0, 1.0), at(0.5, 0.5, 0.5)),
-        (coal.Box(3.0, 3.0, 0.0), at(0.5, 0.5, 0.1)),
+        (coal.Ellipsoid(1.0, 1.0, 1.0), make_pose(0.5, 0.5, 0.5)),
+        (coal.Box(3.0, 3.0, 0.0), make_pose(0.5, 0.5, 0.1)),
     ]
     base, _ = find_colliding_cells(
-        [(coal.Box(0.5, 0.5, 0.4), at(0.0, 0.0, 0.2))], [], odd, lattice, MARGIN
+        [(coal.Box(0.5, 0.5, 0.4), make_pose(0.0, 0.0, 0.2))], [], odd, lattice, MARGIN
     )
     assert not base.any()
     nothing, _ = find_colliding_cells([], [], odd, lattice, MARGIN)

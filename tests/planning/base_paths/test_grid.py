@@ -9,13 +9,13 @@ from helpers.base_scenes import (
     BLINK,
     HALL,
     MARGIN,
-    arm,
-    at,
-    between,
-    chassis,
-    clutter,
-    distance,
-    furniture,
+    compute_distance,
+    interpolate_poses,
+    make_arm_shapes,
+    make_chassis,
+    make_clutter,
+    make_furniture,
+    make_pose,
 )
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
@@ -24,12 +24,12 @@ from vkc_pin.planning.base_paths.base_clearance import Shape
 from vkc_pin.planning.base_paths.grid import HEADINGS, BaseGrid
 from vkc_pin.utils.optional_imports import import_compiled
 
-STANDING = [*furniture(), *clutter(2, 20)]
+STANDING = [*make_furniture(), *make_clutter(2, 20)]
 
 
 @pytest.fixture(scope="module")
 def grid() -> BaseGrid:
-    return BaseGrid(chassis(), arm(), STANDING, HALL, MARGIN)
+    return BaseGrid(make_chassis(), make_arm_shapes(), STANDING, HALL, MARGIN)
 
 
 def states(count: int, seed: int) -> list[list[int]]:
@@ -49,7 +49,10 @@ def test_free_cells_and_poses_agree_with_coal(grid: BaseGrid) -> None:
     answers = []
     for i, j, heading in states(200, 0):
         pose = [*grid.center(i, j), grid.yaws[heading]]
-        base, over = distance(chassis(), STANDING, pose), distance(arm(), STANDING, pose)
+        base, over = (
+            compute_distance(make_chassis(), STANDING, pose),
+            compute_distance(make_arm_shapes(), STANDING, pose),
+        )
         assert grid.is_cell_free(i, j, heading, reaching=True) == (base >= MARGIN)
         assert grid.is_cell_free(i, j, heading) == (min(base, over) >= MARGIN)
         assert grid.is_pose_free(*pose) == (min(base, over) >= MARGIN)
@@ -61,7 +64,7 @@ def test_free_cells_and_poses_agree_with_coal(grid: BaseGrid) -> None:
 
 @pytest.mark.parametrize("reaching", [True, False])
 def test_moves_between_cells_agree_with_coal(grid: BaseGrid, reaching: bool) -> None:
-    shapes = chassis() if reaching else [*chassis(), *arm()]
+    shapes = make_chassis() if reaching else [*make_chassis(), *make_arm_shapes()]
     answers = []
     for i, j, heading in states(25, 2):
         if not all(2 <= k < 98 for k in (i, j)):
@@ -74,7 +77,8 @@ def test_moves_between_cells_agree_with_coal(grid: BaseGrid, reaching: bool) -> 
             (grid.is_left_turn_free(i, j, heading, reaching=reaching), [*here, turned]),
         ):
             nearest = min(
-                distance(shapes, STANDING, pose) for pose in between([*here, yaw], end, angle=0.01)
+                compute_distance(shapes, STANDING, pose)
+                for pose in interpolate_poses([*here, yaw], end, angle=0.01)
             )
             assert nearest >= MARGIN - BLINK if free else nearest < MARGIN + 0.01
             answers.append(free)
@@ -107,8 +111,8 @@ def test_distances_use_the_moves_not_known_to_be_blocked(grid: BaseGrid) -> None
 
 
 def test_distances_around_a_wall() -> None:
-    wall: list[Shape] = [(coal.Box(0.1, 8.0, 1.0), at(0.0, -1.0, 0.5))]
-    grid = BaseGrid(chassis(), [], wall, HALL, MARGIN)
+    wall: list[Shape] = [(coal.Box(0.1, 8.0, 1.0), make_pose(0.0, -1.0, 0.5))]
+    grid = BaseGrid(make_chassis(), [], wall, HALL, MARGIN)
     found = grid.compute_distances(np.array([(-2.0, -3.0)]))[0]
     corner = np.array([0.0, 3.0 + 0.335])
     around = np.hypot(*(corner - (-2.0, -3.0))) + np.hypot(*(corner - grid.center(69, 20)))
@@ -126,8 +130,8 @@ def test_distances_around_a_wall() -> None:
 
 def test_distances_from_blocked_positions() -> None:
     for size, is_finite in ((2.0, True), (20.0, False)):
-        block: list[Shape] = [(coal.Box(size, size, 1.0), at(0.0, 0.0, 0.5))]
-        grid = BaseGrid(chassis(), [], block, HALL, MARGIN)
+        block: list[Shape] = [(coal.Box(size, size, 1.0), make_pose(0.0, 0.0, 0.5))]
+        grid = BaseGrid(make_chassis(), [], block, HALL, MARGIN)
         distances = grid.compute_distances(np.array([(0.7, 0.0)]))
         assert np.isfinite(distances).any() == is_finite
 
@@ -140,12 +144,12 @@ def test_moves_out_of_the_arena_are_rejected(grid: BaseGrid) -> None:
 
 
 def test_arena_need_not_be_square() -> None:
-    standing: list[Shape] = [(coal.Box(0.5, 0.5, 1.0), at(4.0, 1.0, 0.5))]
-    grid = BaseGrid(chassis(), [], standing, (0.0, 8.0, -1.0, 3.0), MARGIN, cells=40)
+    standing: list[Shape] = [(coal.Box(0.5, 0.5, 1.0), make_pose(4.0, 1.0, 0.5))]
+    grid = BaseGrid(make_chassis(), [], standing, (0.0, 8.0, -1.0, 3.0), MARGIN, cells=40)
     assert grid.step == pytest.approx([0.2, 0.1])
     for i, j, heading in states(300, 0):
         i, j = i % 40, j % 40
         pose = [*grid.center(i, j), grid.yaws[heading]]
-        free = distance(chassis(), standing, pose) >= MARGIN
+        free = compute_distance(make_chassis(), standing, pose) >= MARGIN
         assert grid.is_cell_free(i, j, heading) == free
         assert not (free and grid.blocked[i, j, heading])

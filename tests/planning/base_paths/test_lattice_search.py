@@ -7,7 +7,7 @@ from collections.abc import Callable
 import coal
 import numpy as np
 import pytest
-from helpers.base_scenes import MARGIN, at, chassis, clutter
+from helpers.base_scenes import MARGIN, make_chassis, make_clutter, make_pose
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
@@ -149,10 +149,16 @@ def task(
 ) -> tuple[BaseGrid, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return a small room with obstacles, a free start, three goals and their costs."""
     rng = np.random.default_rng(seed)
-    rod: list[Shape] = [(coal.Box(0.1, 0.8, 0.05), at(0.2, 0.0, 0.7))]
-    standing = clutter(int(rng.integers(10_000)), 7, reach=1.8)
+    rod: list[Shape] = [(coal.Box(0.1, 0.8, 0.05), make_pose(0.2, 0.0, 0.7))]
+    standing = make_clutter(int(rng.integers(10_000)), 7, reach=1.8)
     grid = BaseGrid(
-        chassis(0.7, 0.4), rod if seed % 2 else [], standing, ROOM, MARGIN, cells=CELLS, near=0.0
+        make_chassis(0.7, 0.4),
+        rod if seed % 2 else [],
+        standing,
+        ROOM,
+        MARGIN,
+        cells=CELLS,
+        near=0.0,
     )
     poses = rng.uniform([-1.8, -1.8, -3.0], [1.8, 1.8, 3.0], size=(200, 3))
     start = next((pose for pose in poses if grid.is_pose_free(*pose)), poses[0])
@@ -193,9 +199,9 @@ def test_earlier_searches_do_not_change_the_result(seed: int) -> None:
 def test_start_and_goal_on_cells() -> None:
     """Connections have zero length and cost at both ends."""
     grid = BaseGrid(
-        chassis(0.7, 0.4),
+        make_chassis(0.7, 0.4),
         [],
-        [(coal.Box(0.2, 2.5, 1.0), at(0.0, -0.75, 0.5))],
+        [(coal.Box(0.2, 2.5, 1.0), make_pose(0.0, -0.75, 0.5))],
         ROOM,
         MARGIN,
         cells=CELLS,
@@ -213,14 +219,14 @@ def test_start_and_goal_on_cells() -> None:
 
 def test_path_much_longer_than_the_heuristic() -> None:
     """The obstacle on the short path is not known in advance."""
-    gate: list[Shape] = [(coal.Box(0.1, 1.4, 1.0), at(0.0, y, 0.5)) for y in (-1.3, 1.3)]
+    gate: list[Shape] = [(coal.Box(0.1, 1.4, 1.0), make_pose(0.0, y, 0.5)) for y in (-1.3, 1.3)]
     lid: list[Shape] = [
-        (coal.Ellipsoid(0.1, 0.6, 0.1), at(0.0, 0.0, 0.3))
+        (coal.Ellipsoid(0.1, 0.6, 0.1), make_pose(0.0, 0.0, 0.3))
     ]  # whose inside is not looked at
-    walls: list[Shape] = [(coal.Box(8.0, 0.1, 1.0), at(0.0, y, 0.5)) for y in (-2.0, 2.0)]
-    sides = [(coal.Box(0.1, 1.4, 1.0), at(0.0, 4.3, 0.5))]
+    walls: list[Shape] = [(coal.Box(8.0, 0.1, 1.0), make_pose(0.0, y, 0.5)) for y in (-2.0, 2.0)]
+    sides = [(coal.Box(0.1, 1.4, 1.0), make_pose(0.0, 4.3, 0.5))]
     grid = BaseGrid(
-        chassis(0.7, 0.4),
+        make_chassis(0.7, 0.4),
         [],
         [*gate, *lid, *walls[:1], *sides],
         (-5.0, 5.0, -5.0, 5.0),

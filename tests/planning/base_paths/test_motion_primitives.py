@@ -5,7 +5,7 @@ from __future__ import annotations
 import coal
 import numpy as np
 import pytest
-from helpers.base_scenes import HALL, MARGIN, at, chassis
+from helpers.base_scenes import HALL, MARGIN, make_chassis, make_pose
 
 from vkc_pin.planning.base_paths.base_clearance import Shape
 from vkc_pin.planning.base_paths.grid import BaseGrid
@@ -30,7 +30,7 @@ def space(
     carried: list[Shape] | None = None,
     near: float = 1.0,
 ) -> SearchSpace:
-    grid = BaseGrid(chassis(), carried or [], standing, HALL, MARGIN, near=near)
+    grid = BaseGrid(make_chassis(), carried or [], standing, HALL, MARGIN, near=near)
     return SearchSpace(grid, START, np.array(goals))
 
 
@@ -82,7 +82,7 @@ def test_connections_reach_the_cells_around() -> None:
 
 
 def test_connections_without_space_to_turn_are_omitted() -> None:
-    walls: list[Shape] = [(coal.Box(4.0, 0.1, 1.0), at(0.0, y, 0.5)) for y in (-0.55, 0.55)]
+    walls: list[Shape] = [(coal.Box(4.0, 0.1, 1.0), make_pose(0.0, y, 0.5)) for y in (-0.55, 0.55)]
     places = space(walls, [[3.0, 0.0, 0.0]])
     turns = np.abs(wrap_angle(2 * places.get_starts().yaw)) / 2  # from driving ahead or back
     assert len(turns) > 0
@@ -91,7 +91,7 @@ def test_connections_without_space_to_turn_are_omitted() -> None:
 
 
 def test_blocked_start_has_exit_margins() -> None:
-    close, over = [(coal.Box(1.0, 1.0, 1.0), at(x, 0.0, 0.5)) for x in (1.01, 0.9)]
+    close, over = [(coal.Box(1.0, 1.0, 1.0), make_pose(x, 0.0, 0.5)) for x in (1.01, 0.9)]
     free, near, inside = (
         space([], [[3.0, 0.0, 0.0]]),
         space([close], [[3.0, 0.0, 0.0]]),
@@ -113,8 +113,8 @@ def test_blocked_start_has_exit_margins() -> None:
 
 
 def test_load_counts_away_from_start_and_goals() -> None:
-    rod: list[Shape] = [(coal.Box(0.05, 2.0, 0.05), at(0.0, 0.0, 0.8))]
-    post: list[Shape] = [(coal.Box(0.1, 0.1, 1.0), at(x, 0.9, 0.5)) for x in (0.0, 2.0)]
+    rod: list[Shape] = [(coal.Box(0.05, 2.0, 0.05), make_pose(0.0, 0.0, 0.8))]
+    post: list[Shape] = [(coal.Box(0.1, 0.1, 1.0), make_pose(x, 0.9, 0.5)) for x in (0.0, 2.0)]
     places = space(post, [[4.0, 0.0, 0.0]], carried=rod)
     assert places.is_pose_free(START)
     assert not places.is_pose_free(np.array([2.0, 0.0, 0.0]))

@@ -9,13 +9,13 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.carrying import room
+from helpers.carrying import make_room
 from helpers.small_problems import (
-    door_scene,
-    full_scene,
-    random_configurations,
-    with_attachment,
-    with_objects,
+    load_door_scene,
+    make_full_scene,
+    replace_attachment,
+    replace_objects,
+    sample_configurations,
 )
 
 from vkc_pin.errors import InputError, UnknownNameError
@@ -111,9 +111,9 @@ def object_state(
 
 
 def test_the_chain_begins_with_the_robot() -> None:
-    scene = full_scene()
+    scene = make_full_scene()
     chain, robot = consolidate(scene, GRASPS[-1]), scene.robot
-    for z in random_configurations(chain.lower, chain.upper, 4, np.random.default_rng(0)):
+    for z in sample_configurations(chain.lower, chain.upper, 4, np.random.default_rng(0)):
         q, q_robot = chain.coordinates.q(z), robot.coordinates.q(z[: robot.coordinates.size])
         of_chain, of_robot = frames(chain.model, q), frames(robot.model, q_robot)
         for index, frame in enumerate(robot.model.frames):
@@ -142,7 +142,7 @@ def test_the_chain_begins_with_the_robot() -> None:
 def test_names_and_limits_follow_the_joints(
     grasps: dict[str, str], added: list[str], limits: list[tuple[float, float, float, float]]
 ) -> None:
-    scene = full_scene()
+    scene = make_full_scene()
     chain, robot = consolidate(scene, grasps), scene.robot
     size = robot.coordinates.size
     assert chain.names == (*robot.coordinates.names, *added)
@@ -162,7 +162,7 @@ def test_names_and_limits_follow_the_joints(
 
 
 def test_geometry_is_that_of_the_robot_and_of_moving_links() -> None:
-    scene = full_scene()
+    scene = make_full_scene()
     held = {
         Hold("door", "handle"): ["panel_0", "lever_0", "lever_1"],
         Hold("cabinet", "grip"): ["arm_0", "tray_0", "tray_1", "flap_0"],
@@ -181,8 +181,8 @@ def test_geometry_is_that_of_the_robot_and_of_moving_links() -> None:
 
 
 def test_joint_placements_equal_pinocchio() -> None:
-    chain = consolidate(full_scene(), GRASPS[-1])
-    z = random_configurations(chain.lower, chain.upper, 10, np.random.default_rng(3))
+    chain = consolidate(make_full_scene(), GRASPS[-1])
+    z = sample_configurations(chain.lower, chain.upper, 10, np.random.default_rng(3))
     rotations, translations = chain.joint_placements(z)
     assert rotations.shape == (10, chain.model.njoints, 3, 3)
     assert translations.shape == (10, chain.model.njoints, 3)
@@ -199,7 +199,7 @@ def test_joint_placements_equal_pinocchio() -> None:
 
 
 def test_chain_without_holds_is_the_robot() -> None:
-    scene = door_scene()
+    scene = load_door_scene()
     before = scene.robot.model.copy()
     consolidate(scene, {"door": "handle_free"})
     chain = consolidate(scene, {})
@@ -210,7 +210,7 @@ def test_chain_without_holds_is_the_robot() -> None:
 
 
 def test_unknown_names_are_rejected() -> None:
-    scene = full_scene()
+    scene = make_full_scene()
     with pytest.raises(UnknownNameError, match=r"dor.*door"):
         consolidate(scene, {"dor": "handle"})
     with pytest.raises(UnknownNameError, match=r"handel.*handle"):
@@ -220,9 +220,9 @@ def test_unknown_names_are_rejected() -> None:
 
 
 def test_attachment_named_like_a_joint_is_rejected() -> None:
-    scene = full_scene()
+    scene = make_full_scene()
     bar = dataclasses.replace(scene.objects["door"].object.attachments["handle_free"], name="hinge")
-    twice = with_objects(scene, {"door": with_attachment(scene.objects["door"], bar)})
+    twice = replace_objects(scene, {"door": replace_attachment(scene.objects["door"], bar)})
     with pytest.raises(InputError, match=r"door\.hinge"):
         consolidate(twice, {"door": "hinge"})
 
@@ -253,8 +253,8 @@ CARRIED = [
 @cache
 def carried_scene() -> Scene:
     """Return stick, ball, and a cabinet that can be carried away."""
-    scene, case = room(objects=("stick", "ball")), full_scene().objects["cabinet"]
-    return with_objects(
+    scene, case = make_room(objects=("stick", "ball")), make_full_scene().objects["cabinet"]
+    return replace_objects(
         scene,
         {"cabinet": dataclasses.replace(case, object=dataclasses.replace(case.object, free=True))},
     )
@@ -288,7 +288,7 @@ def expected_frames(
     ("scene", "holds"),
     [
         *((carried_scene, holds) for holds in CARRIED),
-        *((full_scene, tuple(map(Hold, grasps, grasps.values()))) for grasps in GRASPS),
+        *((make_full_scene, tuple(map(Hold, grasps, grasps.values()))) for grasps in GRASPS),
     ],
     ids=lambda value: " ".join(map(str, value)) if isinstance(value, tuple) else value.__name__,
 )
@@ -296,7 +296,7 @@ def test_objects_follow_hand_and_grasp(scene: Callable[[], Scene], holds: tuple[
     objects, chain = scene().objects, consolidate(scene(), holds)
     for table in (chain.closures, chain.held_geometries, chain.virtual, chain.prefixes):
         assert tuple(table) == holds
-    for z in random_configurations(chain.lower, chain.upper, 3, np.random.default_rng(4)):
+    for z in sample_configurations(chain.lower, chain.upper, 3, np.random.default_rng(4)):
         q = chain.coordinates.q(z)
         of_shapes, data = shapes(chain.model, chain.collision, q), chain.model.createData()
         pin.forwardKinematics(chain.model, data, q)
@@ -321,7 +321,7 @@ def test_objects_follow_hand_and_grasp(scene: Callable[[], Scene], holds: tuple[
 def test_all_links_of_a_free_object_move() -> None:
     free, fixed = (
         consolidate(scene, [Hold("cabinet", "grip")]).collision.geometryObjects
-        for scene in (carried_scene(), full_scene())
+        for scene in (carried_scene(), make_full_scene())
     )
     names = {shape.name for shape in free} - {shape.name for shape in fixed}
     assert names == {"cabinet.case_0", "cabinet.lid_0"}

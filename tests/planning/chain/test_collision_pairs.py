@@ -11,12 +11,12 @@ import pinocchio as pin
 import pytest
 from helpers.small_problems import (
     SHORT,
-    door_scene,
-    full_scene,
-    margins_at,
-    program_of,
-    with_attachment,
-    with_objects,
+    get_margins,
+    load_door_scene,
+    make_full_scene,
+    make_program,
+    replace_attachment,
+    replace_objects,
 )
 
 from vkc_pin.errors import InputError
@@ -38,8 +38,8 @@ MARGIN, CLOSE = SHORT.dist_safe, SHORT.grasp_clearance
 @cache
 def door_problem() -> TrajectoryProblem:
     """Return the problem of opening the door and driving away: reach, turn, move, go to."""
-    return program_of(
-        door_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(0.0, 0.0)], options=SHORT
+    return make_program(
+        load_door_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(0.0, 0.0)], options=SHORT
     )
 
 
@@ -50,7 +50,9 @@ def pairs(
     part = problem.contacts.phases[phase]
     every = np.arange(len(part.pairs))
     margins = (
-        part.margins if waypoint is None else margins_at(part, every, np.full(len(every), waypoint))
+        part.margins
+        if waypoint is None
+        else get_margins(part, every, np.full(len(every), waypoint))
     )
     found = collections.defaultdict(list)
     for (first, second), margin in zip(part.pairs, margins, strict=True):
@@ -121,12 +123,12 @@ def test_attachment_sets_the_clearance_of_hand_and_object(
     own: float | None, expected: float
 ) -> None:
     """It never exceeds the usual margin, and does not apply to anything else."""
-    scene = door_scene()
+    scene = load_door_scene()
     placed = scene.objects["door"]
     handle = dataclasses.replace(placed.object.attachments["handle"], name="near", clearance=own)
     steps = [Actuate("door", {"hinge": 1.2}, "near"), GoTo(0.0, 0.0)]
-    problem = program_of(
-        with_objects(scene, {"door": with_attachment(placed, handle)}), steps, options=SHORT
+    problem = make_program(
+        replace_objects(scene, {"door": replace_attachment(placed, handle)}), steps, options=SHORT
     )
     hand, begins = set(scene.robot.touch_links), problem.contacts.first_waypoint
     for phase, at in ((0, begins[1]), (1, begins[2]), (3, begins[3])):
@@ -148,7 +150,7 @@ def test_objects_stay_where_earlier_phases_left_them() -> None:
 
 def test_grasped_object_is_paired_with_other_objects() -> None:
     """Its branches that do not move, case and lid, are obstacles to the robot only."""
-    problem = program_of(full_scene(), [Actuate("cabinet", {"swing": 0.5})], options=SHORT)
+    problem = make_program(make_full_scene(), [Actuate("cabinet", {"swing": 0.5})], options=SHORT)
     robot, held = set(problem.scene.robot.links), {f"cabinet.{k}" for k in ("arm", "tray", "flap")}
     others = {"door.frame", "door.panel", "door.lever", "drawer.cabinet", "drawer.tray"}
     others |= set(problem.scene.obstacle_names)
@@ -163,12 +165,12 @@ def test_grasped_object_is_paired_with_other_objects() -> None:
 
 def test_links_of_a_grasped_object_that_can_collide_are_paired() -> None:
     meeting = frozenset({frozenset({"arm", "flap"}), frozenset({"tray", "lid"})})
-    placed = full_scene().objects["cabinet"]
+    placed = make_full_scene().objects["cabinet"]
     placed = dataclasses.replace(
         placed, object=dataclasses.replace(placed.object, own_pairs=meeting)
     )
-    scene = with_objects(full_scene(), {"cabinet": placed})
-    found = pairs(program_of(scene, [Actuate("cabinet", {"swing": 0.5})], options=SHORT), 1)
+    scene = replace_objects(make_full_scene(), {"cabinet": placed})
+    found = pairs(make_program(scene, [Actuate("cabinet", {"swing": 0.5})], options=SHORT), 1)
     own = {key: found[key] for key in found if all(k.startswith("cabinet.") for k in key)}
     assert {frozenset(link.removeprefix("cabinet.") for link in key) for key in own} == meeting
     assert all(set(margins) == {MARGIN} for margins in own.values())
@@ -176,7 +178,7 @@ def test_links_of_a_grasped_object_that_can_collide_are_paired() -> None:
 
 def test_objects_grasped_one_after_the_other() -> None:
     steps = [Grasp("door"), Actuate("drawer", {"slide": 0.2})]
-    problem = program_of(full_scene(), steps, options=SHORT)
+    problem = make_program(make_full_scene(), steps, options=SHORT)
     phases = problem.task.phases
     assert [phase.held for phase in phases] == [(), (), (Hold("drawer", "handle"),)]
     for phase, part in zip(phases, problem.contacts.phases, strict=True):
@@ -192,17 +194,17 @@ def test_objects_grasped_one_after_the_other() -> None:
 
 
 def test_scene_without_collision_geometry_is_rejected() -> None:
-    scene = door_scene()
+    scene = load_door_scene()
     robot = dataclasses.replace(scene.robot, collision=pin.GeometryModel())
     empty = dataclasses.replace(scene, robot=robot, objects={}, obstacles=(), obstacle_labels=())
     with pytest.raises(InputError, match="no pair"):
-        program_of(empty, [GoTo(0.0, 0.0)], options=SHORT)
+        make_program(empty, [GoTo(0.0, 0.0)], options=SHORT)
 
 
 def test_margins_follow_the_options() -> None:
     options = Options(dist_safe=0.05, self_distance=0.03, grasp_clearance=0.01, reach_waypoints=2)
     for steps in ([GoTo(0.0, 0.0)], [Grasp("door", "handle_free")]):
-        problem = program_of(door_scene(), steps, options=options)
+        problem = make_program(load_door_scene(), steps, options=options)
         margins = {margin for found in pairs(problem, 0, waypoint=2).values() for margin in found}
         assert margins == {0.05, 0.03, *([0.01] if isinstance(steps[0], Grasp) else [])}
 
@@ -219,7 +221,7 @@ def drawers(*, opening: float = 0.0) -> Scene:
 
 def moving(scene: Scene, slide: float = 0.3) -> tuple[TrajectoryProblem, int]:
     """Return the problem of moving the near drawer, and the phase in which it moves."""
-    problem = program_of(scene, [Actuate("near", {"slide": slide})], options=SHORT)
+    problem = make_program(scene, [Actuate("near", {"slide": slide})], options=SHORT)
     (number,) = (k for k, part in enumerate(problem.task.phases) if part.name.startswith("move"))
     return problem, number
 

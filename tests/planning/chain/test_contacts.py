@@ -10,11 +10,11 @@ import pinocchio as pin
 import pytest
 from helpers.small_problems import (
     SHORT,
-    all_pairs,
-    door_scene,
-    margins_at,
-    program_of,
-    random_configurations,
+    get_margins,
+    load_door_scene,
+    make_all_pairs,
+    make_program,
+    sample_configurations,
 )
 
 from vkc_pin.planning.chain.collision_pairs import build_phase_geometries
@@ -29,15 +29,15 @@ COAL = 5e-6  # [m], differences between distances of coal, which depend on its l
 @cache
 def door_problem() -> TrajectoryProblem:
     """Return the problem of opening the door and driving away: reach, turn, move, go to."""
-    return program_of(
-        door_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(0.0, 0.0)], options=SHORT
+    return make_program(
+        load_door_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(0.0, 0.0)], options=SHORT
     )
 
 
 def all_distances(problem: TrajectoryProblem, phase: int, z: np.ndarray) -> np.ndarray:
     """Return the signed distance of every pair at every configuration from coal, shape (W, P)."""
     part = problem.contacts.phases[phase]
-    geometry, model = all_pairs(part), problem.chain.model
+    geometry, model = make_all_pairs(part), problem.chain.model
     data, placed = model.createData(), pin.GeometryData(geometry)
     for k in range(len(geometry.collisionPairs)):
         placed.distanceRequests[k].gjk_tolerance = 1e-8
@@ -53,7 +53,7 @@ def all_distances(problem: TrajectoryProblem, phase: int, z: np.ndarray) -> np.n
 def sampled(phase: int) -> tuple[np.ndarray, np.ndarray]:
     """Return random configurations of the door problem and the distances of all pairs there."""
     problem = door_problem()
-    z = random_configurations(
+    z = sample_configurations(
         problem.chain.lower, problem.chain.upper, 120, np.random.default_rng(phase)
     )
     return z, all_distances(problem, phase, z)
@@ -78,7 +78,7 @@ def test_all_pairs_within_reach_are_found_with_their_distances(phase: int) -> No
         contacts.distance, distances[contacts.waypoint, which], rtol=0.0, atol=COAL
     )
     np.testing.assert_array_equal(
-        contacts.margin, margins_at(part, which, waypoints[contacts.waypoint])
+        contacts.margin, get_margins(part, which, waypoints[contacts.waypoint])
     )
     # d = n·(b − a), and n is a unit vector.
     np.testing.assert_allclose(np.linalg.norm(contacts.normal, axis=1), 1.0, atol=1e-9)
@@ -205,7 +205,7 @@ def test_evaluations_are_charged_to_the_budget() -> None:
     problem = door_problem()
     z = np.tile(problem.start, (5, 1))
     inside = z.copy()
-    inside[2:, :2] = door_scene().objects["door"].placement.translation[:2]
+    inside[2:, :2] = load_door_scene().objects["door"].placement.translation[:2]
     for evaluate, expected in (
         (lambda: problem.contacts.evaluate(z, np.ones(5, int), reach=0.1), 5),
         (lambda: problem.contacts.find_first_collision(z, 1, reach=0.0, allowed=1.0), 5),
@@ -216,4 +216,4 @@ def test_evaluations_are_charged_to_the_budget() -> None:
         assert budget.evaluations == expected
     assert found == 2
     with Budget(seconds=0.0).activate(), pytest.raises(BudgetExhaustedError):
-        build_phase_geometries(door_scene(), problem.chain, problem.task, SHORT)
+        build_phase_geometries(load_door_scene(), problem.chain, problem.task, SHORT)

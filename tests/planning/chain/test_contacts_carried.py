@@ -6,8 +6,8 @@ from functools import cache
 
 import numpy as np
 import pinocchio as pin
-from helpers.carrying import STICK, lifted, room, stand, table
-from helpers.small_problems import SHORT, margins_at, program_of, random_configurations
+from helpers.carrying import STICK, describe_stand, describe_table, lift, make_room
+from helpers.small_problems import SHORT, get_margins, make_program, sample_configurations
 
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.world.scene.obstacles import FLOOR
@@ -16,19 +16,19 @@ from vkc_pin.world.task.steps import GoTo, Grasp, Place, Reach, Release
 
 COAL = 5e-6  # [m], differences between distances of coal, which depend on its last query
 MARGIN, CLOSE = SHORT.dist_safe, SHORT.grasp_clearance
-ASIDE = lifted(STICK, [0.0, 0.5, 0.0])
+ASIDE = lift(STICK, [0.0, 0.5, 0.0])
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
 
 
 @cache
 def scene() -> Scene:
-    return room(table(gap=0.05), stand(gap=0.05), objects=("stick", "ball"))
+    return make_room(describe_table(gap=0.05), describe_stand(gap=0.05), objects=("stick", "ball"))
 
 
 @cache
 def placing() -> TrajectoryProblem:
     """Return the problem of taking the stick, putting it elsewhere, and driving away."""
-    return program_of(scene(), [Place("stick", ASIDE), GoTo(0.0, 0.0)], options=SHORT)
+    return make_program(scene(), [Place("stick", ASIDE), GoTo(0.0, 0.0)], options=SHORT)
 
 
 @cache
@@ -41,7 +41,7 @@ def fetching() -> TrajectoryProblem:
         Release("ball"),
         GoTo(0.0, 0.0),
     ]
-    return program_of(
+    return make_program(
         scene(), [*steps, Place("stick", (0.8, 0.0, 0.6)), GoTo(1.0, 0.0)], options=SHORT
     )
 
@@ -56,7 +56,7 @@ def margins(
     )
     found: dict[tuple[str, str], set[float]] = {}
     waypoint = problem.contacts.first_waypoint[phase + (at == "last")]
-    asked = margins_at(part, every, np.full(len(every), waypoint)) if at else part.margins
+    asked = get_margins(part, every, np.full(len(every), waypoint)) if at else part.margins
     for (first, second), margin in zip(part.pairs, asked, strict=True):
         found.setdefault((part.labels[first], part.labels[second]), set()).add(float(margin))
     return found
@@ -113,7 +113,7 @@ def expected_placement(problem: TrajectoryProblem, name: str, row: np.ndarray) -
 
 def test_released_placements_do_not_depend_on_earlier_queries() -> None:
     problem = fetching()
-    z = random_configurations(
+    z = sample_configurations(
         problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(4)
     )
     waypoints = np.arange(1, problem.segments + 1)
@@ -130,7 +130,7 @@ def test_released_placements_do_not_depend_on_earlier_queries() -> None:
 def test_distances_equal_those_of_the_scene_after_the_release() -> None:
     """Compares with a problem of the last phase alone, in the scene that the motion leaves."""
     problem = fetching()
-    z = random_configurations(
+    z = sample_configurations(
         problem.chain.lower,
         problem.chain.upper,
         problem.segments,
@@ -141,7 +141,7 @@ def test_distances_equal_those_of_the_scene_after_the_release() -> None:
     stands = scene()
     for name, end in (("ball", problem.ends[2]), ("stick", problem.ends[4])):
         stands = stands.with_placement(name, expected_placement(problem, name, z[end - 1]))
-    alone = program_of(stands, [GoTo(1.0, 0.0)], options=SHORT)
+    alone = make_program(stands, [GoTo(1.0, 0.0)], options=SHORT)
     rows = np.arange(problem.ends[4], problem.ends[5])
     seen = alone.contacts.evaluate(
         z[rows][:, : alone.chain.size], np.ones(len(rows), int), reach=0.3

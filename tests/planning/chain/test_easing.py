@@ -10,17 +10,17 @@ import pytest
 from helpers.carrying import (
     STICK,
     TOP,
-    above,
-    box,
-    lifted,
-    moved_base,
-    reaching,
-    room,
-    table,
-    tool_at,
+    compute_grasp_pose,
+    describe_box,
+    describe_table,
+    lift,
+    make_room,
+    move_base,
+    solve_above,
+    solve_reach,
 )
-from helpers.riding import cup, plates, scene_of
-from helpers.small_problems import SHORT, margins_at, program_of
+from helpers.riding import describe_cup, make_plate_scene, make_scene
+from helpers.small_problems import SHORT, get_margins, make_program
 
 from vkc_pin.planning.chain.easing import REDUCED_MARGIN_RATIO
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
@@ -33,11 +33,11 @@ GAP = 4e-3  # [m] of what the stick lies on
 NEAR = SHORT.steps(CONTACT_WINDOW)
 LONG = dataclasses.replace(SHORT, reach_waypoints=2 * NEAR + 3)
 N = LONG.reach_waypoints
-ASIDE = lifted(STICK, [0.0, 0.5, 0.0])
+ASIDE = lift(STICK, [0.0, 0.5, 0.0])
 
 
 def problem(scene: Scene, *steps: Step) -> TrajectoryProblem:
-    return program_of(scene, steps, options=LONG)
+    return make_program(scene, steps, options=LONG)
 
 
 def margins(p: TrajectoryProblem, phase: int) -> dict[tuple[str, str], np.ndarray]:
@@ -46,7 +46,7 @@ def margins(p: TrajectoryProblem, phase: int) -> dict[tuple[str, str], np.ndarra
     waypoints = range(first, first + p.task.phases[phase].segments + 1)
     found: dict[tuple[str, str], np.ndarray] = {}
     for k, pair in enumerate(part.pairs.tolist()):
-        row = margins_at(part, np.full(len(waypoints), k), np.array(waypoints))
+        row = get_margins(part, np.full(len(waypoints), k), np.array(waypoints))
         assert k in part.reduced_margins or (row == part.margins[k]).all()
         if k in part.reduced_margins and part.labels[pair[0]] not in p.scene.robot.touch_links:
             key = (part.labels[pair[0]], part.labels[pair[1]])
@@ -67,16 +67,16 @@ def assert_reduced(
 
 
 def test_margins_are_not_reduced_without_need() -> None:
-    p = problem(room(table(gap=GAP)), GoTo(0.0, 1.0))
+    p = problem(make_room(describe_table(gap=GAP)), GoTo(0.0, 1.0))
     assert margins(p, 0) == {}
-    far = problem(room(table(gap=0.03)), Place("stick", ASIDE))
+    far = problem(make_room(describe_table(gap=0.03)), Place("stick", ASIDE))
     assert [margins(far, phase) for phase in (0, 1)] == [{}, {}]
 
 
 def test_margins_are_reduced_where_objects_are_lifted_and_placed() -> None:
     """Placed elsewhere, or grasped again, an object has its margins reduced there."""
     steps = [Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 1.0)]
-    p = problem(room(table(gap=GAP)), *steps)
+    p = problem(make_room(describe_table(gap=GAP)), *steps)
     names = ["reach stick.grip", "place stick", "reach stick.grip", "go to"]
     assert [phase.name for phase in p.task.phases] == names
     assert [margins(p, phase) for phase in (0, 2)] == [{}, {}]
@@ -87,8 +87,8 @@ def test_margins_are_reduced_where_objects_are_lifted_and_placed() -> None:
 
 
 def test_margin_is_half_the_distance_of_each_shape() -> None:
-    wall = box("wall", [0.3, 0.02, 0.3], [0.8, 0.25 + 0.01 + 0.01, TOP + 0.1])
-    p = problem(room(table(gap=GAP), wall), Place("stick", ASIDE))
+    wall = describe_box("wall", [0.3, 0.02, 0.3], [0.8, 0.25 + 0.01 + 0.01, TOP + 0.1])
+    p = problem(make_room(describe_table(gap=GAP), wall), Place("stick", ASIDE))
     part, first = p.contacts.phases[1], int(p.contacts.first_waypoint[1])
     eased = {
         (part.shapes[i].name, part.labels[j]): [*part.reduced_margins[k]]
@@ -112,7 +112,9 @@ def test_margin_is_half_the_distance_of_each_shape() -> None:
 def test_duration_of_reduced_margins_does_not_depend_on_the_time_step() -> None:
     fine = dataclasses.replace(LONG, dt=LONG.dt / 2, reach_waypoints=2 * N)
     for options in (LONG, fine):
-        p = program_of(room(table(gap=GAP)), [Place("stick", ASIDE)], options=options)
+        p = make_program(
+            make_room(describe_table(gap=GAP)), [Place("stick", ASIDE)], options=options
+        )
         first, reduced = p.contacts.first_waypoint[1], p.contacts.phases[1].reduced_margins
         spans = {(begin - first, end - first) for row in reduced.values() for begin, end, _ in row}
         assert {(begin * options.dt, end * options.dt) for begin, end in spans} == {
@@ -123,7 +125,9 @@ def test_duration_of_reduced_margins_does_not_depend_on_the_time_step() -> None:
 
 @pytest.mark.parametrize("gap", [0.0, -1e-3])
 def test_initial_penetration_may_be_left_but_not_entered(gap: float) -> None:
-    p = problem(room(table(gap=gap)), Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 0.0))
+    p = problem(
+        make_room(describe_table(gap=gap)), Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 0.0)
+    )
     found = margins(p, 1)["stick.stick", "table"]
     np.testing.assert_allclose(found[: NEAR + 1], gap, rtol=0.0, atol=1e-6)
     assert_reduced(np.append(np.zeros(NEAR + 1), found[NEAR + 1 :]), 0.0, begin=True, end=True)
@@ -131,9 +135,9 @@ def test_initial_penetration_may_be_left_but_not_entered(gap: float) -> None:
 
 
 def test_margins_are_reduced_to_the_object_below_only() -> None:
-    other = box("other", [0.5, 0.6, 0.02], [0.8, 1.0, TOP - GAP - 0.01])
-    small = box("table", [0.5, 0.7, 0.02], [0.8, 0.0, TOP - GAP - 0.01])
-    p = problem(room(small, other), Place("stick", lifted(STICK, [0.0, 1.0, 0.0])))
+    other = describe_box("other", [0.5, 0.6, 0.02], [0.8, 1.0, TOP - GAP - 0.01])
+    small = describe_box("table", [0.5, 0.7, 0.02], [0.8, 0.0, TOP - GAP - 0.01])
+    p = problem(make_room(small, other), Place("stick", lift(STICK, [0.0, 1.0, 0.0])))
     found = margins(p, 1)
     assert set(found) == {("stick.stick", "table"), ("stick.stick", "other")}
     assert_reduced(found["stick.stick", "table"], REDUCED_MARGIN_RATIO * GAP, begin=True)
@@ -144,19 +148,24 @@ def test_margins_are_reduced_to_the_object_below_only() -> None:
     ("gap", "margin"), [(GAP, REDUCED_MARGIN_RATIO * GAP), (0.0, 0.0), (-1e-3, -1e-3)]
 )
 def test_object_grasped_at_the_start_may_leave_its_support(gap: float, margin: float) -> None:
-    scene, row = room(table(gap=gap)), reaching(tool_at(STICK), above(STICK))
+    scene, row = (
+        make_room(describe_table(gap=gap)),
+        solve_reach(compute_grasp_pose(STICK), solve_above(STICK)),
+    )
     held = scene.with_start(base=row[:3], arm=row[3:]).with_held({"stick": "grip"})
     found = margins(problem(held, GoTo(0.0, 1.0), GoTo(0.0, 0.0)), 0)
     assert set(found) == {("stick.stick", "table")}
     assert_reduced(found["stick.stick", "table"], margin, begin=True)
     assert margins(problem(held, GoTo(0.0, 1.0), GoTo(0.0, 0.0)), 1) == {}
-    raised = held.with_start(base=moved_base(row, x=-0.1)[:3], arm=above(STICK)[3:])
+    raised = held.with_start(base=move_base(row, x=-0.1)[:3], arm=solve_above(STICK)[3:])
     assert margins(problem(raised, GoTo(0.0, 1.0)), 0) == {}
 
 
 def test_margins_of_supported_objects_are_reduced_where_transport_begins() -> None:
     options = dataclasses.replace(LONG, move_waypoints=N)
-    p = program_of(plates(cups=1, wall=0.01), [Actuate("plate", {"slide": 0.3})], options=options)
+    p = make_program(
+        make_plate_scene(cups=1, wall=0.01), [Actuate("plate", {"slide": 0.3})], options=options
+    )
     (number,) = (k for k, phase in enumerate(p.task.phases) if phase.supported)
     row = margins(p, number)["cup.cup", "wall"]
     assert row[0] == pytest.approx(REDUCED_MARGIN_RATIO * 0.01, abs=1e-4)
@@ -167,10 +176,10 @@ def test_margins_of_objects_on_a_tray_are_reduced_where_it_is_lifted() -> None:
     """A cup on a tray is 1 cm in front of a wall; there is none where the tray is placed."""
     things = [
         {"name": "tray", "type": "tray.yaml", "position": [0.8, 0.0, 0.7]},
-        cup(at=(0.82, 0.05, 0.72)),
+        describe_cup(at=(0.82, 0.05, 0.72)),
     ]
     p = problem(
-        scene_of(things, [box("wall", [0.02, 0.02, 0.05], [0.875, 0.05, 0.78])]),
+        make_scene(things, [describe_box("wall", [0.02, 0.02, 0.05], [0.875, 0.05, 0.78])]),
         Place("tray", (-0.5, -1.5, 0.7)),
     )
     (number,) = (k for k, phase in enumerate(p.task.phases) if phase.supported)
@@ -181,15 +190,17 @@ def test_margins_of_objects_on_a_tray_are_reduced_where_it_is_lifted() -> None:
 
 def test_short_phases_begin_and_end_with_reduced_margins() -> None:
     options = dataclasses.replace(SHORT, reach_waypoints=NEAR)
-    p = program_of(
-        room(table(gap=GAP)), [Place("stick", lifted(STICK, [0.0, 0.5, -GAP]))], options=options
+    p = make_program(
+        make_room(describe_table(gap=GAP)),
+        [Place("stick", lift(STICK, [0.0, 0.5, -GAP]))],
+        options=options,
     )
     np.testing.assert_allclose(margins(p, 1)["stick.stick", "table"], np.zeros(NEAR + 1), atol=1e-6)
 
 
 def test_margins_to_the_floor_are_reduced() -> None:
     low = pin.SE3(np.eye(3), np.array([0.8, 0.0, 0.051]))
-    p = problem(room(), Place("stick", low))
+    p = problem(make_room(), Place("stick", low))
     found = margins(p, 1)
     assert set(found) == {("stick.stick", FLOOR)}
     assert_reduced(found["stick.stick", FLOOR], REDUCED_MARGIN_RATIO * 1e-3, end=True)
@@ -200,8 +211,8 @@ def test_margins_to_the_floor_are_reduced() -> None:
 )
 def test_margins_are_reduced_before_and_after_a_touch(gap: float, margin: float | None) -> None:
     point = np.array([0.8, 0.7, 0.75])
-    wall = box("wall", [0.3, 0.1, 0.3], point + np.array([0.0, gap + 0.05, 0.0]))
-    scene = room(wall).with_held({"stick": "grip"})
+    wall = describe_box("wall", [0.3, 0.1, 0.3], point + np.array([0.0, gap + 0.05, 0.0]))
+    scene = make_room(wall).with_held({"stick": "grip"})
     p = problem(scene, Touch("stick.tip", point), GoTo(0.0, 0.0), GoTo(0.0, 1.0))
     for phase, where in ((0, {"end": True}), (1, {"begin": True}), (2, {})):
         found = margins(p, phase)
@@ -211,7 +222,7 @@ def test_margins_are_reduced_before_and_after_a_touch(gap: float, margin: float 
 
 
 def test_margins_are_reduced_for_touches_but_not_for_poses() -> None:
-    scene = room(table(gap=GAP)).with_held({"stick": "grip"})
+    scene = make_room(describe_table(gap=GAP)).with_held({"stick": "grip"})
     reach = Touch("forearm_link", (0.8, 0.0, TOP))
     found = margins(problem(scene, reach), 0)
     assert {first for first, _ in found} == {"forearm_link"}

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.small_problems import door_scene, full_scene, random_configurations
+from helpers.small_problems import load_door_scene, make_full_scene, sample_configurations
 
 from vkc_pin.planning.chain.chain import VirtualKinematicChain, consolidate
 from vkc_pin.planning.chain.inverse_kinematics import PoseSolver
@@ -19,12 +19,12 @@ KINDS = {"pose": 6, "point": 3, "upright": 5}
 
 @pytest.fixture(scope="module", params=[{}, {"cabinet": "ball"}], ids=["robot", "ball"])
 def chain(request: pytest.FixtureRequest) -> VirtualKinematicChain:
-    return consolidate(full_scene(), request.param)
+    return consolidate(make_full_scene(), request.param)
 
 
 @pytest.fixture(scope="module")
 def robot() -> VirtualKinematicChain:
-    return consolidate(door_scene(), {})
+    return consolidate(load_door_scene(), {})
 
 
 def last_frame(chain: VirtualKinematicChain) -> tuple[int, pin.SE3]:
@@ -115,7 +115,7 @@ def test_residuals_and_jacobians(chain: VirtualKinematicChain, kind: str, shifte
     """A shift is fixed in another joint's frame, such as a hand's approach direction."""
     hand, vector = chain.robot.model.njoints - 1, (0.03, -0.05, 0.08)
     solver = make_solver(chain, kind, (hand, vector) if shifted else None)
-    z = random_configurations(chain.lower, chain.upper, 5, np.random.default_rng(0))
+    z = sample_configurations(chain.lower, chain.upper, 5, np.random.default_rng(0))
     target = place(chain, z[0])
     residual, jacobian = solver.evaluate(z, target)
     assert residual.shape == (5, KINDS[kind])
@@ -145,7 +145,7 @@ def test_residuals_and_jacobians(chain: VirtualKinematicChain, kind: str, shifte
 @pytest.mark.parametrize("kind", KINDS)
 def test_solutions_attain_the_goal_within_limits(chain: VirtualKinematicChain, kind: str) -> None:
     rng, turned, solved = np.random.default_rng(1), 0.0, []
-    for row in random_configurations(chain.lower, chain.upper, 4, rng, arena=1.0):
+    for row in sample_configurations(chain.lower, chain.upper, 4, rng, arena=1.0):
         target = place(chain, row)
         guesses = np.clip(row + rng.uniform(-0.6, 0.6, (30, chain.size)), chain.lower, chain.upper)
         z, found = solve(chain, guesses, target, kind)
@@ -157,14 +157,14 @@ def test_solutions_attain_the_goal_within_limits(chain: VirtualKinematicChain, k
 
 
 def test_guesses_at_the_goal_are_not_changed(chain: VirtualKinematicChain) -> None:
-    z = random_configurations(chain.lower, chain.upper, 1, np.random.default_rng(2))
+    z = sample_configurations(chain.lower, chain.upper, 1, np.random.default_rng(2))
     same, found = solve(chain, z, place(chain, z[0]))
     assert found.all()
     np.testing.assert_array_equal(same, z)
 
 
 def test_unreachable_goal(robot: VirtualKinematicChain) -> None:
-    guesses = random_configurations(robot.lower, robot.upper, 30, np.random.default_rng(3))
+    guesses = sample_configurations(robot.lower, robot.upper, 30, np.random.default_rng(3))
     far = pin.SE3(np.eye(3), np.array([0.0, 0.0, 9.0]))
     _, found = solve(robot, guesses, far)
     assert not found.any()

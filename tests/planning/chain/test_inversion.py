@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.objects import SHAPES, joint, load_text
+from helpers.objects import SHAPES, format_joint, load_text
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -104,10 +104,10 @@ def test_inverted_trees_keep_all_frames_and_shapes(tree: tuple[str, int], seed: 
 def test_only_joints_on_the_path_to_the_base_move() -> None:
     links = "".join(f'<link name="{name}"/>' for name in ("base", "arm", "hand", "side", "back"))
     joints = (
-        joint("shoulder", "revolute", "base", "arm", "0 0 1")
-        + joint("wrist", "prismatic", "arm", "hand", "1 0 0")
-        + joint("flap", "revolute", "arm", "side", "0 1 0")
-        + joint("lid", "revolute", "base", "back", "1 0 0")
+        format_joint("shoulder", "revolute", "base", "arm", "0 0 1")
+        + format_joint("wrist", "prismatic", "arm", "hand", "1 0 0")
+        + format_joint("flap", "revolute", "arm", "side", "0 1 0")
+        + format_joint("lid", "revolute", "base", "back", "1 0 0")
     )
     urdf = f'<robot name="t">{links}{joints}</robot>'
     item = load_text(urdf, "urdf: thing.urdf\nattachments: [{name: a, link: hand}]")

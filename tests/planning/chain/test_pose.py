@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.memory import growth
+from helpers.memory import measure_growth
 
 from vkc_pin.planning.chain.pose import (
     POSE_OFFSET_SIZE,
@@ -212,7 +212,7 @@ def sample_placements(kind: str, target: pin.SE3, angle: float) -> list[pin.SE3]
 
 def test_pose_offsets_leave_no_memory_behind() -> None:
     target, placements = pin.SE3.Random(), [pin.SE3.Random() for _ in range(50)]
-    size, objects = growth(lambda: compute_offsets("pose", target, placements))
+    size, objects = measure_growth(lambda: compute_offsets("pose", target, placements))
     assert size <= 50 * 8
     assert objects <= 50 / 2
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.drives import hall
-from helpers.small_problems import SHORT, program_of
+from helpers.drives import make_hall
+from helpers.small_problems import SHORT, make_program
 
 import vkc_pin as vkc
 from vkc_pin.planning.diagnosis.paths import PathDiagnosis, diagnose_paths
@@ -32,7 +32,7 @@ def drive_under_beam(bottom: float, *xs: float) -> tuple[vkc.TrajectoryProblem, 
     position = [1.8, 0.0, bottom + 0.75]
     beam = {"name": "beam", "type": "box", "size": [0.2, 14.0, 1.5], "position": position}
     steps = [vkc.GoTo(x, 0.0, 0.0) for x in xs]
-    p = program_of(hall(obstacles=[beam]), steps, options=SHORT)
+    p = make_program(make_hall(obstacles=[beam]), steps, options=SHORT)
     z = np.tile(p.start, (p.segments, 1))
     z[:, 0] = np.interp(np.arange(p.segments) + 1.0, [0, *p.ends], [0.0, *xs])
     return p, z
@@ -56,7 +56,7 @@ def test_colliding_phase_is_explained(bottom: float, expected: str, is_cut_off: 
 def test_notes_of_the_initialization_are_kept_if_nothing_else_is_found() -> None:
     p, z = drive_under_beam(2.0, 3.6)
     assert diagnose(p, z, hits=None, notes=(NOTE,)).lines == [NOTE]
-    fixed = program_of(hall(base="fixed"), [vkc.Reach((0.5, 0.4, 1.0, 0.0, 1.5, 0.0))])
+    fixed = make_program(make_hall(base="fixed"), [vkc.Reach((0.5, 0.4, 1.0, 0.0, 1.5, 0.0))])
     assert diagnose(fixed, fixed.still, hits=3, notes=(NOTE,)) == ([NOTE], False)
 
 
@@ -73,7 +73,7 @@ def test_missing_path_of_a_later_phase_does_not_cut_off() -> None:
 def test_half_open_door_blocks_the_base(hinge: float) -> None:
     """At 1.2 rad the narrow door blocks the base; every known grasp is behind it."""
     scene = vkc.load_scene("household").with_state("door", {"hinge": hinge})
-    p = program_of(scene, [vkc.Grasp("door", "push_back")])
+    p = make_program(scene, [vkc.Grasp("door", "push_back")])
     found = diagnose(p, p.still, hits=p.segments)
     if hinge == 1.2:
         (line,) = found.lines

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.drives import hall
-from helpers.small_problems import SHORT, program_of
+from helpers.drives import make_hall
+from helpers.small_problems import SHORT, make_program
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -35,7 +35,7 @@ FENCE = box("fence", (0.1, 12.0, 1.0), (1.2, 0.0, 0.5))
 
 
 def problem(obstacles: Sequence[dict[str, Any]], *steps: Any) -> vkc.TrajectoryProblem:
-    return program_of(hall(obstacles=obstacles), list(steps), options=SHORT)
+    return make_program(make_hall(obstacles=obstacles), list(steps), options=SHORT)
 
 
 def gap(width: float) -> list[dict[str, Any]]:
@@ -132,7 +132,7 @@ def test_failing_phase_is_named() -> None:
 def test_closed_door_is_named_unless_opened() -> None:
     steps = [vkc.Actuate("door", {"hinge": 1.4}), vkc.GoTo(4.0, 0.0)]
     blocked, opened = (
-        find_proofs(program_of(vkc.load_scene("door"), own, options=SHORT))
+        find_proofs(make_program(vkc.load_scene("door"), own, options=SHORT))
         for own in (steps[1:], steps)
     )
     (line,) = blocked
@@ -174,4 +174,4 @@ def test_nothing_is_proven_for_packaged_scenes(name: str) -> None:
         if not placed.object.free and placed.object.attachments
     )
     grasp = vkc.Grasp(next(fixed))
-    assert find_proofs(program_of(scene, [grasp], options=SHORT)) == []
+    assert find_proofs(make_program(scene, [grasp], options=SHORT)) == []

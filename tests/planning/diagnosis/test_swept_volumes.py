@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.small_problems import door_scene, program_of
+from helpers.small_problems import load_door_scene, make_program
 
 import vkc_pin as vkc
 from vkc_pin.planning.diagnosis.swept_volumes import find_swept_collisions
@@ -33,14 +33,14 @@ def explain(
     allow: Sequence[Any] = (),
 ) -> list[str]:
     """Explain why the door cannot be opened with a box or an object of some type in the room."""
-    scene = door_scene().with_state("door", {"hinge": state})
+    scene = load_door_scene().with_state("door", {"hinge": state})
     post: dict[str, Any] = {"name": "post", "position": list(at)}
     kind = "obstacles" if object_type is None else "objects"
     post |= {"type": "box", "size": list(size)} if object_type is None else {"type": object_type}
     document = {**scene.document, kind: [*scene.document[kind], post], "allow": list(allow)}
     scene = vkc.Scene.from_document(document, scene.folder)
     steps = [vkc.Actuate("door", {"hinge": hinge})]
-    return find_swept_collisions(program_of(scene, steps, options=OPTIONS))
+    return find_swept_collisions(make_program(scene, steps, options=OPTIONS))
 
 
 def test_obstacle_in_the_swept_volume_is_named() -> None:
@@ -75,7 +75,7 @@ def test_movable_link_proves_nothing(object_type: Any, height: float, proven: bo
 @cache
 def transform_leaf(angle: float) -> pin.SE3:
     """Return the motion of the leaf from closed to an angle [rad]."""
-    placed = door_scene().objects["door"]
+    placed = load_door_scene().objects["door"]
     model = placed.object.model
     hinge = placed.placement * model.jointPlacements[model.getJointId("hinge")]
     turn = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, angle), np.zeros(3))
@@ -92,7 +92,7 @@ def test_goal_is_clipped_to_the_limit() -> None:
 )
 def test_link_of_two_joints_proves_nothing(link: str, attachment: str, angle: float) -> None:
     """The lever may turn away from an obstacle, unlike the leaf."""
-    placed = door_scene().objects["door"]
+    placed = load_door_scene().objects["door"]
     frame = placed.link_placement(link) * placed.object.attachments[attachment].placement
     at = transform_leaf(angle).act(frame.translation)
     assert bool(explain(1.3, at, size=(0.02, 0.02, 0.02))) == (link == "panel")
@@ -101,7 +101,7 @@ def test_link_of_two_joints_proves_nothing(link: str, attachment: str, angle: fl
 @pytest.mark.parametrize(("depth", "proven"), [(0.0005, False), (0.004, True)])
 def test_small_overlap_proves_nothing(depth: float, proven: bool) -> None:
     """A slab of 0.1 m grazes the leaf's lower edge, which is 10 mm above the floor."""
-    door = door_scene().objects["door"].placement
+    door = load_door_scene().objects["door"].placement
     x, y, _ = transform_leaf(0.6).act(door.act(np.array([0.0, -0.5, 0.0])))
     assert bool(explain(1.3, (x, y, depth - 0.04), size=(0.1, 0.1, 0.1))) == proven
 

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers.small_problems import door_scene, program_of
+from helpers.small_problems import load_door_scene, make_program
 
 import vkc_pin as vkc
 from vkc_pin.planning.initialization.approach_paths import ApproachPaths
@@ -19,7 +19,7 @@ def test_hand_approaches_and_retreats_straight(length: float) -> None:
     """A fixed base drives only if the arm alone cannot reach that far."""
     options = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20, approach=length)
     steps = [vkc.Actuate("door", {"hinge": 1.2}), vkc.GoTo(-1.0, 0.5)]
-    problem = program_of(door_scene(), steps, options=options)
+    problem = make_program(load_door_scene(), steps, options=options)
     sampler = KeyframeSampler(problem, np.random.default_rng(0))
     found = BeamSearch(sampler).search(thorough=False)
     path = found.paths[int(np.argmin(found.cost))]
@@ -31,7 +31,7 @@ def test_hand_approaches_and_retreats_straight(length: float) -> None:
         retreat = paths.find_retreat_end(release, phases[3], phases[2])
         for z, (near,) in ((grasp, approach), (release, retreat)):
             hand, other = (
-                dataclasses.replace(door_scene(), start=row[:9]).tool_placement()
+                dataclasses.replace(load_door_scene(), start=row[:9]).tool_placement()
                 for row in (z, near)
             )
             offset = hand.inverse() * other

@@ -7,8 +7,8 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.gates import GOAL, NARROW, TIGHT, gated, walled
-from helpers.small_problems import program_of
+from helpers.gates import GOAL, NARROW, TIGHT, make_gate_problem, make_wall_problem
+from helpers.small_problems import make_program
 
 import vkc_pin as vkc
 from vkc_pin.planning.initialization.base_routes import BaseRoutes, find_folded_arms
@@ -19,7 +19,7 @@ BEYOND = np.array([4.0, 1.5, 0.0])  # [m], [rad] a pose beyond the wall
 
 
 def test_path_leads_through_the_gap() -> None:
-    problem = walled(1.6)
+    problem = make_wall_problem(1.6)
     routes, start = BaseRoutes(problem), problem.start[:3]
     path, guide = (
         find(0, start, BEYOND, 40) for find in (routes.find_path, routes.find_guide_path)
@@ -37,7 +37,7 @@ def test_path_leads_through_the_gap() -> None:
 
 
 def test_missing_path_is_noted() -> None:
-    problem, notes = walled(0.0), list[str]()
+    problem, notes = make_wall_problem(0.0), list[str]()
     routes = BaseRoutes(problem)
     assert routes.find_path(0, problem.start[:3], BEYOND, 40) is None
     assert routes.find_guide_path(0, problem.start[:3], np.array([5.5, 0.0, 0.0]), 40) is None
@@ -47,7 +47,7 @@ def test_missing_path_is_noted() -> None:
 
 
 def test_guess_follows_the_path_with_its_heading() -> None:
-    problem = walled(1.6)
+    problem = make_wall_problem(1.6)
     (guess,) = initialize(problem, "astar", 0)
     path = problem.waypoints(guess.z)[:, :3]
     steps = np.diff(path[:, :2], axis=0)
@@ -59,7 +59,7 @@ def test_guess_follows_the_path_with_its_heading() -> None:
 
 @pytest.mark.parametrize("width", [NARROW, TIGHT, 0.64])  # the base is 0.67 m wide
 def test_folded_arm_fits_through_a_narrow_gate(width: float) -> None:
-    problem = gated(width)
+    problem = make_gate_problem(width)
     routes, start, goal = BaseRoutes(problem), problem.start[:3], np.array(GOAL)
     home, folded = (
         routes.compute_distances(0, start[None], goal[None], folded=each)[0]
@@ -83,7 +83,7 @@ def test_folded_arm_fits_through_a_narrow_gate(width: float) -> None:
 
 def test_guide_reaches_goals_within_the_margin() -> None:
     """Inverse kinematics often leads there; the wall begins at 1.9, the base is 0.5 m long."""
-    problem = walled(1.6)
+    problem = make_wall_problem(1.6)
     routes, start = BaseRoutes(problem), problem.start[:3]
     near, colliding = np.array([1.39, 1.0, 0.0]), np.array([1.5, 1.0, 0.0])
     assert routes.find_path(0, start, near, 40) is None
@@ -95,7 +95,7 @@ def test_guide_reaches_goals_within_the_margin() -> None:
 
 def test_similar_starts_share_distances() -> None:
     """Starts on both sides of a wall agree, in one query or several."""
-    problem = walled(1.6)
+    problem = make_wall_problem(1.6)
     starts = np.array([[x, y, 0.0] for x in (0.5, 3.5) for y in (-0.55, -0.35, 0.05, 0.85)])
     goals = np.tile(BEYOND, (len(starts), 1))
     shared = BaseRoutes(problem)
@@ -121,7 +121,7 @@ TASKS = {  # scene, and steps in the last phase of which the load is carried
 @cache
 def carry(load: str) -> vkc.TrajectoryProblem:
     name, steps = TASKS[load]
-    return program_of(vkc.load_scene(name), steps)
+    return make_program(vkc.load_scene(name), steps)
 
 
 def configure(load: str, arm: np.ndarray | None = None) -> np.ndarray:

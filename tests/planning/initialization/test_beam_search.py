@@ -7,13 +7,13 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.gates import walled
+from helpers.gates import make_wall_problem
 from helpers.small_problems import (
-    door_scene,
-    hand_off_the_handle,
-    program_of,
-    with_attachment,
-    with_objects,
+    compute_grasp_error,
+    load_door_scene,
+    make_program,
+    replace_attachment,
+    replace_objects,
 )
 
 import vkc_pin as vkc
@@ -31,7 +31,7 @@ def problem(*, drives: bool = False, grasps: bool = False) -> vkc.TrajectoryProb
     """Return the problem of opening or just grasping the door; drives: the base goes before."""
     steps = [vkc.Grasp("door")] if grasps else [OPEN]
     before, after = ([vkc.GoTo(-1.0, y)] if drives else [] for y in (0.0, 0.5))
-    return program_of(door_scene(), [*before, *steps, *after], options=FEW)
+    return make_program(load_door_scene(), [*before, *steps, *after], options=FEW)
 
 
 def beam(
@@ -83,7 +83,7 @@ def test_keyframes_are_ordered_and_hold_the_handle(
     assert len(closed) >= 6
     for path in found.paths[np.argsort(found.cost)[:3]]:
         for row in path[closed]:
-            assert hand_off_the_handle(door_scene(), row, row[hinge], row[knob]) < 1e-3
+            assert compute_grasp_error(load_door_scene(), row, row[hinge], row[knob]) < 1e-3
 
 
 @DIRECTIONS
@@ -103,7 +103,7 @@ def test_path_cost_is_length_plus_collisions(backwards: bool, drives: bool) -> N
 
 
 def test_path_cost_with_routes_is_the_driving_distance() -> None:
-    p = walled(1.6)
+    p = make_wall_problem(1.6)
     routes = BaseRoutes(p)
     found = BeamSearch(KeyframeSampler(p, np.random.default_rng(0)), routes).search(thorough=False)
     path = found.paths[0]
@@ -118,7 +118,7 @@ def test_path_cost_with_routes_is_the_driving_distance() -> None:
     ("steps", "ratio"), [([vkc.Grasp("door")], 0.97), ([vkc.GoTo(-1.0, 0.0), OPEN], 1.0)]
 )
 def test_shortened_paths_cost_no_more_and_still_grasp(steps: list[vkc.Step], ratio: float) -> None:
-    p = program_of(door_scene(), steps, options=FEW)
+    p = make_program(load_door_scene(), steps, options=FEW)
     found = beam(p, 1, for_narrow_passages=True).search(thorough=False)  # which are not shortened
     short = beam(p, 1).shorten(found)
     assert (short.cost <= found.cost).all()
@@ -131,7 +131,9 @@ def test_shortened_paths_cost_no_more_and_still_grasp(steps: list[vkc.Step], rat
     assert found.waypoints[moved] == p.ends[len(steps) - 1]
     hinge, knob = (p.chain.index(name) for name in ("door.hinge", "door.knob"))
     for row, cost in zip(short.paths[:, moved], short.collision_cost, strict=True):
-        assert cost >= 1e3 or hand_off_the_handle(door_scene(), row, row[hinge], row[knob]) < 1e-3
+        assert (
+            cost >= 1e3 or compute_grasp_error(load_door_scene(), row, row[hinge], row[knob]) < 1e-3
+        )
         assert np.all((row >= p.chain.lower - 1e-9) & (row <= p.chain.upper + 1e-9))
 
 
@@ -172,11 +174,11 @@ def test_search_is_deterministic(backwards: bool) -> None:
 
 def grasp_with(*, firm: bool) -> vkc.TrajectoryProblem:
     """Return a door problem with a free or a rigid grasp."""
-    scene = door_scene()
+    scene = load_door_scene()
     door = scene.objects["door"]
     tilted = dataclasses.replace(door.object.attachment("handle_free"), name="tilted", firm=firm)
-    scene = with_objects(scene, {"door": with_attachment(door, tilted)})
-    return program_of(scene, [dataclasses.replace(OPEN, attachment="tilted")], options=FEW)
+    scene = replace_objects(scene, {"door": replace_attachment(door, tilted)})
+    return make_program(scene, [dataclasses.replace(OPEN, attachment="tilted")], options=FEW)
 
 
 @pytest.mark.parametrize("firm", [False, True])
@@ -196,7 +198,7 @@ def test_rigid_grasp_is_chosen_before_the_object_moves(firm: bool) -> None:
 def test_open_phases_at_the_end_are_searched_forwards() -> None:
     """A drive, and a task that ends with a free grasp."""
     scene = vkc.load_scene("init_1").sample_start(np.random.default_rng(0))
-    for p in (walled(1.6), program_of(scene, [vkc.Grasp("stick")])):
+    for p in (make_wall_problem(1.6), make_program(scene, [vkc.Grasp("stick")])):
         one, other = (beam(p).search(thorough=True, backwards=each) for each in (False, True))
         np.testing.assert_array_equal(one.paths, other.paths)
         assert one.waypoints == other.waypoints == [0, p.segments]
@@ -232,7 +234,7 @@ def test_search_for_narrow_passages_finds_free_approaches() -> None:
     """At the narrow door a free grasp may have a blocked approach."""
     scene = vkc.load_scene("household").with_state("door", {"hinge": 1.52})
     steps = [vkc.Grasp("door", "handle_free"), vkc.Actuate("door", {"hinge": 0.0})]
-    p = program_of(scene.with_start(base=(1.5, -0.5, 1.57)), steps)
+    p = make_program(scene.with_start(base=(1.5, -0.5, 1.57)), steps)
     grasp, routes, shares = int(p.ends[0]), BaseRoutes(p), []
     before = grasp - p.options.steps(p.options.approach_time)
     for narrow in (False, True):

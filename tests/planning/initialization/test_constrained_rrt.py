@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.small_problems import door_scene, hand_off_the_handle, program_of
+from helpers.small_problems import compute_grasp_error, load_door_scene, make_program
 
 import vkc_pin as vkc
 from vkc_pin.planning.initialization.approach_paths import ApproachPaths
@@ -30,7 +30,7 @@ def make_sampler(p: vkc.TrajectoryProblem, seed: int = 0) -> KeyframeSampler:
 @cache
 def free_door() -> tuple[vkc.TrajectoryProblem, np.ndarray, list[int], np.ndarray]:
     """Return the door problem, keyframes with their waypoints, and straight waypoints."""
-    p = program_of(door_scene(), STEPS, options=FEW)
+    p = make_program(load_door_scene(), STEPS, options=FEW)
     sampler = make_sampler(p)
     found = BeamSearch(sampler).search(thorough=True)
     path = found.paths[int(np.argmin(np.where(found.collision_cost == 0.0, found.cost, np.inf)))]
@@ -51,13 +51,13 @@ def blocked() -> vkc.TrajectoryProblem:
     """Return the same problem with a ball in the elbow's path."""
     p, straight = free_door()[0], find_phase()[1]
     _, places = p.chain.joint_placements(straight[len(straight) // 2][None])
-    elbow = p.chain.model.getJointId(str(door_scene().robot.model.names[4]))
+    elbow = p.chain.model.getJointId(str(load_door_scene().robot.model.names[4]))
     position = places[0, elbow].round(4).tolist()
     ball = {"name": "ball", "type": "sphere", "radius": 0.06, "position": position}
-    document = door_scene().document
+    document = load_door_scene().document
     obstacles = [*document.get("obstacles", []), ball]
-    scene = vkc.Scene.from_document({**document, "obstacles": obstacles}, door_scene().folder)
-    return program_of(scene, STEPS, options=FEW)
+    scene = vkc.Scene.from_document({**document, "obstacles": obstacles}, load_door_scene().folder)
+    return make_program(scene, STEPS, options=FEW)
 
 
 def find_path(seed: int, *, tries: int = MAX_EXTENSIONS) -> np.ndarray | None:
@@ -74,7 +74,7 @@ def compute_penetration(p: vkc.TrajectoryProblem, rows: np.ndarray) -> float:
 def assert_holds_the_handle(p: vkc.TrajectoryProblem, rows: np.ndarray) -> None:
     hinge, knob = (p.chain.index(f"door.{name}") for name in ("hinge", "knob"))
     for row in rows:
-        assert hand_off_the_handle(door_scene(), row, row[hinge], row[knob]) < 1e-3
+        assert compute_grasp_error(load_door_scene(), row, row[hinge], row[knob]) < 1e-3
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -6,9 +6,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.drives import hall
-from helpers.gates import GOAL, NARROW, at, gated, walled
-from helpers.small_problems import door_scene, hand_off_the_handle, program_of
+from helpers.drives import make_hall
+from helpers.gates import GOAL, NARROW, make_gate_problem, make_wall_problem, make_waypoint
+from helpers.small_problems import compute_grasp_error, load_door_scene, make_program
 
 import vkc_pin as vkc
 from vkc_pin.planning.initialization.approach_paths import ApproachPaths
@@ -25,7 +25,7 @@ ROBOT = 9  # x, y and yaw of the base, six joints of the arm
 @cache
 def door() -> tuple[vkc.TrajectoryProblem, np.ndarray, list[int]]:
     """Return the door problem, collision-free keyframes, and their waypoints."""
-    p = program_of(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=FEW)
+    p = make_program(load_door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=FEW)
     found = BeamSearch(KeyframeSampler(p, np.random.default_rng(0))).search(thorough=True)
     best = int(np.argmin(np.where(found.collision_cost == 0.0, found.cost, np.inf)))
     assert found.collision_cost[best] == 0.0
@@ -45,7 +45,7 @@ def assert_holds_the_handle(z: np.ndarray) -> None:
     p, _, _ = door()
     hinge, knob = (p.chain.index(f"door.{name}") for name in ("hinge", "knob"))
     for row in z[int(p.ends[0]) - 1 :]:
-        assert hand_off_the_handle(door_scene(), row, row[hinge], row[knob]) < 1e-3
+        assert compute_grasp_error(load_door_scene(), row, row[hinge], row[knob]) < 1e-3
     assert z[-1, hinge] == pytest.approx(1.2)
 
 
@@ -67,8 +67,10 @@ def test_guess_passes_keyframes_and_closes_the_chain() -> None:
 
 
 def test_straight_paths_start_and_end_at_rest() -> None:
-    p = program_of(hall(), [vkc.GoTo(2.0, 1.0, 0.5)])
-    z = interpolator(p).interpolate(np.array([p.start, at(p, (2.0, 1.0, 0.5))]), [0, p.segments])
+    p = make_program(make_hall(), [vkc.GoTo(2.0, 1.0, 0.5)])
+    z = interpolator(p).interpolate(
+        np.array([p.start, make_waypoint(p, (2.0, 1.0, 0.5))]), [0, p.segments]
+    )
     assert z is not None
     expected = np.outer(sample_smoothstep(p.segments), [2.0, 1.0, 0.5])
     np.testing.assert_allclose(z[:, :3], expected, atol=1e-12)
@@ -108,8 +110,8 @@ def test_later_headings_continue_where_the_base_path_ends(turns: int) -> None:
 
 @pytest.mark.parametrize("turns", [-1, 0, 1])
 def test_base_path_unwinds_if_the_goal_fixes_the_heading(turns: int) -> None:
-    p = walled(1.6)
-    routes, end = BaseRoutes(p), at(p, (4.0, 1.5, turns * 2 * np.pi))
+    p = make_wall_problem(1.6)
+    routes, end = BaseRoutes(p), make_waypoint(p, (4.0, 1.5, turns * 2 * np.pi))
     free, fixed = (
         AStarPaths(routes).find_path(0, p.start, end, 40, turns=each, reaches=True)
         for each in (True, False)
@@ -123,8 +125,8 @@ def test_base_path_unwinds_if_the_goal_fixes_the_heading(turns: int) -> None:
 
 
 def test_astar_paths_move_the_arm_straight() -> None:
-    p = walled(1.6)
-    routes, end = BaseRoutes(p), at(p, (4.0, 1.5, 0.0))
+    p = make_wall_problem(1.6)
+    routes, end = BaseRoutes(p), make_waypoint(p, (4.0, 1.5, 0.0))
     end[3:] += 0.2
     z = interpolator(p, AStarPaths(routes)).interpolate(np.array([p.start, end]), [0, p.segments])
     expected = routes.find_path(0, p.start[:3], end[:3], p.segments)
@@ -136,17 +138,21 @@ def test_astar_paths_move_the_arm_straight() -> None:
 
 
 def test_missing_paths_are_noted_once_per_phase() -> None:
-    p = program_of(walled(0.0).scene, [vkc.GoTo(1.0, 1.0, 0.5), vkc.GoTo(4.0, 1.0, 0.5)])
+    p = make_program(
+        make_wall_problem(0.0).scene, [vkc.GoTo(1.0, 1.0, 0.5), vkc.GoTo(4.0, 1.0, 0.5)]
+    )
     join = interpolator(p, AStarPaths(BaseRoutes(p)))
     for x in (1.0, 0.9):
-        keyframes = np.array([p.start, at(p, (x, 1.0, 0.5)), at(p, (4.0, 1.0, 0.5))])
+        keyframes = np.array(
+            [p.start, make_waypoint(p, (x, 1.0, 0.5)), make_waypoint(p, (4.0, 1.0, 0.5))]
+        )
         assert join.interpolate(keyframes, [0, *p.ends.tolist()]) is None
     assert join.blocked == ["go to: found no path for the base from (1.00, 1.00) to (4.00, 1.00)"]
 
 
 def test_rrt_paths_lead_through_a_narrow_gate() -> None:
-    p = gated(NARROW)
-    ends, violations = np.array([p.start, at(p, GOAL)]), []
+    p = make_gate_problem(NARROW)
+    ends, violations = np.array([p.start, make_waypoint(p, GOAL)]), []
     assert interpolator(p, AStarPaths(BaseRoutes(p))).interpolate(ends, [0, p.segments]) is None
     for paths in (None, rrt_paths(p)):
         z = interpolator(p, paths).interpolate(ends, [0, p.segments])
@@ -159,8 +165,8 @@ def test_rrt_paths_lead_through_a_narrow_gate() -> None:
 
 def test_next_phase_begins_where_the_arm_ended() -> None:
     """The arm is folded in the gate and has no goal, so it may stay folded."""
-    p = program_of(gated(NARROW).scene, [vkc.GoTo(*GOAL), vkc.GoTo(4.5, 0.5, 0.0)])
-    keyframes = np.array([p.start, at(p, GOAL), at(p, (4.5, 0.5, 0.0))])
+    p = make_program(make_gate_problem(NARROW).scene, [vkc.GoTo(*GOAL), vkc.GoTo(4.5, 0.5, 0.0)])
+    keyframes = np.array([p.start, make_waypoint(p, GOAL), make_waypoint(p, (4.5, 0.5, 0.0))])
     z = interpolator(p, rrt_paths(p)).interpolate(keyframes, [0, *p.ends.tolist()])
     assert z is not None
     assert np.abs(np.diff(p.waypoints(z), axis=0)).max() < 1.0
@@ -168,8 +174,8 @@ def test_next_phase_begins_where_the_arm_ended() -> None:
 
 
 def test_rrt_paths_end_at_the_required_arm() -> None:
-    p = gated(NARROW)
-    end, paths = at(p, GOAL), rrt_paths(p)
+    p = make_gate_problem(NARROW)
+    end, paths = make_waypoint(p, GOAL), rrt_paths(p)
     end[2] += 2 * np.pi
     end[4] += 0.1
     for reaches in (True, False):
@@ -186,8 +192,8 @@ def test_rrt_paths_end_at_the_required_arm() -> None:
 @pytest.mark.parametrize("yaw", [-2 * np.pi, 2 * np.pi, -3.1])
 def test_rrt_paths_turn_as_far_as_the_goal_requires(yaw: float) -> None:
     """The base cannot turn inside the gate."""
-    p = gated(NARROW)
-    end = at(p, (*GOAL[:2], yaw))
+    p = make_gate_problem(NARROW)
+    end = make_waypoint(p, (*GOAL[:2], yaw))
     path = rrt_paths(p).find_path(0, p.start, end, 60, turns=False, reaches=True)
     assert path is not None
     np.testing.assert_allclose(path[-1], end, atol=1e-9)
@@ -200,9 +206,9 @@ def test_rrt_paths_turn_as_far_as_the_goal_requires(yaw: float) -> None:
 
 def test_searches_get_shorter_after_failures() -> None:
     """The goal is in a wall; every phase counts its own failures."""
-    p = gated(NARROW)
-    scene = hall(base="fixed", obstacles=p.scene.document["obstacles"])
-    p = program_of(scene, [vkc.Reach((0.5, 0.4, 1.0, 0.0, np.pi / 2, 0.0))] * 2)
+    p = make_gate_problem(NARROW)
+    scene = make_hall(base="fixed", obstacles=p.scene.document["obstacles"])
+    p = make_program(scene, [vkc.Reach((0.5, 0.4, 1.0, 0.0, np.pi / 2, 0.0))] * 2)
     end, paths, used = p.start.copy(), rrt_paths(p), list[int]()
     end[3:ROBOT] = 0.0, 1.2, 0.0, 0.0, 0.0, 0.0  # through the floor
     for phase in (0, 0, 0, 1):

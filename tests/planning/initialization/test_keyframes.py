@@ -7,7 +7,13 @@ import itertools
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.small_problems import SHORT, all_pairs, door_scene, hand_off_the_handle, margins_at
+from helpers.small_problems import (
+    SHORT,
+    compute_grasp_error,
+    get_margins,
+    load_door_scene,
+    make_all_pairs,
+)
 
 import vkc_pin as vkc
 from vkc_pin.planning.initialization.keyframes import (
@@ -26,12 +32,12 @@ OPEN = vkc.Actuate("door", {"hinge": 1.2})
 
 @pytest.fixture(scope="module")
 def problem() -> vkc.TrajectoryProblem:
-    return vkc.build(door_scene(), [OPEN], options=SHORT)
+    return vkc.build(load_door_scene(), [OPEN], options=SHORT)
 
 
 @pytest.fixture(scope="module")
 def drive() -> vkc.TrajectoryProblem:
-    return vkc.build(door_scene(), [vkc.GoTo(0.3, 0.2)], options=SHORT)
+    return vkc.build(load_door_scene(), [vkc.GoTo(0.3, 0.2)], options=SHORT)
 
 
 def make_sampler(
@@ -74,7 +80,7 @@ def test_samples_hold_the_handle_at_every_waypoint(problem: vkc.TrajectoryProble
         assert found.any()
         joints = sampler.object_motion[waypoint - 1, columns]
         for row in z[found]:
-            assert hand_off_the_handle(door_scene(), row[:9], *joints) < 2e-4
+            assert compute_grasp_error(load_door_scene(), row[:9], *joints) < 2e-4
         np.testing.assert_array_equal(z[:, columns], np.tile(joints, (len(z), 1)))
         lower, upper = (limits[waypoint - 1, 3:9] for limits in (problem.lower, problem.upper))
         assert np.all((z[found, 3:9] >= lower - 1e-9) & (z[found, 3:9] <= upper + 1e-9))
@@ -123,9 +129,9 @@ def test_shortfall_is_the_largest_of_any_pair(problem: vkc.TrajectoryProblem) ->
     sampler, grasp = make_sampler(problem), int(problem.ends[0])
     z, _ = sampler.sample(np.tile(problem.start, (24, 1)), grasp, "scatter")
     part, model = problem.contacts.phases[0], problem.chain.model
-    geometry, data = all_pairs(part), model.createData()
+    geometry, data = make_all_pairs(part), model.createData()
     shapes, pairs = pin.GeometryData(geometry), np.arange(len(part.pairs))
-    margins, expected = margins_at(part, pairs, np.full(len(pairs), grasp)), []
+    margins, expected = get_margins(part, pairs, np.full(len(pairs), grasp)), []
     for q in problem.chain.coordinates.q(z):
         pin.updateGeometryPlacements(model, data, geometry, shapes, q)
         pin.computeDistances(geometry, shapes)
@@ -156,7 +162,7 @@ def test_goal_configurations_report_their_residuals(problem: vkc.TrajectoryProbl
     z, residuals = drawn
     assert z.shape == (SAMPLE_COUNT, problem.chain.size)
     for row, residual in zip(z, residuals, strict=True):
-        off = hand_off_the_handle(door_scene(), row[:9], 0.0, 0.0)
+        off = compute_grasp_error(load_door_scene(), row[:9], 0.0, 0.0)
         assert (off < 3e-4) == (
             residual < 1e-4
         ) or 1e-5 < residual < 1e-3  # the two measure angles alike only where small

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.drives import hall
-from helpers.gates import GOAL, NARROW, TIGHT, gated
-from helpers.small_problems import SHORT, door_scene, hand_off_the_handle, program_of
+from helpers.drives import make_hall
+from helpers.gates import GOAL, NARROW, TIGHT, make_gate_problem
+from helpers.small_problems import SHORT, compute_grasp_error, load_door_scene, make_program
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -30,7 +30,7 @@ OPENED = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 
 @cache
 def problem() -> vkc.TrajectoryProblem:
-    return program_of(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=OPENED)
+    return make_program(load_door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=OPENED)
 
 
 @cache
@@ -58,7 +58,7 @@ def test_guesses_hold_the_handle(method: str, seed: int) -> None:
     hinge, knob = (problem().chain.index(f"door.{name}") for name in ("hinge", "knob"))
     for guess in guesses(method, seed):
         for row in guess.z[problem().ends[0] - 1 :]:
-            assert hand_off_the_handle(door_scene(), row, row[hinge], row[knob]) < 1e-3
+            assert compute_grasp_error(load_door_scene(), row, row[hinge], row[knob]) < 1e-3
         assert problem().pose_error(guess.z) < 1e-3
 
 
@@ -77,7 +77,7 @@ def test_wheeled_bases_can_drive_their_guesses(
     document = {**scene.document, "robot": {"name": "husky_ur5e", **robot}}
     scene = vkc.Scene.from_document(document, scene.folder)
     start = scene.sample_start(np.random.default_rng(5))
-    p = program_of(start, [vkc.Actuate(name, goal)], options=vkc.Options())
+    p = make_program(start, [vkc.Actuate(name, goal)], options=vkc.Options())
     guess = next(initialize(p, method, 0))
     along, aside, turn = p.rolling.compute_steps(p.waypoints(guess.z))
     end = int(p.ends[0])
@@ -104,7 +104,7 @@ def test_guess_opens_the_door_after_a_straight_approach() -> None:
     low, high = np.minimum(path[0], path[before]), np.maximum(path[0], path[before])
     assert np.all((path[: before + 1] >= low - 1e-9) & (path[: before + 1] <= high + 1e-9))
     first, last = (
-        dataclasses.replace(door_scene(), start=path[k, :9]).tool_placement()
+        dataclasses.replace(load_door_scene(), start=path[k, :9]).tool_placement()
         for k in (before, reach)
     )
     approach = first.inverse() * last
@@ -141,22 +141,24 @@ def test_stationary_guesses_move_the_base_straight_or_not_at_all() -> None:
 
 def test_base_of_stationary_guesses_moves_to_places_of_little_merit() -> None:
     """Nearly all of the hall is farther from the target than the places that are chosen."""
-    drive = program_of(hall(), [vkc.Reach((2.0, 1.5, 1.0, 0.0, np.pi / 2, 0.0))], options=SHORT)
+    drive = make_program(
+        make_hall(), [vkc.Reach((2.0, 1.5, 1.0, 0.0, np.pi / 2, 0.0))], options=SHORT
+    )
     still, *others = (guess.z for guess in initialize(drive, "stationary", 0, count=2))
     errors = [drive.pose_error(z) for z in others]
     assert max(errors) < 0.9 * drive.pose_error(still)
 
 
 def test_base_turns_the_shorter_direction() -> None:
-    scene = hall().with_start(base=[0.0, 0.0, 3.0])
-    turn = program_of(scene, [vkc.GoTo(1.0, 0.5, -3.0)], options=SHORT)
+    scene = make_hall().with_start(base=[0.0, 0.0, 3.0])
+    turn = make_program(scene, [vkc.GoTo(1.0, 0.5, -3.0)], options=SHORT)
     z = next(initialize(turn, "interpolated", 0)).z
     np.testing.assert_allclose(z[-1, :3], [1.0, 0.5, 2 * np.pi - 3.0])
     np.testing.assert_allclose(z[:, 3:], np.tile(scene.start[3:], (len(z), 1)))
 
 
 def test_unreachable_target_still_has_a_guess() -> None:
-    lost = program_of(hall(), [vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0))], options=SHORT)
+    lost = make_program(make_hall(), [vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0))], options=SHORT)
     found = list(initialize(lost, "interpolated", 0, count=2))
     assert found
     for guess in found:
@@ -165,7 +167,7 @@ def test_unreachable_target_still_has_a_guess() -> None:
 
 def test_fixed_base_stays_in_every_guess() -> None:
     target = vkc.Reach((0.5, 0.4, 1.0, 0.0, np.pi / 2, 0.0))
-    fixed = program_of(hall(base="fixed"), [target], options=SHORT)
+    fixed = make_program(make_hall(base="fixed"), [target], options=SHORT)
     for method in ("interpolated", "stationary"):
         found = [guess.z for guess in initialize(fixed, method, 0, count=2)]
         for z in found:
@@ -178,7 +180,7 @@ def test_base_turns_gradually() -> None:
     scene, rng = vkc.load_scene("aisle_drawer"), np.random.default_rng(7)
     for _ in range(6):  # headings wind by a full turn on some of these paths
         goal = vkc.GoTo(2.9, 2.0, float(rng.uniform(-3.0, 3.0)))
-        p = program_of(scene.sample_start(rng), [goal])
+        p = make_program(scene.sample_start(rng), [goal])
         (guess,) = initialize(p, "astar", 0)
         turns = np.diff(p.waypoints(guess.z)[:, 2])
         assert abs(turns[-1]) < 0.2
@@ -188,7 +190,7 @@ def test_base_turns_gradually() -> None:
 
 def test_task_without_motion_has_a_guess() -> None:
     scene = vkc.load_scene("drawer")
-    p = program_of(scene, [vkc.GoTo(*scene.start[:3].tolist())])
+    p = make_program(scene, [vkc.GoTo(*scene.start[:3].tolist())])
     with np.errstate(all="raise"):
         (guess,) = initialize(p, "interpolated", 0)
     assert np.abs(guess.z - p.start).max() < 1e-9
@@ -258,7 +260,7 @@ def test_guesses_are_requested_once_and_the_best_comes_first(kinds: list[Penetra
 @pytest.mark.parametrize("width", [NARROW, TIGHT])
 def test_rrt_guess_leads_through_a_narrow_gate(width: float) -> None:
     """The base with its arm at home has no path."""
-    gate, notes = gated(width), list[str]()
+    gate, notes = make_gate_problem(width), list[str]()
     assert list(initialize(gate, "astar", 0)) == []
     (guess,) = initialize(gate, "rrt", 0, notes=notes)
     assert (guess.name, notes) == ("rrt", [])
@@ -284,7 +286,7 @@ def test_auto_postpones_guesses_in_collision_and_asks_before_trees_grow(
         asked.append(phases)
         return is_infeasible
 
-    found = list(initialize(gated(NARROW), "auto", 0, count=2, is_infeasible=answer))
+    found = list(initialize(make_gate_problem(NARROW), "auto", 0, count=2, is_infeasible=answer))
     names = ["interpolated"] if is_infeasible else ["rrt", "interpolated"]
     assert [guess.name for guess in found[: len(names)]] == names
     assert found[len(names) - 1].penetration > MAX_GOOD_PENETRATION
@@ -294,7 +296,7 @@ def test_auto_postpones_guesses_in_collision_and_asks_before_trees_grow(
 
 def test_rrt_has_no_guess_if_there_is_no_path() -> None:
     notes: list[str] = []
-    assert list(initialize(gated(0.0), "rrt", 0, count=2, notes=notes)) == []
+    assert list(initialize(make_gate_problem(0.0), "rrt", 0, count=2, notes=notes)) == []
     assert len(notes) == 1
 
 

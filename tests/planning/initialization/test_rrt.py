@@ -7,9 +7,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.drives import hall
-from helpers.gates import GOAL, TIGHT, at, gated
-from helpers.small_problems import program_of
+from helpers.drives import make_hall
+from helpers.gates import GOAL, TIGHT, make_gate_problem, make_waypoint
+from helpers.small_problems import make_program
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as some
@@ -33,7 +33,7 @@ HIDDEN = 0.02
 @cache
 def gate() -> tuple[vkc.TrajectoryProblem, np.ndarray, np.ndarray]:
     """Return a problem that needs a folded arm, a guide path, and postures."""
-    problem = gated(TIGHT)
+    problem = make_gate_problem(TIGHT)
     routes = BaseRoutes(problem)
     guide = routes.find_guide_path(0, problem.start[:3], np.array(GOAL), 80)
     assert guide is not None
@@ -45,7 +45,7 @@ def find_path(
 ) -> np.ndarray | None:
     """Find a path through the gate."""
     problem, guide, arms = gate()
-    ends = at(problem, GOAL)[None] if ends is None else ends
+    ends = make_waypoint(problem, GOAL)[None] if ends is None else ends
     rng = np.random.default_rng(seed)
     return connect(
         problem, 0, problem.start, ends, poses=guide, arms=arms, rng=rng, max_extensions=tries
@@ -100,7 +100,7 @@ def assert_free(problem: vkc.TrajectoryProblem, path: np.ndarray) -> None:
 @given(st.integers(0, 2**32 - 1))
 def test_path_leads_through_the_gate_with_the_arm_folded(seed: int) -> None:
     problem, _, _ = gate()
-    straight = np.array([problem.start, at(problem, GOAL)])
+    straight = np.array([problem.start, make_waypoint(problem, GOAL)])
     assert shortfall(problem, refine(straight)).max() > 0.1
     path = find_path(seed)
     assert path is not None
@@ -116,7 +116,7 @@ def test_path_leads_through_the_gate_with_the_arm_folded(seed: int) -> None:
 
 def test_path_ends_at_a_reachable_end() -> None:
     problem, _, arms = gate()
-    ends = np.tile(at(problem, (2.0, 1.5, 0.0)), (4, 1))  # in the wall
+    ends = np.tile(make_waypoint(problem, (2.0, 1.5, 0.0)), (4, 1))  # in the wall
     ends[1:3, :3], ends[1:3, 3:] = GOAL, arms
     path = find_path(0, ends)
     assert path is not None
@@ -126,14 +126,14 @@ def test_path_ends_at_a_reachable_end() -> None:
 
 @pytest.mark.parametrize("pose", [(2.0, 1.5, 0.0), (4.0, 0.5, 0.0)], ids=["in wall", "behind wall"])
 def test_walled_in_goal_has_no_path(pose: tuple[float, float, float]) -> None:
-    problem = gated(0.0)
-    assert connect_directly(problem, problem.start, at(problem, pose)) is None
+    problem = make_gate_problem(0.0)
+    assert connect_directly(problem, problem.start, make_waypoint(problem, pose)) is None
 
 
 def test_least_violating_end_is_tried() -> None:
     """A goal slightly within the margin is reached; one in the wall is not."""
     problem, _, arms = gate()
-    end = np.array([*at(problem, (1.895 - 0.49, 1.5, np.pi / 2))[:3], *arms[1]])
+    end = np.array([*make_waypoint(problem, (1.895 - 0.49, 1.5, np.pi / 2))[:3], *arms[1]])
     allowed = problem.options.dist_safe
     towards = np.tile(end, (241, 1))
     towards[:, 0] += np.linspace(-0.3, 0.3, 241)
@@ -149,8 +149,8 @@ def test_least_violating_end_is_tried() -> None:
 
 
 def test_free_path_is_straight() -> None:
-    problem = program_of(hall(), [vkc.GoTo(2.0, 1.0, 0.5)])
-    end = at(problem, (2.0, 1.0, 0.5))
+    problem = make_program(make_hall(), [vkc.GoTo(2.0, 1.0, 0.5)])
+    end = make_waypoint(problem, (2.0, 1.0, 0.5))
     end[3:] += 0.3
     path = connect_directly(problem, problem.start, end, tries=1)
     assert path is not None
@@ -171,7 +171,7 @@ def test_arm_on_a_fixed_base_avoids_a_pole() -> None:
         "position": [0.37, 0.25, 1.7],
     }
     reach = vkc.Reach((0.6, 0.35, 0.9, 0.0, np.pi / 2, 0.0))
-    problem = program_of(hall(base="fixed", obstacles=[pole]), [reach])
+    problem = make_program(make_hall(base="fixed", obstacles=[pole]), [reach])
     first, last = problem.start.copy(), problem.start.copy()
     first[3:6], last[3:6] = (0.57, -1.2, -1.2), (2.57, -1.2, -1.2)
     straight = np.array([first, last])
@@ -196,7 +196,7 @@ def test_free_sections_of_the_guide_join_trees_as_a_whole() -> None:
     """Single samples need many more extensions."""
     problem, guide, arms = gate()
     assert all(find_path(seed, tries=60) is not None for seed in range(3))
-    rng, ends = np.random.default_rng(0), at(problem, GOAL)[None]
+    rng, ends = np.random.default_rng(0), make_waypoint(problem, GOAL)[None]
     sparse = guide[[0, -1]]
     path = connect(
         problem, 0, problem.start, ends, poses=sparse, arms=arms, rng=rng, max_extensions=60
@@ -221,7 +221,7 @@ def test_a_budget_ends_the_search() -> None:
 )
 def test_arm_detour_exceeds_a_third_of_the_path(there: float, back: float, is_detour: bool) -> None:
     """A shoulder turns back and forth in one of two phases."""
-    problem = program_of(hall(), [vkc.GoTo(0.5, 0.0), vkc.GoTo(1.0, 0.0)])
+    problem = make_program(make_hall(), [vkc.GoTo(0.5, 0.0), vkc.GoTo(1.0, 0.0)])
     z, middle = np.tile(problem.start, (problem.segments, 1)), int(problem.ends[0])
     z[:, 0] = np.linspace(0.0, 1.0, len(z))
     count = problem.segments - middle

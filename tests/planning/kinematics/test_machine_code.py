@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.small_problems import door_scene, program_of
+from helpers.small_problems import load_door_scene, make_program
 
 import vkc_pin as vkc
 from vkc_pin.options import Options
@@ -80,7 +80,7 @@ def script(path: Path, text: str) -> str:
 
 def test_compiled_waypoint_functions_are_equal_bit_for_bit(folder: Libraries) -> None:
     steps = [Actuate("door", {"hinge": 1.2})]
-    structure = program_of(door_scene(), steps, options=OPTIONS).transcription.structure
+    structure = make_program(load_door_scene(), steps, options=OPTIONS).transcription.structure
     functions = WaypointFunctions(structure.model, structure.slots, structure.poses, Cache())
     interpreted = (functions.value, functions.jacobian, functions.hessian)
     assert not functions.code.try_load()
@@ -95,11 +95,11 @@ def test_compiled_waypoint_functions_are_equal_bit_for_bit(folder: Libraries) ->
 
 
 def test_program_is_rebuilt_when_machine_code_is_available(folder: Libraries) -> None:
-    short = program_of(door_scene(), REACH, options=OPTIONS).transcription
+    short = make_program(load_door_scene(), REACH, options=OPTIONS).transcription
     assert not short.uncompiled_functions
     options = Options(reach_waypoints=8, contact_slots=2)
     structure, cache = (
-        program_of(door_scene(), REACH, options=options).transcription.structure,
+        make_program(load_door_scene(), REACH, options=options).transcription.structure,
         Cache(),
     )
     first = transcribe(structure, cache)
@@ -282,7 +282,7 @@ def has_ended(pid: int) -> bool:
 def plan_door(planner: vkc.Planner | None = None) -> list[bytes]:
     """Return a plan by the given planner, or by a new one without caches."""
     steps, options = [Grasp("door")], vkc.Options(reach_waypoints=10)
-    plan = vkc.plan(door_scene(), steps, options=options, planner=planner or vkc.Planner())
+    plan = vkc.plan(load_door_scene(), steps, options=options, planner=planner or vkc.Planner())
     assert plan.success, plan.summary()
     return [plan.trajectory.times.tobytes(), plan.trajectory.positions.tobytes()]
 

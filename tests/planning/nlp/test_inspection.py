@@ -5,8 +5,8 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.carrying import room, stand
-from helpers.small_problems import SHORT, program_of
+from helpers.carrying import describe_stand, make_room
+from helpers.small_problems import SHORT, make_program
 
 import vkc_pin as vkc
 from vkc_pin.planning.nlp.inspection import patterns, planes, sizes
@@ -20,7 +20,7 @@ def problem() -> TrajectoryProblem:
     """A door and a speed limit, which makes the step durations parameters of the program."""
     slow = vkc.Constraint("slow", lambda s: ca.sumsqr(s.velocity("tool")), upper=4.0)
     steps = [vkc.Actuate("door", {"hinge": 1.2})]
-    return program_of(vkc.load_scene("door"), steps, options=SHORT, terms=[slow])
+    return make_program(vkc.load_scene("door"), steps, options=SHORT, terms=[slow])
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +33,9 @@ def z(problem: TrajectoryProblem) -> np.ndarray:
 
 def test_sizes_add_up() -> None:
     low = vkc.Constraint("low", lambda s: s.coordinate("base_x"), upper=5.0, during=["go to"])
-    pose = program_of(room(stand()), [vkc.Grasp("stick")], options=SHORT).targets[0]
+    pose = make_program(make_room(describe_stand()), [vkc.Grasp("stick")], options=SHORT).targets[0]
     steps = [vkc.Grasp("stick"), vkc.GoTo(0.0, 0.0), vkc.Reach(pose), vkc.Reach(pose)]
-    problem = program_of(room(stand()), steps, options=SHORT, terms=[low])
+    problem = make_program(make_room(describe_stand()), steps, options=SHORT, terms=[low])
     found, t = sizes(problem), problem.transcription
     for kind, total in (
         ("variables", t.size),

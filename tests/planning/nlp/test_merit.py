@@ -6,8 +6,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.drives import hall
-from helpers.small_problems import door_scene, program_of
+from helpers.drives import make_hall
+from helpers.small_problems import load_door_scene, make_program
 
 import vkc_pin as vkc
 from vkc_pin.planning.nlp.merit import (
@@ -33,9 +33,9 @@ PILLAR = {
 @cache
 def problem(kind: str) -> vkc.TrajectoryProblem:
     if kind == "door":
-        return program_of(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=SHORT)
-    scene = hall(base="differential", obstacles=[PILLAR])
-    return program_of(scene, [vkc.GoTo(1.2, 0.4)], options=SHORT, terms=[TALL])
+        return make_program(load_door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=SHORT)
+    scene = make_hall(base="differential", obstacles=[PILLAR])
+    return make_program(scene, [vkc.GoTo(1.2, 0.4)], options=SHORT, terms=[TALL])
 
 
 def measure(p: vkc.TrajectoryProblem, z: np.ndarray, *, rates: bool) -> Infeasibility:
@@ -54,7 +54,7 @@ def make_infeasibility(**amounts: list[float]) -> Infeasibility:
 
 
 def test_feasible_motion_has_no_violation() -> None:
-    p = program_of(hall(), [vkc.GoTo(0.0, 0.0, 0.0)], options=SHORT)
+    p = make_program(make_hall(), [vkc.GoTo(0.0, 0.0, 0.0)], options=SHORT)
     found = measure(p, p.still, rates=True)
     assert (found.total, found.max_violation) == (0.0, 0.0)
     assert set(found.amounts) == set(KINDS)

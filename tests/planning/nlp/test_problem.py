@@ -10,9 +10,15 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.carrying import STICK, lifted, room, stand, table
-from helpers.relaxed import check_relaxation, iterates
-from helpers.small_problems import SHORT, door_scene, full_scene, program_of, random_configurations
+from helpers.carrying import STICK, describe_stand, describe_table, lift, make_room
+from helpers.relaxed import check_relaxation, make_iterates
+from helpers.small_problems import (
+    SHORT,
+    load_door_scene,
+    make_full_scene,
+    make_program,
+    sample_configurations,
+)
 
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
@@ -35,21 +41,23 @@ APPROACH = SHORT.steps(SHORT.approach_time)
 @pytest.fixture(scope="module")
 def opening() -> TrajectoryProblem:
     steps = [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1, -2.2)]
-    return program_of(door_scene(), steps, options=SHORT)
+    return make_program(load_door_scene(), steps, options=SHORT)
 
 
 @pytest.fixture(scope="module")
 def two_grasps() -> TrajectoryProblem:
     drawer = Actuate("drawer", {"slide": 0.2}, attachment="handle_free")
-    return program_of(full_scene(), [Grasp("cabinet", "ball"), drawer, Reach(POSE)], options=SHORT)
+    return make_program(
+        make_full_scene(), [Grasp("cabinet", "ball"), drawer, Reach(POSE)], options=SHORT
+    )
 
 
 @pytest.fixture(scope="module")
 def fetching() -> TrajectoryProblem:
-    scene = room(stand(), objects=("stick", "ball"))
+    scene = make_room(describe_stand(), objects=("stick", "ball"))
     scene = scene.with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
     steps = [Grasp("ball", "pull", "stick.tip"), Place("ball", (0.8, 0.6, 0.7)), Release("stick")]
-    return program_of(scene, [*steps, GoTo(0.0, 0.0)], options=SHORT)
+    return make_program(scene, [*steps, GoTo(0.0, 0.0)], options=SHORT)
 
 
 def bounds(problem: TrajectoryProblem, name: str) -> np.ndarray:
@@ -60,7 +68,7 @@ def bounds(problem: TrajectoryProblem, name: str) -> np.ndarray:
 
 def random_path(problem: TrajectoryProblem, scale: float = 1.0) -> np.ndarray:
     rng = np.random.default_rng(0)
-    far = random_configurations(problem.chain.lower, problem.chain.upper, problem.segments, rng)
+    far = sample_configurations(problem.chain.lower, problem.chain.upper, problem.segments, rng)
     return problem.start + scale * (far - problem.start)
 
 
@@ -108,7 +116,7 @@ def test_grasped_objects_do_not_move_and_freedoms_have_limits(
 
 def test_goal_beyond_a_limit_is_the_limit() -> None:
     steps = [Actuate("door", {"hinge": 2.0}), GoTo(0.0, 0.0)]
-    problem = program_of(door_scene(), steps, options=SHORT)
+    problem = make_program(load_door_scene(), steps, options=SHORT)
     assert np.all(bounds(problem, "door.hinge")[problem.ends[2] - 1 :] == 1.57)
 
 
@@ -123,7 +131,7 @@ def test_robot_stays_within_its_limits_and_the_arena(opening: TrajectoryProblem)
         arm = np.tile(limits[3:], (opening.segments, 1))
         np.testing.assert_array_equal(bound[:, 3 : len(limits)], arm)
     narrow = dataclasses.replace(scene, arena=(-50.0, 1.0, -1.0, 60.0))
-    problem = program_of(narrow, [Reach(POSE)], options=SHORT)
+    problem = make_program(narrow, [Reach(POSE)], options=SHORT)
     np.testing.assert_array_equal(problem.lower[0, :2], [robot.lower[0], -1.0])
     np.testing.assert_array_equal(problem.upper[0, :2], [1.0, robot.upper[1]])
     assert problem.limits("base_x") == (robot.lower[0], 1.0)
@@ -131,8 +139,8 @@ def test_robot_stays_within_its_limits_and_the_arena(opening: TrajectoryProblem)
 
 @pytest.mark.parametrize("start", [2.2, -2.2 - 2 * np.pi, 15.0])
 def test_base_turns_to_the_nearest_equivalent_heading(start: float) -> None:
-    scene = door_scene().with_start(base=[-0.7, 0.3, start])
-    problem = program_of(scene, [GoTo(-0.5, 0.1, -2.2)], options=SHORT)
+    scene = load_door_scene().with_start(base=[-0.7, 0.3, start])
+    problem = make_program(scene, [GoTo(-0.5, 0.1, -2.2)], options=SHORT)
     np.testing.assert_array_equal(problem.lower[-1, :3], problem.upper[-1, :3])
     np.testing.assert_array_equal(problem.lower[-1, :2], [-0.5, 0.1])
     heading = problem.lower[-1, 2]
@@ -141,22 +149,22 @@ def test_base_turns_to_the_nearest_equivalent_heading(start: float) -> None:
 
 
 def test_base_goal_without_heading_leaves_it_free() -> None:
-    problem = program_of(door_scene(), [GoTo(-0.5, 0.1)], options=SHORT)
+    problem = make_program(load_door_scene(), [GoTo(-0.5, 0.1)], options=SHORT)
     np.testing.assert_array_equal(problem.lower[-1, :2], problem.upper[-1, :2])
     assert (problem.lower[-1, 2], problem.upper[-1, 2]) == (-np.inf, np.inf)
 
 
 def test_fixed_base_stays_at_the_start() -> None:
-    scene = dataclasses.replace(door_scene(), robot=load_robot("husky_ur5e", base="fixed"))
-    problem = program_of(scene, [Reach(POSE)], options=SHORT)
+    scene = dataclasses.replace(load_door_scene(), robot=load_robot("husky_ur5e", base="fixed"))
+    problem = make_program(scene, [Reach(POSE)], options=SHORT)
     for bound in (problem.lower, problem.upper):
         np.testing.assert_array_equal(bound[:, :3], np.tile(scene.start[:3], (problem.segments, 1)))
 
 
 def test_start_is_the_state_of_the_scene() -> None:
-    scene = door_scene().with_state("door", {"hinge": 0.3, "knob": 0.2})
+    scene = load_door_scene().with_state("door", {"hinge": 0.3, "knob": 0.2})
     scene = scene.with_start(base=[0.1, 0.2, 0.3])
-    problem = program_of(scene, [Actuate("door", {"hinge": 1.2})], options=SHORT)
+    problem = make_program(scene, [Actuate("door", {"hinge": 1.2})], options=SHORT)
     np.testing.assert_array_equal(problem.start[: len(scene.start)], scene.start)
     assert problem.start[problem.chain.index("door.hinge")] == 0.3
     # the latch does not hold an open door
@@ -213,14 +221,14 @@ def test_goals_of_several_grasps(two_grasps: TrajectoryProblem) -> None:
 
 
 def test_object_held_at_the_start_is_closed_from_the_first_waypoint() -> None:
-    scene = dataclasses.replace(door_scene(), holds=(HANDLE,))
-    problem = program_of(scene, [Actuate("door", {"knob": 0.3})], options=SHORT)
+    scene = dataclasses.replace(load_door_scene(), holds=(HANDLE,))
+    problem = make_program(scene, [Actuate("door", {"knob": 0.3})], options=SHORT)
     assert goal_waypoints(problem) == {"closure door": tuple(range(1, MOVE + 1))}
     assert problem.transcription.structure.stops == ()
 
 
 def test_any_frame_of_the_robot_can_reach_a_pose() -> None:
-    problem = program_of(door_scene(), [Reach(POSE, frame="forearm_link")], options=SHORT)
+    problem = make_program(load_door_scene(), [Reach(POSE, frame="forearm_link")], options=SHORT)
     model = problem.chain.model
     frame = model.frames[model.getFrameId("forearm_link")]
     assert goal_waypoints(problem) == {"goal forearm_link": (REACH,)}
@@ -256,16 +264,16 @@ def test_pose_error_and_drift(opening: TrajectoryProblem) -> None:
     drifts = [np.linalg.norm(r[:3]) / Tolerances().closure_position for r in between]
     drifts += [np.linalg.norm(r[3:]) / Tolerances().closure_angle for r in between]
     assert opening.drift(z) == pytest.approx(max(drifts), rel=1e-6)
-    alone = program_of(door_scene(), [GoTo(0.0, 0.0)], options=SHORT)
+    alone = make_program(load_door_scene(), [GoTo(0.0, 0.0)], options=SHORT)
     assert alone.pose_error(random_path(alone)) == alone.drift(random_path(alone)) == 0.0
 
 
 @pytest.mark.parametrize(
     ("step", "make_scene"),
     [
-        (Actuate("door", {"hinge": 1.2}), door_scene),
-        (Grasp("cabinet", "socket"), full_scene),
-        (Grasp("stick"), lambda: room(table())),
+        (Actuate("door", {"hinge": 1.2}), load_door_scene),
+        (Grasp("cabinet", "socket"), make_full_scene),
+        (Grasp("stick"), lambda: make_room(describe_table())),
     ],
     ids=["door", "socket with a standoff", "stick"],
 )
@@ -273,13 +281,13 @@ def test_hand_approaches_a_grasp_in_a_straight_line(
     step: Step, make_scene: Callable[[], Scene]
 ) -> None:
     """Before the grasp, the tool is `approach` behind the grasp pose, whatever its freedoms."""
-    problem = program_of(make_scene(), [step], options=SHORT)
+    problem = make_program(make_scene(), [step], options=SHORT)
     chain, (hold,) = problem.chain, problem.task.holds
     number = [goal.kind for goal in problem.pose_goals].index("approach")
     placed = problem.scene.objects[hold.object]
     grasp = placed.object.attachments[hold.attachment]
     rng = np.random.default_rng(0)
-    guesses = random_configurations(chain.lower, chain.upper, 60, rng, arena=3.0)
+    guesses = sample_configurations(chain.lower, chain.upper, 60, rng, arena=3.0)
     lower, upper = chain.lower.copy(), chain.upper.copy()
     for name, value in problem.task.state.items():
         lower[chain.index(name)] = upper[chain.index(name)] = value
@@ -306,14 +314,14 @@ def test_hand_approaches_a_grasp_in_a_straight_line(
 
 
 def test_free_objects_are_grasped_at_their_resting_poses() -> None:
-    aside = lifted(STICK, [0.0, 0.5, 0.0])
+    aside = lift(STICK, [0.0, 0.5, 0.0])
     steps = [
         Touch("stick.tip", (0.8, 0.9, 0.7)),
         Place("stick", aside),
         GoTo(0.0, 0.0),
         Grasp("stick"),
     ]
-    problem = program_of(room(table()), steps, options=SHORT)
+    problem = make_program(make_room(describe_table()), steps, options=SHORT)
     ends = problem.ends.tolist()
     point = pin.SE3(np.eye(3), np.array([0.8, 0.9, 0.7]))
     assert [(g.name, g.target, g.row.waypoints, g.row.kind) for g in problem.pose_goals] == [
@@ -345,7 +353,7 @@ def test_initially_held_object_stays_in_the_hand(fetching: TrajectoryProblem) ->
 
 def test_loose_grasps_are_not_clamped() -> None:
     steps = [Actuate("cabinet", {"swing": 0.5}, "sleeve")]
-    assert program_of(full_scene(), steps, options=SHORT).choices == ()
+    assert make_program(make_full_scene(), steps, options=SHORT).choices == ()
 
 
 def test_object_held_by_another_is_approached_along_its_holder(
@@ -370,7 +378,7 @@ def test_grasps_are_chosen_within_their_own_phases(waypoints: int) -> None:
     """The freedoms of an earlier grasp do not bind a later one, however short the phases are."""
     aside = Place("stick", pin.SE3(np.eye(3), np.array([2.5, 0.5, 0.771])))
     options = Options(reach_waypoints=waypoints)
-    problem = program_of(load_scene("init_1"), [aside, Grasp("stick")], options=options)
+    problem = make_program(load_scene("init_1"), [aside, Grasp("stick")], options=options)
     clamped = problem.transcription.structure.clamped
     one, other = sorted({(first, last) for _, first, last in clamped})
     assert one[1] < other[0]
@@ -383,14 +391,16 @@ def test_grasps_are_chosen_within_their_own_phases(waypoints: int) -> None:
 
 def test_relaxed_program_with_rows_of_all_kinds_is_feasible_at_its_iterate() -> None:
     """A wheeled base, a clamped grasp and user-defined constraints."""
-    scene = dataclasses.replace(room(table()), robot=load_robot("husky_ur5e", base="differential"))
+    scene = dataclasses.replace(
+        make_room(describe_table()), robot=load_robot("husky_ur5e", base="differential")
+    )
     terms = [
         Constraint("tip", lambda s: s.position("stick.tip"), upper=0.3, tolerance=0.02),
         Constraint("slow", lambda s: ca.sumsqr(s.velocity("tool")), upper=0.5, tolerance=0.004),
     ]
     steps = [Touch("stick.tip", (0.8, 0.9, 0.7)), Place("stick", (0.8, 0.5, 0.56))]
-    p = program_of(scene, steps, options=SHORT, terms=terms)
-    amounts = [check_relaxation(p, z) for z in iterates(p)]
+    p = make_program(scene, steps, options=SHORT, terms=terms)
+    amounts = [check_relaxation(p, z) for z in make_iterates(p)]
     for kind in ("clearance", "poses", "rolling", "clamped", "terms", "rates"):
         assert max(each[kind] for each in amounts) > 0.1, kind
     # each row is of one kind; 1e-3 is the tolerance of user-defined constraints
@@ -450,4 +460,4 @@ def test_repr(opening: TrajectoryProblem) -> None:
 
 def test_a_joint_cannot_be_grasped_twice() -> None:
     with pytest.raises(InputError, match="two grasps of one joint"):
-        program_of(door_scene(), [Grasp("door", "handle"), Grasp("door", "handle_free")])
+        make_program(load_door_scene(), [Grasp("door", "handle"), Grasp("door", "handle_free")])

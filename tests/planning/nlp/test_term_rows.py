@@ -9,10 +9,10 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.carrying import room, stand, table
-from helpers.program_points import random_point
-from helpers.relaxed import check_relaxation, iterates
-from helpers.small_problems import full_scene, program_of
+from helpers.carrying import describe_stand, describe_table, make_room
+from helpers.program_points import make_random_point
+from helpers.relaxed import check_relaxation, make_iterates
+from helpers.small_problems import make_full_scene, make_program
 
 import vkc_pin as vkc
 from vkc_pin.world.task.phases import Phase
@@ -87,14 +87,14 @@ def make_terms(name: str) -> list[Constraint | Cost]:
 @cache
 def problem(name: str) -> vkc.TrajectoryProblem:
     if name == "stick":
-        scene = room(table())
+        scene = make_room(describe_table())
         steps = [
             vkc.Touch("stick.tip", (0.8, 0.9, 0.7)),
             vkc.Place("stick", (0.8, 0.5, 0.56)),
             vkc.GoTo(0.0, 0.0),
         ]
     elif name == "ball":
-        scene = room(stand(), objects=("stick", "ball")).with_held(
+        scene = make_room(describe_stand(), objects=("stick", "ball")).with_held(
             {"stick": "grip"}, at={"stick": (0.02, -0.1)}
         )
         steps = [
@@ -103,13 +103,13 @@ def problem(name: str) -> vkc.TrajectoryProblem:
             vkc.GoTo(0.0, 0.0),
         ]
     else:
-        scene = full_scene()
+        scene = make_full_scene()
         steps = [
             vkc.Actuate("cabinet", {"swing": 0.5}),
             vkc.Actuate("door", {"hinge": 1.2}),
             vkc.GoTo(0.0, 0.0),
         ]
-    return program_of(scene, steps, options=OPTIONS, terms=make_terms(name))
+    return make_program(scene, steps, options=OPTIONS, terms=make_terms(name))
 
 
 NAMES = ["stick", "ball", "furniture"]
@@ -209,7 +209,7 @@ def expected_values(
 def test_rows_and_costs_are_the_expressions_at_the_waypoints(name: str) -> None:
     """Their excess is relaxed, as that of other rows, and their derivatives are exact."""
     p = problem(name)
-    point, t, cost, seen = random_point(p), p.transcription, 0.0, 0
+    point, t, cost, seen = make_random_point(p), p.transcription, 0.0, 0
     rows, dt = point.rows(), point.dt
     by_name = {term.name: at for term, at in zip(p.terms, t.term_rows, strict=True)}
     for term in make_terms(name):
@@ -234,12 +234,12 @@ def test_rows_and_costs_are_the_expressions_at_the_waypoints(name: str) -> None:
         "ball": {"between": 6, "ball": 6},
         "furniture": {"panel": 17, "look": 17, "tray": 17, "hinge": 17, "slide": 0},
     }[name]
-    random_point(p, seed=2).check_derivatives()
+    make_random_point(p, seed=2).check_derivatives()
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_fully_relaxed_constraints_hold_at_the_iterate(name: str) -> None:
-    amounts = [check_relaxation(problem(name), z) for z in iterates(problem(name), 1)]
+    amounts = [check_relaxation(problem(name), z) for z in make_iterates(problem(name), 1)]
     assert max(each["terms"] for each in amounts) > 0.1
 
 
@@ -257,8 +257,11 @@ def test_position_after_release_depends_on_the_waypoint_of_release() -> None:
 def test_programs_differ_by_expressions_but_not_by_bounds() -> None:
     def make(limit: float, upper: float, *, terms: bool = True) -> vkc.TrajectoryProblem:
         near = vkc.Constraint("near", lambda s: s.position("tool")[2] - limit, upper=upper)
-        return program_of(
-            room(table()), [vkc.GoTo(0.5, 0.5)], options=OPTIONS, terms=[near] if terms else []
+        return make_program(
+            make_room(describe_table()),
+            [vkc.GoTo(0.5, 0.5)],
+            options=OPTIONS,
+            terms=[near] if terms else [],
         )
 
     first, without = make(0.5, 1.0), make(0.5, 1.0, terms=False)
@@ -270,7 +273,9 @@ def test_programs_differ_by_expressions_but_not_by_bounds() -> None:
 
 def test_violations_are_scaled_to_their_tolerance() -> None:
     low = vkc.Constraint("low", lambda s: s.coordinate("base_x"), upper=0.5, tolerance=0.02)
-    p = program_of(room(table()), [vkc.GoTo(1.0, 0.0)], options=OPTIONS, terms=[low])
+    p = make_program(
+        make_room(describe_table()), [vkc.GoTo(1.0, 0.0)], options=OPTIONS, terms=[low]
+    )
     z = p.still
     dt = p.timing_for(z).dt
     assert p.row_error(z, dt) == 0.0
@@ -291,7 +296,7 @@ def test_speed_limits_lengthen_the_steps() -> None:
             tolerance=1e-3,
         )
         options = vkc.Options(reach_waypoints=8)
-        return program_of(room(), [vkc.GoTo(2.0, 0.0)], options=options, terms=[slow])
+        return make_program(make_room(), [vkc.GoTo(2.0, 0.0)], options=options, terms=[slow])
 
     share = np.linspace(0.0, 1.0, 9)[1:, None]
     usual = make(9.0)
@@ -321,8 +326,8 @@ def test_speed_limits_lengthen_the_steps() -> None:
 def test_terms_that_are_not_finite_are_rejected(expression: Any, make: Any) -> None:
     message = "its value or derivative is not finite at the start"
     with pytest.raises(vkc.InputError, match=rf"terms\['mine'\]\.expression: {message}"):
-        program_of(
-            room(table()).with_held({"stick": "grip"}),
+        make_program(
+            make_room(describe_table()).with_held({"stick": "grip"}),
             [vkc.GoTo(0.5, 0.5)],
             options=OPTIONS,
             terms=[make(expression)],
@@ -331,5 +336,7 @@ def test_terms_that_are_not_finite_are_rejected(expression: Any, make: Any) -> N
 
 def test_constant_terms_have_no_rows() -> None:
     here = vkc.Constraint("here", lambda s: s.position("stick.tip"), upper=-9.0, during="go to")
-    p = program_of(room(table()), [vkc.GoTo(1.0, 0.0)], options=OPTIONS, terms=[here])
+    p = make_program(
+        make_room(describe_table()), [vkc.GoTo(1.0, 0.0)], options=OPTIONS, terms=[here]
+    )
     assert p.terms == ()

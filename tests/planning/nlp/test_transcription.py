@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.carrying import room, stand, table
-from helpers.program_points import QUIET, ProgramPoint, random_point
-from helpers.relaxed import Relaxed, check_relaxation, iterates
-from helpers.small_problems import CACHE, door_scene, program_of
-from helpers.telescopes import coupled_scene
+from helpers.carrying import describe_stand, describe_table, make_room
+from helpers.program_points import QUIET, ProgramPoint, make_random_point
+from helpers.relaxed import Relaxed, check_relaxation, make_iterates
+from helpers.small_problems import CACHE, load_door_scene, make_program
+from helpers.telescopes import write_coupled_scene
 
 from vkc_pin.options import Options
 from vkc_pin.planning.chain.pose import flatten_target
@@ -36,33 +36,37 @@ POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
 @cache
 def wheeled_scene(base: str) -> Scene:
     turning = {"turning_radius": 0.8} if base == "ackermann" else {}
-    return dataclasses.replace(door_scene(), robot=load_robot("husky_ur5e", base=base, **turning))
+    return dataclasses.replace(
+        load_door_scene(), robot=load_robot("husky_ur5e", base=base, **turning)
+    )
 
 
 @cache
 def problem(name: str) -> TrajectoryProblem:
     options = OPTIONS
     if name == "door":
-        scene, steps = door_scene(), [Actuate("door", {"hinge": 1.2})]
+        scene, steps = load_door_scene(), [Actuate("door", {"hinge": 1.2})]
     elif name == "push":  # from the start, in the direction of a falling coordinate
-        scene = door_scene().with_state("door", {"hinge": 1.0}).with_held({"door": "push_back"})
+        scene = (
+            load_door_scene().with_state("door", {"hinge": 1.0}).with_held({"door": "push_back"})
+        )
         steps = [Actuate("door", {"hinge": 0.5}), GoTo(0.0, 0.0)]
     elif name == "stick":  # the grasp is chosen and clamped; a point goal and an upright goal
-        scene = room(table())
+        scene = make_room(describe_table())
         steps = [Touch("stick.tip", (0.8, 0.9, 0.7)), Place("stick", (0.8, 0.5, 0.56))]
     elif name == "fetch":  # a ball with the stick, which is then released
-        scene = room(stand(), objects=("stick", "ball"))
+        scene = make_room(describe_stand(), objects=("stick", "ball"))
         scene = scene.with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
         steps = [Grasp("ball", "pull", "stick.tip"), Place("ball", POSE), Release("stick")]
         steps.append(GoTo(0.0, 0.0))
     elif name == "telescope":  # one coordinate moves several joints
         with tempfile.TemporaryDirectory() as folder:
-            scene = coupled_scene(Path(folder))
+            scene = write_coupled_scene(Path(folder))
         steps = [Actuate("drawer", {scene.objects["drawer"].object.coordinates.names[0]: 0.1})]
     else:
         scene, steps = wheeled_scene(name), [Reach(POSE), GoTo(0.0, 0.0, 1.0)]
         options = dataclasses.replace(OPTIONS, contact_slots=1)
-    return program_of(scene, steps, options=options)
+    return make_program(scene, steps, options=options)
 
 
 NAMES = ["door", "differential", "ackermann", "stick", "fetch", "push", "telescope"]
@@ -147,7 +151,7 @@ def relaxed_rows(p: TrajectoryProblem, path: np.ndarray, gears: np.ndarray) -> n
 def test_rows_equal_their_definitions(name: str) -> None:
     """A relaxation variable removes its share of the excess of its waypoint's rows."""
     p = problem(name)
-    point, t = random_point(p), p.transcription
+    point, t = make_random_point(p), p.transcription
     found, expected = point.rows(), np.full(t.rows + t.rate_matrix.size1(), np.nan)
     for rows, values in waypoint_rows(point):
         expected[rows] = values
@@ -164,7 +168,7 @@ def test_rows_equal_their_definitions(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_objective_is_the_weighted_sum_of_squared_steps_and_changes(name: str) -> None:
-    point = random_point(problem(name))
+    point = make_random_point(problem(name))
     bends = np.vstack([changes(point.path, run) for run in runs(point.problem)])
     steps = np.diff(point.path, axis=0)
     squares = [np.sum(w * part**2) for w, part in zip(point.weights, (steps, bends), strict=True)]
@@ -173,7 +177,7 @@ def test_objective_is_the_weighted_sum_of_squared_steps_and_changes(name: str) -
 
 @pytest.mark.parametrize("name", NAMES)
 def test_derivatives_equal_differences(name: str) -> None:
-    random_point(problem(name), seed=1).check_derivatives()
+    make_random_point(problem(name), seed=1).check_derivatives()
 
 
 def test_problems_have_rows_of_all_kinds() -> None:
@@ -205,7 +209,7 @@ def test_bounds_of_wheels(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_fully_relaxed_program_is_feasible_at_its_iterate(name: str) -> None:
-    amounts = [check_relaxation(problem(name), z) for z in iterates(problem(name), 1)]
+    amounts = [check_relaxation(problem(name), z) for z in make_iterates(problem(name), 1)]
     violated = {kind for kind in amounts[0] if max(each[kind] for each in amounts) > 0.1}
     expected = {"poses", "rates"} if name == "telescope" else {"poses", "clearance", "rates"}
     expected |= {"rolling"} if name in ("differential", "ackermann") else set()
@@ -217,13 +221,13 @@ def test_fully_relaxed_program_is_feasible_at_its_iterate(name: str) -> None:
 @pytest.mark.parametrize("axis", [[1.0, 0.0, 0.0], [0.3, -0.8, 0.5]], ids=["x", "oblique"])
 def test_relaxed_program_is_feasible_near_half_turns(axis: list[float], off: float) -> None:
     """Near a half turn the rows vanish, and the residual has two signs."""
-    p = program_of(door_scene(), [Reach(POSE)], options=OPTIONS)
-    (z, *_) = iterates(p, 1)
+    p = make_program(load_door_scene(), [Reach(POSE)], options=OPTIONS)
+    (z, *_) = make_iterates(p, 1)
     pose, data = p.transcription.structure.poses[0], p.chain.model.createData()
     pin.forwardKinematics(p.chain.model, data, p.chain.coordinates.q(z[-1]))
     turn = pin.AngleAxis(np.pi - off, np.array(axis) / np.linalg.norm(axis)).matrix()
     there = data.oMi[pose.joint] * pose.local * pin.SE3(turn, np.array([0.1, -0.2, 0.3]))
-    turned = program_of(door_scene(), [Reach(there)], options=OPTIONS)
+    turned = make_program(load_door_scene(), [Reach(there)], options=OPTIONS)
     check_relaxation(turned, z)
     expected = np.pi - off + np.linalg.norm([0.1, -0.2, 0.3])
     found = Relaxed(turned, z).found.amounts["poses"][-1]
@@ -235,19 +239,23 @@ def test_relaxed_program_is_feasible_near_half_turns(axis: list[float], off: flo
 
 
 def test_one_program_serves_all_problems_of_a_structure() -> None:
-    scene, steps, door = door_scene(), [Actuate("door", {"hinge": 1.2})], door_scene().objects
-    first, spent = program_of(scene, steps, options=OPTIONS), CACHE.build_time
+    scene, steps, door = (
+        load_door_scene(),
+        [Actuate("door", {"hinge": 1.2})],
+        load_door_scene().objects,
+    )
+    first, spent = make_program(scene, steps, options=OPTIONS), CACHE.build_time
     shift = pin.SE3(pin.utils.rotate("z", 0.4), np.array([0.3, -0.2, 0.0]))
     moved = dataclasses.replace(door["door"], placement=shift * door["door"].placement)
     safer = dataclasses.replace(OPTIONS, dist_safe=0.05, penalty=3.0)
     for other in (
-        program_of(scene.sample_start(np.random.default_rng(0)), steps, options=OPTIONS),
-        program_of(dataclasses.replace(scene, objects={"door": moved}), steps, options=OPTIONS),
-        program_of(
+        make_program(scene.sample_start(np.random.default_rng(0)), steps, options=OPTIONS),
+        make_program(dataclasses.replace(scene, objects={"door": moved}), steps, options=OPTIONS),
+        make_program(
             dataclasses.replace(scene, obstacles=(), obstacle_labels=()), steps, options=OPTIONS
         ),
-        program_of(scene, [Actuate("door", {"hinge": 0.4})], options=OPTIONS),
-        program_of(scene.with_state("door", {"knob": 0.1}), steps, options=safer),
+        make_program(scene, [Actuate("door", {"hinge": 0.4})], options=OPTIONS),
+        make_program(scene.with_state("door", {"knob": 0.1}), steps, options=safer),
     ):
         assert other.transcription is first.transcription
     assert CACHE.build_time == spent

@@ -7,7 +7,7 @@ import dataclasses
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.small_problems import door_scene
+from helpers.small_problems import load_door_scene
 
 import vkc_pin as vkc
 from vkc_pin.planning.retiming.limits import Limits
@@ -110,6 +110,6 @@ def test_planned_motion_keeps_its_limits(door_plan: vkc.Plan) -> None:
 
 def test_velocity_constraints_prevent_retiming() -> None:
     limit = vkc.Constraint("gently", lambda s: ca.norm_2(s.velocity("base_link")), upper=0.3)
-    plan = vkc.plan(door_scene(), [vkc.GoTo(0.5, 0.2)], terms=[limit])
+    plan = vkc.plan(load_door_scene(), [vkc.GoTo(0.5, 0.2)], terms=[limit])
     assert plan.success, plan.summary()
     assert plan.trajectory.curve is None

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.closers import closer
-from helpers.executions import door_plan
+from helpers.closers import load_door_with_closer
+from helpers.executions import plan_door
 from scipy.interpolate import CubicHermiteSpline
 
 from vkc_pin.planning.retiming.torque_bounds import TorqueBounds
@@ -14,7 +14,7 @@ from vkc_pin.world.trajectory.dynamics.torques import Torques
 
 def opening(**resistance: float) -> tuple[TorqueBounds, CubicHermiteSpline]:
     """Return the bounds of the last phase, in which the door opens, and its path over time."""
-    plan, scene = door_plan(), closer(**resistance)
+    plan, scene = plan_door(), load_door_with_closer(**resistance)
     phase = plan.trajectory.phases[-1]
     rows = slice(phase.first + 1, phase.last + 1)
     times, points = plan.trajectory.times[rows], plan.trajectory.positions[rows]
@@ -44,11 +44,13 @@ def test_linearized_torques_equal_torques(speed: float, change: float) -> None:
 
 def test_curve_is_slowed_down_to_the_torque_limit() -> None:
     bounds, _ = opening(damping=500.0)
-    plan = door_plan()
+    plan = plan_door()
     phase = plan.trajectory.phases[-1]
     assert plan.trajectory.curve is not None
     curve = plan.trajectory.curve.part(*plan.trajectory.times[[phase.first + 1, phase.last]])
-    bounds = TorqueBounds(Torques(closer(damping=500.0), plan.trajectory), bounds._phases)
+    bounds = TorqueBounds(
+        Torques(load_door_with_closer(damping=500.0), plan.trajectory), bounds._phases
+    )
     assert np.abs(bounds.evaluate(curve)).max() > 1.01
     slower = bounds.slow_down(curve)
     assert np.abs(bounds.evaluate(slower)).max() == pytest.approx(1.0, abs=1e-6)
@@ -58,11 +60,12 @@ def test_curve_is_slowed_down_to_the_torque_limit() -> None:
 
 def test_curve_too_heavy_at_rest_is_not_slowed_down() -> None:
     bounds, _ = opening()
-    plan = door_plan()
+    plan = plan_door()
     phase = plan.trajectory.phases[-1]
     assert plan.trajectory.curve is not None
     curve = plan.trajectory.curve.part(*plan.trajectory.times[[phase.first + 1, phase.last]])
     heavy = TorqueBounds(
-        Torques(closer(stiffness=300.0, springref=-2.0), plan.trajectory), bounds._phases
+        Torques(load_door_with_closer(stiffness=300.0, springref=-2.0), plan.trajectory),
+        bounds._phases,
     )
     assert heavy.slow_down(curve) is curve

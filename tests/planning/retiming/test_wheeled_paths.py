@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.drives import hall, of_rows
+from helpers.drives import make_hall, make_trajectory
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -104,8 +104,8 @@ def test_steered_base_stops_only_where_turns_would_be_too_tight(
 
 
 SCENES = {
-    "differential": hall(base="differential"),
-    "ackermann": hall(base="ackermann", turning_radius=0.8),
+    "differential": make_hall(base="differential"),
+    "ackermann": make_hall(base="ackermann", turning_radius=0.8),
 }
 
 
@@ -117,7 +117,7 @@ def drives(base: str) -> Trajectory:
     turned = np.exp(-0.9j) * (rows[:, 0] + 1j * rows[:, 1])
     rows[:, 0], rows[:, 1] = turned.real, turned.imag
     rows[:, 3] += np.linspace(0.0, 0.4, len(rows))
-    return retime_trajectory(scene, of_rows(scene, rows, dt=1.0))
+    return retime_trajectory(scene, make_trajectory(scene, rows, dt=1.0))
 
 
 @pytest.mark.parametrize("base", ["differential", "ackermann"])

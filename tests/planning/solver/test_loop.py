@@ -9,8 +9,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.drives import hall, moved, through
-from helpers.small_problems import program_of
+from helpers.drives import drive_through, make_hall, move_start
+from helpers.small_problems import make_program
 
 import vkc_pin as vkc
 from vkc_pin.planning.initialization.methods import initialize
@@ -38,10 +38,12 @@ def drive(
     x: float, *obstacles: dict[str, object], options: vkc.Options = FEW
 ) -> tuple[vkc.TrajectoryProblem, np.ndarray]:
     """Return a drive ahead to `x` [m] and the straight path."""
-    scene = hall(obstacles=list(obstacles))
-    problem = program_of(scene, [vkc.GoTo(x, 0.0, 0.0)], options=options)
-    goal = moved(scene.start, x=x)
-    return problem, through(scene, scene.start, goal, steps=problem.segments).positions[1:].copy()
+    scene = make_hall(obstacles=list(obstacles))
+    problem = make_program(scene, [vkc.GoTo(x, 0.0, 0.0)], options=options)
+    goal = move_start(scene.start, x=x)
+    return problem, drive_through(scene, scene.start, goal, steps=problem.segments).positions[
+        1:
+    ].copy()
 
 
 def post(x: float, y: float, radius: float) -> dict[str, object]:
@@ -68,10 +70,10 @@ def walls() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
 @cache
 def reach() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
     """A distant pose of the hand, from a stationary guess."""
-    scene = hall()
+    scene = make_hall()
     tool = scene.tool_placement()
     tool.translation[0] += 5.0
-    problem = program_of(scene, [vkc.Reach(tool)], options=vkc.Options(reach_waypoints=12))
+    problem = make_program(scene, [vkc.Reach(tool)], options=vkc.Options(reach_waypoints=12))
     return problem, problem.still
 
 
@@ -79,7 +81,7 @@ def reach() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
 def grasp() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
     """A grasp between obstacles."""
     scene = vkc.load_scene("init_2").sample_start(np.random.default_rng(5))
-    problem = program_of(scene, [vkc.Grasp("stick")])
+    problem = make_program(scene, [vkc.Grasp("stick")])
     return problem, next(initialize(problem, "astar", 0)).z
 
 

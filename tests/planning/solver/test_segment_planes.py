@@ -6,8 +6,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.drives import hall, moved, through
-from helpers.small_problems import program_of
+from helpers.drives import drive_through, make_hall, move_start
+from helpers.small_problems import make_program
 
 import vkc_pin as vkc
 from vkc_pin.planning.chain.contacts import Contacts
@@ -32,18 +32,18 @@ def box(x: float, y: float, size: list[float]) -> dict[str, object]:
 
 def problem_of(scene: vkc.Scene, **goal: float) -> tuple[TrajectoryProblem, np.ndarray]:
     """Return a problem with few waypoints and the straight path, shape (N, n)."""
-    end = moved(scene.start, **goal)
-    problem = program_of(scene, [vkc.GoTo(*end[:3])], options=FEW)
-    return problem, through(scene, scene.start, end, steps=FEW.reach_waypoints).positions[1:]
+    end = move_start(scene.start, **goal)
+    problem = make_program(scene, [vkc.GoTo(*end[:3])], options=FEW)
+    return problem, drive_through(scene, scene.start, end, steps=FEW.reach_waypoints).positions[1:]
 
 
 @cache
 def past_a_post() -> tuple[TrajectoryProblem, np.ndarray]:
     """The hand, moving sideways, passes through a post between the second and third waypoint."""
-    tool = hall().with_start(arm=ARM).tool_placement().translation
+    tool = make_hall().with_start(arm=ARM).tool_placement().translation
     post = {"name": "post", "type": "cylinder", "radius": 0.03, "length": 1.6}
     post["position"] = [float(tool[0]) + 0.02, float(tool[1]) + WIDTH / 2, 0.8]
-    return problem_of(hall(obstacles=[post]).with_start(arm=ARM), y=WIDTH)
+    return problem_of(make_hall(obstacles=[post]).with_start(arm=ARM), y=WIDTH)
 
 
 def sample_segment(
@@ -106,7 +106,7 @@ def test_lifting_both_ends_lifts_the_segment_to_first_order() -> None:
 
 
 def test_witness_points_are_fixed_in_their_bodies() -> None:
-    problem, z = problem_of(hall(obstacles=[box(0.0, 1.0, [0.04, 0.04, 1.6])]), y=WIDTH)
+    problem, z = problem_of(make_hall(obstacles=[box(0.0, 1.0, [0.04, 0.04, 1.6])]), y=WIDTH)
     found = find_segment_contacts(problem, z).contacts
     along = np.einsum("ci,ci->c", found.normal, found.second - found.first)
     np.testing.assert_allclose(found.distance, along, atol=1e-12)
@@ -121,17 +121,17 @@ def test_witness_points_are_fixed_in_their_bodies() -> None:
 @pytest.mark.parametrize(("gap", "is_free"), [(0.9, False), (1.1, True)])
 def test_segments_need_some_clearance(gap: float, is_free: bool) -> None:
     """The base passes a wall at `gap` times the tolerance."""
-    scene = hall(obstacles=[box(1.0, 1.0, [4.0, 0.1, 0.5])])
+    scene = make_hall(obstacles=[box(1.0, 1.0, [4.0, 0.1, 0.5])])
     problem, _ = problem_of(scene, x=2.0)
     y = scene.start_clearance() - gap * CLEARANCE_TOLERANCE
-    z = np.array([moved(scene.start, x=x, y=y) for x in (0.5, 1.0, 1.5, 2.0, 2.5)])
+    z = np.array([move_start(scene.start, x=x, y=y) for x in (0.5, 1.0, 1.5, 2.0, 2.5)])
     found = find_segment_contacts(problem, z)
     assert found.is_free == is_free
     assert found.contacts.compute_violation() > 0.0
 
 
 def test_start_close_to_an_obstacle_can_be_left() -> None:
-    scene = hall(obstacles=[box(0.546, 0.0, [0.1, 2.0, 0.5])])
+    scene = make_hall(obstacles=[box(0.546, 0.0, [0.1, 2.0, 0.5])])
     assert 0.0 < scene.start_clearance() < SEGMENT_MARGIN
     for x, is_in_collision in ((-1.0, False), (1.0, True)):
         found = find_segment_contacts(*problem_of(scene, x=x))

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from helpers.drives import hall, moved, through
-from helpers.small_problems import door_scene, program_of
+from helpers.drives import drive_through, make_hall, move_start
+from helpers.small_problems import load_door_scene, make_program
 
 import vkc_pin as vkc
 from vkc_pin.planning.chain.contacts import Contacts
@@ -52,11 +52,13 @@ def make_iterate(
 def make_case(kind: str, *, rates: bool = False) -> Iterate:
     """Return a door that has not been reached yet, or a straight drive in an empty hall."""
     if kind == "door":
-        problem = program_of(door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=SHORT)
+        problem = make_program(
+            load_door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=SHORT
+        )
         return make_iterate(problem, problem.still, rates=rates)
-    scene = hall()
-    problem = program_of(scene, [vkc.GoTo(1.0, 0.0)], options=SHORT)
-    z = through(scene, scene.start, moved(scene.start, x=1.0), steps=8).positions[1:]
+    scene = make_hall()
+    problem = make_program(scene, [vkc.GoTo(1.0, 0.0)], options=SHORT)
+    z = drive_through(scene, scene.start, move_start(scene.start, x=1.0), steps=8).positions[1:]
     return make_iterate(problem, z, rates=rates)
 
 
@@ -128,9 +130,9 @@ def test_only_planes_violated_at_the_iterate_have_slack(is_violated: bool) -> No
     """The penalty weight does not matter next to a box beyond the margin."""
     x = 1.6 if is_violated else 1.85
     obstacle = {"name": "box", "type": "box", "size": [0.2, 0.2, 1.0], "position": [x, 0.0, 0.5]}
-    scene = hall(obstacles=[obstacle])
-    problem = program_of(scene, [vkc.GoTo(1.2, 0.0)], options=SHORT)
-    drive = through(scene, scene.start, moved(scene.start, x=1.2), steps=8).positions[1:]
+    scene = make_hall(obstacles=[obstacle])
+    problem = make_program(scene, [vkc.GoTo(1.2, 0.0)], options=SHORT)
+    drive = drive_through(scene, scene.start, move_start(scene.start, x=1.2), steps=8).positions[1:]
     one = make_iterate(problem, drive if is_violated else problem.still, weight=1e-3)
     assert bool(one.found.amounts["clearance"].any()) == is_violated
     step = one.solve(2.0)

@@ -6,23 +6,23 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.carrying import STICK, lifted, room, stand, table
-from helpers.small_problems import SHORT, door_scene, program_of, random_configurations
+from helpers.carrying import STICK, describe_stand, describe_table, lift, make_room
+from helpers.small_problems import SHORT, load_door_scene, make_program, sample_configurations
 
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.solver.to_trajectory import make_trajectory
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Release, Step
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-ASIDE = lifted(STICK, [0.0, 0.5, 0.0])
+ASIDE = lift(STICK, [0.0, 0.5, 0.0])
 
 
 @cache
 def fetch_problem() -> TrajectoryProblem:
-    scene = room(stand(), objects=("stick", "ball")).with_held(
+    scene = make_room(describe_stand(), objects=("stick", "ball")).with_held(
         {"stick": "grip"}, at={"stick": (0.02, -0.1)}
     )
-    return program_of(
+    return make_program(
         scene,
         [Grasp("ball", "pull", "stick.tip"), Place("ball", (0.8, 0.6, 0.7)), GoTo(0.0, 0.0)],
         options=SHORT,
@@ -31,11 +31,11 @@ def fetch_problem() -> TrajectoryProblem:
 
 @cache
 def place_problem() -> TrajectoryProblem:
-    return program_of(room(table()), [Place("stick", ASIDE)], options=SHORT)
+    return make_program(make_room(describe_table()), [Place("stick", ASIDE)], options=SHORT)
 
 
 def make_random(problem: TrajectoryProblem, seed: int = 0) -> tuple[np.ndarray, Trajectory]:
-    z = random_configurations(
+    z = sample_configurations(
         problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(seed)
     )
     return z, make_trajectory(problem, z, problem.timing_for(problem.still).dt)
@@ -93,8 +93,8 @@ def test_last_object_is_released_at_the_end() -> None:
 def test_hand_opens_at_the_end_only_on_request(
     steps: list[Step], held: dict[str, str], last: str
 ) -> None:
-    scene = door_scene().with_held(held) if steps[0] == Release() else door_scene()
-    motion = make_random(program_of(scene, steps, options=SHORT))[1]
+    scene = load_door_scene().with_held(held) if steps[0] == Release() else load_door_scene()
+    motion = make_random(make_program(scene, steps, options=SHORT))[1]
     assert motion.phases[-1].name == last
     if last == "let go":
         assert dict(motion.phases[-1].held) == {}
@@ -104,7 +104,7 @@ def test_hand_opens_at_the_end_only_on_request(
 def test_robot_waits_only_for_the_gripper() -> None:
     """It does not pause between turning the knob and moving the door."""
     steps: list[Step] = [Actuate("door", {"hinge": 1.2}), GoTo(0.0, 0.0)]
-    problem = program_of(door_scene(), steps, options=SHORT)
+    problem = make_program(load_door_scene(), steps, options=SHORT)
     grasp, _, release, _ = problem.ends.tolist()
     assert pauses(problem, make_random(problem)[1]) == [grasp + 1, release + 2]
 
@@ -112,8 +112,8 @@ def test_robot_waits_only_for_the_gripper() -> None:
 def test_object_grasped_at_the_start_is_released_first() -> None:
     """A door grasped at the start is attached in no phase; its grasp keeps its value."""
     for attachment in ("handle", "handle_free"):
-        problem = program_of(
-            door_scene().with_held({"door": attachment}), [GoTo(0.0, 0.0)], options=SHORT
+        problem = make_program(
+            load_door_scene().with_held({"door": attachment}), [GoTo(0.0, 0.0)], options=SHORT
         )
         motion = make_random(problem)[1]
         assert [dict(phase.held) for phase in motion.phases] == [{}]

@@ -6,8 +6,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.drives import hall, moved
-from helpers.small_problems import program_of
+from helpers.drives import make_hall, move_start
+from helpers.small_problems import make_program
 
 import vkc_pin as vkc
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
@@ -31,7 +31,7 @@ def posts() -> TrajectoryProblem:
     ]
     steps = [vkc.GoTo(6.0, 0.0), vkc.GoTo(0.0, 0.0)]
     options = vkc.Options(reach_waypoints=REACH)
-    return program_of(hall(obstacles=obstacles), steps, options=options)
+    return make_program(make_hall(obstacles=obstacles), steps, options=options)
 
 
 def base_crossings(
@@ -39,7 +39,7 @@ def base_crossings(
 ) -> dict[str, list[tuple[int, int]]]:
     """Return the first and last segments in which the base crosses each post."""
     problem = posts()
-    states = np.array([moved(problem.start, x=x, y=y) for x in xs])
+    states = np.array([move_start(problem.start, x=x, y=y) for x in xs])
     where = np.array(segments)
     near = problem.contacts.evaluate(states, where + 1, reach=0.05)
     labels = problem.contacts.phases[0].labels
@@ -81,7 +81,7 @@ def test_grazing_is_no_crossing() -> None:
     xs = np.linspace(1.0, 3.0, 200).tolist()
     assert base_crossings(xs, [0] * 200, y=-0.3) == {"post_2": [(0, 0)]}
     assert base_crossings(xs, [0] * 200, y=GRAZING) == {}
-    states = np.array([moved(posts().start, x=x, y=GRAZING) for x in xs])
+    states = np.array([move_start(posts().start, x=x, y=GRAZING) for x in xs])
     near = posts().contacts.evaluate(states, np.ones(200, int), reach=0.0)
     labels = posts().contacts.phases[0].labels
     assert "base_link" in {labels[pair[0]] for pair in near.pair}

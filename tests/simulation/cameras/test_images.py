@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.executions import drawer_result
+from helpers.executions import simulate_drawer
 
 import vkc_pin as vkc
 from vkc_pin.simulation.cameras.images import ROBOT, Images, render_images
@@ -27,7 +27,7 @@ WRIST = Camera(
 
 @pytest.fixture(scope="module")
 def images() -> Images:
-    executed = drawer_result()
+    executed = simulate_drawer()
     times = np.array([0.0, 0.0, executed.planned.times[-1]])
     try:
         return render_images(executed, [HEAD, WRIST], times)
@@ -56,7 +56,7 @@ def test_images_change_only_with_time(images: Images) -> None:
 
 def test_depth_of_floor_pixels_is_consistent(images: Images) -> None:
     """Floor pixels, projected back along their rays, lie at height 0 and all others above."""
-    executed = drawer_result()
+    executed = simulate_drawer()
     world = Replay(executed.scene, executed.trajectory.times, executed.rows)
     data = world.model.createData()
     row = world.compute_positions(executed.trajectory, np.array([executed.planned.times[-1]]))[0]

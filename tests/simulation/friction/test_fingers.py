@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.grippers import between_cheeks, write_gripper
+from helpers.grippers import write_cheeks_scene, write_gripper
 
 import vkc_pin as vkc
 from vkc_pin.simulation.friction.fingers import find_fingers, limit_finger_servos
@@ -33,7 +33,7 @@ def test_pads_slide_without_a_described_gripper() -> None:
 
 
 def test_described_gripper_uses_its_own_joints(tmp_path: Path) -> None:
-    world = World(between_cheeks(write_gripper(tmp_path), opening=0.03))
+    world = World(write_cheeks_scene(write_gripper(tmp_path), opening=0.03))
     fingers = find_fingers(world, Physics())
     assert (fingers.sides, fingers.names) == (None, ("finger_a_joint", "finger_b_joint"))
     np.testing.assert_allclose(fingers.closed, 0.0)

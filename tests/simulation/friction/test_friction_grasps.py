@@ -6,9 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.executions import drawer_plan, drawer_result, holding, still
-from helpers.fake_plan import fake_plan
-from helpers.grippers import between_cheeks, write_gripper
+from helpers.executions import (
+    make_grasping_scene,
+    make_stationary_motion,
+    plan_drawer,
+    simulate_drawer,
+)
+from helpers.fake_plan import make_fake_plan
+from helpers.grippers import write_cheeks_scene, write_gripper
 
 import vkc_pin as vkc
 from vkc_pin.simulation.execution import simulate
@@ -17,14 +22,14 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def test_drawer_is_pulled_by_friction() -> None:
-    plan = drawer_plan()
+    plan = plan_drawer()
     result = plan.simulate(grasp="friction")
     assert result.ok, result.summary()
     assert result.contacts == ()
     (grip,) = result.grips
     assert grip.slip < 0.005
     # The pulling force is about that of a weld; the robot waits while the fingers close.
-    welded = drawer_result().grips[0]
+    welded = simulate_drawer().grips[0]
     assert 0.2 * welded.force < grip.force < 3.0 * welded.force
     assert result.planned.times[-1] == pytest.approx(
         plan.trajectory.times[-1] + result.physics.grip_time
@@ -34,7 +39,7 @@ def test_drawer_is_pulled_by_friction() -> None:
 
 def test_slipping_object_is_lost() -> None:
     physics = vkc.Physics(closing_force=0.2)
-    result = drawer_plan().simulate(grasp="friction", physics=physics)
+    result = plan_drawer().simulate(grasp="friction", physics=physics)
     assert not result.ok
     assert result.grips[0].broken is not None
     assert result.grips[0].slip > 0.005
@@ -53,7 +58,7 @@ def test_cup_is_carried_and_placed() -> None:
 
 
 def test_described_gripper_closes_its_own_fingers(tmp_path: Path) -> None:
-    scene = between_cheeks(write_gripper(tmp_path), opening=0.03)
+    scene = write_cheeks_scene(write_gripper(tmp_path), opening=0.03)
     plan = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.15})])
     assert plan.success, plan.summary()
     result = plan.simulate(grasp="friction")
@@ -65,15 +70,17 @@ def test_described_gripper_closes_its_own_fingers(tmp_path: Path) -> None:
 
 
 def test_object_in_hand_at_start_stays_there() -> None:
-    scene = holding()
-    result = simulate(scene, [vkc.Grasp("stick")], still(scene, 1.5), grasp="friction")
+    scene = make_grasping_scene()
+    result = simulate(
+        scene, [vkc.Grasp("stick")], make_stationary_motion(scene, 1.5), grasp="friction"
+    )
     (grip,) = result.grips
     assert grip.broken is None, result.summary()
     assert grip.force == pytest.approx(9.81 * 0.4, rel=0.3)
     assert result.misses[0].amount < 0.01
 
 
-@pytest.mark.parametrize("make", [drawer_plan, fake_plan])
+@pytest.mark.parametrize("make", [plan_drawer, make_fake_plan])
 def test_pause_is_inserted_at_waypoint(make: object) -> None:
     motion: Trajectory = make().trajectory  # type: ignore[operator]
     at = motion.phases[1].first
@@ -101,7 +108,7 @@ def test_pause_is_inserted_at_waypoint(make: object) -> None:
 
 
 def test_pause_of_a_moving_curve_is_refused() -> None:
-    motion = drawer_plan().trajectory
+    motion = plan_drawer().trajectory
     assert insert_pauses(motion, [], 0.25) is motion
     with pytest.raises(vkc.InputError, match="while the robot moves"):
         insert_pauses(motion, [motion.phases[0].last // 2], 0.5)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.tasks import double, fatal_once, hanging, where
+from helpers.tasks import crash_once, double, hang, identify_worker
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.parallel.engine import MAX_CRASHES, CrashedTask, require_dask, run_tasks
@@ -24,14 +24,14 @@ def test_tasks_run_once_in_any_number_of_processes(jobs: int) -> None:
 def test_crashed_processes_lose_and_repeat_no_other_task(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     tasks = [(str(k), (str(tmp_path), k)) for k in range(8)]
-    found = list(run_tasks(fatal_once, tasks, jobs=2, dask=True))
+    found = list(run_tasks(crash_once, tasks, jobs=2, dask=True))
     assert sorted((int(key), value) for key, value in found) == [(k, 2 * k) for k in range(8)]
     assert (tmp_path / "2").exists()
 
 
 def test_tasks_that_no_process_survives_are_given_up() -> None:
     pytest.importorskip("distributed")
-    found = dict(run_tasks(hanging, numbered(4), jobs=2, dask=True, limit=1.0))
+    found = dict(run_tasks(hang, numbered(4), jobs=2, dask=True, limit=1.0))
     assert isinstance(found["1"], CrashedTask)
     assert f"{MAX_CRASHES} processes died" in found["1"].reason
     assert [found[key] for key in ("0", "2", "3")] == [0, 4, 6]
@@ -51,7 +51,7 @@ def test_tasks_are_taken_when_they_are_needed(dask: bool) -> None:
             taken.append(k)
             yield str(k), k
 
-    for _, result in run_tasks(where, tasks(), jobs=2 if dask else 1, dask=dask):
+    for _, result in run_tasks(identify_worker, tasks(), jobs=2 if dask else 1, dask=dask):
         found.append(result)
     assert 8 <= len(taken) <= 8 + 4
     if dask:

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers.executions import door_plan, drawer_plan
+from helpers.executions import plan_door, plan_drawer
 
 import vkc_pin as vkc
 from vkc_pin.validation.dynamics.bounds import find_limiting_constraints
@@ -14,7 +14,7 @@ from vkc_pin.validation.samples import Samples
 from vkc_pin.world.trajectory.dynamics.torques import sample_curve
 
 
-@pytest.mark.parametrize("made", [door_plan, drawer_plan])
+@pytest.mark.parametrize("made", [plan_door, plan_drawer])
 def test_motion_is_at_its_bounds_where_reported(made: object) -> None:
     plan: vkc.Plan = made()  # type: ignore[operator]
     motion, samples = plan.trajectory, Samples(plan.scene, plan.trajectory)
@@ -39,7 +39,7 @@ def test_motion_is_at_its_bounds_where_reported(made: object) -> None:
 
 
 def test_torques_bound_the_duration() -> None:
-    plan = door_plan()
+    plan = plan_door()
     samples, curve = Samples(plan.scene, plan.trajectory), plan.trajectory.curve
     assert curve is not None
     moments = sample_curve(curve)
@@ -51,7 +51,7 @@ def test_torques_bound_the_duration() -> None:
 
 
 def test_longest_interval_is_reported() -> None:
-    plan = door_plan()
+    plan = plan_door()
     samples, curve = Samples(plan.scene, plan.trajectory), plan.trajectory.curve
     assert curve is not None
     moments, pieces = sample_curve(curve), len(curve.times) - 1
@@ -73,7 +73,7 @@ def test_longest_interval_is_reported() -> None:
 
 
 def test_motion_without_curve_has_no_bounds() -> None:
-    plan = drawer_plan()
+    plan = plan_drawer()
     bare = dataclasses.replace(plan.trajectory, curve=None)
     assert (
         find_limiting_constraints(

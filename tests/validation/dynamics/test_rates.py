@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers.executions import drawer_plan
+from helpers.executions import plan_drawer
 
 import vkc_pin as vkc
 from vkc_pin.planning.retiming.retime import retime_trajectory
@@ -18,12 +18,12 @@ from vkc_pin.world.trajectory.trajectory import PhaseSpan, Trajectory
 
 
 def find_violations(motion: Trajectory, **options: float) -> dict[tuple[str, str], Violation]:
-    rows = check_rates(Samples(drawer_plan().scene, motion), vkc.Options(**options))  # type: ignore[arg-type]
+    rows = check_rates(Samples(plan_drawer().scene, motion), vkc.Options(**options))  # type: ignore[arg-type]
     return {(row.constraint, row.unit): row for row in rows if row.subject == "elbow_joint"}
 
 
 def retime_smoothly() -> Trajectory:
-    plan = drawer_plan()
+    plan = plan_drawer()
     return retime_trajectory(plan.scene, plan.trajectory, jerk_time=0.2)
 
 
@@ -31,7 +31,7 @@ def test_jerk_violation() -> None:
     motion = retime_smoothly()
     assert not find_violations(motion, jerk_time=0.2)
     assert not find_violations(motion)
-    assert not find_violations(drawer_plan().trajectory)
+    assert not find_violations(plan_drawer().trajectory)
     (kind,) = find_violations(motion, jerk_time=0.5)
     assert kind == ("jerk", "rad/s³")
     assert motion.curve is not None
@@ -43,7 +43,7 @@ def test_jerk_violation() -> None:
 
 def move_elbow(share: float) -> Trajectory:
     """Move the elbow by one cubic, with `share` of its largest acceleration, 1.4 rad/s²."""
-    plan = drawer_plan()
+    plan = plan_drawer()
     motion, elbow = plan.trajectory, plan.trajectory.names.index("elbow_joint")
     rows = np.tile(motion.positions[0], (2, 1))
     rows[1, elbow] += share * 1.4 / 6.0 * 2.0**2  # 3s² − 2s³ in 2 s has 6 / 2² at its ends
@@ -77,7 +77,7 @@ def test_motion_must_begin_and_end_at_rest(speed: float, rests: bool, end: int) 
 
 
 def test_jumps_of_acceleration() -> None:
-    motion = drawer_plan().trajectory
+    motion = plan_drawer().trajectory
     assert motion.curve is not None
     jumps = motion.curve.compute_jerks()[1][:, motion.names.index("elbow_joint")]
     violation = find_violations(motion, jerk_time=1e-3)["jerk", "rad/s² at once"]
@@ -96,7 +96,7 @@ def test_accelerated_motion_violates_all_rates() -> None:
     quick = Curve(motion.curve.times / 3.0, motion.curve.positions, motion.curve.rates * 3.0)
     rows = check_rates(
         Samples(
-            drawer_plan().scene, dataclasses.replace(motion, times=motion.times / 3.0, curve=quick)
+            plan_drawer().scene, dataclasses.replace(motion, times=motion.times / 3.0, curve=quick)
         ),
         vkc.Options(jerk_time=0.2),
     )
@@ -104,7 +104,7 @@ def test_accelerated_motion_violates_all_rates() -> None:
 
 
 def test_jerk_bounds_the_duration() -> None:
-    plan = drawer_plan()
+    plan = plan_drawer()
     report = vkc.validate(plan.scene, plan.steps, retime_smoothly(), vkc.Options(jerk_time=0.2))
     assert report.ok
     assert "jerk" in {bound.kind for bound in report.bounds}

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.closers import changed, closer
-from helpers.executions import door_plan, holding, still
+from helpers.closers import load_door_with_closer, replace_object_fields
+from helpers.executions import make_grasping_scene, make_stationary_motion, plan_door
 from oracle.judge import judge
 
 import vkc_pin as vkc
@@ -23,14 +23,14 @@ HEAVY = {"stiffness": 120.0, "springref": -2.0}
 
 
 def validate_door(scene: vkc.Scene, trajectory: vkc.Trajectory | None = None) -> Report:
-    plan = door_plan()
+    plan = plan_door()
     return validate(
         scene, plan.steps, plan.trajectory if trajectory is None else trajectory, plan.options
     )
 
 
 def test_torque_violation_of_a_heavy_door(tmp_path: Path) -> None:
-    report, plan = validate_door(closer(**HEAVY)), door_plan()
+    report, plan = validate_door(load_door_with_closer(**HEAVY)), plan_door()
     assert {violation.constraint for violation in report.violations} == {"torque"}
     worst = max(report.violations, key=lambda violation: violation.amount)
     assert worst.subject == "shoulder_pan_joint"
@@ -39,7 +39,9 @@ def test_torque_violation_of_a_heavy_door(tmp_path: Path) -> None:
     assert 6.0 < worst.time <= plan.trajectory.times[-1], "where the spring pulls most"
     assert "exceeds the motor's 150 N·m" in worst.detail
     assert "even at rest" in worst.detail
-    planted = dataclasses.replace(plan, scene=closer(**HEAVY), report=report, status="rejected")
+    planted = dataclasses.replace(
+        plan, scene=load_door_with_closer(**HEAVY), report=report, status="rejected"
+    )
     verdict = judge(planted.save(tmp_path / "heavy.npz"))
     assert verdict.agrees
     assert {(found.rule, found.subject) for found in verdict.found} == {
@@ -48,7 +50,7 @@ def test_torque_violation_of_a_heavy_door(tmp_path: Path) -> None:
 
 
 def test_damped_door_must_be_opened_slowly() -> None:
-    scene, plan = closer(damping=400.0), door_plan()
+    scene, plan = load_door_with_closer(damping=400.0), plan_door()
     fast = validate_door(scene)
     assert fast.violations
     assert all(
@@ -65,21 +67,28 @@ def test_damped_door_must_be_opened_slowly() -> None:
 
 
 def test_torque_violation_at_rest() -> None:
-    heavy = changed(vkc.load_scene("init_1"), "stick", mass=60.0).with_held({"stick": "grip"})
-    found = MotorLoads(Samples(heavy, still(heavy))).find_violations()
+    heavy = replace_object_fields(vkc.load_scene("init_1"), "stick", mass=60.0).with_held(
+        {"stick": "grip"}
+    )
+    found = MotorLoads(Samples(heavy, make_stationary_motion(heavy))).find_violations()
     assert {violation.constraint for violation in found} == {"torque"}
     assert "shoulder_lift_joint" in {violation.subject for violation in found}
     assert all("even at rest" in violation.detail for violation in found)
-    assert MotorLoads(Samples(holding(), still(holding()))).find_violations() == []
+    assert (
+        MotorLoads(
+            Samples(make_grasping_scene(), make_stationary_motion(make_grasping_scene()))
+        ).find_violations()
+        == []
+    )
 
 
 def test_missing_masses_are_remarked() -> None:
-    scene = door_plan().scene
+    scene = plan_door().scene
     model = pin.Model(scene.robot.model)
     for joint in range(1, model.njoints):
         model.inertias[joint] = pin.Inertia.Zero()
     scene = dataclasses.replace(
-        closer(**HEAVY), robot=dataclasses.replace(scene.robot, model=model)
+        load_door_with_closer(**HEAVY), robot=dataclasses.replace(scene.robot, model=model)
     )
     report = validate_door(scene)
     assert report.ok
@@ -88,14 +97,21 @@ def test_missing_masses_are_remarked() -> None:
 
 
 def test_massless_payload_is_remarked() -> None:
-    scene = changed(vkc.load_scene("init_1"), "stick", mass=0.0).with_held({"stick": "grip"})
-    (remark,) = MotorLoads(Samples(scene, still(scene))).summarize()["remarks"]
+    scene = replace_object_fields(vkc.load_scene("init_1"), "stick", mass=0.0).with_held(
+        {"stick": "grip"}
+    )
+    (remark,) = MotorLoads(Samples(scene, make_stationary_motion(scene))).summarize()["remarks"]
     assert remark == "carried as massless, since no mass is given: stick"
-    assert MotorLoads(Samples(holding(), still(holding()))).summarize()["remarks"] == ()
+    assert (
+        MotorLoads(
+            Samples(make_grasping_scene(), make_stationary_motion(make_grasping_scene()))
+        ).summarize()["remarks"]
+        == ()
+    )
 
 
 def test_torques_are_reported_and_saved(tmp_path: Path) -> None:
-    plan = door_plan()
+    plan = plan_door()
     assert plan.metrics["torque"] == plan.report.torque > 0.0
     assert (
         f"torques     at most {100.0 * plan.report.torque:.0f} % of the motors' limits"

@@ -4,7 +4,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.fake_plan import fake_plan
+from helpers.fake_plan import make_fake_plan
 
 from vkc_pin.planning.plan import Plan
 from vkc_pin.visualization.plots.clearance import ClearanceCurve, compute_clearance_curves
@@ -15,7 +15,7 @@ TIMES = np.linspace(0.0, 6.0, 13)
 
 @pytest.fixture(scope="module")
 def plan() -> Plan:
-    return fake_plan()
+    return make_fake_plan()
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.fake_plan import fake_plan
+from helpers.fake_plan import make_fake_plan
 
 import vkc_pin as vkc
 from vkc_pin.planning.plan import Plan
@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 @pytest.fixture(scope="module")
 def plan() -> Plan:
-    return fake_plan()
+    return make_fake_plan()
 
 
 def picture(html: str) -> np.ndarray:

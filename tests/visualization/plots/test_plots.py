@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.fake_plan import fake_plan
+from helpers.fake_plan import make_fake_plan
 
 from vkc_pin.errors import InputError
 from vkc_pin.planning.plan import Plan
@@ -16,7 +16,7 @@ from vkc_pin.world.trajectory.curve import Curve
 
 @pytest.fixture(scope="module")
 def plan() -> Plan:
-    return fake_plan()
+    return make_fake_plan()
 
 
 @pytest.fixture(scope="module")

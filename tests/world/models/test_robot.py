@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import trimesh
-from helpers.robots import placement
+from helpers.robots import compute_placement
 
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
@@ -62,10 +62,12 @@ def test_forward_kinematics_match_the_manufacturer(husky: Robot) -> None:
         base = pin.SE3(pin.rpy.rpyToMatrix(0, 0, z[2]), np.array([z[0], z[1], 0.0])).homogeneous
         foot = pin.SE3(np.eye(3), np.array([0.25, 0.0, 0.39])).homogeneous
         flange = base @ foot @ ur5e(z[3:])
-        np.testing.assert_allclose(placement(husky, "tool0", z).homogeneous, flange, atol=1e-12)
+        np.testing.assert_allclose(
+            compute_placement(husky, "tool0", z).homogeneous, flange, atol=1e-12
+        )
         tool = flange @ pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.142224])).homogeneous
         np.testing.assert_allclose(
-            placement(husky, husky.tool_frame, z).homogeneous, tool, atol=1e-12
+            compute_placement(husky, husky.tool_frame, z).homogeneous, tool, atol=1e-12
         )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.arm_urdf import write_arms
-from helpers.robots import placement, small_urdf
+from helpers.robots import compute_placement, write_small_urdf
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.models.robot import Robot
@@ -35,7 +35,7 @@ def test_wheels_and_turning_radius(tmp_path: Path) -> None:
     assert husky.turning_radius == 0.8
     assert husky.wheels is not None
     assert husky.wheels.rim_speed == pytest.approx(husky.wheels.radius * husky.wheels.speed)
-    file = small_urdf(tmp_path)
+    file = write_small_urdf(tmp_path)
     for given, expected in (
         ({"base": "ackermann"}, "turning_radius"),
         ({"base": "ackermann", "turning_radius": -1.0}, "> 0"),
@@ -60,8 +60,8 @@ def test_locked_joints_and_tool_frame() -> None:
     )
     whole = load_robot("husky_ur5e")
     arm = np.array([0.3, -1.0, -1.5, 0.4, 0.2, 0.0])
-    here = placement(robot, "tool", np.concatenate([np.zeros(3), arm[[0, 1, 3, 4]]]))
-    there = placement(whole, "tool", np.concatenate([np.zeros(3), arm]))
+    here = compute_placement(robot, "tool", np.concatenate([np.zeros(3), arm[[0, 1, 3, 4]]]))
+    there = compute_placement(whole, "tool", np.concatenate([np.zeros(3), arm]))
     assert here.isApprox(there, 1e-12)
     with pytest.raises(UnknownNameError) as caught:
         load_robot("husky_ur5e", locked_joints={"elbow": 0.0})
@@ -89,7 +89,8 @@ def test_defaults_of_a_urdf(tmp_path: Path) -> None:
         '<limit lower="-1" upper="1" velocity="1" effort="1"/></joint>'
     )
     robot = load_robot(
-        small_urdf(tmp_path, joints=wheel, links='<link name="w"/><link name="f"/>'), pairs="all"
+        write_small_urdf(tmp_path, joints=wheel, links='<link name="w"/><link name="f"/>'),
+        pairs="all",
     )
     assert robot.coordinates.names[3:] == ("j0", "j1", "j2")
     assert robot.name == "small"
@@ -103,7 +104,7 @@ def test_defaults_of_a_urdf(tmp_path: Path) -> None:
 
 
 def test_robot_yaml_beside_the_urdf_is_used(tmp_path: Path) -> None:
-    file = small_urdf(tmp_path)
+    file = write_small_urdf(tmp_path)
     (tmp_path / "robot.yaml").write_text(
         "urdf: small.urdf\ntool_frame: l3\nhome: {j1: 0.5}\n"
         "joints: {j2: {velocity: 0.2, acceleration: 9}}\n"
@@ -123,7 +124,7 @@ def test_robot_yaml_beside_the_urdf_is_used(tmp_path: Path) -> None:
 
 
 def test_robots_are_named_after_folder_or_file(tmp_path: Path) -> None:
-    small_urdf(tmp_path)
+    write_small_urdf(tmp_path)
     for name, called in (("robot.yaml", tmp_path.name), ("mine.yaml", "mine")):
         (tmp_path / name).write_text("urdf: small.urdf\n")
         assert load_robot(tmp_path / name, pairs="all").name == called
@@ -143,7 +144,7 @@ def test_unknown_names_raise() -> None:
 
 
 def test_invalid_files_raise(tmp_path: Path) -> None:
-    file = small_urdf(tmp_path)
+    file = write_small_urdf(tmp_path)
     text = file.read_text()
     for new, problem in (
         (text.replace("collision>", "visual>"), "no collision geometry"),
@@ -160,13 +161,13 @@ def test_srdf_that_allows_all_pairs_raises(tmp_path: Path) -> None:
     )
     (tmp_path / "small.srdf").write_text(f"<robot>{pairs}</robot>")
     with pytest.raises(InputError, match="no pair of links"):
-        load_robot(small_urdf(tmp_path))
+        load_robot(write_small_urdf(tmp_path))
 
 
 @pytest.mark.parametrize("field", ["locked_joints", "home"])
 @pytest.mark.parametrize("joint", ["j1", "j2"], ids=["planned", "locked"])
 def test_positions_outside_limits_raise(tmp_path: Path, field: str, joint: str) -> None:
-    urdf, file = small_urdf(tmp_path), tmp_path / "robot.yaml"
+    urdf, file = write_small_urdf(tmp_path), tmp_path / "robot.yaml"
     file.write_text(f"urdf: small.urdf\ntool_frame: l2\n{field}: {{{joint}: 2.5}}\n")
     problem = r"outside the joint.s limits .expected between -2 and 2, got 2.5"
     with pytest.raises(InputError, match=problem) as caught:
@@ -183,7 +184,7 @@ def driving_urdf(
     folder: Path, *, order: str = "xyt", shape: bool = False, tilted: bool = False
 ) -> Path:
     """Write the small robot on a planar base of joints and empty links, as in simulators."""
-    file, names = small_urdf(folder), ["world", "m0", "m1", "l0"]
+    file, names = write_small_urdf(folder), ["world", "m0", "m1", "l0"]
     axes = {"x": "1 0 0", "y": "0 1 0", "t": "0 0 1"}
     solid = "<collision><geometry><sphere radius='1'/></geometry></collision>"
     parts = [f'<link name="{name}"/>' for name in names[:2]]
@@ -209,8 +210,8 @@ def test_planar_bases_in_the_urdf_are_locked(tmp_path: Path, order: str) -> None
         warnings.simplefilter("error")  # no warning if their positions are given
         load_robot(file, locked_joints={f"drive_{k}": 0.0 for k in range(3)})
     assert len(load_robot(file, base="fixed").home) == 6
-    plain, z = load_robot(small_urdf(tmp_path)), np.array([0.3, -0.2, 1.0, 0.5, -0.4, 0.3])
-    assert placement(robot, "l3", z).isApprox(placement(plain, "l3", z), 1e-12)
+    plain, z = load_robot(write_small_urdf(tmp_path)), np.array([0.3, -0.2, 1.0, 0.5, -0.4, 0.3])
+    assert compute_placement(robot, "l3", z).isApprox(compute_placement(plain, "l3", z), 1e-12)
 
 
 @pytest.mark.parametrize(
@@ -224,15 +225,15 @@ def test_other_joints_are_not_a_planar_base(tmp_path: Path, change: dict[str, ob
 
 def test_height_of_the_root_link(tmp_path: Path) -> None:
     """The whole robot is raised at any base pose; the argument overrides the file."""
-    file = small_urdf(tmp_path)
+    file = write_small_urdf(tmp_path)
     low, z = load_robot(file), np.array([0.3, -0.2, 1.0, 0.5, -0.4, 0.3])
     (tmp_path / "robot.yaml").write_text("urdf: small.urdf\nbase: {height: 0.25}\n")
     for robot, height in ((load_robot(file), 0.25), (load_robot(file, height=0.7), 0.7)):
         raised = pin.SE3(np.eye(3), np.array([0.0, 0.0, height]))
         assert robot.height == height
         for frame in ("l0", "l3"):
-            expected = raised * placement(low, frame, z)
-            assert placement(robot, frame, z).isApprox(expected, 1e-12)
+            expected = raised * compute_placement(low, frame, z)
+            assert compute_placement(robot, frame, z).isApprox(expected, 1e-12)
         shape, other = (one.collision.geometryObjects[0] for one in (robot, low))
         assert shape.placement.isApprox(raised * other.placement, 1e-12)
     with pytest.raises(InputError, match="height"):
@@ -240,7 +241,7 @@ def test_height_of_the_root_link(tmp_path: Path) -> None:
 
 
 def test_groups_of_the_srdf_select_the_tool_frame(tmp_path: Path) -> None:
-    small_urdf(tmp_path)
+    write_small_urdf(tmp_path)
     (tmp_path / "small.srdf").write_text(
         '<robot name="small"><group name="short"><chain base_link="l0" tip_link="l2"/></group>'
         '<group name="whole"><joint name="j0"/><joint name="j1"/><joint name="j2"/></group></robot>'

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.robots import small_urdf
+from helpers.robots import write_small_urdf
 
 from vkc_pin.errors import InputError
 from vkc_pin.world.models.robot_file import load_robot
@@ -29,7 +29,7 @@ from vkc_pin.world.models.robot_file import load_robot
 def test_invalid_robot_yaml_raises_with_its_line(
     tmp_path: Path, text: str, line: int | None, problem: str
 ) -> None:
-    small_urdf(tmp_path)
+    write_small_urdf(tmp_path)
     (tmp_path / "robot.yaml").write_text(f"urdf: small.urdf\n{text}\n")
     with pytest.raises(InputError, match=problem) as caught:
         load_robot(tmp_path / "robot.yaml")

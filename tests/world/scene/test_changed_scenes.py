@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.carrying import tool_at
+from helpers.carrying import compute_grasp_pose
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -120,7 +120,7 @@ def test_held_object_follows_the_hand(values: tuple[float, float]) -> None:
         held.with_start(base=[1.0, 2.0, -2.0]),
         held.with_placement("cane", pin.SE3.Identity()),
     ):
-        grasp = tool_at(pin.SE3.Identity(), values=values)
+        grasp = compute_grasp_pose(pin.SE3.Identity(), values=values)
         assert_same(scene.objects["cane"].placement, scene.tool_placement() * grasp.inverse())
     released = held.with_held({})
     assert (released.holds, released.held) == ((), {})
@@ -136,7 +136,7 @@ def test_object_held_through_another_follows_its_link(tmp_path: Path) -> None:
     file = load(tmp_path, f"{{{fruit}, cane: {{attachment: grip, at: [0.05, -0.4]}}}}")
     for scene in (held, held.with_start(base=[1.0, 2.0, -2.0]), file):
         tip = scene.objects["cane"].link_placement("tip")
-        on_tip = tool_at(pin.SE3.Identity(), "ball", "pull", roll)
+        on_tip = compute_grasp_pose(pin.SE3.Identity(), "ball", "pull", roll)
         assert_same(scene.objects["fruit"].placement, tip * on_tip.inverse())
     crate = {
         "name": "crate",

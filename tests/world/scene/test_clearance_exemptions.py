@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.drawers import changed, drawer_scene, with_boxes
+from helpers.drawers import add_boxes, load_drawer_scene, replace_drawer_fields
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -32,8 +32,8 @@ HINGE = {"hinge": 1.2}
 def beside(gap: float, begin: float = 1.7) -> Scene:
     """Return the drawer's room with a panel beside the drawer's front, from x = `begin` on."""
     depth = 2.3 - begin
-    return with_boxes(
-        drawer_scene(), side=((depth, 0.1, 0.9), (begin + depth / 2, TRAY + gap + 0.05, 0.45))
+    return add_boxes(
+        load_drawer_scene(), side=((depth, 0.1, 0.9), (begin + depth / 2, TRAY + gap + 0.05, 0.45))
     )
 
 
@@ -72,7 +72,7 @@ def test_drawer_is_exempt_from_a_panel_until_it_has_passed_it(gap: float, begin:
     leaves = 1.903 - begin + np.sqrt(SAFE**2 - gap**2)
     assert upper == (
         np.inf
-        if leaves > drawer_scene().objects["drawer"].object.upper[0]
+        if leaves > load_drawer_scene().objects["drawer"].object.upper[0]
         else pytest.approx(leaves, abs=2e-4)
     )
 
@@ -87,8 +87,8 @@ def test_cache_depends_on_obstacles_and_states() -> None:
     }
     assert find_clearance_exemptions(dataclasses.replace(scene, **parts), SAFE) == ()
     assert find_clearance_exemptions(scene.with_start(base=[0.0, 0.0, 0.0]), SAFE) == (one,)
-    ahead = with_boxes(
-        drawer_scene(), ahead=((0.1, 0.5, 0.2), (1.43, 0.0, 0.755))
+    ahead = add_boxes(
+        load_drawer_scene(), ahead=((0.1, 0.5, 0.2), (1.43, 0.0, 0.755))
     )  # 0.37 m before the front, which is 0.59 m wide
     assert find_clearance_exemptions(ahead, SAFE) == ()
     met = find_clearance_exemptions(ahead.with_state("drawer", {"slide": 0.4}), SAFE)
@@ -107,7 +107,7 @@ def test_drawers_side_by_side_are_exempt_until_either_has_passed() -> None:
         {**drawer, "name": name, "position": place}
         for name, place in zip(("near", "next"), at, strict=True)
     ]
-    scene = changed(drawer_scene(), objects=pair, obstacles=[])
+    scene = replace_drawer_fields(load_drawer_scene(), objects=pair, obstacles=[])
     (one,) = find_clearance_exemptions(scene, SAFE)
     assert one.is_between("near.tray", "next.tray")
     leaves = thick + np.sqrt(SAFE**2 - gap**2)

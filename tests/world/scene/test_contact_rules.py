@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.grippers import between_cheeks, write_gripper
-from helpers.judging import with_object
-from helpers.small_problems import door_scene
+from helpers.grippers import write_cheeks_scene, write_gripper
+from helpers.judging import replace_object
+from helpers.small_problems import load_door_scene
 
 from vkc_pin.options import Options
 from vkc_pin.world.models.articulated_object import Attachment
@@ -31,10 +31,10 @@ LEVER, PANEL = "door.lever", "door.panel"
 
 def door(attachment: str = "handle", **fields: object) -> Scene:
     """Return the door's scene, with something about an attachment changed."""
-    scene = door_scene()
+    scene = load_door_scene()
     given = scene.objects["door"].object.attachments
     changed: Attachment = dataclasses.replace(given[attachment], **fields)  # type: ignore[arg-type]
-    return with_object(scene, attachments={**given, attachment: changed})
+    return replace_object(scene, attachments={**given, attachment: changed})
 
 
 @pytest.mark.parametrize(
@@ -80,8 +80,8 @@ def test_rigid_grasps(attachment: str, contact: str, firm: bool, as_one: bool) -
 
 
 def test_hand_frame_of_a_push_is_the_foremost_point() -> None:
-    robot = door_scene().robot
-    grip = door_scene().objects["door"].object.attachments["handle"]
+    robot = load_door_scene().robot
+    grip = load_door_scene().objects["door"].object.attachments["handle"]
     assert compute_hand_frame(robot, grip) == pin.SE3.Identity()
     front = compute_hand_frame(robot, dataclasses.replace(grip, contact="push"))
     np.testing.assert_array_equal(front.translation, robot.front.translation)
@@ -90,13 +90,13 @@ def test_hand_frame_of_a_push_is_the_foremost_point() -> None:
 
 def test_gripper_openings(tmp_path: Path) -> None:
     """At grasps, at the start, and without a gripper."""
-    scene = between_cheeks(write_gripper(tmp_path / "mine"), opening=0.04, start=0.03)
+    scene = write_cheeks_scene(write_gripper(tmp_path / "mine"), opening=0.04, start=0.03)
     hold = Hold("drawer", "grip")
     assert compute_grasp_opening(scene, hold) == pytest.approx(0.04)
     assert compute_start_opening(scene) == pytest.approx(0.03)
     assert compute_start_opening(scene.with_held({"drawer": "grip"})) == pytest.approx(0.04)
-    assert compute_grasp_opening(door_scene(), HANDLE) is None
-    assert compute_start_opening(door_scene()) is None
+    assert compute_grasp_opening(load_door_scene(), HANDLE) is None
+    assert compute_start_opening(load_door_scene()) is None
     grip = scene.objects["drawer"].object.attachments["grip"]
     pushed = dataclasses.replace(grip, contact="push")
     np.testing.assert_array_equal(

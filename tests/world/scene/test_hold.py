@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.drawers import drawer_scene
+from helpers.drawers import load_drawer_scene
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
@@ -68,7 +68,7 @@ def described(path: Path, name: str, old: str, new: str) -> str:
 def test_approach_from_inside_is_reversed(
     tmp_path: Path,
 ) -> None:
-    right = drawer_scene()
+    right = load_drawer_scene()
     item = {
         **right.document["objects"][0],
         "type": described(tmp_path, "drawer", "approach: [1, 0, 0]", "approach: [-1, 0, 0]"),

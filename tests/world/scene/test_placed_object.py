@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.rooms import TINY, load
+from helpers.rooms import TINY, load_scene_text
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.scene.placed_object import make_world_shapes
 
 
 def test_world_shapes_follow_the_joints(tmp_path: Path) -> None:
-    placed = load(tmp_path, TINY).objects["front"]
+    placed = load_scene_text(tmp_path, TINY).objects["front"]
     np.testing.assert_array_equal(placed.state, [0.3, 0.0])
     shapes = {s.name: s for s in make_world_shapes(placed)}
     middle = np.array([3.0, 0.0, 0.0]) + pin.utils.rotate("z", 0.3) @ [0.0, -0.45, 1.01]
@@ -27,7 +27,7 @@ def test_world_shapes_follow_the_joints(tmp_path: Path) -> None:
 
 
 def test_joints_are_set_by_name_within_their_limits(tmp_path: Path) -> None:
-    placed = load(tmp_path, TINY).objects["front"]
+    placed = load_scene_text(tmp_path, TINY).objects["front"]
     moved = placed.with_state({"knob": 0.5})
     assert moved.state.tolist() == [0.3, 0.5]
     assert placed.state.tolist() == [0.3, 0.0]

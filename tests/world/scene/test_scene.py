@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.rooms import TINY, load
+from helpers.rooms import TINY, load_scene_text
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.models.robot_file import load_robot
@@ -47,7 +47,7 @@ def test_values_are_clamped_to_limits_within_rounding(door: Scene) -> None:
 
 
 def test_fixed_base_starts_anywhere_in_the_arena(tmp_path: Path) -> None:
-    scene = load(
+    scene = load_scene_text(
         tmp_path,
         TINY.replace("husky_ur5e", "{name: husky_ur5e, base: fixed}").replace(
             "0.0, 0.0, 0.5", "0.5, 0.2, 0.5"
@@ -66,11 +66,13 @@ def test_start_clearance_includes_obstacles_and_objects(door: Scene) -> None:
 
 def test_sampling_needs_a_free_start_region(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    none = load(tmp_path, TINY.replace("start_region: {x: [-1, 1], y: [-1, 1], yaw: any}\n", ""))
+    none = load_scene_text(
+        tmp_path, TINY.replace("start_region: {x: [-1, 1], y: [-1, 1], yaw: any}\n", "")
+    )
     with pytest.raises(InputError, match="no start region"):
         none.sample_start(rng)
     text = TINY.replace("x: [-1, 1], y: [-1, 1]", "x: [2, 2.1], y: [2, 2.1]")
-    full = load(
+    full = load_scene_text(
         tmp_path,
         text[: text.index("objects:")]
         + text[text.index("obstacles:") : text.index("  - name: post")],
@@ -83,7 +85,7 @@ def test_start_is_sampled_with_free_held_objects_only(tmp_path: Path) -> None:
     stick = "  - {name: pole, type: stick, position: [0, 0, 0.05]}\n"
     for held, is_valid in (("{pole: end}", True), ("{front: handle}", False)):
         text = TINY.replace("arm: home\n", f"arm: home\n  held: {held}\n")
-        scene = load(tmp_path, text.replace("objects:\n", f"objects:\n{stick}"))
+        scene = load_scene_text(tmp_path, text.replace("objects:\n", f"objects:\n{stick}"))
         if is_valid:
             assert scene.sample_start(np.random.default_rng(0)).held == {"pole": "end"}
         else:

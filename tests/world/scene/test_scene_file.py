@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.rooms import TINY, load
+from helpers.rooms import TINY, load_scene_text
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.scene.obstacles import FLOOR
@@ -29,7 +29,7 @@ def test_every_kind_of_obstacle(tmp_path: Path) -> None:
   - {name: rock, type: mesh, file: wedge.obj, scale: 0.3, position: [1, 2, 0]}
   - {name: chest, type: urdf, file: chest.urdf, position: [-1, 2, 0]}
 """
-    scene = load(tmp_path, TINY + extra)
+    scene = load_scene_text(tmp_path, TINY + extra)
     shapes = {s.name: s for s in scene.obstacles}
     names = ("crate", "post", "ball", "pole", "rock", "chest")
     assert scene.obstacle_labels == (*names, "chest", FLOOR)
@@ -59,7 +59,7 @@ def test_orientations_may_be_quaternions(tmp_path: Path) -> None:
   - {{name: same, type: box, size: [1, 2, 3], position: [0, -3, 2],
      quaternion: [0, 0, 0.7071, 0.7071]}}
 """
-    scene = load(tmp_path, TINY + extra)
+    scene = load_scene_text(tmp_path, TINY + extra)
     turns = {shape.name: shape.placement.rotation for shape in scene.obstacles}
     np.testing.assert_allclose(turns["turned"], turns["same"], atol=1e-12)
 
@@ -78,7 +78,7 @@ def test_orientations_may_be_quaternions(tmp_path: Path) -> None:
 )
 def test_invalid_orientations_are_located(tmp_path: Path, orientation: str, said: str) -> None:
     with pytest.raises(InputError, match=said) as caught:
-        load(
+        load_scene_text(
             tmp_path,
             TINY
             + f"  - {{name: b, type: box, size: [1, 2, 3], position: [0, 3, 2], {orientation}}}\n",
@@ -87,7 +87,7 @@ def test_invalid_orientations_are_located(tmp_path: Path, orientation: str, said
 
 
 def test_floor_is_optional(tmp_path: Path) -> None:
-    assert FLOOR not in load(tmp_path, TINY + "floor: false\n").obstacle_labels
+    assert FLOOR not in load_scene_text(tmp_path, TINY + "floor: false\n").obstacle_labels
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_unknown_names_are_located_with_a_suggestion(
 ) -> None:
     assert old in TINY
     with pytest.raises(UnknownNameError) as caught:
-        load(tmp_path, TINY.replace(old, new))
+        load_scene_text(tmp_path, TINY.replace(old, new))
     error = caught.value
     assert (error.file, error.line, error.field, error.nearest) == (
         tmp_path / "room.yaml",
@@ -162,7 +162,7 @@ def test_invalid_input_is_located(
 ) -> None:
     assert old in TINY
     with pytest.raises(InputError) as caught:
-        load(tmp_path, TINY.replace(old, new))
+        load_scene_text(tmp_path, TINY.replace(old, new))
     error = caught.value
     assert (error.file, error.line, error.field) == (tmp_path / "room.yaml", line, field), str(
         error
@@ -172,7 +172,7 @@ def test_invalid_input_is_located(
 
 def test_the_first_error_in_the_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
-        load(
+        load_scene_text(
             tmp_path,
             TINY.replace("radius: 0.1", "radius: -1")
             .replace("arm: home", "arm: 3")
@@ -184,7 +184,7 @@ def test_the_first_error_in_the_file_is_reported(tmp_path: Path) -> None:
 def test_errors_in_named_files_are_located_there(tmp_path: Path) -> None:
     (tmp_path / "bad.yaml").write_text("urdf: none.urdf\nattachment: []\n")
     with pytest.raises(UnknownNameError) as caught:
-        load(tmp_path, TINY.replace("type: door", "type: bad.yaml"))
+        load_scene_text(tmp_path, TINY.replace("type: door", "type: bad.yaml"))
     assert (caught.value.file, caught.value.line, caught.value.nearest) == (
         tmp_path / "bad.yaml",
         2,
@@ -192,7 +192,7 @@ def test_errors_in_named_files_are_located_there(tmp_path: Path) -> None:
     )
     (tmp_path / "bad.urdf").write_text("<robot>")
     with pytest.raises(InputError) as broken:
-        load(
+        load_scene_text(
             tmp_path, TINY.replace("type: box, size: [0.5, 0.4, 0.3]", "type: urdf, file: bad.urdf")
         )
     assert broken.value.file == tmp_path / "bad.urdf"
@@ -274,8 +274,8 @@ def test_missing_scenes_are_reported(tmp_path: Path) -> None:
 
 def test_start_may_have_a_height(tmp_path: Path) -> None:
     """The height is constant and part of the document; scenes of one robot may differ."""
-    high = load(tmp_path, TINY.replace("arm: home", "arm: home\n  z: 0.4"))
-    low = load(tmp_path, TINY)
+    high = load_scene_text(tmp_path, TINY.replace("arm: home", "arm: home\n  z: 0.4"))
+    low = load_scene_text(tmp_path, TINY)
     assert (low.robot.height, high.robot.height) == (0.0, 0.4)
     assert "z" not in low.document["start"]
     again = Scene.from_document(high.with_start(base=[1.0, 0.0, 0.0]).document, tmp_path)

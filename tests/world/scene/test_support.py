@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.riding import TOP, cup, folder, plates, scene_of
+from helpers.riding import TOP, describe_cup, make_plate_scene, make_scene, write_objects
 
 from vkc_pin.world.models.shapes import get_link_name
 from vkc_pin.world.scene.placed_object import make_world_shapes
@@ -33,12 +33,12 @@ def on(scene: Scene, name: str = "cup") -> set[str]:
     [(-2e-3, True), (0.0, True), (1e-3, True), (2.4e-3, True), (2.6e-3, False), (0.1, False)],
 )
 def test_a_cup_on_a_plate_or_above_it(gap: float, stands: bool) -> None:
-    assert on(plates(gap=gap)) == ({"plate.plate"} if stands else set())
+    assert on(make_plate_scene(gap=gap)) == ({"plate.plate"} if stands else set())
 
 
 @pytest.mark.parametrize("apart", [-1e-3, 0.0, 1e-3])
 def test_adjacent_shape_is_no_support(apart: float) -> None:
-    assert on(plates(cups=1, wall=apart)) == {"plate.plate"}
+    assert on(make_plate_scene(cups=1, wall=apart)) == {"plate.plate"}
 
 
 def test_the_floor_and_two_tables() -> None:
@@ -47,15 +47,15 @@ def test_the_floor_and_two_tables() -> None:
         {"name": f"table_{k}", "type": "box", "size": size, "position": [0.2 * k, 0.0, 0.25]}
         for k in range(3)
     ]
-    assert on(scene_of([cup(at=(0.1, 0.0, 0.5))], tables)) == {"table_0", "table_1"}
-    assert on(scene_of([cup(at=(0.1, 0.0, 0.0))])) == {"floor"}
+    assert on(make_scene([describe_cup(at=(0.1, 0.0, 0.5))], tables)) == {"table_0", "table_1"}
+    assert on(make_scene([describe_cup(at=(0.1, 0.0, 0.0))])) == {"floor"}
 
 
 def test_stacked_objects_are_supported() -> None:
-    scene = plates(cups=1)
-    upper = cup("upper", at=(0.8, 0.06, TOP + 0.1))
+    scene = make_plate_scene(cups=1)
+    upper = describe_cup("upper", at=(0.8, 0.06, TOP + 0.1))
     stacked = Scene.from_document(
-        {**scene.document, "objects": [*scene.document["objects"], upper]}, folder()
+        {**scene.document, "objects": [*scene.document["objects"], upper]}, write_objects()
     )
     assert on(stacked, "upper") == {"cup.cup"}
     assert find_supported_objects(stacked.objects, {"plate": {"plate"}}, ["cup", "upper"]) == {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.litter import AT, BIN, littered
+from helpers.litter import AT, BIN, make_littered_scene
 
 import vkc_pin as vkc
 from vkc_pin.world.task.actions import compile_each_step, generate_alternatives, group_into_actions
@@ -83,14 +83,16 @@ def test_error_names_the_first_infeasible_step(
 @pytest.mark.parametrize("stands", [True, False])
 def test_free_object_is_regrasped_only_if_it_rests_on_a_support(stands: bool) -> None:
     """In the air, it would fall."""
-    x, y, z = littered().with_held({"litter": "grip"}).objects["litter"].placement.translation
+    x, y, z = (
+        make_littered_scene().with_held({"litter": "grip"}).objects["litter"].placement.translation
+    )
     table = {
         "name": "table",
         "type": "box",
         "size": [0.2, 0.2, 0.02],
         "position": [x, y, z - AT[2] - 0.01],
     }
-    scene = littered(*[table] * stands).with_held({"litter": "grip"})
+    scene = make_littered_scene(*[table] * stands).with_held({"litter": "grip"})
     place = vkc.Place("litter", BIN)
     task = compile_task(scene, [place], vkc.Options())
     again = (vkc.Release("litter"), vkc.Place("litter", BIN, "grip"))

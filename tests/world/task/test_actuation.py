@@ -7,7 +7,12 @@ import dataclasses
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.small_problems import door_scene, full_scene, with_attachment, with_objects
+from helpers.small_problems import (
+    load_door_scene,
+    make_full_scene,
+    replace_attachment,
+    replace_objects,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -52,7 +57,7 @@ def test_advance_matches_finite_differences(
 
     The face is on a tray that slides on a rotating arm.
     """
-    arm = full_scene().objects["cabinet"].with_state({"swing": state[0], "slide": state[1]})
+    arm = make_full_scene().objects["cabinet"].with_state({"swing": state[0], "slide": state[1]})
     slides = [
         Freedom(f"_{k}", "prismatic", axis, -0.1, 0.2) for k, axis in enumerate(np.eye(3)[:2])
     ]
@@ -82,7 +87,7 @@ def compiled(scene: Scene, joints: dict[str, float], attachment: str, name: str 
 
 
 def at(hinge: float) -> Scene:
-    return door_scene().with_state("door", {"hinge": hinge})
+    return load_door_scene().with_state("door", {"hinge": hinge})
 
 
 @pytest.mark.parametrize(
@@ -114,8 +119,8 @@ def test_a_latched_door_cannot_be_pushed_open() -> None:
 def test_push_along_the_joint_axis_is_rejected() -> None:
     placement = pin.SE3(pin.rpy.rpyToMatrix(0.0, np.pi / 2, 0.0), np.array([0.0, 6e-4, 0.0]))
     face = Attachment(name="face", link="arm", placement=placement, contact="push")
-    cabinet = with_attachment(full_scene().objects["cabinet"], face)
-    scene = with_objects(door_scene(), {"cabinet": cabinet})
+    cabinet = replace_attachment(make_full_scene().objects["cabinet"], face)
+    scene = replace_objects(load_door_scene(), {"cabinet": cabinet})
     with pytest.raises(InputError, match="does not move 'swing' in a single direction"):
         compiled(scene, {"swing": 0.2}, "face", "cabinet")
 
@@ -129,5 +134,7 @@ def test_face_on_both_sides_of_the_hinge_is_rejected() -> None:
     both = dataclasses.replace(placed.object.attachments["push"], name="both", freedoms=wide)
     with pytest.raises(InputError, match="does not move 'hinge' in a single direction"):
         compiled(
-            with_objects(at(-1.0), {"door": with_attachment(placed, both)}), {"hinge": 0.0}, "both"
+            replace_objects(at(-1.0), {"door": replace_attachment(placed, both)}),
+            {"hinge": 0.0},
+            "both",
         )

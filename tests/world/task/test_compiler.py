@@ -11,10 +11,10 @@ import pinocchio as pin
 import pytest
 from helpers.small_problems import (
     CABINET_STATE,
-    door_scene,
-    full_scene,
-    with_attachment,
-    with_objects,
+    load_door_scene,
+    make_full_scene,
+    replace_attachment,
+    replace_objects,
 )
 
 from vkc_pin.errors import InputError, UnknownNameError
@@ -36,7 +36,7 @@ HANDLE = Hold("door", "handle")
 
 
 def phases(steps: Sequence[Step], scene: Scene | None = None) -> Task:
-    return compile_task(scene or door_scene(), steps, OPTIONS)
+    return compile_task(scene or load_door_scene(), steps, OPTIONS)
 
 
 def with_link(scene: Scene, name: str, link: str) -> Scene:
@@ -85,9 +85,9 @@ def test_latch_is_turned_only_where_it_is_engaged() -> None:
         ({"hinge": 0.3}, ["reach door.handle", "move door.hinge"]),
         ({"hinge": 0.03}, ["reach door.handle", "turn door.knob", "move door.hinge, door.knob"]),
     ):
-        task = phases([OPEN], door_scene().with_state("door", state))
+        task = phases([OPEN], load_door_scene().with_state("door", state))
         assert [phase.name for phase in task.phases] == names
-    task = phases([OPEN], door_scene().with_state("door", {"knob": 0.6}))
+    task = phases([OPEN], load_door_scene().with_state("door", {"knob": 0.6}))
     assert [phase.name for phase in task.phases] == [
         "reach door.handle",
         "move door.hinge, door.knob",
@@ -135,13 +135,13 @@ def test_go_to_releases_fixed_objects() -> None:
     assert last.base == (1.0, 2.0, 0.3)
     assert last.initial_values == {"door.hinge": 1.2, "door.knob": TURNED}
     assert phases([GoTo(1.0, 2.0)]).phases[0].base == (1.0, 2.0, None)
-    held = door_scene().with_held({"door": "handle"})
+    held = load_door_scene().with_held({"door": "handle"})
     assert phases([GoTo(1.0, 2.0)], held).phases[0].released == (HANDLE,)
 
 
 def test_objects_keep_their_state_between_grasps() -> None:
     """The second stands still until it is grasped, the first stays as it was left."""
-    task = phases([OPEN, Actuate("drawer", {"slide": 0.2})], full_scene())
+    task = phases([OPEN, Actuate("drawer", {"slide": 0.2})], make_full_scene())
     names = [
         "reach door.handle",
         "turn door.knob",
@@ -160,9 +160,9 @@ def test_objects_keep_their_state_between_grasps() -> None:
 
 
 def test_task_has_only_joints_that_its_grasps_can_move() -> None:
-    task = phases([Actuate("cabinet", {"slide": 0.2})], full_scene())
+    task = phases([Actuate("cabinet", {"slide": 0.2})], make_full_scene())
     assert task.state == {f"cabinet.{joint}": CABINET_STATE[joint] for joint in ("swing", "slide")}
-    placed = full_scene().objects["cabinet"]
+    placed = make_full_scene().objects["cabinet"]
     assert find_path_joints(placed, placed.object.attachment()) == ["swing", "slide"]
 
 
@@ -190,15 +190,20 @@ def test_unknown_names_are_rejected(step: Step, field: str, nearest: str | None)
 
 def test_joint_must_move_with_the_hand() -> None:
     with pytest.raises(InputError, match="does not move") as caught:
-        phases([Actuate("door", {"knob": 0.3}, "plate")], with_link(door_scene(), "plate", "panel"))
+        phases(
+            [Actuate("door", {"knob": 0.3}, "plate")],
+            with_link(load_door_scene(), "plate", "panel"),
+        )
     assert caught.value.field == "steps[0].joints"
     assert caught.value.expected == "one of hinge"
     with pytest.raises(InputError, match="does not move"):
-        phases([Actuate("door", {"hinge": 0.3}, "post")], with_link(door_scene(), "post", "frame"))
+        phases(
+            [Actuate("door", {"hinge": 0.3}, "post")], with_link(load_door_scene(), "post", "frame")
+        )
 
 
 def test_hand_must_be_able_to_release_the_latch() -> None:
-    plate = with_link(door_scene(), "plate", "panel")
+    plate = with_link(load_door_scene(), "plate", "panel")
     with pytest.raises(InputError, match="is latched") as caught:
         phases([Actuate("door", {"hinge": 1.2}, "plate")], plate)
     assert caught.value.field == "steps[0].attachment"
@@ -211,7 +216,7 @@ def test_hand_must_be_able_to_release_the_latch() -> None:
 @pytest.mark.parametrize("steps", [[], (), [Grasp("door")]])
 def test_nothing_to_do(steps: list[Step]) -> None:
     with pytest.raises(InputError, match="nothing to do") as caught:
-        phases(steps, door_scene().with_held({"door": "handle"}))
+        phases(steps, load_door_scene().with_held({"door": "handle"}))
     assert caught.value.field == "steps"
 
 
@@ -227,13 +232,15 @@ def test_invalid_steps_are_rejected(steps: Any, field: str) -> None:
 
 def test_default_attachment_is_the_first_that_moves_the_joints() -> None:
     """The first of all moves only some of them."""
-    placed = full_scene().objects["cabinet"]
+    placed = make_full_scene().objects["cabinet"]
     named = {
         name: dataclasses.replace(placed.object.attachment(), name=name, link=name)
         for name in ("case", "arm", "lid")
     }
     thing = dataclasses.replace(placed.object, attachments={**named, **placed.object.attachments})
-    scene = with_objects(full_scene(), {"cabinet": dataclasses.replace(placed, object=thing)})
+    scene = replace_objects(
+        make_full_scene(), {"cabinet": dataclasses.replace(placed, object=thing)}
+    )
     for joints, taken in (
         ({"swing": 0.5}, "arm"),
         ({"lid_hinge": 0.2}, "lid"),
@@ -265,19 +272,19 @@ def test_present_or_previous_attachment_is_preferred() -> None:
         ]
     )
     assert task.holds == (Hold("door", "handle_free"),)
-    task = phases([OPEN], door_scene().with_held({"door": "handle_free"}))
+    task = phases([OPEN], load_door_scene().with_held({"door": "handle_free"}))
     assert task.holds == (Hold("door", "handle_free"),)
 
 
 def test_object_grasped_at_two_attachments_in_turn() -> None:
     """Holds of different joints share a chain; of the same joint they cannot."""
-    lid = with_objects(
-        full_scene(),
+    lid = replace_objects(
+        make_full_scene(),
         {
-            "cabinet": with_attachment(
-                full_scene().objects["cabinet"],
+            "cabinet": replace_attachment(
+                make_full_scene().objects["cabinet"],
                 dataclasses.replace(
-                    full_scene().objects["cabinet"].object.attachment(), name="lid", link="lid"
+                    make_full_scene().objects["cabinet"].object.attachment(), name="lid", link="lid"
                 ),
             )
         },
@@ -301,13 +308,13 @@ def test_object_grasped_at_two_attachments_in_turn() -> None:
     assert find_shared_coordinate(lid, task.holds) is None
     both = phases([OPEN, Actuate("door", {"hinge": 0.5}, "handle_free")])
     assert both.holds == (HANDLE, Hold("door", "handle_free"))
-    assert find_shared_coordinate(door_scene(), both.holds) == "door.hinge"
+    assert find_shared_coordinate(load_door_scene(), both.holds) == "door.hinge"
 
 
 def test_unused_initial_hold_is_dropped_if_another_moves_the_same_joints() -> None:
     """With the joints that the new one does not move, which then are none of the task."""
     scene = (
-        with_link(door_scene(), "plate", "panel")
+        with_link(load_door_scene(), "plate", "panel")
         .with_state("door", {"hinge": 0.4, "knob": 0.6})
         .with_held({"door": "handle"})
     )

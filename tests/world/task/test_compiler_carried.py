@@ -8,8 +8,8 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.carrying import BALL, STICK, room, with_object
-from helpers.small_problems import full_scene, with_objects
+from helpers.carrying import BALL, STICK, make_room, place_object
+from helpers.small_problems import make_full_scene, replace_objects
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
@@ -31,7 +31,7 @@ POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array(POINT))
 @cache
 def scene() -> Scene:
     """Return the door's room with drawer and cabinet, and stick and ball in it too."""
-    return with_objects(full_scene(), room(objects=("stick", "ball")).objects)
+    return replace_objects(make_full_scene(), make_room(objects=("stick", "ball")).objects)
 
 
 def phases(*steps: Step, of: Scene | None = None) -> Task:
@@ -89,7 +89,7 @@ def test_place_grasps_carries_and_releases() -> None:
 
 
 def test_place_at_a_point_keeps_the_object_upright() -> None:
-    lying = with_object(scene(), "stick", POSE)
+    lying = place_object(scene(), "stick", POSE)
     task = phases(Place("stick", (0.0, 1.0, 0.5)), GoTo(0.0, 0.0), of=lying)
     (goal,) = task.phases[1].frames
     assert goal.kind == "upright"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pinocchio as pin
-from helpers.small_problems import full_scene
+from helpers.small_problems import make_full_scene
 
 from vkc_pin.world.task.lookup import (
     find_path_joints,
@@ -12,7 +12,7 @@ from vkc_pin.world.task.lookup import (
 
 def test_path_joints_move_the_attachment() -> None:
     """By trying each of them, with Pinocchio."""
-    for placed in full_scene().objects.values():
+    for placed in make_full_scene().objects.values():
         model, base = placed.object.model, placed.object.coordinates.q(placed.state)
         for attachment in placed.object.attachments.values():
             frame, moving = model.getFrameId(attachment.link, pin.FrameType.BODY), []
@@ -25,7 +25,7 @@ def test_path_joints_move_the_attachment() -> None:
                 if not data.oMf[frame].isApprox(other.oMf[frame], 1e-9):
                     moving.append(name)
             assert sorted(find_path_joints(placed, attachment)) == sorted(moving)
-    cabinet = full_scene().objects["cabinet"]
+    cabinet = make_full_scene().objects["cabinet"]
     assert find_path_joints(cabinet, cabinet.object.attachments["grip"]) == ["swing", "slide"], (
         "base first"
     )

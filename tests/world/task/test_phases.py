@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.carrying import room, stand
-from helpers.small_problems import SHORT, full_scene
+from helpers.carrying import describe_stand, make_room
+from helpers.small_problems import SHORT, make_full_scene
 
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
@@ -32,7 +32,11 @@ CARRYING: list[Step] = [
 
 
 def scene_for(steps: list[Step]) -> Scene:
-    return full_scene() if steps is FURNITURE else room(stand(), objects=("stick", "ball"))
+    return (
+        make_full_scene()
+        if steps is FURNITURE
+        else make_room(describe_stand(), objects=("stick", "ball"))
+    )
 
 
 def told(task: Task) -> list[tuple[object, ...]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.riding import TOP, cup, folder, plates, trays
+from helpers.riding import TOP, describe_cup, make_plate_scene, make_tray_scene, write_objects
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
@@ -27,7 +27,10 @@ def rides(task: Task) -> list[list[tuple[str, str]]]:
 
 def test_cup_on_the_plate_moves_with_it() -> None:
     task = compiled(
-        plates(cups=2), vkc.Actuate("plate", {"slide": 0.4}), vkc.Grasp("cup"), vkc.GoTo(0.0, 0.0)
+        make_plate_scene(cups=2),
+        vkc.Actuate("plate", {"slide": 0.4}),
+        vkc.Grasp("cup"),
+        vkc.GoTo(0.0, 0.0),
     )
     assert rides(task) == [[], [("cup", "plate.plate"), ("cup_1", "plate.plate")], [], []]
     for name, y in (("cup", 0.05), ("cup_1", -0.07)):
@@ -41,26 +44,29 @@ def test_cup_on_the_plate_moves_with_it() -> None:
 
 
 def test_object_above_the_plate_or_on_the_post_does_not_move() -> None:
-    assert rides(compiled(plates(gap=0.05), vkc.Actuate("plate", {"slide": 0.4}))) == [[], []]
+    assert rides(compiled(make_plate_scene(gap=0.05), vkc.Actuate("plate", {"slide": 0.4}))) == [
+        [],
+        [],
+    ]
 
 
 def test_tilting_support_is_rejected() -> None:
-    assert rides(compiled(plates("turntable"), vkc.Actuate("plate", {"turn": 0.5})))[1] == [
-        ("cup", "plate.plate")
-    ]
-    assert rides(compiled(plates("flap"), vkc.Actuate("plate", {"tip": 0.09})))[1] == [
+    assert rides(compiled(make_plate_scene("turntable"), vkc.Actuate("plate", {"turn": 0.5})))[
+        1
+    ] == [("cup", "plate.plate")]
+    assert rides(compiled(make_plate_scene("flap"), vkc.Actuate("plate", {"tip": 0.09})))[1] == [
         ("cup", "plate.plate")
     ]
     with pytest.raises(
         InputError, match=r"'cup' rests on 'plate\.plate', which would tilt too much"
     ) as caught:
-        compiled(plates("flap"), vkc.Actuate("plate", {"tip": 0.5}))
+        compiled(make_plate_scene("flap"), vkc.Actuate("plate", {"tip": 0.5}))
     assert caught.value.field == "steps[0]"
     assert "0.50 rad" in str(caught.value)
 
 
 def test_object_on_moving_and_fixed_links_is_rejected() -> None:
-    scene = plates(cups=0)
+    scene = make_plate_scene(cups=0)
     shelf = {
         "name": "shelf",
         "type": "box",
@@ -69,10 +75,10 @@ def test_object_on_moving_and_fixed_links_is_rejected() -> None:
     }
     document = {
         **scene.document,
-        "objects": [*scene.document["objects"], cup(at=(1.0, 0.0, TOP))],
+        "objects": [*scene.document["objects"], describe_cup(at=(1.0, 0.0, TOP))],
         "obstacles": [shelf],
     }
-    between = Scene.from_document(document, folder())
+    between = Scene.from_document(document, write_objects())
     with pytest.raises(
         InputError, match=r"rests both on a moving and on a fixed link: 'plate\.plate' and 'shelf'"
     ):
@@ -81,7 +87,7 @@ def test_object_on_moving_and_fixed_links_is_rejected() -> None:
 
 
 def test_cup_placed_on_the_plate_moves_with_it() -> None:
-    scene = plates().with_placement("cup", pin.SE3(np.eye(3), np.array([0.0, 1.0, 0.0])))
+    scene = make_plate_scene().with_placement("cup", pin.SE3(np.eye(3), np.array([0.0, 1.0, 0.0])))
     steps = vkc.Place("cup", [0.8, 0.05, TOP]), vkc.Actuate("plate", {"slide": 0.4})
     task = compiled(scene, *steps)
     assert rides(task)[-1] == [("cup", "plate.plate")]
@@ -90,7 +96,7 @@ def test_cup_placed_on_the_plate_moves_with_it() -> None:
 
 
 def test_cup_on_the_held_tray_moves_with_it() -> None:
-    task = compiled(trays(), vkc.Place("tray", THERE), vkc.GoTo(0.0, 0.0))
+    task = compiled(make_tray_scene(), vkc.Place("tray", THERE), vkc.GoTo(0.0, 0.0))
     assert rides(task) == [[], [("cup", "tray.tray")], []]
     left = task.phases[2].resting["cup"].translation
     np.testing.assert_allclose(
@@ -100,12 +106,12 @@ def test_cup_on_the_held_tray_moves_with_it() -> None:
 
 def test_supported_object_cannot_be_grasped() -> None:
     with pytest.raises(InputError, match="'cup' rests on an object that the robot carries"):
-        compiled(trays(), vkc.Grasp("tray"), vkc.Grasp("cup", by="tray.tray"))
+        compiled(make_tray_scene(), vkc.Grasp("tray"), vkc.Grasp("cup", by="tray.tray"))
 
 
 def test_supported_object_of_uncertain_placement_cannot_be_grasped() -> None:
     with pytest.raises(
         InputError, match="the placement of 'cup' at this step is known only after planning"
     ):
-        compiled(trays(), vkc.Place("tray", [-0.5, -1.5, 0.7]), vkc.Grasp("cup"))
-    compiled(trays(), vkc.Place("tray", THERE), vkc.Grasp("cup"))
+        compiled(make_tray_scene(), vkc.Place("tray", [-0.5, -1.5, 0.7]), vkc.Grasp("cup"))
+    compiled(make_tray_scene(), vkc.Place("tray", THERE), vkc.Grasp("cup"))

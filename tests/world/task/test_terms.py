@@ -7,8 +7,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.carrying import room, table
-from helpers.drives import hall
+from helpers.carrying import describe_table, make_room
+from helpers.drives import make_hall
 
 import vkc_pin as vkc
 from vkc_pin.world.task.terms import check_terms_active, term_from_dict, term_to_dict, trace_terms
@@ -48,20 +48,20 @@ def three() -> list[vkc.Constraint | vkc.Cost]:
 
 
 def test_terms_survive_a_round_trip_through_data() -> None:
-    found = trace_terms(room(table()), three())
+    found = trace_terms(make_room(describe_table()), three())
     assert [term.name for term in found] == ["slow", "within", "elbow"]
     assert [term.formula.uses_time_step for term in found] == [True, False, False]
     for term in found:
         again = term_from_dict(json.loads(json.dumps(term_to_dict(term))))
         assert again == term
         assert hash(again) == hash(term)
-    assert trace_terms(room(table()), found) == found
-    assert trace_terms(room(table()), []) == ()
+    assert trace_terms(make_room(describe_table()), found) == found
+    assert trace_terms(make_room(describe_table()), []) == ()
 
 
 def test_bounds_are_extended_to_all_rows() -> None:
     unbounded = np.inf
-    slow, within, _ = trace_terms(room(table()), three())
+    slow, within, _ = trace_terms(make_room(describe_table()), three())
     assert isinstance(slow, vkc.Constraint)
     assert isinstance(within, vkc.Constraint)
     np.testing.assert_array_equal(slow.compute_bounds(1), [[-unbounded], [0.0]])
@@ -145,11 +145,11 @@ def test_errors_name_the_invalid_expression(
     expression: Callable[[vkc.State], Any], message: str
 ) -> None:
     with pytest.raises(vkc.InputError, match=rf"(?s)^terms\['mine'\]\.expression: {message}"):
-        trace_terms(hall(), [vkc.Constraint("mine", expression, lower=0.0)])
+        trace_terms(make_hall(), [vkc.Constraint("mine", expression, lower=0.0)])
 
 
 def test_unknown_names_are_named() -> None:
-    scene = room(table())
+    scene = make_room(describe_table())
     for expression, nearest in (
         (lambda s: s.position("stick.tipp"), "stick.tip"),
         (lambda s: s.velocity("tol"), "tool"),
@@ -162,7 +162,7 @@ def test_unknown_names_are_named() -> None:
         trace_terms(scene, [tilt(holding="stik")])
     assert (caught.value.nearest, caught.value.field) == ("stick", "terms['upright'].holding")
     with pytest.raises(vkc.UnknownNameError, match="there is no frame 'stick"):  # traced elsewhere
-        trace_terms(hall(), trace_terms(scene, [tilt()]))
+        trace_terms(make_hall(), trace_terms(scene, [tilt()]))
 
 
 def test_unknown_phases_are_rejected() -> None:
@@ -194,7 +194,7 @@ def test_invalid_terms_are_found_before_planning(function: Callable[..., Any]) -
         ([tilt(), tilt(lower=0.5)], "two terms share a name"),
     ):
         with pytest.raises(vkc.InputError, match=message):
-            function(room(table()), steps, options=SHORT, terms=terms)
+            function(make_room(describe_table()), steps, options=SHORT, terms=terms)
 
 
 @pytest.mark.parametrize(
@@ -209,7 +209,7 @@ def test_invalid_terms_are_found_before_planning(function: Callable[..., Any]) -
     ],
 )
 def test_damaged_expressions_are_rejected(wrong: dict[str, Any]) -> None:
-    (term,) = trace_terms(room(table()), [tilt()])
+    (term,) = trace_terms(make_room(describe_table()), [tilt()])
     data = term_to_dict(term)
     with pytest.raises(vkc.InputError, match="not a saved term"):
         term_from_dict({**data, "expression": {**data["expression"], **wrong}})

@@ -11,16 +11,16 @@ from helpers.carrying import (
     STICK,
     UP,
     Script,
-    above,
-    carried_over,
-    freedom,
-    lifted,
-    moved_base,
-    reaching,
-    room,
-    stand,
-    table,
-    tool_at,
+    carry_over,
+    compute_freedom,
+    compute_grasp_pose,
+    describe_stand,
+    describe_table,
+    lift,
+    make_room,
+    move_base,
+    solve_above,
+    solve_reach,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -65,8 +65,8 @@ def assert_same(first: pin.SE3, second: pin.SE3, tolerance: float = 1e-9) -> Non
 @cache
 def carried() -> tuple[Scene, Trajectory]:
     """Return the stick that is carried over the table, and a ball that is not."""
-    scene = room(table(), objects=("stick", "ball"))
-    return scene, carried_over(scene, values=(0.03, 0.2)).motion()
+    scene = make_room(describe_table(), objects=("stick", "ball"))
+    return scene, carry_over(scene, values=(0.03, 0.2)).motion()
 
 
 def test_object_rests_before_the_grasp_and_after_the_release() -> None:
@@ -77,7 +77,7 @@ def test_object_rests_before_the_grasp_and_after_the_release() -> None:
         for at in placements(scene, motion, "stick", inside(motion, phase)):
             assert_same(at, STICK, 1e-12)
     for at in placements(scene, motion, "stick", inside(motion, 5)):
-        assert_same(at, lifted(STICK, [0.0, 0.5, 0.0]))
+        assert_same(at, lift(STICK, [0.0, 0.5, 0.0]))
     for phase in range(len(motion.phases)):
         for at in placements(scene, motion, "ball", inside(motion, phase, 5)):
             assert_same(at, BALL, 1e-12)
@@ -90,7 +90,9 @@ def test_object_moves_rigidly_with_the_hand() -> None:
         for at, tool in zip(
             placements(scene, motion, "stick", times), tools(scene, motion, times), strict=True
         ):
-            assert_same(at.inverse() * tool, tool_at(pin.SE3.Identity(), values=(0.03, 0.2)))
+            assert_same(
+                at.inverse() * tool, compute_grasp_pose(pin.SE3.Identity(), values=(0.03, 0.2))
+            )
     lowest, highest = (
         placements(scene, motion, "stick", np.array([motion.times[motion.phases[k].last]]))[0]
         for k in (1, 2)
@@ -99,8 +101,8 @@ def test_object_moves_rigidly_with_the_hand() -> None:
 
 
 def test_grasp_freedoms_move_the_hand_along_the_object() -> None:
-    scene = room(table())
-    script = carried_over(scene)
+    scene = make_room(describe_table())
+    script = carry_over(scene)
     count = len(script.rows)
     slide, turn = (
         0.05 * np.sin(np.linspace(0.0, 9.0, count)),
@@ -111,8 +113,8 @@ def test_grasp_freedoms_move_the_hand_along_the_object() -> None:
     # Where the hand closes the stick lies as it lies, whatever the coordinates say; from then on
     # they count.
     offset = (
-        tool_at(pin.SE3.Identity(), values=(slide[first], turn[first]))
-        * tool_at(STICK).inverse()
+        compute_grasp_pose(pin.SE3.Identity(), values=(slide[first], turn[first]))
+        * compute_grasp_pose(STICK).inverse()
         * STICK
     )
     assert np.abs(pin.log6(offset).vector).max() > 1e-2
@@ -123,26 +125,28 @@ def test_grasp_freedoms_move_the_hand_along_the_object() -> None:
         )
         sticks = placements(scene, motion, "stick", times)
         for at, tool, (s, t) in zip(sticks, tools(scene, motion, times), values, strict=True):
-            assert_same(at, tool * tool_at(pin.SE3.Identity(), values=(s, t)).inverse() * offset)
+            assert_same(
+                at, tool * compute_grasp_pose(pin.SE3.Identity(), values=(s, t)).inverse() * offset
+            )
 
 
 def fetched() -> tuple[Scene, Script]:
     """Return a motion in which a held stick lifts a ball, carries it aside and puts it down."""
-    scene = room(stand(), objects=("stick", "ball"))
+    scene = make_room(describe_stand(), objects=("stick", "ball"))
     south = pin.SE3(
         STICK.rotation, BALL.translation - np.array([0.0, 0.285, 0.0])
     )  # of the stick when its tip is at the ball
-    touch = reaching(tool_at(south), above(STICK))
-    up = reaching(tool_at(lifted(south, UP / 4)), touch)
+    touch = solve_reach(compute_grasp_pose(south), solve_above(STICK))
+    up = solve_reach(compute_grasp_pose(lift(south, UP / 4)), touch)
     scene = scene.with_held({"stick": "grip"}).with_start(arm=up[3:])
     script = (
         Script(scene)
         .go(touch)
         .take("ball", "pull", PULL, by="stick.tip")
         .go(up)
-        .go(moved_base(up, y=0.3))
+        .go(move_base(up, y=0.3))
     )
-    script.go(moved_base(touch, y=0.3)).let_go("ball").go(moved_base(touch, y=0.1))
+    script.go(move_base(touch, y=0.3)).let_go("ball").go(move_base(touch, y=0.1))
     return scene, script
 
 
@@ -154,7 +158,9 @@ def test_object_held_through_a_stick_follows_its_tip() -> None:
         *[{"ball": "stick.tip"}] * 3,
         {},
     ]
-    on_tip = (freedom("pull", PULL) * pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.035]))).inverse()
+    on_tip = (
+        compute_freedom("pull", PULL) * pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.035]))
+    ).inverse()
     flipped = pin.SE3(
         np.diag([1.0, -1.0, -1.0]), np.zeros(3)
     )  # of the ball's attachment, which looks down
@@ -168,38 +174,40 @@ def test_object_held_through_a_stick_follows_its_tip() -> None:
             strict=True,
         ):
             assert_same(ball, stick * TIP * on_tip * flipped)
-            assert_same(stick, tool * tool_at(pin.SE3.Identity()).inverse())
+            assert_same(stick, tool * compute_grasp_pose(pin.SE3.Identity()).inverse())
             assert_same(stick.inverse() * ball, pin.SE3(np.eye(3), np.array([0.0, 0.285, 0.0])))
     assert_same(placements(scene, motion, "ball", inside(motion, 0))[7], BALL, 1e-12)
     for at in placements(scene, motion, "ball", inside(motion, 4)):
-        assert_same(at, lifted(BALL, [0.0, 0.3, 0.0]))
+        assert_same(at, lift(BALL, [0.0, 0.3, 0.0]))
 
 
 def test_object_held_at_the_start_is_in_the_hand() -> None:
-    scene = room(objects=("stick",)).with_held({"stick": "grip"}, at={"stick": (-0.04, 0.5)})
+    scene = make_room(objects=("stick",)).with_held({"stick": "grip"}, at={"stick": (-0.04, 0.5)})
     world = World(scene)
     tool = scene.tool_placement()
-    expected = tool * tool_at(pin.SE3.Identity(), values=(-0.04, 0.5)).inverse()
+    expected = tool * compute_grasp_pose(pin.SE3.Identity(), values=(-0.04, 0.5)).inverse()
     assert_same(
         pin.XYZQUATToSE3(world.start[world.get_placement_columns("stick")]), expected, 1e-12
     )
-    motion = Script(scene).go(moved_base(scene.start, x=-1.0, yaw=2.0)).motion()
+    motion = Script(scene).go(move_base(scene.start, x=-1.0, yaw=2.0)).motion()
     times = inside(motion, 0)
     for at, tool in zip(
         placements(scene, motion, "stick", times), tools(scene, motion, times), strict=True
     ):
-        assert_same(at, tool * tool_at(pin.SE3.Identity(), values=(-0.04, 0.5)).inverse())
+        assert_same(
+            at, tool * compute_grasp_pose(pin.SE3.Identity(), values=(-0.04, 0.5)).inverse()
+        )
 
 
 @cache
 def turned() -> tuple[Scene, Trajectory]:
     """Return the stick turned round and round: two turns of the base, and the arm's wrist too."""
-    scene = room(table())
-    down = reaching(tool_at(STICK), above(STICK))
+    scene = make_room(describe_table())
+    down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
     script = Script(scene).go(down).take("stick").go(np.array(scene.start))
-    there = moved_base(scene.start, x=-2.0, yaw=4 * np.pi)
+    there = move_base(scene.start, x=-2.0, yaw=4 * np.pi)
     there[5:9] += [0.4, 1.0, -0.8, 3.0]
-    script.go(there, steps=60).let_go().go(moved_base(there, x=-1.0))
+    script.go(there, steps=60).let_go().go(move_base(there, x=-1.0))
     return scene, script.motion()
 
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.fake_plan import fake_plan
+from helpers.fake_plan import make_fake_plan
 
 from vkc_pin.planning.plan import Plan
 from vkc_pin.world.trajectory.placements import Motion, key_times, sample_motion
@@ -12,7 +12,7 @@ from vkc_pin.world.trajectory.world_model import World
 
 @pytest.fixture(scope="module")
 def plan() -> Plan:
-    return fake_plan()
+    return make_fake_plan()
 
 
 @pytest.fixture(scope="module")

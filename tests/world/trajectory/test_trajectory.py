@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.written import NAMES, PHASES, ROWS, TIMES, example
+from helpers.written import NAMES, PHASES, ROWS, TIMES, make_example
 
 from vkc_pin.errors import InputError
 from vkc_pin.world.scene.hold import make_holds
@@ -16,15 +16,15 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def test_efforts() -> None:
-    assert example().base_path_length() == pytest.approx(5.0 + 1.0)
-    assert example().base_path_length_l1() == pytest.approx(3.0 + 4.0 + 1.0)
-    assert example().arm_path_length() == pytest.approx(
+    assert make_example().base_path_length() == pytest.approx(5.0 + 1.0)
+    assert make_example().base_path_length_l1() == pytest.approx(3.0 + 4.0 + 1.0)
+    assert make_example().arm_path_length() == pytest.approx(
         0.1 + 0.2 + 0.4 + 0.1
     )  # neither the heading nor the door counts
 
 
 def test_samples_and_velocities_of_linear_motions() -> None:
-    motion = example()
+    motion = make_example()
     times, rows = motion.sample(2.0)
     np.testing.assert_allclose(times, np.arange(14) / 2.0)
     np.testing.assert_array_equal(rows, motion(times))
@@ -40,13 +40,13 @@ def test_samples_and_velocities_of_linear_motions() -> None:
 def test_accelerations() -> None:
     """The step of velocity over the shorter of both neighbours' durations; from and to rest."""
     x, hinge = [1.5 / 2.0, -1.5 / 0.5, -0.25 / 0.5, 0.25 / 4.0], [0.0, 0.0, 0.3 / 0.5, -0.3 / 4.0]
-    np.testing.assert_allclose(example().accelerations()[:, 0], x)
-    np.testing.assert_allclose(example().accelerations()[:, 5], hinge)
-    assert example().accelerations().shape == (4, 6)
+    np.testing.assert_allclose(make_example().accelerations()[:, 0], x)
+    np.testing.assert_allclose(make_example().accelerations()[:, 5], hinge)
+    assert make_example().accelerations().shape == (4, 6)
 
 
 def test_at() -> None:
-    motion = example()
+    motion = make_example()
     np.testing.assert_allclose(motion.at(1.0), ROWS[1] / 2 + ROWS[0] / 2)
     np.testing.assert_allclose(
         motion.at([3.5, 6.5])[0], 0.75 * ROWS[2] + 0.25 * ROWS[3], atol=1e-15
@@ -58,13 +58,13 @@ def test_at() -> None:
 
 @pytest.mark.parametrize("time", ["soon", float("nan"), [0.0, float("inf")]])
 def test_what_is_no_time(time: Any) -> None:
-    for ask in (example().at, example().velocity, example().acceleration):
+    for ask in (make_example().at, make_example().velocity, make_example().acceleration):
         with pytest.raises(InputError, match="time"):
             ask(time)
 
 
 def test_round_trip() -> None:
-    motion = example(positions=np.random.default_rng(0).normal(size=ROWS.shape))
+    motion = make_example(positions=np.random.default_rng(0).normal(size=ROWS.shape))
     again = Trajectory.from_dict(json.loads(json.dumps(motion.to_dict())))
     np.testing.assert_array_equal(again.positions, motion.positions)
     np.testing.assert_array_equal(again.times, motion.times)
@@ -78,7 +78,7 @@ def test_round_trip() -> None:
 def test_what_is_held_through_something_is_kept_too() -> None:
     held, by = {"stick": "grip", "ball": "pull"}, {"ball": "stick.tip"}
     phases = (PhaseSpan("reach", 0, 2), PhaseSpan("carry", 2, 3, make_holds(held, by)))
-    data = json.loads(json.dumps(example(phases=phases).to_dict()))
+    data = json.loads(json.dumps(make_example(phases=phases).to_dict()))
     assert [phase["by"] for phase in data["phases"]] == [{}, by]
     assert Trajectory.from_dict(data).phases == phases
     for phase in data["phases"]:  # as in older files
@@ -88,7 +88,7 @@ def test_what_is_held_through_something_is_kept_too() -> None:
 
 @pytest.mark.parametrize("key", ["names", "times", "positions", "phases", "robot_size"])
 def test_data_that_lacks_something(key: str) -> None:
-    data = example().to_dict()
+    data = make_example().to_dict()
     del data[key]
     with pytest.raises(InputError) as caught:
         Trajectory.from_dict(data)
@@ -123,5 +123,5 @@ def test_data_that_lacks_something(key: str) -> None:
 )
 def test_bad_input(field: str, changes: dict[str, Any]) -> None:
     with pytest.raises(InputError) as caught:
-        example(**changes)
+        make_example(**changes)
     assert caught.value.field == field

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.drives import hall
+from helpers.drives import make_hall
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -70,10 +70,10 @@ def test_times_follow_the_faster_wheel() -> None:
 
 
 def test_limits_follow_from_the_robot() -> None:
-    assert make_rolling_limits(hall().robot) is OMNIDIRECTIONAL
-    assert make_rolling_limits(hall(base="fixed").robot) is OMNIDIRECTIONAL
+    assert make_rolling_limits(make_hall().robot) is OMNIDIRECTIONAL
+    assert make_rolling_limits(make_hall(base="fixed").robot) is OMNIDIRECTIONAL
     tank, car = (
-        make_rolling_limits(hall(**robot).robot)
+        make_rolling_limits(make_hall(**robot).robot)
         for robot in ({"base": "differential"}, {"base": "ackermann", "turning_radius": 0.8})
     )
     assert (tank.turning_radius, car.turning_radius) == (0.0, 0.8)

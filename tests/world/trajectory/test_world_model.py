@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.small_problems import full_scene, random_configurations
+from helpers.small_problems import make_full_scene, sample_configurations
 
 import vkc_pin as vkc
 from vkc_pin.world.scene.placed_object import make_world_shapes
@@ -16,14 +16,14 @@ from vkc_pin.world.trajectory.world_model import World, find_coordinate_units
 
 @pytest.fixture(scope="module")
 def world() -> World:
-    return World(full_scene())
+    return World(make_full_scene())
 
 
 def random_rows(world: World, seed: int, count: int = 1) -> np.ndarray:
     robot, objects = world.scene.robot, [placed.object for placed in world.scene.objects.values()]
     lower = np.concatenate([robot.lower, *(item.lower for item in objects)])
     upper = np.concatenate([robot.upper, *(item.upper for item in objects)])
-    return random_configurations(lower, upper, count, np.random.default_rng(seed))
+    return sample_configurations(lower, upper, count, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("seed", range(3))

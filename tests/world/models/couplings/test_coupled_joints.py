@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.telescopes import joint, link, write_telescope
+from helpers.telescopes import format_joint, format_link, write_telescope
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
@@ -15,11 +15,11 @@ from vkc_pin.world.models.couplings.coupled_joints import JointCoupling, find_fo
 
 def file_of(tmp_path: Path, *inside: str, kinds: str = "prismatic") -> Path:
     """Write a chain of joints j1, j2, ... with given contents, and shapes on every other link."""
-    parts = [link("root", "0.1 0.1 0.1")]
+    parts = [format_link("root", "0.1 0.1 0.1")]
     for k, text in enumerate(inside, start=1):
         parts += [
-            link(f"l{k}", "0.1 0.1 0.1" if k % 2 else ""),
-            joint(f"j{k}", kinds, f"l{k - 1}" if k > 1 else "root", f"l{k}", inside=text),
+            format_link(f"l{k}", "0.1 0.1 0.1" if k % 2 else ""),
+            format_joint(f"j{k}", kinds, f"l{k - 1}" if k > 1 else "root", f"l{k}", inside=text),
         ]
     path = tmp_path / "robot.urdf"
     path.write_text(f'<robot name="robot">{"".join(parts)}</robot>', encoding="utf-8")
@@ -73,7 +73,7 @@ def test_leaders_that_cannot_move_raise(
     tmp_path: Path, inside: tuple[str, ...], message: str
 ) -> None:
     path = file_of(tmp_path, *inside)
-    fixed = link("aside") + joint("still", "fixed", "root", "aside")
+    fixed = format_link("aside") + format_joint("still", "fixed", "root", "aside")
     path.write_text(path.read_text().replace("</robot>", fixed + "</robot>"))
     with pytest.raises(InputError, match=message) as caught:
         vkc.load_robot(path, pairs="all", tool_frame=f"l{len(inside)}")

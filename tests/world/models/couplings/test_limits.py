@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.telescopes import joint, link, write_telescope
+from helpers.telescopes import format_joint, format_link, write_telescope
 
 import vkc_pin as vkc
 
@@ -21,10 +21,10 @@ def make_coupled_robot(
     yaml: str = "",
 ) -> vkc.Robot:
     """Return a robot with two joints, of which the second follows the first."""
-    parts = [link(f"l{k}", "0.1 0.1 0.1", f"0 0 {k}") for k in range(3)]
-    parts += [joint("one", kinds[0], "l0", "l1", limits=first, velocity=0.4)]
+    parts = [format_link(f"l{k}", "0.1 0.1 0.1", f"0 0 {k}") for k in range(3)]
+    parts += [format_joint("one", kinds[0], "l0", "l1", limits=first, velocity=0.4)]
     parts += [
-        joint(
+        format_joint(
             "two",
             kinds[1],
             "l1",

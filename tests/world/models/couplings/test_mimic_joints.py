@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-from helpers.telescopes import joint, link, write_telescope
+from helpers.telescopes import format_joint, format_link, write_telescope
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -29,7 +29,7 @@ KINDS = ("revolute", "prismatic", "continuous")
 def random_robot(rng: np.random.Generator) -> tuple[str, str]:
     """Return a URDF of a random tree with random couplings, and its tool link."""
     count = int(rng.integers(3, 8))
-    parts, order = [link("l0", "0.1 0.1 0.1")], rng.permutation(count)
+    parts, order = [format_link("l0", "0.1 0.1 0.1")], rng.permutation(count)
     leads = {
         int(one): int(other)
         for k, one in enumerate(order)
@@ -47,8 +47,8 @@ def random_robot(rng: np.random.Generator) -> tuple[str, str]:
         at, axis = (" ".join(map(str, rng.normal(size=3))) for _ in range(2))
         kind = str(rng.choice(KINDS))
         parts += [
-            link(f"l{k + 1}", "0.1 0.1 0.1", at),
-            joint(f"j{k}", kind, above, f"l{k + 1}", at, axis, (-5.0, 5.0), inside=inside),
+            format_link(f"l{k + 1}", "0.1 0.1 0.1", at),
+            format_joint(f"j{k}", kind, above, f"l{k + 1}", at, axis, (-5.0, 5.0), inside=inside),
         ]
     return f'<robot name="robot">{"".join(parts)}</robot>', f"l{count}"
 
@@ -112,14 +112,16 @@ def test_dynamics_include_followers(tmp_path: Path) -> None:
 def test_leaders_may_be_on_another_branch(tmp_path: Path) -> None:
     """As in a palletizer, the follower is on the path to the tool, its leader is not."""
     parts = [
-        link("root", "0.1 0.1 0.1"),
-        link("a", "0.1 0.1 0.1"),
-        link("b", "0.1 0.1 0.1", "0 0 1"),
+        format_link("root", "0.1 0.1 0.1"),
+        format_link("a", "0.1 0.1 0.1"),
+        format_link("b", "0.1 0.1 0.1", "0 0 1"),
     ]
     parts += [
-        joint("follower", "revolute", "root", "a", inside='<mimic joint="leader" multiplier="-1"/>')
+        format_joint(
+            "follower", "revolute", "root", "a", inside='<mimic joint="leader" multiplier="-1"/>'
+        )
     ]
-    parts += [joint("leader", "revolute", "root", "b")]
+    parts += [format_joint("leader", "revolute", "root", "b")]
     file = tmp_path / "robot.urdf"
     file.write_text(f'<robot name="robot">{"".join(parts)}</robot>')
     robot = vkc.load_robot(file, tool_frame="a", pairs="all")

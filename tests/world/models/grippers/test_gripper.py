@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.grippers import WIDEST, write_gripper
-from helpers.robots import at_rest, placement
+from helpers.robots import compute_placement, get_rest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,9 +25,9 @@ def finger_centers(robot: Robot) -> list[np.ndarray]:
     """Return the centres of the fingers' shapes in the tool frame."""
     data, shapes = robot.model.createData(), robot.collision.createData()
     pin.updateGeometryPlacements(
-        robot.model, data, robot.collision, shapes, robot.coordinates.q(at_rest(robot))
+        robot.model, data, robot.collision, shapes, robot.coordinates.q(get_rest(robot))
     )
-    tool = placement(robot, robot.tool_frame, at_rest(robot))
+    tool = compute_placement(robot, robot.tool_frame, get_rest(robot))
     fingers = [k for k in range(len(shapes.oMg)) if robot.link_of(k).startswith("finger")]
     return [tool.actInv(shapes.oMg[k]).translation for k in fingers]
 
@@ -52,7 +52,9 @@ def test_fingers_are_symmetric_at_the_given_opening(robot: Robot, opening: float
     ):  # fingers are 10 mm thick
         assert middle[0] == pytest.approx(side * (opening / 2.0 + 0.005), abs=1e-5)
     for link in ("finger_a", "finger_b", "hand", "tool"):
-        own = placement(opened, link, at_rest(robot)).actInv(placement(robot, link, at_rest(robot)))
+        own = compute_placement(opened, link, get_rest(robot)).actInv(
+            compute_placement(robot, link, get_rest(robot))
+        )
         away = WIDEST / 2.0 - opening / 2.0 if link.startswith("finger") else 0.0
         assert np.linalg.norm(own.translation) == pytest.approx(away, abs=1e-5)
 

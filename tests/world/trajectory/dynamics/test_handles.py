@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.closers import changed, closer
+from helpers.closers import load_door_with_closer, replace_object_fields
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -27,7 +27,7 @@ def motion(**coordinates: tuple[float, float, float]) -> Motion:
 
 
 def drawer(**resistance: float) -> vkc.Scene:
-    return changed(vkc.load_scene("drawer"), "drawer", joints={"slide": resistance})
+    return replace_object_fields(vkc.load_scene("drawer"), "drawer", joints={"slide": resistance})
 
 
 @pytest.mark.parametrize("riding", [0.0, 2.5])
@@ -56,7 +56,7 @@ def test_friction_opposes_the_motion() -> None:
 
 @cache
 def heavy_door() -> vkc.Scene:
-    return closer(stiffness=5.0, springref=-2.0, damping=3.0)
+    return load_door_with_closer(stiffness=5.0, springref=-2.0, damping=3.0)
 
 
 @pytest.mark.parametrize("attachment", ["handle", "handle_free", "push"])
@@ -93,7 +93,9 @@ def test_wrench_does_the_work_of_the_joints_and_none_along_freedoms(
 
 
 def test_wrench_is_the_smallest_sufficient_one() -> None:
-    handle = Handle(closer(stiffness=5.0, springref=-2.0), vkc.Hold("door", "handle"))
+    handle = Handle(
+        load_door_with_closer(stiffness=5.0, springref=-2.0), vkc.Hold("door", "handle")
+    )
     (wrench,) = handle.wrenches(motion(door_hinge=(0.6, 0.2, 0.1), door_knob=(0.5, 0.0, 0.0)))
     weigh = np.array([1.0] * 3 + [0.1] * 3)
     force = float(np.linalg.norm(wrench[:3]))
@@ -105,7 +107,9 @@ def test_wrench_is_the_smallest_sufficient_one() -> None:
 
 def test_bolts_and_stops_carry_resting_loads() -> None:
     shut = motion(door_hinge=(0.0, 0.0, 0.0), door_knob=(0.2, 0.5, 0.0))
-    handle = Handle(closer(stiffness=5.0, springref=-2.0), vkc.Hold("door", "handle"))
+    handle = Handle(
+        load_door_with_closer(stiffness=5.0, springref=-2.0), vkc.Hold("door", "handle")
+    )
     assert handle.forces(shut)[0, 0] == 0.0
     leaving = motion(door_hinge=(0.0, 0.0, 0.5), door_knob=(0.5, 0.0, 0.0))
     assert handle.forces(leaving)[0, 0] > 10.0

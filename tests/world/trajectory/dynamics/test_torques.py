@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.closers import changed
+from helpers.closers import replace_object_fields
 
 import vkc_pin as vkc
 from vkc_pin.world.trajectory.curve import Curve
@@ -16,7 +16,9 @@ from vkc_pin.world.trajectory.world_model import World
 
 def swung(mass: float, *, base: float = 0.0) -> tuple[vkc.Scene, Trajectory]:
     """Return a scene with the stick in the hand, and a motion of arm and base in it."""
-    scene = changed(vkc.load_scene("init_1"), "stick", mass=mass).with_held({"stick": "grip"})
+    scene = replace_object_fields(vkc.load_scene("init_1"), "stick", mass=mass).with_held(
+        {"stick": "grip"}
+    )
     names = (*scene.robot.coordinates.names, "stick.grip_slide", "stick.grip_turn")
     times, rng = np.linspace(0.0, 1.5, 6), np.random.default_rng(3)
     size = len(scene.start)

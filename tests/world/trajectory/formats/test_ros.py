@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.fake_plan import fake_plan
-from helpers.written import FILES, broken, trajectories
+from helpers.fake_plan import make_fake_plan
+from helpers.written import FILES, trajectories, write_broken
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -68,7 +68,7 @@ def test_resting_coordinates_stay_at_rest() -> None:
 
 @pytest.fixture(scope="module")
 def plan() -> Plan:
-    return fake_plan()
+    return make_fake_plan()
 
 
 @FILES
@@ -197,7 +197,7 @@ def test_invalid_messages_are_rejected(
     with pytest.raises(vkc.InputError, match=f"^{expected}"):
         Trajectory.from_ros(message)
     with pytest.raises(vkc.InputError, match=f"bad.json: {expected}"):
-        Trajectory.from_ros(broken(tmp_path / "bad.json", json.dumps(message)))
+        Trajectory.from_ros(write_broken(tmp_path / "bad.json", json.dumps(message)))
 
 
 @pytest.mark.parametrize("smooth", [True, False])

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.fake_plan import fake_plan
+from helpers.fake_plan import make_fake_plan
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
@@ -25,7 +25,7 @@ Messages = dict[str, list[tuple[int, Any]]]
 @pytest.fixture(scope="module")
 def plan() -> Plan:
     """A plan whose motion is a curve, as those that are planned."""
-    made = fake_plan()
+    made = make_fake_plan()
     motion = made.trajectory
     rates = np.gradient(motion.positions, motion.times, axis=0)
     rates[[0, 6, -1]] = 0.0

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.fake_plan import fake_plan
-from helpers.written import FILES, ROBOT, broken, same, trajectories
+from helpers.fake_plan import make_fake_plan
+from helpers.written import FILES, ROBOT, are_equal, trajectories, write_broken
 from hypothesis import given
 
 import vkc_pin as vkc
@@ -25,19 +25,19 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 @pytest.fixture(scope="module")
 def plan() -> Plan:
-    return fake_plan()
+    return make_fake_plan()
 
 
 @FILES
 @given(trajectory=trajectories())
 def test_tables_are_exact(trajectory: Trajectory, tmp_path: Path) -> None:
-    assert same(Trajectory.from_csv(trajectory.to_csv(tmp_path / "motion.csv")), trajectory)
+    assert are_equal(Trajectory.from_csv(trajectory.to_csv(tmp_path / "motion.csv")), trajectory)
 
 
 @FILES
 @given(trajectory=trajectories())
 def test_json_is_exact(trajectory: Trajectory, tmp_path: Path) -> None:
-    assert same(Trajectory.from_json(trajectory.to_json(tmp_path / "motion.json")), trajectory)
+    assert are_equal(Trajectory.from_json(trajectory.to_json(tmp_path / "motion.json")), trajectory)
 
 
 def test_curves_and_openings_survive_files(tmp_path: Path) -> None:
@@ -46,8 +46,8 @@ def test_curves_and_openings_survive_files(tmp_path: Path) -> None:
     phases = (PhaseSpan("go", 0, 1, opening=0.04),)
     trajectory = Trajectory(ROBOT[:3], times[[0, 2]], rows[[0, 2]], phases, 3, curve)
     table = trajectory.to_csv(tmp_path / "motion.csv")
-    assert same(Trajectory.from_csv(table), trajectory)
-    assert same(Trajectory.from_json(trajectory.to_json(tmp_path / "motion.json")), trajectory)
+    assert are_equal(Trajectory.from_csv(table), trajectory)
+    assert are_equal(Trajectory.from_json(trajectory.to_json(tmp_path / "motion.json")), trajectory)
     table.write_text(table.read_text().replace("base_y velocity", "base_z velocity"))
     with pytest.raises(vkc.InputError, match="not the velocities of its coordinates"):
         Trajectory.from_csv(table)
@@ -107,7 +107,7 @@ def test_unknown_joints_are_rejected(plan: Plan, tmp_path: Path) -> None:
 
 def test_plain_tables_are_read(tmp_path: Path) -> None:
     text = "\ufefftime,base_x,base_y,base_yaw,door.hinge\r\n0,0,0,0,0\r\n\r\n0.5,1,2,3,4\r\n"
-    found = Trajectory.from_csv(broken(tmp_path / "own.csv", text))
+    found = Trajectory.from_csv(write_broken(tmp_path / "own.csv", text))
     assert (found.names, found.robot_size) == (("base_x", "base_y", "base_yaw", "door.hinge"), 3)
     assert found.phases == (PhaseSpan("motion", 0, 1),)
     assert found.positions[1].tolist() == [1.0, 2.0, 3.0, 4.0]
@@ -140,7 +140,7 @@ GOOD = "0.0,0,0,0,1,go,{}\n"
 )
 def test_invalid_tables_are_rejected(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(vkc.InputError, match=message):
-        Trajectory.from_csv(broken(tmp_path / "bad.csv", text))
+        Trajectory.from_csv(write_broken(tmp_path / "bad.csv", text))
 
 
 def test_unreadable_files_are_rejected(tmp_path: Path) -> None:
@@ -189,7 +189,7 @@ def test_large_and_deep_files_are_rejected_in_time(
 ) -> None:
     began = time.process_time()
     with pytest.raises(vkc.InputError, match=message) as caught:
-        read(broken(tmp_path / "bad", text))
+        read(write_broken(tmp_path / "bad", text))
     assert len(str(caught.value)) < 5000
     assert time.process_time() - began < 10.0
 
@@ -211,7 +211,7 @@ def test_large_and_deep_files_are_rejected_in_time(
 )
 def test_invalid_json_is_rejected(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(vkc.InputError, match=message):
-        Trajectory.from_json(broken(tmp_path / "bad.json", text))
+        Trajectory.from_json(write_broken(tmp_path / "bad.json", text))
 
 
 def test_export_of_a_saved_plan(
@@ -223,8 +223,8 @@ def test_export_of_a_saved_plan(
     assert capsys.readouterr().out.splitlines() == [
         f"wrote {out / kind}" for kind in ("csv", "json", "ros")
     ]
-    assert same(Trajectory.from_csv(out / "csv"), plan.trajectory)
-    assert same(Trajectory.from_json(out / "json"), plan.trajectory)
+    assert are_equal(Trajectory.from_csv(out / "csv"), plan.trajectory)
+    assert are_equal(Trajectory.from_json(out / "json"), plan.trajectory)
     assert json.loads((out / "ros").read_text(encoding="utf-8")) == plan.to_ros()
     assert (
         cli.main(

@@ -19,12 +19,8 @@ objects:
     position: [3, 0, 0]
     state: {hinge: 0.3}
 obstacles:
-  - name: crate
-    type: box
-    size: [0.5, 0.4, 0.3]
-    position: [2, 2, 0.15]
-    yaw: 0.2
-    colour: [1, 0, 0]
+  - {name: crate, type: box, size: [0.5, 0.4, 0.3], position: [2, 2, 0.15], \
+yaw: 0.2, colour: [1, 0, 0]}
   - name: post
     type: cylinder
     radius: 0.1

@@ -2,17 +2,17 @@
 
 Usage: python docs/make_tables.py
 
-In a page, what stands between `<!-- figures: NAME -->` and `<!-- /figures: NAME -->` is of
-docs/results/NAME.json: each table is replaced by the one of the experiment's own report that has
-the same columns, and lines that begin like one of `LINES` by the report's. Each line of versions
-and machine says from which commit the trials are.
+Sections between `<!-- figures: NAME -->` and `<!-- /figures: NAME -->` belong to
+docs/results/NAME.json. Each table is replaced by the table with the same columns in the
+experiment's report, and each line with a beginning in `LINES` by the report's line. Lines with
+versions and machine also name the commit of the trials.
 
-In a sentence, what stands between `<!-- figure: NAME WHAT FIELD=VALUE ... -->` and `<!-- / -->` is
-one figure of the trials of docs/results/NAME.json whose fields are as said, see `FIGURES`. It keeps
-as many decimals as it has.
+Figures between `<!-- figure: NAME WHAT FIELD=VALUE ... -->` and `<!-- / -->` are computed from the
+trials of docs/results/NAME.json with these field values, see `FIGURES`. The number of decimals is
+kept.
 
-Figures that are on no record stand between `<!-- measured: COMMIT DATE -->` and `<!-- /measured
--->`; docs/evidence.md lists them. Other sentences are written by hand.
+Figures without a record are between `<!-- measured: COMMIT DATE -->` and `<!-- /measured -->`;
+docs/evidence.md lists them. Other sentences are written by hand.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ PARTS = {
     "ipopt": "Ipopt",
     "validation": "validation",
 }
-# What is done, its record, and the fields of its trials that tell it.
+# Task, its record, and the fields of its trials.
 STATUS: list[tuple[str, str, dict[str, str]]] = [
     ("reach a pose", "door_seed_0", {"task": "reach"}),
     ("push the door, grasp given", "door_seed_0", {"task": "push"}),
@@ -75,14 +75,16 @@ RECORDS: list[dict[str, Any]] = yaml.safe_load((DOCS / "records.yaml").read_text
 
 
 def result(name: str) -> dict[str, Any]:
-    """Return what is on record in docs/results/NAME.json."""
+    """Load the record docs/results/NAME.json."""
     found: dict[str, Any] = json.loads(
         (DOCS / "results" / f"{name}.json").read_text(encoding="utf-8")
     )
     return found
 
 
-def of(trials: Iterable[Mapping[str, Any]], wanted: Mapping[str, str]) -> list[Mapping[str, Any]]:
+def select_trials(
+    trials: Iterable[Mapping[str, Any]], wanted: Mapping[str, str]
+) -> list[Mapping[str, Any]]:
     """Return the trials whose fields are as `wanted`."""
     return [
         trial
@@ -95,7 +97,7 @@ def status() -> str:
     """Return the table of README's section on status."""
     rows = []
     for text, name, wanted in STATUS:
-        own = of(result(name)["trials"], wanted)
+        own = select_trials(result(name)["trials"], wanted)
         waypoints = {trial["waypoints"] for trial in own}
         count = (
             f"{min(waypoints)}" if len(waypoints) == 1 else f"{min(waypoints)} to {max(waypoints)}"
@@ -112,7 +114,7 @@ def door() -> str:
     rows, parts, results = [], [], [result(name) for name in DOOR]
     for task in TASKS:
         for found in results:
-            own = of(found["trials"], {"task": task})
+            own = select_trials(found["trials"], {"task": task})
             times = [f"{value:.3f}" for value in distribution(own, "planning_time")]
             efforts = [
                 f"{distribution(own, field)[0]:.2f}"
@@ -120,7 +122,7 @@ def door() -> str:
             ]
             built = f"{max(trial['build_time'] for trial in own):.2f}"
             rows.append([task, str(found["meta"]["seed"]), good(own), *times, *efforts, built])
-        own = of(results[0]["trials"], {"task": task})
+        own = select_trials(results[0]["trials"], {"task": task})
         split = [f"{distribution(own, f'time_{part}')[0]:.3f}" for part in PARTS]
         parts.append([task, *split, f"{distribution(own, 'iterations')[0]:.0f}"])
     head = [
@@ -140,15 +142,15 @@ def door() -> str:
     )
 
 
-def drawn(name: str) -> str:
+def summarize_random_problems(name: str) -> str:
     """Return the tables of recorded random problems: outcomes, and agreement with the oracle."""
     found = result(name)
     about, trials = found["meta"], found["trials"]
     statuses = sorted({trial["status"] for trial in trials} - {"success"})
     rows = []
     for kind in sorted({trial["kind"] for trial in trials}):
-        own = of(trials, {"kind": kind})
-        counts = [str(len(of(own, {"status": status}))) for status in statuses]
+        own = select_trials(trials, {"kind": kind})
+        counts = [str(len(select_trials(own, {"status": status}))) for status in statuses]
         rows.append(
             [
                 kind,
@@ -279,9 +281,13 @@ def _steady(trials: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _slowdown(trials: Sequence[Mapping[str, Any]], count: str) -> float:
-    base = {trial["number"]: trial["planning_time"] for trial in of(trials, {"obstacles": "30"})}
+    base = {
+        trial["number"]: trial["planning_time"]
+        for trial in select_trials(trials, {"obstacles": "30"})
+    }
     return median(
-        trial["planning_time"] / base[trial["number"]] for trial in of(trials, {"obstacles": count})
+        trial["planning_time"] / base[trial["number"]]
+        for trial in select_trials(trials, {"obstacles": count})
     )
 
 
@@ -289,7 +295,7 @@ def figure(asked: str, before: str) -> str:
     """Return the figure that a mark's text requests, with as many decimals as `before`."""
     name, what, *conditions = asked.split()
     what, _, field = what.partition(":")
-    trials = of(
+    trials = select_trials(
         result(name)["trials"],
         dict(condition.replace("~", " ").split("=", 1) for condition in conditions),
     )
@@ -299,13 +305,13 @@ def figure(asked: str, before: str) -> str:
     return value if isinstance(value, str) else f"{value:.{len(before.partition('.')[2])}f}"
 
 
-def reported(name: str) -> str:
+def make_report(name: str) -> str:
     """Return the tables of a record, as its experiment reports them."""
     own: dict[str, Callable[[], str]] = {
         "status": status,
         "door": door,
         "evidence": evidence,
-        **{name: partial(drawn, name) for name in ("random", "rooms")},
+        **{name: partial(summarize_random_problems, name) for name in ("random", "rooms")},
     }
     if name in own:
         return own[name]() + "\n"
@@ -324,32 +330,32 @@ def columns(table: str) -> str:
     return table.splitlines()[0]
 
 
-def renewed(name: str, section: str) -> str:
+def update_section(name: str, section: str) -> str:
     """Return a section of a page with the tables of a record."""
-    report = reported(name)
+    report = make_report(name)
     tables: dict[str, list[str]] = {}
     for table in TABLE.findall(report):
         tables.setdefault(columns(table), []).append(table)
 
-    def table_of(match: re.Match[str]) -> str:
+    def replace_table(match: re.Match[str]) -> str:
         left = tables.get(columns(match[0]))
         if not left:
             raise ValueError(f"no table of {name} is left with the columns {columns(match[0])}")
         return left.pop(0)
 
-    section = TABLE.sub(table_of, section)
+    section = TABLE.sub(replace_table, section)
     for beginning in LINES:
         line = re.compile(rf"^{beginning}.*$", re.MULTILINE)
         own = line.search(report)
         if own is not None:
             said = own[0] + (
-                f" Commit {commits(trials_of(name))}." if beginning == "Measured on" else ""
+                f" Commit {commits(load_trials(name))}." if beginning == "Measured on" else ""
             )
             section = line.sub(said.replace("\\", r"\\"), section)
     return section
 
 
-def trials_of(name: str) -> list[Mapping[str, Any]]:
+def load_trials(name: str) -> list[Mapping[str, Any]]:
     """Return the trials that a section is about."""
     return [
         trial
@@ -358,19 +364,19 @@ def trials_of(name: str) -> list[Mapping[str, Any]]:
     ]
 
 
-def filled(text: str) -> str:
+def update_page(text: str) -> str:
     """Return a page with the tables and figures between its marks."""
     one = r"(<!-- figure: ([^>]+?) -->)(.*?)(<!-- / -->)"
     text = re.sub(one, lambda m: m[1] + figure(m[2], m[3]) + m[4], text)
     marks = r"(<!-- figures: (\w+) -->)(.*?)(<!-- /figures: \2 -->)"
-    return re.sub(marks, lambda m: m[1] + renewed(m[2], m[3]) + m[4], text, flags=re.DOTALL)
+    return re.sub(marks, lambda m: m[1] + update_section(m[2], m[3]) + m[4], text, flags=re.DOTALL)
 
 
 def main() -> int:
     """Write the pages whose tables are others; say which."""
     for page in PAGES:
         before = page.read_text(encoding="utf-8")
-        if (after := filled(before)) != before:
+        if (after := update_page(before)) != before:
             page.write_text(after, encoding="utf-8")
             sys.stdout.write(f"wrote {page.relative_to(ROOT)}\n")
     return 0

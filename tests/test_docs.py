@@ -301,7 +301,7 @@ def test_tables_are_as_the_results_on_record_say() -> None:
     assert {page.name for page in script["PAGES"]} >= {"README.md", "benchmarks.md", "household.md"}
     for page in script["PAGES"]:
         text = page.read_text(encoding="utf-8")
-        assert text == script["filled"](text), page.name
+        assert text == script["update_page"](text), page.name
         for name in re.findall(r"<!-- figures: (\w+) -->", text):
             assert f"<!-- /figures: {name} -->" in text
 

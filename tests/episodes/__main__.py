@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from tests.oracle.agreement import table
+from tests.oracle.agreement import format_table
 
 from .judged import judged_dataset
 
@@ -21,7 +21,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     given = parser.parse_args(arguments)
     verdicts = judged_dataset(given.dataset, jobs=given.jobs)
-    sys.stdout.write(table(verdicts) + "\n")
+    sys.stdout.write(format_table(verdicts) + "\n")
     return int(any(one.found or one.unjudged for one in verdicts))
 
 

@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from .agreement import judged, recorded, table, written
+from .agreement import format_table, judge_all, record_violations, write_verdicts
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -29,12 +29,14 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error("--record is of one folder")
     wrong = 0
     for path in given.paths:
-        verdicts = judged(sorted(path.rglob("*.npz")) if path.is_dir() else [path], jobs=given.jobs)
+        verdicts = judge_all(
+            sorted(path.rglob("*.npz")) if path.is_dir() else [path], jobs=given.jobs
+        )
         if path.is_dir():
-            written(verdicts, path)
+            write_verdicts(verdicts, path)
         if given.record:
-            recorded(verdicts, given.record)
-        print(table(verdicts))
+            record_violations(verdicts, given.record)
+        print(format_table(verdicts))
         wrong += sum(bool(verdict.success and verdict.found) for verdict in verdicts)
     return 1 if wrong else 0
 

@@ -11,10 +11,10 @@ from pathlib import Path
 
 from .judge import Verdict, judge
 
-__all__ = ["judged", "recorded", "table", "written"]
+__all__ = ["format_table", "judge_all", "record_violations", "write_verdicts"]
 
 
-def judged(paths: Sequence[Path], *, jobs: int = 1) -> list[Verdict]:
+def judge_all(paths: Sequence[Path], *, jobs: int = 1) -> list[Verdict]:
     """Return the verdicts on saved plans, in their order."""
     if jobs == 1:
         return [judge(path) for path in paths]
@@ -22,7 +22,7 @@ def judged(paths: Sequence[Path], *, jobs: int = 1) -> list[Verdict]:
         return list(pool.map(judge, paths, chunksize=4))
 
 
-def written(verdicts: Iterable[Verdict], folder: Path) -> None:
+def write_verdicts(verdicts: Iterable[Verdict], folder: Path) -> None:
     """Write verdicts.jsonl, a line a plan, and agreement.md into a folder."""
     verdicts = list(verdicts)
     lines = [
@@ -30,10 +30,10 @@ def written(verdicts: Iterable[Verdict], folder: Path) -> None:
         for one in verdicts
     ]
     (folder / "verdicts.jsonl").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    (folder / "agreement.md").write_text(table(verdicts) + "\n", encoding="utf-8")
+    (folder / "agreement.md").write_text(format_table(verdicts) + "\n", encoding="utf-8")
 
 
-def recorded(verdicts: Iterable[Verdict], record: Path) -> None:
+def record_violations(verdicts: Iterable[Verdict], record: Path) -> None:
     """Add the number of violations in each trial's plan to a record of trials, as its `oracle`.
 
     Plans are matched to trials by key.
@@ -55,7 +55,7 @@ def recorded(verdicts: Iterable[Verdict], record: Path) -> None:
     record.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 
-def table(verdicts: Sequence[Verdict]) -> str:
+def format_table(verdicts: Sequence[Verdict]) -> str:
     """Return how often both agree, and every plan of which they do not, in Markdown."""
     said = [one for one in verdicts if not one.unjudged]
     rows = ["| plan | oracle | plans |", "| --- | --- | ---: |"]

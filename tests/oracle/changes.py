@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["changed"]
+__all__ = ["write_changed"]
 
 Content = dict[str, Any]
 
 
-def changed(source: Path, target: Path, change: Callable[[Content], None]) -> Path:
+def write_changed(source: Path, target: Path, change: Callable[[Content], None]) -> Path:
     """Write a copy of a plan to `target` that `change` has changed.
 
     It gets a dictionary with `scene`, `steps`, `options`, `names`, `times`, `positions`, `phases`

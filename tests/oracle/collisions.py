@@ -13,8 +13,8 @@ import numpy as np
 
 from .neighbours import Neighbours
 from .plan import Violation
-from .poses import Poses, turn_between
-from .riding import distance
+from .poses import Poses, compute_angle
+from .riding import compute_distance
 from .stage import FLOOR, Solid, Stage, World
 from .touching import SHORT, Licence
 
@@ -68,7 +68,7 @@ class Pairs:
     @staticmethod
     def _steps(place: Poses, part: Solid) -> np.ndarray:
         middle = place.points(part.shape.centre)
-        turned = turn_between(place.turn[1:], place.turn[:-1])
+        turned = compute_angle(place.turn[1:], place.turn[:-1])
         return np.linalg.norm(np.diff(middle, axis=0), axis=1) + turned * part.shape.radius
 
     def counts(self, one: Solid, other: Solid) -> bool:
@@ -80,7 +80,7 @@ class Pairs:
             return True
         if one.owner == "robot":
             return one.link not in robot.on_the_floor
-        return self.world.things[one.owner].free
+        return self.world.objects[one.owner].free
 
     def arcs(self, i: int) -> np.ndarray:
         """Return path lengths of a shape, alone and relative to earlier ones, shape (1 + i, S)."""
@@ -132,7 +132,7 @@ def check_collisions(
             asked = built.margin(one, other)
             least = min(own_safe if one.owner == other.owner == "robot" else safe, asked - SHORT)
             for k in waypoints[near]:
-                apart = distance(one.shape.solid, one.at, other.shape.solid, other.at, k)
+                apart = compute_distance(one.shape.solid, one.at, other.shape.solid, other.at, k)
                 time = float(stage.times[k])
                 licensed = any(own.covers(one.label, other.label, time, apart) for own in allowed)
                 if apart < least and not close[k] and not licensed:
@@ -147,7 +147,7 @@ def check_collisions(
             for own in allowed:
                 if own.depth and own.names(one.label, other.label):
                     slack[(own.begin <= stage.times) & (stage.times <= own.end)] += own.depth
-            depth, row = _deepest(one, other, arc, blocks, slack)
+            depth, row = _find_deepest(one, other, arc, blocks, slack)
             if depth > 0.0:
                 yield Violation(
                     "overlap",
@@ -158,7 +158,7 @@ def check_collisions(
                 )
 
 
-def _deepest(
+def _find_deepest(
     one: Solid, other: Solid, arc: np.ndarray, active: np.ndarray, slack: np.ndarray
 ) -> tuple[float, int]:
     """Return the largest excess of penetration over its limit [m], and its sample.
@@ -179,7 +179,7 @@ def _deepest(
             if not len(later):
                 break
             k = int(k // BLOCK + later[0]) * BLOCK
-        apart = distance(one.shape.solid, one.at, other.shape.solid, other.at, k)
+        apart = compute_distance(one.shape.solid, one.at, other.shape.solid, other.at, k)
         if -apart - slack[k] > worst:
             worst, row = -apart - slack[k], k
         k = max(k + 1, int(np.searchsorted(arc, arc[k] + abs(apart))))

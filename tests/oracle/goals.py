@@ -9,11 +9,11 @@ import coal
 import numpy as np
 
 from .plan import Violation
-from .poses import Poses, pose, turn_between
-from .riding import distance
+from .poses import Poses, compute_angle, make_pose
+from .riding import compute_distance
 from .stage import Stage, World
 
-__all__ = ["check_goals", "touched"]
+__all__ = ["check_goals", "find_touched"]
 
 POINT = coal.Sphere(1e-4)
 
@@ -33,7 +33,7 @@ class End:
         owner, _, link = (name or self.world.robot.tool).partition(".")
         key = (
             (owner, link)
-            if owner in self.world.things and link
+            if owner in self.world.objects and link
             else ("robot", name or self.world.robot.tool)
         )
         return self.stage.links[key].row(self.row)
@@ -45,9 +45,9 @@ class End:
         )
 
 
-def _target(goal: Any) -> Poses:
+def _parse_target(goal: Any) -> Poses:
     array = np.array(goal, float)
-    return pose(array) if array.shape == (3,) else pose(array[:3, 3], array[:3, :3])
+    return make_pose(array) if array.shape == (3,) else make_pose(array[:3, 3], array[:3, :3])
 
 
 FAR, TURN = 1e-3, 1e-3  # [m], [rad]
@@ -55,14 +55,14 @@ Miss = tuple[str, float, str]
 """Subject, excess over the tolerance, detail."""
 
 
-def misses(world: World, step: dict[str, Any], end: End) -> list[Miss]:
+def find_misses(world: World, step: dict[str, Any], end: End) -> list[Miss]:
     """Return the parts of a step's goal that are not reached at the end of a phase."""
     kind, found = step["step"], []
-    for subject, error, limit, what in _errors(world, step, end):
+    for subject, error, limit, what in _compute_errors(world, step, end):
         if not error <= limit + 1e-7:
             found.append((subject, error - limit, f"{kind}: {what} off by {error:.5f}"))
     if kind == "Grasp":
-        found += _grasp(world, step, end)
+        found += _find_grasp_misses(world, step, end)
     if kind in ("Place", "Release"):
         for hold in end.after:
             if step["object"] in (None, hold.object):
@@ -70,7 +70,7 @@ def misses(world: World, step: dict[str, Any], end: End) -> list[Miss]:
     return found
 
 
-def _errors(
+def _compute_errors(
     world: World, step: dict[str, Any], end: End
 ) -> Iterator[tuple[str, float, float, str]]:
     """Yield the subjects, errors, tolerances and names of what a step sets by value or pose."""
@@ -78,7 +78,7 @@ def _errors(
     if kind == "Actuate":
         for joint, goal in step["joints"].items():
             name = f"{step['object']}.{joint}"
-            limit = FAR if world.things[step["object"]].slides(joint) else TURN
+            limit = FAR if world.objects[step["object"]].slides(joint) else TURN
             yield name, abs(end.value(name) - goal), limit, "value"
     elif kind == "GoTo":
         x, y = end.value("base_x") - step["x"], end.value("base_y") - step["y"]
@@ -87,36 +87,36 @@ def _errors(
             off = abs((end.value("base_yaw") - step["yaw"] + np.pi) % (2 * np.pi) - np.pi)
             yield "base heading", off, TURN, "heading"
     elif kind in ("Reach", "Touch", "Place"):
-        yield from _pose_errors(world, step, end)
+        yield from _compute_pose_errors(world, step, end)
 
 
-def _pose_errors(
+def _compute_pose_errors(
     world: World, step: dict[str, Any], end: End
 ) -> Iterator[tuple[str, float, float, str]]:
     """Yield the errors of a frame that a step brings to a pose or point."""
     frame, goal = step.get("frame"), step.get("pose", step.get("target"))
     if step["step"] == "Place":
-        frame = f"{step['object']}.{world.things[step['object']].tree.urdf.base}"
-    here, there = end.frame(frame), _target(goal)
+        frame = f"{step['object']}.{world.objects[step['object']].tree.urdf.base}"
+    here, there = end.frame(frame), _parse_target(goal)
     yield frame or "tool", float(np.linalg.norm(here.at - there.at)), FAR, "place"
     if np.shape(goal) == (4, 4):
-        angle = float(turn_between(here.turn, there.turn)[0])
+        angle = float(compute_angle(here.turn, there.turn)[0])
         yield frame or "tool", angle, TURN, "orientation"
     elif step["step"] == "Place":
         held = step["object"] in {hold.object for hold in world.held}
-        stood = world.things[step["object"]].at.turn[0]
+        stood = world.objects[step["object"]].at.turn[0]
         up = np.array([0.0, 0.0, 1.0]) if held else stood[2]
         now = here.turn[0, 2]  # the world's vertical, seen from the object
         tilt = float(np.arctan2(np.linalg.norm(np.cross(up, now)), up @ now))
         yield frame or "", tilt, TURN, "vertical"
 
 
-def _grasp(world: World, step: dict[str, Any], end: End) -> list[Miss]:
+def _find_grasp_misses(world: World, step: dict[str, Any], end: End) -> list[Miss]:
     """Return the distance and the angle between the hand and the grasp, if they are too large."""
-    thing = world.things[step["object"]]
+    obj = world.objects[step["object"]]
     used = [hold.attachment for hold in (*end.before, *end.after) if hold.object == step["object"]]
     name = step["attachment"] or next(iter(used), None)
-    grasp, row = thing.grasp(name), end.row
+    grasp, row = obj.grasp(name), end.row
     values = {}
     for freedom, *_ in grasp.freedoms:
         index = world.plan.index(f"{step['object']}.{freedom}")
@@ -125,7 +125,7 @@ def _grasp(world: World, step: dict[str, Any], end: End) -> list[Miss]:
     hand = end.frame(step["by"])
     hand = hand @ world.front(grasp.opening) if grasp.pushed else hand
     off = float(np.linalg.norm(hand.at - right.at))
-    angle = float(turn_between(hand.turn, right.turn)[0])
+    angle = float(compute_angle(hand.turn, right.turn)[0])
     subject, found = f"{step['object']}.{grasp.name}", []
     if off > FAR + 1e-7:
         found.append((subject, off - FAR, f"Grasp: {off:.5f} m away"))
@@ -134,15 +134,15 @@ def _grasp(world: World, step: dict[str, Any], end: End) -> list[Miss]:
     return found
 
 
-def touched(world: World, stage: Stage) -> Iterator[tuple[set[str], set[str]]]:
+def find_touched(world: World, stage: Stage) -> Iterator[tuple[set[str], set[str]]]:
     """Yield the brought links and the targets of every `Touch` done at the end of a phase."""
     row = len(stage.times) - 1
     for step in world.plan.steps:
-        if step["step"] != "Touch" or misses(world, step, End(world, [stage], 1)):
+        if step["step"] != "Touch" or find_misses(world, step, End(world, [stage], 1)):
             continue
-        target, owner = _target(step["target"]), step["frame"].partition(".")[0]
+        target, owner = _parse_target(step["target"]), step["frame"].partition(".")[0]
         links = {step["frame"]}
-        if owner not in world.things:
+        if owner not in world.objects:
             owner, tree = "robot", world.robot.tree
             above = {
                 tree.model.names[joint]
@@ -158,7 +158,7 @@ def touched(world: World, stage: Stage) -> Iterator[tuple[set[str], set[str]]]:
         near = {
             part.label
             for part in others
-            if distance(POINT, target, part.shape.solid, part.at, row) < safe
+            if compute_distance(POINT, target, part.shape.solid, part.at, row) < safe
         }
         yield links, near
 
@@ -169,8 +169,8 @@ def check_goals(world: World, stages: list[Stage]) -> Iterator[Violation]:
         world.plan.steps,
         [End(world, stages, number) for number in range(len(stages) + 1)],
     )
-    missing = [[misses(world, step, end) for end in ends] for step in steps]
-    moved = [_moved(world, stage) for stage in stages]
+    missing = [[find_misses(world, step, end) for end in ends] for step in steps]
+    moved = [_find_moved(world, stage) for stage in stages]
     own = [{step["object"]} if step["step"] == "Actuate" else set() for step in steps]
     never = False
     for number, row in enumerate(missing):
@@ -207,11 +207,11 @@ def check_goals(world: World, stages: list[Stage]) -> Iterator[Violation]:
         )
 
 
-def _moved(world: World, stage: Stage) -> set[str]:
+def _find_moved(world: World, stage: Stage) -> set[str]:
     """Return objects whose joints move in a phase."""
     found = set()
     for k, name in enumerate(world.plan.names):
         owner, _, joint = name.partition(".")
-        if joint and joint in world.things[owner].limits and np.ptp(stage.columns[:, k]) > 1e-5:
+        if joint and joint in world.objects[owner].limits and np.ptp(stage.columns[:, k]) > 1e-5:
             found.add(owner)
     return found

@@ -10,13 +10,13 @@ import numpy as np
 
 from .plan import Hold, Violation
 from .poses import IDENTITY
-from .riding import distance
-from .things import Grasp, Robot
+from .riding import compute_distance
+from .scene_objects import Grasp, Robot
 
 if TYPE_CHECKING:
     from .stage import World
 
-__all__ = ["Fingers", "check_openings", "required"]
+__all__ = ["Fingers", "check_openings", "get_required_opening"]
 
 THICK = 2e-3  # [m] of the bar between the fingers by which openings are measured
 SAME = 2e-4  # [m] by which openings may differ
@@ -57,7 +57,8 @@ class Fingers:
         )
         tool = links[robot.tool].inverse()
         return all(
-            distance(shape.solid, tool @ links[shape.link] @ shape.place, bar, IDENTITY) > 0.0
+            compute_distance(shape.solid, tool @ links[shape.link] @ shape.place, bar, IDENTITY)
+            > 0.0
             for shape in self.shapes
         )
 
@@ -76,7 +77,7 @@ class Fingers:
             else float(np.clip(asked, self.least, self.most))
         )
 
-    def at(self, opening: float | None) -> dict[str, float]:
+    def find_joints(self, opening: float | None) -> dict[str, float]:
         """Return where its joints are at an opening; None: at rest."""
         if opening not in self.known:
             low, high = 0.0, 1.0
@@ -93,9 +94,9 @@ class Fingers:
         return self.known[opening]
 
 
-def required(world: World, hold: Hold) -> float | None:
+def get_required_opening(world: World, hold: Hold) -> float | None:
     """Return the opening that what is held asks for; None: as at rest."""
-    grasp: Grasp = world.things[hold.object].grasps[hold.attachment]
+    grasp: Grasp = world.objects[hold.object].grasps[hold.attachment]
     return world.fingers.near(grasp.opening)
 
 
@@ -109,7 +110,7 @@ def check_openings(world: World) -> Iterator[Violation]:
             continue
         is_, right = (
             fingers.resting if one is None else one
-            for one in (phase.opening, required(world, hold))
+            for one in (phase.opening, get_required_opening(world, hold))
         )
         if abs(is_ - right) > SAME:
             detail = f"{1e3 * is_:.1f} mm instead of {1e3 * right:.1f} mm"

@@ -13,9 +13,9 @@ from .neighbours import Neighbours
 from .plan import NotJudged, SavedPlan, Violation, read_plan
 from .rules import check_motion, check_stage
 from .stage import World
-from .touching import licences
+from .touching import find_licences
 
-__all__ = ["Verdict", "judge", "violations"]
+__all__ = ["Verdict", "find_violations", "judge"]
 
 
 @dataclass
@@ -44,7 +44,7 @@ def judge(path: Path) -> Verdict:
     plan = read_plan(path)
     verdict = Verdict(path, plan.success, plan.status, plan.says)
     try:
-        verdict.found = violations(plan)
+        verdict.found = find_violations(plan)
     except NotJudged as error:
         verdict.unjudged = str(error)
     except FileNotFoundError as error:  # the scene has moved away from its plan
@@ -53,12 +53,12 @@ def judge(path: Path) -> Verdict:
     return verdict
 
 
-def violations(plan: SavedPlan) -> list[Violation]:
+def find_violations(plan: SavedPlan) -> list[Violation]:
     """Return what is wrong with a motion: of each rule and subject the worst, by time."""
     world = World(plan)
     stages = list(world.stages())
     found = [*check_motion(world), *check_goals(world, stages)]
-    allowed, built = licences(world, stages), Neighbours(world)
+    allowed, built = find_licences(world, stages), Neighbours(world)
     for stage in stages:
         found += check_stage(world, stage)
         found += check_motors(world, stage)

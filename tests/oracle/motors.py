@@ -13,8 +13,8 @@ import numpy as np
 
 from .plan import Violation
 from .poses import Poses
+from .scene_objects import SceneObject
 from .stage import Stage, World
-from .things import Thing
 
 __all__ = ["check_motors"]
 
@@ -59,33 +59,33 @@ def check_motors(world: World, stage: Stage) -> Iterator[Violation]:
     spans = np.diff(knots)[cubics]
     moments = (knots[cubics, None] + spans[:, None] * _SHARES).ravel()
     h = np.repeat(_STEP * spans, len(_SHARES))
-    rows = [plan.at(moments + k * h) for k in (-1, 0, 1)]
+    rows = [plan.evaluate(moments + k * h) for k in (-1, 0, 1)]
 
     def places(columns: np.ndarray) -> Mapping[str, Poses]:
         arm = {name: columns[:, 3 + k] for k, name in enumerate(robot.arm)}
         wanted = sorted({body.link for body in bodies} | {robot.tool})
         return robot.tree.links({**robot.locked, **arm}, columns[:, :3], wanted)
 
-    loads = bodies + [Body(robot.tool, *weight) for weight in _in_hand(world, stage)]
+    loads = bodies + [Body(robot.tool, *weight) for weight in _find_payloads(world, stage)]
     arm = list(range(3, 3 + len(robot.arm)))
-    torques = _needed(places, loads, rows, h, arm, GRAVITY)
+    torques = _compute_forces(places, loads, rows, h, arm, GRAVITY)
     for hold in stage.phase.holds:
-        thing = world.things[hold.object]
-        if not thing.free and thing.limits:
-            pulls, where = _pull(world, stage, thing, hold.attachment, rows, h)
+        obj = world.objects[hold.object]
+        if not obj.free and obj.limits:
+            pulls, where = _compute_pull(world, stage, obj, hold.attachment, rows, h)
             local = places(rows[1])[robot.tool]
             inside = np.einsum(
                 "kji,kj->ki", np.broadcast_to(local.turn, (len(h), 3, 3)), where - local.at
             )
             for k, column in enumerate(arm):
-                shift, turn = _nudged(places, rows[1], column, robot.tool, inside)
+                shift, turn = _differentiate_points(places, rows[1], column, robot.tool, inside)
                 torques[:, k] += np.einsum("ki,ki->k", pulls[:, :3], shift) + np.einsum(
                     "ki,ki->k", pulls[:, 3:], turn
                 )
     for k, joint in enumerate(robot.arm):
         worst = int(np.argmax(np.abs(torques[:, k])))
         over = abs(torques[worst, k]) - (1.0 + EXCESS) * limits[k]
-        if limits[k] > 0.0 and over > 0.0 and _carries(world, bodies, places, arm[k], limits[k]):
+        if limits[k] > 0.0 and over > 0.0 and _can_carry(world, bodies, places, arm[k], limits[k]):
             yield Violation(
                 "torque",
                 joint,
@@ -95,7 +95,7 @@ def check_motors(world: World, stage: Stage) -> Iterator[Violation]:
             )
 
 
-def _needed(
+def _compute_forces(
     places: Places,
     bodies: list[Body],
     rows: list[np.ndarray],
@@ -107,7 +107,8 @@ def _needed(
     before, now, after = (places(part) for part in rows)
     found = np.zeros((len(h), len(columns)))
     nudges = [
-        (places(_moved(rows[1], c, _NUDGE)), places(_moved(rows[1], c, -_NUDGE))) for c in columns
+        (places(_shift_column(rows[1], c, _NUDGE)), places(_shift_column(rows[1], c, -_NUDGE)))
+        for c in columns
     ]
     for body in bodies:
         x = [frames[body.link].points(body.centre) for frames in (before, now, after)]
@@ -116,8 +117,11 @@ def _needed(
             np.broadcast_to(frames[body.link].turn, (len(h), 3, 3))
             for frames in (before, now, after)
         ]
-        spins = [_vector(turns[i + 1] @ turns[i].transpose(0, 2, 1)) / h[:, None] for i in (0, 1)]
-        half = [_between(turns[i], turns[i + 1]) for i in (0, 1)]
+        spins = [
+            _compute_rotation_vector(turns[i + 1] @ turns[i].transpose(0, 2, 1)) / h[:, None]
+            for i in (0, 1)
+        ]
+        half = [_interpolate_rotations(turns[i], turns[i + 1]) for i in (0, 1)]
         momenta = [
             np.einsum("kij,kj->ki", t @ body.inertia @ t.transpose(0, 2, 1), w)
             for t, w in zip(half, spins, strict=True)
@@ -127,34 +131,36 @@ def _needed(
             shift = (more[body.link].points(body.centre) - less[body.link].points(body.centre)) / (
                 2.0 * _NUDGE
             )
-            turn = _vector(more[body.link].turn @ less[body.link].turn.transpose(0, 2, 1)) / (
-                2.0 * _NUDGE
-            )
+            turn = _compute_rotation_vector(
+                more[body.link].turn @ less[body.link].turn.transpose(0, 2, 1)
+            ) / (2.0 * _NUDGE)
             found[:, k] += np.einsum("ki,ki->k", pulled, np.broadcast_to(shift, pulled.shape))
             found[:, k] += np.einsum("ki,ki->k", twisted, np.broadcast_to(turn, twisted.shape))
     return found
 
 
-def _moved(columns: np.ndarray, column: int, by: float) -> np.ndarray:
+def _shift_column(columns: np.ndarray, column: int, by: float) -> np.ndarray:
     moved = columns.copy()
     moved[:, column] += by
     return moved
 
 
-def _nudged(
+def _differentiate_points(
     places: Places, columns: np.ndarray, column: int, link: str, inside: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return how points of a link, shape (S, 3) in its frame, move and turn with a coordinate."""
-    more, less = (places(_moved(columns, column, sign * _NUDGE))[link] for sign in (1.0, -1.0))
+    more, less = (
+        places(_shift_column(columns, column, sign * _NUDGE))[link] for sign in (1.0, -1.0)
+    )
     ends = [
         np.einsum("kij,kj->ki", np.broadcast_to(p.turn, (len(inside), 3, 3)), inside) + p.at
         for p in (more, less)
     ]
-    turn = _vector(more.turn @ less.turn.transpose(0, 2, 1)) / (2.0 * _NUDGE)
+    turn = _compute_rotation_vector(more.turn @ less.turn.transpose(0, 2, 1)) / (2.0 * _NUDGE)
     return (ends[0] - ends[1]) / (2.0 * _NUDGE), np.broadcast_to(turn, inside.shape)
 
 
-def _vector(turns: np.ndarray) -> np.ndarray:
+def _compute_rotation_vector(turns: np.ndarray) -> np.ndarray:
     """Return small rotations as vectors, shape (S, 3)."""
     skew = np.stack(
         [
@@ -172,15 +178,15 @@ def _vector(turns: np.ndarray) -> np.ndarray:
     )
 
 
-def _between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return rotations half way between close ones."""
+def _interpolate_rotations(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return rotations halfway between close ones."""
     u, _, v = np.linalg.svd(one + other)
     return u @ v
 
 
-def _in_hand(world: World, stage: Stage) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
+def _find_payloads(world: World, stage: Stage) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
     """Yield what is carried: its weight in the frame of the tool, as at the begin of the phase."""
-    held = {hold.object for hold in stage.phase.holds if world.things[hold.object].free}
+    held = {hold.object for hold in stage.phase.holds if world.objects[hold.object].free}
     held |= {name for name, (owner, _) in stage.riding.items() if owner in held}
     for name in sorted(held):
         places = {
@@ -188,49 +194,54 @@ def _in_hand(world: World, stage: Stage) -> Iterator[tuple[float, np.ndarray, np
             for (owner, link), place in stage.links.items()
             if owner == name
         }
-        yield from _weights(world.things[name], places)
+        yield from _find_weights(world.objects[name], places)
 
 
-def _weights(
-    thing: Thing, links: Mapping[str, Poses]
+def _find_weights(
+    obj: SceneObject, links: Mapping[str, Poses]
 ) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
     """Yield the weights of an object's links, of which none is known by shape alone here."""
-    own = {link: thing.tree.urdf.weight(link) for link in thing.tree.urdf.links}
+    own = {link: obj.tree.urdf.weight(link) for link in obj.tree.urdf.links}
     total = sum(mass for mass, _, _ in own.values())
-    factor = 1.0 if thing.mass is None or not total > 0.0 else thing.mass / total
+    factor = 1.0 if obj.mass is None or not total > 0.0 else obj.mass / total
     for link, (mass, centre, inertia) in own.items():
         if mass > 0.0:
             turn = links[link].turn[0]
             yield factor * mass, links[link].points(centre)[0], factor * turn @ inertia @ turn.T
 
 
-def _pull(
-    world: World, stage: Stage, thing: Thing, attachment: str, rows: list[np.ndarray], h: np.ndarray
+def _compute_pull(
+    world: World,
+    stage: Stage,
+    obj: SceneObject,
+    attachment: str,
+    rows: list[np.ndarray],
+    h: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return least wrenches that move an object's joints, (S, 6), and the grasp's place, (S, 3)."""
-    plan, grasp = world.plan, thing.grasps[attachment]
-    names = list(thing.limits)
+    plan, grasp = world.plan, obj.grasps[attachment]
+    names = list(obj.limits)
 
     def state(columns: np.ndarray) -> np.ndarray:
-        known = [plan.index(f"{thing.name}.{joint}") for joint in names]
-        return np.stack([np.full(len(columns), thing.state[j]) if k is None else columns[:, k]
+        known = [plan.index(f"{obj.name}.{joint}") for joint in names]
+        return np.stack([np.full(len(columns), obj.state[j]) if k is None else columns[:, k]
                          for j, k in zip(names, known, strict=True)], axis=1)  # fmt: skip
 
     def places(values: np.ndarray) -> Mapping[str, Poses]:
-        links = thing.tree.links(
-            {j: values[:, k] for k, j in enumerate(names)}, None, thing.tree.urdf.links
+        links = obj.tree.links(
+            {j: values[:, k] for k, j in enumerate(names)}, None, obj.tree.urdf.links
         )
-        return {link: thing.at @ place for link, place in links.items()}
+        return {link: obj.at @ place for link, place in links.items()}
 
     z = [state(part) for part in rows]
-    own = [Body(link, *thing.tree.urdf.weight(link)) for link in thing.tree.urdf.links]
-    asked = _needed(places, own, z, h, list(range(len(names))), np.zeros(3))
+    own = [Body(link, *obj.tree.urdf.weight(link)) for link in obj.tree.urdf.links]
+    asked = _compute_forces(places, own, z, h, list(range(len(names))), np.zeros(3))
     riders = []
     for name, (owner, link) in stage.riding.items():
-        if owner != thing.name:
+        if owner != obj.name:
             continue
-        for weight in _weights(
-            world.things[name],
+        for weight in _find_weights(
+            world.objects[name],
             {
                 part: stage.links[owner, link].row(0).inverse() @ place.row(0)
                 for (one, part), place in stage.links.items()
@@ -238,30 +249,32 @@ def _pull(
             },
         ):
             riders.append(Body(link, *weight))
-    asked += _needed(places, riders, z, h, list(range(len(names))), GRAVITY) if riders else 0.0
+    asked += (
+        _compute_forces(places, riders, z, h, list(range(len(names))), GRAVITY) if riders else 0.0
+    )
     speed, change = (z[2] - z[0]) / (2.0 * h[:, None]), (z[0] - 2.0 * z[1] + z[2]) / h[:, None] ** 2
-    bolts = {latch["joint"]: latch["held_at"] for latch in thing.latches}
+    bolts = {latch["joint"]: latch["held_at"] for latch in obj.latches}
     for k, joint in enumerate(names):
         own_terms, moving = (
-            thing.resists[joint],
+            obj.resists[joint],
             np.where(np.abs(speed[:, k]) > STILL, speed[:, k], 0.0),
         )
         asked[:, k] += own_terms["stiffness"] * (z[1][:, k] - own_terms["springref"])
         asked[:, k] += own_terms["damping"] * moving + own_terms["friction"] * np.sign(moving)
-        low, high = thing.limits[joint][:2]
+        low, high = obj.limits[joint][:2]
         stopped = (z[1][:, k] <= low + STILL) & (asked[:, k] > 0.0) | (
             z[1][:, k] >= high - STILL
         ) & (asked[:, k] < 0.0)
         stopped |= np.abs(z[1][:, k] - bolts.get(joint, np.inf)) <= STILL
         asked[stopped & (moving == 0.0) & (np.abs(change[:, k]) <= 1e-5), k] = 0.0
-    index = {f: plan.index(f"{thing.name}.{f}") for f, *_ in grasp.freedoms}
+    index = {f: plan.index(f"{obj.name}.{f}") for f, *_ in grasp.freedoms}
     values = {f: np.zeros(len(h)) if k is None else rows[1][:, k] for f, k in index.items()}
     link = places(z[1])[grasp.link]
     tool = link @ grasp.tool(values)
     where = np.broadcast_to(tool.at, (len(h), 3))
     inside = np.broadcast_to(grasp.tool(values).at, (len(h), 3))
-    path = [k for k, joint in enumerate(names) if joint in thing.tree.urdf.path_to(grasp.link)]
-    ways = [np.hstack(_nudged(places, z[1], k, grasp.link, inside)) for k in path]
+    path = [k for k, joint in enumerate(names) if joint in obj.tree.urdf.path_to(grasp.link)]
+    ways = [np.hstack(_differentiate_points(places, z[1], k, grasp.link, inside)) for k in path]
     wants = [asked[:, k] for k in path]
     if grasp.pushed:
         normal = np.broadcast_to((link.turn @ grasp.place.turn)[:, :, 2], (len(h), 3))
@@ -276,7 +289,9 @@ def _pull(
             for sign in (1.0, -1.0)
         ]
         shift = (ends[0].at - ends[1].at) / (2.0 * _NUDGE)
-        turn = _vector(ends[0].turn @ ends[1].turn.transpose(0, 2, 1)) / (2.0 * _NUDGE)
+        turn = _compute_rotation_vector(ends[0].turn @ ends[1].turn.transpose(0, 2, 1)) / (
+            2.0 * _NUDGE
+        )
         ways.append(np.hstack([np.broadcast_to(part, (len(h), 3)) for part in (shift, turn)]))
         wants.append(np.zeros(len(h)))
     costs = np.diag([1.0] * 3 + [GRIP**-2] * 3)
@@ -291,13 +306,13 @@ def _pull(
     ), where
 
 
-def _carries(world: World, bodies: list[Body], places: Places, column: int, limit: float) -> bool:
+def _can_carry(world: World, bodies: list[Body], places: Places, column: int, limit: float) -> bool:
     """Return whether a motor holds the arm everywhere; if not, its limit is a placeholder."""
     names = world.plan.names[: world.plan.robot_size]
     spans = [world.robot.limits[name][:2] for name in names]
     low, high = (np.clip([span[k] for span in spans], -np.pi, np.pi) for k in (0, 1))
     postures = np.random.default_rng(1).uniform(low, high, (200, len(names)))
-    more, less = (places(_moved(postures, column, sign * _NUDGE)) for sign in (1.0, -1.0))
+    more, less = (places(_shift_column(postures, column, sign * _NUDGE)) for sign in (1.0, -1.0))
     lift = sum(
         body.mass
         * (more[body.link].points(body.centre) - less[body.link].points(body.centre))[:, 2]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .riding import distance
+from .riding import compute_distance
 
 if TYPE_CHECKING:
     from .poses import Poses
@@ -44,13 +44,13 @@ class Neighbours:
     def __init__(self, world: World) -> None:
         self.world, self.safe = world, float(world.plan.options["dist_safe"])
         self.listed = list(self._listed())
-        self.fixed = {name: thing for name, thing in world.things.items() if not thing.free}
+        self.fixed = {name: obj for name, obj in world.objects.items() if not obj.free}
         zero = {
-            name: {joint: float(np.clip(0.0, *thing.limits[joint][:2])) for joint in thing.state}
-            for name, thing in self.fixed.items()
+            name: {joint: float(np.clip(0.0, *obj.limits[joint][:2])) for joint in obj.state}
+            for name, obj in self.fixed.items()
         }
         self.pairs = [
-            *self._found({name: thing.state for name, thing in self.fixed.items()}),
+            *self._found({name: obj.state for name, obj in self.fixed.items()}),
             *self._found(zero),
         ]
 
@@ -72,7 +72,7 @@ class Neighbours:
         """Return the clearance that a scene asks of two shapes; infinite if it says nothing."""
 
         def means(name: str, part: Solid) -> bool:
-            return part.label == name or (part.owner == name and name in self.world.things)
+            return part.label == name or (part.owner == name and name in self.world.objects)
 
         return min(
             (
@@ -105,17 +105,17 @@ class Neighbours:
     def _found(self, state: dict[str, dict[str, float]]) -> list[Pair]:
         """Return the close pairs in a state of all objects that no hand carries away."""
         links = {
-            name: thing.tree.links(state[name], None, thing.tree.urdf.links)
-            for name, thing in self.fixed.items()
+            name: obj.tree.links(state[name], None, obj.tree.urdf.links)
+            for name, obj in self.fixed.items()
         }
         parts: list[tuple[str, Shape, Poses]] = []
-        for name, thing in self.fixed.items():
-            for shape in thing.tree.urdf.shapes:
+        for name, obj in self.fixed.items():
+            for shape in obj.tree.urdf.shapes:
                 parts.append(
                     (
                         f"{name}.{shape.link}",
                         shape,
-                        thing.at @ links[name][shape.link] @ shape.place,
+                        obj.at @ links[name][shape.link] @ shape.place,
                     )
                 )
         parts += [
@@ -150,7 +150,7 @@ class Neighbours:
         i, j = (0 if len(place.turn) == 1 else k for place in (here, there))
         centres = here.turn[i] @ a.centre + here.at[i], there.turn[j] @ b.centre + there.at[j]
         least = float(np.linalg.norm(centres[0] - centres[1])) - a.radius - b.radius
-        return least if least > self.safe else distance(a.solid, here, b.solid, there, k)
+        return least if least > self.safe else compute_distance(a.solid, here, b.solid, there, k)
 
     def _joints(self, label: str) -> list[str]:
         owner, _, link = label.partition(".")
@@ -169,18 +169,16 @@ class Neighbours:
     ) -> tuple[tuple[float, float], float]:
         """Return the joint interval in which a shape violates the clearance, and the depth."""
         owner, _, link = label.partition(".")
-        thing, deepest = self.fixed[owner], 0.0
+        obj, deepest = self.fixed[owner], 0.0
 
         def apart(values: np.ndarray) -> np.ndarray:
             place = (
-                thing.at
-                @ thing.tree.links({**state, joint: values}, None, [link])[link]
-                @ shape.place
+                obj.at @ obj.tree.links({**state, joint: values}, None, [link])[link] @ shape.place
             )
             return np.array([self._apart((shape, place), other, k) for k in range(len(values))])
 
         ends = []
-        for limit, sign in zip(thing.limits[joint][:2], (-1.0, 1.0), strict=True):
+        for limit, sign in zip(obj.limits[joint][:2], (-1.0, 1.0), strict=True):
             values = np.linspace(
                 state[joint], limit if np.isfinite(limit) else state[joint] + sign * np.pi, VALUES
             )

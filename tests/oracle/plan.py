@@ -113,7 +113,7 @@ class SavedPlan:
     def success(self) -> bool:
         return self.status == "success" and not self.says
 
-    def at(self, moments: np.ndarray) -> np.ndarray:
+    def evaluate(self, moments: np.ndarray) -> np.ndarray:
         """Where all coordinates are at some times."""
         if self.curve is not None:
             return self.curve.derivative(moments, 0)
@@ -125,13 +125,13 @@ class SavedPlan:
         """Return the coordinates at the waypoints and at samples between them."""
         if self.curve is None:
             return self.positions
-        return self.at(np.concatenate([self.curve.inside(_FINE).ravel(), self.times]))
+        return self.evaluate(np.concatenate([self.curve.inside(_FINE).ravel(), self.times]))
 
     def index(self, name: str) -> int | None:
         return self.names.index(name) if name in self.names else None
 
 
-def in_order(held: dict[str, str], by: dict[str, str]) -> tuple[Hold, ...]:
+def sort_holds(held: dict[str, str], by: dict[str, str]) -> tuple[Hold, ...]:
     """Return holds, each after the one that it hangs on."""
     found: list[Hold] = []
     left = dict(held)
@@ -157,7 +157,7 @@ def read_plan(path: Path) -> SavedPlan:
         beside = path.resolve().parent / where["relative"]
         folder = beside if beside.is_dir() else Path(where["absolute"])
     motion = about["trajectory"]
-    holds = [in_order(p["held"], p.get("by") or {}) for p in motion["phases"]]
+    holds = [sort_holds(p["held"], p.get("by") or {}) for p in motion["phases"]]
     both = zip(motion["phases"], holds, strict=True)
     phases = [Phase(p["name"], p["first"], p["last"], held, p.get("opening")) for p, held in both]
     return SavedPlan(

@@ -7,7 +7,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["IDENTITY", "Poses", "axis_turn", "orientation", "pose", "rpy", "turn_between"]
+__all__ = [
+    "IDENTITY",
+    "Poses",
+    "compute_angle",
+    "make_pose",
+    "read_orientation",
+    "rotate_about_axis",
+    "rotate_rpy",
+]
 
 
 class Poses(NamedTuple):
@@ -18,7 +26,8 @@ class Poses(NamedTuple):
 
     def __matmul__(self, other: Poses) -> Poses:
         return Poses(
-            self.turn @ other.turn, np.einsum("kij,kj->ki", *_alike(self.turn, other.at)) + self.at
+            self.turn @ other.turn,
+            np.einsum("kij,kj->ki", *_broadcast(self.turn, other.at)) + self.at,
         )
 
     def inverse(self) -> Poses:
@@ -35,21 +44,21 @@ class Poses(NamedTuple):
         return Poses(self.turn[k][None], self.at[k][None])
 
     @property
-    def still(self) -> bool:
+    def is_constant(self) -> bool:
         """Whether it does not change."""
         return bool(
             np.ptp(self.turn, axis=0).max() < 1e-12 and np.ptp(self.at, axis=0).max() < 1e-12
         )
 
 
-def _alike(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _broadcast(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     size = max(len(one), len(other))
     return np.broadcast_to(one, (size, *one.shape[1:])), np.broadcast_to(
         other, (size, *other.shape[1:])
     )
 
 
-def rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
+def rotate_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
     """Return the rotation by roll about x, then pitch about y, then yaw about z, shape (3, 3)."""
     (a, b, c), (u, v, w) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
     about_x = np.array([[1, 0, 0], [0, a, -u], [0, u, a]])
@@ -58,16 +67,16 @@ def rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
     return about_z @ about_y @ about_x
 
 
-def orientation(about: Mapping[str, Any]) -> np.ndarray:
+def read_orientation(about: Mapping[str, Any]) -> np.ndarray:
     """Return the rotation that `rpy`, `yaw` or `quaternion` of a description says, shape (3, 3)."""
     if about.get("quaternion"):
         x, y, z, w = np.array(about["quaternion"], float) / np.linalg.norm(about["quaternion"])
         across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         return np.eye(3) + 2.0 * w * across + 2.0 * across @ across
-    return rpy(*(about.get("rpy") or (0.0, 0.0, about.get("yaw") or 0.0)))
+    return rotate_rpy(*(about.get("rpy") or (0.0, 0.0, about.get("yaw") or 0.0)))
 
 
-def pose(position: object = (0.0, 0.0, 0.0), turn: np.ndarray | None = None) -> Poses:
+def make_pose(position: object = (0.0, 0.0, 0.0), turn: np.ndarray | None = None) -> Poses:
     """Return one placement."""
     return Poses(
         (np.eye(3) if turn is None else np.asarray(turn, float))[None],
@@ -75,7 +84,7 @@ def pose(position: object = (0.0, 0.0, 0.0), turn: np.ndarray | None = None) -> 
     )
 
 
-def axis_turn(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:
+def rotate_about_axis(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:
     """Return rotations about an axis by angles, shape (S,): shape (S, 3, 3) (Rodrigues)."""
     x, y, z = axis / np.linalg.norm(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -86,11 +95,11 @@ def axis_turn(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:
     )
 
 
-def turn_between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def compute_angle(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return the angles between rotations, shape (S,) [rad]; precise where they are small."""
     return 2.0 * np.arcsin(
         np.clip(np.linalg.norm(one - other, axis=(1, 2)) / np.sqrt(8.0), 0.0, 1.0)
     )
 
 
-IDENTITY = pose()
+IDENTITY = make_pose()

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import coal
 
-from .poses import Poses, pose
+from .poses import Poses, make_pose
 
 if TYPE_CHECKING:
     from .stage import World
 
-__all__ = ["distance", "riders", "stands_on"]
+__all__ = ["compute_distance", "find_riders", "rests_on"]
 
 DROP = 5e-3  # [m] by which something is lowered to see what is below it
 SUPPORT = 2.5e-3  # [m] by which it then overlaps what it stands on, at least
@@ -19,7 +19,7 @@ SUPPORT = 2.5e-3  # [m] by which it then overlaps what it stands on, at least
 _REQUEST, _RESULT = coal.DistanceRequest(), coal.DistanceResult()
 
 
-def distance(one: object, here: Poses, other: object, there: Poses, k: int = 0) -> float:
+def compute_distance(one: object, here: Poses, other: object, there: Poses, k: int = 0) -> float:
     """Return the signed distance of two shapes at moment k [m]."""
     i, j = (0 if len(place.turn) == 1 else k for place in (here, there))
     a, b = coal.Transform3s(here.turn[i], here.at[i]), coal.Transform3s(there.turn[j], there.at[j])
@@ -27,19 +27,19 @@ def distance(one: object, here: Poses, other: object, there: Poses, k: int = 0) 
     return float(coal.distance(one, a, other, b, _REQUEST, _RESULT))
 
 
-def stands_on(
+def rests_on(
     world: World, links: dict[tuple[str, str], Poses], name: str, support: tuple[str, str]
 ) -> bool:
     """Return whether an object overlaps a link by over 2.5 mm at 5 mm lower, not 5 mm higher."""
-    ours = world.things[name].tree.urdf.shapes
+    ours = world.objects[name].tree.urdf.shapes
     theirs = [
-        shape for shape in world.things[support[0]].tree.urdf.shapes if shape.link == support[1]
+        shape for shape in world.objects[support[0]].tree.urdf.shapes if shape.link == support[1]
     ]
 
     def overlap(height: float) -> float:
-        moved, there = pose((0.0, 0.0, height)), links[support].row(0)
+        moved, there = make_pose((0.0, 0.0, height)), links[support].row(0)
         found = [
-            -distance(
+            -compute_distance(
                 one.solid,
                 moved @ links[name, one.link].row(0) @ one.place,
                 other.solid,
@@ -53,7 +53,7 @@ def stands_on(
     return overlap(-DROP) > SUPPORT >= overlap(DROP)
 
 
-def riders(
+def find_riders(
     world: World,
     links: dict[tuple[str, str], Poses],
     moving: set[tuple[str, str]],
@@ -66,11 +66,11 @@ def riders(
         new = {}
         for name in (name for name in waiting if name not in found):
             support = next(
-                (key for key in below if key[0] != name and stands_on(world, links, name, key)),
+                (key for key in below if key[0] != name and rests_on(world, links, name, key)),
                 None,
             )
             if support is not None:
                 new[name] = support
         found |= new
-        below = [(name, link) for name in new for link in world.things[name].tree.urdf.links]
+        below = [(name, link) for name in new for link in world.objects[name].tree.urdf.links]
     return found

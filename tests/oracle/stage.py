@@ -11,12 +11,12 @@ from typing import Any
 import coal
 import numpy as np
 
-from .gripper import Fingers, required
+from .gripper import Fingers, get_required_opening
 from .plan import Hold, Phase, SavedPlan
-from .poses import IDENTITY, Poses, orientation, pose
-from .riding import distance, riders
-from .things import Thing, Tree, load_robot, load_thing
-from .urdf import Shape, mesh_hull, read_urdf, solid
+from .poses import IDENTITY, Poses, make_pose, read_orientation
+from .riding import compute_distance, find_riders
+from .scene_objects import SceneObject, Tree, load_object, load_robot
+from .urdf import Shape, load_mesh_hull, make_solid, read_urdf
 
 __all__ = ["FLOOR", "Solid", "Stage", "World"]
 
@@ -77,8 +77,8 @@ class World:
         self.robot = load_robot(
             scene["robot"], plan.folder, plan.names[3 : plan.robot_size], scene["start"].get("z")
         )
-        self.things = {
-            item["name"]: load_thing(item, plan.folder) for item in scene.get("objects") or ()
+        self.objects = {
+            item["name"]: load_object(item, plan.folder) for item in scene.get("objects") or ()
         }
         arena = scene.get("arena") or {}
         self.arena = (*arena.get("x", (-5.0, 5.0)), *arena.get("y", (-5.0, 5.0)))
@@ -99,14 +99,14 @@ class World:
         self.start |= dict(zip(self.robot.arm, angles, strict=True))
         self.start |= {
             f"{name}.{joint}": value
-            for name, thing in self.things.items()
-            for joint, value in thing.state.items()
+            for name, obj in self.objects.items()
+            for joint, value in obj.state.items()
         }
         self.held: list[Hold] = []
         for name, said in (start.get("held") or {}).items():
             about = {"attachment": said} if isinstance(said, str) else said
             self.held.append(Hold(name, about["attachment"], about.get("by")))
-            grasp, values = self.things[name].grasps[about["attachment"]], about.get("at")
+            grasp, values = self.objects[name].grasps[about["attachment"]], about.get("at")
             for k, (freedom, *_) in enumerate(grasp.freedoms):
                 self.start[f"{name}.{freedom}"] = values[k] if values else 0.0
         self.held.sort(
@@ -116,7 +116,7 @@ class World:
         )
 
     def _obstacle(self, item: dict[str, Any]) -> list[Solid]:
-        here, name = pose(item["position"], orientation(item)), item["name"]
+        here, name = make_pose(item["position"], read_orientation(item)), item["name"]
         if item["type"] == "urdf":
             urdf = read_urdf(self.plan.folder / item["file"])
             links = Tree(urdf, drives=False).links(
@@ -132,11 +132,13 @@ class World:
                 Solid(
                     name,
                     "",
-                    Shape.of("", mesh_hull(self.plan.folder / item["file"], scale), IDENTITY),
+                    Shape.make(
+                        "", load_mesh_hull(self.plan.folder / item["file"], scale), IDENTITY
+                    ),
                     here,
                 )
             ]
-        return [Solid(name, "", Shape.of("", solid(item["type"], item), IDENTITY), here)]
+        return [Solid(name, "", Shape.make("", make_solid(item["type"], item), IDENTITY), here)]
 
     def slides(self, name: str) -> bool:
         """Whether a coordinate is a length."""
@@ -145,10 +147,10 @@ class World:
         owner, _, own = name.partition(".")
         if not own:
             return name != "base_yaw" and self.robot.tree.urdf.kind(name) == "prismatic"
-        thing = self.things[owner]
-        if own in thing.limits:
-            return thing.slides(own)
-        return next(f[1] for grasp in thing.grasps.values() for f in grasp.freedoms if f[0] == own)
+        obj = self.objects[owner]
+        if own in obj.limits:
+            return obj.slides(own)
+        return next(f[1] for grasp in obj.grasps.values() for f in grasp.freedoms if f[0] == own)
 
     def front(self, opening: float | None) -> Poses:
         """Return the foremost point of the touch links in the tool's frame, at an opening [m]."""
@@ -156,30 +158,28 @@ class World:
             self.robot,
             coal.Halfspace(np.array([0.0, 0.0, -1.0]), -1.0),
         )  # all that is a metre ahead, and beyond
-        fingers = self.fingers.at(self.fingers.near(opening))
+        fingers = self.fingers.find_joints(self.fingers.near(opening))
         frames = robot.tree.links(
             {**robot.locked, **fingers}, None, sorted({robot.tool, *robot.touch})
         )
         tool = frames[robot.tool].inverse()
         hand = [shape for shape in robot.tree.urdf.shapes if shape.link in robot.touch]
         gaps = [
-            distance(shape.solid, tool @ frames[shape.link] @ shape.place, wall, IDENTITY)
+            compute_distance(shape.solid, tool @ frames[shape.link] @ shape.place, wall, IDENTITY)
             for shape in hand
         ]
-        return pose((0.0, 0.0, 1.0 - min(gaps)))
+        return make_pose((0.0, 0.0, 1.0 - min(gaps)))
 
     @cached_property
-    def resting(self) -> np.ndarray:
+    def is_resting(self) -> np.ndarray:
         """Return for every step between waypoints whether robot and objects stand still."""
-        things = {
-            f"{name}.{joint}" for name, thing in self.things.items() for joint in thing.limits
-        }
+        joints = {f"{name}.{joint}" for name, obj in self.objects.items() for joint in obj.limits}
         bodies = [
-            k < self.plan.robot_size or name in things for k, name in enumerate(self.plan.names)
+            k < self.plan.robot_size or name in joints for k, name in enumerate(self.plan.names)
         ]
         plan = self.plan
         along = [
-            plan.at(a + (b - a) * np.linspace(0.0, 1.0, _PARTS + 1))[:, bodies]
+            plan.evaluate(a + (b - a) * np.linspace(0.0, 1.0, _PARTS + 1))[:, bodies]
             for a, b in itertools.pairwise(plan.times)
         ]
         return np.array([np.ptp(rows, axis=0).max() < 1e-9 for rows in along])
@@ -190,27 +190,29 @@ class World:
         return Fingers(self.robot)
 
     @cached_property
-    def at_first(self) -> float | None:
+    def start_opening(self) -> float | None:
         """How far it is open at the start."""
         hold = next((hold for hold in self.held if hold.by is None), None)
         return (
             self.fingers.near(self.plan.scene["start"].get("opening"))
             if hold is None
-            else required(self, hold)
+            else get_required_opening(self, hold)
         )
 
     def opened(self, number: int) -> np.ndarray:
         """Return the fingers' joints at a phase's waypoints, (T, k); only the first step moves."""
         phases, fingers = self.plan.phases, self.fingers
         phase = phases[number]
-        here = fingers.at(phase.opening)
+        here = fingers.find_joints(phase.opening)
         rows = np.tile([here[joint] for joint in fingers.joints], (phase.last - phase.first + 1, 1))
         moves = (
             bool(number)
             or not np.ptp(self.plan.positions[:2, : self.plan.robot_size], axis=0).any()
         )
         if moves:
-            before = fingers.at(phases[number - 1].opening if number else self.at_first)
+            before = fingers.find_joints(
+                phases[number - 1].opening if number else self.start_opening
+            )
             rows[0] = [before[joint] for joint in fingers.joints]
         return rows
 
@@ -232,7 +234,7 @@ class World:
         else:  # as often as the fastest stretch of it asks for
             parts = np.stack(
                 [
-                    plan.at(a + (b - a) * np.linspace(0.0, 1.0, _PARTS + 1))
+                    plan.evaluate(a + (b - a) * np.linspace(0.0, 1.0, _PARTS + 1))
                     for a, b in itertools.pairwise(t)
                 ]
             )
@@ -257,7 +259,7 @@ class World:
             [k + np.arange(n) / n for k, n in enumerate(counts)] + [[len(counts)]]
         )
         waypoints = np.arange(len(t))
-        columns = plan.at(np.interp(share, waypoints, t))
+        columns = plan.evaluate(np.interp(share, waypoints, t))
         hand = {
             name: np.interp(share, waypoints, column)
             for name, column in zip(self.fingers.joints, fingers.T, strict=True)
@@ -271,7 +273,7 @@ class World:
 
     def stages(self) -> Iterator[Stage]:
         """Yield the phases in order; free objects keep the poses of the phase before."""
-        free = {name: thing.at for name, thing in self.things.items() if thing.free}
+        free = {name: obj.at for name, obj in self.objects.items() if obj.free}
         upright: dict[str, np.ndarray] = {}
         robot, plan = self.robot, self.plan
         wanted = sorted(
@@ -289,35 +291,37 @@ class World:
                 first = {name: frame.row(0) for name, frame in frames.items()}
                 free |= self._in_hand(first[robot.tool], free)
             links = {("robot", name): frame for name, frame in frames.items()}
-            for name, thing in self.things.items():
-                own = self.links_of(thing, columns)
+            for name, obj in self.objects.items():
+                own = self.links_of(obj, columns)
                 links |= {
-                    (name, link): (free[name] if thing.free else thing.at) @ place
+                    (name, link): (free[name] if obj.free else obj.at) @ place
                     for link, place in own.items()
                 }
-            moving = {key for key, place in links.items() if key[0] != "robot" and not place.still}
+            moving = {
+                key for key, place in links.items() if key[0] != "robot" and not place.is_constant
+            }
             carried = self._carry(phase, columns, links, free)
             moving |= {
-                (name, link) for name in carried for link in self.things[name].tree.urdf.links
+                (name, link) for name in carried for link in self.objects[name].tree.urdf.links
             }
             waiting = [name for name in free if name not in carried]
             upright = {name: upright.get(name, free[name].turn[0, 2]) for name in waiting}
-            riding = riders(self, links, moving, waiting)
+            riding = find_riders(self, links, moving, waiting)
             for name, support in riding.items():  # in the order in which they stand on each other
                 there = links[support]
                 self._set_down(name, there @ (there.row(0).inverse() @ free[name]), links)
             moving |= {
-                (name, link) for name in riding for link in self.things[name].tree.urdf.links
+                (name, link) for name in riding for link in self.objects[name].tree.urdf.links
             }
             free = {
-                name: links[name, self.things[name].tree.urdf.base].row(len(times) - 1)
+                name: links[name, self.objects[name].tree.urdf.base].row(len(times) - 1)
                 for name in free
             }
             solids = [
                 Solid(owner, shape.link, shape, links[owner, shape.link] @ shape.place)
                 for owner, tree in [
                     ("robot", robot.tree),
-                    *((name, thing.tree) for name, thing in self.things.items()),
+                    *((name, obj.tree) for name, obj in self.objects.items()),
                 ]
                 for shape in tree.urdf.shapes
             ]
@@ -332,30 +336,30 @@ class World:
         named = {
             step.get("frame") for step in self.plan.steps if step["step"] in ("Reach", "Touch")
         }
-        return {name for name in named if name and name.partition(".")[0] not in self.things}
+        return {name for name in named if name and name.partition(".")[0] not in self.objects}
 
-    def links_of(self, thing: Thing, columns: np.ndarray) -> dict[str, Poses]:
+    def links_of(self, obj: SceneObject, columns: np.ndarray) -> dict[str, Poses]:
         """Return an object's links in the frame of its base link, along samples of the motion."""
         values: dict[str, np.ndarray | float] = {}
-        for joint, value in thing.state.items():
-            index = self.plan.index(f"{thing.name}.{joint}")
+        for joint, value in obj.state.items():
+            index = self.plan.index(f"{obj.name}.{joint}")
             column = None if index is None else columns[:, index]
             values[joint] = (
                 value if column is None else column if np.ptp(column) > 0.0 else float(column[0])
             )
-        return thing.tree.links(values, None, thing.tree.urdf.links)
+        return obj.tree.links(values, None, obj.tree.urdf.links)
 
     def freedoms(self, hold: Hold, columns: np.ndarray) -> dict[str, np.ndarray]:
         """Return the values of a grasp's freedoms along samples."""
         found = {}
-        for name, *_ in self.things[hold.object].grasps[hold.attachment].freedoms:
+        for name, *_ in self.objects[hold.object].grasps[hold.attachment].freedoms:
             index = self.plan.index(f"{hold.object}.{name}")
             found[name] = np.zeros(len(columns)) if index is None else columns[:, index]
         return found
 
     def in_object(self, hold: Hold, columns: np.ndarray, links: dict[str, Poses]) -> Poses:
         """Return where a grasp has the tool, in the frame of the object's base link."""
-        grasp = self.things[hold.object].grasps[hold.attachment]
+        grasp = self.objects[hold.object].grasps[hold.attachment]
         return links[grasp.link] @ grasp.tool(self.freedoms(hold, columns))
 
     def _in_hand(self, tool: Poses, free: dict[str, Poses]) -> dict[str, Poses]:
@@ -363,16 +367,16 @@ class World:
         found: dict[str, Poses] = {}
         columns = np.array([[self.start.get(name, 0.0) for name in self.plan.names]])
         for hold in self.held:
-            thing = self.things[hold.object]
-            if thing.free:
-                links = self.links_of(thing, columns)
+            obj = self.objects[hold.object]
+            if obj.free:
+                links = self.links_of(obj, columns)
                 holder = tool
                 if hold.by is not None:
                     owner, _, link = hold.by.partition(".")
-                    holder = found[owner] @ self.links_of(self.things[owner], columns)[link]
+                    holder = found[owner] @ self.links_of(self.objects[owner], columns)[link]
                 values = {name: np.array([self.start[f"{hold.object}.{name}"]]) for name, *_ in
-                          thing.grasps[hold.attachment].freedoms}  # fmt: skip
-                grasp = thing.grasps[hold.attachment]
+                          obj.grasps[hold.attachment].freedoms}  # fmt: skip
+                grasp = obj.grasps[hold.attachment]
                 found[hold.object] = holder @ (links[grasp.link] @ grasp.tool(values)).inverse()
         return found
 
@@ -386,14 +390,14 @@ class World:
         """Move attached objects with the links that carry them; return the objects' names."""
         carried = []
         for hold in phase.holds:
-            if not self.things[hold.object].free:
+            if not self.objects[hold.object].free:
                 continue
             owner, _, link = (hold.by or "").partition(".")
             holder = links[owner, link] if hold.by else links["robot", self.robot.tool]
             ideal = (
                 holder
                 @ self.in_object(
-                    hold, columns, self.links_of(self.things[hold.object], columns)
+                    hold, columns, self.links_of(self.objects[hold.object], columns)
                 ).inverse()
             )
             self._set_down(hold.object, ideal @ (ideal.row(0).inverse() @ free[hold.object]), links)
@@ -402,6 +406,6 @@ class World:
 
     def _set_down(self, name: str, where: Poses, links: dict[tuple[str, str], Poses]) -> None:
         """Put a free object's base link somewhere."""
-        tree = self.things[name].tree
-        for link, place in tree.links(self.things[name].state, None, tree.urdf.links).items():
+        tree = self.objects[name].tree
+        for link, place in tree.links(self.objects[name].state, None, tree.urdf.links).items():
             links[name, link] = where @ place

@@ -16,7 +16,7 @@ from helpers.drives import make_hall
 
 import vkc_pin as vkc
 from oracle.__main__ import main
-from oracle.changes import changed
+from oracle.changes import write_changed
 from oracle.judge import judge
 from oracle.plan import read_plan
 from oracle.stage import World
@@ -56,11 +56,11 @@ def test_good_plans_pass(
 # Changes: plan, what to change, the rule that breaks and what it must name.
 
 
-def _start(c: Content) -> None:
+def _move_start(c: Content) -> None:
     c["scene"]["start"]["base"][0] += 0.01
 
 
-def _limit(c: Content) -> None:
+def _exceed_limit(c: Content) -> None:
     c["column"]("elbow_joint")[20:30] = 3.3
 
 
@@ -68,15 +68,15 @@ def _jump(c: Content) -> None:
     c["column"]("base_x")[20] += 0.5
 
 
-def _hurry(c: Content) -> None:
+def _speed_up(c: Content) -> None:
     c["times"][:] *= 0.2
 
 
-def _arena(c: Content) -> None:
+def _leave_arena(c: Content) -> None:
     c["scene"]["arena"]["x"][0] = float(c["column"]("base_x").min()) + 0.05
 
 
-def _wall(c: Content) -> None:
+def _add_wall(c: Content) -> None:
     k = int(np.argmax(np.abs(np.diff(c["column"]("base_x")))))
     x, y = (float(c["column"](name)[k : k + 2].mean()) for name in ("base_x", "base_y"))
     c["scene"]["obstacles"].append(
@@ -88,15 +88,15 @@ def _drift(c: Content) -> None:
     c["column"]("base_x")[48:] += np.linspace(0.0, 0.004, len(c["times"]) - 48)
 
 
-def _latch(c: Content) -> None:
+def _move_latched_joint(c: Content) -> None:
     c["column"]("door.knob")[47:] = 0.3
 
 
-def _short(c: Content) -> None:
+def _stop_short(c: Content) -> None:
     c["steps"][-1]["joints"] = {"hinge": 1.21}
 
 
-def _hands_off(c: Content) -> None:
+def _move_hand_away(c: Content) -> None:
     c["phases"][-1]["held"] = {}
 
 
@@ -104,30 +104,30 @@ def _slide(c: Content) -> None:
     c["column"]("cup.side_turn")[60:] += 0.02
 
 
-def _no_rest(c: Content) -> None:
+def _remove_rest(c: Content) -> None:
     c["times"][41:] -= 0.9
 
 
-def _beside(c: Content) -> None:
+def _place_beside(c: Content) -> None:
     c["steps"][-1]["pose"][0] += 0.005
 
 
-def _clings(c: Content) -> None:
+def _keep_grasp(c: Content) -> None:
     c["phases"][-1]["held"] = dict(c["phases"][-2]["held"])
 
 
-def _elsewhere(c: Content) -> None:
+def _go_elsewhere(c: Content) -> None:
     for item in c["scene"]["objects"]:
         if item["name"] == "stick":
             item["position"][0] += 0.003
 
 
-def _out_of_turn(c: Content) -> None:
+def _move_out_of_turn(c: Content) -> None:
     x, y = (float(c["column"](name)[-1]) for name in ("base_x", "base_y"))
     c["steps"].insert(0, {"step": "GoTo", "x": x, "y": y, "yaw": None})
 
 
-def _blocked(c: Content) -> None:
+def _block(c: Content) -> None:
     drawer = c["scene"]["objects"][0]
     x, y, _ = drawer["position"]
     spot = [
@@ -141,24 +141,24 @@ def _blocked(c: Content) -> None:
 
 
 CHANGES: list[tuple[str, Callable[[Content], None], str, str]] = [
-    ("door", _start, "start", "base_x"),
-    ("door", _limit, "limit", "elbow_joint"),
+    ("door", _move_start, "start", "base_x"),
+    ("door", _exceed_limit, "limit", "elbow_joint"),
     ("door", _jump, "velocity", "base_x"),
     ("door", _jump, "acceleration", "base_x"),
-    ("cup", _hurry, "acceleration", "shoulder"),
-    ("drawer", _arena, "limit", "base_x"),
-    ("drawer", _wall, "overlap", "base_link - post"),
+    ("cup", _speed_up, "acceleration", "shoulder"),
+    ("drawer", _leave_arena, "limit", "base_x"),
+    ("drawer", _add_wall, "overlap", "base_link - post"),
     ("door", _drift, "closure", "door.handle"),
-    ("door", _latch, "latch", "door.hinge"),
-    ("door", _short, "goal", "door.hinge"),
-    ("door", _hands_off, "unheld", "door.hinge"),
+    ("door", _move_latched_joint, "latch", "door.hinge"),
+    ("door", _stop_short, "goal", "door.hinge"),
+    ("door", _move_hand_away, "unheld", "door.hinge"),
     ("cup", _slide, "slide", "cup.side_turn"),
-    ("drawer", _no_rest, "dwell", "drawer"),
-    ("cup", _beside, "goal", "cup.cup"),
-    ("cup", _clings, "goal", "cup"),
-    ("stick", _elsewhere, "closure", "stick.grip"),
-    ("door", _out_of_turn, "order", "steps"),
-    ("drawer", _blocked, "overlap", "drawer."),
+    ("drawer", _remove_rest, "dwell", "drawer"),
+    ("cup", _place_beside, "goal", "cup.cup"),
+    ("cup", _keep_grasp, "goal", "cup"),
+    ("stick", _go_elsewhere, "closure", "stick.grip"),
+    ("door", _move_out_of_turn, "order", "steps"),
+    ("drawer", _block, "overlap", "drawer."),
 ]
 
 
@@ -167,7 +167,7 @@ CHANGES: list[tuple[str, Callable[[Content], None], str, str]] = [
     CHANGES,
     ids=[f"{c[0]}{c[1].__name__}-{c[2]}" for c in CHANGES],
 )
-def test_changes_are_found(
+def test_faults_of_changed_plans_are_found(
     plans: dict[str, Path],
     tmp_path: Path,
     name: str,
@@ -175,7 +175,7 @@ def test_changes_are_found(
     rule: str,
     subject: str,
 ) -> None:
-    verdict = judge(changed(plans[name], tmp_path / "changed.npz", change))
+    verdict = judge(write_changed(plans[name], tmp_path / "changed.npz", change))
     assert verdict.success  # by its own word, which nobody changed
     assert any(one.rule == rule and one.subject.startswith(subject) for one in verdict.found), list(
         map(str, verdict.found)
@@ -183,7 +183,7 @@ def test_changes_are_found(
 
 
 @pytest.mark.parametrize("base", ["differential", "ackermann"])
-def test_bases_on_wheels(base: str, tmp_path: Path) -> None:
+def test_slipping_and_fast_wheels_are_found(base: str, tmp_path: Path) -> None:
     """Good plans pass; those whose base slips, turns against its kinematics or is too fast fail."""
     robot = {"base": base, **({"turning_radius": 0.8} if base == "ackermann" else {})}
     plan = vkc.plan(make_hall(**robot), [vkc.GoTo(1.5, 0.8, 0.3)])
@@ -192,7 +192,9 @@ def test_bases_on_wheels(base: str, tmp_path: Path) -> None:
     assert judge(path).agrees
 
     def rules(change: Callable[[Content], None]) -> set[str]:
-        return {one.rule for one in judge(changed(path, tmp_path / "changed.npz", change)).found}
+        return {
+            one.rule for one in judge(write_changed(path, tmp_path / "changed.npz", change)).found
+        }
 
     def aside(c: Content) -> None:
         yaw, share = c["column"]("base_yaw"), np.linspace(0.0, 0.05, len(c["times"]))
@@ -212,7 +214,7 @@ def test_bases_on_wheels(base: str, tmp_path: Path) -> None:
     assert "wheels" in rules(hurry)
 
 
-def test_clearance_is_measured(plans: dict[str, Path], tmp_path: Path) -> None:
+def test_shape_within_the_clearance_is_found(plans: dict[str, Path], tmp_path: Path) -> None:
     """A ball 15 mm above the robot's highest shape is too close; at 25 mm it is not."""
 
     def ball(height: float) -> Callable[[Content], None]:
@@ -229,7 +231,7 @@ def test_clearance_is_measured(plans: dict[str, Path], tmp_path: Path) -> None:
         return change
 
     near, far = (
-        judge(changed(plans["drawer"], tmp_path / "b.npz", ball(height))).found
+        judge(write_changed(plans["drawer"], tmp_path / "b.npz", ball(height))).found
         for height in (0.015, 0.025)
     )
     (found,) = [one for one in near if one.rule == "clearance"]
@@ -238,9 +240,9 @@ def test_clearance_is_measured(plans: dict[str, Path], tmp_path: Path) -> None:
     assert not [one for one in far if one.rule == "clearance"]
 
 
-def test_what_stands_in_a_drawer_goes_with_it(plans: dict[str, Path], tmp_path: Path) -> None:
+def test_cup_in_a_drawer_moves_with_it(plans: dict[str, Path], tmp_path: Path) -> None:
     """A cup in the drawer's tray moves 0.3 m with it, although the plan does not mention it."""
-    path = changed(plans["drawer"], tmp_path / "changed.npz", _with_cup)
+    path = write_changed(plans["drawer"], tmp_path / "changed.npz", _add_cup)
     stages = list(World(read_plan(path)).stages())
     assert [stage.riding for stage in stages[:-1]] == [{}] * (len(stages) - 1)
     assert stages[-1].riding == {"cup": ("drawer", "tray")}
@@ -249,14 +251,14 @@ def test_what_stands_in_a_drawer_goes_with_it(plans: dict[str, Path], tmp_path: 
     assert judge(path).agrees
 
 
-def _with_cup(c: Content) -> None:
+def _add_cup(c: Content) -> None:
     x, y, _ = c["scene"]["objects"][0]["position"]
     c["scene"]["objects"].append(
         {"name": "cup", "type": "cup", "position": [x + 0.15, y, 0.653]}
     )  # 1 mm above the tray's bottom
 
 
-def test_what_stands_on_something_that_tilts_tips(plans: dict[str, Path], tmp_path: Path) -> None:
+def test_cup_on_a_tilting_door_tips(plans: dict[str, Path], tmp_path: Path) -> None:
     """A cup on a dishwasher's door tips over when another plan closes the door a little.
 
     Nobody grasps the cup; the oracle finds that too.
@@ -272,13 +274,13 @@ def test_what_stands_on_something_that_tilts_tips(plans: dict[str, Path], tmp_pa
         values[60:] = 1.4
         c["positions"] = np.column_stack([c["positions"], values])
 
-    found = judge(changed(plans["cup"], tmp_path / "changed.npz", change)).found
+    found = judge(write_changed(plans["cup"], tmp_path / "changed.npz", change)).found
     (tipped,) = [one for one in found if one.rule == "tips"]
     assert (tipped.subject, tipped.amount) == ("cold_cup", pytest.approx(0.17 - 0.1, abs=2e-3))
     assert "unheld dishwasher.door" in {f"{one.rule} {one.subject}" for one in found}
 
 
-def test_nothing_is_shared_with_the_package(plans: dict[str, Path]) -> None:
+def test_oracle_imports_nothing_of_the_package(plans: dict[str, Path]) -> None:
     files = [file for file in FOLDER.glob("*.py") if not file.name.startswith("test_")]
     assert len(files) > 8
     for file in files:

@@ -20,12 +20,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .goals import touched
+from .goals import find_touched
 from .plan import Hold
-from .riding import distance
+from .riding import compute_distance
 from .stage import Solid, Stage, World
 
-__all__ = ["SHORT", "Licence", "licences"]
+__all__ = ["SHORT", "Licence", "find_licences"]
 
 SHORTLY, WAYPOINTS = 1.0, 4  # [s], and at least as many waypoints
 SHORT = 1e-3  # [m] that clearance at a waypoint may fall short
@@ -65,7 +65,7 @@ class Licence:
 class _Clock:
     def __init__(self, world: World) -> None:
         self.times = world.plan.times
-        self.still = world.resting
+        self.still = world.is_resting
 
     def before(self, waypoint: int) -> float:
         return float(min(self.times[waypoint] - SHORTLY, self.times[max(waypoint - WAYPOINTS, 0)]))
@@ -81,20 +81,24 @@ class _Clock:
         )
 
 
-def licences(world: World, stages: list[Stage]) -> list[Licence]:
+def find_licences(world: World, stages: list[Stage]) -> list[Licence]:
     """Return all of a motion."""
     clock = _Clock(world)
-    found = [*_held(world, clock), *_lifted(world, stages, clock), *_touches(world, stages, clock)]
+    found = [
+        *_license_grasps(world, clock),
+        *_license_supports(world, stages, clock),
+        *_license_touches(world, stages, clock),
+    ]
     for stage in stages:
         for name, (owner, link) in stage.riding.items():
-            ours = frozenset(f"{name}.{own}" for own in world.things[name].tree.urdf.links)
+            ours = frozenset(f"{name}.{own}" for own in world.objects[name].tree.urdf.links)
             found.append(
                 Licence(ours, frozenset({f"{owner}.{link}"}), stage.times[0], stage.times[-1])
             )
     return found
 
 
-def _held(world: World, clock: _Clock) -> Iterator[Licence]:
+def _license_grasps(world: World, clock: _Clock) -> Iterator[Licence]:
     plan = world.plan
     last = len(plan.times) - 1
     spans: list[tuple[Hold, float, float]] = []
@@ -112,21 +116,21 @@ def _held(world: World, clock: _Clock) -> Iterator[Licence]:
     spans += [(hold, -np.inf, clock.after(0)) for hold in world.held]
     for step in plan.steps:
         if step["step"] == "Grasp":  # the motion may end where the hand closes
-            grasp = world.things[step["object"]].grasp(step["attachment"])
+            grasp = world.objects[step["object"]].grasp(step["attachment"])
             spans.append((Hold(step["object"], grasp.name, step["by"]), clock.before(last), np.inf))
     for hold, begin, end in spans:
-        thing = world.things[hold.object]
-        grasp = thing.grasps[hold.attachment]
+        obj = world.objects[hold.object]
+        grasp = obj.grasps[hold.attachment]
         ours = frozenset({hold.by}) if hold.by else frozenset(world.robot.touch)
         yield Licence(ours, frozenset({f"{hold.object}.{grasp.link}"}), begin, end)
         others = frozenset(
-            f"{hold.object}.{link}" for link in thing.tree.urdf.links if link != grasp.link
+            f"{hold.object}.{link}" for link in obj.tree.urdf.links if link != grasp.link
         )
         least = plan.options["grasp_clearance"] if grasp.clearance is None else grasp.clearance
         yield Licence(ours, others, begin, end, least=least)
 
 
-def _lifted(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licence]:
+def _license_supports(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licence]:
     carried: set[str] = set()  # what is in the hand at the start is lifted there
     for number, stage in enumerate(stages):
         before = {hold.object for hold in stages[number - 1].phase.holds} if number else set()
@@ -137,7 +141,7 @@ def _lifted(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licenc
             else now
         )
         for name in now:
-            if not world.things[name].free:
+            if not world.objects[name].free:
                 continue
             for there, row, waypoint in (
                 (before, 0, stage.phase.first),
@@ -150,14 +154,14 @@ def _lifted(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licenc
                         other.label
                         for other in others
                         for part in ours
-                        if _close(world, part, other, row)
+                        if _is_close(world, part, other, row)
                     )
                     labels = frozenset(part.label for part in ours)
                     yield Licence(labels, near, clock.before(waypoint), clock.after(waypoint))
                     if row == 0 and name not in carried:
                         for part in ours:
                             for other in others:
-                                apart = distance(
+                                apart = compute_distance(
                                     part.shape.solid, part.at, other.shape.solid, other.at, 0
                                 )
                                 if apart < 0.0:
@@ -171,16 +175,16 @@ def _lifted(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licenc
         carried |= now
 
 
-def _close(world: World, one: Solid, other: Solid, row: int) -> bool:
+def _is_close(world: World, one: Solid, other: Solid, row: int) -> bool:
     return (
-        distance(one.shape.solid, one.at, other.shape.solid, other.at, row)
+        compute_distance(one.shape.solid, one.at, other.shape.solid, other.at, row)
         < world.plan.options["dist_safe"]
     )
 
 
-def _touches(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licence]:
+def _license_touches(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licence]:
     for stage in stages:
-        for links, near in touched(world, stage):
+        for links, near in find_touched(world, stage):
             waypoint = stage.phase.last
             yield Licence(
                 frozenset(links), frozenset(near), clock.before(waypoint), clock.after(waypoint)

@@ -13,9 +13,9 @@ import numpy as np
 import trimesh
 
 from .plan import NotJudged
-from .poses import Poses, pose, rpy
+from .poses import Poses, make_pose, rotate_rpy
 
-__all__ = ["Shape", "Urdf", "mesh_hull", "read_urdf", "solid"]
+__all__ = ["Shape", "Urdf", "load_mesh_hull", "make_solid", "read_urdf"]
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Shape:
     radius: float
 
     @classmethod
-    def of(cls, link: str, body: Any, place: Poses) -> Shape:
+    def make(cls, link: str, body: Any, place: Poses) -> Shape:
         if isinstance(body, coal.Convex):
             corners = np.array(body.points())
             low, high = corners.min(axis=0), corners.max(axis=0)
@@ -63,7 +63,7 @@ class Shape:
         return cls(link, body, place, np.zeros(3), half, radius)
 
 
-def mesh_hull(file: Path, scale: np.ndarray) -> coal.Convex:
+def load_mesh_hull(file: Path, scale: np.ndarray) -> coal.Convex:
     """Return the convex hull of a mesh file."""
     if not file.is_file():
         raise FileNotFoundError(file)
@@ -72,7 +72,7 @@ def mesh_hull(file: Path, scale: np.ndarray) -> coal.Convex:
         points = np.array(loaded.vertices())
     else:
         points = np.asarray(trimesh.load(file, force="mesh", skip_materials=True).vertices)
-    hull = trimesh.convex.convex_hull(_solid(points * scale))
+    hull = trimesh.convex.convex_hull(_make_convex(points * scale))
     if np.bincount(hull.faces.ravel()).max() > 255:
         raise NotJudged(f"{file.name}: a corner with more neighbours than coal can hold")
     corners, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
@@ -81,7 +81,7 @@ def mesh_hull(file: Path, scale: np.ndarray) -> coal.Convex:
     return coal.Convex(corners, faces)
 
 
-def _solid(points: np.ndarray) -> np.ndarray:
+def _make_convex(points: np.ndarray) -> np.ndarray:
     """Return points of a sheet as those of a plate 1 mm thick, all others as they are."""
     axes = np.linalg.svd(np.cov(points.T))[2]
     widths = [np.ptp(points @ axis) for axis in axes]
@@ -91,7 +91,7 @@ def _solid(points: np.ndarray) -> np.ndarray:
     return points
 
 
-def solid(kind: str, about: dict[str, Any]) -> Any:
+def make_solid(kind: str, about: dict[str, Any]) -> Any:
     """Return the coal shape of a description with `size`, `radius` and `length`."""
     if kind == "box":
         return coal.Box(*map(float, about["size"]))
@@ -101,7 +101,7 @@ def solid(kind: str, about: dict[str, Any]) -> Any:
     return made(float(about["radius"]), float(about["length"]))
 
 
-def _numbers(text: str | None, default: tuple[float, ...]) -> np.ndarray:
+def _parse_numbers(text: str | None, default: tuple[float, ...]) -> np.ndarray:
     return np.array(default if text is None else [float(part) for part in text.split()])
 
 
@@ -173,8 +173,14 @@ class Urdf:
                 [i["ixz"], i["iyz"], i["izz"]],
             ]
         )
-        turn = np.eye(3) if origin is None else rpy(*_numbers(origin.get("rpy"), (0.0, 0.0, 0.0)))
-        centre = np.zeros(3) if origin is None else _numbers(origin.get("xyz"), (0.0, 0.0, 0.0))
+        turn = (
+            np.eye(3)
+            if origin is None
+            else rotate_rpy(*_parse_numbers(origin.get("rpy"), (0.0, 0.0, 0.0)))
+        )
+        centre = (
+            np.zeros(3) if origin is None else _parse_numbers(origin.get("xyz"), (0.0, 0.0, 0.0))
+        )
         return float(inertial.find("mass").get("value")), centre, turn @ tensor @ turn.T
 
     def limits(self, joint: str) -> tuple[float, float, float]:
@@ -208,18 +214,20 @@ class Urdf:
                 assert geometry is not None
                 (shape,) = list(geometry)[:1]
                 if shape.tag == "mesh":
-                    body = mesh_hull(
+                    body = load_mesh_hull(
                         self._file(shape.get("filename", "")),
-                        _numbers(shape.get("scale"), (1.0, 1.0, 1.0)),
+                        _parse_numbers(shape.get("scale"), (1.0, 1.0, 1.0)),
                     )
                 else:
                     about: dict[str, Any] = dict(shape.attrib)
-                    body = solid(shape.tag, {**about, "size": about.get("size", "").split()})
+                    body = make_solid(shape.tag, {**about, "size": about.get("size", "").split()})
                 origin = element.find("origin")
                 given = {} if origin is None else origin.attrib
-                angles = _numbers(given.get("rpy"), (0.0, 0.0, 0.0))
-                place = pose(_numbers(given.get("xyz"), (0.0, 0.0, 0.0)), rpy(*angles))
-                found.append(Shape.of(link.get("name", ""), body, place))
+                angles = _parse_numbers(given.get("rpy"), (0.0, 0.0, 0.0))
+                place = make_pose(
+                    _parse_numbers(given.get("xyz"), (0.0, 0.0, 0.0)), rotate_rpy(*angles)
+                )
+                found.append(Shape.make(link.get("name", ""), body, place))
         return found
 
     def _file(self, address: str) -> Path:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from oracle.changes import changed
+from oracle.changes import write_changed
 from oracle.judge import judge
 
 import vkc_pin as vkc
@@ -107,7 +107,7 @@ def test_backward_push_is_a_violation(tmp_path: Path) -> None:
     hinge = motion.positions[:, motion.names.index("door.hinge")]
     lever = push.amount / (hinge[middle] - hinge[middle - 1])
     assert 0.3 < lever < 0.8  # [m] from the hinge: the region's
-    other = changed(
+    other = write_changed(
         plan.save(tmp_path / "plan.npz"),
         tmp_path / "back.npz",
         lambda content: back(content["positions"]),

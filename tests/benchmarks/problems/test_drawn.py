@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from helpers.experiments import run_experiment
-from oracle.agreement import judged, recorded, written
+from oracle.agreement import judge_all, record_violations, write_verdicts
 from oracle.plan import read_plan
 
 from vkc_pin.benchmarks.problems import random_problems
@@ -56,24 +56,24 @@ def test_plans_are_saved_and_judged(tmp_path: Path) -> None:
         assert saved.scene.document == problem.scene.document
         assert read_plan(path).steps == [step_to_dict(step) for step in saved.steps]
 
-    verdicts = judged(sorted(plans.iterdir()))
+    verdicts = judge_all(sorted(plans.iterdir()))
     assert [verdict.success for verdict in verdicts] == [trial["success"] for trial in trials]
     assert not [verdict for verdict in verdicts if verdict.success and verdict.found]
-    written(verdicts, plans)
+    write_verdicts(verdicts, plans)
     agreement = (plans / "agreement.md").read_text(encoding="utf-8")
     assert f"| success | success, and nothing found | {good} |" in agreement
 
     record = tmp_path / "results.json"
-    recorded(verdicts, record)
+    record_violations(verdicts, record)
     noted = json.loads(record.read_text(encoding="utf-8"))["trials"]
     assert [trial.pop("oracle") for trial in noted] == [len(verdict.found) for verdict in verdicts]
     assert noted == trials
     before = record.read_bytes()
     with pytest.raises(ValueError, match="plans and trials are others: 00003"):
-        recorded(verdicts[:-1], record)
+        record_violations(verdicts[:-1], record)
     verdicts[0].unjudged = "moved away"
     with pytest.raises(ValueError, match=r"1 plans were not judged, .*00000\.npz"):
-        recorded(verdicts, record)
+        record_violations(verdicts, record)
     assert record.read_bytes() == before
 
 

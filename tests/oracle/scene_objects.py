@@ -14,10 +14,10 @@ import pinocchio as pin
 import yaml
 
 from .plan import ROOT, NotJudged
-from .poses import Poses, axis_turn, orientation, pose
+from .poses import Poses, make_pose, read_orientation, rotate_about_axis
 from .urdf import Urdf, read_urdf
 
-__all__ = ["Grasp", "Robot", "Thing", "Tree", "load_robot", "load_thing"]
+__all__ = ["Grasp", "Robot", "SceneObject", "Tree", "load_object", "load_robot"]
 
 
 class Tree:
@@ -66,7 +66,7 @@ class Tree:
         }
         return {
             name: of_joint[frame.parentJoint]
-            @ pose(frame.placement.translation, frame.placement.rotation)
+            @ make_pose(frame.placement.translation, frame.placement.rotation)
             for name, frame in frames.items()
         }
 
@@ -111,13 +111,13 @@ class Grasp:
             if slides:
                 found = found @ Poses(np.tile(np.eye(3), (len(value), 1, 1)), value[:, None] * axis)
             else:
-                turn = axis_turn(axis, value)
+                turn = rotate_about_axis(axis, value)
                 found = found @ Poses(turn, point - turn @ point)
-        return found @ pose((0.0, 0.0, -self.standoff))
+        return found @ make_pose((0.0, 0.0, -self.standoff))
 
 
 @dataclass(frozen=True)
-class Thing:
+class SceneObject:
     """An object: placement, kinematics, joint limits (lower, upper, velocity, acceleration)."""
 
     name: str
@@ -194,7 +194,7 @@ class Robot:
         return {link for link, joints in self.moved_by.items() if not joints}
 
 
-def load_thing(item: Mapping[str, Any], folder: Path) -> Thing:
+def load_object(item: Mapping[str, Any], folder: Path) -> SceneObject:
     """Return the object of an entry in a scene's `objects`."""
     kind = item["type"]
     if isinstance(kind, str):
@@ -216,27 +216,27 @@ def load_thing(item: Mapping[str, Any], folder: Path) -> Thing:
         rest[joint] = float(np.clip(0.0, low, high))
     free = bool(about.get("free", False))
     grasps = {
-        entry["name"]: _grasp(entry, free, item.get("reversed") or ())
+        entry["name"]: _read_grasp(entry, free, item.get("reversed") or ())
         for entry in about["attachments"]
     }
-    return Thing(
+    return SceneObject(
         name=item["name"],
         tree=Tree(urdf, drives=False),
         free=free,
-        at=pose(item["position"], orientation(item)),
+        at=make_pose(item["position"], read_orientation(item)),
         state={**rest, **(item.get("state") or {})},
         limits=limits,
         grasps=grasps,
         latches=[{"held_at": 0.0, **latch} for latch in about.get("latches") or ()],
         resists={
-            joint: _resists(urdf, joint, (about.get("joints") or {}).get(joint, {}))
+            joint: _read_resistance(urdf, joint, (about.get("joints") or {}).get(joint, {}))
             for joint in joints
         },
         mass=about.get("mass"),
     )
 
 
-def _resists(urdf: Urdf, joint: str, said: Mapping[str, Any]) -> dict[str, float]:
+def _read_resistance(urdf: Urdf, joint: str, said: Mapping[str, Any]) -> dict[str, float]:
     """Return friction, damping, stiffness and springref of an object's joint."""
     dynamics = urdf.joints[joint].find("dynamics")
     found = {"friction": 0.0, "damping": 0.0, "stiffness": 0.0, "springref": 0.0}
@@ -248,7 +248,7 @@ def _resists(urdf: Urdf, joint: str, said: Mapping[str, Any]) -> dict[str, float
     return found | {key: float(said[key]) for key in found if key in said}
 
 
-def _grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[str]) -> Grasp:
+def _read_grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[str]) -> Grasp:
     if "approach" in entry:
         z, x = (
             np.array(entry[key], float) / np.linalg.norm(entry[key])
@@ -256,7 +256,7 @@ def _grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[str]) -
         )
         turn = np.column_stack([x, np.cross(z, x), z])
     else:
-        turn = orientation(entry)
+        turn = read_orientation(entry)
     name, joint = entry["name"], entry.get("joint", "fixed")
     axis = (
         np.array(entry["axis"], float) / np.linalg.norm(entry["axis"])
@@ -297,7 +297,7 @@ def _grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[str]) -
             (*freedom[:2], np.array([1.0, -1.0, -1.0]) * freedom[2], *freedom[3:])
             for freedom in freedoms
         ]
-    place = pose(entry.get("position", (0.0, 0.0, 0.0)), turn)
+    place = make_pose(entry.get("position", (0.0, 0.0, 0.0)), turn)
     standoff, firm = float(entry.get("standoff", 0.0)), bool(entry.get("firm", free))
     through = through or [np.zeros(3) for _ in freedoms]
     pushed = entry.get("contact") == "push"
@@ -305,7 +305,7 @@ def _grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[str]) -
     return Grasp(name, entry["link"], place, tuple(freedoms), tuple(through), standoff, firm, *own)
 
 
-def _robot_settings(file: Path) -> tuple[dict[str, Any], Path]:
+def _load_robot_settings(file: Path) -> tuple[dict[str, Any], Path]:
     """Return the contents of a robot.yaml, and it, or of the one beside a URDF that names it."""
     if file.suffix == ".yaml":
         return yaml.safe_load(file.read_text(encoding="utf-8")), file
@@ -317,7 +317,7 @@ def _robot_settings(file: Path) -> tuple[dict[str, Any], Path]:
     return {"urdf": file.name}, file
 
 
-def _joint_limits(
+def _compute_joint_limits(
     urdf: Urdf,
     joint: str,
     coupled: Mapping[str, tuple[str, float, float]],
@@ -341,7 +341,9 @@ def _joint_limits(
     return low, high, fastest, strongest
 
 
-def _rest(urdf: Urdf, joints: list[str], locked: Mapping[str, float]) -> dict[str, float]:
+def _compute_locked_values(
+    urdf: Urdf, joints: list[str], locked: Mapping[str, float]
+) -> dict[str, float]:
     """Return the values at which joints are locked."""
     rest = {}
     for joint in joints:
@@ -358,15 +360,15 @@ def load_robot(
 ) -> Robot:
     """Return a scene's robot; `arm` are its planned joints, which a saved plan names."""
     about = {"name": item} if isinstance(item, str) else dict(item)
-    file = _robot_file(about["name"], folder)
-    own, file = _robot_settings(file)
+    file = _find_robot_file(about["name"], folder)
+    own, file = _load_robot_settings(file)
     urdf = read_urdf(file.parent / own["urdf"])
     tool = about.get("tool_frame") or own.get("tool_frame")
     if tool is None:
         raise NotJudged("no file names the robot's tool frame")
     if about.get("base", "omni") not in ("omni", "differential", "ackermann", "fixed"):
         raise NotJudged(f"base {about['base']}")
-    semantics = _srdf(urdf.path, file.parent, own.get("srdf"))
+    semantics = _read_srdf(urdf.path, file.parent, own.get("srdf"))
     if semantics is None:
         raise NotJudged("no SRDF says which links of the robot may touch")
     base, joints = own.get("base") or {}, own.get("joints") or {}
@@ -381,16 +383,16 @@ def load_robot(
         f"base_{k}": (*span, v, a)
         for k, span, v, a in zip(("x", "y", "yaw"), spans, speeds, strengths, strict=True)
     }
-    coupled = _coupled(urdf, own.get("couplings") or {}, arm)
+    coupled = _find_coupled_joints(urdf, own.get("couplings") or {}, arm)
     for joint in arm:
-        limits[joint] = _joint_limits(urdf, joint, coupled, joints)
+        limits[joint] = _compute_joint_limits(urdf, joint, coupled, joints)
     gripper = {
         joint: (said["closed"], said["open"]) for joint, said in (own.get("gripper") or {}).items()
     }
     wide = {joint: opened for joint, (_, opened) in gripper.items()}
     locked = {**own.get("home", {}), **wide, **own.get("locked_joints", {})}
     others = [j for j in urdf.joints if urdf.moves(j) and j not in arm and j not in coupled]
-    rest = _rest(urdf, others, locked)
+    rest = _compute_locked_values(urdf, others, locked)
     for joint, (master, factor, offset) in (
         (joint, urdf.mimics(joint) or ("", 0.0, 0.0)) for joint in rest
     ):
@@ -406,7 +408,7 @@ def load_robot(
         locked=rest,
         limits=limits,
         home={
-            **_home(semantics, arm),
+            **_read_home(semantics, arm),
             **{joint: value for joint, value in own.get("home", {}).items() if joint in arm},
         },
         exempt={
@@ -423,7 +425,7 @@ def load_robot(
     )
 
 
-def _coupled(
+def _find_coupled_joints(
     urdf: Urdf, stated: Mapping[str, Any], arm: list[str]
 ) -> dict[str, tuple[str, float, float]]:
     """Return mimicking joint → (planned joint, factor, offset)."""
@@ -453,7 +455,7 @@ def _coupled(
     return found
 
 
-def _robot_file(name: str, folder: Path) -> Path:
+def _find_robot_file(name: str, folder: Path) -> Path:
     if name.endswith((".urdf", ".yaml", ".yml")) or "/" in name:
         file = folder / name
         return file / "robot.yaml" if file.is_dir() else file
@@ -463,7 +465,7 @@ def _robot_file(name: str, folder: Path) -> Path:
     return file
 
 
-def _srdf(urdf: Path, folder: Path, named: str | None) -> ElementTree.Element | None:
+def _read_srdf(urdf: Path, folder: Path, named: str | None) -> ElementTree.Element | None:
     stems = dict.fromkeys((urdf.stem, urdf.stem.removesuffix("_robot")))
     places = (
         [folder / named]
@@ -474,7 +476,7 @@ def _srdf(urdf: Path, folder: Path, named: str | None) -> ElementTree.Element | 
     return None if file is None else ElementTree.parse(file).getroot()
 
 
-def _home(semantics: ElementTree.Element, arm: list[str]) -> dict[str, float]:
+def _read_home(semantics: ElementTree.Element, arm: list[str]) -> dict[str, float]:
     """Return where an SRDF says that all planned joints rest, a state called home first."""
     states = sorted(semantics.findall("group_state"), key=lambda state: state.get("name") != "home")
     for state in states:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tests.oracle.agreement import format_table
 
-from .judged import judged_dataset
+from .judged import judge_dataset
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -20,7 +20,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("dataset", type=Path, help="folder of a dataset")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     given = parser.parse_args(arguments)
-    verdicts = judged_dataset(given.dataset, jobs=given.jobs)
+    verdicts = judge_dataset(given.dataset, jobs=given.jobs)
     sys.stdout.write(format_table(verdicts) + "\n")
     return int(any(one.found or one.unjudged for one in verdicts))
 

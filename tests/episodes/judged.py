@@ -16,32 +16,34 @@ from vkc_pin.datasets.episode import Episode
 from vkc_pin.datasets.formats.hdf5 import read_episodes
 from vkc_pin.planning.plan import Plan
 
-__all__ = ["judged_dataset", "saved"]
+__all__ = ["judge_dataset", "save_episode"]
 
 VERDICTS = "oracle.jsonl"
 """In a dataset's folder: a line a shard."""
 
 
-def judged_dataset(folder: Path, *, jobs: int = 1) -> list[Verdict]:
+def judge_dataset(folder: Path, *, jobs: int = 1) -> list[Verdict]:
     """Judge the episodes of a dataset; each shard's verdicts are saved in its folder and reused."""
     dataset = Dataset.open(folder)
-    kept = _kept(folder / VERDICTS)
-    left = [shard for shard in dataset.shards if _name(dataset, shard) not in kept]
+    kept = _read_verdicts(folder / VERDICTS)
+    left = [shard for shard in dataset.shards if _get_name(dataset, shard) not in kept]
     with (
         ProcessPoolExecutor(jobs) as pool,
         (folder / VERDICTS).open("a", encoding="utf-8") as lines,
     ):
-        for shard, verdicts in zip(left, pool.map(_shard, [folder] * len(left), left), strict=True):
-            name = _name(dataset, shard)
+        for shard, verdicts in zip(
+            left, pool.map(_judge_shard, [folder] * len(left), left), strict=True
+        ):
+            name = _get_name(dataset, shard)
             kept[name] = verdicts
             own = [{**asdict(one), "path": str(one.path)} for one in verdicts]
             lines.write(json.dumps({"shard": name, "verdicts": own}) + "\n")
             lines.flush()
-    return [one for shard in dataset.shards for one in kept[_name(dataset, shard)]]
+    return [one for shard in dataset.shards for one in kept[_get_name(dataset, shard)]]
 
 
-def saved(episode: Episode, path: Path) -> Path:
-    """Write an episode as a plan that says of itself what the dataset says of it."""
+def save_episode(episode: Episode, path: Path) -> Path:
+    """Write an episode as a plan with the verdict of the dataset."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         plan = Plan(
@@ -56,23 +58,23 @@ def saved(episode: Episode, path: Path) -> Path:
         return plan.save(path)
 
 
-def _shard(folder: Path, shard: Path) -> list[Verdict]:
-    return list(_verdicts(folder, shard))
+def _judge_shard(folder: Path, shard: Path) -> list[Verdict]:
+    return list(_iterate_verdicts(folder, shard))
 
 
-def _verdicts(folder: Path, shard: Path) -> Iterator[Verdict]:
+def _iterate_verdicts(folder: Path, shard: Path) -> Iterator[Verdict]:
     with tempfile.TemporaryDirectory() as work:
         for episode in read_episodes(shard, folder / "scenes"):
-            verdict = judge(saved(episode, Path(work) / f"{episode.number:06d}.npz"))
+            verdict = judge(save_episode(episode, Path(work) / f"{episode.number:06d}.npz"))
             verdict.path.unlink()
             yield replace(verdict, path=Path(shard.parent.name) / verdict.path.name)
 
 
-def _name(dataset: Dataset, shard: Path) -> str:
+def _get_name(dataset: Dataset, shard: Path) -> str:
     return shard.relative_to(dataset.folder).as_posix()
 
 
-def _kept(file: Path) -> dict[str, list[Verdict]]:
+def _read_verdicts(file: Path) -> dict[str, list[Verdict]]:
     if not file.is_file():
         return {}
     said = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]

@@ -8,7 +8,7 @@ import pytest
 from helpers.datasets import SMALL
 
 from tests.episodes.__main__ import main
-from tests.episodes.judged import VERDICTS, judged_dataset
+from tests.episodes.judged import VERDICTS, judge_dataset
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generation import generate
 
@@ -20,23 +20,23 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return generate(SMALL, 2, tmp_path_factory.mktemp("judged") / "out")
 
 
-def test_episodes_are_judged_once(made: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+def test_each_episode_is_judged_once(made: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(made.folder)]) == 0
     assert "2 plans" in capsys.readouterr().out
     kept = (made.folder / VERDICTS).read_text(encoding="utf-8")
     assert [len(json.loads(line)["verdicts"]) for line in kept.splitlines()] == [2]
-    assert [one.found for one in judged_dataset(made.folder)] == [[], []]
+    assert [one.found for one in judge_dataset(made.folder)] == [[], []]
     assert (made.folder / VERDICTS).read_text(encoding="utf-8") == kept, "nothing is judged twice"
 
 
-def test_changed_motion_is_invalid(made: Dataset, tmp_path: Path) -> None:
+def test_changed_motion_is_judged_invalid(made: Dataset, tmp_path: Path) -> None:
     shutil.copytree(made.folder, tmp_path / "copy")
     (tmp_path / "copy" / VERDICTS).unlink(missing_ok=True)
     (shard,) = Dataset.open(tmp_path / "copy").shards
     with h5py.File(shard, "r+") as file:
         positions = file["data/demo_1/motion/knot_positions"]
         positions[len(positions) // 2, 4] += 0.4
-    good, changed = judged_dataset(tmp_path / "copy")
+    good, changed = judge_dataset(tmp_path / "copy")
     assert not good.found
     assert {one.rule for one in changed.found} & {
         "velocity",

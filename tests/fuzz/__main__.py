@@ -32,7 +32,7 @@ def main() -> int:
         help="write what goes wrong into the corpus, a file for each error",
     )
     parser.add_argument(
-        "--show", type=int, metavar="NUMBER", help="print one case of --kind, and what comes of it"
+        "--show", type=int, metavar="NUMBER", help="print one case of --kind and its outcome"
     )
     given = parser.parse_args()
     worker, rows, seen, bad = Worker(), [], Counter[str](), 0
@@ -63,7 +63,7 @@ def main() -> int:
                 )
                 sys.stdout.flush()
                 if given.keep:
-                    keep(kind, worker.run(**asked, only="make")["case"], found)
+                    save_case(kind, worker.run(**asked, only="make")["case"], found)
         rows.append((kind, count, outcomes, longest, largest))
     good = sorted({name for _, _, outcomes, _, _ in rows for name in outcomes} - set(BAD))
     columns = [*good, *BAD]
@@ -79,7 +79,7 @@ def main() -> int:
     return 1 if bad else 0
 
 
-def keep(kind: str, case: dict[str, object], found: dict[str, str]) -> None:
+def save_case(kind: str, case: dict[str, object], found: dict[str, str]) -> None:
     """Write a case into the corpus."""
     CORPUS.mkdir(exist_ok=True)
     text = json.dumps(

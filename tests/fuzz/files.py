@@ -18,16 +18,16 @@ from vkc_pin.world.files.resources import find_resource_folder
 
 from . import odd
 from .calls import TINY
-from .mutate import changed, data_changes, spoiled
+from .mutate import apply_changes, choose_changes, corrupt
 
-__all__ = ["case", "document_case", "run", "run_document"]
+__all__ = ["make_case", "make_document_case", "run", "run_document"]
 
 MESHES = {"stl": "box.stl", "obj": "box.obj", "ply": "box.ply", "dae": "box.dae"}
 PLANNED = 0.02  # the share of what loads that is planned in
 
 
 @functools.cache
-def pool() -> Path:
+def make_pool() -> Path:
     """A copy of robots and scenes, with a mesh of each kind and a scene that has them."""
     root = Path(tempfile.mkdtemp(prefix="vkc_fuzz_files_"))
     atexit.register(shutil.rmtree, root, ignore_errors=True)
@@ -51,32 +51,32 @@ def pool() -> Path:
 
 
 @functools.cache
-def _files() -> tuple[str, ...]:
+def _list_files() -> tuple[str, ...]:
     found = [
         path
-        for path in sorted(pool().rglob("*"))
+        for path in sorted(make_pool().rglob("*"))
         if path.suffix in (".yaml", ".urdf", ".srdf", ".stl", ".obj", ".ply", ".dae")
     ]
-    return tuple(str(path.relative_to(pool())) for path in found)
+    return tuple(str(path.relative_to(make_pool())) for path in found)
 
 
-def case(rng: random.Random) -> dict[str, Any]:
-    """Return a case: a file, and what is in it instead."""
-    name = rng.choice(_files())
+def make_case(rng: random.Random) -> dict[str, Any]:
+    """Return a case: a file and its new contents."""
+    name = rng.choice(_list_files())
     if name.endswith(".stl") and rng.random() < 0.7:  # there are many
-        name = rng.choice([other for other in _files() if not other.endswith(".stl")])
-    data = spoiled(rng, (pool() / name).read_bytes())
+        name = rng.choice([other for other in _list_files() if not other.endswith(".stl")])
+    data = corrupt(rng, (make_pool() / name).read_bytes())
     return {"file": name, "content": data.decode("latin-1"), "plan": rng.random() < PLANNED}
 
 
 def run(given: dict[str, Any]) -> str:
-    """Load what the file belongs to, and use it."""
-    file = pool() / given["file"]
+    """Load and use the scene or robot that a file belongs to."""
+    file = make_pool() / given["file"]
     kept = file.read_bytes() if file.is_file() else None
     file.parent.mkdir(parents=True, exist_ok=True)
     try:
         file.write_bytes(given["content"].encode("latin-1"))
-        return _used(_loaded(file), planned=given.get("plan", False))
+        return _use(_load(file), planned=given.get("plan", False))
     finally:
         if kept is None:
             file.unlink()
@@ -84,14 +84,14 @@ def run(given: dict[str, Any]) -> str:
             file.write_bytes(kept)
 
 
-def _loaded(file: Path) -> vkc.Scene:
-    scenes, robot = pool() / "scenes", "../robots/husky_ur5e/robot.yaml"
+def _load(file: Path) -> vkc.Scene:
+    scenes, robot = make_pool() / "scenes", "../robots/husky_ur5e/robot.yaml"
     bare: dict[str, Any] = {
         "robot": "husky_ur5e",
         "start": {"base": [0, 0, 0]},
         "arena": {"x": [-9, 9], "y": [-9, 9]},
     }
-    where = file.relative_to(pool()).parts
+    where = file.relative_to(make_pool()).parts
     if where[0] == "robots":
         vkc.load_robot(
             file if file.suffix in (".yaml", ".urdf") else file.parent / "husky_ur5e.urdf"
@@ -113,7 +113,7 @@ def _loaded(file: Path) -> vkc.Scene:
     return vkc.load_scene(file if file.suffix == ".yaml" else scenes / "meshes.yaml")
 
 
-def _used(scene: vkc.Scene, *, planned: bool) -> str:
+def _use(scene: vkc.Scene, *, planned: bool) -> str:
     assert not np.isnan(scene.start_clearance()), "a clearance that is no number"
     repr(scene)
     vkc.Scene.from_document(scene.document, scene.folder)
@@ -129,26 +129,26 @@ def _used(scene: vkc.Scene, *, planned: bool) -> str:
 
 
 @functools.cache
-def _documents() -> dict[str, Any]:
+def _load_documents() -> dict[str, Any]:
     names = ("door", "drawer", "fetch", "household", "init_1", "gap_table")
     return {name: vkc.load_scene(name).document for name in names}
 
 
-def document_case(rng: random.Random) -> dict[str, Any]:
-    """Return a case: a scene, and what is changed in its description."""
-    name = rng.choice(tuple(_documents()))
+def make_document_case(rng: random.Random) -> dict[str, Any]:
+    """Return a case: a scene and changes of its description."""
+    name = rng.choice(tuple(_load_documents()))
     values = odd.VALUES if rng.random() < 0.2 else tuple(odd.JSON_VALUES)
     return {
         "scene": name,
-        "changes": data_changes(rng, _documents()[name], values),
+        "changes": choose_changes(rng, _load_documents()[name], values),
         "plan": rng.random() < PLANNED,
     }
 
 
 def run_document(given: dict[str, Any]) -> str:
     """Build the scene from its description, and use it."""
-    document = changed(_documents()[given["scene"]], given["changes"])
-    return _used(
+    document = apply_changes(_load_documents()[given["scene"]], given["changes"])
+    return _use(
         vkc.Scene.from_document(document, find_resource_folder("scenes")),
         planned=given.get("plan", False),
     )

@@ -10,7 +10,7 @@ from typing import Any
 
 from . import odd
 
-__all__ = ["changed", "data_changes", "places", "spoiled"]
+__all__ = ["apply_changes", "choose_changes", "corrupt", "iterate_paths"]
 
 _NUMBER = re.compile(rb"-?\d+\.?\d*(?:e-?\d+)?")
 _WORD = re.compile(rb"[A-Za-z_][\w.]*")
@@ -51,7 +51,7 @@ _WORDS = (
 )
 
 
-def spoiled(rng: random.Random, data: bytes, most: int = 3) -> bytes:
+def corrupt(rng: random.Random, data: bytes, most: int = 3) -> bytes:
     """Return a file's content with one to a few changes."""
     for _ in range(rng.choice((1, 1, 2, most))):
         data = rng.choice(_CHANGES)(rng, data)[:2_000_000]
@@ -70,22 +70,22 @@ def _cut(rng: random.Random, data: bytes) -> bytes:
     return data[: rng.randrange(len(data) + 1)]
 
 
-def _span(rng: random.Random, data: bytes) -> tuple[int, int]:
+def _choose_span(rng: random.Random, data: bytes) -> tuple[int, int]:
     start = rng.randrange(len(data) + 1)
     return start, min(len(data), start + rng.choice((1, 3, 10, 40, 200, 1000)))
 
 
 def _delete(rng: random.Random, data: bytes) -> bytes:
-    start, end = _span(rng, data)
+    start, end = _choose_span(rng, data)
     return data[:start] + data[end:]
 
 
 def _double(rng: random.Random, data: bytes) -> bytes:
-    start, end = _span(rng, data)
+    start, end = _choose_span(rng, data)
     return data[:end] + data[start:end] * rng.choice((1, 1, 2, 50, 1000)) + data[end:]
 
 
-def _line(rng: random.Random, data: bytes) -> bytes:
+def _change_line(rng: random.Random, data: bytes) -> bytes:
     lines = data.split(b"\n")
     k, other = rng.randrange(len(lines)), rng.randrange(len(lines))
     match rng.randrange(5):
@@ -102,7 +102,7 @@ def _line(rng: random.Random, data: bytes) -> bytes:
     return b"\n".join(lines)
 
 
-def _replaced(
+def _replace(
     rng: random.Random, data: bytes, pattern: re.Pattern[bytes], by: tuple[bytes, ...] = ()
 ) -> bytes:
     found = list(pattern.finditer(data))
@@ -113,9 +113,9 @@ def _replaced(
     return data[: match.start()] + new + data[match.end() :]
 
 
-def _number(rng: random.Random, data: bytes) -> bytes:
+def _change_number(rng: random.Random, data: bytes) -> bytes:
     if rng.random() < 0.4:  # another one that may well do
-        return _replaced(
+        return _replace(
             rng,
             data,
             _NUMBER,
@@ -123,21 +123,21 @@ def _number(rng: random.Random, data: bytes) -> bytes:
                 b"%g" % rng.choice((rng.uniform(-3, 3), rng.uniform(0, 0.1), 1e3)) for _ in "abc"
             ),
         )
-    return _replaced(rng, data, _NUMBER, _NUMBERS)
+    return _replace(rng, data, _NUMBER, _NUMBERS)
 
 
-def _word(rng: random.Random, data: bytes) -> bytes:
-    return _replaced(rng, data, _WORD, _WORDS)
+def _change_word(rng: random.Random, data: bytes) -> bytes:
+    return _replace(rng, data, _WORD, _WORDS)
 
 
-def _attribute(rng: random.Random, data: bytes) -> bytes:
-    return _replaced(rng, data, _ATTRIBUTE, (b"",))
+def _change_attribute(rng: random.Random, data: bytes) -> bytes:
+    return _replace(rng, data, _ATTRIBUTE, (b"",))
 
 
-def _tag(rng: random.Random, data: bytes) -> bytes:
+def _change_tag(rng: random.Random, data: bytes) -> bytes:
     found = list(_TAG.finditer(data))
     if not found:
-        return _word(rng, data)
+        return _change_word(rng, data)
     match, other = rng.choice(found), rng.choice(found)
     new = rng.choice(
         (
@@ -154,7 +154,7 @@ def _tag(rng: random.Random, data: bytes) -> bytes:
     return data[: match.start()] + new + data[match.end() :]
 
 
-def _coded(rng: random.Random, data: bytes) -> bytes:
+def _recode(rng: random.Random, data: bytes) -> bytes:
     text = data.decode("latin-1")
     return rng.choice(
         (
@@ -171,7 +171,7 @@ def _coded(rng: random.Random, data: bytes) -> bytes:
     )
 
 
-def _around(rng: random.Random, data: bytes) -> bytes:
+def _surround(rng: random.Random, data: bytes) -> bytes:
     return rng.choice(
         (
             b"- " * 5000 + data,
@@ -192,32 +192,32 @@ _CHANGES = (
     _cut,
     _delete,
     _double,
-    _line,
-    _line,
-    *[_number] * 6,
-    _word,
-    _word,
-    _attribute,
-    _tag,
-    _tag,
-    _coded,
-    _around,
+    _change_line,
+    _change_line,
+    *[_change_number] * 6,
+    _change_word,
+    _change_word,
+    _change_attribute,
+    _change_tag,
+    _change_tag,
+    _recode,
+    _surround,
 )
 
 
-def places(data: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+def iterate_paths(data: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
     """Return the paths of everything in plain data."""
     yield path
     if isinstance(data, dict | list):
         for key, value in data.items() if isinstance(data, dict) else enumerate(data):
-            yield from places(value, (*path, key))
+            yield from iterate_paths(value, (*path, key))
 
 
-def data_changes(
+def choose_changes(
     rng: random.Random, data: Any, values: tuple[str, ...] = tuple(odd.JSON_VALUES)
 ) -> list[list[Any]]:
     """Return one to three changes for `changed`: a path, an operation, and a value, key or path."""
-    everywhere = [path for path in places(data) if path]
+    everywhere = [path for path in iterate_paths(data) if path]
     made: list[list[Any]] = []
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         path, what = (
@@ -233,19 +233,19 @@ def data_changes(
     return made
 
 
-def changed(data: Any, changes: list[list[Any]]) -> Any:
+def apply_changes(data: Any, changes: list[list[Any]]) -> Any:
     """Return a copy of plain data with changes; those whose place is gone by then are left out."""
     data = copy.deepcopy(data)
     for path, what, value in changes:
         try:
-            around, key = _at(data, path[:-1]), path[-1]
+            around, key = _get_at(data, path[:-1]), path[-1]
             around[key]
             if what == "set":
-                around[key] = odd.value(value)
+                around[key] = odd.make_value(value)
             elif what == "remove":
                 del around[key]
             elif what == "copy":
-                around[key] = copy.deepcopy(_at(data, value))
+                around[key] = copy.deepcopy(_get_at(data, value))
             elif what == "rename" and isinstance(around, dict):
                 around[value] = around.pop(key)
             elif what == "double" and isinstance(around, list):
@@ -255,7 +255,7 @@ def changed(data: Any, changes: list[list[Any]]) -> Any:
     return data
 
 
-def _at(data: Any, path: list[Any]) -> Any:
+def _get_at(data: Any, path: list[Any]) -> Any:
     for key in path:
         data = data[key]
     return data

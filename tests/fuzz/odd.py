@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-__all__ = ["JSON_VALUES", "RAISING", "USUAL", "VALUES", "pipe", "value", "within"]
+__all__ = ["JSON_VALUES", "RAISING", "USUAL", "VALUES", "insert_odd", "make_pipe", "make_value"]
 
 
 @functools.cache
-def pipe() -> Path:
+def make_pipe() -> Path:
     """Return a pipe that nobody reads or writes; real devices could damage the machine."""
     made = Path(tempfile.mkdtemp())
     atexit.register(shutil.rmtree, made, ignore_errors=True)
@@ -58,20 +58,20 @@ class _Endless:
             yield 0.0
 
 
-def _nested(depth: int) -> list[Any]:
+def _nest(depth: int) -> list[Any]:
     made: list[Any] = []
     for _ in range(depth):
         made = [made]
     return made
 
 
-def _itself() -> list[Any]:
+def _make_recursive_list() -> list[Any]:
     made: list[Any] = []
     made.append(made)
     return made
 
 
-def _pose(entry: float) -> pin.SE3:
+def _make_pose(entry: float) -> pin.SE3:
     return pin.SE3(np.full((3, 3), entry), np.full(3, entry))
 
 
@@ -124,7 +124,7 @@ JSON_VALUES: dict[str, Any] = {
     "texts": ["x", "y", "z"],
     "ragged": [[1, 2], [3]],
     "many": [0.0] * 20000,
-    "nested": _nested(60),
+    "nested": _nest(60),
     "empty object": {},
     "object": {"x": 1},
     "object of nan": {"hinge": math.nan},
@@ -154,12 +154,12 @@ _OTHERS: dict[str, Callable[[], Any]] = {
     "exception": lambda: ValueError("x"),
     "path": lambda: Path("nowhere/x.yaml"),
     "folder": lambda: Path("/"),
-    "pipe": pipe,
+    "pipe": make_pipe,
     "long path": lambda: Path("x" * 10000),
     "null path": lambda: Path("\x00"),
     "surrogate path": lambda: Path("a\ud800b.yaml"),
-    "deep": lambda: _nested(5000),
-    "itself": _itself,
+    "deep": lambda: _nest(5000),
+    "itself": _make_recursive_list,
     "dict itself": lambda: (lambda d: d.update(d=d) or d)({}),
     "keys of all kinds": lambda: {None: 1, 1: 2, (): 3, "x": 4},
     "array": lambda: np.zeros(3),
@@ -183,9 +183,9 @@ _OTHERS: dict[str, Callable[[], Any]] = {
     "datetime": lambda: np.datetime64("2020-01-01"),
     "masked": lambda: np.ma.masked,
     "SE3": pin.SE3.Identity,
-    "SE3 of nan": lambda: _pose(math.nan),
-    "SE3 of zeros": lambda: _pose(0.0),
-    "SE3 of 1e300": lambda: _pose(1e300),
+    "SE3 of nan": lambda: _make_pose(math.nan),
+    "SE3 of zeros": lambda: _make_pose(0.0),
+    "SE3 of 1e300": lambda: _make_pose(1e300),
     "Quaternion": pin.Quaternion.Identity,
     "Model": pin.Model,
     "GeometryModel": pin.GeometryModel,
@@ -240,18 +240,18 @@ RAISING = (
     "hostile RuntimeError",
     "hostile KeyError",
 )
-"""Names of those that can be called and raise what they like."""
+"""Names of callables that raise errors."""
 
 
-def value(name: str) -> Any:
-    """Return the value of a name; each time a new one."""
+def make_value(name: str) -> Any:
+    """Return a new value by its name."""
     if name in _OTHERS:
         return _OTHERS[name]()
     found = JSON_VALUES[name]
     return type(found)(found) if isinstance(found, list | dict) else found
 
 
-def within(given: Any, odd: Any, at: int) -> Any:
+def insert_odd(given: Any, odd: Any, at: int) -> Any:
     """Return a copy of a list or dictionary with one odd entry, or `odd` itself if it is empty."""
     if isinstance(given, dict) and given:
         keys = list(given)

@@ -1,4 +1,4 @@
-"""Saved plans, changed at random: what is said in them, their arrays, the archive, its bytes."""
+"""Changes saved plans at random: their metadata, arrays, archive and bytes."""
 
 from __future__ import annotations
 
@@ -14,54 +14,54 @@ import numpy as np
 import vkc_pin as vkc
 
 from . import odd
-from .calls import folder, motion, saved, scene
-from .mutate import changed, data_changes
+from .calls import get_folder, load_door, make_motion, make_plan
+from .mutate import apply_changes, choose_changes
 
-__all__ = ["case", "run"]
+__all__ = ["make_case", "run"]
 
 ARRAYS = ("times", "positions")
 
 
 @functools.cache
-def _base() -> tuple[dict[str, Any], dict[str, Any]]:
-    """A plan of all that plans can have: what it says, and its arrays."""
+def _make_base() -> tuple[dict[str, Any], dict[str, Any]]:
+    """Make a plan with all optional parts: its metadata and arrays."""
     terms = [
         vkc.Constraint("elbow", lambda s: s.coordinate("elbow_joint"), lower=-3.0),
         vkc.Cost("x", lambda s: s.position("tool0")[0]),
     ]
     steps: list[Any] = [vkc.Actuate("drawer", {"slide": 0.1}), vkc.GoTo(0.1, 0.1)]
-    report = vkc.validate(scene(), steps, motion(), terms=terms)
-    planned = saved()
+    report = vkc.validate(load_door(), steps, make_motion(), terms=terms)
+    planned = make_plan()
     from vkc_pin.world.task.terms import trace_terms
 
     plan = vkc.Plan(
-        scene(),
+        load_door(),
         tuple(steps),
         vkc.Options(),
-        motion(),
+        make_motion(),
         report,
         "rejected",
         planned.statistics,
         history=planned.history,
-        terms=trace_terms(scene(), terms),
+        terms=trace_terms(load_door(), terms),
     )
-    file = plan.save(folder() / "base.npz")
+    file = plan.save(get_folder() / "base.npz")
     with np.load(file) as archive:
         return json.loads(str(archive["about"])), {name: archive[name] for name in ARRAYS}
 
 
-def _archive(about: Any, arrays: dict[str, Any]) -> bytes:
+def _write_archive(about: Any, arrays: dict[str, Any]) -> bytes:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, about=about, **arrays)
     return buffer.getvalue()
 
 
-def case(rng: random.Random) -> dict[str, Any]:
+def make_case(rng: random.Random) -> dict[str, Any]:
     """Return a case: changes of the metadata, of arrays, of the archive's members, or of bytes."""
-    about, _ = _base()
+    about, _ = _make_base()
     match rng.randrange(8):
         case 0 | 1 | 2 | 3:
-            return {"about": data_changes(rng, about)}
+            return {"about": choose_changes(rng, about)}
         case 4:
             return {"array": rng.choice((*ARRAYS, "about")), "odd": rng.choice(odd.VALUES)}
         case 5:
@@ -83,16 +83,16 @@ def case(rng: random.Random) -> dict[str, Any]:
             }
 
 
-def _content(given: dict[str, Any]) -> bytes:
-    about, arrays = _base()
+def _make_content(given: dict[str, Any]) -> bytes:
+    about, arrays = _make_base()
     if "about" in given:
-        return _archive(np.array(json.dumps(changed(about, given["about"]))), arrays)
+        return _write_archive(np.array(json.dumps(apply_changes(about, given["about"]))), arrays)
     if "array" in given:
         parts = {"about": np.array(json.dumps(about)), **arrays}
-        value = odd.value(given["odd"])
+        value = odd.make_value(given["odd"])
         try:
             parts[given["array"]] = np.asarray(value)
-            return _archive(parts.pop("about"), parts)
+            return _write_archive(parts.pop("about"), parts)
         except (
             ValueError,
             TypeError,
@@ -101,9 +101,9 @@ def _content(given: dict[str, Any]) -> bytes:
             RecursionError,
         ):  # it is no array, and cannot be pickled
             return b""
-    data = _archive(np.array(json.dumps(about)), arrays)
+    data = _write_archive(np.array(json.dumps(about)), arrays)
     if "member" in given:
-        return _members(data, given["member"], given["does"])
+        return _change_members(data, given["member"], given["does"])
     if "cut" in given:
         return data[: given["cut"]]
     found = bytearray(data)
@@ -112,7 +112,7 @@ def _content(given: dict[str, Any]) -> bytes:
     return bytes(found)
 
 
-def _members(data: bytes, name: str, does: str) -> bytes:
+def _change_members(data: bytes, name: str, does: str) -> bytes:
     buffer = io.BytesIO()
     with (
         zipfile.ZipFile(io.BytesIO(data)) as old,
@@ -147,8 +147,8 @@ def _members(data: bytes, name: str, does: str) -> bytes:
 
 def run(given: dict[str, Any]) -> str:
     """Load it, look at it, and check it."""
-    file = folder() / "spoiled.npz"
-    file.write_bytes(_content(given))
+    file = get_folder() / "spoiled.npz"
+    file.write_bytes(_make_content(given))
     plan = vkc.Plan.load(file)
     plan.summary()
     json.dumps(plan.to_dict())

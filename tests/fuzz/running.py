@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-__all__ = ["BAD", "KINDS", "Worker", "made", "serve"]
+__all__ = ["BAD", "KINDS", "Worker", "make_case", "serve"]
 
 SECONDS, MEGABYTES = 2.0, 500.0  # of processor time and memory that a case may take
 PLANNING = 6.0  # seconds more where there is a problem to build, and to plan for its time limit
@@ -27,16 +27,16 @@ BAD = ("raw", "slow", "memory", "crashed", "hung")
 TESTS = Path(__file__).resolve().parents[1]
 
 
-def _kinds() -> dict[
+def _load_kinds() -> dict[
     str, tuple[Callable[[random.Random], dict[str, Any]], Callable[[dict[str, Any]], str]]
 ]:
     from . import calls, files, plans
 
     return {
-        "files": (files.case, files.run),
-        "documents": (files.document_case, files.run_document),
-        "calls": (calls.case, calls.run),
-        "plans": (plans.case, plans.run),
+        "files": (files.make_case, files.run),
+        "documents": (files.make_document_case, files.run_document),
+        "calls": (calls.make_case, calls.run),
+        "plans": (plans.make_case, plans.run),
     }
 
 
@@ -44,19 +44,19 @@ KINDS = {"files": 0.35, "documents": 0.2, "calls": 0.35, "plans": 0.1}
 """Kind of cases → its share."""
 
 
-def made(kind: str, seed: int, number: int) -> dict[str, Any]:
-    """Return case number `number` of a kind; seed and number say which."""
-    return _kinds()[kind][0](random.Random(f"{kind} {seed} {number}"))
+def make_case(kind: str, seed: int, number: int) -> dict[str, Any]:
+    """Return case `number` of a kind, determined by seed and number."""
+    return _load_kinds()[kind][0](random.Random(f"{kind} {seed} {number}"))
 
 
 def serve() -> None:
-    """Take cases from standard input, a line each, and say what came of each on standard output."""
+    """Read cases from standard input, a line each, and print the outcome of each."""
     answers = os.fdopen(os.dup(1), "w")
     silent = os.open(os.devnull, os.O_RDWR)
     os.dup2(silent, 1)
     os.dup2(silent, 2)
     warnings.simplefilter("ignore")
-    kinds = _kinds()
+    kinds = _load_kinds()
     _limit_memory()
     requests, sys.stdin = sys.stdin, open(os.devnull)  # noqa: SIM115, PTH123 - for as long as the process lives
     for line in requests:
@@ -64,7 +64,7 @@ def serve() -> None:
         case = (
             asked["case"]
             if "case" in asked
-            else made(asked["kind"], asked["seed"], asked["number"])
+            else make_case(asked["kind"], asked["seed"], asked["number"])
         )
         if asked.get("only") == "make":
             answers.write(json.dumps({"case": case}) + "\n")
@@ -81,7 +81,7 @@ def _limit_memory() -> None:
     )
 
 
-def _memory(name: str) -> float:
+def _read_memory(name: str) -> float:
     text = Path("/proc/self/status").read_text(encoding="ascii")
     return (
         next(float(line.split()[1]) for line in text.splitlines() if line.startswith(name)) / 1024.0
@@ -92,7 +92,7 @@ def _run(does: Callable[[dict[str, Any]], str], case: dict[str, Any]) -> dict[st
     from vkc_pin.errors import VkcError
 
     Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak begins anew
-    before, began, error = _memory("VmRSS"), time.process_time(), ""
+    before, began, error = _read_memory("VmRSS"), time.process_time(), ""
     try:
         outcome = does(case)
     except VkcError as refusal:
@@ -111,15 +111,15 @@ def _run(does: Callable[[dict[str, Any]], str], case: dict[str, Any]) -> dict[st
             else "the call"
         )
         outcome, error = "raw", f"{type(raised).__name__} in {where}: {str(raised)[:200]!a}"
-    seconds, grown = time.process_time() - began, _memory("VmHWM") - before
-    if outcome != "raw" and seconds > SECONDS + PLANNING * _plans(case):
+    seconds, grown = time.process_time() - began, _read_memory("VmHWM") - before
+    if outcome != "raw" and seconds > SECONDS + PLANNING * _is_planning(case):
         outcome, error = "slow", f"{seconds:.1f} s"
     if outcome != "raw" and grown > MEGABYTES:
         outcome, error = "memory", f"{grown:.0f} MB"
     return {"outcome": outcome, "error": error, "seconds": seconds, "grown": grown}
 
 
-def _plans(case: dict[str, Any]) -> bool:
+def _is_planning(case: dict[str, Any]) -> bool:
     name = case.get("call", "")
     pictures = ("Plan.to_html", "to_html", "show", "animate", "Plan.plot")
     planning = (
@@ -145,7 +145,7 @@ class Worker:
         self.count, self.hung = 0, hung
 
     def run(self, **asked: Any) -> dict[str, Any]:
-        """Return what came of a case: its outcome, its error if there is one, and what it took."""
+        """Return the outcome of a case, its error if any, and its time and memory."""
         if self.process is None or self.count >= FRESH:
             self.close()
             self.folder = tempfile.TemporaryDirectory(prefix="vkc_fuzz_")

@@ -29,7 +29,7 @@ def worker() -> Iterator[Worker]:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", CASES, ids=["fixed", "fresh"])
-def test_random_input_gives_a_result_or_an_error(worker: Worker, kind: str, seed: int) -> None:
+def test_random_input_yields_a_result_or_an_error(worker: Worker, kind: str, seed: int) -> None:
     bad = []
     for number in range(round(CASES[seed] * KINDS[kind])):
         found = worker.run(kind=kind, seed=seed, number=number)
@@ -40,7 +40,7 @@ def test_random_input_gives_a_result_or_an_error(worker: Worker, kind: str, seed
 
 
 @pytest.mark.parametrize("file", CORPUS, ids=[file.stem for file in CORPUS])
-def test_former_faults_stay_repaired(worker: Worker, file: Path) -> None:
+def test_past_failures_yield_a_result_or_an_error(worker: Worker, file: Path) -> None:
     kept = json.loads(file.read_text(encoding="ascii"))
     found = worker.run(kind=kept["kind"], case=kept["case"])
     assert found["outcome"] not in BAD, (
@@ -48,7 +48,7 @@ def test_former_faults_stay_repaired(worker: Worker, file: Path) -> None:
     )
 
 
-def test_valid_input_gives_a_result(worker: Worker) -> None:
+def test_valid_input_yields_a_result(worker: Worker) -> None:
     from fuzz import calls, files
 
     cases: list[tuple[str, Any]] = [
@@ -62,7 +62,7 @@ def test_valid_input_gives_a_result(worker: Worker) -> None:
     ]
     names += ["robots/husky_ur5e/husky_ur5e.srdf", "scenes/box.dae"]
     for name in names:
-        content = (files.pool() / name).read_bytes().decode("latin-1")
+        content = (files.make_pool() / name).read_bytes().decode("latin-1")
         cases.append(
             ("files", {"file": name, "content": content, "plan": name == "scenes/door.yaml"})
         )

@@ -45,7 +45,7 @@ def make_wedge() -> coal.Convex:
 
 
 def make_furniture() -> list[Shape]:
-    """A table, a table top on four legs, and a block in the way."""
+    """Return a table, a table top on four legs, and a block in front of them."""
     legs = [
         (coal.Box(0.08, 0.08, 0.75), make_pose(-0.5 + 1.4 * a, 3.5 + 0.7 * b, 0.375))
         for a in (-1, 1)

@@ -39,7 +39,7 @@ def save_screenshot(
     return picture
 
 
-READY = 'data-ready="yes"'  # what a page says of itself once it has drawn its first picture
+READY = 'data-ready="yes"'  # set by a page after its first frame
 
 
 def read_document(

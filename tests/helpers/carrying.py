@@ -137,7 +137,7 @@ def solve_above(stick: pin.SE3, **grasp: Any) -> np.ndarray:
 
 @dataclasses.dataclass
 class Script:
-    """Writes a motion: what is held, and where the robot goes with it.
+    """Builds a motion from grasps and robot configurations.
 
     Attributes:
         scene: Where it happens; it begins at the scene's start.

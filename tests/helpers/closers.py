@@ -27,10 +27,10 @@ def replace_object_fields(scene: vkc.Scene, name: str, **fields: Any) -> vkc.Sce
 
 
 def load_door_with_closer(**resistance: float) -> vkc.Scene:
-    """Return the scene with the door, whose hinge resists."""
+    """Return the door scene with a resisting hinge."""
     return replace_object_fields(vkc.load_scene("door"), "door", joints={"hinge": resistance})
 
 
 def load_tray_scene(mass: float) -> vkc.Scene:
-    """Return the scene with the tray, which weighs so much [kg]."""
+    """Return the tray scene with a mass of the tray [kg]."""
     return replace_object_fields(vkc.load_scene("tray"), "tray", mass=mass)

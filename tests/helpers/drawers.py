@@ -44,7 +44,7 @@ def replace_drawer_fields(scene: Scene, **fields: Any) -> Scene:
 
 
 def make_open_scene(*obstacles: dict[str, Any], base: str = "omni") -> Scene:
-    """Return the drawer's arena without what stands about in it."""
+    """Return the drawer's scene with other obstacles."""
     return replace_drawer_fields(
         load_drawer_scene(), obstacles=list(obstacles), robot={"name": "husky_ur5e", "base": base}
     )

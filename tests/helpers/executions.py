@@ -52,7 +52,7 @@ def make_grasping_scene() -> Scene:
 
 
 def make_stationary_motion(scene: Scene, seconds: float = 1.0) -> Trajectory:
-    """Return the motion in which nothing moves and what is held stays so."""
+    """Return a stationary motion with the grasps of the start."""
     names = list(scene.robot.coordinates.names)
     values = scene.start.tolist()
     for hold in scene.holds:

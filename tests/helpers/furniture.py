@@ -27,7 +27,7 @@ def write_flap(
 
     Args:
         folder: Where its files are to be.
-        handle: Elements of the link `flap`, whose frame is on the hinge, half way up.
+        handle: Elements of the link `flap`, whose frame is on the hinge, at half its height.
         thick: The flap [m].
         before: More elements of the case.
         behind: How far the case stands behind the flap [m].

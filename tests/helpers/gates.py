@@ -53,5 +53,5 @@ def make_gate_problem(width: float, *, height: float = 1.5) -> vkc.TrajectoryPro
 
 
 def make_waypoint(problem: vkc.TrajectoryProblem, pose: Sequence[float]) -> np.ndarray:
-    """Return the problem's start with the base elsewhere, shape (n,)."""
+    """Return the problem's start with another base pose, shape (n,)."""
     return np.concatenate([pose, problem.start[3:]])

@@ -34,7 +34,7 @@ def write_gripper(folder: Path, *, gripper: str = _GRIPPER, more: str = "") -> P
 
     Args:
         folder: Where.
-        gripper: What the robot.yaml says of the gripper.
+        gripper: Lines of robot.yaml about the gripper.
         more: Lines of it beyond that.
     """
     file = write_arms(folder)
@@ -108,7 +108,7 @@ def write_cheeks_scene(
 
     Args:
         robot: The robot's robot.yaml.
-        opening: What the attachment says [m]; None: nothing.
+        opening: The attachment's opening [m], or None.
         start: How far the gripper is open at the start [m]; None: as the robot rests.
         gap: From the middle of the handle to either cheek [m]; fingers that are fully open leave 10
             mm of the default.

@@ -16,7 +16,7 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def get_only_violation(report: Report) -> Violation:
-    """Return the one violation there is."""
+    """Return the only violation of a report."""
     assert len(report.violations) == 1, "\n".join(report.lines())
     return report.violations[0]
 
@@ -32,7 +32,7 @@ def check(
     trajectory: Trajectory | None = None,
     **options: float,
 ) -> Report:
-    """Validate the planned motion with something about it changed."""
+    """Validate a plan with another scene, trajectory or options."""
     return validate(
         scene or plan.scene,
         plan.steps,

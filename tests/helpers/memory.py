@@ -32,7 +32,7 @@ class _Mallinfo(ctypes.Structure):
 def measure_growth(
     run: Callable[[], object], *, warm: int = 3, times: int = 6
 ) -> tuple[float, float]:
-    """Return what a call leaves behind: bytes of compiled code, and blocks of Python's objects.
+    """Return the growth per call: bytes of compiled code, and blocks of Python's objects.
 
     It is the least of several calls: caches fill now and then, but what leaks does so every time.
 
@@ -43,7 +43,7 @@ def measure_growth(
     """
     info = getattr(ctypes.CDLL(None), "mallinfo2", None)
     if info is None:
-        pytest.skip("this C library does not tell what is allocated")
+        pytest.skip("this C library does not report allocations")
     info.restype = _Mallinfo
     seen = []
     for _ in range(warm + times + 1):

@@ -1,4 +1,4 @@
-"""What a page of a motion holds."""
+"""Reads the commands and animations of a motion's page."""
 
 from __future__ import annotations
 

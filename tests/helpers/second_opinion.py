@@ -46,7 +46,7 @@ class SecondOpinion:
             module.Plan = make_plan  # type: ignore[attr-defined]
 
     def forget(self) -> None:
-        """Do not judge what has been planned since `verdicts` was asked last."""
+        """Drop the plans made since the last call of `verdicts`."""
         self._waiting.clear()
 
     def verdicts(self, folder: Path) -> list[Verdict]:

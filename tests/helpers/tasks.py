@@ -13,7 +13,7 @@ def double(task: int) -> int:
 
 
 def crash_once(task: tuple[str, int]) -> int:
-    """Kill the process the first time that a task is run, as the system does for want of memory."""
+    """Kill the process when a task runs first, as the system does when memory is short."""
     mark = Path(task[0]) / str(task[1])
     if task[1] == 2 and not mark.exists():
         mark.touch()

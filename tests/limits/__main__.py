@@ -9,8 +9,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from .check import check
-from .files import limits_of, read_csv, read_npz
+from .check import check_motion
+from .files import read_csv, read_limits, read_npz
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -30,9 +30,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(arguments)
     if given.make:
-        from .plans import exported
+        from .plans import export_plans
 
-        for _ in exported(given.paths[0], given.make, first=given.first, seed=given.seed):
+        for _ in export_plans(given.paths[0], given.make, first=given.first, seed=given.seed):
             pass
     plans, moments, wrong, shares = 0, 0, 0, [0.0, 0.0]
     for path in given.paths:
@@ -41,7 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
             tables = [read_csv(table)] if (table := file.with_suffix(".csv")).is_file() else []
             found = []
             for one in (motion, *tables):
-                verdict = check(one, limits_of(about, file))
+                verdict = check_motion(one, read_limits(about, file))
                 found += verdict.found
                 shares = [max(shares[0], verdict.velocity), max(shares[1], verdict.acceleration)]
                 moments += verdict.moments

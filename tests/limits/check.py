@@ -9,7 +9,7 @@ import numpy as np
 
 from .files import Limits, Motion
 
-__all__ = ["RATE", "Excess", "Verdict", "check"]
+__all__ = ["RATE", "Excess", "Verdict", "check_motion"]
 
 RATE = 1000.0  # [Hz]
 SLACK = 1e-6  # of a rate's limit: rounding
@@ -42,7 +42,7 @@ class Verdict:
     acceleration: float
 
 
-def check(motion: Motion, limits: Mapping[str, Limits]) -> Verdict:
+def check_motion(motion: Motion, limits: Mapping[str, Limits]) -> Verdict:
     """Compare a motion with limits, which must be known of all its coordinates.
 
     Velocities and accelerations are looked at twice: as the cubics have them at every moment, and
@@ -51,34 +51,34 @@ def check(motion: Motion, limits: Mapping[str, Limits]) -> Verdict:
     """
     count = int(np.floor((motion.times[-1] - motion.times[0]) * RATE + 1e-9))
     times = motion.times[0] + np.arange(count + 1) / RATE
-    positions, velocities, accelerations = (_sampled(motion, times, order) for order in range(3))
+    positions, velocities, accelerations = (_sample(motion, times, order) for order in range(3))
     first, second = np.diff(positions, axis=0) * RATE, np.diff(positions, 2, axis=0) * RATE**2
     found, shares = list[Excess](), {"velocity": 0.0, "acceleration": 0.0}
     for k, name in enumerate(motion.names):
         own = limits[name]
         outside = np.maximum(own.low - positions[:, k], positions[:, k] - own.high)
-        found += _worst("position", name, outside - OUTSIDE, times, positions[:, k], own.high)
+        found += _find_worst("position", name, outside - OUTSIDE, times, positions[:, k], own.high)
         for what, limit, columns in (
             ("velocity", own.velocity, (velocities[:, k], first[:, k])),
             ("acceleration", own.acceleration, (accelerations[:, k], second[:, k])),
         ):
             for column in columns:
-                found += _worst(
+                found += _find_worst(
                     what, name, np.abs(column) - (1.0 + SLACK) * limit, times, column, limit
                 )
                 shares[what] = max(shares[what], float(np.abs(column).max() / limit))
         slope = (
             np.diff(accelerations[:, k]) * RATE
         )  # where accelerations jump, it is as steep as can be
-        found += _worst(
+        found += _find_worst(
             "jerk", name, np.abs(slope) - (1.0 + SLACK) * own.jerk, times, slope, own.jerk
         )
         ends = motion.velocities[[0, -1], k]
-        found += _worst("rest", name, np.abs(ends) - REST, motion.times[[0, -1]], ends, 0.0)
+        found += _find_worst("rest", name, np.abs(ends) - REST, motion.times[[0, -1]], ends, 0.0)
     return Verdict(len(times), found, **shares)
 
 
-def _worst(
+def _find_worst(
     what: str, name: str, excess: np.ndarray, times: np.ndarray, values: np.ndarray, limit: float
 ) -> list[Excess]:
     k = int(np.argmax(excess))
@@ -87,7 +87,7 @@ def _worst(
     )
 
 
-def _sampled(motion: Motion, times: np.ndarray, order: int) -> np.ndarray:
+def _sample(motion: Motion, times: np.ndarray, order: int) -> np.ndarray:
     """Return positions (0), velocities (1) or accelerations (2) at some times, shape (K, n)."""
     k = np.clip(np.searchsorted(motion.times, times, side="right") - 1, 0, len(motion.times) - 2)
     span = np.diff(motion.times)[k][:, None]

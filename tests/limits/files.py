@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-__all__ = ["Limits", "Motion", "limits_of", "read_csv", "read_npz"]
+__all__ = ["Limits", "Motion", "read_csv", "read_limits", "read_npz"]
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -30,7 +30,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Limits:
-    """What a coordinate keeps to, SI units; infinite where nothing is said."""
+    """Limits of a coordinate, SI units; infinite if not given."""
 
     low: float = -math.inf
     high: float = math.inf
@@ -40,7 +40,7 @@ class Limits:
 
 
 def read_npz(path: Path) -> tuple[Motion, dict[str, Any]]:
-    """Return the motion in a saved plan, and what the file says beside it."""
+    """Return the motion and the metadata of a saved plan."""
     with np.load(path, allow_pickle=False) as archive:
         about = json.loads(str(archive["about"]))
         knots = [
@@ -71,15 +71,15 @@ def read_csv(path: Path) -> Motion:
     )
 
 
-def limits_of(about: dict[str, Any], plan: Path) -> dict[str, Limits]:
+def read_limits(about: dict[str, Any], plan: Path) -> dict[str, Limits]:
     """Return the limits of every coordinate that a plan's scene can have."""
     scene, where = about["scene"], about["folder"]
     folder = ROOT / where["package"] if "package" in where else Path(where["absolute"])
     if "relative" in where and (beside := plan.resolve().parent / where["relative"]).is_dir():
         folder = beside
-    found = _robot(scene, folder)
+    found = _read_robot(scene, folder)
     for item in scene.get("objects") or ():
-        found |= _object(item, folder)
+        found |= _read_object(item, folder)
     grows = about["options"].get("jerk_time", 0.0)
     return (
         {name: replace(own, jerk=own.acceleration / grows) for name, own in found.items()}
@@ -88,7 +88,7 @@ def limits_of(about: dict[str, Any], plan: Path) -> dict[str, Limits]:
     )
 
 
-def _robot(scene: dict[str, Any], folder: Path) -> dict[str, Limits]:
+def _read_robot(scene: dict[str, Any], folder: Path) -> dict[str, Limits]:
     named = scene["robot"] if isinstance(scene["robot"], str) else scene["robot"]["name"]
     file = ROOT / "robots" / named / "robot.yaml"
     if not file.is_file():
@@ -106,7 +106,7 @@ def _robot(scene: dict[str, Any], folder: Path) -> dict[str, Limits]:
         found[f"base_{axis}"] = Limits(
             max(low, spans[k][0]), min(high, spans[k][1]), speeds[k], strengths[k]
         )
-    for name, limit in _urdf((file.parent / own["urdf"]).read_text(encoding="utf-8")).items():
+    for name, limit in _read_urdf((file.parent / own["urdf"]).read_text(encoding="utf-8")).items():
         said = joints.get(name, {})
         velocity = said.get(
             "velocity", limit.velocity if math.isfinite(limit.velocity) else math.pi
@@ -115,7 +115,7 @@ def _robot(scene: dict[str, Any], folder: Path) -> dict[str, Limits]:
     return found
 
 
-def _object(item: dict[str, Any], folder: Path) -> dict[str, Limits]:
+def _read_object(item: dict[str, Any], folder: Path) -> dict[str, Limits]:
     kind = item["type"]
     if isinstance(kind, str):
         given = kind.endswith((".yaml", ".yml")) or "/" in kind
@@ -129,7 +129,7 @@ def _object(item: dict[str, Any], folder: Path) -> dict[str, Limits]:
         else (folder / own["urdf"]).read_text(encoding="utf-8")
     )
     found, joints = dict[str, Limits](), own.get("joints") or {}
-    for name, limit in _urdf(text).items():
+    for name, limit in _read_urdf(text).items():
         said = joints.get(name, {})
         velocity = said.get("velocity", limit.velocity if math.isfinite(limit.velocity) else 1.0)
         found[f"{item['name']}.{name}"] = Limits(
@@ -137,13 +137,13 @@ def _object(item: dict[str, Any], folder: Path) -> dict[str, Limits]:
         )
     for entry in own.get("attachments") or ():
         found |= {
-            f"{item['name']}.{name}": Limits(*span) for name, span in _freedoms(entry).items()
+            f"{item['name']}.{name}": Limits(*span) for name, span in _read_freedoms(entry).items()
         }
     return found
 
 
-def _freedoms(entry: dict[str, Any]) -> dict[str, tuple[float, float]]:
-    """Return name → lower and upper limit of what an attachment leaves free."""
+def _read_freedoms(entry: dict[str, Any]) -> dict[str, tuple[float, float]]:
+    """Return name → lower and upper limit of an attachment's freedoms."""
     name, joint = entry["name"], entry.get("joint", "fixed")
     if "freedoms" in entry:
         return {f"{name}_{own['name']}": tuple(own["limits"]) for own in entry["freedoms"]}
@@ -154,8 +154,8 @@ def _freedoms(entry: dict[str, Any]) -> dict[str, tuple[float, float]]:
     return {} if joint == "fixed" else {name: tuple(entry["limits"])}
 
 
-def _urdf(text: str) -> dict[str, Limits]:
-    """Return what a URDF says of its joints that move."""
+def _read_urdf(text: str) -> dict[str, Limits]:
+    """Return the limits of a URDF's movable joints."""
     found = {}
     for joint in ElementTree.fromstring(text).findall("joint"):
         if joint.get("type") not in ("revolute", "prismatic", "continuous"):

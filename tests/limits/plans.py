@@ -8,12 +8,12 @@ from pathlib import Path
 import vkc_pin as vkc
 from vkc_pin.benchmarks.problems.problem_set import NUMBER, TASKS, make_start, problem
 
-__all__ = ["exported"]
+__all__ = ["export_plans"]
 
 _ROOMS = NUMBER - 20  # of the problems, those in random rooms
 
 
-def exported(folder: Path, count: int, *, first: int = 0, seed: int = 0) -> Iterator[Path]:
+def export_plans(folder: Path, count: int, *, first: int = 0, seed: int = 0) -> Iterator[Path]:
     """Plan, export a table, and yield the .npz of each success; existing files are reused.
 
     Args:

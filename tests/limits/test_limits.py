@@ -11,9 +11,9 @@ import pytest
 
 import vkc_pin as vkc
 from limits.__main__ import main
-from limits.check import check
-from limits.files import Motion, limits_of, read_csv, read_npz
-from limits.plans import exported
+from limits.check import check_motion
+from limits.files import Motion, read_csv, read_limits, read_npz
+from limits.plans import export_plans
 
 COUNT = 8
 
@@ -21,10 +21,12 @@ COUNT = 8
 @pytest.fixture(scope="module")
 def plans(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Return plans of six tasks and in two random rooms, with tables."""
-    return list(exported(tmp_path_factory.mktemp("plans"), COUNT))
+    return list(export_plans(tmp_path_factory.mktemp("plans"), COUNT))
 
 
-def test_limits_are_kept(plans: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
+def test_planned_motions_satisfy_all_limits(
+    plans: list[Path], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert len(plans) == COUNT
     assert main([str(path) for path in plans]) == 0, capsys.readouterr().out
     assert f"{COUNT} plans" in capsys.readouterr().out
@@ -33,12 +35,12 @@ def test_limits_are_kept(plans: list[Path], capsys: pytest.CaptureFixture[str]) 
 def test_motions_reach_a_limit(plans: list[Path]) -> None:
     for path in plans:
         motion, about = read_npz(path)
-        verdict = check(motion, limits_of(about, path))
+        verdict = check_motion(motion, read_limits(about, path))
         assert max(verdict.velocity, verdict.acceleration) > 0.98
         assert verdict.moments > 2000
 
 
-def test_tables_have_the_same_motions(plans: list[Path]) -> None:
+def test_exported_table_equals_the_saved_plan(plans: list[Path]) -> None:
     for path in plans:
         motion, table = read_npz(path)[0], read_csv(path.with_suffix(".csv"))
         assert table.names == motion.names
@@ -47,23 +49,23 @@ def test_tables_have_the_same_motions(plans: list[Path]) -> None:
                 np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-12)
 
 
-def _faster(motion: Motion) -> Motion:
+def _speed_up(motion: Motion) -> Motion:
     return Motion(motion.names, 0.9 * motion.times, motion.positions, motion.velocities / 0.9)
 
 
-def _too_far(motion: Motion) -> Motion:
+def _exceed_position(motion: Motion) -> Motion:
     positions = motion.positions.copy()
     positions[:, motion.names.index("elbow_joint")] += 6.0
     return Motion(motion.names, motion.times, positions, motion.velocities)
 
 
-def _kink(motion: Motion) -> Motion:
+def _add_kink(motion: Motion) -> Motion:
     velocities = motion.velocities.copy()
     velocities[len(velocities) // 2, 0] += 0.05
     return Motion(motion.names, motion.times, motion.positions, velocities)
 
 
-def _no_rest(motion: Motion) -> Motion:
+def _end_moving(motion: Motion) -> Motion:
     velocities = motion.velocities.copy()
     velocities[-1, 1] = 0.01
     return Motion(motion.names, motion.times, motion.positions, velocities)
@@ -72,36 +74,36 @@ def _no_rest(motion: Motion) -> Motion:
 @pytest.mark.parametrize(
     ("change", "what"),
     [
-        (_faster, "acceleration"),
-        (_too_far, "position"),
-        (_kink, "acceleration"),
-        (_no_rest, "rest"),
+        (_speed_up, "acceleration"),
+        (_exceed_position, "position"),
+        (_add_kink, "acceleration"),
+        (_end_moving, "rest"),
     ],
 )
-def test_violations_are_found(
+def test_violations_of_changed_motions_are_found(
     plans: list[Path], change: Callable[[Motion], Motion], what: str
 ) -> None:
     motion, about = read_npz(plans[0])
-    verdict = check(change(motion), limits_of(about, plans[0]))
+    verdict = check_motion(change(motion), read_limits(about, plans[0]))
     assert what in {excess.what for excess in verdict.found}, [
         str(excess) for excess in verdict.found
     ]
 
 
-def test_jerk_limits_are_kept_with_jerk_time_alone(plans: list[Path], tmp_path: Path) -> None:
+def test_only_jerk_time_limits_jerk(plans: list[Path], tmp_path: Path) -> None:
     scene, options = vkc.load_scene("drawer"), vkc.Options(jerk_time=0.1)
     plan = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.3})], options=options)
     assert plan.success
     file = plan.save(tmp_path / "eased.npz")
     motion, about = read_npz(file)
-    limits = limits_of(about, file)
+    limits = read_limits(about, file)
     assert limits["elbow_joint"].jerk == pytest.approx(14.0)
-    verdict = check(motion, limits)
+    verdict = check_motion(motion, limits)
     assert not verdict.found, [str(excess) for excess in verdict.found]
-    assert {excess.what for excess in check(_faster(motion), limits).found} >= {"jerk"}
+    assert {excess.what for excess in check_motion(_speed_up(motion), limits).found} >= {"jerk"}
     plain, said = read_npz(plans[0])
     own = {
         name: replace(limit, jerk=10.0 * limit.acceleration)
-        for name, limit in limits_of(said, plans[0]).items()
+        for name, limit in read_limits(said, plans[0]).items()
     }
-    assert "jerk" in {excess.what for excess in check(plain, own).found}
+    assert "jerk" in {excess.what for excess in check_motion(plain, own).found}

@@ -21,13 +21,13 @@ from vkc_pin.benchmarks.problems.problem_set import TASKS as ALL
 from vkc_pin.benchmarks.problems.problem_set import make_start
 from vkc_pin.utils.parallel.machine import describe_machine, find_versions, measure_peak_memory
 
-from .bound import bound
+from .bound import compute_bound
 
 NAMES = tuple(dict.fromkeys([*TASKS, *(name for name in ALL if name.startswith("household"))]))
 """The tasks of `bench execution`, and those of the household."""
 
 
-def table(rows: list[dict[str, Any]]) -> str:
+def format_table(rows: list[dict[str, Any]]) -> str:
     """Return the table, a line a task, in Markdown."""
     lines = [
         "| task | plans | duration [s] | least along its path [s] | worst ratio | bounded by "
@@ -47,9 +47,9 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def report(result: Mapping[str, Any]) -> str:
+def format_report(result: Mapping[str, Any]) -> str:
     """Return the table of a record in Markdown, with versions and machine at the foot."""
-    return table(result["trials"]) + "\n" + describe_run(result["meta"]) + "\n"
+    return format_table(result["trials"]) + "\n" + describe_run(result["meta"]) + "\n"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -66,7 +66,7 @@ def main(arguments: list[str] | None = None) -> int:
             scene = make_start(name, given.seed, number)
             plan = vkc.plan(scene, ALL[name].steps, seed=given.seed, max_evaluations=1_000_000)
             if plan.success:
-                least, heavy = bound(plan.scene, plan.trajectory)
+                least, heavy = compute_bound(plan.scene, plan.trajectory)
                 duration = float(plan.trajectory.times[-1])
                 row = {
                     "task": name,
@@ -89,7 +89,7 @@ def main(arguments: list[str] | None = None) -> int:
         given.json.write_text(
             json.dumps({"meta": meta, "trials": rows}, indent=1) + "\n", encoding="utf-8"
         )
-    sys.stdout.write(table(rows))
+    sys.stdout.write(format_table(rows))
     return int(any(row["duration"] > 1.15 * row["least"] for row in rows))
 
 

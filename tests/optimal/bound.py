@@ -11,14 +11,14 @@ from vkc_pin.planning.retiming import retime
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["FINE", "bound"]
+__all__ = ["FINE", "compute_bound"]
 
 FINE = 60
 """Places on each of a path's cubics; the package looks at three or less."""
 _SAME = 1e-6  # [s] by which the motion, timed anew, may take another time
 
 
-def bound(scene: Scene, motion: Trajectory, fine: int = FINE) -> tuple[float, int]:
+def compute_bound(scene: Scene, motion: Trajectory, fine: int = FINE) -> tuple[float, int]:
     """Return the least duration [s] under all limits, and the number of runs bound by torques.
 
     The motion is timed anew, which must come to the same. Whatever path TOPP-RA is asked about on
@@ -46,7 +46,7 @@ def bound(scene: Scene, motion: Trajectory, fine: int = FINE) -> tuple[float, in
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(retime, "compute_speeds", noted)
         patch.setattr(retime, "_make_straight_curve", rested)
-        again = retime.retime_trajectory(scene, motion, _parts(motion))
+        again = retime.retime_trajectory(scene, motion, _split(motion))
     assert abs(again.times[-1] - motion.times[-1]) <= _SAME, (
         "the motion that was timed anew is another one"
     )
@@ -62,7 +62,7 @@ def bound(scene: Scene, motion: Trajectory, fine: int = FINE) -> tuple[float, in
     return least, sum(len(limits) > 2 for _, *limits in asked.values())
 
 
-def _parts(motion: Trajectory) -> np.ndarray:
+def _split(motion: Trajectory) -> np.ndarray:
     """Return into how many parts each straight line was cut, by how many cubics lead along it."""
     assert motion.curve is not None
     cubics = np.diff(np.searchsorted(motion.curve.times, motion.times))

@@ -1,4 +1,4 @@
-"""Changed copies of saved plans, to see that what is wrong with them is found."""
+"""Writes changed copies of saved plans, whose faults the oracle must find."""
 
 from __future__ import annotations
 

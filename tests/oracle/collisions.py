@@ -25,7 +25,7 @@ BLOCK = 32  # samples
 
 
 class Pairs:
-    """What moves in a phase, what does not, and how far each shape can have gone.
+    """The moving and fixed shapes of a phase, and the path length of each.
 
     `gone` has for every moving shape how far any point of it has moved from sample to sample, seen
     from the world, the robot's base and its tool, shape (3, S - 1): two shapes move against each
@@ -102,7 +102,7 @@ class Pairs:
 def check_collisions(
     world: World, stage: Stage, allowed: list[Licence], built: Neighbours
 ) -> Iterator[Violation]:
-    """Yield what overlaps ("overlap"), and what is too close at waypoints: "clearance"."""
+    """Yield pairs that overlap ("overlap") or are too close at waypoints ("clearance")."""
     pairs = Pairs(world, stage)
     begins = np.arange(0, pairs.length, BLOCK)
     ends = np.append(begins[1:], pairs.length) - 1

@@ -41,7 +41,7 @@ class Fingers:
             )
 
     def share(self, of: float) -> dict[str, float]:
-        """Return where the joints are at a share of the way from closed to open."""
+        """Return the joints' values between closed (0) and open (1)."""
         return {
             joint: (1.0 - of) * closed + of * open_
             for joint, (closed, open_) in self.robot.gripper.items()
@@ -70,7 +70,7 @@ class Fingers:
         return low
 
     def near(self, asked: float | None) -> float | None:
-        """Return how far it opens if that is asked for."""
+        """Return a requested opening, clipped to the range of the fingers [m]."""
         return (
             None
             if asked is None or not self.joints
@@ -78,7 +78,7 @@ class Fingers:
         )
 
     def find_joints(self, opening: float | None) -> dict[str, float]:
-        """Return where its joints are at an opening; None: at rest."""
+        """Return the joints' values at an opening; None: at rest."""
         if opening not in self.known:
             low, high = 0.0, 1.0
             if self.room(max(float(opening), 1e-6), self.share(0.0)) or opening <= self.least:
@@ -95,7 +95,7 @@ class Fingers:
 
 
 def get_required_opening(world: World, hold: Hold) -> float | None:
-    """Return the opening that what is held asks for; None: as at rest."""
+    """Return the opening that a grasp requires; None: as at rest."""
     grasp: Grasp = world.objects[hold.object].grasps[hold.attachment]
     return world.fingers.near(grasp.opening)
 

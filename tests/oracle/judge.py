@@ -20,9 +20,9 @@ __all__ = ["Verdict", "find_violations", "judge"]
 
 @dataclass
 class Verdict:
-    """What is to be said of a plan: its own verdict, and what is found here.
+    """A plan's own verdict, and the violations found here.
 
-    `unjudged` says why nothing is said.
+    `unjudged` is the reason if the plan could not be judged.
     """
 
     path: Path
@@ -54,7 +54,7 @@ def judge(path: Path) -> Verdict:
 
 
 def find_violations(plan: SavedPlan) -> list[Violation]:
-    """Return what is wrong with a motion: of each rule and subject the worst, by time."""
+    """Return the worst violation of each rule and subject, sorted by time."""
     world = World(plan)
     stages = list(world.stages())
     found = [*check_motion(world), *check_goals(world, stages)]

@@ -42,7 +42,7 @@ Places = Callable[[np.ndarray], Mapping[str, Poses]]  # coordinates, shape (S, n
 
 
 def check_motors(world: World, stage: Stage) -> Iterator[Violation]:
-    """Check that no motor of the arm has to do more than it can."""
+    """Check that no motor of the arm exceeds its torque limit."""
     plan, robot = world.plan, world.robot
     bodies = [
         Body(link, *robot.tree.urdf.weight(link))
@@ -148,7 +148,7 @@ def _shift_column(columns: np.ndarray, column: int, by: float) -> np.ndarray:
 def _differentiate_points(
     places: Places, columns: np.ndarray, column: int, link: str, inside: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return how points of a link, shape (S, 3) in its frame, move and turn with a coordinate."""
+    """Return derivatives of points of a link, (S, 3) in its frame, and of its rotation."""
     more, less = (
         places(_shift_column(columns, column, sign * _NUDGE))[link] for sign in (1.0, -1.0)
     )
@@ -179,13 +179,13 @@ def _compute_rotation_vector(turns: np.ndarray) -> np.ndarray:
 
 
 def _interpolate_rotations(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return rotations halfway between close ones."""
+    """Return the rotations halfway between close rotations."""
     u, _, v = np.linalg.svd(one + other)
     return u @ v
 
 
 def _find_payloads(world: World, stage: Stage) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
-    """Yield what is carried: its weight in the frame of the tool, as at the begin of the phase."""
+    """Yield weights of carried objects in the tool's frame, at the start of the phase."""
     held = {hold.object for hold in stage.phase.holds if world.objects[hold.object].free}
     held |= {name for name, (owner, _) in stage.riding.items() if owner in held}
     for name in sorted(held):

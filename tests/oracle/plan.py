@@ -20,7 +20,7 @@ class NotJudged(Exception):
 
 @dataclass(frozen=True)
 class Violation:
-    """What is wrong: which rule, about what, when [s], by how much."""
+    """A violation: rule, subject, time [s] and amount."""
 
     rule: str
     subject: str
@@ -66,7 +66,7 @@ class Curve:
     rates: np.ndarray
 
     def inside(self, parts: int) -> np.ndarray:
-        """Moments in every cubic, both ends among them."""
+        """Return times in every cubic, with both ends."""
         return self.times[:-1, None] + np.diff(self.times)[:, None] * np.linspace(
             0.0, 1.0, parts + 1
         )
@@ -114,7 +114,7 @@ class SavedPlan:
         return self.status == "success" and not self.says
 
     def evaluate(self, moments: np.ndarray) -> np.ndarray:
-        """Where all coordinates are at some times."""
+        """Return all coordinates at some times."""
         if self.curve is not None:
             return self.curve.derivative(moments, 0)
         return np.stack(
@@ -144,7 +144,7 @@ def sort_holds(held: dict[str, str], by: dict[str, str]) -> tuple[Hold, ...]:
 
 
 def read_plan(path: Path) -> SavedPlan:
-    """Return what the file at `path` says."""
+    """Return the contents of a plan's file."""
     with np.load(path, allow_pickle=False) as archive:
         about = json.loads(str(archive["about"]))
         times, positions = np.array(archive["times"]), np.array(archive["positions"])

@@ -1,4 +1,4 @@
-"""What stands on something that moves, and goes with it."""
+"""Finds objects that rest on moving links, and move with them."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
 __all__ = ["compute_distance", "find_riders", "rests_on"]
 
-DROP = 5e-3  # [m] by which something is lowered to see what is below it
-SUPPORT = 2.5e-3  # [m] by which it then overlaps what it stands on, at least
+DROP = 5e-3  # [m] by which an object is lowered to find its support
+SUPPORT = 2.5e-3  # [m] least overlap with the support then
 
 _REQUEST, _RESULT = coal.DistanceRequest(), coal.DistanceResult()
 

@@ -14,13 +14,13 @@ from .stage import Stage, World
 __all__ = ["check_motion", "check_stage"]
 
 TIP = 0.1  # [rad] by which what something stands on may tilt
-BACK = 1e-4  # [m] by which what is pushed may come back
+BACK = 1e-4  # [m] by which a pushed link may come back
 STILL = 1e-5  # [m] or [rad]
 FINE = 5e-4  # [m] and [rad] between two samples at which a grasp is looked at
 
 
 def check_motion(world: World) -> Iterator[Violation]:
-    """Check what the waypoints alone tell."""
+    """Check the rules that concern waypoints alone."""
     plan = world.plan
     fine = plan.fine()
     for k, name in enumerate(plan.names):
@@ -137,7 +137,7 @@ def _get_limits(world: World, name: str) -> tuple[float, float, float, float]:
 
 
 def _check_dwell(world: World) -> Iterator[Violation]:
-    """Where a hand closes or opens inside the motion, everything rests for `grasp_time`."""
+    """Check that all rests for `grasp_time` where a hand closes or opens during the motion."""
     plan, still = world.plan, world.is_resting
     for one, other in zip(plan.phases, plan.phases[1:], strict=False):
         opens = one.opening != other.opening
@@ -165,7 +165,7 @@ def _check_dwell(world: World) -> Iterator[Violation]:
 
 
 def check_stage(world: World, stage: Stage) -> Iterator[Violation]:
-    """Check what is seen between waypoints as well."""
+    """Check the rules that also concern samples between waypoints."""
     yield from _check_unheld(world, stage)
     yield from _check_latches(world, stage)
     for hold in stage.phase.holds:

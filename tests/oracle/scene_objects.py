@@ -182,7 +182,7 @@ class Robot:
         }
 
     def apart(self, one: str, other: str) -> bool:
-        """Whether two of its links move against each other and are to stay apart."""
+        """Return whether two links move relative to each other and must not collide."""
         return (
             self.moved_by[one] != self.moved_by[other]
             and frozenset((one, other)) not in self.exempt

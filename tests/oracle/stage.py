@@ -1,4 +1,4 @@
-"""A motion phase by phase: densely sampled, with the placement of everything at every sample."""
+"""Samples the phases of a motion densely, with the poses of all shapes."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ class Solid:
 class Stage:
     """A phase.
 
-    `rows` are the samples that are waypoints; `links` has where every link is, by (owner, link);
-    `tool` the robot's tool frame; `moving` the links of objects that move; `riding` what stands on
-    what and is carried along, object → (owner, link); `upright` the direction, in the object's own
-    frame, that was up when it was last put down.
+    `rows` are the samples that are waypoints; `links` are the poses of all links, by (owner, link);
+    `tool` are those of the robot's tool frame; `moving` are the moving links of objects; `riding`
+    maps supported objects to their moving supports (owner, link); `upright` is the vertical
+    direction, in the object's own frame, when it was last put down.
     """
 
     number: int
@@ -69,7 +69,7 @@ class Stage:
 
 
 class World:
-    """All that a plan's scene describes."""
+    """The robot, objects and obstacles of a plan's scene."""
 
     def __init__(self, plan: SavedPlan) -> None:
         self.plan = plan
@@ -141,7 +141,7 @@ class World:
         return [Solid(name, "", Shape.make("", make_solid(item["type"], item), IDENTITY), here)]
 
     def slides(self, name: str) -> bool:
-        """Whether a coordinate is a length."""
+        """Return whether a coordinate is a length."""
         if name in ("base_x", "base_y"):
             return True
         owner, _, own = name.partition(".")
@@ -191,7 +191,7 @@ class World:
 
     @cached_property
     def start_opening(self) -> float | None:
-        """How far it is open at the start."""
+        """Opening of the gripper at the start [m]; None: at rest."""
         hold = next((hold for hold in self.held if hold.by is None), None)
         return (
             self.fingers.near(self.plan.scene["start"].get("opening"))
@@ -358,12 +358,12 @@ class World:
         return found
 
     def in_object(self, hold: Hold, columns: np.ndarray, links: dict[str, Poses]) -> Poses:
-        """Return where a grasp has the tool, in the frame of the object's base link."""
+        """Return the tool's poses in a grasp, in the frame of the object's base link."""
         grasp = self.objects[hold.object].grasps[hold.attachment]
         return links[grasp.link] @ grasp.tool(self.freedoms(hold, columns))
 
     def _in_hand(self, tool: Poses, free: dict[str, Poses]) -> dict[str, Poses]:
-        """Return where free objects are that the hand holds at the start."""
+        """Return the poses of free objects grasped at the start."""
         found: dict[str, Poses] = {}
         columns = np.array([[self.start.get(name, 0.0) for name in self.plan.names]])
         for hold in self.held:
@@ -405,7 +405,7 @@ class World:
         return carried
 
     def _set_down(self, name: str, where: Poses, links: dict[tuple[str, str], Poses]) -> None:
-        """Put a free object's base link somewhere."""
+        """Set the poses of a free object's base link."""
         tree = self.objects[name].tree
         for link, place in tree.links(self.objects[name].state, None, tree.urdf.links).items():
             links[name, link] = where @ place

@@ -82,7 +82,7 @@ class _Clock:
 
 
 def find_licences(world: World, stages: list[Stage]) -> list[Licence]:
-    """Return all of a motion."""
+    """Return all licences of a motion."""
     clock = _Clock(world)
     found = [
         *_license_grasps(world, clock),

@@ -72,7 +72,7 @@ def load_mesh_hull(file: Path, scale: np.ndarray) -> coal.Convex:
         points = np.array(loaded.vertices())
     else:
         points = np.asarray(trimesh.load(file, force="mesh", skip_materials=True).vertices)
-    hull = trimesh.convex.convex_hull(_make_convex(points * scale))
+    hull = trimesh.convex.convex_hull(_thicken(points * scale))
     if np.bincount(hull.faces.ravel()).max() > 255:
         raise NotJudged(f"{file.name}: a corner with more neighbours than coal can hold")
     corners, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
@@ -81,8 +81,8 @@ def load_mesh_hull(file: Path, scale: np.ndarray) -> coal.Convex:
     return coal.Convex(corners, faces)
 
 
-def _make_convex(points: np.ndarray) -> np.ndarray:
-    """Return points of a sheet as those of a plate 1 mm thick, all others as they are."""
+def _thicken(points: np.ndarray) -> np.ndarray:
+    """Return the points of a flat sheet as a plate 1 mm thick; others unchanged."""
     axes = np.linalg.svd(np.cov(points.T))[2]
     widths = [np.ptp(points @ axis) for axis in axes]
     for axis, width in zip(axes, widths, strict=True):
@@ -153,7 +153,7 @@ class Urdf:
         return self.kind(joint) in ("revolute", "continuous", "prismatic")
 
     def effort(self, joint: str) -> float:
-        """Return what the motor of a joint has; 0: nobody says."""
+        """Return the effort limit of a joint; 0: not given."""
         limit = self.joints[joint].find("limit")
         return 0.0 if limit is None else float(limit.get("effort", 0.0))
 

@@ -97,6 +97,7 @@ def test_starts_depend_on_seed_and_task_alone(result: dict[str, Any]) -> None:
     np.testing.assert_allclose(result["trials"][0]["start"][:3], specs[0]["base"], atol=1e-8)
 
 
+@pytest.mark.long
 def test_methods_are_planned_from_the_same_start(tmp_path: Path) -> None:
     words = "baselines --trials 1 --tasks drawer --methods B1 VKC --jobs 1 --save-failures"
     table, trials = run_experiment(words, tmp_path)

@@ -58,6 +58,7 @@ def test_variant_has_the_numbers_of_the_papers_code() -> None:
     assert plain == paper, "the starts are the same"
 
 
+@pytest.mark.long
 def test_variant_is_run_and_reported(tmp_path: Path) -> None:
     words = "household --variant paper --trials 1 --methods VKC --jobs 1"
     table, trials = run_experiment(words, tmp_path)

@@ -88,7 +88,7 @@ def test_tests_find_a_fault(tmp_path: Path) -> None:
     outcomes = {
         mutant.what: run_mutant(mutant, coverage, tmp_path)
         for mutant in mutants(module, (PACKAGE / module).read_text(encoding="utf-8"))
-        if "effort" in mutant.text and mutant.what.startswith("comparison")
+        if "max_evaluations" in mutant.text and mutant.what.startswith("comparison")
     }
     assert outcomes == {"comparison: in → not in": "killed"}
 

@@ -70,6 +70,7 @@ def test_each_task_has_a_record(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert [r["attempts"] for r in again["trials"]] == [r["attempts"] for r in records]
 
 
+@pytest.mark.long
 def test_more_workers_make_the_same_episodes(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     result = run(out=tmp_path / "out", episodes=2, jobs=2, recipe=write(tmp_path), progress=False)

@@ -31,6 +31,7 @@ def test_problems_are_determined_by_their_numbers(number: int) -> None:
     assert (one.number, one.kind) == (number, "scene" if number % 2 else "room")
 
 
+@pytest.mark.long
 def test_problems_have_all_scenes_obstacles_and_kinds_of_steps() -> None:
     problems = [sample_problem(0, number) for number in range(1, 121, 2)]
     names = sorted(list_resources("scenes", "*.yaml"))

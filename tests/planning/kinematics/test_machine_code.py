@@ -78,6 +78,7 @@ def script(path: Path, text: str) -> str:
     return str(path)
 
 
+@pytest.mark.long
 def test_compiled_waypoint_functions_are_equal_bit_for_bit(folder: Libraries) -> None:
     steps = [Actuate("door", {"hinge": 1.2})]
     structure = make_program(load_door_scene(), steps, options=OPTIONS).transcription.structure
@@ -216,7 +217,16 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("how", BROKEN)
+SLOW = pytest.mark.long  # each waits for a compiler
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        pytest.param(how, marks=() if how in ("fails", "computes something else") else SLOW)
+        for how in BROKEN
+    ],
+)
 def test_a_broken_compiler_is_tried_once(
     how: str, folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -43,7 +43,7 @@ def read(name: str) -> str:
     return (ROOT / name).read_text(encoding="utf-8")
 
 
-def blocks(page: Path, language: str) -> list[str]:
+def find_blocks(page: Path, language: str) -> list[str]:
     return re.findall(
         rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
     )
@@ -58,17 +58,17 @@ LONG = (
 )  # pages whose code plans much
 
 
-def snippets() -> list[object]:
+def find_snippets() -> list[object]:
     return [
         pytest.param(
             code, id=f"{page.stem}-{number}", marks=[pytest.mark.long] if page.stem in LONG else []
         )
         for page in PAGES
-        for number, code in enumerate(blocks(page, "python"))
+        for number, code in enumerate(find_blocks(page, "python"))
     ]
 
 
-@pytest.mark.parametrize("code", snippets())
+@pytest.mark.parametrize("code", find_snippets())
 def test_python_runs(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
@@ -81,19 +81,21 @@ def test_python_runs(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_readme_is_brief() -> None:
-    found = blocks(ROOT / "README.md", "python")
+    found = find_blocks(ROOT / "README.md", "python")
     assert found
     for code in found:
         assert len([line for line in code.splitlines() if line.strip()]) <= 10
 
 
 def test_yaml_examples_fit_their_schemas(tmp_path: Path) -> None:
-    room, home = blocks(ROOT / "docs/scenes.md", "yaml")
+    room, home = find_blocks(ROOT / "docs/scenes.md", "yaml")
     for scene, objects, allowed in ((room, ["drawer"], 0), (home, ["door"], 4)):
         (tmp_path / "room.yaml").write_text(scene, encoding="utf-8")
         loaded = vkc.load_scene(tmp_path / "room.yaml")
         assert (list(loaded.objects), len(loaded.allowed)) == (objects, allowed)
-    described, rim, narrow, push, closer, rollers, whole = blocks(ROOT / "docs/objects.md", "yaml")
+    described, rim, narrow, push, closer, rollers, whole = find_blocks(
+        ROOT / "docs/objects.md", "yaml"
+    )
     for text, urdf in (
         (rim, "bowl.urdf"),
         *((own, "drawer.urdf") for own in (narrow, push, rollers)),
@@ -103,7 +105,7 @@ def test_yaml_examples_fit_their_schemas(tmp_path: Path) -> None:
     (tmp_path / "hatch.yaml").write_text(whole, encoding="utf-8")
     assert vkc.load_scene(tmp_path / "hatch.yaml").objects["hatch"].object.name == "hatch"
     assert parse_document(Document(yaml.safe_load(described)), ObjectSchema).urdf == "door.urdf"
-    robot, telescope, wheels = blocks(ROOT / "docs/robots.md", "yaml")
+    robot, telescope, wheels = find_blocks(ROOT / "docs/robots.md", "yaml")
     followed = parse_document(Document(yaml.safe_load(telescope)), RobotSchema).couplings
     assert [coupling.joint for coupling in followed.values()] == ["joint_arm_l3"] * 3
     rolls = parse_document(Document(yaml.safe_load(wheels)), RobotSchema).base
@@ -154,7 +156,7 @@ def test_every_constraint_and_status_is_explained() -> None:
         assert [word for word in words if f"`{word}`" not in read(page)] == [], page
 
 
-def commands() -> dict[str, argparse.ArgumentParser]:
+def find_commands() -> dict[str, argparse.ArgumentParser]:
     """Return the parsers of all commands by name, "bench door" among them."""
     found: dict[str, argparse.ArgumentParser] = {}
 
@@ -174,7 +176,7 @@ def commands() -> dict[str, argparse.ArgumentParser]:
 
 def test_every_command_and_option_is_documented() -> None:
     text = read("docs/cli.md")
-    for name, parser in commands().items():
+    for name, parser in find_commands().items():
         section = text.split(f"## vkc-pin {name}")[1].split("\n## ")[0]
         options = {option for action in parser._actions for option in action.option_strings} - {
             "-h",
@@ -187,7 +189,7 @@ def test_shell_commands_are_understood() -> None:
     lines = [
         line
         for page in PAGES
-        for block in blocks(page, "sh")
+        for block in find_blocks(page, "sh")
         for line in block.splitlines()
         if line.startswith("vkc-pin")
     ]
@@ -197,13 +199,17 @@ def test_shell_commands_are_understood() -> None:
         assert callable(make_parser().parse_args(words).run), line
     targets = set(re.findall(r"^(\w+):", read("Makefile"), re.MULTILINE))
     assert (
-        set(re.findall(r"^make (\w+)", "\n".join(blocks(ROOT / "README.md", "sh")), re.MULTILINE))
+        set(
+            re.findall(
+                r"^make (\w+)", "\n".join(find_blocks(ROOT / "README.md", "sh")), re.MULTILINE
+            )
+        )
         <= targets
     )
 
 
 def test_help_of_every_command() -> None:
-    for name, parser in commands().items():
+    for name, parser in find_commands().items():
         assert f"vkc-pin {name}" in parser.format_help()
     command = [sys.executable, "-m", "vkc_pin.cli", "plan", "--help"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
@@ -227,7 +233,7 @@ def test_links_lead_somewhere(page: Path) -> None:
             }, target
 
 
-def listed(page: str) -> list[str]:
+def find_listed(page: str) -> list[str]:
     """Return what the lists of a page name, some of it with wildcards."""
     blocks = re.findall(r"```{toctree}\n(.*?)```", read(page), re.DOTALL)
     return [
@@ -237,7 +243,7 @@ def listed(page: str) -> list[str]:
 
 def test_every_page_is_in_the_contents() -> None:
     for folder, contents, few in (("docs", "_contents", 15), ("docs/api", "index", 6)):
-        names = listed(f"{folder}/{contents}.md")
+        names = find_listed(f"{folder}/{contents}.md")
         pages = [
             page.stem
             for page in (ROOT / folder).glob("*.md")
@@ -252,7 +258,7 @@ def test_every_page_is_in_the_contents() -> None:
         ] == []
 
 
-def documented(directive: str) -> set[str]:
+def find_documented(directive: str) -> set[str]:
     """Return the names documented by a directive, "auto*" for all directives but modules."""
     pages = (page.read_text(encoding="utf-8") for page in (ROOT / "docs/api").glob("*.md"))
     found = [
@@ -271,7 +277,7 @@ def test_every_public_name_is_in_the_reference() -> None:
     public = {name for name in vkc.__all__ if not inspect.ismodule(getattr(vkc, name))}
     for package in ("datasets", "importing", "procedural"):
         public |= {f"{package}.{name}" for name in getattr(vkc, package).__all__}
-    assert documented("auto*") == public
+    assert find_documented("auto*") == public
 
 
 def test_every_module_is_in_the_reference_once() -> None:
@@ -285,7 +291,7 @@ def test_every_module_is_in_the_reference_once() -> None:
     assert len(found) == len(set(found))
     there.remove("vkc_pin.cli.__main__")  # importing that is running it
     assert set(found) == {name.removesuffix(".__init__") for name in there} - {"vkc_pin"}
-    assert documented("automodule") == set()
+    assert find_documented("automodule") == set()
 
 
 def test_citation_is_of_this_version() -> None:
@@ -450,4 +456,6 @@ def test_site(site: Path) -> None:
     reference = "".join(
         page.read_text(encoding="utf-8") for page in (site / "docs/api").glob("*.html")
     )
-    assert [name for name in documented("auto*") if f'id="vkc_pin.{name}"' not in reference] == []
+    assert [
+        name for name in find_documented("auto*") if f'id="vkc_pin.{name}"' not in reference
+    ] == []

@@ -60,7 +60,7 @@ def result(out: Path) -> dict[str, Any]:
     return json.loads((out / "results.json").read_text(encoding="utf-8"))
 
 
-def files(folder: Path) -> set[str]:
+def list_files(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()} if folder.is_dir() else set()
 
 
@@ -116,7 +116,7 @@ def test_methods_are_planned_from_the_same_start(tmp_path: Path) -> None:
             assert t[name] == pytest.approx(value, rel=1e-3), name
 
 
-def table_of(text: str, title: str) -> list[list[str]]:
+def parse_table(text: str, title: str) -> list[list[str]]:
     """Return the rows of the table in a section."""
     section = text.split(f"## {title}\n")[1].split("\n## ")[0].replace("\\|", "/")
     return parse_cells("\n".join(line for line in section.splitlines() if line.startswith("|")))[1:]
@@ -124,27 +124,27 @@ def table_of(text: str, title: str) -> list[list[str]]:
 
 def test_tables_against_numbers_by_hand(out: Path) -> None:
     text = (out / "table.md").read_text(encoding="utf-8")
-    assert table_of(text, "Success") == [
+    assert parse_table(text, "Success") == [
         ["door", "B1", "1 of 3", "33", "6–79", "0", "collision (penetration) 2"],
         ["door", "B2", "2 of 3", "67", "21–94", "0", "collision (penetration) 1"],
         ["door", "VKC", "3 of 3", "100", "44–100", "0", "none"],
     ]
     # B1 takes 1, 2 and 3 s, VKC 3, 4 and 5 s. The 95th percentile of 1, 2, 3 is 2 + 0.9.
-    times = table_of(text, "Planning time")
+    times = parse_table(text, "Planning time")
     assert times[0] == ["all trials", "door", "B1", "3", "2.00", "2.90", "2.00", "1.00", "0.50"]
     assert times[4] == ["successes", "door", "B2", "2", "3.50", "3.95", "3.50", "0.71", "0.88"]
     common = "Path lengths, peaks and durations where all methods succeed"
     assert "all methods succeed: 1 of 3 (door)." in text
     base = ["door", "base [m]", "6.00 ± –; 6.00", "5.00 ± –; 5.00", "4.00 ± –; 4.00"]
-    assert table_of(text, common)[0] == base
-    pairs = table_of(text, "VKC against each baseline")
+    assert parse_table(text, common)[0] == base
+    pairs = parse_table(text, "VKC against each baseline")
     assert pairs[0] == ["door", "base [m]", "B1", "4.00", "6.00", "1 of 1"]
     assert pairs[6] == ["door", "planning time [s]", "B1", "5.00", "3.00", "0 of 1"]
     assert pairs[7] == ["door", "base [m]", "B2", "3.50", "4.50", "2 of 2"]
-    own = table_of(text, "Path lengths, peaks and durations over each method's own successes")
+    own = parse_table(text, "Path lengths, peaks and durations over each method's own successes")
     assert own[0] == ["door", "n", "1", "2", "3"]
     assert own[1][2:] == ["6.00 ± –; 6.00", "4.50 ± 0.71; 4.50", "3.00 ± 1.00; 3.00"]
-    assert [(row[1], row[2], row[5]) for row in table_of(text, "Failures")] == [
+    assert [(row[1], row[2], row[5]) for row in parse_table(text, "Failures")] == [
         (str(n), method, f"`failures/door_000{n}_{method}.npz`")
         for n, method in ((0, "B1"), (0, "B2"), (1, "B1"))
     ]
@@ -167,7 +167,11 @@ def test_errors_have_no_times_and_no_path_lengths(result: dict[str, Any]) -> Non
 
 
 def test_failures_are_saved(out: Path, result: dict[str, Any]) -> None:
-    assert files(out / "failures") == {"door_0000_B1.npz", "door_0000_B2.npz", "door_0001_B1.npz"}
+    assert list_files(out / "failures") == {
+        "door_0000_B1.npz",
+        "door_0000_B2.npz",
+        "door_0001_B1.npz",
+    }
     saved = vkc.Plan.load(out / "failures" / "door_0001_B1.npz")
     (trial,) = [t for t in result["trials"] if t["key"] == "door/0001/B1"]
     assert saved.claimed is not None
@@ -178,18 +182,18 @@ def test_failures_are_saved(out: Path, result: dict[str, Any]) -> None:
 
 def test_failures_are_planned_again_to_be_saved(tmp_path: Path) -> None:
     run(tmp_path)
-    assert files(tmp_path / "failures") == set()
+    assert list_files(tmp_path / "failures") == set()
 
     def succeed(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
         return solve(scene, {**spec, "number": 2})
 
     run(tmp_path, solve=succeed, save_failures=True)
     text = (tmp_path / "table.md").read_text(encoding="utf-8")
-    assert files(tmp_path / "failures") == set(), "they succeed this time"
+    assert list_files(tmp_path / "failures") == set(), "they succeed this time"
     assert "## Failures" not in text
     assert "| door | B1 | 1 of 3 |" in text, "trials count as recorded"
     run(tmp_path, save_failures=True)
-    assert "door_0001_B1.npz" in files(tmp_path / "failures")
+    assert "door_0001_B1.npz" in list_files(tmp_path / "failures")
 
 
 @pytest.mark.parametrize(
@@ -220,4 +224,4 @@ def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
         run(tmp_path, methods=[])
     with pytest.raises(InputError, match=r"trials: out of range.*at least 1.*got 0"):
         run(tmp_path, trials=0)
-    assert not files(tmp_path)
+    assert not list_files(tmp_path)

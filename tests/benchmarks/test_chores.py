@@ -39,7 +39,7 @@ def test_cluttered_home_contains_the_home() -> None:
     assert len(full.obstacles) + sum(shapes) > 500
 
 
-def gap(scene: vkc.Scene, first: str, second: str) -> float:
+def compute_distance(scene: vkc.Scene, first: str, second: str) -> float:
     """Return the distance of two links [m]."""
     (pair,) = [
         pair
@@ -53,13 +53,15 @@ def test_cluttered_home_is_as_tight_as_real_ones() -> None:
     """Leaves overlap and touch walls, and handles are near obstacles."""
     full = chores.make_cluttered_home()
     opened = full.with_state("door", {"hinge": 1.52})
-    assert gap(full, "door.panel", "casing_above") == pytest.approx(-0.05, abs=1e-4)
-    assert gap(opened, "door.panel", "casing_above") == pytest.approx(-0.05, abs=1e-4)
-    assert gap(full, "door.panel", "casing_beside") == pytest.approx(-0.02, abs=1e-4)
-    assert gap(full, "refrigerator.door", "panel_east") == pytest.approx(0.0, abs=1e-4)
-    assert gap(full, "refrigerator.door", "panel_west") == pytest.approx(0.009, abs=1e-4)
-    assert gap(full, "door.lever", "bag") == pytest.approx(0.01, abs=1e-4)
-    assert gap(opened, "door.lever", "wardrobe") == pytest.approx(0.01, abs=5e-4)
+    assert compute_distance(full, "door.panel", "casing_above") == pytest.approx(-0.05, abs=1e-4)
+    assert compute_distance(opened, "door.panel", "casing_above") == pytest.approx(-0.05, abs=1e-4)
+    assert compute_distance(full, "door.panel", "casing_beside") == pytest.approx(-0.02, abs=1e-4)
+    assert compute_distance(full, "refrigerator.door", "panel_east") == pytest.approx(0.0, abs=1e-4)
+    assert compute_distance(full, "refrigerator.door", "panel_west") == pytest.approx(
+        0.009, abs=1e-4
+    )
+    assert compute_distance(full, "door.lever", "bag") == pytest.approx(0.01, abs=1e-4)
+    assert compute_distance(opened, "door.lever", "wardrobe") == pytest.approx(0.01, abs=5e-4)
     assert chores.CHORES["cluttered"].options.dist_safe == 0.005
 
 
@@ -72,7 +74,7 @@ def test_steps_depend_on_each_other() -> None:
         compile_each_step(scene, steps, vkc.Options())
 
 
-def stay(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
+def plan_to_stay(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     """Return a plan that succeeds unless the number of the trial is 0."""
     plan = vkc.plan(scene, [vkc.GoTo(*scene.start[:2])], seed=spec["seed"])
     status = "success" if spec["number"] else "not converged"
@@ -81,7 +83,7 @@ def stay(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
 
 def test_trials_are_recorded(tmp_path: Path) -> None:
     result = chores.run(
-        trials=3, seed=4, out=tmp_path, chores=("fetch",), progress=False, solve=stay
+        trials=3, seed=4, out=tmp_path, chores=("fetch",), progress=False, solve=plan_to_stay
     )
     assert [trial["number"] for trial in result["trials"]] == [0, 1, 2]
     assert [trial["success"] for trial in result["trials"]] == [False, True, True]

@@ -21,7 +21,7 @@ def copy(made: Dataset, tmp_path: Path) -> Path:
     return tmp_path / "copy"
 
 
-def shard(folder: Path) -> Path:
+def get_shard(folder: Path) -> Path:
     return Dataset.open(folder).shards[0]
 
 
@@ -33,7 +33,7 @@ def test_valid_dataset_passes(copy: Path) -> None:
 
 
 def test_changed_motion_is_invalid(copy: Path) -> None:
-    with h5py.File(shard(copy), "r+") as file:
+    with h5py.File(get_shard(copy), "r+") as file:
         group = file["data/demo_2"]
         positions = group["motion/knot_positions"]
         positions[len(positions) // 2, 4] += 0.4
@@ -57,7 +57,7 @@ def test_added_obstacle_makes_the_episode_invalid(copy: Path) -> None:
     }
     document["obstacles"].append(box)
     (copy / "scenes" / f"{compute_scene_name(document)}.json").write_text(json.dumps(document))
-    with h5py.File(shard(copy), "r+") as file:
+    with h5py.File(get_shard(copy), "r+") as file:
         file["data/demo_0"].attrs["scene"] = compute_scene_name(document)
     found = check_dataset(copy)
     assert list(found.refused) == [episode.number]
@@ -65,7 +65,7 @@ def test_added_obstacle_makes_the_episode_invalid(copy: Path) -> None:
 
 
 def test_repeated_episode_is_a_problem(copy: Path) -> None:
-    with h5py.File(shard(copy), "r+") as file:
+    with h5py.File(get_shard(copy), "r+") as file:
         numbers = [int(file[f"data/demo_{k}"].attrs["number"]) for k in range(4)]
         del file["data/demo_3"]
         file.copy("data/demo_1", "data/demo_3")
@@ -109,6 +109,6 @@ def test_other_folder_is_no_dataset(tmp_path: Path) -> None:
 def test_command_prints_the_result(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["dataset", "check", str(copy), "--quiet"]) == 0
     assert "4 of 4 episodes are valid" in capsys.readouterr().out
-    shard(copy).write_bytes(b"no")
+    get_shard(copy).write_bytes(b"no")
     assert main(["dataset", "check", str(copy), "--quiet"]) == 1
     assert "not an HDF5 file" in capsys.readouterr().out

@@ -17,7 +17,7 @@ from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
-def along(*points: tuple[float, float]) -> Trajectory:
+def make_base_motion(*points: tuple[float, float]) -> Trajectory:
     positions = np.array([[x, y, 0.0] for x, y in points])
     last = len(points) - 1
     return Trajectory(
@@ -48,10 +48,13 @@ def scene() -> Scene:
 
 
 def test_winding_numbers_of_known_paths(scene: Scene) -> None:
-    right, left = along((-2, -0.1), (0, -1), (2, -0.1)), along((-2, -0.1), (0, 1), (2, -0.1))
+    right, left = (
+        make_base_motion((-2, -0.1), (0, -1), (2, -0.1)),
+        make_base_motion((-2, -0.1), (0, 1), (2, -0.1)),
+    )
     assert compute_winding_numbers(scene, right) == {}  # as the straight line goes
     assert compute_winding_numbers(scene, left) == {"post": -1}  # clockwise round it
-    round_it = along((-2, -0.1), (0, -1), (2, 0), (0, 1), (-2, 0), (0, -1), (2, -0.1))
+    round_it = make_base_motion((-2, -0.1), (0, -1), (2, 0), (0, 1), (-2, 0), (0, -1), (2, -0.1))
     assert compute_winding_numbers(scene, round_it) == {"post": 1}
 
 
@@ -59,7 +62,7 @@ def test_winding_numbers_of_known_paths(scene: Scene) -> None:
 def test_paths_on_one_side_have_no_winding_number(
     scene: Scene, points: list[tuple[float, float]]
 ) -> None:
-    assert compute_winding_numbers(scene, along((-2.0, 0.5), *points, (2.0, 0.5))) == {}
+    assert compute_winding_numbers(scene, make_base_motion((-2.0, 0.5), *points, (2.0, 0.5))) == {}
 
 
 def record(number: int, motion: Trajectory, **changes: object) -> dict[str, object]:
@@ -75,10 +78,10 @@ def record(number: int, motion: Trajectory, **changes: object) -> dict[str, obje
 
 
 def test_near_duplicates_are_found() -> None:
-    seen, straight = DuplicateFinder(), along((0, 0), (1, 0), (2, 0))
+    seen, straight = DuplicateFinder(), make_base_motion((0, 0), (1, 0), (2, 0))
     assert seen.find_duplicate(record(3, straight)) is None
-    assert seen.find_duplicate(record(5, along((0, 0), (1, 0.9 * NEAR), (2, 0)))) == 3
-    assert seen.find_duplicate(record(6, along((0, 0), (1, 2.0 * NEAR), (2, 0)))) is None
+    assert seen.find_duplicate(record(5, make_base_motion((0, 0), (1, 0.9 * NEAR), (2, 0)))) == 3
+    assert seen.find_duplicate(record(6, make_base_motion((0, 0), (1, 2.0 * NEAR), (2, 0)))) is None
     assert seen.find_duplicate(record(7, straight, scene="another")) is None
     assert seen.find_duplicate(record(8, straight, object="another")) is None
 

@@ -20,7 +20,7 @@ pytest.importorskip("h5py")
 EPISODES = 4
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def read_contents(folder: Path) -> dict[str, bytes]:
     """Return what a dataset is, without what making it took."""
     kept = [*folder.glob("shards/*/*"), *folder.glob("scenes/*"), folder / "recipe.yaml"]
     return {file.relative_to(folder).as_posix(): file.read_bytes() for file in kept}
@@ -56,7 +56,7 @@ def test_episodes_are_valid_and_reach_their_goals(made: Dataset) -> None:
 def test_jobs_do_not_affect_the_dataset(made: Dataset, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     other = generate(SMALL, EPISODES, tmp_path / "out", jobs=2)
-    assert contents(other.folder) == contents(made.folder)
+    assert read_contents(other.folder) == read_contents(made.folder)
 
 
 def test_dataset_is_extended(made: Dataset, tmp_path: Path) -> None:
@@ -64,7 +64,7 @@ def test_dataset_is_extended(made: Dataset, tmp_path: Path) -> None:
     generate(SMALL, 2, tmp_path / "out")
     before = (tmp_path / "out/journal.jsonl").read_text()
     more = generate(SMALL, EPISODES, tmp_path / "out")
-    assert contents(more.folder) == contents(made.folder)
+    assert read_contents(more.folder) == read_contents(made.folder)
     assert (tmp_path / "out/journal.jsonl").read_text().startswith(before)
 
 
@@ -81,7 +81,9 @@ def test_removed_files_are_made_again(made: Dataset, tmp_path: Path, removed: st
     generate(SMALL, 3, tmp_path / "out")
     for file in (tmp_path / "out").glob(removed):
         shutil.rmtree(file) if file.is_dir() else file.unlink()
-    assert contents(generate(SMALL, EPISODES, tmp_path / "out").folder) == contents(made.folder)
+    assert read_contents(generate(SMALL, EPISODES, tmp_path / "out").folder) == read_contents(
+        made.folder
+    )
 
 
 def test_stopped_generation_is_resumed(made: Dataset, tmp_path: Path) -> None:
@@ -97,7 +99,9 @@ def test_stopped_generation_is_resumed(made: Dataset, tmp_path: Path) -> None:
         time.sleep(0.01)
     process.kill()
     process.communicate(timeout=60)
-    assert contents(generate(SMALL, EPISODES, tmp_path / "out").folder) == contents(made.folder)
+    assert read_contents(generate(SMALL, EPISODES, tmp_path / "out").folder) == read_contents(
+        made.folder
+    )
 
 
 def test_other_folders_and_recipes_are_refused(made: Dataset, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ STEPS = {
 }
 
 
-def off(scene: Scene, name: str) -> float:
+def compute_grasp_error(scene: Scene, name: str) -> float:
     """Return how far the hand is from what it is said to hold [m] and [rad]."""
     (hold,) = scene.holds
     placed = scene.objects[name]
@@ -34,7 +34,7 @@ def test_hand_is_at_the_attachment(name: str) -> None:
     for _ in range(4):
         found = find_grasping_start(scene, step, rng, Options(), planner)
         assert found is not None
-        assert off(found, name) < 1e-5
+        assert compute_grasp_error(found, name) < 1e-5
         assert found.held == {name: step.attachment}
         bases.append(tuple(found.start[:3]))
     assert len(set(bases)) == 4

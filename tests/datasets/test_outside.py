@@ -41,7 +41,7 @@ def copy(made: Dataset, tmp_path: Path) -> Path:
     return folder
 
 
-def surroundings(folder: Path, root: Path) -> dict[str, bytes | None]:
+def read_surroundings(folder: Path, root: Path) -> dict[str, bytes | None]:
     """Return every path in `root` that is not in `folder`, with the contents of files."""
     paths = [path for path in root.rglob("*") if path != folder and folder not in path.parents]
     return {
@@ -62,7 +62,7 @@ def change_journal(folder: Path, **changes: Any) -> None:
 @pytest.mark.parametrize("name", NOT_NAMES, ids=repr)
 def test_robot_name_in_the_journal_is_checked(copy: Path, tmp_path: Path, name: Any) -> None:
     change_journal(copy, robot=name)
-    before = surroundings(copy, tmp_path)
+    before = read_surroundings(copy, tmp_path)
     with pytest.raises(InputError, match="robot: not a plain file name") as caught:
         generate(SMALL, EPISODES, copy)
     assert (caught.value.file, caught.value.field) == (copy / "journal.jsonl", "robot")
@@ -72,7 +72,7 @@ def test_robot_name_in_the_journal_is_checked(copy: Path, tmp_path: Path, name: 
     )
     if name == "../../../evil":
         assert caught.value.got == "'../../../evil'"
-    assert surroundings(copy, tmp_path) == before
+    assert read_surroundings(copy, tmp_path) == before
     assert not (copy / "shards").exists()
 
 
@@ -81,11 +81,11 @@ def test_scene_name_in_a_work_file_is_checked(copy: Path, tmp_path: Path, name: 
     file = sorted((copy / "work").iterdir())[0]
     with h5py.File(file, "r+") as opened:
         opened["data/demo_0"].attrs["scene"] = str(tmp_path / "evil") if name == "/evil" else name
-    before, scenes = surroundings(copy, tmp_path), sorted((copy / "scenes").iterdir())
+    before, scenes = read_surroundings(copy, tmp_path), sorted((copy / "scenes").iterdir())
     with pytest.raises(InputError, match="demo_0: scene: not a plain file name") as caught:
         generate(SMALL, EPISODES, copy)
     assert (caught.value.file, caught.value.field) == (file, "demo_0: scene")
-    assert surroundings(copy, tmp_path) == before
+    assert read_surroundings(copy, tmp_path) == before
     assert sorted((copy / "scenes").iterdir()) == scenes
 
 
@@ -100,10 +100,10 @@ def test_robot_name_of_a_recipe_is_checked(tmp_path: Path) -> None:
 def test_links_out_of_the_folder_are_refused(copy: Path, tmp_path: Path) -> None:
     (copy / "shards").mkdir()
     (copy / "shards" / "husky_ur5e").symlink_to(tmp_path / "outside")
-    before = surroundings(copy, tmp_path)
+    before = read_surroundings(copy, tmp_path)
     with pytest.raises(InputError, match="leads out of the folder"):
         generate(SMALL, EPISODES, copy)
-    assert surroundings(copy, tmp_path) == before
+    assert read_surroundings(copy, tmp_path) == before
     (copy / "shards" / "husky_ur5e").unlink()
     (copy / "elsewhere").mkdir()
     (copy / "shards" / "husky_ur5e").symlink_to("../elsewhere")

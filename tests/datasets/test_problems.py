@@ -15,11 +15,11 @@ from vkc_pin.world.task.steps import Actuate, Grasp, Place, step_to_dict
 PLANNER = Planner()
 
 
-def drawn(number: int, **changes: Any) -> Any:
+def sample(number: int, **changes: Any) -> Any:
     return sample_problem(load_recipe({**SMALL, **changes}), number, {}, PLANNER)
 
 
-def said(found: Any) -> Any:
+def describe(found: Any) -> Any:
     return (
         found.scene.document,
         [step_to_dict(step) for step in found.steps],
@@ -31,33 +31,33 @@ def said(found: Any) -> Any:
 @pytest.mark.parametrize("task", ["given-open", "drive-open", "fetch-place"])
 def test_problem_is_determined_by_recipe_and_number(task: str) -> None:
     for number in range(3):
-        one = said(drawn(number, tasks=[task]))
-        said(drawn(number + 5, tasks=[task]))  # what was drawn before makes no difference
-        assert said(drawn(number, tasks=[task])) == one
-    assert said(drawn(0, tasks=[task])) != said(drawn(1, tasks=[task]))
+        one = describe(sample(number, tasks=[task]))
+        describe(sample(number + 5, tasks=[task]))  # what was drawn before makes no difference
+        assert describe(sample(number, tasks=[task])) == one
+    assert describe(sample(0, tasks=[task])) != describe(sample(1, tasks=[task]))
 
 
 def test_consecutive_numbers_share_a_room() -> None:
-    rooms = [drawn(number).about["room"] for number in range(8)]
+    rooms = [sample(number).about["room"] for number in range(8)]
     assert rooms == ["room_0", "room_0", "room_1", "room_1"] * 2
 
 
 def test_robots_alternate() -> None:
     robots = [{"name": "husky_ur5e"}, {"name": "husky_ur5e", "height": 0.4}]
-    heights = [drawn(number, robots=robots).scene.described.start.z for number in range(0, 8, 2)]
+    heights = [sample(number, robots=robots).scene.described.start.z for number in range(0, 8, 2)]
     assert heights == [None, 0.4, 0.4, None]  # in every room both
 
 
 def test_variants_differ_in_the_seed() -> None:
-    first, second, other = (drawn(number, variants=2) for number in range(3))
-    assert said(first)[:2] == said(second)[:2]
+    first, second, other = (sample(number, variants=2) for number in range(3))
+    assert describe(first)[:2] == describe(second)[:2]
     assert [one.seed for one in (first, second, other)] == [0, 1, 0]
-    assert said(first)[:2] != said(other)[:2]
+    assert describe(first)[:2] != describe(other)[:2]
 
 
 def test_open_task_keeps_to_the_ranges() -> None:
     for number in range(6):
-        found = drawn(
+        found = sample(
             number, tasks=["drive-open"], goal={"share": [0.2, 0.3]}, start={"distance": [1.0, 4.0]}
         )
         (step,) = found.steps
@@ -75,7 +75,7 @@ def test_open_task_keeps_to_the_ranges() -> None:
 
 
 def test_fetched_object_is_placed_on_another_table() -> None:
-    found = drawn(0, tasks=["fetch-place"])
+    found = sample(0, tasks=["fetch-place"])
     grasp, place = found.steps
     assert isinstance(grasp, Grasp)
     assert isinstance(place, Place)
@@ -93,10 +93,10 @@ def test_fetched_object_is_placed_on_another_table() -> None:
 
 def test_impossible_ranges_are_reported() -> None:
     with pytest.raises(NoProblemError, match="no free start in room_0"):
-        drawn(0, tasks=["drive-open"], start={"distance": [50.0, 60.0]})
+        sample(0, tasks=["drive-open"], start={"distance": [50.0, 60.0]})
     crowded = {"objects": 3, "width": [4.0, 4.0], "front": 3.0, "clutter": [1.0, 1.0]}
     with pytest.raises(NoProblemError, match="room 0 for husky_ur5e"):
-        drawn(
+        sample(
             0,
             tasks=["fetch-place"],
             objects=["random_door", "random_oven", "random_chest"],

@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from .mutations import Mutant, mutants
+from .mutations import Mutant, iterate_mutants
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "vkc_pin"
@@ -40,7 +40,7 @@ def sample_mutants(modules: Sequence[str], count: int, seed: int) -> list[Mutant
     """Return faults of random lines: one of each line before a second one of any."""
     lines = defaultdict[tuple[str, int], list[Mutant]](list)
     for module in modules:
-        for mutant in mutants(module, (PACKAGE / module).read_text(encoding="utf-8")):
+        for mutant in iterate_mutants(module, (PACKAGE / module).read_text(encoding="utf-8")):
             lines[module, mutant.line].append(mutant)
     rng = random.Random(seed)
     order = []

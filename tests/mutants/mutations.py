@@ -6,7 +6,7 @@ import ast
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-__all__ = ["Mutant", "mutants"]
+__all__ = ["Mutant", "iterate_mutants"]
 
 COMPARISONS: dict[type[ast.cmpop], str] = {
     ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "==",
@@ -68,12 +68,12 @@ class _Text:
         return (self.bytes[:begin] + piece.encode() + self.bytes[end:]).decode()
 
 
-def mutants(module: str, source: str) -> Iterator[Mutant]:
+def iterate_mutants(module: str, source: str) -> Iterator[Mutant]:
     """Yield every fault of a module in the order of lines, except in texts, types and errors."""
     text, lines, tree = _Text(source), source.splitlines(), ast.parse(source)
     users, found = _find_users(tree), []
-    for node in _nodes(tree):
-        for kind, (begin, end), piece in _faults(node, text):
+    for node in _iterate_nodes(tree):
+        for kind, (begin, end), piece in _iterate_faults(node, text):
             before = text.bytes[begin:end].decode()
             changed = text.with_piece(begin, end, piece)
             if ast.dump(ast.parse(changed)) == ast.dump(tree):
@@ -100,20 +100,20 @@ def _find_users(tree: ast.Module) -> dict[int, tuple[int, ...]]:
     return found
 
 
-def _nodes(node: ast.AST) -> Iterator[ast.AST]:
+def _iterate_nodes(node: ast.AST) -> Iterator[ast.AST]:
     """Yield the nodes that may be changed."""
     for field, value in ast.iter_fields(node):
         if field in ("annotation", "returns", "decorator_list", "type_params"):
             continue
         for child in value if isinstance(value, list) else [value]:
             left_out = (ast.Raise, ast.JoinedStr, ast.Import, ast.ImportFrom)
-            if not isinstance(child, ast.AST) or isinstance(child, left_out) or _only_text(child):
+            if not isinstance(child, ast.AST) or isinstance(child, left_out) or _is_text(child):
                 continue
             yield child
-            yield from _nodes(child)
+            yield from _iterate_nodes(child)
 
 
-def _only_text(node: ast.AST) -> bool:
+def _is_text(node: ast.AST) -> bool:
     """Return whether a statement is a docstring, `__all__` or a message."""
     if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
         return True
@@ -125,10 +125,10 @@ def _only_text(node: ast.AST) -> bool:
     return bool({"__all__", "detail", "expected", "why"} & set(names))
 
 
-def _faults(node: ast.AST, text: _Text) -> Iterator[tuple[str, tuple[int, int], str]]:
+def _iterate_faults(node: ast.AST, text: _Text) -> Iterator[tuple[str, tuple[int, int], str]]:
     """Yield (kind, span of bytes to replace, replacement)."""
     if isinstance(node, ast.Compare):
-        yield from _comparisons(node, text)
+        yield from _change_comparisons(node, text)
     elif isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
         left, right = text.of(node.left), text.of(node.right)
         begin, end = text.span(node.left)[1], text.span(node.right)[0]
@@ -151,13 +151,13 @@ def _faults(node: ast.AST, text: _Text) -> Iterator[tuple[str, tuple[int, int], 
         old, new = ("and", "or") if isinstance(node.op, ast.And) else ("or", "and")
         yield "boolean", (begin + gap.index(old), begin + gap.index(old) + len(old)), new
     elif isinstance(node, ast.Constant):
-        yield from _constants(node, text)
+        yield from _change_constants(node, text)
     elif isinstance(node, ast.If | ast.IfExp | ast.While) and not isinstance(
         node.test, ast.Compare
     ):
         yield "condition", text.span(node.test), f"(not ({text.of(node.test)}))"
     elif isinstance(node, ast.Call):
-        yield from _calls(node, text)
+        yield from _change_calls(node, text)
     elif (
         (isinstance(node, ast.Expr) and isinstance(node.value, ast.Call))
         or isinstance(node, ast.AugAssign | ast.Continue | ast.Break)
@@ -169,7 +169,9 @@ def _faults(node: ast.AST, text: _Text) -> Iterator[tuple[str, tuple[int, int], 
         yield "name", (end - len(node.attr), end), NAMES[node.attr]
 
 
-def _comparisons(node: ast.Compare, text: _Text) -> Iterator[tuple[str, tuple[int, int], str]]:
+def _change_comparisons(
+    node: ast.Compare, text: _Text
+) -> Iterator[tuple[str, tuple[int, int], str]]:
     sides = [node.left, *node.comparators]
     for k, operator in enumerate(node.ops):
         begin, end = text.span(sides[k])[1], text.span(sides[k + 1])[0]
@@ -183,7 +185,9 @@ def _comparisons(node: ast.Compare, text: _Text) -> Iterator[tuple[str, tuple[in
             yield "comparison", (begin, end), REVERSED[type(operator)]
 
 
-def _constants(node: ast.Constant, text: _Text) -> Iterator[tuple[str, tuple[int, int], str]]:
+def _change_constants(
+    node: ast.Constant, text: _Text
+) -> Iterator[tuple[str, tuple[int, int], str]]:
     if isinstance(node.value, bool):
         yield "constant", text.span(node), str(not node.value)
     elif isinstance(node.value, int):
@@ -192,7 +196,7 @@ def _constants(node: ast.Constant, text: _Text) -> Iterator[tuple[str, tuple[int
         yield "constant", text.span(node), repr(node.value * 2 if node.value else 1.0)
 
 
-def _calls(node: ast.Call, text: _Text) -> Iterator[tuple[str, tuple[int, int], str]]:
+def _change_calls(node: ast.Call, text: _Text) -> Iterator[tuple[str, tuple[int, int], str]]:
     if isinstance(node.func, ast.Name) and node.func.id in NAMES:
         yield "name", text.span(node.func), NAMES[node.func.id]
     first = node.args[:2]

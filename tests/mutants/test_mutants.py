@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from .__main__ import PACKAGE, list_files, measure_coverage, run_mutant, sample_mutants
-from .mutations import mutants
+from .mutations import iterate_mutants
 
 SOURCE = '''"""Docstring 3 < 4."""
 __all__ = ["area"]
@@ -30,7 +30,7 @@ class Kept:
 
 
 def made() -> set[str]:
-    return {mutant.what for mutant in mutants("x.py", SOURCE)}
+    return {mutant.what for mutant in iterate_mutants("x.py", SOURCE)}
 
 
 @pytest.mark.parametrize(
@@ -54,7 +54,7 @@ def test_faults_are_of_all_kinds(what: str) -> None:
 
 
 def test_fault_changes_one_line_of_valid_source() -> None:
-    for mutant in mutants("x.py", SOURCE):
+    for mutant in iterate_mutants("x.py", SOURCE):
         assert ast.dump(ast.parse(mutant.source)) != ast.dump(ast.parse(SOURCE))
         before, after = SOURCE.splitlines(), mutant.source.splitlines()
         assert [
@@ -64,7 +64,7 @@ def test_fault_changes_one_line_of_valid_source() -> None:
 
 
 def test_texts_types_and_errors_are_kept() -> None:
-    changed = {mutant.line for mutant in mutants("x.py", SOURCE)}
+    changed = {mutant.line for mutant in iterate_mutants("x.py", SOURCE)}
     lines = SOURCE.splitlines()
     assert not {
         k
@@ -77,7 +77,7 @@ def test_texts_types_and_errors_are_kept() -> None:
 
 
 def test_users_of_a_constant_are_found() -> None:
-    where = {mutant.what: (mutant.line, mutant.users) for mutant in mutants("x.py", SOURCE)}
+    where = {mutant.what: (mutant.line, mutant.users) for mutant in iterate_mutants("x.py", SOURCE)}
     assert where["constant: 5.0 → 10.0"] == (3, (16,))
     assert where["name: min → max"] == (16, (16,))
 
@@ -87,7 +87,7 @@ def test_tests_find_a_fault(tmp_path: Path) -> None:
     coverage = measure_coverage([file], tmp_path)
     outcomes = {
         mutant.what: run_mutant(mutant, coverage, tmp_path)
-        for mutant in mutants(module, (PACKAGE / module).read_text(encoding="utf-8"))
+        for mutant in iterate_mutants(module, (PACKAGE / module).read_text(encoding="utf-8"))
         if "max_evaluations" in mutant.text and mutant.what.startswith("comparison")
     }
     assert outcomes == {"comparison: in → not in": "killed"}

@@ -42,7 +42,7 @@ def plan(robot: Path) -> vkc.Plan:
     return found
 
 
-def with_openings(motion: Trajectory, *openings: float | None) -> Trajectory:
+def replace_openings(motion: Trajectory, *openings: float | None) -> Trajectory:
     both = zip(motion.phases, openings, strict=True)
     return dataclasses.replace(
         motion, phases=tuple(dataclasses.replace(phase, opening=opening) for phase, opening in both)
@@ -63,11 +63,11 @@ def test_narrow_opening_avoids_a_collision(robot: Path, plan: vkc.Plan) -> None:
 
 def test_validation_uses_the_opening_of_each_phase(robot: Path, plan: vkc.Plan) -> None:
     motion = plan.trajectory
-    open_ = with_openings(motion, None, None, None)
+    open_ = replace_openings(motion, None, None, None)
     found = get_violation_names(validate(plan.scene, PULL, open_, plan.options))
     assert ("opening", "drawer.grip") in found
     assert ("clearance", "finger_a – left") in found
-    report = validate(plan.scene, PULL, with_openings(motion, 0.05, 0.05, 0.05), plan.options)
+    report = validate(plan.scene, PULL, replace_openings(motion, 0.05, 0.05, 0.05), plan.options)
     (opening,) = [one for one in report.violations if one.constraint == "opening"]
     assert opening.amount == pytest.approx(0.01)
     assert "50.0 mm open, 40.0 mm are required" in opening.detail
@@ -83,7 +83,7 @@ def test_opening_fingers_must_not_collide(robot: Path, plan: vkc.Plan) -> None:
     motion = found.trajectory
     last = motion.phases[-1]
     assert last.last - last.first == 1  # one step of time, in which the robot rests
-    widened = with_openings(motion, *[phase.opening for phase in motion.phases[:-1]], WIDEST)
+    widened = replace_openings(motion, *[phase.opening for phase in motion.phases[:-1]], WIDEST)
     close = validate(near, asked, widened, found.options)
     assert {
         ("clearance", "finger_a – left"),
@@ -104,7 +104,7 @@ def test_opening_beyond_the_gripper_is_refused(plan: vkc.Plan) -> None:
     with pytest.raises(
         vkc.InputError, match=r"phases\[2\].opening.*so far open.*0 to 0.07996 m.*0.2"
     ):
-        validate(plan.scene, PULL, with_openings(plan.trajectory, NARROW, NARROW, 0.2))
+        validate(plan.scene, PULL, replace_openings(plan.trajectory, NARROW, NARROW, 0.2))
 
 
 def test_robot_must_rest_while_fingers_move(plan: vkc.Plan) -> None:
@@ -234,11 +234,13 @@ def test_openings_are_saved(plan: vkc.Plan, tmp_path: Path) -> None:
         (Trajectory.from_json, plan.trajectory.to_json),
     ):
         assert read(write(tmp_path / "motion")).phases == plan.trajectory.phases
-    mixed = with_openings(plan.trajectory, 0.0, None, NARROW)
+    mixed = replace_openings(plan.trajectory, 0.0, None, NARROW)
     assert [
         phase.opening for phase in Trajectory.from_csv(mixed.to_csv(tmp_path / "mixed")).phases
     ] == [0.0, None, NARROW]
-    assert "opening" not in json.dumps(with_openings(plan.trajectory, None, None, None).to_dict())
+    assert "opening" not in json.dumps(
+        replace_openings(plan.trajectory, None, None, None).to_dict()
+    )
 
 
 @pytest.mark.parametrize(("opening", "stands"), [(0.3, WIDEST), (0.0801, WIDEST)])
@@ -270,7 +272,7 @@ def test_warning_without_a_gripper(tmp_path: Path) -> None:
     ]
     motion = vkc.plan(scene, PULL).trajectory
     with pytest.raises(vkc.InputError, match=r"phases\[1\].opening.*does not open"):
-        validate(scene, PULL, with_openings(motion, None, NARROW, None))
+        validate(scene, PULL, replace_openings(motion, None, NARROW, None))
 
 
 @pytest.mark.parametrize(

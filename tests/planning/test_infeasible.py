@@ -16,7 +16,7 @@ QUICK = vkc.Options(
 )
 
 
-def box(name: str, size: Sequence[float], position: Sequence[float]) -> dict[str, Any]:
+def describe_box(name: str, size: Sequence[float], position: Sequence[float]) -> dict[str, Any]:
     return {"name": name, "type": "box", "size": list(size), "position": list(position)}
 
 
@@ -54,7 +54,7 @@ def find_violation(plan: vkc.Plan, constraint: str, subject: str) -> vkc.Violati
 
 
 def test_door_behind_a_wall() -> None:
-    scene = add_obstacles(box("barrier", (0.1, 1.07, 2.0), (2.3, 0.0, 1.0)))
+    scene = add_obstacles(describe_box("barrier", (0.1, 1.07, 2.0), (2.3, 0.0, 1.0)))
     plan = vkc.plan(scene, [vkc.Actuate("door", {"hinge": 1.2})], options=QUICK)
     assert plan.status == "infeasible"
     check_explanation(plan, "because reach door.handle", "are blocked", "– barrier", "mm")
@@ -102,7 +102,7 @@ def test_target_out_of_reach() -> None:
 
 def test_start_in_collision() -> None:
     plan = vkc.plan(
-        make_hall(obstacles=[box("crate", (0.4, 0.4, 0.4), (0.5, 0.0, 0.2))]),
+        make_hall(obstacles=[describe_box("crate", (0.4, 0.4, 0.4), (0.5, 0.0, 0.2))]),
         [vkc.GoTo(-1.0, 0.0)],
         options=QUICK,
     )
@@ -115,7 +115,7 @@ def test_start_in_collision() -> None:
     assert first.amount == pytest.approx(0.195, abs=1e-3)
 
 
-WALLS = [box("fence", (0.1, 12.0, 2.4), (1.2, 0.0, 1.2))]
+WALLS = [describe_box("fence", (0.1, 12.0, 2.4), (1.2, 0.0, 1.2))]
 
 
 @pytest.mark.parametrize(
@@ -135,14 +135,14 @@ def test_closed_gap(step: Any) -> None:
 
 
 def test_base_goal_inside_furniture() -> None:
-    crate = box("crate", (0.6, 0.6, 0.4), (1.5, 0.0, 0.2))
+    crate = describe_box("crate", (0.6, 0.6, 0.4), (1.5, 0.0, 0.2))
     plan = vkc.plan(make_hall(obstacles=[crate]), [vkc.GoTo(1.5, 0.0, 0.0)], options=QUICK)
     assert plan.status == "infeasible"
     check_explanation(plan, "because go to: no place for the base, proven: ", "it hits crate")
 
 
 def test_all_reasons_are_given() -> None:
-    scene = make_hall(obstacles=[box("crate", (0.4, 0.4, 0.4), (0.5, 0.0, 0.2))])
+    scene = make_hall(obstacles=[describe_box("crate", (0.4, 0.4, 0.4), (0.5, 0.0, 0.2))])
     plan = vkc.plan(scene, [vkc.GoTo(9.0, 0.0)], options=QUICK)
     check_explanation(plan, "start base_link – crate", "goal base_x")
 

@@ -151,27 +151,27 @@ def test_changed_start_is_saved(door_plan: vkc.Plan, saved: Path) -> None:
     np.testing.assert_array_equal(vkc.Plan.load(saved).scene.start, door_plan.scene.start)
 
 
-def _garbage(path: Path) -> None:
+def _write_garbage(path: Path) -> None:
     path.write_bytes(b"this is not a plan at all" * 20)
 
 
-def _truncated(path: Path) -> None:
+def _truncate(path: Path) -> None:
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
 
 
-def _flipped(path: Path) -> None:
+def _flip_bytes(path: Path) -> None:
     data = bytearray(path.read_bytes())
     for at in range(200, len(data) - 400, 97):
         data[at] ^= 0xFF
     path.write_bytes(bytes(data))
 
 
-def _foreign(path: Path) -> None:
+def _write_foreign(path: Path) -> None:
     np.savez(path, weights=np.zeros(3))
 
 
-def _pickled(path: Path) -> None:
+def _write_pickle(path: Path) -> None:
     np.savez(
         path,
         about=np.array({"format": FORMAT}, dtype=object),
@@ -180,10 +180,10 @@ def _pickled(path: Path) -> None:
     )
 
 
-DAMAGES = (_garbage, _truncated, _flipped, _foreign, _pickled)
+DAMAGES = (_write_garbage, _truncate, _flip_bytes, _write_foreign, _write_pickle)
 
 
-def _listed(path: Path) -> None:
+def _write_list(path: Path) -> None:
     np.savez(path, about=np.array("[1, 2]"), times=np.zeros(2), positions=np.zeros((2, 9)))
 
 
@@ -191,7 +191,7 @@ def _listed(path: Path) -> None:
     ("damage", "said"),
     [
         *((damage, "not a saved plan") for damage in DAMAGES),
-        (_listed, r"wrong value .expected fields"),
+        (_write_list, r"wrong value .expected fields"),
     ],
 )
 def test_damaged_files(saved: Path, damage: Callable[[Path], None], said: str) -> None:

@@ -27,7 +27,7 @@ class FakeReport:
         return not self.violations
 
 
-def corner(scene: vkc.Scene) -> Trajectory:
+def make_corner(scene: vkc.Scene) -> Trajectory:
     """Return waypoints of a base that drives ahead, and then to the left."""
     rows = np.tile(scene.start, (9, 1))
     rows[:, 0] += 0.2 * np.minimum(np.arange(9), 4)
@@ -59,8 +59,8 @@ def test_the_curve_comes_closer_where_it_is_wrong(allowed: float, most: int) -> 
         looked.append(float(far.max()))
         return FakeReport(tuple(FakeViolation(int(k)) for k in np.flatnonzero(far > allowed)))
 
-    motion, report = retime_validated(scene, corner(scene), check)
-    np.testing.assert_array_equal(motion.positions, corner(scene).positions)
+    motion, report = retime_validated(scene, make_corner(scene), check)
+    np.testing.assert_array_equal(motion.positions, make_corner(scene).positions)
     assert len(looked) <= most
     assert looked == sorted(looked, reverse=True)
     assert report.ok == (allowed > 1e-6)
@@ -74,6 +74,6 @@ def test_without_repairs_it_is_looked_at_once() -> None:
         looked.append(motion)
         return FakeReport((FakeViolation(0),))
 
-    motion, report = retime_validated(scene, corner(scene), check, repairs=0)
+    motion, report = retime_validated(scene, make_corner(scene), check, repairs=0)
     assert looked == [motion]
     assert not report.ok

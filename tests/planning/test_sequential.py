@@ -33,7 +33,9 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import compute_final_scene
 
 
-def end_motion(scene: Scene, base: list[float], arm: np.ndarray, **objects: float) -> Trajectory:
+def make_end_motion(
+    scene: Scene, base: list[float], arm: np.ndarray, **objects: float
+) -> Trajectory:
     """Return a motion that ends with these coordinates of base, arm and object joints."""
     names = (*scene.robot.coordinates.names, *(name.replace("__", ".") for name in objects))
     last = [*base, *arm, *objects.values()]
@@ -47,7 +49,7 @@ def test_final_coordinates() -> None:
     scene = make_full_scene().with_state("door", {"knob": 0.2})
     arm = np.linspace(-0.5, 0.5, len(scene.start) - 3)
     after = compute_final_scene(
-        scene, end_motion(scene, [0.1, -0.2, 4.0], arm, door__hinge=0.4), []
+        scene, make_end_motion(scene, [0.1, -0.2, 4.0], arm, door__hinge=0.4), []
     )
     np.testing.assert_array_equal(after.start, [0.1, -0.2, 4.0, *arm])
     np.testing.assert_array_equal(after.objects["door"].state, [0.4, 0.2])
@@ -60,7 +62,7 @@ def test_final_coordinates_are_clamped_to_their_limits() -> None:
     scene, off = make_full_scene(), 1e-4
     robot, door = scene.robot, scene.objects["door"].object
     sleeve = scene.objects["cabinet"].object.attachment("sleeve")
-    motion = end_motion(
+    motion = make_end_motion(
         scene,
         [scene.arena[1] + off, scene.arena[2] - off, 0.0],
         robot.upper[3:] + off,

@@ -17,7 +17,7 @@ from vkc_pin.utils.cache import Cache, CacheInfo
 from vkc_pin.utils.parallel.machine import measure_resident_memory
 
 
-def sized(nbytes: int) -> Any:
+def make_sized(nbytes: int) -> Any:
     return SimpleNamespace(nbytes=nbytes)
 
 
@@ -28,7 +28,7 @@ def test_the_most_recent_objects_are_kept(keys: list[int], max_entries: int) -> 
 
         def build(key: int = key) -> Any:
             built.append(key)
-            return sized(key)
+            return make_sized(key)
 
         before = len(built)
         assert cache.get(("number", key), build).nbytes == key
@@ -42,7 +42,7 @@ def test_the_most_recent_objects_are_kept(keys: list[int], max_entries: int) -> 
 def test_objects_are_evicted_by_the_prefix_of_their_key() -> None:
     cache, keys = Cache(), [("solver", 1, "a"), ("solver", 1), ("solver", 2, "a"), "solver"]
     for key in keys:
-        cache.get(key, lambda: sized(1))
+        cache.get(key, lambda: make_sized(1))
     cache.evict("solver", 1)
     assert cache.info().entries == 2
     for key in keys[2:]:
@@ -54,7 +54,7 @@ def test_failed_builds_are_not_cached() -> None:
     with pytest.raises(ZeroDivisionError):
         cache.get("bad", lambda: 1 // 0)
     assert cache.info().entries == 0
-    assert cache.get("bad", lambda: sized(3)).nbytes == 3
+    assert cache.get("bad", lambda: make_sized(3)).nbytes == 3
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc keeps freed memory")
@@ -79,7 +79,7 @@ def test_build_time_includes_parts_once(monkeypatch: pytest.MonkeyPatch) -> None
     clock = iter(range(100))
     monkeypatch.setattr("vkc_pin.utils.cache.time.perf_counter", lambda: float(next(clock)))
     cache = Cache()
-    cache.get("whole", lambda: (cache.get("part", lambda: sized(1)), sized(2))[1])
+    cache.get("whole", lambda: (cache.get("part", lambda: make_sized(1)), make_sized(2))[1])
     assert cache.build_time == 2.0  # of the readings 0 to 2, the second is that of the part
 
 
@@ -89,7 +89,7 @@ def test_planners_lend_one_cache_to_each_thread() -> None:
     def acquire() -> None:
         with planner.acquire() as cache:
             seen.append(cache)
-            cache.get(threading.get_ident(), lambda: sized(5))
+            cache.get(threading.get_ident(), lambda: make_sized(5))
             barrier.wait()
 
     threads = [threading.Thread(target=acquire) for _ in range(2)]
@@ -100,7 +100,7 @@ def test_planners_lend_one_cache_to_each_thread() -> None:
     assert len(set(map(id, seen))) == 2
     assert planner.info() == CacheInfo(entries=2, nbytes=10, hits=0, misses=2)
     with pytest.raises(ZeroDivisionError), planner.acquire() as again:
-        again.get("bad", lambda: sized(1 // 0))
+        again.get("bad", lambda: make_sized(1 // 0))
     assert any(again is cache for cache in seen)
     assert planner.info().entries == 2
 
@@ -109,7 +109,7 @@ def test_planners_lend_one_cache_to_each_thread() -> None:
 def test_trimming_evicts_the_oldest_until_the_rest_fits(sizes: list[int], nbytes: int) -> None:
     cache = Cache(max_nbytes=nbytes)
     for size in sizes:
-        cache.get(size, lambda size=size: sized(size))
+        cache.get(size, lambda size=size: make_sized(size))
     cache.trim()
     left = cache.info()
     expected = next(
@@ -123,11 +123,11 @@ def test_planners_keep_their_limits() -> None:
     with planner.acquire() as first, planner.acquire() as second:
         for cache in (first, second):
             for key in range(3):
-                cache.get(key, lambda: sized(4))
+                cache.get(key, lambda: make_sized(4))
     assert planner.info().entries == 2
     assert planner.info().nbytes == 8
     with planner.acquire() as cache:
-        cache.get("large", lambda: sized(9))
+        cache.get("large", lambda: make_sized(9))
     assert (planner.info().entries, planner.info().nbytes) == (1, 9)
     planner.clear()
     assert planner.info() == CacheInfo()

@@ -24,7 +24,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache" / "vkc_pin"
 
 
-def never() -> None:
+def fail() -> None:
     raise AssertionError("it is there")
 
 
@@ -38,7 +38,7 @@ def test_records_round_trip(here: Path, key: bytes, data: object) -> None:
     assert disk_cache.load_or_build(key, lambda: data) == data
     (file,) = here.iterdir()
     assert file.stat().st_mode & 0o777 == 0o600
-    assert disk_cache.load_or_build(key, never) == data
+    assert disk_cache.load_or_build(key, fail) == data
     assert disk_cache.load_or_build(key + b"x", lambda: "other") == "other"
 
 

@@ -45,7 +45,7 @@ SIDES = np.diag([1.0, -1.0, 1.0])
 
 
 @cache
-def hall() -> Scene:
+def make_hall() -> Scene:
     return make_room(describe_table())
 
 
@@ -62,7 +62,7 @@ def compute_tip_position(scene: Scene, row: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("values", [(0.0, 0.0), (0.06, 0.0), (-0.05, 0.3), (0.09, -0.3)])
 def test_pick_and_place_is_valid(values: tuple[float, float]) -> None:
-    motion = carry_over(hall(), values=values).motion()
+    motion = carry_over(make_hall(), values=values).motion()
     for steps in (
         [PLACED],
         [vkc.Place("stick", ASIDE.translation)],
@@ -71,7 +71,7 @@ def test_pick_and_place_is_valid(values: tuple[float, float]) -> None:
         [vkc.Grasp("stick"), vkc.Release()],
         [vkc.Grasp("stick"), vkc.Release("stick"), vkc.GoTo(0.0, 0.5, 0.0)],
     ):
-        report = judge(hall(), steps, motion)
+        report = judge(make_hall(), steps, motion)
         assert report.ok, "\n".join(report.lines())
         assert report.closure_error < 1e-9
         assert report.clearance == pytest.approx(1e-3, abs=1e-6)  # of the discs above the table
@@ -114,35 +114,35 @@ def test_fetching_with_a_tool_is_valid() -> None:
 
 @pytest.mark.parametrize("side", SIDES, ids=str)
 def test_position_error_of_a_grasp(side: np.ndarray) -> None:
-    motion = carry_over(hall(), off=pin.SE3(np.eye(3), 2e-3 * side)).motion()
-    report = judge(hall(), [PLACED], motion)
+    motion = carry_over(make_hall(), off=pin.SE3(np.eye(3), 2e-3 * side)).motion()
+    report = judge(make_hall(), [PLACED], motion)
     found = get_only_violation(report)
     assert (found.constraint, found.subject, found.unit) == ("closure", "stick.grip", "m")
     assert found.amount == pytest.approx(1e-3, abs=1e-9)
     assert found.waypoint >= motion.phases[2].first
     assert report.closure_error == pytest.approx(2e-3, abs=1e-9)
-    grasped = judge(hall(), [vkc.Grasp("stick"), PLACED], motion)
+    grasped = judge(make_hall(), [vkc.Grasp("stick"), PLACED], motion)
     assert get_violation_names(grasped) == {("closure", "stick.grip"), ("goal", "stick.grip")}
-    within = carry_over(hall(), off=pin.SE3(np.eye(3), 9e-4 * side)).motion()
-    assert judge(hall(), [vkc.Grasp("stick"), PLACED], within).ok
+    within = carry_over(make_hall(), off=pin.SE3(np.eye(3), 9e-4 * side)).motion()
+    assert judge(make_hall(), [vkc.Grasp("stick"), PLACED], within).ok
 
 
 @pytest.mark.parametrize("side", SIDES, ids=str)
 def test_orientation_error_of_a_grasp(side: np.ndarray) -> None:
-    motion = carry_over(hall(), off=pin.SE3(pin.exp3(4e-3 * side), np.zeros(3))).motion()
-    found = get_only_violation(judge(hall(), [PLACED], motion))
+    motion = carry_over(make_hall(), off=pin.SE3(pin.exp3(4e-3 * side), np.zeros(3))).motion()
+    found = get_only_violation(judge(make_hall(), [PLACED], motion))
     assert (found.constraint, found.subject, found.unit) == ("closure", "stick.grip", "rad")
     assert found.amount == pytest.approx(3e-3, abs=1e-6)
 
 
 def test_grasp_coordinates_must_match_the_tool() -> None:
-    script = carry_over(hall(), values=(0.05, 0.0))
+    script = carry_over(make_hall(), values=(0.05, 0.0))
     for column, value, unit in (
         ("stick__grip_slide", 0.053, "m"),
         ("stick__grip_turn", 0.01, "rad"),
     ):
         report = judge(
-            hall(), [PLACED], script.motion(**{column: np.full(len(script.rows), value)})
+            make_hall(), [PLACED], script.motion(**{column: np.full(len(script.rows), value)})
         )
         assert get_violation_names(report) == {("closure", "stick.grip")}
         assert unit in {found.unit for found in report.violations}
@@ -153,7 +153,7 @@ def test_grasp_coordinates_must_match_the_tool() -> None:
 )
 def test_limits_of_grasp_coordinates(values: tuple[float, float], subject: str) -> None:
     down = solve_reach(compute_grasp_pose(lift(STICK, 0.3 * UP), values=values), GUESS)
-    scene = hall().with_held({"stick": "grip"}).with_start(arm=down[3:])
+    scene = make_hall().with_held({"stick": "grip"}).with_start(arm=down[3:])
     script = Script(scene).go(move_base(scene.start, y=0.5))
     script.values |= dict(zip(("stick.grip_slide", "stick.grip_turn"), values, strict=True))
     assert ("limit", subject) in get_violation_names(
@@ -171,12 +171,12 @@ def make_slide(script: Script, *, begin: int, end: int, by: float) -> np.ndarray
     [("grip_slide", 0.02, "m"), ("grip_turn", 0.1, "rad"), ("grip_slide", 1e-4, "m")],
 )
 def test_firm_grasps_must_not_slide(column: str, by: float, unit: str) -> None:
-    script = carry_over(hall())
+    script = carry_over(make_hall())
     phase = script.phases[3]  # half-way, in the air
     motion = script.motion(
         **{f"stick__{column}": make_slide(script, begin=phase.first + 3, end=phase.last - 3, by=by)}
     )
-    report = judge(hall(), [vkc.Release()], motion)
+    report = judge(make_hall(), [vkc.Release()], motion)
     found = next(v for v in report.violations if v.constraint == "slide")
     assert get_violation_names(report) <= {
         ("slide", f"stick.{column}"),
@@ -188,24 +188,24 @@ def test_firm_grasps_must_not_slide(column: str, by: float, unit: str) -> None:
     assert (
         report.closure_error < 1e-9
     )  # the hand is where the coordinates say, so nothing else would notice
-    loose = replace_grasp(hall(), "stick", "grip", firm=False)
+    loose = replace_grasp(make_hall(), "stick", "grip", firm=False)
     assert "slide" not in {v.constraint for v in judge(loose, [vkc.Release()], motion).violations}
 
 
 def test_grasp_coordinates_are_free_before_the_grasp() -> None:
-    script = carry_over(hall(), values=(0.0, 0.0))
+    script = carry_over(make_hall(), values=(0.0, 0.0))
     before = make_slide(script, begin=0, end=script.phases[1].last - 1, by=0.05)[::1] - 0.05
     motion = script.motion(stick__grip_slide=before)
-    report = judge(hall(), [PLACED], motion)
+    report = judge(make_hall(), [PLACED], motion)
     assert report.ok, "\n".join(report.lines())
 
 
 def test_slide_in_the_last_segment_of_a_grasp() -> None:
-    script = carry_over(hall())
+    script = carry_over(make_hall())
     last = script.phases[4].last
     for begin, end, slides in ((last - 1, last, True), (last, last + 1, False)):
         motion = script.motion(stick__grip_slide=make_slide(script, begin=begin, end=end, by=0.01))
-        constraints = {v.constraint for v in judge(hall(), [vkc.Release()], motion).violations}
+        constraints = {v.constraint for v in judge(make_hall(), [vkc.Release()], motion).violations}
         assert ("slide" in constraints) == slides
 
 
@@ -223,12 +223,12 @@ def test_slide_in_the_last_segment_of_a_grasp() -> None:
 )
 def test_pose_error_of_a_placed_object(off: pin.SE3, subject_unit: str, amount: float) -> None:
     goal = pin.SE3(ASIDE.rotation @ off.rotation.T, ASIDE.translation - off.translation)
-    motion = carry_over(hall()).motion()
-    found = get_only_violation(judge(hall(), [vkc.Place("stick", goal)], motion))
+    motion = carry_over(make_hall()).motion()
+    found = get_only_violation(judge(make_hall(), [vkc.Place("stick", goal)], motion))
     assert (found.constraint, found.subject, found.unit) == ("goal", "stick.stick", subject_unit)
     assert found.amount == pytest.approx(amount, abs=1e-8)
     assert found.waypoint == motion.phases[-1].last
-    assert judge(hall(), [vkc.Place("stick", ASIDE)], motion).ok
+    assert judge(make_hall(), [vkc.Place("stick", ASIDE)], motion).ok
 
 
 @pytest.mark.parametrize(
@@ -288,15 +288,19 @@ def test_object_grasped_at_the_start_is_placed_upright() -> None:
 
 
 def test_upside_down_is_not_upright() -> None:
-    scene = place_object(hall(), "stick", pin.SE3(pin.utils.rotate("y", np.pi), ASIDE.translation))
+    scene = place_object(
+        make_hall(), "stick", pin.SE3(pin.utils.rotate("y", np.pi), ASIDE.translation)
+    )
     stands = Script(scene).go(move_base(scene.start, x=-0.5)).motion()
     assert judge(scene, [vkc.Place("stick", ASIDE.translation)], stands).ok
     assert get_only_violation(judge(scene, [PLACED], stands)).amount == pytest.approx(
         np.pi - 1e-3, abs=1e-6
     )
-    lying = carry_over(hall()).motion()
+    lying = carry_over(make_hall()).motion()
     turned = place_object(
-        hall(), "stick", pin.SE3(pin.utils.rotate("y", np.pi) @ STICK.rotation, STICK.translation)
+        make_hall(),
+        "stick",
+        pin.SE3(pin.utils.rotate("y", np.pi) @ STICK.rotation, STICK.translation),
     )
     report = judge(turned, [vkc.Place("stick", (0.8, 0.5, 0.55))], lying)
     assert ("goal", "stick.stick") not in get_violation_names(
@@ -308,7 +312,7 @@ def test_upside_down_is_not_upright() -> None:
 
 
 def test_object_must_be_released() -> None:
-    script = carry_over(hall())
+    script = carry_over(make_hall())
     script.phases[5] = PhaseSpan(
         "stay", script.phases[4].last, script.phases[4].last + 2, script.phases[4].holds
     )
@@ -316,53 +320,55 @@ def test_object_must_be_released() -> None:
     script.rows[-2:] = [script.rows[-3]] * 2
     motion = script.motion()
     for steps in ([PLACED], [vkc.Grasp("stick"), vkc.Release()], [vkc.Release("stick")]):
-        close, held = judge(hall(), steps, motion).violations
+        close, held = judge(make_hall(), steps, motion).violations
         assert (close.constraint, close.subject) == ("clearance", "stick.stick – table")
         assert (held.constraint, held.subject) == ("goal", "stick")
         assert "still grasped" in held.detail
 
 
 def test_placed_object_must_not_be_moved_again() -> None:
-    script = carry_over(hall())
+    script = carry_over(make_hall())
     down = script.rows[script.phases[4].last]
     script.go(down).take("stick").go(move_base(down, y=-0.3)).let_go()
     motion = script.go(move_base(solve_above(STICK), y=0.2)).motion()
     further = vkc.Place("stick", lift(STICK, [0.0, 0.2, 0.0]))
-    assert judge(hall(), [PLACED, further], motion).ok
-    assert ("goal", "stick.stick") in get_violation_names(judge(hall(), [PLACED], motion))
-    assert ("goal", "stick.stick") in get_violation_names(judge(hall(), [further, PLACED], motion))
+    assert judge(make_hall(), [PLACED, further], motion).ok
+    assert ("goal", "stick.stick") in get_violation_names(judge(make_hall(), [PLACED], motion))
+    assert ("goal", "stick.stick") in get_violation_names(
+        judge(make_hall(), [further, PLACED], motion)
+    )
     end = vkc.GoTo(*map(float, motion.positions[-1, :2]))
-    undone = get_only_violation(judge(hall(), [PLACED, end], motion))
+    undone = get_only_violation(judge(make_hall(), [PLACED, end], motion))
     assert (undone.constraint, undone.subject) == ("order", "step 1")
 
 
 def test_object_must_not_be_moved_before_its_step() -> None:
-    script = carry_over(hall())
-    motion = script.go(move_base(hall().start, y=1.0)).motion()
-    assert judge(hall(), [PLACED, vkc.GoTo(0.0, 1.0)], motion).ok
-    back = carry_over(hall()).motion()
+    script = carry_over(make_hall())
+    motion = script.go(move_base(make_hall().start, y=1.0)).motion()
+    assert judge(make_hall(), [PLACED, vkc.GoTo(0.0, 1.0)], motion).ok
+    back = carry_over(make_hall()).motion()
     (x, y) = back.positions[-1, :2]
-    assert get_violation_names(judge(hall(), [vkc.GoTo(float(x), float(y)), PLACED], back)) == {
-        ("order", "stick")
-    }
+    assert get_violation_names(
+        judge(make_hall(), [vkc.GoTo(float(x), float(y)), PLACED], back)
+    ) == {("order", "stick")}
 
 
 def test_grasped_object_must_stay_grasped() -> None:
-    motion = carry_over(hall()).motion()
+    motion = carry_over(make_hall()).motion()
     goto = vkc.GoTo(*map(float, motion.positions[-1, :2]))
-    assert judge(hall(), [vkc.Grasp("stick"), vkc.Release(), goto], motion).ok
-    found = get_only_violation(judge(hall(), [vkc.Grasp("stick"), goto], motion))
+    assert judge(make_hall(), [vkc.Grasp("stick"), vkc.Release(), goto], motion).ok
+    found = get_only_violation(judge(make_hall(), [vkc.Grasp("stick"), goto], motion))
     assert (found.constraint, found.subject) == ("goal", "stick")
     assert "not grasped" in found.detail
 
 
 def test_grasp_at_the_end_of_the_motion() -> None:
     up = solve_above(STICK)
-    motion = Script(hall()).go(up).go(solve_reach(compute_grasp_pose(STICK), up)).motion()
+    motion = Script(make_hall()).go(up).go(solve_reach(compute_grasp_pose(STICK), up)).motion()
     grasp, here = vkc.Grasp("stick"), vkc.GoTo(*map(float, motion.positions[-1, :2]))
     for steps in ([grasp], [grasp, grasp], [here, grasp, grasp]):
-        assert judge(hall(), steps, motion).ok, steps
-    found = get_only_violation(judge(hall(), [grasp, grasp, here], motion))
+        assert judge(make_hall(), steps, motion).ok, steps
+    found = get_only_violation(judge(make_hall(), [grasp, grasp, here], motion))
     assert (found.constraint, found.subject) == ("goal", "stick")
 
 
@@ -477,15 +483,15 @@ def test_object_may_rest_on_a_table_but_not_penetrate_it(gap: float, ok: bool) -
 def test_only_supports_may_be_close() -> None:
     down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
     passing = (
-        Script(hall())
+        Script(make_hall())
         .go(down)
         .take("stick")
-        .go(np.array(hall().start))
-        .go(move_base(hall().start, y=1.0))
+        .go(np.array(make_hall().start))
+        .go(move_base(make_hall().start, y=1.0))
     )
-    passing.go(move_base(down, y=1.0)).let_go().go(move_base(hall().start, y=1.0))
+    passing.go(move_base(down, y=1.0)).let_go().go(move_base(make_hall().start, y=1.0))
     motion, steps = passing.motion(), [vkc.Place("stick", lift(STICK, [0.0, 1.0, 0.0]))]
-    assert judge(hall(), steps, motion).ok
+    assert judge(make_hall(), steps, motion).ok
     shelf = describe_box(
         "shelf", [0.1, 0.2, 0.1], [0.8, 0.6, 0.7 - 0.05 - 0.01]
     )  # the discs' lowest points pass at 0.7
@@ -574,7 +580,7 @@ def test_grasped_object_must_not_hit_free_objects() -> None:
 
 def test_fingers_must_not_penetrate_the_grasped_object() -> None:
     """The grasp lies 3 cm deeper in the hand, so that the palm overlaps the stick."""
-    deep = replace_grasp(hall(), "stick", "grip", standoff=-0.03)
+    deep = replace_grasp(make_hall(), "stick", "grip", standoff=-0.03)
     up = solve_reach(
         compute_grasp_pose(lift(STICK)) * pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.04])),
         solve_above(STICK),
@@ -582,7 +588,9 @@ def test_fingers_must_not_penetrate_the_grasped_object() -> None:
     scene = deep.with_held({"stick": "grip"}).with_start(arm=up[3:])
     report = judge(scene, [vkc.GoTo(0.0, 0.3)], Script(scene).go(move_base(up, y=0.3)).motion())
     assert {v.constraint for v in report.violations} == {"penetration"}
-    assert {v.subject.split(" – ")[0] for v in report.violations} <= set(hall().robot.touch_links)
+    assert {v.subject.split(" – ")[0] for v in report.violations} <= set(
+        make_hall().robot.touch_links
+    )
     assert {v.subject.split(" – ")[1] for v in report.violations} == {"stick.stick"}
 
 
@@ -653,19 +661,19 @@ def test_object_grasped_by_a_tool_requires_the_tool() -> None:
 )
 def test_steps_with_unknown_names_are_refused(step: object, field: str, nearest: str) -> None:
     with pytest.raises(UnknownNameError) as caught:
-        judge(hall(), [step], carry_over(hall()).motion())
+        judge(make_hall(), [step], carry_over(make_hall()).motion())
     assert (caught.value.field, caught.value.nearest) == (field, nearest)
 
 
 def test_trajectories_with_missing_columns_or_frames_are_refused() -> None:
-    full = carry_over(hall()).motion()
+    full = carry_over(make_hall()).motion()
     names_without = tuple(name for name in full.names if name != "stick.grip_slide")
     kept = [full.names.index(name) for name in names_without]
     lacking = Trajectory(
         names_without, full.times, full.positions[:, kept], full.phases, full.robot_size
     )
     with pytest.raises(InputError, match="missing") as caught:
-        judge(hall(), [PLACED], lacking)
+        judge(make_hall(), [PLACED], lacking)
     assert caught.value.expected == "stick.grip_slide"
     script = fetch_ball()
     data = script.motion().to_dict()

@@ -115,7 +115,7 @@ def test_wheel_speed_in_steps(base: str) -> None:
     assert validate(scene, [vkc.GoTo(1.0, 0.0)], straight).ok
 
 
-def circle(
+def make_circle(
     scene: Scene, *, radius: float = 1.0, peak: float = 0.4, aside: float = 0.0
 ) -> tuple[list[Any], Trajectory]:
     """Return the goal and the motion of a quarter circle to the left, with a lateral velocity.
@@ -146,8 +146,8 @@ def circle(
 def test_slip_along_a_curve() -> None:
     """At heading θ, the velocity along −x is lateral by a factor of sin θ."""
     scene = make_hall(base="differential")
-    assert validate(scene, *circle(scene)).ok
-    goal, motion = circle(scene, aside=0.01)
+    assert validate(scene, *make_circle(scene)).ok
+    goal, motion = make_circle(scene, aside=0.01)
     found = get_only_violation(validate(scene, goal, motion))
     assert (found.constraint, found.subject, found.unit) == ("slip", "base", "m/s")
     moments = np.linspace(0.0, motion.times[-1], 5000)
@@ -159,14 +159,14 @@ def test_slip_along_a_curve() -> None:
     assert "mm/s" in found.detail
     assert validate(make_hall(), goal, motion).ok
     for allowed, right in ((0.95e-3, True), (1.1e-3, False)):
-        report = validate(scene, *circle(scene, aside=0.01 * allowed / found.amount))
+        report = validate(scene, *make_circle(scene, aside=0.01 * allowed / found.amount))
         assert report.ok == right
 
 
 @pytest.mark.parametrize(("radius", "ok"), [(0.997, True), (1.01, False)])
 def test_turning_radius_along_a_curve(radius: float, ok: bool) -> None:
     scene = make_hall(base="ackermann", turning_radius=radius)
-    report = validate(scene, *circle(scene))
+    report = validate(scene, *make_circle(scene))
     assert report.ok == ok
     if not ok:
         found = get_only_violation(report)
@@ -178,7 +178,7 @@ def test_wheel_speed_along_a_curve() -> None:
     scene = make_hall(base="differential")
     assert scene.robot.wheels is not None
     peak = scene.robot.wheels.rim_speed / (1.0 + scene.robot.wheels.track / 2)
-    assert validate(scene, *circle(scene, peak=0.999 * peak)).ok
-    found = get_only_violation(validate(scene, *circle(scene, peak=1.02 * peak)))
+    assert validate(scene, *make_circle(scene, peak=0.999 * peak)).ok
+    found = get_only_violation(validate(scene, *make_circle(scene, peak=1.02 * peak)))
     assert (found.constraint, found.subject, found.unit) == ("wheels", "base", "m/s")
     assert found.amount == pytest.approx(0.02 * scene.robot.wheels.rim_speed, rel=0.02)

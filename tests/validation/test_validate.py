@@ -326,23 +326,29 @@ def move_door_alone(scene: Scene, hinge: list[float], knob: list[float]) -> Traj
 def test_latch_violations(
     door_plan: vkc.Plan, hinge: list[float], knob: list[float], short: float
 ) -> None:
-    assert latch_shortfall(door_plan.scene, hinge, knob) == pytest.approx(
+    assert compute_latch_shortfall(door_plan.scene, hinge, knob) == pytest.approx(
         short, abs=5e-3 if hinge[1] * knob[1] > 0 else 1e-6
     )
 
 
 def test_latch_range_between_two_samples(door_plan: vkc.Plan) -> None:
-    assert latch_shortfall(
+    assert compute_latch_shortfall(
         door_plan.scene, [0.0, 0.0, 0.3], [0.0, 0.4, 0.4], reach=0.002
     ) == pytest.approx(0.1)
-    assert latch_shortfall(
+    assert compute_latch_shortfall(
         door_plan.scene, [0.3, -0.305, -0.305], [0.0, 0.0, 0.0], reach=0.002
     ) == pytest.approx(0.5)
-    assert latch_shortfall(door_plan.scene, [0.0, 0.0, 0.3], [0.0, 0.5, 0.5], reach=0.002) == 0.0
-    assert latch_shortfall(door_plan.scene, [0.0, 0.0, 0.3], [0.0, 0.51, 0.0], reach=0.002) == 0.0
+    assert (
+        compute_latch_shortfall(door_plan.scene, [0.0, 0.0, 0.3], [0.0, 0.5, 0.5], reach=0.002)
+        == 0.0
+    )
+    assert (
+        compute_latch_shortfall(door_plan.scene, [0.0, 0.0, 0.3], [0.0, 0.51, 0.0], reach=0.002)
+        == 0.0
+    )
 
 
-def latch_shortfall(
+def compute_latch_shortfall(
     base: Scene, hinge: list[float], knob: list[float], *, reach: float = 0.05
 ) -> float:
     """Return the amount of the latch violation, 0 without one."""

@@ -85,7 +85,7 @@ TRIALS = [
 ]
 
 
-def bars_of(axes: Any) -> list[tuple[str, float]]:
+def read_bars(axes: Any) -> list[tuple[str, float]]:
     names = [label.get_text() for label in axes.get_xticklabels()]
     return [
         (names[round(bar.get_x() + bar.get_width() / 2.0)], bar.get_height())
@@ -96,10 +96,10 @@ def bars_of(axes: Any) -> list[tuple[str, float]]:
 def test_criteria_chart_against_numbers_by_hand() -> None:
     figure = criteria_chart(TRIALS, None, ["one", "two"], title="All")
     success, base, arm, time = figure.axes
-    assert bars_of(success) == [("one", 100.0), ("two", pytest.approx(200.0 / 3.0))]
-    assert bars_of(base) == [("one", 3.5), ("two", 5.5)]  # only where both succeed
-    assert bars_of(arm) == [("one", 35.0), ("two", 55.0)]
-    assert bars_of(time) == [("one", 2.0), ("two", 3.5)]  # of all that have one
+    assert read_bars(success) == [("one", 100.0), ("two", pytest.approx(200.0 / 3.0))]
+    assert read_bars(base) == [("one", 3.5), ("two", 5.5)]  # only where both succeed
+    assert read_bars(arm) == [("one", 35.0), ("two", 55.0)]
+    assert read_bars(time) == [("one", 2.0), ("two", 3.5)]  # of all that have one
     ends = [
         [line.get_segments()[0][:, 1].tolist() for line in axes.collections] for axes in figure.axes
     ]
@@ -121,7 +121,7 @@ def test_criteria_chart_against_numbers_by_hand() -> None:
     assert colours[0][0] != colours[0][1]
 
 
-def grouped(axes: Any) -> dict[str, list[float]]:
+def read_grouped_bars(axes: Any) -> dict[str, list[float]]:
     """Return the heights of a chart's bars, group by group, method after method."""
     names = [label.get_text() for label in axes.get_xticklabels()]
     found: dict[str, list[float]] = {name: [] for name in names}
@@ -147,7 +147,7 @@ def test_means_chart_against_numbers_by_hand() -> None:
         shared=True,
     )
     (axes,) = figure.axes
-    assert grouped(axes) == {
+    assert read_grouped_bars(axes) == {
         "easy\n2 trials": [3.5, 5.5],
         "hard\nown successes": [7.0],
     }  # 9 and 99 are not shared
@@ -168,7 +168,7 @@ def test_means_chart_against_numbers_by_hand() -> None:
     assert axes.get_ylim()[1] > 7.0
 
 
-def fastest(plan: Plan) -> float:
+def compute_peak_speed(plan: Plan) -> float:
     return float(np.abs(plan.trajectory.velocities()[:, 3:9]).max())
 
 
@@ -202,7 +202,7 @@ def test_motions_chart_shows_the_plans(tmp_path: Path) -> None:
     for row in rows:
         assert row[0].get_ylim() == row[1].get_ylim()
     assert rows[1, 0].get_ylim() == pytest.approx(
-        (-2.0 * fastest(slow), 2.0 * fastest(slow))
+        (-2.0 * compute_peak_speed(slow), 2.0 * compute_peak_speed(slow))
     )  # not scaled to the failure
     assert {axes.get_xlim() for axes in rows.ravel()} == {(0.0, 12.0)}
     assert [text.get_text() for text in rows[0, 1].get_legend().get_texts()][:2] == [

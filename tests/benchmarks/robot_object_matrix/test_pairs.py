@@ -90,7 +90,7 @@ def test_low_objects_are_on_a_counter(tmp_path: Path, height: float, raised: boo
     urdf = SMOOTH.replace("0.4 0.4 0.4", f"0.4 0.4 {height}").replace(
         "0 0 0.5", f"0 0 {height / 2}"
     )
-    file = _written(tmp_path / "box.yaml", urdf=urdf)
+    file = _write_object(tmp_path / "box.yaml", urdf=urdf)
     scene = make_hall("husky_ur5e", file, load_description(file))
     boxes = np.array(
         [
@@ -104,13 +104,13 @@ def test_low_objects_are_on_a_counter(tmp_path: Path, height: float, raised: boo
     assert not [pair for pair in vkc.check_scene(scene).close if pair.distance < 0.0]
 
 
-def _written(path: Path, **more: Any) -> str:
+def _write_object(path: Path, **more: Any) -> str:
     description: Mapping[str, Any] = {"urdf": SMOOTH, "attachments": [], **more}
     return str(vkc.procedural.write_object(description, path))
 
 
 def test_object_without_a_grasp_is_unreachable(husky: vkc.Robot, tmp_path: Path) -> None:
-    found = make_pair(husky, "husky_ur5e", _written(tmp_path / "smooth.yaml"))
+    found = make_pair(husky, "husky_ur5e", _write_object(tmp_path / "smooth.yaml"))
     assert found.step is None
     assert found.because.startswith("slide: nothing of it fits between the fingers")
 
@@ -138,7 +138,9 @@ def test_high_object_is_unreachable(husky: vkc.Robot, tmp_path: Path) -> None:
     found = make_pair(
         husky,
         "husky_ur5e",
-        _written(tmp_path / "high.yaml", urdf=high.replace("</robot>", f"{bar}{fixed}</robot>")),
+        _write_object(
+            tmp_path / "high.yaml", urdf=high.replace("</robot>", f"{bar}{fixed}</robot>")
+        ),
     )
     assert found.step is None
     assert found.because.startswith("bar_bar: ")

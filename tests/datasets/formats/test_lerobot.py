@@ -25,12 +25,12 @@ def root(made: Dataset) -> Path:
     return made.folder / "lerobot" / "husky_ur5e"
 
 
-def info(root: Path) -> Any:
+def load_info(root: Path) -> Any:
     return json.loads((root / "meta/info.json").read_text())
 
 
 def test_info_describes_the_features(root: Path) -> None:
-    said = info(root)
+    said = load_info(root)
     assert said["codebase_version"] == "v3.0"
     assert (said["total_episodes"], said["fps"], said["robot_type"]) == (4, 10, "husky_ur5e")
     assert said["splits"] == {"train": "0:4"}
@@ -48,7 +48,7 @@ def test_info_describes_the_features(root: Path) -> None:
 
 
 def test_frames_are_samples_of_episodes(made: Dataset, root: Path) -> None:
-    said = info(root)
+    said = load_info(root)
     table = pq.read_table(root / said["data_path"].format(chunk_index=0, file_index=0))
     assert table.column_names == list(said["features"])
     assert len(table) == said["total_frames"]
@@ -75,7 +75,7 @@ def test_frames_are_samples_of_episodes(made: Dataset, root: Path) -> None:
 
 def test_tables_of_episodes_and_tasks(made: Dataset, root: Path) -> None:
     rows = pq.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    frames = info(root)["total_frames"]
+    frames = load_info(root)["total_frames"]
     assert [row["episode_index"] for row in rows] == [0, 1, 2, 3]
     assert [row["dataset_from_index"] for row in rows] == [
         0,

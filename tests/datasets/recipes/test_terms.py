@@ -27,15 +27,15 @@ SLOW = {"type": "speed", "frame": "base", "most": 0.3}
 RECIPE: dict[str, Any] = {**SMALL, "terms": [SLOW]}
 
 
-def low(frame: str = "hand") -> vkc.Constraint:
+def make_height_limit(frame: str = "hand") -> vkc.Constraint:
     return vkc.Constraint("low", lambda s: s.position(frame)[2], upper=2.5)
 
 
-def recipe(*terms: dict[str, Any]) -> Any:
+def make_recipe(*terms: dict[str, Any]) -> Any:
     return load_recipe({**SMALL, "terms": list(terms)})
 
 
-def inputs(now: pin.SE3, before: pin.SE3, dt: float) -> np.ndarray:
+def flatten_inputs(now: pin.SE3, before: pin.SE3, dt: float) -> np.ndarray:
     columns = [np.concatenate([one.rotation.T.ravel(), one.translation]) for one in (now, before)]
     return np.concatenate([*columns, [dt]])[None]
 
@@ -43,7 +43,7 @@ def inputs(now: pin.SE3, before: pin.SE3, dt: float) -> np.ndarray:
 def test_terms_agree_with_numbers() -> None:
     rng = np.random.default_rng(3)
     axis = np.array([1.0, 2.0, -0.5])
-    upright, speed, away = recipe(
+    upright, speed, away = make_recipe(
         {"type": "upright", "frame": "object", "axis": axis.tolist(), "angle": 0.3, "held": True},
         {"type": "speed", "frame": "hand", "most": 0.4},
         {
@@ -62,7 +62,7 @@ def test_terms_agree_with_numbers() -> None:
     for _ in range(50):
         now, before, dt = pin.SE3.Random(), pin.SE3.Random(), float(rng.uniform(0.01, 0.5))
         now.translation, before.translation = rng.uniform(-2.0, 2.0, (2, 3))
-        row = inputs(now, before, dt)
+        row = flatten_inputs(now, before, dt)
         tilt = math.acos(float((now.rotation @ axis)[2] / np.linalg.norm(axis)))
         assert (upright.formula.evaluate(row)[0, 0] >= upright.lower) == (tilt <= 0.3)
         expected = np.linalg.norm(now.translation - before.translation) / dt
@@ -73,7 +73,7 @@ def test_terms_agree_with_numbers() -> None:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    return generate(RECIPE, 3, tmp_path_factory.mktemp("made") / "out", terms=[low()])
+    return generate(RECIPE, 3, tmp_path_factory.mktemp("made") / "out", terms=[make_height_limit()])
 
 
 def test_episodes_satisfy_their_terms(made: Dataset) -> None:
@@ -98,7 +98,7 @@ def copy(made: Dataset, tmp_path: Path) -> Path:
     return tmp_path / "copy"
 
 
-def said(folder: Path, change: Any) -> int:
+def change_metadata(folder: Path, change: Any) -> int:
     """Change what an episode's file says of it; return its number."""
     with h5py.File(Dataset.open(folder).shards[0], "r+") as file:
         group = file["data/demo_1"]
@@ -112,14 +112,14 @@ def test_violated_term_is_found(copy: Path) -> None:
     def stricter(words: Any) -> None:
         words["terms"][0]["upper"] = 0.01
 
-    number = said(copy, stricter)
+    number = change_metadata(copy, stricter)
     found = check_dataset(copy)
     assert list(found.refused) == [number]
     assert "speed base" in found.refused[number]
 
 
 def test_terms_other_than_the_recipes_are_found(copy: Path) -> None:
-    number = said(copy, lambda words: words.pop("terms"))
+    number = change_metadata(copy, lambda words: words.pop("terms"))
     found = check_dataset(copy)
     assert list(found.refused) == [number]
     assert "terms differ from those of the recipe" in found.refused[number]
@@ -132,7 +132,7 @@ def test_digest_depends_on_terms(made: Dataset) -> None:
     assert load_recipe(made.folder / "recipe.yaml").terms == made.recipe.terms
     with pytest.raises(InputError, match="run otherwise"):
         generate(RECIPE, 3, made.folder)
-    assert generate(RECIPE, 3, made.folder, terms=[low()]).numbers() == made.numbers()
+    assert generate(RECIPE, 3, made.folder, terms=[make_height_limit()]).numbers() == made.numbers()
 
 
 def test_terms_may_hold_in_some_tasks(made: Dataset) -> None:
@@ -192,7 +192,7 @@ def test_wrong_terms_are_refused(tmp_path: Path, entry: str, field: str, text: s
 @pytest.mark.parametrize(
     ("terms", "text"),
     [
-        ([low("hnd")], "did you mean 'hand'"),
+        ([make_height_limit("hnd")], "did you mean 'hand'"),
         (
             [vkc.Constraint("x", lambda s: s.coordinate("elbow"), upper=1.0)],
             "coordinate of husky_ur5e",
@@ -201,7 +201,7 @@ def test_wrong_terms_are_refused(tmp_path: Path, entry: str, field: str, text: s
             [vkc.Constraint("x", lambda s: s.position("hand")[2], upper=1.0, during="reach")],
             "phases are not known yet",
         ),
-        ([low(), low()], "two terms share a name"),
+        ([make_height_limit(), make_height_limit()], "two terms share a name"),
         (["low"], "a list of Constraint and Cost"),
         (3, "not a list"),
     ],

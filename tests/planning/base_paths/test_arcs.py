@@ -13,7 +13,7 @@ PLACES = st.tuples(st.floats(-4.0, 4.0), st.floats(-4.0, 4.0), st.floats(-7.0, 7
 TURNING = 0.3
 
 
-def rolled(path: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def split_steps(path: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the motion of each step along and across its mean heading, and its turn."""
     step = np.diff(path, axis=0)
     seen = np.exp(-1j * (path[:-1, 2] + step[:, 2] / 2)) * (step[:, 0] + 1j * step[:, 1])
@@ -40,7 +40,7 @@ def test_every_step_of_a_curve_rolls_without_slip(
     path = np.vstack([a, sample_path(corners, steps, turning=TURNING)])
     assert path.shape == (steps + 1, 3)
     assert equal(path[-1], b)
-    along, aside, turn = rolled(path)
+    along, aside, turn = split_steps(path)
     np.testing.assert_allclose(aside, 0.0, atol=1e-6)
     assert (np.abs(along) >= radius * np.abs(turn) - 1e-6)[np.abs(turn) < 0.7].all()
     (length,), (turned,) = curves.compute_lengths(a[None], b[None])
@@ -61,7 +61,7 @@ def test_nearest_arc_beats_random_arcs(
     a, rng = np.array(first), np.random.default_rng(0)
     b = a + np.array([dx, dy, turn])
     (found,) = find_nearest_arc(a[None], b[None], radius=radius, turning=TURNING)
-    (along,), (aside,), (turned,) = rolled(np.array([a, found]))
+    (along,), (aside,), (turned,) = split_steps(np.array([a, found]))
     assert abs(aside) < 1e-9
     assert abs(along) >= radius * abs(turned) - 1e-6
 
@@ -158,7 +158,7 @@ def test_car_curves_replace_turns_in_place() -> None:
     assert equal(around[-1], path[-1])
     poses = np.vstack([path[:1], sample_path(around, 150, turning=TURNING)])
     assert all(map(free, poses))
-    along, aside, turn = rolled(poses)
+    along, aside, turn = split_steps(poses)
     np.testing.assert_allclose(aside, 0.0, atol=1e-6)
     assert (np.abs(along) >= 0.6 * np.abs(turn) - 1e-6).all()
     assert np.abs(along).sum() < 1.3 * 12.0

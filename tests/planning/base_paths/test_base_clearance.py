@@ -31,7 +31,7 @@ from vkc_pin.planning.base_paths.base_clearance import (
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-def scene(seed: int) -> tuple[list[Shape], list[Shape], MovingShapes]:
+def make_random_scene(seed: int) -> tuple[list[Shape], list[Shape], MovingShapes]:
     """Return random shapes on the base, obstacles, and the moving shapes."""
     rng = np.random.default_rng(seed)
     shapes = [
@@ -49,7 +49,7 @@ def scene(seed: int) -> tuple[list[Shape], list[Shape], MovingShapes]:
 def test_drives_and_turns_agree_with_coal() -> None:
     answers = []
     for seed in range(25):
-        shapes, standing, body = scene(seed)
+        shapes, standing, body = make_random_scene(seed)
         rng = np.random.default_rng(seed + 1)
         a, yaw = rng.uniform(-2.0, 2.0, 2), rng.uniform(-4.0, 4.0)
         b, end = a + rng.uniform(-1.0, 1.0, 2), yaw + rng.uniform(-2.0, 2.0) * rng.uniform()

@@ -33,7 +33,7 @@ TURNING = 0.3  # [m/rad] where a grid is not told
 NEAR = 1.0
 
 
-def wall_with_a_gap(width: float, *, height: float = 1.0) -> list[Shape]:
+def make_wall_with_gap(width: float, *, height: float = 1.0) -> list[Shape]:
     """A wall along x = 0 from one side of the hall to the other, with a gap around y = 0."""
     side = 5.5 - width / 2
     return [
@@ -150,17 +150,21 @@ def test_base_drives_sideways_along_a_wall() -> None:
 
 
 def test_narrow_gap_is_passed_lengthwise() -> None:
-    standing, start, goals = wall_with_a_gap(0.85), [-2.5, 1.0, np.pi / 2], [[2.5, -1.0, np.pi / 2]]
+    standing, start, goals = (
+        make_wall_with_gap(0.85),
+        [-2.5, 1.0, np.pi / 2],
+        [[2.5, -1.0, np.pi / 2]],
+    )
     path = find(standing, start, goals)
     assert path is not None
     check(path, np.array(start), np.array(goals), make_chassis(), [], standing)
     assert find(standing, start, goals, base=make_chassis(1.0, 0.85)) is None
-    assert find(wall_with_a_gap(1.2), start, goals, base=make_chassis(1.0, 0.85)) is not None
+    assert find(make_wall_with_gap(1.2), start, goals, base=make_chassis(1.0, 0.85)) is not None
 
 
 def test_load_does_not_fit_through_a_gap() -> None:
     standing, start, goals = (
-        wall_with_a_gap(1.0),
+        make_wall_with_gap(1.0),
         np.array([-2.5, 0.0, 0.0]),
         np.array([[2.5, 0.0, 0.0]]),
     )
@@ -172,7 +176,7 @@ def test_load_does_not_fit_through_a_gap() -> None:
         )
         assert (path is not None) == fits
     low = shortest_path(
-        BaseGrid(make_chassis(), across, wall_with_a_gap(1.0, height=0.6), HALL, MARGIN),
+        BaseGrid(make_chassis(), across, make_wall_with_gap(1.0, height=0.6), HALL, MARGIN),
         start,
         goals,
     )

@@ -32,7 +32,7 @@ def grid() -> BaseGrid:
     return BaseGrid(make_chassis(), make_arm_shapes(), STANDING, HALL, MARGIN)
 
 
-def states(count: int, seed: int) -> list[list[int]]:
+def sample_states(count: int, seed: int) -> list[list[int]]:
     return np.random.default_rng(seed).integers([100, 100, HEADINGS], size=(count, 3)).tolist()
 
 
@@ -47,7 +47,7 @@ def test_cells_and_headings(grid: BaseGrid) -> None:
 
 def test_free_cells_and_poses_agree_with_coal(grid: BaseGrid) -> None:
     answers = []
-    for i, j, heading in states(200, 0):
+    for i, j, heading in sample_states(200, 0):
         pose = [*grid.center(i, j), grid.yaws[heading]]
         base, over = (
             compute_distance(make_chassis(), STANDING, pose),
@@ -66,7 +66,7 @@ def test_free_cells_and_poses_agree_with_coal(grid: BaseGrid) -> None:
 def test_moves_between_cells_agree_with_coal(grid: BaseGrid, reaching: bool) -> None:
     shapes = make_chassis() if reaching else [*make_chassis(), *make_arm_shapes()]
     answers = []
-    for i, j, heading in states(25, 2):
+    for i, j, heading in sample_states(25, 2):
         if not all(2 <= k < 98 for k in (i, j)):
             continue
         here, yaw = grid.center(i, j), grid.yaws[heading]
@@ -147,7 +147,7 @@ def test_arena_need_not_be_square() -> None:
     standing: list[Shape] = [(coal.Box(0.5, 0.5, 1.0), make_pose(4.0, 1.0, 0.5))]
     grid = BaseGrid(make_chassis(), [], standing, (0.0, 8.0, -1.0, 3.0), MARGIN, cells=40)
     assert grid.step == pytest.approx([0.2, 0.1])
-    for i, j, heading in states(300, 0):
+    for i, j, heading in sample_states(300, 0):
         i, j = i % 40, j % 40
         pose = [*grid.center(i, j), grid.yaws[heading]]
         free = compute_distance(make_chassis(), standing, pose) >= MARGIN

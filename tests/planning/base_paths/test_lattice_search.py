@@ -28,7 +28,7 @@ CELLS, ROOM = 13, (-2.0, 2.0, -2.0, 2.0)
 ENTRY = 0.6  # [m], maximum distance of start or goal to connected cells
 
 
-def number(grid: BaseGrid, i: int, j: int, heading: int) -> int:
+def get_number(grid: BaseGrid, i: int, j: int, heading: int) -> int:
     return (i * grid.cells + j) * HEADINGS + heading % HEADINGS
 
 
@@ -36,16 +36,16 @@ def add_moves(grid: BaseGrid, edge: Callable[[int, int, float], None]) -> None:
     """Add the free moves between cells and the free turns."""
     for i, j, heading in np.ndindex(grid.cells, grid.cells, HEADINGS):
         k, m = np.add((i, j), grid.moves[heading])
-        here, length = number(grid, i, j, heading), grid.lengths[heading]
+        here, length = get_number(grid, i, j, heading), grid.lengths[heading]
         if 0 <= k < grid.cells and 0 <= m < grid.cells and grid.is_move_free(i, j, heading):
-            edge(here, number(grid, k, m, heading), length)
-            edge(number(grid, k, m, heading), here, BACKWARDS * length)
+            edge(here, get_number(grid, k, m, heading), length)
+            edge(get_number(grid, k, m, heading), here, BACKWARDS * length)
         if grid.is_left_turn_free(i, j, heading):
             turn = TURNING * abs(
                 wrap_angle(grid.yaws[(heading + 1) % HEADINGS] - grid.yaws[heading])
             )
-            edge(here, number(grid, i, j, heading + 1), turn)
-            edge(number(grid, i, j, heading + 1), here, turn)
+            edge(here, get_number(grid, i, j, heading + 1), turn)
+            edge(get_number(grid, i, j, heading + 1), here, turn)
 
 
 def find_heading(
@@ -79,7 +79,7 @@ def compute_cost(
     return float(cost) if free else np.inf
 
 
-def reference(
+def search_full_graph(
     grid: BaseGrid,
     start: NDArray[np.float64],
     goals: NDArray[np.float64],
@@ -106,7 +106,7 @@ def reference(
                 heading = int(np.abs(wrap_angle(grid.yaws - yaw)).argmin())
                 cost = compute_cost(grid, start[:2], center, start[2], yaw, grid.yaws[heading], how)
                 if cost < np.inf:
-                    edge(first, number(grid, i, j, heading), cost)
+                    edge(first, get_number(grid, i, j, heading), cost)
             for goal, more in zip(goals, extra, strict=True):
                 if np.hypot(*(center - goal[:2])) <= radius and grid.is_pose_free(*goal):
                     yaw = find_heading(center, goal[:2], how, goal[2])
@@ -115,7 +115,7 @@ def reference(
                         grid, center, goal[:2], grid.yaws[heading], yaw, goal[2], how
                     )
                     if cost < np.inf:
-                        edge(number(grid, i, j, heading), last, cost + more)
+                        edge(get_number(grid, i, j, heading), last, cost + more)
     for goal, more in zip(goals, extra, strict=True):
         for how in range(3):
             cost = compute_cost(
@@ -144,7 +144,7 @@ def reference(
     return float(dijkstra(graph, indices=first)[last])
 
 
-def task(
+def make_task(
     seed: int,
 ) -> tuple[BaseGrid, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return a small room with obstacles, a free start, three goals and their costs."""
@@ -167,9 +167,9 @@ def task(
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
 def test_cheapest_path_is_found(seed: int) -> None:
-    grid, start, goals, extra = task(seed)
-    expected = reference(grid, start, goals, extra)
-    fresh, *_ = task(seed)  # with empty caches
+    grid, start, goals, extra = make_task(seed)
+    expected = search_full_graph(grid, start, goals, extra)
+    fresh, *_ = make_task(seed)  # with empty caches
     found = find_cheapest_path(SearchSpace(fresh, start, goals), extra)
     if grid.is_pose_free(*start):
         assert (np.inf if found is None else found[0]) == pytest.approx(expected, abs=1e-4)
@@ -177,8 +177,8 @@ def test_cheapest_path_is_found(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_earlier_searches_do_not_change_the_result(seed: int) -> None:
-    grid, start, goals, extra = task(seed)
-    fresh, *_ = task(seed)
+    grid, start, goals, extra = make_task(seed)
+    fresh, *_ = make_task(seed)
     rng = np.random.default_rng(seed)
     for grids in (grid, fresh):
         grids.near = 0.5
@@ -211,7 +211,7 @@ def test_start_and_goal_on_cells() -> None:
     goals = np.array([[*grid.center(10, 2), grid.yaws[12]]])
     found = find_cheapest_path(SearchSpace(grid, start, goals), np.zeros(1))
     assert found is not None
-    assert found[0] == pytest.approx(reference(grid, start, goals, np.zeros(1)), abs=1e-4)
+    assert found[0] == pytest.approx(search_full_graph(grid, start, goals, np.zeros(1)), abs=1e-4)
     same = find_cheapest_path(SearchSpace(grid, start, start[None]), np.zeros(1))
     assert same is not None
     assert same[0] == 0.0

@@ -23,7 +23,7 @@ TURNING = 0.3  # [m/rad], default of a grid
 START = np.array([0.0, 0.0, 0.0])
 
 
-def space(
+def make_space(
     standing: list[Shape],
     goals: list[list[float]],
     *,
@@ -44,16 +44,16 @@ def test_drive_cost(turned: float, factor: float) -> None:
 
 
 def test_cells_near_start_and_goals() -> None:
-    places = space([], [[3.0, 3.0, 0.0]])
+    places = make_space([], [[3.0, 3.0, 0.0]])
     for i, j in np.ndindex(100, 100):
         center = places.grid.center(i, j)
         near = [np.hypot(*np.subtract(center, place)) <= 1.0 for place in ((0.0, 0.0), (3.0, 3.0))]
         assert places.near[i, j] == (0 if near[0] else 1 if near[1] else -1)
-    assert np.all(space([], [[3.0, 3.0, 0.0]], near=0.0).near == -1)
+    assert np.all(make_space([], [[3.0, 3.0, 0.0]], near=0.0).near == -1)
 
 
 def test_connections_reach_the_cells_around() -> None:
-    places = space([], [[3.0, 3.0, 1.0]])
+    places = make_space([], [[3.0, 3.0, 1.0]])
     starts, ends = places.get_starts(), places.get_ends(0)
     assert len(np.unique(starts.cell)) == np.sum(
         [np.hypot(*np.subtract(places.center(c), (0, 0))) <= 0.6 for c in range(10_000)]
@@ -83,19 +83,19 @@ def test_connections_reach_the_cells_around() -> None:
 
 def test_connections_without_space_to_turn_are_omitted() -> None:
     walls: list[Shape] = [(coal.Box(4.0, 0.1, 1.0), make_pose(0.0, y, 0.5)) for y in (-0.55, 0.55)]
-    places = space(walls, [[3.0, 0.0, 0.0]])
+    places = make_space(walls, [[3.0, 0.0, 0.0]])
     turns = np.abs(wrap_angle(2 * places.get_starts().yaw)) / 2  # from driving ahead or back
     assert len(turns) > 0
     assert turns.max() < 0.5
-    assert space([], [[3.0, 0.0, 0.0]]).get_starts().yaw.max() > 1.5
+    assert make_space([], [[3.0, 0.0, 0.0]]).get_starts().yaw.max() > 1.5
 
 
 def test_blocked_start_has_exit_margins() -> None:
     close, over = [(coal.Box(1.0, 1.0, 1.0), make_pose(x, 0.0, 0.5)) for x in (1.01, 0.9)]
     free, near, inside = (
-        space([], [[3.0, 0.0, 0.0]]),
-        space([close], [[3.0, 0.0, 0.0]]),
-        space([over], [[-0.9, 0.0, 0.0]]),
+        make_space([], [[3.0, 0.0, 0.0]]),
+        make_space([close], [[3.0, 0.0, 0.0]]),
+        make_space([over], [[-0.9, 0.0, 0.0]]),
     )
     assert free.exit_margins is None
     assert near.exit_margins is not None
@@ -115,7 +115,7 @@ def test_blocked_start_has_exit_margins() -> None:
 def test_load_counts_away_from_start_and_goals() -> None:
     rod: list[Shape] = [(coal.Box(0.05, 2.0, 0.05), make_pose(0.0, 0.0, 0.8))]
     post: list[Shape] = [(coal.Box(0.1, 0.1, 1.0), make_pose(x, 0.9, 0.5)) for x in (0.0, 2.0)]
-    places = space(post, [[4.0, 0.0, 0.0]], carried=rod)
+    places = make_space(post, [[4.0, 0.0, 0.0]], carried=rod)
     assert places.is_pose_free(START)
     assert not places.is_pose_free(np.array([2.0, 0.0, 0.0]))
     assert places.is_drive_free(Drive(np.array([-0.5, 0.0]), np.array([0.5, 0.0]), 0.0))

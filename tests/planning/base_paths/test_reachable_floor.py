@@ -16,16 +16,16 @@ from vkc_pin.planning.base_paths.reachable_floor import (
 )
 
 
-def box(
+def make_box(
     size: tuple[float, float, float], at: tuple[float, float, float], yaw: float = 0.0
 ) -> Shape:
     return coal.Box(*size), pin.SE3(pin.utils.rotate("z", yaw), np.array(at))
 
 
 BASE = [
-    box((1.0, 0.5, 0.2), (0.0, 0.0, 0.2)),
-    box((0.8, 0.1, 0.3), (0.0, 0.29, 0.15)),
-    box((0.8, 0.1, 0.3), (0.0, -0.29, 0.15)),
+    make_box((1.0, 0.5, 0.2), (0.0, 0.0, 0.2)),
+    make_box((0.8, 0.1, 0.3), (0.0, 0.29, 0.15)),
+    make_box((0.8, 0.1, 0.3), (0.0, -0.29, 0.15)),
 ]
 
 
@@ -38,7 +38,7 @@ def test_disc_is_inscribed_in_the_union_of_shapes() -> None:
 
 
 def test_separate_shapes_do_not_extend_the_disc() -> None:
-    apart = [box((0.4, 0.4, 0.2), (0.0, 0.0, 0.1)), box((0.4, 0.4, 0.2), (0.0, 0.5, 0.1))]
+    apart = [make_box((0.4, 0.4, 0.2), (0.0, 0.0, 0.1)), make_box((0.4, 0.4, 0.2), (0.0, 0.5, 0.1))]
     assert InscribedDiscs(apart).get_radius(0.1) == pytest.approx(0.195)
 
 
@@ -46,18 +46,21 @@ def test_obstacles_above_or_below_the_base_are_no_walls() -> None:
     discs = InscribedDiscs(BASE)
     assert (
         discs.make_walls(
-            [box((1.0, 1.0, 0.1), (0.0, 0.0, 0.5)), box((1.0, 1.0, 0.04), (0.0, 0.0, 0.0))]
+            [
+                make_box((1.0, 1.0, 0.1), (0.0, 0.0, 0.5)),
+                make_box((1.0, 1.0, 0.04), (0.0, 0.0, 0.0)),
+            ]
         )
         == []
     )
     (plate,) = discs.make_walls(
-        [box((1.0, 1.0, 0.01), (0.0, 0.0, 0.225))]
+        [make_box((1.0, 1.0, 0.01), (0.0, 0.0, 0.225))]
     )  # thinner than the distance of levels
     assert plate.radius == pytest.approx(0.335)
 
 
 def test_no_base_and_no_obstacle() -> None:
-    assert InscribedDiscs([]).make_walls([box((1.0, 1.0, 1.0), (0.0, 0.0, 0.5))]) == []
+    assert InscribedDiscs([]).make_walls([make_box((1.0, 1.0, 1.0), (0.0, 0.0, 0.5))]) == []
     assert InscribedDiscs(BASE).make_walls([]) == []
 
 

@@ -44,13 +44,13 @@ GRASPS = [
 ]
 
 
-def frames(model: pin.Model, q: np.ndarray) -> list[pin.SE3]:
+def compute_frames(model: pin.Model, q: np.ndarray) -> list[pin.SE3]:
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
     return [placement.copy() for placement in data.oMf]
 
 
-def shapes(model: pin.Model, geometry: pin.GeometryModel, q: np.ndarray) -> list[pin.SE3]:
+def compute_shapes(model: pin.Model, geometry: pin.GeometryModel, q: np.ndarray) -> list[pin.SE3]:
     data, placed = model.createData(), geometry.createData()
     pin.updateGeometryPlacements(model, data, geometry, placed, q)
     return [placement.copy() for placement in placed.oMg]
@@ -60,7 +60,7 @@ def assert_same(first: pin.SE3, second: pin.SE3, tolerance: float = 1e-10) -> No
     np.testing.assert_allclose(first.homogeneous, second.homogeneous, rtol=0.0, atol=tolerance)
 
 
-def virtual_motion(
+def compute_virtual_motion(
     chain: VirtualKinematicChain, scene: Scene, name: str, grasp: str, z: np.ndarray
 ) -> pin.SE3:
     """J(v) and the standoff after it, from their definition."""
@@ -98,7 +98,7 @@ def virtual_motion(
     return pin.SE3(turn, shift - attachment.standoff * turn[:, 2])
 
 
-def object_state(
+def get_object_state(
     chain: VirtualKinematicChain, scene: Scene, name: str, z: np.ndarray
 ) -> np.ndarray:
     """The object's own coordinates: those of the chain, and those it leaves as they are."""
@@ -115,11 +115,11 @@ def test_the_chain_begins_with_the_robot() -> None:
     chain, robot = consolidate(scene, GRASPS[-1]), scene.robot
     for z in sample_configurations(chain.lower, chain.upper, 4, np.random.default_rng(0)):
         q, q_robot = chain.coordinates.q(z), robot.coordinates.q(z[: robot.coordinates.size])
-        of_chain, of_robot = frames(chain.model, q), frames(robot.model, q_robot)
+        of_chain, of_robot = compute_frames(chain.model, q), compute_frames(robot.model, q_robot)
         for index, frame in enumerate(robot.model.frames):
             assert_same(of_chain[chain.model.getFrameId(frame.name)], of_robot[index])
-        found = shapes(chain.model, chain.collision, q)
-        expected = shapes(robot.model, robot.collision, q_robot)
+        found = compute_shapes(chain.model, chain.collision, q)
+        expected = compute_shapes(robot.model, robot.collision, q_robot)
         for one, other in zip(found, expected, strict=False):
             assert_same(one, other)
 
@@ -251,7 +251,7 @@ CARRIED = [
 
 
 @cache
-def carried_scene() -> Scene:
+def make_carried_scene() -> Scene:
     """Return stick, ball, and a cabinet that can be carried away."""
     scene, case = make_room(objects=("stick", "ball")), make_full_scene().objects["cabinet"]
     return replace_objects(
@@ -260,7 +260,7 @@ def carried_scene() -> Scene:
     )
 
 
-def expected_frames(
+def compute_expected_frames(
     chain: VirtualKinematicChain, scene: Scene, hold: Hold, z: np.ndarray
 ) -> tuple[pin.SE3, dict[str, pin.SE3]]:
     """Return the placements of an object's base and links, multiplied from the robot outwards."""
@@ -270,16 +270,18 @@ def expected_frames(
     )
     if hold.by is None:
         robot = scene.robot
-        holder = frames(robot.model, robot.coordinates.q(z[: robot.coordinates.size]))[
+        holder = compute_frames(robot.model, robot.coordinates.q(z[: robot.coordinates.size]))[
             robot.model.getFrameId(robot.tool_frame)
         ]
     else:
-        holder = expected_frames(chain, scene, hold.by, z)[1][hold.link or ""]
-    own = frames(thing.model, thing.coordinates.q(object_state(chain, scene, hold.object, z)))
+        holder = compute_expected_frames(chain, scene, hold.by, z)[1][hold.link or ""]
+    own = compute_frames(
+        thing.model, thing.coordinates.q(get_object_state(chain, scene, hold.object, z))
+    )
     links = {
         f.name: own[i] for i, f in enumerate(thing.model.frames) if f.type == pin.FrameType.BODY
     }
-    motion = virtual_motion(chain, scene, hold.object, hold.attachment, z)
+    motion = compute_virtual_motion(chain, scene, hold.object, hold.attachment, z)
     base = holder * (links[grasp.link] * grasp.placement * motion).inverse()
     return base, {link: base * placement for link, placement in links.items()}
 
@@ -287,7 +289,7 @@ def expected_frames(
 @pytest.mark.parametrize(
     ("scene", "holds"),
     [
-        *((carried_scene, holds) for holds in CARRIED),
+        *((make_carried_scene, holds) for holds in CARRIED),
         *((make_full_scene, tuple(map(Hold, grasps, grasps.values()))) for grasps in GRASPS),
     ],
     ids=lambda value: " ".join(map(str, value)) if isinstance(value, tuple) else value.__name__,
@@ -298,18 +300,18 @@ def test_objects_follow_hand_and_grasp(scene: Callable[[], Scene], holds: tuple[
         assert tuple(table) == holds
     for z in sample_configurations(chain.lower, chain.upper, 3, np.random.default_rng(4)):
         q = chain.coordinates.q(z)
-        of_shapes, data = shapes(chain.model, chain.collision, q), chain.model.createData()
+        of_shapes, data = compute_shapes(chain.model, chain.collision, q), chain.model.createData()
         pin.forwardKinematics(chain.model, data, q)
         for hold in holds:
             placed = objects[hold.object]
-            base, links = expected_frames(chain, scene(), hold, z)
+            base, links = compute_expected_frames(chain, scene(), hold, z)
             for link, placement in links.items():
                 joint, local = chain.frame(link, hold)
                 assert_same(data.oMi[joint] * local, placement)
             closure = chain.closures[hold]
             assert_same(data.oMi[closure.joint] * closure.local, base)
             assert_same(closure.target, placed.link_placement(placed.object.base_link))
-            state = object_state(chain, scene(), hold.object, z)
+            state = get_object_state(chain, scene(), hold.object, z)
             there = make_world_shapes(dataclasses.replace(placed, placement=base, state=state))
             expected = {shape.name: shape.placement for shape in there}
             for index in chain.held_geometries[hold]:
@@ -321,7 +323,7 @@ def test_objects_follow_hand_and_grasp(scene: Callable[[], Scene], holds: tuple[
 def test_all_links_of_a_free_object_move() -> None:
     free, fixed = (
         consolidate(scene, [Hold("cabinet", "grip")]).collision.geometryObjects
-        for scene in (carried_scene(), make_full_scene())
+        for scene in (make_carried_scene(), make_full_scene())
     )
     names = {shape.name for shape in free} - {shape.name for shape in fixed}
     assert names == {"cabinet.case_0", "cabinet.lid_0"}
@@ -329,8 +331,8 @@ def test_all_links_of_a_free_object_move() -> None:
 
 def test_every_hold_has_shapes_joints_and_names_of_its_own() -> None:
     holds = (STICK, BALL, END, PULLED)
-    chain = consolidate(carried_scene(), holds)
-    robot = carried_scene().robot
+    chain = consolidate(make_carried_scene(), holds)
+    robot = make_carried_scene().robot
     assert chain.names == (
         *robot.coordinates.names,
         "stick.grip_turn",
@@ -354,7 +356,7 @@ def test_every_hold_has_shapes_joints_and_names_of_its_own() -> None:
 def test_attachment_held_twice_is_rejected() -> None:
     """Its freedom would have one name for two coordinates; without freedoms that is allowed."""
     with pytest.raises(InputError, match="two coordinates share this name") as caught:
-        consolidate(carried_scene(), [STICK, PULLED, Hold("ball", "pull")])
+        consolidate(make_carried_scene(), [STICK, PULLED, Hold("ball", "pull")])
     assert str(caught.value.field).startswith("ball.pull_")
-    chain = consolidate(carried_scene(), [STICK, Hold("cabinet", "spike", STICK, "tip")])
+    chain = consolidate(make_carried_scene(), [STICK, Hold("cabinet", "spike", STICK, "tip")])
     assert chain.prefixes[Hold("cabinet", "spike", STICK, "tip")] == "cabinet."

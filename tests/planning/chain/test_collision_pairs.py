@@ -36,14 +36,14 @@ MARGIN, CLOSE = SHORT.dist_safe, SHORT.grasp_clearance
 
 
 @cache
-def door_problem() -> TrajectoryProblem:
+def make_door_problem() -> TrajectoryProblem:
     """Return the problem of opening the door and driving away: reach, turn, move, go to."""
     return make_program(
         load_door_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(0.0, 0.0)], options=SHORT
     )
 
 
-def pairs(
+def list_pairs(
     problem: TrajectoryProblem, phase: int, *, waypoint: int | None = None
 ) -> dict[tuple[str, str], list[float]]:
     """Return (link, link or obstacle) → margins of their pairs at a waypoint, or unreduced."""
@@ -60,10 +60,12 @@ def pairs(
     return dict(found)
 
 
-def link_pairs(problem: TrajectoryProblem, phase: int) -> dict[tuple[str, str], int]:
+def count_link_pairs(problem: TrajectoryProblem, phase: int) -> dict[tuple[str, str], int]:
     """Return (link, link or obstacle) → number of pairs, without those of the robot itself."""
     robot = set(problem.scene.robot.links)
-    return {key: len(found) for key, found in pairs(problem, phase).items() if key[1] not in robot}
+    return {
+        key: len(found) for key, found in list_pairs(problem, phase).items() if key[1] not in robot
+    }
 
 
 def count_shapes(problem: TrajectoryProblem) -> collections.Counter[str]:
@@ -80,7 +82,7 @@ def count_shapes(problem: TrajectoryProblem) -> collections.Counter[str]:
 @pytest.mark.parametrize("phase", [0, 1, 2, 3])
 def test_pairs_of_every_phase(phase: int) -> None:
     """Robot against all else, a grasped object against all that it does not move with."""
-    problem = door_problem()
+    problem = make_door_problem()
     scene, part = problem.scene, problem.contacts.phases[phase]
     shapes = scene.robot.collision.geometryObjects
     robot, hand = set(scene.robot.links), set(scene.robot.touch_links)
@@ -91,24 +93,24 @@ def test_pairs_of_every_phase(phase: int) -> None:
         expected -= {(link, "door.lever") for link in hand}
     expected |= {(link, name) for link in moving | held for name in scene.obstacle_names}
     expected |= {(link, FLOOR) for link in robot - on_floor}
-    counts, found = count_shapes(problem), link_pairs(problem, phase)
+    counts, found = count_shapes(problem), count_link_pairs(problem, phase)
     assert found == {key: counts[key[0]] * counts[key[1]] for key in expected}
     own = {tuple(pair) for pair in part.pairs.tolist() if max(pair) < len(shapes)}
     assert own == {(pair.first, pair.second) for pair in scene.robot.collision.collisionPairs}
     assert len({frozenset(pair) for pair in part.pairs.tolist()}) == len(part.pairs)
-    for (first, second), margins in pairs(problem, phase).items():
+    for (first, second), margins in list_pairs(problem, phase).items():
         close = held and first in hand and second.startswith("door.")
         assert set(margins) == {CLOSE if close else MARGIN}
 
 
 def test_hand_margins_are_reduced_before_grasps_and_after_releases() -> None:
-    problem = door_problem()
+    problem = make_door_problem()
     hand = set(problem.scene.robot.touch_links)
     assert CLOSE < MARGIN
     near, begins = problem.options.steps(CONTACT_WINDOW), problem.contacts.first_waypoint
     for phase, at, away in ((0, begins[1], -1), (3, begins[3], 1)):
         for steps, close in ((0, CLOSE), (near, CLOSE), (near + 1, MARGIN)):
-            for (first, second), margins in pairs(
+            for (first, second), margins in list_pairs(
                 problem, phase, waypoint=int(at + away * steps)
             ).items():
                 assert set(margins) == {
@@ -132,14 +134,14 @@ def test_attachment_sets_the_clearance_of_hand_and_object(
     )
     hand, begins = set(scene.robot.touch_links), problem.contacts.first_waypoint
     for phase, at in ((0, begins[1]), (1, begins[2]), (3, begins[3])):
-        for (first, second), margins in pairs(problem, phase, waypoint=int(at)).items():
+        for (first, second), margins in list_pairs(problem, phase, waypoint=int(at)).items():
             assert set(margins) == {
                 expected if first in hand and second.startswith("door.") else MARGIN
             }
 
 
 def test_objects_stay_where_earlier_phases_left_them() -> None:
-    problem = door_problem()
+    problem = make_door_problem()
     knob = problem.task.phases[3].initial_values["door.knob"]
     for phase, state in ((0, {}), (3, {"hinge": 1.2, "knob": knob})):
         part = problem.contacts.phases[phase]
@@ -154,7 +156,7 @@ def test_grasped_object_is_paired_with_other_objects() -> None:
     robot, held = set(problem.scene.robot.links), {f"cabinet.{k}" for k in ("arm", "tray", "flap")}
     others = {"door.frame", "door.panel", "door.lever", "drawer.cabinet", "drawer.tray"}
     others |= set(problem.scene.obstacle_names)
-    counts, found = count_shapes(problem), link_pairs(problem, 1)
+    counts, found = count_shapes(problem), count_link_pairs(problem, 1)
     expected = {(link, other) for link in held for other in others}
     expected |= {(link, k) for link in robot for k in (*held, *others, *CABINET_FRAME)}
     assert {key: count for key, count in found.items() if key[1] != FLOOR} == {
@@ -170,7 +172,7 @@ def test_links_of_a_grasped_object_that_can_collide_are_paired() -> None:
         placed, object=dataclasses.replace(placed.object, own_pairs=meeting)
     )
     scene = replace_objects(make_full_scene(), {"cabinet": placed})
-    found = pairs(make_program(scene, [Actuate("cabinet", {"swing": 0.5})], options=SHORT), 1)
+    found = list_pairs(make_program(scene, [Actuate("cabinet", {"swing": 0.5})], options=SHORT), 1)
     own = {key: found[key] for key in found if all(k.startswith("cabinet.") for k in key)}
     assert {frozenset(link.removeprefix("cabinet.") for link in key) for key in own} == meeting
     assert all(set(margins) == {MARGIN} for margins in own.values())
@@ -187,7 +189,7 @@ def test_objects_grasped_one_after_the_other() -> None:
             assert paired & set(indices) == (set(indices) if hold in phase.held else set())
     hand = problem.scene.robot.touch_links
     first, last = (
-        pairs(problem, 1, waypoint=int(at)) for at in problem.contacts.first_waypoint[1:3]
+        list_pairs(problem, 1, waypoint=int(at)) for at in problem.contacts.first_waypoint[1:3]
     )
     assert set(last[hand[0], "drawer.tray"]) == {CLOSE}
     assert set(first[hand[0], "door.lever"]) == {CLOSE}
@@ -205,11 +207,13 @@ def test_margins_follow_the_options() -> None:
     options = Options(dist_safe=0.05, self_distance=0.03, grasp_clearance=0.01, reach_waypoints=2)
     for steps in ([GoTo(0.0, 0.0)], [Grasp("door", "handle_free")]):
         problem = make_program(load_door_scene(), steps, options=options)
-        margins = {margin for found in pairs(problem, 0, waypoint=2).values() for margin in found}
+        margins = {
+            margin for found in list_pairs(problem, 0, waypoint=2).values() for margin in found
+        }
         assert margins == {0.05, 0.03, *([0.01] if isinstance(steps[0], Grasp) else [])}
 
 
-def drawers(*, opening: float = 0.0) -> Scene:
+def make_drawers(*, opening: float = 0.0) -> Scene:
     """Return two drawers 15 mm apart, the second one open by a distance [m]."""
     scene = load_scene("drawer")
     pair = [
@@ -219,7 +223,7 @@ def drawers(*, opening: float = 0.0) -> Scene:
     return Scene.from_document({**scene.document, "objects": pair, "obstacles": []}, scene.folder)
 
 
-def moving(scene: Scene, slide: float = 0.3) -> tuple[TrajectoryProblem, int]:
+def make_moving_problem(scene: Scene, slide: float = 0.3) -> tuple[TrajectoryProblem, int]:
     """Return the problem of moving the near drawer, and the phase in which it moves."""
     problem = make_program(scene, [Actuate("near", {"slide": slide})], options=SHORT)
     (number,) = (k for k, part in enumerate(problem.task.phases) if part.name.startswith("move"))
@@ -228,8 +232,8 @@ def moving(scene: Scene, slide: float = 0.3) -> tuple[TrajectoryProblem, int]:
 
 def test_neighbours_are_exempt_at_their_initial_positions() -> None:
     """They keep half their initial distance, unless one starts away from the other's side."""
-    problem, number = moving(drawers())
-    (exemption,) = find_clearance_exemptions(drawers(), SHORT.dist_safe)
+    problem, number = make_moving_problem(make_drawers())
+    (exemption,) = find_clearance_exemptions(make_drawers(), SHORT.dist_safe)
     part = problem.contacts.phases[number]
     (region,) = part.margin_regions
     labels = {frozenset((part.labels[i], part.labels[j])) for i, j in part.pairs[region.pairs]}
@@ -237,12 +241,12 @@ def test_neighbours_are_exempt_at_their_initial_positions() -> None:
     assert region.margin == pytest.approx(0.5 * exemption.distance)
     assert region.columns.tolist() == [problem.chain.index("near.slide")]
     assert (region.lower[0], region.upper[0]) == pytest.approx(exemption.ranges["near.slide"])
-    opened = drawers().with_state("near", {"slide": 0.3})
-    problem, number = moving(opened, 0.0)  # it returns to the neighbour
+    opened = make_drawers().with_state("near", {"slide": 0.3})
+    problem, number = make_moving_problem(opened, 0.0)  # it returns to the neighbour
     assert problem.contacts.phases[number].margin_regions
     end = exemption.ranges["next.slide"][1]
     for opening, is_exempt in ((end - 1e-4, True), (end + 1e-4, False)):
-        problem, number = moving(drawers(opening=opening))
+        problem, number = make_moving_problem(make_drawers(opening=opening))
         assert bool(problem.contacts.phases[number].margin_regions) == is_exempt
 
 
@@ -253,9 +257,9 @@ def test_exemptions_remove_pairs_or_reduce_margins(
     fields: dict[str, float], margin: float | None
 ) -> None:
     exemption = {"pair": ["near.tray", "next.tray"], **fields}
-    document = {**drawers().document, "allow": [exemption]}
-    problem, number = moving(Scene.from_document(document, drawers().folder))
-    found = pairs(problem, number)
+    document = {**make_drawers().document, "allow": [exemption]}
+    problem, number = make_moving_problem(Scene.from_document(document, make_drawers().folder))
+    found = list_pairs(problem, number)
     own = {m for key in [*found] if set(key) == {"near.tray", "next.tray"} for m in found.pop(key)}
     assert own == (set() if margin is None else {margin})
     assert min(min(margins) for margins in found.values()) >= min(MARGIN, CLOSE)

@@ -27,14 +27,14 @@ COAL = 5e-6  # [m], differences between distances of coal, which depend on its l
 
 
 @cache
-def door_problem() -> TrajectoryProblem:
+def make_door_problem() -> TrajectoryProblem:
     """Return the problem of opening the door and driving away: reach, turn, move, go to."""
     return make_program(
         load_door_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(0.0, 0.0)], options=SHORT
     )
 
 
-def all_distances(problem: TrajectoryProblem, phase: int, z: np.ndarray) -> np.ndarray:
+def compute_all_distances(problem: TrajectoryProblem, phase: int, z: np.ndarray) -> np.ndarray:
     """Return the signed distance of every pair at every configuration from coal, shape (W, P)."""
     part = problem.contacts.phases[phase]
     geometry, model = make_all_pairs(part), problem.chain.model
@@ -50,19 +50,19 @@ def all_distances(problem: TrajectoryProblem, phase: int, z: np.ndarray) -> np.n
 
 
 @cache
-def sampled(phase: int) -> tuple[np.ndarray, np.ndarray]:
+def sample_distances(phase: int) -> tuple[np.ndarray, np.ndarray]:
     """Return random configurations of the door problem and the distances of all pairs there."""
-    problem = door_problem()
+    problem = make_door_problem()
     z = sample_configurations(
         problem.chain.lower, problem.chain.upper, 120, np.random.default_rng(phase)
     )
-    return z, all_distances(problem, phase, z)
+    return z, compute_all_distances(problem, phase, z)
 
 
 @pytest.mark.parametrize("phase", [0, 2])
 def test_all_pairs_within_reach_are_found_with_their_distances(phase: int) -> None:
-    problem, reach = door_problem(), 0.25
-    z, distances = sampled(phase)
+    problem, reach = make_door_problem(), 0.25
+    z, distances = sample_distances(phase)
     waypoints = np.full(len(z), problem.ends[phase])
     contacts = problem.contacts.evaluate(z, waypoints, reach=reach)
     part = problem.contacts.phases[phase]
@@ -89,8 +89,8 @@ def test_all_pairs_within_reach_are_found_with_their_distances(phase: int) -> No
 
 def test_batch_evaluation_equals_single_evaluations() -> None:
     """coal returns views of memory that it overwrites."""
-    problem = door_problem()
-    z, _ = sampled(0)
+    problem = make_door_problem()
+    z, _ = sample_distances(0)
     phases = np.arange(12) % 4
     waypoints = problem.ends[phases]
     together = problem.contacts.evaluate(z[:12], waypoints, reach=0.3)
@@ -108,7 +108,7 @@ def test_batch_evaluation_equals_single_evaluations() -> None:
 
 
 def test_no_contacts_within_reach() -> None:
-    problem = door_problem()
+    problem = make_door_problem()
     contacts = problem.contacts.evaluate(problem.start[None], np.array([1]), reach=1e-6)
     assert contacts.pair.shape == (0, 2)
     assert contacts.normal.shape == contacts.first.shape == contacts.second.shape == (0, 3)
@@ -142,7 +142,7 @@ def test_shortfall_violation_and_clearance() -> None:
 
 
 def test_waypoints_between_phases_belong_to_the_earlier_phase() -> None:
-    problem = door_problem()
+    problem = make_door_problem()
     ends = [0, *problem.ends.tolist()]
     for waypoint in range(ends[-1] + 1):
         phase = problem.contacts.find_phase(waypoint)
@@ -152,9 +152,9 @@ def test_waypoints_between_phases_belong_to_the_earlier_phase() -> None:
 @pytest.mark.parametrize("phase", [0, 2])
 def test_planes_have_value_and_gradient_of_the_signed_distance(phase: int) -> None:
     """Where a distance bends, the slope must lie between the one-sided differences."""
-    problem, step, slots = door_problem(), 1e-4, 40
+    problem, step, slots = make_door_problem(), 1e-4, 40
     chain, rng = problem.chain, np.random.default_rng(phase)
-    z, distances = (part[:30] for part in sampled(phase))
+    z, distances = (part[:30] for part in sample_distances(phase))
     waypoints = np.full(len(z), problem.ends[phase])
     contacts = problem.contacts.evaluate(z, waypoints, reach=0.25, nearest=slots)
     planes, offsets = problem.contacts.compute_planes(z, contacts, slots=slots)
@@ -181,16 +181,16 @@ def test_planes_have_value_and_gradient_of_the_signed_distance(phase: int) -> No
         ahead, behind = z + step * direction, z - step * direction
         slope = (evaluate(ahead) - evaluate(behind)) / (2 * step)
         np.testing.assert_allclose(gradients @ direction, slope, rtol=0.0, atol=1e-5)
-        right = (all_distances(problem, phase, ahead) - distances)[pair] / step
-        left = (distances - all_distances(problem, phase, behind))[pair] / step
+        right = (compute_all_distances(problem, phase, ahead) - distances)[pair] / step
+        left = (distances - compute_all_distances(problem, phase, behind))[pair] / step
         outside = np.maximum(np.minimum(left, right) - slope, slope - np.maximum(left, right))
         assert np.median(outside) < 1e-3
         assert outside.max() < 2e-2
 
 
 def test_planes_of_the_worst_contacts_are_kept() -> None:
-    problem = door_problem()
-    z, _ = sampled(0)
+    problem = make_door_problem()
+    z, _ = sample_distances(0)
     z = z[:10]
     contacts = problem.contacts.evaluate(z, np.full(10, problem.ends[0]), reach=0.5)
     few, few_offsets = problem.contacts.compute_planes(z, contacts, slots=2)
@@ -202,7 +202,7 @@ def test_planes_of_the_worst_contacts_are_kept() -> None:
 
 def test_evaluations_are_charged_to_the_budget() -> None:
     """The search for the first collision stops there."""
-    problem = door_problem()
+    problem = make_door_problem()
     z = np.tile(problem.start, (5, 1))
     inside = z.copy()
     inside[2:, :2] = load_door_scene().objects["door"].placement.translation[:2]

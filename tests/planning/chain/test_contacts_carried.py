@@ -21,18 +21,18 @@ POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
 
 
 @cache
-def scene() -> Scene:
+def make_scene() -> Scene:
     return make_room(describe_table(gap=0.05), describe_stand(gap=0.05), objects=("stick", "ball"))
 
 
 @cache
-def placing() -> TrajectoryProblem:
+def make_placing_problem() -> TrajectoryProblem:
     """Return the problem of taking the stick, putting it elsewhere, and driving away."""
-    return make_program(scene(), [Place("stick", ASIDE), GoTo(0.0, 0.0)], options=SHORT)
+    return make_program(make_scene(), [Place("stick", ASIDE), GoTo(0.0, 0.0)], options=SHORT)
 
 
 @cache
-def fetching() -> TrajectoryProblem:
+def make_fetching_problem() -> TrajectoryProblem:
     """Return the problem of grasping the ball with the stick, then releasing ball and stick."""
     steps = [
         Grasp("stick"),
@@ -42,11 +42,11 @@ def fetching() -> TrajectoryProblem:
         GoTo(0.0, 0.0),
     ]
     return make_program(
-        scene(), [*steps, Place("stick", (0.8, 0.0, 0.6)), GoTo(1.0, 0.0)], options=SHORT
+        make_scene(), [*steps, Place("stick", (0.8, 0.0, 0.6)), GoTo(1.0, 0.0)], options=SHORT
     )
 
 
-def margins(
+def list_margins(
     problem: TrajectoryProblem, phase: int, *, at: str = ""
 ) -> dict[tuple[str, str], set[float]]:
     """Return (link, link or obstacle) → margins of pairs, "first" or "last", or unreduced."""
@@ -62,48 +62,60 @@ def margins(
     return found
 
 
-def partners(problem: TrajectoryProblem, phase: int, label: str) -> set[str]:
-    return {a if b == label else b for a, b in margins(problem, phase) if label in (a, b)}
+def list_partners(problem: TrajectoryProblem, phase: int, label: str) -> set[str]:
+    return {a if b == label else b for a, b in list_margins(problem, phase) if label in (a, b)}
 
 
 def test_pairs_of_carried_and_resting_objects() -> None:
     """A carried object is paired with everything but itself and the hand."""
-    robot = scene().robot
+    robot = make_scene().robot
     for phase in (0, 2):
         for label in ("stick.stick", "stick.tip", "ball.ball"):
-            assert partners(placing(), phase, label) == set(robot.links)
-    assert partners(placing(), 1, "ball.ball") == {*robot.links, "stick.stick", "stick.tip"}
+            assert list_partners(make_placing_problem(), phase, label) == set(robot.links)
+    assert list_partners(make_placing_problem(), 1, "ball.ball") == {
+        *robot.links,
+        "stick.stick",
+        "stick.tip",
+    }
     for label in ("stick.stick", "stick.tip"):
         hand = set(robot.touch_links) if label == "stick.stick" else set()
         others = {"ball.ball", "table", "stand", FLOOR}
-        assert partners(placing(), 1, label) == (set(robot.links) - hand) | others
-    for (first, second), found in margins(placing(), 1).items():
+        assert list_partners(make_placing_problem(), 1, label) == (set(robot.links) - hand) | others
+    for (first, second), found in list_margins(make_placing_problem(), 1).items():
         assert found == {CLOSE if first in robot.touch_links and second == "stick.tip" else MARGIN}
 
 
 def test_hand_margins_are_reduced_before_grasps_and_after_releases() -> None:
-    hand = set(scene().robot.touch_links)
+    hand = set(make_scene().robot.touch_links)
     for phase, at in ((0, "last"), (2, "first")):
-        for (first, second), found in margins(placing(), phase, at=at).items():
+        for (first, second), found in list_margins(make_placing_problem(), phase, at=at).items():
             assert found == {CLOSE if first in hand and second.startswith("stick.") else MARGIN}
 
 
 def test_grasping_object_may_touch_the_grasped_one() -> None:
-    before, held = margins(fetching(), 1, at="last"), margins(fetching(), 2)
+    before, held = (
+        list_margins(make_fetching_problem(), 1, at="last"),
+        list_margins(make_fetching_problem(), 2),
+    )
     assert before["stick.tip", "ball.ball"] == {0.0}
     assert before["stick.stick", "ball.ball"] == {MARGIN}
-    assert before[scene().robot.touch_links[0], "ball.ball"] == {
+    assert before[make_scene().robot.touch_links[0], "ball.ball"] == {
         MARGIN
     }  # the hand is not what takes it
     assert ("stick.tip", "ball.ball") not in held
     assert held["stick.stick", "ball.ball"] == {MARGIN}
-    robots = set(scene().robot.links)
-    assert partners(fetching(), 2, "ball.ball") == robots | {"stick.stick", "table", "stand", FLOOR}
-    after = margins(fetching(), 3, at="first")
+    robots = set(make_scene().robot.links)
+    assert list_partners(make_fetching_problem(), 2, "ball.ball") == robots | {
+        "stick.stick",
+        "table",
+        "stand",
+        FLOOR,
+    }
+    after = list_margins(make_fetching_problem(), 3, at="first")
     assert after["stick.tip", "ball.ball"] == {0.0}
 
 
-def expected_placement(problem: TrajectoryProblem, name: str, row: np.ndarray) -> pin.SE3:
+def compute_expected_placement(problem: TrajectoryProblem, name: str, row: np.ndarray) -> pin.SE3:
     """Return where the chain has an object at a configuration."""
     hold = next(hold for hold in problem.task.holds if hold.object == name)
     closure, data = problem.chain.closures[hold], problem.chain.model.createData()
@@ -112,7 +124,7 @@ def expected_placement(problem: TrajectoryProblem, name: str, row: np.ndarray) -
 
 
 def test_released_placements_do_not_depend_on_earlier_queries() -> None:
-    problem = fetching()
+    problem = make_fetching_problem()
     z = sample_configurations(
         problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(4)
     )
@@ -129,7 +141,7 @@ def test_released_placements_do_not_depend_on_earlier_queries() -> None:
 
 def test_distances_equal_those_of_the_scene_after_the_release() -> None:
     """Compares with a problem of the last phase alone, in the scene that the motion leaves."""
-    problem = fetching()
+    problem = make_fetching_problem()
     z = sample_configurations(
         problem.chain.lower,
         problem.chain.upper,
@@ -138,9 +150,9 @@ def test_distances_equal_those_of_the_scene_after_the_release() -> None:
         arena=1.0,
     )
     contacts = problem.evaluate_contacts(z, reach=0.3)
-    stands = scene()
+    stands = make_scene()
     for name, end in (("ball", problem.ends[2]), ("stick", problem.ends[4])):
-        stands = stands.with_placement(name, expected_placement(problem, name, z[end - 1]))
+        stands = stands.with_placement(name, compute_expected_placement(problem, name, z[end - 1]))
     alone = make_program(stands, [GoTo(1.0, 0.0)], options=SHORT)
     rows = np.arange(problem.ends[4], problem.ends[5])
     seen = alone.contacts.evaluate(

@@ -36,11 +36,11 @@ N = LONG.reach_waypoints
 ASIDE = lift(STICK, [0.0, 0.5, 0.0])
 
 
-def problem(scene: Scene, *steps: Step) -> TrajectoryProblem:
+def make_problem(scene: Scene, *steps: Step) -> TrajectoryProblem:
     return make_program(scene, steps, options=LONG)
 
 
-def margins(p: TrajectoryProblem, phase: int) -> dict[tuple[str, str], np.ndarray]:
+def compute_margins(p: TrajectoryProblem, phase: int) -> dict[tuple[str, str], np.ndarray]:
     """Return links → smallest reduced margin at each waypoint of a phase, except of the hand."""
     part, first = p.contacts.phases[phase], int(p.contacts.first_waypoint[phase])
     waypoints = range(first, first + p.task.phases[phase].segments + 1)
@@ -67,28 +67,28 @@ def assert_reduced(
 
 
 def test_margins_are_not_reduced_without_need() -> None:
-    p = problem(make_room(describe_table(gap=GAP)), GoTo(0.0, 1.0))
-    assert margins(p, 0) == {}
-    far = problem(make_room(describe_table(gap=0.03)), Place("stick", ASIDE))
-    assert [margins(far, phase) for phase in (0, 1)] == [{}, {}]
+    p = make_problem(make_room(describe_table(gap=GAP)), GoTo(0.0, 1.0))
+    assert compute_margins(p, 0) == {}
+    far = make_problem(make_room(describe_table(gap=0.03)), Place("stick", ASIDE))
+    assert [compute_margins(far, phase) for phase in (0, 1)] == [{}, {}]
 
 
 def test_margins_are_reduced_where_objects_are_lifted_and_placed() -> None:
     """Placed elsewhere, or grasped again, an object has its margins reduced there."""
     steps = [Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 1.0)]
-    p = problem(make_room(describe_table(gap=GAP)), *steps)
+    p = make_problem(make_room(describe_table(gap=GAP)), *steps)
     names = ["reach stick.grip", "place stick", "reach stick.grip", "go to"]
     assert [phase.name for phase in p.task.phases] == names
-    assert [margins(p, phase) for phase in (0, 2)] == [{}, {}]
+    assert [compute_margins(p, phase) for phase in (0, 2)] == [{}, {}]
     for phase, where in ((1, {"begin": True, "end": True}), (3, {"begin": True})):
-        found = margins(p, phase)
+        found = compute_margins(p, phase)
         assert set(found) == {("stick.stick", "table")}
         assert_reduced(found["stick.stick", "table"], REDUCED_MARGIN_RATIO * GAP, **where)
 
 
 def test_margin_is_half_the_distance_of_each_shape() -> None:
     wall = describe_box("wall", [0.3, 0.02, 0.3], [0.8, 0.25 + 0.01 + 0.01, TOP + 0.1])
-    p = problem(make_room(describe_table(gap=GAP), wall), Place("stick", ASIDE))
+    p = make_problem(make_room(describe_table(gap=GAP), wall), Place("stick", ASIDE))
     part, first = p.contacts.phases[1], int(p.contacts.first_waypoint[1])
     eased = {
         (part.shapes[i].name, part.labels[j]): [*part.reduced_margins[k]]
@@ -125,20 +125,20 @@ def test_duration_of_reduced_margins_does_not_depend_on_the_time_step() -> None:
 
 @pytest.mark.parametrize("gap", [0.0, -1e-3])
 def test_initial_penetration_may_be_left_but_not_entered(gap: float) -> None:
-    p = problem(
+    p = make_problem(
         make_room(describe_table(gap=gap)), Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 0.0)
     )
-    found = margins(p, 1)["stick.stick", "table"]
+    found = compute_margins(p, 1)["stick.stick", "table"]
     np.testing.assert_allclose(found[: NEAR + 1], gap, rtol=0.0, atol=1e-6)
     assert_reduced(np.append(np.zeros(NEAR + 1), found[NEAR + 1 :]), 0.0, begin=True, end=True)
-    assert_reduced(margins(p, 3)["stick.stick", "table"], 0.0, begin=True)
+    assert_reduced(compute_margins(p, 3)["stick.stick", "table"], 0.0, begin=True)
 
 
 def test_margins_are_reduced_to_the_object_below_only() -> None:
     other = describe_box("other", [0.5, 0.6, 0.02], [0.8, 1.0, TOP - GAP - 0.01])
     small = describe_box("table", [0.5, 0.7, 0.02], [0.8, 0.0, TOP - GAP - 0.01])
-    p = problem(make_room(small, other), Place("stick", lift(STICK, [0.0, 1.0, 0.0])))
-    found = margins(p, 1)
+    p = make_problem(make_room(small, other), Place("stick", lift(STICK, [0.0, 1.0, 0.0])))
+    found = compute_margins(p, 1)
     assert set(found) == {("stick.stick", "table"), ("stick.stick", "other")}
     assert_reduced(found["stick.stick", "table"], REDUCED_MARGIN_RATIO * GAP, begin=True)
     assert_reduced(found["stick.stick", "other"], REDUCED_MARGIN_RATIO * GAP, end=True)
@@ -153,12 +153,12 @@ def test_object_grasped_at_the_start_may_leave_its_support(gap: float, margin: f
         solve_reach(compute_grasp_pose(STICK), solve_above(STICK)),
     )
     held = scene.with_start(base=row[:3], arm=row[3:]).with_held({"stick": "grip"})
-    found = margins(problem(held, GoTo(0.0, 1.0), GoTo(0.0, 0.0)), 0)
+    found = compute_margins(make_problem(held, GoTo(0.0, 1.0), GoTo(0.0, 0.0)), 0)
     assert set(found) == {("stick.stick", "table")}
     assert_reduced(found["stick.stick", "table"], margin, begin=True)
-    assert margins(problem(held, GoTo(0.0, 1.0), GoTo(0.0, 0.0)), 1) == {}
+    assert compute_margins(make_problem(held, GoTo(0.0, 1.0), GoTo(0.0, 0.0)), 1) == {}
     raised = held.with_start(base=move_base(row, x=-0.1)[:3], arm=solve_above(STICK)[3:])
-    assert margins(problem(raised, GoTo(0.0, 1.0)), 0) == {}
+    assert compute_margins(make_problem(raised, GoTo(0.0, 1.0)), 0) == {}
 
 
 def test_margins_of_supported_objects_are_reduced_where_transport_begins() -> None:
@@ -167,7 +167,7 @@ def test_margins_of_supported_objects_are_reduced_where_transport_begins() -> No
         make_plate_scene(cups=1, wall=0.01), [Actuate("plate", {"slide": 0.3})], options=options
     )
     (number,) = (k for k, phase in enumerate(p.task.phases) if phase.supported)
-    row = margins(p, number)["cup.cup", "wall"]
+    row = compute_margins(p, number)["cup.cup", "wall"]
     assert row[0] == pytest.approx(REDUCED_MARGIN_RATIO * 0.01, abs=1e-4)
     assert row[-1] == LONG.dist_safe
 
@@ -178,13 +178,16 @@ def test_margins_of_objects_on_a_tray_are_reduced_where_it_is_lifted() -> None:
         {"name": "tray", "type": "tray.yaml", "position": [0.8, 0.0, 0.7]},
         describe_cup(at=(0.82, 0.05, 0.72)),
     ]
-    p = problem(
+    p = make_problem(
         make_scene(things, [describe_box("wall", [0.02, 0.02, 0.05], [0.875, 0.05, 0.78])]),
         Place("tray", (-0.5, -1.5, 0.7)),
     )
     (number,) = (k for k, phase in enumerate(p.task.phases) if phase.supported)
     assert_reduced(
-        margins(p, number)["cup.cup", "wall"], REDUCED_MARGIN_RATIO * 0.01, begin=True, within=1e-4
+        compute_margins(p, number)["cup.cup", "wall"],
+        REDUCED_MARGIN_RATIO * 0.01,
+        begin=True,
+        within=1e-4,
     )
 
 
@@ -195,13 +198,15 @@ def test_short_phases_begin_and_end_with_reduced_margins() -> None:
         [Place("stick", lift(STICK, [0.0, 0.5, -GAP]))],
         options=options,
     )
-    np.testing.assert_allclose(margins(p, 1)["stick.stick", "table"], np.zeros(NEAR + 1), atol=1e-6)
+    np.testing.assert_allclose(
+        compute_margins(p, 1)["stick.stick", "table"], np.zeros(NEAR + 1), atol=1e-6
+    )
 
 
 def test_margins_to_the_floor_are_reduced() -> None:
     low = pin.SE3(np.eye(3), np.array([0.8, 0.0, 0.051]))
-    p = problem(make_room(), Place("stick", low))
-    found = margins(p, 1)
+    p = make_problem(make_room(), Place("stick", low))
+    found = compute_margins(p, 1)
     assert set(found) == {("stick.stick", FLOOR)}
     assert_reduced(found["stick.stick", FLOOR], REDUCED_MARGIN_RATIO * 1e-3, end=True)
 
@@ -213,9 +218,9 @@ def test_margins_are_reduced_before_and_after_a_touch(gap: float, margin: float 
     point = np.array([0.8, 0.7, 0.75])
     wall = describe_box("wall", [0.3, 0.1, 0.3], point + np.array([0.0, gap + 0.05, 0.0]))
     scene = make_room(wall).with_held({"stick": "grip"})
-    p = problem(scene, Touch("stick.tip", point), GoTo(0.0, 0.0), GoTo(0.0, 1.0))
+    p = make_problem(scene, Touch("stick.tip", point), GoTo(0.0, 0.0), GoTo(0.0, 1.0))
     for phase, where in ((0, {"end": True}), (1, {"begin": True}), (2, {})):
-        found = margins(p, phase)
+        found = compute_margins(p, phase)
         assert set(found) == ({("stick.tip", "wall")} if where and margin is not None else set())
         for row in found.values():  # a point has a size of 0.1 mm here
             assert_reduced(row, margin or 0.0, **where, within=6e-5)
@@ -224,6 +229,11 @@ def test_margins_are_reduced_before_and_after_a_touch(gap: float, margin: float 
 def test_margins_are_reduced_for_touches_but_not_for_poses() -> None:
     scene = make_room(describe_table(gap=GAP)).with_held({"stick": "grip"})
     reach = Touch("forearm_link", (0.8, 0.0, TOP))
-    found = margins(problem(scene, reach), 0)
+    found = compute_margins(make_problem(scene, reach), 0)
     assert {first for first, _ in found} == {"forearm_link"}
-    assert margins(problem(scene, Reach(pin.SE3(np.eye(3), np.array([0.8, 0.0, TOP])))), 0) == {}
+    assert (
+        compute_margins(
+            make_problem(scene, Reach(pin.SE3(np.eye(3), np.array([0.8, 0.0, TOP])))), 0
+        )
+        == {}
+    )

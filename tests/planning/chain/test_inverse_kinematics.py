@@ -27,7 +27,7 @@ def robot() -> VirtualKinematicChain:
     return consolidate(load_door_scene(), {})
 
 
-def last_frame(chain: VirtualKinematicChain) -> tuple[int, pin.SE3]:
+def get_last_frame(chain: VirtualKinematicChain) -> tuple[int, pin.SE3]:
     """Return joint and local placement of the grasped object's base, or else of the tool."""
     if chain.closures:
         (closure,) = chain.closures.values()
@@ -39,13 +39,13 @@ def last_frame(chain: VirtualKinematicChain) -> tuple[int, pin.SE3]:
 def make_solver(
     chain: VirtualKinematicChain, kind: str = "pose", shift: Shift | None = None
 ) -> PoseSolver:
-    return PoseSolver(chain.model, PoseRow(*last_frame(chain), (), kind, shift))
+    return PoseSolver(chain.model, PoseRow(*get_last_frame(chain), (), kind, shift))
 
 
 def place(
     chain: VirtualKinematicChain, z: np.ndarray, frame: tuple[int, pin.SE3] | None = None
 ) -> pin.SE3:
-    joint, local = frame or last_frame(chain)
+    joint, local = frame or get_last_frame(chain)
     data = chain.model.createData()
     pin.forwardKinematics(chain.model, data, chain.coordinates.q(z))
     return data.oMi[joint] * local
@@ -79,7 +79,7 @@ def solve(
     weights: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return solutions and their mask, checked against limits and target."""
-    usual = limits(chain)
+    usual = get_limits(chain)
     lower, upper = usual[0] if lower is None else lower, usual[1] if upper is None else upper
     z, found = make_solver(chain, kind, shift).solve(
         guesses,
@@ -99,13 +99,13 @@ def solve(
     return z, found
 
 
-def limits(chain: VirtualKinematicChain) -> tuple[np.ndarray, np.ndarray]:
+def get_limits(chain: VirtualKinematicChain) -> tuple[np.ndarray, np.ndarray]:
     lower, upper = chain.lower.copy(), chain.upper.copy()
     lower[:2], upper[:2] = -3.0, 3.0
     return lower, upper
 
 
-def home(chain: VirtualKinematicChain, *base: float) -> np.ndarray:
+def make_home(chain: VirtualKinematicChain, *base: float) -> np.ndarray:
     return np.concatenate([base or [0.0, 0.0, 0.0], chain.robot.home])
 
 
@@ -171,23 +171,23 @@ def test_unreachable_goal(robot: VirtualKinematicChain) -> None:
 
 
 def test_equal_limits_fix_coordinates(robot: VirtualKinematicChain) -> None:
-    goal, rng = home(robot, 0.5, -0.3, 0.4), np.random.default_rng(4)
+    goal, rng = make_home(robot, 0.5, -0.3, 0.4), np.random.default_rng(4)
     target, guesses = place(robot, goal), goal + rng.uniform(-0.3, 0.3, (40, robot.size))
-    lower, upper = limits(robot)
+    lower, upper = get_limits(robot)
     lower[5] = upper[5] = goal[5]
     _, found = solve(robot, guesses, target, lower=lower, upper=upper)
     assert found.mean() > 0.8
-    lower, upper = (np.tile(side, (40, 1)) for side in limits(robot))  # one row per guess
+    lower, upper = (np.tile(side, (40, 1)) for side in get_limits(robot))  # one row per guess
     lower[:, 2] = upper[:, 2] = guesses[:, 2]
     _, found = solve(robot, guesses, target, lower=lower, upper=upper)
     assert found.mean() > 0.8
 
 
 def test_goal_is_attained_despite_an_active_limit(robot: VirtualKinematicChain) -> None:
-    goal, rng = home(robot), np.random.default_rng(5)
+    goal, rng = make_home(robot), np.random.default_rng(5)
     guesses = goal + rng.uniform(-0.1, 0.1, (40, robot.size))
     guesses[:, 0] = -0.2 - rng.uniform(0.0, 0.03, 40)
-    upper = limits(robot)[1]
+    upper = get_limits(robot)[1]
     farthest = []
     for upper[0] in (3.0, -0.2):
         z, found = solve(robot, guesses, place(robot, goal), upper=upper)
@@ -197,7 +197,7 @@ def test_goal_is_attained_despite_an_active_limit(robot: VirtualKinematicChain) 
 
 
 def test_coordinates_of_large_weight_move_less(robot: VirtualKinematicChain) -> None:
-    goal = home(robot)
+    goal = make_home(robot)
     guesses = goal + np.random.default_rng(6).uniform(-0.2, 0.2, (60, robot.size))
     travel = []
     for weight in (0.1, 100.0):
@@ -210,7 +210,7 @@ def test_coordinates_of_large_weight_move_less(robot: VirtualKinematicChain) -> 
 
 @pytest.mark.parametrize("axis", range(3))
 def test_half_turns_are_no_solutions(robot: VirtualKinematicChain, axis: int) -> None:
-    start = home(robot)
+    start = make_home(robot)
     half_turn = pin.SE3(pin.exp3(np.pi * np.eye(3)[axis]), np.zeros(3))
     solve(robot, start[None], place(robot, start) * half_turn)
 
@@ -218,7 +218,7 @@ def test_half_turns_are_no_solutions(robot: VirtualKinematicChain, axis: int) ->
 @pytest.mark.parametrize("axis", range(2))
 def test_upside_down_frames_are_turned_upright(robot: VirtualKinematicChain, axis: int) -> None:
     """The gradient of a plain tilt vanishes there."""
-    start = home(robot)
+    start = make_home(robot)
     here = place(robot, start)
     target = pin.SE3(pin.exp3(np.pi * np.eye(3)[axis]) @ here.rotation, here.translation)
     assert compute_tilt(here, target) == pytest.approx(np.pi, abs=1e-6)
@@ -230,8 +230,8 @@ def test_upside_down_frames_are_turned_upright(robot: VirtualKinematicChain, axi
 
 
 def test_hand_stops_short_of_its_goal_along_the_approach(robot: VirtualKinematicChain) -> None:
-    goal = home(robot, 0.5, -0.3, 0.4)
-    joint, local = last_frame(robot)
+    goal = make_home(robot, 0.5, -0.3, 0.4)
+    joint, local = get_last_frame(robot)
     shift = (joint, tuple((0.08 * local.rotation[:, 2]).tolist()))
     guesses = goal + np.random.default_rng(11).uniform(-0.3, 0.3, (40, robot.size))
     z, found = solve(robot, guesses, place(robot, goal), shift=shift)

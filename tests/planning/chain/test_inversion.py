@@ -50,7 +50,7 @@ def trees(draw: st.DrawFn) -> tuple[str, int]:
     return f'<robot name="t">{"".join(parts)}</robot>', draw(st.integers(0, number - 1))
 
 
-def placements(
+def compute_placements(
     model: pin.Model, geometry: pin.GeometryModel, q: np.ndarray
 ) -> tuple[dict[str, pin.SE3], dict[str, pin.SE3]]:
     """Placements in the universe frame of all body frames and of all shapes, by name."""
@@ -78,8 +78,8 @@ def test_inverted_trees_keep_all_frames_and_shapes(tree: tuple[str, int], seed: 
     moving = coordinates.names
     assert set(moving) <= set(item.coordinates.names)
     q = coordinates.q(np.array([z[item.coordinates.index(name)] for name in moving]))
-    bodies, shapes = placements(item.model, item.collision, item.coordinates.q(z))
-    new_bodies, new_shapes = placements(model, collision, q)
+    bodies, shapes = compute_placements(item.model, item.collision, item.coordinates.q(z))
+    new_bodies, new_shapes = compute_placements(model, collision, q)
     assert new_bodies.keys() == bodies.keys()
     assert new_shapes.keys() == shapes.keys()
     to_root = bodies[link].inverse()

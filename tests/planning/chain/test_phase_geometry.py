@@ -15,11 +15,13 @@ JOINTS = 3
 COAL = 1e-5  # [m]
 
 
-def random_placement(rng: np.random.Generator, size: float) -> pin.SE3:
+def sample_placement(rng: np.random.Generator, size: float) -> pin.SE3:
     return pin.SE3(pin.exp3(rng.normal(size=3)), rng.uniform(-size, size, 3))
 
 
-def random_geometry(rng: np.random.Generator, moving: int = 7, standing: int = 9) -> PhaseGeometry:
+def make_random_geometry(
+    rng: np.random.Generator, moving: int = 7, standing: int = 9
+) -> PhaseGeometry:
     """Return boxes, balls and cylinders on joints and in a 3 m room, and 2/3 of all pairs."""
     shapes = []
     for k in range(moving + standing):
@@ -30,7 +32,7 @@ def random_geometry(rng: np.random.Generator, moving: int = 7, standing: int = 9
         joint = 1 + int(rng.integers(JOINTS)) if k < moving else 0
         shapes.append(
             pin.GeometryObject(
-                f"s{k}", joint, 0, random_placement(rng, 0.3 if joint else 1.5), solid
+                f"s{k}", joint, 0, sample_placement(rng, 0.3 if joint else 1.5), solid
             )
         )
     every = [
@@ -54,7 +56,7 @@ def random_geometry(rng: np.random.Generator, moving: int = 7, standing: int = 9
     )
 
 
-def random_joints(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+def sample_joints(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return universe and joint placements, shapes (count, J + 1, 3, 3) and (count, J + 1, 3)."""
     rotations = np.array(
         [[np.eye(3), *(pin.exp3(rng.normal(size=3)) for _ in range(JOINTS))] for _ in range(count)]
@@ -64,7 +66,7 @@ def random_joints(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.
     return rotations, translations
 
 
-def all_distances(
+def compute_all_distances(
     part: PhaseGeometry, rotations: np.ndarray, translations: np.ndarray
 ) -> np.ndarray:
     """Return coal's distance of every pair at every configuration, shape (W, P)."""
@@ -85,15 +87,15 @@ def all_distances(
 @given(st.integers(0, 2**32 - 1))
 def test_static_geometry_can_be_moved(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    part, joints = random_geometry(rng), random_joints(rng, 4)
+    part, joints = make_random_geometry(rng), sample_joints(rng, 4)
     part.boxes.find_close_pairs(0.1, *joints)  # fills caches that the copy must not use
-    where = {geometry: random_placement(rng, 1.5) for geometry in (8, 11)}
+    where = {geometry: sample_placement(rng, 1.5) for geometry in (8, 11)}
     moved = part.with_placements(where)
     at, pairs, _ = moved.boxes.find_close_pairs(0.1, *joints)
     for geometry, placement in where.items():
         assert moved.shapes[geometry].placement.isApprox(placement)
         assert not part.shapes[geometry].placement.isApprox(placement)
-    close = np.argwhere(all_distances(moved, *joints) < 0.1 - COAL).tolist()
+    close = np.argwhere(compute_all_distances(moved, *joints) < 0.1 - COAL).tolist()
     assert {tuple(pair) for pair in close} <= set(zip(at.tolist(), pairs.tolist(), strict=True))
 
 
@@ -101,7 +103,7 @@ def test_static_geometry_can_be_moved(seed: int) -> None:
 @given(st.integers(0, 2**32 - 1))
 def test_static_geometry_near_a_box(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    part = random_geometry(rng)
+    part = make_random_geometry(rng)
     lower = rng.uniform(-1.5, 1.0, 3)
     size = rng.uniform(0.05, 0.6, 3)
     box, here = coal.Box(*size), pin.SE3(np.eye(3), lower + size / 2)

@@ -59,7 +59,7 @@ def compute_violation(kind: str, placement: pin.SE3, target: pin.SE3) -> float:
     return float(np.maximum(lower - rows, rows - upper).max())
 
 
-def random_axis(rng: np.random.Generator) -> np.ndarray:
+def sample_axis(rng: np.random.Generator) -> np.ndarray:
     axis = rng.normal(size=3)
     return axis / np.linalg.norm(axis)
 
@@ -73,7 +73,7 @@ def turn(
         level = np.array([np.cos(about), np.sin(about), 0.0]) if axis is None else axis
         rotation = pin.exp3(angle * level) @ pin.utils.rotate("z", heading) @ target.rotation
     else:
-        rotation = target.rotation @ pin.exp3(angle * (random_axis(rng) if axis is None else axis))
+        rotation = target.rotation @ pin.exp3(angle * (sample_axis(rng) if axis is None else axis))
     return pin.SE3(rotation, target.translation.copy())
 
 
@@ -81,7 +81,7 @@ def turn(
 def test_residual_and_rows_are_offset_and_angle(angle: float) -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
-        target, shift, axis = pin.SE3.Random(), rng.normal(size=3), random_axis(rng)
+        target, shift, axis = pin.SE3.Random(), rng.normal(size=3), sample_axis(rng)
         placement = turn("pose", target, angle, rng, axis)
         placement.translation += shift
         chord = 2 * np.sin(angle / 2) * axis
@@ -120,7 +120,7 @@ def test_goal_holds_at_the_target_only(kind: str, angle: float) -> None:
         target = pin.SE3.Random()
         placement = turn(kind, target, angle, rng, axis)
         if kind == "point":
-            placement.translation += angle * random_axis(rng)
+            placement.translation += angle * sample_axis(rng)
         elif kind == "level":
             placement.translation += rng.normal(size=3)
         size = np.linalg.norm(evaluate(RESIDUALS[kind], placement, target))

@@ -25,19 +25,19 @@ from vkc_pin.planning.diagnosis.diagnosis import (
 CRATE = {"name": "crate", "type": "box", "size": [0.6, 0.6, 0.4], "position": [1.5, 0.0, 0.2]}
 
 
-def problem(scene: vkc.Scene, *steps: vkc.steps.Step) -> vkc.TrajectoryProblem:
+def make_problem(scene: vkc.Scene, *steps: vkc.steps.Step) -> vkc.TrajectoryProblem:
     return make_program(scene, list(steps), options=SHORT)
 
 
 def test_demo_has_no_violations() -> None:
-    demo = problem(load_door_scene(), vkc.Actuate("door", {"hinge": 1.2}))
+    demo = make_problem(load_door_scene(), vkc.Actuate("door", {"hinge": 1.2}))
     assert find_impossible_conditions(demo) == []
     assert diagnose_goals(demo, 0) == []
 
 
 def test_goals_beyond_limits_of_every_kind() -> None:
     steps = [vkc.Actuate("door", {"hinge": -2.0}), vkc.GoTo(0.0, 3.0)]
-    first, second = find_impossible_conditions(problem(load_door_scene(), *steps))
+    first, second = find_impossible_conditions(make_problem(load_door_scene(), *steps))
     assert first.constraint == second.constraint == "goal"
     assert (first.subject, first.unit) == ("door.hinge", "rad")
     assert (second.subject, second.unit) == ("base_y", "m")
@@ -48,12 +48,12 @@ def test_goals_beyond_limits_of_every_kind() -> None:
 def test_goal_at_the_limit_is_allowed() -> None:
     scene = load_door_scene()
     steps = [vkc.Actuate("door", {"hinge": 1.57}), vkc.GoTo(scene.arena[1], scene.arena[3])]
-    assert find_impossible_conditions(problem(scene, *steps)) == []
+    assert find_impossible_conditions(make_problem(scene, *steps)) == []
 
 
 def test_start_in_contact() -> None:
     scene = make_hall(obstacles=[{**CRATE, "position": [0.7, 0.0, 0.2]}])
-    (violation, *_) = find_impossible_conditions(problem(scene, vkc.GoTo(-1.0, 0.0)))
+    (violation, *_) = find_impossible_conditions(make_problem(scene, vkc.GoTo(-1.0, 0.0)))
     assert (violation.constraint, violation.subject, violation.waypoint) == (
         "start",
         "base_link – crate",
@@ -72,7 +72,7 @@ def test_links_of_several_shapes_are_listed_once() -> None:
     urdf = f'<robot name="wall"><link name="wall">{wall}</link></robot>'
     item = {"name": "wall", "type": {"urdf": urdf, "attachments": []}, "position": [0.4, 0.0, 0.0]}
     scene = vkc.Scene.from_document({**make_hall().document, "objects": [item]})
-    found = find_impossible_conditions(problem(scene, vkc.GoTo(-1.0, 0.0)))
+    found = find_impossible_conditions(make_problem(scene, vkc.GoTo(-1.0, 0.0)))
     subjects = [violation.subject for violation in found]
     assert "base_link – wall.wall" in subjects
     assert len(subjects) == len(set(subjects))
@@ -83,7 +83,7 @@ def test_attached_object_may_rest_on_another_at_the_start(gap: float) -> None:
     down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
     scene = make_room(describe_table(gap=gap)).with_start(base=down[:3], arm=down[3:])
     held = scene.with_held({"stick": "grip"})
-    assert find_impossible_conditions(problem(held, vkc.GoTo(0.0, 1.0))) == []
+    assert find_impossible_conditions(make_problem(held, vkc.GoTo(0.0, 1.0))) == []
 
 
 def test_robot_with_an_attached_object_may_not_start_inside_a_block() -> None:
@@ -93,12 +93,12 @@ def test_robot_with_an_attached_object_may_not_start_inside_a_block() -> None:
     start = (
         make_room(top, block).with_start(base=down[:3], arm=down[3:]).with_held({"stick": "grip"})
     )
-    found = find_impossible_conditions(problem(start, vkc.GoTo(0.0, 1.0)))
+    found = find_impossible_conditions(make_problem(start, vkc.GoTo(0.0, 1.0)))
     assert {violation.constraint for violation in found} == {"start"}
 
 
 def test_residual_of_an_unreachable_target_is_reported() -> None:
-    target = problem(make_hall(), vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0)))
+    target = make_problem(make_hall(), vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0)))
     (goal,) = diagnose_goals(target, 0)
     assert goal.text.startswith("reach with tool: out of reach")
     assert float(goal.text.split("the nearest stays ")[1].split()[0]) == pytest.approx(
@@ -110,7 +110,9 @@ def test_residual_of_an_unreachable_target_is_reported() -> None:
 
 
 def test_obstacles_of_all_goal_configurations_are_reported_by_phase() -> None:
-    two = problem(make_hall(obstacles=[CRATE]), vkc.GoTo(0.2, 0.0, 0.0), vkc.GoTo(1.5, 0.0, 0.0))
+    two = make_problem(
+        make_hall(obstacles=[CRATE]), vkc.GoTo(0.2, 0.0, 0.0), vkc.GoTo(1.5, 0.0, 0.0)
+    )
     assert diagnose_goal(two, 0, 0) is None
     (goal,) = diagnose_goals(two, 0)
     assert goal == diagnose_goal(two, 1, 0)
@@ -120,7 +122,7 @@ def test_obstacles_of_all_goal_configurations_are_reported_by_phase() -> None:
 
 def test_grasp_is_free_when_placing() -> None:
     """Under a shelf the object can be placed from the side only, with another grasp."""
-    below = problem(
+    below = make_problem(
         make_littered_scene(describe_shelf(*BELOW[:2])), vkc.Place("litter", BELOW, "grip")
     )
     assert [phase.kind for phase in below.task.phases] == ["grasp", "place"]
@@ -132,7 +134,7 @@ def test_tolerance_matches_the_solver(missing: float, free: bool) -> None:
     """The base is near a crate with a given shortfall [m]; the solver accepts 0.5 mm."""
     scene = make_hall(obstacles=[CRATE])
     front = 1.5 - 0.3 - 0.495
-    stop = problem(scene, vkc.GoTo(front - vkc.Options().dist_safe + missing, 0.0, 0.0))
+    stop = make_problem(scene, vkc.GoTo(front - vkc.Options().dist_safe + missing, 0.0, 0.0))
     found = diagnose_goal(stop, 0, 0)
     assert (found is None) == free
     if found is not None:

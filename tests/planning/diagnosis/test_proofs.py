@@ -21,7 +21,9 @@ from vkc_pin.planning.initialization.base_routes import collect_grid_shapes
 FAR = vkc.Reach((4.0, 0.0, 1.0, 0.0, np.pi / 2, 0.0))
 
 
-def box(name: str, size: Sequence[float], at: Sequence[float], yaw: float = 0.0) -> dict[str, Any]:
+def describe_box(
+    name: str, size: Sequence[float], at: Sequence[float], yaw: float = 0.0
+) -> dict[str, Any]:
     return {
         "name": name,
         "type": "box",
@@ -31,17 +33,17 @@ def box(name: str, size: Sequence[float], at: Sequence[float], yaw: float = 0.0)
     }
 
 
-FENCE = box("fence", (0.1, 12.0, 1.0), (1.2, 0.0, 0.5))
+FENCE = describe_box("fence", (0.1, 12.0, 1.0), (1.2, 0.0, 0.5))
 
 
-def problem(obstacles: Sequence[dict[str, Any]], *steps: Any) -> vkc.TrajectoryProblem:
+def make_problem(obstacles: Sequence[dict[str, Any]], *steps: Any) -> vkc.TrajectoryProblem:
     return make_program(make_hall(obstacles=obstacles), list(steps), options=SHORT)
 
 
-def gap(width: float) -> list[dict[str, Any]]:
+def describe_gap(width: float) -> list[dict[str, Any]]:
     length = 6.0 - width / 2
     return [
-        box(name, (0.1, length, 1.0), (1.2, side * (width + length) / 2, 0.5))
+        describe_box(name, (0.1, length, 1.0), (1.2, side * (width + length) / 2, 0.5))
         for name, side in (("left", 1), ("right", -1))
     ]
 
@@ -49,10 +51,10 @@ def gap(width: float) -> list[dict[str, Any]]:
 @pytest.mark.parametrize("step", [vkc.GoTo(3.0, 0.0), vkc.GoTo(3.0, 2.0, 1.0), FAR], ids=str)
 def test_closed_wall_separates_the_goal(step: Any) -> None:
     clutter = [
-        box("crate", (0.4, 0.4, 0.4), (0.0, 2.0, 0.2)),
-        box("shelf", (0.4, 2.0, 1.0), (5.0, 3.0, 0.5)),
+        describe_box("crate", (0.4, 0.4, 0.4), (0.0, 2.0, 0.2)),
+        describe_box("shelf", (0.4, 2.0, 1.0), (5.0, 3.0, 0.5)),
     ]
-    (line,) = find_proofs(problem([FENCE, *clutter], step))
+    (line,) = find_proofs(make_problem([FENCE, *clutter], step))
     assert "no path for the base, " + PROVEN in line
     assert line.endswith("cut off by fence")
 
@@ -61,16 +63,16 @@ def test_closed_wall_separates_the_goal(step: Any) -> None:
 def test_all_sides_of_a_ring_are_named(x: float) -> None:
     sides = {"north": (0, 1), "south": (0, -1), "east": (1, 0), "west": (-1, 0)}
     ring = [
-        box(name, (0.1 if u else 2.0, 0.1 if v else 2.0, 1.0), (x + u, v, 0.5))
+        describe_box(name, (0.1 if u else 2.0, 0.1 if v else 2.0, 1.0), (x + u, v, 0.5))
         for name, (u, v) in sides.items()
     ]
-    (line,) = find_proofs(problem(ring, vkc.GoTo(4.0, 0.0)))
+    (line,) = find_proofs(make_problem(ring, vkc.GoTo(4.0, 0.0)))
     assert line.endswith("cut off by north, south, east, west")
 
 
 @pytest.mark.parametrize("width", [0.3, 0.62, 0.68, 0.85])  # the base is 0.67 m wide
 def test_gap_too_narrow_for_the_base_is_proven(width: float) -> None:
-    lines = find_proofs(problem(gap(width), vkc.GoTo(3.0, 0.0)))
+    lines = find_proofs(make_problem(describe_gap(width), vkc.GoTo(3.0, 0.0)))
     assert bool(lines) == (width < 0.67)
     assert all(line.endswith("cut off by left, right") for line in lines)
 
@@ -79,24 +81,26 @@ def test_gap_too_narrow_for_the_base_is_proven(width: float) -> None:
     ("wall", "step"),
     [
         (
-            box("fence", (0.1, 12.0, 0.6), (1.2, 0.0, 0.3)),
+            describe_box("fence", (0.1, 12.0, 0.6), (1.2, 0.0, 0.3)),
             vkc.Reach((1.8, 0.0, 1.0, 0.0, np.pi / 2, 0.0)),
         ),
-        (box("beam", (0.1, 12.0, 0.3), (1.2, 0.0, 1.5)), vkc.GoTo(3.0, 0.0)),
+        (describe_box("beam", (0.1, 12.0, 0.3), (1.2, 0.0, 1.5)), vkc.GoTo(3.0, 0.0)),
     ],
     ids=["arm reaches across", "base passes under"],
 )
 def test_passable_wall_proves_nothing(wall: dict[str, Any], step: Any) -> None:
-    assert find_proofs(problem([wall], step)) == []
+    assert find_proofs(make_problem([wall], step)) == []
 
 
 @pytest.mark.parametrize("height", [0.42, 0.47])
 def test_wall_that_the_arm_mount_hits_is_proven(height: float) -> None:
     """The base passes under a shorter one at the arena's edge, with the mount beside it."""
-    longer, shorter = (box("beam", (0.1, y, 1.0), (1.2, 0.0, 0.5 + height)) for y in (13.0, 12.0))
-    (line,) = find_proofs(problem([longer], vkc.GoTo(3.0, 0.0)))
+    longer, shorter = (
+        describe_box("beam", (0.1, y, 1.0), (1.2, 0.0, 0.5 + height)) for y in (13.0, 12.0)
+    )
+    (line,) = find_proofs(make_problem([longer], vkc.GoTo(3.0, 0.0)))
     assert line.endswith("cut off by beam")
-    assert find_proofs(problem([shorter], vkc.GoTo(3.0, 0.0))) == []
+    assert find_proofs(make_problem([shorter], vkc.GoTo(3.0, 0.0))) == []
 
 
 @pytest.mark.parametrize(
@@ -117,16 +121,18 @@ def test_wall_that_the_arm_mount_hits_is_proven(height: float) -> None:
     ids=["blocked", "too high", "outside"],
 )
 def test_unreachable_goal_is_proven(step: Any, begin: str, end: str) -> None:
-    (line,) = find_proofs(problem([box("crate", (0.6, 0.6, 0.4), (1.5, 0.0, 0.2))], step))
+    (line,) = find_proofs(
+        make_problem([describe_box("crate", (0.6, 0.6, 0.4), (1.5, 0.0, 0.2))], step)
+    )
     assert line.startswith(begin)
     assert line.endswith(end)
 
 
 def test_failing_phase_is_named() -> None:
     steps = [vkc.GoTo(-1.0, 0.0), vkc.GoTo(3.0, 0.0)]
-    (line,) = find_proofs(problem([FENCE], *steps))
+    (line,) = find_proofs(make_problem([FENCE], *steps))
     assert line.startswith("go to: ")
-    assert find_proofs(problem([FENCE], steps[0])) == []
+    assert find_proofs(make_problem([FENCE], steps[0])) == []
 
 
 def test_closed_door_is_named_unless_opened() -> None:
@@ -149,11 +155,11 @@ def test_existing_path_disproves_nothing(seed: int) -> None:
     places = places[np.hypot(*places.T) > 1.5]
     sizes = rng.uniform(0.1, 1.6, (len(places), 2))
     obstacles = [
-        box(f"box_{k}", (*size, 1.0), (*at, 0.5), float(rng.uniform(-np.pi, np.pi)))
+        describe_box(f"box_{k}", (*size, 1.0), (*at, 0.5), float(rng.uniform(-np.pi, np.pi)))
         for k, (at, size) in enumerate(zip(places, sizes, strict=True))
     ]
     x, y = rng.uniform(-5.0, 5.0, 2).tolist()
-    own = problem(obstacles, vkc.GoTo(x, y))
+    own = make_problem(obstacles, vkc.GoTo(x, y))
     z = own.start.copy()
     z[:3] = 0.0
     moving, standing = collect_grid_shapes(own, 0, z)

@@ -27,14 +27,14 @@ DIRECTIONS = pytest.mark.parametrize("backwards", [False, True], ids=["forwards"
 
 
 @cache
-def problem(*, drives: bool = False, grasps: bool = False) -> vkc.TrajectoryProblem:
+def make_problem(*, drives: bool = False, grasps: bool = False) -> vkc.TrajectoryProblem:
     """Return the problem of opening or just grasping the door; drives: the base goes before."""
     steps = [vkc.Grasp("door")] if grasps else [OPEN]
     before, after = ([vkc.GoTo(-1.0, y)] if drives else [] for y in (0.0, 0.5))
     return make_program(load_door_scene(), [*before, *steps, *after], options=FEW)
 
 
-def beam(
+def make_search(
     p: vkc.TrajectoryProblem, seed: int = 0, *, for_narrow_passages: bool = False
 ) -> BeamSearch:
     sampler = KeyframeSampler(p, np.random.default_rng(seed))
@@ -42,8 +42,10 @@ def beam(
 
 
 @cache
-def search(*, drives: bool = False, thorough: bool = True, backwards: bool = False) -> SearchResult:
-    return beam(problem(drives=drives)).search(thorough=thorough, backwards=backwards)
+def run_search(
+    *, drives: bool = False, thorough: bool = True, backwards: bool = False
+) -> SearchResult:
+    return make_search(make_problem(drives=drives)).search(thorough=thorough, backwards=backwards)
 
 
 def compute_lengths(p: vkc.TrajectoryProblem, paths: np.ndarray) -> np.ndarray:
@@ -61,20 +63,20 @@ def test_keyframes_are_ordered_and_hold_the_handle(
     drives: bool, thorough: bool, backwards: bool
 ) -> None:
     p, found = (
-        problem(drives=drives),
-        search(drives=drives, thorough=thorough, backwards=backwards),
+        make_problem(drives=drives),
+        run_search(drives=drives, thorough=thorough, backwards=backwards),
     )
     assert found.waypoints[0] == 0
     assert np.all(np.diff(found.waypoints) > 0)
     assert set(p.ends.tolist()) <= set(found.waypoints), "every phase ends with a keyframe"
-    assert found.waypoints == search(drives=drives, thorough=not thorough).waypoints
+    assert found.waypoints == run_search(drives=drives, thorough=not thorough).waypoints
     assert found.paths.shape == (len(found.cost), len(found.waypoints), p.chain.size)
     np.testing.assert_array_equal(found.paths[:, 0], np.tile(p.start, (len(found.cost), 1)))
     rows = np.array(found.waypoints[1:]) - 1
     assert np.all(found.paths[:, 1:] >= p.lower[rows] - 1e-9)
     assert np.all(found.paths[:, 1:] <= p.upper[rows] + 1e-9)
     columns = hinge, knob = [p.chain.index(f"door.{name}") for name in ("hinge", "knob")]
-    motion = beam(p).sampler.object_motion[rows][:, columns]
+    motion = make_search(p).sampler.object_motion[rows][:, columns]
     np.testing.assert_allclose(
         found.paths[:, 1:, columns], np.tile(motion, (len(found.cost), 1, 1))
     )
@@ -89,7 +91,7 @@ def test_keyframes_are_ordered_and_hold_the_handle(
 @DIRECTIONS
 @pytest.mark.parametrize("drives", [False, True])
 def test_path_cost_is_length_plus_collisions(backwards: bool, drives: bool) -> None:
-    p, found = problem(drives=drives), search(drives=drives, backwards=backwards)
+    p, found = make_problem(drives=drives), run_search(drives=drives, backwards=backwards)
     lengths = compute_lengths(p, found.paths)
     np.testing.assert_allclose(found.cost, lengths + found.collision_cost, rtol=1e-9)
     count, expected = len(found.cost), np.zeros(len(found.cost))
@@ -119,8 +121,10 @@ def test_path_cost_with_routes_is_the_driving_distance() -> None:
 )
 def test_shortened_paths_cost_no_more_and_still_grasp(steps: list[vkc.Step], ratio: float) -> None:
     p = make_program(load_door_scene(), steps, options=FEW)
-    found = beam(p, 1, for_narrow_passages=True).search(thorough=False)  # which are not shortened
-    short = beam(p, 1).shorten(found)
+    found = make_search(p, 1, for_narrow_passages=True).search(
+        thorough=False
+    )  # which are not shortened
+    short = make_search(p, 1).shorten(found)
     assert (short.cost <= found.cost).all()
     assert (short.cost / found.cost).min() < ratio
     lengths = compute_lengths(p, short.paths)
@@ -139,7 +143,8 @@ def test_shortened_paths_cost_no_more_and_still_grasp(steps: list[vkc.Step], rat
 
 def test_paths_to_grasps_are_shortened_unless_passages_are_narrow() -> None:
     plain, narrow = (
-        beam(problem(grasps=True), 1, for_narrow_passages=each) for each in (False, True)
+        make_search(make_problem(grasps=True), 1, for_narrow_passages=each)
+        for each in (False, True)
     )
     found, sampled = plain.search(thorough=False), narrow.search(thorough=False)
     assert found.cost.min() < 1.02 * plain.shorten(found).cost.min()
@@ -147,7 +152,7 @@ def test_paths_to_grasps_are_shortened_unless_passages_are_narrow() -> None:
 
 
 def test_no_two_paths_end_at_similar_configurations() -> None:
-    ends = search().paths[:, -1]
+    ends = run_search().paths[:, -1]
     assert len(ends) > 5
     for k, end in enumerate(ends):
         distances = np.abs(ends[k + 1 :] - end).max(axis=1)
@@ -158,7 +163,9 @@ def test_diverse_headings_are_kept_on_request() -> None:
     """At most four of the 24 grasps have headings in the same eighth of the circle."""
     counts = []
     for keep_headings in (False, True):
-        found = beam(problem(grasps=True)).search(thorough=True, keep_headings=keep_headings)
+        found = make_search(make_problem(grasps=True)).search(
+            thorough=True, keep_headings=keep_headings
+        )
         sectors = np.floor(found.paths[:, -1, 2] / (np.pi / 4)).astype(int) % 8
         counts.append(np.bincount(sectors, minlength=8))
     assert counts[0].sum() == counts[1].sum() == 24
@@ -167,8 +174,8 @@ def test_diverse_headings_are_kept_on_request() -> None:
 
 @DIRECTIONS
 def test_search_is_deterministic(backwards: bool) -> None:
-    again = beam(problem()).search(thorough=True, backwards=backwards)
-    for values, same in zip(search(backwards=backwards), again, strict=True):
+    again = make_search(make_problem()).search(thorough=True, backwards=backwards)
+    for values, same in zip(run_search(backwards=backwards), again, strict=True):
         np.testing.assert_array_equal(values, same)
 
 
@@ -186,7 +193,7 @@ def test_rigid_grasp_is_chosen_before_the_object_moves(firm: bool) -> None:
     """A rigid grasp is searched forwards, a free one backwards."""
     p = grasp_with(firm=firm)
     assert bool(p.choices) == firm
-    one, other = (beam(p).search(thorough=True, backwards=each) for each in (False, True))
+    one, other = (make_search(p).search(thorough=True, backwards=each) for each in (False, True))
     assert np.array_equal(one.paths, other.paths) == firm
     for column, grasp, last in p.choices:
         closed = [k for k, waypoint in enumerate(one.waypoints) if grasp <= waypoint <= last]
@@ -199,14 +206,16 @@ def test_open_phases_at_the_end_are_searched_forwards() -> None:
     """A drive, and a task that ends with a free grasp."""
     scene = vkc.load_scene("init_1").sample_start(np.random.default_rng(0))
     for p in (make_wall_problem(1.6), make_program(scene, [vkc.Grasp("stick")])):
-        one, other = (beam(p).search(thorough=True, backwards=each) for each in (False, True))
+        one, other = (
+            make_search(p).search(thorough=True, backwards=each) for each in (False, True)
+        )
         np.testing.assert_array_equal(one.paths, other.paths)
         assert one.waypoints == other.waypoints == [0, p.segments]
 
 
 def make_result(jump: float, waypoint: int, *, collision_cost: float = 0.0) -> SearchResult:
     """Return two paths, the cheaper one with a jump of the base [m]."""
-    p, waypoints = problem(), search().waypoints
+    p, waypoints = make_problem(), run_search().waypoints
     paths = np.tile(p.start, (2, len(waypoints), 1))
     paths[1, waypoints.index(waypoint) :, 1] += jump
     paths[0, :, :2] += np.linspace(0.0, 50.0, len(waypoints))[:, None]
@@ -217,9 +226,9 @@ def make_result(jump: float, waypoint: int, *, collision_cost: float = 0.0) -> S
 @pytest.mark.parametrize("has_routes", [False, True])
 def test_grazes_are_acceptable_and_collisions_and_base_jumps_are_not(has_routes: bool) -> None:
     """Jumps are checked in closed phases, given routes."""
-    routes = BaseRoutes(problem()) if has_routes else None
-    own = BeamSearch(beam(problem()).sampler, routes)
-    reach, turn, move = problem().ends.tolist()
+    routes = BaseRoutes(make_problem()) if has_routes else None
+    own = BeamSearch(make_search(make_problem()).sampler, routes)
+    reach, turn, move = make_problem().ends.tolist()
     for collision_cost, expected in ((0.0, True), (59.0, True), (61.0, False)):
         result = make_result(0.0, reach, collision_cost=collision_cost)
         assert own.is_acceptable(result) == expected

@@ -28,7 +28,7 @@ def make_sampler(p: vkc.TrajectoryProblem, seed: int = 0) -> KeyframeSampler:
 
 
 @cache
-def free_door() -> tuple[vkc.TrajectoryProblem, np.ndarray, list[int], np.ndarray]:
+def make_free_door() -> tuple[vkc.TrajectoryProblem, np.ndarray, list[int], np.ndarray]:
     """Return the door problem, keyframes with their waypoints, and straight waypoints."""
     p = make_program(load_door_scene(), STEPS, options=FEW)
     sampler = make_sampler(p)
@@ -41,15 +41,15 @@ def free_door() -> tuple[vkc.TrajectoryProblem, np.ndarray, list[int], np.ndarra
 
 def find_phase() -> tuple[np.ndarray, np.ndarray]:
     """Return the keyframes and the straight waypoints of the phase."""
-    p, path, waypoints, z = free_door()
+    p, path, waypoints, z = make_free_door()
     begin, end = int(p.ends[MOVE - 1]), int(p.ends[MOVE])
     return path[[k for k, at in enumerate(waypoints) if begin <= at <= end]], z[begin:end]
 
 
 @cache
-def blocked() -> vkc.TrajectoryProblem:
+def make_blocked_door() -> vkc.TrajectoryProblem:
     """Return the same problem with a ball in the elbow's path."""
-    p, straight = free_door()[0], find_phase()[1]
+    p, straight = make_free_door()[0], find_phase()[1]
     _, places = p.chain.joint_placements(straight[len(straight) // 2][None])
     elbow = p.chain.model.getJointId(str(load_door_scene().robot.model.names[4]))
     position = places[0, elbow].round(4).tolist()
@@ -62,7 +62,7 @@ def blocked() -> vkc.TrajectoryProblem:
 
 def find_path(seed: int, *, tries: int = MAX_EXTENSIONS) -> np.ndarray | None:
     through, straight = find_phase()
-    sampler = make_sampler(blocked(), seed)
+    sampler = make_sampler(make_blocked_door(), seed)
     return find_constrained_path(sampler, MOVE, through, len(straight), tries)
 
 
@@ -79,12 +79,12 @@ def assert_holds_the_handle(p: vkc.TrajectoryProblem, rows: np.ndarray) -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_path_avoids_an_obstacle_and_holds_the_handle(seed: int) -> None:
-    p, (through, straight) = free_door()[0], find_phase()
-    assert compute_penetration(blocked(), straight) > 0.02
+    p, (through, straight) = make_free_door()[0], find_phase()
+    assert compute_penetration(make_blocked_door(), straight) > 0.02
     rows = find_path(seed)
     assert rows is not None
     assert rows.shape == straight.shape
-    assert compute_penetration(blocked(), rows) <= 5e-3  # waypoints are between nodes
+    assert compute_penetration(make_blocked_door(), rows) <= 5e-3  # waypoints are between nodes
     assert_holds_the_handle(p, rows)
     hinge = rows[:, p.chain.index("door.hinge")]
     assert hinge[-1] == pytest.approx(1.2)
@@ -99,7 +99,7 @@ def test_path_avoids_an_obstacle_and_holds_the_handle(seed: int) -> None:
 
 
 def test_next_phase_begins_where_the_constrained_path_ends() -> None:
-    p, (_, path, waypoints, _) = blocked(), free_door()
+    p, (_, path, waypoints, _) = make_blocked_door(), make_free_door()
     sampler = make_sampler(p)
     approach = ApproachPaths(sampler, keeps_base_fixed=True)
     paths = RrtPaths(sampler, BaseRoutes(p))
@@ -113,13 +113,13 @@ def test_next_phase_begins_where_the_constrained_path_ends() -> None:
 
 
 def test_free_phases_and_colliding_starts_are_not_obstructed() -> None:
-    p, (through, straight) = free_door()[0], find_phase()
+    p, (through, straight) = make_free_door()[0], find_phase()
     assert compute_penetration(p, straight) <= 0.0
     assert not is_obstructed(make_sampler(p), MOVE, through, straight)
-    assert is_obstructed(make_sampler(blocked()), MOVE, through, straight)
+    assert is_obstructed(make_sampler(make_blocked_door()), MOVE, through, straight)
     colliding = through.copy()
     colliding[0] = straight[len(straight) // 2]
-    assert not is_obstructed(make_sampler(blocked()), MOVE, colliding, straight)
+    assert not is_obstructed(make_sampler(make_blocked_door()), MOVE, colliding, straight)
 
 
 def test_extensions_and_budget_end_the_search() -> None:

@@ -23,7 +23,7 @@ ROBOT = 9  # x, y and yaw of the base, six joints of the arm
 
 
 @cache
-def door() -> tuple[vkc.TrajectoryProblem, np.ndarray, list[int]]:
+def make_door_problem() -> tuple[vkc.TrajectoryProblem, np.ndarray, list[int]]:
     """Return the door problem, collision-free keyframes, and their waypoints."""
     p = make_program(load_door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=FEW)
     found = BeamSearch(KeyframeSampler(p, np.random.default_rng(0))).search(thorough=True)
@@ -32,17 +32,17 @@ def door() -> tuple[vkc.TrajectoryProblem, np.ndarray, list[int]]:
     return p, found.paths[best], found.waypoints
 
 
-def interpolator(p: vkc.TrajectoryProblem, paths: Paths | None = None) -> Interpolator:
+def make_interpolator(p: vkc.TrajectoryProblem, paths: Paths | None = None) -> Interpolator:
     sampler = KeyframeSampler(p, np.random.default_rng(0))
     return Interpolator(sampler, ApproachPaths(sampler), paths)
 
 
-def rrt_paths(p: vkc.TrajectoryProblem, seed: int = 0) -> RrtPaths:
+def make_rrt_paths(p: vkc.TrajectoryProblem, seed: int = 0) -> RrtPaths:
     return RrtPaths(KeyframeSampler(p, np.random.default_rng(seed)), BaseRoutes(p))
 
 
 def assert_holds_the_handle(z: np.ndarray) -> None:
-    p, _, _ = door()
+    p, _, _ = make_door_problem()
     hinge, knob = (p.chain.index(f"door.{name}") for name in ("hinge", "knob"))
     for row in z[int(p.ends[0]) - 1 :]:
         assert compute_grasp_error(load_door_scene(), row, row[hinge], row[knob]) < 1e-3
@@ -50,9 +50,9 @@ def assert_holds_the_handle(z: np.ndarray) -> None:
 
 
 def test_guess_passes_keyframes_and_closes_the_chain() -> None:
-    p, keyframes, waypoints = door()
+    p, keyframes, waypoints = make_door_problem()
     given = keyframes.copy()
-    z = interpolator(p).interpolate(keyframes, waypoints)
+    z = make_interpolator(p).interpolate(keyframes, waypoints)
     assert z is not None
     np.testing.assert_array_equal(keyframes, given)
     assert np.all((z >= p.lower) & (z <= p.upper))
@@ -68,7 +68,7 @@ def test_guess_passes_keyframes_and_closes_the_chain() -> None:
 
 def test_straight_paths_start_and_end_at_rest() -> None:
     p = make_program(make_hall(), [vkc.GoTo(2.0, 1.0, 0.5)])
-    z = interpolator(p).interpolate(
+    z = make_interpolator(p).interpolate(
         np.array([p.start, make_waypoint(p, (2.0, 1.0, 0.5))]), [0, p.segments]
     )
     assert z is not None
@@ -77,9 +77,9 @@ def test_straight_paths_start_and_end_at_rest() -> None:
 
 
 def test_base_path_ends_where_the_approach_begins() -> None:
-    p, keyframes, waypoints = door()
+    p, keyframes, waypoints = make_door_problem()
     routes = BaseRoutes(p)
-    z = interpolator(p, AStarPaths(routes)).interpolate(keyframes, waypoints)
+    z = make_interpolator(p, AStarPaths(routes)).interpolate(keyframes, waypoints)
     assert z is not None
     steps = int(p.ends[0]) - FEW.steps(FEW.approach_time)
     grasp = keyframes[waypoints.index(int(p.ends[0]))]
@@ -95,11 +95,11 @@ def test_base_path_ends_where_the_approach_begins() -> None:
 @pytest.mark.parametrize("turns", [-1, 2])
 def test_later_headings_continue_where_the_base_path_ends(turns: int) -> None:
     """Keyframes may be full turns off."""
-    p, keyframes, waypoints = door()
+    p, keyframes, waypoints = make_door_problem()
     wound = keyframes.copy()
     wound[1:, 2] += turns * 2 * np.pi
     plain, other = (
-        interpolator(p, AStarPaths(BaseRoutes(p))).interpolate(each, waypoints)
+        make_interpolator(p, AStarPaths(BaseRoutes(p))).interpolate(each, waypoints)
         for each in (keyframes, wound)
     )
     assert plain is not None
@@ -128,7 +128,9 @@ def test_astar_paths_move_the_arm_straight() -> None:
     p = make_wall_problem(1.6)
     routes, end = BaseRoutes(p), make_waypoint(p, (4.0, 1.5, 0.0))
     end[3:] += 0.2
-    z = interpolator(p, AStarPaths(routes)).interpolate(np.array([p.start, end]), [0, p.segments])
+    z = make_interpolator(p, AStarPaths(routes)).interpolate(
+        np.array([p.start, end]), [0, p.segments]
+    )
     expected = routes.find_path(0, p.start[:3], end[:3], p.segments)
     assert z is not None
     assert expected is not None
@@ -141,7 +143,7 @@ def test_missing_paths_are_noted_once_per_phase() -> None:
     p = make_program(
         make_wall_problem(0.0).scene, [vkc.GoTo(1.0, 1.0, 0.5), vkc.GoTo(4.0, 1.0, 0.5)]
     )
-    join = interpolator(p, AStarPaths(BaseRoutes(p)))
+    join = make_interpolator(p, AStarPaths(BaseRoutes(p)))
     for x in (1.0, 0.9):
         keyframes = np.array(
             [p.start, make_waypoint(p, (x, 1.0, 0.5)), make_waypoint(p, (4.0, 1.0, 0.5))]
@@ -153,9 +155,11 @@ def test_missing_paths_are_noted_once_per_phase() -> None:
 def test_rrt_paths_lead_through_a_narrow_gate() -> None:
     p = make_gate_problem(NARROW)
     ends, violations = np.array([p.start, make_waypoint(p, GOAL)]), []
-    assert interpolator(p, AStarPaths(BaseRoutes(p))).interpolate(ends, [0, p.segments]) is None
-    for paths in (None, rrt_paths(p)):
-        z = interpolator(p, paths).interpolate(ends, [0, p.segments])
+    assert (
+        make_interpolator(p, AStarPaths(BaseRoutes(p))).interpolate(ends, [0, p.segments]) is None
+    )
+    for paths in (None, make_rrt_paths(p)):
+        z = make_interpolator(p, paths).interpolate(ends, [0, p.segments])
         assert z is not None
         np.testing.assert_allclose(z[-1, :3], GOAL, atol=1e-9)
         violations.append(p.evaluate_contacts(z, reach=0.1).compute_violation())
@@ -167,7 +171,7 @@ def test_next_phase_begins_where_the_arm_ended() -> None:
     """The arm is folded in the gate and has no goal, so it may stay folded."""
     p = make_program(make_gate_problem(NARROW).scene, [vkc.GoTo(*GOAL), vkc.GoTo(4.5, 0.5, 0.0)])
     keyframes = np.array([p.start, make_waypoint(p, GOAL), make_waypoint(p, (4.5, 0.5, 0.0))])
-    z = interpolator(p, rrt_paths(p)).interpolate(keyframes, [0, *p.ends.tolist()])
+    z = make_interpolator(p, make_rrt_paths(p)).interpolate(keyframes, [0, *p.ends.tolist()])
     assert z is not None
     assert np.abs(np.diff(p.waypoints(z), axis=0)).max() < 1.0
     assert p.evaluate_contacts(z, reach=0.1).compute_violation() < p.options.dist_safe + 0.02
@@ -175,7 +179,7 @@ def test_next_phase_begins_where_the_arm_ended() -> None:
 
 def test_rrt_paths_end_at_the_required_arm() -> None:
     p = make_gate_problem(NARROW)
-    end, paths = make_waypoint(p, GOAL), rrt_paths(p)
+    end, paths = make_waypoint(p, GOAL), make_rrt_paths(p)
     end[2] += 2 * np.pi
     end[4] += 0.1
     for reaches in (True, False):
@@ -194,7 +198,7 @@ def test_rrt_paths_turn_as_far_as_the_goal_requires(yaw: float) -> None:
     """The base cannot turn inside the gate."""
     p = make_gate_problem(NARROW)
     end = make_waypoint(p, (*GOAL[:2], yaw))
-    path = rrt_paths(p).find_path(0, p.start, end, 60, turns=False, reaches=True)
+    path = make_rrt_paths(p).find_path(0, p.start, end, 60, turns=False, reaches=True)
     assert path is not None
     np.testing.assert_allclose(path[-1], end, atol=1e-9)
     z = np.tile(p.start, (60, 1))
@@ -209,7 +213,7 @@ def test_searches_get_shorter_after_failures() -> None:
     p = make_gate_problem(NARROW)
     scene = make_hall(base="fixed", obstacles=p.scene.document["obstacles"])
     p = make_program(scene, [vkc.Reach((0.5, 0.4, 1.0, 0.0, np.pi / 2, 0.0))] * 2)
-    end, paths, used = p.start.copy(), rrt_paths(p), list[int]()
+    end, paths, used = p.start.copy(), make_rrt_paths(p), list[int]()
     end[3:ROBOT] = 0.0, 1.2, 0.0, 0.0, 0.0, 0.0  # through the floor
     for phase in (0, 0, 0, 1):
         with Budget().activate() as budget:

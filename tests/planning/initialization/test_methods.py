@@ -29,22 +29,22 @@ OPENED = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 
 
 @cache
-def problem() -> vkc.TrajectoryProblem:
+def make_problem() -> vkc.TrajectoryProblem:
     return make_program(load_door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=OPENED)
 
 
 @cache
-def guesses(method: str, seed: int = 0, count: int = 3) -> list[InitialGuess]:
-    return list(initialize(problem(), method, seed, count=count))
+def make_guesses(method: str, seed: int = 0, count: int = 3) -> list[InitialGuess]:
+    return list(initialize(make_problem(), method, seed, count=count))
 
 
 @pytest.mark.parametrize("method", INITIALIZATIONS)
 def test_guesses_are_within_bounds_and_numbered(method: str) -> None:
-    found = guesses(method)
+    found = make_guesses(method)
     assert found
     for guess in found:
-        assert guess.z.shape == (problem().segments, problem().chain.size)
-        assert np.all((guess.z >= problem().lower) & (guess.z <= problem().upper))
+        assert guess.z.shape == (make_problem().segments, make_problem().chain.size)
+        assert np.all((guess.z >= make_problem().lower) & (guess.z <= make_problem().upper))
     if method != "auto":
         names = [method, *(f"{method} {number}" for number in range(2, len(found) + 1))]
         assert [guess.name for guess in found] == names
@@ -55,11 +55,11 @@ def test_guesses_are_within_bounds_and_numbered(method: str) -> None:
 
 @pytest.mark.parametrize(("method", "seed"), [("interpolated", 0), ("interpolated", 1), ("rrt", 0)])
 def test_guesses_hold_the_handle(method: str, seed: int) -> None:
-    hinge, knob = (problem().chain.index(f"door.{name}") for name in ("hinge", "knob"))
-    for guess in guesses(method, seed):
-        for row in guess.z[problem().ends[0] - 1 :]:
+    hinge, knob = (make_problem().chain.index(f"door.{name}") for name in ("hinge", "knob"))
+    for guess in make_guesses(method, seed):
+        for row in guess.z[make_problem().ends[0] - 1 :]:
             assert compute_grasp_error(load_door_scene(), row, row[hinge], row[knob]) < 1e-3
-        assert problem().pose_error(guess.z) < 1e-3
+        assert make_problem().pose_error(guess.z) < 1e-3
 
 
 @pytest.mark.parametrize(
@@ -90,16 +90,16 @@ def test_wheeled_bases_can_drive_their_guesses(
 
 
 def test_guess_opens_the_door_after_a_straight_approach() -> None:
-    z = guesses("interpolated")[0].z
-    hinge, knob = (z[:, problem().chain.index(name)] for name in ("door.hinge", "door.knob"))
-    reach, turn, _ = problem().ends
+    z = make_guesses("interpolated")[0].z
+    hinge, knob = (z[:, make_problem().chain.index(name)] for name in ("door.hinge", "door.knob"))
+    reach, turn, _ = make_problem().ends
     assert np.all(hinge[:turn] == 0.0)
     assert np.all(knob[:reach] == 0.0)
     assert hinge[-1] == pytest.approx(1.2)
     assert np.all(np.diff(hinge) >= 0.0)
     assert np.all(knob[turn - 1 :] >= 0.5)
-    path = problem().waypoints(z)
-    np.testing.assert_array_equal(path[0], problem().start)
+    path = make_problem().waypoints(z)
+    np.testing.assert_array_equal(path[0], make_problem().start)
     before = int(reach) - OPENED.steps(OPENED.approach_time)
     low, high = np.minimum(path[0], path[before]), np.maximum(path[0], path[before])
     assert np.all((path[: before + 1] >= low - 1e-9) & (path[: before + 1] <= high + 1e-9))
@@ -114,29 +114,29 @@ def test_guess_opens_the_door_after_a_straight_approach() -> None:
 
 
 def test_equal_random_seeds_give_equal_guesses_and_several_differ() -> None:
-    found = guesses("interpolated")
-    again = list(initialize(problem(), "interpolated", 0, count=3))
+    found = make_guesses("interpolated")
+    again = list(initialize(make_problem(), "interpolated", 0, count=3))
     assert 2 <= len(found) == len(again)
     for guess, same in zip(found, again, strict=True):
         np.testing.assert_array_equal(guess.z, same.z)
     for guess, other in itertools.combinations(found, 2):
         assert np.abs(guess.z - other.z)[:, :3].max() > OPENED.dist_safe
-    assert not np.array_equal(guesses("interpolated", 1)[0].z, found[0].z)
+    assert not np.array_equal(make_guesses("interpolated", 1)[0].z, found[0].z)
 
 
 def test_stationary_guesses_move_the_base_straight_or_not_at_all() -> None:
-    still, *others = (guess.z for guess in guesses("stationary"))
+    still, *others = (guess.z for guess in make_guesses("stationary"))
     assert len(others) == 4
     for number, other in enumerate(others):
         np.testing.assert_array_equal(other[:, 3:], still[:, 3:])
         assert all(np.abs(other - one)[:, :3].max() > 0.1 for one in [still, *others[:number]])
-        bases = problem().waypoints(other)[:, :3]
-        for begin, end in itertools.pairwise([0, *problem().ends]):
+        bases = make_problem().waypoints(other)[:, :3]
+        for begin, end in itertools.pairwise([0, *make_problem().ends]):
             np.testing.assert_allclose(np.diff(bases[begin : end + 1], 2, axis=0), 0.0, atol=1e-12)
-    np.testing.assert_array_equal(still[:, :9], np.tile(problem().start[:9], (len(still), 1)))
-    hinge = still[:, problem().chain.index("door.hinge")]
+    np.testing.assert_array_equal(still[:, :9], np.tile(make_problem().start[:9], (len(still), 1)))
+    hinge = still[:, make_problem().chain.index("door.hinge")]
     assert hinge[-1] == pytest.approx(1.2)
-    assert hinge[problem().ends[1] - 1] == 0.0
+    assert hinge[make_problem().ends[1] - 1] == 0.0
 
 
 def test_base_of_stationary_guesses_moves_to_places_of_little_merit() -> None:
@@ -302,9 +302,9 @@ def test_rrt_has_no_guess_if_there_is_no_path() -> None:
 
 @pytest.mark.parametrize(("method", "is_fixed"), [("astar", False), ("rrt", True)])
 def test_rrt_keeps_the_base_fixed_during_the_approach(method: str, is_fixed: bool) -> None:
-    reach = int(problem().ends[0])
+    reach = int(make_problem().ends[0])
     begin = reach - OPENED.steps(OPENED.approach_time) - 1
-    approach = guesses(method)[0].z[begin:reach, :3]
+    approach = make_guesses(method)[0].z[begin:reach, :3]
     assert (np.ptp(approach, axis=0).max() < 1e-4) == is_fixed
 
 

@@ -31,7 +31,7 @@ HIDDEN = 0.02
 
 
 @cache
-def gate() -> tuple[vkc.TrajectoryProblem, np.ndarray, np.ndarray]:
+def make_folding_problem() -> tuple[vkc.TrajectoryProblem, np.ndarray, np.ndarray]:
     """Return a problem that needs a folded arm, a guide path, and postures."""
     problem = make_gate_problem(TIGHT)
     routes = BaseRoutes(problem)
@@ -44,7 +44,7 @@ def find_path(
     seed: int, ends: np.ndarray | None = None, *, tries: int = MAX_EXTENSIONS
 ) -> np.ndarray | None:
     """Find a path through the gate."""
-    problem, guide, arms = gate()
+    problem, guide, arms = make_folding_problem()
     ends = make_waypoint(problem, GOAL)[None] if ends is None else ends
     rng = np.random.default_rng(seed)
     return connect(
@@ -69,7 +69,7 @@ def connect_directly(
     )
 
 
-def length(path: np.ndarray) -> float:
+def compute_length(path: np.ndarray) -> float:
     return float(np.linalg.norm(np.diff(path, axis=0) * METRIC, axis=1).sum())
 
 
@@ -82,14 +82,14 @@ def refine(path: np.ndarray, spacing: float = 0.02) -> np.ndarray:
     return np.vstack(rows)
 
 
-def shortfall(problem: vkc.TrajectoryProblem, rows: np.ndarray) -> np.ndarray:
+def compute_shortfall(problem: vkc.TrajectoryProblem, rows: np.ndarray) -> np.ndarray:
     z = np.tile(problem.start, (len(rows), 1))
     z[:, : rows.shape[1]] = rows
     return problem.contacts.evaluate(z, np.ones(len(z), int), reach=0.1).compute_shortfall(len(z))
 
 
 def assert_free(problem: vkc.TrajectoryProblem, path: np.ndarray) -> None:
-    short, allowed = shortfall(problem, refine(path)), problem.options.dist_safe
+    short, allowed = compute_shortfall(problem, refine(path)), problem.options.dist_safe
     assert short.max() <= allowed + HIDDEN
     assert np.mean(short > allowed + 1e-6) < 0.1
     limits = np.array([problem.limits(name) for name in problem.chain.names[: path.shape[1]]])
@@ -99,9 +99,9 @@ def assert_free(problem: vkc.TrajectoryProblem, path: np.ndarray) -> None:
 @settings(max_examples=5, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_path_leads_through_the_gate_with_the_arm_folded(seed: int) -> None:
-    problem, _, _ = gate()
+    problem, _, _ = make_folding_problem()
     straight = np.array([problem.start, make_waypoint(problem, GOAL)])
-    assert shortfall(problem, refine(straight)).max() > 0.1
+    assert compute_shortfall(problem, refine(straight)).max() > 0.1
     path = find_path(seed)
     assert path is not None
     np.testing.assert_array_equal(path[[0, -1]], straight)
@@ -110,12 +110,12 @@ def test_path_leads_through_the_gate_with_the_arm_folded(seed: int) -> None:
     inside = np.abs(rows[:, 0] + 0.3 - 2.0) < 0.1  # the arm at home is 0.2 to 0.45 m ahead
     assert np.abs(rows[inside, 3:] - problem.start[3:]).max(axis=1).min() > 0.2
     # Shortcuts remove most of what the arm does besides folding and unfolding.
-    folding = np.abs(gate()[2][1] - problem.start[3:]).sum()
+    folding = np.abs(make_folding_problem()[2][1] - problem.start[3:]).sum()
     assert np.abs(np.diff(path[:, 3:], axis=0)).sum() < 5.0 * folding
 
 
 def test_path_ends_at_a_reachable_end() -> None:
-    problem, _, arms = gate()
+    problem, _, arms = make_folding_problem()
     ends = np.tile(make_waypoint(problem, (2.0, 1.5, 0.0)), (4, 1))  # in the wall
     ends[1:3, :3], ends[1:3, 3:] = GOAL, arms
     path = find_path(0, ends)
@@ -132,20 +132,20 @@ def test_walled_in_goal_has_no_path(pose: tuple[float, float, float]) -> None:
 
 def test_least_violating_end_is_tried() -> None:
     """A goal slightly within the margin is reached; one in the wall is not."""
-    problem, _, arms = gate()
+    problem, _, arms = make_folding_problem()
     end = np.array([*make_waypoint(problem, (1.895 - 0.49, 1.5, np.pi / 2))[:3], *arms[1]])
     allowed = problem.options.dist_safe
     towards = np.tile(end, (241, 1))
     towards[:, 0] += np.linspace(-0.3, 0.3, 241)
-    short = shortfall(problem, towards)
+    short = compute_shortfall(problem, towards)
     near = towards[int(np.argmax(short > allowed))]
-    assert allowed < shortfall(problem, near[None])[0] < allowed + 3e-3
+    assert allowed < compute_shortfall(problem, near[None])[0] < allowed + 3e-3
     poses = np.array([problem.start[:3], near[:3]])
     ends, rng = np.array([towards[-1], near]), np.random.default_rng(0)
     path = connect(problem, 0, problem.start, ends, poses=poses, arms=arms, rng=rng)
     assert path is not None
     np.testing.assert_array_equal(path[[0, -1]], [problem.start, near])
-    assert shortfall(problem, refine(path)).max() <= allowed + HIDDEN
+    assert compute_shortfall(problem, refine(path)).max() <= allowed + HIDDEN
 
 
 def test_free_path_is_straight() -> None:
@@ -155,7 +155,9 @@ def test_free_path_is_straight() -> None:
     path = connect_directly(problem, problem.start, end, tries=1)
     assert path is not None
     np.testing.assert_array_equal(path[[0, -1]], [problem.start, end])
-    assert length(path) == pytest.approx(length(np.array([problem.start, end])), rel=1e-9)
+    assert compute_length(path) == pytest.approx(
+        compute_length(np.array([problem.start, end])), rel=1e-9
+    )
     path = connect_directly(problem, problem.start, problem.start)
     assert path is not None
     rows = np.vstack([path, resample_path(path, 5, problem.chain.metric[: path.shape[1]])])
@@ -175,8 +177,8 @@ def test_arm_on_a_fixed_base_avoids_a_pole() -> None:
     first, last = problem.start.copy(), problem.start.copy()
     first[3:6], last[3:6] = (0.57, -1.2, -1.2), (2.57, -1.2, -1.2)
     straight = np.array([first, last])
-    assert shortfall(problem, straight).max() == 0.0
-    assert shortfall(problem, refine(straight)).max() > 0.05
+    assert compute_shortfall(problem, straight).max() == 0.0
+    assert compute_shortfall(problem, refine(straight)).max() > 0.05
     path = connect_directly(problem, first, last, tries=MAX_EXTENSIONS)
     assert path is not None
     np.testing.assert_array_equal(path[[0, -1]], straight)
@@ -194,7 +196,7 @@ def test_equal_random_seeds_give_equal_paths() -> None:
 
 def test_free_sections_of_the_guide_join_trees_as_a_whole() -> None:
     """Single samples need many more extensions."""
-    problem, guide, arms = gate()
+    problem, guide, arms = make_folding_problem()
     assert all(find_path(seed, tries=60) is not None for seed in range(3))
     rng, ends = np.random.default_rng(0), make_waypoint(problem, GOAL)[None]
     sparse = guide[[0, -1]]
@@ -240,7 +242,7 @@ PATHS = st.integers(1, 6).flatmap(
 def walk(path: np.ndarray, distance: float) -> np.ndarray:
     """Return the point after a given length of a path [rad]."""
     for a, b in itertools.pairwise(path):
-        piece = length(np.array([a, b]))
+        piece = compute_length(np.array([a, b]))
         if distance <= piece:
             return np.asarray(a + (distance / piece if piece > 0.0 else 0.0) * (b - a))
         distance -= piece
@@ -254,12 +256,12 @@ def test_resampled_path_is_slow_at_both_ends(path: np.ndarray, steps: int) -> No
     assert rows.shape == (steps, SIZE)
     np.testing.assert_allclose(rows[-1], path[-1], rtol=0.0, atol=1e-9)
     share = np.arange(1, steps + 1) / steps
-    passed = length(path) * (3 * share**2 - 2 * share**3)
+    passed = compute_length(path) * (3 * share**2 - 2 * share**3)
     np.testing.assert_allclose(rows, [walk(path, s) for s in passed], rtol=0.0, atol=1e-5)
 
 
 def test_line_checker_rejects_invalid_arguments() -> None:
-    problem, _, _ = gate()
+    problem, _, _ = make_folding_problem()
     how = {"weights": METRIC, "step": 0.1, "reach": 0.0, "allowed": 0.0}
     for z, changed, error, text in (
         (problem.start, {"weights": np.ones(40)}, ValueError, "more coordinates move"),

@@ -22,7 +22,7 @@ def make() -> ca.Function:
 FUNCTION = make()
 
 
-def one_by_one(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def evaluate_one_by_one(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     found = [FUNCTION(a, b) for a, b in zip(x, np.broadcast_to(y, (len(x), 2)), strict=True)]
     return np.array([np.asarray(m).ravel(order="F") for m, _ in found]), np.array(
         [np.asarray(s).ravel() for _, s in found]
@@ -36,7 +36,9 @@ def test_batch_evaluation_equals_single_evaluations() -> None:
         x, y = rng.normal(size=(batch, 3)), rng.normal(size=(batch, 2))
         integers = np.arange(6 * batch)[::-1].reshape(batch, 6)[:, ::2] % 7
         for inputs in ((x, y), (x, y[0]), (integers, np.asfortranarray(y))):
-            for found, expected in zip(function(*inputs), one_by_one(*inputs), strict=True):
+            for found, expected in zip(
+                function(*inputs), evaluate_one_by_one(*inputs), strict=True
+            ):
                 np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12)
 
 

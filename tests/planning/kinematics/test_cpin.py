@@ -22,7 +22,7 @@ TOLERANCE = 1e-12
 AXIS = np.array([0.36, -0.48, 0.8])
 
 
-def composite() -> pin.JointModelComposite:
+def make_composite() -> pin.JointModelComposite:
     """Return a joint made of three others, one of them continuous."""
     joint = pin.JointModelComposite(pin.JointModelRX())
     joint.addJoint(pin.JointModelPY(), pin.SE3.Random())
@@ -30,7 +30,7 @@ def composite() -> pin.JointModelComposite:
     return joint
 
 
-def unbounded_unaligned() -> pin.JointModel:
+def make_unbounded_unaligned() -> pin.JointModel:
     """Return a continuous joint about a slanted axis, as loaded from a URDF."""
     axis = f'<parent link="a"/><child link="b"/><axis xyz="{" ".join(map(str, AXIS))}"/>'
     joint = f'<joint name="j" type="continuous">{axis}</joint>'
@@ -44,10 +44,10 @@ JOINTS: dict[str, Callable[[], object]] = {
     "revolute_z": pin.JointModelRZ,
     "revolute_unaligned": lambda: pin.JointModelRevoluteUnaligned(AXIS),
     "unbounded_x": pin.JointModelRUBX,
-    "unbounded_unaligned": unbounded_unaligned,
+    "unbounded_unaligned": make_unbounded_unaligned,
     "prismatic_y": pin.JointModelPY,
     "prismatic_unaligned": lambda: pin.JointModelPrismaticUnaligned(AXIS),
-    "composite": composite,
+    "composite": make_composite,
     "spherical": pin.JointModelSpherical,
     "spherical_zyx": pin.JointModelSphericalZYX,
     "translation": pin.JointModelTranslation,
@@ -60,7 +60,7 @@ MINIMAL = [
 ]
 
 
-def tree(*kinds: str) -> pin.Model:
+def make_tree(*kinds: str) -> pin.Model:
     """Return a model with a chain of one joint of each kind, each with a body and a fixed frame."""
     pin.seed(7)
     model, parent = pin.Model(), 0
@@ -81,46 +81,46 @@ def tree(*kinds: str) -> pin.Model:
     return model
 
 
-def configurations(model: pin.Model, count: int = 5) -> Iterator[np.ndarray]:
+def sample_configurations(model: pin.Model, count: int = 5) -> Iterator[np.ndarray]:
     pin.seed(3)
     bound = 2.0 * np.ones(model.nq)
     for _ in range(count):
         yield pin.randomConfiguration(model, -bound, bound)
 
 
-def stacked(placements: list[pin.SE3]) -> np.ndarray:
+def stack(placements: list[pin.SE3]) -> np.ndarray:
     return np.array(
         [np.concatenate([m.rotation.T.ravel(), m.translation]) for m in placements]
     ).T.reshape(12, len(placements))
 
 
-def numeric_placements(model: pin.Model, q: np.ndarray) -> np.ndarray:
+def compute_placements(model: pin.Model, q: np.ndarray) -> np.ndarray:
     data = model.createData()
     pin.forwardKinematics(model, data, q)
-    return stacked([data.oMi[i] for i in range(1, model.njoints)])
+    return stack([data.oMi[i] for i in range(1, model.njoints)])
 
 
 @pytest.fixture(scope="module")
 def arm() -> pin.Model:
     """Every joint type with minimal coordinates in one chain."""
-    return tree(*MINIMAL)
+    return make_tree(*MINIMAL)
 
 
 @pytest.mark.parametrize("kind", JOINTS)
 def test_kinematics_and_dynamics_equal_numeric_pinocchio(kind: str) -> None:
-    model = tree(*dict.fromkeys(("planar", kind, "revolute_unaligned")))
+    model = make_tree(*dict.fromkeys(("planar", kind, "revolute_unaligned")))
     data = model.createData()
     frames = [frame.name for frame in model.frames]
     joints, tips = cpin.joint_placements(model), cpin.frame_placements(model, frames)
     torque, com = cpin.rnea(model), cpin.center_of_mass(model)
     random = np.random.default_rng(1)
-    for q in configurations(model):
+    for q in sample_configurations(model):
         v, a = random.normal(size=(2, model.nv))
         pin.framesForwardKinematics(model, data, q)
         np.testing.assert_allclose(
-            joints(q).full(), numeric_placements(model, q), atol=TOLERANCE, rtol=0
+            joints(q).full(), compute_placements(model, q), atol=TOLERANCE, rtol=0
         )
-        np.testing.assert_allclose(tips(q).full(), stacked(list(data.oMf)), atol=TOLERANCE, rtol=0)
+        np.testing.assert_allclose(tips(q).full(), stack(list(data.oMf)), atol=TOLERANCE, rtol=0)
         expected = pin.rnea(model, data, q, v, a)
         np.testing.assert_allclose(
             torque(q, v, a).full().ravel(), expected, atol=TOLERANCE, rtol=TOLERANCE
@@ -132,12 +132,12 @@ def test_kinematics_and_dynamics_equal_numeric_pinocchio(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", JOINTS)
 def test_frame_jacobian_equals_numeric_pinocchio(kind: str) -> None:
-    model = tree(*dict.fromkeys(("planar", kind)))
+    model = make_tree(*dict.fromkeys(("planar", kind)))
     frame, data = model.getFrameId(f"{kind}_tip"), model.createData()
     for reference in ("local_world_aligned", "local", "world"):
         jacobian = cpin.frame_jacobian(model, f"{kind}_tip", reference)
         axes = getattr(pin, reference.upper())
-        for q in configurations(model, 2):
+        for q in sample_configurations(model, 2):
             expected = pin.computeFrameJacobian(model, data, q, frame, axes)
             np.testing.assert_allclose(jacobian(q).full(), expected, atol=TOLERANCE, rtol=0)
 
@@ -152,7 +152,7 @@ def test_derivatives_equal_differences_of_numeric_pinocchio(arm: pin.Model) -> N
     point = random.normal(size=n)
 
     def numeric(at: np.ndarray) -> float:
-        return float(np.sum(weights * numeric_placements(arm, coordinates.q(at))))
+        return float(np.sum(weights * compute_placements(arm, coordinates.q(at))))
 
     hessian, gradient = (part.full().squeeze() for part in derivatives(point))
     for direction in random.normal(size=(20, n)):
@@ -165,7 +165,7 @@ def test_derivatives_equal_differences_of_numeric_pinocchio(arm: pin.Model) -> N
 
 
 def test_dynamics_derivatives_equal_numeric_pinocchio() -> None:
-    model = tree(
+    model = make_tree(
         "revolute_x", "prismatic_unaligned", "revolute_unaligned", "prismatic_y", "revolute_z"
     )
     data, random = model.createData(), np.random.default_rng(5)
@@ -206,7 +206,7 @@ def test_rounded_quarter_turns_add_no_instructions() -> None:
             )
         counts.append(cpin.joint_placements(model).n_instructions())
     assert counts[0] == counts[1]
-    planar = tree("planar")
+    planar = make_tree("planar")
     planar.jointPlacements[1].setIdentity()
     assert cpin.joint_placements(planar).nnz_out() == 7  # c, s, -s, c, 1, x, y
 
@@ -224,7 +224,7 @@ def test_model_is_not_modified(arm: pin.Model) -> None:
 
 
 def test_frames_by_index_and_single_name(arm: pin.Model) -> None:
-    q, index = next(configurations(arm)), arm.getFrameId("revolute_x_tip")
+    q, index = next(sample_configurations(arm)), arm.getFrameId("revolute_x_tip")
     by_name, by_index = (
         cpin.frame_placements(arm, "revolute_x_tip"),
         cpin.frame_placements(arm, [index]),
@@ -291,7 +291,7 @@ def test_backend_is_upstreams_where_it_can_be_imported(monkeypatch: pytest.Monke
     reason="this pinocchio has no casadi binding",
 )
 def test_upstream_equals_compiled(arm: pin.Model) -> None:
-    q, (v, a) = next(configurations(arm)), np.random.default_rng(6).normal(size=(2, arm.nv))
+    q, (v, a) = next(sample_configurations(arm)), np.random.default_rng(6).normal(size=(2, arm.nv))
     frame = arm.getFrameId("planar_tip")
     for name, arguments, inputs in (
         ("joint_placements", (), (q,)),

@@ -28,11 +28,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Libraries:
 A, B, C, D, E = (digit * 40 for digit in "abcde")
 
 
-def names(folder: Libraries) -> list[str]:
+def list_names(folder: Libraries) -> list[str]:
     return sorted(path.name for path in folder.path.iterdir())
 
 
-def tree(folder: Path) -> dict[str, bytes | None]:
+def read_tree(folder: Path) -> dict[str, bytes | None]:
     """Return every path below a folder, with the contents of files."""
     return {
         str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
@@ -40,7 +40,7 @@ def tree(folder: Path) -> dict[str, bytes | None]:
     }
 
 
-def age(path: Path, seconds: float) -> None:
+def make_older(path: Path, seconds: float) -> None:
     os.utime(path, (time.time() - seconds,) * 2)
 
 
@@ -100,7 +100,7 @@ def test_published_libraries_are_found(folder: Libraries) -> None:
     path = folder.find(A)
     assert path is not None
     assert path.read_bytes().startswith(LIBRARY)
-    assert names(folder) == [f"{A}.so"]
+    assert list_names(folder) == [f"{A}.so"]
     assert path.stat().st_mode & 0o777 == 0o600
 
 
@@ -112,7 +112,7 @@ def test_damaged_library_is_removed(folder: Libraries, size: int | None) -> None
     data = path.read_bytes()
     path.write_bytes(bytes([data[0] ^ 1]) + data[1:] if size is None else data[:size])
     assert folder.find(A) is None
-    assert names(folder) == []
+    assert list_names(folder) == []
 
 
 def test_files_that_others_could_write_are_not_used(
@@ -146,9 +146,9 @@ def test_requests_are_listed_until_there_are_too_many(folder: Libraries) -> None
 def test_failed_compilation_is_retried_after_a_day(folder: Libraries) -> None:
     folder.mark_attempt(A)
     assert not folder.request(A, b"what")
-    age(folder.path / f"{A}.failed", 80000)
+    make_older(folder.path / f"{A}.failed", 80000)
     assert not folder.request(A, b"what")
-    age(folder.path / f"{A}.failed", 90000)
+    make_older(folder.path / f"{A}.failed", 90000)
     assert folder.request(A, b"what")
     assert folder.read_job(A) == b"what"
 
@@ -158,14 +158,14 @@ def test_least_recently_used_libraries_are_evicted_first(
 ) -> None:
     for index, key in enumerate([A, B, C, D, E]):
         folder.publish(key, LIBRARY)
-        age(folder.path / f"{key}.so", 1000 - 100 * index)
+        make_older(folder.path / f"{key}.so", 1000 - 100 * index)
     assert folder.find(A) is not None
     monkeypatch.setattr(libraries, "_MAX_FILES", 4)
     folder.evict()
-    assert names(folder) == [f"{A}.so", f"{C}.so", f"{D}.so", f"{E}.so"]
+    assert list_names(folder) == [f"{A}.so", f"{C}.so", f"{D}.so", f"{E}.so"]
     monkeypatch.setattr(libraries, "_MAX_BYTES", 2.5 * len(LIBRARY))
     folder.evict()
-    assert names(folder) == [f"{A}.so", f"{E}.so"]
+    assert list_names(folder) == [f"{A}.so", f"{E}.so"]
 
 
 def test_files_of_dead_processes_are_removed_after_a_day(folder: Libraries) -> None:
@@ -180,12 +180,12 @@ def test_files_of_dead_processes_are_removed_after_a_day(folder: Libraries) -> N
     (build / "f.c").write_bytes(b"")
     folder.publish(A, LIBRARY)
     folder.evict()
-    everything = names(folder)
+    everything = list_names(folder)
     assert len(everything) == 6
     for name in everything:
-        age(folder.path / name, 90000)
+        make_older(folder.path / name, 90000)
     folder.evict()
-    assert names(folder) == [f"{A}.so", "lock"]
+    assert list_names(folder) == [f"{A}.so", "lock"]
 
 
 FOREIGN = (
@@ -208,8 +208,8 @@ def test_files_of_others_are_neither_removed_nor_compiled(
             (place / name).parent.mkdir(parents=True, exist_ok=True)
             (place / name).write_text(name)
         for path in place.rglob("*"):
-            age(path, 1e6)
-    before = tree(folder.path.parent)
+            make_older(path, 1e6)
+    before = read_tree(folder.path.parent)
     assert len(before) > 2 * len(FOREIGN)
     assert Libraries.open_default() is not None
     lock = folder.lock()
@@ -217,7 +217,7 @@ def test_files_of_others_are_neither_removed_nor_compiled(
     compile_jobs(str(folder.path), lock)
     os.close(lock)
     (folder.path / "lock").unlink()
-    assert tree(folder.path.parent) == before
+    assert read_tree(folder.path.parent) == before
 
 
 def test_eviction_does_not_follow_links(folder: Libraries, tmp_path: Path) -> None:
@@ -228,10 +228,10 @@ def test_eviction_does_not_follow_links(folder: Libraries, tmp_path: Path) -> No
     for link in (*links, build / "link"):
         link.symlink_to(tmp_path / "outside")
         os.utime(link, (0.0, 0.0), follow_symlinks=False)
-    age(build, 90000)
+    make_older(build, 90000)
     folder.evict()
     assert (tmp_path / "outside" / "file").read_text() == "mine"
-    assert names(folder) == sorted(link.name for link in links)
+    assert list_names(folder) == sorted(link.name for link in links)
 
 
 def test_only_one_process_compiles(folder: Libraries) -> None:
@@ -260,4 +260,4 @@ def test_files_are_written_atomically(folder: Libraries, monkeypatch: pytest.Mon
     monkeypatch.setattr(Path, "replace", full)
     with pytest.raises(OSError, match="no space"):
         folder.publish(A, LIBRARY)
-    assert names(folder) == []
+    assert list_names(folder) == []

@@ -72,7 +72,7 @@ def compile_here(folder: Libraries) -> None:
     os.close(lock)
 
 
-def script(path: Path, text: str) -> str:
+def write_script(path: Path, text: str) -> str:
     path.write_text(f"#!/bin/sh\n{text}\n", encoding="utf-8")
     path.chmod(0o755)
     return str(path)
@@ -152,7 +152,7 @@ def test_libraries_are_shared_with_later_processes(folder: Libraries) -> None:
     run = [sys.executable, "-c", code]
     process = subprocess.run(run, env=environment, capture_output=True, timeout=120, check=True)
     assert process.stderr == b""
-    until(lambda: not folder.list_jobs())
+    wait_until(lambda: not folder.list_jobs())
     assert len(list(folder.path.glob("*.so"))) == 1
     mine = MachineCode(make())
     assert mine.try_load()
@@ -230,7 +230,7 @@ SLOW = pytest.mark.long  # each waits for a compiler
 def test_a_broken_compiler_is_tried_once(
     how: str, folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("CC", script(tmp_path / "broken", BROKEN[how]))
+    monkeypatch.setenv("CC", write_script(tmp_path / "broken", BROKEN[how]))
     code = MachineCode(make())
     assert not code.try_load()
     assert wait(), how
@@ -248,7 +248,9 @@ def test_hanging_compiler_is_killed(
     pid = tmp_path / "pid"
     monkeypatch.setenv(
         "CC",
-        script(tmp_path / "hangs", f"sleep 600 & echo $! > {pid}.part; mv {pid}.part {pid}; wait"),
+        write_script(
+            tmp_path / "hangs", f"sleep 600 & echo $! > {pid}.part; mv {pid}.part {pid}; wait"
+        ),
     )
     monkeypatch.setattr(machine_code, "_COMPILER_TIMEOUT", 1.0)
     monkeypatch.setattr(machine_code, "_has_python", lambda: False)
@@ -257,7 +259,7 @@ def test_hanging_compiler_is_killed(
     compile_here(folder)
     assert folder.list_jobs() == []
     assert len(list(folder.path.glob("*.failed"))) == 1
-    until(lambda: has_ended(int(pid.read_text())))
+    wait_until(lambda: has_ended(int(pid.read_text())))
 
 
 @pytest.mark.parametrize("executable", ["", "/usr/bin/blender"])
@@ -270,7 +272,7 @@ def test_embedding_program_is_not_started_as_worker(
     assert len(folder.list_jobs()) == 1
 
 
-def until(done: Callable[[], bool]) -> None:
+def wait_until(done: Callable[[], bool]) -> None:
     for _ in range(6000):
         if done():
             return
@@ -332,7 +334,7 @@ def test_planning_works_without_a_compiler(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     if trouble == "broken compiler":
-        monkeypatch.setenv("CC", script(tmp_path / "broken", BROKEN["writes garbage"]))
+        monkeypatch.setenv("CC", write_script(tmp_path / "broken", BROKEN["writes garbage"]))
     elif trouble == "truncated":
         monkeypatch.setattr(
             Libraries,

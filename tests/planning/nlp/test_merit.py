@@ -31,7 +31,7 @@ PILLAR = {
 
 
 @cache
-def problem(kind: str) -> vkc.TrajectoryProblem:
+def make_problem(kind: str) -> vkc.TrajectoryProblem:
     if kind == "door":
         return make_program(load_door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=SHORT)
     scene = make_hall(base="differential", obstacles=[PILLAR])
@@ -44,7 +44,7 @@ def measure(p: vkc.TrajectoryProblem, z: np.ndarray, *, rates: bool) -> Infeasib
     return measure_infeasibility(p, z, p.timing_for(p.still), contacts, rates=rates)
 
 
-def random_path(p: vkc.TrajectoryProblem, seed: int) -> np.ndarray:
+def sample_path(p: vkc.TrajectoryProblem, seed: int) -> np.ndarray:
     return p.clip(p.still + np.random.default_rng(seed).normal(0.0, 0.3, p.still.shape))
 
 
@@ -62,8 +62,8 @@ def test_feasible_motion_has_no_violation() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_amounts_of_each_kind(seed: int) -> None:
-    p = problem("drive")
-    z, timing = random_path(p, seed), p.timing_for(p.still)
+    p = make_problem("drive")
+    z, timing = sample_path(p, seed), p.timing_for(p.still)
     found, path = measure(p, z, rates=True), p.waypoints(z)
     _, lateral, _ = p.rolling.compute_steps(path)
     missing = np.maximum(p.rolling.compute_min_times(path) - timing.dt, 0.0)  # of the faster wheel
@@ -81,8 +81,8 @@ def test_amounts_of_each_kind(seed: int) -> None:
 
 
 def test_pose_amounts_are_distance_plus_angle() -> None:
-    p = problem("door")
-    z = random_path(p, 0)
+    p = make_problem("door")
+    z = sample_path(p, 0)
     found = measure(p, z, rates=False)
     expected = np.zeros(len(z))
     for goal, solver in zip(p.pose_goals, p.transcription.pose_solvers, strict=True):
@@ -98,8 +98,8 @@ def test_pose_amounts_are_distance_plus_angle() -> None:
 
 
 def test_shortfalls_are_those_of_pairs_with_planes() -> None:
-    p = problem("drive")
-    contacts = p.evaluate_contacts(random_path(p, 0), reach=p.options.contact_reach)
+    p = make_problem("drive")
+    contacts = p.evaluate_contacts(sample_path(p, 0), reach=p.options.contact_reach)
     found = compute_shortfalls(contacts, p.segments, 2)
     assert found.any()
     for row in range(p.segments):

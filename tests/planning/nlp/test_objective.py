@@ -22,7 +22,7 @@ def make_cost(*, length: bool = True) -> MotionCost:
     return MotionCost(METRIC, SMOOTHING, ENDS, STOPS, length=length)
 
 
-def rates(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def compute_rates(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return steps and their changes of z_0..z_N."""
     first, second, start_first, start_second = MATRICES
     return first @ path[1:] + np.outer(start_first, path[0]), second @ path[1:] + np.outer(
@@ -30,18 +30,20 @@ def rates(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def quadratic(weights: tuple[np.ndarray, np.ndarray], path: np.ndarray) -> float:
-    return float(sum(np.sum(w * part**2) for w, part in zip(weights, rates(path), strict=True)))
+def compute_quadratic(weights: tuple[np.ndarray, np.ndarray], path: np.ndarray) -> float:
+    return float(
+        sum(np.sum(w * part**2) for w, part in zip(weights, compute_rates(path), strict=True))
+    )
 
 
-def random_path(seed: int, scale: float = 1.0) -> np.ndarray:
+def sample_path(seed: int, scale: float = 1.0) -> np.ndarray:
     return np.cumsum(
         np.random.default_rng(seed).normal(scale=0.1 * scale, size=(ENDS[-1] + 1, len(METRIC))),
         axis=0,
     )
 
 
-def path_length(path: np.ndarray) -> float:
+def compute_path_length(path: np.ndarray) -> float:
     """Return the path length, phase by phase, from its definition."""
     changes, at = [], []
     for begin, end in itertools.pairwise([0, *STOPS, ENDS[-1]]):
@@ -63,29 +65,31 @@ def path_length(path: np.ndarray) -> float:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_squares_are_equation_1(seed: int) -> None:
-    path, total = random_path(seed), 0.0
+    path, total = sample_path(seed), 0.0
     for begin, end in itertools.pairwise([0, *STOPS, ENDS[-1]]):
         step = np.diff(path[begin : end + 1], axis=0)
         bend = np.diff(np.vstack([0 * step[:1], step, 0 * step[:1]]), axis=0)
         total += np.sum(METRIC * step**2) + SMOOTHING * np.sum(METRIC * bend**2)
     squares = make_cost(length=False)
-    assert squares.value(*rates(path)) == pytest.approx(total, rel=1e-12)
-    assert quadratic(squares.weights(*rates(random_path(9))), path) == pytest.approx(
-        total, rel=1e-12
-    )
+    assert squares.value(*compute_rates(path)) == pytest.approx(total, rel=1e-12)
+    assert compute_quadratic(
+        squares.weights(*compute_rates(sample_path(9))), path
+    ) == pytest.approx(total, rel=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_path_length_equals_its_definition(seed: int) -> None:
-    path = random_path(seed)
-    assert make_cost().value(*rates(path)) == pytest.approx(path_length(path), rel=1e-12)
+    path = sample_path(seed)
+    assert make_cost().value(*compute_rates(path)) == pytest.approx(
+        compute_path_length(path), rel=1e-12
+    )
 
 
 def test_stationary_motion_costs_nothing() -> None:
-    still = np.tile(random_path(0)[0], (ENDS[-1] + 1, 1))
+    still = np.tile(sample_path(0)[0], (ENDS[-1] + 1, 1))
     for length in (False, True):
-        assert make_cost(length=length).value(*rates(still)) == 0.0
-    assert np.isfinite(make_cost().weights(*rates(still))[0]).all()
+        assert make_cost(length=length).value(*compute_rates(still)) == 0.0
+    assert np.isfinite(make_cost().weights(*compute_rates(still))[0]).all()
 
 
 def test_motion_at_constant_speed_costs_its_length() -> None:
@@ -107,19 +111,25 @@ def test_motion_at_constant_speed_costs_its_length() -> None:
 def test_quadratic_model_bounds_the_length_from_above(
     one: int, other: int, here: float, there: float
 ) -> None:
-    f, at, away = make_cost(), random_path(one, here), random_path(other, there)
-    weights = f.weights(*rates(at))
-    rise = quadratic(weights, away) - quadratic(weights, at)
-    assert rise >= f.value(*rates(away)) - f.value(*rates(at)) - 1e-9
+    f, at, away = make_cost(), sample_path(one, here), sample_path(other, there)
+    weights = f.weights(*compute_rates(at))
+    rise = compute_quadratic(weights, away) - compute_quadratic(weights, at)
+    assert rise >= f.value(*compute_rates(away)) - f.value(*compute_rates(at)) - 1e-9
     direction, step = away - at, 1e-6
     slopes = [
         (of(at + step * direction) - of(at - step * direction)) / (2 * step)
-        for of in (lambda path: f.value(*rates(path)), lambda path: quadratic(weights, path))
+        for of in (
+            lambda path: f.value(*compute_rates(path)),
+            lambda path: compute_quadratic(weights, path),
+        )
     ]
     assert slopes[0] == pytest.approx(slopes[1], rel=1e-4, abs=1e-5)
 
 
 @given(st.integers(0, 10**6), st.integers(0, 10**6), st.booleans())
 def test_cost_is_convex(one: int, other: int, length: bool) -> None:
-    f, a, b = make_cost(length=length), random_path(one), random_path(other)
-    assert f.value(*rates((a + b) / 2)) <= (f.value(*rates(a)) + f.value(*rates(b))) / 2 + 1e-12
+    f, a, b = make_cost(length=length), sample_path(one), sample_path(other)
+    assert (
+        f.value(*compute_rates((a + b) / 2))
+        <= (f.value(*compute_rates(a)) + f.value(*compute_rates(b))) / 2 + 1e-12
+    )

@@ -60,19 +60,19 @@ def fetching() -> TrajectoryProblem:
     return make_program(scene, [*steps, GoTo(0.0, 0.0)], options=SHORT)
 
 
-def bounds(problem: TrajectoryProblem, name: str) -> np.ndarray:
+def get_bounds(problem: TrajectoryProblem, name: str) -> np.ndarray:
     """Return the bounds of a coordinate at each waypoint after the start, shape (N, 2)."""
     index = problem.chain.index(name)
     return np.column_stack([problem.lower[:, index], problem.upper[:, index]])
 
 
-def random_path(problem: TrajectoryProblem, scale: float = 1.0) -> np.ndarray:
+def sample_path(problem: TrajectoryProblem, scale: float = 1.0) -> np.ndarray:
     rng = np.random.default_rng(0)
     far = sample_configurations(problem.chain.lower, problem.chain.upper, problem.segments, rng)
     return problem.start + scale * (far - problem.start)
 
 
-def goal_waypoints(problem: TrajectoryProblem) -> dict[str, tuple[int, ...]]:
+def get_goal_waypoints(problem: TrajectoryProblem) -> dict[str, tuple[int, ...]]:
     poses = problem.transcription.structure.poses
     return {g.name: pose.waypoints for g, pose in zip(problem.pose_goals, poses, strict=True)}
 
@@ -86,7 +86,7 @@ def test_object_joints_are_fixed_until_they_are_moved(opening: TrajectoryProblem
     turned = 0.5 + LATCH_MARGIN
     reach, turn, move, last = opening.ends.tolist()
     assert opening.segments == opening.transcription.segments == last
-    hinge, knob = bounds(opening, "door.hinge"), bounds(opening, "door.knob")
+    hinge, knob = get_bounds(opening, "door.hinge"), get_bounds(opening, "door.knob")
     assert np.all(hinge[:turn] == 0.0)
     assert np.all(hinge[turn : move - 1] == (-1.57, 1.57))
     assert np.all(hinge[move - 1 :] == 1.2)
@@ -99,11 +99,11 @@ def test_object_joints_are_fixed_until_they_are_moved(opening: TrajectoryProblem
 def test_grasped_objects_do_not_move_and_freedoms_have_limits(
     two_grasps: TrajectoryProblem,
 ) -> None:
-    assert np.all(bounds(two_grasps, "drawer.handle_free") == (-0.6, 0.6))
+    assert np.all(get_bounds(two_grasps, "drawer.handle_free") == (-0.6, 0.6))
     for letter in "xyz":
-        assert np.all(bounds(two_grasps, f"cabinet.ball_{letter}") == (-0.7, 0.6))
-    assert np.all(bounds(two_grasps, "cabinet.swing") == 0.3)
-    slide = bounds(two_grasps, "drawer.slide")
+        assert np.all(get_bounds(two_grasps, f"cabinet.ball_{letter}") == (-0.7, 0.6))
+    assert np.all(get_bounds(two_grasps, "cabinet.swing") == 0.3)
+    slide = get_bounds(two_grasps, "drawer.slide")
     first, last = two_grasps.ends[1:3]
     assert np.all(slide[:first] == 0.0)
     assert np.all(slide[first : last - 1] == (0.0, 0.4))
@@ -117,7 +117,7 @@ def test_grasped_objects_do_not_move_and_freedoms_have_limits(
 def test_goal_beyond_a_limit_is_the_limit() -> None:
     steps = [Actuate("door", {"hinge": 2.0}), GoTo(0.0, 0.0)]
     problem = make_program(load_door_scene(), steps, options=SHORT)
-    assert np.all(bounds(problem, "door.hinge")[problem.ends[2] - 1 :] == 1.57)
+    assert np.all(get_bounds(problem, "door.hinge")[problem.ends[2] - 1 :] == 1.57)
 
 
 def test_robot_stays_within_its_limits_and_the_arena(opening: TrajectoryProblem) -> None:
@@ -169,7 +169,7 @@ def test_start_is_the_state_of_the_scene() -> None:
     assert problem.start[problem.chain.index("door.hinge")] == 0.3
     # the latch does not hold an open door
     assert [phase.segments for phase in problem.task.phases] == [REACH, MOVE]
-    assert np.all(bounds(problem, "door.knob") == 0.2)
+    assert np.all(get_bounds(problem, "door.knob") == 0.2)
 
 
 def test_clip_and_waypoints(opening: TrajectoryProblem) -> None:
@@ -199,7 +199,7 @@ def test_closure_holds_from_the_grasp_to_the_release(opening: TrajectoryProblem)
     reach, _, move, _ = opening.ends.tolist()
     closed = tuple(range(reach, move + 1))
     expected = {"closure door": closed, "approach door.handle": (reach - APPROACH,)}
-    assert goal_waypoints(opening) == expected
+    assert get_goal_waypoints(opening) == expected
     pose, closure = opening.pose_goals[0].row, opening.chain.closures[HANDLE]
     assert (pose.joint, pose.local) == (closure.joint, closure.local)
     assert opening.targets == (opening.scene.objects["door"].placement,) * 2
@@ -207,7 +207,7 @@ def test_closure_holds_from_the_grasp_to_the_release(opening: TrajectoryProblem)
 
 def test_goals_of_several_grasps(two_grasps: TrajectoryProblem) -> None:
     first, second, third, fourth = two_grasps.ends.tolist()
-    assert goal_waypoints(two_grasps) == {
+    assert get_goal_waypoints(two_grasps) == {
         "closure cabinet": (first,),
         "closure drawer": tuple(range(second, third + 1)),
         "approach cabinet.ball": (first - APPROACH,),
@@ -223,7 +223,7 @@ def test_goals_of_several_grasps(two_grasps: TrajectoryProblem) -> None:
 def test_object_held_at_the_start_is_closed_from_the_first_waypoint() -> None:
     scene = dataclasses.replace(load_door_scene(), holds=(HANDLE,))
     problem = make_program(scene, [Actuate("door", {"knob": 0.3})], options=SHORT)
-    assert goal_waypoints(problem) == {"closure door": tuple(range(1, MOVE + 1))}
+    assert get_goal_waypoints(problem) == {"closure door": tuple(range(1, MOVE + 1))}
     assert problem.transcription.structure.stops == ()
 
 
@@ -231,14 +231,14 @@ def test_any_frame_of_the_robot_can_reach_a_pose() -> None:
     problem = make_program(load_door_scene(), [Reach(POSE, frame="forearm_link")], options=SHORT)
     model = problem.chain.model
     frame = model.frames[model.getFrameId("forearm_link")]
-    assert goal_waypoints(problem) == {"goal forearm_link": (REACH,)}
+    assert get_goal_waypoints(problem) == {"goal forearm_link": (REACH,)}
     pose = problem.pose_goals[0].row
     assert (pose.joint, pose.local) == (frame.parentJoint, frame.placement)
 
 
 def test_pose_error_and_drift(opening: TrajectoryProblem) -> None:
     """Pose error is the largest residual at goals; drift is measured between waypoints."""
-    z, data = random_path(opening), opening.chain.model.createData()
+    z, data = sample_path(opening), opening.chain.model.createData()
 
     def residual(row: np.ndarray, number: int = 0) -> np.ndarray:
         pose, target = opening.pose_goals[number].row, opening.targets[number]
@@ -265,7 +265,7 @@ def test_pose_error_and_drift(opening: TrajectoryProblem) -> None:
     drifts += [np.linalg.norm(r[3:]) / Tolerances().closure_angle for r in between]
     assert opening.drift(z) == pytest.approx(max(drifts), rel=1e-6)
     alone = make_program(load_door_scene(), [GoTo(0.0, 0.0)], options=SHORT)
-    assert alone.pose_error(random_path(alone)) == alone.drift(random_path(alone)) == 0.0
+    assert alone.pose_error(sample_path(alone)) == alone.drift(sample_path(alone)) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -342,8 +342,8 @@ def test_initially_held_object_stays_in_the_hand(fetching: TrajectoryProblem) ->
     for name, value, limit in (("slide", 0.02, 0.095), ("turn", -0.1, 1.2)):
         column = f"stick.grip_{name}"
         assert fetching.start[fetching.chain.index(column)] == value
-        assert np.all(bounds(fetching, column)[:until] == value)
-        assert np.all(bounds(fetching, column)[until:] == (-limit, limit))
+        assert np.all(get_bounds(fetching, column)[:until] == value)
+        assert np.all(get_bounds(fetching, column)[until:] == (-limit, limit))
     chosen = [fetching.chain.index(f"ball.pull_{axis}") for axis in "zyx"]
     assert fetching.choices == tuple((column, REACH, 2 * REACH) for column in chosen)
     # they change only while grasping, at next to no cost
@@ -416,7 +416,7 @@ def test_relaxed_program_with_rows_of_all_kinds_is_feasible_at_its_iterate() -> 
 def test_rate_violation_is_that_of_the_trajectory(
     two_grasps: TrajectoryProblem, scale: float
 ) -> None:
-    z = random_path(two_grasps, scale)
+    z = sample_path(two_grasps, scale)
     timing = two_grasps.timing_for(two_grasps.still)
     trajectory, chain = make_trajectory(two_grasps, z, timing.dt), two_grasps.chain
     velocity = np.abs(trajectory.velocities()) / chain.velocity
@@ -443,7 +443,7 @@ def test_only_long_runs_get_more_time(opening: TrajectoryProblem) -> None:
 
 
 def test_contacts_are_those_of_each_phase(opening: TrajectoryProblem) -> None:
-    z = opening.clip(np.nan_to_num(random_path(opening, 0.3)))
+    z = opening.clip(np.nan_to_num(sample_path(opening, 0.3)))
     contacts = opening.evaluate_contacts(z, reach=0.3, nearest=5)
     assert np.bincount(contacts.waypoint).max() == 5
     contacts = opening.evaluate_contacts(z, reach=3.0)

@@ -85,7 +85,7 @@ def make_terms(name: str) -> list[Constraint | Cost]:
 
 
 @cache
-def problem(name: str) -> vkc.TrajectoryProblem:
+def make_problem(name: str) -> vkc.TrajectoryProblem:
     if name == "stick":
         scene = make_room(describe_table())
         steps = [
@@ -192,7 +192,7 @@ class Numbers:
         return (self._value(name, self.t) - self._value(name, self.t - 1)) / self.dt
 
 
-def expected_values(
+def compute_expected_values(
     p: vkc.TrajectoryProblem, term: Constraint | Cost, path: np.ndarray, dt: np.ndarray
 ) -> dict[int, np.ndarray]:
     """Return the term's value at every waypoint of its phases after their first."""
@@ -208,12 +208,12 @@ def expected_values(
 @pytest.mark.parametrize("name", NAMES)
 def test_rows_and_costs_are_the_expressions_at_the_waypoints(name: str) -> None:
     """Their excess is relaxed, as that of other rows, and their derivatives are exact."""
-    p = problem(name)
+    p = make_problem(name)
     point, t, cost, seen = make_random_point(p), p.transcription, 0.0, 0
     rows, dt = point.rows(), point.dt
     by_name = {term.name: at for term, at in zip(p.terms, t.term_rows, strict=True)}
     for term in make_terms(name):
-        expected = expected_values(p, term, point.path, dt)
+        expected = compute_expected_values(p, term, point.path, dt)
         if isinstance(term, Cost):
             cost += term.weight * sum(float(value[0]) for value in expected.values())
         for waypoint, at in by_name.get(term.name, {}).items():
@@ -239,12 +239,14 @@ def test_rows_and_costs_are_the_expressions_at_the_waypoints(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_fully_relaxed_constraints_hold_at_the_iterate(name: str) -> None:
-    amounts = [check_relaxation(problem(name), z) for z in make_iterates(problem(name), 1)]
+    amounts = [
+        check_relaxation(make_problem(name), z) for z in make_iterates(make_problem(name), 1)
+    ]
     assert max(each["terms"] for each in amounts) > 0.1
 
 
 def test_position_after_release_depends_on_the_waypoint_of_release() -> None:
-    p = problem("stick")
+    p = make_problem("stick")
     t, release = p.transcription, int(p.ends[2])
     at = next(at for term, at in zip(p.terms, t.term_rows, strict=True) if term.name == "near")
     row, column = (np.array(part) for part in t.jacobian.sparsity().get_triplet())

@@ -47,7 +47,9 @@ def test_profile_keeps_the_limits_in_the_time(seed: int, size: float) -> None:
             )
 
 
-def differences(path: np.ndarray, runs: list[tuple[int, int]]) -> tuple[np.ndarray, np.ndarray]:
+def compute_differences(
+    path: np.ndarray, runs: list[tuple[int, int]]
+) -> tuple[np.ndarray, np.ndarray]:
     """Return steps and their differences, which in every run begin and end with 0."""
     steps = np.diff(path, axis=0)
     zero = np.zeros((1, path.shape[1]))
@@ -60,7 +62,7 @@ def test_runs_are_stretched_as_needed_up_to_a_limit(seed: int, size: float) -> N
     rng, runs = np.random.default_rng(seed), [(0, 5), (5, 6), (6, 12)]
     limits, dt = (np.full(3, 1.0), np.full(3, 4.0)), np.repeat([0.5, 1.0, 0.8], [5, 1, 6])
     timing = Timing(dt, dt, runs, limits)
-    first, second = differences(
+    first, second = compute_differences(
         np.cumsum(0.5 * size * rng.uniform(-0.5, 0.5, (13, 3)), axis=0), runs
     )
     assert timing.velocity.shape == first.shape
@@ -88,6 +90,6 @@ def test_runs_are_stretched_as_needed_up_to_a_limit(seed: int, size: float) -> N
 def test_slow_motions_keep_their_time() -> None:
     runs = list(itertools.pairwise([0, 4]))
     timing = Timing(np.full(4, 0.5), np.full(4, 0.5), runs, (np.ones(2), np.full(2, 4.0)))
-    first, second = differences(np.linspace(0.0, 0.1, 5)[:, None] * np.ones(2), runs)
+    first, second = compute_differences(np.linspace(0.0, 0.1, 5)[:, None] * np.ones(2), runs)
     assert timing.compute_violation(first, second) < 0.0
     np.testing.assert_array_equal(timing.stretch(first, second).dt, timing.dt)

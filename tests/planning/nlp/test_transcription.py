@@ -34,7 +34,7 @@ POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
 
 
 @cache
-def wheeled_scene(base: str) -> Scene:
+def make_wheeled_scene(base: str) -> Scene:
     turning = {"turning_radius": 0.8} if base == "ackermann" else {}
     return dataclasses.replace(
         load_door_scene(), robot=load_robot("husky_ur5e", base=base, **turning)
@@ -42,7 +42,7 @@ def wheeled_scene(base: str) -> Scene:
 
 
 @cache
-def problem(name: str) -> TrajectoryProblem:
+def make_problem(name: str) -> TrajectoryProblem:
     options = OPTIONS
     if name == "door":
         scene, steps = load_door_scene(), [Actuate("door", {"hinge": 1.2})]
@@ -64,7 +64,7 @@ def problem(name: str) -> TrajectoryProblem:
             scene = write_coupled_scene(Path(folder))
         steps = [Actuate("drawer", {scene.objects["drawer"].object.coordinates.names[0]: 0.1})]
     else:
-        scene, steps = wheeled_scene(name), [Reach(POSE), GoTo(0.0, 0.0, 1.0)]
+        scene, steps = make_wheeled_scene(name), [Reach(POSE), GoTo(0.0, 0.0, 1.0)]
         options = dataclasses.replace(OPTIONS, contact_slots=1)
     return make_program(scene, steps, options=options)
 
@@ -72,19 +72,19 @@ def problem(name: str) -> TrajectoryProblem:
 NAMES = ["door", "differential", "ackermann", "stick", "fetch", "push", "telescope"]
 
 
-def runs(p: TrajectoryProblem) -> list[np.ndarray]:
+def find_runs(p: TrajectoryProblem) -> list[np.ndarray]:
     """Return the waypoints of each run between rests: start, grasps, releases and end."""
     neighbours = zip(p.ends[:-1], p.task.phases[:-1], p.task.phases[1:], strict=True)
     hands = [int(end) for end, a, b in neighbours if a.grasps or set(a.held) - set(b.held)]
     return [np.arange(a, b + 1) for a, b in itertools.pairwise([0, *hands, p.segments])]
 
 
-def changes(path: np.ndarray, run: np.ndarray) -> np.ndarray:
+def compute_changes(path: np.ndarray, run: np.ndarray) -> np.ndarray:
     """Return the changes of the steps within a run, from and to rest."""
     return np.diff(np.diff(path[run], axis=0), axis=0, prepend=0.0, append=0.0)
 
 
-def clamped_steps(p: TrajectoryProblem) -> list[tuple[int, int]]:
+def find_clamped_steps(p: TrajectoryProblem) -> list[tuple[int, int]]:
     """Return (column, waypoint) of the freedoms of firm grasps, while they are constant."""
     found = []
     for hold, names in p.chain.virtual.items():
@@ -99,7 +99,7 @@ def clamped_steps(p: TrajectoryProblem) -> list[tuple[int, int]]:
     return found
 
 
-def waypoint_rows(point: ProgramPoint) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def iterate_waypoint_rows(point: ProgramPoint) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield rows of witness planes and poses, and their values by Pinocchio."""
     p, t, model = point.problem, point.problem.transcription, point.problem.chain.model
     data = model.createData()
@@ -123,7 +123,7 @@ def waypoint_rows(point: ProgramPoint) -> Iterator[tuple[np.ndarray, np.ndarray]
             yield at[k + 1], np.concatenate(values)
 
 
-def relaxed_rows(p: TrajectoryProblem, path: np.ndarray, gears: np.ndarray) -> np.ndarray:
+def compute_relaxed_rows(p: TrajectoryProblem, path: np.ndarray, gears: np.ndarray) -> np.ndarray:
     """Return (value, waypoint) of the other rows, including the rate rows, before relaxation."""
     rows: list[tuple[float, int]] = []
     if not p.rolling.is_omnidirectional:
@@ -134,15 +134,15 @@ def relaxed_rows(p: TrajectoryProblem, path: np.ndarray, gears: np.ndarray) -> n
             steered = [gears[k - 1] * x - radius * turn, gears[k - 1] * x + radius * turn]
             steered = steered if p.chain.robot.base == "ackermann" else []
             rows += [(v, k) for v in (y, *steered, x - arm * turn, x + arm * turn)]
-    rows += [(path[k, c] - path[k - 1, c], k) for c, k in clamped_steps(p)]
+    rows += [(path[k, c] - path[k - 1, c], k) for c, k in find_clamped_steps(p)]
     for phase, end in zip(p.task.phases, p.ends.tolist(), strict=True):
         for name, sign in phase.pushed.items():
             c, steps = p.chain.index(name), range(end - phase.segments + 1, end + 1)
             rows += [(sign * (path[k, c] - path[k - 1, c]), k) for k in steps]
     for k in range(1, p.segments + 1):
         rows += [(v, k) for v in path[k] - path[k - 1]]
-    for run in runs(p):
-        for k, change in zip(run, changes(path, run), strict=True):
+    for run in find_runs(p):
+        for k, change in zip(run, compute_changes(path, run), strict=True):
             rows += [(v, max(int(k), 1)) for v in change]  # a change belongs to its waypoint
     return np.array(rows)
 
@@ -150,12 +150,12 @@ def relaxed_rows(p: TrajectoryProblem, path: np.ndarray, gears: np.ndarray) -> n
 @pytest.mark.parametrize("name", NAMES)
 def test_rows_equal_their_definitions(name: str) -> None:
     """A relaxation variable removes its share of the excess of its waypoint's rows."""
-    p = problem(name)
+    p = make_problem(name)
     point, t = make_random_point(p), p.transcription
     found, expected = point.rows(), np.full(t.rows + t.rate_matrix.size1(), np.nan)
-    for rows, values in waypoint_rows(point):
+    for rows, values in iterate_waypoint_rows(point):
         expected[rows] = values
-    values, waypoints = relaxed_rows(p, point.path, point.gears).T
+    values, waypoints = compute_relaxed_rows(p, point.path, point.gears).T
     excess = np.concatenate([point.excess, point.rate_excess])
     expected[t.first_relaxed_row :] = values - point.relaxation[waypoints.astype(int) - 1] * excess
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
@@ -168,8 +168,8 @@ def test_rows_equal_their_definitions(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_objective_is_the_weighted_sum_of_squared_steps_and_changes(name: str) -> None:
-    point = make_random_point(problem(name))
-    bends = np.vstack([changes(point.path, run) for run in runs(point.problem)])
+    point = make_random_point(make_problem(name))
+    bends = np.vstack([compute_changes(point.path, run) for run in find_runs(point.problem)])
     steps = np.diff(point.path, axis=0)
     squares = [np.sum(w * part**2) for w, part in zip(point.weights, (steps, bends), strict=True)]
     assert point.cost() == pytest.approx(point.penalties + sum(squares), rel=1e-10)
@@ -177,22 +177,31 @@ def test_objective_is_the_weighted_sum_of_squared_steps_and_changes(name: str) -
 
 @pytest.mark.parametrize("name", NAMES)
 def test_derivatives_equal_differences(name: str) -> None:
-    make_random_point(problem(name), seed=1).check_derivatives()
+    make_random_point(make_problem(name), seed=1).check_derivatives()
 
 
 def test_problems_have_rows_of_all_kinds() -> None:
-    kinds = {pose.kind for name in NAMES for pose in problem(name).transcription.structure.poses}
+    kinds = {
+        pose.kind for name in NAMES for pose in make_problem(name).transcription.structure.poses
+    }
     assert kinds == {"pose", "point", "upright"}
-    assert any(pose.shift for pose in problem("fetch").transcription.structure.poses)
-    assert [len(clamped_steps(problem(name))) > 0 for name in ("door", "stick")] == [False, True]
-    assert problem("push").task.phases[0].pushed == {"door.hinge": -1}
-    assert [len(runs(problem(name))) for name in ("ackermann", "door", "fetch")] == [1, 2, 3]
+    assert any(pose.shift for pose in make_problem("fetch").transcription.structure.poses)
+    assert [len(find_clamped_steps(make_problem(name))) > 0 for name in ("door", "stick")] == [
+        False,
+        True,
+    ]
+    assert make_problem("push").task.phases[0].pushed == {"door.hinge": -1}
+    assert [len(find_runs(make_problem(name))) for name in ("ackermann", "door", "fetch")] == [
+        1,
+        2,
+        3,
+    ]
 
 
 @pytest.mark.parametrize("name", ["differential", "ackermann"])
 def test_bounds_of_wheels(name: str) -> None:
     """No lateral motion; forward arcs of at least the turning radius; limited wheel travel."""
-    p = problem(name)
+    p = make_problem(name)
     timing, at = p.timing_for(p.still), p.transcription.base_rows
     lower, upper = (bound[at].reshape(p.segments, -1) for bound in p.row_bounds(timing))
     assert not upper[:, 0].any()
@@ -209,7 +218,9 @@ def test_bounds_of_wheels(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_fully_relaxed_program_is_feasible_at_its_iterate(name: str) -> None:
-    amounts = [check_relaxation(problem(name), z) for z in make_iterates(problem(name), 1)]
+    amounts = [
+        check_relaxation(make_problem(name), z) for z in make_iterates(make_problem(name), 1)
+    ]
     violated = {kind for kind in amounts[0] if max(each[kind] for each in amounts) > 0.1}
     expected = {"poses", "rates"} if name == "telescope" else {"poses", "clearance", "rates"}
     expected |= {"rolling"} if name in ("differential", "ackermann") else set()
@@ -281,7 +292,7 @@ def test_one_program_serves_all_problems_of_a_structure() -> None:
     ],
 )
 def test_other_structures_get_other_programs(change: dict[str, object]) -> None:
-    of = problem("door").transcription.structure
+    of = make_problem("door").transcription.structure
     pose = dataclasses.replace(of.poses[0], local=pin.SE3.Identity())
     one = Structure(model=of.model, segments=of.segments, poses=(pose,), slots=2)
     same = Structure(model=of.model.copy(), segments=of.segments, poses=(pose,), slots=2)
@@ -292,7 +303,7 @@ def test_other_structures_get_other_programs(change: dict[str, object]) -> None:
 
 
 def test_solvers_are_cached() -> None:
-    structure, cache = problem("differential").transcription.structure, Cache()
+    structure, cache = make_problem("differential").transcription.structure, Cache()
     t = transcribe(structure, cache)
     assert transcribe(structure, cache) is t
     first, spent = t.solver(rates=False, options=QUIET), cache.build_time

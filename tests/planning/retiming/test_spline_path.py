@@ -12,14 +12,14 @@ from vkc_pin.planning.retiming.spline_path import fit_path
 NOWHERE = (np.full(3, -np.inf), np.full(3, np.inf))
 
 
-def points(seed: int, count: int = 8) -> np.ndarray:
+def sample_points(seed: int, count: int = 8) -> np.ndarray:
     return np.cumsum(np.random.default_rng(seed).normal(size=(count, 3)), axis=0)
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6), st.integers(3, 12))
 def test_path_without_limits_is_a_natural_spline(seed: int, count: int) -> None:
-    waypoints = points(seed, count)
+    waypoints = sample_points(seed, count)
     path = fit_path(waypoints, np.ones(3), NOWHERE)
     np.testing.assert_allclose(np.diff(path.x), np.linalg.norm(np.diff(waypoints, axis=0), axis=1))
     along = np.linspace(path.x[0], path.x[-1], 200)
@@ -38,7 +38,7 @@ def test_path_of_two_points_is_straight() -> None:
 
 def test_linear_constraints_of_waypoints_hold_along_the_path() -> None:
     """The path is linear in the waypoints: zero combinations of coordinates stay zero."""
-    waypoints = points(5)
+    waypoints = sample_points(5)
     waypoints[:, 2] = 2.0 * waypoints[:, 0] - waypoints[:, 1]
     path = fit_path(waypoints, np.ones(3), NOWHERE)
     found = path(np.linspace(path.x[0], path.x[-1], 300))
@@ -48,7 +48,7 @@ def test_linear_constraints_of_waypoints_hold_along_the_path() -> None:
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6))
 def test_path_stays_within_limits(seed: int) -> None:
-    waypoints = points(seed)
+    waypoints = sample_points(seed)
     lower, upper = waypoints.min(axis=0), waypoints.max(axis=0)
     path = fit_path(waypoints, np.ones(3), (lower, upper))
     found = path(np.linspace(path.x[0], path.x[-1], 500))

@@ -16,7 +16,7 @@ from vkc_pin.planning.retiming.topp_ra import compute_speeds
 FREE = (np.full(2, -np.inf), np.full(2, np.inf))
 
 
-def duration(places: np.ndarray, speeds: np.ndarray) -> float:
+def compute_duration(places: np.ndarray, speeds: np.ndarray) -> float:
     return float((2.0 * np.diff(places) / (speeds[1:] + speeds[:-1])).sum())
 
 
@@ -33,7 +33,7 @@ def test_duration_of_a_straight_path(length: float, fastest: float, strongest: f
     shortest = (
         2.0 * np.sqrt(length / strongest) if fastest * ramp > length else length / fastest + ramp
     )
-    assert duration(places, speeds) == pytest.approx(shortest, rel=1e-2)
+    assert compute_duration(places, speeds) == pytest.approx(shortest, rel=1e-2)
     assert speeds[[0, -1]].tolist() == [0.0, 0.0]
     assert speeds.max() <= fastest * (1 + 1e-6)
 

@@ -12,7 +12,7 @@ from vkc_pin.planning.retiming.torque_bounds import TorqueBounds
 from vkc_pin.world.trajectory.dynamics.torques import Torques
 
 
-def opening(**resistance: float) -> tuple[TorqueBounds, CubicHermiteSpline]:
+def make_opening(**resistance: float) -> tuple[TorqueBounds, CubicHermiteSpline]:
     """Return the bounds of the last phase, in which the door opens, and its path over time."""
     plan, scene = plan_door(), load_door_with_closer(**resistance)
     phase = plan.trajectory.phases[-1]
@@ -27,7 +27,7 @@ def opening(**resistance: float) -> tuple[TorqueBounds, CubicHermiteSpline]:
 
 @pytest.mark.parametrize(("speed", "change"), [(0.3, 0.0), (1.0, -0.7), (1.8, 0.4)])
 def test_linearized_torques_equal_torques(speed: float, change: float) -> None:
-    bounds, path = opening(damping=200.0, friction=4.0, stiffness=5.0, springref=-2.0)
+    bounds, path = make_opening(damping=200.0, friction=4.0, stiffness=5.0, springref=-2.0)
     places = np.linspace(path.x[2], path.x[-3], 5)
     push, square, rest = bounds.linearize(path, path.x, np.full(len(path.x), speed), places)
     tangents, bends = path(places, 1), path(places, 2)
@@ -43,7 +43,7 @@ def test_linearized_torques_equal_torques(speed: float, change: float) -> None:
 
 
 def test_curve_is_slowed_down_to_the_torque_limit() -> None:
-    bounds, _ = opening(damping=500.0)
+    bounds, _ = make_opening(damping=500.0)
     plan = plan_door()
     phase = plan.trajectory.phases[-1]
     assert plan.trajectory.curve is not None
@@ -59,7 +59,7 @@ def test_curve_is_slowed_down_to_the_torque_limit() -> None:
 
 
 def test_curve_too_heavy_at_rest_is_not_slowed_down() -> None:
-    bounds, _ = opening()
+    bounds, _ = make_opening()
     plan = plan_door()
     phase = plan.trajectory.phases[-1]
     assert plan.trajectory.curve is not None

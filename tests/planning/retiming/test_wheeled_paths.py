@@ -21,7 +21,7 @@ SCALE = np.array([1.0, 1.0, 0.5, 0.3])
 TANK = RollingLimits(track=1.0, wheel_speed=1.0)
 
 
-def arcs(steps: list[tuple[float, float]]) -> np.ndarray:
+def make_arcs(steps: list[tuple[float, float]]) -> np.ndarray:
     """Return poses reached by arcs of given lengths [m] and turns [rad], and another coordinate."""
     poses = [np.array([0.3, -0.2, 0.9, 0.0])]
     for length, turn in steps:
@@ -39,7 +39,7 @@ def compute_slip(path: np.ndarray, slopes: np.ndarray) -> float:
 @settings(deadline=None)
 @given(STEPS)
 def test_base_rolls_through_waypoints_on_arcs(steps: list[tuple[float, float]]) -> None:
-    points = arcs(steps)
+    points = make_arcs(steps)
     passed = [points[:1]]
     for path, own in fit_rolling_paths(points, SCALE, FAR, TANK):
         knots = (len(path.x) - 1) // (len(own) - 1)
@@ -53,7 +53,7 @@ def test_base_rolls_through_waypoints_on_arcs(steps: list[tuple[float, float]]) 
     np.testing.assert_array_equal(np.concatenate(passed), points)
 
 
-def smooth_drive(count: int) -> np.ndarray:
+def make_smooth_drive(count: int) -> np.ndarray:
     """Return poses on a winding curve of small arcs that turns in place and reverses."""
     s = np.linspace(0.0, 1.0, 3000 * count + 1)
     speed, turn = 2.0 * np.cos(1.5 * np.pi * s), 2.0 * np.sin(4.0 * s)
@@ -65,7 +65,7 @@ def smooth_drive(count: int) -> np.ndarray:
 
 def test_paths_between_waypoints_roll() -> None:
     """A path through every second waypoint passes the others closely; splines would slip."""
-    fine = smooth_drive(40)
+    fine = make_smooth_drive(40)
     ((path, own),) = fit_rolling_paths(fine[::2], SCALE, FAR, TANK)
     assert len(own) == 21
     dense = np.linspace(0.0, path.x[-1], 4000)
@@ -91,7 +91,7 @@ def test_steered_base_stops_only_where_turns_would_be_too_tight(
     steps: list[tuple[float, float]], stops: int
 ) -> None:
     """Errors of a micrometre are no reason to stop."""
-    points = arcs(steps)
+    points = make_arcs(steps)
     noise = np.random.default_rng(0).uniform(-3e-7, 3e-7, (len(points) - 2, 2))
     points[1:-1, :2] += noise if len(points) == 7 else 0.0
     paths = fit_rolling_paths(points, SCALE, FAR, RollingLimits(turning_radius=1.0))
@@ -109,9 +109,11 @@ SCENES = {
 }
 
 
-def drives(base: str) -> Trajectory:
+def make_drive(base: str) -> Trajectory:
     scene = SCENES[base]
-    poses = arcs([(0.2, 0.0), (0.25, 0.1), (0.25, 0.2), (0.25, 0.25), (-0.1, 0.05), (-0.25, -0.2)])
+    poses = make_arcs(
+        [(0.2, 0.0), (0.25, 0.1), (0.25, 0.2), (0.25, 0.25), (-0.1, 0.05), (-0.25, -0.2)]
+    )
     rows = np.tile(scene.start, (len(poses), 1))
     rows[:, :3] = poses[:, :3] - poses[0, :3]
     turned = np.exp(-0.9j) * (rows[:, 0] + 1j * rows[:, 1])
@@ -123,7 +125,7 @@ def drives(base: str) -> Trajectory:
 @pytest.mark.parametrize("base", ["differential", "ackermann"])
 def test_trajectories_roll_within_wheel_limits(base: str) -> None:
     """Also with points on the arcs between waypoints."""
-    motion, wheels = drives(base), vkc.load_robot("husky_ur5e", base="differential").wheels
+    motion, wheels = make_drive(base), vkc.load_robot("husky_ur5e", base="differential").wheels
     assert wheels is not None
     for trajectory in (
         motion,

@@ -46,24 +46,26 @@ def drive(
     ].copy()
 
 
-def post(x: float, y: float, radius: float) -> dict[str, object]:
+def describe_post(x: float, y: float, radius: float) -> dict[str, object]:
     where = {"position": [x, y, 0.8], "length": 1.6, "radius": radius}
     return {"name": "post", "type": "cylinder", **where}
 
 
-def box(name: str, x: float, y: float, size: list[float]) -> dict[str, object]:
+def describe_box(name: str, x: float, y: float, size: list[float]) -> dict[str, object]:
     return {"name": name, "type": "box", "size": size, "position": [x, y, size[2] / 2]}
 
 
 @cache
-def pillar() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
-    return drive(3.2, post(1.6, 0.05, 0.15))
+def make_pillar_case() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
+    return drive(3.2, describe_post(1.6, 0.05, 0.15))
 
 
 @cache
-def walls() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
+def make_walls_case() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
     """Two walls cross the straight path; all waypoints share one radius."""
-    obstacles = [box(f"wall_{k}", 1.5 + 1.2 * k, (-1.0) ** k, [0.1, 3.0, 1.0]) for k in range(2)]
+    obstacles = [
+        describe_box(f"wall_{k}", 1.5 + 1.2 * k, (-1.0) ** k, [0.1, 3.0, 1.0]) for k in range(2)
+    ]
     return drive(4.2, *obstacles, options=vkc.Options(reach_waypoints=14))
 
 
@@ -86,17 +88,17 @@ def grasp() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
 
 
 @cache
-def blocked() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
+def make_blocked_case() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
     """A wall across the whole hall."""
-    return drive(4.0, box("wall", 2.0, 0.0, [1.0, 12.0, 2.0]))
+    return drive(4.0, describe_box("wall", 2.0, 0.0, [1.0, 12.0, 2.0]))
 
 
 Case = Callable[[], tuple[vkc.TrajectoryProblem, np.ndarray]]
-SOLVED: list[Case] = [pillar, grasp, reach]
+SOLVED: list[Case] = [make_pillar_case, grasp, reach]
 
 
 @cache
-def solution_of(case: Case) -> Solution:
+def solve_case(case: Case) -> Solution:
     return solve(*case())
 
 
@@ -119,16 +121,16 @@ def check_feasible(problem: vkc.TrajectoryProblem, solution: Solution) -> None:
 @pytest.mark.parametrize("case", SOLVED)
 def test_solution_is_feasible(case: Case) -> None:
     problem, guess = case()
-    solution = solution_of(case)
+    solution = solve_case(case)
     assert np.abs(problem.clip(guess) - solution.z).max() > 0.1
     assert (solution.converged, solution.status) == (True, "converged")
     assert solution.shortfall == 0.0
     check_feasible(problem, solution)
 
 
-@pytest.mark.parametrize("case", [*SOLVED, walls, blocked])
+@pytest.mark.parametrize("case", [*SOLVED, make_walls_case, make_blocked_case])
 def test_history_of_rounds(case: Case) -> None:
-    solution = solution_of(case)
+    solution = solve_case(case)
     history = solution.history
     assert [row.round for row in history] == list(range(1, solution.rounds + 1))
     assert solution.iterations == history[-1].iterations
@@ -151,7 +153,7 @@ def test_history_of_rounds(case: Case) -> None:
 
 
 def test_rejected_rounds_shrink_the_trust_region() -> None:
-    history = solution_of(walls).history
+    history = solve_case(make_walls_case).history
     rejected = [(row, after) for row, after in itertools.pairwise(history) if not row.accepted]
     assert rejected, "no round was rejected: choose a harder problem"
     for row, after in rejected:
@@ -159,7 +161,7 @@ def test_rejected_rounds_shrink_the_trust_region() -> None:
 
 
 def test_nearly_feasible_motions_take_small_steps() -> None:
-    history = solution_of(grasp).history
+    history = solve_case(grasp).history
     nearly = [
         after
         for row, after in itertools.pairwise(history)
@@ -174,16 +176,16 @@ def test_nearly_feasible_motions_take_small_steps() -> None:
 @pytest.mark.parametrize("case", SOLVED)
 def test_feasible_motions_are_improved_while_worthwhile(case: Case) -> None:
     """The last round improves little, or nothing limited its step."""
-    *earlier, last = solution_of(case).history
+    *earlier, last = solve_case(case).history
     accepted = [row.objective for row in earlier if row.accepted]
     assert last.accepted
     improved = last.objective < (1.0 - MIN_IMPROVEMENT) * accepted[-1]
     assert not improved or last.step < ACTIVE_FRACTION * last.radius
-    assert solution_of(case).rounds < case()[0].options.max_outer
+    assert solve_case(case).rounds < case()[0].options.max_outer
 
 
 def test_blocked_motions_end_early() -> None:
-    (problem, guess), solution = blocked(), solution_of(blocked)
+    (problem, guess), solution = make_blocked_case(), solve_case(make_blocked_case)
     assert (solution.status, solution.converged) == ("not converged", False)
     assert PROGRESS_ROUNDS <= solution.rounds < FEW.max_outer
     shortfall = problem.evaluate_contacts(solution.z, reach=0.1).compute_violation()
@@ -194,14 +196,14 @@ def test_blocked_motions_end_early() -> None:
 
 def test_callback_receives_the_history() -> None:
     rows: list[object] = []
-    solution = solve(*pillar(), callback=rows.append)
+    solution = solve(*make_pillar_case(), callback=rows.append)
     assert rows == solution.history
     # the same guess gives the same motion
-    np.testing.assert_array_equal(solution.z, solution_of(pillar).z)
+    np.testing.assert_array_equal(solution.z, solve_case(make_pillar_case).z)
 
 
 def test_solution_continues_with_given_radii() -> None:
-    problem, guess = pillar()
+    problem, guess = make_pillar_case()
     first = solve(problem, guess, rounds=3)
     assert first.radius is not None
     assert len(np.unique(first.radius)) > 1, "one radius for all: choose a harder problem"
@@ -217,7 +219,7 @@ def test_solution_continues_with_given_radii() -> None:
 def test_waypoints_do_not_jump_through_obstacles(penalty: float) -> None:
     """A guess around a thin post stays on its side, even if overlap costs less than the detour."""
     options = dataclasses.replace(FEW, penalty=penalty)
-    problem, guess = drive(3.2, post(1.6, -0.42, 0.02), options=options)
+    problem, guess = drive(3.2, describe_post(1.6, -0.42, 0.02), options=options)
     guess[:, 1] -= 1.3 * np.sin(np.linspace(0.0, np.pi, len(guess) + 1)[1:])
     assert find_segment_contacts(problem, guess).is_free
     solution = solve(problem, guess)
@@ -231,7 +233,7 @@ def test_penalty_weights_are_raised_if_stalled_near_feasibility(
     overlap: float, is_near: bool
 ) -> None:
     """The base overlaps a wall at its goal; only a large overlap is reported."""
-    wall = box("wall", 1.565 - overlap, 0.0, [0.1, 2.0, 0.5])
+    wall = describe_box("wall", 1.565 - overlap, 0.0, [0.1, 2.0, 0.5])
     problem, guess = drive(1.0, wall, options=vkc.Options(reach_waypoints=8))
     solution = solve(problem, guess)
     assert not solution.converged
@@ -251,7 +253,7 @@ def test_motion_to_the_start_is_stationary() -> None:
 def test_steps_of_a_stationary_guess_are_lengthened() -> None:
     """Infeasible waypoints are a poor estimate of the duration."""
     problem, guess = reach()
-    assert solution_of(reach).dt.min() > 1.5 * problem.timing_for(guess).dt.max()
+    assert solve_case(reach).dt.min() > 1.5 * problem.timing_for(guess).dt.max()
 
 
 def test_rate_limits_hold_if_the_guess_jumps() -> None:
@@ -273,7 +275,7 @@ def test_rate_limits_hold_if_the_guess_jumps() -> None:
 
 
 def test_exhausted_time_returns_the_guess_within_bounds() -> None:
-    problem, guess = pillar()
+    problem, guess = make_pillar_case()
     with Budget(seconds=0.0).activate():
         solution = solve(problem, guess + 20.0)
     assert (solution.status, solution.converged, solution.rounds) == ("time limit", False, 0)
@@ -284,11 +286,11 @@ def test_exhausted_time_returns_the_guess_within_bounds() -> None:
 def test_evaluation_limit_is_deterministic() -> None:
     """The best iterate is returned; a sufficient budget changes nothing."""
     with Budget().activate() as budget:
-        whole = solve(*pillar())
+        whole = solve(*make_pillar_case())
     cut = []
     for share in (2, 2, 1):
         with Budget(max_evaluations=budget.evaluations // share).activate():
-            cut.append(solve(*pillar()))
+            cut.append(solve(*make_pillar_case()))
     np.testing.assert_array_equal(cut[2].z, whole.z)
     assert cut[2].converged
     assert cut[0].status == "evaluation limit"
@@ -300,10 +302,10 @@ def test_evaluation_limit_is_deterministic() -> None:
 def test_feasible_motion_is_kept_if_the_budget_ends() -> None:
     used: list[int] = []
     with Budget().activate() as budget:
-        whole = solve(*pillar(), callback=lambda _: used.append(budget.evaluations))
+        whole = solve(*make_pillar_case(), callback=lambda _: used.append(budget.evaluations))
     assert any(row.accepted and row.shortfall == 0.0 for row in whole.history[:-1])
     with Budget(max_evaluations=used[-1] - 1).activate():
-        solution = solve(*pillar())
+        solution = solve(*make_pillar_case())
     assert solution.rounds < whole.rounds
     assert (solution.converged, solution.status) == (True, "converged")
-    check_feasible(pillar()[0], solution)
+    check_feasible(make_pillar_case()[0], solution)

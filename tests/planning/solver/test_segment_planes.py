@@ -26,11 +26,11 @@ WIDTH = 2.0  # [m] the base drives sideways
 FEW = vkc.Options(reach_waypoints=5, dt=1.0)
 
 
-def box(x: float, y: float, size: list[float]) -> dict[str, object]:
+def describe_box(x: float, y: float, size: list[float]) -> dict[str, object]:
     return {"name": "box", "type": "box", "size": size, "position": [x, y, size[2] / 2]}
 
 
-def problem_of(scene: vkc.Scene, **goal: float) -> tuple[TrajectoryProblem, np.ndarray]:
+def make_problem(scene: vkc.Scene, **goal: float) -> tuple[TrajectoryProblem, np.ndarray]:
     """Return a problem with few waypoints and the straight path, shape (N, n)."""
     end = move_start(scene.start, **goal)
     problem = make_program(scene, [vkc.GoTo(*end[:3])], options=FEW)
@@ -38,12 +38,12 @@ def problem_of(scene: vkc.Scene, **goal: float) -> tuple[TrajectoryProblem, np.n
 
 
 @cache
-def past_a_post() -> tuple[TrajectoryProblem, np.ndarray]:
+def make_post_case() -> tuple[TrajectoryProblem, np.ndarray]:
     """The hand, moving sideways, passes through a post between the second and third waypoint."""
     tool = make_hall().with_start(arm=ARM).tool_placement().translation
     post = {"name": "post", "type": "cylinder", "radius": 0.03, "length": 1.6}
     post["position"] = [float(tool[0]) + 0.02, float(tool[1]) + WIDTH / 2, 0.8]
-    return problem_of(make_hall(obstacles=[post]).with_start(arm=ARM), y=WIDTH)
+    return make_problem(make_hall(obstacles=[post]).with_start(arm=ARM), y=WIDTH)
 
 
 def sample_segment(
@@ -57,7 +57,7 @@ def sample_segment(
 
 
 def test_thin_obstacle_between_waypoints_is_avoided() -> None:
-    problem, z = past_a_post()
+    problem, z = make_post_case()
     assert problem.evaluate_contacts(z, reach=0.02).compute_clearance() == np.inf
     assert not find_segment_contacts(problem, z).is_free
     solution = solve(problem, z)
@@ -69,7 +69,7 @@ def test_thin_obstacle_between_waypoints_is_avoided() -> None:
 
 def test_deepest_samples_become_planes_at_both_ends() -> None:
     """For each pair, both planes miss the clearance that the segment lacks."""
-    problem, z = past_a_post()
+    problem, z = make_post_case()
     found, dense = find_segment_contacts(problem, z).contacts, sample_segment(problem, z, 2)
     labels = problem.contacts.phases[0].labels
     assert {labels[j] for j in found.pair[:, 1]} == {"post"}
@@ -86,7 +86,7 @@ def test_deepest_samples_become_planes_at_both_ends() -> None:
 
 def test_lifting_both_ends_lifts_the_segment_to_first_order() -> None:
     """Moving both waypoints by ε along the normal moves the sample's distance by ε + O(ε²)."""
-    problem, z = past_a_post()
+    problem, z = make_post_case()
     found = find_segment_contacts(problem, z).contacts
     index = int(np.argmax(found.margin - found.distance))
     pair, normal = found.pair[index], found.normal[index]
@@ -106,7 +106,9 @@ def test_lifting_both_ends_lifts_the_segment_to_first_order() -> None:
 
 
 def test_witness_points_are_fixed_in_their_bodies() -> None:
-    problem, z = problem_of(make_hall(obstacles=[box(0.0, 1.0, [0.04, 0.04, 1.6])]), y=WIDTH)
+    problem, z = make_problem(
+        make_hall(obstacles=[describe_box(0.0, 1.0, [0.04, 0.04, 1.6])]), y=WIDTH
+    )
     found = find_segment_contacts(problem, z).contacts
     along = np.einsum("ci,ci->c", found.normal, found.second - found.first)
     np.testing.assert_allclose(found.distance, along, atol=1e-12)
@@ -121,8 +123,8 @@ def test_witness_points_are_fixed_in_their_bodies() -> None:
 @pytest.mark.parametrize(("gap", "is_free"), [(0.9, False), (1.1, True)])
 def test_segments_need_some_clearance(gap: float, is_free: bool) -> None:
     """The base passes a wall at `gap` times the tolerance."""
-    scene = make_hall(obstacles=[box(1.0, 1.0, [4.0, 0.1, 0.5])])
-    problem, _ = problem_of(scene, x=2.0)
+    scene = make_hall(obstacles=[describe_box(1.0, 1.0, [4.0, 0.1, 0.5])])
+    problem, _ = make_problem(scene, x=2.0)
     y = scene.start_clearance() - gap * CLEARANCE_TOLERANCE
     z = np.array([move_start(scene.start, x=x, y=y) for x in (0.5, 1.0, 1.5, 2.0, 2.5)])
     found = find_segment_contacts(problem, z)
@@ -131,16 +133,16 @@ def test_segments_need_some_clearance(gap: float, is_free: bool) -> None:
 
 
 def test_start_close_to_an_obstacle_can_be_left() -> None:
-    scene = make_hall(obstacles=[box(0.546, 0.0, [0.1, 2.0, 0.5])])
+    scene = make_hall(obstacles=[describe_box(0.546, 0.0, [0.1, 2.0, 0.5])])
     assert 0.0 < scene.start_clearance() < SEGMENT_MARGIN
     for x, is_in_collision in ((-1.0, False), (1.0, True)):
-        found = find_segment_contacts(*problem_of(scene, x=x))
+        found = find_segment_contacts(*make_problem(scene, x=x))
         assert (0 in found.contacts.waypoint) == is_in_collision
         assert found.is_free != is_in_collision
 
 
 def test_merged_contacts_are_sorted_by_waypoint_and_violation() -> None:
-    problem, z = past_a_post()
+    problem, z = make_post_case()
     parts = problem.evaluate_contacts(z, reach=0.3), find_segment_contacts(problem, z).contacts
     both = merge_contacts(*parts)
     assert len(both.waypoint) == sum(len(part.waypoint) for part in parts)
@@ -153,6 +155,6 @@ def test_merged_contacts_are_sorted_by_waypoint_and_violation() -> None:
 
 
 def test_stationary_segments_have_no_contacts() -> None:
-    problem, _ = past_a_post()
+    problem, _ = make_post_case()
     found = find_segment_contacts(problem, problem.still)
     assert (len(found.contacts.waypoint), found.is_free, found.crossings) == (0, True, [])

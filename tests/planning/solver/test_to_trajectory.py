@@ -41,7 +41,7 @@ def make_random(problem: TrajectoryProblem, seed: int = 0) -> tuple[np.ndarray, 
     return z, make_trajectory(problem, z, problem.timing_for(problem.still).dt)
 
 
-def pauses(problem: TrajectoryProblem, motion: Trajectory) -> list[int]:
+def find_pauses(problem: TrajectoryProblem, motion: Trajectory) -> list[int]:
     """Return the waypoints at which the robot has waited for the gripper."""
     robot = motion.robot_size
     still = (np.diff(motion.positions[:, :robot], axis=0) == 0.0).all(axis=1)
@@ -68,7 +68,7 @@ def test_phases_list_attached_objects() -> None:
         (n, 2 * n + 1),
         (2 * n + 1, 3 * n + 2),
     ]
-    assert pauses(fetch_problem(), motion) == [n + 1, 2 * n + 2]
+    assert find_pauses(fetch_problem(), motion) == [n + 1, 2 * n + 2]
 
 
 def test_last_object_is_released_at_the_end() -> None:
@@ -76,7 +76,7 @@ def test_last_object_is_released_at_the_end() -> None:
     assert [phase.name for phase in motion.phases] == ["reach stick.grip", "place stick", "let go"]
     assert [dict(phase.held) for phase in motion.phases] == [{}, {"stick": "grip"}, {}]
     n = SHORT.reach_waypoints
-    assert pauses(place_problem(), motion) == [n + 1, 2 * n + 2]
+    assert find_pauses(place_problem(), motion) == [n + 1, 2 * n + 2]
     assert motion.phases[-1].last == len(motion.times) - 1
 
 
@@ -106,7 +106,7 @@ def test_robot_waits_only_for_the_gripper() -> None:
     steps: list[Step] = [Actuate("door", {"hinge": 1.2}), GoTo(0.0, 0.0)]
     problem = make_program(load_door_scene(), steps, options=SHORT)
     grasp, _, release, _ = problem.ends.tolist()
-    assert pauses(problem, make_random(problem)[1]) == [grasp + 1, release + 2]
+    assert find_pauses(problem, make_random(problem)[1]) == [grasp + 1, release + 2]
 
 
 def test_object_grasped_at_the_start_is_released_first() -> None:
@@ -124,7 +124,7 @@ def test_object_grasped_at_the_start_is_released_first() -> None:
 def test_robot_follows_the_waypoints(make) -> None:  # type: ignore[no-untyped-def]
     problem = make()
     z, motion = make_random(problem)
-    rows = np.delete(motion.positions, pauses(problem, motion), axis=0)
+    rows = np.delete(motion.positions, find_pauses(problem, motion), axis=0)
     robot = motion.robot_size
     np.testing.assert_array_equal(rows[:, :robot], problem.waypoints(z)[:, :robot])
 
@@ -135,7 +135,7 @@ def test_grasp_coordinates_hold_their_values(make) -> None:  # type: ignore[no-u
     problem = make()
     z, motion = make_random(problem)
     path = problem.waypoints(z)
-    rows = np.delete(motion.positions, pauses(problem, motion), axis=0)
+    rows = np.delete(motion.positions, find_pauses(problem, motion), axis=0)
     ends = [0, *problem.ends.tolist()]
     for hold, names in problem.chain.virtual.items():
         columns = [problem.chain.index(name) for name in names]

@@ -17,7 +17,7 @@ REACH, GRAZING = 8, -0.353
 
 
 @cache
-def posts() -> TrajectoryProblem:
+def make_posts_problem() -> TrajectoryProblem:
     """Two posts at x = 2 and 4 m in the path of the base, which is a metre long."""
     obstacles = [
         {
@@ -34,11 +34,11 @@ def posts() -> TrajectoryProblem:
     return make_program(make_hall(obstacles=obstacles), steps, options=options)
 
 
-def base_crossings(
+def find_base_crossings(
     xs: list[float], segments: list[int], y: float = 0.0
 ) -> dict[str, list[tuple[int, int]]]:
     """Return the first and last segments in which the base crosses each post."""
-    problem = posts()
+    problem = make_posts_problem()
     states = np.array([move_start(problem.start, x=x, y=y) for x in xs])
     where = np.array(segments)
     near = problem.contacts.evaluate(states, where + 1, reach=0.05)
@@ -73,17 +73,17 @@ def base_crossings(
 def test_crossings_enter_and_leave_on_opposite_sides(
     xs: list[float], segments: list[int], expected: dict[str, list[tuple[int, int]]]
 ) -> None:
-    assert base_crossings(xs, segments) == expected
+    assert find_base_crossings(xs, segments) == expected
 
 
 def test_grazing_is_no_crossing() -> None:
     """The side of the base overlaps the post, and the normal turns by less than a right angle."""
     xs = np.linspace(1.0, 3.0, 200).tolist()
-    assert base_crossings(xs, [0] * 200, y=-0.3) == {"post_2": [(0, 0)]}
-    assert base_crossings(xs, [0] * 200, y=GRAZING) == {}
-    states = np.array([move_start(posts().start, x=x, y=GRAZING) for x in xs])
-    near = posts().contacts.evaluate(states, np.ones(200, int), reach=0.0)
-    labels = posts().contacts.phases[0].labels
+    assert find_base_crossings(xs, [0] * 200, y=-0.3) == {"post_2": [(0, 0)]}
+    assert find_base_crossings(xs, [0] * 200, y=GRAZING) == {}
+    states = np.array([move_start(make_posts_problem().start, x=x, y=GRAZING) for x in xs])
+    near = make_posts_problem().contacts.evaluate(states, np.ones(200, int), reach=0.0)
+    labels = make_posts_problem().contacts.phases[0].labels
     assert "base_link" in {labels[pair[0]] for pair in near.pair}
 
 

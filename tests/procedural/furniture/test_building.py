@@ -10,7 +10,7 @@ from vkc_pin.procedural.furniture.building import LinkBuilder, ObjectBuilder
 from vkc_pin.world.models.object_file import load_object
 
 
-def built() -> ObjectBuilder:
+def build_object() -> ObjectBuilder:
     builder = ObjectBuilder("thing", LinkBuilder("base"))
     builder.base.add_box((0.0, -0.2, 0.0), (0.3, 0.2, 0.5), "oak")
     moved = builder.add_joint(
@@ -41,7 +41,7 @@ def built() -> ObjectBuilder:
 
 
 def test_masses_and_inertias_match_pinocchio() -> None:
-    thing = load_object(built().description)
+    thing = load_object(build_object().description)
     shapes = (
         (pin.Inertia.FromBox(500.0 * 0.2 * 0.2 * 0.1, 0.2, 0.2, 0.1), pin.SE3.Identity()),
         (

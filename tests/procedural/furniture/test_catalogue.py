@@ -24,12 +24,12 @@ FEW = settings(max_examples=10, deadline=None, phases=[Phase.generate])
 EACH = st.sampled_from(sorted(KINDS))
 
 
-def placed(kind: str, seed: int) -> vkc.PlacedObject:
+def place_object(kind: str, seed: int) -> vkc.PlacedObject:
     thing = vkc.load_object(vkc.procedural.random_object(kind, seed))
     return vkc.PlacedObject(kind, thing, pin.SE3.Identity(), np.clip(0.0, thing.lower, thing.upper))
 
 
-def hand() -> list:
+def get_hand_shapes() -> list:
     """Return the shapes of the gripper and the last link of the arm, in the tool's frame."""
     model, data, geometry = ROBOT.model, ROBOT.model.createData(), ROBOT.collision
     shapes = geometry.createData()
@@ -46,14 +46,14 @@ def hand() -> list:
     ]
 
 
-HAND = hand()
+HAND = get_hand_shapes()
 
 
 @FEW
 @given(EACH, st.integers(0, 5000))
 def test_the_hand_fits_around_every_handle(kind: str, seed: int) -> None:
     """Open fingers keep a plan's clearances: 5 mm to the grasped link, 20 mm to others."""
-    own = placed(kind, seed)
+    own = place_object(kind, seed)
     assert len(own.object.attachments) >= 2
     for attachment in own.object.attachments.values():
         tool = own.link_placement(attachment.link) * attachment.tool(
@@ -76,7 +76,7 @@ def test_the_hand_fits_around_every_handle(kind: str, seed: int) -> None:
 @given(EACH, st.integers(0, 5000))
 def test_links_pass_each_other(kind: str, seed: int) -> None:
     """One joint at a time, from end to end, no link enters the base or another link."""
-    own = placed(kind, seed)
+    own = place_object(kind, seed)
     model = own.object.model
     for k, joint in enumerate(own.object.coordinates.names):
         if model.parents[model.getJointId(joint)] != 0:
@@ -103,7 +103,7 @@ def test_links_pass_each_other(kind: str, seed: int) -> None:
 @FEW
 @given(EACH, st.integers(0, 5000))
 def test_doors_open_towards_the_user(kind: str, seed: int) -> None:
-    own = placed(kind, seed)
+    own = place_object(kind, seed)
     for attachment in own.object.attachments.values():
         joint = (
             own.object.coordinates.names[0]

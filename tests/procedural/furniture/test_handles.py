@@ -14,7 +14,7 @@ from vkc_pin.world.models.object_file import load_object
 FACE = (-0.01, 0.2, 0.3)
 
 
-def builder(kind: str, height: float = 0.9) -> ObjectBuilder:
+def make_builder(kind: str, height: float = 0.9) -> ObjectBuilder:
     builder = ObjectBuilder("thing", LinkBuilder("base"))
     builder.base.add_box((0, -0.3, 0), (0.4, 0.3, 0.6), "oak")
     leaf = builder.add_joint(
@@ -32,7 +32,7 @@ def builder(kind: str, height: float = 0.9) -> ObjectBuilder:
 
 @pytest.mark.parametrize(("kind", "along"), [("upright", 2), ("level", 1)])
 def test_bar_can_be_grasped_anywhere_between_its_posts(kind: str, along: int) -> None:
-    thing = load_object(builder(kind).description)
+    thing = load_object(make_builder(kind).description)
     fixed, free = thing.attachment("handle"), thing.attachment("handle_free")
     centre = np.array(FACE) - [0.06, 0.0, 0.0]
     np.testing.assert_allclose(fixed.placement.translation, centre, atol=1e-9)
@@ -51,7 +51,7 @@ def test_bar_can_be_grasped_anywhere_between_its_posts(kind: str, along: int) ->
 @pytest.mark.parametrize(("height", "down"), [(0.9, 0.0), (0.55, 0.0), (0.3, 0.65), (0.1, 0.65)])
 def test_low_bars_are_grasped_from_above(height: float, down: float) -> None:
     approach = (
-        load_object(builder("level", height).description)
+        load_object(make_builder("level", height).description)
         .attachment("handle")
         .placement.rotation[:, 2]
     )
@@ -59,7 +59,7 @@ def test_low_bars_are_grasped_from_above(height: float, down: float) -> None:
 
 
 def test_knob_can_be_grasped_from_any_direction_in_front() -> None:
-    free = load_object(builder("knob").description).attachment("handle_free")
+    free = load_object(make_builder("knob").description).attachment("handle_free")
     rng = np.random.default_rng(0)
     for _ in range(20):
         tool = free.tool(

@@ -21,11 +21,11 @@ PLACE = ((-3.0, 1.3, 1.051), 0.2)
 
 
 @cache
-def home() -> vkc.Scene:
+def load_home() -> vkc.Scene:
     return vkc.load_scene("household")
 
 
-def parts(scene: vkc.Scene) -> tuple[list, list]:
+def split_parts(scene: vkc.Scene) -> tuple[list, list]:
     """Return what stood there before, and the clutter."""
     new = [shape for shape in scene.obstacles if shape.name.startswith("clutter_")]
     old = [shape for shape in scene.obstacles if not shape.name.startswith("clutter_")]
@@ -37,9 +37,9 @@ def parts(scene: vkc.Scene) -> tuple[list, list]:
 @settings(max_examples=2, deadline=None)
 @given(st.integers(0, 2**31), st.integers(1, 25))
 def test_clutter_rests_or_hangs_without_collisions(seed: int, things: int) -> None:
-    scene = add_clutter(home(), things, seed=seed, clear=[PLACE])
-    assert add_clutter(home(), things, seed=seed, clear=[PLACE]).document == scene.document
-    old, new = parts(scene)
+    scene = add_clutter(load_home(), things, seed=seed, clear=[PLACE])
+    assert add_clutter(load_home(), things, seed=seed, clear=[PLACE]).document == scene.document
+    old, new = split_parts(scene)
     assert len(new) == things
     for shape in new:
         picture = isinstance(shape.geometry, coal.Box) and 2 * min(shape.geometry.halfSide) == 0.025
@@ -60,12 +60,12 @@ def test_clutter_rests_or_hangs_without_collisions(seed: int, things: int) -> No
 
 
 def test_clutter_keeps_free_places_clear() -> None:
-    _, new = parts(add_clutter(home(), 100, seed=2, clear=[PLACE]))
+    _, new = split_parts(add_clutter(load_home(), 100, seed=2, clear=[PLACE]))
     shapes = [(shape.geometry, shape.placement) for shape in new]
     ball = vkc.load_scene("household").objects["cup"].placement.copy()
     for middle, radius in [
         PLACE,
-        *((p.placement.translation, 0.15) for p in home().objects.values() if p.object.free),
+        *((p.placement.translation, 0.15) for p in load_home().objects.values() if p.object.free),
     ]:
         ball.translation = np.array(middle)
         assert compute_clearance(shapes, [(coal.Sphere(radius), ball)]) > -1e-6
@@ -78,4 +78,4 @@ def test_too_much_clutter_is_rejected() -> None:
         with pytest.raises(InputError, match="no space"):
             add_clutter(vkc.Scene.from_document({**empty, "obstacles": obstacles}), things)
     with pytest.raises(InputError, match="count"):
-        add_clutter(home(), -1)
+        add_clutter(load_home(), -1)

@@ -18,7 +18,7 @@ RECTANGLES = st.builds(
 )
 
 
-def as_box(one: Rectangle) -> tuple[coal.Box, pin.SE3]:
+def make_box(one: Rectangle) -> tuple[coal.Box, pin.SE3]:
     return coal.Box(one.length, one.width, 1.0), pin.SE3(
         pin.rpy.rpyToMatrix(0.0, 0.0, one.yaw), np.array([one.x, one.y, 0.0])
     )
@@ -26,7 +26,7 @@ def as_box(one: Rectangle) -> tuple[coal.Box, pin.SE3]:
 
 @given(RECTANGLES, RECTANGLES)
 def test_gap_bounds_the_distance_from_below(one: Rectangle, other: Rectangle) -> None:
-    distance = compute_shape_distance(*as_box(one), *as_box(other))
+    distance = compute_shape_distance(*make_box(one), *make_box(other))
     gap = one.compute_gap(other)
     assert gap == pytest.approx(other.compute_gap(one))
     if distance > 1e-6:
@@ -38,7 +38,7 @@ def test_gap_bounds_the_distance_from_below(one: Rectangle, other: Rectangle) ->
 @given(RECTANGLES, st.floats(-3, 3), st.floats(-3, 3))
 def test_the_distance_of_a_point(one: Rectangle, x: float, y: float) -> None:
     point = coal.Sphere(1e-3), pin.SE3(np.eye(3), np.array([x, y, 0.0]))
-    expected = max(compute_shape_distance(*as_box(one), *point) + 1e-3, 0.0)
+    expected = max(compute_shape_distance(*make_box(one), *point) + 1e-3, 0.0)
     (found,) = one.compute_distances([[x, y]])
     assert found == pytest.approx(expected, abs=2e-3)
 

@@ -15,7 +15,7 @@ from vkc_pin.world.scene.placed_object import make_world_shapes
 FLOOR = Floor(6.0, 5.0)
 
 
-def scene(*standing: parts.Part, walls: bool = False) -> vkc.Scene:
+def make_scene(*standing: parts.Part, walls: bool = False) -> vkc.Scene:
     obstacles = [
         *(parts.make_walls(FLOOR, 2.4, standing) if walls else []),
         *(o for part in standing for o in part.obstacles),
@@ -26,7 +26,7 @@ def scene(*standing: parts.Part, walls: bool = False) -> vkc.Scene:
     return vkc.Scene.from_document({**own, "obstacles": obstacles, "objects": objects})
 
 
-def extent(found: vkc.Scene) -> np.ndarray:
+def compute_extent(found: vkc.Scene) -> np.ndarray:
     boxes = np.array(
         [compute_world_box(shape.geometry, shape.placement) for shape in found.obstacles]
     )
@@ -39,7 +39,7 @@ def test_a_table_stands_on_its_footprint_and_has_a_free_side(side: int) -> None:
     table = parts.make_table(
         "table", Frame(*wall.transform_point(-0.5, 0.0), wall.yaw), (0.8, 1.4, 0.74)
     )
-    low, high = extent(scene(table))
+    low, high = compute_extent(make_scene(table))
     assert [*low[:2], *high[:2]] == pytest.approx(
         [*table.footprint.corners.min(axis=0), *table.footprint.corners.max(axis=0)]
     )
@@ -55,7 +55,7 @@ def test_a_table_stands_on_its_footprint_and_has_a_free_side(side: int) -> None:
 
 def test_a_shelf_stands_against_its_wall() -> None:
     shelf = parts.make_shelf("shelf", FLOOR.make_wall_frame(0, 0.3), (0.3, 1.0, 1.8), 4)
-    low, high = extent(scene(shelf))
+    low, high = compute_extent(make_scene(shelf))
     assert np.array([low, high]) == pytest.approx(
         np.array([[2.68, -0.2, 0.0], [2.98, 0.8, 1.8]]), abs=1e-3
     )
@@ -69,7 +69,7 @@ def test_a_shelf_stands_against_its_wall() -> None:
 )
 def test_openable_object_is_at_its_wall_with_free_floor(kind: str, side: int) -> None:
     part = parts.make_openable(kind, make_fixture(kind, side), FLOOR, side, 0.5, 1.8)
-    room = scene(part, walls=True)
+    room = make_scene(part, walls=True)
     placed = room.objects[kind]
     walls = list_placed_shapes(room.obstacles)
     assert (
@@ -100,8 +100,8 @@ def test_openable_object_is_at_its_wall_with_free_floor(kind: str, side: int) ->
 )
 def test_small_objects_are_on_a_counter(kind: str, seed: int) -> None:
     part = parts.make_openable("it", make_fixture(kind, seed), FLOOR, 2, 0.3, 1.8)
-    low, high = extent(scene(part))
-    room = scene(part)
+    low, high = compute_extent(make_scene(part))
+    room = make_scene(part)
     boxes = np.array(
         [
             compute_world_box(shape.geometry, shape.placement)
@@ -141,7 +141,7 @@ def test_walls_close_the_room_but_for_doors() -> None:
 @pytest.mark.parametrize("kind", parts.CARRIED)
 def test_free_object_rests_on_its_table(kind: str) -> None:
     table = parts.make_table("table", Frame(1.0, -0.5, np.pi), (0.8, 1.4, 0.74))
-    room = scene(table, parts.make_carried_object(kind, kind, table, -0.2, 0.3))
+    room = make_scene(table, parts.make_carried_object(kind, kind, table, -0.2, 0.3))
     placed = room.objects[kind]
     gap = compute_clearance(
         list_placed_shapes(make_world_shapes(placed)), list_placed_shapes(room.obstacles)

@@ -28,7 +28,7 @@ KNOWN = sorted([*OPENABLE, *(f"random_{kind}" for kind in KINDS)])
 OBJECTS = st.one_of(st.none(), st.lists(st.sampled_from(KNOWN), max_size=2).map(tuple))
 
 
-def groups(layout: Layout, scene: vkc.Scene) -> dict[str, list]:
+def group_shapes(layout: Layout, scene: vkc.Scene) -> dict[str, list]:
     """Return the collision shapes of every part and of the walls."""
     found: dict[str, list] = {part.name: [] for part in layout.parts}
     owners = {
@@ -59,7 +59,7 @@ def test_rooms_are_free_of_overlaps_and_have_places_to_stand(
     scene = layout.make_scene()
     assert all(4.0 <= size <= 7.0 for size in (layout.floor.width, layout.floor.depth))
 
-    shapes = groups(layout, scene)
+    shapes = group_shapes(layout, scene)
     for one, other in itertools.combinations(shapes, 2):
         distance = compute_clearance(
             list_placed_shapes(shapes[one]), list_placed_shapes(shapes[other]), reach=0.05

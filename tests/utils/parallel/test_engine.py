@@ -11,13 +11,13 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.parallel.engine import MAX_CRASHES, CrashedTask, require_dask, run_tasks
 
 
-def numbered(count: int) -> list[tuple[str, int]]:
+def make_tasks(count: int) -> list[tuple[str, int]]:
     return [(str(k), k) for k in range(count)]
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_tasks_run_once_in_any_number_of_processes(jobs: int) -> None:
-    found = list(run_tasks(double, numbered(20), jobs=jobs))
+    found = list(run_tasks(double, make_tasks(20), jobs=jobs))
     assert sorted((int(key), value) for key, value in found) == [(k, 2 * k) for k in range(20)]
 
 
@@ -31,7 +31,7 @@ def test_crashed_processes_lose_and_repeat_no_other_task(tmp_path: Path) -> None
 
 def test_tasks_that_no_process_survives_are_given_up() -> None:
     pytest.importorskip("distributed")
-    found = dict(run_tasks(hang, numbered(4), jobs=2, dask=True, limit=1.0))
+    found = dict(run_tasks(hang, make_tasks(4), jobs=2, dask=True, limit=1.0))
     assert isinstance(found["1"], CrashedTask)
     assert f"{MAX_CRASHES} processes died" in found["1"].reason
     assert [found[key] for key in ("0", "2", "3")] == [0, 4, 6]
@@ -63,7 +63,7 @@ def test_missing_schedulers_raise(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr("vkc_pin.utils.parallel.engine._CONNECT_TIMEOUT", 1.0)
     with pytest.raises(InputError, match="no scheduler answers") as caught:
-        list(run_tasks(double, numbered(2), scheduler="tcp://127.0.0.1:9"))
+        list(run_tasks(double, make_tasks(2), scheduler="tcp://127.0.0.1:9"))
     assert caught.value.field == "scheduler"
 
 
@@ -89,6 +89,6 @@ def test_schedulers_without_workers_are_reported(monkeypatch: pytest.MonkeyPatch
                 cluster.scale(1)
 
         assert dict(
-            run_tasks(double, numbered(3), scheduler=cluster.scheduler_address, tell=tell)
+            run_tasks(double, make_tasks(3), scheduler=cluster.scheduler_address, tell=tell)
         ) == {"0": 0, "1": 2, "2": 4}
     assert sum("no workers" in line for line in lines) == 1

@@ -11,11 +11,11 @@ from vkc_pin.utils.parallel.journal import Journal, JournalContents
 HEADER = {"settings": {"recipe": "abc"}, "versions": {"pin": "4"}}
 
 
-def opened(path: Path, header: dict[str, dict[str, str]] = HEADER) -> Journal:
+def open_journal(path: Path, header: dict[str, dict[str, str]] = HEADER) -> Journal:
     return Journal(path, path.open("a+b"), header, "episodes")
 
 
-def line(key: int) -> dict[str, object]:
+def make_line(key: int) -> dict[str, object]:
     return {
         "key": str(key),
         "records": [{"number": key}],
@@ -25,11 +25,11 @@ def line(key: int) -> dict[str, object]:
 
 
 def test_journals_are_read_while_they_are_written(tmp_path: Path) -> None:
-    journal = opened(tmp_path / "j")
+    journal = open_journal(tmp_path / "j")
     for jobs, keys in ((1, (0, 4)), (2, (1, 2, 3))):
         journal.append({"session": {"jobs": jobs}})
         for key in keys:
-            journal.append(line(key))
+            journal.append(make_line(key))
     with (tmp_path / "j").open("ab") as stream:
         stream.write(b'{"key": "5", "rec')
     read = JournalContents.read(tmp_path / "j")
@@ -57,20 +57,20 @@ def test_journals_are_read_while_they_are_written(tmp_path: Path) -> None:
 def test_other_files_are_not_changed(tmp_path: Path, text: str) -> None:
     (tmp_path / "j").write_text(text)
     with pytest.raises(InputError, match=r"not a journal|damaged|run otherwise") as caught:
-        opened(tmp_path / "j")
+        open_journal(tmp_path / "j")
     assert caught.value.file == tmp_path / "j"
     assert (tmp_path / "j").read_text() == text
 
 
 def test_incomplete_lines_are_removed(tmp_path: Path) -> None:
-    journal = opened(tmp_path / "j")
+    journal = open_journal(tmp_path / "j")
     journal.append({"session": {"jobs": 1}})
     for key in range(4):
-        journal.append(line(key))
+        journal.append(make_line(key))
     data = (tmp_path / "j").read_bytes()
     for cut in range(len(data)):
         (tmp_path / "cut").write_bytes(data[:cut])
-        again = opened(tmp_path / "cut")
+        again = open_journal(tmp_path / "cut")
         assert len(again.lines) == max(0, data[:cut].count(b"\n") - 2)
         assert (tmp_path / "cut").read_bytes() == data[: data.rfind(b"\n", 0, max(cut, 58)) + 1]
         del again
@@ -78,12 +78,12 @@ def test_incomplete_lines_are_removed(tmp_path: Path) -> None:
 
 def test_records_stay_in_the_file(tmp_path: Path) -> None:
     """The records of a million tasks would not fit into memory."""
-    journal = opened(tmp_path / "j")
+    journal = open_journal(tmp_path / "j")
     journal.append({"session": {"jobs": 1}})
     path = [[0.001 * k, 0.002 * k] for k in range(200)]
     tracemalloc.start()
     for key in range(300):
-        journal.append({**line(key), "records": [{"number": key, "path": path}]})
+        journal.append({**make_line(key), "records": [{"number": key, "path": path}]})
     read = JournalContents.read(tmp_path / "j")
     size, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
@@ -94,19 +94,19 @@ def test_records_stay_in_the_file(tmp_path: Path) -> None:
         assert "300" not in lines
     del journal.lines["7"]
     assert ("7" in journal.lines, list(journal.lines)[6:8]) == (False, ["6", "8"])
-    journal.append({**line(7), "records": [{"number": 7, "again": True}]})
+    journal.append({**make_line(7), "records": [{"number": 7, "again": True}]})
     for lines in (journal.lines, JournalContents.read(tmp_path / "j").lines):
         assert lines["7"] == [{"number": 7, "again": True}]
 
 
 def test_memory_and_processor_time_are_recorded(tmp_path: Path) -> None:
-    journal = opened(tmp_path / "j")
+    journal = open_journal(tmp_path / "j")
     journal.append({"session": {"jobs": 2}})
-    journal.append(line(0))
+    journal.append(make_line(0))
     for key, process in ((1, "a"), (2, "b"), (3, "a")):
         journal.append(
             {
-                **line(key),
+                **make_line(key),
                 "process": process,
                 "resident_mb": 10.0 * key,
                 "client_seconds": 0.01 * key,
@@ -118,17 +118,17 @@ def test_memory_and_processor_time_are_recorded(tmp_path: Path) -> None:
 
 
 def test_other_headers_raise(tmp_path: Path) -> None:
-    opened(tmp_path / "j")._stream.close()
+    open_journal(tmp_path / "j")._stream.close()
     with pytest.raises(
         InputError, match=r"the episodes in this folder were run otherwise.*recipe abc.*recipe xyz"
     ) as caught:
-        opened(tmp_path / "j", {**HEADER, "settings": {"recipe": "xyz"}})
+        open_journal(tmp_path / "j", {**HEADER, "settings": {"recipe": "xyz"}})
     assert caught.value.field == "recipe"
 
 
 def test_two_writers_raise(tmp_path: Path) -> None:
-    first = opened(tmp_path / "j")
+    first = open_journal(tmp_path / "j")
     with pytest.raises(InputError, match="another run is writing"):
-        opened(tmp_path / "j")
+        open_journal(tmp_path / "j")
     first._stream.close()
-    opened(tmp_path / "j")
+    open_journal(tmp_path / "j")

@@ -15,7 +15,7 @@ from vkc_pin.world.collision.boxes import Boxes
 JOINTS, MOVING, FIXED, STATES = 3, 6, 8, 8
 
 
-def random_rotations(rng: np.random.Generator, *shape: int) -> np.ndarray:
+def sample_rotations(rng: np.random.Generator, *shape: int) -> np.ndarray:
     count = int(np.prod(shape))
     return np.reshape([pin.exp3(rng.normal(size=3)) for _ in range(count)], (*shape, 3, 3))
 
@@ -26,10 +26,10 @@ def test_close_pairs_match_an_exhaustive_search(seed: int, reach: float, with_fi
     """No pair of close boxes is missed, and bounds are lower bounds of distances."""
     rng, count = np.random.default_rng(seed), MOVING + FIXED
     joints = np.concatenate([rng.integers(1, JOINTS + 1, MOVING), np.zeros(FIXED, int)])
-    rotations, centers = random_rotations(rng, count), rng.uniform(-1.0, 1.0, (count, 3))
+    rotations, centers = sample_rotations(rng, count), rng.uniform(-1.0, 1.0, (count, 3))
     halves = rng.uniform(0.02, 0.3, (count, 3))
     pairs = np.array([(a, b) for a, b in itertools.combinations(range(count), 2) if a < MOVING])
-    turned = random_rotations(rng, STATES, JOINTS + 1)
+    turned = sample_rotations(rng, STATES, JOINTS + 1)
     moved = rng.uniform(-1.0, 1.0, (STATES, JOINTS + 1, 3))
     turned[:, 0], moved[:, 0] = np.eye(3), 0.0
     rows, found, bounds = Boxes(joints, rotations, centers, halves, pairs).find_close_pairs(

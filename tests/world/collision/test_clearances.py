@@ -22,7 +22,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 MOVING, STANDING, STATES, WAYPOINTS = 6, 7, 10, 5
 
 
-def random_placement(rng: np.random.Generator, size: float) -> pin.SE3:
+def sample_placement(rng: np.random.Generator, size: float) -> pin.SE3:
     return pin.SE3(pin.exp3(rng.normal(size=3)), rng.uniform(-size, size, 3))
 
 
@@ -33,18 +33,18 @@ class Room:
         rng = self.rng = np.random.default_rng(seed)
         self.model, self.geometry, parent = pin.Model(), pin.GeometryModel(), 0
         for k, joint in enumerate((pin.JointModelPlanar, pin.JointModelRZ, pin.JointModelRX)):
-            parent = self.model.addJoint(parent, joint(), random_placement(rng, 0.3), f"j{k}")
+            parent = self.model.addJoint(parent, joint(), sample_placement(rng, 0.3), f"j{k}")
         self.halves = rng.uniform(0.02, 0.2, (MOVING + STANDING, 3))
         self.shapes = [coal.Box(*(2 * half)) for half in self.halves]
         for k in range(MOVING):
             joint = 1 + int(rng.integers(3))
             self.geometry.addGeometryObject(
-                pin.GeometryObject(f"s{k}", joint, 0, random_placement(rng, 0.2), self.shapes[k])
+                pin.GeometryObject(f"s{k}", joint, 0, sample_placement(rng, 0.2), self.shapes[k])
             )
         self.joints = np.array(
             [*(s.parentJoint for s in self.geometry.geometryObjects), *[0] * STANDING]
         )
-        self.standing = [random_placement(rng, 0.6) for _ in range(STANDING)]
+        self.standing = [sample_placement(rng, 0.6) for _ in range(STANDING)]
         self.pairs = np.array(
             [(a, b) for a, b in itertools.combinations(range(MOVING + STANDING), 2) if a < MOVING]
         )
@@ -160,7 +160,7 @@ def test_first_violation_matches_an_exhaustive_search(
 
 def test_fixed_shapes_can_be_moved() -> None:
     room = Room(4)
-    before, place = room.clearances(), random_placement(room.rng, 0.6)
+    before, place = room.clearances(), sample_placement(room.rng, 0.6)
     moved = np.array([MOVING + 2])
     boxes = before.boxes.move_fixed(moved, place.rotation[None], place.translation[None])
     after = before.move_fixed(boxes, {MOVING + 2: place})

@@ -21,11 +21,11 @@ MOVING = 4
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-def random_placement(rng: np.random.Generator, size: float = 0.6) -> pin.SE3:
+def sample_placement(rng: np.random.Generator, size: float = 0.6) -> pin.SE3:
     return pin.SE3(pin.exp3(rng.normal(size=3)), rng.uniform(-size, size, 3))
 
 
-def mesh(rng: np.random.Generator) -> coal.BVHModelBase:
+def make_mesh(rng: np.random.Generator) -> coal.BVHModelBase:
     shape, corners = coal.BVHModelOBBRSS(), rng.uniform(-0.3, 0.3, (12, 3))
     shape.beginModel(4, 12)
     shape.addVertices(corners)
@@ -34,12 +34,12 @@ def mesh(rng: np.random.Generator) -> coal.BVHModelBase:
     return shape
 
 
-def normal(rng: np.random.Generator) -> np.ndarray:
+def sample_normal(rng: np.random.Generator) -> np.ndarray:
     n = rng.normal(size=3)
     return np.asarray(n / np.linalg.norm(n))
 
 
-def solid(kind: str, rng: np.random.Generator) -> coal.CollisionGeometry:
+def make_solid(kind: str, rng: np.random.Generator) -> coal.CollisionGeometry:
     a, b, c = rng.uniform(0.05, 0.4, 3)
     corners = rng.uniform(-0.3, 0.3, (3, 3))
     made = {
@@ -54,9 +54,9 @@ def solid(kind: str, rng: np.random.Generator) -> coal.CollisionGeometry:
             rng.normal(scale=0.2, size=(400, 3))
         ),  # coal uses hill climbing for hulls of this size
         "TriangleP": lambda: coal.TriangleP(*corners),
-        "Halfspace": lambda: coal.Halfspace(normal(rng), a),
-        "Plane": lambda: coal.Plane(normal(rng), a),
-        "BVHModelOBBRSS": lambda: mesh(rng),
+        "Halfspace": lambda: coal.Halfspace(sample_normal(rng), a),
+        "Plane": lambda: coal.Plane(sample_normal(rng), a),
+        "BVHModelOBBRSS": lambda: make_mesh(rng),
     }
     return made[kind]()
 
@@ -97,7 +97,7 @@ def compute_with_bindings(
     )
 
 
-def table(found: Witnesses) -> np.ndarray:
+def stack_table(found: Witnesses) -> np.ndarray:
     return np.column_stack([found.distance, found.normal, found.first, found.second])
 
 
@@ -113,10 +113,10 @@ def test_distances_equal_those_of_the_bindings(
     one: str, other: str, seed: int, swept: float, tolerance: float
 ) -> None:
     rng = np.random.default_rng(seed)
-    first, second = solid(one, rng), solid(other, rng)
+    first, second = make_solid(one, rng), make_solid(other, rng)
     if one != "TriangleP":
         first.setSweptSphereRadius(swept)
-    here, there = random_placement(rng), random_placement(rng)
+    here, there = sample_placement(rng), sample_placement(rng)
     where, pair = flatten_placements([here, there])[None], (np.zeros(1, int), np.array([[0, 1]]))
     both = Shapes([first, second], tolerance=tolerance)
     try:
@@ -128,10 +128,12 @@ def test_distances_equal_those_of_the_bindings(
         with pytest.raises(type(error), match="not yet supported"):
             both.compute_distances(where, *pair)
         return
-    np.testing.assert_array_equal(table(both.compute_witnesses(where, *pair))[0], expected)
+    np.testing.assert_array_equal(stack_table(both.compute_witnesses(where, *pair))[0], expected)
     np.testing.assert_array_equal(both.compute_distances(where, *pair), expected[:1])
     stands = Shapes([first, second], [there], tolerance=tolerance)
-    np.testing.assert_array_equal(table(stands.compute_witnesses(where[:, :1], *pair))[0], expected)
+    np.testing.assert_array_equal(
+        stack_table(stands.compute_witnesses(where[:, :1], *pair))[0], expected
+    )
 
 
 class Room:
@@ -140,11 +142,11 @@ class Room:
     def __init__(self, seed: int, states: int = 20) -> None:
         rng = np.random.default_rng(seed)
         self.solids = [
-            solid(kind, rng)
+            make_solid(kind, rng)
             for kind in ("Box", "Convex", "Cylinder", "Capsule", "Box", "Sphere", "large Convex")
         ]
-        self.standing = [random_placement(rng) for _ in self.solids[MOVING:]]
-        self.places = [[random_placement(rng) for _ in range(MOVING)] for _ in range(states)]
+        self.standing = [sample_placement(rng) for _ in self.solids[MOVING:]]
+        self.places = [[sample_placement(rng) for _ in range(MOVING)] for _ in range(states)]
         self.where = np.array([flatten_placements(row) for row in self.places])
         pairs = [
             pair for pair in itertools.combinations(range(len(self.solids)), 2) if pair[0] < MOVING
@@ -195,7 +197,7 @@ def test_closest_pairs_match_an_exhaustive_search(
         rounding=0.0,
     )
     assert order[chosen].tolist() == wanted
-    np.testing.assert_array_equal(table(found), room.expected()[order[chosen]])
+    np.testing.assert_array_equal(stack_table(found), room.expected()[order[chosen]])
 
 
 def test_invalid_arrays_raise() -> None:
@@ -212,8 +214,8 @@ def test_invalid_arrays_raise() -> None:
 
 def test_errors_of_coal_are_raised_from_threads() -> None:
     rng = np.random.default_rng(0)
-    both = Shapes([solid("Box", rng), solid("TriangleP", rng)], threads=2)
-    where = flatten_placements([random_placement(rng), random_placement(rng)])[None]
+    both = Shapes([make_solid("Box", rng), make_solid("TriangleP", rng)], threads=2)
+    where = flatten_placements([sample_placement(rng), sample_placement(rng)])[None]
     with pytest.raises(ValueError, match="not yet supported"):
         both.compute_distances(where, np.zeros(1000, int), np.tile([[0, 1]], (1000, 1)))
 

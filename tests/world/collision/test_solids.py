@@ -21,11 +21,11 @@ from vkc_pin.world.files.meshes import make_convex_hull
 NOWHERE = np.array([[[1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0]] * 2])
 
 
-def hull(seed: int) -> coal.Convex:
+def make_hull(seed: int) -> coal.Convex:
     return make_convex_hull(np.random.default_rng(seed).normal(size=(30, 3)))
 
 
-def distance(first: coal.CollisionGeometry, second: coal.CollisionGeometry) -> float:
+def compute_distance(first: coal.CollisionGeometry, second: coal.CollisionGeometry) -> float:
     return float(
         Shapes([first, second]).compute_distances(NOWHERE, np.zeros(1, int), np.array([[0, 1]]))[0]
     )
@@ -39,12 +39,12 @@ def test_unsupported_shapes_raise() -> None:
 
 
 def test_hulls_are_cached_until_they_change() -> None:
-    shape = hull(0)
+    shape = make_hull(0)
     first = convert_solid(shape)
     assert convert_solid(shape) is first
     shape.setSweptSphereRadius(0.1)
     assert convert_solid(shape) is not first
-    assert convert_solid(hull(1)) is not convert_solid(shape)
+    assert convert_solid(make_hull(1)) is not convert_solid(shape)
 
 
 def test_changed_dimensions_are_noticed() -> None:

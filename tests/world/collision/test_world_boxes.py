@@ -10,7 +10,7 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.collision.world_boxes import WorldBoxes
 
 
-def gap(first: tuple[Floats, Floats], second: tuple[Floats, Floats]) -> float:
+def compute_gap(first: tuple[Floats, Floats], second: tuple[Floats, Floats]) -> float:
     """Return the distance of two boxes given by their corners; -inf if they overlap."""
     apart = np.maximum(second[0] - first[1], first[0] - second[1])
     return float(np.linalg.norm(np.maximum(apart, 0.0))) if apart.max() > 0.0 else -np.inf
@@ -50,7 +50,8 @@ def test_close_pairs_match_an_exhaustive_search(
     for k, (a, b) in enumerate(zip(first, last, strict=True)):
         for p, (i, j) in enumerate(pairs.tolist()):
             ends = sum(
-                gap((bottoms[s, i], tops[s, i]), (bottoms[s, j], tops[s, j])) for s in (a, b)
+                compute_gap((bottoms[s, i], tops[s, i]), (bottoms[s, j], tops[s, j]))
+                for s in (a, b)
             )
             if moves[phases[k], [i, j]].any() and (ends - moved[k, i] - moved[k, j]) / 2 < limit:
                 expected.append((k, p))

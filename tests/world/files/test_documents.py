@@ -49,18 +49,18 @@ class Thing(Schema):
     parts: tuple[Part, ...] = ()
 
 
-def written(folder: Path, text: str) -> Path:
+def write_text(folder: Path, text: str) -> Path:
     file = folder / "thing.yaml"
     file.write_text(text, encoding="utf-8")
     return file
 
 
-def paths(data: Any, path: tuple[str | int, ...] = ()) -> list[tuple[str | int, ...]]:
+def list_paths(data: Any, path: tuple[str | int, ...] = ()) -> list[tuple[str | int, ...]]:
     """Return the paths of all fields of nested data."""
     inner: Any = ()
     if isinstance(data, dict | list):
         inner = data.items() if isinstance(data, dict) else enumerate(data)
-    return [path, *(found for key, value in inner for found in paths(value, (*path, key)))]
+    return [path, *(found for key, value in inner for found in list_paths(value, (*path, key)))]
 
 
 @settings(max_examples=50, deadline=None)
@@ -68,9 +68,9 @@ def paths(data: Any, path: tuple[str | int, ...] = ()) -> list[tuple[str | int, 
 def test_fields_are_read_with_their_lines(data: dict[str, Any]) -> None:
     text = yaml.safe_dump(data, default_flow_style=False, sort_keys=False)
     with tempfile.TemporaryDirectory() as folder:
-        document = read_yaml(written(Path(folder), text))
+        document = read_yaml(write_text(Path(folder), text))
     assert document.data == data
-    for path in paths(data):
+    for path in list_paths(data):
         assert document.find_line((*path, "nothing", 3)) == document.find_line(path)
         if path and isinstance(path[-1], str):
             line = text.splitlines()[(document.find_line(path) or 0) - 1]
@@ -84,7 +84,7 @@ def test_field_paths_are_formatted() -> None:
 
 
 def test_empty_files_hold_no_data(tmp_path: Path) -> None:
-    assert read_yaml(written(tmp_path, "# nothing\n")).data is None
+    assert read_yaml(write_text(tmp_path, "# nothing\n")).data is None
 
 
 def test_exponential_aliases_raise(tmp_path: Path) -> None:
@@ -96,7 +96,7 @@ def test_exponential_aliases_raise(tmp_path: Path) -> None:
         for before, name in itertools.pairwise(names)
     ]
     with pytest.raises(InputError, match="too many fields") as caught:
-        read_yaml(written(tmp_path, "\n".join(lines)))
+        read_yaml(write_text(tmp_path, "\n".join(lines)))
     assert caught.value.line in range(1, 10)
 
 
@@ -111,7 +111,7 @@ def test_exponential_aliases_raise(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_yaml_raises(tmp_path: Path, text: str, line: int | None, problem: str) -> None:
-    file = written(tmp_path, text)
+    file = write_text(tmp_path, text)
     with pytest.raises(InputError, match=problem) as caught:
         read_yaml(file)
     assert (caught.value.file, caught.value.line) == (file, line)
@@ -136,7 +136,7 @@ def test_the_first_wrong_field_is_reported(
     tmp_path: Path, text: str, line: int | None, field: str, message: str
 ) -> None:
     with pytest.raises(InputError, match=message) as caught:
-        parse_document(read_yaml(written(tmp_path, text)), Thing)
+        parse_document(read_yaml(write_text(tmp_path, text)), Thing)
     assert (caught.value.field, caught.value.file) == (field, tmp_path / "thing.yaml")
     assert line is None or caught.value.line == line
 
@@ -151,11 +151,11 @@ def test_valid_data_becomes_the_schema() -> None:
 @pytest.mark.parametrize(("opening", "closing"), [("[", "]"), ("{a: ", "}")])
 def test_deeply_nested_yaml_raises(tmp_path: Path, opening: str, closing: str) -> None:
     depth = documents.MAX_DEPTH
-    fine = read_yaml(written(tmp_path, opening * depth + "1" + closing * depth))
+    fine = read_yaml(write_text(tmp_path, opening * depth + "1" + closing * depth))
     assert len(max(fine.lines, key=len)) == depth
     for count in (depth + 1, 1_000_000):
         with pytest.raises(InputError, match=r"too many lists|not valid YAML"):
-            read_yaml(written(tmp_path, opening * count + "1" + closing * count))
+            read_yaml(write_text(tmp_path, opening * count + "1" + closing * count))
 
 
 @pytest.mark.parametrize("endless", [itertools.repeat(0.0), map(abs, itertools.count())])
@@ -176,7 +176,7 @@ def test_text_without_encoding_and_recursive_data_raise() -> None:
 
 
 def test_errors_get_the_line_of_their_field(tmp_path: Path) -> None:
-    document = read_yaml(written(tmp_path, "a: 1\nb:\n  c: 2\n"))
+    document = read_yaml(write_text(tmp_path, "a: 1\nb:\n  c: 2\n"))
     with (
         pytest.raises(InputError, match=r":3: b\.c: mass: too large"),
         document.annotate_errors(("b", "c")),

@@ -10,7 +10,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.world.files.hulls import compute_hull, compute_outer_hull
 
 
-def outside(points: np.ndarray, hull: trimesh.Trimesh) -> float:
+def compute_excess(points: np.ndarray, hull: trimesh.Trimesh) -> float:
     planes = np.einsum("ij,ij->i", hull.face_normals, hull.triangles[:, 0])
     return float((points @ hull.face_normals.T - planes).max())
 
@@ -20,7 +20,7 @@ def test_hulls_of_thin_poles_are_closed_and_face_outward() -> None:
     assert hull.is_volume
     assert hull.volume == pytest.approx(ConvexHull(POLE).volume, rel=1e-12)
     assert hull.area == pytest.approx(ConvexHull(POLE).area, rel=1e-12)
-    assert outside(POLE, hull) < 1e-12
+    assert compute_excess(POLE, hull) < 1e-12
 
 
 @pytest.mark.parametrize(
@@ -56,5 +56,5 @@ def test_outer_hulls_contain_their_points(vertices: int) -> None:
     )
     hull = compute_outer_hull(points, vertices=vertices)
     assert len(hull.vertices) <= vertices
-    assert outside(points, hull) < 1e-9
+    assert compute_excess(points, hull) < 1e-9
     assert 1.0 < hull.volume / tube.volume < (1.2 if vertices == 40 else 1.35)

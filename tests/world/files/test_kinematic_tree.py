@@ -13,98 +13,119 @@ from vkc_pin.world.files.urdf import load_urdf, read_urdf
 SHAPE = "<collision><geometry><sphere radius='0.1'/></geometry></collision>"
 
 
-def joint(name: str, parent: str, child: str, *, kind: str = "fixed", inside: str = "") -> str:
+def format_joint(
+    name: str, parent: str, child: str, *, kind: str = "fixed", inside: str = ""
+) -> str:
     ends = f'<parent link="{parent}"/><child link="{child}"/>'
     return f'<joint name="{name}" type="{kind}">{ends}{inside}</joint>'
 
 
-def written(folder: Path, *lines: str) -> Path:
+def write_urdf(folder: Path, *lines: str) -> Path:
     (folder / "thing.urdf").write_text("\n".join(['<robot name="r">', *lines, "</robot>"]))
     return folder / "thing.urdf"
 
 
-def links(*names: str) -> list[str]:
+def format_links(*names: str) -> list[str]:
     return [f'<link name="{name}">{SHAPE}</link>' for name in names]
 
 
-def two(kind: str = "fixed", inside: str = "") -> list[str]:
+def format_pair(kind: str = "fixed", inside: str = "") -> list[str]:
     """Return two links and a joint `j` between them."""
-    return [*links("a", "b"), joint("j", "a", "b", kind=kind, inside=inside)]
+    return [*format_links("a", "b"), format_joint("j", "a", "b", kind=kind, inside=inside)]
 
 
 @pytest.mark.parametrize(
     ("lines", "line", "message"),
     [
         ([], None, "there are no links"),
-        (links("a", "a"), 3, "a: two links of one name .got lines 2 and 3"),
-        (links("a", " "), 3, "a link without a name"),
-        ([*two(), joint("j", "a", "b")], 5, "j: two joints of one name"),
-        ([*two(), joint("k", "a", "b")], 5, "b: a link with two parents .*'j' and 'k'"),
-        ([*two(), joint("k", "b", "a")], 2, "a: links in a circle .*a → b → a"),
-        ([*links("a"), joint("j", "a", "a")], 2, "a: links in a circle .*a → a"),
-        ([*two(), joint("k", "b", "a"), *links("r")], 2, "a: links in a circle"),
-        (links("a", "b"), 3, "b: links that nothing connects .*got a, b"),
-        ([*links("a"), joint("j", "a", "aa")], 3, "j: child: there is no link 'aa'; did you mean"),
+        (format_links("a", "a"), 3, "a: two links of one name .got lines 2 and 3"),
+        (format_links("a", " "), 3, "a link without a name"),
+        ([*format_pair(), format_joint("j", "a", "b")], 5, "j: two joints of one name"),
         (
-            [*links("a"), '<joint name="j" type="fixed"><parent link="a"/></joint>'],
+            [*format_pair(), format_joint("k", "a", "b")],
+            5,
+            "b: a link with two parents .*'j' and 'k'",
+        ),
+        ([*format_pair(), format_joint("k", "b", "a")], 2, "a: links in a circle .*a → b → a"),
+        ([*format_links("a"), format_joint("j", "a", "a")], 2, "a: links in a circle .*a → a"),
+        (
+            [*format_pair(), format_joint("k", "b", "a"), *format_links("r")],
+            2,
+            "a: links in a circle",
+        ),
+        (format_links("a", "b"), 3, "b: links that nothing connects .*got a, b"),
+        (
+            [*format_links("a"), format_joint("j", "a", "aa")],
+            3,
+            "j: child: there is no link 'aa'; did you mean",
+        ),
+        (
+            [*format_links("a"), '<joint name="j" type="fixed"><parent link="a"/></joint>'],
             3,
             "j: a joint that connects nothing .*<child",
         ),
-        (two("hinge"), 4, "j: this joint type is not supported .*got hinge"),
-        (two("prismatic"), 4, "j: a prismatic joint without limits"),
-        (two(inside='<origin xyz="nan 0 0"/>'), 4, "j: origin xyz: wrong numbers"),
-        (two(inside='<origin rpy="0 0"/>'), 4, "j: origin rpy: wrong numbers"),
-        (two(inside='<origin xyz="20000 0 0"/>'), 4, "expected at most 10000"),
-        (two("continuous", '<axis xyz="0 0 0"/>'), 4, "j: an axis without direction"),
+        (format_pair("hinge"), 4, "j: this joint type is not supported .*got hinge"),
+        (format_pair("prismatic"), 4, "j: a prismatic joint without limits"),
+        (format_pair(inside='<origin xyz="nan 0 0"/>'), 4, "j: origin xyz: wrong numbers"),
+        (format_pair(inside='<origin rpy="0 0"/>'), 4, "j: origin rpy: wrong numbers"),
+        (format_pair(inside='<origin xyz="20000 0 0"/>'), 4, "expected at most 10000"),
+        (format_pair("continuous", '<axis xyz="0 0 0"/>'), 4, "j: an axis without direction"),
         (
-            two("revolute", '<limit lower="1" upper="0" velocity="1"/>'),
+            format_pair("revolute", '<limit lower="1" upper="0" velocity="1"/>'),
             4,
             "j: limit: limits in the wrong order .*got 1 and 0",
         ),
         (
-            two("revolute", '<limit lower="0" upper="inf" velocity="1"/>'),
+            format_pair("revolute", '<limit lower="0" upper="inf" velocity="1"/>'),
             4,
             "j: limit upper: wrong numbers .*1 finite number, got inf",
         ),
         (
-            two("continuous", '<mimic joint="j" multiplier="twice"/>'),
+            format_pair("continuous", '<mimic joint="j" multiplier="twice"/>'),
             4,
             "j: mimic multiplier: wrong numbers .*got twice",
         ),
-        ([*links("a"), '<xacro:wheel side="left"/>'], 3, "xacro has not .*got <xacro:wheel>"),
+        (
+            [*format_links("a"), '<xacro:wheel side="left"/>'],
+            3,
+            "xacro has not .*got <xacro:wheel>",
+        ),
     ],
 )
 def test_invalid_trees_raise(
     tmp_path: Path, lines: list[str], line: int | None, message: str
 ) -> None:
-    file = written(tmp_path, *lines)
+    file = write_urdf(tmp_path, *lines)
     with pytest.raises(InputError, match=message) as caught:
         read_urdf(file)
     assert (caught.value.file, caught.value.line) == (file, line)
 
 
 def test_fixed_joints_need_no_axis(tmp_path: Path) -> None:
-    assert read_urdf(written(tmp_path, *two(inside='<axis xyz="0 0 0"/>'))).links == ("a", "b")
+    assert read_urdf(write_urdf(tmp_path, *format_pair(inside='<axis xyz="0 0 0"/>'))).links == (
+        "a",
+        "b",
+    )
 
 
 def test_incomplete_limits_and_couplings_warn(tmp_path: Path) -> None:
     limit = '<limit effort="1" velocity="1"/>'
     with pytest.warns(UserWarning, match="thing.urdf:4: j: a limit without lower and upper"):
-        load_urdf(written(tmp_path, *two("revolute", limit)))
+        load_urdf(write_urdf(tmp_path, *format_pair("revolute", limit)))
     with pytest.warns(UserWarning, match="thing.urdf:4: j: there is no joint 'k' to follow"):
-        read_urdf(written(tmp_path, *two("continuous", '<mimic joint="k"/>')))
+        read_urdf(write_urdf(tmp_path, *format_pair("continuous", '<mimic joint="k"/>')))
 
 
 def test_velocity_and_effort_limits_are_optional(tmp_path: Path) -> None:
     lines = [
-        *links("a", "b", "c"),
-        joint("k", "b", "c", kind="prismatic", inside='<limit upper="2" velocity="3"/>'),
+        *format_links("a", "b", "c"),
+        format_joint("k", "b", "c", kind="prismatic", inside='<limit upper="2" velocity="3"/>'),
     ]
     model, _, _ = load_urdf(
-        written(
+        write_urdf(
             tmp_path,
             *lines,
-            joint("j", "a", "b", kind="revolute", inside='<limit lower="-1" upper="0.5"/>'),
+            format_joint("j", "a", "b", kind="revolute", inside='<limit lower="-1" upper="0.5"/>'),
         )
     )
     assert list(model.names)[1:] == ["j", "k"]
@@ -116,8 +137,8 @@ def test_velocity_and_effort_limits_are_optional(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("error")
 def test_extensions_are_ignored(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """Elements of simulators and undeclared prefixes change nothing, and no parser complains."""
-    lines = two("continuous", '<axis xyz="0 0 1"/><limit effort="3"/>')
-    plain, _, _ = load_urdf(written(tmp_path, *lines))
+    lines = format_pair("continuous", '<axis xyz="0 0 1"/><limit effort="3"/>')
+    plain, _, _ = load_urdf(write_urdf(tmp_path, *lines))
     gear = lines.pop().replace("</joint>", '<drake:gear ratio="x"/><calibration/></joint>')
     lines += [
         gear,
@@ -126,7 +147,7 @@ def test_extensions_are_ignored(tmp_path: Path, capfd: pytest.CaptureFixture[str
         '<drake:joint name="j" type="universal"/>',
         '<xacro:property name="width" value="3"/>',
     ]
-    assert load_urdf(written(tmp_path, *lines))[0] == plain
+    assert load_urdf(write_urdf(tmp_path, *lines))[0] == plain
     assert not capfd.readouterr().err
 
 
@@ -145,16 +166,16 @@ def test_extensions_are_ignored(tmp_path: Path, capfd: pytest.CaptureFixture[str
     ],
 )
 def test_incomplete_inertials_warn(tmp_path: Path, inertial: str, message: str) -> None:
-    lines = [*links("r", "a"), joint("j", "r", "a", kind="continuous")]
+    lines = [*format_links("r", "a"), format_joint("j", "r", "a", kind="continuous")]
     lines[:2] = [lines[1].replace("</link>", f"{inertial}</link>"), lines[0]]
     with pytest.warns(UserWarning, match=message):
-        model, _, _ = load_urdf(written(tmp_path, *lines))
+        model, _, _ = load_urdf(write_urdf(tmp_path, *lines))
     assert model.inertias[1].mass == 0.0
 
 
 def test_unnamed_robots_are_named_after_their_file(tmp_path: Path) -> None:
     file = tmp_path / "x\x01\udcff\n.urdf"
-    file.write_text(f"<robot>{''.join(links('a'))}</robot>")
+    file.write_text(f"<robot>{''.join(format_links('a'))}</robot>")
     model, collision, _ = load_urdf(file)
     assert model.name == "x\ufffd\ufffd\n"
     assert len(collision.geometryObjects) == 1

@@ -26,7 +26,7 @@ FACES = np.array(
 CORNERS = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 
 
-def two_cubes(path: Path, materials: bool = False) -> Path:
+def write_two_cubes(path: Path, materials: bool = False) -> Path:
     lines = ["mtllib two.mtl"] if materials else []
     for k in range(2):
         lines += [f"o cube{k}", *(f"v {x + 2 * k} {y} {z}" for x, y, z in CORNERS)]
@@ -40,14 +40,14 @@ def two_cubes(path: Path, materials: bool = False) -> Path:
 
 
 def test_objects_of_an_obj_file_are_separate(tmp_path: Path) -> None:
-    mesh = load_mesh(two_cubes(tmp_path / "two.obj"))
+    mesh = load_mesh(write_two_cubes(tmp_path / "two.obj"))
     assert mesh.area == pytest.approx(12.0)
     assert abs(mesh.volume) == pytest.approx(2.0)
     np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [3, 1, 1]])
 
 
 def test_convex_hulls_equal_the_mesh(tmp_path: Path) -> None:
-    shape = load_convex(two_cubes(tmp_path / "two.obj"), (0.5, 1.0, 2.0))
+    shape = load_convex(write_two_cubes(tmp_path / "two.obj"), (0.5, 1.0, 2.0))
     assert isinstance(shape, coal.Convex)
     assert shape.computeVolume() == pytest.approx(1.5 * 1.0 * 2.0)
     assert shape.num_points == 8
@@ -71,7 +71,7 @@ def test_hulls_with_many_neighbours_are_simplified() -> None:
 
 
 def test_colours_divide_meshes_into_parts(tmp_path: Path) -> None:
-    parts = load_parts(two_cubes(tmp_path / "two.obj", materials=True), 2.0)
+    parts = load_parts(write_two_cubes(tmp_path / "two.obj", materials=True), 2.0)
     assert sorted(part.colour or () for part in parts) == [
         (0.0, 0.0, 1.0, 1.0),
         (1.0, 0.0, 0.0, 1.0),
@@ -110,7 +110,7 @@ def test_thin_meshes_need_no_further_package(
 @pytest.mark.parametrize("scale", [(1.0, 0.0, 1.0), (1.0, 2.0), (np.nan, 1.0, 1.0)])
 def test_invalid_scales_raise(tmp_path: Path, scale: tuple[float, ...]) -> None:
     with pytest.raises(InputError, match="scale"):
-        load_mesh(two_cubes(tmp_path / "two.obj"), scale)
+        load_mesh(write_two_cubes(tmp_path / "two.obj"), scale)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ def read(folder: Path, inside: str) -> Srdf:
     return read_srdf(folder / "r.srdf", links=LINKS)
 
 
-def state(name: str, **joints: str) -> str:
+def format_state(name: str, **joints: str) -> str:
     values = "".join(f'<joint name="{joint}" value="{value}"/>' for joint, value in joints.items())
     return f'<group_state name="{name}" group="all">{values}</group_state>'
 
@@ -35,7 +35,9 @@ def test_states_of_several_groups_are_merged(tmp_path: Path) -> None:
     """Joints with several coordinates are skipped."""
     srdf = read(
         tmp_path,
-        state("home", a="0.5") + state("up", a="-1e-1", floating="1 0 0") + state("home", b="2"),
+        format_state("home", a="0.5")
+        + format_state("up", a="-1e-1", floating="1 0 0")
+        + format_state("home", b="2"),
     )
     assert srdf.states == {"home": {"a": 0.5, "b": 2.0}, "up": {"a": -0.1}}
 
@@ -53,8 +55,8 @@ def test_home_states_are_preferred(tmp_path: Path, names: list[str], chosen: str
     values = {name: float(number) for number, name in enumerate(names)}
     srdf = read(
         tmp_path,
-        "".join(state(name, a=str(value), b="0") for name, value in values.items())
-        + state("home", c="1"),
+        "".join(format_state(name, a=str(value), b="0") for name, value in values.items())
+        + format_state("home", c="1"),
     )
     assert srdf.state(["a", "b"])["a"] == values[chosen]
     assert srdf.state(["a", "z"]) == {}

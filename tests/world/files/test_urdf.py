@@ -15,27 +15,29 @@ from vkc_pin.world.files.urdf import load_urdf, read_urdf
 WEDGE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
 
 
-def urdf(folder: Path, shapes: str, *, name: str = "thing.urdf") -> Path:
+def write_urdf(folder: Path, shapes: str, *, name: str = "thing.urdf") -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / name).write_text(f'<robot name="r"><link name="a">{shapes}</link></robot>')
     return folder / name
 
 
-def collision(shape: str, origin: str = "") -> str:
+def format_collision(shape: str, origin: str = "") -> str:
     return f"<collision>{origin}<geometry>{shape}</geometry></collision>"
 
 
 @pytest.mark.parametrize("kind", ["visual", "collision"])
 def test_too_many_shapes_raise(tmp_path: Path, kind: str) -> None:
     """Pinocchio needs minutes for thousands of shapes."""
-    shape = collision('<sphere radius="0.2"/>')
+    shape = format_collision('<sphere radius="0.2"/>')
     many = shape.replace("collision", kind) * 7000
     with pytest.raises(
         InputError, match=f"too many <{kind}> elements.*expected at most 1000.*got 7000"
     ):
-        load_urdf(urdf(tmp_path, shape + many if kind == "visual" else many))
+        load_urdf(write_urdf(tmp_path, shape + many if kind == "visual" else many))
     enough = shape.replace("collision", kind) * 1000
-    _, collides, drawn = load_urdf(urdf(tmp_path, shape + enough if kind == "visual" else enough))
+    _, collides, drawn = load_urdf(
+        write_urdf(tmp_path, shape + enough if kind == "visual" else enough)
+    )
     assert len((drawn if kind == "visual" else collides).geometryObjects) == 1000
 
 
@@ -52,7 +54,7 @@ def test_too_many_shapes_raise(tmp_path: Path, kind: str) -> None:
 def test_triangulated_shapes_enclose_the_solid(tmp_path: Path, shape: str, volume: float) -> None:
     (tmp_path / "wedge.obj").write_text(WEDGE)
     (found,) = read_urdf(
-        urdf(tmp_path, collision(shape, '<origin xyz="1 2 3" rpy="0.1 0.2 0.3"/>'))
+        write_urdf(tmp_path, format_collision(shape, '<origin xyz="1 2 3" rpy="0.1 0.2 0.3"/>'))
     ).read_shapes("collision")
     mesh, solid = found.make_mesh(), found.make_solid()
     assert volume * (1 - 1e-3) <= mesh.volume <= 1.02 * volume
@@ -68,9 +70,9 @@ def test_triangulated_shapes_enclose_the_solid(tmp_path: Path, shape: str, volum
 def test_collision_meshes_become_convex_hulls(tmp_path: Path) -> None:
     ring = trimesh.creation.annulus(0.3, 0.5, 1.0)
     ring.export(tmp_path / "ring.stl")
-    (found,) = read_urdf(urdf(tmp_path, collision('<mesh filename="ring.stl"/>'))).read_shapes(
-        "collision"
-    )
+    (found,) = read_urdf(
+        write_urdf(tmp_path, format_collision('<mesh filename="ring.stl"/>'))
+    ).read_shapes("collision")
     assert found.make_solid().computeVolume() == pytest.approx(ring.convex_hull.volume, rel=1e-3)
     assert found.make_mesh().volume == pytest.approx(ring.volume, rel=1e-3)
     assert ring.volume < 0.9 * ring.convex_hull.volume
@@ -81,7 +83,7 @@ def test_colours_are_shared_by_name(tmp_path: Path) -> None:
     own = f'<visual>{ball}<material name="red"><color rgba="1 0 0 1"/></material></visual>'
     named, plain = f'<visual>{ball}<material name="red"/></visual>', f"<visual>{ball}</visual>"
     shapes = read_urdf(
-        urdf(tmp_path, named + own + plain + collision('<sphere radius="1"/>'))
+        write_urdf(tmp_path, named + own + plain + format_collision('<sphere radius="1"/>'))
     ).read_shapes("visual")
     assert [shape.colour for shape in shapes] == [(1.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 1.0), None]
     assert [shape.name for shape in shapes] == ["a_0", "a_1", "a_2"]
@@ -98,7 +100,9 @@ def test_mesh_addresses_are_resolved(tmp_path: Path) -> None:
     )
     for file in (named, around, beside):
         file.write_text("")
-    path = urdf(tmp_path / "robots" / "pack" / "urdf", collision('<sphere radius="1"/>'))
+    path = write_urdf(
+        tmp_path / "robots" / "pack" / "urdf", format_collision('<sphere radius="1"/>')
+    )
     robot = read_urdf(path, {"other": tmp_path / "elsewhere"})
     assert robot.resolve("package://other/a.stl") == named
     assert robot.resolve("package://pack/meshes/b.stl") == around

@@ -22,7 +22,7 @@ from vkc_pin.world.files.writing import (
 )
 
 
-def everything(folder: Path) -> set[str]:
+def list_everything(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*")}
 
 
@@ -60,35 +60,35 @@ def test_links_are_followed(tmp_path: Path, there: bool) -> None:
     assert target.parent.exists() == there
     assert write_atomically(link, b"after") == link
     assert (link.is_symlink(), target.read_bytes()) == (True, b"after")
-    assert everything(tmp_path) == {"link", "elsewhere", "elsewhere/file"}
+    assert list_everything(tmp_path) == {"link", "elsewhere", "elsewhere/file"}
 
 
-def _folder(path: Path) -> str:
+def _make_folder(path: Path) -> str:
     path.mkdir()
     return "got a folder"
 
 
-def _pipe(path: Path) -> str:
+def _make_pipe(path: Path) -> str:
     os.mkfifo(path)
     return "got a pipe"
 
 
-def _circle(path: Path) -> str:
+def _make_circular_link(path: Path) -> str:
     path.with_name("other").symlink_to(path)
     path.symlink_to(path.with_name("other"))
     return "Too many levels of symbolic links"
 
 
-@pytest.mark.parametrize("make", [_folder, _pipe, _circle])
+@pytest.mark.parametrize("make", [_make_folder, _make_pipe, _make_circular_link])
 def test_other_kinds_of_files_raise(tmp_path: Path, make: Callable[[Path], str]) -> None:
     path = tmp_path / "output"
     reason = make(path)
-    before = everything(tmp_path)
+    before = list_everything(tmp_path)
     for write in (check_writable, lambda path: write_atomically(path, b"data")):
         with pytest.raises(InputError, match=f"a regular file or a new one.*{reason}") as caught:
             write(path)
         assert caught.value.file == str(path)
-    assert everything(tmp_path) == before
+    assert list_everything(tmp_path) == before
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_invalid_paths_raise(
     for write in (check_writable, lambda path: write_atomically(path, b"data")):
         with pytest.raises(InputError, match=reason):
             write(path)
-    assert everything(tmp_path) <= {"file", "new"}
+    assert list_everything(tmp_path) <= {"file", "new"}
 
 
 def test_conflicting_outputs_raise(tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_conflicting_outputs_raise(tmp_path: Path) -> None:
         check_outputs({"--a": one}, inputs={"PLAN": one})
     with pytest.raises(InputError, match=r"--b: a file cannot be a folder .*file of --a"):
         check_outputs({"--a": one, "--b": one / "two" / "three"})
-    assert everything(tmp_path) == {"link"}
+    assert list_everything(tmp_path) == {"link"}
 
 
 def test_failed_writes_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,14 +168,14 @@ def test_folders_are_written_completely_or_not_at_all(tmp_path: Path) -> None:
     with write_folder_atomically(target) as staging:
         (staging / "a").write_text("1", encoding="utf-8")
         assert not target.exists()
-    assert everything(target) == {".vkc-pin.json", "a"}
+    assert list_everything(target) == {".vkc-pin.json", "a"}
     with pytest.raises(FileNotFoundError), write_folder_atomically(target, force=True) as staging:
         (staging / "none" / "b").write_text("2", encoding="utf-8")
     with pytest.raises(InputError, match="already exists"), write_folder_atomically(target):
         pass
-    assert everything(target) == {".vkc-pin.json", "a"}
+    assert list_everything(target) == {".vkc-pin.json", "a"}
     write_folder(target)
-    assert everything(target.parent) == {
+    assert list_everything(target.parent) == {
         f"folder{name}" for name in ("", "/.vkc-pin.json", "/deep", "/deep/a")
     }
     with pytest.raises(InputError, match="no folder"):
@@ -195,12 +195,12 @@ def test_folders_with_foreign_files_are_not_replaced(tmp_path: Path, has_manifes
         write_folder(target)
     (target / other).parent.mkdir(parents=True, exist_ok=True)
     (target / other).write_text("mine")
-    before = everything(tmp_path)
+    before = list_everything(tmp_path)
     for check in (check_replaceable, write_folder):
         with pytest.raises(InputError, match="files that vkc-pin did not write") as caught:
             check(target)
         assert (caught.value.file, caught.value.got) == (target, other)
-    assert everything(tmp_path) == before
+    assert list_everything(tmp_path) == before
 
 
 def test_files_that_appear_meanwhile_are_kept(tmp_path: Path) -> None:
@@ -239,7 +239,7 @@ def test_damaged_manifests_list_no_files(tmp_path: Path, text: str) -> None:
 def test_folders_survive_a_failed_rename(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     target, rename = tmp_path / "folder", Path.rename
     write_folder(target)
-    before = everything(tmp_path)
+    before = list_everything(tmp_path)
 
     def refuse(self: Path, other: Path) -> Path:
         if other == target and (self / "new").exists():
@@ -252,7 +252,7 @@ def test_folders_survive_a_failed_rename(tmp_path: Path, monkeypatch: pytest.Mon
         write_folder_atomically(target, force=True) as staging,
     ):
         (staging / "new").touch()
-    assert everything(tmp_path) == before
+    assert list_everything(tmp_path) == before
 
 
 @pytest.mark.parametrize("name", ["a", "ur5e v2.1", "Küche", "x" * 200, "a..b", "-"])

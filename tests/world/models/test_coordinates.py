@@ -15,7 +15,7 @@ from vkc_pin.world.models.coordinates import Coordinates, wrap_angle
 FREE = ("thing_x", "thing_y", "thing_z", "thing_qx", "thing_qy", "thing_qz", "thing_qw")
 
 
-def mixed() -> pin.Model:
+def make_mixed_model() -> pin.Model:
     """Return a planar base with a wheel, a free body with a lid, and a lift."""
     model = pin.Model()
     base = model.addJoint(0, pin.JointModelPlanar(), pin.SE3.Identity(), "base")
@@ -27,15 +27,15 @@ def mixed() -> pin.Model:
     return model
 
 
-def random_z(rng: np.random.Generator, *shape: int) -> np.ndarray:
-    coordinates = Coordinates(mixed())
+def sample_z(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    coordinates = Coordinates(make_mixed_model())
     z = rng.uniform(-3.0, 3.0, (*shape, coordinates.size))
     z[..., 7:11] /= np.linalg.norm(z[..., 7:11], axis=-1, keepdims=True)
     return z
 
 
 def test_names_joints_and_limits_of_coordinates() -> None:
-    coordinates = Coordinates(mixed())
+    coordinates = Coordinates(make_mixed_model())
     assert coordinates.names == ("base_x", "base_y", "base_yaw", "wheel", *FREE, "lid", "lift")
     assert coordinates.joints == (1, 1, 1, 2, *[3] * 7, 4, 5)
     assert coordinates.units == ("m", "m", "rad", "rad", *"mmm1111", "rad", "m")
@@ -54,9 +54,9 @@ def test_names_joints_and_limits_of_coordinates() -> None:
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_configurations_round_trip(seed: int) -> None:
-    model, rng = mixed(), np.random.default_rng(seed)
+    model, rng = make_mixed_model(), np.random.default_rng(seed)
     coordinates, data = Coordinates(model), model.createData()
-    z = random_z(rng, 4, 3)
+    z = sample_z(rng, 4, 3)
     q = coordinates.q(z)
     np.testing.assert_allclose(coordinates.z(q), z, atol=1e-12)
     np.testing.assert_array_equal(coordinates.q(z[0, 0]), q[0, 0])
@@ -76,7 +76,7 @@ def test_configurations_round_trip(seed: int) -> None:
 @pytest.mark.parametrize("angle", [0.1, 2.0, np.pi - 1e-6])
 def test_quaternions_interpolate_about_one_axis(angle: float) -> None:
     """The midpoint of a linear interpolation is at half the angle."""
-    model, rng = mixed(), np.random.default_rng(0)
+    model, rng = make_mixed_model(), np.random.default_rng(0)
     coordinates, data = Coordinates(model), model.createData()
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
@@ -102,7 +102,7 @@ def test_symbolic_configurations_match_numeric_ones() -> None:
 
 
 def test_invalid_arguments_raise() -> None:
-    coordinates = Coordinates(mixed())
+    coordinates = Coordinates(make_mixed_model())
     with pytest.raises(InputError, match="coordinates"):
         coordinates.q(np.zeros(12))
     with pytest.raises(InputError, match="configuration"):

@@ -27,7 +27,7 @@ KINDS = (
 )
 
 
-def random_tree(rng: np.random.Generator, joints: int) -> pin.Model:
+def make_random_tree(rng: np.random.Generator, joints: int) -> pin.Model:
     """Return a random tree with a body, frame and limits at every joint, and fixed bodies."""
     model = pin.Model()
     for k in range(joints + 1):
@@ -53,7 +53,7 @@ def test_grafted_trees_move_as_before(seed: int, below: int, above: int) -> None
     """The tree that carries it also moves as before, and the mass is that of both."""
     pin.seed(seed % 2**31)
     rng = np.random.default_rng(seed)
-    trunk, branch = random_tree(rng, below), random_tree(rng, above)
+    trunk, branch = make_random_tree(rng, below), make_random_tree(rng, above)
     model, parent, placement = pin.Model(trunk), int(rng.integers(below + 1)), pin.SE3.Random()
     original = branch.copy()
     joints = graft(model, branch, parent=parent, placement=placement, prefix="b.")
@@ -101,7 +101,7 @@ def test_grafted_trees_move_as_before(seed: int, below: int, above: int) -> None
 def test_shapes_move_with_the_grafted_tree(seed: int) -> None:
     pin.seed(seed % 2**31)
     rng = np.random.default_rng(seed)
-    branch, trunk = random_tree(rng, 3), random_tree(rng, 2)
+    branch, trunk = make_random_tree(rng, 3), make_random_tree(rng, 2)
     shape = pin.GeometryObject("s", int(rng.integers(4)), pin.SE3.Random(), coal.Box(1.0, 2.0, 3.0))
     shape.meshColor, shape.meshScale = rng.uniform(size=4), rng.uniform(1.0, 2.0, 3)
     shape.meshPath, shape.overrideMaterial = "mesh.stl", True

@@ -27,7 +27,7 @@ def husky() -> Robot:
     return load_robot("husky_ur5e")
 
 
-def ur5e(q: np.ndarray) -> np.ndarray:
+def compute_ur5e(q: np.ndarray) -> np.ndarray:
     """Compute forward kinematics with the Denavit-Hartenberg parameters of the manufacturer."""
     d, a = [0.1625, 0, 0, 0.1333, 0.0997, 0.0996], [0, -0.425, -0.3922, 0, 0, 0]
     total = np.eye(4)
@@ -61,7 +61,7 @@ def test_forward_kinematics_match_the_manufacturer(husky: Robot) -> None:
         z = np.concatenate([rng.uniform(-3, 3, 3), rng.uniform(-np.pi, np.pi, 6)])
         base = pin.SE3(pin.rpy.rpyToMatrix(0, 0, z[2]), np.array([z[0], z[1], 0.0])).homogeneous
         foot = pin.SE3(np.eye(3), np.array([0.25, 0.0, 0.39])).homogeneous
-        flange = base @ foot @ ur5e(z[3:])
+        flange = base @ foot @ compute_ur5e(z[3:])
         np.testing.assert_allclose(
             compute_placement(husky, "tool0", z).homogeneous, flange, atol=1e-12
         )

@@ -180,7 +180,7 @@ def test_positions_outside_limits_raise(tmp_path: Path, field: str, joint: str) 
     load_robot(urdf, **{field: {joint: 2.0 + 1e-7}})  # type: ignore[arg-type]
 
 
-def driving_urdf(
+def write_driving_urdf(
     folder: Path, *, order: str = "xyt", shape: bool = False, tilted: bool = False
 ) -> Path:
     """Write the small robot on a planar base of joints and empty links, as in simulators."""
@@ -202,7 +202,7 @@ def driving_urdf(
 
 @pytest.mark.parametrize("order", ["xyt", "yxt", "txy", "xty"])
 def test_planar_bases_in_the_urdf_are_locked(tmp_path: Path, order: str) -> None:
-    file = driving_urdf(tmp_path, order=order)
+    file = write_driving_urdf(tmp_path, order=order)
     with pytest.warns(UserWarning, match=r"small.urdf: the .* locked: drive_0, drive_1, drive_2$"):
         robot = load_robot(file)
     assert robot.coordinates.names == ("base_x", "base_y", "base_yaw", "j0", "j1", "j2")
@@ -220,7 +220,7 @@ def test_planar_bases_in_the_urdf_are_locked(tmp_path: Path, order: str) -> None
 )
 def test_other_joints_are_not_a_planar_base(tmp_path: Path, change: dict[str, object]) -> None:
     """Collision shapes, non-horizontal axes or parallel axes exclude a planar base."""
-    assert len(load_robot(driving_urdf(tmp_path, **change)).coordinates.names) == 9  # type: ignore[arg-type]
+    assert len(load_robot(write_driving_urdf(tmp_path, **change)).coordinates.names) == 9  # type: ignore[arg-type]
 
 
 def test_height_of_the_root_link(tmp_path: Path) -> None:

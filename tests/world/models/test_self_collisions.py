@@ -32,10 +32,15 @@ def test_committed_srdf_matches_sampling(husky: Robot) -> None:
 
 def test_pairs_that_always_or_never_collide(tmp_path: Path) -> None:
     radii = {"foot": 1.0, "middle": 0.1, "inner": 0.2, "outer": 0.1}
-    parts = [ball(name, radius) for name, radius in radii.items()]
-    parts += [hinge("foot", "middle", 0.3, upper=1.0), hinge("middle", "inner", 0.2, upper=1.0)]
-    parts += [hinge("inner", "outer", 4.0, upper=1.0)]
-    assert sample_allowed_pairs(load_robot(arm(tmp_path, *parts), pairs="all"), samples=50) == {
+    parts = [format_ball(name, radius) for name, radius in radii.items()]
+    parts += [
+        format_hinge("foot", "middle", 0.3, upper=1.0),
+        format_hinge("middle", "inner", 0.2, upper=1.0),
+    ]
+    parts += [format_hinge("inner", "outer", 4.0, upper=1.0)]
+    assert sample_allowed_pairs(
+        load_robot(write_arm(tmp_path, *parts), pairs="all"), samples=50
+    ) == {
         ("foot", "inner"): "Always",
         ("foot", "middle"): "Adjacent",
         ("foot", "outer"): "Never",
@@ -56,12 +61,12 @@ def test_written_srdf_can_be_read(husky: Robot, tmp_path: Path) -> None:
     assert load_robot("husky_ur5e", srdf=file).home == pytest.approx(husky.home)
 
 
-def ball(name: str, radius: float, x: float = 0.0) -> str:
+def format_ball(name: str, radius: float, x: float = 0.0) -> str:
     shape = f'<origin xyz="{x} 0 0"/><geometry><sphere radius="{radius}"/></geometry>'
     return f'<link name="{name}"><collision>{shape}</collision></link>'
 
 
-def hinge(
+def format_hinge(
     parent: str,
     child: str,
     x: float = 0.0,
@@ -83,7 +88,7 @@ def hinge(
     )
 
 
-def arm(folder: Path, *parts: str, srdf: str | None = None) -> Path:
+def write_arm(folder: Path, *parts: str, srdf: str | None = None) -> Path:
     file = folder / "arm.urdf"
     file.write_text(f'<robot name="arm">{"".join(parts)}</robot>')
     if srdf is not None:
@@ -91,27 +96,27 @@ def arm(folder: Path, *parts: str, srdf: str | None = None) -> Path:
     return file
 
 
-def bracket(folder: Path, *, far: float, srdf: str | None = None) -> Path:
+def write_bracket(folder: Path, *, far: float, srdf: str | None = None) -> Path:
     """Write a post with a fixed bracket, and a shoulder with a fixed cover and a remote elbow."""
-    return arm(
+    return write_arm(
         folder,
         *(
-            ball("post", 0.05),
-            ball("bracket", 0.02, 0.09),
-            ball("shoulder", 0.03),
-            ball("cover", 0.03, 0.05),
-            ball("elbow", 0.02),
+            format_ball("post", 0.05),
+            format_ball("bracket", 0.02, 0.09),
+            format_ball("shoulder", 0.03),
+            format_ball("cover", 0.03, 0.05),
+            format_ball("elbow", 0.02),
         ),
-        hinge("post", "bracket", 0.0, kind="fixed"),
-        hinge("post", "shoulder", 0.0),
-        hinge("shoulder", "cover", 0.0, kind="fixed"),
-        hinge("shoulder", "elbow", far),
+        format_hinge("post", "bracket", 0.0, kind="fixed"),
+        format_hinge("post", "shoulder", 0.0),
+        format_hinge("shoulder", "cover", 0.0, kind="fixed"),
+        format_hinge("shoulder", "elbow", far),
         srdf=srdf,
     )
 
 
 def test_close_neighbours_missing_in_the_srdf_are_adjacent(tmp_path: Path) -> None:
-    robot = load_robot(bracket(tmp_path, far=0.5, srdf=""))
+    robot = load_robot(write_bracket(tmp_path, far=0.5, srdf=""))
     kept_apart = {
         tuple(sorted((robot.link_of(p.first), robot.link_of(p.second))))
         for p in robot.collision.collisionPairs
@@ -125,22 +130,26 @@ def test_close_neighbours_missing_in_the_srdf_are_adjacent(tmp_path: Path) -> No
     assert ("elbow", "post") in kept_apart
 
 
-def slider(folder: Path, *, room: float, srdf: str | None = None, at: float = 0.0) -> Path:
+def write_slider(folder: Path, *, room: float, srdf: str | None = None, at: float = 0.0) -> Path:
     """Write a finger of radius 20 mm on two slides, at most `room` away from the wall ahead."""
-    slides = [hinge("wall", "carriage", 0.04 + at, kind="prismatic", axis="1 0 0", upper=room)]
-    slides.append(hinge("carriage", "finger", 0.0, kind="prismatic", axis="0 1 0", upper=1e-6))
-    return arm(
+    slides = [
+        format_hinge("wall", "carriage", 0.04 + at, kind="prismatic", axis="1 0 0", upper=room)
+    ]
+    slides.append(
+        format_hinge("carriage", "finger", 0.0, kind="prismatic", axis="0 1 0", upper=1e-6)
+    )
+    return write_arm(
         folder,
-        ball("wall", 0.02),
-        ball("carriage", 0.001, 2.0),
-        ball("finger", 0.02),
+        format_ball("wall", 0.02),
+        format_ball("carriage", 0.001, 2.0),
+        format_ball("finger", 0.02),
         *slides,
         srdf=srdf,
     )
 
 
 def test_tight_pairs_have_half_their_distance_as_margin(tmp_path: Path) -> None:
-    robot = load_robot(slider(tmp_path, room=0.012, at=0.004))
+    robot = load_robot(write_slider(tmp_path, room=0.012, at=0.004))
     assert list(robot.tight) == [("finger", "wall")]
     assert robot.tight["finger", "wall"] == pytest.approx(
         0.004, abs=1e-9
@@ -157,12 +166,12 @@ def test_tight_pairs_have_half_their_distance_as_margin(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("srdf", [None, ""], ids=["sampled", "srdf"])
 def test_links_that_always_touch_are_not_checked(tmp_path: Path, srdf: str | None) -> None:
-    file = slider(tmp_path, room=0.0005, srdf=srdf)
+    file = write_slider(tmp_path, room=0.0005, srdf=srdf)
     other = (
-        ball("far", 0.01)
-        + hinge("finger", "far", 0.5, upper=3.1)
-        + ball("end", 0.3)
-        + hinge("far", "end", 0.4)
+        format_ball("far", 0.01)
+        + format_hinge("finger", "far", 0.5, upper=3.1)
+        + format_ball("end", 0.3)
+        + format_hinge("far", "end", 0.4)
     )
     file.write_text(file.read_text().replace("</robot>", f"{other}</robot>"))
     if srdf is None:
@@ -182,7 +191,7 @@ def test_links_that_always_touch_are_not_checked(tmp_path: Path, srdf: str | Non
 
 
 def test_overlap_at_a_stated_home_warns(tmp_path: Path) -> None:
-    file = slider(tmp_path, room=0.1, at=0.02, srdf="")
+    file = write_slider(tmp_path, room=0.1, at=0.02, srdf="")
     home = {"carriage_joint": -0.03, "finger_joint": 0.0}
     with pytest.warns(
         UserWarning, match=r"links that overlap at home are not checked: finger – wall$"
@@ -193,7 +202,7 @@ def test_overlap_at_a_stated_home_warns(tmp_path: Path) -> None:
 
 def test_unstated_homes_are_collision_free(tmp_path: Path) -> None:
     """Only joints without stated position are moved, as little as possible, reproducibly."""
-    file = slider(tmp_path, room=0.1, at=-0.01)
+    file = write_slider(tmp_path, room=0.1, at=-0.01)
     with pytest.warns(
         UserWarning,
         match=r"arm.urdf: links overlap at the default home; .* carriage_joint: 0.0\d+",
@@ -208,7 +217,7 @@ def test_analysis_is_cached_by_its_inputs(tmp_path: Path, monkeypatch: pytest.Mo
     """A second call uses the record; changed shapes, limits or homes make a new one."""
     cache = tmp_path / "cache"
     monkeypatch.setenv(disk_cache.CACHE_VARIABLE, str(cache))
-    file = slider(tmp_path, room=0.012, at=0.004)
+    file = write_slider(tmp_path, room=0.012, at=0.004)
     first, again = load_robot(file), load_robot(file)
     assert len(list(cache.rglob("*.json"))) == 1
     assert (first.tight, first.home.tolist(), first.own_margins(0.02)) == (

@@ -41,7 +41,7 @@ SOLIDS: list[tuple[Callable[[], coal.CollisionGeometry], float]] = [
 ]
 
 
-def random_solids(rng: np.random.Generator, count: int, size: float) -> list[Solid]:
+def make_random_solids(rng: np.random.Generator, count: int, size: float) -> list[Solid]:
     kinds = [SOLIDS[int(k)][0]() for k in rng.integers(len(SOLIDS), size=count)]
     return [
         (kind, pin.SE3(pin.exp3(rng.normal(size=3)), rng.uniform(-size, size, 3))) for kind in kinds
@@ -52,7 +52,7 @@ def random_solids(rng: np.random.Generator, count: int, size: float) -> list[Sol
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.4, 1.0, 3.0]))
 def test_clearance_is_the_smallest_pair_distance(seed: int, size: float) -> None:
     rng = np.random.default_rng(seed)
-    first, second = random_solids(rng, 4, size), random_solids(rng, 6, size)
+    first, second = make_random_solids(rng, 4, size), make_random_solids(rng, 6, size)
     least = min(compute_shape_distance(*one, *other) for one in first for other in second)
     assert compute_clearance(first, second) == pytest.approx(least, abs=1e-6)
     assert compute_clearance(first, []) == np.inf
@@ -90,7 +90,7 @@ def test_unbounded_shapes_raise() -> None:
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_world_boxes_enclose_the_surface(seed: int) -> None:
-    ((shape, placement),) = random_solids(np.random.default_rng(seed), 1, 1.0)
+    ((shape, placement),) = make_random_solids(np.random.default_rng(seed), 1, 1.0)
     low, high = compute_world_box(shape, placement)
     points = triangulate(shape)[0] @ placement.rotation.T + placement.translation
     assert (points >= low - 1e-9).all()

@@ -40,7 +40,7 @@ def load(folder: Path, held: str) -> Scene:
 
 
 @cache
-def hall() -> Scene:
+def make_hall() -> Scene:
     return Scene.from_document(
         {
             "robot": "husky_ur5e",
@@ -83,7 +83,7 @@ def hold(draw: st.DrawFn, scene: Scene) -> Scene:
 
 @st.composite
 def changed_scenes(draw: st.DrawFn) -> Scene:
-    scene = hall()
+    scene = make_hall()
     for change in draw(st.lists(st.sampled_from([start, turn, move, hold]), max_size=5)):
         scene = change(draw, scene)
     return scene
@@ -103,18 +103,20 @@ def test_document_describes_the_changed_scene(scene: Scene) -> None:
 
 def test_documents_and_placements_are_copies() -> None:
     placement = pin.SE3(np.eye(3), np.array([1.0, 0.0, 0.05]))
-    moved = hall().with_placement("cane", placement)
+    moved = make_hall().with_placement("cane", placement)
     placement.translation[:] = 9.0
     np.testing.assert_array_equal(moved.objects["cane"].placement.translation, [1.0, 0.0, 0.05])
-    np.testing.assert_array_equal(hall().objects["cane"].placement.translation, [2.0, 0.0, 0.05])
-    hall().document["objects"].clear()
+    np.testing.assert_array_equal(
+        make_hall().objects["cane"].placement.translation, [2.0, 0.0, 0.05]
+    )
+    make_hall().document["objects"].clear()
     front = {entry["name"]: entry for entry in moved.document["objects"]}["front"]
     assert front["yaw"] == 0.7, "descriptions of unmoved objects are kept"
 
 
 @pytest.mark.parametrize("values", [(0.0, 0.0), (0.05, -0.4), (-0.095, 1.2)])
 def test_held_object_follows_the_hand(values: tuple[float, float]) -> None:
-    held = hall().with_held(GRIP, at={"cane": values})
+    held = make_hall().with_held(GRIP, at={"cane": values})
     for scene in (
         held,
         held.with_start(base=[1.0, 2.0, -2.0]),
@@ -130,7 +132,7 @@ def test_held_object_follows_the_hand(values: tuple[float, float]) -> None:
 def test_object_held_through_another_follows_its_link(tmp_path: Path) -> None:
     roll = (0.3, 0.2, 0.1)
     at = {"cane": (0.05, -0.4), "fruit": roll}
-    held = hall().with_held({"fruit": "pull", "cane": "grip"}, by=BY, at=at)
+    held = make_hall().with_held({"fruit": "pull", "cane": "grip"}, by=BY, at=at)
     assert [str(one) for one in held.holds] == ["cane.grip", "fruit.pull by cane.tip"]
     fruit = "fruit: {attachment: pull, by: cane.tip, at: [0.3, 0.2, 0.1]}"
     file = load(tmp_path, f"{{{fruit}, cane: {{attachment: grip, at: [0.05, -0.4]}}}}")
@@ -151,7 +153,7 @@ def test_object_held_through_another_follows_its_link(tmp_path: Path) -> None:
 def test_short_form_of_holds(tmp_path: Path) -> None:
     scene = load(tmp_path, "{cane: end}")
     assert scene.document["start"]["held"] == {"cane": {"attachment": "end"}}
-    assert scene.held == hall().with_held(GRIP).with_held({"cane": "end"}).held
+    assert scene.held == make_hall().with_held(GRIP).with_held({"cane": "end"}).held
 
 
 @pytest.mark.parametrize(
@@ -174,10 +176,10 @@ def test_unknown_names_are_rejected(
     nearest: str | None,
 ) -> None:
     with pytest.raises(UnknownNameError) as caught:
-        hall().with_held(held, by=by, at=at)
+        make_hall().with_held(held, by=by, at=at)
     assert (caught.value.field, caught.value.nearest) == (field, nearest)
     with pytest.raises(UnknownNameError, match="did you mean 'cane'"):
-        hall().with_placement("cana", pin.SE3.Identity())
+        make_hall().with_placement("cana", pin.SE3.Identity())
 
 
 @pytest.mark.parametrize(
@@ -197,7 +199,7 @@ def test_impossible_holds_are_rejected(
     held: Mapping[str, str], by: Mapping[str, str], at: Mapping[str, Any], match: str
 ) -> None:
     with pytest.raises(InputError, match=match):
-        hall().with_held(held, by=by, at=at)
+        make_hall().with_held(held, by=by, at=at)
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ TRAY = 0.295
 HINGE = {"hinge": 1.2}
 
 
-def beside(gap: float, begin: float = 1.7) -> Scene:
+def make_panel_scene(gap: float, begin: float = 1.7) -> Scene:
     """Return the drawer's room with a panel beside the drawer's front, from x = `begin` on."""
     depth = 2.3 - begin
     return add_boxes(
@@ -37,7 +37,7 @@ def beside(gap: float, begin: float = 1.7) -> Scene:
     )
 
 
-def in_wall(depth: float = 0.05, **fields: Any) -> Scene:
+def make_wall_scene(depth: float = 0.05, **fields: Any) -> Scene:
     """Return a room with a door whose leaf overlaps the wall at its hinges, at y = 0."""
     walls = [
         {
@@ -61,10 +61,10 @@ def in_wall(depth: float = 0.05, **fields: Any) -> Scene:
 @given(gap=st.floats(0.001, 0.018), begin=st.floats(1.4, 1.8))
 @settings(max_examples=8, deadline=None)
 def test_drawer_is_exempt_from_a_panel_until_it_has_passed_it(gap: float, begin: float) -> None:
-    (close,) = find_close_pairs(beside(gap, begin), SAFE)
+    (close,) = find_close_pairs(make_panel_scene(gap, begin), SAFE)
     assert close[:2] == ("drawer.tray", "side")
     assert close.distance == pytest.approx(gap, abs=1e-6)
-    (one,) = find_clearance_exemptions(beside(gap, begin), SAFE)
+    (one,) = find_clearance_exemptions(make_panel_scene(gap, begin), SAFE)
     assert (one.margin, one.distance) == (0.0, close.distance)
     lower, upper = one.ranges["drawer.slide"]
     assert lower == -np.inf
@@ -78,7 +78,7 @@ def test_drawer_is_exempt_from_a_panel_until_it_has_passed_it(gap: float, begin:
 
 
 def test_cache_depends_on_obstacles_and_states() -> None:
-    scene = beside(0.004, 1.4)
+    scene = make_panel_scene(0.004, 1.4)
     (one,) = find_clearance_exemptions(scene, SAFE)
     kept = [k for k, label in enumerate(scene.obstacle_labels) if label != "side"]
     parts = {
@@ -122,7 +122,7 @@ def test_warning_names_overlapping_links() -> None:
     with pytest.warns(
         UserWarning, match=r"tight: .*door\.panel – wall overlap by 50\.0 mm.*`allow:`"
     ) as caught:
-        scene = in_wall()
+        scene = make_wall_scene()
     assert len(caught) == 1
     (one,) = find_clearance_exemptions(scene, SAFE)
     assert one.is_between("wall", "door.panel")
@@ -130,8 +130,8 @@ def test_warning_names_overlapping_links() -> None:
 
 
 def test_exemptions_of_built_neighbours_hold_in_any_state() -> None:
-    (one,) = find_clearance_exemptions(beside(0.004), SAFE)
-    opened = beside(0.004).with_state("drawer", {"slide": 0.4})
+    (one,) = find_clearance_exemptions(make_panel_scene(0.004), SAFE)
+    opened = make_panel_scene(0.004).with_state("drawer", {"slide": 0.4})
     assert find_close_pairs(opened, SAFE) == []
     (other,) = find_clearance_exemptions(opened, SAFE)
     assert (other.shapes, other.margin, other.ranges) == (one.shapes, one.margin, one.ranges)
@@ -159,7 +159,7 @@ def test_allowed_pairs_of_a_scene(tmp_path: Path, allow: list[Any], margin: floa
     )
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # allowed overlaps raise no warning
-        scene = Scene.from_document({**in_wall(-0.004).document, "allow": allow}, tmp_path)
+        scene = Scene.from_document({**make_wall_scene(-0.004).document, "allow": allow}, tmp_path)
     assert scene.allowed[frozenset(("door.panel", "wall"))] == margin
     assert find_close_pairs(scene, SAFE) == []
     assert all(isinstance(label, str) for pair in scene.allowed for label in pair)
@@ -180,7 +180,7 @@ def test_allowed_pairs_of_a_scene(tmp_path: Path, allow: list[Any], margin: floa
 )
 def test_errors_name_invalid_allowed_pairs(allow: list[Any], field: str, said: str) -> None:
     with pytest.raises(InputError) as caught:
-        Scene.from_document({**in_wall(-0.03).document, "allow": allow})
+        Scene.from_document({**make_wall_scene(-0.03).document, "allow": allow})
     assert caught.value.field == field
     assert said in str(caught.value)
 
@@ -196,7 +196,11 @@ def test_missing_file_suggests_the_nearest_one(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=said):
             Scene.from_document(
-                {**in_wall(-0.03).document, "objects": [{**door, "type": missing}], "allow": []},
+                {
+                    **make_wall_scene(-0.03).document,
+                    "objects": [{**door, "type": missing}],
+                    "allow": [],
+                },
                 tmp_path,
             )
 
@@ -206,13 +210,13 @@ def test_unknown_links_in_srdf_are_located(tmp_path: Path) -> None:
         '<robot name="home">\n<disable_collisions link1="doro" link2="wall"/>\n</robot>'
     )
     with pytest.raises(UnknownNameError, match=r"home\.srdf:2: .*did you mean 'door'"):
-        Scene.from_document({**in_wall(-0.03).document, "allow": ["home.srdf"]}, tmp_path)
+        Scene.from_document({**make_wall_scene(-0.03).document, "allow": ["home.srdf"]}, tmp_path)
 
 
 def test_door_opens_and_closes_in_its_wall() -> None:
     """The oracle, which finds neighbours on its own, judges the plan too."""
     with pytest.warns(UserWarning, match="overlap by 50"):
-        scene = in_wall()
+        scene = make_wall_scene()
     plan = vkc.plan(scene, [vkc.Actuate("door", HINGE), vkc.Actuate("door", {"hinge": 0.0})])
     assert plan.success, plan.summary()
     assert plan.report.clearance > 0.015  # of pairs that are not exempt
@@ -232,7 +236,7 @@ def test_cup_may_leave_but_not_enter_an_overlap() -> None:
 
 def test_allowed_margin_decides_about_a_leaf_that_turns_into_its_wall() -> None:
     """3 mm are too few for a leaf 40 mm thick that turns about its edge."""
-    scene = in_wall(-0.003)
+    scene = make_wall_scene(-0.003)
     plan = vkc.plan(scene, [vkc.Actuate("door", HINGE)])
     assert plan.status == "infeasible"
     (note,) = plan.report.notes
@@ -252,14 +256,17 @@ LEAF = (
 )
 
 
-def box(position: str, size: str) -> str:
+def format_box(position: str, size: str) -> str:
     geometry = f'<geometry><box size="{size}"/></geometry>'
     return f'<collision><origin xyz="{position}"/>{geometry}</collision>'
 
 
-def hinged_at_post(folder: Path, *, block: bool) -> Scene:
+def write_post_scene(folder: Path, *, block: bool) -> Scene:
     """Return a room with a leaf 1 mm inside its post; the same obstacle may have a block."""
-    post, blocking = box("0.02 0.049 1", "0.1 0.1 2"), box("0.3 -0.25 0.3", "0.2 0.2 0.6")
+    post, blocking = (
+        format_box("0.02 0.049 1", "0.1 0.1 2"),
+        format_box("0.3 -0.25 0.3", "0.2 0.2 0.6"),
+    )
     wall = f'<robot name="w"><link name="w">{post}{blocking if block else ""}</link></robot>'
     (folder / "wall.urdf").write_text(wall, encoding="utf-8")
     attachment = {
@@ -269,7 +276,10 @@ def hinged_at_post(folder: Path, *, block: bool) -> Scene:
         "approach": [1, 0, 0],
         "closing": [0, 1, 0],
     }
-    door = {"urdf": LEAF.format(leaf=box("0.02 -0.4 1", "0.04 0.8 2")), "attachments": [attachment]}
+    door = {
+        "urdf": LEAF.format(leaf=format_box("0.02 -0.4 1", "0.04 0.8 2")),
+        "attachments": [attachment],
+    }
     document = {
         "name": "hinged",
         "robot": "husky_ur5e",
@@ -289,7 +299,7 @@ def test_exemption_applies_to_shapes_not_links(tmp_path: Path) -> None:
     for name in ("free", "blocked"):
         (tmp_path / name).mkdir()
     steps = [vkc.Actuate("door", {"hinge": 1.2})]
-    free = hinged_at_post(tmp_path / "free", block=False)
+    free = write_post_scene(tmp_path / "free", block=False)
     opened = vkc.plan(free, steps)
     assert opened.success, opened.summary()
     (used,) = opened.report.exemptions
@@ -298,7 +308,7 @@ def test_exemption_applies_to_shapes_not_links(tmp_path: Path) -> None:
     assert "1.0 mm inside each other" in used.reason
     assert f"exempt      {used}" in opened.summary()
 
-    blocked = hinged_at_post(tmp_path / "blocked", block=True)
+    blocked = write_post_scene(tmp_path / "blocked", block=True)
     (one,) = find_clearance_exemptions(blocked, SAFE)
     assert one.shapes == ("door.leaf_0", "wall_0")
     report = validate(blocked, steps, opened.trajectory)

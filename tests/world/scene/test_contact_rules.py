@@ -29,7 +29,7 @@ THROUGH = Hold("door", "handle", Hold("stick", "grip"), "tip")
 LEVER, PANEL = "door.lever", "door.panel"
 
 
-def door(attachment: str = "handle", **fields: object) -> Scene:
+def load_door(attachment: str = "handle", **fields: object) -> Scene:
     """Return the door's scene, with something about an attachment changed."""
     scene = load_door_scene()
     given = scene.objects["door"].object.attachments
@@ -42,7 +42,7 @@ def door(attachment: str = "handle", **fields: object) -> Scene:
     [(None, 0.005), (0.012, 0.012), (0.0, 0.0), (0.5, 0.02)],  # no more than everything keeps
 )
 def test_a_hand_keeps_the_attachments_clearance(clearance: float | None, expected: float) -> None:
-    scene = door(clearance=clearance)
+    scene = load_door(clearance=clearance)
     for link in (LEVER, PANEL):
         assert compute_hand_clearance(scene, HANDLE, link, Options()) == expected
     assert compute_hand_clearance(scene, HANDLE, LEVER, Options(dist_safe=0.001)) == min(
@@ -52,12 +52,12 @@ def test_a_hand_keeps_the_attachments_clearance(clearance: float | None, expecte
 
 def test_pushing_or_indirect_hold_needs_no_clearance_from_its_link() -> None:
     options = Options()
-    pushed = door(contact="push")
+    pushed = load_door(contact="push")
     assert compute_hand_clearance(pushed, HANDLE, LEVER, options) == 0.0
     assert compute_hand_clearance(pushed, HANDLE, PANEL, options) == 0.005
-    assert compute_hand_clearance(door(), THROUGH, LEVER, options) == 0.0
-    assert compute_hand_clearance(door(), THROUGH, PANEL, options) == 0.005
-    assert compute_hand_clearance(door(), HANDLE, LEVER, options) == 0.005
+    assert compute_hand_clearance(load_door(), THROUGH, LEVER, options) == 0.0
+    assert compute_hand_clearance(load_door(), THROUGH, PANEL, options) == 0.005
+    assert compute_hand_clearance(load_door(), HANDLE, LEVER, options) == 0.005
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_pushing_or_indirect_hold_needs_no_clearance_from_its_link() -> None:
     ],
 )
 def test_rigid_grasps(attachment: str, contact: str, firm: bool, as_one: bool) -> None:
-    scene = door(attachment, contact=contact, firm=firm)
+    scene = load_door(attachment, contact=contact, firm=firm)
     assert bool(scene.objects["door"].object.attachments[attachment].freedoms) == (
         attachment == "handle_free"
     )

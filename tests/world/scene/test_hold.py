@@ -55,7 +55,7 @@ def test_a_hold_comes_after_the_one_it_depends_on() -> None:
             check_hold_order(holds)
 
 
-def described(path: Path, name: str, old: str, new: str) -> str:
+def write_object(path: Path, name: str, old: str, new: str) -> str:
     """Write a modified copy of an object's description; return its path."""
     source = Path(str(find_resource_folder("scenes"))) / "objects"
     shutil.copy(source / f"{name}.urdf", path)
@@ -71,7 +71,7 @@ def test_approach_from_inside_is_reversed(
     right = load_drawer_scene()
     item = {
         **right.document["objects"][0],
-        "type": described(tmp_path, "drawer", "approach: [1, 0, 0]", "approach: [-1, 0, 0]"),
+        "type": write_object(tmp_path, "drawer", "approach: [1, 0, 0]", "approach: [-1, 0, 0]"),
     }
     with pytest.warns(
         UserWarning, match=r"the hand would approach drawer\.handle through the object"
@@ -101,7 +101,7 @@ def test_approach_from_inside_is_reversed(
 
 def test_approach_from_below_the_floor_is_reversed(tmp_path: Path) -> None:
     free = "\n    closing: [1, 0, 0]\n    joint: spherical\n    limits: [-1.5, 1.5]"
-    said = described(
+    said = write_object(
         tmp_path,
         "ball",
         f"approach: [0, 0, -1]{free}",
@@ -143,7 +143,7 @@ def test_reversing_twice_restores_the_approach(name: str) -> None:
 
 def test_approach_through_a_held_object_is_reversed(tmp_path: Path) -> None:
     joint = "joint: {}\n    standoff: 0.035"
-    fixed = described(tmp_path, "ball", joint.format("spherical"), joint.format("fixed"))
+    fixed = write_object(tmp_path, "ball", joint.format("spherical"), joint.format("fixed"))
     first, _, last = Path(fixed).read_text().rpartition("approach: [0, 0, -1]")
     document = {"robot": "husky_ur5e", "start": {"base": [0.0, 0.0, 0.0]}}
     stick = {"name": "stick", "type": "stick", "position": [2.0, 0.0, 0.5]}

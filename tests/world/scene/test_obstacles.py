@@ -24,7 +24,7 @@ URDF = """<robot name="r"><link name="a"><collision><origin xyz="0 0 1"/><geomet
 <limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>"""
 
 
-def described(
+def make_shapes(
     folder: Path, **fields: Any
 ) -> tuple[list[pin.GeometryObject], list[pin.GeometryObject]]:
     item = pydantic.TypeAdapter(ObstacleSchema).validate_python(
@@ -33,7 +33,7 @@ def described(
     return make_obstacle_shapes(item, POSE, folder)
 
 
-def volume(shape: pin.GeometryObject) -> float:
+def compute_volume(shape: pin.GeometryObject) -> float:
     return float(trimesh.Trimesh(*triangulate(shape.geometry)).volume)
 
 
@@ -57,8 +57,8 @@ def test_every_kind_has_its_volume_and_place(
     (tmp_path / "wedge.obj").write_text(
         "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
     )
-    (drawn,), (solid,) = described(tmp_path, colour=[0.1, 0.2, 0.3, 0.4], **fields)
-    assert 0.95 * expected <= volume(solid) <= expected * (1 + 1e-9)
+    (drawn,), (solid,) = make_shapes(tmp_path, colour=[0.1, 0.2, 0.3, 0.4], **fields)
+    assert 0.95 * expected <= compute_volume(solid) <= expected * (1 + 1e-9)
     for shape in (drawn, solid):
         assert shape.name == "item"
         assert shape.parentJoint == 0
@@ -70,7 +70,7 @@ def test_every_kind_has_its_volume_and_place(
 
 def test_a_urdf_stands_with_its_joints_at_zero(tmp_path: Path) -> None:
     (tmp_path / "r.urdf").write_text(URDF)
-    _, solid = described(tmp_path, type="urdf", file="r.urdf", colour=[1, 0, 0, 1])
+    _, solid = make_shapes(tmp_path, type="urdf", file="r.urdf", colour=[1, 0, 0, 1])
     assert [shape.name for shape in solid] == ["item_0", "item_1"]
     assert all(shape.parentJoint == 0 for shape in solid)
     where = [

@@ -32,44 +32,48 @@ OBJECTS = (
 
 
 @cache
-def scene(name: str = "household") -> Scene:
+def load(name: str = "household") -> Scene:
     return load_scene(name)
 
 
-def at_origin(name: str, **state: float) -> PlacedObject:
+def place_at_origin(name: str, **state: float) -> PlacedObject:
     item = load_object(name)
     placed = PlacedObject(name, item, pin.SE3.Identity(), np.zeros(item.coordinates.size))
     return placed.with_state(state)
 
 
-def parts(placed: PlacedObject, *links: str) -> list[pin.GeometryObject]:
+def list_parts(placed: PlacedObject, *links: str) -> list[pin.GeometryObject]:
     """Return an object's shapes, of all links by default, in the world frame."""
     return [s for s in make_world_shapes(placed) if not links or get_link_name(s.name) in links]
 
 
-def obstacles(here: Scene, *names: str) -> list[pin.GeometryObject]:
+def list_obstacles(here: Scene, *names: str) -> list[pin.GeometryObject]:
     """Return the shapes of obstacles, by default of all but the floor."""
     labels = zip(here.obstacles, here.obstacle_labels, strict=True)
     return [s for s, label in labels if (label in names if names else label != FLOOR)]
 
 
-def surroundings(here: Scene, without: str = "") -> list[pin.GeometryObject]:
+def list_surroundings(here: Scene, without: str = "") -> list[pin.GeometryObject]:
     """Return the shapes of all obstacles but the floor, and of all objects but one."""
     others = [placed for name, placed in here.objects.items() if name != without]
-    return obstacles(here) + [shape for placed in others for shape in parts(placed)]
+    return list_obstacles(here) + [shape for placed in others for shape in list_parts(placed)]
 
 
-def clearance(shapes: Iterable[pin.GeometryObject], others: Iterable[pin.GeometryObject]) -> float:
+def measure_clearance(
+    shapes: Iterable[pin.GeometryObject], others: Iterable[pin.GeometryObject]
+) -> float:
     return compute_clearance(list_placed_shapes(shapes), list_placed_shapes(others), reach=0.2)
 
 
-def bounds(shapes: Iterable[pin.GeometryObject]) -> np.ndarray:
+def compute_bounds(shapes: Iterable[pin.GeometryObject]) -> np.ndarray:
     """Return the lowest and highest x, y, z, shape (2, 3) [m]."""
     boxes = np.array([compute_world_box(shape.geometry, shape.placement) for shape in shapes])
     return np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
 
-def robot_shapes(robot: Robot, z: np.ndarray, links: Iterable[str]) -> list[pin.GeometryObject]:
+def place_robot_shapes(
+    robot: Robot, z: np.ndarray, links: Iterable[str]
+) -> list[pin.GeometryObject]:
     """Return the shapes of some links at a configuration, in the world frame."""
     data, places = robot.model.createData(), robot.collision.createData()
     pin.updateGeometryPlacements(robot.model, data, robot.collision, places, robot.coordinates.q(z))
@@ -80,17 +84,17 @@ def robot_shapes(robot: Robot, z: np.ndarray, links: Iterable[str]) -> list[pin.
     ]
 
 
-def hand(tool: pin.SE3) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:
+def place_hand(tool: pin.SE3) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:
     """Return the shapes of the open gripper with the tool frame at `tool`."""
-    here = scene().with_start(base=[0.0, 0.0, 0.0], arm=scene().robot.home)
+    here = load().with_start(base=[0.0, 0.0, 0.0], arm=load().robot.home)
     back = tool * here.tool_placement().inverse()
-    shapes = robot_shapes(here.robot, here.start, here.robot.touch_links)
+    shapes = place_robot_shapes(here.robot, here.start, here.robot.touch_links)
     return [(shape.geometry, back * shape.placement) for shape in shapes]
 
 
-@pytest.mark.parametrize("name", [name for name in SCENES if scene(name).start_region])
+@pytest.mark.parametrize("name", [name for name in SCENES if load(name).start_region])
 def test_random_starts_fill_their_region(name: str) -> None:
-    here, rng = scene(name), np.random.default_rng(0)
+    here, rng = load(name), np.random.default_rng(0)
     region = here.start_region
     assert here.name == name
     assert region is not None
@@ -122,16 +126,18 @@ def test_random_starts_fill_their_region(name: str) -> None:
 def test_joints_move_freely_over_their_range(
     name: str, owner: str, joint: str, upper: float
 ) -> None:
-    placed, rest = scene(name).objects[owner], surroundings(scene(name), owner)
+    placed, rest = load(name).objects[owner], list_surroundings(load(name), owner)
     item = placed.object
     k = item.coordinates.index(joint)
     assert item.upper[k] == pytest.approx(upper)
     moving = item.links_moved_by({joint})
     for value in np.linspace(item.lower[k], item.upper[k], 12):
         moved = placed.with_state({joint: float(value)})
-        assert clearance(parts(moved, *moving), rest) > DIST_SAFE, value
+        assert measure_clearance(list_parts(moved, *moving), rest) > DIST_SAFE, value
         others = [link for link in item.links if link not in moving]
-        assert clearance(parts(moved, *moving), parts(moved, *others)) > 0.004, value
+        assert measure_clearance(list_parts(moved, *moving), list_parts(moved, *others)) > 0.004, (
+            value
+        )
 
 
 @pytest.mark.parametrize("name", OBJECTS)
@@ -141,19 +147,19 @@ def test_hand_fits_around_every_attachment(name: str) -> None:
         if attachment.name == "pull":  # grasped by broom and stick, not by the hand
             continue
         opened = name == "dishwasher" and attachment.link == "rack"
-        placed = at_origin(name, **({"door": np.pi / 2} if opened else {}))
+        placed = place_at_origin(name, **({"door": np.pi / 2} if opened else {}))
         tool = placed.link_placement(attachment.link) * attachment.placement
         tool = tool * attachment.motion(np.zeros(len(attachment.freedoms)))
         pushes = attachment.contact == "push"
-        shapes = hand(tool * scene().robot.front.inverse() if pushes else tool)
-        gap = compute_clearance(shapes, list_placed_shapes(parts(placed, attachment.link)))
+        shapes = place_hand(tool * load().robot.front.inverse() if pushes else tool)
+        gap = compute_clearance(shapes, list_placed_shapes(list_parts(placed, attachment.link)))
         if pushes:
             assert gap == pytest.approx(attachment.standoff, abs=1e-5) or gap > GRASP_CLEARANCE
         else:
             assert gap > GRASP_CLEARANCE, attachment.name
         others = [link for link in placed.object.links if link != attachment.link]
         if others and name not in ("stick", "broom"):
-            near = compute_clearance(shapes, list_placed_shapes(parts(placed, *others)))
+            near = compute_clearance(shapes, list_placed_shapes(list_parts(placed, *others)))
             assert near > DIST_SAFE, attachment.name
 
 
@@ -174,11 +180,11 @@ def test_hand_fits_around_every_attachment(name: str) -> None:
 def test_dimensions_match_the_paper(
     name: str, names: list[str], low: tuple[float, ...], high: tuple[float, ...]
 ) -> None:
-    shapes = obstacles(scene(name), *names)
+    shapes = list_obstacles(load(name), *names)
     for label in names if not shapes else ():
         owner, _, link = label.partition(".")
-        shapes = parts(scene(name).objects[owner], link)
-    np.testing.assert_allclose(bounds(shapes), [low, high], atol=1e-9)
+        shapes = list_parts(load(name).objects[owner], link)
+    np.testing.assert_allclose(compute_bounds(shapes), [low, high], atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -195,31 +201,33 @@ def test_dimensions_match_the_paper(
 def test_base_fits_through_passages(
     name: str, state: dict[str, float], begin: tuple[float, float], end: tuple[float, float]
 ) -> None:
-    here = scene(name).with_state("door", state) if state else scene(name)
+    here = load(name).with_state("door", state) if state else load(name)
     heading = float(np.arctan2(end[1] - begin[1], end[0] - begin[0]))
     for x, y in np.linspace(begin, end, 20):
         z = np.array([x, y, heading, *here.robot.home])
-        base = robot_shapes(here.robot, z, ["base_link"])
-        assert clearance(base, surroundings(here)) > DIST_SAFE, (x, y)
+        base = place_robot_shapes(here.robot, z, ["base_link"])
+        assert measure_clearance(base, list_surroundings(here)) > DIST_SAFE, (x, y)
 
 
 def test_gap_between_pillar_and_wall_is_the_only_passage() -> None:
-    here = scene("gap_table")
+    here = load("gap_table")
     for first, second, width in (
         ("pillar", "wall_south", 0.85),
         ("pillar", "sideboard", 0.0),
         ("sideboard", "wall_north", 0.0),
     ):
-        one, two = (list_placed_shapes(obstacles(here, name)) for name in (first, second))
+        one, two = (list_placed_shapes(list_obstacles(here, name)) for name in (first, second))
         assert compute_clearance(one, two) == pytest.approx(width, abs=1e-6)
 
 
 def test_household_is_furnished_without_overlaps() -> None:
-    here = scene()
+    here = load()
     np.testing.assert_allclose(
-        bounds(surroundings(here)), [[-4.1, -4.1, 0.0], [4.1, 4.1, 2.4]], atol=1e-9
+        compute_bounds(list_surroundings(here)), [[-4.1, -4.1, 0.0], [4.1, 4.1, 2.4]], atol=1e-9
     )
-    assert len(surroundings(here)) >= 120
+    assert len(list_surroundings(here)) >= 120
     for name, placed in here.objects.items():
         links = ("panel", "lever") if name == "door" else ()  # its frame fills an opening
-        assert clearance(parts(placed, *links), surroundings(here, name)) > 9e-4, name
+        assert (
+            measure_clearance(list_parts(placed, *links), list_surroundings(here, name)) > 9e-4
+        ), name

@@ -17,7 +17,7 @@ from vkc_pin.world.scene.support import (
 )
 
 
-def on(scene: Scene, name: str = "cup") -> set[str]:
+def find_supports_of(scene: Scene, name: str = "cup") -> set[str]:
     shapes = [
         (f"{other}.{get_link_name(shape.name)}", shape)
         for other, placed in scene.objects.items()
@@ -33,12 +33,12 @@ def on(scene: Scene, name: str = "cup") -> set[str]:
     [(-2e-3, True), (0.0, True), (1e-3, True), (2.4e-3, True), (2.6e-3, False), (0.1, False)],
 )
 def test_a_cup_on_a_plate_or_above_it(gap: float, stands: bool) -> None:
-    assert on(make_plate_scene(gap=gap)) == ({"plate.plate"} if stands else set())
+    assert find_supports_of(make_plate_scene(gap=gap)) == ({"plate.plate"} if stands else set())
 
 
 @pytest.mark.parametrize("apart", [-1e-3, 0.0, 1e-3])
 def test_adjacent_shape_is_no_support(apart: float) -> None:
-    assert on(make_plate_scene(cups=1, wall=apart)) == {"plate.plate"}
+    assert find_supports_of(make_plate_scene(cups=1, wall=apart)) == {"plate.plate"}
 
 
 def test_the_floor_and_two_tables() -> None:
@@ -47,8 +47,11 @@ def test_the_floor_and_two_tables() -> None:
         {"name": f"table_{k}", "type": "box", "size": size, "position": [0.2 * k, 0.0, 0.25]}
         for k in range(3)
     ]
-    assert on(make_scene([describe_cup(at=(0.1, 0.0, 0.5))], tables)) == {"table_0", "table_1"}
-    assert on(make_scene([describe_cup(at=(0.1, 0.0, 0.0))])) == {"floor"}
+    assert find_supports_of(make_scene([describe_cup(at=(0.1, 0.0, 0.5))], tables)) == {
+        "table_0",
+        "table_1",
+    }
+    assert find_supports_of(make_scene([describe_cup(at=(0.1, 0.0, 0.0))])) == {"floor"}
 
 
 def test_stacked_objects_are_supported() -> None:
@@ -57,7 +60,7 @@ def test_stacked_objects_are_supported() -> None:
     stacked = Scene.from_document(
         {**scene.document, "objects": [*scene.document["objects"], upper]}, write_objects()
     )
-    assert on(stacked, "upper") == {"cup.cup"}
+    assert find_supports_of(stacked, "upper") == {"cup.cup"}
     assert find_supported_objects(stacked.objects, {"plate": {"plate"}}, ["cup", "upper"]) == {
         "cup": "plate.plate",
         "upper": "plate.plate",

@@ -29,7 +29,9 @@ from vkc_pin.world.task.phases import Task
 STEP = 1e-6  # [rad] or [m]
 
 
-def moved(placed: PlacedObject, attachment: Attachment, joint: str, values: list[float]) -> float:
+def differentiate_contact(
+    placed: PlacedObject, attachment: Attachment, joint: str, values: list[float]
+) -> float:
     """Return the advance of the contact into its face per unit of a joint, numerically."""
     touched = attachment.placement
     for freedom, value in zip(attachment.freedoms, values, strict=True):
@@ -73,20 +75,26 @@ def test_advance_matches_finite_differences(
     )
     for joint in ("swing", "slide"):
         least, most = compute_advance(arm, face, joint)
-        corners = [moved(arm, face, joint, [x, y, 0.3]) for x in (-0.1, 0.2) for y in (-0.1, 0.2)]
+        corners = [
+            differentiate_contact(arm, face, joint, [x, y, 0.3])
+            for x in (-0.1, 0.2)
+            for y in (-0.1, 0.2)
+        ]
         np.testing.assert_allclose([least, most], [min(corners), max(corners)], rtol=0.0, atol=1e-8)
         inside = [
             own.lower + share * (own.upper - own.lower)
             for own, share in zip(face.freedoms, where, strict=True)
         ]
-        assert least - 1e-8 <= moved(arm, face, joint, inside) <= most + 1e-8
+        assert least - 1e-8 <= differentiate_contact(arm, face, joint, inside) <= most + 1e-8
 
 
-def compiled(scene: Scene, joints: dict[str, float], attachment: str, name: str = "door") -> Task:
+def compile_actuation(
+    scene: Scene, joints: dict[str, float], attachment: str, name: str = "door"
+) -> Task:
     return compile_task(scene, [vkc.Actuate(name, joints, attachment)], Options())
 
 
-def at(hinge: float) -> Scene:
+def open_door(hinge: float) -> Scene:
     return load_door_scene().with_state("door", {"hinge": hinge})
 
 
@@ -95,7 +103,7 @@ def at(hinge: float) -> Scene:
     [(-1.2, 0.0, "push", 1), (1.57, 2.0, "push_back", -1), (0.3, 0.9, "push", 1)],
 )
 def test_door_is_pushed_shut_or_further_open(begin: float, end: float, face: str, way: int) -> None:
-    reach, move = compiled(at(begin), {"hinge": end}, face).phases
+    reach, move = compile_actuation(open_door(begin), {"hinge": end}, face).phases
     assert (reach.pushed, move.pushed, move.name) == ({}, {"door.hinge": way}, "move door.hinge")
 
 
@@ -105,7 +113,7 @@ def test_door_is_pushed_shut_or_further_open(begin: float, end: float, face: str
 def test_push_cannot_pull(begin: float, end: float, face: str, way: str) -> None:
     said = f"pushing 'door' at '{face}' moves 'hinge' {way} only: a hand that pushes cannot pull"
     with pytest.raises(InputError, match=said) as caught:
-        compiled(at(begin), {"hinge": end}, face)
+        compile_actuation(open_door(begin), {"hinge": end}, face)
     assert caught.value.field == "steps[0].joints"
     other = "or an attachment that can be grasped: handle, handle_free"
     assert caught.value.expected == f"{'≥' if way == 'up' else '≤'} {begin:g}, {other}"
@@ -113,7 +121,7 @@ def test_push_cannot_pull(begin: float, end: float, face: str, way: str) -> None
 
 def test_a_latched_door_cannot_be_pushed_open() -> None:
     with pytest.raises(InputError, match="latched"):
-        compiled(at(0.0), {"hinge": 1.0}, "push")
+        compile_actuation(open_door(0.0), {"hinge": 1.0}, "push")
 
 
 def test_push_along_the_joint_axis_is_rejected() -> None:
@@ -122,19 +130,19 @@ def test_push_along_the_joint_axis_is_rejected() -> None:
     cabinet = replace_attachment(make_full_scene().objects["cabinet"], face)
     scene = replace_objects(load_door_scene(), {"cabinet": cabinet})
     with pytest.raises(InputError, match="does not move 'swing' in a single direction"):
-        compiled(scene, {"swing": 0.2}, "face", "cabinet")
+        compile_actuation(scene, {"swing": 0.2}, "face", "cabinet")
 
 
 def test_face_on_both_sides_of_the_hinge_is_rejected() -> None:
-    placed = at(-1.0).objects["door"]
+    placed = open_door(-1.0).objects["door"]
     wide = (
         dataclasses.replace(placed.object.attachments["push"].freedoms[0], lower=-0.7),
         *placed.object.attachments["push"].freedoms[1:],
     )
     both = dataclasses.replace(placed.object.attachments["push"], name="both", freedoms=wide)
     with pytest.raises(InputError, match="does not move 'hinge' in a single direction"):
-        compiled(
-            replace_objects(at(-1.0), {"door": replace_attachment(placed, both)}),
+        compile_actuation(
+            replace_objects(open_door(-1.0), {"door": replace_attachment(placed, both)}),
             {"hinge": 0.0},
             "both",
         )

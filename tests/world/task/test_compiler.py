@@ -35,11 +35,11 @@ HINGE, KNOB = (-1.57, 1.57), (0.0, 0.8)
 HANDLE = Hold("door", "handle")
 
 
-def phases(steps: Sequence[Step], scene: Scene | None = None) -> Task:
+def compile_steps(steps: Sequence[Step], scene: Scene | None = None) -> Task:
     return compile_task(scene or load_door_scene(), steps, OPTIONS)
 
 
-def with_link(scene: Scene, name: str, link: str) -> Scene:
+def add_attachment(scene: Scene, name: str, link: str) -> Scene:
     """Return the scene with one more attachment of the door, at the origin of `link`."""
     placed = scene.objects["door"]
     attachment = dataclasses.replace(
@@ -54,7 +54,7 @@ def with_link(scene: Scene, name: str, link: str) -> Scene:
 
 
 def test_opening_a_door_has_three_phases() -> None:
-    task = phases([OPEN])
+    task = compile_steps([OPEN])
     assert [phase.name for phase in task.phases] == [
         "reach door.handle",
         "turn door.knob",
@@ -85,9 +85,9 @@ def test_latch_is_turned_only_where_it_is_engaged() -> None:
         ({"hinge": 0.3}, ["reach door.handle", "move door.hinge"]),
         ({"hinge": 0.03}, ["reach door.handle", "turn door.knob", "move door.hinge, door.knob"]),
     ):
-        task = phases([OPEN], load_door_scene().with_state("door", state))
+        task = compile_steps([OPEN], load_door_scene().with_state("door", state))
         assert [phase.name for phase in task.phases] == names
-    task = phases([OPEN], load_door_scene().with_state("door", {"knob": 0.6}))
+    task = compile_steps([OPEN], load_door_scene().with_state("door", {"knob": 0.6}))
     assert [phase.name for phase in task.phases] == [
         "reach door.handle",
         "move door.hinge, door.knob",
@@ -98,7 +98,7 @@ def test_latch_is_turned_only_where_it_is_engaged() -> None:
 
 def test_hinge_and_knob_together() -> None:
     """The latch is released first; the knob reaches its goal once the door is open."""
-    far = phases([Actuate("door", {"hinge": 1.2, "knob": 0.7})])
+    far = compile_steps([Actuate("door", {"hinge": 1.2, "knob": 0.7})])
     assert [phase.name for phase in far.phases] == [
         "reach door.handle",
         "turn door.knob",
@@ -106,7 +106,7 @@ def test_hinge_and_knob_together() -> None:
     ]
     assert far.phases[2].values == {"door.hinge": 1.2, "door.knob": 0.7}
     assert far.phases[2].ranges["door.knob"] == (TURNED, KNOB[1])
-    back = phases([Actuate("door", {"hinge": 1.2, "knob": 0.0})])
+    back = compile_steps([Actuate("door", {"hinge": 1.2, "knob": 0.0})])
     assert [phase.name for phase in back.phases][2:] == [
         "move door.hinge, door.knob",
         "turn door.knob",
@@ -119,29 +119,29 @@ def test_hinge_and_knob_together() -> None:
 
 def test_reach_has_one_frame_goal() -> None:
     pose = pin.SE3(np.eye(3), np.array([1.0, 0.0, 1.0]))
-    (phase,) = phases([Reach(pose)]).phases
+    (phase,) = compile_steps([Reach(pose)]).phases
     assert (phase.name, phase.held, phase.segments) == ("reach with tool", (), 10)
     (goal,) = phase.frames
     assert (goal.frame, goal.kind, goal.hold, goal.touches) == ("tool", "pose", None, False)
     assert goal.placement == pose
-    (phase,) = phases([Reach(pose, "forearm_link")]).phases
+    (phase,) = compile_steps([Reach(pose, "forearm_link")]).phases
     assert phase.frames[0].frame == "forearm_link"
 
 
 def test_go_to_releases_fixed_objects() -> None:
-    task = phases([OPEN, GoTo(1.0, 2.0, 0.3)])
+    task = compile_steps([OPEN, GoTo(1.0, 2.0, 0.3)])
     last = task.phases[-1]
     assert (last.name, last.held, last.released) == ("go to", (), (HANDLE,))
     assert last.base == (1.0, 2.0, 0.3)
     assert last.initial_values == {"door.hinge": 1.2, "door.knob": TURNED}
-    assert phases([GoTo(1.0, 2.0)]).phases[0].base == (1.0, 2.0, None)
+    assert compile_steps([GoTo(1.0, 2.0)]).phases[0].base == (1.0, 2.0, None)
     held = load_door_scene().with_held({"door": "handle"})
-    assert phases([GoTo(1.0, 2.0)], held).phases[0].released == (HANDLE,)
+    assert compile_steps([GoTo(1.0, 2.0)], held).phases[0].released == (HANDLE,)
 
 
 def test_objects_keep_their_state_between_grasps() -> None:
     """The second stands still until it is grasped, the first stays as it was left."""
-    task = phases([OPEN, Actuate("drawer", {"slide": 0.2})], make_full_scene())
+    task = compile_steps([OPEN, Actuate("drawer", {"slide": 0.2})], make_full_scene())
     names = [
         "reach door.handle",
         "turn door.knob",
@@ -160,7 +160,7 @@ def test_objects_keep_their_state_between_grasps() -> None:
 
 
 def test_task_has_only_joints_that_its_grasps_can_move() -> None:
-    task = phases([Actuate("cabinet", {"slide": 0.2})], make_full_scene())
+    task = compile_steps([Actuate("cabinet", {"slide": 0.2})], make_full_scene())
     assert task.state == {f"cabinet.{joint}": CABINET_STATE[joint] for joint in ("swing", "slide")}
     placed = make_full_scene().objects["cabinet"]
     assert find_path_joints(placed, placed.object.attachment()) == ["swing", "slide"]
@@ -168,7 +168,7 @@ def test_task_has_only_joints_that_its_grasps_can_move() -> None:
 
 def test_goal_beyond_a_limit_ends_at_the_limit() -> None:
     """Planning then says by how much it fails; later steps start from the limit."""
-    task = phases([Actuate("door", {"hinge": 2.0}), GoTo(0.0, 0.0)])
+    task = compile_steps([Actuate("door", {"hinge": 2.0}), GoTo(0.0, 0.0)])
     assert task.phases[2].values["door.hinge"] == 2.0
     assert task.phases[3].initial_values["door.hinge"] == HINGE[1]
 
@@ -184,31 +184,34 @@ def test_goal_beyond_a_limit_ends_at_the_limit() -> None:
 )
 def test_unknown_names_are_rejected(step: Step, field: str, nearest: str | None) -> None:
     with pytest.raises(UnknownNameError) as caught:
-        phases([GoTo(0.0, 0.0), step])
+        compile_steps([GoTo(0.0, 0.0), step])
     assert (caught.value.field, caught.value.nearest) == (field, nearest)
 
 
 def test_joint_must_move_with_the_hand() -> None:
     with pytest.raises(InputError, match="does not move") as caught:
-        phases(
+        compile_steps(
             [Actuate("door", {"knob": 0.3}, "plate")],
-            with_link(load_door_scene(), "plate", "panel"),
+            add_attachment(load_door_scene(), "plate", "panel"),
         )
     assert caught.value.field == "steps[0].joints"
     assert caught.value.expected == "one of hinge"
     with pytest.raises(InputError, match="does not move"):
-        phases(
-            [Actuate("door", {"hinge": 0.3}, "post")], with_link(load_door_scene(), "post", "frame")
+        compile_steps(
+            [Actuate("door", {"hinge": 0.3}, "post")],
+            add_attachment(load_door_scene(), "post", "frame"),
         )
 
 
 def test_hand_must_be_able_to_release_the_latch() -> None:
-    plate = with_link(load_door_scene(), "plate", "panel")
+    plate = add_attachment(load_door_scene(), "plate", "panel")
     with pytest.raises(InputError, match="is latched") as caught:
-        phases([Actuate("door", {"hinge": 1.2}, "plate")], plate)
+        compile_steps([Actuate("door", {"hinge": 1.2}, "plate")], plate)
     assert caught.value.field == "steps[0].attachment"
     for state in ({"knob": 0.6}, {"hinge": 0.2}):
-        task = phases([Actuate("door", {"hinge": 1.2}, "plate")], plate.with_state("door", state))
+        task = compile_steps(
+            [Actuate("door", {"hinge": 1.2}, "plate")], plate.with_state("door", state)
+        )
         assert [phase.name for phase in task.phases] == ["reach door.plate", "move door.hinge"]
         assert set(task.state) == {"door.hinge"}
 
@@ -216,7 +219,7 @@ def test_hand_must_be_able_to_release_the_latch() -> None:
 @pytest.mark.parametrize("steps", [[], (), [Grasp("door")]])
 def test_nothing_to_do(steps: list[Step]) -> None:
     with pytest.raises(InputError, match="nothing to do") as caught:
-        phases(steps, load_door_scene().with_held({"door": "handle"}))
+        compile_steps(steps, load_door_scene().with_held({"door": "handle"}))
     assert caught.value.field == "steps"
 
 
@@ -226,7 +229,7 @@ def test_nothing_to_do(steps: list[Step]) -> None:
 )
 def test_invalid_steps_are_rejected(steps: Any, field: str) -> None:
     with pytest.raises(InputError) as caught:
-        phases(steps)
+        compile_steps(steps)
     assert caught.value.field == field
 
 
@@ -246,16 +249,16 @@ def test_default_attachment_is_the_first_that_moves_the_joints() -> None:
         ({"lid_hinge": 0.2}, "lid"),
         ({"swing": 0.5, "slide": 0.2}, "grip"),
     ):
-        task = phases([Actuate("cabinet", joints)], scene)
+        task = compile_steps([Actuate("cabinet", joints)], scene)
         assert task.holds == (Hold("cabinet", taken),)
         assert task == dataclasses.replace(
-            phases([Actuate("cabinet", joints, taken)], scene), steps=task.steps
+            compile_steps([Actuate("cabinet", joints, taken)], scene), steps=task.steps
         )
-    assert phases([Grasp("cabinet")], scene).holds == (Hold("cabinet", "case"),)
+    assert compile_steps([Grasp("cabinet")], scene).holds == (Hold("cabinet", "case"),)
     with pytest.raises(
         InputError, match="no attachment of 'cabinet' can bring 'swing' and 'lid_hinge' there"
     ) as caught:
-        phases([Actuate("cabinet", {"swing": 0.5, "lid_hinge": 0.2})], scene)
+        compile_steps([Actuate("cabinet", {"swing": 0.5, "lid_hinge": 0.2})], scene)
     assert caught.value.field == "steps[0].joints"
     assert (
         "case moves nothing; arm moves swing; lid moves lid_hinge; grip moves swing, slide"
@@ -264,7 +267,7 @@ def test_default_attachment_is_the_first_that_moves_the_joints() -> None:
 
 
 def test_present_or_previous_attachment_is_preferred() -> None:
-    task = phases(
+    task = compile_steps(
         [
             Actuate("door", {"hinge": 1.2}, "handle_free"),
             GoTo(0.0, 0.0),
@@ -272,7 +275,7 @@ def test_present_or_previous_attachment_is_preferred() -> None:
         ]
     )
     assert task.holds == (Hold("door", "handle_free"),)
-    task = phases([OPEN], load_door_scene().with_held({"door": "handle_free"}))
+    task = compile_steps([OPEN], load_door_scene().with_held({"door": "handle_free"}))
     assert task.holds == (Hold("door", "handle_free"),)
 
 
@@ -289,7 +292,9 @@ def test_object_grasped_at_two_attachments_in_turn() -> None:
             )
         },
     )
-    task = phases([Actuate("cabinet", {"swing": 0.5}), Actuate("cabinet", {"lid_hinge": 0.2})], lid)
+    task = compile_steps(
+        [Actuate("cabinet", {"swing": 0.5}), Actuate("cabinet", {"lid_hinge": 0.2})], lid
+    )
     grip, other = Hold("cabinet", "grip"), Hold("cabinet", "lid")
     assert task.holds == (grip, other)
     assert [phase.name for phase in task.phases] == [
@@ -306,7 +311,7 @@ def test_object_grasped_at_two_attachments_in_turn() -> None:
         "cabinet.lid_hinge": -0.4,
     }
     assert find_shared_coordinate(lid, task.holds) is None
-    both = phases([OPEN, Actuate("door", {"hinge": 0.5}, "handle_free")])
+    both = compile_steps([OPEN, Actuate("door", {"hinge": 0.5}, "handle_free")])
     assert both.holds == (HANDLE, Hold("door", "handle_free"))
     assert find_shared_coordinate(load_door_scene(), both.holds) == "door.hinge"
 
@@ -314,7 +319,7 @@ def test_object_grasped_at_two_attachments_in_turn() -> None:
 def test_unused_initial_hold_is_dropped_if_another_moves_the_same_joints() -> None:
     """With the joints that the new one does not move, which then are none of the task."""
     scene = (
-        with_link(load_door_scene(), "plate", "panel")
+        add_attachment(load_door_scene(), "plate", "panel")
         .with_state("door", {"hinge": 0.4, "knob": 0.6})
         .with_held({"door": "handle"})
     )
@@ -322,7 +327,7 @@ def test_unused_initial_hold_is_dropped_if_another_moves_the_same_joints() -> No
         [Actuate("door", {"hinge": 0.9}, "plate")],
         [GoTo(0.0, 0.0), Actuate("door", {"hinge": 0.9}, "plate")],
     ):
-        task = phases(steps, scene)
+        task = compile_steps(steps, scene)
         assert task.holds == (Hold("door", "plate"),)
         assert task.state == {"door.hinge": 0.4}
         assert all(phase.initial_values == {"door.hinge": 0.4} for phase in task.phases)

@@ -29,20 +29,20 @@ POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array(POINT))
 
 
 @cache
-def scene() -> Scene:
+def make_scene() -> Scene:
     """Return the door's room with drawer and cabinet, and stick and ball in it too."""
     return replace_objects(make_full_scene(), make_room(objects=("stick", "ball")).objects)
 
 
-def phases(*steps: Step, of: Scene | None = None) -> Task:
-    return compile_task(of or scene(), steps, OPTIONS)
+def compile_steps(*steps: Step, of: Scene | None = None) -> Task:
+    return compile_task(of or make_scene(), steps, OPTIONS)
 
 
-def names(task: Task) -> list[str]:
+def get_names(task: Task) -> list[str]:
     return [phase.name for phase in task.phases]
 
 
-def held(task: Task) -> list[tuple[Hold, ...]]:
+def get_holds(task: Task) -> list[tuple[Hold, ...]]:
     return [phase.held for phase in task.phases]
 
 
@@ -51,9 +51,9 @@ def held(task: Task) -> list[tuple[Hold, ...]]:
 
 
 def test_touch_with_a_stick_grasps_it_first() -> None:
-    task = phases(Touch("stick.tip", POINT))
+    task = compile_steps(Touch("stick.tip", POINT))
     reach, touch = task.phases
-    assert names(task) == ["reach stick.grip", "touch with stick.tip"]
+    assert get_names(task) == ["reach stick.grip", "touch with stick.tip"]
     assert (task.segments, task.holds, task.after) == (20, (GRIP,), (GRIP,))
     assert (reach.held, reach.grasps, reach.released, reach.frames) == ((), (GRIP,), (), ())
     assert (touch.held, touch.grasps, touch.released) == ((GRIP,), (), ())
@@ -69,8 +69,8 @@ def test_touch_with_a_stick_grasps_it_first() -> None:
 
 
 def test_place_grasps_carries_and_releases() -> None:
-    task = phases(Place("stick", POSE), GoTo(0.0, 0.0))
-    assert names(task) == ["reach stick.grip", "place stick", "go to"]
+    task = compile_steps(Place("stick", POSE), GoTo(0.0, 0.0))
+    assert get_names(task) == ["reach stick.grip", "place stick", "go to"]
     reach, place, leave = task.phases
     (goal,) = place.frames
     assert (goal.frame, goal.kind, goal.hold, goal.touches, goal.placement) == (
@@ -89,8 +89,8 @@ def test_place_grasps_carries_and_releases() -> None:
 
 
 def test_place_at_a_point_keeps_the_object_upright() -> None:
-    lying = place_object(scene(), "stick", POSE)
-    task = phases(Place("stick", (0.0, 1.0, 0.5)), GoTo(0.0, 0.0), of=lying)
+    lying = place_object(make_scene(), "stick", POSE)
+    task = compile_steps(Place("stick", (0.0, 1.0, 0.5)), GoTo(0.0, 0.0), of=lying)
     (goal,) = task.phases[1].frames
     assert goal.kind == "upright"
     np.testing.assert_array_equal(goal.placement.translation, [0.0, 1.0, 0.5])
@@ -101,25 +101,25 @@ def test_place_at_a_point_keeps_the_object_upright() -> None:
 
 
 def test_release_ends_the_holds() -> None:
-    task = phases(Touch("stick.tip", POINT), Release(), GoTo(0.0, 0.0))
-    assert names(task) == ["reach stick.grip", "touch with stick.tip", "go to"]
+    task = compile_steps(Touch("stick.tip", POINT), Release(), GoTo(0.0, 0.0))
+    assert get_names(task) == ["reach stick.grip", "touch with stick.tip", "go to"]
     assert (task.phases[2].held, task.phases[2].released) == ((), (GRIP,))
     assert task.phases[2].released_by == {"stick": (GRIP, 1)}
     assert task.after == ()
-    assert phases(Touch("stick.tip", POINT), Release("stick")).after == ()
-    assert phases(Grasp("door"), Release(), GoTo(0.0, 0.0)).phases[1].released == (HANDLE,)
+    assert compile_steps(Touch("stick.tip", POINT), Release("stick")).after == ()
+    assert compile_steps(Grasp("door"), Release(), GoTo(0.0, 0.0)).phases[1].released == (HANDLE,)
 
 
 def test_release_of_objects_held_at_the_start() -> None:
-    task = phases(Release(), of=scene().with_held({"stick": "grip"}))
-    assert (names(task), held(task), task.after) == (["stand still"], [(GRIP,)], ())
-    later = phases(Release(), GoTo(0.0, 0.0), of=scene().with_held({"stick": "grip"}))
+    task = compile_steps(Release(), of=make_scene().with_held({"stick": "grip"}))
+    assert (get_names(task), get_holds(task), task.after) == (["stand still"], [(GRIP,)], ())
+    later = compile_steps(Release(), GoTo(0.0, 0.0), of=make_scene().with_held({"stick": "grip"}))
     assert later.phases[1].released == (GRIP,)
     assert not later.phases[1].released_by, (
         "where it stands is known: it is let go of before anything has moved"
     )
-    moved = phases(
-        GoTo(0.0, 1.0), Release(), GoTo(0.0, 0.0), of=scene().with_held({"stick": "grip"})
+    moved = compile_steps(
+        GoTo(0.0, 1.0), Release(), GoTo(0.0, 0.0), of=make_scene().with_held({"stick": "grip"})
     )
     assert moved.phases[1].released_by == {"stick": (GRIP, 0)}
 
@@ -130,41 +130,41 @@ def test_release_of_objects_held_at_the_start() -> None:
 
 def test_held_object_is_placed_and_released_as_held() -> None:
     with pytest.raises(InputError, match="held elsewhere") as caught:
-        phases(Grasp("stick"), Place("stick", POSE, "end"))
+        compile_steps(Grasp("stick"), Place("stick", POSE, "end"))
     assert caught.value.field == "steps[1].attachment"
     with pytest.raises(UnknownNameError, match="did you mean 'stick'"):
-        phases(Grasp("stick"), Release("stik"))
+        compile_steps(Grasp("stick"), Release("stik"))
 
 
 def test_empty_hand_releases_nothing() -> None:
     for before in ([], [Place("stick", POSE)]):
         with pytest.raises(InputError, match="hand is empty") as caught:
-            phases(*before, Release())
+            compile_steps(*before, Release())
         assert caught.value.field == f"steps[{len(before)}]"
 
 
 def test_fixed_objects_are_released_before_other_steps() -> None:
     for step in (Reach(POSE), GoTo(0.0, 0.0), Touch("forearm_link", POINT)):
-        assert held(phases(Grasp("stick"), step)) == [(), (GRIP,)]
-        assert phases(Grasp("door"), step).phases[1].released == (HANDLE,)
+        assert get_holds(compile_steps(Grasp("stick"), step)) == [(), (GRIP,)]
+        assert compile_steps(Grasp("door"), step).phases[1].released == (HANDLE,)
 
 
 def test_ball_is_fetched_with_the_stick() -> None:
-    task = phases(
+    task = compile_steps(
         Grasp("stick"),
         Grasp("ball", by="stick.tip"),
         GoTo(0.0, 0.0),
         Place("ball", POINT),
         Place("stick", POSE),
     )
-    assert names(task) == [
+    assert get_names(task) == [
         "reach stick.grip",
         "reach ball.grip by stick.tip",
         "go to",
         "place ball",
         "place stick",
     ]
-    assert held(task) == [(), (GRIP,), (GRIP, PULLED), (GRIP, PULLED), (GRIP,)]
+    assert get_holds(task) == [(), (GRIP,), (GRIP, PULLED), (GRIP, PULLED), (GRIP,)]
     assert task.holds == (GRIP, PULLED)
     assert [phase.grasps for phase in task.phases] == [(GRIP,), (PULLED,), (), (), ()]
     assert [phase.released for phase in task.phases] == [(), (), (), (), (PULLED,)]
@@ -177,12 +177,12 @@ def test_ball_is_fetched_with_the_stick() -> None:
 def test_releasing_the_stick_releases_the_ball_on_it() -> None:
     fetch = [Grasp("stick"), Grasp("ball", "pull", by="stick.tip")]
     for step in (Release(), Release("stick"), Place("stick", POSE)):
-        task = phases(*fetch, step, GoTo(0.0, 0.0))
+        task = compile_steps(*fetch, step, GoTo(0.0, 0.0))
         assert (task.phases[-1].held, task.after) == ((), ())
         assert {hold.object for hold in task.phases[-1].released} == {"stick", "ball"}
         assert "ball" in task.phases[-1].released_by
         assert ("stick" in task.phases[-1].released_by) == isinstance(step, Release)
-    task = phases(*fetch, Release("ball"), GoTo(0.0, 0.0))
+    task = compile_steps(*fetch, Release("ball"), GoTo(0.0, 0.0))
     assert (task.phases[-1].held, task.after) == ((GRIP,), (GRIP,))
 
 
@@ -198,23 +198,23 @@ def test_releasing_the_stick_releases_the_ball_on_it() -> None:
 )
 def test_invalid_holders_are_rejected(by: str, match: str, error: type[InputError]) -> None:
     with pytest.raises(error, match=match) as caught:
-        phases(Grasp("stick"), Grasp("ball", by=by))
+        compile_steps(Grasp("stick"), Grasp("ball", by=by))
     assert caught.value.field == "steps[1].by"
 
 
 def test_only_carried_objects_can_hold_others() -> None:
     with pytest.raises(InputError, match="does not carry") as caught:
-        phases(Grasp("ball", by="stick.tip"))
+        compile_steps(Grasp("ball", by="stick.tip"))
     assert (caught.value.field, caught.value.got) == ("steps[0].by", "'stick.tip'")
     with pytest.raises(InputError, match="does not carry"):
-        phases(Place("stick", POSE), Grasp("ball", by="stick.tip"))
+        compile_steps(Place("stick", POSE), Grasp("ball", by="stick.tip"))
     with pytest.raises(InputError, match="does not carry"):  # a door in the hand is not carried
-        phases(Grasp("door"), Grasp("ball", by="door.lever"))
+        compile_steps(Grasp("door"), Grasp("ball", by="door.lever"))
     for again in (Grasp("stick", by="stick.tip"), Grasp("stick", "end")):
         with pytest.raises(InputError, match="held already"):
-            phases(Grasp("stick"), again)
+            compile_steps(Grasp("stick"), again)
     with pytest.raises(InputError, match="is fixed in the world"):
-        phases(Grasp("stick"), Grasp("door", by="stick.tip"))
+        compile_steps(Grasp("stick"), Grasp("door", by="stick.tip"))
 
 
 # --- one hand
@@ -235,13 +235,13 @@ def test_only_carried_objects_can_hold_others() -> None:
 def test_hand_holds_one_object_only(second: Step) -> None:
     first = Grasp("stick")
     with pytest.raises(InputError, match="one hand") as caught:
-        phases(GoTo(0.0, 0.0), first, second)
+        compile_steps(GoTo(0.0, 0.0), first, second)
     assert str(caught.value.field).startswith("steps[2]")
     assert "stick.grip" in str(caught.value)
     with pytest.raises(InputError, match="one hand") as caught:
-        phases(second, of=scene().with_held({"stick": "end"}))
+        compile_steps(second, of=make_scene().with_held({"stick": "end"}))
     assert str(caught.value.field).startswith("steps[0]")
-    phases(first, Release(), second)
+    compile_steps(first, Release(), second)
 
 
 # --- again
@@ -249,8 +249,8 @@ def test_hand_holds_one_object_only(second: Step) -> None:
 
 
 def test_placed_object_can_be_grasped_again() -> None:
-    task = phases(Place("stick", POSE), GoTo(0.0, 0.0), Touch("stick.tip", POINT))
-    assert names(task) == [
+    task = compile_steps(Place("stick", POSE), GoTo(0.0, 0.0), Touch("stick.tip", POINT))
+    assert get_names(task) == [
         "reach stick.grip",
         "place stick",
         "go to",
@@ -262,7 +262,7 @@ def test_placed_object_can_be_grasped_again() -> None:
     assert again.grasps == (GRIP,)
     assert again.resting["stick"] == POSE
     assert touch.lifted == {GRIP: POSE}
-    elsewhere = phases(Place("stick", POSE), Grasp("stick", "end"))
+    elsewhere = compile_steps(Place("stick", POSE), Grasp("stick", "end"))
     assert elsewhere.holds == (GRIP, END)
     assert elsewhere.phases[2].released == (GRIP,)
 
@@ -278,9 +278,9 @@ def test_placed_object_can_be_grasped_again() -> None:
 )
 def test_object_of_uncertain_placement_cannot_be_grasped(before: Sequence[Step]) -> None:
     with pytest.raises(InputError, match="known only after planning") as caught:
-        phases(*before, Touch("stick.tip", POSE))
+        compile_steps(*before, Touch("stick.tip", POSE))
     assert str(caught.value.field).startswith(f"steps[{len(before)}]")
-    other = phases(*before, Grasp("ball"))
+    other = compile_steps(*before, Grasp("ball"))
     assert other.phases[-1].grasps == (Hold("ball", "grip"),)
 
 
@@ -300,7 +300,7 @@ def test_object_of_uncertain_placement_cannot_be_grasped(before: Sequence[Step])
 )
 def test_unknown_names_are_rejected(step: Step, field: str, nearest: str | None) -> None:
     with pytest.raises(UnknownNameError) as caught:
-        phases(step)
+        compile_steps(step)
     assert caught.value.field == field
     if nearest:
         assert caught.value.nearest == nearest
@@ -319,13 +319,13 @@ def test_fixed_objects_are_not_carried_and_free_objects_not_actuated(
     step: Step, field: str
 ) -> None:
     with pytest.raises(InputError) as caught:
-        phases(step)
+        compile_steps(step)
     assert caught.value.field == field
 
 
 def test_every_phase_has_all_placements() -> None:
     """A free object is either in the hand or stands somewhere, never both."""
-    task = phases(
+    task = compile_steps(
         Touch("stick.tip", POINT),
         Grasp("ball", by="stick.tip"),
         Place("ball", POSE),

@@ -12,11 +12,11 @@ FRAMES, COORDINATES = ("tool", "cup.cup"), ("elbow_joint", "door.hinge")
 DT = 0.25
 
 
-def state() -> State:
+def make_state() -> State:
     return State(FRAMES, COORDINATES)
 
 
-def numbers(formula: Formula, count: int = 5) -> np.ndarray:
+def sample_inputs(formula: Formula, count: int = 5) -> np.ndarray:
     """Return random inputs, shape (count, 2·half + 1); the step takes DT."""
     inputs = np.random.default_rng(0).normal(size=(count, 2 * formula.state_size + 1))
     inputs[:, -1] = DT
@@ -24,7 +24,7 @@ def numbers(formula: Formula, count: int = 5) -> np.ndarray:
 
 
 def test_state_returns_the_named_quantities() -> None:
-    s = state()
+    s = make_state()
     parts = [
         s.rotation("cup.cup")[0, 1],
         s.rotation("cup.cup")[1, 0],
@@ -40,7 +40,7 @@ def test_state_returns_the_named_quantities() -> None:
         True,
         True,
     )
-    x = numbers(formula)
+    x = sample_inputs(formula)
     before = x[:, 26:]
     rotation = x[:, :9].reshape(5, 3, 3).swapaxes(1, 2)  # by columns
     expected = [
@@ -70,18 +70,18 @@ def test_state_returns_the_named_quantities() -> None:
     ],
 )
 def test_formula_evaluates_the_expression(expression) -> None:  # type: ignore[no-untyped-def]
-    s = state()
+    s = make_state()
     formula = s.make_formula(expression(s.coordinate("elbow_joint"), s.coordinate("door.hinge")))
     x, y = ca.SX.sym("x"), ca.SX.sym("y")
     direct = ca.Function("direct", [x, y], [expression(x, y)])
-    inputs = numbers(formula, 20)
+    inputs = sample_inputs(formula, 20)
     expected = [np.asarray(direct(row[0], row[1])).ravel() for row in inputs]
     np.testing.assert_allclose(formula.evaluate(inputs), expected, atol=2 * ROUNDING)
 
 
 def test_equal_formulas_compare_equal_and_survive_json() -> None:
     def make(limit: float) -> Formula:
-        s = state()
+        s = make_state()
         return s.make_formula(ca.sumsqr(s.velocity("tool")) - limit)
 
     assert make(0.5) == make(0.5)
@@ -96,7 +96,7 @@ def test_equal_formulas_compare_equal_and_survive_json() -> None:
 
 
 def test_square_roots_are_differentiable_at_zero() -> None:
-    s = state()
+    s = make_state()
     formula = s.make_formula(ca.norm_2(s.velocity("tool")))
     x = ca.SX.sym("x", 25)
     value = formula.function(x)

@@ -31,7 +31,7 @@ CARRYING: list[Step] = [
 ]
 
 
-def scene_for(steps: list[Step]) -> Scene:
+def make_scene(steps: list[Step]) -> Scene:
     return (
         make_full_scene()
         if steps is FURNITURE
@@ -39,7 +39,7 @@ def scene_for(steps: list[Step]) -> Scene:
     )
 
 
-def told(task: Task) -> list[tuple[object, ...]]:
+def describe_phases(task: Task) -> list[tuple[object, ...]]:
     """Return all that is said about the phases but placements, which have no equality."""
     return [
         (
@@ -61,11 +61,11 @@ def told(task: Task) -> list[tuple[object, ...]]:
 
 @pytest.mark.parametrize("steps", [FURNITURE, CARRYING], ids=["furniture", "carrying"])
 def test_truncated_task_is_that_of_the_first_steps(steps: list[Step]) -> None:
-    scene = scene_for(steps)
+    scene = make_scene(steps)
     whole = compile_task(scene, steps, SHORT)
     for count in range(1, len(steps) + 1):
         part, alone = whole.truncate(count), compile_task(scene, steps[:count], SHORT)
-        assert told(part) == told(alone)
+        assert describe_phases(part) == describe_phases(alone)
         assert (part.steps, part.holds, part.after, part.segments) == (
             alone.steps,
             alone.holds,
@@ -75,11 +75,11 @@ def test_truncated_task_is_that_of_the_first_steps(steps: list[Step]) -> None:
         assert dict(part.state) == dict(alone.state)
         assert part.boundaries == alone.boundaries
     assert whole.segments == sum(phase.segments for phase in whole.phases)
-    assert told(whole.truncate(len(steps))) == told(whole)
+    assert describe_phases(whole.truncate(len(steps))) == describe_phases(whole)
 
 
 def test_phase_names() -> None:
-    names = [phase.name for phase in compile_task(scene_for(CARRYING), CARRYING, SHORT).phases]
+    names = [phase.name for phase in compile_task(make_scene(CARRYING), CARRYING, SHORT).phases]
     assert names == [
         "reach stick.grip",
         "touch with stick.tip",

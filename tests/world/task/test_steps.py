@@ -39,7 +39,7 @@ def test_poses_and_points_are_converted_and_copied(pose: Any) -> None:
     assert steps[1].pose == TURN
 
 
-def spoiled(row: int, column: int, value: float) -> np.ndarray:
+def corrupt(row: int, column: int, value: float) -> np.ndarray:
     matrix = TURN.homogeneous.copy()
     matrix[row, column] = value
     return matrix
@@ -51,11 +51,11 @@ def spoiled(row: int, column: int, value: float) -> np.ndarray:
         ("here", "not a pose"),
         ([1.0, 2.0, 3.0], "not a pose"),
         ([1.0, 2.0, 3.0, 0.0, 0.0, np.nan], "not finite"),
-        (spoiled(0, 3, np.inf), "not finite"),
+        (corrupt(0, 3, np.inf), "not finite"),
         (pin.SE3(np.eye(3), np.array([np.nan, 0.0, 0.0])), "not finite"),
-        (spoiled(0, 0, 0.5), "not a rotation"),
+        (corrupt(0, 0, 0.5), "not a rotation"),
         (np.diag([1.0, 1.0, -1.0, 1.0]), "not a rotation"),
-        (spoiled(3, 3, 0.0), "last row"),
+        (corrupt(3, 3, 0.0), "last row"),
     ],
 )
 def test_invalid_poses_are_rejected(pose: Any, problem: str) -> None:
@@ -89,7 +89,7 @@ def test_invalid_joints_are_rejected(joints: Any, field: str) -> None:
         ([1.0, 2.0], "not a pose"),
         (np.zeros((3, 1)), "not a pose"),
         ([0.0, np.nan, 0.0], "not finite"),
-        (spoiled(0, 0, 0.5), "not a rotation"),
+        (corrupt(0, 0, 0.5), "not a rotation"),
     ],
 )
 def test_invalid_targets_are_rejected(target: Any, problem: str) -> None:

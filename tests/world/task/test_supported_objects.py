@@ -17,22 +17,22 @@ from vkc_pin.world.task.phases import Task
 THERE = pin.SE3(np.eye(3), np.array([-0.5, -1.5, 0.7]))
 
 
-def compiled(scene: Scene, *steps: vkc.Step) -> Task:
+def compile_steps(scene: Scene, *steps: vkc.Step) -> Task:
     return compile_task(scene, steps, Options())
 
 
-def rides(task: Task) -> list[list[tuple[str, str]]]:
+def list_supported(task: Task) -> list[list[tuple[str, str]]]:
     return [[(ride.object, ride.support) for ride in phase.supported] for phase in task.phases]
 
 
 def test_cup_on_the_plate_moves_with_it() -> None:
-    task = compiled(
+    task = compile_steps(
         make_plate_scene(cups=2),
         vkc.Actuate("plate", {"slide": 0.4}),
         vkc.Grasp("cup"),
         vkc.GoTo(0.0, 0.0),
     )
-    assert rides(task) == [[], [("cup", "plate.plate"), ("cup_1", "plate.plate")], [], []]
+    assert list_supported(task) == [[], [("cup", "plate.plate"), ("cup_1", "plate.plate")], [], []]
     for name, y in (("cup", 0.05), ("cup_1", -0.07)):
         np.testing.assert_allclose(
             task.phases[1].resting[name].translation, [0.8, y, TOP], rtol=0.0, atol=1e-12
@@ -44,23 +44,25 @@ def test_cup_on_the_plate_moves_with_it() -> None:
 
 
 def test_object_above_the_plate_or_on_the_post_does_not_move() -> None:
-    assert rides(compiled(make_plate_scene(gap=0.05), vkc.Actuate("plate", {"slide": 0.4}))) == [
+    assert list_supported(
+        compile_steps(make_plate_scene(gap=0.05), vkc.Actuate("plate", {"slide": 0.4}))
+    ) == [
         [],
         [],
     ]
 
 
 def test_tilting_support_is_rejected() -> None:
-    assert rides(compiled(make_plate_scene("turntable"), vkc.Actuate("plate", {"turn": 0.5})))[
-        1
-    ] == [("cup", "plate.plate")]
-    assert rides(compiled(make_plate_scene("flap"), vkc.Actuate("plate", {"tip": 0.09})))[1] == [
-        ("cup", "plate.plate")
-    ]
+    assert list_supported(
+        compile_steps(make_plate_scene("turntable"), vkc.Actuate("plate", {"turn": 0.5}))
+    )[1] == [("cup", "plate.plate")]
+    assert list_supported(
+        compile_steps(make_plate_scene("flap"), vkc.Actuate("plate", {"tip": 0.09}))
+    )[1] == [("cup", "plate.plate")]
     with pytest.raises(
         InputError, match=r"'cup' rests on 'plate\.plate', which would tilt too much"
     ) as caught:
-        compiled(make_plate_scene("flap"), vkc.Actuate("plate", {"tip": 0.5}))
+        compile_steps(make_plate_scene("flap"), vkc.Actuate("plate", {"tip": 0.5}))
     assert caught.value.field == "steps[0]"
     assert "0.50 rad" in str(caught.value)
 
@@ -82,22 +84,22 @@ def test_object_on_moving_and_fixed_links_is_rejected() -> None:
     with pytest.raises(
         InputError, match=r"rests both on a moving and on a fixed link: 'plate\.plate' and 'shelf'"
     ):
-        compiled(between, vkc.Actuate("plate", {"slide": 0.4}))
-    assert rides(compiled(between, vkc.GoTo(0.0, 0.0))) == [[]]
+        compile_steps(between, vkc.Actuate("plate", {"slide": 0.4}))
+    assert list_supported(compile_steps(between, vkc.GoTo(0.0, 0.0))) == [[]]
 
 
 def test_cup_placed_on_the_plate_moves_with_it() -> None:
     scene = make_plate_scene().with_placement("cup", pin.SE3(np.eye(3), np.array([0.0, 1.0, 0.0])))
     steps = vkc.Place("cup", [0.8, 0.05, TOP]), vkc.Actuate("plate", {"slide": 0.4})
-    task = compiled(scene, *steps)
-    assert rides(task)[-1] == [("cup", "plate.plate")]
+    task = compile_steps(scene, *steps)
+    assert list_supported(task)[-1] == [("cup", "plate.plate")]
     assert "cup" in task.phases[-2].released_by  # at a heading that the motion decides
     assert "cup" not in task.phases[-1].released_by
 
 
 def test_cup_on_the_held_tray_moves_with_it() -> None:
-    task = compiled(make_tray_scene(), vkc.Place("tray", THERE), vkc.GoTo(0.0, 0.0))
-    assert rides(task) == [[], [("cup", "tray.tray")], []]
+    task = compile_steps(make_tray_scene(), vkc.Place("tray", THERE), vkc.GoTo(0.0, 0.0))
+    assert list_supported(task) == [[], [("cup", "tray.tray")], []]
     left = task.phases[2].resting["cup"].translation
     np.testing.assert_allclose(
         left, THERE.translation + np.array([0.02, 0.05, 0.02]), rtol=0.0, atol=1e-12
@@ -106,12 +108,12 @@ def test_cup_on_the_held_tray_moves_with_it() -> None:
 
 def test_supported_object_cannot_be_grasped() -> None:
     with pytest.raises(InputError, match="'cup' rests on an object that the robot carries"):
-        compiled(make_tray_scene(), vkc.Grasp("tray"), vkc.Grasp("cup", by="tray.tray"))
+        compile_steps(make_tray_scene(), vkc.Grasp("tray"), vkc.Grasp("cup", by="tray.tray"))
 
 
 def test_supported_object_of_uncertain_placement_cannot_be_grasped() -> None:
     with pytest.raises(
         InputError, match="the placement of 'cup' at this step is known only after planning"
     ):
-        compiled(make_tray_scene(), vkc.Place("tray", [-0.5, -1.5, 0.7]), vkc.Grasp("cup"))
-    compiled(make_tray_scene(), vkc.Place("tray", THERE), vkc.Grasp("cup"))
+        compile_steps(make_tray_scene(), vkc.Place("tray", [-0.5, -1.5, 0.7]), vkc.Grasp("cup"))
+    compile_steps(make_tray_scene(), vkc.Place("tray", THERE), vkc.Grasp("cup"))

@@ -23,7 +23,7 @@ def tilt(**fields: Any) -> vkc.Constraint:
     )
 
 
-def three() -> list[vkc.Constraint | vkc.Cost]:
+def make_terms() -> list[vkc.Constraint | vkc.Cost]:
     slow = vkc.Constraint(
         "slow",
         lambda s: (
@@ -48,7 +48,7 @@ def three() -> list[vkc.Constraint | vkc.Cost]:
 
 
 def test_terms_survive_a_round_trip_through_data() -> None:
-    found = trace_terms(make_room(describe_table()), three())
+    found = trace_terms(make_room(describe_table()), make_terms())
     assert [term.name for term in found] == ["slow", "within", "elbow"]
     assert [term.formula.uses_time_step for term in found] == [True, False, False]
     for term in found:
@@ -61,7 +61,7 @@ def test_terms_survive_a_round_trip_through_data() -> None:
 
 def test_bounds_are_extended_to_all_rows() -> None:
     unbounded = np.inf
-    slow, within, _ = trace_terms(make_room(describe_table()), three())
+    slow, within, _ = trace_terms(make_room(describe_table()), make_terms())
     assert isinstance(slow, vkc.Constraint)
     assert isinstance(within, vkc.Constraint)
     np.testing.assert_array_equal(slow.compute_bounds(1), [[-unbounded], [0.0]])
@@ -121,7 +121,7 @@ def test_names_expressions_and_weights_are_checked() -> None:
         vkc.Cost("far", lambda s: s.coordinate("base_x"), 0.1)  # type: ignore[misc]
 
 
-def own(s: vkc.State) -> Any:
+def raise_error(s: vkc.State) -> Any:
     raise ZeroDivisionError("mine")
 
 
@@ -138,7 +138,7 @@ def own(s: vkc.State) -> Any:
             lambda s: s.coordinate("base_x") if s.coordinate("base_y") > 0 else 0.0,
             "it cannot be evaluated",
         ),
-        (own, "it cannot be evaluated.*mine"),
+        (raise_error, "it cannot be evaluated.*mine"),
     ],
 )
 def test_errors_name_the_invalid_expression(

@@ -12,7 +12,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.world.trajectory.curve import Curve, concatenate_curves
 
 
-def some(seed: int, knots: int = 7, size: int = 3) -> Curve:
+def sample_curve(seed: int, knots: int = 7, size: int = 3) -> Curve:
     rng = np.random.default_rng(seed)
     times = 2.0 + np.cumsum(rng.uniform(0.1, 1.0, knots))
     return Curve(times, rng.normal(size=(knots, size)), rng.normal(size=(knots, size)))
@@ -20,7 +20,7 @@ def some(seed: int, knots: int = 7, size: int = 3) -> Curve:
 
 @given(st.integers(0, 10**6), st.integers(2, 9))
 def test_values_and_derivatives_match_scipy(seed: int, knots: int) -> None:
-    curve = some(seed, knots)
+    curve = sample_curve(seed, knots)
     other = CubicHermiteSpline(curve.times, curve.positions, curve.rates)
     moments = np.random.default_rng(seed).uniform(curve.times[0], curve.times[-1], 40)
     for order, mine in enumerate((curve.at, curve.velocity, curve.acceleration)):
@@ -30,7 +30,7 @@ def test_values_and_derivatives_match_scipy(seed: int, knots: int) -> None:
 
 
 def test_curve_is_at_rest_outside_its_span() -> None:
-    curve = some(1)
+    curve = sample_curve(1)
     moments = np.array([curve.times[0] - 1.0, curve.times[-1] + 1.0])
     np.testing.assert_array_equal(curve.at(moments), curve.positions[[0, -1]])
     np.testing.assert_array_equal(curve.velocity(moments), 0.0)
@@ -40,7 +40,7 @@ def test_curve_is_at_rest_outside_its_span() -> None:
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6), st.booleans())
 def test_extrema_and_rates_bound_dense_samples(seed: int, even: bool) -> None:
-    curve = some(seed)
+    curve = sample_curve(seed)
     if even:  # parabolas and straight lines among them
         chords = np.diff(curve.positions, axis=0) / np.diff(curve.times)[:, None]
         curve = Curve(curve.times, curve.positions, np.vstack([chords, chords[-1:]]))
@@ -68,7 +68,7 @@ def test_extrema_and_rates_bound_dense_samples(seed: int, even: bool) -> None:
 
 
 def test_concatenated_parts_equal_the_whole() -> None:
-    curve = some(3)
+    curve = sample_curve(3)
     middle = float(curve.times[3])
     whole = concatenate_curves(
         [curve.part(curve.times[0], middle), curve.part(middle, curve.times[-1]).shift_time(5.0)]
@@ -101,7 +101,7 @@ def test_invalid_arrays_are_rejected(arrays: tuple[object, object, object], fiel
 
 
 def test_curve_must_lead_through_waypoints() -> None:
-    curve = some(4)
+    curve = sample_curve(4)
     at = [0, 2, 6]
     curve.check_through(curve.times[at], curve.positions[at])
     with pytest.raises(InputError, match="a waypoint is none of its knots"):

@@ -33,7 +33,9 @@ TIP = pin.SE3(pin.utils.rotate("x", -np.pi / 2), np.array([0.0, 0.25, 0.0]))  # 
 PULL = (np.pi / 2, 0.0, 0.0)  # how the ball lies on the tip that comes from the right
 
 
-def placements(scene: Scene, motion: Trajectory, name: str, times: np.ndarray) -> list[pin.SE3]:
+def compute_placements(
+    scene: Scene, motion: Trajectory, name: str, times: np.ndarray
+) -> list[pin.SE3]:
     """Return where a free object is at some times, as the world says."""
     world = World(scene)
     return [
@@ -42,7 +44,7 @@ def placements(scene: Scene, motion: Trajectory, name: str, times: np.ndarray) -
     ]
 
 
-def tools(scene: Scene, motion: Trajectory, times: np.ndarray) -> list[pin.SE3]:
+def compute_tools(scene: Scene, motion: Trajectory, times: np.ndarray) -> list[pin.SE3]:
     """Return where the hand is, from the robot alone."""
     model, data, found = scene.robot.model, scene.robot.model.createData(), []
     for row in motion.at(times)[:, : motion.robot_size]:
@@ -51,7 +53,7 @@ def tools(scene: Scene, motion: Trajectory, times: np.ndarray) -> list[pin.SE3]:
     return found
 
 
-def inside(motion: Trajectory, phase: int, count: int = 40) -> np.ndarray:
+def sample_phase(motion: Trajectory, phase: int, count: int = 40) -> np.ndarray:
     """Return times of a phase, both ends among them."""
     return np.linspace(
         motion.times[motion.phases[phase].first], motion.times[motion.phases[phase].last], count
@@ -63,38 +65,42 @@ def assert_same(first: pin.SE3, second: pin.SE3, tolerance: float = 1e-9) -> Non
 
 
 @cache
-def carried() -> tuple[Scene, Trajectory]:
+def make_carried_motion() -> tuple[Scene, Trajectory]:
     """Return the stick that is carried over the table, and a ball that is not."""
     scene = make_room(describe_table(), objects=("stick", "ball"))
     return scene, carry_over(scene, values=(0.03, 0.2)).motion()
 
 
 def test_object_rests_before_the_grasp_and_after_the_release() -> None:
-    scene, motion = carried()
+    scene, motion = make_carried_motion()
     held = [k for k, phase in enumerate(motion.phases) if phase.held]
     assert held == [2, 3, 4]
     for phase in (0, 1):
-        for at in placements(scene, motion, "stick", inside(motion, phase)):
+        for at in compute_placements(scene, motion, "stick", sample_phase(motion, phase)):
             assert_same(at, STICK, 1e-12)
-    for at in placements(scene, motion, "stick", inside(motion, 5)):
+    for at in compute_placements(scene, motion, "stick", sample_phase(motion, 5)):
         assert_same(at, lift(STICK, [0.0, 0.5, 0.0]))
     for phase in range(len(motion.phases)):
-        for at in placements(scene, motion, "ball", inside(motion, phase, 5)):
+        for at in compute_placements(scene, motion, "ball", sample_phase(motion, phase, 5)):
             assert_same(at, BALL, 1e-12)
 
 
 def test_object_moves_rigidly_with_the_hand() -> None:
-    scene, motion = carried()
+    scene, motion = make_carried_motion()
     for phase in (2, 3, 4):
-        times = inside(motion, phase)
+        times = sample_phase(motion, phase)
         for at, tool in zip(
-            placements(scene, motion, "stick", times), tools(scene, motion, times), strict=True
+            compute_placements(scene, motion, "stick", times),
+            compute_tools(scene, motion, times),
+            strict=True,
         ):
             assert_same(
                 at.inverse() * tool, compute_grasp_pose(pin.SE3.Identity(), values=(0.03, 0.2))
             )
     lowest, highest = (
-        placements(scene, motion, "stick", np.array([motion.times[motion.phases[k].last]]))[0]
+        compute_placements(scene, motion, "stick", np.array([motion.times[motion.phases[k].last]]))[
+            0
+        ]
         for k in (1, 2)
     )
     np.testing.assert_allclose(highest.translation - lowest.translation, UP, atol=1e-9)
@@ -119,18 +125,20 @@ def test_grasp_freedoms_move_the_hand_along_the_object() -> None:
     )
     assert np.abs(pin.log6(offset).vector).max() > 1e-2
     for phase in (2, 3, 4):
-        times = inside(motion, phase, 23)
+        times = sample_phase(motion, phase, 23)
         values = np.column_stack(
             [np.interp(times, motion.times, column) for column in (slide, turn)]
         )
-        sticks = placements(scene, motion, "stick", times)
-        for at, tool, (s, t) in zip(sticks, tools(scene, motion, times), values, strict=True):
+        sticks = compute_placements(scene, motion, "stick", times)
+        for at, tool, (s, t) in zip(
+            sticks, compute_tools(scene, motion, times), values, strict=True
+        ):
             assert_same(
                 at, tool * compute_grasp_pose(pin.SE3.Identity(), values=(s, t)).inverse() * offset
             )
 
 
-def fetched() -> tuple[Scene, Script]:
+def make_fetching_motion() -> tuple[Scene, Script]:
     """Return a motion in which a held stick lifts a ball, carries it aside and puts it down."""
     scene = make_room(describe_stand(), objects=("stick", "ball"))
     south = pin.SE3(
@@ -151,7 +159,7 @@ def fetched() -> tuple[Scene, Script]:
 
 
 def test_object_held_through_a_stick_follows_its_tip() -> None:
-    scene, script = fetched()
+    scene, script = make_fetching_motion()
     motion = script.motion()
     assert [phase["by"] for phase in motion.to_dict()["phases"]] == [
         {},
@@ -165,19 +173,19 @@ def test_object_held_through_a_stick_follows_its_tip() -> None:
         np.diag([1.0, -1.0, -1.0]), np.zeros(3)
     )  # of the ball's attachment, which looks down
     for phase in (1, 2, 3):
-        times = inside(motion, phase)
-        sticks = placements(scene, motion, "stick", times)
+        times = sample_phase(motion, phase)
+        sticks = compute_placements(scene, motion, "stick", times)
         for ball, stick, tool in zip(
-            placements(scene, motion, "ball", times),
+            compute_placements(scene, motion, "ball", times),
             sticks,
-            tools(scene, motion, times),
+            compute_tools(scene, motion, times),
             strict=True,
         ):
             assert_same(ball, stick * TIP * on_tip * flipped)
             assert_same(stick, tool * compute_grasp_pose(pin.SE3.Identity()).inverse())
             assert_same(stick.inverse() * ball, pin.SE3(np.eye(3), np.array([0.0, 0.285, 0.0])))
-    assert_same(placements(scene, motion, "ball", inside(motion, 0))[7], BALL, 1e-12)
-    for at in placements(scene, motion, "ball", inside(motion, 4)):
+    assert_same(compute_placements(scene, motion, "ball", sample_phase(motion, 0))[7], BALL, 1e-12)
+    for at in compute_placements(scene, motion, "ball", sample_phase(motion, 4)):
         assert_same(at, lift(BALL, [0.0, 0.3, 0.0]))
 
 
@@ -190,9 +198,11 @@ def test_object_held_at_the_start_is_in_the_hand() -> None:
         pin.XYZQUATToSE3(world.start[world.get_placement_columns("stick")]), expected, 1e-12
     )
     motion = Script(scene).go(move_base(scene.start, x=-1.0, yaw=2.0)).motion()
-    times = inside(motion, 0)
+    times = sample_phase(motion, 0)
     for at, tool in zip(
-        placements(scene, motion, "stick", times), tools(scene, motion, times), strict=True
+        compute_placements(scene, motion, "stick", times),
+        compute_tools(scene, motion, times),
+        strict=True,
     ):
         assert_same(
             at, tool * compute_grasp_pose(pin.SE3.Identity(), values=(-0.04, 0.5)).inverse()
@@ -200,7 +210,7 @@ def test_object_held_at_the_start_is_in_the_hand() -> None:
 
 
 @cache
-def turned() -> tuple[Scene, Trajectory]:
+def make_turning_motion() -> tuple[Scene, Trajectory]:
     """Return the stick turned round and round: two turns of the base, and the arm's wrist too."""
     scene = make_room(describe_table())
     down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
@@ -213,18 +223,24 @@ def turned() -> tuple[Scene, Trajectory]:
 
 def test_placements_are_continuous() -> None:
     """Where one phase ends and the next begins, too."""
-    for scene, motion in (carried(), turned(), (fetched()[0], fetched()[1].motion())):
+    for scene, motion in (
+        make_carried_motion(),
+        make_turning_motion(),
+        (make_fetching_motion()[0], make_fetching_motion()[1].motion()),
+    ):
         for name in scene.objects:
             edges = motion.times[[phase.last for phase in motion.phases[:-1]]]
             for edge in edges:
-                near = placements(scene, motion, name, np.array([edge - 1e-7, edge, edge + 1e-7]))
+                near = compute_placements(
+                    scene, motion, name, np.array([edge - 1e-7, edge, edge + 1e-7])
+                )
                 for other in (near[0], near[2]):
                     assert_same(near[1], other, 1e-5)
 
 
 def test_quaternions_are_continuous() -> None:
     """Of both quaternions of an orientation the nearer one, through two whole turns."""
-    scene, motion = turned()
+    scene, motion = make_turning_motion()
     world, times = World(scene), np.linspace(0.0, motion.times[-1], 3000)
     rows = world.compute_positions(motion, times)[:, world.get_placement_columns("stick")]
     np.testing.assert_allclose(np.linalg.norm(rows[:, 3:], axis=1), 1.0, atol=1e-12)
@@ -238,14 +254,14 @@ def test_quaternions_are_continuous() -> None:
 @settings(max_examples=6, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_placements_do_not_depend_on_other_times(seed: int) -> None:
-    scene, motion = turned()
+    scene, motion = make_turning_motion()
     rng = np.random.default_rng(seed)
     times = np.sort(rng.uniform(-1.0, motion.times[-1] + 1.0, rng.integers(1, 9)))
-    together = placements(scene, motion, "stick", times)
+    together = compute_placements(scene, motion, "stick", times)
     for at, time in zip(together, times, strict=True):
-        assert_same(at, placements(scene, motion, "stick", np.array([time]))[0])
-    assert placements(scene, motion, "stick", np.zeros(0)) == []
-    waypoints = placements(scene, motion, "stick", motion.times)
+        assert_same(at, compute_placements(scene, motion, "stick", np.array([time]))[0])
+    assert compute_placements(scene, motion, "stick", np.zeros(0)) == []
+    waypoints = compute_placements(scene, motion, "stick", motion.times)
     world = World(scene)
     for row, at in zip(world.compute_positions(motion), waypoints, strict=True):
         assert_same(pin.XYZQUATToSE3(row[world.get_placement_columns("stick")]), at, 1e-12)

@@ -27,7 +27,7 @@ def test_missing_values_are_filled_from_their_neighbours() -> None:
     assert np.isnan(table[0, 0])  # the argument is not changed
 
 
-def parts() -> tuple[Trajectory, Trajectory, Trajectory]:
+def make_parts() -> tuple[Trajectory, Trajectory, Trajectory]:
     """Return motions that reach for the door, open it and go on; the second has its hinge."""
     robot = NAMES[:5]
     held = (Hold("door", "handle"),)
@@ -46,7 +46,7 @@ def parts() -> tuple[Trajectory, Trajectory, Trajectory]:
 
 
 def test_concatenation_pauses_at_new_grasps() -> None:
-    whole = concatenate_trajectories(parts(), pause=0.25)
+    whole = concatenate_trajectories(make_parts(), pause=0.25)
     assert whole.names == NAMES
     np.testing.assert_allclose(whole.times, [0.0, 1.0, 3.0, 3.25, 4.25, 4.75])
     np.testing.assert_array_equal(whole.positions[:, :5], ROWS[[0, 1, 2, 2, 3, 0], :5])
@@ -79,7 +79,7 @@ def test_indirect_grasps_pause_too() -> None:
 
 
 def test_motions_must_follow_one_another() -> None:
-    reach, opens, _ = parts()
+    reach, opens, _ = make_parts()
     with pytest.raises(InputError) as raised:
         concatenate_trajectories([reach, reach], pause=0.1)
     assert raised.value.field == "parts[1]"
@@ -94,8 +94,8 @@ def test_motions_must_follow_one_another() -> None:
 
 def test_concatenated_motions_can_be_divided() -> None:
     first, last = 0, 0
-    whole = concatenate_trajectories(parts(), pause=0.25)
-    for part in parts():
+    whole = concatenate_trajectories(make_parts(), pause=0.25)
+    for part in make_parts():
         last = first + len(part.phases)
         found = extract_phases(whole, part.names, first, last)
         count = len(part.times)

@@ -13,7 +13,7 @@ from vkc_pin.world.trajectory.wheels import OMNIDIRECTIONAL, RollingLimits, make
 SPEEDS = st.lists(st.tuples(st.floats(-0.5, 0.5), st.floats(-0.6, 0.6)), min_size=1, max_size=8)
 
 
-def driven(speeds: list[tuple[float, float]]) -> np.ndarray:
+def integrate_arcs(speeds: list[tuple[float, float]]) -> np.ndarray:
     """Return poses after arcs of lengths [m] and turns [rad], by small steps."""
     poses = [np.array([0.3, -0.2, 0.9])]
     for length, turn in speeds:
@@ -29,12 +29,12 @@ def driven(speeds: list[tuple[float, float]]) -> np.ndarray:
 @given(SPEEDS)
 def test_arcs_do_not_slip_sideways(speeds: list[tuple[float, float]]) -> None:
     """Their chords are as long as twice the radius times the sine of half of the turn."""
-    along, aside, turn = RollingLimits.compute_steps(driven(speeds))
+    along, aside, turn = RollingLimits.compute_steps(integrate_arcs(speeds))
     lengths, turns = np.array(speeds).T
     np.testing.assert_allclose(aside, 0.0, atol=1e-6)
     np.testing.assert_allclose(turn, turns, atol=1e-9)
     np.testing.assert_allclose(along, lengths * np.sinc(turns / (2 * np.pi)), atol=1e-6)
-    assert RollingLimits().compute_error(driven(speeds)) < 1e-6
+    assert RollingLimits().compute_error(integrate_arcs(speeds)) < 1e-6
 
 
 def test_error_is_the_larger_of_slip_and_turn() -> None:

@@ -19,7 +19,7 @@ def world() -> World:
     return World(make_full_scene())
 
 
-def random_rows(world: World, seed: int, count: int = 1) -> np.ndarray:
+def sample_rows(world: World, seed: int, count: int = 1) -> np.ndarray:
     robot, objects = world.scene.robot, [placed.object for placed in world.scene.objects.values()]
     lower = np.concatenate([robot.lower, *(item.lower for item in objects)])
     upper = np.concatenate([robot.upper, *(item.upper for item in objects)])
@@ -28,7 +28,7 @@ def random_rows(world: World, seed: int, count: int = 1) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_frames_equal_those_of_robot_and_objects(world: World, seed: int) -> None:
-    scene, (z,) = world.scene, random_rows(world, seed)
+    scene, (z,) = world.scene, sample_rows(world, seed)
     data = world.model.createData()
     pin.framesForwardKinematics(world.model, data, world.coordinates.q(z))
 
@@ -60,7 +60,7 @@ def test_frames_equal_those_of_robot_and_objects(world: World, seed: int) -> Non
 
 @pytest.mark.parametrize("kind", ["collision", "visual"])
 def test_shapes_equal_those_of_robot_and_objects(world: World, kind: str) -> None:
-    scene, (z,) = world.scene, random_rows(world, 3)
+    scene, (z,) = world.scene, sample_rows(world, 3)
     geometry = getattr(world, kind)
     data, shapes = world.model.createData(), geometry.createData()
     pin.updateGeometryPlacements(world.model, data, geometry, shapes, world.coordinates.q(z))

@@ -13,7 +13,7 @@ from vkc_pin.world.files.urdf import UrdfFile, read_urdf
 from vkc_pin.world.models.couplings.coupled_joints import JointCoupling, find_followers
 
 
-def file_of(tmp_path: Path, *inside: str, kinds: str = "prismatic") -> Path:
+def write_chain(tmp_path: Path, *inside: str, kinds: str = "prismatic") -> Path:
     """Write a chain of joints j1, j2, ... with given contents, and shapes on every other link."""
     parts = [format_link("root", "0.1 0.1 0.1")]
     for k, text in enumerate(inside, start=1):
@@ -26,7 +26,7 @@ def file_of(tmp_path: Path, *inside: str, kinds: str = "prismatic") -> Path:
     return path
 
 
-def mimic(leader: str, multiplier: float = 1.0, offset: float = 0.0) -> str:
+def format_mimic(leader: str, multiplier: float = 1.0, offset: float = 0.0) -> str:
     return f'<mimic joint="{leader}" multiplier="{multiplier}" offset="{offset}"/>'
 
 
@@ -37,7 +37,9 @@ def read(path: Path) -> UrdfFile:
 def test_chains_are_resolved_to_their_leader(tmp_path: Path) -> None:
     """j3 = -0.5·j2 + 0.2 and j2 = 2·j1 + 0.1, in any order of the file."""
     found = find_followers(
-        read(file_of(tmp_path, "", mimic("j1", 2.0, 0.1), mimic("j2", -0.5, 0.2))).root
+        read(
+            write_chain(tmp_path, "", format_mimic("j1", 2.0, 0.1), format_mimic("j2", -0.5, 0.2))
+        ).root
     )
     assert found.keys() == {"j2", "j3"}
     assert found["j2"] == JointCoupling("j1", 2.0, 0.1)
@@ -51,7 +53,7 @@ def test_chains_are_resolved_to_their_leader(tmp_path: Path) -> None:
 def test_a_leader_below_its_follower_becomes_a_follower(tmp_path: Path) -> None:
     """j1 = 2·j3 + 0.1 makes j3 = 0.5·j1 - 0.05, and j2 = -4·j3 makes j2 = -2·j1 + 0.2."""
     found = find_followers(
-        read(file_of(tmp_path, mimic("j3", 2.0, 0.1), mimic("j3", -4.0), "")).root
+        read(write_chain(tmp_path, format_mimic("j3", 2.0, 0.1), format_mimic("j3", -4.0), "")).root
     )
     assert found == {"j3": JointCoupling("j1", 0.5, -0.05), "j2": JointCoupling("j1", -2.0, 0.2)}
 
@@ -59,11 +61,14 @@ def test_a_leader_below_its_follower_becomes_a_follower(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("inside", "message"),
     [
-        (("", mimic("j3"), mimic("j2")), "j2: couplings are circular.* j2 → j3 → j2"),
-        (("", mimic("j2")), "j2: couplings are circular.* j2 → j2"),
-        (("", mimic("other")), "j2: .*follows one that cannot move.*'other', which does not exist"),
+        (("", format_mimic("j3"), format_mimic("j2")), "j2: couplings are circular.* j2 → j3 → j2"),
+        (("", format_mimic("j2")), "j2: couplings are circular.* j2 → j2"),
         (
-            ("", mimic("j3"), mimic("still")),
+            ("", format_mimic("other")),
+            "j2: .*follows one that cannot move.*'other', which does not exist",
+        ),
+        (
+            ("", format_mimic("j3"), format_mimic("still")),
             "j2: .*follows one that cannot move.*'still', which is fixed",
         ),
     ],
@@ -72,7 +77,7 @@ def test_a_leader_below_its_follower_becomes_a_follower(tmp_path: Path) -> None:
 def test_leaders_that_cannot_move_raise(
     tmp_path: Path, inside: tuple[str, ...], message: str
 ) -> None:
-    path = file_of(tmp_path, *inside)
+    path = write_chain(tmp_path, *inside)
     fixed = format_link("aside") + format_joint("still", "fixed", "root", "aside")
     path.write_text(path.read_text().replace("</robot>", fixed + "</robot>"))
     with pytest.raises(InputError, match=message) as caught:
@@ -82,7 +87,7 @@ def test_leaders_that_cannot_move_raise(
 
 def test_invalid_couplings_off_the_tool_path_are_ignored(tmp_path: Path) -> None:
     """The fingers of published robots have such couplings."""
-    path = file_of(tmp_path, "", "", mimic("other"))
+    path = write_chain(tmp_path, "", "", format_mimic("other"))
     with pytest.warns(UserWarning, match="there is no joint 'other'"):
         robot = vkc.load_robot(path, pairs="all", tool_frame="l2")
     assert robot.coordinates.names[3:] == ("j1", "j2")
@@ -90,7 +95,7 @@ def test_invalid_couplings_off_the_tool_path_are_ignored(tmp_path: Path) -> None
 
 def test_couplings_of_robot_yaml_override_the_urdf(tmp_path: Path) -> None:
     """Both the short and the full form are read."""
-    file_of(tmp_path, "", mimic("j1", 3.0), "")
+    write_chain(tmp_path, "", format_mimic("j1", 3.0), "")
     text = (
         "urdf: robot.urdf\ntool_frame: l3\ncouplings:\n  j2: j1\n"
         "  j3: {joint: j2, multiplier: -2.0, offset: 0.5}\n"

@@ -26,7 +26,7 @@ from vkc_pin.world.models.robot_model import (
 KINDS = ("revolute", "prismatic", "continuous")
 
 
-def random_robot(rng: np.random.Generator) -> tuple[str, str]:
+def make_random_robot(rng: np.random.Generator) -> tuple[str, str]:
     """Return a URDF of a random tree with random couplings, and its tool link."""
     count = int(rng.integers(3, 8))
     parts, order = [format_link("l0", "0.1 0.1 0.1")], rng.permutation(count)
@@ -58,7 +58,7 @@ def random_robot(rng: np.random.Generator) -> tuple[str, str]:
 def test_kinematics_match_independent_joints(seed: int) -> None:
     """Compares placements and Jacobians with finite differences of independent joints."""
     rng = np.random.default_rng(seed)
-    text, tool = random_robot(rng)
+    text, tool = make_random_robot(rng)
     file = read_urdf(Path("robot.urdf"), text=text)
     single = build_full_model(file)
     full = tighten_coupled_limits(single, file, tool)

@@ -14,7 +14,7 @@ TAIL = "attachments: []\n"
 REAL = st.floats(-1e3, 1e3)
 
 
-def with_dynamics(attributes: str) -> str:
+def add_dynamics(attributes: str) -> str:
     return URDF.replace('<axis xyz="0 0 1"/>', f'<axis xyz="0 0 1"/><dynamics {attributes}/>')
 
 
@@ -25,7 +25,7 @@ def test_resistance_is_zero_by_default() -> None:
 
 
 def test_the_description_overrides_the_urdf_per_value() -> None:
-    urdf = with_dynamics('friction="2" damping="0.5"')
+    urdf = add_dynamics('friction="2" damping="0.5"')
     plain = load_text(urdf, f"urdf: thing.urdf\n{TAIL}").resistance["hinge"]
     assert plain == Resistance(friction=2.0, damping=0.5)
     text = (
@@ -84,9 +84,7 @@ def test_invalid_values_raise_with_their_line(fields: str, field: str, problem: 
 )
 def test_invalid_urdf_dynamics_raise_with_their_line(attributes: str) -> None:
     with pytest.raises(InputError) as caught:
-        load_text(
-            with_dynamics(attributes).replace("<link", "\n<link"), f"urdf: thing.urdf\n{TAIL}"
-        )
+        load_text(add_dynamics(attributes).replace("<link", "\n<link"), f"urdf: thing.urdf\n{TAIL}")
     assert caught.value.line == 4
     assert caught.value.field == f"hinge: dynamics {attributes.partition('=')[0]}"
     assert str(caught.value.file).endswith("thing.urdf")

@@ -20,7 +20,7 @@ def husky() -> Robot:
     return vkc.load_robot("husky_ur5e")
 
 
-def of(robot: Robot, model: pin.Model) -> TorqueLimits:
+def compute_limits(robot: Robot, model: pin.Model) -> TorqueLimits:
     return compute_torque_limits(model, robot.coordinates, robot.lower, robot.upper)
 
 
@@ -34,7 +34,7 @@ def test_limits_are_unknown_without_masses(husky: Robot) -> None:
     model = pin.Model(husky.model)
     for joint in range(2, model.njoints):
         model.inertias[joint] = pin.Inertia.Zero()
-    found = of(husky, model)
+    found = compute_limits(husky, model)
     assert not found.is_known
     assert found.notes == ("the URDF states no masses of the arm",)
 
@@ -45,7 +45,7 @@ def test_joints_without_effort_limit_are_noted(husky: Robot, stated: float) -> N
     limits = np.array(model.effortLimit)
     limits[5] = stated
     model.effortLimit = limits
-    found = of(husky, model)
+    found = compute_limits(husky, model)
     assert np.isinf(found.limits[5])
     assert np.isfinite(found.limits[[3, 4, 6, 7, 8]]).all()
     assert found.notes == ("the URDF states no effort of elbow_joint",)
@@ -58,17 +58,17 @@ def test_limits_that_cannot_hold_the_arm_are_discarded(husky: Robot) -> None:
     limits = np.array(model.effortLimit)
     limits[4] = 0.5 * gravity
     model.effortLimit = limits
-    found = of(husky, model)
+    found = compute_limits(husky, model)
     assert np.isinf(found.limits[4])
     assert len(found.notes) == 1
     assert "shoulder_lift_joint" in found.notes[0]
     assert "cannot hold the arm" in found.notes[0]
     limits[4] = 1.2 * gravity
     model.effortLimit = limits
-    assert of(husky, model).limits[4] == pytest.approx(1.2 * gravity)
+    assert compute_limits(husky, model).limits[4] == pytest.approx(1.2 * gravity)
 
 
-def described(folder: Path, effort: object) -> Path:
+def write_robot(folder: Path, effort: object) -> Path:
     home = vkc.load_robot("husky_ur5e").urdf.parent
     about = yaml.safe_load((home / "robot.yaml").read_text(encoding="utf-8"))
     about["urdf"] = str(home / about["urdf"])
@@ -80,7 +80,7 @@ def described(folder: Path, effort: object) -> Path:
 
 @pytest.mark.parametrize(("effort", "limit"), [(90.0, 90.0), (0, np.inf)])
 def test_robot_yaml_overrides_the_urdf(tmp_path: Path, effort: float, limit: float) -> None:
-    robot = vkc.load_robot(described(tmp_path, effort))
+    robot = vkc.load_robot(write_robot(tmp_path, effort))
     assert robot.efforts.limits[5] == limit
     assert robot.efforts.limits[4] == 150.0
 
@@ -88,5 +88,5 @@ def test_robot_yaml_overrides_the_urdf(tmp_path: Path, effort: float, limit: flo
 @pytest.mark.parametrize("effort", [-1.0, "strong", float("nan")])
 def test_invalid_effort_limits_raise(tmp_path: Path, effort: object) -> None:
     with pytest.raises(InputError) as caught:
-        vkc.load_robot(described(tmp_path, effort))
+        vkc.load_robot(write_robot(tmp_path, effort))
     assert caught.value.field == "joints.elbow_joint.effort"

@@ -21,7 +21,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Robot:
     return vkc.load_robot(write_gripper(tmp_path_factory.mktemp("gripper")))
 
 
-def finger_centers(robot: Robot) -> list[np.ndarray]:
+def compute_finger_centers(robot: Robot) -> list[np.ndarray]:
     """Return the centres of the fingers' shapes in the tool frame."""
     data, shapes = robot.model.createData(), robot.collision.createData()
     pin.updateGeometryPlacements(
@@ -48,7 +48,7 @@ def test_grippers_are_open_by_default_and_mimic_joints_follow(robot: Robot) -> N
 def test_fingers_are_symmetric_at_the_given_opening(robot: Robot, opening: float) -> None:
     opened = robot.opened(opening)
     for middle, side in zip(
-        finger_centers(opened), (1.0, -1.0), strict=True
+        compute_finger_centers(opened), (1.0, -1.0), strict=True
     ):  # fingers are 10 mm thick
         assert middle[0] == pytest.approx(side * (opening / 2.0 + 0.005), abs=1e-5)
     for link in ("finger_a", "finger_b", "hand", "tool"):

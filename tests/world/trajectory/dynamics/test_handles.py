@@ -17,7 +17,7 @@ from vkc_pin.world.trajectory.dynamics.handles import Handle, Motion
 REAL = st.floats(-1.0, 1.0)
 
 
-def motion(**coordinates: tuple[float, float, float]) -> Motion:
+def make_motion(**coordinates: tuple[float, float, float]) -> Motion:
     """Return one moment: coordinate (`_` for `.`) → position, velocity, acceleration."""
     parts = (
         {name.replace("_", ".", 1): np.array([row[k]]) for name, row in coordinates.items()}
@@ -26,19 +26,19 @@ def motion(**coordinates: tuple[float, float, float]) -> Motion:
     return Motion(*parts)
 
 
-def drawer(**resistance: float) -> vkc.Scene:
+def load_drawer(**resistance: float) -> vkc.Scene:
     return replace_object_fields(vkc.load_scene("drawer"), "drawer", joints={"slide": resistance})
 
 
 @pytest.mark.parametrize("riding", [0.0, 2.5])
 def test_drawer_needs_a_force_along_its_slide(riding: float) -> None:
-    scene = drawer(friction=8.0, damping=20.0, stiffness=50.0, springref=-0.1)
+    scene = load_drawer(friction=8.0, damping=20.0, stiffness=50.0, springref=-0.1)
     handle = Handle(
         scene,
         vkc.Hold("drawer", "handle"),
         [(1, pin.Inertia(riding, np.zeros(3), np.zeros((3, 3))))],
     )
-    (wrench,) = handle.wrenches(motion(drawer_slide=(0.2, 0.3, 0.5)))
+    (wrench,) = handle.wrenches(make_motion(drawer_slide=(0.2, 0.3, 0.5)))
     expected = 8.0 + 20.0 * 0.3 + 50.0 * 0.3 + (5.0 + riding) * 0.5
     placed = scene.objects["drawer"]
     opened = (placed.object.link_placement("tray", [value]).translation for value in (1.0, 0.0))
@@ -47,15 +47,15 @@ def test_drawer_needs_a_force_along_its_slide(riding: float) -> None:
 
 
 def test_friction_opposes_the_motion() -> None:
-    handle = Handle(drawer(friction=8.0), vkc.Hold("drawer", "handle"))
+    handle = Handle(load_drawer(friction=8.0), vkc.Hold("drawer", "handle"))
     ahead, back, rest = (
-        handle.forces(motion(drawer_slide=(0.2, v, 0.0)))[0, 0] for v in (0.1, -0.1, 0.0)
+        handle.forces(make_motion(drawer_slide=(0.2, v, 0.0)))[0, 0] for v in (0.1, -0.1, 0.0)
     )
     assert (ahead, back, rest) == pytest.approx((8.0, -8.0, 0.0))
 
 
 @cache
-def heavy_door() -> vkc.Scene:
+def load_heavy_door() -> vkc.Scene:
     return load_door_with_closer(stiffness=5.0, springref=-2.0, damping=3.0)
 
 
@@ -65,11 +65,11 @@ def heavy_door() -> vkc.Scene:
 def test_wrench_does_the_work_of_the_joints_and_none_along_freedoms(
     attachment: str, hinge: tuple[float, float, float], knob: float, rate: float, turn: float
 ) -> None:
-    placed = heavy_door().objects["door"]
+    placed = load_heavy_door().objects["door"]
     grasp = placed.object.attachment(attachment)
     rows = {f"door_{name}": (turn, 0.0, 0.0) for name in grasp.coordinates}
-    now = motion(door_hinge=hinge, door_knob=(knob, rate, 0.0), **rows)
-    handle = Handle(heavy_door(), vkc.Hold("door", attachment))
+    now = make_motion(door_hinge=hinge, door_knob=(knob, rate, 0.0), **rows)
+    handle = Handle(load_heavy_door(), vkc.Hold("door", attachment))
     (wrench,), (force,) = handle.wrenches(now), handle.forces(now)
 
     def tool(values: np.ndarray) -> pin.SE3:
@@ -96,7 +96,7 @@ def test_wrench_is_the_smallest_sufficient_one() -> None:
     handle = Handle(
         load_door_with_closer(stiffness=5.0, springref=-2.0), vkc.Hold("door", "handle")
     )
-    (wrench,) = handle.wrenches(motion(door_hinge=(0.6, 0.2, 0.1), door_knob=(0.5, 0.0, 0.0)))
+    (wrench,) = handle.wrenches(make_motion(door_hinge=(0.6, 0.2, 0.1), door_knob=(0.5, 0.0, 0.0)))
     weigh = np.array([1.0] * 3 + [0.1] * 3)
     force = float(np.linalg.norm(wrench[:3]))
     assert force == pytest.approx(
@@ -106,13 +106,13 @@ def test_wrench_is_the_smallest_sufficient_one() -> None:
 
 
 def test_bolts_and_stops_carry_resting_loads() -> None:
-    shut = motion(door_hinge=(0.0, 0.0, 0.0), door_knob=(0.2, 0.5, 0.0))
+    shut = make_motion(door_hinge=(0.0, 0.0, 0.0), door_knob=(0.2, 0.5, 0.0))
     handle = Handle(
         load_door_with_closer(stiffness=5.0, springref=-2.0), vkc.Hold("door", "handle")
     )
     assert handle.forces(shut)[0, 0] == 0.0
-    leaving = motion(door_hinge=(0.0, 0.0, 0.5), door_knob=(0.5, 0.0, 0.0))
+    leaving = make_motion(door_hinge=(0.0, 0.0, 0.5), door_knob=(0.5, 0.0, 0.0))
     assert handle.forces(leaving)[0, 0] > 10.0
-    slide = Handle(drawer(stiffness=50.0, springref=-1.0), vkc.Hold("drawer", "handle"))
-    assert slide.forces(motion(drawer_slide=(0.0, 0.0, 0.0)))[0, 0] == 0.0
-    assert slide.forces(motion(drawer_slide=(0.1, 0.0, 0.0)))[0, 0] == pytest.approx(55.0)
+    slide = Handle(load_drawer(stiffness=50.0, springref=-1.0), vkc.Hold("drawer", "handle"))
+    assert slide.forces(make_motion(drawer_slide=(0.0, 0.0, 0.0)))[0, 0] == 0.0
+    assert slide.forces(make_motion(drawer_slide=(0.1, 0.0, 0.0)))[0, 0] == pytest.approx(55.0)

@@ -14,7 +14,7 @@ from vkc_pin.world.trajectory.trajectory import PhaseSpan, Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
 
-def swung(mass: float, *, base: float = 0.0) -> tuple[vkc.Scene, Trajectory]:
+def swing_stick(mass: float, *, base: float = 0.0) -> tuple[vkc.Scene, Trajectory]:
     """Return a scene with the stick in the hand, and a motion of arm and base in it."""
     scene = replace_object_fields(vkc.load_scene("init_1"), "stick", mass=mass).with_held(
         {"stick": "grip"}
@@ -33,7 +33,7 @@ def swung(mass: float, *, base: float = 0.0) -> tuple[vkc.Scene, Trajectory]:
     )
 
 
-def energy(world: World, motion: Trajectory, moment: float) -> float:
+def compute_energy(world: World, motion: Trajectory, moment: float) -> float:
     """Return what robot and stick have, of where their bodies are a moment before and after [J]."""
     h = 1e-5
     rows = world.coordinates.q(
@@ -57,13 +57,14 @@ def energy(world: World, motion: Trajectory, moment: float) -> float:
 
 @pytest.mark.parametrize("mass", [0.0, 4.0])
 def test_power_equals_the_change_of_energy(mass: float) -> None:
-    scene, motion = swung(mass)
+    scene, motion = swing_stick(mass)
     world = World(scene)
     for moment in (0.35, 0.8, 1.3):
         torques, rates = Torques(scene, motion).along(np.array([moment])), motion.velocity(moment)
         power = float(torques[0] @ rates[: motion.robot_size])
         gained = (
-            energy(world, motion, moment + 1e-3) - energy(world, motion, moment - 1e-3)
+            compute_energy(world, motion, moment + 1e-3)
+            - compute_energy(world, motion, moment - 1e-3)
         ) / 2e-3
         assert power == pytest.approx(gained, rel=2e-3, abs=2e-2)
 
@@ -71,7 +72,7 @@ def test_power_equals_the_change_of_energy(mass: float) -> None:
 def test_payload_at_rest_adds_its_weight() -> None:
     torques = []
     for mass in (0.0, 3.0):
-        scene, motion = swung(mass)
+        scene, motion = swing_stick(mass)
         still = np.zeros_like(motion.positions[:1])
         torques.append(
             Torques(scene, motion).at(np.zeros(1, int), motion.positions[:1], still, still)[0]
@@ -90,8 +91,8 @@ def test_payload_at_rest_adds_its_weight() -> None:
 
 
 def test_base_acceleration_loads_the_arm() -> None:
-    scene, motion = swung(2.0, base=0.4)
-    _, still = swung(2.0)
+    scene, motion = swing_stick(2.0, base=0.4)
+    _, still = swing_stick(2.0)
     times = np.array([0.4, 0.9])
     assert (
         np.abs(Torques(scene, motion).along(times) - Torques(scene, still).along(times))[

@@ -26,29 +26,29 @@ def saved(door_plan: vkc.Plan, tmp_path_factory: pytest.TempPathFactory) -> Path
     return door_plan.save(tmp_path_factory.mktemp("archives") / "door.npz")
 
 
-def packed(array: Any) -> bytes:
+def pack(array: Any) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, array)
     return buffer.getvalue()
 
 
-def parts(saved: Path) -> dict[str, bytes]:
+def read_parts(saved: Path) -> dict[str, bytes]:
     with zipfile.ZipFile(saved) as archive:
         return {name.removesuffix(".npy"): archive.read(name) for name in archive.namelist()}
 
 
-def written(path: Path, found: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> Path:
+def write_members(path: Path, found: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> Path:
     with zipfile.ZipFile(path, "w", method) as archive:
         for name, data in found.items():
             archive.writestr(f"{name}.npy", data)
     return path
 
 
-def changed(path: Path, saved: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
+def write_changed(path: Path, saved: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
     """The same file with another description."""
     about, _ = read_archive(saved)
     change(about)
-    return written(path, {**parts(saved), "about": packed(np.array(json.dumps(about)))})
+    return write_members(path, {**read_parts(saved), "about": pack(np.array(json.dumps(about)))})
 
 
 def test_round_trip(tmp_path: Path, saved: Path) -> None:
@@ -57,10 +57,10 @@ def test_round_trip(tmp_path: Path, saved: Path) -> None:
     again, found = read_archive(write_archive(tmp_path / "again", whole))
     assert json.dumps(again) == json.dumps(about)
     other = {
-        "times": packed(arrays["times"].astype(">f8")),
-        "positions": packed(np.asfortranarray(arrays["positions"])),
+        "times": pack(arrays["times"].astype(">f8")),
+        "positions": pack(np.asfortranarray(arrays["positions"])),
     }
-    _, swapped = read_archive(written(tmp_path / "other", {**parts(saved), **other}))
+    _, swapped = read_archive(write_members(tmp_path / "other", {**read_parts(saved), **other}))
     for name in ("times", "positions"):
         np.testing.assert_array_equal(found[name], arrays[name])
         np.testing.assert_array_equal(swapped[name], arrays[name])
@@ -102,18 +102,18 @@ DESCRIPTIONS: list[tuple[Change, str]] = [
 def test_invalid_descriptions_are_rejected(
     tmp_path: Path, saved: Path, change: Change, message: str
 ) -> None:
-    path = changed(tmp_path / "wrong", saved, change)
+    path = write_changed(tmp_path / "wrong", saved, change)
     with pytest.raises(vkc.InputError, match=message) as caught:
         vkc.Plan.load(path)
     assert caught.value.file == path
 
 
-def _holes(positions: np.ndarray) -> np.ndarray:
+def _add_holes(positions: np.ndarray) -> np.ndarray:
     positions[3, 4] = np.nan
     return positions
 
 
-def _back(times: np.ndarray) -> np.ndarray:
+def _turn_back(times: np.ndarray) -> np.ndarray:
     times[3] = times[2]
     return times
 
@@ -121,8 +121,8 @@ def _back(times: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("name", "change", "said"),
     [
-        ("positions", _holes, r"positions\[3, 4\]: not finite"),
-        ("times", _back, "times do not increase"),
+        ("positions", _add_holes, r"positions\[3, 4\]: not finite"),
+        ("times", _turn_back, "times do not increase"),
         ("times", lambda times: times[:-1], "phases do not follow|wrong shape"),
         ("positions", lambda positions: positions[:, :-1], "wrong shape"),
         (
@@ -142,15 +142,15 @@ def _back(times: np.ndarray) -> np.ndarray:
 def test_invalid_arrays_are_rejected(
     tmp_path: Path, saved: Path, name: str, change: Callable[[Any], Any], said: str
 ) -> None:
-    found = parts(saved)
+    found = read_parts(saved)
     array = np.load(io.BytesIO(found[name]))
-    path = written(tmp_path / "wrong", {**found, name: packed(change(array.copy()))})
+    path = write_members(tmp_path / "wrong", {**found, name: pack(change(array.copy()))})
     with pytest.raises(vkc.InputError, match=said) as caught:
         vkc.Plan.load(path)
     assert caught.value.file == path
 
 
-def _header(shape: str, dtype: str = "<f8") -> bytes:
+def _make_header(shape: str, dtype: str = "<f8") -> bytes:
     text = (
         f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}".encode().ljust(117)
         + b"\n"
@@ -158,18 +158,18 @@ def _header(shape: str, dtype: str = "<f8") -> bytes:
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
 
 
-def _bomb(found: dict[str, bytes]) -> dict[str, bytes]:
-    return {**found, "positions": _header("(100000, 125)") + bytes(100_000_000)}
+def _make_bomb(found: dict[str, bytes]) -> dict[str, bytes]:
+    return {**found, "positions": _make_header("(100000, 125)") + bytes(100_000_000)}
 
 
-def _tall_tale(found: dict[str, bytes]) -> dict[str, bytes]:
-    return {**found, "positions": _header("(1000000000, 1000)") + bytes(80)}
+def _exaggerate_shape(found: dict[str, bytes]) -> dict[str, bytes]:
+    return {**found, "positions": _make_header("(1000000000, 1000)") + bytes(80)}
 
 
-def _lists(found: dict[str, bytes]) -> dict[str, bytes]:
+def _nest_lists(found: dict[str, bytes]) -> dict[str, bytes]:
     return {
         **found,
-        "about": packed(np.array('{"format": 1, "history": [' + "[]," * 3_000_000 + "[]]}")),
+        "about": pack(np.array('{"format": 1, "history": [' + "[]," * 3_000_000 + "[]]}")),
     }
 
 
@@ -187,12 +187,12 @@ print(int(peak[1]) / 1e3, time.process_time() - before)
 """
 
 
-@pytest.mark.parametrize("make", [_bomb, _tall_tale, _lists])
+@pytest.mark.parametrize("make", [_make_bomb, _exaggerate_shape, _nest_lists])
 def test_large_contents_are_rejected_before_they_are_unpacked(
     tmp_path: Path, saved: Path, make: Callable[[Any], Any]
 ) -> None:
     """In less than 500 MB, and 2 s of CPU time on an idle machine."""
-    path = written(tmp_path / "large", make(parts(saved)))
+    path = write_members(tmp_path / "large", make(read_parts(saved)))
     run = [sys.executable, "-c", LOAD, str(saved), str(path)]
     done = subprocess.run(run, capture_output=True, text=True, timeout=100, check=True)
     said, figures = done.stdout.rsplit("\n", 2)[:2]
@@ -216,8 +216,11 @@ def test_unreadable_files_are_rejected(tmp_path: Path) -> None:
 @pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2])
 def test_only_numpys_compression_is_accepted(tmp_path: Path, saved: Path, method: int) -> None:
     with pytest.raises(vkc.InputError, match="compressed by an unknown method"):
-        vkc.Plan.load(written(tmp_path / "odd", parts(saved), method))
-    assert vkc.Plan.load(written(tmp_path / "plain", parts(saved), zipfile.ZIP_STORED)).seed == 0
+        vkc.Plan.load(write_members(tmp_path / "odd", read_parts(saved), method))
+    assert (
+        vkc.Plan.load(write_members(tmp_path / "plain", read_parts(saved), zipfile.ZIP_STORED)).seed
+        == 0
+    )
 
 
 def test_damaged_bytes_raise_input_errors_only(tmp_path: Path, saved: Path) -> None:

@@ -27,12 +27,12 @@ COLUMNS = arrays(
 )
 
 
-def some(rng: np.random.Generator, n: int = 9) -> tuple[np.ndarray, np.ndarray]:
+def sample_motion(rng: np.random.Generator, n: int = 9) -> tuple[np.ndarray, np.ndarray]:
     return np.cumsum(rng.uniform(0.1, 0.5, n)), np.cumsum(rng.uniform(-0.2, 0.5, (n, 4)), axis=0)
 
 
 def test_velocities_match_scipys_monotone_cubic() -> None:
-    times, positions = some(np.random.default_rng(0))
+    times, positions = sample_motion(np.random.default_rng(0))
     velocities, _ = estimate_rates(times, positions)
     np.testing.assert_allclose(
         velocities[1:-1], PchipInterpolator(times, positions).derivative()(times)[1:-1], atol=1e-12
@@ -146,7 +146,7 @@ def test_invalid_options_are_rejected(plan: Plan, options: dict[str, Any], messa
         plan.to_ros(**options)
 
 
-def changed(message: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
+def replace_value(message: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
     """Return a copy with another value at a path such as "points/0/positions"; None removes it."""
     copy = json.loads(json.dumps(message))
     *path_parts, last = [int(part) if part.isdigit() else part for part in path.split("/")]
@@ -193,7 +193,7 @@ def changed(message: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
 def test_invalid_messages_are_rejected(
     plan: Plan, tmp_path: Path, path: str, value: Any, expected: str
 ) -> None:
-    message = changed(plan.to_ros(), path, value)
+    message = replace_value(plan.to_ros(), path, value)
     with pytest.raises(vkc.InputError, match=f"^{expected}"):
         Trajectory.from_ros(message)
     with pytest.raises(vkc.InputError, match=f"bad.json: {expected}"):

@@ -49,7 +49,7 @@ def read(folder: Path) -> Messages:
     return found
 
 
-def as_data(message: Any) -> dict[str, Any]:
+def convert_message(message: Any) -> dict[str, Any]:
     """Return a JointTrajectory as `to_ros` has it."""
     keys = ("positions", "velocities", "accelerations", "effort")
     return {
@@ -77,7 +77,9 @@ def test_trajectories_equal_those_of_to_ros(plan: Plan, tmp_path: Path) -> None:
     for group in ("arm", "base"):
         ((when, message),) = found[f"/vkc/{group}/joint_trajectory"]
         assert when == 1_250_000_000
-        assert as_data(message) == plan.to_ros(joints=group, rate=100.0, frame="map", stamp=1.25)
+        assert convert_message(message) == plan.to_ros(
+            joints=group, rate=100.0, frame="map", stamp=1.25
+        )
 
 
 def test_base_velocities_lead_along_the_path(plan: Plan, tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Whole-body planning for mobile manipulators on virtual kinematic chains.
 
-What is public is listed in `__init__.pyi` and loaded when it is first asked for (as SPEC 1 of
+Public names are listed in `__init__.pyi` and loaded on first use (as SPEC 1 of
 Scientific Python has it), so that `import vkc_pin` costs little in a process that needs a part of
 it, and type checkers see everything.
 """

@@ -24,7 +24,7 @@ from vkc_pin.world.task.actions import compile_each_step, group_into_actions
 )
 def test_chores_have_the_papers_steps(name: str, number: int, actions: int) -> None:
     chore = chores.CHORES[name]
-    scene, listed = chore.scene(), chore.planned()
+    scene, listed = chore.scene(), chore.list_steps()
     assert len(listed) == number
     assert len(group_into_actions(listed)) == actions
     compile_each_step(scene, listed, chore.options)

@@ -61,7 +61,7 @@ def test_planned_motion_is_valid(door_plan: vkc.Plan) -> None:
     times, safe = door_plan.trajectory.times[1:], door_plan.options.dist_safe
     curves = compute_clearance_curves(door_plan.scene, door_plan.trajectory, times)
     at_waypoints = {curve.name: curve.distances.min() for curve in curves}
-    assert at_waypoints.pop("gripper – what it grasps") > 0.0
+    assert at_waypoints.pop("gripper – grasped object") > 0.0
     assert min(at_waypoints.values()) >= safe - 1e-3
     assert report.clearance <= min(at_waypoints.values()) + 1e-9
     assert report.closure_error <= 1e-3
@@ -500,7 +500,7 @@ def test_fingers_may_be_close_to_the_grasped_link(door_plan: vkc.Plan) -> None:
     hand, times = door_plan.scene.robot.touch_links, door_plan.trajectory.times
     curves = compute_clearance_curves(door_plan.scene, door_plan.trajectory, times)
     gap = next(
-        curve for curve in curves if curve.name == "gripper – what it grasps"
+        curve for curve in curves if curve.name == "gripper – grasped object"
     ).distances.min()
     near = check(door_plan, scene=thicken_lever(door_plan.scene, gap - 0.008))
     assert not {

@@ -40,7 +40,7 @@ __all__ = ["CHORES", "Chore", "fetch", "home", "make_cluttered_home", "plan_tria
 WINDOW = 2
 ONE_CALL, STEP_BY_STEP = "VKC", "step by step"
 THINGS = 300  # in the cluttered home
-_AROUND = 0.2  # [m] around what the chore is about that stays free there
+_AROUND = 0.2  # [m] around the task's objects that stays free of clutter
 _LIMITS = {
     **LIMITS,
     "max_evaluations": 4 * LIMITS["max_evaluations"],
@@ -57,7 +57,7 @@ _SEEDS_ABOUT = (
 BAR_TABLE = (-3.0, 1.3, 1.051)  # [m], where the cup stands in between
 DESK = (1.75, 3.5, 0.741)
 CLEAR = (1.1, -2.9, 0.036)  # floor before the television
-BIN = (3.0, -3.6, 0.16)  # within its walls; what is let go of there falls
+BIN = (3.0, -3.6, 0.16)  # within its walls; released objects would fall
 BEFORE_TABLE = (-0.9, 2.2, 0.036)  # floor before the low table
 SHELF = (-4.61, -1.0, 0.846)
 
@@ -124,7 +124,7 @@ TIGHT: tuple[dict[str, Any], ...] = (
     # door is open as far as asked.
     _box("bag", (1.875, 1.985), (1.11, 1.19), (0.8, 1.04), colour="teal"),
     _box("wardrobe", (0.2, 1.099), (1.3, 1.9), (0.0, 2.0), colour="oak"),
-    # 10 mm from what is carried: a bottle behind the cup in the refrigerator, a mop between broom
+    # 10 mm from carried objects: a bottle behind the cup in the refrigerator, a mop between broom
     # and wall.
     {
         "name": "bottle",
@@ -143,7 +143,7 @@ TIGHT: tuple[dict[str, Any], ...] = (
         "colour": "blue",
     },
 )
-"""What the home lacks to be as tight as real ones, as obstacles."""
+"""Obstacles that make the home as narrow as real ones."""
 
 
 @functools.cache
@@ -167,7 +167,7 @@ class Chore:
     steps: Callable[[Scene], list[Step]]
     options: Options = field(default_factory=Options)
 
-    def planned(self) -> list[Step]:
+    def list_steps(self) -> list[Step]:
         """Return the steps."""
         return self.steps(self.scene())
 
@@ -245,7 +245,7 @@ def run(
     settings |= {
         "window": WINDOW,
         **_LIMITS,
-        "steps": {name: list(map(str, CHORES[name].planned())) for name in chores},
+        "steps": {name: list(map(str, CHORES[name].list_steps())) for name in chores},
     }
     settings |= {"dist_safe": {name: CHORES[name].options.dist_safe for name in chores}}
     return runner.run(
@@ -307,7 +307,7 @@ def _seeds_table(result: Mapping[str, Any]) -> str:
         spreads = list[str]()
         for length in ("base_path_length", "arm_path_length"):
             found = values(select(own, success=True), length)
-            spreads += _apart(min(found), max(found)) if found else ["–"] * 3
+            spreads += _format_spread(min(found), max(found)) if found else ["–"] * 3
         cpu = (
             (format_decimal(float(np.median(times))), format_decimal(max(times)))
             if times
@@ -320,7 +320,7 @@ def _seeds_table(result: Mapping[str, Any]) -> str:
     return format_table(head, rows, text=3)
 
 
-def _apart(low: float, high: float) -> list[str]:
+def _format_spread(low: float, high: float) -> list[str]:
     """Return a range, its spread over the lower end, and half of it over the middle [%]."""
     shares = (high / low - 1.0, (high - low) / (high + low)) if low > 0.0 else (np.nan, np.nan)
     return [

@@ -177,7 +177,9 @@ class Comparison:
         trials_of = _Trials(self, out, solve or self.plan_trial, timed=solve is None)
         record = functools.partial(trials_of.record, save_failures=save_failures)
         result = runner.run(specs, record, out, settings=settings, **execution)
-        saved = trials_of.list_saved(result["trials"], specs, again=save_failures, show=progress)
+        saved = trials_of.list_saved_plans(
+            result["trials"], specs, again=save_failures, show=progress
+        )
         names = {name: self.tasks[name].name for name in tasks}
         pictures = self.draw(result["trials"], out, names, methods)
         pictures += trials_of.draw_motions(result["trials"], specs)
@@ -237,7 +239,7 @@ class _Trials:
         own |= {key: spec[key] for key in ("scene", "number", "placed") if key in spec}
         return trial(found, method=spec["method"], seed=spec["seed"], **own)
 
-    def list_saved(
+    def list_saved_plans(
         self,
         records: Sequence[Record],
         specs: Sequence[Mapping[str, Any]],

@@ -96,7 +96,7 @@ def report(
         parts += [
             "## Failures",
             "`vkc-pin view FILE` shows them, with violated clearances in red.",
-            _failed(records, saved),
+            _list_failures(records, saved),
         ]
     return "\n\n".join([*parts, describe_run(about)]) + "\n"
 
@@ -131,7 +131,9 @@ def _times(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequenc
     rows = []
     for name, good in (("all trials", False), ("successes", True)):
         for task, method in product(tasks, methods):
-            own, reference = (_of(records, task, which, good=good) for which in (method, _OWN))
+            own, reference = (
+                _select_records(records, task, which, good=good) for which in (method, _OWN)
+            )
             (median, late), times = distribution(own, "planning_time"), values(own, "planning_time")
             cells = (
                 median,
@@ -160,7 +162,7 @@ def _calls(
     """Return a section on the time of whole calls, if it is recorded."""
     rows = []
     for task, method in product(tasks, methods):
-        own = _of(records, task, method)
+        own = _select_records(records, task, method)
         if values(own, "wall_time"):
             first = [
                 format_decimal(distribution(own, field)[0]) for field in ("cold_time", "warm_time")
@@ -196,7 +198,7 @@ def _budgets(
     shares = [(name, about["max_evaluations"] * share) for name, share in BUDGETS.items()]
     rows = []
     for task, method in product(tasks, methods):
-        own = _of(records, task, method)
+        own = _select_records(records, task, method)
         good = values([record for record in own if record["success"]], "evaluations")
         within = [sum(count <= limit for count in good) for _, limit in shares]
         gain = 100.0 * (within[-1] - within[-2]) / max(len(own), 1)
@@ -238,7 +240,7 @@ def _criteria(
     rows = []
     for task in tasks:
         own = [record for record in records if record["scene"] == task]
-        good = {method: _of(own, task, method, good=True) for method in methods}
+        good = {method: _select_records(own, task, method, good=True) for method in methods}
         if shared:
             both = find_common_successes(own, methods)
             good = {method: [row[k] for row in both] for k, method in enumerate(methods)}
@@ -274,7 +276,7 @@ def _pairwise(
     return [f"## {_OWN} against each baseline", text, format_table(head, rows, text=3)]
 
 
-def _failed(records: Sequence[Record], saved: Mapping[str, str]) -> str:
+def _list_failures(records: Sequence[Record], saved: Mapping[str, str]) -> str:
     rows = []
     for record in records:
         if record["key"] in saved:
@@ -293,7 +295,9 @@ def _failed(records: Sequence[Record], saved: Mapping[str, str]) -> str:
     )
 
 
-def _of(records: Sequence[Record], task: str, method: str, *, good: bool = False) -> list[Record]:
+def _select_records(
+    records: Sequence[Record], task: str, method: str, *, good: bool = False
+) -> list[Record]:
     """Return the records of a task and method, or its successes."""
     own = (record for record in records if (record["scene"], record["method"]) == (task, method))
     return [record for record in own if record["success"] or not good]

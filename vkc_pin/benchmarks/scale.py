@@ -74,7 +74,7 @@ AXES = {
 _OPENED = {
     "obstacles": 1.2,
     "segments": 0.6,
-}  # [rad] of the hinge: in 20 segments a hand does not hold a handle on a longer way
+}  # [rad] of the hinge: 20 segments are too few for a larger motion
 _WEST, _EAST, _SOUTH, _NORTH, _HALL, _CEILING = (
     -2.5,
     2.5,

@@ -92,4 +92,4 @@ def find_grasping_start(
     return None
 
 
-_EXACT = 1e-2 * TOLERANCE  # [m], [rad]: how far the hand may be off what it holds
+_EXACT = 1e-2 * TOLERANCE  # [m], [rad]: accepted distance of the hand from its grasp

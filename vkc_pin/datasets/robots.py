@@ -39,7 +39,7 @@ def check_frames(recipe: Recipe) -> None:
         with open_gl_context((8, 8)):
             pass
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what is said of robots is said when they are made ready
+        warnings.simplefilter("ignore")  # warnings were issued when robots were prepared
         fields = recipe.fields
         for name in fields.scenes or [entry.name for entry in fields.robots]:
             robot = load_scene(name).robot if fields.scenes else load_robot(name)
@@ -61,7 +61,7 @@ def prepare_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
     """
     found = {}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what is guessed is in the robot's folder
+        warnings.simplefilter("ignore")  # the robot's folder lists guesses
         for entry in () if recipe.fields.scenes else recipe.fields.robots:
             made = folder / check_name(get_robot_name(entry.name), "robots")
             if not (made / "robot.yaml").is_file():

@@ -14,7 +14,7 @@ def test_option_is_changed() -> None:
     assert change == Change("Options", "dt", 0.3)
     assert str(change) == "Options.dt=0.3"
     assert change.options == vkc.Options(dt=0.3)
-    with change.applied():
+    with change.apply():
         assert vkc.Options() == UNCHANGED.options
 
 
@@ -22,7 +22,7 @@ def test_constant_is_changed_for_a_while() -> None:
     before = loop.PROGRESS
     change = parse_change("solver.loop:PROGRESS=0.6")
     assert change.options == vkc.Options()
-    with change.applied():
+    with change.apply():
         assert loop.PROGRESS == 0.6
     assert before == loop.PROGRESS
 
@@ -32,7 +32,7 @@ def test_constant_is_changed_where_it_is_imported_and_restored() -> None:
     assert before == loop.ACTIVE_FRACTION
 
     def fail() -> None:
-        with parse_change("solver.trust_region:ACTIVE_FRACTION=0.123").applied():
+        with parse_change("solver.trust_region:ACTIVE_FRACTION=0.123").apply():
             assert trust_region.ACTIVE_FRACTION == loop.ACTIVE_FRACTION == 0.123
             raise KeyError
 

@@ -55,7 +55,8 @@ def test_requests_are_parsed() -> None:
         Request("drawer", "drawer"),
     ]
     assert [
-        one.imported for one in parse_requests(["a.URDF", "b.sdf", "c.yaml", "urdf"], "objects", ())
+        one.is_imported
+        for one in parse_requests(["a.URDF", "b.sdf", "c.yaml", "urdf"], "objects", ())
     ] == [True, True, False, False]
 
 

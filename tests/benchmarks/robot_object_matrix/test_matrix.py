@@ -62,7 +62,7 @@ def test_report() -> None:
     assert "| three | 3 | 0 | 0 (0%) | 0 (0%) | – | – | – |" in text
     assert (
         text.index("## What failed")
-        < text.index("## What is out of reach")
+        < text.index("## Out of reach")
         < text.index("| one | valve_1 | unreachable")
     )
 

@@ -33,7 +33,7 @@ def test_clearance_curves_agree_with_coal(curves: dict[str, ClearanceCurve], pla
         "robot – objects",
         "robot – obstacles",
         "objects – surroundings",
-        "gripper – what it grasps",
+        "gripper – grasped object",
     ]
     curve = curves["robot – obstacles"]
     arm = range(len(robot.collision.geometryObjects))

@@ -84,11 +84,9 @@ def simulate_workers(costs: Costs, workers: int, tasks: int | None = None) -> di
     rng = np.random.default_rng(_SEED)
     later = costs.later or costs.first
     half = costs.client / 2.0  # to send a task; the other half to take its result
-    free = 0.0  # when the client has done what it has to do so far
-    ready = [0.0] * workers  # when a worker has done what it has been sent so far
-    ended: list[
-        tuple[float, int, int]
-    ] = []  # results on their way to the client: when, which task, which worker's
+    free = 0.0  # when the client is idle
+    ready = [0.0] * workers  # when a worker is idle
+    ended: list[tuple[float, int, int]] = []  # results sent to the client: time, task, worker
     spans: list[tuple[float, float]] = []  # of each task
 
     def send(worker: int) -> None:

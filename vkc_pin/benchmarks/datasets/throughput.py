@@ -207,7 +207,7 @@ def report(result: Mapping[str, Any]) -> str:
         f"recipe {about['recipe']}. "
         "The time counts from when the processes are there to the last attempt; an hour of one "
         "core is of processor "
-        "time, without what else ran on the machine. Growth is that of a process in a thousand "
+        "time, without other processes. Growth is that of a process in a thousand "
         "attempts, once half of its "
         "attempts have filled its caches; the client feeds the processes and writes down what "
         "comes, and takes so much "
@@ -255,7 +255,7 @@ def _simulation(many: Sequence[Record], scheduled: bool) -> list[str]:
         "episodes an hour, simulated",
         "efficiency",
         "client busy",
-        "in vain",
+        "unused work",
         "client saturated at",
     ]
     rows = [
@@ -271,7 +271,7 @@ def _simulation(many: Sequence[Record], scheduled: bool) -> list[str]:
         "result waits for the one client, "
         f"which takes its processor time {'with' if scheduled else 'but not'} that of Dask's "
         "scheduler; efficiency is the share "
-        "of the workers' time that goes into the dataset, and work in vain is what was begun "
+        "of the workers' time that goes into the dataset, and unused work was begun "
         "beyond its last number. Nothing is "
         "said of network and disk."
     )

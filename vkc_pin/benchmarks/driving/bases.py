@@ -20,7 +20,7 @@ from vkc_pin.world.task.steps import Actuate
 __all__ = ["BASES", "TASKS", "TURNING_RADIUS", "make_start", "report", "run"]
 
 TASKS = {"door": {"hinge": 1.2}, "drawer": {"slide": 0.35}}
-"""Scene → what is opened how far: its object of the same name."""
+"""Scene → goal of the object of the same name."""
 TURNING_RADIUS = 0.8
 """Turning radius of steered bases [m], an own choice: a little less than the Husky's length."""
 BASES: dict[str, dict[str, Any]] = {
@@ -28,7 +28,7 @@ BASES: dict[str, dict[str, Any]] = {
     "differential": {},
     "ackermann": {"turning_radius": TURNING_RADIUS},
 }
-"""Kind of base → what else the scene says of the robot."""
+"""Kind of base → further fields of the scene's robot."""
 
 
 def make_start(task: str, base: str, seed: int, number: int) -> Scene:

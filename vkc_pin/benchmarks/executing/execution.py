@@ -42,7 +42,7 @@ TASKS: Mapping[str, str] = {
     "household_cup": "carry a cup to a table",
     "init_1": "touch a cube with a stick",
 }
-"""What is done: name among the experiments' tasks → in words."""
+"""Task → description."""
 _HEAD = [
     "task",
     "plans",

@@ -64,7 +64,9 @@ def success_chart(
         return _rate(own) if own else None
 
     names = {scene: f"{name}\n{_number(records, scene, methods)}" for scene, name in scenes.items()}
-    figure = _grouped(names, methods, bar, label="successful trials [%]", form=".0f", title=title)
+    figure = _draw_groups(
+        names, methods, bar, label="successful trials [%]", form=".0f", title=title
+    )
     (axes,) = figure.axes
     axes.set_ylim(0.0, 108.0)
     axes.set_yticks(range(0, 101, 20))
@@ -115,7 +117,7 @@ def means_chart(
 
     over = "trials in which all methods succeed" if shared else "all trials"
     title = f"{label.partition(' [')[0].capitalize()}: mean and standard deviation over {over}"
-    figure = _grouped(names, methods, bar, label=label, form=".3g", title=title)
+    figure = _draw_groups(names, methods, bar, label=label, form=".3g", title=title)
     (axes,) = figure.axes
     axes.set_ylim(0.0, 1.06 * axes.get_ylim()[1])
     return save_figure(figure, path)
@@ -247,7 +249,7 @@ def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: 
         return save_figure(figure, path)
 
 
-def _grouped(
+def _draw_groups(
     scenes: Mapping[str, str],
     methods: Sequence[str],
     bar: Callable[[str, str], tuple[float, float, float] | None],

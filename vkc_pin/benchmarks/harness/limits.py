@@ -8,7 +8,7 @@ from typing import Any
 __all__ = ["LIMITS", "MAX_EVALUATIONS", "TIME_LIMIT", "describe_limit"]
 
 MAX_EVALUATIONS = 1_000_000
-"""Units, several times what trials take: what can be done is done with less."""
+"""Several times the evaluations of a usual trial."""
 TIME_LIMIT = 1800.0
 """Wall time of a call [s]; trials that it ends are no results of the method."""
 LIMITS: Mapping[str, Any] = {"max_evaluations": MAX_EVALUATIONS, "time_limit": TIME_LIMIT}

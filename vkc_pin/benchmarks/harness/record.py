@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 Record = Mapping[str, Any]
-"""What is kept of a trial, by field; see `trial`."""
+"""Fields of a trial's record; see `trial`."""
 Solve = Callable[[Scene, Mapping[str, Any]], Plan]
 """What plans a trial: takes its scene and its specification."""
 

@@ -103,9 +103,7 @@ def run(
         raise InputError("this is no folder", file=out, field="out") from None
     check_writable(out / _JOURNAL)
     about = describe_environment()
-    made = about.pop(
-        "commit"
-    )  # what the sources are says more than it about whether trials go together
+    made = about.pop("commit")  # the digest of the sources decides whether trials belong together
     about["versions"]["sources"] = _sources()
     described = json.dumps([todo[key] for key in sorted(todo)], sort_keys=True).encode()
     header = {
@@ -216,7 +214,7 @@ def _run(
                 (message,) = line["records"][0]["violations"]
                 detail = (
                     "" if message in told else f"\n{line['traceback']}"
-                )  # many trials may fail in the same way
+                )  # many trials may fail alike
                 tqdm.write(
                     f"{line['key']} failed with an error: {message}{detail}", file=sys.stderr
                 )

@@ -59,7 +59,7 @@ class Clock:
         self._wall, self._cpu = time.perf_counter(), time.process_time()
 
     @property
-    def spent(self) -> float:
+    def cpu_time(self) -> float:
         """CPU time since the beginning [s]."""
         return time.process_time() - self._cpu + self.elsewhere
 
@@ -69,7 +69,7 @@ class Clock:
         return time.perf_counter() - self._wall
 
     @property
-    def left(self) -> float:
+    def remaining(self) -> float:
         """Remaining wall time [s], at least 0."""
         return max(0.0, self.limit - self.wall)
 

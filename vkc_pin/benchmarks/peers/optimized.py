@@ -30,7 +30,7 @@ __all__ = ["plan_by_trajopt"]
 
 _ENDS = 10  # seeds at most
 _SHARE = 0.3  # of the time that is left, for one of them
-_MARGIN = 0.002  # [m] more than what is to be kept, as constraints hold to a tolerance
+_MARGIN = 0.002  # [m] added to margins, since constraints hold to a tolerance
 _PARAMETERS = {
     "max_iterations": 200,
     "initial_trust_box_size": 0.1,
@@ -57,7 +57,7 @@ def plan_by_trajopt(
     segments, found = problem.segments, PeerResult(status="not converged")
     lower, upper = compute_finite_limits(problem)
     goal = problem.pose_goals[0].row
-    asked = {
+    ask_worker = {
         n.replace(".", "_"): float(problem.lower[-1, k])
         for k, n in enumerate(problem.chain.names)
         if _goal(problem, k)
@@ -65,7 +65,7 @@ def plan_by_trajopt(
     with tempfile.TemporaryDirectory() as folder:
         files = describe(problem, Path(folder), inflated=True)
         for row in goals:
-            if clock.left <= 0.0:
+            if clock.remaining <= 0.0:
                 found.status = "timed out"
                 break
             ask = {
@@ -83,12 +83,12 @@ def plan_by_trajopt(
                 "weights": np.sqrt(problem.motion_cost.metric).tolist(),
                 "target": problem.targets[0].homogeneous.tolist(),
                 "at": [int(t) for t in goal.waypoints],
-                "goal": asked,
+                "goal": ask_worker,
                 "margin": _MARGIN,
                 "buffer": 0.02,
                 "longest": 0.1,
                 "contacts": 3,
-                "parameters": {**_PARAMETERS, "max_time": max(_SHARE * clock.left, 1.0)},
+                "parameters": {**_PARAMETERS, "max_time": max(_SHARE * clock.remaining, 1.0)},
             }
             answer = worker(ask)
             clock.elsewhere += answer["cpu"]
@@ -104,7 +104,7 @@ def plan_by_trajopt(
                 "found" if answer["status"] == "NLP_CONVERGED" else "not converged",
             )
             if accept(path):
-                found.first = clock.spent
+                found.first = clock.cpu_time
                 break
     return found
 
@@ -126,7 +126,7 @@ def _worker() -> Callable[[dict[str, Any]], dict[str, Any]]:
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     )
 
-    def heard() -> dict[str, Any]:
+    def read_answer() -> dict[str, Any]:
         assert process.stdout is not None
         while line := process.stdout.readline():
             if line.startswith("{"):
@@ -135,16 +135,16 @@ def _worker() -> Callable[[dict[str, Any]], dict[str, Any]]:
             "the process of trajopt has ended", field="method", got=f"exit code {process.wait()}"
         )
 
-    first = heard()
+    first = read_answer()
     if "error" in first:
         raise InputError(
             "trajopt cannot be run", expected='pip install "vkc-pin[peers]"', got=first["error"]
         )
 
-    def asked(ask: dict[str, Any]) -> dict[str, Any]:
+    def ask_worker(ask: dict[str, Any]) -> dict[str, Any]:
         assert process.stdin is not None
         process.stdin.write(json.dumps(ask) + "\n")
         process.stdin.flush()
-        return heard()
+        return read_answer()
 
-    return asked
+    return ask_worker

@@ -65,7 +65,7 @@ def plan_by_projection(  # noqa: PLR0915 - sets up one planner, step by step
     names = list(scene.getJointNames())
     start = core.JointConfiguration(names, there(find_exact_start(problem)))
     for row in goals:
-        if clock.left <= 0.0:
+        if clock.remaining <= 0.0:
             found.status = "timed out"
             break
         options = rrt.RRTOptions(
@@ -74,7 +74,7 @@ def plan_by_projection(  # noqa: PLR0915 - sets up one planner, step by step
             max_connection_distance=1.0,
             collision_check_step_size=_STEP,
             collision_check_use_bisection=True,
-            max_planning_time=max(0.1, _SHARE * clock.left),
+            max_planning_time=max(0.1, _SHARE * clock.remaining),
             rrt_connect=True,
         )
         options.constraint_projection.path_step_size = 0.1
@@ -88,7 +88,7 @@ def plan_by_projection(  # noqa: PLR0915 - sets up one planner, step by step
             continue
         finally:
             found.own += time.process_time() - began
-        found.first = clock.spent if found.first is None else found.first
+        found.first = clock.cpu_time if found.first is None else found.first
         if not held:
             began = time.process_time()
             shortcuts = core.PathShortcuttingOptions(

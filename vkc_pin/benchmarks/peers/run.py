@@ -98,7 +98,7 @@ def run(
         "tasks": names,
         "methods": chosen,
     }
-    settings |= {"time_limit": time_limit, "peers": _installed(chosen)}
+    settings |= {"time_limit": time_limit, "peers": _find_versions(chosen)}
     specs = [
         {
             "key": f"{task}/{number:04d}/{method}",
@@ -150,7 +150,7 @@ def _row(task: str, method: str, records: Sequence[Record]) -> list[str]:
     return [task, method, count(records), str(late), *times, *own, *lengths, *least]
 
 
-def _installed(methods: Sequence[str]) -> dict[str, str]:
+def _find_versions(methods: Sequence[str]) -> dict[str, str]:
     """Return the versions of the peers' packages."""
     found = {}
     for _, module, package in (PEERS[method] for method in methods if method in PEERS):
@@ -175,8 +175,8 @@ def _record(spec: dict[str, Any], *, folder: str) -> dict[str, Any]:
         share = (took["time_casadi"] + took["time_ipopt"]) / (
             took["planning_time"] + took["build_time"]
         )
-        found.own, found.first = share * clock.spent, clock.spent if plan_of.success else None
-    spent, wall = clock.spent, clock.wall
+        found.own, found.first = share * clock.cpu_time, clock.cpu_time if plan_of.success else None
+    spent, wall = clock.cpu_time, clock.wall
     if plan_of.status != "interrupted":
         Path(folder).mkdir(parents=True, exist_ok=True)
         plan_of.save(Path(folder) / f"{spec['key'].replace('/', '_')}.npz")
@@ -207,7 +207,7 @@ def _by_peer(own: PeerProblem, method: str, seed: int, clock: Clock) -> tuple[Pl
     if not judgements:
         accept(found.path)
     said = judgements[0]
-    late = not said.success and found.status == "timed out"  # what it has by then may be no motion
+    late = not said.success and found.status == "timed out"  # its path may not be a motion
     status = cast("PlanStatus", found.status)
     return dataclasses.replace(said, status=status) if late else said, found
 

@@ -27,7 +27,7 @@ _STEP = 0.05  # [rad] between configurations that are looked at
 _RANGE = 1.0  # [rad] that a tree grows at most at a time
 _TOLERANCE = 1e-5  # of the manifold, [m] and [rad]
 _SIMPLIFYING = 10.0  # [s] at most
-_TURN = 2.0 * np.pi  # [rad] that a joint without limits may turn either way from the start
+_TURN = 2.0 * np.pi  # [rad] range of a joint without limits, on both sides of the start
 
 
 def compute_finite_limits(problem: TrajectoryProblem) -> tuple[Floats, Floats]:
@@ -106,7 +106,7 @@ def plan_by_sampling(  # noqa: C901, PLR0915 - sets up one planner, step by step
         motions = Motions(information)
         information.setMotionValidator(motions)
 
-    def state_of(z: Floats) -> Any:
+    def make_state(z: Floats) -> Any:
         state = information.allocState()
         scaled = [float(value) for value in z * scale]
         if held:
@@ -118,7 +118,7 @@ def plan_by_sampling(  # noqa: C901, PLR0915 - sets up one planner, step by step
 
     if held:
         information.setup()
-    start, states = state_of(find_exact_start(problem)), [state_of(row) for row in goals]
+    start, states = make_state(find_exact_start(problem)), [make_state(row) for row in goals]
     if held:
         for state in (start, *states):
             used.anchorChart(state)
@@ -133,12 +133,12 @@ def plan_by_sampling(  # noqa: C901, PLR0915 - sets up one planner, step by step
     setup.setPlanner(planner)
     setup.setup()
     began = time.process_time()
-    setup.solve(float(max(clock.left - _SIMPLIFYING, 1.0)))
+    setup.solve(float(max(clock.remaining - _SIMPLIFYING, 1.0)))
     found = PeerResult(own=time.process_time() - began, status="timed out")
     if not setup.haveExactSolutionPath():
         return found
     path = setup.getSolutionPath()
-    found.first = clock.spent
+    found.first = clock.cpu_time
     simplifier = og.PathSimplifier(information)
     began = time.process_time()
     simplifier.simplify(path, _SIMPLIFYING)

@@ -38,7 +38,7 @@ TASKS: Mapping[str, str] = {
     "door": "push a door by 1.2 rad whose lever is held",
     "drawer": "pull a drawer out by 0.3 m whose handle is held",
 }
-"""What is done: name → in words."""
+"""Task → description."""
 _HELD: Mapping[str, tuple[str, float, Mapping[str, float]]] = {
     "door": ("hinge", 1.2, {"knob": 0.55}),
     "drawer": ("slide", 0.3, {}),

@@ -46,7 +46,7 @@ PAIRED = {
     "arm_path_length": "arm",
     "objective": "objective",
 }
-"""What is compared with the unchanged planner, problem by problem: field → name."""
+"""Fields compared with the unchanged planner per problem → names."""
 SUMMARY = (
     *("success", "first guess", "time, median [s]", "mean [s]", "95th percentile [s]"),
     *("CPU, median [s]", "mean [s]", "95th percentile [s]", "rounds", "iterations"),

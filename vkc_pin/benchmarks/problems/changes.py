@@ -52,7 +52,7 @@ class Change:
         )
 
     @contextlib.contextmanager
-    def applied(self) -> Iterator[None]:
+    def apply(self) -> Iterator[None]:
         """Change the constant meanwhile, wherever it is imported by name.
 
         Values derived from it at import stay. Plan with a new `Planner`: caches hold the old value.
@@ -89,7 +89,7 @@ def parse_change(text: str) -> Change:
         known = [item.name for item in dataclasses.fields(Options)]
         if change.name not in known:
             raise UnknownNameError("field of Options", change.name, known, field="change")
-        _ = change.options  # says what is wrong with the value
+        _ = change.options  # raises an error for invalid values
         return change
     module, _, name = (part.strip() for part in place.partition(":"))
     if not name:

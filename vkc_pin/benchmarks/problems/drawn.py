@@ -1,6 +1,6 @@
 """Samples random problems: rooms or crowded scenes, random starts, one or two steps.
 
-Some of them are infeasible; what a plan claims must be right in either case.
+Some of them are infeasible; claims of plans must be right in either case.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ __all__ = ["sample_problem"]
 _TRIES = 50  # rooms or obstacles in which something finds no place
 _OBSTACLES = 6  # at most
 _SECOND = 0.3  # share of problems of two steps
-_AIR = 1e-3  # [m] below what is put down
+_AIR = 1e-3  # [m] below placed objects
 
 
 def sample_problem(seed: int, number: int) -> Problem:
@@ -45,7 +45,9 @@ def sample_problem(seed: int, number: int) -> Problem:
     for _ in range(_TRIES):
         try:
             scene = (
-                _room(rng) if number % 2 == 0 else _crowded(names[number // 2 % len(names)], rng)
+                _room(rng)
+                if number % 2 == 0
+                else _make_crowded_scene(names[number // 2 % len(names)], rng)
             )
         except InputError:  # no place for something
             continue
@@ -69,7 +71,7 @@ def _room(rng: np.random.Generator) -> Scene:
     return random_room(int(rng.integers(2**31)), clutter=clutter, objects=objects, carried=carried)
 
 
-def _crowded(name: str, rng: np.random.Generator) -> Scene:
+def _make_crowded_scene(name: str, rng: np.random.Generator) -> Scene:
     """Return a scene with up to six more obstacles, from a random start."""
     scene = load_scene(name)
     more = [_obstacle(scene, k, rng) for k in range(int(rng.integers(0, _OBSTACLES + 1)))]
@@ -107,7 +109,7 @@ def _steps(scene: Scene, rng: np.random.Generator) -> tuple[Step, ...]:
     """Return one or two steps that can be compiled together."""
     while True:
         steps = tuple(_step(scene, rng) for _ in range(1 + (rng.random() < _SECOND)))
-        with contextlib.suppress(InputError):  # such as two things for one hand
+        with contextlib.suppress(InputError):  # such as two objects for one hand
             compile_task(scene, steps, Options())
             return steps
 

@@ -218,14 +218,14 @@ def _low_beam(rng: np.random.Generator) -> _Problem:
     ), (_beyond(rng),)
 
 
-def _taken(rng: np.random.Generator) -> _Problem:
+def _make_occupied_place(rng: np.random.Generator) -> _Problem:
     x, y = (float(value) for value in rng.uniform((1.5, -2.0), (4.0, 2.0)))
     return _hall(_box("crate", (0.6, 0.6, 0.5), (x, y))), (
         GoTo(x + float(rng.uniform(-0.2, 0.2)), y),
     )
 
 
-def _turned(rng: np.random.Generator) -> _Problem:
+def _make_blocked_heading(rng: np.random.Generator) -> _Problem:
     """Return a goal where the base fits, but not at the requested heading."""
     x, y = (float(value) for value in rng.uniform((2.0, -2.0), (4.0, 2.0)))
     walls = [
@@ -251,7 +251,7 @@ def _outside(rng: np.random.Generator) -> _Problem:
     )
 
 
-def _boxed(rng: np.random.Generator) -> _Problem:
+def _make_blocked_drawer(rng: np.random.Generator) -> _Problem:
     """Return a drawer behind a board."""
     scene = load_scene("drawer")
     return _with(scene, _box("board", (0.04, 1.0, 1.2), (float(rng.uniform(1.46, 1.5)), 0.0))), (
@@ -276,7 +276,7 @@ def _cup(rng: np.random.Generator) -> tuple[Scene, Any]:
     return layout.make_scene(), layout.find_part("table_2")
 
 
-def _covered(rng: np.random.Generator) -> _Problem:
+def _make_covered_cup(rng: np.random.Generator) -> _Problem:
     """Return a cup under a lid."""
     scene, _ = _cup(rng)
     x, y, z = scene.objects["cup"].placement.translation.tolist()
@@ -294,7 +294,7 @@ def _sides(x: float, y: float, z: float) -> list[dict[str, Any]]:
     ]
 
 
-def _occupied(rng: np.random.Generator) -> _Problem:
+def _make_occupied_goal(rng: np.random.Generator) -> _Problem:
     """Return a cup whose goal is occupied."""
     scene, table = _cup(rng)
     x, y = table.frame.transform_point(float(rng.uniform(-0.15, 0.0)), 0.0)
@@ -315,15 +315,15 @@ KINDS: Mapping[str, Callable[[np.random.Generator], _Problem]] = {
     "gap too narrow": _narrow,
     "bend too tight": _bend,
     "beam too low": _low_beam,
-    "place taken": _taken,
-    "no room for the heading": _turned,
+    "place taken": _make_occupied_place,
+    "no room for the heading": _make_blocked_heading,
     "pose inside a block": _inside,
     "pose too high": _high,
     "pose outside the arena": _outside,
-    "drawer boxed in": _boxed,
+    "drawer boxed in": _make_blocked_drawer,
     "joint beyond its limit": _beyond_limits,
     "door shut between": _shut,
-    "cup covered": _covered,
-    "cup to an occupied spot": _occupied,
+    "cup covered": _make_covered_cup,
+    "cup to an occupied spot": _make_occupied_goal,
 }
 """Kinds of problems, and what draws one."""

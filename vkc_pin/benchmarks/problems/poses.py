@@ -42,7 +42,7 @@ def sample_pose_over(
             *table.frame.transform_point(-depth / 2.0 - ahead, side),
             rng.uniform(-np.pi, np.pi),
         )
-        at, z = _drawn(scene, base, rng)
+        at, z = _sample_pose(scene, base, rng)
         x, y, up = own.act(at.translation)
         over = (
             -depth / 2.0 < x < min(-depth / 2.0 + 0.5, depth / 2.0)
@@ -74,7 +74,7 @@ def sample_pose_among(layout: Layout, scene: Scene, rng: np.random.Generator) ->
         apart = np.hypot(x - layout.start[0], y - layout.start[1]) >= FAR
         if not apart or not layout.floor.find_free(standing, layout.radius, [[x, y]])[0]:
             continue
-        at, z = _drawn(scene, (x, y, yaw), rng)
+        at, z = _sample_pose(scene, (x, y, yaw), rng)
         free = 0.2 < at.translation[2] < 1.4 and _free(scene, z, NEAR)
         if free and layout.floor.is_connected(standing, layout.radius, [layout.start[:2], (x, y)]):
             return at
@@ -100,7 +100,7 @@ def sample_random_start(scene: Scene, rng: np.random.Generator) -> Scene:
             expected="x and y intervals",
         )
     for x, y, yaw in itertools.islice(scene.start_region.sample_poses(rng), _TRIES):
-        _, z = _drawn(scene, (x, y, yaw), rng)
+        _, z = _sample_pose(scene, (x, y, yaw), rng)
         if _free(scene, z):
             return scene.with_start(base=z[:3], arm=z[3:])
     problem = f"no free configuration of the robot in {_TRIES} tries"
@@ -112,7 +112,7 @@ def sample_random_start(scene: Scene, rng: np.random.Generator) -> Scene:
     )
 
 
-def _drawn(
+def _sample_pose(
     scene: Scene, base: tuple[float, float, float], rng: np.random.Generator
 ) -> tuple[pin.SE3, Floats]:
     """Return tool placement and configuration, shape (n,), with a random arm posture."""

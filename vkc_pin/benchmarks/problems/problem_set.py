@@ -70,7 +70,7 @@ class Problem:
 
     Attributes:
         number: Number, from 0.
-        name: Room or task, and what is to be done.
+        name: Room or task, and goal.
         kind: One of `KINDS`, or a task.
         scene: Initial scene.
         steps: Steps to plan.

@@ -32,7 +32,7 @@ FIELDS = {
     "base_path_length": "base path length",
     "arm_path_length": "arm path length",
 }
-"""What is compared: field → name."""
+"""Compared fields → names."""
 WITHIN = 0.1  # of the least: what counts as the same
 
 

@@ -34,7 +34,7 @@ def run_trial(
 
     planner = _planner(change)
     with (
-        change.applied()
+        change.apply()
     ):  # before the clock starts: looking for where a constant is imported takes a while
         wall, cpu = time.perf_counter(), time.process_time()
         found = plan(
@@ -98,7 +98,7 @@ def _planner(change: Change) -> Planner:
 
 @functools.cache
 def _warm() -> None:
-    """Plan once in this process, which pays for what is loaded only once."""
+    """Plan once in this process, which includes loading."""
     scene = load_scene("drawer")
     if plan(scene, [Reach(scene.tool_placement())], planner=Planner()).status == "interrupted":
         raise KeyboardInterrupt

@@ -44,7 +44,7 @@ class Request:
     link: str | None = None
 
     @property
-    def imported(self) -> bool:
+    def is_imported(self) -> bool:
         """Whether it is a file to import."""
         return self.path.lower().endswith(_FILES)
 
@@ -107,7 +107,7 @@ def prepare_object(one: Request, folder: Path) -> str:
     Raises:
         InputError: There is no such object, it cannot be imported, or its name is no file name.
     """
-    if not one.imported:
+    if not one.is_imported:
         if one.link is not None:
             raise InputError(
                 "only a link of a file can be imported",
@@ -121,7 +121,7 @@ def prepare_object(one: Request, folder: Path) -> str:
     made = folder / name / f"{name}.yaml"
     if not made.is_file():
         with write_folder_atomically(made.parent, force=True) as staging, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what is left out, its report would say
+            warnings.simplefilter("ignore")  # the report lists omissions
             imported = import_object(one.path, staging / "as_it_was", link=one.link)
             _face(imported)
             for file in (staging / "as_it_was").iterdir():

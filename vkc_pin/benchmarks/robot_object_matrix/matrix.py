@@ -61,8 +61,8 @@ def report(result: Mapping[str, Any]) -> str:
         "## Every combination",
         "How many starts succeed; – is out of reach, ! could not be tried.",
         format_table(["object", *robots], rows),
-        *_listed("What failed", [r for r in records if not r["success"] and _reached(r)]),
-        *_listed("What is out of reach", [r for r in records if not _reached(r)]),
+        *_list_failures("What failed", [r for r in records if not r["success"] and _is_reached(r)]),
+        *_list_failures("Out of reach", [r for r in records if not _is_reached(r)]),
     )
 
 
@@ -82,7 +82,7 @@ def chart(records: Sequence[Record], path: str | Path | None) -> Figure:
         for i, name in enumerate(objects):
             for j, robot in enumerate(robots):
                 own = groups.get((robot, name), ())
-                if any(map(_reached, own)):
+                if any(map(_is_reached, own)):
                     share[i, j] = 100.0 * float(np.mean([bool(r["success"]) for r in own]))
                 axes.text(j, i, _cell(own), ha="center", va="center", fontsize=7.5)
         axes.set_facecolor("0.85")
@@ -103,7 +103,7 @@ def _groups(records: Sequence[Record]) -> dict[tuple[str, str], list[Record]]:
     return groups
 
 
-def _reached(record: Record) -> bool:
+def _is_reached(record: Record) -> bool:
     return record["status"] not in _UNREACHED
 
 
@@ -111,13 +111,13 @@ def _cell(own: Sequence[Record]) -> str:
     if any(record["status"] == "error" for record in own):
         return "!"
     good = sum(bool(record["success"]) for record in own)
-    return f"{good}/{len(own)}" if own and all(map(_reached, own)) else "–"
+    return f"{good}/{len(own)}" if own and all(map(_is_reached, own)) else "–"
 
 
 def _summary(robot: str, groups: Mapping[tuple[str, str], Sequence[Record]]) -> list[str]:
     """Return the row of a robot, or of all."""
     chosen = [own for key, own in groups.items() if robot in (key[0], _ALL)]
-    reached = [own for own in chosen if all(map(_reached, own))]
+    reached = [own for own in chosen if all(map(_is_reached, own))]
     flat = [record for own in chosen for record in own]
     cells = [robot, str(len(chosen)), str(len(reached))]
     for judge in (all, any):
@@ -127,7 +127,7 @@ def _summary(robot: str, groups: Mapping[tuple[str, str], Sequence[Record]]) -> 
     return [*cells, *times, *format_medians(flat, "load_time")]
 
 
-def _listed(title: str, records: Sequence[Record]) -> list[str]:
+def _list_failures(title: str, records: Sequence[Record]) -> list[str]:
     """Return a section of failures with their reasons and counts."""
     rows = Counter[tuple[str, ...]]()
     for r in records:

@@ -73,7 +73,7 @@ OBJECTS = (
 SHARE = 0.5
 """Of a joint's range by which it is opened: the middle of what `random_task` draws."""
 
-_IT = "it"  # what the object is called in its hall
+_IT = "it"  # name of the object in its hall
 _SIZE, _HEIGHT = 8.0, 2.4  # inner length of the walls, and their height [m]
 _FRONT = 3.0  # depth of the floor before the object that stays free [m]
 _BEYOND = 2.0  # of floor beyond a wall with a door [m]
@@ -84,13 +84,13 @@ _START: Mapping[str, Any] = {
 _LOW, _COUNTER = (
     0.6,
     0.8,
-)  # [m]: what is lower than the one and nobody says where it stands, stands on a counter so high
+)  # [m]: objects below the one stand on a counter of the other height
 _DEPTH, _BESIDE, _MARGIN, _AIR = (
     0.5,
     0.2,
     0.03,
     0.001,
-)  # [m] of it: its depth, beside, before and behind what stands there, below
+)  # [m] of the counter: depth, margins beside, before and behind the object, height
 _OF_KIND = re.compile(r"(?P<kind>[a-z]+)_(?P<seed>\d+)")
 _SAME = 1e-6  # [rad] or [m]
 
@@ -135,7 +135,7 @@ def load_description(name: str) -> dict[str, Any]:
     data = read_yaml(file).data
     if not isinstance(data, dict) or not isinstance(data.get("urdf"), str):
         raise InputError(
-            "not an object", file=file, field="urdf", expected="the path of a URDF, or what it says"
+            "not an object", file=file, field="urdf", expected="the path or text of a URDF"
         )
     plain = data["urdf"].lstrip().startswith("<")
     return data if plain else {**data, "urdf": str((file.parent / data["urdf"]).resolve())}
@@ -182,12 +182,12 @@ def make_pair(robot: Robot, called: str, name: str, *, seed: int = 0) -> Pair:
     proposals = propose_attachments(load_object(description), robot)
     taken = [proposal.description() for proposal in proposals.found]
     scene = make_hall(called, name, {**description, "attachments": taken})
-    asked = _asked(scene, proposals)
+    asked = _find_opening_steps(scene, proposals)
     if not asked:
         return Pair(scene, None, _why_not(proposals))
     cache, said = Cache(), list[str]()
     for step in asked:
-        blocked = _blocked(scene, step, seed, cache)
+        blocked = _explain_blocked(scene, step, seed, cache)
         if blocked is not None:
             said.append(f"{step.attachment}: {blocked}")
             continue
@@ -205,7 +205,7 @@ def make_pair(robot: Robot, called: str, name: str, *, seed: int = 0) -> Pair:
     return Pair(scene, None, "; ".join(said))
 
 
-def _blocked(scene: Scene, step: Actuate, seed: int, cache: Cache) -> str | None:
+def _explain_blocked(scene: Scene, step: Actuate, seed: int, cache: Cache) -> str | None:
     """Return why no free configuration exists at the end of a phase; None if there is one."""
     options = Options()
     problem = TrajectoryProblem(
@@ -214,7 +214,7 @@ def _blocked(scene: Scene, step: Actuate, seed: int, cache: Cache) -> str | None
     return next((goal.text for goal in diagnose_goals(problem, seed)), None)
 
 
-def _asked(scene: Scene, proposals: Proposals) -> list[Actuate]:
+def _find_opening_steps(scene: Scene, proposals: Proposals) -> list[Actuate]:
     """Return the steps that open a joint on the base, best attachment first."""
     placed = scene.objects[_IT]
     goal = {

@@ -90,9 +90,7 @@ def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
         "kind": get_kind(spec["object"]),
     }
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore"
-        )  # what is said of a robot would be said again of every object
+        warnings.simplefilter("ignore")  # warnings about a robot would repeat for every object
         began = time.perf_counter()
         robot = load_robot(file)
         about["load_time"] = time.perf_counter() - began

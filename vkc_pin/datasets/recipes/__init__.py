@@ -1,1 +1,1 @@
-"""What a dataset is to be: recipes, and the constraints that they name."""
+"""Describes datasets by recipes and named constraints."""

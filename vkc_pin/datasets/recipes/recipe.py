@@ -179,7 +179,7 @@ class Recipe:
     """A recipe that was read and checked.
 
     Attributes:
-        fields: What it says, with defaults where it says nothing.
+        fields: Its fields, with defaults.
         options: How to plan.
     """
 

@@ -209,7 +209,7 @@ class _Room:
         return False
 
     def _does_fit(self, part: Part) -> bool:
-        """Return whether a part is clear of the others, and leaves free what must be free."""
+        """Return whether a part is clear of the others, and keeps the required floor free."""
         own, gap = part.footprint, self.settings.gap
         if (part.side is None and not self.floor.contains(own)) or (
             part.clear_floor and not self.floor.contains(part.clear_floor)

@@ -92,7 +92,7 @@ _KINDS = (
     "robot – objects",
     "robot – obstacles",
     "objects – surroundings",
-    "gripper – what it grasps",
+    "gripper – grasped object",
 )
 
 

@@ -239,7 +239,7 @@ def gap_picture(through: vkc.Plan) -> None:
 
 
 def tray_picture() -> None:
-    """Write a picture of a tray on its way."""
+    """Write a picture of a carried tray."""
     look(*TRAY)
     picture(
         vkc.plan(vkc.load_scene("tray"), [vkc.Place("tray", [-0.3, -1.96, 0.7])]),
@@ -349,7 +349,7 @@ def torque_picture() -> None:
             for edge in (-100.0, 100.0):
                 axes.axhline(edge, color="0.3", linestyle="--", linewidth=1.0)
             axes.set(title=f"a door {title}", xlabel="time [s]", ylim=(-112.0, 112.0))
-        panels[0].set_ylabel("torque [% of what the motor has]")
+        panels[0].set_ylabel("torque [% of the limit]")
         panels[0].legend(fontsize=7, ncols=2, loc="upper left", bbox_to_anchor=(0.0, 0.9))
         save_figure(figure, IMAGES / "torques.png")
 

@@ -1,7 +1,7 @@
 """Draws docs/images/tradeoff.png from docs/results/tradeoff.json: `python docs/make_tradeoff.py`.
 
 That is the record of `vkc-pin bench ablation` with other weights of the base. A point is the mean
-way of base and arm over the problems that succeed at every weight.
+path lengths of base and arm over the problems that succeed at every weight.
 """
 
 from __future__ import annotations
@@ -64,9 +64,9 @@ def main() -> None:
                 fontsize=8,
             )
         axes.margins(x=0.25)
-        axes.set_xlabel("way of the base, mean [m]")
-        axes.set_ylabel("way of the arm, mean [rad]")
-        axes.set_title(f"What a metre of the base is worth, {drawn[0][3]} problems", fontsize=10)
+        axes.set_xlabel("base path, mean [m]")
+        axes.set_ylabel("arm path, mean [rad]")
+        axes.set_title(f"Weight of a metre of the base, {drawn[0][3]} problems", fontsize=10)
         save_figure(figure, DOCS / "images" / "tradeoff.png")
     for row in drawn:
         sys.stdout.write("| {:g} | {:.3f} | {:.3f} | {} |\n".format(*row))

@@ -124,9 +124,9 @@ def test_progress_must_be_a_bool(value: Any) -> None:
 def test_real_terminal(tmp_path: Path) -> None:
     code = """
 import sys; sys.path.insert(0, "tests")
-from helpers.drives import hall
+from helpers.drives import make_hall
 import vkc_pin as vkc
-vkc.plan(hall(), [vkc.GoTo(-1.0, 0.5)], progress=True)
+vkc.plan(make_hall(), [vkc.GoTo(-1.0, 0.5)], progress=True)
 """
     ours, theirs = pty.openpty()
     done = subprocess.run(

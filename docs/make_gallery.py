@@ -47,14 +47,14 @@ SUN = np.array([-0.35, -0.45, 0.82]) / np.linalg.norm([-0.35, -0.45, 0.82])
 FLOOR, SKY, SHADOW = np.array([0.90, 0.89, 0.87]), np.array([0.97, 0.97, 0.98]), 0.82
 
 
-def opened(robot: str, file: str, thing: str, folder: Path) -> vkc.Plan:
+def plan_opening(robot: str, file: str, object_name: str, folder: Path) -> vkc.Plan:
     """Return the plan of a robot opening an object, from the first random start that succeeds."""
-    kept = folder / "plans" / f"{robot}_{thing}.npz"
+    kept = folder / "plans" / f"{robot}_{object_name}.npz"
     if kept.is_file():
         return vkc.Plan.load(kept)
-    found = make_pair(vkc.load_robot(file), file, thing)
+    found = make_pair(vkc.load_robot(file), file, object_name)
     if found.scene is None or found.step is None:
-        raise SystemExit(f"{robot} opens no {thing}: {found.because}")
+        raise SystemExit(f"{robot} opens no {object_name}: {found.because}")
     for number in range(STARTS):
         plan = vkc.plan(
             found.scene.sample_start(np.random.default_rng([7, 0, number])), [found.step], **LIMITS
@@ -63,7 +63,7 @@ def opened(robot: str, file: str, thing: str, folder: Path) -> vkc.Plan:
             kept.parent.mkdir(parents=True, exist_ok=True)
             plan.save(kept)
             return plan
-    raise SystemExit(f"{robot} opens no {thing}: {plan.summary()}")
+    raise SystemExit(f"{robot} opens no {object_name}: {plan.summary()}")
 
 
 def triangles_of(scene: vkc.Scene) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -139,7 +139,7 @@ def dotted(
         yield np.repeat(own, len(u)), points.reshape(-1, 3)
 
 
-def drawn(scene: vkc.Scene) -> Image.Image:
+def draw_scene(scene: vkc.Scene) -> Image.Image:
     """Return the picture of a scene, seen from beside the robot and what it holds."""
     tool, base = scene.tool_placement().translation, scene.start[:2]
     target = np.array([*(0.5 * (tool[:2] + base)), 0.72])
@@ -196,9 +196,9 @@ def main() -> int:
             len(ROBOTS), len(OBJECTS), gridspec_kw={"wspace": 0.02, "hspace": 0.02}
         )
         for row, (robot, file) in enumerate(ready.items()):
-            for column, (thing, name) in enumerate(OBJECTS.items()):
+            for column, (object_name, name) in enumerate(OBJECTS.items()):
                 axis = axes[row, column]
-                axis.imshow(drawn(opened(robot, file, thing, folder).end_scene()))
+                axis.imshow(draw_scene(plan_opening(robot, file, object_name, folder).end_scene()))
                 axis.set(xticks=[], yticks=[])
                 axis.set_title(name if row == 0 else "", fontsize=10)
                 axis.set_ylabel(ROBOTS[robot] if column == 0 else "", fontsize=10)

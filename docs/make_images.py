@@ -140,15 +140,15 @@ def furniture_picture() -> None:
     with use_style():
         figure = new_figure(12.0, 5.6)
         for place, (kind, seed) in enumerate(FURNITURE.items(), start=1):
-            thing = vkc.load_object(vkc.procedural.random_object(kind, seed))
+            item = vkc.load_object(vkc.procedural.random_object(kind, seed))
             state = np.array(
                 [
                     0.0 if name == "knob" else 0.5 * high
-                    for name, high in zip(thing.coordinates.names, thing.upper, strict=True)
+                    for name, high in zip(item.coordinates.names, item.upper, strict=True)
                 ]
             )
             shapes = make_world_shapes(
-                vkc.PlacedObject(kind, thing, pin.SE3.Identity(), state), visual=True
+                vkc.PlacedObject(kind, item, pin.SE3.Identity(), state), visual=True
             )
             faces, colours = list[np.ndarray](), list[np.ndarray]()
             for shape in shapes:

@@ -4,7 +4,7 @@ Usage: python docs/make_tables.py
 
 Sections between `<!-- figures: NAME -->` and `<!-- /figures: NAME -->` belong to
 docs/results/NAME.json. Each table is replaced by the table with the same columns in the
-experiment's report, and each line with a beginning in `LINES` by the report's line. Lines with
+experiment's results, and each line with a beginning in `LINES` by the line there. Lines with
 versions and machine also name the commit of the trials.
 
 Figures between `<!-- figure: NAME WHAT FIELD=VALUE ... -->` and `<!-- / -->` are computed from the
@@ -305,7 +305,7 @@ def figure(asked: str, before: str) -> str:
     return value if isinstance(value, str) else f"{value:.{len(before.partition('.')[2])}f}"
 
 
-def make_report(name: str) -> str:
+def format_record(name: str) -> str:
     """Return the tables of a record, as its experiment reports them."""
     own: dict[str, Callable[[], str]] = {
         "status": status,
@@ -315,13 +315,13 @@ def make_report(name: str) -> str:
     }
     if name in own:
         return own[name]() + "\n"
-    whose = next(entry["report"] for entry in RECORDS if entry["record"] == name)
+    whose = next(entry["module"] for entry in RECORDS if entry["record"] == name)
     if whose.startswith("tests."):
         sys.path.insert(0, str(ROOT))
     module = importlib.import_module(
         whose if whose.startswith("tests.") else f"vkc_pin.benchmarks.{whose}"
     )
-    text: str = module.report(result(name))
+    text: str = module.format_results(result(name))
     return text
 
 
@@ -332,9 +332,9 @@ def columns(table: str) -> str:
 
 def update_section(name: str, section: str) -> str:
     """Return a section of a page with the tables of a record."""
-    report = make_report(name)
+    text = format_record(name)
     tables: dict[str, list[str]] = {}
-    for table in TABLE.findall(report):
+    for table in TABLE.findall(text):
         tables.setdefault(columns(table), []).append(table)
 
     def replace_table(match: re.Match[str]) -> str:
@@ -346,7 +346,7 @@ def update_section(name: str, section: str) -> str:
     section = TABLE.sub(replace_table, section)
     for beginning in LINES:
         line = re.compile(rf"^{beginning}.*$", re.MULTILINE)
-        own = line.search(report)
+        own = line.search(text)
         if own is not None:
             said = own[0] + (
                 f" Commit {commits(load_trials(name))}." if beginning == "Measured on" else ""

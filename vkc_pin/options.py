@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, get_args
 
 from vkc_pin.errors import InputError, format_value
 from vkc_pin.utils.arguments import check_integer, check_number
 
 __all__ = ["Options"]
 
-OBJECTIVES = ("path_length", "control_effort")
+Objective = Literal["path_length", "control_effort"]
+OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
 _MIN, _MAX = 1e-9, 1e9
 _RANGES = {
     "dt": (1e-3, 60.0),
@@ -66,7 +67,7 @@ class Options:
     dist_safe: float = 0.02
     self_distance: float = 0.02
     grasp_clearance: float = 0.005
-    objective: Literal["path_length", "control_effort"] = "path_length"
+    objective: Objective = "path_length"
     velocity_weight_base: float = 1.0
     velocity_weight_heading: float = 0.025
     velocity_weight_arm: float = 0.025

@@ -58,7 +58,7 @@ def generate(app: Sphinx) -> None:
     api_pages.write()
 
 
-def outdated(
+def find_outdated(
     app: Sphinx, env: BuildEnvironment, added: set[str], changed: set[str], removed: set[str]
 ) -> list[str]:
     """Return the notebooks executed since they were read: the repository has no outputs."""
@@ -86,7 +86,9 @@ def films(app: Sphinx, problem: Exception | None) -> None:
     (Path(app.outdir) / "index.html").write_text(REDIRECT.format(f"{START}.html"), encoding="utf-8")
 
 
-def plain(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+def escape_docstring(
+    app: Sphinx, what: str, name: str, member: Any, options: Any, lines: list[str]
+) -> None:
     """Convert a docstring to reStructuredText: outside of `code`, * and | are plain characters."""
     for number, line in enumerate(lines):
         parts = re.split(r"(``[^`]*``|(?::[\w:]+:)?`[^`]*`)", line)
@@ -96,16 +98,18 @@ def plain(app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: li
         lines[number] = "".join(parts)
 
 
-def whole(app: Sphinx, thing: Any, bound: bool) -> None:
+def reset_signature(app: Sphinx, function: Any, bound: bool) -> None:
     """Restore the first parameter, which `autodoc_preserve_defaults` removes from bound methods."""
-    if inspect.ismethod(thing):
-        vars(thing.__func__).pop("__signature__", None)
+    if inspect.ismethod(function):
+        vars(function.__func__).pop("__signature__", None)
 
 
-def skip(app: Sphinx, what: str, name: str, thing: Any, skipped: bool, options: Any) -> bool | None:
+def skip_public(
+    app: Sphinx, what: str, name: str, member: Any, skipped: bool, options: Any
+) -> bool | None:
     """Leave out public names of the package and its subpackages, which have their own pages."""
     public = what == "module" and any(
-        name in owner.__all__ and getattr(owner, name) is thing
+        name in owner.__all__ and getattr(owner, name) is member
         for owner in (vkc, vkc.datasets, vkc.importing, vkc.procedural)
     )
     return True if public else None
@@ -144,10 +148,10 @@ def setup(app: Sphinx) -> dict[str, Any]:
     os.environ.setdefault("MPLBACKEND", "agg")
     app.connect("builder-inited", generate)
     app.connect("source-read", read)
-    app.connect("env-get-outdated", outdated)
+    app.connect("env-get-outdated", find_outdated)
     app.connect("build-finished", films)
-    app.connect("autodoc-process-docstring", plain, priority=400)
-    app.connect("autodoc-before-process-signature", whole, priority=900)
-    app.connect("autodoc-skip-member", skip)
+    app.connect("autodoc-process-docstring", escape_docstring, priority=400)
+    app.connect("autodoc-before-process-signature", reset_signature, priority=900)
+    app.connect("autodoc-skip-member", skip_public)
     app.connect("missing-reference", resolve)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

@@ -17,7 +17,7 @@ import vkc_pin as vkc
 from vkc_pin.benchmarks import baselines
 from vkc_pin.benchmarks.baselines import COMPARED_PLANNERS
 from vkc_pin.benchmarks.comparison import choose_shown_trial
-from vkc_pin.benchmarks.comparison_report import report
+from vkc_pin.benchmarks.comparison_tables import format_results
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.planning.statistics import PlanningStatistics
 from vkc_pin.validation.report import Report
@@ -158,7 +158,9 @@ def test_tables_against_numbers_by_hand(out: Path) -> None:
 def test_errors_have_no_times_and_no_path_lengths(result: dict[str, Any]) -> None:
     error = {"success": False, "status": "error", "violations": ["ValueError: no"]}
     odd = {"key": "door/0003/B1", "scene": "door", "method": "B1", "number": 3, **error}
-    text = report({**result, "trials": [*result["trials"], odd]}, {"door": "open it"}, title="Odd")
+    text = format_results(
+        {**result, "trials": [*result["trials"], odd]}, {"door": "open it"}, title="Odd"
+    )
     assert text.startswith("# Odd\n\n`door`: open it. 3 random starts")
     assert "| door | B1 | 1 of 4 | 25 |" in text
     assert "error 1" in text

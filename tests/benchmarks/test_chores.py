@@ -109,7 +109,7 @@ def test_table_of_seeds_counts_successes_and_steps() -> None:
     trials += [record(5, "VKC", 10), record(5, "step by step", 10), record(6, "step by step", 10)]
     about = {"chores": ["fetch"], "steps": {"fetch": 10 * ["x"]}, "starts": 1, "seed": 4}
     about |= {"seeds": 3, "window": 2, "methods": ["VKC", "step by step"]}
-    text = chores.report({"meta": {**describe_environment(), **about}, "trials": trials})
+    text = chores.format_results({"meta": {**describe_environment(), **about}, "trials": trials})
     assert "| fetch | 0 | in one call | 1 of 2 | all |" in text
     assert "| fetch | 0 | step by step | 2 of 3 | 1, all, all |" in text
     assert "| 8.0–9.0 | 12 | 6 |" in text, "(9 - 8) / 8 and (9 - 8) / (9 + 8)"

@@ -83,7 +83,7 @@ def test_starts_are_shared_by_methods_and_selections(
 
 def test_tables_against_numbers_by_hand(out: Path, result: dict[str, Any]) -> None:
     text = (out / "table.md").read_text(encoding="utf-8")
-    assert text == initialization.report(result)
+    assert text == initialization.format_results(result)
     blocks = [block for block in text.split("\n\n") if block.startswith("|")]
     methods, compared = (parse_cells(block.replace("\\|", "/"))[1:] for block in blocks)
     # Starts 0, 1, 2, each twice: "stationary" takes 1, 1, 2, 2, 3, 3 s.

@@ -78,7 +78,9 @@ def test_errors_have_no_planning_time() -> None:
     about = {"of": "obstacles", "counts": [12], "starts": 1, "seed": 0}
     machine = {"system": "x", "machine": "x", "processor": "x", "cores": 2, "python": "3"}
     error = {"obstacles": 12, "number": 0, "success": False, "status": "error"}
-    text = scale.report({"meta": {**about, "machine": machine, "versions": {}}, "trials": [error]})
+    text = scale.format_results(
+        {"meta": {**about, "machine": machine, "versions": {}}, "trials": [error]}
+    )
     assert f"| 12 | 0 of 1 |{' – |' * 9}" in text
 
 

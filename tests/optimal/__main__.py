@@ -47,7 +47,7 @@ def format_table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def report(result: Mapping[str, Any]) -> str:
+def format_results(result: Mapping[str, Any]) -> str:
     """Return the table of a record in Markdown, with versions and machine at the foot."""
     return format_table(result["trials"]) + "\n" + describe_run(result["meta"]) + "\n"
 

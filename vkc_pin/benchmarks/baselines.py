@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from vkc_pin.benchmarks.comparison import COMPARED_PLANNERS, Assignment, Comparison
-from vkc_pin.benchmarks.comparison_report import select_compared_methods
+from vkc_pin.benchmarks.comparison_tables import select_compared_methods
 from vkc_pin.benchmarks.harness.charts import criteria_chart
 from vkc_pin.benchmarks.harness.record import Record
 from vkc_pin.world.task.steps import Actuate
 
-__all__ = ["COMPARED_PLANNERS", "TASKS", "plan_trial", "report", "run"]
+__all__ = ["COMPARED_PLANNERS", "TASKS", "format_results", "plan_trial", "run"]
 
 TASKS = {
     "door": Assignment("corridor_door", (Actuate("door", {"hinge": 1.5}),), "push a door open"),
@@ -36,4 +36,4 @@ def _draw(
 
 COMPARISON = Comparison("baselines", "Base and arm together, or one after the other", TASKS, _draw)
 
-plan_trial, report, run = COMPARISON.plan_trial, COMPARISON.report, COMPARISON.run
+plan_trial, format_results, run = COMPARISON.plan_trial, COMPARISON.format_results, COMPARISON.run

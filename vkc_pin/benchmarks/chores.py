@@ -25,7 +25,7 @@ from vkc_pin.benchmarks.harness.tables import (
     format_decimal,
     format_medians,
     format_table,
-    join_report,
+    join_sections,
     select,
 )
 from vkc_pin.options import Options
@@ -35,7 +35,16 @@ from vkc_pin.procedural.rooms.clutter import add_clutter
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step
 
-__all__ = ["CHORES", "Chore", "fetch", "home", "make_cluttered_home", "plan_trial", "report", "run"]
+__all__ = [
+    "CHORES",
+    "Chore",
+    "fetch",
+    "format_results",
+    "home",
+    "make_cluttered_home",
+    "plan_trial",
+    "run",
+]
 
 WINDOW = 2
 ONE_CALL, STEP_BY_STEP = "VKC", "step by step"
@@ -253,12 +262,12 @@ def run(
         functools.partial(_record, solve=solve),
         out,
         settings=settings,
-        report=report,
+        format_results=format_results,
         **execution,
     )
 
 
-def report(result: Mapping[str, Any]) -> str:
+def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
     about, records, rows = result["meta"], result["trials"], []
     seeds, methods = about.get("seeds", 1), about.get("methods", [ONE_CALL])
@@ -292,7 +301,7 @@ def report(result: Mapping[str, Any]) -> str:
     if seeds > 1 or len(methods) > 1:
         parts += ["## Seeds", _SEEDS_ABOUT, _seeds_table(result)]
     parts += ["## Every trial", format_table([*head, "base [m]", "arm [rad]"], every, text=5)]
-    return join_report(about, *parts)
+    return join_sections(about, *parts)
 
 
 def _seeds_table(result: Mapping[str, Any]) -> str:

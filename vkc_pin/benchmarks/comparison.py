@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from vkc_pin.baselines.attempt import FINER
 from vkc_pin.baselines.separate import BASELINES, RETRIES, plan_separately
-from vkc_pin.benchmarks.comparison_report import WAYPOINTS, report
+from vkc_pin.benchmarks.comparison_tables import WAYPOINTS, format_results
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import motions_chart
 from vkc_pin.benchmarks.harness.limits import LIMITS, MAX_EVALUATIONS
@@ -183,20 +183,20 @@ class Comparison:
         names = {name: self.tasks[name].name for name in tasks}
         pictures = self.draw(result["trials"], out, names, methods)
         pictures += trials_of.draw_motions(result["trials"], specs)
-        text = self.report(result, saved=saved, pictures=pictures)
+        text = self.format_results(result, saved=saved, pictures=pictures)
         write_atomically(out / "table.md", text.encode())
         return result
 
-    def report(
+    def format_results(
         self,
         result: Mapping[str, Any],
         *,
         saved: Mapping[str, str] | None = None,
         pictures: Sequence[str] = (),
     ) -> str:
-        """Return the tables of a result in Markdown; see `comparison_report.report`."""
+        """Return the tables of a result in Markdown; see `comparison_tables.format_results`."""
         names = {name: self.tasks[name].name for name in result["meta"]["tasks"]}
-        return report(result, names, title=self.title, saved=saved, pictures=pictures)
+        return format_results(result, names, title=self.title, saved=saved, pictures=pictures)
 
 
 def place_objects(scene: Scene, spec: Mapping[str, Any]) -> Scene:

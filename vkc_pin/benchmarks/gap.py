@@ -11,14 +11,14 @@ import numpy as np
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS, describe_limit
 from vkc_pin.benchmarks.harness.runner import Execution
-from vkc_pin.benchmarks.harness.tables import JUDGED, format_table, join_report
+from vkc_pin.benchmarks.harness.tables import JUDGED, format_table, join_sections
 from vkc_pin.benchmarks.problems.ablation import SUMMARIZED, SUMMARY, summary, tabulate_trials
 from vkc_pin.benchmarks.problems.poses import sample_random_start
 from vkc_pin.benchmarks.problems.trials import run_trial
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Reach
 
-__all__ = ["POSE", "SCENE", "make_start", "report", "run"]
+__all__ = ["POSE", "SCENE", "format_results", "make_start", "run"]
 
 SCENE = "gap_table"
 POSE = (2.5, 0.5, 0.95, np.pi, 0.0, 0.0)
@@ -47,13 +47,15 @@ def run(
     runner.check_positive(trials=trials)
     settings = {"benchmark": "gap", "seed": seed, "starts": trials, "pose": POSE, **LIMITS}
     specs = [{"key": f"{number:04d}", "number": number, "seed": seed} for number in range(trials)]
-    return runner.run(specs, _record, out, settings=settings, report=report, **execution)
+    return runner.run(
+        specs, _record, out, settings=settings, format_results=format_results, **execution
+    )
 
 
-def report(result: Mapping[str, Any]) -> str:
+def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
     about, records = result["meta"], result["trials"]
-    return join_report(
+    return join_sections(
         about,
         "# Through a gap to a table",
         f"{about['starts']} random starts of base and arm, seed {about['seed']}, "

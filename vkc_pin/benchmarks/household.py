@@ -22,9 +22,9 @@ __all__ = [
     "PAPER",
     "TABLE_TOP",
     "TASKS",
+    "format_results",
     "make_paper_home",
     "plan_trial",
-    "report",
     "run",
     "sample_cup_pose",
 ]
@@ -167,10 +167,10 @@ PAPER = Comparison(
 plan_trial = COMPARISON.plan_trial
 
 
-def report(result: Mapping[str, Any]) -> str:
+def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result of either variant in Markdown."""
     whose = PAPER if _PAPERS in result["meta"]["scenes"].values() else COMPARISON
-    return whose.report(result)
+    return whose.format_results(result)
 
 
 def run(*, variant: str | None = None, **how: Any) -> dict[str, Any]:

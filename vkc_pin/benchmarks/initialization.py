@@ -19,7 +19,7 @@ from vkc_pin.benchmarks.harness.charts import success_chart
 from vkc_pin.benchmarks.harness.limits import LIMITS, describe_limit
 from vkc_pin.benchmarks.harness.record import Solve, trial
 from vkc_pin.benchmarks.harness.runner import Execution
-from vkc_pin.benchmarks.harness.tables import JUDGED, comparison_table, join_report, methods_table
+from vkc_pin.benchmarks.harness.tables import JUDGED, comparison_table, join_sections, methods_table
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
 from vkc_pin.world.scene.scene import Scene, load_scene
@@ -30,8 +30,8 @@ __all__ = [
     "SCENES",
     "STEPWISE",
     "TARGET",
+    "format_results",
     "plan_trial",
-    "report",
     "run",
     "specify",
 ]
@@ -133,7 +133,9 @@ def run(
         "perturbation": PERTURBATION,
     }
     function = functools.partial(_record, solve=solve)
-    result = runner.run(trials, function, out, settings=settings, report=report, **execution)
+    result = runner.run(
+        trials, function, out, settings=settings, format_results=format_results, **execution
+    )
     title = f"Success by initialization, {starts} starts"
     title += f", {repeats} trials from each" if repeats > 1 else ""
     path, labels = Path(out) / "success.png", _label_scenes(scenes)
@@ -141,7 +143,7 @@ def run(
     return result
 
 
-def report(result: Mapping[str, Any]) -> str:
+def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
     about, records = result["meta"], result["trials"]
     scenes, methods = _label_scenes(about["scenes"]), about["methods"]
@@ -161,7 +163,7 @@ def report(result: Mapping[str, Any]) -> str:
             "without perturbation.",
             comparison_table(records, scenes, ("auto", STEPWISE), ("one problem", STEPWISE)),
         ]
-    return join_report(about, *parts)
+    return join_sections(about, *parts)
 
 
 def _record(spec: dict[str, Any], solve: Solve) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from vkc_pin.benchmarks.harness.tables import (
     format_decimal,
     format_medians,
     format_table,
-    join_report,
+    join_sections,
     select,
 )
 from vkc_pin.errors import InputError
@@ -40,9 +40,9 @@ if TYPE_CHECKING:
 __all__ = [
     "AXES",
     "Axis",
+    "format_results",
     "make_crowded_scene",
     "make_refined_options",
-    "report",
     "run",
     "scale_chart",
     "specify",
@@ -204,12 +204,12 @@ def run(
         **LIMITS,
     }
     result = runner.run(trials, _record, out, settings=settings, **execution)
-    write_atomically(Path(out) / "table.md", report(result).encode())
+    write_atomically(Path(out) / "table.md", format_results(result).encode())
     scale_chart(result["trials"], Path(out) / "scale.png", of=of, title=AXES[of].title)
     return result
 
 
-def report(result: Mapping[str, Any]) -> str:
+def format_results(result: Mapping[str, Any]) -> str:
     """Return the table of a result in Markdown."""
     about, records, rows = result["meta"], result["trials"], []
     of = about["of"]
@@ -227,7 +227,7 @@ def report(result: Mapping[str, Any]) -> str:
         rows.append([str(number), success, *times, *format_medians(own, *TIMES), iterations])
     head = [of, "success", "time, median [s]", "95th percentile [s]", f"ratio to {usual}"]
     head += [f"{name} [s]" for name in TIMES.values()] + ["Ipopt iterations"]
-    return join_report(
+    return join_sections(
         about,
         f"# Planning time against the number of {of}",
         f"{about['starts']} random starts, the same for every number of {of}; seed "

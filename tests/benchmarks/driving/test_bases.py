@@ -46,7 +46,7 @@ def test_failures_are_listed() -> None:
     about = {"starts": 5, "seed": 0, "radius": 0.8, "tasks": ["door"], "bases": ["ackermann"]}
     failure = {"task": "door", "base": "ackermann", "number": 4, "success": False}
     failure |= {"status": "rejected", "violations": ["turning base"], **dict.fromkeys(fields, 1.0)}
-    text = bases.report({"meta": {**describe_environment(), **about}, "trials": [failure]})
+    text = bases.format_results({"meta": {**describe_environment(), **about}, "trials": [failure]})
     assert "- door, ackermann, start 4: rejected; turning base" in text
     assert "| door | ackermann | 0 of 1 |" in text
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from helpers.experiments import run_experiment
 
-from vkc_pin.benchmarks.executing.execution import report
+from vkc_pin.benchmarks.executing.execution import format_results
 from vkc_pin.cli import main
 
 
@@ -42,7 +42,7 @@ def test_failed_executions_are_counted() -> None:
     never = {"task": "drawer", "success": False, "executed": False}
     record = Path(__file__).parents[3] / "docs/results/gap.json"
     about = json.loads(record.read_text(encoding="utf-8"))["meta"]
-    text = report(
+    text = format_results(
         {"meta": {**about, "starts": 3, "tasks": ["drawer"]}, "trials": [fine, bad, never]}
     )
     assert "| drawer | 2 of 3 | 1 of 2 |" in text

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from helpers.experiments import run_experiment
 
-from vkc_pin.benchmarks.peers.run import report, run
+from vkc_pin.benchmarks.peers.run import format_results, run
 from vkc_pin.errors import InputError, UnknownNameError
 
 
@@ -42,7 +42,7 @@ def test_table_counts_trials_that_timed_out() -> None:
     good = {**late, "success": True, "status": "success", "time_final": 3.0, "time_own": 0.5}
     good |= {"time_first": 1.0, "base_path_length": 1.5, "arm_path_length": 2.0}
     good |= {"clearance_at": 0.03, "clearance_between": 0.025}
-    text = report({"meta": about, "trials": [late, good]})
+    text = format_results({"meta": about, "trials": [late, good]})
     numbers = "1 of 2 | 1 | 1.00 | 6.00 | 8.70 | 4.25 | 1.50 | 2.00 | 30.0 | 25.0"
     assert f"| door | OMPL | {numbers} |" in text
     assert "| door | VKC |" not in text

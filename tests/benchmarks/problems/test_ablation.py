@@ -52,7 +52,7 @@ def test_ratios_are_of_problems_that_both_settings_solve() -> None:
     trials += [record(2, "unchanged", 2.0, False), record(2, changed, 9.0)]
     error = {"number": 3, "method": "unchanged", "seed": 0, "success": False, "status": "error"}
     about = {"changes": ["unchanged", changed], "problems": [0, 1, 2, 3], "seed": 0}
-    text = ablation.report(
+    text = ablation.format_results(
         {"meta": {**describe_environment(time_limit=1.0), **about}, "trials": [*trials, error]}
     )
     triple, same = "3.000 (3.000–3.000)", "1.000 (1.000–1.000)"

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from vkc_pin.benchmarks.harness.record import describe_environment
-from vkc_pin.benchmarks.robot_object_matrix.matrix import chart, report
+from vkc_pin.benchmarks.robot_object_matrix.matrix import chart, format_results
 
 
 def record(robot: str, name: str, status: str = "success", **more: Any) -> dict[str, Any]:
@@ -42,8 +42,8 @@ RECORDS = [
 ]
 
 
-def test_report() -> None:
-    text = report(
+def test_tables_list_all_pairs() -> None:
+    text = format_results(
         {
             "meta": {**describe_environment(starts=2, seed=0, share=0.5, max_evaluations=1000)},
             "trials": RECORDS,

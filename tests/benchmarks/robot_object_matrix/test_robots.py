@@ -9,7 +9,7 @@ import pytest
 from helpers.arm_urdf import write_arms
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.robot_object_matrix.robots import report, run
+from vkc_pin.benchmarks.robot_object_matrix.robots import format_results, run
 from vkc_pin.cli import main
 
 
@@ -81,7 +81,7 @@ def test_report_lists_failures_by_robot() -> None:
             "because": "only 1 of 9",
         },
     ]
-    text = report({"meta": about, "trials": trials})
+    text = format_results({"meta": about, "trials": trials})
     assert "| one | 6 | 7 | 4.00 | 0.50 | -4 | 1/2 | 2.00 | 2.90 |" in text
     assert "| two | 6 | 7 | 4.00 | 0.50 | – | – |" in text
     assert "| one | infeasible | too deep |" in text

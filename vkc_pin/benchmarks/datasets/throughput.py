@@ -25,7 +25,7 @@ from vkc_pin.world.files.writing import write_atomically
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["RECIPE", "record", "report", "run", "workers_chart"]
+__all__ = ["RECIPE", "format_results", "record", "run", "workers_chart"]
 
 RECIPE = "home"
 """Of the package: which robots, objects and rooms."""
@@ -110,7 +110,7 @@ def run(
         folder / "results.json", (json.dumps(result, indent=1, allow_nan=False) + "\n").encode()
     )
     workers_chart(result, folder / "workers.png")
-    write_atomically(folder / "table.md", report(result).encode())
+    write_atomically(folder / "table.md", format_results(result).encode())
     return result
 
 
@@ -185,7 +185,7 @@ def _size(dataset: Dataset) -> int:
     return round(sum(file.stat().st_size for file in files) / max(1, len(dataset.numbers())))
 
 
-def report(result: Mapping[str, Any]) -> str:
+def format_results(result: Mapping[str, Any]) -> str:
     """Return the table of a result in Markdown."""
     about, records = result["meta"], result["trials"]
     head = [

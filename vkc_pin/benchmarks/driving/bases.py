@@ -11,13 +11,13 @@ import numpy as np
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial
 from vkc_pin.benchmarks.harness.runner import Execution
-from vkc_pin.benchmarks.harness.tables import JUDGED, count, format_table, join_report, select
+from vkc_pin.benchmarks.harness.tables import JUDGED, count, format_table, join_sections, select
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate
 
-__all__ = ["BASES", "TASKS", "TURNING_RADIUS", "make_start", "report", "run"]
+__all__ = ["BASES", "TASKS", "TURNING_RADIUS", "format_results", "make_start", "run"]
 
 TASKS = {"door": {"hinge": 1.2}, "drawer": {"slide": 0.35}}
 """Scene → goal of the object of the same name."""
@@ -79,10 +79,12 @@ def run(
         for base in bases
         for number in range(trials)
     ]
-    return runner.run(specs, _record, out, settings=settings, report=report, **execution)
+    return runner.run(
+        specs, _record, out, settings=settings, format_results=format_results, **execution
+    )
 
 
-def report(result: Mapping[str, Any]) -> str:
+def format_results(result: Mapping[str, Any]) -> str:
     """Return the table of a result in Markdown."""
     about, records = result["meta"], result["trials"]
     rows = [_row(task, base, records) for task in about["tasks"] for base in about["bases"]]
@@ -94,7 +96,7 @@ def report(result: Mapping[str, Any]) -> str:
     ]
     head = ["task", "base", "success", "time, median [s]", "95th percentile [s]"]
     head += ["evaluations", "Ipopt iterations", "base [m]", "arm [rad]", "motion [s]"]
-    return join_report(
+    return join_sections(
         about,
         "# Bases that drive",
         f"{about['starts']} random starts, seed {about['seed']}; steered bases turn with a radius "

@@ -19,7 +19,7 @@ from vkc_pin.benchmarks.harness.tables import (
     compute_wilson_interval,
     count,
     format_table,
-    join_report,
+    join_sections,
     select,
 )
 from vkc_pin.benchmarks.problems.problem_set import TASKS as ALL
@@ -30,7 +30,7 @@ from vkc_pin.simulation.physics import Physics, import_mujoco
 from vkc_pin.simulation.result import SimulationResult
 from vkc_pin.utils.arguments import check_choice
 
-__all__ = ["TASKS", "report", "run"]
+__all__ = ["TASKS", "format_results", "run"]
 
 TASKS: Mapping[str, str] = {
     "door": "push a door with a latched lever",
@@ -99,10 +99,12 @@ def run(
         for name in names
         for number in range(trials)
     ]
-    return runner.run(specs, _record, out, settings=settings, report=report, **execution)
+    return runner.run(
+        specs, _record, out, settings=settings, format_results=format_results, **execution
+    )
 
 
-def report(result: Mapping[str, Any]) -> str:
+def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
     about, records = result["meta"], result["trials"]
     rows = [_row(name, select(records, task=name)) for name in about["tasks"]]
@@ -111,7 +113,7 @@ def report(result: Mapping[str, Any]) -> str:
         f"{r.get('task')}: {text}" for r in records for text in r.get("problems", ())
     )
     lines = [f"- {text}" + f" ({n} times)" * (n > 1) for text, n in problems.items()]
-    return join_report(
+    return join_sections(
         about,
         "# Plans in physics" + ", held by friction" * (about.get("grasp") == "friction"),
         f"{about['starts']} random starts per task, seed {about['seed']}, {describe_limit(about)} "

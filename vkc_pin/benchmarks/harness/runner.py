@@ -57,7 +57,7 @@ def run(
     out: str | Path,
     *,
     settings: Mapping[str, Any],
-    report: Callable[[dict[str, Any]], str] | None = None,
+    format_results: Callable[[dict[str, Any]], str] | None = None,
     jobs: int = 1,
     scheduler: str | None = None,
     progress: bool = True,
@@ -75,7 +75,7 @@ def run(
             with status "error". A record with status "interrupted" counts as Ctrl-C.
         out: Folder, created if necessary.
         settings: Settings that determine the results, as plain data.
-        report: Makes `out`/table.md of a result.
+        format_results: Makes `out`/table.md of a result.
         jobs: See `Execution`.
         scheduler: See `Execution`.
         progress: See `Execution`.
@@ -140,8 +140,8 @@ def run(
     write_atomically(
         out / "results.json", (json.dumps(result, indent=1, allow_nan=False) + "\n").encode()
     )
-    if report is not None:
-        write_atomically(out / "table.md", report(result).encode())
+    if format_results is not None:
+        write_atomically(out / "table.md", format_results(result).encode())
     return result
 
 

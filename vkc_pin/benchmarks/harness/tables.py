@@ -30,7 +30,7 @@ __all__ = [
     "format_decimal",
     "format_medians",
     "format_table",
-    "join_report",
+    "join_sections",
     "methods_table",
     "select",
     "to_csv",
@@ -113,8 +113,8 @@ def format_medians(records: Sequence[Record], *fields: str) -> list[str]:
     return [format_decimal(distribution(records, field)[0]) for field in fields]
 
 
-def join_report(about: Mapping[str, Any], *parts: str) -> str:
-    """Join the parts of a report, followed by machine and versions."""
+def join_sections(about: Mapping[str, Any], *parts: str) -> str:
+    """Join sections, followed by machine and versions."""
     return "\n\n".join([*parts, describe_run(about)]) + "\n"
 
 

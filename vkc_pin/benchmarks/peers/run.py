@@ -19,7 +19,7 @@ from vkc_pin.benchmarks.harness.tables import (
     format_decimal,
     format_medians,
     format_table,
-    join_report,
+    join_sections,
     select,
 )
 from vkc_pin.benchmarks.peers.found import (
@@ -39,7 +39,7 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.trajectory.formats.archives import PlanStatus
 
-__all__ = ["METHODS", "PEERS", "TIME_LIMIT", "report", "run"]
+__all__ = ["METHODS", "PEERS", "TIME_LIMIT", "format_results", "run"]
 
 PEERS: Mapping[str, tuple[Peer, str, str]] = {
     "trajopt": (plan_by_trajopt, "tesseract_robotics", "tesseract-robotics-nanobind"),
@@ -113,10 +113,12 @@ def run(
         for method in chosen
     ]
     function = functools.partial(_record, folder=str(Path(out) / "plans"))
-    return runner.run(specs, function, out, settings=settings, report=report, **execution)
+    return runner.run(
+        specs, function, out, settings=settings, format_results=format_results, **execution
+    )
 
 
-def report(result: Mapping[str, Any]) -> str:
+def format_results(result: Mapping[str, Any]) -> str:
     """Return the table of a result in Markdown."""
     about, records = result["meta"], result["trials"]
     rows = [
@@ -126,7 +128,7 @@ def report(result: Mapping[str, Any]) -> str:
         if (own := select(records, task=task, method=method))
     ]
     listed = ", ".join(f"{name} {number}" for name, number in about["peers"].items())
-    return join_report(
+    return join_sections(
         about,
         "# Beside other planners",
         f"{about['starts']} problems per task, seed {about['seed']}, the same for all; at most "

@@ -21,7 +21,7 @@ from vkc_pin.benchmarks.harness.tables import (
     format_decimal,
     format_medians,
     format_table,
-    join_report,
+    join_sections,
     select,
 )
 from vkc_pin.benchmarks.problems import trials
@@ -37,7 +37,15 @@ from vkc_pin.benchmarks.problems.problem_set import (
 )
 from vkc_pin.errors import InputError
 
-__all__ = ["SUMMARIZED", "SUMMARY", "report", "run", "specify", "summary", "tabulate_trials"]
+__all__ = [
+    "SUMMARIZED",
+    "SUMMARY",
+    "format_results",
+    "run",
+    "specify",
+    "summary",
+    "tabulate_trials",
+]
 
 PAIRED = {
     "planning_time": "time",
@@ -137,7 +145,9 @@ def run(
         **LIMITS,
     }
     specs = specify(problems=numbers, changes=chosen_changes, seed=seed, tasks=names, starts=starts)
-    return runner.run(specs, _record, out, settings=settings, report=report, **execution)
+    return runner.run(
+        specs, _record, out, settings=settings, format_results=format_results, **execution
+    )
 
 
 def select_problems(problems: Sequence[int] | None) -> list[int]:
@@ -151,7 +161,7 @@ def select_problems(problems: Sequence[int] | None) -> list[int]:
     ]
 
 
-def report(result: Mapping[str, Any]) -> str:
+def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
     about, records = result["meta"], result["trials"]
     base = {_which(record): record for record in select(records, method=str(UNCHANGED))}
@@ -170,7 +180,7 @@ def report(result: Mapping[str, Any]) -> str:
     problems = f"{len(about.get('problems', ()))} problems"
     if "tasks" in about:
         problems = f"{about['starts']} random starts a task"
-    return join_report(
+    return join_sections(
         about,
         "# One setting changed at a time",
         f"{problems}, planning seed {about['seed']}, {describe_limit(about)} each. {JUDGED} "

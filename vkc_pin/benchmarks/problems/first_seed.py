@@ -17,14 +17,14 @@ from vkc_pin.benchmarks.harness.tables import (
     count_failures,
     format_decimal,
     format_table,
-    join_report,
+    join_sections,
     select,
 )
 from vkc_pin.benchmarks.problems.ablation import tabulate_trials
 from vkc_pin.benchmarks.problems.problem_set import TASKS, make_task_problem
 from vkc_pin.benchmarks.problems.trials import run_trial
 
-__all__ = ["report", "run"]
+__all__ = ["format_results", "run"]
 
 
 def run(
@@ -56,10 +56,12 @@ def run(
         for name in names
         for number in range(trials)
     ]
-    return runner.run(specs, _record, out, settings=settings, report=report, **execution)
+    return runner.run(
+        specs, _record, out, settings=settings, format_results=format_results, **execution
+    )
 
 
-def report(result: Mapping[str, Any]) -> str:
+def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
     about, records, rows = result["meta"], result["trials"], []
     for task in (*about["tasks"], "all"):
@@ -72,7 +74,7 @@ def report(result: Mapping[str, Any]) -> str:
             [task, count(own), count(own, "first_seed"), interval, *times, count_failures(own)]
         )
     head = ["task", "success", "first guess only", "of all [%]", "time, median [s]"]
-    return join_report(
+    return join_sections(
         about,
         "# Success with the first initial guess",
         f"{about['starts']} random starts per task, seed {about['seed']}. {JUDGED} The first "

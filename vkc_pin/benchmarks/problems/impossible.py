@@ -13,7 +13,7 @@ from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS, describe_limit
 from vkc_pin.benchmarks.harness.record import distribution, trial
 from vkc_pin.benchmarks.harness.runner import Execution
-from vkc_pin.benchmarks.harness.tables import format_decimal, format_table, join_report, select
+from vkc_pin.benchmarks.harness.tables import format_decimal, format_table, join_sections, select
 from vkc_pin.benchmarks.problems.ablation import tabulate_trials
 from vkc_pin.planning.diagnosis.proofs import PROVEN
 from vkc_pin.planning.planner import plan
@@ -21,7 +21,7 @@ from vkc_pin.procedural.rooms.random_room import sample_layout
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step
 
-__all__ = ["KINDS", "report", "run", "sample_impossible_problem"]
+__all__ = ["KINDS", "format_results", "run", "sample_impossible_problem"]
 
 _WIDTH = 0.67  # [m] of the robot's base
 _HALL = 6.0  # [m] from the middle of the hall to its edges
@@ -50,10 +50,12 @@ def run(
     runner.check_positive(problems=problems)
     settings = {"benchmark": "impossible", "seed": seed, "problems": problems, **LIMITS}
     specs = [{"key": f"{number:05d}", "number": number, "seed": seed} for number in range(problems)]
-    return runner.run(specs, _record, out, settings=settings, report=report, **execution)
+    return runner.run(
+        specs, _record, out, settings=settings, format_results=format_results, **execution
+    )
 
 
-def report(result: Mapping[str, Any]) -> str:
+def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
     about, records, rows = result["meta"], result["trials"], []
     fields = ("success", "explained", "proven")
@@ -68,7 +70,7 @@ def report(result: Mapping[str, Any]) -> str:
         for r in records
         if "notes" in r
     ]
-    return join_report(
+    return join_sections(
         about,
         "# Impossible problems",
         f"{about['problems']} impossible problems, seed {about['seed']}, {describe_limit(about)} "

@@ -15,7 +15,7 @@ from vkc_pin.benchmarks.harness.tables import (
     JUDGED,
     format_decimal,
     format_table,
-    join_report,
+    join_sections,
     select,
 )
 from vkc_pin.benchmarks.problems.ablation import tabulate_trials
@@ -26,7 +26,7 @@ from vkc_pin.procedural.tasks import random_task
 from vkc_pin.utils.arguments import check_choice
 from vkc_pin.world.task.steps import Actuate, Grasp
 
-__all__ = ["report", "run"]
+__all__ = ["format_results", "run"]
 
 _ROOMS = 100_000  # of one seed
 _LIMITS = {
@@ -65,10 +65,12 @@ def run(
         for number in range(problems)
     ]
     function = functools.partial(_record, folder=str(Path(out) / "plans"))
-    return runner.run(specs, function, out, settings=settings, report=report, **execution)
+    return runner.run(
+        specs, function, out, settings=settings, format_results=format_results, **execution
+    )
 
 
-def report(result: Mapping[str, Any]) -> str:
+def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
     about, records, rows = result["meta"], result["trials"], []
     statuses = sorted({record["status"] for record in records} - {"success"})
@@ -79,7 +81,7 @@ def report(result: Mapping[str, Any]) -> str:
         rows.append([kind, str(len(own)), *counts, *times])
     rooms = about["benchmark"] == "rooms"
     head = ["kind", "problems", "success", *statuses, "time, median [s]", "95th percentile [s]"]
-    return join_report(
+    return join_sections(
         about,
         "# Random rooms, one task each" if rooms else "# Random problems",
         f"{about['problems']} problems, seed {about['seed']}, {describe_limit(about)} each. "

@@ -17,7 +17,7 @@ from vkc_pin.benchmarks.harness.tables import (
     compute_quartiles,
     count,
     format_table,
-    join_report,
+    join_sections,
     select,
 )
 from vkc_pin.benchmarks.problems import trials
@@ -25,7 +25,7 @@ from vkc_pin.benchmarks.problems.ablation import select_problems, tabulate_trial
 from vkc_pin.benchmarks.problems.problem_set import problem
 from vkc_pin.errors import InputError
 
-__all__ = ["compute_spread", "report", "run"]
+__all__ = ["compute_spread", "format_results", "run"]
 
 FIELDS = {
     "objective": "objective",
@@ -63,7 +63,9 @@ def run(
         for number in numbers
         for own in range(seed, seed + seeds)
     ]
-    return runner.run(specs, _record, out, settings=settings, report=report, **execution)
+    return runner.run(
+        specs, _record, out, settings=settings, format_results=format_results, **execution
+    )
 
 
 def compute_spread(records: Sequence[Record], field: str) -> float | None:
@@ -72,7 +74,7 @@ def compute_spread(records: Sequence[Record], field: str) -> float | None:
     return max(found) / min(found) - 1.0 if len(found) > 1 and min(found) > 0.0 else None
 
 
-def report(result: Mapping[str, Any]) -> str:
+def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
     about, records = result["meta"], result["trials"]
     groups = {number: select(records, number=number) for number in about["problems"]}
@@ -102,7 +104,7 @@ def report(result: Mapping[str, Any]) -> str:
         "largest",
     ]
     percent = [f"{name} [%]" for name in FIELDS.values()]
-    return join_report(
+    return join_sections(
         about,
         "# Spread over random seeds",
         f"{len(groups)} problems, each planned with {about['seeds']} seeds from {about['seed']} "

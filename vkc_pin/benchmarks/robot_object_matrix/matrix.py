@@ -16,7 +16,7 @@ from vkc_pin.benchmarks.harness.tables import (
     format_decimal,
     format_medians,
     format_table,
-    join_report,
+    join_sections,
 )
 from vkc_pin.benchmarks.robot_object_matrix.pairs import get_kind
 from vkc_pin.visualization.plots.style import new_figure, save_figure, use_style
@@ -24,7 +24,7 @@ from vkc_pin.visualization.plots.style import new_figure, save_figure, use_style
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["chart", "report"]
+__all__ = ["chart", "format_results"]
 
 _SUMMARY = (
     "robot",
@@ -40,13 +40,13 @@ _ALL = "all"
 _UNREACHED = ("unreachable", "no hand")
 
 
-def report(result: Mapping[str, Any]) -> str:
+def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
     about, records = result["meta"], result["trials"]
     groups = _groups(records)
     robots, objects = (list(dict.fromkeys(key[k] for key in groups)) for k in (0, 1))
     rows = [[name, *(_cell(groups.get((robot, name), ())) for robot in robots)] for name in objects]
-    return join_report(
+    return join_sections(
         about,
         "# Robots × objects",
         f"{len(robots)} robots, {len(objects)} objects of {len(set(map(get_kind, objects)))} "

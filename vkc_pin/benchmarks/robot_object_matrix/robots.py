@@ -18,7 +18,7 @@ from vkc_pin.benchmarks.harness.tables import (
     JUDGED,
     format_decimal,
     format_table,
-    join_report,
+    join_sections,
     select,
 )
 from vkc_pin.benchmarks.robot_object_matrix.reach import sample_reachable_poses
@@ -34,7 +34,7 @@ from vkc_pin.world.models.self_collisions import set_collision_pairs
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Reach
 
-__all__ = ["ROBOTS", "report", "run"]
+__all__ = ["ROBOTS", "format_results", "run"]
 
 ROBOTS = (
     *(
@@ -125,10 +125,12 @@ def run(
         }
         for name, file in files.items()
     ]
-    return runner.run(specs, _records, out, settings=settings, report=report, **execution)
+    return runner.run(
+        specs, _records, out, settings=settings, format_results=format_results, **execution
+    )
 
 
-def report(result: Mapping[str, Any]) -> str:
+def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
     about, records = result["meta"], result["trials"]
     failed = [
@@ -137,7 +139,7 @@ def report(result: Mapping[str, Any]) -> str:
         if not r["success"]
     ]
     section = ["## What failed", format_table(("robot", "status", "because"), failed, text=3)]
-    return join_report(
+    return join_sections(
         about,
         "# Robots",
         "Robots are imported from their makers' files alone; each then reaches "
@@ -203,7 +205,7 @@ def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
     folder = Path(spec["out"]) / "robots" / check_name(name, "robots")
     about: dict[str, Any] = {"robot": name}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what importing found is in its report
+        warnings.simplefilter("ignore")  # findings of the import are in its report
         try:
             began = time.process_time()
             imported = import_robot(spec["file"], folder, seed=seed, force=True)

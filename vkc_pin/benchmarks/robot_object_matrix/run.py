@@ -19,7 +19,7 @@ from vkc_pin.benchmarks.robot_object_matrix.given import (
     prepare_object,
     prepare_robot,
 )
-from vkc_pin.benchmarks.robot_object_matrix.matrix import chart, report
+from vkc_pin.benchmarks.robot_object_matrix.matrix import chart, format_results
 from vkc_pin.benchmarks.robot_object_matrix.pairs import OBJECTS, ROBOTS, SHARE, get_kind, make_pair
 from vkc_pin.planning.planner import plan
 from vkc_pin.world.models.robot_file import load_robot
@@ -54,7 +54,7 @@ def run(
     runner.check_positive(starts=starts)
     runner.check_folder(out)
     chosen = [parse_requests(robots, "robots", ROBOTS), parse_requests(objects, "objects", OBJECTS)]
-    things = {one.called: prepare_object(one, Path(out) / "objects") for one in chosen[1]}
+    object_files = {one.called: prepare_object(one, Path(out) / "objects") for one in chosen[1]}
     ready = {one.called: prepare_robot(one, Path(out) / "robots") for one in chosen[0]}
     settings = {
         "benchmark": "anything",
@@ -66,24 +66,26 @@ def run(
     }
     specs = [
         {
-            "key": f"{robot}/{thing}",
+            "key": f"{robot}/{name}",
             "robot": robot,
-            "object": thing,
+            "object": name,
             "files": [file, path],
             "starts": starts,
             "seed": seed,
         }
         for robot, file in ready.items()
-        for thing, path in things.items()
+        for name, path in object_files.items()
     ]
-    result = runner.run(specs, _records, out, settings=settings, report=report, **execution)
+    result = runner.run(
+        specs, _records, out, settings=settings, format_results=format_results, **execution
+    )
     chart(result["trials"], Path(out) / "success.png")
     return result
 
 
 def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a record of every start, or one if the object is unreachable."""
-    seed, (file, thing) = spec["seed"], spec["files"]
+    seed, (file, object_file) = spec["seed"], spec["files"]
     about: dict[str, Any] = {
         "robot": spec["robot"],
         "object": spec["object"],
@@ -95,7 +97,7 @@ def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
         robot = load_robot(file)
         about["load_time"] = time.perf_counter() - began
         began = time.perf_counter()
-        found = make_pair(robot, file, thing, seed=seed)
+        found = make_pair(robot, file, object_file, seed=seed)
         about["look_time"] = time.perf_counter() - began
         if found.scene is None or found.step is None:
             status = "no hand" if found.scene is None else "unreachable"

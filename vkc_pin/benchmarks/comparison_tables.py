@@ -21,7 +21,7 @@ from vkc_pin.benchmarks.harness.tables import (
     format_table,
 )
 
-__all__ = ["BUDGETS", "CRITERIA", "WAYPOINTS", "report", "select_compared_methods"]
+__all__ = ["BUDGETS", "CRITERIA", "WAYPOINTS", "format_results", "select_compared_methods"]
 
 WAYPOINTS = {f"{method}x{finer}": (method, finer) for finer in (1, 3) for method in BASELINES}
 """Baselines with other numbers of waypoints: name → method, multiple of VKC's number."""
@@ -43,7 +43,7 @@ def select_compared_methods(methods: Sequence[str]) -> Sequence[str]:
     return [method for method in methods if method not in WAYPOINTS] or methods
 
 
-def report(
+def format_results(
     result: Mapping[str, Any],
     tasks: Mapping[str, str],
     *,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.errors import InputError
+from vkc_pin.importing.mjcf_models import NO_MASS, compile_mjcf
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
 from vkc_pin.utils.optional_imports import import_optional
 
@@ -28,22 +28,17 @@ def read_object_mjcf(file: Path, *, free: bool = False) -> Description:
         free: Whether to keep free bodies, on floating joints; otherwise they are left out.
     """
     mujoco = import_optional("mujoco", "import", purpose="reading MJCF", file=file)
-    try:
-        model = mujoco.MjModel.from_xml_path(str(file))
-    except ValueError as error:
-        raise InputError(
-            f"MuJoCo cannot read the file: {error}", file=file, expected="an MJCF file"
-        ) from error
+    model, notes = compile_mjcf(file)
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
     mujoco.mj_kinematics(model, data)
-    return _Reader(mujoco, model, data, file).read(free=free)
+    return _Reader(mujoco, model, data, file, notes).read(free=free)
 
 
 class _Reader:
-    def __init__(self, mujoco: Any, model: Any, data: Any, file: Path) -> None:
+    def __init__(self, mujoco: Any, model: Any, data: Any, file: Path, notes: list[str]) -> None:
         self.mujoco, self.model, self.data, self.file = mujoco, model, data, file
-        self.notes = list[str]()
+        self.notes = notes
         names = [str(model.body(k).name) for k in range(model.nbody)]
         self.taken = set(filter(None, names))
         self.bodies = [name or self._add_name(f"body_{k}") for k, name in enumerate(names)]
@@ -123,7 +118,7 @@ class _Reader:
 
     def _read_inertia(self, body: int, frame: pin.SE3) -> pin.Inertia:
         """Return a body's inertia as stated, or as MuJoCo computes it from its geoms' densities."""
-        if not self.model.body_mass[body] > 0.0:
+        if not self.model.body_mass[body] > NO_MASS:
             return pin.Inertia.Zero()
         principal = pin.Inertia(
             float(self.model.body_mass[body]), np.zeros(3), np.diag(self.model.body_inertia[body])

@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
+from vkc_pin.importing.mjcf_models import NO_MASS, compile_mjcf
 from vkc_pin.importing.targets import add_connection, add_origin, format_numbers
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import import_optional
@@ -49,20 +50,15 @@ def convert_mjcf(file: Path, folder: Path) -> ConvertedRobot:
     Other trees are left out.
     """
     mujoco = import_optional("mujoco", "import", purpose="an MJCF file", file=file)
-    try:
-        model = mujoco.MjModel.from_xml_path(str(file.resolve()))
-    except (ValueError, RuntimeError) as error:
-        raise InputError(
-            f"MuJoCo cannot read the file: {' '.join(str(error).split())}", file=file
-        ) from error
-    return _Converter(mujoco, model, file, folder).convert()
+    model, notes = compile_mjcf(file)
+    return _Converter(mujoco, model, file, folder, notes).convert()
 
 
 class _Converter:
-    def __init__(self, mujoco: Any, model: Any, file: Path, folder: Path) -> None:
+    def __init__(self, mujoco: Any, model: Any, file: Path, folder: Path, notes: list[str]) -> None:
         self._mujoco, self._model, self._folder, self._file = mujoco, model, folder, file
         self._result = ConvertedRobot(
-            ElementTree.Element("robot", name=replace_forbidden(file.stem))
+            ElementTree.Element("robot", name=replace_forbidden(file.stem)), notes=notes
         )
         self._names: dict[tuple[str, int], str] = {}
         counts = {"body": model.nbody, "joint": model.njnt}
@@ -193,7 +189,7 @@ class _Converter:
 
     def _convert_inertia(self, link: ElementTree.Element, body: int) -> None:
         model = self._model
-        if model.body_mass[body] <= 0.0:
+        if model.body_mass[body] <= NO_MASS:
             return
         inertial = ElementTree.SubElement(link, "inertial")
         add_origin(

@@ -1,0 +1,86 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from vkc_pin.errors import InputError
+from vkc_pin.importing.mjcf_models import NO_MASS, compile_mjcf
+
+mujoco = pytest.importorskip("mujoco")
+
+DOOR = """<mujoco>{head}<worldbody><body name="case"><geom type="box" size=".2 .2 .2"/>
+  <body name="door" pos="0 -.3 0"><joint name="hinge" axis="0 0 1" range="0 1"/>{inertial}
+    <geom name="leaf" type="box" size=".2 .01 .2"{leaf}/>{more}</body></body>
+  </worldbody>{tail}</mujoco>"""
+
+
+def compile_door(folder: Path, **parts: str) -> tuple[object, str]:
+    slots = dict.fromkeys(("head", "leaf", "more", "tail", "inertial"), "")
+    (folder / "door.xml").write_text(DOOR.format(**{**slots, **parts}))
+    model, notes = compile_mjcf(folder / "door.xml")
+    return model, "; ".join(notes)
+
+
+PAINT = '<asset><texture name="t" type="{}" {}/><material name="m" texture="t"/></asset>'
+MESH = '<asset><mesh name="l" file="gone.obj"/></asset>'
+SEEN, SOLID = ' contype="0" conaffinity="0"', '<geom type="mesh" mesh="l"{}/>'
+
+
+@pytest.mark.parametrize(
+    ("parts", "note", "count"),
+    [
+        ({"head": PAINT.format("2d", 'file="a/wood.png"'), "leaf": ' material="m"'}, "wood.png", 2),
+        ({"head": PAINT.format("cube", 'fileright="r.png"'), "leaf": ' material="m"'}, "r.png", 2),
+        ({"head": PAINT.format("skybox", 'file="sky.png"')}, "sky.png", 2),
+        ({"head": MESH, "more": SOLID.format(SEEN)}, "'gone.obj' of body 'door'", 2),
+        ({"head": MESH, "more": SOLID.format(""), "leaf": SEEN}, "visual shapes collide", 2),
+        ({"head": MESH}, "", 2),
+        ({"tail": '<keyframe><key qpos="0 0 0"/></keyframe>'}, "invalid qpos size", 2),
+        ({"tail": '<sensor><touch site="none"/></sensor>'}, "unrecognized name 'none'", 2),
+        ({"tail": '<actuator><motor joint="none"/></actuator>'}, "actuator", 2),
+        (
+            {"inertial": '<inertial pos="0 0 0" mass="1" diaginertia="1 1 5"/>'},
+            "inertia must satisfy",
+            2,
+        ),
+    ],
+)
+def test_flaws_that_geometry_does_not_need_are_noted(
+    tmp_path: Path, parts: dict[str, str], note: str, count: int
+) -> None:
+    model, notes = compile_door(tmp_path, **parts)
+    assert model.ngeom == count
+    assert model.geom_contype.all()
+    assert model.njnt == 1
+    assert note in notes
+
+
+@pytest.mark.parametrize(
+    ("head", "leaf"),
+    [
+        ('<compiler inertiagrouprange="4 4"/>', ' group="0"'),
+        ("", ' mass="0"'),
+        ("", ' density="0"'),
+        ('<compiler inertiafromgeom="false"/>', ""),
+        ('<compiler inertiafromgeom="true" inertiagrouprange="3 3"/>', ""),
+    ],
+)
+def test_masses_may_be_missing(tmp_path: Path, head: str, leaf: str) -> None:
+    model, _ = compile_door(tmp_path, head=head, leaf=leaf)
+    assert model.body_mass[2] <= NO_MASS
+
+
+def test_all_missing_collision_meshes_are_listed(tmp_path: Path) -> None:
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "there.stl")
+    names = ("gone.obj", "there.stl", "lost.stl")
+    head = "".join(f'<mesh name="{name}" file="{name}"/>' for name in names)
+    more = "".join(f'<geom type="mesh" mesh="{name}"/>' for name in names)
+    with pytest.raises(InputError, match=r"got no gone\.obj, lost\.stl\)"):
+        compile_door(tmp_path, head=f"<asset>{head}</asset>", more=more)
+
+
+def test_errors_of_geometry_stay_errors(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"MuJoCo cannot read the file: .*size 0 must be"):
+        compile_door(tmp_path, more='<geom type="sphere" size="0"/>')

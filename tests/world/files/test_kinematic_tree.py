@@ -81,6 +81,23 @@ def format_pair(kind: str = "fixed", inside: str = "") -> list[str]:
             "j: limit upper: wrong numbers .*1 finite number, got inf",
         ),
         (
+            format_pair("prismatic", '<limit lower="0" upper="1" velocity="-1"/>'),
+            4,
+            "j: limit velocity: a negative velocity limit .*0 or more, got -1",
+        ),
+        (
+            format_pair("continuous", '<limit effort="-2"/>'),
+            4,
+            "j: limit effort: a negative effort limit",
+        ),
+        (
+            format_pair(inside='<origin xyz="1,5 0 0"/>'),
+            4,
+            "j: origin xyz: wrong numbers .*3 finite numbers with spaces between them, got 1,5 0 0",
+        ),
+        (format_pair(inside='<origin xyz="0,5 0"/>'), 4, "origin xyz: wrong numbers"),
+        (format_pair(inside='<origin xyz="1,,2"/>'), 4, "origin xyz: wrong numbers"),
+        (
             format_pair("continuous", '<mimic joint="j" multiplier="twice"/>'),
             4,
             "j: mimic multiplier: wrong numbers .*got twice",
@@ -99,6 +116,31 @@ def test_invalid_trees_raise(
     with pytest.raises(InputError, match=message) as caught:
         read_urdf(file)
     assert (caught.value.file, caught.value.line) == (file, line)
+
+
+@pytest.mark.parametrize("text", ["1, 2, 3", "1,2,3", " 1 ,2 , 3 ", "1.0, 2.0, 3.0,", "1,\n2,\n3"])
+def test_commas_between_numbers_are_read_as_spaces(tmp_path: Path, text: str) -> None:
+    file = write_urdf(tmp_path, *format_pair(inside=f'<origin xyz="{text}"/>'))
+    with pytest.warns(UserWarning, match=r"thing\.urdf: origin xyz: commas are read as spaces"):
+        model, _, _ = load_urdf(file)
+    np.testing.assert_array_equal(
+        model.frames[model.getFrameId("b")].placement.translation, [1, 2, 3]
+    )
+
+
+LARGE = ("1.7976931348623157e308", "3.4028235e38", "1e16", "2147483647", "10000")
+
+
+@pytest.mark.parametrize("large", LARGE)
+def test_huge_limits_mean_none(tmp_path: Path, large: str) -> None:
+    limit = f'<limit lower="-{large}" upper="{large}" velocity="1"/>'
+    model, _, _ = load_urdf(write_urdf(tmp_path, *format_pair("revolute", limit)))
+    assert model.nq == 2, "a continuous joint has cosine and sine"
+    model, _, _ = load_urdf(write_urdf(tmp_path, *format_pair("prismatic", limit)))
+    assert (model.lowerPositionLimit[0], model.upperPositionLimit[0]) == (-1e4, 1e4)
+    limit = f'<limit lower="-1" upper="{large}" velocity="1"/>'
+    model, _, _ = load_urdf(write_urdf(tmp_path, *format_pair("revolute", limit)))
+    assert (model.nq, *model.lowerPositionLimit, *model.upperPositionLimit) == (1, -1.0, 1e4)
 
 
 def test_fixed_joints_need_no_axis(tmp_path: Path) -> None:

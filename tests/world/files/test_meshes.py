@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from vkc_pin.errors import InputError
+from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.files.meshes import (
     load_convex,
     load_mesh,
@@ -44,6 +44,157 @@ def test_objects_of_an_obj_file_are_separate(tmp_path: Path) -> None:
     assert mesh.area == pytest.approx(12.0)
     assert abs(mesh.volume) == pytest.approx(2.0)
     np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [3, 1, 1]])
+
+
+VERTICES = ["\n".join(f"v {x + 2 * k} {y} {z}" for x, y, z in CORNERS) + "\n" for k in range(2)]
+
+
+def format_faces(first: int, corner: str = "{}") -> str:
+    """Return the faces of a cube whose vertices count from `first`, which may be negative."""
+    return "".join(
+        "f " + " ".join(corner.format(i - 1 + first) for i in face) + "\n" for face in FACES
+    )
+
+
+USUAL = VERTICES[0] + VERTICES[1] + format_faces(1) + format_faces(9)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        VERTICES[0] + format_faces(-8) + VERTICES[1] + format_faces(-8),
+        VERTICES[0] + VERTICES[1] + format_faces(-16) + format_faces(-8),
+        VERTICES[0] + format_faces(1) + VERTICES[1] + format_faces(-8),
+        "vt 0 0\n"
+        + VERTICES[0]
+        + format_faces(-8, "{}/-1")
+        + VERTICES[1]
+        + format_faces(9, "{}/1"),
+        "vn 1 0 0\n"
+        + VERTICES[0]
+        + format_faces(-8, "{}//-1")
+        + VERTICES[1]
+        + format_faces(-8, "{}//1"),
+        VERTICES[0]
+        + format_faces(-8).replace("f ", "f  ").replace("\n", "  # a-b\n", 1)
+        # of the other cube, with lines that go on
+        + VERTICES[1]
+        + format_faces(-8).replace(" -1 ", " \\\n-1 "),
+        "\ufeff" + USUAL,
+        USUAL.replace("\n", "\r"),
+        USUAL.replace("v ", "v\t").replace("f ", "f\t"),
+        USUAL.replace("v ", "  v ").replace("f ", "\tf "),
+    ],
+    ids=[
+        "interleaved",
+        "at the end",
+        "mixed",
+        "textures",
+        "normals",
+        "comments and lines that go on",
+        "byte-order mark",
+        "line ends of old Macs",
+        "tabs",
+        "indented",
+    ],
+)
+def test_obj_files_of_other_programs_are_read_alike(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "two.obj"
+    file.write_bytes(text.encode())
+    mesh = load_mesh(file)
+    assert mesh.area == pytest.approx(12.0)
+    assert abs(mesh.volume) == pytest.approx(2.0)
+    np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [3, 1, 1]])
+    assert sum(len(part.faces) for part in load_parts(file)) == 24
+
+
+@pytest.mark.parametrize("index", ["0", "-9", "0/1"])
+def test_faces_without_vertices_are_refused(tmp_path: Path, index: str) -> None:
+    file = tmp_path / "cube.obj"
+    file.write_text(f"{VERTICES[0]}f 1 2 {index}\n")
+    with pytest.raises(InputError, match=r"cube\.obj:9: f: no such vertex.*1 to 8.*got " + index):
+        load_mesh(file)
+
+
+COLLADA = """<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+ <asset>{unit}<up_axis>Y_UP</up_axis></asset>
+ <library_geometries><geometry id="g" name="block"><mesh>
+  <source id="p"><float_array id="pa" count="24">{corners}</float_array><technique_common>
+   <accessor source="#pa" count="8" stride="3"><param name="X" type="float"/>
+    <param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common>
+  </source>
+  <vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+  <triangles count="12"><input semantic="VERTEX" source="#v" offset="0"/><p>{faces}</p></triangles>
+ </mesh></geometry></library_geometries>
+ <library_visual_scenes><visual_scene id="s">
+  <node id="n" name="first"><instance_geometry url="#g"/></node>
+  <node id="m" name="second"><translate>5 0 0</translate><instance_geometry url="#g"/></node>
+ </visual_scene></library_visual_scenes>
+ <scene><instance_visual_scene url="#s"/></scene>
+</COLLADA>"""
+
+
+def write_collada(path: Path, unit: str) -> Path:
+    """Write two blocks of 1 × 2 × 3 units, at 0 and 5 along x."""
+    corners = " ".join(f"{x:g} {2 * y:g} {3 * z:g}" for x, y, z in CORNERS)
+    faces = " ".join(
+        f"{a - 1} {b - 1} {c - 1} {a - 1} {c - 1} {d - 1}" for a, b, c, d in FACES.tolist()
+    )
+    path.write_text(COLLADA.format(unit=unit, corners=corners, faces=faces), "utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("unit", "metres"),
+    [
+        ("", 1.0),
+        ('<unit name="meter" meter="1"/>', 1.0),
+        ('<unit meter="0.01" name="cm"/>', 0.01),
+        ('<unit meter="1e-3"/>', 1e-3),
+        ("<unit name='inch' meter='0.0254'/>", 0.0254),
+        ('<unit meter=" 0.3048 "/>', 0.3048),
+        ('<unit name="meter"/>', 1.0),
+    ],
+)
+def test_the_unit_of_collada_files_counts(tmp_path: Path, unit: str, metres: float) -> None:
+    file = write_collada(tmp_path / "block.dae", unit)
+    size = np.array([6.0, 2.0, 3.0]) * metres
+    np.testing.assert_allclose(load_mesh(file).extents, size)
+    np.testing.assert_allclose(load_mesh(file, (2.0, 1.0, 1.0)).extents, size * (2, 1, 1))
+    np.testing.assert_allclose(np.ptp(np.asarray(load_convex(file).points()), axis=0), size)
+    (part,) = load_parts(file)
+    np.testing.assert_allclose(np.ptp(part.vertices, axis=0), size)
+
+
+@pytest.mark.parametrize("unit", ["0", "-1", "inch", "nan", "1e400", "0,01"])
+def test_units_that_are_no_lengths_are_refused(tmp_path: Path, unit: str) -> None:
+    file = write_collada(tmp_path / "block.dae", f'<unit meter="{unit}"/>')
+    with pytest.raises(InputError, match=rf"block\.dae: <unit> meter: .*got {unit}"):
+        load_mesh(file)
+
+
+def test_submeshes_are_read_alone(tmp_path: Path) -> None:
+    two = write_two_cubes(tmp_path / "two.obj", materials=True)
+    np.testing.assert_allclose(load_mesh(two, submesh="cube1").bounds, [[2, 0, 0], [3, 1, 1]])
+    two.write_text(two.read_text().replace("o cube", "g all cube"))
+    np.testing.assert_allclose(load_mesh(two, submesh="cube0").bounds, [[0, 0, 0], [1, 1, 1]])
+    np.testing.assert_allclose(load_mesh(two, submesh="all").bounds, [[0, 0, 0], [3, 1, 1]])
+    block = write_collada(tmp_path / "block.dae", '<unit meter="0.1"/>')
+    for name, low in (("first", 0.0), ("second", 0.5), ("m", 0.5)):
+        mesh = load_mesh(block, submesh=name)
+        np.testing.assert_allclose(mesh.bounds[:, 0], [low, low + 0.1], atol=1e-9)
+    np.testing.assert_allclose(load_mesh(block, submesh="block").extents, [0.6, 0.2, 0.3])
+    scene = trimesh.Scene()
+    for name, at in (("lid", 0.0), ("pot", 4.0)):
+        scene.add_geometry(trimesh.creation.box().apply_translation((at, 0, 0)), node_name=name)
+    scene.export(tmp_path / "pot.glb")
+    mesh = load_mesh(tmp_path / "pot.glb", submesh="pot")
+    np.testing.assert_allclose(mesh.bounds[:, 0], [3.5, 4.5])
+    for file, word in ((two, "cube1"), (block, "second"), (tmp_path / "pot.glb", "lid")):
+        with pytest.raises(UnknownNameError, match=f"submesh 'cub'.*{word}") as caught:
+            load_mesh(file, submesh="cub")
+        assert caught.value.file == file
 
 
 def test_convex_hulls_equal_the_mesh(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 import pinocchio as pin
@@ -89,7 +90,7 @@ def test_colours_are_shared_by_name(tmp_path: Path) -> None:
     assert [shape.name for shape in shapes] == ["a_0", "a_1", "a_2"]
 
 
-def test_mesh_addresses_are_resolved(tmp_path: Path) -> None:
+def test_mesh_addresses_are_resolved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Given packages, folders above the file, the file's own folder, and absolute paths."""
     for folder in ("elsewhere", "robots/pack/meshes", "robots/pack/urdf"):
         (tmp_path / folder).mkdir(parents=True)
@@ -112,6 +113,34 @@ def test_mesh_addresses_are_resolved(tmp_path: Path) -> None:
         == robot.resolve(str(beside))
         == beside
     )
+    for name in ("a b.stl", "50%25.stl", "ü#1.stl", "m:n.stl", "%41.stl"):
+        file = path.parent / name
+        file.write_text("")
+        for address in (
+            name,
+            quote(name),
+            f"file://{quote(str(file))}",
+            f"file://localhost{quote(str(file))}",
+            f"file:{quote(str(file))}",
+            f"FILE:///{quote(str(file))}",
+            f"file://{quote(name)}",
+            f"package://pack/urdf/{quote(name)}",
+            f"package://pack//urdf/{name}",
+            f"package:///pack/urdf/{name}",
+            f"model://pack/urdf/{quote(name)}",
+            f" {name} ",
+        ):
+            assert robot.resolve(address).samefile(file), address
+    for folder in ("models/bin", "gazebo/tap"):
+        (tmp_path / "robots" / folder).mkdir(parents=True)
+        (tmp_path / "robots" / folder / "d.stl").write_text("")
+    monkeypatch.setenv("GZ_SIM_RESOURCE_PATH", f"/nowhere:{tmp_path}/robots/gazebo")
+    for name in ("bin", "tap"):
+        assert robot.resolve(f"model://{name}/d.stl").parent.name == name
+    with pytest.raises(InputError, match=r"not supported.*got https"):
+        robot.resolve("https://fuel.gazebosim.org/1.0/a.stl")
+    with pytest.raises(InputError, match=r"such as c\.stl"):
+        robot.resolve("c.std")
     for address in ("package://other/b.stl", "package://nowhere/a.stl", "a.stl"):
         with pytest.raises(InputError, match="no such mesh") as caught:
             robot.resolve(address)

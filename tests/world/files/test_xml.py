@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.xml import check_indices, find_line, parse_xml, quote, replace_forbidden
+from vkc_pin.world.files.xml import check_collada, find_line, parse_xml, quote, replace_forbidden
 
 FILE = Path("thing.urdf")
 
@@ -67,18 +67,18 @@ def test_invalid_indices_raise(tmp_path: Path, indices: str, tag: str) -> None:
     file = tmp_path / "mesh.dae"
     file.write_text(f"<a xmlns:c='c'>\n<{tag}>{indices}</{tag}></a>", encoding="utf-8")
     with pytest.raises(InputError, match=r"mesh.dae:2: <.*>: not indices"):
-        check_indices(file)
+        check_collada(file)
 
 
 def test_valid_indices_are_accepted(tmp_path: Path) -> None:
     file = tmp_path / "mesh.dae"
     file.write_text("<a><p>0 1 -1\n2 &#51;<!-- x --></p><n>x</n><p/></a>", encoding="utf-16")
-    check_indices(file)
+    check_collada(file)
     file.write_text("<a><p>0", encoding="utf-8")
     with pytest.raises(InputError, match="not valid XML"):
-        check_indices(file)
+        check_collada(file)
     with pytest.raises(InputError, match="cannot read"):
-        check_indices(tmp_path)
+        check_collada(tmp_path)
 
 
 @given(st.text())

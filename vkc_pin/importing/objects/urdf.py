@@ -100,6 +100,10 @@ def _read_limits(
 ) -> tuple[float, float] | None:
     """Return the limits of a joint, or None if the file states none."""
     limit, name = joint.find("limit"), joint.get("name", "")
+    for key in ("velocity", "effort"):  # -1 in SDF means none
+        if limit is not None and limit.get(key, "").lstrip().startswith("-"):
+            notes.append(f"joint '{name}' has a negative {key} limit: left out")
+            del limit.attrib[key]
     if limit is None:
         joint.append(ElementTree.Element("limit", {"lower": "0", "upper": "0"}))
         return None

@@ -45,7 +45,13 @@ def _check_limits(file: Path, name: str, joint: ElementTree.Element) -> None:
         raise make_element_error(file, joint, problem, field=name, expected="<limit>")
     for limit in limits:
         keys = ("lower", "upper", "velocity", "effort")
-        lower, upper, _, _ = (_parse_limit(file, name, limit, key)[0] for key in keys)
+        lower, upper, *rates = (_parse_limit(file, name, limit, key)[0] for key in keys)
+        for key, rate in zip(keys[2:], rates, strict=True):
+            if rate < 0.0:
+                problem, field = f"a negative {key} limit", f"{name}: limit {key}"
+                raise make_element_error(
+                    file, limit, problem, field=field, expected="0 or more", got=f"{rate:g}"
+                )
         if is_limited and lower > upper:
             problem, got = "limits in the wrong order", f"{lower:g} and {upper:g}"
             field, expected = f"{name}: limit", "lower ≤ upper"
@@ -53,7 +59,11 @@ def _check_limits(file: Path, name: str, joint: ElementTree.Element) -> None:
 
 
 def check_tree(file: Path, root: ElementTree.Element) -> None:
-    """Check that links and joints form one tree, with valid names, types and numbers."""
+    """Check that links and joints form one tree, with valid names, types and numbers.
+
+    Position limits beyond `MAX_COORDINATE`, such as the largest floats, mean none: revolute joints
+    that have only such limits become continuous.
+    """
     for element in root.iter():
         if element.tag.startswith("xacro:") and element.tag not in _XACRO_DEFINITIONS:
             expected, got = "a plain URDF: xacro FILE > robot.urdf", f"<{element.tag}>"
@@ -74,6 +84,8 @@ def check_tree(file: Path, root: ElementTree.Element) -> None:
                 file, joint, problem, field=child, expected="one joint", got=got
             )
         above[child] = parent, name
+        if joint.get("type") == "revolute" and _has_no_limits(file, name, joint):
+            joint.set("type", "continuous")
     _check_roots(file, links, above)
 
 
@@ -204,8 +216,13 @@ def parse_numbers(
         largest: Largest valid magnitude.
     """
     text = element.get(key, default)
+    parts = (text or "").split()
+    # Commas count between all numbers only: in "0,5 1" it would be a decimal point.
+    by_comma = [part.strip() for part in (text or "").strip().rstrip(",").split(",")]
+    if has_commas := len(by_comma) == count > 1:
+        parts = by_comma
     try:
-        values = tuple(float(part) for part in (text or "").split())
+        values = tuple(map(float, parts))
     except ValueError:
         values = ()
     if len(values) != count or not all(
@@ -213,13 +230,15 @@ def parse_numbers(
     ):
         field, expected = (
             f"{where}: {element.tag} {key}",
-            f"{count} finite number{'s' * (count > 1)}",
+            f"{count} finite numbers with spaces between them" if count > 1 else "1 finite number",
         )
         if values and len(values) == count and all(map(math.isfinite, values)):
             expected = f"at most {largest:g}"
         raise make_element_error(
             file, element, "wrong numbers", field=field, expected=expected, got=text
         )
+    if has_commas:
+        warnings.warn(f"{file}: {element.tag} {key}: commas are read as spaces", stacklevel=2)
     return values
 
 
@@ -262,8 +281,20 @@ def _find_link(
     return link
 
 
-def _parse_limit(file: Path, name: str, limit: ElementTree.Element, key: str) -> tuple[float, ...]:
-    return parse_numbers(file, limit, key, 1, default="0", where=name, largest=math.inf)
+def _parse_limit(file: Path, name: str, limit: ElementTree.Element, key: str) -> tuple[float]:
+    (value,) = parse_numbers(file, limit, key, 1, default="0", where=name, largest=math.inf)
+    if key in ("lower", "upper"):
+        value = min(max(value, -MAX_COORDINATE), MAX_COORDINATE)
+    return (value,)
+
+
+def _has_no_limits(file: Path, name: str, joint: ElementTree.Element) -> bool:
+    """Return whether both limits of a joint are so large that they mean none."""
+    return all(
+        abs(_parse_limit(file, name, limit, key)[0]) == MAX_COORDINATE
+        for limit in joint.findall("limit")
+        for key in ("lower", "upper")
+    )
 
 
 def _check_joint(

@@ -1,27 +1,34 @@
 """Reads mesh files and converts them to coal shapes, whose volume and area are checked.
 
 Meshes are read with trimesh: coal 3.0.3 restarts the triangle indices at every object of an OBJ
-file. Only COLLADA files (`.dae`), for which trimesh would need another package, are read by coal.
+file. Only COLLADA files (`.dae`), for which trimesh would need another package, are read by coal,
+which ignores their unit. As in RViz and Gazebo, the unit counts and the upward axis does not.
 """
 
 from __future__ import annotations
 
 import contextlib
+import io
+import re
+import tempfile
 import warnings
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import coal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vkc_pin.errors import InputError
+from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.arrays import MAX_COORDINATE, Floats, Ints
+from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.hulls import SHEET_THICKNESS, compute_hull, compute_outer_hull, thicken
 from vkc_pin.world.files.resources import check_path
-from vkc_pin.world.files.xml import check_indices
+from vkc_pin.world.files.xml import check_collada, parse_xml
 
 if TYPE_CHECKING:
     import trimesh
@@ -39,6 +46,9 @@ __all__ = [
 
 _MAX_NEIGHBOURS = 255  # coal's corners have no more
 _MAX_CACHED_HULLS = 512  # that a process keeps: robots are loaded again and again
+_MARK = b"\xef\xbb\xbf"  # byte-order mark of UTF-8
+# Faces of OBJ files whose corners count from the end, or from 0
+_NOT_FROM_ONE = re.compile(rb"\nf[^\n]*[ /][-0]")
 _HULL_TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
 
 
@@ -57,12 +67,20 @@ class MeshPart:
     colour: tuple[float, float, float, float] | None = None
 
 
-def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.Trimesh:
+def load_mesh(
+    path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, submesh: str | None = None
+) -> trimesh.Trimesh:
     """Return a mesh file as one mesh of all its objects, in the file's frame [m].
 
     Args:
         path: OBJ, STL, PLY, OFF, glTF or COLLADA file.
-        scale: Factor from the file's unit to [m], or one for each axis.
+        scale: Factor from the file's unit to [m], or one for each axis. COLLADA files state their
+            unit, which counts as well.
+        submesh: Name of an object, group or node, to read it alone.
+
+    Raises:
+        InputError: There is no such file, or it is not a valid mesh.
+        UnknownNameError: The file has no such submesh.
     """
     import trimesh
 
@@ -72,15 +90,18 @@ def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.T
         raise InputError("there is no such mesh", file=file, expected="a mesh file")
     by_coal = file.suffix.lower() == ".dae"
     if by_coal:
-        check_indices(file)
+        factors = factors * check_collada(file)
     try:
         if by_coal:
-            shape = coal.MeshLoader().load(str(file), np.ones(3))
-            mesh = trimesh.Trimesh(np.array(shape.vertices()), get_triangles(shape))
+            mesh = _read_collada(file, submesh)
         else:
-            mesh = trimesh.load_mesh(file, force="mesh", skip_materials=True)
-            if isinstance(mesh, trimesh.Scene):
-                mesh = mesh.to_mesh()
+            source, settings = _open_mesh(file, submesh)
+            mesh = trimesh.load_scene(source, force="mesh", skip_materials=True, **settings)
+            if submesh is not None and file.suffix.lower() != ".obj":
+                mesh = _extract_submesh(mesh, file, submesh)
+            mesh = mesh.to_mesh()
+    except InputError:
+        raise
     except Exception as error:  # readers raise any type
         expected = "a COLLADA file" if by_coal else "an OBJ, STL, PLY, OFF, glTF or COLLADA file"
         raise InputError(f"cannot read the mesh: {error}", file=file, expected=expected) from error
@@ -107,6 +128,117 @@ def load_mesh(path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0)) -> trimesh.T
         )
     mesh.apply_transform(np.diag([*factors, 1.0]))
     return mesh
+
+
+def _read_collada(file: Path, submesh: str | None) -> trimesh.Trimesh:
+    """Return a COLLADA file, or the geometry of one of its nodes, in the file's unit."""
+    import trimesh
+
+    if submesh is None:
+        shape = coal.MeshLoader().load(str(file), np.ones(3))
+        return trimesh.Trimesh(np.array(shape.vertices()), get_triangles(shape))
+    root = parse_xml(read_text(file, "COLLADA"), file)
+    labels = {
+        f"#{geometry.get('id')}": {geometry.get("id", ""), geometry.get("name", "")}
+        for geometry in root.iter("geometry")
+    }
+    names, is_found = dict[str, None](), False
+    for node in root.iter("node"):
+        for instance in node.findall("instance_geometry"):
+            own = {node.get("name", ""), node.get("id", "")}
+            own |= labels.get(instance.get("url", ""), set())
+            names.update(dict.fromkeys(sorted(own - {""})))
+            is_found |= submesh in own
+            if submesh not in own:
+                node.remove(instance)
+    if not is_found:
+        raise UnknownNameError("submesh", submesh, names, file=file)
+    with tempfile.TemporaryDirectory() as scratch:
+        copy = Path(scratch, "submesh.dae")
+        ElementTree.ElementTree(root).write(copy, encoding="utf-8", xml_declaration=True)
+        return _read_collada(copy, None)
+
+
+def _extract_submesh(scene: trimesh.Scene, file: Path, submesh: str) -> trimesh.Scene:
+    """Return the part of a scene whose node or geometry has a name."""
+    import trimesh
+
+    found, names = trimesh.Scene(), dict[str, None]()
+    for node in scene.graph.nodes_geometry:
+        transform, geometry = scene.graph[node]
+        names.update({str(node): None, str(geometry): None})
+        if submesh in (str(node), str(geometry)):
+            found.add_geometry(scene.geometry[geometry], transform=transform)
+    if not found.geometry:
+        raise UnknownNameError("submesh", submesh, names, file=file)
+    return found
+
+
+def _open_mesh(file: Path, submesh: str | None = None) -> tuple[Path | io.BytesIO, dict[str, Any]]:
+    """Return what trimesh reads a mesh from, changed where it would misread it, and settings."""
+    import trimesh
+
+    kind = file.suffix.lower()[1:]
+    if kind not in ("obj", "gltf"):
+        return file, {}
+    data = file.read_bytes()
+    is_usual = (
+        submesh is None
+        and not data.startswith((_MARK, b" "))
+        and not any(text in data for text in (b"\t", b"\n ", b"\\\n", b"\\\r"))
+        and data.count(b"\r") == data.count(b"\r\n")
+        and not _NOT_FROM_ONE.search(data)
+    )
+    if kind == "obj" and not is_usual:
+        data = _normalize_obj(data, file, submesh)
+    elif data.startswith(_MARK):
+        data = data.removeprefix(_MARK)
+    else:
+        return file, {}
+    settings = {"file_type": kind, "resolver": trimesh.resolvers.FilePathResolver(file)}
+    return io.BytesIO(data), settings
+
+
+def _normalize_obj(data: bytes, file: Path, submesh: str | None) -> bytes:
+    """Return an OBJ file with plain lines, faces that count from 1, and one object if named."""
+    for old, new in ((b"\r\n", b"\n"), (b"\r", b"\n"), (b"\\\n", b" ")):
+        data = data.replace(old, new)
+    counts = {b"v": 0, b"vt": 0, b"vn": 0}
+    wanted = None if submesh is None else submesh.encode()
+    lines, names = list[bytes](), dict[str, None]()
+    is_kept = is_found = wanted is None
+    for number, line in enumerate(data.removeprefix(_MARK).split(b"\n"), 1):
+        key, *values = line.split() or [b""]
+        if key in counts:
+            counts[key] += 1
+        elif key in (b"o", b"g"):  # a group may have several names
+            own = {b" ".join(values), *values}
+            names.update(dict.fromkeys(name.decode(errors="replace") for name in sorted(own)))
+            is_kept = wanted is None or wanted in own
+        elif key == b"f":
+            if not is_kept:
+                continue
+            is_found = True
+            corners = line.partition(b"#")[0].split()[1:]
+            values = [_count_from_start(corner, counts, file, number) for corner in corners]
+        lines.append(b" ".join([key, *values]))
+    if not is_found:
+        raise UnknownNameError("submesh", str(submesh), names, file=file)
+    return b"\n".join(lines)
+
+
+def _count_from_start(corner: bytes, counts: Mapping[bytes, int], file: Path, line: int) -> bytes:
+    """Return a corner of a face, such as `-3/-3/1`, with indices that count from 1."""
+    indices = list[bytes]()
+    for text, count in zip(corner.split(b"/"), counts.values(), strict=False):
+        if text.startswith(b"-"):
+            text = b"%d" % (count + 1 + int(text))
+        if not indices and int(text) < 1:
+            problem, expected = "no such vertex", f"1 to {count}, or -1 to {-count} from the last"
+            got = corner.decode(errors="replace")
+            raise InputError(problem, file=file, line=line, field="f", expected=expected, got=got)
+        indices.append(text)
+    return b"/".join(indices)
 
 
 def load_convex(
@@ -211,7 +343,12 @@ def load_parts(
         ]
     factors = _check_scale(file, scale)
     try:
-        scene = trimesh.load_scene(file, process=False, group_material=True, split_object=False)
+        source, settings = _open_mesh(file)
+        scene = trimesh.load_scene(
+            source, process=False, group_material=True, split_object=False, **settings
+        )
+    except InputError:
+        raise
     except Exception as error:
         raise InputError(
             f"cannot read the mesh: {error}", file=file, expected="an OBJ file"

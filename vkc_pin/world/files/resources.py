@@ -5,28 +5,35 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
+from urllib.parse import unquote
 
 import pinocchio as pin
 
-from vkc_pin.errors import InputError, UnknownNameError, format_value
+from vkc_pin.errors import InputError, UnknownNameError, find_nearest_name, format_value
 
 __all__ = [
     "check_path",
     "choose_file_names",
     "find_example_robot_data",
     "find_file",
+    "find_mesh_file",
     "find_package_folder",
     "find_resource",
     "find_resource_folder",
+    "list_address_candidates",
     "list_resources",
 ]
 
 _MAX_NAME_LENGTH = (
     64  # characters of a file name without extension; file systems take 255 bytes with it
 )
+_SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(.*)", re.DOTALL)  # not C:, a drive
+_MODEL_PATHS = ("GZ_SIM_RESOURCE_PATH", "GAZEBO_MODEL_PATH")  # variables with folders of models
+_NO_PACKAGES: Mapping[str, Path] = MappingProxyType({})
 _FILE_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _PORT_NAMES = {f"{port}{number}" for port in ("com", "lpt") for number in range(10)}
 _RESERVED_NAMES = {"con", "prn", "aux", "nul", *_PORT_NAMES}  # reserved on Windows
@@ -91,6 +98,105 @@ def find_example_robot_data() -> Path | None:
         if (prefix / "share" / "example-robot-data" / "robots").is_dir():
             return prefix / "share" / "example-robot-data"
     return None
+
+
+def find_mesh_file(
+    address: str,
+    file: Path,
+    packages: Mapping[str, Path] = _NO_PACKAGES,
+    *,
+    line: int | None = None,
+) -> Path:
+    """Return the mesh file of an address in a description file.
+
+    Args:
+        address: A path relative to `file`, a `file:` URI, `package://NAME/...` or
+            `model://NAME/...`, as it is or percent-encoded.
+        file: The description file.
+        packages: Folders of packages and models by name; others are searched around `file`.
+        line: Line of the address in `file`, for messages.
+
+    Raises:
+        InputError: There is no such file.
+    """
+    candidates = [
+        check_path(candidate, "filename", "a mesh file")
+        for candidate in list_address_candidates(address, file, packages)
+    ]
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    first, expected = candidates[0], "a mesh file"
+    if first.parent.is_dir():
+        nearest = find_nearest_name(
+            first.name, sorted(item.name for item in first.parent.iterdir())
+        )
+        expected += f", such as {nearest}" if nearest else ""
+    raise InputError(
+        "there is no such mesh",
+        file=file,
+        line=line,
+        field=address,
+        expected=expected,
+        got=f"nothing at {first}",
+    )
+
+
+def list_address_candidates(
+    address: str, file: Path, packages: Mapping[str, Path] = _NO_PACKAGES
+) -> list[Path]:
+    """Return the paths that an address in a description file may mean; see `find_mesh_file`.
+
+    Raises:
+        InputError: The address has another scheme, such as `https:`.
+    """
+    text = address.strip()
+    match = _SCHEME.fullmatch(text)
+    scheme, rest = (match[1].lower(), match[2]) if match else ("", text)
+    if scheme in ("package", "model"):
+        found = list(_list_package_candidates(rest.lstrip("/"), file, packages))
+    elif scheme in ("", "file"):
+        if rest.startswith("//"):  # `file://HOST/PATH`; without a host also for relative paths
+            host, slash, path = rest[2:].partition("/")
+            rest = slash + path if host.lower() in ("", "localhost") else rest[2:]
+        found = [folder / rest for folder in _list_folders(file)]
+    elif rest.startswith("//"):
+        raise InputError(
+            "this kind of address is not supported",
+            file=file,
+            field=address,
+            expected="a path, or an address with file:, package:// or model://",
+            got=f"{scheme}://",
+        )
+    else:  # a colon in a file name
+        found = [folder / text for folder in _list_folders(file)]
+    decoded = [Path(unquote(str(path))) for path in found]
+    return list(dict.fromkeys(found + decoded))
+
+
+def _list_folders(file: Path) -> list[Path]:
+    """Return the folder of a link to a file, and that of the file itself."""
+    return [file.absolute().parent, file.resolve().parent]
+
+
+def _list_package_candidates(
+    address: str, file: Path, packages: Mapping[str, Path]
+) -> Iterator[Path]:
+    """Yield the paths of `NAME/...` in given folders, around a file and in Gazebo's folders."""
+    name, _, inside = address.partition("/")
+    inside = inside.lstrip("/")
+    if name in packages:
+        yield packages[name] / inside
+    around = dict.fromkeys([*file.absolute().parents, *file.resolve().parents])
+    yield from (folder / name / inside for folder in around)
+    yield from (folder / inside for folder in around)
+    yield from (folder / "models" / name / inside for folder in around)
+    for variable in _MODEL_PATHS:
+        for folder in filter(None, os.environ.get(variable, "").split(os.pathsep)):
+            yield Path(folder) / name / inside
+    # for copies of its URDFs, wherever they are
+    if name == "example-robot-data" and (data := find_example_robot_data()) is not None:
+        yield data / inside
 
 
 def choose_file_names(

@@ -15,10 +15,9 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.files import resources
 from vkc_pin.world.files.kinematic_tree import check_tree, parse_numbers, simplify_tree
 from vkc_pin.world.files.meshes import load_convex, load_mesh, make_bvh
-from vkc_pin.world.files.resources import check_path
+from vkc_pin.world.files.resources import find_mesh_file
 from vkc_pin.world.files.xml import make_element_error, read_xml
 
 if TYPE_CHECKING:
@@ -132,35 +131,8 @@ class UrdfFile:
         return shapes
 
     def resolve(self, address: str) -> Path:
-        """Return the file of a mesh's address: `package://NAME/...`, `file://...`, or a path."""
-        if address.startswith("package://"):
-            package, _, inside = address.removeprefix("package://").partition("/")
-            folders = [self.packages[package]] if package in self.packages else []
-            # parents of a link to the file, and of the file itself
-            around = dict.fromkeys([*self.path.parents, *self.path.resolve().parents])
-            folders += [folder / package for folder in around] + list(around)
-            if (
-                package == "example-robot-data"
-                and (data := resources.find_example_robot_data()) is not None
-            ):
-                folders.append(data)  # for copies of its URDFs, wherever they are
-            candidates = [folder / inside for folder in folders]
-        else:
-            plain = Path(address.removeprefix("file://"))
-            candidates = [
-                folder / plain for folder in (self.path.parent, self.path.resolve().parent)
-            ]  # plain, if absolute
-        for candidate in candidates:
-            if check_path(candidate, "filename", "a mesh file").is_file():
-                return candidate
-        tried = f"nothing at {candidates[0]}"
-        raise InputError(
-            "there is no such mesh",
-            file=self.path,
-            field=address,
-            expected="a mesh file",
-            got=tried,
-        )
+        """Return the file of a mesh's address; see `find_mesh_file`."""
+        return find_mesh_file(address, self.path, self.packages)
 
     def _shape(
         self, link: str, name: str, element: ElementTree.Element, colours: Mapping[str, Colour]

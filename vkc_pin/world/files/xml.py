@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -13,7 +14,7 @@ from vkc_pin.errors import InputError, format_value
 from vkc_pin.world.files.documents import read_text
 
 __all__ = [
-    "check_indices",
+    "check_collada",
     "find_line",
     "make_element_error",
     "parse_xml",
@@ -100,12 +101,18 @@ def quote(text: str) -> str:
     return quoteattr(replace_forbidden(text))
 
 
-def check_indices(file: Path) -> None:
-    """Check that index lists in a COLLADA file hold integers; assimp hangs otherwise."""
-    parser, inside = expat.ParserCreate(), list[str]()
+def check_collada(file: Path) -> float:
+    """Check that index lists in a COLLADA file hold integers, and return the file's unit [m].
 
-    def start(tag: str, _: dict[str, str]) -> None:
+    Assimp hangs on other index lists, and coal ignores the unit.
+    """
+    parser, inside = expat.ParserCreate(), list[str]()
+    unit = ["1"]
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
         inside.append(tag.rpartition(":")[2])
+        if inside == ["COLLADA", "asset", "unit"]:
+            unit[:] = [attributes.get("meter", "1")]
 
     def text(data: str) -> None:
         if inside and inside[-1] in _INDEX_ELEMENTS and data.strip("0123456789+- \t\r\n"):
@@ -133,3 +140,11 @@ def check_indices(file: Path) -> None:
         raise InputError(f"not valid XML: {error}", file=file, line=error.lineno) from error
     except OSError as error:
         raise InputError("cannot read the file", file=file, got=error.strerror) from error
+    try:
+        metres = float(unit[0])
+    except ValueError:
+        metres = math.nan
+    if not 0.0 < metres < math.inf:
+        field, expected = "<unit> meter", "a positive number"
+        raise InputError("not a unit", file=file, field=field, expected=expected, got=unit[0])
+    return metres

@@ -55,9 +55,10 @@ def test_invalid_numbers_raise(name: str, value: Any) -> None:
         ("max_restarts", 10**9),
         ("dt", 1e-9),
         ("dt", 1e9),
+        *(("jerk_time", value) for value in (5e-324, 1e-12, 1e-9, 1e-4, 4.9e-3, 11.0)),
     ],
 )
-def test_values_have_upper_limits(name: str, value: Any) -> None:
+def test_values_are_limited(name: str, value: Any) -> None:
     with pytest.raises(InputError, match=r"at most|from") as caught:
         Options(**{name: value})
     assert caught.value.field == f"Options.{name}"
@@ -95,3 +96,8 @@ def test_the_paper_has_equal_weights() -> None:
         == paper.velocity_weight_object
         == 1.0
     )
+
+
+@pytest.mark.parametrize("value", [0, 0.0, -0.0, 0.005, 10])
+def test_jerk_time_is_zero_or_long_enough(value: float) -> None:
+    assert Options(jerk_time=value).jerk_time == value

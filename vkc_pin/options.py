@@ -18,7 +18,7 @@ _RANGES = {
     "grasp_time": (_MIN, 3600.0),
     "approach_time": (_MIN, 3600.0),
     "approach": (_MIN, 10.0),
-    "jerk_time": (0.0, 10.0),
+    "jerk_time": (0.005, 10.0),  # or 0; motions have a knot every 0.6 ms at the lower bound
 }
 _MAX_INTEGERS = {  # beyond these, planning takes hours and gigabytes
     **dict.fromkeys(("reach_waypoints", "turn_waypoints", "move_waypoints"), 500),
@@ -33,8 +33,8 @@ class Options:
     Attributes:
         dt: Shortest time between two waypoints [s].
         grasp_time: Time at rest for the gripper to close or open [s].
-        jerk_time: Shortest time in which an acceleration rises to its limit [s], which limits
-            jerks; 0: unlimited.
+        jerk_time: Shortest time in which an acceleration rises to its limit [s], at least 5 ms,
+            which limits jerks; 0: unlimited.
         reach_waypoints: Segments of a phase that drives or reaches, carrying an object or not.
         turn_waypoints: Segments of a phase that releases a latch.
         move_waypoints: Segments of a phase that moves a grasped object.
@@ -95,8 +95,12 @@ class Options:
                 value = check_integer(value, field, low=1, high=_MAX_INTEGERS[item.name])
             else:
                 low, high = _RANGES.get(item.name, (_MIN, _MAX))
-                expected = f"a {'positive ' if low else ''}finite number, from {low:g} to {high:g}"
-                value = check_number(value, field, expected, low=low, high=high)
+                has_zero = item.name == "jerk_time"
+                expected = f"a positive finite number, from {low:g} to {high:g}"
+                expected += ", or 0" if has_zero else ""
+                value = check_number(value, field, expected, low=0.0, high=high)
+                if not (low <= value or (has_zero and value == 0.0)):
+                    raise InputError("out of range", field=field, expected=expected, got=value)
             object.__setattr__(self, item.name, value)  # JSON has no NumPy types
 
     @classmethod

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
+from typing import Any
 
+import casadi
 import pytest
 
 import vkc_pin as vkc
 from vkc_pin.validation.report import Report, Violation
+from vkc_pin.world.task.terms import trace_terms
 
 
 def test_failed_plan_keeps_its_violations(door_plan: vkc.Plan, tmp_path: Path) -> None:
@@ -127,3 +131,39 @@ def test_motion_out_of_range(door_plan: vkc.Plan, tmp_path: Path) -> None:
         with pytest.raises(vkc.InputError, match=said) as caught:
             vkc.Plan.load(path)
         assert caught.value.file == path
+
+
+@pytest.mark.parametrize("amount", [float("inf"), 1e308, 0.5])
+@pytest.mark.parametrize("ratio", [float("inf"), float("nan"), -float("inf"), 0.5])
+def test_plan_with_any_amounts_is_saved_and_loaded(
+    door_plan: vkc.Plan, tmp_path: Path, amount: float, ratio: float
+) -> None:
+    blame = Violation("term", "c", amount=amount, unit="", detail="too much")
+    failed = dataclasses.replace(
+        door_plan,
+        report=dataclasses.replace(door_plan.report, violations=(blame,)),
+        status="infeasible",
+        history=({**door_plan.history[0], "ratio": ratio},),
+    )
+    loaded = vkc.Plan.load(failed.save(tmp_path / "plan.npz"), validate=False)
+    assert loaded.report.violations == (blame,)
+    assert str(loaded.history[0]["ratio"]) == str(ratio)
+    text = failed.to_json(tmp_path / "plan.json").read_text(encoding="utf-8")
+    data = json.loads(text, parse_constant=pytest.fail)
+    assert data["violations"][0]["amount"] == (None if amount == float("inf") else amount)
+    motion = vkc.Trajectory.from_json(tmp_path / "plan.json")
+    assert motion.to_dict() == door_plan.trajectory.to_dict()
+
+
+def test_overflowing_term_of_a_plan_is_saved_and_loaded(
+    door_plan: vkc.Plan, tmp_path: Path
+) -> None:
+    def overflow(state: vkc.State) -> Any:
+        return casadi.exp(casadi.exp(200.0 + state.coordinate("base_x")))
+
+    terms = trace_terms(door_plan.scene, [vkc.Constraint("c", overflow, upper=1.0)])
+    report = vkc.validate(door_plan.scene, door_plan.steps, door_plan.trajectory, terms=terms)
+    plan = dataclasses.replace(door_plan, terms=terms, report=report, status="time limit")
+    loaded = vkc.Plan.load(plan.save(tmp_path / "plan.npz"))
+    assert [(v.subject, v.amount) for v in loaded.report.violations] == [("c", float("inf"))]
+    assert loaded.contradictions() == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -89,9 +90,19 @@ def test_contact_with_unplanned_obstacle_is_reported() -> None:
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_diverged_simulation_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"base_bandwidth": 1e7, "arm_bandwidth": 1e7},
+        {"base_bandwidth": 1e7, "arm_bandwidth": 1e7, "damping_ratio": 100.0},
+        {"base_bandwidth": 1e7, "arm_bandwidth": 1e7, "damping_ratio": 0.0, "settle": 0.0},
+    ],
+)
+def test_diverged_simulation_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, float]
+) -> None:
     monkeypatch.chdir(tmp_path)
-    wild = vkc.Physics(timestep=0.01, base_bandwidth=1e7, arm_bandwidth=1e7)
+    wild = vkc.Physics(timestep=0.01, **changes)
     result = plan_drawer().simulate(physics=wild)
     assert result.diverged is not None
     assert result.diverged < 10.0
@@ -128,3 +139,13 @@ def test_invalid_argument_is_named(options: dict[str, object], field: str) -> No
     with pytest.raises(vkc.InputError) as caught:
         plan_drawer().simulate(**options)
     assert caught.value.field == field
+
+
+@pytest.mark.parametrize("grasp", ["weld", "friction"])
+def test_motion_of_a_day_is_too_long_to_execute(grasp: str) -> None:
+    plan = plan_drawer()
+    times = 1e5 * plan.trajectory.times
+    slow = dataclasses.replace(plan.trajectory, times=times, curve=None)
+    with pytest.raises(vkc.InputError, match="too many time steps") as caught:
+        simulate(plan.scene, plan.steps, slow, grasp=grasp)
+    assert caught.value.field == "trajectory"

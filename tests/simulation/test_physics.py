@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import fields
 
 import coal
 import numpy as np
@@ -32,6 +33,9 @@ def test_missing_mujoco_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -
         ("friction", -1.0),
         ("grasp_force", float("nan")),
         ("balanced", 1),
+        ("timestep", 1e-9),
+        ("grip_time", 0.0),
+        *((item.name, 1e9 * 1.1) for item in fields(vkc.Physics) if item.name != "balanced"),
     ],
 )
 def test_out_of_range_setting_is_named(name: str, value: object) -> None:

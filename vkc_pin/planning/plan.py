@@ -8,13 +8,11 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.planning.statistics import PlanningStatistics
 from vkc_pin.utils.arguments import check_bool, check_choice
-from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.arrays import Floats, replace_infinite
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import check_arguments, validate
 from vkc_pin.world.files.resources import check_path
@@ -141,15 +139,13 @@ class Plan:
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return trajectory, metrics and report as plain data; infinite distances are None."""
-        return {
+        """Return trajectory, metrics and report as plain data; infinite numbers are None."""
+        data = {
             "scene": self.scene.name,
             "steps": [step_to_dict(step) for step in self.steps],
             "success": self.success,
             "status": self.status,
-            "metrics": {
-                key: value if np.isfinite(value) else None for key, value in self.metrics.items()
-            },
+            "metrics": self.metrics,
             "seed": self.seed,
             "initialization": self.initialization,
             "violations": [asdict(violation) for violation in self.report.violations],
@@ -157,12 +153,13 @@ class Plan:
             "bounds": [asdict(bound) for bound in self.report.bounds],
             "remarks": list(self.report.remarks),
             "exemptions": [asdict(exemption) for exemption in self.report.exemptions],
-            "trajectory": self.trajectory.to_dict(),
         }
+        return {**replace_infinite(data), "trajectory": self.trajectory.to_dict()}
 
     def to_json(self, path: str | Path) -> Path:
         """Write `to_dict` as JSON; `Trajectory.from_json` reads the trajectory."""
-        return write_atomically(path, (json.dumps(self.to_dict(), indent=1) + "\n").encode("utf-8"))
+        text = json.dumps(self.to_dict(), indent=1, allow_nan=False)
+        return write_atomically(path, (text + "\n").encode("utf-8"))
 
     def to_csv(self, path: str | Path, **options: Any) -> Path:
         """Write the trajectory as a table with a row per waypoint; see `tables.write_csv`."""

@@ -49,6 +49,7 @@ _FRICTION_STEP = 5e-4  # [s] longest time step with friction grasps; see `Builde
 _CLOSED_TIME = 0.2
 _FRAME_PERIOD = 0.02  # [s] between recorded states
 _CONTACT_PERIOD = 0.01  # [s] between two recordings of contacts
+_MAX_STEPS = 2_000_000  # time steps, of which each keeps a row: 1.1 h at 2 ms
 
 
 def simulate(
@@ -189,7 +190,15 @@ class _Run:
             settle = max(settle, physics.grip_time + _CLOSED_TIME)
         start = float(trajectory.times[0]) - settle
         end = float(trajectory.times[-1]) + physics.settle
-        steps = np.arange(int(np.ceil((end - start) / physics.timestep - 1e-9)) + 1)
+        count = (end - start) / physics.timestep
+        if count > _MAX_STEPS:
+            raise InputError(
+                "the motion takes too many time steps",
+                field="trajectory",
+                expected=f"at most {_MAX_STEPS * physics.timestep:g} s, with those of `settle`",
+                got=f"{end - start:.6g} s",
+            )
+        steps = np.arange(int(np.ceil(count - 1e-9)) + 1)
         self.times: Floats = np.asarray(start + physics.timestep * steps, float)
         self.diverged: float | None = None
         self.contact_samples: dict[tuple[str, str], list[tuple[float, float]]] = {}
@@ -228,6 +237,7 @@ class _Run:
             k for k in range(len(self.times)) if k % frame_steps == 0 or k == len(self.times) - 1
         ]
         self.clocks, records = self.times[recorded], list[Floats]()
+        diverging = [getattr(mj.mjtWarning, f"mjWARN_BADQ{name}") for name in ("POS", "VEL", "ACC")]
         for k, clock in enumerate(self.times.tolist()):
             self.grips.follow(data, clock)
             self.latches.follow(data)
@@ -239,19 +249,17 @@ class _Run:
                 data.ctrl[finger_motors] = squeeze[k]
             mj.mj_step(model, data)
             self.efforts[k] = data.qfrc_actuator[dofs]
+            # MuJoCo resets a state that diverged; it has no welds then.
+            if not np.isfinite(data.qpos).all() or any(data.warning[kind].number for kind in diverging):
+                self.diverged, end = clock, k + 1
+                self.times, self.errors = self.times[:end], self.errors[:end]
+                self.efforts = self.efforts[:end]
+                break
             self.grips.measure(data, clock)
             if k % contact_steps == 0 and data.ncon:
                 self._record_contacts(data, labels, clock)
             if k % contact_steps == 0 and self.squeezes is not None:
                 self.squeezes.measure(data, clock)
-            if (
-                not np.isfinite(data.qpos).all()
-                or data.warning[mj.mjtWarning.mjWARN_BADQACC].number
-            ):
-                self.diverged, end = clock, k + 1
-                self.times, self.errors = self.times[:end], self.errors[:end]
-                self.efforts = self.efforts[:end]
-                break
         # After a divergence the last state is repeated.
         records += [records[-1]] * (len(recorded) - len(records))
         self.states: Floats = np.array(records)

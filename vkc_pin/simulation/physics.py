@@ -20,15 +20,24 @@ _NO_MASS = 1e-9  # [kg] up to which a body counts as massless
 _LEAST_MASS = 1e-3  # [kg] of bodies with neither mass nor collision shape
 _LEAST_INERTIA = 1e-6  # smallest moment of inertia per mass [m²]: (1 mm)²
 _ROUNDING = 0.05  # largest correction of an inertia that is not reported, relative
-_NONNEGATIVE = (
-    "settle",
-    "damping_ratio",
-    "revolute_damping",
-    "prismatic_damping",
-    "friction",
-    "latch_play",
-)
-_MAX_STEP = 0.01  # [s]; longer steps miss contacts
+# Smallest and largest settings. Shorter time steps and longer waits take hours and gigabytes, longer
+# time steps miss contacts, and beyond the others the integration breaks down at once.
+_RANGES = {
+    "timestep": (1e-4, 0.01),
+    "settle": (0.0, 60.0),
+    "arm_bandwidth": (1e-3, 1e7),
+    "base_bandwidth": (1e-3, 1e7),
+    "damping_ratio": (0.0, 100.0),
+    "revolute_damping": (0.0, 1e6),
+    "prismatic_damping": (0.0, 1e6),
+    "density": (1e-3, 1e5),
+    "friction": (0.0, 100.0),
+    "grasp_force": (1e-6, 1e9),
+    "grasp_torque": (1e-6, 1e9),
+    "closing_force": (1e-6, 1e6),
+    "grip_time": (1e-3, 60.0),
+    "latch_play": (0.0, 10.0),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,8 +45,8 @@ class Physics:
     """Settings of a simulation.
 
     Attributes:
-        timestep: Integration step [s], at most 0.01.
-        settle: Time at rest before and after the motion [s].
+        timestep: Integration step [s], from 1e-4 to 0.01.
+        settle: Time at rest before and after the motion [s], at most 60.
         arm_bandwidth: Natural frequency of the arm's and fingers' position servos, for the largest
             inertia that each moves along the plan [rad/s]. The default is about 6 Hz, as position
             interfaces of industrial arms reach.
@@ -85,13 +94,10 @@ class Physics:
             if name == "balanced":
                 check_bool(self.balanced, "Physics.balanced")
                 continue
-            high = _MAX_STEP if name == "timestep" else float("inf")
+            low, high = _RANGES[name]
+            expected = f"a number from {low:g} to {high:g}"
             value = check_number(
-                getattr(self, name),
-                f"Physics.{name}",
-                low=0.0,
-                high=high,
-                strict=name not in _NONNEGATIVE,
+                getattr(self, name), f"Physics.{name}", expected, low=low, high=high
             )
             object.__setattr__(self, name, value)
 

@@ -113,3 +113,22 @@ def test_velocity_constraints_prevent_retiming() -> None:
     plan = vkc.plan(load_door_scene(), [vkc.GoTo(0.5, 0.2)], terms=[limit])
     assert plan.success, plan.summary()
     assert plan.trajectory.curve is None
+
+
+@pytest.mark.parametrize("jerk_time", [0.02, 0.1, 0.5])
+@pytest.mark.parametrize("gap", [0.0, 1e-7, 1e-6, 2e-6, 1e-5, 1e-4, 3e-4])
+def test_tiny_step_costs_no_more_than_a_stop(gap: float, jerk_time: float) -> None:
+    """However small the jerk limits, a waypoint beside another does not slow down the motion."""
+    scene = vkc.load_scene("door")
+    slow = sample_trajectory(scene)
+    rows = np.insert(slow.positions, 6, slow.positions[6], axis=0)
+    rows[7, 5] += gap
+    twice = Trajectory(
+        slow.names, np.arange(14.0), rows, (vkc.PhaseSpan("go", 0, 13),), rows.shape[1]
+    )
+    once = retime_trajectory(scene, slow, jerk_time=jerk_time)
+    motion = retime_trajectory(scene, twice, jerk_time=jerk_time)
+    np.testing.assert_array_equal(motion.positions, rows)
+    assert motion.times[-1] <= once.times[-1] + 2.0 + 2.0 * jerk_time
+    limits = Limits.from_scene(scene, motion.names, jerk_time)
+    assert limits.compute_slowdown(motion.curve) <= 1.0 + 1e-6  # type: ignore[arg-type]

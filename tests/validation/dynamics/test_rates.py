@@ -80,7 +80,7 @@ def test_jumps_of_acceleration() -> None:
     motion = plan_drawer().trajectory
     assert motion.curve is not None
     jumps = motion.curve.compute_jerks()[1][:, motion.names.index("elbow_joint")]
-    violation = find_violations(motion, jerk_time=1e-3)["jerk", "rad/s² at once"]
+    violation = find_violations(motion, jerk_time=0.005)["jerk", "rad/s² at once"]
     assert violation.amount == pytest.approx(jumps.max() - 1.4e-3)
     at = motion.curve.times[int(np.argmax(jumps))]
     assert (

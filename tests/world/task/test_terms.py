@@ -206,6 +206,9 @@ def test_invalid_terms_are_found_before_planning(function: Callable[..., Any]) -
         {"code": [["input", [99], 0, 0.0]]},
         {"rows": "many"},
         {"frames": []},
+        *({"rows": rows} for rows in (0, -1, 2, 10**6, 10**9, 1e30, 10**400)),
+        {"rows": 2, "code": [["const", [], 0, 1.0], *2 * [["output", [0], 0, 0.0]]]},
+        {"code": [["const", [], 0, 1.0], ["output", [0], -1, 0.0]]},
     ],
 )
 def test_damaged_expressions_are_rejected(wrong: dict[str, Any]) -> None:

@@ -32,6 +32,9 @@ __all__ = ["retime_trajectory"]
 _MIN_PIECES = 3  # minimum pieces per step; the path velocity is linear in time in each
 _MIN_JOINT_STEP = 1e-6  # [m] or [rad], smaller steps of an object's joint count as none
 _MIN_STEP_DURATION = 1e-6  # [s] at full speed; shorter steps count as none
+# With jerk limits the motion stops between a step whose time at full speed is below this share of
+# `jerk_time`, and one that is longer by this factor: a turn on so short a way would slow down all.
+_SHORT_STEP, _ABRUPT_RATIO = 0.1, 30.0
 _WAIT_DURATION = 1e-3  # [s], duration of a step without motion, unless a hand opens or closes in it
 _ROUNDING = 1e-9  # relative
 # jump in acceleration that is allowed with jerk limits, relative to the acceleration limit
@@ -49,7 +52,8 @@ def retime_trajectory(
     """Return a smooth trajectory through the same waypoints, as fast as its limits allow.
 
     It starts and ends at rest, rests during steps without motion, and stops where a joint of an
-    object starts or ceases to move, since the hand changes direction there. A step without motion
+    object starts or ceases to move, since the hand changes direction there; with jerk limits also
+    before and after a step that is far shorter than its neighbour. A step without motion
     at the begin of a phase, as when a hand opens, keeps its duration. Between stops it follows
     `fit_path` at the speeds of `compute_speeds`, or else straight lines with stops at all
     waypoints; a wheeled base follows `fit_rolling_paths`. The resulting cubics are slowed down
@@ -69,7 +73,10 @@ def retime_trajectory(
     places = np.concatenate([[0], np.cumsum(parts)])  # indices of the waypoints among all points
     positions = _subdivide(trajectory.positions, places, rolling)
     scale = 1.0 / np.where(np.isfinite(limits.velocity), limits.velocity, 1.0)
-    is_still = np.linalg.norm(np.diff(positions, axis=0) * scale, axis=1) <= _MIN_STEP_DURATION
+    lengths = np.linalg.norm(np.diff(positions, axis=0) * scale, axis=1)
+    is_still = lengths <= _MIN_STEP_DURATION
+    short, long = np.sort([lengths[:-1], lengths[1:]], axis=0)
+    is_abrupt = short < np.minimum(_SHORT_STEP * jerk_time, long / _ABRUPT_RATIO)
     wait_durations = {
         int(places[phase.first]): float(np.diff(trajectory.times)[phase.first])
         for phase in trajectory.phases
@@ -77,7 +84,7 @@ def retime_trajectory(
     pieces, ends, torques = list[Curve](), [0], Torques(scene, trajectory)
     moving_joints = np.abs(np.diff(positions[:, trajectory.robot_size :], axis=0)) > _MIN_JOINT_STEP
     phases = torques.phases_of(np.searchsorted(places, np.arange(places[-1]), side="right") - 1)
-    for steps in _split_into_runs(is_still, moving_joints):
+    for steps in _split_into_runs(is_still, moving_joints, is_abrupt):
         points = positions[steps[0] : steps[-1] + 2]
         if is_still[steps[0]]:
             least = np.array([wait_durations.get(step, _WAIT_DURATION) for step in steps])
@@ -105,9 +112,12 @@ def _subdivide(positions: Floats, places: Ints, rolling: RollingLimits) -> Float
     return points
 
 
-def _split_into_runs(is_still: Bools, moving_joints: Bools) -> Iterator[list[int]]:
+def _split_into_runs(
+    is_still: Bools, moving_joints: Bools, is_abrupt: Bools
+) -> Iterator[list[int]]:
     """Yield the steps of each run between stops, see `retime_trajectory`."""
     stops = (moving_joints[1:] != moving_joints[:-1]).any(axis=1) | (is_still[1:] != is_still[:-1])
+    stops |= is_abrupt
     edges = [0, *(np.flatnonzero(stops) + 1).tolist(), len(is_still)]
     yield from (list(range(first, last)) for first, last in itertools.pairwise(edges))
 

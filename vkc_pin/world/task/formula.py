@@ -10,6 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_choice, check_text
 from vkc_pin.utils.arrays import Floats
 
@@ -130,6 +131,12 @@ class Formula:
     coordinates: tuple[str, ...]
     rows: int
     code: tuple[tuple[str, tuple[int, ...], int, float], ...]
+
+    def __post_init__(self) -> None:
+        outputs = sorted(written for name, _, written, _ in self.code if name == "output")
+        if len(outputs) != self.rows or outputs != list(range(self.rows)):
+            expected = f"one output operation for each of {self.rows} rows"
+            raise InputError("wrong number of results", field="rows", expected=expected)
 
     @property
     def has_comparison(self) -> bool:

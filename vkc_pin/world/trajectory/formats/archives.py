@@ -95,9 +95,10 @@ _DAMAGED = (
 
 Text = Annotated[str, Field(strict=True)]
 Count = Annotated[int, Field(strict=True, ge=0)]
-Distance = Annotated[float, Field(strict=True, gt=-math.inf)]  # not NaN
+Distance = Annotated[float, Field(strict=True, gt=-math.inf)]  # not NaN, but perhaps infinite
 Measured = Annotated[float, Field(strict=True, ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Recorded = Annotated[bool, Field(strict=True)] | Annotated[float, Field(strict=True)]
 Named = dict[str, Text]
 
 
@@ -106,13 +107,6 @@ def _is_finite(value: Any) -> bool:
         return isinstance(value, int | float) and math.isfinite(value)
     except OverflowError:  # an integer of hundreds of digits
         return False
-
-
-def _check_row(found: dict[str, Any]) -> dict[str, Any]:
-    for name, value in found.items():
-        if value != math.inf and not _is_finite(value):
-            raise make_validation_error(f"{name!r} is no number", "numbers by name")
-    return found
 
 
 def _check_folder(found: Named) -> Named:
@@ -143,7 +137,7 @@ class _Violation(Schema):
     subject: Text
     waypoint: Count
     time: Finite
-    amount: Finite
+    amount: Distance  # infinite for a user constraint that overflows
     unit: Text
     detail: Text
 
@@ -211,7 +205,7 @@ class _About(Schema):
     metrics: _Metrics  # type: ignore[valid-type]
     seed: Count
     initialization: Text
-    history: Annotated[list[Annotated[dict[str, Any], AfterValidator(_check_row)]], FailFast()]
+    history: Annotated[list[dict[str, Recorded]], FailFast()]
     terms: Annotated[list[dict[str, Any]], FailFast()] = Field(default_factory=list)
 
 

@@ -2,11 +2,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import re
+import signal
 import socket
 import subprocess
 import sys
 import time
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,11 +18,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+import zmq
 from helpers import browser
 from helpers.fake_plan import HINGE, make_fake_plan
 from helpers.pages import read_clips, read_commands
 
-from vkc_pin.errors import InputError
+from vkc_pin.errors import InputError, VkcError
 from vkc_pin.planning.plan import Plan
 from vkc_pin.visualization import viewer as visualization
 from vkc_pin.world.scene.scene import load_scene
@@ -279,6 +283,62 @@ def test_server_answers_only_this_machine(viewer: Any) -> None:
         (number,) = re.findall(r":(\d+)", address)[:1]
         with pytest.raises(ConnectionRefusedError):  # bound to 127.0.0.1 only
             socket.create_connection(("127.0.0.2", int(number)), timeout=20)
+
+
+BAD_MESSAGES = [
+    [b""],
+    [b"\xff\xfe"],
+    [bytes(range(256))],
+    [b"set_object"],
+    [b"set_object", b"/a"],
+    [b"set_object", b"\xff", b""],
+    [b"set_object", b"/a" * 5000, b""],
+    [b"delete", b"/a/b/c/d", b"", b""],
+    [b"capture_image"],
+    [b"capture_image", b"", b""],
+    [b"set_transform", b"", b"\xc1"],
+    [b"wait"],
+]
+
+
+def test_every_message_is_answered_and_viewers_stay_usable(viewer: Any, plan: Plan) -> None:
+    assert visualization._server is not None
+    address = visualization._server[1]
+    context = zmq.Context()
+    context.setsockopt(zmq.LINGER, 0)
+    context.setsockopt(zmq.RCVTIMEO, 20_000)
+    for message in BAD_MESSAGES:
+        with context.socket(zmq.REQ) as stranger:
+            stranger.connect(address)
+            stranger.send_multipart(message)
+            assert stranger.recv() == b"ok" or message[0] != b"set_transform"
+    with context.socket(zmq.REQ) as stranger:  # leaves before it is answered
+        stranger.connect(address)
+        stranger.send(b"wait")
+    context.destroy()
+    again = visualization.show(plan, open_browser=False)
+    assert again.url() == viewer.url(), "the server still runs"
+    assert len(again.static_html()) > 1e6
+
+
+def test_show_ends_when_the_server_is_silent(
+    viewer: Any, plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server = visualization._server
+    assert server is not None
+    monkeypatch.setattr(visualization, "_PATIENCE", 0.5)
+    os.kill(server[0].pid, signal.SIGSTOP)
+    with pytest.raises(VkcError, match="did not answer within"):
+        visualization.show(plan, open_browser=False)
+    assert server[0].wait(timeout=20) != 0
+    assert visualization.show(plan, open_browser=False).url().startswith("http://127.0.0.1:")
+
+
+@pytest.mark.parametrize("path", ["%00", "a%00b", "%00/../index.html", "x" * 300, "%ff", ".."])
+def test_addresses_without_a_file_are_not_found(viewer: Any, path: str) -> None:
+    with pytest.raises(urllib.error.HTTPError) as caught:
+        urllib.request.urlopen(f"{visualization.open_viewer().url()}{path}", timeout=10)
+    assert caught.value.code in (400, 403, 404)
 
 
 def test_server_serves_the_motion(viewer: Any, plan: Plan) -> None:

@@ -250,7 +250,9 @@ class _Run:
             mj.mj_step(model, data)
             self.efforts[k] = data.qfrc_actuator[dofs]
             # MuJoCo resets a state that diverged; it has no welds then.
-            if not np.isfinite(data.qpos).all() or any(data.warning[kind].number for kind in diverging):
+            if not np.isfinite(data.qpos).all() or any(
+                data.warning[kind].number for kind in diverging
+            ):
                 self.diverged, end = clock, k + 1
                 self.times, self.errors = self.times[:end], self.errors[:end]
                 self.efforts = self.efforts[:end]

@@ -20,8 +20,8 @@ _NO_MASS = 1e-9  # [kg] up to which a body counts as massless
 _LEAST_MASS = 1e-3  # [kg] of bodies with neither mass nor collision shape
 _LEAST_INERTIA = 1e-6  # smallest moment of inertia per mass [m²]: (1 mm)²
 _ROUNDING = 0.05  # largest correction of an inertia that is not reported, relative
-# Smallest and largest settings. Shorter time steps and longer waits take hours and gigabytes, longer
-# time steps miss contacts, and beyond the others the integration breaks down at once.
+# Smallest and largest settings. Shorter time steps and longer waits take hours and gigabytes;
+# longer time steps miss contacts; beyond the others the integration breaks down at once.
 _RANGES = {
     "timestep": (1e-4, 0.01),
     "settle": (0.0, 60.0),

@@ -4,22 +4,35 @@ meshcat's own server listens on every interface. This file imports nothing from 
 starts quickly.
 """
 
+import base64
 import contextlib
 import os
 import re
 import sys
 import threading
+import urllib.parse
 
 import tornado.web
 import tornado.websocket
+import zmq
 from meshcat.servers.zmqserver import ZMQWebSocketBridge
 
 LOOPBACK = "127.0.0.1"
+_PATIENCE = 5.0  # [s] until a command gets an error for an answer
+_MAX_MESSAGE = 2**28  # [bytes]
+_MAX_DEPTH = 50  # of the tree of shown objects, which is walked recursively
 _is_here = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:\d+)?", re.IGNORECASE).fullmatch
 
 
 class LoopbackBridge(ZMQWebSocketBridge):
-    """A meshcat server bound to the loopback interface."""
+    """A meshcat server bound to the loopback interface, which answers every message.
+
+    Its socket takes no message before the last one is answered: an exception, or a page that never
+    sends its image, would block it for ever.
+    """
+
+    _number = 0  # of the message that is handled
+    _is_capturing = False
 
     def make_app(self):  # type: ignore[no-untyped-def]
         """Return a web application that listens on loopback and rejects other host names.
@@ -32,13 +45,52 @@ class LoopbackBridge(ZMQWebSocketBridge):
         listen, find = app.listen, app.find_handler
 
         def find_here(request, **options):  # type: ignore[no-untyped-def]
-            if _is_here(request.headers.get("Host", "")):
+            is_here = _is_here(request.headers.get("Host", ""))
+            if is_here and "\0" not in urllib.parse.unquote(request.path):
                 return find(request, **options)
-            return app.get_handler_delegate(request, tornado.web.ErrorHandler, {"status_code": 403})
+            refusal = {"status_code": 404 if is_here else 403}
+            return app.get_handler_delegate(request, tornado.web.ErrorHandler, refusal)
 
         app.listen = lambda port, **options: listen(port, **{**options, "address": LOOPBACK})
         app.find_handler = find_here
         return app
+
+    def setup_zmq(self, url):  # type: ignore[no-untyped-def]
+        """Return the socket for commands, its stream, and its address."""
+        self.context.setsockopt(zmq.MAXMSGSIZE, _MAX_MESSAGE)
+        return super().setup_zmq(url)
+
+    def handle_zmq(self, frames):  # type: ignore[no-untyped-def]
+        """Carry out a command; invalid ones get an error for an answer."""
+        self._number += 1
+        self._is_capturing = False
+        try:
+            self.ioloop.call_later(_PATIENCE, self._give_up, self._number)
+            if b"".join(frames[1:2]).count(b"/") > _MAX_DEPTH:
+                raise ValueError("the path is too long")
+            if frames[0] == b"capture_image":
+                if len(frames) != 3 or not self.websocket_pool:
+                    raise ValueError("expected 3 frames and an open page")
+                self._is_capturing = True
+            super().handle_zmq(frames)
+        except Exception as error:  # whatever a message contains, it must be answered
+            self._answer(f"error: {error}".encode(errors="replace"))
+
+    def send_image(self, data):  # type: ignore[no-untyped-def]
+        """Answer with the image of a page, if one was asked for."""
+        if self._is_capturing:
+            self._is_capturing = False
+            self._answer(base64.b64decode(data.partition(",")[2]))
+
+    def _give_up(self, number: int) -> None:
+        """Answer message `number` with an error, unless it was answered."""
+        if number == self._number:
+            self._answer(b"error: no answer in time")
+
+    def _answer(self, data: bytes) -> None:
+        """Send an answer, unless there is nothing to answer."""
+        if self.zmq_socket.getsockopt(zmq.EVENTS) & zmq.POLLOUT:
+            self.zmq_socket.send(data)
 
     def forward_to_websockets(self, frames):  # type: ignore[no-untyped-def]
         """Send a command to all open pages; skip closed ones, so that the sender gets an answer."""

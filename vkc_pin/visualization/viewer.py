@@ -13,7 +13,7 @@ import re
 import struct
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Recorder", "animate", "open_viewer", "render_page", "show", "to_html"]
 
+_PATIENCE = 10.0  # [s] that the server may take for an answer
 _server: tuple[subprocess.Popen[bytes], str, str] | None = (
     None  # the process, its address for commands, and for browsers
 )
@@ -62,7 +63,7 @@ def show(
 
     Raises:
         InputError: Neither a plan nor a scene, or something that cannot be drawn.
-        VkcError: The server does not start.
+        VkcError: The server does not start, or does not answer.
     """
     scene, plan = _split(plan_or_scene)
     height = check_integer(height, "height", low=1, high=100_000)
@@ -148,7 +149,7 @@ def open_viewer() -> meshcat.Visualizer:
     process share one window.
 
     Raises:
-        VkcError: The server does not start.
+        VkcError: The server does not start, or does not answer.
     """
     global _server
     import meshcat
@@ -156,7 +157,47 @@ def open_viewer() -> meshcat.Visualizer:
     if _server is None or _server[0].poll() is not None:
         _server = _start_server()
     with contextlib.redirect_stdout(None):  # it would print its address
-        return meshcat.Visualizer(zmq_url=_server[1])
+        window = _make_window(_server[1])
+    return meshcat.Visualizer(window=window)
+
+
+def _make_window(address: str) -> Any:
+    """Return a connection to a meshcat server that raises an error if there is no answer in time.
+
+    A server that does not answer is terminated, so that the next viewer gets a new one.
+    """
+    import zmq
+    from meshcat.visualizer import ViewerWindow
+
+    class Window(ViewerWindow):
+        def connect_zmq(self) -> None:
+            super().connect_zmq()
+            self.zmq_socket.setsockopt(zmq.LINGER, 0)
+            self.zmq_socket.setsockopt(zmq.RCVTIMEO, round(1000.0 * _PATIENCE))
+
+        def wait(self) -> str:
+            while (answer := super().wait()) != "ok":  # the server answers before a page is open
+                pass
+            return str(answer)
+
+        def send(self, command: Any) -> None:
+            with _report_silence():
+                super().send(command)
+
+    @contextlib.contextmanager
+    def _report_silence() -> Iterator[None]:
+        try:
+            yield
+        except zmq.Again:
+            if _server is not None:
+                _server[0].kill()
+            raise VkcError(
+                f"meshcat's server did not answer within {_PATIENCE:g} s; it is ended, "
+                "and the next call starts another"
+            ) from None
+
+    with _report_silence():
+        return Window(address, False, [])
 
 
 def _start_server() -> tuple[subprocess.Popen[bytes], str, str]:

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
+from vkc_pin.importing.missing_meshes import replace_missing_meshes
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part, make_inertia
 from vkc_pin.world.files.kinematic_tree import (
     check_tree,
@@ -50,6 +51,7 @@ def read_object_urdf(file: Path, *, free: bool = False) -> Description:
             joint.remove(mimic)
     check_tree(file, root)
     urdf = UrdfFile(file.resolve(), "", root)
+    notes += replace_missing_meshes(urdf, every_link=True)
     names = _find_shape_names(root)
     parts: dict[str, dict[str, list[Part]]] = {
         kind: {link: [] for link in urdf.links} for kind in ("visual", "collision")

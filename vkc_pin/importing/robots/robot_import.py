@@ -164,7 +164,10 @@ class _Importer:
         self._source, self._file, self._folder, self._name = source, source.file, folder, name
         (stem,) = choose_file_names([name], fallback="robot")
         self._settings: dict[str, Any] = {"urdf": f"{stem}.urdf", "srdf": f"{stem}.srdf"}
-        self._findings = [Finding("note", "file", note) for note in source.notes]
+        self._findings = [
+            *(Finding("warning", "shapes", text) for text in source.warnings),
+            *(Finding("note", "file", text) for text in source.notes),
+        ]
 
     def run(
         self, arm: str | None, tool_frame: str | None, most_pieces: int, samples: int, seed: int

@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Any
 
 from vkc_pin.errors import InputError
+from vkc_pin.importing.missing_meshes import replace_missing_meshes
 from vkc_pin.importing.robots.mjcf import convert_mjcf
 from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.files.documents import read_text
@@ -36,6 +37,7 @@ class Source:
         srdf: The SRDF beside it.
         groups: Maps each group of the SRDF to its joints.
         notes: Changes and omissions.
+        warnings: Changes that can make the robot's shape wrong.
     """
 
     file: UrdfFile
@@ -43,6 +45,7 @@ class Source:
     srdf: Srdf = field(default_factory=lambda: Srdf({}, {}))
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def read_source(
@@ -78,20 +81,24 @@ def read_source(
         root[:] = [element for element in root if element.tag in _KEPT]
     notes += _complete_limits(root)
     check_tree(file, root)
+    replaced = replace_missing_meshes(
+        UrdfFile(file.resolve(), "", root, dict(packages)), every_link=False
+    )
     read = UrdfFile(file.resolve(), _format_xml(root), root, dict(packages))
+    warnings = tuple(replaced)
     srdf_path = srdf if srdf is not None else _find_srdf(file)
     if srdf_path is None:
-        return Source(read, kind, Srdf({}, states), {}, tuple(notes))
+        return Source(read, kind, Srdf({}, states), {}, tuple(notes), warnings)
     try:
         semantics = read_srdf(srdf_path, links=read.links)
     except InputError:
         if srdf is not None:
             raise
         notes.append(f"ignored {srdf_path.name} beside it, which names links of another robot")
-        return Source(read, kind, Srdf({}, states), {}, tuple(notes))
+        return Source(read, kind, Srdf({}, states), {}, tuple(notes), warnings)
     groups = {name: group.joints for name, group in read_groups(srdf_path, read.root).items()}
     merged = Srdf(semantics.allowed, {**states, **semantics.states})
-    return Source(read, kind, merged, groups, tuple(notes))
+    return Source(read, kind, merged, groups, tuple(notes), warnings)
 
 
 def choose_free_name(name: str, taken: set[str]) -> str:

@@ -1,0 +1,79 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from vkc_pin.errors import InputError
+from vkc_pin.importing.missing_meshes import replace_missing_meshes
+from vkc_pin.importing.objects.urdf import read_object_urdf
+from vkc_pin.world.files.urdf import UrdfFile, read_urdf
+
+BOX = '<{kind}><geometry><box size="1 1 1"/></geometry></{kind}>'
+MESH = '<{kind}><geometry><mesh filename="{{}}"/></geometry></{kind}>'
+SOLID, SEEN = MESH.format(kind="collision"), MESH.format(kind="visual")
+
+
+def write(folder: Path, *shapes: str) -> UrdfFile:
+    """Write a URDF with one link per argument, and the mesh there.stl beside it."""
+    trimesh.creation.box((1, 1, 1)).export(folder / "there.stl")
+    (folder / "again.STL").write_bytes((folder / "there.stl").read_bytes())
+    links = "".join(f'<link name="l{k}">{text}</link>' for k, text in enumerate(shapes))
+    joints = "".join(
+        f'<joint name="j{k}" type="fixed"><parent link="l0"/><child link="l{k}"/></joint>'
+        for k in range(1, len(shapes))
+    )
+    (folder / "r.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
+    return read_urdf(folder / "r.urdf")
+
+
+@pytest.mark.parametrize(
+    ("shapes", "note", "kinds"),
+    [
+        (SOLID.format("there.std"), "there.std: there.stl beside it is used", ["mesh"]),
+        (SOLID.format("there"), "there.stl beside it", ["mesh"]),
+        (SOLID.format("there.STL"), "there.stl beside it", ["mesh"]),
+        (SOLID.format("again.stl"), "again.STL beside it", ["mesh"]),
+        (SOLID.format("file://./there.dae"), "there.stl beside it", ["mesh"]),
+        (SEEN.format("there.stl") + SOLID.format("gone.stl"), "visual shapes collide", ["mesh"]),
+        (
+            BOX.format(kind="visual") + SOLID.format("a.stl") + SOLID.format("b.stl"),
+            "no collision mesh b.stl: the link's visual shapes collide",
+            ["box"],
+        ),
+        (
+            SEEN.format("gone.dae") + BOX.format(kind="collision"),
+            "no visual mesh gone.dae: left out",
+            ["box"],
+        ),
+    ],
+)
+def test_missing_meshes_are_replaced(
+    tmp_path: Path, shapes: str, note: str, kinds: list[str]
+) -> None:
+    file = write(tmp_path, shapes)
+    notes = replace_missing_meshes(file, every_link=True)
+    assert note in "; ".join(notes)
+    assert [shape.kind for shape in file.read_shapes("collision")] == kinds
+    file.read_shapes("visual")
+    read = read_object_urdf(tmp_path / "r.urdf")
+    assert note in "; ".join(read.notes)
+    assert [part.kind for part in read.links["l0"].solid] == kinds
+
+
+def test_all_missing_meshes_are_listed(tmp_path: Path) -> None:
+    shapes = [SOLID.format(name) for name in ("a.stl", "there.stl", "package://p/b.dae")]
+    with pytest.raises(InputError, match=r"2 meshes do not exist: a\.stl, package://p/b\.dae"):
+        replace_missing_meshes(write(tmp_path, *shapes), every_link=True)
+    with pytest.raises(InputError, match=r"a\.stl: there is no such mesh"):
+        replace_missing_meshes(write(tmp_path, *shapes[:2]), every_link=True)
+
+
+def test_visual_meshes_that_collide_are_needed(tmp_path: Path) -> None:
+    """Objects collide with visual shapes of every such link, robots if there are no others."""
+    cosmetic = (BOX.format(kind="collision"), SEEN.format("gone.stl"))
+    assert len(replace_missing_meshes(write(tmp_path, *cosmetic), every_link=False)) == 1
+    for shapes, every_link in ((cosmetic, True), (cosmetic[1:], False)):
+        with pytest.raises(InputError, match=r"gone\.stl"):
+            replace_missing_meshes(write(tmp_path, *shapes), every_link=every_link)

@@ -192,7 +192,8 @@ def _walk_files(folder: str | Path) -> Iterator[os.DirEntry[str]]:
 def write_folder_atomically(path: str | Path, *, force: bool = False) -> Iterator[Path]:
     """Yield a new folder, which replaces `path` on success and is removed on failure.
 
-    It gets a list of its files, so that a later call can replace it safely.
+    It gets a list of its files, so that a later call can replace it safely. The new folder has the
+    name of `path`, and errors name files in `path` instead.
 
     Args:
         path: The folder, created with its parents.
@@ -202,16 +203,22 @@ def write_folder_atomically(path: str | Path, *, force: bool = False) -> Iterato
     _check_target(target, path, force)
     with _report_path_errors(path):
         target.parent.mkdir(parents=True, exist_ok=True)
-        staging = _make_temporary_path(target.parent)
-        staging.mkdir()
+        temporary = _make_temporary_path(target.parent)
+        staging = temporary / target.name
+        staging.mkdir(parents=True)
     try:
         yield staging
         _check_target(target, path, force)  # it may have changed in the meantime
         with _report_path_errors(path), defer_interrupt():
             _write_manifest(staging)
             _replace_folder(target, staging)
+    except InputError as error:
+        error.args = tuple(str(part).replace(str(staging), str(path)) for part in error.args)
+        if error.file is not None:
+            error.file = type(error.file)(str(error.file).replace(str(staging), str(path)))
+        raise
     finally:
-        shutil.rmtree(staging, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _check_target(target: Path, path: str | Path, force: bool) -> None:

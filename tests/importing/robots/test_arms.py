@@ -50,11 +50,56 @@ def test_arms_are_found_by_their_hands(tmp_path: Path) -> None:
 
 def test_base_joints_are_not_part_of_the_arm(tmp_path: Path) -> None:
     file = read_urdf(write_arms(tmp_path, own_base=True))
-    solid = {shape.link for shape in file.read_shapes("collision")}
-    assert find_own_base(build_body_tree(file), solid) == ("drive_x", "drive_y", "drive_yaw")
+    assert own_base_of(file) == ("drive_x", "drive_y", "drive_yaw")
     assert arms_of(file)[0].joints[0] == "arm_1_joint"
-    plain = read_urdf(write_arms(tmp_path))
-    assert find_own_base(build_body_tree(plain), solid) == ()
+    assert own_base_of(read_urdf(write_arms(tmp_path))) == ()
+
+
+def own_base_of(file: UrdfFile) -> tuple[str, ...]:
+    solid = {shape.link for shape in file.read_shapes("collision")}
+    return find_own_base(file, build_body_tree(file), solid)
+
+
+@pytest.mark.parametrize(
+    ("chain", "count"),
+    [
+        ("px py rz pz", 3),  # a lift on a base
+        ("px py pz rz", 2),
+        ("pz px py rz", 0),
+        ("px py rz rx", 3),
+        ("px py rx", 2),
+        ("pz rz", 0),
+        ("px", 0),  # a rail
+        ("px rz", 2),
+        ("fx px pz ry", 3),  # the frame is turned by a right angle about x
+        ("fx px py rz", 0),
+        ("fx pz py rz", 0),
+    ],
+)
+def test_lifts_are_no_part_of_a_base(tmp_path: Path, chain: str, count: int) -> None:
+    """Each word is a joint: fixed, prismatic or revolute, and its axis."""
+    kinds, axes = (
+        {"p": "prismatic", "r": "revolute", "f": "fixed"},
+        {
+            "x": "1 0 0",
+            "y": "0 1 0",
+            "z": "0 0 1",
+        },
+    )
+    text, parent = '<link name="root"/>', "root"
+    for k, (kind, axis) in enumerate(chain.split()):
+        shape = '<collision><geometry><box size="1 1 1"/></geometry></collision>'
+        is_last = k == len(chain.split()) - 1
+        angle = "1.5707963267948966" if kind == "f" else "0"
+        text += f'''<link name="l{k}">{shape * is_last}</link>
+            <joint name="j{k}" type="{kinds[kind]}"><origin rpy="{angle} 0 0"/><parent
+            link="{parent}"/><child link="l{k}"/><axis xyz="{axes[axis]}"/>
+            <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'''
+        parent = f"l{k}"
+    (tmp_path / "r.urdf").write_text(f'<robot name="r">{text}</robot>')
+    found = own_base_of(read_urdf(tmp_path / "r.urdf"))
+    first = 1 if chain.startswith("f") else 0
+    assert found == tuple(f"j{k}" for k in range(first, first + count))
 
 
 def robots(pattern: str) -> Path:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
@@ -60,7 +61,7 @@ def test_missing_limits_and_masses_are_reported(tmp_path: Path) -> None:
     path.write_text(text, encoding="utf-8")
     found = vkc.importing.doctor(path, samples=5)
     assert (
-        "arm_1_joint, arm_2_joint, arm_3_joint (assumed: 3.14, 3.14, 3.14)"
+        "arm_1_joint, arm_2_joint, arm_3_joint (assumed: 3.14 rad/s)"
         in find_texts(found, "warning", "limits")[0]
     )
     assert "arm_1_joint" in find_texts(found, "note", "effort")[0]
@@ -70,7 +71,7 @@ def test_missing_limits_and_masses_are_reported(tmp_path: Path) -> None:
     (tmp_path / "robot.yaml").write_text(json.dumps(stated), encoding="utf-8")
     found = vkc.importing.doctor(tmp_path, samples=5)
     assert (
-        "no velocity limit in the file: arm_2_joint, arm_3_joint (assumed: 3.14, 3.14)"
+        "no velocity limit in the file: arm_2_joint, arm_3_joint (assumed: 3.14 rad/s)"
         in find_texts(found, "warning", "limits")
     )
     assert "arm_1_joint" not in find_texts(found, "note", "effort")[0]
@@ -111,8 +112,8 @@ def test_closed_hand_is_reported(tmp_path: Path) -> None:
             "locked_joints": {"finger_a_joint": position, "finger_b_joint": position},
         }
         (tmp_path / "robot.yaml").write_text(json.dumps(settings), encoding="utf-8")
-        warnings = find_texts(vkc.importing.doctor(tmp_path, samples=5), "warning", "hand")
-        assert any("no room" in text for text in warnings) == is_reported
+        faults = find_texts(vkc.importing.doctor(tmp_path, samples=5), "fault", "hand")
+        assert any("no room" in text for text in faults) == is_reported
 
 
 def test_invalid_argument_is_named() -> None:
@@ -123,3 +124,55 @@ def test_invalid_argument_is_named() -> None:
     with pytest.raises(vkc.UnknownNameError) as caught:
         vkc.importing.doctor("husky_ur5")
     assert caught.value.nearest == "husky_ur5e"
+
+
+SIZE, LIMITS = '<box size="0.5 0.4 0.5"/>', 'lower="-2" upper="2"'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "level", "part"),
+    [
+        (SIZE, '<box size="50 40 50"/>', "fault", "body is 50 m long"),
+        (SIZE, '<sphere radius="250"/>', "fault", "body is 500 m long"),
+        (SIZE, '<cylinder radius="0.1" length="20"/>', "fault", "body is 20 m long"),
+        (LIMITS, 'lower="-180" upper="180"', "warning", "moves from -180 to 180 rad"),
+        (LIMITS, 'lower="0" upper="90"', "warning", "moves from 0 to 90 rad"),
+        (LIMITS, 'lower="-6.3" upper="6.3"', "", ""),
+        (LIMITS, 'lower="-100000" upper="100000"', "", ""),
+        (SIZE, '<box size="3 2 1"/>', "", ""),
+    ],
+)
+def test_wrong_units_are_recognized(
+    tmp_path: Path, old: str, new: str, level: str, part: str
+) -> None:
+    path = write_arms(tmp_path)
+    path.write_text(path.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
+    found = vkc.importing.doctor(vkc.load_robot(path, pairs="all"), samples=1)
+    texts = {each: find_texts(found, each, "units") for each in ("fault", "warning")}
+    if not level:
+        assert texts == {"fault": [], "warning": []}
+    else:
+        assert part in texts[level][0]
+
+
+def test_robot_in_kilometres_is_too_small(tmp_path: Path) -> None:
+    path = write_arms(tmp_path)
+    root = ElementTree.parse(path).getroot()
+    for element in root.iter():
+        for key in {"size", "xyz"} & set(element.attrib) if element.tag != "axis" else ():
+            values = (0.001 * float(value) for value in element.get(key, "").split())
+            element.set(key, " ".join(f"{value:g}" for value in values))
+    ElementTree.ElementTree(root).write(path)
+    found = vkc.importing.doctor(vkc.load_robot(path, pairs="all"), samples=1)
+    assert "body, is only 0.5 mm long" in find_texts(found, "fault", "units")[0]
+
+
+def test_lift_without_velocity_moves_slowly(tmp_path: Path) -> None:
+    path = write_arms(tmp_path)
+    text = path.read_text(encoding="utf-8").replace(' velocity="1.5"', ' velocity="0"')
+    text = text.replace('name="arm_1_joint" type="revolute"', 'name="arm_1_joint" type="prismatic"')
+    path.write_text(text, encoding="utf-8")
+    robot = vkc.load_robot(path)
+    assert robot.velocity[3:].tolist() == pytest.approx([0.1, *[3.14159265] * 4])
+    text = " ".join(find_texts(vkc.importing.doctor(robot, samples=1), "warning", "limits"))
+    assert "arm_1_joint (assumed: 0.1 m/s); arm_2_joint, arm_3_joint" in text

@@ -227,3 +227,31 @@ def test_file_name_cannot_add_fields_to_the_description(
     )
     assert yaml.safe_load(stated)["tool_frame"] == "tool"
     assert vkc.load_robot(made.folder).name == stem
+
+
+@pytest.mark.parametrize(
+    ("finger", "limits", "expected", "healthy"),
+    [
+        ("revolute", (0.0, 0.0), "a_joint 0.0 to 0.0, right_finger_b_joint 0.0 to 0.0", False),
+        ("prismatic", (0.0, 0.0), "the gripper does not move: its fingers stay", False),
+        ("prismatic", (0.0, 0.001), "the gripper does not move: its fingers stay", False),
+        ("continuous", (0.0, 0.0), "the gripper does not move: its fingers stay", False),
+        ("prismatic", (0.03, 0.03), "its fingers stay 60 mm apart; limits in the file", True),
+        ("prismatic", (0.0, 0.04), "which open from 0 to 80 mm", True),
+        ("fixed", (0.0, 0.0), "'mine' has no fingers: it can reach", True),
+    ],
+)
+def test_hand_that_cannot_open_is_a_fault(
+    tmp_path: Path, finger: str, limits: tuple[float, float], expected: str, healthy: bool
+) -> None:
+    file = write_arms(tmp_path, sides=("right_",))
+    text = file.read_text(encoding="utf-8").replace('"prismatic"', f'"{finger}"')
+    low, high = limits
+    text = text.replace('lower="0.0" upper="0.04"', f'lower="{low}" upper="{high}"')
+    if finger == "fixed":
+        text = text.partition('<link name="right_hand">')[0] + "</robot>"
+    file.write_text(text, encoding="utf-8")
+    made = vkc.importing.import_robot(file, tmp_path / "mine", samples=30)
+    assert expected in str(made)
+    assert ".vkc-pin-" not in str(made)
+    assert made.diagnosis.healthy is healthy

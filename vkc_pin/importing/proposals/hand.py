@@ -13,7 +13,7 @@ from vkc_pin.world.models.grippers.bar_width import BAR_THICKNESS, find_widest_b
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import compute_world_box, list_placed_shapes
 
-__all__ = ["Hand", "make_hand"]
+__all__ = ["Hand", "has_fingers", "make_hand"]
 
 Placed = tuple[coal.CollisionGeometry, pin.SE3]
 
@@ -41,8 +41,29 @@ class Hand:
     width: float
 
 
+def has_fingers(robot: Robot) -> bool:
+    """Return whether a hand has several links, or links moved by joints that are not planned."""
+    if len(robot.touch_links) > 1:
+        return True
+    above = {}
+    for joint in robot.file.root.findall("joint"):
+        parent, child = joint.find("parent"), joint.find("child")
+        if parent is not None and child is not None:
+            above[child.get("link", "")] = joint, parent.get("link", "")
+    for link in robot.touch_links:
+        while link in above and above[link][0].get("name") not in robot.coordinates.names:
+            if above[link][0].get("type") != "fixed":
+                return True
+            link = above[link][1]
+    return False
+
+
 def make_hand(robot: Robot) -> Hand:
-    """Return the open hand of a robot."""
+    """Return the open hand of a robot.
+
+    Raises:
+        InputError: The hand is undefined, or there is no room between its fingers.
+    """
     if not robot.touch_links:
         problem = f"the hand of '{robot.name}' is undefined"
         expected = "touch_links in a robot.yaml, such as `vkc-pin import-robot` writes"
@@ -71,6 +92,8 @@ def make_hand(robot: Robot) -> Hand:
         problem = (
             f"there is no room between the fingers of '{robot.name}' "
             f"at its tool frame '{robot.tool_frame}'"
+            if has_fingers(robot)
+            else f"the hand of '{robot.name}' has no fingers"
         )
         expected = "an open hand around its origin, with x as the closing direction"
         raise InputError(problem, file=robot.urdf, field="tool_frame", expected=expected)

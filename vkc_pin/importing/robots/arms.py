@@ -12,6 +12,7 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.files.urdf import UrdfFile
+from vkc_pin.world.models.robot_model import build_full_model
 
 __all__ = [
     "Arm",
@@ -27,6 +28,7 @@ __all__ = [
 _MOVING = ("revolute", "continuous", "prismatic")
 _FINGER = 7  # largest number of joints of a finger
 _ARM = 3  # smallest number of joints of an arm with a hand; one more without a hand
+_LEVEL = 0.01  # sine of the largest slope of a floor, and of an axis that counts as vertical
 _PARALLEL = 1.0 - 1e-6  # smallest cosine between the axes of a telescope's segments
 _HAND_WORDS = re.compile(r"finger|thumb|gripper|jaw|knuckle|claw|fngr|grip", re.IGNORECASE)
 _ARM_WORDS = re.compile(
@@ -133,19 +135,25 @@ def build_body_tree(file: UrdfFile) -> Body:
     return root
 
 
-def find_own_base(root: Body, solid: Set[str]) -> tuple[str, ...]:
+def find_own_base(file: UrdfFile, root: Body, solid: Set[str]) -> tuple[str, ...]:
     """Return the joints of a mobile base in the robot's file.
 
     These are at least two joints in sequence from the root whose parent links have no shapes, and
-    that are prismatic or rotate about the vertical.
+    that slide along the floor or rotate about the vertical. Lifts belong to the arm.
     """
-    joints, body = [], root
+    full = build_full_model(file)
+    data, joints, body = full.createData(), list[str](), root
+    pin.computeJointJacobians(full, data, pin.neutral(full))
     while len(body.children) == 1 and not solid & set(body.links):
         body = body.children[0]
-        axis = None if body.joint is None else body.joint.find("axis")
-        z = abs(float((axis.get("xyz", "1 0 0") if axis is not None else "1 0 0").split()[2]))
-        kind = None if body.joint is None else body.joint.get("type")
-        if not (kind == "prismatic" or (kind in ("revolute", "continuous") and z > 0.99)):
+        number = full.getJointId(body.name)
+        if full.joints[number].nv != 1:
+            break
+        jacobian = pin.getJointJacobian(full, data, number, pin.LOCAL_WORLD_ALIGNED)
+        slide, turn = np.split(np.abs(jacobian[:, full.joints[number].idx_v]), 2)
+        slides_level = not turn.any() and slide[2] < _LEVEL
+        turns_upright = turn[2] > 1.0 - _LEVEL
+        if not (slides_level or turns_upright):
             break
         joints.append(body.name)
     return tuple(joints) if len(joints) > 1 else ()
@@ -182,7 +190,7 @@ def find_arms(
     each, or one that is named as a jaw. Chains without a hand are arms if they have four joints and
     are not named as legs, heads or wheels.
     """
-    base = find_own_base(root, solid)
+    base = find_own_base(file, root, solid)
     everything, arms = root.subtree(), []
     palms: list[Body] = []
     for body in everything:

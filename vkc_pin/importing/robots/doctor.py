@@ -11,22 +11,27 @@ import numpy as np
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing.convex import compute_concavity
-from vkc_pin.importing.proposals.hand import make_hand
+from vkc_pin.importing.proposals.hand import has_fingers, make_hand
 from vkc_pin.importing.robots.envelopes import find_envelopes
 from vkc_pin.importing.robots.rest_configuration import Clearances, find_inseparable_pairs
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import check_integer, check_number
 from vkc_pin.world.files.meshes import load_mesh
-from vkc_pin.world.models.couplings.limits import DEFAULT_JOINT_VELOCITY
+from vkc_pin.world.models.couplings.limits import DEFAULT_JOINT_VELOCITY, DEFAULT_SLIDE_VELOCITY
 from vkc_pin.world.models.dynamics.torque_limits import UNLIMITED
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
+from vkc_pin.world.models.shapes import compute_bounding_box
 
 __all__ = ["Diagnosis", "Finding", "doctor"]
 
 _SAMPLES = 200
 _CONCAVE = 0.03  # [m] protrusion of a hull above which it is reported
 _LISTED = 6  # names in a list
+_DEFAULT_VELOCITIES = (DEFAULT_JOINT_VELOCITY, DEFAULT_SLIDE_VELOCITY)
+# Sizes of robots [m] and travels of joints [rad], [m] beyond which a unit is probably wrong
+_SMALL, _LARGE, _MANY_TURNS, _LONG = 0.05, 8.0, 6.0 * np.pi, 10.0
+_UNLIMITED_TURNS = 2000.0  # [rad] travels above this mean that a joint is unlimited
 
 
 @dataclass(frozen=True)
@@ -36,7 +41,8 @@ class Finding:
     Attributes:
         level: "fault" (planning fails), "warning" (planning may fail, or values are assumed),
             "note".
-        topic: "home", "pairs", "limits", "effort", "mass", "hand", "shapes", "guessed" or "file".
+        topic: "home", "pairs", "units", "limits", "effort", "mass", "hand", "shapes", "guessed" or
+            "file".
         text: The finding.
         hint: A remedy, or "".
     """
@@ -99,7 +105,7 @@ def doctor(
 
     The examination covers the home configuration (collisions, pairs closer than the margin, the
     floor), pairs of links that no random configuration separates by the margin, missing limits,
-    efforts and masses, the hand, and meshes that are far from convex.
+    efforts and masses, units, the hand, and meshes that are far from convex.
 
     Args:
         robot: A robot, or an argument of `load_robot`.
@@ -122,6 +128,7 @@ def doctor(
     findings = [
         *_check_home(loaded, clearance),
         *_check_pairs(loaded, clearance, samples, seed),
+        *_check_units(loaded),
         *_check_limits_and_masses(loaded),
         *_check_hand(loaded),
     ]
@@ -188,12 +195,39 @@ def _check_pairs(robot: Robot, margin: float, samples: int, seed: int) -> list[F
     return [*findings, Finding("note", "pairs", count)]
 
 
+def _check_units(robot: Robot) -> list[Finding]:
+    """Report sizes and joint limits that no robot has."""
+    findings = []
+    sizes = dict[str, float]()
+    for k, shape in enumerate(robot.collision.geometryObjects):
+        size, link = 2.0 * float(compute_bounding_box(shape)[1].max()), robot.link_of(k)
+        sizes[link] = max(size, sizes.get(link, 0.0))
+    hint = "is the mesh in mm or cm? Set `scale` of its <mesh>, e.g. 0.001 for mm"
+    for link, size in sizes.items():
+        if size > _LARGE:
+            findings.append(Finding("fault", "units", f"{link} is {size:.3g} m long", hint))
+    if sizes and max(sizes.values()) < _SMALL:
+        text = f"the largest link, {max(sizes, key=sizes.__getitem__)}, is only "
+        text += f"{1e3 * max(sizes.values()):.3g} mm long"
+        findings.append(Finding("fault", "units", text, "are the lengths in metres?"))
+    for k, name in enumerate(robot.coordinates.names[3:], 3):
+        slides = robot.coordinates.units[k] == "m"
+        low, high = float(robot.lower[k]), float(robot.upper[k])
+        most = (_LONG, np.inf) if slides else (2.0 * _MANY_TURNS, _UNLIMITED_TURNS)
+        if np.isfinite([low, high]).all() and most[0] < high - low < most[1]:
+            text = f"{name} moves from {low:.4g} to {high:.4g} {'m' if slides else 'rad'}"
+            hint = f"are its limits in {'mm' if slides else 'degrees'}?"
+            findings.append(Finding("warning", "units", text, hint))
+    return findings
+
+
 def _check_limits_and_masses(robot: Robot) -> list[Finding]:
     planned_joints, findings = (
         {name: k for k, name in enumerate(robot.coordinates.names) if k > 2},
         [],
     )
-    no_velocity, no_effort, unlimited = [], [], []
+    no_velocity = dict[str, list[str]]()  # joints by assumed limit
+    no_effort, unlimited = [], []
     for joint in robot.file.root.findall("joint"):
         name, limit = joint.get("name", ""), joint.find("limit")
         if name not in planned_joints:
@@ -201,9 +235,10 @@ def _check_limits_and_masses(robot: Robot) -> list[Finding]:
         velocity = float(limit.get("velocity", "0")) if limit is not None else 0.0
         if (
             not 0.0 < velocity < 1e3
-            and robot.velocity[planned_joints[name]] == DEFAULT_JOINT_VELOCITY
+            and robot.velocity[k := planned_joints[name]] in _DEFAULT_VELOCITIES
         ):
-            no_velocity.append(name)
+            rate = f"{robot.velocity[k]:.3g} {robot.coordinates.units[k]}/s"
+            no_velocity.setdefault(rate, []).append(name)
         if not 0.0 < robot.model.effortLimit[planned_joints[name]] < UNLIMITED:
             no_effort.append(name)
         if joint.get("type") == "continuous":
@@ -213,15 +248,12 @@ def _check_limits_and_masses(robot: Robot) -> list[Finding]:
     }
     massless = [link for link in robot.links if link not in with_mass]
     if no_velocity:
-        used = ", ".join(f"{robot.velocity[planned_joints[name]]:.3g}" for name in no_velocity)
+        text = "; ".join(
+            f"{_format_list(names)} (assumed: {rate})" for rate, names in no_velocity.items()
+        )
         hint = "`joints: {NAME: {velocity: ...}}` in robot.yaml, from the data sheet"
         findings.append(
-            Finding(
-                "warning",
-                "limits",
-                f"no velocity limit in the file: {_format_list(no_velocity)} (assumed: {used})",
-                hint,
-            )
+            Finding("warning", "limits", f"no velocity limit in the file: {text}", hint)
         )
     if unlimited:
         findings.append(Finding("note", "limits", f"unlimited rotation: {_format_list(unlimited)}"))
@@ -262,9 +294,12 @@ def _check_hand(robot: Robot) -> list[Finding]:
     try:
         make_hand(robot)
     except InputError as error:
-        if robot.touch_links:
-            hint = f"attachments are proposed for {error.expected}, see docs/robots.md"
-            findings.append(Finding("warning", "hand", f"{error.problem}: it cannot grasp", hint))
+        if robot.touch_links and has_fingers(robot):
+            hint = f"attachments need {error.expected}, see docs/robots.md"
+            findings.append(Finding("fault", "hand", f"{error.problem}: it cannot grasp", hint))
+        elif robot.touch_links:
+            text = f"{error.problem}: it can reach poses, but not grasp objects"
+            findings.append(Finding("warning", "hand", text))
     for link, share in find_envelopes(robot).items():
         text = f"{link} encloses {share:.0%} of the hand: the fingers cannot reach anything"
         hint = "remove its <collision> from the URDF, as `vkc-pin import-robot` does"

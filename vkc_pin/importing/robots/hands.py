@@ -18,6 +18,8 @@ from vkc_pin.world.models.robot_model import compute_rest_positions, make_config
 
 __all__ = ["Hand", "analyze_hand"]
 
+Positions = Mapping[str, float]  # of joints by name, [m] or [rad]
+
 _POINTS = 120  # sampled points of a finger
 _TIP = 0.025  # [m] length of a fingertip
 _PAD = 0.02  # [m] distance of the grasped object behind the fingertips,
@@ -69,13 +71,26 @@ class Hand:
         }
 
 
-def analyze_hand(file: UrdfFile, full: pin.Model, arm: Arm) -> Hand:
-    """Find the tool frame and the fingers of an arm's hand."""
-    return _HandAnalysis(file, full, arm).run()
+def analyze_hand(
+    file: UrdfFile, full: pin.Model, arm: Arm, linkages: Sequence[Sequence[Positions]] = ()
+) -> Hand:
+    """Find the tool frame and the fingers of an arm's hand.
+
+    Args:
+        file: The robot's URDF.
+        full: Its model with all joints.
+        arm: The arm.
+        linkages: For each linkage of fingers that a tree of joints cannot express, configurations
+            that close it; its joints take no others.
+    """
+    return _HandAnalysis(file, full, arm, linkages).run()
 
 
 class _HandAnalysis:
-    def __init__(self, file: UrdfFile, full: pin.Model, arm: Arm) -> None:
+    def __init__(
+        self, file: UrdfFile, full: pin.Model, arm: Arm, linkages: Sequence[Sequence[Positions]]
+    ) -> None:
+        self._linkages = linkages
         self._file, self._full, self._arm, self._data = file, full, arm, full.createData()
         self._points = _sample_points(
             file, [link for body in arm.palm.subtree() for link in body.links]
@@ -113,11 +128,15 @@ class _HandAnalysis:
         place = inner * closing + across * side + depth * approach
         tool = pin.SE3(np.column_stack([closing, side, approach]), place)
         moves = gap - closed
+        linked = {name for linkage in self._linkages for name in linkage[0]}
+        is_linkage = bool(linked) and linked.issuperset(joints)
         sure = (
             "sure" if len(fingers) == 2 and moves > 0.01 else "likely" if moves > 0.01 else "guess"
         )
         how = (
-            "two fingers"
+            "the fingers of a linkage"
+            if is_linkage
+            else "two fingers"
             if len(fingers) == 2
             else "one jaw and the hand"
             if len(fingers) == 1
@@ -129,7 +148,7 @@ class _HandAnalysis:
             for joint, value in closed_positions.items()
             if abs(value - opened[joint]) > _LITTLE
         }
-        known = moves > 0.01 and len(fingers) <= _GRIPPER
+        known = moves > 0.01 and (is_linkage or len(fingers) <= _GRIPPER)
         return Hand(
             self._link, tool, opened, closing_joints if known else {}, float(gap), touch, sure, why
         )
@@ -222,25 +241,42 @@ class _HandAnalysis:
         """Return open and closed positions of the finger joints, and the gaps there [m]."""
         rest = compute_rest_positions(self._full, self._file, {})
         chosen = {joint: rest[joint] for joint in joints if joint in rest}
-        choices = {joint: self._sample_positions(joint, rest[joint]) for joint in chosen}
+        choices = self._list_choices(chosen)
         best = smallest = self._measure_gap(first, second, chosen)
-        for _ in range(_PASSES if len(chosen) > 1 else 1):
-            for joint, values in choices.items():
-                for value in values:
-                    gap = self._measure_gap(first, second, {**chosen, joint: value})
+        for _ in range(_PASSES if len(choices) > 1 else 1):
+            for positions in choices:
+                for choice in positions:
+                    gap = self._measure_gap(first, second, {**chosen, **choice})
                     smallest = min(smallest, gap)
                     if gap > best + 1e-4:
-                        best, chosen[joint] = gap, value
-        closed_positions = {
-            joint: max(values, key=lambda value: abs(value - chosen[joint]))
-            for joint, values in choices.items()
-        }
+                        best = gap
+                        chosen.update(choice)
+        closed_positions = dict[str, float]()
+        for positions in choices:
+            closed_positions |= max(
+                positions,
+                key=lambda choice: max(abs(choice[name] - chosen[name]) for name in choice),
+            )
         return (
             chosen,
             closed_positions,
             best,
             min(smallest, self._measure_gap(first, second, closed_positions)),
         )
+
+    def _list_choices(self, rest: Positions) -> list[list[dict[str, float]]]:
+        """Return the positions to try for each finger joint, and those of each linkage."""
+        choices, left = list[list[dict[str, float]]](), dict(rest)
+        for linkage in self._linkages:
+            names = [name for name in linkage[0] if name in left]
+            if names:
+                choices.append([{name: state[name] for name in names} for state in linkage])
+                for name in names:
+                    left.pop(name)
+        return choices + [
+            [{joint: value} for value in self._sample_positions(joint, position)]
+            for joint, position in left.items()
+        ]
 
     def _sample_positions(self, joint: str, rest: float) -> list[float]:
         moving = self._full.joints[self._full.getJointId(joint)]

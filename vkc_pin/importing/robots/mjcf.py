@@ -16,6 +16,7 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing.mjcf_models import NO_MASS, compile_mjcf
+from vkc_pin.importing.robots.linkages import solve_linkages
 from vkc_pin.importing.targets import add_connection, add_origin, format_numbers
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import import_optional
@@ -34,11 +35,14 @@ class ConvertedRobot:
     Attributes:
         root: The URDF.
         states: Maps the name of each key frame to joint positions, [m] or [rad].
+        linkages: For each linkage that <connect> closes, some of its configurations, the file's
+            pose first: joint positions, [m] or [rad].
         notes: Changes and omissions.
     """
 
     root: ElementTree.Element
     states: dict[str, dict[str, float]] = field(default_factory=dict)
+    linkages: list[list[dict[str, float]]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
@@ -89,6 +93,11 @@ class _Converter:
             if model.body_rootid[body] == chosen:
                 self._convert_body(body, root=body == chosen)
         self._convert_couplings()
+        scalar = set(self._find_scalar_joints())
+        for states in solve_linkages(self._mujoco, model):
+            if states[0].keys() <= scalar:
+                named = [{self._get_name("joint", j): state[j] for j in state} for state in states]
+                self._result.linkages.append(named)
         for key in range(model.nkey):
             self._result.states[self._get_name("key", key)] = {
                 self._get_name("joint", j): float(

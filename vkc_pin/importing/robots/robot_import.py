@@ -61,6 +61,7 @@ _SAMPLES, _PIECES = 2000, 8
 _NEAR, _MOSTLY = 300, 0.75
 # [m] Distance up to which links are neighbours by design, such as the segments of a telescope
 _NEIGHBOURS = Options().dist_safe + 0.005
+_CLOSED = 0.01  # [m] opening below which fingers that do not move can grasp nothing
 _STANDING = 0.005  # [m] height up to which a root stands on the floor
 
 
@@ -182,7 +183,7 @@ class _Importer:
                 "frame", tool_frame, names, file=self._file.path, field="tool_frame"
             )
         tree = build_body_tree(self._file)
-        base_joints = find_own_base(tree, solid)
+        base_joints = find_own_base(self._file, tree, solid)
         arms = find_arms(self._file, tree, self._source.groups, solid)
         chosen = (
             None
@@ -196,7 +197,10 @@ class _Importer:
         self._file = UrdfFile(self._folder / self._settings["urdf"], text, root)
         if chosen is not None:
             self._set_hand(
-                analyze_hand(self._file, build_full_model(self._file), chosen), tool_frame
+                analyze_hand(
+                    self._file, build_full_model(self._file), chosen, self._source.linkages
+                ),
+                tool_frame,
             )
         if tool_frame is not None:
             self._settings["tool_frame"] = tool_frame
@@ -265,6 +269,8 @@ class _Importer:
         self._settings["touch_links"] = links
         for key, values in hand.settings().items():
             self._settings.setdefault(key, {}).update(values)
+        if hand.open and not hand.closed:
+            self._report_locked_fingers(hand)
         if tool_frame is None:
             tool = choose_free_name("tool", self._get_names())
             self._add_link(tool, hand.link, hand.tool)
@@ -274,6 +280,23 @@ class _Importer:
                 f"hand: frame '{tool}' {hand.why}",
                 "if it is wrong: `tool_frame`, see docs/robots.md",
             )
+
+    def _report_locked_fingers(self, hand: Hand) -> None:
+        """Report that the gripper does not move, a fault if its fingers are closed."""
+        limits = {
+            name: tuple(limit.get(key, "0") for key in ("lower", "upper"))
+            for joint in self._file.root.findall("joint")
+            if (name := joint.get("name", "")) in hand.open
+            and (limit := joint.find("limit")) is not None
+        }
+        fixed = [f"{name} {low} to {high}" for name, (low, high) in limits.items() if low == high]
+        text = f"the gripper does not move: its fingers stay {1e3 * hand.opening:.0f} mm apart"
+        hint = "`gripper`, see docs/robots.md"
+        if fixed:
+            text += f"; limits in the file: {', '.join(fixed)}"
+            hint = "widen these limits in the file"
+        level = "fault" if hand.opening < _CLOSED else "warning"
+        self._findings.append(Finding(level, "hand", text, hint))
 
     def _write_and_load(self) -> Robot:
         """Write the files and return the robot."""

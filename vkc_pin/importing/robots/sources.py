@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -36,6 +36,7 @@ class Source:
         kind: "URDF", "xacro" or "MJCF".
         srdf: The SRDF beside it.
         groups: Maps each group of the SRDF to its joints.
+        linkages: Configurations of closed linkages, see `ConvertedRobot`.
         notes: Changes and omissions.
         warnings: Changes that can make the robot's shape wrong.
     """
@@ -44,6 +45,7 @@ class Source:
     kind: str
     srdf: Srdf = field(default_factory=lambda: Srdf({}, {}))
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    linkages: Sequence[Sequence[Mapping[str, float]]] = ()
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -61,9 +63,11 @@ def read_source(
     root = parse_xml(text, file)
     notes: list[str] = []
     states: dict[str, dict[str, float]] = {}
+    linkages: Sequence[Sequence[Mapping[str, float]]] = ()
     if root.tag == "mujoco":
         converted = convert_mjcf(file, scratch)
         kind, notes, states = "MJCF", converted.notes, converted.states
+        linkages = converted.linkages
         text = _format_xml(converted.root)
     elif root.tag != "robot":
         expected = "<robot> (URDF or xacro) or <mujoco> (MJCF)"
@@ -88,17 +92,17 @@ def read_source(
     warnings = tuple(replaced)
     srdf_path = srdf if srdf is not None else _find_srdf(file)
     if srdf_path is None:
-        return Source(read, kind, Srdf({}, states), {}, tuple(notes), warnings)
+        return Source(read, kind, Srdf({}, states), {}, linkages, tuple(notes), warnings)
     try:
         semantics = read_srdf(srdf_path, links=read.links)
     except InputError:
         if srdf is not None:
             raise
         notes.append(f"ignored {srdf_path.name} beside it, which names links of another robot")
-        return Source(read, kind, Srdf({}, states), {}, tuple(notes), warnings)
+        return Source(read, kind, Srdf({}, states), {}, linkages, tuple(notes), warnings)
     groups = {name: group.joints for name, group in read_groups(srdf_path, read.root).items()}
     merged = Srdf(semantics.allowed, {**states, **semantics.states})
-    return Source(read, kind, merged, groups, tuple(notes), warnings)
+    return Source(read, kind, merged, groups, linkages, tuple(notes), warnings)
 
 
 def choose_free_name(name: str, taken: set[str]) -> str:

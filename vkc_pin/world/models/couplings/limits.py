@@ -16,10 +16,17 @@ from vkc_pin.world.models.couplings.coupled_joints import check_followers, find_
 from vkc_pin.world.models.robot_schema import RobotSchema
 from vkc_pin.world.models.shapes import LIMIT_SLACK
 
-__all__ = ["DEFAULT_JOINT_VELOCITY", "apply_robot_limits", "tighten_coupled_limits"]
+__all__ = [
+    "DEFAULT_JOINT_VELOCITY",
+    "DEFAULT_SLIDE_VELOCITY",
+    "apply_robot_limits",
+    "tighten_coupled_limits",
+]
 
 DEFAULT_JOINT_VELOCITY = np.pi
-"""Velocity limit of joints for which no file states one [rad/s] or [m/s]."""
+"""Velocity limit of revolute joints for which no file states one [rad/s]."""
+DEFAULT_SLIDE_VELOCITY = 0.1
+"""Velocity limit of prismatic joints for which no file states one [m/s]; most of them are lifts."""
 _DEFAULT_JOINT_ACCELERATION = 1.4  # [rad/s²] or [m/s²]
 
 
@@ -91,6 +98,7 @@ def apply_robot_limits(
     unit_rates = coordinates.compute_max_steps(
         1.0, 1.0
     )  # at which the fastest joint moves at 1 m/s or 1 rad/s
+    default_velocity = coordinates.compute_max_steps(DEFAULT_SLIDE_VELOCITY, DEFAULT_JOINT_VELOCITY)
     for move in coordinates.moves[3:]:
         name, k, factor = model.names[move.joint], move.coordinate, abs(move.factor)
         joint_settings, urdf_velocity = (
@@ -105,7 +113,7 @@ def apply_robot_limits(
             velocity[k] = min(velocity[k], urdf_velocity / factor)
         if joint_settings is not None and joint_settings.acceleration is not None:
             acceleration[k] = min(acceleration[k], joint_settings.acceleration / factor)
-    velocity = np.where(np.isinf(velocity), DEFAULT_JOINT_VELOCITY * unit_rates, velocity)
+    velocity = np.where(np.isinf(velocity), default_velocity, velocity)
     acceleration = np.where(
         np.isinf(acceleration), _DEFAULT_JOINT_ACCELERATION * unit_rates, acceleration
     )

@@ -253,10 +253,11 @@ class _HandAnalysis:
                         chosen.update(choice)
         closed_positions = dict[str, float]()
         for positions in choices:
-            closed_positions |= max(
+            furthest: Positions = max(
                 positions,
                 key=lambda choice: max(abs(choice[name] - chosen[name]) for name in choice),
             )
+            closed_positions.update(furthest)
         return (
             chosen,
             closed_positions,

@@ -74,3 +74,30 @@ def test_unnamed_bodies_and_second_joints_get_unique_names(tmp_path: Path) -> No
     (tmp_path / "t.xml").write_text("<mujoco><worldbody><geom type='bx'/></worldbody></mujoco>")
     with pytest.raises(InputError, match=r"t\.xml"):
         read_object_mjcf(tmp_path / "t.xml")
+
+
+@pytest.mark.parametrize(
+    ("joint", "limits", "spring"),
+    [
+        ('range="-10 95" ref="5" stiffness="4" springref="-60"', (-15.0, 90.0), (4.0, -65.0)),
+        ('range="0 90" stiffness="2"', (0.0, 90.0), (2.0, 0.0)),
+        ('range="0 90" ref="90"', (-90.0, 0.0), (0.0, -90.0)),
+        ('range="0 90" stiffness="1" springref="30"', (0.0, 90.0), (1.0, 30.0)),
+        ('stiffness="1" ref="-20"', None, (1.0, 20.0)),
+    ],
+)
+def test_springs_and_limits_count_from_the_pose_in_the_file(
+    tmp_path: Path,
+    joint: str,
+    limits: tuple[float, float] | None,
+    spring: tuple[float, float],
+) -> None:
+    (tmp_path / "t.xml").write_text(
+        f"""<mujoco><worldbody><geom size="0.1"/><body name="a"><geom size="0.2"/>
+        <joint name="x" {joint}/></body></worldbody></mujoco>"""
+    )
+    found = read_object_mjcf(tmp_path / "t.xml")
+    read = found.joints["a"]
+    assert read.limits == (None if limits is None else pytest.approx(np.radians(limits)))
+    assert (read.stiffness, np.degrees(read.springref)) == pytest.approx(spring)
+    assert ("`ref`" in " ".join(found.notes)) == (" ref=" in joint)

@@ -4,9 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from helpers.downloads import SDF
 
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.importing.objects.clean_up import add_missing_limits, load_surfaces
 from vkc_pin.importing.objects.description import Description
 from vkc_pin.importing.objects.sdf import read_object_sdf
 
@@ -30,9 +32,9 @@ def test_relative_frames_inertia_and_resistance_are_read(tmp_path: Path) -> None
     assert np.allclose(hinge.axis, [0.0, 0.0, -1.0])
     shut, open_ = (found.compute_placements({"hinge": value})["door"] for value in (0.0, -0.7))
     leaf = found.links["door"].collision[0].placement
-    assert np.allclose((shut * leaf).translation, [-0.25, 0.0, 0.0])  # in the frame of the case
-    assert np.allclose(shut.translation, [-0.25, -0.3, 0.0])  # on the hinge
-    assert (open_ * leaf).translation[0] < -0.35
+    assert np.allclose((shut * leaf).translation, [0.75, 0.0, 0.4])  # in the world
+    assert np.allclose(shut.translation, [0.75, -0.3, 0.4])  # on the hinge
+    assert (open_ * leaf).translation[0] < 0.65
     partial = read(tmp_path, text.replace(moments, ""))
     assert partial.links["case"].inertia.mass == 0.0
     assert any("<inertial> counts as none" in note for note in partial.notes)
@@ -65,3 +67,382 @@ def test_errors_name_the_file(tmp_path: Path, old: str, new: str, error: type[In
     assert old in SDF
     with pytest.raises(error, match=r"t\.sdf"):
         read(tmp_path, SDF.replace(old, new))
+
+
+CHEST = """<?xml version="1.0"?>
+<sdf version="{version}"><model name="chest">{model}
+<link name="case"><pose>0 0 0.4 0 0 0</pose>
+  <collision name="c"><geometry><box><size>0.4 0.6 0.8</size></box></geometry></collision></link>
+<link name="front">{pose}
+  <collision name="c"><geometry><box><size>0.02 0.56 0.3</size></box></geometry></collision></link>
+<joint name="slide" type="prismatic">{joint_pose}<parent>{parent}</parent><child>{child}</child>
+  <axis>{axis}<limit><lower>{lower}</lower><upper>{upper}</upper></limit>{dynamics}</axis></joint>
+</model></sdf>"""
+USUAL = {
+    "version": "1.7",
+    "model": "",
+    "pose": "<pose>-0.22 0 0.5 0 0 0</pose>",
+    "joint_pose": "",
+    "parent": "case",
+    "child": "front",
+    "axis": "<xyz>-1 0 0</xyz>",
+    "lower": "0",
+    "upper": "0.3",
+    "dynamics": "",
+}
+
+
+def format_chest(**changes: str) -> str:
+    return CHEST.format(**{**USUAL, **changes})
+
+
+def find_axis(found: Description, link: str) -> np.ndarray:
+    """Return the axis of a link's joint in the world."""
+    return found.compute_placements()[link].rotation @ found.joints[link].axis
+
+
+def find_box(found: Description, link: str = "front") -> np.ndarray:
+    """Return the bounding box of a link's first shape in the world, shape (2, 3) [m]."""
+    mesh = found.links[link].collision[0].make_mesh()
+    return mesh.apply_transform(found.compute_placements()[link].homogeneous).bounds
+
+
+FRAMES = (
+    '<frame name="f" attached_to="case"><pose>-0.22 0 0 0 0 0</pose></frame>'
+    '<frame name="g" attached_to="f"/><frame name="h" attached_to="front"/>'
+)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"axis": "<xyz>-3 0 0</xyz>"},
+        {"child": "h", "model": FRAMES},
+        {"parent": "g", "model": FRAMES},
+        {"parent": "__model__"},
+        {"pose": '<pose relative_to="f">0 0 0.1 0 0 0</pose>', "model": FRAMES},
+        {"pose": '<pose relative_to="g"> 0 0 0.1 \n 0\t0 0 </pose>', "model": FRAMES},
+        {"pose": '<pose frame="case">-0.22 0 0.1 0 0 0</pose>', "version": "1.6"},
+        {"pose": '<pose frame="case">-0.22 0 0.5 0 0 0</pose>', "version": "1.7"},
+        {"pose": '<pose relative_to="">-0.22 0 0.5 0 0 0</pose>'},
+        {"pose": '<pose relative_to="__model__">-0.22 0 0.5 0 0 0</pose>'},
+        {"pose": '<pose relative_to="world">-0.22 0 0.5 0 0 0</pose>'},
+        {
+            "pose": '<pose relative_to="slide"/>',
+            "joint_pose": '<pose relative_to="case">-0.22 0 0.1 0 0 0</pose>',
+        },
+        {"pose": '<pose rotation_format="quat_xyzw">-0.22 0 0.5 0 0 0 1</pose>'},
+        {
+            "pose": '<pose rotation_format="quat_xyzw">-0.22 0 0.5 0 0 2 0</pose>',
+            "axis": "<xyz>1 0 0</xyz>",
+        },
+        {
+            "pose": '<pose rotation_format="euler_rpy" degrees="1">-0.22 0 0.5 0 0 180</pose>',
+            "axis": "<xyz>1 0 0</xyz>",
+        },
+        {"pose": '<pose degrees="True">-0.22 0 0.5 0 0 360</pose>'},
+        {"pose": '<pose degrees="TRUE">-0.22 0 0.5 360 0 0</pose>', "version": "1.12"},
+        {"model": '<pose relative_to="">0 0 0 0 0 0</pose>', "version": "1.6.0"},
+        {"version": " 1.10 "},
+        {"version": "1.2"},
+        {"lower": " 0 ", "upper": "3e-1"},
+        {"axis": '<xyz expressed_in="case">-1 0 0</xyz>'},
+        {
+            "axis": '<xyz expressed_in="front">-1 0 0</xyz>',
+            "joint_pose": "<pose>0 0 0 0 0 2</pose>",
+        },
+    ],
+)
+def test_spellings_of_the_same_chest(tmp_path: Path, changes: dict[str, str]) -> None:
+    found = read(tmp_path, format_chest(**changes))
+    np.testing.assert_allclose(
+        find_box(found), [[-0.23, -0.28, 0.35], [-0.21, 0.28, 0.65]], atol=1e-9
+    )
+    np.testing.assert_allclose(find_axis(found, "front"), [-1.0, 0.0, 0.0], atol=1e-9)
+    assert found.joints["front"].limits == (0.0, 0.3)
+    assert found.joints["front"].parent == "case"
+    assert found.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("version", "flag", "axis"),
+    [
+        ("1.2", "", [0, 0, 1]),
+        ("1.3", "", [0, 0, 1]),
+        ("1.4", "", [0, 0, 1]),
+        ("1.4", "<use_parent_model_frame>0</use_parent_model_frame>", [0, 0, 1]),
+        ("1.5", "", [0, -1, 0]),
+        ("1.5", "<use_parent_model_frame>1</use_parent_model_frame>", [0, 0, 1]),
+        ("1.6", "<use_parent_model_frame> True </use_parent_model_frame>", [0, 0, 1]),
+        ("1.6", "<use_parent_model_frame>false</use_parent_model_frame>", [0, -1, 0]),
+        ("1.7", "<use_parent_model_frame>1</use_parent_model_frame>", [0, -1, 0]),
+        ("1.11", "", [0, -1, 0]),
+    ],
+)
+def test_the_version_tells_the_frame_of_the_axis(
+    tmp_path: Path, version: str, flag: str, axis: list[float]
+) -> None:
+    """The front is rolled by a right angle; the model's own pose turns both."""
+    pose = "<pose>-0.22 0 0.5 1.5707963267948966 0 0</pose>"
+    changes = {"version": version, "pose": pose, "axis": f"<xyz>0 0 1</xyz>{flag}"}
+    found = read(tmp_path, format_chest(**changes))
+    np.testing.assert_allclose(find_axis(found, "front"), axis, atol=1e-9)
+    yawed = read(
+        tmp_path, format_chest(**changes, model="<pose>0 0 0 0 0 1.5707963267948966</pose>")
+    )
+    x, y, z = axis
+    np.testing.assert_allclose(find_axis(yawed, "front"), [-y, x, z], atol=1e-9)
+
+
+def test_the_pose_of_the_model_counts(tmp_path: Path) -> None:
+    found = read(tmp_path, format_chest(model="<pose>0 0 0 1.5707963267948966 0 0</pose>"))
+    np.testing.assert_allclose(np.ptp(find_box(found, "case"), axis=0), [0.4, 0.8, 0.6])
+
+
+@pytest.mark.parametrize("frame", ["case", "f", "slide", "front"])
+def test_models_are_placed_by_one_of_their_frames(tmp_path: Path, frame: str) -> None:
+    """Where this frame has been in the model, the model's own frame stays."""
+    found = read(tmp_path, format_chest(model=FRAMES))
+    place = {"case": "0 0 0.4", "f": "-0.22 0 0.4", "slide": "-0.22 0 0.5", "front": "-0.22 0 0.5"}
+    text = format_chest(model=f"{FRAMES}<pose>{place[frame]} 0 0 0</pose>", version="1.8")
+    placed = read(tmp_path, text.replace('"chest"', f'"chest" placement_frame="{frame}"'))
+    np.testing.assert_allclose(find_box(placed), find_box(found), atol=1e-9)
+
+
+def test_elements_of_two_kinds_may_share_a_name(tmp_path: Path) -> None:
+    text = format_chest(joint_pose="<pose>0 0.1 0 0 0 0</pose>").replace('"slide"', '"front"')
+    np.testing.assert_allclose(find_box(read(tmp_path, text))[0], [-0.23, -0.28, 0.35])
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "limits", "assumed"),
+    [
+        ("-0.3", "1e16", (-0.3, np.inf), (-0.3, 0.0)),
+        ("-inf", "0.25", (-np.inf, 0.25), (0.0, 0.25)),
+        ("0", "inf", (0.0, np.inf), (0.0, 0.016)),
+        ("-1e16", "0", (-np.inf, 0.0), (-0.016, 0.0)),
+        ("0.1", "1.79769e308", (0.1, np.inf), (0.1, 0.116)),
+        ("-3.4028234e38", "-0.1", (-np.inf, -0.1), (-0.116, -0.1)),
+        ("-1e16", "1e16", None, (0.0, 0.016)),
+        ("-INF", "Inf", None, (0.0, 0.016)),
+        ("0.3", "-0.1", (-0.1, 0.3), (-0.1, 0.3)),
+    ],
+)
+def test_limits_may_be_one_sided(
+    tmp_path: Path,
+    lower: str,
+    upper: str,
+    limits: tuple[float, float] | None,
+    assumed: tuple[float, float],
+) -> None:
+    found = read(tmp_path, format_chest(lower=lower, upper=upper))
+    assert found.joints["front"].limits == limits
+    completed = add_missing_limits(found, load_surfaces(found))
+    assert completed.joints["front"].limits == pytest.approx(assumed)
+    assert bool(completed.notes) == (
+        limits is None or limits != (float(lower), float(upper)) or np.isinf(limits).any()
+    )
+
+
+def test_only_visual_meshes_may_be_missing(tmp_path: Path) -> None:
+    """They may, if their link has collision shapes."""
+    mesh = '<{} name="v"><geometry><mesh><uri>model://a/b.dae</uri></mesh></geometry></{}>'
+    visual, collision = (mesh.format(kind, kind) for kind in ("visual", "collision"))
+    found = read(tmp_path, format_chest(pose=visual))
+    assert found.links["front"].visual == ()
+    assert "'v' of link 'front' is left out" in found.notes[0]
+    with pytest.raises(InputError, match=r"t\.sdf:5: model://a/b\.dae: there is no such mesh"):
+        read(tmp_path, format_chest(pose=collision))
+    with pytest.raises(InputError, match="no such mesh"):
+        read(tmp_path, format_chest(model=f'<link name="seen">{visual}</link>'))
+
+
+def test_springs_are_read(tmp_path: Path) -> None:
+    spring = "<spring_stiffness>4</spring_stiffness><spring_reference>-0.2</spring_reference>"
+    joint = read(tmp_path, format_chest(dynamics=f"<dynamics>{spring}</dynamics>")).joints["front"]
+    assert (joint.stiffness, joint.springref) == (4.0, -0.2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        *[
+            ({"version": version}, r"t\.sdf:2: sdf version: .*1\.2 to 1\.12")
+            for version in ("1", "", "x", "1.a", "2.0", "1.0", "-1.7", "1,7", "1.7beta")
+        ],
+        ({"axis": "<xyz>0 0 0</xyz>"}, "slide: axis xyz: an axis without direction"),
+        ({"axis": "<xyz>0 1</xyz>"}, r"t\.sdf:8: slide: axis xyz: wrong numbers"),
+        ({"axis": '<xyz expressed_in="cas">0 0 1</xyz>'}, "no frame 'cas'; did you mean 'case'"),
+        ({"pose": '<pose rotation_format="quat">0 0 0 0 0 0</pose>'}, "did you mean 'quat_xyzw'"),
+        (
+            {"pose": '<pose rotation_format="quat_xyzw">0 0 0 0 0 0</pose>'},
+            "front: pose: .*7 finite",
+        ),
+        ({"pose": '<pose rotation_format="quat_xyzw">0 0 0 0 0 0 0</pose>'}, "front: .*length 0"),
+        (
+            {"pose": '<pose degrees="1" rotation_format="quat_xyzw">0 0 0 0 0 0 1</pose>'},
+            "a quaternion in degrees",
+        ),
+        ({"pose": "<pose>0 0 0</pose>"}, "front: pose: wrong numbers .*6 finite numbers"),
+        ({"pose": '<pose relative_to="slide">0 0 0 0 0 0</pose>'}, "cycle .*front → slide → front"),
+        ({"model": '<frame name="a" attached_to="a"/>', "child": "a"}, "cycle .*a → a"),
+        ({"model": '<frame name="a" attached_to="slide"/>', "child": "a"}, "cycle"),
+        ({"parent": "front"}, r"t\.sdf:5: front: links in a circle .*front → front"),
+        ({"child": ""}, r"t\.sdf:7: slide: a joint that connects nothing .*<child>"),
+        ({"child": "world"}, "slide: the world cannot be a child"),
+        ({"model": '<joint name="slide" type="fixed"/>'}, "slide: two joints have the same name"),
+        (
+            {
+                "model": '<joint name="k" type="fixed"><parent>front</parent>'
+                "<child>case</child></joint>"
+            },
+            "links in a circle",
+        ),
+        (
+            {
+                "model": '<joint name="k" type="fixed"><parent>world</parent>'
+                "<child>front</child></joint>"
+            },
+            "front: a link with two parents .*'k' and 'slide'",
+        ),
+        (
+            {
+                "model": '<joint name="k" type="hinge"><parent>world</parent>'
+                "<child>case</child></joint>"
+            },
+            "k: there is no joint type 'hinge'",
+        ),
+        ({"model": "<link/>"}, "a link without a name"),
+        ({"model": "<include><uri>model://nothing</uri></include>"}, r"no such model .*model://no"),
+        ({"model": "<include/>"}, "no such model"),
+        ({"model": "<include><uri>t.sdf</uri></include>"}, r"includes itself .*t\.sdf → t\.sdf"),
+        ({"model": '<model name="m"/>'}, "m: a model without links"),
+        (
+            {
+                "model": "".join(
+                    f'<frame name="f{k}" attached_to="f{k + 1}"/>' for k in range(2000)
+                )
+                + '<frame name="f2000"/>',
+                "parent": "f0",
+            },
+            "nested too deeply",
+        ),
+    ],
+)
+def test_wrong_models_are_refused(tmp_path: Path, changes: dict[str, str], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read(tmp_path, format_chest(**changes))
+
+
+def test_a_missing_or_newer_version_is_noted(tmp_path: Path) -> None:
+    found = read(tmp_path, format_chest().replace(' version="1.7"', ""))
+    assert found.notes == ("t.sdf states no version: read as SDF 1.7",)
+    assert "1.99: read as SDF 1.12" in read(tmp_path, format_chest(version="1.99")).notes[0]
+
+
+def test_submeshes_are_parts_of_a_file(tmp_path: Path) -> None:
+    scene = trimesh.Scene()
+    for name, size, at in (
+        ("shell", (0.4, 0.6, 0.8), (0, 0, 0)),
+        ("face", (0.02, 0.5, 0.3), (1, 0, 0)),
+    ):
+        box = trimesh.creation.box(size).apply_translation(at)
+        scene.add_geometry(box, node_name=name)
+    scene.export(tmp_path / "both.glb")
+    text = format_chest(pose="<pose>0 0 0 0 0 0</pose>")
+    box = "<box><size>0.02 0.56 0.3</size></box>"
+    for centre, low in (("", 1.98), ("<center>true</center>", -0.02)):
+        part = f"<submesh><name>face</name>{centre}</submesh><scale>2 1 1</scale>"
+        mesh = f"<mesh><uri>both.glb</uri>{part}</mesh>"
+        bounds = find_box(read(tmp_path, text.replace(box, mesh)))
+        size = [[low, -0.25, -0.15], [low + 0.04, 0.25, 0.15]]
+        np.testing.assert_allclose(bounds, size, atol=1e-6)
+    with pytest.raises(UnknownNameError, match="submesh 'fac'; did you mean 'face'"):
+        read(tmp_path, text.replace(box, mesh.replace("face", "fac")))
+
+
+WORLD = """<sdf version="1.6"><world name="flat">
+  <include><uri>model://bin</uri><pose>3 0 0 0 0 0</pose></include>
+  <include><uri>model://bin</uri><name>other</name><pose>4 0 0 0 0 0</pose>
+    <static>1</static></include>
+  <model name="wall"><static>true</static><pose>0 2 1 0 0 0</pose><link name="l">
+    <collision name="c"><geometry><box><size>4 0.1 2</size></box></geometry></collision></link>
+  </model>
+  <model name="unit"><pose>1 0 0 0 0 0</pose>
+    <include><uri>model://bin</uri><name>part</name><pose>0 0 1 0 0 0</pose></include>
+    <joint name="door" type="revolute"><parent>world</parent><child>part::body</child>
+      <axis><xyz>0 0 1</xyz><limit><lower>0</lower><upper>1</upper></limit></axis></joint></model>
+  <light name="sun"/><state world_name="flat"/>
+</world></sdf>"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder `worlds` beside a folder `models` with one model in two versions."""
+    bin_folder = tmp_path / "models" / "bin"
+    bin_folder.mkdir(parents=True)
+    (tmp_path / "worlds").mkdir()
+    body = (
+        '<model name="bin"><pose>9 9 9 0 0 0</pose><link name="body"><collision name="c">'
+        "<geometry><ellipsoid><radii>0.1 0.2 0.3</radii></ellipsoid></geometry></collision></link>"
+        "</model>"
+    )
+    (bin_folder / "new.sdf").write_text(f'<sdf version="1.6">{body}</sdf>')
+    (bin_folder / "old.sdf").write_text('<sdf version="1.4"/>')
+    (bin_folder / "model.config").write_text(
+        '<model><sdf version="1.4">old.sdf</sdf><sdf version="1.6">new.sdf</sdf></model>'
+    )
+    return tmp_path / "worlds"
+
+
+def test_worlds_and_included_models_are_read(folder: Path) -> None:
+    (folder / "flat.world").write_text(WORLD)
+    found = read_object_sdf(folder / "flat.world", free=True)
+    kinds = {name: (joint.kind, joint.parent) for name, joint in found.joints.items()}
+    assert kinds == {
+        "bin": ("floating", "world"),
+        "other": ("fixed", "world"),
+        "wall": ("fixed", "world"),
+        "unit::part::body": ("revolute", "world"),
+    }
+    places = found.compute_placements()
+    for name, place in (("bin", [3, 0, 0]), ("other", [4, 0, 0]), ("unit::part::body", [1, 0, 1])):
+        np.testing.assert_allclose(places[name].translation, place)
+    np.testing.assert_allclose(np.ptp(find_box(found, "bin"), axis=0), [0.2, 0.4, 0.6], rtol=0.02)
+    assert found.notes == ("<state> is left out",)
+    alone = read_object_sdf(folder / "flat.world")
+    assert "bin" not in alone.links
+    assert any("'bin' is free" in note for note in alone.notes)
+
+
+@pytest.mark.parametrize("version", ["1.6", "1.9"])
+def test_models_are_included_in_models(folder: Path, version: str) -> None:
+    """By nesting, by merging, by a frame of the included model, and relative to another frame."""
+    include = "<include{merge}><uri>model://bin</uri>{more}</include>"
+    joint = (
+        '<joint name="j" type="fixed"><parent>case</parent><child>{link}</child></joint>'
+        '<frame name="f"><pose>0 0 2 0 0 0</pose></frame>'
+    )
+    for link, merge, more, place in (
+        ("bin::body", "", "", [9, 9, 9]),
+        ("b::body", "", "<name>b</name><pose>1 0 0 0 0 0</pose>", [1, 0, 0]),
+        ("b", "", '<name>b</name><pose relative_to="f">1 0 0 0 0 0</pose>', [1, 0, 2]),
+        ("body", ' merge="true"', "<pose>0 3 0 0 0 0</pose>", [0, 3, 0]),
+    ):
+        model = include.format(merge=merge, more=more) + joint.format(link=link)
+        found = read(folder, format_chest(version=version, model=model))
+        name = next(name for name in found.links if name.endswith("body"))
+        assert found.joints[name].parent == "case"
+        np.testing.assert_allclose(found.compute_placements()[name].translation, place, atol=1e-9)
+
+
+def test_models_that_multiply_are_refused(tmp_path: Path) -> None:
+    for k in range(14):
+        inner = "".join(
+            f"<include><uri>m{k + 1}.sdf</uri><name>{name}</name></include>" for name in "ab"
+        )
+        model = f'<model name="m"><link name="l"/>{inner if k < 13 else ""}</model>'
+        (tmp_path / f"m{k}.sdf").write_text(f'<sdf version="1.7">{model}</sdf>')
+    with pytest.raises(InputError, match=r"m0\.sdf: too many models"):
+        read_object_sdf(tmp_path / "m0.sdf")

@@ -41,19 +41,25 @@ def test_written_object_is_read_back(tmp_path: Path) -> None:
         velocity=0.7,
         damping=0.5,
         friction=0.25,
+        stiffness=4.0,
+        springref=-1.1,
     )
     weight = place.act(pin.Inertia(2.5, np.zeros(3), np.diag([0.1, 0.2, 0.25])))
     links = {"a": Link("a", parts[:1], parts[:1]), "b": Link("b", parts, parts, weight)}
     write_urdf(Description(tmp_path / "x", links, {"b": joint}), tmp_path / "thing.urdf")
-    write_description(tmp_path / "thing.yaml", "thing.urdf", (), about=["One.", "Two."])
+    about = ["One.", "Two."]
+    write_description(tmp_path / "thing.yaml", "thing.urdf", (), about=about, joints=[joint])
     assert (tmp_path / "thing.yaml").read_text().startswith("# One.\n# Two.\nurdf: thing.urdf\n")
     assert yaml.safe_load((tmp_path / "thing.yaml").read_text()) == {
         "urdf": "thing.urdf",
+        "joints": {"hinge": {"stiffness": 4.0, "springref": -1.1}},
         "attachments": [],
     }
     item = vkc.load_object(tmp_path / "thing.yaml")
     assert (item.lower[0], item.upper[0], item.velocity[0]) == (-0.2, 1.1, 0.7)
-    assert (item.resistance["hinge"].damping, item.resistance["hinge"].friction) == (0.5, 0.25)
+    resistance = item.resistance["hinge"]
+    assert (resistance.damping, resistance.friction) == (0.5, 0.25)
+    assert (resistance.stiffness, resistance.springref) == (4.0, -1.1)
     assert item.model.inertias[1].isApprox(weight, 1e-6)
     turned = place * pin.SE3(pin.exp3(axis * 0.5), np.zeros(3))
     assert np.allclose(item.link_placement("b", [0.5]).homogeneous, turned.homogeneous, atol=1e-8)

@@ -96,7 +96,8 @@ def write_object(
     with tempfile.TemporaryDirectory() as scratch:
         trial = Path(scratch) / yaml.name if item.free else yaml
         write_urdf(description, trial.with_suffix(".urdf"))
-        write_description(trial, urdf.name, (), about=())
+        springs = description.joints.values()
+        write_description(trial, urdf.name, (), about=(), joints=springs)
         proposals = propose_attachments(load_object(trial), robot, most=most, **clearances)
     if item.free:
         write_urdf(_remove_lift_joint(description), urdf)
@@ -107,6 +108,7 @@ def write_object(
         urdf.name,
         [proposal.description() for proposal in proposals.found],
         about=about,
+        joints=springs,
         free=item.free,
     )
     # The trial file is temporary.

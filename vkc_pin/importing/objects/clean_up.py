@@ -243,11 +243,14 @@ def scale_object(description: Description, factor: float) -> Description:
         links[name] = Link(name, visual, collision, inertia)
     joints = {}
     for child, joint in description.joints.items():
-        limits = joint.limits
-        if joint.kind == "prismatic" and limits is not None:
-            limits = (factor * limits[0], factor * limits[1])
+        limits, springref = joint.limits, joint.springref
+        if joint.kind == "prismatic":
+            springref *= factor
+            limits = limits and (factor * limits[0], factor * limits[1])
         placement = pin.SE3(joint.placement.rotation, factor * joint.placement.translation)
-        joints[child] = dataclasses.replace(joint, placement=placement, limits=limits)
+        joints[child] = dataclasses.replace(
+            joint, placement=placement, limits=limits, springref=springref
+        )
     return dataclasses.replace(description, links=links, joints=joints)
 
 
@@ -276,11 +279,19 @@ def move_root(description: Description, placement: pin.SE3) -> Description:
     return dataclasses.replace(description, links=links, joints=joints)
 
 
+def _complete_limits(limits: tuple[float, float], travel: float) -> tuple[float, float]:
+    """Return limits of which one is infinite with the other at 0, or else a travel away."""
+    low, high = limits
+    if np.isinf(high):
+        return low, 0.0 if low < 0.0 else low + travel
+    return 0.0 if high > 0.0 else high - travel, high
+
+
 def add_missing_limits(description: Description, meshes: Surfaces) -> Description:
     """Return the object with limits for joints that state none, each noted.
 
     A hinge opens by a right angle, a drawer by most of its depth, in the direction that moves the
-    part away from the centre of the object.
+    part away from the centre of the object. A joint with one limit other than 0 opens from 0 to it.
     """
     joints, notes = dict(description.joints), list(description.notes)
     placements, (low, high) = description.compute_placements(), compute_bounds(description, meshes)
@@ -293,7 +304,8 @@ def add_missing_limits(description: Description, meshes: Surfaces) -> Descriptio
             degrees = float(np.degrees(np.ptp(joint.limits)))
             unit = "are its limits in another unit (MJCF: `angle` of <compiler>)?"
             notes.append(f"joint '{joint.name}' has a range of only {degrees:.1g}°: {unit}")
-        if joint.kind not in ("revolute", "prismatic") or joint.limits is not None:
+        ends = joint.limits or (-np.inf, np.inf)
+        if joint.kind not in ("revolute", "prismatic") or np.isfinite(ends).all():
             continue
         below = description.subtree(child)
         points = np.vstack(_place_vertices(description, meshes, placements, below))
@@ -304,8 +316,12 @@ def add_missing_limits(description: Description, meshes: Surfaces) -> Descriptio
         sign = 1.0 if direction @ (centre - (low + high) / 2.0) >= 0.0 else -1.0
         travel = _OPEN if joint.kind == "revolute" else _PULLED * float(np.ptp(points @ axis))
         limits = (0.0, travel) if sign > 0.0 else (-travel, 0.0)
+        about, reason = "no limits", ", away from centre"
+        if np.isfinite(ends).any():
+            about, reason = f"no {'lower' if np.isinf(ends[0]) else 'upper'} limit", ""
+            limits = _complete_limits(ends, travel)
         joints[child] = dataclasses.replace(joint, limits=limits)
         unit = "rad" if joint.kind == "revolute" else "m"
         chosen = f"{limits[0]:.3g} to {limits[1]:.3g} {unit}"
-        notes.append(f"joint '{joint.name}' states no limits: {chosen} assumed, away from centre")
+        notes.append(f"joint '{joint.name}' states {about}: {chosen} assumed{reason}")
     return dataclasses.replace(description, joints=joints, notes=tuple(notes))

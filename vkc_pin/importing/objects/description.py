@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,13 +12,22 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.arrays import MAX_COORDINATE, Floats
 from vkc_pin.world.files.meshes import load_mesh
 
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["WEIGHTLESS", "Colour", "Description", "Joint", "Link", "Part", "make_inertia"]
+__all__ = [
+    "WEIGHTLESS",
+    "Colour",
+    "Description",
+    "Joint",
+    "Link",
+    "Part",
+    "make_inertia",
+    "make_limits",
+]
 
 Colour = tuple[float, float, float, float]
 WEIGHTLESS = (
@@ -102,10 +112,13 @@ class Joint:
         parent, child: Names of the links.
         placement: Placement of the child's frame in the parent's.
         axis: Unit axis in the child's frame, shape (3,).
-        limits: Lower and upper limit, [rad] or [m]; None if the file states none.
+        limits: Lower and upper limit, [rad] or [m], one of them infinite if the file states only
+            the other; None if the file states none.
         velocity: Velocity limit, [rad/s] or [m/s]; None if the file states none.
         damping: Damping, [N·m·s/rad] or [N·s/m]; 0 if the file states none.
         friction: Coulomb friction, [N·m] or [N]; 0 if the file states none.
+        stiffness: Stiffness of a spring, [N·m/rad] or [N/m]; 0 if the file states none.
+        springref: Rest position of the spring, [rad] or [m].
     """
 
     name: str
@@ -118,6 +131,8 @@ class Joint:
     velocity: float | None = None
     damping: float = 0.0
     friction: float = 0.0
+    stiffness: float = 0.0
+    springref: float = 0.0
 
     def compute_motion(self, value: float) -> pin.SE3:
         """Return the child's frame at a position, [rad] or [m], in its frame at zero."""
@@ -154,7 +169,9 @@ class Description:
             values: Joint positions by name, [rad] or [m]; others are at zero.
         """
         placements = {self.root: pin.SE3.Identity()}
-        while len(placements) < len(self.links):
+        before = 0
+        while before < len(placements):
+            before = len(placements)
             for child, joint in self.joints.items():
                 if child not in placements and joint.parent in placements:
                     value = (values or {}).get(joint.name, 0.0)
@@ -177,6 +194,13 @@ class Description:
                 child for child, joint in self.joints.items() if joint.parent in placements
             }
         return placements
+
+
+def make_limits(low: float, high: float) -> tuple[float, float] | None:
+    """Return the limits of a joint as in `Joint`; numbers beyond `MAX_COORDINATE` mean none."""
+    low = low if low > -MAX_COORDINATE else -math.inf
+    high = high if high < MAX_COORDINATE else math.inf
+    return None if math.isinf(low) and math.isinf(high) else (low, high)
 
 
 def make_inertia(mass: float, moments: Iterable[float], placement: pin.SE3) -> pin.Inertia:

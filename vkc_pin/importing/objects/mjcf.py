@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.importing.mjcf_models import NO_MASS, compile_mjcf
-from vkc_pin.importing.objects.description import Description, Joint, Link, Part
+from vkc_pin.importing.objects.description import Description, Joint, Link, Part, make_limits
 from vkc_pin.utils.optional_imports import import_optional
 
 __all__ = ["read_object_mjcf"]
@@ -97,13 +97,15 @@ class _Reader:
         name = self._find_name("joint", number)
         if kind == "fixed":
             self.notes.append(f"joint '{name}' is a ball joint: taken as fixed")
-        limits = None
-        if model.jnt_limited[number]:
-            zero = float(model.qpos0[model.jnt_qposadr[number]])
-            limits = (
-                float(model.jnt_range[number][0]) - zero,
-                float(model.jnt_range[number][1]) - zero,
+        limits, address = None, model.jnt_qposadr[number]
+        zero = 0.0 if kind == "fixed" else float(model.qpos0[address])
+        if zero:
+            self.notes.append(
+                f"joint '{name}' is at its `ref` in the file: values are less by {zero:.4g}"
             )
+        if model.jnt_limited[number]:
+            low, high = (float(value) - zero for value in model.jnt_range[number])
+            limits = make_limits(low, high)
         return Joint(
             name=name,
             kind="continuous" if kind == "revolute" and limits is None else kind,
@@ -114,6 +116,8 @@ class _Reader:
             limits=limits,
             damping=float(np.ravel(model.dof_damping[model.jnt_dofadr[number]])[0]),
             friction=float(model.dof_frictionloss[model.jnt_dofadr[number]]),
+            stiffness=float(np.ravel(model.jnt_stiffness[number])[0]),
+            springref=float(model.qpos_spring[address]) - zero,
         )
 
     def _read_inertia(self, body: int, frame: pin.SE3) -> pin.Inertia:

@@ -204,15 +204,15 @@ def import_object(
         about = [f"Made of {path.name} {get_origin_marker(_COMMAND)}."]
         if link is not None and link != name:
             about.append(f"Name of the link: {link}")
-        write_description(yaml, urdf.name, (), about=about)
+        springs = description.joints.values()
+        write_description(yaml, urdf.name, (), about=about, joints=springs)
         proposals = propose_attachments(load_object(yaml), robot, most=most, **clearances)
         about.append(f"Attachments as proposed for the hand of {proposals.hand.robot}, best first.")
         about += [
             f"No hand can open {joint}: {reason}." for joint, reason in proposals.because.items()
         ]
-        write_description(
-            yaml, urdf.name, [item.description() for item in proposals.found], about=about
-        )
+        found = [item.description() for item in proposals.found]
+        write_description(yaml, urdf.name, found, about=about, joints=springs)
         plot_attachments(proposals, picture)
     loaded = load_object(target / yaml.name)
     # The files have moved.

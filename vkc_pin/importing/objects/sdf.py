@@ -1,8 +1,13 @@
-"""Reads an object from an SDF file (http://sdformat.org/spec) with one model."""
+"""Reads objects and homes from SDF files (http://sdformat.org/spec), versions 1.2 to 1.12."""
 
 from __future__ import annotations
 
+import math
+import re
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -10,280 +15,796 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.importing.objects.description import Description, Joint, Link, Part, make_inertia
+from vkc_pin.importing.objects.description import (
+    Description,
+    Joint,
+    Link,
+    Part,
+    make_inertia,
+    make_limits,
+)
 from vkc_pin.world.files.documents import read_text
-from vkc_pin.world.files.kinematic_tree import MOMENTS, parse_numbers
-from vkc_pin.world.files.xml import find_line, parse_xml
+from vkc_pin.world.files.kinematic_tree import MOMENTS, find_roots, parse_numbers
+from vkc_pin.world.files.meshes import load_mesh
+from vkc_pin.world.files.resources import find_mesh_file, list_address_candidates
+from vkc_pin.world.files.xml import find_line, make_element_error, parse_xml
 
 __all__ = ["read_object_sdf"]
 
-_NO_LIMIT = 1e15  # limits above this are none; SDF's default is 1e16
-_BASE = "world"
+_NEWEST = 12  # minor version
+_MOST_MODELS = 5000
+_WORLD = "world"
+_MOVING = ("revolute", "continuous", "prismatic")
+_JOINT_TYPES = ("fixed", *_MOVING, "ball", "universal", "revolute2", "screw", "gearbox")
+# Numbers of each shape: name of the element and count
+_SHAPES = {
+    "box": (("size", 3),),
+    "sphere": (("radius", 1),),
+    "cylinder": (("radius", 1), ("length", 1)),
+    "capsule": (("radius", 1), ("length", 1)),
+    "ellipsoid": (("radii", 3),),
+}
 
 
-def read_object_sdf(file: Path) -> Description:
-    """Read the description of an object from an SDF file."""
-    root = parse_xml(read_text(file, "SDF"), file)
-    models = root.findall("model") or root.findall("world/model")
-    if root.tag != "sdf" or len(models) != 1:
-        got = f"<{root.tag}> with {len(models)} models"
-        raise InputError(
-            "the SDF does not hold exactly one model",
-            file=file,
-            expected="<sdf> with one <model>",
-            got=got,
+@dataclass(frozen=True)
+class _Rules:
+    """What depends on the version.
+
+    Attributes:
+        since: First minor version.
+        axis_frame: Element or attribute that changes the frame of a joint's axis from that of the
+            joint; None: the axis is in the model's frame.
+        pose_frame: Attribute of <pose> that names its frame.
+    """
+
+    since: int
+    axis_frame: str | None
+    pose_frame: str
+
+
+_RULES = (
+    _Rules(2, None, "frame"),
+    _Rules(5, "use_parent_model_frame", "frame"),
+    _Rules(7, "expressed_in", "relative_to"),
+)
+
+
+@dataclass(eq=False)
+class _Scope:
+    """A <model> or <world>: named elements, and their poses in its frame.
+
+    Attributes:
+        file: File of the element.
+        element: The <model>, <world> or, without a world, <sdf>.
+        rules: Rules of the version of `file`.
+        above: The model or world around it.
+        path: Prefix of names of links and joints in the description.
+        include: The <include> that it comes from.
+        links, joints, frames: Elements by name.
+        models: Nested models by name.
+        merged: Included models whose elements count as elements of this model.
+        active: Names that are being resolved, to find cycles.
+    """
+
+    file: Path
+    element: ElementTree.Element
+    rules: _Rules
+    above: _Scope | None = None
+    path: str = ""
+    include: ElementTree.Element | None = None
+    links: dict[str, ElementTree.Element] = field(default_factory=dict)
+    joints: dict[str, ElementTree.Element] = field(default_factory=dict)
+    frames: dict[str, ElementTree.Element] = field(default_factory=dict)
+    models: dict[str, _Scope] = field(default_factory=dict)
+    merged: list[_Scope] = field(default_factory=list)
+    active: list[tuple[int, str]] = field(default_factory=list)
+    _found: dict[str, pin.SE3] = field(default_factory=dict)
+    _own_pose: pin.SE3 | None = None
+
+    @property
+    def is_static(self) -> bool:
+        """Whether the model, or one around it, is static."""
+        stated = self._find_setting("static", "0")
+        return _is_true(stated) or (self.above is not None and self.above.is_static)
+
+    def _find_setting(self, name: str, default: str) -> str:
+        """Return the text of an element of the <include> or else of the model."""
+        for element in (self.include, self.element):
+            if element is not None and (text := (element.findtext(name) or "").strip()):
+                return text
+        return default
+
+    def walk(self) -> Iterator[_Scope]:
+        """Yield this model and all inside it."""
+        yield self
+        for scope in (*self.models.values(), *self.merged):
+            yield from scope.walk()
+
+    def find_placement(self, name: str = "") -> pin.SE3:
+        """Return a frame in the world; default: that of this model."""
+        if self.above is None:
+            return self.find_pose(name)
+        return self.above.find_placement() * self._find_own_pose() * self.find_pose(name)
+
+    def _find_own_pose(self) -> pin.SE3:
+        """Return the frame of this model in that of the model or world around it."""
+        if self.above is None:
+            return pin.SE3.Identity()
+        with_pose = self.element
+        if self.include is not None and self.include.find("pose") is not None:
+            with_pose = self.include
+        if self._own_pose is None:
+            placed = self.element.get("placement_frame", "")
+            placed = (with_pose.findtext("placement_frame") or placed).strip()
+            above = self.above
+            given = self._resolve("pose of the model", lambda: above.read_pose(with_pose, ""))
+            self._own_pose = given * self.find_pose(placed).inverse()
+        return self._own_pose
+
+    def _resolve(self, name: str, compute: Any) -> Any:
+        """Return the result of a function for a name, unless it leads back to the name."""
+        key = (id(self), name)
+        if key in self.active:
+            cycle = [other for _, other in [*self.active[self.active.index(key) :], key]]
+            raise InputError(
+                "frames form a cycle", file=self.file, field=name, got=" → ".join(cycle)
+            )
+        self.active.append(key)
+        try:
+            return compute()
+        finally:
+            self.active.pop()
+
+    def find_pose(self, name: str) -> pin.SE3:
+        """Return the frame of a link, frame, joint or nested model in the frame of this model."""
+        if name in ("", "__model__"):
+            return pin.SE3.Identity()
+        if name not in self._found:
+            self._found[name] = self._resolve(name, lambda: self._compute_pose(name))
+        return self._found[name]
+
+    def _compute_pose(self, name: str) -> pin.SE3:
+        if name in self.links:
+            return self.read_pose(self.links[name], "")
+        if name in self.frames:
+            frame = self.frames[name]
+            return self.read_pose(frame, frame.get("attached_to", "").strip())
+        if name in self.joints:
+            return self.find_joint_pose(self.joints[name])
+        if (inner := self._find_inner(name)) is not None:
+            scope, rest = inner
+            return scope._find_own_pose() * scope.find_pose(rest)
+        if name == _WORLD:
+            return self.find_placement().inverse()
+        raise UnknownNameError("frame", name, self._list_names(), file=self.file)
+
+    def _find_inner(self, name: str) -> tuple[_Scope, str] | None:
+        """Return the nested model in which a name is defined, and the name in it."""
+        first, _, rest = name.partition("::")
+        if first in self.models:
+            return self.models[first], rest
+        return next(((item, name) for item in self.merged if item.defines(name)), None)
+
+    def defines(self, name: str) -> bool:
+        """Return whether the name is one of an element of this model."""
+        return (
+            name in self.links
+            or name in self.frames
+            or name in self.joints
+            or self._find_inner(name) is not None
         )
-    for nested in (*models[0].findall("model"), *models[0].findall("include")):
-        problem = "nested models are not supported"
-        raise InputError(
-            problem,
-            file=file,
-            line=find_line(nested),
-            field=nested.tag,
-            expected="links and joints in one model",
-        )
-    return _Reader(file, models[0], float(root.get("version", "1.7").split(".")[1] or 0)).read()
+
+    def _list_names(self) -> list[str]:
+        own = [*self.links, *self.frames, *self.joints, *self.models]
+        return own + [name for scope in self.merged for name in scope._list_names()]
+
+    def find_joint_pose(self, joint: ElementTree.Element) -> pin.SE3:
+        """Return the frame of a joint in the frame of this model."""
+        return self.read_pose(joint, self.read_end(joint, "child"))
+
+    def read_pose(self, element: ElementTree.Element, default_frame: str) -> pin.SE3:
+        """Return the <pose> of an element in the frame of this model."""
+        pose, where = element.find("pose"), element.get("name", element.tag)
+        if pose is None:
+            return self.find_pose(default_frame)
+        stated = pose.get("relative_to") or pose.get(self.rules.pose_frame) or default_frame
+        form = pose.get("rotation_format", "euler_rpy").strip()
+        is_degrees = _is_true(pose.get("degrees", "false"))
+        counts = {"euler_rpy": 6, "quat_xyzw": 7}
+        if form not in counts:
+            raise UnknownNameError(
+                "rotation_format", form, counts, file=self.file, line=find_line(pose), field=where
+            )
+        default = "0 0 0 0 0 0" if form == "euler_rpy" else "0 0 0 0 0 0 1"
+        values = self._parse(pose, pose.text, counts[form], default, f"{where}: pose")
+        if form == "euler_rpy":
+            angles = np.radians(values[3:]) if is_degrees else np.array(values[3:])
+            rotation = pin.rpy.rpyToMatrix(*angles)
+        elif is_degrees or not np.linalg.norm(values[3:]) > 0.0:
+            problem = "a quaternion in degrees" if is_degrees else "a quaternion of length 0"
+            raise make_element_error(self.file, pose, problem, field=where, got=pose.text)
+        else:
+            rotation = pin.Quaternion(np.array(values[3:])).normalized().matrix()
+        return self.find_pose(stated.strip()) * pin.SE3(rotation, np.array(values[:3]))
+
+    def find_link(self, name: str) -> str:
+        """Return the name, in the description, of the link that a frame is attached to."""
+        if name in self.links:
+            return self.path + name
+        return str(self._resolve(name, lambda: self._follow_to_link(name)))
+
+    def _follow_to_link(self, name: str) -> str:
+        if name in ("", "__model__"):
+            return self._find_canonical_link()
+        if name in self.frames:
+            return self.find_link(self.frames[name].get("attached_to", "").strip())
+        if name in self.joints:
+            return self.find_link(self.read_end(self.joints[name], "child"))
+        if (inner := self._find_inner(name)) is not None:
+            return inner[0].find_link(inner[1])
+        if name == _WORLD:
+            return _WORLD
+        names = [*self._list_names(), _WORLD]
+        raise UnknownNameError("link", name, names, file=self.file, field=self.element.get("name"))
+
+    def _find_canonical_link(self) -> str:
+        if self.above is None:
+            return _WORLD
+        stated = self.element.get("canonical_link", "").strip()
+        if stated:
+            return self.find_link(stated)
+        inner = [*self.models.values(), *self.merged]
+        return self.path + next(iter(self.links)) if self.links else inner[0].find_link("")
+
+    def read_end(self, joint: ElementTree.Element, key: str) -> str:
+        """Return the frame that a joint names as its "parent" or "child"."""
+        if not (name := (joint.findtext(key) or "").strip()):
+            problem, expected = "a joint that connects nothing", f"<{key}>"
+            name = joint.get("name", "")
+            raise make_element_error(self.file, joint, problem, field=name, expected=expected)
+        return name
+
+    def read_numbers(
+        self, element: ElementTree.Element, key: str, count: int, default: str | None, where: str
+    ) -> tuple[float, ...]:
+        """Return the numbers of a child element; "inf" becomes the largest float."""
+        found = element.find(key)
+        text = None if found is None else re.sub(r"\binf\b", "1e308", found.text or "", flags=re.I)
+        named = f"{where}: {element.tag} {key}"
+        return self._parse(element if found is None else found, text, count, default, named)
+
+    def _parse(
+        self,
+        element: ElementTree.Element,
+        text: str | None,
+        count: int,
+        default: str | None,
+        where: str,
+    ) -> tuple[float, ...]:
+        text = text if text is None or text.strip() else None  # an empty element is a default
+        holder = ElementTree.Element("", {} if text is None else {"text": text})
+        try:
+            return parse_numbers(
+                self.file, holder, "text", count, default=default, where=where, largest=math.inf
+            )
+        except InputError as error:
+            raise make_element_error(
+                self.file,
+                element,
+                error.problem,
+                field=where,
+                expected=error.expected,
+                got=error.got,
+            ) from None
+
+
+def read_object_sdf(file: Path, *, free: bool = False) -> Description:
+    """Read the description of an object or a home from an SDF file.
+
+    The root's frame is the world. Models that are neither static nor connected to the world stay in
+    their places if they have joints, and are free otherwise.
+
+    Args:
+        file: The file, with one model or one world.
+        free: Whether to keep free models, on floating joints; otherwise those beside others are
+            left out.
+    """
+    try:
+        return _Reader(file).read(free=free)
+    except RecursionError:
+        raise InputError("models or frames are nested too deeply", file=file) from None
 
 
 class _Reader:
-    def __init__(self, file: Path, model: ElementTree.Element, version: float) -> None:
-        self.file, self.model, self.version = file, model, version
-        self.elements = {
-            element.get("name", ""): element
-            for tag in ("link", "joint", "frame")
-            for element in model.findall(tag)
-        }
-        self.notes = list[str]()
-        self._found: dict[str, pin.SE3] = {}
-
-    def read(self) -> Description:
-        elements = self.model.findall("joint")
-        joints = {self._read_text(joint, "child"): joint for joint in elements}
-        names = [link.get("name", "") for link in self.model.findall("link")]
-        if repeated := [name for name in names if names.count(name) > 1]:
-            problem, name = "two links have the same name", repeated[0]
-            raise InputError(problem, file=self.file, field=name, expected="a name for each link")
-        for child, joint in joints.items():
-            for link in (child, self._read_text(joint, "parent")):
-                if link not in (*names, _BASE):
-                    raise UnknownNameError(
-                        "link",
-                        link,
-                        names,
-                        file=self.file,
-                        line=find_line(joint),
-                        field=joint.get("name"),
-                    )
-        roots = [name for name in names if name not in joints]
-        has_world_link = any(self._read_text(joint, "parent") == _BASE for joint in elements)
-        if len(roots) + has_world_link != 1:
-            got = ", ".join([*roots, *([_BASE] if has_world_link else [])]) or "a circle"
+    def __init__(self, file: Path) -> None:
+        self.file, self.notes, self.count = file, list[str](), 0
+        root, rules = self._load(file)
+        worlds, models = root.findall("world"), root.findall("model")
+        if len(worlds) + len(models) != 1:
+            got = f"{len(worlds)} worlds and {len(models)} models"
             raise InputError(
-                "the links do not form one tree",
-                file=self.file,
-                field="model",
-                expected="one tree",
+                "the SDF does not hold exactly one model",
+                file=file,
+                expected="<sdf> with one <model> or one <world>",
                 got=got,
             )
+        self.is_world = bool(worlds)
+        self.world = self._make_scope(
+            _Scope(file, worlds[0] if worlds else root, rules), (file.resolve(),)
+        )
+
+    def _load(self, file: Path) -> tuple[ElementTree.Element, _Rules]:
+        """Return the root of an SDF file and the rules of its version."""
+        root = parse_xml(read_text(file, "SDF"), file)
+        if root.tag != "sdf":
+            expected = "an element <sdf>"
+            raise InputError("this is no SDF", file=file, expected=expected, got=f"<{root.tag}>")
+        text = root.get("version")
+        match = re.fullmatch(
+            r"\s*1\.(\d{1,3})(\.\d+)*\s*", f"1.{_RULES[-1].since}" if text is None else text
+        )
+        if match is None or int(match[1]) < _RULES[0].since:
+            raise make_element_error(
+                file,
+                root,
+                "not a version of SDF",
+                field="sdf version",
+                expected=f"1.{_RULES[0].since} to 1.{_NEWEST}",
+                got=f'"{text}"',
+            )
+        version = int(match[1])
+        if text is None:
+            self.notes.append(f"{file.name} states no version: read as SDF 1.{version}")
+        if version > _NEWEST:
+            self.notes.append(f"{file.name} has version 1.{version}: read as SDF 1.{_NEWEST}")
+        return root, next(rules for rules in reversed(_RULES) if rules.since <= version)
+
+    def _make_scope(self, scope: _Scope, files: tuple[Path, ...]) -> _Scope:
+        """Fill in the elements of a model or world; `files` are those that include it."""
+        self.count += 1
+        if self.count > _MOST_MODELS:
+            expected = f"at most {_MOST_MODELS}"
+            raise InputError("too many models", file=self.file, expected=expected)
+        for tag, elements in (
+            ("link", scope.links),
+            ("joint", scope.joints),
+            ("frame", scope.frames),
+        ):
+            for element in scope.element.findall(tag):
+                self._add(scope, elements, element, element)
+        for element in scope.element.findall("model"):
+            inner = _Scope(scope.file, element, scope.rules, scope)
+            self._add(scope, scope.models, element, inner)
+            self._make_nested(inner, files)
+        for include in scope.element.findall("include"):
+            self._include(scope, include, files)
+        for tag in ("actor", "population", "road", "state"):
+            if scope.element.find(tag) is not None:
+                self.notes.append(f"<{tag}> is left out")
+        is_model = scope.above is not None
+        if is_model and not (scope.links or scope.models or scope.merged):
+            problem, name = "a model without links", scope.element.get("name", "")
+            raise make_element_error(scope.file, scope.element, problem, field=name)
+        return scope
+
+    def _make_nested(self, inner: _Scope, files: tuple[Path, ...], name: str | None = None) -> None:
+        """Fill in a model inside another one or a world; name "": its names are the other's."""
+        assert inner.above is not None
+        name = inner.element.get("name", "") if name is None else name
+        is_only = inner.above.element.tag == "sdf"
+        inner.path = inner.above.path + (f"{name}::" if name and not is_only else "")
+        inner.active = inner.above.active
+        self._make_scope(inner, files)
+
+    def _add(
+        self, scope: _Scope, elements: dict[str, Any], element: ElementTree.Element, item: Any
+    ) -> None:
+        """Add an item by the name of an element, which must be unique."""
+        name = (element.get("name") or element.findtext("name") or "").strip()
+        if not name:
+            problem, expected = f"a {element.tag} without a name", "a name"
+            raise make_element_error(scope.file, element, problem, expected=expected)
+        if name in elements:
+            kind = "model" if element.tag == "include" else element.tag
+            problem, expected = f"two {kind}s have the same name", f"a name for each {kind}"
+            raise make_element_error(scope.file, element, problem, field=name, expected=expected)
+        elements[name] = item
+
+    def _include(
+        self, scope: _Scope, include: ElementTree.Element, files: tuple[Path, ...]
+    ) -> None:
+        file = _find_model(scope.file, include)
+        if file.resolve() in files:
+            got = " → ".join(item.name for item in (*files, file))
+            raise make_element_error(scope.file, include, "a file includes itself", got=got)
+        root, rules = self._load(file)
+        models = root.findall("model")
+        if not models and (root.find("light") is not None or root.find("actor") is not None):
+            return
+        if len(models) != 1:
+            expected, got = "one <model>", f"{len(models)} models"
+            raise InputError("not a model", file=file, expected=expected, got=got)
+        inner, files = (
+            _Scope(file, models[0], rules, scope, include=include),
+            (*files, file.resolve()),
+        )
+        if _is_true(include.get("merge", "false")):
+            scope.merged.append(inner)
+            self._make_nested(inner, files, "")
+            return
+        named = include if include.findtext("name") else models[0]
+        self._add(scope, scope.models, named, inner)
+        self._make_nested(inner, files, (named.findtext("name") or named.get("name") or "").strip())
+
+    def read(self, *, free: bool) -> Description:
+        scopes = list(self.world.walk())
+        links = {scope.path + name: (scope, name) for scope in scopes for name in scope.links}
+        joints: dict[str, tuple[_Scope, ElementTree.Element, str]] = {}  # by the child link
+        for scope in scopes:
+            for name, joint in scope.joints.items():
+                kind = self._read_kind(scope, joint)
+                if kind == "gearbox":
+                    self.notes.append(f"joint '{name}' couples other joints: left out")
+                    continue
+                ends = [scope.find_link(scope.read_end(joint, key)) for key in ("parent", "child")]
+                if ends[1] in joints:
+                    problem, got = "a link with two parents", joints[ends[1]][1].get("name", "")
+                    raise make_element_error(
+                        scope.file,
+                        joint,
+                        problem,
+                        field=ends[1],
+                        expected="one joint",
+                        got=f"joints '{got}' and '{name}'",
+                    )
+                joints[ends[1]] = scope, joint, ends[0]
+        if _WORLD in joints:
+            scope, joint, _ = joints[_WORLD]
+            problem = "the world cannot be a child"
+            raise make_element_error(scope.file, joint, problem, field=joint.get("name"))
+        lines = {name: find_line(scope.links[local]) for name, (scope, local) in links.items()}
+        is_connected = any(parent == _WORLD for _, _, parent in joints.values())
+        above = {child: (parent, "") for child, (_, _, parent) in joints.items()}
+        roots = find_roots(self.file, {**lines, **({_WORLD: None} if is_connected else {})}, above)
+        return self._describe(links, joints, roots, free=free)
+
+    def _describe(
+        self,
+        links: Mapping[str, tuple[_Scope, str]],
+        joints: Mapping[str, tuple[_Scope, ElementTree.Element, str]],
+        roots: Mapping[str, str],
+        *,
+        free: bool,
+    ) -> Description:
+        kinds = self._connect(links, joints, roots, free=free)
+        names = self._choose_names(links, kinds)
+        repeated = Counter(joint.get("name", "") for _, joint, _ in joints.values())
+        frames = {_WORLD: pin.SE3.Identity()}
         # Link frames are moved to their joints, so that axes pass through origins.
-        frames = {
-            name: self.pose(joints[name].get("name", "") if name in joints else name)
-            for name in names
+        for name, (scope, local) in links.items():
+            if name in joints:
+                holder, joint, _ = joints[name]
+                frames[name] = holder.find_placement() * holder.find_joint_pose(joint)
+            elif name in kinds:
+                frames[name] = scope.find_placement(local)
+            else:
+                frames[name] = pin.SE3.Identity()
+        found_links = {_WORLD: Link(_WORLD)} if kinds or _WORLD in roots else {}
+        found_joints = dict[str, Joint]()
+        for name, (scope, local) in links.items():
+            if roots[name] != _WORLD and kinds.get(roots[name], "fixed") == "left out":
+                continue
+            found_links[names[name]] = self._read_link(scope, local, names[name], frames[name])
+            if name in joints:
+                holder, joint, parent = joints[name]
+                label = str(joint.get("name"))
+                label = holder.path + label if repeated[label] > 1 else label
+                ends = (names.get(parent, parent), names[name])
+                found_joints[names[name]] = self._read_joint(
+                    holder, joint, label, ends, frames[parent].inverse() * frames[name]
+                )
+            elif name in kinds:
+                found_joints[names[name]] = Joint(
+                    name=f"{names[name]}_{kinds[name]}",
+                    kind=kinds[name],
+                    parent=_WORLD,
+                    child=names[name],
+                    placement=frames[name],
+                )
+        return Description(self.file, found_links, found_joints, tuple(self.notes))
+
+    def _connect(
+        self,
+        links: Mapping[str, tuple[_Scope, str]],
+        joints: Mapping[str, tuple[_Scope, ElementTree.Element, str]],
+        roots: Mapping[str, str],
+        *,
+        free: bool,
+    ) -> dict[str, str]:
+        """Return how each root that no joint connects is held in the world.
+
+        Values are "fixed", "floating" and "left out". If the only root is to be the description's,
+        there are none.
+        """
+        loose = [name for name in dict.fromkeys(roots.values()) if name != _WORLD]
+        is_connected = _WORLD in roots
+        is_static = {
+            name: any(links[link][0].is_static for link in links if roots[link] == name)
+            for name in loose
         }
-        links = dict[str, Link]()
-        for name in names:
-            visual, collision = (
-                self._read_shapes(name, kind, frames[name]) for kind in ("visual", "collision")
+        if not self.is_world and not free:
+            if len(loose) + is_connected == 1:
+                return {}
+            if not all(is_static.values()):
+                raise InputError(
+                    "the links do not form one tree",
+                    file=self.file,
+                    field="model",
+                    expected="one tree",
+                    got=", ".join([*loose, *([_WORLD] if is_connected else [])]),
+                )
+        kinds = dict[str, str]()
+        for name in loose:
+            label = links[name][0].path.removesuffix("::") or name
+            can_move = any(
+                self._read_kind(scope, joint) in _MOVING
+                for child, (scope, joint, _) in joints.items()
+                if roots[child] == name
             )
-            links[name] = Link(name, visual, collision, self._read_inertia(name, frames[name]))
-        if has_world_link:
-            frames[_BASE], links = pin.SE3.Identity(), {_BASE: Link(_BASE), **links}
-        return Description(
-            self.file,
-            links,
-            {child: self._read_joint(child, joint, frames) for child, joint in joints.items()},
-            tuple(self.notes),
-        )
+            if is_static[name] or can_move:
+                kinds[name] = "fixed"
+                if not is_static[name]:
+                    self.notes.append(
+                        f"'{label}' is not static, but has joints: fixed in its place"
+                    )
+            elif free:
+                kinds[name] = "floating"
+            else:
+                kinds[name] = "left out"
+                self.notes.append(f"'{label}' is free, hence a separate object: left out")
+        return kinds
 
-    def pose(self, name: str, visited: tuple[str, ...] = ()) -> pin.SE3:
-        """Return the frame of a link, joint or frame in the model's frame."""
-        if name in ("", "__model__", _BASE):
-            return pin.SE3.Identity()
-        if name not in self.elements:
-            raise UnknownNameError("frame", name, self.elements, file=self.file)
-        if name in visited:
-            raise InputError(
-                "frames form a cycle",
-                file=self.file,
+    def _choose_names(
+        self, links: Mapping[str, tuple[_Scope, str]], kinds: Mapping[str, str]
+    ) -> dict[str, str]:
+        """Return names of links; the only root of a model in a world is called like the model."""
+        models = Counter(links[name][0].path for name in kinds)
+        names = {name: name for name in links}
+        for name in kinds:
+            path = links[name][0].path
+            if path and models[path] == 1 and path.removesuffix("::") not in links:
+                names[name] = path.removesuffix("::")
+        return names
+
+    def _read_kind(self, scope: _Scope, joint: ElementTree.Element) -> str:
+        kind, name = joint.get("type", "").strip(), joint.get("name")
+        if kind not in _JOINT_TYPES:
+            raise UnknownNameError(
+                "joint type",
+                kind,
+                _JOINT_TYPES,
+                file=scope.file,
+                line=find_line(joint),
                 field=name,
-                got=" → ".join((*visited, name)),
             )
-        if name not in self._found:
-            element = self.elements[name]
-            to = element.get("attached_to", "") if element.tag == "frame" else ""
-            if element.tag == "joint":
-                to = self._read_text(element, "child")
-            self._found[name] = self._read_pose(element, to, (*visited, name))
-        return self._found[name]
-
-    def _read_pose(
-        self, element: ElementTree.Element, default_frame: str, visited: tuple[str, ...] = ()
-    ) -> pin.SE3:
-        """Return the <pose> of an element in the model's frame."""
-        pose = element.find("pose")
-        if pose is None:
-            return self.pose(default_frame, visited)
-        text = ElementTree.Element("pose", {"numbers": pose.text or ""})
-        values = parse_numbers(
-            self.file,
-            text,
-            "numbers",
-            6,
-            default="0 0 0 0 0 0",
-            where=element.get("name", element.tag),
-        )
-        angles = np.radians(values[3:]) if pose.get("degrees") == "true" else np.array(values[3:])
-        return self.pose(pose.get("relative_to", default_frame), visited) * pin.SE3(
-            pin.rpy.rpyToMatrix(*angles), np.array(values[:3])
-        )
+        return kind
 
     def _read_joint(
-        self, child: str, joint: ElementTree.Element, frames: dict[str, pin.SE3]
+        self,
+        scope: _Scope,
+        joint: ElementTree.Element,
+        name: str,
+        ends: tuple[str, str],
+        placement: pin.SE3,
     ) -> Joint:
-        name, kind = joint.get("name", ""), joint.get("type", "")
-        parent = self._read_text(joint, "parent")
-        axis, limits, velocity = np.array([0.0, 0.0, 1.0]), None, None
-        resistance = dict.fromkeys(("damping", "friction"), 0.0)
-        if kind not in ("fixed", "revolute", "continuous", "prismatic"):
+        kind = self._read_kind(scope, joint)
+        if kind not in ("fixed", *_MOVING):
             self.notes.append(f"joint '{name}' is {kind}: taken as fixed")
             kind = "fixed"
+        axis, limits, settings = np.array([0.0, 0.0, 1.0]), None, dict[str, Any]()
         element = joint.find("axis")
         if element is not None and kind != "fixed":
-            axis = np.array(self._read_numbers(element, "xyz", 3, "0 0 1", name))
-            xyz, expressed = element.find("xyz"), name
-            if self.version < 7 and self._read_text(element, "use_parent_model_frame") in (
-                "1",
-                "true",
-            ):
-                expressed = "__model__"
-            elif xyz is not None:
-                expressed = xyz.get("expressed_in", name)
-            axis = frames[child].rotation.T @ self.pose(expressed).rotation @ axis
-            axis /= np.linalg.norm(axis)
-            if (limit := element.find("limit")) is not None:
-                low, high = (
-                    self._read_numbers(limit, key, 1, default, name)[0]
-                    for key, default in (("lower", "-1e16"), ("upper", "1e16"))
-                )
-                if max(abs(low), abs(high)) < _NO_LIMIT:
-                    limits = min(low, high), max(low, high)
-                velocity = self._read_numbers(limit, "velocity", 1, "-1", name)[0]
-            if (dynamics := element.find("dynamics")) is not None:
-                resistance = {
-                    key: max(0.0, self._read_numbers(dynamics, key, 1, "0", name)[0])
-                    for key in resistance
-                }
+            axis = self._read_axis(scope, joint, element)
+            limits, settings["velocity"] = self._read_limits(scope, element, name)
+            settings |= self._read_dynamics(scope, element, name)
+            if element.find("mimic") is not None:
+                self.notes.append(f"joint '{name}' mimics another one: made independent")
         if kind == "revolute" and limits is None:
             kind = "continuous"
         return Joint(
             name=name,
             kind=kind,
-            parent=parent,
-            child=child,
-            placement=frames[parent].inverse() * frames[child],
+            parent=ends[0],
+            child=ends[1],
+            placement=placement,
             axis=axis,
             limits=None if kind == "continuous" else limits,
-            velocity=velocity if velocity is not None and velocity > 0.0 else None,
-            **resistance,
+            **settings,
         )
 
-    def _read_shapes(self, link: str, kind: str, frame: pin.SE3) -> tuple[Part, ...]:
-        parts = []
-        for element in self.elements[link].findall(kind):
+    def _read_axis(
+        self, scope: _Scope, joint: ElementTree.Element, element: ElementTree.Element
+    ) -> Any:
+        """Return the unit axis in the joint's frame, shape (3,)."""
+        name, xyz = joint.get("name", ""), element.find("xyz")
+        axis = np.array(scope.read_numbers(element, "xyz", 3, "0 0 1", name))
+        if not np.linalg.norm(axis) > 0.0:
+            problem, got = "an axis without direction", (element.findtext("xyz") or "").strip()
+            field_ = f"{name}: axis xyz"
+            raise make_element_error(scope.file, element, problem, field=field_, got=got)
+        own = scope.find_joint_pose(joint)
+        stated = "" if xyz is None else xyz.get("expressed_in", "").strip()
+        if stated:
+            frame = scope.find_pose(stated)
+        elif scope.rules.axis_frame is None or (
+            scope.rules.axis_frame == "use_parent_model_frame"
+            and _is_true(element.findtext("use_parent_model_frame") or "")
+        ):
+            frame = scope.find_pose("__model__")
+        else:
+            frame = own
+        axis = own.rotation.T @ frame.rotation @ axis
+        return axis / np.linalg.norm(axis)
+
+    def _read_limits(
+        self, scope: _Scope, element: ElementTree.Element, name: str
+    ) -> tuple[tuple[float, float] | None, float | None]:
+        """Return the position limits and the velocity limit of an axis."""
+        if (limit := element.find("limit")) is None:
+            return None, None
+        low, high, velocity = (
+            scope.read_numbers(limit, key, 1, default, name)[0]
+            for key, default in (("lower", "-1e16"), ("upper", "1e16"), ("velocity", "-1"))
+        )
+        if low > high:
+            ends = f"{low:g} and {high:g}"
+            self.notes.append(
+                f"joint '{name}' has a lower limit above its upper limit, {ends}: swapped"
+            )
+            low, high = high, low
+        return make_limits(low, high), velocity if 0.0 < velocity < 1e15 else None
+
+    def _read_dynamics(
+        self, scope: _Scope, element: ElementTree.Element, name: str
+    ) -> dict[str, float]:
+        if (dynamics := element.find("dynamics")) is None:
+            return {}
+        damping, friction, stiffness, rest = (
+            scope.read_numbers(dynamics, key, 1, "0", name)[0]
+            for key in ("damping", "friction", "spring_stiffness", "spring_reference")
+        )
+        return {
+            "damping": max(0.0, damping),
+            "friction": max(0.0, friction),
+            "stiffness": max(0.0, stiffness),
+            "springref": rest,
+        }
+
+    def _read_link(self, scope: _Scope, local: str, name: str, frame: pin.SE3) -> Link:
+        element = scope.links[local]
+        # Places elements in the link's new frame.
+        base = frame.inverse() * scope.find_placement()
+        visual, collision = (
+            tuple(self._read_shapes(scope, element, kind, base, local))
+            for kind in ("visual", "collision")
+        )
+        return Link(name, visual, collision, self._read_inertia(scope, element, base, local))
+
+    def _read_shapes(
+        self, scope: _Scope, link: ElementTree.Element, kind: str, base: pin.SE3, local: str
+    ) -> Iterator[Part]:
+        for element in link.findall(kind):
             name, geometry = element.get("name", ""), element.find("geometry")
             shape = next(iter(geometry), None) if geometry is not None else None
-            placement = frame.inverse() * self._read_pose(element, link)
-            colour = self._read_colour(element, name)
-            if shape is not None and shape.tag == "mesh":
-                file = self._find_mesh(shape, name)
-                size = self._read_numbers(shape, "scale", 3, "1 1 1", name)
-            elif shape is not None and shape.tag in ("box", "sphere", "cylinder", "capsule"):
-                keys = {"box": (("size", 3),), "sphere": (("radius", 1),)}.get(
-                    shape.tag, (("radius", 1), ("length", 1))
-                )
-                file = None
-                size = tuple(
-                    value
-                    for key, count in keys
-                    for value in self._read_numbers(shape, key, count, None, name)
-                )
-            else:
+            if shape is None or shape.tag not in (*_SHAPES, "mesh"):
                 content = "empty" if shape is None else shape.tag
-                self.notes.append(f"{kind} '{name}' of link '{link}' is {content}: left out")
+                self.notes.append(f"{kind} '{name}' of link '{local}' is {content}: left out")
                 continue
-            settings: dict[str, Any] = {"size": size, "file": file, "colour": colour}
-            parts.append(Part(name=name, placement=placement, kind=shape.tag, **settings))
-        return tuple(parts)
+            try:
+                settings = self._read_geometry(scope, shape, name)
+            except InputError as error:
+                if kind == "collision" or link.find("collision") is None or shape.tag != "mesh":
+                    raise
+                self.notes.append(f"visual '{name}' of link '{local}' is left out: {error}")
+                continue
+            yield Part(
+                name=name,
+                placement=base * scope.read_pose(element, local),
+                colour=self._read_colour(scope, element, name),
+                **settings,
+            )
 
-    def _read_inertia(self, link: str, frame: pin.SE3) -> pin.Inertia:
+    def _read_geometry(
+        self, scope: _Scope, shape: ElementTree.Element, name: str
+    ) -> dict[str, Any]:
+        """Return kind, size, file and triangles of a shape."""
+        if shape.tag == "mesh":
+            uri = (shape.findtext("uri") or "").strip()
+            file = find_mesh_file(uri, scope.file, line=find_line(shape))
+            size = scope.read_numbers(shape, "scale", 3, "1 1 1", name)
+            part = shape.find("submesh")
+            if part is None:
+                return {"kind": "mesh", "size": size, "file": file}
+            mesh = load_mesh(file, submesh=(part.findtext("name") or "").strip())
+            if _is_true(part.findtext("center") or ""):
+                mesh.apply_translation(-mesh.bounds.mean(axis=0))
+            return {"kind": "mesh", "size": size, "triangles": mesh}
+        size = tuple(
+            value
+            for key, count in _SHAPES[shape.tag]
+            for value in scope.read_numbers(shape, key, count, None, name)
+        )
+        if min(size) <= 0.0:
+            problem, expected = "a shape without volume", "sizes above 0"
+            raise make_element_error(
+                scope.file, shape, problem, field=name, expected=expected, got=size
+            )
+        if shape.tag == "ellipsoid":
+            import trimesh
+
+            ball = trimesh.creation.icosphere(subdivisions=3)
+            return {"kind": "mesh", "size": size, "triangles": ball}
+        return {"kind": shape.tag, "size": size}
+
+    def _read_inertia(
+        self, scope: _Scope, link: ElementTree.Element, base: pin.SE3, local: str
+    ) -> pin.Inertia:
         """Return a link's inertia; an incomplete <inertial> counts as none, with a note."""
-        element = self.elements[link].find("inertial")
+        element = link.find("inertial")
         if element is None:
             return pin.Inertia.Zero()
         moments = element.find("inertia")
         try:
             if element.find("mass") is None or moments is None:
-                raise InputError("an <inertial> needs both <mass> and <inertia>", field=link)
-            (mass,) = self._read_numbers(element, "mass", 1, None, link)
-            entries = (self._read_numbers(moments, key, 1, "0", link)[0] for key in MOMENTS)
-            return make_inertia(mass, entries, frame.inverse() * self._read_pose(element, link))
+                raise InputError("an <inertial> needs both <mass> and <inertia>", field=local)
+            (mass,) = scope.read_numbers(element, "mass", 1, None, local)
+            entries = (scope.read_numbers(moments, key, 1, "0", local)[0] for key in MOMENTS)
+            return make_inertia(mass, entries, base * scope.read_pose(element, local))
         except InputError as error:
-            self.notes.append(f"link '{link}': {error}: its <inertial> counts as none")
+            self.notes.append(f"link '{local}': {error}: its <inertial> counts as none")
             return pin.Inertia.Zero()
 
     def _read_colour(
-        self, element: ElementTree.Element, name: str
+        self, scope: _Scope, element: ElementTree.Element, name: str
     ) -> tuple[float, float, float, float] | None:
         material = element.find("material")
         if material is None or material.find("diffuse") is None:
             return None
         rgba = (material.findtext("diffuse") or "").split()
-        values = self._read_numbers(material, "diffuse", len(rgba), None, name)
+        values = scope.read_numbers(material, "diffuse", len(rgba), "", name)
         red, green, blue, opacity = (*values, 1.0)[:4] if len(values) >= 3 else (0.8, 0.8, 0.8, 1.0)
         return red, green, blue, opacity
 
-    def _find_mesh(self, shape: ElementTree.Element, name: str) -> Path:
-        """Return a mesh file: beside the SDF, or `model://NAME/...` in a folder NAME above it."""
-        uri = self._read_text(shape, "uri")
-        inside = (
-            uri.partition("://")[2]
-            if uri.startswith(("model://", "package://"))
-            else uri.removeprefix("file://")
-        )
-        folders = [self.file.resolve().parent, *self.file.resolve().parents]
-        candidates = [folder / inside for folder in folders] + [
-            folder / inside.partition("/")[2] for folder in folders[:2]
-        ]
-        for candidate in candidates:
-            if candidate.is_file():
-                return candidate
-        raise InputError(
-            "the mesh file does not exist",
-            file=self.file,
-            line=find_line(shape),
-            field=name,
-            expected="a mesh file",
-            got=uri,
-        )
 
-    def _read_numbers(
-        self, element: ElementTree.Element, key: str, count: int, default: str | None, where: str
-    ) -> tuple[float, ...]:
-        found = element.findtext(key)
-        text = ElementTree.Element(element.tag, {} if found is None else {key: found})
-        return parse_numbers(
-            self.file, text, key, count, default=default, where=where, largest=1e308
-        )
+def _is_true(text: str) -> bool:
+    return text.strip().lower() in ("1", "true")
 
-    def _read_text(self, element: ElementTree.Element, key: str) -> str:
-        return (element.findtext(key) or "").strip()
+
+def _find_model(file: Path, include: ElementTree.Element) -> Path:
+    """Return the SDF file that an <include> names, in a model's folder as its model.config says."""
+    uri = (include.findtext("uri") or "").strip()
+    candidates = list_address_candidates(uri, file) if uri else []
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+        if (candidate / "model.config").is_file():
+            config = candidate / "model.config"
+            root = parse_xml(read_text(config, "model.config"), config)
+            stated = {
+                int(match[1]): (element.text or "").strip()
+                for element in root.findall("sdf")
+                if (match := re.match(r"\s*1\.(\d{1,3})", element.get("version", "1.0")))
+            }
+            known = [version for version in stated if version <= _NEWEST] or list(stated)
+            if known and (candidate / stated[max(known)]).is_file():
+                return candidate / stated[max(known)]
+        if (candidate / "model.sdf").is_file():
+            return candidate / "model.sdf"
+    raise make_element_error(
+        file,
+        include,
+        "there is no such model",
+        field="include uri",
+        expected="a folder with a model.sdf around the file or in GZ_SIM_RESOURCE_PATH",
+        got=uri or "none",
+    )

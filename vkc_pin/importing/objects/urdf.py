@@ -11,7 +11,14 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing.missing_meshes import replace_missing_meshes
-from vkc_pin.importing.objects.description import Description, Joint, Link, Part, make_inertia
+from vkc_pin.importing.objects.description import (
+    Description,
+    Joint,
+    Link,
+    Part,
+    make_inertia,
+    make_limits,
+)
 from vkc_pin.world.files.kinematic_tree import (
     check_tree,
     parse_inertial,
@@ -122,7 +129,7 @@ def _read_limits(
         low, high = high, low
         limit.set("lower", str(low))
         limit.set("upper", str(high))
-    return low, high
+    return make_limits(low, high)
 
 
 def _read_inertia(file: Path, link: ElementTree.Element, notes: list[str]) -> pin.Inertia:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,12 +60,19 @@ def write_description(
     attachments: Sequence[Mapping[str, Any]],
     *,
     about: Sequence[str],
+    joints: Iterable[Joint] = (),
     free: bool = False,
 ) -> None:
-    """Write the description of an object."""
+    """Write the description of an object, with the springs of its joints."""
     head = "".join(map(format_comment, about))
+    springs = {
+        joint.name: {"stiffness": round(joint.stiffness, 9), "springref": round(joint.springref, 9)}
+        for joint in joints
+        if joint.stiffness > 0.0
+    }
     data = {
         "urdf": urdf,
+        **({"joints": springs} if springs else {}),
         **({"free": True} if free else {}),
         "attachments": [dict(item) for item in attachments],
     }

@@ -20,6 +20,7 @@ from vkc_pin.world.files.xml import find_line, make_element_error, replace_forbi
 __all__ = [
     "MOMENTS",
     "check_tree",
+    "find_roots",
     "parse_inertial",
     "parse_numbers",
     "parse_origin",
@@ -86,7 +87,13 @@ def check_tree(file: Path, root: ElementTree.Element) -> None:
         above[child] = parent, name
         if joint.get("type") == "revolute" and _has_no_limits(file, name, joint):
             joint.set("type", "continuous")
-    _check_roots(file, links, above)
+    lines = {name: find_line(link) for name, link in links.items()}
+    roots = list(dict.fromkeys(find_roots(file, lines, above).values()))
+    if len(roots) > 1:
+        problem, got, second = "links that nothing connects", ", ".join(roots[:5]), roots[1]
+        raise make_element_error(
+            file, links[second], problem, field=second, expected="one root", got=got
+        )
 
 
 def simplify_tree(file: Path, root: ElementTree.Element) -> tuple[str, frozenset[str]]:
@@ -322,30 +329,32 @@ def _check_joint(
             parse_numbers(file, mimic, key, 1, default=default, where=name)
 
 
-def _check_roots(
-    file: Path, links: Mapping[str, ElementTree.Element], above: Mapping[str, tuple[str, str]]
-) -> None:
-    """Check that all links descend from one root."""
-    roots = [link for link in links if link not in above]
-    if len(roots) > 1:
-        problem, got, second = "links that nothing connects", ", ".join(roots[:5]), roots[1]
-        raise make_element_error(
-            file, links[second], problem, field=second, expected="one root", got=got
-        )
-    reaches = set(roots)
-    for link in links:
-        path = list(_walk_to_root(link, above, reaches))
+def find_roots(
+    file: Path, lines: Mapping[str, int | None], above: Mapping[str, tuple[str, str]]
+) -> dict[str, str]:
+    """Return the root of each link, and check that no links form a circle.
+
+    Args:
+        file: The file, for messages.
+        lines: Line of each link in `file`.
+        above: Parent of each link that has one, and the joint between them.
+    """
+    roots = {link: link for link in lines if link not in above}
+    for link in lines:
+        path = list(_walk_to_root(link, above, roots))
         if path and path[-1] in path[:-1]:
             circle = path[path.index(path[-1]) :]
             problem, got = "links in a circle", " → ".join(circle[::-1])
-            raise make_element_error(
-                file, links[link], problem, field=link, expected="a tree", got=got
+            raise InputError(
+                problem, file=file, line=lines[link], field=link, expected="a tree", got=got
             )
-        reaches.update(path)
+        if path:
+            roots |= dict.fromkeys(path, roots[above[path[-1]][0]])
+    return {link: roots[link] for link in lines}
 
 
 def _walk_to_root(
-    link: str, above: Mapping[str, tuple[str, str]], reaches: set[str]
+    link: str, above: Mapping[str, tuple[str, str]], reaches: Collection[str]
 ) -> Iterator[str]:
     """Yield a link and its ancestors, up to a link in `reaches` or the first repeated one."""
     passed: set[str] = set()

@@ -189,7 +189,7 @@ def _list_package_candidates(
         yield packages[name] / inside
     around = dict.fromkeys([*file.absolute().parents, *file.resolve().parents])
     yield from (folder / name / inside for folder in around)
-    yield from (folder / inside for folder in around)
+    yield from (folder / inside for folder in around if inside)
     yield from (folder / "models" / name / inside for folder in around)
     for variable in _MODEL_PATHS:
         for folder in filter(None, os.environ.get(variable, "").split(os.pathsep)):

@@ -255,7 +255,7 @@ def test_only_visual_meshes_may_be_missing(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"t\.sdf:5: model://a/b\.dae: there is no such mesh"):
         read(tmp_path, format_chest(pose=collision))
     with pytest.raises(InputError, match="no such mesh"):
-        read(tmp_path, format_chest(model=f'<link name="seen">{visual}</link>'))
+        read(tmp_path, format_chest(model=f'<static>1</static><link name="seen">{visual}</link>'))
 
 
 def test_springs_are_read(tmp_path: Path) -> None:

@@ -150,11 +150,12 @@ def test_object_is_regrasped_to_be_placed() -> None:
     )
 
 
-def add_attachment(scene: Scene, owner: str, name: str, z: float) -> Scene:
-    """Return the scene with another first attachment of an object, higher by `z`."""
+def add_attachment(scene: Scene, owner: str, name: str, z: float, *, depth: float = 0.0) -> Scene:
+    """Return the scene with another first attachment, higher by `z` and deeper by `depth`."""
     placed = scene.objects[owner]
     grip = placed.object.attachment()
-    lifted = pin.SE3(grip.placement.rotation, grip.placement.translation + np.array([0.0, 0.0, z]))
+    rotation, position = grip.placement.rotation, grip.placement.translation
+    lifted = pin.SE3(rotation, position + [0.0, 0.0, z] + depth * rotation[:, 2])
     attachments = {
         name: dataclasses.replace(grip, name=name, placement=lifted),
         **placed.object.attachments,
@@ -193,6 +194,21 @@ def test_another_attachment_is_tried(
     )
     named = planned(scene, [dataclasses.replace(step, attachment="ceiling")])
     assert not named.success, "who names one means it"
+
+
+@pytest.mark.parametrize("planned", [vkc.plan, functools.partial(vkc.plan, window=2)])
+def test_attachments_share_the_budget(planned: Callable[..., vkc.Plan]) -> None:
+    scene = add_attachment(vkc.load_scene("drawer"), "drawer", "behind", 0.0, depth=0.04)
+    step = vkc.Actuate("drawer", {"slide": 0.2})
+    budget = {"max_evaluations": 40_000}
+    alone = vkc.plan(scene, [dataclasses.replace(step, attachment="behind")], **budget)
+    assert alone.status == "evaluation limit"
+    (note,) = alone.report.notes
+    assert note.startswith("the best trajectory lacks ")
+    assert alone.report.violations[0].subject in note
+    result = planned(scene, [step], **budget)
+    assert result.success, result.summary()
+    assert result.steps[0].attachment == "handle"
 
 
 def test_failed_attachments_are_noted() -> None:

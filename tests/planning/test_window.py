@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import signal
 from collections.abc import Sequence
 from functools import cache
@@ -79,9 +80,10 @@ def test_steps_without_effect_are_refused() -> None:
 
 
 def test_limit_of_evaluations_is_for_all_actions() -> None:
-    alone = plan_actions(load_home(), [OPEN])
+    opening = dataclasses.replace(OPEN, attachment="handle")
+    alone = plan_actions(load_home(), [opening])
     plan = plan_actions(
-        load_home(), [OPEN, *CUP], max_evaluations=int(alone.metrics["evaluations"]) + 1000
+        load_home(), [opening, *CUP], max_evaluations=int(alone.metrics["evaluations"]) + 1000
     )
     assert (plan.status, plan.success) == ("evaluation limit", False)
     assert "steps[1]" in plan.report.notes[0]

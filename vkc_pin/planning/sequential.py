@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.request import PlanningRequest
-from vkc_pin.planning.results import FINAL, add_statistics, concatenate_plans
+from vkc_pin.planning.results import add_statistics, concatenate_plans
 from vkc_pin.planning.solve_task import TaskResult, solve_task
-from vkc_pin.utils.budget import STOP_STATUSES, current_ending, reserve_time
+from vkc_pin.utils.budget import current_ending, reserve_time, share_budget
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import generate_alternatives, has_open_attachment
 from vkc_pin.world.task.compiler import compile_task
@@ -49,9 +49,10 @@ def plan_simultaneously(scene: Scene, task: Task, request: PlanningRequest) -> P
 
     If that fails, the steps are planned sequentially.
     """
-    plan = solve_task(scene, task, request).plan
-    final = STOP_STATUSES if any(has_open_attachment(scene, step) for step in task.steps) else FINAL
-    if plan.success or plan.status in final:
+    with share_budget(2):
+        plan = solve_task(scene, task, request).plan
+    has_alternatives = any(has_open_attachment(scene, step) for step in task.steps)
+    if plan.success or current_ending() or (plan.status == "infeasible" and not has_alternatives):
         return plan
     apart = plan_sequentially(scene, task, request)
     return add_statistics(apart if apart.success else plan, [plan.statistics, apart.statistics])
@@ -67,14 +68,17 @@ def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) 
         The first success, whose steps name the attachment unless it is the default; if all fail,
         the first result, with notes on the others.
     """
-    first = last = solve_task(scene, task, request)
-    statistics, notes = [first.plan.statistics], list[str]()
     # Terms may name phases by their numbers, which grasping anew would change.
-    for name, steps in generate_alternatives(scene, task, anew=not request.terms):
-        if last.plan.success or last.plan.status in STOP_STATUSES or first.is_grasp_independent:
+    alternatives = list(generate_alternatives(scene, task, anew=not request.terms))
+    with share_budget(1 + len(alternatives)):
+        first = last = solve_task(scene, task, request)
+    statistics, notes = [first.plan.statistics], list[str]()
+    for number, (name, steps) in enumerate(alternatives):
+        if last.plan.success or current_ending() or first.is_grasp_independent:
             break
         other = compile_task(scene, steps, request.options)
-        last = solve_task(scene, other, request, check_goals_first=True)
+        with share_budget(len(alternatives) - number):
+            last = solve_task(scene, other, request, check_goals_first=True)
         statistics.append(last.plan.statistics)
         if last.plan.success:
             return dataclasses.replace(last, plan=add_statistics(last.plan, statistics))
@@ -82,7 +86,7 @@ def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) 
     if last is first:
         return first
     plan = first.plan
-    status = last.plan.status if last.plan.status in STOP_STATUSES else plan.status
+    status = current_ending() or plan.status
     report = dataclasses.replace(plan.report, notes=(*plan.report.notes, *notes))
     failed = dataclasses.replace(plan, report=report, status=status)
     return dataclasses.replace(first, plan=add_statistics(failed, statistics))

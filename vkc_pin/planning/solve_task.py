@@ -52,6 +52,9 @@ __all__ = ["TaskResult", "solve_task"]
 _CHECK_TIME = 2e-3
 """Time per waypoint [s] that validation takes, until it was measured; rather too long."""
 
+_NEARLY_FREE = 0.02
+"""Missing clearance [m] up to which a trajectory is described as nearly collision-free."""
+
 Guess = Callable[[TrajectoryProblem], InitialGuess]
 """Makes an initial guess for a problem."""
 
@@ -113,6 +116,8 @@ def solve_task(
         best, status = search.run(guess, check_goals_first=check_goals_first)
     except BudgetExhaustedError as end:
         best, status = search.find_nearest() or search.make_standing(), end.status
+    if status in STOP_STATUSES:
+        best = best.with_notes(_describe_shortfall(best.report))
     cache.trim()  # a chore has many problems, whose solvers grow while they are used
     build_time = cache.build_time - built
     statistics = PlanningStatistics(
@@ -360,6 +365,19 @@ class _Search:
         trajectory = make_stationary_trajectory(self.scene, self.request.options)
         report = self._validate(trajectory)
         return _Candidate("none", np.zeros((0, 0)), trajectory, report, "not converged")
+
+
+def _describe_shortfall(report: Report) -> list[str]:
+    """Return a note on what obstructs a trajectory that lacks only a little clearance."""
+    worst = max(report.violations, key=lambda violation: violation.amount, default=None)
+    if worst is None or any(
+        violation.constraint not in ("clearance", "penetration") for violation in report.violations
+    ):
+        return []
+    return [
+        f"the best trajectory lacks {1e3 * worst.amount:.1f} mm of clearance between "
+        f"{worst.subject}: another attachment or start may be needed rather than more time"
+    ] * (worst.amount < _NEARLY_FREE)
 
 
 def _has_free_ends(problem: TrajectoryProblem, guess: InitialGuess) -> bool:

@@ -15,7 +15,7 @@ from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.results import FINAL, concatenate_plans
 from vkc_pin.planning.solve_task import Guess, TaskResult, solve_task
 from vkc_pin.planning.statistics import PlanningStatistics
-from vkc_pin.utils.budget import STOP_STATUSES, current_ending, reserve_time
+from vkc_pin.utils.budget import current_ending, reserve_time, share_budget
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import generate_alternatives, group_into_actions
 from vkc_pin.world.task.actuation import find_shared_coordinate
@@ -88,7 +88,7 @@ class _SlidingWindow:
                 break
             if failed is None:
                 window = self.window
-            elif self.decided and revocations and failed.status not in FINAL:
+            elif self.decided and revocations and failed.status != "infeasible":
                 self.decided.pop()
                 while self.decided and not self.decided[-1].is_at_rest:
                     self.decided.pop()
@@ -120,7 +120,7 @@ class _SlidingWindow:
             if result.plan.success:
                 self.ahead = self._divide(result, first, last)
         for attempt in range(1, 1 + self._attempts):
-            if failed is None or failed.status in STOP_STATUSES:
+            if failed is None or current_ending():
                 break
             result = self._solve(first, self._current_scene, task, attempt)
             if result.plan.success:
@@ -160,20 +160,21 @@ class _SlidingWindow:
         number = len(self.decided) + len(self.ahead)
         scene = self.ahead[-1].after if self.ahead else self._current_scene
         task, chosen = self._compile(scene, number, number + 1), self.actions[number]
-        failed = self._plan_alone(number, scene, task)
-        if failed is None or failed.status in STOP_STATUSES:
-            return failed
-        for _, steps in generate_alternatives(scene, task):
+        alternatives = list(generate_alternatives(scene, task))
+        with share_budget(1 + len(alternatives)):
+            failed = self._plan_alone(number, scene, task)
+        for k, (_, steps) in enumerate(alternatives):
+            if failed is None or current_ending():
+                break
             self.actions[number] = steps
             task = self._compile(scene, number, number + 1)
             other: Plan | None = failed
             if find_shared_coordinate(scene, task.holds) is None:
-                other = self._plan_alone(number, scene, task, check_goals_first=True)
+                with share_budget(len(alternatives) - k):
+                    other = self._plan_alone(number, scene, task, check_goals_first=True)
             if other is None:
                 return None
             self.actions[number] = chosen
-            if other.status in STOP_STATUSES:
-                return other
         return failed
 
     def _plan_alone(

@@ -129,7 +129,7 @@ def complete_inertias(world: World, physics: Physics) -> list[str]:
         tree.inertias[j] = pin.Inertia(inertia.mass, inertia.lever, tensor)
     if estimated:
         assumed = f"assumed {physics.density:g} kg/m³ in the volume of the collision shapes"
-        notes.append(f"no mass is stated for {', '.join(estimated)}: {assumed}")
+        notes.append(f"no valid mass is stated for {', '.join(estimated)}: {assumed}")
     return notes
 
 

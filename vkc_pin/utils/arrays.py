@@ -1,4 +1,4 @@
-"""Names the array types of signatures, limits coordinates, and prepares numbers for JSON."""
+"""Names the array types of signatures, bounds numbers, and prepares numbers for JSON."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["MAX_COORDINATE", "Bools", "Floats", "Ints", "replace_infinite"]
+__all__ = ["MAX_COORDINATE", "MIN_POSITIVE", "Bools", "Floats", "Ints", "replace_infinite"]
 
 MAX_COORDINATE = 1e4
 """Largest length [m] or angle [rad] in files and arguments."""
+MIN_POSITIVE = 1e-6
+"""Smallest size, velocity, acceleration or time in files that is not 0, in SI units."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int_]

@@ -22,6 +22,7 @@ __all__ = [
     "current_ending",
     "record_evaluations",
     "reserve_time",
+    "share_budget",
     "suspend_budget",
 ]
 
@@ -49,14 +50,15 @@ class Budget:
         max_evaluations: Number of evaluations. Default: unlimited.
 
     Attributes:
+        limits: Deadline as a value of `time.perf_counter()` [s], and number of evaluations.
         is_interrupted: Whether Ctrl-C was pressed.
         evaluations: Evaluations so far.
         reserved: Purpose → time reserved at the end [s].
     """
 
     def __init__(self, seconds: float | None = None, max_evaluations: int | None = None) -> None:
-        self._deadline = math.inf if seconds is None else time.perf_counter() + seconds
-        self._max_evaluations = math.inf if max_evaluations is None else max_evaluations
+        deadline = math.inf if seconds is None else time.perf_counter() + seconds
+        self.limits = deadline, math.inf if max_evaluations is None else max_evaluations
         self.is_interrupted, self.evaluations = False, 0
         self.reserved: dict[str, float] = {}
 
@@ -65,10 +67,21 @@ class Budget:
         """One of `STOP_STATUSES`, or "" before the end."""
         if self.is_interrupted:
             return "interrupted"
-        if self.evaluations > self._max_evaluations:
+        deadline, max_evaluations = self.limits
+        if self.evaluations > max_evaluations:
             return "evaluation limit"
-        late = time.perf_counter() + sum(self.reserved.values()) > self._deadline
+        late = time.perf_counter() + sum(self.reserved.values()) > deadline
         return "time limit" if late else ""
+
+    def divide(self, count: int) -> tuple[float, float]:
+        """Divide what is left by a number, and return the limits before."""
+        before = deadline, max_evaluations = self.limits
+        start = time.perf_counter() + sum(self.reserved.values())
+        self.limits = (
+            start + max(0.0, deadline - start) / count,
+            self.evaluations + (max_evaluations - self.evaluations) / count,
+        )
+        return before
 
     @contextlib.contextmanager
     def activate(self) -> Iterator[Budget]:
@@ -133,6 +146,22 @@ def reserve_time(purpose: str, seconds: float, *, default: bool = False) -> None
     budget = _ACTIVE.get()
     if budget is not None and not (default and budget.reserved.get(purpose)):
         budget.reserved[purpose] = seconds
+
+
+@contextlib.contextmanager
+def share_budget(count: int) -> Iterator[None]:
+    """Limit this thread to an equal share of what is left of its budget.
+
+    Args:
+        count: Number of attempts that the rest of the budget is for, this one included.
+    """
+    budget = _ACTIVE.get()
+    limits = budget.divide(count) if budget is not None else None
+    try:
+        yield
+    finally:
+        if budget is not None and limits is not None:
+            budget.limits = limits
 
 
 @contextlib.contextmanager

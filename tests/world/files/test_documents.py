@@ -129,7 +129,7 @@ def test_invalid_yaml_raises(tmp_path: Path, text: str, line: int | None, proble
         ('name: "a\\0"\n', 1, "name", "not a name"),
         ("name: a\nparts:\n  - size: 1\n    at: [1, 2]\n", 4, "parts[0].at", "3 values"),
         ("name: a\nparts: 3\n", 2, "parts", "a list"),
-        ("parts: [{size: 0}]\nname: 3\n", 1, "parts[0].size", "a number > 0"),
+        ("parts: [{size: 0}]\nname: 3\n", 1, "parts[0].size", "a number from 1e-06 to 10000"),
     ],
 )
 def test_the_first_wrong_field_is_reported(

@@ -205,6 +205,14 @@ def test_extensions_are_ignored(tmp_path: Path, capfd: pytest.CaptureFixture[str
             '<inertial><mass value="heavy"/><inertia ixx="1"/></inertial>',
             "a: mass value: wrong numbers .*got heavy.*counts as none",
         ),
+        (
+            '<inertial><mass value="-3"/><inertia ixx="1"/></inertial>',
+            "2: a: a negative mass .*got -3.*counts as none",
+        ),
+        (
+            '<inertial><mass value="1e10"/><inertia ixx="1"/></inertial>',
+            "a: mass value: wrong numbers .*at most 1e.09, got 1e10.*counts as none",
+        ),
     ],
 )
 def test_incomplete_inertials_warn(tmp_path: Path, inertial: str, message: str) -> None:
@@ -213,6 +221,19 @@ def test_incomplete_inertials_warn(tmp_path: Path, inertial: str, message: str) 
     with pytest.warns(UserWarning, match=message):
         model, _, _ = load_urdf(write_urdf(tmp_path, *lines))
     assert model.inertias[1].mass == 0.0
+
+
+@pytest.mark.parametrize(("mass", "moment"), [(2e4, 400.0), (20.0, 4e5), (1e9, 1e9)])
+def test_large_masses_are_kept(tmp_path: Path, mass: float, moment: float) -> None:
+    moments = " ".join(f'{key}="{moment}"' for key in ("ixx", "iyy", "izz"))
+    inertial = f'<inertial><mass value="{mass}"/><inertia {moments}/></inertial>'
+    root, moving = format_links("r", "a")
+    lines = [root, moving.replace("</link>", f"{inertial}</link>")]
+    model, _, _ = load_urdf(
+        write_urdf(tmp_path, *lines, format_joint("j", "r", "a", kind="continuous"))
+    )
+    assert model.inertias[1].mass == mass
+    np.testing.assert_allclose(model.inertias[1].inertia, moment * np.eye(3))
 
 
 def test_unnamed_robots_are_named_after_their_file(tmp_path: Path) -> None:

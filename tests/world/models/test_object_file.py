@@ -133,6 +133,8 @@ def test_invalid_attachments_raise_with_their_line(entry: str, line: int, field:
     ("old", "new", "line", "field"),
     [
         ("acceleration: 3", "acceleration: -3", 3, "joints.hinge.acceleration"),
+        ("acceleration: 3", "acceleration: 1e-300", 3, "joints.hinge.acceleration"),
+        ("acceleration: 3", "velocity: 1e-7", 3, "joints.hinge.velocity"),
         ("link: panel", "position: [0, 0, 0]", 5, "attachments[0].link"),
         ("link: panel", "link: panel\n  - name: grip\n    link: panel", 7, "attachments[1].name"),
         ("joint: hinge,", "joint: hinge, held_at: 2,", 8, "latches[0].held_at"),

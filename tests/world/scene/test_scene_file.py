@@ -140,7 +140,7 @@ SIZE, BASE = "size: [0.5, 0.4, 0.3]", "base: [0.0, 0.0, 0.5]"
         ("type: door", "type: my/door.yaml", 9, "objects[0].type", "got my/door.yaml"),
         ("type: door", "type: 5", 9, "objects[0].type", "the name or file"),
         ("type: door", "type: {}", 9, "urdf", "missing"),
-        (SIZE, "size: [0.5, -0.4, 0.3]", 13, "obstacles[0].size[1]", "expected a number > 0"),
+        (SIZE, "size: [0.5, -0.4, 0.3]", 13, "obstacles[0].size[1]", "a number from 1e-06"),
         (SIZE, "size: [1, 2, 3, 4]", 13, "obstacles[0].size", "wrong number of values"),
         ("yaw: 0.2, ", "yaw: 0.2, rpy: [0, 0, 0], ", 13, "obstacles[0]", "one of rpy, yaw and"),
         ("colour: [1, 0, 0]", "colour: rd", 13, "obstacles[0].colour", "unknown colour 'rd'"),

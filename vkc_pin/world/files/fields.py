@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from vkc_pin.utils.arrays import MAX_COORDINATE
+from vkc_pin.utils.arrays import MAX_COORDINATE, MIN_POSITIVE
 
 __all__ = [
     "JointSchema",
@@ -74,7 +74,12 @@ _IN_RANGE = require(
     f"a number from {-MAX_COORDINATE:g} to {MAX_COORDINATE:g}",
 )
 Number = Annotated[float, BeforeValidator(_reject_bool), Field(allow_inf_nan=False), _IN_RANGE]
-Positive = Annotated[Number, Field(gt=0.0)]
+_LARGE_ENOUGH = require(
+    lambda value: value >= MIN_POSITIVE,
+    "out of range",
+    f"a number from {MIN_POSITIVE:g} to {MAX_COORDINATE:g}",
+)
+Positive = Annotated[Number, _LARGE_ENOUGH]
 NonNegative = Annotated[Number, Field(ge=0.0)]
 Vector3 = Annotated[tuple[Number, Number, Number], require_length(3)]
 _NAME = re.compile(r"[^\s./]([^./]*[^\s./])?")

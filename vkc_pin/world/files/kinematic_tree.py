@@ -29,6 +29,7 @@ __all__ = [
 
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 """Attributes of <inertia>, along the rows of the upper triangle."""
+_MAX_MASS = 1e9  # [kg], and of moments of inertia [kg·m²]
 
 _JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 _LIMITED_TYPES = ("revolute", "prismatic")
@@ -190,9 +191,14 @@ def parse_inertial(
     if mass is None or inertia is None:
         lacks = f"an <inertial> without <{'mass' if mass is None else 'inertia'}>"
         raise make_element_error(file, inertial, lacks, field=where)
-    (weight,) = parse_numbers(file, mass, "value", 1, default=None, where=where)
+    (weight,) = parse_numbers(file, mass, "value", 1, default=None, where=where, largest=_MAX_MASS)
+    if weight < 0.0:
+        raise make_element_error(
+            file, mass, "a negative mass", field=where, expected="0 kg or more", got=weight
+        )
     moments = tuple(
-        parse_numbers(file, inertia, key, 1, default="0", where=where)[0] for key in MOMENTS
+        parse_numbers(file, inertia, key, 1, default="0", where=where, largest=_MAX_MASS)[0]
+        for key in MOMENTS
     )
     return weight, moments, parse_origin(file, inertial, where)
 

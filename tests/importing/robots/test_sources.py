@@ -9,6 +9,7 @@ from helpers.arm_urdf import write_arms
 import vkc_pin as vkc
 from vkc_pin.importing.robots.sources import Source, expand_xacro, read_source
 from vkc_pin.world.files import resources
+from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.world.files.xml import parse_xml
 
 
@@ -88,6 +89,46 @@ def test_given_packages_take_precedence(file: Path, tmp_path: Path) -> None:
     other.mkdir()
     (other / "links.xacro").write_text(PART.replace("2*length", "4*length"), encoding="utf-8")
     assert size(expand_xacro(file, {"my_parts": other}, {}), file).startswith("1.2")  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("folder", "names"),
+    [
+        ("work/checkout-of-parts", "my_parts"),  # beside the robot's package
+        ("work/my_robot/checkout", "my_parts"),  # within it
+        ("work", "my_parts"),  # around it
+        ("work/my_robot", "my_parts"),
+        ("work/z", " my_parts\n "),
+    ],
+)
+def test_package_xml_names_a_package(file: Path, tmp_path: Path, folder: str, names: str) -> None:
+    (tmp_path / "work" / "my_parts").rename(tmp_path / "elsewhere")
+    with pytest.raises(vkc.InputError, match="packages were not found: my_parts"):
+        expand_xacro(file, {}, {})
+    place = tmp_path / folder
+    place.mkdir(exist_ok=True)
+    (tmp_path / "elsewhere" / "links.xacro").rename(place / "links.xacro")
+    text = f'<?xml version="1.0"?><package format="2"><name>{names}</name></package>'
+    (place / "package.xml").write_text(text)
+    assert size(expand_xacro(file, {}, {}), file) == "0.6 0.1 0.1"
+    plain = place / "r.urdf"
+    plain.write_text('<robot name="r"><link name="a"/></robot>')
+    assert read_urdf(plain).resolve("package://my_parts/links.xacro") == place / "links.xacro"
+
+
+def test_all_missing_packages_are_listed(file: Path) -> None:
+    include = '<xacro:include filename="$(find {})/x.xacro"/>'
+    more = include.format("first_gone") + include.format("second_gone")
+    part = file.parents[2] / "my_parts" / "links.xacro"
+    part.write_text(part.read_text().replace("</robot>", f"{include.format('third')}</robot>"))
+    file.write_text(TEXT.replace("</robot>", f"{more}</robot>"), encoding="utf-8")
+    with pytest.raises(vkc.InputError) as caught:
+        expand_xacro(file, {}, {})
+    message = str(caught.value)
+    assert "packages were not found: first_gone, second_gone, third" in message
+    assert "--package NAME=FOLDER" in message
+    assert message.count("first_gone") == 1
+    assert "class" not in message
 
 
 def test_errors_name_the_cause(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:

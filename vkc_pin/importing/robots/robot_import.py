@@ -261,7 +261,7 @@ class _Importer:
             self._guess(
                 chosen.sure,
                 f"arm: {chosen.name}, {chosen.why}{also}",
-                "another one: arm=..., `--arm`" if others else "",
+                "to choose another: arm, --arm" if others else "",
             )
 
     def _set_hand(self, hand: Hand, tool_frame: str | None) -> None:

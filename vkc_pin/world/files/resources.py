@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import re
@@ -21,6 +22,7 @@ __all__ = [
     "find_example_robot_data",
     "find_file",
     "find_mesh_file",
+    "find_package",
     "find_package_folder",
     "find_resource",
     "find_resource_folder",
@@ -34,6 +36,10 @@ _MAX_NAME_LENGTH = (
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(.*)", re.DOTALL)  # not C:, a drive
 _MODEL_PATHS = ("GZ_SIM_RESOURCE_PATH", "GAZEBO_MODEL_PATH")  # variables with folders of models
 _NO_PACKAGES: Mapping[str, Path] = MappingProxyType({})
+_NEAR = 4  # folders above a file whose other folders are searched for a package.xml
+_MAX_HEAD = 20_000  # characters of a package.xml in which its name stands
+_PACKAGE = re.compile(r"(?i:package|model):/*([^/]+)/+(.+)")  # NAME/... in an address
+_PACKAGE_NAME = re.compile(r"<name>\s*([^<\s]+)\s*</name>")
 _FILE_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _PORT_NAMES = {f"{port}{number}" for port in ("com", "lpt") for number in range(10)}
 _RESERVED_NAMES = {"con", "prn", "aux", "nul", *_PORT_NAMES}  # reserved on Windows
@@ -126,6 +132,10 @@ def find_mesh_file(
     for candidate in candidates:
         if candidate.is_file():
             return candidate
+    if (match := _PACKAGE.match(unquote(address.strip()))) is not None:
+        place = find_package(match[1], file, packages)  # of another folder name
+        if place is not None and (place / match[2]).is_file():
+            return place / match[2]
     first, expected = candidates[0], "a mesh file"
     if first.parent.is_dir():
         nearest = find_nearest_name(
@@ -197,6 +207,43 @@ def _list_package_candidates(
     # for copies of its URDFs, wherever they are
     if name == "example-robot-data" and (data := find_example_robot_data()) is not None:
         yield data / inside
+
+
+def find_package(
+    name: str, file: Path, packages: Mapping[str, str | Path] | None = None
+) -> Path | None:
+    """Return the folder of a ROS package that a file refers to, or None.
+
+    It is one of `packages`; or a folder of that name around the file; or one around it whose
+    package.xml states the name, as checkouts are often called otherwise.
+    """
+    if packages and name in packages:
+        return Path(packages[name])
+    around = list(dict.fromkeys([*file.absolute().parents, *file.resolve().parents]))
+    for folder in around:
+        for place in (folder, folder / name) if folder.name == name else (folder / name,):
+            if place.is_dir():
+                return place
+    for folder in around:
+        if _read_package_name(folder) == name:
+            return folder
+    for folder in around[:_NEAR]:
+        with contextlib.suppress(OSError):
+            for place in sorted(folder.iterdir()):
+                if place.is_dir() and _read_package_name(place) == name:
+                    return place
+    return None
+
+
+def _read_package_name(folder: Path) -> str | None:
+    """Return the name that a folder's package.xml states, or None."""
+    file = folder / "package.xml"
+    try:
+        with file.open(encoding="utf-8", errors="replace") as stream:
+            found = _PACKAGE_NAME.search(stream.read(_MAX_HEAD))
+    except OSError:
+        return None
+    return found.group(1) if found else None
 
 
 def choose_file_names(

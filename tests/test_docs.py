@@ -51,8 +51,14 @@ def find_blocks(page: Path, language: str) -> list[str]:
 
 LONG = (
     "chores",
+    "datasets",
+    "execution",
+    "household",
+    "index",
     "initialization",
+    "objects",
     "own_terms",
+    "reading_failures",
     "robots",
     "tutorial",
 )  # pages whose code plans much

@@ -227,6 +227,7 @@ def test_arm_does_not_reach(monkeypatch: pytest.MonkeyPatch) -> None:
     assert {"goal", "clearance"} & {v.constraint for v in plan.report.violations}
 
 
+@pytest.mark.long
 def test_failed_attempts_are_followed_by_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

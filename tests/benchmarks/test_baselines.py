@@ -182,6 +182,7 @@ def test_failures_are_saved(out: Path, result: dict[str, Any]) -> None:
     np.testing.assert_allclose(saved.scene.start, trial["start"], atol=1e-8)
 
 
+@pytest.mark.long
 def test_failures_are_planned_again_to_be_saved(tmp_path: Path) -> None:
     run(tmp_path)
     assert list_files(tmp_path / "failures") == set()

@@ -34,6 +34,7 @@ def test_tasks_can_be_compiled() -> None:
         assert make_program(scene, task.steps).segments > 0
 
 
+@pytest.mark.long
 def test_variant_has_the_numbers_of_the_papers_code() -> None:
     ours, theirs = vkc.load_scene("household"), make_paper_home()
     differing = {name: task.steps for name, task in PAPER.tasks.items() if task != TASKS[name]}

@@ -96,6 +96,7 @@ def test_page_shows_statistics_and_pictures(copy: Path, tmp_path: Path) -> None:
     )  # type: ignore[union-attr]
 
 
+@pytest.mark.long
 def test_jobs_do_not_affect_the_check(copy: Path) -> None:
     one, two = check_dataset(copy), check_dataset(copy, jobs=2)
     assert one.records == two.records

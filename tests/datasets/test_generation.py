@@ -53,6 +53,7 @@ def test_episodes_are_valid_and_reach_their_goals(made: Dataset) -> None:
     assert len(starts) == EPISODES
 
 
+@pytest.mark.long
 def test_jobs_do_not_affect_the_dataset(made: Dataset, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     other = generate(SMALL, EPISODES, tmp_path / "out", jobs=2)

@@ -48,6 +48,7 @@ def test_past_failures_yield_a_result_or_an_error(worker: Worker, file: Path) ->
     )
 
 
+@pytest.mark.long
 def test_valid_input_yields_a_result(worker: Worker) -> None:
     from fuzz import calls, files
 

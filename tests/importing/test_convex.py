@@ -52,6 +52,7 @@ def test_convex_bodies_stay_as_they_are() -> None:
     assert (single.solid, single.overhead) == pytest.approx((0.006, 0.0), abs=1e-9)
 
 
+@pytest.mark.long
 def test_bin_becomes_hollow_the_same_way_every_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

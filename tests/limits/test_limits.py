@@ -15,12 +15,12 @@ from limits.check import check_motion
 from limits.files import Motion, read_csv, read_limits, read_npz
 from limits.plans import export_plans
 
-COUNT = 8
+COUNT = 4
 
 
 @pytest.fixture(scope="module")
 def plans(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Return plans of six tasks and in two random rooms, with tables."""
+    """Return plans of three tasks and in a random room, with tables."""
     return list(export_plans(tmp_path_factory.mktemp("plans"), COUNT))
 
 

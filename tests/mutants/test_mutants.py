@@ -82,6 +82,7 @@ def test_users_of_a_constant_are_found() -> None:
     assert where["name: min → max"] == (16, (16,))
 
 
+@pytest.mark.long
 def test_tests_find_a_fault(tmp_path: Path) -> None:
     module, file = "benchmarks/harness/limits.py", "tests/benchmarks/harness/test_limits.py"
     coverage = measure_coverage([file], tmp_path)

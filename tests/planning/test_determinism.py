@@ -87,6 +87,7 @@ def test_with_a_tiny_cache(fresh: dict[str, str]) -> None:
     assert compute_hash(plan_door(planner)) == fresh["door"]
 
 
+@pytest.mark.long
 def test_in_concurrent_threads(fresh: dict[str, str]) -> None:
     planner = vkc.Planner()
     found: dict[int, str] = {}

@@ -106,6 +106,7 @@ def test_speed_limit_near_a_point() -> None:
     assert plan.trajectory.times[-1] > plan_without_terms().trajectory.times[-1]
 
 
+@pytest.mark.long
 def test_cost_changes_the_posture() -> None:
     def compute_mean_cost(*terms: vkc.Cost) -> float:
         elbows = [

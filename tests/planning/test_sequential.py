@@ -230,6 +230,7 @@ def test_failed_attachments_are_noted() -> None:
     assert result.report.notes[-1].startswith("at drawer.roof: reach drawer.roof: out of reach")
 
 
+@pytest.mark.long
 def test_another_attachment_of_one_step() -> None:
     scene = add_attachment(vkc.load_scene("drawer"), "drawer", "ceiling", 4.0)
     there = vkc.GoTo(*(scene.start[:2] + 0.1))

@@ -116,6 +116,7 @@ def test_robot_does_not_stop_between_drives() -> None:
     assert speed[first - 1 : first + 1].min() > 0.1 * speed.max()
 
 
+@pytest.mark.long
 def test_four_steps(tmp_path: Path) -> None:
     plan = plan_fridge()
     assert plan.success, plan.summary()

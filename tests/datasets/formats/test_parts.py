@@ -13,6 +13,7 @@ from vkc_pin.datasets.recipes.recipe import load_recipe
 pytest.importorskip("h5py")
 
 
+@pytest.mark.long
 def test_attempts_are_parts_of_a_shard(tmp_path: Path) -> None:
     document = load_recipe({**SMALL, "tasks": ["given-open"]}).document
     made, plain = make_parts((document, [0, 1], {})), run_attempts((document, [0, 1], {}))

@@ -306,6 +306,7 @@ def expected() -> list[bytes]:
     return plan_door()
 
 
+@pytest.mark.long
 def test_plans_are_equal_bit_for_bit(
     folder: Libraries, expected: list[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:

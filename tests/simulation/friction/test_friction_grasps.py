@@ -46,6 +46,7 @@ def test_slipping_object_is_lost() -> None:
     assert any("drawer.slide" in line for line in result.problems())
 
 
+@pytest.mark.long
 def test_cup_is_carried_and_placed() -> None:
     plan = vkc.plan(vkc.load_scene("household"), [vkc.Place("cup", (-0.6, -1.6, 0.751))])
     result = plan.simulate(grasp="friction")

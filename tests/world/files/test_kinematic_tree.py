@@ -83,12 +83,17 @@ def format_pair(kind: str = "fixed", inside: str = "") -> list[str]:
         (
             format_pair("prismatic", '<limit lower="0" upper="1" velocity="-1"/>'),
             4,
-            "j: limit velocity: a negative velocity limit .*0 or more, got -1",
+            "j: limit velocity: velocity limit out of range .*or 0 for none, got -1",
+        ),
+        (
+            format_pair("continuous", '<limit velocity="1e-300"/>'),
+            4,
+            "j: limit velocity: velocity limit out of range .*1e-06 or more, .*got 1e-300",
         ),
         (
             format_pair("continuous", '<limit effort="-2"/>'),
             4,
-            "j: limit effort: a negative effort limit",
+            "j: limit effort: effort limit out of range",
         ),
         (
             format_pair(inside='<origin xyz="1,5 0 0"/>'),

@@ -14,7 +14,7 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.utils.arrays import MAX_COORDINATE
+from vkc_pin.utils.arrays import MAX_COORDINATE, MIN_POSITIVE
 from vkc_pin.world.files.xml import find_line, make_element_error, replace_forbidden
 
 __all__ = [
@@ -49,10 +49,11 @@ def _check_limits(file: Path, name: str, joint: ElementTree.Element) -> None:
         keys = ("lower", "upper", "velocity", "effort")
         lower, upper, *rates = (_parse_limit(file, name, limit, key)[0] for key in keys)
         for key, rate in zip(keys[2:], rates, strict=True):
-            if rate < 0.0:
-                problem, field = f"a negative {key} limit", f"{name}: limit {key}"
+            if rate < 0.0 or 0.0 < rate < MIN_POSITIVE:
+                problem, field = f"{key} limit out of range", f"{name}: limit {key}"
+                expected = f"{MIN_POSITIVE:g} or more, or 0 for none"
                 raise make_element_error(
-                    file, limit, problem, field=field, expected="0 or more", got=f"{rate:g}"
+                    file, limit, problem, field=field, expected=expected, got=f"{rate:g}"
                 )
         if is_limited and lower > upper:
             problem, got = "limits in the wrong order", f"{lower:g} and {upper:g}"

@@ -46,7 +46,7 @@ def test_misuse_is_explained_in_one_line(
         (f"import-robot {file} --output given", "got other files"),
         (f"import-robot {file} --output new --package meshes", "NAME=FOLDER"),
         ("import-home none.xml", "none.xml"),
-        ("import-home binary.urdf", "expected a URDF or MJCF file in UTF-8, got"),
+        ("import-home binary.urdf", "expected a URDF, xacro, MJCF or SDF file in UTF-8, got"),
         ("check drawer --plot it.xyz", "--plot: not the name of a picture (expected a name"),
         ("doctor husky_ur5", "did you mean 'husky_ur5e'?"),
     ):

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import logging
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +32,7 @@ def add_importing(commands: Any) -> None:
     add_option(robot, "--arm NAME", "the arm to plan for, or a part of its name, e.g. left")
     add_option(robot, "--tool-frame FRAME", "the tool frame, if it is not to be guessed")
     add_option(robot, "--srdf FILE", "an SRDF (default: the one beside the file)")
-    about = "folder of a package, for package:// and $(find NAME)"
-    add_option(robot, "--package NAME=FOLDER", about, action="append", default=[])
-    about = "argument of a xacro file"
-    add_option(robot, "--argument NAME=VALUE", about, action="append", default=[])
+    _add_packages(robot)
     about = "largest number of convex pieces of a mesh; 1 keeps hulls"
     add_option(robot, "--most-pieces N", about, type=parse_positive)
     about = "number of configurations for finding pairs that need no check"
@@ -40,12 +40,12 @@ def add_importing(commands: Any) -> None:
     add_seed(robot)
 
     about = (
-        "Import an object from a URDF, MJCF or SDF file: convex pieces, joint limits, attachments "
-        "proposed from its shapes, and a picture of them. The report lists changes, and joints "
-        "that no hand can open."
+        "Import an object from a URDF, xacro, MJCF or SDF file: convex pieces, joint limits, "
+        "attachments proposed from its shapes, and a picture of them. The report lists changes, "
+        "and joints that no hand can open."
     )
     item = add_command(commands, "import-object", "import an object", _import_object, about)
-    add_option(item, "file FILE", "URDF, MJCF or SDF")
+    add_option(item, "file FILE", "URDF, xacro, MJCF or SDF")
     _add_output(item, "import-object")
     size = item.add_mutually_exclusive_group()
     about = "height, for files without a unit (PartNet-Mobility)"
@@ -54,19 +54,21 @@ def add_importing(commands: Any) -> None:
     about = "axis of the file that points up (default z)"
     add_option(item, "--up", about, choices=("z", "y"), default="z")
     add_option(item, "--link NAME", "import only this link and its descendants")
+    _add_packages(item)
     _add_hand(item, most=3)
 
     about = (
-        "Import a whole home from a URDF or MJCF file as a scene: fixed parts become obstacles of "
-        "convex pieces, parts with joints become objects with proposed attachments, and free "
-        "parts become objects to carry. The robot starts at a free pose. The report lists "
+        "Import a whole home from a URDF, xacro, MJCF or SDF file as a scene: fixed parts become "
+        "obstacles of convex pieces, parts with joints become objects with proposed attachments, "
+        "and free parts become objects to carry. The robot starts at a free pose. The report lists "
         "changes, and parts that no hand can move."
     )
     home = add_command(commands, "import-home", "import a whole home", _import_home, about)
-    add_option(home, "file FILE", "URDF or MJCF")
+    add_option(home, "file FILE", "URDF, xacro, MJCF or SDF")
     _add_output(home, "import-home")
     about = "height of the floor in the file (default 0)"
     add_option(home, "--floor METRES", about, type=float, default=0.0)
+    _add_packages(home)
     _add_hand(home, most=2)
     add_seed(home, "random seed of the search for a start pose (default 0)")
 
@@ -83,6 +85,35 @@ def add_importing(commands: Any) -> None:
 def _add_output(parser: argparse.ArgumentParser, command: str) -> None:
     add_option(parser, "--output FOLDER", "a new folder (default: one named like the file)")
     add_option(parser, "--force", f"replace an earlier output of {command}")
+
+
+def _add_packages(parser: argparse.ArgumentParser) -> None:
+    about = "folder of a package, for package://, model:// and $(find NAME)"
+    add_option(parser, "--package NAME=FOLDER", about, action="append", default=[])
+    about = "argument of a xacro file"
+    add_option(parser, "--argument NAME=VALUE", about, action="append", default=[])
+
+
+def _read_packages(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the arguments `packages` and `arguments` of an import."""
+    return {
+        "packages": _parse_pairs(arguments.package, "--package", "NAME=FOLDER"),
+        "arguments": _parse_pairs(arguments.argument, "--argument", "NAME=VALUE"),
+    }
+
+
+@contextlib.contextmanager
+def _print_progress() -> Iterator[None]:
+    """Print the progress that imports log."""
+    logger, handler = logging.getLogger("vkc_pin.importing"), logging.StreamHandler(sys.stderr)
+    level = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)
 
 
 def _add_hand(parser: argparse.ArgumentParser, *, most: int) -> None:
@@ -106,8 +137,7 @@ def _import_robot(arguments: argparse.Namespace) -> int:
         arm=arguments.arm,
         tool_frame=arguments.tool_frame,
         srdf=arguments.srdf,
-        packages=_parse_pairs(arguments.package, "--package", "NAME=FOLDER"),
-        arguments=_parse_pairs(arguments.argument, "--argument", "NAME=VALUE"),
+        **_read_packages(arguments),
         seed=arguments.seed,
         force=arguments.force,
         **chosen,
@@ -129,6 +159,7 @@ def _import_object(arguments: argparse.Namespace) -> int:
         robot=_find_robot(arguments.robot),
         most=arguments.most,
         force=arguments.force,
+        **_read_packages(arguments),
     )
     sys.stdout.write(f"{done.summary()}\nwrote {done.file}\nwrote {done.picture}\n")
     return EXIT_OK
@@ -137,15 +168,17 @@ def _import_object(arguments: argparse.Namespace) -> int:
 def _import_home(arguments: argparse.Namespace) -> int:
     from vkc_pin.importing.homes.home_import import import_home
 
-    done = import_home(
-        arguments.file,
-        arguments.output,
-        floor=arguments.floor,
-        robot=_find_robot(arguments.robot),
-        most=arguments.most,
-        seed=arguments.seed,
-        force=arguments.force,
-    )
+    with _print_progress():
+        done = import_home(
+            arguments.file,
+            arguments.output,
+            floor=arguments.floor,
+            robot=_find_robot(arguments.robot),
+            most=arguments.most,
+            seed=arguments.seed,
+            force=arguments.force,
+            **_read_packages(arguments),
+        )
     sys.stdout.write(f"{done.summary()}\nwrote {done.file}\n")
     return EXIT_OK
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.downloads import SDF
+import trimesh
 from helpers.homes import HOME_MJCF, PLACES, WALLS, write_home_urdf
 
 import vkc_pin as vkc
@@ -140,6 +140,82 @@ def test_mjcf_home_is_imported(tmp_path: Path) -> None:
     assert len(vkc.procedural.goals(done.scene)) == 2
 
 
+def format_sdf_box(size: str, place: str, name: str) -> str:
+    shape = f"<geometry><box><size>{size}</size></box></geometry>"
+    collision = f'<collision name="c"><pose>{place} 0 0 0</pose>{shape}</collision>'
+    return f'<link name="{name}">{collision}</link>'
+
+
+def test_sdf_world_is_imported(tmp_path: Path) -> None:
+    """Static models are fixed, those with joints are objects, and others are free."""
+    chest = (
+        '<sdf version="1.9"><model name="chest">'
+        + format_sdf_box("0.4 0.6 0.8", "0.2 0 0.4", "case")
+        + format_sdf_box("0.02 0.56 0.3", "-0.01 0 0.5", "front").replace(
+            "</link>",
+            '<collision name="handle"><pose>-0.07 0 0.5 0 0 0</pose><geometry><box>'
+            "<size>0.02 0.2 0.02</size></box></geometry></collision></link>",
+        )
+        + '<joint name="slide" type="prismatic"><parent>case</parent><child>front</child>'
+        "<axis><xyz>-1 0 0</xyz><limit><lower>0</lower><upper>0.3</upper></limit></axis></joint>"
+        "</model></sdf>"
+    )
+    (tmp_path / "chest").mkdir()
+    (tmp_path / "chest" / "model.sdf").write_text(chest)
+    cup = '<link name="l"><collision name="c"><geometry><cylinder><radius>0.03</radius>'
+    cup += "<length>0.1</length></cylinder></geometry></collision></link>"
+    (tmp_path / "flat.world").write_text(
+        '<sdf version="1.9"><world name="flat">'
+        "<include><uri>model://chest</uri><pose>2 1 0 0 0 0</pose></include>"
+        '<model name="wall"><static>1</static>'
+        f"{format_sdf_box('6 0.1 2.4', '0 2 1.2', 'l')}</model>"
+        f'<model name="cup"><pose>2.2 1 0.85 0 0 0</pose>{cup}</model></world></sdf>'
+    )
+    done = vkc.importing.import_home(tmp_path / "flat.world", tmp_path / "out")
+    assert done.shapes == {"file": 5, "obstacles": 1, "objects": 4, "floor": 0}
+    assert {name: placed.object.free for name, placed in done.scene.objects.items()} == {
+        "chest": False,
+        "cup": True,
+    }
+    assert list(done.scene.objects["chest"].object.coordinates.names) == ["slide"]
+    assert done.scene.objects["cup"].placement.translation == pytest.approx([2.2, 1.0, 0.8])
+    # Free floor on the three sides without a wall, around what is there
+    assert done.scene.arena == pytest.approx((-5.0, 5.0, 0.7 - 2.0, 2.05))
+
+
+def test_xacro_home_is_imported(tmp_path: Path) -> None:
+    pytest.importorskip("xacro")
+    (tmp_path / "parts" / "meshes").mkdir(parents=True)
+    trimesh.creation.box((0.4, 0.6, 0.8)).export(tmp_path / "parts" / "meshes" / "case.stl")
+    (tmp_path / "flat.urdf.xacro").write_text(
+        """<robot name="flat" xmlns:xacro="http://www.ros.org/wiki/xacro">
+        <xacro:arg name="depth" default="0.3"/>
+        <xacro:macro name="chest" params="name x"><link name="${name}"><collision>
+          <origin xyz="0 0 0.4"/><geometry><mesh filename="package://furniture/meshes/case.stl"/>
+          </geometry></collision></link>
+          <joint name="${name}_stands" type="fixed"><parent link="rooms"/><child link="${name}"/>
+            <origin xyz="${x} 0 0"/></joint>
+          <link name="${name}_front"><collision><geometry><box size="0.02 0.56 0.3"/></geometry>
+            </collision><collision><origin xyz="-0.07 0 0"/><geometry><box size="0.02 0.2 0.02"/>
+            </geometry></collision></link>
+          <joint name="${name}_slide" type="prismatic"><parent link="${name}"/>
+            <child link="${name}_front"/><origin xyz="-0.22 0 0.5"/><axis xyz="-1 0 0"/>
+            <limit lower="0" upper="$(arg depth)"/></joint></xacro:macro>
+        <link name="rooms"/>
+        <xacro:chest name="left" x="${-1}"/><xacro:chest name="right" x="${1+1}"/>
+        </robot>"""
+    )
+    done = vkc.importing.import_home(
+        tmp_path / "flat.urdf.xacro",
+        tmp_path / "out",
+        packages={"furniture": tmp_path / "parts"},
+        arguments={"depth": "0.25"},
+    )
+    assert list(done.scene.objects) == ["left", "right"]
+    assert done.scene.objects["right"].object.upper == pytest.approx([0.25])
+    assert done.scene.arena == pytest.approx((-1.3 - 2.0, 2.2 + 2.0, -2.3, 2.3))
+
+
 def test_folder_and_file_name_are_respected(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     file, out = tmp_path / "x\nfloor: false\n#\x01.xml", tmp_path / "out"
@@ -175,11 +251,10 @@ def test_invalid_homes_and_arguments_are_refused(tmp_path: Path) -> None:
         '<robot name="s"><link name="a"><collision><geometry><box size="1 1 1"/></geometry>'
         "</collision></link></robot>"
     )
-    (tmp_path / "box.sdf").write_text(SDF)
     for file, wrong, word in (
         (tmp_path / "none.urdf", {}, r"none\.urdf"),
         (still, {}, r"still\.urdf.*the home has nothing movable"),
-        (tmp_path / "box.sdf", {}, "URDF and MJCF only"),
+        (still, {"packages": {"p": 1}}, "packages"),
         (still, {"floor": float("nan")}, "floor"),
         (still, {"most": 0}, "most"),
         (still, {"robot": "husky_ur5"}, "husky_ur5e"),

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.importing.homes.splitting import split_home
+from vkc_pin.importing.homes.splitting import add_floor, split_home
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
 
 
@@ -146,3 +146,56 @@ def test_no_shape_is_lost_whatever_the_tree(data: st.DataObject) -> None:
     assert home.shapes == len(kept)
     names = [thing.name for thing in home.objects]
     assert len(set(names)) == len(names)
+
+
+NORTH, SOUTH, EAST, WEST = (
+    ((6.0, 0.1, 2.4), (0.0, 1.95, 1.2)),
+    ((6.0, 0.1, 2.4), (0.0, -1.95, 1.2)),
+    ((0.1, 4.0, 2.4), (2.95, 0.0, 1.2)),
+    ((0.1, 4.0, 2.4), (-2.95, 0.0, 1.2)),
+)
+BAR = ((6.0, 4.0, 0.1), (0.0, 0.0, 2.35))  # a ceiling, no wall
+
+
+@pytest.mark.parametrize(
+    ("walls", "open_sides"),
+    [
+        ([NORTH, SOUTH, EAST, WEST], ""),
+        ([NORTH, SOUTH, EAST, BAR], "w"),
+        ([NORTH, BAR], "swe"),
+        ([BAR], "nswe"),
+        # a door of 1 m, and one that leaves less than half of a wall
+        ([NORTH, SOUTH, EAST, ((0.1, 3.0, 2.4), (-2.95, 0.5, 1.2))], ""),
+        ([NORTH, SOUTH, EAST, ((0.1, 1.5, 2.4), (-2.95, 1.0, 1.2))], "w"),
+        # two halves that overlap, and a wall in the middle of the room
+        ([NORTH, SOUTH, WEST, *[((0.1, 1.5, 2.4), (2.95, y, 1.2)) for y in (-1.2, 0.2)]], ""),
+        ([NORTH, SOUTH, WEST, BAR, ((0.1, 4.0, 2.4), (1.0, 0.0, 1.2))], "e"),
+        # a threshold, a lintel, and a wall with a large window
+        ([NORTH, SOUTH, WEST, BAR, ((0.1, 4.0, 0.2), (2.95, 0.0, 0.1))], "e"),
+        ([NORTH, SOUTH, WEST, BAR, ((0.1, 4.0, 0.9), (2.95, 0.0, 0.45))], ""),
+    ],
+)
+def test_floor_lies_beyond_sides_without_walls(
+    walls: list[tuple[tuple[float, float, float], tuple[float, float, float]]], open_sides: str
+) -> None:
+    parts = tuple(
+        Part(name="", placement=pin.SE3(np.eye(3), np.array(at)), kind="box", size=size)
+        for size, at in walls
+    )
+    joint = _hung("rooms", "lid", "revolute")
+    home = split_home(_home([Link("rooms", (), parts), _box("lid")], [joint]))
+    low, high = add_floor(home, np.array([-3.0, -2.0, 0.0]), np.array([3.0, 2.0, 2.4]))
+    beyond = {side: 2.0 * (side in open_sides) for side in "nswe"}
+    assert low == pytest.approx([-3.0 - beyond["w"], -2.0 - beyond["s"], 0.0])
+    assert high == pytest.approx([3.0 + beyond["e"], 2.0 + beyond["n"], 2.4])
+
+
+def test_floor_lies_around_a_home_without_building() -> None:
+    home = split_home(
+        _home(
+            [Link("w"), _box("a"), _box("b")],
+            [_hung("w", "a", "fixed"), _hung("a", "b", "revolute")],
+        )
+    )
+    low, high = add_floor(home, np.zeros(3), np.ones(3))
+    assert (low.tolist(), high.tolist()) == ([-2.0, -2.0, 0.0], [3.0, 3.0, 1.0])

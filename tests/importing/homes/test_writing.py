@@ -10,7 +10,7 @@ import trimesh
 
 import vkc_pin as vkc
 from vkc_pin.importing.homes.splitting import Home, HomeObject
-from vkc_pin.importing.homes.writing import write_object, write_obstacles
+from vkc_pin.importing.homes.writing import ImportProgress, write_object, write_obstacles
 from vkc_pin.importing.objects.description import Description, Link, Part
 from vkc_pin.world.scene.scene import Scene
 
@@ -81,7 +81,9 @@ def test_primitive_shapes_stay_and_others_become_urdf(tmp_path: Path) -> None:
     ball = Link("a wall", (), (make_part("", "sphere", (0.2,), turned),))
     home = Home((building,), (mesh, ball), (), (), 4, ())
     taken = {"ball", "wedge"}
-    entries, notes = write_obstacles(home, tmp_path / "home.urdf", tmp_path, taken, {})
+    entries, notes = write_obstacles(
+        home, tmp_path / "home.urdf", tmp_path, taken, {}, ImportProgress(home)
+    )
     assert [entry["name"] for entry in entries] == ["a_wall", "walls_1", "wedge_2", "a_wall_2"]
     assert [entry["type"] for entry in entries] == ["box", "capsule", "urdf", "sphere"]
     assert entries[0]["colour"] == list(red)
@@ -109,3 +111,22 @@ def test_primitive_shapes_stay_and_others_become_urdf(tmp_path: Path) -> None:
         )  # balls of triangles are smaller
         if part.kind != "mesh":
             assert shape.placement.isApprox(part.placement, 1e-5)
+
+
+def test_progress_is_logged_every_few_seconds(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    links = tuple(
+        Link(f"chair {k}", (), (make_part("", "sphere", (0.2,), pin.SE3.Identity()),))
+        for k in range(6)
+    )
+    now = 0.0
+    monkeypatch.setattr("time.perf_counter", lambda: now)
+    with caplog.at_level("INFO", "vkc_pin.importing"):
+        progress = ImportProgress(Home((), links, (), (), 6, ()))
+        for number, _ in enumerate(progress.follow(links)):
+            now += (0.5, 2.0, 0.5, 3.0, 1.0, 1.0)[number]
+    assert [record.getMessage() for record in caplog.records] == [
+        "chair 2: part 3 of 6, about 5 s left",
+        "chair 4: part 5 of 6, about 3 s left",
+    ]

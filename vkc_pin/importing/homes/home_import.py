@@ -15,8 +15,13 @@ import pinocchio as pin
 import yaml
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.homes.splitting import FLOOR_RISE, Home, split_home
-from vkc_pin.importing.homes.writing import ImportedHomeObject, write_object, write_obstacles
+from vkc_pin.importing.homes.splitting import FLOOR_RISE, Home, add_floor, split_home
+from vkc_pin.importing.homes.writing import (
+    ImportedHomeObject,
+    ImportProgress,
+    write_object,
+    write_obstacles,
+)
 from vkc_pin.importing.objects.clean_up import (
     compute_bounds,
     load_surfaces,
@@ -31,10 +36,8 @@ from vkc_pin.options import Options
 from vkc_pin.planning.base_paths.reachable_floor import CellGrid, InscribedDiscs, find_blocked_cells
 from vkc_pin.utils.arguments import check_bool, check_instance, check_integer, check_number
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.resources import check_path, choose_file_names
 from vkc_pin.world.files.writing import write_atomically, write_folder_atomically
-from vkc_pin.world.files.xml import parse_xml
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.models.shapes import list_placed_shapes
 from vkc_pin.world.scene.obstacles import FLOOR
@@ -100,12 +103,15 @@ def import_home(
     most: int = 2,
     seed: int = 0,
     force: bool = False,
+    packages: Mapping[str, str | Path] | None = None,
+    arguments: Mapping[str, str] | None = None,
 ) -> ImportedHome:
-    """Import a URDF or MJCF file of a whole home as a scene.
+    """Import a URDF, xacro, MJCF or SDF file of a whole home as a scene.
 
     Fixed links become obstacles of convex pieces. A fixed link with joints becomes an articulated
-    object, for whose joints attachments are proposed. Floating links become free objects. The robot
-    starts at a free pose from which it reaches most objects.
+    object, for whose joints attachments are proposed. Floating links become free objects. The arena
+    covers the home and, on sides without walls, 2 m of floor around it. The robot starts at a free
+    pose from which it reaches most objects. Long imports log their progress to `vkc_pin.importing`.
 
     Args:
         file: The file; its z axis points up.
@@ -116,13 +122,15 @@ def import_home(
         most: Largest number of attachments of one joint.
         seed: Random seed of the search for a start pose.
         force: Whether to replace a folder that an earlier import wrote.
+        packages: Folders of packages by name; others are searched for around the file.
+        arguments: Arguments of a xacro file.
 
     Raises:
         InputError: The file cannot be read, does not describe a home, or has nothing movable; the
             folder holds other files; an argument is invalid; or the robot finds no start pose.
         UnknownNameError: The robot is unknown, or the file refers to an undefined name.
     """
-    path = check_path(file, "file", "a URDF or MJCF file")
+    path = check_path(file, "file", "a URDF, xacro, MJCF or SDF file")
     floor = check_number(floor, "floor", "a height [m]", low=-_LARGEST, high=_LARGEST)
     check_integer(most, "most", low=1, high=100)
     rng = np.random.default_rng(check_integer(seed, "seed", low=0))
@@ -132,16 +140,9 @@ def import_home(
         check_path(folder, "folder", "a folder") if folder is not None else Path(_choose_name(path))
     )
     check_target(target, _COMMAND, force=check_bool(force, "force"))
-    if parse_xml(read_text(path, "URDF or MJCF"), path).tag == "sdf":
-        raise InputError(
-            "homes are imported from URDF and MJCF only",
-            file=path,
-            expected="<robot> or <mujoco>",
-            got="<sdf>",
-        )
+    description = read_description(path, free=True, packages=packages, arguments=arguments)
     description = move_root(
-        rename_for_scenes(read_description(path, free=True)),
-        pin.SE3(np.eye(3), np.array([0.0, 0.0, -floor])),
+        rename_for_scenes(description), pin.SE3(np.eye(3), np.array([0.0, 0.0, -floor]))
     )
     low, high = compute_bounds(description, load_surfaces(description))
     home = split_home(description)
@@ -162,11 +163,15 @@ def import_home(
         names = [item.name for item in home.objects]
         taken = {FLOOR, *names}
         clearances = {"dist_safe": options.dist_safe, "grasp_clearance": options.grasp_clearance}
+        progress = ImportProgress(home)
         objects = tuple(
             write_object(item, hand, staging, cache, stem=stem, most=most, **clearances)
-            for item, stem in zip(home.objects, choose_file_names(names), strict=True)
+            for item, stem in zip(
+                progress.follow(home.objects), choose_file_names(names), strict=True
+            )
         )
-        obstacles, obstacle_notes = write_obstacles(home, path, staging, taken, cache)
+        obstacles, obstacle_notes = write_obstacles(home, path, staging, taken, cache, progress)
+        low, high = add_floor(home, low, high)
         document: dict[str, Any] = {
             "name": _choose_name(path),
             "robot": _resolve_robot(robot),

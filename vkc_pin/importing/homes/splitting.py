@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Collection
 from dataclasses import dataclass
 
@@ -17,11 +18,15 @@ from vkc_pin.importing.objects.clean_up import (
     move_root,
 )
 from vkc_pin.importing.objects.description import Description, Joint, Link
+from vkc_pin.utils.arrays import Floats
 
-__all__ = ["FLOOR_RISE", "Home", "HomeObject", "split_home"]
+__all__ = ["FLOOR_RISE", "Home", "HomeObject", "add_floor", "split_home"]
 
 FLOOR_RISE = 0.02
 """Height up to which shapes are part of the floor [m]: slabs, carpets and thresholds."""
+_FLOOR_BEYOND = 2.0  # [m] of floor on sides without walls: a robot's length, and an arm's
+_WALL_HEIGHT = 0.5  # [m] at which walls are found, below windows
+_WALL_DEPTH = 0.5  # [m] from the side of the home within which walls belong to the side
 _BUILDING = 3.5  # [m] length above which a link is part of the building, not furniture
 _MOVING = ("revolute", "continuous", "prismatic")
 
@@ -128,6 +133,38 @@ def split_home(description: Description) -> Home:
     return Home(
         tuple(building), tuple(furniture), tuple(floor), tuple(objects), shapes, tuple(notes)
     )
+
+
+def add_floor(home: Home, low: Floats, high: Floats) -> tuple[Floats, Floats]:
+    """Return a box around a home with 2 m of floor beyond the sides without walls.
+
+    A side has walls if those of the building cover at least half of its length.
+
+    Args:
+        home: The home.
+        low: Lower corner of its bounding box, shape (3,) [m].
+        high: Upper corner of its bounding box, shape (3,) [m].
+    """
+    from trimesh.intersections import mesh_plane
+
+    up, origin = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, _WALL_HEIGHT])
+    sections = [
+        np.asarray(mesh_plane(part.make_mesh(), up, origin)).reshape(-1, 2, 3)
+        for link in home.building
+        for part in link.solid
+    ]
+    lines = np.concatenate([np.zeros((0, 2, 3)), *sections])
+    beyond = np.zeros((2, 3))
+    for axis, side in itertools.product((0, 1), (0, 1)):
+        distance = np.abs(lines[:, :, axis] - (low, high)[side][axis]).max(axis=1)
+        along = np.sort(lines[distance < _WALL_DEPTH][:, :, 1 - axis], axis=1)
+        covered, reached = 0.0, -np.inf
+        for start, end in sorted(map(tuple, along)):
+            covered += max(0.0, end - max(start, reached))
+            reached = max(reached, end)
+        if covered < 0.5 * (high - low)[1 - axis]:
+            beyond[side, axis] = _FLOOR_BEYOND
+    return low - beyond[0], high + beyond[1]
 
 
 def _fix_immovable_joints(description: Description) -> Description:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import tempfile
+import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -31,8 +33,11 @@ from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.robot import Robot
 
-__all__ = ["ImportedHomeObject", "write_object", "write_obstacles"]
+__all__ = ["ImportProgress", "ImportedHomeObject", "write_object", "write_obstacles"]
 
+T = TypeVar("T")
+_LOGGER = logging.getLogger(__name__)
+_PATIENCE = 2.0  # [s] before the first and between all progress lines
 _LIFT = 0.2  # [m] by which a free object is lifted to test whether a hand can hold it
 
 
@@ -70,6 +75,31 @@ class ImportedHomeObject:
             )
             parts.append(f"carried {by}" if self.free else f"{joint} {by}")
         return f"{self.name}: {'; '.join(parts)}"
+
+
+class ImportProgress:
+    """Logs the number of the part at work, and the time left, every few seconds.
+
+    Args:
+        home: The home, whose parts are objects and obstacles.
+    """
+
+    def __init__(self, home: Home) -> None:
+        self.done = 0
+        self.total = len(home.objects) + sum(1 for _ in _iterate_obstacle_links(home))
+        self._began = self._shown = time.perf_counter()
+
+    def follow(self, parts: Iterable[T]) -> Iterator[T]:
+        """Yield parts, which have a `name`, and count them."""
+        for part in parts:
+            now = time.perf_counter()
+            if now - self._shown > _PATIENCE and self.done:
+                self._shown = now
+                left = (now - self._began) / self.done * (self.total - self.done)
+                about = f"part {self.done + 1} of {self.total}, about {left:.0f} s left"
+                _LOGGER.info("%s: %s", getattr(part, "name", ""), about)
+            yield part
+            self.done += 1
 
 
 def write_object(
@@ -148,7 +178,12 @@ _ALIKE = 1e-4
 
 
 def write_obstacles(
-    home: Home, source: Path, folder: Path, taken: set[str], cache: PieceCache
+    home: Home,
+    source: Path,
+    folder: Path,
+    taken: set[str],
+    cache: PieceCache,
+    progress: ImportProgress,
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Write the fixed parts of a home, and return the scene's obstacle entries and notes.
 
@@ -160,7 +195,7 @@ def write_obstacles(
     named = {choose_name(link.name, taken): link for link in _iterate_obstacle_links(home)}
     written = [name for name, link in named.items() if not _is_simple(link)]
     stems = dict(zip(written, choose_file_names(written), strict=True))
-    for name, link in named.items():
+    for name, link in zip(named, progress.follow(named.values()), strict=True):
         if name not in stems:
             entries.append(_make_simple_entry(name, link))
             continue

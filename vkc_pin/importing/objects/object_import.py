@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -35,9 +34,16 @@ from vkc_pin.importing.objects.writing import write_description, write_urdf
 from vkc_pin.importing.proposals.picture import plot_attachments
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
+from vkc_pin.importing.robots.sources import expand_xacro
 from vkc_pin.importing.targets import check_target, get_origin_marker
 from vkc_pin.options import Options
-from vkc_pin.utils.arguments import check_bool, check_coordinate, check_instance, check_integer
+from vkc_pin.utils.arguments import (
+    check_bool,
+    check_coordinate,
+    check_instance,
+    check_integer,
+    check_mapping,
+)
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.resources import check_path, choose_file_names
@@ -95,29 +101,44 @@ class ImportedObject:
         return "\n".join(lines)
 
 
-def read_description(file: str | Path, *, free: bool = False) -> Description:
-    """Read a URDF, MJCF or SDF file, whose first element tells its format.
+def read_description(
+    file: str | Path,
+    *,
+    free: bool = False,
+    packages: Mapping[str, str | Path] | None = None,
+    arguments: Mapping[str, str] | None = None,
+) -> Description:
+    """Read a URDF, xacro, MJCF or SDF file, whose first element tells its format.
 
     Args:
         file: The file.
-        free: Whether to keep free bodies, on floating joints (URDF and MJCF).
+        free: Whether to keep free bodies, on floating joints.
+        packages: Folders of packages by name; others are searched for around the file.
+        arguments: Arguments of a xacro file.
     """
-    path = check_path(file, "file", "a URDF, MJCF or SDF file")
-    root = parse_xml(read_text(path, "URDF, MJCF or SDF"), path).tag
-    readers: dict[str, Callable[[Path], Description]] = {
-        "robot": partial(read_object_urdf, free=free),
-        "mujoco": partial(read_object_mjcf, free=free),
-        "sdf": read_object_sdf,
+    path = check_path(file, "file", "a URDF, xacro, MJCF or SDF file")
+    folders = {
+        name: check_path(value, f"packages['{name}']", "a folder")
+        for name, value in check_mapping(packages or {}, "packages").items()
     }
-    if root not in readers:
-        expected = "a URDF (<robot>), MJCF (<mujoco>) or SDF (<sdf>) file"
-        raise InputError(
-            "the file does not describe an object", file=path, expected=expected, got=f"<{root}>"
-        )
-    return readers[root](path)
+    root = parse_xml(read_text(path, "URDF, xacro, MJCF or SDF"), path)
+    if root.tag == "robot":
+        is_xacro = "xmlns:xacro" in root.attrib or path.suffix == ".xacro"
+        text = expand_xacro(path, folders, arguments or {}) if is_xacro else None
+        return read_object_urdf(path, free=free, packages=folders, text=text)
+    if root.tag == "mujoco":
+        return read_object_mjcf(path, free=free)
+    if root.tag == "sdf":
+        return read_object_sdf(path, free=free, packages=folders)
+    raise InputError(
+        "the file does not describe an object",
+        file=path,
+        expected="a URDF or xacro (<robot>), MJCF (<mujoco>) or SDF (<sdf>) file",
+        got=f"<{root.tag}>",
+    )
 
 
-def import_object(
+def import_object(  # noqa: PLR0913 - keyword options of a public call
     file: str | Path,
     folder: str | Path | None = None,
     *,
@@ -129,8 +150,10 @@ def import_object(
     options: Options | None = None,
     most: int = 3,
     force: bool = False,
+    packages: Mapping[str, str | Path] | None = None,
+    arguments: Mapping[str, str] | None = None,
 ) -> ImportedObject:
-    """Import an object from a URDF, MJCF or SDF file.
+    """Import an object from a URDF, xacro, MJCF or SDF file.
 
     Its shapes become convex pieces and fixed links are merged. Links without shapes are dropped,
     and missing limits chosen. The origin is below the centre, at the height of the lowest point.
@@ -147,13 +170,15 @@ def import_object(
         options: Options with the clearances of attachments.
         most: Largest number of attachments of one joint.
         force: Whether to replace a folder that an earlier import wrote.
+        packages: Folders of packages by name; others are searched for around the file.
+        arguments: Arguments of a xacro file.
 
     Raises:
         InputError: The file cannot be read or does not describe an object, the folder holds other
             files, or an argument is invalid.
         UnknownNameError: The link or robot is unknown, or the file refers to an unknown name.
     """
-    path = check_path(file, "file", "a URDF, MJCF or SDF file")
+    path = check_path(file, "file", "a URDF, xacro, MJCF or SDF file")
     if up not in ("y", "z"):
         raise InputError(
             "`up` must be an axis of the file",
@@ -177,7 +202,7 @@ def import_object(
     name = _choose_name(path, link)
     target = Path(name) if folder is None else check_path(folder, "folder", "a folder")
     check_target(target, _COMMAND, force=check_bool(force, "force"))
-    description = read_description(path)
+    description = read_description(path, packages=packages, arguments=arguments)
     description = (
         extract_subtree(description, link)
         if link

@@ -298,7 +298,9 @@ class _Scope:
             ) from None
 
 
-def read_object_sdf(file: Path, *, free: bool = False) -> Description:
+def read_object_sdf(
+    file: Path, *, free: bool = False, packages: Mapping[str, Path] | None = None
+) -> Description:
     """Read the description of an object or a home from an SDF file.
 
     The root's frame is the world. Models that are neither static nor connected to the world stay in
@@ -308,16 +310,17 @@ def read_object_sdf(file: Path, *, free: bool = False) -> Description:
         file: The file, with one model or one world.
         free: Whether to keep free models, on floating joints; otherwise those beside others are
             left out.
+        packages: Folders of models by name; others are searched for around the file.
     """
     try:
-        return _Reader(file).read(free=free)
+        return _Reader(file, packages or {}).read(free=free)
     except RecursionError:
         raise InputError("models or frames are nested too deeply", file=file) from None
 
 
 class _Reader:
-    def __init__(self, file: Path) -> None:
-        self.file, self.notes, self.count = file, list[str](), 0
+    def __init__(self, file: Path, packages: Mapping[str, Path]) -> None:
+        self.file, self.packages, self.notes, self.count = file, packages, list[str](), 0
         root, rules = self._load(file)
         worlds, models = root.findall("world"), root.findall("model")
         if len(worlds) + len(models) != 1:
@@ -339,6 +342,13 @@ class _Reader:
         if root.tag != "sdf":
             expected = "an element <sdf>"
             raise InputError("this is no SDF", file=file, expected=expected, got=f"<{root.tag}>")
+        if (
+            raw := next((item for item in root.iter() if item.tag.startswith("xacro:")), None)
+        ) is not None:
+            expected, got = "a plain SDF: xacro FILE > model.sdf", f"<{raw.tag}>"
+            raise make_element_error(
+                file, raw, "xacro has not been run", expected=expected, got=got
+            )
         text = root.get("version")
         match = re.fullmatch(
             r"\s*1\.(\d{1,3})(\.\d+)*\s*", f"1.{_RULES[-1].since}" if text is None else text
@@ -413,7 +423,7 @@ class _Reader:
     def _include(
         self, scope: _Scope, include: ElementTree.Element, files: tuple[Path, ...]
     ) -> None:
-        file = _find_model(scope.file, include)
+        file = _find_model(scope.file, include, self.packages)
         if file.resolve() in files:
             got = " → ".join(item.name for item in (*files, file))
             raise make_element_error(scope.file, include, "a file includes itself", got=got)
@@ -720,7 +730,7 @@ class _Reader:
         """Return kind, size, file and triangles of a shape."""
         if shape.tag == "mesh":
             uri = (shape.findtext("uri") or "").strip()
-            file = find_mesh_file(uri, scope.file, line=find_line(shape))
+            file = find_mesh_file(uri, scope.file, self.packages, line=find_line(shape))
             size = scope.read_numbers(shape, "scale", 3, "1 1 1", name)
             part = shape.find("submesh")
             if part is None:
@@ -780,10 +790,10 @@ def _is_true(text: str) -> bool:
     return text.strip().lower() in ("1", "true")
 
 
-def _find_model(file: Path, include: ElementTree.Element) -> Path:
+def _find_model(file: Path, include: ElementTree.Element, packages: Mapping[str, Path]) -> Path:
     """Return the SDF file that an <include> names, in a model's folder as its model.config says."""
     uri = (include.findtext("uri") or "").strip()
-    candidates = list_address_candidates(uri, file) if uri else []
+    candidates = list_address_candidates(uri, file, packages) if uri else []
     for candidate in candidates:
         if candidate.is_file():
             return candidate

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -33,14 +34,22 @@ __all__ = ["read_object_urdf"]
 _KINDS = ("fixed", "revolute", "continuous", "prismatic")
 
 
-def read_object_urdf(file: Path, *, free: bool = False) -> Description:
+def read_object_urdf(
+    file: Path,
+    *,
+    free: bool = False,
+    packages: Mapping[str, Path] | None = None,
+    text: str | None = None,
+) -> Description:
     """Read the description of an object or a home from a URDF.
 
     Args:
         file: The file.
         free: Whether joints may be floating; otherwise floating joints count as fixed.
+        packages: Folders of packages by name; others are searched for around the file.
+        text: Contents, if they are not to be read from `file`.
     """
-    _, root = read_xml(file, "URDF")
+    _, root = read_xml(file, "URDF", text)
     notes = list[str]()
     stated = {
         joint.get("name", ""): _read_limits(file, joint, notes) for joint in root.findall("joint")
@@ -57,7 +66,7 @@ def read_object_urdf(file: Path, *, free: bool = False) -> Description:
             )
             joint.remove(mimic)
     check_tree(file, root)
-    urdf = UrdfFile(file.resolve(), "", root)
+    urdf = UrdfFile(file.resolve(), "", root, packages or {})
     notes += replace_missing_meshes(urdf, every_link=True)
     names = _find_shape_names(root)
     parts: dict[str, dict[str, list[Part]]] = {

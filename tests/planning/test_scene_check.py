@@ -113,6 +113,38 @@ def test_overlaps_and_close_pairs_are_reported(tmp_path: Path) -> None:
         found.plot(tmp_path / "scene.txt")
 
 
+@pytest.mark.parametrize(
+    ("arena", "boxes", "area"),
+    [
+        (None, {}, None),
+        ({"x": [-1.2, -0.4], "y": [0.1, 0.9]}, {}, "0.6"),
+        (
+            None,
+            {
+                f"wall_{k}": (size, (-0.8 + x, 0.5 + y, 0.5))
+                for k, (size, x, y) in enumerate(
+                    [((0.1, 2.2, 1.0), s, 0.0) for s in (-0.8, 0.8)]
+                    + [((2.2, 0.1, 1.0), 0.0, s) for s in (-0.8, 0.8)]
+                )
+            },
+            "0.6",
+        ),
+    ],
+    ids=["scene", "small arena", "cell"],
+)
+def test_little_floor_is_reported(
+    arena: dict[str, list[float]] | None,
+    boxes: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]],
+    area: str | None,
+) -> None:
+    scene = add_boxes(load_drawer_scene(), **boxes)
+    if arena is not None:
+        scene = replace_drawer_fields(scene, arena=arena, start_region=arena)
+    found = check_scene(scene)
+    assert len(found.warnings) == (area is not None)
+    assert area is None or f"the base reaches at most {area} m² of floor" in str(found)
+
+
 def test_invalid_arguments() -> None:
     with pytest.raises(InputError, match="scene"):
         check_scene("drawer")  # type: ignore[arg-type]

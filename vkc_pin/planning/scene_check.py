@@ -11,6 +11,7 @@ import numpy as np
 
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
+from vkc_pin.planning.base_paths.reachable_floor import CELL, find_free_floor
 from vkc_pin.planning.diagnosis.diagnosis import diagnose_goals, find_impossible_conditions
 from vkc_pin.planning.initialization.keyframes import sample_goal_configurations
 from vkc_pin.planning.nlp.merit import TOLERANCE
@@ -30,6 +31,7 @@ from vkc_pin.world.task.steps import Grasp, Reach
 
 __all__ = ["ReachableAttachment", "SceneCheck", "check_scene"]
 
+_LITTLE_FLOOR = 1.0  # [m²] for the base's origin; less than 1 m² keeps most bases from turning
 _FAR = 0.25  # largest reported clearance [m]
 
 
@@ -78,6 +80,7 @@ class SceneCheck:
         allowed: Pairs that are exempt from clearance.
         attachments: Attachments of all objects that are not grasped.
         problems: Reasons why nothing can be planned.
+        warnings: Reasons why planning may fail.
     """
 
     scene: Scene
@@ -87,6 +90,7 @@ class SceneCheck:
     allowed: tuple[ClearanceExemption, ...]
     attachments: tuple[ReachableAttachment, ...]
     problems: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -106,6 +110,7 @@ class SceneCheck:
         closer = f"closer than {1e3 * self.dist_safe:g} mm to"
         for title, entries in (
             ("nothing can be planned, because", self.problems),
+            ("planning may fail, because", self.warnings),
             (f"the robot is {closer}", self.robot),
             (f"{closer} each other", near),
             ("one in the other", overlapping),
@@ -192,7 +197,27 @@ def check_scene(scene: Scene, *, options: Options | None = None, seed: int = 0) 
         problems=tuple(
             f"{one.subject}: {one.detail}" for one in find_impossible_conditions(problem)
         ),
+        warnings=tuple(_check_floor(scene)),
     )
+
+
+def _check_floor(scene: Scene) -> Iterator[str]:
+    """Yield a warning if the base has so little floor that it can hardly turn."""
+    from scipy import ndimage
+
+    if scene.robot.base == "fixed":
+        return
+    cells, free = find_free_floor(scene)
+    regions, _ = ndimage.label(free)
+    start = regions[cells.at(scene.start[:2])]
+    area = float((regions == start).sum()) * CELL**2 if start else 0.0
+    x_low, x_high, y_low, y_high = scene.arena
+    if area < _LITTLE_FLOOR:
+        yield (
+            f"the base reaches at most {area:.1f} m² of floor in the arena of "
+            f"{x_high - x_low:.1f} × {y_high - y_low:.1f} m: make the arena larger, "
+            "or move the start"
+        )
 
 
 def _check_attachments(

@@ -33,15 +33,13 @@ from vkc_pin.importing.objects.object_import import read_description
 from vkc_pin.importing.objects.pieces import PieceCache
 from vkc_pin.importing.targets import check_target, format_comment, get_origin_marker
 from vkc_pin.options import Options
-from vkc_pin.planning.base_paths.reachable_floor import CellGrid, InscribedDiscs, find_blocked_cells
+from vkc_pin.planning.base_paths.reachable_floor import CELL, find_free_floor
 from vkc_pin.utils.arguments import check_bool, check_instance, check_integer, check_number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.resources import check_path, choose_file_names
 from vkc_pin.world.files.writing import write_atomically, write_folder_atomically
 from vkc_pin.world.models.robot_file import load_robot
-from vkc_pin.world.models.shapes import list_placed_shapes
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 
 __all__ = ["ImportedHome", "find_free_start", "import_home"]
@@ -243,8 +241,6 @@ def _count_shapes(home: Home) -> dict[str, int]:
     return {**shapes, "floor": len(home.floor)}
 
 
-_BASE = 1  # joint number of a robot's base
-_CELL = 0.1  # [m] edge of a grid cell
 _STANDOFF = 0.9  # [m] typical distance of a robot's base from a handle that it grasps
 _RADIUS = 0.5  # [m] around this position within which free floor counts as reaching the handle
 _TRIES = 4000  # sampled poses
@@ -263,19 +259,7 @@ def find_free_start(
 
     robot, arena = scene.robot, scene.arena
     low, high = np.array([arena[0], arena[2]]), np.array([arena[1], arena[3]])
-    base = [shape for shape in robot.collision.geometryObjects if shape.parentJoint == _BASE]
-    standing = [
-        shape
-        for shape, label in zip(scene.obstacles, scene.obstacle_labels, strict=True)
-        if label != FLOOR
-    ]
-    for placed in scene.objects.values():
-        standing += make_world_shapes(placed)
-    cells = CellGrid.over(low, high, _CELL)
-    free = np.ones(cells.shape, bool)
-    for wall in InscribedDiscs(list_placed_shapes(base)).make_walls(list_placed_shapes(standing)):
-        window, own = find_blocked_cells(cells, wall, 0.0)
-        free[window] &= ~own
+    cells, free = find_free_floor(scene)
     regions, count = ndimage.label(free)
     middles = np.stack(np.broadcast_arrays(*cells.centers()), axis=-1)
     reached = np.zeros(count + 1, int)
@@ -312,7 +296,7 @@ def _sample_pose(
     places: Floats, rng: np.random.Generator, low: Floats, high: Floats
 ) -> list[float]:
     """Return a random position in one of some cells, and a random heading."""
-    place = places[int(rng.integers(len(places)))] + rng.uniform(-0.5, 0.5, 2) * _CELL
+    place = places[int(rng.integers(len(places)))] + rng.uniform(-0.5, 0.5, 2) * CELL
     return [
         *np.clip(place, low, high).round(3).tolist(),
         round(float(rng.uniform(-np.pi, np.pi)), 3),

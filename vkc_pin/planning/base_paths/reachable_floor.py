@@ -14,8 +14,24 @@ import numpy as np
 from vkc_pin.planning.base_paths.base_clearance import Shape
 from vkc_pin.planning.base_paths.blocked_cells import Solid, make_solids, slice_solid
 from vkc_pin.utils.arrays import Bools, Floats
+from vkc_pin.world.models.shapes import list_placed_shapes
+from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.scene.scene import Scene
 
-__all__ = ["CellGrid", "InscribedDiscs", "Wall", "find_blocked_cells", "flood_fill"]
+__all__ = [
+    "CELL",
+    "CellGrid",
+    "InscribedDiscs",
+    "Wall",
+    "find_blocked_cells",
+    "find_free_floor",
+    "flood_fill",
+]
+
+CELL = 0.1
+"""Size of the cells of `find_free_floor` [m]."""
+_BASE = 1  # joint number of a robot's base
 
 _HEIGHT_SAMPLES = 9  # heights of the base at which discs are inscribed
 _SLACK = 5e-3  # [m] by which discs are reduced: more than the overlap that validation accepts
@@ -203,6 +219,28 @@ def find_blocked_cells(
     )
     x, y = cells.centers()
     return (rows, columns), _compute_signed_distance(outline, x[rows], y[:, columns]) < reach
+
+
+def find_free_floor(scene: Scene) -> tuple[CellGrid, Bools]:
+    """Return the cells of the arena, and which of them the base's origin may be in.
+
+    The base is reduced to discs inside it, and all objects stay as they are in the scene.
+    """
+    arena = scene.arena
+    base = [shape for shape in scene.robot.collision.geometryObjects if shape.parentJoint == _BASE]
+    standing = [
+        shape
+        for shape, label in zip(scene.obstacles, scene.obstacle_labels, strict=True)
+        if label != FLOOR
+    ]
+    for placed in scene.objects.values():
+        standing += make_world_shapes(placed)
+    cells = CellGrid.over(np.array([arena[0], arena[2]]), np.array([arena[1], arena[3]]), CELL)
+    free = np.ones(cells.shape, bool)
+    for wall in InscribedDiscs(list_placed_shapes(base)).make_walls(list_placed_shapes(standing)):
+        window, own = find_blocked_cells(cells, wall, 0.0)
+        free[window] &= ~own
+    return cells, free
 
 
 def _compute_signed_distance(outline: Floats, x: Floats, y: Floats) -> Floats:

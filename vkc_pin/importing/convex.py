@@ -18,10 +18,10 @@ import coal
 import numpy as np
 
 from vkc_pin.errors import InputError
+from vkc_pin.importing.parsers import cut_mesh
 from vkc_pin.utils.arguments import check_coordinate, check_integer, check_number
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.disk_cache import load_or_build
-from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.files.hulls import compute_hull, compute_outer_hull
 from vkc_pin.world.files.meshes import MeshPart, load_mesh, make_bvh, simplify_mesh
 from vkc_pin.world.files.resources import check_path
@@ -233,13 +233,10 @@ def _cut_mesh(
             thicken(part)
             for part in slice_mesh(trimesh.Trimesh(coarse.vertices, coarse.faces), max_parts)
         ]
-    coacd = import_optional(
-        "coacd", "import", purpose="cutting a concave mesh into convex pieces", file=file
-    )
-    coacd.set_log_level("off")
-    loaded = coacd.Mesh(merged.vertices, merged.faces)
-    parts = coacd.run_coacd(
-        loaded,
+    parts = cut_mesh(
+        np.asarray(merged.vertices),
+        np.asarray(merged.faces),
+        file,
         threshold=error,
         real_metric=True,
         max_convex_hull=max_parts,
@@ -247,7 +244,7 @@ def _cut_mesh(
         preprocess_mode="off",
         **_SEARCH,
     )
-    return [corners for vertices, _ in parts if not is_flat(corners := np.asarray(vertices))]
+    return [corners for part in parts if not is_flat(corners := np.asarray(part))]
 
 
 def _merge_vertices(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from vkc_pin.errors import InputError
+from vkc_pin.utils.isolation import submit_isolated
 from vkc_pin.utils.optional_imports import import_optional
 
 __all__ = ["NO_MASS", "compile_mjcf"]
@@ -25,13 +26,24 @@ def compile_mjcf(file: Path) -> tuple[Any, list[str]]:
     read, masses may be missing, and visual meshes replace missing collision meshes of their body.
 
     Raises:
-        InputError: MuJoCo cannot read the file, or meshes are missing that nothing can replace.
+        InputError: MuJoCo is not installed, cannot read the file, or exceeds a limit; or meshes are
+            missing that nothing can replace.
     """
-    mujoco = import_optional("mujoco", "import", purpose="an MJCF file", file=file)
+    # The child process imports MuJoCo while this one does.
+    fetch = submit_isolated(_compile, file.resolve(), file, program="MuJoCo", file=file)
+    import_optional("mujoco", "import", purpose="an MJCF file", file=file)
+    return fetch()
+
+
+def _compile(path: Path, file: Path) -> tuple[Any, list[str]]:
+    """Return model and notes of the file at an absolute `path`; messages name `file`."""
+    import mujoco
+
+    mujoco.set_mju_user_warning(lambda text: None)  # it would write MUJOCO_LOG.TXT
     first = None
     for repairs in (), (_replace_missing_meshes,), (_replace_missing_meshes, _remove_dynamics):
         try:
-            spec = mujoco.MjSpec.from_file(str(file.resolve()))
+            spec = mujoco.MjSpec.from_file(str(path))
             notes = _remove_looks(spec, file)
             for repair in repairs:
                 notes += repair(spec, file)
@@ -42,6 +54,8 @@ def compile_mjcf(file: Path) -> tuple[Any, list[str]]:
         except InputError:
             raise
         except (ValueError, RuntimeError) as error:
+            if "allocate memory" in str(error):
+                raise MemoryError from error
             first = first or error
             continue
         if _remove_dynamics in repairs:

@@ -7,7 +7,8 @@ import pytest
 from helpers.arm_urdf import write_arms
 
 import vkc_pin as vkc
-from vkc_pin.importing.robots.sources import Source, expand_xacro, read_source
+from vkc_pin.importing.parsers import expand_xacro
+from vkc_pin.importing.robots.sources import Source, read_source
 from vkc_pin.world.files import resources
 from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.world.files.xml import parse_xml

@@ -253,7 +253,7 @@ def test_hanging_compiler_is_killed(
         ),
     )
     monkeypatch.setattr(machine_code, "_COMPILER_TIMEOUT", 1.0)
-    monkeypatch.setattr(machine_code, "_has_python", lambda: False)
+    monkeypatch.setattr(machine_code, "has_python", lambda: False)
     assert not MachineCode(make()).try_load()
     assert not wait()
     compile_here(folder)
@@ -314,7 +314,7 @@ def test_plans_are_equal_bit_for_bit(
     planner = vkc.Planner()
     assert plan_door(planner) == expected
     assert wait()
-    monkeypatch.setattr(machine_code, "_has_python", lambda: False)
+    monkeypatch.setattr(machine_code, "has_python", lambda: False)
     assert list(folder.path.glob("*.failed")) == []
     loaded: list[Any] = []
     external = ca.external

@@ -27,8 +27,8 @@ def read_object_mjcf(file: Path, *, free: bool = False) -> Description:
         file: The file.
         free: Whether to keep free bodies, on floating joints; otherwise they are left out.
     """
-    mujoco = import_optional("mujoco", "import", purpose="reading MJCF", file=file)
     model, notes = compile_mjcf(file)
+    mujoco = import_optional("mujoco", "import", purpose="reading MJCF", file=file)
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
     mujoco.mj_kinematics(model, data)

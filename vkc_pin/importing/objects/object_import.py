@@ -34,7 +34,7 @@ from vkc_pin.importing.objects.writing import write_description, write_urdf
 from vkc_pin.importing.proposals.picture import plot_attachments
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
-from vkc_pin.importing.robots.sources import expand_xacro
+from vkc_pin.importing.parsers import expand_xacro
 from vkc_pin.importing.targets import check_target, get_origin_marker
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import (

@@ -53,8 +53,8 @@ def convert_mjcf(file: Path, folder: Path) -> ConvertedRobot:
     URDF cannot express: ball joints and free joints below the root are locked, planes left out.
     Other trees are left out.
     """
-    mujoco = import_optional("mujoco", "import", purpose="an MJCF file", file=file)
     model, notes = compile_mjcf(file)
+    mujoco = import_optional("mujoco", "import", purpose="an MJCF file", file=file)
     return _Converter(mujoco, model, file, folder, notes).convert()
 
 

@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
-import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing.missing_meshes import replace_missing_meshes
+from vkc_pin.importing.parsers import expand_xacro
 from vkc_pin.importing.robots.mjcf import convert_mjcf
-from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.kinematic_tree import check_tree
-from vkc_pin.world.files.resources import find_package
 from vkc_pin.world.files.srdf import Srdf, read_groups, read_srdf
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.files.xml import parse_xml
 
-__all__ = ["Source", "choose_free_name", "expand_xacro", "read_source"]
+__all__ = ["Source", "choose_free_name", "read_source"]
 
-_FIND = re.compile(r"\$\(find\s+([^\s()$]+)\s*\)")  # NAME in $(find NAME)
 # Elements of a URDF; others belong to simulators and controllers.
 _KEPT = ("link", "joint", "material")
 
@@ -145,60 +138,3 @@ def _find_srdf(file: Path) -> Path | None:
         for folder in (file.parent, file.parent.parent / "srdf")
     ]
     return next((place for place in places if place.is_file()), None)
-
-
-def expand_xacro(file: Path, packages: Mapping[str, Path], arguments: Mapping[str, str]) -> str:
-    """Return the URDF of a xacro file."""
-    xacro = import_optional("xacro", "import", purpose="a xacro file", file=file)
-    substitution = import_optional(
-        "xacro.substitution_args", "import", purpose="a xacro file", file=file
-    )
-    messages, known = io.StringIO(), len(xacro.all_includes)
-    try:
-        with _search_packages(substitution, file, packages), contextlib.redirect_stderr(messages):
-            document = xacro.process_file(str(file), mappings=dict(arguments))
-    except (Exception, SystemExit) as error:  # macros, expressions and XML raise any type
-        _check_packages([file, *map(Path, xacro.all_includes[known:])], file, packages)
-        problem = " ".join((str(error) or messages.getvalue()).split())
-        problem = problem.partition(" [Errno")[0]  # repeats the sentence before
-        raise InputError(f"xacro cannot process the file: {problem}", file=file) from error
-    return str(document.toprettyxml(indent="  "))
-
-
-@contextlib.contextmanager
-def _search_packages(
-    substitution: ModuleType, file: Path, packages: Mapping[str, Path]
-) -> Iterator[None]:
-    """Let `$(find NAME)` search around `file`; xacro itself would ask ROS."""
-
-    def find(name: str) -> str:
-        place = find_package(name, file, packages)
-        if place is None:
-            raise LookupError(f"package '{name}' was not found")
-        return str(place)
-
-    module: Any = substitution
-    original = module._eval_find
-    module._eval_find = find
-    try:
-        yield
-    finally:
-        module._eval_find = original
-
-
-def _check_packages(files: Iterable[Path], file: Path, packages: Mapping[str, Path]) -> None:
-    """Raise an error that lists all packages in `$(find NAME)` of some files that are missing."""
-    names = dict.fromkeys(
-        name
-        for each in files
-        if each.is_file()
-        for name in _FIND.findall(each.read_text(encoding="utf-8", errors="replace"))
-    )
-    if missing := [name for name in names if find_package(name, file, packages) is None]:
-        raise InputError(
-            f"packages were not found: {', '.join(missing)}",
-            file=file,
-            field="$(find ...)",
-            expected="folders around the file with these names, or with a package.xml that states "
-            "them; or state their folders (packages, --package NAME=FOLDER)",
-        )

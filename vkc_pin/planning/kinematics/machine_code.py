@@ -25,6 +25,7 @@ import casadi as ca
 import numpy as np
 
 from vkc_pin.planning.kinematics.libraries import BUILD, Libraries
+from vkc_pin.utils.isolation import has_python
 
 __all__ = ["MachineCode", "compile_jobs", "wait"]
 
@@ -119,7 +120,7 @@ def wait(timeout: float = 600.0) -> bool:
             has_died = process is not None and process.wait(max(remaining, 0.0))
             if has_died and not any(map(folder.has_failed, jobs)):
                 return False  # it cannot start; if one library kills it, the next one continues
-            if remaining < 0.0 or not _has_python():
+            if remaining < 0.0 or not has_python():
                 return False
             time.sleep(0.02)  # another process may be compiling
         return True
@@ -235,7 +236,7 @@ def _start_worker_if_idle(folder: Libraries) -> subprocess.Popen[bytes] | None:
 
     It outlives this process, and ends when no job is left.
     """
-    if not _has_python() or (lock := folder.lock()) is None:
+    if not has_python() or (lock := folder.lock()) is None:
         return None
     try:  # the process inherits the lock
         nice = _NICE_COMMAND if shutil.which(_NICE_COMMAND[0]) else ()
@@ -246,11 +247,6 @@ def _start_worker_if_idle(folder: Libraries) -> subprocess.Popen[bytes] | None:
         os.close(lock)
     threading.Thread(target=process.wait, daemon=True).start()  # reaps the process
     return process
-
-
-def _has_python() -> bool:
-    """Return whether the executable is Python and not a program that embeds it."""
-    return "python" in Path(sys.executable or "").name.lower()
 
 
 def _start_process(command: list[str], folder: Path, *handles: int) -> subprocess.Popen[bytes]:

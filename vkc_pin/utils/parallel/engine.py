@@ -23,7 +23,15 @@ from vkc_pin.errors import InputError, VkcError, format_value
 from vkc_pin.utils.interrupt import handle_interrupt
 from vkc_pin.utils.optional_imports import import_optional
 
-__all__ = ["MAX_CRASHES", "CrashedTask", "is_dask_installed", "require_dask", "run_tasks"]
+__all__ = [
+    "MAX_CRASHES",
+    "CrashedTask",
+    "exit_with_parent",
+    "is_dask_installed",
+    "require_dask",
+    "run_tasks",
+    "run_with_time_limit",
+]
 
 MAX_CRASHES = 4
 """Number of processes that a task may crash on a cluster before it is given up."""
@@ -192,7 +200,7 @@ class _ClusterRun:
     def _submit(self, key: str, task: Any) -> None:
         name = f"vkc-{key}-{secrets.token_hex(4)}"  # clients share results of the same name
         future = self.client.submit(
-            _run_with_time_limit, self.function, task, self.limit, key=name, pure=False
+            run_with_time_limit, self.function, task, self.limit, key=name, pure=False
         )
         self.running[name] = key, task, future
         future.add_done_callback(self.ended.put)
@@ -274,7 +282,8 @@ def _compute_memory_limit(jobs: int) -> int:
     return max(int(MEMORY_LIMIT) // jobs, _MIN_MEMORY)
 
 
-def _run_with_time_limit(function: Function, task: Any, limit: float | None) -> Any:
+def run_with_time_limit(function: Function, task: Any, limit: float | None) -> Any:
+    """Return the result of a task; after `limit` [s], SIGALRM ends this process."""
     # nothing handles the signal, which kills the process even in compiled code
     signal.setitimer(signal.ITIMER_REAL, limit or 0.0)
     try:
@@ -287,12 +296,12 @@ def _run_in_child_process(
     function: Function, key: str, task: Any, limit: float | None, parent: int
 ) -> tuple[str, Any]:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
-    _exit_with_parent(parent)
-    return key, _run_with_time_limit(function, task, limit)
+    exit_with_parent(parent)
+    return key, run_with_time_limit(function, task, limit)
 
 
 @cache
-def _exit_with_parent(parent: int) -> None:
+def exit_with_parent(parent: int) -> None:
     """Exit soon after the parent process was killed."""
 
     def watch() -> None:

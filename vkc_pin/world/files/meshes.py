@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.arrays import MAX_COORDINATE, Floats, Ints
+from vkc_pin.utils.isolation import run_isolated
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.hulls import SHEET_THICKNESS, compute_hull, compute_outer_hull, thicken
 from vkc_pin.world.files.resources import check_path
@@ -135,8 +136,11 @@ def _read_collada(file: Path, submesh: str | None) -> trimesh.Trimesh:
     import trimesh
 
     if submesh is None:
-        shape = coal.MeshLoader().load(str(file), np.ones(3))
-        return trimesh.Trimesh(np.array(shape.vertices()), get_triangles(shape))
+        # It is compiled code, which invalid files crash.
+        vertices, faces = run_isolated(
+            _parse_collada, file.absolute(), program="the COLLADA reader", file=file
+        )
+        return trimesh.Trimesh(vertices, faces)
     root = parse_xml(read_text(file, "COLLADA"), file)
     labels = {
         f"#{geometry.get('id')}": {geometry.get("id", ""), geometry.get("name", "")}
@@ -159,6 +163,11 @@ def _read_collada(file: Path, submesh: str | None) -> trimesh.Trimesh:
         return _read_collada(copy, None)
 
 
+def _parse_collada(file: Path) -> tuple[Floats, Ints]:
+    shape = coal.MeshLoader().load(str(file), np.ones(3))
+    return np.array(shape.vertices()), get_triangles(shape)
+
+
 def _extract_submesh(scene: trimesh.Scene, file: Path, submesh: str) -> trimesh.Scene:
     """Return the part of a scene whose node or geometry has a name."""
     import trimesh
@@ -176,11 +185,10 @@ def _extract_submesh(scene: trimesh.Scene, file: Path, submesh: str) -> trimesh.
 
 def _open_mesh(file: Path, submesh: str | None = None) -> tuple[Path | io.BytesIO, dict[str, Any]]:
     """Return what trimesh reads a mesh from, changed where it would misread it, and settings."""
-    import trimesh
-
+    settings: dict[str, Any] = {"resolver": _make_resolver(file)}
     kind = file.suffix.lower()[1:]
     if kind not in ("obj", "gltf"):
-        return file, {}
+        return file, settings
     data = file.read_bytes()
     is_usual = (
         submesh is None
@@ -194,9 +202,25 @@ def _open_mesh(file: Path, submesh: str | None = None) -> tuple[Path | io.BytesI
     elif data.startswith(_MARK):
         data = data.removeprefix(_MARK)
     else:
-        return file, {}
-    settings = {"file_type": kind, "resolver": trimesh.resolvers.FilePathResolver(file)}
-    return io.BytesIO(data), settings
+        return file, settings
+    return io.BytesIO(data), {**settings, "file_type": kind}
+
+
+def _make_resolver(file: Path) -> Any:
+    """Return trimesh's reader of materials and buffers that a mesh names, without pipes."""
+    import trimesh
+
+    resolver: Any = trimesh.resolvers.FilePathResolver(str(file))
+    read = resolver.get
+
+    def get(name: str) -> bytes:
+        for place in (file.parent / name.strip(), file.parent / Path(name).name):
+            if place.exists() and not place.is_file():
+                raise FileNotFoundError(f"{place} is not a regular file")  # it may be endless
+        return bytes(read(name))
+
+    resolver.get = get
+    return resolver
 
 
 def _normalize_obj(data: bytes, file: Path, submesh: str | None) -> bytes:
@@ -347,17 +371,19 @@ def load_parts(
         scene = trimesh.load_scene(
             source, process=False, group_material=True, split_object=False, **settings
         )
+        parts = [
+            MeshPart(
+                np.asarray(mesh.vertices) * factors, np.asarray(mesh.faces), _find_colour(mesh)
+            )
+            for mesh in scene.geometry.values()
+            if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)
+        ]
     except InputError:
         raise
     except Exception as error:
         raise InputError(
             f"cannot read the mesh: {error}", file=file, expected="an OBJ file"
         ) from error
-    parts = [
-        MeshPart(np.asarray(mesh.vertices) * factors, np.asarray(mesh.faces), _find_colour(mesh))
-        for mesh in scene.geometry.values()
-        if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)
-    ]
     if not parts:
         raise InputError("the mesh is empty", file=file, expected="at least one triangle")
     return [simplify_mesh(part, detail) for part in parts]

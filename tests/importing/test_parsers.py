@@ -1,0 +1,129 @@
+"""Hostile xacro, MJCF and mesh files end in an error that names the file and the reason."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vkc_pin.errors import InputError
+from vkc_pin.importing import import_home, import_object, import_robot
+from vkc_pin.utils.isolation import TIME_VARIABLE
+from vkc_pin.world.files.meshes import load_mesh, load_parts
+
+XACRO = '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">{}<link name="a"/></robot>'
+BOMB = "".join(
+    f'<xacro:macro name="m{k}">{f"<xacro:m{k + 1}/>" * 10}</xacro:macro>' for k in range(9)
+)
+HOSTILE_XACRO = {
+    "pipe": ('<xacro:include filename="pipe"/>', "in time"),
+    "power": ('<xacro:property name="p" value="${10**10**8}"/><link name="${p}"/>', "in time"),
+    "bomb": (f'{BOMB}<xacro:macro name="m9"><link/></xacro:macro><xacro:m0/>', "in time"),
+    "list": ('<link name="${list(range(10**10))}"/>', "too much memory"),
+    "circle": ('<xacro:include filename="robot.xacro"/>', "recursion"),
+    "macro": ('<xacro:macro name="m"><xacro:m/></xacro:macro><xacro:m/>', "recursion"),
+    "folder": ('<xacro:include filename="."/>', "directory"),
+}
+MJCF = '<mujoco>{}<worldbody><body name="b"><joint/><geom size="1"/>{}</body></worldbody></mujoco>'
+GRID = '<flexcomp name="f" type="grid" count="900 900 900" spacing=".1 .1 .1" dim="3"/>'
+COPIES = '<replicate count="1000" offset="1 0 0">'
+HEIGHTS = '<hfield name="h" nrow="60000" ncol="60000" size="1 1 1 1"/>'
+ATTACH = '<attach model="m" body="b" prefix="p"/>'
+HOSTILE_MJCF = {
+    "pipe": ('<include file="pipe"/>', "", "in time"),
+    "keys": ('<size nkey="1000000000"/>', "", "in time"),
+    "copies": ("", f'{COPIES * 3}<geom size="1"/>{"</replicate>" * 3}', "in time"),
+    "grid": ("", GRID, "in time"),
+    "itself": ('<asset><model name="m" file="a.xml"/></asset>', ATTACH, "crashes"),
+    "heights": (f"<asset>{HEIGHTS}</asset>", "", "cannot read"),
+    "include": ('<include file="a.xml"/>', "", "cannot read"),
+}
+IMPORTS = [import_object, import_robot, import_home]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the current folder, in which there is a pipe that nobody writes to."""
+    os.mkfifo(tmp_path / "pipe")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(TIME_VARIABLE, "1.5")
+    return tmp_path
+
+
+@pytest.mark.parametrize("kind", HOSTILE_XACRO)
+def test_hostile_xacro_is_refused(folder: Path, kind: str) -> None:
+    pytest.importorskip("xacro")
+    text, reason = HOSTILE_XACRO[kind]
+    (folder / "robot.xacro").write_text(XACRO.format(text), encoding="utf-8")
+    with pytest.raises(InputError, match=rf"(?s)^robot.xacro: xacro .*{reason}"):
+        import_robot("robot.xacro", "out")
+    assert sorted(file.name for file in folder.iterdir()) == ["pipe", "robot.xacro"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "does"),
+    [*((kind, import_object) for kind in HOSTILE_MJCF), *(("itself", one) for one in IMPORTS[1:])],
+)
+def test_hostile_mjcf_is_refused(folder: Path, kind: str, does: Callable[..., Any]) -> None:
+    pytest.importorskip("mujoco")
+    before, inside, reason = HOSTILE_MJCF[kind]
+    (folder / "a.xml").write_text(MJCF.format(before, inside), encoding="utf-8")
+    with pytest.raises(InputError, match=rf"^a.xml: MuJoCo .*{reason}"):
+        does("a.xml", "out")
+    assert sorted(file.name for file in folder.iterdir()) == ["a.xml", "pipe"]
+
+
+def test_materials_and_textures_that_are_pipes_are_ignored(folder: Path) -> None:
+    triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl m\nf 1/1 2/1 3/1\n"
+    (folder / "a.obj").write_text(f"mtllib pipe\n{triangle}", encoding="utf-8")
+    (folder / "b.obj").write_text(f"mtllib b.mtl\n{triangle}", encoding="utf-8")
+    (folder / "b.mtl").write_text("newmtl m\nmap_Kd pipe\n", encoding="utf-8")
+    for name in ("a.obj", "b.obj"):
+        assert len(load_parts(folder / name)) == len(load_mesh(folder / name).faces) == 1
+    (folder / "c.gltf").write_text(
+        '{"asset": {"version": "2.0"}, "buffers": [{"uri": "pipe", "byteLength": 9}]}',
+        encoding="utf-8",
+    )
+    with pytest.raises(InputError, match=r"c\.gltf: cannot read the mesh: .*regular file"):
+        load_mesh(folder / "c.gltf")
+
+
+PLY = b"ply\nformat ascii 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("a.stl", bytes(80) + b"\xff\xff\xff\xff"),
+        ("a.ply", PLY),
+        ("a.off", b"OFF\n99999999999 1 0\n0 0 0\n"),
+        ("a.obj", b"v 0 0 0\nf 1 2 999999999999\n"),
+        ("a.dae", b"<COLLADA><library_geometries/></COLLADA>"),
+        ("a.dae", b"<COLLADA>" + b"<a>" * 10**6 + b"</a>" * 10**6 + b"</COLLADA>"),
+        ("a.glb", b"glTF" + b"\xff" * 100),
+    ],
+    ids=["stl", "ply", "off", "obj", "dae", "deep dae", "glb"],
+)
+def test_broken_meshes_are_refused(folder: Path, name: str, data: bytes) -> None:
+    (folder / name).write_bytes(data)
+    with pytest.raises(InputError, match=rf"{name}: .*(read the mesh|mesh is empty|crashes)"):
+        load_mesh(folder / name)
+
+
+def test_ctrl_c_ends_an_import(folder: Path) -> None:
+    pytest.importorskip("mujoco")
+    (folder / "a.xml").write_text(MJCF.format('<include file="pipe"/>', ""), encoding="utf-8")
+    command = [sys.executable, "-m", "vkc_pin.cli", "import-object", "a.xml"]
+    environment = {**os.environ, TIME_VARIABLE: "60"}
+    process = subprocess.Popen(command, start_new_session=True, env=environment)
+    time.sleep(3.0)
+    os.killpg(process.pid, signal.SIGINT)  # as the terminal does
+    assert process.wait(timeout=10) == 130
+    assert sorted(file.name for file in folder.iterdir()) == ["a.xml", "pipe"]

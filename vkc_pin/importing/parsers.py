@@ -1,0 +1,139 @@
+"""Calls xacro and CoACD in a child process.
+
+This module imports little, since the child process imports it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from vkc_pin.errors import InputError
+from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.utils.isolation import run_isolated
+from vkc_pin.utils.optional_imports import import_optional
+from vkc_pin.world.files.resources import find_package
+
+__all__ = ["cut_mesh", "expand_xacro"]
+
+_FIND = re.compile(r"\$\(find\s+([^\s()$]+)\s*\)")  # NAME in $(find NAME)
+
+
+def expand_xacro(file: Path, packages: Mapping[str, Path], arguments: Mapping[str, str]) -> str:
+    """Return the URDF of a xacro file.
+
+    Raises:
+        InputError: xacro is not installed or cannot read the file, or a package is not found.
+    """
+    import_optional("xacro", "import", purpose="a xacro file", file=file)
+    return run_isolated(
+        _expand_xacro,
+        file.absolute(),
+        file,
+        dict(packages),
+        dict(arguments),
+        program="xacro",
+        file=file,
+    )
+
+
+def _expand_xacro(
+    path: Path, file: Path, packages: Mapping[str, Path], arguments: Mapping[str, str]
+) -> str:
+    import xacro
+    from xacro import substitution_args
+
+    messages, known = io.StringIO(), len(xacro.all_includes)
+    try:
+        with (
+            _search_packages(substitution_args, path, packages),
+            contextlib.redirect_stderr(messages),
+        ):
+            document = xacro.process_file(str(path), mappings=dict(arguments))
+            return str(document.toprettyxml(indent="  "))
+    except MemoryError:
+        raise
+    except (Exception, SystemExit) as error:  # macros, expressions and XML raise any type
+        cause: Any = error
+        while isinstance(getattr(cause, "exc", None), BaseException):
+            cause = cause.exc
+        if isinstance(cause, MemoryError):  # of an expression
+            raise MemoryError from error
+        includes = [path, *map(Path, xacro.all_includes[known:])]
+        _check_packages(includes, path, file, packages)
+        problem = " ".join((str(error) or messages.getvalue()).split())
+        problem = problem.partition(" [Errno")[0]  # repeats the sentence before
+        raise InputError(f"xacro cannot process the file: {problem}", file=file) from error
+
+
+@contextlib.contextmanager
+def _search_packages(
+    substitution: ModuleType, path: Path, packages: Mapping[str, Path]
+) -> Iterator[None]:
+    """Let `$(find NAME)` search around a file; xacro itself would ask ROS."""
+
+    def find(name: str) -> str:
+        place = find_package(name, path, packages)
+        if place is None:
+            raise LookupError(f"package '{name}' was not found")
+        return str(place)
+
+    module: Any = substitution
+    original = module._eval_find
+    module._eval_find = find
+    try:
+        yield
+    finally:
+        module._eval_find = original
+
+
+def _check_packages(
+    files: Iterable[Path], path: Path, file: Path, packages: Mapping[str, Path]
+) -> None:
+    """Raise an error that lists all packages in `$(find NAME)` of some files that are missing."""
+    names = dict.fromkeys(
+        name
+        for each in files
+        if each.is_file()
+        for name in _FIND.findall(each.read_text(encoding="utf-8", errors="replace"))
+    )
+    if missing := [name for name in names if find_package(name, path, packages) is None]:
+        raise InputError(
+            f"packages were not found: {', '.join(missing)}",
+            file=file,
+            field="$(find ...)",
+            expected="folders around the file with these names, or with a package.xml that states "
+            "them; or state their folders (packages, --package NAME=FOLDER)",
+        )
+
+
+def cut_mesh(vertices: Floats, faces: Ints, file: Path | None, **settings: Any) -> list[Floats]:
+    """Return the vertices of the convex parts into which CoACD cuts a closed mesh.
+
+    Args:
+        vertices: Shape (n, 3) [m].
+        faces: Shape (m, 3).
+        file: File of the mesh, for messages.
+        **settings: Those of `coacd.run_coacd`.
+
+    Raises:
+        InputError: CoACD is not installed, or fails.
+    """
+    import_optional(
+        "coacd", "import", purpose="cutting a concave mesh into convex pieces", file=file
+    )
+    return run_isolated(
+        _run_coacd, vertices, faces, settings, program="CoACD", file=file, patience=5.0
+    )
+
+
+def _run_coacd(vertices: Floats, faces: Ints, settings: Mapping[str, Any]) -> list[Floats]:
+    import coacd
+
+    coacd.set_log_level("off")
+    return [part for part, _ in coacd.run_coacd(coacd.Mesh(vertices, faces), **settings)]

@@ -6,6 +6,7 @@ import difflib
 import reprlib
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 __all__ = [
     "BuildError",
@@ -61,7 +62,22 @@ def find_nearest_name(name: str, choices: Iterable[str]) -> str | None:
 
 
 class VkcError(Exception):
-    """Base class of the errors of this package."""
+    """Base class of the errors of this package. All can be pickled."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the attributes: by default, Python would call the class with the message."""
+        plain = str, int, float, bool, Path, type(None)
+        state = {
+            name: value if isinstance(value, plain) or name == "choices" else _format_detail(value)
+            for name, value in vars(self).items()
+        }
+        return _restore_error, (type(self), self.args, state)
+
+
+def _restore_error(kind: type[VkcError], texts: tuple[Any, ...], state: dict[str, Any]) -> VkcError:
+    error = kind.__new__(kind, *texts)
+    error.__dict__.update(state)
+    return error
 
 
 class BuildError(VkcError):

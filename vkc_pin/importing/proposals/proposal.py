@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Any
 
 from vkc_pin.importing.proposals.hand import Hand
 from vkc_pin.importing.targets import round_values
+from vkc_pin.utils.pickling import freeze
 from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment
 
 __all__ = ["Proposal", "Proposals"]
@@ -89,7 +89,7 @@ class Proposals:
     def make_object(self) -> ArticulatedObject:
         """Return the object with these attachments instead of its own, best first."""
         attachments = {proposal.attachment.name: proposal.attachment for proposal in self.found}
-        return dataclasses.replace(self.object, attachments=MappingProxyType(attachments))
+        return dataclasses.replace(self.object, attachments=freeze(attachments))
 
     def summary(self) -> str:
         """Return a line for each attachment by joint, or the reason why it has none."""

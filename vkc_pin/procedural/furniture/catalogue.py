@@ -6,7 +6,6 @@ import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.procedural.furniture import generators
 from vkc_pin.procedural.furniture.building import ObjectBuilder, Sampler
 from vkc_pin.utils.arguments import check_choice, check_integer, check_mapping
+from vkc_pin.utils.pickling import freeze
 from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.models.object_file import load_object
@@ -39,7 +39,7 @@ class Kind:
     beside: float
 
 
-KINDS: Mapping[str, Kind] = MappingProxyType(
+KINDS: Mapping[str, Kind] = freeze(
     {
         "cabinet": Kind(generators.make_cabinet, "floor", 0.7),
         "chest": Kind(generators.make_chest, "floor", 0.5),

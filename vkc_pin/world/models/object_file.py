@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -13,6 +12,7 @@ from pydantic import Field, model_validator
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_mapping
+from vkc_pin.utils.pickling import freeze
 from vkc_pin.world.files.documents import Document, parse_document, read_yaml
 from vkc_pin.world.files.fields import (
     Name,
@@ -301,12 +301,12 @@ def build_object(document: Document, folder: Path, name: str | None = None) -> A
         upper=coordinates.upper,
         velocity=velocity,
         acceleration=acceleration,
-        attachments=MappingProxyType(attachments),
+        attachments=freeze(attachments),
         latches=_build_latches(document, schema, coordinates),
         base_link=links[0],
         free=schema.free,
         own_pairs=_read_own_pairs(document, schema, links),
-        resistance=MappingProxyType(read_resistances(document, schema.joints, urdf, text, names)),
+        resistance=freeze(read_resistances(document, schema.joints, urdf, text, names)),
     )
 
 

@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
-from types import MappingProxyType
 
 import coal
 import numpy as np
@@ -21,6 +20,7 @@ from vkc_pin.utils.arguments import (
     check_mapping,
     check_text,
 )
+from vkc_pin.utils.pickling import freeze
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import clamp_to_limits, compute_clearance, list_placed_shapes
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
@@ -201,7 +201,7 @@ def place_held_objects(
             in_object = one.object.link_placement(grasp.link, one.state) * grasp.tool(hold.at)
             holder = placed[hold.by.object].link_placement(str(hold.link)) if hold.by else tool()
             placed[hold.object] = dataclasses.replace(one, placement=holder * in_object.inverse())
-    return MappingProxyType(placed)
+    return freeze(placed)
 
 
 def find_reversed_approaches(

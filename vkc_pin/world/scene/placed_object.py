@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import numpy as np
 import pinocchio as pin
@@ -13,6 +12,7 @@ import pinocchio as pin
 from vkc_pin.errors import UnknownNameError
 from vkc_pin.utils.arguments import check_mapping, check_number
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.pickling import freeze
 from vkc_pin.world.collision.placements import flatten_placements
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.world.models.shapes import (
@@ -91,7 +91,7 @@ class PlacedObject:
         changed = dataclasses.replace(
             given, placement=given.placement * _OTHER_SIDE, freedoms=tuple(turned)
         )
-        attachments = MappingProxyType({**self.object.attachments, attachment: changed})
+        attachments = freeze({**self.object.attachments, attachment: changed})
         listed = tuple(sorted({*self.reversed} ^ {attachment}))
         return dataclasses.replace(
             self, object=dataclasses.replace(self.object, attachments=attachments), reversed=listed

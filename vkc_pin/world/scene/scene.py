@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,6 +24,7 @@ from vkc_pin.utils.arguments import (
 )
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.notebook import render_card
+from vkc_pin.utils.pickling import freeze
 from vkc_pin.world.files.resources import check_path, find_file
 from vkc_pin.world.models.shapes import clamp_to_limits, compute_clearance, list_placed_shapes
 from vkc_pin.world.scene.clearance_exemptions import warn_of_overlaps
@@ -190,9 +190,7 @@ class Scene:
             InputError: A value is not finite or outside the joint's limits.
         """
         return self._with(
-            objects=MappingProxyType(
-                {**self.objects, name: self._find_object(name).with_state(values)}
-            )
+            objects=freeze({**self.objects, name: self._find_object(name).with_state(values)})
         )
 
     def with_placement(self, name: str, placement: pin.SE3) -> Scene:
@@ -209,7 +207,7 @@ class Scene:
         placed = dataclasses.replace(
             self._find_object(name), placement=as_placement(placement, name="placement")
         )
-        return self._with(objects=MappingProxyType({**self.objects, name: placed}))
+        return self._with(objects=freeze({**self.objects, name: placed}))
 
     def with_held(
         self,
@@ -257,7 +255,7 @@ class Scene:
             hint = f"turn its approach, or set `reversed: [{hold.attachment}]` for the object"
             warnings.warn(f"{self.file or self.name}: {text}; {hint}", stacklevel=stacklevel)
         changed = objects != dict(self.objects)
-        return self._with(objects=MappingProxyType(objects)) if changed else self
+        return self._with(objects=freeze(objects)) if changed else self
 
     def _find_object(self, name: str) -> PlacedObject:
         return self.objects[check_choice(name, self.objects, "object")]

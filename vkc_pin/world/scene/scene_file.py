@@ -7,7 +7,6 @@ import functools
 import itertools
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ import pinocchio as pin
 
 from vkc_pin.errors import find_nearest_name
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.pickling import freeze
 from vkc_pin.world.files.documents import Document, parse_document
 from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.srdf import read_srdf
@@ -57,7 +57,7 @@ def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         "folder": folder,
         "robot": robot,
         "start": _make_start(document, description.start, robot),
-        "objects": MappingProxyType(objects),
+        "objects": freeze(objects),
         "obstacles": tuple(obstacles),
         "obstacle_labels": tuple(labels),
         "obstacle_names": tuple(item.name for item in description.obstacles),
@@ -66,9 +66,7 @@ def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         "arena": arena,
         "start_region": description.start_region,
         "holds": _make_holds(document, description.start.held, objects),
-        "allowed": MappingProxyType(
-            _find_allowed_pairs(document, description, folder, robot, objects)
-        ),
+        "allowed": freeze(_find_allowed_pairs(document, description, folder, robot, objects)),
         "described": description,
         "opening": description.start.opening,
     }

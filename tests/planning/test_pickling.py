@@ -1,0 +1,124 @@
+"""Errors, scenes and plans pass through process pools, and copies plan and validate alike."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import pickle
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import joblib
+import numpy as np
+import pytest
+
+import vkc_pin as vkc
+from vkc_pin.datasets.problems import NoProblemError
+from vkc_pin.errors import BuildError, InputError, UnknownNameError, VkcError
+from vkc_pin.utils.budget import BudgetExhaustedError
+
+COPIES = {
+    "pickle": lambda value: pickle.loads(pickle.dumps(value)),
+    "protocol 2": lambda value: pickle.loads(pickle.dumps(value, 2)),
+    "deepcopy": copy.deepcopy,
+    "copy": copy.copy,
+    "dask": lambda value: pickle.loads(pytest.importorskip("cloudpickle").dumps(value)),
+}
+ERRORS = [
+    VkcError("it failed"),
+    BuildError("no compiler"),
+    NoProblemError("no free start"),
+    InputError("wrong"),
+    InputError("wrong", file=Path("a.yaml"), line=3, field="size", expected="1", got=2.5),
+    InputError("wrong", expected=(item for item in ()), got=lambda: None),
+    UnknownNameError("link", "wrst", ["base", "wrist"], file="r.yaml", line=2, field="tool"),
+    UnknownNameError("link", "wrst", []),
+]
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=str)
+@pytest.mark.parametrize("way", COPIES)
+def test_copied_errors_keep_their_text_and_details(way: str, error: VkcError) -> None:
+    copied = COPIES[way](error)
+    assert type(copied) is type(error)
+    assert (str(copied), copied.args) == (str(error), error.args)
+    assert vars(copied).keys() == vars(error).keys()
+    plain = {key: value for key, value in vars(error).items() if key not in ("expected", "got")}
+    assert vars(copied).items() >= plain.items()
+
+
+def test_the_reason_of_a_stop_is_copied() -> None:
+    assert pickle.loads(pickle.dumps(BudgetExhaustedError("time limit"))).status == "time limit"
+
+
+def test_a_pool_raises_errors_of_its_processes() -> None:
+    with get_context("spawn").Pool(1) as pool, pytest.raises(UnknownNameError, match="'doors'"):
+        pool.apply_async(vkc.load_scene, ("doors",)).get(timeout=60)
+
+
+STEPS = [vkc.Actuate("door", {"hinge": 0.3})]
+
+
+@functools.cache
+def make_plan() -> vkc.Plan:
+    return vkc.plan(vkc.load_scene("door"), STEPS)
+
+
+def assert_same_motion(one: vkc.Plan, other: vkc.Plan) -> None:
+    assert other.success
+    for name in ("times", "positions"):
+        np.testing.assert_array_equal(
+            getattr(other.trajectory, name), getattr(one.trajectory, name), strict=True
+        )
+    assert repr(other.report) == repr(one.report)
+
+
+def test_a_process_pool_plans_a_sent_scene_alike() -> None:
+    plan = make_plan()
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        returned = pool.submit(vkc.plan, plan.scene, STEPS).result(timeout=120)
+        report = pool.submit(
+            vkc.validate, plan.scene, plan.steps, plan.trajectory
+        ).result(timeout=120)  # fmt: skip
+    assert_same_motion(plan, returned)
+    assert repr(report) == repr(plan.report)
+    again = vkc.validate(returned.scene, returned.steps, returned.trajectory)
+    assert repr(again) == repr(plan.report)
+
+
+def test_joblib_plans_a_sent_scene_alike() -> None:
+    plan = make_plan()
+    for returned in joblib.Parallel(n_jobs=2)([joblib.delayed(vkc.plan)(plan.scene, STEPS)]):
+        assert_same_motion(plan, returned)
+
+
+@pytest.mark.parametrize("way", COPIES)
+def test_copied_scenes_and_plans_plan_and_validate_alike(way: str) -> None:
+    plan, copied = make_plan(), COPIES[way](make_plan())
+    assert copied.scene.document == plan.scene.document
+    assert_same_motion(plan, copied)
+    report = vkc.validate(COPIES[way](plan.scene), STEPS, copied.trajectory)
+    assert repr(report) == repr(plan.report)
+    if way in ("pickle", "deepcopy"):
+        assert_same_motion(plan, vkc.plan(COPIES[way](plan.scene), STEPS))
+
+
+@pytest.mark.parametrize("way", COPIES)
+@pytest.mark.parametrize("name", ["household", "fetch", "drawer", "gap_table"])
+def test_copied_scenes_have_the_same_shapes_and_stay_read_only(name: str, way: str) -> None:
+    scene = vkc.load_scene(name)
+    copied: Any = COPIES[way](scene)
+    assert copied.start_clearance() == scene.start_clearance()
+    assert repr(copied) == repr(scene)
+    assert list(copied.objects) == list(scene.objects)
+    with pytest.raises(TypeError):
+        copied.objects["new"] = None
+    for key, placed in scene.objects.items():
+        item = COPIES[way](placed.object)
+        assert list(item.attachments) == list(placed.object.attachments)
+        assert COPIES[way](placed).object.name == copied.objects[key].object.name
+    robot = COPIES[way](scene.robot)
+    np.testing.assert_array_equal(robot.home, scene.robot.home)
+    assert robot.model == scene.robot.model

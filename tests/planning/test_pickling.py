@@ -38,7 +38,7 @@ ERRORS = [
 ]
 
 
-@pytest.mark.parametrize("error", ERRORS, ids=str)
+@pytest.mark.parametrize("error", ERRORS, ids=range(len(ERRORS)))
 @pytest.mark.parametrize("way", COPIES)
 def test_copied_errors_keep_their_text_and_details(way: str, error: VkcError) -> None:
     copied = COPIES[way](error)

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.arm_urdf import write_arms
 from helpers.downloads import SDF
@@ -33,6 +35,20 @@ def test_robot_is_imported_and_examined(
     assert "mine: 0 faults" in capsys.readouterr().out
     assert run("doctor mine --margin 0.6") == 1
     assert "the margin is 600 mm" in capsys.readouterr().out
+    for what in ("mine", "mine/scene.yaml", "mine/mine.urdf"):
+        assert run(f"view {what} --html page.html") == 0
+        assert "mine" in Path("page.html").read_text(encoding="utf-8")
+    assert run("check mine/scene.yaml") == 0
+    robot = vkc.load_robot(tmp_path / "mine")
+    data, q = robot.model.createData(), robot.coordinates.q(np.r_[0.5, 0.2, 0.0, robot.home])
+    pin.framesForwardKinematics(robot.model, data, q)
+    tool = data.oMf[robot.model.getFrameId("tool")]
+    pose = " ".join(map(str, [*tool.translation, *pin.rpy.matrixToRpy(tool.rotation)]))
+    steps = f"--go-to 0.5 -0.2 0.3 --reach {pose} --go-to 1 0 0"
+    assert run(f"plan {tmp_path}/mine/scene.yaml {steps} --quiet --save plan.npz") == 0
+    plan = vkc.Plan.load("plan.npz")
+    assert [type(step) for step in plan.steps] == [vkc.GoTo, vkc.Reach, vkc.GoTo]
+    assert plan.trajectory.positions[-1, :3] == pytest.approx([1.0, 0.0, 0.0], abs=1e-3)
 
 
 def test_misuse_is_explained_in_one_line(
@@ -68,17 +84,25 @@ def test_object_is_imported(
     output = capsys.readouterr().out
     assert "0.70 m" in output
     assert "door_bar (bar, named as a handle)" in output
-    assert output.count("wrote") == 2
+    assert output.count("wrote") == 3
     assert sorted(file.name for file in (tmp_path / "out").iterdir()) == [
         ".vkc-pin.json",
         "attachments.png",
         "box.urdf",
         "box.yaml",
+        "scene.yaml",
     ]
     assert run(command) == commands.EXIT_MISUSE
     assert "--force" in capsys.readouterr().err
     assert run(command.replace("0.7", "0.8") + " --force") == 0
     assert "0.80 m" in capsys.readouterr().out
+    scene = vkc.load_scene(tmp_path / "out" / "scene.yaml")
+    assert run("check out/scene.yaml") == 0
+    assert "door_bar" in capsys.readouterr().out
+    plan = vkc.plan(scene, [vkc.Actuate("box", {"hinge": -0.5})])
+    assert plan.success, plan.summary()
+    for what in ("out", "out/box.yaml", "out/scene.yaml"):
+        assert run(f"view {what} --html page.html") == 0
 
 
 def test_robot_folder_takes_precedence_over_known_names(

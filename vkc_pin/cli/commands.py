@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
+import itertools
 import json
+import operator
 import platform
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -53,6 +55,19 @@ _EXPORTS = {
     "--ros FILE": "write JSON with the fields of trajectory_msgs/JointTrajectory",
     "--rosbag FOLDER": "write a recording of ROS 2 (rosbag2); needs the extra `ros`",
 }
+_STEPS: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    ("--set OBJECT.JOINT=VALUE", "bring a joint to a value [m], [rad]; may be repeated", {}),
+    (
+        "--reach",
+        "bring the hand to a pose [m], [rad]; may be repeated",
+        {"nargs": 6, "type": float, "metavar": ("X", "Y", "Z", "ROLL", "PITCH", "YAW")},
+    ),
+    (
+        "--go-to",
+        "drive the base to a place [m], [rad]; may be repeated",
+        {"nargs": 3, "type": float, "metavar": ("X", "Y", "YAW")},
+    ),
+)
 Writers = Mapping[str, Callable[[str], object]]
 
 
@@ -86,6 +101,30 @@ def parse_settings(settings: Sequence[str]) -> list[Any]:
     return [Actuate(owner, joints) for owner, joints in grouped]
 
 
+class _AppendStep(argparse.Action):
+    """Appends option and value to `steps`, which keeps the order of different options."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option: str | None = None) -> None:
+        namespace.steps = [*(namespace.steps or ()), (self.const, values)]
+
+
+def _make_steps(given: Sequence[tuple[str, Any]]) -> list[Any]:
+    """Return the steps of options and their values, in this order."""
+    from vkc_pin.world.task.steps import GoTo, Reach
+
+    steps = list[Any]()
+    for option, values in itertools.groupby(given, key=operator.itemgetter(0)):
+        if option == "--set":
+            steps += parse_settings([value for _, value in values])
+        else:
+            make = GoTo if option == "--go-to" else lambda *pose: Reach(pose)
+            steps += [make(*value) for _, value in values]
+    if not steps:
+        expected = "--set OBJECT.JOINT=VALUE, --reach X Y Z ROLL PITCH YAW or --go-to X Y YAW"
+        raise InputError("nothing to plan", field="plan", expected=expected)
+    return steps
+
+
 def _print_progress(row: Any) -> None:
     sys.stderr.write(
         f"  round {row.round:2d}  Ipopt {row.iterations:4d}"
@@ -98,7 +137,7 @@ def _plan(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
     from vkc_pin.visualization.plots.plots import PICTURES
 
-    steps = parse_settings(arguments.set)
+    steps = _make_steps(arguments.steps or ())
     files = _get_given(arguments, "save", "json", "csv", "ros", "html", "rosbag", "plots")
     outputs: dict[str, str] = dict(files)
     if (folder := files.get("plots")) is not None:
@@ -248,16 +287,16 @@ def _simulate(arguments: argparse.Namespace) -> int:
 
 
 def _view(arguments: argparse.Namespace) -> int:
-    import vkc_pin as vkc
     from vkc_pin import visualization
+    from vkc_pin.cli.shown import load_shown
 
     files, what = _get_given(arguments, "html"), str(arguments.what)
-    _check_outputs(files, SCENE_PLAN=what)
-    shown: Any = vkc.Plan.load(what) if what.endswith(".npz") else vkc.load_scene(what)
+    _check_outputs(files, WHAT=what)
+    shown, frames = load_shown(what)
     if files:
-        writers = {"html": functools.partial(visualization.to_html, shown)}
+        writers = {"html": functools.partial(visualization.to_html, shown, frames=frames)}
         return EXIT_OK if _write(files, writers) else EXIT_MISUSE
-    visualization.show(shown)
+    visualization.show(shown, frames=frames)
     sys.stdout.write("press Enter to end\n")
     sys.stdout.flush()
     with contextlib.suppress(EOFError):
@@ -314,12 +353,15 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def _add_plan(commands: Any) -> None:
-    about = "Plan a motion that brings joints of objects to values."
+    about = (
+        "Plan a motion of the steps --set, --reach and --go-to, in this order. It brings joints of "
+        "objects to values, the hand to poses and the base to places."
+    )
     plan = add_command(commands, "plan", "plan a motion", _plan, about)
     add_option(plan, "scene SCENE", "name of an included scene, or a YAML file")
-    add_option(
-        plan, "--set OBJECT.JOINT=VALUE", "goals, in this order", action="append", required=True
-    )
+    for form, text, settings in _STEPS:
+        option = form.partition(" ")[0]
+        add_option(plan, form, text, action=_AppendStep, dest="steps", const=option, **settings)
     for form, text in (_OUTPUTS | _EXPORTS).items():
         add_option(plan, form, text)
     methods = "auto, interpolated, astar, rrt or stationary"
@@ -362,9 +404,10 @@ def _add_check_and_simulate(commands: Any) -> None:
 
 
 def _add_view_and_export(commands: Any) -> None:
-    about = "Show a scene or a saved plan in the browser."
-    view = add_command(commands, "view", "show a scene or plan", _view, about)
-    add_option(view, "what SCENE|PLAN", "a scene, or a saved plan (.npz)")
+    about = "Show a scene, a saved plan, a robot with its tool frame, or an object in the browser."
+    view = add_command(commands, "view", "show a scene, plan, robot or object", _view, about)
+    about = "a saved plan (.npz), or the name, file or folder of a scene, robot or object"
+    add_option(view, "what WHAT", about)
     add_option(view, "--html FILE", "write a page instead of starting a server")
 
     about = "Write the motion of a saved plan for other programs."

@@ -161,7 +161,9 @@ def _import_object(arguments: argparse.Namespace) -> int:
         force=arguments.force,
         **_read_packages(arguments),
     )
-    sys.stdout.write(f"{done.summary()}\nwrote {done.file}\nwrote {done.picture}\n")
+    written = [done.file, done.picture, *([] if done.scene is None else [done.scene])]
+    lines = "".join(f"wrote {file}\n" for file in written)
+    sys.stdout.write(f"{done.summary()}\n{lines}")
     return EXIT_OK
 
 

@@ -36,7 +36,14 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> vkc.importing.Imported
 
 def test_folder_describes_the_robot(imported: vkc.importing.ImportedRobot) -> None:
     names = {path.name for path in imported.folder.iterdir()}
-    assert names == {".vkc-pin.json", "robot.yaml", "mine.urdf", "mine.srdf", "collision"}
+    assert names == {
+        ".vkc-pin.json",
+        "robot.yaml",
+        "scene.yaml",
+        "mine.urdf",
+        "mine.srdf",
+        "collision",
+    }
     again = vkc.load_robot(imported.folder)
     assert again.name == "mine"
     assert again.coordinates.names[3:] == tuple(f"right_arm_{k}_joint" for k in range(1, 6))

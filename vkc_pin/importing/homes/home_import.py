@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-import yaml
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing.homes.splitting import FLOOR_RISE, Home, add_floor, split_home
@@ -31,13 +30,14 @@ from vkc_pin.importing.objects.clean_up import (
 from vkc_pin.importing.objects.description import WEIGHTLESS
 from vkc_pin.importing.objects.object_import import read_description
 from vkc_pin.importing.objects.pieces import PieceCache
-from vkc_pin.importing.targets import check_target, format_comment, get_origin_marker
+from vkc_pin.importing.scenes import refer_to_robot, write_scene
+from vkc_pin.importing.targets import check_target
 from vkc_pin.options import Options
 from vkc_pin.planning.base_paths.reachable_floor import CELL, find_free_floor
 from vkc_pin.utils.arguments import check_bool, check_instance, check_integer, check_number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.resources import check_path, choose_file_names
-from vkc_pin.world.files.writing import write_atomically, write_folder_atomically
+from vkc_pin.world.files.writing import write_folder_atomically
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
@@ -172,7 +172,7 @@ def import_home(
         low, high = add_floor(home, low, high)
         document: dict[str, Any] = {
             "name": _choose_name(path),
-            "robot": _resolve_robot(robot),
+            "robot": refer_to_robot(robot),
             "start": {"base": [round(float(value), 3) for value in (*(low + high)[:2] / 2.0, 0.0)]},
             "arena": {axis: _round_interval(low[k], high[k]) for k, axis in enumerate("xy")},
             "start_region": {axis: _round_interval(low[k], high[k]) for k, axis in enumerate("xy")},
@@ -183,7 +183,7 @@ def import_home(
             warnings.simplefilter("ignore")  # they are repeated when the scene is loaded
             scene, reached = find_free_start(Scene.from_document(document, staging), rng, path)
         document["start"] = {"base": scene.start[:3].tolist()}
-        _write_scene(staging / "scene.yaml", path, document)
+        write_scene(staging / "scene.yaml", path, document, _COMMAND)
     weight = (WEIGHTLESS,) if all(item.description.is_massless for item in home.objects) else ()
     notes = (
         *home.notes,
@@ -210,18 +210,6 @@ def _choose_name(path: Path) -> str:
     """Return a name for a home."""
     name = re.sub(r"[^A-Za-z0-9_]+", "_", path.stem).strip("_")
     return choose_file_names([name], fallback="home")[0]
-
-
-def _resolve_robot(robot: str | Path) -> str:
-    """Return a robot as a scene in another folder refers to it."""
-    by_path = isinstance(robot, Path) or robot.endswith((".urdf", ".yaml", ".yml")) or "/" in robot
-    return str(Path(robot).resolve()) if by_path else str(robot)
-
-
-def _write_scene(file: Path, source: Path, document: Mapping[str, Any]) -> None:
-    head = format_comment(f"Made of {source.name} {get_origin_marker(_COMMAND)}.")
-    body = yaml.safe_dump(document, sort_keys=False, width=130, default_flow_style=None)
-    write_atomically(file, (head + body).encode())
 
 
 def _note_floor_shapes(home: Home) -> list[str]:

@@ -35,6 +35,7 @@ from vkc_pin.importing.parsers import expand_xacro
 from vkc_pin.importing.proposals.picture import plot_attachments
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
+from vkc_pin.importing.scenes import make_object_scene, refer_to_robot, write_scene
 from vkc_pin.importing.targets import check_target, get_origin_marker
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import (
@@ -73,6 +74,7 @@ class ImportedObject:
         size: Length, width and height of the closed object [m], shape (3,).
         notes: Changes and omissions.
         picture: Image of the attachments.
+        scene: Scene with the object and a robot in front of it; None if the robot finds no room.
     """
 
     file: Path
@@ -81,6 +83,7 @@ class ImportedObject:
     size: Floats
     notes: tuple[str, ...]
     picture: Path
+    scene: Path | None
 
     def summary(self) -> str:
         """Return a readable report."""
@@ -198,6 +201,7 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
     check_integer(most, "most", low=1, high=100)
     options = Options() if options is None else check_instance(options, Options, "options")
     clearances = {"dist_safe": options.dist_safe, "grasp_clearance": options.grasp_clearance}
+    reference = refer_to_robot(robot)
     robot = robot if isinstance(robot, Robot) else load_robot(robot)
     name = _choose_name(path, link)
     target = Path(name) if folder is None else check_path(folder, "folder", "a folder")
@@ -239,11 +243,20 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
         found = [item.description() for item in proposals.found]
         write_description(yaml, urdf.name, found, about=about, joints=springs)
         plot_attachments(proposals, picture)
+        scene = make_object_scene(yaml.name, proposals, size, reference, staging)
+        if scene is not None:
+            write_scene(staging / "scene.yaml", path, scene, _COMMAND)
     loaded = load_object(target / yaml.name)
     # The files have moved.
     proposals = dataclasses.replace(proposals, object=dataclasses.replace(loaded, attachments={}))
     return ImportedObject(
-        target / yaml.name, loaded, proposals, size, description.notes, target / picture.name
+        target / yaml.name,
+        loaded,
+        proposals,
+        size,
+        description.notes,
+        target / picture.name,
+        None if scene is None else target / "scene.yaml",
     )
 
 

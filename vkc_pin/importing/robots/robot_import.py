@@ -36,6 +36,7 @@ from vkc_pin.importing.robots.rest_configuration import (
     measure_floor_heights,
 )
 from vkc_pin.importing.robots.sources import Source, choose_free_name, read_source
+from vkc_pin.importing.scenes import make_robot_scene, write_scene
 from vkc_pin.importing.targets import (
     add_connection,
     check_target,
@@ -70,7 +71,7 @@ class ImportedRobot:
     """An imported robot.
 
     Attributes:
-        folder: Output folder, for `load_robot`.
+        folder: Output folder, for `load_robot`; its scene.yaml is for `load_scene`.
         robot: The robot.
         arms: Names of all arms, the chosen one first.
         pieces: Decompositions of the collision meshes.
@@ -165,6 +166,7 @@ class _Importer:
         self._source, self._file, self._folder, self._name = source, source.file, folder, name
         (stem,) = choose_file_names([name], fallback="robot")
         self._settings: dict[str, Any] = {"urdf": f"{stem}.urdf", "srdf": f"{stem}.srdf"}
+        self._base = "omni"
         self._findings = [
             *(Finding("warning", "shapes", text) for text in source.warnings),
             *(Finding("note", "file", text) for text in source.notes),
@@ -211,6 +213,8 @@ class _Importer:
     def _make_result(
         self, robot: Robot, arms: list[Arm], chosen: Arm | None, pieces: list[Piece]
     ) -> ImportedRobot:
+        scene = make_robot_scene(self._name, "robot.yaml", self._base)
+        write_scene(self._folder / "scene.yaml", self._source.file.path, scene, "import-robot")
         findings = (*doctor(robot).findings, *self._findings)
         others = [arm.name for arm in arms if arm is not chosen]
         names = () if chosen is None else (chosen.name, *others)
@@ -244,9 +248,12 @@ class _Importer:
                 "the planner's base replaces that of the file: "
                 f"{', '.join(base_joints)} are locked",
             )
-        kind, why = guess_base_kind(self._file.root)
+        self._base, why = guess_base_kind(self._file.root)
+        kind = self._base
         sure = "likely" if kind != "omni" else "guess"
-        self._guess(sure, f"base: {kind} ({why})", "set it in scenes or `load_robot`: `base: ...`")
+        self._guess(
+            sure, f"base: {kind} ({why})", "if it is wrong: `base` in scene.yaml and other scenes"
+        )
         if chosen is not None:
             for leader, *others in find_telescopes(build_full_model(self._file), chosen.joints):
                 self._settings.setdefault("couplings", {}).update(dict.fromkeys(others, leader))

@@ -1,15 +1,20 @@
 from __future__ import annotations
 
+import csv
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from vkc_pin.cli import main
-from vkc_pin.datasets.check import check_dataset
-from vkc_pin.datasets.dataset import Dataset
+from vkc_pin.datasets.check import check_dataset, check_lerobot, check_shard
+from vkc_pin.datasets.dataset import Dataset, read_table
 from vkc_pin.datasets.episode import compute_scene_name
+from vkc_pin.datasets.formats.hdf5 import open_shard
 from vkc_pin.errors import InputError
 
 h5py = pytest.importorskip("h5py")
@@ -72,6 +77,253 @@ def test_repeated_episode_is_a_problem(copy: Path) -> None:
     found = check_dataset(copy)
     assert f"episode {numbers[1]} occurs 2 times" in found.problems
     assert any("episodes.csv" in problem for problem in found.problems)
+
+
+def set_array(name: str, value: Any, at: Any = ...) -> Callable[[Any], None]:
+    """Return a change of an array of a demo."""
+
+    def change(demo: Any) -> None:
+        demo[name][at] = value
+
+    return change
+
+
+def set_attribute(name: str, value: Any) -> Callable[[Any], None]:
+    return lambda demo: demo.attrs.__setitem__(name, value)
+
+
+def set_description(*path: str, value: Any) -> Callable[[Any], None]:
+    """Return a change of a field in the description of a demo."""
+
+    def change(demo: Any) -> None:
+        data = inner = json.loads(demo.attrs["episode"])
+        for name in path[:-1]:
+            inner = inner[name]
+        inner[path[-1]] = value
+        demo.attrs["episode"] = json.dumps(data)
+
+    return change
+
+
+def replace_array(name: str, make: Callable[[Any], Any]) -> Callable[[Any], None]:
+    """Return a change that replaces an array by what `make` returns for its values."""
+
+    def change(demo: Any) -> None:
+        values = make(demo[name][:])
+        del demo[name]
+        demo[name] = values
+
+    return change
+
+
+HEADER = (
+    "number,task,robot,room,object,kind,attachment,joint,goal,variant,status,reason,duration,"
+    "base_path_length,arm_path_length,clearance,waypoints,scene,seconds,planning_time"
+)
+FALSE_SAMPLES = [
+    (set_array("actions", 7.0), "actions[0, 0] is 7"),
+    (set_array("actions", np.nan, (3, 2)), "actions[3, 2] is nan"),
+    (set_array("states", 1e-3, (0, 5)), "states[0, 5] is 0.001"),
+    (set_array("obs/hand_pose", np.nan), "obs/hand_pose[0, 0] is nan"),
+    (set_array("obs/base_pose", np.inf, (1, 0)), "obs/base_pose[1, 0] is inf"),
+    (set_array("obs/holding", 0.5, (2, 0)), "obs/holding[2, 0] is 0.5"),
+    (set_array("obs/gripper", -1.0, (-1, 0)), "obs/gripper["),
+    (set_array("rewards", 1.0), "rewards[0] is 1"),
+    (set_array("dones", 1, 4), "dones[4] is 1"),
+    (lambda demo: demo["obs"].move("arm_position", "x"), "obs: there is no member of data/demo_"),
+    (lambda demo: demo.pop("states"), "states: missing"),
+    (lambda demo: demo.create_dataset("next", data=[1.0]), "there is no member of data/demo_"),
+    (replace_array("actions", lambda a: a[:-1]), "actions: wrong shape"),
+    (replace_array("dones", lambda a: a.astype(float)), "dones: wrong type of array"),
+    (replace_array("obs/gripper", lambda a: a[:, 0]), "gripper: wrong shape"),
+    (set_attribute("num_samples", 1), "num_samples is 1, not"),
+    (set_attribute("task", "drive-open"), "task is 'drive-open', not 'given-open'"),
+    (set_description("about", "task", value="drive-open"), "about.task is 'drive-open'"),
+    (set_description("about", "robot", value="tiago"), "about.robot is 'tiago', not 'husky_ur5e'"),
+    (set_description("about", "goal", value=3.0), "about.goal is 3.0, not"),
+    (set_description("about", "kind", value="sofa"), "about.kind is 'sofa', not"),
+    (set_description("about", "variant", value=1), "about.variant is 1, not 0"),
+    (set_description("about", "instruction", value="x"), "about.instruction is 'x', not None"),
+    (set_description("about", "metrics", value={"duration": 1.0}), "about.metrics.duration is 1.0"),
+    (set_description("about", "metrics", value=[]), "about.metrics are []"),
+    (set_description("about", value={}), "about.task is None, not 'given-open'"),
+    (set_description("validation", "clearance", value=9.0), "clearance 9 m instead of"),
+    (set_description("steps", value=[]), "steps of no task"),
+]
+"""A change of a demo, and the reason why it is invalid then."""
+
+
+@pytest.mark.parametrize("first", range(0, len(FALSE_SAMPLES), 4))
+def test_everything_that_a_learner_reads_follows_from_the_motion(copy: Path, first: int) -> None:
+    changes = FALSE_SAMPLES[first : first + 4]
+    with h5py.File(get_shard(copy), "r+") as file:
+        for k, (change, _) in enumerate(changes):
+            change(file[f"data/demo_{k}"])
+        numbers = [int(file[f"data/demo_{k}"].attrs["number"]) for k in range(4)]
+    task = str(get_shard(copy)), str(copy / "scenes"), Dataset.open(copy).recipe.document
+    records, problems = check_shard(task)
+    reasons = {record["number"]: record["refused"] for record in records}
+    for k, (_, expected) in enumerate(changes):
+        found = [*problems, reasons.get(numbers[k], "")]
+        assert any(expected in text for text in found), (expected, found)
+    assert len(records) + sum(f"demo_{k}" in text for text in problems for k in range(4)) == 4
+
+
+def test_samples_of_another_episode_are_refused(copy: Path) -> None:
+    with h5py.File(get_shard(copy), "r+") as file:
+        for part in ("obs", "actions", "states", "rewards", "dones"):
+            file.move(f"data/demo_0/{part}", "data/x")
+            file.move(f"data/demo_1/{part}", f"data/demo_0/{part}")
+            file.move("data/x", f"data/demo_1/{part}")
+    found = check_dataset(copy)
+    texts = [*found.refused.values(), *found.problems]
+    assert sum("obs/base_pose" in text for text in texts) == 2
+
+
+def swap_demos(file: Any) -> None:
+    file.move("data/demo_0", "x")
+    file.move("data/demo_1", "data/demo_0")
+    file.move("x", "data/demo_1")
+
+
+def set_mask(file: Any) -> None:
+    del file["mask/train"]
+    file["mask/train"] = np.array(["demo_0", "demo_0"], "S")
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (swap_demos, "not in order"),
+        (lambda file: file["data"].attrs.__setitem__("total", 1), "total is 1"),
+        (lambda file: file["data"].attrs.__setitem__("env_args", "{}"), "env_args is {}"),
+        (lambda file: file["data"].attrs.__setitem__("options", '{"dt": 0.1}'), "options is"),
+        (lambda file: file.pop("mask"), "mask: missing"),
+        (lambda file: file.pop("mask/valid"), "mask/valid: missing"),
+        (set_mask, "mask/train is ['demo_0', 'demo_0']"),
+        (lambda file: file.create_group("mask/test"), "there is no member of mask 'test'"),
+        (lambda file: file.create_group("extra"), "there is no member of a shard 'extra'"),
+    ],
+)
+def test_parts_of_a_shard_follow_from_its_episodes(
+    copy: Path, change: Callable[[Any], None], expected: str
+) -> None:
+    recipe = Dataset.open(copy).recipe
+    with open_shard(get_shard(copy), copy / "scenes") as shard:
+        assert shard.find_shard_differences("husky_ur5e", recipe) == []
+        assert "env_args" in "".join(shard.find_shard_differences("tiago", recipe))
+    with h5py.File(get_shard(copy), "r+") as file:
+        change(file)
+    try:
+        with open_shard(get_shard(copy), copy / "scenes") as shard:
+            found = "".join(shard.find_shard_differences("husky_ur5e", recipe))
+    except InputError as error:
+        found = str(error)
+    assert expected in found
+
+
+def test_damaged_files_do_not_end_the_check(copy: Path) -> None:
+    other = copy / "shards" / "tiago" / "shard-00000.hdf5"
+    other.parent.mkdir()
+    other.write_bytes(get_shard(copy).read_bytes()[:5000])
+    (copy / "episodes.csv").write_bytes(b"number\n\xff\n")
+    (copy / "failures.csv").write_text("number,task\nx\n")
+    found = check_dataset(copy)
+    assert (found.episodes, dict(found.refused)) == (4, {})
+    for text in ("shard-00000.hdf5: not an HDF5 file", "episodes.csv", "failures.csv"):
+        assert any(text in problem for problem in found.problems), text
+    assert any(problem.startswith("lerobot/tiago: missing") for problem in found.problems)
+
+
+def test_table_of_episodes_is_compared(copy: Path) -> None:
+    with (copy / "episodes.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    changes = {"task": "fetch-place", "goal": "9", "duration": "nan", "scene": "0"}
+    for row, (column, value) in zip(rows, changes.items(), strict=True):
+        row[column] = value
+    with (copy / "episodes.csv").open("w", newline="") as stream:
+        table = csv.DictWriter(stream, list(rows[0]))
+        table.writeheader()
+        table.writerows(rows)
+    shutil.rmtree(copy / "lerobot")
+    found = check_dataset(copy)
+    assert not found.refused
+    for column, problem in zip(changes, found.problems, strict=True):
+        assert problem.startswith(f"episodes.csv: {column} of episode ")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "number\n1\n", '"', "\x00", HEADER, f"{HEADER}\n1\n", f"{HEADER}\nx{',' * 20}\n"],
+)
+def test_damaged_tables_are_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / "table.csv").write_text(text)
+    if text == HEADER:
+        assert read_table(tmp_path / "table.csv") == []
+        return
+    with pytest.raises(InputError) as caught:
+        read_table(tmp_path / "table.csv")
+    assert caught.value.file == tmp_path / "table.csv"
+
+
+def change_column(name: str, value: Any) -> Callable[[Path], None]:
+    """Return a change of the first entry of a column of frames."""
+    arrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+
+    def change(folder: Path) -> None:
+        file = folder / "data/chunk-000/file-000.parquet"
+        with parquet.ParquetFile(file) as opened:
+            tables = [opened.read_row_group(k) for k in range(opened.num_row_groups)]
+        rows = tables[1].to_pylist()
+        if isinstance(rows[0][name], list):
+            rows[0][name][0] = value
+        else:
+            rows[0][name] = value
+        tables[1] = arrow.Table.from_pylist(rows, schema=tables[1].schema)
+        with parquet.ParquetWriter(file, tables[0].schema) as writer:
+            for table in tables:
+                writer.write_table(table)
+
+    return change
+
+
+def change_json(name: str, field: str, value: Any) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        file = folder / "meta" / name
+        file.write_text(json.dumps({**json.loads(file.read_text()), field: value}))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (change_column("action", 7.0), "row group 1: action: 7.0, not"),
+        (change_column("observation.state", float("nan")), "observation.state: nan, not"),
+        (change_column("task_index", 1), "task_index: 1, not 0"),
+        (change_column("episode_index", 0), "episode_index: 0, not 1"),
+        (change_json("info.json", "fps", 5), "info.json: 5, not 10"),
+        (change_json("stats.json", "action", {}), "stats.json: the fields [], not"),
+        (change_json("info.json", "more", 1), "info.json: the fields"),
+        (lambda folder: (folder / "meta/tasks.parquet").unlink(), "there is no such file"),
+        (lambda folder: (folder / "data/chunk-000/file-000.parquet").write_bytes(b"x"), "damaged"),
+        (
+            lambda folder: shutil.copy(
+                folder / "meta/tasks.parquet", folder / "data/chunk-000/file-000.parquet"
+            ),
+            "other columns or sizes",
+        ),
+        (lambda folder: (folder / "data/more.parquet").write_bytes(b"x"), "an unknown file"),
+    ],
+)
+def test_lerobots_layout_is_compared(
+    copy: Path, change: Callable[[Path], None], expected: str
+) -> None:
+    change(copy / "lerobot" / "husky_ur5e")
+    found = check_lerobot((str(copy), "husky_ur5e"))
+    assert found
+    assert any(expected in problem for problem in found), found
 
 
 def test_page_shows_statistics_and_pictures(copy: Path, tmp_path: Path) -> None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
+import contextlib
 import itertools
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -13,27 +12,29 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.datasets.dataset import Dataset
+from vkc_pin.datasets.dataset import Dataset, read_table
 from vkc_pin.datasets.diversity import (
     DuplicateFinder,
     compute_winding_numbers,
     sample_coarse_trajectory,
 )
 from vkc_pin.datasets.episode import Episode, compute_scene_name
-from vkc_pin.datasets.formats.hdf5 import read_episodes, read_numbers
-from vkc_pin.datasets.problems import resolve_episode_terms
+from vkc_pin.datasets.formats.hdf5 import Shard, open_shard, read_episodes, read_numbers
+from vkc_pin.datasets.formats.lerobot import find_differences
+from vkc_pin.datasets.problems import describe_problem, resolve_episode_terms
 from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
 from vkc_pin.datasets.statistics import make_statistics_page
-from vkc_pin.errors import InputError, VkcError
-from vkc_pin.utils.arguments import check_integer
+from vkc_pin.errors import VkcError, format_value
+from vkc_pin.utils.arguments import check_integer, is_number
 from vkc_pin.utils.parallel.engine import CrashedTask, is_dask_installed, run_tasks
-from vkc_pin.world.files.documents import read_text
+from vkc_pin.validation.validate import validate
 from vkc_pin.world.files.writing import check_inside, check_writable, write_atomically
 
 __all__ = ["DatasetCheck", "check_dataset"]
 
 _LISTED = 20  # problems in the text
 _PICTURES = 10  # episodes on the statistics page
+_TOLERANCE = 1e-5  # of metrics, as on another machine; relative, and [m] or [s]
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,10 @@ def check_dataset(
     """Validate every episode of a dataset again, and write a page of statistics.
 
     The check is independent of planning: scenes are built from their files by content, trajectories
-    are read from the shards, and the independent validation checks both.
+    are read from the shards, and the independent validation checks both. Everything else that a
+    learner reads is made again from scene, steps and trajectory, and compared: samples, masks and
+    descriptions in the shards, LeRobot's layout, and episodes.csv. Of camera images only the sizes
+    are compared, and in LeRobot's layout the pixels with those of the shards.
 
     Args:
         folder: The dataset.
@@ -130,12 +134,17 @@ def check_dataset(
             bar.update()
     records = [record for k in sorted(found) for record in found[k][0]]
     problems = [text for k in sorted(found) for text in found[k][1]]
-    problems += _check_consistency(dataset, records)
+    problems += _check_lerobot_folders(dataset, jobs)
+    failures: list[dict[str, str]] = []
+    with _collect_errors(problems, "episodes.csv"):
+        problems += _check_consistency(dataset, records)
+    with _collect_errors(problems, "failures.csv"):
+        failures = read_table(dataset.folder / "failures.csv")
     refused = {record["number"]: record["refused"] for record in records if record["refused"]}
-    failures = _read_table(dataset.folder / "failures.csv")
-    chosen = np.random.default_rng(seed).permutation(len(records))[:_PICTURES]
+    valid = [record["number"] for record in records if not record["refused"]]
+    chosen = np.random.default_rng(seed).permutation(len(valid))[:_PICTURES]
     intact_shards = [shard for k, shard in enumerate(shards) if not found[k][1]]
-    shown_episodes = _read_selected(dataset, intact_shards, {records[k]["number"] for k in chosen})
+    shown_episodes = _read_selected(dataset, intact_shards, {valid[k] for k in chosen})
     text = make_statistics_page(
         dataset.recipe, records, failures, shown_episodes, refused, problems
     )
@@ -153,43 +162,130 @@ def check_shard(
     Args:
         task: The shard, the folder of its scenes, and its recipe's document.
     """
-    shard, scenes, recipe = Path(task[0]), Path(task[1]), load_recipe(task[2])
-    records: list[dict[str, Any]] = []
+    path, scenes, recipe = Path(task[0]), Path(task[1]), load_recipe(task[2])
+    records, problems = list[dict[str, Any]](), list[str]()
+    name = f"{path.parent.name}/{path.name}"  # for messages
+    with _collect_errors(problems, name), open_shard(path, scenes) as shard:
+        for k in range(len(shard)):
+            with _collect_errors(problems, name):
+                records.append(_check_episode(shard, k, recipe, path.parent.name))
+        found = shard.find_shard_differences(path.parent.name, recipe)
+        problems += [f"{name}: {difference}" for difference in found]
+    return records, problems
+
+
+@contextlib.contextmanager
+def _collect_errors(problems: list[str], name: str) -> Iterator[None]:
+    """Add errors to problems, so that one file or episode does not end the check of others."""
     try:
-        for episode in read_episodes(shard, scenes):
-            records.append(_check_episode(episode, recipe))
-    except (VkcError, OSError) as error:
-        return records, [f"{shard.name}: {error}"]
-    return records, []
+        yield
+    except VkcError as error:
+        problems.append(str(error))
+    except Exception as error:  # whatever a file of others contains
+        problems.append(f"{name}: {type(error).__name__}: {error}")
 
 
-def _check_episode(episode: Episode, recipe: Recipe) -> dict[str, Any]:
+def _check_episode(shard: Shard, k: int, recipe: Recipe, robot: str) -> dict[str, Any]:
     """Return the record of an episode; "refused" is the reason if it is invalid, else ""."""
-    about = dict(episode.about)
-    motion = episode.trajectory
-    refused, winding, start = "", {}, motion.positions[0]
-    try:
+    episode = shard.read(k)
+    motion, reasons = episode.trajectory, list[str]()
+    winding: dict[str, int] = {}
+    start, fields = motion.positions[0], ("task", "room", "object", "kind", "attachment")
+    about: dict[str, Any] = {**dict.fromkeys(fields, ""), "goal": []}
+    with _collect_errors(reasons, "episode"):
         scene = episode.scene()
-        report = episode.validate()
-        reasons = [str(violation) for violation in report.violations] + report.contradictions(
-            episode.claimed
+        start, winding = scene.start, compute_winding_numbers(scene, motion)
+        about = describe_problem(scene, episode.steps)
+        about["variant"] = episode.number % recipe.fields.variants
+        report = validate(scene, episode.steps, motion, episode.options, episode.terms)
+        reasons += [str(violation) for violation in report.violations]
+        reasons += report.contradictions(episode.claimed)
+        reasons += _find_false_claims(
+            episode.about,
+            {**about, "robot": robot},
+            {**motion.metrics(), **report.measures()},
         )
+        if episode.document["robot"]["name"] != robot:
+            got = format_value(episode.document["robot"]["name"])
+            reasons.append(f"its scene is for the robot {got}, not {robot}")
         if episode.terms != resolve_episode_terms(recipe, scene, about):
             reasons.append("its terms differ from those of the recipe")
-        refused, winding = "; ".join(reasons[:3]), compute_winding_numbers(scene, motion)
-        start = scene.start
-    except VkcError as error:
-        refused = str(error)
+        reasons += shard.find_differences(k, episode, scene.robot, recipe.fields.rate)
+    clearance = episode.claimed.clearance
     return {
-        **{key: value for key, value in about.items() if key != "metrics"},
-        **about.get("metrics", {}),
+        **about,
+        **motion.metrics(),
+        **({"clearance": clearance} if np.isfinite(clearance) else {}),
+        "robot": robot,
         "number": episode.number,
         "scene": compute_scene_name(episode.document),
         "start": np.asarray(start).round(4).tolist(),
+        "waypoints": len(motion.times),
         "way": sample_coarse_trajectory(motion),
         "winding": sorted(winding.items()),
-        "refused": refused,
+        "refused": "; ".join(reasons[:3]),
     }
+
+
+def _find_false_claims(
+    claims: Mapping[str, Any], truth: Mapping[str, Any], metrics: Mapping[str, float]
+) -> list[str]:
+    """Return false values of an episode's `about`.
+
+    Args:
+        claims: See `Episode.about`.
+        truth: True values.
+        metrics: True metrics, of which the claims have some.
+    """
+    claims, claimed = dict(claims), claims.get("metrics")
+    claims.pop("metrics", None)
+    numbers = claimed if isinstance(claimed, dict) else {}
+    found = [
+        f"about.{name} is {format_value(claims.get(name))}, not {format_value(truth.get(name))}"
+        for name in {**truth, **claims}
+        if name not in claims or name not in truth or claims[name] != truth[name]
+    ]
+    if claimed is not numbers:
+        found.append(f"about.metrics are {format_value(claimed)}")
+    for name, value in numbers.items():
+        known = metrics.get(name, value if name == "evaluations" else np.nan)
+        if not is_number(value) or not abs(value - known) <= _TOLERANCE * max(1.0, abs(known)):
+            got = format_value(value)
+            found.append(f"about.metrics.{name} is {got}, not {format_value(known)}")
+    return found
+
+
+def check_lerobot(task: tuple[str, str]) -> list[str]:
+    """Return problems of the episodes of a robot in LeRobot's layout.
+
+    Args:
+        task: The dataset, and the robot.
+    """
+    dataset, robot = Dataset.open(task[0]), task[1]
+    problems: list[str] = []
+    with _collect_errors(problems, f"lerobot/{robot}"):
+        found = find_differences(
+            dataset.folder / "lerobot" / robot, dataset.episodes(robot), dataset.recipe.fields.rate
+        )
+        problems += [f"lerobot/{robot}/{difference}" for difference in found]
+    return problems
+
+
+def _check_lerobot_folders(dataset: Dataset, jobs: int) -> Iterator[str]:
+    """Yield problems of the episodes in LeRobot's layout, if there are any."""
+    folder = dataset.folder / "lerobot"
+    if not folder.exists():
+        return
+    names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    for name in sorted(names - set(dataset.robots)):
+        yield f"lerobot/{name}: there are no episodes of this robot"
+    for name in sorted(set(dataset.robots) - names):
+        yield f"lerobot/{name}: missing"
+    tasks = ((name, (str(dataset.folder), name)) for name in dataset.robots if name in names)
+    found = dict(run_tasks(check_lerobot, tasks, jobs=jobs, dask=is_dask_installed()))
+    for name in sorted(found):
+        result = found[name]
+        yield from [result.reason] if isinstance(result, CrashedTask) else result
 
 
 def _check_consistency(dataset: Dataset, records: list[dict[str, Any]]) -> Iterator[str]:
@@ -203,19 +299,25 @@ def _check_consistency(dataset: Dataset, records: list[dict[str, Any]]) -> Itera
         duplicate = finder.find_duplicate(record)
         if duplicate is not None and duplicate != record["number"]:
             yield f"episode {record['number']} is nearly the same as {duplicate}"
-    table = {int(row["number"]) for row in _read_table(dataset.folder / "episodes.csv")}
-    if table != set(counts):
+    table = {int(row["number"]): row for row in read_table(dataset.folder / "episodes.csv")}
+    if set(table) != set(counts):
         yield f"episodes.csv names {len(table)} episodes, the shards have {len(counts)}"
+    for record in records:
+        row = table.get(record["number"], {})
+        for name in row:
+            if name in record and not _is_cell_of(row[name], record[name]):
+                got, expected = format_value(row[name]), format_value(record[name])
+                yield f"episodes.csv: {name} of episode {record['number']} is {got}, not {expected}"
 
 
-def _read_table(path: Path) -> list[dict[str, str]]:
-    """Return the rows of a table that `generate` wrote."""
-    if not path.is_file():
-        return []
+def _is_cell_of(text: str, value: Any) -> bool:
+    """Return whether a cell of a table shows a value, up to the rounding of numbers."""
+    if not isinstance(value, float):
+        return text == str(value)
     try:
-        return list(csv.DictReader(io.StringIO(read_text(path, "CSV"))))
-    except csv.Error as error:
-        raise InputError("the file is not a CSV table", file=path, got=str(error)) from error
+        return abs(float(text) - value) <= 2.0 * _TOLERANCE * max(1.0, abs(value))
+    except ValueError:
+        return False
 
 
 def _read_selected(dataset: Dataset, shards: Iterable[Path], numbers: set[int]) -> list[Episode]:

@@ -4,20 +4,34 @@ from __future__ import annotations
 
 import csv
 import io
+import re
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Self
+
+from pydantic import BaseModel, Field, model_validator
 
 from vkc_pin.datasets.diversity import DuplicateFinder
 from vkc_pin.datasets.episode import Episode, get_work_file
 from vkc_pin.datasets.formats.hdf5 import read_episodes, read_numbers, write_shard
 from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError
+from vkc_pin.world.files.documents import Document, parse_document, read_text
+from vkc_pin.world.files.fields import make_validation_error
 from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.writing import check_name, write_atomically
 
-__all__ = ["EPISODES_A_SHARD", "Dataset", "Register", "write_table"]
+__all__ = [
+    "EPISODES_A_SHARD",
+    "Dataset",
+    "Register",
+    "check_attempt",
+    "read_intact_numbers",
+    "read_table",
+    "write_table",
+]
 
 EPISODES_A_SHARD = 100
 """Episodes in one shard; the last one of each robot may have fewer."""
@@ -26,6 +40,80 @@ _COLUMNS = (
     *("variant", "status", "reason", "duration", "base_path_length", "arm_path_length"),
     *("clearance", "waypoints", "scene", "seconds", "planning_time"),
 )
+
+_Text = Annotated[str, Field(strict=True)]
+_Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+_Measured = Annotated[float, Field(strict=True, ge=0.0, allow_inf_nan=False)]
+_Count = Annotated[int, Field(strict=True, ge=0)]
+
+
+class _AttemptSchema(BaseModel):
+    """The record of an attempt: the fields that are used; there are others for statistics."""
+
+    number: _Count
+    success: Annotated[bool, Field(strict=True)]
+    status: _Text
+    reason: _Text = ""
+    task: _Text | None = None
+    robot: _Text | None = None
+    room: _Text | None = None
+    object: _Text | None = None
+    kind: _Text | None = None
+    attachment: _Text | None = None
+    joint: _Text | None = None
+    goal: _Finite | list[_Finite] | None = None
+    variant: _Count | None = None
+    scene: _Text | None = None
+    start: list[_Finite] | None = None
+    way: list[list[_Finite]] | None = None
+    waypoints: _Count | None = None
+    duration: _Measured | None = None
+    base_path_length: _Measured | None = None
+    arm_path_length: _Measured | None = None
+    clearance: _Finite | None = None
+    seconds: _Measured | None = None
+    planning_time: _Measured | None = None
+    cpu_time: _Measured | None = None
+
+    @model_validator(mode="after")
+    def _check_success(self) -> Self:
+        needed = ("task", "robot", "room", "object", "kind", "goal", "scene", "way", "duration")
+        missing = [name for name in needed if getattr(self, name) is None]
+        if self.success and missing:
+            raise make_validation_error(f"{missing[0]} is missing", "that of an episode")
+        if self.way is not None and (not self.way or len({len(row) for row in self.way}) > 1):
+            raise make_validation_error("`way` is no table", "rows of equal length")
+        return self
+
+
+def check_attempt(key: str, records: list[dict[str, Any]]) -> None:
+    """Check the record of an attempt in a journal.
+
+    Raises:
+        InputError: There is not one record, its number is not its key, or a field is invalid.
+    """
+    if len(records) != 1:
+        raise InputError("wrong number", field="records", expected="one", got=len(records))
+    if records[0].get("success"):
+        check_name(records[0].get("robot"), "robot")
+    record = parse_document(Document(records[0]), _AttemptSchema)
+    if str(record.number) != key:
+        expected = f"{key}, as the line's key"
+        raise InputError("another number", field="number", expected=expected, got=record.number)
+
+
+def read_intact_numbers(file: Path) -> list[int]:
+    """Return the numbers of the episodes in a shard or work file; none if there is no valid file.
+
+    A damaged file counts as removed: its episodes are made again. A warning names it.
+    """
+    if not file.exists():
+        return []
+    try:
+        return read_numbers(file)
+    except InputError as error:
+        warnings.warn(f"{error}; its episodes are made again", stacklevel=2)
+        return []
 
 
 @dataclass(frozen=True)
@@ -65,14 +153,20 @@ class Dataset:
         """Return the numbers of all episodes, shard by shard."""
         return [number for shard in self.shards for number in read_numbers(shard)]
 
-    def episodes(self) -> Iterator[Episode]:
-        """Yield all episodes, shard by shard, reading one at a time.
+    @property
+    def robots(self) -> list[str]:
+        """Names of the robots that have episodes."""
+        return sorted({shard.parent.name for shard in self.shards})
+
+    def episodes(self, robot: str | None = None) -> Iterator[Episode]:
+        """Yield all episodes, or those of a robot, shard by shard, reading one at a time.
 
         Raises:
             InputError: A file is damaged.
         """
         for shard in self.shards:
-            yield from read_episodes(shard, self.folder / "scenes")
+            if robot in (None, shard.parent.name):
+                yield from read_episodes(shard, self.folder / "scenes")
 
 
 class Register:
@@ -141,13 +235,11 @@ class Register:
         numbers = self._shards[folder][k * EPISODES_A_SHARD : (k + 1) * EPISODES_A_SHARD]
         path = folder / f"shard-{k:05d}.hdf5"
         files = [get_work_file(self.dataset.folder, number) for number in numbers]
-        existing = read_numbers(path) if path.is_file() else []
+        existing = read_intact_numbers(path)
         if existing != numbers:
             # Episodes whose work file was removed may be in the shard that is replaced.
             parts = [
-                (file, 0)
-                if file.is_file() or number not in existing
-                else (path, existing.index(number))
+                (path, existing.index(number)) if number in existing else (file, 0)
                 for file, number in zip(files, numbers, strict=True)
             ]
             write_shard(path, parts, self.dataset.folder / "scenes")
@@ -168,3 +260,26 @@ def write_table(path: Path, records: Sequence[Mapping[str, Any]]) -> Path:
     writer.writeheader()
     writer.writerows(records)
     return write_atomically(path, buffer.getvalue().encode())
+
+
+def read_table(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a table of `write_table`; none if there is no such file.
+
+    Raises:
+        InputError: The file is no such table.
+    """
+    if not path.is_file():
+        return []
+    expected = "the columns and whole numbers that `generate` writes"
+    try:
+        table = csv.DictReader(io.StringIO(read_text(path, "CSV")), strict=True)
+        rows = list(table)
+    except csv.Error as error:
+        raise InputError("not a CSV table", file=path, got=str(error)) from error
+    if tuple(table.fieldnames or ()) != _COLUMNS:
+        raise InputError("wrong columns", file=path, expected=expected, got=table.fieldnames)
+    for line, row in enumerate(rows, start=2):
+        is_whole = None not in row and None not in row.values()
+        if not is_whole or not re.fullmatch(r"\d{1,18}", row["number"], re.ASCII):
+            raise InputError("an invalid row", file=path, line=line, expected=expected)
+    return rows

@@ -25,7 +25,7 @@ from vkc_pin.planning.planner import Planner, plan
 from vkc_pin.simulation.cameras.images import Images, render_images
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.simulation.result import SimulationResult
-from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.arrays import Floats, replace_infinite
 from vkc_pin.utils.parallel.machine import (
     identify_process,
     measure_peak_memory,
@@ -38,7 +38,7 @@ from vkc_pin.world.files.writing import check_name
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step, step_from_dict, step_to_dict
 from vkc_pin.world.task.terms import Term, term_from_dict, term_to_dict
-from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.trajectory import MOST_SAMPLES, Trajectory
 
 __all__ = [
     "Episode",
@@ -232,8 +232,16 @@ def _record_simulation(executed: SimulationResult) -> dict[str, Any]:
 
 
 def sample_times(motion: Trajectory, rate: float) -> Floats:
-    """Return the sampling times of a trajectory at a rate [Hz], shape (N,) [s]."""
-    count = int(np.ceil((motion.times[-1] - motion.times[0]) * rate)) + 1
+    """Return the sampling times of a trajectory at a rate [Hz], shape (N,) [s].
+
+    Raises:
+        InputError: There are too many.
+    """
+    count = np.ceil((motion.times[-1] - motion.times[0]) * rate) + 1.0
+    if count > MOST_SAMPLES:
+        expected = f"a motion of at most {MOST_SAMPLES} samples at {rate:g} Hz"
+        raise InputError("too long a motion", field="motion", expected=expected, got=f"{count:g}")
+    count = int(count)
     return np.minimum(motion.times[0] + np.arange(count) / rate, motion.times[-1])
 
 
@@ -293,14 +301,8 @@ def pack(
         "terms": [term_to_dict(term) for term in plan_result.terms],
         "options": asdict(plan_result.options),
         "motion": motion,
-        "validation": {
-            **plan_result.report.to_dict(),
-            "clearance": _finite_or_none(plan_result.report.clearance),
-        },
+        "validation": replace_infinite(plan_result.report.to_dict()),
     }
-    data["validation"]["clearances"] = [
-        _finite_or_none(value) for value in plan_result.report.clearances
-    ]
     buffer = io.BytesIO()
     seen: Any = {"images": np.frombuffer(images, np.uint8)} if images else {}
     np.savez_compressed(
@@ -324,10 +326,6 @@ def pack(
 def _round_to_grid(values: Any) -> Floats:
     """Return numbers rounded to multiples of `_GRID`."""
     return np.round(np.array(values, float) / _GRID) * _GRID
-
-
-def _finite_or_none(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def unpack(data: bytes, robots: Path | None = None) -> Episode:
@@ -377,7 +375,12 @@ def make_episode(
             terms=tuple(term_from_dict(term) for term in data.get("terms", ())),
             robots=robots,
         )
-    except (LookupError, TypeError, AttributeError) as error:
+    except InputError:
+        raise
+    except (
+        *(LookupError, TypeError, AttributeError, ValueError),
+        *(OverflowError, RecursionError, MemoryError),
+    ) as error:
         raise InputError(
             "the data are not an episode",
             expected="an episode written by `generate`",

@@ -6,7 +6,6 @@ import contextlib
 import itertools
 import sys
 import time
-import warnings
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence, Set
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 import yaml
 from tqdm import tqdm
 
-from vkc_pin.datasets.dataset import Dataset, Register
+from vkc_pin.datasets.dataset import Dataset, Register, check_attempt, read_intact_numbers
 from vkc_pin.datasets.episode import Made, get_work_file
 from vkc_pin.datasets.formats import hdf5
 from vkc_pin.datasets.formats import lerobot as lerobot_layout
@@ -42,6 +41,7 @@ from vkc_pin.world.task.terms import Term
 __all__ = ["generate"]
 
 _MAX_ATTEMPTS_PER_EPISODE = 4  # attempts per requested episode, after which generation fails
+_MAX_AHEAD = 10  # attempts that are started, as a multiple of those after which generation fails
 _MIN_ATTEMPTS = 40  # attempts before generation may fail
 _WATCHDOG = 3.0  # multiple of the planning time limit after which a process is terminated
 
@@ -109,7 +109,7 @@ def generate(  # noqa: PLR0913 - keyword options of a public call
                 check_replaceable(robot)
         _prepare_folder(folder, loaded)
         dataset = Dataset(folder, loaded)
-        numbers = dataset.numbers()
+        numbers = {n for shard in dataset.shards for n in read_intact_numbers(shard)}
         if (existing := len(numbers)) > wanted:
             raise InputError(
                 "the dataset already has more episodes",
@@ -119,7 +119,7 @@ def generate(  # noqa: PLR0913 - keyword options of a public call
                 got=wanted,
             )
         register = Register(dataset, wanted)
-        for key in _find_lost(dataset, journal, set(numbers)):
+        for key in _find_lost(dataset, journal, numbers):
             del journal.lines[key]  # they are generated again
         for key in sorted(journal.lines, key=int):
             register.add(_get_record(journal, key))
@@ -165,11 +165,14 @@ def _open_journal(folder: Path, recipe: Recipe) -> Iterator[Journal]:
         )
     if folder.is_dir():
         check_links(folder)
+        for name in ("lerobot", "robots", "scenes", "shards", "work"):
+            if (folder / name).exists() and not (folder / name).is_dir():
+                raise InputError("this is no folder", file=folder / name, expected="a folder")
     check_writable(file)
     folder.mkdir(parents=True, exist_ok=True)
     header = {"settings": {"recipe": recipe.digest}, "versions": find_versions()}
     with file.open("a+b") as stream:
-        yield Journal(file, stream, header, "episodes")
+        yield Journal(file, stream, header, "episodes", check_attempt)
 
 
 def _prepare_folder(folder: Path, recipe: Recipe) -> None:
@@ -189,12 +192,13 @@ def _get_record(journal: Journal, key: str) -> dict[str, Any]:
 
 def _find_lost(dataset: Dataset, journal: Journal, existing: Set[int]) -> list[str]:
     """Return successful episodes of the journal that neither a shard nor a work file holds."""
-    succeeded = [
+    return [
         key
         for key in journal.lines
-        if int(key) not in existing and _get_record(journal, key)["success"]
+        if int(key) not in existing
+        and _get_record(journal, key)["success"]
+        and read_intact_numbers(get_work_file(dataset.folder, int(key))) != [int(key)]
     ]
-    return [key for key in succeeded if not get_work_file(dataset.folder, int(key)).is_file()]
 
 
 def _run_attempts(
@@ -266,6 +270,8 @@ def _iterate_tasks(
             yield str(number), (document, [number], robots)
         if register.full or register.decided >= max_attempts:
             return
+        if block * size >= _MAX_AHEAD * max_attempts:  # none is decided: a result is missing
+            return
         numbers = range(block * size, (block + 1) * size)
         missing = [number for number in numbers if str(number) not in journal.lines]
         if missing:
@@ -335,19 +341,9 @@ def _write_card(dataset: Dataset, register: Register) -> None:
 
 def _write_lerobot(dataset: Dataset) -> None:
     """Write the episodes of every robot in LeRobot's layout."""
-    for shards in sorted((dataset.folder / "shards").iterdir()):
-        entries = (
-            episode
-            for shard in sorted(shards.glob("*.hdf5"))
-            for episode in hdf5.read_episodes(shard, dataset.folder / "scenes")
-        )
-        first = next(entries)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            robot = first.scene().robot
+    for robot in dataset.robots:
         lerobot_layout.write_lerobot(
-            dataset.folder / "lerobot" / shards.name,
-            itertools.chain([first], entries),
-            robot,
+            dataset.folder / "lerobot" / robot,
+            dataset.episodes(robot),
             dataset.recipe.fields.rate,
         )

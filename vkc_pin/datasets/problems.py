@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,19 +14,26 @@ import numpy as np
 from vkc_pin.datasets.grasping import find_grasping_start
 from vkc_pin.datasets.recipes.recipe import Recipe, get_robot_name, load_recipe
 from vkc_pin.datasets.recipes.terms import resolve_terms
-from vkc_pin.errors import VkcError
+from vkc_pin.errors import InputError, VkcError
 from vkc_pin.options import Options
 from vkc_pin.planning.planner import Planner
 from vkc_pin.procedural.rooms.parts import CARRIED, Part
 from vkc_pin.procedural.rooms.random_room import Layout, sample_layout
 from vkc_pin.procedural.rooms.settings import RoomSettings
 from vkc_pin.procedural.tasks import goals
+from vkc_pin.utils.arguments import check_choice
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step
 from vkc_pin.world.task.terms import Term
 
-__all__ = ["NoProblemError", "Problem", "resolve_episode_terms", "sample_problem"]
+__all__ = [
+    "NoProblemError",
+    "Problem",
+    "describe_problem",
+    "resolve_episode_terms",
+    "sample_problem",
+]
 
 _CACHED_ROOMS = 48  # rooms in a process's cache
 _STARTS = 300  # sampled start poses
@@ -106,11 +113,11 @@ def sample_problem(
             entry.height,
         )
         robot = entry.name
-    about: dict[str, Any] = {"task": task, "robot": get_robot_name(robot), "room": place.scene.name}
-    scene, steps, sampled = (_sample_fetch_task if task == "fetch-place" else _sample_open_task)(
+    about: dict[str, Any] = {"task": task, "robot": get_robot_name(robot)}
+    scene, steps = (_sample_fetch_task if task == "fetch-place" else _sample_open_task)(
         recipe, place, rng, task == "given-open", planner
     )
-    about |= {**sampled, "variant": variant}
+    about |= {**describe_problem(scene, steps), "variant": variant}
     return Problem(
         number,
         scene,
@@ -120,6 +127,37 @@ def sample_problem(
         about,
         resolve_episode_terms(recipe, scene, about),
     )
+
+
+def describe_problem(scene: Scene, steps: Sequence[Step]) -> dict[str, Any]:
+    """Return the sampled values that follow from scene and steps, as plain data.
+
+    Raises:
+        InputError: The steps are of no task.
+    """
+    goal: float | list[float]
+    match steps:
+        case [Actuate(joints={**joints}) as step] if len(joints) == 1:
+            ((joint, goal),) = joints.items()
+            task = "given-open" if step.object in scene.held else "drive-open"
+        case [Grasp() as step, Place(object=name, pose=tuple() as point)] if name == step.object:
+            joint, goal, task = "", list(point), "fetch-place"
+        case _:
+            expected = "one Actuate of one joint, or Grasp and Place of one object"
+            raise InputError("steps of no task", field="steps", expected=expected, got=steps)
+    check_choice(step.object, scene.objects, "object", "steps")
+    item = scene.objects[step.object].object
+    stem, _, number = item.name.rpartition("_")
+    kind = stem if joint and number.isdigit() else item.name
+    return {
+        "task": task,
+        "room": scene.name,
+        "object": step.object,
+        "kind": kind,
+        "attachment": step.attachment,
+        "joint": joint,
+        "goal": goal,
+    }
 
 
 def resolve_episode_terms(
@@ -175,8 +213,8 @@ def _make_place(recipe_json: str, room: int, robot: str, height: float | None) -
 
 def _sample_open_task(
     recipe: Recipe, place: _Place, rng: np.random.Generator, given: bool, planner: Planner
-) -> tuple[Scene, tuple[Step, ...], dict[str, Any]]:
-    """Return scene, steps and sampled values of a task that opens or closes something."""
+) -> tuple[Scene, tuple[Step, ...]]:
+    """Return scene and steps of a task that opens or closes something."""
     scene, fields = place.scene, recipe.fields
     share = round(float(rng.uniform(*fields.goal.share)), 4)
     offered = [step for step in goals(scene, share=share) if isinstance(step, Actuate)]
@@ -197,7 +235,6 @@ def _sample_open_task(
         ]
         attachment = str(rng.choice(sorted(names_on_link)))
     step = Actuate(name, step.joints, attachment)
-    ((joint, goal),) = step.joints.items()
     if given:
         terms = resolve_terms(recipe.select_terms("given-open"), scene, name, attachment)
         found = find_grasping_start(scene, step, rng, recipe.options, planner, terms)
@@ -206,18 +243,13 @@ def _sample_open_task(
         scene = found
     else:
         scene = _sample_start(recipe, place, rng, scene.objects[name].placement.translation)
-    kind = _get_kind(recipe, item.name)
-    return (
-        scene,
-        (step,),
-        {"object": name, "kind": kind, "attachment": attachment, "joint": joint, "goal": goal},
-    )
+    return scene, (step,)
 
 
 def _sample_fetch_task(
     recipe: Recipe, place: _Place, rng: np.random.Generator, given: bool, planner: Planner
-) -> tuple[Scene, tuple[Step, ...], dict[str, Any]]:
-    """Return scene, steps and sampled values of a task that moves an object to another table."""
+) -> tuple[Scene, tuple[Step, ...]]:
+    """Return scene and steps of a task that moves an object to another table."""
     scene, layout, fields = place.scene, place.layout, recipe.fields
     assert layout is not None  # recipes of scene files do not fetch
     free = [name for name, placed in scene.objects.items() if placed.object.free]
@@ -235,14 +267,7 @@ def _sample_fetch_task(
     table = others[int(rng.integers(len(others)))]
     target = _sample_position_on_table(table, placed.object.name, rng, fields.goal.edge)
     scene = _sample_start(recipe, place, rng, placed.placement.translation)
-    values = {
-        "object": name,
-        "kind": placed.object.name,
-        "attachment": attachment,
-        "joint": "",
-        "goal": list(target),
-    }
-    return scene, (Grasp(name, attachment), Place(name, target)), values
+    return scene, (Grasp(name, attachment), Place(name, target))
 
 
 def _sample_position_on_table(
@@ -290,10 +315,3 @@ def _is_connected(place: _Place, base: Floats) -> bool:
         part.standing_place for part in place.layout.parts if part.standing_place is not None
     ]
     return place.layout.floor.is_connected(standing, place.layout.radius, [*standing_places, where])
-
-
-def _get_kind(recipe: Recipe, object_name: str) -> str:
-    """Return the kind of an object from the name in its description."""
-    return (
-        object_name.rpartition("_")[0] if object_name.rpartition("_")[2].isdigit() else object_name
-    )

@@ -7,6 +7,7 @@ itself is in double precision under `motion`.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import io
 import json
@@ -16,23 +17,36 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
 
 from vkc_pin.datasets.episode import Episode, compute_scene_name, make_episode
+from vkc_pin.datasets.formats.hdf5_reader import Group, open_hdf5, require_h5py
 from vkc_pin.datasets.formats.samples import sample_episode
-from vkc_pin.errors import InputError
+from vkc_pin.datasets.recipes.recipe import Recipe
+from vkc_pin.errors import InputError, format_value
 from vkc_pin.simulation.cameras.images import Images
-from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.utils.optional_imports import import_optional
-from vkc_pin.world.files.documents import parse_json, read_text
+from vkc_pin.utils.arrays import Floats, Ints, replace_infinite
+from vkc_pin.world.files.documents import Document, parse_document, parse_json, read_text
+from vkc_pin.world.files.fields import Name, Schema
 from vkc_pin.world.files.writing import check_name, write_atomically
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.task.steps import step_to_dict
 from vkc_pin.world.task.terms import term_to_dict
+from vkc_pin.world.trajectory.formats.archives import MotionSchema, ReportSchema
 
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["make_part", "read_episodes", "read_numbers", "require_h5py", "write_shard"]
+__all__ = [
+    "Shard",
+    "make_part",
+    "open_shard",
+    "read_episodes",
+    "read_numbers",
+    "require_h5py",
+    "write_shard",
+]
 
 _OBSERVED = (
     *("base_pose", "base_velocity", "arm_position", "arm_velocity"),
@@ -40,15 +54,20 @@ _OBSERVED = (
 )
 _ENVIRONMENT = "vkc_pin"
 _HELD_OUT = 10  # every so many an episode is in mask/valid, the others are in mask/train
-
-
-def require_h5py() -> Any:
-    """Return h5py.
-
-    Raises:
-        InputError: It is not installed.
-    """
-    return import_optional("h5py", "data", purpose="a dataset")
+# Type and number of axes of an episode's samples, of the arrays of its motion, and of images by the
+# end of their names.
+_SAMPLED = {"actions": ("f4", 2), "states": ("f4", 2), "rewards": ("f4", 1), "dones": ("u1", 1)}
+_MOTION = {
+    "times": ("f8", 1),
+    "positions": ("f8", 2),
+    "waypoints": ("i4", 1),
+    "knot_times": ("f8", 1),
+    "knot_positions": ("f8", 2),
+    "knot_rates": ("f8", 2),
+}
+_IMAGES = {"_image": ("u1", 4), "_depth": ("u2", 3), "_segmentation": ("u2", 3)}
+_MAX_IMAGES = 4_000_000_000  # [bytes] of a camera in an episode
+_TOLERANCE = 1e-5  # of single precision, and of other machines; relative, and [m] or [rad]
 
 
 def write_shard(path: Path, parts: Sequence[tuple[Path, int]], scenes: Path) -> Path:
@@ -63,25 +82,24 @@ def write_shard(path: Path, parts: Sequence[tuple[Path, int]], scenes: Path) -> 
     """
     h5py = require_h5py()
     buffer = io.BytesIO()
-    masks: dict[str, list[str]] = {"train": [], "valid": []}
+    numbers: list[int] = []
     total = 0
     with h5py.File(buffer, "w", libver="latest") as file:
         data = file.create_group("data")
         for k, (source, place) in enumerate(parts):
             name = f"demo_{k}"
-            with _opened(source) as found:
-                found.copy(f"data/demo_{place}", data, name=name)
+            with open_hdf5(source) as found:
+                demo = found.open_group("data").open_group(f"demo_{place}")
+                _check_members(demo)
+                _keep_scene(found, _read_scene_name(demo), scenes)
+                found.handle.copy(f"data/demo_{place}", data, name=name)
                 if k == 0:
                     for said in ("options", "env_args"):  # of the recipe, and so of all
-                        data.attrs[said] = found["data"].attrs[said]
-                scene = check_name(data[name].attrs["scene"], f"demo_{place}: scene", file=source)
-                _keep_scene(found, scenes / f"{scene}.json")
-            total += int(data[name].attrs["num_samples"])
-            masks[
-                "valid" if data[name].attrs["number"] % _HELD_OUT == _HELD_OUT - 1 else "train"
-            ].append(name)
+                        data.attrs[said] = found.open_group("data").read_text(said)
+                total += demo.read_integer("num_samples")
+                numbers.append(demo.read_integer("number"))
         data.attrs["total"] = total
-        for mask, names in masks.items():
+        for mask, names in _make_masks(numbers).items():
             file.create_dataset(f"mask/{mask}", data=np.array(names, dtype="S"))
     return write_atomically(path, buffer.getvalue())
 
@@ -101,43 +119,60 @@ def make_part(episode: Episode, robot: Robot, rate: float, recipe: str) -> bytes
         data = file.create_group("data")
         _write(data.create_group("demo_0"), episode, robot, rate)
         data.attrs["options"] = json.dumps(asdict(episode.options), sort_keys=True)
-        settings = {
-            "robot": robot.name,
-            "rate": rate,
-            "recipe": recipe,
-            "scenes": "../../scenes/<scene>.json",
-        }
-        data.attrs["env_args"] = json.dumps(
-            {"env_name": _ENVIRONMENT, "env_type": -1, "env_kwargs": settings}
-        )
+        data.attrs["env_args"] = json.dumps(_make_settings(robot.name, rate, recipe))
         scene = json.dumps(episode.document, sort_keys=True, separators=(",", ":")) + "\n"
         file.create_dataset("scene", data=np.frombuffer(scene.encode(), np.uint8))
     return buffer.getvalue()
 
 
-def _keep_scene(found: h5py.File, path: Path) -> None:
+def _make_settings(robot: str, rate: float, recipe: str) -> dict[str, Any]:
+    """Return the settings of the environment, as robomimic calls them."""
+    settings = {
+        "robot": robot,
+        "rate": rate,
+        "recipe": recipe,
+        "scenes": "../../scenes/<scene>.json",
+    }
+    return {"env_name": _ENVIRONMENT, "env_type": -1, "env_kwargs": settings}
+
+
+def _make_masks(numbers: Sequence[int]) -> dict[str, list[str]]:
+    """Return the demos for training and validation of a shard with these episodes."""
+    masks: dict[str, list[str]] = {"train": [], "valid": []}
+    for k, number in enumerate(numbers):
+        masks["valid" if number % _HELD_OUT == _HELD_OUT - 1 else "train"].append(f"demo_{k}")
+    return masks
+
+
+def _keep_scene(found: Group, name: str, scenes: Path) -> None:
     """Write the scene of an episode unless it exists."""
-    if "scene" in found and not path.is_file():
-        write_atomically(path, found["scene"][:].tobytes())
+    path = scenes / f"{name}.json"
+    if "scene" in found.list_names() and not path.is_file():
+        data = found.read_array("scene", "u1", (None,)).tobytes()
+        _check_scene(parse_json(data.decode(errors="replace"), found.file), name, found.file)
+        write_atomically(path, data)
+
+
+def _make_arrays(episode: Episode, robot: Robot, rate: float) -> dict[str, NDArray[np.generic]]:
+    """Return all that is sampled from a motion, by its place in a demo."""
+    found = sample_episode(episode, robot, rate)
+    done = np.zeros(len(found["time"]), np.uint8)
+    done[-1] = 1
+    arrays = {f"obs/{name}": found[name].astype(np.float32) for name in _OBSERVED}
+    arrays |= {name: found[name].astype(np.float32) for name in ("actions", "states")}
+    return {**arrays, "dones": done, "rewards": done.astype(np.float32)}
 
 
 def _write(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> None:
-    found, motion = sample_episode(episode, robot, rate), episode.trajectory.to_dict()
-    count = len(found["time"])
-    for name in _OBSERVED:
-        _array(group, f"obs/{name}", found[name], np.float32)
-    _array(group, "actions", found["actions"], np.float32)
-    _array(group, "states", found["states"], np.float32)
+    arrays, motion = _make_arrays(episode, robot, rate), episode.trajectory.to_dict()
+    for name, values in arrays.items():
+        _array(group, name, values, values.dtype)
     images = episode.images()
     for name, pixels in (
         {} if images is None else images.pictures.items()
     ):  # a chunk each: loaders read single moments
         squeezed = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
         group.create_dataset(f"obs/{name}", data=pixels, chunks=(1, *pixels.shape[1:]), **squeezed)
-    done = np.zeros(count, np.uint8)
-    done[-1] = 1
-    group.create_dataset("dones", data=done)
-    group.create_dataset("rewards", data=done.astype(np.float32))
     curve = {name: np.array(values) for name, values in motion.pop("curve", {}).items()}
     waypoints = {name: np.array(motion.pop(name)) for name in ("times", "positions")}
     at = _among(curve, waypoints)
@@ -148,10 +183,7 @@ def _write(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> No
         _array(group, "motion/waypoints", at, np.int32)
     for name, values in curve.items():
         _array(group, f"motion/knot_{name}", values, np.float64)
-    report = episode.claimed.to_dict()
-    for name in ("clearance", "clearances"):
-        report[name] = _finite(report[name])
-    group.attrs["num_samples"] = count
+    group.attrs["num_samples"] = len(arrays["dones"])
     group.attrs["number"] = episode.number
     group.attrs["scene"] = compute_scene_name(episode.document)
     group.attrs["task"] = str(episode.about["task"])
@@ -161,7 +193,7 @@ def _write(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> No
         "where": episode.where,
         "steps": [step_to_dict(step) for step in episode.steps],
         "motion": motion,
-        "validation": report,
+        "validation": replace_infinite(episode.claimed.to_dict()),
     }
     if episode.terms:
         said["terms"] = [term_to_dict(term) for term in episode.terms]
@@ -189,97 +221,255 @@ def _array(group: h5py.Group, name: str, values: Any, kind: Any) -> None:
     group.create_dataset(name, data=values, chunks=values.shape if squeezed else None, **squeezed)
 
 
-def _finite(values: Any) -> Any:
-    if isinstance(values, Sequence):
-        return [_finite(value) for value in values]
-    return float(values) if np.isfinite(values) else None
+class _EpisodeSchema(Schema):
+    """The attribute `episode`; scenes, steps and terms check their own parts."""
+
+    about: dict[str, Any]
+    start: dict[str, Any]
+    where: str | None
+    steps: list[dict[str, Any]]
+    motion: MotionSchema
+    validation: ReportSchema
+    terms: list[dict[str, Any]] = Field(default_factory=list)
+    images: list[Name] | None = None
+    segments: list[str] = Field(default_factory=list)
 
 
-def read_numbers(path: Path) -> list[int]:
-    """Return the numbers of a shard's episodes, in order.
-
-    Raises:
-        InputError: The file is no shard.
-    """
-    with _opened(path) as file:
-        return [int(file["data"][f"demo_{k}"].attrs["number"]) for k in range(len(file["data"]))]
-
-
-def read_episodes(path: Path, scenes: Path) -> Iterator[Episode]:
-    """Yield the episodes of a shard, in order.
+class Shard:
+    """An open shard, from this program or another; nothing in it is trusted.
 
     Args:
-        path: Shard.
+        root: Root of its file.
+        scenes: Folder of the dataset's scenes.
+    """
+
+    def __init__(self, root: Group, scenes: Path) -> None:
+        self.file, self._root, self._scenes = root.file, root, scenes
+        self._data = root.open_group("data")
+        self._documents: dict[str, Any] = {}
+
+    def __len__(self) -> int:
+        return len(self._data.list_names())
+
+    def read_number(self, k: int) -> int:
+        """Return the number of episode `k`."""
+        return self._data.open_group(f"demo_{k}").read_integer("number")
+
+    def check_members(self) -> None:
+        """Check that all episodes have the arrays that they must have, and no others."""
+        for k in range(len(self)):
+            _check_members(self._data.open_group(f"demo_{k}"))
+            self.read_number(k)
+
+    def read(self, k: int) -> Episode:
+        """Return episode `k`.
+
+        Raises:
+            InputError: Something in it is missing or invalid.
+        """
+        demo = self._data.open_group(f"demo_{k}")
+        _check_members(demo)
+        name = _read_scene_name(demo)
+        if name not in self._documents:
+            self._documents[name] = _read_scene(self._scenes, name)
+        with Document(None, self.file).annotate_errors((f"demo_{k}",)):
+            options = parse_json(self._data.read_text("options"), self.file)
+            said = _read_description(demo)
+            data = {**said, "options": options, "scene": self._documents[name]}
+            data["number"] = demo.read_integer("number")
+            episode = make_episode(data, _read_motion(demo), self._scenes.parent / "robots")
+        if said["images"] is None:
+            return episode
+        return replace(episode, load_images=functools.partial(_read_images, self.file, k))
+
+    def find_differences(self, k: int, episode: Episode, robot: Robot, rate: float) -> list[str]:
+        """Return what a learner reads of an episode that does not follow from its motion.
+
+        Args:
+            k: Place of the episode.
+            episode: The episode, as read.
+            robot: Its robot.
+            rate: Sampling rate of the recipe [Hz].
+
+        Raises:
+            InputError: An array is missing, or has another type or shape.
+        """
+        demo = self._data.open_group(f"demo_{k}")
+        arrays = _make_arrays(episode, robot, rate)
+        count, found = len(arrays["dones"]), []
+        for name, values in arrays.items():
+            stored = demo.read_array(name, values.dtype.str[1:], values.shape)
+            wrong = ~np.isclose(stored, values, rtol=_TOLERANCE, atol=_TOLERANCE)
+            if wrong.any():
+                row = np.argwhere(wrong)[0].tolist()
+                at = tuple(row)
+                found.append(f"{name}{row} is {stored[at]:.6g}, not {values[at]:.6g} as its motion")
+        _check_images(demo, _read_description(demo)["images"] or [], count)
+        claims = {"num_samples": demo.read_integer("num_samples"), "task": demo.read_text("task")}
+        truth = {"num_samples": count, "task": episode.about.get("task")}
+        return found + _compare(claims, truth)
+
+    def find_shard_differences(self, robot: str, recipe: Recipe) -> list[str]:
+        """Return what a learner reads of the shard as a whole that does not follow from its demos.
+
+        Args:
+            robot: Name of the robot.
+            recipe: Recipe of the dataset.
+        """
+        self._root.check_names(("data", "mask"))
+        demos = [self._data.open_group(f"demo_{k}") for k in range(len(self))]
+        numbers = [demo.read_integer("number") for demo in demos]
+        masks, mask = _make_masks(numbers), self._root.open_group("mask")
+        mask.check_names(tuple(masks))
+        claims: dict[str, Any] = {
+            "total": self._data.read_integer("total"),
+            "env_args": parse_json(self._data.read_text("env_args"), self.file),
+            "options": parse_json(self._data.read_text("options"), self.file),
+            **{
+                f"mask/{name}": [
+                    text.decode(errors="replace")
+                    for text in mask.read_array(name, "S", (None,)).tolist()
+                ]
+                for name in masks
+            },
+        }
+        truth = {
+            "total": sum(demo.read_integer("num_samples") for demo in demos),
+            "env_args": _make_settings(robot, recipe.fields.rate, recipe.digest),
+            "options": asdict(recipe.options),
+            **{f"mask/{name}": names for name, names in masks.items()},
+        }
+        order = [] if numbers == sorted(numbers) else ["its episodes are not in order of number"]
+        return _compare(claims, truth) + order
+
+
+def _compare(claims: Mapping[str, Any], truth: Mapping[str, Any]) -> list[str]:
+    return [
+        f"{name} is {format_value(claims[name])}, not {format_value(value)}"
+        for name, value in truth.items()
+        if claims[name] != value
+    ]
+
+
+@contextlib.contextmanager
+def open_shard(path: Path, scenes: Path) -> Iterator[Shard]:
+    """Open a shard.
+
+    Args:
+        path: Shard, or part of one.
         scenes: Folder of the dataset's scenes.
 
     Raises:
         InputError: The file is damaged or no shard.
     """
-    documents: dict[str, Any] = {}
-    with _opened(path) as file:
-        for k in range(len(file["data"])):
-            try:
-                options = parse_json(str(file["data"].attrs["options"]), path)
-                group = file["data"][f"demo_{k}"]
-                name = check_name(group.attrs["scene"], f"demo_{k}: scene", file=path)
-                if name not in documents:
-                    documents[name] = _document(scenes, name)
-                said = parse_json(str(group.attrs["episode"]), path)
-                arrays = {key: np.array(values) for key, values in group["motion"].items()}
-                if (at := arrays.pop("waypoints", None)) is not None:
-                    arrays |= {key: arrays[f"knot_{key}"][at] for key in ("times", "positions")}
-                number = int(group.attrs["number"])
-            except (LookupError, TypeError, OSError, ValueError) as error:
-                if isinstance(error, InputError):
-                    raise
-                raise InputError(
-                    "not a shard of episodes", file=path, field=f"demo_{k}", got=str(error)
-                ) from error
-            episode = make_episode(
-                {**said, "options": options, "number": number, "scene": documents[name]},
-                arrays,
-                scenes.parent / "robots",
-            )
-            yield (
-                replace(episode, load_images=functools.partial(_images, path, k))
-                if "images" in said
-                else episode
-            )
+    with open_hdf5(path) as root:
+        yield Shard(root, scenes)
 
 
-def _images(path: Path, k: int) -> Images:
-    """Read the camera images of an episode."""
-    with _opened(path) as file:
-        try:
-            group = file["data"][f"demo_{k}"]
-            said = parse_json(str(group.attrs["episode"]), path)
-            return Images(
-                {name: group["obs"][name][:] for name in said["images"]}, tuple(said["segments"])
-            )
-        except (LookupError, TypeError, OSError) as error:
-            raise InputError(
-                "images are missing or damaged", file=path, field=f"demo_{k}", got=str(error)
-            ) from error
+def read_numbers(path: Path) -> list[int]:
+    """Return the numbers of a shard's episodes, in order, whose members are checked.
+
+    Raises:
+        InputError: The file is damaged or no shard.
+    """
+    with open_shard(path, Path()) as shard:
+        shard.check_members()
+        return [shard.read_number(k) for k in range(len(shard))]
 
 
-def _document(scenes: Path, name: str) -> Any:
-    file = scenes / f"{name}.json"
-    document = parse_json(read_text(file, "scene"), file)
-    if compute_scene_name(document) != name:
-        raise InputError(
-            "this scene is not what its name says",
-            file=file,
-            expected=name,
-            got=compute_scene_name(document),
-        )
-    return document
+def read_episodes(path: Path, scenes: Path) -> Iterator[Episode]:
+    """Yield the episodes of a shard, in order; see `open_shard`."""
+    with open_shard(path, scenes) as shard:
+        for k in range(len(shard)):
+            yield shard.read(k)
 
 
-def _opened(path: Path) -> Any:
-    h5py = require_h5py()
+def _check_members(demo: Group) -> None:
+    """Check the names, types and sizes of an episode's arrays; nothing is read."""
+    demo.check_names((*_SAMPLED, "obs", "motion"))
+    for name, (dtype, axes) in _SAMPLED.items():
+        demo.check_array(name, dtype, (None,) * axes)
+    observed = demo.open_group("obs")
+    images = [name for name in observed.list_names() if name.endswith(tuple(_IMAGES))]
+    observed.check_names((*_OBSERVED, *images))
+    for name in _OBSERVED:
+        observed.check_array(name, "f4", (None, None))
+    _check_images(demo, images, None)
+    motion = demo.open_group("motion")
+    motion.check_names(tuple(_MOTION))
+    for name in motion.list_names():
+        dtype, axes = _MOTION[name]
+        motion.check_array(name, dtype, (None,) * axes)
+
+
+def _check_images(demo: Group, names: Sequence[str], count: int | None) -> None:
+    """Check types and shapes of images; `count` is the number of samples, if known."""
+    for name in names:
+        ending = next((end for end in _IMAGES if name.endswith(end)), None)
+        if ending is None:
+            raise demo.make_error("no images", name, expected=" or ".join(_IMAGES), got=name)
+        dtype, axes = _IMAGES[ending]
+        shape = (count, None, None, 3)[:axes]
+        demo.check_array(f"obs/{name}", dtype, shape, _MAX_IMAGES)
+
+
+def _read_scene_name(demo: Group) -> str:
+    place = demo.name.rpartition("/")[2]
+    return check_name(demo.read_attribute("scene"), f"{place}: scene", file=demo.file)
+
+
+def _read_description(demo: Group) -> dict[str, Any]:
+    data = parse_json(demo.read_text("episode"), demo.file)
     try:
-        return h5py.File(path, "r")
-    except OSError as error:
+        return parse_document(Document(data), _EpisodeSchema).model_dump()
+    except InputError as error:
+        where = f"{demo.name.rpartition('/')[2]}: {error.field}"
         raise InputError(
-            "not an HDF5 file", file=path, expected="a shard of a dataset", got=str(error)
+            error.problem, file=demo.file, field=where, expected=error.expected, got=error.got
         ) from error
+
+
+def _read_motion(demo: Group) -> dict[str, Floats]:
+    """Return the arrays of a motion as `make_episode` expects them."""
+    motion = demo.open_group("motion")
+    found = {
+        name: motion.read_array(name, dtype, (None,) * axes)
+        for name, (dtype, axes) in _MOTION.items()
+        if name in motion.list_names()
+    }
+    at = found.pop("waypoints", None)
+    if at is None:
+        return found
+    for name in ("times", "positions"):
+        knots = found.get(f"knot_{name}")
+        if knots is None:
+            raise motion.make_error("missing", f"knot_{name}", expected="an array")
+        if at.min(initial=0) < 0 or at.max(initial=0) >= len(knots):
+            expected = f"indices from 0 to {len(knots) - 1}"
+            raise motion.make_error("out of range", "waypoints", expected=expected)
+        found[name] = knots[at]
+    return found
+
+
+def _read_images(path: Path, k: int) -> Images:
+    """Read the camera images of an episode."""
+    with open_hdf5(path) as root:
+        demo = root.open_group("data").open_group(f"demo_{k}")
+        said = _read_description(demo)
+        names = said["images"] or []
+        _check_images(demo, names, demo.read_integer("num_samples"))
+        arrays = {name: demo.open_group("obs").handle[name][:] for name in names}
+        return Images(arrays, tuple(said["segments"]))
+
+
+def _read_scene(scenes: Path, name: str) -> Any:
+    file = scenes / f"{name}.json"
+    return _check_scene(parse_json(read_text(file, "scene"), file), name, file)
+
+
+def _check_scene(document: Any, name: str, file: Path) -> Any:
+    """Return the description of a scene if its digest is `name`."""
+    if not isinstance(document, dict) or compute_scene_name(document) != name:
+        problem = "this scene is not what its name says"
+        raise InputError(problem, file=file, expected=name, got=compute_scene_name(document))
+    return document

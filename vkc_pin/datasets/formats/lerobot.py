@@ -7,8 +7,10 @@ since features have one shape. Images are PNG files in the parquet files; there 
 from __future__ import annotations
 
 import io
+import itertools
 import json
-from collections.abc import Iterable, Iterator, Mapping
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +18,14 @@ import numpy as np
 
 from vkc_pin.datasets.episode import Episode
 from vkc_pin.datasets.formats.samples import sample_episode
-from vkc_pin.errors import InputError
+from vkc_pin.errors import InputError, format_value
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import import_optional
-from vkc_pin.world.files.writing import write_folder_atomically
+from vkc_pin.world.files.documents import parse_json, read_text
+from vkc_pin.world.files.writing import MANIFEST, write_folder_atomically
 from vkc_pin.world.models.robot import Robot
 
-__all__ = ["VERSION", "describe_task", "require_pyarrow", "write_lerobot"]
+__all__ = ["VERSION", "describe_task", "find_differences", "require_pyarrow", "write_lerobot"]
 
 VERSION = "v3.0"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -31,6 +34,7 @@ _CHUNK = 1000  # files of a folder
 _SIZE = 100  # [MB] of a file; files are cut before they get there
 _ROWS = 200_000  # frames of a file
 _IMAGES = 90_000_000  # bytes of images in a file, after which the next one is begun
+_TOLERANCE = 1e-5  # of numbers made on another machine, relative and absolute
 _SEEN = "_image"  # end of the names of what becomes an image
 _KINDS = {
     "timestamp": "float32",
@@ -76,7 +80,7 @@ def describe_task(about: Mapping[str, Any]) -> str:
     )
 
 
-def write_lerobot(path: Path, episodes: Iterable[Episode], robot: Robot, rate: float) -> Path:
+def write_lerobot(path: Path, episodes: Iterator[Episode], rate: float) -> Path:
     """Write episodes of one robot atomically to a folder, which is replaced; return it.
 
     `observation.state` is base pose, arm and gripper, `observation.velocity` base and arm velocity,
@@ -85,24 +89,62 @@ def write_lerobot(path: Path, episodes: Iterable[Episode], robot: Robot, rate: f
 
     Args:
         path: Folder.
-        episodes: Episodes, in order.
-        robot: Their robot.
+        episodes: Episodes, in order; at least one.
         rate: Frames per second, a whole number.
     """
     arrow = require_pyarrow(rate)
     with write_folder_atomically(path, force=True) as folder:
-        writer = _Writer(arrow, folder, robot, rate)
-        for episode in episodes:
-            writer.add(episode)
-        writer.close()
+        _Writer(arrow, folder, rate).run(episodes)
     return path
+
+
+def find_differences(path: Path, episodes: Iterator[Episode], rate: float) -> list[str]:
+    """Return differences of a folder to what `write_lerobot` writes, one per line.
+
+    Args:
+        path: Folder.
+        episodes: Its episodes, in order; at least one.
+        rate: Frames per second, a whole number.
+
+    Raises:
+        InputError: A file is missing or damaged, or has other columns or sizes.
+    """
+    comparison = _Comparison(require_pyarrow(rate), path, rate)
+    comparison.run(episodes)
+    known = {*comparison.files, path / MANIFEST}
+    others = sorted(file for file in path.rglob("*") if not file.is_dir() and file not in known)
+    return comparison.found + [f"{file.relative_to(path)}: an unknown file" for file in others]
 
 
 class _Writer:
     """Writes frames as they come, and tables and statistics at the end."""
 
-    def __init__(self, arrow: Any, folder: Path, robot: Robot, rate: float) -> None:
-        self.arrow, self.folder, self.robot, self.rate = arrow, folder, robot, int(rate)
+    def __init__(self, arrow: Any, folder: Path, rate: float) -> None:
+        self.arrow, self.folder, self.rate = arrow, folder, int(rate)
+
+    def run(self, episodes: Iterator[Episode]) -> None:
+        """Write all episodes."""
+        first = next(episodes)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # they were shown during generation
+            self._begin(first.scene().robot)
+        for episode in itertools.chain([first], episodes):
+            self.add(episode)
+        self._close()
+
+    def _write_tables(self, path: Path, tables: Sequence[Any]) -> None:
+        """Write tables as the row groups of a file."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        parquet = self.arrow.parquet
+        with parquet.ParquetWriter(path, tables[0].schema, compression="snappy") as writer:
+            for table in tables:
+                writer.write_table(table)
+
+    def _write_json(self, path: Path, content: Any) -> None:
+        path.write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8")
+
+    def _begin(self, robot: Robot) -> None:
+        self.robot = robot
         joints = list(robot.coordinates.names)
         names = {
             "observation.state": [*joints, "gripper"],
@@ -120,9 +162,9 @@ class _Writer:
         self.tasks: dict[str, int] = {}
         self.rows: list[dict[str, Any]] = []
         self.stats: list[dict[str, dict[str, Floats]]] = []
-        self.frames, self.files = 0, 0
+        self.frames, self.count = 0, 0  # of frames, and of files with frames
         self._waiting: list[dict[str, Any]] = []
-        self._held, self._bytes = 0, 0
+        self._frames_waiting, self._bytes = 0, 0
 
     def add(self, episode: Episode) -> None:
         """Add an episode."""
@@ -152,7 +194,9 @@ class _Writer:
                 {"bytes": _png(one), "path": f"frame-{k:06d}.png"} for k, one in enumerate(pixels)
             ]
             size += sum(len(one["bytes"]) for one in columns[name])
-        if self._held and (self._held + count > _ROWS or self._bytes + size > _IMAGES):
+        if self._frames_waiting and (
+            self._frames_waiting + count > _ROWS or self._bytes + size > _IMAGES
+        ):
             self._flush()
         self.stats.append(stats)
         self.rows.append(
@@ -160,8 +204,8 @@ class _Writer:
                 "episode_index": number,
                 "tasks": [describe_task(episode.about)],
                 "length": count,
-                "data/chunk_index": self.files // _CHUNK,
-                "data/file_index": self.files % _CHUNK,
+                "data/chunk_index": self.count // _CHUNK,
+                "data/file_index": self.count % _CHUNK,
                 "dataset_from_index": self.frames,
                 "dataset_to_index": self.frames + count,
                 "meta/episodes/chunk_index": 0,
@@ -174,16 +218,14 @@ class _Writer:
             }
         )
         self._waiting.append(columns)
-        self._held += count
+        self._frames_waiting += count
         self._bytes += size
         self.frames += count
 
     def _flush(self) -> None:
         """Write pending frames to a file with one row group per episode."""
         arrow = self.arrow
-        place = {"chunk_index": self.files // _CHUNK, "file_index": self.files % _CHUNK}
-        path = self.folder / _DATA.format(**place)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        place = {"chunk_index": self.count // _CHUNK, "file_index": self.count % _CHUNK}
         fields: list[Any] = []
         for name, feature in self.features.items():
             kind = arrow.float32() if feature["dtype"] == "float32" else arrow.int64()
@@ -192,35 +234,34 @@ class _Writer:
             elif feature["shape"] != [1]:
                 kind = arrow.list_(kind, feature["shape"][0])
             fields.append((name, kind))
-        schema = arrow.schema(fields)
-        with arrow.parquet.ParquetWriter(path, schema, compression="snappy") as writer:
-            for columns in self._waiting:
-                arrays = []
-                for name, kind in fields:
-                    values = columns[name]
-                    if isinstance(values, list):
-                        arrays.append(arrow.array(values, kind))
-                        continue
-                    flat = arrow.array(values.reshape(-1))
-                    rows = arrow.FixedSizeListArray.from_arrays
-                    arrays.append(flat if values.ndim == 1 else rows(flat, type=kind))
-                writer.write_table(arrow.Table.from_arrays(arrays, schema=schema))
-        self._waiting, self._held, self._bytes, self.files = [], 0, 0, self.files + 1
+        tables, schema = [], arrow.schema(fields)
+        for columns in self._waiting:
+            arrays = []
+            for name, kind in fields:
+                values = columns[name]
+                if isinstance(values, list):
+                    arrays.append(arrow.array(values, kind))
+                    continue
+                flat = arrow.array(values.reshape(-1))
+                rows = arrow.FixedSizeListArray.from_arrays
+                arrays.append(flat if values.ndim == 1 else rows(flat, type=kind))
+            tables.append(arrow.Table.from_arrays(arrays, schema=schema))
+        self._write_tables(self.folder / _DATA.format(**place), tables)
+        self._waiting, self._frames_waiting, self._bytes, self.count = [], 0, 0, self.count + 1
 
-    def close(self) -> None:
+    def _close(self) -> None:
         """Write pending frames, tables and statistics."""
         arrow, meta = self.arrow, self.folder / "meta"
         if self._waiting:
             self._flush()
         path = self.folder / _EPISODES.format(chunk_index=0, file_index=0)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        arrow.parquet.write_table(arrow.Table.from_pylist(self.rows), path, compression="snappy")
+        self._write_tables(path, [arrow.Table.from_pylist(self.rows)])
         columns = {
             "task_index": arrow.array(list(self.tasks.values()), arrow.int64()),
             "task": arrow.array(list(self.tasks)),
         }
         table = arrow.table(columns).replace_schema_metadata({"pandas": json.dumps(_PANDAS)})
-        arrow.parquet.write_table(table, meta / "tasks.parquet")
+        self._write_tables(meta / "tasks.parquet", [table])
         info = {
             "codebase_version": VERSION,
             "robot_type": self.robot.name,
@@ -240,8 +281,95 @@ class _Writer:
             name: _merge_statistics([own[name] for own in self.stats]) for name in self.features
         }
         for name, content in (("info", info), ("stats", stats)):
-            text = json.dumps(content, indent=4) + "\n"
-            (meta / f"{name}.json").write_text(text, encoding="utf-8")
+            self._write_json(meta / f"{name}.json", content)
+
+
+class _Comparison(_Writer):
+    """Compares files with what would be written.
+
+    Attributes:
+        found: Differences.
+        files: All files.
+    """
+
+    def __init__(self, arrow: Any, folder: Path, rate: float) -> None:
+        super().__init__(arrow, folder, rate)
+        self.found: list[str] = []
+        self.files: list[Path] = []
+
+    def _write_json(self, path: Path, content: Any) -> None:
+        self.files.append(path)
+        self._compare(path, "", parse_json(read_text(path, "JSON"), path), content)
+
+    def _write_tables(self, path: Path, tables: Sequence[Any]) -> None:
+        self.files.append(path)
+        if not path.is_file() or path.is_symlink():
+            raise InputError("there is no such file", file=path, expected="a file of the dataset")
+        parquet, arrow = self.arrow.parquet, self.arrow
+        try:
+            with parquet.ParquetFile(path) as file:
+                groups = [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)]
+                sizes = [table.num_rows for table in tables]
+                if groups != sizes or not file.schema_arrow.equals(tables[0].schema):
+                    raise InputError(
+                        "other columns or sizes",
+                        file=path,
+                        expected=f"row groups of {sizes} with {tables[0].schema.names}",
+                        got=f"{groups[:100]} with {file.schema_arrow.names[:100]}",
+                    )
+                for k, table in enumerate(tables):
+                    stored = file.read_row_group(k)
+                    for name in table.column_names:
+                        column, truth = stored[name], table[name]
+                        if not column.equals(truth):
+                            where = f"row group {k}: {name}"
+                            self._compare(path, where, column.to_pylist(), truth.to_pylist())
+        except (arrow.ArrowException, OSError, MemoryError) as error:
+            problem, expected = "not a Parquet file, or a damaged one", "a file of the dataset"
+            raise InputError(problem, file=path, expected=expected, got=str(error)) from error
+
+    def _compare(self, path: Path, where: str, stored: Any, truth: Any) -> None:
+        """Record the first difference of plain data, numbers up to rounding."""
+        if difference := _find_difference(stored, truth):
+            name = path.relative_to(self.folder)
+            self.found.append(": ".join(part for part in (str(name), where, difference) if part))
+
+
+def _find_difference(stored: Any, truth: Any) -> str:
+    """Return the first difference of plain data as text; none: an empty one."""
+    if isinstance(truth, dict) and isinstance(stored, dict):
+        if set(stored) != set(truth):
+            return f"the fields {format_value(list(stored))}, not {format_value(list(truth))}"
+        pairs = [(stored[name], truth[name]) for name in truth]
+    elif isinstance(truth, list) and isinstance(stored, list):
+        if len(stored) != len(truth):
+            return f"{len(stored)} entries, not {len(truth)}"
+        pairs = list(zip(stored, truth, strict=True))
+    else:
+        return "" if _agrees(stored, truth) else f"{format_value(stored)}, not {truth!r:.300}"
+    return next(filter(None, (_find_difference(*pair) for pair in pairs)), "")
+
+
+def _agrees(stored: Any, truth: Any) -> bool:
+    """Return whether two values agree, numbers up to rounding, and images pixel by pixel."""
+    if isinstance(truth, bytes) and isinstance(stored, bytes):
+        return stored == truth or _decode(stored, truth) == _decode(truth, truth)
+    if isinstance(truth, float) and isinstance(stored, float):
+        return bool(np.isclose(stored, truth, rtol=_TOLERANCE, atol=_TOLERANCE))
+    return bool(type(stored) is type(truth) and stored == truth)
+
+
+def _decode(image: bytes, like: bytes) -> bytes:
+    """Return the pixels of a PNG file, if it has the size of another one."""
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(image), formats=["PNG"]) as shown:
+            if shown.size != Image.open(io.BytesIO(like)).size or shown.mode != "RGB":
+                return b""
+            return shown.tobytes()
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):  # no image
+        return b""
 
 
 def _pictures(episode: Episode) -> Iterator[tuple[str, Any]]:

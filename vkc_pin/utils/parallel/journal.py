@@ -3,14 +3,29 @@
 from __future__ import annotations
 
 import fcntl
+import itertools
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
 from vkc_pin.errors import InputError
+from vkc_pin.utils.arguments import (
+    check_instance,
+    check_integer,
+    check_list,
+    check_mapping,
+    check_number,
+    check_text,
+)
 
-__all__ = ["Journal", "JournalContents", "Records"]
+__all__ = ["CheckRecords", "Journal", "JournalContents", "Records"]
+
+CheckRecords = Callable[[str, list[dict[str, Any]]], object]
+"""Raises an `InputError` for invalid records of a task, given its key and them."""
+
+
+_MAX_LINE = 50_000_000  # [bytes]
 
 
 class Records(Mapping[str, list[dict[str, Any]]]):
@@ -56,7 +71,8 @@ class JournalContents:
         processes: Key → process of the task, if recorded.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, check_records: CheckRecords | None = None) -> None:
+        self._path, self._check_records = path, check_records
         self.lines = Records(path)
         self.sessions: list[dict[str, Any]] = []
         self.memory = 0.0
@@ -86,24 +102,27 @@ class JournalContents:
         """Total time of the sessions, each until its last task [s]."""
         return float(sum(session["seconds"] for session in self.sessions))
 
-    def _parse(self, path: Path, lines: Iterable[bytes]) -> int:
+    def _parse(self, path: Path, stream: IO[bytes]) -> int:
         """Read all complete lines, and return the offset of their end [bytes]."""
         end = 0
-        for number, text in enumerate(lines, start=1):
-            if not text.endswith(b"\n"):
+        for number in itertools.count(1):
+            text = stream.readline(_MAX_LINE)
+            if not text.endswith(b"\n") and len(text) < _MAX_LINE:
                 break
             try:
+                if len(text) == _MAX_LINE:
+                    raise InputError("too long", expected=f"at most {_MAX_LINE:g} bytes")
                 line = json.loads(text)
                 if number == 1:
                     self._check_header(line)
                 else:
-                    self._add(line, end)
-            except (ValueError, LookupError, TypeError, AttributeError) as error:
-                if isinstance(error, InputError):
+                    self._add(line, end, number)
+            except (ValueError, LookupError, RecursionError) as error:
+                if isinstance(error, InputError) and error.file is not None:
                     raise
-                expected = "the lines that a run writes"
+                problem, expected = "this line is damaged", "the lines that a run writes"
                 raise InputError(
-                    "this line is damaged", file=path, line=number, expected=expected
+                    problem, file=path, line=number, expected=expected, got=str(error)
                 ) from error
             end += len(text)
         return end
@@ -111,21 +130,39 @@ class JournalContents:
     def _check_header(self, header: Mapping[str, Any]) -> None:
         """Accept any header."""
 
-    def _add(self, line: dict[str, Any], offset: int) -> None:
+    def _add(self, line: Any, offset: int, number: int | None = None) -> None:
+        """Add a line at an offset [bytes]; `number` is that of a line in the file, else None."""
+        line = check_mapping(line, "line")
         if "session" in line:
-            self.sessions.append({**line["session"], "trials": 0, "seconds": 0.0})
+            session = check_mapping(line["session"], "session")
+            session["jobs"] = check_integer(session.get("jobs"), "jobs", low=1)
+            self.sessions.append({**session, "trials": 0, "seconds": 0.0})
             return
-        if not isinstance(line["records"], list):
-            raise TypeError("a task's records are a list")
-        self.lines.add(line["key"], offset)
-        self.memory = max(self.memory, line["memory_mb"])
-        self.sessions[-1]["trials"] += 1
-        self.sessions[-1]["seconds"] = line["seconds"]
-        if "client_seconds" in line:
-            self.sessions[-1]["client_seconds"] = line["client_seconds"]
-        if "process" in line:
-            self.processes[line["key"]] = line["process"]
-            self.memories.setdefault(line["process"], []).append(line["resident_mb"])
+        key = check_text(line.get("key"), "key")
+        records = check_instance(line.get("records"), list, "records")
+        check_list(records, "records", "a list of records", dict)
+        if self._check_records is not None and number is not None:
+            try:
+                self._check_records(key, records)
+            except InputError as error:
+                place: Any = {"file": self._path, "line": number, "field": error.field}
+                raise InputError(
+                    error.problem, **place, expected=error.expected, got=error.got
+                ) from error
+        known = {name: line[name] for name in ("client_seconds", "resident_mb") if name in line}
+        numbers = {"memory_mb": line.get("memory_mb"), "seconds": line.get("seconds"), **known}
+        numbers = {name: check_number(value, name) for name, value in numbers.items()}
+        process = check_text(line["process"], "process") if "process" in line else None
+        session = self.sessions[-1]
+        self.lines.add(key, offset)
+        self.memory = max(self.memory, numbers["memory_mb"])
+        session["trials"] += 1
+        session["seconds"] = numbers["seconds"]
+        if "client_seconds" in numbers:
+            session["client_seconds"] = numbers["client_seconds"]
+        if process is not None:
+            self.processes[key] = process
+            self.memories.setdefault(process, []).append(numbers["resident_mb"])
 
 
 class Journal(JournalContents):
@@ -138,21 +175,27 @@ class Journal(JournalContents):
         stream: The file, open for reading and appending ("a+b").
         header: Plain data that the results depend on: fields by name, in groups.
         kind: Plural name of the tasks, for messages.
+        check_records: Checks the records of every task in the file.
 
     Raises:
         InputError: Another process writes the file, it is not a journal, or its header differs.
     """
 
     def __init__(
-        self, path: Path, stream: IO[bytes], header: Mapping[str, Any], kind: str = "trials"
+        self,
+        path: Path,
+        stream: IO[bytes],
+        header: Mapping[str, Any],
+        kind: str = "trials",
+        check_records: CheckRecords | None = None,
     ) -> None:
-        super().__init__(path)
+        super().__init__(path, check_records)
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             problem = "another run is writing to this folder; wait for it, or use another"
             raise InputError(problem, file=path) from None
-        self._path, self._stream, self._kind = path, stream, kind
+        self._stream, self._kind = stream, kind
         self._header = json.loads(json.dumps(header))
         stream.seek(0)
         self._end = self._parse(path, stream)
@@ -185,7 +228,7 @@ class Journal(JournalContents):
 
     def _check_header(self, header: Mapping[str, Any]) -> None:
         """Raise an error that names the differences to this journal's header."""
-        old, new = _flatten(header), _flatten(self._header)
+        old, new = _flatten(check_mapping(header, "header")), _flatten(self._header)
         differing = [name for name in {**old, **new} if old.get(name) != new.get(name)]
         if differing:
             named = [name for name in differing if name != "specification"] or differing

@@ -13,7 +13,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    create_model,
+    model_validator,
+)
 from pydantic.types import FailFast
 
 from vkc_pin.errors import InputError
@@ -33,7 +41,9 @@ __all__ = [
     "FORMAT",
     "METRICS",
     "STATUSES",
+    "MotionSchema",
     "PlanStatus",
+    "ReportSchema",
     "read_archive",
     "resolve_folder",
     "serialize_folder",
@@ -95,7 +105,9 @@ _DAMAGED = (
 
 Text = Annotated[str, Field(strict=True)]
 Count = Annotated[int, Field(strict=True, ge=0)]
-Distance = Annotated[float, Field(strict=True, gt=-math.inf)]  # not NaN, but perhaps infinite
+# Perhaps infinite, for which datasets have null, but not NaN.
+_from_null = BeforeValidator(lambda value: math.inf if value is None else value)
+Distance = Annotated[float, Field(strict=True, gt=-math.inf), _from_null]
 Measured = Annotated[float, Field(strict=True, ge=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Recorded = Annotated[bool, Field(strict=True)] | Annotated[float, Field(strict=True)]
@@ -126,7 +138,9 @@ class _Phase(Schema):
     opening: Measured | None = None
 
 
-class _Motion(Schema):
+class MotionSchema(Schema):
+    """A motion without its arrays, as in a saved plan."""
+
     names: Annotated[list[Text], FailFast()]
     robot_size: Count
     phases: Annotated[list[_Phase], FailFast()]
@@ -177,7 +191,9 @@ class _Exemption(Schema):
     reason: Text
 
 
-class _Report(Schema):
+class ReportSchema(Schema):
+    """A validation report."""
+
     violations: Annotated[list[_Violation], FailFast()]
     clearance: Distance
     closure_error: Measured
@@ -199,8 +215,8 @@ class _About(Schema):
     folder: Annotated[Named, AfterValidator(_check_folder)]
     steps: Annotated[list[dict[str, Any]], FailFast()]
     options: dict[str, Any]
-    trajectory: _Motion
-    validation: _Report
+    trajectory: MotionSchema
+    validation: ReportSchema
     status: PlanStatus
     metrics: _Metrics  # type: ignore[valid-type]
     seed: Count

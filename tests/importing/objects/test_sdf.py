@@ -284,6 +284,8 @@ def test_springs_are_read(tmp_path: Path) -> None:
             {"pose": '<pose degrees="1" rotation_format="quat_xyzw">0 0 0 0 0 0 1</pose>'},
             "a quaternion in degrees",
         ),
+        ({"pose": "<pose>0 0 1e300 0 0 0</pose>"}, "front: pose: .*at most 10000"),
+        ({"dynamics": "<dynamics><damping>inf</damping></dynamics>"}, "damping: .*at most 10000"),
         ({"pose": "<pose>0 0 0</pose>"}, "front: pose: wrong numbers .*6 finite numbers"),
         ({"pose": '<pose relative_to="slide">0 0 0 0 0 0</pose>'}, "cycle .*front → slide → front"),
         ({"model": '<frame name="a" attached_to="a"/>', "child": "a"}, "cycle .*a → a"),

@@ -98,9 +98,10 @@ USUAL = VERTICES[0] + VERTICES[1] + format_faces(1) + format_faces(9)
         "indented",
     ],
 )
-def test_obj_files_of_other_programs_are_read_alike(tmp_path: Path, text: str) -> None:
+@pytest.mark.parametrize("coding", ["utf-8", "utf-16"])
+def test_obj_files_of_other_programs_are_read_alike(tmp_path: Path, text: str, coding: str) -> None:
     file = tmp_path / "two.obj"
-    file.write_bytes(text.encode())
+    file.write_bytes(text.encode(coding))
     mesh = load_mesh(file)
     assert mesh.area == pytest.approx(12.0)
     assert abs(mesh.volume) == pytest.approx(2.0)
@@ -165,6 +166,13 @@ def test_the_unit_of_collada_files_counts(tmp_path: Path, unit: str, metres: flo
     np.testing.assert_allclose(np.ptp(np.asarray(load_convex(file).points()), axis=0), size)
     (part,) = load_parts(file)
     np.testing.assert_allclose(np.ptp(part.vertices, axis=0), size)
+
+
+@pytest.mark.parametrize("unit", ["1e-300", "1e-9", "1e-7"])
+def test_tiny_meshes_are_refused(tmp_path: Path, unit: str) -> None:
+    file = write_collada(tmp_path / "block.dae", f'<unit meter="{unit}"/>')
+    with pytest.raises(InputError, match=r"block\.dae: tip: .*too small: is its unit or scale"):
+        load_convex(file, about="tip")
 
 
 @pytest.mark.parametrize("unit", ["0", "-1", "inch", "nan", "1e400", "0,01"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -113,6 +114,8 @@ def read_description(
 ) -> Description:
     """Read a URDF, xacro, MJCF or SDF file, whose first element tells its format.
 
+    Warnings become notes of the description.
+
     Args:
         file: The file.
         free: Whether to keep free bodies, on floating joints.
@@ -124,15 +127,25 @@ def read_description(
         name: check_path(value, f"packages['{name}']", "a folder")
         for name, value in check_mapping(packages or {}, "packages").items()
     }
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        description = _read_format(path, folders, arguments or {}, free=free)
+    notes = dict.fromkeys(str(warning.message) for warning in caught)
+    return dataclasses.replace(description, notes=(*description.notes, *notes))
+
+
+def _read_format(
+    path: Path, packages: Mapping[str, Path], arguments: Mapping[str, str], *, free: bool
+) -> Description:
     root = parse_xml(read_text(path, "URDF, xacro, MJCF or SDF"), path)
     if root.tag == "robot":
         is_xacro = "xmlns:xacro" in root.attrib or path.suffix == ".xacro"
-        text = expand_xacro(path, folders, arguments or {}) if is_xacro else None
-        return read_object_urdf(path, free=free, packages=folders, text=text)
+        text = expand_xacro(path, packages, arguments) if is_xacro else None
+        return read_object_urdf(path, free=free, packages=packages, text=text)
     if root.tag == "mujoco":
         return read_object_mjcf(path, free=free)
     if root.tag == "sdf":
-        return read_object_sdf(path, free=free, packages=folders)
+        return read_object_sdf(path, free=free, packages=packages)
     raise InputError(
         "the file does not describe an object",
         file=path,

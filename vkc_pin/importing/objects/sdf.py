@@ -23,6 +23,7 @@ from vkc_pin.importing.objects.description import (
     make_inertia,
     make_limits,
 )
+from vkc_pin.utils.arrays import MAX_COORDINATE
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.kinematic_tree import MOMENTS, find_roots, parse_numbers
 from vkc_pin.world.files.meshes import load_mesh
@@ -265,13 +266,21 @@ class _Scope:
         return name
 
     def read_numbers(
-        self, element: ElementTree.Element, key: str, count: int, default: str | None, where: str
+        self,
+        element: ElementTree.Element,
+        key: str,
+        count: int,
+        default: str | None,
+        where: str,
+        *,
+        largest: float = MAX_COORDINATE,
     ) -> tuple[float, ...]:
-        """Return the numbers of a child element; "inf" becomes the largest float."""
+        """Return the numbers of a child element; "inf" becomes 1e308."""
         found = element.find(key)
         text = None if found is None else re.sub(r"\binf\b", "1e308", found.text or "", flags=re.I)
         named = f"{where}: {element.tag} {key}"
-        return self._parse(element if found is None else found, text, count, default, named)
+        holder = element if found is None else found
+        return self._parse(holder, text, count, default, named, largest)
 
     def _parse(
         self,
@@ -280,12 +289,13 @@ class _Scope:
         count: int,
         default: str | None,
         where: str,
+        largest: float = MAX_COORDINATE,
     ) -> tuple[float, ...]:
         text = text if text is None or text.strip() else None  # an empty element is a default
         holder = ElementTree.Element("", {} if text is None else {"text": text})
         try:
             return parse_numbers(
-                self.file, holder, "text", count, default=default, where=where, largest=math.inf
+                self.file, holder, "text", count, default=default, where=where, largest=largest
             )
         except InputError as error:
             raise make_element_error(
@@ -663,7 +673,7 @@ class _Reader:
         if (limit := element.find("limit")) is None:
             return None, None
         low, high, velocity = (
-            scope.read_numbers(limit, key, 1, default, name)[0]
+            scope.read_numbers(limit, key, 1, default, name, largest=math.inf)[0]
             for key, default in (("lower", "-1e16"), ("upper", "1e16"), ("velocity", "-1"))
         )
         if low > high:
@@ -672,7 +682,7 @@ class _Reader:
                 f"joint '{name}' has a lower limit above its upper limit, {ends}: swapped"
             )
             low, high = high, low
-        return make_limits(low, high), velocity if 0.0 < velocity < 1e15 else None
+        return make_limits(low, high), velocity if 0.0 < velocity < MAX_COORDINATE else None
 
     def _read_dynamics(
         self, scope: _Scope, element: ElementTree.Element, name: str

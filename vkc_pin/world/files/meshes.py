@@ -7,6 +7,7 @@ which ignores their unit. As in RViz and Gazebo, the unit counts and the upward 
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import io
 import re
@@ -47,7 +48,7 @@ __all__ = [
 
 _MAX_NEIGHBOURS = 255  # coal's corners have no more
 _MAX_CACHED_HULLS = 512  # that a process keeps: robots are loaded again and again
-_MARK = b"\xef\xbb\xbf"  # byte-order mark of UTF-8
+_SMALLEST = 1e-6  # [m] size of meshes, below which triangles have no area in floating point
 # Faces of OBJ files whose corners count from the end, or from 0
 _NOT_FROM_ONE = re.compile(rb"\nf[^\n]*[ /][-0]")
 _HULL_TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
@@ -190,17 +191,19 @@ def _open_mesh(file: Path, submesh: str | None = None) -> tuple[Path | io.BytesI
     if kind not in ("obj", "gltf"):
         return file, settings
     data = file.read_bytes()
+    if is_utf16 := data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        data = data.decode("utf-16").encode()
     is_usual = (
         submesh is None
-        and not data.startswith((_MARK, b" "))
+        and not data.startswith((codecs.BOM_UTF8, b" "))
         and not any(text in data for text in (b"\t", b"\n ", b"\\\n", b"\\\r"))
         and data.count(b"\r") == data.count(b"\r\n")
         and not _NOT_FROM_ONE.search(data)
     )
     if kind == "obj" and not is_usual:
         data = _normalize_obj(data, file, submesh)
-    elif data.startswith(_MARK):
-        data = data.removeprefix(_MARK)
+    elif is_utf16 or data.startswith(codecs.BOM_UTF8):
+        data = data.removeprefix(codecs.BOM_UTF8)
     else:
         return file, settings
     return io.BytesIO(data), {**settings, "file_type": kind}
@@ -231,7 +234,7 @@ def _normalize_obj(data: bytes, file: Path, submesh: str | None) -> bytes:
     wanted = None if submesh is None else submesh.encode()
     lines, names = list[bytes](), dict[str, None]()
     is_kept = is_found = wanted is None
-    for number, line in enumerate(data.removeprefix(_MARK).split(b"\n"), 1):
+    for number, line in enumerate(data.removeprefix(codecs.BOM_UTF8).split(b"\n"), 1):
         key, *values = line.split() or [b""]
         if key in counts:
             counts[key] += 1
@@ -314,6 +317,14 @@ def make_convex_hull(
     if not len(given):
         raise InputError("a hull of nothing", file=file, field=about, expected="at least one point")
     given, was_flat = thicken(given)
+    if (size := float(np.ptp(given, axis=0).max())) < _SMALLEST:
+        raise InputError(
+            "the mesh is too small: is its unit or scale wrong?",
+            file=file,
+            field=about,
+            expected=f"a size of at least {_SMALLEST:g} m",
+            got=f"{size:.3g}",
+        )
     if was_flat:
         named = " of ".join(str(part) for part in (about, file) if part is not None) or "a mesh"
         warnings.warn(

@@ -29,4 +29,43 @@ def test_picture_explains_missing_attachments(tmp_path: Path) -> None:
         plot_attachments("drawer")  # type: ignore[arg-type]
     found = vkc.importing.propose_attachments(write_flap(tmp_path, thick=0.12))
     figure = plot_attachments(found)
-    assert "120 mm at its thinnest" in figure.axes[0].texts[0].get_text()
+    text = figure.axes[1].texts[0].get_text().replace("\n", " ")
+    assert "120 mm at its thinnest" in text
+
+
+FIXED = '<collision><geometry><box size="{} {} {}"/></geometry></collision>'
+
+
+@pytest.mark.parametrize(
+    ("size", "door", "tried"),
+    [
+        ((0.5, 0.4, 0.6), "0.5 0.4 0.02", True),  # lies flush on the case
+        ((0.5, 0.4, 0.6), "0.5 0.4 0.3", False),  # too thick
+        ((7.0, 0.4, 0.6), "7.0 0.4 0.3", False),
+        ((0.2, 0.2, 2.0), "0.2 0.2 0.3", False),
+        ((0.5, 0.4, 0.6), "", False),  # no joint
+    ],
+)
+def test_picture_shows_objects_that_nothing_opens(
+    tmp_path: Path, size: tuple[float, float, float], door: str, tried: bool
+) -> None:
+    width, depth, height = size
+    lid = FIXED.format(*door.split()) if door else ""
+    thick = float(door.split()[2]) if door else 0.0
+    joint = f"""<link name="lid">{lid}</link><joint name="top" type="prismatic"><origin
+        xyz="0 0 {height + thick / 2}"/><parent link="case"/><child link="lid"/><axis xyz="0 0 1"/>
+        <limit lower="0" upper="0.2" effort="1" velocity="1"/></joint>"""
+    case = FIXED.format(width, depth, height).replace(
+        "<geometry>", f'<origin xyz="0 0 {height / 2}"/><geometry>'
+    )
+    urdf = f'<robot name="r"><link name="case">{case}</link>{joint if door else ""}</robot>'
+    item = vkc.load_object({"urdf": urdf, "attachments": []}, folder=tmp_path)
+    found = vkc.importing.propose_attachments(item)
+    assert not found.found
+    assert bool(found.rejected.get("top")) is tried
+    whole, words = plot_attachments(found).axes
+    assert ("places tried" in whole.get_title()) is tried
+    longest = max(width, depth, height + thick)
+    assert np.ptp(whole.get_xlim()) == pytest.approx(longest, rel=0.1)
+    assert len(whole.collections) == (3 if tried else 1)  # the shapes, and places with arrows
+    assert words.texts[0].get_text().startswith("No hand can open")

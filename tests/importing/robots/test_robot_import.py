@@ -39,6 +39,7 @@ def test_folder_describes_the_robot(imported: vkc.importing.ImportedRobot) -> No
     assert names == {
         ".vkc-pin.json",
         "robot.yaml",
+        "robot.png",
         "scene.yaml",
         "mine.urdf",
         "mine.srdf",

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterable
+import textwrap
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,16 +16,20 @@ from vkc_pin.importing.proposals.proposal import Proposal, Proposals
 from vkc_pin.utils.arguments import check_instance
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
+from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.world.models.shapes import get_link_name, triangulate
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["plot_attachments"]
+__all__ = ["Triangles", "plot_attachments", "to_rgb"]
 
 _PANELS = 12  # largest number of panels
 _COLUMNS = 4
 _WIDTH = 3.2  # [inch] of a panel
+_LETTERS = 48  # in a line of its text
+_PLACES = 60  # largest number of drawn places that were tried
+_ARROW = 0.06  # [m] length of their arrows
 _FACET = 0.05  # [m] approximate edge length of drawn triangles
 _OPEN = 0.35  # opening of the drawn joint, relative to how far it opens
 _LIGHT = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])
@@ -38,7 +43,8 @@ _STATIC_COLOUR, _MOVING_COLOUR, _HELD_COLOUR = (
 def plot_attachments(proposals: Proposals, path: str | Path | None = None) -> Figure:
     """Draw the hand at every proposed attachment, and list the joints that no hand can open.
 
-    Joints are drawn a third open.
+    Joints are drawn a third open. If there are such joints, the closed object is drawn with its
+    size, the links that they move, and the places that were tried.
 
     Args:
         proposals: Result of `propose_attachments`.
@@ -49,7 +55,8 @@ def plot_attachments(proposals: Proposals, path: str | Path | None = None) -> Fi
     """
     check_instance(proposals, Proposals, "proposals")
     drawn = proposals.found[:_PANELS]
-    panels = max(1, len(drawn) + bool(proposals.because))
+    fails = bool(proposals.because) or not drawn
+    panels = len(drawn) + 2 * fails
     columns = min(panels, _COLUMNS)
     rows = -(-panels // columns)
     with use_style():
@@ -62,14 +69,20 @@ def plot_attachments(proposals: Proposals, path: str | Path | None = None) -> Fi
             axes.set_title(
                 f"{proposal.attachment.name}  {proposal.score:.2f}\n{opened}", fontsize=8
             )
-        if proposals.because or not drawn:
+        if fails:
+            whole: Any = figure.add_subplot(rows, columns, panels - 1, projection="3d")
+            _draw_closed(whole, proposals)
             words: Any = figure.add_subplot(rows, columns, panels)
             words.axis("off")
             reasons = (
                 "\n\n".join(f"{joint}: {reason}" for joint, reason in proposals.because.items())
                 or "it has no joints"
             )
-            words.text(0.0, 1.0, "No hand can open\n\n" + reasons, va="top", wrap=True, fontsize=8)
+            text = "\n".join(
+                textwrap.fill(line, _LETTERS)
+                for line in f"No hand can open\n\n{reasons}".split("\n")
+            )
+            words.text(0.0, 1.0, text, va="top", fontsize=8)
         more = len(proposals.found) - len(drawn)
         figure.suptitle(
             f"{proposals.object.name}, hand of {proposals.hand.robot}"
@@ -77,6 +90,29 @@ def plot_attachments(proposals: Proposals, path: str | Path | None = None) -> Fi
             fontsize=10,
         )
     return save_figure(figure, path)
+
+
+def _draw_closed(axes: Any, proposals: Proposals) -> None:
+    """Draw the closed object in metres, with the links and places where no hand could open it."""
+    item = proposals.object
+    state = np.clip(np.zeros(len(item.lower)), item.lower, item.upper)
+    triangles = Triangles()
+    _add_object(triangles, item, state, item.links_moved_by(set(proposals.because)))
+    places = [place for tried in proposals.rejected.values() for place in tried]
+    step = max(1, len(places) // _PLACES)
+    if chosen := places[::step]:
+        points = np.array([place.translation for place in chosen])
+        back = -np.array([place.rotation[:, 2] for place in chosen])
+        axes.quiver(
+            *(points + _ARROW * back).T, *(-_ARROW * back).T, color=_HELD_COLOUR, linewidth=0.8
+        )
+        axes.scatter(*points.T, color=[_HELD_COLOUR], s=6, depthshade=False)
+        direction = back.mean(axis=0)
+    else:
+        direction = np.array([-1.0, 0.0, 0.0])
+    triangles.draw(axes, direction, ticks=True)
+    count = f", {len(places)} places tried" if places else ""
+    axes.set_title(f"closed{count} [m]", fontsize=8)
 
 
 def _draw(axes: Any, proposals: Proposals, proposal: Proposal, joint: str) -> None:
@@ -87,69 +123,96 @@ def _draw(axes: Any, proposals: Proposals, proposal: Proposal, joint: str) -> No
         state[item.coordinates.index(name)] = value
     index = item.coordinates.index(joint)
     state[index] += _OPEN * (proposal.opens[joint] - state[index])
-    data = item.model.createData()
-    pin.forwardKinematics(item.model, data, item.coordinates.q(state))
-    moving, faces, colours = item.links_moved_by({joint}), list[Floats](), list[Floats]()
-    for shape in item.collision.geometryObjects:
-        base = _MOVING_COLOUR if get_link_name(shape.name) in moving else _STATIC_COLOUR
-        _add_shape(
-            faces, colours, shape.geometry, data.oMi[shape.parentJoint] * shape.placement, base
-        )
+    triangles = Triangles()
+    _add_object(triangles, item, state, item.links_moved_by({joint}))
     tool = item.link_placement(attachment.link, state) * attachment.tool(
         np.zeros(len(attachment.freedoms))
     )
     for geometry, where in (*proposals.hand.touch, *proposals.hand.others):
-        _add_shape(faces, colours, geometry, tool * where, np.array(_to_rgb(COLOURS[0])))
-    _add_triangles(axes, faces, colours, tool)
+        triangles.add(geometry, tool * where, to_rgb(COLOURS[0]))
+    triangles.draw(axes, -tool.rotation[:, 2])
 
 
-def _add_shape(
-    faces: list[Floats],
-    colours: list[Floats],
-    geometry: coal.CollisionGeometry,
-    where: pin.SE3,
-    base: Floats,
+def _add_object(
+    triangles: Triangles, item: ArticulatedObject, state: Floats, moving: Collection[str]
 ) -> None:
-    import trimesh
+    """Add the shapes of an object, in another colour where links move."""
+    data = item.model.createData()
+    pin.forwardKinematics(item.model, data, item.coordinates.q(state))
+    for shape in item.collision.geometryObjects:
+        base = _MOVING_COLOUR if get_link_name(shape.name) in moving else _STATIC_COLOUR
+        triangles.add(shape.geometry, data.oMi[shape.parentJoint] * shape.placement, base)
 
-    vertices, corners = triangulate(geometry)
-    # matplotlib would draw large triangles in the wrong order.
-    if (size := float(np.ptp(vertices, axis=0).max())) > _FACET:
-        vertices, corners = trimesh.remesh.subdivide_to_size(
-            vertices, corners, max(_FACET, size / 12.0), max_iter=20
+
+class Triangles:
+    """Shaded triangles of shapes, to be drawn into axes in three dimensions."""
+
+    def __init__(self) -> None:
+        self._faces, self._colours = list[Floats](), list[Floats]()
+
+    def add(self, geometry: coal.CollisionGeometry, where: pin.SE3, base: Floats) -> None:
+        """Add a shape with a colour, shape (3,)."""
+        import trimesh
+
+        vertices, corners = triangulate(geometry)
+        # matplotlib would draw large triangles in the wrong order.
+        if (size := float(np.ptp(vertices, axis=0).max())) > _FACET:
+            vertices, corners = trimesh.remesh.subdivide_to_size(
+                vertices, corners, max(_FACET, size / 12.0), max_iter=20
+            )
+        placed = (vertices @ where.rotation.T + where.translation)[corners]
+        normals = np.cross(placed[:, 1] - placed[:, 0], placed[:, 2] - placed[:, 0])
+        lengths = np.linalg.norm(normals, axis=1)
+        shade = 0.62 + 0.38 * np.abs(normals @ _LIGHT) / np.maximum(lengths, 1e-12)
+        self._faces.append(placed)
+        self._colours.append(np.clip(shade[:, None] * base, 0.0, 1.0))
+
+    def draw(
+        self,
+        axes: Any,
+        towards: Floats,
+        *,
+        ticks: bool = False,
+        box: tuple[Floats, Floats] | None = None,
+    ) -> None:
+        """Draw all triangles.
+
+        Args:
+            axes: Axes in three dimensions.
+            towards: Direction to the viewer, shape (3,); its height is ignored.
+            ticks: Whether to draw the axes [m].
+            box: Corners of the part to show [m], shape (3,) each; None: everything.
+        """
+        # The module has no type annotations.
+        collection = importlib.import_module("mpl_toolkits.mplot3d.art3d").Poly3DCollection
+
+        triangles, shades = np.concatenate(self._faces), np.concatenate(self._colours)
+        if box is not None:
+            middles = triangles.mean(axis=1)
+            inside = ((middles >= box[0]) & (middles <= box[1])).all(axis=1)
+            triangles, shades = triangles[inside], shades[inside]
+        axes.add_collection3d(
+            collection(triangles, facecolors=shades, edgecolors="none", shade=False)
         )
-    placed = (vertices @ where.rotation.T + where.translation)[corners]
-    normals = np.cross(placed[:, 1] - placed[:, 0], placed[:, 2] - placed[:, 0])
-    lengths = np.linalg.norm(normals, axis=1)
-    shade = 0.62 + 0.38 * np.abs(normals @ _LIGHT) / np.maximum(lengths, 1e-12)
-    faces.append(placed)
-    colours.append(np.clip(shade[:, None] * base, 0.0, 1.0))
+        points = triangles.reshape(-1, 3)
+        low, high = (points.min(axis=0), points.max(axis=0)) if box is None else box
+        middle, half = (low + high) / 2.0, float((high - low).max()) / 2.0
+        for set_limits, centre in zip(
+            (axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, strict=True
+        ):
+            set_limits(centre - half, centre + half)
+        level = float(np.linalg.norm(towards[:2]))
+        azimuth = np.degrees(np.arctan2(towards[1], towards[0])) if level > 0.3 else -120.0
+        axes.view_init(elev=25.0, azim=azimuth + 40.0)
+        axes.set_box_aspect((1.0, 1.0, 1.0), zoom=1.0 if ticks else 1.45)
+        if ticks:
+            axes.tick_params(labelsize=6, pad=-2)
+        else:
+            axes.set_axis_off()
 
 
-def _add_triangles(
-    axes: Any, faces: Iterable[Floats], colours: Iterable[Floats], tool: pin.SE3
-) -> None:
-    """Add triangles to axes, viewed from the side of the hand."""
-    # The module has no type annotations.
-    collection = importlib.import_module("mpl_toolkits.mplot3d.art3d").Poly3DCollection
+def to_rgb(colour: str) -> Floats:
+    """Return red, green and blue of a colour's name, shape (3,), from 0 to 1."""
+    from matplotlib import colors
 
-    triangles, shades = np.concatenate(list(faces)), np.concatenate(list(colours))
-    axes.add_collection3d(collection(triangles, facecolors=shades, edgecolors="none", shade=False))
-    low, high = triangles.reshape(-1, 3).min(axis=0), triangles.reshape(-1, 3).max(axis=0)
-    middle, half = (low + high) / 2.0, float((high - low).max()) / 2.0
-    for set_limits, centre in zip(
-        (axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, strict=True
-    ):
-        set_limits(centre - half, centre + half)
-    back = -tool.rotation[:, 2]
-    azimuth = np.degrees(np.arctan2(back[1], back[0])) if np.linalg.norm(back[:2]) > 0.3 else -120.0
-    axes.view_init(elev=25.0, azim=azimuth + 40.0)
-    axes.set_box_aspect((1.0, 1.0, 1.0), zoom=1.45)
-    axes.set_axis_off()
-
-
-def _to_rgb(colour: str) -> tuple[float, float, float]:
-    from matplotlib.colors import to_rgb
-
-    red, green, blue = to_rgb(colour)
-    return float(red), float(green), float(blue)
+    return np.array(colors.to_rgb(colour))

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import pinocchio as pin
+
 from vkc_pin.importing.proposals.hand import Hand
 from vkc_pin.importing.targets import round_values
 from vkc_pin.utils.pickling import freeze
@@ -71,12 +73,14 @@ class Proposals:
         hand: The hand.
         found: Proposed attachments, best first.
         because: Maps joints to the reason why no hand can open them.
+        rejected: Maps these joints to the tool frames that were tried, in the object's base frame.
     """
 
     object: ArticulatedObject
     hand: Hand
     found: tuple[Proposal, ...]
     because: Mapping[str, str]
+    rejected: Mapping[str, tuple[pin.SE3, ...]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         names = ", ".join(proposal.attachment.name for proposal in self.found) or "none"

@@ -54,6 +54,7 @@ class _Tally:
     blocked: Counter[Obstruction] = field(default_factory=Counter)
     cramped: int = 0
     pieces: int = 0
+    places: list[pin.SE3] = field(default_factory=list)  # of the tool, in the base frame
 
 
 def propose_attachments(
@@ -104,7 +105,9 @@ def propose_attachments(
         for opening in search.openings.values()
         if not any(opening.joint in proposal.opens for proposal in found)
     }
-    return Proposals(item, search.hand, tuple(found), because)
+    numbers = {opening.joint: number for number, opening in search.openings.items()}
+    rejected = {joint: tuple(search.tallies[numbers[joint]].places) for joint in because}
+    return Proposals(item, search.hand, tuple(found), because, rejected)
 
 
 class _Search:
@@ -231,6 +234,7 @@ class _Search:
             reasons.append(blocked)
         else:
             tally.blocked[reasons[0]] += 1
+            tally.places.append(at * grasp.placement)
             return None
         room = next(
             (
@@ -251,6 +255,7 @@ class _Search:
                     opens[joint_opening.joint] = reached
         if opening.joint not in opens:
             tally.cramped += 1
+            tally.places.append(at * grasp.placement)
             return None
         kind, freedom = grip.freedoms()
         share = abs(opens[opening.joint] - opening.closed) / max(

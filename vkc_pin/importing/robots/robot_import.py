@@ -27,6 +27,7 @@ from vkc_pin.importing.robots.doctor import Diagnosis, Finding, doctor
 from vkc_pin.importing.robots.envelopes import find_envelopes, remove_collision_shapes
 from vkc_pin.importing.robots.hands import Hand, analyze_hand
 from vkc_pin.importing.robots.mesh_pieces import Piece, write_meshes
+from vkc_pin.importing.robots.picture import plot_robot
 from vkc_pin.importing.robots.rest_configuration import (
     HOME_ROOM,
     Home,
@@ -55,8 +56,10 @@ from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.models.robot_model import build_full_model
 from vkc_pin.world.models.self_collisions import sample_allowed_pairs, set_collision_pairs
 
-__all__ = ["ImportedRobot", "import_robot"]
+__all__ = ["PICTURE", "ImportedRobot", "import_robot"]
 
+PICTURE = "robot.png"
+"""File name of a robot's picture."""
 _SAMPLES, _PIECES = 2000, 8
 # Samples, and the smallest fraction of them in which a pair of neighbours is close
 _NEAR, _MOSTLY = 300, 0.75
@@ -85,7 +88,7 @@ class ImportedRobot:
     diagnosis: Diagnosis
 
     def __str__(self) -> str:
-        return f"{self.diagnosis}\nwrote {self.folder}"
+        return f"{self.diagnosis}\nwrote {self.folder}\nwrote {self.folder / PICTURE}"
 
 
 def import_robot(  # noqa: PLR0913 - keyword options of a public call
@@ -105,7 +108,8 @@ def import_robot(  # noqa: PLR0913 - keyword options of a public call
     """Import a robot from a URDF, xacro or MJCF file.
 
     The output folder holds robot.yaml, a URDF with a frame `tool` where the hand grasps, an SRDF
-    with sampled pairs that need no check, and meshes, with convex pieces for collision. Missing
+    with sampled pairs that need no check, and meshes, with convex pieces for collision; scene.yaml,
+    a scene with the robot alone; and robot.png, a picture of it at home. Missing
     information is guessed from names and shapes, and reported.
 
     Args:
@@ -215,6 +219,7 @@ class _Importer:
     ) -> ImportedRobot:
         scene = make_robot_scene(self._name, "robot.yaml", self._base)
         write_scene(self._folder / "scene.yaml", self._source.file.path, scene, "import-robot")
+        plot_robot(robot, self._folder / PICTURE)
         findings = (*doctor(robot).findings, *self._findings)
         others = [arm.name for arm in arms if arm is not chosen]
         names = () if chosen is None else (chosen.name, *others)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
@@ -26,6 +28,10 @@ if TYPE_CHECKING:
 __all__ = ["Approach", "plot_scene"]
 
 _ARROW = 0.35  # [m]
+_MARGIN, _BEYOND = 0.3, 0.1  # [m] around what is drawn, and around labels
+_LARGE, _SMALL = 7.0, 2.5  # [inch] longer side of the plan, and smallest length of the other
+_FRAME, _LEGEND = 0.8, 2.6  # [inch] for labels of the axes, and for the legend
+_LETTERS = 40  # in a line of the legend
 _BESIDE = 0.4  # largest distance between arrows that share a label [m]
 
 
@@ -51,7 +57,7 @@ def plot_scene(
     stuck: Sequence[str] = (),
     path: str | Path | None = None,
 ) -> Figure:
-    """Draw a scene from above.
+    """Draw a scene from above, with numbered attachments and a legend of their names.
 
     Args:
         scene: Scene to draw.
@@ -62,6 +68,7 @@ def plot_scene(
     Raises:
         InputError: `path` has another extension.
     """
+    from matplotlib.lines import Line2D
     from matplotlib.patches import Polygon
 
     target = None if path is None else check_path(path, "path")
@@ -74,7 +81,7 @@ def plot_scene(
         )
     world, (blue, red) = World(scene), COLOURS[:2]
     with use_style():
-        figure = new_figure(8.0, 8.0)
+        figure = new_figure(_LARGE, _LARGE)
         draw_top_view(figure, world, None)
         axes = figure.axes[0]
         data = world.model.createData()
@@ -108,6 +115,32 @@ def plot_scene(
             if base is not None:
                 axes.plot([base[0], x], [base[1], y], ":", color=colour, linewidth=0.8, zorder=5)
                 axes.plot(base[0], base[1], "o", color=colour, markersize=4, zorder=7)
-        for text, place, (_, colour) in names:  # one for all that come from one side of an object
-            axes.annotate(text, place, color=colour, fontsize=7, zorder=7)
+        for number, (_, place, (_, colour)) in enumerate(names, 1):
+            axes.annotate(str(number), place, color=colour, fontsize=8, weight="bold", zorder=8)
+        _fit(figure, [place for _, place, _ in names], bool(names))
+        if names:
+            handles = [
+                Line2D([], [], linestyle="", marker=f"${k}$", color=colour, label=_wrap(text))
+                for k, (text, _, (_, colour)) in enumerate(names, 1)
+            ]
+            figure.legend(handles=handles, loc="outside right upper", fontsize=7)
         return save_figure(figure, target)
+
+
+def _fit(figure: Figure, places: Sequence[tuple[float, float]], has_legend: bool) -> None:
+    """Set the limits to what is drawn within the arena, and the figure's size to their ratio."""
+    (axes,) = figure.axes
+    low, high = np.array(axes.dataLim.min), np.array(axes.dataLim.max)
+    arena = np.array([axes.get_xlim(), axes.get_ylim()]).T
+    low, high = np.maximum(low - _MARGIN, arena[0]), np.minimum(high + _MARGIN, arena[1])
+    if places:
+        low = np.minimum(low, np.min(places, axis=0) - _BEYOND)
+        high = np.maximum(high, np.max(places, axis=0) + _BEYOND)
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    width, height = np.maximum(_LARGE * (high - low) / (high - low).max(), _SMALL)
+    figure.set_size_inches(width + _FRAME + _LEGEND * has_legend, height + _FRAME)
+
+
+def _wrap(text: str) -> str:
+    return textwrap.fill(text, _LETTERS)

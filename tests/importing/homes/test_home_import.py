@@ -167,20 +167,26 @@ def test_sdf_world_is_imported(tmp_path: Path) -> None:
     (tmp_path / "flat.world").write_text(
         '<sdf version="1.9"><world name="flat">'
         "<include><uri>model://chest</uri><pose>2 1 0 0 0 0</pose></include>"
+        "<include><uri>model://chest</uri><name>other</name><pose>2 -1 0 0 0 0</pose></include>"
         '<model name="wall"><static>1</static>'
         f"{format_sdf_box('6 0.1 2.4', '0 2 1.2', 'l')}</model>"
         f'<model name="cup"><pose>2.2 1 0.85 0 0 0</pose>{cup}</model></world></sdf>'
     )
     done = vkc.importing.import_home(tmp_path / "flat.world", tmp_path / "out")
-    assert done.shapes == {"file": 5, "obstacles": 1, "objects": 4, "floor": 0}
+    assert done.shapes == {"file": 8, "obstacles": 1, "objects": 7, "floor": 0}
     assert {name: placed.object.free for name, placed in done.scene.objects.items()} == {
         "chest": False,
+        "other": False,
         "cup": True,
     }
-    assert list(done.scene.objects["chest"].object.coordinates.names) == ["slide"]
+    for name in ("chest", "other"):
+        made = done.scene.objects[name].object
+        assert list(made.coordinates.names) == ["slide"]
+        assert {grasp.link for grasp in made.attachments.values()} == {"front"}
+    assert "not static, but with joints, hence fixed in place: chest, other" in done.notes
     assert done.scene.objects["cup"].placement.translation == pytest.approx([2.2, 1.0, 0.8])
     # Free floor on the three sides without a wall, around what is there
-    assert done.scene.arena == pytest.approx((-5.0, 5.0, 0.7 - 2.0, 2.05))
+    assert done.scene.arena == pytest.approx((-5.0, 5.0, -1.3 - 2.0, 2.05))
 
 
 def test_xacro_home_is_imported(tmp_path: Path) -> None:

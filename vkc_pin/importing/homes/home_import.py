@@ -190,7 +190,7 @@ def import_home(
         *weight,
         *_note_floor_shapes(home),
         *obstacle_notes,
-        *(note for item in objects for note in item.notes),
+        *(f"{item.name}: {note}" for item in objects for note in item.notes),
     )
     return ImportedHome(
         target / "scene.yaml",

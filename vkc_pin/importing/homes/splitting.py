@@ -228,13 +228,34 @@ def _place_object(
     name: str, description: Description, place: pin.SE3, *, free: bool = False
 ) -> HomeObject:
     """Return an object whose root is at `place` in the world."""
-    inside = move_root(description, place)
+    inside = move_root(_remove_prefix(description, f"{name}::"), place)
     low, high = compute_bounds(inside, load_surfaces(inside), find_closed_positions(inside))
     x, y = ((low + high) / 2.0).round(6)[:2].tolist()
     z = float(low[2].round(6)) if free else 0.0
     return HomeObject(
         name, move_root(inside, pin.SE3(np.eye(3), -np.array([x, y, z]))), (x, y, z), free
     )
+
+
+def _remove_prefix(description: Description, prefix: str) -> Description:
+    """Return an object without a prefix of names, as models of SDF worlds have it."""
+    names = {name: name.removeprefix(prefix) for name in description.links}
+    if len(set(names.values())) < len(names):
+        return description
+    links = {
+        names[name]: dataclasses.replace(link, name=names[name])
+        for name, link in description.links.items()
+    }
+    joints = {
+        names[child]: dataclasses.replace(
+            joint,
+            name=joint.name.removeprefix(prefix),
+            parent=names[joint.parent],
+            child=names[child],
+        )
+        for child, joint in description.joints.items()
+    }
+    return dataclasses.replace(description, links=links, joints=joints)
 
 
 def _measure_length(link: Link) -> float:

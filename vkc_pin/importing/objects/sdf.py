@@ -23,7 +23,7 @@ from vkc_pin.importing.objects.description import (
     make_inertia,
     make_limits,
 )
-from vkc_pin.utils.arrays import MAX_COORDINATE
+from vkc_pin.utils.arrays import MAX_COORDINATE, MIN_POSITIVE
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.kinematic_tree import MOMENTS, find_roots, parse_numbers
 from vkc_pin.world.files.meshes import load_mesh
@@ -548,14 +548,16 @@ class _Reader:
         """
         loose = [name for name in dict.fromkeys(roots.values()) if name != _WORLD]
         is_connected = _WORLD in roots
-        is_static = {
-            name: any(links[link][0].is_static for link in links if roots[link] == name)
-            for name in loose
+        static = {roots[link] for link, (scope, _) in links.items() if scope.is_static}
+        moving = {
+            roots[child]
+            for child, (scope, joint, _) in joints.items()
+            if self._read_kind(scope, joint) in _MOVING
         }
         if not self.is_world and not free:
             if len(loose) + is_connected == 1:
                 return {}
-            if not all(is_static.values()):
+            if not static.issuperset(loose):
                 raise InputError(
                     "the links do not form one tree",
                     file=self.file,
@@ -563,25 +565,17 @@ class _Reader:
                     expected="one tree",
                     got=", ".join([*loose, *([_WORLD] if is_connected else [])]),
                 )
-        kinds = dict[str, str]()
-        for name in loose:
-            label = links[name][0].path.removesuffix("::") or name
-            can_move = any(
-                self._read_kind(scope, joint) in _MOVING
-                for child, (scope, joint, _) in joints.items()
-                if roots[child] == name
-            )
-            if is_static[name] or can_move:
-                kinds[name] = "fixed"
-                if not is_static[name]:
-                    self.notes.append(
-                        f"'{label}' is not static, but has joints: fixed in its place"
-                    )
-            elif free:
-                kinds[name] = "floating"
-            else:
-                kinds[name] = "left out"
-                self.notes.append(f"'{label}' is free, hence a separate object: left out")
+        other = "floating" if free else "left out"
+        kinds = {name: "fixed" if name in static | moving else other for name in loose}
+        for chosen, about in (
+            (moving - static, "not static, but with joints, hence fixed in place"),
+            ({name for name in kinds if kinds[name] == "left out"}, "free, hence left out"),
+        ):
+            labels = [
+                links[name][0].path.removesuffix("::") or name for name in loose if name in chosen
+            ]
+            if labels:
+                self.notes.append(f"{about}: {', '.join(labels)}")
         return kinds
 
     def _choose_names(
@@ -682,7 +676,9 @@ class _Reader:
                 f"joint '{name}' has a lower limit above its upper limit, {ends}: swapped"
             )
             low, high = high, low
-        return make_limits(low, high), velocity if 0.0 < velocity < MAX_COORDINATE else None
+        return make_limits(
+            low, high
+        ), velocity if MIN_POSITIVE <= velocity < MAX_COORDINATE else None
 
     def _read_dynamics(
         self, scope: _Scope, element: ElementTree.Element, name: str

@@ -136,12 +136,20 @@ def _read_collada(file: Path, submesh: str | None) -> trimesh.Trimesh:
     """Return a COLLADA file, or the geometry of one of its nodes, in the file's unit."""
     import trimesh
 
-    if submesh is None:
+    with tempfile.TemporaryDirectory() as scratch:
+        source = file.absolute()
+        if submesh is not None:
+            source = Path(scratch, "submesh.dae")
+            _copy_submesh(file, submesh, source)
         # It is compiled code, which invalid files crash.
         vertices, faces = run_isolated(
-            _parse_collada, file.absolute(), program="the COLLADA reader", file=file
+            _parse_collada, source, program="the COLLADA reader", file=file
         )
-        return trimesh.Trimesh(vertices, faces)
+    return trimesh.Trimesh(vertices, faces)
+
+
+def _copy_submesh(file: Path, submesh: str, copy: Path) -> None:
+    """Write a COLLADA file without the geometry of all nodes but those with a name."""
     root = parse_xml(read_text(file, "COLLADA"), file)
     labels = {
         f"#{geometry.get('id')}": {geometry.get("id", ""), geometry.get("name", "")}
@@ -158,10 +166,7 @@ def _read_collada(file: Path, submesh: str | None) -> trimesh.Trimesh:
                 node.remove(instance)
     if not is_found:
         raise UnknownNameError("submesh", submesh, names, file=file)
-    with tempfile.TemporaryDirectory() as scratch:
-        copy = Path(scratch, "submesh.dae")
-        ElementTree.ElementTree(root).write(copy, encoding="utf-8", xml_declaration=True)
-        return _read_collada(copy, None)
+    ElementTree.ElementTree(root).write(copy, encoding="utf-8", xml_declaration=True)
 
 
 def _parse_collada(file: Path) -> tuple[Floats, Ints]:

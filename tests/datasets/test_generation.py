@@ -16,7 +16,7 @@ from vkc_pin.datasets.generation import generate
 from vkc_pin.datasets.recipes.recipe import load_recipe
 from vkc_pin.errors import InputError, UnknownNameError, VkcError
 
-pytest.importorskip("h5py")
+h5py = pytest.importorskip("h5py")
 EPISODES = 4
 
 
@@ -85,6 +85,92 @@ def test_removed_files_are_made_again(made: Dataset, tmp_path: Path, removed: st
     assert read_contents(generate(SMALL, EPISODES, tmp_path / "out").folder) == read_contents(
         made.folder
     )
+
+
+@pytest.mark.filterwarnings("ignore:.*made again")
+def test_damaged_files_are_made_again(made: Dataset, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    shutil.copytree(made.folder, folder)
+    works, (shard,) = sorted((folder / "work").iterdir()), (folder / "shards").glob("*/*")
+    for file, data in zip(works, (b"", b"x", works[2].read_bytes()[:2000]), strict=False):
+        file.write_bytes(data)
+    shard.write_bytes(shard.read_bytes()[:-100])
+    with pytest.warns(UserWarning, match="damaged one .*; its episodes are made again"):
+        generate(SMALL, EPISODES, folder, lerobot=True)
+    assert read_contents(folder) == read_contents(made.folder)
+    with h5py.File(shard, "r+") as opened:  # then its episodes are those of the work files
+        del opened["data/demo_2/motion"]
+    generate(SMALL, EPISODES, folder, lerobot=True)
+    assert read_contents(folder) == read_contents(made.folder)
+
+
+def change_line(line: dict[str, Any], *path: Any, value: Any) -> None:
+    """Set a field of a line of the journal, or remove it if the value is `...`."""
+    inner: Any = line
+    for name in path[:-1]:
+        inner = inner[name]
+    if value is ...:
+        del inner[path[-1]]
+    else:
+        inner[path[-1]] = value
+
+
+LINES: list[tuple[tuple[Any, ...], Any]] = [
+    *((("key",), value) for value in ("abc", "1.5", "01", "-1", None, "9" * 5000, 1)),
+    (("records",), []),
+    (("records",), [{}, {}]),
+    (("records",), [3]),
+    (("records",), [{}]),
+    (("records",), {"number": 1}),
+    (("records", 0, "number"), 0),
+    (("records", 0, "number"), 1.5),
+    (("records", 0, "success"), "yes"),
+    (("records", 0, "status"), ...),
+    *((("records", 0, "way"), value) for value in ("x", [], [[0.0], [0.0, 1.0]], [[None]], ...)),
+    (("records", 0, "duration"), -1.0),
+    (("records", 0, "duration"), float("nan")),
+    (("records", 0, "scene"), 3),
+    (("records", 0, "goal"), {"x": 1}),
+    (("memory_mb",), "much"),
+    (("seconds",), ...),
+    (("process",), 3),
+    (("resident_mb",), ...),
+]
+
+
+@pytest.mark.parametrize("place", range(len(LINES)))
+def test_damaged_lines_of_a_journal_are_named(made: Dataset, tmp_path: Path, place: int) -> None:
+    path, value = LINES[place]
+    file = tmp_path / "out" / "journal.jsonl"
+    file.parent.mkdir()
+    lines = (made.folder / "journal.jsonl").read_text().splitlines()
+    data = json.loads(lines[3])
+    change_line(data, *path, value=value)
+    lines[3] = json.dumps(data)
+    file.write_text("\n".join(lines) + "\n")
+    with pytest.raises(InputError) as caught:
+        generate(SMALL, EPISODES, file.parent)
+    assert (caught.value.file, caught.value.line) == (file, 4)
+    assert sorted(path.name for path in file.parent.iterdir()) == ["journal.jsonl"]
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "{}", '"x"', "null", "\x00", '{"session": 3}'])
+def test_other_lines_of_a_journal_are_named(made: Dataset, tmp_path: Path, text: str) -> None:
+    file = tmp_path / "out" / "journal.jsonl"
+    file.parent.mkdir()
+    lines = (made.folder / "journal.jsonl").read_text().splitlines()
+    file.write_text("\n".join([lines[0], text, *lines[1:]]) + "\n")
+    with pytest.raises(InputError, match=r"journal\.jsonl:2: this line is damaged"):
+        generate(SMALL, EPISODES, file.parent)
+
+
+@pytest.mark.parametrize("name", ["work", "shards", "scenes", "robots", "lerobot"])
+def test_files_in_place_of_folders_are_named(made: Dataset, tmp_path: Path, name: str) -> None:
+    shutil.copy(made.folder / "journal.jsonl", tmp_path)
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(InputError, match="this is no folder") as caught:
+        generate(SMALL, EPISODES, tmp_path)
+    assert caught.value.file == tmp_path / name
 
 
 def test_stopped_generation_is_resumed(made: Dataset, tmp_path: Path) -> None:

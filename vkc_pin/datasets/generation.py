@@ -95,7 +95,7 @@ def generate(  # noqa: PLR0913 - keyword options of a public call
             without a display.
         KeyboardInterrupt: Ctrl-C was pressed; the same call continues the run.
     """
-    wanted = check_integer(episodes, "episodes", low=1)
+    wanted = check_integer(episodes, "episodes", low=1, high=10**9)
     jobs = check_integer(jobs, "jobs", low=1, high=4096)
     loaded = _load_recipe(recipe, terms, variants=variants, simulate=simulate, cameras=cameras)
     if check_bool(lerobot, "lerobot"):

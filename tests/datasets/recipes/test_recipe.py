@@ -88,6 +88,11 @@ def test_unknown_names_are_refused(tmp_path: Path, line: str, field: str, said: 
     [
         ("max_evaluations: 0", "max_evaluations"),
         ("variants: -1", "variants"),
+        ("variants: 1000000000", "variants"),
+        ("rate: 1.0e-9", "rate"),
+        ("rate: 5000", "rate"),
+        ("rooms: {episodes: 100000}", "rooms.episodes"),
+        ("rooms: {first: 10000000000}", "rooms.first"),
         ("robots: []", "robots"),
         ("goal: {share: [0.5, 0.4]}", "goal.share"),
         ("goal: {share: [0.0, 0.4]}", "goal.share"),

@@ -63,7 +63,8 @@ _share = require(
 )
 Interval = Annotated[tuple[Number, Number], require_length(2), _increasing]
 Share = Annotated[Interval, _share]
-Whole = Annotated[int, Field(strict=True, ge=1)]
+Whole = Annotated[int, Field(strict=True, ge=1, le=10**9)]
+Several = Annotated[int, Field(strict=True, ge=1, le=1000)]  # attempts of a process at a time
 Pixels = Annotated[int, Field(strict=True, ge=8, le=2048)]
 Names = Annotated[tuple[str, ...], require(lambda value: value, "there is nothing", "at least one")]
 
@@ -82,8 +83,8 @@ class RoomsSchema(Schema):
     """
 
     count: Whole | None = 50
-    first: Annotated[int, Field(strict=True, ge=0)] = 0
-    episodes: Whole = 4
+    first: Annotated[int, Field(strict=True, ge=0, le=10**9)] = 0
+    episodes: Several = 4
     objects: Annotated[int, Field(strict=True, ge=1, le=3)] = 2
     clutter: Interval = (0.0, 0.4)
     width: Interval = (5.5, 8.0)
@@ -167,10 +168,10 @@ class RecipeSchema(Schema):
     options: dict[str, Any] = Field(default_factory=dict)
     max_evaluations: Whole = 100_000
     time_limit: Positive = 60.0
-    variants: Whole = 1
-    rate: Positive = 10.0
+    variants: Several = 1
+    rate: Annotated[Positive, Field(ge=0.01, le=1000.0)] = 10.0
     simulate: bool = False
-    cameras: tuple[CameraSchema, ...] = ()
+    cameras: Annotated[tuple[CameraSchema, ...], Field(max_length=16)] = ()
     terms: tuple[TermSchema, ...] = ()
 
 

@@ -200,6 +200,17 @@ def test_the_pose_of_the_model_counts(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.ptp(find_box(found, "case"), axis=0), [0.4, 0.8, 0.6])
 
 
+@pytest.mark.parametrize("version", ["1.4", "1.6"])
+@pytest.mark.parametrize("free", [False, True])
+def test_links_of_old_files_may_be_called_world(tmp_path: Path, version: str, free: bool) -> None:
+    text = format_chest(version=version, parent="world").replace('"case"', '"world"')
+    (tmp_path / "t.sdf").write_text(text)
+    found = read_object_sdf(tmp_path / "t.sdf", free=free)
+    assert found.joints["front"].parent == "world"
+    assert len(found.links) == 2 + free
+    np.testing.assert_allclose(np.ptp(find_box(found, "world"), axis=0), [0.4, 0.6, 0.8])
+
+
 @pytest.mark.parametrize("frame", ["case", "f", "slide", "front"])
 def test_models_are_placed_by_one_of_their_frames(tmp_path: Path, frame: str) -> None:
     """Where this frame has been in the model, the model's own frame stays."""
@@ -318,6 +329,12 @@ def test_springs_are_read(tmp_path: Path) -> None:
         ({"model": "<link/>"}, "a link without a name"),
         ({"model": "<include><uri>model://nothing</uri></include>"}, r"no such model .*model://no"),
         ({"model": "<include/>"}, "no such model"),
+        ({"model": f"<include><uri>{'a' * 300}</uri></include>"}, "no file can be called that"),
+        ({"model": "<include><uri>model://%00</uri></include>"}, "no file can be called that"),
+        (
+            {"model": '<link name="a::b"/><model name="a"><link name="b"/></model>'},
+            "a::b: two links have the same name",
+        ),
         ({"model": "<include><uri>t.sdf</uri></include>"}, r"includes itself .*t\.sdf → t\.sdf"),
         ({"model": '<model name="m"/>'}, "m: a model without links"),
         (

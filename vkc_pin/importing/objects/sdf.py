@@ -35,6 +35,7 @@ __all__ = ["read_object_sdf"]
 _NEWEST = 12  # minor version
 _MOST_MODELS = 5000
 _WORLD = "world"
+_BASE = "\0world"  # the world among links: links of old files may be called "world"
 _MOVING = ("revolute", "continuous", "prismatic")
 _JOINT_TYPES = ("fixed", *_MOVING, "ball", "universal", "revolute2", "screw", "gearbox")
 # Numbers of each shape: name of the element and count
@@ -244,13 +245,13 @@ class _Scope:
         if (inner := self._find_inner(name)) is not None:
             return inner[0].find_link(inner[1])
         if name == _WORLD:
-            return _WORLD
+            return _BASE
         names = [*self._list_names(), _WORLD]
         raise UnknownNameError("link", name, names, file=self.file, field=self.element.get("name"))
 
     def _find_canonical_link(self) -> str:
         if self.above is None:
-            return _WORLD
+            return _BASE
         stated = self.element.get("canonical_link", "").strip()
         if stated:
             return self.find_link(stated)
@@ -395,7 +396,7 @@ class _Reader:
         for element in scope.element.findall("model"):
             inner = _Scope(scope.file, element, scope.rules, scope)
             self._add(scope, scope.models, element, inner)
-            self._make_nested(inner, files)
+            self._fill_inner_scope(inner, files)
         for include in scope.element.findall("include"):
             self._include(scope, include, files)
         for tag in ("actor", "population", "road", "state"):
@@ -407,7 +408,9 @@ class _Reader:
             raise make_element_error(scope.file, scope.element, problem, field=name)
         return scope
 
-    def _make_nested(self, inner: _Scope, files: tuple[Path, ...], name: str | None = None) -> None:
+    def _fill_inner_scope(
+        self, inner: _Scope, files: tuple[Path, ...], name: str | None = None
+    ) -> None:
         """Fill in a model inside another one or a world; name "": its names are the other's."""
         assert inner.above is not None
         name = inner.element.get("name", "") if name is None else name
@@ -450,15 +453,23 @@ class _Reader:
         )
         if _is_true(include.get("merge", "false")):
             scope.merged.append(inner)
-            self._make_nested(inner, files, "")
+            self._fill_inner_scope(inner, files, "")
             return
         named = include if include.findtext("name") else models[0]
         self._add(scope, scope.models, named, inner)
-        self._make_nested(inner, files, (named.findtext("name") or named.get("name") or "").strip())
+        self._fill_inner_scope(
+            inner, files, (named.findtext("name") or named.get("name") or "").strip()
+        )
 
     def read(self, *, free: bool) -> Description:
         scopes = list(self.world.walk())
-        links = {scope.path + name: (scope, name) for scope in scopes for name in scope.links}
+        links: dict[str, tuple[_Scope, str]] = {}
+        for scope in scopes:
+            for name, link in scope.links.items():
+                if (key := scope.path + name) in links:
+                    problem = "two links have the same name"
+                    raise make_element_error(scope.file, link, problem, field=key)
+                links[key] = scope, name
         joints: dict[str, tuple[_Scope, ElementTree.Element, str]] = {}  # by the child link
         for scope in scopes:
             for name, joint in scope.joints.items():
@@ -478,14 +489,14 @@ class _Reader:
                         got=f"joints '{got}' and '{name}'",
                     )
                 joints[ends[1]] = scope, joint, ends[0]
-        if _WORLD in joints:
-            scope, joint, _ = joints[_WORLD]
+        if _BASE in joints:
+            scope, joint, _ = joints[_BASE]
             problem = "the world cannot be a child"
             raise make_element_error(scope.file, joint, problem, field=joint.get("name"))
         lines = {name: find_line(scope.links[local]) for name, (scope, local) in links.items()}
-        is_connected = any(parent == _WORLD for _, _, parent in joints.values())
+        is_connected = any(parent == _BASE for _, _, parent in joints.values())
         above = {child: (parent, "") for child, (_, _, parent) in joints.items()}
-        roots = find_roots(self.file, {**lines, **({_WORLD: None} if is_connected else {})}, above)
+        roots = find_roots(self.file, {**lines, **({_BASE: None} if is_connected else {})}, above)
         return self._describe(links, joints, roots, free=free)
 
     def _describe(
@@ -498,8 +509,9 @@ class _Reader:
     ) -> Description:
         kinds = self._connect(links, joints, roots, free=free)
         names = self._choose_names(links, kinds)
+        base = names[_BASE]
         repeated = Counter(joint.get("name", "") for _, joint, _ in joints.values())
-        frames = {_WORLD: pin.SE3.Identity()}
+        frames = {_BASE: pin.SE3.Identity()}
         # Link frames are moved to their joints, so that axes pass through origins.
         for name, (scope, local) in links.items():
             if name in joints:
@@ -509,17 +521,17 @@ class _Reader:
                 frames[name] = scope.find_placement(local)
             else:
                 frames[name] = pin.SE3.Identity()
-        found_links = {_WORLD: Link(_WORLD)} if kinds or _WORLD in roots else {}
+        found_links = {base: Link(base)} if kinds or _BASE in roots else {}
         found_joints = dict[str, Joint]()
         for name, (scope, local) in links.items():
-            if roots[name] != _WORLD and kinds.get(roots[name], "fixed") == "left out":
+            if roots[name] != _BASE and kinds.get(roots[name], "fixed") == "left out":
                 continue
             found_links[names[name]] = self._read_link(scope, local, names[name], frames[name])
             if name in joints:
                 holder, joint, parent = joints[name]
                 label = str(joint.get("name"))
                 label = holder.path + label if repeated[label] > 1 else label
-                ends = (names.get(parent, parent), names[name])
+                ends = (names[parent], names[name])
                 found_joints[names[name]] = self._read_joint(
                     holder, joint, label, ends, frames[parent].inverse() * frames[name]
                 )
@@ -527,7 +539,7 @@ class _Reader:
                 found_joints[names[name]] = Joint(
                     name=f"{names[name]}_{kinds[name]}",
                     kind=kinds[name],
-                    parent=_WORLD,
+                    parent=base,
                     child=names[name],
                     placement=frames[name],
                 )
@@ -546,8 +558,8 @@ class _Reader:
         Values are "fixed", "floating" and "left out". If the only root is to be the description's,
         there are none.
         """
-        loose = [name for name in dict.fromkeys(roots.values()) if name != _WORLD]
-        is_connected = _WORLD in roots
+        loose = [name for name in dict.fromkeys(roots.values()) if name != _BASE]
+        is_connected = _BASE in roots
         static = {roots[link] for link, (scope, _) in links.items() if scope.is_static}
         moving = {
             roots[child]
@@ -588,7 +600,10 @@ class _Reader:
             path = links[name][0].path
             if path and models[path] == 1 and path.removesuffix("::") not in links:
                 names[name] = path.removesuffix("::")
-        return names
+        base = _WORLD
+        while base in names.values():
+            base += "_"
+        return {**names, _BASE: base}
 
     def _read_kind(self, scope: _Scope, joint: ElementTree.Element) -> str:
         kind, name = joint.get("type", "").strip(), joint.get("name")

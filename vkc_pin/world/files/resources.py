@@ -125,10 +125,7 @@ def find_mesh_file(
     Raises:
         InputError: There is no such file.
     """
-    candidates = [
-        check_path(candidate, "filename", "a mesh file")
-        for candidate in list_address_candidates(address, file, packages)
-    ]
+    candidates = list_address_candidates(address, file, packages)
     for candidate in candidates:
         if candidate.is_file():
             return candidate
@@ -158,7 +155,7 @@ def list_address_candidates(
     """Return the paths that an address in a description file may mean; see `find_mesh_file`.
 
     Raises:
-        InputError: The address has another scheme, such as `https:`.
+        InputError: The address has another scheme, such as `https:`, or is too long.
     """
     text = address.strip()
     match = _SCHEME.fullmatch(text)
@@ -181,7 +178,8 @@ def list_address_candidates(
     else:  # a colon in a file name
         found = [folder / text for folder in _list_folders(file)]
     decoded = [Path(unquote(str(path))) for path in found]
-    return list(dict.fromkeys(found + decoded))
+    candidates = dict.fromkeys(found + decoded)
+    return [check_path(path, "filename", "a file") for path in candidates]
 
 
 def _list_folders(file: Path) -> list[Path]:

@@ -128,6 +128,8 @@ def _draw(axes: Any, proposals: Proposals, proposal: Proposal, joint: str) -> No
     tool = item.link_placement(attachment.link, state) * attachment.tool(
         np.zeros(len(attachment.freedoms))
     )
+    if attachment.contact == "push":  # the foremost point of the hand is there
+        tool = tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, -proposals.hand.tip]))
     for geometry, where in (*proposals.hand.touch, *proposals.hand.others):
         triangles.add(geometry, tool * where, to_rgb(COLOURS[0]))
     triangles.draw(axes, -tool.rotation[:, 2])

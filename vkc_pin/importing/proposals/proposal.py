@@ -25,9 +25,9 @@ class Proposal:
 
     Attributes:
         attachment: The attachment.
-        kind: "bar", "knob" or "edge".
+        kind: "bar", "knob", "edge" or "push".
         named: Whether a name identifies it as a handle.
-        thickness: Thickness between the fingers [m].
+        thickness: Thickness between the fingers [m]; 0 for a push.
         score: Quality, from 0 to 1.
         opens: Maps each joint to the position, [rad] or [m], to which it can be opened before the
             hand collides with the object.
@@ -52,10 +52,20 @@ class Proposal:
             "approach": round_values(item.placement.rotation[:, 2], 12),
             "closing": round_values(item.placement.rotation[:, 0], 12),
         }
-        if item.freedoms:
+        if item.contact == "push":
+            data["contact"] = "push"
+            data["freedoms"] = [
+                {
+                    "name": freedom.suffix.removeprefix("_"),
+                    "slide" if freedom.kind == "prismatic" else "turn": freedom.axis.tolist(),
+                    "limits": round_values([freedom.lower, freedom.upper]),
+                }
+                for freedom in item.freedoms
+            ]
+        elif item.freedoms:
             data |= {"joint": item.joint, "axis": round_values(item.freedoms[0].axis, 12)}
             data["limits"] = [item.freedoms[0].lower, item.freedoms[0].upper]
-        if len(item.freedoms) == 2:
+        if item.joint == "cylindrical":
             data["turn"] = [item.freedoms[1].lower, item.freedoms[1].upper]
         if item.standoff:
             data["standoff"] = round(item.standoff, 5)
@@ -116,15 +126,17 @@ class Proposals:
                 free = (
                     f", {1e3 * (slide.upper - slide.lower):.0f} mm to slide along" if slide else ""
                 )
-                freedom = proposal.attachment.joint
                 when = _format_conditions(
                     [f"{other} is at {value:.3g}" for other, value in proposal.when.items()]
                 )
                 wide = proposal.attachment.opening
                 narrow = "" if wide is None else f", fingers {1e3 * wide:.0f} mm apart"
+                thick = f"{1e3 * proposal.thickness:.0f} mm thick"
+                how = f"{thick}{narrow}, {proposal.attachment.joint}{free}"
+                if proposal.kind == "push":
+                    how = f"a face to push{free}"
                 lines.append(
-                    f"  {proposal.score:.2f}  {name}: "
-                    f"{1e3 * proposal.thickness:.0f} mm thick{narrow}, {freedom}{free}, "
+                    f"  {proposal.score:.2f}  {name}: {how}, "
                     f"opens to {proposal.opens[joint]:.3g} {unit}{when}"
                 )
             if joint in self.because:

@@ -14,6 +14,7 @@ from vkc_pin.importing.proposals.candidates import Candidate, Piece, Thickness, 
 from vkc_pin.importing.proposals.fitting import GraspMotion, HandClearance, Obstruction
 from vkc_pin.importing.proposals.hand import make_hand
 from vkc_pin.importing.proposals.proposal import Proposal, Proposals
+from vkc_pin.importing.proposals.pushing import Push, find_pushes
 from vkc_pin.importing.proposals.ranking import (
     Opening,
     find_named_handles,
@@ -23,7 +24,7 @@ from vkc_pin.importing.proposals.ranking import (
 from vkc_pin.utils.arguments import check_instance, check_integer, check_number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.urdf import read_urdf
-from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment
+from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment, Freedom
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
 
@@ -43,6 +44,12 @@ _ROOM = (0.02, 0.01)  # [m] extra clearances that increase the score
 _SLACK = 0.05  # [m] slide to either side above which the score does not increase further
 _WORTH = 0.1  # smallest score, relative to the best grasp of a joint
 _ROUND = 0.01  # [m] openings are multiples of this, and smaller than fully open by at least this
+_PUSHED = 60  # places on faces that are checked with the hand
+_PUSH = 0.3  # factor for the score of a push, which cannot pull the joint back
+_APART = 0.25  # [m] smallest distance of two pushes of a joint, which slide along the face
+_PUSH_STEPS = 8  # positions of the joint at which the clearance of a push is checked
+_TILT, _TILT_ROOM = 0.4, 0.005  # [rad] rotation about the contact, and the standoff that it takes
+_CLOSING = np.array([1.0, 0.0, 0.0])  # along which both fingers touch a face
 _LITTLE = 0.1  # smallest travel of a joint, relative to its range, that counts as opening it
 
 
@@ -71,7 +78,8 @@ def propose_attachments(
     the open fingers, and their pads meet faces off which they do not slip, there is a bar, a knob
     or an edge. The open hand is placed there, and retreats straight, among all shapes of the closed
     object; then it follows the joint as it opens. Where fully open fingers have no clearance, a
-    gripper's fingers are tried closer together; the attachment then has this `opening`.
+    gripper's fingers are tried closer together; the attachment then has this `opening`. Joints
+    whose links offer no grasp, such as sliding doors without a handle, get pushes on their faces.
 
     Args:
         item: The object, standing upright on its lowest point.
@@ -149,7 +157,59 @@ class _Search:
                     number, {other.joint: other.opened for other in others}
                 )
                 self.tallies[number] = self.tallies[number] if found else before
-        return found
+        return found or self._propose_pushes(number)
+
+    def _propose_pushes(self, number: int) -> list[Proposal]:
+        """Return pushes for a joint whose links offer no grasp, best first; at most two."""
+        opening, hand = self.openings[number], self.hand
+        self.fitting.place(self.closed)
+        at = self.fitting.joint(number).copy()
+        pushes = [
+            push
+            for piece in self.pieces.get(number, ())
+            for push in find_pushes(piece, at, opening, hand.width)
+        ]
+        found, taken = list[Proposal](), list[Floats]()
+        for push in sorted(pushes, key=lambda push: -push.quality)[:_PUSHED]:
+            where = push.placement.translation
+            if any(np.linalg.norm(where - other) < _APART for other in taken):
+                continue
+            link, opened = push.piece.link, self._follow_push(push, opening)
+            share = abs(opened - opening.closed) / max(abs(opening.opened - opening.closed), 1e-9)
+            if share <= _LITTLE:
+                continue
+            placement = self.item.model.frames[self.item.link_frame(link)].placement.inverse()
+            slide = Freedom("_slide", "prismatic", _CLOSING, *push.slide)
+            turn = Freedom("_turn", "revolute", _CLOSING, -_TILT, _TILT)
+            attachment = Attachment(
+                name=link,
+                link=link,
+                placement=placement * push.placement,
+                joint="listed",
+                freedoms=(slide, turn) if push.slide[0] < push.slide[1] else (turn,),
+                standoff=_TILT_ROOM,
+                contact="push",
+            )
+            score = _PUSH * push.quality * min(share, 1.0)
+            found.append(Proposal(attachment, "push", False, 0.0, score, {opening.joint: opened}))
+            taken.append(where)
+        return sorted(found, key=lambda proposal: -proposal.score)[: min(2, self.most)]
+
+    def _follow_push(self, push: Push, opening: Opening) -> float:
+        """Return how far a hand pushes a joint open, [rad] or [m], before it is obstructed."""
+        ahead = _retreat(self.hand.tip + self.close + _TILT_ROOM)
+        link, reached = push.piece.link, opening.closed
+        for value in np.linspace(opening.closed, opening.opened, _PUSH_STEPS + 1).tolist():
+            state = self.closed.copy()
+            state[opening.coordinate] = value
+            self.fitting.place(state)
+            tool = self.fitting.joint(opening.number) * push.placement * ahead
+            blocked = self.fitting.find_obstruction(tool, link)
+            if blocked or (value == opening.closed and self._check_retreat(tool, link)):
+                break
+            reached = value
+        self.fitting.place(self.closed)
+        return float(reached)
 
     def _find_joint(self, link: str) -> int:
         return int(self.item.model.frames[self.item.link_frame(link)].parentJoint)

@@ -10,6 +10,7 @@ from helpers.downloads import SDF
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.importing.objects.clean_up import add_missing_limits, load_surfaces
 from vkc_pin.importing.objects.description import Description
+from vkc_pin.importing.objects.object_import import read_description
 from vkc_pin.importing.objects.sdf import read_object_sdf
 
 
@@ -354,6 +355,13 @@ def test_wrong_models_are_refused(tmp_path: Path, changes: dict[str, str], messa
         read(tmp_path, format_chest(**changes))
 
 
+def test_commas_between_numbers_are_noted(tmp_path: Path) -> None:
+    (tmp_path / "t.sdf").write_text(format_chest(pose="<pose>-0.22, 0, 0.5, 0, 0, 0</pose>"))
+    found = read_description(tmp_path / "t.sdf")
+    np.testing.assert_allclose(find_box(found)[0], [-0.23, -0.28, 0.35])
+    assert found.notes == (f"{tmp_path / 't.sdf'}: pose text: commas are read as spaces",)
+
+
 def test_a_missing_or_newer_version_is_noted(tmp_path: Path) -> None:
     found = read(tmp_path, format_chest().replace(' version="1.7"', ""))
     assert found.notes == ("t.sdf states no version: read as SDF 1.7",)
@@ -392,7 +400,7 @@ WORLD = """<sdf version="1.6"><world name="flat">
     <include><uri>model://bin</uri><name>part</name><pose>0 0 1 0 0 0</pose></include>
     <joint name="door" type="revolute"><parent>world</parent><child>part::body</child>
       <axis><xyz>0 0 1</xyz><limit><lower>0</lower><upper>1</upper></limit></axis></joint></model>
-  <light name="sun"/><state world_name="flat"/>
+  <light name="sun"/><state world_name="flat"/><model name="nothing"/>
 </world></sdf>"""
 
 
@@ -429,7 +437,7 @@ def test_worlds_and_included_models_are_read(folder: Path) -> None:
     for name, place in (("bin", [3, 0, 0]), ("other", [4, 0, 0]), ("unit::part::body", [1, 0, 1])):
         np.testing.assert_allclose(places[name].translation, place)
     np.testing.assert_allclose(np.ptp(find_box(found, "bin"), axis=0), [0.2, 0.4, 0.6], rtol=0.02)
-    assert found.notes == ("<state> is left out",)
+    assert found.notes == ("<state> is left out", "model 'nothing' has no links: left out")
     alone = read_object_sdf(folder / "flat.world")
     assert "bin" not in alone.links
     assert "free, hence left out: bin" in alone.notes

@@ -95,3 +95,31 @@ def test_inertia_is_read(tmp_path: Path) -> None:
     ):
         assert words in note
         assert "counts as none" in note
+
+
+@pytest.mark.parametrize(
+    ("kind", "limit", "read", "limits"),
+    [
+        ("revolute", 'lower="-1.8e308" upper="1.8e308"', None, None),
+        ("revolute", 'lower="-1.79769e308" upper="1.79769e308"', "continuous", None),
+        ("revolute", 'lower="-3.4028235e38" upper="3.4028235e38"', "continuous", None),
+        ("revolute", 'lower="-1e16" upper="1.5"', "revolute", (-np.inf, 1.5)),
+        ("prismatic", 'lower="-1e16" upper="1e16"', "prismatic", None),
+        ("prismatic", 'lower="0" upper="2147483647"', "prismatic", (0.0, np.inf)),
+        ("prismatic", 'lower="0" upper="0.4" velocity="-1" effort="-1"', "prismatic", (0.0, 0.4)),
+    ],
+)
+def test_huge_limits_are_none(
+    tmp_path: Path, kind: str, limit: str, read: str | None, limits: tuple[float, float] | None
+) -> None:
+    file = tmp_path / "t.urdf"
+    file.write_text(
+        f'<robot name="t"><link name="a"/><link name="b"/><joint name="j" type="{kind}">'
+        f'<parent link="a"/><child link="b"/><limit {limit}/></joint></robot>'
+    )
+    if read is None:  # beyond the largest float
+        with pytest.raises(InputError, match="j: limit lower: wrong numbers"):
+            read_object_urdf(file)
+        return
+    joint = read_object_urdf(file).joints["b"]
+    assert (joint.kind, joint.limits, joint.velocity) == (read, limits, None)

@@ -255,8 +255,12 @@ class _Scope:
         stated = self.element.get("canonical_link", "").strip()
         if stated:
             return self.find_link(stated)
-        inner = [*self.models.values(), *self.merged]
-        return self.path + next(iter(self.links)) if self.links else inner[0].find_link("")
+        if self.links:
+            return self.path + next(iter(self.links))
+        for scope in (*self.models.values(), *self.merged):
+            return scope.find_link("")
+        problem = "a model without links"
+        raise make_element_error(self.file, self.element, problem, field=self.element.get("name"))
 
     def read_end(self, joint: ElementTree.Element, key: str) -> str:
         """Return the frame that a joint names as its "parent" or "child"."""
@@ -293,7 +297,7 @@ class _Scope:
         largest: float = MAX_COORDINATE,
     ) -> tuple[float, ...]:
         text = text if text is None or text.strip() else None  # an empty element is a default
-        holder = ElementTree.Element("", {} if text is None else {"text": text})
+        holder = ElementTree.Element(element.tag, {} if text is None else {"text": text})
         try:
             return parse_numbers(
                 self.file, holder, "text", count, default=default, where=where, largest=largest
@@ -402,10 +406,14 @@ class _Reader:
         for tag in ("actor", "population", "road", "state"):
             if scope.element.find(tag) is not None:
                 self.notes.append(f"<{tag}> is left out")
-        is_model = scope.above is not None
-        if is_model and not (scope.links or scope.models or scope.merged):
-            problem, name = "a model without links", scope.element.get("name", "")
-            raise make_element_error(scope.file, scope.element, problem, field=name)
+        for name, inner in list(scope.models.items()):
+            if inner.links or inner.models or inner.merged:
+                continue
+            if not self.is_world:
+                problem = "a model without links"
+                raise make_element_error(inner.file, inner.element, problem, field=name)
+            self.notes.append(f"model '{name}' has no links: left out")
+            del scope.models[name]
         return scope
 
     def _fill_inner_scope(
@@ -443,6 +451,7 @@ class _Reader:
         root, rules = self._load(file)
         models = root.findall("model")
         if not models and (root.find("light") is not None or root.find("actor") is not None):
+            self.notes.append(f"{file.name} is left out: it holds no model")
             return
         if len(models) != 1:
             expected, got = "one <model>", f"{len(models)} models"

@@ -20,7 +20,7 @@ from . import odd
 from .calls import TINY
 from .mutate import apply_changes, choose_changes, corrupt
 
-__all__ = ["make_case", "make_document_case", "run", "run_document"]
+__all__ = ["DAE", "make_case", "make_document_case", "run", "run_document"]
 
 MESHES = {"stl": "box.stl", "obj": "box.obj", "ply": "box.ply", "dae": "box.dae"}
 PLANNED = 0.02  # the share of what loads that is planned in
@@ -36,7 +36,7 @@ def make_pool() -> Path:
     for name in MESHES.values():
         if not name.endswith("dae"):
             trimesh.creation.box(extents=(0.5, 0.4, 0.3)).export(root / "scenes" / name)
-    (root / "scenes" / "box.dae").write_text(_DAE, encoding="utf-8")
+    (root / "scenes" / "box.dae").write_text(DAE, encoding="utf-8")
     entries = [
         f"  - {{name: {kind}, type: mesh, file: {name}, position: [{k}, 2.0, 0.5]}}"
         for k, (kind, name) in enumerate(MESHES.items())
@@ -154,7 +154,7 @@ def run_document(given: dict[str, Any]) -> str:
     )
 
 
-_DAE = """<?xml version="1.0"?>
+DAE = """<?xml version="1.0"?>
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
 <asset><unit meter="1"/><up_axis>Z_UP</up_axis></asset>
 <library_geometries><geometry id="g"><mesh>

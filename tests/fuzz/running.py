@@ -30,17 +30,18 @@ TESTS = Path(__file__).resolve().parents[1]
 def _load_kinds() -> dict[
     str, tuple[Callable[[random.Random], dict[str, Any]], Callable[[dict[str, Any]], str]]
 ]:
-    from . import calls, files, plans
+    from . import calls, files, imports, plans
 
     return {
         "files": (files.make_case, files.run),
         "documents": (files.make_document_case, files.run_document),
         "calls": (calls.make_case, calls.run),
         "plans": (plans.make_case, plans.run),
+        "imports": (imports.make_case, imports.run),
     }
 
 
-KINDS = {"files": 0.35, "documents": 0.2, "calls": 0.35, "plans": 0.1}
+KINDS = {"files": 0.3, "documents": 0.15, "calls": 0.3, "plans": 0.1, "imports": 0.15}
 """Kind of cases → its share."""
 
 
@@ -157,6 +158,7 @@ class Worker:
                 **os.environ,
                 "OMP_NUM_THREADS": "1",
                 "VKC_PIN_CACHE": "off",
+                "VKC_PIN_PARSE_SECONDS": "10",
                 "MPLBACKEND": "agg",
                 "TMPDIR": self.folder.name,
             }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
+from vkc_pin.world.files.writing import MANIFEST, check_writable
 
 __all__ = [
     "add_connection",
@@ -79,14 +81,15 @@ def check_target(folder: Path, command: str, *, force: bool) -> None:
         command: Name of the command, e.g. "import-home".
         force: Whether the command may replace its own earlier output.
     """
-    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-        return
-    own = folder.is_dir() and any(
+    is_folder = os.path.isdir(folder)  # noqa: PTH112 - False also without permission to look
+    own = is_folder and any(
         get_origin_marker(command) in _read_first_line(file) for file in folder.glob("*.yaml")
     )
-    if force and own:
+    is_free = not os.path.exists(folder) or (is_folder and not any(folder.iterdir()))  # noqa: PTH110
+    if is_free or (force and own):
+        check_writable(folder / MANIFEST, field="folder")  # before the work, not after it
         return
-    expected, got = "a new or an empty folder", "other files" if folder.is_dir() else "a file"
+    expected, got = "a new or an empty folder", "other files" if is_folder else "a file"
     if own:
         expected += ", or force=True (--force) to replace it"
         got = f"an earlier output of {command}"

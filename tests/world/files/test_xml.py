@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -90,3 +91,14 @@ def test_quoted_text_round_trips(text: str) -> None:
 def test_forbidden_characters_become_replacement_characters() -> None:
     text = "a\0b\x1fc\ud800d\uffffe\tf\ng"
     assert replace_forbidden(text) == "a\ufffdb\ufffdc\ufffdd\ufffde\tf\ng"
+
+
+@pytest.mark.parametrize("depth", [199, 200, 100_000])
+def test_deep_elements_are_refused_before_they_exhaust_the_stack(depth: int) -> None:
+    text = f"<robot>{'<a>' * depth}{'</a>' * depth}</robot>"
+    if depth < 200:
+        copied = copy.deepcopy(parse_xml(text, FILE))
+        assert ElementTree.tostring(copied) == ElementTree.tostring(parse_xml(text, FILE))
+        return
+    with pytest.raises(InputError, match=r"thing\.urdf:1: a: too many elements inside each other"):
+        parse_xml(text, FILE)

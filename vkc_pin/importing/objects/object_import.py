@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.errors import InputError, format_value
+from vkc_pin.errors import InputError
 from vkc_pin.importing.objects.clean_up import (
     add_missing_limits,
     compute_bounds,
@@ -41,10 +41,12 @@ from vkc_pin.importing.targets import check_target, get_origin_marker
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import (
     check_bool,
+    check_choice,
     check_coordinate,
     check_instance,
     check_integer,
     check_mapping,
+    check_text,
 )
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.documents import read_text
@@ -127,9 +129,12 @@ def read_description(
         name: check_path(value, f"packages['{name}']", "a folder")
         for name, value in check_mapping(packages or {}, "packages").items()
     }
+    given = {
+        name: str(value) for name, value in check_mapping(arguments or {}, "arguments").items()
+    }
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        description = _read_format(path, folders, arguments or {}, free=free)
+        description = _read_format(path, folders, given, free=free)
     notes = dict.fromkeys(str(warning.message) for warning in caught)
     return dataclasses.replace(description, notes=(*description.notes, *notes))
 
@@ -195,13 +200,9 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
         UnknownNameError: The link or robot is unknown, or the file refers to an unknown name.
     """
     path = check_path(file, "file", "a URDF, xacro, MJCF or SDF file")
-    if up not in ("y", "z"):
-        raise InputError(
-            "`up` must be an axis of the file",
-            field="up",
-            expected='"y" or "z"',
-            got=format_value(up),
-        )
+    check_choice(up, ("y", "z"), "vertical axis", "up")
+    if link is not None:
+        check_text(link, "link", "the name of a link")
     for name, value in (("height", height), ("scale", scale)):
         if value is not None and check_coordinate(value, name) <= 0.0:
             raise InputError(
@@ -222,7 +223,7 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
     description = read_description(path, packages=packages, arguments=arguments)
     description = (
         extract_subtree(description, link)
-        if link
+        if link is not None
         else dataclasses.replace(
             description, notes=description.notes + find_multiple_objects(description)
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
@@ -159,7 +160,7 @@ def import_robot(  # noqa: PLR0913 - keyword options of a public call
         with warnings.catch_warnings():
             # They name temporary files, and loading the folder repeats them.
             warnings.simplefilter("ignore")
-            imported = _Importer(source, staging, target.resolve().name).run(
+            imported = _Importer(source, staging, Path(os.path.realpath(target)).name).run(
                 arm, tool_frame, most_pieces, samples, seed
             )
     return dataclasses.replace(imported, folder=target, robot=load_robot(target / "robot.yaml"))

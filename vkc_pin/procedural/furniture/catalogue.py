@@ -17,7 +17,7 @@ from vkc_pin.procedural.furniture.building import ObjectBuilder, Sampler
 from vkc_pin.utils.arguments import check_choice, check_integer, check_mapping
 from vkc_pin.utils.pickling import freeze
 from vkc_pin.world.files.resources import check_path
-from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.world.files.writing import check_writable, write_atomically
 from vkc_pin.world.models.object_file import load_object
 
 __all__ = ["KINDS", "Kind", "random_object", "write_object"]
@@ -95,6 +95,7 @@ def write_object(description: Mapping[str, Any], path: str | Path) -> Path:
         expected = "a path that ends with .yaml"
         raise InputError("not an object file", field="path", expected=expected, got=file.name)
     load_object(plain, folder=file.parent)  # raises an error if it is invalid
+    check_writable(file)
     urdf = plain["urdf"]
     if urdf.lstrip().startswith("<"):
         plain = {**plain, "urdf": write_atomically(file.with_suffix(".urdf"), urdf.encode()).name}

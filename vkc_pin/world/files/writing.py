@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import secrets
@@ -17,6 +18,7 @@ from vkc_pin.world.files.documents import parse_json, read_text
 from vkc_pin.world.files.resources import check_path
 
 __all__ = [
+    "MANIFEST",
     "check_inside",
     "check_links",
     "check_name",
@@ -30,6 +32,7 @@ __all__ = [
 MANIFEST = ".vkc-pin.json"
 """File that lists the other files in a folder of `write_folder_atomically`."""
 _MAX_NAME_LENGTH = 200  # bytes, so that an ending can be added
+_FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _MAX_LISTED = 3  # files that a message names
 
 
@@ -217,6 +220,10 @@ def write_folder_atomically(path: str | Path, *, force: bool = False) -> Iterato
         if error.file is not None:
             error.file = type(error.file)(str(error.file).replace(str(staging), str(path)))
         raise
+    except OSError as error:
+        if error.errno not in _FULL_DISK:
+            raise
+        raise InputError("cannot write this", file=path, got=error.strerror) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 

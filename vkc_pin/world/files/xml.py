@@ -24,6 +24,7 @@ __all__ = [
 ]
 
 _INDEX_ELEMENTS = ("h", "p", "v", "vcount")
+_MAX_DEPTH = 200  # of elements inside each other: Python writes and copies them recursively
 _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
@@ -67,11 +68,26 @@ def read_xml(
 def parse_xml(text: str, file: Path) -> ElementTree.Element:
     """Return the root of an XML document; `file` is for messages."""
     builder = ElementTree.TreeBuilder(element_factory=_Element)
-    parser = expat.ParserCreate()
+    parser, depth = expat.ParserCreate(), 0
 
     def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal depth
+        depth += 1
+        if depth > _MAX_DEPTH:
+            raise InputError(
+                "too many elements inside each other",
+                file=file,
+                line=parser.CurrentLineNumber,
+                field=tag,
+                expected=f"at most {_MAX_DEPTH}",
+            )
         element: Any = builder.start(tag, attributes)
         element.line = parser.CurrentLineNumber
+
+    def end(tag: str) -> None:
+        nonlocal depth
+        depth -= 1
+        builder.end(tag)
 
     def entity(name: str, *_: object) -> None:
         raise InputError(
@@ -82,7 +98,7 @@ def parse_xml(text: str, file: Path) -> ElementTree.Element:
             expected="plain text",
         )
 
-    parser.StartElementHandler, parser.EndElementHandler = start, builder.end
+    parser.StartElementHandler, parser.EndElementHandler = start, end
     parser.CharacterDataHandler, parser.EntityDeclHandler = builder.data, entity
     try:
         parser.Parse(text.encode(), True)

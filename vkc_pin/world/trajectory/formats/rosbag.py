@@ -6,8 +6,10 @@ A motion is plain data as returned by `Trajectory.to_dict`. Messages are built f
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import sqlite3
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -80,7 +82,7 @@ def write_rosbag(
         motion, store.types, rate, states, frame=frame, base_frame=own, stamp=stamp
     )
     found = sorted(messages, key=lambda item: item[1])
-    with write_folder_atomically(path, force=force) as staging:
+    with write_folder_atomically(path, force=force) as staging, _report_database_errors(path):
         inside = staging / Path(path).absolute().name  # names the database
         with Writer(inside, version=_FORMAT) as writer:
             ends = [end for end in TOPICS if any(end == own for own, _, _ in found)]
@@ -94,6 +96,14 @@ def write_rosbag(
             file.rename(staging / file.name)
         inside.rmdir()
     return Path(path)
+
+
+@contextlib.contextmanager
+def _report_database_errors(path: str | Path) -> Iterator[None]:
+    try:
+        yield
+    except sqlite3.Error as error:  # such as a full disk
+        raise InputError("cannot write this", file=path, got=str(error)) from error
 
 
 def import_rosbags() -> Any:

@@ -1,0 +1,167 @@
+"""Every function that writes leaves all or nothing, and follows no link out of its folder."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import resource
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import vkc_pin as vkc
+from vkc_pin.errors import InputError
+from vkc_pin.procedural import random_object, write_object
+from vkc_pin.world.models.self_collisions import write_srdf
+
+ROBOT = Path(__file__).parent / "fuzz" / "inputs" / "robot.urdf"
+OBJECT = ROBOT.with_name("cabinet.urdf")
+HOME = ROBOT.with_name("home.xml")
+
+
+@functools.cache
+def make_plan() -> vkc.Plan:
+    return vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 0.2})])
+
+
+@functools.cache
+def simulate() -> vkc.SimulationResult:
+    pytest.importorskip("mujoco")
+    return make_plan().simulate()
+
+
+def _import_object(path: Path, **options: Any) -> None:
+    vkc.importing.import_object(OBJECT, path, most=1, **options)
+
+
+def _import_home(path: Path, **options: Any) -> None:
+    pytest.importorskip("mujoco")
+    vkc.importing.import_home(HOME, path, most=1, **options)
+
+
+def _import_robot(path: Path, **options: Any) -> None:
+    vkc.importing.import_robot(ROBOT, path, samples=100, most_pieces=1, **options)
+
+
+def _write_rosbag(path: Path, **options: Any) -> None:
+    pytest.importorskip("rosbags")
+    make_plan().to_rosbag(path, **options)
+
+
+FILES: dict[str, Callable[[Path], Any]] = {
+    "a.npz": lambda path: make_plan().save(path),
+    "a.json": lambda path: make_plan().to_json(path),
+    "a.csv": lambda path: make_plan().to_csv(path),
+    "motion.csv": lambda path: make_plan().trajectory.to_csv(path),
+    "motion.json": lambda path: make_plan().trajectory.to_json(path),
+    "result.json": lambda path: simulate().to_json(path),
+    "drawers.yaml": lambda path: write_object(random_object("drawers", seed=1), path),
+}
+FOLDERS: dict[str, Callable[..., Any]] = {
+    "bag": _write_rosbag,
+    "object": _import_object,
+    "home": _import_home,
+    "robot": _import_robot,
+}
+SLOW: dict[str, Callable[[Path], Any]] = {
+    "a.html": lambda path: make_plan().to_html(path),
+    "robot.srdf": lambda path: write_srdf(make_plan().scene.robot, path, samples=50),
+}
+WRITERS = {**FILES, **FOLDERS}
+
+
+@contextlib.contextmanager
+def fill_disk(free: int = 100) -> Iterator[None]:
+    """Let no file become larger than a number of bytes, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (free, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def list_files(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Return a folder in another one, in which files of others are."""
+    (tmp_path / "others").mkdir()
+    (tmp_path / "others" / "letter.txt").write_text("dear", encoding="utf-8")
+    (tmp_path / "mine").mkdir()
+    return tmp_path / "mine"
+
+
+@pytest.mark.parametrize("name", [*WRITERS, *SLOW])
+def test_a_full_disk_leaves_nothing_behind(folder: Path, name: str) -> None:
+    if name.startswith("result"):
+        simulate()
+    make_plan()
+    with fill_disk(), pytest.raises(InputError, match=r"cannot write this .*(large|disk)"):
+        {**WRITERS, **SLOW}[name](folder / name)
+    assert list_files(folder) == set()
+    assert list_files(folder.parent / "others") == {"letter.txt"}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_full_disk_keeps_the_previous_file(folder: Path, name: str) -> None:
+    (folder / name).write_text("before", encoding="utf-8")
+    with fill_disk(), pytest.raises(InputError, match="File too large"):
+        FILES[name](folder / name)
+    assert (folder / name).read_text(encoding="utf-8") == "before"
+    assert list_files(folder) == {name}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_no_writer_takes_a_pipe_a_loop_or_a_folder_below_a_file(folder: Path, name: str) -> None:
+    os.mkfifo(folder / f"pipe{Path(name).suffix}")
+    (folder / f"loop{Path(name).suffix}").symlink_to(f"loop{Path(name).suffix}")
+    (folder / "file").touch()
+    before = list_files(folder)
+    for target in (f"pipe{Path(name).suffix}", f"loop{Path(name).suffix}", f"file/{name}"):
+        with pytest.raises(InputError):
+            WRITERS[name](folder / target)
+        assert list_files(folder) == before
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+@pytest.mark.parametrize("force", [False, True])
+def test_folders_of_others_are_not_replaced(folder: Path, name: str, force: bool) -> None:
+    others = folder.parent / "others"
+    (folder / name).symlink_to(others)
+    for target in (others, folder / name):
+        with pytest.raises(InputError, match=r"other files|already exists|did not write"):
+            FOLDERS[name](target, force=force)
+    assert (folder / name).is_symlink()
+    assert (others / "letter.txt").read_text(encoding="utf-8") == "dear"
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_links_in_a_replaced_folder_are_not_followed(folder: Path, name: str) -> None:
+    FOLDERS[name](folder / name)
+    others = folder.parent / "others"
+    written = sorted(path for path in (folder / name).iterdir() if path.is_file())
+    for path in written:
+        if path.suffix != ".yaml" and path.name != ".vkc-pin.json":
+            path.unlink()
+            path.symlink_to(others / "letter.txt")
+    FOLDERS[name](folder / name, force=True)
+    assert not any(path.is_symlink() for path in (folder / name).rglob("*"))
+    assert (others / "letter.txt").read_text(encoding="utf-8") == "dear"
+    assert list_files(others) == {"letter.txt"}
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_folder_without_permission_is_named(folder: Path, name: str) -> None:
+    folder.chmod(0o500)
+    try:
+        with pytest.raises(InputError, match="ermission"):
+            WRITERS[name](folder / name)
+    finally:
+        folder.chmod(0o700)

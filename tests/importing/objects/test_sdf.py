@@ -257,15 +257,27 @@ def test_limits_may_be_one_sided(
     )
 
 
-def test_only_visual_meshes_may_be_missing(tmp_path: Path) -> None:
-    """They may, if their link has collision shapes."""
-    mesh = '<{} name="v"><geometry><mesh><uri>model://a/b.dae</uri></mesh></geometry></{}>'
-    visual, collision = (mesh.format(kind, kind) for kind in ("visual", "collision"))
+def test_missing_meshes_are_replaced_or_listed(tmp_path: Path) -> None:
+    mesh = '<{} name="v"><geometry><mesh><uri>model://a/{}.dae</uri></mesh></geometry></{}>'
+    visual, collision, other = (
+        mesh.format(kind, file, kind)
+        for kind, file in (("visual", "b"), ("collision", "b"), ("collision", "c"))
+    )
     found = read(tmp_path, format_chest(pose=visual))
     assert found.links["front"].visual == ()
-    assert "'v' of link 'front' is left out" in found.notes[0]
+    assert "link 'front': " in found.notes[0]
+    assert "no such mesh" in found.notes[0]
+    assert found.notes[0].endswith("left out")
+    shown = visual.replace(
+        "<mesh><uri>model://a/b.dae</uri></mesh>", "<sphere><radius>1</radius></sphere>"
+    )
+    found = read(tmp_path, format_chest(pose=collision + shown))
+    assert [part.kind for part in found.links["front"].solid] == ["sphere"]
+    assert found.notes[0].endswith("its visual shapes collide instead")
     with pytest.raises(InputError, match=r"t\.sdf:5: model://a/b\.dae: there is no such mesh"):
         read(tmp_path, format_chest(pose=collision))
+    with pytest.raises(InputError, match=r"2 meshes do not exist: model://a/b\.dae, model"):
+        read(tmp_path, format_chest(pose=collision + other))
     with pytest.raises(InputError, match="no such mesh"):
         read(tmp_path, format_chest(model=f'<static>1</static><link name="seen">{visual}</link>'))
 

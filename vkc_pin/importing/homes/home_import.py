@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -169,7 +169,7 @@ def import_home(
             )
         )
         obstacles, obstacle_notes = write_obstacles(home, path, staging, taken, cache, progress)
-        low, high = add_floor(home, low, high)
+        bounds, (low, high) = (low, high), add_floor(home, low, high)
         document: dict[str, Any] = {
             "name": _choose_name(path),
             "robot": refer_to_robot(robot),
@@ -189,6 +189,7 @@ def import_home(
         *home.notes,
         *weight,
         *_note_floor_shapes(home),
+        *_note_open_sides(bounds, (low, high)),
         *obstacle_notes,
         *(f"{item.name}: {note}" for item in objects for note in item.notes),
     )
@@ -217,6 +218,17 @@ def _note_floor_shapes(home: Home) -> list[str]:
         return []
     names = ", ".join(dict.fromkeys(home.floor))
     return [f"at most {1e3 * FLOOR_RISE:g} mm above the floor, hence part of it: {names}"]
+
+
+def _note_open_sides(before: tuple[Floats, Floats], after: tuple[Floats, Floats]) -> Iterator[str]:
+    sides = [
+        f"{sign}{name}"
+        for sign, old, new in zip("-+", before, after, strict=True)
+        for name, moved in zip("xy", old != new, strict=False)
+        if moved
+    ]
+    if sides:
+        yield f"2 m of floor lie beyond the sides without walls: {', '.join(sides)}"
 
 
 def _count_shapes(home: Home) -> dict[str, int]:

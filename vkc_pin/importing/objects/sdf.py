@@ -335,7 +335,8 @@ def read_object_sdf(
 
 class _Reader:
     def __init__(self, file: Path, packages: Mapping[str, Path]) -> None:
-        self.file, self.packages, self.notes, self.count = file, packages, list[str](), 0
+        self.file, self.packages, self.count = file, packages, 0
+        self.notes, self.missing = list[str](), list[InputError]()
         root, rules = self._load(file)
         worlds, models = root.findall("world"), root.findall("model")
         if len(worlds) + len(models) != 1:
@@ -552,6 +553,7 @@ class _Reader:
                     child=names[name],
                     placement=frames[name],
                 )
+        self._check_missing()
         return Description(self.file, found_links, found_joints, tuple(self.notes))
 
     def _connect(
@@ -724,15 +726,42 @@ class _Reader:
         element = scope.links[local]
         # Places elements in the link's new frame.
         base = frame.inverse() * scope.find_placement()
+        lost: dict[str, list[InputError]] = {"visual": [], "collision": []}
         visual, collision = (
-            tuple(self._read_shapes(scope, element, kind, base, local))
-            for kind in ("visual", "collision")
+            tuple(self._read_shapes(scope, element, kind, base, local, errors))
+            for kind, errors in lost.items()
         )
+        if lost["collision"] and visual:
+            collision, about = (), "its visual shapes collide instead"
+            self.notes += [f"link '{local}': {error}: {about}" for error in lost["collision"]]
+        elif lost["collision"] or (lost["visual"] and not visual and not collision):
+            self.missing += lost["collision"] or lost["visual"]
+        self.notes += [f"link '{local}': {error}: left out" for error in lost["visual"]]
         return Link(name, visual, collision, self._read_inertia(scope, element, base, local))
 
+    def _check_missing(self) -> None:
+        """Raise an error about all meshes that are missing and that nothing can replace."""
+        if len(self.missing) == 1:
+            raise self.missing[0]
+        if self.missing:
+            listed = ", ".join(dict.fromkeys(str(error.field) for error in self.missing))
+            raise InputError(
+                f"{len(self.missing)} meshes do not exist: {listed}",
+                file=self.file,
+                expected="mesh files, or visual shapes of the same links",
+                got=self.missing[0].got,
+            )
+
     def _read_shapes(
-        self, scope: _Scope, link: ElementTree.Element, kind: str, base: pin.SE3, local: str
+        self,
+        scope: _Scope,
+        link: ElementTree.Element,
+        kind: str,
+        base: pin.SE3,
+        local: str,
+        lost: list[InputError],
     ) -> Iterator[Part]:
+        """Yield the shapes of a link, and add errors about missing meshes to `lost`."""
         for element in link.findall(kind):
             name, geometry = element.get("name", ""), element.find("geometry")
             shape = next(iter(geometry), None) if geometry is not None else None
@@ -740,27 +769,26 @@ class _Reader:
                 content = "empty" if shape is None else shape.tag
                 self.notes.append(f"{kind} '{name}' of link '{local}' is {content}: left out")
                 continue
-            try:
-                settings = self._read_geometry(scope, shape, name)
-            except InputError as error:
-                if kind == "collision" or link.find("collision") is None or shape.tag != "mesh":
-                    raise
-                self.notes.append(f"visual '{name}' of link '{local}' is left out: {error}")
-                continue
+            file = None
+            if shape.tag == "mesh":
+                uri, line = (shape.findtext("uri") or "").strip(), find_line(shape)
+                try:
+                    file = find_mesh_file(uri, scope.file, self.packages, line=line)
+                except InputError as error:
+                    lost.append(error)
+                    continue
             yield Part(
                 name=name,
                 placement=base * scope.read_pose(element, local),
                 colour=self._read_colour(scope, element, name),
-                **settings,
+                **self._read_geometry(scope, shape, name, file),
             )
 
     def _read_geometry(
-        self, scope: _Scope, shape: ElementTree.Element, name: str
+        self, scope: _Scope, shape: ElementTree.Element, name: str, file: Path | None
     ) -> dict[str, Any]:
         """Return kind, size, file and triangles of a shape."""
-        if shape.tag == "mesh":
-            uri = (shape.findtext("uri") or "").strip()
-            file = find_mesh_file(uri, scope.file, self.packages, line=find_line(shape))
+        if file is not None:
             size = scope.read_numbers(shape, "scale", 3, "1 1 1", name)
             part = shape.find("submesh")
             if part is None:

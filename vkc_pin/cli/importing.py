@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import contextlib
 import logging
+import math
+import shlex
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vkc_pin.cli.options import (
     EXIT_FAILED,
@@ -19,6 +21,9 @@ from vkc_pin.cli.options import (
     parse_positive,
 )
 from vkc_pin.errors import InputError
+
+if TYPE_CHECKING:
+    from vkc_pin.importing.objects.object_import import ImportedObject
 
 __all__ = ["add_importing"]
 
@@ -142,7 +147,8 @@ def _import_robot(arguments: argparse.Namespace) -> int:
         force=arguments.force,
         **chosen,
     )
-    sys.stdout.write(f"{made}\n")
+    scene = shlex.quote(str(made.folder / "scene.yaml"))
+    sys.stdout.write(f"{made}\ntry: vkc-pin plan {scene} --go-to 1 0 0\n")
     return EXIT_OK if made.diagnosis.healthy else EXIT_FAILED
 
 
@@ -163,8 +169,19 @@ def _import_object(arguments: argparse.Namespace) -> int:
     )
     written = [done.file, done.picture, *([] if done.scene is None else [done.scene])]
     lines = "".join(f"wrote {file}\n" for file in written)
-    sys.stdout.write(f"{done.summary()}\n{lines}")
+    sys.stdout.write(f"{done.summary()}\n{lines}{_suggest_plan(done)}")
     return EXIT_OK
+
+
+def _suggest_plan(done: ImportedObject) -> str:
+    """Return a line with a command that plans the first joint that a hand can open."""
+    for joint in done.object.coordinates.names:
+        goal = done.proposals.find_goal(joint)
+        if goal is not None and done.scene is not None:
+            value = math.trunc(1e3 * goal) / 1e3  # within the limits
+            setting = shlex.quote(f"{done.object.name}.{joint}={value:g}")
+            return f"try: vkc-pin plan {shlex.quote(str(done.scene))} --set {setting}\n"
+    return ""
 
 
 def _import_home(arguments: argparse.Namespace) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
@@ -31,6 +32,10 @@ class Obstruction:
 
     what: str
     link: str = ""
+
+
+# [m] of a forearm: radius, length, and distance of its end behind the tool frame
+_ARM_RADIUS, _ARM_LENGTH, _ARM_START = 0.05, 0.4, 0.2
 
 
 class HandClearance:
@@ -95,6 +100,16 @@ class HandClearance:
                         "fingers" if is_held[k] and touches else "others", str(self.links[k])
                     )
         return None
+
+    def is_hidden(self, tool: pin.SE3) -> bool:
+        """Return whether the object is in the way of a forearm straight behind a hand at `tool`."""
+        arm = coal.Capsule(_ARM_RADIUS, _ARM_LENGTH)
+        middle = -(_ARM_START + _ARM_LENGTH / 2.0)
+        where = tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, middle]))
+        return any(
+            compute_shape_distance(arm, where, shape.geometry, at) <= 0.0
+            for shape, at in zip(self._shapes, self._at, strict=True)
+        )
 
 
 def _transform_box(box: tuple[Floats, Floats], where: pin.SE3) -> tuple[Floats, Floats]:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import pinocchio as pin
 
 from vkc_pin.importing.proposals.hand import Hand
@@ -105,13 +106,32 @@ class Proposals:
         attachments = {proposal.attachment.name: proposal.attachment for proposal in self.found}
         return dataclasses.replace(self.object, attachments=freeze(attachments))
 
+    def find_goal(self, joint: str) -> float | None:
+        """Return the position, [rad] or [m], up to which a hand can open a joint; None: not."""
+        index = self.object.coordinates.index(joint)
+        closed = float(np.clip(0.0, self.object.lower[index], self.object.upper[index]))
+        reached = [proposal.opens[joint] for proposal in self.opening(joint)]
+        return max(reached, key=lambda value: abs(value - closed), default=None)
+
+    def _format_reached(self, index: int) -> str:
+        """Format how far a hand can open a joint, if this is less than its range."""
+        joint, unit = self.object.coordinates.names[index], self.object.coordinates.units[index]
+        low, high = float(self.object.lower[index]), float(self.object.upper[index])
+        goal = self.find_goal(joint)
+        closed = float(np.clip(0.0, low, high))
+        travel = max(high - closed, closed - low)
+        if goal is None or not np.isfinite(travel) or abs(goal - closed) >= (1.0 - 1e-3) * travel:
+            return ""
+        share = abs(goal - closed) / travel
+        return f": a hand opens it to {goal:.3g} {unit}, {share:.0%} of its range"
+
     def summary(self) -> str:
         """Return a line for each attachment by joint, or the reason why it has none."""
         lines = []
         for index, joint in enumerate(self.object.coordinates.names):
             low, high = self.object.lower[index], self.object.upper[index]
             unit = self.object.coordinates.units[index]
-            lines.append(f"{joint}, {low:.3g} to {high:.3g} {unit}")
+            lines.append(f"{joint}, {low:.3g} to {high:.3g} {unit}{self._format_reached(index)}")
             for proposal in self.opening(joint):
                 handle = ", named as a handle" if proposal.named else ""
                 name = f"{proposal.attachment.name} ({proposal.kind}{handle})"

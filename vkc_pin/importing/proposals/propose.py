@@ -42,6 +42,7 @@ _NEAR, _SIMILAR = 0.06, 0.5
 _TURNED = 0.5
 _ROOM = (0.02, 0.01)  # [m] extra clearances that increase the score
 _SLACK = 0.05  # [m] slide to either side above which the score does not increase further
+_HIDDEN = 0.4  # factor for places at which the object is in the way of a straight forearm
 _WORTH = 0.1  # smallest score, relative to the best grasp of a joint
 _ROUND = 0.01  # [m] openings are multiples of this, and smaller than fully open by at least this
 _PUSHED = 60  # places on faces that are checked with the hand
@@ -327,6 +328,8 @@ class _Search:
             * (0.5 + 0.5 * min(grip.slack / _SLACK, 1.0))
             * (0.7 + 0.3 * room / _ROOM[0])
         )
+        if self.fitting.is_hidden(tool):
+            score *= _HIDDEN
         score *= 1.0 - 0.2 * standoff / max(furthest, 1e-9) if standoff else 1.0
         frame = self.item.model.frames[self.item.link_frame(link)]
         placement = frame.placement.inverse() * grasp.placement

@@ -17,6 +17,7 @@ __all__ = ["Opening", "find_named_handles", "find_openings", "score_grasp"]
 _WORDS = ("handle", "knob", "lever", "grip", "pull")
 _KINDS = {"bar": 1.0, "knob": 0.8, "edge": 0.4}
 _UNNAMED = 0.6  # factor for pieces that are not named as handles
+_THIN = 0.008  # [m] thickness below which a piece is rather a screw or a rim than a handle
 _UPWARDS = 0.5  # factor for grasps from below: few arms reach up from the floor
 _TURN = 2.0 * np.pi / 3.0  # [rad] assumed travel of joints without limits
 
@@ -100,9 +101,10 @@ def find_openings(item: ArticulatedObject, pieces: dict[int, list[Piece]]) -> di
 def score_grasp(grasp: Candidate, tool: pin.SE3, opening: Opening, *, named: bool) -> float:
     """Return the quality of a grasp for opening a joint, from 0 to 1.
 
-    It is the product of factors for the kind; the name; the leverage; the distance from the centre,
-    off which the part would jam; the direction of the pull, against the fingers rather than along
-    the bar, on which they would slip; and the side of approach, from where the part moves to.
+    It is the product of factors for the kind; the name; the leverage; a sufficient thickness; the
+    distance from the centre, off which the part would jam; the direction of the pull, against the
+    fingers rather than along the bar, on which they would slip; and the side of approach, from
+    where the part moves to.
 
     Args:
         grasp: The grasp.
@@ -129,6 +131,7 @@ def score_grasp(grasp: Candidate, tool: pin.SE3, opening: Opening, *, named: boo
         _KINDS[grasp.kind]
         * (1.0 if named else _UNNAMED)
         * max(leverage, 0.02)
+        * min(grasp.thickness / _THIN, 1.0)
         * (1.0 - 0.4 * min(eccentricity, 1.0))
         * (1.0 - 0.8 * (pull @ along) ** 2)
         * (0.65 - 0.35 * (pull @ approach))

@@ -7,7 +7,6 @@ import re
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +22,10 @@ from vkc_pin.importing.objects.description import (
     make_inertia,
     make_limits,
 )
+from vkc_pin.importing.objects.sdf_scope import BASE, RULES, WORLD, Rules, Scope, is_true
 from vkc_pin.utils.arrays import MAX_COORDINATE, MIN_POSITIVE
 from vkc_pin.world.files.documents import read_text
-from vkc_pin.world.files.kinematic_tree import MOMENTS, find_roots, parse_numbers
+from vkc_pin.world.files.kinematic_tree import MOMENTS, find_roots
 from vkc_pin.world.files.meshes import load_mesh
 from vkc_pin.world.files.resources import find_mesh_file, list_address_candidates
 from vkc_pin.world.files.xml import find_line, make_element_error, parse_xml
@@ -34,8 +34,6 @@ __all__ = ["read_object_sdf"]
 
 _NEWEST = 12  # minor version
 _MOST_MODELS = 5000
-_WORLD = "world"
-_BASE = "\0world"  # the world among links: links of old files may be called "world"
 _MOVING = ("revolute", "continuous", "prismatic")
 _JOINT_TYPES = ("fixed", *_MOVING, "ball", "universal", "revolute2", "screw", "gearbox")
 # Numbers of each shape: name of the element and count
@@ -46,271 +44,6 @@ _SHAPES = {
     "capsule": (("radius", 1), ("length", 1)),
     "ellipsoid": (("radii", 3),),
 }
-
-
-@dataclass(frozen=True)
-class _Rules:
-    """What depends on the version.
-
-    Attributes:
-        since: First minor version.
-        axis_frame: Element or attribute that changes the frame of a joint's axis from that of the
-            joint; None: the axis is in the model's frame.
-        pose_frame: Attribute of <pose> that names its frame.
-    """
-
-    since: int
-    axis_frame: str | None
-    pose_frame: str
-
-
-_RULES = (
-    _Rules(2, None, "frame"),
-    _Rules(5, "use_parent_model_frame", "frame"),
-    _Rules(7, "expressed_in", "relative_to"),
-)
-
-
-@dataclass(eq=False)
-class _Scope:
-    """A <model> or <world>: named elements, and their poses in its frame.
-
-    Attributes:
-        file: File of the element.
-        element: The <model>, <world> or, without a world, <sdf>.
-        rules: Rules of the version of `file`.
-        above: The model or world around it.
-        path: Prefix of names of links and joints in the description.
-        include: The <include> that it comes from.
-        links, joints, frames: Elements by name.
-        models: Nested models by name.
-        merged: Included models whose elements count as elements of this model.
-        active: Names that are being resolved, to find cycles.
-    """
-
-    file: Path
-    element: ElementTree.Element
-    rules: _Rules
-    above: _Scope | None = None
-    path: str = ""
-    include: ElementTree.Element | None = None
-    links: dict[str, ElementTree.Element] = field(default_factory=dict)
-    joints: dict[str, ElementTree.Element] = field(default_factory=dict)
-    frames: dict[str, ElementTree.Element] = field(default_factory=dict)
-    models: dict[str, _Scope] = field(default_factory=dict)
-    merged: list[_Scope] = field(default_factory=list)
-    active: list[tuple[int, str]] = field(default_factory=list)
-    _found: dict[str, pin.SE3] = field(default_factory=dict)
-    _own_pose: pin.SE3 | None = None
-
-    @property
-    def is_static(self) -> bool:
-        """Whether the model, or one around it, is static."""
-        stated = self._find_setting("static", "0")
-        return _is_true(stated) or (self.above is not None and self.above.is_static)
-
-    def _find_setting(self, name: str, default: str) -> str:
-        """Return the text of an element of the <include> or else of the model."""
-        for element in (self.include, self.element):
-            if element is not None and (text := (element.findtext(name) or "").strip()):
-                return text
-        return default
-
-    def walk(self) -> Iterator[_Scope]:
-        """Yield this model and all inside it."""
-        yield self
-        for scope in (*self.models.values(), *self.merged):
-            yield from scope.walk()
-
-    def find_placement(self, name: str = "") -> pin.SE3:
-        """Return a frame in the world; default: that of this model."""
-        if self.above is None:
-            return self.find_pose(name)
-        return self.above.find_placement() * self._find_own_pose() * self.find_pose(name)
-
-    def _find_own_pose(self) -> pin.SE3:
-        """Return the frame of this model in that of the model or world around it."""
-        if self.above is None:
-            return pin.SE3.Identity()
-        with_pose = self.element
-        if self.include is not None and self.include.find("pose") is not None:
-            with_pose = self.include
-        if self._own_pose is None:
-            placed = self.element.get("placement_frame", "")
-            placed = (with_pose.findtext("placement_frame") or placed).strip()
-            above = self.above
-            given = self._resolve("pose of the model", lambda: above.read_pose(with_pose, ""))
-            self._own_pose = given * self.find_pose(placed).inverse()
-        return self._own_pose
-
-    def _resolve(self, name: str, compute: Any) -> Any:
-        """Return the result of a function for a name, unless it leads back to the name."""
-        key = (id(self), name)
-        if key in self.active:
-            cycle = [other for _, other in [*self.active[self.active.index(key) :], key]]
-            raise InputError(
-                "frames form a cycle", file=self.file, field=name, got=" → ".join(cycle)
-            )
-        self.active.append(key)
-        try:
-            return compute()
-        finally:
-            self.active.pop()
-
-    def find_pose(self, name: str) -> pin.SE3:
-        """Return the frame of a link, frame, joint or nested model in the frame of this model."""
-        if name in ("", "__model__"):
-            return pin.SE3.Identity()
-        if name not in self._found:
-            self._found[name] = self._resolve(name, lambda: self._compute_pose(name))
-        return self._found[name]
-
-    def _compute_pose(self, name: str) -> pin.SE3:
-        if name in self.links:
-            return self.read_pose(self.links[name], "")
-        if name in self.frames:
-            frame = self.frames[name]
-            return self.read_pose(frame, frame.get("attached_to", "").strip())
-        if name in self.joints:
-            return self.find_joint_pose(self.joints[name])
-        if (inner := self._find_inner(name)) is not None:
-            scope, rest = inner
-            return scope._find_own_pose() * scope.find_pose(rest)
-        if name == _WORLD:
-            return self.find_placement().inverse()
-        raise UnknownNameError("frame", name, self._list_names(), file=self.file)
-
-    def _find_inner(self, name: str) -> tuple[_Scope, str] | None:
-        """Return the nested model in which a name is defined, and the name in it."""
-        first, _, rest = name.partition("::")
-        if first in self.models:
-            return self.models[first], rest
-        return next(((item, name) for item in self.merged if item.defines(name)), None)
-
-    def defines(self, name: str) -> bool:
-        """Return whether the name is one of an element of this model."""
-        return (
-            name in self.links
-            or name in self.frames
-            or name in self.joints
-            or self._find_inner(name) is not None
-        )
-
-    def _list_names(self) -> list[str]:
-        own = [*self.links, *self.frames, *self.joints, *self.models]
-        return own + [name for scope in self.merged for name in scope._list_names()]
-
-    def find_joint_pose(self, joint: ElementTree.Element) -> pin.SE3:
-        """Return the frame of a joint in the frame of this model."""
-        return self.read_pose(joint, self.read_end(joint, "child"))
-
-    def read_pose(self, element: ElementTree.Element, default_frame: str) -> pin.SE3:
-        """Return the <pose> of an element in the frame of this model."""
-        pose, where = element.find("pose"), element.get("name", element.tag)
-        if pose is None:
-            return self.find_pose(default_frame)
-        stated = pose.get("relative_to") or pose.get(self.rules.pose_frame) or default_frame
-        form = pose.get("rotation_format", "euler_rpy").strip()
-        is_degrees = _is_true(pose.get("degrees", "false"))
-        counts = {"euler_rpy": 6, "quat_xyzw": 7}
-        if form not in counts:
-            raise UnknownNameError(
-                "rotation_format", form, counts, file=self.file, line=find_line(pose), field=where
-            )
-        default = "0 0 0 0 0 0" if form == "euler_rpy" else "0 0 0 0 0 0 1"
-        values = self._parse(pose, pose.text, counts[form], default, f"{where}: pose")
-        if form == "euler_rpy":
-            angles = np.radians(values[3:]) if is_degrees else np.array(values[3:])
-            rotation = pin.rpy.rpyToMatrix(*angles)
-        elif is_degrees or not np.linalg.norm(values[3:]) > 0.0:
-            problem = "a quaternion in degrees" if is_degrees else "a quaternion of length 0"
-            raise make_element_error(self.file, pose, problem, field=where, got=pose.text)
-        else:
-            rotation = pin.Quaternion(np.array(values[3:])).normalized().matrix()
-        return self.find_pose(stated.strip()) * pin.SE3(rotation, np.array(values[:3]))
-
-    def find_link(self, name: str) -> str:
-        """Return the name, in the description, of the link that a frame is attached to."""
-        if name in self.links:
-            return self.path + name
-        return str(self._resolve(name, lambda: self._follow_to_link(name)))
-
-    def _follow_to_link(self, name: str) -> str:
-        if name in ("", "__model__"):
-            return self._find_canonical_link()
-        if name in self.frames:
-            return self.find_link(self.frames[name].get("attached_to", "").strip())
-        if name in self.joints:
-            return self.find_link(self.read_end(self.joints[name], "child"))
-        if (inner := self._find_inner(name)) is not None:
-            return inner[0].find_link(inner[1])
-        if name == _WORLD:
-            return _BASE
-        names = [*self._list_names(), _WORLD]
-        raise UnknownNameError("link", name, names, file=self.file, field=self.element.get("name"))
-
-    def _find_canonical_link(self) -> str:
-        if self.above is None:
-            return _BASE
-        stated = self.element.get("canonical_link", "").strip()
-        if stated:
-            return self.find_link(stated)
-        if self.links:
-            return self.path + next(iter(self.links))
-        for scope in (*self.models.values(), *self.merged):
-            return scope.find_link("")
-        problem = "a model without links"
-        raise make_element_error(self.file, self.element, problem, field=self.element.get("name"))
-
-    def read_end(self, joint: ElementTree.Element, key: str) -> str:
-        """Return the frame that a joint names as its "parent" or "child"."""
-        if not (name := (joint.findtext(key) or "").strip()):
-            problem, expected = "a joint that connects nothing", f"<{key}>"
-            name = joint.get("name", "")
-            raise make_element_error(self.file, joint, problem, field=name, expected=expected)
-        return name
-
-    def read_numbers(
-        self,
-        element: ElementTree.Element,
-        key: str,
-        count: int,
-        default: str | None,
-        where: str,
-        *,
-        largest: float = MAX_COORDINATE,
-    ) -> tuple[float, ...]:
-        """Return the numbers of a child element; "inf" becomes 1e308."""
-        found = element.find(key)
-        text = None if found is None else re.sub(r"\binf\b", "1e308", found.text or "", flags=re.I)
-        named = f"{where}: {element.tag} {key}"
-        holder = element if found is None else found
-        return self._parse(holder, text, count, default, named, largest)
-
-    def _parse(
-        self,
-        element: ElementTree.Element,
-        text: str | None,
-        count: int,
-        default: str | None,
-        where: str,
-        largest: float = MAX_COORDINATE,
-    ) -> tuple[float, ...]:
-        text = text if text is None or text.strip() else None  # an empty element is a default
-        holder = ElementTree.Element(element.tag, {} if text is None else {"text": text})
-        try:
-            return parse_numbers(
-                self.file, holder, "text", count, default=default, where=where, largest=largest
-            )
-        except InputError as error:
-            raise make_element_error(
-                self.file,
-                element,
-                error.problem,
-                field=where,
-                expected=error.expected,
-                got=error.got,
-            ) from None
 
 
 def read_object_sdf(
@@ -349,10 +82,10 @@ class _Reader:
             )
         self.is_world = bool(worlds)
         self.world = self._make_scope(
-            _Scope(file, worlds[0] if worlds else root, rules), (file.resolve(),)
+            Scope(file, worlds[0] if worlds else root, rules), (file.resolve(),)
         )
 
-    def _load(self, file: Path) -> tuple[ElementTree.Element, _Rules]:
+    def _load(self, file: Path) -> tuple[ElementTree.Element, Rules]:
         """Return the root of an SDF file and the rules of its version."""
         root = parse_xml(read_text(file, "SDF"), file)
         if root.tag != "sdf":
@@ -367,15 +100,15 @@ class _Reader:
             )
         text = root.get("version")
         match = re.fullmatch(
-            r"\s*1\.(\d{1,3})(\.\d+)*\s*", f"1.{_RULES[-1].since}" if text is None else text
+            r"\s*1\.(\d{1,3})(\.\d+)*\s*", f"1.{RULES[-1].since}" if text is None else text
         )
-        if match is None or int(match[1]) < _RULES[0].since:
+        if match is None or int(match[1]) < RULES[0].since:
             raise make_element_error(
                 file,
                 root,
                 "not a version of SDF",
                 field="sdf version",
-                expected=f"1.{_RULES[0].since} to 1.{_NEWEST}",
+                expected=f"1.{RULES[0].since} to 1.{_NEWEST}",
                 got=f'"{text}"',
             )
         version = int(match[1])
@@ -383,9 +116,9 @@ class _Reader:
             self.notes.append(f"{file.name} states no version: read as SDF 1.{version}")
         if version > _NEWEST:
             self.notes.append(f"{file.name} has version 1.{version}: read as SDF 1.{_NEWEST}")
-        return root, next(rules for rules in reversed(_RULES) if rules.since <= version)
+        return root, next(rules for rules in reversed(RULES) if rules.since <= version)
 
-    def _make_scope(self, scope: _Scope, files: tuple[Path, ...]) -> _Scope:
+    def _make_scope(self, scope: Scope, files: tuple[Path, ...]) -> Scope:
         """Fill in the elements of a model or world; `files` are those that include it."""
         self.count += 1
         if self.count > _MOST_MODELS:
@@ -399,7 +132,7 @@ class _Reader:
             for element in scope.element.findall(tag):
                 self._add(scope, elements, element, element)
         for element in scope.element.findall("model"):
-            inner = _Scope(scope.file, element, scope.rules, scope)
+            inner = Scope(scope.file, element, scope.rules, scope)
             self._add(scope, scope.models, element, inner)
             self._fill_inner_scope(inner, files)
         for include in scope.element.findall("include"):
@@ -418,7 +151,7 @@ class _Reader:
         return scope
 
     def _fill_inner_scope(
-        self, inner: _Scope, files: tuple[Path, ...], name: str | None = None
+        self, inner: Scope, files: tuple[Path, ...], name: str | None = None
     ) -> None:
         """Fill in a model inside another one or a world; name "": its names are the other's."""
         assert inner.above is not None
@@ -429,7 +162,7 @@ class _Reader:
         self._make_scope(inner, files)
 
     def _add(
-        self, scope: _Scope, elements: dict[str, Any], element: ElementTree.Element, item: Any
+        self, scope: Scope, elements: dict[str, Any], element: ElementTree.Element, item: Any
     ) -> None:
         """Add an item by the name of an element, which must be unique."""
         name = (element.get("name") or element.findtext("name") or "").strip()
@@ -442,9 +175,7 @@ class _Reader:
             raise make_element_error(scope.file, element, problem, field=name, expected=expected)
         elements[name] = item
 
-    def _include(
-        self, scope: _Scope, include: ElementTree.Element, files: tuple[Path, ...]
-    ) -> None:
+    def _include(self, scope: Scope, include: ElementTree.Element, files: tuple[Path, ...]) -> None:
         file = _find_model(scope.file, include, self.packages)
         if file.resolve() in files:
             got = " → ".join(item.name for item in (*files, file))
@@ -458,10 +189,10 @@ class _Reader:
             expected, got = "one <model>", f"{len(models)} models"
             raise InputError("not a model", file=file, expected=expected, got=got)
         inner, files = (
-            _Scope(file, models[0], rules, scope, include=include),
+            Scope(file, models[0], rules, scope, include=include),
             (*files, file.resolve()),
         )
-        if _is_true(include.get("merge", "false")):
+        if is_true(include.get("merge", "false")):
             scope.merged.append(inner)
             self._fill_inner_scope(inner, files, "")
             return
@@ -473,14 +204,14 @@ class _Reader:
 
     def read(self, *, free: bool) -> Description:
         scopes = list(self.world.walk())
-        links: dict[str, tuple[_Scope, str]] = {}
+        links: dict[str, tuple[Scope, str]] = {}
         for scope in scopes:
             for name, link in scope.links.items():
                 if (key := scope.path + name) in links:
                     problem = "two links have the same name"
                     raise make_element_error(scope.file, link, problem, field=key)
                 links[key] = scope, name
-        joints: dict[str, tuple[_Scope, ElementTree.Element, str]] = {}  # by the child link
+        joints: dict[str, tuple[Scope, ElementTree.Element, str]] = {}  # by the child link
         for scope in scopes:
             for name, joint in scope.joints.items():
                 kind = self._read_kind(scope, joint)
@@ -499,29 +230,29 @@ class _Reader:
                         got=f"joints '{got}' and '{name}'",
                     )
                 joints[ends[1]] = scope, joint, ends[0]
-        if _BASE in joints:
-            scope, joint, _ = joints[_BASE]
+        if BASE in joints:
+            scope, joint, _ = joints[BASE]
             problem = "the world cannot be a child"
             raise make_element_error(scope.file, joint, problem, field=joint.get("name"))
         lines = {name: find_line(scope.links[local]) for name, (scope, local) in links.items()}
-        is_connected = any(parent == _BASE for _, _, parent in joints.values())
+        is_connected = any(parent == BASE for _, _, parent in joints.values())
         above = {child: (parent, "") for child, (_, _, parent) in joints.items()}
-        roots = find_roots(self.file, {**lines, **({_BASE: None} if is_connected else {})}, above)
+        roots = find_roots(self.file, {**lines, **({BASE: None} if is_connected else {})}, above)
         return self._describe(links, joints, roots, free=free)
 
     def _describe(
         self,
-        links: Mapping[str, tuple[_Scope, str]],
-        joints: Mapping[str, tuple[_Scope, ElementTree.Element, str]],
+        links: Mapping[str, tuple[Scope, str]],
+        joints: Mapping[str, tuple[Scope, ElementTree.Element, str]],
         roots: Mapping[str, str],
         *,
         free: bool,
     ) -> Description:
         kinds = self._connect(links, joints, roots, free=free)
         names = self._choose_names(links, kinds)
-        base = names[_BASE]
+        base = names[BASE]
         repeated = Counter(joint.get("name", "") for _, joint, _ in joints.values())
-        frames = {_BASE: pin.SE3.Identity()}
+        frames = {BASE: pin.SE3.Identity()}
         # Link frames are moved to their joints, so that axes pass through origins.
         for name, (scope, local) in links.items():
             if name in joints:
@@ -531,10 +262,10 @@ class _Reader:
                 frames[name] = scope.find_placement(local)
             else:
                 frames[name] = pin.SE3.Identity()
-        found_links = {base: Link(base)} if kinds or _BASE in roots else {}
+        found_links = {base: Link(base)} if kinds or BASE in roots else {}
         found_joints = dict[str, Joint]()
         for name, (scope, local) in links.items():
-            if roots[name] != _BASE and kinds.get(roots[name], "fixed") == "left out":
+            if roots[name] != BASE and kinds.get(roots[name], "fixed") == "left out":
                 continue
             found_links[names[name]] = self._read_link(scope, local, names[name], frames[name])
             if name in joints:
@@ -558,8 +289,8 @@ class _Reader:
 
     def _connect(
         self,
-        links: Mapping[str, tuple[_Scope, str]],
-        joints: Mapping[str, tuple[_Scope, ElementTree.Element, str]],
+        links: Mapping[str, tuple[Scope, str]],
+        joints: Mapping[str, tuple[Scope, ElementTree.Element, str]],
         roots: Mapping[str, str],
         *,
         free: bool,
@@ -569,8 +300,8 @@ class _Reader:
         Values are "fixed", "floating" and "left out". If the only root is to be the description's,
         there are none.
         """
-        loose = [name for name in dict.fromkeys(roots.values()) if name != _BASE]
-        is_connected = _BASE in roots
+        loose = [name for name in dict.fromkeys(roots.values()) if name != BASE]
+        is_connected = BASE in roots
         static = {roots[link] for link, (scope, _) in links.items() if scope.is_static}
         moving = {
             roots[child]
@@ -586,7 +317,7 @@ class _Reader:
                     file=self.file,
                     field="model",
                     expected="one tree",
-                    got=", ".join([*loose, *([_WORLD] if is_connected else [])]),
+                    got=", ".join([*loose, *([WORLD] if is_connected else [])]),
                 )
         other = "floating" if free else "left out"
         kinds = {name: "fixed" if name in static | moving else other for name in loose}
@@ -602,7 +333,7 @@ class _Reader:
         return kinds
 
     def _choose_names(
-        self, links: Mapping[str, tuple[_Scope, str]], kinds: Mapping[str, str]
+        self, links: Mapping[str, tuple[Scope, str]], kinds: Mapping[str, str]
     ) -> dict[str, str]:
         """Return names of links; the only root of a model in a world is called like the model."""
         models = Counter(links[name][0].path for name in kinds)
@@ -611,12 +342,12 @@ class _Reader:
             path = links[name][0].path
             if path and models[path] == 1 and path.removesuffix("::") not in links:
                 names[name] = path.removesuffix("::")
-        base = _WORLD
+        base = WORLD
         while base in names.values():
             base += "_"
-        return {**names, _BASE: base}
+        return {**names, BASE: base}
 
-    def _read_kind(self, scope: _Scope, joint: ElementTree.Element) -> str:
+    def _read_kind(self, scope: Scope, joint: ElementTree.Element) -> str:
         kind, name = joint.get("type", "").strip(), joint.get("name")
         if kind not in _JOINT_TYPES:
             raise UnknownNameError(
@@ -631,7 +362,7 @@ class _Reader:
 
     def _read_joint(
         self,
-        scope: _Scope,
+        scope: Scope,
         joint: ElementTree.Element,
         name: str,
         ends: tuple[str, str],
@@ -663,7 +394,7 @@ class _Reader:
         )
 
     def _read_axis(
-        self, scope: _Scope, joint: ElementTree.Element, element: ElementTree.Element
+        self, scope: Scope, joint: ElementTree.Element, element: ElementTree.Element
     ) -> Any:
         """Return the unit axis in the joint's frame, shape (3,)."""
         name, xyz = joint.get("name", ""), element.find("xyz")
@@ -678,7 +409,7 @@ class _Reader:
             frame = scope.find_pose(stated)
         elif scope.rules.axis_frame is None or (
             scope.rules.axis_frame == "use_parent_model_frame"
-            and _is_true(element.findtext("use_parent_model_frame") or "")
+            and is_true(element.findtext("use_parent_model_frame") or "")
         ):
             frame = scope.find_pose("__model__")
         else:
@@ -687,7 +418,7 @@ class _Reader:
         return axis / np.linalg.norm(axis)
 
     def _read_limits(
-        self, scope: _Scope, element: ElementTree.Element, name: str
+        self, scope: Scope, element: ElementTree.Element, name: str
     ) -> tuple[tuple[float, float] | None, float | None]:
         """Return the position limits and the velocity limit of an axis."""
         if (limit := element.find("limit")) is None:
@@ -707,7 +438,7 @@ class _Reader:
         ), velocity if MIN_POSITIVE <= velocity < MAX_COORDINATE else None
 
     def _read_dynamics(
-        self, scope: _Scope, element: ElementTree.Element, name: str
+        self, scope: Scope, element: ElementTree.Element, name: str
     ) -> dict[str, float]:
         if (dynamics := element.find("dynamics")) is None:
             return {}
@@ -722,7 +453,7 @@ class _Reader:
             "springref": rest,
         }
 
-    def _read_link(self, scope: _Scope, local: str, name: str, frame: pin.SE3) -> Link:
+    def _read_link(self, scope: Scope, local: str, name: str, frame: pin.SE3) -> Link:
         element = scope.links[local]
         # Places elements in the link's new frame.
         base = frame.inverse() * scope.find_placement()
@@ -754,7 +485,7 @@ class _Reader:
 
     def _read_shapes(
         self,
-        scope: _Scope,
+        scope: Scope,
         link: ElementTree.Element,
         kind: str,
         base: pin.SE3,
@@ -785,7 +516,7 @@ class _Reader:
             )
 
     def _read_geometry(
-        self, scope: _Scope, shape: ElementTree.Element, name: str, file: Path | None
+        self, scope: Scope, shape: ElementTree.Element, name: str, file: Path | None
     ) -> dict[str, Any]:
         """Return kind, size, file and triangles of a shape."""
         if file is not None:
@@ -794,7 +525,7 @@ class _Reader:
             if part is None:
                 return {"kind": "mesh", "size": size, "file": file}
             mesh = load_mesh(file, submesh=(part.findtext("name") or "").strip())
-            if _is_true(part.findtext("center") or ""):
+            if is_true(part.findtext("center") or ""):
                 mesh.apply_translation(-mesh.bounds.mean(axis=0))
             return {"kind": "mesh", "size": size, "triangles": mesh}
         size = tuple(
@@ -815,7 +546,7 @@ class _Reader:
         return {"kind": shape.tag, "size": size}
 
     def _read_inertia(
-        self, scope: _Scope, link: ElementTree.Element, base: pin.SE3, local: str
+        self, scope: Scope, link: ElementTree.Element, base: pin.SE3, local: str
     ) -> pin.Inertia:
         """Return a link's inertia; an incomplete <inertial> counts as none, with a note."""
         element = link.find("inertial")
@@ -833,7 +564,7 @@ class _Reader:
             return pin.Inertia.Zero()
 
     def _read_colour(
-        self, scope: _Scope, element: ElementTree.Element, name: str
+        self, scope: Scope, element: ElementTree.Element, name: str
     ) -> tuple[float, float, float, float] | None:
         material = element.find("material")
         if material is None or material.find("diffuse") is None:
@@ -842,10 +573,6 @@ class _Reader:
         values = scope.read_numbers(material, "diffuse", len(rgba), "", name)
         red, green, blue, opacity = (*values, 1.0)[:4] if len(values) >= 3 else (0.8, 0.8, 0.8, 1.0)
         return red, green, blue, opacity
-
-
-def _is_true(text: str) -> bool:
-    return text.strip().lower() in ("1", "true")
 
 
 def _find_model(file: Path, include: ElementTree.Element, packages: Mapping[str, Path]) -> Path:

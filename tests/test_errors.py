@@ -53,3 +53,13 @@ def test_messages_are_short_for_any_value() -> None:
         "[1, 2.5, 'door']",
         str(10**30),
     )
+
+
+def test_messages_hold_no_control_characters_of_names() -> None:
+    name = "a\x1b[2J\nb\udcff\u202e.urdf"
+    plain = r"a\x1b[2J\nb\udcff\u202e.urdf"
+    assert str(InputError("wrong", file=name, field=name)) == f"{plain}: {plain}: wrong"
+    unknown = UnknownNameError("link", name, [name + "x"])
+    assert str(unknown).count(plain) == 3
+    assert str(unknown).isprintable()
+    assert (unknown.name, unknown.nearest) == (name, name + "x")

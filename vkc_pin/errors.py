@@ -47,10 +47,19 @@ def _shorten(text: str, most: int = _MAX_VALUE_LENGTH) -> str:
     return text if len(text) <= most else f"{text[: most - 43]}...{text[-40:]}"
 
 
+def _escape(text: str) -> str:
+    """Replace what terminals would execute or cannot print by Python's escapes."""
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
+
+
 def _format_detail(value: object) -> str:
     if isinstance(value, float | Path):
         return _shorten(str(value))
     return _shorten(value if isinstance(value, str) else format_value(value))
+
+
+def _shorten_name(name: str) -> str:
+    return _escape(_shorten(name, _MAX_NAME_LENGTH))
 
 
 def find_nearest_name(name: str, choices: Iterable[str]) -> str | None:
@@ -108,9 +117,9 @@ class InputError(VkcError, ValueError):
     ) -> None:
         self.problem, self.file, self.line, self.field = problem, file, line, field
         self.expected, self.got = expected, got
-        named = None if file is None else _shorten(str(file))
+        named = None if file is None else _escape(_shorten(str(file)))
         where = "" if named is None else f"{named}:{line}: " if line is not None else f"{named}: "
-        what = problem if field is None else f"{_shorten(field)}: {problem}"
+        what = problem if field is None else f"{_escape(_shorten(field))}: {problem}"
         details = [
             f"{label} {_format_detail(value)}"
             for label, value in (("expected", expected), ("got", got))
@@ -137,11 +146,11 @@ class UnknownNameError(InputError):
     ) -> None:
         self.kind, self.name, self.choices = kind, name, tuple(str(c) for c in choices)
         self.nearest = find_nearest_name(name, self.choices)
-        listed = ", ".join(_shorten(choice, _MAX_NAME_LENGTH) for choice in self.choices[:12]) + (
+        listed = ", ".join(_shorten_name(choice) for choice in self.choices[:12]) + (
             ", ..." if len(self.choices) > 12 else ""
         )
-        hint = f"; did you mean '{self.nearest}'?" if self.nearest else ""
-        problem = f"there is no {kind} '{_shorten(name, _MAX_NAME_LENGTH)}'"
+        hint = f"; did you mean '{_shorten_name(self.nearest)}'?" if self.nearest else ""
+        problem = f"there is no {kind} '{_shorten_name(name)}'"
         known = f"here are: {listed or 'none'}"
         super().__init__(
             f"{problem}{hint} T{known}" if hint else f"{problem}; t{known}",

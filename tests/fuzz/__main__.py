@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import random
 import sys
 from collections import Counter
 from pathlib import Path
@@ -21,7 +22,7 @@ def main() -> int:
     """Run cases; return 1 if something is wrong with one of them."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("--cases", type=int, default=1000, help="how many, of all kinds together")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seed", type=int, help="a new one by default, which is printed")
     parser.add_argument("--kind", choices=KINDS, help="this kind alone")
     parser.add_argument(
         "--first", type=int, default=0, help="the number of the first case of each kind"
@@ -35,6 +36,9 @@ def main() -> int:
         "--show", type=int, metavar="NUMBER", help="print one case of --kind and its outcome"
     )
     given = parser.parse_args()
+    if given.seed is None:
+        given.seed = random.SystemRandom().randrange(10**6)
+        sys.stdout.write(f"--seed {given.seed}\n")
     worker, rows, seen, bad = Worker(), [], Counter[str](), 0
     if given.show is not None:
         asked = {"kind": given.kind, "seed": given.seed, "number": given.show}

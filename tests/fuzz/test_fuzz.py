@@ -50,7 +50,7 @@ def test_past_failures_yield_a_result_or_an_error(worker: Worker, file: Path) ->
 
 @pytest.mark.long
 def test_valid_input_yields_a_result(worker: Worker) -> None:
-    from fuzz import calls, files
+    from fuzz import calls, files, imports
 
     cases: list[tuple[str, Any]] = [
         ("calls", {"call": name, "changes": []}) for name in calls.CALLS
@@ -68,6 +68,14 @@ def test_valid_input_yields_a_result(worker: Worker) -> None:
             ("files", {"file": name, "content": content, "plan": name == "scenes/door.yaml"})
         )
     cases += [("documents", {"scene": "household", "changes": []}), ("plans", {"about": []})]
+    for name, text in imports.FILES.items():
+        content = {
+            name: text,
+            **{key: data.decode("latin-1") for key, data in imports.make_beside().items()},
+        }
+        cases.append(
+            ("imports", {"file": name, "kind": Path(name).stem, "content": content, "plan": False})
+        )
     wrong = []
     for kind, case in cases:
         found = worker.run(kind=kind, case=case)

@@ -169,35 +169,25 @@ class Triangles:
         self._faces.append(placed)
         self._colours.append(np.clip(shade[:, None] * base, 0.0, 1.0))
 
-    def draw(
-        self,
-        axes: Any,
-        towards: Floats,
-        *,
-        ticks: bool = False,
-        box: tuple[Floats, Floats] | None = None,
-    ) -> None:
-        """Draw all triangles.
+    def draw(self, axes: Any, towards: Floats, *, ticks: bool = False) -> None:
+        """Draw all triangles, if there are any.
 
         Args:
             axes: Axes in three dimensions.
             towards: Direction to the viewer, shape (3,); its height is ignored.
             ticks: Whether to draw the axes [m].
-            box: Corners of the part to show [m], shape (3,) each; None: everything.
         """
+        if not self._faces:
+            return
         # The module has no type annotations.
         collection = importlib.import_module("mpl_toolkits.mplot3d.art3d").Poly3DCollection
 
         triangles, shades = np.concatenate(self._faces), np.concatenate(self._colours)
-        if box is not None:
-            middles = triangles.mean(axis=1)
-            inside = ((middles >= box[0]) & (middles <= box[1])).all(axis=1)
-            triangles, shades = triangles[inside], shades[inside]
         axes.add_collection3d(
             collection(triangles, facecolors=shades, edgecolors="none", shade=False)
         )
         points = triangles.reshape(-1, 3)
-        low, high = (points.min(axis=0), points.max(axis=0)) if box is None else box
+        low, high = points.min(axis=0), points.max(axis=0)
         middle, half = (low + high) / 2.0, float((high - low).max()) / 2.0
         for set_limits, centre in zip(
             (axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, strict=True

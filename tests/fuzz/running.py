@@ -30,7 +30,7 @@ TESTS = Path(__file__).resolve().parents[1]
 def _load_kinds() -> dict[
     str, tuple[Callable[[random.Random], dict[str, Any]], Callable[[dict[str, Any]], str]]
 ]:
-    from . import calls, files, imports, plans
+    from . import calls, datasets, files, imports, plans
 
     return {
         "files": (files.make_case, files.run),
@@ -38,10 +38,15 @@ def _load_kinds() -> dict[
         "calls": (calls.make_case, calls.run),
         "plans": (plans.make_case, plans.run),
         "imports": (imports.make_case, imports.run),
+        "datasets": (datasets.make_case, datasets.run),
+        "journals": (datasets.make_journal_case, datasets.run_journal),
     }
 
 
-KINDS = {"files": 0.3, "documents": 0.15, "calls": 0.3, "plans": 0.1, "imports": 0.15}
+KINDS = {
+    **{"files": 0.25, "documents": 0.15, "calls": 0.25, "plans": 0.1},
+    **{"imports": 0.1, "datasets": 0.1, "journals": 0.05},
+}
 """Kind of cases → its share."""
 
 

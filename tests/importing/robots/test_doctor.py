@@ -176,3 +176,14 @@ def test_lift_without_velocity_moves_slowly(tmp_path: Path) -> None:
     assert robot.velocity[3:].tolist() == pytest.approx([0.1, *[3.14159265] * 4])
     text = " ".join(find_texts(vkc.importing.doctor(robot, samples=1), "warning", "limits"))
     assert "arm_1_joint (assumed: 0.1 m/s); arm_2_joint, arm_3_joint" in text
+
+
+@pytest.mark.parametrize("samples", [0, 10**6 + 1, 10**12])
+def test_number_of_samples_is_limited(samples: int) -> None:
+    for call in (
+        lambda: vkc.importing.doctor("husky_ur5e", samples=samples),
+        lambda: vkc.importing.import_robot("husky_ur5e", "/nowhere", samples=samples),
+    ):
+        with pytest.raises(vkc.InputError) as caught:
+            call()
+        assert caught.value.field == "samples"

@@ -116,7 +116,7 @@ def doctor(
     Raises:
         InputError: The robot cannot be loaded, or an argument is invalid.
     """
-    check_integer(samples, "samples", low=1)
+    check_integer(samples, "samples", low=1, high=1_000_000)
     clearance = (
         Options().dist_safe
         if margin is None

@@ -140,8 +140,8 @@ def import_robot(  # noqa: PLR0913 - keyword options of a public call
     for field, given in (("arm", arm), ("tool_frame", tool_frame)):
         if given is not None:
             check_text(given, field, "a name")
-    check_integer(most_pieces, "most_pieces", low=1)
-    check_integer(samples, "samples", low=1)
+    check_integer(most_pieces, "most_pieces", low=1, high=1000)
+    check_integer(samples, "samples", low=1, high=1_000_000)
     places = {
         key: check_path(place, f"packages.{key}")
         for key, place in check_mapping(packages or {}, "packages").items()

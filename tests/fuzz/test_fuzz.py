@@ -76,7 +76,7 @@ def test_valid_input_yields_a_result(worker: Worker) -> None:
         cases.append(
             ("imports", {"file": name, "kind": Path(name).stem, "content": content, "plan": False})
         )
-    cases += [("datasets", {"changes": []}), ("journals", {"line": 0, "changes": []})]
+    cases += [("datasets", {"changes": [], "plan": True}), ("journals", {"line": 0, "changes": []})]
     wrong = []
     for kind, case in cases:
         found = worker.run(kind=kind, case=case)

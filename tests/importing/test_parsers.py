@@ -133,5 +133,6 @@ def test_ctrl_c_ends_an_import(folder: Path) -> None:
     process = subprocess.Popen(command, start_new_session=True, env=environment)
     time.sleep(3.0)
     os.killpg(process.pid, signal.SIGINT)  # as the terminal does
-    assert process.wait(timeout=10) == 130
+    # the latter: on a slow machine, before the command handles the signal
+    assert process.wait(timeout=10) in (130, -signal.SIGINT)
     assert sorted(file.name for file in folder.iterdir()) == ["a.xml", "pipe"]

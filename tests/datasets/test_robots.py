@@ -17,7 +17,6 @@ from vkc_pin.world.models.robot_file import find_robot, load_robot
 def test_robot_without_a_hand_is_imported_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("coacd")
     recipe = load_recipe({**SMALL, "robots": ["husky_ur5e", {"name": "panda", "height": 0.5}]})
     found = robots.prepare_robots(recipe, tmp_path)
     assert list(found) == ["panda"]  # the other one says what its hand is

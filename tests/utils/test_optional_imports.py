@@ -37,13 +37,13 @@ def test_installed_packages_are_returned() -> None:
     ) == {"a": 1}
 
 
-@pytest.mark.parametrize("name", ["coacd", "coacd.inside"])
+@pytest.mark.parametrize("name", ["mujoco", "mujoco.inside"])
 def test_missing_packages_name_the_extra(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    monkeypatch.setitem(sys.modules, "coacd", None)
+    monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(vkc.InputError) as caught:
         optional_imports.import_optional(
             name, "import", purpose="cutting a mesh", file="robot.urdf", field="mesh"
         )
     assert 'pip install "vkc-pin[import]"' in str(caught.value)
     assert (caught.value.file, caught.value.field) == ("robot.urdf", "mesh")
-    assert "cutting a mesh needs the Python package coacd" in str(caught.value)
+    assert "cutting a mesh needs the Python package mujoco" in str(caught.value)

@@ -1,29 +1,32 @@
-"""Decomposes concave meshes into convex pieces with CoACD (Wei et al., SIGGRAPH 2022).
+"""Decomposes meshes into convex pieces that contain them.
 
-Pieces contain the surface that they are made from, since planning would drive through whatever they
-leave uncovered. CoACD takes closed meshes of few triangles; it would remesh others for minutes, so
-these are cut by planes.
+Planning would drive through parts of a surface that no piece contains. The surface is therefore cut
+by planes until the hulls of its parts hardly protrude over it; then parts whose common hull
+protrudes little are merged. Every point of the surface stays in a part, whether the mesh is closed
+or open, manifold or not.
 """
 
 from __future__ import annotations
 
 import hashlib
+import heapq
+import itertools
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache, cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import coal
 import numpy as np
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.parsers import cut_mesh
 from vkc_pin.utils.arguments import check_coordinate, check_integer, check_number
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.disk_cache import load_or_build
-from vkc_pin.world.files.hulls import compute_hull, compute_outer_hull
-from vkc_pin.world.files.meshes import MeshPart, load_mesh, make_bvh, simplify_mesh
+from vkc_pin.world.files.hulls import SHEET_THICKNESS, compute_hull, compute_outer_hull, thicken
+from vkc_pin.world.files.meshes import MeshPart, load_mesh, make_bvh
 from vkc_pin.world.files.resources import check_path
 
 if TYPE_CHECKING:
@@ -32,34 +35,43 @@ if TYPE_CHECKING:
 __all__ = [
     "ERROR",
     "PIECES",
-    "THICKNESS",
     "Pieces",
     "compute_concavity",
     "compute_solid_volume",
     "decompose",
     "is_flat",
     "measure_outside",
-    "slice_mesh",
-    "thicken",
 ]
 
 ERROR = 0.02
 """Largest protrusion of pieces over the surface [m], about the clearance margin of motions."""
 PIECES = 12
-"""Largest number of pieces of one mesh: planning time grows with their number."""
-_VERSION = 1  # of the disk cache: increase it whenever the same mesh would be cut differently
-_MAX_TRIANGLES = 2000  # of a mesh for CoACD, which takes minutes for larger ones
+"""Number of pieces of one mesh, unless cavities need more: planning time grows with it."""
+_VERSION = 2  # of the disk cache: increase it whenever the same mesh would be cut differently
 _CORNERS = 40  # largest number of vertices of a piece, as in the packaged collision geometry
 # Pieces are simplified only above this multiple of the vertex limit: simplifying takes a second.
 _CORNER_TOLERANCE = 1.5
+_FLATNESS = 1e-4  # [m] thickness up to which parts become plates
 _SAMPLES_PER_CELL = 16  # surface samples that detect the grid cells of a mesh's skin
 _MAX_SAMPLES = 4_000_000
 _SAMPLES = 1000  # samples on a surface in addition to its vertices
+_OUTWARD = 1e-5  # [m] offset of samples that tells outer faces from faces between pieces
 _POINT_RADIUS = 1e-6  # [m] radius of the sphere that stands for a point in distance queries
 _CELLS = 96  # grid cells along the longest edge, for volumes of open meshes
-_SEARCH = {
-    "resolution": 1000
-}  # samples with which CoACD rates cuts: half its default, half the time
+_MAX_CELLS = 1_000_000  # of the grid that tells outer from inner space while a mesh is cut
+_CUT_SHARE = 0.4  # of the error: parts that protrude by less are not cut
+_FREE_SHARE = 0.5  # of the error: pieces are merged up to this even if there are few
+_MERGE_SHARE = 0.8  # of the error: leaves room for what samples miss and for fewer vertices
+_EXTRA = 4  # multiple of `PIECES` up to which the error matters more than the number
+_MAX_PARTS = 64  # of a mesh before merging
+_MAX_TRIANGLES = 3000  # of a part while its best cut is sought
+_FACET_PLANES, _AXIS_PLANES = 10, 7  # candidate cuts: through facets, and across each axis
+# Costs of a merged hull besides its protrusion: of its mean thickness over the two, and of its size
+_VOLUME_COST, _SIZE_COST = 2.0, 0.02
+_MIN_FACET = 0.02  # smallest area of a facet that is a candidate, relative to the part
+# Reduction of volume, relative to the hull, that outweighs a facet of the whole part's area
+_FACET_BONUS = 0.3
+_SNAP = 3e-5  # [m] distance from a plane that counts as zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,14 +80,24 @@ class Pieces:
 
     Attributes:
         meshes: The pieces, closed, in the frame of the mesh [m].
-        solid: Volume of the mesh itself [m³], including cavities that are not reachable from
-            outside.
         error: Largest protrusion of the pieces over the mesh's surface [m], measured at samples.
+        mesh: The mesh.
     """
 
     meshes: tuple[trimesh.Trimesh, ...]
-    solid: float
     error: float
+    mesh: trimesh.Trimesh
+
+    @cached_property
+    def hull_volume(self) -> float:
+        """Volume of the convex hull of the mesh [m³]."""
+        return float(_make_hull(self.mesh.vertices).volume)
+
+    @cached_property
+    def solid(self) -> float:
+        """Volume of the mesh [m³], including cavities that are not reachable from outside."""
+        # The volume of an open mesh is only measured, and hull and pieces contain the mesh.
+        return min(compute_solid_volume(self.mesh), self.hull_volume, self.volume)
 
     @property
     def volume(self) -> float:
@@ -91,36 +113,35 @@ class Pieces:
 def decompose(
     mesh: str | Path | trimesh.Trimesh,
     *,
-    most_pieces: int = PIECES,
+    most_pieces: int | None = None,
     error: float = ERROR,
     overhead: float = 0.0,
     corners: int = _CORNERS,
-    seed: int = 0,
 ) -> Pieces:
     """Decompose a mesh into convex pieces that contain it.
 
-    The result is the convex hull if it is close to the mesh, else the hulls of its connected
-    bodies, else those of the parts into which CoACD cuts it. The same mesh gives the same pieces;
-    the parts of meshes that had to be cut are cached on disk.
+    The result is the convex hull if it is close to the mesh, else the hulls of parts into which
+    planes cut the surface. Parts thinner than 0.1 mm become plates of 1 mm. The same mesh gives the
+    same pieces; those of meshes that had to be cut are cached on disk.
 
     Args:
-        mesh: A mesh file in [m], or a mesh; it need not be closed.
-        most_pieces: Largest number of pieces.
+        mesh: A mesh file in [m], or a mesh. It may be open, non-manifold or flat.
+        most_pieces: Largest number of pieces. Defaults to `PIECES`, and to four times as many where
+            fewer would protrude by more than `error`, as those of a cabinet with many shelves.
         error: Largest protrusion of the pieces over the mesh's surface [m], unless it takes more
-            pieces.
+            pieces: see `Pieces.error`.
         overhead: A hull whose excess volume, relative to the mesh, is no larger than this is kept
             whole, wherever it protrudes.
         corners: Largest number of vertices. A piece with half as many again is replaced by an
             enclosing polytope.
-        seed: Random seed.
 
     Raises:
-        InputError: The mesh cannot be read, is empty or flat, or has to be cut and CoACD is not
-            installed.
+        InputError: The mesh cannot be read or is empty, or an argument is invalid.
     """
     import trimesh
 
-    check_integer(most_pieces, "most_pieces", low=1)
+    if most_pieces is not None:
+        check_integer(most_pieces, "most_pieces", low=1)
     check_integer(corners, "corners", low=8)
     error, overhead = check_coordinate(error, "error"), check_number(overhead, "overhead", low=0.0)
     if error <= 0.0:
@@ -128,40 +149,30 @@ def decompose(
             "`error` must be positive", field="error", expected="a number above 0 [m]", got=error
         )
     if isinstance(mesh, trimesh.Trimesh):
-        file, loaded = None, mesh
+        loaded = mesh
     else:
-        file = check_path(mesh, "mesh", "a mesh or a mesh file")
-        loaded = load_mesh(file)
-    hull = _make_hull(loaded.vertices, file)
-    hulls, solid = [hull], min(compute_solid_volume(loaded), float(hull.volume))
-    if (
-        most_pieces > 1
-        and hull.volume > (1.0 + overhead) * solid
-        and _measure_protrusion(hulls, loaded) > error
-    ):
-        hulls = _make_body_hulls(loaded, most_pieces)
-        if not hulls or _measure_protrusion(hulls, loaded) > error:
+        loaded = load_mesh(check_path(mesh, "mesh", "a mesh or a mesh file"))
+    hull = tuple(_simplify([_make_hull(loaded.vertices)], corners))
+    whole = Pieces(hull, _measure_protrusion(hull, loaded), loaded)
+    if most_pieces == 1 or whole.error <= error:
+        return whole
+    if overhead > 0.0 and not is_flat(loaded) and whole.overhead <= overhead:
+        return whole
 
-            def cut_pieces() -> list[list[list[float]]]:
-                """Return the vertices of each piece."""
-                parts = _cut_mesh(loaded, most_pieces, error, seed, file)
-                parts = parts or [np.asarray(hull.vertices)]
-                pieces = _simplify(_enclose_surface(parts, _sample_surface(loaded)), corners)
-                return [piece.vertices.tolist() for piece in pieces]
+    def cut_pieces() -> list[list[list[float]]]:
+        """Return the vertices of each piece."""
+        parts = _cut_mesh(loaded, most_pieces, error)
+        pieces = _simplify([_make_hull(part) for part in parts], corners)
+        return [piece.vertices.tolist() for piece in pieces]
 
-            parts = load_or_build(
-                _make_cache_key(loaded, most_pieces, error, corners, seed), cut_pieces
-            )
-            hulls = [compute_hull(np.array(part)) for part in parts]
-    pieces = tuple(_simplify(hulls, corners))
-    # The volume of an open mesh is only measured, and the pieces contain the mesh.
-    solid = min(solid, float(sum(piece.volume for piece in pieces)))
-    return Pieces(pieces, solid, _measure_protrusion(pieces, loaded))
+    key = _make_cache_key(loaded, most_pieces, error, corners)
+    pieces = tuple(compute_hull(np.array(piece)) for piece in load_or_build(key, cut_pieces))
+    return Pieces(pieces, _measure_protrusion(pieces, loaded), loaded)
 
 
 def compute_concavity(mesh: trimesh.Trimesh) -> float:
     """Return the largest protrusion of a mesh's convex hull over its surface [m], sampled."""
-    return _measure_protrusion([_make_hull(mesh.vertices, None)], mesh)
+    return _measure_protrusion([_make_hull(mesh.vertices)], mesh)
 
 
 def compute_solid_volume(mesh: trimesh.Trimesh) -> float:
@@ -171,136 +182,16 @@ def compute_solid_volume(mesh: trimesh.Trimesh) -> float:
     outside; cells of the surface itself count half. Holes narrower than a hundredth of the mesh
     count as closed.
     """
-    import trimesh
-    from scipy import ndimage
-
     if mesh.is_volume and mesh.body_count == 1:
         return float(mesh.volume)
-    pitch = float(mesh.extents.max()) / _CELLS
-    low = mesh.bounds[0] - 1.5 * pitch
-    size = np.ceil((mesh.bounds[1] - low) / pitch).astype(int) + 2
-    skin = np.zeros(size, bool)
-    count = int(min(_SAMPLES_PER_CELL * mesh.area / pitch**2, _MAX_SAMPLES)) + 1
-    points = np.vstack([mesh.vertices, trimesh.sample.sample_surface(mesh, count, seed=0)[0]])
-    skin[tuple(np.floor((points - low) / pitch).astype(int).T)] = True
-    regions, _ = ndimage.label(~skin)
-    inside = ~skin & (regions != regions[0, 0, 0])
-    return float((inside.sum() + 0.5 * skin.sum()) * pitch**3)
+    grid = _Grid(mesh, max(float(mesh.extents.max()), SHEET_THICKNESS) / _CELLS)
+    inside = (~grid.is_outside).sum() - 0.5 * grid.is_skin.sum()
+    return float(inside * grid.pitch**3)
 
 
-def _make_cache_key(mesh: trimesh.Trimesh, *settings: float) -> bytes:
-    """Return a key of everything that the pieces of a mesh depend on."""
-    surface = hashlib.sha256(
-        np.asarray(mesh.vertices, float).tobytes() + np.asarray(mesh.faces, np.int64).tobytes()
-    )
-    return json.dumps(("pieces", _VERSION, settings, surface.hexdigest())).encode()
-
-
-def _simplify(pieces: Sequence[trimesh.Trimesh], corners: int) -> list[trimesh.Trimesh]:
-    """Replace pieces with many vertices by enclosing polytopes with few."""
-    return [
-        compute_outer_hull(one.vertices, vertices=corners)
-        if len(one.vertices) > _CORNER_TOLERANCE * corners
-        else one
-        for one in pieces
-    ]
-
-
-def _make_body_hulls(mesh: trimesh.Trimesh, max_parts: int) -> list[trimesh.Trimesh]:
-    """Return the hulls of a mesh's connected bodies."""
-    merged = _merge_vertices(mesh)
-    if not 1 < merged.body_count <= max_parts:
-        return []
-    bodies = [
-        np.asarray(body.vertices) for body in merged.split(only_watertight=False, repair=False)
-    ]
-    return [] if any(map(is_flat, bodies)) else [_make_hull(body, None) for body in bodies]
-
-
-def _cut_mesh(
-    mesh: trimesh.Trimesh, max_parts: int, error: float, seed: int, file: Path | None
-) -> list[Floats]:
-    """Return the vertices of parts of a mesh."""
-    import trimesh
-
-    merged = _merge_vertices(mesh)
-    if not merged.is_volume or len(merged.faces) > _MAX_TRIANGLES:
-        coarse = simplify_mesh(
-            MeshPart(np.asarray(merged.vertices), np.asarray(merged.faces)),
-            merged.extents.max() / _CELLS,
-        )
-        return [
-            thicken(part)
-            for part in slice_mesh(trimesh.Trimesh(coarse.vertices, coarse.faces), max_parts)
-        ]
-    parts = cut_mesh(
-        np.asarray(merged.vertices),
-        np.asarray(merged.faces),
-        file,
-        threshold=error,
-        real_metric=True,
-        max_convex_hull=max_parts,
-        seed=seed,
-        preprocess_mode="off",
-        **_SEARCH,
-    )
-    return [corners for part in parts if not is_flat(corners := np.asarray(part))]
-
-
-def _merge_vertices(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return a copy of a mesh in which coincident vertices are merged."""
-    merged = mesh.copy()
-    merged.merge_vertices(merge_tex=True, merge_norm=True)
-    return merged
-
-
-def _make_hull(points: Any, file: Path | None) -> trimesh.Trimesh:
-    """Return the convex hull of points, which must not be flat."""
-    points = np.asarray(points, float)
-    if is_flat(points):
-        raise InputError(
-            "the mesh is flat",
-            file=file,
-            expected="triangles that enclose a volume",
-            got="triangles in one plane",
-        )
-    return compute_hull(points)
-
-
-def _sample_surface(mesh: trimesh.Trimesh) -> Floats:
-    """Return points on a mesh, shape (n, 3): its vertices, and samples uniform by area."""
-    import trimesh
-
-    samples, _ = trimesh.sample.sample_surface(mesh, 4 * _SAMPLES, seed=0)
-    return np.vstack([np.asarray(mesh.vertices), np.asarray(samples)])
-
-
-def _measure_protrusion(pieces: Sequence[trimesh.Trimesh], mesh: trimesh.Trimesh) -> float:
-    """Return the largest distance of the pieces' outer surface from a mesh [m], sampled."""
-    import trimesh
-
-    triangles, here, request, result = (
-        make_bvh(mesh),
-        coal.Transform3s(),
-        coal.DistanceRequest(),
-        coal.DistanceResult(),
-    )
-    triangles.computeLocalAABB()
-    point_shape, furthest = coal.Sphere(_POINT_RADIUS), 0.0
-    for piece in pieces:
-        points = np.vstack(
-            [piece.triangles_center, trimesh.sample.sample_surface(piece, _SAMPLES, seed=0)[0]]
-        )
-        is_covered = np.zeros(len(points), bool)
-        for other in pieces:
-            if other is not piece:
-                is_covered |= measure_outside(other, points) < -_POINT_RADIUS
-        for point in points[~is_covered]:
-            result.clear()
-            place = coal.Transform3s(np.eye(3), point)
-            distance = coal.distance(point_shape, place, triangles, here, request, result)
-            furthest = max(furthest, distance)
-    return furthest
+def is_flat(mesh: trimesh.Trimesh) -> bool:
+    """Return whether a mesh lies almost in one plane, so that it becomes a plate."""
+    return thicken(mesh.vertices, _FLATNESS)[1]
 
 
 def measure_outside(piece: trimesh.Trimesh, points: Floats) -> Floats:
@@ -313,108 +204,368 @@ def measure_outside(piece: trimesh.Trimesh, points: Floats) -> Floats:
     )
 
 
-def _enclose_surface(parts: list[Floats], surface: Floats) -> list[trimesh.Trimesh]:
-    """Return the hulls of parts, extended to contain a surface."""
-    hulls = [compute_hull(part) for part in parts]
-    beyond = np.array([measure_outside(hull, surface) for hull in hulls])
-    nearest, is_outside = beyond.argmin(axis=0), beyond.min(axis=0) > 1e-9
+def _make_cache_key(mesh: trimesh.Trimesh, *settings: float | None) -> bytes:
+    """Return a key of everything that the pieces of a mesh depend on."""
+    surface = hashlib.sha256(
+        np.asarray(mesh.vertices, float).tobytes() + np.asarray(mesh.faces, np.int64).tobytes()
+    )
+    return json.dumps(("pieces", _VERSION, settings, surface.hexdigest())).encode()
+
+
+def _make_hull(points: Floats) -> trimesh.Trimesh:
+    """Return the convex hull of points, or a plate around flat ones."""
+    return compute_hull(thicken(points, _FLATNESS)[0])
+
+
+def _simplify(pieces: Sequence[trimesh.Trimesh], corners: int) -> list[trimesh.Trimesh]:
+    """Replace pieces with many vertices by enclosing polytopes with few."""
     return [
-        compute_hull(np.vstack([np.asarray(hull.vertices), surface[is_outside & (nearest == k)]]))
-        for k, hull in enumerate(hulls)
+        compute_outer_hull(one.vertices, vertices=corners)
+        if len(one.vertices) > _CORNER_TOLERANCE * corners
+        else one
+        for one in pieces
     ]
 
 
-THICKNESS = 1e-3
-"""Thickness that flat parts are given [m]."""
-_FLAT_RATIO = 1e-4  # thickness relative to the extent up to which points are flat
-_FLAT_THICKNESS = 1e-5  # [m] thickness up to which points are flat
-_PLANES = 12  # number of cutting planes along each axis
-_MIN_GAIN = 0.01  # smallest reduction of volume of a cut, relative to the whole hull
+def _measure_protrusion(pieces: Sequence[trimesh.Trimesh], mesh: trimesh.Trimesh) -> float:
+    """Return the largest distance of the pieces' outer surface from a mesh [m], sampled."""
+    import trimesh
+
+    # coal 3.0.3 takes points for inside if any triangle has no area.
+    has_area = mesh.area_faces > 0.0
+    if not has_area.any():
+        return 0.0
+    triangles = make_bvh(MeshPart(np.asarray(mesh.vertices), np.asarray(mesh.faces)[has_area]))
+    triangles.computeLocalAABB()
+    here, request, result = coal.Transform3s(), coal.DistanceRequest(), coal.DistanceResult()
+    point_shape, furthest = coal.Sphere(_POINT_RADIUS), 0.0
+    for piece in pieces:
+        samples, faces = trimesh.sample.sample_surface(piece, _SAMPLES, seed=0)
+        points = np.vstack([piece.triangles_center, samples])
+        outward = points + _OUTWARD * np.vstack([piece.face_normals, piece.face_normals[faces]])
+        is_covered = np.zeros(len(points), bool)
+        for other in pieces:
+            if other is not piece:
+                is_covered |= measure_outside(other, outward) < 0.0
+        for point in points[~is_covered]:
+            result.clear()
+            place = coal.Transform3s(np.eye(3), point)
+            distance = coal.distance(point_shape, place, triangles, here, request, result)
+            furthest = max(furthest, distance)
+    return furthest
 
 
-def slice_mesh(mesh: trimesh.Trimesh, max_parts: int) -> list[Floats]:
-    """Cut a mesh by planes into parts whose convex hulls have a small total volume.
+class _Grid:
+    """Cells around a mesh.
 
-    Greedily, the part whose best cut reduces the volume most is cut in two. Planes are normal to
-    the axes of the mesh and to its principal axes. Points on a cut belong to both sides, so that
-    the hulls contain the mesh.
-
-    Returns:
-        The points of each part, shape (n, 3).
+    Attributes:
+        low: Corner of the first cell, shape (3,) [m].
+        pitch: Edge of a cell [m].
+        points: Vertices and samples of the surface, shape (n, 3) [m].
+        is_skin: Whether cells hold points of the surface, shape (i, j, k).
+        is_outside: Whether cells can be reached from outside, shape (i, j, k).
     """
-    vertices, edges = np.asarray(mesh.vertices, float), np.asarray(mesh.edges_unique)
-    axes = np.vstack([np.eye(3), np.linalg.eigh(np.cov(vertices.T))[1].T])
-    least = _MIN_GAIN * _compute_hull_volume(vertices)
-    parts = [(vertices, edges)]
-    cuts = [_find_best_cut(vertices, edges, axes)]
-    while len(parts) < max_parts:
-        k = int(np.argmax([gain for gain, _ in cuts]))
-        gain, halves = cuts[k]
-        if gain <= least:
-            break
-        parts[k : k + 1] = halves
-        cuts[k : k + 1] = [_find_best_cut(*half, axes) for half in halves]
-    return [points for points, _ in parts]
+
+    def __init__(self, mesh: trimesh.Trimesh, pitch: float) -> None:
+        import trimesh
+        from scipy import ndimage
+
+        self.pitch, self.low = pitch, mesh.bounds[0] - 1.5 * pitch
+        size = np.ceil((mesh.bounds[1] - self.low) / pitch).astype(int) + 2
+        self.is_skin = np.zeros(size, bool)
+        count = int(min(_SAMPLES_PER_CELL * mesh.area / pitch**2, _MAX_SAMPLES)) + 1
+        samples = trimesh.sample.sample_surface(mesh, count, seed=0)[0]
+        self.points = np.vstack([mesh.vertices, samples])
+        self.is_skin[self.find_cells(self.points)] = True
+        regions, _ = ndimage.label(~self.is_skin)
+        self.is_outside = regions == regions[0, 0, 0]
+
+    def find_cells(self, points: Floats) -> tuple[Ints, ...]:
+        """Return the indices of the cells of points, or of the nearest cells."""
+        cells = np.floor((points - self.low) / self.pitch).astype(int)
+        return tuple(np.clip(cells, 0, np.array(self.is_skin.shape) - 1).T)
 
 
-def is_flat(points: Floats) -> bool:
-    """Return whether points, shape (n, 3) [m], lie almost in one plane."""
-    if len(points) < 4:
-        return True
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
-    return bool(spread[-1] <= max(_FLAT_THICKNESS, _FLAT_RATIO * spread[0]))
+class _Surface:
+    """Estimates protrusions over a mesh, faster than `_measure_protrusion`."""
+
+    def __init__(self, mesh: trimesh.Trimesh, error: float) -> None:
+        from scipy import ndimage
+
+        volume = float(np.prod(mesh.extents + 0.1 * mesh.extents.max()))
+        self._grid = _Grid(mesh, max(error / 3.0, (volume / _MAX_CELLS) ** (1.0 / 3.0)))
+        is_skin, points = self._grid.is_skin, self._grid.points
+        numbers = np.cumsum(is_skin.ravel()) - 1
+        cells = numbers[np.ravel_multi_index(self._grid.find_cells(points), is_skin.shape)]
+        sums = [np.bincount(cells, weights=coordinates) for coordinates in points.T]
+        self._centres = np.column_stack(sums) / np.bincount(cells)[:, None]
+        nearest = ndimage.distance_transform_edt(
+            ~is_skin, return_distances=False, return_indices=True
+        )
+        self._nearest = numbers.reshape(is_skin.shape)[tuple(nearest)]
+
+    def measure_protrusion(self, points: Floats) -> float:
+        """Return the largest distance of points from the solid mesh [m]; 0 within its skin."""
+        cells = self._grid.find_cells(points)
+        squares = ((points - self._centres[self._nearest[cells]]) ** 2).sum(axis=1)
+        # The surface comes nearer than the centre of its points in a cell.
+        squares = np.maximum(squares - 0.75 * self._grid.pitch**2, 0.0)
+        return float(np.sqrt(np.where(self._grid.is_outside[cells], squares, 0.0).max()))
 
 
-def thicken(points: Floats) -> Floats:
-    """Return points that span a volume: flat ones become layers `THICKNESS` apart."""
-    if not is_flat(points):
-        return points
-    axes = np.linalg.svd(points - points.mean(axis=0))[2]
-    # Along all axes, since the points may lie on a line.
-    layers = [points + 0.5 * side * THICKNESS * axis for axis in axes for side in (-1.0, 1.0)]
-    return np.vstack(layers)
+# Points of a unit cube that choose samples on triangles
+_RANDOM = np.random.default_rng(0).random((400, 3))
 
 
-def _find_best_cut(
-    points: Floats, edges: Ints, axes: Floats
-) -> tuple[float, list[tuple[Floats, Ints]]]:
-    """Return the largest reduction of the hulls' volume by one cut [m³], and the two sides."""
-    whole = _compute_hull_volume(points)
-    best: tuple[float, list[tuple[Floats, Ints]]] = (0.0, [])
-    if whole == 0.0:
-        return best
-    for axis in axes:
-        along = points @ axis
-        for place in np.linspace(along.min(), along.max(), _PLANES + 2)[1:-1]:
-            sides = [_clip(points, edges, sign * along, sign * place) for sign in (1.0, -1.0)]
-            if min(len(side) for side, _ in sides) < 3:
-                continue
-            gain = whole - sum(_compute_hull_volume(side) for side, _ in sides)
-            if gain > best[0]:
-                best = (gain, sides)
-    return best
+class _Hull:
+    """Convex hull of a part of a mesh's surface.
+
+    Attributes:
+        corners: Shape (k, 3) [m].
+        bounds: Corners of the box around it, shape (2, 3) [m].
+        protrusion: Protrusion over the whole mesh [m].
+    """
+
+    def __init__(self, points: Floats, surface: _Surface) -> None:
+        from scipy.spatial import ConvexHull, QhullError
+
+        points = thicken(points, _FLATNESS)[0]
+        try:
+            hull = ConvexHull(points)
+        except QhullError:
+            hull = ConvexHull(points, qhull_options="QJ Pp")
+        self.corners = points[hull.vertices]
+        self.volume, self.area = float(hull.volume), float(hull.area)
+        self.bounds = np.array([self.corners.min(axis=0), self.corners.max(axis=0)])
+        triangles = points[hull.simplices]
+        a, b, c = triangles.transpose(1, 0, 2)
+        areas = np.linalg.norm(np.cross(b - a, c - a), axis=1).cumsum()
+        place = (np.arange(len(_RANDOM)) + _RANDOM[:, 2]) / len(_RANDOM) * areas[-1]
+        a, b, c = triangles[np.searchsorted(areas, place)].transpose(1, 0, 2)
+        u, v = np.sqrt(_RANDOM[:, :1]), _RANDOM[:, 1:2]
+        samples = a + u * (b - a) + u * v * (c - b)
+        large = triangles[np.argsort(-np.diff(areas, prepend=0.0))[: len(_RANDOM)]].mean(axis=1)
+        self.protrusion = surface.measure_protrusion(np.vstack([samples, large]))
 
 
-def _clip(points: Floats, edges: Ints, along: Floats, place: float) -> tuple[Floats, Ints]:
-    """Return the points with `along` up to `place`, those on cut edges, and the edges between."""
-    is_inside = along <= place
-    index = np.cumsum(is_inside) - 1
-    inside = edges[is_inside[edges].all(axis=1)]
-    crossing = edges[is_inside[edges[:, 0]] != is_inside[edges[:, 1]]]
-    start, end = crossing[:, 0], crossing[:, 1]
-    fraction = ((place - along[start]) / (along[end] - along[start]))[:, None]
-    cut = points[start] * (1.0 - fraction) + points[end] * fraction
-    cut_edges = np.column_stack(
-        [index[np.where(is_inside[start], start, end)], is_inside.sum() + np.arange(len(cut))]
-    )
-    return np.vstack([points[is_inside], cut]), np.vstack([index[inside], cut_edges])
+def _cut_mesh(mesh: trimesh.Trimesh, most_pieces: int | None, error: float) -> list[Floats]:
+    """Return the corners of convex pieces that contain a mesh."""
+    merged = mesh.copy()
+    merged.merge_vertices(merge_tex=True, merge_norm=True)
+    merged.update_faces(merged.area_faces > 0.0)
+    surface = _Surface(merged, error)
+    hulls = _cut_surface(merged, surface, _CUT_SHARE * error)
+
+    @cache
+    def unite(one: _Hull, other: _Hull) -> _Hull:
+        return _Hull(np.vstack([one.corners, other.corners]), surface)
+
+    few, most = (PIECES, _EXTRA * PIECES) if most_pieces is None else (most_pieces, most_pieces)
+    for limit, least in (
+        (_FREE_SHARE * error, 1),
+        (_MERGE_SHARE * error, few),
+        (error, few),
+        (np.inf, most),
+    ):
+        hulls = _merge_hulls(hulls, unite, limit, least)
+    return [hull.corners for hull in hulls]
 
 
-def _compute_hull_volume(points: Floats) -> float:
-    """Return the volume of the convex hull of points [m³]; 0 if they are flat."""
+def _cut_surface(mesh: trimesh.Trimesh, surface: _Surface, limit: float) -> list[_Hull]:
+    """Cut a mesh into parts that protrude by at most `limit` [m], or into `_MAX_PARTS`."""
+    import trimesh
+
+    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+    labels = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(faces))
+    bodies = range(labels.max() + 1)
+    groups = [faces[labels == k] for k in bodies] if len(bodies) <= _MAX_PARTS // 2 else [faces]
+    numbers, finished = itertools.count(), list[_Hull]()
+    queue = list[tuple[float, int, _Hull, Floats, Ints]]()
+
+    def add_part(vertices: Floats, faces: Ints) -> None:
+        if len(faces):
+            used, renumbered = np.unique(faces, return_inverse=True)
+            hull = _Hull(vertices[used], surface)
+            part = vertices[used], renumbered.reshape(-1, 3)
+            heapq.heappush(queue, (-hull.protrusion, next(numbers), hull, *part))
+
+    for group in groups:
+        add_part(vertices, group)
+    while queue and len(queue) + len(finished) < _MAX_PARTS:
+        *_, hull, vertices, faces = heapq.heappop(queue)
+        plane = _find_cut(vertices, faces) if hull.protrusion > limit else None
+        if plane is None:
+            finished.append(hull)
+        else:
+            for part in _clip(vertices, faces, *plane):
+                add_part(*part)
+    return finished + [hull for *_, hull, _, _ in queue]
+
+
+def _clip(
+    vertices: Floats, faces: Ints, normal: Floats, offset: float
+) -> Iterator[tuple[Floats, Ints]]:
+    """Yield the triangles in a plane, below and above it; those across it are divided."""
+    import trimesh
+
+    heights = _measure_heights(vertices, normal, offset)
+    in_plane = (heights[faces] == 0.0).all(axis=1)
+    yield vertices, faces[in_plane]
+    others = faces[~in_plane]
+    for sign in (-1.0, 1.0):
+        yield trimesh.intersections.slice_faces_plane(
+            vertices, others, sign * normal, offset * normal, cached_dots=sign * heights
+        )[:2]
+
+
+def _measure_heights(vertices: Floats, normal: Floats, offset: float) -> Floats:
+    """Return the heights of vertices above a plane, shape (n,) [m]; small ones become 0."""
+    heights = vertices @ normal - offset
+    return np.where(np.abs(heights) < _SNAP, 0.0, heights)
+
+
+def _find_cut(vertices: Floats, faces: Ints) -> tuple[Floats, float] | None:
+    """Return the normal and offset of the plane that divides a part best, or None.
+
+    That is the plane that reduces the volume of the hulls most. Several cuts may be needed before
+    the volume falls, since the hull of half a ring is half a disc: planes of large facets, and to
+    a lesser degree those through the middle, are preferred.
+    """
+    vertices, faces = _coarsen(vertices, faces)
+    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    flatness = _FLATNESS if thicken(vertices, _FLATNESS)[1] else 0.0
+    whole = _compute_hull_volume(vertices, flatness)
+    best, chosen = -np.inf, None
+    for normal, offset, bonus in _list_planes(vertices, faces):
+        heights = _measure_heights(vertices, normal, offset)
+        ends = heights[edges]
+        across = (ends.min(axis=1) < 0.0) & (ends.max(axis=1) > 0.0)
+        share = (ends[across, 0] / (ends[across, 0] - ends[across, 1]))[:, None]
+        start, end = vertices[edges[across]].transpose(1, 0, 2)
+        crossings = start + share * (end - start)
+        volumes, sides = 0.0, int((heights[faces] == 0.0).all(axis=1).any())
+        for above in (-heights, heights):
+            used = np.unique(faces[(above[faces] > 0.0).any(axis=1)])
+            used = used[above[used] >= 0.0]
+            sides += len(used) > 0
+            volumes += _compute_hull_volume(np.vstack([vertices[used], crossings]), flatness)
+        value = (whole - volumes) / whole + bonus
+        if sides > 1 and value > best:
+            best, chosen = value, (normal, offset)
+    return chosen
+
+
+def _list_planes(vertices: Floats, faces: Ints) -> Iterator[tuple[Floats, float, float]]:
+    """Yield normals, offsets and bonuses of planes through large facets and across the axes."""
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.linalg.norm(normals, axis=1)
+    has_area = areas > 0.0
+    if not has_area.any():
+        return
+    corners, areas = corners[has_area], areas[has_area]
+    normals = normals[has_area] / areas[:, None]
+    largest = np.abs(normals).argmax(axis=1)
+    normals *= np.sign(normals[np.arange(len(normals)), largest])[:, None]
+    offsets = np.einsum("ij,ij->i", normals, corners[:, 0])
+    extent = float(np.ptp(vertices, axis=0).max())
+    planes = np.column_stack([normals, offsets])
+    _, group = np.unique((planes / (1, 1, 1, extent)).round(3), axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    facets = np.bincount(group, areas)
+    sums = [np.bincount(group, areas * column) for column in planes.T]
+    means = np.asarray(np.column_stack(sums), float)
+    means = means / np.linalg.norm(means[:, :3], axis=1, keepdims=True)
+    for k in np.argsort(-facets, kind="stable")[:_FACET_PLANES]:
+        if facets[k] > _MIN_FACET * areas.sum():
+            yield means[k, :3], float(means[k, 3]), _FACET_BONUS * float(facets[k] / areas.sum())
+    for axis in np.vstack([np.eye(3), np.linalg.eigh(np.cov(vertices.T))[1].T]):
+        along = vertices @ axis
+        low, high = along.min(), along.max()
+        for place in np.linspace(low, high, _AXIS_PLANES + 2)[1:-1]:
+            rank = (high - low) / extent - 3.0 * abs(place - (low + high) / 2.0) / extent
+            yield axis, float(place), 0.01 * float(rank)
+
+
+def _coarsen(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
+    """Return at most `_MAX_TRIANGLES` triangles between vertices of a mesh.
+
+    In each cell of a grid, the vertex at the sharpest corner stands for all, so that facets stay in
+    their planes.
+    """
+    import trimesh
+
+    if len(faces) <= _MAX_TRIANGLES:
+        return vertices, faces
+    normals = np.zeros((len(faces), 3))
+    found, has_area = trimesh.triangles.normals(vertices[faces])
+    normals[has_area] = found
+    total = np.zeros_like(vertices)
+    np.add.at(total, faces, normals[:, None])
+    counts = np.bincount(faces.ravel(), minlength=len(vertices))
+    order = np.argsort(np.linalg.norm(total, axis=1) / np.maximum(counts, 1), kind="stable")
+    cell, kept = float(np.ptp(vertices, axis=0).max()) / 64.0, faces
+    while len(kept) > _MAX_TRIANGLES:
+        cells = np.floor(vertices[order] / cell).astype(np.int64)
+        _, first, group = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+        representative = np.empty(len(vertices), int)
+        representative[order] = order[first][group.reshape(-1)]
+        kept = np.unique(np.sort(representative[faces], axis=1), axis=0)
+        kept = kept[(kept[:, 0] < kept[:, 1]) & (kept[:, 1] < kept[:, 2])]
+        cell *= 1.4
+    used, kept = np.unique(kept, return_inverse=True)
+    return vertices[used], kept.reshape(-1, 3)
+
+
+def _compute_hull_volume(points: Floats, flatness: float = 0.0) -> float:
+    """Return the volume of the convex hull of points [m³]; 0 if they are flat.
+
+    With a `flatness` [m], see `thicken`, it is the volume of the plate around them.
+    """
     from scipy.spatial import ConvexHull, QhullError
 
+    if len(points) and flatness:
+        points = thicken(points, flatness)[0]
     try:
         return float(ConvexHull(points).volume) if len(points) > 3 else 0.0
-    except (QhullError, ValueError):
+    except QhullError:
         return 0.0
+
+
+def _merge_hulls(
+    hulls: Sequence[_Hull], unite: Callable[[_Hull, _Hull], _Hull], limit: float, least: int
+) -> list[_Hull]:
+    """Merge pairs whose common hull protrudes least, until `least` are left.
+
+    No result protrudes by more than `limit` [m].
+    """
+    if len(hulls) <= least:
+        return list(hulls)
+    left = dict(enumerate(hulls))
+    numbers = itertools.count(len(left))
+    slack = _CUT_SHARE * limit if np.isfinite(limit) else 0.0
+    queue = list[tuple[float, int, int, _Hull]]()
+
+    def add_pair(i: int, j: int) -> None:
+        low, high = left[i].bounds, left[j].bounds
+        # Between parts that are further apart, the hull would protrude more.
+        if max((low[0] - high[1]).max(), (high[0] - low[1]).max()) <= 2.0 * limit:
+            union = unite(left[i], left[j])
+            if union.protrusion <= limit:
+                # Among those that protrude little, small ones come first.
+                size = float(np.linalg.norm(np.ptp(union.bounds, axis=0)))
+                added = max(union.volume - left[i].volume - left[j].volume, 0.0) / union.area
+                cost = max(union.protrusion - slack, 0.0) + _SIZE_COST * size + _VOLUME_COST * added
+                heapq.heappush(queue, (cost, i, j, union))
+
+    for i, j in itertools.combinations(left, 2):
+        add_pair(i, j)
+    while queue and len(left) > least:
+        _, i, j, union = heapq.heappop(queue)
+        if i in left and j in left:
+            del left[i], left[j]
+            left[k := next(numbers)] = union
+            for other in left:
+                if other != k:
+                    add_pair(other, k)
+    return list(left.values())

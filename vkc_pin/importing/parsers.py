@@ -1,4 +1,4 @@
-"""Calls xacro and CoACD in a child process.
+"""Calls xacro in a child process.
 
 This module imports little, since the child process imports it.
 """
@@ -14,12 +14,11 @@ from types import ModuleType
 from typing import Any
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.isolation import run_isolated
 from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.files.resources import find_package
 
-__all__ = ["cut_mesh", "expand_xacro"]
+__all__ = ["expand_xacro"]
 
 _FIND = re.compile(r"\$\(find\s+([^\s()$]+)\s*\)")  # NAME in $(find NAME)
 
@@ -110,30 +109,3 @@ def _check_packages(
             expected="folders around the file with these names, or with a package.xml that states "
             "them; or state their folders (packages, --package NAME=FOLDER)",
         )
-
-
-def cut_mesh(vertices: Floats, faces: Ints, file: Path | None, **settings: Any) -> list[Floats]:
-    """Return the vertices of the convex parts into which CoACD cuts a closed mesh.
-
-    Args:
-        vertices: Shape (n, 3) [m].
-        faces: Shape (m, 3).
-        file: File of the mesh, for messages.
-        **settings: Those of `coacd.run_coacd`.
-
-    Raises:
-        InputError: CoACD is not installed, or fails.
-    """
-    import_optional(
-        "coacd", "import", purpose="cutting a concave mesh into convex pieces", file=file
-    )
-    return run_isolated(
-        _run_coacd, vertices, faces, settings, program="CoACD", file=file, patience=5.0
-    )
-
-
-def _run_coacd(vertices: Floats, faces: Ints, settings: Mapping[str, Any]) -> list[Floats]:
-    import coacd
-
-    coacd.set_log_level("off")
-    return [part for part, _ in coacd.run_coacd(coacd.Mesh(vertices, faces), **settings)]

@@ -50,10 +50,9 @@ def run_isolated(
     *arguments: Any,
     program: str,
     file: str | Path | None = None,
-    patience: float = 1.0,
 ) -> T:
     """Return the result of a function that runs in a child process; see `submit_isolated`."""
-    return submit_isolated(function, *arguments, program=program, file=file, patience=patience)()
+    return submit_isolated(function, *arguments, program=program, file=file)()
 
 
 def submit_isolated(
@@ -61,7 +60,6 @@ def submit_isolated(
     *arguments: Any,
     program: str,
     file: str | Path | None = None,
-    patience: float = 1.0,
 ) -> Callable[[], T]:
     """Start a function in the child process of this thread, and return one that waits for it.
 
@@ -72,14 +70,13 @@ def submit_isolated(
         *arguments: Its arguments. They, its result and its exceptions must be picklable.
         program: Name of the program that parses, for messages: "MuJoCo".
         file: File that is parsed, for messages.
-        patience: Factor of the time limit.
 
     Raises:
         InputError: The program crashes or exceeds a limit.
     """
     if not has_python():
         return lambda: function(*arguments)
-    child, seconds = _get_child(), patience * _read_limit(TIME_VARIABLE)
+    child, seconds = _get_child(), _read_limit(TIME_VARIABLE)
     child.submit((function, arguments, seconds))
     return lambda: child.receive(program, file, seconds)
 

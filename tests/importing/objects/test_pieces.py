@@ -75,7 +75,7 @@ def test_repeated_mesh_is_decomposed_once(tmp_path: Path) -> None:
             decompose_links(description, load_surfaces(description), known).links["twins"].collision
         )
     assert len(known) == 1
-    (cut,) = known.values()
+    (cut,) = (pieces.meshes for pieces in known.values())
     assert len(found[0]) == len(found[1]) == len(cut) > 1
     for at, pieces in zip(places, found, strict=True):
         for part, piece in zip(pieces, cut, strict=True):

@@ -46,16 +46,17 @@ def test_pieces_replace_meshes_and_visuals_are_copied(file: Path, tmp_path: Path
     root, pieces, notes = write_meshes(read_urdf(file), folder, most_pieces=4)
     (folder / "r.urdf").write_bytes(ElementTree.tostring(root))
     shapes = read_urdf(folder / "r.urdf").read_shapes("collision")
-    assert [shape.kind for shape in shapes] == ["box", "mesh", "mesh"]
+    assert [shape.kind for shape in shapes] == ["box", "mesh", "mesh", "mesh"]
     before = next(
         shape
         for shape in read_urdf(file).read_shapes("collision")
         if shape.file and shape.file.name == "angle.stl"
     ).make_mesh()
-    after = trimesh.util.concatenate([shape.make_mesh() for shape in shapes[1:]])
+    after = trimesh.util.concatenate([shape.make_mesh() for shape in shapes[1:3]])
     assert after.bounds == pytest.approx(before.bounds)
     assert after.volume == pytest.approx(before.volume, rel=1e-5)
-    (piece,) = pieces
+    piece, plate = pieces
+    assert (plate.mesh, plate.count) == ("sheet.stl", 1)
     assert (piece.link, piece.count) == ("a", 2)
     assert piece.hull > 1.0 > 0.05 > abs(piece.overhead)
     assert any("sheet.stl is flat" in note for note in notes)

@@ -10,18 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.importing.convex import (
-    ERROR,
-    THICKNESS,
-    compute_concavity,
-    decompose,
-    is_flat,
-    measure_outside,
-    thicken,
-)
+from vkc_pin.importing.convex import ERROR, Pieces, decompose, is_flat, measure_outside
 from vkc_pin.importing.objects.clean_up import Surfaces
 from vkc_pin.importing.objects.description import Description, Link, Part
-from vkc_pin.world.files.hulls import compute_hull
+from vkc_pin.world.files.hulls import SHEET_THICKNESS
 
 if TYPE_CHECKING:
     import trimesh
@@ -33,7 +25,7 @@ _FINE = 0.006
 _INSIDE = 1e-3  # [m] largest protrusion of a piece that counts as inside another
 
 
-PieceCache = dict[tuple[Path | None, tuple[float, ...], float], "Sequence[trimesh.Trimesh]"]
+PieceCache = dict[tuple[Path | None, tuple[float, ...], float], Pieces]
 """Cache of the pieces of mesh files, in the mesh's frame, by file, scale and error [m]."""
 
 
@@ -42,7 +34,8 @@ def decompose_links(
 ) -> Description:
     """Return the object with convex collision geometry only.
 
-    Notes name flat shapes, and links that collide with their visual shapes.
+    Notes name flat shapes, pieces that protrude far, and links that collide with their visual
+    shapes.
     """
     notes, links = list(description.notes), dict[str, Link]()
     for name, link in description.links.items():
@@ -53,13 +46,13 @@ def decompose_links(
             if part.kind != "mesh":
                 solids.append(part)
                 continue
-            if is_flat(mesh.vertices):
-                flat_parts.append(part.name or "a mesh")
-            pieces = (
-                _make_convex(mesh, error)
-                if cache is None or part.file is None
-                else _find_cached_pieces(part, error, cache)
-            )
+            title = part.name or (part.file.name if part.file else "a mesh")
+            if is_flat(mesh):
+                flat_parts.append(title)
+            pieces, protrusion = _decompose_part(part, mesh, error, cache)
+            if protrusion > error:
+                far = f"protrude by up to {1e3 * protrusion:.0f} mm (aim: {1e3 * error:g} mm)"
+                notes.append(f"link '{name}': the convex pieces of {title} {far}")
             solids += [
                 Part(
                     name=part.name,
@@ -73,7 +66,7 @@ def decompose_links(
             ]
         if flat_parts:
             names = ", ".join(dict.fromkeys(flat_parts))
-            made = f"flat shapes were made {1e3 * THICKNESS:g} mm thick"
+            made = f"flat shapes were made {1e3 * SHEET_THICKNESS:g} mm thick"
             notes.append(f"link '{name}': {made}: {names}")
         if link.visual and not link.collision:
             notes.append(f"link '{name}' has no collision geometry: its visual geometry is used")
@@ -83,23 +76,19 @@ def decompose_links(
     return dataclasses.replace(description, links=links, notes=tuple(notes))
 
 
-def _find_cached_pieces(part: Part, error: float, cache: PieceCache) -> Sequence[trimesh.Trimesh]:
-    """Return the convex pieces of a mesh file, in the frame of its link."""
+def _decompose_part(
+    part: Part, mesh: trimesh.Trimesh, error: float, cache: PieceCache | None
+) -> tuple[Sequence[trimesh.Trimesh], float]:
+    """Return the convex pieces of a mesh in the frame of its link, and their protrusion [m]."""
+    if cache is None or part.file is None:
+        pieces = decompose(mesh, error=error)
+        return pieces.meshes, pieces.error
     key = (part.file, part.size, error)
     if key not in cache:
-        cache[key] = _make_convex(
-            dataclasses.replace(part, placement=pin.SE3.Identity()).make_mesh(), error
-        )
-    return [piece.copy().apply_transform(part.placement.homogeneous) for piece in cache[key]]
-
-
-def _make_convex(mesh: trimesh.Trimesh, error: float) -> Sequence[trimesh.Trimesh]:
-    """Return convex pieces that contain a mesh."""
-    if is_flat(mesh.vertices):
-        return [compute_hull(thicken(np.asarray(mesh.vertices)))]
-    if compute_concavity(mesh) <= error:  # cheaper than `decompose`
-        return [compute_hull(mesh.vertices)]
-    return decompose(mesh, error=error).meshes
+        there = dataclasses.replace(part, placement=pin.SE3.Identity())
+        cache[key] = decompose(there.make_mesh(), error=error)
+    found, placement = cache[key], part.placement.homogeneous
+    return [piece.copy().apply_transform(placement) for piece in found.meshes], found.error
 
 
 def _remove_inner(parts: list[Part]) -> list[Part]:

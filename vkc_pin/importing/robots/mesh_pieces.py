@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.convex import Pieces, decompose
-from vkc_pin.world.files.hulls import compute_hull
+from vkc_pin.importing.convex import Pieces, decompose, is_flat
+from vkc_pin.world.files.hulls import SHEET_THICKNESS
 from vkc_pin.world.files.meshes import load_mesh
 from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.world.files.urdf import UrdfFile, UrdfShape
@@ -47,15 +47,15 @@ class Piece:
 
 
 def write_meshes(
-    file: UrdfFile, folder: Path, *, most_pieces: int
+    file: UrdfFile, folder: Path, *, most_pieces: int | None
 ) -> tuple[ElementTree.Element, list[Piece], list[str]]:
     """Write the meshes of a URDF into `folder`; return the URDF, the decompositions and notes.
 
     Collision meshes are written as convex pieces, `collision/<link>_<k>.stl`; visual meshes are
     copied into `visual`. `choose_file_names` chooses the names.
 
-    Links without collision shapes collide with their visual shapes. Flat collision meshes, and
-    visual meshes that cannot be read, are left out.
+    Links without collision shapes collide with their visual shapes. Visual meshes that cannot be
+    read are left out. Notes name them, flat meshes, and pieces that protrude far.
     """
     root = copy.deepcopy(file.root)
     links = {link.get("name", ""): link for link in root.findall("link")}
@@ -64,8 +64,7 @@ def write_meshes(
     shapes: dict[str, list[UrdfShape]] = {}
     for shape in file.read_shapes("collision"):
         shapes.setdefault(shape.link, []).append(shape)
-    # Pieces and hull volume by mesh file and scale
-    done: dict[tuple[Path, tuple[float, ...]], tuple[Pieces, float]] = {}
+    done: dict[tuple[Path, tuple[float, ...]], Pieces] = {}  # by mesh file and scale
     for name, link in links.items():
         elements = link.findall("collision")
         written = 0
@@ -75,29 +74,27 @@ def write_meshes(
             place = list(link).index(element)
             link.remove(element)
             key = shape.file, shape.size
-            try:
-                if key not in done:
-                    mesh = load_mesh(shape.file, shape.size)
-                    error = min(_MAX_ERROR, _MAX_RELATIVE_ERROR * float(mesh.extents.max()))
-                    pieces = decompose(
-                        mesh, most_pieces=most_pieces, error=error, overhead=_MAX_OVERHEAD
-                    )
-                    done[key] = pieces, float(compute_hull(mesh.vertices).volume)
-            except InputError as error_:
-                if "flat" not in error_.problem:
-                    raise
-                notes.append(
-                    f"{name}: {shape.file.name} is flat and was removed from the collision geometry"
+            if key not in done:
+                mesh = load_mesh(shape.file, shape.size)
+                error = min(_MAX_ERROR, _MAX_RELATIVE_ERROR * float(mesh.extents.max()))
+                done[key] = decompose(
+                    mesh, most_pieces=most_pieces, error=error, overhead=_MAX_OVERHEAD
                 )
-                continue
-            pieces, hull = done[key]
+                title, protrusion = f"{name}: {shape.file.name}", 1e3 * done[key].error
+                if is_flat(mesh):
+                    thickness = f"{1e3 * SHEET_THICKNESS:g} mm thick"
+                    notes.append(f"{title} is flat: it collides as a plate, {thickness}")
+                if done[key].error > error:
+                    aim = f"(aim: {1e3 * error:.0f} mm)"
+                    notes.append(f"{title}: its pieces protrude by up to {protrusion:.0f} mm {aim}")
+            pieces = done[key]
             decompositions.append(
                 Piece(
                     name,
                     shape.file.name,
                     len(pieces.meshes),
                     pieces.overhead,
-                    hull / pieces.solid - 1.0,
+                    pieces.hull_volume / pieces.solid - 1.0,
                     pieces.error,
                 )
             )

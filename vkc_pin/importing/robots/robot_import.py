@@ -61,7 +61,7 @@ __all__ = ["PICTURE", "ImportedRobot", "import_robot"]
 
 PICTURE = "robot.png"
 """File name of a robot's picture."""
-_SAMPLES, _PIECES = 2000, 8
+_SAMPLES = 2000
 # Samples, and the smallest fraction of them in which a pair of neighbours is close
 _NEAR, _MOSTLY = 300, 0.75
 # [m] Distance up to which links are neighbours by design, such as the segments of a telescope
@@ -101,7 +101,7 @@ def import_robot(  # noqa: PLR0913 - keyword options of a public call
     srdf: str | Path | None = None,
     packages: Mapping[str, str | Path] | None = None,
     arguments: Mapping[str, str] | None = None,
-    most_pieces: int = _PIECES,
+    most_pieces: int | None = None,
     samples: int = _SAMPLES,
     seed: int = 0,
     force: bool = False,
@@ -124,7 +124,8 @@ def import_robot(  # noqa: PLR0913 - keyword options of a public call
         packages: Folders for `package://` and `$(find ...)`; others are searched for around the
             file.
         arguments: Arguments of a xacro file.
-        most_pieces: Largest number of convex pieces of a mesh; 1 keeps hulls.
+        most_pieces: Largest number of convex pieces of a mesh; 1 keeps hulls. Defaults to 12, and
+            to 48 where fewer would fill a cavity.
         samples: Number of configurations for finding pairs that need no check.
         seed: Random seed.
         force: Whether to replace a folder that an earlier import wrote.
@@ -140,7 +141,8 @@ def import_robot(  # noqa: PLR0913 - keyword options of a public call
     for field, given in (("arm", arm), ("tool_frame", tool_frame)):
         if given is not None:
             check_text(given, field, "a name")
-    check_integer(most_pieces, "most_pieces", low=1, high=1000)
+    if most_pieces is not None:
+        check_integer(most_pieces, "most_pieces", low=1, high=1000)
     check_integer(samples, "samples", low=1, high=1_000_000)
     places = {
         key: check_path(place, f"packages.{key}")
@@ -178,7 +180,12 @@ class _Importer:
         ]
 
     def run(
-        self, arm: str | None, tool_frame: str | None, most_pieces: int, samples: int, seed: int
+        self,
+        arm: str | None,
+        tool_frame: str | None,
+        most_pieces: int | None,
+        samples: int,
+        seed: int,
     ) -> ImportedRobot:
         """Write all files into the folder."""
         solid = {shape.link for shape in self._file.read_shapes("collision")}

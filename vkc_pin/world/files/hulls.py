@@ -28,17 +28,17 @@ _NUM_DIRECTIONS = 400  # of cuts, spread over the sphere
 _QHULL_OPTIONS = ("QbB Pp Qt", "Pp Qt", "Pp QJ")
 
 
-def thicken(points: ArrayLike) -> tuple[Floats, bool]:
+def thicken(points: ArrayLike, flatness: float = 0.0) -> tuple[Floats, bool]:
     """Return points that span a volume, and whether the given ones, shape (n, 3) [m], do not.
 
     A plane set becomes a plate around it, a line a square bar, a point a cube, all with thickness
-    `SHEET_THICKNESS`.
+    `SHEET_THICKNESS`. So do sets thinner than `flatness` [m].
     """
     given = np.asarray(points, float)
     around = given - given.mean(axis=0)
     axes = np.linalg.eigh(around.T @ around)[1].T
     extents = np.ptp(around @ axes.T, axis=0)
-    (flat,) = np.nonzero(extents <= _FLATNESS_RATIO * extents.max())
+    (flat,) = np.nonzero(extents <= max(_FLATNESS_RATIO * extents.max(), flatness))
     found = given
     for axis in axes[flat]:
         found = np.concatenate(

@@ -35,6 +35,7 @@ from vkc_pin.utils.budget import (
     STOP_STATUSES,
     BudgetExhaustedError,
     count_evaluations,
+    enforce_share,
     record_evaluations,
     reserve_time,
     suspend_budget,
@@ -206,6 +207,7 @@ class _Search:
                 and not solution.shortfall
             ):
                 return self._best, solution.status
+            enforce_share()  # where the first guess suffices, it may use the whole budget
             record_evaluations()
             if is_search and self._find_proofs(problem):
                 break

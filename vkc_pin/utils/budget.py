@@ -20,6 +20,7 @@ __all__ = [
     "StopStatus",
     "count_evaluations",
     "current_ending",
+    "enforce_share",
     "record_evaluations",
     "reserve_time",
     "share_budget",
@@ -51,6 +52,7 @@ class Budget:
 
     Attributes:
         limits: Deadline as a value of `time.perf_counter()` [s], and number of evaluations.
+        share: Limits of the present attempt; see `share_budget`.
         is_interrupted: Whether Ctrl-C was pressed.
         evaluations: Evaluations so far.
         reserved: Purpose → time reserved at the end [s].
@@ -59,6 +61,7 @@ class Budget:
     def __init__(self, seconds: float | None = None, max_evaluations: int | None = None) -> None:
         deadline = math.inf if seconds is None else time.perf_counter() + seconds
         self.limits = deadline, math.inf if max_evaluations is None else max_evaluations
+        self.share = self.limits
         self.is_interrupted, self.evaluations = False, 0
         self.reserved: dict[str, float] = {}
 
@@ -70,18 +73,20 @@ class Budget:
         deadline, max_evaluations = self.limits
         if self.evaluations > max_evaluations:
             return "evaluation limit"
-        late = time.perf_counter() + sum(self.reserved.values()) > deadline
-        return "time limit" if late else ""
+        return "time limit" if self.end_time > deadline else ""
+
+    @property
+    def end_time(self) -> float:
+        """Time at which planning would end if it stopped now [s]."""
+        return time.perf_counter() + sum(self.reserved.values())
 
     def divide(self, count: int) -> tuple[float, float]:
-        """Divide what is left by a number, and return the limits before."""
-        before = deadline, max_evaluations = self.limits
-        start = time.perf_counter() + sum(self.reserved.values())
-        self.limits = (
+        """Return the limits of an equal share of what is left."""
+        (deadline, max_evaluations), start = self.limits, self.end_time
+        return (
             start + max(0.0, deadline - start) / count,
             self.evaluations + (max_evaluations - self.evaluations) / count,
         )
-        return before
 
     @contextlib.contextmanager
     def activate(self) -> Iterator[Budget]:
@@ -150,18 +155,29 @@ def reserve_time(purpose: str, seconds: float, *, default: bool = False) -> None
 
 @contextlib.contextmanager
 def share_budget(count: int) -> Iterator[None]:
-    """Limit this thread to an equal share of what is left of its budget.
+    """Give this attempt an equal share of what is left of this thread's budget.
+
+    The share ends nothing until the attempt calls `enforce_share`.
 
     Args:
         count: Number of attempts that the rest of the budget is for, this one included.
     """
     budget = _ACTIVE.get()
-    limits = budget.divide(count) if budget is not None else None
+    if budget is None:
+        yield
+        return
+    before, budget.share = (budget.limits, budget.share), budget.divide(count)
     try:
         yield
     finally:
-        if budget is not None and limits is not None:
-            budget.limits = limits
+        budget.limits, budget.share = before
+
+
+def enforce_share() -> None:
+    """Limit the present attempt to its share of the budget; see `share_budget`."""
+    budget = _ACTIVE.get()
+    if budget is not None:
+        budget.limits = budget.share
 
 
 @contextlib.contextmanager

@@ -27,6 +27,13 @@ SMOOTH = """<robot name="smooth"><link name="frame"/>
 <parent link="frame"/><child link="block"/><origin xyz="0 0 0.5"/><axis xyz="-1 0 0"/>
 <limit lower="0" upper="0.3" effort="1" velocity="1"/></joint></robot>"""
 
+# No hand can hold this or push it about its axis.
+SPHERE = """<robot name="smooth"><link name="frame"/>
+<link name="ball"><collision><geometry><sphere radius="0.2"/></geometry></collision></link>
+<joint name="spin" type="revolute">
+<parent link="frame"/><child link="ball"/><origin xyz="0 0 0.5"/><axis xyz="0 0 1"/>
+<limit lower="0" upper="1" effort="1" velocity="1"/></joint></robot>"""
+
 
 @pytest.fixture(scope="module")
 def husky() -> vkc.Robot:
@@ -110,9 +117,9 @@ def _write_object(path: Path, **more: Any) -> str:
 
 
 def test_object_without_a_grasp_is_unreachable(husky: vkc.Robot, tmp_path: Path) -> None:
-    found = make_pair(husky, "husky_ur5e", _write_object(tmp_path / "smooth.yaml"))
+    found = make_pair(husky, "husky_ur5e", _write_object(tmp_path / "smooth.yaml", urdf=SPHERE))
     assert found.step is None
-    assert found.because.startswith("slide: nothing of it fits between the fingers")
+    assert found.because.startswith("spin: nothing of it fits between the fingers")
 
 
 def test_robot_without_a_hand_has_no_step() -> None:

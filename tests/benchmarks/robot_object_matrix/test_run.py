@@ -18,9 +18,9 @@ def test_bench_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     slide = vkc.load_object(description)
     urdf = (
         '<robot name="smooth"><link name="frame"/>'
-        '<link name="block"><collision><geometry><box size="0.4 0.4 0.4"/></geometry></collision>'
-        '</link><joint name="slide" type="prismatic">'
-        '<parent link="frame"/><child link="block"/><axis xyz="-1 0 0"/>'
+        '<link name="ball"><collision><geometry><sphere radius="0.2"/></geometry></collision>'
+        '</link><joint name="spin" type="revolute">'
+        '<parent link="frame"/><child link="ball"/><axis xyz="0 0 1"/>'
         '<limit lower="0" upper="0.3" effort="1" velocity="1"/></joint></robot>'
     )
     smooth = vkc.procedural.write_object(

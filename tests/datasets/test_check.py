@@ -49,6 +49,7 @@ def test_changed_motion_is_invalid(copy: Path) -> None:
     assert str(number) in str(found)
 
 
+@pytest.mark.long
 def test_added_obstacle_makes_the_episode_invalid(copy: Path) -> None:
     """The check builds the scenes from the files: it does not believe what planning saw."""
     episode = next(Dataset.open(copy).episodes())
@@ -222,6 +223,7 @@ def test_parts_of_a_shard_follow_from_its_episodes(
     assert expected in found
 
 
+@pytest.mark.long
 def test_damaged_files_do_not_end_the_check(copy: Path) -> None:
     other = copy / "shards" / "tiago" / "shard-00000.hdf5"
     other.parent.mkdir()

@@ -60,6 +60,7 @@ def test_jobs_do_not_affect_the_dataset(made: Dataset, tmp_path: Path) -> None:
     assert read_contents(other.folder) == read_contents(made.folder)
 
 
+@pytest.mark.long
 def test_dataset_is_extended(made: Dataset, tmp_path: Path) -> None:
     """What was made is not made again, and becomes what it would have been at once."""
     generate(SMALL, 2, tmp_path / "out")
@@ -88,6 +89,7 @@ def test_removed_files_are_made_again(made: Dataset, tmp_path: Path, removed: st
 
 
 @pytest.mark.filterwarnings("ignore:.*made again")
+@pytest.mark.long
 def test_damaged_files_are_made_again(made: Dataset, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     shutil.copytree(made.folder, folder)
@@ -173,6 +175,7 @@ def test_files_in_place_of_folders_are_named(made: Dataset, tmp_path: Path, name
     assert caught.value.file == tmp_path / name
 
 
+@pytest.mark.long
 def test_stopped_generation_is_resumed(made: Dataset, tmp_path: Path) -> None:
     script = (
         f"from vkc_pin.datasets.generation import generate; generate({SMALL!r}, {EPISODES}, 'out')"

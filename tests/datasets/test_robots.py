@@ -14,6 +14,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.world.models.robot_file import find_robot, load_robot
 
 
+@pytest.mark.long
 def test_robot_without_a_hand_is_imported_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -203,7 +203,22 @@ def check_contract(mesh: Triangles, pieces: Pieces) -> None:
         assert measure_distances(mesh, points).max(initial=0.0) < pieces.error + 2e-3
 
 
-@pytest.mark.parametrize("kind", ZOO)
+LONG = (
+    "bowl",
+    "cup of sheet",
+    "dense L",
+    "dense sheets",
+    "links of a chain",
+    "many shelves",
+    "tube",
+    "turned L",
+)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(kind, marks=pytest.mark.long) if kind in LONG else kind for kind in ZOO],
+)
 def test_pieces_contain_the_mesh_and_leave_cavities_free(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

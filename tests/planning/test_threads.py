@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
 
 PROGRAM = """
@@ -40,6 +42,7 @@ print("done")
 """
 
 
+@pytest.mark.long
 def test_eight_threads_with_shared_and_own_planners() -> None:
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM],

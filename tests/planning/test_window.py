@@ -147,6 +147,7 @@ def compute_weighted_length(plan: vkc.Plan) -> float:
 
 
 @pytest.mark.parametrize("start", [5])
+@pytest.mark.long
 def test_window_shortens_the_path(start: int) -> None:
     """The best grasp of the stick depends on the target of its tip."""
     scene = vkc.load_scene("init_1").sample_start(np.random.default_rng(start))

@@ -14,6 +14,7 @@ from vkc_pin.simulation import snapshots
 from vkc_pin.simulation.snapshots import RenderedScene
 
 
+@pytest.mark.long
 def test_snapshots_differ_where_objects_move(tmp_path: Path) -> None:
     result = simulate_drawer()
     stage = RenderedScene(result)

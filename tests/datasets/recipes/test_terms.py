@@ -76,6 +76,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return generate(RECIPE, 3, tmp_path_factory.mktemp("made") / "out", terms=[make_height_limit()])
 
 
+@pytest.mark.long
 def test_episodes_satisfy_their_terms(made: Dataset) -> None:
     assert [entry.type for entry in made.recipe.fields.terms] == ["speed", "traced"]
     for episode in made.episodes():

@@ -476,6 +476,7 @@ def test_models_are_included_in_models(folder: Path, version: str) -> None:
         np.testing.assert_allclose(found.compute_placements()[name].translation, place, atol=1e-9)
 
 
+@pytest.mark.long
 def test_models_that_multiply_are_refused(tmp_path: Path) -> None:
     for k in range(14):
         inner = "".join(

@@ -197,6 +197,7 @@ def test_invalid_robots_are_named(tmp_path: Path, text: str, said: str) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.long
 def test_telescope_is_proposed_as_one_coordinate(tmp_path: Path) -> None:
     """Nothing is proposed if the file states it."""
     for mimics, told in (("", True), ("chain", False)):

@@ -98,6 +98,7 @@ def find(
 @given(st.integers(0, 2**32 - 1))
 @example(280)  # a drive whose ends differ in heading by a rounding error
 @example(955485)  # a move from near the start to near a goal, which in between is near neither
+@pytest.mark.long
 def test_paths_are_collision_free(seed: int) -> None:
     rng = np.random.default_rng(seed)
     standing = [*make_furniture(), *make_clutter(int(rng.integers(10_000)), 12)]

@@ -210,6 +210,7 @@ def sample_placements(kind: str, target: pin.SE3, angle: float) -> list[pin.SE3]
     return [pin.SE3(p.rotation, p.translation + rng.normal(size=3)) for p in placements]
 
 
+@pytest.mark.long
 def test_pose_offsets_leave_no_memory_behind() -> None:
     target, placements = pin.SE3.Random(), [pin.SE3.Random() for _ in range(50)]
     size, objects = measure_growth(lambda: compute_offsets("pose", target, placements))

@@ -95,6 +95,7 @@ def test_compiled_waypoint_functions_are_equal_bit_for_bit(folder: Libraries) ->
     assert folder.list_jobs() == []
 
 
+@pytest.mark.long
 def test_program_is_rebuilt_when_machine_code_is_available(folder: Libraries) -> None:
     short = make_program(load_door_scene(), REACH, options=OPTIONS).transcription
     assert not short.uncompiled_functions

@@ -91,6 +91,7 @@ def changed_scenes(draw: st.DrawFn) -> Scene:
 
 @settings(max_examples=15, deadline=None)
 @given(scene=changed_scenes())
+@pytest.mark.long
 def test_document_describes_the_changed_scene(scene: Scene) -> None:
     again = Scene.from_document(json.loads(json.dumps(scene.document)), scene.folder)
     assert [(one, one.at) for one in again.holds] == [(one, one.at) for one in scene.holds]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from typing import NamedTuple
 
@@ -69,15 +70,19 @@ def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) 
         the first result, with notes on the others.
     """
     # Terms may name phases by their numbers, which grasping anew would change.
-    alternatives = list(generate_alternatives(scene, task, anew=not request.terms))
-    with share_budget(1 + len(alternatives)):
+    alternatives = functools.cache(
+        lambda: tuple(generate_alternatives(scene, task, anew=not request.terms))
+    )
+    with share_budget(lambda: 1 + len(alternatives())):
         first = last = solve_task(scene, task, request)
+    if first.plan.success or first.is_grasp_independent or current_ending():
+        return first
     statistics, notes = [first.plan.statistics], list[str]()
-    for number, (name, steps) in enumerate(alternatives):
-        if last.plan.success or current_ending() or first.is_grasp_independent:
+    for number, (name, steps) in enumerate(alternatives()):
+        if current_ending():
             break
         other = compile_task(scene, steps, request.options)
-        with share_budget(len(alternatives) - number):
+        with share_budget(len(alternatives()) - number):
             last = solve_task(scene, other, request, check_goals_first=True)
         statistics.append(last.plan.statistics)
         if last.plan.success:

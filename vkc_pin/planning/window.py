@@ -160,17 +160,19 @@ class _SlidingWindow:
         number = len(self.decided) + len(self.ahead)
         scene = self.ahead[-1].after if self.ahead else self._current_scene
         task, chosen = self._compile(scene, number, number + 1), self.actions[number]
-        alternatives = list(generate_alternatives(scene, task))
-        with share_budget(1 + len(alternatives)):
+        alternatives = functools.cache(lambda: tuple(generate_alternatives(scene, task)))
+        with share_budget(lambda: 1 + len(alternatives())):
             failed = self._plan_alone(number, scene, task)
-        for k, (_, steps) in enumerate(alternatives):
-            if failed is None or current_ending():
+        if failed is None or current_ending():
+            return failed
+        for k, (_, steps) in enumerate(alternatives()):
+            if current_ending():
                 break
             self.actions[number] = steps
             task = self._compile(scene, number, number + 1)
             other: Plan | None = failed
             if find_shared_coordinate(scene, task.holds) is None:
-                with share_budget(len(alternatives) - k):
+                with share_budget(len(alternatives()) - k):
                     other = self._plan_alone(number, scene, task, check_goals_first=True)
             if other is None:
                 return None

@@ -6,7 +6,7 @@ import contextlib
 import math
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from types import FrameType
 from typing import Literal, get_args
@@ -52,7 +52,7 @@ class Budget:
 
     Attributes:
         limits: Deadline as a value of `time.perf_counter()` [s], and number of evaluations.
-        share: Limits of the present attempt; see `share_budget`.
+        share: Computes the limits of the present attempt; see `share_budget`.
         is_interrupted: Whether Ctrl-C was pressed.
         evaluations: Evaluations so far.
         reserved: Purpose → time reserved at the end [s].
@@ -61,7 +61,7 @@ class Budget:
     def __init__(self, seconds: float | None = None, max_evaluations: int | None = None) -> None:
         deadline = math.inf if seconds is None else time.perf_counter() + seconds
         self.limits = deadline, math.inf if max_evaluations is None else max_evaluations
-        self.share = self.limits
+        self.share: Callable[[], tuple[float, float]] | None = None
         self.is_interrupted, self.evaluations = False, 0
         self.reserved: dict[str, float] = {}
 
@@ -79,14 +79,6 @@ class Budget:
     def end_time(self) -> float:
         """Time at which planning would end if it stopped now [s]."""
         return time.perf_counter() + sum(self.reserved.values())
-
-    def divide(self, count: int) -> tuple[float, float]:
-        """Return the limits of an equal share of what is left."""
-        (deadline, max_evaluations), start = self.limits, self.end_time
-        return (
-            start + max(0.0, deadline - start) / count,
-            self.evaluations + (max_evaluations - self.evaluations) / count,
-        )
 
     @contextlib.contextmanager
     def activate(self) -> Iterator[Budget]:
@@ -154,30 +146,42 @@ def reserve_time(purpose: str, seconds: float, *, default: bool = False) -> None
 
 
 @contextlib.contextmanager
-def share_budget(count: int) -> Iterator[None]:
-    """Give this attempt an equal share of what is left of this thread's budget.
+def share_budget(count: int | Callable[[], int]) -> Iterator[None]:
+    """Give this attempt an equal share of what this thread's budget has left.
 
     The share ends nothing until the attempt calls `enforce_share`.
 
     Args:
-        count: Number of attempts that the rest of the budget is for, this one included.
+        count: Number of attempts that share the budget, this one included. A function is called
+            only when the share of a limited budget is enforced.
     """
     budget = _ACTIVE.get()
     if budget is None:
         yield
         return
-    before, budget.share = (budget.limits, budget.share), budget.divide(count)
+    limits, share = budget.limits, budget.share
+    start = budget.end_time, budget.evaluations
+
+    def divide() -> tuple[float, float]:
+        number = count if isinstance(count, int) else count()
+        deadline, max_evaluations = (
+            first + max(0.0, last - first) / number
+            for first, last in zip(start, limits, strict=True)
+        )
+        return deadline, max_evaluations
+
+    budget.share = divide
     try:
         yield
     finally:
-        budget.limits, budget.share = before
+        budget.limits, budget.share = limits, share
 
 
 def enforce_share() -> None:
     """Limit the present attempt to its share of the budget; see `share_budget`."""
     budget = _ACTIVE.get()
-    if budget is not None:
-        budget.limits = budget.share
+    if budget is not None and budget.share is not None and min(budget.limits) < math.inf:
+        budget.limits = budget.share()
 
 
 @contextlib.contextmanager

@@ -16,6 +16,7 @@ from vkc_pin.importing.objects.clean_up import (
     find_closed_positions,
     load_surfaces,
     move_root,
+    rename,
 )
 from vkc_pin.importing.objects.description import Description, Joint, Link
 from vkc_pin.utils.arrays import Floats
@@ -242,20 +243,7 @@ def _remove_prefix(description: Description, prefix: str) -> Description:
     names = {name: name.removeprefix(prefix) for name in description.links}
     if len(set(names.values())) < len(names):
         return description
-    links = {
-        names[name]: dataclasses.replace(link, name=names[name])
-        for name, link in description.links.items()
-    }
-    joints = {
-        names[child]: dataclasses.replace(
-            joint,
-            name=joint.name.removeprefix(prefix),
-            parent=names[joint.parent],
-            child=names[child],
-        )
-        for child, joint in description.joints.items()
-    }
-    return dataclasses.replace(description, links=links, joints=joints)
+    return rename(description, names, lambda name: name.removeprefix(prefix))
 
 
 def _measure_length(link: Link) -> float:

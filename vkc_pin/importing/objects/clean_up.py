@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +29,7 @@ __all__ = [
     "make_upright",
     "merge_fixed_links",
     "move_root",
+    "rename",
     "rename_for_scenes",
     "scale_object",
 ]
@@ -100,7 +101,20 @@ def choose_name(wanted: str, taken: set[str]) -> str:
 def rename_for_scenes(description: Description) -> Description:
     """Return the object with names of links and joints that scenes and steps accept."""
     links_taken, joints_taken = set[str](), set[str]()
-    names = {name: choose_name(name, links_taken) for name in description.links}
+    links = {name: choose_name(name, links_taken) for name in description.links}
+    return rename(description, links, lambda name: choose_name(name, joints_taken))
+
+
+def rename(
+    description: Description, names: Mapping[str, str], name_joint: Callable[[str], str]
+) -> Description:
+    """Return an object with other names.
+
+    Args:
+        description: The object.
+        names: New name of each link.
+        name_joint: Returns the new name of a joint.
+    """
     links = {
         names[name]: dataclasses.replace(link, name=names[name])
         for name, link in description.links.items()
@@ -108,7 +122,7 @@ def rename_for_scenes(description: Description) -> Description:
     joints = {
         names[child]: dataclasses.replace(
             joint,
-            name=choose_name(joint.name, joints_taken),
+            name=name_joint(joint.name),
             parent=names[joint.parent],
             child=names[child],
         )

@@ -58,7 +58,7 @@ def generate(app: Sphinx) -> None:
     api_pages.write()
 
 
-def find_outdated(
+def find_outdated_pages(
     app: Sphinx, env: BuildEnvironment, added: set[str], changed: set[str], removed: set[str]
 ) -> list[str]:
     """Return the notebooks executed since they were read: the repository has no outputs."""
@@ -148,7 +148,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     os.environ.setdefault("MPLBACKEND", "agg")
     app.connect("builder-inited", generate)
     app.connect("source-read", read)
-    app.connect("env-get-outdated", find_outdated)
+    app.connect("env-get-outdated", find_outdated_pages)
     app.connect("build-finished", films)
     app.connect("autodoc-process-docstring", escape_docstring, priority=400)
     app.connect("autodoc-before-process-signature", reset_signature, priority=900)

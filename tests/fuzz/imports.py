@@ -21,7 +21,7 @@ from vkc_pin.importing.robots.sources import read_source
 from .files import DAE
 from .mutate import corrupt
 
-__all__ = ["FILES", "make_beside", "make_case", "run"]
+__all__ = ["FILES", "make_case", "make_neighbor_files", "run"]
 
 OTHER_XACRO = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><material name="m"/></robot>'
 IMPORTED = 0.1  # the share of cases that are imported as a whole; the others are only read
@@ -39,7 +39,7 @@ FILES = {
 
 
 @functools.cache
-def make_beside() -> dict[str, bytes]:
+def make_neighbor_files() -> dict[str, bytes]:
     """Return the files beside those of `FILES`, by name."""
     box = trimesh.creation.box((0.05, 0.05, 0.2))
     found = {f"part.{kind}": box.export(file_type=kind) for kind in ("stl", "obj")}
@@ -53,7 +53,7 @@ def make_beside() -> dict[str, bytes]:
 def make_case(rng: random.Random) -> dict[str, Any]:
     """Return a case: a file, and files beside it, of which one is changed."""
     name = rng.choice(tuple(FILES))
-    files = {name: FILES[name].encode(), **make_beside()}
+    files = {name: FILES[name].encode(), **make_neighbor_files()}
     file_name = name
     match rng.randrange(8):
         case 0 | 1 | 2:

@@ -71,7 +71,7 @@ def test_valid_input_yields_a_result(worker: Worker) -> None:
     for name, text in imports.FILES.items():
         content = {
             name: text,
-            **{key: data.decode("latin-1") for key, data in imports.make_beside().items()},
+            **{key: data.decode("latin-1") for key, data in imports.make_neighbor_files().items()},
         }
         cases.append(
             ("imports", {"file": name, "kind": Path(name).stem, "content": content, "plan": False})

@@ -186,7 +186,7 @@ def test_sdf_world_is_imported(tmp_path: Path) -> None:
     assert "not static, but with joints, hence fixed in place: chest, other" in done.notes
     assert "2 m of floor lie beyond the sides without walls: -x, -y, +x" in done.notes
     assert done.scene.objects["cup"].placement.translation == pytest.approx([2.2, 1.0, 0.8])
-    # Free floor on the three sides without a wall, around what is there
+    # Free floor on the three sides without a wall, around the furniture
     assert done.scene.arena == pytest.approx((-5.0, 5.0, -1.3 - 2.0, 2.05))
 
 

@@ -102,7 +102,7 @@ class HandClearance:
         return None
 
     def is_hidden(self, tool: pin.SE3) -> bool:
-        """Return whether the object is in the way of a forearm straight behind a hand at `tool`."""
+        """Return whether the object blocks a forearm straight behind a hand at `tool`."""
         arm = coal.Capsule(_ARM_RADIUS, _ARM_LENGTH)
         middle = -(_ARM_START + _ARM_LENGTH / 2.0)
         where = tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, middle]))

@@ -105,7 +105,7 @@ class _Linkage:
         return [dict(zip(self._joints, map(float, state), strict=True)) for state in found]
 
     def _follow(self, rest: Floats, end: float) -> list[Floats]:
-        """Return closed configurations on the way of the driving joint to `end`."""
+        """Return closed configurations on a path of the driving joint to `end`."""
         from scipy.optimize import least_squares
 
         path, before = list[Floats](), rest
@@ -126,7 +126,7 @@ class _Linkage:
         return path
 
     def _measure_gaps(self, state: Floats) -> Floats:
-        """Return how far the loops are from closed [m], and couplings from satisfied."""
+        """Return the errors of the loops [m] and of the couplings."""
         model, data = self._model, self._data
         data.qpos[:] = model.qpos0
         data.qpos[self._addresses] = self._zero + state

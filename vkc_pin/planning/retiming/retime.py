@@ -33,7 +33,7 @@ _MIN_PIECES = 3  # minimum pieces per step; the path velocity is linear in time 
 _MIN_JOINT_STEP = 1e-6  # [m] or [rad], smaller steps of an object's joint count as none
 _MIN_STEP_DURATION = 1e-6  # [s] at full speed; shorter steps count as none
 # With jerk limits the motion stops between a step whose time at full speed is below this share of
-# `jerk_time`, and one that is longer by this factor: a turn on so short a way would slow down all.
+# `jerk_time`, and one that is longer by this factor: a turn on a short path would slow down all.
 _SHORT_STEP, _ABRUPT_RATIO = 0.1, 30.0
 _WAIT_DURATION = 1e-3  # [s], duration of a step without motion, unless a hand opens or closes in it
 _ROUNDING = 1e-9  # relative

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["Approach", "plot_scene"]
 
 _ARROW = 0.35  # [m]
-_MARGIN, _BEYOND = 0.3, 0.1  # [m] around what is drawn, and around labels
+_MARGIN, _BEYOND = 0.3, 0.1  # [m] around the content, and around labels
 _LARGE, _SMALL = 7.0, 2.5  # [inch] longer side of the plan, and smallest length of the other
 _FRAME, _LEGEND = 0.8, 2.6  # [inch] for labels of the axes, and for the legend
 _LETTERS = 40  # in a line of the legend
@@ -128,7 +128,7 @@ def plot_scene(
 
 
 def _fit(figure: Figure, places: Sequence[tuple[float, float]], has_legend: bool) -> None:
-    """Set the limits to what is drawn within the arena, and the figure's size to their ratio."""
+    """Set the limits to the content within the arena, and the figure's size to their ratio."""
     (axes,) = figure.axes
     low, high = np.array(axes.dataLim.min), np.array(axes.dataLim.max)
     arena = np.array([axes.get_xlim(), axes.get_ylim()]).T

@@ -61,6 +61,17 @@ def test_door_behind_a_wall() -> None:
     assert find_violation(plan, "penetration", "– barrier").unit == "m"
 
 
+def test_door_that_opens_less_than_asked_says_how_far() -> None:
+    """The hand on the lever has no room for 1.4 rad between the door and a wall beside it."""
+    scene = add_obstacles(describe_box("beside", (1.2, 0.05, 2.2), (1.85, 0.59, 1.1)))
+    plan = vkc.plan(scene, [vkc.Actuate("door", {"hinge": -1.4}, "handle")], options=QUICK)
+    assert plan.status == "infeasible"
+    report = check_explanation(plan, "because move door.hinge", "– beside", "free configurations")
+    found = float(report.split("were found up to hinge = ")[1].split()[0])
+    assert -1.3 < found < -1.1
+    assert vkc.plan(scene, [vkc.Actuate("door", {"hinge": found})], options=QUICK).success
+
+
 @pytest.mark.parametrize(
     ("joints", "name", "beyond"),
     [({"hinge": 2.0}, "door.hinge", 0.43), ({"knob": -0.5}, "door.knob", 0.5)],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import time
@@ -13,6 +14,7 @@ import numpy as np
 
 from vkc_pin.planning.diagnosis.diagnosis import (
     BlockedGoal,
+    describe_free_range,
     diagnose_goal,
     find_impossible_conditions,
 )
@@ -218,7 +220,7 @@ class _Search:
             if any(goal.is_deep for goal in goals):
                 break
         record_evaluations()
-        return self._explain_failure(problem, [goal.text for goal in goals], is_search=is_search)
+        return self._explain_failure(problem, goals, is_search=is_search)
 
     def _build_problem(self) -> TrajectoryProblem:
         request = self.request
@@ -244,12 +246,13 @@ class _Search:
             self._best = candidate
 
     def _explain_failure(
-        self, problem: TrajectoryProblem, lines: list[str], *, is_search: bool
+        self, problem: TrajectoryProblem, goals: list[BlockedGoal], *, is_search: bool
     ) -> tuple[_Candidate, PlanStatus]:
         """Return the best candidate and the status of a failure, with notes on its causes."""
         if is_search and self._find_proofs(problem):
             best = self._make_stationary(problem)
             return best.with_notes(self._find_proofs(problem)), "infeasible"
+        lines = [self._describe_goal(problem, goal) for goal in goals]
         nearest = self.find_nearest()
         best = nearest or self._make_stationary(problem)
         has_cause = bool(lines) or (nearest is None and bool(self._blocked_phases))
@@ -263,6 +266,13 @@ class _Search:
             )
             status = "infeasible" if is_cut_off else status
         return best.with_notes(lines), status
+
+    def _describe_goal(self, problem: TrajectoryProblem, goal: BlockedGoal) -> str:
+        """Return why a goal is blocked, and how far it is free, within the budget."""
+        free = ""
+        with contextlib.suppress(BudgetExhaustedError):
+            free = describe_free_range(problem, goal.phase, self.request.random_seed)
+        return f"{goal.text}; free configurations were found up to {free}" if free else goal.text
 
     def find_nearest(self) -> _Candidate | None:
         """Return the best candidate, else the nearest infeasible solution; None without any."""

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import copy
+
 import pytest
 from helpers.carrying import (
     STICK,
@@ -17,6 +19,8 @@ from helpers.small_problems import SHORT, load_door_scene, make_program
 
 import vkc_pin as vkc
 from vkc_pin.planning.diagnosis.diagnosis import (
+    BlockedGoal,
+    describe_free_range,
     diagnose_goal,
     diagnose_goals,
     find_impossible_conditions,
@@ -140,3 +144,52 @@ def test_tolerance_matches_the_solver(missing: float, free: bool) -> None:
     if found is not None:
         assert "base_link – crate" in found.text
         assert found.shortfall == pytest.approx(missing, abs=1e-5)
+
+
+def make_far_drawer() -> vkc.Scene:
+    """Return an open drawer that a robot with a fixed base does not reach once it is closed."""
+    document = copy.deepcopy(dict(vkc.load_scene("drawer").document))
+    del document["start_region"]
+    document["objects"][0]["state"] = {"slide": 0.3}
+    document["robot"] = {"name": "husky_ur5e", "base": "fixed"}
+    return vkc.Scene.from_document({**document, "start": {"base": [0.4, 0, 0], "arm": "home"}})
+
+
+def make_door_beside_a_wall() -> vkc.Scene:
+    """Return a door that opens into the room by more than the hand on its lever has room for."""
+    document = dict(vkc.load_scene("door").document)
+    wall = {"name": "wall", "type": "box", "size": [1.2, 0.05, 2.2], "position": [1.85, 0.59, 1.1]}
+    return vkc.Scene.from_document({**document, "obstacles": [*document["obstacles"], wall]})
+
+
+@pytest.mark.parametrize(
+    ("scene", "name", "goal", "cause"),
+    [
+        (make_far_drawer(), "drawer.slide", 0.0, "out of reach"),
+        (make_door_beside_a_wall(), "door.hinge", -1.4, "– wall"),
+    ],
+)
+def test_range_of_a_blocked_joint(scene: vkc.Scene, name: str, goal: float, cause: str) -> None:
+    """Goals up to the end of the range have free configurations, goals a little beyond do not."""
+    owner, _, joint = name.partition(".")
+
+    def diagnose(value: float) -> list[BlockedGoal]:
+        return diagnose_goals(make_problem(scene, vkc.Actuate(owner, {joint: value})), 0)
+
+    (blocked,) = diagnose(goal)
+    assert cause in blocked.text
+    problem = make_problem(scene, vkc.Actuate(owner, {joint: goal}))
+    text = describe_free_range(problem, blocked.phase, 0)
+    said, value, unit = text.removeprefix(joint).split()
+    assert (said, unit) == ("=", problem.unit(name))
+    beyond = 0.06 * (goal - problem.task.phases[0].initial_values[name])
+    assert diagnose(float(value)) == []
+    assert diagnose(float(value) + beyond) != []
+
+
+def test_no_range_of_goals_that_are_free_nowhere() -> None:
+    fixed = vkc.Scene.from_document(
+        {**make_far_drawer().document, "start": {"base": [-0.5, 0, 0], "arm": "home"}}
+    )
+    problem = make_problem(fixed, vkc.Actuate("drawer", {"slide": 0.0}))
+    assert [describe_free_range(problem, number, 0) for number in (0, 1)] == ["", ""]

@@ -14,11 +14,19 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH
+from vkc_pin.world.task.steps import Actuate
 
-__all__ = ["BlockedGoal", "diagnose_goal", "diagnose_goals", "find_impossible_conditions"]
+__all__ = [
+    "BlockedGoal",
+    "describe_free_range",
+    "diagnose_goal",
+    "diagnose_goals",
+    "find_impossible_conditions",
+]
 
 _MAX_BATCHES = 4  # batches of `SAMPLE_COUNT` random configurations before a goal counts as blocked
 _DEEP_SHORTFALL = 0.05  # [m], [rad] above which the solver cannot repair a goal configuration
+_BISECTIONS = 5  # of the motion of an object joint, with one batch each: 1 s or less
 
 
 class BlockedGoal(NamedTuple):
@@ -27,10 +35,12 @@ class BlockedGoal(NamedTuple):
     Attributes:
         text: Explanation, one line.
         shortfall: Residual [m] or [rad], or clearance shortfall [m], of the best configuration.
+        phase: Number of the phase, from 0.
     """
 
     text: str
     shortfall: float
+    phase: int
 
     @property
     def is_deep(self) -> bool:
@@ -100,7 +110,7 @@ def diagnose_goal(problem: TrajectoryProblem, number: int, random_seed: int) -> 
             f"{phase.name}: out of reach, none of {len(z)} configurations tried gets there; "
             f"the nearest stays {least:.3f} m or rad short"
         )
-        return BlockedGoal(text, least)
+        return BlockedGoal(text, least, number)
     reached = z[residual < TOLERANCE]
     contacts = problem.contacts.evaluate(
         reached, np.full(len(reached), end), reach=problem.options.largest_margin
@@ -118,7 +128,56 @@ def diagnose_goal(problem: TrajectoryProblem, number: int, random_seed: int) -> 
         f"{phase.name}: all {len(reached)} configurations found there are blocked; "
         f"in the least blocked one {first} – {second} {gap}"
     )
-    return BlockedGoal(text, float(shortfall[best]))
+    return BlockedGoal(text, float(shortfall[best]), number)
+
+
+def describe_free_range(problem: TrajectoryProblem, number: int, random_seed: int) -> str:
+    """Describe how far the goal of an `Actuate` step has collision-free configurations.
+
+    The positions between start and goal are bisected, with samples at each. Nothing is proven.
+
+    Returns:
+        Joint positions, for example "hinge = 1.18 rad"; empty if the phase moves no joint to a
+        goal of the task, or if nothing free is found.
+    """
+    phase, row = problem.task.phases[number], int(problem.ends[number]) - 1
+    wanted = [
+        f"{step.object}.{joint}"
+        for step in problem.task.steps
+        if isinstance(step, Actuate)
+        for joint in step.joints
+    ]
+    names = [name for name in phase.values if name in wanted]
+    begin = np.array([phase.initial_values[name] for name in names])
+    columns = [problem.chain.index(name) for name in names]
+    end = problem.lower[row, columns]
+    if (begin == end).all():
+        return ""
+    free, least, most = None, 0.0, 1.0
+    for _ in range(_BISECTIONS):
+        share = (least + most) / 2
+        values = np.round(begin + share * (end - begin), 3)  # so that the text is exact
+        lower, upper = problem.lower.copy(), problem.upper.copy()
+        lower[row, columns] = upper[row, columns] = values
+        other, rng = problem.with_bounds(lower, upper), np.random.default_rng(random_seed)
+        if _has_free_sample(other, row + 1, sample_goal_configurations(other, row + 1, rng)):
+            free, least = values, share
+        else:
+            most = share
+    if free is None:
+        return ""
+    return ", ".join(
+        f"{name.partition('.')[2]} = {value:g} {problem.unit(name)}"
+        for name, value in zip(names, free.tolist(), strict=True)
+    )
+
+
+def _has_free_sample(
+    problem: TrajectoryProblem, waypoint: int, samples: tuple[Floats, Floats] | None
+) -> bool:
+    """Return whether one of the samples reaches the goal of a waypoint without collision."""
+    z = np.zeros((0, problem.chain.size)) if samples is None else samples[0][samples[1] < TOLERANCE]
+    return bool(len(z) and compute_shortfall(problem, z, waypoint).min() <= CLEARANCE_TOLERANCE)
 
 
 def _sample_goal(
@@ -131,8 +190,7 @@ def _sample_goal(
         if samples is None:
             return None
         batches.append(samples)
-        z = samples[0][samples[1] < TOLERANCE]
-        if len(z) and compute_shortfall(problem, z, waypoint).min() <= CLEARANCE_TOLERANCE:
+        if _has_free_sample(problem, waypoint, samples):
             break
     z, residual = (np.concatenate(parts) for parts in zip(*batches, strict=True))
     return z, residual

@@ -379,7 +379,7 @@ def main() -> int:
             return 1
     attachments()
     picture(door, "door", WIDE, HALF_OPEN)
-    plots(door, "door", "joints", "clearance", "top_view")
+    plots(door, "door", "joints")
     door.simulate().plot(IMAGES / "physics.png")
     plots(stick, "stick", "top_view")
     look(*UNDER_THE_TABLE)

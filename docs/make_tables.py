@@ -3,13 +3,13 @@
 Usage: python docs/make_tables.py
 
 Sections between `<!-- figures: NAME -->` and `<!-- /figures: NAME -->` belong to
-docs/results/NAME.json. Each table is replaced by the table with the same columns in the
+docs/results/NAME.json.gz. Each table is replaced by the table with the same columns in the
 experiment's results, and each line with a beginning in `LINES` by the line there. Lines with
 versions and machine also name the commit of the trials.
 
 Figures between `<!-- figure: NAME WHAT FIELD=VALUE ... -->` and `<!-- / -->` are computed from the
-trials of docs/results/NAME.json with these field values, see `FIGURES`. The number of decimals is
-kept.
+trials of docs/results/NAME.json.gz with these field values, see `FIGURES`. The number of decimals
+is kept.
 
 Figures without a record are between `<!-- measured: COMMIT DATE -->` and `<!-- /measured -->`;
 docs/evidence.md lists them. Other sentences are written by hand.
@@ -17,6 +17,7 @@ docs/evidence.md lists them. Other sentences are written by hand.
 
 from __future__ import annotations
 
+import gzip
 import importlib
 import json
 import re
@@ -75,9 +76,9 @@ RECORDS: list[dict[str, Any]] = yaml.safe_load((DOCS / "records.yaml").read_text
 
 
 def result(name: str) -> dict[str, Any]:
-    """Load the record docs/results/NAME.json."""
+    """Load the record docs/results/NAME.json.gz."""
     found: dict[str, Any] = json.loads(
-        (DOCS / "results" / f"{name}.json").read_text(encoding="utf-8")
+        gzip.decompress((DOCS / "results" / f"{name}.json.gz").read_bytes())
     )
     return found
 
@@ -224,7 +225,7 @@ def evidence() -> str:
             [
                 f"[{entry['claim']}]({entry['page']})",
                 whole,
-                f"[{name}](results/{name}.json)",
+                f"[{name}](results/{name}.json.gz)",
                 commits(trials),
             ]
         )

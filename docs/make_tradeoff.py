@@ -1,11 +1,12 @@
-"""Draws docs/images/tradeoff.png from docs/results/tradeoff.json: `python docs/make_tradeoff.py`.
+"""Draws docs/images/tradeoff.png from its record: `python docs/make_tradeoff.py`.
 
-That is the record of `vkc-pin bench ablation` with other weights of the base. A point is the mean
-path lengths of base and arm over the problems that succeed at every weight.
+docs/results/tradeoff.json.gz is that of `vkc-pin bench ablation` with other weights of the base. A
+point is the mean path lengths of base and arm over the problems that succeed at every weight.
 """
 
 from __future__ import annotations
 
+import gzip
 import json
 import sys
 from collections.abc import Mapping, Sequence
@@ -44,9 +45,8 @@ def points(trials: Sequence[Mapping[str, Any]]) -> list[tuple[float, float, floa
 
 def main() -> None:
     """Draw the curve, and print its points as a table."""
-    drawn = points(
-        json.loads((DOCS / "results" / "tradeoff.json").read_text(encoding="utf-8"))["trials"]
-    )
+    record = DOCS / "results" / "tradeoff.json.gz"
+    drawn = points(json.loads(gzip.decompress(record.read_bytes()))["trials"])
     with use_style():
         figure = new_figure(5.6, 3.8)
         axes = figure.subplots()

@@ -76,11 +76,10 @@ def test_package_is_typed_and_licensed() -> None:
     assert metadata.metadata("vkc-pin")["License-Expression"] == "BSD-2-Clause"
 
 
-def test_wheel_carries_robots_and_scenes(tmp_path: Path) -> None:
-    """Robots, scenes and `py.typed` are in the wheel, built here without compiled modules."""
+def build(kind: str, folder: Path) -> Path:
+    """Build an sdist, or a wheel without compiled modules."""
     settings = {f"cmake.define.VKC_PIN_BUILD_{module}": "OFF" for module in ("CPIN", "DISTANCES")}
-    build = f"build_wheel({str(tmp_path)!r}, {settings})"
-    code = f"from scikit_build_core.build import build_wheel; {build}"
+    code = f"import scikit_build_core.build as b; b.build_{kind}({str(folder)!r}, {settings})"
     done = subprocess.run(
         [sys.executable, "-c", code],
         cwd=CHECKOUT,
@@ -90,7 +89,18 @@ def test_wheel_carries_robots_and_scenes(tmp_path: Path) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    (wheel,) = tmp_path.glob("*.whl")
+    (built,) = folder.iterdir()
+    return built
+
+
+def test_sdist_is_small(tmp_path: Path) -> None:
+    assert build("sdist", tmp_path).stat().st_size < 8e6
+
+
+def test_wheel_is_small_and_carries_robots_and_scenes(tmp_path: Path) -> None:
+    """With the compiled modules, of 1.1 MB, it stays below 3 MB."""
+    wheel = build("wheel", tmp_path)
+    assert wheel.stat().st_size < 1.9e6
     names = set(zipfile.ZipFile(wheel).namelist())
     assert "vkc_pin/py.typed" in names
     for kind in ("robots", "scenes"):

@@ -78,7 +78,10 @@ def films(app: Sphinx, problem: Exception | None) -> None:
     if problem is not None or app.builder.name != "html":
         return
     folder = Path(app.outdir) / "docs" / "animations"
-    shutil.copytree(ROOT / "docs" / "animations", folder, dirs_exist_ok=True)
+    recorded = ROOT / "docs" / "animations"  # not in the sdist
+    if recorded.is_dir():
+        shutil.copytree(recorded, folder, dirs_exist_ok=True)
+    folder.mkdir(exist_ok=True)
     plan = vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 1.2})])
     if not plan.success:
         raise RuntimeError(plan.summary())

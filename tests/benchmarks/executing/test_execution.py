@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from pathlib import Path
 
@@ -40,8 +41,8 @@ def test_failed_executions_are_counted() -> None:
     fine = {"task": "drawer", "success": True, "executed": True, "arm_error": 0.01, "problems": []}
     bad = {**fine, "executed": False, "arm_error": 0.02, "problems": ["cup – floor: 9 mm deep"]}
     never = {"task": "drawer", "success": False, "executed": False}
-    record = Path(__file__).parents[3] / "docs/results/gap.json"
-    about = json.loads(record.read_text(encoding="utf-8"))["meta"]
+    record = Path(__file__).parents[3] / "docs/results/gap.json.gz"
+    about = json.loads(gzip.decompress(record.read_bytes()))["meta"]
     text = format_results(
         {"meta": {**about, "starts": 3, "tasks": ["drawer"]}, "trials": [fine, bad, never]}
     )

@@ -151,6 +151,12 @@ def test_modules_are_imported_by_their_full_names() -> None:
     assert wrong == []
 
 
+def test_calls_of_one_operating_system_are_in_one_module() -> None:
+    words = re.compile(r"/proc/|sched_|malloc_trim|prctl|import resource|getrusage|confstr")
+    found = [name for name, file in modules().items() if words.search(file.read_text())]
+    assert found == ["vkc_pin.utils.system"]
+
+
 def test_every_module_says_what_it_hands_out() -> None:
     for name, file in modules().items():
         tree = ast.parse(file.read_text(encoding="utf-8"))

@@ -68,6 +68,7 @@ def test_compiled_against_what_is_required(project: dict[str, Any]) -> None:
     run = {r.name: r.specifier for r in map(Requirement, project["project"]["dependencies"])}
     assert build["libpinocchio"] == run["pin"]
     assert build["casadi"] == run["casadi"]
+    assert build["cmeel-boost"] == run["cmeel-boost"]
     assert build["libcoal"] == run["coal"]
 
 

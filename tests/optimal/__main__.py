@@ -19,7 +19,8 @@ from vkc_pin.benchmarks.harness.record import find_commit
 from vkc_pin.benchmarks.harness.tables import describe_run
 from vkc_pin.benchmarks.problems.problem_set import TASKS as ALL
 from vkc_pin.benchmarks.problems.problem_set import make_start
-from vkc_pin.utils.parallel.machine import describe_machine, find_versions, measure_peak_memory
+from vkc_pin.utils.parallel.machine import describe_machine, find_versions
+from vkc_pin.utils.system import measure_peak_memory
 
 from .bound import compute_bound
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin.utils.cache import Cache, CacheInfo
-from vkc_pin.utils.parallel.machine import measure_resident_memory
+from vkc_pin.utils.system import measure_resident_memory
 
 
 def make_sized(nbytes: int) -> Any:

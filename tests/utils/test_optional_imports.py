@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import sys
 import types
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,6 +30,19 @@ def test_missing_compiled_modules_raise(monkeypatch: pytest.MonkeyPatch) -> None
         ):
             find_path()
     assert find_path() is not None
+
+
+def test_libraries_of_other_releases_are_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "casadi-3.9.1.dist-info").mkdir()
+    text = "Metadata-Version: 2.1\nName: casadi\nVersion: 3.9.1\n"
+    (tmp_path / "casadi-3.9.1.dist-info" / "METADATA").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setitem(sys.modules, "vkc_pin.planning.base_paths._driving", None)
+    expected = r"does not fit .*: casadi 3\.9\.1\. Either pip install 'casadi<3\.9,>=3\.8', or"
+    with pytest.raises(BuildError, match=expected):
+        find_path()
 
 
 def test_installed_packages_are_returned() -> None:

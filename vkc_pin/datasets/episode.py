@@ -26,11 +26,8 @@ from vkc_pin.simulation.cameras.images import Images, render_images
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.simulation.result import SimulationResult
 from vkc_pin.utils.arrays import Floats, replace_infinite
-from vkc_pin.utils.parallel.machine import (
-    identify_process,
-    measure_peak_memory,
-    measure_resident_memory,
-)
+from vkc_pin.utils.parallel.machine import identify_process
+from vkc_pin.utils.system import measure_peak_memory, measure_resident_memory
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.files.resources import find_resource_folder

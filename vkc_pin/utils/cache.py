@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
@@ -11,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar, cast
 
 from vkc_pin.utils.budget import record_evaluations
+from vkc_pin.utils.system import release_freed_memory
 
 __all__ = ["Cache", "CacheInfo"]
 
@@ -94,9 +93,7 @@ class Cache:
             return
         while total > self.max_nbytes and len(self._objects) > 1:
             total -= int(self._objects.popitem(last=False)[1].nbytes)
-        # glibc keeps freed memory between used blocks; other C libraries have no such call
-        with contextlib.suppress(AttributeError, OSError, TypeError):
-            ctypes.CDLL(None).malloc_trim(0)
+        release_freed_memory()
 
     def info(self) -> CacheInfo:
         """Return the contents and use of the cache."""

@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.parallel.engine import exit_with_parent, run_with_time_limit
+from vkc_pin.utils.system import limit_resource
 
 __all__ = [
     "MEMORY_VARIABLE",
@@ -236,10 +237,6 @@ def _pickle_error(error: BaseException) -> bytes:
 
 
 def _limit_resources(memory: int) -> None:
-    import resource
-
     limits = {"RLIMIT_DATA": memory, "RLIMIT_FSIZE": _MAX_FILE_SIZE, "RLIMIT_CORE": 0}
     for name, limit in limits.items():
-        # Some limits do not exist on macOS, and none can be above that of the user.
-        with contextlib.suppress(AttributeError, ValueError, OSError):
-            resource.setrlimit(getattr(resource, name), (limit, limit))
+        limit_resource(name, limit)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, requires, version
 from typing import Any
 
 from vkc_pin.errors import BuildError, InputError
@@ -24,11 +26,33 @@ def import_compiled(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
+        if unfit := _find_unfit_libraries():
+            installed = " and ".join(f"{name} {version}" for name, version in unfit.values())
+            needed = " ".join(f"'{requirement}'" for requirement in unfit)
+            raise BuildError(
+                f"the compiled module {name} does not fit the installed libraries ({error}): "
+                f"{installed}. Either pip install {needed}, or {REBUILD_HINT}"
+            ) from error
         raise BuildError(
-            f"the compiled module {name} cannot be imported ({error}). It is built when vkc-pin is "
-            "installed, which needs a C++17 compiler (Debian, Ubuntu: apt install g++); then "
-            f"{REBUILD_HINT}"
+            f"the compiled module {name} cannot be imported ({error}). It is in the wheels of "
+            "vkc-pin; installing from sources builds it, which needs a C++17 compiler (Debian, "
+            f"Ubuntu: apt install g++); then {REBUILD_HINT}"
         ) from error
+
+
+def _find_unfit_libraries() -> dict[str, tuple[str, str]]:
+    """Return the requirements of this package that are not met: name and installed version."""
+    from packaging.requirements import Requirement
+
+    found = {}
+    with contextlib.suppress(PackageNotFoundError):  # a source tree that was never installed
+        for requirement in map(Requirement, requires("vkc-pin") or ()):
+            with contextlib.suppress(PackageNotFoundError):
+                installed = version(requirement.name)
+                if not (requirement.marker or requirement.specifier.contains(installed)):
+                    text = f"{requirement.name}{requirement.specifier}"
+                    found[text] = (requirement.name, installed)
+    return found
 
 
 def import_optional(

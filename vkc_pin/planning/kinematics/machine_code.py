@@ -26,6 +26,7 @@ import numpy as np
 
 from vkc_pin.planning.kinematics.libraries import BUILD, Libraries
 from vkc_pin.utils.isolation import has_python
+from vkc_pin.utils.system import find_libc_version
 
 __all__ = ["MachineCode", "compile_jobs", "wait"]
 
@@ -219,10 +220,8 @@ def _find_compiler() -> tuple[str, ...] | None:
 
 def _compute_key(compiler: tuple[str, ...], texts: list[str]) -> str:
     """Return the key of a library: a digest of functions, compiler and platform."""
-    status, libc = Path(compiler[0]).stat(), None
-    with contextlib.suppress(OSError, ValueError):  # no GNU C library
-        libc = os.confstr("CS_GNU_LIBC_VERSION")
-    machine = (platform.system(), platform.machine(), libc)
+    status = Path(compiler[0]).stat()
+    machine = (platform.system(), platform.machine(), find_libc_version())
     resolved = str(Path(compiler[0]).resolve())
     toolchain = (*compiler, resolved, status.st_size, status.st_mtime_ns, *_FLAGS)
     digest = hashlib.sha256(json.dumps([toolchain, ca.CasadiMeta.version(), machine]).encode())

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 
+from vkc_pin.utils.system import count_cores
+
 __all__ = ["count_threads"]
 
 _MAX_THREADS = 8
@@ -15,7 +17,5 @@ def count_threads() -> int:
     That is the number of cores available to this process, limited to 8 and to `OMP_NUM_THREADS`.
     """
     requested = os.environ.get("OMP_NUM_THREADS", "")
-    cores = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    )
+    cores = count_cores()
     return max(1, min(int(requested) if requested.isdigit() else cores, cores, _MAX_THREADS))

@@ -1,0 +1,76 @@
+"""Queries the operating system: the only module with calls that not every POSIX system has."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import platform
+import resource
+import sys
+from pathlib import Path
+
+__all__ = [
+    "count_cores",
+    "find_libc_version",
+    "find_processor_name",
+    "limit_resource",
+    "measure_peak_memory",
+    "measure_resident_memory",
+    "release_freed_memory",
+]
+
+
+def count_cores() -> int:
+    """Return the number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def find_processor_name() -> str:
+    """Return the name of the processor, or of its architecture."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    return next(
+        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")),
+        platform.processor(),
+    )
+
+
+def find_libc_version() -> str | None:
+    """Return name and version of the GNU C library, or None where there is another."""
+    with contextlib.suppress(OSError, ValueError):
+        return os.confstr("CS_GNU_LIBC_VERSION")
+    return None
+
+
+def measure_peak_memory() -> float:
+    """Return the largest memory use of this process so far [MB]."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 2**10)  # [bytes], and [KB] elsewhere
+
+
+def measure_resident_memory() -> float:
+    """Return the current memory use of this process [MB], or the largest one outside Linux."""
+    try:
+        pages = Path("/proc/self/statm").read_text(encoding="ascii").split()[1]
+    except OSError:
+        return measure_peak_memory()
+    return int(pages) * resource.getpagesize() / 2**20
+
+
+def release_freed_memory() -> None:
+    """Return memory that was freed to the system, where the C library can be asked to."""
+    # glibc keeps freed memory between used blocks; other C libraries have no such call
+    with contextlib.suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def limit_resource(name: str, limit: int) -> None:
+    """Limit a resource of this process, such as "RLIMIT_DATA", where the system has that limit."""
+    # Some limits do not exist on macOS, and none can be above that of the user.
+    with contextlib.suppress(AttributeError, ValueError, OSError):
+        resource.setrlimit(getattr(resource, name), (limit, limit))

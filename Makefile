@@ -33,6 +33,7 @@ lint: $(VENV)/test.stamp
 	$(BIN)/ruff format --check --quiet
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
+	$(BIN)/zizmor --offline --quiet .github/workflows
 
 clean:
 	rm -rf $(VENV) out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
@@ -56,12 +57,20 @@ has_headers = import pathlib, sys, sysconfig; sys.exit(not pathlib.Path(sysconfi
 COMPILED := $(wildcard vkc_pin/*/*/*.cpp vkc_pin/*/*/*.hpp)
 $(VENV)/installed.stamp: pyproject.toml CMakeLists.txt $(COMPILED) | $(VENV)/created.stamp
 	@echo "Installing vkc-pin and what it needs into $(VENV); compiling takes a minute or two"
-	$(PIP) install --editable .
+	@$(listed) build-system requires > $(VENV)/build-packages.txt
+	@$(listed) project dependencies > $(VENV)/packages.txt
+	$(PIP) install --requirement $(VENV)/build-packages.txt cmake ninja
+	@# The other packages are installed while this one is compiled, against what is in $(VENV) already.
+	$(PIP) install --requirement $(VENV)/packages.txt & others=$$!; \
+	$(PIP) install --no-deps --no-build-isolation --editable . && wait $$others
 	@touch $@
 
-# Read from pyproject.toml: asking pip for '.[test]' would compile the package once more. Usage: $(call extra,test)
-extra = @$(BIN)/python -c '$(extra_packages)' $(1) > $(VENV)/$(1)-packages.txt && $(PIP) install --requirement $(VENV)/$(1)-packages.txt
-extra_packages = import sys, tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"][sys.argv[1]], sep="\n")
+# Prints requirements of pyproject.toml: asking pip for '.[test]' would compile the package once more.
+listed = $(BIN)/python -c '$(list_requirements)'
+list_requirements = import functools, sys, tomllib; \
+  print(*functools.reduce(dict.get, sys.argv[1:], tomllib.load(open("pyproject.toml", "rb"))), sep="\n")
+# Usage: $(call extra,test)
+extra = @$(listed) project optional-dependencies $(1) > $(VENV)/$(1)-packages.txt && $(PIP) install --requirement $(VENV)/$(1)-packages.txt
 
 $(VENV)/test.stamp: $(VENV)/installed.stamp
 	$(call extra,test)

@@ -300,12 +300,15 @@ def test_every_module_is_in_the_reference_once() -> None:
     assert find_documented("automodule") == set()
 
 
-def test_citation_is_of_this_version() -> None:
+def test_all_files_have_one_version() -> None:
     found, project = (
         yaml.safe_load(read("CITATION.cff")),
         tomllib.loads(read("pyproject.toml"))["project"],
     )
     assert (found["version"], found["license"]) == (project["version"], project["license"])
+    assert yaml.safe_load(read("tools/conda/recipe.yaml"))["context"]["version"] == found["version"]
+    assert vkc.__version__ == project["version"]
+    assert re.findall(r"^## \[([^]]+)\]", read("CHANGELOG.md"), re.MULTILINE)[0] == found["version"]
 
 
 def test_tables_are_as_the_results_on_record_say() -> None:

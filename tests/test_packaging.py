@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from helpers.declared import SCRIPTS, find_undeclared, run_without
 from packaging.requirements import Requirement
 
@@ -70,6 +71,15 @@ def test_compiled_against_what_is_required(project: dict[str, Any]) -> None:
     assert build["casadi"] == run["casadi"]
     assert build["cmeel-boost"] == run["cmeel-boost"]
     assert build["libcoal"] == run["coal"]
+
+
+def test_recipe_needs_the_same_packages(project: dict[str, Any]) -> None:
+    names = {"matplotlib": "matplotlib-base", "meshcat": "meshcat-python", "pin": "pinocchio"}
+    names |= {"pin-pink": "pink", "PyYAML": "pyyaml"}
+    recipe = yaml.safe_load((CHECKOUT / "tools/conda/recipe.yaml").read_text(encoding="utf-8"))
+    found = {text.partition(" ")[0] for text in recipe["requirements"]["run"]} - {"python"}
+    needed = {Requirement(text).name for text in project["project"]["dependencies"]}
+    assert found == {names.get(name, name) for name in needed - {"cmeel-boost"}}
 
 
 def test_package_is_typed_and_licensed() -> None:

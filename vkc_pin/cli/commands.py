@@ -16,6 +16,7 @@ from typing import Any
 
 from vkc_pin.benchmarks.commands import add_bench
 from vkc_pin.cli.datasets import add_datasets
+from vkc_pin.cli.first_steps import add_completion, add_first_steps
 from vkc_pin.cli.importing import add_importing
 from vkc_pin.cli.options import (
     EXIT_FAILED,
@@ -23,6 +24,8 @@ from vkc_pin.cli.options import (
     EXIT_INTERRUPTED,
     EXIT_MISUSE,
     EXIT_OK,
+    GroupedCommands,
+    GroupedHelp,
     add_command,
     add_option,
     add_seed,
@@ -324,20 +327,32 @@ def make_parser() -> argparse.ArgumentParser:
         prog="vkc-pin",
         description="Whole-body planning on virtual kinematic chains.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        formatter_class=GroupedHelp,
     )
     versions = {**find_versions(), "Python": platform.python_version()}
     listed = ", ".join(f"{name} {number}" for name, number in versions.items())
     add_option(
         parser, "--version", "show versions, also of dependencies", action="version", version=listed
     )
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    commands = GroupedCommands(parser)
+    commands.start_group("first steps")
+    add_first_steps(commands)
+    commands.start_group("motions")
     _add_plan(commands)
     _add_check_and_simulate(commands)
     _add_view_and_export(commands)
+    commands.start_group("robots, objects and homes from files")
+    add_importing(commands)
+    _add_srdf(commands)
+    commands.start_group("datasets and experiments")
     add_datasets(commands)
     add_bench(commands)
-    add_importing(commands)
+    commands.start_group("this command")
+    add_completion(commands, make_parser)
+    return parser
+
+
+def _add_srdf(commands: Any) -> None:
     srdf = add_command(
         commands,
         "srdf",
@@ -349,7 +364,6 @@ def make_parser() -> argparse.ArgumentParser:
     add_option(srdf, "--output FILE", "SRDF to write", required=True)
     add_option(srdf, "--samples", "number of configurations", type=parse_positive, default=20000)
     add_seed(srdf)
-    return parser
 
 
 def _add_plan(commands: Any) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from vkc_pin.benchmarks.commands import EXIT_INTERRUPTED, EXIT_OK, parse_natural, parse_positive
@@ -14,6 +14,8 @@ __all__ = [
     "EXIT_INTERRUPTED",
     "EXIT_MISUSE",
     "EXIT_OK",
+    "GroupedCommands",
+    "GroupedHelp",
     "add_command",
     "add_option",
     "add_seed",
@@ -22,6 +24,31 @@ __all__ = [
 ]
 
 EXIT_FAILED, EXIT_MISUSE, EXIT_INFEASIBLE = 1, 2, 3
+
+
+class GroupedCommands:
+    """The commands of a parser, whose help lists them in groups."""
+
+    def __init__(self, parser: argparse.ArgumentParser) -> None:
+        self._parser = parser
+        self._commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def start_group(self, title: str) -> None:
+        """Begin the group of the next commands."""
+        self._parser.description = f"{self._parser.description}\n\n{title}:"
+
+    def add_parser(self, name: str, *, help: str, **settings: Any) -> argparse.ArgumentParser:
+        """Add a command, as `add_parser` of subparsers does."""
+        self._parser.description = f"{self._parser.description}\n  {name:<15}{help}"
+        return self._commands.add_parser(name, help=help, **settings)
+
+
+class GroupedHelp(argparse.RawDescriptionHelpFormatter):
+    """Formats the help of a parser with `GroupedCommands`, which the description lists."""
+
+    def add_arguments(self, actions: Iterable[argparse.Action]) -> None:
+        """Add the options alone."""
+        super().add_arguments(action for action in actions if action.option_strings)
 
 
 def add_command(

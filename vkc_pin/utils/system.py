@@ -14,6 +14,7 @@ __all__ = [
     "count_cores",
     "find_libc_version",
     "find_processor_name",
+    "has_screen",
     "limit_resource",
     "measure_peak_memory",
     "measure_resident_memory",
@@ -38,6 +39,12 @@ def find_processor_name() -> str:
         (line.partition(":")[2].strip() for line in lines if line.startswith("model name")),
         platform.processor(),
     )
+
+
+def has_screen() -> bool:
+    """Return whether a browser can open a window."""
+    variables = ("DISPLAY", "WAYLAND_DISPLAY")
+    return sys.platform in ("darwin", "win32") or any(map(os.environ.get, variables))
 
 
 def find_libc_version() -> str | None:

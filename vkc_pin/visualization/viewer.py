@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, cast
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.utils.arguments import check_bool, check_instance, check_integer, check_mapping
 from vkc_pin.utils.notebook import in_notebook
+from vkc_pin.utils.system import has_screen
 from vkc_pin.validation.report import CheckedMotion
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.scene.poses import as_placement
@@ -80,10 +81,7 @@ def show(
     viewer = open_viewer()
     _draw(viewer, scene, plan, frames=frames)
     sys.stdout.write(f"meshcat shows it at {viewer.url()}\n")
-    screen = sys.platform in ("darwin", "win32") or bool(
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    )
-    if screen if open_browser is None else open_browser:
+    if has_screen() if open_browser is None else open_browser:
         import webbrowser
 
         webbrowser.open(viewer.url(), new=2)

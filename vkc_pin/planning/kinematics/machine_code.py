@@ -28,7 +28,7 @@ from vkc_pin.planning.kinematics.libraries import BUILD, Libraries
 from vkc_pin.utils.isolation import has_python
 from vkc_pin.utils.system import find_libc_version
 
-__all__ = ["MachineCode", "compile_jobs", "wait"]
+__all__ = ["MachineCode", "compile_jobs", "find_compiler", "wait"]
 
 # No fused multiply-add, the interpreter's own sine and cosine, and no instructions that another
 # machine with the same home may lack: results are equal bit for bit. -O2 took 1.4 times as long to
@@ -83,7 +83,7 @@ class MachineCode:
             return self.is_compiled
         # RuntimeError: from CasADi, or no thread can be started
         with contextlib.suppress(OSError, RuntimeError, ValueError):
-            folder, compiler = Libraries.open_default(), _find_compiler()
+            folder, compiler = Libraries.open_default(), find_compiler()
             if folder is None or compiler is None:
                 return False
             if not self._key:
@@ -208,7 +208,7 @@ def _is_identical(one: ca.Function, other: ca.Function, samples: int) -> bool:
     return True
 
 
-def _find_compiler() -> tuple[str, ...] | None:
+def find_compiler() -> tuple[str, ...] | None:
     """Return the command of the C compiler with its full path, or None."""
     try:
         name, *options = shlex.split(os.environ.get("CC", "")) or ["cc"]

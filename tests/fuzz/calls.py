@@ -156,6 +156,15 @@ def _plan_step(step: type) -> Callable[..., Any]:
 _POSE = (1.0, 0.2, 0.8, 0.0, 0.1, 0.2)
 _ROS = functools.cache(lambda: make_motion().to_ros())
 
+
+def _place_drawer_in_hand() -> pin.SE3:
+    """Return the placement of an open drawer whose handle is in the hand."""
+    placed = load_door().objects["drawer"].with_state({"slide": 0.1})
+    grasp = placed.object.attachment("handle")
+    in_drawer = placed.object.link_placement(grasp.link, placed.state) * grasp.tool()
+    return load_door().tool_placement() * in_drawer.inverse()
+
+
 CALLS: dict[str, Call] = {
     "load_scene": Call(vkc.load_scene, lambda: {"name_or_path": "drawer"}),
     "load_robot": Call(
@@ -191,7 +200,18 @@ CALLS: dict[str, Call] = {
     ),
     "Scene.with_held": Call(
         _call_method(load_door, "with_held"),
-        lambda: {"held": {"drawer": "handle"}, "by": {}, "at": {}},
+        lambda: {"held": {"drawer": "handle"}, "by": {}, "at": {}, "measured": {}},
+    ),
+    "Scene.with_measured_grasp": Call(
+        _call_method(load_door, "with_measured_grasp"),
+        lambda: {
+            "name": "drawer",
+            "attachment": "handle",
+            "base": load_door().start[:3].tolist(),
+            "arm": load_door().start[3:].tolist(),
+            "state": {"slide": 0.1},
+            "placement": _place_drawer_in_hand(),
+        },
     ),
     "Scene.with_held holds": Call(
         _call_method(load_door, "with_held"), lambda: {"held": [vkc.Hold("drawer", "handle")]}
@@ -407,7 +427,14 @@ CALLS: dict[str, Call] = {
     ),
     "Hold": Call(
         lambda **k: load_door().with_held([vkc.Hold(**k)]),
-        lambda: {"object": "drawer", "attachment": "handle", "by": None, "link": None, "at": ()},
+        lambda: {
+            "object": "drawer",
+            "attachment": "handle",
+            "by": None,
+            "link": None,
+            "at": (),
+            "deviation": (0.001, 0.0, 0.0, 0.0, 0.0, 0.1),
+        },
     ),
     "PhaseSpan": Call(
         lambda **k: vkc.Trajectory(

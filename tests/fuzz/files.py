@@ -131,7 +131,9 @@ def _use(scene: vkc.Scene, *, planned: bool) -> str:
 @functools.cache
 def _load_documents() -> dict[str, Any]:
     names = ("door", "drawer", "fetch", "household", "init_1", "gap_table")
-    return {name: vkc.load_scene(name).document for name in names}
+    stick = vkc.Hold("stick", "grip", deviation=(0.001, 0.0, 0.002, 0.0, 0.1, 0.0))
+    measured = vkc.load_scene("init_1").with_held([stick]).document
+    return {name: vkc.load_scene(name).document for name in names} | {"measured": measured}
 
 
 def make_document_case(rng: random.Random) -> dict[str, Any]:

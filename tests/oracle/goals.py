@@ -114,9 +114,11 @@ def _compute_pose_errors(
 def _find_grasp_misses(world: World, step: dict[str, Any], end: End) -> list[Miss]:
     """Return the distance and the angle between the hand and the grasp, if they are too large."""
     obj = world.objects[step["object"]]
-    used = [hold.attachment for hold in (*end.before, *end.after) if hold.object == step["object"]]
+    used = {
+        hold.attachment: hold for hold in (*end.before, *end.after) if hold.object == step["object"]
+    }
     name = step["attachment"] or next(iter(used), None)
-    grasp, row = obj.grasp(name), end.row
+    grasp, row = world.grasp(used[name]) if name in used else obj.grasp(name), end.row
     values = {}
     for freedom, *_ in grasp.freedoms:
         index = world.plan.index(f"{step['object']}.{freedom}")

@@ -96,7 +96,7 @@ class Fingers:
 
 def get_required_opening(world: World, hold: Hold) -> float | None:
     """Return the opening that a grasp requires; None: as at rest."""
-    grasp: Grasp = world.objects[hold.object].grasps[hold.attachment]
+    grasp: Grasp = world.grasp(hold)
     return world.fingers.near(grasp.opening)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from .plan import Violation
 from .poses import Poses
-from .scene_objects import SceneObject
+from .scene_objects import Grasp, SceneObject
 from .stage import Stage, World
 
 __all__ = ["check_motors"]
@@ -72,7 +72,7 @@ def check_motors(world: World, stage: Stage) -> Iterator[Violation]:
     for hold in stage.phase.holds:
         obj = world.objects[hold.object]
         if not obj.free and obj.limits:
-            pulls, where = _compute_pull(world, stage, obj, hold.attachment, rows, h)
+            pulls, where = _compute_pull(world, stage, obj, world.grasp(hold), rows, h)
             local = places(rows[1])[robot.tool]
             inside = np.einsum(
                 "kji,kj->ki", np.broadcast_to(local.turn, (len(h), 3, 3)), where - local.at
@@ -214,12 +214,12 @@ def _compute_pull(
     world: World,
     stage: Stage,
     obj: SceneObject,
-    attachment: str,
+    grasp: Grasp,
     rows: list[np.ndarray],
     h: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return least wrenches that move an object's joints, (S, 6), and the grasp's place, (S, 3)."""
-    plan, grasp = world.plan, obj.grasps[attachment]
+    plan = world.plan
     names = list(obj.limits)
 
     def state(columns: np.ndarray) -> np.ndarray:

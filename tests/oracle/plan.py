@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,11 +37,15 @@ class Violation:
 
 @dataclass(frozen=True)
 class Hold:
-    """An object held at an attachment, by the tool or by a frame "<object>.<link>"."""
+    """An object held at an attachment, by the tool or by a frame "<object>.<link>".
+
+    It is `measured` while it is held as the scene's start says.
+    """
 
     object: str
     attachment: str
     by: str | None
+    measured: bool = False
 
 
 @dataclass(frozen=True)
@@ -131,7 +136,9 @@ class SavedPlan:
         return self.names.index(name) if name in self.names else None
 
 
-def sort_holds(held: dict[str, str], by: dict[str, str]) -> tuple[Hold, ...]:
+def sort_holds(
+    held: dict[str, str], by: dict[str, str], measured: Collection[str]
+) -> tuple[Hold, ...]:
     """Return holds, each after the one that it hangs on."""
     found: list[Hold] = []
     left = dict(held)
@@ -139,7 +146,7 @@ def sort_holds(held: dict[str, str], by: dict[str, str]) -> tuple[Hold, ...]:
         ready = [name for name in left if by.get(name, "").partition(".")[0] not in left]
         if not ready:
             raise ValueError(f"objects hold each other: {left}")
-        found += [Hold(name, left.pop(name), by.get(name)) for name in ready]
+        found += [Hold(name, left.pop(name), by.get(name), name in measured) for name in ready]
     return tuple(found)
 
 
@@ -157,7 +164,14 @@ def read_plan(path: Path) -> SavedPlan:
         beside = path.resolve().parent / where["relative"]
         folder = beside if beside.is_dir() else Path(where["absolute"])
     motion = about["trajectory"]
-    holds = [sort_holds(p["held"], p.get("by") or {}) for p in motion["phases"]]
+    said = (about["scene"]["start"].get("held") or {}).items()
+    holds, measured = (
+        [],
+        {name for name, hold in said if isinstance(hold, dict) and "measured" in hold},
+    )
+    for p in motion["phases"]:
+        measured &= (p.get("deviation") or {}).keys()
+        holds.append(sort_holds(p["held"], p.get("by") or {}, measured))
     both = zip(motion["phases"], holds, strict=True)
     phases = [Phase(p["name"], p["first"], p["last"], held, p.get("opening")) for p, held in both]
     return SavedPlan(

@@ -171,7 +171,7 @@ def check_stage(world: World, stage: Stage) -> Iterator[Violation]:
     for hold in stage.phase.holds:
         yield from _check_closure(world, stage, hold)
         yield from _check_push(world, stage, hold)
-        grasp = world.objects[hold.object].grasps[hold.attachment]
+        grasp = world.grasp(hold)
         for name, *_ in grasp.freedoms if grasp.firm else ():
             column = stage.columns[:, world.plan.names.index(f"{hold.object}.{name}")]
             yield from _find_worst(
@@ -240,7 +240,7 @@ def _check_latches(world: World, stage: Stage) -> Iterator[Violation]:
 
 def _check_push(world: World, stage: Stage, hold: Hold) -> Iterator[Violation]:
     """Check that a pushed link stays ahead of the hand at the contact, up to rounding."""
-    grasp = world.objects[hold.object].grasps[hold.attachment]
+    grasp = world.grasp(hold)
     if not grasp.pushed:
         return
     size, link = len(stage.times), stage.links[hold.object, grasp.link]
@@ -263,7 +263,7 @@ def _check_push(world: World, stage: Stage, hold: Hold) -> Iterator[Violation]:
 
 def _check_closure(world: World, stage: Stage, hold: Hold) -> Iterator[Violation]:
     """The tool, or what takes its place, is where the attachment has it."""
-    grasp, obj = world.objects[hold.object].grasps[hold.attachment], world.objects[hold.object]
+    grasp, obj = world.grasp(hold), world.objects[hold.object]
     times, columns = stage.times, stage.columns
     tool, link = stage.tool, stage.links[hold.object, grasp.link]
     if (

@@ -89,7 +89,7 @@ class Grasp:
 
     `freedoms` are (name of the coordinate in the object, slides or not, axis, lower, upper); those
     that turn do so about an axis through a point of `through`. Of a grasp that is `pushed`, the
-    hand's foremost point is where the tool would be.
+    hand's foremost point is where the tool would be. One that is measured is `off` by a pose.
     """
 
     name: str
@@ -102,6 +102,7 @@ class Grasp:
     clearance: float | None
     pushed: bool
     opening: float | None
+    off: Poses | None = None
 
     def tool(self, values: Mapping[str, np.ndarray]) -> Poses:
         """Return the tool in the link's frame at values of the freedoms, shape (S,) each."""
@@ -113,7 +114,8 @@ class Grasp:
             else:
                 turn = rotate_about_axis(axis, value)
                 found = found @ Poses(turn, point - turn @ point)
-        return found @ make_pose((0.0, 0.0, -self.standoff))
+        found = found @ make_pose((0.0, 0.0, -self.standoff))
+        return found if self.off is None else found @ self.off
 
 
 @dataclass(frozen=True)

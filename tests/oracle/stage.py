@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,7 +15,7 @@ from .gripper import Fingers, get_required_opening
 from .plan import Hold, Phase, SavedPlan
 from .poses import IDENTITY, Poses, make_pose, read_orientation
 from .riding import compute_distance, find_riders
-from .scene_objects import SceneObject, Tree, load_object, load_robot
+from .scene_objects import Grasp, SceneObject, Tree, load_object, load_robot
 from .urdf import Shape, load_mesh_hull, make_solid, read_urdf
 
 __all__ = ["FLOOR", "Solid", "Stage", "World"]
@@ -103,12 +103,22 @@ class World:
             for joint, value in obj.state.items()
         }
         self.held: list[Hold] = []
+        self.measured: dict[str, Grasp] = {}
         for name, said in (start.get("held") or {}).items():
             about = {"attachment": said} if isinstance(said, str) else said
-            self.held.append(Hold(name, about["attachment"], about.get("by")))
+            measured = about.get("measured")
+            self.held.append(Hold(name, about["attachment"], about.get("by"), bool(measured)))
             grasp, values = self.objects[name].grasps[about["attachment"]], about.get("at")
-            for k, (freedom, *_) in enumerate(grasp.freedoms):
-                self.start[f"{name}.{freedom}"] = values[k] if values else 0.0
+            own = {
+                name: values[k] if values else 0.0 for k, (name, *_) in enumerate(grasp.freedoms)
+            }
+            self.start |= {f"{name}.{freedom}": value for freedom, value in own.items()}
+            if measured:
+                there = make_pose(measured["position"], read_orientation(measured))
+                hand = grasp.place @ there.inverse()
+                hand = hand @ self.front(grasp.opening) if grasp.pushed else hand
+                right = grasp.tool({freedom: np.array([value]) for freedom, value in own.items()})
+                self.measured[name] = replace(grasp, off=right.inverse() @ hand)
         self.held.sort(
             key=lambda hold: (
                 hold.by is not None and hold.by.partition(".")[0] in {h.object for h in self.held}
@@ -349,17 +359,22 @@ class World:
             )
         return obj.tree.links(values, None, obj.tree.urdf.links)
 
+    def grasp(self, hold: Hold) -> Grasp:
+        """Return the grasp of a hold, as measured or as described."""
+        own = self.objects[hold.object].grasps[hold.attachment]
+        return self.measured[hold.object] if hold.measured else own
+
     def freedoms(self, hold: Hold, columns: np.ndarray) -> dict[str, np.ndarray]:
         """Return the values of a grasp's freedoms along samples."""
         found = {}
-        for name, *_ in self.objects[hold.object].grasps[hold.attachment].freedoms:
+        for name, *_ in self.grasp(hold).freedoms:
             index = self.plan.index(f"{hold.object}.{name}")
             found[name] = np.zeros(len(columns)) if index is None else columns[:, index]
         return found
 
     def in_object(self, hold: Hold, columns: np.ndarray, links: dict[str, Poses]) -> Poses:
         """Return the tool's poses in a grasp, in the frame of the object's base link."""
-        grasp = self.objects[hold.object].grasps[hold.attachment]
+        grasp = self.grasp(hold)
         return links[grasp.link] @ grasp.tool(self.freedoms(hold, columns))
 
     def _in_hand(self, tool: Poses, free: dict[str, Poses]) -> dict[str, Poses]:
@@ -376,7 +391,7 @@ class World:
                     holder = found[owner] @ self.links_of(self.objects[owner], columns)[link]
                 values = {name: np.array([self.start[f"{hold.object}.{name}"]]) for name, *_ in
                           obj.grasps[hold.attachment].freedoms}  # fmt: skip
-                grasp = obj.grasps[hold.attachment]
+                grasp = self.grasp(hold)
                 found[hold.object] = holder @ (links[grasp.link] @ grasp.tool(values)).inverse()
         return found
 

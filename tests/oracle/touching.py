@@ -85,7 +85,7 @@ def find_licences(world: World, stages: list[Stage]) -> list[Licence]:
     """Return all licences of a motion."""
     clock = _Clock(world)
     found = [
-        *_license_grasps(world, clock),
+        *_license_grasps(world, stages, clock),
         *_license_supports(world, stages, clock),
         *_license_touches(world, stages, clock),
     ]
@@ -98,7 +98,7 @@ def find_licences(world: World, stages: list[Stage]) -> list[Licence]:
     return found
 
 
-def _license_grasps(world: World, clock: _Clock) -> Iterator[Licence]:
+def _license_grasps(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licence]:
     plan = world.plan
     last = len(plan.times) - 1
     spans: list[tuple[Hold, float, float]] = []
@@ -120,14 +120,32 @@ def _license_grasps(world: World, clock: _Clock) -> Iterator[Licence]:
             spans.append((Hold(step["object"], grasp.name, step["by"]), clock.before(last), np.inf))
     for hold, begin, end in spans:
         obj = world.objects[hold.object]
-        grasp = obj.grasps[hold.attachment]
+        grasp = world.grasp(hold)
         ours = frozenset({hold.by}) if hold.by else frozenset(world.robot.touch)
-        yield Licence(ours, frozenset({f"{hold.object}.{grasp.link}"}), begin, end)
+        held = frozenset({f"{hold.object}.{grasp.link}"})
+        near = _measure_hand(stages[0], ours, held) if hold.measured else np.inf
+        yield Licence(ours, held, begin, end, depth=max(0.0, -near))
         others = frozenset(
             f"{hold.object}.{link}" for link in obj.tree.urdf.links if link != grasp.link
         )
         least = plan.options["grasp_clearance"] if grasp.clearance is None else grasp.clearance
-        yield Licence(ours, others, begin, end, least=least)
+        near = _measure_hand(stages[0], ours, others) if hold.measured else np.inf
+        yield Licence(ours, others, begin, end, least=min(least, near), depth=max(0.0, -near))
+
+
+def _measure_hand(stage: Stage, ours: frozenset[str], others: frozenset[str]) -> float:
+    """Return the distance of links at the start of a stage [m]."""
+    ones, those = (
+        [part for part in stage.solids if part.label in labels] for labels in (ours, others)
+    )
+    return min(
+        (
+            compute_distance(one.shape.solid, one.at, other.shape.solid, other.at, 0)
+            for one in ones
+            for other in those
+        ),
+        default=np.inf,
+    )
 
 
 def _license_supports(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Licence]:

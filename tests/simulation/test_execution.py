@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.executions import (
     make_grasping_scene,
@@ -19,7 +20,7 @@ from helpers.executions import (
 
 import vkc_pin as vkc
 from vkc_pin.simulation.execution import simulate
-from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.scene.scene import Scene, load_scene
 
 
 def test_drawer_is_pulled() -> None:
@@ -149,3 +150,21 @@ def test_motion_of_a_day_is_too_long_to_execute(grasp: str) -> None:
     with pytest.raises(vkc.InputError, match="too many time steps") as caught:
         simulate(plan.scene, plan.steps, slow, grasp=grasp)
     assert caught.value.field == "trajectory"
+
+
+def test_plan_goes_on_from_where_the_execution_ended() -> None:
+    """The drawer is 6 mm beside its place when the hand closes."""
+    scene = load_scene("drawer")
+    placed = scene.objects["drawer"].placement
+    moved = pin.SE3(placed.rotation, placed.translation + np.array([0.0, 0.006, 0.0]))
+    actual = scene.with_placement("drawer", moved)
+    grasp = vkc.plan(scene, [vkc.Grasp("drawer")])
+    after = simulate(scene, grasp.steps, grasp.trajectory, actual=actual).end_scene()
+    assert np.linalg.norm(after.holds[0].deviation[:3]) == pytest.approx(0.006, abs=5e-4)
+    rest = vkc.plan(after, [vkc.Actuate("drawer", {"slide": 0.2})])
+    assert rest.success, rest.summary()
+    result = rest.simulate()
+    assert result.ok, result.summary()
+    end = result.end_scene()
+    assert end.objects["drawer"].state[0] == pytest.approx(0.2, abs=5e-3)
+    assert end.holds[0].deviation == pytest.approx(after.holds[0].deviation, abs=1e-3)

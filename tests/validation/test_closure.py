@@ -72,8 +72,7 @@ def test_drift_between_two_samples_is_found(plan: Plan, by: float, right: bool) 
         _, hold = find_grasp_phase(samples)
         assert (
             one.amount + LIMITS[0]
-            <= samples.compute_grasp_errors_at(hold.object, hold.attachment, moments)[:, 0].max()
-            + RESOLUTION
+            <= samples.compute_grasp_errors_at(hold, moments)[:, 0].max() + RESOLUTION
         )
 
 
@@ -90,7 +89,7 @@ def test_largest_drift_is_that_of_a_fine_grid(plan: Plan, seed: int) -> None:
     samples = Samples(plan.scene, Trajectory(names, times, positions, (span,), size, curve))
     drift = find_drift(samples, span, hold, (0.0, 0.0))
     moments = np.linspace(*times, 5001)
-    fine = samples.compute_grasp_errors_at(hold.object, hold.attachment, moments).max(axis=0)
+    fine = samples.compute_grasp_errors_at(hold, moments).max(axis=0)
     np.testing.assert_allclose(drift.measured, fine, rtol=0.0, atol=5e-6)
     assert (fine <= drift.bound + RESOLUTION).all()
 

@@ -131,7 +131,7 @@ def test_grasp_errors(seed: int, grasp: str) -> None:
         scene, {"cabinet": dataclasses.replace(placed, placement=tool * hand.inverse())}
     )
     np.testing.assert_allclose(
-        Samples(here, trajectory).compute_grasp_errors("cabinet", grasp, np.array([0])),
+        Samples(here, trajectory).compute_grasp_errors(Hold("cabinet", grasp), np.array([0])),
         0.0,
         atol=1e-7,
     )
@@ -140,7 +140,9 @@ def test_grasp_errors(seed: int, grasp: str) -> None:
     there = replace_objects(
         scene, {"cabinet": dataclasses.replace(placed, placement=off * hand.inverse())}
     )
-    (errors,) = Samples(there, trajectory).compute_grasp_errors("cabinet", grasp, np.array([0]))
+    (errors,) = Samples(there, trajectory).compute_grasp_errors(
+        Hold("cabinet", grasp), np.array([0])
+    )
     assert errors[0] == pytest.approx(np.linalg.norm(shift))
     assert errors[1] == pytest.approx(np.linalg.norm(turn))
 

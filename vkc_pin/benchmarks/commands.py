@@ -122,6 +122,8 @@ def _add_scenes(benches: Any) -> None:
     _add_choice(parser, "tasks", f"{tasks} household_cabinet household_cup init_1 (default: all)")
     about = "weld (default), or friction"
     parser.add_argument("--grasp", default="weld", metavar="MODEL", help=about)
+    about = "execute and measure the grasp, displace the hand by MM, and plan the rest from there"
+    parser.add_argument("--off", nargs="+", type=float, default=[], metavar="MM", help=about)
 
     about = "measure validated episodes per hour of each dataset task"
     parser = _add_experiment(

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
+from vkc_pin.errors import InputError
+from vkc_pin.options import Options
 from vkc_pin.simulation.contacts import Contact
 from vkc_pin.simulation.goals import Miss
 from vkc_pin.simulation.physics import Physics
@@ -19,9 +22,12 @@ from vkc_pin.simulation.snapshots import write_snapshots, write_video
 from vkc_pin.simulation.welds import Grip
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.world.scene.hold import Hold, measure_grasp
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.actions import compile_each_step
 from vkc_pin.world.task.steps import Step, step_to_dict
 from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World, make_scene_at
 
 __all__ = ["SimulationResult", "Tracking"]
 
@@ -126,6 +132,32 @@ class SimulationResult:
     def ok(self) -> bool:
         """Whether all goals are reached, no grasp is lost, and no contact is deeper than 1 mm."""
         return self.reached and not self.problems()
+
+    def end_scene(self) -> Scene:
+        """Return the scene as it really is at the end, from which planning can continue.
+
+        Robot and objects are where the execution left them. Grasps are as measured there; objects
+        that were pulled out of the hand are not held.
+
+        Raises:
+            InputError: The integration diverged, or an object slipped by more than 20 mm or
+                0.2 rad.
+        """
+        if self.diverged is not None:
+            problem, expected = "the integration diverged", "an execution that ended"
+            got = f"diverged at {self.diverged:.2f} s"
+            raise InputError(problem, field="end_scene", expected=expected, got=got)
+        world, row = World(self.scene), self.rows[-1]
+        values = dict(zip(world.coordinates.names, row.tolist(), strict=True))
+        scene = make_scene_at(self.scene, world, row, values)
+        lost = {grip.what: grip.broken is not None for grip in self.grips}  # the last time
+        holds, measured = list[Hold](), dict[str, pin.SE3]()
+        for hold in compile_each_step(self.scene, self.steps, Options())[-1].after:
+            if not lost.get(str(hold)) and hold.by in (None, *holds):
+                holds.append(hold)
+                measured[hold.object] = measure_grasp(scene.objects, hold, scene.tool_placement)
+        held = scene.with_held([hold.nominal for hold in holds], measured=measured)
+        return replace(held, opening=self.planned.phases[-1].opening)
 
     def problems(self) -> list[str]:
         """Return what failed, one line each."""

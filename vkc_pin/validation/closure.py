@@ -15,8 +15,8 @@ import numpy as np
 
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.samples import LENGTH_STEP, MAX_SAMPLES, Samples
-from vkc_pin.world.scene.contact_rules import compute_hand_frame
-from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.hold import Hold, get_attachment
+from vkc_pin.world.scene.measured_grasp import compute_hand_frame
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -59,7 +59,7 @@ def find_drift(
     """Find the largest drift of a grasp in a phase; limits of position [m] and angle [rad]."""
     rows = samples.get_rows(phase)
     times = samples.times[rows]
-    errors = samples.compute_grasp_errors(hold.object, hold.attachment, rows, hold.frame)
+    errors = samples.compute_grasp_errors(hold, rows)
     if (
         samples.scene.objects[hold.object].object.free or samples.is_truncated
     ):  # it moves rigidly with the hand
@@ -76,7 +76,7 @@ def find_drift(
         )
 
     def evaluate(moments: Floats) -> Floats:
-        return samples.compute_grasp_errors_at(hold.object, hold.attachment, moments, hold.frame)
+        return samples.compute_grasp_errors_at(hold, moments)
 
     return _maximize(times, errors, evaluate, bound_curvature, np.array(limits))
 
@@ -173,9 +173,7 @@ def _bound_rotation_acceleration(
 def _find_hand_levers(samples: Samples, phase: PhaseSpan, hold: Hold) -> list[_Lever]:
     """Return the levers of the grasping frame, from the world on."""
     scene = samples.scene
-    tip = compute_hand_frame(
-        scene.robot, scene.objects[hold.object].object.attachments[hold.attachment]
-    )
+    tip = compute_hand_frame(scene.robot, get_attachment(scene.objects, hold))
     reach, backwards = float(np.linalg.norm(tip.translation)), list[_Lever]()
     frame, through = hold.frame, hold.by
     # A link of a grasped object moves rigidly with the holder, except for the grasp's freedoms.
@@ -206,8 +204,8 @@ def _find_hand_levers(samples: Samples, phase: PhaseSpan, hold: Hold) -> list[_L
 
 def _find_grasp_levers(samples: Samples, hold: Hold) -> list[_Lever]:
     """Return the levers of the attachment's frame, from the world on."""
-    attachment = samples.scene.objects[hold.object].object.attachments[hold.attachment]
-    reach, backwards = abs(attachment.standoff), list[_Lever]()
+    attachment = get_attachment(samples.scene.objects, hold)
+    reach, backwards = float(np.linalg.norm(attachment.offset.translation)), list[_Lever]()
     for suffix, freedom in reversed(
         list(zip(attachment.coordinates, attachment.freedoms, strict=True))
     ):

@@ -11,7 +11,7 @@ import pinocchio as pin
 from vkc_pin.options import Options
 from vkc_pin.utils.arrays import Ints
 from vkc_pin.validation.distances import CollisionShapes
-from vkc_pin.validation.goals import MOTION_TOLERANCE
+from vkc_pin.validation.goals import MOTION_TOLERANCE, make_hold
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.tolerances import Tolerances
@@ -22,13 +22,13 @@ from vkc_pin.world.scene.contact_rules import (
     CONTACT_WINDOW,
     compute_grasp_opening,
     compute_hand_clearance,
-    compute_hand_frame,
     find_grasped_link,
     find_gripper_hold,
     find_touch_links,
     is_rigid_grasp,
 )
-from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.hold import Hold, get_attachment
+from vkc_pin.world.scene.measured_grasp import compute_hand_frame
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Grasp, Step, Touch
 
@@ -132,7 +132,7 @@ def check_pushes(samples: Samples) -> Iterator[Violation]:
     scene, tool = samples.scene, samples.scene.robot.tool_frame
     for phase in samples.trajectory.phases:
         for hold in phase.holds:
-            attachment = scene.objects[hold.object].object.attachments[hold.attachment]
+            attachment = get_attachment(scene.objects, hold)
             if attachment.contact != "push":
                 continue
             rows = samples.get_rows(phase)
@@ -225,7 +225,9 @@ class _WindowFinder:
         link, is_rigid = find_grasped_link(self.scene, hold), is_rigid_grasp(self.scene, hold)
         clearance = compute_hand_clearance(self.scene, hold, link, self.options)
         pairs = self._pair_links(find_touch_links(self.scene, hold), {link})
-        yield Window(pairs, begin, end, 0.0 if is_rigid else clearance, moves_together=is_rigid)
+        margin = min(clearance, 0.0) if is_rigid else clearance
+        contact = CONTACT_DEPTH + max(0.0, -margin)
+        yield Window(pairs, begin, end, margin, contact, moves_together=is_rigid)
 
     def _find_hand_windows(self, hold: Hold, first: int, last: int) -> Iterator[Window]:
         """Yield windows of the grasping links with all links of the object."""
@@ -236,7 +238,8 @@ class _WindowFinder:
                 by_clearance.setdefault(least, set()).add(link)
         for least, links in by_clearance.items():
             pairs = self._pair_links(find_touch_links(self.scene, hold), links)
-            yield Window(pairs, first, last, least, 0.0 if least else CONTACT_DEPTH)
+            contact = 0.0 if least > 0.0 else CONTACT_DEPTH - least
+            yield Window(pairs, first, last, least, contact)
 
     def _find_grasp_windows(self, steps: Sequence[Grasp]) -> Iterator[Window]:
         """Yield windows around phase ends at which the hand is at a grasp, held or not."""
@@ -245,22 +248,12 @@ class _WindowFinder:
             attachments = self.scene.objects[step.object].object.attachments
             limits = (self.tolerances.goal_position, self.tolerances.goal_angle)
             for name in attachments if step.attachment is None else [step.attachment]:
-                errors = self.samples.compute_grasp_errors(
-                    step.object, name, self.samples.waypoint_rows[ends], step.by
-                )
-                hold = self._make_hold(step, name)
+                hold = make_hold(self.scene, step, name)
+                errors = self.samples.compute_grasp_errors(hold, self.samples.waypoint_rows[ends])
                 for at in ends[(errors <= limits).all(axis=1)].tolist():
                     yield from self._find_hand_windows(
                         hold, self._extend(at, -1), self._extend(at, 1)
                     )
-
-    def _make_hold(self, step: Grasp, attachment: str) -> Hold:
-        """Make the hold that a step establishes; holds of the object in between are ignored."""
-        owner, _, link = (step.by or "").partition(".")
-        through = None
-        if step.by:
-            through = Hold(owner, self.scene.objects[owner].object.attachment().name)
-        return Hold(step.object, attachment, through, link or None)
 
     def _find_carry_windows(
         self, owner: str, at: int, other: int, *, begin: bool = True, new: bool = False

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,9 +13,11 @@ from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.models.coordinates import wrap_angle
+from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 
-__all__ = ["check_goals", "check_steps"]
+__all__ = ["check_goals", "check_steps", "make_hold"]
 
 MOTION_TOLERANCE = 1e-5  # smaller displacements do not count as motion [m] or [rad]
 
@@ -243,7 +245,9 @@ def _compute_goal_errors(
                 name, abs(value - goal), unit, f"{value:.4f} {unit} instead of {goal:.4f} {unit}"
             )
     elif isinstance(step, Grasp):
-        name, (distance, turn) = _find_closest_grasp(samples, step, row)
+        near = phases[max(end - 1, 0) : end + 1]  # those that end or begin here
+        holds = [hold for phase in near for hold in phase.holds if hold.frame == step.by]
+        name, (distance, turn) = _find_closest_grasp(samples, step, row, holds)
         expect(
             f"{step.object}.{name}", distance, "m", f"the tool is {distance:.4f} m from the grasp"
         )
@@ -303,10 +307,20 @@ def _compute_angle_error(placement: pin.SE3, target: pin.SE3, free: str) -> floa
     return float(np.linalg.norm(pin.log3(target.rotation.T @ placement.rotation)))
 
 
-def _find_closest_grasp(samples: Samples, step: Grasp, row: int) -> tuple[str, tuple[float, float]]:
+def make_hold(scene: Scene, step: Grasp, attachment: str) -> Hold:
+    """Make the hold that a step establishes; holds of the object in between are ignored."""
+    owner, _, link = (step.by or "").partition(".")
+    through = Hold(owner, scene.objects[owner].object.attachment().name) if step.by else None
+    return Hold(step.object, attachment, through, link or None)
+
+
+def _find_closest_grasp(
+    samples: Samples, step: Grasp, row: int, holds: Iterable[Hold]
+) -> tuple[str, tuple[float, float]]:
     """Return a grasp step's attachment and the tool's distance [m] and angle [rad] from it.
 
-    Without a name, it is the nearest attachment that is used at the start or in a phase.
+    Without a name, it is the nearest attachment that is used at the start or in a phase. The
+    distance from one of `holds`, those just before and after, is that from the grasp as measured.
     """
     used = [samples.scene.held, *(phase.held for phase in samples.trajectory.phases)]
     names = (
@@ -315,8 +329,11 @@ def _find_closest_grasp(samples: Samples, step: Grasp, row: int) -> tuple[str, t
         else [held[step.object] for held in used if step.object in held]
     )
     names = names or [samples.scene.objects[step.object].object.attachment().name]
+    known = {hold.attachment: hold for hold in holds if hold.object == step.object}
     errors = {
-        name: samples.compute_grasp_errors(step.object, name, np.array([row]), step.by)[0]
+        name: samples.compute_grasp_errors(
+            known.get(name) or make_hold(samples.scene, step, name), np.array([row])
+        )[0]
         for name in names
     }
     name = min(errors, key=lambda key: float(errors[key].max()))

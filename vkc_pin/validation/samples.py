@@ -15,8 +15,8 @@ from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.validation.report import Violation
 from vkc_pin.world.models.articulated_object import Freedom
 from vkc_pin.world.models.grippers.bar_width import WIDTH_TOLERANCE
-from vkc_pin.world.scene.contact_rules import compute_hand_frame
-from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.hold import Hold, get_attachment
+from vkc_pin.world.scene.measured_grasp import compute_hand_frame
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.free_objects import FreeObjects
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
@@ -88,12 +88,20 @@ class Samples:
             check_choice(name, known, "coordinate", "trajectory.names")
 
     def _check_phases(self) -> None:
+        measured = {hold for hold in self.scene.holds if hold.deviation}
         for number, phase in enumerate(self.trajectory.phases):
+            measured &= set(phase.holds)
             if phase.opening is not None:
                 self._check_opening(phase.opening, f"trajectory.phases[{number}].opening")
             for hold in phase.holds:
                 owner, attachment = hold.object, hold.attachment
                 field = f"trajectory.phases[{number}].held"
+                if hold.deviation and hold not in measured:
+                    raise InputError(
+                        "only grasps of the scene's start deviate, until they end",
+                        field=field.replace("held", "deviation"),
+                        got=str(hold),
+                    )
                 check_choice(owner, self.scene.objects, "object", field)
                 attachments = self.scene.objects[owner].object.attachments
                 check_choice(attachment, attachments, f"attachment of '{owner}'", field)
@@ -262,29 +270,20 @@ class Samples:
                 turns[k, f], origins[k, f] = placed.rotation, placed.translation
         return turns, origins
 
-    def compute_grasp_errors(
-        self, owner: str, name: str, rows: Ints, by: str | None = None
-    ) -> Floats:
-        """Compute position [m] and angle [rad] errors of a grasp at samples, shape (K, 2).
+    def compute_grasp_errors(self, hold: Hold, rows: Ints) -> Floats:
+        """Compute position [m] and angle [rad] errors of a grasp at samples, shape (K, 2)."""
+        return self._compute_grasp_errors(hold, self.times[rows], self.z[rows])
 
-        `by` is the frame that grasps instead of the tool, "<object>.<link>".
-        """
-        return self._compute_grasp_errors(owner, name, self.times[rows], self.z[rows], by)
-
-    def compute_grasp_errors_at(
-        self, owner: str, name: str, times: Floats, by: str | None = None
-    ) -> Floats:
+    def compute_grasp_errors_at(self, hold: Hold, times: Floats) -> Floats:
         """Compute the errors of a grasp at increasing times, shape (K,) [s]."""
         z = self.world.compute_positions(self.trajectory, times, self.free_objects)
-        return self._compute_grasp_errors(owner, name, times, z, by)
+        return self._compute_grasp_errors(hold, times, z)
 
-    def _compute_grasp_errors(
-        self, owner: str, name: str, times: Floats, z: Floats, by: str | None
-    ) -> Floats:
-        attachment = self.scene.objects[owner].object.attachments[name]
+    def _compute_grasp_errors(self, hold: Hold, times: Floats, z: Floats) -> Floats:
+        owner, attachment = hold.object, get_attachment(self.scene.objects, hold)
         hand = compute_hand_frame(self.scene.robot, attachment)
         turns, origins = self._compute_frames(
-            z, by or self.scene.robot.tool_frame, f"{owner}.{attachment.link}"
+            z, hold.frame or self.scene.robot.tool_frame, f"{owner}.{attachment.link}"
         )
         positions, names = self.trajectory.at(times), self.trajectory.names
         values = np.zeros((len(times), len(attachment.coordinates)))

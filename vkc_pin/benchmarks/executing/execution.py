@@ -7,10 +7,15 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any, Unpack, cast
 
 import numpy as np
 
+from vkc_pin.benchmarks.executing.measured import (
+    DEGREES_PER_MM,
+    displace_hand,
+    grasp_in_physics,
+)
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.limits import LIMITS, describe_limit
 from vkc_pin.benchmarks.harness.record import Record, trial, values
@@ -28,7 +33,10 @@ from vkc_pin.planning.planner import plan
 from vkc_pin.simulation.execution import GRASPS, simulate
 from vkc_pin.simulation.physics import Physics, import_mujoco
 from vkc_pin.simulation.result import SimulationResult
-from vkc_pin.utils.arguments import check_choice
+from vkc_pin.utils.arguments import check_choice, check_list, check_number
+from vkc_pin.world.scene.measured_grasp import MAX_POSITION_DEVIATION
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.steps import Actuate, Place
 
 __all__ = ["TASKS", "format_results", "run"]
 
@@ -65,6 +73,7 @@ def run(
     seed: int = 0,
     tasks: Sequence[str] = tuple(TASKS),
     grasp: str = "weld",
+    off: Sequence[float] = (),
     **execution: Unpack[Execution],
 ) -> dict[str, Any]:
     """Run the experiment in the folder `out`; see `runner.run`.
@@ -75,6 +84,8 @@ def run(
         seed: Random seed of starts and planning.
         tasks: Some of `TASKS`.
         grasp: Kind of grasp; see `simulate`.
+        off: Instead of whole tasks: the grasp is executed and measured, and the rest is planned
+            from there and executed, for each distance [mm] by which the hand closes elsewhere.
     """
     import_mujoco()
     runner.check_positive(trials=trials)
@@ -88,7 +99,18 @@ def run(
         **LIMITS,
     }
     settings |= {"physics": vars(Physics()), "grasp": check_choice(grasp, GRASPS, "grasp")}
-    specs = [
+    largest = 1e3 * MAX_POSITION_DEVIATION
+    given: tuple[Any, ...] = check_list(off, "off", "distances [mm]")
+    distances = [
+        check_number(mm, f"off[{k}]", f"0 to {largest:g} mm", low=0.0, high=largest)
+        for k, mm in enumerate(given)
+    ]
+    if distances:
+        held = [task for task in TASKS if isinstance(ALL[task].steps[0], Actuate | Place)]
+        for name in names:
+            check_choice(name, held, "task that moves a single object", "tasks")
+        settings["off"] = distances
+    specs: list[dict[str, Any]] = [
         {
             "key": f"{list(TASKS).index(name):02d}/{number:04d}",
             "task": name,
@@ -99,6 +121,12 @@ def run(
         for name in names
         for number in range(trials)
     ]
+    if distances:
+        specs = [
+            {**spec, "key": f"{spec['key']}/{mm:g}", "off": mm}
+            for spec in specs
+            for mm in distances
+        ]
     return runner.run(
         specs, _record, out, settings=settings, format_results=format_results, **execution
     )
@@ -107,12 +135,24 @@ def run(
 def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
     about, records = result["meta"], result["trials"]
-    rows = [_row(name, select(records, task=name)) for name in about["tasks"]]
+    rows = [
+        _row(f"{name}, {mm:g} mm off", select(records, task=name, off=mm))
+        for name in about["tasks"]
+        for mm in about.get("off", ())
+    ]
+    rows = rows or [_row(name, select(records, task=name)) for name in about["tasks"]]
     rows += [_row("all", records)] if len(rows) > 1 else []
     problems = Counter(
         f"{r.get('task')}: {text}" for r in records for text in r.get("problems", ())
     )
     lines = [f"- {text}" + f" ({n} times)" * (n > 1) for text, n in problems.items()]
+    table, sections = format_table(_HEAD, rows), list[str]()
+    if about.get("off"):
+        about_off = (
+            "The grasp is executed first. The rest is planned from there, as measured and with the "
+            f"hand displaced, and turned by {DEGREES_PER_MM:g}° per mm, in random directions."
+        )
+        sections = [about_off, table, _list_trials(records)]
     return join_sections(
         about,
         "# Plans in physics" + ", held by friction" * (about.get("grasp") == "friction"),
@@ -122,10 +162,20 @@ def format_results(result: Mapping[str, Any]) -> str:
         "and 0.02 rad of the goal, nothing is pulled out of the hand, and no contact is deeper "
         "than planned by more than 1 mm; beside it Wilson's interval of 95 %. Errors of arm and "
         "base, misses of goals, forces, torques and slips are the largest of all trials.",
-        format_table(_HEAD, rows),
+        *(sections or [table]),
         "## What went wrong",
         "\n".join(lines) or "Nothing.",
     )
+
+
+def _list_trials(records: Sequence[Record]) -> str:
+    """Return a list of all trials with their starts and random seeds."""
+    lines = [
+        f"- {r['task']}, start {r['number']}, seed {r['seed']}, {r['off']:g} mm off: "
+        f"{r['status']}, {'executed' if r['executed'] else 'not executed'}"
+        for r in records
+    ]
+    return "\n".join(["## Trials", "", *lines])
 
 
 def _row(name: str, records: Sequence[Record]) -> list[str]:
@@ -154,8 +204,19 @@ _FIGURES = {
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:
     scene, steps = make_start(spec["task"], spec["seed"], spec["number"]), ALL[spec["task"]].steps
-    found = plan(scene, steps, seed=spec["seed"], **LIMITS)
     more: dict[str, Any] = {"task": spec["task"], "number": spec["number"], "executed": False}
+    start: Scene | None = scene
+    if (mm := spec.get("off")) is not None:
+        more["off"], step = mm, cast("Actuate | Place", steps[0])
+        rng = np.random.default_rng([spec["seed"], spec["number"], round(1e3 * mm)])
+        found, start = grasp_in_physics(scene, step, spec["seed"], spec["grasp"], LIMITS)
+        start = displace_hand(start, step, mm, rng) if start is not None and mm else start
+    if start is None:  # the grasp failed
+        problems = [f"the grasp: {found.status}"]
+        return trial(found, method="VKC", seed=spec["seed"], **more, problems=problems) | {
+            "success": False
+        }
+    found = plan(start, steps, seed=spec["seed"], **LIMITS)
     if found.success:
         begin = time.perf_counter()
         executed = simulate(found.scene, found.steps, found.trajectory, grasp=spec["grasp"])

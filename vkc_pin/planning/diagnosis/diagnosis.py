@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import NamedTuple
 
 import numpy as np
 
+from vkc_pin.errors import InputError
 from vkc_pin.planning.initialization.keyframes import compute_shortfall, sample_goal_configurations
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
@@ -72,6 +74,9 @@ def find_impossible_conditions(problem: TrajectoryProblem) -> list[Violation]:
                     f"it is grasped at the start, but the hand is {error:.4f} m or rad "
                     "from its attachment"
                 )
+                with contextlib.suppress(InputError):
+                    problem.scene.with_measured_grasp(goal.object)
+                    detail += "; if it is there, see Scene.with_measured_grasp"
                 found.append(
                     Violation("closure", goal.about, amount=error, unit="m", detail=detail)
                 )

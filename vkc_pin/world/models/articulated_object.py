@@ -83,6 +83,8 @@ class Attachment:
     `-standoff` along the tool's z axis. The tool's z axis points out of the palm (direction of
     approach), its x axis along the direction in which the fingers close.
 
+    A hand that really grasped elsewhere is at `placement · J(v) · offset · deviation`.
+
     Attributes:
         name: Name of the attachment in the object.
         link: Grasped link.
@@ -102,6 +104,7 @@ class Attachment:
         contact: "grasp": the hand closes on the link and moves it in any direction. "push": the
             hand's foremost point takes the place of the tool frame, against a face whose inward
             normal is the z axis of `placement`, and moves the link in that direction only.
+        deviation: Measured pose of the hand in its nominal placement; None: as described.
     """
 
     name: str
@@ -114,6 +117,7 @@ class Attachment:
     clearance: float | None = None
     opening: float | None = None
     contact: str = "grasp"
+    deviation: pin.SE3 | None = None
 
     @property
     def coordinates(self) -> tuple[str, ...]:
@@ -122,8 +126,9 @@ class Attachment:
 
     @property
     def offset(self) -> pin.SE3:
-        """Tool frame in the moving frame of the virtual joint."""
-        return pin.SE3(np.eye(3), np.array([0.0, 0.0, -self.standoff]))
+        """Tool frame in the moving frame of the virtual joint, including `deviation`."""
+        nominal = pin.SE3(np.eye(3), np.array([0.0, 0.0, -self.standoff]))
+        return nominal if self.deviation is None else nominal * self.deviation
 
     def motion(self, values: ArrayLike = ()) -> pin.SE3:
         """Return J(v) · offset at the values v of the k freedoms, shape (k,), [rad] or [m].

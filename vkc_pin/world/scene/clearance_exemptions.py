@@ -37,7 +37,9 @@ __all__ = [
     "PlacedShapes",
     "find_clearance_exemptions",
     "find_close_pairs",
+    "get_cached",
     "make_shape_keys",
+    "make_state_key",
     "warn_of_overlaps",
 ]
 
@@ -172,12 +174,12 @@ def find_clearance_exemptions(scene: _Scene, dist_safe: float) -> tuple[Clearanc
         ]
         return *listed, *_find_neighbours(scene, dist_safe)
 
-    return _get_cached(
+    return get_cached(
         scene,
         (
             "clearance_exemptions",
             dist_safe,
-            *(_make_state_key(placed) for placed in scene.objects.values()),
+            *(make_state_key(placed) for placed in scene.objects.values()),
         ),
         find,
     )
@@ -339,9 +341,9 @@ class PlacedShapes:
                     self.keys[other],
                     joint,
                     reach,
-                    *map(_make_state_key, where),
+                    *map(make_state_key, where),
                 )
-                lower, upper, deepest = _get_cached(
+                lower, upper, deepest = get_cached(
                     self.scene, key, partial(self._find_exempt_range, own, other, joint, reach)
                 )
                 found[f"{owner}.{joint}"] = (lower, upper)
@@ -457,7 +459,7 @@ class PlacedShapes:
         return [str(item.model.names[joint]) for joint in support if joint]
 
 
-def _get_cached(scene: _Scene, key: Hashable, make: Callable[[], T]) -> T:
+def get_cached(scene: _Scene, key: Hashable, make: Callable[[], T]) -> T:
     """Return the value cached under a key in a scene, computed if there is none."""
     found: T | None = scene.memory.get(key)
     if found is None:
@@ -467,5 +469,6 @@ def _get_cached(scene: _Scene, key: Hashable, make: Callable[[], T]) -> T:
     return found
 
 
-def _make_state_key(placed: PlacedObject) -> tuple[bytes, bytes]:
+def make_state_key(placed: PlacedObject) -> tuple[bytes, bytes]:
+    """Return a key of an object's placement and joint values."""
     return placed.placement.homogeneous.tobytes(), placed.state.tobytes()

@@ -5,6 +5,8 @@ The planner and the independent validation both implement these rules.
 - A hand keeps the attachment's clearance from the whole object that it grasps, during the grasp and
   for `CONTACT_WINDOW` before and after. Without a clearance of its own that is
   `Options.grasp_clearance`. An object held through another link needs no clearance from that link.
+  A hand whose measured grasp deviates from the attachment may be as close to the object, or overlap
+  it as much, as in that grasp.
 - The hand and the grasped link are rigidly connected, unless the grasp has a freedom.
 - A hand that pushes touches the link with its foremost point. It needs no clearance from that link,
   never overlaps it, and moves it forward only.
@@ -28,15 +30,18 @@ grasped or released, and before the motion; after the last grasp it stays.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 
+import numpy as np
 import pinocchio as pin
 
 from vkc_pin.options import Options
 from vkc_pin.world.models.articulated_object import Attachment
-from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.scene.clearance_exemptions import CONTACT_DEPTH
-from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.models.shapes import compute_clearance, get_link_name, list_placed_shapes
+from vkc_pin.world.scene.clearance_exemptions import CONTACT_DEPTH, get_cached, make_state_key
+from vkc_pin.world.scene.hold import Hold, get_attachment
+from vkc_pin.world.scene.measured_grasp import compute_hand_frame
+from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 
 __all__ = [
@@ -44,7 +49,6 @@ __all__ = [
     "CONTACT_WINDOW",
     "compute_grasp_opening",
     "compute_hand_clearance",
-    "compute_hand_frame",
     "compute_start_opening",
     "find_grasped_link",
     "find_gripper_hold",
@@ -57,7 +61,7 @@ CONTACT_WINDOW = 1.0
 
 
 def _get_attachment(scene: Scene, hold: Hold) -> Attachment:
-    return scene.objects[hold.object].object.attachments[hold.attachment]
+    return get_attachment(scene.objects, hold)
 
 
 def find_grasped_link(scene: Scene, hold: Hold) -> str:
@@ -73,25 +77,65 @@ def find_touch_links(scene: Scene, hold: Hold) -> Collection[str]:
 def compute_hand_clearance(scene: Scene, hold: Hold, link: str, options: Options) -> float:
     """Return the clearance that the grasping links keep from a link of the grasped object [m].
 
-    It applies during the grasp and shortly before and after.
+    It applies during the grasp and shortly before and after. It is negative where a measured grasp
+    overlaps the link.
     """
     attachment = _get_attachment(scene, hold)
     if (hold.by or attachment.contact == "push") and link == find_grasped_link(scene, hold):
-        return 0.0
-    return min(
-        options.grasp_clearance if attachment.clearance is None else attachment.clearance,
-        options.dist_safe,
-    )
+        nominal = 0.0
+    else:
+        own = options.grasp_clearance if attachment.clearance is None else attachment.clearance
+        nominal = min(own, options.dist_safe)
+    if not hold.deviation:
+        return nominal
+    measured = _measure_hand_distances(scene, hold).get(link, np.inf)
+    return min(nominal, measured - CONTACT_DEPTH)
 
 
-def compute_hand_frame(robot: Robot, attachment: Attachment) -> pin.SE3:
-    """Return the frame that is brought to an attachment, in the tool frame.
+def _measure_hand_distances(scene: Scene, hold: Hold) -> Mapping[str, float]:
+    """Return link → distance of the grasping links in a measured grasp of the scene's start [m].
 
-    It is the tool frame itself, or, for a push, the foremost point of the hand.
+    The distance is the smaller one of those at the start and in the grasp, if they differ.
     """
-    if attachment.contact != "push":
-        return pin.SE3.Identity()
-    return robot.opened(robot.opening(attachment.opening)).front
+    (own,) = (one for one in scene.holds if one == hold)
+    placed, links = scene.objects[hold.object], find_touch_links(scene, hold)
+    key = (hold, own.at, scene.start.tobytes(), make_state_key(placed))
+    return get_cached(scene, key, lambda: _compute_hand_distances(scene, own, placed, links))
+
+
+def _compute_hand_distances(
+    scene: Scene, hold: Hold, placed: PlacedObject, links: Collection[str]
+) -> Mapping[str, float]:
+    if hold.by is not None:  # such an object is placed in the hand
+        hand = [
+            shape
+            for shape in make_world_shapes(scene.objects[hold.by.object])
+            if f"{hold.by.object}.{get_link_name(shape.name)}" in links
+        ]
+        hands = list_placed_shapes(hand)
+    else:
+        attachment, robot = get_attachment(scene.objects, hold), scene.robot
+        grasp = placed.link_placement(attachment.link) * attachment.tool(hold.at)
+        grasp = grasp * compute_hand_frame(robot, attachment).inverse()
+        to_grasp = grasp * scene.tool_placement().inverse()
+        geometry = robot.opened(compute_grasp_opening(scene, hold)).collision
+        data, shapes = robot.model.createData(), geometry.createData()
+        pin.updateGeometryPlacements(
+            robot.model, data, geometry, shapes, robot.coordinates.q(scene.start)
+        )
+        hands = [
+            (geometry.geometryObjects[i].geometry, moved * shapes.oMg[i])
+            for i in range(len(shapes.oMg))
+            if robot.link_of(i) in links
+            for moved in (pin.SE3.Identity(), to_grasp)
+        ]
+    found: dict[str, list[pin.GeometryObject]] = {}
+    for shape in make_world_shapes(placed):
+        found.setdefault(f"{hold.object}.{get_link_name(shape.name)}", []).append(shape)
+    return {
+        label: compute_clearance(hands, list_placed_shapes(shapes))
+        for label, shapes in found.items()
+    }
 
 
 def is_rigid_grasp(scene: Scene, hold: Hold) -> bool:

@@ -15,22 +15,29 @@ import pinocchio as pin
 from vkc_pin.errors import InputError, UnknownNameError, format_value
 from vkc_pin.utils.arguments import (
     check_array,
+    check_finite_array,
     check_instance,
     check_list,
     check_mapping,
     check_text,
 )
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.pickling import freeze
+from vkc_pin.world.models.articulated_object import Attachment
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import clamp_to_limits, compute_clearance, list_placed_shapes
+from vkc_pin.world.scene.measured_grasp import apply_deviation, check_deviation, fit_grasp
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 
 __all__ = [
     "Hold",
     "Solids",
     "check_hold_order",
+    "compute_tool_placement",
     "find_reversed_approaches",
+    "get_attachment",
     "make_holds",
+    "measure_grasp",
     "place_held_objects",
     "resolve_holds",
     "warn_of_openings",
@@ -50,7 +57,8 @@ MAX_HELD = 50
 class Hold:
     """An object held at one of its attachments, by the robot's tool or through another held object.
 
-    Holds are equal if object, attachment and grasping frame are equal, regardless of `at`.
+    Holds are equal if object, attachment, grasping frame and deviation are equal, regardless of
+    `at`.
 
     Attributes:
         object: Its name in the scene.
@@ -59,6 +67,8 @@ class Hold:
         link: Link of that object which replaces the tool frame.
         at: Values of the attachment's freedoms at the start of a scene that has this hold, [m] and
             [rad]; empty elsewhere.
+        deviation: Measured pose of the grasping frame, in the frame that is nominal for the
+            attachment at `at`: x, y, z [m] and rotation vector [rad]; empty for a nominal grasp.
     """
 
     object: str
@@ -66,6 +76,7 @@ class Hold:
     by: Hold | None = None
     link: str | None = None
     at: tuple[float, ...] = field(default=(), compare=False)
+    deviation: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("object", "attachment", "link"):
@@ -76,11 +87,28 @@ class Hold:
         object.__setattr__(
             self, "at", tuple(check_array(self.at, "Hold.at", "a list of numbers").ravel().tolist())
         )
+        deviation = check_finite_array(self.deviation, "Hold.deviation").ravel()
+        if deviation.size not in (0, 6):
+            expected = "x, y, z [m] and a rotation vector [rad]"
+            raise InputError(
+                "wrong number of values",
+                field="Hold.deviation",
+                expected=expected,
+                got=deviation.size,
+            )
+        check_deviation(deviation, "Hold.deviation")
+        object.__setattr__(self, "deviation", tuple(deviation.tolist()))
 
     @property
     def frame(self) -> str | None:
         """Label of the grasping frame, "<object>.<link>"; None: the tool frame."""
         return f"{self.by.object}.{self.link}" if self.by else None
+
+    @property
+    def nominal(self) -> Hold:
+        """The same hold, and those it depends on, without `at` and `deviation`."""
+        by = None if self.by is None else self.by.nominal
+        return Hold(self.object, self.attachment, by, self.link)
 
     def __str__(self) -> str:
         return f"{self.object}.{self.attachment}" + (f" by {self.frame}" if self.by else "")
@@ -90,6 +118,7 @@ def make_holds(
     held: Mapping[str, str],
     by: Mapping[str, str] | None = None,
     at: Mapping[str, Sequence[float]] | None = None,
+    deviation: Mapping[str, Sequence[float]] | None = None,
 ) -> tuple[Hold, ...]:
     """Return the holds that mappings describe, as in files, each after the one it depends on.
 
@@ -97,17 +126,18 @@ def make_holds(
         held: Object → attachment.
         by: Object → "<object>.<link>", for objects that the tool itself does not hold.
         at: Object → values of its attachment's freedoms, [m] and [rad].
+        deviation: Object → deviation of its grasp, see `Hold`.
     """
     held = check_mapping(held, "held", "object names, each with that of an attachment")
-    by, at = (
-        check_mapping({} if by is None else by, "by"),
-        check_mapping({} if at is None else at, "at"),
+    by, at, deviation = (
+        check_mapping({} if given is None else given, field_name)
+        for field_name, given in (("by", by), ("at", at), ("deviation", deviation))
     )
     if len(held) > MAX_HELD:
         raise InputError(
             "too many objects are held", field="held", expected=f"at most {MAX_HELD}", got=len(held)
         )
-    for field_name, names in (("by", by), ("at", at)):
+    for field_name, names in (("by", by), ("at", at), ("deviation", deviation)):
         for name in names:
             if name not in held:
                 raise UnknownNameError("held object", name, held, field=field_name)
@@ -135,7 +165,8 @@ def make_holds(
                 if owner not in held:
                     raise UnknownNameError("held object", owner, held, field="by")
                 holder = find(owner, (*above, name))
-            found[name] = Hold(name, held[name], holder, link, at.get(name, ()))
+            details = at.get(name, ()), deviation.get(name, ())
+            found[name] = Hold(name, held[name], holder, link, *details)
         return found[name]
 
     for name in held:
@@ -156,17 +187,50 @@ def check_hold_order(holds: Iterable[Hold]) -> tuple[Hold, ...]:
     return holds
 
 
-def resolve_holds(objects: Mapping[str, PlacedObject], holds: Iterable[Hold]) -> tuple[Hold, ...]:
-    """Return holds checked against the objects, with values for all freedoms (default 0)."""
+def get_attachment(objects: Mapping[str, PlacedObject], hold: Hold) -> Attachment:
+    """Return the attachment of a hold, with the hold's deviation."""
+    return apply_deviation(objects[hold.object].object.attachment(hold.attachment), hold.deviation)
+
+
+def compute_tool_placement(robot: Robot, start: Floats) -> pin.SE3:
+    """Return the placement of the tool frame in the world at a configuration, shape (n,)."""
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(start))
+    return data.oMf[robot.model.getFrameId(robot.tool_frame)].copy()
+
+
+def measure_grasp(
+    objects: Mapping[str, PlacedObject], hold: Hold, tool: Callable[[], pin.SE3]
+) -> pin.SE3:
+    """Return where an attachment's frame is in the grasping frame, as the objects are placed."""
+    grasp = objects[hold.object].object.attachment(hold.attachment)
+    holder = objects[hold.by.object].link_placement(str(hold.link)) if hold.by else tool()
+    return holder.actInv(objects[hold.object].link_placement(grasp.link) * grasp.placement)
+
+
+def resolve_holds(
+    objects: Mapping[str, PlacedObject],
+    holds: Iterable[Hold],
+    robot: Robot,
+    measured: Mapping[str, pin.SE3] | None = None,
+) -> tuple[Hold, ...]:
+    """Return holds checked against the objects, with values for all freedoms.
+
+    Args:
+        objects: Name → object.
+        holds: Holds, each after the one it depends on.
+        robot: Robot.
+        measured: Object → measured placement of the attachment's frame in the grasping frame.
+            Freedoms without given values are those nearest to it, otherwise 0.
+    """
+    measured = {} if measured is None else measured
     found: dict[Hold, Hold] = {}
     for hold in check_hold_order(holds):
         if hold.object not in objects:
             raise UnknownNameError("object", hold.object, objects, field="held")
-        where, freedoms = (
-            f"held.{hold.object}.at",
-            objects[hold.object].object.attachment(hold.attachment).freedoms,
-        )
-        values = hold.at or (0.0,) * len(freedoms)
+        attachment = objects[hold.object].object.attachment(hold.attachment)
+        where, freedoms = f"held.{hold.object}.at", attachment.freedoms
+        values, deviation = hold.at or (0.0,) * len(freedoms), hold.deviation
         if len(values) != len(freedoms):
             raise InputError(
                 "wrong number of values",
@@ -176,6 +240,14 @@ def resolve_holds(objects: Mapping[str, PlacedObject], holds: Iterable[Hold]) ->
             )
         for value, freedom in zip(values, freedoms, strict=True):
             clamp_to_limits(value, freedom.lower, freedom.upper, where)
+        if hold.object in measured:
+            values, deviation = fit_grasp(
+                robot,
+                attachment,
+                measured[hold.object],
+                hold.at or None,
+                f"held.{hold.object}.measured",
+            )
         if hold.by is not None:
             objects[hold.by.object].link_placement(str(hold.link))
             if not (objects[hold.object].object.free and objects[hold.by.object].object.free):
@@ -183,9 +255,8 @@ def resolve_holds(objects: Mapping[str, PlacedObject], holds: Iterable[Hold]) ->
                     "only a free object can be held through another, and only through a free one"
                 )
                 raise InputError(problem, field=f"held.{hold.object}.by", got=hold.frame)
-        found[hold] = dataclasses.replace(
-            hold, at=values, by=None if hold.by is None else found[hold.by]
-        )
+        by = None if hold.by is None else found[hold.by]
+        found[hold] = dataclasses.replace(hold, at=values, by=by, deviation=deviation)
     return tuple(found.values())
 
 
@@ -197,7 +268,7 @@ def place_held_objects(
     for hold in holds:
         one = placed[hold.object]
         if one.object.free:
-            grasp = one.object.attachment(hold.attachment)
+            grasp = get_attachment(objects, hold)
             in_object = one.object.link_placement(grasp.link, one.state) * grasp.tool(hold.at)
             holder = placed[hold.by.object].link_placement(str(hold.link)) if hold.by else tool()
             placed[hold.object] = dataclasses.replace(one, placement=holder * in_object.inverse())

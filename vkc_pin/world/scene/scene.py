@@ -30,8 +30,11 @@ from vkc_pin.world.models.shapes import clamp_to_limits, compute_clearance, list
 from vkc_pin.world.scene.clearance_exemptions import warn_of_overlaps
 from vkc_pin.world.scene.hold import (
     Hold,
+    check_hold_order,
+    compute_tool_placement,
     find_reversed_approaches,
     make_holds,
+    measure_grasp,
     place_held_objects,
     resolve_holds,
     warn_of_openings,
@@ -215,20 +218,81 @@ class Scene:
         *,
         by: Mapping[str, str] | None = None,
         at: Mapping[str, Sequence[float]] | None = None,
+        measured: Mapping[str, Any] | None = None,
     ) -> Scene:
         """Return the scene with the robot holding objects at the start.
+
+        The virtual joint of a measured grasp is the measured transform; `with_measured_grasp`
+        derives it from measured positions. After its release the nominal attachment applies.
 
         Args:
             held: Object → attachment; or complete holds, each after the one it depends on.
             by: Object → "<object>.<link>", for objects held through another object of `held`.
-            at: Object → values of its attachment's freedoms, [m] and [rad]; default 0.
+            at: Object → values of its attachment's freedoms, [m] and [rad]; default 0, or those
+                nearest to the measured grasp.
+            measured: Object → measured placement of the attachment's frame (that of its
+                description) in the tool frame, or in the frame `by`; see `as_placement`.
 
         Raises:
             UnknownNameError: There is no such object, attachment or link.
-            InputError: Values do not fit the attachment's freedoms, or objects hold each other.
+            InputError: Values do not fit the attachment's freedoms, objects hold each other, or a
+                measured grasp is more than 20 mm or 0.2 rad from its attachment.
         """
-        holds = make_holds(held, by, at) if isinstance(held, Mapping) else held
-        return self._with(holds=resolve_holds(self.objects, holds))
+        holds = check_hold_order(make_holds(held, by, at) if isinstance(held, Mapping) else held)
+        poses = check_mapping({} if measured is None else measured, "measured")
+        for name in poses:
+            names = [hold.object for hold in holds]
+            check_choice(name, names, "held object", f"measured.{name}")
+        poses = {name: as_placement(pose, name=f"measured.{name}") for name, pose in poses.items()}
+        return self._with(holds=resolve_holds(self.objects, holds, self.robot, poses))
+
+    def with_measured_grasp(
+        self,
+        name: str,
+        attachment: str | None = None,
+        *,
+        base: ArrayLike | None = None,
+        arm: ArrayLike | None = None,
+        state: Mapping[str, float] | None = None,
+        placement: Any = None,
+    ) -> Scene:
+        """Return the scene as measured, with the robot holding an object where its hand is.
+
+        Other objects stay held.
+
+        Args:
+            name: Object.
+            attachment: Grasped attachment. Default: the one that is held, or else the first.
+            base: Measured x, y [m] and yaw [rad] of the base, shape (3,); None keeps them.
+            arm: Measured arm joints [rad], shape (n - 3,); None keeps them.
+            state: Measured joints of the object, [rad] or [m]; the others keep their values.
+            placement: Measured placement of the object's base link in the world, see
+                `as_placement`; None keeps it.
+
+        Raises:
+            UnknownNameError: There is no such object, attachment or joint.
+            InputError: A value is invalid, or the hand is more than 20 mm or 0.2 rad from the
+                attachment.
+        """
+        placed = self._find_object(name)
+        if placement is not None:
+            pose = as_placement(placement, name="placement")
+            placed = dataclasses.replace(placed, placement=pose)
+        placed = placed.with_state({} if state is None else state)
+        before = next((hold for hold in self.holds if hold.object == name), None)
+        if attachment is None and before is not None:
+            attachment = before.attachment
+        grasp = placed.object.attachment(attachment)
+        by, link = (None, None) if before is None else (before.by, before.link)
+        hold = Hold(name, grasp.name, by, link)
+        moved = self.with_start(base, arm)
+        objects = freeze({**moved.objects, name: placed})
+        measured = {name: measure_grasp(objects, hold, moved.tool_placement)}
+        holds = [_replace_hold(one, before, hold) for one in self.holds]
+        holds += [hold] if before is None else []
+        return moved._with(
+            objects=objects, holds=resolve_holds(objects, holds, self.robot, measured)
+        )
 
     def with_approaches(self, holds: Iterable[Hold], *, stacklevel: int = 2) -> Scene:
         """Return the scene with those attachments reversed that cannot be approached otherwise.
@@ -273,10 +337,7 @@ class Scene:
 
     def tool_placement(self) -> pin.SE3:
         """Return the placement of the robot's tool frame in the world frame at the start."""
-        model = self.robot.model
-        data = model.createData()
-        pin.framesForwardKinematics(model, data, self.robot.coordinates.q(self.start))
-        return data.oMf[model.getFrameId(self.robot.tool_frame)].copy()
+        return compute_tool_placement(self.robot, self.start)
 
     def start_clearance(self, *, reach: float = np.inf) -> float:
         """Return the smallest distance between robot and world at the start [m].
@@ -348,6 +409,15 @@ class Scene:
         problem = f"no collision-free start of the robot in {_MAX_TRIES} attempts"
         expected = f"a clearance of {START_CLEARANCE} m somewhere"
         raise InputError(problem, file=file, field="start_region", expected=expected)
+
+
+def _replace_hold(one: Hold, before: Hold | None, hold: Hold) -> Hold:
+    """Return a hold with `before` replaced, be it the hold itself or one it depends on."""
+    if one == before:
+        return hold
+    return (
+        one if one.by is None else dataclasses.replace(one, by=_replace_hold(one.by, before, hold))
+    )
 
 
 def load_scene(name_or_path: str | Path) -> Scene:

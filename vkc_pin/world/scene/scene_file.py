@@ -24,7 +24,16 @@ from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.models.shapes import clamp_to_limits
 from vkc_pin.world.scene import scene_schema as schema
-from vkc_pin.world.scene.hold import Hold, make_holds, resolve_holds
+from vkc_pin.world.scene.hold import (
+    Hold,
+    compute_tool_placement,
+    get_attachment,
+    make_holds,
+    measure_grasp,
+    place_held_objects,
+    resolve_holds,
+)
+from vkc_pin.world.scene.measured_grasp import compute_measured_pose
 from vkc_pin.world.scene.obstacles import FLOOR, make_floor_shape, make_obstacle_shapes
 from vkc_pin.world.scene.placed_object import PlacedObject
 
@@ -51,12 +60,13 @@ def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         obstacles.append(make_floor_shape(arena))
         labels.append(FLOOR)
     _check_within_arena(document, description, arena)
+    start = _make_start(document, description.start, robot)
     return {
         "name": description.name or (document.file.stem if document.file else "scene"),
         "file": document.file,
         "folder": folder,
         "robot": robot,
-        "start": _make_start(document, description.start, robot),
+        "start": start,
         "objects": freeze(objects),
         "obstacles": tuple(obstacles),
         "obstacle_labels": tuple(labels),
@@ -65,7 +75,7 @@ def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         "floor": description.floor,
         "arena": arena,
         "start_region": description.start_region,
-        "holds": _make_holds(document, description.start.held, objects),
+        "holds": _make_holds(document, description.start.held, objects, robot, start),
         "allowed": freeze(_find_allowed_pairs(document, description, folder, robot, objects)),
         "described": description,
         "opening": description.start.opening,
@@ -89,11 +99,16 @@ def make_document(fields: Mapping[str, Any]) -> dict[str, Any]:
     )
     held = {}
     for hold in fields["holds"]:
-        entries = {
+        entries: dict[str, Any] = {
             "attachment": hold.attachment,
             "by": hold.frame,
             "at": list(hold.at) if any(hold.at) else None,
         }
+        if hold.deviation:
+            grasp = get_attachment(objects, hold)
+            pose = pin.SE3ToXYZQUAT(compute_measured_pose(fields["robot"], grasp, hold.at))
+            entries["at"] = list(hold.at) or None
+            entries["measured"] = {"position": pose[:3].tolist(), "quaternion": pose[3:].tolist()}
         held[hold.object] = {key: value for key, value in entries.items() if value is not None}
     for item, entry in zip(described.objects, plain["objects"], strict=True):
         placed = objects[item.name]
@@ -212,7 +227,11 @@ def _make_start(document: Document, item: schema.StartSchema, robot: Robot) -> F
 
 
 def _make_holds(
-    document: Document, held: Mapping[str, schema.HeldSchema], objects: Mapping[str, PlacedObject]
+    document: Document,
+    held: Mapping[str, schema.HeldSchema],
+    objects: Mapping[str, PlacedObject],
+    robot: Robot,
+    start: Floats,
 ) -> tuple[Hold, ...]:
     attachments = {name: item.attachment for name, item in held.items()}
     by = {name: item.by for name, item in held.items() if item.by is not None}
@@ -228,9 +247,36 @@ def _make_holds(
                 {name: by[name]} if name in by else {},
                 {name: at[name]} if name in at else {},
             )
-            resolve_holds(objects, make_holds(both, through, values))
+            resolve_holds(objects, make_holds(both, through, values), robot)
     with document.annotate_errors(("start", "held")):
-        return resolve_holds(objects, make_holds(attachments, by, at))
+        holds = make_holds(attachments, by, at)
+        found = resolve_holds(objects, holds, robot)
+    measured = _find_measured_poses(held, found, objects, robot, start)
+    for name in measured:
+        with document.annotate_errors(("start", "held", name, "measured")):
+            found = resolve_holds(objects, holds, robot, {name: measured[name]})
+    return resolve_holds(objects, holds, robot, measured) if measured else found
+
+
+def _find_measured_poses(
+    held: Mapping[str, schema.HeldSchema],
+    holds: Iterable[Hold],
+    objects: Mapping[str, PlacedObject],
+    robot: Robot,
+    start: Floats,
+) -> dict[str, pin.SE3]:
+    """Return the stated or derived placements of attachments in the grasping frames."""
+    tool = functools.partial(compute_tool_placement, robot, start)
+    derived = {name for name, item in held.items() if item.measured == "derive"}
+    now = place_held_objects(objects, tool, [one for one in holds if one.object not in derived])
+    found = {}
+    for hold in holds:
+        stated = held[hold.object].measured
+        if stated is not None:
+            found[hold.object] = (
+                measure_grasp(now, hold, tool) if stated == "derive" else _make_pose(stated)
+            )
+    return found
 
 
 def _find_allowed_pairs(

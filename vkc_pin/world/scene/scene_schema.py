@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.fields import (
@@ -100,6 +100,14 @@ def _parse_heading(value: Any) -> Any:
     if isinstance(value, str) and value != "any":
         raise make_validation_error(f"unknown heading '{value}'", "any, or [lowest, highest]")
     return None if value == "any" else value
+
+
+def _parse_measured(value: Any) -> Any:
+    if value != "derive" and not isinstance(value, dict | PoseSchema):
+        raise make_validation_error(
+            "wrong value", "derive, or a pose such as {position: [0, 0, 0]}"
+        )
+    return value
 
 
 Fraction = Annotated[Number, Field(ge=0.0, le=1.0)]
@@ -226,12 +234,23 @@ class SceneRobotSchema(Schema):
     tool_frame: str | None = None
 
 
+_Measured = Annotated[
+    Annotated[PoseSchema, Tag("pose")] | Annotated[Literal["derive"], Tag("derive")],
+    Discriminator(lambda value: "derive" if value == "derive" else "pose"),
+]
+
+
 class HeldSchema(Schema):
-    """A hold: attachment, frame that grasps, and values of the attachment's freedoms."""
+    """A hold: attachment, frame that grasps, and values of the attachment's freedoms.
+
+    `measured` is the measured pose of the attachment's frame in the grasping frame, or "derive":
+    that of robot and object as the scene places them.
+    """
 
     attachment: str
     by: str | None = None
     at: tuple[Number, ...] | None = None
+    measured: Annotated[_Measured, BeforeValidator(_parse_measured)] | None = None
 
 
 class StartSchema(Schema):

@@ -245,13 +245,15 @@ def find_driven_coordinates(scene: Scene, hold: Hold) -> list[str]:
 
 
 def find_shared_coordinate(scene: Scene, holds: Iterable[Hold]) -> str | None:
-    """Return a coordinate that two of the holds move, or None.
+    """Return a coordinate that two of the holds have, of a joint or of a grasp, or None.
 
     Such holds cannot be part of the same kinematic chain.
     """
     driven = set[str]()
     for hold in holds:
-        own = find_driven_coordinates(scene, hold)
+        attachment = scene.objects[hold.object].object.attachments[hold.attachment]
+        freedoms = [f"{hold.object}.{name}" for name in attachment.coordinates]
+        own = [*find_driven_coordinates(scene, hold), *freedoms]
         if not driven.isdisjoint(own):
             return next(name for name in own if name in driven)
         driven.update(own)

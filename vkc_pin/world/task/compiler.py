@@ -160,8 +160,10 @@ class _Compiler:
         attachment = find_attachment(placed, attachment_name or earlier, f"{where}.attachment")
         through = self._find_holder(by, name, f"{where}.by") if by is not None else None
         hold = Hold(name, attachment.name, *(through or (None, None)))
-        if hold in self.held:
-            return hold
+        if (
+            same := next((one for one in self.held if one.nominal == hold.nominal), None)
+        ) is not None:
+            return same
         if (held := self._find_hold(name)) is not None and placed.object.free:
             raise InputError(
                 f"'{name}' is held already, as {held}",

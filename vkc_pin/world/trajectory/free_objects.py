@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.scene.hold import get_attachment
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.scene.support import find_supported_objects
@@ -129,7 +130,7 @@ class FreeObjects:
                 carrier = self.scene.objects[hold.by.object]
                 link = carrier.object.link_placement(str(hold.link), carrier.state)
                 holders = [placement * link for placement in found[hold.by.object]]
-            attachment = placed.object.attachment(hold.attachment)
+            attachment = get_attachment(self.scene.objects, hold)
             grasped = placed.object.link_placement(attachment.link, placed.state)
             names = [f"{hold.object}.{name}" for name in attachment.coordinates]
             freedom = values[:, [self.trajectory.names.index(name) for name in names]]

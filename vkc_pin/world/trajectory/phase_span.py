@@ -52,7 +52,10 @@ class PhaseSpan:
         return {hold.object: hold.attachment for hold in self.holds}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data; `by` maps objects held through another to its "<object>.<link>"."""
+        """Return plain data; `by` maps objects held through another to its "<object>.<link>".
+
+        `deviation` maps objects to that of their holds, if there is any.
+        """
         by = {hold.object: hold.frame for hold in self.holds if hold.by}
         data = {
             "name": self.name,
@@ -61,7 +64,9 @@ class PhaseSpan:
             "held": self.held,
             "by": by,
         }
-        return data if self.opening is None else {**data, "opening": self.opening}
+        deviation = {hold.object: list(hold.deviation) for hold in self.holds if hold.deviation}
+        more = {"deviation": deviation or None, "opening": self.opening}
+        return data | {name: value for name, value in more.items() if value is not None}
 
     @classmethod
     def from_dict(cls, data: Any, where: str) -> PhaseSpan:
@@ -71,7 +76,9 @@ class PhaseSpan:
             InputError: A field is missing or invalid.
         """
         phase = check_mapping(data, where)
-        held = make_holds(get_required(phase, "held"), phase.get("by"))
+        held = make_holds(
+            get_required(phase, "held"), phase.get("by"), deviation=phase.get("deviation")
+        )
         name, first, last = (get_required(phase, key) for key in ("name", "first", "last"))
         return cls(name, first, last, held, phase.get("opening"))
 

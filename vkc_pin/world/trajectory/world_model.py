@@ -196,38 +196,46 @@ def _compute_finger_positions(
     return np.column_stack([np.interp(times, moments, column) for column in np.array(values).T])
 
 
-def compute_final_scene(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> Scene:
-    """Compute the scene at the end of a motion."""
-    last = dict(zip(trajectory.names, trajectory.positions[-1].tolist(), strict=True))
+def make_scene_at(scene: Scene, world: World, row: Floats, values: Mapping[str, float]) -> Scene:
+    """Return a scene in which robot and objects are elsewhere, and nothing is held.
 
-    def end(coordinate: str, lower: float, upper: float) -> float:
-        return float(np.clip(last[coordinate], lower, upper))
-
-    robot = np.clip(
-        trajectory.positions[-1, : trajectory.robot_size], scene.robot.lower, scene.robot.upper
-    )
+    Args:
+        scene: Scene.
+        world: The scene as one tree.
+        row: World coordinates with the placements of free objects, shape (n,).
+        values: Coordinates of the robot, and of joints of objects; clipped to their limits.
+    """
+    robot = np.array([values[name] for name in scene.robot.coordinates.names])
+    robot = np.clip(robot, scene.robot.lower, scene.robot.upper)
     robot[:2] = np.clip(robot[:2], scene.arena[::2], scene.arena[1::2])
     after = scene.with_held({}).with_start(base=robot[:3], arm=robot[3:])
-    world = World(scene)
-    (row,) = world.compute_positions(trajectory, trajectory.times[-1:])
     for name, placed in scene.objects.items():
         item = placed.object
         if item.free:
             after = after.with_placement(name, world.get_placement(name, row))
         joints = zip(item.coordinates.names, item.lower, item.upper, strict=True)
         state = {
-            joint: end(f"{name}.{joint}", low, high)
+            joint: float(np.clip(values[f"{name}.{joint}"], low, high))
             for joint, low, high in joints
-            if f"{name}.{joint}" in last
+            if f"{name}.{joint}" in values
         }
         if state:
             after = after.with_state(name, state)
-    held = []
+    return after
+
+
+def compute_final_scene(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> Scene:
+    """Compute the scene at the end of a motion."""
+    last = dict(zip(trajectory.names, trajectory.positions[-1].tolist(), strict=True))
+    world = World(scene)
+    (row,) = world.compute_positions(trajectory, trajectory.times[-1:])
+    after, held = make_scene_at(scene, world, row, last), []
     for hold in holds:
         attachment = scene.objects[hold.object].object.attachment(hold.attachment)
         freedoms = zip(attachment.coordinates, attachment.freedoms, strict=True)
         at = tuple(
-            end(f"{hold.object}.{name}", freedom.lower, freedom.upper) for name, freedom in freedoms
+            float(np.clip(last[f"{hold.object}.{name}"], freedom.lower, freedom.upper))
+            for name, freedom in freedoms
         )
         held.append(dataclasses.replace(hold, at=at))
     return dataclasses.replace(after.with_held(held), opening=trajectory.phases[-1].opening)

@@ -9,8 +9,8 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.scene.contact_rules import compute_hand_frame
-from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.hold import Hold, get_attachment
+from vkc_pin.world.scene.measured_grasp import compute_hand_frame
 from vkc_pin.world.scene.scene import Scene
 
 __all__ = ["Handle", "Loads"]
@@ -37,7 +37,7 @@ class Handle:
     def __init__(self, scene: Scene, hold: Hold, loads: Loads = ()) -> None:
         self.name, self.placed = hold.object, scene.objects[hold.object]
         item = self.placed.object
-        self.attachment = item.attachment(hold.attachment)
+        self.attachment = get_attachment(scene.objects, hold)
         self.point = compute_hand_frame(scene.robot, self.attachment)
         own, loaded = pin.Model(item.model), pin.Model(item.model)
         for joint, inertia in loads:
@@ -97,7 +97,7 @@ class Handle:
             else:
                 origin = origin + axis * value[:, None]
                 axes.append((axis, None))
-        points = origin - at.standoff * rotation[..., 2]
+        points = origin + rotation @ at.offset.translation
         directions = np.zeros((len(turns), 0 if at.firm or at.contact == "push" else len(axes), 6))
         for k, (axis, center) in enumerate(axes[: directions.shape[1]]):
             directions[:, k, :3] = axis if center is None else np.cross(axis, points - center)

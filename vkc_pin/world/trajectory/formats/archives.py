@@ -136,6 +136,7 @@ class _Phase(Schema):
     held: Named
     by: Named = Field(default_factory=dict)
     opening: Measured | None = None
+    deviation: dict[str, Annotated[list[Finite], Field(min_length=6, max_length=6)]] | None = None
 
 
 class MotionSchema(Schema):

@@ -91,10 +91,10 @@ def write_csv(
     for time, waypoint, values in _list_rows(motion, columns):
         number += waypoint > phases[number]["last"]
         phase = phases[number]
-        held = {
-            name: [at, phase["by"][name]] if name in phase["by"] else at
-            for name, at in phase["held"].items()
-        }
+        held, deviation = dict(phase["held"]), phase.get("deviation") or {}
+        for name in phase["by"].keys() | deviation.keys():
+            own = [deviation[name]] if name in deviation else []
+            held[name] = [held[name], phase["by"].get(name), *own]
         if has_openings:
             opening = phase.get(_OPENING)
             openings = ["" if opening is None else repr(float(opening))]
@@ -306,8 +306,10 @@ def _add_phase(
         return
     try:
         items = json.loads(held).items()
-        at = {name: hold if isinstance(hold, str) else hold[0] for name, hold in items}
-        by = {name: hold[1] for name, hold in items if not isinstance(hold, str)}
+        rows = {name: [hold, None] if isinstance(hold, str) else hold for name, hold in items}
+        at = {name: row[0] for name, row in rows.items()}
+        by = {name: row[1] for name, row in rows.items() if row[1] is not None}
+        deviation = {name: row[2] for name, row in rows.items() if len(row) > 2}
     except (ValueError, AttributeError, TypeError, LookupError, RecursionError):
         problem, expected = "not the held objects", 'JSON such as {"door": "handle"}'
         raise InputError(
@@ -319,4 +321,5 @@ def _add_phase(
             got=format_value(held),
         ) from None
     first = max(row - 1, 0)
-    phases.append({"name": name, "first": first, "last": row, "held": at, "by": by, **opening})
+    details = {"held": at, "by": by, **({"deviation": deviation} if deviation else {}), **opening}
+    phases.append({"name": name, "first": first, "last": row, **details})

@@ -1,0 +1,87 @@
+"""Tests plans that go on from a measured grasp, and how they are validated and saved."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.drawers import make_grasping_scene
+
+import vkc_pin as vkc
+from vkc_pin.errors import InputError
+from vkc_pin.world.trajectory.trajectory import Trajectory
+
+PULL = vkc.Actuate("drawer", {"slide": 0.2})
+
+
+def make_start(off: float) -> vkc.Scene:
+    """Return the drawer's scene with a base that is `off` from where the hand is at the handle."""
+    scene = make_grasping_scene()
+    return scene.with_start(base=scene.start[:3] + np.array([off, 0.0, 0.0]))
+
+
+@cache
+def plan_measured() -> vkc.Plan:
+    return vkc.plan(make_start(0.005).with_measured_grasp("drawer"), [PULL])
+
+
+def test_drawer_held_beside_its_handle_is_opened(tmp_path: Path) -> None:
+    plan, tool = plan_measured(), plan_measured().scene.tool_placement()
+    assert plan.success, plan.summary()
+    assert np.linalg.norm(plan.scene.holds[0].deviation) == pytest.approx(0.005, abs=1e-5)
+    end = plan.end_scene()
+    moved = end.tool_placement()  # as far as the drawer, which opens along −x
+    slide = end.objects["drawer"].state[0]
+    along = pin.SE3(np.eye(3), np.array([-slide, 0.0, 0.0]))
+    np.testing.assert_allclose((along * tool).homogeneous, moved.homogeneous, atol=1e-4)
+    assert end.holds == plan.scene.holds
+    loaded = vkc.Plan.load(plan.save(tmp_path / "plan.npz"))
+    assert loaded.success
+    assert loaded.scene.holds == plan.scene.holds
+
+
+def test_nominal_grasp_applies_after_the_release() -> None:
+    steps = [PULL, vkc.Release(), vkc.Actuate("drawer", {"slide": 0.1})]
+    plan = vkc.plan(plan_measured().scene, steps)
+    assert plan.success, plan.summary()
+    held = [phase.holds[0] for phase in plan.trajectory.phases if phase.holds]
+    assert held[0] == plan.scene.holds[0]
+    assert held[-1] == held[0].nominal != held[0]
+
+
+def test_grasp_step_of_a_measured_grasp_is_done() -> None:
+    plan = vkc.plan(plan_measured().scene, [vkc.Grasp("drawer"), PULL])
+    assert plan.success, plan.summary()
+
+
+def _replace_holds(plan: vkc.Plan, scene: vkc.Scene) -> Trajectory:
+    phases = tuple(
+        dataclasses.replace(phase, holds=scene.holds) for phase in plan.trajectory.phases
+    )
+    return dataclasses.replace(plan.trajectory, phases=phases)
+
+
+def test_motion_must_keep_the_grasp_of_its_scene() -> None:
+    plan, nominal = plan_measured(), make_start(0.005)
+    assert vkc.validate(plan.scene, [PULL], plan.trajectory).ok
+    other = vkc.validate(plan.scene, [PULL], _replace_holds(plan, nominal))
+    amounts = {one.constraint: one.amount for one in other.violations}
+    assert amounts["closure"] == pytest.approx(0.004, abs=1e-5)
+    with pytest.raises(InputError, match=r"phases\[0\].deviation.*drawer.handle"):
+        vkc.validate(nominal, [PULL], plan.trajectory)
+    closer = make_start(0.004).with_measured_grasp("drawer")
+    with pytest.raises(InputError, match=r"phases\[0\].deviation"):
+        vkc.validate(closer, [PULL], plan.trajectory)
+
+
+def test_unmeasured_grasp_is_infeasible_and_says_how_to_measure_it() -> None:
+    (near, far) = (vkc.plan(make_start(off), [PULL]) for off in (0.005, 0.03))
+    assert near.status == far.status == "infeasible"
+    assert "see Scene.with_measured_grasp" in near.summary()
+    assert "with_measured_grasp" not in far.summary()
+    with pytest.raises(InputError, match=r"expected within 20 mm and 0.2 rad, got 30.0 mm"):
+        make_start(0.03).with_measured_grasp("drawer")

@@ -47,7 +47,7 @@ ERROR = 0.02
 """Largest protrusion of pieces over the surface [m], about the clearance margin of motions."""
 PIECES = 12
 """Number of pieces of one mesh, unless cavities need more: planning time grows with it."""
-_VERSION = 2  # of the disk cache: increase it whenever the same mesh would be cut differently
+_VERSION = 3  # of the disk cache: increase it whenever the same mesh would be cut differently
 _CORNERS = 40  # largest number of vertices of a piece, as in the packaged collision geometry
 # Pieces are simplified only above this multiple of the vertex limit: simplifying takes a second.
 _CORNER_TOLERANCE = 1.5
@@ -64,7 +64,7 @@ _FREE_SHARE = 0.5  # of the error: pieces are merged up to this even if there ar
 _MERGE_SHARE = 0.8  # of the error: leaves room for what samples miss and for fewer vertices
 _EXTRA = 4  # multiple of `PIECES` up to which the error matters more than the number
 _MAX_PARTS = 64  # of a mesh before merging
-_MAX_TRIANGLES = 3000  # of a part while its best cut is sought
+_MAX_TRIANGLES = 600  # of a part while its best cut is sought
 _FACET_PLANES, _AXIS_PLANES = 10, 7  # candidate cuts: through facets, and across each axis
 # Costs of a merged hull besides its protrusion: of its mean thickness over the two, and of its size
 _VOLUME_COST, _SIZE_COST = 2.0, 0.02
@@ -317,16 +317,28 @@ class _Surface:
 _RANDOM = np.random.default_rng(0).random((400, 3))
 
 
+# Directions spread over the sphere, in which the outlines of smooth parts are taken
+_DIRECTIONS = np.random.default_rng(1).normal(size=(3, 128))
+
+
+def _choose_extremes(points: Floats) -> Floats:
+    """Return the points that are extreme in some direction, at most one for each."""
+    if len(points) <= _DIRECTIONS.shape[1]:
+        return points
+    return points[np.unique((points @ _DIRECTIONS).argmax(axis=0))]
+
+
 class _Hull:
     """Convex hull of a part of a mesh's surface.
 
     Attributes:
-        corners: Shape (k, 3) [m].
+        corners: Corners of the parts in it, shape (k, 3) [m].
+        outline: Those from which its measures are computed, shape (l, 3) [m].
         bounds: Corners of the box around it, shape (2, 3) [m].
         protrusion: Protrusion over the whole mesh [m].
     """
 
-    def __init__(self, points: Floats, surface: _Surface) -> None:
+    def __init__(self, points: Floats, surface: _Surface, corners: Floats | None = None) -> None:
         from scipy.spatial import ConvexHull, QhullError
 
         points = thicken(points, _FLATNESS)[0]
@@ -334,9 +346,11 @@ class _Hull:
             hull = ConvexHull(points)
         except QhullError:
             hull = ConvexHull(points, qhull_options="QJ Pp")
-        self.corners = points[hull.vertices]
+        found = points[hull.vertices]
+        self.corners = found if corners is None else corners
+        self.outline = _choose_extremes(found)
         self.volume, self.area = float(hull.volume), float(hull.area)
-        self.bounds = np.array([self.corners.min(axis=0), self.corners.max(axis=0)])
+        self.bounds = np.array([found.min(axis=0), found.max(axis=0)])
         triangles = points[hull.simplices]
         a, b, c = triangles.transpose(1, 0, 2)
         areas = np.linalg.norm(np.cross(b - a, c - a), axis=1).cumsum()
@@ -358,7 +372,11 @@ def _cut_mesh(mesh: trimesh.Trimesh, most_pieces: int | None, error: float) -> l
 
     @cache
     def unite(one: _Hull, other: _Hull) -> _Hull:
-        return _Hull(np.vstack([one.corners, other.corners]), surface)
+        outline, corners = (
+            np.vstack([getattr(hull, name) for hull in (one, other)])
+            for name in ("outline", "corners")
+        )
+        return _Hull(outline, surface, corners)
 
     few, most = (PIECES, _EXTRA * PIECES) if most_pieces is None else (most_pieces, most_pieces)
     for limit, least in (
@@ -445,9 +463,10 @@ def _find_cut(vertices: Floats, faces: Ints) -> tuple[Floats, float] | None:
         crossings = start + share * (end - start)
         volumes, sides = 0.0, int((heights[faces] == 0.0).all(axis=1).any())
         for above in (-heights, heights):
-            used = np.unique(faces[(above[faces] > 0.0).any(axis=1)])
-            used = used[above[used] >= 0.0]
-            sides += len(used) > 0
+            used = np.zeros(len(vertices), bool)
+            used[faces[(above[faces] > 0.0).any(axis=1)]] = True
+            used &= above >= 0.0
+            sides += bool(used.any())
             volumes += _compute_hull_volume(np.vstack([vertices[used], crossings]), flatness)
         value = (whole - volumes) / whole + bonus
         if sides > 1 and value > best:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import trimesh
@@ -58,3 +60,16 @@ def test_outer_hulls_contain_their_points(vertices: int) -> None:
     assert len(hull.vertices) <= vertices
     assert compute_excess(points, hull) < 1e-9
     assert 1.0 < hull.volume / tube.volume < (1.2 if vertices == 40 else 1.35)
+
+
+def test_outer_hulls_of_dense_meshes_need_little_memory() -> None:
+    """A ball of 40 962 corners has 81 920 facets, each of which could be compared with all."""
+    ball = trimesh.creation.icosphere(subdivisions=6, radius=0.1)
+    tracemalloc.start()
+    hull = compute_outer_hull(ball.vertices)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 300e6
+    assert len(hull.vertices) <= 40
+    assert compute_excess(ball.vertices, hull) < 1e-9
+    assert 1.0 < hull.volume / ball.volume < 1.2

@@ -24,6 +24,8 @@ _FLATNESS_RATIO = (
 )
 _MIN_CUT_DEPTH = 5e-4  # [m]: no cut takes away less
 _NUM_DIRECTIONS = 400  # of cuts, spread over the sphere
+_NUM_CUTS = 12  # deepest planes of which one is chosen
+_MAX_FACETS = 1000  # of a hull whose normals are all candidate cuts
 # Options of Qhull, tried in this order: scaled to the unit cube, unscaled, and joggled.
 _QHULL_OPTIONS = ("QbB Pp Qt", "Pp Qt", "Pp QJ")
 
@@ -86,8 +88,9 @@ def _orient_faces(hull: ConvexHull) -> trimesh.Trimesh:
 def compute_outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trimesh:
     """Return a convex polytope with few vertices that contains all points, up to 1e-9 m.
 
-    The box along the principal axes of the hull is cut repeatedly by the tangent plane of the hull
-    that lies deepest below one of the polytope's corners. Flat sets are thickened first.
+    The box along the principal axes of the hull is cut repeatedly by a tangent plane of the hull:
+    of those deepest below a corner of the polytope, by the one that cuts off most volume. Flat sets
+    are thickened first.
 
     Args:
         points: Shape (n, 3) [m].
@@ -96,7 +99,9 @@ def compute_outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trim
     hull = compute_hull(thicken(points)[0])
     corners = np.asarray(hull.vertices)
     normals = _sample_directions(hull)
-    offsets = (corners @ normals.T).max(axis=0)
+    offsets = np.concatenate(
+        [(corners @ some.T).max(axis=0) for some in np.array_split(normals, 1 + len(normals) // 64)]
+    )
     axes = np.linalg.eigh(np.cov(corners.T))[1].T
     found = []
     for frame in (np.eye(3), axes):
@@ -105,34 +110,60 @@ def compute_outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trim
         polytope = _intersect_half_spaces(chosen_normals, chosen_offsets, corners)
         for _ in range(4 * vertices):
             depth = (polytope.points @ normals.T).max(axis=0) - offsets
-            order = np.argsort(-depth)[:12]
-            trials = []
-            for k in order[depth[order] > _MIN_CUT_DEPTH]:
+            order = np.argsort(-depth)[:_NUM_CUTS]
+            order = order[depth[order] > _MIN_CUT_DEPTH]
+            cut_off = _compute_cut_volumes(polytope, normals[order], offsets[order])
+            for k in order[np.argsort(-cut_off, kind="stable")]:
                 planes = (
                     np.vstack([chosen_normals, normals[k]]),
                     np.append(chosen_offsets, offsets[k]),
                 )
                 trial = _intersect_half_spaces(*planes, corners)
                 if len(trial.vertices) <= vertices:
-                    trials.append((trial, planes))
-            if not trials:
+                    polytope, (chosen_normals, chosen_offsets) = trial, planes
+                    break
+            else:
                 break
-            polytope, (chosen_normals, chosen_offsets) = min(
-                trials, key=lambda trial: trial[0].volume
-            )
         found.append(polytope)
     return compute_hull(min(found, key=lambda polytope: polytope.volume).points)
 
 
 def _sample_directions(hull: trimesh.Trimesh) -> Floats:
-    """Return normals of candidate cuts: those of the hull, and some spread over the sphere."""
+    """Return normals of candidate cuts: those of the hull, and some spread over the sphere.
+
+    Of the many facets of a finely meshed hull, only the largest of each direction counts.
+    """
     k = np.arange(_NUM_DIRECTIONS) + 0.5
     z, turn = 1.0 - 2.0 * k / _NUM_DIRECTIONS, np.pi * (1.0 + 5.0**0.5) * k
     spread = np.stack(
         [np.sqrt(1.0 - z**2) * np.cos(turn), np.sqrt(1.0 - z**2) * np.sin(turn), z], axis=1
     )
-    _, first = np.unique(np.asarray(hull.face_normals).round(2), axis=0, return_index=True)
-    return np.vstack([np.asarray(hull.face_normals)[np.sort(first)], spread])
+    normals = np.asarray(hull.face_normals)
+    _, first = np.unique(normals.round(2), axis=0, return_index=True)
+    if len(first) > _MAX_FACETS:
+        normals = normals[np.argsort(-hull.area_faces, kind="stable")]
+        _, first = np.unique(normals.round(1), axis=0, return_index=True)
+    return np.vstack([normals[np.sort(first)], spread])
+
+
+def _compute_cut_volumes(polytope: ConvexHull, normals: Floats, offsets: Floats) -> Floats:
+    """Return the volumes of a polytope above planes, shape (k,) [m³].
+
+    They are sums of cones over the surface above a plane, with the apex in that plane.
+    """
+    corners = polytope.points[polytope.simplices]
+    areas = np.linalg.norm(np.cross(*(corners[:, 1:] - corners[:, :1]).transpose(1, 0, 2)), axis=1)
+    apexes = offsets[:, None] * normals
+    cones = -(apexes @ polytope.equations[:, :3].T + polytope.equations[:, 3]) * areas / 6.0
+    heights = np.einsum("ijk,lk->lij", corners, normals) - offsets[:, None, None]
+    low, middle, high = np.moveaxis(np.sort(heights, axis=2), 2, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        tip, foot = (
+            high**2 / ((high - low) * (high - middle)),
+            1.0 - low**2 / ((low - middle) * (low - high)),
+        )
+    share = np.where(middle <= 0.0, np.where(high > 0.0, tip, 0.0), np.where(low < 0.0, foot, 1.0))
+    return np.asarray((share * cones).sum(axis=1))
 
 
 def _intersect_half_spaces(

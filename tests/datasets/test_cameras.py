@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -52,7 +54,34 @@ def test_images_are_read_back(made: Dataset) -> None:
         thing = {name for name in images.segments if name.startswith(f"{episode.about['object']}.")}
         seen = {images.segments[k] for k in np.unique(images.pictures["wrist_segmentation"])}
         assert seen & thing  # the hand has hold of it
-    assert check_dataset(made.folder).ok
+
+
+def test_check_renders_images_again(made: Dataset, tmp_path: Path) -> None:
+    """Of three changed images and many others that are rendered again, it names those three."""
+    copy = tmp_path / "copy"
+    shutil.copytree(made.folder, copy, ignore=shutil.ignore_patterns("lerobot"))
+    with h5py.File(Dataset.open(copy).shards[0], "r+") as file:
+        demo = file["data/demo_0"]
+        number, last = int(demo.attrs["number"]), len(demo["dones"]) - 1
+        demo["obs/wrist_image"][0, :8] = 255 - demo["obs/wrist_image"][0, :8]
+        demo["obs/head_depth"][-1, :, :10] += 500
+        demo["obs/head_segmentation"][-1] = 999
+    found = check_dataset(copy)
+    assert not found.refused
+    assert "pixels rendered again and compared: episode 0 (samples 0, " in str(found)
+    names = [f"head_depth[{last}]", f"head_segmentation[{last}]", "wrist_image[0]"]
+    starts = [text.partition(" differ ")[0].split(" of the pixels of ") for text in found.problems]
+    assert [name for _, name in starts] == names
+    assert all(start.startswith(f"episode {number}: ") for start, _ in starts)
+
+
+def test_check_without_opengl_says_that_pixels_are_not_compared(
+    made: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(snapshots, "_CONTEXTS", ("no_such_context",))
+    found = check_dataset(made.folder)
+    assert found.ok, found.lines()
+    assert "pixels not compared: cannot render without a display" in str(found)
 
 
 def test_lerobot_layout_has_colour_images(made: Dataset) -> None:

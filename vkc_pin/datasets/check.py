@@ -18,14 +18,17 @@ from vkc_pin.datasets.diversity import (
     compute_winding_numbers,
     sample_coarse_trajectory,
 )
-from vkc_pin.datasets.episode import Episode, compute_scene_name
+from vkc_pin.datasets.episode import Episode, compute_scene_name, sample_times
 from vkc_pin.datasets.formats.hdf5 import Shard, open_shard, read_episodes, read_numbers
 from vkc_pin.datasets.formats.lerobot import find_differences
 from vkc_pin.datasets.problems import describe_problem, resolve_episode_terms
 from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
 from vkc_pin.datasets.statistics import make_statistics_page
 from vkc_pin.errors import VkcError, format_value
+from vkc_pin.simulation.cameras.images import Images, render_images
+from vkc_pin.simulation.execution import simulate
 from vkc_pin.utils.arguments import check_integer, is_number
+from vkc_pin.utils.arrays import Bools, Ints
 from vkc_pin.utils.parallel.engine import CrashedTask, is_dask_installed, run_tasks
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.files.writing import check_inside, check_writable, write_atomically
@@ -34,6 +37,9 @@ __all__ = ["DatasetCheck", "check_dataset"]
 
 _LISTED = 20  # problems in the text
 _PICTURES = 10  # episodes on the statistics page
+_RENDERED = 3  # episodes of which the first, middle and last images are rendered again
+_COLOUR_TOLERANCE, _DEPTH_TOLERANCE = 16, 10  # of a pixel: of 255 levels, and [mm]
+_PIXEL_TOLERANCE = 0.02  # share of an image's pixels that may differ, as with another renderer
 _TOLERANCE = 1e-5  # of metrics, as on another machine; relative, and [m] or [s]
 
 
@@ -48,6 +54,8 @@ class DatasetCheck:
         problems: Other problems, one line each: damaged files, repeated numbers, near-duplicates.
         records: A record of every episode, see `statistics`.
         page: The statistics page.
+        pixels: Which camera images were rendered again and compared, or why none; empty without
+            cameras.
     """
 
     folder: Path
@@ -56,6 +64,7 @@ class DatasetCheck:
     problems: tuple[str, ...]
     records: tuple[Mapping[str, Any], ...]
     page: Path | None = None
+    pixels: str = ""
 
     @property
     def ok(self) -> bool:
@@ -75,6 +84,8 @@ class DatasetCheck:
             found.append(
                 f"  base paths that wind around an obstacle: {winding[True]} of {len(self.records)}"
             )
+        if self.pixels:
+            found.append(f"  {self.pixels}")
         if self.page is not None:
             found.append(f"  statistics: {self.page}")
         return found
@@ -96,14 +107,15 @@ def check_dataset(
     The check is independent of planning: scenes are built from their files by content, trajectories
     are read from the shards, and the independent validation checks both. Everything else that a
     learner reads is made again from scene, steps and trajectory, and compared: samples, masks and
-    descriptions in the shards, LeRobot's layout, and episodes.csv. Of camera images only the sizes
-    are compared, and in LeRobot's layout the pixels with those of the shards.
+    descriptions in the shards, LeRobot's layout, and episodes.csv. Camera images have the right
+    sizes, and in LeRobot's layout the pixels of the shards; those of three episodes, which depend
+    on `seed`, are rendered again if OpenGL is available.
 
     Args:
         folder: The dataset.
         jobs: Processes on this machine.
         page: File of the page; defaults to `statistics.html` in the folder.
-        seed: Random seed of the ten episodes that are shown.
+        seed: Random seed of the ten episodes that are shown, three of them with images compared.
         progress: Whether to show a progress bar.
 
     Raises:
@@ -145,12 +157,16 @@ def check_dataset(
     chosen = np.random.default_rng(seed).permutation(len(valid))[:_PICTURES]
     intact_shards = [shard for k, shard in enumerate(shards) if not found[k][1]]
     shown_episodes = _read_selected(dataset, intact_shards, {valid[k] for k in chosen})
+    pixels, differences = _compare_pixels(
+        dataset.recipe, shown_episodes, [valid[k] for k in chosen[:_RENDERED]]
+    )
+    problems += differences
     text = make_statistics_page(
         dataset.recipe, records, failures, shown_episodes, refused, problems
     )
     write_atomically(target, text.encode())
     return DatasetCheck(
-        dataset.folder, len(records), refused, tuple(problems), tuple(records), target
+        dataset.folder, len(records), refused, tuple(problems), tuple(records), target, pixels
     )
 
 
@@ -225,6 +241,74 @@ def _check_episode(shard: Shard, k: int, recipe: Recipe, robot: str) -> dict[str
         "winding": sorted(winding.items()),
         "refused": "; ".join(reasons[:3]),
     }
+
+
+def _compare_pixels(
+    recipe: Recipe, episodes: Iterable[Episode], numbers: Iterable[int]
+) -> tuple[str, list[str]]:
+    """Render the first, middle and last images of episodes again.
+
+    Returns:
+        What was compared, and the differences.
+    """
+    compared, problems, wanted = list[str](), list[str](), set(numbers)
+    if not recipe.cameras:
+        return "", []
+    for episode in sorted(episodes, key=lambda episode: episode.number):
+        stored = episode.images() if episode.number in wanted else None
+        if stored is None:
+            continue
+        times = sample_times(episode.trajectory, recipe.fields.rate)
+        samples = np.unique([0, len(times) // 2, len(times) - 1])
+        try:
+            executed = simulate(episode.scene(), episode.steps, episode.trajectory)
+            images = render_images(executed, recipe.cameras, times[samples])
+        except VkcError as error:  # no OpenGL on this machine
+            return f"pixels not compared: {error}", problems
+        found = _find_different_images(images, stored, samples)
+        problems += [f"episode {episode.number}: {text}" for text in found]
+        compared.append(f"{episode.number} (samples {', '.join(map(str, samples.tolist()))})")
+    if not compared:
+        return "pixels not compared: no valid episode has images", problems
+    return f"pixels rendered again and compared: episode {', '.join(compared)}", problems
+
+
+def _find_different_images(found: Images, stored: Images, samples: Ints) -> Iterator[str]:
+    """Yield which of the stored images of some samples differ from those found there."""
+    for name, pictures in found.pictures.items():
+        if name not in stored.pictures:
+            yield f"{name}: missing"
+            continue
+        for k, sample in enumerate(samples.tolist()):
+            new, old = (
+                _name_segments(images, pixels) if name.endswith("_segmentation") else pixels
+                for images, pixels in (
+                    (found, pictures[k]),
+                    (stored, stored.pictures[name][sample]),
+                )
+            )
+            share = float(_find_different_pixels(new, old).mean())
+            if share > _PIXEL_TOLERANCE:
+                yield (
+                    f"{share:.0%} of the pixels of {name}[{sample}] differ from the images "
+                    f"rendered again, {_PIXEL_TOLERANCE:.0%} may"
+                )
+
+
+def _find_different_pixels(new: Any, old: Any) -> Bools:
+    """Return which pixels of an image differ by more than the tolerance, shape (H, W)."""
+    if new.dtype.kind not in "iu":  # names of segments
+        return np.asarray(new != old)
+    difference = np.abs(new.astype(int) - old.astype(int))
+    if difference.ndim == 3:
+        return np.asarray(difference.max(axis=2) > _COLOUR_TOLERANCE)
+    return np.asarray(difference > _DEPTH_TOLERANCE)
+
+
+def _name_segments(images: Images, pixels: Any) -> Any:
+    """Return the name of the body that each pixel shows; "?" for numbers without a name."""
+    names = np.array([*images.segments, "?"])
+    return names[np.minimum(pixels, len(images.segments))]
 
 
 def _find_false_claims(

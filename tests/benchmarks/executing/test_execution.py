@@ -37,6 +37,21 @@ def test_experiment_with_friction(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "glue" in capsys.readouterr().err
 
 
+def test_rest_is_planned_from_the_measured_grasp(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = "execution --trials 1 --tasks"
+    table, (trial,) = run_experiment(f"{words} drawer --off 4 --seed 3", tmp_path / "out")
+    assert trial["success"] is True, trial["violations"]
+    assert trial["executed"] is True, trial["problems"]
+    assert "| drawer, 4 mm off | 1 of 1 | 1 of 1 |" in table
+    assert "- drawer, start 0, seed 3, 4 mm off: success, executed" in table
+    for wrong, field in (("drawer --off 30", "off[0]"), ("init_1 --off 1", "tasks")):
+        command = ["bench", *words.split(), *wrong.split(), "--out", str(tmp_path / "other")]
+        assert main(command) == 2
+        assert field in capsys.readouterr().err
+
+
 def test_failed_executions_are_counted() -> None:
     fine = {"task": "drawer", "success": True, "executed": True, "arm_error": 0.01, "problems": []}
     bad = {**fine, "executed": False, "arm_error": 0.02, "problems": ["cup – floor: 9 mm deep"]}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections import Counter
 from collections.abc import Iterator
 from typing import Any
@@ -22,6 +23,9 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
 # Nothing is compiled in the background and nothing is written to the user's home; tests of that
 # name folders of their own.
 os.environ["VKC_PIN_CACHE"] = "off"
+
+# A shell that runs the tests in the background lets them ignore Ctrl-C, which some of them press.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 # Every motion that succeeds in a test is judged by the oracle as well, before the test is over.

@@ -30,7 +30,7 @@ UNFINISHED = [
 ]
 INFEASIBLE = ["plan", "drawer", "--set", "drawer.slide=9"]
 SUCCESS = ["plan", "drawer", "--set", "drawer.slide=0.3"]
-OUTPUTS = ["--save", "plan.npz", "--json", "plan.json", "--html", "plan.html"]
+OUTPUTS = ["--save", "plan.npz", "--json", "plan.json", "--csv", "plan.csv"]
 
 
 @pytest.fixture(autouse=True)
@@ -86,6 +86,9 @@ def check_complete(folder: Path) -> set[str]:
         elif name.endswith(".html"):
             assert text.startswith(b"<!DOCTYPE html>")
             assert text.endswith(b"</html>\n")
+        elif name.endswith(".csv"):
+            assert len({line.count(b",") for line in text.splitlines()}) == 1
+            assert text.endswith(b"\n")
         else:
             assert vkc.Trajectory.from_json(folder / name).times[0] == 0.0
     return names
@@ -103,9 +106,9 @@ def test_files_are_written_when_outputs_are_closed(
     assert done.returncode == code, done
     assert "Traceback" not in done.stderr
     assert "cannot print" not in done.stderr
-    assert check_complete(tmp_path) == {"plan.npz", "plan.json", "plan.html"}
+    assert check_complete(tmp_path) == {"plan.npz", "plan.json", "plan.csv"}
     if redirected.startswith("2"):
-        assert "wrote plan.html" in done.stdout
+        assert "wrote plan.csv" in done.stdout
 
 
 def test_progress_that_cannot_be_printed_is_no_failure(tmp_path: Path, full: Path) -> None:
@@ -116,17 +119,17 @@ def test_progress_that_cannot_be_printed_is_no_failure(tmp_path: Path, full: Pat
 
 
 @pytest.mark.parametrize(
-    ("words", "code"), [(INFEASIBLE, 3), (["view", "drawer"], 2)], ids=["infeasible", "success"]
+    ("words", "code"), [(INFEASIBLE, 3), (SUCCESS, 2)], ids=["infeasible", "success"]
 )
 def test_report_on_a_full_disk_is_no_success(
     words: list[str], code: int, tmp_path: Path, full: Path
 ) -> None:
     """Files are written all the same, and a failure keeps its code."""
-    done = shell(">FULL", [*words, "--html", "page.html"], tmp_path, full)
+    done = shell(">FULL", [*words, "--quiet", "--json", "plan.json"], tmp_path, full)
     assert (done.returncode, done.stdout) == (code, "")
     assert done.stderr.splitlines()[-1] == "vkc-pin: cannot print: No space left on device"
     assert "Traceback" not in done.stderr
-    assert check_complete(tmp_path) == {"page.html"}
+    assert check_complete(tmp_path) == {"plan.json"}
 
 
 @pytest.mark.parametrize(("redirected", "code"), [(">PIPE", 0), (">FULL", 2)])
@@ -202,14 +205,15 @@ def test_ctrl_c_while_planning_writes_the_best_motion(tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     code = finish(process, printed)
     assert code in (0, 130)  # planning may be over by then
-    assert check_complete(tmp_path) <= {"plan.npz", "plan.json", "plan.html"}
+    assert check_complete(tmp_path) <= {"plan.npz", "plan.json", "plan.csv"}
     if code == 130 and (tmp_path / "plan.npz").exists():
         assert vkc.Plan.load(tmp_path / "plan.npz").status in ("interrupted", "success")
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.2])
 def test_ctrl_c_while_writing_leaves_complete_files(delay: float, tmp_path: Path) -> None:
-    process = start([*SUCCESS, *OUTPUTS, "--plots", "plots", "--quiet"], tmp_path)
+    outputs = [*OUTPUTS, "--html", "plan.html", "--plots", "plots", "--quiet"]
+    process = start([*SUCCESS, *outputs], tmp_path)
     while not (tmp_path / "plan.npz").exists():
         assert process.poll() is None
         time.sleep(0.002)
@@ -226,7 +230,7 @@ def test_ctrl_c_while_writing_leaves_complete_files(delay: float, tmp_path: Path
 
 def test_ignored_ctrl_c_stays_ignored(tmp_path: Path) -> None:
     """Background processes of scripts ignore it."""
-    command = [*COMMAND, "view", "drawer", "--html", "page.html"]
+    command = [*COMMAND, *SUCCESS, "--quiet", "--json", "plan.json"]
     process = subprocess.Popen(
         command, cwd=tmp_path, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)
     )
@@ -234,4 +238,4 @@ def test_ignored_ctrl_c_stays_ignored(tmp_path: Path) -> None:
         process.send_signal(signal.SIGINT)
         time.sleep(0.05)
     assert process.returncode == 0
-    assert check_complete(tmp_path) == {"page.html"}
+    assert check_complete(tmp_path) == {"plan.json"}

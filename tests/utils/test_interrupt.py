@@ -39,6 +39,16 @@ def test_deferred_interrupts_reach_the_budget() -> None:
     assert budget.is_interrupted
 
 
+def test_ignored_interrupts_stay_ignored() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with Budget().activate() as budget, raise_on_interrupt(), defer_interrupt():
+            press()
+        assert not budget.is_interrupted
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def test_interrupts_raise_on_request() -> None:
     received: list[int] = []
     mine = signal.signal(signal.SIGINT, lambda number, frame: received.append(number))

@@ -16,10 +16,14 @@ __all__ = ["defer_interrupt", "handle_interrupt", "raise_on_interrupt"]
 def handle_interrupt(
     handler: Callable[[int, FrameType | None], object] | signal.Handlers,
 ) -> Iterator[Any]:
-    """Call `handler` at Ctrl-C, and yield the previous handler."""
+    """Call `handler` at Ctrl-C, and yield the previous handler.
+
+    Where Ctrl-C is ignored, as in background processes of scripts, it stays ignored.
+    """
     before = signal.getsignal(signal.SIGINT)
     # None: a program that embeds Python handles the signal, and could not be restored
-    if before is None or threading.current_thread() is not threading.main_thread():
+    is_kept = before in (None, signal.SIG_IGN)
+    if is_kept or threading.current_thread() is not threading.main_thread():
         yield before
         return
     signal.signal(signal.SIGINT, handler)

@@ -27,7 +27,7 @@ from vkc_pin.utils.arrays import MAX_COORDINATE, MIN_POSITIVE
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.kinematic_tree import MOMENTS, find_roots
 from vkc_pin.world.files.meshes import load_mesh
-from vkc_pin.world.files.resources import find_mesh_file, list_address_candidates
+from vkc_pin.world.files.resources import find_mesh_file, iterate_address_candidates
 from vkc_pin.world.files.xml import find_line, make_element_error, parse_xml
 
 __all__ = ["read_object_sdf"]
@@ -578,7 +578,7 @@ class _Reader:
 def _find_model(file: Path, include: ElementTree.Element, packages: Mapping[str, Path]) -> Path:
     """Return the SDF file that an <include> names, in a model's folder as its model.config says."""
     uri = (include.findtext("uri") or "").strip()
-    candidates = list_address_candidates(uri, file, packages) if uri else []
+    candidates = iterate_address_candidates(uri, file, packages) if uri else []
     for candidate in candidates:
         if candidate.is_file():
             return candidate

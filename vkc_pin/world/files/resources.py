@@ -26,7 +26,7 @@ __all__ = [
     "find_package_folder",
     "find_resource",
     "find_resource_folder",
-    "list_address_candidates",
+    "iterate_address_candidates",
     "list_resources",
 ]
 
@@ -125,15 +125,17 @@ def find_mesh_file(
     Raises:
         InputError: There is no such file.
     """
-    candidates = list_address_candidates(address, file, packages)
-    for candidate in candidates:
+    first: Path | None = None
+    for candidate in iterate_address_candidates(address, file, packages):
         if candidate.is_file():
             return candidate
+        first = first or candidate
     if (match := _PACKAGE.match(unquote(address.strip()))) is not None:
         place = find_package(match[1], file, packages)  # of another folder name
         if place is not None and (place / match[2]).is_file():
             return place / match[2]
-    first, expected = candidates[0], "a mesh file"
+    assert first is not None  # there is a folder around every file
+    expected = "a mesh file"
     if first.parent.is_dir():
         nearest = find_nearest_name(
             first.name, sorted(item.name for item in first.parent.iterdir())
@@ -149,10 +151,10 @@ def find_mesh_file(
     )
 
 
-def list_address_candidates(
+def iterate_address_candidates(
     address: str, file: Path, packages: Mapping[str, Path] = _NO_PACKAGES
-) -> list[Path]:
-    """Return the paths that an address in a description file may mean; see `find_mesh_file`.
+) -> Iterator[Path]:
+    """Yield the paths that an address in a description file may mean; see `find_mesh_file`.
 
     Raises:
         InputError: The address has another scheme, such as `https:`, or is too long.
@@ -161,7 +163,7 @@ def list_address_candidates(
     match = _SCHEME.fullmatch(text)
     scheme, rest = (match[1].lower(), match[2]) if match else ("", text)
     if scheme in ("package", "model"):
-        found = list(_list_package_candidates(rest.lstrip("/"), file, packages))
+        found: Iterable[Path] = _list_package_candidates(rest.lstrip("/"), file, packages)
     elif scheme in ("", "file"):
         if rest.startswith("//"):  # `file://HOST/PATH`; without a host also for relative paths
             host, slash, path = rest[2:].partition("/")
@@ -177,9 +179,13 @@ def list_address_candidates(
         )
     else:  # a colon in a file name
         found = [folder / text for folder in _list_folders(file)]
-    decoded = [Path(unquote(str(path))) for path in found]
-    candidates = dict.fromkeys(found + decoded)
-    return [check_path(path, "filename", "a file") for path in candidates]
+    decoded = []
+    for path in found:
+        yield check_path(path, "filename", "a file")
+        if "%" in str(path):
+            decoded.append(Path(unquote(str(path))))
+    for path in decoded:
+        yield check_path(path, "filename", "a file")
 
 
 def _list_folders(file: Path) -> list[Path]:

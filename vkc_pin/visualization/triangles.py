@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import coal
@@ -19,6 +20,7 @@ __all__ = ["Solid", "make_box", "make_tube", "merge_solids", "shade", "simplify"
 _CREASE = np.radians(35.0)  # faces that meet at a larger angle keep an edge between them
 _SIDES = 8  # of a tube
 _GRAIN = 2.0**-14  # rounding of vertices, for better compression [m]
+_MAX_CACHED_SOLIDS = 512  # that a process keeps: robots are drawn again and again
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,14 +53,25 @@ def to_solid(shape: coal.CollisionGeometry) -> Solid:
 
 def shade(vertices: Floats, faces: NDArray[np.int64]) -> Solid:
     """Add normals to triangles; vertices on sharp edges are duplicated."""
+    return _shade(np.asarray(vertices, float).tobytes(), np.asarray(faces, np.int64).tobytes())
+
+
+@lru_cache(maxsize=_MAX_CACHED_SOLIDS)
+def _shade(vertices: bytes, faces: bytes) -> Solid:
     import trimesh
 
-    mesh = trimesh.graph.smooth_shade(
-        trimesh.Trimesh(vertices, faces, process=False), angle=_CREASE
+    triangles = trimesh.Trimesh(
+        np.frombuffer(vertices).reshape(-1, 3),
+        np.frombuffer(faces, np.int64).reshape(-1, 3),
+        process=False,
     )
+    mesh = trimesh.graph.smooth_shade(triangles, angle=_CREASE)
     points = (np.round(np.asarray(mesh.vertices) / _GRAIN) * _GRAIN).astype(np.float32)
     normals = (np.round(np.asarray(mesh.vertex_normals) * 64.0) / 64.0).astype(np.float32)
-    return Solid(points, np.asarray(mesh.faces, np.uint32), normals)
+    arrays = (points, np.asarray(mesh.faces, np.uint32), normals)
+    for array in arrays:
+        array.flags.writeable = False
+    return Solid(*arrays)
 
 
 def simplify(solid: Solid, width: float) -> Solid:

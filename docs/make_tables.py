@@ -24,7 +24,7 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from statistics import mean, median
 from typing import Any
@@ -75,6 +75,7 @@ STATUS: list[tuple[str, str, dict[str, str]]] = [
 RECORDS: list[dict[str, Any]] = yaml.safe_load((DOCS / "records.yaml").read_text(encoding="utf-8"))
 
 
+@cache
 def result(name: str) -> dict[str, Any]:
     """Load the record docs/results/NAME.json.gz."""
     found: dict[str, Any] = json.loads(

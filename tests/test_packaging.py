@@ -54,7 +54,10 @@ def test_dependencies_are_ranges(project: dict[str, Any]) -> None:
         assert metadata.version(Requirement(text).name) in specifiers, text
 
 
-@pytest.mark.parametrize(("extra", "script"), [("", "meshes"), ("import", "imports")])
+@pytest.mark.parametrize(
+    ("extra", "script"),
+    [("", "meshes"), pytest.param("import", "imports", marks=pytest.mark.long)],
+)
 def test_declared_dependencies_suffice(extra: str, script: str, tmp_path: Path) -> None:
     """Optional packages of dependencies, such as those of trimesh, are not needed, or declared."""
     modules = find_undeclared(extra)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from helpers.drives import DT, make_hall
+from helpers.drives import DT, make_hall, make_scene
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.scene.hold import make_holds
 from vkc_pin.world.scene.placed_object import PlacedObject
@@ -55,7 +55,7 @@ def make_room(
         **scene.document,
         "objects": [{"name": n, "type": n, "position": _get_position(n)} for n in objects],
     }
-    scene = Scene.from_document(document)
+    scene = make_scene(document)
     return scene.with_start(arm=solve_above(STICK)[3:]) if "stick" in objects else scene
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -20,7 +22,7 @@ def make_hall(
     *, base: str = "omni", obstacles: Sequence[Mapping[str, Any]] = (), **robot: Any
 ) -> Scene:
     """Return a hall of 12 m x 12 m with the Husky at its centre, and more fields of `robot`."""
-    return Scene.from_document(
+    return make_scene(
         {
             "robot": {"name": "husky_ur5e", "base": base, **robot},
             "start": {"base": [0.0, 0.0, 0.0], "arm": "home"},
@@ -28,6 +30,16 @@ def make_hall(
             "obstacles": list(obstacles),
         }
     )
+
+
+def make_scene(document: Mapping[str, Any]) -> Scene:
+    """Return the scene of a document, built once."""
+    return _build_scene(json.dumps(document))
+
+
+@cache
+def _build_scene(text: str) -> Scene:
+    return Scene.from_document(json.loads(text))
 
 
 def drive_through(scene: Scene, *stops: np.ndarray, steps: int = 40, dt: float = DT) -> Trajectory:

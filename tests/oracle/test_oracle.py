@@ -42,15 +42,11 @@ def plans(tmp_path_factory: pytest.TempPathFactory, door_plan: vkc.Plan) -> dict
     return {name: plan.save(folder / f"{name}.npz") for name, plan in found.items()}
 
 
-def test_good_plans_pass(
-    plans: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name, path in plans.items():
-        verdict = judge(path)
-        assert verdict.agrees, (name, [str(one) for one in verdict.found])
-        assert not verdict.unjudged
-    assert main([str(next(iter(plans.values())).parent)]) == 0
-    assert "| success | success, and nothing found | 4 |" in capsys.readouterr().out
+def test_good_plans_pass(plans: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    code = main([str(next(iter(plans.values())).parent)])
+    printed = capsys.readouterr().out
+    assert code == 0, printed
+    assert "| success | success, and nothing found | 4 |" in printed
 
 
 # Changes: plan, what to change, the rule that breaks and what it must name.

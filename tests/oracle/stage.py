@@ -116,7 +116,6 @@ class World:
             if measured:
                 there = make_pose(measured["position"], read_orientation(measured))
                 hand = grasp.place @ there.inverse()
-                hand = hand @ self.front(grasp.opening) if grasp.pushed else hand
                 right = grasp.tool({freedom: np.array([value]) for freedom, value in own.items()})
                 self.measured[name] = replace(grasp, off=right.inverse() @ hand)
         self.held.sort(

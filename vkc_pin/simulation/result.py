@@ -22,7 +22,7 @@ from vkc_pin.simulation.snapshots import write_snapshots, write_video
 from vkc_pin.simulation.welds import Grip
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.writing import write_atomically
-from vkc_pin.world.scene.hold import Hold, measure_grasp
+from vkc_pin.world.scene.hold import Hold, get_attachment, measure_grasp
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import compile_each_step
 from vkc_pin.world.task.steps import Step, step_to_dict
@@ -137,7 +137,7 @@ class SimulationResult:
         """Return the scene as it really is at the end, from which planning can continue.
 
         Robot and objects are where the execution left them. Grasps are as measured there; objects
-        that were pulled out of the hand are not held.
+        that were pushed, or pulled out of the hand, are not held.
 
         Raises:
             InputError: The integration diverged, or an object slipped by more than 20 mm or
@@ -153,7 +153,8 @@ class SimulationResult:
         lost = {grip.what: grip.broken is not None for grip in self.grips}  # the last time
         holds, measured = list[Hold](), dict[str, pin.SE3]()
         for hold in compile_each_step(self.scene, self.steps, Options())[-1].after:
-            if not lost.get(str(hold)) and hold.by in (None, *holds):
+            pushes = get_attachment(scene.objects, hold).contact == "push"
+            if not (lost.get(str(hold)) or pushes) and hold.by in (None, *holds):
                 holds.append(hold)
                 measured[hold.object] = measure_grasp(scene.objects, hold, scene.tool_placement)
         held = scene.with_held([hold.nominal for hold in holds], measured=measured)

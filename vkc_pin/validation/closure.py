@@ -15,8 +15,8 @@ import numpy as np
 
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.samples import LENGTH_STEP, MAX_SAMPLES, Samples
+from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import Hold, get_attachment
-from vkc_pin.world.scene.measured_grasp import compute_hand_frame
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 

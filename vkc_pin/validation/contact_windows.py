@@ -22,13 +22,13 @@ from vkc_pin.world.scene.contact_rules import (
     CONTACT_WINDOW,
     compute_grasp_opening,
     compute_hand_clearance,
+    compute_hand_frame,
     find_grasped_link,
     find_gripper_hold,
     find_touch_links,
     is_rigid_grasp,
 )
 from vkc_pin.world.scene.hold import Hold, get_attachment
-from vkc_pin.world.scene.measured_grasp import compute_hand_frame
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Grasp, Step, Touch
 

@@ -15,8 +15,8 @@ from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.validation.report import Violation
 from vkc_pin.world.models.articulated_object import Freedom
 from vkc_pin.world.models.grippers.bar_width import WIDTH_TOLERANCE
+from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import Hold, get_attachment
-from vkc_pin.world.scene.measured_grasp import compute_hand_frame
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.free_objects import FreeObjects
 from vkc_pin.world.trajectory.phase_span import PhaseSpan

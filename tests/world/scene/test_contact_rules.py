@@ -17,11 +17,11 @@ from vkc_pin.world.models.articulated_object import Attachment
 from vkc_pin.world.scene.contact_rules import (
     compute_grasp_opening,
     compute_hand_clearance,
+    compute_hand_frame,
     compute_start_opening,
     is_rigid_grasp,
 )
 from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.measured_grasp import compute_hand_frame
 from vkc_pin.world.scene.scene import Scene
 
 HANDLE, FREE = Hold("door", "handle"), Hold("door", "handle_free")

@@ -155,6 +155,9 @@ def test_hand_too_far_from_its_attachment_is_refused(off: list[float], got: str)
         Hold("drawer", "handle", deviation=tuple(off))
     with pytest.raises(InputError, match="wrong number of values"):
         Hold("drawer", "handle", deviation=(0.0,))
+    near = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.001]))
+    with pytest.raises(InputError, match=r"held.drawer.measured: a hand that pushes only touches"):
+        make_hall().with_held({"drawer": "push"}, measured={"drawer": near})
     with pytest.raises(UnknownNameError, match="drawr"):
         make_hall().with_held({"drawer": "handle"}, measured={"drawr": measured})
 

@@ -20,8 +20,8 @@ from vkc_pin.world.models.articulated_object import Attachment
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.grafting import graft, graft_geometry, round_placement
 from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import Hold, get_attachment, make_holds, resolve_holds
-from vkc_pin.world.scene.measured_grasp import compute_hand_frame
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.scene.support import SupportedObject
@@ -234,9 +234,7 @@ def consolidate(
         InputError: Two grasps move the same joint, or a freedom of a grasp has the name of a joint.
     """
     robot = check_instance(scene, Scene, "scene").robot
-    holds = resolve_holds(
-        scene.objects, make_holds(holds) if isinstance(holds, Mapping) else holds, robot
-    )
+    holds = resolve_holds(scene.objects, make_holds(holds) if isinstance(holds, Mapping) else holds)
     cache = Cache() if cache is None else check_instance(cache, Cache, "cache")
     model, collision = pin.Model(robot.model), pin.GeometryModel()
     shapes, joints = robot.collision.geometryObjects, list(range(model.njoints))

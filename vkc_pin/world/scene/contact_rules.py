@@ -37,10 +37,10 @@ import pinocchio as pin
 
 from vkc_pin.options import Options
 from vkc_pin.world.models.articulated_object import Attachment
+from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import compute_clearance, get_link_name, list_placed_shapes
 from vkc_pin.world.scene.clearance_exemptions import CONTACT_DEPTH, get_cached, make_state_key
 from vkc_pin.world.scene.hold import Hold, get_attachment
-from vkc_pin.world.scene.measured_grasp import compute_hand_frame
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 
@@ -49,6 +49,7 @@ __all__ = [
     "CONTACT_WINDOW",
     "compute_grasp_opening",
     "compute_hand_clearance",
+    "compute_hand_frame",
     "compute_start_opening",
     "find_grasped_link",
     "find_gripper_hold",
@@ -116,7 +117,6 @@ def _compute_hand_distances(
     else:
         attachment, robot = get_attachment(scene.objects, hold), scene.robot
         grasp = placed.link_placement(attachment.link) * attachment.tool(hold.at)
-        grasp = grasp * compute_hand_frame(robot, attachment).inverse()
         to_grasp = grasp * scene.tool_placement().inverse()
         geometry = robot.opened(compute_grasp_opening(scene, hold)).collision
         data, shapes = robot.model.createData(), geometry.createData()
@@ -136,6 +136,16 @@ def _compute_hand_distances(
         label: compute_clearance(hands, list_placed_shapes(shapes))
         for label, shapes in found.items()
     }
+
+
+def compute_hand_frame(robot: Robot, attachment: Attachment) -> pin.SE3:
+    """Return the frame that is brought to an attachment, in the tool frame.
+
+    It is the tool frame itself, or, for a push, the foremost point of the hand.
+    """
+    if attachment.contact != "push":
+        return pin.SE3.Identity()
+    return robot.opened(robot.opening(attachment.opening)).front
 
 
 def is_rigid_grasp(scene: Scene, hold: Hold) -> bool:

@@ -211,7 +211,6 @@ def measure_grasp(
 def resolve_holds(
     objects: Mapping[str, PlacedObject],
     holds: Iterable[Hold],
-    robot: Robot,
     measured: Mapping[str, pin.SE3] | None = None,
 ) -> tuple[Hold, ...]:
     """Return holds checked against the objects, with values for all freedoms.
@@ -219,7 +218,6 @@ def resolve_holds(
     Args:
         objects: Name → object.
         holds: Holds, each after the one it depends on.
-        robot: Robot.
         measured: Object → measured placement of the attachment's frame in the grasping frame.
             Freedoms without given values are those nearest to it, otherwise 0.
     """
@@ -242,11 +240,17 @@ def resolve_holds(
             clamp_to_limits(value, freedom.lower, freedom.upper, where)
         if hold.object in measured:
             values, deviation = fit_grasp(
-                robot,
                 attachment,
                 measured[hold.object],
                 hold.at or None,
                 f"held.{hold.object}.measured",
+            )
+        if deviation and attachment.contact == "push":
+            raise InputError(
+                "a hand that pushes only touches, so that its grasp cannot deviate",
+                field=f"held.{hold.object}.measured",
+                expected="an attachment that is grasped",
+                got=attachment.name,
             )
         if hold.by is not None:
             objects[hold.by.object].link_placement(str(hold.link))

@@ -12,15 +12,12 @@ import pinocchio as pin
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.articulated_object import Attachment
-from vkc_pin.world.models.robot import Robot
 
 __all__ = [
     "MAX_ANGLE_DEVIATION",
     "MAX_POSITION_DEVIATION",
     "apply_deviation",
     "check_deviation",
-    "compute_hand_frame",
-    "compute_measured_pose",
     "fit_grasp",
 ]
 
@@ -33,16 +30,6 @@ _SLACK = 1e-9  # [m] or [rad] of rounding
 _MAX_STARTS = 81  # combinations of lower end, middle and upper end of the freedoms
 
 
-def compute_hand_frame(robot: Robot, attachment: Attachment) -> pin.SE3:
-    """Return the frame that is brought to an attachment, in the tool frame.
-
-    It is the tool frame itself, or, for a push, the foremost point of the hand.
-    """
-    if attachment.contact != "push":
-        return pin.SE3.Identity()
-    return robot.opened(robot.opening(attachment.opening)).front
-
-
 def apply_deviation(attachment: Attachment, deviation: Sequence[float]) -> Attachment:
     """Return an attachment with a deviation, see `Hold.deviation`; none if it is empty."""
     if not deviation:
@@ -51,19 +38,7 @@ def apply_deviation(attachment: Attachment, deviation: Sequence[float]) -> Attac
     return dataclasses.replace(attachment, deviation=pin.SE3(turn, shift))
 
 
-def compute_measured_pose(robot: Robot, attachment: Attachment, values: Sequence[float]) -> pin.SE3:
-    """Return the attachment's frame in the grasping frame, for an attachment with its deviation.
-
-    Args:
-        robot: Robot.
-        attachment: Attachment; its frame is that of the description, `Attachment.placement`.
-        values: Values of its freedoms, [m] and [rad].
-    """
-    return compute_hand_frame(robot, attachment) * attachment.motion(values).inverse()
-
-
 def fit_grasp(
-    robot: Robot,
     attachment: Attachment,
     measured: pin.SE3,
     values: Sequence[float] | None,
@@ -72,7 +47,6 @@ def fit_grasp(
     """Return freedoms and deviation of a measured grasp.
 
     Args:
-        robot: Robot.
         attachment: Nominal attachment.
         measured: Measured placement of its frame in the grasping frame.
         values: Values of the freedoms, [m] and [rad]; None: those with the smallest deviation.
@@ -84,7 +58,7 @@ def fit_grasp(
     Raises:
         InputError: The hand is too far from the attachment.
     """
-    hand = measured.inverse() * compute_hand_frame(robot, attachment)
+    hand = measured.inverse()
 
     def compute_deviation(at: Sequence[float] | Floats) -> Floats:
         off = attachment.motion(at).actInv(hand)

@@ -244,7 +244,7 @@ class Scene:
             names = [hold.object for hold in holds]
             check_choice(name, names, "held object", f"measured.{name}")
         poses = {name: as_placement(pose, name=f"measured.{name}") for name, pose in poses.items()}
-        return self._with(holds=resolve_holds(self.objects, holds, self.robot, poses))
+        return self._with(holds=resolve_holds(self.objects, holds, poses))
 
     def with_measured_grasp(
         self,
@@ -290,9 +290,7 @@ class Scene:
         measured = {name: measure_grasp(objects, hold, moved.tool_placement)}
         holds = [_replace_hold(one, before, hold) for one in self.holds]
         holds += [hold] if before is None else []
-        return moved._with(
-            objects=objects, holds=resolve_holds(objects, holds, self.robot, measured)
-        )
+        return moved._with(objects=objects, holds=resolve_holds(objects, holds, measured))
 
     def with_approaches(self, holds: Iterable[Hold], *, stacklevel: int = 2) -> Scene:
         """Return the scene with those attachments reversed that cannot be approached otherwise.

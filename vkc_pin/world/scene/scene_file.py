@@ -33,7 +33,6 @@ from vkc_pin.world.scene.hold import (
     place_held_objects,
     resolve_holds,
 )
-from vkc_pin.world.scene.measured_grasp import compute_measured_pose
 from vkc_pin.world.scene.obstacles import FLOOR, make_floor_shape, make_obstacle_shapes
 from vkc_pin.world.scene.placed_object import PlacedObject
 
@@ -106,7 +105,7 @@ def make_document(fields: Mapping[str, Any]) -> dict[str, Any]:
         }
         if hold.deviation:
             grasp = get_attachment(objects, hold)
-            pose = pin.SE3ToXYZQUAT(compute_measured_pose(fields["robot"], grasp, hold.at))
+            pose = pin.SE3ToXYZQUAT(grasp.motion(hold.at).inverse())
             entries["at"] = list(hold.at) or None
             entries["measured"] = {"position": pose[:3].tolist(), "quaternion": pose[3:].tolist()}
         held[hold.object] = {key: value for key, value in entries.items() if value is not None}
@@ -247,15 +246,15 @@ def _make_holds(
                 {name: by[name]} if name in by else {},
                 {name: at[name]} if name in at else {},
             )
-            resolve_holds(objects, make_holds(both, through, values), robot)
+            resolve_holds(objects, make_holds(both, through, values))
     with document.annotate_errors(("start", "held")):
         holds = make_holds(attachments, by, at)
-        found = resolve_holds(objects, holds, robot)
+        found = resolve_holds(objects, holds)
     measured = _find_measured_poses(held, found, objects, robot, start)
     for name in measured:
         with document.annotate_errors(("start", "held", name, "measured")):
-            found = resolve_holds(objects, holds, robot, {name: measured[name]})
-    return resolve_holds(objects, holds, robot, measured) if measured else found
+            found = resolve_holds(objects, holds, {name: measured[name]})
+    return resolve_holds(objects, holds, measured) if measured else found
 
 
 def _find_measured_poses(

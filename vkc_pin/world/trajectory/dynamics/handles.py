@@ -9,8 +9,8 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import Hold, get_attachment
-from vkc_pin.world.scene.measured_grasp import compute_hand_frame
 from vkc_pin.world.scene.scene import Scene
 
 __all__ = ["Handle", "Loads"]

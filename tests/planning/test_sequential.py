@@ -131,17 +131,27 @@ def test_final_holds_by_a_tool() -> None:
     assert after.holds[1].at == tuple(values)
 
 
-def test_object_is_regrasped_to_be_placed() -> None:
-    """An object grasped from the side is regrasped from above, to be put into a bin."""
+@pytest.mark.parametrize("off", [0.0, 0.003])
+def test_object_is_regrasped_to_be_placed(off: float) -> None:
+    """An object grasped from the side is regrasped from above, to be put into a bin.
+
+    That grasp is nominal, be the first one as described or `off` beside it.
+    """
     shelved = make_littered_scene(describe_shelf(*AT[:2]))
     taken = vkc.plan(shelved, [vkc.Grasp("litter", "grip")])
     assert taken.success
-    free = compute_final_scene(make_littered_scene(), taken.trajectory, taken.end_scene().holds)
+    (hold,) = taken.end_scene().holds
+    free = compute_final_scene(make_littered_scene(), taken.trajectory, [hold])
+    if off:
+        base = free.start[:3] + np.array([off, 0.0, 0.0])
+        free = free.with_measured_grasp("litter", base=base)
+        assert free.holds[0] != hold
     plan = vkc.plan(free, [vkc.Place("litter", BIN)])
     assert plan.success
     assert plan.steps == (vkc.Release("litter"), vkc.Place("litter", BIN, "grip"))
     assert validate(free, plan.steps, plan.trajectory).ok
-    first = plan.trajectory.phases[0]
+    first, *_, last = (phase for phase in plan.trajectory.phases if phase.holds)
+    assert (first.holds, last.holds) == (free.holds, (hold,))
     np.testing.assert_array_equal(
         np.ptp(plan.trajectory.positions[: first.last + 1, : len(free.start)], axis=0), 0.0
     )

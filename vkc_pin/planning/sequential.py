@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from vkc_pin.planning.plan import Plan
@@ -14,6 +15,7 @@ from vkc_pin.planning.solve_task import TaskResult, solve_task
 from vkc_pin.utils.budget import current_ending, reserve_time, share_budget
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import generate_alternatives, has_open_attachment
+from vkc_pin.world.task.actuation import find_shared_coordinate
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Step
@@ -81,9 +83,8 @@ def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) 
     for number, (name, steps) in enumerate(alternatives()):
         if current_ending():
             break
-        other = compile_task(scene, steps, request.options)
         with share_budget(len(alternatives()) - number):
-            last = solve_task(scene, other, request, check_goals_first=True)
+            last = _solve_alternative(scene, steps, request)
         statistics.append(last.plan.statistics)
         if last.plan.success:
             return dataclasses.replace(last, plan=add_statistics(last.plan, statistics))
@@ -95,6 +96,19 @@ def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) 
     report = dataclasses.replace(plan.report, notes=(*plan.report.notes, *notes))
     failed = dataclasses.replace(plan, report=report, status=status)
     return dataclasses.replace(first, plan=add_statistics(failed, statistics))
+
+
+def _solve_alternative(scene: Scene, steps: Sequence[Step], request: PlanningRequest) -> TaskResult:
+    """Solve a task as one problem, or step by step if its holds cannot be in one chain.
+
+    The latter is so where an object is grasped anew whose measured grasp deviates.
+    """
+    task = compile_task(scene, steps, request.options)
+    if find_shared_coordinate(scene, task.holds) is None:
+        return solve_task(scene, task, request, check_goals_first=True)
+    results = [part.result for part in plan_each_step(scene, task, request)]
+    plan = concatenate_plans(scene, steps, request, [result.plan for result in results])
+    return dataclasses.replace(results[-1], scene=scene, plan=plan)
 
 
 def plan_each_step(scene: Scene, task: Task, request: PlanningRequest) -> list[PlannedStep]:

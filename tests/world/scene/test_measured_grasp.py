@@ -153,6 +153,7 @@ def test_hand_too_far_from_its_attachment_is_refused(off: list[float], got: str)
         make_hall().with_held({"drawer": "handle"}, measured={"drawer": measured})
     with pytest.raises(InputError, match=rf"Hold\.deviation.*{got}"):
         Hold("drawer", "handle", deviation=tuple(off))
+    assert Hold("drawer", "handle", deviation=(0.0,) * 6) == Hold("drawer", "handle")
     with pytest.raises(InputError, match="wrong number of values"):
         Hold("drawer", "handle", deviation=(0.0,))
     near = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.001]))

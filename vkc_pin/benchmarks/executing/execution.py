@@ -172,7 +172,7 @@ def _list_trials(records: Sequence[Record]) -> str:
     """Return a list of all trials with their starts and random seeds."""
     lines = [
         f"- {r['task']}, start {r['number']}, seed {r['seed']}, {r['off']:g} mm off: "
-        f"{r['status']}, {'executed' if r['executed'] else 'not executed'}"
+        f"{r['status']}, {'executed' if r.get('executed') else 'not executed'}"
         for r in records
     ]
     return "\n".join(["## Trials", "", *lines])
@@ -210,7 +210,7 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
         more["off"], step = mm, cast("Actuate | Place", steps[0])
         rng = np.random.default_rng([spec["seed"], spec["number"], round(1e3 * mm)])
         found, start = grasp_in_physics(scene, step, spec["seed"], spec["grasp"], LIMITS)
-        start = displace_hand(start, step, mm, rng) if start is not None and mm else start
+        start = displace_hand(start, mm, rng) if start is not None and mm else start
     if start is None:  # the grasp failed
         problems = [f"the grasp: {found.status}"]
         return trial(found, method="VKC", seed=spec["seed"], **more, problems=problems) | {

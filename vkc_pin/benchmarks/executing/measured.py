@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
@@ -18,7 +17,7 @@ from vkc_pin.simulation.execution import simulate
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
-from vkc_pin.world.task.steps import Actuate, Grasp, Place
+from vkc_pin.world.task.steps import Actuate, Grasp, Place, Reach
 
 __all__ = ["DEGREES_PER_MM", "displace_hand", "grasp_in_physics"]
 
@@ -43,51 +42,42 @@ def grasp_in_physics(
     return found, executed.end_scene() if executed.ok else None
 
 
-def displace_hand(
-    scene: Scene, step: Actuate | Place, distance: float, rng: np.random.Generator
-) -> Scene:
+def displace_hand(scene: Scene, distance: float, rng: np.random.Generator) -> Scene:
     """Return a scene in which the hand holds the object elsewhere, by a random displacement.
 
     Args:
         scene: Scene with a held object.
-        step: Step that moves it.
         distance: Displacement of the hand [mm]; see `DEGREES_PER_MM`.
         rng: Random generator of directions.
 
     Raises:
         InputError: The robot cannot reach there.
     """
+    (hold,), tool = scene.holds, scene.tool_placement()
     for _ in range(_DRAWS):
         shift, turn = (draw / np.linalg.norm(draw) for draw in rng.normal(size=(2, 3)))
         turn *= np.radians(DEGREES_PER_MM * distance)
-        (hold,) = scene.holds
-        deviation = (*(1e-3 * distance * shift).tolist(), *turn.tolist())
-        held = scene.with_held([dataclasses.replace(hold, deviation=deviation)])
-        if scene.objects[hold.object].object.free:  # then the object is elsewhere
-            return held
-        row = _reach_grasp(held, [step])
+        row = _reach(scene.with_held({}), tool * pin.SE3(pin.exp3(turn), 1e-3 * distance * shift))
         if row is not None:
             return scene.with_measured_grasp(hold.object, base=row[:3], arm=row[3:])
     raise InputError("the robot cannot hold the object elsewhere", got=f"{distance:g} mm off")
 
 
-def _reach_grasp(scene: Scene, steps: Sequence[Actuate | Place]) -> Floats | None:
-    """Return the configuration near the start at which the hand is where it holds the object.
-
-    Returns None if there is none.
-    """
+def _reach(scene: Scene, tool: pin.SE3) -> Floats | None:
+    """Return the configuration near the start that brings the tool to a pose; None if none."""
     options = Options()
-    problem = TrajectoryProblem(scene, compile_task(scene, steps, options), options)
+    problem = TrajectoryProblem(scene, compile_task(scene, [Reach(tool)], options), options)
     search = KeyframeSampler(problem, np.random.default_rng(0))
-    pose, robot = search.find_pose(1), scene.robot.coordinates.size
-    if pose is not None:
-        solver, target = search.get_pose_solver(pose)
-        lower, upper = problem.chain.lower[None].copy(), problem.chain.upper[None].copy()
-        lower[:, robot:] = upper[:, robot:] = problem.start[None, robot:]
-        bounds = {"lower": lower, "upper": upper, "weights": search.weights}
-        z, found = solver.solve(
-            problem.start[None].copy(), target, **bounds, iterations=100, tolerance=_TOLERANCE
-        )
-        if found[0]:
-            return np.asarray(z[0, :robot])
-    return None
+    pose = search.find_pose(problem.segments)
+    assert pose is not None
+    solver, target = search.get_pose_solver(pose)
+    z, found = solver.solve(
+        problem.start[None].copy(),
+        target,
+        lower=problem.chain.lower[None],
+        upper=problem.chain.upper[None],
+        weights=search.weights,
+        iterations=100,
+        tolerance=_TOLERANCE,
+    )
+    return np.asarray(z[0]) if found[0] else None

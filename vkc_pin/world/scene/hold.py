@@ -97,7 +97,8 @@ class Hold:
                 got=deviation.size,
             )
         check_deviation(deviation, "Hold.deviation")
-        object.__setattr__(self, "deviation", tuple(deviation.tolist()))
+        given = tuple(deviation.tolist()) if deviation.any() else ()
+        object.__setattr__(self, "deviation", given)
 
     @property
     def frame(self) -> str | None:

@@ -168,14 +168,9 @@ def test_notebooks_are_kept_without_outputs(path: Path) -> None:
             assert (cell.outputs, cell.execution_count) == ([], None), cell.id
 
 
+@pytest.mark.long
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(path.stem, marks=() if number == 0 else pytest.mark.long)
-        for number, path in enumerate(NOTEBOOKS)
-    ],
-)
+@pytest.mark.parametrize("name", [path.stem for path in NOTEBOOKS])
 def test_notebook_runs_and_its_cells_show_what_they_should(name: str, tmp_path: Path) -> None:
     cells = execute(name, tmp_path)
     for cell, patterns in EXPECTED[name].items():

@@ -165,6 +165,7 @@ def compute_hash(plan: vkc.Plan) -> str:
     ).hexdigest()
 
 
+@pytest.mark.long
 def test_result_is_reproducible_in_another_process() -> None:
     code = (
         "import sys; sys.path[:0] = ['tests', 'tests/baselines']\n"

@@ -104,6 +104,7 @@ def test_tables_against_numbers_by_hand(out: Path, result: dict[str, Any]) -> No
     assert (out / "success.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.long
 def test_experiment_with_planning(tmp_path: Path) -> None:
     words = "initialization --starts 1 --scenes init_1 --methods astar --jobs 1"
     table, (trial,) = run_experiment(words, tmp_path)

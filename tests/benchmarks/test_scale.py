@@ -40,6 +40,7 @@ def test_starts_are_shared_and_free_among_all_obstacles() -> None:
         assert make_crowded_scene(1000).with_start(base=base).start_clearance() >= 0.03
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("of", "counts"), [("obstacles", (30, 60)), ("segments", (40, 80))])
 def test_experiment(of: str, counts: tuple[int, int], tmp_path: Path) -> None:
     words = f"scale --starts 1 --of {of} --counts {counts[1]} {counts[0]}"

@@ -78,7 +78,7 @@ def test_finished_dataset_is_left_unchanged(made: Dataset) -> None:
         generate(SMALL, EPISODES - 1, made.folder)
 
 
-@pytest.mark.parametrize("removed", ["work/*", "shards/*/*"])
+@pytest.mark.parametrize("removed", ["shards/*/*", pytest.param("work/*", marks=pytest.mark.long)])
 def test_removed_files_are_made_again(made: Dataset, tmp_path: Path, removed: str) -> None:
     generate(SMALL, 3, tmp_path / "out")
     for file in (tmp_path / "out").glob(removed):

@@ -15,7 +15,7 @@ from fuzz.running import BAD, KINDS, Worker
 
 CORPUS = sorted((Path(__file__).parent / "corpus").glob("*.json"))
 FRESH = int(os.environ.get("FUZZ_SEED", random.SystemRandom().randrange(10**6)))
-CASES = {1: 100, FRESH: 50}
+CASES = {1: 60, FRESH: 40}
 """Random seed → number of cases of all kinds."""
 
 

@@ -213,6 +213,7 @@ LONG = (
     "many shelves",
     "tube",
     "turned L",
+    "wave",
 )
 
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import subprocess
 import sys
 import threading
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -44,12 +44,12 @@ def plan_stick(planner: vkc.Planner | None = None) -> vkc.Plan:
     )
 
 
-def hash_in_process(task: str, **variables: str) -> str:
-    """Return the hash of a task in another process."""
+@cache
+def hash_in_process(task: str) -> str:
+    """Return the hash of a task in a fresh process."""
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT.format(task)],
         cwd=Path(__file__).parent,
-        env={**os.environ, **variables},
         capture_output=True,
         text=True,
         timeout=250,
@@ -59,14 +59,8 @@ def hash_in_process(task: str, **variables: str) -> str:
     return done.stdout.strip()
 
 
-@pytest.fixture(scope="module")
-def fresh() -> dict[str, str]:
-    """Return what comes out in fresh processes."""
-    return {task: hash_in_process(task) for task in ("door", "stick")}
-
-
 @pytest.mark.long
-def test_after_a_hundred_other_plans(fresh: dict[str, str]) -> None:
+def test_after_a_hundred_other_plans() -> None:
     planner = vkc.Planner()
     scene = vkc.load_scene("door")
     for number in range(100):  # of three structures, from as many starts
@@ -75,20 +69,20 @@ def test_after_a_hundred_other_plans(fresh: dict[str, str]) -> None:
         vkc.plan(there, [vkc.GoTo(*BASE[:2])], options=options, planner=planner)
     assert planner.info().hits > 0
     for _ in range(2):
-        assert compute_hash(plan_door(planner)) == fresh["door"]
-        assert compute_hash(plan_stick(planner)) == fresh["stick"]
-    assert compute_hash(plan_door(planner)) == fresh["door"]
+        assert compute_hash(plan_door(planner)) == hash_in_process("door")
+        assert compute_hash(plan_stick(planner)) == hash_in_process("stick")
+    assert compute_hash(plan_door(planner)) == hash_in_process("door")
 
 
-def test_with_a_tiny_cache(fresh: dict[str, str]) -> None:
+def test_with_a_tiny_cache() -> None:
     planner = vkc.Planner(entries=1, megabytes=1e-3)
-    assert compute_hash(plan_door(planner)) == fresh["door"]
+    assert compute_hash(plan_door(planner)) == hash_in_process("door")
     assert planner.info().entries <= 1
-    assert compute_hash(plan_door(planner)) == fresh["door"]
+    assert compute_hash(plan_door(planner)) == hash_in_process("door")
 
 
 @pytest.mark.long
-def test_in_concurrent_threads(fresh: dict[str, str]) -> None:
+def test_in_concurrent_threads() -> None:
     planner = vkc.Planner()
     found: dict[int, str] = {}
 
@@ -102,4 +96,9 @@ def test_in_concurrent_threads(fresh: dict[str, str]) -> None:
             thread.start()
         for thread in threads:
             thread.join()
-        assert found == {0: fresh["door"], 1: fresh["stick"], 2: fresh["door"], 3: fresh["stick"]}
+        assert found == {
+            0: hash_in_process("door"),
+            1: hash_in_process("stick"),
+            2: hash_in_process("door"),
+            3: hash_in_process("stick"),
+        }

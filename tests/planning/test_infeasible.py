@@ -53,6 +53,7 @@ def find_violation(plan: vkc.Plan, constraint: str, subject: str) -> vkc.Violati
     return found[0]
 
 
+@pytest.mark.long
 def test_door_behind_a_wall() -> None:
     scene = add_obstacles(describe_box("barrier", (0.1, 1.07, 2.0), (2.3, 0.0, 1.0)))
     plan = vkc.plan(scene, [vkc.Actuate("door", {"hinge": 1.2})], options=QUICK)

@@ -26,6 +26,7 @@ POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
 COAL = 2e-5  # [m] by which answers of coal differ that it came to from different guesses
 
 
+@pytest.mark.long
 def test_distance_queries_hardly_depend_on_the_number_of_obstacles() -> None:
     queries, plans = [], []
     for count in (30, 1000):

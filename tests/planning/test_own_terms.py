@@ -220,6 +220,7 @@ def test_infeasible_constraint_is_reported() -> None:
     assert violation.amount > 7.0
 
 
+@pytest.mark.long
 def test_plans_are_saved_with_their_terms(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -479,6 +479,7 @@ def test_invalid_arguments(case: tuple[dict[str, Any], str, str]) -> None:
     assert text in str(caught.value)
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.*links overlap at the default home")
 def test_robot_from_a_urdf_alone() -> None:
     scene = vkc.Scene.from_document({"robot": "tiago", "start": {"base": [0.0, 0.0, 0.0]}})

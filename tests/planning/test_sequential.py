@@ -160,6 +160,12 @@ def test_object_is_regrasped_to_be_placed(off: float) -> None:
     )
 
 
+PLANNERS = [
+    vkc.plan,
+    pytest.param(functools.partial(vkc.plan, window=2), marks=pytest.mark.long),
+]
+
+
 def add_attachment(scene: Scene, owner: str, name: str, z: float, *, depth: float = 0.0) -> Scene:
     """Return the scene with another first attachment, higher by `z` and deeper by `depth`."""
     placed = scene.objects[owner]
@@ -186,7 +192,7 @@ def make_refrigerator() -> Scene:
     ).sample_start(np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("planned", [vkc.plan, functools.partial(vkc.plan, window=2)])
+@pytest.mark.parametrize("planned", PLANNERS)
 def test_another_attachment_is_tried(
     planned: Callable[..., vkc.Plan],
 ) -> None:
@@ -206,7 +212,7 @@ def test_another_attachment_is_tried(
     assert not named.success, "who names one means it"
 
 
-@pytest.mark.parametrize("planned", [vkc.plan, functools.partial(vkc.plan, window=2)])
+@pytest.mark.parametrize("planned", PLANNERS)
 def test_attachments_share_the_budget(planned: Callable[..., vkc.Plan]) -> None:
     scene = add_attachment(vkc.load_scene("drawer"), "drawer", "behind", 0.0, depth=0.04)
     step = vkc.Actuate("drawer", {"slide": 0.2})
@@ -268,6 +274,7 @@ def test_two_leaves_are_opened_in_one_problem() -> None:
     assert result.end_scene().held == {"it": "handle_right"}
 
 
+@pytest.mark.long
 def test_holds_of_the_same_joint_are_planned_sequentially() -> None:
     first, second = (
         vkc.Actuate("it", {"hinge_left": value}, name)

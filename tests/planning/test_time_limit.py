@@ -40,7 +40,13 @@ class Looks:
         return call()
 
 
-@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+@pytest.mark.parametrize(
+    "call",
+    [
+        pytest.param(call, id=name, marks=[pytest.mark.long] if name == "chore" else [])
+        for name, call in CALLS.items()
+    ],
+)
 def test_plan_is_returned_wherever_time_ends(
     call: Callable[[], vkc.Plan], monkeypatch: pytest.MonkeyPatch
 ) -> None:

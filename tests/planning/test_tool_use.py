@@ -73,6 +73,7 @@ def solve(
     return solve_task(scene, compile_task(scene, steps, request.options), request, guess=guess)
 
 
+@pytest.mark.long
 def test_simultaneous_planning_costs_less_than_sequential() -> None:
     request = PlanningRequest("astar", vkc.Options())
     steps = [vkc.Grasp("stick"), vkc.Touch("stick.tip", TARGET)]

@@ -79,6 +79,7 @@ def test_steps_without_effect_are_refused() -> None:
         plan_actions(load_home().with_held({"cup": "side"}), [G("cup")])
 
 
+@pytest.mark.long
 def test_limit_of_evaluations_is_for_all_actions() -> None:
     opening = dataclasses.replace(OPEN, attachment="handle")
     alone = plan_actions(load_home(), [opening])

@@ -22,6 +22,7 @@ def test_starts_are_the_same_for_every_base() -> None:
     assert not np.array_equal(bases.make_start("door", "omni", 3, 8).start, scenes[0].start)
 
 
+@pytest.mark.long
 def test_experiment(tmp_path: Path) -> None:
     words = "bases --trials 1 --tasks drawer --bases omni differential"
     table, records = run_experiment(words, tmp_path)

@@ -15,6 +15,7 @@ from vkc_pin.benchmarks.problems import ablation
 CHANGE = "solver.loop:PROGRESS=0.6"
 
 
+@pytest.mark.long
 def test_experiment_on_numbered_problems(tmp_path: Path) -> None:
     table, trials = run_experiment(f"ablation --problems 42 9 --changes {CHANGE}", tmp_path)
     assert [(r["number"], r["kind"], r["method"]) for r in trials] == [
@@ -27,6 +28,7 @@ def test_experiment_on_numbered_problems(tmp_path: Path) -> None:
     assert "| unchanged | reach | " in table
 
 
+@pytest.mark.long
 def test_experiment_on_random_starts_of_tasks(tmp_path: Path) -> None:
     words = f"ablation --tasks drawer --starts 2 --seed 5 --changes {CHANGE}"
     table, trials = run_experiment(words, tmp_path)

@@ -11,6 +11,7 @@ import vkc_pin as vkc
 from vkc_pin.benchmarks.problems import first_seed
 
 
+@pytest.mark.long
 def test_experiment(tmp_path: Path) -> None:
     table, trials = run_experiment("first-seed --trials 1 --tasks drawer door", tmp_path)
     assert [r["task"] for r in trials] == ["door", "drawer"]

@@ -11,6 +11,7 @@ import vkc_pin as vkc
 from vkc_pin.benchmarks.problems import spread
 
 
+@pytest.mark.long
 def test_experiment(tmp_path: Path) -> None:
     table, trials = run_experiment("spread --problems 9 --seeds 2 --seed 4", tmp_path)
     assert [(r["number"], r["seed"]) for r in trials] == [(9, 4), (9, 5)]

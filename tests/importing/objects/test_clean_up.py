@@ -95,6 +95,34 @@ def test_inertia_is_merged_scaled_and_turned() -> None:
     assert not alone.is_massless
 
 
+def test_long_chains_of_fixed_links_are_merged() -> None:
+    """1500 links in a row, the last of which a hinge carries, and behind it two without shapes."""
+    count, step = 1500, pin.SE3(np.eye(3), np.array([0.01, 0.0, 0.0]))
+    box = Part(name="", placement=pin.SE3.Identity(), kind="box", size=(0.1, 0.1, 0.1))
+    kinds = dict.fromkeys(range(1, count - 1), "fixed") | dict.fromkeys(
+        range(count - 1, count + 2), "revolute"
+    )
+    joints = {
+        f"l{k}": Joint(
+            name=f"j{k}",
+            kind=kind,
+            parent=f"l{k - 1}",
+            child=f"l{k}",
+            placement=step,
+            limits=(0.0, 1.0),
+        )
+        for k, kind in kinds.items()
+    }
+    links = {f"l{k}": Link(f"l{k}", (), (box,) * (k < count)) for k in range(count + 2)}
+    merged = merge_fixed_links(Description(Path("f"), links, joints))
+    assert list(merged.links) == ["l0", f"l{count - 1}"]
+    (hinge,) = merged.joints.values()
+    assert hinge.parent == "l0"
+    assert hinge.placement.translation == pytest.approx([0.01 * (count - 1), 0.0, 0.0])
+    assert len(merged.links["l0"].collision) == count - 1
+    assert [f"link 'l{k}'" in note for k, note in enumerate(merged.notes, count)] == [True] * 2
+
+
 def test_separate_objects_in_one_file_are_noted(tmp_path: Path) -> None:
     def box(name: str, parent: str, kind: str) -> str:
         return (

@@ -139,15 +139,15 @@ def merge_fixed_links(description: Description) -> Description:
     """
     links, joints = dict(description.links), dict(description.joints)
     notes = list(description.notes)
-    for child in list(joints):
-        below = description.subtree(child)
-        if not any(links[name].solid for name in below if name in links):
-            notes.append(
-                f"joint '{joints[child].name}' moves no shape: left out with link '{child}'"
-            )
-            for name in below:
-                links.pop(name, None)
-                joints.pop(name, None)
+    has_shape = set[str]()  # links that are, or move, a shape
+    for name, link in links.items():
+        while link.solid and name not in has_shape:
+            has_shape.add(name)
+            name = joints[name].parent if name in joints else name
+    for child in [child for child in joints if child not in has_shape]:
+        notes.append(f"joint '{joints[child].name}' moves no shape: left out with link '{child}'")
+        links.pop(child, None)
+        del joints[child]
     for child, joint in joints.items():
         if (
             joint.kind != "fixed"
@@ -156,6 +156,7 @@ def merge_fixed_links(description: Description) -> Description:
         ):
             placement = joint.placement * joint.compute_motion(joint.limits[0])
             joints[child] = dataclasses.replace(joint, placement=placement, limits=(0.0, 0.0))
+    children = dataclasses.replace(description, joints=joints).children()
     for child in list(joints):
         joint = joints[child]
         is_single_valued = joint.kind != "fixed" and joint.limits == (0.0, 0.0)
@@ -176,12 +177,13 @@ def merge_fixed_links(description: Description) -> Description:
                 parent.name, (*parent.visual, *visual), (*parent.collision, *collision), inertia
             )
             del joints[child]
-            for name, other in joints.items():
-                if other.parent == child:
-                    placement = joint.placement * other.placement
-                    joints[name] = dataclasses.replace(
-                        other, parent=joint.parent, placement=placement
-                    )
+            moved = [name for name in children.pop(child, ()) if name in joints]
+            children[joint.parent] += moved
+            for name in moved:
+                placement = joint.placement * joints[name].placement
+                joints[name] = dataclasses.replace(
+                    joints[name], parent=joint.parent, placement=placement
+                )
     return dataclasses.replace(description, links=links, joints=joints, notes=tuple(notes))
 
 

@@ -187,13 +187,20 @@ class Description:
 
     def subtree(self, link: str) -> set[str]:
         """Return a link and all its descendants."""
-        placements, before = {link}, 0
-        while len(placements) > before:
-            before = len(placements)
-            placements |= {
-                child for child, joint in self.joints.items() if joint.parent in placements
-            }
-        return placements
+        children = self.children()
+        found, ahead = {link}, [link]
+        while ahead:
+            new = [child for child in children.get(ahead.pop(), ()) if child not in found]
+            found.update(new)
+            ahead += new
+        return found
+
+    def children(self) -> dict[str, list[str]]:
+        """Return the children of each link that has any."""
+        found: dict[str, list[str]] = {}
+        for child, joint in self.joints.items():
+            found.setdefault(joint.parent, []).append(child)
+        return found
 
 
 def make_limits(low: float, high: float) -> tuple[float, float] | None:

@@ -10,6 +10,7 @@ from typing import Any
 import lazy_loader
 
 from vkc_pin.utils import notebook
+from vkc_pin.utils.optional_imports import explain_unfit_libraries
 
 _public, _names, __all__ = lazy_loader.attach_stub(__name__, __file__)
 __all__ += ["__version__", "cpin"]
@@ -26,7 +27,8 @@ def __getattr__(name: str) -> Any:
 
         return globals().setdefault(name, kinematics)
     if name != "__version__":
-        return _public(name)
+        with explain_unfit_libraries():
+            return _public(name)
     from importlib.metadata import PackageNotFoundError, version  # takes longer than all the rest
 
     try:

@@ -13,9 +13,12 @@ import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn, TextIO
 
+from vkc_pin.errors import BuildError
+from vkc_pin.utils.optional_imports import explain_unfit_libraries
+
 __all__ = ["main"]
 
-_INTERRUPTED = 130
+_MISUSE, _INTERRUPTED = 2, 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -35,10 +38,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     _open_closed_streams()
     sys.stdout, printed = _make_tolerant(sys.stdout, 1)
     sys.stderr, _ = _make_tolerant(sys.stderr, 2)
-    from vkc_pin.cli.commands import EXIT_MISUSE, run
-
     try:
+        with explain_unfit_libraries():
+            from vkc_pin.cli.commands import run
         code = run(sys.argv[1:])
+    except BuildError as error:
+        sys.stderr.write(f"vkc-pin: {error}\n")
+        code = _MISUSE
     except SystemExit as stop:  # --help, or invalid arguments
         code = int(stop.code or 0)
     if signal.getsignal(signal.SIGINT) is _exit_at_once:
@@ -46,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     sys.stdout.flush()
     if printed.error is not None and printed.error.errno != errno.EPIPE:
         sys.stderr.write(f"vkc-pin: cannot print: {printed.error.strerror}\n")
-        code = code or EXIT_MISUSE
+        code = code or _MISUSE
     sys.stderr.flush()
     return code
 

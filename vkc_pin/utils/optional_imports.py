@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, requires, version
 from typing import Any
 
 from vkc_pin.errors import BuildError, InputError
 
-__all__ = ["REBUILD_HINT", "import_compiled", "import_optional"]
+__all__ = ["REBUILD_HINT", "explain_unfit_libraries", "import_compiled", "import_optional"]
 
 REBUILD_HINT = (
     "build vkc-pin again: pip install --force-reinstall --no-deps --no-cache-dir vkc-pin "
@@ -24,15 +24,9 @@ def import_compiled(name: str) -> Any:
         BuildError: The module cannot be imported.
     """
     try:
-        return import_module(name)
+        with explain_unfit_libraries():
+            return import_module(name)
     except ImportError as error:
-        if unfit := _find_unfit_libraries():
-            installed = " and ".join(f"{name} {version}" for name, version in unfit.values())
-            needed = " ".join(f"'{requirement}'" for requirement in unfit)
-            raise BuildError(
-                f"the compiled module {name} does not fit the installed libraries ({error}): "
-                f"{installed}. Either pip install {needed}, or {REBUILD_HINT}"
-            ) from error
         raise BuildError(
             f"the compiled module {name} cannot be imported ({error}). It is in the wheels of "
             "vkc-pin; installing from sources builds it, which needs a C++17 compiler (Debian, "
@@ -40,8 +34,30 @@ def import_compiled(name: str) -> Any:
         ) from error
 
 
+@contextlib.contextmanager
+def explain_unfit_libraries() -> Iterator[None]:
+    """Turn a failed import into a `BuildError` if libraries of other releases are installed.
+
+    Compiled modules of this package and of Pinocchio then lack their libraries, or symbols.
+    """
+    try:
+        yield
+    except ImportError as error:
+        unfit = _find_unfit_libraries()
+        if not unfit:
+            raise
+        installed = " and ".join(f"{name} {version}" for name, version in unfit.values())
+        needed = " ".join(f"'{requirement}'" for requirement in unfit)
+        raise BuildError(
+            f"vkc-pin does not fit the installed {installed} ({error}). Either pip install "
+            f"{needed}, or {REBUILD_HINT}"
+        ) from error
+
+
 def _find_unfit_libraries() -> dict[str, tuple[str, str]]:
     """Return the requirements of this package that are not met: name and installed version."""
+    from importlib.metadata import PackageNotFoundError, requires, version
+
     from packaging.requirements import Requirement
 
     found = {}

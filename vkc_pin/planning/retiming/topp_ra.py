@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+import warnings
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
@@ -88,7 +89,9 @@ def _import_toppra() -> None:
         placeholders["matplotlib"].__dict__["pyplot"] = placeholders["matplotlib.pyplot"]
     sys.modules |= placeholders
     try:
-        logger = logging.getLogger(import_module("toppra").__name__)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", SyntaxWarning)  # of its docstrings, at the first import
+            logger = logging.getLogger(import_module("toppra").__name__)
     finally:
         for name in placeholders:
             del sys.modules[name]

@@ -4,6 +4,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Of pip's packages few modules are imported: with --no-compile, Python compiles those alone.
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .PHONY: demo test test-long lint docs clean
@@ -59,10 +60,10 @@ $(VENV)/installed.stamp: pyproject.toml CMakeLists.txt $(COMPILED) | $(VENV)/cre
 	@echo "Installing vkc-pin and what it needs into $(VENV); compiling takes a minute or two"
 	@$(listed) build-system requires > $(VENV)/build-packages.txt
 	@$(listed) project dependencies > $(VENV)/packages.txt
-	$(PIP) install --requirement $(VENV)/build-packages.txt cmake ninja
+	$(PIP) install --no-compile --requirement $(VENV)/build-packages.txt cmake ninja
 	@# The other packages are installed while this one is compiled, against what is in $(VENV) already.
-	$(PIP) install --requirement $(VENV)/packages.txt & others=$$!; \
-	$(PIP) install --no-deps --no-build-isolation --editable . && wait $$others
+	$(PIP) install --no-compile --requirement $(VENV)/packages.txt & others=$$!; \
+	$(PIP) install --no-compile --no-deps --no-build-isolation --editable . && wait $$others
 	@touch $@
 
 # Prints requirements of pyproject.toml: asking pip for '.[test]' would compile the package once more.
@@ -70,7 +71,7 @@ listed = $(BIN)/python -c '$(list_requirements)'
 list_requirements = import functools, sys, tomllib; \
   print(*functools.reduce(dict.get, sys.argv[1:], tomllib.load(open("pyproject.toml", "rb"))), sep="\n")
 # Usage: $(call extra,test)
-extra = @$(listed) project optional-dependencies $(1) > $(VENV)/$(1)-packages.txt && $(PIP) install --requirement $(VENV)/$(1)-packages.txt
+extra = @$(listed) project optional-dependencies $(1) > $(VENV)/$(1)-packages.txt && $(PIP) install --no-compile --requirement $(VENV)/$(1)-packages.txt
 
 $(VENV)/test.stamp: $(VENV)/installed.stamp
 	$(call extra,test)

@@ -62,6 +62,7 @@ def test_progress_is_one_line(jupyter: Kernel) -> None:
     assert jupyter.run("plan = vkc.plan(scene, steps)") == []
 
 
+@pytest.mark.long
 def test_interrupted_cell_leaves_a_plan(jupyter: Kernel) -> None:
     """The callback waits, so that the interrupt arrives during planning."""
     code = """

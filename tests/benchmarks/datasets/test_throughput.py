@@ -15,6 +15,7 @@ from vkc_pin.datasets.recipes.recipe import TASKS
 pytest.importorskip("h5py")
 
 
+@pytest.mark.long
 def test_each_task_has_a_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recipe = write(tmp_path)
     out = tmp_path / "out"

@@ -43,6 +43,7 @@ def test_problems_have_all_scenes_obstacles_and_kinds_of_steps() -> None:
     assert (min(added), max(added)) == (0, 6)
 
 
+@pytest.mark.long
 def test_plans_are_saved_and_judged(tmp_path: Path) -> None:
     table, trials = run_experiment("random --problems 4", tmp_path)
     assert [trial["key"] for trial in trials] == ["00000", "00001", "00002", "00003"]

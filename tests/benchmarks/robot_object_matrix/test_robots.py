@@ -13,6 +13,7 @@ from vkc_pin.benchmarks.robot_object_matrix.robots import format_results, run
 from vkc_pin.cli import main
 
 
+@pytest.mark.long
 def test_bench_robots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     good = write_arms(tmp_path / "good")
     legless = tmp_path / "legless.urdf"

@@ -95,7 +95,9 @@ def test_readme_is_brief() -> None:
 
 
 def test_yaml_examples_fit_their_schemas(tmp_path: Path) -> None:
-    room, home = find_blocks(ROOT / "docs/scenes.md", "yaml")
+    room, measured, home = find_blocks(ROOT / "docs/scenes.md", "yaml")
+    start = parse_document(Document(yaml.safe_load(measured)["start"]), StartSchema)
+    assert "drawer" in start.held
     for scene, objects, allowed in ((room, ["drawer"], 0), (home, ["door"], 4)):
         (tmp_path / "room.yaml").write_text(scene, encoding="utf-8")
         loaded = vkc.load_scene(tmp_path / "room.yaml")

@@ -32,6 +32,7 @@ from vkc_pin.planning.solver.trust_region import (
 from vkc_pin.utils.budget import Budget
 
 FEW = vkc.Options(reach_waypoints=20, max_outer=12)
+ONE_BLOCK = vkc.Options(reach_waypoints=14)
 
 
 def drive(
@@ -61,12 +62,20 @@ def make_pillar_case() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
 
 
 @cache
-def make_walls_case() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
-    """Two walls cross the straight path; all waypoints share one radius."""
+def make_roadside_case() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
+    """The base grazes a post, and the first feasible motion can be shortened."""
+    return drive(3.2, describe_post(1.6, 0.3, 0.15))
+
+
+@cache
+def make_walls_case(
+    options: vkc.Options = ONE_BLOCK,
+) -> tuple[vkc.TrajectoryProblem, np.ndarray]:
+    """Two walls cross the straight path; all waypoints share one radius, unless there are more."""
     obstacles = [
         describe_box(f"wall_{k}", 1.5 + 1.2 * k, (-1.0) ** k, [0.1, 3.0, 1.0]) for k in range(2)
     ]
-    return drive(4.2, *obstacles, options=vkc.Options(reach_waypoints=14))
+    return drive(4.2, *obstacles, options=options)
 
 
 @cache
@@ -185,9 +194,10 @@ def test_feasible_motions_are_improved_while_worthwhile(case: Case) -> None:
 
 
 def test_blocked_motions_end_early() -> None:
-    (problem, guess), solution = make_blocked_case(), solve_case(make_blocked_case)
+    problem, guess = make_blocked_case()
+    solution = solve(problem, guess, rounds=vkc.Options().max_outer)
     assert (solution.status, solution.converged) == ("not converged", False)
-    assert PROGRESS_ROUNDS <= solution.rounds < FEW.max_outer
+    assert PROGRESS_ROUNDS <= solution.rounds < vkc.Options().max_outer / 2
     shortfall = problem.evaluate_contacts(solution.z, reach=0.1).compute_violation()
     assert solution.shortfall == pytest.approx(shortfall)
     assert shortfall > NEARLY_FEASIBLE
@@ -203,7 +213,7 @@ def test_callback_receives_the_history() -> None:
 
 
 def test_solution_continues_with_given_radii() -> None:
-    problem, guess = make_pillar_case()
+    problem, guess = make_walls_case(FEW)
     first = solve(problem, guess, rounds=3)
     assert first.radius is not None
     assert len(np.unique(first.radius)) > 1, "one radius for all: choose a harder problem"
@@ -288,8 +298,8 @@ def test_evaluation_limit_is_deterministic() -> None:
     with Budget().activate() as budget:
         whole = solve(*make_pillar_case())
     cut = []
-    for share in (2, 2, 1):
-        with Budget(max_evaluations=budget.evaluations // share).activate():
+    for share in (0.8, 0.8, 1.0):
+        with Budget(max_evaluations=int(share * budget.evaluations)).activate():
             cut.append(solve(*make_pillar_case()))
     np.testing.assert_array_equal(cut[2].z, whole.z)
     assert cut[2].converged
@@ -302,10 +312,10 @@ def test_evaluation_limit_is_deterministic() -> None:
 def test_feasible_motion_is_kept_if_the_budget_ends() -> None:
     used: list[int] = []
     with Budget().activate() as budget:
-        whole = solve(*make_pillar_case(), callback=lambda _: used.append(budget.evaluations))
+        whole = solve(*make_roadside_case(), callback=lambda _: used.append(budget.evaluations))
     assert any(row.accepted and row.shortfall == 0.0 for row in whole.history[:-1])
     with Budget(max_evaluations=used[-1] - 1).activate():
-        solution = solve(*make_pillar_case())
+        solution = solve(*make_roadside_case())
     assert solution.rounds < whole.rounds
     assert (solution.converged, solution.status) == (True, "converged")
-    check_feasible(make_pillar_case()[0], solution)
+    check_feasible(make_roadside_case()[0], solution)

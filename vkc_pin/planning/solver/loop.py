@@ -9,9 +9,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from vkc_pin.planning.chain.contacts import Contacts
-from vkc_pin.planning.nlp.merit import TOLERANCE, Infeasibility, Merit, measure_infeasibility
+from vkc_pin.planning.nlp.merit import (
+    TOLERANCE,
+    Infeasibility,
+    Merit,
+    compute_shortfalls,
+    measure_infeasibility,
+)
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.solver.segment_planes import find_segment_contacts, merge_contacts
+from vkc_pin.planning.solver.segment_planes import (
+    SegmentContacts,
+    find_segment_contacts,
+    merge_contacts,
+)
+from vkc_pin.planning.solver.separation import Separation
 from vkc_pin.planning.solver.solution import Iteration, Solution
 from vkc_pin.planning.solver.subproblem import Step, Subproblem
 from vkc_pin.planning.solver.trust_region import (
@@ -21,7 +32,7 @@ from vkc_pin.planning.solver.trust_region import (
     TrustRegion,
     is_step_acceptable,
 )
-from vkc_pin.planning.solver.tunnelling import Crossing, find_new_crossings
+from vkc_pin.planning.solver.tunnelling import find_new_crossings
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.budget import STOP_STATUSES, BudgetExhaustedError, record_evaluations
 
@@ -43,9 +54,9 @@ class _Point:
     """Waypoints z_1..z_N, shape (N, n), and their evaluation, also within segments."""
 
     z: Floats
-    contacts: Contacts
-    is_clear: bool
-    crossings: list[Crossing]
+    at: Contacts  # coal's, at the waypoints
+    between: SegmentContacts
+    contacts: Contacts  # all of them, those of penetrating stretches in one direction
     infeasibility: Infeasibility
     objective: float
     pose_error: float
@@ -54,6 +65,11 @@ class _Point:
     def shortfall(self) -> Floats:
         """Clearance violation at each waypoint, shape (N,) [m]."""
         return self.infeasibility.amounts["clearance"]
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether no pair lacks clearance at or between waypoints."""
+        return self.between.is_free and self.at.compute_violation() < CLEARANCE_TOLERANCE
 
     @property
     def is_nearly_feasible(self) -> bool:
@@ -72,13 +88,14 @@ class _Loop:
         self.solution = Solution(z, self.timing.dt)
         self.subproblem = Subproblem(problem, self.solution)
         self.region = TrustRegion(problem.segments, problem.options.steps(BLOCK_TIME), radius)
+        self.separation = Separation(problem)
         self.feasible: tuple[Floats, Floats] | None = None  # last feasible waypoints and time steps
 
     def run(self, callback: Callback, rounds: int) -> None:
         """Run rounds until the trajectory is feasible and short, or progress stalls."""
         solution, region, started = self.solution, self.region, time.perf_counter()
-        self.point = self._evaluate(solution.z)
-        reference, since = self.point.infeasibility.total, 0  # when rounds were last counted
+        self._set_point(self._evaluate(solution.z))
+        reference, since = self._measure_total(), 0  # when rounds were last counted
         best = float("inf")  # objective of the last feasible trajectory
         for _ in range(rounds):
             record_evaluations()
@@ -129,7 +146,7 @@ class _Loop:
             # the loop by itself.
             since += accepted or shortfall.max() >= NEARLY_FEASIBLE
             # The infeasibility may also grow, where the objective decreased instead.
-            total, shortfall = self.point.infeasibility.total, self.point.shortfall
+            total, shortfall = self._measure_total(), self.point.shortfall
             if not PROGRESS * reference < total <= reference:
                 reference, since = total, 0
             if since >= PROGRESS_ROUNDS:
@@ -149,14 +166,34 @@ class _Loop:
 
     def _evaluate(self, z: Floats) -> _Point:
         options, begin = self.problem.options, time.perf_counter()
-        found = self.problem.evaluate_contacts(
+        at = self.problem.evaluate_contacts(
             z, reach=options.contact_reach, nearest=options.contact_slots
         )
-        segments = find_segment_contacts(self.problem, z)
+        between = find_segment_contacts(self.problem, z)
         self.solution.timings["coal"] += time.perf_counter() - begin
-        is_clear = segments.is_free and found.compute_violation() < CLEARANCE_TOLERANCE
-        contacts = merge_contacts(found, segments.contacts)
-        return _Point(z, contacts, is_clear, segments.crossings, *self._measure(z, contacts))
+        return self._make_point(z, at, between)
+
+    def _make_point(self, z: Floats, at: Contacts, between: SegmentContacts) -> _Point:
+        contacts = self.separation.replace_contacts(z, at, between.contacts)
+        return _Point(z, at, between, contacts, *self._measure(z, contacts))
+
+    def _measure_total(self) -> float:
+        """Return the sum of all violations of the iterate, whatever the directions of stretches."""
+        point, total = self.point, self.point.infeasibility.total
+        if not self.separation.is_active:
+            return total
+        every, t = merge_contacts(point.at, point.between.contacts), self.problem.transcription
+        nearest = compute_shortfalls(every, t.segments, t.slots)
+        return total + float(nearest.sum() - point.shortfall.sum())
+
+    def _set_point(self, point: _Point) -> None:
+        """Make `point` the iterate, and choose how its penetrating stretches separate."""
+        was_active = self.separation.is_active
+        if point.infeasibility.amounts["poses"].max() < NEARLY_FEASIBLE:
+            self.separation.update(point.z, point.at, point.between.crossings)
+        if was_active or self.separation.is_active:
+            point = self._make_point(point.z, point.at, point.between)
+        self.point = point
 
     def _measure(self, z: Floats, contacts: Contacts) -> tuple[Infeasibility, float, float]:
         """Return infeasibility, objective and pose error, which depend on the timing."""
@@ -170,7 +207,8 @@ class _Loop:
         """Return predicted and actual penalty reduction per waypoint, and whether to accept.
 
         The trial's penalty is infinite where a pair newly passes through each other, once the poses
-        are nearly feasible. Before, the waypoints do not describe a motion yet.
+        are nearly feasible. Before, and as long as stretches penetrate, the waypoints do not
+        describe a motion yet.
         """
         point, merit = self.point, self.merit
         expected = (
@@ -180,8 +218,11 @@ class _Loop:
         before, after = (
             merit.compute_penalty(each.infeasibility, clearance=True) for each in (point, trial)
         )
-        if point.infeasibility.amounts["poses"].max() < NEARLY_FEASIBLE:
-            for crossing in find_new_crossings(trial.crossings, point.crossings):
+        if (
+            not self.separation.is_active
+            and point.infeasibility.amounts["poses"].max() < NEARLY_FEASIBLE
+        ):
+            for crossing in find_new_crossings(trial.between.crossings, point.between.crossings):
                 after[max(crossing.first - 1, 0) : crossing.last + 1] = np.inf
         penalty, gain = float(before.sum()), point.objective - trial.objective
         accepted = is_step_acceptable(
@@ -196,8 +237,8 @@ class _Loop:
         was_infeasible = self.point.infeasibility.max_violation > TOLERANCE
         pace = self.problem.pace(trial.z)
         is_too_fast = self.timing.compute_violation(*pace) > TOLERANCE
-        self.point, self.solution.z = trial, trial.z
-        timing = self.timing
+        self._set_point(trial)
+        trial, timing, self.solution.z = self.point, self.timing, trial.z
         # Infeasible waypoints are a poor estimate of how long the motion takes.
         if was_infeasible and not self.rates:
             self.timing = self.problem.timing_for(trial.z)

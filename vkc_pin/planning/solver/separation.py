@@ -1,0 +1,272 @@
+"""Separates bodies that penetrate over a stretch of waypoints, all on the same side."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from vkc_pin.planning.chain.contacts import Contacts, make_empty_contacts
+from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.solver.segment_planes import merge_contacts
+from vkc_pin.planning.solver.tunnelling import Crossing
+from vkc_pin.utils.arrays import Bools, Floats, Ints
+from vkc_pin.world.models.shapes import triangulate
+
+__all__ = ["Separation"]
+
+SHALLOW = 0.01  # [m] penetration up to which opposite normals of a stretch are ignored
+SAME_DIRECTION = 0.99  # cosine above which two candidate directions count as one
+PUSHES = 6  # Gauss-Newton steps that separate a stretch in one direction
+MAX_PUSH = 0.5  # [m], [rad] limit of such a step
+
+_Key = tuple[int, tuple[int, int]]
+
+
+class _Stretch(NamedTuple):
+    """Rows `first` to `last` of z at which two bodies penetrate in a phase.
+
+    A body is the number of a joint, or minus the index of a geometry that is fixed in the world.
+    `depth` is the sum of the penetrations [m].
+    """
+
+    phase: int
+    bodies: tuple[int, int]
+    first: int
+    last: int
+    normals: Floats  # of its contacts, shape (C, 3)
+    depth: float
+    direction: Floats | None = None  # from first to second body, in the frame of the second
+
+    def is_at(self, contacts: Contacts, phases: Ints, bodies: Ints, margin: int) -> Bools:
+        """Return which contacts are between its bodies, up to `margin` waypoints from it."""
+        row = contacts.waypoint
+        near = (row >= self.first - margin) & (row <= self.last + margin)
+        return near & (phases == self.phase) & (bodies == self.bodies).all(axis=1)
+
+
+class Separation:
+    """Chooses the side on which each penetrating stretch of a motion leaves the other body.
+
+    Where a motion passes through a body, coal's normals point back before its middle and forward
+    behind it, so that planes with these normals pull the waypoints apart instead of aside. Here one
+    direction n is chosen for the whole stretch. Its contacts have the distance in this direction,
+    min n·b − max n·a over the points of both bodies, until the stretch is free.
+
+    Args:
+        problem: Problem.
+    """
+
+    def __init__(self, problem: TrajectoryProblem) -> None:
+        self.problem, self.contacts = problem, problem.contacts
+        self._stretches: list[_Stretch] = []
+        self._vertices: dict[tuple[int, int], Floats] = {}
+        self._pairs: dict[_Key, Ints] = {}
+
+    @property
+    def is_active(self) -> bool:
+        """Whether any stretch is left."""
+        return bool(self._stretches)
+
+    def update(self, z: Floats, contacts: Contacts, crossings: Sequence[Crossing]) -> None:
+        """Find the penetrating stretches of z_1..z_N, shape (N, n), and choose their directions.
+
+        Args:
+            z: z_1..z_N.
+            contacts: coal's contacts.
+            crossings: Pairs that pass through each other between waypoints.
+        """
+        self._stretches = []
+        for stretch in sorted(self._find_stretches(contacts, crossings), key=lambda s: -s.depth):
+            # The displacement of a deeper one may have freed it.
+            if not stretch.depth or self._penetrates(z, stretch):
+                direction, z = self._choose_direction(z, stretch)
+                self._stretches.append(stretch._replace(direction=direction))
+
+    def replace_contacts(self, z: Floats, at: Contacts, between: Contacts) -> Contacts:
+        """Merge contacts at and between waypoints, with those of the stretches in their direction.
+
+        Args:
+            z: z_1..z_N, shape (N, n).
+            at: coal's contacts at the waypoints.
+            between: Contacts of segments, expressed at the waypoints.
+        """
+        if not self._stretches:
+            return merge_contacts(at, between)
+        parts = []
+        for part, margin in ((at, 0), (between, 1)):
+            phases, bodies = self._find_phases(part.waypoint), self._find_bodies(part.pair)
+            covered = [stretch.is_at(part, phases, bodies, margin) for stretch in self._stretches]
+            parts.append(part.select(np.flatnonzero(~np.any(covered, axis=0))))
+        return merge_contacts(*parts, *(self._make_contacts(z, each) for each in self._stretches))
+
+    def _find_stretches(self, contacts: Contacts, crossings: Iterable[Crossing]) -> list[_Stretch]:
+        """Return the stretches in which normals oppose each other, or that end on another side."""
+        deep = contacts.select(np.flatnonzero((contacts.distance < 0.0) & (contacts.margin > 0.0)))
+        overlaps, crossed = defaultdict[_Key, list[int]](list), defaultdict[_Key, set[int]](set)
+        phases, bodies = self._find_phases(deep.waypoint), self._find_bodies(deep.pair)
+        for number, (phase, (one, other)) in enumerate(
+            zip(phases.tolist(), bodies.tolist(), strict=True)
+        ):
+            overlaps[phase, (one, other)].append(number)
+        for crossing in crossings:
+            one, other = self._find_bodies(np.array([crossing.pair]))[0].tolist()
+            key = self.contacts.find_phase(crossing.first + 1), (one, other)
+            # Rows of z inside the crossing, or at both ends of its only segment.
+            inside = range(crossing.first, crossing.last) or (crossing.first - 1, crossing.first)
+            crossed[key] |= {row for row in inside if row >= 0}
+        found = []
+        for key in {**overlaps, **crossed}:
+            own = deep.select(np.array(overlaps[key], int))
+            rows = np.array(sorted({*own.waypoint.tolist(), *crossed[key]}))
+            for part in np.split(rows, np.flatnonzero(np.diff(rows) > 2) + 1):
+                first, last = int(part[0]), int(part[-1])
+                overlap = own.select(
+                    np.flatnonzero((own.waypoint >= first) & (own.waypoint <= last))
+                )
+                normals, depth = overlap.normal, -overlap.distance
+                opposes = depth.max(initial=0.0) > SHALLOW and (normals @ normals.T).min() < 0.0
+                if opposes or not crossed[key].isdisjoint(part.tolist()):
+                    found.append(_Stretch(*key, first, last, normals, float(depth.sum())))
+        return found
+
+    def _find_phases(self, rows: Ints) -> Ints:
+        return self.contacts.find_phases(rows + 1)
+
+    def _find_bodies(self, pairs: Ints) -> Ints:
+        joints = self.contacts.get_joints(pairs)
+        return np.where(joints > 0, joints, -pairs)
+
+    def _get_pairs(self, stretch: _Stretch) -> Ints:
+        """Return geometries and number of each pair of the bodies with a margin, shape (P, 3)."""
+        key = stretch.phase, stretch.bodies
+        if key not in self._pairs:
+            part = self.contacts.phases[stretch.phase]
+            own = (self._find_bodies(part.pairs) == stretch.bodies).all(axis=1)
+            numbers = np.flatnonzero(own & (part.margins > 0.0))
+            self._pairs[key] = np.column_stack([part.pairs[numbers], numbers])
+        return self._pairs[key]
+
+    def _penetrates(self, z: Floats, stretch: _Stretch) -> bool:
+        """Return whether two bodies penetrate anywhere in a stretch."""
+        rows = np.arange(stretch.first, stretch.last + 1)
+        found = self.contacts.evaluate(z[rows], rows + 1, reach=0.0)
+        return bool((self._find_bodies(found.pair) == stretch.bodies).all(axis=1).any())
+
+    def _make_contacts(self, z: Floats, stretch: _Stretch) -> Contacts:
+        """Return the contacts of a stretch in its direction."""
+        rows = np.arange(stretch.first, stretch.last + 1)
+        assert stretch.direction is not None
+        return self._measure(z[rows], stretch, np.tile(stretch.direction, (len(rows), 1)), rows)
+
+    def _measure(self, z: Floats, stretch: _Stretch, directions: Floats, rows: Ints) -> Contacts:
+        """Return contacts of all pairs of a stretch's bodies in one direction per configuration.
+
+        Args:
+            z: Configurations, shape (B, n).
+            stretch: The stretch.
+            directions: Directions in the frame of the second body, shape (B, 3).
+            rows: Waypoints of the contacts, shape (B,).
+        """
+        rotations, translations = self.contacts.compute_placements(z)
+        joint = max(stretch.bodies[1], 0)
+        normal = np.einsum("bij,bj->bi", rotations[:, joint], directions)
+        parts, part = [make_empty_contacts()], self.contacts.phases[stretch.phase]
+        for first, second, number in self._get_pairs(stretch).tolist():
+            ends = []
+            for geometry, sign in ((first, 1.0), (second, -1.0)):
+                points, joint = self._get_vertices(stretch.phase, geometry), part.joint[geometry]
+                local = sign * np.einsum("bij,bi->bj", rotations[:, joint], normal)
+                support = points[(local @ points.T).argmax(axis=1)]
+                turned = np.einsum("bij,bj->bi", rotations[:, joint], support)
+                ends.append(turned + translations[:, joint])
+            distance = np.einsum("bi,bi->b", normal, ends[1] - ends[0])
+            pair = np.tile([first, second], (len(z), 1))
+            margin = np.full(len(z), part.margins[number])
+            parts.append(Contacts(rows, pair, distance, margin, normal, *ends))
+        return merge_contacts(*parts)
+
+    def _get_vertices(self, phase: int, geometry: int) -> Floats:
+        """Return the vertices of a geometry in the frame of its joint, shape (n, 3) [m]."""
+        if (phase, geometry) not in self._vertices:
+            part = self.contacts.phases[phase]
+            points, _ = triangulate(part.shapes[geometry].geometry)
+            placed = points @ part.rotation[geometry].T + part.translation[geometry]
+            self._vertices[phase, geometry] = placed
+        return self._vertices[phase, geometry]
+
+    def _choose_direction(self, z: Floats, stretch: _Stretch) -> tuple[Floats, Floats]:
+        """Choose the direction of a stretch by merit.
+
+        In each candidate direction, the stretch and the waypoints at its ends are moved by the
+        least displacement that separates the bodies. The least
+        sum of the detour (in the metric of the motion cost) and of the violations that are left
+        decides. Directions along the motion
+        lose, since they would move one of the ends through the whole body.
+
+        Returns:
+            The direction, shape (3,), and z_1..z_N after the displacement.
+        """
+        problem, part = self.problem, self.contacts.phases[stretch.phase]
+        begin = problem.ends[stretch.phase - 1] if stretch.phase else 0
+        first, last = (
+            max(stretch.first - 1, begin),
+            min(stretch.last + 1, problem.ends[stretch.phase] - 1),
+        )
+        rows = np.arange(first, last + 1)
+        middle = z[[(stretch.first + stretch.last) // 2]]
+        rotations, _ = self.contacts.compute_placements(middle)
+        frame = rotations[0, max(stretch.bodies[1], 0)]
+        axes = [stretch.normals]
+        for geometry in np.unique(self._get_pairs(stretch)[:, :2]).tolist():
+            box = (rotations[0, part.joint[geometry]] @ part.rotation[geometry]).T
+            axes += [box, -box]
+        candidates = _select_distinct(np.concatenate(axes) @ frame)
+        count = len(candidates)
+        moved, waypoints = np.tile(z[rows], (count, 1)), np.tile(rows, count)
+        directions = np.repeat(candidates, len(rows), axis=0)
+        self._push(moved, waypoints, stretch, directions)
+        left = self.contacts.evaluate(
+            moved,
+            waypoints + 1,
+            reach=problem.options.largest_margin,
+            nearest=problem.options.contact_slots,
+        )
+        own = self._measure(moved, stretch, directions, np.arange(len(moved)))
+        violation = np.zeros(len(moved))
+        for found in (left, own):
+            np.add.at(violation, found.waypoint, np.maximum(found.margin - found.distance, 0.0))
+        change = moved - np.tile(z[rows], (count, 1))
+        detour = np.sqrt((problem.motion_cost.metric * change**2).sum(axis=1))
+        merit = problem.options.penalty * violation.reshape(count, -1).sum(axis=1)
+        best = int(np.argmin(merit + 2.0 * detour.reshape(count, -1).max(axis=1)))
+        z = z.copy()
+        z[rows] = moved.reshape(count, len(rows), -1)[best]
+        return candidates[best], z
+
+    def _push(self, z: Floats, rows: Ints, stretch: _Stretch, directions: Floats) -> None:
+        """Move configurations z, shape (B, n), until the deepest pair is apart in its direction."""
+        problem = self.problem
+        lower, upper = problem.lower[rows], problem.upper[rows]
+        free = upper - lower > 1e-9
+        for _ in range(PUSHES):
+            found = self._measure(z, stretch, directions, np.arange(len(z)))
+            found = found.select(np.flatnonzero(found.slot == 0))  # the largest violation
+            gradient = self.contacts.compute_gradients(z, found)
+            growth = np.maximum(found.margin - found.distance, 0.0)
+            step = free * gradient
+            step *= (growth / np.maximum((step * gradient).sum(axis=1), 1e-6))[:, None]
+            size = np.abs(step).max(axis=1, keepdims=True)
+            step *= np.minimum(1.0, MAX_PUSH / np.maximum(size, 1e-9))
+            z[:] = np.clip(z + step, lower, upper)
+
+
+def _select_distinct(directions: Floats) -> Floats:
+    """Return the directions that differ from those before them, shape (n, 3)."""
+    chosen: list[Floats] = []
+    for direction in directions:
+        if all(direction @ other < SAME_DIRECTION for other in chosen):
+            chosen.append(direction)
+    return np.array(chosen)

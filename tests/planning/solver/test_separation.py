@@ -112,6 +112,16 @@ def test_gradients_of_a_direction_equal_finite_differences() -> None:
     np.testing.assert_allclose(slope, expected, atol=1e-5)
 
 
+def test_allowed_overlaps_may_be_passed_through() -> None:
+    crate = {"name": "crate", "type": "box", "size": [0.2, 0.2, 0.5], "position": [3.0, 0.0, 0.25]}
+    scene = make_hall(obstacles=[crate])
+    allow = [{"pair": [link, "crate"], "margin": -2.0} for link in scene.robot.links]
+    scene = vkc.Scene.from_document({**scene.document, "allow": allow})
+    plan = vkc.plan(scene, [vkc.GoTo(GOAL, 0.0, 0.0)], initialization="interpolated")
+    assert plan.success
+    assert np.abs(plan.trajectory.positions[:, 1]).max() < 0.05
+
+
 @pytest.mark.parametrize("crates", [(), ((3.0, 1.0, 0.6),), ((3.0, 0.645, 0.6),)])
 def test_free_and_grazing_motions_keep_coals_contacts(
     crates: tuple[tuple[float, float, float], ...],

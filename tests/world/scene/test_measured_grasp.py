@@ -47,6 +47,17 @@ def make_measured(name: str, attachment: str, at: list[float], off: np.ndarray) 
     return (grasp.motion(at) * pin.SE3(pin.exp3(off[3:]), off[:3])).inverse()
 
 
+def hold_measured(
+    grasp: tuple[str, str], share: float, off: np.ndarray
+) -> tuple[vkc.Scene, pin.SE3]:
+    """Return a scene with a grasp that is off in the direction `off`, and its measured pose."""
+    name, attachment = grasp
+    at = choose_values(name, attachment, share)
+    measured = make_measured(*grasp, at, off * np.repeat([0.011, 0.11], 3))
+    scene = make_hall().with_held({name: attachment}, at={name: at}, measured={name: measured})
+    return scene, measured
+
+
 def choose_values(name: str, attachment: str, share: float) -> list[float]:
     freedoms = make_hall().objects[name].object.attachment(attachment).freedoms
     return [one.lower + share * (one.upper - one.lower) for one in freedoms]
@@ -57,10 +68,8 @@ def choose_values(name: str, attachment: str, share: float) -> list[float]:
 def test_virtual_joint_is_the_measured_transform(
     grasp: tuple[str, str], share: float, off: np.ndarray
 ) -> None:
-    name, attachment = grasp
-    at = choose_values(name, attachment, share)
-    measured = make_measured(*grasp, at, off * np.repeat([0.011, 0.11], 3))
-    scene = make_hall().with_held({name: attachment}, at={name: at}, measured={name: measured})
+    (name, attachment), (scene, measured) = grasp, hold_measured(grasp, share, off)
+    at = scene.holds[0].at
     chain = consolidate(scene, scene.holds)
     z = np.zeros(chain.size)
     z[: len(scene.start)] = scene.start
@@ -85,10 +94,7 @@ def test_virtual_joint_is_the_measured_transform(
 def test_measured_grasp_survives_files(
     grasp: tuple[str, str], share: float, off: np.ndarray
 ) -> None:
-    name, attachment = grasp
-    at = choose_values(name, attachment, share)
-    measured = make_measured(*grasp, at, off * np.repeat([0.011, 0.11], 3))
-    scene = make_hall().with_held({name: attachment}, at={name: at}, measured={name: measured})
+    scene, _ = hold_measured(grasp, share, off)
     again = vkc.Scene.from_document(json.loads(json.dumps(scene.document)))
     assert again.holds == scene.holds
     assert again.holds[0].at == scene.holds[0].at

@@ -22,7 +22,7 @@ SAME_DIRECTION = 0.99  # cosine above which two candidate directions count as on
 PUSHES = 6  # Gauss-Newton steps that separate a stretch in one direction
 MAX_PUSH = 0.5  # [m], [rad] limit of such a step
 
-_Key = tuple[int, tuple[int, int]]
+_Key = tuple[int, tuple[int, int]]  # phase and bodies, see `_Stretch`
 
 
 class _Stretch(NamedTuple):
@@ -103,7 +103,10 @@ class Separation:
         return merge_contacts(*parts, *(self._make_contacts(z, each) for each in self._stretches))
 
     def _find_stretches(self, contacts: Contacts, crossings: Iterable[Crossing]) -> list[_Stretch]:
-        """Return the stretches in which normals oppose each other, or that end on another side."""
+        """Return the stretches in which normals oppose each other, or that end on another side.
+
+        Bodies that may overlap have none.
+        """
         deep = contacts.select(np.flatnonzero((contacts.distance < 0.0) & (contacts.margin > 0.0)))
         overlaps, crossed = defaultdict[_Key, list[int]](list), defaultdict[_Key, set[int]](set)
         phases, bodies = self._find_phases(deep.waypoint), self._find_bodies(deep.pair)
@@ -130,7 +133,7 @@ class Separation:
                 opposes = depth.max(initial=0.0) > SHALLOW and (normals @ normals.T).min() < 0.0
                 if opposes or not crossed[key].isdisjoint(part.tolist()):
                     found.append(_Stretch(*key, first, last, normals, float(depth.sum())))
-        return found
+        return [stretch for stretch in found if len(self._get_pairs(stretch))]
 
     def _find_phases(self, rows: Ints) -> Ints:
         return self.contacts.find_phases(rows + 1)
@@ -201,9 +204,8 @@ class Separation:
         """Choose the direction of a stretch by merit.
 
         In each candidate direction, the stretch and the waypoints at its ends are moved by the
-        least displacement that separates the bodies. The least
-        sum of the detour (in the metric of the motion cost) and of the violations that are left
-        decides. Directions along the motion
+        least displacement that separates the bodies. The least sum of the detour (in the metric of
+        the motion cost) and of the violations that are left decides. Directions along the motion
         lose, since they would move one of the ends through the whole body.
 
         Returns:

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import io
 import os
 import resource
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.datasets import SMALL
 
 import vkc_pin as vkc
+from vkc_pin.benchmarks.harness.record import find_commit
+from vkc_pin.benchmarks.harness.runner import run
+from vkc_pin.cli import main
 from vkc_pin.errors import InputError
 from vkc_pin.procedural import random_object, write_object
 from vkc_pin.world.models.self_collisions import write_srdf
@@ -25,6 +32,11 @@ HOME = ROBOT.with_name("home.xml")
 @functools.cache
 def make_plan() -> vkc.Plan:
     return vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 0.2})])
+
+
+@functools.cache
+def save_plan() -> Path:
+    return make_plan().save(Path(tempfile.mkdtemp(), "plan.npz"))
 
 
 @functools.cache
@@ -46,6 +58,34 @@ def _import_robot(path: Path, **options: Any) -> None:
     vkc.importing.import_robot(ROBOT, path, samples=100, most_pieces=1, **options)
 
 
+def _generate(path: Path) -> None:
+    pytest.importorskip("h5py")
+    vkc.datasets.generate(SMALL, 1, path)
+
+
+def _run_trial(trial: dict[str, Any]) -> dict[str, Any]:
+    return {**trial, "status": "success"}
+
+
+def _run_benchmark(path: Path) -> None:
+    run([{"key": "0"}], _run_trial, path, settings={}, progress=False)
+
+
+def _render_film(path: Path) -> None:
+    if shutil.which("ffmpeg") is None:
+        pytest.importorskip("imageio_ffmpeg")
+    simulate().to_mp4(path, rate=2.0)
+
+
+def _write_ros(path: Path) -> None:
+    """Write ROS messages with the command line, whose errors are text."""
+    text = io.StringIO()
+    with contextlib.redirect_stderr(text), contextlib.redirect_stdout(io.StringIO()):
+        code = main(["export", str(save_plan()), "--ros", str(path)])
+    if code:
+        raise InputError(text.getvalue())
+
+
 def _write_rosbag(path: Path, **options: Any) -> None:
     pytest.importorskip("rosbags")
     make_plan().to_rosbag(path, **options)
@@ -59,6 +99,8 @@ FILES: dict[str, Callable[[Path], Any]] = {
     "motion.json": lambda path: make_plan().trajectory.to_json(path),
     "result.json": lambda path: simulate().to_json(path),
     "drawers.yaml": lambda path: write_object(random_object("drawers", seed=1), path),
+    "plot.png": lambda path: make_plan().plot(path),
+    "ros.json": _write_ros,
 }
 FOLDERS: dict[str, Callable[..., Any]] = {
     "bag": _write_rosbag,
@@ -66,11 +108,18 @@ FOLDERS: dict[str, Callable[..., Any]] = {
     "home": _import_home,
     "robot": _import_robot,
 }
+RESUMED: dict[str, Callable[[Path], Any]] = {"dataset": _generate, "benchmark": _run_benchmark}
+"""Writers of folders that continue what is there."""
 SLOW: dict[str, Callable[[Path], Any]] = {
     "a.html": lambda path: make_plan().to_html(path),
     "robot.srdf": lambda path: write_srdf(make_plan().scene.robot, path, samples=50),
 }
-WRITERS = {**FILES, **FOLDERS}
+RENDERED: dict[str, Callable[[Path], Any]] = {
+    "pictures.png": lambda path: simulate().plot(path, count=2),
+    "film.mp4": _render_film,
+}
+"""Writers that compute for long, and look at their target before."""
+WRITERS = {**FILES, **FOLDERS, **RESUMED, **RENDERED}
 
 
 @contextlib.contextmanager
@@ -97,11 +146,11 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "mine"
 
 
-@pytest.mark.parametrize("name", [*WRITERS, *SLOW])
+@pytest.mark.parametrize("name", [*FILES, *FOLDERS, *SLOW])
 def test_a_full_disk_leaves_nothing_behind(folder: Path, name: str) -> None:
     if name.startswith("result"):
         simulate()
-    make_plan()
+    save_plan()
     with fill_disk(), pytest.raises(InputError, match=r"cannot write this .*(large|disk)"):
         {**WRITERS, **SLOW}[name](folder / name)
     assert list_files(folder) == set()
@@ -115,6 +164,16 @@ def test_a_full_disk_keeps_the_previous_file(folder: Path, name: str) -> None:
         FILES[name](folder / name)
     assert (folder / name).read_text(encoding="utf-8") == "before"
     assert list_files(folder) == {name}
+
+
+@pytest.mark.parametrize("name", [pytest.param("dataset", marks=pytest.mark.long), "benchmark"])
+def test_a_full_disk_leaves_a_folder_that_can_be_continued(folder: Path, name: str) -> None:
+    find_commit()  # cached: the limit of this test would kill git, which would leave a lock
+    with fill_disk(), pytest.raises(InputError, match=r"cannot write this .*File too large"):
+        RESUMED[name](folder / name)
+    RESUMED[name](folder / name)
+    assert len(list_files(folder / name)) > 2
+    assert list_files(folder.parent / "others") == {"letter.txt"}
 
 
 @pytest.mark.parametrize("name", WRITERS)

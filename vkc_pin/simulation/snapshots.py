@@ -25,7 +25,7 @@ from vkc_pin.utils import arguments
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.visualization.camera import FIELD_OF_VIEW
 from vkc_pin.visualization.room import is_wall
-from vkc_pin.world.files.writing import write_atomically
+from vkc_pin.world.files.writing import check_writable, write_atomically
 from vkc_pin.world.scene.obstacles import FLOOR
 
 __all__ = ["RenderedScene", "open_gl_context", "write_snapshots", "write_video"]
@@ -176,6 +176,7 @@ def write_snapshots(executed: Execution, path: str | Path, *, count: int = 6) ->
         The path.
     """
     count = arguments.check_integer(count, "count", low=2, high=_MAX_SNAPSHOTS)
+    check_writable(path)
     first, last = float(executed.planned.times[0]), float(executed.planned.times[-1])
     held = [phase for phase in executed.planned.phases if phase.holds]
     begin = float(executed.planned.times[held[0].first]) if held else first
@@ -216,6 +217,7 @@ def write_video(executed: Execution, path: str | Path, *, rate: float = 25.0) ->
         arguments.check_number(rate, "rate", "frames per second", low=1.0, high=_MAX_RATE),
         _find_ffmpeg(),
     )
+    check_writable(path)
     times = np.arange(executed.trajectory.times[0], executed.trajectory.times[-1], 1.0 / rate)
     scene, size = RenderedScene(executed), "x".join(map(str, _SIZE))
     with tempfile.TemporaryDirectory() as folder:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import itertools
 import json
+import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
@@ -221,9 +222,14 @@ class Journal(JournalContents):
             raise InputError("not a journal", file=self._path, line=1, expected=expected, got=got)
 
     def _write(self, line: Mapping[str, Any]) -> None:
-        text = _encode_line(line)
-        self._stream.write(text)
-        self._stream.flush()
+        text, done = _encode_line(line), 0
+        try:  # past the buffer, which would raise once more when the stream is closed
+            while done < len(text):
+                done += os.write(self._stream.fileno(), text[done:])
+        except OSError as error:
+            raise InputError(
+                "cannot write this", file=self._path, expected="a writable file", got=error.strerror
+            ) from error
         self._end += len(text)
 
     def _check_header(self, header: Mapping[str, Any]) -> None:

@@ -29,6 +29,7 @@ from vkc_pin.visualization.plots.style import (
 )
 from vkc_pin.visualization.plots.top_view import draw_top_view
 from vkc_pin.world.files.resources import check_path
+from vkc_pin.world.files.writing import check_writable
 from vkc_pin.world.trajectory.world_model import World
 
 if TYPE_CHECKING:
@@ -59,6 +60,8 @@ def plot(plan: CheckedMotion, path: str | Path | None = None) -> Figure | dict[s
     _check_plan(plan)
     target = None if path is None else check_path(path, "path")
     if target is None or target.suffix.lower() in PICTURES:
+        if target is not None:
+            check_writable(target)  # before drawing, which takes seconds
         return save_figure(_plot_all(plan), target)
     if target.is_file():
         expected = f"a folder, or a name ending with {', '.join(PICTURES)}"

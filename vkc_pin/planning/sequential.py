@@ -8,6 +8,7 @@ import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from vkc_pin.planning.initialization.initial_guess import make_initial_guess
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.results import add_statistics, concatenate_plans
@@ -40,25 +41,63 @@ class PlannedStep(NamedTuple):
 def plan_sequentially(scene: Scene, task: Task, request: PlanningRequest) -> Plan:
     """Plan every step from the end of the one before, up to the first failure; concatenate them."""
     parts = plan_each_step(scene, task, request)
-    steps: list[tuple[Step, ...]] = [(step,) for step in task.steps]
-    for part in parts:  # one step becomes several where an object is grasped anew
-        steps[part.number] = part.result.plan.steps
     plans = [part.result.plan for part in parts]
-    return concatenate_plans(scene, list(itertools.chain(*steps)), request, plans)
+    return concatenate_plans(scene, _list_steps(task, parts), request, plans)
 
 
 def plan_simultaneously(scene: Scene, task: Task, request: PlanningRequest) -> Plan:
     """Plan several steps as one problem, in which grasps and base poses depend on later steps.
 
-    If that fails, the steps are planned sequentially.
+    "auto" starts from the solutions of the steps, planned sequentially: their search is cheaper,
+    and the motion costs no more than theirs. Initial guesses for all steps together are searched if
+    a step fails; with other initializations they come first.
     """
+    is_auto = request.initialization == "auto"
     with share_budget(2):
-        plan = solve_task(scene, task, request).plan
+        first = (_plan_from_steps if is_auto else _plan_from_guesses)(scene, task, request)
+    if first.success or current_ending():
+        return first
     has_alternatives = any(has_open_attachment(scene, step) for step in task.steps)
-    if plan.success or current_ending() or (plan.status == "infeasible" and not has_alternatives):
-        return plan
-    apart = plan_sequentially(scene, task, request)
-    return add_statistics(apart if apart.success else plan, [plan.statistics, apart.statistics])
+    if not is_auto and first.status == "infeasible" and not has_alternatives:
+        return first
+    second = (_plan_from_guesses if is_auto else _plan_from_steps)(scene, task, request)
+    best = second if second.success or is_auto else first
+    return add_statistics(best, [first.statistics, second.statistics])
+
+
+def _plan_from_guesses(scene: Scene, task: Task, request: PlanningRequest) -> Plan:
+    """Plan all steps as one problem, from initial guesses for the whole."""
+    return solve_task(scene, task, request).plan
+
+
+def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> Plan:
+    """Plan all steps as one problem, from their solutions one after the other.
+
+    Returns:
+        The concatenated solutions of the steps if one fails, or if they cannot be improved.
+    """
+    parts = plan_each_step(scene, task, request)
+    steps, statistics = _list_steps(task, parts), [part.result.plan.statistics for part in parts]
+    whole = task if steps == task.steps else compile_task(scene, steps, request.options)
+    is_planned = parts and all(part.result.plan.success for part in parts) and not current_ending()
+    # A chain can contain a joint only once.
+    if is_planned and find_shared_coordinate(scene, whole.holds) is None:
+        pieces = [part.result.phase_waypoints() for part in parts]
+        guess = functools.partial(make_initial_guess, parts=pieces)
+        plan = solve_task(scene, whole, request, guess=guess).plan
+        statistics.append(plan.statistics)
+        if plan.success:
+            return add_statistics(plan, statistics)
+    plans = [part.result.plan for part in parts]
+    return concatenate_plans(scene, steps, request, plans, statistics=statistics)
+
+
+def _list_steps(task: Task, parts: Sequence[PlannedStep]) -> tuple[Step, ...]:
+    """Return the steps of a task, with the attachments of their plans."""
+    steps: list[tuple[Step, ...]] = [(step,) for step in task.steps]
+    for part in parts:  # one step becomes several where an object is grasped anew
+        steps[part.number] = part.result.plan.steps
+    return tuple(itertools.chain(*steps))
 
 
 def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) -> TaskResult:

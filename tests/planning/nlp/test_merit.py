@@ -12,6 +12,7 @@ from helpers.small_problems import load_door_scene, make_program
 import vkc_pin as vkc
 from vkc_pin.planning.nlp.merit import (
     GROWTH,
+    MAX_WEIGHT,
     Infeasibility,
     Merit,
     compute_shortfalls,
@@ -127,3 +128,5 @@ def test_weights_of_violated_kinds_increase() -> None:
     increased = {"clearance": 2.0 * GROWTH, "terms": 2.0 * GROWTH}
     assert merit.weights == {**dict.fromkeys(KINDS, 2.0), **increased}
     assert not merit.increase_weights(make_infeasibility(poses=[0.09, 0.0]), 0.1)
+    merit.weights["clearance"] = MAX_WEIGHT  # a violation that more weight does not remove
+    assert not merit.increase_weights(make_infeasibility(clearance=[0.2]), 0.1)

@@ -15,6 +15,7 @@ from vkc_pin.utils.arrays import Floats
 
 __all__ = [
     "GROWTH",
+    "MAX_WEIGHT",
     "TOLERANCE",
     "Infeasibility",
     "Merit",
@@ -25,6 +26,7 @@ __all__ = [
 # [m], [rad], and relative to the limits for rates: tolerance of all constraints except clearance
 TOLERANCE = 1e-4
 GROWTH = 4.0  # factor by which a weight grows if it proved too small
+MAX_WEIGHT = 1000.0  # [1/m], [1/rad] beyond which a violation is taken for unavoidable
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +125,11 @@ class Merit:
     def increase_weights(self, infeasibility: Infeasibility, tolerance: float) -> bool:
         """Increase the weights of kinds violated by more than `tolerance`; return whether any."""
         amounts = infeasibility.amounts
-        violated = [kind for kind in self.weights if amounts[kind].max(initial=0.0) > tolerance]
-        for kind in violated:
+        increased = [
+            kind
+            for kind, weight in self.weights.items()
+            if weight < MAX_WEIGHT and amounts[kind].max(initial=0.0) > tolerance
+        ]
+        for kind in increased:
             self.weights[kind] *= GROWTH
-        return bool(violated)
+        return bool(increased)

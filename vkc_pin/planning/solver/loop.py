@@ -44,7 +44,8 @@ NEARLY_FEASIBLE = 0.01
 # rounds within which the infeasibility must decrease; near feasibility only accepted rounds count
 PROGRESS_ROUNDS = 5
 PROGRESS = 0.7  # factor by which the infeasibility must decrease in these rounds
-MIN_IMPROVEMENT = 0.05  # relative decrease of the objective that justifies further rounds
+# relative decrease of the objective that justifies further rounds, from a guess and a solution
+MIN_IMPROVEMENT, MIN_CONTINUED_IMPROVEMENT = 0.05, 0.01
 
 Callback = Callable[[Iteration], None]
 
@@ -89,6 +90,7 @@ class _Loop:
         self.subproblem = Subproblem(problem, self.solution)
         self.region = TrustRegion(problem.segments, problem.options.steps(BLOCK_TIME), radius)
         self.separation = Separation(problem)
+        self.improvement = MIN_IMPROVEMENT if radius is None else MIN_CONTINUED_IMPROVEMENT
         self.feasible: tuple[Floats, Floats] | None = None  # last feasible waypoints and time steps
 
     def run(self, callback: Callback, rounds: int) -> None:
@@ -138,7 +140,7 @@ class _Loop:
                     if self.problem.drift(trial.z) <= 1.0:
                         solution.converged, solution.status = True, "converged"
                         self.feasible = trial.z, solution.dt
-                    improved = best < (1.0 - MIN_IMPROVEMENT) * last
+                    improved = best < (1.0 - self.improvement) * last
                     if not improved or (size < ACTIVE_FRACTION * used).all():
                         break
             region.adapt(predicted, actual, size, accepted)
@@ -153,15 +155,22 @@ class _Loop:
                 break
             if accepted and not converged and self.point.is_nearly_feasible:
                 region.limit()
-            if region.has_stalled(size, shortfall) and not self._raise_penalties():
-                break
+            if region.has_stalled(size, shortfall):
+                if not self._raise_penalties():
+                    break
+            elif accepted and nearly and step.slack.max() > CLEARANCE_TOLERANCE:
+                # A weight is too small if violations pay even according to the model.
+                self._increase_weights()
 
     def _raise_penalties(self) -> bool:
         """Raise the weights of violated constraints near feasibility; return whether any rose."""
         if self.point.shortfall.max() >= NEARLY_FEASIBLE:
             return False
-        self.subproblem.reset_multipliers()
         self.region.reset()
+        return self._increase_weights()
+
+    def _increase_weights(self) -> bool:
+        self.subproblem.reset_multipliers()
         return self.merit.increase_weights(self.point.infeasibility, CLEARANCE_TOLERANCE)
 
     def _evaluate(self, z: Floats) -> _Point:

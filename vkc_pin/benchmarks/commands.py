@@ -79,7 +79,7 @@ def _add_comparisons(benches: Any) -> None:
         about = "save the plans of failures"
         parser.add_argument("--save-failures", action="store_true", help=about)
 
-    about = "compare with trajopt, OMPL and roboplan (needs the extra `peers`)"
+    about = "compare with trajopt, OMPL, roboplan and HPP (needs the extra `peers`)"
     parser = _add_experiment(benches, "peers", about, module="peers.run")
     _add_count(parser, "--trials", 20, "problems per task")
     _add_choice(parser, "tasks", "reach door drawer (default: all)")

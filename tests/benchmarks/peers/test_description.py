@@ -37,16 +37,28 @@ def test_description_has_the_same_kinematics_and_pairs(task: str, tmp_path: Path
     )
 
 
-def test_inflated_shapes_collide_where_margins_are_violated(tmp_path: Path) -> None:
+@pytest.mark.parametrize("by_body", [False, True])
+def test_shapes_are_closer_than_asked_where_margins_are_violated(
+    by_body: bool, tmp_path: Path
+) -> None:
     problem = build_program(make_problem("drawer", 18, 0))
-    files = describe(problem, tmp_path, inflated=True)
+    files = describe(problem, tmp_path, by_body=by_body)
     model = pin.buildModelFromUrdf(str(files.urdf))
     shapes = pin.buildGeomFromUrdf(model, str(files.urdf), pin.GeometryType.COLLISION)
     numbers = {
         shape.name.rpartition("_")[0]: number for number, shape in enumerate(shapes.geometryObjects)
     }
-    for one, other in files.margins:
-        shapes.addCollisionPair(pin.CollisionPair(*sorted((numbers[one], numbers[other]))))
+    by_bodies: dict[tuple[int, ...], set[float]] = {}
+    for (one, other), margin in files.margins.items():
+        pair = sorted((numbers[one], numbers[other]))
+        shapes.addCollisionPair(pin.CollisionPair(*pair))
+        bodies = sorted(shapes.geometryObjects[number].parentJoint for number in pair)
+        by_bodies.setdefault(tuple(bodies), set()).add(margin)
+    assert all(len(margins) == 1 for margins in by_bodies.values())
+    assert any(margins != {0.0} for margins in by_bodies.values()) == by_body
+    data = pin.GeometryData(shapes)
+    for number, margin in enumerate(files.margins.values()):
+        data.collisionRequests[number].security_margin = margin
     order = [list(model.names)[1:].index(name) for name in files.joints]
     rng, lower, upper = np.random.default_rng(0), *compute_finite_limits(problem)
     z, agreed = rng.uniform(lower, upper, (60, len(lower))), 0
@@ -55,9 +67,7 @@ def test_inflated_shapes_collide_where_margins_are_violated(tmp_path: Path) -> N
         slack = (contacts.distance - contacts.margin)[contacts.waypoint == row].min(initial=0.1)
         q = np.zeros(model.nq)
         q[order] = configuration
-        hit = pin.computeCollisions(
-            model, model.createData(), shapes, pin.GeometryData(shapes), q, True
-        )
+        hit = pin.computeCollisions(model, model.createData(), shapes, data, q, True)
         if abs(slack) > 0.005:
             assert hit == (slack < 0.0), slack
             agreed += 1

@@ -1,1 +1,1 @@
-"""Compares this package with trajopt, OMPL, roboplan and both baselines."""
+"""Compares this package with trajopt, OMPL, roboplan, HPP and both baselines."""

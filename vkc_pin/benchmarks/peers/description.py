@@ -39,7 +39,7 @@ class Description:
         urdf: URDF file.
         srdf: SRDF file.
         joints: Names of the joints, in the order of the chain's coordinates.
-        margins: (link, link) → clearance to keep [m].
+        margins: (link, link) → clearance that the planner has to keep [m].
     """
 
     urdf: Path
@@ -48,14 +48,15 @@ class Description:
     margins: dict[tuple[str, str], float]
 
 
-def describe(problem: TrajectoryProblem, folder: Path, *, inflated: bool = False) -> Description:
+def describe(problem: TrajectoryProblem, folder: Path, *, by_body: bool = False) -> Description:
     """Write URDF, SRDF and meshes of a problem to a folder.
+
+    The second shape of each pair is inflated by the clearance that the planner does not keep.
 
     Args:
         problem: Problem with one phase.
         folder: Existing folder.
-        inflated: Whether the second shape of each pair is inflated by the pair's clearance, for
-            planners without clearances.
+        by_body: Whether the planner keeps one clearance per pair of bodies, else none.
 
     Raises:
         InputError: The chain has a joint that URDF does not support.
@@ -89,21 +90,19 @@ def describe(problem: TrajectoryProblem, folder: Path, *, inflated: bool = False
     goal = problem.pose_goals[0].row
     ET.SubElement(root, "link", name=FRAME)
     _joint(root, f"to_{FRAME}", "fixed", f"body_{goal.joint}", FRAME, goal.local)
-    margins = {
-        tuple(pair): margin
-        for pair, margin in zip(part.pairs.tolist(), part.margins.tolist(), strict=True)
-    }
-    links = {f"shape_{number}": (number, 0.0) for number in range(len(part.shapes))}
-    kept = {frozenset((f"shape_{i}", f"shape_{j}")): margin for (i, j), margin in margins.items()}
-    if inflated:  # the second of each pair, once for every clearance
-        own = {(j, max(0.0, margin)) for (_, j), margin in margins.items()}
-        links |= {_thick(j, margin): (j, margin) for j, margin in own}
-        kept = {
-            frozenset((f"shape_{i}", _thick(j, max(0.0, margin)))): 0.0
-            for (i, j), margin in margins.items()
-        }
-        used = {name for pair in kept for name in pair}
-        links = {name: about for name, about in links.items() if name in used}
+    margins = dict(zip(map(tuple, part.pairs.tolist()), part.margins.tolist(), strict=True))
+    least: dict[frozenset[int], float] = {}  # of each pair of bodies
+    for (i, j), margin in margins.items():
+        bodies = frozenset((part.joint[i], part.joint[j]))
+        least[bodies] = min(margin, least.get(bodies, margin)) if by_body else 0.0
+    links: dict[str, tuple[int, float]] = {}
+    kept: dict[frozenset[str], float] = {}
+    for (i, j), margin in margins.items():
+        own = least[frozenset((part.joint[i], part.joint[j]))]
+        rest = max(0.0, margin - own)
+        one, other = f"shape_{i}", _thick(j, rest)
+        links |= {one: (i, 0.0), other: (j, rest)}
+        kept[frozenset((one, other))] = own
     for name, (number, thicker) in links.items():
         shape, link = part.shapes[number], ET.SubElement(root, "link", name=name)
         body = "world" if part.joint[number] == 0 else f"body_{part.joint[number]}"

@@ -6,22 +6,17 @@ straight lines to goal configurations, the nearest first.
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from vkc_pin.benchmarks.peers.description import FRAME, GROUP, describe
 from vkc_pin.benchmarks.peers.found import Clock, PeerResult
+from vkc_pin.benchmarks.peers.processes import start_solver
 from vkc_pin.benchmarks.peers.sampled import compute_finite_limits
 from vkc_pin.benchmarks.peers.tasks import PeerProblem, sample_goals
-from vkc_pin.errors import InputError
 from vkc_pin.planning.initialization.keyframes import sample_smoothstep
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
@@ -50,7 +45,7 @@ def plan_by_trajopt(
     accept: Callable[[Floats], bool],
 ) -> PeerResult:
     """Plan with trajopt; see `found.Peer`."""
-    worker = _worker()
+    worker = start_solver("trajopt", "trajopt_solver")
     goals = sample_goals(problem, np.random.default_rng([seed, 1]), _ENDS)
     if not len(goals):
         return PeerResult(status="no configuration at the goal")
@@ -63,7 +58,7 @@ def plan_by_trajopt(
         if _goal(problem, k)
     }
     with tempfile.TemporaryDirectory() as folder:
-        files = describe(problem, Path(folder), inflated=True)
+        files = describe(problem, Path(folder))
         for row in goals:
             if clock.remaining <= 0.0:
                 found.status = "timed out"
@@ -116,35 +111,3 @@ def _goal(problem: TrajectoryProblem, column: int) -> bool:
         for limits in ((problem.lower[-1], problem.upper[-1]), (problem.lower[0], problem.upper[0]))
     )
     return bool(last[0] == last[1] and before[0] != before[1])
-
-
-@cache
-def _worker() -> Callable[[dict[str, Any]], dict[str, Any]]:
-    """Start the worker process once and return a function that sends it requests."""
-    command = [sys.executable, str(Path(__file__).with_name("trajopt_worker.py"))]
-    process = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    )
-
-    def read_answer() -> dict[str, Any]:
-        assert process.stdout is not None
-        while line := process.stdout.readline():
-            if line.startswith("{"):
-                return dict(json.loads(line))
-        raise InputError(
-            "the process of trajopt has ended", field="method", got=f"exit code {process.wait()}"
-        )
-
-    first = read_answer()
-    if "error" in first:
-        raise InputError(
-            "trajopt cannot be run", expected='pip install "vkc-pin[peers]"', got=first["error"]
-        )
-
-    def ask_worker(ask: dict[str, Any]) -> dict[str, Any]:
-        assert process.stdin is not None
-        process.stdin.write(json.dumps(ask) + "\n")
-        process.stdin.flush()
-        return read_answer()
-
-    return ask_worker

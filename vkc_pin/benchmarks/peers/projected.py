@@ -44,7 +44,7 @@ def plan_by_projection(  # noqa: PLR0915 - sets up one planner, step by step
         return PeerResult(status="no configuration at the goal")
     held = problem.is_closed(problem.task.phases[0])
     with tempfile.TemporaryDirectory() as folder:
-        files = describe(problem, Path(folder), inflated=True)
+        files = describe(problem, Path(folder))
         scene = core.Scene("chain", core.loadUrdfSceneDescription(str(files.urdf)))
         scene.importSrdf(files.srdf.read_text(encoding="utf-8"))
     scene.setRngSeed(seed)

@@ -22,6 +22,7 @@ from vkc_pin.benchmarks.harness.tables import (
     join_sections,
     select,
 )
+from vkc_pin.benchmarks.peers.constraint_graph import plan_by_constraint_graph
 from vkc_pin.benchmarks.peers.found import (
     Clock,
     Peer,
@@ -45,6 +46,7 @@ PEERS: Mapping[str, tuple[Peer, str, str]] = {
     "trajopt": (plan_by_trajopt, "tesseract_robotics", "tesseract-robotics-nanobind"),
     "OMPL": (plan_by_sampling, "ompl", "ompl"),
     "roboplan": (plan_by_projection, "roboplan", "roboplan"),
+    "HPP": (plan_by_constraint_graph, "pyhpp", "hpp-python"),
 }
 """Name → what plans with it, its module, and its package."""
 METHODS = (*PEERS, *BASELINES, "VKC")

@@ -1,50 +1,26 @@
-"""Runs trajopt in its own process; requests and answers are lines of JSON.
-
-The wheel loads its own C++ library first, so nothing of this package is imported here.
-"""
+"""Solves requests with trajopt of tesseract, in the process of `worker`."""
 
 from __future__ import annotations
 
 import ctypes
 import importlib.util
-import json
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
-__all__ = ["main"]
+__all__ = ["Solver"]
 
 
-def main() -> int:
-    """Answer requests until the input ends."""
-    found = importlib.util.find_spec("tesseract_robotics")
-    if found is None or found.origin is None:
-        print(json.dumps({"error": "tesseract_robotics is not installed"}), flush=True)
-        return 1
-    bundled = Path(found.origin).parent / "libstdc++.so.6"
-    try:
-        if bundled.is_file():
-            ctypes.CDLL(str(bundled), mode=ctypes.RTLD_GLOBAL)
-        solve = _Solver()
-    except Exception as error:
-        print(json.dumps({"error": f"{type(error).__name__}: {error}"}), flush=True)
-        return 1
-    print(json.dumps({"ready": True, "cpu": time.process_time()}), flush=True)
-    for line in sys.stdin:
-        began = time.process_time()
-        try:
-            answer = solve(json.loads(line))
-        except Exception as error:
-            answer = {"error": f"{type(error).__name__}: {error}"}
-        print(json.dumps({**answer, "cpu": time.process_time() - began}), flush=True)
-    return 0
-
-
-class _Solver:
+class Solver:
     """Solves requests; keeps the environment of the last files."""
 
     def __init__(self) -> None:
+        found = importlib.util.find_spec("tesseract_robotics")
+        if found is None or found.origin is None:
+            raise ModuleNotFoundError("tesseract_robotics is not installed")
+        bundled = Path(found.origin).parent / "libstdc++.so.6"
+        if bundled.is_file():  # the wheel needs its own C++ library, loaded before all others
+            ctypes.CDLL(str(bundled), mode=ctypes.RTLD_GLOBAL)
         from tesseract_robotics import (
             tesseract_collision,
             tesseract_common,
@@ -144,7 +120,3 @@ class _Solver:
         back = np.empty_like(z)
         back[:, order] = z
         return {"z": back.tolist(), "status": solver.getStatus().name, "own": own}
-
-
-if __name__ == "__main__":
-    sys.exit(main())

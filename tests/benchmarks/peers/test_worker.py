@@ -1,0 +1,59 @@
+"""The process of a solver says what it cannot do, and goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from vkc_pin.benchmarks.peers import worker
+from vkc_pin.benchmarks.peers.processes import start_solver
+from vkc_pin.errors import InputError
+
+FILE = Path(worker.__file__)
+# Module, its package, and what the error about a missing description names.
+SOLVERS = [("trajopt_solver", "tesseract_robotics", "/nowhere"), ("hpp_solver", "pyhpp", "URDF")]
+
+
+@pytest.mark.parametrize("solver", [solver for solver, *_ in SOLVERS])
+def test_worker_reports_a_missing_package(solver: str) -> None:
+    command = [sys.executable, "-S", str(FILE), solver]  # without what is installed
+    done = subprocess.run(command, input="", capture_output=True, text=True, timeout=60)
+    error = json.loads(done.stdout)["error"]
+    assert error.startswith("ModuleNotFoundError")
+    assert done.returncode == 1
+
+
+def test_missing_solver_is_refused() -> None:
+    with pytest.raises(InputError, match="nothing cannot be run") as refused:
+        start_solver("nothing", "no_solver")
+    assert "no_solver" in str(refused.value)
+
+
+@pytest.mark.parametrize(("solver", "package", "named"), SOLVERS)
+def test_wrong_request_does_not_end_the_worker(solver: str, package: str, named: str) -> None:
+    found = find_spec(package)
+    if found is None or found.origin is None:
+        pytest.skip(f'needs {package}: pip install "vkc-pin[peers]"')
+    libraries = str(Path(found.origin).parents[3])
+    asked = json.dumps({"urdf": "/nowhere", "srdf": "/nowhere"})
+    done = subprocess.run(
+        [sys.executable, str(FILE), solver],
+        input=f"{asked}\n{asked}\n",
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env={**os.environ, "LD_LIBRARY_PATH": libraries},
+    )
+    first, *answers = [
+        json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")
+    ]
+    assert first["ready"] is True
+    assert len(answers) == 2
+    assert all(named in answer["error"] for answer in answers)
+    assert done.returncode == 0

@@ -35,7 +35,8 @@ class Options:
         grasp_time: Time at rest for the gripper to close or open [s].
         jerk_time: Shortest time in which an acceleration rises to its limit [s], at least 5 ms,
             which limits jerks; 0: unlimited.
-        reach_waypoints: Segments of a phase that drives or reaches, carrying an object or not.
+        reach_waypoints: Segments of a phase that drives or reaches, carrying an object or not. In
+            every phase they double, at most twice, if only the motion between them is invalid.
         turn_waypoints: Segments of a phase that releases a latch.
         move_waypoints: Segments of a phase that moves a grasped object.
         dist_safe: Clearance at the waypoints [m].

@@ -53,6 +53,20 @@ def test_own_guess_is_the_only_one() -> None:
     assert asked == [result.problem]
 
 
+def test_waypoints_double_where_they_are_too_coarse() -> None:
+    """On five segments of a door's arc the hand drifts by 3 mm from the handle."""
+    scene, options = load_door_scene(), vkc.Options(move_waypoints=5)
+    task = compile_task(scene, [vkc.Actuate("door", {"hinge": 1.3}, "handle")], options)
+    result = solve_task(scene, task, PlanningRequest("interpolated", options, random_seed=1))
+    assert result.plan.success, result.plan.summary()
+    assert result.plan.initialization == "interpolated", "of the first guess"
+    assert result.problem is not None
+    segments = [phase.segments for phase in result.problem.task.phases]
+    before = [phase.segments for phase in task.phases]
+    assert segments == [*before[:-1], 10]
+    assert result.phase_waypoints().phases == tuple(phase.key for phase in task.phases)
+
+
 def test_infeasible_solution_of_the_least_shortfall_is_returned() -> None:
     """A wall from side to side, to pass which no time is left."""
     wall = {"name": "wall", "type": "box", "size": [0.6, 9.0, 2.0], "position": [2.0, 0.0, 1.0]}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -21,7 +20,12 @@ from vkc_pin.planning.diagnosis.diagnosis import (
 from vkc_pin.planning.diagnosis.paths import diagnose_paths
 from vkc_pin.planning.diagnosis.proofs import find_proofs
 from vkc_pin.planning.diagnosis.swept_volumes import find_swept_collisions
-from vkc_pin.planning.initialization.initial_guess import InitialGuess, PhaseWaypoints
+from vkc_pin.planning.initialization.initial_guess import (
+    InitialGuess,
+    PhaseWaypoints,
+    extract_phase_waypoints,
+    make_initial_guess,
+)
 from vkc_pin.planning.initialization.methods import initialize
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import Plan
@@ -58,6 +62,9 @@ _CHECK_TIME = 2e-3
 _NEARLY_FREE = 0.02
 """Missing clearance [m] up to which a trajectory is described as nearly collision-free."""
 
+_MAX_REFINEMENTS = 2
+"""How often the waypoints of a phase may double."""
+
 Guess = Callable[[TrajectoryProblem], InitialGuess]
 """Makes an initial guess for a problem."""
 
@@ -86,11 +93,7 @@ class TaskResult:
     def phase_waypoints(self) -> PhaseWaypoints:
         """Return the best waypoints, as an initial guess of problems with more phases."""
         assert self.problem is not None
-        phases = tuple(phase.key for phase in self.task.phases)
-        path, ends = self.problem.waypoints(self.z), [0, *self.problem.ends.tolist()]
-        waypoints = tuple(path[first : last + 1] for first, last in itertools.pairwise(ends))
-        names = self.problem.chain.names
-        return PhaseWaypoints(phases, names, waypoints, self.plan.initialization)
+        return extract_phase_waypoints(self.problem, self.z, self.plan.initialization)
 
 
 def solve_task(
@@ -143,15 +146,16 @@ def solve_task(
         history=tuple(search.history),
         terms=request.terms,
     )
-    found = search.problem, best.z, search.check_time, search.is_grasp_independent
+    found = best.problem, best.z, search.check_time, search.is_grasp_independent
     return TaskResult(scene, task, plan, *found)
 
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """Trajectory found from one initial guess, with z_1..z_N, shape (N, n)."""
+    """Trajectory found from one initial guess, with its problem and z_1..z_N, shape (N, n)."""
 
     name: str
+    problem: TrajectoryProblem | None
     z: Floats
     trajectory: Trajectory
     report: Report
@@ -163,6 +167,20 @@ class _Candidate:
 
     def is_better(self, other: _Candidate) -> bool:
         return self.report.ok or self.violation < other.violation
+
+    def find_coarse_phases(self) -> set[int]:
+        """Return the numbers of phases that are valid at their waypoints, but not in between.
+
+        Torques do not depend on how far waypoints are apart.
+        """
+        if self.status != "rejected" or self.problem is None:
+            return set()
+        wrong = [each.waypoint for each in self.report.violations if each.constraint != "torque"]
+        return {
+            number
+            for number, phase in enumerate(self.trajectory.phases[: len(self.problem.ends)])
+            if any(phase.first <= waypoint <= phase.last for waypoint in wrong)
+        }
 
     def with_notes(self, notes: Iterable[str]) -> _Candidate:
         report = dataclasses.replace(self.report, notes=tuple(notes))
@@ -182,13 +200,14 @@ class _Search:
         self._blocked_phases: list[str] = []  # phases without a path of the base
         self._best: _Candidate | None = None
         # The solution nearest to feasibility of those that are too far from it to be validated.
-        self._infeasible: tuple[Solution, str] | None = None
+        self._infeasible: tuple[TrajectoryProblem, Solution, str] | None = None
         self._goals: dict[int, BlockedGoal | None] = {}
         self._proofs: list[str] | None = None
 
     def run(self, guess: Guess | None, *, check_goals_first: bool) -> tuple[_Candidate, PlanStatus]:
         """Return the best candidate and the status of the plan; see `solve_task`."""
-        problem, goals = self._build_problem(), list[BlockedGoal]()
+        problem, goals = self._build_problem(self.task), list[BlockedGoal]()
+        self.problem = problem
         if reasons := find_impossible_conditions(problem):
             self.is_grasp_independent = True
             best = self._make_stationary(problem)
@@ -199,8 +218,7 @@ class _Search:
         is_search = guess is None
         guesses = iter([guess(problem)]) if guess else self._generate_guesses(problem)
         for number, start in enumerate(guesses, start=1):
-            solution = solve(problem, start.z, callback=self._report_round, radius=start.radius)
-            self._add_solution(problem, solution, start.name)
+            solution = self._solve_from(problem, start)
             if self._best is not None and self._best.status == "success":
                 return self._best, "success"
             if (
@@ -222,28 +240,48 @@ class _Search:
         record_evaluations()
         return self._explain_failure(problem, goals, is_search=is_search)
 
-    def _build_problem(self) -> TrajectoryProblem:
+    def _build_problem(self, task: Task) -> TrajectoryProblem:
         request = self.request
-        self.problem = TrajectoryProblem(
-            self.scene, self.task, request.options, request.terms, cache=request.cache
+        problem = TrajectoryProblem(
+            self.scene, task, request.options, request.terms, cache=request.cache
         )
-        reserve_time("validation", _CHECK_TIME * self.problem.segments, default=True)
-        return self.problem
+        reserve_time("validation", _CHECK_TIME * problem.segments, default=True)
+        return problem
 
-    def _add_solution(self, problem: TrajectoryProblem, solution: Solution, name: str) -> None:
-        """Record a solution, and keep it if it is the best, or the nearest to feasibility."""
+    def _solve_from(self, problem: TrajectoryProblem, guess: InitialGuess) -> Solution:
+        """Solve a problem from a guess, and again with more waypoints where they are too coarse."""
+        for refinement in range(_MAX_REFINEMENTS + 1):
+            solution = solve(problem, guess.z, callback=self._report_round, radius=guess.radius)
+            candidate = self._add_solution(problem, solution, guess.name)
+            coarse = set() if candidate is None else candidate.find_coarse_phases()
+            if not coarse or refinement == _MAX_REFINEMENTS:
+                break
+            part = extract_phase_waypoints(problem, solution.z, guess.name)
+            problem = self._build_problem(problem.task.refine(coarse))
+            guess = dataclasses.replace(make_initial_guess(problem, [part]), name=guess.name)
+        return solution
+
+    def _add_solution(
+        self, problem: TrajectoryProblem, solution: Solution, name: str
+    ) -> _Candidate | None:
+        """Record a solution, and keep it if it is the best, or the nearest to feasibility.
+
+        Returns:
+            Its trajectory; None if it is too far from feasibility.
+        """
         self.rounds += solution.rounds
         self.iterations += solution.iterations
         for key, value in solution.timings.items():
             self.times[key] += value
         self.history += [dataclasses.asdict(row) for row in solution.history]
         if solution.shortfall:
-            if self._infeasible is None or solution.shortfall < self._infeasible[0].shortfall:
-                self._infeasible = (solution, name)
-            return
+            if self._infeasible is None or solution.shortfall < self._infeasible[1].shortfall:
+                self._infeasible = (problem, solution, name)
+            return None
         candidate = self._evaluate(problem, solution, name)
         if self._best is None or candidate.is_better(self._best):
             self._best = candidate
+        return candidate
 
     def _explain_failure(
         self, problem: TrajectoryProblem, goals: list[BlockedGoal], *, is_search: bool
@@ -276,8 +314,8 @@ class _Search:
 
     def find_nearest(self) -> _Candidate | None:
         """Return the best candidate, else the nearest infeasible solution; None without any."""
-        if self._best is None and self._infeasible and self.problem is not None:
-            return self._evaluate(self.problem, *self._infeasible)
+        if self._best is None and self._infeasible:
+            return self._evaluate(*self._infeasible)
         return self._best
 
     def _find_proofs(self, problem: TrajectoryProblem) -> list[str]:
@@ -349,7 +387,7 @@ class _Search:
         self.times["retiming"] += took - (self.times["validation"] - validated)
         failure: PlanStatus = "rejected" if solution.converged else "not converged"
         status = "success" if report.ok else failure
-        return _Candidate(name, solution.z, trajectory, report, status)
+        return _Candidate(name, problem, solution.z, trajectory, report, status)
 
     @cached_property
     def _has_velocity_terms(self) -> bool:
@@ -376,7 +414,8 @@ class _Search:
         """Return a stationary trajectory, the result before the first initial guess."""
         trajectory = make_stationary_trajectory(self.scene, self.request.options)
         report = self._validate(trajectory)
-        return _Candidate("none", np.zeros((0, 0)), trajectory, report, "not converged")
+        z = np.zeros((0, 0))
+        return _Candidate("none", self.problem, z, trajectory, report, "not converged")
 
 
 def _describe_shortfall(report: Report) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,7 +13,13 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.task.phases import PhaseKey
 from vkc_pin.world.trajectory.splicing import fill_missing_values
 
-__all__ = ["InitialGuess", "PhaseWaypoints", "make_initial_guess", "perturb"]
+__all__ = [
+    "InitialGuess",
+    "PhaseWaypoints",
+    "extract_phase_waypoints",
+    "make_initial_guess",
+    "perturb",
+]
 
 # [m], [rad] initial trust region: a nearly feasible guess is improved in smaller steps
 _WARM_RADIUS = 0.2
@@ -51,6 +58,16 @@ class PhaseWaypoints:
     names: tuple[str, ...]
     waypoints: tuple[Floats, ...]
     initialization: str
+
+
+def extract_phase_waypoints(
+    problem: TrajectoryProblem, z: Floats, initialization: str
+) -> PhaseWaypoints:
+    """Return z_1..z_N of a problem, shape (N, n), as waypoints of its phases."""
+    phases = tuple(phase.key for phase in problem.task.phases)
+    path, ends = problem.waypoints(z), [0, *problem.ends.tolist()]
+    waypoints = tuple(path[first : last + 1] for first, last in itertools.pairwise(ends))
+    return PhaseWaypoints(phases, problem.chain.names, waypoints, initialization)
 
 
 def make_initial_guess(problem: TrajectoryProblem, parts: Sequence[PhaseWaypoints]) -> InitialGuess:

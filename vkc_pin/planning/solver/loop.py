@@ -136,10 +136,8 @@ class _Loop:
                 self._accept(trial)
                 if converged := step.succeeded and self._is_feasible():
                     best = row.objective
-                    # Waypoints that are too far apart on an arc cannot be repaired by more rounds.
-                    if self.problem.drift(trial.z) <= 1.0:
-                        solution.converged, solution.status = True, "converged"
-                        self.feasible = trial.z, solution.dt
+                    solution.converged, solution.status = True, "converged"
+                    self.feasible = trial.z, solution.dt
                     improved = best < (1.0 - self.improvement) * last
                     if not improved or (size < ACTIVE_FRACTION * used).all():
                         break

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import Literal
@@ -167,6 +167,14 @@ class Task:
     def supported(self) -> tuple[SupportedObject, ...]:
         """Objects that rest on moving links in any phase."""
         return tuple(dict.fromkeys(one for phase in self.phases for one in phase.supported))
+
+    def refine(self, numbers: Collection[int]) -> Task:
+        """Return the task with twice as many segments in the phases of some numbers, from 0."""
+        phases = (
+            replace(phase, segments=2 * phase.segments) if number in numbers else phase
+            for number, phase in enumerate(self.phases)
+        )
+        return replace(self, phases=tuple(phases))
 
     def truncate(self, count: int) -> Task:
         """Return the task of the first `count` steps (at least 1) alone."""

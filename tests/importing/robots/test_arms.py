@@ -48,6 +48,26 @@ def test_arms_are_found_by_their_hands(tmp_path: Path) -> None:
     assert set(caught.value.choices) == {"left", "right", "port"}
 
 
+@pytest.mark.parametrize(("ahead", "count"), [(0.15, 5), (0.0, 6)])
+def test_jaw_named_by_its_link_closes_against_the_hand(
+    tmp_path: Path, ahead: float, count: int
+) -> None:
+    """The hand extends beside the jaw, or ends where the last link of the wrist begins."""
+    path = write_arms(tmp_path)
+    text = path.read_text(encoding="utf-8").partition('<link name="finger_a">')[0]
+    shape = '<collision><origin xyz="0 {} {}"/><geometry><box size="0.02 0.02 {}"/></geometry>'
+    text += f"""<link name="gripper">{shape.format(0.02, 0.1, 0.2)}</collision></link>
+        <joint name="joint_6" type="revolute"><parent link="hand"/><child link="gripper"/>
+        <origin xyz="0 0 0.06"/><axis xyz="1 0 0"/><limit lower="-0.2" upper="1.2"/></joint>
+        <link name="side">{shape.format(-0.03, ahead / 2, ahead or 0.01)}</collision></link>
+        <joint name="beside" type="fixed"><parent link="hand"/><child link="side"/>
+        <origin xyz="0 0 {0.06 if ahead else 0.03}"/></joint></robot>"""
+    path.write_text(text, encoding="utf-8")
+    (arm,) = arms_of(read_urdf(path))
+    assert len(arm.joints) == count
+    assert [finger.name for finger in arm.fingers] == ["joint_6"] * (6 - count)
+
+
 def test_base_joints_are_not_part_of_the_arm(tmp_path: Path) -> None:
     file = read_urdf(write_arms(tmp_path, own_base=True))
     assert own_base_of(file) == ("drive_x", "drive_y", "drive_yaw")

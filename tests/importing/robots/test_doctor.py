@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
-from helpers.arm_urdf import write_arms
+from helpers.arm_urdf import HEIGHT, write_arms
 
 import vkc_pin as vkc
 from vkc_pin.importing.robots.doctor import Diagnosis
@@ -79,8 +79,8 @@ def test_missing_limits_and_masses_are_reported(tmp_path: Path) -> None:
 
 def test_hand_in_front_of_its_tool_frame_is_reported(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
-    assert find_texts(vkc.importing.doctor(path, samples=5), "warning", "hand") == [
-        "no link may touch what is grasped"
+    assert find_texts(vkc.importing.doctor(path, samples=5), "limitation", "hand") == [
+        "no link may touch what is grasped: it can reach poses, but not grasp objects"
     ]
     text = path.read_text(encoding="utf-8").replace(
         "</robot>",
@@ -97,23 +97,60 @@ def test_hand_in_front_of_its_tool_frame_is_reported(tmp_path: Path) -> None:
     )
 
 
-def test_closed_hand_is_reported(tmp_path: Path) -> None:
-    path = write_arms(tmp_path)
+def write_robot(folder: Path, **settings: object) -> Path:
+    path = write_arms(folder)
     tool = (
         '<link name="tool"/><joint name="tool_joint" type="fixed"><parent link="hand"/>'
         '<child link="tool"/><origin xyz="0 0 0.125" rpy="0 0 1.57079633"/></joint></robot>'
     )
     path.write_text(path.read_text(encoding="utf-8").replace("</robot>", tool), encoding="utf-8")
+    given: dict[str, object] = {"urdf": path.name, "tool_frame": "tool"}
+    given["locked_joints"] = {"finger_a_joint": 0.03, "finger_b_joint": 0.03}
+    given["base"] = {"height": HEIGHT}
+    given["touch_links"] = ["arm_5", "hand", "finger_a", "finger_b"]
+    (folder / "robot.yaml").write_text(json.dumps(given | settings), encoding="utf-8")
+    return folder
+
+
+def test_closed_hand_is_reported(tmp_path: Path) -> None:
     for position, is_reported in ((0.0, True), (0.03, False)):
-        settings = {
-            "urdf": path.name,
-            "tool_frame": "tool",
-            "touch_links": ["finger_a", "finger_b"],
-            "locked_joints": {"finger_a_joint": position, "finger_b_joint": position},
-        }
-        (tmp_path / "robot.yaml").write_text(json.dumps(settings), encoding="utf-8")
-        faults = find_texts(vkc.importing.doctor(tmp_path, samples=5), "fault", "hand")
+        locked = {"finger_a_joint": position, "finger_b_joint": position}
+        robot = write_robot(tmp_path, touch_links=["finger_a", "finger_b"], locked_joints=locked)
+        faults = find_texts(vkc.importing.doctor(robot, samples=5), "fault", "hand")
         assert any("no room" in text for text in faults) == is_reported
+
+
+OPEN = {"finger_a_joint": 0.03, "finger_b_joint": 0.03}
+
+
+@pytest.mark.parametrize(
+    ("settings", "limitation", "note"),
+    [
+        ({}, "", "up to 50 mm thick: level ones at 0.3 to 1."),
+        # An arm that stands upright, with a wrist that pitches but does not roll.
+        (
+            {"locked_joints": OPEN | dict.fromkeys(("arm_2_joint", "arm_3_joint"), 0.0)},
+            "cannot grasp level bars",
+            "thick: upright ones at 1.",
+        ),
+        ({"base": {"height": -0.1}}, "cannot grasp door levers, 1 m high", "level ones at 0.1 to"),
+        (
+            {"locked_joints": dict.fromkeys(OPEN, 0.01)},
+            "cannot grasp bars more than 10 mm thick",
+            "up to 10 mm thick",
+        ),
+        ({"touch_links": ["arm_5"]}, "has no fingers: it can reach poses", ""),
+    ],
+)
+def test_bars_that_a_hand_can_grasp_are_reported(
+    tmp_path: Path, settings: dict[str, object], limitation: str, note: str
+) -> None:
+    found = vkc.importing.doctor(write_robot(tmp_path, **settings), samples=5)
+    limitations = find_texts(found, "limitation", "hand")
+    assert len(limitations) == bool(limitation)
+    assert limitation in " ".join(limitations)
+    assert note in " ".join(find_texts(found, "note", "hand"))
+    assert f"{bool(limitation):d} limitation" in str(found).splitlines()[0]
 
 
 def test_invalid_argument_is_named() -> None:

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 from helpers.arm_urdf import write_arms
 
+from vkc_pin.importing import import_robot
+from vkc_pin.importing.proposals.hand import make_hand
 from vkc_pin.importing.robots.arms import Arm, build_body_tree, find_arms
 from vkc_pin.importing.robots.hands import analyze_hand
 from vkc_pin.world.files.urdf import read_urdf
+from vkc_pin.world.models.grippers.bar_width import find_thickest_rod
 from vkc_pin.world.models.robot_model import build_full_model
 
 
@@ -52,6 +55,32 @@ def test_single_jaw_opens_from_the_hand(tmp_path: Path) -> None:
     assert hand.open == {"finger_a_joint": 0.04}
     np.testing.assert_allclose(hand.tool.rotation[:, 2], [0, 0, 1], atol=0.3)
     assert np.abs(hand.tool.rotation[1, 0]) > 0.9
+
+
+def test_hand_beside_a_hinge_approaches_across_its_axis(tmp_path: Path) -> None:
+    path = write_arms(tmp_path)
+    text = path.read_text(encoding="utf-8")
+    wrist = '<joint name="wrist" type="fixed"><origin xyz="0 {} 0.2"/>'
+    path.write_text(text.replace(wrist.format(0), wrist.format(0.15)), encoding="utf-8")
+    _, hand = found(path)
+    np.testing.assert_allclose(hand.tool.rotation[:, 2], [0, 0, 1], atol=1e-9)
+
+
+def test_jaw_that_turns_far_opens_as_far_as_a_lever_fits(tmp_path: Path) -> None:
+    path = write_arms(tmp_path)
+    text = path.read_text(encoding="utf-8").partition('<link name="finger_a">')[0]
+    shape = '<collision><origin xyz="0 {} 0.04"/><geometry><box size="0.02 0.02 0.08"/></geometry>'
+    text += f"""<link name="jaw">{shape.format(0.01)}</collision></link>
+        <joint name="jaw_joint" type="revolute"><parent link="hand"/><child link="jaw"/>
+        <origin xyz="0 0 0.06"/><axis xyz="-1 0 0"/><limit lower="0" upper="2.6"/></joint>
+        <link name="side">{shape.format(-0.01)}</collision></link>
+        <joint name="beside" type="fixed"><parent link="hand"/><child link="side"/>
+        <origin xyz="0 0 0.06"/></joint></robot>"""
+    path.write_text(text, encoding="utf-8")
+    robot = import_robot(path, tmp_path / "mine", samples=20).robot
+    assert find_thickest_rod(make_hand(robot).touch) > 0.035
+    assert robot.gripper is not None
+    assert 0.5 < robot.gripper.open[0] < 2.5
 
 
 def test_tool_frame_of_a_flange_points_along_the_last_axis(tmp_path: Path) -> None:

@@ -264,3 +264,40 @@ def test_hand_that_cannot_open_is_a_fault(
     assert expected in str(made)
     assert ".vkc-pin-" not in str(made)
     assert made.diagnosis.healthy is healthy
+
+
+def test_column_of_a_lift_may_sink_into_the_floor(tmp_path: Path) -> None:
+    file = write_arms(tmp_path / "given")
+    foot = '<link name="foot"><collision><origin xyz="0 0 0.05"/><geometry>'
+    foot += '<box size="0.4 0.4 0.1"/></geometry></collision></link>'
+    foot += '<joint name="lift" type="prismatic"><parent link="foot"/><child link="body"/>'
+    foot += '<axis xyz="0 0 1"/><limit lower="0" upper="1" effort="9" velocity="1"/></joint>'
+    text = file.read_text(encoding="utf-8").replace('name="robot">', f'name="robot">{foot}')
+    text = text.replace("0 0 -0.1", "0 0 -0.5").replace("0.5 0.4 0.5", "0.1 0.1 1.0")
+    file.write_text(text, encoding="utf-8")
+    made = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
+    assert "the lift sinks body into the floor" in str(made)
+    assert "body" not in made.robot.links
+    assert made.diagnosis.healthy
+    assert "level ones at 0.1 to 1.9 m" in str(made)
+
+
+@pytest.mark.parametrize(("first", "second"), [("a", "b"), ("b", "a")])
+def test_closing_direction_suits_a_wrist_without_roll(
+    tmp_path: Path, first: str, second: str
+) -> None:
+    """The arm pitches forwards only: the hand's y axis never turns upside down."""
+    file = write_arms(tmp_path / "given")
+    text = file.read_text(encoding="utf-8").replace("finger_a", f"finger_{first}_")
+    text = text.replace("finger_b", f"finger_{second}_")
+    for k in (3, 4):
+        text = text.replace(f'"arm_{k}_joint" type="revolute"', f'"arm_{k}_joint" type="fixed"')
+    for k in (2, 5):
+        head, joint, tail = text.partition(f'<joint name="arm_{k}_joint"')
+        text = head + joint + tail.replace('lower="-2"', 'lower="0"', 1)
+    post = '<link name="post"><collision><geometry><box size="0.1 0.1 0.9"/></geometry></collision>'
+    post += '</link><joint name="post_joint" type="fixed"><origin xyz="0.6 0 0.1"/>'
+    post += '<parent link="body"/><child link="post"/></joint></robot>'
+    file.write_text(text.replace("</robot>", post), encoding="utf-8")
+    made = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
+    assert "thick: upright ones at" in str(made)

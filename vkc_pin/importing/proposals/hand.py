@@ -9,11 +9,17 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.models.grippers.bar_width import BAR_THICKNESS, find_widest_bar
+from vkc_pin.world.models.grippers.bar_width import (
+    BAR_THICKNESS,
+    WIDEST_BAR,
+    find_widest_bar,
+)
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import compute_world_box, list_placed_shapes
 
 __all__ = ["Hand", "has_fingers", "make_hand"]
+
+_RIM = 0.005  # [m] ahead of the tool frame, largest height of a flange's rim
 
 Placed = tuple[coal.CollisionGeometry, pin.SE3]
 
@@ -42,9 +48,7 @@ class Hand:
 
 
 def has_fingers(robot: Robot) -> bool:
-    """Return whether a hand has several links, or links moved by joints that are not planned."""
-    if len(robot.touch_links) > 1:
-        return True
+    """Return whether joints that are not planned move links of a hand."""
     above = {}
     for joint in robot.file.root.findall("joint"):
         parent, child = joint.find("parent"), joint.find("child")
@@ -87,14 +91,21 @@ def make_hand(robot: Robot) -> Hand:
         elif frame.parentJoint in robot.model.supports[shape.parentJoint]:
             others.append(placed)
     fingers, others_placed = tuple(list_placed_shapes(touch)), tuple(list_placed_shapes(others))
-    opening = find_widest_bar(fingers)
-    if opening < 2.0 * BAR_THICKNESS:
-        problem = (
-            f"there is no room between the fingers of '{robot.name}' "
-            f"at its tool frame '{robot.tool_frame}'"
-            if has_fingers(robot)
-            else f"the hand of '{robot.name}' has no fingers"
-        )
+    opening, parts = find_widest_bar(fingers), len(robot.touch_links)
+    if parts == 1 and not has_fingers(robot):  # a flange, whose rim has nothing ahead of it
+        ahead = pin.SE3(np.eye(3), np.array([0.0, 0.0, -_RIM]))
+        opening = max(opening, find_widest_bar([(solid, ahead * at) for solid, at in fingers]))
+    if not 2.0 * BAR_THICKNESS <= opening < WIDEST_BAR:  # closed, or nothing on either side
+        problem = f"the hand of '{robot.name}' has no fingers"
+        if opening < WIDEST_BAR and (parts > 1 or has_fingers(robot)):
+            problem = (
+                f"there is no room between the fingers of '{robot.name}' "
+                f"at its tool frame '{robot.tool_frame}'"
+            )
+        elif has_fingers(robot):
+            problem = (
+                f"the tool frame '{robot.tool_frame}' of '{robot.name}' is not between its fingers"
+            )
         expected = "an open hand around its origin, with x as the closing direction"
         raise InputError(problem, file=robot.urdf, field="tool_frame", expected=expected)
     beyond = [

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.models.robot_model import build_full_model
 
@@ -23,11 +24,15 @@ __all__ = [
     "find_own_base",
     "find_telescopes",
     "guess_base_kind",
+    "sample_points",
 ]
 
 _MOVING = ("revolute", "continuous", "prismatic")
 _FINGER = 7  # largest number of joints of a finger
 _ARM = 3  # smallest number of joints of an arm with a hand; one more without a hand
+_BESIDE = 0.5  # smallest length of a palm beside a jaw, relative to the jaw's
+_JAW_ANGLES = np.linspace(-0.8, 0.8, 9)  # [rad]
+_POINTS = 120  # sampled points of a link
 _LEVEL = 0.01  # sine of the largest slope of a floor, and of an axis that counts as vertical
 _PARALLEL = 1.0 - 1e-6  # smallest cosine between the axes of a telescope's segments
 _HAND_WORDS = re.compile(r"finger|thumb|gripper|jaw|knuckle|claw|fngr|grip", re.IGNORECASE)
@@ -199,7 +204,7 @@ def find_arms(
             or len(_find_planned_joints(body, base)) < _ARM
         ):
             continue
-        if _is_palm(body):
+        if _is_palm(body, file):
             palms.append(body)
     inside = {id(below) for palm in palms for below in palm.subtree()}
     carrying = {id(above) for palm in palms for above in palm.path()}
@@ -303,7 +308,7 @@ def _get_last_joints(joints: Sequence[str]) -> set[str]:
     return set(joints[-4:])
 
 
-def _is_palm(body: Body) -> bool:
+def _is_palm(body: Body, file: UrdfFile) -> bool:
     """Return whether a body has fingers: two or more, or one that is named as a jaw."""
     if (
         not body.children
@@ -316,13 +321,46 @@ def _is_palm(body: Body) -> bool:
     if len(body.children) == 1:
         jaw = body.children[0]
         return (
-            bool(_HAND_WORDS.search(jaw.name))
+            bool(_HAND_WORDS.search(f"{jaw.name} {jaw.links[0]}"))
             and not _WRIST_WORDS.search(jaw.name)
             and not jaw.children
+            and _is_beside(body, jaw, file)
         )
     named = [bool(_HAND_WORDS.search(f"{child.name} {child.links[0]}")) for child in body.children]
     other = [bool(_OTHER_WORDS.search(f"{child.name} {child.links[0]}")) for child in body.children]
     return any(named) or not any(other)
+
+
+def _is_beside(palm: Body, jaw: Body, file: UrdfFile) -> bool:
+    """Return whether a palm extends beside a jaw, which closes against it, rather than behind it.
+
+    What turns about its own length, such as the last link of a wrist, is no jaw.
+    """
+    full = build_full_model(file)
+    data = full.createData()
+    pin.framesForwardKinematics(full, data, pin.neutral(full))
+    points = {
+        link: corners @ place.rotation.T + place.translation
+        for link, corners in sample_points(file, [*palm.links, *jaw.links]).items()
+        for place in (data.oMf[full.getFrameId(link, pin.FrameType.BODY)],)
+    }
+    own, others = ([points[link] for link in body.links if link in points] for body in (jaw, palm))
+    if not (own and others):
+        return False
+    number = full.getJointId(jaw.name)
+    base, motion = data.oMi[number], np.asarray(data.joints[number].S, float).ravel()
+    axis = base.rotation @ (motion[3:] if motion[3:].any() else np.zeros(3))
+    ahead = np.vstack(own) - base.translation
+    centre = ahead.mean(axis=0)
+    across = centre - (centre @ axis) * axis
+    if np.linalg.norm(across) < abs(centre @ axis):
+        return False
+    across /= np.linalg.norm(across)
+    reach = float((ahead @ across).max())
+    beside = np.vstack(others) - base.translation
+    # A palm lies where the jaw turns to rather than where it is.
+    towards = [pin.exp3(angle * axis) @ across for angle in _JAW_ANGLES]
+    return max(float((beside @ one).max()) for one in towards) > _BESIDE * reach
 
 
 def _find_planned_joints(body: Body, base: Collection[str]) -> tuple[str, ...]:
@@ -339,6 +377,27 @@ def _choose_name(joints: Sequence[str], palm: Body, groups: Mapping[str, Sequenc
         if sum(bool(pattern.search(name)) for name in [*joints[-3:], palm.links[0]]) >= 2:
             return side
     return palm.links[0]
+
+
+def sample_points(file: UrdfFile, links: Sequence[str]) -> dict[str, Floats]:
+    """Return points on links, shape (n, 3) in the link's frame [m]."""
+    points_by_link: dict[str, Floats] = {}
+    for kind in ("collision", "visual"):
+        new: dict[str, list[Floats]] = {}
+        for shape in file.read_shapes(kind):
+            if shape.link in links and shape.link not in points_by_link:
+                try:
+                    mesh = shape.make_mesh()
+                except InputError:
+                    continue
+                corners, sampled = (
+                    np.asarray(mesh.vertices),
+                    np.asarray(mesh.sample(_POINTS, seed=0)),
+                )
+                step = max(1, len(corners) // _POINTS)
+                new.setdefault(shape.link, []).append(np.vstack([corners[::step], sampled]))
+        points_by_link.update({link: np.vstack(points) for link, points in new.items()})
+    return points_by_link
 
 
 def _get_link(joint: ElementTree.Element, key: str) -> str:

@@ -11,14 +11,16 @@ import numpy as np
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing.convex import compute_concavity
-from vkc_pin.importing.proposals.hand import has_fingers, make_hand
+from vkc_pin.importing.proposals.hand import Hand, has_fingers, make_hand
 from vkc_pin.importing.robots.envelopes import find_envelopes
+from vkc_pin.importing.robots.reach import find_grasp_heights
 from vkc_pin.importing.robots.rest_configuration import Clearances, find_inseparable_pairs
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import check_integer, check_number
 from vkc_pin.world.files.meshes import load_mesh
 from vkc_pin.world.models.couplings.limits import DEFAULT_JOINT_VELOCITY, DEFAULT_SLIDE_VELOCITY
 from vkc_pin.world.models.dynamics.torque_limits import UNLIMITED
+from vkc_pin.world.models.grippers.bar_width import find_thickest_rod
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.models.shapes import compute_bounding_box
@@ -27,8 +29,11 @@ __all__ = ["Diagnosis", "Finding", "doctor"]
 
 _SAMPLES = 200
 _CONCAVE = 0.03  # [m] protrusion of a hull above which it is reported
+_COUNTED = ("fault", "limitation", "warning")  # levels whose number is reported
 _LISTED = 6  # names in a list
 _DEFAULT_VELOCITIES = (DEFAULT_JOINT_VELOCITY, DEFAULT_SLIDE_VELOCITY)
+_BAR = 0.015  # [m] thickness of common handles
+_LEVER, _NEAR_LEVER = 1.0, 0.15  # [m] height of door levers, and its spread
 # Sizes of robots [m] and travels of joints [rad], [m] beyond which a unit is probably wrong
 _SMALL, _LARGE, _MANY_TURNS, _LONG = 0.05, 8.0, 6.0 * np.pi, 10.0
 _UNLIMITED_TURNS = 2000.0  # [rad] travels above this mean that a joint is unlimited
@@ -39,8 +44,8 @@ class Finding:
     """A finding of the examination.
 
     Attributes:
-        level: "fault" (planning fails), "warning" (planning may fail, or values are assumed),
-            "note".
+        level: "fault" (planning fails), "limitation" (a common task that the robot cannot do),
+            "warning" (planning may fail, or values are assumed), "note".
         topic: "home", "pairs", "units", "limits", "effort", "mass", "hand", "shapes", "guessed" or
             "file".
         text: The finding.
@@ -66,7 +71,7 @@ class Diagnosis:
     findings: tuple[Finding, ...]
 
     def __post_init__(self) -> None:
-        order = ("fault", "warning", "note")
+        order = (*_COUNTED, "note")
         object.__setattr__(
             self,
             "findings",
@@ -80,17 +85,16 @@ class Diagnosis:
 
     def __str__(self) -> str:
         counts = {
-            level: sum(finding.level == level for finding in self.findings)
-            for level in ("fault", "warning")
+            level: sum(finding.level == level for finding in self.findings) for level in _COUNTED
         }
         counted = ", ".join(
             f"{count} {level}{'s' * (count != 1)}" for level, count in counts.items()
         )
         lines = [f"{self.name}: {counted}"]
         for finding in self.findings:
-            lines.append(f"  {finding.level:7} {finding.topic:8} {finding.text}")
+            lines.append(f"  {finding.level:10} {finding.topic:8} {finding.text}")
             if finding.hint:
-                lines.append(f"{'':19}→ {finding.hint}")
+                lines.append(f"{'':22}→ {finding.hint}")
         return "\n".join(lines)
 
 
@@ -105,7 +109,8 @@ def doctor(
 
     The examination covers the home configuration (collisions, pairs closer than the margin, the
     floor), pairs of links that no random configuration separates by the margin, missing limits,
-    efforts and masses, units, the hand, and meshes that are far from convex.
+    efforts and masses, units, the hand and the bars that it can grasp, and meshes that are far
+    from convex.
 
     Args:
         robot: A robot, or an argument of `load_robot`.
@@ -130,7 +135,7 @@ def doctor(
         *_check_pairs(loaded, clearance, samples, seed),
         *_check_units(loaded),
         *_check_limits_and_masses(loaded),
-        *_check_hand(loaded),
+        *_check_hand(loaded, seed),
     ]
     findings += [
         *_check_shapes(loaded),
@@ -289,28 +294,16 @@ def _read_mass(link: ElementTree.Element) -> float:
         return 0.0
 
 
-def _check_hand(robot: Robot) -> list[Finding]:
+def _check_hand(robot: Robot, seed: int) -> list[Finding]:
     findings = []
-    try:
-        make_hand(robot)
-    except InputError as error:
-        if robot.touch_links and has_fingers(robot):
-            hint = f"attachments need {error.expected}, see docs/robots.md"
-            findings.append(Finding("fault", "hand", f"{error.problem}: it cannot grasp", hint))
-        elif robot.touch_links:
-            text = f"{error.problem}: it can reach poses, but not grasp objects"
-            findings.append(Finding("warning", "hand", text))
     for link, share in find_envelopes(robot).items():
         text = f"{link} encloses {share:.0%} of the hand: the fingers cannot reach anything"
         hint = "remove its <collision> from the URDF, as `vkc-pin import-robot` does"
         findings.append(Finding("warning", "hand", text, hint))
     if not robot.touch_links:
-        hint = (
-            "`touch_links` in robot.yaml: palm and fingers; "
-            "without them a grasp is reported as a collision"
-        )
-        findings.append(Finding("warning", "hand", "no link may touch what is grasped", hint))
-        return findings
+        text = "no link may touch what is grasped: it can reach poses, but not grasp objects"
+        hint = "`touch_links` in robot.yaml: palm and fingers, if it has a hand"
+        return [*findings, Finding("limitation", "hand", text, hint)]
     frame = robot.model.frames[robot.model.getFrameId(robot.tool_frame)]
     behind = []
     for k, shape in enumerate(robot.collision.geometryObjects):
@@ -338,6 +331,43 @@ def _check_hand(robot: Robot) -> list[Finding]:
                 f"none of the touch_links moves with the tool frame {robot.tool_frame}",
             )
         )
+    try:
+        findings += _check_grasps(robot, make_hand(robot), seed)
+    except InputError as error:
+        if has_fingers(robot):
+            hint = f"attachments need {error.expected}, see docs/robots.md"
+            findings.append(Finding("fault", "hand", f"{error.problem}: it cannot grasp", hint))
+        else:
+            text = f"{error.problem}: it can reach poses, but not grasp objects"
+            findings.append(Finding("limitation", "hand", text))
+    return findings
+
+
+def _check_grasps(robot: Robot, hand: Hand, seed: int) -> list[Finding]:
+    """Report which bars the hand can grasp, and where."""
+    room = min(hand.opening, find_thickest_rod(hand.touch))
+    findings, thickness = [], max(0.0, room - 2.0 * Options().grasp_clearance)
+    if thickness < _BAR:
+        text = f"it cannot grasp bars more than {1e3 * thickness:.0f} mm thick"
+        findings.append(Finding("limitation", "hand", text, "open the fingers further"))
+    heights = find_grasp_heights(robot, seed=seed)
+    where = [
+        f"{kind} ones at {found.min():.1f} to {found.max():.1f} m"
+        for kind, found in heights.items()
+        if len(found)
+    ]
+    if where:
+        text = f"it grasps bars up to {1e3 * thickness:.0f} mm thick: {', '.join(where)}"
+        findings.append(Finding("note", "hand", text))
+    level, text, hint = heights["level"], "", ""
+    if not len(level):
+        text = "it cannot grasp level bars, such as most handles: no configuration holds one"
+        hint = "a wrist that rolls the hand, or a tool frame that is turned about z"
+    elif not (abs(level - _LEVER) < _NEAR_LEVER).any():
+        text = f"it cannot grasp door levers, {_LEVER:.0f} m high: level bars, see below"
+        hint = "mounted higher or lower, it can: `base.height` in robot.yaml"
+    if text:
+        findings.append(Finding("limitation", "hand", text, hint))
     return findings
 
 

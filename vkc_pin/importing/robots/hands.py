@@ -3,28 +3,39 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.errors import InputError
-from vkc_pin.importing.robots.arms import Arm, Body
+from vkc_pin.importing.robots.arms import Arm, Body, sample_points
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.urdf import UrdfFile
+from vkc_pin.world.models.grippers.bar_width import (
+    WIDEST_BAR,
+    PlacedShape,
+    find_thickest_rod,
+    find_widest_bar,
+)
 from vkc_pin.world.models.robot_model import compute_rest_positions, make_configuration
 
 __all__ = ["Hand", "analyze_hand"]
 
 Positions = Mapping[str, float]  # of joints by name, [m] or [rad]
 
-_POINTS = 120  # sampled points of a finger
 _TIP = 0.025  # [m] length of a fingertip
 _PAD = 0.02  # [m] distance of the grasped object behind the fingertips,
 _SHARE = 0.3  # at most this fraction of a finger's length
 _SNAP = np.cos(np.radians(12.0))  # closer directions snap to an axis of the hand
+_ALIGNED = 0.7  # cosine between the axis of a wrist that rolls and the approach
+_ROD = 0.036  # [m] thickness of a lever, with clearance on both sides
+# Shifts of a tool frame without room for such a rod [m], along its z and x axes
+_AHEAD, _ASIDE = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03), (0.0, -0.01, 0.01, -0.02, 0.02)
+_LITTLE_ROOM = 0.002  # [m] smallest gain for which it is shifted
+_SHARES = (0.75, 0.5)  # of the opening, at which rotating jaws may have more room
+_ENCLOSED = 0.005  # [m] by which fingers extend beyond the tool frame
 _STUB = 0.3  # shorter fingers, relative to the longest, are parts of a drive
 _GRIPPER = 3  # largest number of fingers of a gripper, all of which close together
 _LITTLE = 1e-6  # [m] or [rad] smallest travel between open and closed
@@ -92,7 +103,7 @@ class _HandAnalysis:
     ) -> None:
         self._linkages = linkages
         self._file, self._full, self._arm, self._data = file, full, arm, full.createData()
-        self._points = _sample_points(
+        self._points = sample_points(
             file, [link for body in arm.palm.subtree() for link in body.links]
         )
         self._link = arm.palm.links[0]
@@ -112,23 +123,13 @@ class _HandAnalysis:
         ):
             return self._use_flange(touch)
         first, second = self._divide_fingers(fingers)
-        self._approach = approach = self._find_approach(fingers)
+        self._approach = self._find_approach(fingers)
         joints = [body.name for finger in fingers for body in finger.subtree() if body.is_planned]
         opened, closed_positions, gap, closed = self._find_opening(first, second, joints)
-        a, b = self._find_tips(first, second, opened, approach)
-        closing = b.mean(axis=0) - a.mean(axis=0)
-        closing = _snap(_normalize(closing - (closing @ approach) * approach))
-        inner = 0.5 * ((a @ closing).max() + (b @ closing).min())
-        everything = np.vstack([self._find_points(finger, opened) for finger in fingers])
-        along = everything @ approach
-        depth = min(float((a @ approach).max()), float((b @ approach).max()))
-        depth -= min(_PAD, _SHARE * float(along.max() - along.min()))
-        side = np.cross(approach, closing)
-        across = 0.5 * (float((a @ side).mean()) + float((b @ side).mean()))
-        place = inner * closing + across * side + depth * approach
-        tool = pin.SE3(np.column_stack([closing, side, approach]), place)
-        moves = gap - closed
         linked = {name for linkage in self._linkages for name in linkage[0]}
+        tool, opened = self._place_tool(first, second, opened, closed_positions, linked)
+        gap = self._measure_gap(first, second, opened)
+        moves = gap - closed
         is_linkage = bool(linked) and linked.issuperset(joints)
         sure = (
             "sure" if len(fingers) == 2 and moves > 0.01 else "likely" if moves > 0.01 else "guess"
@@ -232,7 +233,8 @@ class _HandAnalysis:
             b = np.vstack([self._find_fingertip(finger, positions) for finger in second])
         else:
             b = self._find_points(self._arm.palm, positions, alone=True)
-            b = b[b @ self._approach >= (b @ self._approach).max() - 2.0 * _TIP]
+            along = b @ self._approach
+            b = b[along >= along.max() - min(2.0 * _TIP, _SHARE * float(np.ptp(along)))]
         return float(cKDTree(a).query(b)[0].min())
 
     def _find_opening(
@@ -292,16 +294,31 @@ class _HandAnalysis:
         return [rest, float(low), float(0.5 * (low + high)), float(high)]
 
     def _find_approach(self, fingers: Sequence[Body]) -> Floats:
-        """Return the direction from the arm's last joint to the fingertips, in the palm's frame."""
+        """Return the direction from the arm's last joint to the fingertips, in the palm's frame.
+
+        It is across the axis of a hinge, beside which a hand may be mounted.
+        """
         tips = np.array([self._find_fingertip(finger, {}).mean(axis=0) for finger in fingers])
         base = np.mean([self._find_base(finger) for finger in fingers], axis=0)
-        wrist = (
-            self._data.oMf[self._palm]
-            .actInv(self._data.oMi[self._full.getJointId(self._arm.joints[-1])])
-            .translation
+        wrist, axis = self._find_wrist()
+        place = wrist.translation
+        towards = _normalize(
+            tips.mean(axis=0) - (base if np.linalg.norm(base - place) < 0.01 else place)
         )
-        towards = tips.mean(axis=0) - (base if np.linalg.norm(base - wrist) < 0.01 else wrist)
-        return _snap(_normalize(towards))
+        joint = self._arm.palm.joint
+        is_hinge = joint is not None and joint.get("type") != "prismatic"
+        if is_hinge and abs(towards @ axis) <= _ALIGNED:
+            towards = _normalize(towards - (towards @ axis) * axis)
+        return _snap(towards)
+
+    def _find_wrist(self) -> tuple[pin.SE3, Floats]:
+        """Return the placement of the arm's last joint in the palm's frame, and its axis."""
+        joint = self._full.getJointId(self._arm.joints[-1])
+        wrist = self._data.oMf[self._palm].actInv(self._data.oMi[joint])
+        element = self._arm.palm.joint
+        axis = element.find("axis") if element is not None else None
+        text = axis.get("xyz", "1 0 0") if axis is not None else "1 0 0"
+        return wrist, _normalize(wrist.rotation @ np.array([float(v) for v in text.split()]))
 
     def _find_tips(
         self,
@@ -319,21 +336,76 @@ class _HandAnalysis:
         )
         return tuple(side[side @ approach >= (side @ approach).max() - _TIP] for side in (a, b))
 
+    def _place_tool(
+        self,
+        first: Sequence[Body],
+        second: Sequence[Body],
+        opened: Positions,
+        closed: Positions,
+        linked: Set[str],
+    ) -> tuple[pin.SE3, dict[str, float]]:
+        """Return the tool frame, and the open positions, with room for a rod between the fingers.
+
+        Jaws that turn far point aside when they are fully open, and have little room where they
+        meet: they are opened less, then the frame is shifted.
+        """
+        states = [dict(opened)]
+        if not linked & closed.keys():
+            for share in _SHARES:
+                part = {
+                    name: share * opened[name] + (1.0 - share) * closed[name] for name in closed
+                }
+                states.append({**opened, **part})
+        best, room, chosen = pin.SE3.Identity(), -1.0, states[0]
+        for shifts in ([(0.0, 0.0)], list(itertools.product(_AHEAD, _ASIDE))):
+            for state in states:
+                tool, shapes = self._find_tool(first, second, state), self._place_shapes(state)
+                for ahead, aside in shifts:
+                    moved = tool * pin.SE3(np.eye(3), np.array([aside, 0.0, ahead]))
+                    wider = _measure_room(shapes, moved)
+                    if wider > room + _LITTLE_ROOM:
+                        best, room, chosen = moved, wider, state
+                    if room >= _ROD:
+                        return best, chosen
+        return best, chosen
+
+    def _find_tool(
+        self, first: Sequence[Body], second: Sequence[Body], opened: Positions
+    ) -> pin.SE3:
+        """Return the tool frame between the fingertips of an open hand, in the palm's frame."""
+        approach = self._approach
+        a, b = self._find_tips(first, second, opened, approach)
+        closing = b.mean(axis=0) - a.mean(axis=0)
+        closing = _snap(_normalize(closing - (closing @ approach) * approach))
+        inner = 0.5 * ((a @ closing).max() + (b @ closing).min())
+        fingers = [*first, *(finger for finger in second if finger not in first)]
+        along = np.vstack([self._find_points(finger, opened) for finger in fingers]) @ approach
+        depth = min(float((a @ approach).max()), float((b @ approach).max()))
+        depth -= min(_PAD, _SHARE * float(along.max() - along.min()))
+        side = np.cross(approach, closing)
+        across = 0.5 * (float((a @ side).mean()) + float((b @ side).mean()))
+        place = inner * closing + across * side + depth * approach
+        return pin.SE3(np.column_stack([closing, side, approach]), place)
+
+    def _place_shapes(self, positions: Positions) -> list[PlacedShape]:
+        """Return the hand's collision shapes in the palm's frame."""
+        palm, links = self._place(positions), self._points.keys()
+        return [
+            (shape.make_solid(), palm.actInv(self._data.oMf[frame]) * shape.placement)
+            for shape in self._file.read_shapes("collision")
+            if shape.link in links
+            for frame in (self._full.getFrameId(shape.link, pin.FrameType.BODY),)
+        ]
+
     def _use_flange(self, touch: tuple[str, ...]) -> Hand:
         """Return the tool frame at the end of an arm without fingers."""
         joint = self._full.getJointId(self._arm.joints[-1])
         palm = self._place({})
-        wrist = palm.actInv(self._data.oMi[joint])
-        element = self._arm.palm.joint
+        wrist, turn = self._find_wrist()
         points = self._find_points(self._arm.palm, {}, alone=True)
         frames = [self._full.getFrameId(link, pin.FrameType.BODY) for link in self._arm.palm.links]
         ends = np.array([palm.actInv(self._data.oMf[frame]).translation for frame in frames])
         end = ends[np.linalg.norm(ends - wrist.translation, axis=1).argmax()]
-        axis = element.find("axis") if element is not None else None
-        along = np.array(
-            [float(v) for v in (axis.get("xyz", "1 0 0") if axis is not None else "1 0 0").split()]
-        )
-        turn = _normalize(wrist.rotation @ along)
         reach = (points.mean(axis=0) if len(points) else end) - wrist.translation
         towards = (
             end - wrist.translation if np.linalg.norm(end - wrist.translation) > 0.01 else reach
@@ -345,7 +417,7 @@ class _HandAnalysis:
         ):
             # The last link's frame is at its joint, and its shape may lie behind it.
             towards = wrist.translation - before
-        is_aligned = abs(turn @ _normalize(towards)) > 0.7
+        is_aligned = abs(turn @ _normalize(towards)) > _ALIGNED
         approach = _snap(turn * np.sign(turn @ towards) if is_aligned else _normalize(towards))
         depth = max(
             float((points @ approach).max()) if len(points) else -np.inf, float(end @ approach)
@@ -357,25 +429,12 @@ class _HandAnalysis:
         return Hand(self._link, tool, {}, {}, 0.0, touch, sure, why)
 
 
-def _sample_points(file: UrdfFile, links: Sequence[str]) -> dict[str, Floats]:
-    """Return points on links, shape (n, 3) in the link's frame [m]."""
-    points_by_link: dict[str, Floats] = {}
-    for kind in ("collision", "visual"):
-        new: dict[str, list[Floats]] = {}
-        for shape in file.read_shapes(kind):
-            if shape.link in links and shape.link not in points_by_link:
-                try:
-                    mesh = shape.make_mesh()
-                except InputError:
-                    continue
-                corners, sampled = (
-                    np.asarray(mesh.vertices),
-                    np.asarray(mesh.sample(_POINTS, seed=0)),
-                )
-                step = max(1, len(corners) // _POINTS)
-                new.setdefault(shape.link, []).append(np.vstack([corners[::step], sampled]))
-        points_by_link.update({link: np.vstack(points) for link, points in new.items()})
-    return points_by_link
+def _measure_room(shapes: Sequence[PlacedShape], tool: pin.SE3) -> float:
+    """Return the thickness of a rod that fits at a tool frame between fingers [m]; else 0."""
+    ahead = tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, _ENCLOSED]))
+    if find_widest_bar([(solid, ahead.actInv(at)) for solid, at in shapes]) >= WIDEST_BAR:
+        return 0.0
+    return find_thickest_rod([(solid, tool.actInv(at)) for solid, at in shapes])
 
 
 def _find_last_body(finger: Body, points: Mapping[str, Floats]) -> Body:

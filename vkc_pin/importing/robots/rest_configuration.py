@@ -11,7 +11,7 @@ import pinocchio as pin
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_model import find_nearest_position
-from vkc_pin.world.models.shapes import LinkDistances, ShapeDistances
+from vkc_pin.world.models.shapes import LinkDistances, ShapeDistances, triangulate
 
 __all__ = [
     "HOME_ROOM",
@@ -20,6 +20,8 @@ __all__ = [
     "find_arm_positions",
     "find_home",
     "find_inseparable_pairs",
+    "find_sunken_links",
+    "get_arm_bounds",
     "measure_floor_heights",
 ]
 
@@ -27,6 +29,9 @@ HOME_ROOM = 0.03
 """Desired clearance between links and to the floor at home [m], above the default margin."""
 
 _SAMPLES = 600
+_VERTICAL = 1.0 - 1e-6  # smallest vertical part of the axis of a lift
+_SUNKEN = 0.005  # [m] height above the floor that a sunken column may have
+_DEEP = 10.0  # [m] below which no lift goes
 _STEPS = 150  # steps of the local search around the best sample
 
 
@@ -134,7 +139,7 @@ def find_home(robot: Robot, named: Iterable[tuple[str, Floats]], *, seed: int = 
             return Home(positions, clearance, how)
         if best is None or clearance > best.clearance:
             best = Home(positions, clearance, how)
-    rng, (low, high) = np.random.default_rng(seed), _get_bounds(robot)
+    rng, (low, high) = np.random.default_rng(seed), get_arm_bounds(robot)
     middle, span = 0.5 * (low + high), np.maximum(high - low, 1e-9)
     frame, data = robot.model.getFrameId(robot.tool_frame), robot.model.createData()
 
@@ -182,7 +187,7 @@ def find_inseparable_pairs(
         The pairs with their largest distance [m].
     """
     clearances, rng = Clearances(robot), np.random.default_rng(seed)
-    low, high = _get_bounds(robot)
+    low, high = get_arm_bounds(robot)
     pairs = clearances.by_links()
     furthest, separated = dict.fromkeys(pairs.links, -np.inf), dict.fromkeys(pairs.links, 0)
     for arm in (robot.home, *rng.uniform(low, high, (samples, len(low)))):
@@ -199,9 +204,36 @@ def find_inseparable_pairs(
     return {links: furthest[links] for links in pairs.links}
 
 
-def _get_bounds(robot: Robot) -> tuple[Floats, Floats]:
+def get_arm_bounds(robot: Robot) -> tuple[Floats, Floats]:
     """Return the arm's position limits within ±π, shape (n − 3,) each."""
     return np.maximum(robot.lower[3:], -np.pi), np.minimum(robot.upper[3:], np.pi)
+
+
+def find_sunken_links(robot: Robot) -> list[str]:
+    """Return the links of a lift that its lowest position sinks below the base's lowest point.
+
+    They are drawn as columns, which a real base takes in or which telescope.
+    """
+    model, data = robot.model, robot.model.createData()
+    lowest = np.maximum(get_arm_bounds(robot)[0], -_DEEP)
+    pin.forwardKinematics(model, data, robot.coordinates.q(np.concatenate([np.zeros(3), lowest])))
+    lifts = {1}
+    for joint in range(2, model.njoints):
+        motion = np.asarray(data.joints[joint].S, float).reshape(6, -1)[:, 0]
+        is_vertical = abs((data.oMi[joint].rotation @ motion[:3])[2]) > _VERTICAL
+        if is_vertical and model.parents[joint] in lifts:
+            lifts.add(joint)
+    tops, floor = dict[str, float](), 0.0
+    for k, shape in enumerate(robot.collision.geometryObjects):
+        if shape.parentJoint in lifts:
+            place = data.oMi[shape.parentJoint] * shape.placement
+            heights = triangulate(shape.geometry)[0] @ place.rotation[2] + place.translation[2]
+            if shape.parentJoint == 1:
+                floor = min(floor, float(heights.min()))
+            else:
+                name = robot.link_of(k)
+                tops[name] = max(float(heights.max()), tops.get(name, -np.inf))
+    return sorted(link for link, top in tops.items() if top < floor + _SUNKEN)
 
 
 def measure_floor_heights(
@@ -215,7 +247,7 @@ def measure_floor_heights(
     clearances, rng = Clearances(robot), np.random.default_rng(seed)
     clearances.place(robot.home)
     base_heights = [height for link, height in clearances.floor(moved=False)]
-    low, high = _get_bounds(robot)
+    low, high = get_arm_bounds(robot)
     best: dict[str, float] = {}
     for arm in rng.uniform(low, high, (samples, len(low))):
         clearances.place(arm)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pinocchio as pin
 import yaml
 
@@ -29,12 +30,14 @@ from vkc_pin.importing.robots.envelopes import find_envelopes, remove_collision_
 from vkc_pin.importing.robots.hands import Hand, analyze_hand
 from vkc_pin.importing.robots.mesh_pieces import Piece, write_meshes
 from vkc_pin.importing.robots.picture import plot_robot
+from vkc_pin.importing.robots.reach import find_grasp_heights
 from vkc_pin.importing.robots.rest_configuration import (
     HOME_ROOM,
     Home,
     find_arm_positions,
     find_home,
     find_inseparable_pairs,
+    find_sunken_links,
     measure_floor_heights,
 )
 from vkc_pin.importing.robots.sources import Source, choose_free_name, read_source
@@ -209,18 +212,20 @@ class _Importer:
         self._findings += [Finding("warning", "shapes", note) for note in notes]
         text = ElementTree.tostring(root, encoding="unicode")
         self._file = UrdfFile(self._folder / self._settings["urdf"], text, root)
+        hand = None
         if chosen is not None:
-            self._set_hand(
-                analyze_hand(
-                    self._file, build_full_model(self._file), chosen, self._source.linkages
-                ),
-                tool_frame,
-            )
+            full = build_full_model(self._file)
+            hand = analyze_hand(self._file, full, chosen, self._source.linkages)
+            self._set_hand(hand, tool_frame)
         if tool_frame is not None:
             self._settings["tool_frame"] = tool_frame
-        robot = self._place_on_floor(self._remove_envelopes(self._write_and_load()), seed)
+        robot = self._remove_columns(self._remove_envelopes(self._write_and_load()))
+        robot = self._place_on_floor(robot, seed)
         self._report(pieces, self._find_home(robot, samples, seed))
-        return self._make_result(load_robot(self._folder / "robot.yaml"), arms, chosen, pieces)
+        robot = load_robot(self._folder / "robot.yaml")
+        if hand is not None and tool_frame is None:
+            robot = self._turn_tool(robot, hand, seed)
+        return self._make_result(robot, arms, chosen, pieces)
 
     def _make_result(
         self, robot: Robot, arms: list[Arm], chosen: Arm | None, pieces: list[Piece]
@@ -301,6 +306,28 @@ class _Importer:
                 "if it is wrong: `tool_frame`, see docs/robots.md",
             )
 
+    def _turn_tool(self, robot: Robot, hand: Hand, seed: int) -> Robot:
+        """Return the robot with its closing direction reversed if it then grasps more bars.
+
+        The direction from one finger to the other is arbitrary, but not every wrist rolls by half a
+        turn.
+        """
+        grasped = find_grasp_heights(robot, seed=seed)
+        if all(map(len, grasped.values())):
+            return robot
+        turned = find_grasp_heights(robot, is_turned=True, seed=seed)
+        if [bool(len(turned[kind])) for kind in grasped] <= [
+            bool(len(heights)) for heights in grasped.values()
+        ]:
+            return robot
+        for kind, name in (("link", robot.tool_frame), ("joint", f"{robot.tool_frame}_joint")):
+            (element,) = self._file.root.findall(f"{kind}[@name='{name}']")
+            self._file.root.remove(element)
+        half_turn = pin.SE3(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+        self._add_link(robot.tool_frame, hand.link, hand.tool * half_turn)
+        self._write()
+        return load_robot(self._folder / "robot.yaml")
+
     def _report_locked_fingers(self, hand: Hand) -> None:
         """Report that the gripper does not move, a fault if its fingers are closed."""
         limits = {
@@ -375,6 +402,17 @@ class _Importer:
         for link, share in envelopes.items():
             text = f"{link} encloses {share:.0%} of the hand: left out"
             self._findings.append(Finding("warning", "hand", text))
+        return self._write_and_load()
+
+    def _remove_columns(self, robot: Robot) -> Robot:
+        """Return the robot without shapes that its lift sinks into the floor."""
+        if not (columns := find_sunken_links(robot)):
+            return robot
+        remove_collision_shapes(self._file.root, columns)
+        for link in columns:
+            text = f"the lift sinks {link} into the floor: its collision shapes are left out"
+            hint = "nothing keeps this column off obstacles"
+            self._findings.append(Finding("warning", "shapes", text, hint))
         return self._write_and_load()
 
     def _place_on_floor(self, robot: Robot, seed: int) -> Robot:

@@ -26,7 +26,7 @@ from vkc_pin.utils.arrays import Floats
 __all__ = ["plan_by_constraint_graph"]
 
 _ENDS = 20  # configurations at the goal
-_SHARE = 0.2  # of the time that is left, for one of them
+_SHARE = 0.3  # of the time that is left, for one of them
 _SETTINGS = {
     "tolerance": 1e-5,  # of the closure, [m] and [rad]
     "step": 0.1,  # [rad] of a projected path

@@ -43,10 +43,9 @@ class Solver:
         inner.distance(self.distance)
         steering = inner.steeringMethod()
         planner.pathProjector(self.core.ProgressiveProjector(self.distance, steering, ask["step"]))
-        search = self.core.DiffusingPlanner(inner)
-        search.maxIterations(_ITERATIONS)
-        search.timeOut(ask["time"])
-        planner.innerPlanner(search)
+        planner.innerPlanner(self.core.DiffusingPlanner(inner))
+        planner.maxIterations(_ITERATIONS)
+        planner.timeOut(ask["time"])
         start, goal = (self.order(np.array(ask[name])) for name in ("start", "goal"))
         began = time.process_time()
         try:

@@ -7,18 +7,22 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from vkc_pin.benchmarks.peers.found import Clock, compute_clearances, validate_path
+from vkc_pin.benchmarks.peers.found import Clock, Peer, compute_clearances, validate_path
 from vkc_pin.benchmarks.peers.run import PEERS
 from vkc_pin.benchmarks.peers.tasks import build_program, make_problem
+
+
+def find_peer(name: str) -> Peer:
+    plan_by_peer, module, _ = PEERS[name]
+    if find_spec(module) is None:
+        pytest.skip(f'needs {module}: pip install "vkc-pin[peers]"')
+    return plan_by_peer
 
 
 @pytest.mark.parametrize("task", ["reach", "drawer"])
 @pytest.mark.parametrize("name", PEERS)
 def test_peer_finds_a_valid_path(name: str, task: str) -> None:
-    plan_by_peer, module, _ = PEERS[name]
-    if find_spec(module) is None:
-        pytest.skip(f'needs {module}: pip install "vkc-pin[peers]"')
-    own = make_problem(task, 18, 0)
+    plan_by_peer, own = find_peer(name), make_problem(task, 18, 0)
     problem = build_program(own)
 
     def accept(path: np.ndarray) -> bool:
@@ -31,3 +35,11 @@ def test_peer_finds_a_valid_path(name: str, task: str) -> None:
     assert result.success, result.report
     distances = compute_clearances(problem, result.trajectory).values()
     assert all(distance is None or distance > 0.0 for distance in distances)
+
+
+@pytest.mark.parametrize("name", PEERS)
+def test_peer_ends_at_its_time_limit(name: str) -> None:
+    plan_by_peer, own = find_peer(name), make_problem("door", 20270430, 1)
+    problem, clock = build_program(own), Clock(1.5)
+    plan_by_peer(own, problem, 0, clock, lambda path: False)
+    assert clock.wall < 20.0

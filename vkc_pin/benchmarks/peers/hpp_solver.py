@@ -2,7 +2,7 @@
 
 The constraint graph has one state, in which a grasped object stays so, and one transition.
 `DiffusingPlanner` grows trees from both ends, and projects their edges. `BiRRTPlanner` does not
-project them, so that the configuration may jump. `BiRrtStar` finds fewer paths, and later.
+project them, so that the configuration may jump. `BiRrtStar` needs more time.
 """
 
 from __future__ import annotations

@@ -35,6 +35,19 @@ def test_missing_solver_is_refused() -> None:
     assert "no_solver" in str(refused.value)
 
 
+def test_solver_that_crashed_is_started_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solver = "import os\nclass Solver:\n    def __call__(self, ask): return ask or os._exit(3)\n"
+    (tmp_path / "crashing_solver.py").write_text(solver)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    ask_solver = start_solver("crash", "crashing_solver")
+    assert ask_solver({"z": 1})["z"] == 1
+    with pytest.raises(InputError, match=r"the process of crash has ended.*exit code 3"):
+        ask_solver({})
+    assert start_solver("crash", "crashing_solver")({"z": 2})["z"] == 2
+
+
 @pytest.mark.parametrize(("solver", "package", "named"), SOLVERS)
 def test_wrong_request_does_not_end_the_worker(solver: str, package: str, named: str) -> None:
     found = find_spec(package)

@@ -46,6 +46,7 @@ def start_solver(
         while line := process.stdout.readline():
             if line.startswith("{"):
                 return dict(json.loads(line))
+        start_solver.cache_clear()  # the next problem has a new process
         raise InputError(
             f"the process of {name} has ended", field="method", got=f"exit code {process.wait()}"
         )

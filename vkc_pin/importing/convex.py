@@ -450,7 +450,8 @@ def _find_cut(vertices: Floats, faces: Ints) -> tuple[Floats, float] | None:
     a lesser degree those through the middle, are preferred.
     """
     vertices, faces = _coarsen(vertices, faces)
-    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges = edges[_find_unique_rows(edges)[0]]
     flatness = _FLATNESS if thicken(vertices, _FLATNESS)[1] else 0.0
     whole = _compute_hull_volume(vertices, flatness)
     best, chosen = -np.inf, None
@@ -519,21 +520,37 @@ def _coarsen(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
     normals = np.zeros((len(faces), 3))
     found, has_area = trimesh.triangles.normals(vertices[faces])
     normals[has_area] = found
-    total = np.zeros_like(vertices)
-    np.add.at(total, faces, normals[:, None])
-    counts = np.bincount(faces.ravel(), minlength=len(vertices))
+    corners = faces.ravel()
+    counts, *sums = (
+        np.bincount(corners, weights, minlength=len(vertices))
+        for weights in (None, *np.repeat(normals, 3, axis=0).T)
+    )
+    total = np.column_stack(sums)
     order = np.argsort(np.linalg.norm(total, axis=1) / np.maximum(counts, 1), kind="stable")
     cell, kept = float(np.ptp(vertices, axis=0).max()) / 64.0, faces
     while len(kept) > _MAX_TRIANGLES:
         cells = np.floor(vertices[order] / cell).astype(np.int64)
-        _, first, group = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+        first, group = _find_unique_rows(cells)
         representative = np.empty(len(vertices), int)
-        representative[order] = order[first][group.reshape(-1)]
-        kept = np.unique(np.sort(representative[faces], axis=1), axis=0)
+        representative[order] = order[first][group]
+        kept = np.sort(representative[faces], axis=1)
         kept = kept[(kept[:, 0] < kept[:, 1]) & (kept[:, 1] < kept[:, 2])]
+        kept = kept[_find_unique_rows(kept)[0]]
         cell *= 1.4
     used, kept = np.unique(kept, return_inverse=True)
     return vertices[used], kept.reshape(-1, 3)
+
+
+def _find_unique_rows(rows: Ints) -> tuple[Ints, Ints]:
+    """Return the first index of each distinct row, in lexicographic order, and each row's group.
+
+    It is `numpy.unique` along the first axis, which takes four times as long.
+    """
+    order = np.lexsort(rows.T[::-1])
+    differs = (np.diff(rows[order], axis=0) != 0).any(axis=1)
+    group = np.empty(len(rows), int)
+    group[order] = np.append(0, np.cumsum(differs))[: len(rows)]
+    return order[np.append(True, differs)[: len(rows)]], group
 
 
 def _compute_hull_volume(points: Floats, flatness: float = 0.0) -> float:

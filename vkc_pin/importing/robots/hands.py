@@ -388,8 +388,13 @@ class _HandAnalysis:
         return pin.SE3(np.column_stack([closing, side, approach]), place)
 
     def _place_shapes(self, positions: Positions) -> list[PlacedShape]:
-        """Return the hand's collision shapes in the palm's frame."""
-        palm, links = self._place(positions), self._points.keys()
+        """Return the hand's collision shapes in the palm's frame.
+
+        Invisible ones among visible ones, such as safety boxes, are left out.
+        """
+        palm, links = self._place(positions), set(self._points)
+        visible = {shape.link for shape in self._file.read_shapes("visual")}
+        links = links & visible or links
         return [
             (shape.make_solid(), palm.actInv(self._data.oMf[frame]) * shape.placement)
             for shape in self._file.read_shapes("collision")

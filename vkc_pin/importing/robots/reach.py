@@ -8,13 +8,15 @@ import pinocchio as pin
 from vkc_pin.importing.robots.rest_configuration import Clearances, get_arm_bounds
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.shapes import triangulate
+from vkc_pin.world.models.shapes import get_link_name, triangulate
 
 __all__ = ["find_grasp_heights"]
 
 _HEIGHTS = np.arange(1, 20) / 10.0  # [m] of the bars
 _UPRIGHT = np.cos(0.6)  # of the largest slope of the approach
-_FACE = 0.05  # [m] from a bar's centre to the door or drawer front behind it, with clearance
+# Distance [m] from the centre of a bar to the front behind it, less the clearance of links, and of
+# those that may touch what they grasp
+_FACE, _TOUCH_FACE = 0.05, 0.065
 _SAMPLES, _STARTS, _STEPS = 500, 10, 30
 _STEP = 0.5  # largest step of a joint, [m] or [rad]
 _PROGRESS = 0.9  # factor by which the error must decrease in three steps
@@ -67,11 +69,14 @@ class _GraspSearch:
         random = rng.uniform(self._low, self._high, (_SAMPLES, len(self._low)))
         self._samples = np.vstack([robot.home, random])
         self._errors = np.array([self._measure(arm, 0.0) for arm in self._samples])
-        corners = dict[int, list[Floats]]()
+        corners = dict[tuple[int, float], list[Floats]]()
         for shape in robot.collision.geometryObjects:
             points = triangulate(shape.geometry)[0] @ shape.placement.rotation.T
-            corners.setdefault(shape.parentJoint, []).append(points + shape.placement.translation)
-        self._corners = {joint: np.vstack(points) for joint, points in corners.items()}
+            face = _TOUCH_FACE if get_link_name(shape.name) in robot.touch_links else _FACE
+            corners.setdefault((shape.parentJoint, face), []).append(
+                points + shape.placement.translation
+            )
+        self._corners = {key: np.vstack(points) for key, points in corners.items()}
 
     def run(self) -> Floats:
         """Return the heights at which a bar can be grasped [m]."""
@@ -136,10 +141,10 @@ class _GraspSearch:
         self._measure(arm, 0.0)
         approach = np.append(self._pose.rotation[:2, 2], 0.0)
         approach /= np.linalg.norm(approach)
-        face = float(self._pose.translation @ approach) + _FACE
+        bar = float(self._pose.translation @ approach)
         return all(
             float((points @ (place.rotation.T @ approach)).max() + place.translation @ approach)
-            < face
-            for joint, points in self._corners.items()
+            < bar + face
+            for (joint, face), points in self._corners.items()
             for place in (self._data.oMi[joint],)
         )

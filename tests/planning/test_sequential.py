@@ -216,7 +216,7 @@ def test_another_attachment_is_tried(
 def test_attachments_share_the_budget(planned: Callable[..., vkc.Plan]) -> None:
     scene = add_attachment(vkc.load_scene("drawer"), "drawer", "behind", 0.0, depth=0.04)
     step = vkc.Actuate("drawer", {"slide": 0.2})
-    budget = {"max_evaluations": 40_000}
+    budget = {"max_evaluations": 30_000}
     alone = vkc.plan(scene, [dataclasses.replace(step, attachment="behind")], **budget)
     assert alone.status == "evaluation limit"
     (note,) = alone.report.notes

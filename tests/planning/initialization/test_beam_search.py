@@ -116,41 +116,6 @@ def test_path_cost_with_routes_is_the_driving_distance() -> None:
     assert found.cost[0] == pytest.approx(metric[0] * distance + turned)
 
 
-@pytest.mark.parametrize(
-    ("steps", "ratio"), [([vkc.Grasp("door")], 0.97), ([vkc.GoTo(-1.0, 0.0), OPEN], 1.0)]
-)
-def test_shortened_paths_cost_no_more_and_still_grasp(steps: list[vkc.Step], ratio: float) -> None:
-    p = make_program(load_door_scene(), steps, options=FEW)
-    found = make_search(p, 1, for_narrow_passages=True).search(
-        thorough=False
-    )  # which are not shortened
-    short = make_search(p, 1).shorten(found)
-    assert (short.cost <= found.cost).all()
-    assert (short.cost / found.cost).min() < ratio
-    lengths = compute_lengths(p, short.paths)
-    reached = found.collision_cost < 1e3
-    difference = short.cost - lengths - short.collision_cost
-    np.testing.assert_allclose(difference[reached], 0.0, atol=1e-6)
-    (moved,) = np.flatnonzero((short.paths != found.paths).any(axis=(0, 2)))
-    assert found.waypoints[moved] == p.ends[len(steps) - 1]
-    hinge, knob = (p.chain.index(name) for name in ("door.hinge", "door.knob"))
-    for row, cost in zip(short.paths[:, moved], short.collision_cost, strict=True):
-        assert (
-            cost >= 1e3 or compute_grasp_error(load_door_scene(), row, row[hinge], row[knob]) < 1e-3
-        )
-        assert np.all((row >= p.chain.lower - 1e-9) & (row <= p.chain.upper + 1e-9))
-
-
-def test_paths_to_grasps_are_shortened_unless_passages_are_narrow() -> None:
-    plain, narrow = (
-        make_search(make_problem(grasps=True), 1, for_narrow_passages=each)
-        for each in (False, True)
-    )
-    found, sampled = plain.search(thorough=False), narrow.search(thorough=False)
-    assert found.cost.min() < 1.02 * plain.shorten(found).cost.min()
-    assert found.cost.min() < sampled.cost.min()
-
-
 def test_no_two_paths_end_at_similar_configurations() -> None:
     ends = run_search().paths[:, -1]
     assert len(ends) > 5

@@ -31,7 +31,7 @@ def make_sampler(p: vkc.TrajectoryProblem, seed: int = 0) -> KeyframeSampler:
 def make_free_door() -> tuple[vkc.TrajectoryProblem, np.ndarray, list[int], np.ndarray]:
     """Return the door problem, keyframes with their waypoints, and straight waypoints."""
     p = make_program(load_door_scene(), STEPS, options=FEW)
-    sampler = make_sampler(p)
+    sampler = make_sampler(p, 2)
     found = BeamSearch(sampler).search(thorough=True)
     path = found.paths[int(np.argmin(np.where(found.collision_cost == 0.0, found.cost, np.inf)))]
     z = Interpolator(sampler, ApproachPaths(sampler), None).interpolate(path, found.waypoints)

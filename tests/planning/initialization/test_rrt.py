@@ -19,7 +19,6 @@ from vkc_pin.planning.initialization.base_routes import BaseRoutes
 from vkc_pin.planning.initialization.rrt import (
     MAX_EXTENSIONS,
     connect,
-    has_arm_detour,
     resample_path,
 )
 from vkc_pin.utils.budget import Budget, BudgetExhaustedError
@@ -215,21 +214,6 @@ def test_a_budget_ends_the_search() -> None:
         pytest.raises(BudgetExhaustedError),
     ):
         find_path(0)
-
-
-@pytest.mark.parametrize(
-    ("there", "back", "is_detour"),
-    [(1.0, 0.0, False), (1.2, 0.2, False), (2.0, 1.5, True), (3.0, 0.0, False)],
-)
-def test_arm_detour_exceeds_a_third_of_the_path(there: float, back: float, is_detour: bool) -> None:
-    """A shoulder turns back and forth in one of two phases."""
-    problem = make_program(make_hall(), [vkc.GoTo(0.5, 0.0), vkc.GoTo(1.0, 0.0)])
-    z, middle = np.tile(problem.start, (problem.segments, 1)), int(problem.ends[0])
-    z[:, 0] = np.linspace(0.0, 1.0, len(z))
-    count = problem.segments - middle
-    turns = np.interp(np.arange(1, count + 1), [0, count // 2, count], [0.0, there, there - back])
-    z[middle:, 3] += turns
-    assert has_arm_detour(problem, z) == is_detour
 
 
 PATHS = st.integers(1, 6).flatmap(

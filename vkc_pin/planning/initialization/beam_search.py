@@ -28,7 +28,6 @@ _BEAM_WIDTH = 24  # configurations kept per keyframe
 _COLLISION_COST, _DEPTH_COST = 10.0, 300.0
 _UNREACHABLE_COST = 1e3  # cost of an infeasible configuration or a missing base path
 _ACCEPTABLE_COST = 60.0  # collision cost that the solver can repair: one or two grazing contacts
-_SHORTENING_ROUNDS = 8  # times that each keyframe is moved towards its neighbours
 _SECTORS, _SECTOR_QUOTA = 8, 4  # sectors of base headings, and configurations preferred per sector
 # [m] base motion between keyframes of a closed chain that surely crosses an obstacle
 _MAX_JUMP = 0.5
@@ -77,7 +76,7 @@ class BeamSearch:
         sampler: Keyframe sampler.
         routes: Base paths that determine distances. Default: straight lines.
         for_narrow_passages: Whether grasps count as free only if the approach to them is free, too,
-            paths are not shortened, and base paths are those with the arm folded.
+            and base paths are those with the arm folded.
     """
 
     def __init__(
@@ -156,25 +155,13 @@ class BeamSearch:
         """Extend paths to the next keyframe, in a phase, and keep the cheapest."""
         more = self._sample_continuations(found, keyframe, phase, mode)
         total = self._compute_total(found, more.parents, more.z, phase) + more.penalty
-        sampled, waypoints = len(total), [*found.waypoints, keyframe]
-        has_pose = self.sampler.find_pose(keyframe) is not None
-        if not self.for_narrow_passages and not self._is_closed(phase) and has_pose:
-            best = np.argsort(total, kind="stable")[: 2 * _BEAM_WIDTH]
-            parents = more.parents[best]
-            paths = np.concatenate([found.paths[parents], more.z[best, None]], axis=1)
-            part = SearchResult(paths, total[best], more.penalty[best], waypoints)
-            short = self.shorten(part, len(found.waypoints))
-            z, penalty = short.paths[:, -1], short.collision_cost
-            cost = self._compute_total(found, parents, z, phase) + penalty
-            more = _Continuations.concatenate([more, _Continuations(parents, z, penalty)])
-            total = np.concatenate([total, cost])
-        best = _select_beam(total, more.z, sampled, _SECTORS if mode.keep_headings else 1)
+        best = _select_beam(total, more.z, _SECTORS if mode.keep_headings else 1)
         parents = more.parents[best]
         return SearchResult(
             np.concatenate([found.paths[parents], more.z[best, None]], axis=1),
             total[best],
             found.collision_cost[parents] + more.penalty[best],
-            waypoints,
+            [*found.waypoints, keyframe],
         )
 
     def _extend_backwards(
@@ -280,54 +267,6 @@ class BeamSearch:
         penalty = self._compute_penalty(pushed, waypoint)
         return more.concatenate([more, _Continuations(more.parents[best], pushed, penalty)])
 
-    def shorten(self, found: SearchResult, first: int = 1) -> SearchResult:
-        """Shorten paths by a local search over the keyframes of open phases.
-
-        Each such keyframe, from index `first` on, is moved in turn towards the middle of its
-        neighbours along the pose's manifold, by a fraction that is halved when the path gets no
-        cheaper. So paths compare by what the solver can make of them, not by luck.
-        """
-        paths, cost, collision_cost = (
-            found.paths.copy(),
-            found.cost.copy(),
-            found.collision_cost.copy(),
-        )
-        at, robot = found.waypoints, self.sampler.robot_size
-        movable = [
-            k
-            for k in range(first, len(at))
-            if not self.sampler.is_closed_at(at[k]) and self.sampler.find_pose(at[k]) is not None
-        ]
-        share = np.full((len(paths), len(at), 1), 0.5)
-        penalty = {k: self._compute_penalty(paths[:, k], at[k]) for k in movable}
-        for k in movable * _SHORTENING_ROUNDS:
-            moved = paths[:, k].copy()
-            middle = paths[:, [k - 1, *([k + 1] if k + 1 < len(at) else [])]].mean(axis=1)
-            moved[:, :robot] += share[:, k] * (middle - moved)[:, :robot]
-            moved, reached = self.sampler.sample(moved, at[k], "track")
-            new = self._compute_penalty(moved, at[k], reached)
-            gain = (
-                self._compute_cost_around(paths, paths[:, k], at, k)
-                + penalty[k]
-                - self._compute_cost_around(paths, moved, at, k)
-                - new
-            )
-            cheaper = gain > 0.0
-            paths[cheaper, k] = moved[cheaper]
-            cost[cheaper] -= gain[cheaper]
-            collision_cost[cheaper] += (new - penalty[k])[cheaper]
-            penalty[k][cheaper] = new[cheaper]
-            share[~cheaper, k] /= 2.0
-        return SearchResult(paths, cost, collision_cost, at)
-
-    def _compute_cost_around(self, paths: Floats, z: Floats, at: list[int], k: int) -> Floats:
-        """Return the cost from keyframe k - 1 to k + 1 of paths through z, shape (B, n), at k."""
-        find_phase = self.problem.contacts.find_phase
-        cost = self._compute_path_cost(paths[:, k - 1], z, find_phase(at[k]))
-        if k + 1 < len(at):
-            cost = cost + self._compute_path_cost(z, paths[:, k + 1], find_phase(at[k + 1]))
-        return cost
-
     def _compute_penalty(self, z: Floats, waypoint: int, reached: Bools | None = None) -> Floats:
         """Return the penalty for collisions and unreached poses at a waypoint, shape (B,)."""
         reached = np.ones(len(z), bool) if reached is None else reached
@@ -346,12 +285,10 @@ class BeamSearch:
         return penalty
 
 
-def _select_beam(total: Floats, z: Floats, sampled: int, sectors: int) -> Ints:
+def _select_beam(total: Floats, z: Floats, sectors: int) -> Ints:
     """Select the cheapest continuations of which no two are similar; return their indices.
 
-    At most half of them come after the first `sampled` ones, which are not shortened: a short path
-    may be a dead end. With several heading sectors, those beyond the quota of their sector come
-    last.
+    With several heading sectors, those beyond the quota of their sector come last.
     """
     rest, kept, late = np.argsort(total, kind="stable"), list[int](), list[int]()
     headings = np.floor(z[:, 2] / (2 * np.pi) * sectors).astype(int) % sectors
@@ -361,8 +298,6 @@ def _select_beam(total: Floats, z: Floats, sampled: int, sectors: int) -> Ints:
         (late if sectors > 1 and count[headings[first]] >= _SECTOR_QUOTA else kept).append(first)
         count[headings[first]] += 1
         rest = rest[np.abs(z[rest] - z[first]).max(axis=1) > SIMILARITY_TOLERANCE]
-        if np.count_nonzero(np.array(kept) >= sampled) >= _BEAM_WIDTH // 2:
-            rest = rest[rest < sampled]
     return np.array(kept + late[: _BEAM_WIDTH - len(kept)])
 
 

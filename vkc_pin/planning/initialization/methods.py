@@ -20,7 +20,6 @@ from vkc_pin.planning.initialization.keyframes import (
     KeyframeSampler,
     interpolate_object_joints,
 )
-from vkc_pin.planning.initialization.rrt import has_arm_detour
 from vkc_pin.planning.nlp.merit import Merit, measure_infeasibility
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
@@ -240,17 +239,8 @@ class _GuessSearch:
         return found
 
     def _order_paths(self, found: SearchResult) -> Iterable[Floats]:
-        """Return paths by cost, each after its shortened version.
-
-        A shortened path may graze obstacles, so the merit of the guesses decides between the two.
-        """
-        if len(found.waypoints) == 2:  # paths to a single keyframe are shortened already
-            return found.paths[np.argsort(found.cost, kind="stable")]
-        short = self.beam.shorten(found)
-        order = np.argsort(short.cost, kind="stable")
-        return itertools.chain.from_iterable(
-            zip(short.paths[order], found.paths[order], strict=True)
-        )
+        """Return paths by cost."""
+        return found.paths[np.argsort(found.cost, kind="stable")]
 
     def _is_sufficient(self, z: Floats, shortfall: float, penetration: float) -> bool:
         """Return whether a guess is good enough to skip the comparison with others."""
@@ -293,7 +283,7 @@ class _GuessSearch:
 class _RrtSearch(_GuessSearch):
     """Generates guesses with RRT paths of base and arm.
 
-    Trees are slow, so the first guess that is nearly free and direct is taken.
+    Trees are slow, so the first guess that is nearly free is taken.
     """
 
     compared_columns = 3  # if trees fail along a base path, another arm rarely helps
@@ -320,7 +310,7 @@ class _RrtSearch(_GuessSearch):
         return None
 
     def _is_sufficient(self, z: Floats, shortfall: float, penetration: float) -> bool:
-        return penetration <= MAX_GOOD_PENETRATION and not has_arm_detour(self.problem, z)
+        return penetration <= MAX_GOOD_PENETRATION
 
     def _order_paths(self, found: SearchResult) -> Iterable[Floats]:
         # Paths with keyframes in collision come last.

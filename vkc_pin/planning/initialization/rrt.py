@@ -20,7 +20,7 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.utils.optional_imports import import_compiled
 
-__all__ = ["MAX_EXTENSIONS", "STEP", "connect", "has_arm_detour", "resample_path"]
+__all__ = ["MAX_EXTENSIONS", "STEP", "connect", "resample_path"]
 
 MAX_EXTENSIONS = 1500
 """Maximum number of tree extensions."""
@@ -69,15 +69,6 @@ def connect(
     if path is not None and not fine.is_free(path):
         path = fine.run(ends, max_extensions)
     return None if path is None else fine.straighten(path)
-
-
-def has_arm_detour(problem: TrajectoryProblem, z: Floats) -> bool:
-    """Return whether the arm takes a detour in an open phase of a motion z_1..z_N, shape (N, n)."""
-    size, metric = problem.chain.robot.coordinates.size, problem.chain.metric
-    rows = problem.waypoints(z)[:, :size]
-    spans = zip(problem.task.phases, itertools.pairwise([0, *problem.ends.tolist()]), strict=True)
-    paths = [rows[begin : end + 1] for phase, (begin, end) in spans if not problem.is_closed(phase)]
-    return any(_compute_detour(path, metric[:size]) > _MAX_DETOUR for path in paths)
 
 
 def _compute_detour(path: Floats, metric: Floats) -> float:

@@ -22,7 +22,7 @@ from vkc_pin.world.task.compiler import compile_task
 PULL = [vkc.Actuate("drawer", {"slide": 0.3})]
 
 
-@pytest.mark.parametrize(("number", "seed"), [(39, 101), (38, 105)])
+@pytest.mark.parametrize(("number", "seed"), [(35, 9035)])
 def test_guesses_are_tried_until_a_trajectory_is_valid(number: int, seed: int) -> None:
     problem, rows = make_drawn_problem(number), list[vkc.Iteration]()
     plan = vkc.plan(problem.scene, problem.steps, seed=seed, callback=rows.append)

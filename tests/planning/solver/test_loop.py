@@ -170,7 +170,8 @@ def test_rejected_rounds_shrink_the_trust_region() -> None:
 
 
 def test_nearly_feasible_motions_take_small_steps() -> None:
-    history = solve_case(grasp).history
+    problem, guess = drive(3.2, describe_post(1.6, -0.1, 0.1))
+    history = solve(problem, guess).history
     nearly = [
         after
         for row, after in itertools.pairwise(history)

@@ -8,10 +8,12 @@ import io
 import os
 import resource
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import pytest
 from helpers.datasets import SMALL
@@ -124,13 +126,19 @@ WRITERS = {**FILES, **FOLDERS, **RESUMED, **RENDERED}
 
 @contextlib.contextmanager
 def fill_disk(free: int = 100) -> Iterator[None]:
-    """Let no file become larger than a number of bytes, as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (free, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    """Let no file become larger than a number of bytes, as on a full disk.
+
+    Imports write no bytecode meanwhile: Python 3.11 keeps the part of it that fits.
+    """
+    before, writes_no_bytecode = resource.getrlimit(resource.RLIMIT_FSIZE), sys.dont_write_bytecode
+    with mock.patch.dict(os.environ, PYTHONDONTWRITEBYTECODE="1"):
+        sys.dont_write_bytecode = True
+        resource.setrlimit(resource.RLIMIT_FSIZE, (free, before[1]))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+            sys.dont_write_bytecode = writes_no_bytecode
 
 
 def list_files(folder: Path) -> set[str]:

@@ -111,7 +111,7 @@ FOLDERS: dict[str, Callable[..., Any]] = {
     "robot": _import_robot,
 }
 RESUMED: dict[str, Callable[[Path], Any]] = {"dataset": _generate, "benchmark": _run_benchmark}
-"""Writers of folders that continue what is there."""
+"""Writers that continue an unfinished folder."""
 SLOW: dict[str, Callable[[Path], Any]] = {
     "a.html": lambda path: make_plan().to_html(path),
     "robot.srdf": lambda path: write_srdf(make_plan().scene.robot, path, samples=50),
@@ -120,7 +120,7 @@ RENDERED: dict[str, Callable[[Path], Any]] = {
     "pictures.png": lambda path: simulate().plot(path, count=2),
     "film.mp4": _render_film,
 }
-"""Writers that compute for long, and look at their target before."""
+"""Writers that compute for long, and check their target first."""
 WRITERS = {**FILES, **FOLDERS, **RESUMED, **RENDERED}
 
 
@@ -175,7 +175,7 @@ def test_a_full_disk_keeps_the_previous_file(folder: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [pytest.param("dataset", marks=pytest.mark.long), "benchmark"])
-def test_a_full_disk_leaves_a_folder_that_can_be_continued(folder: Path, name: str) -> None:
+def test_writers_continue_after_a_full_disk(folder: Path, name: str) -> None:
     find_commit()  # cached: the limit of this test would kill git, which would leave a lock
     with fill_disk(), pytest.raises(InputError, match=r"cannot write this .*File too large"):
         RESUMED[name](folder / name)

@@ -53,14 +53,16 @@ def plan_simultaneously(scene: Scene, task: Task, request: PlanningRequest) -> P
     a step fails; with other initializations they come first.
     """
     is_auto = request.initialization == "auto"
+    order = (_plan_from_steps, _plan_from_guesses)
+    plan_first, plan_second = order if is_auto else order[::-1]
     with share_budget(2):
-        first = (_plan_from_steps if is_auto else _plan_from_guesses)(scene, task, request)
+        first = plan_first(scene, task, request)
     if first.success or current_ending():
         return first
     has_alternatives = any(has_open_attachment(scene, step) for step in task.steps)
     if not is_auto and first.status == "infeasible" and not has_alternatives:
         return first
-    second = (_plan_from_guesses if is_auto else _plan_from_steps)(scene, task, request)
+    second = plan_second(scene, task, request)
     best = second if second.success or is_auto else first
     return add_statistics(best, [first.statistics, second.statistics])
 

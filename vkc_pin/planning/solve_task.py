@@ -300,7 +300,7 @@ class _Search:
         elif is_search and not lines:
             seed = self.request.random_seed
             lines, is_cut_off = diagnose_paths(
-                problem, best.z, best.report, self._blocked_phases, seed
+                best.problem or problem, best.z, best.report, self._blocked_phases, seed
             )
             status = "infeasible" if is_cut_off else status
         return best.with_notes(lines), status

@@ -38,9 +38,7 @@ def test_description_has_the_same_kinematics_and_pairs(task: str, tmp_path: Path
 
 
 @pytest.mark.parametrize("by_body", [False, True])
-def test_shapes_are_closer_than_asked_where_margins_are_violated(
-    by_body: bool, tmp_path: Path
-) -> None:
+def test_shapes_violate_the_same_margins(by_body: bool, tmp_path: Path) -> None:
     problem = build_program(make_problem("drawer", 18, 0))
     files = describe(problem, tmp_path, by_body=by_body)
     model = pin.buildModelFromUrdf(str(files.urdf))

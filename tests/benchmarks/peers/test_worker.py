@@ -1,4 +1,4 @@
-"""The process of a solver says what it cannot do, and goes on."""
+"""The process of a solver reports errors, and continues."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from vkc_pin.benchmarks.peers.processes import start_solver
 from vkc_pin.errors import InputError
 
 FILE = Path(worker.__file__)
-# Module, its package, and what the error about a missing description names.
+# Module, its package, and the key in the error about a missing description.
 SOLVERS = [("trajopt_solver", "tesseract_robotics", "/nowhere"), ("hpp_solver", "pyhpp", "URDF")]
 
 
 @pytest.mark.parametrize("solver", [solver for solver, *_ in SOLVERS])
 def test_worker_reports_a_missing_package(solver: str) -> None:
-    command = [sys.executable, "-S", str(FILE), solver]  # without what is installed
+    command = [sys.executable, "-S", str(FILE), solver]  # without installed packages
     done = subprocess.run(command, input="", capture_output=True, text=True, timeout=60)
     error = json.loads(done.stdout)["error"]
     assert error.startswith("ModuleNotFoundError")
     assert done.returncode == 1
 
 
-def test_missing_solver_is_refused() -> None:
+def test_missing_solver_raises_an_error() -> None:
     with pytest.raises(InputError, match="nothing cannot be run") as refused:
         start_solver("nothing", "no_solver")
     assert "no_solver" in str(refused.value)

@@ -112,7 +112,7 @@ def write_robot(folder: Path, **settings: object) -> Path:
     return folder
 
 
-def test_closed_hand_is_reported(tmp_path: Path) -> None:
+def test_doctor_reports_a_closed_hand(tmp_path: Path) -> None:
     for position, is_reported in ((0.0, True), (0.03, False)):
         locked = {"finger_a_joint": position, "finger_b_joint": position}
         robot = write_robot(tmp_path, touch_links=["finger_a", "finger_b"], locked_joints=locked)
@@ -142,7 +142,7 @@ OPEN = {"finger_a_joint": 0.03, "finger_b_joint": 0.03}
         ({"touch_links": ["arm_5"]}, "has no fingers: it can reach poses", ""),
     ],
 )
-def test_bars_that_a_hand_can_grasp_are_reported(
+def test_doctor_reports_the_bars_of_a_hand(
     tmp_path: Path, settings: dict[str, object], limitation: str, note: str
 ) -> None:
     found = vkc.importing.doctor(write_robot(tmp_path, **settings), samples=5)

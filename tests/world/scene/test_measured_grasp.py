@@ -47,7 +47,7 @@ def make_measured(name: str, attachment: str, at: list[float], off: np.ndarray) 
     return (grasp.motion(at) * pin.SE3(pin.exp3(off[3:]), off[:3])).inverse()
 
 
-def hold_measured(
+def make_measured_scene(
     grasp: tuple[str, str], share: float, off: np.ndarray
 ) -> tuple[vkc.Scene, pin.SE3]:
     """Return a scene with a grasp that is off in the direction `off`, and its measured pose."""
@@ -68,7 +68,7 @@ def choose_values(name: str, attachment: str, share: float) -> list[float]:
 def test_virtual_joint_is_the_measured_transform(
     grasp: tuple[str, str], share: float, off: np.ndarray
 ) -> None:
-    (name, attachment), (scene, measured) = grasp, hold_measured(grasp, share, off)
+    (name, attachment), (scene, measured) = grasp, make_measured_scene(grasp, share, off)
     at = scene.holds[0].at
     chain = consolidate(scene, scene.holds)
     z = np.zeros(chain.size)
@@ -94,7 +94,7 @@ def test_virtual_joint_is_the_measured_transform(
 def test_measured_grasp_survives_files(
     grasp: tuple[str, str], share: float, off: np.ndarray
 ) -> None:
-    scene, _ = hold_measured(grasp, share, off)
+    scene, _ = make_measured_scene(grasp, share, off)
     again = vkc.Scene.from_document(json.loads(json.dumps(scene.document)))
     assert again.holds == scene.holds
     assert again.holds[0].at == scene.holds[0].at

@@ -15,7 +15,7 @@ __all__ = ["find_grasp_heights"]
 _HEIGHTS = np.arange(1, 20) / 10.0  # [m] of the bars
 _UPRIGHT = np.cos(0.6)  # of the largest slope of the approach
 # Distance [m] from the centre of a bar to the front behind it, less the clearance of links, and of
-# those that may touch what they grasp
+# touch links
 _FACE, _TOUCH_FACE = 0.05, 0.065
 _SAMPLES, _STARTS, _STEPS = 500, 10, 30
 _STEP = 0.5  # largest step of a joint, [m] or [rad]

@@ -255,6 +255,15 @@ def test_another_attachment_of_one_step() -> None:
     assert result.steps == (there, vkc.Actuate("drawer", {"slide": 0.2}, "handle"))
 
 
+def test_failure_of_a_step_is_that_of_all_steps() -> None:
+    """Its motion stands still, rather than to do the first step alone."""
+    steps = [vkc.GoTo(-1.5, 0.0), vkc.GoTo(30.0, 0.0)]
+    result = vkc.plan(make_refrigerator(), steps)
+    assert result.status == "infeasible"
+    assert result.steps == tuple(steps)
+    assert np.ptp(result.trajectory.positions, axis=0).max() == 0.0
+
+
 def test_two_leaves_are_opened_in_one_problem() -> None:
     steps = [vkc.Actuate("it", {"hinge_left": 0.6}), vkc.Actuate("it", {"hinge_right": 0.5})]
     result = vkc.plan(make_refrigerator(), steps)

@@ -3,35 +3,64 @@
 from __future__ import annotations
 
 import argparse
-import importlib.abc
-import importlib.machinery
-import importlib.util
+import hashlib
+import importlib
 import json
 import os
 import random
-import subprocess
 import sys
-import time
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import FrameType
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
 from .mutations import Mutant, iterate_mutants
+from .plugin import PACKAGE, Recorder, Replacer
 
-ROOT = Path(__file__).resolve().parents[2]
-PACKAGE = ROOT / "vkc_pin"
+ROOT = PACKAGE.parent
 MODULES = ["validation", "planning/chain", "planning/solver", "planning/nlp", "world/scene"]
 TESTS = [f"tests/{name}" for name in MODULES] + ["tests/planning/test_solve_task.py"]
+IMPORTED = (
+    "casadi",
+    "coal",
+    "hypothesis",
+    "pinocchio",
+    "pydantic",
+    "scipy.optimize",
+    "toppra",
+    "trimesh",
+)
 PATIENCE = 5.0  # tests that take so many times as long as without the fault, and 30 s more, fail
 
 
+def show(line: str) -> None:
+    """Print a line at once."""
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+class Executed(NamedTuple):
+    """A test without a fault: its time [s], and the lines that it executes as module → lines."""
+
+    seconds: float
+    lines: Mapping[str, Sequence[int]]
+
+
+Coverage = dict[str, dict[str, Executed]]  # file → id → test; the id of what is imported is ""
+
+
 def list_files(names: Sequence[str], root: Path, pattern: str) -> list[str]:
-    """Return the files of folders and files below `root`, relative to it."""
+    """Return the files of folders and files below `root`, relative to it.
+
+    Raises:
+        SystemExit: One of them does not exist.
+    """
     paths = [root / name for name in names]
+    for path in paths:
+        if not path.exists():
+            raise SystemExit(f"no such file or folder: {path}")
     files = [p for path in paths for p in ([path] if path.is_file() else path.rglob(pattern))]
     return sorted({str(file.relative_to(root)) for file in files})
 
@@ -51,104 +80,89 @@ def sample_mutants(modules: Sequence[str], count: int, seed: int) -> list[Mutant
     return [mutant for *_, mutant in sorted(order, key=lambda item: item[:2])[:count]]
 
 
-def run_tests(file: str, *arguments: str, timeout: float | None = None) -> bool:
-    """Return whether a file of tests passes, within some time [s]."""
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", file]
-    command += ["-m", "not long and not browser", "-p", "tests.mutants.__main__"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
-    environment["MUTANTS"] = json.dumps(arguments)
+def run_tests(files: Sequence[str], folder: Path, make_plugin: Callable[[], Any]) -> bool:
+    """Return whether tests pass with a plugin of pytest; `pytest.log` says why they fail.
+
+    They run in a copy of this process, which has imported everything but the package.
+    """
+    if child := os.fork():
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        return status in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED)
+    status: int = pytest.ExitCode.INTERNAL_ERROR
     try:
-        done = subprocess.run(
-            command, cwd=ROOT, env=environment, timeout=timeout, capture_output=True, check=False
-        )
-    except subprocess.TimeoutExpired:
-        return False
-    return done.returncode in (0, 5)
+        log = os.open(folder / "pytest.log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(log, 1)
+        os.dup2(log, 2)
+        marks = ["-m", "not long and not browser"]
+        options = ["-x", "-q", "-p", "no:cacheprovider", "--rootdir", str(ROOT), *marks]
+        status = pytest.main([*options, *files], [make_plugin()])
+    finally:
+        sys.stdout.flush()
+        os._exit(status)
 
 
-def measure_coverage(files: Sequence[str], folder: Path) -> dict[str, tuple[float, set[str]]]:
-    """Return file of tests → its time [s], and the lines that it executes as "module:line".
+def measure_coverage(files: Sequence[str], folder: Path) -> Coverage:
+    """Return what each test of some files executes; kept in a folder until a source changes.
 
     Raises:
         SystemExit: A test fails without a fault.
     """
-    found = {}
+    shared = [PACKAGE, ROOT / "tests" / "helpers", ROOT / "tests" / "oracle"]
+    common = hashlib.sha256((ROOT / "tests" / "conftest.py").read_bytes())
+    for path in sorted(path for part in shared for path in part.rglob("*.py")):
+        common.update(path.read_bytes())
+    found: Coverage = {}
     folder.mkdir(parents=True, exist_ok=True)
-    for file in files:
-        record = folder / f"{file.replace('/', '.')}.json"
-        began = time.perf_counter()
-        if not run_tests(file, "record", str(record)):
-            raise SystemExit(f"{file} fails without a fault")
-        lines = json.loads(record.read_text(encoding="utf-8"))
-        found[file] = (time.perf_counter() - began, set(lines))
+    for number, file in enumerate(files, 1):
+        digest = common.copy()
+        digest.update((ROOT / file).read_bytes())
+        record = folder / f"{file.replace('/', '.')}.{digest.hexdigest()[:16]}.json"
+        if not record.exists():
+            for old in folder.glob(f"{file.replace('/', '.')}.*.json"):
+                old.unlink()
+            show(f"recording {number} of {len(files)}: {file}")
+            if not run_tests([file], folder, lambda path=record: Recorder(path)):
+                raise SystemExit(f"{file} fails without a fault: see {folder / 'pytest.log'}")
+        tests = json.loads(record.read_text(encoding="utf-8"))
+        found[file] = {name: Executed(*test) for name, test in tests.items()}
     return found
 
 
-def run_mutant(mutant: Mutant, coverage: dict[str, tuple[float, set[str]]], folder: Path) -> str:
+def select_tests(mutant: Mutant, coverage: Coverage) -> list[str]:
+    """Return the tests that may notice a fault, in the order in which they should run.
+
+    Those that execute the line come first, the file of the module's own tests before others, quick
+    ones before slow ones. Then come the others of these files: what several tests of a file share
+    is executed by the first of them alone. A line that is executed when the package is imported
+    concerns all tests that execute some line of its module.
+    """
+    mirror = f"tests/{Path(mutant.module).with_suffix('').parent}/test_{Path(mutant.module).stem}"
+    users, order = set(mutant.users), []
+    executed, imported = dict[str, set[int]](), set[int]()
+    for own in coverage.values():
+        executed |= {name: set(test.lines.get(mutant.module, ())) for name, test in own.items()}
+        imported |= executed.pop("")
+    if users <= imported:
+        users = set().union(*executed.values())
+    for file, tests in coverage.items():
+        chosen = {name for name in tests if name and users & executed[name]}
+        cost = sum(tests[name].seconds for name in chosen)
+        for name, test in tests.items() if chosen else ():
+            place = (name not in chosen, not file.startswith(mirror), cost, file, test.seconds)
+            order.append((*place, name))
+    return [name for *_, name in sorted(order) if name]
+
+
+def run_mutant(mutant: Mutant, coverage: Coverage, folder: Path) -> str:
     """Return "killed", "survived", or "uncovered" where no test executes the line."""
-    changed = {f"{mutant.module}:{line}" for line in mutant.users}
-    files = [file for file, (_, lines) in coverage.items() if changed & lines]
-    source = folder / "mutant.py"
-    source.write_text(mutant.source, encoding="utf-8")
-    mirror = f"tests/{Path(mutant.module).parent}/test_{Path(mutant.module).stem}"
-    for file in sorted(files, key=lambda name: (not name.startswith(mirror), coverage[name][0])):
-        limit = 30.0 + PATIENCE * coverage[file][0]
-        if not run_tests(file, "replace", mutant.module, str(source), timeout=limit):
-            return "killed"
-    return "survived" if files else "uncovered"
-
-
-class Replacer(importlib.abc.MetaPathFinder):
-    """Finds one module of the package in another file."""
-
-    def __init__(self, module: str, source: str) -> None:
-        self.name = "vkc_pin." + module.removesuffix(".py").replace("/", ".")
-        self.module, self.source = PACKAGE / module, Path(source).read_text(encoding="utf-8")
-
-    def find_spec(self, fullname: str, path: Any, target: Any = None) -> Any:
-        if fullname != self.name:
-            return None
-        loader = importlib.machinery.SourceFileLoader(fullname, str(self.module))
-        code = compile(self.source, str(self.module), "exec", dont_inherit=True)
-        loader.get_code = lambda _: code  # type: ignore[method-assign]
-        return importlib.util.spec_from_file_location(fullname, self.module, loader=loader)
-
-
-class Recorder:
-    """Writes down which lines of the package tests execute."""
-
-    def __init__(self, record: str) -> None:
-        self.record, self.lines, self.prefix = Path(record), set[str](), f"{PACKAGE}/"
-        sys.settrace(self.trace)
-
-    def trace(self, frame: FrameType, event: str, argument: Any) -> Any:
-        name = frame.f_code.co_filename
-        if not name.startswith(self.prefix):
-            return None
-        self.lines.add(f"{name.removeprefix(self.prefix)}:{frame.f_lineno}")
-        return self.trace
-
-    def pytest_sessionfinish(self) -> None:
-        sys.settrace(None)
-        self.record.write_text(json.dumps(sorted(self.lines)), encoding="utf-8")
-
-
-def start_plugin() -> Recorder | None:
-    """Replace a module or record lines, before `tests/conftest.py` imports the package."""
-    does, *arguments = json.loads(os.environ["MUTANTS"])
-    if does == "record":
-        return Recorder(*arguments)
-    sys.meta_path.insert(0, Replacer(*arguments))
-    return None
-
-
-PLUGIN = start_plugin() if __name__ != "__main__" and "MUTANTS" in os.environ else None
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    """Register the recorder in the process that runs the tests."""
-    if PLUGIN is not None:
-        config.pluginmanager.register(PLUGIN)
+    selected = select_tests(mutant, coverage)
+    if not selected:
+        return "uncovered"
+    tests = {name: test for own in coverage.values() for name, test in own.items()}
+    limits = {name: 30.0 + PATIENCE * tests[name].seconds for name in selected}
+    files = list(dict.fromkeys(name.partition("::")[0] for name in selected))
+    passed = run_tests(files, folder, lambda: Replacer(mutant.module, mutant.source, limits))
+    return "survived" if passed else "killed"
 
 
 def main() -> int:
@@ -160,18 +174,22 @@ def main() -> int:
     parser.add_argument("--tests", nargs="+", default=TESTS, help="folders and files of tests")
     given = parser.parse_args()
     folder = ROOT / "out" / "mutants"
+    os.environ["OMP_NUM_THREADS"] = "1"
+    for name in IMPORTED:
+        importlib.import_module(name)
     coverage = measure_coverage(list_files(given.tests, ROOT, "test_*.py"), folder)
-    counts = Counter[str]()
-    modules = list_files(given.modules, PACKAGE, "*.py")
-    for mutant in sample_mutants(modules, given.sample, given.seed):
+    counts = Counter(dict.fromkeys(("killed", "survived", "uncovered"), 0))
+    sample = sample_mutants(list_files(given.modules, PACKAGE, "*.py"), given.sample, given.seed)
+    for number, mutant in enumerate(sample, 1):
         outcome = run_mutant(mutant, coverage, folder)
         counts[outcome] += 1
+        place = f"{mutant.module}:{mutant.line}: {mutant.what}"
+        show(f"{number} of {len(sample)}, {counts['killed']} killed: {outcome}: {place}")
         if outcome != "killed":
-            place = f"{mutant.module}:{mutant.line}"
-            sys.stdout.write(f"{outcome}: {place}: {mutant.what}\n    {mutant.text}\n")
-            sys.stdout.flush()
-    sys.stdout.write(", ".join(f"{count} {name}" for name, count in counts.items()) + "\n")
-    return int(counts.total() > counts["killed"])
+            show(f"    {mutant.text}")
+    summary = ", ".join(f"{count} {name}" for name, count in counts.items())
+    show(f"{summary}: {counts['killed'] / max(len(sample), 1):.0%} killed")
+    return int(len(sample) > counts["killed"])
 
 
 if __name__ == "__main__":

@@ -35,8 +35,8 @@ class Mutant:
         line: Line of the fault, from 1.
         what: "kind: before → after".
         text: The unchanged line without indentation.
-        users: Lines whose behaviour changes: the line itself, or those that use the constant that
-            it defines.
+        users: Lines whose behaviour changes: those of its statement, or those that use the constant
+            that it defines.
         source: The whole module with the fault.
     """
 
@@ -75,20 +75,25 @@ def iterate_mutants(module: str, source: str) -> Iterator[Mutant]:
     for node in _iterate_nodes(tree):
         for kind, (begin, end), piece in _iterate_faults(node, text):
             before = text.bytes[begin:end].decode()
-            changed = text.with_piece(begin, end, piece)
-            if ast.dump(ast.parse(changed)) == ast.dump(tree):
+            if before == piece:
                 continue
+            changed = text.with_piece(begin, end, piece)
             line = text.bytes[:begin].count(b"\n") + 1
             what = f"{kind}: {' '.join(before.split())} → {' '.join(piece.split())}"
-            own = users.get(line, (line,))
-            mutant = Mutant(module, line, what, lines[line - 1].strip(), own, changed)
+            mutant = Mutant(module, line, what, lines[line - 1].strip(), users[line], changed)
             found.append((begin, mutant))
     yield from (mutant for _, mutant in sorted(found, key=lambda pair: pair[0]))
 
 
 def _find_users(tree: ast.Module) -> dict[int, tuple[int, ...]]:
-    """Return line that defines a constant of the module → the lines that use it."""
+    """Return line → the lines of its statement, or those that use the constant it defines."""
     found: dict[int, tuple[int, ...]] = {}
+    for statement in ast.walk(tree):
+        if isinstance(statement, ast.stmt):
+            body = getattr(statement, "body", None)  # whose statements come later
+            end = max(body[0].lineno - 1, statement.lineno) if body else statement.end_lineno
+            span = tuple(range(statement.lineno, (end or statement.lineno) + 1))
+            found |= dict.fromkeys(span, span)
     loads = [n for n in ast.walk(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Load)]
     for item in tree.body:
         if isinstance(item, ast.Assign | ast.AnnAssign):
@@ -96,7 +101,8 @@ def _find_users(tree: ast.Module) -> dict[int, tuple[int, ...]]:
             nodes = [node for target in targets for node in ast.walk(target)]
             names = {node.id for node in nodes if isinstance(node, ast.Name)}
             using = tuple(sorted({node.lineno for node in loads if node.id in names}))
-            found |= dict.fromkeys(range(item.lineno, (item.end_lineno or item.lineno) + 1), using)
+            if using:
+                found |= dict.fromkeys(found[item.lineno], using)
     return found
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import ast
-from pathlib import Path
+import subprocess
+import sys
 
 import pytest
 
-from .__main__ import PACKAGE, list_files, measure_coverage, run_mutant, sample_mutants
-from .mutations import iterate_mutants
+from .__main__ import ROOT, Coverage, Executed, list_files, sample_mutants, select_tests
+from .mutations import Mutant, iterate_mutants
+from .plugin import PACKAGE
 
 SOURCE = '''"""Docstring 3 < 4."""
 __all__ = ["area"]
@@ -82,16 +84,65 @@ def test_users_of_a_constant_are_found() -> None:
     assert where["name: min → max"] == (16, (16,))
 
 
-@pytest.mark.long
-def test_tests_find_a_fault(tmp_path: Path) -> None:
-    module, file = "benchmarks/harness/limits.py", "tests/benchmarks/harness/test_limits.py"
-    coverage = measure_coverage([file], tmp_path)
-    outcomes = {
-        mutant.what: run_mutant(mutant, coverage, tmp_path)
-        for mutant in iterate_mutants(module, (PACKAGE / module).read_text(encoding="utf-8"))
-        if "max_evaluations" in mutant.text and mutant.what.startswith("comparison")
+def test_constants_defined_and_used_at_import_have_the_line_of_their_use() -> None:
+    source = "A = 1\nB = 2\n\n\ndef double() -> int:\n    return (\n        2\n        * A\n    )\n"
+    users = {mutant.what: mutant.users for mutant in iterate_mutants("x.py", source)}
+    assert users["constant: 1 → 2"] == (8,)
+    assert users["constant: 2 → 3"] == (6, 7, 8, 9)  # the last one: B has no user
+    assert users["arithmetic: * → /"] == (6, 7, 8, 9)
+
+
+def make_coverage(module: str) -> Coverage:
+    """Return five tests in three files; line 3 is executed by the import alone."""
+    executed = {
+        "tests/planning/test_plan.py": {"fast": (0.1, [7]), "slow": (5.0, [7, 8])},
+        "tests/world/scene/test_poses.py": {"own": (1.0, [7]), "other": (0.5, [9])},
+        "tests/world/test_links.py": {"far": (0.1, [9])},
     }
-    assert outcomes == {"comparison: in → not in": "killed"}
+    return {
+        file: {"": Executed(0.0, {module: [1, 3]})}
+        | {
+            f"{file}::{name}": Executed(time, {module: lines})
+            for name, (time, lines) in tests.items()
+        }
+        for file, tests in executed.items()
+    }
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        (7, ["own", "fast", "slow", "other"]),  # the module's own file first, quick tests first
+        (8, ["slow", "fast"]),  # what a file shares may be executed by the first of its tests
+        (9, ["other", "far", "own"]),
+        (3, ["other", "own", "far", "fast", "slow"]),
+        (5, []),
+    ],
+)
+def test_tests_that_execute_the_line_come_first(line: int, expected: list[str]) -> None:
+    mutant = Mutant("world/scene/poses.py", line, "constant: 1 → 2", "x = 1", (line,), "x = 2")
+    tests = select_tests(mutant, make_coverage("world/scene/poses.py"))
+    assert [test.partition("::")[2] for test in tests] == expected
+
+
+@pytest.mark.long
+def test_command_reports_faults_and_reuses_coverage() -> None:
+    command = [sys.executable, "-m", "tests.mutants", "--sample", "4"]
+    command += ["--modules", "benchmarks/harness/limits.py"]
+    command += ["--tests", "tests/benchmarks/harness/test_limits.py"]
+    for _ in range(2):
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    *lines, summary = done.stdout.splitlines()
+    assert summary == "3 killed, 1 survived, 0 uncovered: 75% killed", done.stdout
+    assert done.returncode == 1
+    place = "benchmarks/harness/limits.py:12: constant: 1800.0 → 3600.0"
+    assert [line for line in lines if "survived" in line and line.endswith(place)]
+    assert lines[0].startswith("1 of 4, "), "the second run records nothing"
+
+
+def test_unknown_files_are_reported() -> None:
+    with pytest.raises(SystemExit, match=r"no such file or folder: .*validation/swept"):
+        list_files(["validation/sweep.py", "validation/swept"], PACKAGE, "*.py")
 
 
 def test_sample_has_one_fault_of_each_line_first() -> None:

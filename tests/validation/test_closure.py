@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from helpers.small_problems import make_full_scene
 
 import vkc_pin as vkc
 from vkc_pin.planning.plan import Plan
@@ -92,6 +93,22 @@ def test_largest_drift_is_that_of_a_fine_grid(plan: Plan, seed: int) -> None:
     fine = samples.compute_grasp_errors_at(hold, moments).max(axis=0)
     np.testing.assert_allclose(drift.measured, fine, rtol=0.0, atol=5e-6)
     assert (fine <= drift.bound + RESOLUTION).all()
+
+
+@pytest.mark.parametrize("attachment", ["rail", "sleeve", "socket", "wheel", "face"])
+def test_drift_of_grasps_with_freedoms_is_that_of_a_fine_grid(attachment: str) -> None:
+    scene = make_full_scene()
+    coordinates = scene.objects["cabinet"].object.attachments[attachment].coordinates
+    names = (*scene.robot.coordinates.names, "cabinet.swing", "cabinet.slide")
+    names += tuple(f"cabinet.{suffix}" for suffix in coordinates)
+    rng, times = np.random.default_rng(3), np.array([0.0, 0.5])
+    positions, rates = rng.uniform(-0.3, 0.3, (2, 2, len(names)))
+    span = vkc.PhaseSpan("all", 0, 1, (vkc.Hold("cabinet", attachment),))
+    size, curve = len(scene.start), Curve(times, positions, rates)
+    samples = Samples(scene, Trajectory(names, times, positions, (span,), size, curve))
+    drift = find_drift(samples, span, span.holds[0], (0.0, 0.0))
+    fine = samples.compute_grasp_errors_at(span.holds[0], np.linspace(*times, 5001))
+    np.testing.assert_allclose(drift.measured, fine.max(axis=0), rtol=0.0, atol=5e-6)
 
 
 def test_drift_below_half_of_the_limit_is_only_bounded(plan: Plan) -> None:

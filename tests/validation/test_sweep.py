@@ -151,6 +151,8 @@ def test_wire_between_two_samples() -> None:
     hits = list(sweep(table, samples.z[[0, -1]], np.array([0, 1])))
     assert ("base_link", "wire") in {(hit.first, hit.second) for hit in hits if hit.distance < 0}
     assert all(hit.distance > 1.0 for hit in hits if hit.at_waypoint and hit.second == "wire")
+    through = [hit.shapes for hit in hits if hit.distance < 0]
+    assert len(through) == len(set(through)), "one sample proves that a pair overlaps"
 
 
 @pytest.mark.parametrize(

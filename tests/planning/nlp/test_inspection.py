@@ -52,10 +52,13 @@ def test_sizes_add_up() -> None:
     assert found["rows: clamped freedoms"] == clamped > 0
 
 
-def test_planes_are_distances_to_first_order(problem: TrajectoryProblem, z: np.ndarray) -> None:
-    found = planes(problem, z, WAYPOINT)
+@pytest.mark.parametrize("at", [0, WAYPOINT - 1, -1])
+def test_planes_are_distances_to_first_order(
+    problem: TrajectoryProblem, z: np.ndarray, at: int
+) -> None:
+    found = planes(problem, z, int(np.arange(1, len(z) + 1)[at]))
     assert 0 < len(found) <= problem.options.contact_slots
-    here, step = z[WAYPOINT - 1], 1e-4
+    here, step = z[at], 1e-4
     moved = np.array([here + sign * step * axis for axis in np.eye(len(here)) for sign in (1, -1)])
     for plane in found:
         assert plane.values(here[None])[0] == pytest.approx(plane.distance, abs=1e-9)

@@ -133,3 +133,27 @@ def test_free_and_grazing_motions_keep_coals_contacts(
         contacts.arrays(), merge_contacts(at, between).arrays(), strict=True
     ):
         np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize(("depth", "is_active"), [(0.008, False), (0.012, True)])
+def test_shallow_overlaps_keep_coals_contacts(depth: float, is_active: bool) -> None:
+    """The base touches a crate with its front, its side and its rear, at three waypoints."""
+    problem, path = make_problem((3.0, 0.1, 0.6))
+    z = np.tile(path[0], (len(path), 1))
+    z[:3, :2] = [2.205 + depth, 0.1], [3.0, 0.735 - depth], [3.795 - depth, 0.1]
+    at = problem.evaluate_contacts(z, reach=0.0)
+    assert at.distance[at.waypoint < 3].min() == pytest.approx(-depth, abs=1e-4)
+    separation = Separation(problem)
+    separation.update(z, at, [])
+    assert separation.is_active == is_active
+
+
+def test_waypoints_beside_a_stretch_do_not_change_sides() -> None:
+    """It is shorter back out of the crate than aside, but the next waypoint is behind the crate."""
+    problem, path = make_problem((3.0, 0.1, 1.0))
+    z = np.where(np.arange(len(path))[:, None] < 10, path[0], path[-1])
+    z[10, :2] = 2.5, 0.1
+    _, contacts, _, _ = separate(problem, z)
+    inside = contacts.select(np.flatnonzero((contacts.waypoint == 10) & (contacts.distance < -0.3)))
+    np.testing.assert_allclose(inside.normal, [[0.0, 1.0, 0.0]] * len(inside.normal), atol=1e-6)
+    assert len(inside.normal)

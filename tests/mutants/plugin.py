@@ -1,0 +1,97 @@
+"""Plugins of pytest that record what each test executes, or run chosen tests with a fault."""
+
+from __future__ import annotations
+
+import faulthandler
+import importlib.abc
+import importlib.machinery
+import importlib.util
+import json
+import sys
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+__all__ = ["PACKAGE", "Recorder", "Replacer"]
+
+PACKAGE = Path(__file__).resolve().parents[2] / "vkc_pin"
+GRACE = 60.0  # [s] in which the package must be imported and the tests collected
+
+
+class Recorder:
+    """Writes the time [s] and the executed lines of each test: test → [time, module → lines].
+
+    The lines that importing the package executes are those of the test "".
+    """
+
+    def __init__(self, record: Path) -> None:
+        import coverage
+
+        self.record, self.seconds = record, defaultdict[str, float](float)
+        self.coverage = coverage.Coverage(
+            data_file=None, config_file=False, include=[f"{PACKAGE}/*"]
+        )
+        self.coverage.start()
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
+        self.coverage.switch_context(item.nodeid)
+        done = yield
+        self.coverage.switch_context("")
+        return done
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        self.seconds[report.nodeid] += report.duration
+
+    def pytest_sessionfinish(self, exitstatus: int) -> None:
+        self.coverage.stop()
+        if exitstatus:
+            return
+        data = self.coverage.get_data()
+        tests = {test: [seconds, {}] for test, seconds in {"": 0.0, **self.seconds}.items()}
+        for file in data.measured_files():
+            module = str(Path(file).relative_to(PACKAGE))
+            for line, names in data.contexts_by_lineno(file).items():
+                for name in names:
+                    tests[name][1].setdefault(module, []).append(line)
+        self.record.write_text(json.dumps(tests), encoding="utf-8")
+
+
+class Replacer(importlib.abc.MetaPathFinder):
+    """Imports a module of the package from another source, and runs only some tests.
+
+    Args:
+        module: The module, such as "planning/solver/loop.py".
+        source: The source that replaces it.
+        limits: Id of each test → its time limit [s], in the order in which they run.
+    """
+
+    def __init__(self, module: str, source: str, limits: Mapping[str, float]) -> None:
+        self.name = "vkc_pin." + module.removesuffix(".py").replace("/", ".")
+        self.module, self.source, self.limits = PACKAGE / module, source, limits
+        sys.meta_path.insert(0, self)
+        self._end_process_after(GRACE)
+
+    def find_spec(self, fullname: str, path: Any, target: Any = None) -> Any:
+        if fullname != self.name:
+            return None
+        loader = importlib.machinery.SourceFileLoader(fullname, str(self.module))
+        code = compile(self.source, str(self.module), "exec", dont_inherit=True)
+        loader.get_code = lambda _: code  # type: ignore[method-assign]
+        return importlib.util.spec_from_file_location(fullname, self.module, loader=loader)
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        found = {item.nodeid: item for item in items}
+        items[:] = [found[test] for test in self.limits if test in found]
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> None:
+        self._end_process_after(self.limits[item.nodeid])
+
+    def _end_process_after(self, limit: float) -> None:
+        """End the process unless this is called again within `limit` [s]; C++ may hang as well."""
+        faulthandler.dump_traceback_later(limit, exit=True, file=sys.__stderr__)

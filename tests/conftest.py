@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from collections import Counter
@@ -32,6 +33,12 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 OPINION = SecondOpinion()
 OPINION.attach()
 OPINIONS: dict[str, dict[str, Any]] = {}  # of the processes that tests run in
+
+
+def pytest_collection_finish() -> None:
+    """Spare later garbage collections what stays until the end: all tests and modules."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

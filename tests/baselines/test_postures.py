@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -110,8 +111,8 @@ def add_board() -> vkc.Scene:
     return add_boxes(load_drawer_scene(), board=([0.02, 1.0, 1.2], [1.7, 0.0, 0.6]))
 
 
-@pytest.mark.parametrize("scene", [raise_drawer(), add_board()], ids=["out of reach", "collision"])
-def test_no_pose(scene: vkc.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("make_scene", [raise_drawer, add_board])
+def test_no_pose(make_scene: Callable[[], vkc.Scene], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "TRIES", 1000)
-    problem = make_reach(scene)
+    problem = make_reach(make_scene())
     assert find_poses(problem).shape == (0, problem.chain.size)

@@ -61,7 +61,15 @@ def check_motors(world: World, stage: Stage) -> Iterator[Violation]:
     h = np.repeat(_STEP * spans, len(_SHARES))
     rows = [plan.evaluate(moments + k * h) for k in (-1, 0, 1)]
 
+    known: dict[bytes, Mapping[str, Poses]] = {}
+
     def places(columns: np.ndarray) -> Mapping[str, Poses]:
+        key = columns.tobytes()
+        if key not in known:
+            known[key] = find_links(columns)
+        return known[key]
+
+    def find_links(columns: np.ndarray) -> Mapping[str, Poses]:
         arm = {name: columns[:, 3 + k] for k, name in enumerate(robot.arm)}
         wanted = sorted({body.link for body in bodies} | {robot.tool})
         return robot.tree.links({**robot.locked, **arm}, columns[:, :3], wanted)

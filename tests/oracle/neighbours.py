@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .poses import make_pose
 from .riding import compute_distance
 
 if TYPE_CHECKING:
@@ -124,8 +125,13 @@ class Neighbours:
             if solid.owner != "floor"
         ]
         found, done = [], set()
-        for label, shape, place in parts:
-            for other, second, there in parts if self._joints(label) else ():
+        centres = np.array([(place @ make_pose(shape.centre)).at[0] for _, shape, place in parts])
+        radii = np.array([shape.radius for _, shape, _ in parts])
+        for k, (label, shape, place) in enumerate(parts):
+            if not self._joints(label):
+                continue
+            gaps = np.linalg.norm(centres - centres[k], axis=1) - radii - radii[k]
+            for other, second, there in (parts[i] for i in np.flatnonzero(gaps <= self.safe)):
                 key = frozenset(((label, id(shape)), (other, id(second))))
                 if label.partition(".")[0] == other.partition(".")[0] or key in done:
                     continue

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
-__all__ = ["ROOT", "Hold", "NotJudged", "Phase", "SavedPlan", "Violation", "read_plan"]
+__all__ = ["ROOT", "Hold", "NotJudged", "Phase", "SavedPlan", "Violation", "read_plan", "read_yaml"]
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -189,3 +190,9 @@ def read_plan(path: Path) -> SavedPlan:
         says=[f"{v['constraint']} {v['subject']}" for v in about["validation"]["violations"]],
         terms=len(about.get("terms", ())),
     )
+
+
+def read_yaml(path: Path) -> Any:
+    """Return the contents of a YAML file."""
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same in C, where it is compiled
+    return yaml.load(path.read_text(encoding="utf-8"), Loader=loader)

@@ -25,10 +25,7 @@ class Poses(NamedTuple):
     at: np.ndarray
 
     def __matmul__(self, other: Poses) -> Poses:
-        return Poses(
-            self.turn @ other.turn,
-            np.einsum("kij,kj->ki", *_broadcast(self.turn, other.at)) + self.at,
-        )
+        return Poses(self.turn @ other.turn, (self.turn @ other.at[:, :, None])[:, :, 0] + self.at)
 
     def inverse(self) -> Poses:
         back = self.turn.transpose(0, 2, 1)
@@ -49,13 +46,6 @@ class Poses(NamedTuple):
         return bool(
             np.ptp(self.turn, axis=0).max() < 1e-12 and np.ptp(self.at, axis=0).max() < 1e-12
         )
-
-
-def _broadcast(one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    size = max(len(one), len(other))
-    return np.broadcast_to(one, (size, *one.shape[1:])), np.broadcast_to(
-        other, (size, *other.shape[1:])
-    )
 
 
 def rotate_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:

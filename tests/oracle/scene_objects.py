@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-import yaml
 
-from .plan import ROOT, NotJudged
+from .plan import ROOT, NotJudged, read_yaml
 from .poses import Poses, make_pose, read_orientation, rotate_about_axis
 from .urdf import Urdf, read_urdf
 
@@ -57,10 +56,11 @@ class Tree:
         frames = {name: self.frame(name) for name in wanted}
         joints = sorted({frame.parentJoint for frame in frames.values()})
         found = np.empty((rows, len(joints), 4, 4))
+        placements = [self.data.oMi[joint] for joint in joints]
         for k in range(rows):
             pin.forwardKinematics(self.model, self.data, q[k])
-            for column, joint in enumerate(joints):
-                found[k, column] = self.data.oMi[joint].homogeneous
+            for column, placement in enumerate(placements):
+                found[k, column] = placement.homogeneous
         of_joint = {
             joint: Poses(found[:, i, :3, :3], found[:, i, :3, 3]) for i, joint in enumerate(joints)
         }
@@ -202,7 +202,7 @@ def load_object(item: Mapping[str, Any], folder: Path) -> SceneObject:
     if isinstance(kind, str):
         by_path = kind.endswith((".yaml", ".yml")) or "/" in kind
         file = folder / kind if by_path else ROOT / "scenes" / "objects" / f"{kind}.yaml"
-        about = yaml.safe_load(file.read_text(encoding="utf-8"))
+        about = read_yaml(file)
         folder = file.parent
     else:
         about = kind
@@ -310,10 +310,10 @@ def _read_grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[st
 def _load_robot_settings(file: Path) -> tuple[dict[str, Any], Path]:
     """Return the contents of a robot.yaml, and it, or of the one beside a URDF that names it."""
     if file.suffix == ".yaml":
-        return yaml.safe_load(file.read_text(encoding="utf-8")), file
+        return read_yaml(file), file
     settings = file.parent / "robot.yaml"
     if settings.is_file():
-        beside = yaml.safe_load(settings.read_text(encoding="utf-8"))
+        beside = read_yaml(settings)
         if beside["urdf"] == file.name:
             return beside, settings
     return {"urdf": file.name}, file

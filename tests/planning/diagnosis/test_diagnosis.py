@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 
 import pytest
 from helpers.carrying import (
@@ -163,15 +164,17 @@ def make_door_beside_a_wall() -> vkc.Scene:
 
 
 @pytest.mark.parametrize(
-    ("scene", "name", "goal", "cause"),
+    ("make_scene", "name", "goal", "cause"),
     [
-        (make_far_drawer(), "drawer.slide", 0.0, "out of reach"),
-        (make_door_beside_a_wall(), "door.hinge", -1.4, "– wall"),
+        (make_far_drawer, "drawer.slide", 0.0, "out of reach"),
+        (make_door_beside_a_wall, "door.hinge", -1.4, "– wall"),
     ],
 )
-def test_range_of_a_blocked_joint(scene: vkc.Scene, name: str, goal: float, cause: str) -> None:
+def test_range_of_a_blocked_joint(
+    make_scene: Callable[[], vkc.Scene], name: str, goal: float, cause: str
+) -> None:
     """Goals up to the end of the range have free configurations, goals a little beyond do not."""
-    owner, _, joint = name.partition(".")
+    scene, (owner, _, joint) = make_scene(), name.partition(".")
 
     def diagnose(value: float) -> list[BlockedGoal]:
         return diagnose_goals(make_problem(scene, vkc.Actuate(owner, {joint: value})), 0)

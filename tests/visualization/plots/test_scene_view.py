@@ -4,11 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from helpers.drawers import load_drawer_scene
 
-import vkc_pin as vkc
 from vkc_pin.visualization.plots.scene_view import Approach, plot_scene
-
-DRAWER = vkc.load_scene("drawer")
 
 
 def make_approaches(count: int) -> list[Approach]:
@@ -22,7 +20,7 @@ def make_approaches(count: int) -> list[Approach]:
 
 @pytest.mark.parametrize("count", [0, 1, 17])
 def test_attachments_are_numbered_in_a_legend(count: int) -> None:
-    figure = plot_scene(DRAWER, make_approaches(count))
+    figure = plot_scene(load_drawer_scene(), make_approaches(count))
     (axes,) = figure.axes
     numbers = [text.get_text() for text in axes.texts if text.get_text()]
     assert numbers == [str(k) for k in range(1, count + 1)]
@@ -33,7 +31,7 @@ def test_attachments_are_numbered_in_a_legend(count: int) -> None:
 
 @pytest.mark.parametrize("arena", [(-20.0, 20.0, -20.0, 20.0), (-30.0, 3.0, -3.0, 3.0)])
 def test_limits_are_tight_in_a_large_arena(arena: tuple[float, float, float, float]) -> None:
-    figure = plot_scene(dataclasses.replace(DRAWER, arena=arena), make_approaches(3))
+    figure = plot_scene(dataclasses.replace(load_drawer_scene(), arena=arena), make_approaches(3))
     (axes,) = figure.axes
     width, height = np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())
     assert 3.0 < width < 7.0
@@ -42,5 +40,5 @@ def test_limits_are_tight_in_a_large_arena(arena: tuple[float, float, float, flo
 
 def test_arrows_outside_the_arena_are_shown() -> None:
     outside = Approach("drawer.back", np.array([0.0, -9.0, 1.0]), np.array([0.0, 1.0, 0.0]), None)
-    (axes,) = plot_scene(DRAWER, [outside]).axes
+    (axes,) = plot_scene(load_drawer_scene(), [outside]).axes
     assert axes.get_ylim()[0] < -9.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import importlib
+import itertools
 import json
 import os
 import random
@@ -32,6 +33,7 @@ IMPORTED = (
     "toppra",
     "trimesh",
 )
+MAX_SECONDS = 60.0  # processor time of the tests that a fault has to survive
 PATIENCE = 5.0  # tests that take so many times as long as without the fault, and 30 s more, fail
 
 
@@ -42,7 +44,7 @@ def show(line: str) -> None:
 
 
 class Executed(NamedTuple):
-    """A test without a fault: its time [s], and the lines that it executes as module → lines."""
+    """A test without a fault: its processor time [s], and module → the lines that it executes."""
 
     seconds: float
     lines: Mapping[str, Sequence[int]]
@@ -134,7 +136,7 @@ def select_tests(mutant: Mutant, coverage: Coverage) -> list[str]:
     Those that execute the line come first, the file of the module's own tests before others, quick
     ones before slow ones. Then come the others of these files: what several tests of a file share
     is executed by the first of them alone. A line that is executed when the package is imported
-    concerns all tests that execute some line of its module.
+    concerns all tests that execute some line of its module. No test begins after MAX_SECONDS.
     """
     mirror = f"tests/{Path(mutant.module).with_suffix('').parent}/test_{Path(mutant.module).stem}"
     users, order = set(mutant.users), []
@@ -150,7 +152,9 @@ def select_tests(mutant: Mutant, coverage: Coverage) -> list[str]:
         for name, test in tests.items() if chosen else ():
             place = (name not in chosen, not file.startswith(mirror), cost, file, test.seconds)
             order.append((*place, name))
-    return [name for *_, name in sorted(order) if name]
+    order = sorted(entry for entry in order if entry[-1])
+    begins = itertools.accumulate((seconds for *_, seconds, _ in order), initial=0.0)
+    return [name for (*_, name), begin in zip(order, begins, strict=False) if begin < MAX_SECONDS]
 
 
 def run_mutant(mutant: Mutant, coverage: Coverage, folder: Path) -> str:

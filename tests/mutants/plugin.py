@@ -8,7 +8,7 @@ import importlib.machinery
 import importlib.util
 import json
 import sys
-from collections import defaultdict
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ GRACE = 60.0  # [s] in which the package must be imported and the tests collecte
 
 
 class Recorder:
-    """Writes the time [s] and the executed lines of each test: test → [time, module → lines].
+    """Writes test → [processor time [s], module → executed lines].
 
     The lines that importing the package executes are those of the test "".
     """
@@ -30,7 +30,7 @@ class Recorder:
     def __init__(self, record: Path) -> None:
         import coverage
 
-        self.record, self.seconds = record, defaultdict[str, float](float)
+        self.record, self.seconds = record, dict[str, float]()
         self.coverage = coverage.Coverage(
             data_file=None, config_file=False, include=[f"{PACKAGE}/*"]
         )
@@ -39,16 +39,15 @@ class Recorder:
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
         self.coverage.switch_context(item.nodeid)
+        began = time.process_time()
         done = yield
+        self.seconds[item.nodeid] = time.process_time() - began
         self.coverage.switch_context("")
         return done
 
-    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        self.seconds[report.nodeid] += report.duration
-
     def pytest_sessionfinish(self, exitstatus: int) -> None:
         self.coverage.stop()
-        if exitstatus:
+        if exitstatus not in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED):
             return
         data = self.coverage.get_data()
         tests = {test: [seconds, {}] for test, seconds in {"": 0.0, **self.seconds}.items()}

@@ -31,7 +31,7 @@ from helpers.riding import make_plate_scene, slide_plate
 from helpers.small_problems import load_door_scene
 
 from vkc_pin.options import Options
-from vkc_pin.validation.contact_windows import check_gripper, find_contact_windows
+from vkc_pin.validation.contact_windows import check_gripper, check_pushes, find_contact_windows
 from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.tolerances import Tolerances
@@ -107,6 +107,23 @@ def test_windows_of_a_grasp() -> None:
     assert find_windows(door, held) == expect_hand_windows(
         "door.lever", (15 - STEPS, 30 + STEPS), (15, 30), DOOR
     )
+
+
+@pytest.mark.parametrize(("back", "is_wrong"), [(0.9 * CONTACT_DEPTH, False), (0.05, True)])
+def test_pushed_links_may_not_go_back(back: float, is_wrong: bool) -> None:
+    scene = load_drawer_scene()
+    slide = 0.3 - np.cumsum([0.0, 0.1, 0.0, -back, 0.1])
+    push = Hold("drawer", "push")
+    freedoms = scene.objects["drawer"].object.attachments["push"].coordinates
+    names = (*scene.robot.coordinates.names, *(f"drawer.{name}" for name in ("slide", *freedoms)))
+    rows = np.tile(np.append(scene.start, np.zeros(len(freedoms) + 1)), (len(slide), 1))
+    rows[:, len(scene.start)] = slide
+    spans = (PhaseSpan("push", 0, len(slide) - 1, (push,)),)
+    motion = Trajectory(names, np.arange(5.0), rows, spans, len(scene.start))
+    found = list(check_pushes(Samples(scene, motion)))
+    assert [(one.constraint, one.waypoint) for one in found] == [("push", 3)] * is_wrong
+    for one in found:
+        assert one.amount == pytest.approx(back - CONTACT_DEPTH, abs=1e-9)
 
 
 def test_windows_of_a_grasp_step_without_hold() -> None:

@@ -71,13 +71,14 @@ def test_planes_are_distances_to_first_order(
 def test_distances_out_of_reach_are_nan(problem: TrajectoryProblem, z: np.ndarray) -> None:
     close = z.copy()
     close[:, 0] = 1.9
-    far = np.vstack([close[:1], z[:1] - 2.4 * np.eye(z.shape[1])[0]])
+    far = close[:1] - np.outer([0.0, 0.28, 2.9], np.eye(z.shape[1])[0])
     found = planes(problem, close, 2)
     fixed = [plane for plane in found if any(name.startswith("door") for name in plane.names)]
     assert fixed, [plane.names for plane in found]
     for plane in fixed:
-        near, away = plane.distances(far)
+        near, within, away = plane.distances(far)
         assert near == pytest.approx(plane.distance, abs=1e-12)
+        assert 0.3 < within < plane.distance + 0.3
         assert np.isnan(away)
 
 

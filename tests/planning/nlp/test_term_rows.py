@@ -314,6 +314,24 @@ def test_speed_limits_lengthen_the_steps() -> None:
     assert infeasible.timing_for(z).dt[0] <= 8.0 * dt[0]
 
 
+@pytest.mark.parametrize(("run", "row"), [(0, 0), (0, -1), (1, 0), (1, -1)])
+def test_speed_limits_lengthen_the_steps_between_two_stops(run: int, row: int) -> None:
+    """The first or last step before or after a grasp is too fast."""
+    slow = vkc.Constraint("slow", lambda s: s.velocity("tool")[0], upper=0.1)
+    steps = [vkc.Grasp("stick"), vkc.GoTo(1.0, 0.0)]
+    limited, usual = (
+        make_program(make_room(describe_stand()), steps, options=OPTIONS, terms=terms)
+        for terms in ([slow], [])
+    )
+    (stop,) = usual.transcription.structure.stops
+    own = np.split(np.arange(usual.segments), [stop])[run]
+    z = usual.still
+    z[own[row] :, 0] += 0.1
+    ratio = limited.timing_for(z).dt / usual.timing_for(z).dt
+    assert (ratio[own] > 1.2).all()
+    assert (np.delete(ratio, own) == 1.0).all()
+
+
 @pytest.mark.parametrize(
     "expression",
     [

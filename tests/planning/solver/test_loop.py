@@ -145,6 +145,7 @@ def test_history_of_rounds(case: Case) -> None:
     assert solution.iterations == history[-1].iterations
     assert all(0.0 < time < 100.0 for time in solution.timings.values())
     assert set(solution.timings) == {"coal", "casadi", "ipopt"}
+    assert sum(solution.timings.values()) <= history[-1].time
     assert history[0].radius == FIRST_RADIUS
     for row in history:
         assert 0.0 < row.time < 100.0

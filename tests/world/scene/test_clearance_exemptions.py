@@ -110,6 +110,13 @@ def test_drawers_side_by_side_are_exempt_until_either_has_passed() -> None:
     scene = replace_drawer_fields(load_drawer_scene(), objects=pair, obstacles=[])
     (one,) = find_clearance_exemptions(scene, SAFE)
     assert one.is_between("near.tray", "next.tray")
+    # The ranges follow the state of either drawer.
+    for name, other in (("near", "next"), ("next", "near")):
+        found = find_clearance_exemptions(scene.with_state(name, {"slide": 0.01}), SAFE)
+        upper = one.ranges[f"{other}.slide"][1]
+        assert sorted(each.ranges[f"{other}.slide"][1] for each in found) == pytest.approx(
+            [upper, upper + 0.01], abs=4e-4
+        )
     leaves = thick + np.sqrt(SAFE**2 - gap**2)
     assert {name: ends[1] for name, ends in one.ranges.items()} == {
         f"{name}.slide": pytest.approx(leaves, abs=2e-4) for name in ("near", "next")
@@ -118,12 +125,28 @@ def test_drawers_side_by_side_are_exempt_until_either_has_passed() -> None:
     assert one.is_active(["near.slide", "next.slide"], out).tolist() == [True, True, False, False]
 
 
+def test_warning_names_the_six_deepest_overlaps() -> None:
+    walls = [
+        {"name": f"wall_{k}", "type": "box", "size": [0.08, 1.2, 2.4], "position": [2.55, y, 1.2]}
+        for k, y in enumerate(0.6 - 0.01 * np.arange(1, 9))
+    ]
+    with pytest.warns(UserWarning, match="overlap other shapes") as caught:
+        scene = make_wall_scene(obstacles=walls)
+    text = str(caught[0].message)
+    close = find_close_pairs(scene, 0.0)
+    assert len(close) == len(walls)
+    assert text.count("overlap by") == 6
+    assert "wall_2 overlap" in text
+    assert "wall_1 overlap" not in text
+    assert "; and 2 more." in text
+
+
 def test_warning_names_overlapping_links() -> None:
     with pytest.warns(
         UserWarning, match=r"tight: .*door\.panel – wall overlap by 50\.0 mm.*`allow:`"
     ) as caught:
         scene = make_wall_scene()
-    assert len(caught) == 1
+    assert [one.filename for one in caught] == [__file__]
     (one,) = find_clearance_exemptions(scene, SAFE)
     assert one.is_between("wall", "door.panel")
     assert (one.margin, one.ranges) == (-np.inf, {"door.hinge": (-np.inf, np.inf)})

@@ -109,9 +109,8 @@ def measure_coverage(files: Sequence[str], folder: Path) -> Coverage:
     Raises:
         SystemExit: A test fails without a fault.
     """
-    shared = [PACKAGE, ROOT / "tests" / "helpers", ROOT / "tests" / "oracle"]
-    common = hashlib.sha256((ROOT / "tests" / "conftest.py").read_bytes())
-    for path in sorted(path for part in shared for path in part.rglob("*.py")):
+    common = hashlib.sha256()
+    for path in sorted([*PACKAGE.rglob("*.py"), *(ROOT / "tests" / "helpers").rglob("*.py")]):
         common.update(path.read_bytes())
     found: Coverage = {}
     folder.mkdir(parents=True, exist_ok=True)
@@ -133,12 +132,14 @@ def measure_coverage(files: Sequence[str], folder: Path) -> Coverage:
 def select_tests(mutant: Mutant, coverage: Coverage) -> list[str]:
     """Return the tests that may notice a fault, in the order in which they should run.
 
-    Those that execute the line come first, the file of the module's own tests before others, quick
-    ones before slow ones. Then come the others of these files: what several tests of a file share
-    is executed by the first of them alone. A line that is executed when the package is imported
-    concerns all tests that execute some line of its module. No test begins after MAX_SECONDS.
+    Those that execute the line come first: those in the file of the module's own tests, then those
+    in its folder; quick ones before slow ones. Then come the others of these files: what several
+    tests of a file share is executed by the first of them alone. A line that is executed when the
+    package is imported concerns all tests that execute some line of its module. No test begins
+    after MAX_SECONDS.
     """
-    mirror = f"tests/{Path(mutant.module).with_suffix('').parent}/test_{Path(mutant.module).stem}"
+    module = Path("tests", mutant.module)
+    own_tests = module.with_name(f"test_{module.stem}")
     users, order = set(mutant.users), []
     executed, imported = dict[str, set[int]](), set[int]()
     for own in coverage.values():
@@ -149,8 +150,9 @@ def select_tests(mutant: Mutant, coverage: Coverage) -> list[str]:
     for file, tests in coverage.items():
         chosen = {name for name in tests if name and users & executed[name]}
         cost = sum(tests[name].seconds for name in chosen)
+        far = [not file.startswith(str(near)) for near in (own_tests, own_tests.parent)]
         for name, test in tests.items() if chosen else ():
-            place = (name not in chosen, not file.startswith(mirror), cost, file, test.seconds)
+            place = (name not in chosen, far, cost, file, test.seconds)
             order.append((*place, name))
     order = sorted(entry for entry in order if entry[-1])
     begins = itertools.accumulate((seconds for *_, seconds, _ in order), initial=0.0)

@@ -69,6 +69,15 @@ def test_planned_motion_is_valid(door_plan: vkc.Plan) -> None:
     assert report.states > len(door_plan.trajectory.times)
 
 
+def test_clearance_is_the_smallest_of_all_phases() -> None:
+    crate = {"name": "crate", "type": "box", "size": [0.4, 0.4, 0.3], "position": [1.73, 0, 0.15]}
+    scene = make_hall(obstacles=[crate])
+    stops = [move_start(scene.start, x=x) for x in (0.0, 0.5, 1.0)]
+    report = validate(scene, [vkc.GoTo(1.0, 0.0, 0.0)], drive_through(scene, *stops))
+    assert report.clearance == report.clearances[1] == pytest.approx(0.035, abs=1e-3)
+    assert report.clearances[0] > 0.05
+
+
 def test_heading_goal_is_periodic(empty: Scene, drive: Trajectory) -> None:
     assert validate(empty, [vkc.GoTo(2.0, 0.0, np.pi / 2 - 4 * np.pi)], drive).ok
 

@@ -140,20 +140,6 @@ def test_attachment_sets_the_clearance_of_hand_and_object(
             }
 
 
-def test_exemptions_do_not_pair_the_hand_with_the_link_it_grasps() -> None:
-    hand = load_door_scene().robot.touch_links
-    allow = [{"pair": [link, "door.lever"], "margin": 0.001} for link in hand]
-    scene = Scene.from_document(
-        {**load_door_scene().document, "allow": allow}, load_door_scene().folder
-    )
-    problem = make_program(scene, [Actuate("door", {"hinge": 1.2})], options=SHORT)
-    found = list_pairs(problem, 0)
-    assert all(
-        found[link, "door.lever"] == [0.001] * len(found[link, "door.lever"]) for link in hand
-    )
-    assert not {(link, "door.lever") for link in hand} & {*list_pairs(problem, 1)}
-
-
 def test_objects_stay_where_earlier_phases_left_them() -> None:
     problem = make_door_problem()
     knob = problem.task.phases[3].initial_values["door.knob"]

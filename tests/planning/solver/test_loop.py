@@ -206,6 +206,14 @@ def test_blocked_motions_end_early() -> None:
     assert solve(problem, guess, rounds=2).rounds == 2
 
 
+def test_choosing_sides_of_a_closed_wall_is_no_progress() -> None:
+    """The path goes through a thin wall, whose nearest side differs between waypoints."""
+    problem, guess = drive(4.0, describe_box("wall", 2.0, 0.0, [0.1, 12.0, 2.0]))
+    solution = solve(problem, guess, rounds=vkc.Options().max_outer)
+    assert not solution.converged
+    assert solution.rounds < vkc.Options().max_outer
+
+
 def test_callback_receives_the_history() -> None:
     rows: list[object] = []
     solution = solve(*make_pillar_case(), callback=rows.append)

@@ -21,6 +21,7 @@ from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import consolidate
 from vkc_pin.world.scene.contact_rules import compute_hand_clearance
 from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.measured_grasp import fit_grasp
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 
 HALL = {
@@ -144,6 +145,14 @@ def test_freedoms_take_what_they_can_of_a_measured_grasp(share: float, off: np.n
         np.linalg.norm(np.array(one.deviation or [0.0] * 6) / scale) for one in (fitted, stated)
     ]
     assert sizes[0] <= sizes[1] + 1e-6
+
+
+@pytest.mark.parametrize("around", [-3.0, 0.2, 3.0])
+def test_freedoms_are_fitted_all_around_a_rim(around: float) -> None:
+    rim = vkc.load_object("bowl").attachment("rim")
+    values, deviation = fit_grasp(rim, rim.motion([around, 0.1]).inverse(), None, "measured")
+    assert values == pytest.approx([around, 0.1], abs=1e-5)
+    assert np.abs(deviation or 0.0).max() < 1e-5
 
 
 @pytest.mark.parametrize(

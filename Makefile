@@ -8,6 +8,10 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .PHONY: demo test test-long lint docs clean
+# The extras that a goal needs are installed with the other packages, while this one is compiled.
+test test-long: EXTRAS := test docs
+lint: EXTRAS := test
+docs: EXTRAS := docs
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/installed.stamp
@@ -60,23 +64,20 @@ $(VENV)/installed.stamp: pyproject.toml CMakeLists.txt $(COMPILED) | $(VENV)/cre
 	@echo "Installing vkc-pin and what it needs into $(VENV); compiling takes a minute or two"
 	@$(listed) build-system requires > $(VENV)/build-packages.txt
 	@$(listed) project dependencies > $(VENV)/packages.txt
+	@$(foreach extra,$(EXTRAS),$(listed) project optional-dependencies $(extra) >> $(VENV)/packages.txt &&) true
 	$(PIP) install --no-compile --requirement $(VENV)/build-packages.txt cmake ninja
 	@# The other packages are installed while this one is compiled, against what is in $(VENV) already.
 	$(PIP) install --no-compile --requirement $(VENV)/packages.txt & others=$$!; \
 	$(PIP) install --no-compile --no-deps --no-build-isolation --editable . && wait $$others
+	@touch $@ $(EXTRAS:%=$(VENV)/%.stamp)
+
+# An extra that was not installed just now.
+$(VENV)/test.stamp $(VENV)/docs.stamp: $(VENV)/%.stamp: $(VENV)/installed.stamp
+	@{ [ -e $@ ] && [ ! $@ -ot $< ]; } || { $(listed) project optional-dependencies $* > $(VENV)/$*-packages.txt && \
+	  $(PIP) install --no-compile --requirement $(VENV)/$*-packages.txt; }
 	@touch $@
 
 # Prints requirements of pyproject.toml: asking pip for '.[test]' would compile the package once more.
 listed = $(BIN)/python -c '$(list_requirements)'
 list_requirements = import functools, sys, tomllib; \
   print(*functools.reduce(dict.get, sys.argv[1:], tomllib.load(open("pyproject.toml", "rb"))), sep="\n")
-# Usage: $(call extra,test)
-extra = @$(listed) project optional-dependencies $(1) > $(VENV)/$(1)-packages.txt && $(PIP) install --no-compile --requirement $(VENV)/$(1)-packages.txt
-
-$(VENV)/test.stamp: $(VENV)/installed.stamp
-	$(call extra,test)
-	@touch $@
-
-$(VENV)/docs.stamp: $(VENV)/installed.stamp
-	$(call extra,docs)
-	@touch $@

@@ -119,7 +119,9 @@ def test_progress_that_cannot_be_printed_is_no_failure(tmp_path: Path, full: Pat
 
 
 @pytest.mark.parametrize(
-    ("words", "code"), [(INFEASIBLE, 3), (SUCCESS, 2)], ids=["infeasible", "success"]
+    ("words", "code"),
+    [pytest.param(INFEASIBLE, 3, marks=pytest.mark.long), (SUCCESS, 2)],
+    ids=["infeasible", "success"],
 )
 def test_report_on_a_full_disk_is_no_success(
     words: list[str], code: int, tmp_path: Path, full: Path

@@ -26,7 +26,9 @@ def test_robot_without_a_hand_is_imported_once(
     assert robots.prepare_robots(recipe, tmp_path) == found
 
 
-@pytest.mark.parametrize("given", ["robot.yaml", "husky_ur5e.urdf"])
+@pytest.mark.parametrize(
+    "given", ["robot.yaml", pytest.param("husky_ur5e.urdf", marks=pytest.mark.long)]
+)
 def test_robot_by_path_is_found_again(tmp_path: Path, given: str) -> None:
     """The dataset says where its URDF is, since its name alone would not."""
     pytest.importorskip("h5py")

@@ -69,7 +69,9 @@ def test_handle_close_to_another_part_of_its_object(tmp_path: Path) -> None:
     add_ledge(tmp_path, gap=0.012)  # as it was, for whoever judges the plan again
 
 
-@pytest.mark.parametrize(("gap", "clearance"), [(0.012, 0.016), (0.003, None)])
+@pytest.mark.parametrize(
+    ("gap", "clearance"), [(0.012, 0.016), pytest.param(0.003, None, marks=pytest.mark.long)]
+)
 def test_clearance_of_an_attachment(tmp_path: Path, gap: float, clearance: float | None) -> None:
     plan = vkc.plan(
         add_ledge(tmp_path, gap=gap, clearance=clearance),

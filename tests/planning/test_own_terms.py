@@ -146,8 +146,8 @@ def test_constraint_on_a_link_of_a_fixed_object() -> None:
     "planner",
     [
         vkc.plan,
-        functools.partial(vkc.plan, window=2),
-        lambda *a, **k: vkc.plan(*a, simultaneous=False, **k),
+        pytest.param(functools.partial(vkc.plan, window=2), marks=pytest.mark.long),
+        pytest.param(functools.partial(vkc.plan, simultaneous=False), marks=pytest.mark.long),
     ],
 )
 def test_terms_hold_for_several_steps(planner: Callable[..., vkc.Plan]) -> None:

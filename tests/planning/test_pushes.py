@@ -72,7 +72,13 @@ def measure_gaps(plan: vkc.Plan, thing: str, face: str) -> np.ndarray:
     return np.array(found)
 
 
-@pytest.mark.parametrize("case", CASES, ids=[f"{thing}.{face}" for _, thing, _, _, face in CASES])
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, id=f"{case[1]}.{case[-1]}", marks=[pytest.mark.long] if k else [])
+        for k, case in enumerate(CASES)
+    ],
+)
 def test_open_objects_are_pushed_shut(case: tuple[str, str, str, float, str]) -> None:
     """The hand stays on the face, up to its tilt, and the joint never moves back."""
     plan, (_, thing, joint, begin, face) = push_shut(*case), case

@@ -56,7 +56,7 @@ def test_plan_is_returned_wherever_time_ends(
     count = looks.count
     assert count > 50
     rounds = []
-    for last in [0, 1, 2, *np.linspace(5, count - 8, 5).astype(int).tolist()]:
+    for last in [0, 2, *np.linspace(5, count - 8, 3).astype(int).tolist()]:
         plan = looks.upto(last, call)
         assert plan.success or plan.status == "time limit"
         assert plan.success == plan.report.ok

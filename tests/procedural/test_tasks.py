@@ -76,7 +76,9 @@ def test_random_tasks_accept_room_settings() -> None:
         vkc.procedural.random_task(2, clutter=0.0, objects=())
 
 
-@pytest.mark.parametrize("kind", ["door", "drawers", "valve"])
+@pytest.mark.parametrize(
+    "kind", ["drawers", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("door", "valve"))]
+)
 def test_random_tasks_are_planned(kind: str, tmp_path: Path) -> None:
     """In a furnished room; the saved plan contains the object's description."""
     room, steps = vkc.procedural.random_task(11, objects=(f"random_{kind}",), clutter=0.3)

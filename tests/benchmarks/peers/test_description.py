@@ -14,7 +14,10 @@ from vkc_pin.benchmarks.peers.sampled import compute_finite_limits
 from vkc_pin.benchmarks.peers.tasks import TASKS, build_program, make_problem, sample_goals
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
+    "task",
+    [task if task == "door" else pytest.param(task, marks=pytest.mark.long) for task in TASKS],
+)
 def test_description_has_the_same_kinematics_and_pairs(task: str, tmp_path: Path) -> None:
     problem = build_program(make_problem(task, 18, 0))
     files = describe(problem, tmp_path)

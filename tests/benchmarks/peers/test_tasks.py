@@ -9,7 +9,10 @@ from vkc_pin.benchmarks.peers.tasks import TASKS, build_program, make_problem, s
 from vkc_pin.planning.initialization.keyframes import compute_shortfall
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
+    "task",
+    [task if task == "reach" else pytest.param(task, marks=pytest.mark.long) for task in TASKS],
+)
 def test_problems_are_determined_by_number_and_free(task: str) -> None:
     one, same, other = make_problem(task, 3, 1), make_problem(task, 3, 1), make_problem(task, 3, 2)
     assert np.array_equal(one.scene.start, same.scene.start)

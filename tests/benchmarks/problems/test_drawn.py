@@ -79,6 +79,7 @@ def test_plans_are_saved_and_judged(tmp_path: Path) -> None:
     assert record.read_bytes() == before
 
 
+@pytest.mark.long
 def test_tasks_in_random_rooms(tmp_path: Path) -> None:
     table, trials = run_experiment("random --of rooms --problems 2", tmp_path / "rooms")
     assert [trial["success"] for trial in trials] == [True, True]
@@ -89,6 +90,9 @@ def test_tasks_in_random_rooms(tmp_path: Path) -> None:
     assert "# Random rooms, one task each" in table
     with pytest.raises(InputError, match="run otherwise"):  # the folder has other problems
         random_problems.run(problems=2, out=tmp_path / "rooms")
+
+
+def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="rooms"):
         random_problems.run(of="room", out=tmp_path / "none")
     with pytest.raises(InputError, match="problems"):

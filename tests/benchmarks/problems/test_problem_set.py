@@ -26,7 +26,13 @@ def test_other_numbers_are_refused(number: int) -> None:
     assert (found.value.expected, found.value.got) == ("0 to 59", repr(number))
 
 
-@pytest.mark.parametrize("number", [0, 1, 10, 11, 20, 23, 30, 40, 44, 54, 55])
+@pytest.mark.parametrize(
+    "number",
+    [
+        *(0, 10, 20, 30, 40),
+        *(pytest.param(number, marks=pytest.mark.long) for number in (1, 11, 23, 44, 54, 55)),
+    ],
+)
 def test_problems_are_reproducible_and_can_be_compiled(number: int) -> None:
     one, other = problem(number), problem(number)
     assert (one.number, one.kind, one.name) == (number, get_kind(number), other.name)

@@ -13,6 +13,7 @@ from vkc_pin.benchmarks.robot_object_matrix.run import run
 from vkc_pin.cli import main
 
 
+@pytest.mark.long
 def test_bench_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     description = vkc.procedural.random_object("drawers", 0)
     slide = vkc.load_object(description)

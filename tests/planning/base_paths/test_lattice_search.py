@@ -165,7 +165,9 @@ def make_task(
     return grid, start, poses[100:103], rng.choice([0.0, 1.0], 3)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+@pytest.mark.parametrize(
+    "seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))]
+)
 def test_cheapest_path_is_found(seed: int) -> None:
     grid, start, goals, extra = make_task(seed)
     expected = search_full_graph(grid, start, goals, extra)

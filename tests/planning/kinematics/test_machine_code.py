@@ -327,7 +327,10 @@ def test_plans_are_equal_bit_for_bit(
     assert len(loaded) > 2
 
 
-@pytest.mark.parametrize("trouble", ["broken compiler", "truncated", "no folder"])
+@pytest.mark.parametrize(
+    "trouble",
+    ["broken compiler", "truncated", pytest.param("no folder", marks=pytest.mark.long)],
+)
 def test_planning_works_without_a_compiler(
     trouble: str,
     folder: Libraries,

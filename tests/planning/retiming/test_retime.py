@@ -115,8 +115,8 @@ def test_velocity_constraints_prevent_retiming() -> None:
     assert plan.trajectory.curve is None
 
 
-@pytest.mark.parametrize("jerk_time", [0.02, 0.1, 0.5])
-@pytest.mark.parametrize("gap", [0.0, 1e-7, 1e-6, 2e-6, 1e-5, 1e-4, 3e-4])
+@pytest.mark.parametrize("jerk_time", [0.02, 0.5])
+@pytest.mark.parametrize("gap", [0.0, 1e-6, 2e-6, 1e-5, 3e-4])
 def test_tiny_step_costs_no_more_than_a_stop(gap: float, jerk_time: float) -> None:
     """However small the jerk limits, a waypoint beside another does not slow down the motion."""
     scene = vkc.load_scene("door")

@@ -91,19 +91,19 @@ def compute_clearance(
         second: Other shapes, likewise.
         reach: Cutoff [m]: if all distances are larger, the result is some number ≥ `reach`.
     """
-    nearest, others = reach, list(second)
-    boxes = np.array([compute_world_box(shape, placement) for shape, placement in others]).reshape(
-        -1, 2, 3
-    )
-    for shape, placement in first:
-        low, high = compute_world_box(shape, placement)
-        # Shapes translated by the overlap of their boxes are separate, so that negative gaps are
-        # lower bounds, too.
-        gaps = np.maximum(boxes[:, 0] - high, low - boxes[:, 1]).max(axis=1)
-        for k in np.argsort(gaps, kind="stable").tolist():
-            if gaps[k] >= nearest:
-                break
-            nearest = min(nearest, compute_shape_distance(shape, placement, *others[k]))
+    nearest, some, others = reach, list(first), list(second)
+    if not some or not others:
+        return nearest
+    (low, high), (lower, upper) = _compute_world_boxes(some), _compute_world_boxes(others)
+    # Shapes translated by the overlap of their boxes are separate, so that negative gaps are lower
+    # bounds, too.
+    gaps = np.maximum(lower - high[:, None], low[:, None] - upper).max(axis=2)
+    pairs = np.argwhere(gaps < reach)
+    pairs = pairs[np.argsort(gaps[tuple(pairs.T)], kind="stable")]
+    for i, k in pairs.tolist():
+        if gaps[i, k] >= nearest:
+            break
+        nearest = min(nearest, compute_shape_distance(*some[i], *others[k]))
     return nearest
 
 
@@ -173,6 +173,21 @@ def compute_world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tupl
     centre = placement.act(np.asarray(shape.aabb_local.center(), float))
     extent = np.abs(placement.rotation) @ _get_half_extents(shape)
     return centre - extent, centre + extent
+
+
+def _compute_world_boxes(
+    shapes: Sequence[tuple[coal.CollisionGeometry, pin.SE3]],
+) -> tuple[Floats, Floats]:
+    """Return the lower and upper corners of many shapes' boxes, as `compute_world_box`, (n, 3)."""
+    for shape, _ in shapes:
+        shape.computeLocalAABB()
+    centres = np.array([shape.aabb_local.center() for shape, _ in shapes])
+    halves = np.array([_get_half_extents(shape) for shape, _ in shapes])
+    turns = np.array([placement.rotation for _, placement in shapes])
+    middles = np.einsum("kij,kj->ki", turns, centres)
+    middles += [placement.translation for _, placement in shapes]
+    extents = np.einsum("kij,kj->ki", np.abs(turns), halves)
+    return middles - extents, middles + extents
 
 
 class ShapeDistances:

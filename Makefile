@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 # Of pip's packages few modules are imported: with --no-compile, Python compiles those alone.
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: demo test test-long lint docs clean
+.PHONY: demo test test-long pytest lint docs clean
 # The extras that a goal needs are installed with the other packages, while this one is compiled.
 test test-long: EXTRAS := test docs
 lint: EXTRAS := test
@@ -22,7 +22,10 @@ demo: $(VENV)/installed.stamp
 PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 
 test: $(VENV)/test.stamp $(VENV)/docs.stamp
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint docs
+	@$(MAKE) --no-print-directory --jobs=2 lint docs pytest
+
+# Begins when lint has succeeded, beside the documentation, which takes longer and only one core.
+pytest: $(VENV)/test.stamp
 	$(PYTEST) -m "not long"
 
 # These leave the notebooks that they run in out/notebooks; the documentation shows them with what came out.

@@ -21,6 +21,7 @@ SHALLOW = 0.01  # [m] penetration up to which opposite normals of a stretch are 
 SAME_DIRECTION = 0.99  # cosine above which two candidate directions count as one
 PUSHES = 6  # Gauss-Newton steps that separate a stretch in one direction
 MAX_PUSH = 0.5  # [m], [rad] limit of such a step
+TRANSITION_SAMPLES = 8  # states between a displaced waypoint and the next one that stays
 
 _Key = tuple[int, tuple[int, int]]  # phase and bodies, see `_Stretch`
 
@@ -205,8 +206,9 @@ class Separation:
 
         In each candidate direction, the stretch and the waypoints at its ends are moved by the
         least displacement that separates the bodies. The least sum of the detour (in the metric of
-        the motion cost) and of the violations that are left decides. Directions along the motion
-        lose, since they would move one of the ends through the whole body.
+        the motion cost) and of the violations that are left, at these waypoints and on the way to
+        them, decides. Directions along the motion lose, since they would move one of the ends
+        through the whole body, or leave the next waypoint on the other side.
 
         Returns:
             The direction, shape (3,), and z_1..z_N after the displacement.
@@ -242,11 +244,37 @@ class Separation:
             np.add.at(violation, found.waypoint, np.maximum(found.margin - found.distance, 0.0))
         change = moved - np.tile(z[rows], (count, 1))
         detour = np.sqrt((problem.motion_cost.metric * change**2).sum(axis=1))
-        merit = problem.options.penalty * violation.reshape(count, -1).sum(axis=1)
-        best = int(np.argmin(merit + 2.0 * detour.reshape(count, -1).max(axis=1)))
+        moved = moved.reshape(count, len(rows), -1)
+        total = violation.reshape(count, -1).sum(axis=1)
+        total += self._measure_transition(problem.waypoints(z)[first], moved[:, 0], first + 1)
+        if last + 2 <= problem.ends[stretch.phase]:
+            total += self._measure_transition(z[last + 1], moved[:, -1], last + 2)
+        merit = problem.options.penalty * total + 2.0 * detour.reshape(count, -1).max(axis=1)
+        best = int(np.argmin(merit))
         z = z.copy()
-        z[rows] = moved.reshape(count, len(rows), -1)[best]
+        z[rows] = moved[best]
         return candidates[best], z
+
+    def _measure_transition(self, begin: Floats, ends: Floats, waypoint: int) -> Floats:
+        """Return the largest violation between one configuration and each of others.
+
+        Args:
+            begin: Configuration, shape (n,).
+            ends: The others, shape (B, n).
+            waypoint: Waypoint that determines the phase.
+
+        Returns:
+            Missing clearance, shape (B,) [m].
+        """
+        share = (np.arange(TRANSITION_SAMPLES) + 0.5)[:, None] / TRANSITION_SAMPLES
+        states = (begin + share * (ends[:, None] - begin)).reshape(-1, len(begin))
+        found = self.contacts.evaluate(
+            states,
+            np.full(len(states), waypoint),
+            reach=self.problem.options.largest_margin,
+            nearest=1,
+        )
+        return found.compute_shortfall(len(states)).reshape(len(ends), -1).max(axis=1)
 
     def _push(self, z: Floats, rows: Ints, stretch: _Stretch, directions: Floats) -> None:
         """Move configurations z, shape (B, n), until the deepest pair is apart in its direction."""

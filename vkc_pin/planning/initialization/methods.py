@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
@@ -92,11 +93,20 @@ def initialize(
 def interleave_guesses(*kinds: Iterator[InitialGuess | None]) -> Iterator[InitialGuess]:
     """Interleave initialization methods; None is a search without a guess.
 
-    Methods are tried in order until one returns a good guess, which is nearly collision-free; the
-    best guess so far is yielded. Next time, methods without a good guess come last, and otherwise
-    those first that have waited longest.
+    Methods are tried in order until one returns a good guess, which is nearly collision-free, and
+    this is yielded. Next time, methods without a good guess come last, and otherwise those first
+    that have waited longest. Without a good guess, the best of the methods that were yielded least
+    often is next: guesses of one method tend to fail for the same reason.
     """
-    waiting, found, poor = list(kinds), list[InitialGuess](), set[Iterator[InitialGuess | None]]()
+    def is_good(guess: InitialGuess | None) -> bool:
+        return guess is not None and not guess.penetration > MAX_GOOD_PENETRATION
+
+    def rank(one: tuple[Iterator[InitialGuess | None], InitialGuess]) -> tuple[bool, int, float]:
+        kind, guess = one
+        return not is_good(guess), 0 if is_good(guess) else yielded[kind], guess.penetration
+
+    waiting, poor = list(kinds), set[Iterator[InitialGuess | None]]()
+    found, yielded = list[tuple[Iterator[InitialGuess | None], InitialGuess]](), Counter()
     while waiting or found:
         for kind in sorted(waiting, key=lambda kind: kind in poor):
             waiting.remove(kind)
@@ -105,14 +115,16 @@ def interleave_guesses(*kinds: Iterator[InitialGuess | None]) -> Iterator[Initia
             except StopIteration:
                 continue
             waiting.append(kind)
-            good = guess is not None and not guess.penetration > MAX_GOOD_PENETRATION
-            (poor.discard if good else poor.add)(kind)
+            (poor.discard if is_good(guess) else poor.add)(kind)
             if guess is not None:
-                found.append(guess)
-            if good:
+                found.append((kind, guess))
+            if is_good(guess):
                 break
         if found:
-            yield found.pop(min(range(len(found)), key=lambda k: found[k].penetration))
+            best = min(found, key=rank)
+            found.remove(best)
+            yielded[best[0]] += 1
+            yield best[1]
 
 
 def _generate_stationary_guesses(

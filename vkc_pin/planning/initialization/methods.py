@@ -98,6 +98,7 @@ def interleave_guesses(*kinds: Iterator[InitialGuess | None]) -> Iterator[Initia
     that have waited longest. Without a good guess, the best of the methods that were yielded least
     often is next: guesses of one method tend to fail for the same reason.
     """
+
     def is_good(guess: InitialGuess | None) -> bool:
         return guess is not None and not guess.penetration > MAX_GOOD_PENETRATION
 

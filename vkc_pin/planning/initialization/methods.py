@@ -37,6 +37,7 @@ Initialization = Literal["auto", "interpolated", "astar", "rrt", "stationary"]
 INITIALIZATIONS: tuple[Initialization, ...] = get_args(Initialization)
 MAX_GOOD_PENETRATION = 0.045
 """Penetration [m] at a waypoint, or total shortfall, of a guess that is good enough."""
+_Kind = Iterator[InitialGuess | None]
 _COMPARED_PATHS = 8  # paths of the beam that are turned into guesses and compared
 _PLACE_SAMPLES = 128  # random places that are compared for each phase end of a stationary guess
 
@@ -90,7 +91,7 @@ def initialize(
         )
 
 
-def interleave_guesses(*kinds: Iterator[InitialGuess | None]) -> Iterator[InitialGuess]:
+def interleave_guesses(*kinds: _Kind) -> Iterator[InitialGuess]:
     """Interleave initialization methods; None is a search without a guess.
 
     Methods are tried in order until one returns a good guess, which is nearly collision-free, and
@@ -102,12 +103,12 @@ def interleave_guesses(*kinds: Iterator[InitialGuess | None]) -> Iterator[Initia
     def is_good(guess: InitialGuess | None) -> bool:
         return guess is not None and not guess.penetration > MAX_GOOD_PENETRATION
 
-    def rank(one: tuple[Iterator[InitialGuess | None], InitialGuess]) -> tuple[bool, int, float]:
+    def rank(one: tuple[_Kind, InitialGuess]) -> tuple[int, float]:
         kind, guess = one
-        return not is_good(guess), 0 if is_good(guess) else yielded[kind], guess.penetration
+        return 0 if is_good(guess) else 1 + turns[kind], guess.penetration
 
-    waiting, poor = list(kinds), set[Iterator[InitialGuess | None]]()
-    found, yielded = list[tuple[Iterator[InitialGuess | None], InitialGuess]](), Counter()
+    waiting, poor = list(kinds), set[_Kind]()
+    found, turns = list[tuple[_Kind, InitialGuess]](), Counter[_Kind]()
     while waiting or found:
         for kind in sorted(waiting, key=lambda kind: kind in poor):
             waiting.remove(kind)
@@ -124,7 +125,7 @@ def interleave_guesses(*kinds: Iterator[InitialGuess | None]) -> Iterator[Initia
         if found:
             best = min(found, key=rank)
             found.remove(best)
-            yielded[best[0]] += 1
+            turns[best[0]] += 1
             yield best[1]
 
 

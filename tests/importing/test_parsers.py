@@ -15,8 +15,11 @@ import pytest
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing import import_home, import_object, import_robot
+from vkc_pin.importing.parsers import uses_xacro
+from vkc_pin.importing.robots.sources import read_source
 from vkc_pin.utils.isolation import TIME_VARIABLE
 from vkc_pin.world.files.meshes import load_mesh, load_parts
+from vkc_pin.world.files.xml import parse_xml
 
 XACRO = '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">{}<link name="a"/></robot>'
 BOMB = "".join(
@@ -136,3 +139,31 @@ def test_ctrl_c_ends_an_import(folder: Path) -> None:
     # the latter: on a slow machine, before the command handles the signal
     assert process.wait(timeout=10) in (130, -signal.SIGINT)
     assert sorted(file.name for file in folder.iterdir()) == ["a.xml", "pipe"]
+
+
+@pytest.mark.parametrize(
+    ("elements", "name", "expected"),
+    [
+        ("<!-- <xacro:m/> -->", "robot.urdf", False),
+        ("", "robot.urdf.xacro", True),
+        ('<xacro:property name="p" value="1"/>', "robot.urdf", True),
+        ('<link name="${1}"/>', "robot.urdf", True),
+        ('<link name="b"><note>$(arg n)</note></link>', "robot.urdf", True),
+    ],
+)
+def test_files_that_xacro_wrote_do_not_need_it(elements: str, name: str, expected: bool) -> None:
+    """They declare its namespace, but contain neither its elements nor substitutions."""
+    file = Path(name)
+    assert uses_xacro(parse_xml(XACRO.format(elements), file), file) == expected
+
+
+def test_robot_that_xacro_wrote_is_read_without_xacro(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "xacro", None)  # as if it was not installed
+    (tmp_path / "robot.urdf").write_text(XACRO.format(""))
+    found = read_source(tmp_path / "robot.urdf", tmp_path, packages={}, arguments={})
+    assert found.kind == "URDF"
+    (tmp_path / "robot.urdf").write_text(XACRO.format('<link name="${1}"/>'))
+    with pytest.raises(InputError, match="needs the Python package xacro"):
+        read_source(tmp_path / "robot.urdf", tmp_path, packages={}, arguments={})

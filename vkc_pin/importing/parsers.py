@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
@@ -18,9 +19,21 @@ from vkc_pin.utils.isolation import run_isolated
 from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.files.resources import find_package
 
-__all__ = ["expand_xacro"]
+__all__ = ["expand_xacro", "uses_xacro"]
 
 _FIND = re.compile(r"\$\(find\s+([^\s()$]+)\s*\)")  # NAME in $(find NAME)
+
+
+def uses_xacro(root: ElementTree.Element, file: Path) -> bool:
+    """Return whether xacro must process a file; those that it wrote declare its namespace, too."""
+    return file.suffix == ".xacro" or (
+        "xmlns:xacro" in root.attrib
+        and any(
+            element.tag.startswith("xacro:")
+            or any("$" in text for text in (element.text or "", *element.attrib.values()))
+            for element in root.iter()
+        )
+    )
 
 
 def expand_xacro(file: Path, packages: Mapping[str, Path], arguments: Mapping[str, str]) -> str:

@@ -32,7 +32,7 @@ from vkc_pin.importing.objects.pieces import decompose_links
 from vkc_pin.importing.objects.sdf import read_object_sdf
 from vkc_pin.importing.objects.urdf import read_object_urdf
 from vkc_pin.importing.objects.writing import write_description, write_urdf
-from vkc_pin.importing.parsers import expand_xacro
+from vkc_pin.importing.parsers import expand_xacro, uses_xacro
 from vkc_pin.importing.proposals.picture import plot_attachments
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
@@ -144,8 +144,7 @@ def _read_format(
 ) -> Description:
     root = parse_xml(read_text(path, "URDF, xacro, MJCF or SDF"), path)
     if root.tag == "robot":
-        is_xacro = "xmlns:xacro" in root.attrib or path.suffix == ".xacro"
-        text = expand_xacro(path, packages, arguments) if is_xacro else None
+        text = expand_xacro(path, packages, arguments) if uses_xacro(root, path) else None
         return read_object_urdf(path, free=free, packages=packages, text=text)
     if root.tag == "mujoco":
         return read_object_mjcf(path, free=free)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing.missing_meshes import replace_missing_meshes
-from vkc_pin.importing.parsers import expand_xacro
+from vkc_pin.importing.parsers import expand_xacro, uses_xacro
 from vkc_pin.importing.robots.mjcf import convert_mjcf
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.kinematic_tree import check_tree
@@ -70,7 +70,7 @@ def read_source(
         raise InputError(
             "the file does not describe a robot", file=file, expected=expected, got=f"<{root.tag}>"
         )
-    elif "xmlns:xacro" in root.attrib or file.suffix == ".xacro":
+    elif uses_xacro(root, file):
         kind, text = "xacro", expand_xacro(file, packages, arguments)
     else:
         kind = "URDF"

@@ -35,6 +35,7 @@ from vkc_pin.validation.contact_windows import check_gripper, check_pushes, find
 from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.tolerances import Tolerances
+from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
@@ -312,6 +313,17 @@ def test_initial_penetration_is_exempt_once() -> None:
         assert {
             samples.world.collision_labels[k] for pair in window.pairs.tolist() for k in pair
         } == {"stick.stick", "table"}
+
+
+@pytest.mark.parametrize(("gap", "listed"), [(0.0, []), (-0.002, ["stick.stick – table"])])
+def test_exemptions_list_overlaps_but_not_touches(gap: float, listed: list[str]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        scene = make_room(describe_table(gap=gap))
+    down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
+    motion = Script(scene).go(down).take("stick").go(np.array(scene.start)).motion()
+    report = validate(scene, [Grasp("stick")], motion, Options())
+    assert [one.subject for one in report.exemptions] == listed
 
 
 def test_windows_of_a_grasp_by_a_tool() -> None:

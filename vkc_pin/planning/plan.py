@@ -119,7 +119,7 @@ class Plan:
     def summary(self) -> str:
         """Return a summary: success or the first twelve violations, path lengths, times."""
         m, verdict = self.metrics, "success" if self.success else f"FAILED, {self.status}"
-        stages = zip(("seeds", "coal", "CasADi", "Ipopt", "validation"), _SUMMARIZED, strict=True)
+        stages = zip(("guesses", "coal", "CasADi", "Ipopt", "validation"), _SUMMARIZED, strict=True)
         times = ", ".join(f"{name} {m[f'time_{stage}']:.3f}" for name, stage in stages)
         lines = [
             f"{self.scene.name}: {verdict} — {', '.join(p.name for p in self.trajectory.phases)}",

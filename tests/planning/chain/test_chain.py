@@ -20,8 +20,6 @@ from helpers.small_problems import (
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.planning.chain.chain import (
-    FREEDOM_ACCELERATION,
-    FREEDOM_VELOCITY,
     VirtualKinematicChain,
     consolidate,
 )
@@ -132,7 +130,7 @@ def test_the_chain_begins_with_the_robot() -> None:
             ["drawer.slide", "cabinet.rail", "cabinet.slide", "cabinet.swing"],
             [
                 (0.0, 0.4, 0.5, 1.0),
-                (-0.05, 0.08, FREEDOM_VELOCITY, FREEDOM_ACCELERATION),
+                (-0.05, 0.08, 1.0, 2.0),
                 (0.0, 0.3, 0.4, 0.7),
                 (-1.0, 2.0, 1.5, 3.0),
             ],

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers.drawers import SHORT, load_drawer_scene
 from helpers.drives import make_hall
+from helpers.gates import make_gate_problem
 from helpers.small_problems import load_door_scene, make_program
 
 import vkc_pin as vkc
@@ -146,3 +147,22 @@ def test_cache_is_trimmed_after_each_task() -> None:
     assert solve_task(scene, compile_task(scene, PULL, SHORT), request).plan.success
     assert cache.info().entries == 1
     assert cache.info().misses > 1
+
+
+@pytest.mark.parametrize(
+    ("width", "goals", "status", "text"),
+    [
+        (0.66, [4.0], "infeasible", "from (0.00, 0.00) to (4.00, 0.00), and none with the arm"),
+        (0.72, [4.0], "not converged", "from (0.00, 0.00) to (4.00, 0.00) but with the arm"),
+        (0.66, [0.5, 4.0], "not converged", "from (0.50, 0.00) to (4.00, 0.00), and none with"),
+    ],
+)
+def test_missing_base_path_is_infeasible_only_for_any_arm_and_beginning(
+    width: float, goals: list[float], status: str, text: str
+) -> None:
+    """The base is 0.67 wide, its arm at rest 0.72. Later phases could begin elsewhere."""
+    scene = make_gate_problem(width).scene
+    task = compile_task(scene, [vkc.GoTo(x, 0.0, 0.0) for x in goals], SHORT)
+    plan = solve_task(scene, task, PlanningRequest("astar", SHORT)).plan
+    assert plan.status == status, plan.summary()
+    assert f"found no path for the base {text}" in plan.report.notes[-1]

@@ -293,9 +293,8 @@ class _Search:
         lines = [self._describe_goal(problem, goal) for goal in goals]
         nearest = self.find_nearest()
         best = nearest or self._make_stationary(problem)
-        has_cause = bool(lines) or (nearest is None and bool(self._blocked_phases))
-        status = "infeasible" if has_cause else best.status
-        if nearest is None:
+        status = "infeasible" if lines else best.status
+        if lines and nearest is None:
             lines = [*lines, *self._blocked_phases]
         elif is_search and not lines:
             seed = self.request.random_seed

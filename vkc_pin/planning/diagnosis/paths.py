@@ -39,7 +39,7 @@ def diagnose_paths(
 
     Base paths are searched from where the motion begins a phase to the free configurations that are
     found for its goal. If there is none, or the goal is a base position, they are searched to where
-    the motion ends the phase.
+    the motion ends the phase, within the limits there.
 
     Args:
         problem: Problem that could not be solved.
@@ -51,18 +51,20 @@ def diagnose_paths(
     if problem.chain.robot.base == "fixed":
         return PathDiagnosis(list(blocked))
     lines, routes, path, is_cut_off = [], BaseRoutes(problem), problem.waypoints(z), False
-    begin = 0
+    begin, last = 0, path[0, :3]
     for number, (phase, end) in enumerate(
         zip(problem.task.phases, problem.ends.tolist(), strict=True)
     ):
-        start, last = path[[begin, end], :3]
-        own = [line for line in blocked if line.startswith(f"{phase.name}: ")]
+        lower, upper = problem.lower[end - 1, :3], problem.upper[end - 1, :3]
+        start, last = last, np.clip(path[end, :3], lower, upper)
+        named = [line for line in blocked if line.startswith(f"{phase.name}: ")]
+        own = [line for line in named if line not in lines]  # phases may have the same name
         is_hit = any(
             v.constraint in ("penetration", "clearance") and begin <= v.waypoint <= end
             for v in report.violations
         )
         begin = end
-        if problem.is_closed(phase) or not (own or is_hit):
+        if problem.is_closed(phase) or not (named or is_hit):
             lines += own
             continue
         goals, where = _find_base_goals(problem, number, last, random_seed)

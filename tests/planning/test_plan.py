@@ -269,7 +269,7 @@ def test_report_of_a_success(door_plan: vkc.Plan) -> None:
         f"arm {m['arm_path_length']:.2f} rad",
         f"{1e3 * m['clearance']:.1f} mm at the closest",
         f"{m['planning_time']:.3f} s after {m['build_time']:.2f} s of symbolic build",
-        "seeds ",
+        "guesses ",
         "coal ",
         "CasADi ",
         "Ipopt ",

@@ -92,9 +92,11 @@ def compute_clearance(
         reach: Cutoff [m]: if all distances are larger, the result is some number ≥ `reach`.
     """
     nearest, some, others = reach, list(first), list(second)
-    if not some or not others:
-        return nearest
-    (low, high), (lower, upper) = _compute_world_boxes(some), _compute_world_boxes(others)
+    boxes = [
+        np.array([compute_world_box(*shape) for shape in group]).reshape(-1, 2, 3)
+        for group in (some, others)
+    ]
+    (low, high), (lower, upper) = (each.swapaxes(0, 1) for each in boxes)
     # Shapes translated by the overlap of their boxes are separate, so that negative gaps are lower
     # bounds, too.
     gaps = np.maximum(lower - high[:, None], low[:, None] - upper).max(axis=2)
@@ -173,21 +175,6 @@ def compute_world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tupl
     centre = placement.act(np.asarray(shape.aabb_local.center(), float))
     extent = np.abs(placement.rotation) @ _get_half_extents(shape)
     return centre - extent, centre + extent
-
-
-def _compute_world_boxes(
-    shapes: Sequence[tuple[coal.CollisionGeometry, pin.SE3]],
-) -> tuple[Floats, Floats]:
-    """Return the lower and upper corners of many shapes' boxes, as `compute_world_box`, (n, 3)."""
-    for shape, _ in shapes:
-        shape.computeLocalAABB()
-    centres = np.array([shape.aabb_local.center() for shape, _ in shapes])
-    halves = np.array([_get_half_extents(shape) for shape, _ in shapes])
-    turns = np.array([placement.rotation for _, placement in shapes])
-    middles = np.einsum("kij,kj->ki", turns, centres)
-    middles += [placement.translation for _, placement in shapes]
-    extents = np.einsum("kij,kj->ki", np.abs(turns), halves)
-    return middles - extents, middles + extents
 
 
 class ShapeDistances:

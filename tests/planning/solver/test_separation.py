@@ -20,11 +20,19 @@ GOAL = 6.0
 
 
 @cache
-def make_problem(*crates: tuple[float, float, float]) -> tuple[TrajectoryProblem, np.ndarray]:
-    """Return a drive to x = 6 m and the straight path; crates have x, y and width [m]."""
+def make_problem(*crates: tuple[float, ...]) -> tuple[TrajectoryProblem, np.ndarray]:
+    """Return a drive to x = 6 m and the straight path; crates have x, y and sizes along them [m].
+
+    A crate with one size is square.
+    """
     obstacles = [
-        {"name": f"crate_{k}", "type": "box", "size": [w, w, 0.5], "position": [x, y, 0.25]}
-        for k, (x, y, w) in enumerate(crates)
+        {
+            "name": f"crate_{k}",
+            "type": "box",
+            "size": [size[0], size[-1], 0.5],
+            "position": [x, y, 0.25],
+        }
+        for k, (x, y, *size) in enumerate(crates)
     ]
     scene = make_hall(obstacles=obstacles)
     options = vkc.Options(reach_waypoints=30)
@@ -157,3 +165,14 @@ def test_waypoints_beside_a_stretch_do_not_change_sides() -> None:
     inside = contacts.select(np.flatnonzero((contacts.waypoint == 10) & (contacts.distance < -0.3)))
     np.testing.assert_allclose(inside.normal, [[0.0, 1.0, 0.0]] * len(inside.normal), atol=1e-6)
     assert len(inside.normal)
+
+
+@pytest.mark.parametrize("length", [0.06, 0.3])
+def test_waypoints_around_a_stretch_stay_where_no_segment_crosses(length: float) -> None:
+    """Back out of a thin wall is shorter than aside, but then the next segment leads through it."""
+    problem, z = make_problem((3.0, 0.1, length, 2.6))
+    separation, contacts, _, _ = separate(problem, z)
+    assert separation.is_active
+    inside = contacts.select(np.flatnonzero(contacts.distance < -0.3))
+    assert len(inside.normal)
+    np.testing.assert_allclose(np.abs(inside.normal[:, 1]), 1.0, atol=1e-6)

@@ -21,7 +21,7 @@ SHALLOW = 0.01  # [m] penetration up to which opposite normals of a stretch are 
 SAME_DIRECTION = 0.99  # cosine above which two candidate directions count as one
 PUSHES = 6  # Gauss-Newton steps that separate a stretch in one direction
 MAX_PUSH = 0.5  # [m], [rad] limit of such a step
-TRANSITION_SAMPLES = 8  # states between a displaced waypoint and the next one that stays
+TRANSITION_SAMPLES = 8  # states in a segment between a displaced waypoint and its neighbour
 
 _Key = tuple[int, tuple[int, int]]  # phase and bodies, see `_Stretch`
 
@@ -206,9 +206,9 @@ class Separation:
 
         In each candidate direction, the stretch and the waypoints at its ends are moved by the
         least displacement that separates the bodies. The least sum of the detour (in the metric of
-        the motion cost) and of the violations that are left, at these waypoints and on the way to
-        them, decides. Directions along the motion lose, since they would move one of the ends
-        through the whole body, or leave the next waypoint on the other side.
+        the motion cost) and of the remaining violations, at these waypoints and in the segments to
+        their neighbours, decides. Directions along the motion lose, since they would move one of
+        the ends through the whole body, or leave the next waypoint on the other side.
 
         Returns:
             The direction, shape (3,), and z_1..z_N after the displacement.
@@ -256,11 +256,11 @@ class Separation:
         return candidates[best], z
 
     def _measure_transition(self, begin: Floats, ends: Floats, waypoint: int) -> Floats:
-        """Return the largest violation between one configuration and each of others.
+        """Return the largest violation in the segments from one configuration to others.
 
         Args:
             begin: Configuration, shape (n,).
-            ends: The others, shape (B, n).
+            ends: Other configurations, shape (B, n).
             waypoint: Waypoint that determines the phase.
 
         Returns:

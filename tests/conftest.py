@@ -36,7 +36,7 @@ OPINIONS: dict[str, dict[str, Any]] = {}  # of the processes that tests run in
 
 
 def pytest_collection_finish() -> None:
-    """Spare later garbage collections what stays until the end: all tests and modules."""
+    """Exclude tests and modules, which stay until the end, from garbage collections."""
     gc.collect()
     gc.freeze()
 

@@ -50,7 +50,7 @@ class Executed(NamedTuple):
     lines: Mapping[str, Sequence[int]]
 
 
-Coverage = dict[str, dict[str, Executed]]  # file → id → test; the id of what is imported is ""
+Coverage = dict[str, dict[str, Executed]]  # file → id → test; "" stands for imports
 
 
 def list_files(names: Sequence[str], root: Path, pattern: str) -> list[str]:

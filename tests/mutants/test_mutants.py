@@ -115,7 +115,7 @@ def make_coverage(module: str) -> Coverage:
         # the module's own file first, quick tests first, and none after one of 90 s
         (7, ["own", "fast", "slow"]),
         (8, ["slow"]),
-        # what a file shares may be executed by the first of its tests
+        # shared fixtures are executed by the first test of a file
         (9, ["other", "far", "own"]),
         (3, ["other", "own", "far", "fast", "slow"]),
         (5, []),
@@ -142,7 +142,7 @@ def test_command_reports_faults_and_reuses_coverage() -> None:
     assert lines[0].startswith("1 of 4, "), "the second run records nothing"
 
 
-def test_unknown_files_are_reported() -> None:
+def test_unknown_files_end_the_command() -> None:
     with pytest.raises(SystemExit, match=r"no such file or folder: .*validation/swept"):
         list_files(["validation/sweep.py", "validation/swept"], PACKAGE, "*.py")
 

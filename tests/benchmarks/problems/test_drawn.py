@@ -92,7 +92,7 @@ def test_tasks_in_random_rooms(tmp_path: Path) -> None:
         random_problems.run(problems=2, out=tmp_path / "rooms")
 
 
-def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
+def test_wrong_arguments_raise_errors(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="rooms"):
         random_problems.run(of="room", out=tmp_path / "none")
     with pytest.raises(InputError, match="problems"):

@@ -56,6 +56,8 @@ def test_colliding_phase_is_explained(bottom: float, expected: str, is_cut_off: 
 def test_notes_of_the_initialization_are_kept_if_nothing_else_is_found() -> None:
     p, z = drive_under_beam(2.0, 3.6)
     assert diagnose(p, z, hits=None, notes=(NOTE,)).lines == [NOTE]
+    p, z = drive_under_beam(2.0, 1.0, 3.6)  # two phases with the same name
+    assert diagnose(p, z, hits=None, notes=(NOTE,)).lines == [NOTE]
     fixed = make_program(make_hall(base="fixed"), [vkc.Reach((0.5, 0.4, 1.0, 0.0, 1.5, 0.0))])
     assert diagnose(fixed, fixed.still, hits=3, notes=(NOTE,)) == ([NOTE], False)
 

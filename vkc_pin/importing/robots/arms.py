@@ -324,14 +324,14 @@ def _is_palm(body: Body, file: UrdfFile) -> bool:
             bool(_HAND_WORDS.search(f"{jaw.name} {jaw.links[0]}"))
             and not _WRIST_WORDS.search(jaw.name)
             and not jaw.children
-            and _extends_beside(body, jaw, file)
+            and _has_jaw_beside(body, jaw, file)
         )
     named = [bool(_HAND_WORDS.search(f"{child.name} {child.links[0]}")) for child in body.children]
     other = [bool(_OTHER_WORDS.search(f"{child.name} {child.links[0]}")) for child in body.children]
     return any(named) or not any(other)
 
 
-def _extends_beside(palm: Body, jaw: Body, file: UrdfFile) -> bool:
+def _has_jaw_beside(palm: Body, jaw: Body, file: UrdfFile) -> bool:
     """Return whether a palm extends beside a jaw, which closes against it, rather than behind it.
 
     What turns about its own length, such as the last link of a wrist, is no jaw.

@@ -57,14 +57,13 @@ def diagnose_paths(
     ):
         lower, upper = problem.lower[end - 1, :3], problem.upper[end - 1, :3]
         start, last = last, np.clip(path[end, :3], lower, upper)
-        named = [line for line in blocked if line.startswith(f"{phase.name}: ")]
-        own = [line for line in named if line not in lines]  # phases may have the same name
+        own = [line for line in blocked if line.startswith(f"{phase.name}: ")]
         is_hit = any(
             v.constraint in ("penetration", "clearance") and begin <= v.waypoint <= end
             for v in report.violations
         )
         begin = end
-        if problem.is_closed(phase) or not (named or is_hit):
+        if problem.is_closed(phase) or not (own or is_hit):
             lines += own
             continue
         goals, where = _find_base_goals(problem, number, last, random_seed)
@@ -89,7 +88,8 @@ def diagnose_paths(
             lines += own
             continue
         lines.append(f"{phase.name}: {text}")
-    return PathDiagnosis(lines, is_cut_off)
+    # Phases with the same name have the same explanations.
+    return PathDiagnosis(list(dict.fromkeys(lines)), is_cut_off)
 
 
 def _find_base_goals(

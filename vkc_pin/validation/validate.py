@@ -7,6 +7,7 @@ most 5 mm and 0.01 rad apart, and at finer ones where a collision could hide bet
 
 from __future__ import annotations
 
+import bisect
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -324,14 +325,14 @@ def _check_clearance(
     lasts = [phase.last for phase in samples.trajectory.phases]
     exempt = _find_exempt_pairs(samples, options.dist_safe)
     for hit in sweep(pairs, samples.z, samples.waypoint_rows):
-        allowed, state = exempt.get(hit.shapes, ()), samples.z[[hit.row]]
+        allowed = exempt.get(hit.shapes, ())
         # The exemption also covers the segment before it ends and the one after it begins.
-        active = [-one.margin for one in allowed if one.is_active(names, state)[0]]
+        active = [-one.margin for one in allowed if one.is_active(names, samples.z[[hit.row]])[0]]
         tolerated = max([0.0, *active])
         overlap = max(hit.contact, CONTACT_DEPTH + tolerated if tolerated > 0.0 else 0.0)
         if hit.margin > -np.inf and not tolerated > 0.0:
-            phase = np.searchsorted(lasts, samples.find_waypoint(hit.row))
-            np.minimum.at(nearest, phase, hit.distance)
+            phase = bisect.bisect_left(lasts, samples.find_waypoint(hit.row))
+            nearest[phase] = min(nearest[phase], hit.distance)
         is_checked, millimetres = hit.at_waypoint and hit.row > 0, 1e3 * abs(hit.distance)
         margin = min(hit.margin, -tolerated) if tolerated > 0.0 else hit.margin
         short = margin - WAYPOINT_TOLERANCE - hit.distance

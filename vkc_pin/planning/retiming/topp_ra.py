@@ -23,6 +23,7 @@ __all__ = ["compute_speeds"]
 # Offsets of constrained points from the ends of segments, where accelerations jump, relative to the
 # length; the second one is tried if the first fails.
 _KNOT_OFFSETS = (1e-3, 1e-2)
+_MAX_SPEED = 1e8  # of paths that no velocity limits
 
 
 def compute_speeds(
@@ -51,24 +52,12 @@ def compute_speeds(
     """
     _import_toppra()
     from toppra.algorithm import TOPPRA
-    from toppra.constraint import (
-        DiscretizationType,
-        JointAccelerationConstraint,
-        JointVelocityConstraint,
-    )
 
     limited = np.flatnonzero(np.isfinite(velocity) & np.isfinite(acceleration))
     if not len(limited):
         return None
-    constraints: list[Any] = [
-        JointVelocityConstraint(np.column_stack([-velocity[limited], velocity[limited]])),
-        JointAccelerationConstraint(
-            np.column_stack([-acceleration[limited], acceleration[limited]]),
-            discretization_scheme=DiscretizationType.Interpolation,
-        ),
-    ]
-    if linear is not None:
-        constraints.append(_to_toppra_constraint(linear, len(limited)))
+    rates = velocity[limited], acceleration[limited]
+    constraints = [_make_toppra_constraint(path, limited, *rates, linear)]
     for offset in _KNOT_OFFSETS:
         grid = _replace_knots(path.x, positions, offset)
         solver = TOPPRA(
@@ -129,27 +118,40 @@ def _to_toppra_path(path: CubicHermiteSpline, columns: Ints) -> Any:
     return Path()
 
 
-def _to_toppra_constraint(
-    linear: Callable[[Floats], tuple[Floats, Floats, Floats]], size: int
+def _make_toppra_constraint(
+    path: CubicHermiteSpline,
+    columns: Ints,
+    velocity: Floats,
+    acceleration: Floats,
+    linear: Callable[[Floats], tuple[Floats, Floats, Floats]] | None,
 ) -> Any:
-    """Return linear constraints for `toppra`, applied at both ends of each grid interval."""
+    """Return the constraints of `compute_speeds` for `toppra`.
+
+    Linear ones hold at both ends of each grid interval.
+    """
     from toppra.constraint import LinearConstraint
     from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
 
-    class Bound(LinearConstraint):
-        dof = size
+    class Constraint(LinearConstraint):
+        dof = len(columns)
 
         def __init__(self) -> None:
             super().__init__()
             self.identical = True
 
-        def compute_constraint_params(
-            self, path: Any, gridpoints: Floats, *_: Any, **__: Any
-        ) -> Any:
-            a, b, c = linear(gridpoints)
+        def compute_constraint_params(self, _: Any, gridpoints: Floats) -> Any:
+            tangents, curvatures = (path(gridpoints, order)[:, columns] for order in (1, 2))
+            with np.errstate(divide="ignore"):
+                speeds = (velocity / np.abs(tangents)).min(axis=1)
+            squares = np.column_stack([np.zeros(len(speeds)), np.minimum(speeds, _MAX_SPEED) ** 2])
+            rows = [(tangents / acceleration, curvatures / acceleration, np.zeros_like(tangents))]
+            if linear is not None:
+                rows.append(linear(gridpoints))
+            a, b, c = (np.column_stack(parts) for parts in zip(*rows, strict=True))
             both = np.vstack([np.eye(a.shape[1]), -np.eye(a.shape[1])])
-            return canlinear_colloc_to_interpolate(
+            coefficients = canlinear_colloc_to_interpolate(
                 a, b, c, both, np.ones(len(both)), None, None, gridpoints, identical=True
             )
+            return *coefficients[:-1], squares
 
-    return Bound()
+    return Constraint()

@@ -25,8 +25,13 @@ def test_every_option_is_documented() -> None:
         assert f"        {item.name}: " in Options.__doc__
 
 
-@pytest.mark.parametrize("name", WHOLE)
-@pytest.mark.parametrize("value", [0, 2.0, True, "4", None])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *((name, value) for name in WHOLE for value in (-1, 2.0, True, "4", None)),
+        *((name, 0) for name in WHOLE if name != "max_refinements"),
+    ],
+)
 def test_invalid_integers_raise(name: str, value: Any) -> None:
     with pytest.raises(InputError) as caught:
         Options(**{name: value})
@@ -53,6 +58,7 @@ def test_invalid_numbers_raise(name: str, value: Any) -> None:
         ("move_waypoints", 501),
         ("contact_slots", 1000),
         ("max_restarts", 10**9),
+        ("max_refinements", 5),
         ("dt", 1e-9),
         ("dt", 1e9),
         *(("jerk_time", value) for value in (5e-324, 1e-12, 1e-9, 1e-4, 4.9e-3, 11.0)),
@@ -66,7 +72,7 @@ def test_values_are_limited(name: str, value: Any) -> None:
 
 def test_numbers_become_builtin_types() -> None:
     """JSON has no NumPy types."""
-    values = {name: np.int64(7) for name in WHOLE} | {name: np.float32(0.5) for name in REAL}
+    values = {name: np.int64(4) for name in WHOLE} | {name: np.float32(0.5) for name in REAL}
     options = Options(**values)
     assert Options(**json.loads(json.dumps(asdict(options)))) == options
     assert {type(getattr(options, name)) for name in WHOLE} == {int}

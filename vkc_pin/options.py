@@ -22,7 +22,8 @@ _RANGES = {
 }
 _MAX_INTEGERS = {  # beyond these, planning takes hours and gigabytes
     **dict.fromkeys(("reach_waypoints", "turn_waypoints", "move_waypoints"), 500),
-    **{"contact_slots": 64, "max_outer": 10_000, "max_iterations": 100_000, "max_restarts": 1000},
+    **{"max_refinements": 4, "contact_slots": 64, "max_outer": 10_000},
+    **{"max_iterations": 100_000, "max_restarts": 1000},
 }
 
 
@@ -35,10 +36,11 @@ class Options:
         grasp_time: Time at rest for the gripper to close or open [s].
         jerk_time: Shortest time in which an acceleration rises to its limit [s], at least 5 ms,
             which limits jerks; 0: unlimited.
-        reach_waypoints: Segments of a phase that drives or reaches, carrying an object or not. In
-            every phase they double, at most twice, if only the motion between them is invalid.
+        reach_waypoints: Segments of a phase that drives or reaches, carrying an object or not.
         turn_waypoints: Segments of a phase that releases a latch.
         move_waypoints: Segments of a phase that moves a grasped object.
+        max_refinements: How often the segments of a phase may double where the motion is valid at
+            the waypoints, but not in between; 0: their numbers are fixed.
         dist_safe: Clearance at the waypoints [m].
         self_distance: Clearance between links of the robot [m]. Links that are always closer keep
             half of their largest distance.
@@ -65,6 +67,7 @@ class Options:
     reach_waypoints: int = 40
     turn_waypoints: int = 6
     move_waypoints: int = 30
+    max_refinements: int = 2
     dist_safe: float = 0.02
     self_distance: float = 0.02
     grasp_clearance: float = 0.005
@@ -93,7 +96,8 @@ class Options:
                     raise InputError("unknown", field=field, expected=expected, got=got)
                 value = str(value)
             elif item.type == "int":
-                value = check_integer(value, field, low=1, high=_MAX_INTEGERS[item.name])
+                least = 0 if item.name == "max_refinements" else 1
+                value = check_integer(value, field, low=least, high=_MAX_INTEGERS[item.name])
             else:
                 low, high = _RANGES.get(item.name, (_MIN, _MAX))
                 has_zero = item.name == "jerk_time"

@@ -68,6 +68,17 @@ def test_waypoints_double_where_they_are_too_coarse() -> None:
     assert result.phase_waypoints().phases == tuple(phase.key for phase in task.phases)
 
 
+def test_numbers_of_waypoints_can_be_fixed() -> None:
+    options = vkc.Options(move_waypoints=5, max_refinements=0, max_restarts=1)
+    scene = load_door_scene()
+    task = compile_task(scene, [vkc.Actuate("door", {"hinge": 1.3}, "handle")], options)
+    result = solve_task(scene, task, PlanningRequest("interpolated", options, random_seed=1))
+    assert result.problem is not None
+    assert result.problem.task.phases == task.phases
+    assert result.plan.status == "rejected"
+    assert {found.constraint for found in result.plan.report.violations} == {"closure"}
+
+
 def test_infeasible_solution_of_the_least_shortfall_is_returned() -> None:
     """A wall from side to side, to pass which no time is left."""
     wall = {"name": "wall", "type": "box", "size": [0.6, 9.0, 2.0], "position": [2.0, 0.0, 1.0]}

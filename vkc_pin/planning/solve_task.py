@@ -62,9 +62,6 @@ _CHECK_TIME = 2e-3
 _NEARLY_FREE = 0.02
 """Missing clearance [m] up to which a trajectory is described as nearly collision-free."""
 
-_MAX_REFINEMENTS = 2
-"""How often the waypoints of a phase may double."""
-
 Guess = Callable[[TrajectoryProblem], InitialGuess]
 """Makes an initial guess for a problem."""
 
@@ -250,11 +247,12 @@ class _Search:
 
     def _solve_from(self, problem: TrajectoryProblem, guess: InitialGuess) -> Solution:
         """Solve a problem from a guess, and again with more waypoints where they are too coarse."""
-        for refinement in range(_MAX_REFINEMENTS + 1):
+        most = problem.options.max_refinements
+        for refinement in range(most + 1):
             solution = solve(problem, guess.z, callback=self._report_round, radius=guess.radius)
             candidate = self._add_solution(problem, solution, guess.name)
             coarse = set() if candidate is None else candidate.find_coarse_phases()
-            if not coarse or refinement == _MAX_REFINEMENTS:
+            if not coarse or refinement == most:
                 break
             part = extract_phase_waypoints(problem, solution.z, guess.name)
             problem = self._build_problem(problem.task.refine(coarse))

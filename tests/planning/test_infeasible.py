@@ -35,6 +35,7 @@ def check_explanation(plan: vkc.Plan, *texts: str) -> str:
         assert violation.subject
         assert violation.amount > 0.0
         assert 0 <= violation.waypoint < len(plan.trajectory.times)
+        assert 0.0 <= violation.time <= plan.trajectory.times[-1]
         assert f"waypoint {violation.waypoint}" in str(violation)
     report = plan.summary()
     assert report.splitlines()[0].startswith(f"{plan.scene.name}: FAILED, {plan.status} — ")
@@ -95,7 +96,9 @@ def test_goal_outside_the_arena() -> None:
         "goal base_x: 9 is beyond the limits -6 to 6 by 3",
         "goal base_y: -6.5 is beyond the limits -6 to 6 by 0.5",
     )
-    assert find_violation(plan, "goal", "base_x").waypoint == QUICK.reach_waypoints
+    goal = find_violation(plan, "goal", "base_x")
+    assert goal.waypoint == QUICK.reach_waypoints
+    assert goal.time == plan.trajectory.times[-1]  # of the motion in the plan, not of the program
 
 
 def test_target_out_of_reach() -> None:
@@ -112,6 +115,14 @@ def test_target_out_of_reach() -> None:
     assert goal.waypoint == len(plan.trajectory.times) - 1
 
 
+def test_goal_slightly_out_of_reach() -> None:
+    """A proof never reads "0.00 m too high": its figure has three digits."""
+    plan = vkc.plan(make_hall(), [vkc.Touch("forearm_link", (0.5, 0.5, 1.0))], options=QUICK)
+    report = check_explanation(plan, "because touch with forearm_link: out of reach, proven: ")
+    beyond = float(report.split("at z = 1.00 m is ")[1].split()[0])
+    assert 0.0 < beyond < 0.005
+
+
 def test_start_in_collision() -> None:
     plan = vkc.plan(
         make_hall(obstacles=[describe_box("crate", (0.4, 0.4, 0.4), (0.5, 0.0, 0.2))]),
@@ -125,6 +136,13 @@ def test_start_in_collision() -> None:
     first = plan.report.violations[0]
     assert (first.constraint, first.subject, first.waypoint) == ("start", "base_link – crate", 0)
     assert first.amount == pytest.approx(0.195, abs=1e-3)
+
+
+def test_start_that_touches_an_obstacle() -> None:
+    crate = describe_box("crate", (0.4, 0.4, 0.4), (0.495 + 0.2, 0.0, 0.2))  # before the base
+    plan = vkc.plan(make_hall(obstacles=[crate]), [vkc.GoTo(-1.0, 0.0)], options=QUICK)
+    assert plan.status == "infeasible"
+    check_explanation(plan, "start base_link – crate: touch at the start")
 
 
 WALLS = [describe_box("fence", (0.1, 12.0, 2.4), (1.2, 0.0, 1.2))]

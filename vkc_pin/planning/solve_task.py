@@ -208,7 +208,9 @@ class _Search:
         if reasons := find_impossible_conditions(problem):
             self.is_grasp_independent = True
             best = self._make_stationary(problem)
-            return dataclasses.replace(best, report=best.report.with_reasons(reasons)), "infeasible"
+            times = best.trajectory.times.tolist()
+            timed = [dataclasses.replace(one, time=times[one.waypoint]) for one in reasons]
+            return dataclasses.replace(best, report=best.report.with_reasons(timed)), "infeasible"
         if check_goals_first and (goals := self._find_blocked_goals(problem)):
             best = self._make_stationary(problem)
             return best.with_notes(goal.text for goal in goals), "infeasible"

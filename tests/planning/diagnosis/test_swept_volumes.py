@@ -47,7 +47,9 @@ def test_obstacle_in_the_swept_volume_is_named() -> None:
     (line,) = explain(1.3)
     assert "no path for door.hinge, proven: between 0 and 1.3, at " in line
     assert "door.panel – post overlap by " in line
-    assert 1.0 < float(line.partition(", at ")[2].partition(",")[0]) < 1.3
+    worst, first = float(line.split(", at ")[1].split(",")[0]), float(line.split("first at ")[1])
+    assert 1.0 < first < worst < 1.3
+    assert explain(first - 0.01) == []
 
 
 @pytest.mark.parametrize(

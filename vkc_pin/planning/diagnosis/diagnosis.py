@@ -51,7 +51,10 @@ class BlockedGoal(NamedTuple):
 
 
 def find_impossible_conditions(problem: TrajectoryProblem) -> list[Violation]:
-    """Find violations that no motion can change, at the start or of goals beyond limits."""
+    """Find violations that no motion can change, at the start or of goals beyond limits.
+
+    They name waypoints, but no times, which depend on the motion in the plan.
+    """
     start = problem.start[None]
     contacts = problem.contacts.evaluate(start, np.array([0]), reach=0.0)
     labels, deepest = problem.contacts.phases[0].labels, dict[str, float]()
@@ -64,7 +67,8 @@ def find_impossible_conditions(problem: TrajectoryProblem) -> list[Violation]:
             deepest[subject] = min(float(distance), deepest.get(subject, np.inf))
     found = []
     for subject, distance in deepest.items():  # links of several shapes count once
-        detail = f"overlap by {-1e3 * distance:.1f} mm at the start"
+        depth = f"{-1e3 * distance:.1f}"
+        detail = "touch at the start" if depth == "0.0" else f"overlap by {depth} mm at the start"
         found.append(Violation("start", subject, amount=-distance, unit="m", detail=detail))
     for goal, solver in zip(problem.pose_goals, problem.transcription.pose_solvers, strict=True):
         if goal.kind == "closure" and goal.object in problem.scene.held and 1 in goal.row.waypoints:
@@ -80,7 +84,6 @@ def find_impossible_conditions(problem: TrajectoryProblem) -> list[Violation]:
                 found.append(
                     Violation("closure", goal.about, amount=error, unit="m", detail=detail)
                 )
-    dt = problem.timing_for(problem.still).dt
     for phase, end in zip(problem.task.phases, problem.ends.tolist(), strict=True):
         goals, base = dict(phase.values), () if phase.base is None else phase.base[:2]
         goals |= {n: v for n, v in zip(problem.chain.names, base, strict=False) if v is not None}
@@ -89,9 +92,10 @@ def find_impossible_conditions(problem: TrajectoryProblem) -> list[Violation]:
             beyond = max(lower - value, value - upper)
             if beyond > 1e-9:
                 detail = f"{value:g} is beyond the limits {lower:g} to {upper:g} by {beyond:.4g}"
-                at = {"waypoint": end, "time": float(dt[:end].sum())}
                 unit = problem.unit(name)
-                found.append(Violation("goal", name, **at, amount=beyond, unit=unit, detail=detail))
+                found.append(
+                    Violation("goal", name, waypoint=end, amount=beyond, unit=unit, detail=detail)
+                )
     return found
 
 

@@ -124,7 +124,7 @@ def _find_base_goals(problem: TrajectoryProblem, number: int) -> tuple[list[_Bas
         height = abs(at[2] - shoulder[2])
         if height > length:
             beyond.append(
-                f"{goal.about} at z = {at[2]:.2f} m is {height - length:.2f} m too high "
+                f"{goal.about} at z = {at[2]:.2f} m is {height - length:.3g} m too high "
                 f"or low, wherever the base is: it turns about a joint at z = {shoulder[2]:.2f} m, "
                 f"and the whole arm with it is {length:.2f} m long"
             )

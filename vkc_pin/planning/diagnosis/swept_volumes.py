@@ -71,6 +71,9 @@ def _find_collision(problem: TrajectoryProblem, phase: Phase, coordinate: str) -
             worst = int(np.argmin(distance))
             if distance[worst] < deepest:
                 deepest = float(distance[worst])
-                where = f"between {begin:.3g} and {end:.3g}, at {values[worst]:.3g}"
-                text = f"{where}, {label} – {other} overlap by {-1e3 * deepest:.1f} mm"
+                first = values[np.argmax(distance < -_CERTAIN_OVERLAP)]
+                text = (
+                    f"between {begin:.3g} and {end:.3g}, at {values[worst]:.3g}, {label} – {other} "
+                    f"overlap by {-1e3 * deepest:.1f} mm, and first at {first:.3g}"
+                )
     return text

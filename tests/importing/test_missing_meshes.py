@@ -70,6 +70,15 @@ def test_all_missing_meshes_are_listed(tmp_path: Path) -> None:
         replace_missing_meshes(write(tmp_path, *shapes[:2]), every_link=True)
 
 
+@pytest.mark.parametrize("address", ["{}.stl", "package://{}/a.stl", "model://p/{}", "file:///{}"])
+def test_meshes_whose_names_no_file_can_have_are_missing(tmp_path: Path, address: str) -> None:
+    for name in ("é" * 300, "a/" * 3000, "%00"):
+        file = write(tmp_path, SOLID.format(address.format(name)))
+        with pytest.raises(InputError, match="there is no such mesh") as caught:
+            replace_missing_meshes(file, every_link=True)
+        assert caught.value.file == tmp_path / "r.urdf"
+
+
 def test_visual_meshes_that_collide_are_needed(tmp_path: Path) -> None:
     """Objects collide with visual shapes of every such link, robots if there are no others."""
     cosmetic = (BOX.format(kind="collision"), SEEN.format("gone.stl"))

@@ -74,10 +74,10 @@ def test_masses_may_be_missing(tmp_path: Path, head: str, leaf: str) -> None:
 
 def test_all_missing_collision_meshes_are_listed(tmp_path: Path) -> None:
     trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "there.stl")
-    names = ("gone.obj", "there.stl", "lost.stl")
+    names = ("gone.obj", "there.stl", "lost.stl", f"{'é' * 300}.stl")
     head = "".join(f'<mesh name="{name}" file="{name}"/>' for name in names)
     more = "".join(f'<geom type="mesh" mesh="{name}"/>' for name in names)
-    with pytest.raises(InputError, match=r"got no gone\.obj, lost\.stl\)"):
+    with pytest.raises(InputError, match=r"got no gone\.obj, lost\.stl, é"):
         compile_door(tmp_path, head=f"<asset>{head}</asset>", more=more)
 
 

@@ -33,6 +33,7 @@ HOSTILE_XACRO = {
     "circle": ('<xacro:include filename="robot.xacro"/>', "recursion"),
     "macro": ('<xacro:macro name="m"><xacro:m/></xacro:macro><xacro:m/>', "recursion"),
     "folder": ('<xacro:include filename="."/>', "directory"),
+    "long": (f'<xacro:include filename="{"é" * 300}"/>', "cannot process the file"),
 }
 MJCF = '<mujoco>{}<worldbody><body name="b"><joint/><geom size="1"/>{}</body></worldbody></mujoco>'
 GRID = '<flexcomp name="f" type="grid" count="900 900 900" spacing=".1 .1 .1" dim="3"/>'

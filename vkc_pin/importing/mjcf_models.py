@@ -8,6 +8,7 @@ from typing import Any
 from vkc_pin.errors import InputError
 from vkc_pin.utils.isolation import submit_isolated
 from vkc_pin.utils.optional_imports import import_optional
+from vkc_pin.utils.system import is_file
 
 __all__ = ["NO_MASS", "compile_mjcf"]
 
@@ -72,7 +73,7 @@ def _remove_looks(spec: Any, file: Path) -> list[str]:
         name
         for texture in spec.textures
         for name in (texture.file, *texture.cubefiles)
-        if name and not _find_file(spec, texture, name, "texturedir").is_file()
+        if name and not is_file(_find_file(spec, texture, name, "texturedir"))
     ]
     for material in spec.materials:
         material.textures = [""] * len(list(material.textures))
@@ -90,7 +91,7 @@ def _replace_missing_meshes(spec: Any, file: Path) -> list[str]:
     missing = {
         mesh.name or Path(mesh.file).stem: mesh
         for mesh in spec.meshes
-        if mesh.file and not _find_file(spec, mesh, mesh.file, "meshdir").is_file()
+        if mesh.file and not is_file(_find_file(spec, mesh, mesh.file, "meshdir"))
     }
     notes, lost = list[str](), list[str]()
     for body in spec.bodies if missing else ():

@@ -17,6 +17,7 @@ from typing import Any
 from vkc_pin.errors import InputError
 from vkc_pin.utils.isolation import run_isolated
 from vkc_pin.utils.optional_imports import import_optional
+from vkc_pin.utils.system import is_file
 from vkc_pin.world.files.resources import find_package
 
 __all__ = ["expand_xacro", "uses_xacro"]
@@ -111,7 +112,7 @@ def _check_packages(
     names = dict.fromkeys(
         name
         for each in files
-        if each.is_file()
+        if is_file(each)
         for name in _FIND.findall(each.read_text(encoding="utf-8", errors="replace"))
     )
     if missing := [name for name in names if find_package(name, path, packages) is None]:

@@ -1,4 +1,4 @@
-"""Queries the operating system: the only module with calls that not every POSIX system has."""
+"""Queries the operating system, also with calls that not every POSIX system has."""
 
 from __future__ import annotations
 
@@ -15,11 +15,17 @@ __all__ = [
     "find_libc_version",
     "find_processor_name",
     "has_screen",
+    "is_file",
     "limit_resource",
     "measure_peak_memory",
     "measure_resident_memory",
     "release_freed_memory",
 ]
+
+
+def is_file(path: Path) -> bool:
+    """Return whether there is a file; `Path.is_file` raises where the name is too long for one."""
+    return os.path.isfile(path)  # noqa: PTH113
 
 
 def count_cores() -> int:

@@ -342,8 +342,8 @@ def test_springs_are_read(tmp_path: Path) -> None:
         ({"model": "<link/>"}, "a link without a name"),
         ({"model": "<include><uri>model://nothing</uri></include>"}, r"no such model .*model://no"),
         ({"model": "<include/>"}, "no such model"),
-        ({"model": f"<include><uri>{'a' * 300}</uri></include>"}, "no file can be called that"),
-        ({"model": "<include><uri>model://%00</uri></include>"}, "no file can be called that"),
+        ({"model": f"<include><uri>{'a' * 300}</uri></include>"}, "no such model"),
+        ({"model": "<include><uri>model://%00</uri></include>"}, "no such model"),
         (
             {"model": '<link name="a::b"/><model name="a"><link name="b"/></model>'},
             "a::b: two links have the same name",

@@ -119,14 +119,15 @@ def test_package_xml_names_a_package(file: Path, tmp_path: Path, folder: str, na
 
 def test_all_missing_packages_are_listed(file: Path) -> None:
     include = '<xacro:include filename="$(find {})/x.xacro"/>'
-    more = include.format("first_gone") + include.format("second_gone")
+    more = "".join(map(include.format, ("first_gone", "second_gone", "é" * 300)))
     part = file.parents[2] / "my_parts" / "links.xacro"
     part.write_text(part.read_text().replace("</robot>", f"{include.format('third')}</robot>"))
     file.write_text(TEXT.replace("</robot>", f"{more}</robot>"), encoding="utf-8")
     with pytest.raises(vkc.InputError) as caught:
         expand_xacro(file, {}, {})
     message = str(caught.value)
-    assert "packages were not found: first_gone, second_gone, third" in message
+    assert "packages were not found: first_gone, second_gone, é" in message
+    assert "é, third " in message
     assert "--package NAME=FOLDER" in message
     assert message.count("first_gone") == 1
     assert "class" not in message

@@ -24,6 +24,7 @@ from vkc_pin.importing.objects.description import (
 )
 from vkc_pin.importing.objects.sdf_scope import BASE, RULES, WORLD, Rules, Scope, is_true
 from vkc_pin.utils.arrays import MAX_COORDINATE, MIN_POSITIVE
+from vkc_pin.utils.system import is_file
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.kinematic_tree import MOMENTS, find_roots
 from vkc_pin.world.files.meshes import load_mesh
@@ -580,9 +581,9 @@ def _find_model(file: Path, include: ElementTree.Element, packages: Mapping[str,
     uri = (include.findtext("uri") or "").strip()
     candidates = iterate_address_candidates(uri, file, packages) if uri else []
     for candidate in candidates:
-        if candidate.is_file():
+        if is_file(candidate):
             return candidate
-        if (candidate / "model.config").is_file():
+        if is_file(candidate / "model.config"):
             config = candidate / "model.config"
             root = parse_xml(read_text(config, "model.config"), config)
             stated = {
@@ -591,9 +592,9 @@ def _find_model(file: Path, include: ElementTree.Element, packages: Mapping[str,
                 if (match := re.match(r"\s*1\.(\d{1,3})", element.get("version", "1.0")))
             }
             known = [version for version in stated if version <= _NEWEST] or list(stated)
-            if known and (candidate / stated[max(known)]).is_file():
+            if known and is_file(candidate / stated[max(known)]):
                 return candidate / stated[max(known)]
-        if (candidate / "model.sdf").is_file():
+        if is_file(candidate / "model.sdf"):
             return candidate / "model.sdf"
     raise make_element_error(
         file,

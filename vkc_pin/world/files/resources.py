@@ -15,6 +15,7 @@ from urllib.parse import unquote
 import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError, find_nearest_name, format_value
+from vkc_pin.utils.system import is_file
 
 __all__ = [
     "check_path",
@@ -127,16 +128,16 @@ def find_mesh_file(
     """
     first: Path | None = None
     for candidate in iterate_address_candidates(address, file, packages):
-        if candidate.is_file():
+        if is_file(candidate):
             return candidate
         first = first or candidate
     if (match := _PACKAGE.match(unquote(address.strip()))) is not None:
         place = find_package(match[1], file, packages)  # of another folder name
-        if place is not None and (place / match[2]).is_file():
+        if place is not None and is_file(place / match[2]):
             return place / match[2]
     assert first is not None  # there is a folder around every file
     expected = "a mesh file"
-    if first.parent.is_dir():
+    with contextlib.suppress(OSError, ValueError):  # there may be no such folder
         nearest = find_nearest_name(
             first.name, sorted(item.name for item in first.parent.iterdir())
         )
@@ -157,7 +158,7 @@ def iterate_address_candidates(
     """Yield the paths that an address in a description file may mean; see `find_mesh_file`.
 
     Raises:
-        InputError: The address has another scheme, such as `https:`, or is too long.
+        InputError: The address has another scheme, such as `https:`.
     """
     text = address.strip()
     match = _SCHEME.fullmatch(text)
@@ -181,11 +182,10 @@ def iterate_address_candidates(
         found = [folder / text for folder in _list_folders(file)]
     decoded = []
     for path in found:
-        yield check_path(path, "filename", "a file")
+        yield path
         if "%" in str(path):
             decoded.append(Path(unquote(str(path))))
-    for path in decoded:
-        yield check_path(path, "filename", "a file")
+    yield from decoded
 
 
 def _list_folders(file: Path) -> list[Path]:
@@ -226,7 +226,7 @@ def find_package(
     around = list(dict.fromkeys([*file.absolute().parents, *file.resolve().parents]))
     for folder in around:
         for place in (folder, folder / name) if folder.name == name else (folder / name,):
-            if place.is_dir():
+            if os.path.isdir(place):  # noqa: PTH112 - its name may be too long
                 return place
     for folder in around:
         if _read_package_name(folder) == name:

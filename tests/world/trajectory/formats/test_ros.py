@@ -200,6 +200,19 @@ def test_invalid_messages_are_rejected(
         Trajectory.from_ros(write_broken(tmp_path / "bad.json", json.dumps(message)))
 
 
+def test_sent_knots_are_the_same_motion(door_plan: Plan) -> None:
+    """Clearances hold at waypoints: knots between two of them must not count as such."""
+    motion = door_plan.trajectory
+    sent = Trajectory.from_ros(motion.to_ros(joints="all"), like=motion)
+    assert len(motion.times) < len(motion.curve.times)
+    np.testing.assert_allclose(sent.times, motion.times - motion.times[0], atol=1e-8)
+    assert [vars(phase) for phase in sent.phases] == [vars(phase) for phase in motion.phases]
+    moments = np.linspace(0.0, sent.times[-1], 500)
+    np.testing.assert_allclose(sent.at(moments), motion.at(moments), atol=1e-7)
+    tight = dataclasses.replace(door_plan.options, dist_safe=door_plan.report.clearance - 1e-5)
+    assert vkc.validate(door_plan.scene, door_plan.steps, sent, tight).ok
+
+
 @pytest.mark.parametrize("smooth", [True, False])
 def test_sent_motions_can_be_validated(door_plan: Plan, smooth: bool) -> None:
     sent = Trajectory.from_ros(

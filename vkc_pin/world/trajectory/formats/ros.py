@@ -131,8 +131,9 @@ def from_ros(
 
     Args:
         message: Data, or a JSON file with them, with all of the robot's coordinates, base first.
-        like: Motion with the phases and the number of robot coordinates. Its phases end at the
-            points that are nearest in time. Default: one phase without holds.
+        like: Motion with the phases, the waypoints and the number of robot coordinates. Its
+            waypoints are the points that are nearest in time; others are knots of the curve only,
+            if there are velocities. Default: one phase without holds, every point a waypoint.
         robot_size: Number of robot coordinates without `like`. Default: those before the first
             with a dot in its name.
     """
@@ -162,21 +163,27 @@ def from_ros(
     size = infer_robot_size(names)
     if robot_size is not None:
         size = check_integer(robot_size, "robot_size", low=3)
+    has_curve = bool(rates) and len(rates) == len(rows)
+    waypoints = list(range(len(rows)))
     phases = [make_single_phase(len(rows))] if len(rows) > 1 else []
     if like is not None:
-        size, began = like["robot_size"], np.array(like["times"], float)
-        edges = (began - began[0])[[0, *(phase["last"] for phase in like["phases"])]]
-        at = np.abs(np.asarray(times)[:, None] - edges).argmin(axis=0).tolist() if times else []
-        ends = zip(like["phases"], at, at[1:], strict=False)
+        size, moments = like["robot_size"], np.array(like["times"], float)
+        between = (np.array(times[1:]) + np.array(times[:-1])) / 2.0
+        at = np.searchsorted(between, moments - moments[0])  # the points that are nearest in time
+        if has_curve:
+            waypoints = np.union1d(at, [0, len(rows) - 1]).tolist()
+            at = np.searchsorted(waypoints, at)
+        edges = at[[0, *(phase["last"] for phase in like["phases"])]].tolist()
+        ends = zip(like["phases"], edges, edges[1:], strict=False)
         phases = [{**phase, "first": first, "last": last} for phase, first, last in ends]
     motion = {
         "names": names,
-        "times": times,
-        "positions": rows,
+        "times": [times[k] for k in waypoints],
+        "positions": [rows[k] for k in waypoints],
         "robot_size": size,
         "phases": phases,
     }
-    if rates and len(rates) == len(rows):
+    if has_curve:
         motion["curve"] = {"times": times, "positions": rows, "rates": rates}
     return motion
 

@@ -133,7 +133,11 @@ OPEN = {"finger_a_joint": 0.03, "finger_b_joint": 0.03}
             "cannot grasp level bars",
             "thick: upright ones at 1.",
         ),
-        ({"base": {"height": -0.1}}, "cannot grasp door levers, 1 m high", "level ones at 0.1 to"),
+        (
+            {"base": {"height": -0.1}},
+            "cannot turn door levers, 1 m high",
+            "level ones at 0.1 to",
+        ),
         (
             {"locked_joints": dict.fromkeys(OPEN, 0.01)},
             "cannot grasp bars more than 10 mm thick",
@@ -151,6 +155,30 @@ def test_doctor_reports_the_bars_of_a_hand(
     assert limitation in " ".join(limitations)
     assert note in " ".join(find_texts(found, "note", "hand"))
     assert f"{bool(limitation):d} limitation" in str(found).splitlines()[0]
+
+
+def test_doctor_proposes_a_height_that_suits_common_tasks(tmp_path: Path) -> None:
+    robot = write_robot(tmp_path, base={"height": -0.3})
+    found = vkc.importing.doctor(robot, samples=5)
+    (hint,) = [finding.hint for finding in found.findings if finding.level == "limitation"]
+    assert hint.startswith("mounted 0.7 m higher, it can: `base: {height: 0.4}`")
+    write_robot(tmp_path, base={"height": 0.4})
+    assert not find_texts(vkc.importing.doctor(robot, samples=5), "limitation", "hand")
+
+
+@pytest.mark.parametrize(("range_", "side"), [((0.0, 2.0), "right"), ((-2.0, 0.0), "left")])
+def test_doctor_reports_a_wrist_that_cannot_turn_a_lever(
+    tmp_path: Path, range_: tuple[float, float], side: str
+) -> None:
+    """The hand rolls only one way from the pose that grasps level bars."""
+    robot = write_robot(tmp_path, locked_joints=OPEN | {"arm_5_joint": 0.0})
+    path = tmp_path / "robot.urdf"
+    head, joint, tail = path.read_text(encoding="utf-8").partition('<joint name="arm_4_joint"')
+    low, high = range_
+    tail = tail.replace('lower="-2" upper="2"', f'lower="{low}" upper="{high}"', 1)
+    path.write_text(head + joint + tail, encoding="utf-8")
+    limitations = find_texts(vkc.importing.doctor(robot, samples=5), "limitation", "hand")
+    assert f"turn door levers with the free end on the {side}" in " ".join(limitations)
 
 
 def test_invalid_argument_is_named() -> None:

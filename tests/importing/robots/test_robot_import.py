@@ -304,3 +304,22 @@ def test_closing_direction_suits_a_wrist_without_roll(
     file.write_text(text.replace("</robot>", post), encoding="utf-8")
     made = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
     assert "thick: upright ones at" in str(made)
+
+
+@pytest.mark.parametrize(("first", "second"), [("a", "b"), ("b", "a")])
+def test_closing_direction_leaves_the_wrist_room_to_turn_levers(
+    tmp_path: Path, first: str, second: str
+) -> None:
+    """The arm pitches forwards only, and its wrist rolls by half a turn and little more."""
+    file = write_arms(tmp_path / "given")
+    text = file.read_text(encoding="utf-8").replace("finger_a", f"finger_{first}_")
+    text = text.replace("finger_b", f"finger_{second}_")
+    text = text.replace('"arm_5_joint" type="revolute"', '"arm_5_joint" type="fixed"')
+    for joint, limits in ((2, (0, 2)), (3, (0, 2)), (4, (-2.3, 1.6))):
+        head, name, tail = text.partition(f'<joint name="arm_{joint}_joint"')
+        low, high = limits
+        tail = tail.replace('lower="-2" upper="2"', f'lower="{low}" upper="{high}"', 1)
+        text = head + name + tail
+    file.write_text(text, encoding="utf-8")
+    made = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
+    assert "turn door levers" not in str(made)

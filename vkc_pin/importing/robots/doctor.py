@@ -13,7 +13,11 @@ from vkc_pin.errors import InputError
 from vkc_pin.importing.convex import compute_concavity
 from vkc_pin.importing.proposals.hand import Hand, has_fingers, make_hand
 from vkc_pin.importing.robots.envelopes import find_envelopes
-from vkc_pin.importing.robots.reach import find_grasp_heights
+from vkc_pin.importing.robots.reach import (
+    TASK_HEIGHTS,
+    find_grasp_heights,
+    find_missing_tasks,
+)
 from vkc_pin.importing.robots.rest_configuration import Clearances, find_inseparable_pairs
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import check_integer, check_number
@@ -33,7 +37,7 @@ _COUNTED = ("fault", "limitation", "warning")  # levels whose number is reported
 _LISTED = 6  # names in a list
 _DEFAULT_VELOCITIES = (DEFAULT_JOINT_VELOCITY, DEFAULT_SLIDE_VELOCITY)
 _BAR = 0.015  # [m] thickness of common handles
-_LEVER, _NEAR_LEVER = 1.0, 0.15  # [m] height of door levers, and its spread
+_LIFTS = np.arange(-5, 11) / 10.0  # [m] by which a robot may be raised
 # Sizes of robots [m] and travels of joints [rad], [m] beyond which a unit is probably wrong
 _SMALL, _LARGE, _MANY_TURNS, _LONG = 0.05, 8.0, 6.0 * np.pi, 10.0
 _UNLIMITED_TURNS = 2000.0  # [rad] travels above this mean that a joint is unlimited
@@ -353,22 +357,38 @@ def _check_grasps(robot: Robot, hand: Hand, seed: int) -> list[Finding]:
     heights = find_grasp_heights(robot, seed=seed)
     where = [
         f"{kind} ones at {found.min():.1f} to {found.max():.1f} m"
-        for kind, found in heights.items()
-        if len(found)
+        for kind in ("level", "upright")
+        if len(found := heights[kind])
     ]
     if where:
         text = f"it grasps bars up to {1e3 * thickness:.0f} mm thick: {', '.join(where)}"
         findings.append(Finding("note", "hand", text))
-    level, text, hint = heights["level"], "", ""
-    if not len(level):
-        text = "it cannot grasp level bars, such as most handles: no configuration holds one"
-        hint = "a wrist that rolls the hand, or a tool frame that is turned about z"
-    elif not (abs(level - _LEVER) < _NEAR_LEVER).any():
-        text = f"it cannot grasp door levers, {_LEVER:.0f} m high: level bars, see below"
-        hint = "mounted higher or lower, it can: `base.height` in robot.yaml"
-    if text:
+    if missing := find_missing_tasks(heights):
+        text = f"it cannot {' or '.join(missing)}: level bars, see below"
+        hint = "no other height of its base suits all of this"
+        if not len(heights["level"]):
+            text = "it cannot grasp level bars, such as most handles: no configuration holds one"
+            hint = "a wrist that rolls the hand, or a tool frame that is turned about z"
+        hint = _suggest_height(robot, seed) or hint
         findings.append(Finding("limitation", "hand", text, hint))
     return findings
+
+
+def _suggest_height(robot: Robot, seed: int) -> str:
+    """Return the height at which a robot can do common tasks, as text, or ""."""
+    clearances = Clearances(robot)
+    clearances.place(robot.home)
+    floor = min((height for _, height in clearances.floor(moved=False)), default=0.0)
+    lifts, suitable = _LIFTS[max(floor, 0.0) + _LIFTS > 0.0], []
+    for lift in lifts:
+        found = find_grasp_heights(robot, lift=lift, heights=TASK_HEIGHTS, seed=seed)
+        suitable += [] if find_missing_tasks(found) else [float(lift)]
+    if not suitable:
+        return ""
+    lift = suitable[len(suitable) // 2]
+    where = f"{abs(lift):.1f} m {'higher' if lift > 0.0 else 'lower'}"
+    height = round(robot.height + lift, 3)
+    return f"mounted {where}, it can: `base: {{height: {height:g}}}` in robot.yaml"
 
 
 def _check_shapes(robot: Robot) -> list[Finding]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+
 import numpy as np
 import pinocchio as pin
 
@@ -10,10 +12,18 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import get_link_name, triangulate
 
-__all__ = ["find_grasp_heights"]
+__all__ = ["TASK_HEIGHTS", "find_grasp_heights", "find_missing_tasks", "should_reverse_tool"]
 
 _HEIGHTS = np.arange(1, 20) / 10.0  # [m] of the bars
-_UPRIGHT = np.cos(0.6)  # of the largest slope of the approach
+_HANDLE, _LEVER = (0.7, 0.8), (1.0,)  # [m] heights around handles of drawers, and of door levers
+TASK_HEIGHTS = (*_HANDLE, *_LEVER)
+"""Heights of the bars that common tasks need [m]."""
+_TILT = 0.6  # [rad] largest slope of the approach
+# [rad] by which a lever is turned, and distance [m] of the hand from its axis
+_TURNS, _LEVER_ARM = (0.2, 0.4, 0.6), 0.07
+_SIDES = {"left": 1.0, "right": -1.0}  # of a lever's free end, and the sense in which it turns
+_RAISED = 1.0  # [m] above the floor, from which arms reach below their base
+_FEW = 1.15  # ratio of bars, of which a random search misses some
 # Distance [m] from the centre of a bar to the front behind it, less the clearance of links, and of
 # touch links
 _FACE, _TOUCH_FACE = 0.05, 0.065
@@ -23,10 +33,33 @@ _PROGRESS = 0.9  # factor by which the error must decrease in three steps
 _DAMPING, _TOLERANCE = 1e-6, 1e-3
 
 
+def should_reverse_tool(robot: Robot, *, seed: int = 0) -> bool:
+    """Return whether a hand with its tool frame turned by half a turn about z is more useful.
+
+    It then does more common tasks; or as many, though not all, and grasps more bars where the floor
+    is not in the way. The direction from one finger to the other is arbitrary, but not every wrist
+    rolls by half a turn, or by more to turn a lever.
+    """
+    tasks, bars = [], []
+    for is_turned in (False, True):
+        found = find_grasp_heights(robot, is_turned=is_turned, heights=TASK_HEIGHTS, seed=seed)
+        tasks.append(len(find_missing_tasks(found)))
+        if not tasks[0]:
+            return False
+        found = find_grasp_heights(robot, is_turned=is_turned, lift=_RAISED, seed=seed)
+        bars.append(sum(map(len, found.values())))
+    return tasks[1] < tasks[0] or (tasks[1] == tasks[0] and bars[1] > _FEW * bars[0])
+
+
 def find_grasp_heights(
-    robot: Robot, *, is_turned: bool = False, seed: int = 0
+    robot: Robot,
+    *,
+    is_turned: bool = False,
+    lift: float = 0.0,
+    heights: Iterable[float] = _HEIGHTS,
+    seed: int = 0,
 ) -> dict[str, Floats]:
-    """Return the heights at which a hand can grasp bars on a vertical face, up to 1.9 m.
+    """Return the heights at which a hand can grasp bars on a vertical face.
 
     The base is wherever it is needed. Configurations are found by inverse kinematics; their links
     overlap neither each other nor the floor, and stay on the hand's side of the face.
@@ -34,15 +67,36 @@ def find_grasp_heights(
     Args:
         robot: The robot.
         is_turned: Whether the tool frame is turned by half a turn about its z axis.
+        lift: Height by which the robot is raised [m].
+        heights: Heights to examine, in ascending order [m]; by default up to 1.9 m.
         seed: Random seed.
 
     Returns:
-        "level" and "upright": heights of bars with this direction, shape (k,) [m].
+        "level" and "upright": heights of bars with this direction, shape (k,) [m]. "left" and
+        "right": those of levers, level bars, that it can turn down by their left or right end.
     """
     rng = np.random.default_rng(seed)
     up = -1.0 if is_turned else 1.0
-    axes = {"level": (1, 0), "upright": (0, 1)}
-    return {kind: _GraspSearch(robot, *axes[kind], up, rng).run() for kind in axes}
+    found = dict[str, Floats]()
+    for kind, axes in (("level", (1, 0)), ("upright", (0, 1))):
+        found |= _GraspSearch(robot, *axes, up, lift, rng).run(kind, heights)
+    return found
+
+
+def find_missing_tasks(found: Mapping[str, Floats]) -> list[str]:
+    """Return common tasks that a robot cannot do, such as "turn door levers, 1 m high".
+
+    Args:
+        found: Result of `find_grasp_heights` that includes `TASK_HEIGHTS`.
+    """
+    missing = []
+    if not set(_HANDLE) <= set(found["level"]):
+        missing.append("grasp handles of drawers, {} to {} m high".format(*_HANDLE))
+    sides = [side for side in _SIDES if not set(_LEVER) <= set(found[side])]
+    if sides:
+        which = f" with the free end on the {sides[0]}" if len(sides) < len(_SIDES) else ""
+        missing.append(f"turn door levers{which}, {_LEVER[0]:.0f} m high")
+    return missing
 
 
 class _GraspSearch:
@@ -56,19 +110,26 @@ class _GraspSearch:
         level: Number of the tool's level axis.
         upright: Number of its upright axis.
         up: Height of this axis, 1 or -1.
+        lift: Height by which the robot is raised [m].
         rng: Random number generator.
     """
 
     def __init__(
-        self, robot: Robot, level: int, upright: int, up: float, rng: np.random.Generator
+        self,
+        robot: Robot,
+        level: int,
+        upright: int,
+        up: float,
+        lift: float,
+        rng: np.random.Generator,
     ) -> None:
         self._robot, self._clearances = robot, Clearances(robot)
         self._data, self._frame = robot.model.createData(), robot.model.getFrameId(robot.tool_frame)
         self._low, self._high = get_arm_bounds(robot)
-        self._level, self._upright, self._up = level, upright, up
+        self._level, self._upright, self._up, self._lift = level, upright, up, lift
         random = rng.uniform(self._low, self._high, (_SAMPLES, len(self._low)))
         self._samples = np.vstack([robot.home, random])
-        self._errors = np.array([self._measure(arm, 0.0) for arm in self._samples])
+        self._errors = np.array([self._measure(arm, 0.0, 0.0) for arm in self._samples])
         corners = dict[tuple[int, float], list[Floats]]()
         for shape in robot.collision.geometryObjects:
             points = triangulate(shape.geometry)[0] @ shape.placement.rotation.T
@@ -78,27 +139,59 @@ class _GraspSearch:
             )
         self._corners = {key: np.vstack(points) for key, points in corners.items()}
 
-    def run(self) -> Floats:
-        """Return the heights at which a bar can be grasped [m]."""
-        found, before = list[float](), list[Floats]()
-        for height in _HEIGHTS:
-            errors = np.linalg.norm(self._errors - [height, 0.0, 0.0], axis=1)
+    def run(self, kind: str, heights: Iterable[float]) -> dict[str, Floats]:
+        """Return the heights of bars that can be grasped, and of levers that can be turned [m]."""
+        kinds = [kind, *_SIDES] if kind == "level" else [kind]
+        found: dict[str, list[float]] = {each: [] for each in kinds}
+        before = list[Floats]()
+        for height in heights:
+            errors = np.linalg.norm(self._errors - [height - self._lift, 0.0, 0.0], axis=1)
+            missing = list(kinds)
             for start in [*before, *self._samples[np.argsort(errors)[:_STARTS]]]:
-                arm = self._solve(start, height)
-                if arm is not None and self._is_free(arm):
-                    found.append(height)
-                    before = [arm]
+                arm = self._grasp(start, height)
+                if arm is None:
+                    continue
+                before = [arm] if kind in missing else before
+                done = [each for each in missing if each == kind or self._turns(arm, height, each)]
+                for each in done:
+                    found[each].append(height)
+                    missing.remove(each)
+                if not missing:
                     break
-        return np.array(found)
+        return {each: np.array(values) for each, values in found.items()}
 
-    def _measure(self, arm: Floats, height: float) -> Floats:
-        """Return the errors of a hand at a bar, in height [m] and directions, shape (3,)."""
+    def _grasp(self, start: Floats, height: float, slope: float = 0.0) -> Floats | None:
+        """Return a free configuration with the hand at a bar, near the given one, or None."""
+        arm = self._solve(start, height - self._lift, slope)
+        return arm if arm is not None and self._is_free(arm) else None
+
+    def _turns(self, arm: Floats, height: float, side: str) -> bool:
+        """Return whether the hand can turn a lever down from a grasp."""
+        for angle in _TURNS:
+            slope = self._up * _SIDES[side] * np.sin(angle)
+            turned = self._grasp(arm, height - _LEVER_ARM * np.sin(angle), slope)
+            if turned is None:
+                return False
+            arm = turned
+        return True
+
+    def _measure(self, arm: Floats, height: float, slope: float) -> Floats:
+        """Return the errors of a hand at a bar, in height [m] and directions, shape (3,).
+
+        Args:
+            arm: Positions of the arm.
+            height: Height of the bar above the root's floor [m].
+            slope: Vertical part of the tool's level axis.
+        """
         self._q = self._robot.coordinates.q(np.concatenate([np.zeros(3), arm]))
         pin.framesForwardKinematics(self._robot.model, self._data, self._q)
         self._pose = self._data.oMf[self._frame]
         vertical = self._pose.rotation[2]
-        missing = min(0.0, self._up * vertical[self._upright] - _UPRIGHT)
-        return np.array([self._pose.translation[2] - height, vertical[self._level], missing])
+        self._least = np.cos(_TILT) * np.sqrt(1.0 - slope**2)
+        missing = min(0.0, self._up * vertical[self._upright] - self._least)
+        return np.array(
+            [self._pose.translation[2] - height, vertical[self._level] - slope, missing]
+        )
 
     def _differentiate(self) -> Floats:
         """Return the derivatives of the errors by the arm's positions, shape (3, n)."""
@@ -110,14 +203,14 @@ class _GraspSearch:
             axes[1, k] * jacobian[1] - axes[0, k] * jacobian[2]
             for k in (self._level, self._upright)
         )
-        is_missing = self._up * axes[2, self._upright] < _UPRIGHT
+        is_missing = self._up * axes[2, self._upright] < self._least
         return np.array([jacobian[0], level, self._up * upright * is_missing])
 
-    def _solve(self, arm: Floats, height: float) -> Floats | None:
+    def _solve(self, arm: Floats, height: float, slope: float) -> Floats | None:
         """Return a configuration with the hand at a bar, near the given one, or None."""
         history = list[float]()
         for _ in range(_STEPS):
-            errors = self._measure(arm, height)
+            errors = self._measure(arm, height, slope)
             history.append(float(np.linalg.norm(errors)))
             if history[-1] < _TOLERANCE:
                 return arm
@@ -136,14 +229,14 @@ class _GraspSearch:
     def _is_free(self, arm: Floats) -> bool:
         """Return whether all links are free, and on the hand's side of the face."""
         self._clearances.place(arm)
-        if self._clearances.least(0.0) < 0.0:
+        if self._clearances.least(0.0, floor=-self._lift) < 0.0:
             return False
-        self._measure(arm, 0.0)
-        approach = np.append(self._pose.rotation[:2, 2], 0.0)
-        approach /= np.linalg.norm(approach)
-        bar = float(self._pose.translation @ approach)
+        self._measure(arm, 0.0, 0.0)
+        normal = np.cross(self._pose.rotation[:, self._level], [0.0, 0.0, 1.0])  # of the face
+        normal *= np.sign(normal @ self._pose.rotation[:, 2]) / np.linalg.norm(normal)
+        bar = float(self._pose.translation @ normal)
         return all(
-            float((points @ (place.rotation.T @ approach)).max() + place.translation @ approach)
+            float((points @ (place.rotation.T @ normal)).max() + place.translation @ normal)
             < bar + face
             for (joint, face), points in self._corners.items()
             for place in (self._data.oMi[joint],)

@@ -78,11 +78,10 @@ class Clearances:
             heights[self._names[k]] = min(float(lowest[k]), heights.get(self._names[k], np.inf))
         return sorted(heights.items(), key=lambda item: item[1])
 
-    def least(self, limit: float = np.inf) -> float:
+    def least(self, limit: float = np.inf, *, floor: float = 0.0) -> float:
         """Return the smallest distance between links and to the floor [m], at most `limit`."""
-        nearest = float(
-            min(limit, self._distances.compute_lowest_points()[self._is_moved].min(initial=np.inf))
-        )
+        lowest = self._distances.compute_lowest_points()[self._is_moved].min(initial=np.inf)
+        nearest = float(min(limit, lowest - floor))
         bounds = self._distances.compute_lower_bounds(self._pairs)
         for k in np.argsort(bounds).tolist():
             if bounds[k] > nearest:

@@ -30,7 +30,7 @@ from vkc_pin.importing.robots.envelopes import find_envelopes, remove_collision_
 from vkc_pin.importing.robots.hands import Hand, analyze_hand
 from vkc_pin.importing.robots.mesh_pieces import Piece, write_meshes
 from vkc_pin.importing.robots.picture import plot_robot
-from vkc_pin.importing.robots.reach import find_grasp_heights
+from vkc_pin.importing.robots.reach import should_reverse_tool
 from vkc_pin.importing.robots.rest_configuration import (
     HOME_ROOM,
     Home,
@@ -307,18 +307,8 @@ class _Importer:
             )
 
     def _turn_tool(self, robot: Robot, hand: Hand, seed: int) -> Robot:
-        """Return the robot with its closing direction reversed if it then grasps more bars.
-
-        The direction from one finger to the other is arbitrary, but not every wrist rolls by half a
-        turn.
-        """
-        grasped = find_grasp_heights(robot, seed=seed)
-        if all(map(len, grasped.values())):
-            return robot
-        turned = find_grasp_heights(robot, is_turned=True, seed=seed)
-        if [bool(len(turned[kind])) for kind in grasped] <= [
-            bool(len(heights)) for heights in grasped.values()
-        ]:
+        """Return the robot with its closing direction reversed if its wrist then can do more."""
+        if not should_reverse_tool(robot, seed=seed):
             return robot
         for kind, name in (("link", robot.tool_frame), ("joint", f"{robot.tool_frame}_joint")):
             (element,) = self._file.root.findall(f"{kind}[@name='{name}']")
@@ -341,7 +331,9 @@ class _Importer:
         hint = "`gripper`, see docs/robots.md"
         if fixed:
             text += f"; limits in the file: {', '.join(fixed)}"
-            hint = "widen these limits in the file"
+            hint = (
+                "widen these limits in a copy of the file, to ±0.6 rad or ±40 mm say, and import it"
+            )
         level = "fault" if hand.opening < _CLOSED else "warning"
         self._findings.append(Finding(level, "hand", text, hint))
 

@@ -74,6 +74,6 @@ def make_fake_plan(scene: Scene | None = None) -> Plan:
         steps=(Actuate("door", {"hinge": HINGE}),),
         options=Options(),
         trajectory=Trajectory(names, times, positions, phases, len(robot)),
-        report=Report((blame,), -0.03, states=100),
+        report=Report((blame,), -0.03, states=100, notes=("go to: found no path",)),
         status="rejected",
     )

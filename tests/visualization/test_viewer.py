@@ -225,8 +225,28 @@ def test_page_contains_phases_violations_and_status(page: Path, plan: Plan) -> N
     film = json.loads(match[1])
     assert film["duration"] == pytest.approx(plan.trajectory.times[-1])
     assert [phase["name"] for phase in film["phases"]] == ["reach door.handle", "move door.hinge"]
-    assert film["notes"][0]["text"] == "penetration: forearm_link – sofa"
+    assert film["notes"][0]["text"].startswith("penetration forearm_link – sofa: ")
+    assert film["because"] == list(plan.report.notes)
     assert "rejected" in film["headline"]
+
+
+def test_times_of_a_page_count_from_the_begin_of_the_motion(plan: Plan, tmp_path: Path) -> None:
+    motion, report = plan.trajectory, plan.report
+    late = dataclasses.replace(
+        plan,
+        trajectory=dataclasses.replace(motion, times=motion.times + 100.0, curve=None),
+        report=dataclasses.replace(
+            report,
+            violations=[dataclasses.replace(v, time=v.time + 100.0) for v in report.violations],
+        ),
+    )
+    films = []
+    for one in (plan, late):
+        text = visualization.to_html(one, tmp_path / "page.html").read_text(encoding="utf-8")
+        films.append(json.loads(text.partition('id="film">')[2].partition("</script>")[0]))
+    assert films[1]["notes"] == [
+        {**note, "time": pytest.approx(note["time"])} for note in films[0]["notes"]
+    ]
 
 
 def test_arguments_that_cannot_be_shown_are_refused(plan: Plan, tmp_path: Path) -> None:
@@ -429,7 +449,8 @@ def test_browser_shows_links_at_their_placements(page: Path, plan: Plan) -> None
     assert "data-error" not in text
     assert re.search(r'<input id="time"[^>]*max="6"', text), "the slider ends where the motion does"
     assert "4.4 / 6.0 s" in text
-    assert "penetration: forearm_link" in text
+    assert "penetration forearm_link" in text
+    assert f"because {plan.report.notes[0]}" in text
     match = re.search(r'<pre id="seen">(.*?)</pre>', text, re.DOTALL)
     assert match
     told = json.loads(match[1])

@@ -95,6 +95,7 @@ def write_page(
             {"name": phase.name, "last": float(times[phase.last]) - begin} for phase in phases
         ],
         "notes": [{"text": text, "time": time - begin} for text, time in notes],
+        "because": [],
         "headline": f"{headline} (translucent: as planned)",
         "ghosts": False,
     }

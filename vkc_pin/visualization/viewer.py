@@ -262,8 +262,9 @@ def _make_page(
 
 def _describe_film(scene: Scene, plan: CheckedMotion | None) -> dict[str, Any]:
     if plan is None:
-        return {"duration": 0.0, "phases": [], "notes": [], "headline": scene.name}
-    times = plan.trajectory.times - plan.trajectory.times[0]
+        return {"duration": 0.0, "phases": [], "notes": [], "because": [], "headline": scene.name}
+    begin = float(plan.trajectory.times[0])
+    times = plan.trajectory.times - begin
     return {
         "duration": float(times[-1]),
         "phases": [
@@ -271,8 +272,10 @@ def _describe_film(scene: Scene, plan: CheckedMotion | None) -> dict[str, Any]:
             for phase in plan.trajectory.phases
         ],
         "notes": [
-            {"text": f"{v.constraint}: {v.subject}", "time": v.time} for v in plan.report.violations
+            {"text": f"{v.constraint} {v.subject}: {v.detail}", "time": v.time - begin}
+            for v in plan.report.violations
         ],
+        "because": list(plan.report.notes),
         "headline": f"{scene.name}: {'success' if plan.success else 'FAILED, ' + plan.status}",
     }
 

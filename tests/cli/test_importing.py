@@ -120,6 +120,14 @@ def test_robot_folder_takes_precedence_over_known_names(
     assert "for the hand of panda, best first" in capsys.readouterr().out
     assert run("doctor panda") == 0
     assert "panda_joint1" not in capsys.readouterr().out
+    assert run(f"import-object box.sdf --robot {tmp_path}/panda --most 1 --output fixed") == 0
+    for folder in ("box", "panda", "fixed"):
+        (tmp_path / "moved" / folder).parent.mkdir(exist_ok=True)
+        (tmp_path / folder).rename(tmp_path / "moved" / folder)
+    robot = vkc.load_scene("moved/box/scene.yaml").robot
+    assert robot.urdf.resolve().parent == tmp_path / "moved" / "panda"
+    with pytest.raises(vkc.InputError, match=f"{tmp_path}/panda"):
+        vkc.load_scene("moved/fixed/scene.yaml")
 
 
 def test_home_is_imported_as_a_scene(

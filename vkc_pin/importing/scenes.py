@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,22 +17,44 @@ from vkc_pin.importing.targets import format_comment, get_origin_marker
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.robot_file import list_robots
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene
 
-__all__ = ["make_object_scene", "make_robot_scene", "refer_to_robot", "write_scene"]
+__all__ = [
+    "locate_robot",
+    "make_object_scene",
+    "make_robot_scene",
+    "refer_to_robot",
+    "write_scene",
+]
 
 _ROOM = 3.0  # [m] of floor around the base of a robot
 _DISTANCES = np.arange(1.2, 6.0, 0.2)  # [m] of the start from the object's grasp
 _MARGIN = 2.0  # [m] of floor around start and object
 
 
-def refer_to_robot(robot: str | Path | Robot) -> str:
-    """Return a robot as a scene in another folder refers to it."""
+def locate_robot(robot: str | Path | Robot) -> str:
+    """Return a robot's name or absolute path, as a scene in any folder can refer to it."""
     if isinstance(robot, Robot):
         described = robot.urdf.parent / "robot.yaml"
-        return str((described if described.is_file() else robot.urdf).resolve())
+        file = described if described.is_file() else robot.urdf
+        return robot.name if list_robots().get(robot.name) == file else str(file.resolve())
     by_path = isinstance(robot, Path) or robot.endswith((".urdf", ".yaml", ".yml")) or "/" in robot
     return str(Path(robot).resolve()) if by_path else str(robot)
+
+
+def refer_to_robot(robot: str | Path | Robot, folder: Path) -> str:
+    """Return a robot as a scene that is written into a folder refers to it.
+
+    Names and absolute paths stay; other paths are relative to the folder, so that both can be moved
+    together.
+    """
+    place = locate_robot(robot)
+    is_given = not isinstance(robot, Robot) and Path(robot).is_absolute()
+    if is_given or not Path(place).is_absolute():
+        return place
+    relative = Path(os.path.relpath(place, os.path.realpath(folder))).as_posix()
+    return relative if "/" in relative else f"./{relative}"
 
 
 def write_scene(file: Path, source: Path, document: Mapping[str, Any], command: str) -> None:
@@ -63,7 +86,7 @@ def make_object_scene(
         file: Description of the object, relative to the scene.
         proposals: Its attachments; the robot starts in front of the best one.
         size: Size of the object [m], shape (3,).
-        robot: The robot, see `refer_to_robot`.
+        robot: The robot, see `locate_robot`.
         folder: Folder of the scene.
     """
     place, back = np.zeros(2), np.array([-1.0, 0.0])

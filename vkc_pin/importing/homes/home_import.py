@@ -30,7 +30,7 @@ from vkc_pin.importing.objects.clean_up import (
 from vkc_pin.importing.objects.description import WEIGHTLESS
 from vkc_pin.importing.objects.object_import import read_description
 from vkc_pin.importing.objects.pieces import PieceCache
-from vkc_pin.importing.scenes import refer_to_robot, write_scene
+from vkc_pin.importing.scenes import locate_robot, refer_to_robot, write_scene
 from vkc_pin.importing.targets import check_target
 from vkc_pin.options import Options
 from vkc_pin.planning.base_paths.reachable_floor import CELL, find_free_floor
@@ -172,7 +172,7 @@ def import_home(
         bounds, (low, high) = (low, high), add_floor(home, low, high)
         document: dict[str, Any] = {
             "name": _choose_name(path),
-            "robot": refer_to_robot(robot),
+            "robot": locate_robot(robot),
             "start": {"base": [round(float(value), 3) for value in (*(low + high)[:2] / 2.0, 0.0)]},
             "arena": {axis: _round_interval(low[k], high[k]) for k, axis in enumerate("xy")},
             "start_region": {axis: _round_interval(low[k], high[k]) for k, axis in enumerate("xy")},
@@ -183,6 +183,7 @@ def import_home(
             warnings.simplefilter("ignore")  # they are repeated when the scene is loaded
             scene, reached = find_free_start(Scene.from_document(document, staging), rng, path)
         document["start"] = {"base": scene.start[:3].tolist()}
+        document["robot"] = refer_to_robot(robot, target)
         write_scene(staging / "scene.yaml", path, document, _COMMAND)
     weight = (WEIGHTLESS,) if all(item.description.is_massless for item in home.objects) else ()
     notes = (

@@ -36,7 +36,12 @@ from vkc_pin.importing.parsers import expand_xacro, uses_xacro
 from vkc_pin.importing.proposals.picture import plot_attachments
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
-from vkc_pin.importing.scenes import make_object_scene, refer_to_robot, write_scene
+from vkc_pin.importing.scenes import (
+    locate_robot,
+    make_object_scene,
+    refer_to_robot,
+    write_scene,
+)
 from vkc_pin.importing.targets import check_target, get_origin_marker
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import (
@@ -214,8 +219,7 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
     check_integer(most, "most", low=1, high=100)
     options = Options() if options is None else check_instance(options, Options, "options")
     clearances = {"dist_safe": options.dist_safe, "grasp_clearance": options.grasp_clearance}
-    reference = refer_to_robot(robot)
-    robot = robot if isinstance(robot, Robot) else load_robot(robot)
+    given, robot = robot, robot if isinstance(robot, Robot) else load_robot(robot)
     name = _choose_name(path, link)
     target = Path(name) if folder is None else check_path(folder, "folder", "a folder")
     check_target(target, _COMMAND, force=check_bool(force, "force"))
@@ -256,8 +260,9 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
         found = [item.description() for item in proposals.found]
         write_description(yaml, urdf.name, found, about=about, joints=springs)
         plot_attachments(proposals, picture)
-        scene = make_object_scene(yaml.name, proposals, size, reference, staging)
+        scene = make_object_scene(yaml.name, proposals, size, locate_robot(given), staging)
         if scene is not None:
+            scene["robot"] = refer_to_robot(given, target)
             write_scene(staging / "scene.yaml", path, scene, _COMMAND)
     loaded = load_object(target / yaml.name)
     # The files have moved.

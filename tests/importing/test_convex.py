@@ -236,6 +236,21 @@ def test_pieces_contain_the_mesh_and_leave_cavities_free(
         assert measure_uncovered(pieces.meshes, np.array([point])) > near - 0.02 - 1e-4
 
 
+def test_long_narrow_strips_are_cut() -> None:
+    """A grid that coarsens a metre of ribbon must not be wider than the ribbon."""
+    x = np.linspace(0.0, 1.0, 400)
+    z = 0.004 + 0.003 * np.sin(10.0 * x)
+    edges = [np.column_stack([x, np.full(400, y), z]) for y in (0.001, 0.004)]
+    k = np.arange(399)
+    faces = np.vstack(
+        [np.column_stack([k, k + 1, k + 400]), np.column_stack([k + 1, k + 401, k + 400])]
+    )
+    ribbon = Triangles(np.vstack(edges), faces)
+    pieces = decompose(ribbon, error=0.004)
+    check_contract(ribbon, pieces)
+    assert pieces.error < 0.004 < compute_concavity(ribbon)
+
+
 def test_convex_bodies_stay_as_they_are() -> None:
     corner = box((0.1, 0.1, 1)).apply_translation((0.4, 0, 0.6))
     pieces = decompose(trimesh.util.concatenate([box((1, 0.1, 0.1)), corner]))

@@ -23,7 +23,7 @@ import numpy as np
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_coordinate, check_integer, check_number
-from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.utils.arrays import Floats, Ints, find_unique_rows
 from vkc_pin.utils.disk_cache import load_or_build
 from vkc_pin.world.files.hulls import SHEET_THICKNESS, compute_hull, compute_outer_hull, thicken
 from vkc_pin.world.files.meshes import MeshPart, load_mesh, make_bvh
@@ -47,7 +47,7 @@ ERROR = 0.02
 """Largest protrusion of pieces over the surface [m], about the clearance margin of motions."""
 PIECES = 12
 """Number of pieces of one mesh, unless cavities need more: planning time grows with it."""
-_VERSION = 3  # of the disk cache: increase it whenever the same mesh would be cut differently
+_VERSION = 4  # of the disk cache: increase it whenever the same mesh would be cut differently
 _CORNERS = 40  # largest number of vertices of a piece, as in the packaged collision geometry
 # Pieces are simplified only above this multiple of the vertex limit: simplifying takes a second.
 _CORNER_TOLERANCE = 1.5
@@ -55,6 +55,8 @@ _FLATNESS = 1e-4  # [m] thickness up to which parts become plates
 _SAMPLES_PER_CELL = 16  # surface samples that detect the grid cells of a mesh's skin
 _MAX_SAMPLES = 4_000_000
 _SAMPLES = 1000  # samples on a surface in addition to its vertices
+_BOUNDING_SAMPLES = 20_000  # samples on a mesh that bound distances from it
+_BATCH = 256  # samples that are looked for in other pieces at once
 _OUTWARD = 1e-5  # [m] offset of samples that tells outer faces from faces between pieces
 _POINT_RADIUS = 1e-6  # [m] radius of the sphere that stands for a point in distance queries
 _CELLS = 96  # grid cells along the longest edge, for volumes of open meshes
@@ -64,7 +66,10 @@ _FREE_SHARE = 0.5  # of the error: pieces are merged up to this even if there ar
 _MERGE_SHARE = 0.8  # of the error: leaves room for what samples miss and for fewer vertices
 _EXTRA = 4  # multiple of `PIECES` up to which the error matters more than the number
 _MAX_PARTS = 64  # of a mesh before merging
+_MAX_HULL_POINTS = 1000  # of a part: if it has more, its hull is that of its extreme ones
 _MAX_TRIANGLES = 600  # of a part while its best cut is sought
+_MAX_COARSE_TRIANGLES = 150  # of a part while the most promising cuts are sought
+_PROMISING_PLANES = 8  # number of these cuts
 _FACET_PLANES, _AXIS_PLANES = 10, 7  # candidate cuts: through facets, and across each axis
 # Costs of a merged hull besides its protrusion: of its mean thickness over the two, and of its size
 _VOLUME_COST, _SIZE_COST = 2.0, 0.02
@@ -152,12 +157,19 @@ def decompose(
         loaded = mesh
     else:
         loaded = load_mesh(check_path(mesh, "mesh", "a mesh or a mesh file"))
-    hull = tuple(_simplify([_make_hull(loaded.vertices)], corners))
-    whole = Pieces(hull, _measure_protrusion(hull, loaded), loaded)
-    if most_pieces == 1 or whole.error <= error:
-        return whole
-    if overhead > 0.0 and not is_flat(loaded) and whole.overhead <= overhead:
-        return whole
+
+    def measure(pieces: Sequence[trimesh.Trimesh]) -> Pieces:
+        return Pieces(tuple(pieces), _measure_protrusion(pieces, loaded), loaded)
+
+    def is_sufficient(hull: Pieces) -> bool:
+        if most_pieces == 1 or hull.error <= error:
+            return True
+        return overhead > 0.0 and not is_flat(loaded) and hull.overhead <= overhead
+
+    hull = measure([_make_hull(loaded.vertices)])
+    # A simplified hull contains the hull, and thus protrudes no less.
+    if is_sufficient(hull) and is_sufficient(hull := measure(_simplify(hull.meshes, corners))):
+        return hull
 
     def cut_pieces() -> list[list[list[float]]]:
         """Return the vertices of each piece."""
@@ -166,8 +178,7 @@ def decompose(
         return [piece.vertices.tolist() for piece in pieces]
 
     key = _make_cache_key(loaded, most_pieces, error, corners)
-    pieces = tuple(compute_hull(np.array(piece)) for piece in load_or_build(key, cut_pieces))
-    return Pieces(pieces, _measure_protrusion(pieces, loaded), loaded)
+    return measure([compute_hull(np.array(piece)) for piece in load_or_build(key, cut_pieces)])
 
 
 def compute_concavity(mesh: trimesh.Trimesh) -> float:
@@ -230,28 +241,41 @@ def _simplify(pieces: Sequence[trimesh.Trimesh], corners: int) -> list[trimesh.T
 def _measure_protrusion(pieces: Sequence[trimesh.Trimesh], mesh: trimesh.Trimesh) -> float:
     """Return the largest distance of the pieces' outer surface from a mesh [m], sampled."""
     import trimesh
+    from scipy.spatial import KDTree
 
     # coal 3.0.3 takes points for inside if any triangle has no area.
     has_area = mesh.area_faces > 0.0
     if not has_area.any():
         return 0.0
-    triangles = make_bvh(MeshPart(np.asarray(mesh.vertices), np.asarray(mesh.faces)[has_area]))
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)[has_area]
+    triangles = make_bvh(MeshPart(vertices, faces))
     triangles.computeLocalAABB()
     here, request, result = coal.Transform3s(), coal.DistanceRequest(), coal.DistanceResult()
-    point_shape, furthest = coal.Sphere(_POINT_RADIUS), 0.0
+    point, furthest = coal.Sphere(_POINT_RADIUS), 0.0
+    points, normals = list[Floats](), list[Floats]()
     for piece in pieces:
-        samples, faces = trimesh.sample.sample_surface(piece, _SAMPLES, seed=0)
-        points = np.vstack([piece.triangles_center, samples])
-        outward = points + _OUTWARD * np.vstack([piece.face_normals, piece.face_normals[faces]])
-        is_covered = np.zeros(len(points), bool)
-        for other in pieces:
-            if other is not piece:
-                is_covered |= measure_outside(other, outward) < 0.0
-        for point in points[~is_covered]:
+        samples, sampled = trimesh.sample.sample_surface(piece, _SAMPLES, seed=0)
+        largest = np.argsort(-piece.area_faces, kind="stable")[:_SAMPLES]
+        points += [piece.triangles_center[largest], samples]
+        normals += [piece.face_normals[largest], piece.face_normals[sampled]]
+    places = np.vstack(points)
+    owners = np.repeat(np.arange(len(points)) // 2, [len(some) for some in points])
+    outward = places + _OUTWARD * np.vstack(normals)
+    # No point is further from the surface than from the nearest point of it: few are measured.
+    known, _ = trimesh.sample.sample_surface(mesh, _BOUNDING_SAMPLES, seed=0)
+    bounds, _ = KDTree(np.vstack([vertices[np.unique(faces)], known])).query(places)
+    order = np.argsort(-bounds)
+    for batch in np.split(order, range(_BATCH, len(order), _BATCH)):
+        is_covered = np.zeros(len(batch), bool)
+        for number, piece in enumerate(pieces):
+            others = owners[batch] != number
+            is_covered[others] |= measure_outside(piece, outward[batch[others]]) < 0.0
+        for k in batch[~is_covered]:
+            if bounds[k] <= furthest:
+                return furthest
             result.clear()
-            place = coal.Transform3s(np.eye(3), point)
-            distance = coal.distance(point_shape, place, triangles, here, request, result)
-            furthest = max(furthest, distance)
+            place = coal.Transform3s(np.eye(3), places[k])
+            furthest = max(furthest, coal.distance(point, place, triangles, here, request, result))
     return furthest
 
 
@@ -318,36 +342,42 @@ _RANDOM = np.random.default_rng(0).random((400, 3))
 
 
 # Directions spread over the sphere, in which the outlines of smooth parts are taken
-_DIRECTIONS = np.random.default_rng(1).normal(size=(3, 128))
+_DIRECTIONS = np.random.default_rng(1).normal(size=(3, 128)).T
 
 
 def _choose_extremes(points: Floats) -> Floats:
     """Return the points that are extreme in some direction, at most one for each."""
-    if len(points) <= _DIRECTIONS.shape[1]:
+    if len(points) <= len(_DIRECTIONS):
         return points
-    return points[np.unique((points @ _DIRECTIONS).argmax(axis=0))]
+    return points[np.unique((_DIRECTIONS @ points.T).argmax(axis=1))]
+
+
+# Choice of points on two outlines whose midpoints bound the protrusion of the common hull
+_MIDPOINTS = np.random.default_rng(2).integers(2**31, size=(2, 64))
 
 
 class _Hull:
-    """Convex hull of a part of a mesh's surface.
+    """Convex hull of parts of a mesh's surface.
 
     Attributes:
-        corners: Corners of the parts in it, shape (k, 3) [m].
-        outline: Those from which its measures are computed, shape (l, 3) [m].
+        parts: Vertices of each part, shape (k, 3) [m].
+        outline: Corners from which its measures are computed, shape (l, 3) [m].
         bounds: Corners of the box around it, shape (2, 3) [m].
         protrusion: Protrusion over the whole mesh [m].
     """
 
-    def __init__(self, points: Floats, surface: _Surface, corners: Floats | None = None) -> None:
+    def __init__(self, points: Floats, surface: _Surface, parts: Sequence[Floats] = ()) -> None:
         from scipy.spatial import ConvexHull, QhullError
 
-        points = thicken(points, _FLATNESS)[0]
+        self.parts = parts or (points,)
+        points, _ = thicken(points, _FLATNESS)
+        if len(points) > _MAX_HULL_POINTS:
+            points = _choose_extremes(points)
         try:
             hull = ConvexHull(points)
         except QhullError:
             hull = ConvexHull(points, qhull_options="QJ Pp")
         found = points[hull.vertices]
-        self.corners = found if corners is None else corners
         self.outline = _choose_extremes(found)
         self.volume, self.area = float(hull.volume), float(hull.area)
         self.bounds = np.array([found.min(axis=0), found.max(axis=0)])
@@ -363,7 +393,7 @@ class _Hull:
 
 
 def _cut_mesh(mesh: trimesh.Trimesh, most_pieces: int | None, error: float) -> list[Floats]:
-    """Return the corners of convex pieces that contain a mesh."""
+    """Return points whose hulls contain a mesh, for each piece."""
     merged = mesh.copy()
     merged.merge_vertices(merge_tex=True, merge_norm=True)
     merged.update_faces(merged.area_faces > 0.0)
@@ -372,21 +402,27 @@ def _cut_mesh(mesh: trimesh.Trimesh, most_pieces: int | None, error: float) -> l
 
     @cache
     def unite(one: _Hull, other: _Hull) -> _Hull:
-        outline, corners = (
-            np.vstack([getattr(hull, name) for hull in (one, other)])
-            for name in ("outline", "corners")
-        )
-        return _Hull(outline, surface, corners)
+        outline = np.vstack([one.outline, other.outline])
+        return _Hull(outline, surface, [*one.parts, *other.parts])
 
     few, most = (PIECES, _EXTRA * PIECES) if most_pieces is None else (most_pieces, most_pieces)
+
+    @cache
+    def estimate(one: _Hull, other: _Hull) -> float:
+        starts, ends = (
+            hull.outline[chosen % len(hull.outline)]
+            for hull, chosen in zip((one, other), _MIDPOINTS, strict=True)
+        )
+        return surface.measure_protrusion((starts + ends) / 2.0)
+
     for limit, least in (
         (_FREE_SHARE * error, 1),
         (_MERGE_SHARE * error, few),
         (error, few),
         (np.inf, most),
     ):
-        hulls = _merge_hulls(hulls, unite, limit, least)
-    return [hull.corners for hull in hulls]
+        hulls = _merge_hulls(hulls, unite, estimate, limit, least)
+    return [np.vstack(hull.parts) for hull in hulls]
 
 
 def _cut_surface(mesh: trimesh.Trimesh, surface: _Surface, limit: float) -> list[_Hull]:
@@ -449,13 +485,32 @@ def _find_cut(vertices: Floats, faces: Ints) -> tuple[Floats, float] | None:
     the volume falls, since the hull of half a ring is half a disc: planes of large facets, and to
     a lesser degree those through the middle, are preferred.
     """
-    vertices, faces = _coarsen(vertices, faces)
+    vertices, faces = _coarsen(vertices, faces, _MAX_TRIANGLES)
+    planes = list(_list_planes(vertices, faces))
+    if len(faces) > _MAX_COARSE_TRIANGLES:
+        values = _rate_planes(*_coarsen(vertices, faces, _MAX_COARSE_TRIANGLES), planes)
+        best = np.argsort(-values, kind="stable")[:_PROMISING_PLANES]
+        planes = [planes[k] for k in np.sort(best)]
+    values = _rate_planes(vertices, faces, planes)
+    if not np.isfinite(values).any():
+        return None
+    normal, offset, _ = planes[int(values.argmax())]
+    return normal, offset
+
+
+def _rate_planes(
+    vertices: Floats, faces: Ints, planes: Sequence[tuple[Floats, float, float]]
+) -> Floats:
+    """Return the relative reduction of the hulls' volume by planes plus bonuses, shape (k,).
+
+    It is -inf for planes that leave the part whole.
+    """
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges = edges[_find_unique_rows(edges)[0]]
+    edges = edges[find_unique_rows(edges)[0]]
     flatness = _FLATNESS if thicken(vertices, _FLATNESS)[1] else 0.0
     whole = _compute_hull_volume(vertices, flatness)
-    best, chosen = -np.inf, None
-    for normal, offset, bonus in _list_planes(vertices, faces):
+    values = np.full(len(planes), -np.inf)
+    for number, (normal, offset, bonus) in enumerate(planes):
         heights = _measure_heights(vertices, normal, offset)
         ends = heights[edges]
         across = (ends.min(axis=1) < 0.0) & (ends.max(axis=1) > 0.0)
@@ -469,10 +524,9 @@ def _find_cut(vertices: Floats, faces: Ints) -> tuple[Floats, float] | None:
             used &= above >= 0.0
             sides += bool(used.any())
             volumes += _compute_hull_volume(np.vstack([vertices[used], crossings]), flatness)
-        value = (whole - volumes) / whole + bonus
-        if sides > 1 and value > best:
-            best, chosen = value, (normal, offset)
-    return chosen
+        if sides > 1:
+            values[number] = (whole - volumes) / whole + bonus
+    return values
 
 
 def _list_planes(vertices: Floats, faces: Ints) -> Iterator[tuple[Floats, float, float]]:
@@ -490,8 +544,7 @@ def _list_planes(vertices: Floats, faces: Ints) -> Iterator[tuple[Floats, float,
     offsets = np.einsum("ij,ij->i", normals, corners[:, 0])
     extent = float(np.ptp(vertices, axis=0).max())
     planes = np.column_stack([normals, offsets])
-    _, group = np.unique((planes / (1, 1, 1, extent)).round(3), axis=0, return_inverse=True)
-    group = group.reshape(-1)
+    _, group = find_unique_rows((planes / (1, 1, 1, extent)).round(3))
     facets = np.bincount(group, areas)
     sums = [np.bincount(group, areas * column) for column in planes.T]
     means = np.asarray(np.column_stack(sums), float)
@@ -507,15 +560,15 @@ def _list_planes(vertices: Floats, faces: Ints) -> Iterator[tuple[Floats, float,
             yield axis, float(place), 0.01 * float(rank)
 
 
-def _coarsen(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
-    """Return at most `_MAX_TRIANGLES` triangles between vertices of a mesh.
+def _coarsen(vertices: Floats, faces: Ints, most: int) -> tuple[Floats, Ints]:
+    """Return at most `most` triangles between vertices of a mesh.
 
     In each cell of a grid, the vertex at the sharpest corner stands for all, so that facets stay in
     their planes.
     """
     import trimesh
 
-    if len(faces) <= _MAX_TRIANGLES:
+    if len(faces) <= most:
         return vertices, faces
     normals = np.zeros((len(faces), 3))
     found, has_area = trimesh.triangles.normals(vertices[faces])
@@ -528,29 +581,19 @@ def _coarsen(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
     total = np.column_stack(sums)
     order = np.argsort(np.linalg.norm(total, axis=1) / np.maximum(counts, 1), kind="stable")
     cell, kept = float(np.ptp(vertices, axis=0).max()) / 64.0, faces
-    while len(kept) > _MAX_TRIANGLES:
+    while len(kept) > most:
         cells = np.floor(vertices[order] / cell).astype(np.int64)
-        first, group = _find_unique_rows(cells)
+        first, group = find_unique_rows(cells)
         representative = np.empty(len(vertices), int)
         representative[order] = order[first][group]
-        kept = np.sort(representative[faces], axis=1)
-        kept = kept[(kept[:, 0] < kept[:, 1]) & (kept[:, 1] < kept[:, 2])]
-        kept = kept[_find_unique_rows(kept)[0]]
+        coarse = np.sort(representative[faces], axis=1)
+        coarse = coarse[(coarse[:, 0] < coarse[:, 1]) & (coarse[:, 1] < coarse[:, 2])]
+        if not len(coarse):  # a strip narrower than a cell
+            break
+        kept = coarse[find_unique_rows(coarse)[0]]
         cell *= 1.4
     used, kept = np.unique(kept, return_inverse=True)
     return vertices[used], kept.reshape(-1, 3)
-
-
-def _find_unique_rows(rows: Ints) -> tuple[Ints, Ints]:
-    """Return the first index of each distinct row, in lexicographic order, and each row's group.
-
-    It is `numpy.unique` along the first axis, which takes four times as long.
-    """
-    order = np.lexsort(rows.T[::-1])
-    differs = (np.diff(rows[order], axis=0) != 0).any(axis=1)
-    group = np.empty(len(rows), int)
-    group[order] = np.append(0, np.cumsum(differs))[: len(rows)]
-    return order[np.append(True, differs)[: len(rows)]], group
 
 
 def _compute_hull_volume(points: Floats, flatness: float = 0.0) -> float:
@@ -569,39 +612,53 @@ def _compute_hull_volume(points: Floats, flatness: float = 0.0) -> float:
 
 
 def _merge_hulls(
-    hulls: Sequence[_Hull], unite: Callable[[_Hull, _Hull], _Hull], limit: float, least: int
+    hulls: Sequence[_Hull],
+    unite: Callable[[_Hull, _Hull], _Hull],
+    estimate: Callable[[_Hull, _Hull], float],
+    limit: float,
+    least: int,
 ) -> list[_Hull]:
     """Merge pairs whose common hull protrudes least, until `least` are left.
 
-    No result protrudes by more than `limit` [m].
+    No result protrudes by more than `limit` [m]. `unite` returns the common hull of two, `estimate`
+    a lower bound of its protrusion [m].
     """
     if len(hulls) <= least:
         return list(hulls)
     left = dict(enumerate(hulls))
     numbers = itertools.count(len(left))
     slack = _CUT_SHARE * limit if np.isfinite(limit) else 0.0
-    queue = list[tuple[float, int, int, _Hull]]()
+    queue = list[tuple[float, int, int, _Hull | None]]()
 
-    def add_pair(i: int, j: int) -> None:
-        low, high = left[i].bounds, left[j].bounds
+    def add_pair(i: int, j: int, union: _Hull | None = None) -> None:
+        bounds = np.stack([left[i].bounds, left[j].bounds])
+        low, high = bounds.transpose(1, 0, 2)
         # Between parts that are further apart, the hull would protrude more.
-        if max((low[0] - high[1]).max(), (high[0] - low[1]).max()) <= 2.0 * limit:
-            union = unite(left[i], left[j])
-            if union.protrusion <= limit:
-                # Among those that protrude little, small ones come first.
-                size = float(np.linalg.norm(np.ptp(union.bounds, axis=0)))
-                added = max(union.volume - left[i].volume - left[j].volume, 0.0) / union.area
-                cost = max(union.protrusion - slack, 0.0) + _SIZE_COST * size + _VOLUME_COST * added
-                heapq.heappush(queue, (cost, i, j, union))
+        if (low.max(axis=0) - high.min(axis=0)).max() > 2.0 * limit:
+            return
+        protrusion = union.protrusion if union else estimate(left[i], left[j])
+        if protrusion > limit:
+            return
+        # Among those that protrude little, small ones come first.
+        size = float(np.linalg.norm(high.max(axis=0) - low.min(axis=0)))
+        cost = max(protrusion - slack, 0.0) + _SIZE_COST * size
+        if union:
+            added = max(union.volume - left[i].volume - left[j].volume, 0.0) / union.area
+            cost += _VOLUME_COST * added
+        heapq.heappush(queue, (cost, i, j, union))
 
     for i, j in itertools.combinations(left, 2):
         add_pair(i, j)
     while queue and len(left) > least:
         _, i, j, union = heapq.heappop(queue)
-        if i in left and j in left:
-            del left[i], left[j]
-            left[k := next(numbers)] = union
-            for other in left:
-                if other != k:
-                    add_pair(other, k)
+        if i not in left or j not in left:
+            continue
+        if union is None:
+            add_pair(i, j, unite(left[i], left[j]))
+            continue
+        del left[i], left[j]
+        left[k := next(numbers)] = union
+        for other in left:
+            if other != k:
+                add_pair(other, k)
     return list(left.values())

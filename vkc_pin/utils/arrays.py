@@ -9,7 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["MAX_COORDINATE", "MIN_POSITIVE", "Bools", "Floats", "Ints", "replace_infinite"]
+__all__ = [
+    "MAX_COORDINATE",
+    "MIN_POSITIVE",
+    "Bools",
+    "Floats",
+    "Ints",
+    "find_unique_rows",
+    "replace_infinite",
+]
 
 MAX_COORDINATE = 1e4
 """Largest length [m] or angle [rad] in files and arguments."""
@@ -19,6 +27,18 @@ MIN_POSITIVE = 1e-6
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int_]
 Bools = NDArray[np.bool_]
+
+
+def find_unique_rows(rows: NDArray[Any]) -> tuple[Ints, Ints]:
+    """Return the first index of each distinct row, in lexicographic order, and each row's group.
+
+    It is `numpy.unique` along the first axis, which takes four times as long.
+    """
+    order = np.lexsort(rows.T[::-1])
+    differs = (np.diff(rows[order], axis=0) != 0).any(axis=1)
+    group = np.empty(len(rows), int)
+    group[order] = np.append(0, np.cumsum(differs))[: len(rows)]
+    return order[np.append(True, differs)[: len(rows)]], group
 
 
 def replace_infinite(data: Any) -> Any:

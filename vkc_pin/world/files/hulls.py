@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.arrays import Floats, find_unique_rows
 
 if TYPE_CHECKING:
     import trimesh
@@ -139,10 +139,10 @@ def _sample_directions(hull: trimesh.Trimesh) -> Floats:
         [np.sqrt(1.0 - z**2) * np.cos(turn), np.sqrt(1.0 - z**2) * np.sin(turn), z], axis=1
     )
     normals = np.asarray(hull.face_normals)
-    _, first = np.unique(normals.round(2), axis=0, return_index=True)
+    first, _ = find_unique_rows(normals.round(2))
     if len(first) > _MAX_FACETS:
         normals = normals[np.argsort(-hull.area_faces, kind="stable")]
-        _, first = np.unique(normals.round(1), axis=0, return_index=True)
+        first, _ = find_unique_rows(normals.round(1))
     return np.vstack([normals[np.sort(first)], spread])
 
 
@@ -175,5 +175,5 @@ def _intersect_half_spaces(
     centre = inner.mean(axis=0)
     corners = HalfspaceIntersection(np.column_stack([normals, -offsets]), centre).intersections
     corners = corners[np.isfinite(corners).all(axis=1)]
-    _, first = np.unique(corners.round(7), axis=0, return_index=True)
+    first, _ = find_unique_rows(corners.round(7))
     return ConvexHull(corners[np.sort(first)])

@@ -113,7 +113,7 @@ def _change(file: Any, given: dict[str, Any]) -> None:
 
 def _change_member(file: Any, name: str, action: str, value: Any) -> None:
     if action == "fill":
-        if isinstance(file[name], h5py.Dataset) and file[name].dtype.kind != "S":
+        if isinstance(file[name], h5py.Dataset) and file[name].dtype.kind not in "SO":
             with np.errstate(all="ignore"):
                 file[name][...] = np.full(file[name].shape, value, float).astype(file[name].dtype)
         return

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -52,6 +54,19 @@ def test_large_jerk_limits_cost_little_time() -> None:
     ]
     assert longest == sorted(longest)
     assert longest[0] <= 1.03 * pace.times[-1]
+
+
+def test_coordinates_without_limits_cause_no_warning() -> None:
+    """Wheeled bases have coordinates whose accelerations and jerks are unlimited."""
+    points = np.cumsum(np.random.default_rng(4).uniform(0.1, 0.4, (5, 2)), axis=0)
+    path, pace, limits = make_path(points, 20.0)
+    free = limits._replace(
+        acceleration=np.append(limits.acceleration[:1], np.inf), jerk=np.array([20.0, np.inf])
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        curve = limit_jerk(path, pace, 4, free)
+    assert curve.compute_jerks()[0][:, 0].max() <= 20.0 * (1.0 + 1e-6)
 
 
 def test_curve_stays_on_the_path() -> None:

@@ -36,7 +36,8 @@ def limit_jerk(path: CubicHermiteSpline, pace: Curve, steps: int, limits: Limits
         steps: Number of steps.
         limits: Limits of the path's coordinates.
     """
-    rise_time = float((limits.acceleration / limits.jerk)[np.isfinite(limits.jerk)].max())
+    limited = np.isfinite(limits.jerk)
+    rise_time = float((limits.acceleration[limited] / limits.jerk[limited]).max())
     candidates = (
         limits.slow_down(_average_pace(path, pace, steps, factor * rise_time))
         for factor in _SPAN_FACTORS

@@ -314,6 +314,8 @@ class _Compiler:
         self._release_fixed_objects()
         point = not isinstance(step.target, pin.SE3)
         target = pin.SE3(np.eye(3), np.array(step.target)) if point else step.target
+        if hold is not None and not point:
+            self._check_level(hold, link, target, f"{where}.target")
         goal = FrameGoal(link, target, "point" if point else "pose", hold, touches=True)
         self._append("touch", (step.frame,), self.options.reach_waypoints, frames=(goal,))
 
@@ -332,10 +334,17 @@ class _Compiler:
         # As it rests now; an object held from the start, with its z axis up.
         rotation = np.eye(3) if step.object in self.scene.held else placed.placement.rotation
         pose = pin.SE3(rotation, np.array(step.pose)) if upright else step.pose
+        self._check_level(hold, placed.object.base_link, pose, f"{where}.pose")
         goal = FrameGoal(placed.object.base_link, pose, "upright" if upright else "pose", hold)
         about, count = (step.object,), self.options.reach_waypoints
         self._append("place", about, count, frames=(goal,), lowered={hold: pose})
         self._release(hold, pose, nearly=upright)
+
+    def _check_level(self, hold: Hold, link: str, goal: pin.SE3, where: str) -> None:
+        """Check that no object on a carried one would tilt with `link` at a goal."""
+        placed = self.scene.objects[hold.object]
+        local = placed.object.link_placement(link, placed.state)
+        self.supports.check_level(hold, goal * local.inverse(), where)
 
     def release(self, step: Release, where: str) -> None:
         """Release one object, or all."""

@@ -28,6 +28,9 @@ __all__ = [
 ]
 
 
+_LEVEL = 1e-3  # [rad] tilt up to which a goal counts as level: the tolerance of goals
+
+
 class SupportTracker:
     """Free objects that rest on links which a robot carries or moves.
 
@@ -53,6 +56,12 @@ class SupportTracker:
             for one in supported:
                 self.resting.pop(one.object)
                 self.moved.add(one.object)
+
+    def check_level(self, hold: Hold, placement: pin.SE3, where: str) -> None:
+        """Check that a goal of a carried object keeps the objects on it level."""
+        for one in self.carried:
+            if one.hold == hold:
+                _check_tilt(one, compute_tilt(one.carrier_placement, placement), _LEVEL, where)
 
     def release_carried(self, hold: Hold, placement: pin.SE3) -> list[str]:
         """Release the objects on a free object released at `placement`; return their names."""
@@ -144,8 +153,12 @@ def compute_placement_after_motion(
 ) -> pin.SE3:
     """Return the placement of a supported object after a joint of its support has moved."""
     link = after.link_placement(one.link)
-    if (angle := compute_tilt(before.link_placement(one.link), link)) > MAX_TILT:
-        problem = f"'{one.object}' rests on '{one.support}', which would tilt too much"
-        expected = f"that it is removed before, or at most {MAX_TILT:g} rad"
-        raise InputError(problem, field=where, expected=expected, got=f"{angle:.2f} rad")
+    _check_tilt(one, compute_tilt(before.link_placement(one.link), link), MAX_TILT, where)
     return link * one.placement_in_link
+
+
+def _check_tilt(one: SupportedObject, angle: float, most: float, where: str) -> None:
+    if angle > most:
+        problem = f"'{one.object}' rests on '{one.support}', which would tilt too much"
+        expected = f"that it is removed before, or at most {most:g} rad"
+        raise InputError(problem, field=where, expected=expected, got=f"{angle:.3g} rad")

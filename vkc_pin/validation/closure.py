@@ -23,7 +23,7 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 __all__ = ["Drift", "find_drift"]
 
 RESOLUTION = 1e-6
-"""Accuracy of a maximum [m] or [rad]."""
+"""Accuracy of a maximum: absolute up to 1 m or 1 rad, relative beyond."""
 PROVEN_FRACTION = 0.5
 """Fraction of a limit below which errors are only bounded, and not maximized."""
 
@@ -102,7 +102,8 @@ def _maximize(
             + bound_curvature(begin, end) * ((end - begin) ** 2 / 8.0)[:, None]
         )
         bound[:, 1] = np.arcsin(np.minimum(bound[:, 1], 1.0))
-        proven = np.maximum(found + RESOLUTION, PROVEN_FRACTION * limits)
+        proven = found + RESOLUTION * np.maximum(found, 1.0)
+        proven = np.maximum(proven, PROVEN_FRACTION * limits)
         open_ = np.flatnonzero((bound > proven).any(axis=1) & (end - begin > 1e-12))
         if not len(open_) or (budget := budget - len(open_)) < 0:
             break

@@ -252,6 +252,19 @@ def test_failed_attachments_are_noted() -> None:
     assert result.report.notes[-1].startswith("at drawer.roof: reach drawer.roof: out of reach")
 
 
+def test_attachments_that_only_a_user_can_choose_are_noted() -> None:
+    """Lying on its side, the cup is held too low at `side`: the fingers need 20 mm to the table."""
+    scene = vkc.load_scene("household")
+    lying = pin.SE3(pin.exp3(np.array([0.0, np.pi / 2, 0.0])), np.array([-0.6, -1.6, 0.786]))
+    first = vkc.plan(scene, [vkc.Place("cup", lying)])
+    assert first.status == "infeasible"
+    untried = "at cup.oblique, cup.top: not tried, since the step names none"
+    assert first.report.notes[-1] == untried
+    assert vkc.plan(scene, [vkc.Place("cup", lying, "oblique")]).success
+    named = vkc.plan(scene, [vkc.Place("cup", lying, "side")])
+    assert untried not in named.report.notes
+
+
 @pytest.mark.long
 def test_another_attachment_of_one_step() -> None:
     scene = add_attachment(vkc.load_scene("drawer"), "drawer", "ceiling", 4.0)

@@ -15,7 +15,11 @@ from vkc_pin.planning.results import add_statistics, concatenate_plans
 from vkc_pin.planning.solve_task import TaskResult, solve_task
 from vkc_pin.utils.budget import current_ending, reserve_time, share_budget
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.actions import generate_alternatives, has_open_attachment
+from vkc_pin.world.task.actions import (
+    generate_alternatives,
+    has_open_attachment,
+    list_untried_attachments,
+)
 from vkc_pin.world.task.actuation import find_shared_coordinate
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Task
@@ -110,7 +114,7 @@ def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) 
 
     Returns:
         The first success, whose steps name the attachment unless it is the default; if all fail,
-        the first result, with notes on the others.
+        the first result, with notes on the others and on attachments that only a user can choose.
     """
     # Terms may name phases by their numbers, which grasping anew would change.
     alternatives = functools.cache(
@@ -120,7 +124,7 @@ def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) 
         first = last = solve_task(scene, task, request)
     if first.plan.success or first.is_grasp_independent or current_ending():
         return first
-    statistics, notes = [first.plan.statistics], list[str]()
+    statistics, notes = [first.plan.statistics], list_untried_attachments(scene, task)
     for number, (name, steps) in enumerate(alternatives()):
         if current_ending():
             break
@@ -130,7 +134,7 @@ def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) 
         if last.plan.success:
             return dataclasses.replace(last, plan=add_statistics(last.plan, statistics))
         notes.append(f"at {name}: {next(iter(last.plan.report.notes), last.plan.status)}")
-    if last is first:
+    if not notes:
         return first
     plan = first.plan
     status = current_ending() or plan.status

@@ -22,6 +22,7 @@ __all__ = [
     "generate_alternatives",
     "group_into_actions",
     "has_open_attachment",
+    "list_untried_attachments",
 ]
 
 
@@ -84,6 +85,25 @@ def generate_alternatives(
                     f"{step.object}.{name}",
                     (*task.steps[:number], changed, *task.steps[number + 1 :]),
                 )
+
+
+def list_untried_attachments(scene: Scene, task: Task) -> list[str]:
+    """List attachments of objects that a step grasps at the first one for want of a name.
+
+    They are not tried in its place: some are for tools, others for another use of the object.
+    """
+    found = []
+    for step in task.steps:
+        if isinstance(step, Grasp | Place) and step.attachment is None:
+            used = {hold.attachment for hold in task.holds if hold.object == step.object}
+            others = [
+                f"{step.object}.{name}"
+                for name in scene.objects[step.object].object.attachments
+                if name not in used
+            ]
+            if others and step.object not in scene.held:
+                found.append(f"at {', '.join(others)}: not tried, since the step names none")
+    return list(dict.fromkeys(found))
 
 
 def _regrasp(scene: Scene, step: Step) -> tuple[Release, Actuate | Place] | None:

@@ -166,6 +166,27 @@ def test_doctor_proposes_a_height_that_suits_common_tasks(tmp_path: Path) -> Non
     assert not find_texts(vkc.importing.doctor(robot, samples=5), "limitation", "hand")
 
 
+@pytest.mark.parametrize(("gap", "is_barred"), [(0.01, True), (0.03, False)])
+def test_doctor_keeps_the_clearances_of_plans(tmp_path: Path, gap: float, is_barred: bool) -> None:
+    """The hand rolls by a quarter turn for level bars, and a camera comes near fins beside it."""
+    locked = OPEN | {"arm_5_joint": 0.0}
+    robot = write_robot(tmp_path, locked_joints=locked, srdf="all_pairs.srdf")
+    (tmp_path / "all_pairs.srdf").write_text('<robot name="robot"/>', encoding="utf-8")
+    path, parts = tmp_path / "robot.urdf", ""
+    for name, parent, place in (
+        ("left_fin", "arm_3", "0 0.1 0.15"),
+        ("right_fin", "arm_3", "0 -0.1 0.15"),
+        ("camera", "arm_4", f"0.1 0 {gap - 0.01}"),
+    ):
+        parts += f'<link name="{name}"><collision><geometry><box size="0.04 0.04 0.04"/>'
+        parts += f'</geometry></collision></link><joint name="{name}_joint" type="fixed">'
+        parts += f'<origin xyz="{place}"/><parent link="{parent}"/><child link="{name}"/></joint>'
+    text = path.read_text(encoding="utf-8").replace("</robot>", parts + "</robot>")
+    path.write_text(text, encoding="utf-8")
+    limitations = find_texts(vkc.importing.doctor(robot, samples=5), "limitation", "hand")
+    assert any("cannot grasp level bars" in text for text in limitations) == is_barred
+
+
 @pytest.mark.parametrize(("range_", "side"), [((0.0, 2.0), "right"), ((-2.0, 0.0), "left")])
 def test_doctor_reports_a_wrist_that_cannot_turn_a_lever(
     tmp_path: Path, range_: tuple[float, float], side: str

@@ -8,10 +8,9 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import VkcError
+from vkc_pin.importing.robots.rest_configuration import Clearances
 from vkc_pin.options import Options
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.shapes import ShapeDistances
 
 __all__ = ["sample_reachable_poses"]
 
@@ -40,8 +39,8 @@ def sample_reachable_poses(robot: Robot, name: str, number: int, *, seed: int = 
         np.where(np.isfinite(robot.upper), robot.upper, np.pi),
     )
     low[:3], high[:3] = (-_AWAY, -_AWAY, -np.pi), (_AWAY, _AWAY, np.pi)
-    free, data, frame = (
-        _Free(robot),
+    clearances, data, frame = (
+        Clearances(robot),
         robot.model.createData(),
         robot.model.getFrameId(robot.tool_frame),
     )
@@ -50,7 +49,8 @@ def sample_reachable_poses(robot: Robot, name: str, number: int, *, seed: int = 
         if len(poses) == number:
             return poses
         z = rng.uniform(low, high)
-        if free(z):
+        clearances.place(z[3:])
+        if clearances.is_free():
             pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(z))
             pose = data.oMf[frame]
             if pose.translation[2] > Options().dist_safe:
@@ -59,27 +59,3 @@ def sample_reachable_poses(robot: Robot, name: str, number: int, *, seed: int = 
         f"{name}: only {len(poses)} of {number * _TRIES} random configurations are free of "
         "collision"
     )
-
-
-class _Free:
-    """Checks whether a configuration keeps the robot's default margins."""
-
-    def __init__(self, robot: Robot) -> None:
-        options, shapes = Options(), robot.collision.geometryObjects
-        self._distances = ShapeDistances(robot.model, robot.coordinates.q, shapes)
-        margins = robot.own_margins(options.self_distance)
-        self._pairs, self._margins = list(margins), np.array(list(margins.values()))
-        self._numbers, self._floor = (
-            np.array(self._pairs, np.int64).reshape(-1, 2),
-            options.dist_safe,
-        )
-        self._carried = np.array([shape.parentJoint > 1 for shape in shapes])
-
-    def __call__(self, z: Floats) -> bool:
-        self._distances.set_configuration(z)
-        if (self._distances.compute_lowest_points()[self._carried] < self._floor).any():
-            return False
-        close = np.flatnonzero(self._distances.compute_lower_bounds(self._numbers) < self._margins)
-        return all(
-            self._distances.compute_distance([self._pairs[k]]) >= self._margins[k] for k in close
-        )

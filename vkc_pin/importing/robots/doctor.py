@@ -368,7 +368,7 @@ def _check_grasps(robot: Robot, hand: Hand, seed: int) -> list[Finding]:
         hint = "no other height of its base suits all of this"
         if not len(heights["level"]):
             text = "it cannot grasp level bars, such as most handles: no configuration holds one"
-            hint = "a wrist that rolls the hand, or a tool frame that is turned about z"
+            hint = "a wrist that rolls the hand with clearance, or a tool frame turned about z"
         hint = _suggest_height(robot, seed) or hint
         findings.append(Finding("limitation", "hand", text, hint))
     return findings

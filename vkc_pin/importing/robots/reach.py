@@ -62,7 +62,7 @@ def find_grasp_heights(
     """Return the heights at which a hand can grasp bars on a vertical face.
 
     The base is wherever it is needed. Configurations are found by inverse kinematics; their links
-    overlap neither each other nor the floor, and stay on the hand's side of the face.
+    keep the default margins to each other and the floor, and stay on the hand's side of the face.
 
     Args:
         robot: The robot.
@@ -229,7 +229,7 @@ class _GraspSearch:
     def _is_free(self, arm: Floats) -> bool:
         """Return whether all links are free, and on the hand's side of the face."""
         self._clearances.place(arm)
-        if self._clearances.least(0.0, floor=-self._lift) < 0.0:
+        if not self._clearances.is_free(floor=-self._lift):
             return False
         self._measure(arm, 0.0, 0.0)
         normal = np.cross(self._pose.rotation[:, self._level], [0.0, 0.0, 1.0])  # of the face

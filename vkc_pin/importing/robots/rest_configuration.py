@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.options import Options
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_model import find_nearest_position
@@ -59,7 +60,10 @@ class Clearances:
         self._distances = ShapeDistances(robot.model, robot.coordinates.q, shapes)
         self.pairs = [(pair.first, pair.second) for pair in robot.collision.collisionPairs]
         self._pairs = np.array(self.pairs, np.int64).reshape(-1, 2)
-        self._is_moved = np.array([shape.parentJoint > 1 for shape in shapes])
+        self._options = Options()
+        margins = robot.own_margins(self._options.self_distance)
+        self._margins = np.array([margins[pair] for pair in self.pairs])
+        self._is_moved = np.array([shape.parentJoint > 1 for shape in shapes], bool)
         self._names = [robot.link_of(k) for k in range(len(shapes))]
 
     def place(self, arm: Floats) -> None:
@@ -78,10 +82,22 @@ class Clearances:
             heights[self._names[k]] = min(float(lowest[k]), heights.get(self._names[k], np.inf))
         return sorted(heights.items(), key=lambda item: item[1])
 
-    def least(self, limit: float = np.inf, *, floor: float = 0.0) -> float:
-        """Return the smallest distance between links and to the floor [m], at most `limit`."""
+    def is_free(self, *, floor: float = 0.0) -> bool:
+        """Return whether the links keep the default margins of plans, at a height of the floor."""
         lowest = self._distances.compute_lowest_points()[self._is_moved].min(initial=np.inf)
-        nearest = float(min(limit, lowest - floor))
+        if lowest < floor + self._options.dist_safe:
+            return False
+        close = np.flatnonzero(self._distances.compute_lower_bounds(self._pairs) < self._margins)
+        return all(
+            self._distances.compute_distance([self.pairs[k]]) >= self._margins[k]
+            for k in close.tolist()
+        )
+
+    def least(self, limit: float = np.inf) -> float:
+        """Return the smallest distance between links and to the floor [m], at most `limit`."""
+        nearest = float(
+            min(limit, self._distances.compute_lowest_points()[self._is_moved].min(initial=np.inf))
+        )
         bounds = self._distances.compute_lower_bounds(self._pairs)
         for k in np.argsort(bounds).tolist():
             if bounds[k] > nearest:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.small_problems import make_full_scene
 
@@ -16,6 +17,7 @@ from vkc_pin.validation.closure import (
 )
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -109,6 +111,29 @@ def test_drift_of_grasps_with_freedoms_is_that_of_a_fine_grid(attachment: str) -
     drift = find_drift(samples, span, span.holds[0], (0.0, 0.0))
     fine = samples.compute_grasp_errors_at(span.holds[0], np.linspace(*times, 5001))
     np.testing.assert_allclose(drift.measured, fine.max(axis=0), rtol=0.0, atol=5e-6)
+
+
+@pytest.mark.parametrize("attachment", ["rail", "sleeve", "socket", "wheel", "face"])
+def test_errors_are_measured_from_the_frame_of_the_attachment(attachment: str) -> None:
+    scene = make_full_scene()
+    held = scene.objects["cabinet"].object.attachments[attachment]
+    coordinates = [f"cabinet.{suffix}" for suffix in held.coordinates]
+    names = (*scene.robot.coordinates.names, "cabinet.swing", "cabinet.slide", *coordinates)
+    positions = np.random.default_rng(4).uniform(-2.0, 2.0, (3, len(names)))
+    hold = vkc.Hold("cabinet", attachment)
+    span, times = vkc.PhaseSpan("all", 0, 2, (hold,)), np.array([0.0, 0.5, 1.0])
+    samples = Samples(scene, Trajectory(names, times, positions, (span,), len(scene.start)))
+    rows = samples.waypoint_rows
+    frames = (scene.robot.tool_frame, f"cabinet.{held.link}")
+    placements = zip(*(samples.compute_placements(rows, name) for name in frames), strict=True)
+    off = [
+        (link * held.tool(values)).actInv(tool * compute_hand_frame(scene.robot, held))
+        for (tool, link), values in zip(placements, positions[:, -len(coordinates) :], strict=True)
+    ]
+    expected = [
+        (np.linalg.norm(one.translation), np.linalg.norm(pin.log3(one.rotation))) for one in off
+    ]
+    np.testing.assert_allclose(samples.compute_grasp_errors(hold, rows), expected, atol=1e-9)
 
 
 def test_drift_below_half_of_the_limit_is_only_bounded(plan: Plan) -> None:

@@ -13,7 +13,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_choice
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.validation.report import Violation
-from vkc_pin.world.models.articulated_object import Freedom
+from vkc_pin.world.models.articulated_object import Attachment, Freedom
 from vkc_pin.world.models.grippers.bar_width import WIDTH_TOLERANCE
 from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import Hold, get_attachment
@@ -290,17 +290,28 @@ class Samples:
         for column, suffix in enumerate(attachment.coordinates):
             if f"{owner}.{suffix}" in names:
                 values[:, column] = positions[:, names.index(f"{owner}.{suffix}")]
-        # The freedoms of most grasps are constant.
-        known, which = np.unique(values, axis=0, return_inverse=True)
-        held = [attachment.tool(row) for row in known]
-        turn, origin = (
-            np.array([getattr(part, side) for part in held]) for side in ("rotation", "translation")
-        )
-        which = which.reshape(-1)
-        aimed = origins[:, 1] + np.einsum("kij,kj->ki", turns[:, 1], origin[which])
+        turn, origin = _compute_tools(attachment, values)
+        aimed = origins[:, 1] + np.einsum("kij,kj->ki", turns[:, 1], origin)
         off = origins[:, 0] + turns[:, 0] @ hand.translation - aimed
-        rotation = np.swapaxes(turns[:, 1] @ turn[which], 1, 2) @ turns[:, 0] @ hand.rotation
+        rotation = np.swapaxes(turns[:, 1] @ turn, 1, 2) @ turns[:, 0] @ hand.rotation
         return np.column_stack([np.linalg.norm(off, axis=1), _compute_angles(rotation)])
+
+
+def _compute_tools(attachment: Attachment, values: Floats) -> tuple[Floats, Floats]:
+    """Compute `Attachment.tool` for K rows of values: rotations (K, 3, 3), origins (K, 3) [m]."""
+    turns = np.broadcast_to(attachment.placement.rotation, (len(values), 3, 3))
+    origins = np.broadcast_to(attachment.placement.translation, (len(values), 3))
+    for freedom, steps in zip(attachment.freedoms, values.T, strict=True):
+        if freedom.unit == "rad":
+            cross, amounts = pin.skew(freedom.axis), steps[:, None, None]
+            turn = np.eye(3) + np.sin(amounts) * cross + (1.0 - np.cos(amounts)) * cross @ cross
+            shifts = freedom.through - turn @ freedom.through
+        else:
+            turn, shifts = np.eye(3), steps[:, None] * freedom.axis
+        origins = origins + np.einsum("kij,kj->ki", turns, shifts)
+        turns = turns @ turn
+    offset = attachment.offset
+    return turns @ offset.rotation, origins + turns @ offset.translation
 
 
 def _compute_angles(rotations: Floats) -> Floats:

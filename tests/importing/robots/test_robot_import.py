@@ -238,6 +238,22 @@ def test_file_name_cannot_add_fields_to_the_description(
     assert vkc.load_robot(made.folder).name == stem
 
 
+@pytest.mark.parametrize(
+    ("first", "named"), [("body", "all links"), ("hand", "hand, finger_a, finger_b")]
+)
+def test_visual_shapes_replace_missing_collision_shapes(
+    tmp_path: Path, first: str, named: str
+) -> None:
+    """The file has collision shapes before the link `first` only."""
+    file = write_arms(tmp_path / "given")
+    head, link, tail = file.read_text(encoding="utf-8").partition(f'<link name="{first}"')
+    file.write_text(head + link + tail.replace("collision>", "visual>"), encoding="utf-8")
+    made = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
+    assert f"visual shapes are used for want of collision shapes: {named} [guess]" in str(made)
+    assert "which open from 0 to 80 mm" in str(made)
+    assert {"hand", "finger_a", "finger_b"} <= set(made.robot.touch_links)
+
+
 STUCK = ("the gripper does not move: its fingers stay", False)
 
 

@@ -18,6 +18,7 @@ import yaml
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.importing.robots.arms import (
     Arm,
+    Body,
     build_body_tree,
     choose_arm,
     find_arms,
@@ -70,6 +71,7 @@ _NEAR, _MOSTLY = 300, 0.75
 # [m] Distance up to which links are neighbours by design, such as the segments of a telescope
 _NEIGHBOURS = Options().dist_safe + 0.005
 _CLOSED = 0.01  # [m] opening below which fingers that do not move can grasp nothing
+_AT_END = 3  # joints after which links belong to an arm or its hand
 _STANDING = 0.005  # [m] height up to which a root stands on the floor
 
 
@@ -191,15 +193,13 @@ class _Importer:
         seed: int,
     ) -> ImportedRobot:
         """Write all files into the folder."""
-        solid = {shape.link for shape in self._file.read_shapes("collision")}
-        if not solid:
-            self._use_visual_shapes()
-            solid = {shape.link for shape in self._file.read_shapes("collision")}
         if tool_frame is not None and tool_frame not in (names := sorted(self._get_names())):
             raise UnknownNameError(
                 "frame", tool_frame, names, file=self._file.path, field="tool_frame"
             )
         tree = build_body_tree(self._file)
+        self._use_visual_shapes(tree)
+        solid = {shape.link for shape in self._file.read_shapes("collision")}
         base_joints = find_own_base(self._file, tree, solid)
         arms = find_arms(self._file, tree, self._source.groups, solid)
         chosen = (
@@ -239,19 +239,30 @@ class _Importer:
         diagnosis = Diagnosis(self._name, findings)
         return ImportedRobot(self._folder, robot, names, tuple(pieces), diagnosis)
 
-    def _use_visual_shapes(self) -> None:
-        """Use visual shapes for collision if the file has no collision shapes."""
+    def _use_visual_shapes(self, tree: Body) -> None:
+        """Use visual shapes for collision where the file has none: everywhere, or for hands."""
+        solid = {shape.link for shape in self._file.read_shapes("collision")}
+        links = set[str]()
+        for body in tree.subtree():
+            below = {link for part in body.subtree() for link in part.links}
+            at_end = sum(part.is_planned for part in body.path()) >= _AT_END
+            if (at_end or not solid) and not solid & below:
+                links |= below
+        used = list[str]()
         for link in self._file.root.findall("link"):
-            for visual in link.findall("visual"):
+            for visual in link.findall("visual") if link.get("name") in links else ():
                 element = ElementTree.SubElement(link, "collision")
                 element.extend(child for child in visual if child.tag in ("origin", "geometry"))
-        if not self._file.read_shapes("collision"):
+                used.append(link.get("name", ""))
+        if not solid and not used:
             raise InputError(
                 "the robot has no shapes",
                 file=self._file.path,
                 expected="<collision> or <visual> elements",
             )
-        self._guess("guess", "no link has a collision shape: visual shapes are used")
+        if used:
+            which = ", ".join(dict.fromkeys(used)) if solid else "all links"
+            self._guess("guess", f"visual shapes are used for want of collision shapes: {which}")
 
     def _guess(self, sure: str, text: str, hint: str = "") -> None:
         self._findings.append(

@@ -239,7 +239,7 @@ def test_file_name_cannot_add_fields_to_the_description(
 
 
 @pytest.mark.parametrize(
-    ("first", "named"), [("body", "all links"), ("hand", "hand, finger_a, finger_b")]
+    ("first", "named"), [("body", "all links"), ("arm_5", "arm_5, hand, finger_a, finger_b")]
 )
 def test_visual_shapes_replace_missing_collision_shapes(
     tmp_path: Path, first: str, named: str

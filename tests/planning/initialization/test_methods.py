@@ -140,16 +140,6 @@ def test_stationary_guesses_move_the_base_straight_or_not_at_all() -> None:
     assert hinge[make_problem().ends[1] - 1] == 0.0
 
 
-def test_base_of_stationary_guesses_moves_to_places_of_little_merit() -> None:
-    """Nearly all of the hall is farther from the target than the places that are chosen."""
-    drive = make_program(
-        make_hall(), [vkc.Reach((2.0, 1.5, 1.0, 0.0, np.pi / 2, 0.0))], options=SHORT
-    )
-    still, *others = (guess.z for guess in initialize(drive, "stationary", 0, count=2))
-    errors = [drive.pose_error(z) for z in others]
-    assert max(errors) < 0.9 * drive.pose_error(still)
-
-
 def test_base_turns_the_shorter_direction() -> None:
     scene = make_hall().with_start(base=[0.0, 0.0, 3.0])
     turn = make_program(scene, [vkc.GoTo(1.0, 0.5, -3.0)], options=SHORT)

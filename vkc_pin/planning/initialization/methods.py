@@ -21,7 +21,6 @@ from vkc_pin.planning.initialization.keyframes import (
     KeyframeSampler,
     interpolate_object_joints,
 )
-from vkc_pin.planning.nlp.merit import Merit, measure_infeasibility
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 
@@ -39,7 +38,6 @@ MAX_GOOD_PENETRATION = 0.045
 """Penetration [m] at a waypoint, or total shortfall, of a guess that is good enough."""
 _Kind = Iterator[InitialGuess | None]
 _COMPARED_PATHS = 8  # paths of the beam that are turned into guesses and compared
-_PLACE_SAMPLES = 128  # random places that are compared for each phase end of a stationary guess
 
 
 def initialize(
@@ -134,9 +132,9 @@ def _generate_stationary_guesses(
 ) -> Iterator[InitialGuess]:
     """Generate a guess with a stationary robot, then others in which the base moves straight.
 
-    The base moves to the random place, near or far, with the least merit up to the end of the
-    phase. An arm on a fixed base moves to random postures in the same way. Lengths are sampled
-    within limits, angles within π of the start.
+    The base moves to a random place, near or far, in each phase. An arm on a fixed base moves to
+    random postures in the same way. Lengths are sampled within limits, angles within π of the
+    start.
     """
     still, robot = interpolate_object_joints(problem, problem.still), problem.chain.robot
     yield InitialGuess("stationary", still)
@@ -144,31 +142,14 @@ def _generate_stationary_guesses(
     turns = np.array([problem.unit(problem.chain.names[column]) == "rad" for column in columns])
     middle = problem.start[columns]
     for number in range(2, count + 1):
-        z = still
+        z = still.copy()
         for begin, end in itertools.pairwise([0, *problem.ends.tolist()]):
             now = problem.waypoints(z)[begin, columns]
             share = np.minimum(np.arange(1, len(z) - begin + 1) / (end - begin), 1.0)[:, None]
             low = np.where(turns, middle - np.pi, problem.lower[end - 1, columns])
             high = np.where(turns, middle + np.pi, problem.upper[end - 1, columns])
-            samples = np.tile(z, (_PLACE_SAMPLES, 1, 1))
-            for moved in samples:
-                moved[begin:, columns] = now + share * rng.uniform() * (
-                    rng.uniform(low, high) - now
-                )
-            z = min(map(problem.clip, samples), key=lambda z: _compute_merit(problem, z, end))
-        yield InitialGuess(f"stationary {number}", z)
-
-
-def _compute_merit(problem: TrajectoryProblem, z: Floats, waypoint: int) -> float:
-    """Return the merit of z_1..z_N, shape (N, n), without violations after a waypoint."""
-    timing, options = problem.timing_for(z), problem.options
-    contacts = problem.evaluate_contacts(
-        z, reach=options.largest_margin, nearest=options.contact_slots
-    )
-    penalty = Merit(options.penalty).compute_penalty(
-        measure_infeasibility(problem, z, timing, contacts, rates=False), clearance=True
-    )
-    return problem.objective(z, timing.dt) + float(penalty[:waypoint].sum())
+            z[begin:, columns] = now + share * rng.uniform() * (rng.uniform(low, high) - now)
+        yield InitialGuess(f"stationary {number}", problem.clip(z))
 
 
 @dataclass(frozen=True, eq=False)

@@ -124,7 +124,9 @@ def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) 
         first = last = solve_task(scene, task, request)
     if first.plan.success or first.is_grasp_independent or current_ending():
         return first
-    statistics, notes = [first.plan.statistics], list_untried_attachments(scene, task)
+    statistics, notes = [first.plan.statistics], list[str]()
+    if first.plan.report.notes:  # reasons that may be those of the grasp
+        notes += list_untried_attachments(scene, task)
     for number, (name, steps) in enumerate(alternatives()):
         if current_ending():
             break

@@ -138,25 +138,30 @@ class _Sweep:
             todo.before + todo.after < motion
         )
         free &= ~self._table.find_moving_together(todo.pair, first, first + 1)
-        for c in np.flatnonzero(free).tolist():
-            row, k = todo.low[c], todo.pair[c]
-            stack = [(0.0, 1.0, todo.before[c], todo.after[c])]
-            while stack:
-                low, high, before, after = stack.pop()
-                if (width := (high - low) * motion[c]) <= 2 * RESOLUTION or before + after >= width:
-                    continue
-                middle = (low + high) / 2
-                state = self._solids.place(
-                    self._solids.world.coordinates.q(
-                        (1 - middle) * z[[row]] + middle * z[[row + 1]]
-                    )
-                )
-                found = state.compute_distances(np.zeros(1, int), self._table.pairs[[k]])
-                yield from self._make_hits(np.array([row]), np.array([k]), found)
-                between = float(found[0])
+        stacks = {
+            c: [(0.0, 1.0, float(todo.before[c]), float(todo.after[c]))]
+            for c in np.flatnonzero(free).tolist()
+        }
+        while True:  # one step of the search of every interval at once
+            steps = {c: step for c in stacks if (step := _pop_open_part(stacks[c], motion[c]))}
+            if not steps:
+                return
+            which = np.array(list(steps))
+            middle = np.array([(low + high) / 2 for low, high, _, _ in steps.values()])
+            places, at = np.unique([todo.low[which], middle], axis=1, return_inverse=True)
+            rows, share = places[0].astype(int), places[1][:, None]
+            found = self._solids.place(
+                self._solids.world.coordinates.q((1 - share) * z[rows] + share * z[rows + 1])
+            ).compute_distances(at.ravel(), self._table.pairs[todo.pair[which]])
+            yield from self._make_hits(todo.low[which], todo.pair[which], found)
+            for (c, step), half, between in zip(
+                steps.items(), middle.tolist(), found.tolist(), strict=True
+            ):
+                low, high, before, after = step
                 if between < -overlap[c]:
-                    break
-                stack += [(low, middle, before, between), (middle, high, between, after)]
+                    del stacks[c]
+                else:
+                    stacks[c] += [(low, half, before, between), (half, high, between, after)]
 
     def _find_nearest(self, placed: PlacedShapes) -> tuple[Ints, Ints, Floats]:
         """Return states, pairs and distances [m] of the closest pairs and all below margins."""
@@ -233,6 +238,19 @@ class Intervals(NamedTuple):
             self.before[which],
             self.after[which],
         )
+
+
+_Part = tuple[float, float, float, float]  # begin and end of it, distances there [m]
+
+
+def _pop_open_part(stack: list[_Part], motion: float) -> _Part | None:
+    """Pop the next part of an interval in which a pair may overlap unseen; None without any."""
+    while stack:
+        low, high, before, after = part = stack.pop()
+        width = (high - low) * motion
+        if width > 2 * RESOLUTION and before + after < width:
+            return part
+    return None
 
 
 def _find_group_minima(groups: Ints, values: Floats) -> Ints:

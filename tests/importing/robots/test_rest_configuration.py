@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers.arm_urdf import HEIGHT, write_arms
+from helpers.telescopes import write_telescope
 
 import vkc_pin as vkc
 from vkc_pin.importing.robots.rest_configuration import (
@@ -12,6 +14,7 @@ from vkc_pin.importing.robots.rest_configuration import (
     Clearances,
     find_home,
     find_inseparable_pairs,
+    find_nested_pairs,
     measure_floor_heights,
 )
 
@@ -53,6 +56,15 @@ def test_inseparable_pairs_are_found(tmp_path: Path) -> None:
     # Links arm_2 and arm_3 are 40 mm apart in line and closer where they turn.
     assert ("arm_2", "arm_3") not in near
     assert ("arm_2", "arm_3") in find_inseparable_pairs(robot, 0.035, samples=50, share=0.5)
+
+
+def test_parts_of_a_telescope_lie_in_each_other_by_design(tmp_path: Path, robot: vkc.Robot) -> None:
+    """The links of the wrist, which overlap the retracted segments, too, are none of them."""
+    telescope = vkc.load_robot(write_telescope(tmp_path), pairs="all")
+    segments = [f"segment_{k}" for k in range(1, 5)]
+    nested = [("carriage", "segment_1"), *itertools.combinations(segments, 2)]
+    assert find_nested_pairs(telescope, 0.025) == nested
+    assert find_nested_pairs(robot, 0.025) == []
 
 
 def test_floor_heights_of_fixed_and_moving_links(robot: vkc.Robot) -> None:

@@ -21,6 +21,7 @@ __all__ = [
     "find_arm_positions",
     "find_home",
     "find_inseparable_pairs",
+    "find_nested_pairs",
     "find_sunken_links",
     "get_arm_bounds",
     "measure_floor_heights",
@@ -217,6 +218,37 @@ def find_inseparable_pairs(
         if not pairs.links:
             break
     return {links: furthest[links] for links in pairs.links}
+
+
+def find_nested_pairs(robot: Robot, margin: float) -> list[tuple[str, str]]:
+    """Return sorted pairs of links of a telescope that are closer than `margin` [m] at its limits.
+
+    These are the links that one coordinate slides, and those from which they slide.
+    """
+    clearances, bounds = Clearances(robot), (robot.lower, robot.upper)
+    joints = dict[int, set[int]]()
+    for move in robot.coordinates.moves:
+        if move.slides:
+            joints.setdefault(move.coordinate, set()).add(move.joint)
+    nested = set[tuple[str, str]]()
+    for coordinate, moved in joints.items():
+        if len(moved) > 1:
+            parts = moved | {int(robot.model.parents[joint]) for joint in moved}
+            links = {
+                robot.link_of(k)
+                for k, shape in enumerate(robot.collision.geometryObjects)
+                if shape.parentJoint in parts
+            }
+            for bound in bounds:
+                arm = robot.home.copy()
+                arm[coordinate - 3] = bound[coordinate]
+                clearances.place(arm)
+                nested |= {
+                    (min(pair), max(pair))
+                    for *pair, _ in clearances.links(margin)
+                    if links.issuperset(pair)
+                }
+    return sorted(nested)
 
 
 def get_arm_bounds(robot: Robot) -> tuple[Floats, Floats]:

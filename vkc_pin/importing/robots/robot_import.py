@@ -38,6 +38,7 @@ from vkc_pin.importing.robots.rest_configuration import (
     find_arm_positions,
     find_home,
     find_inseparable_pairs,
+    find_nested_pairs,
     find_sunken_links,
     measure_floor_heights,
 )
@@ -461,6 +462,10 @@ class _Importer:
             )
             self._findings.append(Finding("note", "pairs", text))
             allowed[min(one, other), max(one, other)] = "Near"
+        for one, other in find_nested_pairs(set_collision_pairs(robot, allowed), _NEIGHBOURS):
+            text = f"{one} and {other} are parts of a telescope: the pair is not checked"
+            self._findings.append(Finding("note", "pairs", text))
+            allowed[one, other] = "Near"
         checked, arm = set_collision_pairs(robot, allowed), robot.coordinates.names[3:]
         named = [
             (f"the state '{name}' of the file", find_arm_positions(robot, state))

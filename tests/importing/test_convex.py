@@ -298,3 +298,12 @@ def test_invalid_arguments_are_named(wrong: dict[str, float]) -> None:
     with pytest.raises(vkc.InputError) as caught:
         decompose(box((1, 1, 1)), **wrong)  # type: ignore[arg-type]
     assert caught.value.field == next(iter(wrong))
+
+
+def test_invalid_meshes_are_named() -> None:
+    broken = box((1, 1, 1))
+    broken.vertices[3, 1] = np.nan
+    for mesh, field in ((broken, "mesh.vertices[3, 1]"), (Triangles(), "mesh")):
+        with pytest.raises(vkc.InputError) as caught:
+            decompose(mesh)
+        assert caught.value.field == field

@@ -22,7 +22,12 @@ import coal
 import numpy as np
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arguments import check_coordinate, check_integer, check_number
+from vkc_pin.utils.arguments import (
+    check_coordinate,
+    check_finite_array,
+    check_integer,
+    check_number,
+)
 from vkc_pin.utils.arrays import Floats, Ints, find_unique_rows
 from vkc_pin.utils.disk_cache import load_or_build
 from vkc_pin.world.files.hulls import SHEET_THICKNESS, compute_hull, compute_outer_hull, thicken
@@ -155,6 +160,9 @@ def decompose(
         )
     if isinstance(mesh, trimesh.Trimesh):
         loaded = mesh
+        check_finite_array(loaded.vertices, "mesh.vertices")
+        if not len(loaded.faces):
+            raise InputError("the mesh is empty", field="mesh", expected="at least one triangle")
     else:
         loaded = load_mesh(check_path(mesh, "mesh", "a mesh or a mesh file"))
 
@@ -535,8 +543,6 @@ def _list_planes(vertices: Floats, faces: Ints) -> Iterator[tuple[Floats, float,
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.linalg.norm(normals, axis=1)
     has_area = areas > 0.0
-    if not has_area.any():
-        return
     corners, areas = corners[has_area], areas[has_area]
     normals = normals[has_area] / areas[:, None]
     largest = np.abs(normals).argmax(axis=1)
@@ -586,11 +592,15 @@ def _coarsen(vertices: Floats, faces: Ints, most: int) -> tuple[Floats, Ints]:
         first, group = find_unique_rows(cells)
         representative = np.empty(len(vertices), int)
         representative[order] = order[first][group]
-        coarse = np.sort(representative[faces], axis=1)
-        coarse = coarse[(coarse[:, 0] < coarse[:, 1]) & (coarse[:, 1] < coarse[:, 2])]
-        if not len(coarse):  # a strip narrower than a cell
-            break
-        kept = coarse[find_unique_rows(coarse)[0]]
+        kept = np.sort(representative[faces], axis=1)
+        low, middle, high = kept.T
+        is_triangle = (low < middle) & (middle < high)
+        is_in_triangle = np.zeros(len(vertices), bool)
+        is_in_triangle[kept[is_triangle]] = True
+        # A strip narrower than a cell becomes a line.
+        is_line = (low < high) & ~is_in_triangle[kept].all(axis=1)
+        kept = kept[is_triangle | is_line]
+        kept = kept[find_unique_rows(kept)[0]]
         cell *= 1.4
     used, kept = np.unique(kept, return_inverse=True)
     return vertices[used], kept.reshape(-1, 3)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["HEIGHT", "write_arms"]
+__all__ = ["HEIGHT", "set_limits", "write_arms"]
 
 HEIGHT = 0.35  # [m] of the root above the floor
 
@@ -34,6 +34,13 @@ def _format_joint(
         f'<parent link="{parent}"/><child link="{child}"/>'
         f'<axis xyz="{axis}"/>{limit}</joint>'
     )
+
+
+def set_limits(urdf: str, joint: str, lower: float, upper: float) -> str:
+    """Return a URDF with other limits of a joint, which have been -2 and 2."""
+    head, name, tail = urdf.partition(f'<joint name="{joint}"')
+    limits = f'lower="{lower}" upper="{upper}"'
+    return head + name + tail.replace('lower="-2" upper="2"', limits, 1)
 
 
 def write_arms(

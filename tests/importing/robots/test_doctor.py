@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
-from helpers.arm_urdf import HEIGHT, write_arms
+from helpers.arm_urdf import HEIGHT, set_limits, write_arms
 
 import vkc_pin as vkc
 from vkc_pin.importing.robots.doctor import Diagnosis
@@ -191,13 +191,11 @@ def test_doctor_keeps_the_clearances_of_plans(tmp_path: Path, gap: float, is_bar
 def test_doctor_reports_a_wrist_that_cannot_turn_a_lever(
     tmp_path: Path, range_: tuple[float, float], side: str
 ) -> None:
-    """The hand rolls only one way from the pose that grasps level bars."""
+    """From the pose that grasps level bars, the hand rolls in one direction only."""
     robot = write_robot(tmp_path, locked_joints=OPEN | {"arm_5_joint": 0.0})
     path = tmp_path / "robot.urdf"
-    head, joint, tail = path.read_text(encoding="utf-8").partition('<joint name="arm_4_joint"')
-    low, high = range_
-    tail = tail.replace('lower="-2" upper="2"', f'lower="{low}" upper="{high}"', 1)
-    path.write_text(head + joint + tail, encoding="utf-8")
+    text = set_limits(path.read_text(encoding="utf-8"), "arm_4_joint", *range_)
+    path.write_text(text, encoding="utf-8")
     limitations = find_texts(vkc.importing.doctor(robot, samples=5), "limitation", "hand")
     assert f"turn door levers with the free end on the {side}" in " ".join(limitations)
 

@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 import trimesh
 import yaml
-from helpers.arm_urdf import HEIGHT, write_arms
+from helpers.arm_urdf import HEIGHT, set_limits, write_arms
 from helpers.telescopes import FOLLOWERS, write_telescope
 
 import vkc_pin as vkc
@@ -312,8 +312,7 @@ def test_closing_direction_suits_a_wrist_without_roll(
     for k in (3, 4):
         text = text.replace(f'"arm_{k}_joint" type="revolute"', f'"arm_{k}_joint" type="fixed"')
     for k in (2, 5):
-        head, joint, tail = text.partition(f'<joint name="arm_{k}_joint"')
-        text = head + joint + tail.replace('lower="-2"', 'lower="0"', 1)
+        text = set_limits(text, f"arm_{k}_joint", 0, 2)
     post = '<link name="post"><collision><geometry><box size="0.1 0.1 0.9"/></geometry></collision>'
     post += '</link><joint name="post_joint" type="fixed"><origin xyz="0.6 0 0.1"/>'
     post += '<parent link="body"/><child link="post"/></joint></robot>'
@@ -332,10 +331,7 @@ def test_closing_direction_leaves_the_wrist_room_to_turn_levers(
     text = text.replace("finger_b", f"finger_{second}_")
     text = text.replace('"arm_5_joint" type="revolute"', '"arm_5_joint" type="fixed"')
     for joint, limits in ((2, (0, 2)), (3, (0, 2)), (4, (-2.3, 1.6))):
-        head, name, tail = text.partition(f'<joint name="arm_{joint}_joint"')
-        low, high = limits
-        tail = tail.replace('lower="-2" upper="2"', f'lower="{low}" upper="{high}"', 1)
-        text = head + name + tail
+        text = set_limits(text, f"arm_{joint}_joint", *limits)
     file.write_text(text, encoding="utf-8")
     made = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
     assert "turn door levers" not in str(made)

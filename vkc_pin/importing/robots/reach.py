@@ -36,9 +36,9 @@ _DAMPING, _TOLERANCE = 1e-6, 1e-3
 def should_reverse_tool(robot: Robot, *, seed: int = 0) -> bool:
     """Return whether a hand with its tool frame turned by half a turn about z is more useful.
 
-    It then does more common tasks; or as many, though not all, and grasps more bars where the floor
-    is not in the way. The direction from one finger to the other is arbitrary, but not every wrist
-    rolls by half a turn, or by more to turn a lever.
+    It then does more common tasks; or as many, though not all, and grasps more bars far above the
+    floor. The direction from one finger to the other is arbitrary, but not every wrist rolls by
+    half a turn, or by more to turn a lever.
     """
     tasks, bars = [], []
     for is_turned in (False, True):

@@ -132,9 +132,8 @@ def _generate_stationary_guesses(
 ) -> Iterator[InitialGuess]:
     """Generate a guess with a stationary robot, then others in which the base moves straight.
 
-    The base moves to a random place, near or far, in each phase. An arm on a fixed base moves to
-    random postures in the same way. Lengths are sampled within limits, angles within π of the
-    start.
+    The base moves to a random place, near or far, in each phase; an arm on a fixed base, to a
+    random posture. Lengths are sampled within limits, angles within π of the start.
     """
     still, robot = interpolate_object_joints(problem, problem.still), problem.chain.robot
     yield InitialGuess("stationary", still)

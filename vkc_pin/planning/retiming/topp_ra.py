@@ -56,12 +56,11 @@ def compute_speeds(
     limited = np.flatnonzero(np.isfinite(velocity) & np.isfinite(acceleration))
     if not len(limited):
         return None
-    rates = velocity[limited], acceleration[limited]
-    constraints = [_make_toppra_constraint(path, limited, *rates, linear)]
+    constraint = _make_toppra_constraint(velocity[limited], acceleration[limited], linear)
     for offset in _KNOT_OFFSETS:
         grid = _replace_knots(path.x, positions, offset)
         solver = TOPPRA(
-            constraints, _to_toppra_path(path, limited), gridpoints=grid, solver_wrapper="seidel"
+            [constraint], _to_toppra_path(path, limited), gridpoints=grid, solver_wrapper="seidel"
         )
         _, speeds, _ = solver.compute_parameterization(0.0, 0.0)
         if speeds is not None and np.isfinite(speeds).all() and (speeds[1:-1] > 0.0).all():
@@ -119,8 +118,6 @@ def _to_toppra_path(path: CubicHermiteSpline, columns: Ints) -> Any:
 
 
 def _make_toppra_constraint(
-    path: CubicHermiteSpline,
-    columns: Ints,
     velocity: Floats,
     acceleration: Floats,
     linear: Callable[[Floats], tuple[Floats, Floats, Floats]] | None,
@@ -133,14 +130,14 @@ def _make_toppra_constraint(
     from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
 
     class Constraint(LinearConstraint):
-        dof = len(columns)
+        dof = len(velocity)
 
         def __init__(self) -> None:
             super().__init__()
             self.identical = True
 
-        def compute_constraint_params(self, _: Any, gridpoints: Floats) -> Any:
-            tangents, curvatures = (path(gridpoints, order)[:, columns] for order in (1, 2))
+        def compute_constraint_params(self, path: Any, gridpoints: Floats) -> Any:
+            tangents, curvatures = (path(gridpoints, order) for order in (1, 2))
             with np.errstate(divide="ignore"):
                 speeds = (velocity / np.abs(tangents)).min(axis=1)
             squares = np.column_stack([np.zeros(len(speeds)), np.minimum(speeds, _MAX_SPEED) ** 2])

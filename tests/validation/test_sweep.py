@@ -155,6 +155,18 @@ def test_wire_between_two_samples() -> None:
     assert len(through) == len(set(through)), "one sample proves that a pair overlaps"
 
 
+@pytest.mark.parametrize("y", [0.31, 0.53, 0.75, 0.97])
+def test_fence_is_found_wherever_a_stick_passes_it_between_two_samples(y: float) -> None:
+    scene = make_room(describe_box("fence", [0.6, 0.001, 0.1], [0.8, y, 0.56]))
+    down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
+    script = Script(scene).go(down).take("stick").go(move_base(down, y=1.0), steps=1)
+    motion, world = script.motion(dt=10.0), World(scene)
+    table = PairTable(scene, CollisionShapes(world), motion, 0.02)
+    hits = list(sweep(table, world.compute_positions(motion), np.arange(len(motion.times))))
+    through = {hit.first for hit in hits if hit.second == "fence" and hit.distance < -5e-4}
+    assert through >= {"stick.stick", "stick.tip"}
+
+
 def test_overlaps_at_a_sample_are_not_searched_between_samples() -> None:
     scene = make_hall(obstacles=[describe_box("box", [0.4, 0.4, 0.6], [2.0, 0.0, 0.3])])
     motion = make_trajectory(scene, np.vstack([scene.start, move_start(scene.start, x=2.0)]))

@@ -78,3 +78,18 @@ import matplotlib.pyplot
 assert plt.figure is matplotlib.pyplot.figure
 """
     subprocess.run([sys.executable, "-c", code], timeout=60, check=True)
+
+
+def test_further_constraints_hold_along_the_path() -> None:
+    """|b w²| ≤ 1 with b = 4 limits the speed to 0.5, |a u| ≤ 1 with a = 2 its change to 0.5."""
+    path = fit_path(np.array([[0.0, 0.0], [3.0, 0.0]]), np.ones(2), FREE)
+    places, limits = np.linspace(0.0, 3.0, 201), (np.full(2, 10.0), np.full(2, 2.0))
+
+    def linear(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        rows = np.ones((len(positions), 2))
+        return rows * [0.0, 2.0], rows * [4.0, 0.0], rows * 0.0
+
+    speeds = compute_speeds(path, places, *limits, linear)
+    assert speeds is not None
+    assert compute_duration(places, speeds) == pytest.approx(3.0 / 0.5 + 0.5 / 0.5, rel=1e-2)
+    assert speeds.max() == pytest.approx(0.5, rel=1e-6)

@@ -11,8 +11,7 @@ import pinocchio as pin
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import chores
-from vkc_pin.planning.initialization import constrained_rrt as held
-from vkc_pin.planning.initialization import interpolation as joining
+from vkc_pin.planning.initialization import interpolation, rrt
 from vkc_pin.planning.initialization.keyframes import compute_shortfall
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
@@ -23,40 +22,40 @@ EVERY = 6  # of the waypoints that are drawn
 
 
 def main() -> int:
-    """Draw a narrow door being closed: interpolated between keyframes, and by constrained RRT."""
+    """Draw a narrow door being closed: interpolated between keyframes, and by random trees."""
     scene = (
         chores.make_cluttered_home()
         .with_state("door", {"hinge": 1.52})
         .with_start(base=(1.2, 2.6, -1.57))
     )
     seen: list[tuple[TrajectoryProblem, list[np.ndarray]]] = []
-    search = joining.RrtPaths.find_constrained_path
+    search = interpolation.RrtPaths.find_closed_path
 
     def kept(
-        paths: joining.RrtPaths, phase: int, through: np.ndarray, straight: np.ndarray
+        paths: interpolation.RrtPaths, phase: int, through: np.ndarray, straight: np.ndarray
     ) -> np.ndarray | None:
         path, sampler = search(paths, phase, through, straight), paths.sampler
         if path is not None:
-            own = held._Search(sampler, phase, len(straight))
+            own = rrt._ClosedSearch(sampler, phase, through, len(straight))
             closed, _ = own.project(straight, np.arange(own.begin + 1.0, own.end + 1.0))
             seen.append((sampler.problem, [closed, path]))
         return path
 
-    joining.RrtPaths.find_constrained_path = kept
+    interpolation.RrtPaths.find_closed_path = kept
     step = vkc.Actuate("door", {"hinge": 0.0}, "handle_free")
     plan = vkc.plan(scene, [step], options=chores.CHORES["cluttered"].options, initialization="rrt")
-    joining.RrtPaths.find_constrained_path = search
+    interpolation.RrtPaths.find_closed_path = search
     sys.stdout.write(plan.summary() + "\n")
     problem, ways = seen[-1]
     phase = len(problem.task.phases) - 1
     with use_style():
         figure = new_figure(8.0, 3.9)
         for number, (way, title) in enumerate(
-            zip(ways, ("straight between knots", "as trees lead it"), strict=True)
+            zip(ways, ("straight between keyframes", "along the trees' path"), strict=True)
         ):
             axes = figure.add_subplot(1, 2, number + 1)
             short = (
-                compute_shortfall(problem, way, problem.contacts.inside(phase), reach=0.0)
+                compute_shortfall(problem, way, problem.contacts.find_waypoint(phase), reach=0.0)
                 - problem.options.dist_safe
             )
             draw_held(axes, problem, way, int(np.argmax(short)) if short.max() > 0.0 else None)

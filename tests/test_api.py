@@ -21,7 +21,6 @@ COMPILED = tuple(
         "planning.kinematics._cpin",
         "world.collision._distances",
         "planning.base_paths._driving",
-        "planning.initialization._trees",
         "planning.solver._kkt",
     )
 )

@@ -234,27 +234,6 @@ class ContactModel:
         record_evaluations(min(found + 1, len(z)))
         return found
 
-    def make_line_checker(
-        self,
-        z: Floats,
-        waypoint: int,
-        *,
-        weights: Floats,
-        step: float,
-        reach: float,
-        allowed: float,
-    ) -> Any:
-        """Return `Clearances.make_line_checker` of a waypoint's phase."""
-        return self._clearances[self.find_phase(waypoint)].make_line_checker(
-            self.chain.coordinates.index_maps,
-            z,
-            waypoint,
-            weights=weights,
-            step=step,
-            reach=reach,
-            allowed=allowed,
-        )
-
     def compute_placements(self, z: Floats) -> tuple[Floats, Floats]:
         """Return the chain's `joint_placements`, evaluated in batches of one size.
 

@@ -9,9 +9,13 @@ import numpy as np
 from vkc_pin.planning.base_paths.arcs import Curves, interpolate_arcs, sample_path
 from vkc_pin.planning.initialization.approach_paths import ApproachPaths
 from vkc_pin.planning.initialization.base_routes import BaseRoutes
-from vkc_pin.planning.initialization.constrained_rrt import find_constrained_path, is_obstructed
 from vkc_pin.planning.initialization.keyframes import KeyframeSampler, sample_smoothstep
-from vkc_pin.planning.initialization.rrt import MAX_EXTENSIONS, connect, resample_path
+from vkc_pin.planning.initialization.rrt import (
+    MAX_EXTENSIONS,
+    find_closed_path,
+    find_open_path,
+    is_obstructed,
+)
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.task.phases import Phase
 
@@ -73,7 +77,7 @@ class RrtPaths:
         self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool
     ) -> Floats | None:
         """See `AStarPaths.find_path`."""
-        problem, size = self.problem, self.sampler.robot_size
+        problem, arm = self.problem, slice(3, self.sampler.robot_size)
         poses, last = first[None, :3], last.copy()
         if problem.chain.robot.base != "fixed":
             guide = self.routes.find_guide_path(phase, first[:3], last[:3], 2 * steps)
@@ -85,26 +89,26 @@ class RrtPaths:
             else:
                 guide[:, 2] -= turned  # the trees find where the base can turn
             poses = guide
-        start, goal = first[3:size], last[3:size]
+        start, goal = first[arm], last[arm]
         folded = self.routes.get_folded_arm(phase)
         nearest = self.routes.find_nearest_folded_arm(phase, start, goal)
         arms = np.array([start, goal, problem.chain.robot.home, folded, nearest])
-        ends = np.tile(last[:size], (1 if reaches else len(arms), 1))
+        ends = np.tile(last, (1 if reaches else len(arms), 1))
         if not reaches:
-            ends[:, 3:] = arms
-        rng, limit = self.sampler.rng, self._get_extension_limit(phase)
-        path = connect(
-            problem, phase, first, ends, poses=poses, arms=arms, rng=rng, max_extensions=limit
+            ends[:, arm] = arms
+        limit = self._get_extension_limit(phase)
+        path = find_open_path(
+            self.sampler, phase, first, ends, steps, limit, poses=poses, arms=arms
         )
         self._count_failures(phase, path)
-        return None if path is None else resample_path(path, steps, problem.chain.metric[:size])
+        return None if path is None else path[:, : arm.stop]
 
-    def find_constrained_path(self, phase: int, through: Floats, straight: Floats) -> Floats | None:
+    def find_closed_path(self, phase: int, through: Floats, straight: Floats) -> Floats | None:
         """Find waypoints of a closed phase around obstacles; None if straight lines are free."""
         if not is_obstructed(self.sampler, phase, through, straight):
             return None
         limit = self._get_extension_limit(phase)
-        path = find_constrained_path(self.sampler, phase, through, len(straight), limit)
+        path = find_closed_path(self.sampler, phase, through, len(straight), limit)
         self._count_failures(phase, path)
         return path
 
@@ -170,7 +174,7 @@ class Interpolator:
             if problem.is_closed(phase):
                 self._fill_straight(rows, keyframes[inside], [at[k] - begin for k in inside])
                 path = (
-                    self.paths.find_constrained_path(number, keyframes[inside], rows)
+                    self.paths.find_closed_path(number, keyframes[inside], rows)
                     if isinstance(self.paths, RrtPaths)
                     else None
                 )

@@ -1,193 +1,351 @@
-"""Finds paths of base and arm between two configurations with RRT-Connect.
+"""Finds paths of base and arm around obstacles with two random trees.
 
-RRT-Connect (Kuffner and LaValle, ICRA 2000) in the robot's coordinates. The base is sampled near a
-guide path, the arm near postures that are likely to be needed there, so that narrow passages are
-found quickly.
+RRT-Connect (Kuffner and LaValle, ICRA 2000) in all coordinates. In phases with a closed chain,
+steps are projected to the closure manifold (Berenson, Srinivasa, Ferguson and Kuffner,
+*Manipulation planning on constraint manifolds*, ICRA 2009), and the progress of the object joints
+along their given motion is one more coordinate: a door may wait until the arm is out of its frame.
+In open phases, samples are near a guide path of the base, with arm postures that are likely to be
+needed there, so that narrow passages are found quickly.
 """
 
 from __future__ import annotations
 
-import itertools
-from functools import cached_property
-from typing import Any
+from abc import ABC, abstractmethod
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from vkc_pin.planning.initialization.keyframes import compute_shortfall, sample_smoothstep
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.utils.arrays import Floats
-from vkc_pin.utils.budget import record_evaluations
-from vkc_pin.utils.optional_imports import import_compiled
+from vkc_pin.planning.initialization.keyframes import (
+    SAMPLE_COUNT,
+    KeyframeSampler,
+    compute_shortfall,
+    sample_smoothstep,
+)
+from vkc_pin.utils.arrays import Bools, Floats, Ints
 
-__all__ = ["MAX_EXTENSIONS", "STEP", "connect", "resample_path"]
+__all__ = [
+    "MAX_EXTENSIONS",
+    "find_closed_path",
+    "find_open_path",
+    "is_obstructed",
+]
 
 MAX_EXTENSIONS = 1500
 """Maximum number of tree extensions."""
-STEP = 0.15
-"""Distance between collision checks, in the metric of searches: [rad] of a joint."""
-
-# of successive searches: the second if the first one missed a collision
-_STEP_SIZES = (STEP, 0.04)
-_SHORTCUT_ROUNDS = 11  # partial shortcuts per coordinate between random points
-# relative saving in length that a shortcut needs, or a further round of shortcuts
-_MIN_SAVING = 1e-3
-# share of a path by which the arm may exceed its straight path before another one is searched for
-_MAX_DETOUR = 1 / 3
-_PATH_SPREAD = 0.1  # [m], [rad] largest standard deviation of base samples from the guide path
-_END_SPREAD = 0.4  # [m], [rad] largest standard deviation of base samples at the ends, and of arms
+_STEP = 0.15  # between collision checks, in the metric of searches: [rad] of a joint
+_GUIDED_SAMPLES = SAMPLE_COUNT // 8  # towards which a tree grows at once in an open phase
+_CLOSED_SAMPLES = SAMPLE_COUNT // 4
+# largest standard deviation of samples in open phases from guide path and likely postures
+_BASE_SPREAD, _ARM_SPREAD = 0.1, 0.4  # [m] and [rad]
+_STRAIGHTENING_ROUNDS = 3
+_MIN_SAVING = 1e-3  # relative saving in length that a partial shortcut needs
 
 
-def connect(
-    problem: TrajectoryProblem,
-    phase: int,
-    first: Floats,
-    ends: Floats,
-    *,
-    poses: Floats,
-    arms: Floats,
-    rng: np.random.Generator,
-    max_extensions: int = MAX_EXTENSIONS,
-) -> Floats | None:
-    """Find a nearly collision-free path of the robot.
+def is_obstructed(sampler: KeyframeSampler, phase: int, through: Floats, straight: Floats) -> bool:
+    """Return whether straight lines through a closed-chain phase collide and trees may help.
+
+    Trees do not help a base with wheels, whose arcs they ignore, or a phase that starts in
+    collision.
 
     Args:
-        problem: Problem.
-        phase: Number of the phase, an open one.
-        first: Start configuration, shape (n,); coordinates outside the robot stay constant.
-        ends: Possible end configurations, shape (E, m).
-        poses: x, y [m] and yaw [rad] along a guide path of the base, shape (P, 3).
-        arms: Arm postures that are likely to be needed, shape (A, m - 3) [m] or [rad].
-        rng: Random number generator.
+        sampler: Keyframe sampler of the problem.
+        phase: Number of the phase, with a closed chain.
+        through: Configurations at its keyframes, shape (K, n).
+        straight: Waypoints on straight lines through them, shape (steps, n).
+    """
+    if sampler.curves is not None:
+        return False
+    search = _ClosedSearch(sampler, phase, through, len(straight))
+    closed, _ = search.project(straight, np.arange(search.begin + 1.0, search.end + 1.0))
+    return not search.are_free(closed).all() and bool(search.are_free(through[:1]).all())
+
+
+def find_closed_path(
+    sampler: KeyframeSampler, phase: int, through: Floats, steps: int, max_extensions: int
+) -> Floats | None:
+    """Find waypoints of a closed-chain phase from the first of some configurations.
+
+    Args:
+        sampler: Keyframe sampler of the problem, whose base has no steered wheels.
+        phase: Number of the phase.
+        through: Configurations at its keyframes, shape (K, n).
+        steps: Number of waypoints of the phase.
         max_extensions: Maximum number of tree extensions.
 
     Returns:
-        Corners of the path, shape (K, m); None if no path was found.
+        Nearly collision-free waypoints, shape (steps, n), which may end at another configuration;
+        None if no path was found.
     """
-    coarse, fine = (_Search(problem, phase, first, poses, arms, rng, step) for step in _STEP_SIZES)
-    path = coarse.run(ends, max_extensions)
-    if path is not None and not fine.is_free(path):
-        path = fine.run(ends, max_extensions)
-    return None if path is None else fine.straighten(path)
+    search = _ClosedSearch(sampler, phase, through, steps)
+    ends = np.vstack([through[-1:], search.sample_at(search.end)])
+    path = search.connect(through[:1], ends, max_extensions)
+    return None if path is None else search.resample(search.shorten(path), steps)
 
 
-def _compute_detour(path: Floats, metric: Floats) -> float:
-    """Return the share of a path, shape (K, m), by which the arm exceeds its straight path."""
-    base, arm = np.split(path * metric, [3], axis=1)
-    length = np.abs(np.diff(arm, axis=0)).sum()
-    driven = np.linalg.norm(np.diff(base, axis=0), axis=1).sum()
-    return float((length - np.abs(arm[-1] - arm[0]).sum()) / max(length + driven, 1e-12))
+def find_open_path(
+    sampler: KeyframeSampler,
+    phase: int,
+    first: Floats,
+    ends: Floats,
+    steps: int,
+    max_extensions: int,
+    *,
+    poses: Floats,
+    arms: Floats,
+) -> Floats | None:
+    """Find waypoints of the robot in an open phase.
+
+    Args:
+        sampler: Keyframe sampler of the problem.
+        phase: Number of the phase.
+        first: Start configuration, shape (n,); coordinates outside the robot stay constant.
+        ends: Possible end configurations, shape (E, n).
+        steps: Number of waypoints.
+        max_extensions: Maximum number of tree extensions.
+        poses: x, y [m] and yaw [rad] along a guide path of the base, shape (P, 3).
+        arms: Arm postures that are likely to be needed, shape (A, m - 3) [m] or [rad].
+
+    Returns:
+        Nearly collision-free waypoints, shape (steps, n); None if no path was found.
+    """
+    search = _OpenSearch(sampler, phase, first, poses, arms)
+    path = search.connect(first[None], ends, max_extensions)
+    return None if path is None else search.resample(search.straighten(search.shorten(path)), steps)
 
 
-def resample_path(path: Floats, steps: int, metric: Floats) -> Floats:
-    """Resample a path, shape (K, m), to `steps` rows without its first, slow at both ends."""
-    lengths = np.linalg.norm(np.diff(path, axis=0) * metric, axis=1)
-    passed = np.concatenate([[0.0], np.cumsum(lengths + 1e-12)])
-    at = passed[-1] * sample_smoothstep(steps)
-    return np.column_stack([np.interp(at, passed, column) for column in path.T])
+class _Path(NamedTuple):
+    """Configurations, shape (P, n), and their progress as fractional waypoints, shape (P,)."""
+
+    z: Floats
+    at: Floats
 
 
-class _Search:
-    """Searches paths in one open phase; expensive parts are compiled (`_trees.cpp`)."""
+class _Tree:
+    def __init__(self, z: Floats, at: float) -> None:
+        self.z, self.at, self.parents = z, np.full(len(z), at), np.full(len(z), -1)
 
-    def __init__(
-        self,
-        problem: TrajectoryProblem,
-        phase: int,
-        first: Floats,
-        poses: Floats,
-        arms: Floats,
-        rng: np.random.Generator,
-        step: float,
-    ) -> None:
-        self.problem, self.first, self.poses, self.arms = problem, first, poses, arms
-        self.rng, self.step = rng, step
-        self.size = problem.chain.robot.coordinates.size
-        self.waypoint = problem.contacts.find_waypoint(phase)
-        # Shortfalls up to the margin are allowed: the solver resolves them.
-        self.allowed = problem.options.dist_safe
-        self.weights = problem.chain.metric[: self.size]
-        limits = np.array([problem.limits(name) for name in problem.chain.names[: self.size]])
-        self.lower, self.upper = limits.T
+    def add(self, z: Floats, at: Floats, parents: Ints) -> Ints:
+        self.z, self.at = np.concatenate([self.z, z]), np.concatenate([self.at, at])
+        self.parents = np.concatenate([self.parents, parents])
+        return np.arange(len(self.z) - len(z), len(self.z))
 
-    def run(self, ends: Floats, max_extensions: int) -> Floats | None:
-        """Find a path to one of `ends`, shape (E, m), with shortcuts between random points."""
-        shortfall = self._compute_shortfall(ends)
-        ends = ends[shortfall <= max(self.allowed, shortfall.min())]
-        start = self.first[None, : self.size]
-        path = self._call(self._trees.run, start, _as_rows(ends), max_extensions)
-        return self._call(self._trees.shortened, path) if len(path) else None
+    def trace_to_root(self, node: int) -> _Path:
+        nodes = [node]
+        while self.parents[nodes[-1]] >= 0:
+            nodes.append(int(self.parents[nodes[-1]]))
+        return _Path(self.z[nodes], self.at[nodes])
 
-    def _find_free_sections(self) -> list[Floats]:
-        """Return collision-free sections of the guide path with each of the arms, (R, m) each."""
-        sections = []
-        for arm in self.arms:
-            rows = np.column_stack([self.poses, np.tile(arm, (len(self.poses), 1))])
-            rows = np.clip(rows, self.lower, self.upper)
-            middles = (rows[1:] + rows[:-1]) / 2
-            free = self._compute_shortfall(np.concatenate([rows, middles])) <= self.allowed
-            at = np.flatnonzero(free[: len(rows)])
-            is_joined = free[len(rows) + at[:-1]] & (np.diff(at) == 1)
-            parts = np.split(at, np.flatnonzero(~is_joined) + 1)
-            sections += [rows[part] for part in parts if len(part)]
-        return sections
 
-    @cached_property
-    def _lines(self) -> Any:
-        return self.problem.contacts.make_line_checker(
-            self.first,
-            self.waypoint,
-            weights=self.weights,
-            step=self.step,
-            reach=0.0,
-            allowed=self.allowed,
-        )
+class _Search(ABC):
+    """Searches a path in one phase, from progress `begin` to `end`."""
 
-    @cached_property
-    def _trees(self) -> Any:
-        sections = self._find_free_sections()
-        rows = np.concatenate([np.empty((0, self.size)), *sections])
-        parts = map(_as_rows, (self.weights, self.lower, self.upper, self.poses, self.arms, rows))
-        lengths = np.array([len(section) for section in sections], np.int64)
-        random_seed = int(self.rng.integers(2**63))
-        module = import_compiled("vkc_pin.planning.initialization._trees")
-        return module.Trees(self._lines, *parts, lengths, _PATH_SPREAD, _END_SPREAD, random_seed)
+    def __init__(self, sampler: KeyframeSampler, phase: int, begin: float) -> None:
+        self.sampler, self.problem = sampler, sampler.problem
+        self.begin, self.end = begin, float(self.problem.ends[phase])
+        self.waypoint = self.problem.contacts.find_waypoint(phase)
 
-    def _call(self, method: Any, rows: ArrayLike, *arguments: Any) -> Any:
-        """Call a method of the trees, and record the evaluations of its collision checks."""
-        result = method(_as_rows(rows), *arguments)
-        record_evaluations(self._lines.looked())
-        return result
+    @abstractmethod
+    def project(self, z: Floats, at: Floats) -> tuple[Floats, Bools]:
+        """Project configurations, shape (B, n), with their progress to the constraints.
 
-    def _compute_shortfall(self, rows: Floats) -> Floats:
-        z = np.tile(self.first, (len(rows), 1))
-        z[:, : self.size] = rows
+        Returns projected configurations, and a mask of those that satisfy the constraints.
+        """
+
+    @abstractmethod
+    def sample(self) -> tuple[Floats, float]:
+        """Sample nearly collision-free configurations, shape (B, n), and their progress."""
+
+    def are_free(self, z: Floats) -> Bools:
+        """Return which configurations are nearly collision-free, shape (B,).
+
+        Shortfalls up to `Options.dist_safe` are allowed: the solver resolves them.
+        """
+        return self.compute_shortfall(z) <= self.problem.options.dist_safe
+
+    def compute_shortfall(self, z: Floats) -> Floats:
         return compute_shortfall(self.problem, z, self.waypoint, reach=0.0)
 
-    def is_free(self, path: Floats) -> bool:
-        return all(self._call(self._trees.along, ends) == 1.0 for ends in itertools.pairwise(path))
+    def compute_distances(self, z: Floats, other: Floats) -> Floats:
+        return np.asarray(np.linalg.norm((z - other) * self.sampler.weights, axis=-1))
 
-    def straighten(self, path: Floats) -> Floats:
-        """Straighten the motion of the arm, and of each joint alone, where that is collision-free.
+    def compute_gaps(self, z: Floats) -> Floats:
+        return self.compute_distances(z[1:], z[:-1])
+
+    def connect(self, first: Floats, ends: Floats, max_extensions: int) -> _Path | None:
+        """Find a path from `first`, shape (1, n), to one of `ends`, shape (E, n).
+
+        If none of the ends is nearly collision-free, the least violating ones are used.
+        """
+        shortfall = self.compute_shortfall(ends)
+        ends = ends[shortfall <= max(self.problem.options.dist_safe, float(shortfall.min()))]
+        one, other = _Tree(first, self.begin), _Tree(ends, self.end)
+        forwards, grown, tips = True, 0, np.zeros(1, int)
+        while grown < max_extensions:
+            path = self.try_connect(one, other, tips)
+            if path is not None:
+                return path if forwards else _Path(path.z[::-1], path.at[::-1])
+            forwards, one, other = not forwards, other, one
+            goals, at = self.sample()
+            tips = np.unique(self.grow(one, goals, np.full(len(goals), at)))
+            grown += max(len(goals), 1)
+        return None
+
+    def try_connect(self, tree: _Tree, other: _Tree, tips: Ints) -> _Path | None:
+        """Grow `other` towards the `tips` of `tree`; return the connecting path if they meet."""
+        if not len(tips):
+            return None
+        reached = self.grow(other, tree.z[tips], tree.at[tips])
+        gaps = self.compute_distances(other.z[reached], tree.z[tips])
+        best = int(np.argmin(gaps))
+        if gaps[best] > _STEP:
+            return None
+        here, there = tree.trace_to_root(int(tips[best])), other.trace_to_root(int(reached[best]))
+        return _Path(np.vstack([here.z[::-1], there.z]), np.concatenate([here.at[::-1], there.at]))
+
+    def grow(self, tree: _Tree, goals: Floats, at: Floats) -> Ints:
+        """Grow a tree step by step towards goals; return the last node of each branch, (B,)."""
+        ends = np.array(
+            [int(np.argmin(self.compute_distances(tree.z, goal))) for goal in goals], int
+        )
+        growing = np.arange(len(goals))
+        while len(growing):
+            left = self.compute_distances(tree.z[ends[growing]], goals[growing])
+            growing, left = growing[left > _STEP], left[left > _STEP]
+            here, share = ends[growing], _STEP / left
+            progress = tree.at[here] + share * (at[growing] - tree.at[here])
+            moved, feasible = self.project(
+                tree.z[here] + share[:, None] * (goals[growing] - tree.z[here]), progress
+            )
+            nearer = left - self.compute_distances(moved, goals[growing])
+            good = (
+                feasible
+                & (self.compute_distances(moved, tree.z[here]) <= 2.0 * _STEP)
+                & (nearer > _STEP / 4.0)
+            )
+            good[good] = self.are_free(moved[good])
+            growing = growing[good]
+            ends[growing] = tree.add(moved[good], progress[good], here[good])
+        return ends
+
+    def shorten(self, path: _Path) -> _Path:
+        """Shortcut a path between random points on it, with projected steps."""
+        for _ in range(len(path.z)):
+            first, last = sorted(self.sampler.rng.integers(len(path.z), size=2))
+            count = int(np.ceil(self.compute_distances(path.z[first], path.z[last]) / _STEP))
+            if not 1 < count < last - first:
+                continue
+            share = np.arange(1, count) / count
+            at = path.at[first] + share * (path.at[last] - path.at[first])
+            z = path.z[first] + share[:, None] * (path.z[last] - path.z[first])
+            path = self.replace(path, first, last, z, at)
+        return path
+
+    def straighten(self, path: _Path) -> _Path:
+        """Move the arm, and each joint alone, evenly along a path where that is collision-free.
 
         A path through a narrow passage with another posture moves all joints. Straight lines in all
         coordinates seldom undo that, and the solver cannot, because obstacles are in between. So
         coordinates are treated separately (partial shortcuts: Geraerts and Overmars, IJRR 2007),
-        first along the whole path, then between random points on it. Detours of the arm are treated
-        repeatedly as long as that pays off.
+        first along the whole path, then between random points on it.
         """
-        previous, path = np.inf, self._call(self._trees.evened, path, 0, _MIN_SAVING)
-        while (length := self._compute_length(path)) < (1.0 - _MIN_SAVING) * previous:
-            previous = length
-            path = self._call(self._trees.evened, path, _SHORTCUT_ROUNDS, _MIN_SAVING)
-            if _compute_detour(path, self.weights) <= _MAX_DETOUR:
-                break
+        arm = range(3, self.sampler.robot_size)
+        for number in range(1 + _STRAIGHTENING_ROUNDS):
+            for columns in [list(arm), *([column] for column in arm)]:
+                first, last = 0, len(path.z) - 1
+                if number:
+                    first, last = sorted(self.sampler.rng.integers(len(path.z), size=2))
+                if last - first > 1:
+                    part = path.z[first : last + 1]
+                    passed = np.cumsum(self.compute_gaps(part))
+                    share, z = (passed[:-1] / max(passed[-1], 1e-12))[:, None], part[1:-1].copy()
+                    z[:, columns] = part[0, columns] + share * (part[-1] - part[0])[columns]
+                    path = self.replace(path, first, last, z, path.at[first + 1 : last])
         return path
 
-    def _compute_length(self, path: Floats) -> float:
-        return float(np.linalg.norm(np.diff(path, axis=0) * self.weights, axis=1).sum())
+    def replace(self, path: _Path, first: int, last: int, z: Floats, at: Floats) -> _Path:
+        """Replace what is between two points of a path if that is shorter and collision-free."""
+        z, feasible = self.project(z, at)
+        gaps = self.compute_gaps(np.vstack([path.z[first], z, path.z[last]]))
+        before = self.compute_gaps(path.z[first : last + 1]).sum()
+        is_shorter = gaps.max() <= 2.0 * _STEP and gaps.sum() < (1.0 - _MIN_SAVING) * before
+        if not (feasible.all() and is_shorter and self.are_free(z).all()):
+            return path
+        return _Path(
+            np.vstack([path.z[: first + 1], z, path.z[last:]]),
+            np.concatenate([path.at[: first + 1], at, path.at[last:]]),
+        )
+
+    def resample(self, path: _Path, steps: int) -> Floats | None:
+        """Resample a path to `steps` waypoints, slow at both ends; None if a projection fails."""
+        passed = np.concatenate([[0.0], np.cumsum(self.compute_gaps(path.z) + 1e-12)])
+        rows = passed[-1] * sample_smoothstep(steps)
+        z = np.stack([np.interp(rows, passed, column) for column in path.z.T], axis=1)
+        z, feasible = self.project(z, np.interp(rows, passed, path.at))
+        return z if feasible.all() else None
 
 
-def _as_rows(rows: ArrayLike) -> Floats:
-    """Return a contiguous array, as the compiled code expects it."""
-    return np.ascontiguousarray(rows, float)
+class _ClosedSearch(_Search):
+    """Searches in a phase with a closed chain, with the grasp of its first configuration."""
+
+    def __init__(self, sampler: KeyframeSampler, phase: int, through: Floats, steps: int) -> None:
+        end = int(sampler.problem.ends[phase])
+        super().__init__(sampler, phase, float(end - steps))
+        pose = sampler.find_pose(end)
+        assert pose is not None, "a grasped articulated object closes the chain"
+        self.pose, self.through = pose, through
+        motion = np.vstack([self.problem.start, sampler.object_motion])
+        self.object_motion = motion[end - steps : end + 1, sampler.object_columns]
+        self.grasp_columns = sampler.find_grasp_columns(end)
+
+    def project(self, z: Floats, at: Floats) -> tuple[Floats, Bools]:
+        z, columns = z.copy(), self.sampler.object_columns
+        whole = np.arange(self.begin, self.end + 1)
+        z[:, columns] = np.stack(
+            [np.interp(at, whole, column) for column in self.object_motion.T], axis=1
+        )
+        lower, upper = self.sampler.compute_limits(z, self.waypoint)
+        lower[:, columns] = upper[:, columns] = z[:, columns]
+        return self.sampler.solve_pose(z, self.pose, lower, upper)
+
+    def sample(self) -> tuple[Floats, float]:
+        waypoint = int(self.sampler.rng.integers(int(self.begin) + 1, int(self.end) + 1))
+        return self.sample_at(waypoint), float(waypoint)
+
+    def sample_at(self, waypoint: float) -> Floats:
+        """Sample nearly collision-free configurations at a waypoint with the phase's grasp."""
+        before, found = self.through[np.arange(_CLOSED_SAMPLES) % len(self.through)], []
+        for how in ("scatter", "shake"):
+            z, closed = self.sampler.sample(before, int(waypoint), how)
+            is_same = z[:, self.grasp_columns] == self.through[0, self.grasp_columns]
+            found.append(z[closed & is_same.all(axis=1)])
+        z = np.concatenate(found)
+        return z[self.are_free(z)] if len(z) else z
+
+
+class _OpenSearch(_Search):
+    """Searches in an open phase, near a guide path of the base."""
+
+    def __init__(
+        self, sampler: KeyframeSampler, phase: int, first: Floats, poses: Floats, arms: Floats
+    ) -> None:
+        super().__init__(sampler, phase, float(sampler.problem.ends[phase]))
+        self.first, self.poses, self.arms = first, poses, arms
+
+    def project(self, z: Floats, at: Floats) -> tuple[Floats, Bools]:
+        size, limits = self.sampler.robot_size, self.problem.limits
+        lower, upper = np.array([limits(name) for name in self.problem.chain.names[:size]]).T
+        z = np.hstack([np.clip(z[:, :size], lower, upper), z[:, size:]])
+        return z, np.ones(len(z), bool)
+
+    def sample(self) -> tuple[Floats, float]:
+        rng, count = self.sampler.rng, _GUIDED_SAMPLES
+        arm = slice(3, self.sampler.robot_size)
+        z = np.tile(self.first, (count, 1))
+        z[:, :3] = rng.choice(self.poses, count)
+        z[:, arm] = rng.choice(self.arms, count)
+        # Half of them are exactly on the guide path, in one of the likely postures.
+        spread = rng.uniform(0.0, 1.0, (count, 1)) * rng.integers(2, size=(count, 1))
+        z[:, :3] += _BASE_SPREAD * spread * rng.normal(size=(count, 3))
+        z[:, arm] += _ARM_SPREAD * spread * rng.normal(size=z[:, arm].shape)
+        z, _ = self.project(z, np.full(count, self.end))
+        return z[self.are_free(z)], self.end

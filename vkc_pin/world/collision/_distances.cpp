@@ -16,7 +16,6 @@
 #include "bodies.hpp"
 #include "boxes.hpp"
 #include "clearances.hpp"
-#include "lines.hpp"
 #include "margins.hpp"
 #include "shapes.hpp"
 #include "solids.hpp"
@@ -63,29 +62,4 @@ NB_MODULE(_distances, module)
     .def("near", &WorldBoxes::near);
   module.def("nearest", &nearest);
   module.def("first_blocked", &first_blocked);
-  nb::class_<Lines>(module, "Lines")
-    .def(
-      nb::init<
-        const Bodies &,
-        const Boxes &,
-        const Shapes &,
-        const Margins &,
-        const Indices<2> &,
-        const Indices<2> &,
-        const Indices<2> &,
-        const Numbers<1> &,
-        const Numbers<1> &,
-        double,
-        Index,
-        double,
-        double,
-        double>(),
-      nb::keep_alive<1, 2>(),
-      nb::keep_alive<1, 3>(),
-      nb::keep_alive<1, 4>(),
-      nb::keep_alive<1, 5>())
-    .def("looked", &Lines::looked)
-    .def(
-      "straight", // valid as long as this object lives
-      [](Lines & self) { return nb::capsule(static_cast<vkc_pin::StraightLines *>(&self), vkc_pin::STRAIGHT_LINES); });
 }

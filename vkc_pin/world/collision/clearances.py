@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import NamedTuple
 
-import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats, Ints
@@ -111,34 +110,4 @@ class Clearances:
         """
         return int(
             self._find_first_violation(*self._parts, q, z, waypoint, reach, allowed, _ROUNDING)
-        )
-
-    def make_line_checker(
-        self,
-        places: Sequence[Ints],
-        z: Floats,
-        waypoint: int,
-        *,
-        weights: Floats,
-        step: float,
-        reach: float,
-        allowed: float,
-    ) -> Any:
-        """Return a checker of straight lines between configurations, for compiled searches.
-
-        It stops where `find_first_violation` would. This object must outlive it.
-
-        Args:
-            places: Indices of the entries of z in q; see `Coordinates.index_maps`.
-            z: Configuration with the values of constant coordinates, shape (n,).
-            waypoint: Index of the waypoint, which selects the margins.
-            weights: Weights of the m varying coordinates, the first ones of z, shape (m,).
-            step: Largest weighted change of a coordinate between successive checks.
-            reach: Pairs further apart are ignored [m].
-            allowed: Tolerated violation of the margins [m].
-        """
-        maps = [np.ascontiguousarray(part, np.int64) for part in places]
-        vectors = np.ascontiguousarray(z, float), np.ascontiguousarray(weights, float)
-        return load_compiled().Lines(
-            *self._parts, *maps, *vectors, step, waypoint, reach, allowed, _ROUNDING
         )

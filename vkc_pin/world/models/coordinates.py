@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_array, check_choice
-from vkc_pin.utils.arrays import Bools, Floats, Ints
+from vkc_pin.utils.arrays import Bools, Floats
 
 __all__ = ["Coordinates", "MovedJoint", "wrap_angle"]
 
@@ -148,17 +148,6 @@ class Coordinates:
             quaternions,
             _merge_into_slices(plain),
         )
-
-    @property
-    def index_maps(self) -> tuple[Ints, Ints, Ints]:
-        """Index pairs (in q, in z) of equal entries, angles and quaternions, shape (K, 2) each.
-
-        Angles map to two entries of q and quaternions to four; pairs give the first entry.
-        """
-        plain, angles, quaternions = (
-            np.array(p, int).reshape(-1, 2) for p in (self._plain, self._angles, self._quaternions)
-        )
-        return plain, angles, quaternions
 
     @property
     def followers(self) -> tuple[MovedJoint, ...]:

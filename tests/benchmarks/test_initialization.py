@@ -62,8 +62,11 @@ def test_trials_are_recorded(result: dict[str, Any]) -> None:
         (STEPWISE, n, 0) for n in range(3)
     }
     assert len(trials) == len(asked)
+    first = {t["number"]: t["seed"] for t in trials if t["repeat"] == 0}
+    assert len(set(first.values())) == len(first), "each start has its own random seed"
     for t in trials:
-        assert (t["seed"], t["perturbation"]) == ((5, 0.0) if t["repeat"] == 0 else (6, 0.05))
+        assert t["seed"] == first[t["number"]] + t["repeat"]
+        assert t["perturbation"] == (0.05 if t["repeat"] else 0.0)
         assert t["success"] == (t["status"] == "success") == (not t["violations"])
     meta = result["meta"]
     assert (meta["benchmark"], meta["seed"], meta["starts"]) == ("initialization", 5, 3)

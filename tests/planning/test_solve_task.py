@@ -80,8 +80,8 @@ def test_numbers_of_waypoints_can_be_fixed() -> None:
 
 
 def test_infeasible_solution_of_the_least_shortfall_is_returned() -> None:
-    """A wall from side to side, to pass which no time is left."""
-    wall = {"name": "wall", "type": "box", "size": [0.6, 9.0, 2.0], "position": [2.0, 0.0, 1.0]}
+    """A wall from side to side."""
+    wall = {"name": "wall", "type": "box", "size": [0.6, 12.0, 2.0], "position": [2.0, 0.0, 1.0]}
     scene, options = make_hall(obstacles=[wall]), vkc.Options(max_restarts=1)
     task = compile_task(scene, [vkc.GoTo(4.0, 0.0)], options)
     request = PlanningRequest("interpolated", options)

@@ -63,8 +63,9 @@ def specify(
 ) -> list[dict[str, Any]]:
     """Return the trials, ordered by scene, start, repeat and method.
 
-    Starts depend on seed and scene alone. The first repeat has an unperturbed initial guess. With
-    "auto", the steps are also planned one after the other, once per start.
+    Starts, and random seeds of planning from each, depend on seed and scene alone. The first repeat
+    has an unperturbed initial guess. With "auto", the steps are also planned one after the other,
+    once per start.
     """
     trials = []
     for scene in scenes:
@@ -72,6 +73,7 @@ def specify(
         rng, loaded = np.random.default_rng([seed, number]), load_scene(scene)
         for start in range(starts):
             base = loaded.sample_start(rng).start[:3].tolist()
+            own_seed = int(np.random.default_rng([seed, number, start]).integers(2**31))
             for repeat in range(repeats):
                 for method in (
                     *methods,
@@ -89,7 +91,7 @@ def specify(
                     trials.append(
                         {
                             **spec,
-                            "seed": seed + repeat,
+                            "seed": own_seed + repeat,
                             "perturbation": PERTURBATION if repeat else 0.0,
                         }
                     )

@@ -330,11 +330,12 @@ class _OpenSearch(_Search):
     ) -> None:
         super().__init__(sampler, phase, float(sampler.problem.ends[phase]))
         self.first, self.poses, self.arms = first, poses, arms
+        names = self.problem.chain.names[: sampler.robot_size]
+        self.lower, self.upper = np.array([self.problem.limits(name) for name in names]).T
 
     def project(self, z: Floats, at: Floats) -> tuple[Floats, Bools]:
-        size, limits = self.sampler.robot_size, self.problem.limits
-        lower, upper = np.array([limits(name) for name in self.problem.chain.names[:size]]).T
-        z = np.hstack([np.clip(z[:, :size], lower, upper), z[:, size:]])
+        robot, others = np.split(z, [len(self.lower)], axis=1)
+        z = np.hstack([np.clip(robot, self.lower, self.upper), others])
         return z, np.ones(len(z), bool)
 
     def sample(self) -> tuple[Floats, float]:

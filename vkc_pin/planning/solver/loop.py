@@ -145,8 +145,9 @@ class _Loop:
             # Near feasibility, rejected rounds are not counted: they shrink the radius, which ends
             # the loop by itself.
             since += accepted or shortfall.max() >= NEARLY_FEASIBLE
+            # The infeasibility may also grow, where the objective decreased instead.
             total, shortfall = self._measure_total(), self.point.shortfall
-            if total <= PROGRESS * reference:
+            if not PROGRESS * reference < total <= reference:
                 reference, since = total, 0
             if since >= PROGRESS_ROUNDS:
                 break

@@ -35,8 +35,8 @@ SIDE, FINER, COLOURS = (
     2,
     160,
 )  # [pixels] of a picture in the grid; in each of these so many; of the palette
-AWAY = np.array([-0.85, -0.85, 0.62])  # from what is looked at to the camera, before it is scaled
-FIELD = 0.62  # half of what is seen, at 1 m
+VIEW_DIRECTION = np.array([-0.85, -0.85, 0.62])  # from the target to the camera, not normalized
+FIELD = 0.62  # [m] half the width of the view at a distance of 1 m
 PIECE = 0.4  # [m] longest edge of a drawn triangle
 NEAR = 1.0  # [m] triangles closer to the camera are omitted
 DOTS, PARTS = (
@@ -66,7 +66,7 @@ def plan_opening(robot: str, file: str, object_name: str, folder: Path) -> vkc.P
     raise SystemExit(f"{robot} opens no {object_name}: {plan.summary()}")
 
 
-def triangles_of(scene: vkc.Scene) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def collect_triangles(scene: vkc.Scene) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield triangles in the world, shape (n, 3, 3), edges at most `PIECE`, and colours (n, 3)."""
     world = World(scene)
     data = world.model.createData()
@@ -105,7 +105,7 @@ class Camera:
             size,
         )
 
-    def seen(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return pixel columns and rows, shape (..., 2), and depths along the view [m]."""
         own = (points - self.position) @ self.axes.T
         ahead = np.maximum(own[..., 2], 1e-6)
@@ -122,7 +122,7 @@ class Camera:
         return np.where(down > 1e-6, self.position[2] / np.maximum(down, 1e-6), np.inf)
 
 
-def dotted(
+def sample_triangles(
     corners: np.ndarray, pixels: np.ndarray, apart: float
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield indices of triangles and points on them, shape (k, 3), at most `apart` [pixels]."""
@@ -140,31 +140,33 @@ def dotted(
 
 
 def draw_scene(scene: vkc.Scene) -> Image.Image:
-    """Return the picture of a scene, seen from beside the robot and what it holds."""
+    """Return the picture of a scene, viewed from beside the robot and its load."""
     tool, base = scene.tool_placement().translation, scene.start[:2]
     target = np.array([*(0.5 * (tool[:2] + base)), 0.72])
     size = SIDE * FINER
     camera = Camera(
-        target, target + AWAY * (1.15 + 0.5 * float(np.linalg.norm(tool[:2] - base))), size
+        target,
+        target + VIEW_DIRECTION * (1.15 + 0.5 * float(np.linalg.norm(tool[:2] - base))),
+        size,
     )
     floor = camera.on_floor()
     depth, dark = floor.ravel().copy(), np.zeros(size * size, bool)
     image = np.where(np.isfinite(depth)[:, None], FLOOR, SKY)
-    for corners, colours in triangles_of(scene):
+    for corners, colours in collect_triangles(scene):
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         shades = np.clip(colours * (0.62 + 0.38 * np.abs(normals @ SUN))[:, None], 0.0, 1.0)
         fallen = corners - corners[..., 2:] * SUN / SUN[2]
         for own, shown, apart in ((corners, True, DOTS[0]), (fallen, False, DOTS[1])):
-            pixels, ahead = camera.seen(own)
+            pixels, ahead = camera.project(own)
             visible = (
                 (ahead.min(axis=1) > NEAR)
                 & (pixels.max(axis=1) > 0.0).all(axis=1)
                 & (pixels.min(axis=1) < size).all(axis=1)
             )
             numbers = np.flatnonzero(visible)
-            for which, points in dotted(own[numbers], pixels[numbers], apart):
-                place, away = camera.seen(points)
+            for which, points in sample_triangles(own[numbers], pixels[numbers], apart):
+                place, away = camera.project(points)
                 columns, rows = place.astype(int).T
                 kept = (columns >= 0) & (columns < size) & (rows >= 0) & (rows < size)
                 at, which, away = (rows * size + columns)[kept], numbers[which[kept]], away[kept]

@@ -31,7 +31,7 @@ def main() -> int:
     seen: list[tuple[TrajectoryProblem, list[np.ndarray]]] = []
     search = interpolation.RrtPaths.find_closed_path
 
-    def kept(
+    def record(
         paths: interpolation.RrtPaths, phase: int, through: np.ndarray, straight: np.ndarray
     ) -> np.ndarray | None:
         path, sampler = search(paths, phase, through, straight), paths.sampler
@@ -41,24 +41,24 @@ def main() -> int:
             seen.append((sampler.problem, [closed, path]))
         return path
 
-    interpolation.RrtPaths.find_closed_path = kept
+    interpolation.RrtPaths.find_closed_path = record
     step = vkc.Actuate("door", {"hinge": 0.0}, "handle_free")
     plan = vkc.plan(scene, [step], options=chores.CHORES["cluttered"].options, initialization="rrt")
     interpolation.RrtPaths.find_closed_path = search
     sys.stdout.write(plan.summary() + "\n")
-    problem, ways = seen[-1]
+    problem, paths = seen[-1]
     phase = len(problem.task.phases) - 1
     with use_style():
         figure = new_figure(8.0, 3.9)
-        for number, (way, title) in enumerate(
-            zip(ways, ("straight between keyframes", "along the trees' path"), strict=True)
+        for number, (path, title) in enumerate(
+            zip(paths, ("straight between keyframes", "along the trees' path"), strict=True)
         ):
             axes = figure.add_subplot(1, 2, number + 1)
             short = (
-                compute_shortfall(problem, way, problem.contacts.find_waypoint(phase), reach=0.0)
+                compute_shortfall(problem, path, problem.contacts.find_waypoint(phase), reach=0.0)
                 - problem.options.dist_safe
             )
-            draw_held(axes, problem, way, int(np.argmax(short)) if short.max() > 0.0 else None)
+            draw_path(axes, problem, path, int(np.argmax(short)) if short.max() > 0.0 else None)
             overlap = (
                 f"{1e3 * short.max():.0f} mm inside at most"
                 if short.max() > 0.0
@@ -69,14 +69,14 @@ def main() -> int:
     return 0
 
 
-def draw_held(axes: Any, problem: TrajectoryProblem, way: np.ndarray, worst: int | None) -> None:
+def draw_path(axes: Any, problem: TrajectoryProblem, path: np.ndarray, worst: int | None) -> None:
     """Draw walls, arm and door leaf at some waypoints, the worst one in another colour."""
     from matplotlib.colors import to_rgb
     from scipy.spatial import ConvexHull
 
     part = problem.contacts.phases[len(problem.task.phases) - 1]
-    rotations, translations = problem.chain.joint_placements(way)
-    shown = [*range(0, len(way), EVERY), *([] if worst is None else [worst])]
+    rotations, translations = problem.chain.joint_placements(path)
+    shown = [*range(0, len(path), EVERY), *([] if worst is None else [worst])]
     for shape, label in zip(part.shapes, part.labels, strict=True):
         points = triangulate(shape.geometry)[0]
         for k in shown if shape.parentJoint else [0]:

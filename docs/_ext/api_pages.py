@@ -17,12 +17,12 @@ def packages() -> dict[str, dict[str, Path]]:
     ):
         parts = file.relative_to(ROOT).with_suffix("").parts
         name = ".".join(part for part in parts if part != "__init__")
-        if name != "vkc_pin" and file.name != "__main__.py":  # importing that is running it
+        if name != "vkc_pin" and file.name != "__main__.py":  # importing it runs it
             found.setdefault(parts[1] if len(parts) > 2 else "package", {})[name] = file
     return found
 
 
-def taken(file: Path) -> dict[str, list[str]]:
+def find_reexports(file: Path) -> dict[str, list[str]]:
     """Return module → names that a package's `__init__.py` imports from it and documents."""
     tree = ast.parse(file.read_text(encoding="utf-8"))
     return {
@@ -35,11 +35,13 @@ def taken(file: Path) -> dict[str, list[str]]:
 def page(package: str, files: dict[str, Path]) -> str:
     """Return the page of a package."""
     own = f"vkc_pin.{package}"
-    faces = taken(files[own]) if own in files else {}
+    reexports = find_reexports(files[own]) if own in files else {}
     title = "Top-level modules" if package == "package" else f"`{package}`"
     blocks = [f"# {title}\n"]
     for name in files:
-        left_out = f"   :exclude-members: {', '.join(faces[name])}\n" if name in faces else ""
+        left_out = (
+            f"   :exclude-members: {', '.join(reexports[name])}\n" if name in reexports else ""
+        )
         heading = "" if name == own else f"## {name.removeprefix('vkc_pin.')}\n\n"
         blocks.append(f"{heading}```{{eval-rst}}\n.. automodule:: {name}\n{left_out}```\n")
     return "\n".join(blocks)

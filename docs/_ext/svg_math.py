@@ -18,12 +18,12 @@ SCALE = (
 
 
 @cache
-def drawn(latex: str, inline: bool) -> str:
+def draw_formula(latex: str, inline: bool) -> str:
     """Return the SVG picture of a formula, scaled to the text and aligned with its baseline."""
     picture = str(ziamath.Latex(latex, size=SIZE, inline=inline, color="currentColor").svg())
     found = re.search(r'viewBox="([-\d.]+) ([-\d.]+) ([-\d.]+) ([-\d.]+)"', picture)
     if found is None:
-        raise RuntimeError(f"no picture came of {latex}")
+        raise RuntimeError(f"found no picture of {latex}")
     _, top, width, height = map(float, found.groups())
     size = f"width:{width * SCALE:.3f}em;height:{height * SCALE:.3f}em"
     style = f"{size};vertical-align:{-(top + height) * SCALE:.3f}em"
@@ -34,13 +34,13 @@ def drawn(latex: str, inline: bool) -> str:
 
 def inline_formula(self: Any, node: nodes.math) -> None:
     """Write a formula within a line."""
-    self.body.append(drawn(node.astext(), True))
+    self.body.append(draw_formula(node.astext(), True))
     raise nodes.SkipNode
 
 
 def displayed_formula(self: Any, node: nodes.math_block) -> None:
     """Write a formula that stands alone."""
-    self.body.append(f'<div class="formula">{drawn(node.astext(), False)}</div>\n')
+    self.body.append(f'<div class="formula">{draw_formula(node.astext(), False)}</div>\n')
     raise nodes.SkipNode
 
 

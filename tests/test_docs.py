@@ -325,6 +325,8 @@ def test_all_files_have_one_version() -> None:
     assert yaml.safe_load(read("tools/conda/recipe.yaml"))["context"]["version"] == found["version"]
     assert vkc.__version__ == project["version"]
     assert re.findall(r"^## \[([^]]+)\]", read("CHANGELOG.md"), re.MULTILINE)[0] == found["version"]
+    for page in ("README.md", "docs/installation.md"):
+        assert set(re.findall(r"[Vv]ersion (\d+\.\d+\.\d+)", read(page))) == {found["version"]}
 
 
 def test_tables_are_as_the_results_on_record_say() -> None:

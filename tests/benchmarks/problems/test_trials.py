@@ -27,7 +27,13 @@ def test_objective_is_that_of_the_solver(drawn: vkc.Plan) -> None:
 
 @pytest.mark.parametrize(
     ("name", "solves", "expected"),
-    [("interpolated", 1, True), ("astar 2", 2, False), ("astar, interpolated", 3, False)],
+    [
+        ("interpolated", 1, True),
+        ("astar 2", 2, False),
+        ("astar, interpolated", 3, False),
+        ("astar, rrt, then all at once", 3, True),
+        ("astar, rrt, then all at once", 4, False),
+    ],
 )
 def test_first_seed(drawn: vkc.Plan, name: str, solves: int, expected: bool) -> None:
     plan = dataclasses.replace(drawn, initialization=name)

@@ -62,9 +62,9 @@ SUMMARY = (
 )
 """Columns of `summary`."""
 SUMMARIZED = (
-    "First guess: trials that ran the solver once. Times are those of all trials, CPU time "
-    "with building symbolic programs. Rounds and iterations are means, path lengths medians of "
-    "successes."
+    "First guess: trials in which no program needed a second initial guess. Times are those of "
+    "all trials, CPU time with building symbolic programs. Rounds and iterations are means, path "
+    "lengths medians of successes."
 )
 """Description of `summary`."""
 

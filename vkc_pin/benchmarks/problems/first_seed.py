@@ -78,7 +78,7 @@ def format_results(result: Mapping[str, Any]) -> str:
         about,
         "# Success with the first initial guess",
         f"{about['starts']} random starts per task, seed {about['seed']}. {JUDGED} The first "
-        "guess sufficed if the solver ran once; its interval is Wilson's of 95 % confidence.",
+        "guess sufficed if no program needed another; its interval is Wilson's of 95 % confidence.",
         format_table([*head, "95th percentile [s]", "failures"], rows),
         "## Every trial",
         tabulate_trials(records),

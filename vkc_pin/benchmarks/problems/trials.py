@@ -58,8 +58,15 @@ def run_trial(
 
 
 def is_first_guess_success(found: Plan, solves: int) -> bool:
-    """Return whether a plan succeeded with the first of its `solves` runs of the solver."""
-    return found.success and solves == 1
+    """Return whether a plan succeeded with the first initial guess of each of its programs.
+
+    Several steps are solved one by one, then all at once: `Plan.initialization` names each program.
+
+    Args:
+        found: The plan.
+        solves: How often the solver ran.
+    """
+    return found.success and solves == len(found.initialization.split(", "))
 
 
 def compute_objective(found: Plan, planner: Planner | None = None) -> float | None:

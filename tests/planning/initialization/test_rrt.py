@@ -24,7 +24,7 @@ from vkc_pin.planning.initialization.rrt import (
     MAX_EXTENSIONS,
     find_closed_path,
     find_open_path,
-    is_obstructed,
+    needs_trees,
 )
 from vkc_pin.utils.budget import Budget, BudgetExhaustedError
 
@@ -261,7 +261,7 @@ def make_blocked_door() -> vkc.TrajectoryProblem:
     return make_program(scene, OPEN_AND_LEAVE, options=FEW)
 
 
-def find_closed(seed: int, *, tries: int = MAX_EXTENSIONS) -> np.ndarray | None:
+def find_path_with_door(seed: int, *, tries: int = MAX_EXTENSIONS) -> np.ndarray | None:
     through, straight = find_phase()
     sampler = make_sampler(make_blocked_door(), seed)
     return find_closed_path(sampler, MOVE, through, len(straight), tries)
@@ -282,7 +282,7 @@ def assert_holds_the_handle(p: vkc.TrajectoryProblem, rows: np.ndarray) -> None:
 def test_path_avoids_an_obstacle_and_holds_the_handle(seed: int) -> None:
     p, (through, straight) = make_free_door()[0], find_phase()
     assert compute_penetration(make_blocked_door(), straight) > 0.02
-    rows = find_closed(seed)
+    rows = find_path_with_door(seed)
     assert rows is not None
     assert rows.shape == straight.shape
     assert compute_penetration(make_blocked_door(), rows) <= 5e-3  # waypoints are between nodes
@@ -296,7 +296,7 @@ def test_path_avoids_an_obstacle_and_holds_the_handle(seed: int) -> None:
     assert steps[0] < 0.1
     assert steps.max() < 0.6
     if seed == 1:
-        np.testing.assert_array_equal(find_closed(seed), rows)
+        np.testing.assert_array_equal(find_path_with_door(seed), rows)
 
 
 def test_next_phase_begins_where_the_closed_path_ends() -> None:
@@ -313,17 +313,17 @@ def test_next_phase_begins_where_the_closed_path_ends() -> None:
     assert np.abs(np.diff(z, axis=0))[:, 3:9].max() < 1.0
 
 
-def test_free_phases_and_colliding_starts_are_not_obstructed() -> None:
+def test_free_phases_and_colliding_starts_need_no_trees() -> None:
     p, (through, straight) = make_free_door()[0], find_phase()
     assert compute_penetration(p, straight) <= 0.0
-    assert not is_obstructed(make_sampler(p), MOVE, through, straight)
-    assert is_obstructed(make_sampler(make_blocked_door()), MOVE, through, straight)
+    assert not needs_trees(make_sampler(p), MOVE, through, straight)
+    assert needs_trees(make_sampler(make_blocked_door()), MOVE, through, straight)
     colliding = through.copy()
     colliding[0] = straight[len(straight) // 2]
-    assert not is_obstructed(make_sampler(make_blocked_door()), MOVE, colliding, straight)
+    assert not needs_trees(make_sampler(make_blocked_door()), MOVE, colliding, straight)
 
 
 def test_extensions_and_budget_end_the_search() -> None:
-    assert find_closed(0, tries=0) is None
+    assert find_path_with_door(0, tries=0) is None
     with Budget(max_evaluations=50).activate(), pytest.raises(BudgetExhaustedError):
-        find_closed(0)
+        find_path_with_door(0)

@@ -195,11 +195,14 @@ def test_feasible_motions_are_improved_while_worthwhile(case: Case) -> None:
     assert solve_case(case).rounds < case()[0].options.max_outer
 
 
-def test_blocked_motions_do_not_converge() -> None:
-    problem, guess = make_blocked_case()
+@pytest.mark.parametrize("seed", range(3))
+def test_blocked_motions_end_early(seed: int) -> None:
+    """The goal is deep in a block across the hall; rounding may differ."""
+    problem, guess = drive(4.0, describe_box("block", 4.0, 0.0, [2.5, 12.0, 2.0]))
+    guess = guess + np.random.default_rng(seed).normal(0.0, 1e-9, guess.shape)
     solution = solve(problem, guess, rounds=vkc.Options().max_outer)
     assert (solution.status, solution.converged) == ("not converged", False)
-    assert PROGRESS_ROUNDS <= solution.rounds <= vkc.Options().max_outer
+    assert PROGRESS_ROUNDS <= solution.rounds < vkc.Options().max_outer
     shortfall = problem.evaluate_contacts(solution.z, reach=0.1).compute_violation()
     assert solution.shortfall == pytest.approx(shortfall)
     assert shortfall > NEARLY_FEASIBLE

@@ -14,7 +14,7 @@ from vkc_pin.planning.initialization.rrt import (
     MAX_EXTENSIONS,
     find_closed_path,
     find_open_path,
-    is_obstructed,
+    needs_trees,
 )
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.task.phases import Phase
@@ -105,7 +105,7 @@ class RrtPaths:
 
     def find_closed_path(self, phase: int, through: Floats, straight: Floats) -> Floats | None:
         """Find waypoints of a closed phase around obstacles; None if straight lines are free."""
-        if not is_obstructed(self.sampler, phase, through, straight):
+        if not needs_trees(self.sampler, phase, through, straight):
             return None
         limit = self._get_extension_limit(phase)
         path = find_closed_path(self.sampler, phase, through, len(straight), limit)

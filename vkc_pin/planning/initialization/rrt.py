@@ -27,7 +27,7 @@ __all__ = [
     "MAX_EXTENSIONS",
     "find_closed_path",
     "find_open_path",
-    "is_obstructed",
+    "needs_trees",
 ]
 
 MAX_EXTENSIONS = 1500
@@ -41,7 +41,7 @@ _STRAIGHTENING_ROUNDS = 3
 _MIN_SAVING = 1e-3  # relative saving in length that a partial shortcut needs
 
 
-def is_obstructed(sampler: KeyframeSampler, phase: int, through: Floats, straight: Floats) -> bool:
+def needs_trees(sampler: KeyframeSampler, phase: int, through: Floats, straight: Floats) -> bool:
     """Return whether straight lines through a closed-chain phase collide and trees may help.
 
     Trees do not help a base with wheels, whose arcs they ignore, or a phase that starts in
@@ -77,7 +77,7 @@ def find_closed_path(
         None if no path was found.
     """
     search = _ClosedSearch(sampler, phase, through, steps)
-    ends = np.vstack([through[-1:], search.sample_at(search.end)])
+    ends = np.vstack([through[-1:], search.sample_waypoint(int(search.end))])
     path = search.connect(through[:1], ends, max_extensions)
     return None if path is None else search.resample(search.shorten(path), steps)
 
@@ -263,7 +263,7 @@ class _Search(ABC):
         return path
 
     def replace(self, path: _Path, first: int, last: int, z: Floats, at: Floats) -> _Path:
-        """Replace what is between two points of a path if that is shorter and collision-free."""
+        """Replace the piece between two points of a path by a shorter, collision-free one."""
         z, feasible = self.project(z, at)
         gaps = self.compute_gaps(np.vstack([path.z[first], z, path.z[last]]))
         before = self.compute_gaps(path.z[first : last + 1]).sum()
@@ -309,13 +309,13 @@ class _ClosedSearch(_Search):
 
     def sample(self) -> tuple[Floats, float]:
         waypoint = int(self.sampler.rng.integers(int(self.begin) + 1, int(self.end) + 1))
-        return self.sample_at(waypoint), float(waypoint)
+        return self.sample_waypoint(waypoint), float(waypoint)
 
-    def sample_at(self, waypoint: float) -> Floats:
+    def sample_waypoint(self, waypoint: int) -> Floats:
         """Sample nearly collision-free configurations at a waypoint with the phase's grasp."""
         before, found = self.through[np.arange(_CLOSED_SAMPLES) % len(self.through)], []
         for how in ("scatter", "shake"):
-            z, closed = self.sampler.sample(before, int(waypoint), how)
+            z, closed = self.sampler.sample(before, waypoint, how)
             is_same = z[:, self.grasp_columns] == self.through[0, self.grasp_columns]
             found.append(z[closed & is_same.all(axis=1)])
         z = np.concatenate(found)

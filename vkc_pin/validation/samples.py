@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable
 from functools import cached_property
 
@@ -197,14 +196,10 @@ class Samples:
         self.required_count = float(counts.sum())
         self.is_truncated = self.required_count > max(MAX_SAMPLES, len(counts))
         counts = np.ones(len(counts), int) if self.is_truncated else counts.astype(int)
-        times = [
-            np.linspace(a, b, n, endpoint=False)
-            for (a, b), n in zip(itertools.pairwise(edges), counts, strict=True)
-        ]
         rows = np.concatenate([[0], np.cumsum(counts)])
-        return np.concatenate([*times, edges[-1:]]), rows[
-            np.searchsorted(edges, self.trajectory.times)
-        ]
+        numbers = np.arange(rows[-1]) - np.repeat(rows[:-1], counts)
+        times = np.repeat(edges[:-1], counts) + numbers * np.repeat(np.diff(edges) / counts, counts)
+        return np.append(times, edges[-1]), rows[np.searchsorted(edges, self.trajectory.times)]
 
     def get_unit(self, name: str) -> str:
         """Return the unit of a coordinate, "m" or "rad"."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Set
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -226,7 +227,7 @@ class ArticulatedObject:
         """Total mass of the links [kg]; 0 if the description states none."""
         return compute_mass(self.model)
 
-    @property
+    @cached_property
     def links(self) -> tuple[str, ...]:
         """Names of the links."""
         return tuple(

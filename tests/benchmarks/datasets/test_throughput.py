@@ -39,6 +39,9 @@ def test_each_task_has_a_record(tmp_path: Path, capsys: pytest.CaptureFixture[st
     result = json.loads((out / "results.json").read_text())
     records = result["trials"]
     assert [record["task"] for record in records] == list(TASKS)
+    (session,) = result["meta"]["sessions"]
+    assert session["trials"] == sum(record["attempts"] for record in records)
+    assert {record["commit"] for record in records} == {result["meta"]["commit"]}
     for record in records:
         assert {
             "task",
@@ -89,7 +92,7 @@ def test_more_workers_make_the_same_episodes(tmp_path: Path) -> None:
         ]
         assert shards[0] == shards[1]
     assert [one["workers"] for one in result["trials"]] == [2, 2, 2]
-    assert "times one" in (tmp_path / "out/table.md").read_text()
+    assert "speedup" in (tmp_path / "out/table.md").read_text()
 
 
 def write(folder: Path) -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vkc_pin.benchmarks.datasets.simulated import WORKERS, Costs, measure_costs, simulate_workers
-from vkc_pin.benchmarks.harness.record import Record, describe_environment
+from vkc_pin.benchmarks.harness.record import Record, describe_environment, find_commit
 from vkc_pin.benchmarks.harness.runner import check_folder
 from vkc_pin.benchmarks.harness.tables import describe_run, format_decimal, format_table, to_csv
 from vkc_pin.datasets.dataset import Dataset
@@ -29,7 +29,7 @@ __all__ = ["RECIPE", "format_results", "record", "run", "workers_chart"]
 
 RECIPE = "home"
 """Of the package: which robots, objects and rooms."""
-_LEAST = 20  # attempts of a process that a slope is told of
+_LEAST = 20  # attempts of a process from which a growth is computed
 
 
 def run(
@@ -97,8 +97,13 @@ def run(
                 }
                 for count, rate in rates.items()
             ]
+    session = {
+        "jobs": jobs,
+        "trials": sum(one["attempts"] for one in records),
+        "seconds": sum(one["wall_time"] for one in records),
+    }
     about = describe_environment(
-        benchmark="throughput", recipe=made.digest, episodes=episodes, jobs=jobs, sessions=[]
+        benchmark="throughput", recipe=made.digest, episodes=episodes, jobs=jobs, sessions=[session]
     )
     about |= {
         "peak_memory_mb": max(record["memory_mb"] for record in records),
@@ -141,6 +146,7 @@ def record(task: str, dataset: Dataset, jobs: int | None, wall: float) -> dict[s
     }
     return {
         "task": task,
+        "commit": find_commit(),
         "episodes_per_hour": round(3600.0 * good / kept.seconds, 1) if kept.seconds else 0.0,
         "episodes_per_core_hour": round(3600.0 * good / worked, 1) if worked else 0.0,
         "attempts": len(attempts),
@@ -190,29 +196,25 @@ def format_results(result: Mapping[str, Any]) -> str:
     about, records = result["meta"], result["trials"]
     head = [
         "task",
-        "episodes an hour",
-        "an hour of one core",
+        "episodes per hour",
+        "per core and hour",
         "success of attempts",
         "workers",
         "memory [MB]",
-        "growth [MB a thousand]",
+        "growth [MB per 1000 attempts]",
         "client [ms]",
-        "an attempt [s]",
-        "setting up [s]",
+        "attempt [s]",
+        "setup [s]",
         "planning [s]",
     ]
     parts = [
         "# Throughput",
-        f"{about['episodes']} validated episodes of each task, with {about['jobs']} processes, "
-        f"recipe {about['recipe']}. "
-        "The time counts from when the processes are there to the last attempt; an hour of one "
-        "core is of processor "
-        "time, without other processes. Growth is that of a process in a thousand "
-        "attempts, once half of its "
-        "attempts have filled its caches; the client feeds the processes and writes down what "
-        "comes, and takes so much "
-        "processor time an attempt. Medians of an attempt, of what sets it up (room, start, "
-        "grasp) and of planning it.",
+        f"{about['episodes']} validated episodes per task, {about['jobs']} processes, recipe "
+        f"{about['recipe']}. Episodes per hour count from the start of the processes to the last "
+        "attempt; those per core and hour are of CPU time, without other processes. Growth is that "
+        "of a process in the second half of its attempts. The client distributes tasks and writes "
+        "results: its CPU time is per attempt. Medians of an attempt, its setup (room, start, "
+        "grasp) and planning.",
         format_table(head, [_row(one) for one in records]),
         *_curve(result["curve"]),
         *_simulation(result["simulated"], bool(about["scheduled"])),
@@ -242,9 +244,9 @@ def _curve(curve: Sequence[Record]) -> list[str]:
         ]
         for one in curve
     ]
-    text = "The same episodes by fewer workers, in this run too. "
-    text += "One works in the client's own process, without Dask."
-    return [text, format_table(["task", "workers", "episodes an hour", "times one"], rows)]
+    text = "The same episodes with fewer workers, in this run. "
+    text += "A single worker is the client's own process, without Dask."
+    return [text, format_table(["task", "workers", "episodes per hour", "speedup"], rows)]
 
 
 def _simulation(many: Sequence[Record], scheduled: bool) -> list[str]:
@@ -252,10 +254,10 @@ def _simulation(many: Sequence[Record], scheduled: bool) -> list[str]:
     head = [
         "task",
         "workers",
-        "episodes an hour, simulated",
+        "episodes per hour, simulated",
         "efficiency",
         "client busy",
-        "unused work",
+        "discarded work",
         "client saturated at",
     ]
     rows = [
@@ -267,13 +269,11 @@ def _simulation(many: Sequence[Record], scheduled: bool) -> list[str]:
         for one in many
     ]
     text = (
-        "Many workers, simulated from what these tasks took, a hundred tasks for each. Every "
-        "result waits for the one client, "
-        f"which takes its processor time {'with' if scheduled else 'but not'} that of Dask's "
-        "scheduler; efficiency is the share "
-        "of the workers' time that goes into the dataset, and unused work was begun "
-        "beyond its last number. Nothing is "
-        "said of network and disk."
+        "Many workers, simulated from the durations of these tasks, with a hundred tasks per "
+        "worker. Every result waits for the single client, whose CPU time "
+        f"{'includes' if scheduled else 'excludes'} that of Dask's scheduler. Efficiency is the "
+        "share of the workers' time spent on the dataset; discarded work was begun beyond its last "
+        "number. Network and disks are not simulated."
     )
     return [text, format_table(head, rows), "![Efficiency of many workers, simulated](workers.png)"]
 

@@ -1,4 +1,4 @@
-"""What several test files need and what takes long to make."""
+"""Configures the tests, lets the oracle judge their plans, and provides shared fixtures."""
 
 from __future__ import annotations
 
@@ -10,33 +10,32 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from helpers.second_opinion import SecondOpinion
+from helpers.second_opinion import PlanJudge
 from hypothesis import settings
 
 import vkc_pin as vkc
 
-# The same examples every time, so that what passed goes on passing; HYPOTHESIS_PROFILE=random looks
-# for new ones.
+# Examples are reproducible; HYPOTHESIS_PROFILE=random generates new ones.
 settings.register_profile("repeatable", derandomize=True)
 settings.register_profile("random", derandomize=False)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
 
-# Nothing is compiled in the background and nothing is written to the user's home; tests of that
-# name folders of their own.
+# Disables background compilation and the cache in the user's home. Tests of the cache set their own
+# folders.
 os.environ["VKC_PIN_CACHE"] = "off"
 
-# A shell that runs the tests in the background lets them ignore Ctrl-C, which some of them press.
+# Background processes of a shell ignore SIGINT, which some tests send.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-# Every motion that succeeds in a test is judged by the oracle as well, before the test is over.
-OPINION = SecondOpinion()
-OPINION.attach()
-OPINIONS: dict[str, dict[str, Any]] = {}  # of the processes that tests run in
+# The oracle judges every successful plan of a test before the test ends.
+JUDGE = PlanJudge()
+JUDGE.attach()
+COUNTS: dict[str, dict[str, Any]] = {}  # counts by test process
 
 
 def pytest_collection_finish() -> None:
-    """Exclude tests and modules, which stay until the end, from garbage collections."""
+    """Exclude tests and modules, which live until the end, from garbage collection."""
     gc.collect()
     gc.freeze()
 
@@ -48,39 +47,40 @@ def second_opinion(
     """Fail the test if the oracle contradicts a plan that its planner called successful."""
     yield
     if request.node.get_closest_marker("made_up"):
-        OPINION.forget()
-    if wrong := OPINION.verdicts(tmp_path_factory.getbasetemp()):
+        JUDGE.drop_plans()
+    if verdicts := JUDGE.verdicts(tmp_path_factory.getbasetemp()):
         pytest.fail(
-            "\n".join(f"{verdict.path}: {found}" for verdict in wrong for found in verdict.found),
+            "\n".join(
+                f"{verdict.path}: {found}" for verdict in verdicts for found in verdict.found
+            ),
             pytrace=False,
         )
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Say what was judged; with pytest-xdist, to the process that the others work for."""
-    counts = {name: value for name, value in vars(OPINION).items() if not name.startswith("_")}
-    output: dict[str, Any] = getattr(session.config, "workeroutput", OPINIONS)
+    """Store the counts of the oracle; with pytest-xdist, send them to the main process."""
+    counts = {name: value for name, value in vars(JUDGE).items() if not name.startswith("_")}
+    output: dict[str, Any] = getattr(session.config, "workeroutput", COUNTS)
     output["second opinion"] = counts
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_testnodedown(node: Any) -> None:
-    """Take what a process of pytest-xdist says at its end."""
+    """Store the counts of a pytest-xdist process that ends."""
     if "second opinion" in getattr(node, "workeroutput", {}):
-        OPINIONS[node.gateway.id] = node.workeroutput["second opinion"]
+        COUNTS[node.gateway.id] = node.workeroutput["second opinion"]
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """Say how much the oracle has judged, and what it could not."""
+    """Print the number of judged plans, and the reasons for unjudged ones."""
     planned, judged, seconds = (
-        sum(counts[name] for counts in OPINIONS.values())
-        for name in ("planned", "judged", "seconds")
+        sum(counts[name] for counts in COUNTS.values()) for name in ("planned", "judged", "seconds")
     )
     terminalreporter.write_line(
         f"oracle: {planned} motions planned, {judged} different ones judged in {seconds:.1f} s"
     )
     for reason, count in Counter(
-        reason for counts in OPINIONS.values() for reason in counts["unjudged"]
+        reason for counts in COUNTS.values() for reason in counts["unjudged"]
     ).items():
         terminalreporter.write_line(f"oracle: {count} not judged: {reason}")
 

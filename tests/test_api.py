@@ -14,7 +14,7 @@ import pytest
 import vkc_pin as vkc
 
 ROOT = Path(__file__).resolve().parent.parent
-# Compiled, and a process of its own.
+# Compiled modules, and modules that run as scripts.
 COMPILED = tuple(
     f"vkc_pin.{name}"
     for name in (
@@ -52,7 +52,7 @@ def test_every_module_lists_its_public_names(name: str) -> None:
     if Path(str(module.__file__)).name == "__init__.py" and set(vars(module)) <= BARE | _submodules(
         name
     ):
-        return  # a folder that has nothing of its own
+        return  # a package without names of its own
     assert sorted(set(module.__all__)) == sorted(module.__all__)
     for public in module.__all__:
         assert hasattr(module, public), public
@@ -60,9 +60,9 @@ def test_every_module_lists_its_public_names(name: str) -> None:
 
 def test_every_public_name_is_documented() -> None:
     for public in vkc.__all__:
-        thing = getattr(vkc, public)
-        if inspect.isclass(thing) or inspect.isfunction(thing):
-            assert inspect.getdoc(thing), public
+        value = getattr(vkc, public)
+        if inspect.isclass(value) or inspect.isfunction(value):
+            assert inspect.getdoc(value), public
     for name in ("plan", "build", "load_scene", "load_robot", "load_object", "validate"):
         assert "Raises:" in (getattr(vkc, name).__doc__ or ""), name
 
@@ -77,7 +77,7 @@ def test_options_are_keyword_only(name: str) -> None:
     assert len(positional) <= 2
 
 
-def test_the_package_loads_what_is_asked_for_and_nothing_else() -> None:
+def test_heavy_dependencies_are_loaded_on_first_use() -> None:
     heavy = (
         "casadi",
         "coal",
@@ -103,7 +103,7 @@ def test_the_package_loads_what_is_asked_for_and_nothing_else() -> None:
     assert done.stdout.splitlines() == ["[]", "[]", "['casadi', 'coal', 'pinocchio', 'pydantic']"]
 
 
-def test_the_stub_lists_what_the_package_gives() -> None:
+def test_stub_lists_the_public_names() -> None:
     tree = ast.parse((ROOT / "vkc_pin/__init__.pyi").read_text(encoding="utf-8"))
     listed = next(
         ast.literal_eval(node.value) for node in tree.body if isinstance(node, ast.Assign)
@@ -118,7 +118,7 @@ def test_the_stub_lists_what_the_package_gives() -> None:
 
 
 @pytest.mark.parametrize("package", ["datasets", "importing", "procedural"])
-def test_no_function_has_the_name_of_a_module_beside_it(package: str) -> None:
+def test_no_public_function_is_named_like_a_sibling_module(package: str) -> None:
     """Importing the module would replace the function as the package's attribute."""
     owner = getattr(vkc, package)
     assert {name for _, name, _ in pkgutil.iter_modules(owner.__path__)}.isdisjoint(owner.__all__)

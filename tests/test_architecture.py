@@ -1,4 +1,4 @@
-"""The layout follows its rules: imports go down, names are complete, all is documented."""
+"""Tests that imports follow the layers, and that modules and packages are documented."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "vkc_pin"
-SCRIPTS = {"vkc_pin.visualization.server", "vkc_pin.cli.__main__"}  # run, and imported by nothing
-# The import linter as a command, blind to where an editable installation says that the package is.
+SCRIPTS = {"vkc_pin.visualization.server", "vkc_pin.cli.__main__"}  # never imported
+# Runs the import linter on the working directory instead of an editable installation.
 LINT = (
     "import sys; sys.meta_path = [one for one in sys.meta_path "
     "if 'vkc_pin' not in getattr(type(one), '__module__', '')]; "
@@ -25,7 +25,7 @@ LINT = (
 )
 
 
-def modules() -> dict[str, Path]:
+def find_modules() -> dict[str, Path]:
     """Return every module of the package by its full name."""
     files = {
         ".".join(file.relative_to(ROOT).with_suffix("").parts): file
@@ -47,8 +47,8 @@ def lint(folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture
-def copy(tmp_path: Path) -> Path:
-    """Return a copy of the package and its contracts, which may be spoilt."""
+def package_copy(tmp_path: Path) -> Path:
+    """Return a copy of the package and its import contracts that tests may modify."""
     shutil.copytree(
         PACKAGE, tmp_path / "vkc_pin", ignore=shutil.ignore_patterns("__pycache__", "*.html")
     )
@@ -56,7 +56,7 @@ def copy(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_imports_that_go_up_are_refused(copy: Path) -> None:
+def test_import_contracts_refuse_forbidden_imports(package_copy: Path) -> None:
     changes = (
         ("world/files/writing.py", "from vkc_pin.world.models.robot import Robot"),
         ("world/models/robot.py", "def _late():\n    from vkc_pin.planning.plan import Plan"),
@@ -67,9 +67,9 @@ def test_imports_that_go_up_are_refused(copy: Path) -> None:
         ("planning/nlp/problem.py", "from vkc_pin.visualization.viewer import show"),
     )
     for file, line in changes:
-        with (copy / "vkc_pin" / file).open("a", encoding="utf-8") as stream:
+        with (package_copy / "vkc_pin" / file).open("a", encoding="utf-8") as stream:
             stream.write(f"\n{line}\n")
-    done = lint(copy)
+    done = lint(package_copy)
     assert done.returncode != 0, done.stdout
     broken = {line for line in done.stdout.splitlines() if " BROKEN" in line}
     details = done.stdout.partition("Broken contracts")[2]
@@ -96,28 +96,28 @@ def test_imports_that_go_up_are_refused(copy: Path) -> None:
         assert [chain for chain in chains if chain not in section] == [], section
 
 
-def test_a_package_without_a_layer_is_refused(copy: Path) -> None:
-    (copy / "vkc_pin" / "new_package").mkdir()
-    (copy / "vkc_pin" / "new_package" / "__init__.py").touch()
-    done = lint(copy)
+def test_a_package_without_a_layer_is_refused(package_copy: Path) -> None:
+    (package_copy / "vkc_pin" / "new_package").mkdir()
+    (package_copy / "vkc_pin" / "new_package" / "__init__.py").touch()
+    done = lint(package_copy)
     assert done.returncode != 0
     assert "new_package" in done.stdout + done.stderr
 
 
 @pytest.mark.parametrize("name", ["trimesh", "matplotlib.pyplot", "scipy", "meshcat"])
-def test_heavy_imports_at_the_top_of_a_module_are_refused(copy: Path, name: str) -> None:
-    with (copy / "vkc_pin" / "errors.py").open("a", encoding="utf-8") as stream:
+def test_heavy_imports_at_the_top_of_a_module_are_refused(package_copy: Path, name: str) -> None:
+    with (package_copy / "vkc_pin" / "errors.py").open("a", encoding="utf-8") as stream:
         stream.write(f"\nimport {name}\n")
     command = [sys.executable, "-m", "ruff", "check", "--no-cache", "--select", "TID253", "vkc_pin"]
     done = subprocess.run(
-        command, cwd=copy, capture_output=True, text=True, timeout=60, check=False
+        command, cwd=package_copy, capture_output=True, text=True, timeout=60, check=False
     )
     assert done.returncode != 0
     assert "TID253" in done.stdout
 
 
-def test_modules_are_imported_by_their_full_names() -> None:
-    known, wrong = modules(), []
+def test_names_are_imported_from_modules_and_not_from_packages() -> None:
+    known, wrong = find_modules(), []
     packages = {
         name.rpartition(".")[0].removeprefix("vkc_pin.") for name in known if name.count(".") > 1
     }
@@ -147,14 +147,14 @@ def test_modules_are_imported_by_their_full_names() -> None:
     assert wrong == []
 
 
-def test_calls_of_one_operating_system_are_in_one_module() -> None:
-    words = re.compile(r"/proc/|sched_|malloc_trim|prctl|import resource\n|getrusage|confstr")
-    found = [name for name, file in modules().items() if words.search(file.read_text())]
+def test_calls_of_the_operating_system_are_in_one_module() -> None:
+    calls = re.compile(r"/proc/|sched_|malloc_trim|prctl|import resource\n|getrusage|confstr")
+    found = [name for name, file in find_modules().items() if calls.search(file.read_text())]
     assert found == ["vkc_pin.utils.system"]
 
 
-def test_every_module_says_what_it_hands_out() -> None:
-    for name, file in modules().items():
+def test_every_module_has_a_docstring_and_lists_its_public_names() -> None:
+    for name, file in find_modules().items():
         tree = parse(file)
         assert ast.get_docstring(tree), name
         if file.name != "__init__.py" and name not in SCRIPTS:
@@ -164,7 +164,7 @@ def test_every_module_says_what_it_hands_out() -> None:
             ), name
 
 
-def test_the_page_names_every_package() -> None:
+def test_architecture_page_lists_every_package() -> None:
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     rows = text.split("## The packages")[1].split("\n## ")[0].splitlines()
     named = {
@@ -173,9 +173,9 @@ def test_the_page_names_every_package() -> None:
         if row.startswith("| `")
         for name in re.findall(r"`(\w+)`", row.split("|")[1])
     }
-    assert named == {name.split(".")[1] for name in modules() if "." in name}
+    assert named == {name.split(".")[1] for name in find_modules() if "." in name}
 
 
-def test_the_diagram_shows_the_imports() -> None:
+def test_architecture_diagram_is_up_to_date() -> None:
     drawn = runpy.run_path(str(ROOT / "docs" / "make_architecture.py"))["main"]()
     assert (ROOT / "docs" / "images" / "architecture.svg").read_text(encoding="utf-8") == drawn

@@ -1,4 +1,4 @@
-"""The documentation is correct: its code runs, its links work, and its names exist."""
+"""Tests that the code of the documentation runs, its links work, and its names exist."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def find_blocks(page: Path, language: str) -> list[str]:
     )
 
 
-LONG = (
+LONG_PAGES = (
     "baselines",
     "chores",
     "datasets",
@@ -65,47 +65,49 @@ LONG = (
     "reading_failures",
     "robots",
     "tutorial",
-)  # pages whose code plans much
+)  # pages whose code runs for long
 
 
 def find_snippets() -> list[object]:
-    """Return the Python code of all pages, each with the output that the same section shows."""
+    """Return the Python snippets of all pages, each with the output shown in its section."""
     pattern = r"^```python\n(.*?)^```$(?:(?:(?!^```|^#).)*^```text\n(.*?)^```$)?"
     return [
         pytest.param(
-            *code, id=f"{page.stem}-{number}", marks=[pytest.mark.long] if page.stem in LONG else []
+            *code,
+            id=f"{page.stem}-{number}",
+            marks=[pytest.mark.long] if page.stem in LONG_PAGES else [],
         )
         for page in PAGES
         for number, code in enumerate(re.findall(pattern, page.read_text("utf-8"), re.M | re.S))
     ]
 
 
-@pytest.mark.parametrize(("code", "shown"), find_snippets())
-def test_python_runs(
+@pytest.mark.parametrize(("code", "expected"), find_snippets())
+def test_python_snippets_run_and_print_the_shown_output(
     code: str,
-    shown: str,
+    expected: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    exec(compile(code, "documentation", "exec"), names)  # trusted: it is the repository's own
+    exec(compile(code, "documentation", "exec"), names)  # trusted code of this repository
     printed = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
-    for line in shown.replace("...", "").splitlines():  # figures differ among machines
-        begin = " ".join(re.split(r"\d", line)[0].split()[:3])
-        assert any(one.startswith(begin) for one in printed), line
-    for written in re.findall(r'\.(?:to_html|save)\("([^"]+)"\)', code):
-        assert (tmp_path / written).is_file()
+    for line in expected.replace("...", "").splitlines():  # numbers differ between machines
+        prefix = " ".join(re.split(r"\d", line)[0].split()[:3])
+        assert any(text.startswith(prefix) for text in printed), line
+    for file in re.findall(r'\.(?:to_html|save)\("([^"]+)"\)', code):
+        assert (tmp_path / file).is_file()
     plan = names.get("plan")
     if isinstance(plan, vkc.Plan):
         assert plan.success, plan.summary()
 
 
-def test_readme_is_brief() -> None:
-    found = find_blocks(ROOT / "README.md", "python")
-    assert len(found) >= 2
-    for code in found:
+def test_readme_snippets_are_brief() -> None:
+    snippets = find_blocks(ROOT / "README.md", "python")
+    assert len(snippets) >= 2
+    for code in snippets:
         assert len([line for line in code.splitlines() if line.strip()]) <= 10
 
 
@@ -130,11 +132,11 @@ def test_yaml_examples_fit_their_schemas(tmp_path: Path) -> None:
     assert vkc.load_scene(tmp_path / "hatch.yaml").objects["hatch"].object.name == "hatch"
     assert parse_document(Document(yaml.safe_load(described)), ObjectSchema).urdf == "door.urdf"
     robot, telescope, wheels = find_blocks(ROOT / "docs/robots.md", "yaml")
-    followed = parse_document(Document(yaml.safe_load(telescope)), RobotSchema).couplings
-    assert [coupling.joint for coupling in followed.values()] == ["joint_arm_l3"] * 3
-    rolls = parse_document(Document(yaml.safe_load(wheels)), RobotSchema).base
-    assert rolls.wheels is not None
-    assert (round(rolls.wheels.rim_speed, 3), rolls.turning_radius) == (1.0, 1.2)
+    couplings = parse_document(Document(yaml.safe_load(telescope)), RobotSchema).couplings
+    assert [coupling.joint for coupling in couplings.values()] == ["joint_arm_l3"] * 3
+    base = parse_document(Document(yaml.safe_load(wheels)), RobotSchema).base
+    assert base.wheels is not None
+    assert (round(base.wheels.rim_speed, 3), base.turning_radius) == (1.0, 1.2)
     assert parse_document(Document(yaml.safe_load(robot)), RobotSchema).tool_frame == "tool"
 
 
@@ -164,7 +166,7 @@ def test_every_option_of_load_robot_is_documented() -> None:
     assert [name for name in function.__kwdefaults__ if f"`{name}`" not in text] == []
 
 
-def test_every_constraint_and_status_is_explained() -> None:
+def test_every_constraint_and_status_is_documented() -> None:
     names = re.findall(
         r'"(\w+)"', (Violation.__doc__ or "").split("constraint:")[1].split("subject:")[0]
     )
@@ -181,7 +183,7 @@ def test_every_constraint_and_status_is_explained() -> None:
 
 
 def find_commands() -> dict[str, argparse.ArgumentParser]:
-    """Return the parsers of all commands by name, "bench door" among them."""
+    """Return the parsers of all commands by name, such as "bench door"."""
     found: dict[str, argparse.ArgumentParser] = {}
 
     def collect(parser: argparse.ArgumentParser, prefix: str) -> None:
@@ -209,7 +211,7 @@ def test_every_command_and_option_is_documented() -> None:
         assert [option for option in options if option not in section] == [], name
 
 
-def test_shell_commands_are_understood() -> None:
+def test_shell_commands_are_valid() -> None:
     lines = [
         line
         for page in PAGES
@@ -233,7 +235,7 @@ def test_shell_commands_are_understood() -> None:
     )
 
 
-def test_help_of_every_command() -> None:
+def test_every_command_has_help() -> None:
     for name, parser in find_commands().items():
         assert f"vkc-pin {name}" in parser.format_help()
     command = [sys.executable, "-m", "vkc_pin.cli", "plan", "--help"]
@@ -243,7 +245,7 @@ def test_help_of_every_command() -> None:
 
 
 @pytest.mark.parametrize("page", [*PAGES, *DECISIONS], ids=lambda page: page.name)
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_have_targets(page: Path) -> None:
     text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
     for target in re.findall(r"\]\(([^)\s]+)\)", text):
         if target.startswith("https://"):
@@ -258,8 +260,8 @@ def test_links_lead_somewhere(page: Path) -> None:
             }, target
 
 
-def find_listed(page: str) -> list[str]:
-    """Return what the lists of a page name, some of it with wildcards."""
+def find_toctree_entries(page: str) -> list[str]:
+    """Return the entries of a page's toctrees, which may contain wildcards."""
     blocks = re.findall(r"```{toctree}\n(.*?)```", read(page), re.DOTALL)
     return [
         line for block in blocks for line in block.splitlines() if line and not line.startswith(":")
@@ -267,14 +269,14 @@ def find_listed(page: str) -> list[str]:
 
 
 def test_every_page_is_in_the_contents() -> None:
-    for folder, contents, few in (("docs", "_contents", 15), ("docs/api", "index", 6)):
-        names = find_listed(f"{folder}/{contents}.md")
+    for folder, contents, min_count in (("docs", "_contents", 15), ("docs/api", "index", 6)):
+        names = find_toctree_entries(f"{folder}/{contents}.md")
         pages = [
             page.stem
             for page in (ROOT / folder).glob("*.md")
             if page.stem not in ("index", contents)
         ]
-        assert len(pages) >= few
+        assert len(pages) >= min_count
         assert [page for page in pages if not any(fnmatch(page, name) for name in names)] == []
         assert [
             name
@@ -284,7 +286,7 @@ def test_every_page_is_in_the_contents() -> None:
 
 
 def find_documented(directive: str) -> set[str]:
-    """Return the names documented by a directive, "auto*" for all directives but modules."""
+    """Return the names documented by a directive, "auto*" for all except automodule."""
     pages = (page.read_text(encoding="utf-8") for page in (ROOT / "docs/api").glob("*.md"))
     found = [
         pair
@@ -309,30 +311,34 @@ def test_every_module_is_in_the_reference_once() -> None:
     pages = runpy.run_path(str(ROOT / "docs/_ext/api_pages.py"))
     text = "".join(pages["page"](package, files) for package, files in pages["packages"]().items())
     found = re.findall(r"^\.\. automodule:: (\S+)", text, re.MULTILINE)
-    there = {
+    modules = {
         ".".join(file.relative_to(ROOT).with_suffix("").parts)
         for file in (ROOT / "vkc_pin").rglob("*.py")
     }
     assert len(found) == len(set(found))
-    there.remove("vkc_pin.cli.__main__")  # importing that is running it
-    assert set(found) == {name.removesuffix(".__init__") for name in there} - {"vkc_pin"}
+    modules.remove("vkc_pin.cli.__main__")  # importing it runs it
+    assert set(found) == {name.removesuffix(".__init__") for name in modules} - {"vkc_pin"}
     assert find_documented("automodule") == set()
 
 
-def test_all_files_have_one_version() -> None:
-    found, project = (
+def test_all_files_state_the_same_version() -> None:
+    citation, project = (
         yaml.safe_load(read("CITATION.cff")),
         tomllib.loads(read("pyproject.toml"))["project"],
     )
-    assert (found["version"], found["license"]) == (project["version"], project["license"])
-    assert yaml.safe_load(read("tools/conda/recipe.yaml"))["context"]["version"] == found["version"]
+    assert (citation["version"], citation["license"]) == (project["version"], project["license"])
+    assert (
+        yaml.safe_load(read("tools/conda/recipe.yaml"))["context"]["version"] == citation["version"]
+    )
     assert vkc.__version__ == project["version"]
-    assert re.findall(r"^## \[([^]]+)\]", read("CHANGELOG.md"), re.MULTILINE)[0] == found["version"]
+    assert (
+        re.findall(r"^## \[([^]]+)\]", read("CHANGELOG.md"), re.MULTILINE)[0] == citation["version"]
+    )
     for page in ("README.md", "docs/installation.md"):
-        assert set(re.findall(r"[Vv]ersion (\d+\.\d+\.\d+)", read(page))) == {found["version"]}
+        assert set(re.findall(r"[Vv]ersion (\d+\.\d+\.\d+)", read(page))) == {citation["version"]}
 
 
-def test_tables_are_as_the_results_on_record_say() -> None:
+def test_tables_agree_with_the_recorded_results() -> None:
     script = runpy.run_path(str(ROOT / "docs/make_tables.py"))
     assert {page.name for page in script["PAGES"]} >= {"README.md", "benchmarks.md", "household.md"}
     for page in script["PAGES"]:
@@ -342,35 +348,35 @@ def test_tables_are_as_the_results_on_record_say() -> None:
             assert f"<!-- /figures: {name} -->" in text
 
 
-def test_every_record_has_a_claim_and_the_command_that_makes_it_again() -> None:
+def test_every_record_has_a_claim_and_the_command_that_reproduces_it() -> None:
     script = runpy.run_path(str(ROOT / "docs/make_tables.py"))
     rows = {entry["record"]: entry["command"] for entry in script["RECORDS"]}
     assert len(rows) == len(script["RECORDS"])
     assert set(rows) == {
         file.name.removesuffix(".json.gz") for file in (ROOT / "docs/results").iterdir()
     }
-    own = [name for name, command in rows.items() if not command.startswith("python")]
-    commands = re.findall(r"`(vkc-pin bench [^`]+)`", read("docs/evidence.md"))[: len(own)]
+    benchmarks = [name for name, command in rows.items() if not command.startswith("python")]
+    commands = re.findall(r"`(vkc-pin bench [^`]+)`", read("docs/evidence.md"))[: len(benchmarks)]
     parser = make_parser()
-    for name, line in zip(own, commands, strict=True):
-        about, given = (
+    for name, line in zip(benchmarks, commands, strict=True):
+        meta, arguments = (
             script["result"](name)["meta"],
             parser.parse_args(shlex.split(line)[1:]),
         )
         assert line.endswith(f"out/{name}.json" if name.startswith("door") else f"out/{name}")
-        assert given.seed == about["seed"], name
+        assert arguments.seed == meta["seed"], name
         counts = {
-            key: getattr(given, key, None)
+            key: getattr(arguments, key, None)
             for key in ("starts", "goals", "problems", "trials", "seeds")
         }
         for key, value in counts.items():
-            told = about.get("starts" if key == "trials" and "starts" in about else key)
-            if value is not None and isinstance(told, int):
-                assert value == told, (name, key)
+            recorded = meta.get("starts" if key == "trials" and "starts" in meta else key)
+            if value is not None and isinstance(recorded, int):
+                assert value == recorded, (name, key)
 
 
-def test_figures_in_sentences_come_from_records_or_say_when_they_were_measured() -> None:
-    """What looks like a rate or a time that was measured is between marks."""
+def test_figures_in_sentences_are_between_marks_of_their_source() -> None:
+    """Rates and times come from a record, or state when they were measured."""
     marks = r"<!-- (figures?|measured): (?:.*?)-->.*?<!-- (?:/figures: \w+|/measured|/) -->"
     claims = r"\b\d+ of \d+\b|\d s in the median|\d s at the 95th|\d times as (?:slow|fast|long)"
     for page in PAGES:
@@ -388,9 +394,9 @@ def test_figures_are_computed_from_the_trials_of_a_record() -> None:
         name: json.loads(gzip.decompress((ROOT / f"docs/results/{name}.json.gz").read_bytes()))
         for name in ("household", "door_seed_0", "gap")
     }
-    own = [t for t in trials["household"]["trials"] if (t["method"], t["scene"]) == ("B1", "door")]
-    successes = sum(t["success"] for t in own)
-    assert 0 < successes < len(own)
+    door = [t for t in trials["household"]["trials"] if (t["method"], t["scene"]) == ("B1", "door")]
+    successes = sum(t["success"] for t in door)
+    assert 0 < successes < len(door)
     assert figure("household successes method=B1 scene=door", "") == str(successes)
     assert figure("gap good", "") == f"{sum(t['success'] for t in trials['gap']['trials'])} of 50"
     times = [
@@ -404,14 +410,14 @@ def test_figures_are_computed_from_the_trials_of_a_record() -> None:
     ("asked", "before"),
     [("good gap", ""), ("door_seed_0 median:planning_time task=nothing", "0.0")],
 )
-def test_figures_of_no_record_or_trial_raise(asked: str, before: str) -> None:
+def test_figures_without_record_or_trial_raise(asked: str, before: str) -> None:
     figure = runpy.run_path(str(ROOT / "docs/make_tables.py"))["figure"]
     with pytest.raises((ValueError, OSError)):
         figure(asked, before)
 
 
 class Links(HTMLParser):
-    """What a page of the site leads to, and what it loads."""
+    """Collects the links, the loaded files and the anchors of a page of the site."""
 
     def __init__(self, page: Path) -> None:
         super().__init__()
@@ -421,11 +427,11 @@ class Links(HTMLParser):
         self.feed(page.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = {name: value or "" for name, value in attrs}
-        self.ids.add(given.get("id", ""))
-        if tag == "a" and "href" in given:
-            self.links.add(given["href"])
-        elif tag == "link" and given.get("rel") not in (
+        values = {name: value or "" for name, value in attrs}
+        self.ids.add(values.get("id", ""))
+        if tag == "a" and "href" in values:
+            self.links.add(values["href"])
+        elif tag == "link" and values.get("rel") not in (
             "stylesheet",
             "preload",
             "icon",
@@ -433,12 +439,12 @@ class Links(HTMLParser):
         ):
             return
         elif tag in ("script", "img", "iframe", "link", "source", "video"):
-            self.loaded.add(given.get("src", given.get("href", "")))
+            self.loaded.add(values.get("src", values.get("href", "")))
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of the site, built with warnings as errors."""
+    """Build the site with warnings as errors, and return its folder."""
     pytest.importorskip(
         "sphinx", reason="the documentation is built with Sphinx: pip install '.[docs]'"
     )
@@ -466,7 +472,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.long
 @pytest.mark.timeout(600)
-def test_site(site: Path) -> None:
+def test_site_is_complete_and_loads_no_external_files(site: Path) -> None:
     pages = {
         page.resolve(): Links(page)
         for page in site.rglob("*.html")
@@ -483,9 +489,9 @@ def test_site(site: Path) -> None:
             ):
                 continue
             file = (page.parent / unquote(parts.path)).resolve() if parts.path else page
-            assert file.is_file(), f"{page.name} leads to {target}"
+            assert file.is_file(), f"{page.name} links to {target}"
             if parts.fragment and file in pages:
-                assert unquote(parts.fragment) in pages[file].ids, f"{page.name} leads to {target}"
+                assert unquote(parts.fragment) in pages[file].ids, f"{page.name} links to {target}"
     for sheet in site.rglob("*.css"):
         assert not re.search(r"url\(['\"]?(https?:)?//", sheet.read_text(encoding="utf-8")), (
             sheet.name

@@ -1,4 +1,4 @@
-"""Tests the messages of errors."""
+"""Tests error messages."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from vkc_pin.errors import InputError, UnknownNameError, VkcError, find_nearest_
 
 
 @pytest.mark.parametrize(
-    ("given", "text"),
+    ("fields", "text"),
     [
         ({}, "too large"),
         ({"file": "a.yaml", "line": 3, "field": "size"}, "a.yaml:3: size: too large"),
@@ -16,15 +16,15 @@ from vkc_pin.errors import InputError, UnknownNameError, VkcError, find_nearest_
         ({"field": "size", "got": 0}, "size: too large (got 0)"),
     ],
 )
-def test_errors_name_place_and_values(given: dict[str, object], text: str) -> None:
-    error = InputError("too large", **given)  # type: ignore[arg-type]
+def test_messages_state_place_and_values(fields: dict[str, object], text: str) -> None:
+    error = InputError("too large", **fields)  # type: ignore[arg-type]
     assert str(error) == text
     assert isinstance(error, ValueError)
     assert isinstance(error, VkcError)
-    assert {name: getattr(error, name) for name in given} == given
+    assert {name: getattr(error, name) for name in fields} == fields
 
 
-def test_unknown_names_have_suggestions() -> None:
+def test_messages_about_unknown_names_suggest_the_nearest() -> None:
     error = UnknownNameError(
         "link", "wrst", ["base", "wrist", "hand"], file="r.yaml", line=2, field="tool"
     )
@@ -55,7 +55,7 @@ def test_messages_are_short_for_any_value() -> None:
     )
 
 
-def test_messages_hold_no_control_characters_of_names() -> None:
+def test_messages_contain_no_control_characters() -> None:
     name = "a\x1b[2J\nb\udcff\u202e.urdf"
     plain = r"a\x1b[2J\nb\udcff\u202e.urdf"
     assert str(InputError("wrong", file=name, field=name)) == f"{plain}: {plain}: wrong"

@@ -1,4 +1,4 @@
-"""The wheel works in a new environment with each of its extras alone."""
+"""Tests the wheel in a new environment with each extra alone."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from helpers.declared import SCRIPTS
+from helpers.dependencies import SCRIPTS
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 EXTRAS = {
@@ -46,7 +46,7 @@ def environment(tmp_path: Path) -> Iterator[Path]:
 
 
 def run(*arguments: str, python: Path = Path(sys.executable), folder: Path | None = None) -> str:
-    """Run Python without the checkout on its path, and return what it prints."""
+    """Run Python without the checkout on its path, and return the output."""
     settings = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     if folder is not None:
         settings |= {"PYTHONPATH": str(SCRIPTS.parent), "VKC_PIN_CACHE": str(folder / "cache")}

@@ -1,4 +1,4 @@
-"""Every notebook runs from top to bottom, and its cells show what their text says."""
+"""Tests that every notebook runs and that its cells show the expected output."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ EXPECTED: dict[str, dict[str, tuple[str, ...]]] = {
 
 
 def execute(name: str, folder: Path) -> dict[str, nbformat.NotebookNode]:
-    """Run a notebook in `folder` and return its cells by id; the site shows the outputs."""
+    """Run a notebook in `folder`, save it for the site, and return its cells by id."""
     notebook = nbformat.read(ROOT / "notebooks" / f"{name}.ipynb", as_version=4)
     NotebookClient(
         notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
@@ -135,7 +135,7 @@ def execute(name: str, folder: Path) -> dict[str, nbformat.NotebookNode]:
 
 
 def read_output(cell: nbformat.NotebookNode) -> str:
-    """Return what a cell printed and the text of its value."""
+    """Return the printed output of a cell and the text of its value."""
     parts = []
     for output in cell.outputs:
         if output.output_type == "stream" and output.name == "stdout":
@@ -149,7 +149,7 @@ def read_output(cell: nbformat.NotebookNode) -> str:
 
 
 def read_picture_size(cell: nbformat.NotebookNode) -> tuple[int, int]:
-    """Return width and height of the PNG that a cell shows [pixels]."""
+    """Return width and height of the PNG in a cell's output [pixels]."""
     (data,) = (out.data for out in cell.outputs if "image/png" in out.get("data", {}))
     png = base64.b64decode(data["image/png"])
     assert png.startswith(b"\x89PNG\r\n\x1a\n")
@@ -157,7 +157,7 @@ def read_picture_size(cell: nbformat.NotebookNode) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebooks_are_kept_without_outputs(path: Path) -> None:
+def test_notebooks_are_stored_without_outputs(path: Path) -> None:
     notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
     assert set(notebook.metadata) == {"kernelspec", "language_info"}
@@ -171,7 +171,7 @@ def test_notebooks_are_kept_without_outputs(path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("name", [path.stem for path in NOTEBOOKS])
-def test_notebook_runs_and_its_cells_show_what_they_should(name: str, tmp_path: Path) -> None:
+def test_notebook_runs_and_its_cells_show_the_expected_output(name: str, tmp_path: Path) -> None:
     cells = execute(name, tmp_path)
     for cell, patterns in EXPECTED[name].items():
         shown = read_output(cells[cell])
@@ -190,7 +190,7 @@ def test_notebook_runs_and_its_cells_show_what_they_should(name: str, tmp_path: 
         assert plan.trajectory.column("door.hinge")[-1] == pytest.approx(1.2, abs=1e-3)
 
 
-def test_equations_are_those_of_the_documentation() -> None:
+def test_equations_agree_with_the_documentation() -> None:
     page = (ROOT / "docs" / "formulation.md").read_text(encoding="utf-8")
     notebook = nbformat.read(ROOT / "notebooks" / "03_optimisation_problem.ipynb", as_version=4)
     (source,) = (cell.source for cell in notebook.cells if cell.id == "equations")

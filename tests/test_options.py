@@ -12,14 +12,14 @@ import pytest
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 
-WHOLE = [item.name for item in fields(Options) if item.type == "int"]
-REAL = [item.name for item in fields(Options) if item.type == "float"]
+INTEGERS = [item.name for item in fields(Options) if item.type == "int"]
+REALS = [item.name for item in fields(Options) if item.type == "float"]
 
 
 def test_every_option_is_documented() -> None:
-    assert sorted([*WHOLE, *REAL, "objective"]) == sorted(item.name for item in fields(Options))
-    assert "dist_safe" in REAL
-    assert "move_waypoints" in WHOLE
+    assert sorted([*INTEGERS, *REALS, "objective"]) == sorted(item.name for item in fields(Options))
+    assert "dist_safe" in REALS
+    assert "move_waypoints" in INTEGERS
     assert Options.__doc__ is not None
     for item in fields(Options):
         assert f"        {item.name}: " in Options.__doc__
@@ -28,8 +28,8 @@ def test_every_option_is_documented() -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        *((name, value) for name in WHOLE for value in (-1, 2.0, True, "4", None)),
-        *((name, 0) for name in WHOLE if name != "max_refinements"),
+        *((name, value) for name in INTEGERS for value in (-1, 2.0, True, "4", None)),
+        *((name, 0) for name in INTEGERS if name != "max_refinements"),
     ],
 )
 def test_invalid_integers_raise(name: str, value: Any) -> None:
@@ -39,11 +39,11 @@ def test_invalid_integers_raise(name: str, value: Any) -> None:
     assert caught.value.got == repr(value)
 
 
-WRONG = [(name, value) for name in REAL for value in (-1.0, np.nan, np.inf, "0.1")]
+INVALID = [(name, value) for name in REALS for value in (-1.0, np.nan, np.inf, "0.1")]
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [*WRONG, *((name, 0.0) for name in REAL if name != "jerk_time")]
+    ("name", "value"), [*INVALID, *((name, 0.0) for name in REALS if name != "jerk_time")]
 )
 def test_invalid_numbers_raise(name: str, value: Any) -> None:
     with pytest.raises(InputError) as caught:
@@ -64,7 +64,7 @@ def test_invalid_numbers_raise(name: str, value: Any) -> None:
         *(("jerk_time", value) for value in (5e-324, 1e-12, 1e-9, 1e-4, 4.9e-3, 11.0)),
     ],
 )
-def test_values_are_limited(name: str, value: Any) -> None:
+def test_values_out_of_range_raise(name: str, value: Any) -> None:
     with pytest.raises(InputError, match=r"at most|from") as caught:
         Options(**{name: value})
     assert caught.value.field == f"Options.{name}"
@@ -72,11 +72,11 @@ def test_values_are_limited(name: str, value: Any) -> None:
 
 def test_numbers_become_builtin_types() -> None:
     """JSON has no NumPy types."""
-    values = {name: np.int64(4) for name in WHOLE} | {name: np.float32(0.5) for name in REAL}
+    values = {name: np.int64(4) for name in INTEGERS} | {name: np.float32(0.5) for name in REALS}
     options = Options(**values)
     assert Options(**json.loads(json.dumps(asdict(options)))) == options
-    assert {type(getattr(options, name)) for name in WHOLE} == {int}
-    assert {type(getattr(options, name)) for name in REAL} == {float}
+    assert {type(getattr(options, name)) for name in INTEGERS} == {int}
+    assert {type(getattr(options, name)) for name in REALS} == {float}
     assert Options(dt=1).dt == 1.0
 
 
@@ -85,7 +85,7 @@ def test_times_are_rounded_to_steps() -> None:
     assert Options(dt=0.1).steps(1.0) == 10
 
 
-def test_objective_is_one_of_two() -> None:
+def test_objective_is_path_length_or_control_effort() -> None:
     assert Options(objective="control_effort").objective == "control_effort"
     for value in ("lengths", None, 1, np.nan):
         with pytest.raises(InputError, match="'path_length' or 'control_effort'") as caught:
@@ -93,7 +93,7 @@ def test_objective_is_one_of_two() -> None:
         assert caught.value.field == "Options.objective"
 
 
-def test_the_paper_has_equal_weights() -> None:
+def test_options_of_the_paper_have_equal_weights() -> None:
     paper = Options.paper(dt=0.5, velocity_weight_base=2.0)
     assert (paper.objective, paper.dt, paper.velocity_weight_base) == ("control_effort", 0.5, 2.0)
     assert (
@@ -105,5 +105,5 @@ def test_the_paper_has_equal_weights() -> None:
 
 
 @pytest.mark.parametrize("value", [0, 0.0, -0.0, 0.005, 10])
-def test_jerk_time_is_zero_or_long_enough(value: float) -> None:
+def test_jerk_time_may_be_zero_or_in_range(value: float) -> None:
     assert Options(jerk_time=value).jerk_time == value

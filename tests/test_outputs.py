@@ -1,4 +1,4 @@
-"""Every function that writes leaves all or nothing, and follows no link out of its folder."""
+"""Tests that writers leave complete files or none, and do not follow links out of their folder."""
 
 from __future__ import annotations
 
@@ -120,15 +120,15 @@ RENDERED: dict[str, Callable[[Path], Any]] = {
     "pictures.png": lambda path: simulate().plot(path, count=2),
     "film.mp4": _render_film,
 }
-"""Writers that compute for long, and check their target first."""
+"""Slow writers, which check their target first."""
 WRITERS = {**FILES, **FOLDERS, **RESUMED, **RENDERED}
 
 
 @contextlib.contextmanager
 def fill_disk(free: int = 100) -> Iterator[None]:
-    """Let no file become larger than a number of bytes, as on a full disk.
+    """Limit files to `free` bytes, as on a full disk.
 
-    Imports write no bytecode meanwhile: Python 3.11 keeps the part of it that fits.
+    Imports write no bytecode meanwhile, because Python 3.11 keeps truncated files.
     """
     before, writes_no_bytecode = resource.getrlimit(resource.RLIMIT_FSIZE), sys.dont_write_bytecode
     with mock.patch.dict(os.environ, PYTHONDONTWRITEBYTECODE="1"):
@@ -147,7 +147,7 @@ def list_files(folder: Path) -> set[str]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Return a folder in another one, in which files of others are."""
+    """Return an empty folder beside a folder with the file of another user."""
     (tmp_path / "others").mkdir()
     (tmp_path / "others" / "letter.txt").write_text("dear", encoding="utf-8")
     (tmp_path / "mine").mkdir()
@@ -155,7 +155,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", [*FILES, *FOLDERS, *SLOW])
-def test_a_full_disk_leaves_nothing_behind(folder: Path, name: str) -> None:
+def test_full_disk_leaves_no_partial_files(folder: Path, name: str) -> None:
     if name.startswith("result"):
         simulate()
     save_plan()
@@ -166,7 +166,7 @@ def test_a_full_disk_leaves_nothing_behind(folder: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_full_disk_keeps_the_previous_file(folder: Path, name: str) -> None:
+def test_full_disk_keeps_the_previous_file(folder: Path, name: str) -> None:
     (folder / name).write_text("before", encoding="utf-8")
     with fill_disk(), pytest.raises(InputError, match="File too large"):
         FILES[name](folder / name)
@@ -176,7 +176,7 @@ def test_a_full_disk_keeps_the_previous_file(folder: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", [pytest.param("dataset", marks=pytest.mark.long), "benchmark"])
 def test_writers_continue_after_a_full_disk(folder: Path, name: str) -> None:
-    find_commit()  # cached: the limit of this test would kill git, which would leave a lock
+    find_commit()  # cached, because git killed by the size limit leaves a lock
     with fill_disk(), pytest.raises(InputError, match=r"cannot write this .*File too large"):
         RESUMED[name](folder / name)
     RESUMED[name](folder / name)
@@ -185,7 +185,7 @@ def test_writers_continue_after_a_full_disk(folder: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_no_writer_takes_a_pipe_a_loop_or_a_folder_below_a_file(folder: Path, name: str) -> None:
+def test_pipes_link_loops_and_paths_below_files_are_refused(folder: Path, name: str) -> None:
     os.mkfifo(folder / f"pipe{Path(name).suffix}")
     (folder / f"loop{Path(name).suffix}").symlink_to(f"loop{Path(name).suffix}")
     (folder / "file").touch()
@@ -198,7 +198,7 @@ def test_no_writer_takes_a_pipe_a_loop_or_a_folder_below_a_file(folder: Path, na
 
 @pytest.mark.parametrize("name", FOLDERS)
 @pytest.mark.parametrize("force", [False, True])
-def test_folders_of_others_are_not_replaced(folder: Path, name: str, force: bool) -> None:
+def test_folders_with_other_files_are_not_replaced(folder: Path, name: str, force: bool) -> None:
     others = folder.parent / "others"
     (folder / name).symlink_to(others)
     for target in (others, folder / name):
@@ -225,7 +225,7 @@ def test_links_in_a_replaced_folder_are_not_followed(folder: Path, name: str) ->
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_folder_without_permission_is_named(folder: Path, name: str) -> None:
+def test_missing_permission_is_reported(folder: Path, name: str) -> None:
     folder.chmod(0o500)
     try:
         with pytest.raises(InputError, match="ermission"):

@@ -1,9 +1,7 @@
-"""What a user gets by installing the package."""
+"""Tests the contents and the dependencies of the installed package."""
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 import subprocess
 import sys
 import tomllib
@@ -14,7 +12,7 @@ from typing import Any
 
 import pytest
 import yaml
-from helpers.declared import SCRIPTS, find_undeclared, run_without
+from helpers.dependencies import SCRIPTS, find_undeclared, run_without
 from packaging.requirements import Requirement
 
 import vkc_pin
@@ -25,19 +23,6 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 @pytest.fixture(scope="module")
 def project() -> dict[str, Any]:
     return tomllib.loads((CHECKOUT / "pyproject.toml").read_text())
-
-
-def modules() -> list[str]:
-    names = (module.name for module in pkgutil.walk_packages(vkc_pin.__path__, "vkc_pin."))
-    return ["vkc_pin", *(name for name in names if not name.rpartition(".")[2].startswith("_"))]
-
-
-@pytest.mark.parametrize("name", modules())
-def test_every_public_name_imports(name: str) -> None:
-    module = importlib.import_module(name)
-    assert [
-        public for public in getattr(module, "__all__", ()) if not hasattr(module, public)
-    ] == []
 
 
 def test_command_is_declared_and_exists() -> None:
@@ -59,15 +44,15 @@ def test_dependencies_are_ranges(project: dict[str, Any]) -> None:
     [("", "meshes"), pytest.param("import", "imports", marks=pytest.mark.long)],
 )
 def test_declared_dependencies_suffice(extra: str, script: str, tmp_path: Path) -> None:
-    """Optional packages of dependencies, such as those of trimesh, are not needed, or declared."""
+    """Optional dependencies of dependencies, such as trimesh's, are declared or not required."""
     modules = find_undeclared(extra)
     assert {"pytest", "sphinx"} & set(modules)
     assert "trimesh" not in modules
     run_without([*modules, "networkx"], SCRIPTS / f"{script}.py", tmp_path)
 
 
-def test_compiled_against_what_is_required(project: dict[str, Any]) -> None:
-    """Versions for building and for running have the same ranges, so that pip picks a match."""
+def test_build_and_runtime_dependencies_have_the_same_ranges(project: dict[str, Any]) -> None:
+    """Pip then installs the versions that the extensions are compiled against."""
     build = {r.name: r.specifier for r in map(Requirement, project["build-system"]["requires"])}
     run = {r.name: r.specifier for r in map(Requirement, project["project"]["dependencies"])}
     assert build["libpinocchio"] == run["pin"]
@@ -76,13 +61,13 @@ def test_compiled_against_what_is_required(project: dict[str, Any]) -> None:
     assert build["libcoal"] == run["coal"]
 
 
-def test_recipe_needs_the_same_packages(project: dict[str, Any]) -> None:
+def test_conda_recipe_requires_the_same_packages(project: dict[str, Any]) -> None:
     names = {"matplotlib": "matplotlib-base", "meshcat": "meshcat-python", "pin": "pinocchio"}
     names |= {"pin-pink": "pink", "PyYAML": "pyyaml"}
     recipe = yaml.safe_load((CHECKOUT / "tools/conda/recipe.yaml").read_text(encoding="utf-8"))
     found = {text.partition(" ")[0] for text in recipe["requirements"]["run"]} - {"python"}
-    needed = {Requirement(text).name for text in project["project"]["dependencies"]}
-    assert found == {names.get(name, name) for name in needed - {"cmeel-boost"}}
+    required = {Requirement(text).name for text in project["project"]["dependencies"]}
+    assert found == {names.get(name, name) for name in required - {"cmeel-boost"}}
 
 
 def test_package_is_typed_and_licensed() -> None:
@@ -111,8 +96,8 @@ def test_sdist_is_small(tmp_path: Path) -> None:
     assert build("sdist", tmp_path).stat().st_size < 8e6
 
 
-def test_wheel_is_small_and_carries_robots_and_scenes(tmp_path: Path) -> None:
-    """With the compiled modules, of 1.1 MB, it stays below 3 MB."""
+def test_wheel_is_small_and_contains_robots_and_scenes(tmp_path: Path) -> None:
+    """With the compiled modules (1.1 MB) the wheel is smaller than 3 MB."""
     wheel = build("wheel", tmp_path)
     assert wheel.stat().st_size < 1.9e6
     names = set(zipfile.ZipFile(wheel).namelist())

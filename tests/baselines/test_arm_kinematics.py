@@ -1,4 +1,4 @@
-"""Inverse kinematics of the arm alone agrees with numeric Pinocchio."""
+"""Tests the inverse kinematics of the arm alone against Pinocchio."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from helpers.drawers import (
     compute_handle_pose,
     compute_pose_error,
     load_drawer_scene,
+    make_drawer_scene,
     make_grasping_scene,
-    make_open_scene,
 )
 from helpers.small_problems import make_program
 
@@ -22,8 +22,8 @@ from vkc_pin.planning.initialization.keyframes import KeyframeSampler
 from vkc_pin.planning.nlp.merit import TOLERANCE
 
 SLIDE = {"slide": 0.3}
-EXACT = np.sqrt(3.0) * TOLERANCE  # [m] and [rad]: it holds for each coordinate
-STILL = 0.0
+EXACT = np.sqrt(3.0) * TOLERANCE  # [m] and [rad]: the tolerance is per coordinate
+UNCHANGED = 0.0
 
 
 def make_problem(attachment: str = "handle") -> tuple[vkc.TrajectoryProblem, ArmKinematics]:
@@ -34,39 +34,39 @@ def make_problem(attachment: str = "handle") -> tuple[vkc.TrajectoryProblem, Arm
 
 
 @cache
-def share_problem() -> tuple[vkc.TrajectoryProblem, ArmKinematics]:
+def make_shared_problem() -> tuple[vkc.TrajectoryProblem, ArmKinematics]:
     return make_problem()
 
 
 @pytest.mark.parametrize("waypoint", [1, 4, 8])
 @pytest.mark.parametrize("seed", range(3))
 def test_arm_closes_the_chain(waypoint: int, seed: int) -> None:
-    problem, arm = share_problem()
+    problem, arm = make_shared_problem()
     rng = np.random.default_rng(seed)
-    seeds = arm.sampler.object_motion[waypoint - 1].copy()
-    seeds[:3] += rng.uniform(-0.05, 0.05, 3)
-    seeds[3:9] += rng.normal(0.0, 0.3, 6)
-    given = seeds.copy()
-    z, closed = arm.solve(seeds, waypoint)
-    np.testing.assert_array_equal(seeds, given)
+    guess = arm.sampler.object_motion[waypoint - 1].copy()
+    guess[:3] += rng.uniform(-0.05, 0.05, 3)
+    guess[3:9] += rng.normal(0.0, 0.3, 6)
+    before = guess.copy()
+    z, closed = arm.solve(guess, waypoint)
+    np.testing.assert_array_equal(guess, before)
     assert closed
     assert compute_pose_error(problem.scene, z, compute_handle_pose(z[-1])) <= EXACT
-    np.testing.assert_allclose(z[[0, 1, 2, 9]], given[[0, 1, 2, 9]], rtol=0.0, atol=STILL)
-    assert np.all((z >= problem.chain.lower - STILL) & (z <= problem.chain.upper + STILL))
-    assert np.abs(z - given).max() > 0.05
+    np.testing.assert_allclose(z[[0, 1, 2, 9]], before[[0, 1, 2, 9]], rtol=0.0, atol=UNCHANGED)
+    assert np.all((z >= problem.chain.lower - UNCHANGED) & (z <= problem.chain.upper + UNCHANGED))
+    assert np.abs(z - before).max() > 0.05
 
 
 def test_solution_is_a_fixed_point() -> None:
-    problem, arm = share_problem()
+    problem, arm = make_shared_problem()
     start = problem.start.copy()
     z, closed = arm.solve(start, 1)
-    again, also = arm.solve(z, 1)
+    again, closed_again = arm.solve(z, 1)
     assert closed
-    assert also
+    assert closed_again
     np.testing.assert_array_equal(again, z)
 
 
-def test_freedoms_of_a_grasp_are_decided_too() -> None:
+def test_grasp_freedoms_are_solved_for() -> None:
     problem, arm = make_problem("handle_free")
     tilt, slide = (problem.chain.index(f"drawer.{name}") for name in ("handle_free", "slide"))
     assert arm.columns.tolist() == [3, 4, 5, 6, 7, 8, tilt]
@@ -93,7 +93,7 @@ def test_waypoints_without_closure_are_unchanged() -> None:
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_joint_limits_hold(side: float) -> None:
+def test_solution_satisfies_joint_limits(side: float) -> None:
     """The limits of the shoulder exclude the solution."""
     problem, arm = make_problem()
     chain, pan = problem.chain, 3
@@ -105,9 +105,9 @@ def test_joint_limits_hold(side: float) -> None:
     start[pan] = (within + beyond) / 2
     z, closed = arm.solve(start, 4)
     assert not closed
-    assert np.all((z >= chain.lower - STILL) & (z <= chain.upper + STILL))
+    assert np.all((z >= chain.lower - UNCHANGED) & (z <= chain.upper + UNCHANGED))
     assert compute_pose_error(problem.scene, z, compute_handle_pose(z[-1])) > 1e-3
-    # With just enough room it is.
+    # Slightly wider limits admit it.
     chain.lower[pan], chain.upper[pan] = np.sort([free[pan] + side * 1e-4, free[pan] - side * 0.6])
     z, closed = arm.solve(start, 4)
     assert closed
@@ -121,8 +121,8 @@ def test_start_may_exceed_limits_by_rounding() -> None:
     assert arm.solve(z, 4)[1]
 
 
-def test_base_too_far_away() -> None:
-    scene = make_open_scene()
+def test_base_out_of_reach_leaves_the_chain_open() -> None:
+    scene = make_drawer_scene()
     problem = make_program(
         make_grasping_scene(scene), [vkc.Actuate("drawer", SLIDE)], options=SHORT
     )
@@ -132,4 +132,4 @@ def test_base_too_far_away() -> None:
     z, closed = arm.solve(away, 4)
     assert not closed
     assert np.isfinite(z).all()
-    np.testing.assert_allclose(z[:3], away[:3], rtol=0.0, atol=STILL)
+    np.testing.assert_allclose(z[:3], away[:3], rtol=0.0, atol=UNCHANGED)

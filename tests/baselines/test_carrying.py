@@ -1,4 +1,4 @@
-"""The baselines carry a cup from table to table, and drive with the arm as it is."""
+"""Tests that the baselines carry a cup between tables, and keep the arm posture on drives."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from helpers.drawers import (
     compute_handle_pose,
     compute_pose_error,
     load_drawer_scene,
+    make_drawer_scene,
     make_grasping_scene,
-    make_open_scene,
 )
 from helpers.drives import make_hall
 from helpers.small_problems import make_program
@@ -25,11 +25,11 @@ from vkc_pin.baselines.postures import generate_postures
 from vkc_pin.world.trajectory.world_model import World
 
 OPTIONS = vkc.Options(reach_waypoints=20, move_waypoints=15)
-CUP, THERE = (
+CUP, GOAL = (
     (1.5, 0.1, 0.501),
     (-0.2, 1.7, 0.701),
-)  # on a table before the robot, and on one to its left
-CARRY = vkc.Place("cup", THERE)
+)  # on a table in front of the robot, and on one to its left
+CARRY = vkc.Place("cup", GOAL)
 CARRIED = [
     "go to",
     "reach cup.side",
@@ -37,7 +37,7 @@ CARRIED = [
     "go to",
     "place cup",
     "let go",
-]  # drive, reach, draw back, drive, put down
+]  # drive, reach, retreat, drive, put down
 PULL = vkc.Actuate("drawer", {"slide": 0.15})
 
 
@@ -53,122 +53,124 @@ def make_room(*more: dict[str, Any], arm: np.ndarray | None = None) -> vkc.Scene
     return scene if arm is None else scene.with_start(arm=arm)
 
 
-def plan(scene: vkc.Scene, *steps: vkc.Step, **arguments: Any) -> vkc.Plan:
+def plan_steps(scene: vkc.Scene, *steps: vkc.Step, **arguments: Any) -> vkc.Plan:
     return plan_separately(scene, steps, **{"options": OPTIONS, "retries": 1, **arguments})
 
 
 @cache
 def carry_cup(method: str = "B1") -> vkc.Plan:
-    return plan(make_room(), CARRY, method=method)
+    return plan_steps(make_room(), CARRY, method=method)
 
 
 @cache
 def pull_and_drive() -> vkc.Plan:
-    return plan(make_open_scene(), PULL, vkc.GoTo(-1.0, 1.0))
+    return plan_steps(make_drawer_scene(), PULL, vkc.GoTo(-1.0, 1.0))
 
 
-def list_phase_names(found: vkc.Plan) -> list[str]:
-    return [phase.name for phase in found.trajectory.phases]
+def list_phase_names(plan: vkc.Plan) -> list[str]:
+    return [phase.name for phase in plan.trajectory.phases]
 
 
-def get_rows(found: vkc.Plan, phase: int) -> np.ndarray:
+def get_rows(plan: vkc.Plan, phase: int) -> np.ndarray:
     """Return the waypoints of a phase, the robot's columns."""
-    span = found.trajectory.phases[phase]
+    span = plan.trajectory.phases[phase]
     return np.array(
-        found.trajectory.positions[span.first : span.last + 1, : found.trajectory.robot_size]
+        plan.trajectory.positions[span.first : span.last + 1, : plan.trajectory.robot_size]
     )
 
 
-def compute_placement(found: vkc.Plan, waypoint: int, name: str = "cup") -> pin.SE3:
+def compute_placement(plan: vkc.Plan, waypoint: int, name: str = "cup") -> pin.SE3:
     """Return the placement of an object at a waypoint, by the world model of validation."""
-    world = World(found.scene)
-    return world.get_placement(name, world.compute_positions(found.trajectory)[waypoint])
+    world = World(plan.scene)
+    return world.get_placement(name, world.compute_positions(plan.trajectory)[waypoint])
 
 
 def test_cup_is_carried_from_table_to_table() -> None:
-    found = carry_cup()
-    assert found.success, found.summary()
-    assert vkc.validate(found.scene, found.steps, found.trajectory, found.options).ok
-    assert list_phase_names(found) == CARRIED
-    assert [dict(phase.held) for phase in found.trajectory.phases] == [
+    plan = carry_cup()
+    assert plan.success, plan.summary()
+    assert vkc.validate(plan.scene, plan.steps, plan.trajectory, plan.options).ok
+    assert list_phase_names(plan) == CARRIED
+    assert [dict(phase.held) for phase in plan.trajectory.phases] == [
         {},
         {},
         *[{"cup": "side"}] * 3,
         {},
     ]
-    end = compute_placement(found, -1)
-    np.testing.assert_allclose(end.translation, THERE, atol=1e-3)
-    assert end.rotation[2, 2] > np.cos(1e-3), "it stands upright"
+    end = compute_placement(plan, -1)
+    np.testing.assert_allclose(end.translation, GOAL, atol=1e-3)
+    assert end.rotation[2, 2] > np.cos(1e-3), "the cup stands upright"
 
 
 def test_base_and_arm_move_one_after_the_other() -> None:
-    found = carry_cup()
+    plan = carry_cup()
     for drives in (0, 3):
-        arm = get_rows(found, drives)[:, 3:]
-        assert np.ptp(get_rows(found, drives)[:, :2], axis=0).max() > 0.3
+        arm = get_rows(plan, drives)[:, 3:]
+        assert np.ptp(get_rows(plan, drives)[:, :2], axis=0).max() > 0.3
         np.testing.assert_array_equal(arm, np.tile(arm[0], (len(arm), 1)))
     for moves in (1, 2, 4):
-        base = get_rows(found, moves)[:, :3]
-        assert np.ptp(get_rows(found, moves)[:, 3:], axis=0).max() > 0.05
+        base = get_rows(plan, moves)[:, :3]
+        assert np.ptp(get_rows(plan, moves)[:, 3:], axis=0).max() > 0.05
         np.testing.assert_allclose(base, np.tile(base[0], (len(base), 1)), atol=1e-12)
 
 
-def test_object_grasped_at_the_start() -> None:
-    before = carry_cup()
-    span = before.trajectory.phases[3]
-    row = before.trajectory.positions[span.first]
-    at = [
-        float(row[before.trajectory.names.index(f"cup.side_{name}")]) for name in ("slide", "turn")
+def test_object_grasped_at_the_start_is_placed() -> None:
+    carried = carry_cup()
+    span = carried.trajectory.phases[3]
+    row = carried.trajectory.positions[span.first]
+    freedoms = [
+        float(row[carried.trajectory.names.index(f"cup.side_{name}")]) for name in ("slide", "turn")
     ]
     scene = make_room().with_start(base=row[:3], arm=row[3:9])
     attachment = scene.objects["cup"].object.attachments["side"]
-    values = dict(zip(("slide", "turn"), at, strict=True))
+    values = dict(zip(("slide", "turn"), freedoms, strict=True))
     held = scene.with_held(
         {"cup": "side"},
         at={"cup": [values[name.removeprefix("side_")] for name in attachment.coordinates]},
     )
-    found = plan(held, CARRY)
-    assert found.success, found.summary()
-    assert list_phase_names(found) == ["go to", "place cup", "let go"]
+    plan = plan_steps(held, CARRY)
+    assert plan.success, plan.summary()
+    assert list_phase_names(plan) == ["go to", "place cup", "let go"]
 
 
-def test_drive_after_an_actuation() -> None:
-    found = pull_and_drive()
-    assert found.success, found.summary()
-    assert list_phase_names(found)[:3] == ["go to", "reach drawer.handle", "move drawer.slide"]
-    assert set(list_phase_names(found)[3:]) == {"go to"}
-    last = found.trajectory.positions[-1]
+def test_drive_after_an_actuation_keeps_object_and_arm() -> None:
+    plan = pull_and_drive()
+    assert plan.success, plan.summary()
+    assert list_phase_names(plan)[:3] == ["go to", "reach drawer.handle", "move drawer.slide"]
+    assert set(list_phase_names(plan)[3:]) == {"go to"}
+    last = plan.trajectory.positions[-1]
     np.testing.assert_allclose(last[:2], [-1.0, 1.0], atol=1e-3)
-    assert found.trajectory.column("drawer.slide")[-1] == pytest.approx(0.15, abs=1e-3)
-    arm = get_rows(found, len(list_phase_names(found)) - 1)[:, 3:]
+    assert plan.trajectory.column("drawer.slide")[-1] == pytest.approx(0.15, abs=1e-3)
+    arm = get_rows(plan, len(list_phase_names(plan)) - 1)[:, 3:]
     np.testing.assert_array_equal(arm, np.tile(arm[0], (len(arm), 1)))
 
 
 @pytest.mark.parametrize("yaw", [None, 2.0, -2.0])
-def test_drive(yaw: float | None) -> None:
-    found = plan(make_open_scene(), vkc.GoTo(-1.0, 1.0, yaw))
-    assert found.success, found.summary()
-    assert list_phase_names(found) == ["go to"]
-    assert np.ptp(found.trajectory.positions[:, 3:9], axis=0).max() == 0.0
-    np.testing.assert_allclose(found.trajectory.positions[-1, :2], [-1.0, 1.0], atol=1e-3)
+def test_drive_keeps_the_arm_posture(yaw: float | None) -> None:
+    plan = plan_steps(make_drawer_scene(), vkc.GoTo(-1.0, 1.0, yaw))
+    assert plan.success, plan.summary()
+    assert list_phase_names(plan) == ["go to"]
+    assert np.ptp(plan.trajectory.positions[:, 3:9], axis=0).max() == 0.0
+    np.testing.assert_allclose(plan.trajectory.positions[-1, :2], [-1.0, 1.0], atol=1e-3)
     if yaw is None:  # an omnidirectional base need not turn
-        assert np.ptp(found.trajectory.positions[:, 2]) < 0.1
+        assert np.ptp(plan.trajectory.positions[:, 2]) < 0.1
     else:
-        assert np.cos(found.trajectory.positions[-1, 2] - yaw) == pytest.approx(1.0)
+        assert np.cos(plan.trajectory.positions[-1, 2] - yaw) == pytest.approx(1.0)
 
 
-def test_no_base_path() -> None:
-    scene = make_open_scene(describe_box("wall", [0.1, 4.6, 2.4], [0.15, 0.0, 1.2]))
-    found = plan(scene, vkc.GoTo(1.0, 0.0))
-    assert (found.success, found.status) == (False, "no base path")
-    assert np.ptp(found.trajectory.positions[:, :3], axis=0).max() == 0.0, "it stands at its start"
+def test_wall_blocks_the_base_path() -> None:
+    scene = make_drawer_scene(describe_box("wall", [0.1, 4.6, 2.4], [0.15, 0.0, 1.2]))
+    plan = plan_steps(scene, vkc.GoTo(1.0, 0.0))
+    assert (plan.success, plan.status) == (False, "no base path")
+    assert np.ptp(plan.trajectory.positions[:, :3], axis=0).max() == 0.0, (
+        "the robot stays at its start"
+    )
 
 
 def make_drive(scene: vkc.Scene) -> vkc.TrajectoryProblem:
     return make_program(scene, [vkc.GoTo(*scene.start[:3].tolist())], options=OPTIONS)
 
 
-def test_postures_of_an_arm_at_home() -> None:
+def test_arm_at_home_has_one_other_posture() -> None:
     scene = load_drawer_scene()
     first, second = generate_postures(make_drive(scene))
     assert len(first) == 0
@@ -176,8 +178,8 @@ def test_postures_of_an_arm_at_home() -> None:
     assert np.abs(second[0, 3:] - scene.robot.home).max() > 0.5
 
 
-def test_postures_after_a_release() -> None:
-    scene = make_grasping_scene(make_open_scene())
+def test_arm_retreats_from_the_handle_after_a_release() -> None:
+    scene = make_grasping_scene(make_drawer_scene())
     *_, back, home, compact = generate_postures(make_drive(scene))
     np.testing.assert_allclose(compact[:-1], home, atol=1e-12)
     assert len(back) == 1
@@ -189,11 +191,11 @@ def test_postures_after_a_release() -> None:
 
 
 def test_grasped_object_is_lifted_first() -> None:
-    found = carry_cup()
-    row = found.trajectory.positions[found.trajectory.phases[1].last]
-    lifted = found.trajectory.positions[found.trajectory.phases[2].last]
+    plan = carry_cup()
+    row = plan.trajectory.positions[plan.trajectory.phases[1].last]
+    lifted = plan.trajectory.positions[plan.trajectory.phases[2].last]
     assert np.abs(lifted[:3] - row[:3]).max() < 1e-9
-    low, high = (compute_placement(found, found.trajectory.phases[k].last) for k in (1, 2))
+    low, high = (compute_placement(plan, plan.trajectory.phases[k].last) for k in (1, 2))
     np.testing.assert_allclose(
         high.translation - low.translation, [0.0, 0.0, vkc.Options().approach], atol=2e-3
     )

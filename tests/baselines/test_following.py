@@ -1,4 +1,4 @@
-"""The arm follows base and object, waypoint by waypoint: closed, free and continuous."""
+"""Tests that the arm follows base and object: closed, collision-free and continuous."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from vkc_pin.baselines.refining import CLEAR
 from vkc_pin.planning.initialization.keyframes import sample_smoothstep
 from vkc_pin.planning.nlp.merit import TOLERANCE
 
-STILL = 0.0
+UNCHANGED = 0.0
 ROUNDING = 1e-6  # [m]
-CLOSED = np.sqrt(3.0) * TOLERANCE  # [m]: it holds for each coordinate
+CLOSED = np.sqrt(3.0) * TOLERANCE  # [m]: the tolerance is per coordinate
 GOAL = 0.3  # [m]
 
 
@@ -37,15 +37,15 @@ def make_problem(lamp: float | None = None, attachment: str = "handle") -> vkc.T
 
 
 def make_base_path(problem: vkc.TrajectoryProblem, *change: float) -> np.ndarray:
-    """Return a straight path of the base, by its changes of x, y and yaw."""
+    """Return a straight base path with given changes of x, y and yaw."""
     share = np.arange(1, problem.segments + 1)[:, None] / problem.segments
     return np.asarray(problem.start[:3] + share * np.array(change or (0.0, 0.0, 0.0)))
 
 
 def follow_path(
-    problem: vkc.TrajectoryProblem, way: np.ndarray, *, refine: bool = False, seed: int = 0
+    problem: vkc.TrajectoryProblem, base_path: np.ndarray, *, refine: bool = False, seed: int = 0
 ) -> FollowResult:
-    return follow(problem, way, np.random.default_rng(seed), refine=refine)
+    return follow(problem, base_path, np.random.default_rng(seed), refine=refine)
 
 
 def check_closed_and_free(problem: vkc.TrajectoryProblem, rows: np.ndarray) -> None:
@@ -61,75 +61,82 @@ def check_closed_and_free(problem: vkc.TrajectoryProblem, rows: np.ndarray) -> N
             >= -CLEAR - ROUNDING
         )
         assert np.all(
-            (row >= problem.lower.min(axis=0) - STILL) & (row <= problem.upper.max(axis=0) + STILL)
+            (row >= problem.lower.min(axis=0) - UNCHANGED)
+            & (row <= problem.upper.max(axis=0) + UNCHANGED)
         )
 
 
 @pytest.mark.parametrize("refine", [False, True], ids=["B1", "B2"])
 @pytest.mark.parametrize("change", [(-0.25, 0.0, 0.0), (0.0, -0.3, 0.2)], ids=["back", "aside"])
-def test_arm_follows_to_the_end(change: Sequence[float], refine: bool) -> None:
+def test_arm_follows_the_whole_base_path(change: Sequence[float], refine: bool) -> None:
     problem = make_problem()
-    way = make_base_path(problem, *change)
-    found = follow_path(problem, way, refine=refine)
-    assert (found.cause, found.share) == ("", 1.0)
-    check_closed_and_free(problem, found.z)
-    np.testing.assert_allclose(found.z[:, :3], way, rtol=0.0, atol=STILL)
-    np.testing.assert_allclose(found.z[:, -1], GOAL * sample_smoothstep(8), rtol=0.0, atol=STILL)
-    assert np.abs(np.diff(problem.waypoints(found.z)[:, 3:9], axis=0)).max() < 0.6, (
-        "from the waypoint before"
+    base_path = make_base_path(problem, *change)
+    result = follow_path(problem, base_path, refine=refine)
+    assert (result.cause, result.share) == ("", 1.0)
+    check_closed_and_free(problem, result.z)
+    np.testing.assert_allclose(result.z[:, :3], base_path, rtol=0.0, atol=UNCHANGED)
+    np.testing.assert_allclose(
+        result.z[:, -1], GOAL * sample_smoothstep(8), rtol=0.0, atol=UNCHANGED
+    )
+    assert np.abs(np.diff(problem.waypoints(result.z)[:, 3:9], axis=0)).max() < 0.6, (
+        "the arm moves continuously"
     )
 
 
 def test_result_depends_on_the_random_seed_only() -> None:
-    problem = make_problem(0.92)  # where random arms are needed
-    way = make_base_path(problem)
-    np.testing.assert_array_equal(follow_path(problem, way).z, follow_path(problem, way).z)
-    assert not np.array_equal(follow_path(problem, way).z, follow_path(problem, way, seed=1).z)
+    problem = make_problem(0.92)  # random arm configurations are needed
+    base_path = make_base_path(problem)
+    np.testing.assert_array_equal(
+        follow_path(problem, base_path).z, follow_path(problem, base_path).z
+    )
+    assert not np.array_equal(
+        follow_path(problem, base_path).z, follow_path(problem, base_path, seed=1).z
+    )
 
 
-def test_base_out_of_reach() -> None:
+def test_following_ends_where_the_base_is_out_of_reach() -> None:
     problem = make_problem()
-    way = make_base_path(problem, -0.6, 0.0, 0.0)
-    found = follow_path(problem, way)
-    assert found.cause == "no inverse kinematics"
-    done = round(8 * found.share)
-    assert found.share == done / 8
-    assert 0 < done < 8
-    assert found.z.shape == (8, problem.chain.size)
-    check_closed_and_free(problem, found.z[:done])
-    np.testing.assert_allclose(found.z[:done, :3], way[:done], rtol=0.0, atol=STILL)
-    # From there on all stands still, in what was not at the handle.
-    np.testing.assert_array_equal(found.z[done:], np.tile(found.z[done], (8 - done, 1)))
+    base_path = make_base_path(problem, -0.6, 0.0, 0.0)
+    result = follow_path(problem, base_path)
+    assert result.cause == "no inverse kinematics"
+    count = round(8 * result.share)
+    assert result.share == count / 8
+    assert 0 < count < 8
+    assert result.z.shape == (8, problem.chain.size)
+    check_closed_and_free(problem, result.z[:count])
+    np.testing.assert_allclose(result.z[:count, :3], base_path[:count], rtol=0.0, atol=UNCHANGED)
+    # The other waypoints repeat the first configuration that misses the handle.
+    np.testing.assert_array_equal(result.z[count:], np.tile(result.z[count], (8 - count, 1)))
     assert (
-        compute_pose_error(problem.scene, found.z[done], compute_handle_pose(found.z[done, -1]))
+        compute_pose_error(problem.scene, result.z[count], compute_handle_pose(result.z[count, -1]))
         > 1e-3
     )
 
 
 @pytest.mark.parametrize(("refine", "least"), [(False, 0.5), (True, 0.5)], ids=["B1", "B2"])
-def test_unavoidable_collision(refine: bool, least: float) -> None:
+def test_following_ends_at_an_unavoidable_collision(refine: bool, least: float) -> None:
     """At the end the drawer itself would touch the lamp."""
     problem = make_problem(0.9)
-    found = follow_path(problem, make_base_path(problem), refine=refine)
-    assert found.cause == "collision"
-    done = round(8 * found.share)
-    assert least <= found.share < 1.0
-    check_closed_and_free(problem, found.z[:done])
-    wrong = found.z[done]
-    assert compute_pose_error(problem.scene, wrong, compute_handle_pose(wrong[-1])) < CLOSED, (
-        "the chain is closed all the same"
-    )
-    assert compute_spare_clearance(problem.scene, wrong, slide=wrong[-1], held=True) < -1e-3
-    np.testing.assert_array_equal(found.z[done:], np.tile(wrong, (8 - done, 1)))
+    result = follow_path(problem, make_base_path(problem), refine=refine)
+    assert result.cause == "collision"
+    count = round(8 * result.share)
+    assert least <= result.share < 1.0
+    check_closed_and_free(problem, result.z[:count])
+    colliding = result.z[count]
+    assert (
+        compute_pose_error(problem.scene, colliding, compute_handle_pose(colliding[-1])) < CLOSED
+    ), "the chain is still closed"
+    assert compute_spare_clearance(problem.scene, colliding, slide=colliding[-1], held=True) < -1e-3
+    np.testing.assert_array_equal(result.z[count:], np.tile(colliding, (8 - count, 1)))
 
 
 def test_other_arm_configurations_are_tried_after_a_collision() -> None:
     problem = make_problem(0.92)
-    found = follow_path(problem, make_base_path(problem))
-    assert (found.cause, found.share) == ("", 1.0)
-    check_closed_and_free(problem, found.z)
-    steps = np.abs(np.diff(problem.waypoints(found.z)[:, 3:9], axis=0))
-    assert steps.max() > 0.6, "no random arm was needed"
+    result = follow_path(problem, make_base_path(problem))
+    assert (result.cause, result.share) == ("", 1.0)
+    check_closed_and_free(problem, result.z)
+    steps = np.abs(np.diff(problem.waypoints(result.z)[:, 3:9], axis=0))
+    assert steps.max() > 0.6, "no random arm configuration was needed"
 
 
 def test_only_b2_moves_the_object_off_its_time_law() -> None:
@@ -141,7 +148,7 @@ def test_only_b2_moves_the_object_off_its_time_law() -> None:
     assert (plain.cause, refined.cause) == ("", "")
     check_closed_and_free(problem, plain.z)
     check_closed_and_free(problem, refined.z)
-    np.testing.assert_allclose(plain.z[:, -1], law, rtol=0.0, atol=STILL)
+    np.testing.assert_allclose(plain.z[:, -1], law, rtol=0.0, atol=UNCHANGED)
     assert np.abs(refined.z[:, -1] - law).max() > 0.005
-    assert refined.z[-1, -1] == pytest.approx(GOAL, abs=STILL)
-    np.testing.assert_allclose(refined.z[:, :3], make_base_path(problem), rtol=0.0, atol=STILL)
+    assert refined.z[-1, -1] == pytest.approx(GOAL, abs=UNCHANGED)
+    np.testing.assert_allclose(refined.z[:, :3], make_base_path(problem), rtol=0.0, atol=UNCHANGED)

@@ -1,4 +1,4 @@
-"""Paths of the base are straight where possible, avoid obstacles, or do not exist."""
+"""Tests base paths: straight where possible, around obstacles, or none."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.base_scenes import BLINK, MARGIN, compute_distance, interpolate_poses
+from helpers.base_scenes import MARGIN, MARGIN_TOLERANCE, compute_distance, interpolate_poses
 from helpers.carrying import describe_box, make_room
-from helpers.drawers import SHORT, load_drawer_scene, make_open_scene, replace_drawer_fields
+from helpers.drawers import SHORT, load_drawer_scene, make_drawer_scene, replace_scene_fields
 from helpers.drives import make_hall
 from helpers.small_problems import load_door_scene, make_program
 
@@ -40,24 +40,24 @@ def make_paths(scene: vkc.Scene, name: str = "drawer", **joints: float) -> BaseP
 def compute_clearance(
     scene: vkc.Scene, poses: np.ndarray, *, without: Sequence[str] = ("drawer",)
 ) -> float:
-    """Return the smallest distance of the base on straight lines between poses [m]."""
+    """Return the clearance of the base on straight lines between poses [m]."""
     base = [
         (s.geometry, s.placement)
         for s in scene.robot.collision.geometryObjects
         if s.parentJoint == 1
     ]
     labels = zip(scene.obstacle_labels, scene.obstacles, strict=True)
-    still = [shape for label, shape in labels if label != FLOOR]
+    fixed = [shape for label, shape in labels if label != FLOOR]
     for name, placed in scene.objects.items():
-        still += make_world_shapes(placed) if name not in without else []
+        fixed += make_world_shapes(placed) if name not in without else []
     rows = np.vstack(
         [interpolate_poses(a, b, length=0.05, angle=0.1) for a, b in itertools.pairwise(poses)]
     )
-    return min(compute_distance(base, list_placed_shapes(still), row.tolist()) for row in rows)
+    return min(compute_distance(base, list_placed_shapes(fixed), row.tolist()) for row in rows)
 
 
-def test_straight_path() -> None:
-    path = make_paths(make_open_scene(POST)).path(START, BESIDE, 10)
+def test_free_path_is_straight() -> None:
+    path = make_paths(make_drawer_scene(POST)).path(START, BESIDE, 10)
     assert path is not None
     u = np.arange(1, 11) / 10
     for column in range(3):  # from rest to rest
@@ -65,16 +65,16 @@ def test_straight_path() -> None:
         np.testing.assert_allclose(path[:, column], expected, atol=1e-12)
 
 
-def test_path_around_an_obstacle() -> None:
-    scene = make_open_scene(POST)
+def test_path_leads_around_an_obstacle() -> None:
+    scene = make_drawer_scene(POST)
     assert compute_clearance(scene, np.array([START, AISLE])) < 0.0
     path = make_paths(scene).path(START, AISLE, 80)
     assert path is not None
     assert path.shape == (80, 3)
     np.testing.assert_array_equal(path[-1, :2], AISLE[:2])
     assert np.cos(path[-1, 2] - AISLE[2]) == pytest.approx(1.0)
-    # It keeps its margin, but for the corners that are cut between two waypoints.
-    assert compute_clearance(scene, np.vstack([START, path])) >= MARGIN - BLINK - 0.01
+    # The path keeps its margin, except where waypoints cut a corner.
+    assert compute_clearance(scene, np.vstack([START, path])) >= MARGIN - MARGIN_TOLERANCE - 0.01
     steps = np.linalg.norm(np.diff(np.vstack([START, path])[:, :2], axis=0), axis=1)
     assert steps.sum() < 1.3 * np.hypot(*(AISLE - START)[:2])
     assert steps.max() < 0.15
@@ -88,54 +88,59 @@ def test_path_around_an_obstacle() -> None:
         [
             ([2.4, 0.1, 1.0], [-1.4, 0.6, 0.5]),
             ([0.1, 4.0, 1.0], [-0.2, 1.5, 0.5]),
-        ],  # round the start
+        ],  # around the start
     ],
     ids=["a wall across", "walled in"],
 )
-def test_no_path(walls: list[tuple[list[float], list[float]]]) -> None:
+def test_walls_leave_no_path(walls: list[tuple[list[float], list[float]]]) -> None:
     boxes = [
         {"name": f"wall_{k}", "type": "box", "size": size, "position": at}
         for k, (size, at) in enumerate(walls)
     ]
-    scene = make_open_scene(*boxes)
+    scene = make_drawer_scene(*boxes)
     assert compute_clearance(scene, np.array([START, START])) > MARGIN
     assert compute_clearance(scene, np.array([AISLE, AISLE])) > MARGIN
     assert make_paths(scene).path(START, AISLE, 10) is None
 
 
-def test_path_of_a_differential_base() -> None:
-    path = make_paths(make_open_scene(base="differential")).path(START, BESIDE, 400)
+def test_differential_base_turns_in_place() -> None:
+    path = make_paths(make_drawer_scene(base="differential")).path(START, BESIDE, 400)
     assert path is not None
     steps = np.diff(np.vstack([START, path]), axis=0)
     heading = np.vstack([START, path])[:-1, 2] + steps[:, 2] / 2
     sideways = np.abs(np.cos(heading) * steps[:, 1] - np.sin(heading) * steps[:, 0])
-    assert sideways.max() < 5e-3, "it turns where it stands, but for the step in which it begins to"
+    assert sideways.max() < 5e-3, (
+        "the base turns in place, except in the step in which a turn begins"
+    )
     assert np.median(sideways) < 1e-9
 
 
 def test_other_objects_are_obstacles_in_their_state() -> None:
     scene = load_drawer_scene()
     door = {"name": "door", "type": "door", "position": [0.0, 0.44, 0.0]}
-    both = replace_drawer_fields(make_open_scene(), objects=[*scene.document["objects"], door])
+    both = replace_scene_fields(make_drawer_scene(), objects=[*scene.document["objects"], door])
     before, after = np.array([-0.9, -0.05, 0.0]), np.array([0.8, -0.05, 0.0])
     for hinge, straight in ((0.0, False), (1.5, True)):
-        here = both.with_state("door", {"hinge": hinge})
-        assert (compute_clearance(here, np.array([before, after])) > MARGIN) == straight
-        path = make_paths(here).path(before, after, 80)
+        scene_with_state = both.with_state("door", {"hinge": hinge})
+        assert (compute_clearance(scene_with_state, np.array([before, after])) > MARGIN) == straight
+        path = make_paths(scene_with_state).path(before, after, 80)
         assert path is not None
         assert (np.ptp(path[:, 1]) < 1e-9) == straight
-        assert compute_clearance(here, np.vstack([before, path])) >= MARGIN - BLINK - 0.01
+        assert (
+            compute_clearance(scene_with_state, np.vstack([before, path]))
+            >= MARGIN - MARGIN_TOLERANCE - 0.01
+        )
 
 
 def test_grasped_door_is_no_obstacle() -> None:
     scene = load_door_scene()
     before, after = np.array([1.8, -0.05, 0.0]), np.array([3.3, -0.05, 0.0])
     assert compute_clearance(scene, np.array([before, after]), without=()) < 0.0
-    found = make_paths(scene, "door", hinge=1.2)
-    path = found.path(before, after, 10)
+    paths = make_paths(scene, "door", hinge=1.2)
+    path = paths.path(before, after, 10)
     assert path is not None
     np.testing.assert_allclose(path[:, 1:], np.tile(before[1:], (10, 1)), atol=1e-12)
-    assert not found.grid.is_pose_free(2.55, -0.5, 0.0)
+    assert not paths.grid.is_pose_free(2.55, -0.5, 0.0)
 
 
 SHELF: dict[str, Any] = {
@@ -144,7 +149,7 @@ SHELF: dict[str, Any] = {
     "size": [0.3, 1.0, 0.1],
     "position": [-0.4, 0.65, 1.0],
 }  # over the base
-ASIDE = np.array([-1.5, -1.57, 0.0, 0.0, 0.0, 0.0])  # the arm stretched out upwards
+ARM_UP = np.array([-1.5, -1.57, 0.0, 0.0, 0.0, 0.0])  # the arm stretched out upwards
 
 
 def make_drive(
@@ -153,28 +158,28 @@ def make_drive(
     return make_program(scene.with_start(base=START), [vkc.GoTo(x, y, yaw)], options=SHORT)
 
 
-def test_path_with_the_arm() -> None:
-    problem = make_drive(make_open_scene(SHELF).with_start(arm=ASIDE), 0.5, 0.6)
+def test_path_avoids_collisions_of_the_arm() -> None:
+    problem = make_drive(make_drawer_scene(SHELF).with_start(arm=ARM_UP), 0.5, 0.6)
     goal = np.array([0.5, 0.6, 0.0])
-    bare = BasePaths(problem).path(START, goal, 80)
-    assert bare is not None
+    base_path = BasePaths(problem).path(START, goal, 80)
+    assert base_path is not None
     np.testing.assert_allclose(
-        np.diff(bare[:, 0]) * 0.9 / 2.0, -np.diff(bare[:, 1]), atol=1e-9
+        np.diff(base_path[:, 0]) * 0.9 / 2.0, -np.diff(base_path[:, 1]), atol=1e-9
     )  # straight below the shelf
-    whole = BasePaths(problem, whole=True)
-    assert not all(whole.grid.is_pose_free(*pose) for pose in bare)
-    path = whole.path(START, goal, 80)
+    whole_robot = BasePaths(problem, whole=True)
+    assert not all(whole_robot.grid.is_pose_free(*pose) for pose in base_path)
+    path = whole_robot.path(START, goal, 80)
     assert path is not None
     np.testing.assert_array_equal(path[-1, :2], goal[:2])
     z = np.tile(problem.start, (len(path), 1))
     z[:, :3] = path
     contacts = problem.contacts.evaluate(z, np.ones(len(z), int), reach=MARGIN)
-    assert contacts.compute_violation() < 0.01 + BLINK, (
-        "but for the corners that are cut between two waypoints"
+    assert contacts.compute_violation() < 0.01 + MARGIN_TOLERANCE, (
+        "except where waypoints cut a corner"
     )
 
 
-def test_path_with_a_grasped_object() -> None:
+def test_grasped_object_adds_its_shapes_to_the_base() -> None:
     scene = make_room(objects=["stick"])
     held = scene.with_held({"stick": "grip"})
     shapes = [
@@ -184,38 +189,38 @@ def test_path_with_a_grasped_object() -> None:
     assert shapes[1] == shapes[0] + len(scene.objects["stick"].object.collision.geometryObjects)
 
 
-def test_several_goals() -> None:
-    found = make_paths(make_open_scene(POST))
+def test_nearest_reachable_goal_is_chosen() -> None:
+    paths = make_paths(make_drawer_scene(POST))
     blocked, free = AISLE, np.array([0.5, 1.0, 0.5])
-    path = found.path(START, np.array([blocked, free]), 10)
+    path = paths.path(START, np.array([blocked, free]), 10)
     assert path is not None
     np.testing.assert_array_equal(path[-1], free)
     near, far = np.array([-0.3, -0.7, 0.0]), np.array([1.0, -1.4, 0.0])
     start = np.array([-0.3, 0.9, -np.pi / 2])
     for goals in ([far, near], [near, far]):
-        path = found.path(start, np.array(goals), 10)
+        path = paths.path(start, np.array(goals), 10)
         assert path is not None
         np.testing.assert_array_equal(path[-1, :2], near[:2])
 
 
 def test_initial_guess_has_a_constant_arm() -> None:
-    problem = make_drive(make_open_scene(POST), *AISLE[:2].tolist())
+    problem = make_drive(make_drawer_scene(POST), *AISLE[:2].tolist())
     goals = find_goal_poses(vkc.GoTo(*AISLE[:2].tolist()), 0.0)
-    (seed,) = BasePaths(problem, whole=True).make_guesses(problem, goals)
-    assert seed.z.shape == (problem.segments, problem.chain.size)
-    np.testing.assert_array_equal(seed.z[:, 3:], np.tile(problem.start[3:], (problem.segments, 1)))
-    np.testing.assert_allclose(seed.z[-1, :2], AISLE[:2], atol=1e-12)
+    (guess,) = BasePaths(problem, whole=True).make_guesses(problem, goals)
+    assert guess.z.shape == (problem.segments, problem.chain.size)
+    np.testing.assert_array_equal(guess.z[:, 3:], np.tile(problem.start[3:], (problem.segments, 1)))
+    np.testing.assert_allclose(guess.z[-1, :2], AISLE[:2], atol=1e-12)
     wall: dict[str, Any] = {
         "name": "wall",
         "type": "box",
         "size": [0.1, 4.6, 1.0],
         "position": [0.0, 0.0, 0.5],
     }
-    problem = make_drive(make_open_scene(wall), *AISLE[:2].tolist())
+    problem = make_drive(make_drawer_scene(wall), *AISLE[:2].tolist())
     assert list(BasePaths(problem, whole=True).make_guesses(problem, goals)) == []
 
 
-def test_path_through_a_narrow_gate() -> None:
+def test_path_leads_through_a_narrow_gate() -> None:
     """The gate is 0.73 m wide, the base 0.67 m; a coarse grid has no path."""
     walls = [
         describe_box(str(side), [0.2, 6.0, 1.5], [0.0, 0.09 + 3.365 * side, 0.75])
@@ -224,12 +229,12 @@ def test_path_through_a_narrow_gate() -> None:
     narrow = make_hall(obstacles=walls).with_start(
         arm=np.array([1.57, -2.2, 2.5, -1.9, -1.57, 0.0])
     )  # the arm folded
-    found, goal = (
+    paths, goal = (
         BasePaths(make_drive(narrow, 1.5, 0.5, 0.0), whole=True),
         np.array([1.5, 0.5, 0.0]),
     )
-    assert shortest_path(found.grid, START.tolist(), goal[None]) is None
-    path = found.path(START, goal, 80)
+    assert shortest_path(paths.grid, START.tolist(), goal[None]) is None
+    path = paths.path(START, goal, 80)
     assert path is not None
     np.testing.assert_array_equal(path[-1, :2], goal[:2])
     through = path[np.abs(path[:, 0]) < 0.3]
@@ -238,14 +243,14 @@ def test_path_through_a_narrow_gate() -> None:
 
 
 @pytest.mark.parametrize("yaw", [-3.0, 0.4, 7.0])
-def test_headings(yaw: float) -> None:
-    some = find_goal_poses(vkc.GoTo(1.0, 2.0), yaw)
-    assert some.shape == (16, 3)
-    np.testing.assert_array_equal(some[:, :2], np.tile([1.0, 2.0], (16, 1)))
-    turns = np.abs(some[:, 2] - yaw)
+def test_goal_headings_are_sorted_by_distance(yaw: float) -> None:
+    poses = find_goal_poses(vkc.GoTo(1.0, 2.0), yaw)
+    assert poses.shape == (16, 3)
+    np.testing.assert_array_equal(poses[:, :2], np.tile([1.0, 2.0], (16, 1)))
+    turns = np.abs(poses[:, 2] - yaw)
     assert turns[0] < 1e-9
     assert np.all(np.diff(turns) > -1e-9)
     assert turns[-1] == pytest.approx(np.pi)
-    (one,) = find_goal_poses(vkc.GoTo(1.0, 2.0, 1.0), yaw)
-    assert np.cos(one[2] - 1.0) == pytest.approx(1.0)
-    assert abs(one[2] - yaw) <= np.pi, "the nearest of equal headings"
+    (pose,) = find_goal_poses(vkc.GoTo(1.0, 2.0, 1.0), yaw)
+    assert np.cos(pose[2] - 1.0) == pytest.approx(1.0)
+    assert abs(pose[2] - yaw) <= np.pi, "the nearest of equal headings"

@@ -1,4 +1,4 @@
-"""Base poses satisfy the pose constraints, are collision-free, and are sorted by distance."""
+"""Tests that base poses satisfy the constraints, are collision-free and sorted by distance."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from helpers.drawers import (
     compute_spare_clearance,
     load_drawer_scene,
     make_grasping_scene,
-    replace_drawer_fields,
+    replace_scene_fields,
 )
 from helpers.small_problems import make_program
 
 import vkc_pin as vkc
-from vkc_pin.baselines import postures as module
+from vkc_pin.baselines import postures
 from vkc_pin.baselines.postures import find_base_poses
 
 
@@ -49,7 +49,7 @@ def find_poses(
 
 
 def compute_distances(rows: np.ndarray, near: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-    """Return distances of rows from `near`, with the weights of the metric."""
+    """Return the weighted distances of rows from `near`."""
     lever = 0.3249  # [m/rad] of this arm
     counts = [1.0 / lever if name in ("base_x", "base_y") else 1.0 for name in names]
     return np.array(
@@ -58,21 +58,21 @@ def compute_distances(rows: np.ndarray, near: np.ndarray, names: tuple[str, ...]
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_poses_from_which_the_arm_reaches_a_handle(seed: int) -> None:
+def test_arm_reaches_the_handle_from_all_poses(seed: int) -> None:
     scene, problem = load_drawer_scene(), make_reach(load_drawer_scene())
     rows = find_poses(problem, seed=seed)
-    assert rows.shape == (module.ENOUGH, problem.chain.size)
+    assert rows.shape == (postures.ENOUGH, problem.chain.size)
     assert max(
         compute_pose_error(scene, row, compute_handle_pose()) for row in rows
     ) < 1e-4 * np.sqrt(3)
     assert min(compute_spare_clearance(scene, row) for row in rows) >= -1e-6
     assert np.all((rows >= problem.lower[-1]) & (rows <= problem.upper[-1]))
-    assert np.all(rows[:, -1] == 0.0), "the drawer is still shut"
-    assert np.ptp(rows[:, 0]) > 0.3, "they are from all over"
+    assert np.all(rows[:, -1] == 0.0), "the drawer is still closed"
+    assert np.ptp(rows[:, 0]) > 0.3, "the poses are spread"
     assert np.ptp(rows[:, 1]) > 0.3
 
 
-def test_poses_from_which_the_arm_reaches_a_moved_handle() -> None:
+def test_arm_reaches_the_moved_handle_from_all_poses() -> None:
     problem = make_pull()
     rows = find_poses(problem)
     assert len(rows) > 10
@@ -90,11 +90,11 @@ def test_poses_are_sorted_by_distance() -> None:
     problem = make_reach(load_drawer_scene(), "handle_free")
     near = problem.start.copy()
     near[:3] = [0.8, -0.6, 0.3]
-    for rows, from_there in (
+    for rows, reference in (
         (find_poses(problem), problem.start),
         (find_poses(problem, near=near), near),
     ):
-        distances = compute_distances(rows, from_there, problem.chain.names)
+        distances = compute_distances(rows, reference, problem.chain.names)
         assert np.all(np.diff(distances) >= 0.0)
         assert distances[-1] > distances[0] + 1.0
     assert not np.array_equal(find_poses(problem)[0], find_poses(problem, near=near)[0])
@@ -102,7 +102,7 @@ def test_poses_are_sorted_by_distance() -> None:
 
 def raise_drawer() -> vkc.Scene:
     scene = load_drawer_scene()
-    return replace_drawer_fields(
+    return replace_scene_fields(
         scene, objects=[{**scene.document["objects"][0], "position": [1.93, 0.0, 2.0]}]
     )
 
@@ -112,7 +112,9 @@ def add_board() -> vkc.Scene:
 
 
 @pytest.mark.parametrize("make_scene", [raise_drawer, add_board])
-def test_no_pose(make_scene: Callable[[], vkc.Scene], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "TRIES", 1000)
+def test_unreachable_handle_has_no_pose(
+    make_scene: Callable[[], vkc.Scene], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(postures, "TRIES", 1000)
     problem = make_reach(make_scene())
     assert find_poses(problem).shape == (0, problem.chain.size)

@@ -1,4 +1,4 @@
-"""Refinement moves arm and object out of collision while the base stands."""
+"""Tests the refinement of arm and object configurations out of collision at a fixed base."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from vkc_pin.baselines.refining import CLEAR, refine_configuration
 from vkc_pin.planning.initialization.keyframes import KeyframeSampler
 from vkc_pin.planning.nlp.merit import TOLERANCE
 
-HALF, ROUNDING = 4, 1e-6  # a waypoint; [m]
+HALF, ROUNDING = 4, 1e-6  # waypoint; [m]
 TILT, SLIDE = -2, -1  # columns
 
 
 class Pulling:
-    """Half-way through pulling a drawer under a lamp; the hand may tilt about the bar."""
+    """A drawer that is half pulled out under a lamp; the hand may tilt about the bar."""
 
     def __init__(self, bottom: float, *, waypoint: int = HALF) -> None:
         scene = make_grasping_scene(attachment="handle_free")
@@ -55,10 +55,10 @@ class Pulling:
             columns=self.columns,
         )
 
-    def spare(self, z: np.ndarray) -> float:
+    def compute_clearance(self, z: np.ndarray) -> float:
         return compute_spare_clearance(self.scene, z, slide=z[SLIDE], held=True)
 
-    def off(self, z: np.ndarray) -> float:
+    def compute_error(self, z: np.ndarray) -> float:
         return compute_pose_error(self.scene, z, compute_handle_pose(z[SLIDE], tilt=z[TILT]))
 
 
@@ -68,22 +68,22 @@ def make_low_lamp() -> Pulling:
 
 
 @pytest.mark.parametrize("bottom", [0.96, 0.92, 0.9])
-def test_collision_is_left(bottom: float) -> None:
+def test_refined_configuration_is_collision_free(bottom: float) -> None:
     pulling = Pulling(bottom)
-    given = pulling.z.copy()
-    assert pulling.spare(given) < -5e-3
+    before = pulling.z.copy()
+    assert pulling.compute_clearance(before) < -5e-3
     z, closed = pulling.refine_configuration()
     assert closed
-    assert pulling.spare(z) >= -CLEAR - ROUNDING
-    assert pulling.off(z) < np.sqrt(3.0) * TOLERANCE
-    np.testing.assert_array_equal(z[:3], given[:3])
-    np.testing.assert_array_equal(pulling.z, given)
+    assert pulling.compute_clearance(z) >= -CLEAR - ROUNDING
+    assert pulling.compute_error(z) < np.sqrt(3.0) * TOLERANCE
+    np.testing.assert_array_equal(z[:3], before[:3])
+    np.testing.assert_array_equal(pulling.z, before)
     assert np.all(
         (z >= pulling.problem.lower[HALF - 1] - ROUNDING)
         & (z <= pulling.problem.upper[HALF - 1] + ROUNDING)
     )
-    assert z[SLIDE] != given[SLIDE], "the drawer gives way, too"
-    assert abs(z[SLIDE] - given[SLIDE]) < 0.02
+    assert z[SLIDE] != before[SLIDE], "the drawer moves as well"
+    assert abs(z[SLIDE] - before[SLIDE]) < 0.02
 
 
 def test_result_is_near_the_wanted_configuration() -> None:
@@ -93,16 +93,16 @@ def test_result_is_near_the_wanted_configuration() -> None:
     wanted[TILT] += 0.5
     tilted, closed = pulling.refine_configuration(wanted=wanted)
     assert closed
-    assert pulling.spare(tilted) >= -CLEAR - ROUNDING
+    assert pulling.compute_clearance(tilted) >= -CLEAR - ROUNDING
     assert tilted[TILT] > near[TILT] + 0.05
 
 
 def test_goal_of_the_object_is_kept() -> None:
     pulling = Pulling(0.92, waypoint=8)
-    assert pulling.spare(pulling.z) < 0.0
+    assert pulling.compute_clearance(pulling.z) < 0.0
     z, closed = pulling.refine_configuration()
     assert closed
-    assert pulling.spare(z) >= -CLEAR - ROUNDING
+    assert pulling.compute_clearance(z) >= -CLEAR - ROUNDING
     assert z[SLIDE] == pytest.approx(0.3, abs=ROUNDING)
 
 
@@ -110,24 +110,23 @@ def test_open_chain_is_closed() -> None:
     pulling = make_low_lamp()
     start = pulling.z.copy()
     start[3:9] += np.random.default_rng(0).normal(0.0, 0.05, 6)
-    assert pulling.off(start) > 0.01
+    assert pulling.compute_error(start) > 0.01
     z, closed = pulling.refine_configuration(start)
     assert closed
-    assert pulling.off(z) < np.sqrt(3.0) * TOLERANCE
-    assert pulling.spare(z) >= -CLEAR - ROUNDING
+    assert pulling.compute_error(z) < np.sqrt(3.0) * TOLERANCE
+    assert pulling.compute_clearance(z) >= -CLEAR - ROUNDING
 
 
-def test_closed_chain_without_free_space() -> None:
-    """The penetration becomes no larger."""
+def test_penetration_does_not_grow_without_free_space() -> None:
     pulling = Pulling(0.7)
     z, closed = pulling.refine_configuration()
     assert closed
-    assert pulling.off(z) < np.sqrt(3.0) * TOLERANCE
-    assert pulling.spare(z) < -0.01
-    assert pulling.spare(z) >= pulling.spare(pulling.z) - ROUNDING
+    assert pulling.compute_error(z) < np.sqrt(3.0) * TOLERANCE
+    assert pulling.compute_clearance(z) < -0.01
+    assert pulling.compute_clearance(z) >= pulling.compute_clearance(pulling.z) - ROUNDING
 
 
-def test_base_out_of_reach() -> None:
+def test_base_out_of_reach_leaves_the_chain_open() -> None:
     pulling = make_low_lamp()
     away = pulling.z.copy()
     away[0] -= 1.5
@@ -139,9 +138,9 @@ def test_base_out_of_reach() -> None:
 
 def test_waypoints_without_closure_are_unchanged() -> None:
     problem = make_program(load_drawer_scene(), [vkc.Grasp("drawer")])
-    knots = KeyframeSampler(problem, np.random.default_rng(0))
+    sampler = KeyframeSampler(problem, np.random.default_rng(0))
     z, closed = refine_configuration(
-        problem, knots, problem.start, wanted=problem.start, waypoint=1, columns=np.arange(3, 9)
+        problem, sampler, problem.start, wanted=problem.start, waypoint=1, columns=np.arange(3, 9)
     )
     assert closed
     np.testing.assert_array_equal(z, problem.start)

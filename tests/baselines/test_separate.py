@@ -1,4 +1,4 @@
-"""Base and arm planned one after the other: successes, causes of failure, and attempts."""
+"""Tests planning of the base before the arm: successes, causes of failure, and attempts."""
 
 from __future__ import annotations
 
@@ -19,15 +19,14 @@ from helpers.drawers import (
     compute_handle_pose,
     compute_pose_error,
     load_drawer_scene,
+    make_drawer_scene,
     make_grasping_scene,
-    make_open_scene,
-    replace_drawer_fields,
+    replace_scene_fields,
 )
 from helpers.small_problems import load_door_scene
 
 import vkc_pin as vkc
-from vkc_pin.baselines import BASELINES, attempt, plan_separately, separate
-from vkc_pin.baselines import postures as poses
+from vkc_pin.baselines import BASELINES, attempt, plan_separately, postures, separate
 from vkc_pin.baselines.attempt import FINER
 from vkc_pin.benchmarks.household import TASKS
 from vkc_pin.planning.statistics import STAGES
@@ -60,10 +59,12 @@ def get_rows(plan: vkc.Plan, phase: int) -> np.ndarray:
     )
 
 
-def limit_search(monkeypatch: pytest.MonkeyPatch, *, tries: int = 1000, stands: int = 1) -> None:
-    """Search less for what does not exist."""
-    monkeypatch.setattr(poses, "TRIES", tries)
-    monkeypatch.setattr(attempt, "_STANDS", stands)
+def limit_search(
+    monkeypatch: pytest.MonkeyPatch, *, tries: int = 1000, base_poses: int = 1
+) -> None:
+    """Limit the search for solutions that do not exist."""
+    monkeypatch.setattr(postures, "TRIES", tries)
+    monkeypatch.setattr(attempt, "_STANDS", base_poses)
 
 
 def plan_failure(scene: vkc.Scene, **arguments: Any) -> vkc.Plan:
@@ -76,13 +77,13 @@ def plan_failure(scene: vkc.Scene, **arguments: Any) -> vkc.Plan:
 
 @pytest.mark.parametrize("method", BASELINES)
 @pytest.mark.parametrize("task", PLANS)
-def test_open_space(task: str, method: str) -> None:
+def test_both_methods_succeed_in_open_space(task: str, method: str) -> None:
     plan = PLANS[task](method)
     assert plan.success, plan.summary()
     assert plan.status == "success"
-    again = vkc.validate(plan.scene, plan.steps, plan.trajectory, plan.options)
-    assert again.ok, again.lines()
-    assert again.clearance == plan.report.clearance > 0.0
+    report = vkc.validate(plan.scene, plan.steps, plan.trajectory, plan.options)
+    assert report.ok, report.lines()
+    assert report.clearance == plan.report.clearance > 0.0
     np.testing.assert_allclose(plan.trajectory.positions[0, :9], plan.scene.start, atol=1e-9)
     name, goal = {"drawer": ("drawer.slide", 0.3), "door": ("door.hinge", 0.3)}[task]
     assert plan.trajectory.column(name)[-1] == pytest.approx(goal, abs=1e-3)
@@ -90,17 +91,17 @@ def test_open_space(task: str, method: str) -> None:
 
 
 @pytest.mark.parametrize("task", PLANS)
-def test_metrics(task: str) -> None:
+def test_metrics_agree_with_trajectory_and_report(task: str) -> None:
     plan = PLANS[task]("B1")
-    m, motion = plan.metrics, plan.trajectory
-    assert m["duration"] == motion.times[-1]
-    assert m["clearance"] == plan.report.clearance
-    assert m["closure_error"] == plan.report.closure_error
-    assert m["rounds"] == 1.0
-    assert m["iterations"] > 0.0
-    parts = sum(m[f"time_{part}"] for part in (*STAGES, "following"))
-    assert 0.0 < parts <= m["planning_time"]
-    assert m["build_time"] >= 0.0
+    metrics, motion = plan.metrics, plan.trajectory
+    assert metrics["duration"] == motion.times[-1]
+    assert metrics["clearance"] == plan.report.clearance
+    assert metrics["closure_error"] == plan.report.closure_error
+    assert metrics["rounds"] == 1.0
+    assert metrics["iterations"] > 0.0
+    stage_times = sum(metrics[f"time_{stage}"] for stage in (*STAGES, "following"))
+    assert 0.0 < stage_times <= metrics["planning_time"]
+    assert metrics["build_time"] >= 0.0
 
 
 @pytest.mark.parametrize("method", BASELINES)
@@ -111,7 +112,7 @@ def test_base_and_arm_move_one_after_the_other(task: str, method: str) -> None:
     assert (drive.name, dict(drive.held), dict(reach.held)) == ("go to", {}, {})
     assert reach.name == f"reach {task}.handle"
     assert [dict(phase.held) for phase in holds] == [{task: "handle"}] * len(holds)
-    assert len(holds) == {"drawer": 1, "door": 2}[task]  # the door's knob is turned before
+    assert len(holds) == {"drawer": 1, "door": 2}[task]  # the door's knob is turned first
     np.testing.assert_array_equal(
         get_rows(plan, 0)[:, 3:], np.tile(plan.scene.start[3:], (len(get_rows(plan, 0)), 1))
     )
@@ -122,15 +123,15 @@ def test_base_and_arm_move_one_after_the_other(task: str, method: str) -> None:
     assert np.ptp(get_rows(plan, 1)[:, 3:], axis=0).max() > 0.3
     if task == "door":
         assert np.ptp(get_rows(plan, 2)[:, :3], axis=0).max() < 1e-5, (
-            "it stands while the latch is released"
+            "the base stands still while the latch is released"
         )
         assert np.ptp(plan.trajectory.column("door.knob")[holds[0].first : holds[0].last]) > 0.3
-    # The object's joints run to their goals in finer steps.
+    # The object's joints move to their goals in finer steps.
     moved = holds[-1].last - holds[-1].first
     assert moved in (
         FINER * plan.options.move_waypoints,
         FINER * plan.options.move_waypoints + 1,
-    )  # and the hand's wait
+    )  # plus the wait for the gripper
 
 
 def test_b1_follows_the_time_law_of_the_object() -> None:
@@ -150,8 +151,8 @@ def test_b1_follows_the_time_law_of_the_object() -> None:
         )
 
 
-def test_differential_base() -> None:
-    scene = make_open_scene(base="differential")
+def test_differential_base_does_not_slip_sideways() -> None:
+    scene = make_drawer_scene(base="differential")
     plan = plan_separately(scene, [PULL], options=OPTIONS)
     assert plan.success, plan.summary()
     x, y, yaw = plan.trajectory.positions[:, :3].T
@@ -185,27 +186,27 @@ def test_result_is_reproducible_in_another_process() -> None:
 
 
 @pytest.mark.parametrize("method", BASELINES)
-def test_no_base_pose_in_a_narrow_aisle(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_narrow_aisle_has_no_base_pose(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     limit_search(monkeypatch)
     plan = plan_failure(
         add_boxes(load_drawer_scene(), counter_2=([0.9, 4.4, 1.2], [1.0, 0.0, 0.6])), method=method
     )
     assert plan.status == "no base pose"
     assert [phase.name for phase in plan.trajectory.phases] == ["stand"]
-    assert np.ptp(plan.trajectory.positions, axis=0).max() == 0.0, "it stands at its start"
+    assert np.ptp(plan.trajectory.positions, axis=0).max() == 0.0, "the robot stays at its start"
     assert [(v.constraint, v.subject) for v in plan.report.violations] == [("goal", "drawer.slide")]
 
 
-def test_no_base_pose_for_the_open_drawer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_open_drawer_has_no_base_pose(monkeypatch: pytest.MonkeyPatch) -> None:
     limit_search(monkeypatch)
-    plan = plan_failure(add_boxes(make_open_scene(), post=([0.05, 0.05, 1.0], [1.65, 0.25, 0.5])))
+    plan = plan_failure(add_boxes(make_drawer_scene(), post=([0.05, 0.05, 1.0], [1.65, 0.25, 0.5])))
     assert plan.status == "no base pose"
     assert [phase.name for phase in plan.trajectory.phases] == ["go to", "reach drawer.handle"]
     last = plan.trajectory.positions[-1]
     assert compute_pose_error(plan.scene, last, compute_handle_pose()) < 1e-3
     kinds = {v.constraint for v in plan.report.violations}
     assert "goal" in kinds
-    # A motion that ends before the grasp has no leave to be as close to the tray as a grasp is.
+    # Only a grasp exempts the hand from its clearance to the tray.
     assert all(
         v.subject.endswith("drawer.tray")
         for v in plan.report.violations
@@ -214,7 +215,7 @@ def test_no_base_pose_for_the_open_drawer(monkeypatch: pytest.MonkeyPatch) -> No
     assert kinds <= {"goal", "clearance"}
 
 
-def test_arm_does_not_reach(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arm_does_not_reach_between_two_shelves(monkeypatch: pytest.MonkeyPatch) -> None:
     """The solver finds no path between two shelves."""
     limit_search(monkeypatch)
     shelves = {
@@ -222,7 +223,7 @@ def test_arm_does_not_reach(monkeypatch: pytest.MonkeyPatch) -> None:
         for name, z in (("above", 0.15), ("below", -0.15))
     }
     options = dataclasses.replace(OPTIONS, max_restarts=1, max_iterations=20)
-    plan = plan_failure(add_boxes(make_open_scene(), **shelves), options=options)
+    plan = plan_failure(add_boxes(make_drawer_scene(), **shelves), options=options)
     assert plan.status == "arm does not reach"
     assert [phase.name for phase in plan.trajectory.phases][-2:] == ["go to", "reach drawer.handle"]
     assert {"goal", "clearance"} & {v.constraint for v in plan.report.violations}
@@ -234,16 +235,16 @@ def test_failed_attempts_are_followed_by_others(
 ) -> None:
     seeds, ends = list[list[int]](), list[tuple[vkc.Trajectory, float, str]]()
 
-    class Noted(attempt.Attempt):
-        def __init__(self, *arguments: Any, **named: Any) -> None:
-            seeds.append(list(named["seed"]))
-            super().__init__(*arguments, **named)
+    class RecordedAttempt(attempt.Attempt):
+        def __init__(self, *arguments: Any, **keywords: Any) -> None:
+            seeds.append(list(keywords["seed"]))
+            super().__init__(*arguments, **keywords)
 
         def run(self, steps: Any) -> tuple[vkc.Trajectory, float, str]:
             ends.append(super().run(steps))
             return ends[-1]
 
-    monkeypatch.setattr(separate, "Attempt", Noted)
+    monkeypatch.setattr(separate, "Attempt", RecordedAttempt)
     scene = vkc.load_scene("household").with_start(base=[0.968827218, -0.761078307, 0.355251978])
     task = TASKS["door"]
     plan = plan_separately(scene, task.steps, method="B1", seed=111)
@@ -259,24 +260,24 @@ def test_failed_attempts_are_followed_by_others(
 
 
 @pytest.mark.parametrize("stage", ["solve", "follow", "find_base_poses"])
-def test_ctrl_c(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls, done = [], getattr(attempt, stage)
+def test_ctrl_c_interrupts_each_stage(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls, original = [], getattr(attempt, stage)
 
-    def pressed(*arguments: Any, **given: Any) -> Any:
+    def press_ctrl_c(*arguments: Any, **keywords: Any) -> Any:
         calls.append(stage)
         signal.raise_signal(signal.SIGINT)
-        return done(*arguments, **given)
+        return original(*arguments, **keywords)
 
-    monkeypatch.setattr(attempt, stage, pressed)
-    plan = plan_failure(make_open_scene(), retries=3)
+    monkeypatch.setattr(attempt, stage, press_ctrl_c)
+    plan = plan_failure(make_drawer_scene(), retries=3)
     assert plan.status == "interrupted"
     assert calls == [stage]
-    before = {
+    phases = {
         "solve": ["stand"],
         "find_base_poses": ["stand"],
         "follow": ["go to", "reach drawer.handle"],
     }[stage]
-    assert [phase.name for phase in plan.trajectory.phases] == before
+    assert [phase.name for phase in plan.trajectory.phases] == phases
 
 
 MISUSES: dict[str, tuple[dict[str, Any], str, str]] = {
@@ -315,7 +316,7 @@ MISUSES: dict[str, tuple[dict[str, Any], str, str]] = {
 
 
 @pytest.mark.parametrize("case", MISUSES.values(), ids=MISUSES)
-def test_invalid_arguments(case: tuple[dict[str, Any], str, str]) -> None:
+def test_invalid_arguments_are_refused(case: tuple[dict[str, Any], str, str]) -> None:
     arguments, field, text = case
     call: dict[str, Any] = {"steps": [PULL], **arguments}
     with pytest.raises(vkc.InputError) as caught:
@@ -325,7 +326,7 @@ def test_invalid_arguments(case: tuple[dict[str, Any], str, str]) -> None:
 
 
 @pytest.mark.parametrize("method", ["B1", "B2"])
-def test_reach(method: str) -> None:
+def test_pose_is_reached(method: str) -> None:
     steps = [vkc.Reach((1.2, 0.4, 0.9, 0.0, 1.2, 0.3))]
     plan = plan_separately(load_drawer_scene(), steps, method=method, options=OPTIONS)
     assert plan.success
@@ -333,10 +334,10 @@ def test_reach(method: str) -> None:
     assert not plan.trajectory.phases[-1].held
 
 
-def test_two_objects() -> None:
+def test_two_objects_are_actuated_in_turn() -> None:
     second = {"name": "second", "type": "drawer", "position": [1.93, -1.4, 0.0]}
-    scene = replace_drawer_fields(
-        make_open_scene(), objects=[*load_drawer_scene().document["objects"], second]
+    scene = replace_scene_fields(
+        make_drawer_scene(), objects=[*load_drawer_scene().document["objects"], second]
     )
     plan = plan_separately(scene, [PULL, vkc.Actuate("second", {"slide": 0.2})], options=OPTIONS)
     assert plan.success, plan.summary()
@@ -347,45 +348,45 @@ def test_two_objects() -> None:
 
 def test_grasped_object_is_not_grasped_again() -> None:
     plan = plan_separately(
-        make_open_scene(), [vkc.Actuate("drawer", {"slide": 0.15}), PULL], options=OPTIONS
+        make_drawer_scene(), [vkc.Actuate("drawer", {"slide": 0.15}), PULL], options=OPTIONS
     )
     assert plan.success, plan.summary()
     names = [phase.name for phase in plan.trajectory.phases]
     assert names == ["go to", "reach drawer.handle", "move drawer.slide", "move drawer.slide"]
 
 
-def test_object_grasped_at_the_start() -> None:
-    plan = plan_separately(make_grasping_scene(make_open_scene()), [PULL], options=OPTIONS)
+def test_object_grasped_at_the_start_is_not_reached_again() -> None:
+    plan = plan_separately(make_grasping_scene(make_drawer_scene()), [PULL], options=OPTIONS)
     assert plan.success, plan.summary()
     assert [phase.name for phase in plan.trajectory.phases] == ["move drawer.slide"]
 
 
-def test_no_base_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    limit_search(monkeypatch, stands=3)
-    plan = plan_failure(add_boxes(make_open_scene(), wall=([0.1, 4.6, 2.4], [0.15, 0.0, 1.2])))
+def test_wall_blocks_the_base_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    limit_search(monkeypatch, base_poses=3)
+    plan = plan_failure(add_boxes(make_drawer_scene(), wall=([0.1, 4.6, 2.4], [0.15, 0.0, 1.2])))
     assert plan.status == "no base path"
     assert [phase.name for phase in plan.trajectory.phases] == ["go to"]
 
 
-def test_time_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    limit_search(monkeypatch, stands=4)
-    plan = plan_failure(make_open_scene(), time_limit=1e-6, retries=5)
+def test_time_limit_ends_planning(monkeypatch: pytest.MonkeyPatch) -> None:
+    limit_search(monkeypatch, base_poses=4)
+    plan = plan_failure(make_drawer_scene(), time_limit=1e-6, retries=5)
     assert plan.status == "time limit"
     assert plan.metrics["rounds"] == 1.0
 
 
-def test_limit_of_evaluations() -> None:
-    whole = open_drawer("B1")
-    used = int(whole.metrics["evaluations"])
+def test_evaluation_limit_is_reproducible() -> None:
+    complete = open_drawer("B1")
+    used = int(complete.metrics["evaluations"])
     assert compute_hash(
         plan_separately(load_drawer_scene(), [PULL], max_evaluations=used)
-    ) == compute_hash(whole)
-    short = [
+    ) == compute_hash(complete)
+    limited = [
         plan_separately(load_drawer_scene(), [PULL], max_evaluations=2 * used // 3, planner=planner)
         for planner in (None, vkc.Planner())
     ]
-    assert [plan.status for plan in short] == ["evaluation limit"] * 2
-    assert compute_hash(short[0]) == compute_hash(short[1])
+    assert [plan.status for plan in limited] == ["evaluation limit"] * 2
+    assert compute_hash(limited[0]) == compute_hash(limited[1])
 
 
 @pytest.mark.parametrize(
@@ -399,7 +400,7 @@ def test_limit_of_evaluations() -> None:
     ],
     ids=str,
 )
-def test_arguments_are_checked_as_those_of_plan(arguments: dict[str, Any], field: str) -> None:
+def test_arguments_are_checked_as_in_plan(arguments: dict[str, Any], field: str) -> None:
     call = {"scene": load_drawer_scene(), **arguments}
     with pytest.raises(vkc.InputError) as caught:
         plan_separately(call.pop("scene"), [PULL], **{"retries": 1, **call})

@@ -1,4 +1,4 @@
-"""Methods are compared at tasks; a stand-in for the planner returns plans that nobody planned."""
+"""Tests the comparison of planning methods, with a fake planner."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.planning.statistics import PlanningStatistics
 from vkc_pin.validation.report import Report
 
-GOOD = {"B1": {2, 3}, "B2": {1, 2}, "VKC": {0, 1, 2}}
-"""Method → the starts from which `solve` succeeds."""
+SUCCESSES = {"B1": {2, 3}, "B2": {1, 2}, "VKC": {0, 1, 2}}
+"""Method → numbers of the starts from which `solve` succeeds."""
 
 
 def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     method, number = spec["method"], spec["number"]
-    good, k = number in GOOD[method], COMPARED_PLANNERS.index(method)
+    success, k = number in SUCCESSES[method], COMPARED_PLANNERS.index(method)
     plan = make_fake_plan(scene)
     metrics = {
         **plan.trajectory.metrics(),
@@ -38,8 +38,8 @@ def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
         "clearance": np.inf,
         "closure_error": 1e-4,
     }
-    outcome = Report() if good else plan.report
-    status = "success" if good else "collision"
+    outcome = Report() if success else plan.report
+    status = "success" if success else "collision"
     return replace_metrics(plan, metrics, status=status, report=outcome, seed=spec["seed"])
 
 
@@ -71,7 +71,7 @@ def test_trials_are_recorded(result: dict[str, Any]) -> None:
     ]
     for t in trials:
         assert (t["scene"], t["seed"]) == ("door", 5 + t["number"])
-        assert t["success"] == (t["number"] in GOOD[t["method"]])
+        assert t["success"] == (t["number"] in SUCCESSES[t["method"]])
         assert t["duration"] == pytest.approx(6.0)
     meta = result["meta"]
     assert (meta["benchmark"], meta["seed"], meta["starts"]) == ("baselines", 5, 3)
@@ -82,7 +82,7 @@ def test_trials_are_recorded(result: dict[str, Any]) -> None:
 
 def test_starts_depend_on_seed_and_task_alone(result: dict[str, Any]) -> None:
     rng, scene = np.random.default_rng([5, 1]), vkc.load_scene("aisle_drawer")
-    drawn = [scene.sample_start(rng).start[:3].tolist() for _ in range(2)]
+    sampled = [scene.sample_start(rng).start[:3].tolist() for _ in range(2)]
     specify = baselines.COMPARISON.specify
     specs = specify(trials=2, seed=5, tasks=["door", "drawer"], methods=["B1", "VKC"])
     assert [(s["scene"], s["method"], s["number"]) for s in specs] == [
@@ -91,16 +91,16 @@ def test_starts_depend_on_seed_and_task_alone(result: dict[str, Any]) -> None:
         for method in ("B1", "VKC")
         for number in (0, 1)
     ]
-    assert [s["base"] for s in specs if s["scene"] == "drawer"] == 2 * drawn
-    (alone,) = specify(trials=1, seed=5, tasks=["drawer"], methods=["B2"])
-    assert (alone["base"], alone["seed"], alone["key"]) == (drawn[0], 5, "drawer/0000/B2")
+    assert [s["base"] for s in specs if s["scene"] == "drawer"] == 2 * sampled
+    (single,) = specify(trials=1, seed=5, tasks=["drawer"], methods=["B2"])
+    assert (single["base"], single["seed"], single["key"]) == (sampled[0], 5, "drawer/0000/B2")
     np.testing.assert_allclose(result["trials"][0]["start"][:3], specs[0]["base"], atol=1e-8)
 
 
 @pytest.mark.long
 def test_methods_are_planned_from_the_same_start(tmp_path: Path) -> None:
-    words = "baselines --trials 1 --tasks drawer --methods B1 VKC --jobs 1 --save-failures"
-    table, trials = run_experiment(words, tmp_path)
+    arguments = "baselines --trials 1 --tasks drawer --methods B1 VKC --jobs 1 --save-failures"
+    table, trials = run_experiment(arguments, tmp_path)
     assert [t["method"] for t in trials] == ["B1", "VKC"]
     assert trials[0]["start"] == trials[1]["start"]
     assert trials[1]["success"], trials[1]["violations"]
@@ -110,8 +110,8 @@ def test_methods_are_planned_from_the_same_start(tmp_path: Path) -> None:
         saved = tmp_path / f"failures/drawer_0000_{t['method']}.npz"
         assert saved.is_file() != t["success"]
         plan = vkc.Plan.load(tmp_path / f"shown/drawer_0000_{t['method']}.npz")
-        found = vkc.validate(plan.scene, plan.steps, plan.trajectory, plan.options)
-        assert found.ok == t["success"]
+        report = vkc.validate(plan.scene, plan.steps, plan.trajectory, plan.options)
+        assert report.ok == t["success"]
         for name, value in plan.trajectory.metrics().items():
             assert t[name] == pytest.approx(value, rel=1e-3), name
 
@@ -122,7 +122,7 @@ def parse_table(text: str, title: str) -> list[list[str]]:
     return parse_cells("\n".join(line for line in section.splitlines() if line.startswith("|")))[1:]
 
 
-def test_tables_against_numbers_by_hand(out: Path) -> None:
+def test_tables_equal_values_computed_by_hand(out: Path) -> None:
     text = (out / "table.md").read_text(encoding="utf-8")
     assert parse_table(text, "Success") == [
         ["door", "B1", "1 of 3", "33", "6–79", "0", "collision (penetration) 2"],
@@ -192,15 +192,15 @@ def test_failures_are_planned_again_to_be_saved(tmp_path: Path) -> None:
 
     run(tmp_path, solve=succeed, save_failures=True)
     text = (tmp_path / "table.md").read_text(encoding="utf-8")
-    assert list_files(tmp_path / "failures") == set(), "they succeed this time"
+    assert list_files(tmp_path / "failures") == set(), "the repeated trials succeed"
     assert "## Failures" not in text
-    assert "| door | B1 | 1 of 3 |" in text, "trials count as recorded"
+    assert "| door | B1 | 1 of 3 |" in text, "recorded outcomes are unchanged"
     run(tmp_path, save_failures=True)
     assert "door_0001_B1.npz" in list_files(tmp_path / "failures")
 
 
 @pytest.mark.parametrize(
-    ("good", "expected"),
+    ("successes", "expected"),
     [
         ({"B1": {1, 2}, "B2": {2, 3}, "VKC": {0, 1, 2, 3}}, 2),
         ({"B1": {1}, "B2": {0}, "VKC": {0, 1}}, 0),
@@ -209,9 +209,11 @@ def test_failures_are_planned_again_to_be_saved(tmp_path: Path) -> None:
         ({"B1": set(), "B2": set(), "VKC": set()}, None),
     ],
 )
-def test_shown_trial_has_most_successes(good: dict[str, set[int]], expected: int | None) -> None:
+def test_shown_trial_has_most_successes(
+    successes: dict[str, set[int]], expected: int | None
+) -> None:
     records = [
-        {"scene": "door", "method": m, "number": n, "success": n in good[m]}
+        {"scene": "door", "method": m, "number": n, "success": n in successes[m]}
         for n in range(4)
         for m in COMPARED_PLANNERS
     ]

@@ -1,4 +1,4 @@
-"""Chores of many steps are planned; a stand-in for the planner only drives."""
+"""Tests chores of many steps, with a fake planner that only drives."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from vkc_pin.world.task.actions import compile_each_step, group_into_actions
 )
 def test_chores_have_the_papers_steps(name: str, number: int, actions: int) -> None:
     chore = chores.CHORES[name]
-    scene, listed = chore.scene(), chore.list_steps()
-    assert len(listed) == number
-    assert len(group_into_actions(listed)) == actions
-    compile_each_step(scene, listed, chore.options)
+    scene, steps = chore.scene(), chore.list_steps()
+    assert len(steps) == number
+    assert len(group_into_actions(steps)) == actions
+    compile_each_step(scene, steps, chore.options)
 
 
 def test_cluttered_home_contains_the_home() -> None:
-    home, full = vkc.load_scene("household"), chores.make_cluttered_home()
-    assert full.document["obstacles"][: len(home.document["obstacles"])] == list(
+    home, cluttered = vkc.load_scene("household"), chores.make_cluttered_home()
+    assert cluttered.document["obstacles"][: len(home.document["obstacles"])] == list(
         home.document["obstacles"]
     )
-    shapes = [len(placed.object.collision.geometryObjects) for placed in full.objects.values()]
-    assert len(full.obstacles) + sum(shapes) > 500
+    shapes = [len(placed.object.collision.geometryObjects) for placed in cluttered.objects.values()]
+    assert len(cluttered.obstacles) + sum(shapes) > 500
 
 
 def compute_distance(scene: vkc.Scene, first: str, second: str) -> float:
-    """Return the distance of two links [m]."""
+    """Return the distance between two links [m]."""
     (pair,) = [
         pair
         for pair in find_close_pairs(scene, 0.02)
@@ -49,18 +49,24 @@ def compute_distance(scene: vkc.Scene, first: str, second: str) -> float:
     return pair.distance
 
 
-def test_cluttered_home_is_as_tight_as_real_ones() -> None:
-    """Leaves overlap and touch walls, and handles are near obstacles."""
-    full = chores.make_cluttered_home()
-    opened = full.with_state("door", {"hinge": 1.52})
-    assert compute_distance(full, "door.panel", "casing_above") == pytest.approx(-0.05, abs=1e-4)
+def test_cluttered_home_has_overlaps_and_small_gaps() -> None:
+    """Door leaves overlap and touch walls; handles are near obstacles."""
+    cluttered = chores.make_cluttered_home()
+    opened = cluttered.with_state("door", {"hinge": 1.52})
+    assert compute_distance(cluttered, "door.panel", "casing_above") == pytest.approx(
+        -0.05, abs=1e-4
+    )
     assert compute_distance(opened, "door.panel", "casing_above") == pytest.approx(-0.05, abs=1e-4)
-    assert compute_distance(full, "door.panel", "casing_beside") == pytest.approx(-0.02, abs=1e-4)
-    assert compute_distance(full, "refrigerator.door", "panel_east") == pytest.approx(0.0, abs=1e-4)
-    assert compute_distance(full, "refrigerator.door", "panel_west") == pytest.approx(
+    assert compute_distance(cluttered, "door.panel", "casing_beside") == pytest.approx(
+        -0.02, abs=1e-4
+    )
+    assert compute_distance(cluttered, "refrigerator.door", "panel_east") == pytest.approx(
+        0.0, abs=1e-4
+    )
+    assert compute_distance(cluttered, "refrigerator.door", "panel_west") == pytest.approx(
         0.009, abs=1e-4
     )
-    assert compute_distance(full, "door.lever", "bag") == pytest.approx(0.01, abs=1e-4)
+    assert compute_distance(cluttered, "door.lever", "bag") == pytest.approx(0.01, abs=1e-4)
     assert compute_distance(opened, "door.lever", "wardrobe") == pytest.approx(0.01, abs=5e-4)
     assert chores.CHORES["cluttered"].options.dist_safe == 0.005
 
@@ -99,17 +105,21 @@ def test_trials_are_recorded(tmp_path: Path) -> None:
 
 
 def test_table_of_seeds_counts_successes_and_steps() -> None:
-    def record(seed: int, method: str, done: int | None) -> dict[str, Any]:
-        own = {"scene": "fetch", "number": 0, "method": method, "seed": seed, "steps_done": done}
+    def make_record(seed: int, method: str, done: int | None) -> dict[str, Any]:
+        fields = {"scene": "fetch", "number": 0, "method": method, "seed": seed, "steps_done": done}
         success = done == 10
         status = "success" if success else "not converged"
-        return {**own, "success": success, "status": status, "arm_path_length": 3.0 + seed}
+        return {**fields, "success": success, "status": status, "arm_path_length": 3.0 + seed}
 
-    trials = [record(4, "VKC", None), record(4, "step by step", 1)]
-    trials += [record(5, "VKC", 10), record(5, "step by step", 10), record(6, "step by step", 10)]
-    about = {"chores": ["fetch"], "steps": {"fetch": 10 * ["x"]}, "starts": 1, "seed": 4}
-    about |= {"seeds": 3, "window": 2, "methods": ["VKC", "step by step"]}
-    text = chores.format_results({"meta": {**describe_environment(), **about}, "trials": trials})
+    trials = [make_record(4, "VKC", None), make_record(4, "step by step", 1)]
+    trials += [
+        make_record(5, "VKC", 10),
+        make_record(5, "step by step", 10),
+        make_record(6, "step by step", 10),
+    ]
+    meta = {"chores": ["fetch"], "steps": {"fetch": 10 * ["x"]}, "starts": 1, "seed": 4}
+    meta |= {"seeds": 3, "window": 2, "methods": ["VKC", "step by step"]}
+    text = chores.format_results({"meta": {**describe_environment(), **meta}, "trials": trials})
     assert "| fetch | 0 | in one call | 1 of 2 | all |" in text
     assert "| fetch | 0 | step by step | 2 of 3 | 1, all, all |" in text
     assert "| 8.0–9.0 | 12 | 6 |" in text, "(9 - 8) / 8 and (9 - 8) / (9 + 8)"

@@ -1,4 +1,4 @@
-"""The robot drives through a gap to a table."""
+"""Tests the benchmark in which the robot drives through a gap to a table."""
 
 from __future__ import annotations
 
@@ -48,7 +48,9 @@ def test_robot_drives_through_the_gap_and_reaches_over_the_table() -> None:
     np.testing.assert_allclose(tool.rotation[:, 2], [0.0, 0.0, -1.0], atol=5e-3)
 
 
-def test_experiment(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_trial_is_recorded_and_tabulated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     table, (record,) = run_experiment("gap --trials 1", tmp_path)
     assert table in capsys.readouterr().out
     assert record["success"] is True, record["violations"]

@@ -1,4 +1,4 @@
-"""Six tasks in a home are compared; some of them with the numbers of the paper's code."""
+"""Tests the comparison on household tasks, two of them also with the paper's numbers."""
 
 from __future__ import annotations
 
@@ -47,22 +47,22 @@ def test_variant_has_the_numbers_of_the_papers_code() -> None:
         if name == "dishwasher":
             upper[other.object.coordinates.names.index("rack")] = 0.8
         np.testing.assert_array_equal(other.object.upper, upper)
-    there = theirs.with_placement("cup", pin.SE3(np.eye(3), np.array([-0.6, -1.6, 1.11])))
-    cup = list_placed_shapes(make_world_shapes(there.objects["cup"]))
-    clearance = compute_clearance(cup, list_placed_shapes(there.obstacles))
+    scene = theirs.with_placement("cup", pin.SE3(np.eye(3), np.array([-0.6, -1.6, 1.11])))
+    cup = list_placed_shapes(make_world_shapes(scene.objects["cup"]))
+    clearance = compute_clearance(cup, list_placed_shapes(scene.obstacles))
     assert clearance == pytest.approx(1e-3, abs=1e-6), "the cup rests on the table"
     assert vkc.Scene.from_document(theirs.document, theirs.folder).document == theirs.document
     plain, paper = (
-        which.specify(trials=2, seed=3, tasks=list(TASKS), methods=["VKC"], max_evaluations=7)
-        for which in (COMPARISON, PAPER)
+        comparison.specify(trials=2, seed=3, tasks=list(TASKS), methods=["VKC"], max_evaluations=7)
+        for comparison in (COMPARISON, PAPER)
     )
     assert plain == paper, "the starts are the same"
 
 
 @pytest.mark.long
 def test_variant_is_run_and_reported(tmp_path: Path) -> None:
-    words = "household --variant paper --trials 1 --methods VKC --jobs 1"
-    table, trials = run_experiment(words, tmp_path)
+    arguments = "household --variant paper --trials 1 --methods VKC --jobs 1"
+    table, trials = run_experiment(arguments, tmp_path)
     assert table.startswith("# Two tasks in a home, with the numbers of the paper's code\n")
     assert [(t["scene"], t["success"]) for t in trials] == [("cup", True), ("dishwasher", True)]
     for name in ("success", "base_path_length", "arm_path_length", "planning_time", "cup_joints"):
@@ -89,7 +89,7 @@ def test_every_task_is_planned(name: str, method: str) -> None:
     assert report.contradictions(plan.report) == []
 
 
-def test_cup_stands_wholly_on_the_coffee_table() -> None:
+def test_cup_rests_entirely_on_the_coffee_table() -> None:
     scene, rng = vkc.load_scene("household"), np.random.default_rng(0)
     labelled = list(zip(scene.obstacles, scene.obstacle_labels, strict=True))
     table = [shape for shape, label in labelled if label == "coffee_table"]
@@ -100,9 +100,9 @@ def test_cup_stands_wholly_on_the_coffee_table() -> None:
     others = list_placed_shapes([shape for shape in scene.obstacles if shape is not plate])
     poses = np.array([sample_cup_pose(scene, rng)["cup"] for _ in range(300)])
     for pose in poses[:40]:
-        there = scene.with_placement("cup", pin.SE3(pin.rpy.rpyToMatrix(*pose[3:]), pose[:3]))
-        cup = list_placed_shapes(make_world_shapes(there.objects["cup"]))
-        assert np.all(np.abs(pose[:2] - center) + 0.035 < half), "all of its foot"
+        placed = scene.with_placement("cup", pin.SE3(pin.rpy.rpyToMatrix(*pose[3:]), pose[:3]))
+        cup = list_placed_shapes(make_world_shapes(placed.objects["cup"]))
+        assert np.all(np.abs(pose[:2] - center) + 0.035 < half), "the whole foot is on the plate"
         on_plate = compute_clearance(cup, list_placed_shapes([plate]))
         assert on_plate == pytest.approx(1e-3, abs=1e-6)
         assert compute_clearance(cup, others, reach=0.1) > 0.02
@@ -110,20 +110,20 @@ def test_cup_stands_wholly_on_the_coffee_table() -> None:
     assert not np.ptp(poses[:, 2:5], axis=0).any()
 
 
-def test_places_and_starts_depend_on_seed_and_task_alone() -> None:
+def test_cup_poses_and_starts_depend_on_seed_and_task_alone() -> None:
     specs = COMPARISON.specify(trials=2, seed=3, tasks=list(TASKS), methods=["B1", "VKC"])
     assert all(s["seed"] == 3 + s["number"] for s in specs)
     rng, scene = np.random.default_rng([3, 0]), vkc.load_scene("household")
     for number in (0, 1):
         pose = sample_cup_pose(scene, rng)
         base = place_objects(scene, {"placed": pose}).sample_start(rng).start[:3].tolist()
-        mine = [s for s in specs if (s["scene"], s["number"]) == ("cup", number)]
-        assert [(s["placed"], s["base"]) for s in mine] == 2 * [(pose, base)]
+        selected = [s for s in specs if (s["scene"], s["number"]) == ("cup", number)]
+        assert [(s["placed"], s["base"]) for s in selected] == 2 * [(pose, base)]
     assert all("placed" not in s for s in specs if s["scene"] != "cup")
 
 
 @pytest.mark.parametrize(
-    ("more", "message"),
+    ("arguments", "message"),
     [
         (["--tasks", "fridge"], "there is no task 'fridge'"),
         (["--methods", "B3"], "'B3'"),
@@ -131,8 +131,8 @@ def test_places_and_starts_depend_on_seed_and_task_alone() -> None:
     ],
 )
 def test_wrong_names_are_refused(
-    more: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["bench", "household", "--out", str(tmp_path / "out"), *more]) == 2
+    assert main(["bench", "household", "--out", str(tmp_path / "out"), *arguments]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -1,4 +1,4 @@
-"""Initialization methods are compared on plans that a fake planner returns."""
+"""Tests the comparison of initialization methods, with a fake planner."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from vkc_pin.validation.report import Report
 def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
     """Fail with "stationary", and with "interpolated" from odd starts."""
     method, number = spec["method"], spec["number"]
-    good = method != "stationary" and not (method == "interpolated" and number % 2)
+    success = method != "stationary" and not (method == "interpolated" and number % 2)
     stepwise = method == STEPWISE
     k = 0 if stepwise else COMPARED_INITIALIZATIONS.index(method)
     metrics = {
@@ -33,7 +33,7 @@ def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:
         "arm_path_length": 7.0 + number * stepwise,
     }
     plan = make_fake_plan(scene)
-    status, report = ("success", Report()) if good else ("rejected", plan.report)
+    status, report = ("success", Report()) if success else ("rejected", plan.report)
     return replace_metrics(plan, metrics, status=status, report=report, seed=spec["seed"])
 
 
@@ -56,16 +56,16 @@ def result(out: Path) -> dict[str, Any]:
 
 def test_trials_are_recorded(result: dict[str, Any]) -> None:
     trials = result["trials"]
-    asked = {(t["method"], t["number"], t["repeat"]) for t in trials}
+    recorded = {(t["method"], t["number"], t["repeat"]) for t in trials}
     numbers = [(n, r) for n in range(3) for r in range(2)]
-    assert asked == {(m, *at) for m in COMPARED_INITIALIZATIONS for at in numbers} | {
+    assert recorded == {(m, *at) for m in COMPARED_INITIALIZATIONS for at in numbers} | {
         (STEPWISE, n, 0) for n in range(3)
     }
-    assert len(trials) == len(asked)
-    first = {t["number"]: t["seed"] for t in trials if t["repeat"] == 0}
-    assert len(set(first.values())) == len(first), "each start has its own random seed"
+    assert len(trials) == len(recorded)
+    seeds = {t["number"]: t["seed"] for t in trials if t["repeat"] == 0}
+    assert len(set(seeds.values())) == len(seeds), "each start has its own random seed"
     for t in trials:
-        assert t["seed"] == first[t["number"]] + t["repeat"]
+        assert t["seed"] == seeds[t["number"]] + t["repeat"]
         assert t["perturbation"] == (0.05 if t["repeat"] else 0.0)
         assert t["success"] == (t["status"] == "success") == (not t["violations"])
     meta = result["meta"]
@@ -77,14 +77,14 @@ def test_starts_are_shared_by_methods_and_selections(
     result: dict[str, Any], tmp_path: Path
 ) -> None:
     starts = [{tuple(t["start"]) for t in result["trials"] if t["number"] == n} for n in range(3)]
-    assert [len(found) for found in starts] == [1, 1, 1]
+    assert [len(start) for start in starts] == [1, 1, 1]
     assert len(set.union(*starts)) == 3
     fewer = run(tmp_path, starts=2, repeats=1, methods=["astar"])["trials"]
     assert [t["method"] for t in fewer] == ["astar", "astar"], "stepwise is compared with auto"
     assert [tuple(t["start"]) for t in fewer] == [*starts[0], *starts[1]]
 
 
-def test_tables_against_numbers_by_hand(out: Path, result: dict[str, Any]) -> None:
+def test_tables_equal_values_computed_by_hand(out: Path, result: dict[str, Any]) -> None:
     text = (out / "table.md").read_text(encoding="utf-8")
     assert text == initialization.format_results(result)
     blocks = [block for block in text.split("\n\n") if block.startswith("|")]
@@ -108,9 +108,9 @@ def test_tables_against_numbers_by_hand(out: Path, result: dict[str, Any]) -> No
 
 
 @pytest.mark.long
-def test_experiment_with_planning(tmp_path: Path) -> None:
-    words = "initialization --starts 1 --scenes init_1 --methods astar --jobs 1"
-    table, (trial,) = run_experiment(words, tmp_path)
+def test_planned_trial_is_recorded(tmp_path: Path) -> None:
+    arguments = "initialization --starts 1 --scenes init_1 --methods astar --jobs 1"
+    table, (trial,) = run_experiment(arguments, tmp_path)
     assert (trial["key"], trial["method"]) == ("init_1/0000/000/astar", "astar")
     assert trial["success"] is True, (trial["status"], trial["violations"])
     assert trial["initialization"].startswith("astar")
@@ -121,9 +121,9 @@ def test_experiment_with_planning(tmp_path: Path) -> None:
         <= trial["base_path_length_l1"]
         <= np.sqrt(2.0) * trial["base_path_length"]
     )
-    parts = [trial[name] for name in trial if name.startswith("time_")]
-    assert all(part >= 0.0 for part in parts)
-    assert 0.0 < sum(parts) <= trial["planning_time"]
+    stage_times = [trial[name] for name in trial if name.startswith("time_")]
+    assert all(stage_time >= 0.0 for stage_time in stage_times)
+    assert 0.0 < sum(stage_times) <= trial["planning_time"]
     assert trial["waypoints"] == 82, "two times 40 segments, the start, and a pause for the gripper"
     assert f"| init_1: no obstacle | astar | 1 of 1 | {trial['planning_time']:.2f} |" in table
 
@@ -132,7 +132,7 @@ def test_wrong_names_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="did you mean 'astar'"):
         run(tmp_path, methods=["astra"])
     with pytest.raises(UnknownNameError, match="init_1"):
-        run(tmp_path, scenes=["door"], solve=initialization.plan_trial)  # it has no stick
+        run(tmp_path, scenes=["door"], solve=initialization.plan_trial)  # the scene has no stick
     with pytest.raises(InputError, match="scenes: there is nothing to run"):
         run(tmp_path, scenes=[])
     assert not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""Planning time is measured against numbers of obstacles or segments."""
+"""Tests planning time against the number of obstacles or segments."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vkc_pin.benchmarks.scale import make_crowded_scene, make_refined_options
 from vkc_pin.errors import InputError
 
 
-def test_more_obstacles_include_the_fewer() -> None:
+def test_larger_sets_of_obstacles_contain_the_smaller_ones() -> None:
     few, some, many = (make_crowded_scene(count) for count in (10, 30, 300))
     assert [len(scene.obstacle_names) for scene in (few, some, many)] == [10, 30, 300]
     assert some.obstacle_names[:10] == few.obstacle_names
@@ -25,7 +25,7 @@ def test_more_obstacles_include_the_fewer() -> None:
     assert set(few.obstacle_labels) >= {"wall_west", "wall_above_door", "hall_wall"}
 
 
-def test_starts_are_shared_and_free_among_all_obstacles() -> None:
+def test_starts_are_shared_and_collision_free_for_all_obstacles() -> None:
     trials = scale.specify(starts=3, seed=4, counts=(30, 100))
     assert [(t["number"], t["obstacles"]) for t in trials] == [
         (n, count) for n in range(3) for count in (30, 100)
@@ -33,8 +33,8 @@ def test_starts_are_shared_and_free_among_all_obstacles() -> None:
     bases = [t["base"] for t in trials]
     assert bases[::2] == bases[1::2]
     assert len({tuple(base) for base in bases}) == 3
-    more = scale.specify(starts=2, seed=4, counts=(10,))
-    assert [t["base"] for t in more] == bases[:4:2]
+    others = scale.specify(starts=2, seed=4, counts=(10,))
+    assert [t["base"] for t in others] == bases[:4:2]
     assert scale.specify(starts=1, seed=5, counts=(10,))[0]["base"] != bases[0]
     for base in bases[::2]:
         assert make_crowded_scene(1000).with_start(base=base).start_clearance() >= 0.03
@@ -42,9 +42,11 @@ def test_starts_are_shared_and_free_among_all_obstacles() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize(("of", "counts"), [("obstacles", (30, 60)), ("segments", (40, 80))])
-def test_experiment(of: str, counts: tuple[int, int], tmp_path: Path) -> None:
-    words = f"scale --starts 1 --of {of} --counts {counts[1]} {counts[0]}"
-    table, trials = run_experiment(words, tmp_path)
+def test_planning_times_are_tabulated_by_count(
+    of: str, counts: tuple[int, int], tmp_path: Path
+) -> None:
+    arguments = f"scale --starts 1 --of {of} --counts {counts[1]} {counts[0]}"
+    table, trials = run_experiment(arguments, tmp_path)
     assert [t[of] for t in trials] == list(counts)
     usual = scale.AXES[of].usual
     (reference,) = [t["planning_time"] for t in trials if t[of] == usual]
@@ -76,11 +78,11 @@ def test_refined_options_divide_the_same_time(segments: int) -> None:
 
 
 def test_errors_have_no_planning_time() -> None:
-    about = {"of": "obstacles", "counts": [12], "starts": 1, "seed": 0}
+    meta = {"of": "obstacles", "counts": [12], "starts": 1, "seed": 0}
     machine = {"system": "x", "machine": "x", "processor": "x", "cores": 2, "python": "3"}
     error = {"obstacles": 12, "number": 0, "success": False, "status": "error"}
     text = scale.format_results(
-        {"meta": {**about, "machine": machine, "versions": {}}, "trials": [error]}
+        {"meta": {**meta, "machine": machine, "versions": {}}, "trials": [error]}
     )
     assert f"| 12 | 0 of 1 |{' – |' * 9}" in text
 

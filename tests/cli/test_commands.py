@@ -18,8 +18,7 @@ from vkc_pin import cli
 from vkc_pin.benchmarks import door
 from vkc_pin.cli import commands, main
 
-ROOT = Path(__file__).resolve().parents[2]
-UNFINISHED = [
+TIMED_OUT = [
     "plan",
     "drawer",
     "--set",
@@ -41,12 +40,12 @@ class Run:
 
 @pytest.fixture(scope="module")
 def planned(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """A plan of the door with outputs in folders that do not exist yet."""
+    """Plan the door with outputs in folders that do not exist yet."""
     folder = tmp_path_factory.mktemp("cli") / "new" / "out"
     files = [
         part
         for kind in ("html", "save", "json", "plots")
-        for part in (f"--{kind}", str(folder / NAMES[kind]))
+        for part in (f"--{kind}", str(folder / OUTPUT_NAMES[kind]))
     ]
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
@@ -54,14 +53,14 @@ def planned(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return Run(code, out.getvalue(), err.getvalue(), folder)
 
 
-NAMES = {"html": "door.html", "save": "door.npz", "json": "door.json", "plots": "plots"}
+OUTPUT_NAMES = {"html": "door.html", "save": "door.npz", "json": "door.json", "plots": "plots"}
 
 
 def run_misused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Return the error of a misused command, which ends without output or traceback."""
+    """Run a misused command and return its error; it must print no output and no traceback."""
     try:
         code = cli.main(list(arguments))
-    except SystemExit as stop:  # argparse's own
+    except SystemExit as stop:  # raised by argparse
         code = int(stop.code or 0)
     captured = capsys.readouterr()
     assert code == 2, captured
@@ -74,7 +73,7 @@ def test_plan_prints_a_report_and_writes_every_output(planned: Run) -> None:
     assert planned.code == 0, planned.err
     assert "door: success" in planned.out
     assert "every constraint holds" in planned.out
-    for kind, name in NAMES.items():
+    for kind, name in OUTPUT_NAMES.items():
         assert f"wrote {planned.folder / name}" in planned.out, kind
     assert "round  1" in planned.err  # progress
     assert "Traceback" not in planned.err
@@ -88,7 +87,9 @@ def test_plan_prints_a_report_and_writes_every_output(planned: Run) -> None:
     assert len(list((planned.folder / "plots").glob("*.png"))) >= 3
 
 
-def test_check_of_a_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_reports_reached_and_blocked_attachments(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert cli.main(["check", "drawer", "--plot", str(tmp_path / "drawer.png")]) == 0
     out = capsys.readouterr().out
     assert "drawer.handle, approach (1.00, 0.00, 0.00): reached from (" in out
@@ -130,9 +131,9 @@ def test_check_validates_a_saved_plan(
 def test_view_writes_a_page(
     planned: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for what, name in ((str(planned.folder / "door.npz"), "plan.html"), ("drawer", "scene.html")):
+    for source, name in ((str(planned.folder / "door.npz"), "plan.html"), ("drawer", "scene.html")):
         page = tmp_path / name
-        assert cli.main(["view", what, "--html", str(page)]) == 0
+        assert cli.main(["view", source, "--html", str(page)]) == 0
         assert page.stat().st_size > 10_000
         assert str(page) in capsys.readouterr().out
 
@@ -141,7 +142,7 @@ def test_failed_plan_is_written_and_returns_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "late.json"
-    assert cli.main([*UNFINISHED, "--json", str(path)]) == 1
+    assert cli.main([*TIMED_OUT, "--json", str(path)]) == 1
     captured = capsys.readouterr()
     assert captured.out.startswith("drawer: FAILED, time limit")
     assert captured.err == ""  # --quiet
@@ -181,7 +182,7 @@ def test_failed_plan_is_written_and_returns_1(
         ("", ["COMMAND"]),
     ],
 )
-def test_misuse_is_explained_in_one_line(
+def test_misuse_is_explained(
     words: str, texts: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     error = run_misused(capsys, *words.split())
@@ -214,7 +215,7 @@ def test_invalid_files_are_named(
         ("--ros one --html one/page.html", ["--html: a file cannot be a folder"]),
     ],
 )
-def test_outputs_that_cannot_be_written_are_refused_before_planning(
+def test_unwritable_outputs_are_rejected_before_planning(
     options: str,
     texts: list[str],
     tmp_path: Path,
@@ -225,7 +226,7 @@ def test_outputs_that_cannot_be_written_are_refused_before_planning(
     (tmp_path / "file").write_text("")
     (tmp_path / "folder").mkdir()
     os.mkfifo(tmp_path / "pipe")
-    error = run_misused(capsys, *UNFINISHED, *options.split())
+    error = run_misused(capsys, *TIMED_OUT, *options.split())
     assert [text for text in texts if text not in error] == []
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "folder", "pipe"]
 
@@ -260,7 +261,7 @@ def test_version_lists_dependencies(capsys: pytest.CaptureFixture[str]) -> None:
     assert "unknown" not in versions.values()
 
 
-def test_exit_code_tells_infeasible_from_failed(
+def test_exit_code_distinguishes_infeasible_from_failed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = str(tmp_path / "plan.npz")
@@ -273,7 +274,7 @@ def test_exit_code_tells_infeasible_from_failed(
     assert capsys.readouterr().out.startswith("drawer: FAILED, evaluation limit")
 
 
-def test_settings_of_one_object_become_one_step() -> None:
+def test_consecutive_settings_of_an_object_become_one_step() -> None:
     settings = ["door.knob=0.5", "door.hinge=1.2", "drawer.slide=0.3", "door.hinge=0"]
     assert commands.parse_settings([*settings, "door.hinge = 1"]) == [
         vkc.Actuate("door", {"knob": 0.5, "hinge": 1.2}),

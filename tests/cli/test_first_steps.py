@@ -1,4 +1,4 @@
-"""The commands for the first steps: demo, new and completion."""
+"""Tests the commands for the first steps: demo, new and completion."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_new_scene_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert (folder / "plan.html").is_file()
 
 
-def test_new_leaves_what_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_new_does_not_overwrite_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "plan.py").write_text("mine")
     assert main(["new", str(tmp_path)]) == 2
     assert "expected a new or empty folder" in capsys.readouterr().err

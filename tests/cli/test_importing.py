@@ -6,15 +6,15 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.arm_urdf import write_arms
-from helpers.downloads import SDF
 from helpers.grippers import write_gripper
 from helpers.homes import HOME_MJCF
+from helpers.partnet import SDF
 
 import vkc_pin as vkc
 from vkc_pin.cli import commands
 
 
-def run(command: str) -> int:
+def run_command(command: str) -> int:
     return commands.run(command.split())
 
 
@@ -24,28 +24,28 @@ def test_robot_is_imported_and_examined(
     monkeypatch.chdir(tmp_path)
     file = write_arms(tmp_path / "given", sides=("left_", "right_"))
     command = f"import-robot {file} --output mine --arm left --samples 100"
-    assert run(command) == 0
+    assert run_command(command) == 0
     output = capsys.readouterr().out
     assert "arm: left, 5 joints, 2 fingers" in output
     assert "wrote mine" in output
     assert vkc.load_robot(tmp_path / "mine").coordinates.names[3] == "left_arm_1_joint"
-    assert run(command) == commands.EXIT_MISUSE
+    assert run_command(command) == commands.EXIT_MISUSE
     assert "--force" in capsys.readouterr().err
-    assert run("doctor mine") == 0
+    assert run_command("doctor mine") == 0
     assert "mine: 0 faults" in capsys.readouterr().out
-    assert run("doctor mine --margin 0.6") == 1
+    assert run_command("doctor mine --margin 0.6") == 1
     assert "the margin is 600 mm" in capsys.readouterr().out
-    for what in ("mine", "mine/scene.yaml", "mine/mine.urdf"):
-        assert run(f"view {what} --html page.html") == 0
+    for source in ("mine", "mine/scene.yaml", "mine/mine.urdf"):
+        assert run_command(f"view {source} --html page.html") == 0
         assert "mine" in Path("page.html").read_text(encoding="utf-8")
-    assert run("check mine/scene.yaml") == 0
+    assert run_command("check mine/scene.yaml") == 0
     robot = vkc.load_robot(tmp_path / "mine")
     data, q = robot.model.createData(), robot.coordinates.q(np.r_[0.5, 0.2, 0.0, robot.home])
     pin.framesForwardKinematics(robot.model, data, q)
     tool = data.oMf[robot.model.getFrameId("tool")]
     pose = " ".join(map(str, [*tool.translation, *pin.rpy.matrixToRpy(tool.rotation)]))
     steps = f"--go-to 0.5 -0.2 0.3 --reach {pose} --go-to 1 0 0"
-    assert run(f"plan {tmp_path}/mine/scene.yaml {steps} --quiet --save plan.npz") == 0
+    assert run_command(f"plan {tmp_path}/mine/scene.yaml {steps} --quiet --save plan.npz") == 0
     plan = vkc.Plan.load("plan.npz")
     assert [type(step) for step in plan.steps] == [vkc.GoTo, vkc.Reach, vkc.GoTo]
     assert plan.trajectory.positions[-1, :3] == pytest.approx([1.0, 0.0, 0.0], abs=1e-3)
@@ -66,7 +66,7 @@ def test_misuse_is_explained_in_one_line(
         ("check drawer --plot it.xyz", "--plot: not the name of a picture (expected a name"),
         ("doctor husky_ur5", "did you mean 'husky_ur5e'?"),
     ):
-        assert run(command) == commands.EXIT_MISUSE
+        assert run_command(command) == commands.EXIT_MISUSE
         printed = capsys.readouterr()
         assert part in printed.err
         assert printed.out == ""
@@ -80,7 +80,7 @@ def test_object_is_imported(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "box.sdf").write_text(SDF)
     command = "import-object box.sdf --output out --height 0.7 --most 1"
-    assert run(command) == 0
+    assert run_command(command) == 0
     output = capsys.readouterr().out
     assert "0.70 m" in output
     assert "door_bar (bar, named as a handle)" in output
@@ -92,16 +92,16 @@ def test_object_is_imported(
         "box.yaml",
         "scene.yaml",
     ]
-    assert run(command) == commands.EXIT_MISUSE
+    assert run_command(command) == commands.EXIT_MISUSE
     assert "--force" in capsys.readouterr().err
-    assert run(command.replace("0.7", "0.8") + " --force") == 0
+    assert run_command(command.replace("0.7", "0.8") + " --force") == 0
     assert "0.80 m" in capsys.readouterr().out
     scene = vkc.load_scene(tmp_path / "out" / "scene.yaml")
-    assert run("check out/scene.yaml") == 0
+    assert run_command("check out/scene.yaml") == 0
     assert "door_bar" in capsys.readouterr().out
     plan = vkc.plan(scene, [vkc.Actuate("box", {"hinge": -0.5})])
     assert plan.success, plan.summary()
-    assert run("view out/box.yaml --html page.html") == 0
+    assert run_command("view out/box.yaml --html page.html") == 0
 
 
 def test_robot_folder_takes_precedence_over_known_names(
@@ -111,16 +111,18 @@ def test_robot_folder_takes_precedence_over_known_names(
     (tmp_path / "box.sdf").write_text(SDF)
     monkeypatch.chdir(tmp_path)
     command = "import-object box.sdf --robot panda --most 1"
-    assert run(command) == commands.EXIT_MISUSE
+    assert run_command(command) == commands.EXIT_MISUSE
     error = capsys.readouterr().err
     assert "panda.urdf: touch_links: the hand of 'panda' is undefined" in error
     assert "import-robot" in error
     write_gripper(tmp_path / "panda")
-    assert run(command) == 0
+    assert run_command(command) == 0
     assert "for the hand of panda, best first" in capsys.readouterr().out
-    assert run("doctor panda") == 0
+    assert run_command("doctor panda") == 0
     assert "panda_joint1" not in capsys.readouterr().out
-    assert run(f"import-object box.sdf --robot {tmp_path}/panda --most 1 --output fixed") == 0
+    assert (
+        run_command(f"import-object box.sdf --robot {tmp_path}/panda --most 1 --output fixed") == 0
+    )
     for folder in ("box", "panda", "fixed"):
         (tmp_path / "moved" / folder).parent.mkdir(exist_ok=True)
         (tmp_path / folder).rename(tmp_path / "moved" / folder)
@@ -137,10 +139,10 @@ def test_home_is_imported_as_a_scene(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "small.xml").write_text(HOME_MJCF)
     command = "import-home small.xml --output out --most 1 --seed 3"
-    assert run(command) == 0
+    assert run_command(command) == 0
     output = capsys.readouterr().out
     assert "5 obstacles, 1 articulated objects, 1 free objects" in output
     assert output.endswith("wrote out/scene.yaml\n")
-    assert run(command) == commands.EXIT_MISUSE
+    assert run_command(command) == commands.EXIT_MISUSE
     assert "--force" in capsys.readouterr().err
-    assert run("check out/scene.yaml") == 0
+    assert run_command("check out/scene.yaml") == 0

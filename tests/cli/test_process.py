@@ -1,4 +1,4 @@
-"""The process loses no files to closed or full outputs, and Ctrl-C leaves none half written."""
+"""Tests that closed or full outputs lose no files, and that Ctrl-C leaves no partial files."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import vkc_pin as vkc
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMAND = [sys.executable, "-m", "vkc_pin.cli"]
-UNFINISHED = [
+TIMED_OUT = [
     "plan",
     "drawer",
     "--set",
@@ -34,15 +34,15 @@ OUTPUTS = ["--save", "plan.npz", "--json", "plan.json", "--csv", "plan.csv"]
 
 
 @pytest.fixture(autouse=True)
-def source_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
+def add_source_to_path(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(
         "PYTHONPATH", os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
     )
 
 
 @pytest.fixture
-def full(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A device that is always full: a new one if permitted, else the system's."""
+def full_device(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a device that is always full: a new one if permitted, else the system's."""
     path = tmp_path_factory.mktemp("device") / "full"
     if os.getuid() == 0:
         os.mknod(path, stat.S_IFCHR | 0o666, os.makedev(1, 7))
@@ -53,14 +53,14 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def shell(
-    redirected: str, words: list[str], folder: Path, full: Path
+def run_in_shell(
+    redirection: str, words: list[str], folder: Path, full_device: Path
 ) -> subprocess.CompletedProcess[str]:
     """Run a command with redirected outputs; PIPE has no reader, FULL is a full device."""
     reads, writes = os.pipe()
     os.close(reads)
-    redirected = redirected.replace("PIPE", f"&{writes}").replace("FULL", str(full))
-    command = ["bash", "-c", f'exec "$@" {redirected}', "bash", *COMMAND, *words]
+    redirection = redirection.replace("PIPE", f"&{writes}").replace("FULL", str(full_device))
+    command = ["bash", "-c", f'exec "$@" {redirection}', "bash", *COMMAND, *words]
     try:
         return subprocess.run(
             command,
@@ -95,24 +95,24 @@ def check_complete(folder: Path) -> set[str]:
 
 
 @pytest.mark.parametrize(
-    ("redirected", "words", "code"),
-    [(">PIPE", UNFINISHED, 1), ("2>FULL", UNFINISHED, 1), (">&- 2>&- <&-", INFEASIBLE, 3)],
+    ("redirection", "words", "code"),
+    [(">PIPE", TIMED_OUT, 1), ("2>FULL", TIMED_OUT, 1), (">&- 2>&- <&-", INFEASIBLE, 3)],
 )
 def test_files_are_written_when_outputs_are_closed(
-    redirected: str, words: list[str], code: int, tmp_path: Path, full: Path
+    redirection: str, words: list[str], code: int, tmp_path: Path, full_device: Path
 ) -> None:
-    """A file opened next must not take the place of the closed output."""
-    done = shell(redirected, [*words, *OUTPUTS], tmp_path, full)
+    """A file opened later must not reuse the descriptor of a closed output."""
+    done = run_in_shell(redirection, [*words, *OUTPUTS], tmp_path, full_device)
     assert done.returncode == code, done
     assert "Traceback" not in done.stderr
     assert "cannot print" not in done.stderr
     assert check_complete(tmp_path) == {"plan.npz", "plan.json", "plan.csv"}
-    if redirected.startswith("2"):
+    if redirection.startswith("2"):
         assert "wrote plan.csv" in done.stdout
 
 
-def test_progress_that_cannot_be_printed_is_no_failure(tmp_path: Path, full: Path) -> None:
-    done = shell("2>FULL", [*SUCCESS, "--save", "plan.npz"], tmp_path, full)
+def test_progress_on_a_full_device_does_not_fail(tmp_path: Path, full_device: Path) -> None:
+    done = run_in_shell("2>FULL", [*SUCCESS, "--save", "plan.npz"], tmp_path, full_device)
     assert done.returncode == 0, done
     assert vkc.Plan.load(tmp_path / "plan.npz").success
     assert "drawer: success" in done.stdout
@@ -123,37 +123,37 @@ def test_progress_that_cannot_be_printed_is_no_failure(tmp_path: Path, full: Pat
     [pytest.param(INFEASIBLE, 3, marks=pytest.mark.long), (SUCCESS, 2)],
     ids=["infeasible", "success"],
 )
-def test_report_on_a_full_disk_is_no_success(
-    words: list[str], code: int, tmp_path: Path, full: Path
+def test_report_on_a_full_device_fails(
+    words: list[str], code: int, tmp_path: Path, full_device: Path
 ) -> None:
-    """Files are written all the same, and a failure keeps its code."""
-    done = shell(">FULL", [*words, "--quiet", "--json", "plan.json"], tmp_path, full)
+    """Files are still written, and a failure keeps its exit code."""
+    done = run_in_shell(">FULL", [*words, "--quiet", "--json", "plan.json"], tmp_path, full_device)
     assert (done.returncode, done.stdout) == (code, "")
     assert done.stderr.splitlines()[-1] == "vkc-pin: cannot print: No space left on device"
     assert "Traceback" not in done.stderr
     assert check_complete(tmp_path) == {"plan.json"}
 
 
-@pytest.mark.parametrize(("redirected", "code"), [(">PIPE", 0), (">FULL", 2)])
+@pytest.mark.parametrize(("redirection", "code"), [(">PIPE", 0), (">FULL", 2)])
 def test_help_on_closed_and_full_outputs(
-    redirected: str, code: int, tmp_path: Path, full: Path
+    redirection: str, code: int, tmp_path: Path, full_device: Path
 ) -> None:
-    done = shell(redirected, ["--help"], tmp_path, full)
+    done = run_in_shell(redirection, ["--help"], tmp_path, full_device)
     assert done.returncode == code, done
     assert "Traceback" not in done.stderr
 
 
 def test_characters_outside_the_encoding_are_escaped(
-    tmp_path: Path, full: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, full_device: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PYTHONIOENCODING", "ascii")
-    done = shell("", UNFINISHED, tmp_path, full)
+    done = run_in_shell("", TIMED_OUT, tmp_path, full_device)
     assert done.returncode == 1, done
     assert "drawer: FAILED, time limit \\u2014 stand" in done.stdout
 
 
-def start(words: list[str], folder: Path, *options: str) -> subprocess.Popen[str]:
-    """Start a command that Ctrl-C interrupts, with options of Python."""
+def start_process(words: list[str], folder: Path, *options: str) -> subprocess.Popen[str]:
+    """Start a command that Ctrl-C interrupts, with options of the Python interpreter."""
     command = [COMMAND[0], *options, *COMMAND[1:], *words]
     return subprocess.Popen(
         command,
@@ -163,7 +163,7 @@ def start(words: list[str], folder: Path, *options: str) -> subprocess.Popen[str
         text=True,
         preexec_fn=lambda: signal.signal(
             signal.SIGINT, signal.SIG_DFL
-        ),  # the shell of the tests may ignore it
+        ),  # the shell that runs the tests may ignore it
     )
 
 
@@ -174,7 +174,7 @@ def read_lines(process: subprocess.Popen[str], printed: list[str]) -> Iterator[s
         yield line
 
 
-def finish(process: subprocess.Popen[str], printed: list[str]) -> int:
+def wait_for_exit(process: subprocess.Popen[str], printed: list[str]) -> int:
     """Return the exit code of a process; it must end without a traceback."""
     assert process.stderr is not None
     printed += process.stderr.readlines()
@@ -187,7 +187,7 @@ def finish(process: subprocess.Popen[str], printed: list[str]) -> int:
 
 @pytest.mark.parametrize("module", ["argparse", "pinocchio", "vkc_pin.planning.solver.loop"])
 def test_ctrl_c_during_imports_writes_nothing(module: str, tmp_path: Path) -> None:
-    process, printed = start([*SUCCESS, *OUTPUTS], tmp_path, "-X", "importtime"), []
+    process, printed = start_process([*SUCCESS, *OUTPUTS], tmp_path, "-X", "importtime"), []
     begun = False
     for line in read_lines(process, printed):
         name = line.rpartition("|")[2].strip()
@@ -197,15 +197,15 @@ def test_ctrl_c_during_imports_writes_nothing(module: str, tmp_path: Path) -> No
             break
     else:
         pytest.fail(f"{module} is not imported")
-    assert finish(process, printed) == 130
+    assert wait_for_exit(process, printed) == 130
     assert check_complete(tmp_path) == set()
 
 
 def test_ctrl_c_while_planning_writes_the_best_motion(tmp_path: Path) -> None:
-    process, printed = start([*SUCCESS, *OUTPUTS], tmp_path), []
+    process, printed = start_process([*SUCCESS, *OUTPUTS], tmp_path), []
     next(line for line in read_lines(process, printed) if re.match(r"  round +1 ", line))
     process.send_signal(signal.SIGINT)
-    code = finish(process, printed)
+    code = wait_for_exit(process, printed)
     assert code in (0, 130)  # planning may be over by then
     assert check_complete(tmp_path) <= {"plan.npz", "plan.json", "plan.csv"}
     if code == 130 and (tmp_path / "plan.npz").exists():
@@ -215,13 +215,13 @@ def test_ctrl_c_while_planning_writes_the_best_motion(tmp_path: Path) -> None:
 @pytest.mark.parametrize("delay", [0.0, 0.2])
 def test_ctrl_c_while_writing_leaves_complete_files(delay: float, tmp_path: Path) -> None:
     outputs = [*OUTPUTS, "--html", "plan.html", "--plots", "plots", "--quiet"]
-    process = start([*SUCCESS, *outputs], tmp_path)
+    process = start_process([*SUCCESS, *outputs], tmp_path)
     while not (tmp_path / "plan.npz").exists():
         assert process.poll() is None
         time.sleep(0.002)
     time.sleep(delay)
     process.send_signal(signal.SIGINT)
-    assert finish(process, []) in (0, 130)
+    assert wait_for_exit(process, []) in (0, 130)
     for picture in (tmp_path / "plots").glob("*"):
         assert picture.read_bytes()[-8:-4] == b"IEND"
         picture.unlink()
@@ -231,7 +231,7 @@ def test_ctrl_c_while_writing_leaves_complete_files(delay: float, tmp_path: Path
 
 
 def test_ignored_ctrl_c_stays_ignored(tmp_path: Path) -> None:
-    """Background processes of scripts ignore it."""
+    """Background processes of scripts ignore Ctrl-C."""
     command = [*COMMAND, *SUCCESS, "--quiet", "--json", "plan.json"]
     process = subprocess.Popen(
         command, cwd=tmp_path, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,4 +1,4 @@
-"""Shares a dataset between tests, which must not change it."""
+"""Provides a dataset that the tests share and must not modify."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vkc_pin.datasets.generation import generate
 
 
 @pytest.fixture(scope="session")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """Return a dataset of four episodes in both layouts."""
     pytest.importorskip("h5py")
     pytest.importorskip("pyarrow")

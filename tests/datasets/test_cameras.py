@@ -1,4 +1,4 @@
-"""Images in datasets: in HDF5 beside what else is observed, and in LeRobot's layout."""
+"""Tests camera images in datasets, in HDF5 and in LeRobot's layout."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from vkc_pin.simulation import snapshots
 
 h5py = pytest.importorskip("h5py")
 pq = pytest.importorskip("pyarrow.parquet")
-EYES: list[dict[str, Any]] = [{**camera, "width": 40, "height": 32} for camera in CAMERAS]
-SEEING = {**SMALL, "simulate": True, "cameras": EYES, "rate": 5}
+SMALL_CAMERAS: list[dict[str, Any]] = [{**camera, "width": 40, "height": 32} for camera in CAMERAS]
+RECIPE = {**SMALL, "simulate": True, "cameras": SMALL_CAMERAS, "rate": 5}
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     try:
         with snapshots.open_gl_context((8, 8)):
             pass
     except vkc.VkcError as error:  # no OpenGL on this machine
         pytest.skip(str(error))
-    return generate(SEEING, 2, tmp_path_factory.mktemp("made") / "out", lerobot=True)
+    return generate(RECIPE, 2, tmp_path_factory.mktemp("made") / "out", lerobot=True)
 
 
-def test_every_sample_has_images(made: Dataset) -> None:
-    with h5py.File(made.shards[0]) as file:
+def test_every_sample_has_images(dataset: Dataset) -> None:
+    with h5py.File(dataset.shards[0]) as file:
         for group in file["data"].values():
             count = group.attrs["num_samples"]
             for camera in ("head", "wrist"):
@@ -47,19 +47,21 @@ def test_every_sample_has_images(made: Dataset) -> None:
                 assert group[f"obs/{camera}_image"][0].std() > 5.0
 
 
-def test_images_are_read_back(made: Dataset) -> None:
-    for episode in made.episodes():
+def test_images_are_read_back(dataset: Dataset) -> None:
+    for episode in dataset.episodes():
         images = episode.images()
         assert images is not None
-        thing = {name for name in images.segments if name.startswith(f"{episode.about['object']}.")}
-        seen = {images.segments[k] for k in np.unique(images.pictures["wrist_segmentation"])}
-        assert seen & thing  # the hand has hold of it
+        object_segments = {
+            name for name in images.segments if name.startswith(f"{episode.about['object']}.")
+        }
+        visible = {images.segments[k] for k in np.unique(images.pictures["wrist_segmentation"])}
+        assert visible & object_segments  # the wrist camera sees the grasped object
 
 
-def test_check_renders_images_again(made: Dataset, tmp_path: Path) -> None:
-    """Of three changed images and many others that are rendered again, it names those three."""
+def test_check_renders_images_again(dataset: Dataset, tmp_path: Path) -> None:
+    """The check reports the three modified images and no others."""
     copy = tmp_path / "copy"
-    shutil.copytree(made.folder, copy, ignore=shutil.ignore_patterns("lerobot"))
+    shutil.copytree(dataset.folder, copy, ignore=shutil.ignore_patterns("lerobot"))
     with h5py.File(Dataset.open(copy).shards[0], "r+") as file:
         demo = file["data/demo_0"]
         number, last = int(demo.attrs["number"]), len(demo["dones"]) - 1
@@ -75,18 +77,18 @@ def test_check_renders_images_again(made: Dataset, tmp_path: Path) -> None:
     assert all(start.startswith(f"episode {number}: ") for start, _ in starts)
 
 
-def test_check_without_opengl_says_that_pixels_are_not_compared(
-    made: Dataset, monkeypatch: pytest.MonkeyPatch
+def test_check_without_opengl_reports_that_pixels_are_not_compared(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(snapshots, "_CONTEXTS", ("no_such_context",))
-    found = check_dataset(made.folder)
+    found = check_dataset(dataset.folder)
     assert found.ok, found.lines()
     assert "pixels not compared: cannot render without a display" in str(found)
 
 
-def test_lerobot_layout_has_colour_images(made: Dataset) -> None:
+def test_lerobot_layout_has_colour_images(dataset: Dataset) -> None:
     image = pytest.importorskip("PIL.Image")
-    root = made.folder / "lerobot/husky_ur5e"
+    root = dataset.folder / "lerobot/husky_ur5e"
     features = json.loads((root / "meta/info.json").read_text())["features"]
     stats = json.loads((root / "meta/stats.json").read_text())
     table = pq.read_table(root / "data/chunk-000/file-000.parquet")
@@ -97,38 +99,42 @@ def test_lerobot_layout_has_colour_images(made: Dataset) -> None:
             "shape": [32, 40, 3],
             "names": ["height", "width", "channels"],
         }
-        own = [np.asarray(image.open(io.BytesIO(one["bytes"]))) for one in table[name].to_pylist()]
-        told = np.concatenate(
-            [episode.images().pictures[f"{camera}_image"] for episode in made.episodes()]
+        decoded = [
+            np.asarray(image.open(io.BytesIO(entry["bytes"]))) for entry in table[name].to_pylist()
+        ]
+        expected = np.concatenate(
+            [episode.images().pictures[f"{camera}_image"] for episode in dataset.episodes()]
         )  # type: ignore[union-attr]
-        np.testing.assert_array_equal(np.array(own), told)
+        np.testing.assert_array_equal(np.array(decoded), expected)
         assert np.shape(stats[name]["mean"]) == (3, 1, 1)
         np.testing.assert_allclose(
-            np.ravel(stats[name]["mean"]), told.mean(axis=(0, 1, 2)) / 255.0, atol=1e-9
+            np.ravel(stats[name]["mean"]), expected.mean(axis=(0, 1, 2)) / 255.0, atol=1e-9
         )
         np.testing.assert_allclose(
-            np.ravel(stats[name]["std"]), told.std(axis=(0, 1, 2)) / 255.0, atol=1e-9
+            np.ravel(stats[name]["std"]), expected.std(axis=(0, 1, 2)) / 255.0, atol=1e-9
         )
-        assert stats[name]["count"] == [len(told)]
+        assert stats[name]["count"] == [len(expected)]
 
 
 def test_digest_depends_on_cameras() -> None:
-    blind, seeing = load_recipe({**SMALL, "simulate": True}), load_recipe(SEEING)
-    moved = load_recipe({**SEEING, "cameras": [{**EYES[0], "fov": 61.0}, EYES[1]]})
-    assert len({blind.digest, seeing.digest, moved.digest}) == 3
-    assert load_recipe({**SMALL, "simulate": True, "cameras": []}).digest == blind.digest
-    assert load_recipe(seeing).cameras == seeing.cameras
+    without_cameras, with_cameras = load_recipe({**SMALL, "simulate": True}), load_recipe(RECIPE)
+    moved = load_recipe(
+        {**RECIPE, "cameras": [{**SMALL_CAMERAS[0], "fov": 61.0}, SMALL_CAMERAS[1]]}
+    )
+    assert len({without_cameras.digest, with_cameras.digest, moved.digest}) == 3
+    assert load_recipe({**SMALL, "simulate": True, "cameras": []}).digest == without_cameras.digest
+    assert load_recipe(with_cameras).cameras == with_cameras.cameras
 
 
 @pytest.mark.parametrize(
-    ("cameras", "said"),
+    ("cameras", "message"),
     [
-        ([{**EYES[0], "fov": 180.0}], "fov"),
-        ([{**EYES[0], "target": EYES[0]["position"]}], "is undefined"),
-        ([EYES[0], EYES[0]], "two cameras of one name"),
-        ([{**EYES[0], "wdth": 64}], "did you mean 'width'"),
+        ([{**SMALL_CAMERAS[0], "fov": 180.0}], "fov"),
+        ([{**SMALL_CAMERAS[0], "target": SMALL_CAMERAS[0]["position"]}], "is undefined"),
+        ([SMALL_CAMERAS[0], SMALL_CAMERAS[0]], "two cameras of one name"),
+        ([{**SMALL_CAMERAS[0], "wdth": 64}], "did you mean 'width'"),
     ],
 )
-def test_wrong_cameras_are_refused(cameras: Any, said: str) -> None:
-    with pytest.raises(vkc.InputError, match=said):
-        load_recipe({**SEEING, "cameras": cameras})
+def test_invalid_cameras_are_rejected(cameras: Any, message: str) -> None:
+    with pytest.raises(vkc.InputError, match=message):
+        load_recipe({**RECIPE, "cameras": cameras})

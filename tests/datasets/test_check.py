@@ -21,8 +21,8 @@ h5py = pytest.importorskip("h5py")
 
 
 @pytest.fixture
-def copy(made: Dataset, tmp_path: Path) -> Path:
-    shutil.copytree(made.folder, tmp_path / "copy")
+def copy(dataset: Dataset, tmp_path: Path) -> Path:
+    shutil.copytree(dataset.folder, tmp_path / "copy")
     return tmp_path / "copy"
 
 
@@ -44,7 +44,7 @@ def test_changed_motion_is_invalid(copy: Path) -> None:
 
 @pytest.mark.long
 def test_added_obstacle_makes_the_episode_invalid(copy: Path) -> None:
-    """The check builds the scenes from the files: it does not believe what planning saw."""
+    """The check builds the scene from its file and does not rely on the planner."""
     episode = next(Dataset.open(copy).episodes())
     middle = episode.trajectory.at(episode.trajectory.times[-1] / 2.0)
     document = json.loads(json.dumps(episode.document))
@@ -63,7 +63,7 @@ def test_added_obstacle_makes_the_episode_invalid(copy: Path) -> None:
     assert "block" in found.refused[episode.number]
 
 
-def test_repeated_episode_is_a_problem(copy: Path) -> None:
+def test_repeated_episode_is_reported(copy: Path) -> None:
     with h5py.File(get_shard(copy), "r+") as file:
         numbers = [int(file[f"data/demo_{k}"].attrs["number"]) for k in range(4)]
         del file["data/demo_3"]
@@ -74,7 +74,7 @@ def test_repeated_episode_is_a_problem(copy: Path) -> None:
 
 
 def set_array(name: str, value: Any, at: Any = ...) -> Callable[[Any], None]:
-    """Return a change of an array of a demo."""
+    """Return a function that modifies an array of a demo."""
 
     def change(demo: Any) -> None:
         demo[name][at] = value
@@ -87,7 +87,7 @@ def set_attribute(name: str, value: Any) -> Callable[[Any], None]:
 
 
 def set_description(*path: str, value: Any) -> Callable[[Any], None]:
-    """Return a change of a field in the description of a demo."""
+    """Return a function that sets a field in the description of a demo."""
 
     def change(demo: Any) -> None:
         data = inner = json.loads(demo.attrs["episode"])
@@ -100,7 +100,7 @@ def set_description(*path: str, value: Any) -> Callable[[Any], None]:
 
 
 def replace_array(name: str, make: Callable[[Any], Any]) -> Callable[[Any], None]:
-    """Return a change that replaces an array by what `make` returns for its values."""
+    """Return a function that replaces an array by the result of `make` for its values."""
 
     def change(demo: Any) -> None:
         values = make(demo[name][:])
@@ -114,7 +114,7 @@ HEADER = (
     "number,task,robot,room,object,kind,attachment,joint,goal,variant,status,reason,duration,"
     "base_path_length,arm_path_length,clearance,waypoints,scene,seconds,planning_time"
 )
-FALSE_SAMPLES = [
+DEMO_CHANGES = [
     (set_array("actions", 7.0), "actions[0, 0] is 7"),
     (set_array("actions", np.nan, (3, 2)), "actions[3, 2] is nan"),
     (set_array("states", 1e-3, (0, 5)), "states[0, 5] is 0.001"),
@@ -144,12 +144,12 @@ FALSE_SAMPLES = [
     (set_description("validation", "clearance", value=9.0), "clearance 9 m instead of"),
     (set_description("steps", value=[]), "steps of no task"),
 ]
-"""A change of a demo, and the reason why it is invalid then."""
+"""Modifications of a demo, each with part of the expected message."""
 
 
-@pytest.mark.parametrize("first", range(0, len(FALSE_SAMPLES), 4))
-def test_everything_that_a_learner_reads_follows_from_the_motion(copy: Path, first: int) -> None:
-    changes = FALSE_SAMPLES[first : first + 4]
+@pytest.mark.parametrize("first", range(0, len(DEMO_CHANGES), 4))
+def test_modified_samples_and_metadata_are_reported(copy: Path, first: int) -> None:
+    changes = DEMO_CHANGES[first : first + 4]
     with h5py.File(get_shard(copy), "r+") as file:
         for k, (change, _) in enumerate(changes):
             change(file[f"data/demo_{k}"])
@@ -163,7 +163,7 @@ def test_everything_that_a_learner_reads_follows_from_the_motion(copy: Path, fir
     assert len(records) + sum(f"demo_{k}" in text for text in problems for k in range(4)) == 4
 
 
-def test_samples_of_another_episode_are_refused(copy: Path) -> None:
+def test_samples_of_another_episode_are_rejected(copy: Path) -> None:
     with h5py.File(get_shard(copy), "r+") as file:
         for part in ("obs", "actions", "states", "rewards", "dones"):
             file.move(f"data/demo_0/{part}", "data/x")
@@ -199,7 +199,7 @@ def set_mask(file: Any) -> None:
         (lambda file: file.create_group("extra"), "there is no member of a shard 'extra'"),
     ],
 )
-def test_parts_of_a_shard_follow_from_its_episodes(
+def test_modified_shard_metadata_is_reported(
     copy: Path, change: Callable[[Any], None], expected: str
 ) -> None:
     recipe = Dataset.open(copy).recipe
@@ -217,7 +217,7 @@ def test_parts_of_a_shard_follow_from_its_episodes(
 
 
 @pytest.mark.long
-def test_damaged_files_do_not_end_the_check(copy: Path) -> None:
+def test_damaged_files_do_not_abort_the_check(copy: Path) -> None:
     other = copy / "shards" / "tiago" / "shard-00000.hdf5"
     other.parent.mkdir()
     other.write_bytes(get_shard(copy).read_bytes()[:5000])
@@ -230,7 +230,7 @@ def test_damaged_files_do_not_end_the_check(copy: Path) -> None:
     assert any(problem.startswith("lerobot/tiago: missing") for problem in found.problems)
 
 
-def test_table_of_episodes_is_compared(copy: Path) -> None:
+def test_modified_episode_table_is_reported(copy: Path) -> None:
     with (copy / "episodes.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     changes = {"task": "fetch-place", "goal": "9", "duration": "nan", "scene": "0"}
@@ -251,7 +251,7 @@ def test_table_of_episodes_is_compared(copy: Path) -> None:
     "text",
     ["", "number\n1\n", '"', "\x00", HEADER, f"{HEADER}\n1\n", f"{HEADER}\nx{',' * 20}\n"],
 )
-def test_damaged_tables_are_named(tmp_path: Path, text: str) -> None:
+def test_damaged_table_error_names_the_file(tmp_path: Path, text: str) -> None:
     (tmp_path / "table.csv").write_text(text)
     if text == HEADER:
         assert read_table(tmp_path / "table.csv") == []
@@ -262,7 +262,7 @@ def test_damaged_tables_are_named(tmp_path: Path, text: str) -> None:
 
 
 def change_column(name: str, value: Any) -> Callable[[Path], None]:
-    """Return a change of the first entry of a column of frames."""
+    """Return a function that modifies a column in the first frame of the second episode."""
     arrow = pytest.importorskip("pyarrow")
     parquet = pytest.importorskip("pyarrow.parquet")
 
@@ -312,7 +312,7 @@ def change_json(name: str, field: str, value: Any) -> Callable[[Path], None]:
         (lambda folder: (folder / "data/more.parquet").write_bytes(b"x"), "an unknown file"),
     ],
 )
-def test_lerobots_layout_is_compared(
+def test_modified_lerobot_files_are_reported(
     copy: Path, change: Callable[[Path], None], expected: str
 ) -> None:
     change(copy / "lerobot" / "husky_ur5e")
@@ -321,7 +321,7 @@ def test_lerobots_layout_is_compared(
     assert any(expected in problem for problem in found), found
 
 
-def test_valid_dataset_passes_and_its_page_shows_it(
+def test_valid_dataset_passes_and_its_page_reports_success(
     copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     found = check_dataset(copy, page=tmp_path / "page.html", seed=3)
@@ -343,20 +343,20 @@ def test_valid_dataset_passes_and_its_page_shows_it(
     assert text.count("<svg") == 5
     assert "<script" not in text
     assert 'src="http' not in text
-    again = tmp_path / "again.html"
-    command = ["dataset", "check", str(copy), "--quiet", "--html", str(again), "--seed", "3"]
+    second_page = tmp_path / "again.html"
+    command = ["dataset", "check", str(copy), "--quiet", "--html", str(second_page), "--seed", "3"]
     assert main(command) == 0
     assert "4 of 4 episodes are valid" in capsys.readouterr().out
-    assert again.read_text(encoding="utf-8") == text
+    assert second_page.read_text(encoding="utf-8") == text
 
 
 @pytest.mark.long
 def test_jobs_do_not_affect_the_check(copy: Path) -> None:
-    one, two = check_dataset(copy), check_dataset(copy, jobs=2)
-    assert one.records == two.records
+    serial, parallel = check_dataset(copy), check_dataset(copy, jobs=2)
+    assert serial.records == parallel.records
 
 
-def test_other_folder_is_no_dataset(tmp_path: Path) -> None:
+def test_folder_without_a_dataset_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="the folder holds no dataset"):
         check_dataset(tmp_path)
 

@@ -52,10 +52,10 @@ def test_winding_numbers_of_known_paths(scene: Scene) -> None:
         make_base_motion((-2, -0.1), (0, -1), (2, -0.1)),
         make_base_motion((-2, -0.1), (0, 1), (2, -0.1)),
     )
-    assert compute_winding_numbers(scene, right) == {}  # as the straight line goes
-    assert compute_winding_numbers(scene, left) == {"post": -1}  # clockwise round it
-    round_it = make_base_motion((-2, -0.1), (0, -1), (2, 0), (0, 1), (-2, 0), (0, -1), (2, -0.1))
-    assert compute_winding_numbers(scene, round_it) == {"post": 1}
+    assert compute_winding_numbers(scene, right) == {}  # on the same side as the straight line
+    assert compute_winding_numbers(scene, left) == {"post": -1}  # clockwise around the post
+    loop = make_base_motion((-2, -0.1), (0, -1), (2, 0), (0, 1), (-2, 0), (0, -1), (2, -0.1))
+    assert compute_winding_numbers(scene, loop) == {"post": 1}
 
 
 @given(st.lists(st.tuples(st.floats(-3, 3), st.floats(0.5, 3)), min_size=1, max_size=6))
@@ -65,7 +65,7 @@ def test_paths_on_one_side_have_no_winding_number(
     assert compute_winding_numbers(scene, make_base_motion((-2.0, 0.5), *points, (2.0, 0.5))) == {}
 
 
-def record(number: int, motion: Trajectory, **changes: object) -> dict[str, object]:
+def make_record(number: int, motion: Trajectory, **changes: object) -> dict[str, object]:
     return {
         "number": number,
         "scene": "s",
@@ -78,12 +78,18 @@ def record(number: int, motion: Trajectory, **changes: object) -> dict[str, obje
 
 
 def test_near_duplicates_are_found() -> None:
-    seen, straight = DuplicateFinder(), make_base_motion((0, 0), (1, 0), (2, 0))
-    assert seen.find_duplicate(record(3, straight)) is None
-    assert seen.find_duplicate(record(5, make_base_motion((0, 0), (1, 0.9 * NEAR), (2, 0)))) == 3
-    assert seen.find_duplicate(record(6, make_base_motion((0, 0), (1, 2.0 * NEAR), (2, 0)))) is None
-    assert seen.find_duplicate(record(7, straight, scene="another")) is None
-    assert seen.find_duplicate(record(8, straight, object="another")) is None
+    finder, straight = DuplicateFinder(), make_base_motion((0, 0), (1, 0), (2, 0))
+    assert finder.find_duplicate(make_record(3, straight)) is None
+    assert (
+        finder.find_duplicate(make_record(5, make_base_motion((0, 0), (1, 0.9 * NEAR), (2, 0))))
+        == 3
+    )
+    assert (
+        finder.find_duplicate(make_record(6, make_base_motion((0, 0), (1, 2.0 * NEAR), (2, 0))))
+        is None
+    )
+    assert finder.find_duplicate(make_record(7, straight, scene="another")) is None
+    assert finder.find_duplicate(make_record(8, straight, object="another")) is None
 
 
 def test_coverage_of_an_interval() -> None:

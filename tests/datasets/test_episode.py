@@ -16,46 +16,46 @@ DOCUMENT = load_recipe(SMALL).document
 
 
 def test_packed_episode_is_read_back() -> None:
-    """All that was planned is there again, to 1e-9 at every moment."""
+    """Unpacking restores the plan, and its trajectory to 1e-9."""
     found = plan(load_scene("drawer"), [Actuate("drawer", {"slide": 0.2})])
     data, record = pack(7, {"robot": "husky_ur5e", "task": "drive-open"}, found)
-    again = unpack(data)
-    motion, was = again.trajectory, found.trajectory
-    times = np.linspace(was.times[0], was.times[-1], 500)
-    assert np.abs(motion.at(times) - was.at(times)).max() <= 1e-9
-    assert np.array_equal(motion.times, was.times)
-    assert motion.phases == was.phases
-    assert again.steps == found.steps
-    assert again.options == found.options
-    report = again.validate()
+    episode = unpack(data)
+    restored, original = episode.trajectory, found.trajectory
+    times = np.linspace(original.times[0], original.times[-1], 500)
+    assert np.abs(restored.at(times) - original.at(times)).max() <= 1e-9
+    assert np.array_equal(restored.times, original.times)
+    assert restored.phases == original.phases
+    assert episode.steps == found.steps
+    assert episode.options == found.options
+    report = episode.validate()
     assert report.ok
-    assert report.contradictions(again.claimed) == []
-    assert record["scene"] == compute_scene_name(again.document)
+    assert report.contradictions(episode.claimed) == []
+    assert record["scene"] == compute_scene_name(episode.document)
     assert len(data) <= 40_000
 
 
 def test_attempts_are_determined_by_their_number() -> None:
     record, data = run_attempt(DOCUMENT, 0, {})
-    again, same = run_attempt(DOCUMENT, 0, {})
+    second_record, second_data = run_attempt(DOCUMENT, 0, {})
     assert record["success"]
-    assert data == same
-    times = {name for name in record if name.endswith("_time")} | {
+    assert data == second_data
+    measured = {name for name in record if name.endswith("_time")} | {
         "seconds",
         "memory_mb",
         "resident_mb",
     }
-    assert {k: v for k, v in record.items() if k not in times} == {
-        k: v for k, v in again.items() if k not in times
+    assert {k: v for k, v in record.items() if k not in measured} == {
+        k: v for k, v in second_record.items() if k not in measured
     }
     json.dumps(record)
 
 
 def test_scene_name_is_a_digest() -> None:
-    found = unpack(run_attempt(DOCUMENT, 0, {})[1])
-    assert "start" not in found.document
-    name = compute_scene_name(found.document)
-    assert name == compute_scene_name(json.loads(json.dumps(found.document)))
-    assert name != compute_scene_name({**found.document, "floor": False})
+    episode = unpack(run_attempt(DOCUMENT, 0, {})[1])
+    assert "start" not in episode.document
+    name = compute_scene_name(episode.document)
+    assert name == compute_scene_name(json.loads(json.dumps(episode.document)))
+    assert name != compute_scene_name({**episode.document, "floor": False})
 
 
 def test_failed_plan_has_a_reason() -> None:
@@ -65,7 +65,7 @@ def test_failed_plan_has_a_reason() -> None:
     assert record["reason"]
 
 
-def test_simulation_decides_success() -> None:
+def test_simulated_attempt_has_a_consistent_status() -> None:
     pytest.importorskip("mujoco")
     record, _ = run_attempt({**DOCUMENT, "simulate": True}, 0, {})
     assert record["simulated"]

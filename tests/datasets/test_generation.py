@@ -21,89 +21,93 @@ EPISODES = 4
 
 
 def read_contents(folder: Path) -> dict[str, bytes]:
-    """Return what a dataset is, without what making it took."""
-    kept = [*folder.glob("shards/*/*"), *folder.glob("scenes/*"), folder / "recipe.yaml"]
-    return {file.relative_to(folder).as_posix(): file.read_bytes() for file in kept}
+    """Return the contents of shards, scenes and recipe, without records of the run."""
+    files = [*folder.glob("shards/*/*"), *folder.glob("scenes/*"), folder / "recipe.yaml"]
+    return {file.relative_to(folder).as_posix(): file.read_bytes() for file in files}
 
 
-def test_episodes_are_the_first_successful_numbers(made: Dataset) -> None:
-    numbers = made.numbers()
+def test_dataset_contains_the_first_successful_attempts(dataset: Dataset) -> None:
+    numbers = dataset.numbers()
     lines = [
-        json.loads(line) for line in (made.folder / "journal.jsonl").read_text().splitlines()[1:]
+        json.loads(line) for line in (dataset.folder / "journal.jsonl").read_text().splitlines()[1:]
     ]
-    tried = {line["key"]: line["records"][0]["success"] for line in lines if "session" not in line}
-    good = sorted(int(key) for key, success in tried.items() if success)
-    assert sorted(numbers) == good[:EPISODES]
+    outcomes = {
+        line["key"]: line["records"][0]["success"] for line in lines if "session" not in line
+    }
+    successful = sorted(int(key) for key, success in outcomes.items() if success)
+    assert sorted(numbers) == successful[:EPISODES]
     assert len(set(numbers)) == EPISODES
     for name in ("README.md", "episodes.csv", "failures.csv", "recipe.yaml"):
-        assert (made.folder / name).is_file()
-    assert len((made.folder / "episodes.csv").read_text().splitlines()) == 1 + EPISODES
+        assert (dataset.folder / name).is_file()
+    assert len((dataset.folder / "episodes.csv").read_text().splitlines()) == 1 + EPISODES
 
 
-def test_episodes_are_valid_and_reach_their_goals(made: Dataset) -> None:
+def test_episodes_are_valid_and_reach_their_goals(dataset: Dataset) -> None:
     starts = set()
-    for episode in made.episodes():
+    for episode in dataset.episodes():
         report = episode.validate()
         assert report.ok, report.lines()
         assert report.contradictions(episode.claimed) == []
         goal = episode.trajectory.column(f"{episode.about['object']}.{episode.about['joint']}")[-1]
         assert goal == pytest.approx(episode.about["goal"], abs=1e-3)
-        assert episode.trajectory.phases[0].held  # the grasp is given
+        assert episode.trajectory.phases[0].held  # grasped from the start
         starts.add(tuple(episode.trajectory.positions[0][:2]))
     assert len(starts) == EPISODES
 
 
 @pytest.mark.long
-def test_jobs_do_not_affect_the_dataset(made: Dataset, tmp_path: Path) -> None:
+def test_jobs_do_not_affect_the_dataset(dataset: Dataset, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     other = generate(SMALL, EPISODES, tmp_path / "out", jobs=2)
-    assert read_contents(other.folder) == read_contents(made.folder)
+    assert read_contents(other.folder) == read_contents(dataset.folder)
 
 
 @pytest.mark.long
-def test_dataset_is_extended(made: Dataset, tmp_path: Path) -> None:
-    """What was made is not made again, and becomes what it would have been at once."""
+def test_dataset_is_extended(dataset: Dataset, tmp_path: Path) -> None:
+    """Extension reuses existing episodes and gives the same dataset as a single run."""
     generate(SMALL, 2, tmp_path / "out")
     before = (tmp_path / "out/journal.jsonl").read_text()
-    more = generate(SMALL, EPISODES, tmp_path / "out")
-    assert read_contents(more.folder) == read_contents(made.folder)
+    extended = generate(SMALL, EPISODES, tmp_path / "out")
+    assert read_contents(extended.folder) == read_contents(dataset.folder)
     assert (tmp_path / "out/journal.jsonl").read_text().startswith(before)
 
 
-def test_finished_dataset_is_left_unchanged(made: Dataset) -> None:
-    before = {file: file.read_bytes() for file in made.folder.rglob("*") if file.is_file()}
-    generate(SMALL, EPISODES, made.folder, lerobot=True)
-    assert {file: file.read_bytes() for file in made.folder.rglob("*") if file.is_file()} == before
+def test_finished_dataset_is_left_unchanged(dataset: Dataset) -> None:
+    before = {file: file.read_bytes() for file in dataset.folder.rglob("*") if file.is_file()}
+    generate(SMALL, EPISODES, dataset.folder, lerobot=True)
+    assert {
+        file: file.read_bytes() for file in dataset.folder.rglob("*") if file.is_file()
+    } == before
     with pytest.raises(InputError, match="more episodes"):
-        generate(SMALL, EPISODES - 1, made.folder)
+        generate(SMALL, EPISODES - 1, dataset.folder)
 
 
 @pytest.mark.parametrize("removed", ["shards/*/*", pytest.param("work/*", marks=pytest.mark.long)])
-def test_removed_files_are_made_again(made: Dataset, tmp_path: Path, removed: str) -> None:
+def test_removed_files_are_recreated(dataset: Dataset, tmp_path: Path, removed: str) -> None:
     generate(SMALL, 3, tmp_path / "out")
     for file in (tmp_path / "out").glob(removed):
         shutil.rmtree(file) if file.is_dir() else file.unlink()
     assert read_contents(generate(SMALL, EPISODES, tmp_path / "out").folder) == read_contents(
-        made.folder
+        dataset.folder
     )
 
 
 @pytest.mark.filterwarnings("ignore:.*made again")
 @pytest.mark.long
-def test_damaged_files_are_made_again(made: Dataset, tmp_path: Path) -> None:
+def test_damaged_files_are_recreated(dataset: Dataset, tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    shutil.copytree(made.folder, folder)
-    works, (shard,) = sorted((folder / "work").iterdir()), (folder / "shards").glob("*/*")
-    for file, data in zip(works, (b"", b"x", works[2].read_bytes()[:2000]), strict=False):
+    shutil.copytree(dataset.folder, folder)
+    work_files, (shard,) = sorted((folder / "work").iterdir()), (folder / "shards").glob("*/*")
+    for file, data in zip(work_files, (b"", b"x", work_files[2].read_bytes()[:2000]), strict=False):
         file.write_bytes(data)
     shard.write_bytes(shard.read_bytes()[:-100])
     with pytest.warns(UserWarning, match="damaged one .*; its episodes are made again"):
         generate(SMALL, EPISODES, folder, lerobot=True)
-    assert read_contents(folder) == read_contents(made.folder)
-    with h5py.File(shard, "r+") as opened:  # then its episodes are those of the work files
+    assert read_contents(folder) == read_contents(dataset.folder)
+    with h5py.File(shard, "r+") as opened:  # its episodes are then read from the work files
         del opened["data/demo_2/motion"]
     generate(SMALL, EPISODES, folder, lerobot=True)
-    assert read_contents(folder) == read_contents(made.folder)
+    assert read_contents(folder) == read_contents(dataset.folder)
 
 
 def change_line(line: dict[str, Any], *path: Any, value: Any) -> None:
@@ -117,7 +121,7 @@ def change_line(line: dict[str, Any], *path: Any, value: Any) -> None:
         inner[path[-1]] = value
 
 
-LINES: list[tuple[tuple[Any, ...], Any]] = [
+JOURNAL_DAMAGES: list[tuple[tuple[Any, ...], Any]] = [
     *((("key",), value) for value in ("abc", "1.5", "01", "-1", None, "9" * 5000, 1)),
     (("records",), []),
     (("records",), [{}, {}]),
@@ -140,12 +144,12 @@ LINES: list[tuple[tuple[Any, ...], Any]] = [
 ]
 
 
-@pytest.mark.parametrize("place", range(len(LINES)))
-def test_damaged_lines_of_a_journal_are_named(made: Dataset, tmp_path: Path, place: int) -> None:
-    path, value = LINES[place]
+@pytest.mark.parametrize("index", range(len(JOURNAL_DAMAGES)))
+def test_error_names_a_damaged_journal_line(dataset: Dataset, tmp_path: Path, index: int) -> None:
+    path, value = JOURNAL_DAMAGES[index]
     file = tmp_path / "out" / "journal.jsonl"
     file.parent.mkdir()
-    lines = (made.folder / "journal.jsonl").read_text().splitlines()
+    lines = (dataset.folder / "journal.jsonl").read_text().splitlines()
     data = json.loads(lines[3])
     change_line(data, *path, value=value)
     lines[3] = json.dumps(data)
@@ -157,18 +161,20 @@ def test_damaged_lines_of_a_journal_are_named(made: Dataset, tmp_path: Path, pla
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "{}", '"x"', "null", "\x00", '{"session": 3}'])
-def test_other_lines_of_a_journal_are_named(made: Dataset, tmp_path: Path, text: str) -> None:
+def test_error_names_an_unknown_journal_line(dataset: Dataset, tmp_path: Path, text: str) -> None:
     file = tmp_path / "out" / "journal.jsonl"
     file.parent.mkdir()
-    lines = (made.folder / "journal.jsonl").read_text().splitlines()
+    lines = (dataset.folder / "journal.jsonl").read_text().splitlines()
     file.write_text("\n".join([lines[0], text, *lines[1:]]) + "\n")
     with pytest.raises(InputError, match=r"journal\.jsonl:2: this line is damaged"):
         generate(SMALL, EPISODES, file.parent)
 
 
 @pytest.mark.parametrize("name", ["work", "shards", "scenes", "robots", "lerobot"])
-def test_files_in_place_of_folders_are_named(made: Dataset, tmp_path: Path, name: str) -> None:
-    shutil.copy(made.folder / "journal.jsonl", tmp_path)
+def test_error_names_a_file_in_place_of_a_folder(
+    dataset: Dataset, tmp_path: Path, name: str
+) -> None:
+    shutil.copy(dataset.folder / "journal.jsonl", tmp_path)
     (tmp_path / name).write_text("mine")
     with pytest.raises(InputError, match="this is no folder") as caught:
         generate(SMALL, EPISODES, tmp_path)
@@ -176,7 +182,7 @@ def test_files_in_place_of_folders_are_named(made: Dataset, tmp_path: Path, name
 
 
 @pytest.mark.long
-def test_stopped_generation_is_resumed(made: Dataset, tmp_path: Path) -> None:
+def test_killed_generation_is_resumed(dataset: Dataset, tmp_path: Path) -> None:
     script = (
         f"from vkc_pin.datasets.generation import generate; generate({SMALL!r}, {EPISODES}, 'out')"
     )
@@ -190,11 +196,13 @@ def test_stopped_generation_is_resumed(made: Dataset, tmp_path: Path) -> None:
     process.kill()
     process.communicate(timeout=60)
     assert read_contents(generate(SMALL, EPISODES, tmp_path / "out").folder) == read_contents(
-        made.folder
+        dataset.folder
     )
 
 
-def test_other_folders_and_recipes_are_refused(made: Dataset, tmp_path: Path) -> None:
+def test_foreign_folders_and_different_recipes_are_rejected(
+    dataset: Dataset, tmp_path: Path
+) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/thesis.tex").write_text("x")
     with pytest.raises(InputError, match="the folder holds other files"):
@@ -203,20 +211,20 @@ def test_other_folders_and_recipes_are_refused(made: Dataset, tmp_path: Path) ->
     with pytest.raises(InputError, match="episodes"):
         generate(SMALL, 0, tmp_path / "new")
     with pytest.raises(InputError, match="run otherwise") as caught:
-        generate({**SMALL, "max_evaluations": 7}, EPISODES, made.folder)
+        generate({**SMALL, "max_evaluations": 7}, EPISODES, dataset.folder)
     assert caught.value.field == "recipe"
     with pytest.raises(UnknownNameError, match="did you mean 'random_oven'"):
         generate({**SMALL, "objects": ["random_ovens"]}, 1, tmp_path / "new")
     assert not (tmp_path / "new").exists()
 
 
-def test_generation_without_success_ends(tmp_path: Path) -> None:
+def test_generation_without_success_raises(tmp_path: Path) -> None:
     far = {**SMALL, "tasks": ["drive-open"], "start": {"distance": [90.0, 91.0]}}
     with pytest.raises(VkcError, match=r"attempts gave 0 of 1 episodes.*no free start"):
         generate(far, 1, tmp_path / "out")
 
 
-def record(
+def make_record(
     number: int, *, success: bool = True, robot: str = "a", at: float = 0.0
 ) -> dict[str, Any]:
     about = {
@@ -238,8 +246,8 @@ def record(
 
 def test_accepted_episodes_do_not_depend_on_the_order(tmp_path: Path) -> None:
     records = [
-        record(k, success=k % 3 != 1, at=float(k // 4)) for k in range(12)
-    ]  # every fourth place is new
+        make_record(k, success=k % 3 != 1, at=float(k // 4)) for k in range(12)
+    ]  # each path is shared by four attempts
     found = []
     for order in (range(12), reversed(range(12)), (5, 0, 11, 3, 1, 2, 9, 10, 4, 8, 7, 6)):
         register = Register(Dataset(tmp_path, load_recipe(SMALL)), 3)
@@ -256,5 +264,5 @@ def test_accepted_episodes_do_not_depend_on_the_order(tmp_path: Path) -> None:
     assert (2, "duplicate") in found[0][1]
     assert (1, "x") in found[0][1]
     assert not any("way" in one for one in (*register.accepted, *register.failures)), (
-        "most of a record is for nothing then"
+        "registered records must not keep their coarse trajectories"
     )

@@ -17,16 +17,16 @@ STEPS = {
 
 
 def compute_grasp_error(scene: Scene, name: str) -> float:
-    """Return how far the hand is from what it is said to hold [m] and [rad]."""
+    """Return the largest deviation of the hand from its grasp [m] or [rad]."""
     (hold,) = scene.holds
     placed = scene.objects[name]
     grasp = placed.object.attachments[hold.attachment]
-    wanted = placed.link_placement(grasp.link) * grasp.tool(hold.at)
-    return float(np.abs(pin.log6(wanted.actInv(scene.tool_placement())).vector).max())
+    expected = placed.link_placement(grasp.link) * grasp.tool(hold.at)
+    return float(np.abs(pin.log6(expected.actInv(scene.tool_placement())).vector).max())
 
 
 @pytest.mark.parametrize("name", ["drawer", "door"])
-def test_hand_is_at_the_attachment(name: str) -> None:
+def test_grasping_start_places_the_hand_at_the_attachment(name: str) -> None:
     scene = load_scene(name)
     step = Actuate(name, STEPS[name].joints, next(iter(scene.objects[name].object.attachments)))
     rng, planner = np.random.default_rng(0), Planner()
@@ -41,16 +41,18 @@ def test_hand_is_at_the_attachment(name: str) -> None:
     assert plan(found, [step], planner=planner).success
 
 
-def test_blocked_grasp_has_no_start() -> None:
+def test_blocked_grasp_has_no_grasping_start() -> None:
     scene = load_scene("drawer")
     document = scene.document
     attachment, placed = (
         next(iter(scene.objects["drawer"].object.attachments)),
         scene.objects["drawer"],
     )
-    at = placed.link_placement(placed.object.attachments[attachment].link).translation.tolist()
+    position = placed.link_placement(
+        placed.object.attachments[attachment].link
+    ).translation.tolist()
     document["obstacles"].append(
-        {"name": "block", "type": "box", "size": [1.0, 1.0, 1.0], "position": at}
+        {"name": "block", "type": "box", "size": [1.0, 1.0, 1.0], "position": position}
     )
     with pytest.warns(UserWarning, match="overlap other shapes"):
         blocked = Scene.from_document(document, scene.folder)

@@ -1,4 +1,4 @@
-"""Resuming or checking a dataset from another source changes nothing outside its folder."""
+"""Tests that resuming or checking an untrusted dataset changes nothing outside its folder."""
 
 from __future__ import annotations
 
@@ -20,14 +20,25 @@ from vkc_pin.errors import InputError
 
 h5py = pytest.importorskip("h5py")
 EPISODES = 4
-NOT_NAMES = ["../../../evil", "/evil", "a/b", "..", "", ".hidden", "a\\b", "x" * 300, "\ud800", 3]
+INVALID_NAMES = [
+    "../../../evil",
+    "/evil",
+    "a/b",
+    "..",
+    "",
+    ".hidden",
+    "a\\b",
+    "x" * 300,
+    "\ud800",
+    3,
+]
 
 
 @pytest.fixture
-def copy(made: Dataset, tmp_path: Path) -> Path:
-    """Return a dataset deep in a folder, with files around it, whose shards are missing."""
+def copy(dataset: Dataset, tmp_path: Path) -> Path:
+    """Return a dataset without shards, in a nested folder among other files."""
     folder = tmp_path / "a" / "b" / "dataset"
-    shutil.copytree(made.folder, folder)
+    shutil.copytree(dataset.folder, folder)
     shutil.rmtree(folder / "shards")
     for name in (
         "notes.txt",
@@ -50,7 +61,7 @@ def read_surroundings(folder: Path, root: Path) -> dict[str, bytes | None]:
 
 
 def change_journal(folder: Path, **changes: Any) -> None:
-    """Change the records of all attempts."""
+    """Update fields in the records of all attempts."""
     file = folder / "journal.jsonl"
     lines = [json.loads(line) for line in file.read_text().splitlines()]
     for line in lines:
@@ -59,7 +70,7 @@ def change_journal(folder: Path, **changes: Any) -> None:
     file.write_text("".join(json.dumps(line) + "\n" for line in lines))
 
 
-@pytest.mark.parametrize("name", NOT_NAMES, ids=repr)
+@pytest.mark.parametrize("name", INVALID_NAMES, ids=repr)
 def test_robot_name_in_the_journal_is_checked(copy: Path, tmp_path: Path, name: Any) -> None:
     change_journal(copy, robot=name)
     before = read_surroundings(copy, tmp_path)
@@ -97,7 +108,7 @@ def test_robot_name_of_a_recipe_is_checked(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_links_out_of_the_folder_are_refused(copy: Path, tmp_path: Path) -> None:
+def test_symlinks_out_of_the_folder_are_rejected(copy: Path, tmp_path: Path) -> None:
     (copy / "shards").mkdir()
     (copy / "shards" / "husky_ur5e").symlink_to(tmp_path / "outside")
     before = read_surroundings(copy, tmp_path)
@@ -112,7 +123,7 @@ def test_links_out_of_the_folder_are_refused(copy: Path, tmp_path: Path) -> None
     assert [path.name for path in (copy / "elsewhere").iterdir()] == ["shard-00000.hdf5"]
 
 
-def test_page_of_a_check_is_not_written_through_a_link(copy: Path, tmp_path: Path) -> None:
+def test_check_page_is_not_written_through_a_symlink(copy: Path, tmp_path: Path) -> None:
     generate(SMALL, EPISODES, copy)
     (tmp_path / "profile").write_text("mine")
     (copy / "statistics.html").symlink_to(tmp_path / "profile")
@@ -122,14 +133,14 @@ def test_page_of_a_check_is_not_written_through_a_link(copy: Path, tmp_path: Pat
     assert check_dataset(copy, page=tmp_path / "page.html").page == tmp_path / "page.html"
 
 
-def test_other_files_in_the_lerobot_folder_are_kept(copy: Path) -> None:
+def test_foreign_files_in_the_lerobot_folder_are_kept(copy: Path) -> None:
     pytest.importorskip("pyarrow")
     generate(SMALL, EPISODES, copy, lerobot=True)
-    own = copy / "lerobot" / "husky_ur5e"
+    robot_folder = copy / "lerobot" / "husky_ur5e"
     generate(SMALL, EPISODES, copy, lerobot=True)
-    (own / "notes.txt").write_text("mine")
+    (robot_folder / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match=r"would delete .*got notes\.txt\)") as caught:
         generate(SMALL, EPISODES + 1, copy, lerobot=True)
-    assert caught.value.file == own
-    assert (own / "notes.txt").read_text() == "mine"
-    assert len(Dataset.open(copy).numbers()) == EPISODES, "refused before anything was planned"
+    assert caught.value.file == robot_folder
+    assert (robot_folder / "notes.txt").read_text() == "mine"
+    assert len(Dataset.open(copy).numbers()) == EPISODES, "the error must precede planning"

@@ -19,12 +19,12 @@ def sample(number: int, **changes: Any) -> Any:
     return sample_problem(load_recipe({**SMALL, **changes}), number, {}, PLANNER)
 
 
-def describe(found: Any) -> Any:
+def describe(problem: Any) -> Any:
     return (
-        found.scene.document,
-        [step_to_dict(step) for step in found.steps],
-        found.about,
-        found.seed,
+        problem.scene.document,
+        [step_to_dict(step) for step in problem.steps],
+        problem.about,
+        problem.seed,
     )
 
 
@@ -32,7 +32,7 @@ def describe(found: Any) -> Any:
 def test_problem_is_determined_by_recipe_and_number(task: str) -> None:
     for number in range(3):
         one = describe(sample(number, tasks=[task]))
-        describe(sample(number + 5, tasks=[task]))  # what was drawn before makes no difference
+        describe(sample(number + 5, tasks=[task]))  # earlier samples must not matter
         assert describe(sample(number, tasks=[task])) == one
     assert describe(sample(0, tasks=[task])) != describe(sample(1, tasks=[task]))
 
@@ -45,50 +45,50 @@ def test_consecutive_numbers_share_a_room() -> None:
 def test_robots_alternate() -> None:
     robots = [{"name": "husky_ur5e"}, {"name": "husky_ur5e", "height": 0.4}]
     heights = [sample(number, robots=robots).scene.described.start.z for number in range(0, 8, 2)]
-    assert heights == [None, 0.4, 0.4, None]  # in every room both
+    assert heights == [None, 0.4, 0.4, None]  # both robots in each room
 
 
-def test_variants_differ_in_the_seed() -> None:
+def test_variants_differ_only_in_the_seed() -> None:
     first, second, other = (sample(number, variants=2) for number in range(3))
     assert describe(first)[:2] == describe(second)[:2]
     assert [one.seed for one in (first, second, other)] == [0, 1, 0]
     assert describe(first)[:2] != describe(other)[:2]
 
 
-def test_open_task_keeps_to_the_ranges() -> None:
+def test_open_task_respects_the_ranges() -> None:
     for number in range(6):
-        found = sample(
+        problem = sample(
             number, tasks=["drive-open"], goal={"share": [0.2, 0.3]}, start={"distance": [1.0, 4.0]}
         )
-        (step,) = found.steps
+        (step,) = problem.steps
         assert isinstance(step, Actuate)
-        placed = found.scene.objects[step.object]
+        placed = problem.scene.objects[step.object]
         ((joint, goal),) = step.joints.items()
         k = placed.object.coordinates.index(joint)
-        share = abs(goal - placed.state[k]) / (placed.object.upper[k] - placed.object.lower[k])
-        assert 0.199 <= share <= 0.301
+        fraction = abs(goal - placed.state[k]) / (placed.object.upper[k] - placed.object.lower[k])
+        assert 0.199 <= fraction <= 0.301
         assert (
-            1.0 <= np.linalg.norm(found.scene.start[:2] - placed.placement.translation[:2]) <= 4.0
+            1.0 <= np.linalg.norm(problem.scene.start[:2] - placed.placement.translation[:2]) <= 4.0
         )
-        assert found.scene.start_clearance() >= START_CLEARANCE
-        assert found.scene.held == {}
+        assert problem.scene.start_clearance() >= START_CLEARANCE
+        assert problem.scene.held == {}
 
 
 def test_fetched_object_is_placed_on_another_table() -> None:
-    found = sample(0, tasks=["fetch-place"])
-    grasp, place = found.steps
+    problem = sample(0, tasks=["fetch-place"])
+    grasp, place = problem.steps
     assert isinstance(grasp, Grasp)
     assert isinstance(place, Place)
-    tops = {
+    obstacles = {
         name: shape
-        for shape, name in zip(found.scene.obstacles, found.scene.obstacle_labels, strict=True)
+        for shape, name in zip(problem.scene.obstacles, problem.scene.obstacle_labels, strict=True)
     }
-    top = tops["table_2_top"]
-    local = top.placement.actInv(np.array(found.about["goal"]))
+    top = obstacles["table_2_top"]
+    local = top.placement.actInv(np.array(problem.about["goal"]))
     assert (np.abs(local[:2]) <= np.asarray(top.geometry.halfSide)[:2]).all()
     assert local[2] == pytest.approx(
         top.geometry.halfSide[2] + 0.035 + 0.001, abs=2e-3
-    )  # the ball's radius above it
+    )  # the ball's radius above the table top
 
 
 def test_impossible_ranges_are_reported() -> None:
@@ -105,7 +105,7 @@ def test_impossible_ranges_are_reported() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "called"),
+    ("entry", "expected"),
     [
         ("panda", "panda"),
         ("/a/b/panda/robot.yaml", "panda"),
@@ -113,5 +113,5 @@ def test_impossible_ranges_are_reported() -> None:
         ("/a/panda", "panda"),
     ],
 )
-def test_robot_names(name: str, called: str) -> None:
-    assert get_robot_name(name) == called
+def test_robot_name_is_derived_from_the_entry(entry: str, expected: str) -> None:
+    assert get_robot_name(entry) == expected

@@ -20,28 +20,28 @@ def test_robot_without_a_hand_is_imported_once(
 ) -> None:
     recipe = load_recipe({**SMALL, "robots": ["husky_ur5e", {"name": "panda", "height": 0.5}]})
     found = robots.prepare_robots(recipe, tmp_path)
-    assert list(found) == ["panda"]  # the other one says what its hand is
+    assert list(found) == ["panda"]  # the other robot describes its hand
     assert load_robot(found["panda"]).touch_links
     monkeypatch.setattr(robots, "import_robot", None)
     assert robots.prepare_robots(recipe, tmp_path) == found
 
 
 @pytest.mark.parametrize(
-    "given", ["robot.yaml", pytest.param("husky_ur5e.urdf", marks=pytest.mark.long)]
+    "file_name", ["robot.yaml", pytest.param("husky_ur5e.urdf", marks=pytest.mark.long)]
 )
-def test_robot_by_path_is_found_again(tmp_path: Path, given: str) -> None:
-    """The dataset says where its URDF is, since its name alone would not."""
+def test_robot_by_path_is_found_again(tmp_path: Path, file_name: str) -> None:
+    """The dataset stores the path of the URDF, since the robot's name is not sufficient."""
     pytest.importorskip("h5py")
     shutil.copytree(find_robot("husky_ur5e").parent, tmp_path / "mine/rover")
-    recipe = {**SMALL, "robots": [str(tmp_path / "mine/rover" / given)]}
-    made = generate(recipe, 1, tmp_path / "out")
-    (episode,) = made.episodes()
-    assert episode.about["robot"] == ("rover" if given == "robot.yaml" else "husky_ur5e")
+    recipe = {**SMALL, "robots": [str(tmp_path / "mine/rover" / file_name)]}
+    dataset = generate(recipe, 1, tmp_path / "out")
+    (episode,) = dataset.episodes()
+    assert episode.about["robot"] == ("rover" if file_name == "robot.yaml" else "husky_ur5e")
     assert episode.scene().robot.urdf == tmp_path / "mine/rover/husky_ur5e.urdf"
-    assert check_dataset(made.folder).ok
+    assert check_dataset(dataset.folder).ok
 
 
-def test_robots_of_one_name_are_refused(tmp_path: Path) -> None:
+def test_robots_with_the_same_name_are_rejected(tmp_path: Path) -> None:
     for folder in ("a", "b"):
         shutil.copytree(find_robot("husky_ur5e").parent, tmp_path / folder / "rover")
     paths = [str(tmp_path / folder / "rover/robot.yaml") for folder in ("a", "b")]

@@ -1,1 +1,1 @@
-"""`python -m tests.episodes DATASET`: every episode of a dataset is judged by the oracle."""
+"""Judges every episode of a dataset with the oracle: `python -m tests.episodes DATASET`."""

@@ -1,4 +1,4 @@
-"""Episodes of a dataset before the oracle, which reads nothing but saved plans."""
+"""Judges the episodes of a dataset with the oracle, which reads only saved plans."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from vkc_pin.planning.plan import Plan
 __all__ = ["judge_dataset", "save_episode"]
 
 VERDICTS = "oracle.jsonl"
-"""In a dataset's folder: a line a shard."""
+"""File in a dataset's folder with one line per shard."""
 
 
 def judge_dataset(folder: Path, *, jobs: int = 1) -> list[Verdict]:
     """Judge the episodes of a dataset; each shard's verdicts are saved in its folder and reused."""
     dataset = Dataset.open(folder)
-    kept = _read_verdicts(folder / VERDICTS)
-    left = [shard for shard in dataset.shards if _get_name(dataset, shard) not in kept]
+    known = _read_verdicts(folder / VERDICTS)
+    remaining = [shard for shard in dataset.shards if _get_name(dataset, shard) not in known]
     with (
         ProcessPoolExecutor(jobs) as pool,
-        (folder / VERDICTS).open("a", encoding="utf-8") as lines,
+        (folder / VERDICTS).open("a", encoding="utf-8") as stream,
     ):
         for shard, verdicts in zip(
-            left, pool.map(_judge_shard, [folder] * len(left), left), strict=True
+            remaining, pool.map(_judge_shard, [folder] * len(remaining), remaining), strict=True
         ):
             name = _get_name(dataset, shard)
-            kept[name] = verdicts
-            own = [{**asdict(one), "path": str(one.path)} for one in verdicts]
-            lines.write(json.dumps({"shard": name, "verdicts": own}) + "\n")
-            lines.flush()
-    return [one for shard in dataset.shards for one in kept[_get_name(dataset, shard)]]
+            known[name] = verdicts
+            entries = [{**asdict(verdict), "path": str(verdict.path)} for verdict in verdicts]
+            stream.write(json.dumps({"shard": name, "verdicts": entries}) + "\n")
+            stream.flush()
+    return [verdict for shard in dataset.shards for verdict in known[_get_name(dataset, shard)]]
 
 
 def save_episode(episode: Episode, path: Path) -> Path:
@@ -77,10 +77,10 @@ def _get_name(dataset: Dataset, shard: Path) -> str:
 def _read_verdicts(file: Path) -> dict[str, list[Verdict]]:
     if not file.is_file():
         return {}
-    said = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+    entries = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
     return {
-        one["shard"]: [
-            Verdict(**{**verdict, "path": Path(verdict["path"])}) for verdict in one["verdicts"]
+        entry["shard"]: [
+            Verdict(**{**verdict, "path": Path(verdict["path"])}) for verdict in entry["verdicts"]
         ]
-        for one in said
+        for entry in entries
     }

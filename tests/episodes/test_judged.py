@@ -16,21 +16,23 @@ h5py = pytest.importorskip("h5py")
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return generate(SMALL, 2, tmp_path_factory.mktemp("judged") / "out")
 
 
-def test_each_episode_is_judged_once(made: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([str(made.folder)]) == 0
+def test_each_episode_is_judged_once(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(dataset.folder)]) == 0
     assert "2 plans" in capsys.readouterr().out
-    kept = (made.folder / VERDICTS).read_text(encoding="utf-8")
-    assert [len(json.loads(line)["verdicts"]) for line in kept.splitlines()] == [2]
-    assert [one.found for one in judge_dataset(made.folder)] == [[], []]
-    assert (made.folder / VERDICTS).read_text(encoding="utf-8") == kept, "nothing is judged twice"
+    saved = (dataset.folder / VERDICTS).read_text(encoding="utf-8")
+    assert [len(json.loads(line)["verdicts"]) for line in saved.splitlines()] == [2]
+    assert [verdict.found for verdict in judge_dataset(dataset.folder)] == [[], []]
+    assert (dataset.folder / VERDICTS).read_text(encoding="utf-8") == saved, (
+        "no episode is judged twice"
+    )
 
 
-def test_changed_motion_is_judged_invalid(made: Dataset, tmp_path: Path) -> None:
-    shutil.copytree(made.folder, tmp_path / "copy")
+def test_changed_motion_is_judged_invalid(dataset: Dataset, tmp_path: Path) -> None:
+    shutil.copytree(dataset.folder, tmp_path / "copy")
     (tmp_path / "copy" / VERDICTS).unlink(missing_ok=True)
     (shard,) = Dataset.open(tmp_path / "copy").shards
     with h5py.File(shard, "r+") as file:

@@ -19,55 +19,55 @@ CORPUS = Path(__file__).with_name("corpus")
 
 
 def main() -> int:
-    """Run cases; return 1 if something is wrong with one of them."""
+    """Run cases; return 1 if one of them fails."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
-    parser.add_argument("--cases", type=int, default=1000, help="how many, of all kinds together")
-    parser.add_argument("--seed", type=int, help="a new one by default, which is printed")
-    parser.add_argument("--kind", choices=KINDS, help="this kind alone")
+    parser.add_argument("--cases", type=int, default=1000, help="total number of cases")
+    parser.add_argument("--seed", type=int, help="random seed; a new one by default, printed")
+    parser.add_argument("--kind", choices=KINDS, help="run only this kind")
     parser.add_argument(
-        "--first", type=int, default=0, help="the number of the first case of each kind"
+        "--first", type=int, default=0, help="number of the first case of each kind"
     )
     parser.add_argument(
         "--keep",
         action="store_true",
-        help="write what goes wrong into the corpus, a file for each error",
+        help="add failing cases to the corpus, one for each error",
     )
     parser.add_argument(
         "--show", type=int, metavar="NUMBER", help="print one case of --kind and its outcome"
     )
-    given = parser.parse_args()
-    if given.seed is None:
-        given.seed = random.SystemRandom().randrange(10**6)
-        sys.stdout.write(f"--seed {given.seed}\n")
-    worker, rows, seen, bad = Worker(), [], Counter[str](), 0
-    if given.show is not None:
-        asked = {"kind": given.kind, "seed": given.seed, "number": given.show}
-        found = {**worker.run(**asked, only="make"), **worker.run(**asked)}
-        sys.stdout.write(json.dumps(found, indent=1) + "\n")
+    arguments = parser.parse_args()
+    if arguments.seed is None:
+        arguments.seed = random.SystemRandom().randrange(10**6)
+        sys.stdout.write(f"--seed {arguments.seed}\n")
+    worker, rows, errors, failures = Worker(), [], Counter[str](), 0
+    if arguments.show is not None:
+        request = {"kind": arguments.kind, "seed": arguments.seed, "number": arguments.show}
+        result = {**worker.run(**request, only="make"), **worker.run(**request)}
+        sys.stdout.write(json.dumps(result, indent=1) + "\n")
         return 0
     for kind, share in KINDS.items():
-        if given.kind not in (None, kind):
+        if arguments.kind not in (None, kind):
             continue
-        count = given.cases if given.kind else round(given.cases * share)
+        count = arguments.cases if arguments.kind else round(arguments.cases * share)
         outcomes, longest, largest = Counter[str](), 0.0, 0.0
-        for number in range(given.first, given.first + count):
-            asked = {"kind": kind, "seed": given.seed, "number": number}
-            found = worker.run(**asked)
-            outcomes[found["outcome"]] += 1
-            longest, largest = max(longest, found["seconds"]), max(largest, found["grown"])
-            if found["outcome"] not in BAD:
+        for number in range(arguments.first, arguments.first + count):
+            request = {"kind": kind, "seed": arguments.seed, "number": number}
+            result = worker.run(**request)
+            outcomes[result["outcome"]] += 1
+            longest, largest = max(longest, result["seconds"]), max(largest, result["grown"])
+            if result["outcome"] not in BAD:
                 continue
-            bad += 1
-            error = found["error"].partition(": ")[0] if found["outcome"] == "raw" else ""
-            key = f"{kind} {found['outcome']} {error}"
-            seen[key] += 1
-            if seen[key] == 1:
+            failures += 1
+            error = result["error"].partition(": ")[0] if result["outcome"] == "raw" else ""
+            key = f"{kind} {result['outcome']} {error}"
+            errors[key] += 1
+            if errors[key] == 1:
                 sys.stdout.write(
-                    f"{kind} {given.seed} {number}: {found['outcome']}, {found['error']}\n"
+                    f"{kind} {arguments.seed} {number}: {result['outcome']}, {result['error']}\n"
                 )
                 sys.stdout.flush()
-                if given.keep:
-                    save_case(kind, worker.run(**asked, only="make")["case"], found)
+                if arguments.keep:
+                    save_case(kind, worker.run(**request, only="make")["case"], result)
         rows.append((kind, count, outcomes, longest, largest))
     good = sorted({name for _, _, outcomes, _, _ in rows for name in outcomes} - set(BAD))
     columns = [*good, *BAD]
@@ -77,17 +77,17 @@ def main() -> int:
     for kind, count, outcomes, longest, largest in rows:
         cells = [f"{outcomes[name]:9d}" for name in columns]
         sys.stdout.write(f"{kind:>9} {count:9d} {' '.join(cells)} {longest:9.1f} {largest:9.0f}\n")
-    for key, number in seen.most_common():
+    for key, number in errors.most_common():
         sys.stdout.write(f"{number:6d} {key}\n")
     worker.close()
-    return 1 if bad else 0
+    return 1 if failures else 0
 
 
-def save_case(kind: str, case: dict[str, object], found: dict[str, str]) -> None:
+def save_case(kind: str, case: dict[str, object], result: dict[str, str]) -> None:
     """Write a case into the corpus."""
     CORPUS.mkdir(exist_ok=True)
     text = json.dumps(
-        {"kind": kind, "was": f"{found['outcome']}: {found['error']}", "case": case}, indent=1
+        {"kind": kind, "was": f"{result['outcome']}: {result['error']}", "case": case}, indent=1
     )
     name = hashlib.sha256(json.dumps(case).encode()).hexdigest()[:10]
     (CORPUS / f"{kind}_{name}.json").write_text(text + "\n", encoding="ascii")

@@ -1,4 +1,4 @@
-"""Calls public functions with valid arguments, one or two of which a case makes invalid."""
+"""Calls public functions with one or two invalid arguments."""
 
 from __future__ import annotations
 
@@ -42,30 +42,30 @@ TINY = {
 
 @dataclass(frozen=True)
 class Call:
-    """Something public, and arguments that work; `often` says how many cases it gets."""
+    """A public function with valid arguments, and its weight in the choice of cases."""
 
-    does: Callable[..., Any]
+    function: Callable[..., Any]
     arguments: Callable[[], dict[str, Any]]
-    often: float = 1.0
+    weight: float = 1.0
 
 
 @functools.cache
-def load_door() -> vkc.Scene:
-    """A small scene: the robot, a table that holds a stick, a drawer."""
+def load_drawer_scene() -> vkc.Scene:
+    """Load a small scene with a drawer."""
     return vkc.load_scene("drawer")
 
 
 @functools.cache
-def load_stick() -> vkc.Scene:
+def load_fetch_scene() -> vkc.Scene:
     """Load a scene with free objects."""
     return vkc.load_scene("fetch")
 
 
 @functools.cache
-def make_motion() -> vkc.Trajectory:
-    """A motion in `scene`: it drives and turns an arm joint."""
-    start = np.concatenate([load_door().start, [0.0]])
-    names = (*load_door().robot.coordinates.names, "drawer.slide")
+def make_trajectory() -> vkc.Trajectory:
+    """Make a trajectory in the drawer scene along which all coordinates increase."""
+    start = np.concatenate([load_drawer_scene().start, [0.0]])
+    names = (*load_drawer_scene().robot.coordinates.names, "drawer.slide")
     end = start + 0.1
     positions = np.linspace(start, end, 5)
     phases = (
@@ -77,10 +77,10 @@ def make_motion() -> vkc.Trajectory:
 
 @functools.cache
 def make_plan() -> vkc.Plan:
-    """What planning with next to no time comes to."""
+    """Plan with a minimal budget."""
     options = vkc.Options(**TINY)
     return vkc.plan(
-        load_door(),
+        load_drawer_scene(),
         [vkc.GoTo(0.1, 0.1)],
         options=options,
         time_limit=0.5,
@@ -98,12 +98,12 @@ def get_folder() -> Path:
 
 @functools.cache
 def write_files() -> dict[str, Path]:
-    """The motion in all the kinds of files that can be read."""
-    made = {
-        "csv": make_motion().to_csv(get_folder() / "motion.csv"),
-        "json": make_motion().to_json(get_folder() / "motion.json"),
+    """Write the trajectory and the plan in all file formats that can be read."""
+    files = {
+        "csv": make_trajectory().to_csv(get_folder() / "motion.csv"),
+        "json": make_trajectory().to_json(get_folder() / "motion.json"),
     }
-    return {**made, "npz": make_plan().save(get_folder() / "plan.npz")}
+    return {**files, "npz": make_plan().save(get_folder() / "plan.npz")}
 
 
 def _make_steps() -> list[Any]:
@@ -112,7 +112,7 @@ def _make_steps() -> list[Any]:
 
 def _make_planning_arguments() -> dict[str, Any]:
     return {
-        "scene": load_door(),
+        "scene": load_drawer_scene(),
         "steps": _make_steps(),
         "options": vkc.Options(**TINY),
         "time_limit": 0.2,
@@ -120,22 +120,22 @@ def _make_planning_arguments() -> dict[str, Any]:
     }
 
 
-def _redirect_output(does: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that writes relative file names into `folder`."""
+def _redirect_output(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that writes to relative paths below the folder of the cases."""
 
-    def inside(path: Any = None, **arguments: Any) -> Any:
+    def redirected(path: Any = None, **arguments: Any) -> Any:
         if isinstance(path, str | Path) and path and not Path(path).is_absolute():
             path = get_folder() / "written" / path
-        return does(path, **arguments)
+        return function(path, **arguments)
 
-    return inside
+    return redirected
 
 
 def _call_method(make: Callable[[], Any], name: str) -> Callable[..., Any]:
     return lambda *a, **k: getattr(make(), name)(*a, **k)
 
 
-def _make_term(kind: type, **arguments: Any) -> Any:
+def _plan_with_term(kind: type, **arguments: Any) -> Any:
     return vkc.plan(**{**_make_planning_arguments(), "terms": [kind(**arguments)]})
 
 
@@ -143,26 +143,26 @@ def _compute_expression(state: Any) -> Any:
     return state.coordinate("elbow_joint")
 
 
-def _plan_step(step: type) -> Callable[..., Any]:
-    """Return a function that makes the step and compiles a task with it."""
+def _make_step_builder(step: type) -> Callable[..., Any]:
+    """Return a function that makes the step and builds a problem with it."""
 
-    def built(**arguments: Any) -> Any:
-        made = step(**arguments)
-        return vkc.build(load_stick(), [made], options=vkc.Options(**TINY))
+    def build(**arguments: Any) -> Any:
+        instance = step(**arguments)
+        return vkc.build(load_fetch_scene(), [instance], options=vkc.Options(**TINY))
 
-    return built
+    return build
 
 
 _POSE = (1.0, 0.2, 0.8, 0.0, 0.1, 0.2)
-_ROS = functools.cache(lambda: make_motion().to_ros())
+_ROS = functools.cache(lambda: make_trajectory().to_ros())
 
 
 def _place_drawer_in_hand() -> pin.SE3:
     """Return the placement of an open drawer whose handle is in the hand."""
-    placed = load_door().objects["drawer"].with_state({"slide": 0.1})
-    grasp = placed.object.attachment("handle")
-    in_drawer = placed.object.link_placement(grasp.link, placed.state) * grasp.tool()
-    return load_door().tool_placement() * in_drawer.inverse()
+    drawer = load_drawer_scene().objects["drawer"].with_state({"slide": 0.1})
+    grasp = drawer.object.attachment("handle")
+    in_drawer = drawer.object.link_placement(grasp.link, drawer.state) * grasp.tool()
+    return load_drawer_scene().tool_placement() * in_drawer.inverse()
 
 
 CALLS: dict[str, Call] = {
@@ -184,70 +184,75 @@ CALLS: dict[str, Call] = {
     "load_object": Call(vkc.load_object, lambda: {"name_or_path": "drawer"}),
     "Scene.from_document": Call(
         vkc.Scene.from_document,
-        lambda: {"document": load_door().document, "folder": load_door().folder},
+        lambda: {"document": load_drawer_scene().document, "folder": load_drawer_scene().folder},
         0.5,
     ),
     "Scene.with_start": Call(
-        _call_method(load_door, "with_start"),
-        lambda: {"base": load_door().start[:3].tolist(), "arm": load_door().start[3:].tolist()},
+        _call_method(load_drawer_scene, "with_start"),
+        lambda: {
+            "base": load_drawer_scene().start[:3].tolist(),
+            "arm": load_drawer_scene().start[3:].tolist(),
+        },
     ),
     "Scene.with_state": Call(
-        _call_method(load_door, "with_state"), lambda: {"name": "drawer", "values": {"slide": 0.1}}
+        _call_method(load_drawer_scene, "with_state"),
+        lambda: {"name": "drawer", "values": {"slide": 0.1}},
     ),
     "Scene.with_placement": Call(
-        _call_method(load_stick, "with_placement"),
-        lambda: {"name": next(iter(load_stick().objects)), "placement": pin.SE3.Identity()},
+        _call_method(load_fetch_scene, "with_placement"),
+        lambda: {"name": next(iter(load_fetch_scene().objects)), "placement": pin.SE3.Identity()},
     ),
     "Scene.with_held": Call(
-        _call_method(load_door, "with_held"),
+        _call_method(load_drawer_scene, "with_held"),
         lambda: {"held": {"drawer": "handle"}, "by": {}, "at": {}, "measured": {}},
     ),
     "Scene.with_measured_grasp": Call(
-        _call_method(load_door, "with_measured_grasp"),
+        _call_method(load_drawer_scene, "with_measured_grasp"),
         lambda: {
             "name": "drawer",
             "attachment": "handle",
-            "base": load_door().start[:3].tolist(),
-            "arm": load_door().start[3:].tolist(),
+            "base": load_drawer_scene().start[:3].tolist(),
+            "arm": load_drawer_scene().start[3:].tolist(),
             "state": {"slide": 0.1},
             "placement": _place_drawer_in_hand(),
         },
     ),
     "Scene.with_held holds": Call(
-        _call_method(load_door, "with_held"), lambda: {"held": [vkc.Hold("drawer", "handle")]}
+        _call_method(load_drawer_scene, "with_held"),
+        lambda: {"held": [vkc.Hold("drawer", "handle")]},
     ),
     "Scene.start_clearance": Call(
-        _call_method(load_door, "start_clearance"), lambda: {"reach": 0.1}
+        _call_method(load_drawer_scene, "start_clearance"), lambda: {"reach": 0.1}
     ),
     "Scene.sample_start": Call(
-        _call_method(load_door, "sample_start"), lambda: {"rng": np.random.default_rng(0)}
+        _call_method(load_drawer_scene, "sample_start"), lambda: {"rng": np.random.default_rng(0)}
     ),
     "PlacedObject.with_state": Call(
-        _call_method(lambda: load_door().objects["drawer"], "with_state"),
+        _call_method(lambda: load_drawer_scene().objects["drawer"], "with_state"),
         lambda: {"values": {"slide": 0.1}},
     ),
     "PlacedObject.link_placement": Call(
-        _call_method(lambda: load_door().objects["drawer"], "link_placement"),
+        _call_method(lambda: load_drawer_scene().objects["drawer"], "link_placement"),
         lambda: {"link": "tray"},
     ),
     "ArticulatedObject.attachment": Call(
-        _call_method(lambda: load_door().objects["drawer"].object, "attachment"),
+        _call_method(lambda: load_drawer_scene().objects["drawer"].object, "attachment"),
         lambda: {"name": "handle"},
     ),
     "ArticulatedObject.link_frame": Call(
-        _call_method(lambda: load_door().objects["drawer"].object, "link_frame"),
+        _call_method(lambda: load_drawer_scene().objects["drawer"].object, "link_frame"),
         lambda: {"link": "tray"},
     ),
     "ArticulatedObject.link_placement": Call(
-        _call_method(lambda: load_door().objects["drawer"].object, "link_placement"),
+        _call_method(lambda: load_drawer_scene().objects["drawer"].object, "link_placement"),
         lambda: {"link": "tray", "state": [0.1]},
     ),
     "Attachment.motion": Call(
-        _call_method(lambda: load_door().objects["drawer"].object.attachment(), "motion"),
+        _call_method(lambda: load_drawer_scene().objects["drawer"].object.attachment(), "motion"),
         lambda: {"values": []},
     ),
     "Attachment.tool": Call(
-        _call_method(lambda: load_door().objects["drawer"].object.attachment(), "tool"),
+        _call_method(lambda: load_drawer_scene().objects["drawer"].object.attachment(), "tool"),
         lambda: {"values": []},
     ),
     "Freedom.motion": Call(
@@ -255,13 +260,15 @@ CALLS: dict[str, Call] = {
         lambda: {"value": 0.5},
     ),
     "Robot.link_of": Call(
-        _call_method(lambda: load_door().robot, "link_of"), lambda: {"geometry": 0}
+        _call_method(lambda: load_drawer_scene().robot, "link_of"), lambda: {"geometry": 0}
     ),
     "Coordinates.q": Call(
-        _call_method(lambda: load_door().robot.coordinates, "q"), lambda: {"z": load_door().start}
+        _call_method(lambda: load_drawer_scene().robot.coordinates, "q"),
+        lambda: {"z": load_drawer_scene().start},
     ),
     "Coordinates.index": Call(
-        _call_method(lambda: load_door().robot.coordinates, "index"), lambda: {"name": "base_x"}
+        _call_method(lambda: load_drawer_scene().robot.coordinates, "index"),
+        lambda: {"name": "base_x"},
     ),
     "random_room": Call(
         vkc.procedural.random_room,
@@ -288,7 +295,7 @@ CALLS: dict[str, Call] = {
         vkc.load_object,
         lambda: {"name_or_path": vkc.procedural.random_object("door"), "folder": "."},
     ),
-    "goals": Call(vkc.procedural.goals, lambda: {"scene": load_door(), "share": 0.5}),
+    "goals": Call(vkc.procedural.goals, lambda: {"scene": load_drawer_scene(), "share": 0.5}),
     "RoomSettings": Call(
         vkc.procedural.RoomSettings,
         lambda: {
@@ -310,28 +317,32 @@ CALLS: dict[str, Call] = {
         2.0,
     ),
     "Options.paper": Call(vkc.Options.paper, lambda: {"dt": 0.5, "objective": "control_effort"}),
-    "Reach": Call(_plan_step(vkc.Reach), lambda: {"pose": list(_POSE), "frame": None}),
+    "Reach": Call(_make_step_builder(vkc.Reach), lambda: {"pose": list(_POSE), "frame": None}),
     "Grasp": Call(
-        _plan_step(vkc.Grasp), lambda: {"object": "ball", "attachment": None, "by": None}
+        _make_step_builder(vkc.Grasp), lambda: {"object": "ball", "attachment": None, "by": None}
     ),
     "Actuate": Call(
-        lambda **k: vkc.build(load_door(), [vkc.Actuate(**k)], options=vkc.Options(**TINY)),
+        lambda **k: vkc.build(load_drawer_scene(), [vkc.Actuate(**k)], options=vkc.Options(**TINY)),
         lambda: {"object": "drawer", "joints": {"slide": 0.2}, "attachment": "handle"},
     ),
-    "Touch": Call(_plan_step(vkc.Touch), lambda: {"frame": "tool0", "target": [1.0, 0.2, 0.8]}),
+    "Touch": Call(
+        _make_step_builder(vkc.Touch), lambda: {"frame": "tool0", "target": [1.0, 0.2, 0.8]}
+    ),
     "Place": Call(
-        _plan_step(vkc.Place),
+        _make_step_builder(vkc.Place),
         lambda: {"object": "ball", "pose": [1.0, 0.2, 0.8], "attachment": None},
     ),
     "Release": Call(
         lambda **k: vkc.build(
-            load_door(), [vkc.Grasp("drawer"), vkc.Release(**k)], options=vkc.Options(**TINY)
+            load_drawer_scene(),
+            [vkc.Grasp("drawer"), vkc.Release(**k)],
+            options=vkc.Options(**TINY),
         ),
         lambda: {"object": "drawer"},
     ),
-    "GoTo": Call(_plan_step(vkc.GoTo), lambda: {"x": 0.1, "y": 0.1, "yaw": 0.2}),
+    "GoTo": Call(_make_step_builder(vkc.GoTo), lambda: {"x": 0.1, "y": 0.1, "yaw": 0.2}),
     "Constraint": Call(
-        functools.partial(_make_term, vkc.Constraint),
+        functools.partial(_plan_with_term, vkc.Constraint),
         lambda: {
             "name": "elbow",
             "expression": _compute_expression,
@@ -344,7 +355,7 @@ CALLS: dict[str, Call] = {
         1.5,
     ),
     "Cost": Call(
-        functools.partial(_make_term, vkc.Cost),
+        functools.partial(_plan_with_term, vkc.Cost),
         lambda: {
             "name": "elbow",
             "expression": _compute_expression,
@@ -383,7 +394,7 @@ CALLS: dict[str, Call] = {
     "plan_separately": Call(
         vkc.baselines.plan_separately,
         lambda: {
-            "scene": load_door(),
+            "scene": load_drawer_scene(),
             "steps": _make_steps(),
             "method": "B1",
             "options": vkc.Options(**TINY),
@@ -397,7 +408,7 @@ CALLS: dict[str, Call] = {
     "build": Call(
         vkc.build,
         lambda: {
-            "scene": load_door(),
+            "scene": load_drawer_scene(),
             "steps": _make_steps(),
             "options": vkc.Options(**TINY),
             "terms": (),
@@ -407,26 +418,31 @@ CALLS: dict[str, Call] = {
     "validate": Call(
         vkc.validate,
         lambda: {
-            "scene": load_door(),
+            "scene": load_drawer_scene(),
             "steps": _make_steps(),
-            "trajectory": make_motion(),
+            "trajectory": make_trajectory(),
             "options": vkc.Options(),
             "terms": (),
         },
     ),
     "invert": Call(
         vkc.invert,
-        lambda: {"obj": load_door().objects["drawer"].object, "link": "tray", "state": [0.1]},
+        lambda: {
+            "obj": load_drawer_scene().objects["drawer"].object,
+            "link": "tray",
+            "state": [0.1],
+        },
     ),
     "consolidate": Call(
         vkc.consolidate,
-        lambda: {"scene": load_door(), "holds": {"drawer": "handle"}, "cache": None},
+        lambda: {"scene": load_drawer_scene(), "holds": {"drawer": "handle"}, "cache": None},
     ),
     "consolidate holds": Call(
-        vkc.consolidate, lambda: {"scene": load_door(), "holds": [vkc.Hold("drawer", "handle")]}
+        vkc.consolidate,
+        lambda: {"scene": load_drawer_scene(), "holds": [vkc.Hold("drawer", "handle")]},
     ),
     "Hold": Call(
-        lambda **k: load_door().with_held([vkc.Hold(**k)]),
+        lambda **k: load_drawer_scene().with_held([vkc.Hold(**k)]),
         lambda: {
             "object": "drawer",
             "attachment": "handle",
@@ -438,32 +454,32 @@ CALLS: dict[str, Call] = {
     ),
     "PhaseSpan": Call(
         lambda **k: vkc.Trajectory(
-            make_motion().names,
-            make_motion().times,
-            make_motion().positions,
+            make_trajectory().names,
+            make_trajectory().times,
+            make_trajectory().positions,
             [vkc.PhaseSpan(**k)],
-            make_motion().robot_size,
+            make_trajectory().robot_size,
         ),
         lambda: {"name": "all", "first": 0, "last": 4, "holds": ()},
     ),
     "Trajectory": Call(
         vkc.Trajectory,
         lambda: {
-            "names": make_motion().names,
-            "times": make_motion().times,
-            "positions": make_motion().positions,
-            "phases": make_motion().phases,
-            "robot_size": make_motion().robot_size,
+            "names": make_trajectory().names,
+            "times": make_trajectory().times,
+            "positions": make_trajectory().positions,
+            "phases": make_trajectory().phases,
+            "robot_size": make_trajectory().robot_size,
         },
         1.5,
     ),
-    "Trajectory.at": Call(_call_method(make_motion, "at"), lambda: {"time": [0.5, 1.0]}),
-    "Trajectory.column": Call(_call_method(make_motion, "column"), lambda: {"name": "base_x"}),
+    "Trajectory.at": Call(_call_method(make_trajectory, "at"), lambda: {"time": [0.5, 1.0]}),
+    "Trajectory.column": Call(_call_method(make_trajectory, "column"), lambda: {"name": "base_x"}),
     "Trajectory.from_dict": Call(
-        vkc.Trajectory.from_dict, lambda: {"data": make_motion().to_dict()}, 2.0
+        vkc.Trajectory.from_dict, lambda: {"data": make_trajectory().to_dict()}, 2.0
     ),
     "Trajectory.to_csv": Call(
-        _redirect_output(lambda path, **k: make_motion().to_csv(path, **k)),
+        _redirect_output(lambda path, **k: make_trajectory().to_csv(path, **k)),
         lambda: {
             "path": "t.csv",
             "joints": ["base_x", "base_y", "base_yaw"],
@@ -471,11 +487,11 @@ CALLS: dict[str, Call] = {
         },
     ),
     "Trajectory.to_json": Call(
-        _redirect_output(lambda path, **k: make_motion().to_json(path, **k)),
+        _redirect_output(lambda path, **k: make_trajectory().to_json(path, **k)),
         lambda: {"path": "t.json"},
     ),
     "Trajectory.to_ros": Call(
-        _call_method(make_motion, "to_ros"),
+        _call_method(make_trajectory, "to_ros"),
         lambda: {
             "joints": "robot",
             "rate": 5.0,
@@ -492,7 +508,7 @@ CALLS: dict[str, Call] = {
     "Trajectory.from_json": Call(vkc.Trajectory.from_json, lambda: {"path": write_files()["json"]}),
     "Trajectory.from_ros": Call(
         vkc.Trajectory.from_ros,
-        lambda: {"message": _ROS(), "like": make_motion(), "robot_size": None},
+        lambda: {"message": _ROS(), "like": make_trajectory(), "robot_size": None},
         1.5,
     ),
     "Plan.load": Call(vkc.Plan.load, lambda: {"path": write_files()["npz"]}),
@@ -519,7 +535,7 @@ CALLS: dict[str, Call] = {
         lambda path, **k: to_html(path=get_folder() / "p.html", **k),
         lambda: {
             "path": None,
-            "plan_or_scene": load_door(),
+            "plan_or_scene": load_drawer_scene(),
             "frames": {"goal": pin.SE3.Identity()},
         },
         0.3,
@@ -527,7 +543,7 @@ CALLS: dict[str, Call] = {
     "show": Call(
         lambda **k: vkc.visualization.show(**{**k, "open_browser": False}),
         lambda: {
-            "plan_or_scene": load_door(),
+            "plan_or_scene": load_drawer_scene(),
             "open_browser": False,
             "height": 300,
             "frames": None,
@@ -538,45 +554,47 @@ CALLS: dict[str, Call] = {
     "plot_joints": Call(plot_joints, lambda: {"plan": make_plan()}, 0.2),
     "plot_clearance": Call(plot_clearance, lambda: {"plan": make_plan()}, 0.2),
     "plot_top_view": Call(plot_top_view, lambda: {"plan": make_plan()}, 0.2),
-    "joint_placements": Call(joint_placements, lambda: {"model": load_door().robot.model}, 0.5),
+    "joint_placements": Call(
+        joint_placements, lambda: {"model": load_drawer_scene().robot.model}, 0.5
+    ),
     "frame_placements": Call(
-        frame_placements, lambda: {"model": load_door().robot.model, "frames": ["tool0"]}
+        frame_placements, lambda: {"model": load_drawer_scene().robot.model, "frames": ["tool0"]}
     ),
     "frame_jacobian": Call(
         frame_jacobian,
         lambda: {
-            "model": load_door().robot.model,
+            "model": load_drawer_scene().robot.model,
             "frame": "tool0",
             "reference": "local_world_aligned",
         },
     ),
-    "rnea": Call(rnea, lambda: {"model": load_door().robot.model}, 0.5),
-    "center_of_mass": Call(center_of_mass, lambda: {"model": load_door().robot.model}, 0.5),
+    "rnea": Call(rnea, lambda: {"model": load_drawer_scene().robot.model}, 0.5),
+    "center_of_mass": Call(center_of_mass, lambda: {"model": load_drawer_scene().robot.model}, 0.5),
 }
 
 
 def make_case(rng: random.Random) -> dict[str, Any]:
-    """Return a case: a call, and which of its arguments is what."""
+    """Return a case: a call and changes of its arguments."""
     names = list(CALLS)
-    name = rng.choices(names, [CALLS[each].often for each in names])[0]
+    name = rng.choices(names, [CALLS[each].weight for each in names])[0]
     parameters = list(CALLS[name].arguments())
     changes = []
     for parameter in rng.sample(parameters, min(len(parameters), rng.choice((1, 1, 1, 2)))):
         value = rng.choice(odd.USUAL if rng.random() < 0.5 else odd.VALUES)
-        if parameter == "callback" and value in odd.RAISING:  # errors of the caller's own functions
+        if parameter == "callback" and value in odd.RAISING:  # its own errors pass through
             value = "None"
         changes.append([parameter, value, rng.randrange(8) if rng.random() < 0.4 else None])
     return {"call": name, "changes": changes}
 
 
-def run(given: dict[str, Any]) -> str:
-    """Make the call and return its outcome, or raise its error."""
-    call = CALLS[given["call"]]
+def run(case: dict[str, Any]) -> str:
+    """Make the call of a case and return its outcome, or raise its error."""
+    call = CALLS[case["call"]]
     arguments = call.arguments()
-    for parameter, name, at in given["changes"]:
+    for parameter, name, at in case["changes"]:
         value = odd.make_value(name)
         arguments[parameter] = (
-            value if at is None else odd.insert_odd(arguments[parameter], value, at)
+            value if at is None else odd.insert_value(arguments[parameter], value, at)
         )
-    call.does(**arguments)
+    call.function(**arguments)
     return "done"

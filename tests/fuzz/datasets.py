@@ -61,12 +61,12 @@ def make_case(rng: random.Random) -> dict[str, Any]:
             pairs = [(rng.choice(_list_members()), rng.choice(ACTIONS)) for _ in range(2)]
             return {"members": pairs[: rng.choice((1, 1, 2))], "value": rng.choice(_NUMBERS)}
         case 1:
-            place, name = rng.choice(_list_attributes())
-            return {"attribute": [place, name], "value": rng.choice((*_NUMBERS, "", "[]", None))}
+            member, name = rng.choice(_list_attributes())
+            return {"attribute": [member, name], "value": rng.choice((*_NUMBERS, "", "[]", None))}
         case 2:
             with h5py.File(_make_base().shards[0]) as file:
-                said = json.loads(file["data/demo_0"].attrs["episode"])
-            return {"changes": choose_changes(rng, said)}
+                metadata = json.loads(file["data/demo_0"].attrs["episode"])
+            return {"changes": choose_changes(rng, metadata)}
         case _:
             data = _make_base().shards[0].read_bytes()
             return {"content": corrupt(rng, data).decode("latin-1")}
@@ -75,16 +75,16 @@ def make_case(rng: random.Random) -> dict[str, Any]:
 _NUMBERS = (0, 1, -1, 0.5, 1e9, 1e300, "nan", 2**62)
 
 
-def run(given: dict[str, Any]) -> str:
+def run(case: dict[str, Any]) -> str:
     """Read and check the episodes of a changed shard."""
     base = _make_base()
     file = base.folder.parent / "changed.hdf5"
-    if "content" in given:
-        file.write_bytes(given["content"].encode("latin-1"))
+    if "content" in case:
+        file.write_bytes(case["content"].encode("latin-1"))
     else:
         shutil.copy(base.shards[0], file)
-        with h5py.File(file, "r+") as opened:
-            _change(opened, given)
+        with h5py.File(file, "r+") as archive:
+            _change_archive(archive, case)
     with open_shard(file, base.folder / "scenes") as shard:
         for k in range(len(shard)):
             episode = shard.read(k)
@@ -94,21 +94,21 @@ def run(given: dict[str, Any]) -> str:
     return "done"
 
 
-def _change(file: Any, given: dict[str, Any]) -> None:
-    if "changes" in given:
+def _change_archive(file: Any, case: dict[str, Any]) -> None:
+    if "changes" in case:
         attributes = file["data/demo_0"].attrs
-        said = apply_changes(json.loads(attributes["episode"]), given["changes"])
-        attributes["episode"] = json.dumps(said)
+        metadata = apply_changes(json.loads(attributes["episode"]), case["changes"])
+        attributes["episode"] = json.dumps(metadata)
         return
-    value = float("nan") if given["value"] == "nan" else given["value"]
-    if "attribute" in given:
-        place, name = given["attribute"]
-        del file[place].attrs[name]
+    value = float("nan") if case["value"] == "nan" else case["value"]
+    if "attribute" in case:
+        member, name = case["attribute"]
+        del file[member].attrs[name]
         if value is not None:
-            file[place].attrs[name] = value
+            file[member].attrs[name] = value
         return
-    for name, action in given["members"]:
-        with contextlib.suppress(RuntimeError):  # beyond a link to itself
+    for name, action in case["members"]:
+        with contextlib.suppress(RuntimeError):  # behind a link to itself
             if name in file:
                 _change_member(file, name, action, value)
 
@@ -151,18 +151,18 @@ def make_journal_case(rng: random.Random) -> dict[str, Any]:
     return {"line": number, "content": data.decode("latin-1"), "plan": True}
 
 
-def run_journal(given: dict[str, Any]) -> str:
+def run_journal(case: dict[str, Any]) -> str:
     """Resume generation with a changed journal."""
     base = _make_base()
     folder = base.folder.parent / "copy"
     shutil.copytree(base.folder, folder)
     try:
         lines = (folder / "journal.jsonl").read_bytes().splitlines()
-        if "content" in given:
-            lines[given["line"]] = given["content"].encode("latin-1")
+        if "content" in case:
+            lines[case["line"]] = case["content"].encode("latin-1")
         else:
-            changed = apply_changes(json.loads(lines[given["line"]]), given["changes"])
-            lines[given["line"]] = json.dumps(changed).encode()
+            changed = apply_changes(json.loads(lines[case["line"]]), case["changes"])
+            lines[case["line"]] = json.dumps(changed).encode()
         (folder / "journal.jsonl").write_bytes(b"\n".join(lines) + b"\n")
         assert len(generate(RECIPE, EPISODES, folder).numbers()) == EPISODES
     finally:

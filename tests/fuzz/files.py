@@ -1,4 +1,4 @@
-"""Mutates description files: a copy of all robots and scenes in which one file is corrupted."""
+"""Corrupts one file at a time in a copy of all robots and scenes."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from .mutate import apply_changes, choose_changes, corrupt
 __all__ = ["DAE", "make_case", "make_document_case", "run", "run_document"]
 
 MESHES = {"stl": "box.stl", "obj": "box.obj", "ply": "box.ply", "dae": "box.dae"}
-PLANNED = 0.02  # the share of what loads that is planned in
+PLANNING_SHARE = 0.02  # share of cases that also plan in the loaded scene
 
 
 @functools.cache
-def make_pool() -> Path:
-    """A copy of robots and scenes, with a mesh of each kind and a scene that has them."""
+def copy_resources() -> Path:
+    """Copy all robots and scenes, and add a mesh of each format and a scene with these meshes."""
     root = Path(tempfile.mkdtemp(prefix="vkc_fuzz_files_"))
     atexit.register(shutil.rmtree, root, ignore_errors=True)
     for kind in ("robots", "scenes"):
@@ -41,83 +41,83 @@ def make_pool() -> Path:
         f"  - {{name: {kind}, type: mesh, file: {name}, position: [{k}, 2.0, 0.5]}}"
         for k, (kind, name) in enumerate(MESHES.items())
     ]
-    shown = "\n".join(entries)
+    obstacles = "\n".join(entries)
     text = (
         "robot: ../robots/husky_ur5e/robot.yaml\nstart: {base: [0, 0, 0]}\n"
         "arena: {x: [-9, 9], y: [-9, 9]}\nobstacles:\n"
     )
-    (root / "scenes" / "meshes.yaml").write_text(f"{text}{shown}\n", encoding="utf-8")
+    (root / "scenes" / "meshes.yaml").write_text(f"{text}{obstacles}\n", encoding="utf-8")
     return root
 
 
 @functools.cache
 def _list_files() -> tuple[str, ...]:
-    found = [
+    files = [
         path
-        for path in sorted(make_pool().rglob("*"))
+        for path in sorted(copy_resources().rglob("*"))
         if path.suffix in (".yaml", ".urdf", ".srdf", ".stl", ".obj", ".ply", ".dae")
     ]
-    return tuple(str(path.relative_to(make_pool())) for path in found)
+    return tuple(str(path.relative_to(copy_resources())) for path in files)
 
 
 def make_case(rng: random.Random) -> dict[str, Any]:
     """Return a case: a file and its new contents."""
     name = rng.choice(_list_files())
-    if name.endswith(".stl") and rng.random() < 0.7:  # there are many
+    if name.endswith(".stl") and rng.random() < 0.7:  # most files are STL meshes
         name = rng.choice([other for other in _list_files() if not other.endswith(".stl")])
-    data = corrupt(rng, (make_pool() / name).read_bytes())
-    return {"file": name, "content": data.decode("latin-1"), "plan": rng.random() < PLANNED}
+    data = corrupt(rng, (copy_resources() / name).read_bytes())
+    return {"file": name, "content": data.decode("latin-1"), "plan": rng.random() < PLANNING_SHARE}
 
 
-def run(given: dict[str, Any]) -> str:
-    """Load and use the scene or robot that a file belongs to."""
-    file = make_pool() / given["file"]
-    kept = file.read_bytes() if file.is_file() else None
+def run(case: dict[str, Any]) -> str:
+    """Load and check the scene or robot to which the corrupted file belongs."""
+    file = copy_resources() / case["file"]
+    original = file.read_bytes() if file.is_file() else None
     file.parent.mkdir(parents=True, exist_ok=True)
     try:
-        file.write_bytes(given["content"].encode("latin-1"))
-        return _use(_load(file), planned=given.get("plan", False))
+        file.write_bytes(case["content"].encode("latin-1"))
+        return _check(_load(file), with_plan=case.get("plan", False))
     finally:
-        if kept is None:
+        if original is None:
             file.unlink()
         else:
-            file.write_bytes(kept)
+            file.write_bytes(original)
 
 
 def _load(file: Path) -> vkc.Scene:
-    scenes, robot = make_pool() / "scenes", "../robots/husky_ur5e/robot.yaml"
-    bare: dict[str, Any] = {
+    scenes, robot = copy_resources() / "scenes", "../robots/husky_ur5e/robot.yaml"
+    base: dict[str, Any] = {
         "robot": "husky_ur5e",
         "start": {"base": [0, 0, 0]},
         "arena": {"x": [-9, 9], "y": [-9, 9]},
     }
-    where = file.relative_to(make_pool()).parts
-    if where[0] == "robots":
+    parts = file.relative_to(copy_resources()).parts
+    if parts[0] == "robots":
         vkc.load_robot(
             file if file.suffix in (".yaml", ".urdf") else file.parent / "husky_ur5e.urdf"
         )
-        return vkc.Scene.from_document({**bare, "robot": robot}, scenes)
-    if where[1] == "objects":
+        return vkc.Scene.from_document({**base, "robot": robot}, scenes)
+    if parts[1] == "objects":
         file = file.with_suffix(".yaml")
         vkc.load_object(file)
         entry = {"name": "thing", "type": f"objects/{file.name}", "position": [3.0, 0.0, 0.5]}
-        return vkc.Scene.from_document({**bare, "objects": [entry]}, scenes)
-    if where[1] == "furniture":
+        return vkc.Scene.from_document({**base, "objects": [entry]}, scenes)
+    if parts[1] == "furniture":
         entry = {
             "name": "thing",
             "type": "urdf",
             "file": f"furniture/{file.name}",
             "position": [3.0, 0.0, 0.0],
         }
-        return vkc.Scene.from_document({**bare, "obstacles": [entry]}, scenes)
+        return vkc.Scene.from_document({**base, "obstacles": [entry]}, scenes)
     return vkc.load_scene(file if file.suffix == ".yaml" else scenes / "meshes.yaml")
 
 
-def _use(scene: vkc.Scene, *, planned: bool) -> str:
-    assert not np.isnan(scene.start_clearance()), "a clearance that is no number"
+def _check(scene: vkc.Scene, *, with_plan: bool) -> str:
+    assert not np.isnan(scene.start_clearance()), "the clearance is not a number"
     repr(scene)
     vkc.Scene.from_document(scene.document, scene.folder)
-    if not planned:
+    if not with_plan:
         return "loaded"
     steps: list[Any] = [vkc.GoTo(float(scene.start[0]), float(scene.start[1]), 0.5)]
     for name, placed in scene.objects.items():
@@ -143,16 +143,16 @@ def make_document_case(rng: random.Random) -> dict[str, Any]:
     return {
         "scene": name,
         "changes": choose_changes(rng, _load_documents()[name], values),
-        "plan": rng.random() < PLANNED,
+        "plan": rng.random() < PLANNING_SHARE,
     }
 
 
-def run_document(given: dict[str, Any]) -> str:
-    """Build the scene from its description, and use it."""
-    document = apply_changes(_load_documents()[given["scene"]], given["changes"])
-    return _use(
+def run_document(case: dict[str, Any]) -> str:
+    """Load and check a scene from its changed description."""
+    document = apply_changes(_load_documents()[case["scene"]], case["changes"])
+    return _check(
         vkc.Scene.from_document(document, find_resource_folder("scenes")),
-        planned=given.get("plan", False),
+        with_plan=case.get("plan", False),
     )
 
 

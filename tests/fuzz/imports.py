@@ -1,4 +1,4 @@
-"""Makes hostile SDF, MJCF, URDF, xacro and mesh files, and imports them."""
+"""Imports corrupted SDF, MJCF, URDF, xacro and mesh files."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from .mutate import corrupt
 __all__ = ["FILES", "make_case", "make_neighbor_files", "run"]
 
 OTHER_XACRO = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><material name="m"/></robot>'
-IMPORTED = 0.1  # the share of cases that are imported as a whole; the others are only read
+IMPORT_SHARE = 0.1  # share of cases that are imported; the others are only read
 _NAMED = re.compile(r'(?<=name=")[^"]*(?=")')
 _TEXTS = """ |.|..|../../evil|/etc/evil|a/b|a\\b|con|CON|nul.txt|-rf|~|é|ü|кухня|柜子|🚪
 á|&#8238;evil|&#8232;|&#133;|&#10;free: true|&#13;&#10;|&#9;|&quot;/&gt;&lt;link name=&quot;x
 &amp;|&lt;|'|{x: 1}|- a|# a|: |!!python/object:os.system|null|true|1|1e5|.nan|%s|{0}|$(find x)
 ${1/0}|world|__model__|tool|floor|base"""
 NAMES = ("", *_TEXTS.replace("\n", "|").split("|"), "x" * 64, "x" * 255, "é" * 200, "x" * 70_000)
-"""Names as they are written in an attribute."""
+"""Names, escaped as in an XML attribute."""
 FILES = {
     path.name: path.read_text(encoding="utf-8")
     for path in sorted(Path(__file__).with_name("inputs").iterdir())
@@ -42,16 +42,16 @@ FILES = {
 def make_neighbor_files() -> dict[str, bytes]:
     """Return the files beside those of `FILES`, by name."""
     box = trimesh.creation.box((0.05, 0.05, 0.2))
-    found = {f"part.{kind}": box.export(file_type=kind) for kind in ("stl", "obj")}
-    found["part.dae"] = DAE
-    found["other.xacro"] = OTHER_XACRO
+    contents = {f"part.{kind}": box.export(file_type=kind) for kind in ("stl", "obj")}
+    contents["part.dae"] = DAE
+    contents["other.xacro"] = OTHER_XACRO
     return {
-        name: text if isinstance(text, bytes) else text.encode() for name, text in found.items()
+        name: text if isinstance(text, bytes) else text.encode() for name, text in contents.items()
     }
 
 
 def make_case(rng: random.Random) -> dict[str, Any]:
-    """Return a case: a file, and files beside it, of which one is changed."""
+    """Return a case: a file and its neighbors, one of which is changed."""
     name = rng.choice(tuple(FILES))
     files = {name: FILES[name].encode(), **make_neighbor_files()}
     file_name = name
@@ -59,7 +59,7 @@ def make_case(rng: random.Random) -> dict[str, Any]:
         case 0 | 1 | 2:
             files[name] = corrupt(rng, files[name])
         case 3:
-            other = rng.choice([one for one in files if one != name])
+            other = rng.choice([neighbor for neighbor in files if neighbor != name])
             files[other] = corrupt(rng, files[other])
         case 4 | 5:
             files[name] = _rename(rng, FILES[name]).encode("utf-8", "replace")
@@ -70,17 +70,17 @@ def make_case(rng: random.Random) -> dict[str, Any]:
             file_name += Path(name).suffix
             files[file_name] = files.pop(name)
         case _:
-            files[name] = _nest(rng, FILES[name]).encode()
+            files[name] = _multiply_element(rng, FILES[name]).encode()
     return {
         "file": file_name,
         "kind": Path(name).stem,
         "content": {key: data.decode("latin-1") for key, data in files.items()},
-        "plan": rng.random() < IMPORTED,
+        "plan": rng.random() < IMPORT_SHARE,
     }
 
 
 def _rename(rng: random.Random, text: str) -> str:
-    """Give an element, everywhere it is named, another name."""
+    """Rename one or two elements wherever their names occur."""
     names = sorted(set(_NAMED.findall(text)))
     for old in rng.sample(names, min(len(names), rng.choice((1, 1, 2)))):
         new = rng.choice((*NAMES, *names))
@@ -89,8 +89,8 @@ def _rename(rng: random.Random, text: str) -> str:
     return text
 
 
-def _nest(rng: random.Random, text: str) -> str:
-    """Put an element into itself many times, or beside itself."""
+def _multiply_element(rng: random.Random, text: str) -> str:
+    """Nest or repeat an element many times."""
     match = rng.choice(list(re.finditer(r"<(\w+)[ >]", text)))
     count, tag = rng.choice((50, 600, 5000, 100_000)), match[1]
     if rng.random() < 0.5:
@@ -100,37 +100,37 @@ def _nest(rng: random.Random, text: str) -> str:
     return text[: match.start()] + new + text[match.start() :]
 
 
-def run(given: dict[str, Any]) -> str:
-    """Read the file, or import it as a whole; nothing may be written beside the target."""
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place, "files")
+def run(case: dict[str, Any]) -> str:
+    """Read or import the file, and check that nothing is written outside the target folder."""
+    with tempfile.TemporaryDirectory() as root:
+        folder = Path(root, "files")
         folder.mkdir()
-        for name, text in given["content"].items():
+        for name, text in case["content"].items():
             (folder / name).write_bytes(text.encode("latin-1"))
-        before = _list_files(Path(place))
+        before = _list_files(Path(root))
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                return _import(folder / given["file"], given["kind"], Path(place), given["plan"])
+                return _import(folder / case["file"], case["kind"], Path(root), case["plan"])
         finally:
-            new = _list_files(Path(place)) - before
+            new = _list_files(Path(root)) - before
             assert all(name.startswith(("out/", "scratch/")) for name in new), sorted(new)
-            assert not any(name.startswith(".") for name in os.listdir(place)), os.listdir(place)  # noqa: PTH208
+            assert not any(name.startswith(".") for name in os.listdir(root)), os.listdir(root)  # noqa: PTH208
 
 
-def _import(file: Path, kind: str, place: Path, whole: bool) -> str:
+def _import(file: Path, kind: str, root: Path, complete: bool) -> str:
     if kind == "robot":
-        if whole:
-            import_robot(file, place / "out", samples=100, most_pieces=1)
+        if complete:
+            import_robot(file, root / "out", samples=100, most_pieces=1)
         else:
-            read_source(file, place / "scratch", packages={}, arguments={})
-    elif not whole:
+            read_source(file, root / "scratch", packages={}, arguments={})
+    elif not complete:
         rename_for_scenes(read_description(file, free=True))
     elif file.suffix == ".xml":
-        import_home(file, place / "out", most=1)
+        import_home(file, root / "out", most=1)
     else:
-        import_object(file, place / "out", most=1)
-    return "imported" if whole else "loaded"
+        import_object(file, root / "out", most=1)
+    return "imported" if complete else "loaded"
 
 
 def _list_files(folder: Path) -> set[str]:

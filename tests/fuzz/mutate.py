@@ -1,4 +1,4 @@
-"""Changes at random: of text and bytes, and of plain data at places in it."""
+"""Changes text, bytes and plain data at random."""
 
 from __future__ import annotations
 
@@ -51,19 +51,19 @@ _WORDS = (
 )
 
 
-def corrupt(rng: random.Random, data: bytes, most: int = 3) -> bytes:
-    """Return a file's content with one to a few changes."""
-    for _ in range(rng.choice((1, 1, 2, most))):
+def corrupt(rng: random.Random, data: bytes, max_changes: int = 3) -> bytes:
+    """Return the content of a file with one to `max_changes` changes."""
+    for _ in range(rng.choice((1, 1, 2, max_changes))):
         data = rng.choice(_CHANGES)(rng, data)[:2_000_000]
     return data
 
 
 def _flip(rng: random.Random, data: bytes) -> bytes:
-    found = bytearray(data)
+    changed = bytearray(data)
     for _ in range(rng.choice((1, 1, 2, 8, 64))):
-        if found:
-            found[rng.randrange(len(found))] = rng.randrange(256)
-    return bytes(found)
+        if changed:
+            changed[rng.randrange(len(changed))] = rng.randrange(256)
+    return bytes(changed)
 
 
 def _cut(rng: random.Random, data: bytes) -> bytes:
@@ -105,16 +105,16 @@ def _change_line(rng: random.Random, data: bytes) -> bytes:
 def _replace(
     rng: random.Random, data: bytes, pattern: re.Pattern[bytes], by: tuple[bytes, ...] = ()
 ) -> bytes:
-    found = list(pattern.finditer(data))
-    if not found:
+    matches = list(pattern.finditer(data))
+    if not matches:
         return _flip(rng, data)
-    match = rng.choice(found)
-    new = rng.choice(by) if by and rng.random() < 0.7 else rng.choice(found)[0]
+    match = rng.choice(matches)
+    new = rng.choice(by) if by and rng.random() < 0.7 else rng.choice(matches)[0]
     return data[: match.start()] + new + data[match.end() :]
 
 
 def _change_number(rng: random.Random, data: bytes) -> bytes:
-    if rng.random() < 0.4:  # another one that may well do
+    if rng.random() < 0.4:  # a plausible number
         return _replace(
             rng,
             data,
@@ -135,10 +135,10 @@ def _change_attribute(rng: random.Random, data: bytes) -> bytes:
 
 
 def _change_tag(rng: random.Random, data: bytes) -> bytes:
-    found = list(_TAG.finditer(data))
-    if not found:
+    matches = list(_TAG.finditer(data))
+    if not matches:
         return _change_word(rng, data)
-    match, other = rng.choice(found), rng.choice(found)
+    match, other = rng.choice(matches), rng.choice(matches)
     new = rng.choice(
         (
             b"",
@@ -206,7 +206,7 @@ _CHANGES = (
 
 
 def iterate_paths(data: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Return the paths of everything in plain data."""
+    """Yield the paths of all values in plain data."""
     yield path
     if isinstance(data, dict | list):
         for key, value in data.items() if isinstance(data, dict) else enumerate(data):
@@ -216,41 +216,41 @@ def iterate_paths(data: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, 
 def choose_changes(
     rng: random.Random, data: Any, values: tuple[str, ...] = tuple(odd.JSON_VALUES)
 ) -> list[list[Any]]:
-    """Return one to three changes for `changed`: a path, an operation, and a value, key or path."""
-    everywhere = [path for path in iterate_paths(data) if path]
-    made: list[list[Any]] = []
+    """Return one to three changes: a path, an operation, and a value, key or source path."""
+    paths = [path for path in iterate_paths(data) if path]
+    changes: list[list[Any]] = []
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
-        path, what = (
-            rng.choice(everywhere),
+        path, operation = (
+            rng.choice(paths),
             rng.choice(("set", "set", "set", "remove", "rename", "copy", "double")),
         )
-        with_what: Any = rng.choice(values)
-        if what == "copy":
-            with_what = list(rng.choice(everywhere))
-        elif what == "rename":
-            with_what = rng.choice(("x", "", "name", "type", "a.b", "\ud800", "position"))
-        made.append([list(path), what, with_what])
-    return made
+        operand: Any = rng.choice(values)
+        if operation == "copy":
+            operand = list(rng.choice(paths))
+        elif operation == "rename":
+            operand = rng.choice(("x", "", "name", "type", "a.b", "\ud800", "position"))
+        changes.append([list(path), operation, operand])
+    return changes
 
 
 def apply_changes(data: Any, changes: list[list[Any]]) -> Any:
-    """Return a copy of plain data with changes; those whose place is gone by then are left out."""
+    """Return a changed copy of plain data, skipping changes whose path no longer exists."""
     data = copy.deepcopy(data)
-    for path, what, value in changes:
+    for path, operation, value in changes:
         try:
-            around, key = _get_at(data, path[:-1]), path[-1]
-            around[key]
-            if what == "set":
-                around[key] = odd.make_value(value)
-            elif what == "remove":
-                del around[key]
-            elif what == "copy":
-                around[key] = copy.deepcopy(_get_at(data, value))
-            elif what == "rename" and isinstance(around, dict):
-                around[value] = around.pop(key)
-            elif what == "double" and isinstance(around, list):
-                around.insert(key, copy.deepcopy(around[key]))
-        except (LookupError, TypeError, ValueError):  # the last: of what became an array
+            parent, key = _get_at(data, path[:-1]), path[-1]
+            parent[key]
+            if operation == "set":
+                parent[key] = odd.make_value(value)
+            elif operation == "remove":
+                del parent[key]
+            elif operation == "copy":
+                parent[key] = copy.deepcopy(_get_at(data, value))
+            elif operation == "rename" and isinstance(parent, dict):
+                parent[value] = parent.pop(key)
+            elif operation == "double" and isinstance(parent, list):
+                parent.insert(key, copy.deepcopy(parent[key]))
+        except (LookupError, TypeError, ValueError):  # ValueError: an array replaced the value
             continue
     return data
 

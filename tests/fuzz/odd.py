@@ -1,4 +1,4 @@
-"""Values that no argument wants, by name, so that a case can be written down and repeated."""
+"""Makes invalid values by name, so that cases can be saved and repeated."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-__all__ = ["JSON_VALUES", "RAISING", "USUAL", "VALUES", "insert_odd", "make_pipe", "make_value"]
+__all__ = ["JSON_VALUES", "RAISING", "USUAL", "VALUES", "insert_value", "make_pipe", "make_value"]
 
 
 @functools.cache
 def make_pipe() -> Path:
     """Return a pipe that nobody reads or writes; real devices could damage the machine."""
-    made = Path(tempfile.mkdtemp())
-    atexit.register(shutil.rmtree, made, ignore_errors=True)
-    os.mkfifo(made / "pipe")
-    return made / "pipe"
+    folder = Path(tempfile.mkdtemp())
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    os.mkfifo(folder / "pipe")
+    return folder / "pipe"
 
 
 class _Hostile:
-    """Says that it is a sequence, a number and a mapping, and raises when it is asked."""
+    """Claims to be a sequence, a number and a mapping, but raises an error on every use."""
 
     def __init__(self, error: type[Exception]) -> None:
         self._error = error
@@ -48,7 +48,7 @@ class _Hostile:
 
 
 class _Endless:
-    """An iterable that never ends, and says that it is short."""
+    """An endless iterable that claims to have three entries."""
 
     def __len__(self) -> int:
         return 3
@@ -59,24 +59,23 @@ class _Endless:
 
 
 def _nest(depth: int) -> list[Any]:
-    made: list[Any] = []
+    nested: list[Any] = []
     for _ in range(depth):
-        made = [made]
-    return made
+        nested = [nested]
+    return nested
 
 
 def _make_recursive_list() -> list[Any]:
-    made: list[Any] = []
-    made.append(made)
-    return made
+    values: list[Any] = []
+    values.append(values)
+    return values
 
 
 def _make_pose(entry: float) -> pin.SE3:
     return pin.SE3(np.full((3, 3), entry), np.full(3, entry))
 
 
-# What JSON, and so a file, can hold. NaN and infinities are among them: Python's own reader takes
-# them.
+# Values that a JSON file can contain, including NaN and infinities, which Python's parser accepts.
 JSON_VALUES: dict[str, Any] = {
     "None": None,
     "True": True,
@@ -196,7 +195,7 @@ _OTHERS: dict[str, Callable[[], Any]] = {
     "rng": lambda: np.random.default_rng(0),
 }
 VALUES: tuple[str, ...] = (*JSON_VALUES, *_OTHERS)
-"""The names of all values."""
+"""Names of all values."""
 
 USUAL = (
     *(
@@ -232,7 +231,7 @@ USUAL = (
         "SE3",
     ),
 )
-"""Names of those that some argument may take."""
+"""Names of values that are valid for some argument."""
 RAISING = (
     "raising function",
     "type",
@@ -244,27 +243,27 @@ RAISING = (
 
 
 def make_value(name: str) -> Any:
-    """Return a new value by its name."""
+    """Return a new copy of a named value."""
     if name in _OTHERS:
         return _OTHERS[name]()
-    found = JSON_VALUES[name]
-    return type(found)(found) if isinstance(found, list | dict) else found
+    value = JSON_VALUES[name]
+    return type(value)(value) if isinstance(value, list | dict) else value
 
 
-def insert_odd(given: Any, odd: Any, at: int) -> Any:
-    """Return a copy of a list or dictionary with one odd entry, or `odd` itself if it is empty."""
-    if isinstance(given, dict) and given:
-        keys = list(given)
-        key = keys[at % len(keys)]
-        if at % 3 == 0 and isinstance(odd, str | int | float | tuple | None):
-            return {**given, odd: given[key]}
-        return {**given, key: odd}
-    if isinstance(given, list | tuple) and len(given):
-        copy = list(given)
-        copy[at % len(copy)] = odd
+def insert_value(container: Any, value: Any, index: int) -> Any:
+    """Return a copy of a container with one entry replaced, or `value` if there is none."""
+    if isinstance(container, dict) and container:
+        keys = list(container)
+        key = keys[index % len(keys)]
+        if index % 3 == 0 and isinstance(value, str | int | float | tuple | None):
+            return {**container, value: container[key]}
+        return {**container, key: value}
+    if isinstance(container, list | tuple) and len(container):
+        copy = list(container)
+        copy[index % len(copy)] = value
         return copy
-    if isinstance(given, np.ndarray) and given.ndim:
-        copy = given.tolist()
-        copy[at % len(copy)] = odd
+    if isinstance(container, np.ndarray) and container.ndim:
+        copy = container.tolist()
+        copy[index % len(copy)] = value
         return copy
-    return odd
+    return value

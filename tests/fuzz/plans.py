@@ -14,7 +14,7 @@ import numpy as np
 import vkc_pin as vkc
 
 from . import odd
-from .calls import get_folder, load_door, make_motion, make_plan
+from .calls import get_folder, load_drawer_scene, make_plan, make_trajectory
 from .mutate import apply_changes, choose_changes
 
 __all__ = ["make_case", "run"]
@@ -24,26 +24,26 @@ ARRAYS = ("times", "positions")
 
 @functools.cache
 def _make_base() -> tuple[dict[str, Any], dict[str, Any]]:
-    """Make a plan with all optional parts: its metadata and arrays."""
+    """Return metadata and arrays of a plan with all optional parts."""
     terms = [
         vkc.Constraint("elbow", lambda s: s.coordinate("elbow_joint"), lower=-3.0),
         vkc.Cost("x", lambda s: s.position("tool0")[0]),
     ]
     steps: list[Any] = [vkc.Actuate("drawer", {"slide": 0.1}), vkc.GoTo(0.1, 0.1)]
-    report = vkc.validate(load_door(), steps, make_motion(), terms=terms)
+    report = vkc.validate(load_drawer_scene(), steps, make_trajectory(), terms=terms)
     planned = make_plan()
     from vkc_pin.world.task.terms import trace_terms
 
     plan = vkc.Plan(
-        load_door(),
+        load_drawer_scene(),
         tuple(steps),
         vkc.Options(),
-        make_motion(),
+        make_trajectory(),
         report,
         "rejected",
         planned.statistics,
         history=planned.history,
-        terms=trace_terms(load_door(), terms),
+        terms=trace_terms(load_drawer_scene(), terms),
     )
     file = plan.save(get_folder() / "base.npz")
     with np.load(file) as archive:
@@ -83,15 +83,15 @@ def make_case(rng: random.Random) -> dict[str, Any]:
             }
 
 
-def _make_content(given: dict[str, Any]) -> bytes:
+def _make_content(case: dict[str, Any]) -> bytes:
     about, arrays = _make_base()
-    if "about" in given:
-        return _write_archive(np.array(json.dumps(apply_changes(about, given["about"]))), arrays)
-    if "array" in given:
+    if "about" in case:
+        return _write_archive(np.array(json.dumps(apply_changes(about, case["about"]))), arrays)
+    if "array" in case:
         parts = {"about": np.array(json.dumps(about)), **arrays}
-        value = odd.make_value(given["odd"])
+        value = odd.make_value(case["odd"])
         try:
-            parts[given["array"]] = np.asarray(value)
+            parts[case["array"]] = np.asarray(value)
             return _write_archive(parts.pop("about"), parts)
         except (
             ValueError,
@@ -99,20 +99,20 @@ def _make_content(given: dict[str, Any]) -> bytes:
             RuntimeError,
             AttributeError,
             RecursionError,
-        ):  # it is no array, and cannot be pickled
+        ):  # not an array, or impossible to pickle
             return b""
     data = _write_archive(np.array(json.dumps(about)), arrays)
-    if "member" in given:
-        return _change_members(data, given["member"], given["does"])
-    if "cut" in given:
-        return data[: given["cut"]]
-    found = bytearray(data)
-    for at, byte in given["bytes"]:
-        found[at % len(found)] = byte
-    return bytes(found)
+    if "member" in case:
+        return _change_members(data, case["member"], case["does"])
+    if "cut" in case:
+        return data[: case["cut"]]
+    changed = bytearray(data)
+    for index, byte in case["bytes"]:
+        changed[index % len(changed)] = byte
+    return bytes(changed)
 
 
-def _change_members(data: bytes, name: str, does: str) -> bytes:
+def _change_members(data: bytes, name: str, action: str) -> bytes:
     buffer = io.BytesIO()
     with (
         zipfile.ZipFile(io.BytesIO(data)) as old,
@@ -121,9 +121,9 @@ def _change_members(data: bytes, name: str, does: str) -> bytes:
         for member in old.namelist():
             content = old.read(member)
             if member == name:
-                if does == "remove":
+                if action == "remove":
                     continue
-                lie = (
+                huge_header = (
                     b"\x93NUMPY\x01\x00v\x00"
                     + b"{'descr': '<f8', 'fortran_order': False, 'shape': (9000000000,), }".ljust(
                         117
@@ -135,20 +135,20 @@ def _change_members(data: bytes, name: str, does: str) -> bytes:
                 content = {
                     "empty": b"",
                     "garbage": content[::-1],
-                    "liar": lie,
+                    "liar": huge_header,
                     "text": b"{}",
                     "deep": nested.getvalue(),
-                }.get(does, content)
+                }.get(action, content)
             new.writestr(member, content)
-            if does == "double" and member == name:
+            if action == "double" and member == name:
                 new.writestr(f"x{member}", content)
     return buffer.getvalue()
 
 
-def run(given: dict[str, Any]) -> str:
-    """Load it, look at it, and check it."""
+def run(case: dict[str, Any]) -> str:
+    """Load, print and validate the corrupted plan."""
     file = get_folder() / "spoiled.npz"
-    file.write_bytes(_make_content(given))
+    file.write_bytes(_make_content(case))
     plan = vkc.Plan.load(file)
     plan.summary()
     json.dumps(plan.to_dict())

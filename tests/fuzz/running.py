@@ -1,4 +1,4 @@
-"""Runs cases in a watched process, so that crashes, hangs and memory use are assigned to a case."""
+"""Runs cases in a worker process, and attributes crashes, hangs and memory use to them."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from typing import Any
 
 __all__ = ["BAD", "KINDS", "Worker", "make_case", "serve"]
 
-SECONDS, MEGABYTES = 2.0, 500.0  # of processor time and memory that a case may take
-PLANNING = 6.0  # seconds more where there is a problem to build, and to plan for its time limit
-HUNG = 40.0  # seconds of the clock after which a case is given up
-FRESH = 1500  # cases after which a new process begins
+SECONDS, MEGABYTES = 2.0, 500.0  # limits of processor time and memory for a case
+PLANNING = 6.0  # additional seconds for cases that build or solve a problem
+TIMEOUT = 40.0  # wall-clock seconds after which a case is aborted
+CASES_PER_PROCESS = 1500
 BAD = ("raw", "slow", "memory", "crashed", "hung")
 TESTS = Path(__file__).resolve().parents[1]
 
@@ -47,7 +47,7 @@ KINDS = {
     **{"files": 0.25, "documents": 0.15, "calls": 0.25, "plans": 0.1},
     **{"imports": 0.1, "datasets": 0.1, "journals": 0.05},
 }
-"""Kind of cases → its share."""
+"""Share of each kind of case."""
 
 
 def make_case(kind: str, seed: int, number: int) -> dict[str, Any]:
@@ -56,7 +56,7 @@ def make_case(kind: str, seed: int, number: int) -> dict[str, Any]:
 
 
 def serve() -> None:
-    """Read cases from standard input, a line each, and print the outcome of each."""
+    """Read cases from standard input, one per line, and print their outcomes."""
     answers = os.fdopen(os.dup(1), "w")
     silent = os.open(os.devnull, os.O_RDWR)
     os.dup2(silent, 1)
@@ -64,23 +64,23 @@ def serve() -> None:
     warnings.simplefilter("ignore")
     kinds = _load_kinds()
     _limit_memory()
-    requests, sys.stdin = sys.stdin, open(os.devnull)  # noqa: SIM115, PTH123 - for as long as the process lives
+    requests, sys.stdin = sys.stdin, open(os.devnull)  # noqa: SIM115, PTH123 - open while the process runs
     for line in requests:
-        asked = json.loads(line)
+        request = json.loads(line)
         case = (
-            asked["case"]
-            if "case" in asked
-            else make_case(asked["kind"], asked["seed"], asked["number"])
+            request["case"]
+            if "case" in request
+            else make_case(request["kind"], request["seed"], request["number"])
         )
-        if asked.get("only") == "make":
+        if request.get("only") == "make":
             answers.write(json.dumps({"case": case}) + "\n")
         else:
-            answers.write(json.dumps(_run(kinds[asked["kind"]][1], case)) + "\n")
+            answers.write(json.dumps(_run(kinds[request["kind"]][1], case)) + "\n")
         answers.flush()
 
 
 def _limit_memory() -> None:
-    """Let an allocation fail that is far too large, before the machine has to find room for it."""
+    """Limit the address space, so that excessive allocations fail at once."""
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
     resource.setrlimit(
         resource.RLIMIT_AS, (pages * resource.getpagesize() + 6 * 2**30, resource.RLIM_INFINITY)
@@ -94,30 +94,30 @@ def _read_memory(name: str) -> float:
     )
 
 
-def _run(does: Callable[[dict[str, Any]], str], case: dict[str, Any]) -> dict[str, Any]:
+def _run(function: Callable[[dict[str, Any]], str], case: dict[str, Any]) -> dict[str, Any]:
     from vkc_pin.errors import VkcError
 
-    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak begins anew
-    before, began, error = _read_memory("VmRSS"), time.process_time(), ""
+    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # resets the peak
+    before, start, error = _read_memory("VmRSS"), time.process_time(), ""
     try:
-        outcome = does(case)
-    except VkcError as refusal:
-        outcome, error = "refused", str(refusal)[:300]
-        if len(text := str(refusal)) > 4000 or not text.strip():
+        outcome = function(case)
+    except VkcError as rejection:
+        outcome, error = "refused", str(rejection)[:300]
+        if len(text := str(rejection)) > 4000 or not text.strip():
             outcome, error = "raw", f"a message of {len(text)} characters: {text[:200]}"
-    except BaseException as raised:
+    except BaseException as exception:
         frames = [
             frame
-            for frame in traceback.extract_tb(raised.__traceback__)
+            for frame in traceback.extract_tb(exception.__traceback__)
             if "/vkc_pin/" in frame.filename
         ]
-        where = (
+        line = (
             f"{frames[-1].filename.rpartition('/vkc_pin/')[2]}:{frames[-1].lineno}"
             if frames
             else "the call"
         )
-        outcome, error = "raw", f"{type(raised).__name__} in {where}: {str(raised)[:200]!a}"
-    seconds, grown = time.process_time() - began, _read_memory("VmHWM") - before
+        outcome, error = "raw", f"{type(exception).__name__} in {line}: {str(exception)[:200]!a}"
+    seconds, grown = time.process_time() - start, _read_memory("VmHWM") - before
     if outcome != "raw" and seconds > SECONDS + PLANNING * _is_planning(case):
         outcome, error = "slow", f"{seconds:.1f} s"
     if outcome != "raw" and grown > MEGABYTES:
@@ -144,15 +144,15 @@ def _is_planning(case: dict[str, Any]) -> bool:
 
 
 class Worker:
-    """A process that runs cases, and is begun anew when one of them ends it."""
+    """A process that runs cases, and is restarted after a crash or a hang."""
 
-    def __init__(self, hung: float = HUNG) -> None:
+    def __init__(self, timeout: float = TIMEOUT) -> None:
         self.process: subprocess.Popen[bytes] | None = None
-        self.count, self.hung = 0, hung
+        self.count, self.timeout = 0, timeout
 
-    def run(self, **asked: Any) -> dict[str, Any]:
+    def run(self, **request: Any) -> dict[str, Any]:
         """Return the outcome of a case, its error if any, and its time and memory."""
-        if self.process is None or self.count >= FRESH:
+        if self.process is None or self.count >= CASES_PER_PROCESS:
             self.close()
             self.folder = tempfile.TemporaryDirectory(prefix="vkc_fuzz_")
             code = (
@@ -181,33 +181,34 @@ class Worker:
         assert process.stdin is not None
         assert process.stdout is not None
         try:
-            process.stdin.write(json.dumps(asked).encode("ascii") + b"\n")
+            process.stdin.write(json.dumps(request).encode("ascii") + b"\n")
             process.stdin.flush()
-            if not select.select([process.stdout], [], [], self.hung + 60.0 * (self.count == 1))[0]:
+            limit = self.timeout + 60.0 * (self.count == 1)
+            if not select.select([process.stdout], [], [], limit)[0]:
                 self.close()
                 return {
                     "outcome": "hung",
-                    "error": f"no answer in {self.hung:g} s",
-                    "seconds": self.hung,
+                    "error": f"no answer in {self.timeout:g} s",
+                    "seconds": self.timeout,
                     "grown": 0.0,
                 }
             line = process.stdout.readline()
         except BrokenPipeError:
             line = b""
         if not line:
-            code_ = process.wait()
+            exit_code = process.wait()
             self.close()
             return {
                 "outcome": "crashed",
-                "error": f"the interpreter ended with {code_}",
+                "error": f"the interpreter exited with {exit_code}",
                 "seconds": 0.0,
                 "grown": 0.0,
             }
-        found: dict[str, Any] = json.loads(line)
-        return found
+        result: dict[str, Any] = json.loads(line)
+        return result
 
     def close(self) -> None:
-        """End the process."""
+        """Kill the process."""
         if self.process is not None:
             self.process.kill()
             self.process.communicate()

@@ -1,4 +1,4 @@
-"""Random input gives a result or an error of the package, in little time and memory."""
+"""Tests that random input yields results or errors of the package within time and memory limits."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ import pytest
 from fuzz.running import BAD, KINDS, Worker
 
 CORPUS = sorted((Path(__file__).parent / "corpus").glob("*.json"))
-FRESH = int(os.environ.get("FUZZ_SEED", random.SystemRandom().randrange(10**6)))
-CASES = {1: 60, FRESH: 40}
+NEW_SEED = int(os.environ.get("FUZZ_SEED", random.SystemRandom().randrange(10**6)))
+CASES = {1: 60, NEW_SEED: 40}
 """Random seed → number of cases of all kinds."""
 
 
 @pytest.fixture(scope="module")
 def worker() -> Iterator[Worker]:
     """Yield the process that runs the cases."""
-    made = Worker()
-    yield made
-    made.close()
+    process = Worker()
+    yield process
+    process.close()
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", CASES, ids=["fixed", "fresh"])
 def test_random_input_yields_a_result_or_an_error(worker: Worker, kind: str, seed: int) -> None:
-    bad = []
+    failures = []
     for number in range(round(CASES[seed] * KINDS[kind])):
-        found = worker.run(kind=kind, seed=seed, number=number)
-        if found["outcome"] in BAD:
+        result = worker.run(kind=kind, seed=seed, number=number)
+        if result["outcome"] in BAD:
             show = f"python -m tests.fuzz --kind {kind} --seed {seed} --show {number}"
-            bad.append(f"{found['outcome']}, {found['error']}: {show}")
-    assert not bad, "\n".join(bad)
+            failures.append(f"{result['outcome']}, {result['error']}: {show}")
+    assert not failures, "\n".join(failures)
 
 
 @pytest.mark.parametrize("file", CORPUS, ids=[file.stem for file in CORPUS])
 def test_past_failures_yield_a_result_or_an_error(worker: Worker, file: Path) -> None:
-    kept = json.loads(file.read_text(encoding="ascii"))
-    found = worker.run(kind=kept["kind"], case=kept["case"])
-    assert found["outcome"] not in BAD, (
-        f"{found['outcome']}, {found['error']}; before: {kept['was']}"
+    record = json.loads(file.read_text(encoding="ascii"))
+    result = worker.run(kind=record["kind"], case=record["case"])
+    assert result["outcome"] not in BAD, (
+        f"{result['outcome']}, {result['error']}; before: {record['was']}"
     )
 
 
@@ -63,7 +63,7 @@ def test_valid_input_yields_a_result(worker: Worker) -> None:
     ]
     names += ["robots/husky_ur5e/husky_ur5e.srdf", "scenes/box.dae"]
     for name in names:
-        content = (files.make_pool() / name).read_bytes().decode("latin-1")
+        content = (files.copy_resources() / name).read_bytes().decode("latin-1")
         cases.append(
             ("files", {"file": name, "content": content, "plan": name == "scenes/door.yaml"})
         )
@@ -77,9 +77,9 @@ def test_valid_input_yields_a_result(worker: Worker) -> None:
             ("imports", {"file": name, "kind": Path(name).stem, "content": content, "plan": False})
         )
     cases += [("datasets", {"changes": [], "plan": True}), ("journals", {"line": 0, "changes": []})]
-    wrong = []
+    failures = []
     for kind, case in cases:
-        found = worker.run(kind=kind, case=case)
-        if found["outcome"] not in ("done", "loaded", "made", "planned"):
-            wrong.append((kind, {**case, "content": ""}, found))
-    assert wrong == []
+        result = worker.run(kind=kind, case=case)
+        if result["outcome"] not in ("done", "loaded", "planned"):
+            failures.append((kind, {**case, "content": ""}, result))
+    assert failures == []

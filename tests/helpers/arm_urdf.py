@@ -6,7 +6,7 @@ from pathlib import Path
 
 __all__ = ["HEIGHT", "set_limits", "write_arms"]
 
-HEIGHT = 0.35  # [m] of the root above the floor
+HEIGHT = 0.35  # height of the root above the floor [m]
 
 
 def _format_link(name: str, size: str = "", at: str = "0 0 0", mesh: str = "") -> str:
@@ -37,7 +37,7 @@ def _format_joint(
 
 
 def set_limits(urdf: str, joint: str, lower: float, upper: float) -> str:
-    """Return a URDF with other limits of a joint, which have been -2 and 2."""
+    """Return the URDF with the limits -2 and 2 of a joint replaced."""
     head, name, tail = urdf.partition(f'<joint name="{joint}"')
     limits = f'lower="{lower}" upper="{upper}"'
     return head + name + tail.replace('lower="-2" upper="2"', limits, 1)
@@ -48,14 +48,14 @@ def write_arms(
 ) -> Path:
     """Write robot.urdf into a folder and return it.
 
-    The root stands `HEIGHT` above the floor, arms point up at 0; fingers close along y of the hand,
-    which points along z, and open from 0 to 80 mm between their faces.
+    The root is `HEIGHT` above the floor, and arms point up at 0. The hand points along its z axis;
+    fingers close along its y axis and open from 0 to 80 mm between their faces.
 
     Args:
-        folder: Where.
-        sides: A prefix of names for each arm: ("",), or ("left_", "right_").
-        own_base: Put joints below the root by which the robot drives.
-        mesh: A file for the shape of the base, instead of a box.
+        folder: Output folder.
+        sides: Name prefix of each arm: ("",), or ("left_", "right_").
+        own_base: Whether the URDF has joints that drive the base.
+        mesh: Mesh file of the base. Default: a box.
     """
     parts = []
     if own_base:

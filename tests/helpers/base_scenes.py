@@ -1,4 +1,4 @@
-"""Scenes for a mobile base, and what coal says about its poses, asked for every pair of shapes."""
+"""Makes scenes for a mobile base, and computes its clearance by coal without culling."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from vkc_pin.world.files.meshes import make_convex_hull
 
 HALL = (-5.0, 5.0, -5.0, 5.0)
 MARGIN = 0.02
-# [m] by which a motion may come closer than its margin between two questions, and rounding
-BLINK = 1.1e-3
+# tolerated shortfall of the margin between two checked poses, with rounding [m]
+MARGIN_TOLERANCE = 1.1e-3
 
 
 def make_pose(x: float, y: float, z: float, yaw: float = 0.0) -> pin.SE3:
@@ -32,8 +32,8 @@ def make_arm_shapes() -> list[Shape]:
     shapes = []
     for k in range(10):
         x, y, z = rng.uniform([-0.2, -0.3, 0.5], [0.5, 0.3, 1.0])
-        turned = pin.SE3(pin.utils.rotate("y", rng.uniform(0.0, np.pi)), np.array([x, y, z]))
-        shapes.append((coal.Capsule(0.05, 0.25) if k % 2 else coal.Box(0.1, 0.1, 0.3), turned))
+        placement = pin.SE3(pin.utils.rotate("y", rng.uniform(0.0, np.pi)), np.array([x, y, z]))
+        shapes.append((coal.Capsule(0.05, 0.25) if k % 2 else coal.Box(0.1, 0.1, 0.3), placement))
     return shapes
 
 
@@ -60,7 +60,7 @@ def make_furniture() -> list[Shape]:
 
 
 def make_clutter(seed: int, count: int, *, reach: float = 4.5) -> list[Shape]:
-    """Boxes, cylinders, spheres, and lying capsules at random."""
+    """Return random boxes, cylinders, spheres and lying capsules."""
     rng = np.random.default_rng(seed)
     shapes: list[Shape] = []
     for k in range(count):
@@ -90,17 +90,17 @@ def make_clutter(seed: int, count: int, *, reach: float = 4.5) -> list[Shape]:
 def compute_distance(
     shapes: Sequence[Shape], standing: Sequence[Shape], pose: Sequence[float]
 ) -> float:
-    """Return coal's smallest distance [m] of shapes on a base at (x, y, yaw) to fixed shapes."""
+    """Return coal's smallest distance of a base at (x, y, yaw) to fixed shapes [m]."""
     base = make_pose(pose[0], pose[1], 0.0, pose[2])
     nearest = np.inf
     for shape, placement in shapes:
-        where = _transform(base * placement)
-        for other, there in standing:
+        transform = _transform(base * placement)
+        for other, other_placement in standing:
             found = coal.distance(
                 shape,
-                where,
+                transform,
                 other,
-                _transform(there),
+                _transform(other_placement),
                 coal.DistanceRequest(),
                 coal.DistanceResult(),
             )
@@ -111,7 +111,7 @@ def compute_distance(
 def interpolate_poses(
     a: Sequence[float], b: Sequence[float], *, length: float = 0.01, angle: float = 0.02
 ) -> NDArray[np.float64]:
-    """Return poses on the straight line between two, at most a step [m], [rad] apart; (N, 3)."""
+    """Return poses from `a` to `b`, at most `length` [m] and `angle` [rad] apart, shape (N, 3)."""
     change = np.subtract(b, a)
     count = 2 + int(max(np.hypot(change[0], change[1]) / length, abs(change[2]) / angle))
     return np.linspace(a, b, count)

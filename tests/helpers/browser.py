@@ -1,4 +1,4 @@
-"""Headless Chromium for tests and for the pictures in the documentation."""
+"""Runs headless Chromium for tests and for the pictures of the documentation."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ def read_document(
     until: str = READY,
     budgets: tuple[float, ...] = (6.0, 20.0, 60.0),
 ) -> str:
-    """Return the page's elements as they are once its scripts have run.
+    """Return the DOM of a page after its scripts have run.
 
-    Chromium's virtual clock does not wait for what other threads unpack. On a busy machine it can
-    run out before the page is there; then, as long as the text lacks `until`, the page is opened
-    again with the next of `budgets` [s].
+    Chromium's virtual clock does not wait for other threads. On a busy machine the budget can end
+    before the page is complete. While the text lacks `until`, the page is opened again with the
+    next of `budgets` [s].
     """
     text = ""
     for budget in budgets:
@@ -68,10 +68,10 @@ def _run(page: Path, time: float | None, budget: float, *options: str) -> str:
     assert CHROMIUM is not None, "Chromium is not installed"
     address = page.resolve().as_uri() + ("" if time is None else f"#t={time}")
     with tempfile.TemporaryDirectory() as profile:
-        own = (f"--user-data-dir={profile}", f"--virtual-time-budget={1000 * budget:.0f}")
-        command = [CHROMIUM, *FLAGS, *own, *options, address]
+        arguments = (f"--user-data-dir={profile}", f"--virtual-time-budget={1000 * budget:.0f}")
+        command = [CHROMIUM, *FLAGS, *arguments, *options, address]
         run = partial(subprocess.run, command, capture_output=True, text=True, check=True)
         try:
             return str(run(timeout=40).stdout)
-        except subprocess.TimeoutExpired:  # on a busy machine, its virtual clock may stand still
+        except subprocess.TimeoutExpired:  # the virtual clock may stall on a busy machine
             return str(run(timeout=120).stdout)

@@ -1,4 +1,4 @@
-"""A stick on a table, a ball on a stand, and motions with them in the hand that nobody planned."""
+"""Makes scenes with a stick and a ball, and unplanned motions that carry them."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 STICK = pin.SE3(
     np.eye(3), np.array([0.8, 0.0, 0.55])
-)  # along y, its tip to the left; its discs stand 0.05 below
-TOP = 0.5  # [m] of the table
+)  # along y, its tip to the left; its discs reach 0.05 m below it
+TOP = 0.5  # height of the table [m]
 BALL = pin.SE3(
     np.eye(3), np.array([0.8, 0.285, 0.7])
-)  # where the tip touches it when the stick is held at this height
+)  # touched by the tip of a stick grasped at this height
 GUESS = np.array(
     [0.0, 0.0, 0.0, 0.07, -1.69, -1.39, -1.63, 1.57, -1.5]
-)  # the hand above the table, looking down
+)  # the hand above the table, pointing down
 UP = np.array([0.0, 0.0, 0.2])
 FREE = {"stick": STICK, "ball": BALL}
 
@@ -42,7 +42,7 @@ def describe_table(*, gap: float = 1e-3) -> dict[str, Any]:
 
 
 def describe_stand(name: str = "stand", *, aside: float = 0.0, gap: float = 1e-3) -> dict[str, Any]:
-    """Return a post under the ball, or `aside` [m] along y from it, its top `gap` below it."""
+    """Return a post `gap` [m] below the ball, shifted by `aside` [m] along y."""
     return describe_box(name, [0.06, 0.06, 0.5], [0.8, 0.285 + aside, 0.665 - gap - 0.25])
 
 
@@ -74,7 +74,7 @@ def compute_grasp_pose(
     attachment: str = "grip",
     values: Sequence[float] = (0.0, 0.0),
 ) -> pin.SE3:
-    """Return, by definition, the hand's pose that grasps a one-link object at `object_at`."""
+    """Return the pose of the hand that grasps a one-link object at `object_at`, by definition."""
     grasp = load_object(name).attachment(attachment)
     return (
         object_at
@@ -85,7 +85,7 @@ def compute_grasp_pose(
 
 
 def compute_freedom(attachment: str, values: Sequence[float]) -> pin.SE3:
-    """Return J(v) of the attachments of stick and ball, from their files."""
+    """Return the freedom J(v) of an attachment of stick or ball, from their files."""
     if attachment == "end":
         return pin.SE3.Identity()
     if len(values) == 2:  # slides along −y, and turns about it
@@ -98,9 +98,9 @@ def compute_freedom(attachment: str, values: Sequence[float]) -> pin.SE3:
 
 
 def solve_reach(tool: pin.SE3, guess: np.ndarray = GUESS) -> np.ndarray:
-    """Return robot coordinates, shape (9,), that reach `tool`, near `guess` and with its base.
+    """Return robot coordinates that reach `tool`, shape (9,), with the base of `guess`.
 
-    Newton steps on numeric Pinocchio, from `guess` and then from around it.
+    Newton's method on numeric Pinocchio starts at `guess`, then at random points around it.
     """
     robot, rng = make_hall().robot, np.random.default_rng(0)
     model, data = robot.model, robot.model.createData()
@@ -136,12 +136,12 @@ def solve_above(stick: pin.SE3, **grasp: Any) -> np.ndarray:
 
 
 @dataclasses.dataclass
-class Script:
+class MotionBuilder:
     """Builds a motion from grasps and robot configurations.
 
     Attributes:
-        scene: Where it happens; it begins at the scene's start.
-        values: Coordinate of a grasp → value, from the first waypoint to the last.
+        scene: Scene of the motion, which begins at the scene's start.
+        values: Grasp coordinate → value, constant along the motion.
     """
 
     scene: Scene
@@ -159,18 +159,18 @@ class Script:
         grasp = self.scene.objects[name].object.attachment(attachment)
         self.values |= {f"{name}.{c}": v for c, v in zip(grasp.coordinates, values, strict=True)}
 
-    def go(self, row: np.ndarray, *, steps: int = 20) -> Script:
-        """Go there from rest to rest."""
-        share = np.linspace(0.0, 1.0, steps + 1)[1:, None]
-        smooth, before = share**2 * (3.0 - 2.0 * share), self.rows[-1]
+    def go(self, row: np.ndarray, *, steps: int = 20) -> MotionBuilder:
+        """Move to `row` from rest to rest."""
+        fraction = np.linspace(0.0, 1.0, steps + 1)[1:, None]
+        smooth, before = fraction**2 * (3.0 - 2.0 * fraction), self.rows[-1]
         first = len(self.rows) - 1
         self.rows += list(before + smooth * (row - before))
         holds = make_holds(self.held, self.by)
         self.phases.append(PhaseSpan(f"phase {len(self.phases)}", first, len(self.rows) - 1, holds))
         return self
 
-    def wait(self) -> Script:
-        """Stand still for two steps."""
+    def wait(self) -> MotionBuilder:
+        """Rest for two steps."""
         return self.go(self.rows[-1], steps=2)
 
     def take(
@@ -179,23 +179,23 @@ class Script:
         attachment: str = "grip",
         values: Sequence[float] = (0.0, 0.0),
         by: str | None = None,
-    ) -> Script:
-        """Close the hand, or whatever `by` is."""
+    ) -> MotionBuilder:
+        """Grasp an object with the hand, or with the frame `by`."""
         self.held[name] = attachment
         if by is not None:
             self.by[name] = by
         self._set(name, attachment, values)
         return self
 
-    def let_go(self, *names: str) -> Script:
-        """Let go of some, or of all."""
+    def let_go(self, *names: str) -> MotionBuilder:
+        """Release the named objects, or all."""
         for name in names or tuple(self.held):
             del self.held[name]
             self.by.pop(name, None)
         return self
 
     def motion(self, *, dt: float = DT, **columns: Sequence[float]) -> Trajectory:
-        """Return the motion; `columns` gives values of grasp coordinates over the waypoints."""
+        """Return the motion; `columns` replaces values of grasp coordinates at all waypoints."""
         robot, shape = self.scene.robot.coordinates.names, len(self.rows)
         extra = [np.full(shape, value) for value in self.values.values()]
         rows = np.column_stack([np.array(self.rows), *extra])
@@ -206,34 +206,34 @@ class Script:
 
 
 def move_base(row: np.ndarray, **values: float) -> np.ndarray:
-    """Return a row with the base further: x, y and yaw by name."""
+    """Return `row` with the base moved by `values` of x, y and yaw."""
     out = np.array(row)
     for name, value in values.items():
         out[("x", "y", "yaw").index(name)] += value
     return out
 
 
-def carry_over(
+def make_carrying_motion(
     scene: Scene,
     *,
     aside: float = 0.5,
     values: Sequence[float] = (0.0, 0.0),
     off: pin.SE3 | None = None,
-) -> Script:
+) -> MotionBuilder:
     """Take the stick from the table, move it `aside` [m] along y, put it down and retreat.
 
-    With `off` the hand closes that far beside the attachment, in the tool's frame.
+    `off` displaces the hand from the attachment, in the tool's frame.
     """
     off = pin.SE3.Identity() if off is None else off
     up = solve_reach(compute_grasp_pose(lift(STICK), values=values) * off, _make_guess_above())
     down = solve_reach(compute_grasp_pose(STICK, values=values) * off, up)
-    script = Script(scene).go(up).go(down).take("stick", values=values).go(up)
+    script = MotionBuilder(scene).go(up).go(down).take("stick", values=values).go(up)
     script.go(move_base(up, y=aside)).go(move_base(down, y=aside)).let_go()
     return script.go(move_base(up, y=aside))
 
 
 def place_object(scene: Scene, name: str, placement: pin.SE3) -> Scene:
-    """Return the scene with a free object elsewhere."""
+    """Return the scene with a free object at `placement`."""
     placed: PlacedObject = dataclasses.replace(scene.objects[name], placement=placement)
     return dataclasses.replace(scene, objects={**scene.objects, name: placed})
 

@@ -12,19 +12,23 @@ from vkc_pin.world.scene.scene import Scene
 
 
 def describe_random_obstacles(seed: int, count: int) -> list[dict[str, Any]]:
-    """Return `count` random obstacles: near and far, from 1 cm to 3 m, turned anyhow."""
+    """Return `count` random obstacles of 1 cm to 3 m, near and far, partly rotated."""
     rng, obstacles = np.random.default_rng(seed), []
     for number in range(count):
         size = (10.0 ** rng.uniform(-2.0, 0.5, 3)).tolist()
-        thing: dict[str, Any] = {
+        obstacle: dict[str, Any] = {
             "name": f"thing_{number}",
             "position": rng.uniform([-3.0, -3.0, 0.0], [5.0, 3.0, 2.0]).tolist(),
         }
-        thing["rpy"] = (rng.uniform(-np.pi, np.pi, 3) * rng.choice([0.0, 1.0], 3)).tolist()
+        obstacle["rpy"] = (rng.uniform(-np.pi, np.pi, 3) * rng.choice([0.0, 1.0], 3)).tolist()
         kind = ("box", "sphere", "cylinder", "capsule")[number % 4]
         fields = {"box": {"size": size}, "sphere": {"radius": size[0] / 2}}
         obstacles.append(
-            {**thing, "type": kind, **fields.get(kind, {"radius": size[0] / 2, "length": size[1]})}
+            {
+                **obstacle,
+                "type": kind,
+                **fields.get(kind, {"radius": size[0] / 2, "length": size[1]}),
+            }
         )
     return obstacles
 

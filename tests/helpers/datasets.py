@@ -1,4 +1,4 @@
-"""A small dataset, made once for the tests of a file, and what its recipe says."""
+"""Defines the recipe of a small dataset."""
 
 from __future__ import annotations
 
@@ -10,4 +10,4 @@ SMALL: dict[str, Any] = {
     "objects": ["random_oven", "random_drawers"],
     "rooms": {"count": 2, "objects": 1, "episodes": 2, "clutter": [0.0, 0.0]},
 }
-"""Of episodes that are planned in a tenth of a second."""
+"""Recipe of episodes that take a tenth of a second to plan."""

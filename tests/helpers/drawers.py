@@ -1,4 +1,4 @@
-"""Provides the drawer's room: the handle's pose, a robot that grasps it, and coal's distances."""
+"""Provides the drawer scene, poses of its handle, a grasping robot, and clearances by coal."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene, load_scene
 
-MARGIN, BESIDE_HANDLE = 0.02, 0.005  # [m]: Options.dist_safe and Options.grasp_clearance
+MARGIN, HAND_CLEARANCE = 0.02, 0.005  # [m]: Options.dist_safe and Options.grasp_clearance
 SHORT = Options(reach_waypoints=5, turn_waypoints=3, move_waypoints=8)
-STANDING = np.array(
+NEAR_HANDLE = np.array(
     [0.63, 0.08, 0.42, 2.288, -0.13, -0.55, 0.681, 1.141, 1.571]
-)  # nearly at the handle of the shut drawer
+)  # near the handle of the closed drawer
 
 
 @cache
@@ -30,30 +30,29 @@ def load_drawer_scene() -> Scene:
 
 
 def add_boxes(scene: Scene, **boxes: tuple[Sequence[float], Sequence[float]]) -> Scene:
-    """Return the scene with more boxes in it, each by its size and the place of its centre."""
+    """Return the scene with more boxes: name → (size, position of the centre)."""
     added = [
         {"name": n, "type": "box", "size": list(size), "position": list(at)}
         for n, (size, at) in boxes.items()
     ]
-    return replace_drawer_fields(scene, obstacles=[*scene.document["obstacles"], *added])
+    return replace_scene_fields(scene, obstacles=[*scene.document["obstacles"], *added])
 
 
-def replace_drawer_fields(scene: Scene, **fields: Any) -> Scene:
+def replace_scene_fields(scene: Scene, **fields: Any) -> Scene:
     """Return the scene with other fields of its document."""
     return Scene.from_document({**scene.document, **fields}, scene.folder)
 
 
-def make_open_scene(*obstacles: dict[str, Any], base: str = "omni") -> Scene:
+def make_drawer_scene(*obstacles: dict[str, Any], base: str = "omni") -> Scene:
     """Return the drawer's scene with other obstacles."""
-    return replace_drawer_fields(
+    return replace_scene_fields(
         load_drawer_scene(), obstacles=list(obstacles), robot={"name": "husky_ur5e", "base": base}
     )
 
 
 def compute_handle_pose(slide: float = 0.0, *, tilt: float = 0.0) -> pin.SE3:
-    """Return the tool's pose that grasps the handle, from the drawer's URDF, by hand."""
-    # The tool's z axis, along which it comes, along x; its x axis, in which the fingers close,
-    # upwards.
+    """Return the tool's grasp pose at the handle, with numbers of the drawer's URDF."""
+    # The tool's z axis (approach) is along x, its x axis (closing direction) upwards.
     grasp = pin.SE3(
         np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]),
         np.array([1.93 - 0.115 - slide, 0.0, 0.755]),
@@ -74,11 +73,11 @@ def compute_pose_error(scene: Scene, row: np.ndarray, target: pin.SE3) -> float:
 
 @cache
 def _solve_grasp() -> np.ndarray:
-    return solve_reach(compute_handle_pose(), STANDING)
+    return solve_reach(compute_handle_pose(), NEAR_HANDLE)
 
 
 def make_grasping_scene(scene: Scene | None = None, attachment: str = "handle") -> Scene:
-    """Return the scene with the robot holding the shut drawer, from 1.2 m before it."""
+    """Return the scene with the robot grasping the closed drawer, its base 1.2 m in front of it."""
     scene, row = scene or load_drawer_scene(), _solve_grasp()
     return scene.with_start(base=row[:3], arm=row[3:]).with_held({"drawer": attachment})
 
@@ -86,10 +85,10 @@ def make_grasping_scene(scene: Scene | None = None, attachment: str = "handle") 
 def compute_spare_clearance(
     scene: Scene, row: np.ndarray, *, slide: float = 0.0, held: bool = False
 ) -> float:
-    """Return the smallest distance minus margin of all pairs [m]; `row` begins with the robot's z.
+    """Return the smallest difference between distance and margin over all pairs [m].
 
-    The robot's own pairs, the robot and everything, and what it holds and everything but what that
-    is part of.
+    Pairs are those within the robot, of the robot and the scene, and, if `held`, of the grasped
+    tray and other objects and obstacles. `row` begins with the robot's coordinates.
     """
     robot, state = scene.robot, {"drawer": {"slide": slide}}
     model, data, shapes = robot.model, robot.model.createData(), robot.collision.createData()
@@ -101,18 +100,18 @@ def compute_spare_clearance(
     found = [
         _compute_gap(links[i], shapes.oMg[i], links[j], shapes.oMg[j]) - MARGIN for i, j in own
     ]
-    things = _get_shapes(scene, state)
+    labelled = _get_shapes(scene, state)
     for i, link in enumerate(links):
-        for label, shape in things:
+        for label, shape in labelled:
             wheels = label == FLOOR and link.parentJoint == 1
             touching = label == "drawer.tray" and get_link_name(link.name) in robot.touch_links
             if not wheels and not (touching and held):
                 gap = _compute_gap(link, shapes.oMg[i], shape, shape.placement)
-                found.append(gap - (BESIDE_HANDLE if touching else MARGIN))
+                found.append(gap - (HAND_CLEARANCE if touching else MARGIN))
     if held:
-        tray = [shape for label, shape in things if label == "drawer.tray"]
+        tray = [shape for label, shape in labelled if label == "drawer.tray"]
         others = [
-            shape for label, shape in things if not label.startswith("drawer.") and label != FLOOR
+            shape for label, shape in labelled if not label.startswith("drawer.") and label != FLOOR
         ]
         found += [
             _compute_gap(one, one.placement, other, other.placement) - MARGIN
@@ -125,16 +124,21 @@ def compute_spare_clearance(
 def _get_shapes(
     scene: Scene, state: Mapping[str, Mapping[str, float]]
 ) -> list[tuple[str, pin.GeometryObject]]:
-    things = list(zip(scene.obstacle_labels, scene.obstacles, strict=True))
+    labelled = list(zip(scene.obstacle_labels, scene.obstacles, strict=True))
     for name, placed in scene.objects.items():
-        things += [
+        labelled += [
             (f"{name}.{get_link_name(s.name)}", s)
             for s in make_world_shapes(placed.with_state(state.get(name, {})))
         ]
-    return things
+    return labelled
 
 
 def _compute_gap(
-    first: pin.GeometryObject, where: pin.SE3, second: pin.GeometryObject, there: pin.SE3
+    first: pin.GeometryObject,
+    first_placement: pin.SE3,
+    second: pin.GeometryObject,
+    second_placement: pin.SE3,
 ) -> float:
-    return compute_shape_distance(first.geometry, where, second.geometry, there)
+    return compute_shape_distance(
+        first.geometry, first_placement, second.geometry, second_placement
+    )

@@ -1,4 +1,4 @@
-"""An empty hall, and motions through it that nobody planned."""
+"""Makes an empty hall, and unplanned motions through it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DT = 0.25  # [s]
 def make_hall(
     *, base: str = "omni", obstacles: Sequence[Mapping[str, Any]] = (), **robot: Any
 ) -> Scene:
-    """Return a hall of 12 m x 12 m with the Husky at its centre, and more fields of `robot`."""
+    """Return a hall of 12 m x 12 m with the Husky at its centre; `robot` adds fields of it."""
     return make_scene(
         {
             "robot": {"name": "husky_ur5e", "base": base, **robot},
@@ -33,7 +33,7 @@ def make_hall(
 
 
 def make_scene(document: Mapping[str, Any]) -> Scene:
-    """Return the scene of a document, built once."""
+    """Return the scene of a document, cached."""
     return _build_scene(json.dumps(document))
 
 
@@ -43,9 +43,9 @@ def _build_scene(text: str) -> Scene:
 
 
 def drive_through(scene: Scene, *stops: np.ndarray, steps: int = 40, dt: float = DT) -> Trajectory:
-    """Return a motion from the start through `stops`, shape (n,) each, at rest at all of them."""
-    share = np.linspace(0.0, 1.0, steps + 1)[1:, None]
-    smooth = share**2 * (3.0 - 2.0 * share)
+    """Return a motion through `stops`, shape (n,) each, at rest at each."""
+    fraction = np.linspace(0.0, 1.0, steps + 1)[1:, None]
+    smooth = fraction**2 * (3.0 - 2.0 * fraction)
     rows = [stops[0][None]]
     for before, after in itertools.pairwise(stops):
         rows.append(before + smooth * (after - before))
@@ -58,14 +58,14 @@ def drive_through(scene: Scene, *stops: np.ndarray, steps: int = 40, dt: float =
 def make_trajectory(
     scene: Scene, rows: np.ndarray, *, dt: float = DT, phases: tuple[PhaseSpan, ...] = ()
 ) -> Trajectory:
-    """Return the motion through `rows`, shape (T, n), of the robot alone, `dt` apart."""
+    """Return a motion of the robot alone through `rows`, shape (T, n), with time step `dt`."""
     names = scene.robot.coordinates.names
     phases = phases or (PhaseSpan("drive", 0, len(rows) - 1),)
     return Trajectory(names, dt * np.arange(len(rows)), rows, phases, len(names))
 
 
 def move_start(start: np.ndarray, **values: float) -> np.ndarray:
-    """Return `start` with the base elsewhere: x, y and yaw by name."""
+    """Return `start` with other values of the base's x, y and yaw."""
     out = np.array(start)
     for name, value in values.items():
         out[("x", "y", "yaw").index(name)] = value

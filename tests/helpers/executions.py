@@ -1,4 +1,4 @@
-"""Plans to execute in physics, results of executions, and stationary motions."""
+"""Provides plans to simulate, a simulation result, and stationary motions."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def simulate_drawer() -> SimulationResult:
 
 
 def make_grasping_scene() -> Scene:
-    """Return a scene with the stick in the hand."""
+    """Return a scene with the stick grasped."""
     return vkc.load_scene("init_1").with_held({"stick": "grip"})
 
 

@@ -10,7 +10,7 @@ from vkc_pin.cli import main
 
 
 def run_experiment(words: str, out: Path) -> tuple[str, list[dict[str, Any]]]:
-    """Run `vkc-pin bench WORDS` twice, which must add no trial; return its table and its trials."""
+    """Run `vkc-pin bench WORDS`; return its table and trials. A second run must add no trial."""
     command = ["bench", *words.split(), "--quiet", "--out", str(out)]
     assert main(command) == 0
     journal = (out / "trials.jsonl").read_bytes()

@@ -22,7 +22,7 @@ HINGE = 1.2
 
 @dataclass(frozen=True, eq=False)
 class PlanWithMetrics(Plan):
-    """A plan with metrics that no trajectory has, for tests of records."""
+    """A plan with arbitrary metrics, for tests of records."""
 
     replaced: Mapping[str, float] = field(default_factory=dict)
 
@@ -32,13 +32,13 @@ class PlanWithMetrics(Plan):
 
 
 def replace_metrics(plan: Plan, metrics: Mapping[str, float], **changes: Any) -> Plan:
-    """Return a plan with other metrics, and other fields."""
+    """Return a plan with other metrics and fields."""
     fields = {name: value for name, value in vars(plan).items() if name != "replaced"}
     return PlanWithMetrics(**{**fields, **changes}, replaced=metrics)
 
 
 def make_fake_plan(scene: Scene | None = None) -> Plan:
-    """Return a plan of 6 s in two phases, whose report blames the forearm and the sofa at 4 s."""
+    """Return a plan of 6 s in two phases, with a collision of forearm and sofa at 4 s."""
     scene = load_scene("door") if scene is None else scene
     robot = scene.robot.coordinates.names
     names = (
@@ -50,17 +50,17 @@ def make_fake_plan(scene: Scene | None = None) -> Plan:
     times = np.concatenate(
         [np.linspace(0.0, 3.0, 7), 3.0 + np.geomspace(0.1, 3.0, 7)]
     )  # not evenly spaced
-    done = np.linspace(0.0, 1.0, len(times))
+    fraction = np.linspace(0.0, 1.0, len(times))
     start = np.concatenate([scene.start, np.zeros(3)])
     end = start + np.concatenate(
         [[2.3, -0.5, -3.9], 0.8 * np.ones(len(robot) - 3), [HINGE, 0.6, 0.3]]
     )
-    positions = start + np.outer(done**2, end - start)
+    positions = start + np.outer(fraction**2, end - start)
     phases = (
         PhaseSpan("reach door.handle", 0, 6),
         PhaseSpan("move door.hinge", 6, len(times) - 1, (Hold("door", "handle"),)),
     )
-    blame = Violation(
+    collision = Violation(
         "penetration",
         "forearm_link – sofa",
         waypoint=9,
@@ -74,6 +74,6 @@ def make_fake_plan(scene: Scene | None = None) -> Plan:
         steps=(Actuate("door", {"hinge": HINGE}),),
         options=Options(),
         trajectory=Trajectory(names, times, positions, phases, len(robot)),
-        report=Report((blame,), -0.03, states=100, notes=("go to: found no path",)),
+        report=Report((collision,), -0.03, states=100, notes=("go to: found no path",)),
         status="rejected",
     )

@@ -1,4 +1,4 @@
-"""A box with a flap, whose handle a test chooses."""
+"""Writes a cabinet with a flap and any handle."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ BAR = (
     '<collision{}><origin xyz="-0.08 0.5 0" />'
     '<geometry><box size="0.02 0.02 0.3"/></geometry></collision>'
 )
-"""Upright, 70 mm before a flap that is hinged at y = 0."""
+"""Upright bar, its back 70 mm in front of a flap that is hinged at y = 0."""
 
 
 def write_flap(
@@ -26,12 +26,12 @@ def write_flap(
     """Return a cabinet, 0.6 m wide and 0.8 m high, with a flap that opens towards -x.
 
     Args:
-        folder: Where its files are to be.
-        handle: Elements of the link `flap`, whose frame is on the hinge, at half its height.
-        thick: The flap [m].
-        before: More elements of the case.
-        behind: How far the case stands behind the flap [m].
-        attachments: Of the description.
+        folder: Output folder.
+        handle: More URDF elements of the flap, whose frame is on the hinge at half height.
+        thick: Thickness of the flap [m].
+        before: More URDF elements of the case.
+        behind: Gap between flap and case [m].
+        attachments: Attachments of the description, as YAML.
     """
     middle = 0.2 + behind + thick / 2.0
     text = f"""<robot name="flap">

@@ -1,4 +1,4 @@
-"""Makes halls with a wall across, which the base passes at its end or through a gate, or not."""
+"""Makes problems of driving past the end of a wall or through a gate in it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import vkc_pin as vkc
 from helpers.drives import make_hall
 from helpers.small_problems import make_program
 
-NARROW = 0.73  # [m] the base is 0.67 wide and the arm at home 0.72; both want 0.02 on either side
-TIGHT = 0.70  # [m] here the arm at home does not fit, not even if it may graze
+NARROW = 0.73  # [m]; the base is 0.67 wide, the arm at home 0.72, and the margin 0.02
+TOO_NARROW = 0.70  # [m]; narrower than the arm at home
 GOAL = (4.0, 0.5, 0.0)
 
 
@@ -25,7 +25,7 @@ def _make_problem(
 
 
 def make_wall_problem(gap: float) -> vkc.TrajectoryProblem:
-    """Return the problem of driving past a wall across the hall that leaves a gap beside it [m]."""
+    """Return the problem of driving through the `gap` [m] at the end of a wall across the hall."""
     wall = {
         "name": "wall",
         "type": "box",
@@ -36,7 +36,7 @@ def make_wall_problem(gap: float) -> vkc.TrajectoryProblem:
 
 
 def make_gate_problem(width: float, *, height: float = 1.5) -> vkc.TrajectoryProblem:
-    """Return the problem of driving through a gate of some width [m] in a wall across the hall."""
+    """Return the problem of driving through a gate of `width` [m] in a wall across the hall."""
     size = (6.4 - width) / 2
     return _make_problem(
         [

@@ -10,9 +10,9 @@ from typing import Any
 from helpers.arm_urdf import HEIGHT, write_arms
 from vkc_pin.world.scene.scene import Scene
 
-__all__ = ["WIDEST", "describe_cheeks_drawer", "write_cheeks_scene", "write_gripper"]
+__all__ = ["MAX_OPENING", "describe_cheeks_drawer", "write_cheeks_scene", "write_gripper"]
 
-WIDEST = 0.08  # [m] between the faces of the fingers
+MAX_OPENING = 0.08  # largest opening between the faces of the fingers [m]
 _GRIPPER = "gripper:\n  finger_a_joint: {closed: 0.0, open: 0.04}\n"
 _FLOOR = (
     "<link name='floor'/><joint name='floor_joint' type='fixed'><parent link='floor'/><child "
@@ -33,9 +33,9 @@ def write_gripper(folder: Path, *, gripper: str = _GRIPPER, more: str = "") -> P
     close along the tool's x axis, the world's y.
 
     Args:
-        folder: Where.
+        folder: Output folder.
         gripper: Lines of robot.yaml about the gripper.
-        more: Lines of it beyond that.
+        more: Further lines of robot.yaml.
     """
     file = write_arms(folder)
     text = file.read_text(encoding="utf-8")
@@ -45,10 +45,10 @@ def write_gripper(folder: Path, *, gripper: str = _GRIPPER, more: str = "") -> P
     text = (before + joint + body + mimic + end + rest).replace(
         "</robot>", _FLOOR + _TOOL + "</robot>"
     )
-    seen = re.sub(
+    with_visuals = re.sub(
         r"<collision>(.*?)</collision>", r"<visual>\1</visual><collision>\1</collision>", text
     )
-    file.write_text(seen, encoding="utf-8")
+    file.write_text(with_visuals, encoding="utf-8")
     links = ["body", *(f"arm_{k + 1}" for k in range(5)), "hand", "finger_a", "finger_b"]
     pairs = [
         *itertools.pairwise(links),
@@ -57,11 +57,11 @@ def write_gripper(folder: Path, *, gripper: str = _GRIPPER, more: str = "") -> P
         ("arm_5", "finger_b"),
         ("body", "arm_2"),
     ]
-    near = "".join(
+    disabled = "".join(
         f'<disable_collisions link1="{one}" link2="{other}" reason="Adjacent"/>'
         for one, other in pairs
     )
-    (folder / "robot.srdf").write_text(f'<robot name="robot">{near}</robot>', encoding="utf-8")
+    (folder / "robot.srdf").write_text(f'<robot name="robot">{disabled}</robot>', encoding="utf-8")
     lines = [
         "urdf: robot.urdf",
         "srdf: robot.srdf",
@@ -109,11 +109,11 @@ def write_cheeks_scene(
     Args:
         robot: The robot's robot.yaml.
         opening: The attachment's opening [m], or None.
-        start: How far the gripper is open at the start [m]; None: as the robot rests.
-        gap: From the middle of the handle to either cheek [m]; fingers that are fully open leave 10
-            mm of the default.
-        other: Where another drawer stands, whose attachment says nothing.
-        height: Of the drawer [m].
+        start: Opening of the gripper at the start [m]. Default: the robot's rest opening.
+        gap: Distance from the middle of the handle to either cheek [m]. The default leaves 10 mm
+            beside fully open fingers.
+        other: Position of another drawer, whose attachment states no opening.
+        height: Height of the drawer [m].
     """
     plain: dict[str, Any] = {"name": "grip", "link": "front", "position": [-0.05, 0.0, 0.0]}
     plain |= {"approach": [1.0, 0.0, 0.0], "closing": [0.0, 1.0, 0.0]}

@@ -28,11 +28,11 @@ WALLS = {  # name → x from, to; y from, to [m]
 
 
 def write_home_urdf(folder: Path) -> tuple[Path, int]:
-    """Write a home of three rooms as one URDF, and return it and how many shapes collide in it.
+    """Write a home of three rooms as one URDF; return it and the number of its collision shapes.
 
-    Its walls are shapes of the root; refrigerator, drawers and dishwasher are fixed links with
-    joints; the door hangs on the root itself; a sofa is a concave mesh, a table of several shapes;
-    cups float, a lump is too thick for a hand, a carpet lies there.
+    Walls are shapes of the root. Refrigerator, drawers, dishwasher and door are fixed to the root.
+    The sofa is a concave mesh, the table has several shapes. Two cups and a lump that is too thick
+    for the hand are floating; a carpet lies on the floor.
     """
     folder.mkdir(parents=True, exist_ok=True)
     robot = ElementTree.Element("robot", name="home")
@@ -42,14 +42,16 @@ def write_home_urdf(folder: Path) -> tuple[Path, int]:
     _add_box(world, (9.6, 10.2, 0.1), (0.0, 1.0, -0.05), "slab")
     for kind, (x, y, yaw, seed) in PLACES.items():
         source = ElementTree.fromstring(str(vkc.procedural.random_object(kind, seed)["urdf"]))
-        own = [link.get("name", "") for link in source.findall("link")]
+        links = [link.get("name", "") for link in source.findall("link")]
         for element in (*source.findall("link"), *source.findall("joint")):
             for name in [element, *element.findall("parent"), *element.findall("child")]:
                 for key in ("name", "link"):
                     if name.get(key) is not None:
                         name.set(key, f"{kind}_{name.get(key)}")
             robot.append(element)
-        _add_joint(robot, f"{kind}_stands", "fixed", "world", f"{kind}_{own[0]}", (x, y, 0.0), yaw)
+        _add_joint(
+            robot, f"{kind}_stands", "fixed", "world", f"{kind}_{links[0]}", (x, y, 0.0), yaw
+        )
     table = _add_link(robot, "table", "fixed", (0.0, 0.5, 0.0))
     _add_box(table, (0.8, 1.2, 0.04), (0.0, 0.0, 0.73))
     for k, (x, y) in enumerate(((-0.35, -0.55), (-0.35, 0.55), (0.35, -0.55), (0.35, 0.55))):
@@ -69,7 +71,7 @@ def write_home_urdf(folder: Path) -> tuple[Path, int]:
     for k, y in enumerate((0.2, 0.6)):
         _add_cylinder(
             _add_link(robot, f"cup_{k}", "floating", (0.25, y, 0.749)), 0.03, 0.1
-        )  # one millimetre deep in the table
+        )  # 1 mm inside the table
     _add_box(
         _add_link(robot, "lump", "floating", (2.0, 5.0, 0.0)), (0.4, 0.4, 0.4), (0.0, 0.0, 0.2)
     )

@@ -1,4 +1,4 @@
-"""Reports on motions, and scenes and motions with something about them changed."""
+"""Validates plans, and changes their scenes and motions."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def check(
 def replace_object(
     scene: Scene, name: str = "door", *, placement: pin.SE3 | None = None, **fields: object
 ) -> Scene:
-    """Return `scene` with an object that stands elsewhere or has other fields."""
+    """Return `scene` with another placement or other fields of an object."""
     placed = scene.objects[name]
     changed = dataclasses.replace(placed, object=dataclasses.replace(placed.object, **fields))
     if placement is not None:
@@ -56,6 +56,6 @@ def replace_attachments(scene: Scene, change: Mapping[str, Attachment]) -> Scene
     return replace_object(scene, attachments={**scene.objects["door"].object.attachments, **change})
 
 
-def cut_at_grasp(plan: vkc.Plan) -> Trajectory:
+def get_approach(plan: vkc.Plan) -> Trajectory:
     """Return the first phase of the planned motion."""
     return plan.trajectory.parts()[0]

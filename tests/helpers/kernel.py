@@ -17,8 +17,8 @@ class Kernel:
     """Runs cells.
 
     Attributes:
-        client: Talks to the kernel.
-        manager: Starts, interrupts and ends it.
+        client: Client of the kernel.
+        manager: Manager that starts, interrupts and ends the kernel.
     """
 
     def __init__(self, manager: Any, client: Any) -> None:
@@ -30,10 +30,10 @@ class Kernel:
         """Run a cell and return its outputs as in a saved notebook, with updates in place.
 
         Args:
-            code: The cell.
-            interrupt: Interrupt the kernel when this text comes.
-            delay: That long after it [s].
-            timeout: Of the cell [s].
+            code: Code of the cell.
+            interrupt: Text of an output that triggers an interrupt of the kernel.
+            delay: Time between that output and the interrupt [s].
+            timeout: Time limit of the cell [s].
         """
         sent = self.client.execute(code)
         outputs: list[dict[str, Any]] = []

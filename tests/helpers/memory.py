@@ -34,22 +34,22 @@ def measure_growth(
 ) -> tuple[float, float]:
     """Return the growth per call: bytes of compiled code, and blocks of Python's objects.
 
-    It is the least of several calls: caches fill now and then, but what leaks does so every time.
+    It is the minimum over several calls, since caches fill occasionally and leaks grow every time.
 
     Args:
-        run: The call.
-        warm: How often it is called before anything counts.
-        times: How often it is measured.
+        run: Function to call.
+        warm: Number of calls before the measurement.
+        times: Number of measured calls.
     """
     info = getattr(ctypes.CDLL(None), "mallinfo2", None)
     if info is None:
         pytest.skip("this C library does not report allocations")
     info.restype = _Mallinfo
-    seen = []
+    allocated = []
     for _ in range(warm + times + 1):
         run()
         gc.collect()
-        told = info()
-        seen.append((told.uordblks + told.hblkhd, sys.getallocatedblocks()))
-    grown = np.diff(np.array(seen[warm:], float), axis=0)
+        usage = info()
+        allocated.append((usage.uordblks + usage.hblkhd, sys.getallocatedblocks()))
+    grown = np.diff(np.array(allocated[warm:], float), axis=0)
     return float(grown[:, 0].min()), float(grown[:, 1].min())

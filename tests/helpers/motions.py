@@ -1,11 +1,11 @@
-"""Random motions, and distances of their pairs by brute force."""
+"""Makes random motions, and computes distances of their pairs by brute force."""
 
 from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
 
-from helpers.carrying import Script, describe_table, make_room
+from helpers.carrying import MotionBuilder, describe_table, make_room
 from vkc_pin.validation.pairs import PairTable
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
@@ -14,7 +14,7 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def make_random_door_motion(scene: Scene, seed: int, *, size: float) -> Trajectory:
-    """Return a random motion near the door, four waypoints; steps of joints are up to `size`."""
+    """Return a random motion of four waypoints near the door, with joint steps up to `size`."""
     rng = np.random.default_rng(seed)
     door = scene.objects["door"].object
     first = np.concatenate([scene.start, [0.6, 0.3]])
@@ -60,11 +60,11 @@ def get_pair_names(table: PairTable, k: int) -> tuple[str, str]:
 def make_random_stick_motion(
     seed: int, *, size: float, scene: Scene | None = None
 ) -> tuple[Scene, Trajectory]:
-    """Return a random motion with a stick and a ball on its tip, five waypoints, two phases."""
+    """Return a random motion of two phases with a stick and a ball on its tip, five waypoints."""
     rng = np.random.default_rng(seed)
     scene = make_room(describe_table(), objects=("stick", "ball")) if scene is None else scene
     scene = scene.with_held({"stick": "grip", "ball": "pull"}, by={"ball": "stick.tip"})
-    script = Script(scene)
+    script = MotionBuilder(scene)
     for phase in range(2):
         if phase:
             script.let_go("ball")

@@ -1,4 +1,4 @@
-"""Descriptions of objects, written for a test."""
+"""Describes small objects."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def format_joint(name: str, kind: str, parent: str, child: str, axis: str) -> st
     return f'<joint name="{name}" type="{kind}">{links}<axis xyz="{axis}"/>{limit}</joint>'
 
 
-def load_text(urdf: str, yaml: str) -> ArticulatedObject:
+def load_object_text(urdf: str, yaml: str) -> ArticulatedObject:
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "thing.urdf").write_text(urdf)
         (Path(folder) / "thing.yaml").write_text(yaml)

@@ -1,4 +1,4 @@
-"""Reads the commands and animations of a motion's page."""
+"""Reads the commands and animations of a motion's HTML page."""
 
 from __future__ import annotations
 

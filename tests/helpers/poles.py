@@ -1,4 +1,4 @@
-"""A thin pole whose hull by Qhull, scaled to the unit cube, has triangles that overlap."""
+"""Provides a thin pole; its hull by Qhull, scaled to the unit cube, has overlapping triangles."""
 
 from __future__ import annotations
 

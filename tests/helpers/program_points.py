@@ -1,4 +1,4 @@
-"""Random points at which a nonlinear program is compared with its definition."""
+"""Makes random points at which tests compare a nonlinear program with its definition."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PENALTY = 7.0
 
 @dataclass
 class ProgramPoint:
-    """Variables and parameters of a program, all random but start and targets."""
+    """Variables and parameters of a program, all random except start and targets."""
 
     problem: TrajectoryProblem
     z: np.ndarray  # (N, n)
@@ -49,16 +49,16 @@ class ProgramPoint:
     @property
     def parameters(self) -> np.ndarray:
         p = self.problem
-        given = p.parameters_at(self.z)
-        given |= {"gears": self.gears, "dt": self.dt, "planes": self.planes}
-        given |= dict(zip(("step_weights", "change_weights"), self.weights, strict=True))
+        values = p.parameters_at(self.z)
+        values |= {"gears": self.gears, "dt": self.dt, "planes": self.planes}
+        values |= dict(zip(("step_weights", "change_weights"), self.weights, strict=True))
         vector = p.transcription.parameter_vector(
             offsets=self.offsets,
             penalty=PENALTY,
             pose_offsets=self.pose_offsets,
             excess=self.excess,
             relaxation_weights=self.relaxation_weights,
-            **given,
+            **values,
         )
         return np.concatenate([vector, self.rate_excess])
 
@@ -81,9 +81,9 @@ class ProgramPoint:
         return np.asarray(self.functions()[1](self.x, self.parameters)[0]).ravel()
 
     def check_derivatives(self) -> None:
-        """Compare gradient, Jacobian and Hessian with differences along random directions.
+        """Compare gradient, Jacobian and Hessian with finite differences in random directions.
 
-        A nonzero that the sparsity pattern lacks would show up as a difference, too.
+        Nonzeros missing in a sparsity pattern show up as differences, too.
         """
         objective, constraints, lagrangian = self.functions()
         rng, parameters, weight, h = np.random.default_rng(3), self.parameters, 0.7, 1e-6

@@ -12,7 +12,7 @@ QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes"}
 CLEARANCE, REST = 31.0, 17.0  # weights
 
 
-class Relaxed:
+class RelaxedProgram:
     """A program, with rate rows, set up at an iterate with the timing of the stationary motion."""
 
     def __init__(self, problem: TrajectoryProblem, z: np.ndarray) -> None:
@@ -32,17 +32,17 @@ class Relaxed:
     def _parameters(self, *, relaxed: bool) -> np.ndarray:
         p, f = self.problem, self.found
         planes, offsets = self._planes
-        given = {"planes": planes, "offsets": offsets, "penalty": CLEARANCE, "dt": self.timing.dt}
-        given |= p.parameters_at(self.z)
+        values = {"planes": planes, "offsets": offsets, "penalty": CLEARANCE, "dt": self.timing.dt}
+        values |= p.parameters_at(self.z)
         rate_excess = np.zeros(len(f.rate_excess))
         if relaxed:
-            given |= {"pose_offsets": f.pose_offsets, "excess": f.excess}
-            given["relaxation_weights"] = self.merit.compute_penalty(f, clearance=False)
+            values |= {"pose_offsets": f.pose_offsets, "excess": f.excess}
+            values["relaxation_weights"] = self.merit.compute_penalty(f, clearance=False)
             rate_excess = f.rate_excess
-        return np.concatenate([p.transcription.parameter_vector(**given), rate_excess])
+        return np.concatenate([p.transcription.parameter_vector(**values), rate_excess])
 
     def rows(self, relaxations: np.ndarray | float, *, relaxed: bool = True) -> np.ndarray:
-        """Return the rows at the iterate; not relaxed: without excess that could be subtracted."""
+        """Return the rows at the iterate; unless `relaxed`, no excess is subtracted."""
         x = self.problem.transcription.pack(self.z, self.slack, relaxations)
         return np.asarray(self._rows(x, self._parameters(relaxed=relaxed))[0]).ravel()
 
@@ -53,11 +53,11 @@ class Relaxed:
 
     def quadratic_cost(self) -> float:
         """Return the motion cost according to the quadratic model in the program."""
-        given = self.problem.rates(self.z)
+        rates = self.problem.rates(self.z)
         return float(
             sum(
                 np.sum(w * part**2)
-                for w, part in zip(self.problem.motion_cost.weights(*given), given, strict=True)
+                for w, part in zip(self.problem.motion_cost.weights(*rates), rates, strict=True)
             )
         )
 
@@ -77,35 +77,40 @@ def make_iterates(problem: TrajectoryProblem, count: int = 3) -> list[np.ndarray
 def check_relaxation(problem: TrajectoryProblem, z: np.ndarray) -> dict[str, float]:
     """Check the program set up at an iterate; return the violation of each kind there.
 
-    With relaxation variables of 1 it is feasible and costs the merit, with 0 it is exact, and in
-    between proportional.
+    With relaxation variables of 1 the program is feasible and its cost is the merit; with 0 it is
+    exact. In between, violations are proportional.
     """
-    t, at = problem.transcription, Relaxed(problem, z)
-    raw, still, share = (
+    t, at = problem.transcription, RelaxedProgram(problem, z)
+    raw, residual, fractions = (
         at.rows(0.0),
         at.violations(at.rows(1.0)),
         np.random.default_rng(21).uniform(0.1, 0.9, t.segments),
     )
     assert np.isfinite(raw).all()
-    assert still.max() < 1e-8 * max(1.0, np.abs(raw).max())
-    own = problem.term_evaluator.compute_cost(z, at.timing.dt)
-    expected = at.quadratic_cost() + own + at.merit.compute_penalty(at.found, clearance=True).sum()
+    assert residual.max() < 1e-8 * max(1.0, np.abs(raw).max())
+    terms = problem.term_evaluator.compute_cost(z, at.timing.dt)
+    expected = (
+        at.quadratic_cost() + terms + at.merit.compute_penalty(at.found, clearance=True).sum()
+    )
     np.testing.assert_allclose(at.cost(1.0), expected, rtol=1e-9)
     np.testing.assert_array_equal(raw, at.rows(0.0, relaxed=False))
     np.testing.assert_array_equal(raw, at.rows(1.0, relaxed=False))
     # Rows of planes have slacks of their own.
-    between, firm = at.rows(share), t.first_relaxed_row
+    between, firm = at.rows(fractions), t.first_relaxed_row
     np.testing.assert_array_equal(between[t.slot_rows], raw[t.slot_rows])
     owners = np.concatenate([t.row_waypoints, t.rate_waypoints])
     np.testing.assert_allclose(
         at.violations(between)[firm:],
-        (1.0 - share[owners]) * at.violations(raw)[firm:],
+        (1.0 - fractions[owners]) * at.violations(raw)[firm:],
         rtol=1e-7,
         atol=1e-9,
     )
     for rows_at in t.pose_rows:
         for waypoint, rows in rows_at.items():
             np.testing.assert_allclose(
-                between[rows[:3]], (1.0 - share[waypoint - 1]) * raw[rows[:3]], rtol=0.0, atol=1e-9
+                between[rows[:3]],
+                (1.0 - fractions[waypoint - 1]) * raw[rows[:3]],
+                rtol=0.0,
+                atol=1e-9,
             )
     return {kind: float(amount.sum()) for kind, amount in at.found.amounts.items()}

@@ -1,4 +1,4 @@
-"""Robots for tests: small ones, and where their frames are."""
+"""Writes small robots, and computes placements of their frames."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pinocchio as pin
 from vkc_pin.world.models.robot import Robot
 
 
-def get_rest(robot: Robot) -> np.ndarray:
+def get_home_configuration(robot: Robot) -> np.ndarray:
     return np.concatenate([np.zeros(3), robot.home])
 
 

@@ -1,4 +1,4 @@
-"""A small room, described in YAML."""
+"""Describes a small room in YAML."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lets the oracle judge every motion that is planned, by keeping the plans that planners make."""
+"""Collects the successful plans of all planners, and lets the oracle judge them."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from vkc_pin.benchmarks.peers import found as peers
 from vkc_pin.planning import results, solve_task
 from vkc_pin.planning.plan import Plan
 
-__all__ = ["SecondOpinion"]
+__all__ = ["PlanJudge"]
 
 
-class SecondOpinion:
-    """Keeps the plans that succeed, and judges them.
+class PlanJudge:
+    """Collects successful plans and judges them.
 
     Attributes:
-        planned, judged: How many motions were planned, and how many different ones were judged.
-        unjudged: Why others were not.
-        seconds: What judging took.
+        planned, judged: Number of collected plans, and of distinct plans that were judged.
+        unjudged: Reasons of plans that could not be judged.
+        seconds: Time spent on judging [s].
     """
 
     def __init__(self) -> None:
@@ -34,7 +34,7 @@ class SecondOpinion:
         self._known: set[str] = set()
 
     def attach(self) -> None:
-        """Listen from now on."""
+        """Start to collect plans."""
 
         def make_plan(*values: Any, **fields: Any) -> Plan:
             plan = Plan(*values, **fields)
@@ -45,16 +45,16 @@ class SecondOpinion:
         for module in (results, solve_task, separate, peers):
             module.Plan = make_plan  # type: ignore[attr-defined]
 
-    def forget(self) -> None:
-        """Drop the plans made since the last call of `verdicts`."""
+    def drop_plans(self) -> None:
+        """Drop the plans collected since the last call of `verdicts`."""
         self._waiting.clear()
 
     def verdicts(self, folder: Path) -> list[Verdict]:
-        """Judge the motions planned since the last call; return the verdicts that disagree."""
+        """Judge the plans collected since the last call; return the verdicts that disagree."""
         found, waiting, self._waiting = [], self._waiting, []
         self.planned += len(waiting)
         for plan in waiting:
-            if (digest := _digest(plan)) in self._known:
+            if (digest := _compute_digest(plan)) in self._known:
                 continue
             self._known.add(digest)
             path = plan.save(folder / f"{digest}.npz")
@@ -69,12 +69,12 @@ class SecondOpinion:
         return found
 
 
-def _digest(plan: Plan) -> str:
-    about = [
+def _compute_digest(plan: Plan) -> str:
+    task = [
         plan.scene.document,
         str(plan.scene.folder),
         plan.to_dict()["steps"],
         vars(plan.options),
     ]
-    content = json.dumps([about, plan.trajectory.to_dict()], sort_keys=True)
+    content = json.dumps([task, plan.trajectory.to_dict()], sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()[:16]

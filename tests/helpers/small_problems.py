@@ -1,4 +1,4 @@
-"""Scenes, grasps and short problems that several tests use."""
+"""Provides scenes, grasps and short problems."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from vkc_pin.world.task.terms import Term
 CACHE = Cache()
 SHORT = Options(reach_waypoints=5, turn_waypoints=3, move_waypoints=4)
 
-# A cabinet with a swinging arm on a slanted axis, on it a tray that slides, and beside the way two
-# flaps.
+# A cabinet with a swinging arm on a slanted axis, a sliding tray on the arm, and two flaps outside
+# this chain.
 _CABINET = """
 <robot name="cabinet">
   <link name="case"><collision><geometry><box size="0.5 0.5 0.5"/></geometry></collision></link>
@@ -78,7 +78,7 @@ def load_cabinet() -> ArticulatedObject:
 
 
 def replace_objects(scene: Scene, objects: Mapping[str, PlacedObject]) -> Scene:
-    """Return `scene` with `objects` added to its own, or in their place."""
+    """Return `scene` with `objects` added or replaced."""
     return dataclasses.replace(scene, objects={**scene.objects, **objects})
 
 
@@ -92,7 +92,7 @@ def replace_attachment(placed: PlacedObject, attachment: Attachment) -> PlacedOb
 
 @cache
 def make_full_scene() -> Scene:
-    """Return the door's room with a drawer and a cabinet, with grasps of every kind."""
+    """Return the door's room with a drawer and a cabinet that has attachments of every kind."""
     scene, drawer = load_door_scene(), load_scene("drawer").objects["drawer"]
     state = np.array([CABINET_STATE[name] for name in load_cabinet().coordinates.names])
     case = PlacedObject(
@@ -122,7 +122,7 @@ def make_full_scene() -> Scene:
         ),
         turns[2],
     )
-    for freer in (
+    for attachment in (
         dataclasses.replace(
             grip,
             name="rail",
@@ -141,7 +141,7 @@ def make_full_scene() -> Scene:
         dataclasses.replace(grip, name="wheel", joint="listed", freedoms=wheel, standoff=0.02),
         dataclasses.replace(grip, name="face", joint="listed", freedoms=face, standoff=0.01),
     ):
-        case = replace_attachment(case, freer)
+        case = replace_attachment(case, attachment)
     return replace_objects(scene, {"drawer": drawer, "cabinet": case})
 
 
@@ -160,7 +160,7 @@ def sample_configurations(
 
 
 def make_all_pairs(part: PhaseGeometry) -> pin.GeometryModel:
-    """Return a phase's geometry as Pinocchio's own with all pairs, without culling."""
+    """Return a phase's geometry as a Pinocchio model with all pairs, without culling."""
     geometry = pin.GeometryModel()
     for shape in part.shapes:
         geometry.addGeometryObject(shape)
@@ -185,7 +185,7 @@ def make_program(
     options: Options | None = None,
     terms: Sequence[Term] = (),
 ) -> TrajectoryProblem:
-    """Return the program of `steps`; tests of one process share the symbolic ones."""
+    """Return the program of `steps`; symbolic programs are cached per process."""
     return build(scene, steps, options=options, terms=terms, cache=CACHE)
 
 

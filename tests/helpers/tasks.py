@@ -1,4 +1,4 @@
-"""Tasks of the engine, importable by other processes."""
+"""Defines tasks of the engine that other processes can import."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ def double(task: int) -> int:
 
 
 def crash_once(task: tuple[str, int]) -> int:
-    """Kill the process when a task runs first, as the system does when memory is short."""
-    mark = Path(task[0]) / str(task[1])
-    if task[1] == 2 and not mark.exists():
-        mark.touch()
+    """Kill the process in the first run of task 2, as the system does without free memory."""
+    marker = Path(task[0]) / str(task[1])
+    if task[1] == 2 and not marker.exists():
+        marker.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return 2 * task[1]
 

@@ -18,7 +18,7 @@ __all__ = [
     "write_telescope_scene",
 ]
 
-SEGMENT = 0.15  # [m] that each segment comes out
+SEGMENT = 0.15  # extension of each segment [m]
 FOLLOWERS = {f"out_{k}": "out_1" for k in (2, 3, 4)}
 _TOOL = (
     '<joint name="tool_joint" type="fixed">'
@@ -28,7 +28,7 @@ _TOOL = (
 
 
 def format_link(name: str, size: str = "", at: str = "0 0 0") -> str:
-    """Return a link, with a box of some size if one is named."""
+    """Return a link, with a box if `size` is not empty."""
     shape = f'<origin xyz="{at}"/><geometry><box size="{size}"/></geometry>' if size else ""
     return f'<link name="{name}">{f"<collision>{shape}</collision>" if size else ""}</link>'
 
@@ -45,7 +45,7 @@ def format_joint(
     velocity: float = 0.5,
     inside: str = "",
 ) -> str:
-    """Return a joint, with something inside it."""
+    """Return a joint; `inside` holds further elements."""
     limit = "" if kind == "continuous" else f'lower="{limits[0]}" upper="{limits[1]}" '
     return (
         f'<joint name="{name}" type="{kind}"><origin xyz="{at}"/>'
@@ -59,16 +59,15 @@ def write_telescope(
 ) -> Path:
     """Write the robot's URDF, SRDF and robot.yaml into a folder, and return the last.
 
-    At 0 the arm is drawn in and points the hand along x of the base, 0.46 m up; then the tool's z
-    axis is x, and its x axis y.
+    At 0 the arm is retracted, and the hand points along x of the base, 0.46 m up; the tool's z axis
+    is along x, its x axis along y.
 
     Args:
-        folder: Where.
-        couplings: What robot.yaml says of them; None: that the second to fourth segment follow the
-            first.
-        mimics: A word: joints that the URDF lets follow "first", each the first one, or "chain",
-            each the one before it.
-        more: Lines of robot.yaml beyond that.
+        folder: Output folder.
+        couplings: Couplings of robot.yaml. Default: the second to fourth segment follow the first.
+        mimics: Mimic joints of the URDF: "first" (segments follow the first one), "chain" (each
+            follows the previous one), or "" (none).
+        more: Further lines of robot.yaml.
     """
     parts = [
         format_link("body", "0.44 0.4 0.3", "0 0 0.2"),
@@ -82,8 +81,8 @@ def write_telescope(
     below, at = "carriage", "0.05 0 0"
     for k in range(1, 5):
         width = 0.1 - 0.018 * k
-        followed = {"first": "out_1", "chain": f"out_{k - 1}"}.get(mimics, "") if k > 1 else ""
-        inside = f'<mimic joint="{followed}"/>' if followed else ""
+        leader = {"first": "out_1", "chain": f"out_{k - 1}"}.get(mimics, "") if k > 1 else ""
+        inside = f'<mimic joint="{leader}"/>' if leader else ""
         parts += [format_link(f"segment_{k}", f"0.2 {width} {width}", "0.1 0 0")]
         parts.append(
             format_joint(
@@ -130,12 +129,12 @@ def write_telescope(
         ("mast", "carriage"),
     ]
     pairs += [("mast", name) for name in arm] + list(itertools.product(arm[1:], ["yaw", "pitch"]))
-    near = "".join(
+    disabled = "".join(
         f'<disable_collisions link1="{one}" link2="{other}" reason="Adjacent"/>'
         for one, other in dict.fromkeys(pairs)
     )
-    (folder / "robot.srdf").write_text(f'<robot name="robot">{near}</robot>', encoding="utf-8")
-    said = (
+    (folder / "robot.srdf").write_text(f'<robot name="robot">{disabled}</robot>', encoding="utf-8")
+    text = (
         ", ".join(f"{joint}: {leader}" for joint, leader in FOLLOWERS.items())
         if couplings is None
         else couplings
@@ -146,17 +145,17 @@ def write_telescope(
         "tool_frame: tool",
         "touch_links: [hand, finger_a, finger_b]",
     ]
-    lines += [f"couplings: {{{said}}}"] if said else []
+    lines += [f"couplings: {{{text}}}"] if text else []
     (folder / "robot.yaml").write_text("\n".join(lines) + f"\n{more}", encoding="utf-8")
     return folder / "robot.yaml"
 
 
 def write_telescope_scene(folder: Path, *, base: str = "omni") -> Scene:
-    """Return a scene: the robot in front of a drawer that it reaches from where it stands.
+    """Return a scene with the robot in front of a drawer within reach.
 
     Args:
-        folder: Where to write the robot.
-        base: How it moves.
+        folder: Output folder of the robot.
+        base: Kind of the base.
     """
     robot = write_telescope(folder, more="home: {out_1: 0.05, lift: 0.4}\n")
     document = write_cheeks_scene(robot, height=0.9, gap=0.1).document
@@ -168,9 +167,9 @@ def write_coupled_scene(folder: Path, *, base: str = "omni", more: str = "") -> 
     """Return a scene with a drawer and a robot with several kinds of coupled joints.
 
     Args:
-        folder: Where to write the robot.
-        base: How it moves.
-        more: Lines of its robot.yaml.
+        folder: Output folder of the robot.
+        base: Kind of the base.
+        more: Further lines of robot.yaml.
     """
     couplings = (
         "out_2: {joint: out_1, multiplier: 0.5}, "

@@ -1,4 +1,4 @@
-"""Trials of an experiment, importable by other processes."""
+"""Defines trials of an experiment that other processes can import."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def make_trials(number: int = 6, **more: Any) -> list[dict[str, Any]]:
 
 
 def solve_square(spec: dict[str, Any]) -> dict[str, Any]:
-    """A deterministic trial, with the fields and types that records have."""
+    """Run a deterministic trial with the fields and types of records."""
     k = spec["number"]
     values = {
         "evaluations": np.float64(k) / 3.0,

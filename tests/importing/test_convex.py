@@ -19,45 +19,45 @@ concatenate = trimesh.util.concatenate
 CAVITY = (0.24, 0.3, 0.4)  # in the middle of a cabinet
 
 
-def block(low: tuple[float, float, float], high: tuple[float, float, float]) -> Triangles:
+def make_block(low: tuple[float, float, float], high: tuple[float, float, float]) -> Triangles:
     size = np.subtract(high, low)
     return box(size).apply_translation(np.add(low, size / 2.0))
 
 
 def weld(*bodies: Triangles) -> Triangles:
-    """Return one mesh of bodies that share their corners."""
+    """Merge bodies into one mesh with shared vertices."""
     mesh = concatenate(list(bodies))
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     return mesh
 
 
-def open_at(mesh: Triangles, *sides: tuple[int, float]) -> Triangles:
-    """Return a mesh without its triangles in planes, each an axis and a coordinate."""
+def remove_sides(mesh: Triangles, *sides: tuple[int, float]) -> Triangles:
+    """Remove the triangles in planes, each given by an axis and a coordinate."""
     mesh = mesh.copy()
-    for axis, place in sides:
-        mesh.update_faces((np.abs(mesh.triangles[:, :, axis] - place) > 1e-6).any(axis=1))
+    for axis, coordinate in sides:
+        mesh.update_faces((np.abs(mesh.triangles[:, :, axis] - coordinate) > 1e-6).any(axis=1))
     return mesh
 
 
-def sheet_cabinet() -> Triangles:
-    return open_at(block((0, 0, 0), (0.5, 0.6, 0.8)), (0, 0.0))
+def make_sheet_cabinet() -> Triangles:
+    return remove_sides(make_block((0, 0, 0), (0.5, 0.6, 0.8)), (0, 0.0))
 
 
-def boards(*shelves: float) -> Triangles:
-    """Return a cabinet of closed boards, 20 mm thick, with shelves at some heights."""
+def make_board_cabinet(*shelves: float) -> Triangles:
+    """Make a cabinet of solid boards, 20 mm thick, with shelves at the given heights."""
     t, (x, y, z) = 0.02, (0.5, 0.6, 0.8)
     return weld(
-        block((0, 0, 0), (x, y, t)),
-        block((0, 0, z - t), (x, y, z)),
-        block((0, 0, t), (x, t, z - t)),
-        block((0, y - t, t), (x, y, z - t)),
-        block((x - t, t, t), (x, y - t, z - t)),
-        *(block((0, t, height), (x - t, y - t, height + t)) for height in shelves),
+        make_block((0, 0, 0), (x, y, t)),
+        make_block((0, 0, z - t), (x, y, z)),
+        make_block((0, 0, t), (x, t, z - t)),
+        make_block((0, y - t, t), (x, y, z - t)),
+        make_block((x - t, t, t), (x, y - t, z - t)),
+        *(make_block((0, t, height), (x - t, y - t, height + t)) for height in shelves),
     )
 
 
 def mirror(mesh: Triangles) -> Triangles:
-    """Return a mesh mirrored in y with triangles that face inward."""
+    """Mirror a mesh in y, so that its triangles face inward."""
     return Triangles(mesh.vertices * (1, -1, 1), mesh.faces)
 
 
@@ -65,36 +65,34 @@ def turn(mesh: Triangles) -> Triangles:
     return mesh.copy().apply_transform(trimesh.transformations.euler_matrix(0.3, 0.4, 0.5))
 
 
-def touching(*, tee: bool) -> Triangles:
-    """Return two blocks in one mesh, as an L or a T."""
+def make_two_blocks(*, tee: bool) -> Triangles:
+    """Make an L or a T of two blocks in one mesh."""
     shift = 0.13 if tee else 0.0
     return weld(
-        block((0, 0, 0), (0.3, 0.04, 0.03)),
-        block((shift, 0.04 if tee else 0.0, 0), (shift + 0.04, 0.2, 0.03)),
+        make_block((0, 0, 0), (0.3, 0.04, 0.03)),
+        make_block((shift, 0.04 if tee else 0.0, 0), (shift + 0.04, 0.2, 0.03)),
     )
 
 
-def cup(wall: float) -> Triangles:
+def make_cup(wall: float) -> Triangles:
     profile = [[0, 0], [0.1, 0], [0.1, 0.2], [0.1 - wall, 0.2], [0.1 - wall, wall], [0, wall]]
     return revolve(np.array(profile if wall else profile[:3], float), sections=32)
 
 
-def bowl() -> Triangles:
+def make_bowl() -> Triangles:
     ball = trimesh.creation.icosphere(3, 0.15)
     ball.update_faces((ball.triangles[:, :, 2] < 1e-6).all(axis=1))
     return ball
 
 
-def plate_with_hole() -> Triangles:
-    """Return a flat frame."""
+def make_flat_frame() -> Triangles:
     outer = np.array([[-0.3, -0.2, 0.5], [0.3, -0.2, 0.5], [0.3, 0.2, 0.5], [-0.3, 0.2, 0.5]])
     faces = [[k, (k + 1) % 4, 4 + k] for k in range(4)]
     faces += [[(k + 1) % 4, 4 + (k + 1) % 4, 4 + k] for k in range(4)]
     return Triangles(np.vstack([outer, outer * (0.7, 0.7, 1.0)]), faces)
 
 
-def wave() -> Triangles:
-    """Return a corrugated sheet."""
+def make_corrugated_sheet() -> Triangles:
     n = 40
     x, y = np.meshgrid(np.linspace(0.0, 0.6, n), np.linspace(0.0, 0.4, n))
     k = np.arange(n * n).reshape(n, n)
@@ -103,46 +101,46 @@ def wave() -> Triangles:
     return Triangles(vertices, np.vstack([np.column_stack([a, b, c]), np.column_stack([a, c, d])]))
 
 
-def link() -> Triangles:
+def make_chain_link() -> Triangles:
     return torus(0.1, 0.02, major_sections=16, minor_sections=8)
 
 
 Point = tuple[float, float, float]
-ZOO: dict[str, tuple[Callable[[], Triangles], list[Point], int]] = {
+SHAPES: dict[str, tuple[Callable[[], Triangles], list[Point], int]] = {
     # Mesh, points that stay free, largest number of pieces
-    "sheets": (sheet_cabinet, [CAVITY], 5),
-    "dense sheets": (lambda: sheet_cabinet().subdivide_to_size(0.04), [CAVITY], 5),
-    "turned sheets": (lambda: turn(sheet_cabinet()), [], 5),
-    "basket": (lambda: open_at(box((0.4, 0.3, 0.2)), (2, 0.1)), [(0, 0, 0)], 5),
-    "boards": (boards, [CAVITY], 5),
-    "inverted boards": (lambda: mirror(boards()), [(0.24, -0.3, 0.4)], 5),
-    "shelves": (lambda: boards(0.2, 0.5), [(0.24, 0.3, 0.35), (0.24, 0.3, 0.65)], 7),
+    "sheets": (make_sheet_cabinet, [CAVITY], 5),
+    "dense sheets": (lambda: make_sheet_cabinet().subdivide_to_size(0.04), [CAVITY], 5),
+    "turned sheets": (lambda: turn(make_sheet_cabinet()), [], 5),
+    "basket": (lambda: remove_sides(box((0.4, 0.3, 0.2)), (2, 0.1)), [(0, 0, 0)], 5),
+    "boards": (make_board_cabinet, [CAVITY], 5),
+    "inverted boards": (lambda: mirror(make_board_cabinet()), [(0.24, -0.3, 0.4)], 5),
+    "shelves": (lambda: make_board_cabinet(0.2, 0.5), [(0.24, 0.3, 0.35), (0.24, 0.3, 0.65)], 7),
     "many shelves": (
-        lambda: boards(*np.arange(0.08, 0.75, 0.08)),
+        lambda: make_board_cabinet(*np.arange(0.08, 0.75, 0.08)),
         [(0.24, 0.3, 0.13 + 0.08 * k) for k in range(8)],
         14,
     ),
-    "L": (lambda: touching(tee=False), [(0.1, 0.1, 0.015)], 3),
-    "T": (lambda: touching(tee=True), [(0.05, 0.1, 0.015), (0.25, 0.1, 0.015)], 2),
-    "turned L": (lambda: turn(touching(tee=False)), [], 3),
-    "dense L": (lambda: touching(tee=False).subdivide_to_size(0.01), [(0.1, 0.1, 0.015)], 3),
-    "cup": (lambda: cup(0.01), [(0, 0, 0.1)], 12),
-    "cup of sheet": (lambda: cup(0.0), [(0, 0, 0.1)], 12),
+    "L": (lambda: make_two_blocks(tee=False), [(0.1, 0.1, 0.015)], 3),
+    "T": (lambda: make_two_blocks(tee=True), [(0.05, 0.1, 0.015), (0.25, 0.1, 0.015)], 2),
+    "turned L": (lambda: turn(make_two_blocks(tee=False)), [], 3),
+    "dense L": (lambda: make_two_blocks(tee=False).subdivide_to_size(0.01), [(0.1, 0.1, 0.015)], 3),
+    "cup": (lambda: make_cup(0.01), [(0, 0, 0.1)], 12),
+    "cup of sheet": (lambda: make_cup(0.0), [(0, 0, 0.1)], 12),
     "tube": (
-        lambda: open_at(cylinder(0.1, 0.2, sections=24), (2, 0.1), (2, -0.1)),
+        lambda: remove_sides(cylinder(0.1, 0.2, sections=24), (2, 0.1), (2, -0.1)),
         [(0, 0, 0)],
         12,
     ),
-    "bowl": (bowl, [(0, 0, -0.05)], 24),
+    "bowl": (make_bowl, [(0, 0, -0.05)], 24),
     "ring": (lambda: torus(0.2, 0.04, major_sections=24, minor_sections=12), [(0, 0, 0)], 12),
     "links of a chain": (
-        lambda: concatenate([link(), turn(link())]),
+        lambda: concatenate([make_chain_link(), turn(make_chain_link())]),
         [(0, 0, 0)],
         16,
     ),
-    "flat frame": (plate_with_hole, [(0, 0, 0.5)], 6),
-    "wave": (wave, [], 12),
-    # Sides of their boxes are triangles without area.
+    "flat frame": (make_flat_frame, [(0, 0, 0.5)], 6),
+    "wave": (make_corrugated_sheet, [], 12),
+    # The sides of flat boxes are triangles without area.
     "crossing sheets": (
         lambda: concatenate([box((0.6, 0, 0.4)), box((0, 0.6, 0.4))]),
         [(0.15, 0.15, 0)],
@@ -152,15 +150,15 @@ ZOO: dict[str, tuple[Callable[[], Triangles], list[Point], int]] = {
 
 
 def measure_uncovered(pieces: tuple[Triangles, ...], points: np.ndarray) -> np.ndarray:
-    """Return how far points lie outside of all pieces [m], by the planes of their faces."""
-    out = []
+    """Return signed distances of points from the union of pieces [m], by their face planes."""
+    distances = []
     for piece in pieces:
         offsets = np.einsum("ij,ij->i", piece.face_normals, piece.triangles[:, 0])
-        out.append((points @ piece.face_normals.T - offsets).max(axis=1))
-    return np.min(out, axis=0)
+        distances.append((points @ piece.face_normals.T - offsets).max(axis=1))
+    return np.min(distances, axis=0)
 
 
-def sample(mesh: Triangles, count: int) -> np.ndarray:
+def sample_points(mesh: Triangles, count: int) -> np.ndarray:
     points = trimesh.sample.sample_surface(mesh, count, seed=5)[0]
     return np.vstack([mesh.vertices[np.unique(mesh.faces)], points])
 
@@ -174,26 +172,26 @@ def measure_distances(mesh: Triangles, points: np.ndarray) -> np.ndarray:
     triangles.addTriangles(faces)
     triangles.endModel()
     triangles.computeLocalAABB()
-    point, here = coal.Sphere(1e-9), coal.Transform3s()
+    sphere, identity = coal.Sphere(1e-9), coal.Transform3s()
     return np.array(
         [
             coal.distance(
-                point,
-                coal.Transform3s(np.eye(3), place),
+                sphere,
+                coal.Transform3s(np.eye(3), point),
                 triangles,
-                here,
+                identity,
                 coal.DistanceRequest(),
                 coal.DistanceResult(),
             )
-            for place in points
+            for point in points
         ]
     )
 
 
-def check_contract(mesh: Triangles, pieces: Pieces) -> None:
-    """Check that pieces contain a mesh, and protrude by no more than they state."""
+def check_pieces(mesh: Triangles, pieces: Pieces) -> None:
+    """Check that pieces contain the mesh and exceed it by no more than their stated error."""
     assert all(piece.is_volume for piece in pieces.meshes)
-    assert measure_uncovered(pieces.meshes, sample(mesh, 3000)).max() < 1e-4
+    assert measure_uncovered(pieces.meshes, sample_points(mesh, 3000)).max() < 1e-4
     for piece in pieces.meshes:
         points = trimesh.sample.sample_surface(piece, 100, seed=7)[0]
         outward = points + 1e-4 * (points - piece.center_mass)
@@ -203,7 +201,7 @@ def check_contract(mesh: Triangles, pieces: Pieces) -> None:
         assert measure_distances(mesh, points).max(initial=0.0) < pieces.error + 2e-3
 
 
-LONG = (
+SLOW_SHAPES = (
     "bowl",
     "cup",
     "cup of sheet",
@@ -219,25 +217,28 @@ LONG = (
 
 @pytest.mark.parametrize(
     "kind",
-    [pytest.param(kind, marks=pytest.mark.long) if kind in LONG else kind for kind in ZOO],
+    [
+        pytest.param(kind, marks=pytest.mark.long) if kind in SLOW_SHAPES else kind
+        for kind in SHAPES
+    ],
 )
 def test_pieces_contain_the_mesh_and_leave_cavities_free(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(disk_cache.CACHE_VARIABLE, "off")
-    make, free, most = ZOO[kind]
+    make, free, most = SHAPES[kind]
     mesh = make()
     pieces = decompose(mesh)
-    check_contract(mesh, pieces)
+    check_pieces(mesh, pieces)
     assert pieces.error <= 0.02
     assert len(pieces.meshes) <= most
     for point in free:
-        near = float(measure_distances(mesh, np.array([point]))[0])
-        assert measure_uncovered(pieces.meshes, np.array([point])) > near - 0.02 - 1e-4
+        distance = float(measure_distances(mesh, np.array([point]))[0])
+        assert measure_uncovered(pieces.meshes, np.array([point])) > distance - 0.02 - 1e-4
 
 
 def test_long_narrow_strips_are_cut() -> None:
-    """A grid that coarsens a metre of ribbon must not be wider than the ribbon."""
+    """The grid that coarsens a ribbon of 1 m must be finer than the ribbon's width."""
     x = np.linspace(0.0, 1.0, 400)
     z = 0.004 + 0.003 * np.sin(10.0 * x)
     edges = [np.column_stack([x, np.full(400, y), z]) for y in (0.001, 0.004)]
@@ -247,11 +248,11 @@ def test_long_narrow_strips_are_cut() -> None:
     )
     ribbon = Triangles(np.vstack(edges), faces)
     pieces = decompose(ribbon, error=0.004)
-    check_contract(ribbon, pieces)
+    check_pieces(ribbon, pieces)
     assert pieces.error < 0.004 < compute_concavity(ribbon)
 
 
-def test_convex_bodies_stay_as_they_are() -> None:
+def test_convex_bodies_are_not_cut() -> None:
     corner = box((0.1, 0.1, 1)).apply_translation((0.4, 0, 0.6))
     pieces = decompose(trimesh.util.concatenate([box((1, 0.1, 0.1)), corner]))
     assert sorted(len(piece.vertices) for piece in pieces.meshes) == [8, 8]
@@ -261,27 +262,25 @@ def test_convex_bodies_stay_as_they_are() -> None:
     assert (single.solid, single.overhead) == pytest.approx((0.006, 0.0), abs=1e-9)
 
 
-def test_cached_pieces_equal_the_first_ones(
+def test_cached_pieces_equal_computed_pieces(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Pieces from the cache equal those of the first call bit for bit."""
     monkeypatch.setenv(disk_cache.CACHE_VARIABLE, str(tmp_path / "cache"))
-    mesh = cup(0.02)
+    mesh = make_cup(0.02)
     assert compute_concavity(mesh) > 0.06
     pieces = decompose(mesh)
     assert pieces.solid == pytest.approx(mesh.volume)
     assert pieces.overhead < 0.3
     assert decompose(mesh, most_pieces=1).overhead > 0.8
-    again = decompose(mesh)
-    assert (again.solid, again.error) == (pieces.solid, pieces.error)
-    for one, other in zip(pieces.meshes, again.meshes, strict=True):
+    cached = decompose(mesh)
+    assert (cached.solid, cached.error) == (pieces.solid, pieces.error)
+    for one, other in zip(pieces.meshes, cached.meshes, strict=True):
         np.testing.assert_array_equal(one.vertices, other.vertices)
         np.testing.assert_array_equal(one.faces, other.faces)
     assert len(decompose(mesh, most_pieces=6).meshes) <= 6
 
 
-def test_volume_of_an_open_surface() -> None:
-    """A box without a corner of its lid holds what it held; one without the lid is a thin shell."""
+def test_box_without_its_lid_is_a_thin_shell_and_one_with_a_hole_is_solid() -> None:
     whole = box((0.4, 0.3, 0.2)).subdivide_to_size(0.02)
     pierced, open_ = whole.copy(), whole.copy()
     pierced.update_faces(np.arange(len(whole.faces)) != 7)
@@ -289,18 +288,19 @@ def test_volume_of_an_open_surface() -> None:
     assert compute_solid_volume(whole) == pytest.approx(0.024)
     assert compute_solid_volume(open_) < 0.3 * 0.024
     assert not pierced.is_watertight
+    assert compute_solid_volume(pierced) == pytest.approx(0.024, rel=0.01)
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"most_pieces": 0}, {"error": 0.0}, {"error": float("nan")}, {"corners": 3}]
+    "argument", [{"most_pieces": 0}, {"error": 0.0}, {"error": float("nan")}, {"corners": 3}]
 )
-def test_invalid_arguments_are_named(wrong: dict[str, float]) -> None:
+def test_errors_name_the_invalid_argument(argument: dict[str, float]) -> None:
     with pytest.raises(vkc.InputError) as caught:
-        decompose(box((1, 1, 1)), **wrong)  # type: ignore[arg-type]
-    assert caught.value.field == next(iter(wrong))
+        decompose(box((1, 1, 1)), **argument)  # type: ignore[arg-type]
+    assert caught.value.field == next(iter(argument))
 
 
-def test_invalid_meshes_are_named() -> None:
+def test_errors_name_the_invalid_part_of_a_mesh() -> None:
     broken = box((1, 1, 1))
     broken.vertices[3, 1] = np.nan
     for mesh, field in ((broken, "mesh.vertices[3, 1]"), (Triangles(), "mesh")):

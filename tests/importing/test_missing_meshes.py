@@ -12,11 +12,11 @@ from vkc_pin.world.files.urdf import UrdfFile, read_urdf
 
 BOX = '<{kind}><geometry><box size="1 1 1"/></geometry></{kind}>'
 MESH = '<{kind}><geometry><mesh filename="{{}}"/></geometry></{kind}>'
-SOLID, SEEN = MESH.format(kind="collision"), MESH.format(kind="visual")
+COLLISION, VISUAL = MESH.format(kind="collision"), MESH.format(kind="visual")
 
 
-def write(folder: Path, *shapes: str) -> UrdfFile:
-    """Write a URDF with one link per argument, and the mesh there.stl beside it."""
+def write_robot(folder: Path, *shapes: str) -> UrdfFile:
+    """Write a URDF with one link per argument, and meshes there.stl and again.STL beside it."""
     trimesh.creation.box((1, 1, 1)).export(folder / "there.stl")
     (folder / "again.STL").write_bytes((folder / "there.stl").read_bytes())
     links = "".join(f'<link name="l{k}">{text}</link>' for k, text in enumerate(shapes))
@@ -31,19 +31,23 @@ def write(folder: Path, *shapes: str) -> UrdfFile:
 @pytest.mark.parametrize(
     ("shapes", "note", "kinds"),
     [
-        (SOLID.format("there.std"), "there.std: there.stl beside it is used", ["mesh"]),
-        (SOLID.format("there"), "there.stl beside it", ["mesh"]),
-        (SOLID.format("there.STL"), "there.stl beside it", ["mesh"]),
-        (SOLID.format("again.stl"), "again.STL beside it", ["mesh"]),
-        (SOLID.format("file://./there.dae"), "there.stl beside it", ["mesh"]),
-        (SEEN.format("there.stl") + SOLID.format("gone.stl"), "visual shapes collide", ["mesh"]),
+        (COLLISION.format("there.std"), "there.std: there.stl beside it is used", ["mesh"]),
+        (COLLISION.format("there"), "there.stl beside it", ["mesh"]),
+        (COLLISION.format("there.STL"), "there.stl beside it", ["mesh"]),
+        (COLLISION.format("again.stl"), "again.STL beside it", ["mesh"]),
+        (COLLISION.format("file://./there.dae"), "there.stl beside it", ["mesh"]),
         (
-            BOX.format(kind="visual") + SOLID.format("a.stl") + SOLID.format("b.stl"),
+            VISUAL.format("there.stl") + COLLISION.format("gone.stl"),
+            "visual shapes collide",
+            ["mesh"],
+        ),
+        (
+            BOX.format(kind="visual") + COLLISION.format("a.stl") + COLLISION.format("b.stl"),
             "no collision mesh b.stl: the link's visual shapes collide",
             ["box"],
         ),
         (
-            SEEN.format("gone.dae") + BOX.format(kind="collision"),
+            VISUAL.format("gone.dae") + BOX.format(kind="collision"),
             "no visual mesh gone.dae: left out",
             ["box"],
         ),
@@ -52,37 +56,37 @@ def write(folder: Path, *shapes: str) -> UrdfFile:
 def test_missing_meshes_are_replaced(
     tmp_path: Path, shapes: str, note: str, kinds: list[str]
 ) -> None:
-    file = write(tmp_path, shapes)
+    file = write_robot(tmp_path, shapes)
     notes = replace_missing_meshes(file, every_link=True)
     assert note in "; ".join(notes)
     assert [shape.kind for shape in file.read_shapes("collision")] == kinds
     file.read_shapes("visual")
-    read = read_object_urdf(tmp_path / "r.urdf")
-    assert note in "; ".join(read.notes)
-    assert [part.kind for part in read.links["l0"].solid] == kinds
+    description = read_object_urdf(tmp_path / "r.urdf")
+    assert note in "; ".join(description.notes)
+    assert [part.kind for part in description.links["l0"].solid] == kinds
 
 
 def test_all_missing_meshes_are_listed(tmp_path: Path) -> None:
-    shapes = [SOLID.format(name) for name in ("a.stl", "there.stl", "package://p/b.dae")]
+    shapes = [COLLISION.format(name) for name in ("a.stl", "there.stl", "package://p/b.dae")]
     with pytest.raises(InputError, match=r"2 meshes do not exist: a\.stl, package://p/b\.dae"):
-        replace_missing_meshes(write(tmp_path, *shapes), every_link=True)
+        replace_missing_meshes(write_robot(tmp_path, *shapes), every_link=True)
     with pytest.raises(InputError, match=r"a\.stl: there is no such mesh"):
-        replace_missing_meshes(write(tmp_path, *shapes[:2]), every_link=True)
+        replace_missing_meshes(write_robot(tmp_path, *shapes[:2]), every_link=True)
 
 
 @pytest.mark.parametrize("address", ["{}.stl", "package://{}/a.stl", "model://p/{}", "file:///{}"])
-def test_meshes_whose_names_no_file_can_have_are_missing(tmp_path: Path, address: str) -> None:
+def test_meshes_with_impossible_file_names_are_missing(tmp_path: Path, address: str) -> None:
     for name in ("é" * 300, "a/" * 3000, "%00"):
-        file = write(tmp_path, SOLID.format(address.format(name)))
+        file = write_robot(tmp_path, COLLISION.format(address.format(name)))
         with pytest.raises(InputError, match="there is no such mesh") as caught:
             replace_missing_meshes(file, every_link=True)
         assert caught.value.file == tmp_path / "r.urdf"
 
 
-def test_visual_meshes_that_collide_are_needed(tmp_path: Path) -> None:
-    """Objects collide with visual shapes of every such link, robots if there are no others."""
-    cosmetic = (BOX.format(kind="collision"), SEEN.format("gone.stl"))
-    assert len(replace_missing_meshes(write(tmp_path, *cosmetic), every_link=False)) == 1
+def test_missing_visual_meshes_that_collide_are_errors(tmp_path: Path) -> None:
+    """Visual shapes collide per link in objects, but in robots only without collision shapes."""
+    cosmetic = (BOX.format(kind="collision"), VISUAL.format("gone.stl"))
+    assert len(replace_missing_meshes(write_robot(tmp_path, *cosmetic), every_link=False)) == 1
     for shapes, every_link in ((cosmetic, True), (cosmetic[1:], False)):
         with pytest.raises(InputError, match=r"gone\.stl"):
-            replace_missing_meshes(write(tmp_path, *shapes), every_link=every_link)
+            replace_missing_meshes(write_robot(tmp_path, *shapes), every_link=every_link)

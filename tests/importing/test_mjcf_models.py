@@ -23,19 +23,27 @@ def compile_door(folder: Path, **parts: str) -> tuple[object, str]:
     return model, "; ".join(notes)
 
 
-PAINT = '<asset><texture name="t" type="{}" {}/><material name="m" texture="t"/></asset>'
+TEXTURE = '<asset><texture name="t" type="{}" {}/><material name="m" texture="t"/></asset>'
 MESH = '<asset><mesh name="l" file="gone.obj"/></asset>'
-SEEN, SOLID = ' contype="0" conaffinity="0"', '<geom type="mesh" mesh="l"{}/>'
+VISUAL, MESH_GEOM = ' contype="0" conaffinity="0"', '<geom type="mesh" mesh="l"{}/>'
 
 
 @pytest.mark.parametrize(
     ("parts", "note", "count"),
     [
-        ({"head": PAINT.format("2d", 'file="a/wood.png"'), "leaf": ' material="m"'}, "wood.png", 2),
-        ({"head": PAINT.format("cube", 'fileright="r.png"'), "leaf": ' material="m"'}, "r.png", 2),
-        ({"head": PAINT.format("skybox", 'file="sky.png"')}, "sky.png", 2),
-        ({"head": MESH, "more": SOLID.format(SEEN)}, "'gone.obj' of body 'door'", 2),
-        ({"head": MESH, "more": SOLID.format(""), "leaf": SEEN}, "visual shapes collide", 2),
+        (
+            {"head": TEXTURE.format("2d", 'file="a/wood.png"'), "leaf": ' material="m"'},
+            "wood.png",
+            2,
+        ),
+        (
+            {"head": TEXTURE.format("cube", 'fileright="r.png"'), "leaf": ' material="m"'},
+            "r.png",
+            2,
+        ),
+        ({"head": TEXTURE.format("skybox", 'file="sky.png"')}, "sky.png", 2),
+        ({"head": MESH, "more": MESH_GEOM.format(VISUAL)}, "'gone.obj' of body 'door'", 2),
+        ({"head": MESH, "more": MESH_GEOM.format(""), "leaf": VISUAL}, "visual shapes collide", 2),
         ({"head": MESH}, "", 2),
         ({"tail": '<keyframe><key qpos="0 0 0"/></keyframe>'}, "invalid qpos size", 2),
         ({"tail": '<sensor><touch site="none"/></sensor>'}, "unrecognized name 'none'", 2),
@@ -47,7 +55,7 @@ SEEN, SOLID = ' contype="0" conaffinity="0"', '<geom type="mesh" mesh="l"{}/>'
         ),
     ],
 )
-def test_flaws_that_geometry_does_not_need_are_noted(
+def test_errors_outside_the_geometry_are_noted(
     tmp_path: Path, parts: dict[str, str], note: str, count: int
 ) -> None:
     model, notes = compile_door(tmp_path, **parts)
@@ -81,6 +89,6 @@ def test_all_missing_collision_meshes_are_listed(tmp_path: Path) -> None:
         compile_door(tmp_path, head=f"<asset>{head}</asset>", more=more)
 
 
-def test_errors_of_geometry_stay_errors(tmp_path: Path) -> None:
+def test_errors_in_the_geometry_are_raised(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"MuJoCo cannot read the file: .*size 0 must be"):
         compile_door(tmp_path, more='<geom type="sphere" size="0"/>')

@@ -1,4 +1,4 @@
-"""Hostile xacro, MJCF and mesh files end in an error that names the file and the reason."""
+"""Tests that hostile xacro, MJCF and mesh files raise errors that name the file and the reason."""
 
 from __future__ import annotations
 
@@ -54,19 +54,21 @@ IMPORTS = [import_object, import_robot, import_home]
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return the current folder, in which there is a pipe that nobody writes to."""
+    """Return the current folder, which contains a pipe without a writer."""
     os.mkfifo(tmp_path / "pipe")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
 def limit_time(reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wait only briefly for files that take for ever."""
+    """Set a short time limit for files whose processing never ends."""
     monkeypatch.setenv(TIME_VARIABLE, "1" if reason == "in time" else "60")
 
 
 @pytest.mark.parametrize("kind", HOSTILE_XACRO)
-def test_hostile_xacro_is_refused(folder: Path, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hostile_xacro_is_rejected(
+    folder: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("xacro")
     text, reason = HOSTILE_XACRO[kind]
     limit_time(reason, monkeypatch)
@@ -77,18 +79,21 @@ def test_hostile_xacro_is_refused(folder: Path, kind: str, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize(
-    ("kind", "does"),
-    [*((kind, import_object) for kind in HOSTILE_MJCF), *(("itself", one) for one in IMPORTS[1:])],
+    ("kind", "import_file"),
+    [
+        *((kind, import_object) for kind in HOSTILE_MJCF),
+        *(("itself", function) for function in IMPORTS[1:]),
+    ],
 )
-def test_hostile_mjcf_is_refused(
-    folder: Path, kind: str, does: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+def test_hostile_mjcf_is_rejected(
+    folder: Path, kind: str, import_file: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("mujoco")
     before, inside, reason = HOSTILE_MJCF[kind]
     limit_time(reason, monkeypatch)
     (folder / "a.xml").write_text(MJCF.format(before, inside), encoding="utf-8")
     with pytest.raises(InputError, match=rf"^a.xml: MuJoCo .*{reason}"):
-        does("a.xml", "out")
+        import_file("a.xml", "out")
     assert sorted(file.name for file in folder.iterdir()) == ["a.xml", "pipe"]
 
 
@@ -123,7 +128,7 @@ PLY = b"ply\nformat ascii 1.0\nelement vertex 99999999999\nproperty float x\nend
     ],
     ids=["stl", "ply", "off", "obj", "dae", "deep dae", "glb"],
 )
-def test_broken_meshes_are_refused(folder: Path, name: str, data: bytes) -> None:
+def test_broken_meshes_are_rejected(folder: Path, name: str, data: bytes) -> None:
     (folder / name).write_bytes(data)
     with pytest.raises(InputError, match=rf"{name}: .*(read the mesh|mesh is empty|crashes)"):
         load_mesh(folder / name)
@@ -137,7 +142,7 @@ def test_ctrl_c_ends_an_import(folder: Path) -> None:
     process = subprocess.Popen(command, start_new_session=True, env=environment)
     time.sleep(3.0)
     os.killpg(process.pid, signal.SIGINT)  # as the terminal does
-    # the latter: on a slow machine, before the command handles the signal
+    # -SIGINT: on a slow machine, the signal arrives before the command handles it
     assert process.wait(timeout=10) in (130, -signal.SIGINT)
     assert sorted(file.name for file in folder.iterdir()) == ["a.xml", "pipe"]
 
@@ -152,19 +157,21 @@ def test_ctrl_c_ends_an_import(folder: Path) -> None:
         ('<link name="b"><note>$(arg n)</note></link>', "robot.urdf", True),
     ],
 )
-def test_files_that_xacro_wrote_do_not_need_it(elements: str, name: str, expected: bool) -> None:
-    """They declare its namespace, but contain neither its elements nor substitutions."""
+def test_only_xacro_elements_and_substitutions_need_xacro(
+    elements: str, name: str, expected: bool
+) -> None:
+    """Files written by xacro contain neither, but declare its namespace."""
     file = Path(name)
     assert uses_xacro(parse_xml(XACRO.format(elements), file), file) == expected
 
 
-def test_robot_that_xacro_wrote_is_read_without_xacro(
+def test_robot_written_by_xacro_is_read_without_xacro(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "xacro", None)  # as if it was not installed
+    monkeypatch.setitem(sys.modules, "xacro", None)  # as if not installed
     (tmp_path / "robot.urdf").write_text(XACRO.format(""))
-    found = read_source(tmp_path / "robot.urdf", tmp_path, packages={}, arguments={})
-    assert found.kind == "URDF"
+    source = read_source(tmp_path / "robot.urdf", tmp_path, packages={}, arguments={})
+    assert source.kind == "URDF"
     (tmp_path / "robot.urdf").write_text(XACRO.format('<link name="${1}"/>'))
     with pytest.raises(InputError, match="needs the Python package xacro"):
         read_source(tmp_path / "robot.urdf", tmp_path, packages={}, arguments={})

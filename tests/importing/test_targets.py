@@ -1,4 +1,4 @@
-"""Imports overwrite only their own earlier output."""
+"""Tests that imports overwrite only their own earlier output."""
 
 from __future__ import annotations
 

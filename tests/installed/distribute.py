@@ -1,4 +1,4 @@
-"""Runs trials on a worker of a scheduler that has a dashboard."""
+"""Runs trials on a Dask cluster with a dashboard."""
 
 from __future__ import annotations
 

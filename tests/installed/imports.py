@@ -12,7 +12,7 @@ import vkc_pin as vkc
 
 SAMPLES = 50
 L_SHAPE = [(0.05, 0.05), (-0.3, 0.05), (-0.3, -0.3), (0.3, -0.3), (0.3, 0.3), (0.05, 0.3)]
-"""Corners of a concave prism, [m], beginning with the one from which all others are visible."""
+"""Corners of a concave prism, [m], starting with the one from which all others are visible."""
 HOME = """<robot name="home"><link name="world">
 <collision name="north"><origin xyz="0 3 1"/><geometry><box size="6 0.1 2"/></geometry></collision>
 <collision name="south"><origin xyz="0 -3 1"/><geometry><box size="6 0.1 2"/></geometry></collision>

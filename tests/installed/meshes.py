@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from helpers.poles import POLE, write_pole
+from helpers.poles import write_pole
 
 import vkc_pin as vkc
 from vkc_pin.world.files.meshes import load_convex, load_mesh, load_parts
@@ -27,7 +27,7 @@ DAE = """<?xml version="1.0"?>
 
 
 def write_formats(folder: Path) -> None:
-    """Write the pole in every format, in text that is not UTF-8 where a format is text."""
+    """Write the pole in every format; OBJ and MTL files in Latin-1 with non-ASCII comments."""
     pole = load_mesh(write_pole(folder / "pole.obj"))
     for name in ("stl", "ply", "off", "glb"):
         pole.export(folder / f"pole.{name}")
@@ -65,7 +65,6 @@ def main() -> None:
     document = {"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}, "obstacles": obstacles}
     scene = vkc.Scene.from_document(document)
     assert scene.obstacle_names == FORMATS
-    assert np.ptp(POLE[:, 2]) > 0.5
 
 
 if __name__ == "__main__":

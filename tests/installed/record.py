@@ -1,4 +1,4 @@
-"""Writes a recording of ROS 2, and reads it."""
+"""Writes a plan as a ROS 2 bag, and reads it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Executes a plan in physics."""
+"""Executes a plan in the physics simulation."""
 
 from __future__ import annotations
 

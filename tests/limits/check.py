@@ -12,78 +12,90 @@ from .files import Limits, Motion
 __all__ = ["RATE", "Excess", "Verdict", "check_motion"]
 
 RATE = 1000.0  # [Hz]
-SLACK = 1e-6  # of a rate's limit: rounding
-OUTSIDE = 1e-6  # [m] or [rad] of a position
+SLACK = 1e-6  # relative excess over a rate limit: rounding
+OUTSIDE = 1e-6  # [m] or [rad] beyond a position limit: rounding
 REST = 1e-6  # [m/s] or [rad/s] at both ends
 
 
 @dataclass(frozen=True)
 class Excess:
-    """A violated limit: kind of quantity, coordinate, time [s] and value."""
+    """A violated limit: quantity, coordinate, time [s], value and limit."""
 
-    what: str
+    quantity: str
     name: str
     time: float
     value: float
     limit: float
 
     def __str__(self) -> str:
-        where = f"{self.what} of {self.name} at {self.time:.3f} s"
+        where = f"{self.quantity} of {self.name} at {self.time:.3f} s"
         return f"{where}: {self.value:.9g}, limit {self.limit:.9g}"
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The number of samples, the violated limits, and the largest rates relative to limits."""
+    """Number of samples, violated limits, and largest rates relative to their limits."""
 
-    moments: int
-    found: list[Excess]
+    samples: int
+    excesses: list[Excess]
     velocity: float
     acceleration: float
 
 
 def check_motion(motion: Motion, limits: Mapping[str, Limits]) -> Verdict:
-    """Compare a motion with limits, which must be known of all its coordinates.
+    """Compare a motion with the limits of all its coordinates.
 
-    Velocities and accelerations are looked at twice: as the cubics have them at every moment, and
-    as differences of positions a millisecond apart, which know of no cubics. Jerks are differences
-    of accelerations.
+    Velocities and accelerations are checked twice: as derivatives of the cubics, and as differences
+    of positions at intervals of 1 ms, independent of the cubics. Jerks are differences of
+    accelerations.
     """
     count = int(np.floor((motion.times[-1] - motion.times[0]) * RATE + 1e-9))
     times = motion.times[0] + np.arange(count + 1) / RATE
     positions, velocities, accelerations = (_sample(motion, times, order) for order in range(3))
     first, second = np.diff(positions, axis=0) * RATE, np.diff(positions, 2, axis=0) * RATE**2
-    found, shares = list[Excess](), {"velocity": 0.0, "acceleration": 0.0}
+    excesses, ratios = list[Excess](), {"velocity": 0.0, "acceleration": 0.0}
     for k, name in enumerate(motion.names):
-        own = limits[name]
-        outside = np.maximum(own.low - positions[:, k], positions[:, k] - own.high)
-        found += _find_worst("position", name, outside - OUTSIDE, times, positions[:, k], own.high)
-        for what, limit, columns in (
-            ("velocity", own.velocity, (velocities[:, k], first[:, k])),
-            ("acceleration", own.acceleration, (accelerations[:, k], second[:, k])),
+        own_limits = limits[name]
+        outside = np.maximum(own_limits.low - positions[:, k], positions[:, k] - own_limits.high)
+        excesses += _find_worst(
+            "position", name, outside - OUTSIDE, times, positions[:, k], own_limits.high
+        )
+        for quantity, limit, columns in (
+            ("velocity", own_limits.velocity, (velocities[:, k], first[:, k])),
+            ("acceleration", own_limits.acceleration, (accelerations[:, k], second[:, k])),
         ):
             for column in columns:
-                found += _find_worst(
-                    what, name, np.abs(column) - (1.0 + SLACK) * limit, times, column, limit
+                excesses += _find_worst(
+                    quantity, name, np.abs(column) - (1.0 + SLACK) * limit, times, column, limit
                 )
-                shares[what] = max(shares[what], float(np.abs(column).max() / limit))
-        slope = (
-            np.diff(accelerations[:, k]) * RATE
-        )  # where accelerations jump, it is as steep as can be
-        found += _find_worst(
-            "jerk", name, np.abs(slope) - (1.0 + SLACK) * own.jerk, times, slope, own.jerk
+                ratios[quantity] = max(ratios[quantity], float(np.abs(column).max() / limit))
+        jerks = np.diff(accelerations[:, k]) * RATE  # very large where accelerations jump
+        excesses += _find_worst(
+            "jerk",
+            name,
+            np.abs(jerks) - (1.0 + SLACK) * own_limits.jerk,
+            times,
+            jerks,
+            own_limits.jerk,
         )
         ends = motion.velocities[[0, -1], k]
-        found += _find_worst("rest", name, np.abs(ends) - REST, motion.times[[0, -1]], ends, 0.0)
-    return Verdict(len(times), found, **shares)
+        excesses += _find_worst("rest", name, np.abs(ends) - REST, motion.times[[0, -1]], ends, 0.0)
+    return Verdict(len(times), excesses, **ratios)
 
 
 def _find_worst(
-    what: str, name: str, excess: np.ndarray, times: np.ndarray, values: np.ndarray, limit: float
+    quantity: str,
+    name: str,
+    excess: np.ndarray,
+    times: np.ndarray,
+    values: np.ndarray,
+    limit: float,
 ) -> list[Excess]:
     k = int(np.argmax(excess))
     return (
-        [] if excess[k] <= 0.0 else [Excess(what, name, float(times[k]), float(values[k]), limit)]
+        []
+        if excess[k] <= 0.0
+        else [Excess(quantity, name, float(times[k]), float(values[k]), limit)]
     )
 
 
@@ -103,8 +115,7 @@ def _sample(motion: Motion, times: np.ndarray, order: int) -> np.ndarray:
         motion.positions[k + 1],
         motion.velocities[k + 1],
     )
-    # Differences of positions, not these themselves: rounding is divided by the square of a short
-    # span.
+    # Differences of positions avoid rounding errors, which a division by span² amplifies.
     from_p = weights[0] + weights[2] if order == 0 else 0.0
     return (
         from_p * p + weights[2] * (q - p) + span * (weights[1] * v + weights[3] * w)

@@ -1,4 +1,4 @@
-"""Has plans made, of all the experiments' tasks and of random rooms, and exports them."""
+"""Plans the tasks of all experiments and of random rooms, and exports the motions."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from vkc_pin.benchmarks.problems.problem_set import NUMBER, TASKS, make_start, p
 
 __all__ = ["export_plans"]
 
-_ROOMS = NUMBER - 20  # of the problems, those in random rooms
+_ROOMS = NUMBER - 20  # number of problems in random rooms
 
 
 def export_plans(folder: Path, count: int, *, first: int = 0, seed: int = 0) -> Iterator[Path]:
-    """Plan, export a table, and yield the .npz of each success; existing files are reused.
+    """Plan problems, export tables, and yield the .npz of each success; existing files are reused.
 
     Args:
-        folder: Where to write.
-        count: How many problems.
-        first: The number of the first: every fourth one is in a random room, as long as there are
-            such.
-        seed: Of the starts and of planning.
+        folder: Folder of the exported files.
+        count: Number of problems.
+        first: Number of the first problem. Every fourth problem is in a random room, until the
+            rooms run out.
+        seed: Random seed of the starts and of planning.
     """
     rooms = range(_ROOMS)
     for number in range(first, first + count):

@@ -1,5 +1,5 @@
-"""Checks whether tests notice small faults in the package.
+"""Checks whether the tests detect small faults in the package.
 
-`python -m tests.mutants --sample 100 --seed 1` draws faults, runs the tests that execute a changed
-line with each of them, and prints those that no test notices.
+`python -m tests.mutants --sample 100 --seed 1` samples faults, runs the tests that execute the
+changed line of each fault, and prints the faults that no test detects.
 """

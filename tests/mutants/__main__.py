@@ -1,4 +1,4 @@
-"""Runs tests on faults at random places: `python -m tests.mutants --sample 100 --seed 1`."""
+"""Runs tests with faults in random lines: `python -m tests.mutants --sample 100 --seed 1`."""
 
 from __future__ import annotations
 
@@ -33,31 +33,31 @@ IMPORTED = (
     "toppra",
     "trimesh",
 )
-MAX_SECONDS = 60.0  # processor time of the tests that a fault has to survive
-PATIENCE = 5.0  # tests that take so many times as long as without the fault, and 30 s more, fail
+MAX_SECONDS = 60.0  # [s] of CPU time after which a fault counts as survived
+PATIENCE = 5.0  # time limit of a test: 30 s plus this multiple of its time without the fault
 
 
-def show(line: str) -> None:
-    """Print a line at once."""
+def print_line(line: str) -> None:
+    """Print a line and flush."""
     sys.stdout.write(f"{line}\n")
     sys.stdout.flush()
 
 
 class Executed(NamedTuple):
-    """A test without a fault: its processor time [s], and module → the lines that it executes."""
+    """Execution of a test without a fault: CPU time [s], and module → executed lines."""
 
     seconds: float
     lines: Mapping[str, Sequence[int]]
 
 
-Coverage = dict[str, dict[str, Executed]]  # file → id → test; "" stands for imports
+Coverage = dict[str, dict[str, Executed]]  # file → id → test; the id "" denotes imports
 
 
 def list_files(names: Sequence[str], root: Path, pattern: str) -> list[str]:
-    """Return the files of folders and files below `root`, relative to it.
+    """Return the files in folders below `root`, relative to it.
 
     Raises:
-        SystemExit: One of them does not exist.
+        SystemExit: A file or folder does not exist.
     """
     paths = [root / name for name in names]
     for path in paths:
@@ -68,24 +68,24 @@ def list_files(names: Sequence[str], root: Path, pattern: str) -> list[str]:
 
 
 def sample_mutants(modules: Sequence[str], count: int, seed: int) -> list[Mutant]:
-    """Return faults of random lines: one of each line before a second one of any."""
+    """Return faults of random lines: one fault of each line before a second one of any line."""
     lines = defaultdict[tuple[str, int], list[Mutant]](list)
     for module in modules:
         for mutant in iterate_mutants(module, (PACKAGE / module).read_text(encoding="utf-8")):
             lines[module, mutant.line].append(mutant)
     rng = random.Random(seed)
     order = []
-    for own in lines.values():
-        rng.shuffle(own)
+    for faults in lines.values():
+        rng.shuffle(faults)
         place = rng.random()
-        order += [(turn, place, mutant) for turn, mutant in enumerate(own)]
+        order += [(turn, place, mutant) for turn, mutant in enumerate(faults)]
     return [mutant for *_, mutant in sorted(order, key=lambda item: item[:2])[:count]]
 
 
 def run_tests(files: Sequence[str], folder: Path, make_plugin: Callable[[], Any]) -> bool:
-    """Return whether tests pass with a plugin of pytest; `pytest.log` says why they fail.
+    """Return whether tests pass with a pytest plugin; `pytest.log` has the failures.
 
-    They run in a copy of this process, which has imported everything but the package.
+    The tests run in a fork of this process, which has imported all dependencies of the package.
     """
     if child := os.fork():
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
@@ -104,7 +104,7 @@ def run_tests(files: Sequence[str], folder: Path, make_plugin: Callable[[], Any]
 
 
 def measure_coverage(files: Sequence[str], folder: Path) -> Coverage:
-    """Return what each test of some files executes; kept in a folder until a source changes.
+    """Return the lines that each test executes, cached in a folder until a source changes.
 
     Raises:
         SystemExit: A test fails without a fault.
@@ -112,7 +112,7 @@ def measure_coverage(files: Sequence[str], folder: Path) -> Coverage:
     common = hashlib.sha256()
     for path in sorted([*PACKAGE.rglob("*.py"), *(ROOT / "tests" / "helpers").rglob("*.py")]):
         common.update(path.read_bytes())
-    found: Coverage = {}
+    coverage: Coverage = {}
     folder.mkdir(parents=True, exist_ok=True)
     for number, file in enumerate(files, 1):
         digest = common.copy()
@@ -121,29 +121,30 @@ def measure_coverage(files: Sequence[str], folder: Path) -> Coverage:
         if not record.exists():
             for old in folder.glob(f"{file.replace('/', '.')}.*.json"):
                 old.unlink()
-            show(f"recording {number} of {len(files)}: {file}")
+            print_line(f"recording {number} of {len(files)}: {file}")
             if not run_tests([file], folder, lambda path=record: Recorder(path)):
                 raise SystemExit(f"{file} fails without a fault: see {folder / 'pytest.log'}")
         tests = json.loads(record.read_text(encoding="utf-8"))
-        found[file] = {name: Executed(*test) for name, test in tests.items()}
-    return found
+        coverage[file] = {name: Executed(*test) for name, test in tests.items()}
+    return coverage
 
 
 def select_tests(mutant: Mutant, coverage: Coverage) -> list[str]:
-    """Return the tests that may notice a fault, in the order in which they should run.
+    """Return the tests that may detect a fault, in the order of execution.
 
-    Those that execute the line come first: those in the file of the module's own tests, then those
-    in its folder; quick ones before slow ones. Then come the others of these files: what several
-    tests of a file share is executed by the first of them alone. A line that is executed when the
-    package is imported concerns all tests that execute some line of its module. No test begins
-    after MAX_SECONDS.
+    Tests that execute the line come first: those in the module's own test file, then those in its
+    folder, quick tests before slow ones. The other tests of these files follow, since only the
+    first test of a file executes shared fixtures. A line that is executed at import selects all
+    tests that execute any line of its module. No test begins after MAX_SECONDS.
     """
     module = Path("tests", mutant.module)
     own_tests = module.with_name(f"test_{module.stem}")
     users, order = set(mutant.users), []
     executed, imported = dict[str, set[int]](), set[int]()
-    for own in coverage.values():
-        executed |= {name: set(test.lines.get(mutant.module, ())) for name, test in own.items()}
+    for tests_of_file in coverage.values():
+        executed |= {
+            name: set(test.lines.get(mutant.module, ())) for name, test in tests_of_file.items()
+        }
         imported |= executed.pop("")
     if users <= imported:
         users = set().union(*executed.values())
@@ -160,11 +161,13 @@ def select_tests(mutant: Mutant, coverage: Coverage) -> list[str]:
 
 
 def run_mutant(mutant: Mutant, coverage: Coverage, folder: Path) -> str:
-    """Return "killed", "survived", or "uncovered" where no test executes the line."""
+    """Return "killed", "survived", or "uncovered" if no test executes the line."""
     selected = select_tests(mutant, coverage)
     if not selected:
         return "uncovered"
-    tests = {name: test for own in coverage.values() for name, test in own.items()}
+    tests = {
+        name: test for tests_of_file in coverage.values() for name, test in tests_of_file.items()
+    }
     limits = {name: 30.0 + PATIENCE * tests[name].seconds for name in selected}
     files = list(dict.fromkeys(name.partition("::")[0] for name in selected))
     passed = run_tests(files, folder, lambda: Replacer(mutant.module, mutant.source, limits))
@@ -172,29 +175,31 @@ def run_mutant(mutant: Mutant, coverage: Coverage, folder: Path) -> str:
 
 
 def main() -> int:
-    """Run faults; return 1 if one survives."""
+    """Run tests with sampled faults; return 1 unless all faults are killed."""
     parser = argparse.ArgumentParser(prog="python -m tests.mutants", description=__doc__)
     parser.add_argument("--sample", type=int, default=100, help="number of faults")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--modules", nargs="+", default=MODULES, help="folders and modules")
     parser.add_argument("--tests", nargs="+", default=TESTS, help="folders and files of tests")
-    given = parser.parse_args()
+    options = parser.parse_args()
     folder = ROOT / "out" / "mutants"
     os.environ["OMP_NUM_THREADS"] = "1"
     for name in IMPORTED:
         importlib.import_module(name)
-    coverage = measure_coverage(list_files(given.tests, ROOT, "test_*.py"), folder)
+    coverage = measure_coverage(list_files(options.tests, ROOT, "test_*.py"), folder)
     counts = Counter(dict.fromkeys(("killed", "survived", "uncovered"), 0))
-    sample = sample_mutants(list_files(given.modules, PACKAGE, "*.py"), given.sample, given.seed)
+    sample = sample_mutants(
+        list_files(options.modules, PACKAGE, "*.py"), options.sample, options.seed
+    )
     for number, mutant in enumerate(sample, 1):
         outcome = run_mutant(mutant, coverage, folder)
         counts[outcome] += 1
-        place = f"{mutant.module}:{mutant.line}: {mutant.what}"
-        show(f"{number} of {len(sample)}, {counts['killed']} killed: {outcome}: {place}")
+        place = f"{mutant.module}:{mutant.line}: {mutant.change}"
+        print_line(f"{number} of {len(sample)}, {counts['killed']} killed: {outcome}: {place}")
         if outcome != "killed":
-            show(f"    {mutant.text}")
+            print_line(f"    {mutant.text}")
     summary = ", ".join(f"{count} {name}" for name, count in counts.items())
-    show(f"{summary}: {counts['killed'] / max(len(sample), 1):.0%} killed")
+    print_line(f"{summary}: {counts['killed'] / max(len(sample), 1):.0%} killed")
     return int(len(sample) > counts["killed"])
 
 

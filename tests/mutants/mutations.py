@@ -1,4 +1,4 @@
-"""Changes one operator, constant, call or statement of a module."""
+"""Changes one operator, constant, call or statement of a module at a time."""
 
 from __future__ import annotations
 
@@ -33,67 +33,67 @@ class Mutant:
     Attributes:
         module: Path in the package, such as "planning/solver/loop.py".
         line: Line of the fault, from 1.
-        what: "kind: before → after".
+        change: "kind: before → after".
         text: The unchanged line without indentation.
-        users: Lines whose behaviour changes: those of its statement, or those that use the constant
-            that it defines.
-        source: The whole module with the fault.
+        users: Lines whose behaviour changes: the lines of its statement, or those that read the
+            constant that it defines.
+        source: Source code of the module with the fault.
     """
 
     module: str
     line: int
-    what: str
+    change: str
     text: str
     users: tuple[int, ...]
     source: str
 
 
-class _Text:
-    """A source whose pieces are replaced by position."""
+class _Source:
+    """Source code, with access to nodes and replacements by byte position."""
 
     def __init__(self, source: str) -> None:
         self.bytes = source.encode()
         lines = self.bytes.splitlines(keepends=True)
         self.begins = [sum(len(line) for line in lines[:k]) for k in range(len(lines) + 1)]
 
-    def span(self, node: ast.AST) -> tuple[int, int]:
+    def get_span(self, node: ast.AST) -> tuple[int, int]:
         begin = self.begins[node.lineno - 1] + node.col_offset  # type: ignore[attr-defined]
         return begin, self.begins[node.end_lineno - 1] + node.end_col_offset  # type: ignore[attr-defined]
 
-    def of(self, node: ast.AST) -> str:
-        begin, end = self.span(node)
+    def get_source(self, node: ast.AST) -> str:
+        begin, end = self.get_span(node)
         return self.bytes[begin:end].decode()
 
-    def with_piece(self, begin: int, end: int, piece: str) -> str:
-        return (self.bytes[:begin] + piece.encode() + self.bytes[end:]).decode()
+    def replace(self, begin: int, end: int, replacement: str) -> str:
+        return (self.bytes[:begin] + replacement.encode() + self.bytes[end:]).decode()
 
 
 def iterate_mutants(module: str, source: str) -> Iterator[Mutant]:
-    """Yield every fault of a module in the order of lines, except in texts, types and errors."""
-    text, lines, tree = _Text(source), source.splitlines(), ast.parse(source)
-    users, found = _find_users(tree), []
+    """Yield the faults of a module by line, except in strings, annotations and errors."""
+    text, lines, tree = _Source(source), source.splitlines(), ast.parse(source)
+    users, mutants = _find_users(tree), []
     for node in _iterate_nodes(tree):
-        for kind, (begin, end), piece in _iterate_faults(node, text):
+        for kind, (begin, end), replacement in _iterate_faults(node, text):
             before = text.bytes[begin:end].decode()
-            if before == piece:
+            if before == replacement:
                 continue
-            changed = text.with_piece(begin, end, piece)
+            changed = text.replace(begin, end, replacement)
             line = text.bytes[:begin].count(b"\n") + 1
-            what = f"{kind}: {' '.join(before.split())} → {' '.join(piece.split())}"
-            mutant = Mutant(module, line, what, lines[line - 1].strip(), users[line], changed)
-            found.append((begin, mutant))
-    yield from (mutant for _, mutant in sorted(found, key=lambda pair: pair[0]))
+            change = f"{kind}: {' '.join(before.split())} → {' '.join(replacement.split())}"
+            mutant = Mutant(module, line, change, lines[line - 1].strip(), users[line], changed)
+            mutants.append((begin, mutant))
+    yield from (mutant for _, mutant in sorted(mutants, key=lambda pair: pair[0]))
 
 
 def _find_users(tree: ast.Module) -> dict[int, tuple[int, ...]]:
-    """Return line → the lines of its statement, or those that use the constant it defines."""
-    found: dict[int, tuple[int, ...]] = {}
+    """Return line → the lines of its statement, or those that read the constant it defines."""
+    users: dict[int, tuple[int, ...]] = {}
     for statement in ast.walk(tree):
         if isinstance(statement, ast.stmt):
-            body = getattr(statement, "body", None)  # whose statements come later
+            body = getattr(statement, "body", None)  # statements of the body have their own lines
             end = max(body[0].lineno - 1, statement.lineno) if body else statement.end_lineno
             span = tuple(range(statement.lineno, (end or statement.lineno) + 1))
-            found |= dict.fromkeys(span, span)
+            users |= dict.fromkeys(span, span)
     loads = [n for n in ast.walk(tree) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Load)]
     for item in tree.body:
         if isinstance(item, ast.Assign | ast.AnnAssign):
@@ -102,8 +102,8 @@ def _find_users(tree: ast.Module) -> dict[int, tuple[int, ...]]:
             names = {node.id for node in nodes if isinstance(node, ast.Name)}
             using = tuple(sorted({node.lineno for node in loads if node.id in names}))
             if using:
-                found |= dict.fromkeys(found[item.lineno], using)
-    return found
+                users |= dict.fromkeys(users[item.lineno], using)
+    return users
 
 
 def _iterate_nodes(node: ast.AST) -> Iterator[ast.AST]:
@@ -112,8 +112,8 @@ def _iterate_nodes(node: ast.AST) -> Iterator[ast.AST]:
         if field in ("annotation", "returns", "decorator_list", "type_params"):
             continue
         for child in value if isinstance(value, list) else [value]:
-            left_out = (ast.Raise, ast.JoinedStr, ast.Import, ast.ImportFrom)
-            if not isinstance(child, ast.AST) or isinstance(child, left_out) or _is_text(child):
+            excluded = (ast.Raise, ast.JoinedStr, ast.Import, ast.ImportFrom)
+            if not isinstance(child, ast.AST) or isinstance(child, excluded) or _is_text(child):
                 continue
             yield child
             yield from _iterate_nodes(child)
@@ -131,13 +131,13 @@ def _is_text(node: ast.AST) -> bool:
     return bool({"__all__", "detail", "expected", "why"} & set(names))
 
 
-def _iterate_faults(node: ast.AST, text: _Text) -> Iterator[tuple[str, tuple[int, int], str]]:
-    """Yield (kind, span of bytes to replace, replacement)."""
+def _iterate_faults(node: ast.AST, text: _Source) -> Iterator[tuple[str, tuple[int, int], str]]:
+    """Yield the kind, the byte span to replace and the replacement of each fault."""
     if isinstance(node, ast.Compare):
         yield from _change_comparisons(node, text)
     elif isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
-        left, right = text.of(node.left), text.of(node.right)
-        begin, end = text.span(node.left)[1], text.span(node.right)[0]
+        left, right = text.get_source(node.left), text.get_source(node.right)
+        begin, end = text.get_span(node.left)[1], text.get_span(node.right)[0]
         gap = text.bytes[begin:end].decode()
         sign = next(
             (sign for sign in ("**", "//", "+", "-", "*", "/", "%", "&", "|") if sign in gap), None
@@ -150,9 +150,9 @@ def _iterate_faults(node: ast.AST, text: _Text) -> Iterator[tuple[str, tuple[int
             at = begin + gap.index(sign)
             yield "arithmetic", (at, at + len(sign)), OPERATORS[type(node.op)]
     elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Not):
-        yield "sign", text.span(node), f"({text.of(node.operand)})"
+        yield "sign", text.get_span(node), f"({text.get_source(node.operand)})"
     elif isinstance(node, ast.BoolOp):
-        begin, end = text.span(node.values[0])[1], text.span(node.values[1])[0]
+        begin, end = text.get_span(node.values[0])[1], text.get_span(node.values[1])[0]
         gap = text.bytes[begin:end].decode()
         old, new = ("and", "or") if isinstance(node.op, ast.And) else ("or", "and")
         yield "boolean", (begin + gap.index(old), begin + gap.index(old) + len(old)), new
@@ -161,7 +161,7 @@ def _iterate_faults(node: ast.AST, text: _Text) -> Iterator[tuple[str, tuple[int
     elif isinstance(node, ast.If | ast.IfExp | ast.While) and not isinstance(
         node.test, ast.Compare
     ):
-        yield "condition", text.span(node.test), f"(not ({text.of(node.test)}))"
+        yield "condition", text.get_span(node.test), f"(not ({text.get_source(node.test)}))"
     elif isinstance(node, ast.Call):
         yield from _change_calls(node, text)
     elif (
@@ -169,18 +169,18 @@ def _iterate_faults(node: ast.AST, text: _Text) -> Iterator[tuple[str, tuple[int
         or isinstance(node, ast.AugAssign | ast.Continue | ast.Break)
         or (isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Subscript))
     ):
-        yield "dropped", text.span(node), "pass"
+        yield "dropped", text.get_span(node), "pass"
     elif isinstance(node, ast.Attribute) and node.attr in NAMES:
-        begin, end = text.span(node)
+        begin, end = text.get_span(node)
         yield "name", (end - len(node.attr), end), NAMES[node.attr]
 
 
 def _change_comparisons(
-    node: ast.Compare, text: _Text
+    node: ast.Compare, text: _Source
 ) -> Iterator[tuple[str, tuple[int, int], str]]:
     sides = [node.left, *node.comparators]
     for k, operator in enumerate(node.ops):
-        begin, end = text.span(sides[k])[1], text.span(sides[k + 1])[0]
+        begin, end = text.get_span(sides[k])[1], text.get_span(sides[k + 1])[0]
         gap = text.bytes[begin:end]
         begin, end = (
             begin + len(gap) - len(gap.lstrip(b") ")),
@@ -192,23 +192,27 @@ def _change_comparisons(
 
 
 def _change_constants(
-    node: ast.Constant, text: _Text
+    node: ast.Constant, text: _Source
 ) -> Iterator[tuple[str, tuple[int, int], str]]:
     if isinstance(node.value, bool):
-        yield "constant", text.span(node), str(not node.value)
+        yield "constant", text.get_span(node), str(not node.value)
     elif isinstance(node.value, int):
-        yield "constant", text.span(node), str(node.value + 1)
+        yield "constant", text.get_span(node), str(node.value + 1)
     elif isinstance(node.value, float):
-        yield "constant", text.span(node), repr(node.value * 2 if node.value else 1.0)
+        yield "constant", text.get_span(node), repr(node.value * 2 if node.value else 1.0)
 
 
-def _change_calls(node: ast.Call, text: _Text) -> Iterator[tuple[str, tuple[int, int], str]]:
+def _change_calls(node: ast.Call, text: _Source) -> Iterator[tuple[str, tuple[int, int], str]]:
     if isinstance(node.func, ast.Name) and node.func.id in NAMES:
-        yield "name", text.span(node.func), NAMES[node.func.id]
+        yield "name", text.get_span(node.func), NAMES[node.func.id]
     first = node.args[:2]
     if len(first) == 2 and not any(
         isinstance(argument, ast.Starred | ast.GeneratorExp) for argument in first
     ):
-        (begin, middle), (other, end) = (text.span(argument) for argument in first)
+        (begin, middle), (other, end) = (text.get_span(argument) for argument in first)
         between = text.bytes[middle:other].decode()
-        yield "swapped", (begin, end), f"{text.of(first[1])}{between}{text.of(first[0])}"
+        yield (
+            "swapped",
+            (begin, end),
+            f"{text.get_source(first[1])}{between}{text.get_source(first[0])}",
+        )

@@ -1,4 +1,4 @@
-"""Plugins of pytest that record what each test executes, or run chosen tests with a fault."""
+"""Provides pytest plugins that record executed lines, or run selected tests with a fault."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ import pytest
 __all__ = ["PACKAGE", "Recorder", "Replacer"]
 
 PACKAGE = Path(__file__).resolve().parents[2] / "vkc_pin"
-GRACE = 60.0  # [s] in which the package must be imported and the tests collected
+GRACE = 60.0  # [s] for importing the package and collecting the tests
 
 
 class Recorder:
-    """Writes test → [processor time [s], module → executed lines].
+    """Writes test → [CPU time [s], module → executed lines].
 
-    The lines that importing the package executes are those of the test "".
+    Lines that are executed when the package is imported belong to the test "".
     """
 
     def __init__(self, record: Path) -> None:
@@ -39,11 +39,11 @@ class Recorder:
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[None]:
         self.coverage.switch_context(item.nodeid)
-        began = time.process_time()
-        done = yield
-        self.seconds[item.nodeid] = time.process_time() - began
+        start_time = time.process_time()
+        result = yield
+        self.seconds[item.nodeid] = time.process_time() - start_time
         self.coverage.switch_context("")
-        return done
+        return result
 
     def pytest_sessionfinish(self, exitstatus: int) -> None:
         self.coverage.stop()
@@ -60,12 +60,12 @@ class Recorder:
 
 
 class Replacer(importlib.abc.MetaPathFinder):
-    """Imports a module of the package from another source, and runs only some tests.
+    """Imports a module of the package from another source, and runs selected tests only.
 
     Args:
-        module: The module, such as "planning/solver/loop.py".
-        source: The source that replaces it.
-        limits: Id of each test → its time limit [s], in the order in which they run.
+        module: Path in the package, such as "planning/solver/loop.py".
+        source: Source code that replaces the module's.
+        limits: Id of each test → its time limit [s], in the order of execution.
     """
 
     def __init__(self, module: str, source: str, limits: Mapping[str, float]) -> None:
@@ -92,5 +92,5 @@ class Replacer(importlib.abc.MetaPathFinder):
         self._end_process_after(self.limits[item.nodeid])
 
     def _end_process_after(self, limit: float) -> None:
-        """End the process unless this is called again within `limit` [s]; C++ may hang as well."""
+        """End the process, even in C++ code, unless this is called again within `limit` [s]."""
         faulthandler.dump_traceback_later(limit, exit=True, file=sys.__stderr__)

@@ -1,4 +1,4 @@
-"""Faults are made at every kind of place, and tests that execute a changed line find them."""
+"""Tests the kinds of faults, and the selection of tests that execute a changed line."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ class Kept:
 '''
 
 
-def made() -> set[str]:
-    return {mutant.what for mutant in iterate_mutants("x.py", SOURCE)}
+def list_changes() -> set[str]:
+    return {mutant.change for mutant in iterate_mutants("x.py", SOURCE)}
 
 
 @pytest.mark.parametrize(
-    "what",
+    "change",
     [
         "comparison: < → <=",
         "comparison: < → >=",
@@ -51,8 +51,8 @@ def made() -> set[str]:
         "arithmetic: * → /",
     ],
 )
-def test_faults_are_of_all_kinds(what: str) -> None:
-    assert what in made()
+def test_faults_are_of_all_kinds(change: str) -> None:
+    assert change in list_changes()
 
 
 def test_fault_changes_one_line_of_valid_source() -> None:
@@ -65,7 +65,7 @@ def test_fault_changes_one_line_of_valid_source() -> None:
         assert mutant.text == before[mutant.line - 1].strip()
 
 
-def test_texts_types_and_errors_are_kept() -> None:
+def test_strings_annotations_and_errors_are_unchanged() -> None:
     changed = {mutant.line for mutant in iterate_mutants("x.py", SOURCE)}
     lines = SOURCE.splitlines()
     assert not {
@@ -78,22 +78,24 @@ def test_texts_types_and_errors_are_kept() -> None:
     }
 
 
-def test_users_of_a_constant_are_found() -> None:
-    where = {mutant.what: (mutant.line, mutant.users) for mutant in iterate_mutants("x.py", SOURCE)}
-    assert where["constant: 5.0 → 10.0"] == (3, (16,))
-    assert where["name: min → max"] == (16, (16,))
+def test_users_of_a_constant_are_the_lines_that_read_it() -> None:
+    found = {
+        mutant.change: (mutant.line, mutant.users) for mutant in iterate_mutants("x.py", SOURCE)
+    }
+    assert found["constant: 5.0 → 10.0"] == (3, (16,))
+    assert found["name: min → max"] == (16, (16,))
 
 
-def test_constants_defined_and_used_at_import_have_the_line_of_their_use() -> None:
+def test_users_are_the_lines_of_the_statement_or_of_reads() -> None:
     source = "A = 1\nB = 2\n\n\ndef double() -> int:\n    return (\n        2\n        * A\n    )\n"
-    users = {mutant.what: mutant.users for mutant in iterate_mutants("x.py", source)}
+    users = {mutant.change: mutant.users for mutant in iterate_mutants("x.py", source)}
     assert users["constant: 1 → 2"] == (8,)
-    assert users["constant: 2 → 3"] == (6, 7, 8, 9)  # the last one: B has no user
+    assert users["constant: 2 → 3"] == (6, 7, 8, 9)  # last: B has no user
     assert users["arithmetic: * → /"] == (6, 7, 8, 9)
 
 
 def make_coverage(module: str) -> Coverage:
-    """Return five tests in three files; line 3 is executed by the import alone."""
+    """Return five tests in three files; only the import executes line 3."""
     executed = {
         "tests/planning/test_plan.py": {"fast": (0.1, [7]), "slow": (90.0, [7, 8])},
         "tests/world/scene/test_poses.py": {"own": (1.0, [7]), "other": (0.5, [9])},
@@ -112,10 +114,10 @@ def make_coverage(module: str) -> Coverage:
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        # the module's own file first, quick tests first, and none after one of 90 s
+        # the module's own file first, quick tests first, and no test after one of 90 s
         (7, ["own", "fast", "slow"]),
         (8, ["slow"]),
-        # shared fixtures are executed by the first test of a file
+        # the first test of a file executes shared fixtures
         (9, ["other", "far", "own"]),
         (3, ["other", "own", "far", "fast", "slow"]),
         (5, []),
@@ -133,13 +135,13 @@ def test_command_reports_faults_and_reuses_coverage() -> None:
     command += ["--modules", "benchmarks/harness/limits.py"]
     command += ["--tests", "tests/benchmarks/harness/test_limits.py"]
     for _ in range(2):
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    *lines, summary = done.stdout.splitlines()
-    assert summary == "3 killed, 1 survived, 0 uncovered: 75% killed", done.stdout
-    assert done.returncode == 1
+        process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    *lines, summary = process.stdout.splitlines()
+    assert summary == "3 killed, 1 survived, 0 uncovered: 75% killed", process.stdout
+    assert process.returncode == 1
     place = "benchmarks/harness/limits.py:12: constant: 1800.0 → 3600.0"
     assert [line for line in lines if "survived" in line and line.endswith(place)]
-    assert lines[0].startswith("1 of 4, "), "the second run records nothing"
+    assert lines[0].startswith("1 of 4, "), "the second run reuses the coverage"
 
 
 def test_unknown_files_end_the_command() -> None:

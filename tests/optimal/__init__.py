@@ -1,1 +1,1 @@
-"""Compares durations of motions with the fastest along the same paths, by TOPP-RA."""
+"""Compares durations of motions with the least durations along their paths, by TOPP-RA."""

@@ -1,4 +1,4 @@
-"""Prints a table of durations of plans beside the least ones along the same paths.
+"""Prints a table of plan durations and of the least durations along the same paths.
 
 Usage: python -m tests.optimal --starts N --json FILE
 """
@@ -17,19 +17,21 @@ import vkc_pin as vkc
 from vkc_pin.benchmarks.executing.execution import TASKS
 from vkc_pin.benchmarks.harness.record import find_commit
 from vkc_pin.benchmarks.harness.tables import describe_run
-from vkc_pin.benchmarks.problems.problem_set import TASKS as ALL
+from vkc_pin.benchmarks.problems.problem_set import TASKS as ALL_TASKS
 from vkc_pin.benchmarks.problems.problem_set import make_start
 from vkc_pin.utils.parallel.machine import describe_machine, find_versions
 from vkc_pin.utils.system import measure_peak_memory
 
 from .bound import compute_bound
 
-NAMES = tuple(dict.fromkeys([*TASKS, *(name for name in ALL if name.startswith("household"))]))
-"""The tasks of `bench execution`, and those of the household."""
+TASK_NAMES = tuple(
+    dict.fromkeys([*TASKS, *(name for name in ALL_TASKS if name.startswith("household"))])
+)
+"""Tasks of `bench execution` and of the household."""
 
 
 def format_table(rows: list[dict[str, Any]]) -> str:
-    """Return the table, a line a task, in Markdown."""
+    """Return a Markdown table with one line per task."""
     lines = [
         "| task | plans | duration [s] | least along its path [s] | worst ratio | bounded by "
         "torques |",
@@ -37,57 +39,65 @@ def format_table(rows: list[dict[str, Any]]) -> str:
     ]
     for task in dict.fromkeys(row["task"] for row in rows):
         own = [row for row in rows if row["task"] == task]
-        takes, least = (
+        duration, least = (
             sum(row[field] for row in own) / len(own) for field in ("duration", "least")
         )
-        worst, heavy = (
+        worst, torque_bound = (
             max(row["duration"] / row["least"] for row in own),
             sum(row["heavy"] > 0 for row in own),
         )
-        lines.append(f"| {task} | {len(own)} | {takes:.2f} | {least:.2f} | {worst:.3f} | {heavy} |")
+        lines.append(
+            f"| {task} | {len(own)} | {duration:.2f} | {least:.2f} | {worst:.3f} | {torque_bound} |"
+        )
     return "\n".join(lines) + "\n"
 
 
 def format_results(result: Mapping[str, Any]) -> str:
-    """Return the table of a record in Markdown, with versions and machine at the foot."""
+    """Return the Markdown table of a record, with versions and machine below."""
     return format_table(result["trials"]) + "\n" + describe_run(result["meta"]) + "\n"
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Plan, and compare; 1 if a motion takes more than 1.15 times as long as it has to."""
+    """Plan and compare; return 1 if a duration exceeds 1.15 times its least value."""
     parser = argparse.ArgumentParser(prog="python -m tests.optimal", description=__doc__)
-    parser.add_argument("--starts", type=int, default=5, help="random starts a task")
+    parser.add_argument("--starts", type=int, default=5, help="random starts per task")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--tasks", nargs="+", default=NAMES, choices=NAMES)
-    parser.add_argument("--json", type=Path, help="where to write the figures of each plan")
-    given = parser.parse_args(arguments)
-    rows, began, known = list[dict[str, Any]](), time.perf_counter(), describe_machine()
-    for name in given.tasks:
-        for number in range(given.starts):
-            scene = make_start(name, given.seed, number)
-            plan = vkc.plan(scene, ALL[name].steps, seed=given.seed, max_evaluations=1_000_000)
+    parser.add_argument("--tasks", nargs="+", default=TASK_NAMES, choices=TASK_NAMES)
+    parser.add_argument("--json", type=Path, help="file for the results of each plan")
+    options = parser.parse_args(arguments)
+    rows, start_time, machine = list[dict[str, Any]](), time.perf_counter(), describe_machine()
+    for name in options.tasks:
+        for number in range(options.starts):
+            scene = make_start(name, options.seed, number)
+            plan = vkc.plan(
+                scene, ALL_TASKS[name].steps, seed=options.seed, max_evaluations=1_000_000
+            )
             if plan.success:
-                least, heavy = compute_bound(plan.scene, plan.trajectory)
+                least, torque_bound = compute_bound(plan.scene, plan.trajectory)
                 duration = float(plan.trajectory.times[-1])
                 row = {
                     "task": name,
                     "number": number,
                     "duration": duration,
                     "least": least,
-                    "heavy": heavy,
+                    "heavy": torque_bound,
                 }
                 rows.append({**row, "commit": find_commit()})
-    if given.json is not None:
-        session = {"jobs": 1, "trials": len(rows), "seconds": round(time.perf_counter() - began, 1)}
+    if options.json is not None:
+        session = {
+            "jobs": 1,
+            "trials": len(rows),
+            "seconds": round(time.perf_counter() - start_time, 1),
+        }
         meta = {
             "versions": find_versions(),
-            "machine": known,
-            "seed": given.seed,
-            "starts": given.starts,
+            "machine": machine,
+            "seed": options.seed,
+            "starts": options.starts,
             "sessions": [session],
         }
         meta["peak_memory_mb"] = round(measure_peak_memory(), 1)
-        given.json.write_text(
+        options.json.write_text(
             json.dumps({"meta": meta, "trials": rows}, indent=1) + "\n", encoding="utf-8"
         )
     sys.stdout.write(format_table(rows))

@@ -1,4 +1,4 @@
-"""The least time that a motion can take along its own path, between the same rests."""
+"""Computes the least duration of a motion along its own path, between the same rests."""
 
 from __future__ import annotations
 
@@ -14,56 +14,56 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 __all__ = ["FINE", "compute_bound"]
 
 FINE = 60
-"""Places on each of a path's cubics; the package looks at three or less."""
-_SAME = 1e-6  # [s] by which the motion, timed anew, may take another time
+"""Grid points on each cubic of a path; the package uses at most three."""
+_TOLERANCE = 1e-6  # [s] difference of durations after retiming
 
 
-def compute_bound(scene: Scene, motion: Trajectory, fine: int = FINE) -> tuple[float, int]:
-    """Return the least duration [s] under all limits, and the number of runs bound by torques.
+def compute_bound(scene: Scene, motion: Trajectory, points: int = FINE) -> tuple[float, int]:
+    """Return the least duration [s] under all limits, and the number of paths bound by torques.
 
-    The motion is timed anew, which must come to the same. Whatever path TOPP-RA is asked about on
-    the way, it is asked about again, at many more places. Stops and rests are those of the motion.
+    The motion is retimed, which must reproduce its duration. TOPP-RA then solves every path of this
+    retiming again, on a finer grid. Stops and rests are those of the motion.
     """
-    asked, rests, solve, rest = (
+    paths, rest_times, compute_speeds, make_straight_curve = (
         dict[int, tuple[Any, ...]](),
         list[float](),
         retime.compute_speeds,
         retime._make_straight_curve,
     )
 
-    def noted(path: Any, places: Any, *limits: Any) -> Any:
-        asked[id(path)] = (
+    def record_path(path: Any, places: Any, *limits: Any) -> Any:
+        paths[id(path)] = (
             path,
             *limits,
-        )  # the last time, torques among the limits if they bound it
-        return solve(path, places, *limits)
+        )  # the last call includes torque limits if they bind
+        return compute_speeds(path, places, *limits)
 
-    def rested(*given: Any) -> Any:
-        curve = rest(*given)
-        rests.append(float(curve.times[-1]))
+    def record_rest(*arguments: Any) -> Any:
+        curve = make_straight_curve(*arguments)
+        rest_times.append(float(curve.times[-1]))
         return curve
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(retime, "compute_speeds", noted)
-        patch.setattr(retime, "_make_straight_curve", rested)
-        again = retime.retime_trajectory(scene, motion, _split(motion))
-    assert abs(again.times[-1] - motion.times[-1]) <= _SAME, (
-        "the motion that was timed anew is another one"
+        patch.setattr(retime, "compute_speeds", record_path)
+        patch.setattr(retime, "_make_straight_curve", record_rest)
+        retimed = retime.retime_trajectory(scene, motion, _count_parts(motion))
+    assert abs(retimed.times[-1] - motion.times[-1]) <= _TOLERANCE, (
+        "the retimed motion is another one"
     )
-    least = sum(rests)
-    for path, *limits in asked.values():
-        shares = np.arange(fine) / fine
+    least = sum(rest_times)
+    for path, *limits in paths.values():
+        fractions = np.arange(points) / points
         places = np.append(
-            (path.x[:-1, None] + np.diff(path.x)[:, None] * shares).ravel(), path.x[-1]
+            (path.x[:-1, None] + np.diff(path.x)[:, None] * fractions).ravel(), path.x[-1]
         )
-        speeds = solve(path, places, *limits)
+        speeds = compute_speeds(path, places, *limits)
         assert speeds is not None
         least += float((2.0 * np.diff(places) / (speeds[1:] + speeds[:-1])).sum())
-    return least, sum(len(limits) > 2 for _, *limits in asked.values())
+    return least, sum(len(limits) > 2 for _, *limits in paths.values())
 
 
-def _split(motion: Trajectory) -> np.ndarray:
-    """Return into how many parts each straight line was cut, by how many cubics lead along it."""
+def _count_parts(motion: Trajectory) -> np.ndarray:
+    """Return the number of parts of each straight line, from its number of cubics."""
     assert motion.curve is not None
     cubics = np.diff(np.searchsorted(motion.curve.times, motion.times))
     return np.maximum(cubics // 3, 1)

@@ -1,9 +1,8 @@
-"""A second opinion on saved motions, that shares no line with the package.
+"""Validates saved motions independently of the package.
 
-It reads a plan's .npz, scene, URDFs and YAML files by itself and judges the motion by what docs/
-says of these files and of what a motion must keep to. It imports numpy, PyYAML, Pinocchio for
-kinematics, coal for distances, trimesh for meshes, and nothing of vkc_pin: `test_oracle.py` makes
-sure.
+The oracle reads the plan (.npz), scene, URDF and YAML files itself, and checks the motion against
+the rules in docs/. It imports numpy, PyYAML, Pinocchio for kinematics, coal for distances and
+trimesh for meshes, but not vkc_pin, which `test_oracle.py` verifies.
 
-Run it with `python -m tests.oracle FOLDER_OR_PLAN ...`.
+Usage: `python -m tests.oracle FOLDER_OR_PLAN ...`.
 """

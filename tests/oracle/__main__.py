@@ -13,32 +13,32 @@ from .agreement import format_table, judge_all, record_violations, write_verdict
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Judge; 1 if a plan is a success by its own word and not by the oracle's."""
+    """Judge plans; return 1 if the oracle finds violations in a plan that claims success."""
     parser = argparse.ArgumentParser(prog="python -m tests.oracle", description=__doc__)
     parser.add_argument(
-        "paths", nargs="+", type=Path, help="saved plans (.npz), or folders with some"
+        "paths", nargs="+", type=Path, help="saved plans (.npz), or folders that contain them"
     )
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--jobs", type=int, default=1, help="number of processes")
     parser.add_argument(
         "--record",
         type=Path,
-        help="results.json of the only folder's trials, in which verdicts are noted",
+        help="results.json of the folder's trials, to which verdicts are added",
     )
-    given = parser.parse_args(arguments)
-    if given.record and len(given.paths) > 1:
-        parser.error("--record is of one folder")
-    wrong = 0
-    for path in given.paths:
+    options = parser.parse_args(arguments)
+    if options.record and len(options.paths) > 1:
+        parser.error("--record needs a single folder")
+    false_successes = 0
+    for path in options.paths:
         verdicts = judge_all(
-            sorted(path.rglob("*.npz")) if path.is_dir() else [path], jobs=given.jobs
+            sorted(path.rglob("*.npz")) if path.is_dir() else [path], jobs=options.jobs
         )
         if path.is_dir():
             write_verdicts(verdicts, path)
-        if given.record:
-            record_violations(verdicts, given.record)
+        if options.record:
+            record_violations(verdicts, options.record)
         print(format_table(verdicts))
-        wrong += sum(bool(verdict.success and verdict.found) for verdict in verdicts)
-    return 1 if wrong else 0
+        false_successes += sum(bool(verdict.success and verdict.found) for verdict in verdicts)
+    return 1 if false_successes else 0
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Compares the plans' own verdicts with those of the oracle: JSON lines and a table."""
+"""Compares the verdicts of plans and oracle, in JSON lines and a table."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["format_table", "judge_all", "record_violations", "write_verdicts"]
 
 
 def judge_all(paths: Sequence[Path], *, jobs: int = 1) -> list[Verdict]:
-    """Return the verdicts on saved plans, in their order."""
+    """Return the verdicts on saved plans, in the same order."""
     if jobs == 1:
         return [judge(path) for path in paths]
     with ProcessPoolExecutor(jobs) as pool:
@@ -23,7 +23,7 @@ def judge_all(paths: Sequence[Path], *, jobs: int = 1) -> list[Verdict]:
 
 
 def write_verdicts(verdicts: Iterable[Verdict], folder: Path) -> None:
-    """Write verdicts.jsonl, a line a plan, and agreement.md into a folder."""
+    """Write verdicts.jsonl, with one line per plan, and agreement.md into a folder."""
     verdicts = list(verdicts)
     lines = [
         json.dumps({**asdict(one), "path": one.path.relative_to(folder).as_posix()})
@@ -34,41 +34,41 @@ def write_verdicts(verdicts: Iterable[Verdict], folder: Path) -> None:
 
 
 def record_violations(verdicts: Iterable[Verdict], record: Path) -> None:
-    """Add the number of violations in each trial's plan to a record of trials, as its `oracle`.
+    """Add the number of violations in each trial's plan to a record of trials, as `oracle`.
 
     Plans are matched to trials by key.
 
     Raises:
-        ValueError: Trials and plans are not the same, or a plan was not judged; nothing is written.
+        ValueError: Trials and plans differ, or a plan was not judged; nothing is written.
     """
     result = json.loads(record.read_text(encoding="utf-8"))
-    own = {one.path.stem: one for one in verdicts}
+    by_key = {verdict.path.stem: verdict for verdict in verdicts}
     keys = {trial["key"] for trial in result["trials"]}
-    if keys != set(own):
+    if keys != set(by_key):
         raise ValueError(
-            f"{record}: plans and trials are others: {', '.join(sorted(keys ^ set(own))[:5])}"
+            f"{record}: plans and trials are others: {', '.join(sorted(keys ^ set(by_key))[:5])}"
         )
-    if skipped := [one.path for one in own.values() if one.unjudged]:
+    if skipped := [verdict.path for verdict in by_key.values() if verdict.unjudged]:
         raise ValueError(f"{record}: {len(skipped)} plans were not judged, {skipped[0]} for one")
     for trial in result["trials"]:
-        trial["oracle"] = len(own[trial["key"]].found)
+        trial["oracle"] = len(by_key[trial["key"]].found)
     record.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 
 
 def format_table(verdicts: Sequence[Verdict]) -> str:
-    """Return how often both agree, and every plan of which they do not, in Markdown."""
-    said = [one for one in verdicts if not one.unjudged]
+    """Return a Markdown table of agreements, and a list of the plans with disagreement."""
+    judged = [one for one in verdicts if not one.unjudged]
     rows = ["| plan | oracle | plans |", "| --- | --- | ---: |"]
-    for success, right, what in (
+    for success, is_clean, label in (
         (True, True, "success, and nothing found"),
         (True, False, "**false success**"),
         (False, False, "failure, and something found"),
         (False, True, "failure, and nothing found"),
     ):
-        count = sum(one.success == success and (not one.found) == right for one in said)
-        rows.append(f"| {'success' if success else 'failure'} | {what} | {count} |")
-    rows.append(f"| any | not judged | {len(verdicts) - len(said)} |")
-    for one in said:
+        count = sum(one.success == success and (not one.found) == is_clean for one in judged)
+        rows.append(f"| {'success' if success else 'failure'} | {label} | {count} |")
+    rows.append(f"| any | not judged | {len(verdicts) - len(judged)} |")
+    for one in judged:
         if not one.agrees:
             rows += [
                 "",

@@ -1,4 +1,4 @@
-"""Writes changed copies of saved plans, whose faults the oracle must find."""
+"""Writes changed copies of saved plans, with faults that the oracle must find."""
 
 from __future__ import annotations
 
@@ -15,32 +15,36 @@ Content = dict[str, Any]
 
 
 def write_changed(source: Path, target: Path, change: Callable[[Content], None]) -> Path:
-    """Write a copy of a plan to `target` that `change` has changed.
+    """Write a copy of a plan to `target`, modified by `change`.
 
-    It gets a dictionary with `scene`, `steps`, `options`, `names`, `times`, `positions`, `phases`
-    and `column`, which returns one of the positions' columns by name. Waypoints that it has moved,
-    in place or time, have straight lines between them.
+    `change` receives a dictionary with `scene`, `steps`, `options`, `names`, `times`, `positions`,
+    `phases` and `column`, which returns a column of the positions by name. If `change` modifies
+    times or positions, straight lines connect the waypoints.
     """
     with np.load(source, allow_pickle=False) as archive:
-        about = json.loads(str(archive["about"]))
+        metadata = json.loads(str(archive["about"]))
         content: Content = {
             "times": archive["times"].copy(),
             "positions": archive["positions"].copy(),
         }
-        before = {name: array.copy() for name, array in content.items()}
+        original = {name: array.copy() for name, array in content.items()}
         knots = {name: archive[name] for name in archive if name.startswith("knot_")}
-    motion = about["trajectory"]
-    content |= {"scene": about["scene"], "steps": about["steps"], "options": about["options"]}
+    motion = metadata["trajectory"]
+    content |= {
+        "scene": metadata["scene"],
+        "steps": metadata["steps"],
+        "options": metadata["options"],
+    }
     content |= {"names": motion["names"], "phases": motion["phases"]}
     content["column"] = lambda name: content["positions"][:, motion["names"].index(name)]
     change(content)
-    about |= {"scene": content["scene"], "steps": content["steps"]}
-    about["trajectory"] = {**motion, "phases": content["phases"], "names": content["names"]}
-    same = all(np.array_equal(before[name], content[name]) for name in before)
+    metadata |= {"scene": content["scene"], "steps": content["steps"]}
+    metadata["trajectory"] = {**motion, "phases": content["phases"], "names": content["names"]}
+    unchanged = all(np.array_equal(original[name], content[name]) for name in original)
     arrays: dict[str, Any] = {
         "times": content["times"],
         "positions": content["positions"],
-        **(knots if same else {}),
+        **(knots if unchanged else {}),
     }
-    np.savez_compressed(target, about=np.array(json.dumps(about)), **arrays)
+    np.savez_compressed(target, about=np.array(json.dumps(metadata)), **arrays)
     return target

@@ -1,8 +1,8 @@
-"""Distances of all pairs along a phase, every 2 mm and 5 mrad.
+"""Checks the distances of all pairs along a phase, every 2 mm and 5 mrad.
 
-A sample is left out only where the pair cannot have come together since one that was looked at: by
-balls around shapes and boxes around what stands, over blocks of samples, and by how far the two can
-have moved against each other since their distance was asked.
+A sample is skipped only if the pair cannot be in contact there. Bounding spheres of shapes and
+bounding boxes of fixed shapes prove that for blocks of samples; the last computed distance, with a
+bound on the relative motion since then, proves it for single samples.
 """
 
 from __future__ import annotations
@@ -11,25 +11,25 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from .exemptions import CLEARANCE_SLACK, Exemption
 from .neighbours import Neighbours
 from .plan import Violation
 from .poses import Poses, compute_angle
-from .riding import compute_distance
 from .stage import FLOOR, Solid, Stage, World
-from .touching import SHORT, Licence
+from .supports import compute_distance
 
 __all__ = ["CONTACT", "check_collisions"]
 
-CONTACT = 1e-4  # [m] of overlap that is rounding
+CONTACT = 1e-4  # [m] of penetration: rounding
 BLOCK = 32  # samples
 
 
 class Pairs:
-    """The moving and fixed shapes of a phase, and the path length of each.
+    """The moving and fixed shapes of a phase, and the displacements of moving shapes.
 
-    `gone` has for every moving shape how far any point of it has moved from sample to sample, seen
-    from the world, the robot's base and its tool, shape (3, S - 1): two shapes move against each
-    other by no more than the sum of both in any of the three.
+    `displacements` bound the motion of any point of a moving shape from sample to sample, relative
+    to the world, the robot's base and its tool, shape (3, S - 1). In each of the three frames, the
+    sum of two displacements bounds the relative motion of two shapes.
     """
 
     def __init__(self, world: World, stage: Stage) -> None:
@@ -39,114 +39,141 @@ class Pairs:
             for part in stage.solids
             if part.owner == "robot" or (part.owner, part.link) in stage.moving
         ]
-        taken = {id(part) for part in self.moving}
-        self.standing = [part for part in stage.solids if id(part) not in taken]
+        moving_ids = {id(part) for part in self.moving}
+        self.fixed = [part for part in stage.solids if id(part) not in moving_ids]
         self.length = len(stage.times)
         base = stage.links["robot", world.robot.tree.urdf.base]
         frames = [None, base.inverse(), stage.tool.inverse()]
-        self.turns = np.array([part.at.turn[0] for part in self.standing]).reshape(-1, 3, 3)
-        self.middles = np.array(
-            [part.at.points(part.shape.centre)[0] for part in self.standing]
+        self.fixed_rotations = np.array([part.poses.rotation[0] for part in self.fixed]).reshape(
+            -1, 3, 3
+        )
+        self.fixed_centres = np.array(
+            [part.poses.transform_point(part.shape.centre)[0] for part in self.fixed]
         ).reshape(-1, 3)
-        self.halves = np.array([part.shape.half for part in self.standing]).reshape(-1, 3)
-        self.centres, self.gone = [], []
+        self.fixed_half_sides = np.array([part.shape.half for part in self.fixed]).reshape(-1, 3)
+        self.centres, self.displacements = [], []
         for part in self.moving:
-            whole = Poses(
-                np.broadcast_to(part.at.turn, (self.length, 3, 3)),
-                np.broadcast_to(part.at.at, (self.length, 3)),
+            poses = Poses(
+                np.broadcast_to(part.poses.rotation, (self.length, 3, 3)),
+                np.broadcast_to(part.poses.translation, (self.length, 3)),
             )
-            self.centres.append(whole.points(part.shape.centre))
-            self.gone.append(
+            self.centres.append(poses.transform_point(part.shape.centre))
+            self.displacements.append(
                 np.array(
                     [
-                        self._steps(whole if frame is None else frame @ whole, part)
+                        self._compute_steps(poses if frame is None else frame @ poses, part)
                         for frame in frames
                     ]
                 )
             )
 
     @staticmethod
-    def _steps(place: Poses, part: Solid) -> np.ndarray:
-        middle = place.points(part.shape.centre)
-        turned = compute_angle(place.turn[1:], place.turn[:-1])
-        return np.linalg.norm(np.diff(middle, axis=0), axis=1) + turned * part.shape.radius
+    def _compute_steps(poses: Poses, part: Solid) -> np.ndarray:
+        centre = poses.transform_point(part.shape.centre)
+        angles = compute_angle(poses.rotation[1:], poses.rotation[:-1])
+        return np.linalg.norm(np.diff(centre, axis=0), axis=1) + angles * part.shape.radius
 
-    def counts(self, one: Solid, other: Solid) -> bool:
-        """Whether two shapes, the first of which moves, are to stay apart."""
+    def is_checked(self, one: Solid, other: Solid) -> bool:
+        """Return whether a moving shape must not collide with another shape."""
         robot = self.world.robot
         if one.owner == other.owner:
-            return one.owner == "robot" and robot.apart(one.link, other.link)
+            return one.owner == "robot" and robot.is_checked_pair(one.link, other.link)
         if other.owner != FLOOR:
             return True
         if one.owner == "robot":
-            return one.link not in robot.on_the_floor
+            return one.link not in robot.base_links
         return self.world.objects[one.owner].free
 
-    def arcs(self, i: int) -> np.ndarray:
-        """Return path lengths of a shape, alone and relative to earlier ones, shape (1 + i, S)."""
-        steps = [self.gone[i][0], *((self.gone[i] + self.gone[j]).min(axis=0) for j in range(i))]
+    def compute_arcs(self, i: int) -> np.ndarray:
+        """Return path lengths of a shape, absolute and relative to earlier ones, (1 + i, S)."""
+        steps = [
+            self.displacements[i][0],
+            *((self.displacements[i] + self.displacements[j]).min(axis=0) for j in range(i)),
+        ]
         return np.concatenate([np.zeros((1 + i, 1)), np.cumsum(steps, axis=1)], axis=1)
 
-    def standing_bounds(self, i: int, rows: np.ndarray) -> np.ndarray:
-        """Return lower bounds of distances to all fixed shapes, shape (rows, fixed shapes)."""
-        local = np.einsum("kba,rkb->rka", self.turns, self.centres[i][rows][:, None] - self.middles)
-        outside = np.maximum(np.abs(local) - self.halves, 0.0)
-        return np.sqrt(np.einsum("rka,rka->rk", outside, outside)) - self.moving[i].shape.radius
+    def bound_fixed_distances(self, i: int, rows: np.ndarray) -> np.ndarray:
+        """Return lower bounds of the distances to all fixed shapes, shape (rows, fixed shapes)."""
+        local = np.einsum(
+            "kba,rkb->rka",
+            self.fixed_rotations,
+            self.centres[i][rows][:, None] - self.fixed_centres,
+        )
+        excess = np.maximum(np.abs(local) - self.fixed_half_sides, 0.0)
+        return np.sqrt(np.einsum("rka,rka->rk", excess, excess)) - self.moving[i].shape.radius
 
-    def ball_bounds(self, i: int, j: int, rows: np.ndarray) -> np.ndarray:
-        """The same of two that move, by the balls around them, shape (rows,)."""
-        apart = np.linalg.norm(self.centres[i][rows] - self.centres[j][rows], axis=1)
-        return np.asarray(apart - self.moving[i].shape.radius - self.moving[j].shape.radius)
+    def bound_moving_distances(self, i: int, j: int, rows: np.ndarray) -> np.ndarray:
+        """Return lower bounds of the distance between two moving shapes, shape (rows,)."""
+        distances = np.linalg.norm(self.centres[i][rows] - self.centres[j][rows], axis=1)
+        return np.asarray(distances - self.moving[i].shape.radius - self.moving[j].shape.radius)
 
 
 def check_collisions(
-    world: World, stage: Stage, allowed: list[Licence], built: Neighbours
+    world: World, stage: Stage, exemptions: list[Exemption], neighbours: Neighbours
 ) -> Iterator[Violation]:
     """Yield pairs that overlap ("overlap") or are too close at waypoints ("clearance")."""
     pairs = Pairs(world, stage)
     begins = np.arange(0, pairs.length, BLOCK)
     ends = np.append(begins[1:], pairs.length) - 1
     middles, waypoints = (begins + ends) // 2, stage.rows[1:]
-    safe, own_safe = (
-        float(world.plan.options[key]) - SHORT for key in ("dist_safe", "self_distance")
+    clearance, self_clearance = (
+        float(world.plan.options[key]) - CLEARANCE_SLACK for key in ("dist_safe", "self_distance")
     )
     for i, one in enumerate(pairs.moving):
-        arcs = pairs.arcs(i)
+        arcs = pairs.compute_arcs(i)
         reach = np.maximum(arcs[:, ends] - arcs[:, middles], arcs[:, middles] - arcs[:, begins])
         active, close = (
-            pairs.standing_bounds(i, middles) < reach[0][:, None],
-            pairs.standing_bounds(i, waypoints) < safe,
+            pairs.bound_fixed_distances(i, middles) < reach[0][:, None],
+            pairs.bound_fixed_distances(i, waypoints) < clearance,
         )
-        some = np.flatnonzero(active.any(axis=0) | close.any(axis=0))
-        todo = [(pairs.standing[k], arcs[0], active[:, k], close[:, k]) for k in some]
+        candidates = np.flatnonzero(active.any(axis=0) | close.any(axis=0))
+        todo = [(pairs.fixed[k], arcs[0], active[:, k], close[:, k]) for k in candidates]
         for j, other in enumerate(pairs.moving[:i]):
-            bounds = pairs.ball_bounds(i, j, middles), pairs.ball_bounds(i, j, waypoints)
+            bounds = (
+                pairs.bound_moving_distances(i, j, middles),
+                pairs.bound_moving_distances(i, j, waypoints),
+            )
             todo.append(
-                (other, arcs[1 + j], bounds[0] < reach[1 + j], bounds[1] < max(safe, own_safe))
+                (
+                    other,
+                    arcs[1 + j],
+                    bounds[0] < reach[1 + j],
+                    bounds[1] < max(clearance, self_clearance),
+                )
             )
         for other, arc, blocks, near in todo:
-            if not pairs.counts(one, other):
+            if not pairs.is_checked(one, other):
                 continue
             names = f"{one.label} - {other.label}"
-            close, built_in = built.during(stage, one, other)
-            asked = built.margin(one, other)
-            least = min(own_safe if one.owner == other.owner == "robot" else safe, asked - SHORT)
+            close, depths = neighbours.find_exempt_samples(stage, one, other)
+            margin = neighbours.get_margin(one, other)
+            required = min(
+                self_clearance if one.owner == other.owner == "robot" else clearance,
+                margin - CLEARANCE_SLACK,
+            )
             for k in waypoints[near]:
-                apart = compute_distance(one.shape.solid, one.at, other.shape.solid, other.at, k)
+                distance = compute_distance(
+                    one.shape.solid, one.poses, other.shape.solid, other.poses, k
+                )
                 time = float(stage.times[k])
-                licensed = any(own.covers(one.label, other.label, time, apart) for own in allowed)
-                if apart < least and not close[k] and not licensed:
+                exempt = any(
+                    exemption.applies(one.label, other.label, time, distance)
+                    for exemption in exemptions
+                )
+                if distance < required and not close[k] and not exempt:
                     yield Violation(
                         "clearance",
                         names,
                         time,
-                        least - apart,
-                        f"{1e3 * apart:.2f} mm apart at a waypoint",
+                        required - distance,
+                        f"{1e3 * distance:.2f} mm apart at a waypoint",
                     )
-            slack = CONTACT + np.maximum(built_in, max(0.0, -asked))
-            for own in allowed:
-                if own.depth and own.names(one.label, other.label):
-                    slack[(own.begin <= stage.times) & (stage.times <= own.end)] += own.depth
+            slack = CONTACT + np.maximum(depths, max(0.0, -margin))
+            for exemption in exemptions:
+                if exemption.depth and exemption.includes(one.label, other.label):
+                    slack[(exemption.begin <= stage.times) & (stage.times <= exemption.end)] += (
+                        exemption.depth
+                    )
             depth, row = _find_deepest(one, other, arc, blocks, slack)
             if depth > 0.0:
                 yield Violation(
@@ -163,24 +190,24 @@ def _find_deepest(
 ) -> tuple[float, int]:
     """Return the largest excess of penetration over its limit [m], and its sample.
 
-    The excess is negative where the shapes provably keep the limit.
+    The excess is negative if the shapes provably satisfy the limit.
 
     Args:
-        one: A shape.
-        other: The other.
-        arc: How far they have moved against each other, from the first sample on, shape (S,) [m].
-        active: For every block of samples, whether they could overlap there.
-        slack: By how much they may overlap, shape (S,) [m].
+        one: First shape.
+        other: Second shape.
+        arc: Length of their relative path from the first sample on, shape (S,) [m].
+        active: Whether the shapes could overlap in a block of samples, for every block.
+        slack: Largest penetration allowed, shape (S,) [m].
     """
-    worst, row, k = -np.inf, 0, 0
+    max_excess, row, k = -np.inf, 0, 0
     while k < len(arc):
         if not active[k // BLOCK]:
             later = np.flatnonzero(active[k // BLOCK :])
             if not len(later):
                 break
             k = int(k // BLOCK + later[0]) * BLOCK
-        apart = compute_distance(one.shape.solid, one.at, other.shape.solid, other.at, k)
-        if -apart - slack[k] > worst:
-            worst, row = -apart - slack[k], k
-        k = max(k + 1, int(np.searchsorted(arc, arc[k] + abs(apart))))
-    return worst, row
+        distance = compute_distance(one.shape.solid, one.poses, other.shape.solid, other.poses, k)
+        if -distance - slack[k] > max_excess:
+            max_excess, row = -distance - slack[k], k
+        k = max(k + 1, int(np.searchsorted(arc, arc[k] + abs(distance))))
+    return max_excess, row

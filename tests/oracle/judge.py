@@ -1,4 +1,4 @@
-"""Judges a saved plan."""
+"""Judges saved plans."""
 
 from __future__ import annotations
 
@@ -7,22 +7,23 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from .collisions import check_collisions
+from .exemptions import find_exemptions
 from .goals import check_goals
 from .motors import check_motors
 from .neighbours import Neighbours
 from .plan import NotJudged, SavedPlan, Violation, read_plan
 from .rules import check_motion, check_stage
 from .stage import World
-from .touching import find_licences
 
 __all__ = ["Verdict", "find_violations", "judge"]
 
 
 @dataclass
 class Verdict:
-    """A plan's own verdict, and the violations found here.
+    """A plan's own verdict, and the violations that the oracle finds.
 
-    `unjudged` is the reason if the plan could not be judged.
+    `says` are the violations in the plan's own report. `unjudged` is the reason why the oracle
+    cannot judge the plan.
     """
 
     path: Path
@@ -40,35 +41,37 @@ class Verdict:
 
 def judge(path: Path) -> Verdict:
     """Return the verdict on a saved plan."""
-    began = time.perf_counter()
+    start_time = time.perf_counter()
     plan = read_plan(path)
-    verdict = Verdict(path, plan.success, plan.status, plan.says)
+    verdict = Verdict(path, plan.success, plan.status, plan.violations)
     try:
         verdict.found = find_violations(plan)
     except NotJudged as error:
         verdict.unjudged = str(error)
-    except FileNotFoundError as error:  # the scene has moved away from its plan
+    except FileNotFoundError as error:  # files of the scene were moved
         verdict.unjudged = f"no longer there: {error}"
-    verdict.seconds = time.perf_counter() - began
+    verdict.seconds = time.perf_counter() - start_time
     return verdict
 
 
 def find_violations(plan: SavedPlan) -> list[Violation]:
     """Return the worst violation of each rule and subject, sorted by time."""
     world = World(plan)
-    stages = list(world.stages())
-    found = [*check_motion(world), *check_goals(world, stages)]
-    allowed, built = find_licences(world, stages), Neighbours(world)
+    stages = list(world.iterate_stages())
+    violations = [*check_motion(world), *check_goals(world, stages)]
+    exemptions, neighbours = find_exemptions(world, stages), Neighbours(world)
     for stage in stages:
-        found += check_stage(world, stage)
-        found += check_motors(world, stage)
-        found += check_collisions(world, stage, allowed, built)
+        violations += check_stage(world, stage)
+        violations += check_motors(world, stage)
+        violations += check_collisions(world, stage, exemptions, neighbours)
     worst: dict[tuple[str, str], Violation] = {}
-    for one in found:
-        key = (one.rule, one.subject)
-        if key not in worst or worst[key].amount < one.amount:
-            worst[key] = one
+    for violation in violations:
+        key = (violation.rule, violation.subject)
+        if key not in worst or worst[key].amount < violation.amount:
+            worst[key] = violation
     for rule, subject in list(worst):
         if rule == "overlap":
             worst.pop(("clearance", subject), None)
-    return sorted(worst.values(), key=lambda one: (one.time, one.rule, one.subject))
+    return sorted(
+        worst.values(), key=lambda violation: (violation.time, violation.rule, violation.subject)
+    )

@@ -1,9 +1,9 @@
-"""Finds pairs that may stay close: those that a scene allows, and those close by construction.
+"""Finds pairs that may stay close: pairs that a scene allows, and pairs close by construction.
 
-A shape of an object that no hand can carry away, and another that is fixed there, are neighbours if
-they are closer than the clearance at the start or with every joint at zero: for as long as each of
-their joints is between the values at which it alone would take them that far apart. Neighbours need
-no clearance. Those that overlap where they stand may do so, as deep as one joint alone takes them.
+Neighbours are a shape of an articulated object and a shape of another object or obstacle that are
+closer than the clearance, at the start or with all joints at zero. They need no clearance while
+each of their joints is in the interval in which it alone keeps them that close. Neighbours that
+overlap initially may overlap there, up to the largest penetration that a single joint causes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .poses import make_pose
-from .riding import compute_distance
+from .supports import compute_distance
 
 if TYPE_CHECKING:
     from .poses import Poses
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 
 __all__ = ["Neighbours"]
 
-NEARLY = 1e-3  # [m] short of the clearance that is as good as having it
-RESTS = 1e-4  # [m] of overlap that is none
-VALUES = 150  # of a joint on its way to a limit
+SLACK = 1e-3  # [m] of the clearance
+ROUNDING = 1e-4  # [m] of penetration
+VALUES = 150  # of a joint between its state and a limit
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two shapes, their penetration limit [m], and "<object>.<joint>" → interval of the joint."""
+    """Two shapes, the allowed penetration [m], and "<object>.<joint>" → interval of the joint."""
 
     shapes: frozenset[tuple[str, int]]
     depth: float
@@ -43,70 +43,73 @@ class Neighbours:
     """The neighbouring pairs of a world."""
 
     def __init__(self, world: World) -> None:
-        self.world, self.safe = world, float(world.plan.options["dist_safe"])
-        self.listed = list(self._listed())
+        self.world, self.clearance = world, float(world.plan.options["dist_safe"])
+        self.allowed_pairs = list(self._read_allowed_pairs())
         self.fixed = {name: obj for name, obj in world.objects.items() if not obj.free}
-        zero = {
+        zeros = {
             name: {joint: float(np.clip(0.0, *obj.limits[joint][:2])) for joint in obj.state}
             for name, obj in self.fixed.items()
         }
         self.pairs = [
-            *self._found({name: obj.state for name, obj in self.fixed.items()}),
-            *self._found(zero),
+            *self._find_pairs({name: obj.state for name, obj in self.fixed.items()}),
+            *self._find_pairs(zeros),
         ]
 
-    def _listed(self) -> list[tuple[str, str, float]]:
-        found = []
+    def _read_allowed_pairs(self) -> list[tuple[str, str, float]]:
+        pairs = []
         for item in self.world.plan.scene.get("allow") or ():
             if item.get("srdf"):
                 root = ElementTree.parse(self.world.plan.folder / item["srdf"]).getroot()
-                found += [
-                    (each.get("link1"), each.get("link2"), -np.inf)
-                    for each in root.iter("disable_collisions")
+                pairs += [
+                    (pair.get("link1"), pair.get("link2"), -np.inf)
+                    for pair in root.iter("disable_collisions")
                 ]
             else:
                 margin = item.get("margin")
-                found.append((*item["pair"], -np.inf if margin is None else float(margin)))
-        return found
+                pairs.append((*item["pair"], -np.inf if margin is None else float(margin)))
+        return pairs
 
-    def margin(self, one: Solid, other: Solid) -> float:
-        """Return the clearance that a scene asks of two shapes; infinite if it says nothing."""
+    def get_margin(self, one: Solid, other: Solid) -> float:
+        """Return the clearance that a scene sets for two shapes; infinite by default."""
 
-        def means(name: str, part: Solid) -> bool:
+        def matches(name: str, part: Solid) -> bool:
             return part.label == name or (part.owner == name and name in self.world.objects)
 
         return min(
             (
-                m
-                for a, b, m in self.listed
-                if (means(a, one) and means(b, other)) or (means(a, other) and means(b, one))
+                margin
+                for a, b, margin in self.allowed_pairs
+                if (matches(a, one) and matches(b, other))
+                or (matches(a, other) and matches(b, one))
             ),
             default=np.inf,
         )
 
-    def during(self, stage: Stage, one: Solid, other: Solid) -> tuple[np.ndarray, np.ndarray]:
-        """Return the samples at which shapes need no clearance, and their penetration limit."""
+    def find_exempt_samples(
+        self, stage: Stage, one: Solid, other: Solid
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the samples at which shapes need no clearance, and the allowed penetrations."""
         close, depth = np.zeros(len(stage.times), bool), np.zeros(len(stage.times))
         shapes = frozenset((part.label, id(part.shape)) for part in (one, other))
         for pair in self.pairs:
             if pair.shapes == shapes:
-                holds = np.ones(len(stage.times), bool)
+                inside = np.ones(len(stage.times), bool)
                 for name, (low, high) in pair.joints.items():
-                    index, (owner, _, joint) = self.world.plan.index(name), name.partition(".")
+                    index, (owner, _, joint) = self.world.plan.find_index(name), name.partition(".")
                     values = (
                         stage.columns[:, index]
                         if index is not None
                         else np.array([self.fixed[owner].state[joint]])
                     )
-                    holds &= (low <= values) & (values <= high)
-                close |= holds
-                depth = np.maximum(depth, np.where(holds, pair.depth, 0.0))
+                    inside &= (low <= values) & (values <= high)
+                close |= inside
+                depth = np.maximum(depth, np.where(inside, pair.depth, 0.0))
         return close, depth
 
-    def _found(self, state: dict[str, dict[str, float]]) -> list[Pair]:
-        """Return the close pairs in a state of all objects that no hand carries away."""
+    def _find_pairs(self, state: dict[str, dict[str, float]]) -> list[Pair]:
+        """Return the close pairs in a state of the objects' joints."""
         links = {
-            name: obj.tree.links(state[name], None, obj.tree.urdf.links)
+            name: obj.tree.compute_links(state[name], None, obj.tree.urdf.links)
             for name, obj in self.fixed.items()
         }
         parts: list[tuple[str, Shape, Poses]] = []
@@ -116,56 +119,82 @@ class Neighbours:
                     (
                         f"{name}.{shape.link}",
                         shape,
-                        obj.at @ links[name][shape.link] @ shape.place,
+                        obj.placement @ links[name][shape.link] @ shape.placement,
                     )
                 )
         parts += [
-            (solid.label, solid.shape, solid.at)
+            (solid.label, solid.shape, solid.poses)
             for solid in self.world.obstacles
             if solid.owner != "floor"
         ]
-        found, done = [], set()
-        centres = np.array([(place @ make_pose(shape.centre)).at[0] for _, shape, place in parts])
+        pairs, done = [], set()
+        centres = np.array(
+            [(placement @ make_pose(shape.centre)).translation[0] for _, shape, placement in parts]
+        )
         radii = np.array([shape.radius for _, shape, _ in parts])
-        for k, (label, shape, place) in enumerate(parts):
-            if not self._joints(label):
+        for k, (label, shape, placement) in enumerate(parts):
+            if not self._find_joints(label):
                 continue
-            gaps = np.linalg.norm(centres - centres[k], axis=1) - radii - radii[k]
-            for other, second, there in (parts[i] for i in np.flatnonzero(gaps <= self.safe)):
-                key = frozenset(((label, id(shape)), (other, id(second))))
-                if label.partition(".")[0] == other.partition(".")[0] or key in done:
+            distances = np.linalg.norm(centres - centres[k], axis=1) - radii - radii[k]
+            for other, other_shape, other_placement in (
+                parts[i] for i in np.flatnonzero(distances <= self.clearance)
+            ):
+                shapes = frozenset(((label, id(shape)), (other, id(other_shape))))
+                if label.partition(".")[0] == other.partition(".")[0] or shapes in done:
                     continue
-                done.add(key)
-                apart = self._apart((shape, place), (second, there))
-                if apart < self.safe - NEARLY:
-                    ranges, deepest = {}, max(0.0, -apart)
-                    for (mine, own), (_, body, where) in (
-                        ((label, shape), (other, second, there)),
-                        ((other, second), (label, shape, place)),
+                done.add(shapes)
+                distance = self._compute_distance(
+                    (shape, placement), (other_shape, other_placement)
+                )
+                if distance < self.clearance - SLACK:
+                    ranges, max_depth = {}, max(0.0, -distance)
+                    for (moving_label, moving_shape), (_, fixed_shape, fixed_placement) in (
+                        ((label, shape), (other, other_shape, other_placement)),
+                        ((other, other_shape), (label, shape, placement)),
                     ):
-                        owner = mine.partition(".")[0]
-                        for joint in self._joints(mine):
-                            ends, deep = self._range(mine, own, joint, state[owner], (body, where))
-                            ranges[f"{owner}.{joint}"], deepest = ends, max(deepest, deep)
-                    depth = 0.0 if apart > -RESTS else np.inf if len(ranges) == 1 else deepest
-                    found.append(Pair(key, depth, ranges))
-        return found
+                        owner = moving_label.partition(".")[0]
+                        for joint in self._find_joints(moving_label):
+                            interval, depth_of_joint = self._find_joint_range(
+                                moving_label,
+                                moving_shape,
+                                joint,
+                                state[owner],
+                                (fixed_shape, fixed_placement),
+                            )
+                            ranges[f"{owner}.{joint}"], max_depth = (
+                                interval,
+                                max(max_depth, depth_of_joint),
+                            )
+                    depth = (
+                        0.0 if distance > -ROUNDING else np.inf if len(ranges) == 1 else max_depth
+                    )
+                    pairs.append(Pair(shapes, depth, ranges))
+        return pairs
 
-    def _apart(self, one: tuple[Shape, object], other: tuple[Shape, object], k: int = 0) -> float:
-        (a, here), (b, there) = one, other
-        i, j = (0 if len(place.turn) == 1 else k for place in (here, there))
-        centres = here.turn[i] @ a.centre + here.at[i], there.turn[j] @ b.centre + there.at[j]
-        least = float(np.linalg.norm(centres[0] - centres[1])) - a.radius - b.radius
-        return least if least > self.safe else compute_distance(a.solid, here, b.solid, there, k)
+    def _compute_distance(
+        self, one: tuple[Shape, object], other: tuple[Shape, object], k: int = 0
+    ) -> float:
+        (a, placement), (b, other_placement) = one, other
+        i, j = (0 if len(poses.rotation) == 1 else k for poses in (placement, other_placement))
+        centres = (
+            placement.rotation[i] @ a.centre + placement.translation[i],
+            other_placement.rotation[j] @ b.centre + other_placement.translation[j],
+        )
+        lower_bound = float(np.linalg.norm(centres[0] - centres[1])) - a.radius - b.radius
+        return (
+            lower_bound
+            if lower_bound > self.clearance
+            else compute_distance(a.solid, placement, b.solid, other_placement, k)
+        )
 
-    def _joints(self, label: str) -> list[str]:
+    def _find_joints(self, label: str) -> list[str]:
         owner, _, link = label.partition(".")
         if owner not in self.fixed:
             return []
         urdf = self.fixed[owner].tree.urdf
-        return [joint for joint in urdf.path_to(link) if urdf.moves(joint)]
+        return [joint for joint in urdf.find_joint_path(link) if urdf.is_movable(joint)]
 
-    def _range(
+    def _find_joint_range(
         self,
         label: str,
         shape: Shape,
@@ -173,28 +202,32 @@ class Neighbours:
         state: dict[str, float],
         other: tuple[Shape, Poses],
     ) -> tuple[tuple[float, float], float]:
-        """Return the joint interval in which a shape violates the clearance, and the depth."""
+        """Return the joint interval in which a shape violates the clearance, and its depth."""
         owner, _, link = label.partition(".")
-        obj, deepest = self.fixed[owner], 0.0
+        obj, max_depth = self.fixed[owner], 0.0
 
-        def apart(values: np.ndarray) -> np.ndarray:
-            place = (
-                obj.at @ obj.tree.links({**state, joint: values}, None, [link])[link] @ shape.place
+        def compute_distances(values: np.ndarray) -> np.ndarray:
+            placement = (
+                obj.placement
+                @ obj.tree.compute_links({**state, joint: values}, None, [link])[link]
+                @ shape.placement
             )
-            return np.array([self._apart((shape, place), other, k) for k in range(len(values))])
+            return np.array(
+                [self._compute_distance((shape, placement), other, k) for k in range(len(values))]
+            )
 
         ends = []
         for limit, sign in zip(obj.limits[joint][:2], (-1.0, 1.0), strict=True):
             values = np.linspace(
                 state[joint], limit if np.isfinite(limit) else state[joint] + sign * np.pi, VALUES
             )
-            distances = apart(values)
-            beyond = np.flatnonzero(distances >= self.safe)
+            distances = compute_distances(values)
+            beyond = np.flatnonzero(distances >= self.clearance)
             inside = distances[: beyond[0]] if len(beyond) else distances
             if len(inside) and inside.min() < 0.0:
                 k = int(np.argmin(inside))
                 around = np.linspace(values[max(k - 1, 0)], values[min(k + 1, VALUES - 1)], VALUES)
-                deepest = max(deepest, float(-apart(around).min()))
+                max_depth = max(max_depth, float(-compute_distances(around).min()))
             if not len(beyond):
                 ends.append(sign * np.inf)
                 continue
@@ -202,7 +235,9 @@ class Neighbours:
             for _ in range(30):
                 middle = (near + far) / 2
                 near, far = (
-                    (near, middle) if apart(np.array([middle]))[0] >= self.safe else (middle, far)
+                    (near, middle)
+                    if compute_distances(np.array([middle]))[0] >= self.clearance
+                    else (middle, far)
                 )
             ends.append(float(far))
-        return (ends[0], ends[1]), deepest
+        return (ends[0], ends[1]), max_depth

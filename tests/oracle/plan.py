@@ -1,4 +1,4 @@
-"""Reads a saved plan: an .npz with JSON `about`, `times`, `positions`, and optionally a curve."""
+"""Reads a saved plan: an .npz with JSON `about`, `times`, `positions` and an optional curve."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 class NotJudged(Exception):
-    """The plan is of a kind that cannot be judged here."""
+    """The oracle cannot judge this kind of plan."""
 
 
 @dataclass(frozen=True)
 class Violation:
-    """A violation: rule, subject, time [s] and amount."""
+    """A violation: rule, subject, time [s], amount and detail."""
 
     rule: str
     subject: str
@@ -38,9 +38,9 @@ class Violation:
 
 @dataclass(frozen=True)
 class Hold:
-    """An object held at an attachment, by the tool or by a frame "<object>.<link>".
+    """An object grasped at an attachment, by the tool or by a frame "<object>.<link>".
 
-    It is `measured` while it is held as the scene's start says.
+    A `measured` grasp has the deviation that the start of the scene states.
     """
 
     object: str
@@ -51,7 +51,7 @@ class Hold:
 
 @dataclass(frozen=True)
 class Phase:
-    """A phase from waypoint `first` to `last`; `opening` of the gripper [m], None: at rest."""
+    """A phase from waypoint `first` to `last`, with the gripper's `opening` [m]; None: at rest."""
 
     name: str
     first: int
@@ -60,36 +60,40 @@ class Phase:
     opening: float | None
 
 
-_FINE = 8  # parts of a cubic that are looked at
+_PARTS = 8  # of a cubic between samples
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Cubics between knots, by positions and velocities there."""
+    """Cubics between knots, from the positions and velocities at the knots."""
 
     times: np.ndarray
     positions: np.ndarray
-    rates: np.ndarray
+    velocities: np.ndarray
 
-    def inside(self, parts: int) -> np.ndarray:
-        """Return times in every cubic, with both ends."""
+    def sample_times(self, parts: int) -> np.ndarray:
+        """Return equidistant times in every cubic, including its ends, shape (C, parts + 1)."""
         return self.times[:-1, None] + np.diff(self.times)[:, None] * np.linspace(
             0.0, 1.0, parts + 1
         )
 
-    def derivative(
-        self, moments: np.ndarray, order: int, number: np.ndarray | None = None
+    def evaluate(
+        self, times: np.ndarray, order: int, cubics: np.ndarray | None = None
     ) -> np.ndarray:
-        """Return values (0), velocities (1) or accelerations (2) of the cubics at some times."""
+        """Return positions (0), velocities (1) or accelerations (2) at times [s]."""
         k = (
-            np.clip(np.searchsorted(self.times, moments, side="right") - 1, 0, len(self.times) - 2)
-            if number is None
-            else number
+            np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
+            if cubics is None
+            else cubics
         )
-        h, since = np.diff(self.times)[k][:, None], (moments - self.times[k])[:, None]
-        p, v, step = self.positions[k], self.rates[k], self.positions[k + 1] - self.positions[k]
-        c2 = (3.0 * step / h - 2.0 * v - self.rates[k + 1]) / h
-        c3 = (v + self.rates[k + 1] - 2.0 * step / h) / h**2
+        h, since = np.diff(self.times)[k][:, None], (times - self.times[k])[:, None]
+        p, v, step = (
+            self.positions[k],
+            self.velocities[k],
+            self.positions[k + 1] - self.positions[k],
+        )
+        c2 = (3.0 * step / h - 2.0 * v - self.velocities[k + 1]) / h
+        c3 = (v + self.velocities[k + 1] - 2.0 * step / h) / h**2
         if order == 0:
             return p + since * (v + since * (c2 + since * c3))
         return (
@@ -99,7 +103,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class SavedPlan:
-    """A plan's file; `says` is its own verdict: violated constraints by name and subject."""
+    """A saved plan; `violations` are those of its own report, by constraint and subject."""
 
     scene: dict[str, Any]
     folder: Path
@@ -112,87 +116,89 @@ class SavedPlan:
     robot_size: int
     phases: list[Phase]
     status: str
-    says: list[str]
+    violations: list[str]
     terms: int
 
     @property
     def success(self) -> bool:
-        return self.status == "success" and not self.says
+        return self.status == "success" and not self.violations
 
-    def evaluate(self, moments: np.ndarray) -> np.ndarray:
-        """Return all coordinates at some times."""
+    def evaluate(self, times: np.ndarray) -> np.ndarray:
+        """Return all coordinates at times [s]."""
         if self.curve is not None:
-            return self.curve.derivative(moments, 0)
+            return self.curve.evaluate(times, 0)
         return np.stack(
-            [np.interp(moments, self.times, column) for column in self.positions.T], axis=1
+            [np.interp(times, self.times, column) for column in self.positions.T], axis=1
         )
 
-    def fine(self) -> np.ndarray:
+    def sample_coordinates(self) -> np.ndarray:
         """Return the coordinates at the waypoints and at samples between them."""
         if self.curve is None:
             return self.positions
-        return self.evaluate(np.concatenate([self.curve.inside(_FINE).ravel(), self.times]))
+        return self.evaluate(np.concatenate([self.curve.sample_times(_PARTS).ravel(), self.times]))
 
-    def index(self, name: str) -> int | None:
+    def find_index(self, name: str) -> int | None:
         return self.names.index(name) if name in self.names else None
 
 
 def sort_holds(
     held: dict[str, str], by: dict[str, str], measured: Collection[str]
 ) -> tuple[Hold, ...]:
-    """Return holds, each after the one that it hangs on."""
-    found: list[Hold] = []
-    left = dict(held)
-    while left:
-        ready = [name for name in left if by.get(name, "").partition(".")[0] not in left]
+    """Return grasps in an order in which every holder precedes its objects."""
+    holds: list[Hold] = []
+    remaining = dict(held)
+    while remaining:
+        ready = [name for name in remaining if by.get(name, "").partition(".")[0] not in remaining]
         if not ready:
-            raise ValueError(f"objects hold each other: {left}")
-        found += [Hold(name, left.pop(name), by.get(name), name in measured) for name in ready]
-    return tuple(found)
+            raise ValueError(f"objects hold each other: {remaining}")
+        holds += [Hold(name, remaining.pop(name), by.get(name), name in measured) for name in ready]
+    return tuple(holds)
 
 
 def read_plan(path: Path) -> SavedPlan:
-    """Return the contents of a plan's file."""
+    """Return the plan in a file."""
     with np.load(path, allow_pickle=False) as archive:
-        about = json.loads(str(archive["about"]))
+        metadata = json.loads(str(archive["about"]))
         times, positions = np.array(archive["times"]), np.array(archive["positions"])
         knots = ("knot_times", "knot_positions", "knot_rates")
         curve = Curve(*(np.array(archive[name]) for name in knots)) if knots[0] in archive else None
-    where = about["folder"]
-    if "package" in where:
-        folder = ROOT / where["package"]
+    location = metadata["folder"]
+    if "package" in location:
+        folder = ROOT / location["package"]
     else:
-        beside = path.resolve().parent / where["relative"]
-        folder = beside if beside.is_dir() else Path(where["absolute"])
-    motion = about["trajectory"]
-    said = (about["scene"]["start"].get("held") or {}).items()
+        beside = path.resolve().parent / location["relative"]
+        folder = beside if beside.is_dir() else Path(location["absolute"])
+    motion = metadata["trajectory"]
+    start_grasps = (metadata["scene"]["start"].get("held") or {}).items()
     holds, measured = (
         [],
-        {name for name, hold in said if isinstance(hold, dict) and "measured" in hold},
+        {name for name, hold in start_grasps if isinstance(hold, dict) and "measured" in hold},
     )
     for p in motion["phases"]:
         measured &= (p.get("deviation") or {}).keys()
         holds.append(sort_holds(p["held"], p.get("by") or {}, measured))
-    both = zip(motion["phases"], holds, strict=True)
-    phases = [Phase(p["name"], p["first"], p["last"], held, p.get("opening")) for p, held in both]
+    pairs = zip(motion["phases"], holds, strict=True)
+    phases = [Phase(p["name"], p["first"], p["last"], held, p.get("opening")) for p, held in pairs]
     return SavedPlan(
-        scene=about["scene"],
+        scene=metadata["scene"],
         folder=folder,
-        steps=about["steps"],
-        options=about["options"],
+        steps=metadata["steps"],
+        options=metadata["options"],
         names=motion["names"],
         times=times,
         positions=positions,
         curve=curve,
         robot_size=motion["robot_size"],
         phases=phases,
-        status=about["status"],
-        says=[f"{v['constraint']} {v['subject']}" for v in about["validation"]["violations"]],
-        terms=len(about.get("terms", ())),
+        status=metadata["status"],
+        violations=[
+            f"{v['constraint']} {v['subject']}" for v in metadata["validation"]["violations"]
+        ],
+        terms=len(metadata.get("terms", ())),
     )
 
 
 def read_yaml(path: Path) -> Any:
     """Return the contents of a YAML file."""
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the same in C, where it is compiled
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the faster one, if it is compiled
     return yaml.load(path.read_text(encoding="utf-8"), Loader=loader)

@@ -1,4 +1,4 @@
-"""Placements at many samples: rotations (S, 3, 3) and translations (S, 3) [m]; S = 1: constant."""
+"""Computes with placements at samples: rotations (S, 3, 3) and translations (S, 3) [m]."""
 
 from __future__ import annotations
 
@@ -19,32 +19,36 @@ __all__ = [
 
 
 class Poses(NamedTuple):
-    """Placements over time."""
+    """Placements over time; S = 1: constant."""
 
-    turn: np.ndarray
-    at: np.ndarray
+    rotation: np.ndarray
+    translation: np.ndarray
 
     def __matmul__(self, other: Poses) -> Poses:
-        return Poses(self.turn @ other.turn, (self.turn @ other.at[:, :, None])[:, :, 0] + self.at)
+        return Poses(
+            self.rotation @ other.rotation,
+            (self.rotation @ other.translation[:, :, None])[:, :, 0] + self.translation,
+        )
 
     def inverse(self) -> Poses:
-        back = self.turn.transpose(0, 2, 1)
-        return Poses(back, -np.einsum("kij,kj->ki", back, self.at))
+        inverse_rotation = self.rotation.transpose(0, 2, 1)
+        return Poses(inverse_rotation, -np.einsum("kij,kj->ki", inverse_rotation, self.translation))
 
-    def points(self, point: np.ndarray) -> np.ndarray:
-        """Where a point of the frame is, shape (S, 3)."""
-        return self.turn @ point + self.at
+    def transform_point(self, point: np.ndarray) -> np.ndarray:
+        """Return a point of the frame in the parent frame, shape (S, 3)."""
+        return self.rotation @ point + self.translation
 
-    def row(self, k: int) -> Poses:
-        """The placement at moment k alone."""
-        k = 0 if len(self.turn) == 1 else k
-        return Poses(self.turn[k][None], self.at[k][None])
+    def get_sample(self, k: int) -> Poses:
+        """Return the placement at sample k."""
+        k = 0 if len(self.rotation) == 1 else k
+        return Poses(self.rotation[k][None], self.translation[k][None])
 
     @property
     def is_constant(self) -> bool:
-        """Whether it does not change."""
+        """Whether all placements are equal."""
         return bool(
-            np.ptp(self.turn, axis=0).max() < 1e-12 and np.ptp(self.at, axis=0).max() < 1e-12
+            np.ptp(self.rotation, axis=0).max() < 1e-12
+            and np.ptp(self.translation, axis=0).max() < 1e-12
         )
 
 
@@ -57,36 +61,38 @@ def rotate_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
     return about_z @ about_y @ about_x
 
 
-def read_orientation(about: Mapping[str, Any]) -> np.ndarray:
-    """Return the rotation that `rpy`, `yaw` or `quaternion` of a description says, shape (3, 3)."""
-    if about.get("quaternion"):
-        x, y, z, w = np.array(about["quaternion"], float) / np.linalg.norm(about["quaternion"])
-        across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        return np.eye(3) + 2.0 * w * across + 2.0 * across @ across
-    return rotate_rpy(*(about.get("rpy") or (0.0, 0.0, about.get("yaw") or 0.0)))
+def read_orientation(description: Mapping[str, Any]) -> np.ndarray:
+    """Return the rotation of a description's `rpy`, `yaw` or `quaternion`, shape (3, 3)."""
+    if description.get("quaternion"):
+        x, y, z, w = np.array(description["quaternion"], float) / np.linalg.norm(
+            description["quaternion"]
+        )
+        skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        return np.eye(3) + 2.0 * w * skew + 2.0 * skew @ skew
+    return rotate_rpy(*(description.get("rpy") or (0.0, 0.0, description.get("yaw") or 0.0)))
 
 
-def make_pose(position: object = (0.0, 0.0, 0.0), turn: np.ndarray | None = None) -> Poses:
-    """Return one placement."""
+def make_pose(position: object = (0.0, 0.0, 0.0), rotation: np.ndarray | None = None) -> Poses:
+    """Return a constant placement."""
     return Poses(
-        (np.eye(3) if turn is None else np.asarray(turn, float))[None],
+        (np.eye(3) if rotation is None else np.asarray(rotation, float))[None],
         np.asarray(position, float)[None],
     )
 
 
 def rotate_about_axis(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Return rotations about an axis by angles, shape (S,): shape (S, 3, 3) (Rodrigues)."""
+    """Return rotations about an axis, shape (S, 3, 3), by angles of shape (S,) (Rodrigues)."""
     x, y, z = axis / np.linalg.norm(axis)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return (
         np.eye(3)
-        + np.sin(angles)[:, None, None] * cross
-        + (1 - np.cos(angles))[:, None, None] * (cross @ cross)
+        + np.sin(angles)[:, None, None] * skew
+        + (1 - np.cos(angles))[:, None, None] * (skew @ skew)
     )
 
 
 def compute_angle(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the angles between rotations, shape (S,) [rad]; precise where they are small."""
+    """Return the angles between rotations, shape (S,) [rad]; accurate for small angles."""
     return 2.0 * np.arcsin(
         np.clip(np.linalg.norm(one - other, axis=(1, 2)) / np.sqrt(8.0), 0.0, 1.0)
     )

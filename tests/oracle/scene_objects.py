@@ -20,25 +20,25 @@ __all__ = ["Grasp", "Robot", "SceneObject", "Tree", "load_object", "load_robot"]
 
 
 class Tree:
-    """The kinematics of a URDF, by Pinocchio, on a planar joint at a height [m] if it drives."""
+    """Kinematics of a URDF, by Pinocchio; a mobile base adds a planar joint at a height [m]."""
 
-    def __init__(self, urdf: Urdf, *, drives: bool, height: float = 0.0) -> None:
+    def __init__(self, urdf: Urdf, *, is_mobile: bool, height: float = 0.0) -> None:
         self.urdf = urdf
         self.model = pin.buildModelFromXML(
-            urdf.text, *((pin.JointModelPlanar(), "base") if drives else ())
+            urdf.text, *((pin.JointModelPlanar(), "base") if is_mobile else ())
         )
-        if drives:
+        if is_mobile:
             self.model.jointPlacements[1] = pin.SE3(np.eye(3), np.array([0.0, 0.0, height]))
         self.data = self.model.createData()
 
-    def links(
+    def compute_links(
         self, values: Mapping[str, np.ndarray | float], base: np.ndarray | None, wanted: list[str]
     ) -> dict[str, Poses]:
-        """Return where links (or other frames) are in the frame of the root's parent.
+        """Return the poses of links or other frames, relative to the parent of the root.
 
         Args:
-            values: Joint → values, shape (S,) or one number [m] or [rad]; all others are neutral.
-            base: x, y [m] and yaw [rad] of one that drives, shape (S, 3).
+            values: Joint → values [m] or [rad], shape (S,) or a number. Default: neutral.
+            base: x, y [m] and yaw [rad] of a mobile base, shape (S, 3).
             wanted: Names of frames.
         """
         rows = max(
@@ -53,25 +53,26 @@ class Tree:
                 q[:, joint.idx_q], q[:, joint.idx_q + 1] = np.cos(value), np.sin(value)
             else:
                 q[:, joint.idx_q] = value
-        frames = {name: self.frame(name) for name in wanted}
+        frames = {name: self.find_frame(name) for name in wanted}
         joints = sorted({frame.parentJoint for frame in frames.values()})
-        found = np.empty((rows, len(joints), 4, 4))
+        matrices = np.empty((rows, len(joints), 4, 4))
         placements = [self.data.oMi[joint] for joint in joints]
         for k in range(rows):
             pin.forwardKinematics(self.model, self.data, q[k])
             for column, placement in enumerate(placements):
-                found[k, column] = placement.homogeneous
-        of_joint = {
-            joint: Poses(found[:, i, :3, :3], found[:, i, :3, 3]) for i, joint in enumerate(joints)
+                matrices[k, column] = placement.homogeneous
+        joint_poses = {
+            joint: Poses(matrices[:, i, :3, :3], matrices[:, i, :3, 3])
+            for i, joint in enumerate(joints)
         }
         return {
-            name: of_joint[frame.parentJoint]
+            name: joint_poses[frame.parentJoint]
             @ make_pose(frame.placement.translation, frame.placement.rotation)
             for name, frame in frames.items()
         }
 
-    def frame(self, name: str) -> Any:
-        """The frame of a link, or else of another of that name."""
+    def find_frame(self, name: str) -> Any:
+        """Return the frame of a link or, without such a link, another frame of that name."""
         for kind in (
             pin.FrameType.BODY,
             pin.FrameType.OP_FRAME,
@@ -85,37 +86,37 @@ class Tree:
 
 @dataclass(frozen=True)
 class Grasp:
-    """An attachment: the tool's pose in a link is place · J(v) · standoff along the tool's −z.
+    """An attachment: the tool's pose in a link is placement · J(v) · standoff along the tool's −z.
 
-    `freedoms` are (name of the coordinate in the object, slides or not, axis, lower, upper); those
-    that turn do so about an axis through a point of `through`. Of a grasp that is `pushed`, the
-    hand's foremost point is where the tool would be. One that is measured is `off` by a pose.
+    `freedoms` are (name of the coordinate in the object, is prismatic, axis, lower, upper); axes of
+    rotation pass through `points`. A `pushed` link touches the foremost point of the hand, not the
+    tool. `deviation` is the pose error of a measured grasp.
     """
 
     name: str
     link: str
-    place: Poses
+    placement: Poses
     freedoms: tuple[tuple[str, bool, np.ndarray, float, float], ...]
-    through: tuple[np.ndarray, ...]
+    points: tuple[np.ndarray, ...]
     standoff: float
     firm: bool
     clearance: float | None
     pushed: bool
     opening: float | None
-    off: Poses | None = None
+    deviation: Poses | None = None
 
-    def tool(self, values: Mapping[str, np.ndarray]) -> Poses:
-        """Return the tool in the link's frame at values of the freedoms, shape (S,) each."""
-        found = self.place
-        for (name, slides, axis, _, _), point in zip(self.freedoms, self.through, strict=True):
+    def compute_tool(self, values: Mapping[str, np.ndarray]) -> Poses:
+        """Return the tool's poses in the link's frame for values of the freedoms, shape (S,)."""
+        pose = self.placement
+        for (name, is_prismatic, axis, _, _), point in zip(self.freedoms, self.points, strict=True):
             value = np.atleast_1d(values[name])
-            if slides:
-                found = found @ Poses(np.tile(np.eye(3), (len(value), 1, 1)), value[:, None] * axis)
+            if is_prismatic:
+                pose = pose @ Poses(np.tile(np.eye(3), (len(value), 1, 1)), value[:, None] * axis)
             else:
-                turn = rotate_about_axis(axis, value)
-                found = found @ Poses(turn, point - turn @ point)
-        found = found @ make_pose((0.0, 0.0, -self.standoff))
-        return found if self.off is None else found @ self.off
+                rotation = rotate_about_axis(axis, value)
+                pose = pose @ Poses(rotation, point - rotation @ point)
+        pose = pose @ make_pose((0.0, 0.0, -self.standoff))
+        return pose if self.deviation is None else pose @ self.deviation
 
 
 @dataclass(frozen=True)
@@ -125,32 +126,32 @@ class SceneObject:
     name: str
     tree: Tree
     free: bool
-    at: Poses
+    placement: Poses
     state: dict[str, float]
     limits: dict[str, tuple[float, float, float, float]]
     grasps: dict[str, Grasp]
     latches: list[dict[str, Any]]
-    resists: dict[str, dict[str, float]]
+    resistances: dict[str, dict[str, float]]
     mass: float | None
 
-    def grasp(self, name: str | None) -> Grasp:
+    def get_grasp(self, name: str | None) -> Grasp:
         return next(iter(self.grasps.values())) if name is None else self.grasps[name]
 
-    def slides(self, joint: str) -> bool:
-        return self.tree.urdf.kind(joint) == "prismatic"
+    def is_prismatic(self, joint: str) -> bool:
+        return self.tree.urdf.get_joint_type(joint) == "prismatic"
 
 
 @dataclass(frozen=True)
 class Robot:
     """A robot: planned joints `arm`; pairs of links `exempt` from checks; finger joints `gripper`.
 
-    `coupled` joints move with one of `arm`: joint → (that one, factor, offset).
+    `coupled` maps joints to the planned joints that they follow: (planned joint, factor, offset).
     """
 
     tree: Tree
     base: str
     tool: str
-    touch: set[str]
+    touch_links: set[str]
     arm: list[str]
     locked: dict[str, float]
     limits: dict[str, tuple[float, float, float, float]]
@@ -160,40 +161,42 @@ class Robot:
     coupled: dict[str, tuple[str, float, float]]
     wheels: dict[str, float] | None
     turning_radius: float
-    efforts: dict[str, float]
+    torque_limits: dict[str, float]
 
-    def moved(self, arm: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return where all joints are that move with the arm, of values of its planned ones."""
+    def compute_joint_values(self, arm: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return the values of planned and coupled joints, from those of planned joints."""
         return {
             **arm,
             **{
-                joint: factor * arm[by] + offset
-                for joint, (by, factor, offset) in self.coupled.items()
+                joint: factor * arm[leader] + offset
+                for joint, (leader, factor, offset) in self.coupled.items()
             },
         }
 
     @cached_property
-    def moved_by(self) -> dict[str, tuple[str, ...]]:
-        """Link → the planned joints between it and the base."""
+    def planned_joints(self) -> dict[str, tuple[str, ...]]:
+        """Link → planned and coupled joints between the base and the link."""
         urdf = self.tree.urdf
         return {
             link: tuple(
-                joint for joint in urdf.path_to(link) if joint in self.arm or joint in self.coupled
+                joint
+                for joint in urdf.find_joint_path(link)
+                if joint in self.arm or joint in self.coupled
             )
             for link in urdf.links
         }
 
-    def apart(self, one: str, other: str) -> bool:
-        """Return whether two links move relative to each other and must not collide."""
+    def is_checked_pair(self, one: str, other: str) -> bool:
+        """Return whether two links move relative to each other and are not exempt from checks."""
         return (
-            self.moved_by[one] != self.moved_by[other]
+            self.planned_joints[one] != self.planned_joints[other]
             and frozenset((one, other)) not in self.exempt
         )
 
     @cached_property
-    def on_the_floor(self) -> set[str]:
-        """The links that no planned joint moves: wheels stand on the floor."""
-        return {link for link, joints in self.moved_by.items() if not joints}
+    def base_links(self) -> set[str]:
+        """Links that move with the base alone; wheels touch the floor."""
+        return {link for link, joints in self.planned_joints.items() if not joints}
 
 
 def load_object(item: Mapping[str, Any], folder: Path) -> SceneObject:
@@ -202,63 +205,67 @@ def load_object(item: Mapping[str, Any], folder: Path) -> SceneObject:
     if isinstance(kind, str):
         by_path = kind.endswith((".yaml", ".yml")) or "/" in kind
         file = folder / kind if by_path else ROOT / "scenes" / "objects" / f"{kind}.yaml"
-        about = read_yaml(file)
+        description = read_yaml(file)
         folder = file.parent
     else:
-        about = kind
-    inside = about["urdf"].lstrip().startswith("<")
-    urdf = Urdf(folder / "urdf", about["urdf"]) if inside else read_urdf(folder / about["urdf"])
-    joints = [joint for joint in urdf.joints if urdf.moves(joint)]
-    limits, rest = {}, {}
+        description = kind
+    is_inline = description["urdf"].lstrip().startswith("<")
+    urdf = (
+        Urdf(folder / "urdf", description["urdf"])
+        if is_inline
+        else read_urdf(folder / description["urdf"])
+    )
+    joints = [joint for joint in urdf.joints if urdf.is_movable(joint)]
+    limits, neutral = {}, {}
     for joint in joints:
-        low, high, fastest = urdf.limits(joint)
-        own = (about.get("joints") or {}).get(joint, {})
-        fastest = own.get("velocity", fastest if np.isfinite(fastest) else 1.0)
-        limits[joint] = (low, high, float(fastest), float(own.get("acceleration", 2.0)))
-        rest[joint] = float(np.clip(0.0, low, high))
-    free = bool(about.get("free", False))
+        low, high, velocity = urdf.get_limits(joint)
+        settings = (description.get("joints") or {}).get(joint, {})
+        velocity = settings.get("velocity", velocity if np.isfinite(velocity) else 1.0)
+        limits[joint] = (low, high, float(velocity), float(settings.get("acceleration", 2.0)))
+        neutral[joint] = float(np.clip(0.0, low, high))
+    free = bool(description.get("free", False))
     grasps = {
         entry["name"]: _read_grasp(entry, free, item.get("reversed") or ())
-        for entry in about["attachments"]
+        for entry in description["attachments"]
     }
     return SceneObject(
         name=item["name"],
-        tree=Tree(urdf, drives=False),
+        tree=Tree(urdf, is_mobile=False),
         free=free,
-        at=make_pose(item["position"], read_orientation(item)),
-        state={**rest, **(item.get("state") or {})},
+        placement=make_pose(item["position"], read_orientation(item)),
+        state={**neutral, **(item.get("state") or {})},
         limits=limits,
         grasps=grasps,
-        latches=[{"held_at": 0.0, **latch} for latch in about.get("latches") or ()],
-        resists={
-            joint: _read_resistance(urdf, joint, (about.get("joints") or {}).get(joint, {}))
+        latches=[{"held_at": 0.0, **latch} for latch in description.get("latches") or ()],
+        resistances={
+            joint: _read_resistance(urdf, joint, (description.get("joints") or {}).get(joint, {}))
             for joint in joints
         },
-        mass=about.get("mass"),
+        mass=description.get("mass"),
     )
 
 
-def _read_resistance(urdf: Urdf, joint: str, said: Mapping[str, Any]) -> dict[str, float]:
-    """Return friction, damping, stiffness and springref of an object's joint."""
+def _read_resistance(urdf: Urdf, joint: str, settings: Mapping[str, Any]) -> dict[str, float]:
+    """Return friction, damping, stiffness and spring reference of an object's joint."""
     dynamics = urdf.joints[joint].find("dynamics")
-    found = {"friction": 0.0, "damping": 0.0, "stiffness": 0.0, "springref": 0.0}
-    found |= (
+    resistance = {"friction": 0.0, "damping": 0.0, "stiffness": 0.0, "springref": 0.0}
+    resistance |= (
         {}
         if dynamics is None
-        else {key: float(value) for key, value in dynamics.attrib.items() if key in found}
+        else {key: float(value) for key, value in dynamics.attrib.items() if key in resistance}
     )
-    return found | {key: float(said[key]) for key in found if key in said}
+    return resistance | {key: float(settings[key]) for key in resistance if key in settings}
 
 
-def _read_grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[str]) -> Grasp:
+def _read_grasp(entry: Mapping[str, Any], free: bool, reversed_names: Sequence[str]) -> Grasp:
     if "approach" in entry:
         z, x = (
             np.array(entry[key], float) / np.linalg.norm(entry[key])
             for key in ("approach", "closing")
         )
-        turn = np.column_stack([x, np.cross(z, x), z])
+        rotation = np.column_stack([x, np.cross(z, x), z])
     else:
-        turn = read_orientation(entry)
+        rotation = read_orientation(entry)
     name, joint = entry["name"], entry.get("joint", "fixed")
     axis = (
         np.array(entry["axis"], float) / np.linalg.norm(entry["axis"])
@@ -266,17 +273,18 @@ def _read_grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[st
         else np.zeros(3)
     )
     freedoms: list[tuple[str, bool, np.ndarray, float, float]] = []
-    through = [
-        np.array(own.get("through", (0.0, 0.0, 0.0)), float) for own in entry.get("freedoms", ())
+    points = [
+        np.array(freedom.get("through", (0.0, 0.0, 0.0)), float)
+        for freedom in entry.get("freedoms", ())
     ]
-    for own in entry.get("freedoms", ()):
-        direction = np.array(own["slide"] if "slide" in own else own["turn"], float)
+    for freedom in entry.get("freedoms", ()):
+        direction = np.array(freedom["slide"] if "slide" in freedom else freedom["turn"], float)
         freedoms.append(
             (
-                f"{name}_{own['name']}",
-                "slide" in own,
+                f"{name}_{freedom['name']}",
+                "slide" in freedom,
                 direction / np.linalg.norm(direction),
-                *own["limits"],
+                *freedom["limits"],
             )
         )
     if joint == "spherical":
@@ -291,24 +299,24 @@ def _read_grasp(entry: Mapping[str, Any], free: bool, reversed_ones: Sequence[st
         ]
     elif joint != "fixed":
         freedoms = [(name, joint == "prismatic", axis, *entry["limits"])]
-    if (
-        name in reversed_ones
-    ):  # the fingers close along the same line, the hand comes from the other side
-        turn = np.column_stack([turn[:, 0], -turn[:, 1], -turn[:, 2]])
+    if name in reversed_names:  # same closing direction, opposite approach
+        rotation = np.column_stack([rotation[:, 0], -rotation[:, 1], -rotation[:, 2]])
         freedoms = [
             (*freedom[:2], np.array([1.0, -1.0, -1.0]) * freedom[2], *freedom[3:])
             for freedom in freedoms
         ]
-    place = make_pose(entry.get("position", (0.0, 0.0, 0.0)), turn)
+    placement = make_pose(entry.get("position", (0.0, 0.0, 0.0)), rotation)
     standoff, firm = float(entry.get("standoff", 0.0)), bool(entry.get("firm", free))
-    through = through or [np.zeros(3) for _ in freedoms]
+    points = points or [np.zeros(3) for _ in freedoms]
     pushed = entry.get("contact") == "push"
-    own = entry.get("clearance"), pushed, entry.get("opening")
-    return Grasp(name, entry["link"], place, tuple(freedoms), tuple(through), standoff, firm, *own)
+    options = entry.get("clearance"), pushed, entry.get("opening")
+    return Grasp(
+        name, entry["link"], placement, tuple(freedoms), tuple(points), standoff, firm, *options
+    )
 
 
 def _load_robot_settings(file: Path) -> tuple[dict[str, Any], Path]:
-    """Return the contents of a robot.yaml, and it, or of the one beside a URDF that names it."""
+    """Return the settings and path of a robot.yaml, or of the one that belongs to a URDF."""
     if file.suffix == ".yaml":
         return read_yaml(file), file
     settings = file.parent / "robot.yaml"
@@ -325,93 +333,100 @@ def _compute_joint_limits(
     coupled: Mapping[str, tuple[str, float, float]],
     joints: Mapping[str, Any],
 ) -> tuple[float, float, float, float]:
-    """Return lower, upper, velocity and acceleration of a joint and of those that follow it."""
+    """Return the position, velocity and acceleration limits of a joint and its coupled joints."""
     members = {joint: (joint, 1.0, 0.0)} | {
-        name: how for name, how in coupled.items() if how[0] == joint
+        name: coupling for name, coupling in coupled.items() if coupling[0] == joint
     }
-    low, high, fastest, strongest = -np.inf, np.inf, np.inf, np.inf
+    low, high, velocity, acceleration = -np.inf, np.inf, np.inf, np.inf
     for name, (_, factor, offset) in members.items():
-        least, most, fast = urdf.limits(name)
+        least, most, speed = urdf.get_limits(name)
         ends = [(end - offset) / factor for end in (least, most)]
-        low, high, said = max(low, min(ends)), min(high, max(ends)), joints.get(name, {})
-        fast = said.get("velocity", fast if 0.0 < fast < 1e3 else np.inf)
-        fastest = min(fastest, fast / abs(factor))
-        strongest = min(strongest, said.get("acceleration", np.inf) / abs(factor))
+        low, high, settings = max(low, min(ends)), min(high, max(ends)), joints.get(name, {})
+        speed = settings.get("velocity", speed if 0.0 < speed < 1e3 else np.inf)
+        velocity = min(velocity, speed / abs(factor))
+        acceleration = min(acceleration, settings.get("acceleration", np.inf) / abs(factor))
     most = max(abs(factor) for _, factor, _ in members.values())
-    fastest = fastest if fastest < np.inf else np.pi / most
-    strongest = strongest if strongest < np.inf else 1.4 / most
-    return low, high, fastest, strongest
+    velocity = velocity if velocity < np.inf else np.pi / most
+    acceleration = acceleration if acceleration < np.inf else 1.4 / most
+    return low, high, velocity, acceleration
 
 
 def _compute_locked_values(
     urdf: Urdf, joints: list[str], locked: Mapping[str, float]
 ) -> dict[str, float]:
     """Return the values at which joints are locked."""
-    rest = {}
+    values = {}
     for joint in joints:
-        low, high, _ = urdf.limits(joint)
-        rest[joint] = locked.get(joint, 0.0 if low <= 0.0 <= high else (low + high) / 2)
-    for joint in rest:
-        if (mimic := urdf.mimics(joint)) is not None and joint not in locked and mimic[0] in rest:
-            rest[joint] = mimic[1] * rest[mimic[0]] + mimic[2]
-    return rest
+        low, high, _ = urdf.get_limits(joint)
+        values[joint] = locked.get(joint, 0.0 if low <= 0.0 <= high else (low + high) / 2)
+    for joint in values:
+        if (
+            (mimic := urdf.get_mimic(joint)) is not None
+            and joint not in locked
+            and mimic[0] in values
+        ):
+            values[joint] = mimic[1] * values[mimic[0]] + mimic[2]
+    return values
 
 
 def load_robot(
     item: Mapping[str, Any] | str, folder: Path, arm: list[str], height: float | None
 ) -> Robot:
-    """Return a scene's robot; `arm` are its planned joints, which a saved plan names."""
-    about = {"name": item} if isinstance(item, str) else dict(item)
-    file = _find_robot_file(about["name"], folder)
-    own, file = _load_robot_settings(file)
-    urdf = read_urdf(file.parent / own["urdf"])
-    tool = about.get("tool_frame") or own.get("tool_frame")
+    """Return a scene's robot, with the planned joints `arm` of a saved plan."""
+    description = {"name": item} if isinstance(item, str) else dict(item)
+    file = _find_robot_file(description["name"], folder)
+    settings, file = _load_robot_settings(file)
+    urdf = read_urdf(file.parent / settings["urdf"])
+    tool = description.get("tool_frame") or settings.get("tool_frame")
     if tool is None:
         raise NotJudged("no file names the robot's tool frame")
-    if about.get("base", "omni") not in ("omni", "differential", "ackermann", "fixed"):
-        raise NotJudged(f"base {about['base']}")
-    semantics = _read_srdf(urdf.path, file.parent, own.get("srdf"))
+    if description.get("base", "omni") not in ("omni", "differential", "ackermann", "fixed"):
+        raise NotJudged(f"base {description['base']}")
+    semantics = _read_srdf(urdf.path, file.parent, settings.get("srdf"))
     if semantics is None:
-        raise NotJudged("no SRDF says which links of the robot may touch")
-    base, joints = own.get("base") or {}, own.get("joints") or {}
+        raise NotJudged("no SRDF lists the links of the robot that may touch")
+    base, joints = settings.get("base") or {}, settings.get("joints") or {}
     height = float(base.get("height", 0.0)) if height is None else height
-    speeds, strengths = (
+    velocities, accelerations = (
         base.get("velocity", (1.0, 1.0, 2.0)),
         base.get("acceleration", (3.0, 3.0, 6.0)),
     )
     (x, y) = base.get("position", ((-20.0, 20.0), (-20.0, 20.0)))
-    spans = (x, y, (-np.inf, np.inf))
+    intervals = (x, y, (-np.inf, np.inf))
     limits = {
-        f"base_{k}": (*span, v, a)
-        for k, span, v, a in zip(("x", "y", "yaw"), spans, speeds, strengths, strict=True)
+        f"base_{k}": (*interval, v, a)
+        for k, interval, v, a in zip(
+            ("x", "y", "yaw"), intervals, velocities, accelerations, strict=True
+        )
     }
-    coupled = _find_coupled_joints(urdf, own.get("couplings") or {}, arm)
+    coupled = _find_coupled_joints(urdf, settings.get("couplings") or {}, arm)
     for joint in arm:
         limits[joint] = _compute_joint_limits(urdf, joint, coupled, joints)
     gripper = {
-        joint: (said["closed"], said["open"]) for joint, said in (own.get("gripper") or {}).items()
+        joint: (finger["closed"], finger["open"])
+        for joint, finger in (settings.get("gripper") or {}).items()
     }
-    wide = {joint: opened for joint, (_, opened) in gripper.items()}
-    locked = {**own.get("home", {}), **wide, **own.get("locked_joints", {})}
-    others = [j for j in urdf.joints if urdf.moves(j) and j not in arm and j not in coupled]
-    rest = _compute_locked_values(urdf, others, locked)
+    open_fingers = {joint: opened for joint, (_, opened) in gripper.items()}
+    locked = {**settings.get("home", {}), **open_fingers, **settings.get("locked_joints", {})}
+    others = [j for j in urdf.joints if urdf.is_movable(j) and j not in arm and j not in coupled]
+    locked_values = _compute_locked_values(urdf, others, locked)
     for joint, (master, factor, offset) in (
-        (joint, urdf.mimics(joint) or ("", 0.0, 0.0)) for joint in rest
+        (joint, urdf.get_mimic(joint) or ("", 0.0, 0.0)) for joint in locked_values
     ):
         if master in gripper:
             closed, opened = (factor * end + offset for end in gripper[master])
             gripper[joint] = (closed, opened)
     return Robot(
-        tree=Tree(urdf, drives=True, height=height),
-        base=about.get("base", "omni"),
+        tree=Tree(urdf, is_mobile=True, height=height),
+        base=description.get("base", "omni"),
         tool=tool,
-        touch=set(own.get("touch_links", ())),
+        touch_links=set(settings.get("touch_links", ())),
         arm=arm,
-        locked=rest,
+        locked=locked_values,
         limits=limits,
         home={
             **_read_home(semantics, arm),
-            **{joint: value for joint, value in own.get("home", {}).items() if joint in arm},
+            **{joint: value for joint, value in settings.get("home", {}).items() if joint in arm},
         },
         exempt={
             frozenset((pair.get("link1", ""), pair.get("link2", "")))
@@ -420,41 +435,46 @@ def load_robot(
         gripper=gripper,
         coupled=coupled,
         wheels=base.get("wheels"),
-        turning_radius=float(about.get("turning_radius") or base.get("turning_radius") or 0.0),
-        efforts={
-            joint: float(joints.get(joint, {}).get("effort", urdf.effort(joint))) for joint in arm
+        turning_radius=float(
+            description.get("turning_radius") or base.get("turning_radius") or 0.0
+        ),
+        torque_limits={
+            joint: float(joints.get(joint, {}).get("effort", urdf.get_effort_limit(joint)))
+            for joint in arm
         },
     )
 
 
 def _find_coupled_joints(
-    urdf: Urdf, stated: Mapping[str, Any], arm: list[str]
+    urdf: Urdf, settings: Mapping[str, Any], arm: list[str]
 ) -> dict[str, tuple[str, float, float]]:
-    """Return mimicking joint → (planned joint, factor, offset)."""
-    follows = {joint: how for joint in urdf.joints if (how := urdf.mimics(joint)) is not None}
-    for joint, said in stated.items():
-        about = {"joint": said} if isinstance(said, str) else said
-        follows[joint] = (
-            about["joint"],
-            float(about.get("multiplier", 1.0)),
-            float(about.get("offset", 0.0)),
+    """Return coupled joint → (planned joint, factor, offset)."""
+    leaders = {
+        joint: mimic for joint in urdf.joints if (mimic := urdf.get_mimic(joint)) is not None
+    }
+    for joint, setting in settings.items():
+        description = {"joint": setting} if isinstance(setting, str) else setting
+        leaders[joint] = (
+            description["joint"],
+            float(description.get("multiplier", 1.0)),
+            float(description.get("offset", 0.0)),
         )
-    of_leader: dict[str, tuple[str, float, float]] = {}
-    for joint in (name for name in urdf.joints if urdf.moves(name)):
+    chains: dict[str, tuple[str, float, float]] = {}
+    for joint in (name for name in urdf.joints if urdf.is_movable(name)):
         leader, factor, offset = joint, 1.0, 0.0
-        for _ in follows:  # more often than once each would be a circle
-            if leader in follows:
-                above, multiplier, shift = follows[leader]
-                leader, factor, offset = above, factor * multiplier, offset + factor * shift
-        of_leader[joint] = leader, factor, offset
-    planned = {of_leader[joint][0]: joint for joint in arm}
-    found = {}
-    for joint, (leader, factor, offset) in of_leader.items():
+        for _ in leaders:  # a longer chain would be a cycle
+            if leader in leaders:
+                next_leader, multiplier, shift = leaders[leader]
+                leader, factor, offset = next_leader, factor * multiplier, offset + factor * shift
+        chains[joint] = leader, factor, offset
+    planned = {chains[joint][0]: joint for joint in arm}
+    coupled = {}
+    for joint, (leader, factor, offset) in chains.items():
         if leader in planned and joint not in arm and factor:
-            by = planned[leader]
-            share = factor / of_leader[by][1]
-            found[joint] = by, share, offset - share * of_leader[by][2]
-    return found
+            planned_joint = planned[leader]
+            ratio = factor / chains[planned_joint][1]
+            coupled[joint] = planned_joint, ratio, offset - ratio * chains[planned_joint][2]
+    return coupled
 
 
 def _find_robot_file(name: str, folder: Path) -> Path:
@@ -463,23 +483,23 @@ def _find_robot_file(name: str, folder: Path) -> Path:
         return file / "robot.yaml" if file.is_dir() else file
     file = ROOT / "robots" / name / "robot.yaml"
     if not file.is_file():
-        raise NotJudged(f"{name} is no robot of this repository")
+        raise NotJudged(f"{name} is not a robot of this repository")
     return file
 
 
-def _read_srdf(urdf: Path, folder: Path, named: str | None) -> ElementTree.Element | None:
+def _read_srdf(urdf: Path, folder: Path, file_name: str | None) -> ElementTree.Element | None:
     stems = dict.fromkeys((urdf.stem, urdf.stem.removesuffix("_robot")))
-    places = (
-        [folder / named]
-        if named
+    paths = (
+        [folder / file_name]
+        if file_name
         else [p / f"{s}.srdf" for s in stems for p in (urdf.parent, urdf.parent.parent / "srdf")]
     )
-    file = next((place for place in places if place.is_file()), None)
+    file = next((path for path in paths if path.is_file()), None)
     return None if file is None else ElementTree.parse(file).getroot()
 
 
 def _read_home(semantics: ElementTree.Element, arm: list[str]) -> dict[str, float]:
-    """Return where an SRDF says that all planned joints rest, a state called home first."""
+    """Return an SRDF group state of all planned joints, preferably "home"; default: zeros."""
     states = sorted(semantics.findall("group_state"), key=lambda state: state.get("name") != "home")
     for state in states:
         values = {

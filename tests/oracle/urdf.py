@@ -1,4 +1,4 @@
-"""Reads URDF files: the text for Pinocchio's own reader, and the shapes of links for coal."""
+"""Reads URDF files: text for the parser of Pinocchio, and shapes of links for coal."""
 
 from __future__ import annotations
 
@@ -20,61 +20,61 @@ __all__ = ["Shape", "Urdf", "load_mesh_hull", "make_solid", "read_urdf"]
 
 @dataclass(frozen=True)
 class Shape:
-    """A convex solid on a link, with a ball and a box around it.
+    """A convex solid on a link, with a bounding box and a bounding sphere.
 
-    `place` is its placement in the link's frame; `centre` and `half` are the box in the shape's own
-    frame, `radius` that of the ball around its centre [m].
+    `placement` is that of the solid in the link's frame. `centre` and `half` are the centre and the
+    half sides of the box in the solid's frame; `radius` is that of the sphere around `centre` [m].
     """
 
     link: str
     solid: Any
-    place: Poses
+    placement: Poses
     centre: np.ndarray
     half: np.ndarray
     radius: float
 
     @classmethod
-    def make(cls, link: str, body: Any, place: Poses) -> Shape:
-        if isinstance(body, coal.Convex):
-            corners = np.array(body.points())
+    def make(cls, link: str, solid: Any, placement: Poses) -> Shape:
+        if isinstance(solid, coal.Convex):
+            corners = np.array(solid.points())
             low, high = corners.min(axis=0), corners.max(axis=0)
             centre, half = (low + high) / 2, (high - low) / 2
             return cls(
                 link,
-                body,
-                place,
+                solid,
+                placement,
                 centre,
                 half,
                 float(np.linalg.norm(corners - centre, axis=1).max()),
             )
-        if isinstance(body, coal.Box):
-            half = np.array(body.halfSide)
+        if isinstance(solid, coal.Box):
+            half = np.array(solid.halfSide)
             radius = float(np.linalg.norm(half))
-        elif isinstance(body, coal.Sphere):
-            half, radius = np.full(3, body.radius), body.radius
-        elif isinstance(body, coal.Capsule):
-            radius = body.halfLength + body.radius
-            half = np.array([body.radius, body.radius, radius])
+        elif isinstance(solid, coal.Sphere):
+            half, radius = np.full(3, solid.radius), solid.radius
+        elif isinstance(solid, coal.Capsule):
+            radius = solid.halfLength + solid.radius
+            half = np.array([solid.radius, solid.radius, radius])
         else:
             half, radius = (
-                np.array([body.radius, body.radius, body.halfLength]),
-                float(np.hypot(body.radius, body.halfLength)),
+                np.array([solid.radius, solid.radius, solid.halfLength]),
+                float(np.hypot(solid.radius, solid.halfLength)),
             )
-        return cls(link, body, place, np.zeros(3), half, radius)
+        return cls(link, solid, placement, np.zeros(3), half, radius)
 
 
 def load_mesh_hull(file: Path, scale: np.ndarray) -> coal.Convex:
     """Return the convex hull of a mesh file."""
     if not file.is_file():
         raise FileNotFoundError(file)
-    if file.suffix.lower() == ".dae":  # for which trimesh wants another package
-        loaded = coal.MeshLoader().load(str(file), np.ones(3))
-        points = np.array(loaded.vertices())
+    if file.suffix.lower() == ".dae":  # trimesh needs an optional dependency
+        mesh = coal.MeshLoader().load(str(file), np.ones(3))
+        points = np.array(mesh.vertices())
     else:
         points = np.asarray(trimesh.load(file, force="mesh", skip_materials=True).vertices)
     hull = trimesh.convex.convex_hull(_thicken(points * scale))
     if np.bincount(hull.faces.ravel()).max() > 255:
-        raise NotJudged(f"{file.name}: a corner with more neighbours than coal can hold")
+        raise NotJudged(f"{file.name}: a vertex has more neighbours than coal supports")
     corners, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
     corners.extend(np.asarray(hull.vertices, float))
     faces.extend(coal.Triangle(*face) for face in hull.faces.tolist())
@@ -82,7 +82,7 @@ def load_mesh_hull(file: Path, scale: np.ndarray) -> coal.Convex:
 
 
 def _thicken(points: np.ndarray) -> np.ndarray:
-    """Return the points of a flat sheet as a plate 1 mm thick; others unchanged."""
+    """Return points with flat sheets thickened to plates of 1 mm."""
     axes = np.linalg.svd(np.cov(points.T))[2]
     widths = [np.ptp(points @ axis) for axis in axes]
     for axis, width in zip(axes, widths, strict=True):
@@ -91,14 +91,14 @@ def _thicken(points: np.ndarray) -> np.ndarray:
     return points
 
 
-def make_solid(kind: str, about: dict[str, Any]) -> Any:
-    """Return the coal shape of a description with `size`, `radius` and `length`."""
+def make_solid(kind: str, description: dict[str, Any]) -> Any:
+    """Return the coal shape with the `size`, `radius` and `length` of a description."""
     if kind == "box":
-        return coal.Box(*map(float, about["size"]))
+        return coal.Box(*map(float, description["size"]))
     if kind == "sphere":
-        return coal.Sphere(float(about["radius"]))
-    made = {"cylinder": coal.Cylinder, "capsule": coal.Capsule}[kind]
-    return made(float(about["radius"]), float(about["length"]))
+        return coal.Sphere(float(description["radius"]))
+    make_shape = {"cylinder": coal.Cylinder, "capsule": coal.Capsule}[kind]
+    return make_shape(float(description["radius"]), float(description["length"]))
 
 
 def _parse_numbers(text: str | None, default: tuple[float, ...]) -> np.ndarray:
@@ -106,7 +106,7 @@ def _parse_numbers(text: str | None, default: tuple[float, ...]) -> np.ndarray:
 
 
 def read_urdf(path: Path) -> Urdf:
-    """Return a URDF file, whose hulls are made once as long as it does not change."""
+    """Return a URDF file, cached until it changes."""
     return _read(path.resolve(), path.stat().st_mtime_ns)
 
 
@@ -133,39 +133,39 @@ class Urdf:
 
     @cached_property
     def base(self) -> str:
-        """The root link."""
+        """Name of the root link."""
         children = {joint.find("child").get("link") for joint in self.joints.values()}
         return next(link for link in self.links if link not in children)
 
-    def path_to(self, link: str) -> list[str]:
+    def find_joint_path(self, link: str) -> list[str]:
         """Return the joints from the root to a link."""
-        above = {joint.find("child").get("link"): name for name, joint in self.joints.items()}
-        found: list[str] = []
-        while link in above:
-            found.insert(0, above[link])
-            link = self.joints[above[link]].find("parent").get("link")
-        return found
+        parents = {joint.find("child").get("link"): name for name, joint in self.joints.items()}
+        path: list[str] = []
+        while link in parents:
+            path.insert(0, parents[link])
+            link = self.joints[parents[link]].find("parent").get("link")
+        return path
 
-    def kind(self, joint: str) -> str:
+    def get_joint_type(self, joint: str) -> str:
         return str(self.joints[joint].get("type"))
 
-    def moves(self, joint: str) -> bool:
-        return self.kind(joint) in ("revolute", "continuous", "prismatic")
+    def is_movable(self, joint: str) -> bool:
+        return self.get_joint_type(joint) in ("revolute", "continuous", "prismatic")
 
-    def effort(self, joint: str) -> float:
-        """Return the effort limit of a joint; 0: not given."""
+    def get_effort_limit(self, joint: str) -> float:
+        """Return the effort limit of a joint, or 0 without one."""
         limit = self.joints[joint].find("limit")
         return 0.0 if limit is None else float(limit.get("effort", 0.0))
 
-    def weight(self, link: str) -> tuple[float, np.ndarray, np.ndarray]:
+    def get_inertial(self, link: str) -> tuple[float, np.ndarray, np.ndarray]:
         """Return mass [kg], centre of mass [m] and central inertia [kg·m²] in the link's frame."""
         inertial = next(
             item for item in self.root.findall("link") if item.get("name") == link
         ).find("inertial")
         if inertial is None:
             return 0.0, np.zeros(3), np.zeros((3, 3))
-        origin, about = inertial.find("origin"), inertial.find("inertia").attrib
-        i = {key: float(about[key]) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")}
+        origin, attributes = inertial.find("origin"), inertial.find("inertia").attrib
+        i = {key: float(attributes[key]) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")}
         tensor = np.array(
             [
                 [i["ixx"], i["ixy"], i["ixz"]],
@@ -173,7 +173,7 @@ class Urdf:
                 [i["ixz"], i["iyz"], i["izz"]],
             ]
         )
-        turn = (
+        rotation = (
             np.eye(3)
             if origin is None
             else rotate_rpy(*_parse_numbers(origin.get("rpy"), (0.0, 0.0, 0.0)))
@@ -181,20 +181,23 @@ class Urdf:
         centre = (
             np.zeros(3) if origin is None else _parse_numbers(origin.get("xyz"), (0.0, 0.0, 0.0))
         )
-        return float(inertial.find("mass").get("value")), centre, turn @ tensor @ turn.T
+        return float(inertial.find("mass").get("value")), centre, rotation @ tensor @ rotation.T
 
-    def limits(self, joint: str) -> tuple[float, float, float]:
-        """Return lower, upper and velocity limit; infinite where there are none."""
+    def get_limits(self, joint: str) -> tuple[float, float, float]:
+        """Return the lower, upper and velocity limits, with the defaults of URDF."""
         limit = self.joints[joint].find("limit")
-        about = {} if limit is None else {key: float(value) for key, value in limit.attrib.items()}
+        attributes = (
+            {} if limit is None else {key: float(value) for key, value in limit.attrib.items()}
+        )
         low, high = (
-            (about.get("lower", 0.0), about.get("upper", 0.0))
-            if self.kind(joint) != "continuous"
+            (attributes.get("lower", 0.0), attributes.get("upper", 0.0))
+            if self.get_joint_type(joint) != "continuous"
             else (-np.inf, np.inf)
         )
-        return low, high, about.get("velocity", np.inf)
+        return low, high, attributes.get("velocity", np.inf)
 
-    def mimics(self, joint: str) -> tuple[str, float, float] | None:
+    def get_mimic(self, joint: str) -> tuple[str, float, float] | None:
+        """Return the leading joint, multiplier and offset of a mimic joint."""
         mimic = self.joints[joint].find("mimic")
         if mimic is None:
             return None
@@ -206,36 +209,38 @@ class Urdf:
 
     @cached_property
     def shapes(self) -> list[Shape]:
-        """All collision shapes."""
-        found = []
+        """Collision shapes of all links."""
+        shapes = []
         for link in self.root.findall("link"):
             for element in link.findall("collision"):
                 geometry = element.find("geometry")
                 assert geometry is not None
                 (shape,) = list(geometry)[:1]
                 if shape.tag == "mesh":
-                    body = load_mesh_hull(
-                        self._file(shape.get("filename", "")),
+                    solid = load_mesh_hull(
+                        self._find_mesh(shape.get("filename", "")),
                         _parse_numbers(shape.get("scale"), (1.0, 1.0, 1.0)),
                     )
                 else:
-                    about: dict[str, Any] = dict(shape.attrib)
-                    body = make_solid(shape.tag, {**about, "size": about.get("size", "").split()})
+                    description: dict[str, Any] = dict(shape.attrib)
+                    solid = make_solid(
+                        shape.tag, {**description, "size": description.get("size", "").split()}
+                    )
                 origin = element.find("origin")
-                given = {} if origin is None else origin.attrib
-                angles = _parse_numbers(given.get("rpy"), (0.0, 0.0, 0.0))
-                place = make_pose(
-                    _parse_numbers(given.get("xyz"), (0.0, 0.0, 0.0)), rotate_rpy(*angles)
+                attributes = {} if origin is None else origin.attrib
+                angles = _parse_numbers(attributes.get("rpy"), (0.0, 0.0, 0.0))
+                placement = make_pose(
+                    _parse_numbers(attributes.get("xyz"), (0.0, 0.0, 0.0)), rotate_rpy(*angles)
                 )
-                found.append(Shape.make(link.get("name", ""), body, place))
-        return found
+                shapes.append(Shape.make(link.get("name", ""), solid, placement))
+        return shapes
 
-    def _file(self, address: str) -> Path:
+    def _find_mesh(self, address: str) -> Path:
         if not address.startswith("package://"):
-            plain = Path(address.removeprefix("file://"))
-            return plain if plain.is_absolute() else self.path.parent / plain
-        package, _, inside = address.removeprefix("package://").partition("/")
+            path = Path(address.removeprefix("file://"))
+            return path if path.is_absolute() else self.path.parent / path
+        package, _, relative = address.removeprefix("package://").partition("/")
         for folder in [*(above / package for above in self.path.parents), *self.path.parents[:2]]:
-            if (folder / inside).is_file():
-                return folder / inside
+            if (folder / relative).is_file():
+                return folder / relative
         raise NotJudged(f"{self.path.name}: no mesh {address}")

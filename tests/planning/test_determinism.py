@@ -1,4 +1,4 @@
-"""The same call gives the same bits, in any thread or process and with any cache."""
+"""Tests that plans are equal bit for bit in any thread or process and with any cache."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ import pytest
 import vkc_pin as vkc
 from vkc_pin.benchmarks import initialization
 
-ROOT = Path(__file__).resolve().parents[2]
 BASE = [-0.03, 0.09, -1.19]
 SCRIPT = "from test_determinism import *; print(compute_hash(plan_{}()))"
 
@@ -60,13 +59,13 @@ def hash_in_process(task: str) -> str:
 
 
 @pytest.mark.long
-def test_after_a_hundred_other_plans() -> None:
+def test_plan_is_the_same_after_a_hundred_other_plans() -> None:
     planner = vkc.Planner()
     scene = vkc.load_scene("door")
-    for number in range(100):  # of three structures, from as many starts
-        there = scene.sample_start(np.random.default_rng(number))
+    for number in range(100):  # three problem sizes, a hundred starts
+        start = scene.sample_start(np.random.default_rng(number))
         options = vkc.Options(reach_waypoints=10 + 5 * (number % 3), max_restarts=1, max_outer=4)
-        vkc.plan(there, [vkc.GoTo(*BASE[:2])], options=options, planner=planner)
+        vkc.plan(start, [vkc.GoTo(*BASE[:2])], options=options, planner=planner)
     assert planner.info().hits > 0
     for _ in range(2):
         assert compute_hash(plan_door(planner)) == hash_in_process("door")
@@ -74,7 +73,7 @@ def test_after_a_hundred_other_plans() -> None:
     assert compute_hash(plan_door(planner)) == hash_in_process("door")
 
 
-def test_with_a_tiny_cache() -> None:
+def test_plan_is_the_same_with_a_tiny_cache() -> None:
     planner = vkc.Planner(entries=1, megabytes=1e-3)
     assert compute_hash(plan_door(planner)) == hash_in_process("door")
     assert planner.info().entries <= 1
@@ -82,14 +81,14 @@ def test_with_a_tiny_cache() -> None:
 
 
 @pytest.mark.long
-def test_in_concurrent_threads() -> None:
+def test_plans_are_the_same_in_concurrent_threads() -> None:
     planner = vkc.Planner()
     found: dict[int, str] = {}
 
     def work(number: int) -> None:
         found[number] = compute_hash((plan_door, plan_stick)[number % 2](planner))
 
-    for _ in range(2):  # the second time with what the first left
+    for _ in range(2):  # the second time with a filled cache
         found.clear()
         threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
         for thread in threads:

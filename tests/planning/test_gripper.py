@@ -1,4 +1,4 @@
-"""The gripper's opening: required by attachments, from the plan to its validation and files."""
+"""Tests gripper openings that attachments require, in plans, validation and files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.grippers import WIDEST, write_cheeks_scene, write_gripper
+from helpers.grippers import MAX_OPENING, write_cheeks_scene, write_gripper
 from helpers.judging import get_violation_names
 
 import vkc_pin as vkc
@@ -50,7 +50,7 @@ def replace_openings(motion: Trajectory, *openings: float | None) -> Trajectory:
 
 
 def test_narrow_opening_avoids_a_collision(robot: Path, plan: vkc.Plan) -> None:
-    """Fully open fingers are 10 mm from the cheeks, which must keep 20 mm."""
+    """Fully open fingers are 10 mm from the cheeks, less than the required 20 mm."""
     wide = vkc.plan(write_cheeks_scene(robot), PULL)
     assert not wide.success
     assert {
@@ -63,8 +63,8 @@ def test_narrow_opening_avoids_a_collision(robot: Path, plan: vkc.Plan) -> None:
 
 def test_validation_uses_the_opening_of_each_phase(robot: Path, plan: vkc.Plan) -> None:
     motion = plan.trajectory
-    open_ = replace_openings(motion, None, None, None)
-    found = get_violation_names(validate(plan.scene, PULL, open_, plan.options))
+    wide = replace_openings(motion, None, None, None)
+    found = get_violation_names(validate(plan.scene, PULL, wide, plan.options))
     assert ("opening", "drawer.grip") in found
     assert ("clearance", "finger_a – left") in found
     report = validate(plan.scene, PULL, replace_openings(motion, 0.05, 0.05, 0.05), plan.options)
@@ -75,16 +75,18 @@ def test_validation_uses_the_opening_of_each_phase(robot: Path, plan: vkc.Plan) 
 
 
 def test_opening_fingers_must_not_collide(robot: Path, plan: vkc.Plan) -> None:
-    """The hand releases between narrower cheeks, and opens there."""
+    """The hand releases the drawer and opens between narrower cheeks."""
     near = write_cheeks_scene(robot, opening=NARROW, gap=0.055)
-    asked = [vkc.Grasp("drawer"), vkc.Release()]
-    found = vkc.plan(near, asked)
+    steps = [vkc.Grasp("drawer"), vkc.Release()]
+    found = vkc.plan(near, steps)
     assert found.success, found.summary()
     motion = found.trajectory
     last = motion.phases[-1]
-    assert last.last - last.first == 1  # one step of time, in which the robot rests
-    widened = replace_openings(motion, *[phase.opening for phase in motion.phases[:-1]], WIDEST)
-    close = validate(near, asked, widened, found.options)
+    assert last.last - last.first == 1  # one time step, in which the robot rests
+    widened = replace_openings(
+        motion, *[phase.opening for phase in motion.phases[:-1]], MAX_OPENING
+    )
+    close = validate(near, steps, widened, found.options)
     assert {
         ("clearance", "finger_a – left"),
         ("clearance", "finger_b – right"),
@@ -92,7 +94,7 @@ def test_opening_fingers_must_not_collide(robot: Path, plan: vkc.Plan) -> None:
     inside = write_cheeks_scene(robot, opening=NARROW, gap=0.045)
     deep = [
         one
-        for one in validate(inside, asked, widened, found.options).violations
+        for one in validate(inside, steps, widened, found.options).violations
         if one.constraint == "penetration"
     ]
     assert {one.subject for one in deep} == {"finger_a – left", "finger_b – right"}
@@ -146,8 +148,8 @@ def test_planner_and_validator_place_the_fingers_alike(robot: Path) -> None:
     for k, shape in enumerate(
         contacts.phases[0].shapes[: len(scene.robot.collision.geometryObjects)]
     ):
-        here = data.oMi[shape.parentJoint] * shape.placement
-        np.testing.assert_allclose(here.homogeneous, shapes.oMg[k].homogeneous, atol=1e-9)
+        placement = data.oMi[shape.parentJoint] * shape.placement
+        np.testing.assert_allclose(placement.homogeneous, shapes.oMg[k].homogeneous, atol=1e-9)
         assert scene.robot.link_of(k) == world.collision_labels[k]
 
 
@@ -169,9 +171,9 @@ def test_opening_changes_at_release_and_grasp(robot: Path) -> None:
     columns = [world.coordinates.index(f"finger_{name}_joint") for name in "ab"]
     fingers = world.compute_positions(found.trajectory)[:, columns]
     np.testing.assert_allclose(fingers[: spans[1].last + 1], NARROW / 2.0, atol=1e-5)
-    np.testing.assert_allclose(fingers[spans[2].first + 1 :], WIDEST / 2.0)
-    drawn = sample_motion(world, found.trajectory)
-    assert drawn.moving[np.array(world.coordinates.joints)[columns]].all()
+    np.testing.assert_allclose(fingers[spans[2].first + 1 :], MAX_OPENING / 2.0)
+    sampled = sample_motion(world, found.trajectory)
+    assert sampled.moving[np.array(world.coordinates.joints)[columns]].all()
     assert (
         found.trajectory.times[spans[2].first + 1] - found.trajectory.times[spans[2].first]
         >= found.options.grasp_time
@@ -185,19 +187,19 @@ def test_finger_frames_depend_on_the_opening(robot: Path, opening: float | None)
     bent = opened.coordinates.q(scene.start + np.array([0.2, 0.1, 0.3, 0.1, 0.2, -0.1, 0.1, 0.1]))
     data = opened.model.createData()
     pin.framesForwardKinematics(opened.model, data, bent)
-    place = data.oMf[opened.model.getFrameId(finger)].copy()
-    for step in (vkc.Reach(place, finger), vkc.Touch(finger, place.translation.tolist())):
+    target = data.oMf[opened.model.getFrameId(finger)].copy()
+    for step in (vkc.Reach(target, finger), vkc.Touch(finger, target.translation.tolist())):
         found = vkc.plan(scene, [step])
         assert found.success, found.summary()
         assert [phase.opening for phase in found.trajectory.phases] == [opening]
         end = opened.coordinates.q(found.trajectory.positions[-1])
         pin.framesForwardKinematics(opened.model, data, end)
         np.testing.assert_allclose(
-            data.oMf[opened.model.getFrameId(finger)].translation, place.translation, atol=2e-3
+            data.oMf[opened.model.getFrameId(finger)].translation, target.translation, atol=2e-3
         )
 
 
-def test_rest_between_actions_that_change_the_opening(robot: Path) -> None:
+def test_robot_rests_between_actions_that_change_the_opening(robot: Path) -> None:
     found = vkc.plan(
         write_cheeks_scene(robot, opening=NARROW), [vkc.GoTo(-0.3, 0.2), PULL[0]], window=1
     )
@@ -243,23 +245,23 @@ def test_openings_are_saved(plan: vkc.Plan, tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize(("opening", "stands"), [(0.3, WIDEST), (0.0801, WIDEST)])
-def test_opening_is_clamped_with_a_warning(robot: Path, opening: float, stands: float) -> None:
-    with warnings.catch_warnings(record=True) as told:
+@pytest.mark.parametrize(("opening", "clamped"), [(0.3, MAX_OPENING), (0.0801, MAX_OPENING)])
+def test_opening_is_clamped_with_a_warning(robot: Path, opening: float, clamped: float) -> None:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         scene = write_cheeks_scene(robot, opening=opening)
     assert compile_task(scene, PULL, vkc.Options()).phases[0].opening == pytest.approx(
-        stands, abs=2e-4
+        clamped, abs=2e-4
     )
-    said = [str(one.message) for one in told]
+    messages = [str(one.message) for one in caught]
     if opening == 0.3:
         text = "opens from 0.0 to 80.0 mm, not 300 mm as requested for drawer.grip"
-        assert said == [f"cheeks: the gripper of 'mine' {text}: it opens to 80.0 mm"]
-    else:  # what is measured is not that exact
-        assert said == []
+        assert messages == [f"cheeks: the gripper of 'mine' {text}: it opens to 80.0 mm"]
+    else:  # within the accuracy of the measured range
+        assert messages == []
 
 
-def test_warning_without_a_gripper(tmp_path: Path) -> None:
+def test_opening_without_a_gripper_is_ignored_with_a_warning(tmp_path: Path) -> None:
     robot = write_gripper(tmp_path / "plain", gripper="locked_joints: {finger_a_joint: 0.04}\n")
     with pytest.warns(
         UserWarning,
@@ -285,7 +287,7 @@ def test_warning_without_a_gripper(tmp_path: Path) -> None:
         (float("nan"), "finite"),
     ],
 )
-def test_invalid_openings(robot: Path, opening: Any, problem: str) -> None:
+def test_invalid_openings_are_refused(robot: Path, opening: Any, problem: str) -> None:
     with pytest.raises(vkc.InputError, match=problem) as caught:
         write_cheeks_scene(robot, opening=opening)
     assert "attachments[0].opening" in str(caught.value)

@@ -1,4 +1,4 @@
-"""Plans, progress and interrupts in a real Jupyter kernel."""
+"""Tests plans, progress and interrupts in a real Jupyter kernel."""
 
 from __future__ import annotations
 
@@ -13,15 +13,17 @@ DOOR = """
 scene = vkc.load_scene("door").with_start(base=[-0.03, 0.09, -1.19])
 steps = [vkc.Actuate("door", {"hinge": 1.2})]
 """
-TELL = "print(plan.status, plan.success, len(plan.report.violations), len(plan.summary()) > 100)"
-TOLD = r"interrupted False [1-9]\d* True\n"
+PRINT_STATUS = (
+    "print(plan.status, plan.success, len(plan.report.violations), len(plan.summary()) > 100)"
+)
+INTERRUPTED_STATUS = r"interrupted False [1-9]\d* True\n"
 
 
 @pytest.fixture(scope="module")
 def jupyter() -> Iterator[Kernel]:
-    with start_kernel() as started:
-        started.run(DOOR)
-        yield started
+    with start_kernel() as kernel:
+        kernel.run(DOOR)
+        yield kernel
 
 
 def get_output(outputs: list[dict[str, Any]]) -> str:
@@ -33,7 +35,7 @@ def get_output(outputs: list[dict[str, Any]]) -> str:
     )
 
 
-def test_show_is_part_of_the_notebook(jupyter: Kernel) -> None:
+def test_show_embeds_its_page_in_the_notebook(jupyter: Kernel) -> None:
     (output,) = jupyter.run("from helpers.fake_plan import make_fake_plan\nmake_fake_plan().show()")
     page = output["data"]["text/html"]
     assert "iframe srcdoc=" in page
@@ -41,7 +43,7 @@ def test_show_is_part_of_the_notebook(jupyter: Kernel) -> None:
     assert not re.search(r"""\bsrc=["']?http""", page)
 
 
-def test_value_of_a_cell_is_an_overview(jupyter: Kernel) -> None:
+def test_cell_displays_an_overview_of_its_value(jupyter: Kernel) -> None:
     jupyter.run("plan = vkc.plan(scene, steps, time_limit=1e-6)")
     for code, text in (("plan", "FAILED, time limit"), ("scene", "obstacles")):
         (output,) = jupyter.run(code)
@@ -63,7 +65,7 @@ def test_progress_is_one_line(jupyter: Kernel) -> None:
 
 
 @pytest.mark.long
-def test_interrupted_cell_leaves_a_plan(jupyter: Kernel) -> None:
+def test_interrupted_cell_returns_a_plan(jupyter: Kernel) -> None:
     """The callback waits, so that the interrupt arrives during planning."""
     code = """
 import time
@@ -74,7 +76,7 @@ plan = vkc.plan(scene, steps, initialization="stationary", callback=wait, progre
 """
     outputs = jupyter.run(code, interrupt="now", delay=0.3)
     assert "FAILED, interrupted" in get_output(outputs).split("\r")[-1]
-    assert re.fullmatch(TOLD, get_output(jupyter.run(TELL)))
+    assert re.fullmatch(INTERRUPTED_STATUS, get_output(jupyter.run(PRINT_STATUS)))
     (value,) = jupyter.run("plan")
     assert "FAILED, interrupted" in value["data"]["text/html"]
     assert get_output(jupyter.run("print(vkc.plan(scene, steps).status)")) == "success\n"

@@ -1,4 +1,4 @@
-"""Failures are explained: constraint, links or coordinate, place and amount."""
+"""Tests that failures name the constraint, links or coordinate, waypoint and amount."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def add_obstacles(*obstacles: dict[str, Any]) -> vkc.Scene:
 
 
 def check_explanation(plan: vkc.Plan, *texts: str) -> str:
-    """Check that the plan failed and that all violations have a place and an amount."""
+    """Check that the plan failed and that all violations have a waypoint and an amount."""
     assert not plan.success
     assert plan.status in ("infeasible", "not converged", "rejected")
     assert plan.report.violations
@@ -55,7 +55,7 @@ def find_violation(plan: vkc.Plan, constraint: str, subject: str) -> vkc.Violati
 
 
 @pytest.mark.long
-def test_door_behind_a_wall() -> None:
+def test_wall_that_blocks_a_door_is_named() -> None:
     scene = add_obstacles(describe_box("barrier", (0.1, 1.07, 2.0), (2.3, 0.0, 1.0)))
     plan = vkc.plan(scene, [vkc.Actuate("door", {"hinge": 1.2})], options=QUICK)
     assert plan.status == "infeasible"
@@ -63,8 +63,8 @@ def test_door_behind_a_wall() -> None:
     assert find_violation(plan, "penetration", "– barrier").unit == "m"
 
 
-def test_door_that_opens_less_than_asked_says_how_far() -> None:
-    """The hand on the lever has no room for 1.4 rad between the door and a wall beside it."""
+def test_partly_blocked_door_reports_its_free_range() -> None:
+    """At 1.4 rad the hand on the lever does not fit between the door and the wall."""
     scene = add_obstacles(describe_box("beside", (1.2, 0.05, 2.2), (1.85, 0.59, 1.1)))
     plan = vkc.plan(scene, [vkc.Actuate("door", {"hinge": -1.4}, "handle")], options=QUICK)
     assert plan.status == "infeasible"
@@ -85,7 +85,7 @@ def test_goal_beyond_a_joint_limit(joints: dict[str, float], name: str, beyond: 
     first = plan.report.violations[0]
     assert (first.constraint, first.subject, first.unit) == ("goal", name, "rad")
     assert first.amount == pytest.approx(beyond)
-    assert plan.metrics["rounds"] == 0  # nothing was tried
+    assert plan.metrics["rounds"] == 0  # the solver did not run
 
 
 def test_goal_outside_the_arena() -> None:
@@ -98,7 +98,7 @@ def test_goal_outside_the_arena() -> None:
     )
     goal = find_violation(plan, "goal", "base_x")
     assert goal.waypoint == QUICK.reach_waypoints
-    assert goal.time == plan.trajectory.times[-1]  # of the motion in the plan, not of the program
+    assert goal.time == plan.trajectory.times[-1]  # in the plan's motion, not in the program
 
 
 def test_target_out_of_reach() -> None:
@@ -111,12 +111,12 @@ def test_target_out_of_reach() -> None:
         "goal tool",
     )
     goal = find_violation(plan, "goal", "tool")
-    assert goal.amount == pytest.approx(2.3135, abs=1e-3)  # nothing was tried: it stands still
+    assert goal.amount == pytest.approx(2.3135, abs=1e-3)  # the motion is stationary
     assert goal.waypoint == len(plan.trajectory.times) - 1
 
 
 def test_goal_slightly_out_of_reach() -> None:
-    """A proof never reads "0.00 m too high": its figure has three digits."""
+    """The figure of a proof has three digits, so that it never reads "0.00 m too high"."""
     plan = vkc.plan(make_hall(), [vkc.Touch("forearm_link", (0.5, 0.5, 1.0))], options=QUICK)
     report = check_explanation(plan, "because touch with forearm_link: out of reach, proven: ")
     beyond = float(report.split("at z = 1.00 m is ")[1].split()[0])
@@ -138,14 +138,14 @@ def test_start_in_collision() -> None:
     assert first.amount == pytest.approx(0.195, abs=1e-3)
 
 
-def test_start_that_touches_an_obstacle() -> None:
-    crate = describe_box("crate", (0.4, 0.4, 0.4), (0.495 + 0.2, 0.0, 0.2))  # before the base
+def test_start_in_contact_with_an_obstacle() -> None:
+    crate = describe_box("crate", (0.4, 0.4, 0.4), (0.495 + 0.2, 0.0, 0.2))  # in front of the base
     plan = vkc.plan(make_hall(obstacles=[crate]), [vkc.GoTo(-1.0, 0.0)], options=QUICK)
     assert plan.status == "infeasible"
     check_explanation(plan, "start base_link – crate: touch at the start")
 
 
-WALLS = [describe_box("fence", (0.1, 12.0, 2.4), (1.2, 0.0, 1.2))]
+FENCE = [describe_box("fence", (0.1, 12.0, 2.4), (1.2, 0.0, 1.2))]
 
 
 @pytest.mark.parametrize(
@@ -153,25 +153,25 @@ WALLS = [describe_box("fence", (0.1, 12.0, 2.4), (1.2, 0.0, 1.2))]
     [vkc.GoTo(3.0, 0.0), vkc.Reach((3.0, 0.0, 1.0, 0.0, np.pi / 2, 0.0))],
     ids=["base", "reach"],
 )
-def test_closed_gap(step: Any) -> None:
-    plan = vkc.plan(make_hall(obstacles=WALLS), [step], options=QUICK)
+def test_goal_behind_a_fence_has_no_base_path(step: Any) -> None:
+    plan = vkc.plan(make_hall(obstacles=FENCE), [step], options=QUICK)
     assert plan.status == "infeasible"
     check_explanation(
         plan,
         "no path for the base, proven: at any heading, with the arm anywhere",
     )
-    assert plan.metrics["rounds"] == 0  # nothing was tried
+    assert plan.metrics["rounds"] == 0  # the solver did not run
     assert find_violation(plan, "goal", "").waypoint == len(plan.trajectory.times) - 1
 
 
-def test_base_goal_inside_furniture() -> None:
+def test_base_goal_inside_an_obstacle() -> None:
     crate = describe_box("crate", (0.6, 0.6, 0.4), (1.5, 0.0, 0.2))
     plan = vkc.plan(make_hall(obstacles=[crate]), [vkc.GoTo(1.5, 0.0, 0.0)], options=QUICK)
     assert plan.status == "infeasible"
     check_explanation(plan, "because go to: no place for the base, proven: ", "it hits crate")
 
 
-def test_all_reasons_are_given() -> None:
+def test_all_reasons_are_reported() -> None:
     scene = make_hall(obstacles=[describe_box("crate", (0.4, 0.4, 0.4), (0.5, 0.0, 0.2))])
     plan = vkc.plan(scene, [vkc.GoTo(9.0, 0.0)], options=QUICK)
     check_explanation(plan, "start base_link – crate", "goal base_x")

@@ -1,4 +1,4 @@
-"""Many obstacles cost little, and culling omits no contact: compared with all pairs."""
+"""Tests that many obstacles cost little and that culling omits no contact."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Reach, Release
 
 SEEDS = st.integers(0, 2**32 - 1)
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
-COAL = 2e-5  # [m] by which answers of coal differ that it came to from different guesses
+COAL_TOLERANCE = 2e-5  # [m] difference of coal's distances from different initial guesses
 
 
 @pytest.mark.long
@@ -38,7 +38,7 @@ def test_distance_queries_hardly_depend_on_the_number_of_obstacles() -> None:
     assert queries[0] > 1000
     assert queries[1] <= 2 * queries[0]
     phases = make_program(plans[1].scene, plans[1].steps).contacts.phases
-    assert queries[1] < sum(len(part.pairs) for part in phases)  # at hundreds of configurations
+    assert queries[1] < sum(len(part.pairs) for part in phases)  # in hundreds of configurations
 
 
 def compute_all_distances(
@@ -70,39 +70,41 @@ def check_contacts(
     part, waypoints = model.phases[phase], np.full(len(z), problem.ends[phase])
     distances = compute_all_distances(problem, part, z)
     contacts = model.evaluate(z, waypoints, reach=reach, nearest=nearest)
-    number = {tuple(pair): k for k, pair in enumerate(part.pairs.tolist())}
-    which = np.array([number[tuple(pair)] for pair in contacts.pair.tolist()], int)
-    every, same = np.arange(len(part.pairs)), np.full(len(part.pairs), problem.ends[phase])
+    indices = {tuple(pair): k for k, pair in enumerate(part.pairs.tolist())}
+    index = np.array([indices[tuple(pair)] for pair in contacts.pair.tolist()], int)
+    pairs, ends = np.arange(len(part.pairs)), np.full(len(part.pairs), problem.ends[phase])
     margins = np.array(
         [
-            part.margin_table.compute_margins(every, same, z, np.full(len(every), row))
+            part.margin_table.compute_margins(pairs, ends, z, np.full(len(pairs), row))
             for row in range(len(z))
         ]
     )
-    assert len(set(zip(contacts.waypoint.tolist(), which.tolist(), strict=True))) == len(which)
+    assert len(set(zip(contacts.waypoint.tolist(), index.tolist(), strict=True))) == len(index)
     np.testing.assert_allclose(
-        contacts.distance, distances[contacts.waypoint, which], rtol=0.0, atol=COAL
+        contacts.distance, distances[contacts.waypoint, index], rtol=0.0, atol=COAL_TOLERANCE
     )
-    np.testing.assert_array_equal(contacts.margin, margins[contacts.waypoint, which])
+    np.testing.assert_array_equal(contacts.margin, margins[contacts.waypoint, index])
     for row in range(len(z)):
-        mine = (
+        found = (
             contacts.distance[contacts.waypoint == row] - contacts.margin[contacts.waypoint == row]
         )
-        assert np.all(np.diff(mine) >= 0.0)
-        asked = (distances[row] < reach) & (margins[row] > -np.inf)
-        lack = np.sort((distances[row] - margins[row])[asked])[:nearest]
-        sure = (
-            np.abs(distances[row] - reach) > COAL
-        ).all()  # a pair just at the reach may count or not
-        assert not sure or len(mine) == len(lack)
-        np.testing.assert_allclose(mine[: len(lack)], lack[: len(mine)], rtol=0.0, atol=COAL)
+        assert np.all(np.diff(found) >= 0.0)
+        is_expected = (distances[row] < reach) & (margins[row] > -np.inf)
+        expected = np.sort((distances[row] - margins[row])[is_expected])[:nearest]
+        is_unambiguous = (
+            np.abs(distances[row] - reach) > COAL_TOLERANCE
+        ).all()  # a pair at the limit of the reach may be included or not
+        assert not is_unambiguous or len(found) == len(expected)
+        np.testing.assert_allclose(
+            found[: len(expected)], expected[: len(found)], rtol=0.0, atol=COAL_TOLERANCE
+        )
 
 
-REACHES, NUMBERS = st.sampled_from([0.0, 0.02, 0.25, 1.0]), st.sampled_from([None, 1, 6])
+REACHES, NEAREST = st.sampled_from([0.0, 0.02, 0.25, 1.0]), st.sampled_from([None, 1, 6])
 
 
 @settings(max_examples=10, deadline=None)
-@given(SEEDS, st.sampled_from([0, 3, 40, 150]), REACHES, NUMBERS)
+@given(SEEDS, st.sampled_from([0, 3, 40, 150]), REACHES, NEAREST)
 def test_contacts_are_those_among_all_pairs(
     seed: int, count: int, reach: float, nearest: int | None
 ) -> None:
@@ -115,7 +117,7 @@ def test_contacts_are_those_among_all_pairs(
 
 
 @settings(max_examples=8, deadline=None)
-@given(SEEDS, st.sampled_from([0, 1, 60]), REACHES, NUMBERS)
+@given(SEEDS, st.sampled_from([0, 1, 60]), REACHES, NEAREST)
 def test_contacts_of_grasped_objects_are_those_among_all_pairs(
     seed: int, count: int, reach: float, nearest: int | None
 ) -> None:

@@ -1,4 +1,4 @@
-"""Tests plans that go on from a measured grasp, and how they are validated and saved."""
+"""Tests plans that continue from a measured grasp, their validation and their files."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 PULL = vkc.Actuate("drawer", {"slide": 0.2})
 
 
-def make_start(off: float) -> vkc.Scene:
-    """Return the drawer's scene with a base that is `off` from where the hand is at the handle."""
+def make_start(offset: float) -> vkc.Scene:
+    """Return the drawer's scene with the base displaced by `offset` [m] from the nominal grasp."""
     scene = make_grasping_scene()
-    return scene.with_start(base=scene.start[:3] + np.array([off, 0.0, 0.0]))
+    return scene.with_start(base=scene.start[:3] + np.array([offset, 0.0, 0.0]))
 
 
 @cache
@@ -34,7 +34,7 @@ def test_drawer_held_beside_its_handle_is_opened(tmp_path: Path) -> None:
     assert plan.success, plan.summary()
     assert np.linalg.norm(plan.scene.holds[0].deviation) == pytest.approx(0.005, abs=1e-5)
     end = plan.end_scene()
-    moved = end.tool_placement()  # as far as the drawer, which opens along −x
+    moved = end.tool_placement()  # with the drawer, which opens along −x
     slide = end.objects["drawer"].state[0]
     along = pin.SE3(np.eye(3), np.array([-slide, 0.0, 0.0]))
     np.testing.assert_allclose((along * tool).homogeneous, moved.homogeneous, atol=1e-4)
@@ -48,12 +48,12 @@ def test_nominal_grasp_applies_after_the_release() -> None:
     steps = [PULL, vkc.Release(), vkc.Actuate("drawer", {"slide": 0.1})]
     plan = vkc.plan(plan_measured().scene, steps)
     assert plan.success, plan.summary()
-    held = [phase.holds[0] for phase in plan.trajectory.phases if phase.holds]
-    assert held[0] == plan.scene.holds[0]
-    assert held[-1] == held[0].nominal != held[0]
+    holds = [phase.holds[0] for phase in plan.trajectory.phases if phase.holds]
+    assert holds[0] == plan.scene.holds[0]
+    assert holds[-1] == holds[0].nominal != holds[0]
 
 
-def test_grasp_step_of_a_measured_grasp_is_done() -> None:
+def test_measured_grasp_satisfies_a_grasp_step() -> None:
     plan = vkc.plan(plan_measured().scene, [vkc.Grasp("drawer"), PULL])
     assert plan.success, plan.summary()
 
@@ -78,8 +78,8 @@ def test_motion_must_keep_the_grasp_of_its_scene() -> None:
         vkc.validate(closer, [PULL], plan.trajectory)
 
 
-def test_unmeasured_grasp_is_infeasible_and_says_how_to_measure_it() -> None:
-    (near, far) = (vkc.plan(make_start(off), [PULL]) for off in (0.005, 0.03))
+def test_infeasible_unmeasured_grasp_suggests_with_measured_grasp() -> None:
+    (near, far) = (vkc.plan(make_start(offset), [PULL]) for offset in (0.005, 0.03))
     assert near.status == far.status == "infeasible"
     assert "see Scene.with_measured_grasp" in near.summary()
     assert "with_measured_grasp" not in far.summary()

@@ -1,4 +1,4 @@
-"""Errors, scenes and plans pass through process pools, and copies plan and validate alike."""
+"""Tests copies of errors, scenes and plans, and their transfer to process pools."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from vkc_pin.datasets.problems import NoProblemError
 from vkc_pin.errors import BuildError, InputError, UnknownNameError, VkcError
 from vkc_pin.utils.budget import BudgetExhaustedError
 
-COPIES = {
+COPY_METHODS = {
     "pickle": lambda value: pickle.loads(pickle.dumps(value)),
     "protocol 2": lambda value: pickle.loads(pickle.dumps(value, 2)),
     "deepcopy": copy.deepcopy,
@@ -39,21 +39,23 @@ ERRORS = [
 
 
 @pytest.mark.parametrize("error", ERRORS, ids=range(len(ERRORS)))
-@pytest.mark.parametrize("way", COPIES)
-def test_copied_errors_keep_their_text_and_details(way: str, error: VkcError) -> None:
-    copied = COPIES[way](error)
+@pytest.mark.parametrize("method", COPY_METHODS)
+def test_copied_errors_keep_their_text_and_details(method: str, error: VkcError) -> None:
+    copied = COPY_METHODS[method](error)
     assert type(copied) is type(error)
     assert (str(copied), copied.args) == (str(error), error.args)
     assert vars(copied).keys() == vars(error).keys()
-    plain = {key: value for key, value in vars(error).items() if key not in ("expected", "got")}
-    assert vars(copied).items() >= plain.items()
+    comparable = {
+        key: value for key, value in vars(error).items() if key not in ("expected", "got")
+    }
+    assert vars(copied).items() >= comparable.items()
 
 
-def test_the_reason_of_a_stop_is_copied() -> None:
+def test_copied_budget_error_keeps_its_status() -> None:
     assert pickle.loads(pickle.dumps(BudgetExhaustedError("time limit"))).status == "time limit"
 
 
-def test_a_pool_raises_errors_of_its_processes() -> None:
+def test_process_pool_raises_the_errors_of_its_workers() -> None:
     with get_context("spawn").Pool(1) as pool, pytest.raises(UnknownNameError, match="'doors'"):
         pool.apply_async(vkc.load_scene, ("doors",)).get(timeout=60)
 
@@ -75,7 +77,7 @@ def assert_same_motion(one: vkc.Plan, other: vkc.Plan) -> None:
     assert repr(other.report) == repr(one.report)
 
 
-def test_a_process_pool_plans_a_sent_scene_alike() -> None:
+def test_process_pool_plans_the_same_motion() -> None:
     plan = make_plan()
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         returned = pool.submit(vkc.plan, plan.scene, STEPS).result(timeout=120)
@@ -88,37 +90,37 @@ def test_a_process_pool_plans_a_sent_scene_alike() -> None:
     assert repr(again) == repr(plan.report)
 
 
-def test_joblib_plans_a_sent_scene_alike() -> None:
+def test_joblib_plans_the_same_motion() -> None:
     plan = make_plan()
     for returned in joblib.Parallel(n_jobs=2)([joblib.delayed(vkc.plan)(plan.scene, STEPS)]):
         assert_same_motion(plan, returned)
 
 
-@pytest.mark.parametrize("way", COPIES)
-def test_copied_scenes_and_plans_plan_and_validate_alike(way: str) -> None:
-    plan, copied = make_plan(), COPIES[way](make_plan())
+@pytest.mark.parametrize("method", COPY_METHODS)
+def test_copied_scenes_and_plans_give_the_same_motions_and_reports(method: str) -> None:
+    plan, copied = make_plan(), COPY_METHODS[method](make_plan())
     assert copied.scene.document == plan.scene.document
     assert_same_motion(plan, copied)
-    report = vkc.validate(COPIES[way](plan.scene), STEPS, copied.trajectory)
+    report = vkc.validate(COPY_METHODS[method](plan.scene), STEPS, copied.trajectory)
     assert repr(report) == repr(plan.report)
-    if way in ("pickle", "deepcopy"):
-        assert_same_motion(plan, vkc.plan(COPIES[way](plan.scene), STEPS))
+    if method in ("pickle", "deepcopy"):
+        assert_same_motion(plan, vkc.plan(COPY_METHODS[method](plan.scene), STEPS))
 
 
-@pytest.mark.parametrize("way", COPIES)
+@pytest.mark.parametrize("method", COPY_METHODS)
 @pytest.mark.parametrize("name", ["household", "fetch", "drawer", "gap_table"])
-def test_copied_scenes_have_the_same_shapes_and_stay_read_only(name: str, way: str) -> None:
+def test_copied_scenes_have_the_same_shapes_and_stay_read_only(name: str, method: str) -> None:
     scene = vkc.load_scene(name)
-    copied: Any = COPIES[way](scene)
+    copied: Any = COPY_METHODS[method](scene)
     assert copied.start_clearance() == scene.start_clearance()
     assert repr(copied) == repr(scene)
     assert list(copied.objects) == list(scene.objects)
     with pytest.raises(TypeError):
         copied.objects["new"] = None
     for key, placed in scene.objects.items():
-        item = COPIES[way](placed.object)
+        item = COPY_METHODS[method](placed.object)
         assert list(item.attachments) == list(placed.object.attachments)
-        assert COPIES[way](placed).object.name == copied.objects[key].object.name
-    robot = COPIES[way](scene.robot)
+        assert COPY_METHODS[method](placed).object.name == copied.objects[key].object.name
+    robot = COPY_METHODS[method](scene.robot)
     np.testing.assert_array_equal(robot.home, scene.robot.home)
     assert robot.model == scene.robot.model

@@ -69,7 +69,7 @@ def saved(door_plan: vkc.Plan, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def own_scene(tmp_path: Path) -> vkc.Scene:
-    """A scene of a user, with a mesh beside it."""
+    """Load a user's scene that refers to a mesh file in its folder."""
     home = tmp_path / "work" / "scenes"
     home.mkdir(parents=True)
     (home / "heap.obj").write_text(TETRAHEDRON)
@@ -114,15 +114,15 @@ def test_file_has_no_pickles_and_no_absolute_paths(saved: Path) -> None:
             assert array.dtype != object
     about = json.dumps(read_contents(saved)["about"])
     assert read_contents(saved)["about"]["folder"] == {"package": "scenes"}
-    for place in (
+    for folder in (
         str(Path.home()),
         str(Path(vkc.__file__).resolve().parent.parent),
         str(saved.parent),
     ):
-        assert place == "/" or place not in about
+        assert folder == "/" or folder not in about
 
 
-def test_plan_moves_with_its_scene(own_scene: vkc.Scene, tmp_path: Path) -> None:
+def test_plan_file_moves_with_its_scene(own_scene: vkc.Scene, tmp_path: Path) -> None:
     plan = plan_short_drive(own_scene)
     plan.save(tmp_path / "work" / "out" / "yard.npz")
     assert read_contents(tmp_path / "work" / "out" / "yard.npz")["about"]["folder"][
@@ -135,7 +135,7 @@ def test_plan_moves_with_its_scene(own_scene: vkc.Scene, tmp_path: Path) -> None
     assert vkc.validate(loaded.scene, loaded.steps, loaded.trajectory, loaded.options).ok
 
 
-def test_plan_moves_without_its_scene(own_scene: vkc.Scene, tmp_path: Path) -> None:
+def test_plan_file_moves_without_its_scene(own_scene: vkc.Scene, tmp_path: Path) -> None:
     plan = plan_short_drive(own_scene)
     path = plan.save(tmp_path / "work" / "out" / "yard.npz")
     alone = shutil.move(path, tmp_path / "yard.npz")
@@ -188,21 +188,23 @@ def _write_list(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("damage", "said"),
+    ("damage", "message"),
     [
         *((damage, "not a saved plan") for damage in DAMAGES),
         (_write_list, r"wrong value .expected fields"),
     ],
 )
-def test_damaged_files(saved: Path, damage: Callable[[Path], None], said: str) -> None:
+def test_damaged_files_are_refused(
+    saved: Path, damage: Callable[[Path], None], message: str
+) -> None:
     damage(saved)
-    with pytest.raises(vkc.InputError, match=said) as caught:
+    with pytest.raises(vkc.InputError, match=message) as caught:
         vkc.Plan.load(saved)
     assert caught.value.file == saved
     assert str(saved) in str(caught.value)
 
 
-def test_unknown_format(saved: Path) -> None:
+def test_unknown_format_is_refused(saved: Path) -> None:
     rewrite(saved, lambda about: (about.update(format=FORMAT + 1), about.pop("trajectory")))
     with pytest.raises(vkc.InputError, match="unknown format") as caught:
         vkc.Plan.load(saved)
@@ -229,7 +231,7 @@ def test_unknown_format(saved: Path) -> None:
         (lambda about: about.update(folder=7), "folder: wrong value"),
     ],
 )
-def test_inconsistent_files(
+def test_inconsistent_files_are_refused(
     saved: Path, change: Callable[[dict[str, Any]], Any], text: str
 ) -> None:
     rewrite(saved, change)
@@ -238,7 +240,7 @@ def test_inconsistent_files(
     assert caught.value.file == saved
 
 
-def test_file_without_self_distance(saved: Path) -> None:
+def test_missing_self_distance_defaults_to_dist_safe(saved: Path) -> None:
     rewrite(
         saved,
         lambda about: (
@@ -250,7 +252,7 @@ def test_file_without_self_distance(saved: Path) -> None:
     assert (options.dist_safe, options.self_distance) == (0.013, 0.013)
 
 
-def test_missing_file(tmp_path: Path) -> None:
+def test_missing_file_is_reported(tmp_path: Path) -> None:
     for path in (tmp_path / "none.npz", tmp_path):
         with pytest.raises(vkc.InputError, match="cannot read the plan") as caught:
             vkc.Plan.load(path)
@@ -280,7 +282,7 @@ def test_report_of_a_success(door_plan: vkc.Plan) -> None:
 
 
 def test_report_of_a_failure(door_plan: vkc.Plan) -> None:
-    blame = Violation(
+    violation = Violation(
         "penetration",
         "forearm_link – sofa",
         waypoint=9,
@@ -290,7 +292,7 @@ def test_report_of_a_failure(door_plan: vkc.Plan) -> None:
         detail="overlap by 30 mm",
     )
     failed = dataclasses.replace(
-        door_plan, status="rejected", report=Report((blame,), -0.03, states=100)
+        door_plan, status="rejected", report=Report((violation,), -0.03, states=100)
     )
     report = failed.summary()
     assert report.startswith("door: FAILED, rejected — reach")
@@ -300,13 +302,13 @@ def test_report_of_a_failure(door_plan: vkc.Plan) -> None:
 def test_success_requires_status_and_validation(door_plan: vkc.Plan) -> None:
     assert door_plan.success
     assert not dataclasses.replace(door_plan, status="not converged").success
-    blame = Violation(
+    violation = Violation(
         "goal", "base", waypoint=9, time=4.0, amount=0.03, unit="m", detail="elsewhere"
     )
-    assert not dataclasses.replace(door_plan, report=Report((blame,))).success
+    assert not dataclasses.replace(door_plan, report=Report((violation,))).success
 
 
-def test_plain_data(door_plan: vkc.Plan) -> None:
+def test_plan_is_converted_to_plain_data(door_plan: vkc.Plan) -> None:
     data = json.loads(json.dumps(door_plan.to_dict(), allow_nan=False))
     assert (data["scene"], data["success"], data["status"]) == ("door", True, "success")
     assert data["steps"] == [
@@ -322,9 +324,9 @@ def test_plain_data(door_plan: vkc.Plan) -> None:
         "by": {},
     }
     open_space = dataclasses.replace(door_plan.report, clearance=float("inf"))
-    endless = dataclasses.replace(door_plan, report=open_space)
+    unbounded = dataclasses.replace(door_plan, report=open_space)
     assert (
-        json.loads(json.dumps(endless.to_dict(), allow_nan=False))["metrics"]["clearance"] is None
+        json.loads(json.dumps(unbounded.to_dict(), allow_nan=False))["metrics"]["clearance"] is None
     )
 
 

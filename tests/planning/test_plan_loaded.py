@@ -1,4 +1,4 @@
-"""The claims of a loaded file are checked."""
+"""Tests that the claims of loaded files are validated."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vkc_pin.world.task.terms import trace_terms
 
 
 def test_failed_plan_keeps_its_violations(door_plan: vkc.Plan, tmp_path: Path) -> None:
-    blame = Violation(
+    violation = Violation(
         "penetration",
         "forearm_link – sofa",
         waypoint=9,
@@ -26,7 +26,7 @@ def test_failed_plan_keeps_its_violations(door_plan: vkc.Plan, tmp_path: Path) -
         detail="overlap by 30 mm",
     )
     report = Report(
-        (blame,),
+        (violation,),
         float("inf"),
         closure_error=1e-4,
         closure_angle=2e-4,
@@ -34,15 +34,15 @@ def test_failed_plan_keeps_its_violations(door_plan: vkc.Plan, tmp_path: Path) -
         notes=("the sofa stands in the way",),
     )
     positions = door_plan.trajectory.positions.copy()
-    positions[5, 2] += 1.5  # such reports are not of motions that are right
+    positions[5, 2] += 1.5  # a report with violations belongs to an invalid motion
     bent = dataclasses.replace(door_plan.trajectory, positions=positions, curve=None)
     failed = dataclasses.replace(door_plan, trajectory=bent, report=report, status="infeasible")
     loaded = vkc.Plan.load(failed.save(tmp_path / "failed.npz"))
     assert (loaded.success, loaded.status, loaded.claimed) == (False, "infeasible", report)
-    assert (loaded.report.violations, loaded.report.notes) == ((blame,), report.notes)
+    assert (loaded.report.violations, loaded.report.notes) == ((violation,), report.notes)
     late = dataclasses.replace(
         failed, status="time limit"
-    )  # then the violations are those of the motion
+    )  # violations are then recomputed from the motion
     loaded = vkc.Plan.load(late.save(tmp_path / "late.npz"))
     assert {v.constraint for v in loaded.report.violations} == {
         "velocity",
@@ -56,8 +56,8 @@ def test_failed_plan_keeps_its_violations(door_plan: vkc.Plan, tmp_path: Path) -
     )
 
 
-def spoil(plan: vkc.Plan) -> vkc.Plan:
-    """Return the plan with another motion and the same claims."""
+def invalidate_motion(plan: vkc.Plan) -> vkc.Plan:
+    """Return the plan with an invalid motion and its old report."""
     positions = plan.trajectory.positions.copy()
     positions[5, 2] += 1.5
     return dataclasses.replace(
@@ -66,7 +66,7 @@ def spoil(plan: vkc.Plan) -> vkc.Plan:
 
 
 def test_success_is_validated(door_plan: vkc.Plan, tmp_path: Path) -> None:
-    bad = spoil(door_plan)
+    bad = invalidate_motion(door_plan)
     assert bad.success
     loaded = vkc.Plan.load(bad.save(tmp_path / "bad.npz"))
     assert (loaded.success, loaded.status) == (False, "rejected")
@@ -83,7 +83,7 @@ def test_success_is_validated(door_plan: vkc.Plan, tmp_path: Path) -> None:
 def test_report_without_validation_is_the_claim_of_the_file(
     door_plan: vkc.Plan, tmp_path: Path
 ) -> None:
-    path = spoil(door_plan).save(tmp_path / "bad.npz")
+    path = invalidate_motion(door_plan).save(tmp_path / "bad.npz")
     loaded = vkc.Plan.load(path, validate=False)
     assert (loaded.is_validated, loaded.success) == (False, False)
     assert loaded.report == loaded.claimed == door_plan.report
@@ -92,20 +92,22 @@ def test_report_without_validation_is_the_claim_of_the_file(
 
 
 def test_reasons_of_an_infeasible_task_are_loaded(door_plan: vkc.Plan, tmp_path: Path) -> None:
-    blame = Violation("penetration", "a – b", amount=0.03, unit="m", detail="overlap by 30 mm")
-    said = dataclasses.replace(
-        spoil(door_plan), status="infeasible", report=Report((blame,), notes=("so it is",))
+    violation = Violation("penetration", "a – b", amount=0.03, unit="m", detail="overlap by 30 mm")
+    failed = dataclasses.replace(
+        invalidate_motion(door_plan),
+        status="infeasible",
+        report=Report((violation,), notes=("so it is",)),
     )
-    path = said.save(tmp_path / "said.npz")
-    assert vkc.Plan.load(path).report.violations == (blame,)
+    path = failed.save(tmp_path / "failed.npz")
+    assert vkc.Plan.load(path).report.violations == (violation,)
     assert vkc.Plan.load(path).report.notes == ("so it is",)
-    right = dataclasses.replace(door_plan, status="infeasible", report=said.report)
-    loaded = vkc.Plan.load(right.save(path))
+    valid = dataclasses.replace(door_plan, status="infeasible", report=failed.report)
+    loaded = vkc.Plan.load(valid.save(path))
     assert (loaded.report.ok, loaded.success) == (True, False)
     assert "1 constraint(s) violated" in loaded.contradictions()
 
 
-def test_motion_of_another_robot(door_plan: vkc.Plan, tmp_path: Path) -> None:
+def test_motion_of_another_robot_is_refused(door_plan: vkc.Plan, tmp_path: Path) -> None:
     names = ("arm", *door_plan.trajectory.names[1:])
     path = dataclasses.replace(
         door_plan, trajectory=dataclasses.replace(door_plan.trajectory, names=names)
@@ -118,35 +120,35 @@ def test_motion_of_another_robot(door_plan: vkc.Plan, tmp_path: Path) -> None:
 
 
 def test_motion_out_of_range(door_plan: vkc.Plan, tmp_path: Path) -> None:
-    for far, said in ((1e6, None), (1e100, "trajectory.positions")):
+    for value, field in ((1e6, None), (1e100, "trajectory.positions")):
         positions = door_plan.trajectory.positions.copy()
-        positions[5, 0] = far
+        positions[5, 0] = value
         trajectory = dataclasses.replace(door_plan.trajectory, positions=positions, curve=None)
         path = dataclasses.replace(door_plan, trajectory=trajectory).save(tmp_path / "far")
-        if said is None:
+        if field is None:
             loaded = vkc.Plan.load(path)
             assert not loaded.success
             assert "sampling" in {violation.constraint for violation in loaded.report.violations}
             continue
-        with pytest.raises(vkc.InputError, match=said) as caught:
+        with pytest.raises(vkc.InputError, match=field) as caught:
             vkc.Plan.load(path)
         assert caught.value.file == path
 
 
 @pytest.mark.parametrize("amount", [float("inf"), 1e308, 0.5])
 @pytest.mark.parametrize("ratio", [float("inf"), float("nan"), -float("inf"), 0.5])
-def test_plan_with_any_amounts_is_saved_and_loaded(
+def test_plan_with_non_finite_numbers_is_saved_and_loaded(
     door_plan: vkc.Plan, tmp_path: Path, amount: float, ratio: float
 ) -> None:
-    blame = Violation("term", "c", amount=amount, unit="", detail="too much")
+    violation = Violation("term", "c", amount=amount, unit="", detail="too much")
     failed = dataclasses.replace(
         door_plan,
-        report=dataclasses.replace(door_plan.report, violations=(blame,)),
+        report=dataclasses.replace(door_plan.report, violations=(violation,)),
         status="infeasible",
         history=({**door_plan.history[0], "ratio": ratio},),
     )
     loaded = vkc.Plan.load(failed.save(tmp_path / "plan.npz"), validate=False)
-    assert loaded.report.violations == (blame,)
+    assert loaded.report.violations == (violation,)
     assert str(loaded.history[0]["ratio"]) == str(ratio)
     text = failed.to_json(tmp_path / "plan.json").read_text(encoding="utf-8")
     data = json.loads(text, parse_constant=pytest.fail)
@@ -155,7 +157,7 @@ def test_plan_with_any_amounts_is_saved_and_loaded(
     assert motion.to_dict() == door_plan.trajectory.to_dict()
 
 
-def test_overflowing_term_of_a_plan_is_saved_and_loaded(
+def test_plan_with_an_overflowing_term_is_saved_and_loaded(
     door_plan: vkc.Plan, tmp_path: Path
 ) -> None:
     def overflow(state: vkc.State) -> Any:

@@ -31,9 +31,8 @@ from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.trajectory.wheels import make_rolling_limits
 from vkc_pin.world.trajectory.world_model import World
 
-ROOT = Path(__file__).resolve().parents[2]
 HINGE = 1.2
-SEEN = vkc.Options(reach_waypoints=20)
+FEW = vkc.Options(reach_waypoints=20)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +40,7 @@ def demo() -> vkc.Plan:
     return vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": HINGE})])
 
 
-def place_tool(scene: vkc.Scene, row: np.ndarray) -> pin.SE3:
+def compute_tool_placement(scene: vkc.Scene, row: np.ndarray) -> pin.SE3:
     """Return the tool's placement at one row of a trajectory, by numeric Pinocchio."""
     model = scene.robot.model
     data = model.createData()
@@ -50,7 +49,7 @@ def place_tool(scene: vkc.Scene, row: np.ndarray) -> pin.SE3:
     return data.oMf[model.getFrameId(scene.robot.tool_frame)].copy()
 
 
-def place_handle(hinge: float, knob: float) -> pin.SE3:
+def compute_handle_placement(hinge: float, knob: float) -> pin.SE3:
     """Return the tool's placement at the door's handle, from the URDF."""
     model = pin.buildModelFromUrdf(str(find_resource_folder("scenes") / "objects" / "door.urdf"))
     data, q = model.createData(), pin.neutral(model)
@@ -58,8 +57,7 @@ def place_handle(hinge: float, knob: float) -> pin.SE3:
         q[model.joints[model.getJointId(name)].idx_q] = value
     pin.framesForwardKinematics(model, data, q)
     lever = data.oMf[model.getFrameId("lever")]
-    # The tool's x axis, in which the fingers close, along the lever's z; its z axis, along which it
-    # comes, along x.
+    # The tool closes (x) along the lever's z axis and approaches (z) along the lever's x axis.
     grasp = pin.SE3(
         np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]),
         np.array([-0.105, 0.07, 0.0]),
@@ -90,7 +88,7 @@ def test_demo_opens_the_door(demo: vkc.Plan) -> None:
     hinge, knob = get_column(demo, "door.hinge"), get_column(demo, "door.knob")
     assert (hinge[0], knob[0]) == (0.0, 0.0)
     assert hinge[-1] == pytest.approx(HINGE, abs=1e-3)
-    assert np.all(knob[hinge > 1e-4] >= 0.5 - 1e-4)  # the bolt holds until the lever is turned
+    assert np.all(knob[hinge > 1e-4] >= 0.5 - 1e-4)  # the latch holds until the lever is turned
 
 
 def test_demo_holds_the_handle(demo: vkc.Plan) -> None:
@@ -100,7 +98,9 @@ def test_demo_holds_the_handle(demo: vkc.Plan) -> None:
     times = np.linspace(demo.trajectory.times[holds[0].first], demo.trajectory.times[-1], 150)
     index = [demo.trajectory.names.index(name) for name in ("door.hinge", "door.knob")]
     for row in demo.trajectory.at(times):
-        distance, angle = measure_error(place_tool(demo.scene, row), place_handle(*row[index]))
+        distance, angle = measure_error(
+            compute_tool_placement(demo.scene, row), compute_handle_placement(*row[index])
+        )
         assert distance <= 1e-3
         assert angle <= 1e-3
 
@@ -110,7 +110,7 @@ def test_demo_keeps_velocity_and_acceleration_limits(demo: vkc.Plan) -> None:
     np.testing.assert_allclose(trajectory.positions[0, :9], demo.scene.start, atol=1e-9)
     times = np.linspace(trajectory.times[0], trajectory.times[-1], 20_001)
     rows, step = trajectory(times)[:, :9], times[1] - times[0]
-    speeds = np.diff(rows, axis=0) / step  # in numbers alone; nowhere a gap, and from rest to rest
+    speeds = np.diff(rows, axis=0) / step  # finite differences, so that jumps would show
     assert np.all(np.abs(speeds) <= robot.velocity * 1.001 + 1e-9)
     speeds = np.vstack([np.zeros(9), speeds, np.zeros(9)])
     assert np.all(np.abs(np.diff(speeds, axis=0)) <= robot.acceleration * step * 1.001 + 1e-9)
@@ -120,7 +120,7 @@ def test_demo_keeps_velocity_and_acceleration_limits(demo: vkc.Plan) -> None:
     assert trajectory.times[grasp + 1] - trajectory.times[grasp] == pytest.approx(
         demo.options.grasp_time
     )
-    # It does not wander: from the start to the handle and on by the door's width.
+    # The base drives to the handle and along the door's arc without detours.
     assert trajectory.base_path_length() < 6.0
 
 
@@ -137,19 +137,21 @@ def test_metrics(demo: vkc.Plan) -> None:
     assert m["iterations"] == sum(demo.history[k - 1]["iterations"] for k in ends[1:])
 
 
-def test_reach() -> None:
+def test_tool_reaches_a_pose() -> None:
     scene = vkc.load_scene("door")
     target = pin.SE3(pin.rpy.rpyToMatrix(0.0, np.pi / 2, 0.3), np.array([1.5, 0.5, 1.0]))
-    plan = vkc.plan(scene, [vkc.Reach(target)], options=SEEN)
+    plan = vkc.plan(scene, [vkc.Reach(target)], options=FEW)
     check_success(plan)
-    distance, angle = measure_error(place_tool(scene, plan.trajectory.positions[-1]), target)
+    distance, angle = measure_error(
+        compute_tool_placement(scene, plan.trajectory.positions[-1]), target
+    )
     assert distance <= 1e-3
     assert angle <= 1e-3
 
 
 @pytest.mark.parametrize("yaw", [1.0])
-def test_drive(yaw: float | None) -> None:
-    plan = vkc.plan(vkc.load_scene("door"), [vkc.GoTo(0.5, 0.0, yaw)], options=SEEN)
+def test_base_reaches_a_goal(yaw: float | None) -> None:
+    plan = vkc.plan(vkc.load_scene("door"), [vkc.GoTo(0.5, 0.0, yaw)], options=FEW)
     check_success(plan)
     x, y, heading = plan.trajectory.positions[-1, :3]
     assert np.hypot(x - 0.5, y) <= 1e-3
@@ -179,14 +181,14 @@ def compute_final_placement(plan: vkc.Plan, name: str) -> pin.SE3:
     return world.get_placement(name, world.compute_positions(plan.trajectory)[-1])
 
 
-@pytest.mark.parametrize("joint", [True, False], ids=["jointly", "step by step"])
-def test_pick_and_place(joint: bool) -> None:
+@pytest.mark.parametrize("simultaneous", [True, False], ids=["jointly", "step by step"])
+def test_pick_and_place(simultaneous: bool) -> None:
     scene, aside = move_back(make_room(describe_table())), lift(STICK, [0.0, 0.5, 0.0])
     plan = vkc.plan(
         scene,
         [vkc.Grasp("stick"), vkc.Place("stick", aside), vkc.GoTo(-1.0, 0.0)],
-        options=SEEN,
-        simultaneous=joint,
+        options=FEW,
+        simultaneous=simultaneous,
     )
     check_success(plan)
     assert max(measure_error(compute_final_placement(plan, "stick"), aside)) <= 1e-3
@@ -195,11 +197,19 @@ def test_pick_and_place(joint: bool) -> None:
     values = [get_column(plan, f"stick.grip_{name}")[held[0].first] for name in ("slide", "turn")]
     first, last = plan.trajectory.positions[held[0].first], plan.trajectory.positions[held[-1].last]
     assert (
-        max(measure_error(place_tool(scene, first), compute_grasp_pose(STICK, values=values)))
+        max(
+            measure_error(
+                compute_tool_placement(scene, first), compute_grasp_pose(STICK, values=values)
+            )
+        )
         <= 1e-3
     )
     assert (
-        max(measure_error(place_tool(scene, last), compute_grasp_pose(aside, values=values)))
+        max(
+            measure_error(
+                compute_tool_placement(scene, last), compute_grasp_pose(aside, values=values)
+            )
+        )
         <= 2e-3
     )
     assert np.hypot(*(plan.trajectory.positions[-1, :2] - [-1.0, 0.0])) <= 1e-3
@@ -208,24 +218,24 @@ def test_pick_and_place(joint: bool) -> None:
 def test_touch_and_release() -> None:
     scene, point = move_back(make_room(describe_table())), np.array([0.8, 1.0, 0.9])
     plan = vkc.plan(
-        scene, [vkc.Touch("stick.tip", point), vkc.Release(), vkc.GoTo(-1.0, 0.0)], options=SEEN
+        scene, [vkc.Touch("stick.tip", point), vkc.Release(), vkc.GoTo(-1.0, 0.0)], options=FEW
     )
     check_success(plan)
     last = plan.trajectory.phases[-1]
     assert dict(last.held) == {}
     tip = compute_final_placement(plan, "stick").act(
         np.array([0.0, 0.25, 0.0])
-    )  # it stays where it was let go of
+    )  # it stays at the release
     np.testing.assert_allclose(tip, point, rtol=0.0, atol=1e-3)
 
 
-def test_fetching_with_a_tool() -> None:
+def test_object_is_fetched_with_a_tool() -> None:
     scene = make_room(
         describe_stand(), describe_stand("stand_2", aside=0.3), objects=("stick", "ball")
     ).with_held({"stick": "grip"})
     aside = lift(BALL, [0.0, 0.3, 0.0])
     steps = [vkc.Grasp("ball", "pull", "stick.tip"), vkc.Place("ball", aside), vkc.GoTo(-0.6, -0.3)]
-    plan = vkc.plan(scene.with_start(base=[-0.6, -0.3, 0.0]), steps, options=SEEN)
+    plan = vkc.plan(scene.with_start(base=[-0.6, -0.3, 0.0]), steps, options=FEW)
     check_success(plan)
     assert max(measure_error(compute_final_placement(plan, "ball"), aside)) <= 1e-3
     assert {"ball": "stick.tip"} in [phase["by"] for phase in plan.trajectory.to_dict()["phases"]]
@@ -236,12 +246,12 @@ def test_object_placed_at_a_point_is_upright() -> None:
     plan = vkc.plan(
         move_back(make_room(describe_table())),
         [vkc.Place("stick", (0.8, 0.6, 0.551))],
-        options=SEEN,
+        options=FEW,
     )
     check_success(plan)
-    there = compute_final_placement(plan, "stick")
-    np.testing.assert_allclose(there.translation, [0.8, 0.6, 0.551], rtol=0.0, atol=1e-3)
-    np.testing.assert_allclose(there.rotation[2], [0.0, 0.0, 1.0], rtol=0.0, atol=2e-3)
+    placement = compute_final_placement(plan, "stick")
+    np.testing.assert_allclose(placement.translation, [0.8, 0.6, 0.551], rtol=0.0, atol=1e-3)
+    np.testing.assert_allclose(placement.rotation[2], [0.0, 0.0, 1.0], rtol=0.0, atol=2e-3)
 
 
 def test_callback_is_called_in_every_round() -> None:
@@ -269,12 +279,14 @@ def test_errors_of_the_callback_are_raised() -> None:
         raise RuntimeError("mine")
 
     with pytest.raises(RuntimeError, match="mine"):
-        vkc.plan(make_hall(), [vkc.GoTo(1.0, 0.0)], callback=fail, options=SEEN)
+        vkc.plan(make_hall(), [vkc.GoTo(1.0, 0.0)], callback=fail, options=FEW)
 
 
 @pytest.mark.parametrize("rounds", [0, 2])
-def test_time_limit(demo: vkc.Plan, rounds: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every round takes a day of the clock."""
+def test_time_limit_bounds_the_rounds(
+    demo: vkc.Plan, rounds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On the patched clock every round takes a day."""
     real, day, done = time.perf_counter, 86400.0, list[vkc.Iteration]()
     monkeypatch.setattr(time, "perf_counter", lambda: real() + day * len(done))
     limit = (rounds - 0.5) * day if rounds else 1e-9
@@ -292,7 +304,7 @@ def test_time_limit(demo: vkc.Plan, rounds: int, monkeypatch: pytest.MonkeyPatch
 
 @pytest.fixture
 def ctrl_c() -> Iterator[Any]:
-    """Ctrl-C a while after the first round began, from another thread."""
+    """Return a function that sends SIGINT from another thread after a delay [s]."""
     timers: list[threading.Timer] = []
 
     def press(delay: float) -> None:
@@ -328,21 +340,21 @@ def test_ctrl_c_returns_the_best_trajectory(demo: vkc.Plan, ctrl_c: Any, delay: 
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_start_outside_its_limits_by_rounding() -> None:
+def test_start_outside_its_limits_by_rounding_is_accepted() -> None:
     scene = make_hall()
     arm = scene.start[3:].copy()
     arm[0], arm[5] = scene.robot.lower[3], scene.robot.upper[8]
     outside = arm + np.array([-1e-8, 0.0, 0.0, 0.0, 0.0, 1e-8])
-    check_success(vkc.plan(scene.with_start(arm=outside), [vkc.GoTo(-1.0, 0.5)], options=SEEN))
-    # A scene that was made by other means keeps the rounding.
+    check_success(vkc.plan(scene.with_start(arm=outside), [vkc.GoTo(-1.0, 0.5)], options=FEW))
+    # A scene that is constructed directly keeps the rounding.
     raw = dataclasses.replace(scene, start=np.concatenate([scene.start[:3], outside]))
-    plan = vkc.plan(raw, [vkc.GoTo(-1.0, 0.5)], options=SEEN)
+    plan = vkc.plan(raw, [vkc.GoTo(-1.0, 0.5)], options=FEW)
     check_success(plan)
     np.testing.assert_array_equal(plan.trajectory.positions[0], raw.start)
 
 
 @pytest.mark.parametrize("gap", [0.0005])
-def test_start_closer_than_dist_safe(gap: float) -> None:
+def test_start_closer_than_dist_safe_is_accepted(gap: float) -> None:
     wall = {
         "name": "wall",
         "type": "box",
@@ -350,8 +362,8 @@ def test_start_closer_than_dist_safe(gap: float) -> None:
         "position": [0.545 + gap, 0.0, 0.25],
     }
     scene = make_hall(obstacles=[wall])
-    assert 0.0 < scene.start_clearance() < SEEN.dist_safe / 2 + 1e-6
-    plan = vkc.plan(scene, [vkc.GoTo(-1.0, 0.5)], options=SEEN)
+    assert 0.0 < scene.start_clearance() < FEW.dist_safe / 2 + 1e-6
+    plan = vkc.plan(scene, [vkc.GoTo(-1.0, 0.5)], options=FEW)
     check_success(plan)
     assert plan.report.clearance == pytest.approx(scene.start_clearance(), abs=1e-6)
 
@@ -402,28 +414,28 @@ def test_wheel_speed_limits_the_motion(tmp_path: Path) -> None:
     (tmp_path / "robot.yaml").write_text(text, encoding="utf-8")
     quick = make_hall(base="differential")
     slow = dataclasses.replace(quick, robot=vkc.load_robot(tmp_path, base="differential"))
-    rims = []
+    rim_speeds = []
     for scene in (quick, slow):
         plan = vkc.plan(scene, [vkc.GoTo(4.0, 1.0, 1.0)])
         check_success(plan)
         along, _, turn = make_rolling_limits(scene.robot).compute_steps(plan.trajectory.positions)
-        rims.append(
+        rim_speeds.append(
             (np.abs(along) + scene.robot.wheels.track / 2 * np.abs(turn))
             / np.diff(plan.trajectory.times)
         )
-    assert rims[0].max() > 0.3
-    assert 0.1 < rims[1].max() <= 0.2 * 1.001
+    assert rim_speeds[0].max() > 0.3
+    assert 0.1 < rim_speeds[1].max() <= 0.2 * 1.001
 
 
 def test_fixed_base_stays() -> None:
     plan = vkc.plan(
-        make_hall(base="fixed"), [vkc.Reach((0.5, 0.4, 1.0, 0.0, np.pi / 2, 0.0))], options=SEEN
+        make_hall(base="fixed"), [vkc.Reach((0.5, 0.4, 1.0, 0.0, np.pi / 2, 0.0))], options=FEW
     )
     check_success(plan)
     assert np.ptp(plan.trajectory.positions[:, :3], axis=0).max() == 0.0
 
 
-def test_another_robot() -> None:
+def test_another_robot_reaches_a_pose() -> None:
     document = {
         "robot": "panda",
         "start": {"base": [0.0, 0.0, 0.0], "arm": "home"},
@@ -436,10 +448,13 @@ def test_another_robot() -> None:
     plan = vkc.plan(scene, [vkc.Reach(target)])
     check_success(plan)
     assert plan.trajectory.names[:4] == ("base_x", "base_y", "base_yaw", "panda_joint1")
-    assert max(measure_error(place_tool(scene, plan.trajectory.positions[-1]), target)) <= 1e-3
+    assert (
+        max(measure_error(compute_tool_placement(scene, plan.trajectory.positions[-1]), target))
+        <= 1e-3
+    )
 
 
-MISUSES: dict[str, tuple[dict[str, Any], str, str]] = {
+INVALID_ARGUMENTS: dict[str, tuple[dict[str, Any], str, str]] = {
     "unknown initialization": (
         {"initialization": "interpolate"},
         "initialization",
@@ -469,7 +484,7 @@ MISUSES: dict[str, tuple[dict[str, Any], str, str]] = {
 }
 
 
-@pytest.mark.parametrize("case", MISUSES.values(), ids=MISUSES)
+@pytest.mark.parametrize("case", INVALID_ARGUMENTS.values(), ids=INVALID_ARGUMENTS)
 def test_invalid_arguments(case: tuple[dict[str, Any], str, str]) -> None:
     arguments, field, text = case
     call: dict[str, Any] = {"scene": make_hall(), "steps": [vkc.GoTo(1.0, 0.0)], **arguments}
@@ -481,14 +496,14 @@ def test_invalid_arguments(case: tuple[dict[str, Any], str, str]) -> None:
 
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore:.*links overlap at the default home")
-def test_robot_from_a_urdf_alone() -> None:
+def test_robot_from_a_urdf_alone_reaches_a_pose() -> None:
     scene = vkc.Scene.from_document({"robot": "tiago", "start": {"base": [0.0, 0.0, 0.0]}})
     assert scene.robot.tight["arm_2_link", "torso_lift_link"] == pytest.approx(0.0188, abs=1e-4)
     target = pin.SE3(np.eye(3), np.array([1.5, 0.4, 0.9]))
-    plan = vkc.plan(scene, [vkc.Reach(target)], options=SEEN)
+    plan = vkc.plan(scene, [vkc.Reach(target)], options=FEW)
     assert plan.success, plan.summary()
-    assert place_tool(scene, plan.trajectory.positions[-1]).isApprox(target, 2e-3)
+    assert compute_tool_placement(scene, plan.trajectory.positions[-1]).isApprox(target, 2e-3)
     motion, steps = plan.trajectory, plan.steps
-    assert validate(plan.scene, steps, motion, SEEN).ok
-    held_back = validate(plan.scene, steps, motion, dataclasses.replace(SEEN, self_distance=0.2))
-    assert {violation.constraint for violation in held_back.violations} == {"clearance"}
+    assert validate(plan.scene, steps, motion, FEW).ok
+    stricter = validate(plan.scene, steps, motion, dataclasses.replace(FEW, self_distance=0.2))
+    assert {violation.constraint for violation in stricter.violations} == {"clearance"}

@@ -1,4 +1,4 @@
-"""One line of progress in terminals and notebooks."""
+"""Tests the progress line in terminals and pipes."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 class Terminal(io.StringIO):
-    """A terminal that remembers what was written to it."""
+    """A terminal that records its output."""
 
     def isatty(self) -> bool:
         return True
 
     def lines(self) -> list[str]:
-        """Return what can be read in the end: a carriage return writes over what is there."""
+        """Return the visible lines: text after a carriage return overwrites the line."""
         seen = []
         for line in self.getvalue().split("\n"):
             text = ""
@@ -53,7 +53,7 @@ def make_iteration(**changes: Any) -> Any:
     return SimpleNamespace(**{"round": 3, "shortfall": 0.0123, "objective": 4.5678, **changes})
 
 
-def test_text_of_progress() -> None:
+def test_progress_text_names_steps_and_activity() -> None:
     seen: list[tuple[str, bool]] = []
     line = Progress(lambda text, last: seen.append((text, last)))
     line.set_steps(3, 2, 18)
@@ -73,42 +73,40 @@ def test_text_of_progress() -> None:
     assert re.fullmatch(r"stopped after [\d.]+ s", seen[-1][0])
 
 
-def test_terminal_has_one_line(terminal: Terminal) -> None:
+def test_terminal_shows_one_line(terminal: Terminal) -> None:
     plan = vkc.plan(make_hall(), [vkc.GoTo(-1.0, 0.5)], progress=True)
     assert plan.success
     first, rest = terminal.lines()
     assert rest == ""
-    assert re.match(
-        r".*: success — base \d\.\d\d m, arm .* rad, planned in [\d.]+ s$|.*: success — ", first
-    )
+    assert re.match(r".*: success — base \d\.\d\d m, arm .* rad, planned in [\d.]+ s$", first)
     assert all(len(part.rstrip()) < 70 for part in re.split(r"[\r\n]", terminal.getvalue()))
     assert "looking for an initial guess" in terminal.getvalue()
     assert "round 1" in terminal.getvalue()
 
 
-def test_errors_leave_a_line(terminal: Terminal) -> None:
-    def fails(line: vkc.Iteration) -> None:
+def test_progress_line_ends_after_an_error(terminal: Terminal) -> None:
+    def fail(line: vkc.Iteration) -> None:
         raise ValueError("mine")
 
     with pytest.raises(ValueError, match="mine"):
-        vkc.plan(make_hall(), [vkc.GoTo(-1.0, 0.5)], progress=True, callback=fails)
+        vkc.plan(make_hall(), [vkc.GoTo(-1.0, 0.5)], progress=True, callback=fail)
     assert re.fullmatch(r"stopped after [\d.]+ s", terminal.lines()[0])
 
 
 def test_closed_terminal_does_not_stop_planning(
     terminal: Terminal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def gone(text: str) -> int:
+    def fail_to_write(text: str) -> int:
         raise OSError(5, "Input/output error")
 
-    monkeypatch.setattr(terminal, "write", gone)
+    monkeypatch.setattr(terminal, "write", fail_to_write)
     plan = vkc.plan(
         make_hall(), [vkc.GoTo(0.3, 0.2)], options=vkc.Options(reach_waypoints=8), progress=True
     )
     assert plan.success
 
 
-def test_pipe_gets_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+def test_nothing_is_written_to_a_pipe(capfd: pytest.CaptureFixture[str]) -> None:
     with show_progress(True) as line:
         line.set_activity("something")
         assert line.write is None
@@ -121,25 +119,25 @@ def test_progress_must_be_a_bool(value: Any) -> None:
         vkc.plan(make_hall(), [vkc.GoTo(-1.0, 0.5)], progress=value)
 
 
-def test_real_terminal(tmp_path: Path) -> None:
+def test_pseudo_terminal_shows_one_line(tmp_path: Path) -> None:
     code = """
 import sys; sys.path.insert(0, "tests")
 from helpers.drives import make_hall
 import vkc_pin as vkc
 vkc.plan(make_hall(), [vkc.GoTo(-1.0, 0.5)], progress=True)
 """
-    ours, theirs = pty.openpty()
+    controller, child = pty.openpty()
     done = subprocess.run(
         [sys.executable, "-c", code],
         cwd=ROOT,
         stdout=subprocess.PIPE,
-        stderr=theirs,
+        stderr=child,
         timeout=120,
         check=True,
     )
-    os.close(theirs)
-    text = os.read(ours, 100_000).decode()
-    os.close(ours)
+    os.close(child)
+    text = os.read(controller, 100_000).decode()
+    os.close(controller)
     assert done.stdout == b""
     assert text.count("\n") == 1
     assert text.count("\r") > 3

@@ -1,4 +1,4 @@
-"""Doors and drawers are shut by pushing, and a bowl is grasped at its rim."""
+"""Tests that doors and drawers are pushed shut and that a bowl is grasped at its rim."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from oracle.judge import judge
 
 import vkc_pin as vkc
 
-CASES = [  # scene, object, joint, where it is at the start, the face
+CASES = [  # scene, object, joint, initial value, attachment
     ("door", "door", "hinge", -1.2, "push"),
     ("drawer", "drawer", "slide", 0.3, "push"),
     ("household", "dishwasher", "door", 0.6, "door_push"),
@@ -22,20 +22,20 @@ CASES = [  # scene, object, joint, where it is at the start, the face
 
 
 @cache
-def push_shut(scene: str, thing: str, joint: str, begin: float, face: str) -> vkc.Plan:
+def push_shut(scene: str, owner: str, joint: str, begin: float, face: str) -> vkc.Plan:
     return vkc.plan(
-        vkc.load_scene(scene).with_state(thing, {joint: begin}),
-        [vkc.Actuate(thing, {joint: 0.0}, face)],
+        vkc.load_scene(scene).with_state(owner, {joint: begin}),
+        [vkc.Actuate(owner, {joint: 0.0}, face)],
     )
 
 
-def measure_gaps(plan: vkc.Plan, thing: str, face: str) -> np.ndarray:
+def measure_gaps(plan: vkc.Plan, owner: str, face: str) -> np.ndarray:
     """Return distances of the hand's foremost point from the face while it pushes [m]."""
     scene, motion = plan.scene, plan.trajectory
     (phase,), robot, placed, found = (
         [one for one in motion.phases if one.holds],
         scene.robot,
-        scene.objects[thing],
+        scene.objects[owner],
         [],
     )
     attachment, model, data = placed.object.attachments[face], robot.model, robot.model.createData()
@@ -60,9 +60,9 @@ def measure_gaps(plan: vkc.Plan, thing: str, face: str) -> np.ndarray:
         )
         named = dict(zip(motion.names, row.tolist(), strict=True))
         state = {
-            name: named[f"{thing}.{name}"]
+            name: named[f"{owner}.{name}"]
             for name in placed.object.coordinates.names
-            if f"{thing}.{name}" in named
+            if f"{owner}.{name}" in named
         }
         found.append(
             -(
@@ -81,13 +81,13 @@ def measure_gaps(plan: vkc.Plan, thing: str, face: str) -> np.ndarray:
 )
 def test_open_objects_are_pushed_shut(case: tuple[str, str, str, float, str]) -> None:
     """The hand stays on the face, up to its tilt, and the joint never moves back."""
-    plan, (_, thing, joint, begin, face) = push_shut(*case), case
+    plan, (_, owner, joint, begin, face) = push_shut(*case), case
     assert plan.success, plan.summary()
-    column = plan.trajectory.positions[:, plan.trajectory.names.index(f"{thing}.{joint}")]
+    column = plan.trajectory.positions[:, plan.trajectory.names.index(f"{owner}.{joint}")]
     assert (column[0], abs(column[-1]) < 1e-3) == (begin, True)
     assert (np.diff(column) * np.sign(begin)).max() < 1e-6
-    distance = measure_gaps(plan, thing, face)
-    standoff = plan.scene.objects[thing].object.attachments[face].standoff
+    distance = measure_gaps(plan, owner, face)
+    standoff = plan.scene.objects[owner].object.attachments[face].standoff
     assert standoff > 0.0
     assert distance.min() > standoff * np.cos(0.4) - 1.1e-3
     assert distance.max() < standoff + 1.1e-3
@@ -98,25 +98,23 @@ def test_backward_push_is_a_violation(tmp_path: Path) -> None:
     motion, (phase,) = plan.trajectory, [one for one in plan.trajectory.phases if one.holds]
     middle = (phase.first + phase.last) // 2
 
-    def back(rows: np.ndarray) -> None:
-        rows[middle + 1] = rows[
-            middle - 1
-        ]  # robot and door together: it would hold if the hand did
+    def reverse(rows: np.ndarray) -> None:
+        rows[middle + 1] = rows[middle - 1]  # robot and door move back together
 
     rows = motion.positions.copy()
-    back(rows)
-    said = vkc.validate(
+    reverse(rows)
+    violations = vkc.validate(
         plan.scene, plan.steps, dataclasses.replace(motion, positions=rows, curve=None)
     ).violations
-    (push,) = [one for one in said if one.constraint == "push"]
+    (push,) = [one for one in violations if one.constraint == "push"]
     assert (push.subject, push.unit) == ("door.push", "m")
     hinge = motion.positions[:, motion.names.index("door.hinge")]
     lever = push.amount / (hinge[middle] - hinge[middle - 1])
-    assert 0.3 < lever < 0.8  # [m] from the hinge: the region's
+    assert 0.3 < lever < 0.8  # [m] from the hinge, within the contact region
     other = write_changed(
         plan.save(tmp_path / "plan.npz"),
         tmp_path / "back.npz",
-        lambda content: back(content["positions"]),
+        lambda content: reverse(content["positions"]),
     )
     assert {one.subject for one in judge(other).found if one.rule == "push"} == {"door.push"}
 

@@ -1,4 +1,4 @@
-"""A stationary plan without parts is a plan like any other."""
+"""Tests the stationary plan that replaces a plan without parts."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from vkc_pin.planning.statistics import PlanningStatistics
 
 
 @pytest.mark.parametrize("name", ["household"])
-def test_stationary_plan(name: str) -> None:
+def test_plan_without_parts_is_stationary(name: str) -> None:
     scene = vkc.load_scene(name)
     request = PlanningRequest("auto", vkc.Options(), random_seed=3)
-    spent = [PlanningStatistics(1.5), PlanningStatistics(0.5, rounds=2)]
-    plan = concatenate_plans(scene, [vkc.GoTo(0.3, 0.2)], request, [], statistics=spent)
+    statistics = [PlanningStatistics(1.5), PlanningStatistics(0.5, rounds=2)]
+    plan = concatenate_plans(scene, [vkc.GoTo(0.3, 0.2)], request, [], statistics=statistics)
     assert (plan.status, plan.success, plan.seed) == ("interrupted", False, 3)
     assert {violation.constraint for violation in plan.report.violations} == {"goal"}
     assert (plan.trajectory.positions == plan.trajectory.positions[0]).all()
@@ -29,7 +29,7 @@ def test_stationary_plan(name: str) -> None:
     assert "interrupted" in plan._repr_html_()
 
 
-def test_stationary_plan_with_a_grasped_object() -> None:
+def test_stationary_plan_keeps_the_grasped_object() -> None:
     scene = make_room(describe_table())
     attachment = next(iter(scene.objects["stick"].object.attachments))
     held = scene.with_held({"stick": attachment})

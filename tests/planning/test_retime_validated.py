@@ -42,38 +42,42 @@ def make_corner(scene: vkc.Scene) -> Trajectory:
 
 
 def compute_deviation(scene: vkc.Scene, motion: Trajectory) -> np.ndarray:
-    """Return how far the base leaves the two straight lines in every segment [m]."""
-    far = []
+    """Return the distance of the base from the two straight lines in every segment [m]."""
+    deviations = []
     for begin, end in zip(motion.times, motion.times[1:], strict=False):
         x, y = (motion(np.linspace(begin, end, 50))[:, :2] - np.asarray(scene.start)[:2]).T
-        far.append(np.maximum(np.minimum(np.abs(y), np.abs(x - 0.8)), x - 0.8).max())
-    return np.array(far)
+        deviations.append(np.maximum(np.minimum(np.abs(y), np.abs(x - 0.8)), x - 0.8).max())
+    return np.array(deviations)
 
 
-@pytest.mark.parametrize(("allowed", "most"), [(1.0, 1), (5e-3, 4), (1e-9, 4)])
-def test_the_curve_comes_closer_where_it_is_wrong(allowed: float, most: int) -> None:
-    scene, looked = vkc.load_scene("door"), list[float]()
+@pytest.mark.parametrize(("allowed", "max_checks"), [(1.0, 1), (5e-3, 4), (1e-9, 4)])
+def test_repairs_reduce_the_deviation_until_the_check_accepts(
+    allowed: float, max_checks: int
+) -> None:
+    scene, checked = vkc.load_scene("door"), list[float]()
 
     def check(motion: Trajectory) -> FakeReport:
-        far = compute_deviation(scene, motion)
-        looked.append(float(far.max()))
-        return FakeReport(tuple(FakeViolation(int(k)) for k in np.flatnonzero(far > allowed)))
+        deviations = compute_deviation(scene, motion)
+        checked.append(float(deviations.max()))
+        return FakeReport(
+            tuple(FakeViolation(int(k)) for k in np.flatnonzero(deviations > allowed))
+        )
 
     motion, report = retime_validated(scene, make_corner(scene), check)
     np.testing.assert_array_equal(motion.positions, make_corner(scene).positions)
-    assert len(looked) <= most
-    assert looked == sorted(looked, reverse=True)
+    assert len(checked) <= max_checks
+    assert checked == sorted(checked, reverse=True)
     assert report.ok == (allowed > 1e-6)
-    assert compute_deviation(scene, motion).max() == looked[-1]
+    assert compute_deviation(scene, motion).max() == checked[-1]
 
 
-def test_without_repairs_it_is_looked_at_once() -> None:
-    scene, looked = vkc.load_scene("door"), list[Trajectory]()
+def test_curve_is_checked_once_without_repairs() -> None:
+    scene, checked = vkc.load_scene("door"), list[Trajectory]()
 
     def check(motion: Trajectory) -> FakeReport:
-        looked.append(motion)
+        checked.append(motion)
         return FakeReport((FakeViolation(0),))
 
     motion, report = retime_validated(scene, make_corner(scene), check, repairs=0)
-    assert looked == [motion]
+    assert checked == [motion]
     assert not report.ok

@@ -1,4 +1,4 @@
-"""The check of a scene: close pairs, reachable attachments, and directions of frames."""
+"""Tests the scene check: close pairs, reachable attachments and frame directions."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.drawers import add_boxes, load_drawer_scene, replace_drawer_fields
+from helpers.drawers import add_boxes, load_drawer_scene, replace_scene_fields
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
@@ -16,30 +16,35 @@ from vkc_pin.world.scene.scene import Scene
 
 
 @pytest.fixture(scope="module")
-def found() -> SceneCheck:
+def drawer_check() -> SceneCheck:
     return check_scene(load_drawer_scene())
 
 
-def test_free_scene(found: SceneCheck) -> None:
-    assert found.ok
-    assert (found.robot, found.close, found.allowed, found.problems) == ((), (), (), ())
-    assert found.warnings == ()
-    assert [one.attachment for one in found.attachments] == list(
+def test_free_scene_has_no_problems(drawer_check: SceneCheck) -> None:
+    assert drawer_check.ok
+    assert (
+        drawer_check.robot,
+        drawer_check.close,
+        drawer_check.allowed,
+        drawer_check.problems,
+    ) == ((), (), (), ())
+    assert drawer_check.warnings == ()
+    assert [one.attachment for one in drawer_check.attachments] == list(
         load_drawer_scene().objects["drawer"].object.attachments
     )
-    for one in found.attachments:
+    for one in drawer_check.attachments:
         np.testing.assert_allclose(one.approach, [1.0, 0.0, 0.0], atol=1e-9)
         np.testing.assert_allclose(one.closing, [0.0, 0.0, 1.0], atol=1e-9)
 
 
-def test_reachable_configurations_are_valid(found: SceneCheck) -> None:
+def test_reachable_configurations_are_valid(drawer_check: SceneCheck) -> None:
     scene = load_drawer_scene()
     grasps = {
         name
         for name, one in scene.objects["drawer"].object.attachments.items()
         if one.contact == "grasp"
     }
-    for one in (one for one in found.attachments if one.attachment in grasps):
+    for one in (one for one in drawer_check.attachments if one.attachment in grasps):
         assert one.configuration is not None
         there = scene.with_start(base=one.configuration[:3], arm=one.configuration[3:])
         still = vkc.Trajectory(
@@ -54,7 +59,7 @@ def test_reachable_configurations_are_valid(found: SceneCheck) -> None:
         )
         report = validate(there, [vkc.Reach(there.tool_placement())], still)
         assert report.ok, report.lines()
-        assert report.clearance >= 0.005 - 1e-6  # of the hand at the handle
+        assert report.clearance >= 0.005 - 1e-6  # between the hand and the drawer
         assert one.clearance >= 0.02
 
 
@@ -65,10 +70,10 @@ def test_blocked_attachments_name_the_obstacle() -> None:
     assert any("not reached" in line for line in blocked.lines())
 
 
-def test_unreachable_attachments() -> None:
+def test_unreachable_attachments_are_reported() -> None:
     (drawer,) = load_drawer_scene().document["objects"]
     high = check_scene(
-        replace_drawer_fields(
+        replace_scene_fields(
             load_drawer_scene(), objects=[{**drawer, "position": [1.93, 0.0, 2.0]}]
         )
     )
@@ -80,7 +85,7 @@ def test_unreachable_attachments() -> None:
 
 def test_grasped_objects_are_not_checked() -> None:
     cup = {"name": "cup", "type": "cup", "position": [0.0, 0.0, 1.5]}
-    scene = replace_drawer_fields(
+    scene = replace_scene_fields(
         load_drawer_scene(), objects=[*load_drawer_scene().document["objects"], cup]
     )
     held = check_scene(
@@ -96,9 +101,7 @@ def test_overlaps_and_close_pairs_are_reported(tmp_path: Path) -> None:
     )
     x, y, _ = scene.start[:3]
     post = {"name": "post", "type": "box", "size": [0.1, 0.1, 1.0], "position": [x, y, 0.5]}
-    found = check_scene(
-        replace_drawer_fields(scene, obstacles=[*scene.document["obstacles"], post])
-    )
+    found = check_scene(replace_scene_fields(scene, obstacles=[*scene.document["obstacles"], post]))
     assert not found.ok
     assert found.problems
     assert all("post" in line and "overlap" in line for line in found.problems)
@@ -132,14 +135,14 @@ def test_overlaps_and_close_pairs_are_reported(tmp_path: Path) -> None:
     ],
     ids=["small arena", "cell"],
 )
-def test_little_floor_is_reported(
+def test_small_reachable_floor_area_is_reported(
     arena: dict[str, list[float]] | None,
     boxes: dict[str, tuple[tuple[float, float, float], tuple[float, float, float]]],
     area: str,
 ) -> None:
     scene = add_boxes(load_drawer_scene(), **boxes)
     if arena is not None:
-        scene = replace_drawer_fields(scene, arena=arena, start_region=arena)
+        scene = replace_scene_fields(scene, arena=arena, start_region=arena)
     (warning,) = check_scene(scene).warnings
     assert f"the base reaches at most {area} m² of floor" in warning
 
@@ -163,9 +166,9 @@ def test_planning_continues_from_the_end_scene() -> None:
     assert pulled.success, pulled.summary()
     after = pulled.end_scene()
     assert after.objects["drawer"].state[0] == pytest.approx(0.3, abs=1e-3)
-    gone = vkc.plan(after, [vkc.Release(), vkc.GoTo(0.0, 0.0)])
-    assert gone.success, gone.summary()
-    assert gone.end_scene().held == {}
-    refused = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 9.0})])
+    driven = vkc.plan(after, [vkc.Release(), vkc.GoTo(0.0, 0.0)])
+    assert driven.success, driven.summary()
+    assert driven.end_scene().held == {}
+    failed = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 9.0})])
     with pytest.raises(InputError, match="no success"):
-        refused.end_scene()
+        failed.end_scene()

@@ -1,4 +1,4 @@
-"""Sequential planning, other attachments, and the scene at the end of a motion."""
+"""Tests sequential planning, alternative attachments, and final scenes of motions."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ import pinocchio as pin
 import pytest
 from helpers.carrying import (
     STICK,
-    Script,
-    carry_over,
+    MotionBuilder,
     compute_grasp_pose,
     describe_table,
     lift,
+    make_carrying_motion,
     make_room,
     move_base,
     solve_above,
 )
-from helpers.litter import AT, BIN, describe_shelf, make_littered_scene
+from helpers.litter import BIN_POSITION, LITTER_POSITION, describe_shelf, make_littered_scene
 from helpers.small_problems import make_full_scene, replace_objects
 
 import vkc_pin as vkc
@@ -45,7 +45,7 @@ def make_end_motion(
     )
 
 
-def test_final_coordinates() -> None:
+def test_final_scene_has_the_final_coordinates() -> None:
     scene = make_full_scene().with_state("door", {"knob": 0.2})
     arm = np.linspace(-0.5, 0.5, len(scene.start) - 3)
     after = compute_final_scene(
@@ -59,17 +59,17 @@ def test_final_coordinates() -> None:
 
 
 def test_final_coordinates_are_clamped_to_their_limits() -> None:
-    scene, off = make_full_scene(), 1e-4
+    scene, excess = make_full_scene(), 1e-4
     robot, door = scene.robot, scene.objects["door"].object
     sleeve = scene.objects["cabinet"].object.attachment("sleeve")
     motion = make_end_motion(
         scene,
-        [scene.arena[1] + off, scene.arena[2] - off, 0.0],
-        robot.upper[3:] + off,
-        door__hinge=door.upper[0] + off,
-        door__knob=door.lower[1] - off,
-        cabinet__sleeve_slide=sleeve.freedoms[0].lower - off,
-        cabinet__sleeve_turn=sleeve.freedoms[1].upper + off,
+        [scene.arena[1] + excess, scene.arena[2] - excess, 0.0],
+        robot.upper[3:] + excess,
+        door__hinge=door.upper[0] + excess,
+        door__knob=door.lower[1] - excess,
+        cabinet__sleeve_slide=sleeve.freedoms[0].lower - excess,
+        cabinet__sleeve_turn=sleeve.freedoms[1].upper + excess,
     )
     after = compute_final_scene(scene, motion, [Hold("cabinet", "sleeve")])
     np.testing.assert_array_equal(
@@ -87,7 +87,10 @@ def test_final_placement_of_a_grasped_object() -> None:
     scene, values = make_room(describe_table()), (0.03, 0.2)
     down = solve_above(STICK, values=values)
     script = (
-        Script(scene).go(down).take("stick", values=values).go(move_base(down, x=-0.4, yaw=0.5))
+        MotionBuilder(scene)
+        .go(down)
+        .take("stick", values=values)
+        .go(move_base(down, x=-0.4, yaw=0.5))
     )
     after = compute_final_scene(scene, script.motion(), [Hold("stick", "grip")])
     assert [(hold, hold.at) for hold in after.holds] == [(Hold("stick", "grip"), values)]
@@ -102,7 +105,7 @@ def test_final_placement_of_a_grasped_object() -> None:
 
 def test_final_placement_of_a_released_object() -> None:
     scene = make_room(describe_table())
-    script = carry_over(scene, values=(0.03, 0.2))
+    script = make_carrying_motion(scene, values=(0.03, 0.2))
     after = compute_final_scene(scene, script.motion(), [])
     assert dict(after.held) == {}
     np.testing.assert_allclose(
@@ -122,7 +125,9 @@ def test_final_holds_by_a_tool() -> None:
     turns = scene.objects["ball"].object.attachment("pull").freedoms
     values = [0.5 * (turn.lower + turn.upper) for turn in turns]
     script = (
-        Script(scene).take("ball", "pull", values, by="stick.tip").go(move_base(scene.start, y=0.3))
+        MotionBuilder(scene)
+        .take("ball", "pull", values, by="stick.tip")
+        .go(move_base(scene.start, y=0.3))
     )
     stick = Hold("stick", "grip")
     holds = (stick, Hold("ball", "pull", stick, "tip"))
@@ -132,29 +137,31 @@ def test_final_holds_by_a_tool() -> None:
 
 
 @functools.cache
-def take_litter() -> vkc.Plan:
+def grasp_litter() -> vkc.Plan:
     """Return a plan that grasps a piece of litter on a shelf from the side."""
-    plan = vkc.plan(make_littered_scene(describe_shelf(*AT[:2])), [vkc.Grasp("litter", "grip")])
+    plan = vkc.plan(
+        make_littered_scene(describe_shelf(*LITTER_POSITION[:2])), [vkc.Grasp("litter", "grip")]
+    )
     assert plan.success, plan.summary()
     return plan
 
 
-@pytest.mark.parametrize("off", [0.0, pytest.param(0.003, marks=pytest.mark.long)])
-def test_object_is_regrasped_to_be_placed(off: float) -> None:
-    """An object grasped from the side is regrasped from above, to be put into a bin.
+@pytest.mark.parametrize("offset", [0.0, pytest.param(0.003, marks=pytest.mark.long)])
+def test_object_is_regrasped_to_be_placed(offset: float) -> None:
+    """An object grasped from the side is regrasped from above, to be placed in a bin.
 
-    That grasp is nominal, be the first one as described or `off` beside it.
+    The second grasp is nominal, even if the first one is displaced by `offset` [m].
     """
-    taken = take_litter()
-    (hold,) = taken.end_scene().holds
-    free = compute_final_scene(make_littered_scene(), taken.trajectory, [hold])
-    if off:
-        base = free.start[:3] + np.array([off, 0.0, 0.0])
+    grasped = grasp_litter()
+    (hold,) = grasped.end_scene().holds
+    free = compute_final_scene(make_littered_scene(), grasped.trajectory, [hold])
+    if offset:
+        base = free.start[:3] + np.array([offset, 0.0, 0.0])
         free = free.with_measured_grasp("litter", base=base)
         assert free.holds[0] != hold
-    plan = vkc.plan(free, [vkc.Place("litter", BIN)])
+    plan = vkc.plan(free, [vkc.Place("litter", BIN_POSITION)])
     assert plan.success
-    assert plan.steps == (vkc.Release("litter"), vkc.Place("litter", BIN, "grip"))
+    assert plan.steps == (vkc.Release("litter"), vkc.Place("litter", BIN_POSITION, "grip"))
     assert validate(free, plan.steps, plan.trajectory).ok
     first, *_, last = (phase for phase in plan.trajectory.phases if phase.holds)
     assert (first.holds, last.holds) == (free.holds, (hold,))
@@ -162,7 +169,7 @@ def test_object_is_regrasped_to_be_placed(off: float) -> None:
         np.ptp(plan.trajectory.positions[: first.last + 1, : len(free.start)], axis=0), 0.0
     )
     np.testing.assert_allclose(
-        plan.end_scene().objects["litter"].placement.translation, BIN, atol=2e-3
+        plan.end_scene().objects["litter"].placement.translation, BIN_POSITION, atol=2e-3
     )
 
 
@@ -198,28 +205,28 @@ def make_refrigerator() -> Scene:
     ).sample_start(np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("planned", PLANNERS)
-def test_another_attachment_is_tried(
-    planned: Callable[..., vkc.Plan],
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_another_attachment_is_tried_if_the_first_one_fails(
+    planner: Callable[..., vkc.Plan],
 ) -> None:
     scene = add_attachment(vkc.load_scene("drawer"), "drawer", "ceiling", 4.0)
     step = vkc.Actuate("drawer", {"slide": 0.2})
-    result = planned(scene, [step])
+    result = planner(scene, [step])
     assert result.success, result.summary()
-    (asked,) = result.steps
-    assert asked == dataclasses.replace(step, attachment="handle")
+    (planned_step,) = result.steps
+    assert planned_step == dataclasses.replace(step, attachment="handle")
     assert result.trajectory.phases[-1].held == {"drawer": "handle"}
-    alone = planned(scene, [asked])
+    alone = planner(scene, [planned_step])
     np.testing.assert_array_equal(result.trajectory.positions, alone.trajectory.positions)
     assert result.metrics["evaluations"] > alone.metrics["evaluations"], (
-        "it took what the first one took as well"
+        "evaluations of the first attachment must count"
     )
-    named = planned(scene, [dataclasses.replace(step, attachment="ceiling")])
-    assert not named.success, "who names one means it"
+    named = planner(scene, [dataclasses.replace(step, attachment="ceiling")])
+    assert not named.success, "a named attachment must not be replaced"
 
 
-@pytest.mark.parametrize("planned", PLANNERS)
-def test_attachments_share_the_budget(planned: Callable[..., vkc.Plan]) -> None:
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_attachments_share_the_budget(planner: Callable[..., vkc.Plan]) -> None:
     scene = add_attachment(vkc.load_scene("drawer"), "drawer", "behind", 0.0, depth=0.04)
     step = vkc.Actuate("drawer", {"slide": 0.2})
     budget = {"max_evaluations": 30_000}
@@ -228,21 +235,23 @@ def test_attachments_share_the_budget(planned: Callable[..., vkc.Plan]) -> None:
     (note,) = alone.report.notes
     assert note.startswith("the best trajectory lacks ")
     assert alone.report.violations[0].subject in note
-    result = planned(scene, [step], **budget)
+    result = planner(scene, [step], **budget)
     assert result.success, result.summary()
     assert result.steps[0].attachment == "handle"
 
 
 def test_failed_attachments_are_noted() -> None:
     scene = add_attachment(vkc.load_scene("drawer"), "drawer", "ceiling", 4.0)
-    thing = scene.objects["drawer"]
-    attachments = {name: one for name, one in thing.object.attachments.items() if name == "ceiling"}
+    drawer = scene.objects["drawer"]
+    attachments = {
+        name: one for name, one in drawer.object.attachments.items() if name == "ceiling"
+    }
     attachments["roof"] = dataclasses.replace(attachments["ceiling"], name="roof")
     scene = replace_objects(
         scene,
         {
             "drawer": dataclasses.replace(
-                thing, object=dataclasses.replace(thing.object, attachments=attachments)
+                drawer, object=dataclasses.replace(drawer.object, attachments=attachments)
             )
         },
     )
@@ -252,8 +261,8 @@ def test_failed_attachments_are_noted() -> None:
     assert result.report.notes[-1].startswith("at drawer.roof: reach drawer.roof: out of reach")
 
 
-def test_attachments_that_only_a_user_can_choose_are_noted() -> None:
-    """Lying on its side, the cup is held too low at `side`: the fingers need 20 mm to the table."""
+def test_untried_attachments_are_noted() -> None:
+    """At `side` of a lying cup, the fingers are closer to the table than the required 20 mm."""
     scene = vkc.load_scene("household")
     lying = pin.SE3(pin.exp3(np.array([0.0, np.pi / 2, 0.0])), np.array([-0.6, -1.6, 0.786]))
     first = vkc.plan(scene, [vkc.Place("cup", lying)])
@@ -266,16 +275,16 @@ def test_attachments_that_only_a_user_can_choose_are_noted() -> None:
 
 
 @pytest.mark.long
-def test_another_attachment_of_one_step() -> None:
+def test_another_attachment_is_tried_for_one_of_two_steps() -> None:
     scene = add_attachment(vkc.load_scene("drawer"), "drawer", "ceiling", 4.0)
-    there = vkc.GoTo(*(scene.start[:2] + 0.1))
-    result = vkc.plan(scene, [there, vkc.Actuate("drawer", {"slide": 0.2})])
+    drive = vkc.GoTo(*(scene.start[:2] + 0.1))
+    result = vkc.plan(scene, [drive, vkc.Actuate("drawer", {"slide": 0.2})])
     assert result.success, result.summary()
-    assert result.steps == (there, vkc.Actuate("drawer", {"slide": 0.2}, "handle"))
+    assert result.steps == (drive, vkc.Actuate("drawer", {"slide": 0.2}, "handle"))
 
 
-def test_failure_of_a_step_is_that_of_all_steps() -> None:
-    """Its motion stands still, rather than to do the first step alone."""
+def test_failure_of_one_step_fails_all_steps() -> None:
+    """The motion is stationary; it does not perform the first step alone."""
     steps = [vkc.GoTo(-1.5, 0.0), vkc.GoTo(30.0, 0.0)]
     result = vkc.plan(make_refrigerator(), steps)
     assert result.status == "infeasible"
@@ -320,5 +329,5 @@ def test_holds_of_the_same_joint_are_planned_sequentially() -> None:
     ended = vkc.plan(begun.end_scene(), [second])
     assert ended.success, ended.summary()
     assert "it.handle_left" not in ended.trajectory.names
-    chore = vkc.plan(make_refrigerator(), [first, second], window=2)
-    assert chore.success, chore.summary()
+    windowed = vkc.plan(make_refrigerator(), [first, second], window=2)
+    assert windowed.success, windowed.summary()

@@ -1,4 +1,4 @@
-"""A task is solved from initial guess to initial guess, within its budget."""
+"""Tests that a task is solved from one initial guess after another, within its budget."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from helpers.gates import make_gate_problem
 from helpers.small_problems import load_door_scene, make_program
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.problems.problem_set import problem as make_drawn_problem
+from vkc_pin.benchmarks.problems.problem_set import problem as make_random_problem
 from vkc_pin.planning.initialization.initial_guess import InitialGuess
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.solve_task import solve_task
@@ -25,7 +25,7 @@ PULL = [vkc.Actuate("drawer", {"slide": 0.3})]
 
 @pytest.mark.parametrize(("number", "seed"), [(35, 9035)])
 def test_guesses_are_tried_until_a_trajectory_is_valid(number: int, seed: int) -> None:
-    problem, rows = make_drawn_problem(number), list[vkc.Iteration]()
+    problem, rows = make_random_problem(number), list[vkc.Iteration]()
     plan = vkc.plan(problem.scene, problem.steps, seed=seed, callback=rows.append)
     assert plan.success, plan.summary()
     begins = [k for k, row in enumerate(rows) if row.round == 1]
@@ -39,28 +39,28 @@ def test_guesses_are_tried_until_a_trajectory_is_valid(number: int, seed: int) -
     assert parts <= plan.metrics["planning_time"] + plan.metrics["build_time"]
 
 
-def test_own_guess_is_the_only_one() -> None:
+def test_user_guess_is_the_only_one() -> None:
     scene = make_hall()
     task = compile_task(scene, [vkc.GoTo(1.0, 0.0)], SHORT)
-    request, asked = PlanningRequest("auto", SHORT), []
+    request, problems = PlanningRequest("auto", SHORT), []
 
     def guess(problem: vkc.TrajectoryProblem) -> InitialGuess:
-        asked.append(problem)
+        problems.append(problem)
         return InitialGuess("mine", problem.still)
 
     result = solve_task(scene, task, request, guess=guess)
     assert result.plan.success, result.plan.summary()
     assert result.plan.initialization == "mine"
-    assert asked == [result.problem]
+    assert problems == [result.problem]
 
 
-def test_waypoints_double_where_they_are_too_coarse() -> None:
+def test_waypoints_of_too_coarse_phases_are_doubled() -> None:
     """On five segments of a door's arc the hand drifts by 3 mm from the handle."""
     scene, options = load_door_scene(), vkc.Options(move_waypoints=5)
     task = compile_task(scene, [vkc.Actuate("door", {"hinge": 1.3}, "handle")], options)
     result = solve_task(scene, task, PlanningRequest("interpolated", options, random_seed=1))
     assert result.plan.success, result.plan.summary()
-    assert result.plan.initialization == "interpolated", "of the first guess"
+    assert result.plan.initialization == "interpolated", "the name is that of the first guess"
     assert result.problem is not None
     segments = [phase.segments for phase in result.problem.task.phases]
     before = [phase.segments for phase in task.phases]
@@ -79,31 +79,31 @@ def test_numbers_of_waypoints_can_be_fixed() -> None:
     assert {found.constraint for found in result.plan.report.violations} == {"closure"}
 
 
-def test_infeasible_solution_of_the_least_shortfall_is_returned() -> None:
-    """A wall from side to side."""
+def test_infeasible_solution_with_the_least_shortfall_is_returned() -> None:
+    """A wall spans the hall."""
     wall = {"name": "wall", "type": "box", "size": [0.6, 12.0, 2.0], "position": [2.0, 0.0, 1.0]}
     scene, options = make_hall(obstacles=[wall]), vkc.Options(max_restarts=1)
     task = compile_task(scene, [vkc.GoTo(4.0, 0.0)], options)
     request = PlanningRequest("interpolated", options)
-    plan = solve_task(scene, task, request, guess=interpolate).plan
+    plan = solve_task(scene, task, request, guess=make_straight_guess).plan
     assert not plan.success
     assert plan.metrics["rounds"] > 0
     assert "wall" in plan.summary()
     assert plan.trajectory.positions[-1, 0] == pytest.approx(4.0, abs=0.1)
 
 
-def interpolate(problem: vkc.TrajectoryProblem) -> InitialGuess:
+def make_straight_guess(problem: vkc.TrajectoryProblem) -> InitialGuess:
     z = np.tile(problem.start, (problem.segments, 1))
     z[:, 0] = np.linspace(0.0, 4.0, problem.segments + 1)[1:]
     return InitialGuess("straight", z)
 
 
 def test_budget_may_end_before_the_first_guess() -> None:
-    late, spent = "time limit", "evaluation limit"
+    timed_out, exhausted = "time limit", "evaluation limit"
     budgets: list[tuple[dict[str, Any], str]] = [
-        ({"time_limit": 1e-3}, late),
-        ({"max_evaluations": 1}, spent),
-        ({"max_evaluations": 3000}, spent),
+        ({"time_limit": 1e-3}, timed_out),
+        ({"max_evaluations": 1}, exhausted),
+        ({"max_evaluations": 3000}, exhausted),
     ]
     for budget, status in budgets:
         plan = vkc.plan(
@@ -168,10 +168,10 @@ def test_cache_is_trimmed_after_each_task() -> None:
         (0.66, [0.5, 4.0], "not converged", "from (0.50, 0.00) to (4.00, 0.00), and none with"),
     ],
 )
-def test_missing_base_path_is_infeasible_only_for_any_arm_and_beginning(
+def test_missing_base_path_is_infeasible_only_for_every_arm_posture_and_start(
     width: float, goals: list[float], status: str, text: str
 ) -> None:
-    """The base is 0.67 wide, its arm at rest 0.72. Later phases could begin elsewhere."""
+    """The base is 0.67 m wide, or 0.72 m with the arm at home. Later phases may start elsewhere."""
     scene = make_gate_problem(width).scene
     task = compile_task(scene, [vkc.GoTo(x, 0.0, 0.0) for x in goals], SHORT)
     plan = solve_task(scene, task, PlanningRequest("astar", SHORT)).plan

@@ -1,4 +1,4 @@
-"""Statistics of planning add up, and records keep their names."""
+"""Tests that planning statistics are added and that their records keep their keys."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def test_statistics_add_field_by_field() -> None:
     assert sum([one, other], start=PlanningStatistics()) == total
 
 
-def test_records_keep_their_names() -> None:
+def test_records_keep_their_keys() -> None:
     times = {stage: float(k) for k, stage in enumerate(STAGES)}
     statistics = PlanningStatistics(2.0, 1.0, 7, 3, 500).with_times(times)
     metrics = statistics.to_metrics()

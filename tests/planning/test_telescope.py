@@ -1,4 +1,4 @@
-"""A telescope with one motor is one coordinate, from the start to the controller's message."""
+"""Tests that a telescope with one motor is one coordinate, from the start to ROS messages."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NAMES = ("base_x", "base_y", "base_yaw", "lift", "out_1", "yaw_joint", "pitch_jo
 
 @pytest.fixture(scope="module")
 def opened(tmp_path_factory: pytest.TempPathFactory) -> vkc.Plan:
-    """A drawer is pulled open, between two cheeks, by a robot whose base stands still."""
+    """Plan to open a drawer between two cheeks with a fixed base."""
     scene = write_telescope_scene(tmp_path_factory.mktemp("telescope"), base="fixed")
     return vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.15})], seed=0)
 
@@ -34,24 +34,24 @@ def test_telescope_opens_a_drawer(opened: vkc.Plan) -> None:
     assert 0.0 <= out.min() <= out.max() <= SEGMENT
 
 
-def test_message_has_one_coordinate(opened: vkc.Plan) -> None:
+def test_message_has_one_coordinate_for_the_telescope(opened: vkc.Plan) -> None:
     message = opened.to_ros(joints="arm", rate=50.0)
     assert message["joint_names"] == list(NAMES[3:])
     robot = opened.scene.robot
     rows = np.array([point["positions"] for point in message["points"]])
-    ways = {
+    columns = {
         str(robot.model.names[j]): f * rows[:, k - 3] + b
         for k, j, f, b, _ in robot.coordinates.moves
         if k > 2
     }
-    assert {*ways} == {*NAMES[3:], *FOLLOWERS}
+    assert {*columns} == {*NAMES[3:], *FOLLOWERS}
     for joint, leader in FOLLOWERS.items():
-        np.testing.assert_array_equal(ways[joint], ways[leader])
+        np.testing.assert_array_equal(columns[joint], columns[leader])
 
 
 @pytest.fixture(scope="module")
 def coupled(tmp_path_factory: pytest.TempPathFactory) -> vkc.Plan:
-    """Joints follow others backwards, at other rates, and turn as another slides."""
+    """Plan with joints that follow others backwards, at other rates, or turn as another slides."""
     scene = write_coupled_scene(
         tmp_path_factory.mktemp("coupled"),
         more="joints: {roll_joint: {velocity: 0.9, acceleration: 0.6}}\n",
@@ -61,15 +61,14 @@ def coupled(tmp_path_factory: pytest.TempPathFactory) -> vkc.Plan:
     return plan
 
 
-def test_coupled_joints_are_planned_and_judged(coupled: vkc.Plan) -> None:
-    """Joints follow backwards, at other rates, and turn as another slides."""
+def test_coupled_joints_are_planned(coupled: vkc.Plan) -> None:
     assert coupled.trajectory is not None
     assert coupled.trajectory.robot_size == 6
     assert np.ptp(coupled.trajectory.positions[:, 3:], axis=0).max() > 0.05
 
 
-def compute_limit_shares(plan: vkc.Plan, motion: vkc.Trajectory) -> dict[str, float]:
-    """Return how much of its limits every joint uses; more than 1 is a violation."""
+def compute_limit_ratios(plan: vkc.Plan, motion: vkc.Trajectory) -> dict[str, float]:
+    """Return the ratio of every joint's motion to its limits; ratios above 1 are violations."""
     file = ElementTree.parse(Path(plan.scene.folder) / "robot.urdf")
     urdf = {}
     for one in file.iter("joint"):
@@ -86,11 +85,11 @@ def compute_limit_shares(plan: vkc.Plan, motion: vkc.Trajectory) -> dict[str, fl
         own, place = urdf[name], factor * places[:, k] + offset
         assert own["lower"] - 1e-9 <= place.min() <= place.max() <= own["upper"] + 1e-9
         fastest, strongest = (0.9, 0.6) if name == "roll_joint" else (own["velocity"], np.inf)
-        used = (
+        ratios = (
             np.abs(factor * rates[:, k]).max() / fastest,
             np.abs(factor * changes[:, k]).max() / strongest,
         )
-        found[name] = float(max(used))
+        found[name] = float(max(ratios))
     return found
 
 
@@ -98,13 +97,13 @@ def test_every_coupled_joint_keeps_its_limits(coupled: vkc.Plan, tmp_path: Path)
     motion = coupled.trajectory
     assert motion is not None
     assert motion.curve is not None
-    used = compute_limit_shares(coupled, motion)
-    assert max(used, key=used.__getitem__) == "roll_joint"
-    assert 0.9 < used["roll_joint"] <= 1.0 + 1e-9
-    curve, factor = motion.curve, 0.97 * np.sqrt(used["roll_joint"])
+    ratios = compute_limit_ratios(coupled, motion)
+    assert max(ratios, key=ratios.__getitem__) == "roll_joint"
+    assert 0.9 < ratios["roll_joint"] <= 1.0 + 1e-9
+    curve, factor = motion.curve, 0.97 * np.sqrt(ratios["roll_joint"])
     quick = Curve(curve.times * factor, curve.positions, curve.rates / factor)
     faster = dataclasses.replace(motion, times=motion.times * factor, curve=quick)
-    assert compute_limit_shares(coupled, faster)["roll_joint"] > 1.02
+    assert compute_limit_ratios(coupled, faster)["roll_joint"] > 1.02
     found = vkc.validate(coupled.scene, coupled.steps, faster, coupled.options).violations
     assert {one.subject for one in found} == {"yaw_joint"}
     saved = dataclasses.replace(coupled, trajectory=faster).save(tmp_path / "faster.npz")

@@ -1,4 +1,4 @@
-"""Concurrent threads with shared and own planners compute equal bits, and the process ends."""
+"""Tests that concurrent threads with shared and own planners give the same plans."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ print("done")
 
 
 @pytest.mark.long
-def test_eight_threads_with_shared_and_own_planners() -> None:
+def test_eight_threads_with_shared_and_own_planners_give_the_same_plans() -> None:
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM],
         cwd=ROOT,

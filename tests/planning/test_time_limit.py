@@ -24,18 +24,18 @@ CALLS: dict[str, Callable[[], vkc.Plan]] = {
 }
 
 
-class Looks:
-    """A clock by which time is up at one of the looks at it."""
+class FakeClock:
+    """A budget whose time limit is reached after a given number of queries."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.count, self.last = 0, np.inf
-        monkeypatch.setattr(Budget, "stop_status", property(self.ended))
+        monkeypatch.setattr(Budget, "stop_status", property(self.get_status))
 
-    def ended(self, budget: Budget) -> str:
+    def get_status(self, budget: Budget) -> str:
         self.count += 1
         return "time limit" if self.count > self.last else ""
 
-    def upto(self, last: float, call: Callable[[], vkc.Plan]) -> vkc.Plan:
+    def plan_with(self, last: float, call: Callable[[], vkc.Plan]) -> vkc.Plan:
         self.count, self.last = 0, last
         return call()
 
@@ -47,17 +47,17 @@ class Looks:
         for name, call in CALLS.items()
     ],
 )
-def test_plan_is_returned_wherever_time_ends(
+def test_plan_is_returned_wherever_the_time_limit_interrupts_it(
     call: Callable[[], vkc.Plan], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    looks = Looks(monkeypatch)
-    whole = looks.upto(np.inf, call)
+    clock = FakeClock(monkeypatch)
+    whole = clock.plan_with(np.inf, call)
     assert whole.success, whole.summary()
-    count = looks.count
+    count = clock.count
     assert count > 50
     rounds = []
     for last in [0, 2, *np.linspace(5, count - 8, 3).astype(int).tolist()]:
-        plan = looks.upto(last, call)
+        plan = clock.plan_with(last, call)
         assert plan.success or plan.status == "time limit"
         assert plan.success == plan.report.ok
         assert np.isfinite(plan.trajectory.positions).all()
@@ -69,8 +69,8 @@ def test_plan_is_returned_wherever_time_ends(
 @pytest.mark.parametrize("limit", [0.05, 1.0])
 def test_hard_task_keeps_the_time_limit(limit: float) -> None:
     scene = vkc.load_scene("fetch")
-    began = time.perf_counter()
+    start = time.perf_counter()
     plan = vkc.plan(scene, fetch(scene), time_limit=limit, planner=vkc.Planner(), window=2)
-    assert time.perf_counter() - began < limit + 3.0
+    assert time.perf_counter() - start < limit + 3.0
     assert plan.status == "time limit"
     assert plan.report.violations

@@ -82,13 +82,17 @@ def test_simultaneous_planning_costs_less_than_sequential() -> None:
     )
     assert [part.result.plan.success for part in parts] == [True, True]
     pieces = [part.result.phase_waypoints() for part in parts]
-    one = solve(sample_start(), steps, request, lambda problem: make_initial_guess(problem, pieces))
-    assert one.plan.success, one.plan.summary()
-    before = compute_objective(one.problem, make_initial_guess(one.problem, pieces).z)
-    assert compute_objective(one.problem, one.z) < before
+    simultaneous = solve(
+        sample_start(), steps, request, lambda problem: make_initial_guess(problem, pieces)
+    )
+    assert simultaneous.plan.success, simultaneous.plan.summary()
+    before = compute_objective(
+        simultaneous.problem, make_initial_guess(simultaneous.problem, pieces).z
+    )
+    assert compute_objective(simultaneous.problem, simultaneous.z) < before
     assert (
-        np.abs(one.z[39, :3] - parts[0].result.z[39, :3]).max() > 1e-3
-    )  # the grasp has moved in favour of what follows
+        np.abs(simultaneous.z[39, :3] - parts[0].result.z[39, :3]).max() > 1e-3
+    )  # the grasp moves in favour of the touch
 
 
 def test_each_step_begins_at_the_end_of_the_previous() -> None:
@@ -97,20 +101,20 @@ def test_each_step_begins_at_the_end_of_the_previous() -> None:
     parts = plan_each_step(
         sample_start(), compile_task(sample_start(), steps, request.options), request
     )
-    assert len(parts) == 2  # grasping what is held changes nothing
+    assert len(parts) == 2  # the second grasp is already satisfied
     first, second = (part.result for part in parts)
     end = first.plan.trajectory
     after = compute_final_scene(sample_start(), end, first.task.after)
     np.testing.assert_allclose(after.start, end.positions[-1, : end.robot_size], atol=1e-9)
     assert dict(after.held) == {"stick": "grip"}
     np.testing.assert_allclose(second.scene.start, after.start, atol=1e-12)
-    # The stick is where it was: the hand has only closed on it.
-    lay, lies = sample_start().objects["stick"].placement, after.objects["stick"].placement
-    assert np.linalg.norm(lay.actInv(lies).translation) < 1e-4
+    # The stick does not move while the hand closes.
+    initial, final = sample_start().objects["stick"].placement, after.objects["stick"].placement
+    assert np.linalg.norm(initial.actInv(final).translation) < 1e-4
     world = World(sample_start())
     np.testing.assert_allclose(
         world.get_placement("stick", world.compute_positions(end)[-1]).homogeneous,
-        lay.homogeneous,
+        initial.homogeneous,
         atol=1e-9,
     )
 

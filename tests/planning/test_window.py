@@ -1,4 +1,4 @@
-"""Long lists of steps are planned in a sliding window of actions."""
+"""Tests planning of long lists of steps in a sliding window of actions."""
 
 from __future__ import annotations
 
@@ -17,10 +17,12 @@ from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.trajectory.world_model import World
 
-A, G, P = vkc.Actuate, vkc.Grasp, vkc.Place
 TABLE = (-3.0, 1.3, 1.051)  # on the bar table
-OPEN, SHUT = A("refrigerator", {"hinge": 1.57}), A("refrigerator", {"hinge": 0.0})
-CUP = (G("cold_cup"), P("cold_cup", TABLE))
+OPEN, SHUT = (
+    vkc.Actuate("refrigerator", {"hinge": 1.57}),
+    vkc.Actuate("refrigerator", {"hinge": 0.0}),
+)
+CUP = (vkc.Grasp("cold_cup"), vkc.Place("cold_cup", TABLE))
 
 
 @cache
@@ -29,19 +31,24 @@ def load_home() -> vkc.Scene:
 
 
 def plan_actions(
-    scene: vkc.Scene, steps: Sequence[vkc.Step], *, window: int = 2, **how: Any
+    scene: vkc.Scene, steps: Sequence[vkc.Step], *, window: int = 2, **options: Any
 ) -> vkc.Plan:
-    return vkc.plan(scene, steps, window=window, **how)
+    return vkc.plan(scene, steps, window=window, **options)
 
 
 @cache
 def plan_fridge() -> vkc.Plan:
-    """Take the cup out of the refrigerator, and close the refrigerator."""
+    """Plan to take the cup out of the refrigerator and to close the door."""
     return plan_actions(load_home(), [OPEN, *CUP, SHUT])
 
 
-def test_one_hand_cannot_open_a_door_with_a_cup_in_it() -> None:
-    steps = [OPEN, G("cold_cup"), A("door", {"hinge": 1.52}), P("cold_cup", (1.75, 3.5, 0.741))]
+def test_hand_that_holds_a_cup_cannot_open_a_door() -> None:
+    steps = [
+        OPEN,
+        vkc.Grasp("cold_cup"),
+        vkc.Actuate("door", {"hinge": 1.52}),
+        vkc.Place("cold_cup", (1.75, 3.5, 0.741)),
+    ]
     with pytest.raises(
         InputError, match=r"steps\[2\].object: the robot has one hand, and it holds cold_cup.side"
     ) as caught:
@@ -50,22 +57,29 @@ def test_one_hand_cannot_open_a_door_with_a_cup_in_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "kind", "field", "says"),
+    ("step", "error", "field", "text"),
     [
-        (A("fridge", {"hinge": 1.0}), UnknownNameError, "steps[3].object", "refrigerator"),
-        (A("refrigerator", {"door": 1.0}), UnknownNameError, "steps[3].joints", "hinge"),
-        (G("cup", "handle"), UnknownNameError, "steps[3].attachment", "side"),
-        (P("door", (0, 0, 0)), InputError, "steps[3].object", "is fixed in the world"),
+        (
+            vkc.Actuate("fridge", {"hinge": 1.0}),
+            UnknownNameError,
+            "steps[3].object",
+            "refrigerator",
+        ),
+        (vkc.Actuate("refrigerator", {"door": 1.0}), UnknownNameError, "steps[3].joints", "hinge"),
+        (vkc.Grasp("cup", "handle"), UnknownNameError, "steps[3].attachment", "side"),
+        (vkc.Place("door", (0, 0, 0)), InputError, "steps[3].object", "is fixed in the world"),
         (vkc.Release(), InputError, "steps[3]", "the hand is empty"),
-        (G("litter", by="broom.bristles"), InputError, "steps[3].by", "does not carry"),
+        (vkc.Grasp("litter", by="broom.bristles"), InputError, "steps[3].by", "does not carry"),
         ("tidy up", InputError, "steps[3]", "not a step"),
     ],
 )
-def test_impossible_steps_are_refused(wrong: vkc.Grasp, kind: type, field: str, says: str) -> None:
-    with pytest.raises(kind) as caught:
-        plan_actions(load_home(), [OPEN, G("cold_cup"), P("cold_cup", TABLE), wrong, SHUT])
+def test_impossible_steps_are_refused(step: vkc.Grasp, error: type, field: str, text: str) -> None:
+    with pytest.raises(error) as caught:
+        plan_actions(
+            load_home(), [OPEN, vkc.Grasp("cold_cup"), vkc.Place("cold_cup", TABLE), step, SHUT]
+        )
     assert caught.value.field == field
-    assert says in str(caught.value)
+    assert text in str(caught.value)
 
 
 @pytest.mark.parametrize("window", [0, -1, 1.5, True, "2"])
@@ -76,11 +90,11 @@ def test_invalid_window(window: object) -> None:
 
 def test_steps_without_effect_are_refused() -> None:
     with pytest.raises(InputError, match="nothing to do"):
-        plan_actions(load_home().with_held({"cup": "side"}), [G("cup")])
+        plan_actions(load_home().with_held({"cup": "side"}), [vkc.Grasp("cup")])
 
 
 @pytest.mark.long
-def test_limit_of_evaluations_is_for_all_actions() -> None:
+def test_evaluation_limit_applies_to_all_actions_together() -> None:
     opening = dataclasses.replace(OPEN, attachment="handle")
     alone = plan_actions(load_home(), [opening])
     plan = plan_actions(
@@ -91,7 +105,7 @@ def test_limit_of_evaluations_is_for_all_actions() -> None:
     assert plan.trajectory.phases[1].name == "move refrigerator.hinge"
 
 
-def test_ctrl_c_keeps_decided_actions() -> None:
+def test_ctrl_c_keeps_completed_actions() -> None:
     seen: list[vkc.Iteration] = []
 
     def stop(row: vkc.Iteration) -> None:
@@ -118,7 +132,7 @@ def test_robot_does_not_stop_between_drives() -> None:
 
 
 @pytest.mark.long
-def test_four_steps(tmp_path: Path) -> None:
+def test_cup_is_taken_from_the_refrigerator(tmp_path: Path) -> None:
     plan = plan_fridge()
     assert plan.success, plan.summary()
     assert plan.steps == (OPEN, *CUP, SHUT)
@@ -152,8 +166,8 @@ def compute_weighted_length(plan: vkc.Plan) -> float:
 def test_window_shortens_the_path(start: int) -> None:
     """The best grasp of the stick depends on the target of its tip."""
     scene = vkc.load_scene("init_1").sample_start(np.random.default_rng(start))
-    steps = [G("stick"), vkc.Touch("stick.tip", TARGET)]
-    blind, seeing = (plan_actions(scene, steps, window=window) for window in (1, 2))
-    assert blind.success, blind.summary()
-    assert seeing.success, seeing.summary()
-    assert compute_weighted_length(seeing) < compute_weighted_length(blind)
+    steps = [vkc.Grasp("stick"), vkc.Touch("stick.tip", TARGET)]
+    separate, together = (plan_actions(scene, steps, window=window) for window in (1, 2))
+    assert separate.success, separate.summary()
+    assert together.success, together.summary()
+    assert compute_weighted_length(together) < compute_weighted_length(separate)

@@ -1,4 +1,4 @@
-"""Tests possible and random tasks; all are planned and judged by the oracle."""
+"""Tests the possible goals of a scene, and random tasks, whose plans the oracle judges."""
 
 from __future__ import annotations
 
@@ -12,48 +12,48 @@ import vkc_pin as vkc
 
 def test_goals_lists_every_joint_and_free_object_once() -> None:
     home = vkc.load_scene("household")
-    offered = {
+    steps = {
         (step.object, *getattr(step, "joints", ())): step
         for step in vkc.procedural.goals(home, share=0.5)
     }
-    assert {key for key in offered if len(key) == 2} == {
+    assert {key for key in steps if len(key) == 2} == {
         *(("door", "hinge"), ("drawer", "slide"), ("dishwasher", "rack"), ("dishwasher", "door")),
         *(("refrigerator", "hinge"), ("cabinet", "hinge")),
     }
-    grasped = {step.object for step in offered.values() if isinstance(step, vkc.Grasp)}
+    grasped = {step.object for step in steps.values() if isinstance(step, vkc.Grasp)}
     assert grasped == {name for name, placed in home.objects.items() if placed.object.free}
-    assert offered["refrigerator", "hinge"] == vkc.Actuate(
+    assert steps["refrigerator", "hinge"] == vkc.Actuate(
         "refrigerator", {"hinge": 1.0}, "handle_free"
     )
 
 
-def test_joints_without_limits_turn_by_a_fraction_of_a_turn() -> None:
+def test_continuous_joints_move_by_a_fraction_of_a_revolution() -> None:
     description = vkc.procedural.random_object("valve", 0)
     urdf = description["urdf"].replace('type="revolute"', 'type="continuous"')
-    here = {"name": "valve", "type": {**description, "urdf": urdf}, "position": [2.0, 0.0, 0.0]}
+    entry = {"name": "valve", "type": {**description, "urdf": urdf}, "position": [2.0, 0.0, 0.0]}
     scene = vkc.Scene.from_document(
-        {"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}, "objects": [here]}
+        {"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}, "objects": [entry]}
     )
     (step,) = vkc.procedural.goals(scene, share=0.25)
     assert isinstance(step, vkc.Actuate)
     assert step.joints["turn"] == pytest.approx(np.pi / 2, abs=1e-3)
 
 
-def test_no_goal_is_beyond_a_limit() -> None:
+def test_goals_stay_within_joint_limits() -> None:
     scene = vkc.load_scene("corridor_door")
     door = scene.objects["door"].object
     (step,) = vkc.procedural.goals(scene, share=0.5)
     assert isinstance(step, vkc.Actuate)
     assert step.joints["hinge"] == door.upper[door.coordinates.index("hinge")] == np.pi / 2.0, (
-        "rounded it would be 1.571"
+        "1.571, the rounded value, would exceed the limit"
     )
 
 
 @pytest.mark.parametrize("share", [0.0, 1.1, "half"])
 def test_invalid_shares_are_rejected(share: object) -> None:
-    with pytest.raises(vkc.InputError) as found:
+    with pytest.raises(vkc.InputError) as caught:
         vkc.procedural.goals(vkc.load_scene("drawer"), share=share)  # type: ignore[arg-type]
-    assert found.value.field == "share"
+    assert caught.value.field == "share"
 
 
 def test_random_tasks_are_reproducible() -> None:
@@ -80,7 +80,7 @@ def test_random_tasks_accept_room_settings() -> None:
     "kind", ["drawers", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("door", "valve"))]
 )
 def test_random_tasks_are_planned(kind: str, tmp_path: Path) -> None:
-    """In a furnished room; the saved plan contains the object's description."""
+    """Plan in a furnished room; the saved plan contains the object's description."""
     room, steps = vkc.procedural.random_task(11, objects=(f"random_{kind}",), clutter=0.3)
     plan = vkc.plan(room, steps)
     assert plan.success, plan.validation
@@ -90,7 +90,7 @@ def test_random_tasks_are_planned(kind: str, tmp_path: Path) -> None:
     assert plan.trajectory.positions[
         -1, plan.trajectory.names.index(f"{kind}.{joint}")
     ] == pytest.approx(value, abs=1e-3)
-    kept = vkc.Plan.load(plan.save(tmp_path / "plan.npz"))
-    assert kept.scene.document == room.document
-    assert kept.success
-    assert kept.scene.objects[kind].object.model == room.objects[kind].object.model
+    loaded = vkc.Plan.load(plan.save(tmp_path / "plan.npz"))
+    assert loaded.scene.document == room.document
+    assert loaded.success
+    assert loaded.scene.objects[kind].object.model == room.objects[kind].object.model

@@ -1,4 +1,4 @@
-"""Contact pairs are those between which the planner keeps a clearance."""
+"""Tests that contact pairs are those for which the planner keeps a clearance."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def test_contact_pairs_include_all_pairs_of_the_planner() -> None:
         for one in find_clearance_exemptions(plan.scene, Options().dist_safe)
         if one.margin < 0.0
     }
-    wanted = {
+    required = {
         frozenset(pair)
         for pair in table.pairs.tolist()
         if frozenset(labels[k] for k in pair) not in exempt
     }
-    assert wanted <= colliding
+    assert required <= colliding
     assert pairs.overlapping == ()
     hand, link = find_touch_links(plan.scene, holds[0]), find_grasped_link(plan.scene, holds[0])
     grasp_pairs = {
@@ -49,7 +49,7 @@ def test_contact_pairs_include_all_pairs_of_the_planner() -> None:
     }
     assert grasp_pairs
     always = {frozenset(pair) for pair in pairs.always.tolist()}
-    assert not grasp_pairs & always  # only by the hold's bit
+    assert not grasp_pairs & always  # enabled only by the bit of the hold
     assert pairs.bits[holds[0]]
 
 
@@ -57,17 +57,17 @@ def test_free_objects_but_not_wheels_collide_with_the_floor() -> None:
     scene = make_grasping_scene()
     world = World(scene)
     labels = world.collision_labels
-    below = [
+    floor_pairs = [
         pair
         for pair in find_contact_pairs(world, scene.holds).always.tolist()
         if FLOOR in (labels[pair[0]], labels[pair[1]])
     ]
-    on_it = {labels[k] for pair in below for k in pair} - {FLOOR}
-    assert any(label.startswith("stick.") for label in on_it)
-    robot = {
+    colliding = {labels[k] for pair in floor_pairs for k in pair} - {FLOOR}
+    assert any(label.startswith("stick.") for label in colliding)
+    robot_base = {
         labels[i] for i, shape in enumerate(world.bodies.geometryObjects) if shape.parentJoint == 1
     }
-    assert not robot & on_it
+    assert not robot_base & colliding
 
 
 def test_unplanned_contacts_are_found() -> None:

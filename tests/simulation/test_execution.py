@@ -1,4 +1,4 @@
-"""Simulation reproduces valid plans and reports deviations of the world."""
+"""Tests that simulation reproduces valid plans and reports deviations."""
 
 from __future__ import annotations
 
@@ -103,15 +103,15 @@ def test_diverged_simulation_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, float]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    wild = vkc.Physics(timestep=0.01, **changes)
-    result = plan_drawer().simulate(physics=wild)
+    unstable = vkc.Physics(timestep=0.01, **changes)
+    result = plan_drawer().simulate(physics=unstable)
     assert result.diverged is not None
     assert result.diverged < 10.0
     assert not result.ok
     assert "the integration diverged" in result.summary()
     assert len(result.rows) == len(result.trajectory.times)
     assert np.isfinite(result.rows).all()
-    assert list(tmp_path.iterdir()) == []  # MuJoCo would log it here
+    assert list(tmp_path.iterdir()) == []  # MuJoCo's log file would appear here
 
 
 def test_simulation_is_deterministic() -> None:
@@ -143,7 +143,7 @@ def test_invalid_argument_is_named(options: dict[str, object], field: str) -> No
 
 
 @pytest.mark.parametrize("grasp", ["weld", "friction"])
-def test_motion_of_a_day_is_too_long_to_execute(grasp: str) -> None:
+def test_motion_with_too_many_time_steps_is_rejected(grasp: str) -> None:
     plan = plan_drawer()
     times = 1e5 * plan.trajectory.times
     slow = dataclasses.replace(plan.trajectory, times=times, curve=None)
@@ -152,8 +152,8 @@ def test_motion_of_a_day_is_too_long_to_execute(grasp: str) -> None:
     assert caught.value.field == "trajectory"
 
 
-def test_plan_goes_on_from_where_the_execution_ended() -> None:
-    """The drawer is 6 mm beside its place when the hand closes."""
+def test_planning_continues_from_the_executed_end_state() -> None:
+    """The drawer is displaced by 6 mm when the hand closes."""
     scene = load_scene("drawer")
     placed = scene.objects["drawer"].placement
     moved = pin.SE3(placed.rotation, placed.translation + np.array([0.0, 0.006, 0.0]))

@@ -1,4 +1,4 @@
-"""The MuJoCo model has the kinematics, masses and shapes of the kinematic tree."""
+"""Tests that the MuJoCo model has the kinematics, masses and shapes of the kinematic tree."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ def build_model(scene: Scene, *, has_notes: bool = False) -> PhysicalWorld:
     return Builder(world, physics).build(find_contact_pairs(world, holds), driven, holds, latches)
 
 
-def random_rows(world: World, count: int) -> np.ndarray:
+def sample_rows(world: World, count: int) -> np.ndarray:
     rows = world.start + np.random.default_rng(1).uniform(
         -2.0, 2.0, (count, world.coordinates.size)
     )
     for name, placed in world.scene.objects.items():
         if placed.object.free:
             columns = world.get_placement_columns(name)
-            turns = rows[:, columns.start + 3 : columns.stop]
-            turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+            quaternions = rows[:, columns.start + 3 : columns.stop]
+            quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     return rows
 
 
@@ -52,7 +52,7 @@ def test_placements_agree_with_pinocchio(name: str, tmp_path: Path) -> None:
     physical = build_model(scene, has_notes=coupled)
     world, model = physical.world, physical.model
     data, tree = mujoco.MjData(model), world.model.createData()
-    for row in random_rows(world, 5):
+    for row in sample_rows(world, 5):
         data.qpos[:] = physical.to_qpos(row)
         mujoco.mj_kinematics(model, data)
         pin.forwardKinematics(world.model, tree, world.coordinates.q(row))
@@ -84,7 +84,7 @@ def test_placements_agree_with_pinocchio(name: str, tmp_path: Path) -> None:
 
 def test_masses_agree_with_pinocchio() -> None:
     physical = build_model(vkc.load_scene("household"))
-    tree = World(physical.world.scene).model  # as the files have it
+    tree = World(physical.world.scene).model  # with the inertias of the files
     for joint in range(1, tree.njoints):
         inertia, body = tree.inertias[joint], int(physical.bodies[joint])
         assert physical.model.body_mass[body] == pytest.approx(inertia.mass)
@@ -92,7 +92,7 @@ def test_masses_agree_with_pinocchio() -> None:
         principal = np.sort(np.linalg.eigvalsh(np.asarray(inertia.inertia)))
         principal += max(
             0.0, principal[2] - principal[0] - principal[1]
-        )  # the cabinet's are rounded
+        )  # the cabinet's inertias are rounded
         np.testing.assert_allclose(np.sort(physical.model.body_inertia[body]), principal, rtol=1e-3)
 
 
@@ -102,9 +102,9 @@ def test_objects_have_the_described_joint_resistance() -> None:
     placed = plan.scene.objects["drawer"]
 
     def simulate_with(**resistance: float) -> SimulationResult:
-        own = {"slide": Resistance(**resistance)}
+        resistances = {"slide": Resistance(**resistance)}
         changed = dataclasses.replace(
-            placed, object=dataclasses.replace(placed.object, resistance=own)
+            placed, object=dataclasses.replace(placed.object, resistance=resistances)
         )
         actual = dataclasses.replace(plan.scene, objects={**plan.scene.objects, "drawer": changed})
         return plan.simulate(actual=actual)

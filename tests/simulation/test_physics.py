@@ -1,4 +1,4 @@
-"""Physical settings are checked, and missing masses are completed."""
+"""Tests the checks of physical settings and the completion of missing masses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Web pages show the executed motion beside the plan."""
+"""Tests that web pages show the executed motion beside the plan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Servos have their joints' strength and track the plan."""
+"""Tests the reference and the feedforward of servos."""
 
 from __future__ import annotations
 
@@ -52,13 +52,19 @@ def test_feedforward_agrees_with_inverse_dynamics_of_mujoco(name: str, tmp_path:
     model = physical.model
     model.opt.gravity[:], data = 0.0, mujoco.MjData(model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    slopes = np.zeros((model.nv, robot.size))
+    transmission = np.zeros((model.nv, robot.size))
     for move in robot.moves:
-        own = model.body_dofadr[physical.bodies[move.joint]] + (
+        dof = model.body_dofadr[physical.bodies[move.joint]] + (
             move.coordinate if move.coordinate < 3 else 0
         )
-        slopes[own, move.coordinate] = move.factor
-    for row, v, a, efforts in zip(rows, velocities, accelerations, found, strict=True):
-        data.qpos[:], data.qvel[:], data.qacc[:] = physical.to_qpos(row), slopes @ v, slopes @ a
+        transmission[dof, move.coordinate] = move.factor
+    for row, v, a, torques in zip(rows, velocities, accelerations, found, strict=True):
+        data.qpos[:], data.qvel[:], data.qacc[:] = (
+            physical.to_qpos(row),
+            transmission @ v,
+            transmission @ a,
+        )
         mujoco.mj_inverse(model, data)
-        np.testing.assert_allclose(efforts[: robot.size], slopes.T @ data.qfrc_inverse, atol=1e-6)
+        np.testing.assert_allclose(
+            torques[: robot.size], transmission.T @ data.qfrc_inverse, atol=1e-6
+        )

@@ -1,4 +1,4 @@
-"""Snapshots and videos show the robot and moving objects."""
+"""Tests that snapshots and videos show the robot and moving objects."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from vkc_pin.simulation.snapshots import RenderedScene
 @pytest.mark.long
 def test_snapshots_differ_where_objects_move(tmp_path: Path) -> None:
     result = simulate_drawer()
-    stage = RenderedScene(result)
+    rendered = RenderedScene(result)
     try:
-        first, again, last = stage.render(
-            np.array([0.0, 0.0, result.trajectory.times[-1]]), stage.find_viewpoint()
+        first, again, last = rendered.render(
+            np.array([0.0, 0.0, result.trajectory.times[-1]]), rendered.find_viewpoint()
         )
     except vkc.VkcError as error:  # no OpenGL on this machine
         pytest.skip(str(error))
@@ -50,10 +50,10 @@ def test_video_has_the_duration_of_the_motion(tmp_path: Path) -> None:
         pytest.skip(str(error))
     data = file.read_bytes()
     assert data[4:8] == b"ftyp"
-    at = data.index(b"mvhd") + 4  # version and flags, created, changed, ticks a second, duration
-    ticks, duration = (int.from_bytes(data[at + k : at + k + 4], "big") for k in (12, 16))
+    at = data.index(b"mvhd") + 4  # version and flags, creation, modification, time scale, duration
+    time_scale, duration = (int.from_bytes(data[at + k : at + k + 4], "big") for k in (12, 16))
     times = result.trajectory.times
-    assert duration / ticks == pytest.approx(times[-1] - times[0], abs=0.25)
+    assert duration / time_scale == pytest.approx(times[-1] - times[0], abs=0.25)
 
 
 def test_missing_ffmpeg_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

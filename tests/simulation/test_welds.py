@@ -1,4 +1,4 @@
-"""Welds carry the load of grasped objects for as long as the plan holds them."""
+"""Tests that welds carry the load of grasped objects while the plan holds them."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def test_load_of_a_grip_is_the_object_weight() -> None:
     model, data = world.model, world.model.createData()
     pin.framesForwardKinematics(model, data, world.coordinates.q(result.rows[-1]))
     joint = model.getJointId("stick.placement")
-    arm = (
+    lever = (
         data.oMi[joint].act(model.inertias[joint].lever)
         - data.oMf[model.getFrameId(scene.robot.tool_frame)].translation
     )
     weight = np.array([0.0, 0.0, -9.81 * mass])
     assert grip.force == pytest.approx(9.81 * mass, rel=0.02)
-    assert grip.torque == pytest.approx(np.linalg.norm(np.cross(arm, weight)), rel=0.05)
+    assert grip.torque == pytest.approx(np.linalg.norm(np.cross(lever, weight)), rel=0.05)
     assert (
         np.linalg.norm(data.oMi[joint].translation - scene.objects["stick"].placement.translation)
         < 0.02
@@ -48,6 +48,6 @@ def test_hold_spans_follow_the_plan() -> None:
     assert begin == -np.inf
 
 
-def test_pushes_are_not_held() -> None:
+def test_pushes_have_no_hold_spans() -> None:
     scene = vkc.load_scene("door").with_held({"door": "push"})
     assert find_hold_spans(scene, make_stationary_motion(scene)) == []

@@ -65,9 +65,9 @@ def test_wrong_types_raise(name: str, value: Any) -> None:
 
 
 def test_arrays_hold_real_numbers_and_are_copies() -> None:
-    given = np.arange(3.0)
-    found = check_array(given, "it")
-    given[0] = 7.0
+    source = np.arange(3.0)
+    found = check_array(source, "it")
+    source[0] = 7.0
     assert found.tolist() == [0.0, 1.0, 2.0]
     assert check_array([], "it").shape == (0,)
     assert check_finite_array([[1, 2]], "it").tolist() == [[1.0, 2.0]]

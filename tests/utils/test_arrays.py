@@ -8,7 +8,7 @@ from vkc_pin.utils.arrays import find_unique_rows
 
 @pytest.mark.parametrize("shape", [(1, 3), (40, 2), (200, 3), (0, 3)])
 @pytest.mark.parametrize("decimals", [0, 1])
-def test_unique_rows_are_those_of_numpy(shape: tuple[int, int], decimals: int) -> None:
+def test_unique_rows_agree_with_numpy(shape: tuple[int, int], decimals: int) -> None:
     rows = np.random.default_rng(3).normal(size=shape).round(decimals)  # -0.0 equals 0.0
     first, group = find_unique_rows(rows)
     _, expected, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)

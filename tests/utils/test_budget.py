@@ -27,7 +27,7 @@ def handler_is_restored() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
-def press() -> None:
+def press_ctrl_c() -> None:
     os.kill(os.getpid(), signal.SIGINT)
     time.sleep(0.01)  # the handler runs between two steps of the interpreter
 
@@ -37,15 +37,15 @@ def test_other_threads_have_their_own_budget() -> None:
 
     def work() -> None:
         record_evaluations(10**9)
-        with Budget().activate() as budget:
-            interrupted.append(budget.is_interrupted)
+        with Budget().activate() as thread_budget:
+            interrupted.append(thread_budget.is_interrupted)
 
-    with Budget(max_evaluations=1).activate() as mine:
+    with Budget(max_evaluations=1).activate() as budget:
         thread = threading.Thread(target=work)
         thread.start()
         thread.join()
     assert interrupted == [False]
-    assert mine.evaluations == 0
+    assert budget.evaluations == 0
 
 
 def test_evaluations_are_limited() -> None:
@@ -64,15 +64,15 @@ def test_evaluations_are_limited() -> None:
         assert (budget.evaluations, budget.stop_status) == (11, "evaluation limit")
 
 
-def test_the_second_ctrl_c_raises() -> None:
+def test_second_ctrl_c_raises() -> None:
     with pytest.raises(KeyboardInterrupt), Budget().activate() as budget:  # noqa: PT012
         record_evaluations()
         assert not budget.stop_status
-        press()
+        press_ctrl_c()
         assert budget.stop_status == "interrupted"
         with pytest.raises(BudgetExhaustedError, match="interrupted"):
             record_evaluations()
-        press()
+        press_ctrl_c()
 
 
 def test_foreign_handlers_are_kept(

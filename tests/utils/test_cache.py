@@ -59,7 +59,7 @@ def test_failed_builds_are_not_cached() -> None:
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc keeps freed memory")
 def test_trimming_releases_memory() -> None:
-    """Also between blocks that are still in use: a process would grow with every structure."""
+    """Memory between blocks in use is released too; otherwise the process would keep growing."""
     cache, between = Cache(max_nbytes=1.0), []
     for key in range(20):
         blocks = []
@@ -80,15 +80,15 @@ def test_build_time_includes_parts_once(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr("vkc_pin.utils.cache.time.perf_counter", lambda: float(next(clock)))
     cache = Cache()
     cache.get("whole", lambda: (cache.get("part", lambda: make_sized(1)), make_sized(2))[1])
-    assert cache.build_time == 2.0  # of the readings 0 to 2, the second is that of the part
+    assert cache.build_time == 2.0  # from reading 0 to 2; reading 1 is that of the part
 
 
-def test_planners_lend_one_cache_to_each_thread() -> None:
-    planner, barrier, seen = vkc.Planner(), threading.Barrier(2, timeout=30), list[Cache]()
+def test_each_thread_acquires_its_own_cache() -> None:
+    planner, barrier, caches = vkc.Planner(), threading.Barrier(2, timeout=30), list[Cache]()
 
     def acquire() -> None:
         with planner.acquire() as cache:
-            seen.append(cache)
+            caches.append(cache)
             cache.get(threading.get_ident(), lambda: make_sized(5))
             barrier.wait()
 
@@ -97,11 +97,11 @@ def test_planners_lend_one_cache_to_each_thread() -> None:
         thread.start()
     for thread in threads:
         thread.join()
-    assert len(set(map(id, seen))) == 2
+    assert len(set(map(id, caches))) == 2
     assert planner.info() == CacheInfo(entries=2, nbytes=10, hits=0, misses=2)
-    with pytest.raises(ZeroDivisionError), planner.acquire() as again:
-        again.get("bad", lambda: make_sized(1 // 0))
-    assert any(again is cache for cache in seen)
+    with pytest.raises(ZeroDivisionError), planner.acquire() as reused:
+        reused.get("bad", lambda: make_sized(1 // 0))
+    assert any(reused is cache for cache in caches)
     assert planner.info().entries == 2
 
 

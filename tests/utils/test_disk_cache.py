@@ -1,4 +1,4 @@
-"""Tests that records on disk are exact, and rebuilt where they cannot be trusted."""
+"""Tests that records on disk are exact, and are rebuilt if damaged or foreign."""
 
 from __future__ import annotations
 
@@ -19,60 +19,62 @@ PLAIN = st.recursive(
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv(disk_cache.CACHE_VARIABLE, str(tmp_path / "cache"))
     return tmp_path / "cache" / "vkc_pin"
 
 
-def fail() -> None:
-    raise AssertionError("it is there")
+def fail_to_build() -> None:
+    raise AssertionError("the record exists")
 
 
 @given(key=st.binary(), data=PLAIN)
 @settings(
     max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
-def test_records_round_trip(here: Path, key: bytes, data: object) -> None:
-    for file in here.glob("*.json"):
+def test_records_round_trip(cache_folder: Path, key: bytes, data: object) -> None:
+    for file in cache_folder.glob("*.json"):
         file.unlink()
     assert disk_cache.load_or_build(key, lambda: data) == data
-    (file,) = here.iterdir()
+    (file,) = cache_folder.iterdir()
     assert file.stat().st_mode & 0o777 == 0o600
-    assert disk_cache.load_or_build(key, fail) == data
+    assert disk_cache.load_or_build(key, fail_to_build) == data
     assert disk_cache.load_or_build(key + b"x", lambda: "other") == "other"
 
 
-@pytest.mark.parametrize("harm", ["cut", "changed", "writable", "link", "folder"])
-def test_damaged_and_foreign_records_are_rebuilt(here: Path, tmp_path: Path, harm: str) -> None:
+@pytest.mark.parametrize("damage", ["cut", "changed", "writable", "link", "folder"])
+def test_damaged_and_foreign_records_are_rebuilt(
+    cache_folder: Path, tmp_path: Path, damage: str
+) -> None:
     assert disk_cache.load_or_build(b"key", lambda: [1.5, "a"]) == [1.5, "a"]
-    (file,) = here.iterdir()
-    if harm == "cut":
+    (file,) = cache_folder.iterdir()
+    if damage == "cut":
         file.write_bytes(file.read_bytes()[:-1])
-    elif harm == "changed":
+    elif damage == "changed":
         file.write_bytes(file.read_bytes().replace(b"1.5", b"2.5"))
-    elif harm == "writable":
+    elif damage == "writable":
         file.chmod(0o666)
-    elif harm == "link":
+    elif damage == "link":
         file.rename(tmp_path / "elsewhere")
         file.symlink_to(tmp_path / "elsewhere")
     else:
-        here.chmod(0o777)
+        cache_folder.chmod(0o777)
     assert disk_cache.load_or_build(b"key", lambda: "new") == "new"
 
 
-def test_the_cache_can_be_disabled(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_can_be_disabled(cache_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(disk_cache.CACHE_VARIABLE, "off")
     assert [disk_cache.load_or_build(b"key", lambda count=count: count) for count in (1, 2)] == [
         1,
         2,
     ]  # type: ignore[misc]
-    assert not here.exists()
+    assert not cache_folder.exists()
 
 
-def test_failed_writes_do_not_raise(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
+def test_failed_writes_do_not_raise(cache_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def raise_no_space(*_: object) -> None:
         raise OSError("no space left")
 
     disk_cache.load_or_build(b"other", lambda: 1)
-    monkeypatch.setattr(os, "fdopen", full)
+    monkeypatch.setattr(os, "fdopen", raise_no_space)
     assert disk_cache.load_or_build(b"key", lambda: 2) == 2

@@ -19,22 +19,22 @@ def handler_is_restored() -> Iterator[None]:
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def press() -> None:
+def press_ctrl_c() -> None:
     os.kill(os.getpid(), signal.SIGINT)
 
 
 def test_interrupts_are_deferred() -> None:
     done = []
     with pytest.raises(KeyboardInterrupt), raise_on_interrupt(), defer_interrupt():  # noqa: PT012
-        press()
-        press()
+        press_ctrl_c()
+        press_ctrl_c()
         done.append("all")
     assert done == ["all"]
 
 
 def test_deferred_interrupts_reach_the_budget() -> None:
     with Budget().activate() as budget, defer_interrupt():
-        press()
+        press_ctrl_c()
         assert not budget.is_interrupted
     assert budget.is_interrupted
 
@@ -43,7 +43,7 @@ def test_ignored_interrupts_stay_ignored() -> None:
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with Budget().activate() as budget, raise_on_interrupt(), defer_interrupt():
-            press()
+            press_ctrl_c()
         assert not budget.is_interrupted
     finally:
         signal.signal(signal.SIGINT, before)
@@ -51,11 +51,11 @@ def test_ignored_interrupts_stay_ignored() -> None:
 
 def test_interrupts_raise_on_request() -> None:
     received: list[int] = []
-    mine = signal.signal(signal.SIGINT, lambda number, frame: received.append(number))
+    previous = signal.signal(signal.SIGINT, lambda number, frame: received.append(number))
     try:
         with pytest.raises(KeyboardInterrupt), raise_on_interrupt():
-            press()
-        press()
+            press_ctrl_c()
+        press_ctrl_c()
     finally:
-        signal.signal(signal.SIGINT, mine)
+        signal.signal(signal.SIGINT, previous)
     assert received == [signal.SIGINT]

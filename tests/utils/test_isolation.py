@@ -1,4 +1,4 @@
-"""Calls in the child process give results or errors, and leave no process behind."""
+"""Tests that calls in the child process return results or errors and leave no process behind."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from vkc_pin.utils.isolation import (
 )
 
 
-def call(function: Callable[..., Any], *arguments: Any) -> Any:
+def call_isolated(function: Callable[..., Any], *arguments: Any) -> Any:
     return run_isolated(function, *arguments, program="the parser", file="a.xml")
 
 
@@ -38,22 +38,24 @@ def is_running(process: int) -> bool:
     return status.rpartition(")")[2].split()[0] != "Z"
 
 
-def wait_until_gone(process: int) -> bool:
+def wait_until_ended(process: int) -> bool:
     end = time.monotonic() + 10.0
     while is_running(process) and time.monotonic() < end:
         time.sleep(0.05)
     return not is_running(process)
 
 
-def test_results_and_errors_of_a_function_are_its_own() -> None:
-    child = call(os.getpid)
+def test_results_and_errors_are_passed_on() -> None:
+    child = call_isolated(os.getpid)
     assert child != os.getpid()
-    np.testing.assert_array_equal(call(np.cross, np.eye(3)[0], np.eye(3)[1]), [0.0, 0.0, 1.0])
+    np.testing.assert_array_equal(
+        call_isolated(np.cross, np.eye(3)[0], np.eye(3)[1]), [0.0, 0.0, 1.0]
+    )
     with pytest.raises(ValueError, match="invalid literal for int"):
-        call(int, "five")
+        call_isolated(int, "five")
     with pytest.raises(InputError, match="PRIVATE_LIMIT: out of range"):
-        call(_fail)
-    assert call(os.getpid) == child
+        call_isolated(_fail)
+    assert call_isolated(os.getpid) == child
 
 
 def _fail() -> None:
@@ -78,60 +80,60 @@ def _fail() -> None:
         (os._exit, (7,), "crashes .*got exit code 7"),
     ],
 )
-def test_a_failure_names_program_and_reason(
+def test_failure_names_program_and_reason(
     function: Callable[..., Any], arguments: tuple[Any, ...], reason: str, monkeypatch: Any
 ) -> None:
     if "in time" in reason:
         monkeypatch.setenv(TIME_VARIABLE, "0.5")
     with pytest.raises((InputError, RuntimeError, TypeError), match=reason) as caught:
-        call(function, *arguments)
+        call_isolated(function, *arguments)
     if isinstance(caught.value, InputError):
         assert str(caught.value).startswith("a.xml: the parser ")
-    assert call(abs, -2) == 2
+    assert call_isolated(abs, -2) == 2
 
 
-def test_the_child_process_cannot_fill_the_disk_or_this_folder(tmp_path: Path) -> None:
+def test_child_process_cannot_fill_the_disk_or_the_current_folder(tmp_path: Path) -> None:
     file = tmp_path / "large"
     with pytest.raises(OSError, match="File too large"):
-        call(Path.write_bytes, file, bytes(2**25))
+        call_isolated(Path.write_bytes, file, bytes(2**25))
     assert file.stat().st_size <= 2**24
-    assert call(os.getcwd) == "/"
+    assert call_isolated(os.getcwd) == "/"
 
 
 def test_limits_come_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(MEMORY_VARIABLE, "0.5")
     with pytest.raises(InputError, match=r"at most 0\.5 GB"):
-        call(np.ones, 10**8)
+        call_isolated(np.ones, 10**8)
     monkeypatch.setenv(MEMORY_VARIABLE, "2")
-    assert call(np.ones, 10**7).sum() == 10**7
+    assert call_isolated(np.ones, 10**7).sum() == 10**7
     for wrong in ("much", "0", "-1", "nan", "inf", "1e9"):
         monkeypatch.setenv(TIME_VARIABLE, wrong)
         with pytest.raises(InputError, match=f"{TIME_VARIABLE}: wrong environment variable"):
-            call(abs, 1)
+            call_isolated(abs, 1)
 
 
-def test_a_result_that_nobody_fetched_is_dropped() -> None:
+def test_unfetched_result_is_dropped() -> None:
     submit_isolated(abs, -1, program="the parser")
-    assert call(abs, -2) == 2
+    assert call_isolated(abs, -2) == 2
 
 
-def test_a_process_that_ended_between_calls_is_replaced() -> None:
-    child = call(os.getpid)
+def test_child_process_that_ended_between_calls_is_replaced() -> None:
+    child = call_isolated(os.getpid)
     os.kill(child, signal.SIGINT)  # as Ctrl-C does to all processes of a terminal
     os.waitid(os.P_PID, child, os.WEXITED | os.WNOWAIT)
-    assert call(os.getpid) != child
+    assert call_isolated(os.getpid) != child
 
 
-def test_threads_and_forks_have_processes_of_their_own() -> None:
-    child, found = call(os.getpid), list[int]()
-    thread = threading.Thread(target=lambda: found.append(call(os.getpid)))
+def test_threads_and_forks_have_their_own_child_processes() -> None:
+    child, found = call_isolated(os.getpid), list[int]()
+    thread = threading.Thread(target=lambda: found.append(call_isolated(os.getpid)))
     thread.start()
     thread.join()
     with get_context("fork").Pool(1) as pool:
-        found.append(pool.apply(call, (os.getpid,)))
+        found.append(pool.apply(call_isolated, (os.getpid,)))
     assert len({child, *found}) == 3
-    assert call(os.getpid) == child
-    assert all(map(wait_until_gone, found))
+    assert call_isolated(os.getpid) == child
+    assert all(map(wait_until_ended, found))
 
 
 SCRIPT = """
@@ -143,7 +145,7 @@ run_isolated(time.sleep, 50.0, program="it")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_the_child_process_ends_with_its_parent(number: signal.Signals) -> None:
+def test_child_process_ends_with_its_parent(number: signal.Signals) -> None:
     pipe = subprocess.PIPE
     command = [sys.executable, "-c", SCRIPT]
     with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True) as parent:
@@ -153,4 +155,4 @@ def test_the_child_process_ends_with_its_parent(number: signal.Signals) -> None:
         parent.send_signal(number)
         _, error = parent.communicate(timeout=20)
     assert ("KeyboardInterrupt" in error) == (number == signal.SIGINT)
-    assert wait_until_gone(child)
+    assert wait_until_ended(child)

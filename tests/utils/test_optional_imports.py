@@ -20,11 +20,11 @@ def find_path() -> object:
 
 
 def test_missing_compiled_modules_raise(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(name: str) -> types.ModuleType:
+    def raise_import_error(name: str) -> types.ModuleType:
         raise ImportError(f"no {name}")
 
     with monkeypatch.context() as patch:
-        patch.setattr(optional_imports, "import_module", missing)
+        patch.setattr(optional_imports, "import_module", raise_import_error)
         with pytest.raises(
             BuildError, match=r"_driving cannot be imported \(no .*compiler.*pip install"
         ):
@@ -32,7 +32,7 @@ def test_missing_compiled_modules_raise(monkeypatch: pytest.MonkeyPatch) -> None
     assert find_path() is not None
 
 
-def test_libraries_of_other_releases_are_named(
+def test_incompatible_library_releases_are_named(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "casadi-3.9.1.dist-info").mkdir()

@@ -1,4 +1,4 @@
-"""The validator accepts valid transport of free objects and names each violation."""
+"""Tests that validation accepts valid transport of free objects and reports each violation."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from helpers.carrying import (
     GUESS,
     STICK,
     UP,
-    Script,
-    carry_over,
+    MotionBuilder,
     compute_grasp_pose,
     describe_box,
     describe_stand,
     describe_table,
     lift,
+    make_carrying_motion,
     make_room,
     move_base,
     place_object,
@@ -41,7 +41,7 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 ASIDE = lift(STICK, [0.0, 0.5, 0.0])
 PLACED = vkc.Place("stick", ASIDE)
-SIDES = np.diag([1.0, -1.0, 1.0])
+DIRECTIONS = np.diag([1.0, -1.0, 1.0])
 
 
 @cache
@@ -62,7 +62,7 @@ def compute_tip_position(scene: Scene, row: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("values", [(0.0, 0.0), (0.06, 0.0), (-0.05, 0.3), (0.09, -0.3)])
 def test_pick_and_place_is_valid(values: tuple[float, float]) -> None:
-    motion = carry_over(make_hall(), values=values).motion()
+    motion = make_carrying_motion(make_hall(), values=values).motion()
     for steps in (
         [PLACED],
         [vkc.Place("stick", ASIDE.translation)],
@@ -86,19 +86,19 @@ def test_object_grasped_at_the_start_may_leave_its_support_within_a_second() -> 
             .with_held({"stick": "grip"})
         )
         report = judge(
-            held, [vkc.GoTo(0.0, 0.5)], Script(held).go(up).go(move_base(up, y=0.5)).motion()
+            held, [vkc.GoTo(0.0, 0.5)], MotionBuilder(held).go(up).go(move_base(up, y=0.5)).motion()
         )
         assert report.ok, "\n".join(report.lines())
         late = (
-            Script(held)
+            MotionBuilder(held)
             .go(move_base(down, y=0.1), steps=60)
             .go(up)
             .go(move_base(up, y=0.5))
             .motion()
         )
-        what = "penetration" if gap < 0.0 else "clearance"
+        constraint = "penetration" if gap < 0.0 else "clearance"
         assert get_violation_names(judge(held, [vkc.GoTo(0.0, 0.5)], late)) == {
-            (what, "stick.stick – table")
+            (constraint, "stick.stick – table")
         }
 
 
@@ -112,9 +112,9 @@ def test_fetching_with_a_tool_is_valid() -> None:
         assert report.ok, "\n".join(report.lines())
 
 
-@pytest.mark.parametrize("side", SIDES, ids=str)
-def test_position_error_of_a_grasp(side: np.ndarray) -> None:
-    motion = carry_over(make_hall(), off=pin.SE3(np.eye(3), 2e-3 * side)).motion()
+@pytest.mark.parametrize("direction", DIRECTIONS, ids=str)
+def test_position_error_of_a_grasp_is_reported(direction: np.ndarray) -> None:
+    motion = make_carrying_motion(make_hall(), off=pin.SE3(np.eye(3), 2e-3 * direction)).motion()
     report = judge(make_hall(), [PLACED], motion)
     found = get_only_violation(report)
     assert (found.constraint, found.subject, found.unit) == ("closure", "stick.grip", "m")
@@ -123,20 +123,22 @@ def test_position_error_of_a_grasp(side: np.ndarray) -> None:
     assert report.closure_error == pytest.approx(2e-3, abs=1e-9)
     grasped = judge(make_hall(), [vkc.Grasp("stick"), PLACED], motion)
     assert get_violation_names(grasped) == {("closure", "stick.grip"), ("goal", "stick.grip")}
-    within = carry_over(make_hall(), off=pin.SE3(np.eye(3), 9e-4 * side)).motion()
+    within = make_carrying_motion(make_hall(), off=pin.SE3(np.eye(3), 9e-4 * direction)).motion()
     assert judge(make_hall(), [vkc.Grasp("stick"), PLACED], within).ok
 
 
-@pytest.mark.parametrize("side", SIDES, ids=str)
-def test_orientation_error_of_a_grasp(side: np.ndarray) -> None:
-    motion = carry_over(make_hall(), off=pin.SE3(pin.exp3(4e-3 * side), np.zeros(3))).motion()
+@pytest.mark.parametrize("direction", DIRECTIONS, ids=str)
+def test_orientation_error_of_a_grasp_is_reported(direction: np.ndarray) -> None:
+    motion = make_carrying_motion(
+        make_hall(), off=pin.SE3(pin.exp3(4e-3 * direction), np.zeros(3))
+    ).motion()
     found = get_only_violation(judge(make_hall(), [PLACED], motion))
     assert (found.constraint, found.subject, found.unit) == ("closure", "stick.grip", "rad")
     assert found.amount == pytest.approx(3e-3, abs=1e-6)
 
 
 def test_grasp_coordinates_must_match_the_tool() -> None:
-    script = carry_over(make_hall(), values=(0.05, 0.0))
+    script = make_carrying_motion(make_hall(), values=(0.05, 0.0))
     for column, value, unit in (
         ("stick__grip_slide", 0.053, "m"),
         ("stick__grip_turn", 0.01, "rad"),
@@ -151,17 +153,17 @@ def test_grasp_coordinates_must_match_the_tool() -> None:
 @pytest.mark.parametrize(
     ("values", "subject"), [((0.1, 0.0), "stick.grip_slide"), ((0.0, -1.25), "stick.grip_turn")]
 )
-def test_limits_of_grasp_coordinates(values: tuple[float, float], subject: str) -> None:
+def test_grasp_coordinates_must_be_within_limits(values: tuple[float, float], subject: str) -> None:
     down = solve_reach(compute_grasp_pose(lift(STICK, 0.3 * UP), values=values), GUESS)
     scene = make_hall().with_held({"stick": "grip"}).with_start(arm=down[3:])
-    script = Script(scene).go(move_base(scene.start, y=0.5))
+    script = MotionBuilder(scene).go(move_base(scene.start, y=0.5))
     script.values |= dict(zip(("stick.grip_slide", "stick.grip_turn"), values, strict=True))
     assert ("limit", subject) in get_violation_names(
         judge(scene, [vkc.GoTo(0.0, 0.5)], script.motion())
     )
 
 
-def make_slide(script: Script, *, begin: int, end: int, by: float) -> np.ndarray:
+def make_slide(script: MotionBuilder, *, begin: int, end: int, by: float) -> np.ndarray:
     """Return a column that changes by `by` between two waypoints and is constant otherwise."""
     return by * np.interp(np.arange(len(script.rows)), [begin, end], [0.0, 1.0])
 
@@ -171,7 +173,7 @@ def make_slide(script: Script, *, begin: int, end: int, by: float) -> np.ndarray
     [("grip_slide", 0.02, "m"), ("grip_turn", 0.1, "rad"), ("grip_slide", 1e-4, "m")],
 )
 def test_firm_grasps_must_not_slide(column: str, by: float, unit: str) -> None:
-    script = carry_over(make_hall())
+    script = make_carrying_motion(make_hall())
     phase = script.phases[3]  # half-way, in the air
     motion = script.motion(
         **{f"stick__{column}": make_slide(script, begin=phase.first + 3, end=phase.last - 3, by=by)}
@@ -187,21 +189,21 @@ def test_firm_grasps_must_not_slide(column: str, by: float, unit: str) -> None:
     assert phase.first < found.waypoint <= phase.last
     assert (
         report.closure_error < 1e-9
-    )  # the hand is where the coordinates say, so nothing else would notice
+    )  # the hand follows the coordinates, so that closure does not show the slide
     loose = replace_grasp(make_hall(), "stick", "grip", firm=False)
     assert "slide" not in {v.constraint for v in judge(loose, [vkc.Release()], motion).violations}
 
 
 def test_grasp_coordinates_are_free_before_the_grasp() -> None:
-    script = carry_over(make_hall(), values=(0.0, 0.0))
-    before = make_slide(script, begin=0, end=script.phases[1].last - 1, by=0.05)[::1] - 0.05
+    script = make_carrying_motion(make_hall(), values=(0.0, 0.0))
+    before = make_slide(script, begin=0, end=script.phases[1].last - 1, by=0.05) - 0.05
     motion = script.motion(stick__grip_slide=before)
     report = judge(make_hall(), [PLACED], motion)
     assert report.ok, "\n".join(report.lines())
 
 
-def test_slide_in_the_last_segment_of_a_grasp() -> None:
-    script = carry_over(make_hall())
+def test_slide_in_the_last_segment_of_a_grasp_is_reported() -> None:
+    script = make_carrying_motion(make_hall())
     last = script.phases[4].last
     for begin, end, slides in ((last - 1, last, True), (last, last + 1, False)):
         motion = script.motion(stick__grip_slide=make_slide(script, begin=begin, end=end, by=0.01))
@@ -210,7 +212,7 @@ def test_slide_in_the_last_segment_of_a_grasp() -> None:
 
 
 @pytest.mark.parametrize(
-    ("off", "subject_unit", "amount"),
+    ("error", "unit", "amount"),
     [
         (pin.SE3(np.eye(3), np.array([2e-3, 0.0, 0.0])), "m", 1e-3),
         (pin.SE3(np.eye(3), np.array([0.0, -2e-3, 0.0])), "m", 1e-3),
@@ -221,11 +223,13 @@ def test_slide_in_the_last_segment_of_a_grasp() -> None:
     ],
     ids=["x", "y", "z", "heading", "tilt", "roll"],
 )
-def test_pose_error_of_a_placed_object(off: pin.SE3, subject_unit: str, amount: float) -> None:
-    goal = pin.SE3(ASIDE.rotation @ off.rotation.T, ASIDE.translation - off.translation)
-    motion = carry_over(make_hall()).motion()
+def test_pose_error_of_a_placed_object_is_reported(
+    error: pin.SE3, unit: str, amount: float
+) -> None:
+    goal = pin.SE3(ASIDE.rotation @ error.rotation.T, ASIDE.translation - error.translation)
+    motion = make_carrying_motion(make_hall()).motion()
     found = get_only_violation(judge(make_hall(), [vkc.Place("stick", goal)], motion))
-    assert (found.constraint, found.subject, found.unit) == ("goal", "stick.stick", subject_unit)
+    assert (found.constraint, found.subject, found.unit) == ("goal", "stick.stick", unit)
     assert found.amount == pytest.approx(amount, abs=1e-8)
     assert found.waypoint == motion.phases[-1].last
     assert judge(make_hall(), [vkc.Place("stick", ASIDE)], motion).ok
@@ -243,7 +247,7 @@ def test_placing_at_a_point_leaves_only_the_heading_free(axis: int, wrong: bool)
     up, down = solve_above(STICK), solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
     there = solve_reach(compute_grasp_pose(put), move_base(down, y=0.5))
     script = (
-        Script(scene)
+        MotionBuilder(scene)
         .go(up)
         .go(down)
         .take("stick")
@@ -264,39 +268,39 @@ def test_placing_at_a_point_leaves_only_the_heading_free(axis: int, wrong: bool)
 
 
 def test_object_grasped_at_the_start_is_placed_upright() -> None:
-    aslant = pin.SE3(pin.exp3(np.array([0.5, 0.2, 0.0])), np.array([0.8, 0.0, 0.75]))
+    slanted = pin.SE3(pin.exp3(np.array([0.5, 0.2, 0.0])), np.array([0.8, 0.0, 0.75]))
     held = (
         make_room()
         .with_held({"stick": "grip"})
-        .with_start(arm=solve_reach(compute_grasp_pose(aslant), GUESS)[3:])
+        .with_start(arm=solve_reach(compute_grasp_pose(slanted), GUESS)[3:])
     )
     level = (
-        Script(held)
+        MotionBuilder(held)
         .go(solve_reach(compute_grasp_pose(lift(STICK)), np.array(held.start)))
         .let_go()
         .wait()
     )
     report = judge(held, [vkc.Place("stick", lift(STICK).translation)], level.motion())
     assert report.ok, "\n".join(report.lines())
-    script = Script(held).go(move_base(held.start, x=-0.5, yaw=1.2)).let_go().wait()
+    script = MotionBuilder(held).go(move_base(held.start, x=-0.5, yaw=1.2)).let_go().wait()
     there = held.with_start(base=script.rows[-1][:3]).objects["stick"].placement
     tilted = get_only_violation(
         judge(held, [vkc.Place("stick", there.translation)], script.motion())
     )
     assert (tilted.constraint, tilted.subject, tilted.unit) == ("goal", "stick.stick", "rad")
-    assert tilted.amount == pytest.approx(np.arccos(aslant.rotation[2, 2]) - 1e-3, abs=1e-6)
+    assert tilted.amount == pytest.approx(np.arccos(slanted.rotation[2, 2]) - 1e-3, abs=1e-6)
 
 
-def test_upside_down_is_not_upright() -> None:
+def test_object_placed_at_a_point_may_stay_upside_down() -> None:
     scene = place_object(
         make_hall(), "stick", pin.SE3(pin.utils.rotate("y", np.pi), ASIDE.translation)
     )
-    stands = Script(scene).go(move_base(scene.start, x=-0.5)).motion()
+    stands = MotionBuilder(scene).go(move_base(scene.start, x=-0.5)).motion()
     assert judge(scene, [vkc.Place("stick", ASIDE.translation)], stands).ok
     assert get_only_violation(judge(scene, [PLACED], stands)).amount == pytest.approx(
         np.pi - 1e-3, abs=1e-6
     )
-    lying = carry_over(make_hall()).motion()
+    lying = make_carrying_motion(make_hall()).motion()
     turned = place_object(
         make_hall(),
         "stick",
@@ -305,14 +309,14 @@ def test_upside_down_is_not_upright() -> None:
     report = judge(turned, [vkc.Place("stick", (0.8, 0.5, 0.55))], lying)
     assert ("goal", "stick.stick") not in get_violation_names(
         report
-    )  # it stands as it stood, wherever its top is
+    )  # its orientation has not changed
     assert ("closure", "stick.grip") in get_violation_names(
         report
-    )  # but nobody can take it from there
+    )  # but the hand cannot grasp it there
 
 
 def test_object_must_be_released() -> None:
-    script = carry_over(make_hall())
+    script = make_carrying_motion(make_hall())
     script.phases[5] = PhaseSpan(
         "stay", script.phases[4].last, script.phases[4].last + 2, script.phases[4].holds
     )
@@ -327,7 +331,7 @@ def test_object_must_be_released() -> None:
 
 
 def test_placed_object_must_not_be_moved_again() -> None:
-    script = carry_over(make_hall())
+    script = make_carrying_motion(make_hall())
     down = script.rows[script.phases[4].last]
     script.go(down).take("stick").go(move_base(down, y=-0.3)).let_go()
     motion = script.go(move_base(solve_above(STICK), y=0.2)).motion()
@@ -343,10 +347,10 @@ def test_placed_object_must_not_be_moved_again() -> None:
 
 
 def test_object_must_not_be_moved_before_its_step() -> None:
-    script = carry_over(make_hall())
+    script = make_carrying_motion(make_hall())
     motion = script.go(move_base(make_hall().start, y=1.0)).motion()
     assert judge(make_hall(), [PLACED, vkc.GoTo(0.0, 1.0)], motion).ok
-    back = carry_over(make_hall()).motion()
+    back = make_carrying_motion(make_hall()).motion()
     (x, y) = back.positions[-1, :2]
     assert get_violation_names(
         judge(make_hall(), [vkc.GoTo(float(x), float(y)), PLACED], back)
@@ -354,7 +358,7 @@ def test_object_must_not_be_moved_before_its_step() -> None:
 
 
 def test_grasped_object_must_stay_grasped() -> None:
-    motion = carry_over(make_hall()).motion()
+    motion = make_carrying_motion(make_hall()).motion()
     goto = vkc.GoTo(*map(float, motion.positions[-1, :2]))
     assert judge(make_hall(), [vkc.Grasp("stick"), vkc.Release(), goto], motion).ok
     found = get_only_violation(judge(make_hall(), [vkc.Grasp("stick"), goto], motion))
@@ -362,9 +366,11 @@ def test_grasped_object_must_stay_grasped() -> None:
     assert "not grasped" in found.detail
 
 
-def test_grasp_at_the_end_of_the_motion() -> None:
+def test_grasp_steps_may_end_the_motion() -> None:
     up = solve_above(STICK)
-    motion = Script(make_hall()).go(up).go(solve_reach(compute_grasp_pose(STICK), up)).motion()
+    motion = (
+        MotionBuilder(make_hall()).go(up).go(solve_reach(compute_grasp_pose(STICK), up)).motion()
+    )
     grasp, here = vkc.Grasp("stick"), vkc.GoTo(*map(float, motion.positions[-1, :2]))
     for steps in ([grasp], [grasp, grasp], [here, grasp, grasp]):
         assert judge(make_hall(), steps, motion).ok, steps
@@ -373,14 +379,14 @@ def test_grasp_at_the_end_of_the_motion() -> None:
 
 
 @cache
-def touch_wall(gap: float = 0.0) -> tuple[Scene, Script, np.ndarray]:
+def touch_wall(gap: float = 0.0) -> tuple[Scene, MotionBuilder, np.ndarray]:
     """Return scene, motion and position of a touch, `gap` [m] in front of a wall."""
     held = make_room().with_held({"stick": "grip"})
     there = move_base(held.start, y=0.4)
     tip = compute_tip_position(held, there)
     wall = describe_box("wall", [0.3, 0.1, 0.3], tip + np.array([0.0, gap + 0.05, 0.0]))
     scene = make_room(wall).with_held({"stick": "grip"})
-    return scene, Script(scene).go(there).go(np.array(scene.start)), tip
+    return scene, MotionBuilder(scene).go(there).go(np.array(scene.start)), tip
 
 
 def judge_touch(gap: float, steps: Sequence[vkc.Touch | vkc.GoTo]) -> Report:
@@ -393,12 +399,12 @@ def test_touch_permits_contact(gap: float) -> None:
     _, _, tip = touch_wall(gap)
     report = judge_touch(gap, [vkc.Touch("stick.tip", tip)])
     assert report.ok, "\n".join(report.lines())
-    unasked = judge_touch(gap, [vkc.GoTo(0.0, 0.4)])
-    assert get_violation_names(unasked) <= {
+    without_touch = judge_touch(gap, [vkc.GoTo(0.0, 0.4)])
+    assert get_violation_names(without_touch) <= {
         ("clearance", "stick.tip – wall"),
         ("penetration", "stick.tip – wall"),
     }
-    assert get_violation_names(unasked)
+    assert get_violation_names(without_touch)
 
 
 def test_touch_permits_no_penetration() -> None:
@@ -415,18 +421,20 @@ def test_touch_permits_contact_of_its_link_only() -> None:
     assert ("penetration", "stick.tip – wall") in get_violation_names(report)
 
 
-@pytest.mark.parametrize("side", SIDES, ids=str)
-def test_position_error_of_a_touch(side: np.ndarray) -> None:
+@pytest.mark.parametrize("direction", DIRECTIONS, ids=str)
+def test_position_error_of_a_touch_is_reported(direction: np.ndarray) -> None:
     _, _, tip = touch_wall(1e-3)
-    found = get_only_violation(judge_touch(1e-3, [vkc.Touch("stick.tip", tip + 1.5e-3 * side)]))
+    found = get_only_violation(
+        judge_touch(1e-3, [vkc.Touch("stick.tip", tip + 1.5e-3 * direction)])
+    )
     assert (found.constraint, found.subject, found.unit) == ("goal", "stick.tip", "m")
     assert found.amount == pytest.approx(0.5e-3, abs=1e-8)
-    assert judge_touch(1e-3, [vkc.Touch("stick.tip", tip + 0.9e-3 * side)]).ok
+    assert judge_touch(1e-3, [vkc.Touch("stick.tip", tip + 0.9e-3 * direction)]).ok
 
 
-def test_orientation_error_of_a_touch() -> None:
+def test_orientation_error_of_a_touch_is_reported() -> None:
     _, _, tip = touch_wall(1e-3)
-    looking = pin.SE3(pin.utils.rotate("x", -np.pi / 2), tip)  # z along y, as the stick lies
+    looking = pin.SE3(pin.utils.rotate("x", -np.pi / 2), tip)  # z along y, like the stick
     assert judge_touch(1e-3, [vkc.Touch("stick.tip", looking)]).ok
     turned = looking * pin.SE3(pin.exp3(np.array([0.0, 0.0, 0.01])), np.zeros(3))
     found = get_only_violation(judge_touch(1e-3, [vkc.Touch("stick.tip", turned)]))
@@ -456,9 +464,9 @@ def test_free_objects_may_be_touched() -> None:
         .with_held({"stick": "grip"})
         .with_start(base=start[:3], arm=start[3:])
     )
-    motion = Script(scene).go(there).motion()
-    side = BALL.translation - np.array([0.0, 0.035, 0.0])
-    report = judge(scene, [vkc.Touch("stick.tip", side)], motion)
+    motion = MotionBuilder(scene).go(there).motion()
+    contact = BALL.translation - np.array([0.0, 0.035, 0.0])
+    report = judge(scene, [vkc.Touch("stick.tip", contact)], motion)
     assert report.ok, "\n".join(report.lines())
     assert get_violation_names(judge(scene, [vkc.GoTo(0.0, 0.0)], motion)) & {
         ("clearance", "stick.tip – ball.ball"),
@@ -472,7 +480,7 @@ def test_free_objects_may_be_touched() -> None:
 )
 def test_object_may_rest_on_a_table_but_not_penetrate_it(gap: float, ok: bool) -> None:
     scene = make_room(describe_table(gap=gap))
-    report = judge(scene, [PLACED], carry_over(scene).motion())
+    report = judge(scene, [PLACED], make_carrying_motion(scene).motion())
     assert report.ok == ok, "\n".join(report.lines())
     if not ok:
         found = get_only_violation(report)
@@ -483,7 +491,7 @@ def test_object_may_rest_on_a_table_but_not_penetrate_it(gap: float, ok: bool) -
 def test_only_supports_may_be_close() -> None:
     down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
     passing = (
-        Script(make_hall())
+        MotionBuilder(make_hall())
         .go(down)
         .take("stick")
         .go(np.array(make_hall().start))
@@ -500,18 +508,18 @@ def test_only_supports_may_be_close() -> None:
     assert get_only_violation(report).amount == pytest.approx(0.01 - 1e-3, abs=1e-4)
 
 
-def test_neighbour_at_the_grasp_may_be_close_but_not_passed() -> None:
+def test_neighbour_at_the_grasp_may_be_close_but_not_penetrated() -> None:
     fence = describe_box("fence", [0.6, 0.001, 0.1], [0.8, 0.262, 0.56])
     scene = make_room(describe_table(), fence)
     down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
-    through = Script(scene).go(down).take("stick").go(move_base(down, y=0.6)).motion()
+    through = MotionBuilder(scene).go(down).take("stick").go(move_base(down, y=0.6)).motion()
     report = judge(scene, [vkc.GoTo(0.0, 0.6)], through)
     assert {
         ("penetration", "stick.tip – fence"),
         ("penetration", "stick.stick – fence"),
     } <= get_violation_names(report)
     over = (
-        Script(scene)
+        MotionBuilder(scene)
         .go(down)
         .take("stick")
         .go(np.array(scene.start))
@@ -523,7 +531,7 @@ def test_neighbour_at_the_grasp_may_be_close_but_not_passed() -> None:
 
 def test_grasped_object_must_not_hit_the_floor() -> None:
     hanging = pin.utils.rotate("x", -np.pi / 2)  # the stick's y points down
-    heights = (0.3, 0.24)  # of its middle: the tip is 0.25 below
+    heights = (0.3, 0.24)  # of the stick's middle, 0.25 m above its tip
     rows = [
         solve_reach(
             compute_grasp_pose(pin.SE3(hanging, np.array([0.9, 0.0, z])), values=(0.0, 0.0))
@@ -534,14 +542,14 @@ def test_grasped_object_must_not_hit_the_floor() -> None:
         compute_grasp_pose(pin.SE3(hanging, np.array([0.9, 0.0, heights[1]]))), rows[0]
     )
     scene = make_room().with_held({"stick": "grip"}).with_start(arm=rows[0][3:])
-    motion = Script(scene).go(rows[1]).motion()
+    motion = MotionBuilder(scene).go(rows[1]).motion()
     report = judge(scene, [vkc.GoTo(0.0, 0.0)], motion)
     found = next(v for v in report.violations if v.subject.endswith(" – floor"))
     assert (found.constraint, found.subject) == ("penetration", "stick.tip – floor")
     assert found.amount == pytest.approx(0.01, abs=1e-5)
     assert found.waypoint == len(motion.times) - 1
     higher = (
-        Script(scene)
+        MotionBuilder(scene)
         .go(solve_reach(compute_grasp_pose(pin.SE3(hanging, np.array([0.9, 0.0, 0.275]))), rows[0]))
         .motion()
     )
@@ -555,11 +563,11 @@ def test_grasped_object_must_not_hit_the_floor() -> None:
 def test_grasped_object_must_not_hit_the_robot() -> None:
     scene = make_room().with_held({"stick": "grip"})
     bent = np.array(scene.start)
-    bent[6] -= 2.36  # the wrist, so that the dowel comes back to the forearm
-    report = judge(scene, [vkc.GoTo(0.0, 0.0)], Script(scene).go(bent).motion())
+    bent[6] -= 2.36  # bends the wrist until the stick hits the forearm
+    report = judge(scene, [vkc.GoTo(0.0, 0.0)], MotionBuilder(scene).go(bent).motion())
     assert get_violation_names(report) == {("penetration", "forearm_link – stick.stick")}
     assert judge(
-        make_room(), [vkc.GoTo(0.0, 0.0)], Script(make_room()).go(bent).motion()
+        make_room(), [vkc.GoTo(0.0, 0.0)], MotionBuilder(make_room()).go(bent).motion()
     ).ok  # the robot alone
 
 
@@ -571,7 +579,7 @@ def test_grasped_object_must_not_hit_free_objects() -> None:
     )
     scene = scene.with_start(arm=start[3:])
     for forward, constraint in ((0.08, None), (0.1, "clearance"), (0.125, "penetration")):
-        motion = Script(scene).go(move_base(start, y=forward)).motion()
+        motion = MotionBuilder(scene).go(move_base(start, y=forward)).motion()
         report = judge(scene, [vkc.GoTo(0.0, forward)], motion)
         assert get_violation_names(report) == (
             {(constraint, "stick.tip – ball.ball")} if constraint else set()
@@ -579,14 +587,16 @@ def test_grasped_object_must_not_hit_free_objects() -> None:
 
 
 def test_fingers_must_not_penetrate_the_grasped_object() -> None:
-    """The grasp lies 3 cm deeper in the hand, so that the palm overlaps the stick."""
+    """The grasp is 3 cm deeper in the hand, so that the palm overlaps the stick."""
     deep = replace_grasp(make_hall(), "stick", "grip", standoff=-0.03)
     up = solve_reach(
         compute_grasp_pose(lift(STICK)) * pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.04])),
         solve_above(STICK),
     )
     scene = deep.with_held({"stick": "grip"}).with_start(arm=up[3:])
-    report = judge(scene, [vkc.GoTo(0.0, 0.3)], Script(scene).go(move_base(up, y=0.3)).motion())
+    report = judge(
+        scene, [vkc.GoTo(0.0, 0.3)], MotionBuilder(scene).go(move_base(up, y=0.3)).motion()
+    )
     assert {v.constraint for v in report.violations} == {"penetration"}
     assert {v.subject.split(" – ")[0] for v in report.violations} <= set(
         make_hall().robot.touch_links
@@ -595,8 +605,8 @@ def test_fingers_must_not_penetrate_the_grasped_object() -> None:
 
 
 @cache
-def fetch_ball(off: float = 0.0) -> Script:
-    """Bring the tip to `off` [m] before the ball, and carry the ball to the second stand."""
+def fetch_ball(off: float = 0.0) -> MotionBuilder:
+    """Move the tip to `off` [m] in front of the ball, and carry the ball to the second stand."""
     scene = make_room(
         describe_stand(), describe_stand("stand_2", aside=0.3), objects=("stick", "ball")
     )
@@ -606,7 +616,10 @@ def fetch_ball(off: float = 0.0) -> Script:
     start = move_base(touch, y=-0.1)
     scene = scene.with_held({"stick": "grip"}).with_start(base=start[:3], arm=start[3:])
     script = (
-        Script(scene).go(touch).take("ball", "pull", (np.pi / 2, 0.0, 0.0), by="stick.tip").go(up)
+        MotionBuilder(scene)
+        .go(touch)
+        .take("ball", "pull", (np.pi / 2, 0.0, 0.0), by="stick.tip")
+        .go(up)
     )
     script.go(move_base(up, y=0.3)).go(move_base(touch, y=0.3)).let_go("ball")
     return script.go(move_base(touch, y=0.26))
@@ -615,7 +628,7 @@ def fetch_ball(off: float = 0.0) -> Script:
 FETCHED = vkc.Place("ball", lift(BALL, [0.0, 0.3, 0.0]))
 
 
-def test_position_error_of_a_grasp_by_a_tool() -> None:
+def test_position_error_of_a_grasp_by_a_tool_is_reported() -> None:
     report = judge(fetch_ball(2e-3).scene, [FETCHED], fetch_ball(2e-3).motion())
     found = get_only_violation(report)
     assert (found.constraint, found.subject, found.unit) == ("closure", "ball.pull", "m")
@@ -627,10 +640,12 @@ def test_position_error_of_a_grasp_by_a_tool() -> None:
     )
     assert ("goal", "ball.pull") in get_violation_names(grasped)
     by_hand = judge(fetch_ball().scene, [vkc.Grasp("ball", "pull"), FETCHED], fetch_ball().motion())
-    assert ("goal", "ball.pull") in get_violation_names(by_hand)  # the hand itself never was there
+    assert ("goal", "ball.pull") in get_violation_names(
+        by_hand
+    )  # the hand itself never reaches the ball
 
 
-def test_tool_must_not_penetrate_what_it_grasps() -> None:
+def test_tool_must_not_penetrate_the_grasped_object() -> None:
     assert judge(fetch_ball(-5e-5).scene, [FETCHED], fetch_ball(-5e-5).motion()).ok
     report = judge(fetch_ball(-5e-4).scene, [FETCHED], fetch_ball(-5e-4).motion())
     assert get_violation_names(report) == {("penetration", "stick.tip – ball.ball")}
@@ -661,19 +676,19 @@ def test_object_grasped_by_a_tool_requires_the_tool() -> None:
 )
 def test_steps_with_unknown_names_are_refused(step: object, field: str, nearest: str) -> None:
     with pytest.raises(UnknownNameError) as caught:
-        judge(make_hall(), [step], carry_over(make_hall()).motion())
+        judge(make_hall(), [step], make_carrying_motion(make_hall()).motion())
     assert (caught.value.field, caught.value.nearest) == (field, nearest)
 
 
 def test_trajectories_with_missing_columns_or_frames_are_refused() -> None:
-    full = carry_over(make_hall()).motion()
-    names_without = tuple(name for name in full.names if name != "stick.grip_slide")
-    kept = [full.names.index(name) for name in names_without]
-    lacking = Trajectory(
-        names_without, full.times, full.positions[:, kept], full.phases, full.robot_size
+    full = make_carrying_motion(make_hall()).motion()
+    names = tuple(name for name in full.names if name != "stick.grip_slide")
+    columns = [full.names.index(name) for name in names]
+    incomplete = Trajectory(
+        names, full.times, full.positions[:, columns], full.phases, full.robot_size
     )
     with pytest.raises(InputError, match="missing") as caught:
-        judge(make_hall(), [PLACED], lacking)
+        judge(make_hall(), [PLACED], incomplete)
     assert caught.value.expected == "stick.grip_slide"
     script = fetch_ball()
     data = script.motion().to_dict()

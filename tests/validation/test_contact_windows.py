@@ -1,4 +1,4 @@
-"""Windows: which pairs may be close, when, and which overlap counts as contact."""
+"""Tests which pairs may be close, when, and which overlap counts as contact."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from helpers.carrying import (
     STICK,
     TOP,
-    Script,
+    MotionBuilder,
     compute_grasp_pose,
     describe_box,
     describe_stand,
@@ -24,11 +24,11 @@ from helpers.carrying import (
     solve_above,
     solve_reach,
 )
-from helpers.drawers import add_boxes, load_drawer_scene, replace_drawer_fields
+from helpers.drawers import add_boxes, load_drawer_scene, replace_scene_fields
 from helpers.drives import drive_through, make_trajectory
 from helpers.grippers import write_cheeks_scene, write_gripper
-from helpers.riding import make_plate_scene, slide_plate
 from helpers.small_problems import load_door_scene
+from helpers.supports import make_plate_scene, slide_plate
 
 from vkc_pin.options import Options
 from vkc_pin.validation.contact_windows import check_gripper, check_pushes, find_contact_windows
@@ -67,51 +67,52 @@ def find_windows(
             assert window.contact == (
                 0.0 if by_hand and not window.moves_together else CONTACT_DEPTH
             )
-            at = found.setdefault((first, second), [])
-            at += [(window.first, window.last)] * ((window.first, window.last) not in at)
-    return {pair: sorted(at) for pair, at in found.items()}
+            intervals = found.setdefault((first, second), [])
+            interval = (window.first, window.last)
+            intervals += [interval] * (interval not in intervals)
+    return {pair: sorted(intervals) for pair, intervals in found.items()}
 
 
-def stand_still(scene: Scene) -> Trajectory:
+def make_stationary_motion(scene: Scene) -> Trajectory:
     return make_trajectory(scene, np.tile(scene.start, (11, 1)))
 
 
 DOOR, TIP = ("door.frame", "door.panel"), ("stick.tip",)
 
 
-def expect_hand_windows(
+def make_hand_windows(
     label: str,
     near: tuple[int, int],
     held: tuple[int, int] | None = None,
     others: Sequence[str] = (),
 ) -> dict[tuple[str, str], list[tuple[int, int]]]:
-    """Return the windows of the hand with a grasped link and with the object's others."""
+    """Return the expected windows of the hand with a grasped link and the object's other links."""
     found = {(link, other): [near] for link in HANDS for other in (label, *others)}
     return found | {(link, label): sorted({near, held or near}) for link in HANDS}
 
 
-def test_windows_of_a_grasp() -> None:
+def test_hand_may_be_close_to_a_grasped_object() -> None:
     door = load_door_scene()
-    assert find_windows(door, stand_still(door)) == {}
+    assert find_windows(door, make_stationary_motion(door)) == {}
     assert (
-        find_windows(door, stand_still(door), [Actuate("door", {"hinge": 1.0})]) == {}
-    )  # the motion says where it is held
+        find_windows(door, make_stationary_motion(door), [Actuate("door", {"hinge": 1.0})]) == {}
+    )  # the holds of the motion decide
     assert find_windows(
-        door.with_held({"door": "handle"}), stand_still(door)
-    ) == expect_hand_windows("door.lever", (0, 10), (0, 0), DOOR)  # let go of at once
+        door.with_held({"door": "handle"}), make_stationary_motion(door)
+    ) == make_hand_windows("door.lever", (0, 10), (0, 0), DOOR)  # released at once
     motion, hold = (
         drive_through(door, door.start, move_base(door.start, y=0.3)),
         (Hold("door", "handle"),),
     )
     spans = (PhaseSpan("reach", 0, 15), PhaseSpan("hold", 15, 30, hold), PhaseSpan("leave", 30, 40))
     held = dataclasses.replace(motion, phases=spans)
-    assert find_windows(door, held) == expect_hand_windows(
+    assert find_windows(door, held) == make_hand_windows(
         "door.lever", (15 - STEPS, 30 + STEPS), (15, 30), DOOR
     )
 
 
 @pytest.mark.parametrize(("back", "is_wrong"), [(0.9 * CONTACT_DEPTH, False), (0.05, True)])
-def test_pushed_links_may_not_go_back(back: float, is_wrong: bool) -> None:
+def test_pushed_links_must_not_move_back(back: float, is_wrong: bool) -> None:
     scene = load_drawer_scene()
     slide = 0.3 - np.cumsum([0.0, 0.1, 0.0, -back, 0.1])
     push = Hold("drawer", "push")
@@ -127,15 +128,15 @@ def test_pushed_links_may_not_go_back(back: float, is_wrong: bool) -> None:
         assert one.amount == pytest.approx(back - CONTACT_DEPTH, abs=1e-9)
 
 
-def test_windows_of_a_grasp_step_without_hold() -> None:
+def test_hand_may_be_close_to_the_object_of_a_grasp_step_without_hold() -> None:
     scene = make_room(describe_table())
     there = (
-        Script(scene)
+        MotionBuilder(scene)
         .go(solve_reach(compute_grasp_pose(STICK), solve_above(STICK)))
         .go(np.array(scene.start))
     )
     assert find_windows(scene, there.motion()) == {}
-    assert find_windows(scene, there.motion(), [Grasp("stick")]) == expect_hand_windows(
+    assert find_windows(scene, there.motion(), [Grasp("stick")]) == make_hand_windows(
         "stick.stick", (20 - STEPS, 20 + STEPS), others=TIP
     )
 
@@ -162,10 +163,10 @@ def test_only_rigid_grasps_move_together(attachment: str, rigid: bool) -> None:
     )
 
 
-def carry_stick(scene: Scene, *, aside: float = 0.5) -> Script:
+def carry_stick(scene: Scene, *, aside: float = 0.5) -> MotionBuilder:
     down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
     script = (
-        Script(scene)
+        MotionBuilder(scene)
         .go(down)
         .take("stick")
         .go(np.array(scene.start))
@@ -174,7 +175,7 @@ def carry_stick(scene: Scene, *, aside: float = 0.5) -> Script:
     return script.go(move_base(down, y=aside)).let_go().go(move_base(scene.start, y=aside))
 
 
-def test_windows_of_a_carried_object_with_its_supports() -> None:
+def test_carried_object_may_be_close_to_its_supports() -> None:
     short = describe_box("board", [0.5, 0.6, 0.02], [0.8, 0.0, TOP - 0.011])
     other = describe_box("other", [0.5, 0.6, 0.02], [0.8, 1.0, TOP - 0.011])
     between = describe_box(
@@ -187,7 +188,7 @@ def test_windows_of_a_carried_object_with_its_supports() -> None:
     scene = make_room(short, other, between, beside, far)
     taken, left = (20, 20 + STEPS), (80 - STEPS, 80)
     assert find_windows(scene, carry_stick(scene, aside=1.0).motion(), dist_safe=0.055) == {
-        **expect_hand_windows("stick.stick", (20 - STEPS, 80 + STEPS), (20, 80), TIP),
+        **make_hand_windows("stick.stick", (20 - STEPS, 80 + STEPS), (20, 80), TIP),
         ("stick.stick", "board"): [taken],
         ("stick.tip", "board"): [taken],
         ("stick.stick", "near"): [taken],
@@ -196,33 +197,33 @@ def test_windows_of_a_carried_object_with_its_supports() -> None:
     }
     wide = find_windows(
         scene, carry_stick(scene, aside=1.0).motion(), dist_safe=0.15
-    )  # the wrist is that close when the hand closes
+    )  # the wrist is within 0.15 m at the grasp
     assert {pair for pair in wide if pair[0] in set(scene.robot.links)} == set(
-        expect_hand_windows("stick.stick", (0, 0), others=TIP)
+        make_hand_windows("stick.stick", (0, 0), others=TIP)
     )
     tight = find_windows(scene, carry_stick(scene, aside=1.0).motion(), dist_safe=1e-3 / 2)
     assert (
-        tight.keys() == expect_hand_windows("stick.stick", (0, 0), others=TIP).keys()
-    )  # everything is 1 mm away at least
+        tight.keys() == make_hand_windows("stick.stick", (0, 0), others=TIP).keys()
+    )  # all supports are at least 1 mm away
 
 
-def test_windows_of_an_object_grasped_at_the_start() -> None:
+def test_object_grasped_at_the_start_may_be_close_to_its_support() -> None:
     scene = make_room(describe_table()).with_held({"stick": "grip"})
     low = scene.with_start(arm=solve_reach(compute_grasp_pose(STICK), solve_above(STICK))[3:])
-    drive = Script(low).go(move_base(low.start, y=0.3)).motion()
+    drive = MotionBuilder(low).go(move_base(low.start, y=0.3)).motion()
     assert find_windows(low, drive) == {
-        **expect_hand_windows("stick.stick", (0, 20), others=TIP),
+        **make_hand_windows("stick.stick", (0, 20), others=TIP),
         ("stick.stick", "table"): [(0, STEPS)],
     }
     left = (
-        Script(low)
+        MotionBuilder(low)
         .go(move_base(low.start, y=0.3))
         .let_go()
         .go(move_base(low.start, y=0.3, x=-0.1))
         .motion()
     )
     assert find_windows(low, left) == {
-        **expect_hand_windows("stick.stick", (0, 20 + STEPS), (0, 20), TIP),
+        **make_hand_windows("stick.stick", (0, 20 + STEPS), (0, 20), TIP),
         ("stick.stick", "table"): [(0, STEPS), (20 - STEPS, 20)],
     }
 
@@ -234,7 +235,7 @@ def test_windows_of_an_object_grasped_at_the_start() -> None:
             0.005,
             [],
             (2, 6, 0.0, CONTACT_DEPTH, False, True),
-        ),  # until the front, 18 mm thick, has left it by √(20² - 5²) mm
+        ),  # until the front, 18 mm thick, is √(20² - 5²) mm past it
         (-0.002, [], (2, 6, -np.inf, np.inf, True, True)),
         (
             -0.002,
@@ -243,7 +244,7 @@ def test_windows_of_an_object_grasped_at_the_start() -> None:
         ),
     ],
 )
-def test_windows_of_clearance_exemptions(
+def test_exempt_pairs_may_be_close(
     gap: float, allow: list[object], expected: tuple[float, ...]
 ) -> None:
     with warnings.catch_warnings():
@@ -251,7 +252,7 @@ def test_windows_of_clearance_exemptions(
         side = add_boxes(
             load_drawer_scene(), side=((0.4, 0.1, 0.9), (2.085, 0.295 + gap + 0.05, 0.45))
         )
-        scene = replace_drawer_fields(side, allow=allow).with_state("drawer", {"slide": 0.3})
+        scene = replace_scene_fields(side, allow=allow).with_state("drawer", {"slide": 0.3})
     slide = np.array([0.3, 0.1, 0.03, 0.0, 0.0, 0.0, 0.03, 0.1, 0.3])
     rows = np.column_stack([np.tile(scene.start, (9, 1)), slide])
     motion = Trajectory(
@@ -284,7 +285,7 @@ def test_initial_penetration_is_exempt_once() -> None:
         scene = make_room(describe_table(gap=-0.002))
     down, up = solve_reach(compute_grasp_pose(STICK), solve_above(STICK)), np.array(scene.start)
     script = (
-        Script(scene)
+        MotionBuilder(scene)
         .go(down)
         .take("stick")
         .go(up)
@@ -316,38 +317,38 @@ def test_initial_penetration_is_exempt_once() -> None:
 
 
 @pytest.mark.parametrize(("gap", "listed"), [(0.0, []), (-0.002, ["stick.stick – table"])])
-def test_exemptions_list_overlaps_but_not_touches(gap: float, listed: list[str]) -> None:
+def test_exemptions_list_overlaps_but_not_contacts(gap: float, listed: list[str]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         scene = make_room(describe_table(gap=gap))
     down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
-    motion = Script(scene).go(down).take("stick").go(np.array(scene.start)).motion()
+    motion = MotionBuilder(scene).go(down).take("stick").go(np.array(scene.start)).motion()
     report = validate(scene, [Grasp("stick")], motion, Options())
     assert [one.subject for one in report.exemptions] == listed
 
 
-def test_windows_of_a_grasp_by_a_tool() -> None:
+def test_tool_may_be_close_to_its_grasped_object() -> None:
     scene = make_room(describe_stand(), objects=("stick", "ball")).with_held({"stick": "grip"})
     script = (
-        Script(scene)
+        MotionBuilder(scene)
         .take("ball", "pull", (0.0, 0.0, 0.0), by="stick.tip")
         .go(move_base(scene.start, y=0.5))
     )
     found = find_windows(scene, script.motion())
     assert found == {
-        **expect_hand_windows("stick.stick", (0, 20), others=TIP),
+        **make_hand_windows("stick.stick", (0, 20), others=TIP),
         ("stick.tip", "ball.ball"): [(0, 20)],
         ("ball.ball", "stand"): [(0, STEPS)],
     }
 
 
-def test_windows_of_a_touch() -> None:
+def test_touching_link_may_be_close_to_shapes_at_the_target() -> None:
     wall = describe_box("wall", [0.3, 0.1, 0.3], [0.8, 0.95, 0.75])  # its near side is at y = 0.9
     scene = make_room(describe_table(), wall).with_held({"stick": "grip"})
     tip = scene.objects["stick"].link_placement("tip").translation
     for gap, touches in ((0.0, True), (0.019, True), (0.021, False), (-0.05, True)):
         aside = 0.9 - gap - tip[1]
-        there = Script(
+        there = MotionBuilder(
             make_room(describe_table(), {**wall, "position": [tip[0], 0.95, tip[2]]}).with_held(
                 {"stick": "grip"}
             )
@@ -356,8 +357,8 @@ def test_windows_of_a_touch() -> None:
         target = tip + np.array([0.0, aside, 0.0])
         for goal in (tuple(target), pin.SE3(np.eye(3), target)):
             found = find_windows(there.scene, there.motion(), [Touch("stick.tip", goal)])
-            wanted = {("stick.tip", "wall"): [(20 - STEPS, 20 + STEPS)]} if touches else {}
-            assert found == {**expect_hand_windows("stick.stick", (0, 40), others=TIP), **wanted}
+            touch = {("stick.tip", "wall"): [(20 - STEPS, 20 + STEPS)]} if touches else {}
+            assert found == {**make_hand_windows("stick.stick", (0, 40), others=TIP), **touch}
         assert ("stick.tip", "wall") not in find_windows(
             there.scene, there.motion(), [Touch("stick.tip", tuple(target + 0.05))]
         )
@@ -376,11 +377,11 @@ def test_supported_objects_move_with_their_support() -> None:
 
 
 @pytest.mark.parametrize(
-    ("openings", "told"),
+    ("openings", "count"),
     [((0.04, 0.04, 0.04), 0), ((None, 0.04, 0.04), 1), ((0.04, None, 0.04), 1)],
 )
 def test_gripper_must_be_open_as_required(
-    tmp_path: Path, openings: tuple[float | None, ...], told: int
+    tmp_path: Path, openings: tuple[float | None, ...], count: int
 ) -> None:
     scene = write_cheeks_scene(write_gripper(tmp_path / "mine"), opening=0.04, start=0.04)
     rows, hold = np.tile(scene.start, (61, 1)), (Hold("drawer", "grip"),)
@@ -389,16 +390,16 @@ def test_gripper_must_be_open_as_required(
     found = list(
         check_gripper(Samples(scene, make_trajectory(scene, rows, phases=phases)), Options())
     )
-    assert [(one.constraint, one.subject) for one in found] == [("opening", "drawer.grip")] * told
+    assert [(one.constraint, one.subject) for one in found] == [("opening", "drawer.grip")] * count
 
 
-def test_windows_of_a_touch_of_a_free_object() -> None:
+def test_touching_link_may_be_close_to_a_free_object() -> None:
     scene = make_room(describe_table(), objects=("stick", "ball")).with_held({"stick": "grip"})
     tip = scene.objects["stick"].link_placement("tip").translation
     beside = place_object(scene, "ball", pin.SE3(np.eye(3), tip + np.array([0.0, 0.035, 0.0])))
     for there, touched in ((beside, True), (scene, False)):
         script = (
-            Script(there)
+            MotionBuilder(there)
             .go(move_base(there.start, x=-0.1), steps=2 * STEPS)
             .go(there.start, steps=2 * STEPS)
         )
@@ -407,25 +408,27 @@ def test_windows_of_a_touch_of_a_free_object() -> None:
         )
         assert ((3 * STEPS, 4 * STEPS) in found) == touched
     inside = [Touch("ball.ball", tuple(tip + np.array([0.0, 0.035, 0.0])))]
-    found = find_windows(beside, Script(beside).wait().motion(), inside)
+    found = find_windows(beside, MotionBuilder(beside).wait().motion(), inside)
     assert found == {
-        **expect_hand_windows("stick.stick", (0, 2), others=TIP),
+        **make_hand_windows("stick.stick", (0, 2), others=TIP),
         ("stick.tip", "ball.ball"): [(0, 2)],
     }
 
 
 @pytest.mark.parametrize(("dt", "last"), [(0.25, 4), (1.0, 4), (0.125, 8)])
-def test_window_lasts_a_second_or_as_many_moving_steps(dt: float, last: int) -> None:
+def test_window_lasts_one_second_but_at_least_four_moving_steps(dt: float, last: int) -> None:
     scene = make_room(describe_table()).with_held({"stick": "grip"})
     low = scene.with_start(arm=solve_reach(compute_grasp_pose(STICK), solve_above(STICK))[3:])
     there, pair = move_base(low.start, y=0.3), ("stick.stick", "table")
-    assert find_windows(low, Script(low).go(there).motion(dt=dt))[pair] == [(0, last)]
-    if dt == 1.0:  # two steps in which nothing moves do not count
-        assert find_windows(low, Script(low).wait().go(there).motion(dt=dt))[pair] == [(0, 6)]
+    assert find_windows(low, MotionBuilder(low).go(there).motion(dt=dt))[pair] == [(0, last)]
+    if dt == 1.0:  # two steps at rest do not count
+        assert find_windows(low, MotionBuilder(low).wait().go(there).motion(dt=dt))[pair] == [
+            (0, 6)
+        ]
 
 
 @pytest.mark.parametrize(
-    ("way", "rest"),
+    ("positions", "rest"),
     [
         ([0, 1, 2, 2, 2, 3, 4], 2.0),
         ([0, 1, 2, 2, 3, 4, 5], 1.0),
@@ -435,11 +438,11 @@ def test_window_lasts_a_second_or_as_many_moving_steps(dt: float, last: int) -> 
         ([2, 2, 3, 3, 4, 4, 4], 1.0),
     ],
 )
-def test_robot_must_rest_where_it_grasps(way: list[float], rest: float) -> None:
+def test_robot_must_rest_at_a_grasp(positions: list[float], rest: float) -> None:
     """The door may move meanwhile."""
     scene, hold = load_door_scene(), (Hold("door", "handle"),)
     rows = np.column_stack([np.tile(scene.start, (7, 1)), 0.01 * np.arange(7), np.zeros(7)])
-    rows[:, 0] += 0.01 * np.array(way)
+    rows[:, 0] += 0.01 * np.array(positions)
     names = (*scene.robot.coordinates.names, "door.hinge", "door.knob")
     phases = (PhaseSpan("reach", 0, 3), PhaseSpan("move", 3, 6, hold))
     motion = Trajectory(names, np.arange(7.0), rows, phases, 9)
@@ -451,13 +454,15 @@ def test_robot_must_rest_where_it_grasps(way: list[float], rest: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("way", "rest"), [([0, 1, 2, 3, 3, 3, 4], 2.0), ([0, 3, 3, 3, 4, 5, 6], 0.0)]
+    ("positions", "rest"), [([0, 1, 2, 3, 3, 3, 4], 2.0), ([0, 3, 3, 3, 4, 5, 6], 0.0)]
 )
-def test_robot_must_rest_while_fingers_move(tmp_path: Path, way: list[float], rest: float) -> None:
-    """Fingers begin to move where the phase begins."""
+def test_robot_must_rest_while_fingers_move(
+    tmp_path: Path, positions: list[float], rest: float
+) -> None:
+    """Fingers begin to move at the beginning of the phase."""
     scene = write_cheeks_scene(write_gripper(tmp_path / "mine"), start=0.05)
     rows = np.tile(scene.start, (7, 1))
-    rows[:, 0] += 0.01 * np.array(way)
+    rows[:, 0] += 0.01 * np.array(positions)
     phases = (PhaseSpan("one", 0, 3, (), 0.05), PhaseSpan("two", 3, 6, (), 0.02))
     motion = make_trajectory(scene, rows, dt=1.0, phases=phases)
     found = list(check_gripper(Samples(scene, motion), Options(grasp_time=2.0)))

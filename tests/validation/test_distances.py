@@ -1,4 +1,4 @@
-"""Distances of a world's shapes and their bounds agree with coal's for all pairs."""
+"""Tests distances of a world's shapes, and their bounds, against coal."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vkc_pin.validation.distances import POINT_RADIUS, CollisionShapes
 from vkc_pin.world.models.shapes import compute_shape_distance
 from vkc_pin.world.trajectory.world_model import World
 
-COAL = 1e-5  # [m]
+COAL = 1e-5  # accuracy of coal's distances [m]
 
 
 @cache
@@ -37,7 +37,7 @@ def place_shapes(q: np.ndarray) -> list[pin.SE3]:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_bounds_and_nearest_pair(seed: int) -> None:
+def test_distances_and_nearest_pair_agree_with_coal(seed: int) -> None:
     shapes, q = make_shapes().world.shapes, sample_configuration(seed)
     placed, at = make_shapes().place(q[None]), place_shapes(q)
     pairs = np.array(
@@ -58,14 +58,14 @@ def test_bounds_and_nearest_pair(seed: int) -> None:
     np.testing.assert_allclose(placed.compute_distances(first, pairs), expected, atol=COAL)
     bounds = placed.compute_lower_bounds(first, pairs)
     assert (bounds <= expected + COAL).all()
-    assert np.isfinite(bounds).mean() > 0.8, "and most say something"
+    assert np.isfinite(bounds).mean() > 0.8, "most bounds must be finite"
     ((best,), (least,)) = placed.find_nearest(pairs)
     assert least == pytest.approx(expected.min(), abs=COAL)
     assert expected[best] == pytest.approx(least, abs=COAL)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_shapes_near_a_point(seed: int) -> None:
+def test_shapes_near_a_point_are_found(seed: int) -> None:
     q, rng = sample_configuration(seed), np.random.default_rng(seed)
     placed, at = make_shapes().place(q[None]), place_shapes(q)
     counted = 0
@@ -81,17 +81,17 @@ def test_shapes_near_a_point(seed: int) -> None:
     assert counted > 0
 
 
-def test_many_configurations_give_the_results_of_single_ones() -> None:
+def test_results_of_many_configurations_are_those_of_single_ones() -> None:
     q = np.array([sample_configuration(seed) for seed in range(6)])
     together, count = make_shapes().place(q), make_shapes().body_count
     pairs = np.array(
         [(a, b) for a in range(count) for b in range(count, len(make_shapes().world.shapes))]
     )
-    which, distances = together.find_nearest(pairs)
+    nearest, distances = together.find_nearest(pairs)
     for state, row in enumerate(q):
         alone, none = make_shapes().place(row[None]), np.zeros(len(pairs), int)
         np.testing.assert_array_equal(
-            alone.find_nearest(pairs), ([which[state]], [distances[state]])
+            alone.find_nearest(pairs), ([nearest[state]], [distances[state]])
         )
         np.testing.assert_array_equal(
             alone.compute_distances(none, pairs), together.compute_distances(none + state, pairs)

@@ -1,4 +1,4 @@
-"""The table lists the pairs that can collide, with their clearances."""
+"""Tests the collision pairs of the table, and their clearances."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers.carrying import Script, describe_stand, describe_table, make_room, move_base
+from helpers.carrying import MotionBuilder, describe_stand, describe_table, make_room, move_base
 from helpers.motions import get_pair_names, make_random_door_motion
 from helpers.small_problems import load_door_scene, make_full_scene, make_program
 
@@ -29,17 +29,17 @@ def door() -> Scene:
     return load_door_scene()
 
 
-def test_pairs_of_robot_objects_and_walls(door: Scene) -> None:
+def test_robot_objects_and_walls_are_paired(door: Scene) -> None:
     motion = make_random_door_motion(door, 0, size=0.1)
     table = PairTable(door, CollisionShapes(World(door)), motion, 0.02)
-    robot, things = door.robot.collision, door.objects["door"].object.collision.geometryObjects
+    robot, shapes = door.robot.collision, door.objects["door"].object.collision.geometryObjects
     walls = [label for label in door.obstacle_labels if label != FLOOR]
     arm = [shape for shape in robot.geometryObjects if shape.parentJoint > 1]
-    leaves = [shape for shape in things if shape.parentJoint > 0]
+    leaves = [shape for shape in shapes if shape.parentJoint > 0]
     bodies = len(robot.geometryObjects)
     expected = (
         len(robot.collisionPairs)
-        + bodies * (len(things) + len(walls))
+        + bodies * (len(shapes) + len(walls))
         + len(arm)
         + len(leaves) * len(walls)
     )
@@ -66,10 +66,14 @@ def test_windows_change_margin_and_contact_of_their_pairs(door: Scene) -> None:
         assert {int(k): float(contact[k]) for k in np.flatnonzero(contact)} == (
             {3: 1e-4} if waypoint < 2 else {}
         )
-    for begin, as_one in ((0, [3]), (1, []), (2, [])):  # all the time between two waypoints
+    for begin, together in (
+        (0, [3]),
+        (1, []),
+        (2, []),
+    ):  # throughout the interval between two waypoints
         at = np.full(len(every), begin)
         np.testing.assert_array_equal(
-            np.flatnonzero(table.find_moving_together(every, at, at + 1)), as_one
+            np.flatnonzero(table.find_moving_together(every, at, at + 1)), together
         )
 
 
@@ -93,7 +97,7 @@ def test_windows_of_unlisted_pairs_have_no_effect(door: Scene) -> None:
     assert not table.get_contact_overlaps(every, np.zeros_like(every), np.ones_like(every)).any()
 
 
-def test_links_that_never_move_are_not_paired_with_obstacles() -> None:
+def test_static_links_are_not_paired_with_obstacles() -> None:
     scene = make_full_scene()
     names = (*scene.robot.coordinates.names, "cabinet.slide", "cabinet.swing")
     positions = np.vstack(
@@ -116,12 +120,12 @@ def test_links_that_never_move_are_not_paired_with_obstacles() -> None:
         assert {moving, "cabinet.lid"} not in paired
 
 
-def test_pairs_of_free_objects() -> None:
+def test_free_objects_are_paired_with_obstacles_while_carried() -> None:
     scene = make_room(describe_table(), describe_stand(), objects=("stick", "ball"))
-    still = Script(scene).go(move_base(scene.start, y=0.1)).motion()
-    carried = Script(scene).take("stick").go(move_base(scene.start, y=0.1)).motion()
+    still = MotionBuilder(scene).go(move_base(scene.start, y=0.1)).motion()
+    carried = MotionBuilder(scene).take("stick").go(move_base(scene.start, y=0.1)).motion()
 
-    def paired(motion: Trajectory) -> dict[str, set[str]]:
+    def find_partners(motion: Trajectory) -> dict[str, set[str]]:
         found = PairTable(scene, CollisionShapes(World(scene)), motion, 0.02)
         names: dict[str, set[str]] = {}
         for first, second in (get_pair_names(found, k) for k in range(len(found.pairs))):
@@ -130,20 +134,20 @@ def test_pairs_of_free_objects() -> None:
         return names
 
     robots = {scene.robot.link_of(i) for i in range(len(scene.robot.collision.geometryObjects))}
-    stands = paired(still)
+    partners = find_partners(still)
     for name in ("stick.stick", "stick.tip", "ball.ball"):
-        assert stands[name] == robots
-    moves = paired(carried)
+        assert partners[name] == robots
+    partners = find_partners(carried)
     for name in ("stick.stick", "stick.tip"):
-        assert moves[name] == robots | {"ball.ball", "table", "stand", FLOOR}
-    assert moves["ball.ball"] == robots | {"stick.stick", "stick.tip"}
+        assert partners[name] == robots | {"ball.ball", "table", "stand", FLOOR}
+    assert partners["ball.ball"] == robots | {"stick.stick", "stick.tip"}
 
 
-def test_close_pairs_move_in_their_phase() -> None:
+def test_close_pairs_are_those_that_move_in_the_phase() -> None:
     """The stick lies on a table, is carried, and lies there again."""
     scene = make_room(describe_table())
     script = (
-        Script(scene)
+        MotionBuilder(scene)
         .go(move_base(scene.start, y=0.1))
         .take("stick")
         .go(move_base(scene.start, y=0.3))
@@ -153,32 +157,32 @@ def test_close_pairs_move_in_their_phase() -> None:
     samples = Samples(scene, motion)
     solids = CollisionShapes(samples.world)
     found = PairTable(scene, solids, motion, 0.02)
-    lies = [
+    supports = [
         k
         for k in range(len(found.pairs))
         if {name.partition(".")[0] for name in get_pair_names(found, k)} == {"stick", "table"}
     ]
-    assert lies
+    assert supports
     still = np.zeros((1, len(found.groups)))
     placed = solids.place(samples.world.coordinates.q(samples.z[samples.waypoint_rows]))
     for waypoint in range(61):
         here = np.array([waypoint])
         _, pairs = found.find_close_pairs(placed, here, here, still, np.inf)
         assert (
-            set(lies) <= set(pairs.tolist())
+            set(supports) <= set(pairs.tolist())
             if 20 < waypoint <= 40
-            else set(lies).isdisjoint(pairs.tolist())
+            else set(supports).isdisjoint(pairs.tolist())
         )
-        if waypoint < 60:  # and on the way to the next
+        if waypoint < 60:  # and between this waypoint and the next
             _, pairs = found.find_close_pairs(placed, here, here + 1, still, np.inf)
             assert (
-                set(lies) <= set(pairs.tolist())
+                set(supports) <= set(pairs.tolist())
                 if 20 <= waypoint < 40
-                else set(lies).isdisjoint(pairs.tolist())
+                else set(supports).isdisjoint(pairs.tolist())
             )
 
 
-def test_self_collision_of_an_object() -> None:
+def test_links_of_an_object_are_paired() -> None:
     scene = load_scene("household")
     names = (*scene.robot.coordinates.names, "dishwasher.rack")
     rows = np.vstack([np.append(scene.start, value) for value in (0.0, 0.2)])
@@ -194,7 +198,7 @@ def test_self_collision_of_an_object() -> None:
     assert own == {("dishwasher.door", "dishwasher.rack")}
 
 
-def test_self_clearance_of_the_robot(door: Scene) -> None:
+def test_self_clearances_agree_with_the_program(door: Scene) -> None:
     first, second = next(iter(door.robot.own_margins(0.02)))
     one, other = sorted((door.robot.link_of(first), door.robot.link_of(second)))
     scene = dataclasses.replace(

@@ -1,4 +1,4 @@
-"""Reports as text, and as plain data and back."""
+"""Tests reports as text and as plain data."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ FULL = Report(
 )
 
 
-def test_text_of_violations() -> None:
+def test_lines_describe_the_violations() -> None:
     head = "validation  3 configurations checked: "
     assert Report(states=3).lines() == [head + "every constraint holds"]
     assert FULL.lines() == [
@@ -55,7 +55,7 @@ def test_text_of_violations() -> None:
     assert Report((LIMIT,) * 14).lines()[-1] == "  ... and 2 more"
 
 
-def test_text_of_limiting_constraints() -> None:
+def test_timing_describes_the_limiting_constraints() -> None:
     assert Report().timing() == []
     assert FULL.timing() == [
         "bounded by  base_x velocity 62 % (1.0 to 2.5 s), rest 25 % (0.0 to 1.0 s)",
@@ -68,17 +68,21 @@ def test_text_of_limiting_constraints() -> None:
     assert FULL.measures() == {"clearance": -0.01, "closure_error": 0.001, "torque": 0.5}
 
 
-@pytest.mark.parametrize(("off", "differs"), [(0.9e-5, False), (1.5e-5, True), (math.nan, True)])
+@pytest.mark.parametrize(
+    ("difference", "differs"), [(0.9e-5, False), (1.5e-5, True), (math.nan, True)]
+)
 @pytest.mark.parametrize("field", ["clearance", "closure_error", "closure_angle"])
-def test_contradictions_of_numbers(field: str, off: float, differs: bool) -> None:
+def test_contradictions_list_different_numbers(
+    field: str, difference: float, differs: bool
+) -> None:
     numbers = dict.fromkeys(("clearance", "closure_error", "closure_angle"), 0.5)
     for sign in (-1.0, 1.0):
-        other = Report(**{**numbers, field: 0.5 + sign * off})  # type: ignore[arg-type]
+        other = Report(**{**numbers, field: 0.5 + sign * difference})  # type: ignore[arg-type]
         lines = Report(**numbers).contradictions(other)  # type: ignore[arg-type]
         assert [line.partition(" ")[0] for line in lines] == [field] * differs
 
 
-def test_contradictions_of_verdicts() -> None:
+def test_contradictions_list_different_verdicts() -> None:
     assert FULL.contradictions(FULL) == Report().contradictions(Report()) == []
     assert Report().contradictions(Report(clearance=0.5)) == ["clearance 0.5 m instead of inf m"]
     assert Report().contradictions(Report((LIMIT,))) == ["1 constraint(s) violated"]
@@ -133,7 +137,7 @@ def test_missing_fields_have_defaults() -> None:
         (("more",), 1.5, None),
     ],
 )
-def test_invalid_data(path: tuple[str | int, ...], value: object, field: str | None) -> None:
+def test_invalid_data_raise(path: tuple[str | int, ...], value: object, field: str | None) -> None:
     data: Any = json.loads(json.dumps(FULL.to_dict()))
     place = data
     for key in path[:-1]:
@@ -144,7 +148,7 @@ def test_invalid_data(path: tuple[str | int, ...], value: object, field: str | N
     assert caught.value.field == field
 
 
-def test_text_by_phase(door_plan: vkc.Plan) -> None:
+def test_phases_are_described_by_times_lengths_and_clearance(door_plan: vkc.Plan) -> None:
     report, motion = door_plan.report, door_plan.trajectory
     parts = motion.parts()
     for line, part, close in zip(report.by_phase(motion), parts, report.clearances, strict=True):
@@ -156,7 +160,7 @@ def test_text_by_phase(door_plan: vkc.Plan) -> None:
     assert Report().by_phase(motion)[0].count("inf mm") == 1
 
 
-def test_clearance_of_each_phase(door_plan: vkc.Plan) -> None:
+def test_clearance_of_a_phase_is_at_most_that_of_its_waypoints(door_plan: vkc.Plan) -> None:
     fine, report = door_plan.trajectory, door_plan.report
     assert min(report.clearances) == report.clearance
     for phase, close in zip(fine.phases, report.clearances, strict=True):

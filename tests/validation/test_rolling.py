@@ -1,4 +1,4 @@
-"""Wheeled bases neither slip nor turn too tightly, and their wheels keep their speed limit."""
+"""Tests the checks of slip, turning radius and wheel speed of wheeled bases."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
-def test_slip_of_a_differential_base_in_steps() -> None:
+def test_slip_of_a_motion_without_curve_is_reported() -> None:
     scene = make_hall(base="differential")
     ahead = drive_through(
         scene, scene.start, move_start(scene.start, x=2.0), move_start(scene.start, x=2.0, yaw=1.0)
@@ -26,7 +26,7 @@ def test_slip_of_a_differential_base_in_steps() -> None:
     heading = np.linspace(0.0, 1.5, 41)
     curve = np.tile(
         scene.start, (41, 1)
-    )  # a circle of 1 m to the left, the chords at the headings in the middle of each step
+    )  # circle of 1 m to the left; chords have the mean heading of their step
     curve[:, 0], curve[:, 1], curve[:, 2] = np.sin(heading), 1.0 - np.cos(heading), heading
     assert "slip" not in {
         v.constraint
@@ -39,19 +39,19 @@ def test_slip_of_a_differential_base_in_steps() -> None:
     assert found.amount == pytest.approx(steps.max())
     assert found.waypoint == steps.argmax()
     assert found.time == pytest.approx(sideways.times[found.waypoint])
-    for step, right in ((0.9e-4, True), (1.5e-4, False)):  # 0.1 mm aside in a step is all right
+    for step, ok in ((0.9e-4, True), (1.5e-4, False)):  # the tolerance is 0.1 mm per step
         aside = drive_through(
             scene, scene.start, move_start(scene.start, x=2.0, y=0.1 * step / found.amount)
         )
         assert (
             "slip"
             not in {v.constraint for v in validate(scene, [vkc.GoTo(2.0, 0.0)], aside).violations}
-        ) == right
+        ) == ok
     assert validate(make_hall(), [vkc.GoTo(2.0, 0.1, 0.0)], sideways).ok
 
 
 @pytest.mark.parametrize(("radius", "ok"), [(0.99, True), (1.01, False)])
-def test_turning_radius_in_steps(radius: float, ok: bool) -> None:
+def test_turning_radius_of_a_motion_without_curve_is_checked(radius: float, ok: bool) -> None:
     scene = make_hall(base="ackermann", turning_radius=radius)
     heading = np.concatenate([np.linspace(0.0, 1.5, 41), np.linspace(1.5, 0.3, 33)[1:]])
     rows = np.tile(scene.start, (len(heading), 1))
@@ -80,14 +80,14 @@ def test_steered_base_must_not_turn_in_place() -> None:
 
 
 @pytest.mark.parametrize("base", ["differential", "ackermann"])
-def test_wheel_speed_in_steps(base: str) -> None:
-    """On a circle of 1 m the outer wheels go 1 + track / 2 times as fast as the base."""
+def test_wheel_speed_of_a_motion_without_curve_is_checked(base: str) -> None:
+    """On a circle of 1 m the outer wheels roll 1 + track / 2 times as fast as the base."""
     scene = make_hall(base=base, **({"turning_radius": 0.8} if base == "ackermann" else {}))
     wheels = scene.robot.wheels
     assert wheels is not None
     assert wheels.rim_speed == pytest.approx(
         1.0, rel=1e-3
-    )  # Clearpath's limit on the speed of a Husky [m/s]
+    )  # Clearpath's speed limit of the Husky [m/s]
     heading = np.concatenate(
         [
             np.zeros(1),
@@ -102,15 +102,15 @@ def test_wheel_speed_in_steps(base: str) -> None:
     turn = np.diff(heading).max()
     fastest = (2.0 * np.sin(turn / 2) + turn * wheels.track / 2) / 0.05
     assert found.amount == pytest.approx(fastest - wheels.rim_speed)
-    for excess, right in (
+    for excess, ok in (
         (0.5, True),
         (2.0, False),
-    ):  # times what is all right, a thousandth of what the wheels can
+    ):  # multiples of the tolerance, a thousandth of the wheels' speed limit
         dt = 0.05 * fastest / (wheels.rim_speed * (1.0 + excess * 1e-3))
-        assert validate(scene, goal, make_trajectory(scene, rows, dt=dt)).ok == right
+        assert validate(scene, goal, make_trajectory(scene, rows, dt=dt)).ok == ok
     assert validate(scene, goal, make_trajectory(scene, rows, dt=0.05 * fastest)).ok
-    everywhere = make_hall()
-    assert validate(everywhere, goal, make_trajectory(everywhere, rows, dt=0.05)).ok
+    omni = make_hall()
+    assert validate(omni, goal, make_trajectory(omni, rows, dt=0.05)).ok
     straight = drive_through(scene, scene.start, move_start(scene.start, x=1.0), dt=1.5 / 40 / 0.99)
     assert validate(scene, [vkc.GoTo(1.0, 0.0)], straight).ok
 
@@ -143,7 +143,7 @@ def make_circle(
     return [vkc.GoTo(*rows[-1, :3])], motion
 
 
-def test_slip_along_a_curve() -> None:
+def test_slip_along_a_curve_is_reported() -> None:
     """At heading θ, the velocity along −x is lateral by a factor of sin θ."""
     scene = make_hall(base="differential")
     assert validate(scene, *make_circle(scene)).ok
@@ -158,13 +158,13 @@ def test_slip_along_a_curve() -> None:
     assert motion.times[found.waypoint] <= found.time <= motion.times[found.waypoint + 1]
     assert "mm/s" in found.detail
     assert validate(make_hall(), goal, motion).ok
-    for allowed, right in ((0.95e-3, True), (1.1e-3, False)):
+    for allowed, ok in ((0.95e-3, True), (1.1e-3, False)):
         report = validate(scene, *make_circle(scene, aside=0.01 * allowed / found.amount))
-        assert report.ok == right
+        assert report.ok == ok
 
 
 @pytest.mark.parametrize(("radius", "ok"), [(0.997, True), (1.01, False)])
-def test_turning_radius_along_a_curve(radius: float, ok: bool) -> None:
+def test_turning_radius_along_a_curve_is_checked(radius: float, ok: bool) -> None:
     scene = make_hall(base="ackermann", turning_radius=radius)
     report = validate(scene, *make_circle(scene))
     assert report.ok == ok
@@ -174,7 +174,7 @@ def test_turning_radius_along_a_curve(radius: float, ok: bool) -> None:
         assert found.amount == pytest.approx((radius - 1.0) * 0.4, rel=1e-2)
 
 
-def test_wheel_speed_along_a_curve() -> None:
+def test_wheel_speed_along_a_curve_is_checked() -> None:
     scene = make_hall(base="differential")
     assert scene.robot.wheels is not None
     peak = scene.robot.wheels.rim_speed / (1.0 + scene.robot.wheels.track / 2)

@@ -1,4 +1,4 @@
-"""Motions are sampled densely, with limits, units and grasp errors of their coordinates."""
+"""Tests the density of samples, and limits, units and grasp errors of coordinates."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.carrying import Script, make_room
+from helpers.carrying import MotionBuilder, make_room
 from helpers.drives import make_hall, make_trajectory, move_start
 from helpers.small_problems import load_door_scene, make_full_scene, replace_objects
 from helpers.telescopes import write_coupled_scene
@@ -55,7 +55,7 @@ def sample_motion(scene: Scene, seed: int, *, grasp: str = "grip", number: int =
     )
 
 
-def test_density_of_coupled_joints(tmp_path: Path) -> None:
+def test_samples_of_coupled_joints_are_dense(tmp_path: Path) -> None:
     scene = write_coupled_scene(tmp_path)
     rows = np.tile(scene.start, (3, 1))
     rows[1:, 3:] += [[0.4, 0.0, 0.0], [0.4, 0.1, 0.9]]
@@ -64,13 +64,13 @@ def test_density_of_coupled_joints(tmp_path: Path) -> None:
         scene, Trajectory(names, np.array([0.0, 1.0, 2.0]), rows, phases, len(scene.start))
     )
     steps = np.abs(np.diff(samples.z, axis=0)).max(axis=0)
-    goes = {
+    travel = {
         str(samples.world.model.names[m.joint]): abs(m.factor) * steps[m.coordinate]
         for m in samples.world.coordinates.moves
     }
-    assert goes["roll_joint"] == pytest.approx(ANGLE_STEP, rel=0.05)
-    assert goes["pitch_joint"] <= ANGLE_STEP
-    assert goes["lift"] == pytest.approx(LENGTH_STEP, rel=0.05)
+    assert travel["roll_joint"] == pytest.approx(ANGLE_STEP, rel=0.05)
+    assert travel["pitch_joint"] <= ANGLE_STEP
+    assert travel["lift"] == pytest.approx(LENGTH_STEP, rel=0.05)
 
 
 @settings(max_examples=15, deadline=None)
@@ -79,8 +79,8 @@ def test_samples_are_dense(seed: int, grasp: str) -> None:
     trajectory = sample_motion(make_full_scene(), seed, grasp=grasp)
     samples = Samples(make_full_scene(), trajectory)
     steps = np.abs(np.diff(trajectory.at(samples.times), axis=0))
-    of_objects = ("drawer.slide", "cabinet.slide", "cabinet.rail", "cabinet.sleeve_slide")
-    lengths = np.array([name in ("base_x", "base_y", *of_objects) for name in trajectory.names])
+    slides = ("drawer.slide", "cabinet.slide", "cabinet.rail", "cabinet.sleeve_slide")
+    lengths = np.array([name in ("base_x", "base_y", *slides) for name in trajectory.names])
     assert steps[:, lengths].max(initial=0.0) <= LENGTH_STEP * (1 + 1e-6)
     assert steps[:, ~lengths].max(initial=0.0) <= ANGLE_STEP * (1 + 1e-6)
     assert np.linalg.norm(steps[:, :2], axis=1).max() <= LENGTH_STEP * (1 + 1e-6)
@@ -100,7 +100,7 @@ def test_samples_are_dense(seed: int, grasp: str) -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(sorted(VIRTUAL)))
-def test_grasp_errors(seed: int, grasp: str) -> None:
+def test_grasp_errors_are_the_displacement_of_the_object(seed: int, grasp: str) -> None:
     """The cabinet is placed where the tool grasps it exactly, then displaced."""
     scene = make_full_scene()
     trajectory, rng = sample_motion(scene, seed, grasp=grasp, number=2), np.random.default_rng(seed)
@@ -147,7 +147,7 @@ def test_grasp_errors(seed: int, grasp: str) -> None:
     assert errors[1] == pytest.approx(np.linalg.norm(turn))
 
 
-def test_driven_coordinates() -> None:
+def test_grasps_drive_the_joints_between_root_and_attachment() -> None:
     samples = Samples(make_full_scene(), sample_motion(make_full_scene(), 0))
     assert samples.find_driven_coordinates(()) == set()
     assert samples.find_driven_coordinates(make_holds({"cabinet": "grip"})) == {
@@ -161,17 +161,17 @@ def test_driven_coordinates() -> None:
     }
 
 
-def stand_still(scene: Scene) -> Samples:
+def sample_stationary_motion(scene: Scene) -> Samples:
     return Samples(scene, make_trajectory(scene, np.tile(scene.start, (2, 1))))
 
 
-def test_limits_of_robot_coordinates() -> None:
+def test_limits_of_the_base_include_the_arena() -> None:
     scene = dataclasses.replace(make_hall(), arena=(-5.0, 6.0, -7.0, 8.0))
     robot = scene.robot
     lower, upper = robot.lower.copy(), robot.upper.copy()
     lower[:3], upper[:3] = [-1.0, -9.0, -2.0], [9.0, 1.0, 3.0]
     robot = dataclasses.replace(robot, lower=lower, upper=upper)
-    samples = stand_still(dataclasses.replace(scene, robot=robot))
+    samples = sample_stationary_motion(dataclasses.replace(scene, robot=robot))
     limits = np.array([samples.get_limits(name) for name in robot.coordinates.names])
     np.testing.assert_array_equal(limits[:2, :2], [(-1.0, 6.0), (-7.0, 1.0)])
     np.testing.assert_array_equal(limits[2:, 0], lower[2:])
@@ -180,17 +180,17 @@ def test_limits_of_robot_coordinates() -> None:
     np.testing.assert_array_equal(limits[:, 3], robot.acceleration)
 
 
-def test_limits_of_a_fixed_base() -> None:
+def test_fixed_base_is_limited_to_its_start() -> None:
     scene = make_hall(base="fixed").with_start(base=[1.0, -2.0, 0.5])
-    samples, robot = stand_still(scene), scene.robot
+    samples, robot = sample_stationary_motion(scene), scene.robot
     limits = np.array([samples.get_limits(name)[:2] for name in robot.coordinates.names])
     np.testing.assert_array_equal(limits[:3], [(1.0, 1.0), (-2.0, -2.0), (0.5, 0.5)])
     np.testing.assert_array_equal(limits[3:], np.column_stack([robot.lower, robot.upper])[3:])
 
 
-def test_limits_of_objects_and_grasps() -> None:
+def test_objects_and_grasps_have_the_limits_of_their_joints() -> None:
     scene = make_room()
-    samples = Samples(scene, Script(scene).take("stick").wait().motion())
+    samples = Samples(scene, MotionBuilder(scene).take("stick").wait().motion())
     freedoms = scene.objects["stick"].object.attachment("grip").freedoms
     for freedom, name in zip(freedoms, ("slide", "turn"), strict=True):
         limits = samples.get_limits(f"stick.grip_{name}")
@@ -199,12 +199,12 @@ def test_limits_of_objects_and_grasps() -> None:
     item = load_door_scene().objects["door"].object
     for i, joint in enumerate(item.coordinates.names):
         arrays = (item.lower, item.upper, item.velocity, item.acceleration)
-        assert stand_still(load_door_scene()).get_limits(f"door.{joint}") == tuple(
+        assert sample_stationary_motion(load_door_scene()).get_limits(f"door.{joint}") == tuple(
             float(values[i]) for values in arrays
         )
 
 
-def test_number_of_samples_per_step() -> None:
+def test_number_of_samples_grows_with_the_step() -> None:
     scene, wrist = make_hall(), 8
     steps = [
         ({0: 0.05}, 10),
@@ -229,23 +229,26 @@ def test_number_of_samples_per_step() -> None:
     assert samples.get_rows(PhaseSpan("p", 1, 3)).tolist() == list(range(10, 23))
 
 
-def test_number_of_samples_along_a_curve() -> None:
-    """Half a metre from rest to rest has 0.75 m at its largest speed; knots are samples, too."""
+def test_number_of_samples_along_a_curve_follows_its_largest_speed() -> None:
+    """Half a metre from rest to rest counts as 0.75 m at the largest speed; knots are samples."""
     scene = make_hall()
     rows = np.array([move_start(scene.start, x=x) for x in (0.0, 0.25, 0.5)])
-    for knots, way in ((np.array([0.0, 2.0]), rows[[0, 2]]), (np.array([0.0, 1.0, 2.0]), rows)):
-        curve = Curve(knots, way, np.zeros_like(way))
+    for knots, positions in (
+        (np.array([0.0, 2.0]), rows[[0, 2]]),
+        (np.array([0.0, 1.0, 2.0]), rows),
+    ):
+        curve = Curve(knots, positions, np.zeros_like(positions))
         motion = dataclasses.replace(make_trajectory(scene, rows[[0, 2]], dt=2.0), curve=curve)
         samples = Samples(scene, motion)
         assert np.diff(samples.waypoint_rows).tolist() == [150]
         assert set(knots.tolist()) <= set(samples.times.tolist())
 
 
-@pytest.mark.parametrize(("size", "right"), [(0.99e12, True), (1.01e12, False)])
-def test_coordinates_out_of_range_are_refused(size: float, right: bool) -> None:
+@pytest.mark.parametrize(("size", "ok"), [(0.99e12, True), (1.01e12, False)])
+def test_coordinates_out_of_range_are_refused(size: float, ok: bool) -> None:
     scene = make_hall()
     motion = make_trajectory(scene, np.array([scene.start, move_start(scene.start, y=-size)]))
-    if right:
+    if ok:
         samples = Samples(scene, motion)
         assert samples.required_count > MAX_SAMPLES
         np.testing.assert_array_equal(samples.times, motion.times)
@@ -256,11 +259,11 @@ def test_coordinates_out_of_range_are_refused(size: float, right: bool) -> None:
 
 
 def test_frames_must_be_links_of_free_objects() -> None:
-    samples = stand_still(make_room())
+    samples = sample_stationary_motion(make_room())
     samples.check_frame("stick.tip", "by")
     for frame in ("stik.tip", "stick.tap"):
         with pytest.raises(UnknownNameError) as caught:
             samples.check_frame(frame, "by")
         assert caught.value.field == "by"
     with pytest.raises(InputError, match="stands fixed"):
-        stand_still(load_door_scene()).check_frame("door.panel", "by")
+        sample_stationary_motion(load_door_scene()).check_frame("door.panel", "by")

@@ -1,4 +1,4 @@
-"""No pair that comes close along a motion is left out: compared with brute force."""
+"""Tests by brute force that a sweep finds all pairs that come close along a motion."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.carrying import (
     STICK,
-    Script,
+    MotionBuilder,
     compute_grasp_pose,
     describe_box,
     describe_table,
@@ -42,7 +42,7 @@ from vkc_pin.world.trajectory.world_model import World
 COAL = 2e-5  # accuracy of coal's distances [m]
 
 
-def test_closest_pair_of_every_waypoint() -> None:
+def test_closest_pair_of_every_waypoint_is_found() -> None:
     door = load_door_scene()
     parts = [make_random_door_motion(door, seed, size=0.5).positions for seed in range(8)]
     rows = np.concatenate([*parts, parts[0] + 30.0 * np.eye(parts[0].shape[1])[0]])
@@ -74,7 +74,7 @@ def sweep_motion(scene: Scene, motion: Trajectory) -> tuple[PairTable, Samples, 
 
 
 def check_sweep(scene: Scene, motion: Trajectory) -> None:
-    """Compare the hits with the distances of all pairs, five times as finely."""
+    """Compare the hits with the distances of all pairs, at five times as many samples."""
     table, samples, hits = sweep_motion(scene, motion)
     robot = np.array([group == "robot" for group in table.groups])[table.pairs].any(axis=1)
     distances = compute_all_distances(table, samples.z)
@@ -134,7 +134,7 @@ def test_no_penetration_is_missed_between_sparse_samples(seed: int, size: float)
             assert {(t, *get_pair_names(table, k)), (t + 1, *get_pair_names(table, k))} & found
 
 
-def test_wire_between_two_samples() -> None:
+def test_wire_between_two_samples_is_found() -> None:
     wire = {
         "name": "wire",
         "type": "cylinder",
@@ -152,14 +152,14 @@ def test_wire_between_two_samples() -> None:
     assert ("base_link", "wire") in {(hit.first, hit.second) for hit in hits if hit.distance < 0}
     assert all(hit.distance > 1.0 for hit in hits if hit.at_waypoint and hit.second == "wire")
     through = [hit.shapes for hit in hits if hit.distance < 0]
-    assert len(through) == len(set(through)), "one sample proves that a pair overlaps"
+    assert len(through) == len(set(through)), "one sample per overlapping pair is enough"
 
 
 @pytest.mark.parametrize("y", [0.31, 0.53, 0.75, 0.97])
-def test_fence_is_found_wherever_a_stick_passes_it_between_two_samples(y: float) -> None:
+def test_fence_crossed_between_two_samples_is_found(y: float) -> None:
     scene = make_room(describe_box("fence", [0.6, 0.001, 0.1], [0.8, y, 0.56]))
     down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
-    script = Script(scene).go(down).take("stick").go(move_base(down, y=1.0), steps=1)
+    script = MotionBuilder(scene).go(down).take("stick").go(move_base(down, y=1.0), steps=1)
     motion, world = script.motion(dt=10.0), World(scene)
     table = PairTable(scene, CollisionShapes(world), motion, 0.02)
     hits = list(sweep(table, world.compute_positions(motion), np.arange(len(motion.times))))
@@ -182,15 +182,19 @@ def test_overlaps_at_a_sample_are_not_searched_between_samples() -> None:
     ("overlap", "together", "before"),
     [(None, False, 0), (0.0, True, 0), (0.0, True, 1), (0.0, False, 0), (1e-4, False, 0)],
 )
-def test_windows_permit_contact_but_no_passing_through(
+def test_windows_permit_contact_but_no_crossing(
     overlap: float | None, together: bool, before: int
 ) -> None:
-    """A stick passes a fence beside which it lay; no sample touches the fence."""
+    """A stick crosses a fence beside it between two samples, neither of which is in collision."""
     fence = describe_box("fence", [0.6, 0.001, 0.1], [0.8, 0.262, 0.56])
     scene = make_room(fence)
     down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
     motion = (
-        Script(scene).go(down).take("stick").go(move_base(down, y=1.0), steps=1).motion(dt=10.0)
+        MotionBuilder(scene)
+        .go(down)
+        .take("stick")
+        .go(move_base(down, y=1.0), steps=1)
+        .motion(dt=10.0)
     )
     world = World(scene)
     labels = world.collision_labels
@@ -205,7 +209,7 @@ def test_windows_permit_contact_but_no_passing_through(
     hits = list(sweep(table, world.compute_positions(motion), np.arange(len(motion.times))))
     assert all(hit.distance > 0.0 for hit in hits if hit.at_waypoint and hit.second == "fence")
     through = {hit.first for hit in hits if hit.second == "fence" and hit.distance < -5e-4}
-    if together and not before:  # as for a hand and what it grasps, until it lets go
+    if together and not before:  # like a hand and the grasped object until its release
         assert not through & {"stick.stick", "stick.tip"}
     else:
         assert through >= {"stick.stick", "stick.tip"}
@@ -218,7 +222,7 @@ def test_constant_penetration_is_reported_at_every_sample() -> None:
     motion = make_trajectory(scene, np.vstack([scene.start, inside, turned, scene.start]), dt=4.0)
     _, samples, hits = sweep_motion(scene, motion)
     first, last = samples.waypoint_rows[1:3]
-    assert last - first > 3, "there is nothing to look at: turn the arm further"
+    assert last - first > 3, "too few samples: turn the arm further"
     rows = {
         hit.row
         for hit in hits
@@ -231,7 +235,7 @@ def test_objects_at_rest_are_not_checked_again() -> None:
     scene = make_room(describe_table(gap=5e-4))
     down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
     script = (
-        Script(scene)
+        MotionBuilder(scene)
         .go(down)
         .take("stick")
         .go(move_base(down, y=0.05), steps=1)
@@ -244,7 +248,7 @@ def test_objects_at_rest_are_not_checked_again() -> None:
     pair = {frozenset((hit.first, hit.second)) for hit in resting if hit.distance < 1e-3} & {
         frozenset((one, "table")) for one in ("stick.stick", "stick.tip")
     }
-    assert pair, "it touches nothing: choose another way of putting it down"
+    assert pair, "no contact: choose another placement"
     samples = Samples(scene, motion)
     begin = samples.waypoint_rows[last.first]
     assert not [

@@ -1,4 +1,4 @@
-"""The validator checks user constraints, whose violations are known from geometry."""
+"""Tests the validation of user constraints with violations known from geometry."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.carrying import STICK, TOP, carry_over, describe_table, make_room
+from helpers.carrying import STICK, TOP, describe_table, make_carrying_motion, make_room
 from helpers.drives import DT, drive_through, make_hall, make_trajectory, move_start
 
 import vkc_pin as vkc
@@ -30,9 +30,12 @@ def limit_tip(upper: float, **fields: Any) -> vkc.Constraint:
     return vkc.Constraint("low tip", lambda s: s.position("stick.tip")[2], upper=upper, **fields)
 
 
-def test_constraint_on_a_grasped_object() -> None:
+def test_constraint_on_a_grasped_object_is_checked() -> None:
     scene = make_room(describe_table())
-    motion, place = carry_over(scene, aside=0.3).motion(), [vkc.Place("stick", (0.8, 0.3, 0.551))]
+    motion, place = (
+        make_carrying_motion(scene, aside=0.3).motion(),
+        [vkc.Place("stick", (0.8, 0.3, 0.551))],
+    )
     link = scene.objects["stick"].object.link_placement("tip", [])
     highest = (STICK * link).translation[2] + 0.2
     assert find_violations(scene, motion, limit_tip(highest + 1e-4), place) == []
@@ -42,7 +45,7 @@ def test_constraint_on_a_grasped_object() -> None:
     assert f"{highest:.6g} is more than 0.6 by" in violation.detail
     held = [phase for phase in motion.phases if phase.held]
     assert motion.times[held[0].first] <= violation.time <= motion.times[held[-1].last]
-    # Nothing is wrong where it stands, before and after.
+    # The constraint holds before and after the transport.
     assert (
         find_violations(
             scene,
@@ -88,10 +91,12 @@ def test_costs_are_ignored() -> None:
 
 
 @pytest.mark.parametrize(
-    ("bound", "excess", "wrong"),
+    ("bound", "excess", "violated"),
     [("lower", 5e-4, False), ("upper", 5e-4, False), ("upper", 2e-3, True)],
 )
-def test_tolerance_at_waypoints(bound: str, excess: float, wrong: bool) -> None:
+def test_violation_at_waypoints_beyond_the_tolerance_is_reported(
+    bound: str, excess: float, violated: bool
+) -> None:
     motion = drive_through(make_hall(), START, move_start(START, x=2.0))
     limit = 2.0 - excess if bound == "upper" else excess
     fields = {bound: limit, "during": "drive 1"}
@@ -100,14 +105,16 @@ def test_tolerance_at_waypoints(bound: str, excess: float, wrong: bool) -> None:
         lambda s: s.coordinate("base_x") if bound == "upper" else 2 - s.coordinate("base_x"),
         **fields,
     )
-    assert len(find_violations(make_hall(), motion, term)) == wrong
+    assert len(find_violations(make_hall(), motion, term)) == violated
     assert (
         find_violations(make_hall(), motion, dataclasses.replace(term, tolerance=2 * excess)) == []
     )
 
 
-@pytest.mark.parametrize(("turn", "wrong"), [(0.2, False), (0.6, True)])
-def test_tolerance_between_waypoints(turn: float, wrong: bool) -> None:
+@pytest.mark.parametrize(("turn", "violated"), [(0.2, False), (0.6, True)])
+def test_violation_between_waypoints_beyond_the_tolerance_is_reported(
+    turn: float, violated: bool
+) -> None:
     """The hand swings out by r·(1 − cos(turn/2)) in the middle of a turn of the base."""
     scene, steps = make_hall(), 2
     arm = scene.tool_placement().translation
@@ -118,9 +125,9 @@ def test_tolerance_between_waypoints(turn: float, wrong: bool) -> None:
     edge = away * np.cos(turn / 2)
     term = vkc.Constraint("behind", lambda s: s.position("tool")[0], upper=edge)
     out = away - edge
-    assert (out > INTERMEDIATE_FACTOR * term.tolerance) == wrong
+    assert (out > INTERMEDIATE_FACTOR * term.tolerance) == violated
     violations = find_violations(scene, motion, term)
-    assert len(violations) == wrong
+    assert len(violations) == violated
     for violation in violations:
         assert violation.amount == pytest.approx(out, rel=1e-3)
         assert violation.waypoint == 1
@@ -136,7 +143,7 @@ def test_tolerance_between_waypoints(turn: float, wrong: bool) -> None:
     )
 
 
-def test_velocities_are_those_of_the_segment() -> None:
+def test_velocities_at_waypoints_are_those_of_the_segment_before() -> None:
     scene = make_hall()
     motion = drive_through(scene, START, move_start(START, x=2.0))
     speeds = np.abs(np.diff(motion.positions[:, 0])) / DT
@@ -153,7 +160,7 @@ def test_velocities_are_those_of_the_segment() -> None:
         assert violation.waypoint in np.flatnonzero(speeds > 0.999 * fastest) + 1
     rate = vkc.Constraint("rate", lambda s: s.rate("base_x"), upper=0.9 * fastest)
     assert find_violations(scene, motion, rate)[0].amount == pytest.approx(0.1 * fastest, rel=1e-6)
-    # Nothing jumps at waypoints, so that nothing is worse between them than at both.
+    # Rates do not jump at waypoints, so that no violation between them exceeds those at both.
     brakes = vkc.Constraint(
         "brakes", lambda s: s.rate("base_x") - 0.2 * (2.0 - s.coordinate("base_x")), upper=0.0
     )
@@ -170,9 +177,7 @@ def test_constraint_holds_after_the_first_waypoint_of_its_phases() -> None:
     assert len(find_violations(scene, motion, ahead)) == 1
     assert find_violations(scene, motion, dataclasses.replace(ahead, during="drive 2")) == []
     clear = dataclasses.replace(ahead, lower=motion.positions[41, 0], during="drive 2")
-    assert (
-        find_violations(scene, motion, clear) == []
-    )  # although where the phase begins is before that
+    assert find_violations(scene, motion, clear) == []  # although the phase begins before that
     assert (
         len(
             find_violations(
@@ -188,7 +193,7 @@ def test_constraint_holds_after_the_wait_for_the_gripper() -> None:
     driven = drive_through(
         scene, START, move_start(START, x=1.0), move_start(START, x=2.0), steps=10
     )
-    rows = np.vstack([driven.positions[:11], driven.positions[10:]])  # stands still for a step
+    rows = np.vstack([driven.positions[:11], driven.positions[10:]])  # rests for a step
     phases = (vkc.PhaseSpan("drive 1", 0, 10), vkc.PhaseSpan("drive 2", 10, 21))
     motion = make_trajectory(scene, rows, dt=0.5, phases=phases)
     ahead = vkc.Constraint(
@@ -201,7 +206,7 @@ def test_constraint_holds_after_the_wait_for_the_gripper() -> None:
     )
     assert (
         len(find_violations(scene, still, ahead, [vkc.GoTo(1.0, 0.0)])) == 1
-    )  # who does not move at all does not get there
+    )  # a base that never moves does not satisfy it
 
 
 def test_nan_is_a_violation() -> None:

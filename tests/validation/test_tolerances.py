@@ -11,7 +11,9 @@ from vkc_pin.validation.validate import validate
 
 
 @pytest.mark.parametrize(("angle", "ok"), [(0.049, False), (0.051, True)])
-def test_goal_tolerance(door_plan: vkc.Plan, angle: float, ok: bool) -> None:
+def test_goals_within_the_tolerance_are_accepted(
+    door_plan: vkc.Plan, angle: float, ok: bool
+) -> None:
     report = validate(
         door_plan.scene,
         [vkc.Actuate("door", {"hinge": 1.25})],
@@ -25,6 +27,6 @@ def test_goal_tolerance(door_plan: vkc.Plan, angle: float, ok: bool) -> None:
     "name", ["closure_position", "closure_angle", "goal_position", "goal_angle"]
 )
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, 11.0, "1", None])
-def test_invalid_tolerances(name: str, value: Any) -> None:
+def test_invalid_tolerances_raise(name: str, value: Any) -> None:
     with pytest.raises(InputError, match=name):
         vkc.Tolerances(**{name: value})

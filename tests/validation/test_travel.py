@@ -1,4 +1,4 @@
-"""Bounds of displacements hold for the paths of the corners of the shapes' boxes."""
+"""Tests bounds of displacements against the paths of the corners of the shapes' boxes."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def measure_paths(world: World, z: np.ndarray, count: int) -> np.ndarray:
 
 @pytest.mark.parametrize("size", [0.1, 1.0])
 @pytest.mark.parametrize("seed", range(3))
-def test_bounds_for_revolute_and_prismatic_joints(seed: int, size: float) -> None:
+def test_bounds_hold_for_revolute_and_prismatic_joints(seed: int, size: float) -> None:
     world, rng = World(make_full_scene()), np.random.default_rng(seed)
     z = rng.uniform(-1.0, 1.0, (1, world.coordinates.size)) + size * rng.uniform(
         -1.0, 1.0, (4, world.coordinates.size)
@@ -52,7 +52,7 @@ def test_bounds_for_revolute_and_prismatic_joints(seed: int, size: float) -> Non
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_bounds_for_coupled_joints(seed: int, tmp_path: Path) -> None:
+def test_bounds_hold_for_coupled_joints(seed: int, tmp_path: Path) -> None:
     world, rng = World(write_coupled_scene(tmp_path)), np.random.default_rng(seed)
     low, high = (
         np.nan_to_num(bound, posinf=1.0, neginf=-1.0)
@@ -66,7 +66,7 @@ def test_bounds_for_coupled_joints(seed: int, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("size", [0.1, 1.0])
 @pytest.mark.parametrize("seed", range(3))
-def test_bounds_for_grasped_objects(seed: int, size: float) -> None:
+def test_bounds_hold_for_grasped_objects(seed: int, size: float) -> None:
     scene, motion = make_random_stick_motion(seed, size=size)
     samples = Samples(scene, motion)
     world = samples.world

@@ -1,4 +1,4 @@
-"""The validator accepts valid motions and names each violation."""
+"""Tests that validation accepts valid motions and reports each violation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from helpers.drives import (
 )
 from helpers.judging import (
     check,
-    cut_at_grasp,
+    get_approach,
     get_only_violation,
     get_violation_names,
     replace_attachments,
@@ -41,17 +41,14 @@ WRIST = "wrist_3_joint"
 
 
 @pytest.fixture(scope="module")
-def empty() -> Scene:
+def hall() -> Scene:
     return make_hall()
 
 
 @pytest.fixture(scope="module")
-def drive(empty: Scene) -> Trajectory:
-    """Two metres ahead and a quarter turn."""
-    return drive_through(empty, empty.start, move_start(empty.start, x=2.0, yaw=np.pi / 2))
-
-
-ARRIVED = vkc.GoTo(2.0, 0.0, np.pi / 2)
+def drive(hall: Scene) -> Trajectory:
+    """Return a drive two metres ahead with a quarter turn."""
+    return drive_through(hall, hall.start, move_start(hall.start, x=2.0, yaw=np.pi / 2))
 
 
 def test_planned_motion_is_valid(door_plan: vkc.Plan) -> None:
@@ -78,15 +75,15 @@ def test_clearance_is_the_smallest_of_all_phases() -> None:
     assert report.clearances[0] > 0.05
 
 
-def test_heading_goal_is_periodic(empty: Scene, drive: Trajectory) -> None:
-    assert validate(empty, [vkc.GoTo(2.0, 0.0, np.pi / 2 - 4 * np.pi)], drive).ok
+def test_heading_goal_is_periodic(hall: Scene, drive: Trajectory) -> None:
+    assert validate(hall, [vkc.GoTo(2.0, 0.0, np.pi / 2 - 4 * np.pi)], drive).ok
 
 
 @pytest.mark.parametrize("error", [0.01, 1e-8, -1e-8])
-def test_motion_must_begin_at_the_start(empty: Scene, drive: Trajectory, error: float) -> None:
+def test_motion_must_begin_at_the_start(hall: Scene, drive: Trajectory, error: float) -> None:
     positions = drive.positions + error * (np.arange(drive.positions.shape[1]) == 1)
     found = get_only_violation(
-        validate(empty, [vkc.GoTo(2.0, error, np.pi / 2)], replace_positions(drive, positions))
+        validate(hall, [vkc.GoTo(2.0, error, np.pi / 2)], replace_positions(drive, positions))
     )
     assert (found.constraint, found.subject, found.waypoint, found.unit) == (
         "start",
@@ -120,12 +117,12 @@ def test_objects_must_begin_at_their_state(door_plan: vkc.Plan) -> None:
     ],
 )
 def test_limit_violation_names_coordinate_waypoint_and_excess(
-    empty: Scene, subject: str, value: float, excess: float, unit: str
+    hall: Scene, subject: str, value: float, excess: float, unit: str
 ) -> None:
-    there = np.array(empty.start)
-    there[empty.robot.coordinates.index(subject)] = value
-    motion = drive_through(empty, empty.start, there, empty.start, steps=60)
-    found = get_only_violation(validate(empty, [vkc.GoTo(0.0, 0.0)], motion))
+    there = np.array(hall.start)
+    there[hall.robot.coordinates.index(subject)] = value
+    motion = drive_through(hall, hall.start, there, hall.start, steps=60)
+    found = get_only_violation(validate(hall, [vkc.GoTo(0.0, 0.0)], motion))
     assert (found.constraint, found.subject, found.waypoint, found.unit) == (
         "limit",
         subject,
@@ -136,29 +133,29 @@ def test_limit_violation_names_coordinate_waypoint_and_excess(
     assert f"by {excess:.4f} {unit}" in found.detail
 
 
-def test_limit_violation_between_waypoints(empty: Scene) -> None:
+def test_limit_violation_between_waypoints_is_found(hall: Scene) -> None:
     """The curve overshoots the limit by 0.1 m after the second waypoint."""
-    rows = np.array([move_start(empty.start, x=x) for x in (0.0, 5.9, 5.9)])
+    rows = np.array([move_start(hall.start, x=x) for x in (0.0, 5.9, 5.9)])
     rates = np.zeros_like(rows)
     rates[1:, 0] = [0.8, -0.8]
     times = np.array([0.0, 20.0, 21.0])
     motion = dataclasses.replace(
-        make_trajectory(empty, rows), times=times, curve=Curve(times, rows, rates)
+        make_trajectory(hall, rows), times=times, curve=Curve(times, rows, rates)
     )
-    report = validate(empty, [vkc.GoTo(5.9, 0.0)], motion)
+    report = validate(hall, [vkc.GoTo(5.9, 0.0)], motion)
     (found,) = [one for one in report.violations if one.constraint == "limit"]
     assert (found.subject, found.waypoint) == ("base_x", 1)
     assert found.amount == pytest.approx(0.1)
 
 
-def test_start_may_exceed_limits_slightly(empty: Scene) -> None:
+def test_start_may_exceed_limits_slightly(hall: Scene) -> None:
     for outside, constraints in ((1e-8, []), (5e-3, []), (0.02, ["limit"])):
-        start = np.array(empty.start)
-        start[-1] = empty.robot.upper[-1] + outside
+        start = np.array(hall.start)
+        start[-1] = hall.robot.upper[-1] + outside
         end = move_start(start, x=1.0)
-        end[-1] = empty.robot.upper[-1]
-        motion = make_trajectory(empty, np.vstack([start, end]), dt=10.0)
-        report = validate(dataclasses.replace(empty, start=start), [vkc.GoTo(1.0, 0.0)], motion)
+        end[-1] = hall.robot.upper[-1]
+        motion = make_trajectory(hall, np.vstack([start, end]), dt=10.0)
+        report = validate(dataclasses.replace(hall, start=start), [vkc.GoTo(1.0, 0.0)], motion)
         assert [violation.constraint for violation in report.violations] == constraints, "\n".join(
             report.lines()
         )
@@ -177,12 +174,12 @@ def test_fixed_base_must_not_move() -> None:
     assert ("limit", "base_x") in get_violation_names(found)
 
 
-def test_velocity_violation(empty: Scene) -> None:
+def test_velocity_violation_is_reported(hall: Scene) -> None:
     speed = np.concatenate([np.linspace(0.3, 1.2, 4), np.linspace(0.9, 0.3, 3)])
-    rows = np.tile(empty.start, (len(speed) + 1, 1))
+    rows = np.tile(hall.start, (len(speed) + 1, 1))
     rows[1:, 0] += np.cumsum(speed) * DT
     found = get_only_violation(
-        validate(empty, [vkc.GoTo(rows[-1, 0], 0.0)], make_trajectory(empty, rows))
+        validate(hall, [vkc.GoTo(rows[-1, 0], 0.0)], make_trajectory(hall, rows))
     )
     assert (found.constraint, found.subject, found.waypoint, found.unit) == (
         "velocity",
@@ -190,7 +187,7 @@ def test_velocity_violation(empty: Scene) -> None:
         3,
         "m/s",
     )
-    assert found.amount == pytest.approx(1.2 - empty.robot.velocity[0])
+    assert found.amount == pytest.approx(1.2 - hall.robot.velocity[0])
 
 
 @pytest.mark.parametrize(
@@ -201,11 +198,11 @@ def test_velocity_violation(empty: Scene) -> None:
         ([0.1, 0.2, 0.3, 0.6, 0.9], 5),
     ],
 )
-def test_acceleration_violation(empty: Scene, speed: list[float], waypoint: int) -> None:
-    rows = np.tile(empty.start, (len(speed) + 1, 1))
+def test_acceleration_violation_is_reported(hall: Scene, speed: list[float], waypoint: int) -> None:
+    rows = np.tile(hall.start, (len(speed) + 1, 1))
     rows[1:, 0] += np.cumsum(speed) * DT
     found = get_only_violation(
-        validate(empty, [vkc.GoTo(rows[-1, 0], 0.0)], make_trajectory(empty, rows))
+        validate(hall, [vkc.GoTo(rows[-1, 0], 0.0)], make_trajectory(hall, rows))
     )
     assert (found.constraint, found.subject, found.waypoint, found.unit) == (
         "acceleration",
@@ -213,10 +210,10 @@ def test_acceleration_violation(empty: Scene, speed: list[float], waypoint: int)
         waypoint,
         "m/s²",
     )
-    assert found.amount == pytest.approx(0.9 / DT - empty.robot.acceleration[0])
+    assert found.amount == pytest.approx(0.9 / DT - hall.robot.acceleration[0])
 
 
-def test_objects_have_limits_of_position_and_velocity(door_plan: vkc.Plan) -> None:
+def test_object_joints_have_position_and_velocity_limits(door_plan: vkc.Plan) -> None:
     door = door_plan.scene.objects["door"].object
     scene = replace_object(door_plan.scene, upper=np.array([1.1, 0.8]))
     found = get_only_violation(check(door_plan, scene=scene))
@@ -236,14 +233,16 @@ def test_objects_have_limits_of_position_and_velocity(door_plan: vkc.Plan) -> No
     ("shift", "turn", "units"),
     [(0.002, 0.0, {"m"}), (0.0, 0.003, {"rad"}), (0.003, 0.003, {"m", "rad"})],
 )
-def test_closure_violation(door_plan: vkc.Plan, shift: float, turn: float, units: set[str]) -> None:
+def test_closure_violation_is_reported(
+    door_plan: vkc.Plan, shift: float, turn: float, units: set[str]
+) -> None:
     """The grasp is displaced on the lever after planning."""
     grasp = door_plan.scene.objects["door"].object.attachments["handle"]
-    off = grasp.placement * pin.SE3(
+    displaced = grasp.placement * pin.SE3(
         pin.exp3(np.array([0.0, 0.0, turn])), np.array([0.0, 0.0, shift])
     )
     scene = replace_attachments(
-        door_plan.scene, {"handle": dataclasses.replace(grasp, placement=off)}
+        door_plan.scene, {"handle": dataclasses.replace(grasp, placement=displaced)}
     )
     report, planned = check(door_plan, scene=scene), check(door_plan)
     assert get_violation_names(report) == {("closure", "door.handle")}
@@ -260,7 +259,7 @@ def test_closure_violation(door_plan: vkc.Plan, shift: float, turn: float, units
 
 
 def thin_out(plan: vkc.Plan, every: int) -> Trajectory:
-    """Return the planned motion with only some waypoints of its last phase, linear between them."""
+    """Return the planned motion with fewer waypoints in its last phase, interpolated linearly."""
     full, last = plan.trajectory, plan.trajectory.phases[-1]
     keep = np.unique([*range(last.first + 1), *range(last.first, last.last, every), last.last])
     phases = (*full.phases[:-1], dataclasses.replace(last, last=len(keep) - 1))
@@ -269,7 +268,7 @@ def thin_out(plan: vkc.Plan, every: int) -> Trajectory:
     )
 
 
-def test_closure_violation_between_waypoints(door_plan: vkc.Plan) -> None:
+def test_closure_violation_between_waypoints_is_found(door_plan: vkc.Plan) -> None:
     sparse = thin_out(door_plan, 10)
     report = check(door_plan, trajectory=sparse)
     drifts = [found for found in report.violations if found.constraint == "closure"]
@@ -278,7 +277,7 @@ def test_closure_violation_between_waypoints(door_plan: vkc.Plan) -> None:
         assert sparse.times[found.waypoint] < found.time < sparse.times[found.waypoint + 1]
 
 
-def test_latch_violation_of_a_planned_motion(door_plan: vkc.Plan) -> None:
+def test_latch_violation_of_a_planned_motion_is_reported(door_plan: vkc.Plan) -> None:
     (latch,) = door_plan.scene.objects["door"].object.latches
     knob, hinge = (
         door_plan.trajectory.column("door.knob"),
@@ -307,16 +306,20 @@ def move_door_alone(scene: Scene, hinge: list[float], knob: list[float]) -> Traj
 
 
 @pytest.mark.parametrize(
-    ("hinge", "knob", "short"),
+    ("hinge", "knob", "shortfall"),
     [
         ([0.0, 0.0, 0.3], [0.0, 0.5, 0.5], 0.0),  # turned, then pushed
-        ([0.0, 0.3, 0.3], [0.0, 0.6, 0.6], 0.5),  # both at once: it leaves with the knob at 0
+        (
+            [0.0, 0.3, 0.3],
+            [0.0, 0.6, 0.6],
+            0.5,
+        ),  # both at once: the hinge leaves with the knob at 0
         ([0.0, 0.0, 0.3], [0.0, 0.4, 0.4], 0.1),
         (
             [0.0, 0.0, 0.3],
             [0.0, 0.6, 0.0],
             0.0,
-        ),  # 0.6 − 0.6 · 0.05 / 0.3 = 0.5 where the latch's reach ends
+        ),  # 0.6 − 0.6 · 0.05 / 0.3 = 0.5 at the end of the latch's reach
         ([0.0, 0.0, 0.3], [0.0, 0.58, 0.0], 0.5 - 0.58 * 5 / 6),
         ([0.0, 0.0, -0.3], [0.0, 0.3, 0.3], 0.2),  # pulled
         ([0.3, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0),  # shutting needs no turned knob
@@ -324,23 +327,23 @@ def move_door_alone(scene: Scene, hinge: list[float], knob: list[float]) -> Traj
         ([0.3, -0.3, -0.3], [0.0, 0.0, 0.0], 0.5),  # through the frame to the other side
         ([0.1, 0.3, 0.3], [0.0, 0.0, 0.0], 0.0),  # ajar: the bolt is out of the lock
         ([0.04, 0.3, 0.3], [0.2, 0.2, 0.2], 0.3),  # ajar, but within the latch's reach
-        ([0.04, 0.04, 0.3], [0.0, 0.6, 0.6], 0.0),  # it may rest ajar until the knob is turned
+        ([0.04, 0.04, 0.3], [0.0, 0.6, 0.6], 0.0),  # the door may rest ajar until the knob turns
         (
             [0.0, 0.04, 0.3],
             [0.7, 0.5, 0.7],
             0.0,
-        ),  # released as long as it is within reach, though on its way back
+        ),  # released within reach, although the knob turns back
     ],
 )
-def test_latch_violations(
-    door_plan: vkc.Plan, hinge: list[float], knob: list[float], short: float
+def test_latch_releases_the_hinge_only_with_the_knob_turned(
+    door_plan: vkc.Plan, hinge: list[float], knob: list[float], shortfall: float
 ) -> None:
     assert compute_latch_shortfall(door_plan.scene, hinge, knob) == pytest.approx(
-        short, abs=5e-3 if hinge[1] * knob[1] > 0 else 1e-6
+        shortfall, abs=5e-3 if hinge[1] * knob[1] > 0 else 1e-6
     )
 
 
-def test_latch_range_between_two_samples(door_plan: vkc.Plan) -> None:
+def test_latch_violation_between_two_samples_is_found(door_plan: vkc.Plan) -> None:
     assert compute_latch_shortfall(
         door_plan.scene, [0.0, 0.0, 0.3], [0.0, 0.4, 0.4], reach=0.002
     ) == pytest.approx(0.1)
@@ -371,10 +374,10 @@ def compute_latch_shortfall(
     return sum(violation.amount for violation in found)
 
 
-def test_rest_too_short_for_the_gripper(door_plan: vkc.Plan) -> None:
-    rests = door_plan.options.grasp_time
-    assert check(door_plan, grasp_time=rests - 1e-9).ok
-    found = get_only_violation(check(door_plan, grasp_time=rests + 0.25))
+def test_rest_too_short_for_the_gripper_is_reported(door_plan: vkc.Plan) -> None:
+    rest = door_plan.options.grasp_time
+    assert check(door_plan, grasp_time=rest - 1e-9).ok
+    found = get_only_violation(check(door_plan, grasp_time=rest + 0.25))
     grasp = door_plan.trajectory.phases[1].first
     assert (found.constraint, found.subject, found.unit, found.waypoint) == (
         "dwell",
@@ -384,25 +387,25 @@ def test_rest_too_short_for_the_gripper(door_plan: vkc.Plan) -> None:
     )
     assert found.time == pytest.approx(door_plan.trajectory.times[grasp])
     assert 0.0 < found.amount <= 0.25 + 1e-9
-    assert not check(door_plan, grasp_time=rests + 0.25 - found.amount + 1e-4).ok
+    assert not check(door_plan, grasp_time=rest + 0.25 - found.amount + 1e-4).ok
 
 
 def test_joints_must_not_move_without_a_grasp(door_plan: vkc.Plan) -> None:
-    let_go = tuple(dataclasses.replace(phase, holds=()) for phase in door_plan.trajectory.phases)
-    report = check(door_plan, trajectory=dataclasses.replace(door_plan.trajectory, phases=let_go))
+    released = tuple(dataclasses.replace(phase, holds=()) for phase in door_plan.trajectory.phases)
+    report = check(door_plan, trajectory=dataclasses.replace(door_plan.trajectory, phases=released))
     unheld = {found.subject: found for found in report.violations if found.constraint == "unheld"}
     assert set(unheld) == {"door.hinge", "door.knob"}
     assert {found.constraint for found in report.violations} <= {
         "unheld",
         "clearance",
-    }  # the hand touches what it grasps
+    }  # the hand touches the grasped link
     hinge = door_plan.trajectory.column("door.hinge")
     assert unheld["door.hinge"].amount == pytest.approx(np.abs(hinge).max())
     assert hinge[unheld["door.hinge"].waypoint] == pytest.approx(hinge[np.argmax(np.abs(hinge))])
     assert "door is not grasped" in unheld["door.hinge"].detail
 
 
-def drive_beside_a_crate(gap: float) -> tuple[Scene, Trajectory]:
+def make_drive_to_a_crate(gap: float) -> tuple[Scene, Trajectory]:
     """Return a hall with a crate, and a drive that ends `gap` in front of it."""
     crate = {"name": "crate", "type": "box", "size": [0.4, 2.0, 0.3], "position": [2.5, 0.0, 0.15]}
     scene = make_hall(obstacles=[crate])
@@ -414,13 +417,13 @@ def drive_beside_a_crate(gap: float) -> tuple[Scene, Trajectory]:
 
 
 @pytest.mark.parametrize(
-    ("gap", "short"), [(0.0195, 0.0), (0.0191, 0.0), (0.0185, 0.0005), (0.015, 0.004)]
+    ("gap", "shortfall"), [(0.0195, 0.0), (0.0191, 0.0), (0.0185, 0.0005), (0.015, 0.004)]
 )
-def test_clearance_violation_at_a_waypoint(gap: float, short: float) -> None:
-    scene, motion = drive_beside_a_crate(gap)
+def test_clearance_violation_at_a_waypoint_is_reported(gap: float, shortfall: float) -> None:
+    scene, motion = make_drive_to_a_crate(gap)
     report = validate(scene, [vkc.GoTo(1.0, 0.0)], motion, Options(dist_safe=0.02))
     assert report.clearance == pytest.approx(gap, abs=1e-5)
-    if not short:
+    if not shortfall:
         assert report.ok, "\n".join(report.lines())
         return
     found = get_only_violation(report)
@@ -430,11 +433,11 @@ def test_clearance_violation_at_a_waypoint(gap: float, short: float) -> None:
         40,
         "m",
     )
-    assert found.amount == pytest.approx(short, abs=1e-5)
+    assert found.amount == pytest.approx(shortfall, abs=1e-5)
 
 
-def test_penetration_at_a_waypoint() -> None:
-    scene, motion = drive_beside_a_crate(-0.03)
+def test_penetration_at_a_waypoint_is_reported() -> None:
+    scene, motion = make_drive_to_a_crate(-0.03)
     found = get_only_violation(validate(scene, [vkc.GoTo(1.0, 0.0)], motion))
     assert (found.constraint, found.subject, found.waypoint) == (
         "penetration",
@@ -444,7 +447,7 @@ def test_penetration_at_a_waypoint() -> None:
     assert found.amount == pytest.approx(0.03, abs=1e-5)
 
 
-def test_penetration_between_waypoints() -> None:
+def test_penetration_between_waypoints_is_found() -> None:
     board = {"name": "board", "type": "box", "size": [0.005, 1.0, 0.2], "position": [2.0, 0.0, 0.1]}
     scene = make_hall(obstacles=[board])
     rows = np.array([scene.start, move_start(scene.start, x=4.0)])
@@ -464,11 +467,11 @@ def test_penetration_between_waypoints() -> None:
     assert validate(make_hall(), [vkc.GoTo(4.0, 0.0)], motion).ok
 
 
-def test_grasped_objects_must_keep_clear(door_plan: vkc.Plan) -> None:
+def test_grasped_objects_must_not_collide(door_plan: vkc.Plan) -> None:
     shape = coal.Box(0.3, 0.3, 1.0)
     place = pin.SE3(
         np.eye(3), np.array([3.35, 0.3, 1.5])
-    )  # where the panel swings to, above the robot's base
+    )  # in the path of the panel, above the robot's base
     obstacles = (*door_plan.scene.obstacles, pin.GeometryObject("pillar", 0, place, shape))
     labels = (*door_plan.scene.obstacle_labels, "pillar")
     scene = dataclasses.replace(door_plan.scene, obstacles=obstacles, obstacle_labels=labels)
@@ -479,7 +482,9 @@ def test_grasped_objects_must_keep_clear(door_plan: vkc.Plan) -> None:
 
 @pytest.mark.parametrize("name", ["base_x", "shoulder_pan_joint", "door.hinge"])
 @pytest.mark.parametrize("jump", [1e3, 1e9])
-def test_motion_too_long_to_be_sampled(door_plan: vkc.Plan, name: str, jump: float) -> None:
+def test_motion_too_long_to_be_sampled_is_reported(
+    door_plan: vkc.Plan, name: str, jump: float
+) -> None:
     positions = door_plan.trajectory.positions.copy()
     positions[40:, door_plan.trajectory.names.index(name)] += jump
     report = check(
@@ -494,7 +499,7 @@ def test_motion_too_long_to_be_sampled(door_plan: vkc.Plan, name: str, jump: flo
 
 
 def thicken_lever(scene: Scene, by: float) -> Scene:
-    """Return the scene with a lever that is thicker by `by` [m] all round."""
+    """Return the scene with the radius of the lever increased by `by` [m]."""
     placed: PlacedObject = scene.objects["door"]
     collision = placed.object.collision.copy()
     for shape in collision.geometryObjects:
@@ -522,12 +527,12 @@ def test_fingers_may_be_close_to_the_grasped_link(door_plan: vkc.Plan) -> None:
     assert {v.subject.split(" – ")[1] for v in found} == {"door.lever"}
     assert max(v.amount for v in found) == pytest.approx(0.008, abs=1e-3)
     grasp = validate(
-        thicken_lever(door_plan.scene, gap - 0.008), [vkc.Grasp("door")], cut_at_grasp(door_plan)
+        thicken_lever(door_plan.scene, gap - 0.008), [vkc.Grasp("door")], get_approach(door_plan)
     )
     assert {v.constraint for v in grasp.violations if v.subject.split(" – ")[0] in hand} == set()
 
 
-def test_trajectories_of_another_scene_are_refused(door_plan: vkc.Plan, empty: Scene) -> None:
+def test_trajectories_of_another_scene_are_refused(door_plan: vkc.Plan, hall: Scene) -> None:
     motion, steps = door_plan.trajectory, door_plan.steps
     with pytest.raises(UnknownNameError, match="coordinate") as caught:
         check(
@@ -560,4 +565,4 @@ def test_trajectories_of_another_scene_are_refused(door_plan: vkc.Plan, empty: S
         check(door_plan, trajectory=dataclasses.replace(motion, phases=phases))
     assert other.value.expected == "door.handle_free"
     with pytest.raises(UnknownNameError):
-        validate(empty, steps, motion)
+        validate(hall, steps, motion)

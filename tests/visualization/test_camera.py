@@ -24,7 +24,7 @@ def test_camera_sees_the_whole_motion() -> None:
     assert (depth > 0).all()
     assert np.abs(local @ up / depth).max() < half
     assert np.abs(local @ right / depth).max() < 1.5 * half
-    assert np.abs(local @ right / depth).max() > 0.5 * half, "not from far away either"
+    assert np.abs(local @ right / depth).max() > 0.5 * half, "the camera is not too far away"
 
 
 def test_motion_along_x_is_seen_from_its_side() -> None:

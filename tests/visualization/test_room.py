@@ -40,7 +40,7 @@ def test_walls_are_visible_from_inside_only(room: Room) -> None:
         assert np.allclose(part.solid.normals, normal)
         assert part.one_sided
         assert not part.shadow
-    assert "walls/wall_above_door/inside" not in inside, "it stands between room and hall"
+    assert "walls/wall_above_door/inside" not in inside, "it separates room and hall"
 
 
 def test_walls_obstruct_the_view_less_than_furniture(room: Room, scene: Scene) -> None:

@@ -17,13 +17,13 @@ from vkc_pin.visualization.triangles import (
 )
 
 
-def as_mesh(solid: Solid) -> trimesh.Trimesh:
+def make_mesh(solid: Solid) -> trimesh.Trimesh:
     mesh = trimesh.Trimesh(solid.vertices, solid.faces, process=False)
     mesh.merge_vertices(merge_norm=True)
     return mesh
 
 
-def ball(radius: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
+def make_ball(radius: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
     return np.array(mesh.vertices), np.array(mesh.faces)
 
@@ -31,33 +31,31 @@ def ball(radius: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
 def test_boxes_are_shaded_flat_and_balls_smooth() -> None:
     box = to_solid(coal.Box(1.0, 1.0, 1.0))
     assert np.allclose(np.sort(np.abs(box.normals), axis=1), [0, 0, 1], atol=0.02), (
-        "each side its own normal"
+        "each side has its own normal"
     )
     sphere = to_solid(coal.Sphere(1.0))
-    assert np.einsum("ij,ij->i", sphere.normals, sphere.vertices).min() > 0.97, (
-        "normals point straight out"
-    )
+    assert np.einsum("ij,ij->i", sphere.normals, sphere.vertices).min() > 0.97, "normals are radial"
 
 
 def test_sides_of_a_box_face_outwards() -> None:
     lower, upper = np.array([-1.0, 0.0, 2.0]), np.array([1.0, 3.0, 4.0])
     whole = make_box(lower, upper)
-    assert as_mesh(whole).volume == pytest.approx(12.0)
+    assert make_mesh(whole).volume == pytest.approx(12.0)
     for side in range(6):
         solid = make_box(lower, upper, (side,))
         axis, positive = divmod(side, 2)
         assert np.allclose(solid.vertices[:, axis], (lower, upper)[positive][axis])
         assert np.allclose(solid.normals, (2 * positive - 1) * np.eye(3)[axis])
         corners = solid.vertices[solid.faces]
-        turn = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        assert (np.einsum("ij,ij->i", turn, solid.normals[:2]) > 0).all()
+        face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        assert (np.einsum("ij,ij->i", face_normals, solid.normals[:2]) > 0).all()
 
 
 def test_coarse_copy_has_fewer_faces_and_the_same_volume() -> None:
-    fine = shade(*ball())
-    light = simplify(fine, 0.1)
-    assert len(light.faces) < 0.8 * len(fine.faces)
-    assert as_mesh(light).volume == pytest.approx(as_mesh(fine).volume, rel=0.1)
+    fine = shade(*make_ball())
+    coarse = simplify(fine, 0.1)
+    assert len(coarse.faces) < 0.8 * len(fine.faces)
+    assert make_mesh(coarse).volume == pytest.approx(make_mesh(fine).volume, rel=0.1)
 
 
 def test_solids_are_moved_and_merged() -> None:
@@ -68,7 +66,7 @@ def test_solids_are_moved_and_merged() -> None:
     assert np.allclose(moved.vertices.min(axis=0), [4.0, 0.0, 0.0], atol=1e-6)
     both = merge_solids([solid, moved])
     assert len(both.vertices) == 2 * len(solid.vertices)
-    assert as_mesh(both).volume == pytest.approx(2.0, rel=1e-5)
+    assert make_mesh(both).volume == pytest.approx(2.0, rel=1e-5)
 
 
 def test_tube_follows_its_line() -> None:
@@ -76,11 +74,11 @@ def test_tube_follows_its_line() -> None:
     line = np.column_stack([np.cos(angle), np.sin(angle), 0.2 * angle])
     solid = make_tube(line, 0.01)
     assert solid is not None
-    away = np.linalg.norm(solid.vertices[:, None] - line[None], axis=2).min(axis=1)
-    assert np.allclose(away, 0.01, atol=1e-3)
+    distances = np.linalg.norm(solid.vertices[:, None] - line[None], axis=2).min(axis=1)
+    assert np.allclose(distances, 0.01, atol=1e-3)
     corners = solid.vertices[solid.faces]
-    turn = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    assert (np.einsum("ij,ij->i", turn, solid.normals[solid.faces[:, 0]]) > 0).all(), (
-        "wound outwards"
+    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("ij,ij->i", face_normals, solid.normals[solid.faces[:, 0]]) > 0).all(), (
+        "faces are wound outwards"
     )
-    assert make_tube(np.zeros((5, 3)), 0.01) is None, "nothing moves"
+    assert make_tube(np.zeros((5, 3)), 0.01) is None, "a line of length zero has no tube"

@@ -47,22 +47,22 @@ def commands(page: Path) -> list[dict[str, Any]]:
     return read_commands(page.read_text(encoding="utf-8"))
 
 
-def drawn(commands: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+def map_objects(commands: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     return {c["path"]: c["object"] for c in commands if c["type"] == "set_object"}
 
 
-def vertices(item: dict[str, Any]) -> np.ndarray:
+def read_vertices(item: dict[str, Any]) -> np.ndarray:
     extension = item["geometries"][0]["data"]["attributes"]["position"]["array"]
     return np.frombuffer(extension.data, np.float32).reshape(-1, 3)
 
 
-# What is drawn
+# Geometry
 
 
 def test_page_has_robot_door_walls_paths_and_ghosts(
     commands: list[dict[str, Any]], plan: Plan
 ) -> None:
-    shapes = drawn(commands)
+    shapes = map_objects(commands)
     for part in (
         "forearm_link",
         "door/frame",
@@ -74,7 +74,7 @@ def test_page_has_robot_door_walls_paths_and_ghosts(
     ):
         assert any(part in path for path in shapes), part
     assert {"/meshcat/paths/tool", "/meshcat/paths/base"} <= shapes.keys()
-    arm = [vertices(item) for path, item in shapes.items() if "forearm_link" in path]
+    arm = [read_vertices(item) for path, item in shapes.items() if "forearm_link" in path]
     assert sum(len(points) for points in arm) > 3000, "the arm's visual meshes"
     robot = [item for path, item in shapes.items() if path.startswith("/meshcat/robot/")]
     assert len({item["materials"][0]["color"] for item in robot}) >= 5
@@ -89,23 +89,23 @@ def test_page_has_robot_door_walls_paths_and_ghosts(
 
 
 def test_walls_are_transparent_from_outside(commands: list[dict[str, Any]]) -> None:
-    things = drawn(commands)
+    objects = map_objects(commands)
     for name in ("wall_west", "wall_south"):
-        outside = things[f"/meshcat/room/walls/{name}/outside"]["materials"][0]
+        outside = objects[f"/meshcat/room/walls/{name}/outside"]["materials"][0]
         assert outside["transparent"]
         assert outside["opacity"] < 0.2
-        assert things[f"/meshcat/room/walls/{name}/inside"]["materials"][0]["side"] == 0, (
-            "seen from the room only"
+        assert objects[f"/meshcat/room/walls/{name}/inside"]["materials"][0]["side"] == 0, (
+            "visible from the room only"
         )
-    assert things["/meshcat/room/walls/wall_left_of_door/sides"]["materials"][0]["opacity"] < 0.5, (
-        "stands between two rooms"
-    )
+    assert (
+        objects["/meshcat/room/walls/wall_left_of_door/sides"]["materials"][0]["opacity"] < 0.5
+    ), "it separates two rooms"
 
 
-# Time
+# Animation
 
 
-def test_scene_is_drawn_with_frames_and_without_markup_from_its_name(tmp_path: Path) -> None:
+def test_scene_page_shows_frames_and_escapes_its_name(tmp_path: Path) -> None:
     placement = pin.SE3(pin.rpy.rpyToMatrix(0.1, -0.4, 2.0), np.array([1.0, -0.5, 0.8]))
     scene = dataclasses.replace(load_scene("drawer"), name="</script><b>%FILM%")
     file = visualization.to_html(
@@ -116,52 +116,54 @@ def test_scene_is_drawn_with_frames_and_without_markup_from_its_name(tmp_path: P
     assert "<title>&lt;/script&gt;&lt;b&gt;%FILM%" in text
     commands = read_commands(text)
     assert not read_clips(commands)
-    assert any("drawer" in path for path in drawn(commands))
-    assert not any("ghosts" in path or "paths" in path for path in drawn(commands))
-    things = {
-        path: item for path, item in drawn(commands).items() if path.startswith("/meshcat/frames/")
+    assert any("drawer" in path for path in map_objects(commands))
+    assert not any("ghosts" in path or "paths" in path for path in map_objects(commands))
+    arrows = {
+        path: item
+        for path, item in map_objects(commands).items()
+        if path.startswith("/meshcat/frames/")
     }
-    assert set(things) == {f"/meshcat/frames/door.hinge/{axis}" for axis in "xyz"}
-    for axis, item in things.items():
+    assert set(arrows) == {f"/meshcat/frames/door.hinge/{axis}" for axis in "xyz"}
+    for axis, item in arrows.items():
         column = "xyz".index(axis[-1])
-        low, high = vertices(item).min(axis=0), vertices(item).max(axis=0)
-        assert high[column] > 0.1  # along its axis, and thin across it
+        low, high = read_vertices(item).min(axis=0), read_vertices(item).max(axis=0)
+        assert high[column] > 0.1  # long along its axis, thin across it
         assert np.delete(high - low, column).max() < 0.02
         red, green, blue = (item["materials"][0]["color"] >> shift & 255 for shift in (16, 8, 0))
         assert int(np.argmax([red, green, blue])) == column
         assert item["materials"][0]["depthTest"] is False
-    (stands,) = (
+    (matrix,) = (
         c["matrix"]
         for c in commands
         if c["type"] == "set_transform" and c["path"] == "/meshcat/frames/door.hinge"
     )
-    assert np.allclose(np.reshape(stands, (4, 4)).T, placement.homogeneous)
+    assert np.allclose(np.reshape(matrix, (4, 4)).T, placement.homogeneous)
 
 
 def test_interpolated_animation_agrees_with_the_motion(
     commands: list[dict[str, Any]], plan: Plan
 ) -> None:
-    """Joint by joint as three.js does it: positions linear, quaternions along the great circle."""
+    """Interpolate like three.js: positions linearly, quaternions by slerp."""
     world = World(plan.scene)
     data = world.model.createData()
-    moving, still = (
+    clips, static = (
         read_clips(commands),
         {c["path"]: c["matrix"] for c in commands if c["type"] == "set_transform"},
     )
-    shift = pin.SE3(np.array(still["/meshcat"]).reshape(4, 4).T)
+    shift = pin.SE3(np.array(static["/meshcat"]).reshape(4, 4).T)
     for moment in (0.0, 0.33, 2.9, 3.05, 4.4, 5.9, 6.0):
         (row,) = world.compute_positions(plan.trajectory, [moment])
         pin.framesForwardKinematics(world.model, data, world.coordinates.q(row))
         for path in (
             p
-            for p in moving
+            for p in clips
             if p.startswith(("/meshcat/robot/", "/meshcat/objects/")) and "<object>" not in p
         ):
             nodes = path.split("/")
             placement = pin.SE3.Identity()
             for depth in range(2, len(nodes) + 1):
-                placement = placement * local_placement(
-                    "/".join(nodes[:depth]), moment, moving, still
+                placement = placement * compute_local_placement(
+                    "/".join(nodes[:depth]), moment, clips, static
                 )
             name = nodes[-1] if nodes[2] == "robot" else f"{nodes[3]}.{nodes[-1]}"
             expected = shift * data.oMi[world.model.getJointId(name)]
@@ -171,11 +173,11 @@ def test_interpolated_animation_agrees_with_the_motion(
             )
 
 
-def local_placement(
-    path: str, moment: float, moving: dict[str, Any], still: dict[str, Any]
+def compute_local_placement(
+    path: str, moment: float, clips: dict[str, Any], static: dict[str, Any]
 ) -> pin.SE3:
-    placement = pin.SE3(np.array(still.get(path, np.eye(4).ravel())).reshape(4, 4).T)
-    for track in moving.get(path, {"tracks": []})["tracks"]:
+    placement = pin.SE3(np.array(static.get(path, np.eye(4).ravel())).reshape(4, 4).T)
+    for track in clips.get(path, {"tracks": []})["tracks"]:
         times = np.array([key["time"] for key in track["keys"]])
         values = np.array([key["value"] for key in track["keys"]])
         i = int(np.clip(np.searchsorted(times, moment, side="right") - 1, 0, len(times) - 2))
@@ -207,15 +209,15 @@ def test_violating_links_turn_red_at_the_time_of_the_violation(
         assert all(abs(moment - 4.0) < 0.5 for moment in alarms)
 
 
-# The page
+# Page
 
 
-def test_page_is_one_file_that_loads_nothing(page: Path) -> None:
+def test_page_is_one_self_contained_file(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert page.stat().st_size < 5e6
-    assert "default-src 'none'" in text, "the browser itself refuses every load"
-    own = re.sub(r'<script type="application/[^>]*>[^<]*</script>', "", text)
-    assert not re.search(r"https?://|<link|<img|<iframe|\bsrc=|@import|url\(", own)
+    assert "default-src 'none'" in text, "the browser blocks all requests"
+    markup = re.sub(r'<script type="application/[^>]*>[^<]*</script>', "", text)
+    assert not re.search(r"https?://|<link|<img|<iframe|\bsrc=|@import|url\(", markup)
     assert [file.name for file in page.parent.glob("*.html")] == ["door.html"]
 
 
@@ -230,9 +232,9 @@ def test_page_contains_phases_violations_and_status(page: Path, plan: Plan) -> N
     assert "rejected" in film["headline"]
 
 
-def test_times_of_a_page_count_from_the_begin_of_the_motion(plan: Plan, tmp_path: Path) -> None:
+def test_page_times_start_with_the_motion(plan: Plan, tmp_path: Path) -> None:
     motion, report = plan.trajectory, plan.report
-    late = dataclasses.replace(
+    shifted = dataclasses.replace(
         plan,
         trajectory=dataclasses.replace(motion, times=motion.times + 100.0, curve=None),
         report=dataclasses.replace(
@@ -241,7 +243,7 @@ def test_times_of_a_page_count_from_the_begin_of_the_motion(plan: Plan, tmp_path
         ),
     )
     films = []
-    for one in (plan, late):
+    for one in (plan, shifted):
         text = visualization.to_html(one, tmp_path / "page.html").read_text(encoding="utf-8")
         films.append(json.loads(text.partition('id="film">')[2].partition("</script>")[0]))
     assert films[1]["notes"] == [
@@ -249,7 +251,7 @@ def test_times_of_a_page_count_from_the_begin_of_the_motion(plan: Plan, tmp_path
     ]
 
 
-def test_arguments_that_cannot_be_shown_are_refused(plan: Plan, tmp_path: Path) -> None:
+def test_invalid_arguments_are_rejected(plan: Plan, tmp_path: Path) -> None:
     for call in (
         lambda: visualization.show("door"),
         lambda: visualization.to_html(None, tmp_path / "x.html"),
@@ -271,8 +273,8 @@ def viewer(plan: Plan) -> Iterator[Any]:
     process[0].kill()
 
 
-def request(port: int, host: str, *lines: str) -> int:
-    """Return the status of the server's answer; further lines ask for its websocket."""
+def request_status(port: int, host: str, *lines: str) -> int:
+    """Return the status of the server's response; header lines request its websocket."""
     head = [f"GET {'/' if lines else '/static/'} HTTP/1.1", f"Host: {host}"]
     head += lines or ["Connection: close"]
     with socket.create_connection(("127.0.0.1", port), timeout=20) as connection:
@@ -280,8 +282,8 @@ def request(port: int, host: str, *lines: str) -> int:
         return int(connection.makefile("rb").readline().split()[1])
 
 
-def test_server_answers_only_this_machine(viewer: Any) -> None:
-    """Web pages elsewhere may resolve names of their own to this machine."""
+def test_server_accepts_only_local_clients(viewer: Any) -> None:
+    """A foreign web page may resolve its own host name to this machine."""
     assert visualization._server is not None
     port = int(visualization._server[2].split(":")[2].split("/")[0])
     upgrade = (
@@ -291,14 +293,14 @@ def test_server_answers_only_this_machine(viewer: Any) -> None:
         "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
     )
     for host in ("localhost", "LOCALHOST", "127.0.0.1", f"[::1]:{port}"):
-        assert request(port, host) == 200, host
+        assert request_status(port, host) == 200, host
     local = f"localhost:{port}"
-    assert request(port, local, *upgrade, f"Origin: http://{local}") == 101
+    assert request_status(port, local, *upgrade, f"Origin: http://{local}") == 101
     for origin in ("http://evil.example", f"http://evil.example:{port}", "http://localhost:1"):
-        assert request(port, local, *upgrade, f"Origin: {origin}") == 403, origin
+        assert request_status(port, local, *upgrade, f"Origin: {origin}") == 403, origin
     for host in (f"evil.example:{port}", "localhost.evil.example", "0.0.0.0", "127.0.0.1@evil"):
-        assert request(port, host) in (400, 403), host
-        assert request(port, host, *upgrade, f"Origin: http://{host}") in (400, 403), host
+        assert request_status(port, host) in (400, 403), host
+        assert request_status(port, host, *upgrade, f"Origin: http://{host}") in (400, 403), host
     for address in visualization._server[1:]:
         (number,) = re.findall(r":(\d+)", address)[:1]
         with pytest.raises(ConnectionRefusedError):  # bound to 127.0.0.1 only
@@ -321,27 +323,27 @@ BAD_MESSAGES = [
 ]
 
 
-def test_every_message_is_answered_and_viewers_stay_usable(viewer: Any, plan: Plan) -> None:
+def test_invalid_messages_are_answered_and_leave_viewers_usable(viewer: Any, plan: Plan) -> None:
     assert visualization._server is not None
     address = visualization._server[1]
     context = zmq.Context()
     context.setsockopt(zmq.LINGER, 0)
     context.setsockopt(zmq.RCVTIMEO, 20_000)
     for message in BAD_MESSAGES:
-        with context.socket(zmq.REQ) as stranger:
-            stranger.connect(address)
-            stranger.send_multipart(message)
-            assert stranger.recv() == b"ok" or message[0] != b"set_transform"
-    with context.socket(zmq.REQ) as stranger:  # leaves before it is answered
-        stranger.connect(address)
-        stranger.send(b"wait")
+        with context.socket(zmq.REQ) as client:
+            client.connect(address)
+            client.send_multipart(message)
+            assert client.recv() == b"ok" or message[0] != b"set_transform"
+    with context.socket(zmq.REQ) as client:  # disconnects before the reply
+        client.connect(address)
+        client.send(b"wait")
     context.destroy()
-    again = visualization.show(plan, open_browser=False)
-    assert again.url() == viewer.url(), "the server still runs"
-    assert len(again.static_html()) > 1e6
+    second_viewer = visualization.show(plan, open_browser=False)
+    assert second_viewer.url() == viewer.url(), "the server still runs"
+    assert len(second_viewer.static_html()) > 1e6
 
 
-def test_show_ends_when_the_server_is_silent(
+def test_show_raises_if_the_server_does_not_answer(
     viewer: Any, plan: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server = visualization._server
@@ -366,7 +368,7 @@ def test_server_serves_the_motion(viewer: Any, plan: Plan) -> None:
         assert b"meshcat-pane" in answer.read()
     scene = viewer.static_html()
     assert len(scene) > 1e6
-    assert visualization.animate(plan).url() == viewer.url(), "one window for a process"
+    assert visualization.animate(plan).url() == viewer.url(), "one window per process"
 
 
 def test_animate_uses_a_given_viewer(plan: Plan) -> None:
@@ -377,7 +379,7 @@ def test_animate_uses_a_given_viewer(plan: Plan) -> None:
     recorder = Recorder()
     mine = meshcat.Visualizer(window=recorder)["mine"]
     assert visualization.animate(plan, mine) is mine
-    assert "/meshcat/mine/paths/tool" in drawn(recorder.commands)
+    assert "/meshcat/mine/paths/tool" in map_objects(recorder.commands)
     assert all(path.startswith("/meshcat/mine/") for path in read_clips(recorder.commands))
 
 
@@ -453,8 +455,8 @@ def test_browser_shows_links_at_their_placements(page: Path, plan: Plan) -> None
     assert f"because {plan.report.notes[0]}" in text
     match = re.search(r'<pre id="seen">(.*?)</pre>', text, re.DOTALL)
     assert match
-    told = json.loads(match[1])
-    assert told["sun"]
+    measured = json.loads(match[1])
+    assert measured["sun"]
     world = World(plan.scene)
     data = world.model.createData()
     (row,) = world.compute_positions(plan.trajectory, [moment])
@@ -465,8 +467,8 @@ def test_browser_shows_links_at_their_placements(page: Path, plan: Plan) -> None
         ("hinge", "door.hinge"),
         ("knob", "door.knob"),
     ):
-        seen = np.array(told["seen"][name]).reshape(4, 4).T
-        assert np.allclose(seen, data.oMi[world.model.getJointId(joint)].homogeneous, atol=1e-4), (
-            name
-        )
+        placement = np.array(measured["seen"][name]).reshape(4, 4).T
+        assert np.allclose(
+            placement, data.oMi[world.model.getJointId(joint)].homogeneous, atol=1e-4
+        ), name
     assert 0.1 < row[world.coordinates.index("door.hinge")] < HINGE

@@ -17,7 +17,7 @@ pytest.importorskip("h5py")
 
 @pytest.mark.long
 def test_each_task_has_a_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    recipe = write(tmp_path)
+    recipe = write_recipe(tmp_path)
     out = tmp_path / "out"
     assert (
         main(
@@ -55,7 +55,7 @@ def test_each_task_has_a_record(tmp_path: Path, capsys: pytest.CaptureFixture[st
         assert record["attempts"] >= record["successes"] >= 2
         assert record["episodes_per_hour"] > 0.0
         assert 50.0 < record["memory_mb"] < 2000.0
-        assert record["memory_slope_mb"] is None  # of so few
+        assert record["memory_slope_mb"] is None  # too few episodes
         assert 0.0 < record["client_ms"] < 1000.0 * record["wall_time"]
         lines = (out / record["task"] / "journal.jsonl").read_text().splitlines()[1:]
         seconds = [
@@ -64,20 +64,22 @@ def test_each_task_has_a_record(tmp_path: Path, capsys: pytest.CaptureFixture[st
         assert record["episodes_per_hour"] == pytest.approx(
             3600.0 * record["successes"] / seconds[-1], rel=1e-2
         )
-    assert result["curve"] == []  # of one worker
+    assert result["curve"] == []  # one worker only
     for task in TASKS:
-        many = [one for one in result["simulated"] if one["task"] == task]
-        assert [one["workers"] for one in many] == list(WORKERS)
-        assert all(0.0 < one["efficiency"] <= 1.0 for one in many)
+        simulations = [one for one in result["simulated"] if one["task"] == task]
+        assert [one["workers"] for one in simulations] == list(WORKERS)
+        assert all(0.0 < one["efficiency"] <= 1.0 for one in simulations)
     assert (out / "workers.png").read_bytes().startswith(b"\x89PNG")
-    again = run(out=out, episodes=2, recipe=recipe, progress=False)  # nothing is made again
+    again = run(out=out, episodes=2, recipe=recipe, progress=False)  # no episode is generated again
     assert [r["attempts"] for r in again["trials"]] == [r["attempts"] for r in records]
 
 
 @pytest.mark.long
-def test_more_workers_make_the_same_episodes(tmp_path: Path) -> None:
+def test_episodes_do_not_depend_on_the_number_of_workers(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
-    result = run(out=tmp_path / "out", episodes=2, jobs=2, recipe=write(tmp_path), progress=False)
+    result = run(
+        out=tmp_path / "out", episodes=2, jobs=2, recipe=write_recipe(tmp_path), progress=False
+    )
     assert [(one["task"], one["workers"]) for one in result["curve"]] == [
         (task, count) for task in TASKS for count in (1, 2)
     ]
@@ -95,7 +97,7 @@ def test_more_workers_make_the_same_episodes(tmp_path: Path) -> None:
     assert "speedup" in (tmp_path / "out/table.md").read_text()
 
 
-def write(folder: Path) -> str:
+def write_recipe(folder: Path) -> str:
     recipe = folder / "small.yaml"
     recipe.write_text(yaml.safe_dump(SMALL))
     return str(recipe)

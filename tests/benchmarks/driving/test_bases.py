@@ -1,4 +1,4 @@
-"""Kinds of bases are compared at a door and a drawer."""
+"""Tests the comparison of base kinematics at a door and a drawer."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def test_starts_are_the_same_for_every_base() -> None:
 
 
 @pytest.mark.long
-def test_experiment(tmp_path: Path) -> None:
-    words = "bases --trials 1 --tasks drawer --bases omni differential"
-    table, records = run_experiment(words, tmp_path)
+def test_both_bases_open_the_drawer(tmp_path: Path) -> None:
+    arguments = "bases --trials 1 --tasks drawer --bases omni differential"
+    table, records = run_experiment(arguments, tmp_path)
     assert [(r["base"], r["success"]) for r in records] == [("differential", True), ("omni", True)]
     for r in records:
         assert f"| drawer | {r['base']} | 1 of 1 | {r['planning_time']:.3f} |" in table
@@ -44,10 +44,10 @@ def test_failures_are_listed() -> None:
         "arm_path_length",
         "duration",
     )
-    about = {"starts": 5, "seed": 0, "radius": 0.8, "tasks": ["door"], "bases": ["ackermann"]}
+    meta = {"starts": 5, "seed": 0, "radius": 0.8, "tasks": ["door"], "bases": ["ackermann"]}
     failure = {"task": "door", "base": "ackermann", "number": 4, "success": False}
     failure |= {"status": "rejected", "violations": ["turning base"], **dict.fromkeys(fields, 1.0)}
-    text = bases.format_results({"meta": {**describe_environment(), **about}, "trials": [failure]})
+    text = bases.format_results({"meta": {**describe_environment(), **meta}, "trials": [failure]})
     assert "- door, ackermann, start 4: rejected; turning base" in text
     assert "| door | ackermann | 0 of 1 |" in text
 

@@ -1,4 +1,4 @@
-"""Plans are executed in physics and counted."""
+"""Tests the experiment that executes planned motions in a physics simulation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vkc_pin.benchmarks.executing.execution import format_results
 from vkc_pin.cli import main
 
 
-def test_experiment_with_welded_grasp(tmp_path: Path) -> None:
+def test_drawer_is_opened_with_a_welded_grasp(tmp_path: Path) -> None:
     table, (trial,) = run_experiment("execution --trials 1 --tasks drawer", tmp_path)
     assert trial["success"] is True, trial["violations"]
     assert trial["executed"] is True, trial["problems"]
@@ -27,39 +27,55 @@ def test_experiment_with_welded_grasp(tmp_path: Path) -> None:
     assert "Nothing." in table
 
 
-def test_experiment_with_friction(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = "execution --trials 1 --tasks drawer --grasp"
-    table, (trial,) = run_experiment(f"{words} friction", tmp_path / "out")
+def test_drawer_is_opened_with_a_friction_grasp(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = "execution --trials 1 --tasks drawer --grasp"
+    table, (trial,) = run_experiment(f"{arguments} friction", tmp_path / "out")
     assert "held by friction" in table
     assert trial["executed"] is True, trial["problems"]
     assert 0.0 < trial["slip"] < 0.005
-    assert main(["bench", *words.split(), "glue", "--out", str(tmp_path / "other")]) == 2
+    assert main(["bench", *arguments.split(), "glue", "--out", str(tmp_path / "other")]) == 2
     assert "glue" in capsys.readouterr().err
 
 
-def test_rest_is_planned_from_the_measured_grasp(
+def test_motion_after_grasping_is_planned_from_the_measured_grasp(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = "execution --trials 1 --tasks"
-    table, (trial,) = run_experiment(f"{words} drawer --off 4 --seed 3", tmp_path / "out")
+    arguments = "execution --trials 1 --tasks"
+    table, (trial,) = run_experiment(f"{arguments} drawer --off 4 --seed 3", tmp_path / "out")
     assert trial["success"] is True, trial["violations"]
     assert trial["executed"] is True, trial["problems"]
     assert "| drawer, 4 mm off | 1 of 1 | 1 of 1 |" in table
     assert "- drawer, start 0, seed 3, 4 mm off: success, executed" in table
     for wrong, field in (("drawer --off 30", "off[0]"), ("init_1 --off 1", "tasks")):
-        command = ["bench", *words.split(), *wrong.split(), "--out", str(tmp_path / "other")]
+        command = ["bench", *arguments.split(), *wrong.split(), "--out", str(tmp_path / "other")]
         assert main(command) == 2
         assert field in capsys.readouterr().err
 
 
 def test_failed_executions_are_counted() -> None:
-    fine = {"task": "drawer", "success": True, "executed": True, "arm_error": 0.01, "problems": []}
-    bad = {**fine, "executed": False, "arm_error": 0.02, "problems": ["cup – floor: 9 mm deep"]}
-    never = {"task": "drawer", "success": False, "executed": False}
+    executed = {
+        "task": "drawer",
+        "success": True,
+        "executed": True,
+        "arm_error": 0.01,
+        "problems": [],
+    }
+    failed = {
+        **executed,
+        "executed": False,
+        "arm_error": 0.02,
+        "problems": ["cup – floor: 9 mm deep"],
+    }
+    unplanned = {"task": "drawer", "success": False, "executed": False}
     record = Path(__file__).parents[3] / "docs/results/gap.json.gz"
-    about = json.loads(gzip.decompress(record.read_bytes()))["meta"]
+    meta = json.loads(gzip.decompress(record.read_bytes()))["meta"]
     text = format_results(
-        {"meta": {**about, "starts": 3, "tasks": ["drawer"]}, "trials": [fine, bad, never]}
+        {
+            "meta": {**meta, "starts": 3, "tasks": ["drawer"]},
+            "trials": [executed, failed, unplanned],
+        }
     )
     assert "| drawer | 2 of 3 | 1 of 2 |" in text
     assert "1.15" in text

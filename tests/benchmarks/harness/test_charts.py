@@ -22,8 +22,8 @@ from vkc_pin.validation.report import Report
 SCENES = {"a": "easy", "b": "hard"}
 RATES = {("a", "one"): (4, 4), ("a", "two"): (3, 4), ("b", "one"): (1, 4), ("b", "two"): (0, 4)}
 RECORDS: list[dict[str, Any]] = [
-    {"scene": scene, "method": method, "success": k < good}
-    for (scene, method), (good, number) in RATES.items()
+    {"scene": scene, "method": method, "success": k < successes}
+    for (scene, method), (successes, number) in RATES.items()
     for k in range(number)
 ]
 
@@ -53,7 +53,7 @@ def test_success_chart_has_rates_and_intervals() -> None:
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["one", "two"]
     assert all(
         bar.get_height() == 0.0 for bar in axes.patches if bar not in bars
-    )  # what the legend needs shows nothing
+    )  # bars for the legend have no height
 
 
 def test_method_without_trials_has_no_bar() -> None:
@@ -65,7 +65,7 @@ def test_method_without_trials_has_no_bar() -> None:
     ]
 
 
-def record(
+def make_record(
     method: str, number: int, success: bool, base: float, time: float | None
 ) -> dict[str, Any]:
     figures = {"base_path_length": base, "arm_path_length": 10.0 * base, "planning_time": time}
@@ -74,14 +74,14 @@ def record(
 
 TRIALS = [
     *(
-        record("one", number, True, base, time)
+        make_record("one", number, True, base, time)
         for number, base, time in ((0, 3.0, 1.0), (1, 4.0, 2.0), (2, 9.0, 6.0))
     ),
     *(
-        record("two", number, good, base, time)
-        for number, good, base, time in ((0, True, 5.0, 3.0), (1, True, 6.0, 4.0))
+        make_record("two", number, successes, base, time)
+        for number, successes, base, time in ((0, True, 5.0, 3.0), (1, True, 6.0, 4.0))
     ),
-    record("two", 2, False, 99.0, None),  # an error
+    make_record("two", 2, False, 99.0, None),  # an error
 ]
 
 
@@ -93,18 +93,19 @@ def read_bars(axes: Any) -> list[tuple[str, float]]:
     ]
 
 
-def test_criteria_chart_against_numbers_by_hand() -> None:
+def test_criteria_chart_equals_values_computed_by_hand() -> None:
     figure = criteria_chart(TRIALS, None, ["one", "two"], title="All")
     success, base, arm, time = figure.axes
     assert read_bars(success) == [("one", 100.0), ("two", pytest.approx(200.0 / 3.0))]
     assert read_bars(base) == [("one", 3.5), ("two", 5.5)]  # only where both succeed
     assert read_bars(arm) == [("one", 35.0), ("two", 55.0)]
-    assert read_bars(time) == [("one", 2.0), ("two", 3.5)]  # of all that have one
+    assert read_bars(time) == [("one", 2.0), ("two", 3.5)]  # over all trials with a time
     ends = [
         [line.get_segments()[0][:, 1].tolist() for line in axes.collections] for axes in figure.axes
     ]
     assert ends[0] == [
-        pytest.approx([100.0 * end for end in compute_wilson_interval(good, 3)]) for good in (3, 2)
+        pytest.approx([100.0 * end for end in compute_wilson_interval(successes, 3)])
+        for successes in (3, 2)
     ]
     assert ends[1:] == [
         [[3.25, 3.75], [5.25, 5.75]],
@@ -112,31 +113,31 @@ def test_criteria_chart_against_numbers_by_hand() -> None:
         [[1.5, 4.0], [3.25, 3.75]],
     ]
     assert [text.get_text() for text in success.texts + base.texts] == ["100", "67", "3.50", "5.50"]
-    about = [axes.get_xlabel().replace("\n", " ") for axes in figure.axes]
-    assert "Wilson" in about[0]
-    assert about[1] == about[2] == "median and quartiles over the 2 trials where all succeed"
-    assert about[3] == "median and quartiles over all trials"
+    labels = [axes.get_xlabel().replace("\n", " ") for axes in figure.axes]
+    assert "Wilson" in labels[0]
+    assert labels[1] == labels[2] == "median and quartiles over the 2 trials where all succeed"
+    assert labels[3] == "median and quartiles over all trials"
     colours = [[bar.get_facecolor() for bar in axes.patches] for axes in figure.axes]
     assert all(pair == colours[0] for pair in colours)
     assert colours[0][0] != colours[0][1]
 
 
 def read_grouped_bars(axes: Any) -> dict[str, list[float]]:
-    """Return the heights of a chart's bars, group by group, method after method."""
+    """Return group → heights of its bars, in the order of methods."""
     names = [label.get_text() for label in axes.get_xticklabels()]
-    found: dict[str, list[float]] = {name: [] for name in names}
+    heights: dict[str, list[float]] = {name: [] for name in names}
     for bar in axes.patches:
-        if bar.get_width() < 0.5:  # not what the legend needs
-            found[names[round(bar.get_x() + bar.get_width() / 2.0)]].append(bar.get_height())
-    return found
+        if bar.get_width() < 0.5:  # not a bar for the legend
+            heights[names[round(bar.get_x() + bar.get_width() / 2.0)]].append(bar.get_height())
+    return heights
 
 
-def test_means_chart_against_numbers_by_hand() -> None:
-    lonely = [
-        {**record("one", 0, True, 7.0, 5.0), "scene": "b"},
-        {**record("two", 0, False, 1.0, 7.0), "scene": "b"},
+def test_means_chart_equals_values_computed_by_hand() -> None:
+    unpaired = [
+        {**make_record("one", 0, True, 7.0, 5.0), "scene": "b"},
+        {**make_record("two", 0, False, 1.0, 7.0), "scene": "b"},
     ]
-    records, scenes = [*TRIALS, *lonely], {"a": "easy", "b": "hard"}
+    records, scenes = [*TRIALS, *unpaired], {"a": "easy", "b": "hard"}
     figure = means_chart(
         records,
         None,
@@ -187,23 +188,23 @@ def test_motions_chart_shows_the_plans(tmp_path: Path) -> None:
     rows = np.array(figure.axes).reshape(3, 2)
     assert rows[0, 0].get_title() == "first, FAILED: rejected (6.0 s)"
     assert rows[0, 1].get_title() == "second (12.0 s)"
-    for column, shown in enumerate((plan, slow)):
-        motion, (position, velocity, base) = shown.trajectory, rows[:, column]
+    for column, charted in enumerate((plan, slow)):
+        motion, (position, velocity, base) = charted.trajectory, rows[:, column]
         for axes, read, columns in (
             (position, motion.at, slice(3, 9)),
             (velocity, motion.velocity, slice(3, 9)),
             (base, motion.velocity, slice(0, 3)),
         ):
-            when = axes.lines[0].get_xdata()
-            assert set(motion.times) <= set(when)
+            times = axes.lines[0].get_xdata()
+            assert set(motion.times) <= set(times)
             np.testing.assert_allclose(
-                [line.get_ydata() for line in axes.lines], read(when)[:, columns].T
+                [line.get_ydata() for line in axes.lines], read(times)[:, columns].T
             )
     for row in rows:
         assert row[0].get_ylim() == row[1].get_ylim()
     assert rows[1, 0].get_ylim() == pytest.approx(
         (-2.0 * compute_peak_speed(slow), 2.0 * compute_peak_speed(slow))
-    )  # not scaled to the failure
+    )  # the scale ignores the failed plan
     assert {axes.get_xlim() for axes in rows.ravel()} == {(0.0, 12.0)}
     assert [text.get_text() for text in rows[0, 1].get_legend().get_texts()][:2] == [
         "shoulder_pan",
@@ -227,8 +228,8 @@ def test_scale_chart_shows_medians_and_shares(tmp_path: Path) -> None:
             "planning_time": time,
             **{field: part * time for field, part in share.items()},
         }
-        for count, own in times.items()
-        for time in own
+        for count, samples in times.items()
+        for time in samples
     ]
     figure = scale_chart(
         [*records, {"obstacles": 10, "status": "error"}], tmp_path / "scale.png", title="Many"

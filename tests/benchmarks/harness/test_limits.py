@@ -1,10 +1,10 @@
-"""Limits of trials are stated in words."""
+"""Tests the descriptions of trial limits."""
 
 from __future__ import annotations
 
 from vkc_pin.benchmarks.harness.limits import LIMITS, describe_limit
 
 
-def test_records_state_evaluations_or_planning_time() -> None:
+def test_description_states_evaluations_or_planning_time() -> None:
     assert describe_limit({**LIMITS, "seed": 3}) == "at most 1 000 000 evaluations"
     assert describe_limit({"time_limit": 20.0}) == "at most 20 s of planning"

@@ -1,4 +1,4 @@
-"""Trials are recorded."""
+"""Tests the records of trials."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
-def test_commit_needs_git(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commit_is_none_without_git(monkeypatch: pytest.MonkeyPatch) -> None:
     record.find_commit.cache_clear()
-    found = record.find_commit()
-    assert found is None or len(found) >= 7
+    commit = record.find_commit()
+    assert commit is None or len(commit) >= 7
     monkeypatch.setenv("PATH", "")
     record.find_commit.cache_clear()
     assert record.find_commit() is None
@@ -26,21 +26,21 @@ def test_commit_needs_git(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_failure_is_recorded_with_the_first_violation() -> None:
     plan = make_fake_plan()
-    found = record.trial(plan, method="VKC", seed=3, number=7)
-    assert (found["scene"], found["method"], found["seed"], found["number"]) == (
+    trial = record.trial(plan, method="VKC", seed=3, number=7)
+    assert (trial["scene"], trial["method"], trial["seed"], trial["number"]) == (
         "door",
         "VKC",
         3,
         7,
     )
-    assert (found["success"], found["status"]) == (False, "rejected")
-    assert found["failed_constraint"] == "penetration forearm_link – sofa"
-    assert found["violations"] == [str(plan.report.violations[0])]
-    assert found["base_path_length"] == plan.metrics["base_path_length"]
-    assert found["waypoints"] == len(plan.trajectory.times)
-    np.testing.assert_allclose(found["start"], plan.scene.start, atol=1e-9)
-    late = dataclasses.replace(plan, status="time limit", report=Report())
-    assert record.trial(late, method="VKC", seed=0)["failed_constraint"] == "time limit"
+    assert (trial["success"], trial["status"]) == (False, "rejected")
+    assert trial["failed_constraint"] == "penetration forearm_link – sofa"
+    assert trial["violations"] == [str(plan.report.violations[0])]
+    assert trial["base_path_length"] == plan.metrics["base_path_length"]
+    assert trial["waypoints"] == len(plan.trajectory.times)
+    np.testing.assert_allclose(trial["start"], plan.scene.start, atol=1e-9)
+    timed_out = dataclasses.replace(plan, status="time limit", report=Report())
+    assert record.trial(timed_out, method="VKC", seed=0)["failed_constraint"] == "time limit"
 
 
 def test_peaks_are_those_of_the_arm() -> None:
@@ -54,5 +54,5 @@ def test_peaks_are_those_of_the_arm() -> None:
     times = np.array([0.0, 1.0, 3.0, 3.5])
     motion = Trajectory(names, times, np.array(positions), (PhaseSpan("move", 0, 3),), 5)
     # The elbow turns by -3 rad in 2 s; its velocity changes by 1.2 rad/s within 0.5 s.
-    found = record.compute_peaks(motion)
-    assert found == pytest.approx({"peak_velocity": 1.5, "peak_acceleration": 2.4})
+    peaks = record.compute_peaks(motion)
+    assert peaks == pytest.approx({"peak_velocity": 1.5, "peak_acceleration": 2.4})

@@ -24,21 +24,21 @@ from vkc_pin.benchmarks.harness import runner
 from vkc_pin.errors import InputError, VkcError
 
 
-class Counting:
-    """Runs `square`, records the keys, and is interrupted after some trials."""
+class CountingSolver:
+    """Runs `solve_square` and records the keys; an interrupt comes after `stop_after` trials."""
 
-    def __init__(self, until: int = 1000) -> None:
-        self.asked: list[str] = []
-        self.until = until
+    def __init__(self, stop_after: int = 1000) -> None:
+        self.keys: list[str] = []
+        self.stop_after = stop_after
 
     def __call__(self, spec: dict[str, Any]) -> dict[str, Any]:
-        if len(self.asked) == self.until:
+        if len(self.keys) == self.stop_after:
             raise KeyboardInterrupt
-        self.asked.append(spec["key"])
+        self.keys.append(spec["key"])
         return solve_square(spec)
 
 
-def run(
+def run_trials(
     out: Path,
     function: Any = solve_square,
     number: int = 6,
@@ -46,17 +46,19 @@ def run(
     scheduler: str | None = None,
     **settings: Any,
 ) -> dict[str, Any]:
-    how: dict[str, Any] = {"jobs": jobs, "scheduler": scheduler, "progress": False}
-    return runner.run(make_trials(number), function, out, settings={**SETTINGS, **settings}, **how)
+    arguments: dict[str, Any] = {"jobs": jobs, "scheduler": scheduler, "progress": False}
+    return runner.run(
+        make_trials(number), function, out, settings={**SETTINGS, **settings}, **arguments
+    )
 
 
-def read(out: Path) -> dict[str, Any]:
+def read_results(out: Path) -> dict[str, Any]:
     return json.loads((out / "results.json").read_text(encoding="utf-8"))
 
 
-def test_results_are_records_and_settings(tmp_path: Path) -> None:
-    result = run(tmp_path / "new" / "out")
-    assert read(tmp_path / "new" / "out") == result
+def test_results_contain_records_and_settings(tmp_path: Path) -> None:
+    result = run_trials(tmp_path / "new" / "out")
+    assert read_results(tmp_path / "new" / "out") == result
     assert [t["key"] for t in result["trials"]] == ["000", "001", "002", "003", "004", "005"]
     assert result["trials"][3] == {
         "key": "003",
@@ -79,21 +81,21 @@ def test_results_are_records_and_settings(tmp_path: Path) -> None:
     assert 20.0 < meta["peak_memory_mb"] < 10_000.0
 
 
-def test_csv_has_the_records_of_json(tmp_path: Path) -> None:
-    result = run(tmp_path, divide_by_zero)  # the failure has other fields than the rest
+def test_csv_and_json_have_the_same_records(tmp_path: Path) -> None:
+    result = run_trials(tmp_path, divide_by_zero)  # the failed trial has other fields
     with (tmp_path / "results.csv").open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == len(result["trials"]) == 6
-    texts = {"key", "status", "failed_constraint"}
+    text_fields = {"key", "status", "failed_constraint"}
     for row, found in zip(rows, result["trials"], strict=True):
         assert set(row) >= set(found)
         for field, cell in row.items():
-            value = None if cell == "" else cell if field in texts else json.loads(cell)
+            value = None if cell == "" else cell if field in text_fields else json.loads(cell)
             assert value == found.get(field), field
 
 
 def test_trial_may_have_several_records(tmp_path: Path) -> None:
-    result = run(
+    result = run_trials(
         tmp_path, lambda spec: [{"part": part, "number": spec["number"]} for part in "ba"], number=2
     )
     assert [(t["key"], t["part"]) for t in result["trials"]] == [
@@ -104,19 +106,19 @@ def test_trial_may_have_several_records(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize("until", [0, 4])
-def test_interrupted_run_is_resumed(tmp_path: Path, until: int) -> None:
-    first, second = Counting(until), Counting()
-    with pytest.raises(KeyboardInterrupt, match=f"{until} of 6 trials are done"):
-        run(tmp_path / "stopped", first)
+@pytest.mark.parametrize("stop_after", [0, 4])
+def test_interrupted_run_is_resumed(tmp_path: Path, stop_after: int) -> None:
+    first, second = CountingSolver(stop_after), CountingSolver()
+    with pytest.raises(KeyboardInterrupt, match=f"{stop_after} of 6 trials are done"):
+        run_trials(tmp_path / "stopped", first)
     assert not (tmp_path / "stopped" / "results.json").exists()
-    resumed = run(tmp_path / "stopped", second)
-    assert sorted(first.asked + second.asked) == [t["key"] for t in make_trials()][::-1]
+    resumed = run_trials(tmp_path / "stopped", second)
+    assert sorted(first.keys + second.keys) == [t["key"] for t in make_trials()][::-1]
     assert (
-        first.asked == [t["key"] for t in make_trials()][:until]
-    )  # in the order given, not that of the keys
-    assert [s["trials"] for s in resumed["meta"]["sessions"]] == [until, 6 - until]
-    assert resumed["trials"] == run(tmp_path / "whole")["trials"]
+        first.keys == [t["key"] for t in make_trials()][:stop_after]
+    )  # in the given order, not sorted by key
+    assert [s["trials"] for s in resumed["meta"]["sessions"]] == [stop_after, 6 - stop_after]
+    assert resumed["trials"] == run_trials(tmp_path / "whole")["trials"]
     assert (tmp_path / "stopped" / "results.csv").read_bytes() == (
         tmp_path / "whole" / "results.csv"
     ).read_bytes()
@@ -124,58 +126,57 @@ def test_interrupted_run_is_resumed(tmp_path: Path, until: int) -> None:
 
 def test_interrupted_record_interrupts_the_run(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt, match="0 of 6"):
-        run(tmp_path, lambda spec: {**solve_square(spec), "status": "interrupted"})
-    assert run(tmp_path)["trials"][0]["status"] == "success"
+        run_trials(tmp_path, lambda spec: {**solve_square(spec), "status": "interrupted"})
+    assert run_trials(tmp_path)["trials"][0]["status"] == "success"
 
 
-def test_torn_last_line_is_run_again(tmp_path: Path) -> None:
-    whole = run(tmp_path)
+def test_trial_of_a_truncated_last_line_is_run_again(tmp_path: Path) -> None:
+    whole = run_trials(tmp_path)
     file = tmp_path / "trials.jsonl"
     data = file.read_bytes()
     lines = data.splitlines(keepends=True)
     assert len(lines) == 2 + 6  # header, session, trials in the order of running
-    # Torn inside the header, the session's line and trials; within a line, and just before the end
-    # of it.
-    for kept, cut in ((0, 40), (1, 5), (3, 25), (7, len(lines[7]) - 1), (7, 1)):
-        file.write_bytes(b"".join(lines[:kept]) + lines[kept][:cut])
-        again = Counting()
-        assert run(tmp_path, again)["trials"] == whole["trials"]
-        assert again.asked == [t["key"] for t in make_trials()][max(kept - 2, 0) :]
+    # Truncated inside the header, the session's line and trials: within a line or before its end.
+    for count, length in ((0, 40), (1, 5), (3, 25), (7, len(lines[7]) - 1), (7, 1)):
+        file.write_bytes(b"".join(lines[:count]) + lines[count][:length])
+        again = CountingSolver()
+        assert run_trials(tmp_path, again)["trials"] == whole["trials"]
+        assert again.keys == [t["key"] for t in make_trials()][max(count - 2, 0) :]
         assert [
             json.loads(line) for line in file.read_bytes().splitlines()
-        ]  # nothing of the torn line is left
+        ]  # the truncated line is gone
 
 
-def test_damaged_line_is_an_error(tmp_path: Path) -> None:
-    run(tmp_path)
+def test_damaged_line_raises_an_error(tmp_path: Path) -> None:
+    run_trials(tmp_path)
     file = tmp_path / "trials.jsonl"
     lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
     for damage in ('{"key": "00\n', "[]\n", "{}\n"):
         file.write_text("".join([*lines[:3], damage, *lines[4:]]), encoding="utf-8")
         with pytest.raises(InputError, match=r"trials\.jsonl:4: this line is damaged"):
-            run(tmp_path)
+            run_trials(tmp_path)
 
 
 def test_folder_with_other_files_is_refused(tmp_path: Path) -> None:
     for name in ("table.md", "results.json", "thesis.tex"):
         (tmp_path / name).mkdir()
-        assert run(tmp_path / name)["trials"]
+        assert run_trials(tmp_path / name)["trials"]
         out = tmp_path / "own" / name
         out.mkdir(parents=True)
         (out / name).write_text("mine")
         with pytest.raises(InputError, match="there are other files in this folder") as caught:
-            run(out)
+            run_trials(out)
         assert (caught.value.file, caught.value.got) == (out, name)
         assert [(path.name, path.read_text()) for path in out.iterdir()] == [(name, "mine")]
     (tmp_path / "folders" / "objects").mkdir(parents=True)
     (tmp_path / "folders" / ".gitignore").touch()
-    assert run(tmp_path / "folders")["trials"]
+    assert run_trials(tmp_path / "folders")["trials"]
 
 
-def test_other_file_named_as_the_journal_is_refused(tmp_path: Path) -> None:
+def test_foreign_file_with_the_name_of_the_journal_is_refused(tmp_path: Path) -> None:
     (tmp_path / "trials.jsonl").write_text("court cases, in one line")
     with pytest.raises(InputError, match="not a journal"):
-        run(tmp_path)
+        run_trials(tmp_path)
     assert (tmp_path / "trials.jsonl").read_text() == "court cases, in one line"
     assert [path.name for path in tmp_path.iterdir()] == ["trials.jsonl"]
 
@@ -183,24 +184,24 @@ def test_other_file_named_as_the_journal_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "name", ["results.csv", "results.json", "table.md", "trials.jsonl", "deep/x"]
 )
-def test_links_out_of_the_folder_are_refused(tmp_path: Path, name: str) -> None:
+def test_symbolic_links_out_of_the_folder_are_refused(tmp_path: Path, name: str) -> None:
     out = tmp_path / "out"
-    run(out)
+    run_trials(out)
     (out / "deep").mkdir()
     (tmp_path / "mine").write_bytes((out / name).read_bytes() if (out / name).is_file() else b"")
     before = (tmp_path / "mine").read_bytes()
     (out / name).unlink(missing_ok=True)
     (out / name).symlink_to("../../mine" if "/" in name else "../mine")
     with pytest.raises(InputError, match="a symbolic link leads out of the folder"):
-        run(out)
+        run_trials(out)
     assert (tmp_path / "mine").read_bytes() == before
 
 
-def test_other_settings_and_versions_are_refused(tmp_path: Path) -> None:
-    run(tmp_path)
+def test_changed_settings_and_versions_are_refused(tmp_path: Path) -> None:
+    run_trials(tmp_path)
     before = (tmp_path / "trials.jsonl").read_bytes()
     with pytest.raises(InputError) as caught:
-        run(tmp_path, seed=4, methods=["x"])
+        run_trials(tmp_path, seed=4, methods=["x"])
     text = str(caught.value)
     for part in (
         "seed 3",
@@ -212,12 +213,12 @@ def test_other_settings_and_versions_are_refused(tmp_path: Path) -> None:
     ):
         assert part in text
     assert caught.value.field == "seed, methods"
-    with pytest.raises(InputError, match="specification"):  # the same settings, yet other trials
+    with pytest.raises(InputError, match="specification"):  # same settings, other trials
         runner.run(make_trials(5), solve_square, tmp_path, settings=SETTINGS, progress=False)
     assert (tmp_path / "trials.jsonl").read_bytes() == before
     (tmp_path / "trials.jsonl").write_bytes(before.replace(b'"sources": "', b'"sources": "x'))
     with pytest.raises(InputError, match=r"versions\.sources.*expected sources x"):
-        run(tmp_path)
+        run_trials(tmp_path)
 
 
 def test_workers_of_a_scheduler_run_the_trials(tmp_path: Path) -> None:
@@ -225,12 +226,14 @@ def test_workers_of_a_scheduler_run_the_trials(tmp_path: Path) -> None:
     options = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
     with distributed.LocalCluster(host="127.0.0.1", **options) as cluster:
         address = cluster.scheduler_address
-        there = run(tmp_path / "there", identify_worker, number=2, scheduler=address)["trials"]
-    assert {t["process"] for t in there}.isdisjoint({os.getpid()})
+        trials = run_trials(tmp_path / "there", identify_worker, number=2, scheduler=address)[
+            "trials"
+        ]
+    assert {t["process"] for t in trials}.isdisjoint({os.getpid()})
 
 
 def test_results_are_the_same_for_any_number_of_jobs(tmp_path: Path) -> None:
-    assert run(tmp_path / "two", jobs=2)["trials"] == run(tmp_path / "one")["trials"]
+    assert run_trials(tmp_path / "two", jobs=2)["trials"] == run_trials(tmp_path / "one")["trials"]
     assert (tmp_path / "two" / "results.csv").read_bytes() == (
         tmp_path / "one" / "results.csv"
     ).read_bytes()
@@ -240,7 +243,7 @@ def test_results_are_the_same_for_any_number_of_jobs(tmp_path: Path) -> None:
 def test_error_is_recorded_as_failure(
     tmp_path: Path, jobs: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    records = run(tmp_path, divide_by_zero, jobs=jobs)["trials"]
+    records = run_trials(tmp_path, divide_by_zero, jobs=jobs)["trials"]
     assert records[2] == {
         "key": "002",
         "number": 2,
@@ -250,28 +253,28 @@ def test_error_is_recorded_as_failure(
         "violations": ["ZeroDivisionError: nothing to divide by"],
     }
     assert [t["status"] for t in records].count("error") == 1
-    said = capsys.readouterr().err
-    assert "002 failed with an error" in said
-    assert "nothing to divide by" in said
-    assert "in divide_by_zero" in said  # where it happened
+    stderr = capsys.readouterr().err
+    assert "002 failed with an error" in stderr
+    assert "nothing to divide by" in stderr
+    assert "in divide_by_zero" in stderr  # the traceback
 
 
-def test_dead_process_is_an_error(tmp_path: Path) -> None:
+def test_killed_worker_raises_an_error(tmp_path: Path) -> None:
     with pytest.raises(VkcError, match="a process died"):
-        run(tmp_path, crash, jobs=2)
-    assert run(tmp_path)["trials"] == run(tmp_path / "whole")["trials"]
+        run_trials(tmp_path, crash, jobs=2)
+    assert run_trials(tmp_path)["trials"] == run_trials(tmp_path / "whole")["trials"]
 
 
 def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="no folder"):
-        run(tmp_path / "file")
+        run_trials(tmp_path / "file")
     with pytest.raises(InputError, match="no folder"):
-        run(tmp_path / "file" / "out")
+        run_trials(tmp_path / "file" / "out")
     with pytest.raises(InputError, match="same key"):
         runner.run([*make_trials(2), *make_trials(1)], solve_square, tmp_path, settings=SETTINGS)
     with pytest.raises(InputError, match="jobs"):
-        run(tmp_path, jobs=0)
+        run_trials(tmp_path, jobs=0)
 
 
 SCRIPT = """
@@ -288,10 +291,10 @@ def test_stopped_process_keeps_finished_trials(tmp_path: Path, jobs: int, kind: 
     path = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
     process = subprocess.Popen(
         [sys.executable, "-c", SCRIPT, str(tmp_path), str(jobs)],
-        start_new_session=True,  # a group of its own, as of a command in a terminal
+        start_new_session=True,  # a process group, like that of a command in a terminal
         preexec_fn=lambda: signal.signal(
             signal.SIGINT, signal.SIG_DFL
-        ),  # a shell's background job ignores it, and hands that on
+        ),  # children of background jobs inherit SIG_IGN
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "PYTHONPATH": path},
@@ -301,15 +304,13 @@ def test_stopped_process_keeps_finished_trials(tmp_path: Path, jobs: int, kind: 
         assert time.monotonic() < deadline
         assert process.poll() is None, process.communicate()[1]
         time.sleep(0.02)
-    if kind == "SIGINT":  # as Ctrl-C: to all processes
+    if kind == "SIGINT":  # like Ctrl-C, which all processes receive
         os.killpg(process.pid, signal.SIGINT)
     else:
         process.kill()
-    _, said = process.communicate(
-        timeout=30
-    )  # the other processes hold the pipe's end while they live
+    _, stderr = process.communicate(timeout=30)  # running workers keep the pipe open
     if kind == "SIGINT":
-        assert "of 6 trials are done" in said
-    counting = Counting()
-    assert run(tmp_path, counting)["trials"] == run(tmp_path / "whole")["trials"]
-    assert 0 < len(counting.asked) <= 4
+        assert "of 6 trials are done" in stderr
+    counting = CountingSolver()
+    assert run_trials(tmp_path, counting)["trials"] == run_trials(tmp_path / "whole")["trials"]
+    assert 0 < len(counting.keys) <= 4

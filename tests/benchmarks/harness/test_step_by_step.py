@@ -1,4 +1,4 @@
-"""Steps are planned one by one, until one fails."""
+"""Tests step-by-step planning, which ends at the first failure."""
 
 from __future__ import annotations
 

@@ -13,51 +13,51 @@ from vkc_pin.benchmarks.harness import tables
 SCENES = {"a": "easy", "b": "hard"}
 
 
-def record(
+def make_record(
     scene: str,
     method: str,
     number: int,
     time: float | None,
     base: float,
     arm: float,
-    blame: str = "",
+    failure: str = "",
 ) -> dict[str, Any]:
-    """Return a record; `blame` is "status" or "status: constraint subject", None for a success."""
-    status, _, constraint = (blame or "success").partition(": ")
-    found = {
+    """Return a record; `failure` is "status" or "status: constraint subject", "" for a success."""
+    status, _, constraint = (failure or "success").partition(": ")
+    fields = {
         "scene": scene,
         "method": method,
         "number": number,
         "repeat": 0,
-        "success": not blame,
+        "success": not failure,
         "status": status,
     }
-    found |= {"failed_constraint": (constraint or status) if blame else None}
+    fields |= {"failed_constraint": (constraint or status) if failure else None}
     if time is not None:
-        found |= {
+        fields |= {
             "planning_time": time,
             "base_path_length": base,
             "base_path_length_l1": 2.0 * base,
             "arm_path_length": arm,
         }
-    return found
+    return fields
 
 
 RECORDS = [
-    record("a", "auto", 0, 1.0, 3.0, 10.0),
-    record("a", "auto", 1, 2.0, 4.0, 12.0),
-    record("a", "auto", 2, 3.0, 5.0, 17.0),
-    record("a", "slow", 0, 5.0, 6.0, 11.0),
-    record("a", "slow", 1, 9.0, 99.0, 99.0, "rejected: penetration forearm – sofa"),
-    record("a", "slow", 2, 7.0, 4.0, 17.0),
-    record("b", "auto", 0, 2.5, 7.0, 20.0),
-    record("b", "slow", 0, 20.0, 99.0, 99.0, "time limit"),
-    record("b", "slow", 1, None, 0.0, 0.0, "error: error"),
-    record("b", "slow", 2, 20.0, 99.0, 99.0, "time limit"),
+    make_record("a", "auto", 0, 1.0, 3.0, 10.0),
+    make_record("a", "auto", 1, 2.0, 4.0, 12.0),
+    make_record("a", "auto", 2, 3.0, 5.0, 17.0),
+    make_record("a", "slow", 0, 5.0, 6.0, 11.0),
+    make_record("a", "slow", 1, 9.0, 99.0, 99.0, "rejected: penetration forearm – sofa"),
+    make_record("a", "slow", 2, 7.0, 4.0, 17.0),
+    make_record("b", "auto", 0, 2.5, 7.0, 20.0),
+    make_record("b", "slow", 0, 20.0, 99.0, 99.0, "time limit"),
+    make_record("b", "slow", 1, None, 0.0, 0.0, "error: error"),
+    make_record("b", "slow", 2, 20.0, 99.0, 99.0, "time limit"),
 ]
 
 
-def test_methods_against_numbers_by_hand() -> None:
+def test_methods_table_equals_values_computed_by_hand() -> None:
     head, *rows = parse_cells(tables.methods_table(RECORDS, SCENES, ["auto", "slow", "unused"]))
     times = ["time, median [s]", "95th percentile [s]"]
     assert head == [
@@ -111,7 +111,7 @@ def test_methods_against_numbers_by_hand() -> None:
     ]
 
 
-def test_comparison_against_numbers_by_hand() -> None:
+def test_comparison_table_equals_values_computed_by_hand() -> None:
     head, *rows = parse_cells(
         tables.comparison_table(RECORDS, SCENES, ("auto", "slow"), ("one", "two")).replace(
             "\\|", "/"
@@ -138,13 +138,13 @@ def test_comparison_against_numbers_by_hand() -> None:
     ]
 
 
-def test_common_successes_of_three_methods() -> None:
-    third = record("a", "third", 2, 1.0, 1.0, 1.0)
+def test_common_successes_are_starts_where_all_methods_succeed() -> None:
+    third = make_record("a", "third", 2, 1.0, 1.0, 1.0)
     del third["repeat"]  # an experiment without repeats
-    found = tables.find_common_successes(
-        [*RECORDS, third, record("a", "third", 1, 1.0, 1.0, 1.0)], ["third", "slow", "auto"]
+    common = tables.find_common_successes(
+        [*RECORDS, third, make_record("a", "third", 1, 1.0, 1.0, 1.0)], ["third", "slow", "auto"]
     )
-    assert [[(r["method"], r["number"]) for r in row] for row in found] == [
+    assert [[(r["method"], r["number"]) for r in row] for row in common] == [
         [("third", 2), ("slow", 2), ("auto", 2)]
     ]
 
@@ -152,14 +152,14 @@ def test_common_successes_of_three_methods() -> None:
 def test_mean_and_deviation_of_a_sample() -> None:
     assert tables.compute_mean_and_deviation([2.0, 4.0, 9.0]) == pytest.approx(
         (5.0, np.sqrt(13.0))
-    )  # 9 + 1 + 16, by 2
+    )  # (9 + 1 + 16) / 2
     one, none = tables.compute_mean_and_deviation([2.0]), tables.compute_mean_and_deviation([])
     assert one[0] == 2.0
     assert np.isnan([one[1], *none]).all()
 
 
 @pytest.mark.parametrize(
-    ("good", "number", "low", "high"),
+    ("successes", "trials", "low", "high"),
     # Published values of the interval: 81 of 263 (Newcombe 1998), 15 of 148, 0 of 20, 1 of 29.
     [
         (81, 263, 0.2553, 0.3662),
@@ -169,10 +169,10 @@ def test_mean_and_deviation_of_a_sample() -> None:
     ],
 )
 def test_wilson_interval_against_published_values(
-    good: int, number: int, low: float, high: float
+    successes: int, trials: int, low: float, high: float
 ) -> None:
-    assert tables.compute_wilson_interval(good, number) == pytest.approx((low, high), abs=5e-5)
-    assert tables.compute_wilson_interval(number - good, number) == pytest.approx(
+    assert tables.compute_wilson_interval(successes, trials) == pytest.approx((low, high), abs=5e-5)
+    assert tables.compute_wilson_interval(trials - successes, trials) == pytest.approx(
         (1.0 - high, 1.0 - low), abs=5e-5
     )
 
@@ -186,7 +186,7 @@ def test_quartiles_of_values() -> None:
     assert np.isnan(tables.compute_quartiles([])).all()
 
 
-def test_csv_has_a_column_of_each_field() -> None:
+def test_csv_has_a_column_for_each_field() -> None:
     records = [
         {"key": "x", "good": True, "values": [1.5, 2]},
         {"key": 'a "b", c\nd', "more": None, "good": False},
@@ -199,7 +199,7 @@ def test_csv_has_a_column_of_each_field() -> None:
     ]
 
 
-def test_foot_names_machine_versions_and_time() -> None:
+def test_footer_states_machine_versions_and_time() -> None:
     machine = {
         "system": "Linux",
         "machine": "x86_64",
@@ -211,13 +211,13 @@ def test_foot_names_machine_versions_and_time() -> None:
         {"jobs": 2, "trials": 5, "seconds": 60.0},
         {"jobs": 1, "trials": 7, "seconds": 30.0},
     ]
-    about = {"versions": {"vkc-pin": "1.2", "pin": "4.1"}, "machine": machine}
+    meta = {"versions": {"vkc-pin": "1.2", "pin": "4.1"}, "machine": machine}
     assert (
-        tables.describe_run(about)
+        tables.describe_run(meta)
         == "Measured on 2 cores of Abacus 3, Linux, Python 3.12.1, vkc-pin 1.2, pin 4.1."
     )
-    about["versions"]["sources"] = "abc"
-    assert tables.describe_run({**about, "sessions": sessions, "peak_memory_mb": 320.4}) == (
+    meta["versions"]["sources"] = "abc"
+    assert tables.describe_run({**meta, "sessions": sessions, "peak_memory_mb": 320.4}) == (
         "Measured on 2 cores of Abacus 3, Linux, Python 3.12.1, vkc-pin 1.2, pin 4.1 (sources "
         "abc). "
         "12 trials, 1 or 2 at a time, took 1.5 min and up to 320 MB a process."

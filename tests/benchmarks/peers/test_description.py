@@ -1,4 +1,4 @@
-"""The chain as a URDF moves as the chain does, and looks at the same pairs."""
+"""Tests the URDF of a chain: its kinematics, collision pairs and margins."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def test_description_has_the_same_kinematics_and_pairs(task: str, tmp_path: Path
         q = np.zeros(model.nq)
         q[order] = row
         pin.framesForwardKinematics(model, data, q)
-        at = data.oMf[model.getFrameId(FRAME)]
-        np.testing.assert_allclose(at.homogeneous, problem.targets[0].homogeneous, atol=1e-6)
+        placement = data.oMf[model.getFrameId(FRAME)]
+        np.testing.assert_allclose(placement.homogeneous, problem.targets[0].homogeneous, atol=1e-6)
     lower, upper = compute_finite_limits(problem)
     np.testing.assert_allclose(model.lowerPositionLimit[order], lower)
     np.testing.assert_allclose(model.upperPositionLimit[order], upper)
-    (part,) = problem.contacts.phases
-    assert len(files.margins) == len(part.pairs)
+    (phase,) = problem.contacts.phases
+    assert len(files.margins) == len(phase.pairs)
     disabled = ET.parse(files.srdf).findall("disable_collisions")
     assert not {frozenset((pair.get("link1"), pair.get("link2"))) for pair in disabled} & set(
         map(frozenset, files.margins)
@@ -68,8 +68,8 @@ def test_shapes_violate_the_same_margins(by_body: bool, tmp_path: Path) -> None:
         slack = (contacts.distance - contacts.margin)[contacts.waypoint == row].min(initial=0.1)
         q = np.zeros(model.nq)
         q[order] = configuration
-        hit = pin.computeCollisions(model, model.createData(), shapes, data, q, True)
+        in_collision = pin.computeCollisions(model, model.createData(), shapes, data, q, True)
         if abs(slack) > 0.005:
-            assert hit == (slack < 0.0), slack
+            assert in_collision == (slack < 0.0), slack
             agreed += 1
     assert agreed > 40

@@ -1,4 +1,4 @@
-"""Other planners solve a reach and a drawer that is grasped at the start."""
+"""Tests other planners on a reach and on a drawer that is grasped at the start."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ def find_peer(name: str) -> Peer:
 @pytest.mark.parametrize("task", ["reach", "drawer"])
 @pytest.mark.parametrize("name", PEERS)
 def test_peer_finds_a_valid_path(name: str, task: str) -> None:
-    plan_by_peer, own = find_peer(name), make_problem(task, 18, 0)
-    problem = build_program(own)
+    plan_by_peer, peer_problem = find_peer(name), make_problem(task, 18, 0)
+    problem = build_program(peer_problem)
 
     def accept(path: np.ndarray) -> bool:
-        return validate_path(own, problem, path, "", name="", seed=0).success
+        return validate_path(peer_problem, problem, path, "", name="", seed=0).success
 
-    found = plan_by_peer(own, problem, 0, Clock(60.0), accept)
+    found = plan_by_peer(peer_problem, problem, 0, Clock(60.0), accept)
     assert found.path is not None, (found.status, found.about)
     assert np.array_equal(found.path[0], problem.start)
-    result = validate_path(own, problem, found.path, found.status, name="peer", seed=0)
+    result = validate_path(peer_problem, problem, found.path, found.status, name="peer", seed=0)
     assert result.success, result.report
     distances = compute_clearances(problem, result.trajectory).values()
     assert all(distance is None or distance > 0.0 for distance in distances)
@@ -39,7 +39,7 @@ def test_peer_finds_a_valid_path(name: str, task: str) -> None:
 
 @pytest.mark.parametrize("name", PEERS)
 def test_peer_ends_at_its_time_limit(name: str) -> None:
-    plan_by_peer, own = find_peer(name), make_problem("door", 20270430, 1)
-    problem, clock = build_program(own), Clock(1.5)
-    plan_by_peer(own, problem, 0, clock, lambda path: False)
+    plan_by_peer, peer_problem = find_peer(name), make_problem("door", 20270430, 1)
+    problem, clock = build_program(peer_problem), Clock(1.5)
+    plan_by_peer(peer_problem, problem, 0, clock, lambda path: False)
     assert clock.wall < 20.0

@@ -1,4 +1,4 @@
-"""Peers, baselines and this package get the same problems and are validated alike."""
+"""Tests the comparison with other planners, on equal problems and with equal validation."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from vkc_pin.benchmarks.peers.run import format_results, run
 from vkc_pin.errors import InputError, UnknownNameError
 
 
-def test_experiment_at_a_reach(tmp_path: Path) -> None:
-    words = "peers --trials 1 --tasks reach --methods B1 VKC --seed 18"
-    table, trials = run_experiment(words, tmp_path)
+def test_baseline_and_planner_solve_the_same_reach(tmp_path: Path) -> None:
+    arguments = "peers --trials 1 --tasks reach --methods B1 VKC --seed 18"
+    table, trials = run_experiment(arguments, tmp_path)
     assert [trial["method"] for trial in trials] == ["B1", "VKC"]
     for trial in trials:
         assert trial["success"] is True, trial["violations"]
@@ -35,15 +35,21 @@ def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
 
 def test_table_counts_trials_that_timed_out() -> None:
     record = Path(__file__).parents[3] / "docs/results/gap.json.gz"
-    about = json.loads(gzip.decompress(record.read_bytes()))["meta"]
-    about |= {"starts": 2, "tasks": ["door"], "methods": ["OMPL", "VKC"]}
-    about |= {"peers": {"ompl": "2"}, "time_limit": 60.0}
-    late = {"task": "door", "method": "OMPL", "success": False, "status": "timed out"}
-    late |= {"time_final": 9.0, "time_own": 8.0}
-    good = {**late, "success": True, "status": "success", "time_final": 3.0, "time_own": 0.5}
-    good |= {"time_first": 1.0, "base_path_length": 1.5, "arm_path_length": 2.0}
-    good |= {"clearance_at": 0.03, "clearance_between": 0.025}
-    text = format_results({"meta": about, "trials": [late, good]})
+    meta = json.loads(gzip.decompress(record.read_bytes()))["meta"]
+    meta |= {"starts": 2, "tasks": ["door"], "methods": ["OMPL", "VKC"]}
+    meta |= {"peers": {"ompl": "2"}, "time_limit": 60.0}
+    timed_out = {"task": "door", "method": "OMPL", "success": False, "status": "timed out"}
+    timed_out |= {"time_final": 9.0, "time_own": 8.0}
+    success = {
+        **timed_out,
+        "success": True,
+        "status": "success",
+        "time_final": 3.0,
+        "time_own": 0.5,
+    }
+    success |= {"time_first": 1.0, "base_path_length": 1.5, "arm_path_length": 2.0}
+    success |= {"clearance_at": 0.03, "clearance_between": 0.025}
+    text = format_results({"meta": meta, "trials": [timed_out, success]})
     numbers = "1 of 2 | 1 | 1.00 | 6.00 | 8.70 | 4.25 | 1.50 | 2.00 | 30.0 | 25.0"
     assert f"| door | OMPL | {numbers} |" in text
     assert "| door | VKC |" not in text

@@ -1,4 +1,4 @@
-"""A reach and a held drawer by ompl."""
+"""Tests the paths and the limits of sampling-based planners."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Problems follow from numbers, and begin free."""
+"""Tests that problems are reproducible and start collision-free."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vkc_pin.planning.initialization.keyframes import compute_shortfall
     "task",
     [task if task == "reach" else pytest.param(task, marks=pytest.mark.long) for task in TASKS],
 )
-def test_problems_are_determined_by_number_and_free(task: str) -> None:
+def test_problems_are_reproducible_and_start_collision_free(task: str) -> None:
     one, same, other = make_problem(task, 3, 1), make_problem(task, 3, 1), make_problem(task, 3, 2)
     assert np.array_equal(one.scene.start, same.scene.start)
     assert not np.array_equal(one.scene.start, other.scene.start)
@@ -23,5 +23,5 @@ def test_problems_are_determined_by_number_and_free(task: str) -> None:
     assert 1 <= len(goals) <= 5
     residual, _ = problem.transcription.pose_solvers[0].evaluate(goals, problem.targets[0])
     assert np.abs(residual).max() < 1e-7
-    far = np.linalg.norm((goals - problem.start) * problem.chain.metric, axis=1)
-    assert np.all(np.diff(far) >= 0.0)
+    distances = np.linalg.norm((goals - problem.start) * problem.chain.metric, axis=1)
+    assert np.all(np.diff(distances) >= 0.0)

@@ -1,4 +1,4 @@
-"""The process of a solver reports errors, and continues."""
+"""Tests that the worker process of a solver reports errors and continues."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from vkc_pin.benchmarks.peers.processes import start_solver
 from vkc_pin.errors import InputError
 
 FILE = Path(worker.__file__)
-# Module, its package, and the key in the error about a missing description.
+# Module, its package, and a word of the error about a missing description.
 SOLVERS = [("trajopt_solver", "tesseract_robotics", "/nowhere"), ("hpp_solver", "pyhpp", "URDF")]
 
 
 @pytest.mark.parametrize("solver", [solver for solver, *_ in SOLVERS])
 def test_worker_reports_a_missing_package(solver: str) -> None:
     command = [sys.executable, "-S", str(FILE), solver]  # without installed packages
-    done = subprocess.run(command, input="", capture_output=True, text=True, timeout=60)
-    error = json.loads(done.stdout)["error"]
+    process = subprocess.run(command, input="", capture_output=True, text=True, timeout=60)
+    error = json.loads(process.stdout)["error"]
     assert error.startswith("ModuleNotFoundError")
-    assert done.returncode == 1
+    assert process.returncode == 1
 
 
 def test_missing_solver_raises_an_error() -> None:
-    with pytest.raises(InputError, match="nothing cannot be run") as refused:
+    with pytest.raises(InputError, match="nothing cannot be run") as raised:
         start_solver("nothing", "no_solver")
-    assert "no_solver" in str(refused.value)
+    assert "no_solver" in str(raised.value)
 
 
 def test_solver_that_crashed_is_started_again(
@@ -48,25 +48,25 @@ def test_solver_that_crashed_is_started_again(
     assert start_solver("crash", "crashing_solver")({"z": 2})["z"] == 2
 
 
-@pytest.mark.parametrize(("solver", "package", "named"), SOLVERS)
-def test_wrong_request_does_not_end_the_worker(solver: str, package: str, named: str) -> None:
-    found = find_spec(package)
-    if found is None or found.origin is None:
+@pytest.mark.parametrize(("solver", "package", "key"), SOLVERS)
+def test_wrong_request_does_not_end_the_worker(solver: str, package: str, key: str) -> None:
+    spec = find_spec(package)
+    if spec is None or spec.origin is None:
         pytest.skip(f'needs {package}: pip install "vkc-pin[peers]"')
-    libraries = str(Path(found.origin).parents[3])
-    asked = json.dumps({"urdf": "/nowhere", "srdf": "/nowhere"})
-    done = subprocess.run(
+    libraries = str(Path(spec.origin).parents[3])
+    request = json.dumps({"urdf": "/nowhere", "srdf": "/nowhere"})
+    process = subprocess.run(
         [sys.executable, str(FILE), solver],
-        input=f"{asked}\n{asked}\n",
+        input=f"{request}\n{request}\n",
         capture_output=True,
         text=True,
         timeout=120,
         env={**os.environ, "LD_LIBRARY_PATH": libraries},
     )
     first, *answers = [
-        json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")
+        json.loads(line) for line in process.stdout.splitlines() if line.startswith("{")
     ]
     assert first["ready"] is True
     assert len(answers) == 2
-    assert all(named in answer["error"] for answer in answers)
-    assert done.returncode == 0
+    assert all(key in answer["error"] for answer in answers)
+    assert process.returncode == 0

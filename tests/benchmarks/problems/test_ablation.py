@@ -1,4 +1,4 @@
-"""Settings are changed one at a time."""
+"""Tests the ablation experiment, which changes one setting at a time."""
 
 from __future__ import annotations
 
@@ -16,46 +16,52 @@ CHANGE = "solver.loop:PROGRESS=0.6"
 
 
 @pytest.mark.long
-def test_experiment_on_numbered_problems(tmp_path: Path) -> None:
+def test_numbered_problems_are_planned_with_each_setting(tmp_path: Path) -> None:
     table, trials = run_experiment(f"ablation --problems 42 9 --changes {CHANGE}", tmp_path)
     assert [(r["number"], r["kind"], r["method"]) for r in trials] == [
         (number, kind, method)
         for number, kind in ((9, "reach"), (42, "scene"))
         for method in ("unchanged", CHANGE)
     ]
-    good = sum(r["success"] for r in trials if r["method"] == CHANGE)
-    assert f"| {CHANGE} | {good} of 2 |" in table
+    successes = sum(r["success"] for r in trials if r["method"] == CHANGE)
+    assert f"| {CHANGE} | {successes} of 2 |" in table
     assert "| unchanged | reach | " in table
 
 
 @pytest.mark.long
-def test_experiment_on_random_starts_of_tasks(tmp_path: Path) -> None:
-    words = f"ablation --tasks drawer --starts 2 --seed 5 --changes {CHANGE}"
-    table, trials = run_experiment(words, tmp_path)
+def test_tasks_are_planned_from_random_starts_with_each_setting(tmp_path: Path) -> None:
+    arguments = f"ablation --tasks drawer --starts 2 --seed 5 --changes {CHANGE}"
+    table, trials = run_experiment(arguments, tmp_path)
     length = {(r["number"], r["method"]): r["base_path_length"] for r in trials}
     assert len(length) == len(trials) == 4
     assert length[0, CHANGE] != length[1, CHANGE]
-    good = sum(r["success"] for r in trials if r["method"] == CHANGE)
+    successes = sum(r["success"] for r in trials if r["method"] == CHANGE)
     assert "2 random starts a task, planning seed 5" in table
-    assert f"| {CHANGE} | drawer | {good} of 2 |" in table
+    assert f"| {CHANGE} | drawer | {successes} of 2 |" in table
 
 
 def test_ratios_are_of_problems_that_both_settings_solve() -> None:
-    def record(number: int, method: str, time: float, success: bool = True) -> dict[str, Any]:
+    def make_record(number: int, method: str, time: float, success: bool = True) -> dict[str, Any]:
         counts = {"rounds": 1, "iterations": 2, "cpu_time": 1, "planning_time": time}
         lengths = {"base_path_length": 1.0, "arm_path_length": 0.0, "objective": 2.0 * time}
-        own = {"number": number, "method": method, "kind": "reach", "seed": 0, "success": success}
+        fields = {
+            "number": number,
+            "method": method,
+            "kind": "reach",
+            "seed": 0,
+            "success": success,
+        }
         status = "success" if success else "error"
-        return {**own, **counts, **lengths, "first_seed": success, "status": status}
+        return {**fields, **counts, **lengths, "first_seed": success, "status": status}
 
     changed = "Options.dt=0.3"
-    trials = [record(0, "unchanged", 1.0), record(0, changed, 3.0)]
-    trials += [record(1, "unchanged", 1.0), record(1, changed, 9.0, False)]
-    trials += [record(2, "unchanged", 2.0, False), record(2, changed, 9.0)]
+    trials = [make_record(0, "unchanged", 1.0), make_record(0, changed, 3.0)]
+    trials += [make_record(1, "unchanged", 1.0), make_record(1, changed, 9.0, False)]
+    trials += [make_record(2, "unchanged", 2.0, False), make_record(2, changed, 9.0)]
     error = {"number": 3, "method": "unchanged", "seed": 0, "success": False, "status": "error"}
-    about = {"changes": ["unchanged", changed], "problems": [0, 1, 2, 3], "seed": 0}
+    meta = {"changes": ["unchanged", changed], "problems": [0, 1, 2, 3], "seed": 0}
     text = ablation.format_results(
-        {"meta": {**describe_environment(time_limit=1.0), **about}, "trials": [*trials, error]}
+        {"meta": {**describe_environment(time_limit=1.0), **meta}, "trials": [*trials, error]}
     )
     triple, same = "3.000 (3.000–3.000)", "1.000 (1.000–1.000)"
     assert f"| {changed} | 1 | {triple} | {same} | {same} | – | {triple} |" in text

@@ -1,4 +1,4 @@
-"""Settings of the planner that are changed for an experiment."""
+"""Tests changes of planner settings for an experiment."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change, parse_change
 from vkc_pin.planning.solver import loop, trust_region
 
 
-def test_option_is_changed() -> None:
+def test_changed_option_leaves_the_defaults_unchanged() -> None:
     change = parse_change("Options.dt=0.3")
     assert change == Change("Options", "dt", 0.3)
     assert str(change) == "Options.dt=0.3"
@@ -18,7 +18,7 @@ def test_option_is_changed() -> None:
         assert vkc.Options() == UNCHANGED.options
 
 
-def test_constant_is_changed_for_a_while() -> None:
+def test_constant_is_changed_within_the_context() -> None:
     before = loop.PROGRESS
     change = parse_change("solver.loop:PROGRESS=0.6")
     assert change.options == vkc.Options()
@@ -27,7 +27,7 @@ def test_constant_is_changed_for_a_while() -> None:
     assert before == loop.PROGRESS
 
 
-def test_constant_is_changed_where_it_is_imported_and_restored() -> None:
+def test_constant_is_changed_in_importing_modules_and_restored() -> None:
     before = trust_region.ACTIVE_FRACTION
     assert before == loop.ACTIVE_FRACTION
 

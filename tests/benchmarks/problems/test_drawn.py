@@ -1,4 +1,4 @@
-"""Problems are drawn at random, and their saved plans can be judged by others."""
+"""Tests random problems: their sampling, saved plans, and verdicts of the oracle."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from vkc_pin.world.task.steps import step_to_dict
 
 
 @pytest.mark.parametrize("number", [1, 6])
-def test_problems_are_determined_by_their_numbers(number: int) -> None:
+def test_problems_are_determined_by_seed_and_number(number: int) -> None:
     one, same, other = (
         sample_problem(4, number),
         sample_problem(4, number),
@@ -35,10 +35,10 @@ def test_problems_are_determined_by_their_numbers(number: int) -> None:
 def test_problems_have_all_scenes_obstacles_and_kinds_of_steps() -> None:
     problems = [sample_problem(0, number) for number in range(1, 121, 2)]
     names = sorted(list_resources("scenes", "*.yaml"))
-    assert [own.scene.name for own in problems[: len(names)]] == names
-    steps = {type(step).__name__ for own in problems for step in own.steps}
+    assert [problem.scene.name for problem in problems[: len(names)]] == names
+    steps = {type(step).__name__ for problem in problems for step in problem.steps}
     assert steps == {"Actuate", "Grasp", "Place", "Reach", "Touch", "GoTo"}
-    assert {len(own.steps) for own in problems} == {1, 2}
+    assert {len(problem.steps) for problem in problems} == {1, 2}
     added = [sum(name.startswith("random_") for name in p.scene.obstacle_names) for p in problems]
     assert (min(added), max(added)) == (0, 6)
 
@@ -47,9 +47,9 @@ def test_problems_have_all_scenes_obstacles_and_kinds_of_steps() -> None:
 def test_plans_are_saved_and_judged(tmp_path: Path) -> None:
     table, trials = run_experiment("random --problems 4", tmp_path)
     assert [trial["key"] for trial in trials] == ["00000", "00001", "00002", "00003"]
-    good = sum(trial["success"] for trial in trials)
-    assert good > 0
-    assert f"| all | 4 | {good} |" in table
+    successes = sum(trial["success"] for trial in trials)
+    assert successes > 0
+    assert f"| all | 4 | {successes} |" in table
     plans = tmp_path / "plans"
     for trial in trials:
         path = plans / f"{trial['key']}.npz"
@@ -63,13 +63,15 @@ def test_plans_are_saved_and_judged(tmp_path: Path) -> None:
     assert not [verdict for verdict in verdicts if verdict.success and verdict.found]
     write_verdicts(verdicts, plans)
     agreement = (plans / "agreement.md").read_text(encoding="utf-8")
-    assert f"| success | success, and nothing found | {good} |" in agreement
+    assert f"| success | success, and nothing found | {successes} |" in agreement
 
     record = tmp_path / "results.json"
     record_violations(verdicts, record)
-    noted = json.loads(record.read_text(encoding="utf-8"))["trials"]
-    assert [trial.pop("oracle") for trial in noted] == [len(verdict.found) for verdict in verdicts]
-    assert noted == trials
+    recorded = json.loads(record.read_text(encoding="utf-8"))["trials"]
+    assert [trial.pop("oracle") for trial in recorded] == [
+        len(verdict.found) for verdict in verdicts
+    ]
+    assert recorded == trials
     before = record.read_bytes()
     with pytest.raises(ValueError, match="plans and trials are others: 00003"):
         record_violations(verdicts[:-1], record)
@@ -80,7 +82,7 @@ def test_plans_are_saved_and_judged(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_tasks_in_random_rooms(tmp_path: Path) -> None:
+def test_tasks_in_random_rooms_are_planned_and_saved(tmp_path: Path) -> None:
     table, trials = run_experiment("random --of rooms --problems 2", tmp_path / "rooms")
     assert [trial["success"] for trial in trials] == [True, True]
     for trial in trials:

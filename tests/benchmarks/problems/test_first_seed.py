@@ -1,4 +1,4 @@
-"""Trials whose first initial guess suffices are counted."""
+"""Tests the count of trials that the first initial guess solves."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vkc_pin.benchmarks.problems import first_seed
 
 
 @pytest.mark.long
-def test_experiment(tmp_path: Path) -> None:
+def test_first_guess_successes_are_counted(tmp_path: Path) -> None:
     table, trials = run_experiment("first-seed --trials 1 --tasks drawer door", tmp_path)
     assert [r["task"] for r in trials] == ["door", "drawer"]
     for r in trials:

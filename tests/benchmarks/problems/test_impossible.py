@@ -1,4 +1,4 @@
-"""Impossible problems are recognised and explained."""
+"""Tests that impossible problems are recognised and explained."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_problems_are_determined_by_their_numbers() -> None:
         assert one[1][0].__class__ is other[1][0].__class__
 
 
-def test_experiment(tmp_path: Path) -> None:
+def test_trials_are_explained_and_proven_infeasible(tmp_path: Path) -> None:
     table, trials = run_experiment("impossible --problems 4", tmp_path)
     kinds = ["closed wall", "fence round the start", "fence round the goal", "gap too narrow"]
     assert [t["kind"] for t in trials] == kinds

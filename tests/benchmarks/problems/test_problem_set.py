@@ -1,4 +1,4 @@
-"""The sixty problems are reproducible, and none is infeasible for lack of space or reach."""
+"""Tests that the sixty problems are reproducible and can be compiled."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vkc_pin.world.scene.scene import START_CLEARANCE
 from vkc_pin.world.task.compiler import compile_task
 
 
-def test_kinds() -> None:
+def test_kinds_have_their_numbers_of_problems() -> None:
     assert Counter(map(get_kind, range(NUMBER))) == dict(
         zip(KINDS, (10, 10, 10, 10, 20), strict=True)
     )
@@ -21,9 +21,9 @@ def test_kinds() -> None:
 
 @pytest.mark.parametrize("number", [-1, 60, 1.0, True])
 def test_other_numbers_are_refused(number: int) -> None:
-    with pytest.raises(vkc.InputError) as found:
+    with pytest.raises(vkc.InputError) as raised:
         problem(number)
-    assert (found.value.expected, found.value.got) == ("0 to 59", repr(number))
+    assert (raised.value.expected, raised.value.got) == ("0 to 59", repr(number))
 
 
 @pytest.mark.parametrize(
@@ -44,8 +44,8 @@ def test_problems_are_reproducible_and_can_be_compiled(number: int) -> None:
 
 def test_starts_depend_on_task_seed_and_number() -> None:
     starts = [
-        make_start(*which).start[:3].tolist()
-        for which in (("door", 1, 0), ("door", 1, 0), ("door", 1, 1), ("door", 2, 0))
+        make_start(*arguments).start[:3].tolist()
+        for arguments in (("door", 1, 0), ("door", 1, 0), ("door", 1, 1), ("door", 2, 0))
     ]
     assert starts[0] == starts[1]
     assert len({tuple(start) for start in starts}) == 3

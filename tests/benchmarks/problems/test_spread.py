@@ -1,4 +1,4 @@
-"""Problems are planned with several random seeds."""
+"""Tests the spread of results over random seeds."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from vkc_pin.benchmarks.problems import spread
 
 
 @pytest.mark.long
-def test_experiment(tmp_path: Path) -> None:
+def test_problem_is_planned_with_each_seed(tmp_path: Path) -> None:
     table, trials = run_experiment("spread --problems 9 --seeds 2 --seed 4", tmp_path)
     assert [(r["number"], r["seed"]) for r in trials] == [(9, 4), (9, 5)]
-    good = sum(r["success"] for r in trials)
-    assert f"| 9 | {trials[0]['problem']} | {good} of 2 |" in table
+    successes = sum(r["success"] for r in trials)
+    assert f"| 9 | {trials[0]['problem']} | {successes} of 2 |" in table
 
 
-def test_spread_is_of_successes() -> None:
+def test_spread_covers_successes_only() -> None:
     records = [
         {"success": True, "x": 2.0},
         {"success": True, "x": 3.0},

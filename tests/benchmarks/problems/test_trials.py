@@ -1,4 +1,4 @@
-"""One trial: what is on record of it agrees with what the planner did."""
+"""Tests that the record of a trial agrees with its plan."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from vkc_pin.benchmarks.problems.problem_set import problem
 
 
 @pytest.fixture(scope="module")
-def drawn() -> vkc.Plan:
-    own = problem(20)
-    return vkc.plan(own.scene, own.steps)
+def planned() -> vkc.Plan:
+    case = problem(20)
+    return vkc.plan(case.scene, case.steps)
 
 
-def test_objective_is_that_of_the_solver(drawn: vkc.Plan) -> None:
-    """Without freedoms of the grasp, all coordinates count, and the last accepted round agrees."""
-    assert drawn.success, drawn.summary()
-    (last, *_) = [row["objective"] for row in reversed(drawn.history) if row["accepted"]]
-    assert trials.compute_objective(drawn) == pytest.approx(last, rel=1e-6)
+def test_objective_equals_that_of_the_last_accepted_round(planned: vkc.Plan) -> None:
+    """Without grasp freedoms, the objective covers all coordinates."""
+    assert planned.success, planned.summary()
+    (last, *_) = [row["objective"] for row in reversed(planned.history) if row["accepted"]]
+    assert trials.compute_objective(planned) == pytest.approx(last, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -35,16 +35,18 @@ def test_objective_is_that_of_the_solver(drawn: vkc.Plan) -> None:
         ("astar, rrt, then all at once", 4, False),
     ],
 )
-def test_first_seed(drawn: vkc.Plan, name: str, solves: int, expected: bool) -> None:
-    plan = dataclasses.replace(drawn, initialization=name)
+def test_first_guess_success_depends_on_solves_and_status(
+    planned: vkc.Plan, name: str, solves: int, expected: bool
+) -> None:
+    plan = dataclasses.replace(planned, initialization=name)
     assert trials.is_first_guess_success(plan, solves) is expected
     assert not trials.is_first_guess_success(dataclasses.replace(plan, status="rejected"), solves)
 
 
-def test_record_of_a_trial() -> None:
-    own = problem(20)
+def test_record_has_settings_and_times() -> None:
+    case = problem(20)
     record = trials.run_trial(
-        own.scene, own.steps, seed=3, change=parse_change("Options.max_restarts=2"), number=20
+        case.scene, case.steps, seed=3, change=parse_change("Options.max_restarts=2"), number=20
     )
     assert record["success"] is True, record["violations"]
     assert (record["method"], record["seed"], record["number"]) == ("Options.max_restarts=2", 3, 20)

@@ -1,4 +1,4 @@
-"""Robots and objects as they are asked for: what texts mean, and files that are imported once."""
+"""Tests requested robots and objects: parsing of requests, and import of files."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def test_requests_are_parsed() -> None:
         Request("drawer", "drawer"),
     ]
     assert [
-        one.is_imported
-        for one in parse_requests(["a.URDF", "b.sdf", "c.yaml", "urdf"], "objects", ())
+        request.is_imported
+        for request in parse_requests(["a.URDF", "b.sdf", "c.yaml", "urdf"], "objects", ())
     ] == [True, True, False, False]
 
 
@@ -69,23 +69,25 @@ def test_malformed_requests_are_refused(texts: list[str]) -> None:
         parse_requests(texts, "objects", ("oven_0",))
 
 
-def test_file_is_imported_once_facing_the_robot(tmp_path: Path) -> None:
+def test_object_file_is_imported_once_and_faces_the_robot(tmp_path: Path) -> None:
     (tmp_path / "flat.urdf").write_text(DESK, encoding="utf-8")
-    (one,) = parse_requests([f"desk={tmp_path / 'flat.urdf'}#case"], "objects", ())
-    made = prepare_object(one, tmp_path / "objects")
-    item = vkc.load_object(load_description(made))
+    (request,) = parse_requests([f"desk={tmp_path / 'flat.urdf'}#case"], "objects", ())
+    file_name = prepare_object(request, tmp_path / "objects")
+    item = vkc.load_object(load_description(file_name))
     assert sorted(item.links) == ["case", "front", "tray"], "not the lamp"
-    best = item.attachment()
-    approach = (item.link_placement(best.link, [0.0]) * best.placement).rotation[:, 2]
+    attachment = item.attachment()
+    approach = (item.link_placement(attachment.link, [0.0]) * attachment.placement).rotation[:, 2]
     np.testing.assert_allclose(approach, [1.0, 0.0, 0.0], atol=1e-9)
-    shut, drawn = (item.link_placement("tray", [value]).translation for value in (0.0, 0.3))
-    np.testing.assert_allclose(drawn - shut, [-0.3, 0.0, 0.0], atol=1e-9)
-    written = {file: file.read_bytes() for file in Path(made).parent.rglob("*") if file.is_file()}
-    assert prepare_object(one, tmp_path / "objects") == made
+    closed, opened = (item.link_placement("tray", [value]).translation for value in (0.0, 0.3))
+    np.testing.assert_allclose(opened - closed, [-0.3, 0.0, 0.0], atol=1e-9)
+    written = {
+        file: file.read_bytes() for file in Path(file_name).parent.rglob("*") if file.is_file()
+    }
+    assert prepare_object(request, tmp_path / "objects") == file_name
     assert {
-        file: file.read_bytes() for file in Path(made).parent.rglob("*") if file.is_file()
+        file: file.read_bytes() for file in Path(file_name).parent.rglob("*") if file.is_file()
     } == written
-    assert not list((tmp_path / "objects").glob(".*")), "nothing is left over"
+    assert not list((tmp_path / "objects").glob(".*")), "no temporary files remain"
 
 
 @pytest.mark.parametrize("link", ["../../evil", "..", "a/b", "/evil", ".hidden"])
@@ -94,24 +96,24 @@ def test_link_name_must_be_a_file_name(tmp_path: Path, link: str) -> None:
     (tmp_path / "evil" / "letter.txt").write_text("mine")
     desk = DESK.replace("case", link)
     (tmp_path / "flat.urdf").write_text(desk, encoding="utf-8")
-    (one,) = parse_requests([f"{tmp_path / 'flat.urdf'}#{link}"], "objects", ())
+    (request,) = parse_requests([f"{tmp_path / 'flat.urdf'}#{link}"], "objects", ())
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(vkc.InputError, match="objects: not a plain file name"):
-        prepare_object(one, tmp_path / "a" / "objects")
+        prepare_object(request, tmp_path / "a" / "objects")
     with pytest.raises(vkc.InputError, match="robots: not a plain file name"):
         prepare_robot(Request(link, "husky_ur5e"), tmp_path / "a" / "robots")
     assert sorted(tmp_path.rglob("*")) == before
-    (one,) = parse_requests([f"desk={tmp_path / 'flat.urdf'}#{link}"], "objects", ())
-    assert prepare_object(one, tmp_path / "objects") == str(tmp_path / "objects/desk/desk.yaml")
+    (request,) = parse_requests([f"desk={tmp_path / 'flat.urdf'}#{link}"], "objects", ())
+    assert prepare_object(request, tmp_path / "objects") == str(tmp_path / "objects/desk/desk.yaml")
 
 
-def test_robot_with_a_hand_is_not_imported(tmp_path: Path) -> None:
+def test_bundled_robot_is_used_and_robot_file_is_imported_once(tmp_path: Path) -> None:
     assert prepare_robot(Request("husky", "husky_ur5e"), tmp_path) == "husky_ur5e"
     assert not list(tmp_path.iterdir())
     file = write_arms(tmp_path / "given")
-    made = Path(prepare_robot(Request("two_arms", str(file)), tmp_path / "robots"))
-    assert made == tmp_path / "robots" / "two_arms"
-    assert vkc.load_robot(made).touch_links
-    changed = (made / "robot.yaml").stat().st_mtime_ns
+    folder = Path(prepare_robot(Request("two_arms", str(file)), tmp_path / "robots"))
+    assert folder == tmp_path / "robots" / "two_arms"
+    assert vkc.load_robot(folder).touch_links
+    changed = (folder / "robot.yaml").stat().st_mtime_ns
     prepare_robot(Request("two_arms", str(file)), tmp_path / "robots")
-    assert (made / "robot.yaml").stat().st_mtime_ns == changed
+    assert (folder / "robot.yaml").stat().st_mtime_ns == changed

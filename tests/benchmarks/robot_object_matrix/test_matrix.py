@@ -1,4 +1,4 @@
-"""What is made of the records of robots × objects."""
+"""Tests the tables and the chart of the robot–object matrix."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from vkc_pin.benchmarks.harness.record import describe_environment
 from vkc_pin.benchmarks.robot_object_matrix.matrix import chart, format_results
 
 
-def record(robot: str, name: str, status: str = "success", **more: Any) -> dict[str, Any]:
-    own = (
+def make_record(robot: str, name: str, status: str = "success", **fields: Any) -> dict[str, Any]:
+    times = (
         {"planning_time": 1.0, "load_time": 0.5}
         if status not in ("unreachable", "error", "no hand")
         else {}
@@ -20,23 +20,23 @@ def record(robot: str, name: str, status: str = "success", **more: Any) -> dict[
         "object": name,
         "success": status == "success",
         "status": status,
-        **own,
-        **more,
+        **times,
+        **fields,
     }
 
 
 RECORDS = [
-    *(record("one", "oven_0", planning_time=time) for time in (1.0, 3.0)),
+    *(make_record("one", "oven_0", planning_time=time) for time in (1.0, 3.0)),
     *(
-        record("one", "door", status, because=why)
-        for status, why in (("success", ""), ("infeasible", "the shelf | the wall"))
+        make_record("one", "door", status, because=reason)
+        for status, reason in (("success", ""), ("infeasible", "the shelf | the wall"))
     ),
-    record("one", "valve_1", "unreachable", because="turn: nothing of it fits"),
-    *(record("two", "oven_0", "not converged", because="") for _ in range(2)),
-    record("two", "door", "error", violations=["InputError: no"]),
-    record("two", "valve_1", "unreachable", because="turn: nothing of it fits"),
+    make_record("one", "valve_1", "unreachable", because="turn: nothing of it fits"),
+    *(make_record("two", "oven_0", "not converged", because="") for _ in range(2)),
+    make_record("two", "door", "error", violations=["InputError: no"]),
+    make_record("two", "valve_1", "unreachable", because="turn: nothing of it fits"),
     *(
-        record("three", name, "no hand", because="touch_links: not known")
+        make_record("three", name, "no hand", because="touch_links: not known")
         for name in ("oven_0", "door", "valve_1")
     ),
 ]
@@ -56,7 +56,7 @@ def test_tables_list_all_pairs() -> None:
     assert "| all | 9 | 4 | 1 (25%) | 2 (50%) |" in text
     assert "| oven_0 | 2/2 | 0/2 | – |\n| door | 1/2 | ! | – |\n| valve_1 | – | – | – |" in text
     assert "| one | door | infeasible | 1 | the shelf \\| the wall |" in text
-    assert "| two | oven_0 | not converged | 2 |  |" in text, "those alike are one row"
+    assert "| two | oven_0 | not converged | 2 |  |" in text, "equal failures share a row"
     assert "| two | door | error | 1 | InputError: no |" in text
     assert "| three | every object | no hand | 3 | touch_links: not known |" in text
     assert "| three | 3 | 0 | 0 (0%) | 0 (0%) | – | – | – |" in text
@@ -67,7 +67,7 @@ def test_tables_list_all_pairs() -> None:
     )
 
 
-def test_chart(tmp_path: Path) -> None:
+def test_chart_shows_the_successes_of_all_pairs(tmp_path: Path) -> None:
     figure = chart(RECORDS, tmp_path / "success.png")
     axes, _ = figure.axes
     assert [text.get_text() for text in axes.texts] == [
@@ -82,6 +82,6 @@ def test_chart(tmp_path: Path) -> None:
         "–",
     ]
     assert [label.get_text() for label in axes.get_yticklabels()] == ["oven_0", "door", "valve_1"]
-    shown = axes.images[0].get_array()
-    assert shown.tolist() == [[100.0, 0.0, None], [50.0, 0.0, None], [None, None, None]]
+    rates = axes.images[0].get_array()
+    assert rates.tolist() == [[100.0, 0.0, None], [50.0, 0.0, None], [None, None, None]]
     assert (tmp_path / "success.png").stat().st_size > 5000

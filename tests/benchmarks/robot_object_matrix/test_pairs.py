@@ -1,4 +1,4 @@
-"""A robot and a thing that opens, alone in a hall."""
+"""Tests the scenes of the robot–object matrix: a robot and an articulated object in a hall."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SMOOTH = """<robot name="smooth"><link name="frame"/>
 <parent link="frame"/><child link="block"/><origin xyz="0 0 0.5"/><axis xyz="-1 0 0"/>
 <limit lower="0" upper="0.3" effort="1" velocity="1"/></joint></robot>"""
 
-# No hand can hold this or push it about its axis.
+# No hand can grasp this ball or turn it by pushing.
 SPHERE = """<robot name="smooth"><link name="frame"/>
 <link name="ball"><collision><geometry><sphere radius="0.2"/></geometry></collision></link>
 <joint name="spin" type="revolute">
@@ -65,8 +65,10 @@ def test_objects_are_placed_by_kind(name: str) -> None:
     assert bool(counters) == (name == "faucet_0")
     assert (low[2] > 0.7) if counters else (0.0 <= low[2] < 0.05)
     in_wall = name == "narrow_door"
-    assert (high[0] > 4.0) == in_wall, "a door is in the wall at x = 4 m, the others are before it"
-    assert scene.arena[1] == (6.0 if in_wall else 4.0), "there is floor beyond a door"
+    assert (high[0] > 4.0) == in_wall, (
+        "a door is in the wall at x = 4 m, other objects are in front of it"
+    )
+    assert scene.arena[1] == (6.0 if in_wall else 4.0), "the floor extends beyond a door"
     assert low[0] > 2.9, "the robot starts 2 m away"
     start = scene.sample_start(np.random.default_rng(0))
     assert start.start_clearance() >= START_CLEARANCE
@@ -74,15 +76,15 @@ def test_objects_are_placed_by_kind(name: str) -> None:
 
 
 def test_joint_is_opened_by_half_its_range(husky: vkc.Robot) -> None:
-    found = make_pair(husky, "husky_ur5e", "drawers_0")
-    assert found.scene is not None
-    assert found.step is not None
-    item = found.scene.objects["it"].object
+    pair = make_pair(husky, "husky_ur5e", "drawers_0")
+    assert pair.scene is not None
+    assert pair.step is not None
+    item = pair.scene.objects["it"].object
     proposals = vkc.importing.propose_attachments(
         vkc.load_object(vkc.procedural.random_object("drawers", 0)), husky
     )
-    ((joint, goal),) = found.step.joints.items()
-    assert found.step.attachment is None, "planning chooses"
+    ((joint, goal),) = pair.step.joints.items()
+    assert pair.step.attachment is None, "the planner chooses the attachment"
     assert goal == pytest.approx(
         SHARE * (item.upper - item.lower)[item.coordinates.index(joint)], abs=1e-3
     )
@@ -93,7 +95,7 @@ def test_joint_is_opened_by_half_its_range(husky: vkc.Robot) -> None:
 
 
 @pytest.mark.parametrize(("height", "raised"), [(0.4, True), (0.8, False)])
-def test_low_objects_are_on_a_counter(tmp_path: Path, height: float, raised: bool) -> None:
+def test_low_objects_are_placed_on_a_counter(tmp_path: Path, height: float, raised: bool) -> None:
     urdf = SMOOTH.replace("0.4 0.4 0.4", f"0.4 0.4 {height}").replace(
         "0 0 0.5", f"0 0 {height / 2}"
     )
@@ -111,21 +113,21 @@ def test_low_objects_are_on_a_counter(tmp_path: Path, height: float, raised: boo
     assert not [pair for pair in vkc.check_scene(scene).close if pair.distance < 0.0]
 
 
-def _write_object(path: Path, **more: Any) -> str:
-    description: Mapping[str, Any] = {"urdf": SMOOTH, "attachments": [], **more}
+def _write_object(path: Path, **fields: Any) -> str:
+    description: Mapping[str, Any] = {"urdf": SMOOTH, "attachments": [], **fields}
     return str(vkc.procedural.write_object(description, path))
 
 
 def test_object_without_a_grasp_is_unreachable(husky: vkc.Robot, tmp_path: Path) -> None:
-    found = make_pair(husky, "husky_ur5e", _write_object(tmp_path / "smooth.yaml", urdf=SPHERE))
-    assert found.step is None
-    assert found.because.startswith("spin: nothing of it fits between the fingers")
+    pair = make_pair(husky, "husky_ur5e", _write_object(tmp_path / "smooth.yaml", urdf=SPHERE))
+    assert pair.step is None
+    assert pair.because.startswith("spin: nothing of it fits between the fingers")
 
 
 def test_robot_without_a_hand_has_no_step() -> None:
-    found = make_pair(vkc.load_robot("ur5"), "ur5", "drawers_0")
-    assert (found.scene, found.step) == (None, None)
-    assert "the hand of 'ur5_robot' is undefined" in found.because
+    pair = make_pair(vkc.load_robot("ur5"), "ur5", "drawers_0")
+    assert (pair.scene, pair.step) == (None, None)
+    assert "the hand of 'ur5_robot' is undefined" in pair.because
 
 
 def test_high_object_is_unreachable(husky: vkc.Robot, tmp_path: Path) -> None:
@@ -142,12 +144,12 @@ def test_high_object_is_unreachable(husky: vkc.Robot, tmp_path: Path) -> None:
         '<origin xyz="-0.26 0 0"/></joint>'
     )
     high = SMOOTH.replace("0 0 0.5", "0 0 3.5").replace('<link name="frame"/>', foot)
-    found = make_pair(
+    pair = make_pair(
         husky,
         "husky_ur5e",
         _write_object(
             tmp_path / "high.yaml", urdf=high.replace("</robot>", f"{bar}{fixed}</robot>")
         ),
     )
-    assert found.step is None
-    assert found.because.startswith("bar_bar: ")
+    assert pair.step is None
+    assert pair.because.startswith("bar_bar: ")

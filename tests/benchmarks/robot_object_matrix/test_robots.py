@@ -1,4 +1,4 @@
-"""Robots are checked from the command line: one reaches its poses, one is no robot."""
+"""Tests the check of imported robots from the command line."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from vkc_pin.cli import main
 
 
 @pytest.mark.long
-def test_bench_robots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    good = write_arms(tmp_path / "good")
+def test_command_records_reached_poses_and_a_failed_import(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    valid = write_arms(tmp_path / "good")
     legless = tmp_path / "legless.urdf"
     box = "<link name='{}'><collision><geometry><box size='1 1 1'/></geometry></collision></link>"
     legless.write_text(f"<robot name='legless'>{box.format('a')}</robot>", encoding="utf-8")
@@ -26,7 +28,7 @@ def test_bench_robots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         "--goals",
         "2",
         "--robots",
-        str(good),
+        str(valid),
         str(legless),
         "--quiet",
         "--out",
@@ -45,7 +47,7 @@ def test_bench_robots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
         (True, [], 1),
     ]
     assert all(r["base_path_length"] + r["arm_path_length"] > 0.1 for r in reached), (
-        "it has to move"
+        "the robot moves"
     )
     assert reached[0]["home_room"] >= 0.03
     assert reached[0]["joints"] == 5
@@ -56,12 +58,12 @@ def test_bench_robots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
 
     journal = (out / "trials.jsonl").read_bytes()
     assert main(command) == 0
-    assert (out / "trials.jsonl").read_bytes() == journal, "nothing was run again"
+    assert (out / "trials.jsonl").read_bytes() == journal, "no trial was run again"
 
 
 def test_report_lists_failures_by_robot() -> None:
-    about = {"robots": ["one", "two"], "goals": 2, "seed": 0, "time_limit": 5.0, "versions": {}}
-    about["machine"] = {"cores": 2, "processor": "x", "machine": "x", "system": "x", "python": "3"}
+    meta = {"robots": ["one", "two"], "goals": 2, "seed": 0, "time_limit": 5.0, "versions": {}}
+    meta["machine"] = {"cores": 2, "processor": "x", "machine": "x", "system": "x", "python": "3"}
     facts = {"import_time": 4.0, "load_time": 0.5, "joints": 6, "pairs": 7, "home_room": -0.004}
     trials = [
         {"robot": "one", **facts, "success": True, "status": "success", "planning_time": 1.0},
@@ -82,7 +84,7 @@ def test_report_lists_failures_by_robot() -> None:
             "because": "only 1 of 9",
         },
     ]
-    text = format_results({"meta": about, "trials": trials})
+    text = format_results({"meta": meta, "trials": trials})
     assert "| one | 6 | 7 | 4.00 | 0.50 | -4 | 1/2 | 2.00 | 2.90 |" in text
     assert "| two | 6 | 7 | 4.00 | 0.50 | – | – |" in text
     assert "| one | infeasible | too deep |" in text

@@ -1,4 +1,4 @@
-"""The robot–object matrix runs from the command line: one robot, one feasible object, one not."""
+"""Tests the robot–object matrix from the command line."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ from vkc_pin.cli import main
 
 
 @pytest.mark.long
-def test_bench_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_opens_a_drawer_and_records_an_unreachable_object(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     description = vkc.procedural.random_object("drawers", 0)
-    slide = vkc.load_object(description)
+    drawers = vkc.load_object(description)
     urdf = (
         '<robot name="smooth"><link name="frame"/>'
         '<link name="ball"><collision><geometry><sphere radius="0.2"/></geometry></collision>'
@@ -51,17 +53,17 @@ def test_bench_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         r["object"]: r
         for r in json.loads((out / "results.json").read_text(encoding="utf-8"))["trials"]
     }
-    opened, other = records["drawers_0"], records["smooth"]
+    opened, unreachable = records["drawers_0"], records["smooth"]
     assert (opened["success"], opened["violations"], opened["kind"]) == (True, [], "drawers")
-    reach = (slide.upper - slide.lower)[slide.coordinates.index(opened["joint"])]
+    reach = (drawers.upper - drawers.lower)[drawers.coordinates.index(opened["joint"])]
     assert opened["goal"] == pytest.approx(SHARE * reach, abs=1e-3)
-    assert opened["base_path_length"] > 0.5, "it starts 2 m away"
-    assert (other["success"], other["status"]) == (False, "unreachable")
+    assert opened["base_path_length"] > 0.5, "the robot starts 2 m away"
+    assert (unreachable["success"], unreachable["status"]) == (False, "unreachable")
 
     journal = (out / "trials.jsonl").read_bytes()
     assert main([*command, "--out", str(out)]) == 0
     again = (out / "trials.jsonl").read_bytes()
-    assert again == journal, "nothing was run again"
+    assert again == journal, "no trial was run again"
 
 
 def test_wrong_arguments_are_refused(tmp_path: Path) -> None:

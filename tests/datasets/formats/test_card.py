@@ -14,7 +14,7 @@ def test_card_has_counts_and_failures() -> None:
         "versions": {"pin": "4.1"},
         "recipe": "name: home\n",
     }
-    one = {
+    episode = {
         "task": "drive-open",
         "robot": "panda",
         "kind": "oven",
@@ -22,8 +22,8 @@ def test_card_has_counts_and_failures() -> None:
         "scene": "s",
         "duration": 1800.0,
     }
-    failed = {"status": "infeasible", "reason": "the wall is in the way"}
-    text = make_card(about, [one, {**one, "scene": "t"}], [failed, failed])
+    failure = {"status": "infeasible", "reason": "the wall is in the way"}
+    text = make_card(about, [episode, {**episode, "scene": "t"}], [failure, failure])
     _, head, body = text.split("---\n", 2)
     assert yaml.safe_load(head)["license"] == "cc-by-4.0"
     assert yaml.safe_load(head)["size_categories"] == ["n<1K"]

@@ -17,8 +17,8 @@ from vkc_pin.errors import InputError
 h5py = pytest.importorskip("h5py")
 
 
-def test_groups_have_robomimics_layout(made: Dataset) -> None:
-    (shard,) = made.shards
+def test_groups_have_the_robomimic_layout(dataset: Dataset) -> None:
+    (shard,) = dataset.shards
     with h5py.File(shard) as file:
         data = file["data"]
         assert json.loads(data.attrs["env_args"]).keys() == {"env_name", "env_type", "env_kwargs"}
@@ -36,16 +36,22 @@ def test_groups_have_robomimics_layout(made: Dataset) -> None:
                 assert len(values) == count, name
                 assert values.dtype in (np.float32, np.uint8), name
             assert group["dones"][:].tolist() == [0] * (count - 1) + [1]
-            told, there = group["actions"][:], group["obs"]
+            actions, observations = group["actions"][:], group["obs"]
             robot = np.hstack(
-                [there["base_pose"][:], there["arm_position"][:], there["gripper"][:]]
+                [
+                    observations["base_pose"][:],
+                    observations["arm_position"][:],
+                    observations["gripper"][:],
+                ]
             )
-            assert np.array_equal(told[:-1], robot[1:])  # what it is told is where it is next
+            assert np.array_equal(
+                actions[:-1], robot[1:]
+            )  # an action is the next state of the robot
 
 
-def test_episodes_are_read_back_to_1e_9(made: Dataset) -> None:
-    for episode in read_episodes(made.shards[0], made.folder / "scenes"):
-        record, data = run_attempt(made.recipe.document, episode.number, {})
+def test_episodes_are_read_back_to_1e_9(dataset: Dataset) -> None:
+    for episode in read_episodes(dataset.shards[0], dataset.folder / "scenes"):
+        record, data = run_attempt(dataset.recipe.document, episode.number, {})
         fresh = unpack(data)
         assert record["success"]
         times = np.linspace(fresh.trajectory.times[0], fresh.trajectory.times[-1], 300)
@@ -60,8 +66,8 @@ def test_episodes_are_read_back_to_1e_9(made: Dataset) -> None:
         assert np.array_equal(episode.scene().start, fresh.scene().start)
 
 
-def test_samples_lie_on_the_trajectory(made: Dataset) -> None:
-    episode = next(made.episodes())
+def test_samples_lie_on_the_trajectory(dataset: Dataset) -> None:
+    episode = next(dataset.episodes())
     robot = episode.scene().robot
     found = sample_episode(episode, robot, 25.0)
     motion = episode.trajectory
@@ -77,38 +83,40 @@ def test_samples_lie_on_the_trajectory(made: Dataset) -> None:
         robot.model, data, robot.coordinates.q(found["states"][7][: motion.robot_size])
     )
     hand = data.oMf[robot.model.getFrameId(robot.tool_frame)]
-    there = pin.XYZQUATToSE3(found["hand_pose"][7])
-    assert np.allclose(there.homogeneous, hand.homogeneous, atol=1e-9)
-    assert (found["holding"] == 1.0).all()  # the grasp is given
+    hand_pose = pin.XYZQUATToSE3(found["hand_pose"][7])
+    assert np.allclose(hand_pose.homogeneous, hand.homogeneous, atol=1e-9)
+    assert (found["holding"] == 1.0).all()  # grasped from the start
     assert (
         np.einsum("ij,ij->i", found["hand_pose"][1:, 3:], found["hand_pose"][:-1, 3:]) > 0.0
     ).all()
 
 
-def test_shards_are_reproducible(made: Dataset, tmp_path: Path) -> None:
-    """Made anew of what was read back, and copied from the shard itself."""
+def test_shards_are_reproducible(dataset: Dataset, tmp_path: Path) -> None:
+    """Rewriting the episodes and copying the shard give the same bytes."""
     files = []
-    for episode in made.episodes():
+    for episode in dataset.episodes():
         files.append(tmp_path / f"{episode.number}.hdf5")
         files[-1].write_bytes(
-            make_part(episode, episode.scene().robot, made.recipe.fields.rate, made.recipe.digest)
+            make_part(
+                episode, episode.scene().robot, dataset.recipe.fields.rate, dataset.recipe.digest
+            )
         )
     again = write_shard(tmp_path / "again.hdf5", [(file, 0) for file in files], tmp_path / "scenes")
     copied = write_shard(
-        tmp_path / "copied.hdf5", [(made.shards[0], k) for k in range(4)], tmp_path / "scenes"
+        tmp_path / "copied.hdf5", [(dataset.shards[0], k) for k in range(4)], tmp_path / "scenes"
     )
-    assert again.read_bytes() == copied.read_bytes() == made.shards[0].read_bytes()
-    assert read_numbers(again) == made.numbers()
+    assert again.read_bytes() == copied.read_bytes() == dataset.shards[0].read_bytes()
+    assert read_numbers(again) == dataset.numbers()
     scenes = [
         {file.name: file.read_bytes() for file in (folder / "scenes").iterdir()}
-        for folder in (tmp_path, made.folder)
+        for folder in (tmp_path, dataset.folder)
     ]
     assert scenes[0] == scenes[1]
 
 
-def test_damaged_files_are_errors(made: Dataset, tmp_path: Path) -> None:
+def test_damaged_files_raise(dataset: Dataset, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
-    shutil.copytree(made.folder, copy)
+    shutil.copytree(dataset.folder, copy)
     shard = Dataset.open(copy).shards[0]
     with h5py.File(shard, "r+") as file:
         del file["data/demo_1/motion/knot_rates"]
@@ -123,9 +131,9 @@ def test_damaged_files_are_errors(made: Dataset, tmp_path: Path) -> None:
         list(Dataset.open(copy).episodes())
 
 
-def test_changed_scene_is_an_error(made: Dataset, tmp_path: Path) -> None:
+def test_changed_scene_raises(dataset: Dataset, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
-    shutil.copytree(made.folder, copy)
+    shutil.copytree(dataset.folder, copy)
     for file in (copy / "scenes").iterdir():
         file.write_text(file.read_text().replace('"floor":true', '"floor":false'))
     with pytest.raises(InputError, match="not what its name says"):

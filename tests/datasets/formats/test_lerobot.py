@@ -1,4 +1,4 @@
-"""LeRobot's layout, as its own code writes it; and, where it is installed, as it reads it."""
+"""Tests LeRobot's layout: features, frames, tables and statistics."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ pq = pytest.importorskip("pyarrow.parquet")
 
 
 @pytest.fixture(scope="module")
-def root(made: Dataset) -> Path:
-    return made.folder / "lerobot" / "husky_ur5e"
+def root(dataset: Dataset) -> Path:
+    return dataset.folder / "lerobot" / "husky_ur5e"
 
 
 def load_info(root: Path) -> Any:
@@ -30,11 +30,11 @@ def load_info(root: Path) -> Any:
 
 
 def test_info_describes_the_features(root: Path) -> None:
-    said = load_info(root)
-    assert said["codebase_version"] == "v3.0"
-    assert (said["total_episodes"], said["fps"], said["robot_type"]) == (4, 10, "husky_ur5e")
-    assert said["splits"] == {"train": "0:4"}
-    assert said["data_path"] == "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+    info = load_info(root)
+    assert info["codebase_version"] == "v3.0"
+    assert (info["total_episodes"], info["fps"], info["robot_type"]) == (4, 10, "husky_ur5e")
+    assert info["splits"] == {"train": "0:4"}
+    assert info["data_path"] == "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
     for name, dtype in (
         ("timestamp", "float32"),
         ("frame_index", "int64"),
@@ -42,38 +42,40 @@ def test_info_describes_the_features(root: Path) -> None:
         ("index", "int64"),
         ("task_index", "int64"),
     ):
-        assert said["features"][name] == {"dtype": dtype, "shape": [1], "names": None}
+        assert info["features"][name] == {"dtype": dtype, "shape": [1], "names": None}
     for name in ("observation.state", "action"):
-        assert said["features"][name]["shape"] == [len(said["features"][name]["names"])]
+        assert info["features"][name]["shape"] == [len(info["features"][name]["names"])]
 
 
-def test_frames_are_samples_of_episodes(made: Dataset, root: Path) -> None:
-    said = load_info(root)
-    table = pq.read_table(root / said["data_path"].format(chunk_index=0, file_index=0))
-    assert table.column_names == list(said["features"])
-    assert len(table) == said["total_frames"]
+def test_frames_are_samples_of_episodes(dataset: Dataset, root: Path) -> None:
+    info = load_info(root)
+    table = pq.read_table(root / info["data_path"].format(chunk_index=0, file_index=0))
+    assert table.column_names == list(info["features"])
+    assert len(table) == info["total_frames"]
     assert table["index"].to_pylist() == list(range(len(table)))
     state = np.array(table["observation.state"].to_pylist())
     first = 0
-    for number, episode in enumerate(made.episodes()):
-        found = sample_episode(episode, episode.scene().robot, said["fps"])
+    for number, episode in enumerate(dataset.episodes()):
+        found = sample_episode(episode, episode.scene().robot, info["fps"])
         count = len(found["time"])
-        own = slice(first, first + count)
-        assert set(table["episode_index"].to_pylist()[own]) == {number}
-        assert table["frame_index"].to_pylist()[own] == list(range(count))
+        rows = slice(first, first + count)
+        assert set(table["episode_index"].to_pylist()[rows]) == {number}
+        assert table["frame_index"].to_pylist()[rows] == list(range(count))
         assert np.allclose(
-            np.array(table["timestamp"].to_pylist()[own]) * said["fps"], np.arange(count), atol=1e-4
+            np.array(table["timestamp"].to_pylist()[rows]) * info["fps"],
+            np.arange(count),
+            atol=1e-4,
         )
-        assert np.allclose(state[own, :3], found["base_pose"], atol=1e-6)
-        assert np.allclose(np.array(table["action"].to_pylist())[own], found["actions"], atol=1e-6)
+        assert np.allclose(state[rows, :3], found["base_pose"], atol=1e-6)
+        assert np.allclose(np.array(table["action"].to_pylist())[rows], found["actions"], atol=1e-6)
         first += count
     assert first == len(table)
     assert (
         pq.ParquetFile(root / "data/chunk-000/file-000.parquet").num_row_groups == 4
-    )  # one an episode
+    )  # one per episode
 
 
-def test_tables_of_episodes_and_tasks(made: Dataset, root: Path) -> None:
+def test_episode_and_task_tables_are_consistent(dataset: Dataset, root: Path) -> None:
     rows = pq.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
     frames = load_info(root)["total_frames"]
     assert [row["episode_index"] for row in rows] == [0, 1, 2, 3]
@@ -90,27 +92,27 @@ def test_tables_of_episodes_and_tasks(made: Dataset, root: Path) -> None:
         "stats/action/mean",
     } <= set(rows[0])
     tasks = pq.read_table(root / "meta/tasks.parquet").to_pydict()
-    texts = dict(zip(tasks["task"], tasks["task_index"], strict=True))
+    indices = dict(zip(tasks["task"], tasks["task_index"], strict=True))
     assert [row["tasks"] for row in rows] == [
-        [describe_task(episode.about)] for episode in made.episodes()
+        [describe_task(episode.about)] for episode in dataset.episodes()
     ]
-    assert sorted(texts.values()) == list(range(len(texts)))
+    assert sorted(indices.values()) == list(range(len(indices)))
 
 
-def test_statistics_are_those_of_all_frames(root: Path) -> None:
+def test_statistics_cover_all_frames(root: Path) -> None:
     stats = json.loads((root / "meta/stats.json").read_text())
     table = pq.read_table(root / "data/chunk-000/file-000.parquet")
     assert set(stats) == set(table.column_names)
     values = np.array(table["observation.velocity"].to_pylist(), float)
-    own = stats["observation.velocity"]
-    assert np.allclose(own["mean"], values.mean(axis=0), atol=1e-7)
-    assert np.allclose(own["std"], values.std(axis=0), atol=1e-7)
-    assert np.allclose(own["min"], values.min(axis=0))
-    assert np.allclose(own["max"], values.max(axis=0))
-    assert own["count"] == [len(values)]
+    velocity_stats = stats["observation.velocity"]
+    assert np.allclose(velocity_stats["mean"], values.mean(axis=0), atol=1e-7)
+    assert np.allclose(velocity_stats["std"], values.std(axis=0), atol=1e-7)
+    assert np.allclose(velocity_stats["min"], values.min(axis=0))
+    assert np.allclose(velocity_stats["max"], values.max(axis=0))
+    assert velocity_stats["count"] == [len(values)]
 
 
-def test_rate_must_be_whole(tmp_path: Path) -> None:
+def test_rate_must_be_a_whole_number(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="whole numbers of frames"):
         generate({**SMALL, "rate": 12.5}, 1, tmp_path / "out", lerobot=True)
-    assert not (tmp_path / "out").exists()  # not after hours of planning
+    assert not (tmp_path / "out").exists()  # the error must precede planning

@@ -14,13 +14,13 @@ pytest.importorskip("h5py")
 
 
 @pytest.mark.long
-def test_attempts_are_parts_of_a_shard(tmp_path: Path) -> None:
+def test_parts_of_attempts_form_a_shard(tmp_path: Path) -> None:
     document = load_recipe({**SMALL, "tasks": ["given-open"]}).document
-    made, plain = make_parts((document, [0, 1], {})), run_attempts((document, [0, 1], {}))
-    assert [record["success"] for record, _ in made] == [True, True]
-    for (record, data), (same, _) in zip(made, plain, strict=True):
+    parts, attempts = make_parts((document, [0, 1], {})), run_attempts((document, [0, 1], {}))
+    assert [record["success"] for record, _ in parts] == [True, True]
+    for (record, data), (expected, _) in zip(parts, attempts, strict=True):
         assert {key: record[key] for key in ("number", "way", "scene", "evaluations")} == {
-            key: same[key] for key in ("number", "way", "scene", "evaluations")
+            key: expected[key] for key in ("number", "way", "scene", "evaluations")
         }
         (tmp_path / f"{record['number']}.hdf5").write_bytes(data)
     shard = write_shard(

@@ -24,13 +24,13 @@ SMALL: dict[str, Any] = {
 }
 
 
-def write(folder: Path, text: str) -> Path:
+def write_recipe(folder: Path, text: str) -> Path:
     path = folder / "recipe.yaml"
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def test_packaged_recipe() -> None:
+def test_packaged_recipe_is_loaded() -> None:
     recipe = load_recipe("home")
     assert recipe.fields.rooms.count == 50
     assert set(recipe.fields.tasks) == {"given-open", "drive-open", "fetch-place"}
@@ -38,13 +38,13 @@ def test_packaged_recipe() -> None:
     assert len(recipe.fields.robots) >= 3
 
 
-def test_document_makes_the_same_recipe(tmp_path: Path) -> None:
+def test_recipe_document_round_trips(tmp_path: Path) -> None:
     recipe = load_recipe({**SMALL, "options": {"dist_safe": 0.03}, "goal": {"share": [0.2, 0.3]}})
-    file = write(tmp_path, yaml.safe_dump(recipe.document))
-    again = load_recipe(file)
-    assert again.digest == recipe.digest
-    assert again.document == recipe.document
-    assert again.options.dist_safe == 0.03
+    file = write_recipe(tmp_path, yaml.safe_dump(recipe.document))
+    reloaded = load_recipe(file)
+    assert reloaded.digest == recipe.digest
+    assert reloaded.document == recipe.document
+    assert reloaded.options.dist_safe == 0.03
 
 
 @pytest.mark.parametrize(
@@ -57,12 +57,14 @@ def test_document_makes_the_same_recipe(tmp_path: Path) -> None:
         ({"variants": 2}, False),
     ],
 )
-def test_digest_depends_on_what_determines_episodes(change: dict[str, Any], same: bool) -> None:
+def test_digest_depends_only_on_fields_that_determine_episodes(
+    change: dict[str, Any], same: bool
+) -> None:
     assert (load_recipe({**SMALL, **change}).digest == load_recipe(SMALL).digest) == same
 
 
 @pytest.mark.parametrize(
-    ("line", "field", "said"),
+    ("line", "field", "message"),
     [
         ("robots: [husky_ur5]", "robots[0]", "did you mean 'husky_ur5e'"),
         ("objects: [random_ovens]", "objects[0]", "did you mean 'random_oven'"),
@@ -73,14 +75,14 @@ def test_digest_depends_on_what_determines_episodes(change: dict[str, Any], same
         ("options: {dist_saf: 0.1}", "options.dist_saf", "did you mean 'dist_safe'"),
     ],
 )
-def test_unknown_names_are_refused(tmp_path: Path, line: str, field: str, said: str) -> None:
-    file = write(tmp_path, f"name: small\n{line}\n")
+def test_unknown_names_are_rejected(tmp_path: Path, line: str, field: str, message: str) -> None:
+    file = write_recipe(tmp_path, f"name: small\n{line}\n")
     with pytest.raises(UnknownNameError) as caught:
         load_recipe(file)
     assert caught.value.file == file
     assert caught.value.line == 2
     assert caught.value.field == field
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -103,8 +105,8 @@ def test_unknown_names_are_refused(tmp_path: Path, line: str, field: str, said: 
         ("scenes: [missing.yaml]\ntasks: [drive-open]", "scenes[0]"),
     ],
 )
-def test_wrong_values_are_refused(tmp_path: Path, line: str, field: str) -> None:
-    file = write(tmp_path, f"name: small\n{line}\n")
+def test_invalid_values_are_rejected(tmp_path: Path, line: str, field: str) -> None:
+    file = write_recipe(tmp_path, f"name: small\n{line}\n")
     with pytest.raises(InputError) as caught:
         load_recipe(file)
     assert str(caught.value.file) == str(file)
@@ -114,7 +116,7 @@ def test_wrong_values_are_refused(tmp_path: Path, line: str, field: str) -> None
 def test_every_field_is_documented(tmp_path: Path) -> None:
     page = (Path(__file__).parents[3] / "docs/datasets.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"^```yaml\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
-    assert load_recipe(write(tmp_path, block)).fields.name == "home"
+    assert load_recipe(write_recipe(tmp_path, block)).fields.name == "home"
     for schema in (RecipeSchema, RoomsSchema, StartSchema, GoalSchema, RobotEntry):
         assert [name for name in schema.model_fields if f"`{name}`" not in page] == [], (
             schema.__name__

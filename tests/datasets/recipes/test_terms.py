@@ -1,4 +1,4 @@
-"""Terms of recipes: the value of each kind, episodes that satisfy them, and error messages."""
+"""Tests the terms of recipes: their values, episodes that satisfy them, and error messages."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from vkc_pin.datasets.recipes.terms import KeepOutSchema, SpeedSchema, TracedSch
 from vkc_pin.errors import InputError
 
 h5py = pytest.importorskip("h5py")
-SLOW = {"type": "speed", "frame": "base", "most": 0.3}
-RECIPE: dict[str, Any] = {**SMALL, "terms": [SLOW]}
+SPEED_LIMIT = {"type": "speed", "frame": "base", "most": 0.3}
+RECIPE: dict[str, Any] = {**SMALL, "terms": [SPEED_LIMIT]}
 
 
 def make_height_limit(frame: str = "hand") -> vkc.Constraint:
@@ -40,10 +40,10 @@ def flatten_inputs(now: pin.SE3, before: pin.SE3, dt: float) -> np.ndarray:
     return np.concatenate([*columns, [dt]])[None]
 
 
-def test_terms_agree_with_numbers() -> None:
+def test_terms_agree_with_numpy() -> None:
     rng = np.random.default_rng(3)
     axis = np.array([1.0, 2.0, -0.5])
-    upright, speed, away = make_recipe(
+    upright, speed, keep_out = make_recipe(
         {"type": "upright", "frame": "object", "axis": axis.tolist(), "angle": 0.3, "held": True},
         {"type": "speed", "frame": "hand", "most": 0.4},
         {
@@ -53,12 +53,12 @@ def test_terms_agree_with_numbers() -> None:
             "size": [2.0, 0.6, 1.0],
         },
     ).terms
-    assert [term.name for term in (upright, speed, away)] == [
+    assert [term.name for term in (upright, speed, keep_out)] == [
         "upright object",
         "speed hand",
         "keep-out base",
     ]
-    assert [term.holding for term in (upright, speed, away)] == ["object", None, None]
+    assert [term.holding for term in (upright, speed, keep_out)] == ["object", None, None]
     for _ in range(50):
         now, before, dt = pin.SE3.Random(), pin.SE3.Random(), float(rng.uniform(0.01, 0.5))
         now.translation, before.translation = rng.uniform(-2.0, 2.0, (2, 3))
@@ -68,18 +68,18 @@ def test_terms_agree_with_numbers() -> None:
         expected = np.linalg.norm(now.translation - before.translation) / dt
         assert speed.formula.evaluate(row)[0, 0] == pytest.approx(expected, rel=1e-6)
         inside = np.all(np.abs(now.translation - [1.0, -0.5, 0.2]) < [1.0, 0.3, 0.5])
-        assert (away.formula.evaluate(row)[0, 0] < 0.0) == inside
+        assert (keep_out.formula.evaluate(row)[0, 0] < 0.0) == inside
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return generate(RECIPE, 3, tmp_path_factory.mktemp("made") / "out", terms=[make_height_limit()])
 
 
 @pytest.mark.long
-def test_episodes_satisfy_their_terms(made: Dataset) -> None:
-    assert [entry.type for entry in made.recipe.fields.terms] == ["speed", "traced"]
-    for episode in made.episodes():
+def test_episodes_satisfy_their_terms(dataset: Dataset) -> None:
+    assert [entry.type for entry in dataset.recipe.fields.terms] == ["speed", "traced"]
+    for episode in dataset.episodes():
         assert [term.name for term in episode.terms] == ["speed base", "low"]
         assert [term.formula.frames for term in episode.terms] == [
             ("base",),
@@ -90,63 +90,66 @@ def test_episodes_satisfy_their_terms(made: Dataset) -> None:
         fine = np.linspace(times[0], times[-1], 2000)
         speeds = np.linalg.norm(episode.trajectory.velocity(fine)[:, :2], axis=1)
         assert speeds.max() < 0.3 + 1e-2
-    assert check_dataset(made.folder).ok
+    assert check_dataset(dataset.folder).ok
 
 
 @pytest.fixture
-def copy(made: Dataset, tmp_path: Path) -> Path:
-    shutil.copytree(made.folder, tmp_path / "copy")
+def copy(dataset: Dataset, tmp_path: Path) -> Path:
+    shutil.copytree(dataset.folder, tmp_path / "copy")
     return tmp_path / "copy"
 
 
 def change_metadata(folder: Path, change: Any) -> int:
-    """Change what an episode's file says of it; return its number."""
+    """Modify the metadata of an episode and return its number."""
     with h5py.File(Dataset.open(folder).shards[0], "r+") as file:
         group = file["data/demo_1"]
-        words = json.loads(group.attrs["episode"])
-        change(words)
-        group.attrs["episode"] = json.dumps(words)
+        metadata = json.loads(group.attrs["episode"])
+        change(metadata)
+        group.attrs["episode"] = json.dumps(metadata)
         return int(group.attrs["number"])
 
 
-def test_violated_term_is_found(copy: Path) -> None:
-    def stricter(words: Any) -> None:
-        words["terms"][0]["upper"] = 0.01
+def test_violated_term_is_reported(copy: Path) -> None:
+    def tighten(metadata: Any) -> None:
+        metadata["terms"][0]["upper"] = 0.01
 
-    number = change_metadata(copy, stricter)
+    number = change_metadata(copy, tighten)
     found = check_dataset(copy)
     assert list(found.refused) == [number]
     assert "speed base" in found.refused[number]
 
 
-def test_terms_other_than_the_recipes_are_found(copy: Path) -> None:
-    number = change_metadata(copy, lambda words: words.pop("terms"))
+def test_terms_that_differ_from_the_recipe_are_reported(copy: Path) -> None:
+    number = change_metadata(copy, lambda metadata: metadata.pop("terms"))
     found = check_dataset(copy)
     assert list(found.refused) == [number]
     assert "terms differ from those of the recipe" in found.refused[number]
 
 
-def test_digest_depends_on_terms(made: Dataset) -> None:
+def test_digest_depends_on_terms(dataset: Dataset) -> None:
     plain, slow = load_recipe(SMALL), load_recipe(RECIPE)
-    assert len({plain.digest, slow.digest, made.recipe.digest}) == 3
-    assert load_recipe(made.recipe.document).digest == made.recipe.digest
-    assert load_recipe(made.folder / "recipe.yaml").terms == made.recipe.terms
+    assert len({plain.digest, slow.digest, dataset.recipe.digest}) == 3
+    assert load_recipe(dataset.recipe.document).digest == dataset.recipe.digest
+    assert load_recipe(dataset.folder / "recipe.yaml").terms == dataset.recipe.terms
     with pytest.raises(InputError, match="run otherwise"):
-        generate(RECIPE, 3, made.folder)
-    assert generate(RECIPE, 3, made.folder, terms=[make_height_limit()]).numbers() == made.numbers()
+        generate(RECIPE, 3, dataset.folder)
+    assert (
+        generate(RECIPE, 3, dataset.folder, terms=[make_height_limit()]).numbers()
+        == dataset.numbers()
+    )
 
 
-def test_terms_may_hold_in_some_tasks(made: Dataset) -> None:
-    own = load_recipe(
+def test_terms_apply_only_to_their_tasks(dataset: Dataset) -> None:
+    recipe = load_recipe(
         {
             **SMALL,
             "tasks": ["given-open", "drive-open"],
-            "terms": [{**SLOW, "tasks": ["drive-open"]}],
+            "terms": [{**SPEED_LIMIT, "tasks": ["drive-open"]}],
         }
     )
-    episode = next(made.episodes())
+    episode = next(dataset.episodes())
     found = [
-        resolve_episode_terms(own, episode.scene(), {**episode.about, "task": task})
+        resolve_episode_terms(recipe, episode.scene(), {**episode.about, "task": task})
         for task in ("given-open", "drive-open")
     ]
     assert [len(terms) for terms in found] == [0, 1]
@@ -181,7 +184,7 @@ def test_terms_may_hold_in_some_tasks(made: Dataset) -> None:
         ("{type: python, expression: os.getcwd()}", "terms[0].type", "traced"),
     ],
 )
-def test_wrong_terms_are_refused(tmp_path: Path, entry: str, field: str, text: str) -> None:
+def test_invalid_terms_are_rejected(tmp_path: Path, entry: str, field: str, text: str) -> None:
     file = tmp_path / "recipe.yaml"
     file.write_text(f"name: small\nterms:\n  - {entry}\n", encoding="utf-8")
     with pytest.raises(InputError) as caught:
@@ -207,7 +210,7 @@ def test_wrong_terms_are_refused(tmp_path: Path, entry: str, field: str, text: s
         (3, "not a list"),
     ],
 )
-def test_wrong_terms_write_nothing(tmp_path: Path, terms: Any, text: str) -> None:
+def test_invalid_terms_write_no_files(tmp_path: Path, terms: Any, text: str) -> None:
     with pytest.raises(InputError) as caught:
         generate(SMALL, 1, tmp_path / "out", terms=terms)
     assert text in str(caught.value)

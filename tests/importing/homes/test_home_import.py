@@ -15,7 +15,7 @@ from vkc_pin.world.scene.scene import START_CLEARANCE
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:.*movable links overlap other shapes"
-)  # cups in their table, as in real homes
+)  # cups penetrate their table, as in real homes
 
 
 @pytest.fixture(scope="module")
@@ -39,14 +39,14 @@ def test_every_shape_of_the_file_is_imported(
     colliding = sum(
         len(placed.object.collision.geometryObjects) for placed in scene.objects.values()
     )
-    assert colliding == home.shapes["objects"]  # none of them is a mesh
+    assert colliding == home.shapes["objects"]  # no object has meshes
     sofa = [
         shape
         for shape, label in zip(scene.obstacles, scene.obstacle_labels, strict=True)
         if label == "sofa"
     ]
-    assert len(sofa) == 2, "a concave mesh, whose hull would fill the space above the seat"
-    assert len(scene.obstacles) == home.shapes["obstacles"] + 2  # with the floor
+    assert len(sofa) == 2, "the hull of the sofa would fill the space above its seat"
+    assert len(scene.obstacles) == home.shapes["obstacles"] + 2  # one sofa piece, the floor
 
 
 def test_placements_agree_with_the_file(home: vkc.importing.ImportedHome) -> None:
@@ -67,18 +67,18 @@ def test_placements_agree_with_the_file(home: vkc.importing.ImportedHome) -> Non
                 }
             ],
         }
-        there = vkc.Scene.from_document(document)
+        reference = vkc.Scene.from_document(document)
         boxes = [
             np.array(
                 [
                     compute_world_box(shape.geometry, shape.placement)
-                    for shape in make_world_shapes(one)
+                    for shape in make_world_shapes(placed)
                 ]
             )
-            for one in (scene.objects[name], there.objects["it"])
+            for placed in (scene.objects[name], reference.objects["it"])
         ]
         assert np.allclose(np.sort(boxes[0], axis=0), np.sort(boxes[1], axis=0), atol=1e-5), kind
-        own, other = scene.objects[name].object, there.objects["it"].object
+        own, other = scene.objects[name].object, reference.objects["it"].object
         assert np.allclose(own.upper - own.lower, other.upper - other.lower)
     assert scene.objects["cup_0"].placement.translation == pytest.approx([0.25, 0.2, 0.749])
     assert [name for name, placed in scene.objects.items() if placed.object.free] == [
@@ -90,7 +90,7 @@ def test_placements_agree_with_the_file(home: vkc.importing.ImportedHome) -> Non
 
 def test_start_is_free_and_reaches_most_objects(home: vkc.importing.ImportedHome) -> None:
     assert home.scene.start_clearance() >= START_CLEARANCE
-    assert home.scene.start[1] < 2.9  # the bedroom has the lump alone, which no hand can grasp
+    assert home.scene.start[1] < 2.9  # the bedroom contains only the lump, which no hand can grasp
     assert home.reached == 6
     assert home.scene.sample_start(np.random.default_rng(1)).start_clearance() >= START_CLEARANCE
 
@@ -128,16 +128,16 @@ def test_imported_objects_can_be_opened_and_grasped(home: vkc.importing.Imported
 def test_mjcf_home_is_imported(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     (tmp_path / "small.xml").write_text(HOME_MJCF)
-    done = vkc.importing.import_home(tmp_path / "small.xml", tmp_path / "out")
-    assert done.shapes == {"file": 9, "obstacles": 5, "objects": 4, "floor": 0}
-    assert set(done.scene.obstacle_names) == {"north", "south", "east", "west", "board"}
-    assert {name: placed.object.free for name, placed in done.scene.objects.items()} == {
+    imported = vkc.importing.import_home(tmp_path / "small.xml", tmp_path / "out")
+    assert imported.shapes == {"file": 9, "obstacles": 5, "objects": 4, "floor": 0}
+    assert set(imported.scene.obstacle_names) == {"north", "south", "east", "west", "board"}
+    assert {name: placed.object.free for name, placed in imported.scene.objects.items()} == {
         "cupboard": False,
         "mug": True,
     }
-    assert any("'ground'" in note and "plane" in note for note in done.notes)
-    assert done.scene.objects["mug"].placement.translation == pytest.approx([0.0, 2.3, 0.7])
-    assert len(vkc.procedural.goals(done.scene)) == 2
+    assert any("'ground'" in note and "plane" in note for note in imported.notes)
+    assert imported.scene.objects["mug"].placement.translation == pytest.approx([0.0, 2.3, 0.7])
+    assert len(vkc.procedural.goals(imported.scene)) == 2
 
 
 def format_sdf_box(size: str, place: str, name: str) -> str:
@@ -172,22 +172,22 @@ def test_sdf_world_is_imported(tmp_path: Path) -> None:
         f"{format_sdf_box('6 0.1 2.4', '0 2 1.2', 'l')}</model>"
         f'<model name="cup"><pose>2.2 1 0.85 0 0 0</pose>{cup}</model></world></sdf>'
     )
-    done = vkc.importing.import_home(tmp_path / "flat.world", tmp_path / "out")
-    assert done.shapes == {"file": 8, "obstacles": 1, "objects": 7, "floor": 0}
-    assert {name: placed.object.free for name, placed in done.scene.objects.items()} == {
+    imported = vkc.importing.import_home(tmp_path / "flat.world", tmp_path / "out")
+    assert imported.shapes == {"file": 8, "obstacles": 1, "objects": 7, "floor": 0}
+    assert {name: placed.object.free for name, placed in imported.scene.objects.items()} == {
         "chest": False,
         "other": False,
         "cup": True,
     }
     for name in ("chest", "other"):
-        made = done.scene.objects[name].object
-        assert list(made.coordinates.names) == ["slide"]
-        assert {grasp.link for grasp in made.attachments.values()} == {"front"}
-    assert "not static, but with joints, hence fixed in place: chest, other" in done.notes
-    assert "2 m of floor lie beyond the sides without walls: -x, -y, +x" in done.notes
-    assert done.scene.objects["cup"].placement.translation == pytest.approx([2.2, 1.0, 0.8])
-    # Free floor on the three sides without a wall, around the furniture
-    assert done.scene.arena == pytest.approx((-5.0, 5.0, -1.3 - 2.0, 2.05))
+        item = imported.scene.objects[name].object
+        assert list(item.coordinates.names) == ["slide"]
+        assert {grasp.link for grasp in item.attachments.values()} == {"front"}
+    assert "not static, but with joints, hence fixed in place: chest, other" in imported.notes
+    assert "2 m of floor lie beyond the sides without walls: -x, -y, +x" in imported.notes
+    assert imported.scene.objects["cup"].placement.translation == pytest.approx([2.2, 1.0, 0.8])
+    # free floor on the three sides without a wall
+    assert imported.scene.arena == pytest.approx((-5.0, 5.0, -1.3 - 2.0, 2.05))
 
 
 def test_xacro_home_is_imported(tmp_path: Path) -> None:
@@ -212,18 +212,18 @@ def test_xacro_home_is_imported(tmp_path: Path) -> None:
         <xacro:chest name="left" x="${-1}"/><xacro:chest name="right" x="${1+1}"/>
         </robot>"""
     )
-    done = vkc.importing.import_home(
+    imported = vkc.importing.import_home(
         tmp_path / "flat.urdf.xacro",
         tmp_path / "out",
         packages={"furniture": tmp_path / "parts"},
         arguments={"depth": "0.25"},
     )
-    assert list(done.scene.objects) == ["left", "right"]
-    assert done.scene.objects["right"].object.upper == pytest.approx([0.25])
-    assert done.scene.arena == pytest.approx((-1.3 - 2.0, 2.2 + 2.0, -2.3, 2.3))
+    assert list(imported.scene.objects) == ["left", "right"]
+    assert imported.scene.objects["right"].object.upper == pytest.approx([0.25])
+    assert imported.scene.arena == pytest.approx((-1.3 - 2.0, 2.2 + 2.0, -2.3, 2.3))
 
 
-def test_folder_and_file_name_are_respected(tmp_path: Path) -> None:
+def test_second_import_replaces_only_its_own_output(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     file, out = tmp_path / "x\nfloor: false\n#\x01.xml", tmp_path / "out"
     file.write_text(
@@ -252,29 +252,29 @@ def test_folder_and_file_name_are_respected(tmp_path: Path) -> None:
         vkc.importing.import_home(file, out, force=True)
 
 
-def test_invalid_homes_and_arguments_are_refused(tmp_path: Path) -> None:
-    still = tmp_path / "still.urdf"
-    still.write_text(
+def test_invalid_homes_and_arguments_are_rejected(tmp_path: Path) -> None:
+    immovable = tmp_path / "still.urdf"
+    immovable.write_text(
         '<robot name="s"><link name="a"><collision><geometry><box size="1 1 1"/></geometry>'
         "</collision></link></robot>"
     )
-    for file, wrong, word in (
+    for file, argument, message in (
         (tmp_path / "none.urdf", {}, r"none\.urdf"),
-        (still, {}, r"still\.urdf.*the home has nothing movable"),
-        (still, {"packages": {"p": 1}}, "packages"),
-        (still, {"floor": float("nan")}, "floor"),
-        (still, {"most": 0}, "most"),
-        (still, {"robot": "husky_ur5"}, "husky_ur5e"),
-        (still, {"options": 1}, "options"),
+        (immovable, {}, r"still\.urdf.*the home has nothing movable"),
+        (immovable, {"packages": {"p": 1}}, "packages"),
+        (immovable, {"floor": float("nan")}, "floor"),
+        (immovable, {"most": 0}, "most"),
+        (immovable, {"robot": "husky_ur5"}, "husky_ur5e"),
+        (immovable, {"options": 1}, "options"),
     ):
-        with pytest.raises(vkc.InputError, match=word):
-            vkc.importing.import_home(file, tmp_path / "out", **wrong)  # type: ignore[arg-type]
+        with pytest.raises(vkc.InputError, match=message):
+            vkc.importing.import_home(file, tmp_path / "out", **argument)  # type: ignore[arg-type]
     assert not (tmp_path / "out").exists()
     assert not list(tmp_path.glob(".import-home-*"))
 
 
 def make_divided_room(drawer_x: float, **more: object) -> vkc.Scene:
-    """Return a floor of 10 m × 4 m, divided by a wall, with a drawer in one part."""
+    """Return a floor of 10 m × 4 m, divided by a wall, with a drawer on one side."""
     return vkc.Scene.from_document(
         {
             "robot": "husky_ur5e",
@@ -295,7 +295,7 @@ def make_divided_room(drawer_x: float, **more: object) -> vkc.Scene:
 
 
 @pytest.mark.parametrize(("drawer_x", "side"), [(3.0, 1.0), (-2.0, -1.0)])
-def test_start_is_where_objects_are_reachable(drawer_x: float, side: float) -> None:
+def test_start_is_on_the_side_of_the_reachable_object(drawer_x: float, side: float) -> None:
     for seed in range(1):
         scene, reached = find_free_start(make_divided_room(drawer_x), np.random.default_rng(seed))
         assert np.sign(scene.start[0]) == side

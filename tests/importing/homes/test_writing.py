@@ -17,7 +17,7 @@ from vkc_pin.world.scene.scene import Scene
 SETTINGS = {"stem": "can", "most": 2, "dist_safe": 0.02, "grasp_clearance": 0.005}
 
 
-def _can(radius: float) -> HomeObject:
+def _make_can(radius: float) -> HomeObject:
     part = Part(
         name="",
         placement=pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.06])),
@@ -33,52 +33,52 @@ def _can(radius: float) -> HomeObject:
 
 
 def test_free_object_has_no_joint(tmp_path: Path) -> None:
-    done = write_object(_can(0.03), vkc.load_robot("husky_ur5e"), tmp_path, {}, **SETTINGS)
+    written = write_object(_make_can(0.03), vkc.load_robot("husky_ur5e"), tmp_path, {}, **SETTINGS)
     item = vkc.load_object(tmp_path / "objects" / "can" / "can.yaml")
     assert item.free
     assert item.coordinates.size == 0
     assert item.base_link == "can"
     assert (
         list(item.attachments)
-        == [proposal.attachment.name for proposal in done.proposals.found]
+        == [proposal.attachment.name for proposal in written.proposals.found]
         != []
     )
     for attachment in item.attachments.values():
         assert attachment.placement.translation[2] > 0.0
         assert attachment.firm
-    assert done.entry == {
+    assert written.entry == {
         "name": "can",
         "type": "objects/can/can.yaml",
         "position": [1.0, 2.0, 0.7],
     }
-    assert done.summary().startswith("can: carried by can_")
+    assert written.summary().startswith("can: carried by can_")
 
 
 def test_thick_object_is_reported(tmp_path: Path) -> None:
-    done = write_object(_can(0.3), vkc.load_robot("husky_ur5e"), tmp_path, {}, **SETTINGS)
+    written = write_object(_make_can(0.3), vkc.load_robot("husky_ur5e"), tmp_path, {}, **SETTINGS)
     assert not vkc.load_object(tmp_path / "objects" / "can" / "can.yaml").attachments
-    assert "carried by no hand: nothing of it fits" in done.summary()
+    assert "carried by no hand: nothing of it fits" in written.summary()
 
 
 def make_part(name: str, kind: str, size: tuple[float, ...], at: pin.SE3, **more: object) -> Part:
     return Part(name=name, placement=at, kind=kind, size=size, **more)  # type: ignore[arg-type]
 
 
-def test_primitive_shapes_stay_and_others_become_urdf(tmp_path: Path) -> None:
-    turned = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 1.1), np.array([1.0, 2.0, 0.7]))
+def test_primitive_shapes_are_kept_and_meshes_become_urdf(tmp_path: Path) -> None:
+    placement = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 1.1), np.array([1.0, 2.0, 0.7]))
     red = (1.0, 0.0, 0.0, 1.0)
-    seen = make_part("looks", "box", (2.0, 0.1, 2.0), turned, colour=red)
+    visual = make_part("looks", "box", (2.0, 0.1, 2.0), placement, colour=red)
     wedge = trimesh.convex.convex_hull([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
     building = Link(
         "walls",
-        (seen,),
+        (visual,),
         (
-            make_part("a wall", "box", (2.0, 0.1, 2.0), turned),
-            make_part("", "capsule", (0.1, 1.0), turned),
+            make_part("a wall", "box", (2.0, 0.1, 2.0), placement),
+            make_part("", "capsule", (0.1, 1.0), placement),
         ),
     )
-    mesh = Link("wedge", (), (make_part("", "mesh", (1.0, 1.0, 1.0), turned, triangles=wedge),))
-    ball = Link("a wall", (), (make_part("", "sphere", (0.2,), turned),))
+    mesh = Link("wedge", (), (make_part("", "mesh", (1.0, 1.0, 1.0), placement, triangles=wedge),))
+    ball = Link("a wall", (), (make_part("", "sphere", (0.2,), placement),))
     home = Home((building,), (mesh, ball), (), (), 4, ())
     taken = {"ball", "wedge"}
     entries, notes = write_obstacles(
@@ -108,7 +108,7 @@ def test_primitive_shapes_stay_and_others_become_urdf(tmp_path: Path) -> None:
         )
         assert np.vstack([box.min_, box.max_]) == pytest.approx(
             own.make_mesh().bounds, abs=2e-3
-        )  # balls of triangles are smaller
+        )  # triangulated spheres are smaller
         if part.kind != "mesh":
             assert shape.placement.isApprox(part.placement, 1e-5)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.downloads import write_partnet_object
+from helpers.partnet import write_partnet_object
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
@@ -60,8 +60,8 @@ def test_scaling_scales_shapes_and_limits(
     assert large.joints["link_0"].limits == pytest.approx((0.0, factor * 0.36))
 
 
-def test_inertia_is_merged_scaled_and_turned() -> None:
-    """A handle is fixed to a door, and a flap to the handle: its limits are equal."""
+def test_inertia_is_merged_scaled_and_rotated() -> None:
+    """A handle is fixed to a door, and a flap with equal limits to the handle."""
     place = pin.SE3(np.eye(3), np.array([0.0, 0.5, 0.0]))
     box = Part(name="", placement=pin.SE3.Identity(), kind="box", size=(0.1, 0.1, 0.1))
     inertia = pin.Inertia(2.0, np.array([0.1, 0.2, 0.3]), np.diag([0.1, 0.2, 0.25]))
@@ -87,16 +87,16 @@ def test_inertia_is_merged_scaled_and_turned() -> None:
     assert np.allclose(door.collision[2].placement.homogeneous, flap.homogeneous)
     assert door.inertia.isApprox(inertia + place.act(inertia) + flap.act(inertia))
     assert any("flap_joint" in note for note in merged.notes)
-    alone = Description(Path("f"), {"a": Link("a", inertia=inertia)}, {})
-    large = scale_object(alone, 3.0).links["a"].inertia
+    single = Description(Path("f"), {"a": Link("a", inertia=inertia)}, {})
+    large = scale_object(single, 3.0).links["a"].inertia
     assert large.isApprox(pin.Inertia(2.0, 3.0 * inertia.lever, 9.0 * inertia.inertia))
-    turned = make_upright(alone, "y").links["a"].inertia
-    assert np.allclose(turned.lever, [0.1, -0.3, 0.2])
-    assert not alone.is_massless
+    rotated = make_upright(single, "y").links["a"].inertia
+    assert np.allclose(rotated.lever, [0.1, -0.3, 0.2])
+    assert not single.is_massless
 
 
 def test_long_chains_of_fixed_links_are_merged() -> None:
-    """1500 links in a row, the last of which a hinge carries, and behind it two without shapes."""
+    """A hinge connects the last of 1500 links, followed by two links without shapes."""
     count, step = 1500, pin.SE3(np.eye(3), np.array([0.01, 0.0, 0.0]))
     box = Part(name="", placement=pin.SE3.Identity(), kind="box", size=(0.1, 0.1, 0.1))
     kinds = dict.fromkeys(range(1, count - 1), "fixed") | dict.fromkeys(
@@ -124,7 +124,7 @@ def test_long_chains_of_fixed_links_are_merged() -> None:
 
 
 def test_separate_objects_in_one_file_are_noted(tmp_path: Path) -> None:
-    def box(name: str, parent: str, kind: str) -> str:
+    def format_box(name: str, parent: str, kind: str) -> str:
         return (
             f'<link name="{name}"><collision><geometry><box size="1 1 1"/></geometry></collision>'
             f'</link><joint name="{name}_joint" type="{kind}"><parent link="{parent}"/>'
@@ -136,12 +136,12 @@ def test_separate_objects_in_one_file_are_noted(tmp_path: Path) -> None:
         file.write_text(f'<robot name="it"><link name="world"/>{"".join(parts)}</robot>')
         return find_multiple_objects(read_object_urdf(file))
 
-    oven = box("oven", "world", "fixed") + box("door", "oven", "revolute")
-    chest = box("chest", "world", "fixed") + box("lid", "chest", "revolute")
-    (note,) = find_notes(oven, chest, box("rack", "chest", "prismatic"))
+    oven = format_box("oven", "world", "fixed") + format_box("door", "oven", "revolute")
+    chest = format_box("chest", "world", "fixed") + format_box("lid", "chest", "revolute")
+    (note,) = find_notes(oven, chest, format_box("rack", "chest", "prismatic"))
     assert "'oven' (1 joint), 'chest' (2 joints)" in note
-    assert find_notes(oven) == find_notes(oven, box("wall", "world", "fixed")) == ()
-    drawers = box("upper", "world", "prismatic"), box("lower", "world", "prismatic")
+    assert find_notes(oven) == find_notes(oven, format_box("wall", "world", "fixed")) == ()
+    drawers = format_box("upper", "world", "prismatic"), format_box("lower", "world", "prismatic")
     assert find_notes(*drawers) == ()
 
 
@@ -155,21 +155,21 @@ def test_missing_limits_open_outwards(cabinet: Description) -> None:
         compute_bounds(limited, load_surfaces(limited), {"joint_1": value})
         for value in (0.0, low if abs(low) > high else high)
     )
-    front = shut[0][0] < opened[0][0] or shut[1][0] > opened[1][0]
-    assert not front  # it comes out of the front, x after the file's own turn
+    grows = opened[1][0] - opened[0][0] > shut[1][0] - shut[0][0] + 0.1
+    assert grows  # the door opens to the front, along x
     assert any("joint_1" in note and "1.57" in note for note in limited.notes)
     assert limited.joints["link_0"].limits == (0.0, 0.36)
-    little = dataclasses.replace(
+    narrow = dataclasses.replace(
         limited.joints["link_1"], limits=(0.0, 0.0274)
-    )  # 1.57, taken for degrees
-    noted = add_missing_limits(
-        dataclasses.replace(limited, joints={**limited.joints, "link_1": little}),
+    )  # 1.57 read as degrees
+    notes = add_missing_limits(
+        dataclasses.replace(limited, joints={**limited.joints, "link_1": narrow}),
         load_surfaces(limited),
     ).notes
-    assert any("only 1.6°" in note or "only 2°" in note for note in noted)
+    assert any("only 1.6°" in note or "only 2°" in note for note in notes)
 
 
-def test_subtree_is_extracted_turned_and_moved(cabinet: Description) -> None:
+def test_subtree_is_extracted_rotated_and_moved(cabinet: Description) -> None:
     found = make_upright(extract_subtree(cabinet, "link_2"), "y")
     low, high = compute_bounds(found, load_surfaces(found))
     assert (high - low)[2] == pytest.approx(1.0)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.downloads import MJCF
+from helpers.partnet import MJCF
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing.objects.mjcf import read_object_mjcf
@@ -13,8 +13,8 @@ pytest.importorskip("mujoco")
 
 
 def test_bodies_joints_and_shapes_are_read(tmp_path: Path) -> None:
-    resisting = 'name="hinge" damping="0.4" frictionloss="0.2"'
-    (tmp_path / "t.xml").write_text(MJCF.replace('name="hinge"', resisting))
+    attributes = 'name="hinge" damping="0.4" frictionloss="0.2"'
+    (tmp_path / "t.xml").write_text(MJCF.replace('name="hinge"', attributes))
     found = read_object_mjcf(tmp_path / "t.xml")
     assert list(found.links) == ["world", "case", "door"]
     hinge = found.joints["door"]
@@ -86,7 +86,7 @@ def test_unnamed_bodies_and_second_joints_get_unique_names(tmp_path: Path) -> No
         ('stiffness="1" ref="-20"', None, (1.0, 20.0)),
     ],
 )
-def test_springs_and_limits_count_from_the_pose_in_the_file(
+def test_springs_and_limits_are_relative_to_the_pose_in_the_file(
     tmp_path: Path,
     joint: str,
     limits: tuple[float, float] | None,

@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import yaml
-from helpers.downloads import SDF, write_partnet_object
+from helpers.partnet import SDF, write_partnet_object
 
 import vkc_pin as vkc
 from vkc_pin.importing.objects.object_import import read_description
@@ -35,7 +35,9 @@ def test_import_finds_handles_and_reports_changes(cabinet: vkc.importing.Importe
     assert cabinet.picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_object_stands_on_the_floor_in_its_height(cabinet: vkc.importing.ImportedObject) -> None:
+def test_object_rests_on_the_floor_and_has_the_requested_height(
+    cabinet: vkc.importing.ImportedObject,
+) -> None:
     assert cabinet.file.name == "object_45427.yaml"
     assert cabinet.size[2] == pytest.approx(0.8)
     item, data = cabinet.object, cabinet.object.model.createData()
@@ -79,33 +81,33 @@ def test_imported_object_can_be_opened(
 def test_single_link_is_imported_under_its_name(link: str, name: str, tmp_path: Path) -> None:
     file = write_partnet_object(tmp_path / "in")
     file.write_text(file.read_text().replace('"link_2"', f'"{link}"'))
-    done = vkc.importing.import_object(file, tmp_path / "out", link=link, up="y", most=1)
-    assert done.file.name == f"{name}.yaml"
-    assert (done.file.parent / f"{name}.urdf").is_file()
-    assert done.object.base_link == link
-    assert (f"# Name of the link: {link}\n" in done.file.read_text()) == (link != name)
-    assert set(done.object.coordinates.names) == {"joint_0", "joint_1"}
-    assert done.size[2] == pytest.approx(1.0)
+    imported = vkc.importing.import_object(file, tmp_path / "out", link=link, up="y", most=1)
+    assert imported.file.name == f"{name}.yaml"
+    assert (imported.file.parent / f"{name}.urdf").is_file()
+    assert imported.object.base_link == link
+    assert (f"# Name of the link: {link}\n" in imported.file.read_text()) == (link != name)
+    assert set(imported.object.coordinates.names) == {"joint_0", "joint_1"}
+    assert imported.size[2] == pytest.approx(1.0)
 
 
 def test_failed_import_leaves_no_files(tmp_path: Path) -> None:
     (tmp_path / "box.sdf").write_text(SDF)
     out = tmp_path / "made" / "box"
-    handless = dataclasses.replace(vkc.load_robot("husky_ur5e"), touch_links=())
+    without_hand = dataclasses.replace(vkc.load_robot("husky_ur5e"), touch_links=())
     with pytest.raises(vkc.InputError, match="touch_links"):
-        vkc.importing.import_object(tmp_path / "box.sdf", out, robot=handless)
+        vkc.importing.import_object(tmp_path / "box.sdf", out, robot=without_hand)
     assert list((tmp_path / "made").iterdir()) == []
-    done = vkc.importing.import_object(tmp_path / "box.sdf", out, most=1)
-    assert done.proposals.opening("hinge")[0].kind == "bar"
-    assert done.size == pytest.approx([0.54, 0.6, 0.8], abs=0.01)
+    imported = vkc.importing.import_object(tmp_path / "box.sdf", out, most=1)
+    assert imported.proposals.opening("hinge")[0].kind == "bar"
+    assert imported.size == pytest.approx([0.54, 0.6, 0.8], abs=0.01)
 
 
-def test_invalid_objects_and_arguments_are_refused(tmp_path: Path) -> None:
+def test_invalid_objects_and_arguments_are_rejected(tmp_path: Path) -> None:
     (tmp_path / "page.xml").write_text("<html/>")
     with pytest.raises(vkc.InputError, match=r"page\.xml.*<html>"):
         read_description(tmp_path / "page.xml")
     file = write_partnet_object(tmp_path / "in")
-    for wrong, word in (
+    for argument, message in (
         ({"height": 0.0}, "height"),
         ({"height": 1.0, "scale": 2.0}, "scale"),
         ({"up": "x"}, "up"),
@@ -120,6 +122,6 @@ def test_invalid_objects_and_arguments_are_refused(tmp_path: Path) -> None:
         ({"folder": tmp_path / "in", "force": True}, "already exists"),
         ({"most": 0}, "most"),
     ):
-        with pytest.raises(vkc.InputError, match=word):
-            vkc.importing.import_object(file, **{"folder": tmp_path / "out", **wrong})  # type: ignore[arg-type]
+        with pytest.raises(vkc.InputError, match=message):
+            vkc.importing.import_object(file, **{"folder": tmp_path / "out", **argument})  # type: ignore[arg-type]
     assert not (tmp_path / "out").exists()

@@ -5,51 +5,51 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import trimesh
-from helpers.downloads import write_partnet_object
+from helpers.partnet import write_partnet_object
 
 from vkc_pin.importing.objects.clean_up import load_surfaces, merge_fixed_links
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part
 from vkc_pin.importing.objects.pieces import PieceCache, decompose_links
 from vkc_pin.importing.objects.urdf import read_object_urdf
 
-HERE = pin.SE3.Identity()
+IDENTITY = pin.SE3.Identity()
 
 
-def alone(*meshes: trimesh.Trimesh) -> Description:
+def make_description(*meshes: trimesh.Trimesh) -> Description:
     parts = tuple(
-        Part(name="p", placement=HERE, kind="mesh", size=(1, 1, 1), triangles=mesh)
+        Part(name="p", placement=IDENTITY, kind="mesh", size=(1, 1, 1), triangles=mesh)
         for mesh in meshes
     )
     joint = Joint(
-        name="j", kind="prismatic", parent="a", child="b", placement=HERE, limits=(0.0, 1.0)
+        name="j", kind="prismatic", parent="a", child="b", placement=IDENTITY, limits=(0.0, 1.0)
     )
     return Description(Path("f"), {"a": Link("a"), "b": Link("b", parts, parts)}, {"b": joint})
 
 
-def pieces(description: Description) -> tuple[tuple[Part, ...], tuple[str, ...]]:
+def decompose_description(description: Description) -> tuple[tuple[Part, ...], tuple[str, ...]]:
     found = decompose_links(description, load_surfaces(description))
     return found.links["b"].collision, found.notes
 
 
 def test_flat_shapes_are_thickened_and_noted(tmp_path: Path) -> None:
     found = merge_fixed_links(read_object_urdf(write_partnet_object(tmp_path)))
-    done = decompose_links(found, load_surfaces(found))
+    decomposed = decompose_links(found, load_surfaces(found))
     decoration = next(
-        part for part in done.links["link_0"].collision if part.name == "decoration-6"
+        part for part in decomposed.links["link_0"].collision if part.name == "decoration-6"
     )
     assert decoration.make_mesh().volume > 0.0
-    assert any("decoration-6" in note and "link_0" in note for note in done.notes)
+    assert any("decoration-6" in note and "link_0" in note for note in decomposed.notes)
 
 
 def test_enclosed_pieces_are_removed() -> None:
     large, small = trimesh.creation.box((0.3, 0.3, 0.3)), trimesh.creation.box((0.1, 0.1, 0.1))
     beside = small.copy().apply_translation((0.15, 0.0, 0.0))
-    found, _ = pieces(alone(small, large, beside))
+    found, _ = decompose_description(make_description(small, large, beside))
     assert sorted(round(part.make_mesh().volume, 6) for part in found) == [0.001, 0.027]
 
 
 def test_visual_boxes_replace_missing_collision_geometry() -> None:
-    box = Part(name="", placement=HERE, kind="box", size=(0.1, 0.1, 0.1))
+    box = Part(name="", placement=IDENTITY, kind="box", size=(0.1, 0.1, 0.1))
     found = decompose_links(
         Description(Path("f"), {"a": Link("a", (box,))}, {}), {id(box): box.make_mesh()}
     )
@@ -67,15 +67,15 @@ def test_repeated_mesh_is_decomposed_once(tmp_path: Path) -> None:
         Part(name="", placement=at, kind="mesh", size=(1.0, 1.0, 1.0), file=tmp_path / "twins.stl")
         for at in places
     )
-    known: PieceCache = {}
+    cache: PieceCache = {}
     found = []
     for part in parts:
         description = Description(tmp_path / "t.urdf", {"twins": Link("twins", (), (part,))}, {})
         found.append(
-            decompose_links(description, load_surfaces(description), known).links["twins"].collision
+            decompose_links(description, load_surfaces(description), cache).links["twins"].collision
         )
-    assert len(known) == 1
-    (cut,) = (pieces.meshes for pieces in known.values())
+    assert len(cache) == 1
+    (cut,) = (pieces.meshes for pieces in cache.values())
     assert len(found[0]) == len(found[1]) == len(cut) > 1
     for at, pieces in zip(places, found, strict=True):
         for part, piece in zip(pieces, cut, strict=True):

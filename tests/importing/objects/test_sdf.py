@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from helpers.downloads import SDF
+from helpers.partnet import SDF
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.importing.objects.clean_up import add_missing_limits, load_surfaces
@@ -14,7 +14,7 @@ from vkc_pin.importing.objects.object_import import read_description
 from vkc_pin.importing.objects.sdf import read_object_sdf
 
 
-def read(folder: Path, text: str) -> Description:
+def read_model(folder: Path, text: str) -> Description:
     (folder / "t.sdf").write_text(text)
     return read_object_sdf(folder / "t.sdf")
 
@@ -24,7 +24,7 @@ def test_relative_frames_inertia_and_resistance_are_read(tmp_path: Path) -> None
     inertial = f"<inertial><pose>0 0 0.1 0 0 0</pose><mass>2</mass>{moments}</inertial>"
     resistance = "<dynamics><damping>0.4</damping><friction>0.2</friction></dynamics></axis>"
     text = SDF.replace('<link name="case">', f'<link name="case">{inertial}')
-    found = read(tmp_path, text.replace("</axis>", resistance))
+    found = read_model(tmp_path, text.replace("</axis>", resistance))
     assert found.links["case"].inertia.mass == 2.0
     assert np.trace(found.links["case"].inertia.inertia) == pytest.approx(0.55)
     assert (found.joints["door"].damping, found.joints["door"].friction) == (0.4, 0.2)
@@ -36,12 +36,12 @@ def test_relative_frames_inertia_and_resistance_are_read(tmp_path: Path) -> None
     assert np.allclose((shut * leaf).translation, [0.75, 0.0, 0.4])  # in the world
     assert np.allclose(shut.translation, [0.75, -0.3, 0.4])  # on the hinge
     assert (open_ * leaf).translation[0] < 0.65
-    partial = read(tmp_path, text.replace(moments, ""))
+    partial = read_model(tmp_path, text.replace(moments, ""))
     assert partial.links["case"].inertia.mass == 0.0
     assert any("<inertial> counts as none" in note for note in partial.notes)
 
 
-def test_joint_to_the_world_makes_it_the_root(tmp_path: Path) -> None:
+def test_joint_to_the_world_makes_the_world_the_root(tmp_path: Path) -> None:
     fixed = '<joint name="f" type="fixed"><parent>world</parent><child>case</child></joint></model>'
     (tmp_path / "t.sdf").write_text(SDF.replace("</model>", fixed))
     found = read_object_sdf(tmp_path / "t.sdf")
@@ -67,7 +67,7 @@ def test_joint_to_the_world_makes_it_the_root(tmp_path: Path) -> None:
 def test_errors_name_the_file(tmp_path: Path, old: str, new: str, error: type[InputError]) -> None:
     assert old in SDF
     with pytest.raises(error, match=r"t\.sdf"):
-        read(tmp_path, SDF.replace(old, new))
+        read_model(tmp_path, SDF.replace(old, new))
 
 
 CHEST = """<?xml version="1.0"?>
@@ -79,7 +79,7 @@ CHEST = """<?xml version="1.0"?>
 <joint name="slide" type="prismatic">{joint_pose}<parent>{parent}</parent><child>{child}</child>
   <axis>{axis}<limit><lower>{lower}</lower><upper>{upper}</upper></limit>{dynamics}</axis></joint>
 </model></sdf>"""
-USUAL = {
+DEFAULTS = {
     "version": "1.7",
     "model": "",
     "pose": "<pose>-0.22 0 0.5 0 0 0</pose>",
@@ -94,7 +94,7 @@ USUAL = {
 
 
 def format_chest(**changes: str) -> str:
-    return CHEST.format(**{**USUAL, **changes})
+    return CHEST.format(**{**DEFAULTS, **changes})
 
 
 def find_axis(found: Description, link: str) -> np.ndarray:
@@ -102,7 +102,7 @@ def find_axis(found: Description, link: str) -> np.ndarray:
     return found.compute_placements()[link].rotation @ found.joints[link].axis
 
 
-def find_box(found: Description, link: str = "front") -> np.ndarray:
+def compute_box(found: Description, link: str = "front") -> np.ndarray:
     """Return the bounding box of a link's first shape in the world, shape (2, 3) [m]."""
     mesh = found.links[link].collision[0].make_mesh()
     return mesh.apply_transform(found.compute_placements()[link].homogeneous).bounds
@@ -155,10 +155,10 @@ FRAMES = (
         },
     ],
 )
-def test_spellings_of_the_same_chest(tmp_path: Path, changes: dict[str, str]) -> None:
-    found = read(tmp_path, format_chest(**changes))
+def test_equivalent_spellings_yield_the_same_chest(tmp_path: Path, changes: dict[str, str]) -> None:
+    found = read_model(tmp_path, format_chest(**changes))
     np.testing.assert_allclose(
-        find_box(found), [[-0.23, -0.28, 0.35], [-0.21, 0.28, 0.65]], atol=1e-9
+        compute_box(found), [[-0.23, -0.28, 0.35], [-0.21, 0.28, 0.65]], atol=1e-9
     )
     np.testing.assert_allclose(find_axis(found, "front"), [-1.0, 0.0, 0.0], atol=1e-9)
     assert found.joints["front"].limits == (0.0, 0.3)
@@ -181,50 +181,50 @@ def test_spellings_of_the_same_chest(tmp_path: Path, changes: dict[str, str]) ->
         ("1.11", "", [0, -1, 0]),
     ],
 )
-def test_the_version_tells_the_frame_of_the_axis(
+def test_version_determines_the_frame_of_the_axis(
     tmp_path: Path, version: str, flag: str, axis: list[float]
 ) -> None:
-    """The front is rolled by a right angle; the model's own pose turns both."""
+    """The front is rolled by 90°; the pose of the model also rotates the axis."""
     pose = "<pose>-0.22 0 0.5 1.5707963267948966 0 0</pose>"
     changes = {"version": version, "pose": pose, "axis": f"<xyz>0 0 1</xyz>{flag}"}
-    found = read(tmp_path, format_chest(**changes))
+    found = read_model(tmp_path, format_chest(**changes))
     np.testing.assert_allclose(find_axis(found, "front"), axis, atol=1e-9)
-    yawed = read(
+    yawed = read_model(
         tmp_path, format_chest(**changes, model="<pose>0 0 0 0 0 1.5707963267948966</pose>")
     )
     x, y, z = axis
     np.testing.assert_allclose(find_axis(yawed, "front"), [-y, x, z], atol=1e-9)
 
 
-def test_the_pose_of_the_model_counts(tmp_path: Path) -> None:
-    found = read(tmp_path, format_chest(model="<pose>0 0 0 1.5707963267948966 0 0</pose>"))
-    np.testing.assert_allclose(np.ptp(find_box(found, "case"), axis=0), [0.4, 0.8, 0.6])
+def test_pose_of_the_model_is_applied(tmp_path: Path) -> None:
+    found = read_model(tmp_path, format_chest(model="<pose>0 0 0 1.5707963267948966 0 0</pose>"))
+    np.testing.assert_allclose(np.ptp(compute_box(found, "case"), axis=0), [0.4, 0.8, 0.6])
 
 
 @pytest.mark.parametrize("version", ["1.4", "1.6"])
 @pytest.mark.parametrize("free", [False, True])
-def test_links_of_old_files_may_be_called_world(tmp_path: Path, version: str, free: bool) -> None:
+def test_links_of_old_files_may_be_named_world(tmp_path: Path, version: str, free: bool) -> None:
     text = format_chest(version=version, parent="world").replace('"case"', '"world"')
     (tmp_path / "t.sdf").write_text(text)
     found = read_object_sdf(tmp_path / "t.sdf", free=free)
     assert found.joints["front"].parent == "world"
     assert len(found.links) == 2 + free
-    np.testing.assert_allclose(np.ptp(find_box(found, "world"), axis=0), [0.4, 0.6, 0.8])
+    np.testing.assert_allclose(np.ptp(compute_box(found, "world"), axis=0), [0.4, 0.6, 0.8])
 
 
 @pytest.mark.parametrize("frame", ["case", "f", "slide", "front"])
-def test_models_are_placed_by_one_of_their_frames(tmp_path: Path, frame: str) -> None:
-    """Where this frame has been in the model, the model's own frame stays."""
-    found = read(tmp_path, format_chest(model=FRAMES))
-    place = {"case": "0 0 0.4", "f": "-0.22 0 0.4", "slide": "-0.22 0 0.5", "front": "-0.22 0 0.5"}
-    text = format_chest(model=f"{FRAMES}<pose>{place[frame]} 0 0 0</pose>", version="1.8")
-    placed = read(tmp_path, text.replace('"chest"', f'"chest" placement_frame="{frame}"'))
-    np.testing.assert_allclose(find_box(placed), find_box(found), atol=1e-9)
+def test_model_pose_refers_to_its_placement_frame(tmp_path: Path, frame: str) -> None:
+    """A pose equal to that of the frame in the model leaves the model in place."""
+    found = read_model(tmp_path, format_chest(model=FRAMES))
+    poses = {"case": "0 0 0.4", "f": "-0.22 0 0.4", "slide": "-0.22 0 0.5", "front": "-0.22 0 0.5"}
+    text = format_chest(model=f"{FRAMES}<pose>{poses[frame]} 0 0 0</pose>", version="1.8")
+    placed = read_model(tmp_path, text.replace('"chest"', f'"chest" placement_frame="{frame}"'))
+    np.testing.assert_allclose(compute_box(placed), compute_box(found), atol=1e-9)
 
 
-def test_elements_of_two_kinds_may_share_a_name(tmp_path: Path) -> None:
+def test_links_and_joints_may_share_a_name(tmp_path: Path) -> None:
     text = format_chest(joint_pose="<pose>0 0.1 0 0 0 0</pose>").replace('"slide"', '"front"')
-    np.testing.assert_allclose(find_box(read(tmp_path, text))[0], [-0.23, -0.28, 0.35])
+    np.testing.assert_allclose(compute_box(read_model(tmp_path, text))[0], [-0.23, -0.28, 0.35])
 
 
 @pytest.mark.parametrize(
@@ -248,7 +248,7 @@ def test_limits_may_be_one_sided(
     limits: tuple[float, float] | None,
     assumed: tuple[float, float],
 ) -> None:
-    found = read(tmp_path, format_chest(lower=lower, upper=upper))
+    found = read_model(tmp_path, format_chest(lower=lower, upper=upper))
     assert found.joints["front"].limits == limits
     completed = add_missing_limits(found, load_surfaces(found))
     assert completed.joints["front"].limits == pytest.approx(assumed)
@@ -263,28 +263,32 @@ def test_missing_meshes_are_replaced_or_listed(tmp_path: Path) -> None:
         mesh.format(kind, file, kind)
         for kind, file in (("visual", "b"), ("collision", "b"), ("collision", "c"))
     )
-    found = read(tmp_path, format_chest(pose=visual))
+    found = read_model(tmp_path, format_chest(pose=visual))
     assert found.links["front"].visual == ()
     assert "link 'front': " in found.notes[0]
     assert "no such mesh" in found.notes[0]
     assert found.notes[0].endswith("left out")
-    shown = visual.replace(
+    sphere = visual.replace(
         "<mesh><uri>model://a/b.dae</uri></mesh>", "<sphere><radius>1</radius></sphere>"
     )
-    found = read(tmp_path, format_chest(pose=collision + shown))
+    found = read_model(tmp_path, format_chest(pose=collision + sphere))
     assert [part.kind for part in found.links["front"].solid] == ["sphere"]
     assert found.notes[0].endswith("its visual shapes collide instead")
     with pytest.raises(InputError, match=r"t\.sdf:5: model://a/b\.dae: there is no such mesh"):
-        read(tmp_path, format_chest(pose=collision))
+        read_model(tmp_path, format_chest(pose=collision))
     with pytest.raises(InputError, match=r"2 meshes do not exist: model://a/b\.dae, model"):
-        read(tmp_path, format_chest(pose=collision + other))
+        read_model(tmp_path, format_chest(pose=collision + other))
     with pytest.raises(InputError, match="no such mesh"):
-        read(tmp_path, format_chest(model=f'<static>1</static><link name="seen">{visual}</link>'))
+        read_model(
+            tmp_path, format_chest(model=f'<static>1</static><link name="seen">{visual}</link>')
+        )
 
 
 def test_springs_are_read(tmp_path: Path) -> None:
     spring = "<spring_stiffness>4</spring_stiffness><spring_reference>-0.2</spring_reference>"
-    joint = read(tmp_path, format_chest(dynamics=f"<dynamics>{spring}</dynamics>")).joints["front"]
+    joint = read_model(tmp_path, format_chest(dynamics=f"<dynamics>{spring}</dynamics>")).joints[
+        "front"
+    ]
     assert (joint.stiffness, joint.springref) == (4.0, -0.2)
 
 
@@ -362,25 +366,25 @@ def test_springs_are_read(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_wrong_models_are_refused(tmp_path: Path, changes: dict[str, str], message: str) -> None:
+def test_invalid_models_are_rejected(tmp_path: Path, changes: dict[str, str], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        read(tmp_path, format_chest(**changes))
+        read_model(tmp_path, format_chest(**changes))
 
 
 def test_commas_between_numbers_are_noted(tmp_path: Path) -> None:
     (tmp_path / "t.sdf").write_text(format_chest(pose="<pose>-0.22, 0, 0.5, 0, 0, 0</pose>"))
     found = read_description(tmp_path / "t.sdf")
-    np.testing.assert_allclose(find_box(found)[0], [-0.23, -0.28, 0.35])
+    np.testing.assert_allclose(compute_box(found)[0], [-0.23, -0.28, 0.35])
     assert found.notes == (f"{tmp_path / 't.sdf'}: pose text: commas are read as spaces",)
 
 
-def test_a_missing_or_newer_version_is_noted(tmp_path: Path) -> None:
-    found = read(tmp_path, format_chest().replace(' version="1.7"', ""))
+def test_missing_and_newer_versions_are_noted(tmp_path: Path) -> None:
+    found = read_model(tmp_path, format_chest().replace(' version="1.7"', ""))
     assert found.notes == ("t.sdf states no version: read as SDF 1.7",)
-    assert "1.99: read as SDF 1.12" in read(tmp_path, format_chest(version="1.99")).notes[0]
+    assert "1.99: read as SDF 1.12" in read_model(tmp_path, format_chest(version="1.99")).notes[0]
 
 
-def test_submeshes_are_parts_of_a_file(tmp_path: Path) -> None:
+def test_submesh_selects_a_part_of_a_mesh_file(tmp_path: Path) -> None:
     scene = trimesh.Scene()
     for name, size, at in (
         ("shell", (0.4, 0.6, 0.8), (0, 0, 0)),
@@ -394,11 +398,11 @@ def test_submeshes_are_parts_of_a_file(tmp_path: Path) -> None:
     for centre, low in (("", 1.98), ("<center>true</center>", -0.02)):
         part = f"<submesh><name>face</name>{centre}</submesh><scale>2 1 1</scale>"
         mesh = f"<mesh><uri>both.glb</uri>{part}</mesh>"
-        bounds = find_box(read(tmp_path, text.replace(box, mesh)))
-        size = [[low, -0.25, -0.15], [low + 0.04, 0.25, 0.15]]
-        np.testing.assert_allclose(bounds, size, atol=1e-6)
+        bounds = compute_box(read_model(tmp_path, text.replace(box, mesh)))
+        expected = [[low, -0.25, -0.15], [low + 0.04, 0.25, 0.15]]
+        np.testing.assert_allclose(bounds, expected, atol=1e-6)
     with pytest.raises(UnknownNameError, match="submesh 'fac'; did you mean 'face'"):
-        read(tmp_path, text.replace(box, mesh.replace("face", "fac")))
+        read_model(tmp_path, text.replace(box, mesh.replace("face", "fac")))
 
 
 WORLD = """<sdf version="1.6"><world name="flat">
@@ -418,7 +422,7 @@ WORLD = """<sdf version="1.6"><world name="flat">
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder `worlds` beside a folder `models` with one model in two versions."""
+    """Return a folder `worlds` beside a folder `models` with one model in two versions."""
     bin_folder = tmp_path / "models" / "bin"
     bin_folder.mkdir(parents=True)
     (tmp_path / "worlds").mkdir()
@@ -445,39 +449,47 @@ def test_worlds_and_included_models_are_read(folder: Path) -> None:
         "wall": ("fixed", "world"),
         "unit::part::body": ("revolute", "world"),
     }
-    places = found.compute_placements()
-    for name, place in (("bin", [3, 0, 0]), ("other", [4, 0, 0]), ("unit::part::body", [1, 0, 1])):
-        np.testing.assert_allclose(places[name].translation, place)
-    np.testing.assert_allclose(np.ptp(find_box(found, "bin"), axis=0), [0.2, 0.4, 0.6], rtol=0.02)
+    placements = found.compute_placements()
+    for name, position in (
+        ("bin", [3, 0, 0]),
+        ("other", [4, 0, 0]),
+        ("unit::part::body", [1, 0, 1]),
+    ):
+        np.testing.assert_allclose(placements[name].translation, position)
+    np.testing.assert_allclose(
+        np.ptp(compute_box(found, "bin"), axis=0), [0.2, 0.4, 0.6], rtol=0.02
+    )
     assert found.notes == ("<state> is left out", "model 'nothing' has no links: left out")
-    alone = read_object_sdf(folder / "flat.world")
-    assert "bin" not in alone.links
-    assert "free, hence left out: bin" in alone.notes
+    without_free = read_object_sdf(folder / "flat.world")
+    assert "bin" not in without_free.links
+    assert "free, hence left out: bin" in without_free.notes
 
 
 @pytest.mark.parametrize("version", ["1.6", "1.9"])
-def test_models_are_included_in_models(folder: Path, version: str) -> None:
-    """By nesting, by merging, by a frame of the included model, and relative to another frame."""
+def test_models_include_models(folder: Path, version: str) -> None:
+    """Covers nested and merged models, and poses relative to another frame."""
     include = "<include{merge}><uri>model://bin</uri>{more}</include>"
     joint = (
         '<joint name="j" type="fixed"><parent>case</parent><child>{link}</child></joint>'
         '<frame name="f"><pose>0 0 2 0 0 0</pose></frame>'
     )
-    for link, merge, more, place in (
+    for link, merge, more, position in (
         ("bin::body", "", "", [9, 9, 9]),
         ("b::body", "", "<name>b</name><pose>1 0 0 0 0 0</pose>", [1, 0, 0]),
         ("b", "", '<name>b</name><pose relative_to="f">1 0 0 0 0 0</pose>', [1, 0, 2]),
         ("body", ' merge="true"', "<pose>0 3 0 0 0 0</pose>", [0, 3, 0]),
     ):
         model = include.format(merge=merge, more=more) + joint.format(link=link)
-        found = read(folder, format_chest(version=version, model=model))
+        found = read_model(folder, format_chest(version=version, model=model))
         name = next(name for name in found.links if name.endswith("body"))
         assert found.joints[name].parent == "case"
-        np.testing.assert_allclose(found.compute_placements()[name].translation, place, atol=1e-9)
+        np.testing.assert_allclose(
+            found.compute_placements()[name].translation, position, atol=1e-9
+        )
 
 
 @pytest.mark.long
-def test_models_that_multiply_are_refused(tmp_path: Path) -> None:
+def test_exponentially_many_models_are_rejected(tmp_path: Path) -> None:
     for k in range(14):
         inner = "".join(
             f"<include><uri>m{k + 1}.sdf</uri><name>{name}</name></include>" for name in "ab"

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.downloads import write_partnet_object
+from helpers.partnet import write_partnet_object
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.importing.objects.description import Link
@@ -65,12 +65,12 @@ def test_errors_name_file_and_element(tmp_path: Path) -> None:
 
 
 def test_inertia_is_read(tmp_path: Path) -> None:
-    placed = '<origin xyz="0.1 0.2 0.3" rpy="0 0 1.5707963267948966"/>'
+    origin = '<origin xyz="0.1 0.2 0.3" rpy="0 0 1.5707963267948966"/>'
     moments = '<inertia ixx="0.1" iyy="0.2" izz="0.25" ixy="0.01"/>'
-    whole = f'<inertial>{placed}<mass value="2"/>{moments}</inertial>'
+    complete = f'<inertial>{origin}<mass value="2"/>{moments}</inertial>'
     unit = '<inertia ixx="1" iyy="1" izz="1"/>'
     impossible = '<inertia ixx="1" iyy="1" izz="1" ixy="3"/>'
-    text = f"""<robot name="t"><link name="a">{whole}</link><link name="b"/>
+    text = f"""<robot name="t"><link name="a">{complete}</link><link name="b"/>
     <link name="c"><inertial><mass value="1"/></inertial></link>
     <link name="d"><inertial><mass value="-1"/>{unit}</inertial></link>
     <link name="e"><inertial><mass value="1"/>{impossible}</inertial></link>
@@ -98,7 +98,7 @@ def test_inertia_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "limit", "read", "limits"),
+    ("kind", "limit", "expected_kind", "limits"),
     [
         ("revolute", 'lower="-1.8e308" upper="1.8e308"', None, None),
         ("revolute", 'lower="-1.79769e308" upper="1.79769e308"', "continuous", None),
@@ -109,17 +109,21 @@ def test_inertia_is_read(tmp_path: Path) -> None:
         ("prismatic", 'lower="0" upper="0.4" velocity="-1" effort="-1"', "prismatic", (0.0, 0.4)),
     ],
 )
-def test_huge_limits_are_none(
-    tmp_path: Path, kind: str, limit: str, read: str | None, limits: tuple[float, float] | None
+def test_huge_limits_count_as_unlimited(
+    tmp_path: Path,
+    kind: str,
+    limit: str,
+    expected_kind: str | None,
+    limits: tuple[float, float] | None,
 ) -> None:
     file = tmp_path / "t.urdf"
     file.write_text(
         f'<robot name="t"><link name="a"/><link name="b"/><joint name="j" type="{kind}">'
         f'<parent link="a"/><child link="b"/><limit {limit}/></joint></robot>'
     )
-    if read is None:  # beyond the largest float
+    if expected_kind is None:  # beyond the largest float
         with pytest.raises(InputError, match="j: limit lower: wrong numbers"):
             read_object_urdf(file)
         return
     joint = read_object_urdf(file).joints["b"]
-    assert (joint.kind, joint.limits, joint.velocity) == (read, limits, None)
+    assert (joint.kind, joint.limits, joint.velocity) == (expected_kind, limits, None)

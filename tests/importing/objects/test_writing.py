@@ -15,14 +15,16 @@ from vkc_pin.world.files.urdf import read_urdf
 
 
 def test_written_object_is_read_back(tmp_path: Path) -> None:
-    place = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.4, 1.2), np.array([0.1, 0.2, 0.3]))
+    placement = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.4, 1.2), np.array([0.1, 0.2, 0.3]))
     red = (1.0, 0.0, 0.0, 1.0)
     parts = (
-        Part(name="handle & bar", placement=place, kind="cylinder", size=(0.01, 0.3), colour=red),
-        Part(name="", placement=place, kind="capsule", size=(0.02, 0.3)),
+        Part(
+            name="handle & bar", placement=placement, kind="cylinder", size=(0.01, 0.3), colour=red
+        ),
+        Part(name="", placement=placement, kind="capsule", size=(0.02, 0.3)),
         Part(
             name="",
-            placement=place,
+            placement=placement,
             kind="mesh",
             size=(0.5, 0.5, 0.5),
             triangles=trimesh.creation.icosphere(),
@@ -35,7 +37,7 @@ def test_written_object_is_read_back(tmp_path: Path) -> None:
         kind="revolute",
         parent="a",
         child="b",
-        placement=place,
+        placement=placement,
         axis=axis,
         limits=(-0.2, 1.1),
         velocity=0.7,
@@ -44,8 +46,8 @@ def test_written_object_is_read_back(tmp_path: Path) -> None:
         stiffness=4.0,
         springref=-1.1,
     )
-    weight = place.act(pin.Inertia(2.5, np.zeros(3), np.diag([0.1, 0.2, 0.25])))
-    links = {"a": Link("a", parts[:1], parts[:1]), "b": Link("b", parts, parts, weight)}
+    inertia = placement.act(pin.Inertia(2.5, np.zeros(3), np.diag([0.1, 0.2, 0.25])))
+    links = {"a": Link("a", parts[:1], parts[:1]), "b": Link("b", parts, parts, inertia)}
     write_urdf(Description(tmp_path / "x", links, {"b": joint}), tmp_path / "thing.urdf")
     about = ["One.", "Two."]
     write_description(tmp_path / "thing.yaml", "thing.urdf", (), about=about, joints=[joint])
@@ -60,9 +62,9 @@ def test_written_object_is_read_back(tmp_path: Path) -> None:
     resistance = item.resistance["hinge"]
     assert (resistance.damping, resistance.friction) == (0.5, 0.25)
     assert (resistance.stiffness, resistance.springref) == (4.0, -1.1)
-    assert item.model.inertias[1].isApprox(weight, 1e-6)
-    turned = place * pin.SE3(pin.exp3(axis * 0.5), np.zeros(3))
-    assert np.allclose(item.link_placement("b", [0.5]).homogeneous, turned.homogeneous, atol=1e-8)
+    assert item.model.inertias[1].isApprox(inertia, 1e-6)
+    moved = placement * pin.SE3(pin.exp3(axis * 0.5), np.zeros(3))
+    assert np.allclose(item.link_placement("b", [0.5]).homogeneous, moved.homogeneous, atol=1e-8)
     assert [shape.name for shape in item.collision.geometryObjects] == [
         "a_0",
         *(f"b_{k}" for k in range(5)),
@@ -71,13 +73,13 @@ def test_written_object_is_read_back(tmp_path: Path) -> None:
     assert [type(shape).__name__ for shape in capsule] == ["Cylinder", "Sphere", "Sphere"]
     assert capsule[0].halfLength == 0.15
     bar = item.collision.geometryObjects[1]
-    assert np.allclose(bar.placement.homogeneous, place.homogeneous, atol=1e-8)
+    assert np.allclose(bar.placement.homogeneous, placement.homogeneous, atol=1e-8)
     assert (bar.geometry.radius, bar.geometry.halfLength) == (0.01, 0.15)
     assert 'name="handle &amp; bar"' in (tmp_path / "thing.urdf").read_text()
     ball = item.collision.geometryObjects[5]
     assert np.allclose(
         ball.placement.act(np.asarray(ball.geometry.points()).mean(axis=0)),
-        place.translation,
+        placement.translation,
         atol=1e-3,
     )
     assert np.allclose(item.visual.geometryObjects[1].meshColor, red)
@@ -89,11 +91,13 @@ def test_written_object_is_read_back(tmp_path: Path) -> None:
 def test_links_with_similar_names_keep_their_own_meshes(
     small: str, large: str, tmp_path: Path
 ) -> None:
-    def solid(size: float) -> tuple[Part, ...]:
-        mesh, here = trimesh.creation.box((size,) * 3), pin.SE3.Identity()
-        return (Part(name="", placement=here, kind="mesh", size=(1.0, 1.0, 1.0), triangles=mesh),)
+    def make_cube(size: float) -> tuple[Part, ...]:
+        mesh, identity = trimesh.creation.box((size,) * 3), pin.SE3.Identity()
+        return (
+            Part(name="", placement=identity, kind="mesh", size=(1.0, 1.0, 1.0), triangles=mesh),
+        )
 
-    parts = {small: solid(0.1), large: solid(0.2)}
+    parts = {small: make_cube(0.1), large: make_cube(0.2)}
     links = {"case": Link("case"), **{name: Link(name, own, own) for name, own in parts.items()}}
     joints = {
         name: Joint(

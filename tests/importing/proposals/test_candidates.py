@@ -20,18 +20,18 @@ HAND = Hand("none", (), (), opening=0.086, tip=0.019, width=0.022)
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def found(
+def find_grasps(
     geometry: coal.CollisionGeometry, placement: pin.SE3 | None = None
 ) -> tuple[list[Candidate], Thickness]:
-    seen = Thickness()
+    thickness = Thickness()
     piece = Piece.from_shape(
         pin.GeometryObject("link_0", 0, 0, placement or pin.SE3.Identity(), geometry)
     )
-    return list(find_candidates(piece, HAND, 0.005, UP, seen)), seen
+    return list(find_candidates(piece, HAND, 0.005, UP, thickness)), thickness
 
 
 def test_bar_is_grasped_around_its_middle() -> None:
-    grasps, _ = found(coal.Cylinder(0.01, 0.3), pin.SE3(np.eye(3), np.array([0.1, 0.2, 0.3])))
+    grasps, _ = find_grasps(coal.Cylinder(0.01, 0.3), pin.SE3(np.eye(3), np.array([0.1, 0.2, 0.3])))
     bars = [
         grasp
         for grasp in grasps
@@ -49,12 +49,12 @@ def test_bar_is_grasped_around_its_middle() -> None:
 
 
 def test_panel_is_grasped_at_its_edges() -> None:
-    grasps, seen = found(coal.Box(0.02, 0.6, 0.8))
+    grasps, thickness = find_grasps(coal.Box(0.02, 0.6, 0.8))
     assert {grasp.kind for grasp in grasps} == {"edge"}
-    assert seen.too_thick > 0
+    assert thickness.too_thick > 0
     for grasp in grasps:
         tool = grasp.placement.rotation
-        assert abs(tool[0, 0]) == pytest.approx(1.0)  # closes on the thickness
+        assert abs(tool[0, 0]) == pytest.approx(1.0)  # the fingers close across the panel
         depth = abs(grasp.placement.translation @ tool[:, 2])
         assert np.isclose(depth, [0.28, 0.38]).any()  # 20 mm behind the edge
         assert grasp.round == 0.0
@@ -63,18 +63,18 @@ def test_panel_is_grasped_at_its_edges() -> None:
 @settings(max_examples=30, deadline=None)
 @given(size=st.tuples(*[st.floats(0.005, 0.3)] * 3), yaw=st.floats(-3.0, 3.0))
 def test_every_grasp_fits_and_closes_upwards(size: tuple[float, float, float], yaw: float) -> None:
-    for grasp in found(coal.Box(*size), pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, yaw), np.zeros(3)))[
-        0
-    ]:
+    for grasp in find_grasps(
+        coal.Box(*size), pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, yaw), np.zeros(3))
+    )[0]:
         assert grasp.thickness <= HAND.opening - 2 * 0.005 + 1e-12
         tool = grasp.placement.rotation
         assert np.allclose(tool.T @ tool, np.eye(3), atol=1e-9)
         assert np.linalg.det(tool) > 0.0
-        assert tool[2, 0] >= -0.3 - 1e-9  # of two hands half a turn apart, the one that points up
+        assert tool[2, 0] >= -0.3 - 1e-9  # of two equivalent hands, the one that points up
         assert grasp.span[0] <= 0.0 <= grasp.span[1]
 
 
-def piece(geometry: coal.CollisionGeometry, placement: pin.SE3 | None = None) -> Piece:
+def make_piece(geometry: coal.CollisionGeometry, placement: pin.SE3 | None = None) -> Piece:
     return Piece.from_shape(
         pin.GeometryObject("link_0", 0, 0, placement or pin.SE3.Identity(), geometry)
     )
@@ -85,18 +85,18 @@ angles = st.floats(-3.0, 3.0)
 
 @settings(max_examples=40, deadline=None)
 @given(roll=angles, pitch=angles, yaw=angles)
-def test_axes_of_a_turned_box_are_its_own(roll: float, pitch: float, yaw: float) -> None:
+def test_axes_of_a_rotated_box_are_found(roll: float, pitch: float, yaw: float) -> None:
     rotation = pin.rpy.rpyToMatrix(roll, pitch, yaw)
-    box = piece(coal.Box(0.5, 0.2, 0.05), pin.SE3(rotation, np.array([1.0, 2.0, 3.0])))
+    box = make_piece(coal.Box(0.5, 0.2, 0.05), pin.SE3(rotation, np.array([1.0, 2.0, 3.0])))
     assert np.allclose(box.axes @ box.axes.T, np.eye(3), atol=1e-9)
     assert np.allclose(
         np.ptp(box.extents, axis=1), [0.5, 0.2, 0.05], rtol=0.031
-    )  # as thin as along any, within 3 %
+    )  # minimum width, within 3 %
 
 
-def test_section_of_a_turned_box() -> None:
-    turn = pin.rpy.rpyToMatrix(0.0, 0.0, 0.7)
-    box = piece(coal.Box(0.5, 0.2, 0.05), pin.SE3(turn, np.array([1.0, 0.0, 0.0])))
+def test_section_of_a_rotated_box_is_computed() -> None:
+    rotation = pin.rpy.rpyToMatrix(0.0, 0.0, 0.7)
+    box = make_piece(coal.Box(0.5, 0.2, 0.05), pin.SE3(rotation, np.array([1.0, 0.0, 0.0])))
     section = box.compute_section(0, float(box.extents[0].mean()))
     assert section is not None
     assert np.allclose(section.centre, [1.0, 0.0, 0.0], atol=1e-9)
@@ -118,10 +118,10 @@ def test_faces_are_graspable_and_corners_are_not() -> None:
     assert not SQUARE.is_graspable(np.array([1.0, 1.0]) / np.sqrt(2.0))
 
 
-def test_clipped_section_keeps_its_remainder() -> None:
-    left = SQUARE.clip(np.array([1.0, 0.0]), -0.005)
-    assert left is not None
-    assert left.extent(np.array([1.0, 0.0])) == pytest.approx((-0.01, -0.005))
-    assert left.extent(np.array([0.0, 1.0])) == pytest.approx((-0.01, 0.01))
+def test_clipping_cuts_off_a_part_of_the_section() -> None:
+    clipped = SQUARE.clip(np.array([1.0, 0.0]), -0.005)
+    assert clipped is not None
+    assert clipped.extent(np.array([1.0, 0.0])) == pytest.approx((-0.01, -0.005))
+    assert clipped.extent(np.array([0.0, 1.0])) == pytest.approx((-0.01, 0.01))
     assert SQUARE.clip(np.array([1.0, 0.0]), -0.02) is None
-    assert np.allclose(left.to_joint_frame(np.array([0.001, 0.002])), [0.001, 0.002, 0.0])
+    assert np.allclose(clipped.to_joint_frame(np.array([0.001, 0.002])), [0.001, 0.002, 0.0])

@@ -56,33 +56,34 @@ def test_clearance_agrees_with_coal(fitting: HandClearance) -> None:
         for name in ("case", "flap")
     }
 
-    def free(x: float) -> bool:
+    def is_free(x: float) -> bool:
         tool = pin.SE3(FRONT, np.array([x, 0.5, 0.5]))
         touch, others = (
-            [(shape, tool * where) for shape, where in group] for group in (hand.touch, hand.others)
+            [(shape, tool * placement) for shape, placement in group]
+            for group in (hand.touch, hand.others)
         )
-        found = (
+        expected = (
             compute_clearance(touch, groups["flap"]) >= 0.005
             and compute_clearance([*touch, *others], groups["case"]) >= 0.02
             and compute_clearance(others, groups["flap"]) >= 0.02
         )
-        assert (fitting.find_obstruction(tool, "flap") is None) == found
-        return found
+        assert (fitting.find_obstruction(tool, "flap") is None) == expected
+        return expected
 
     places = np.linspace(-0.4, 0.1, 26).tolist()
-    changes = [(a, b) for a, b in itertools.pairwise(places) if free(a) != free(b)]
+    changes = [(a, b) for a, b in itertools.pairwise(places) if is_free(a) != is_free(b)]
     assert changes
-    for one, other in changes:  # and where that changes, to 0.1 mm
-        before = free(one)
+    for one, other in changes:  # bisect to 0.1 mm
+        before = is_free(one)
         while abs(other - one) > 1e-4:
             middle = (one + other) / 2.0
-            one, other = (middle, other) if free(middle) == before else (one, middle)
+            one, other = (middle, other) if is_free(middle) == before else (one, middle)
 
 
-def grip(folder: Path, **what: str) -> tuple[GraspMotion, Opening, HandClearance]:
-    """Return the hand at the middle of the bar, from the front."""
+def make_grasp_motion(folder: Path, **shapes: str) -> tuple[GraspMotion, Opening, HandClearance]:
+    """Return a frontal grasp at the bar's middle, the flap's opening and the hand's clearance."""
     fitting = HandClearance(
-        write_flap(folder, BAR.format(""), **what),
+        write_flap(folder, BAR.format(""), **shapes),
         make_hand(vkc.load_robot("husky_ur5e")),
         0.02,
         0.005,
@@ -114,9 +115,9 @@ def make_box(position: str, size: str) -> str:
 
 
 def test_free_bar_permits_sliding_and_turning(tmp_path: Path) -> None:
-    hand, opening, fitting = grip(tmp_path)
+    hand, opening, fitting = make_grasp_motion(tmp_path)
     assert hand.follow(opening) == pytest.approx(1.5)
-    assert np.allclose(fitting.state, 0.0)  # put back
+    assert np.allclose(fitting.state, 0.0)  # reset
     kind, freedoms = hand.freedoms()
     assert kind == "cylindrical"
     slide, turn = freedoms
@@ -128,14 +129,14 @@ def test_free_bar_permits_sliding_and_turning(tmp_path: Path) -> None:
 
 def test_obstacles_limit_slide_and_opening(tmp_path: Path) -> None:
     above = make_box("-0.15 0.5 0.68", "0.3 0.6 0.02")
-    hand, opening, _ = grip(tmp_path, before=above)
+    hand, opening, _ = make_grasp_motion(tmp_path, before=above)
     hand.follow(opening)
     slide = hand.freedoms()[1][0]
     assert slide.upper - slide.lower < 0.25
     assert hand.slack < 0.13
     wall = make_box("-0.5 -0.3 0.5", "0.4 0.02 1.0")
-    hand, opening, _ = grip(tmp_path, before=wall)
+    hand, opening, _ = make_grasp_motion(tmp_path, before=wall)
     assert 0.5 < hand.follow(opening) <= 1.5
     shelf = make_box("-0.7 0.3 0.5", "0.4 0.8 1.0")
-    hand, opening, _ = grip(tmp_path, before=shelf)
+    hand, opening, _ = make_grasp_motion(tmp_path, before=shelf)
     assert hand.follow(opening) < 1.0

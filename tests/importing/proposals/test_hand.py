@@ -14,7 +14,7 @@ def test_hand_dimensions_agree_with_the_data_sheet() -> None:
     assert 0.015 < hand.tip < 0.022
     assert 0.018 < hand.width < 0.04
     assert len(hand.touch) == 5
-    assert len(hand.others) == 1  # the wrist behind it
+    assert len(hand.others) == 1  # the wrist
 
 
 def test_robot_without_touch_links_has_no_hand() -> None:
@@ -23,7 +23,7 @@ def test_robot_without_touch_links_has_no_hand() -> None:
         make_hand(robot)
 
 
-def test_tool_frame_inside_the_palm_is_refused() -> None:
+def test_tool_frame_inside_the_palm_is_rejected() -> None:
     robot = dataclasses.replace(vkc.load_robot("husky_ur5e"), tool_frame="gripper_link")
     with pytest.raises(vkc.InputError, match="no room between the fingers"):
         make_hand(robot)

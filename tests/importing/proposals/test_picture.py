@@ -46,7 +46,7 @@ FIXED = '<collision><geometry><box size="{} {} {}"/></geometry></collision>'
         ((0.5, 0.4, 0.6), "", False),  # no joint
     ],
 )
-def test_picture_shows_objects_that_nothing_opens(
+def test_picture_shows_objects_that_no_hand_can_open(
     tmp_path: Path, size: tuple[float, float, float], door: str, tried: bool
 ) -> None:
     width, depth, height = size
@@ -63,9 +63,9 @@ def test_picture_shows_objects_that_nothing_opens(
     found = vkc.importing.propose_attachments(item)
     assert not found.found
     assert bool(found.rejected.get("top")) is tried
-    whole, words = plot_attachments(found).axes
+    whole, explanation = plot_attachments(found).axes
     assert ("places tried" in whole.get_title()) is tried
     longest = max(width, depth, height + thick)
     assert np.ptp(whole.get_xlim()) == pytest.approx(longest, rel=0.1)
-    assert len(whole.collections) == (3 if tried else 1)  # the shapes, and places with arrows
-    assert words.texts[0].get_text().startswith("No hand can open")
+    assert len(whole.collections) == (3 if tried else 1)  # the shapes, and tried places with arrows
+    assert explanation.texts[0].get_text().startswith("No hand can open")

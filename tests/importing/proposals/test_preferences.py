@@ -39,15 +39,17 @@ BAR = [
     ],
 )
 def test_bar_is_preferred_to_a_thin_knob(tmp_path: Path, knob: tuple[str, str, str]) -> None:
-    """The bar is off the centre and has no name that tells a handle."""
-    made = vkc.importing.import_object(write_drawer(tmp_path, *BAR, knob), tmp_path / "out", most=1)
-    (found,) = made.proposals.found
+    """The bar is off the centre, and its name does not suggest a handle."""
+    imported = vkc.importing.import_object(
+        write_drawer(tmp_path, *BAR, knob), tmp_path / "out", most=1
+    )
+    (found,) = imported.proposals.found
     assert found.thickness > 0.01
 
 
 @pytest.mark.parametrize("hidden", [True, False])
 def test_reachable_bar_is_preferred_to_a_hidden_knob(tmp_path: Path, hidden: bool) -> None:
-    """A board stands behind the hand at the knob, but not at the bar."""
+    """A board behind the knob obstructs the hand there, but not at the bar."""
     knob = ("knob", "-0.025 0 -0.05", "0.05 0.03 0.03")
     board = BOX.format("board", "-0.7 0 -0.05", "0.2 0.5 0.02") if hidden else ""
     file = write_drawer(tmp_path, *BAR, knob, walls=board)
@@ -57,11 +59,13 @@ def test_reachable_bar_is_preferred_to_a_hidden_knob(tmp_path: Path, hidden: boo
 
 
 @pytest.mark.parametrize(("gap", "goal"), [(0.3, 0.225), (0.34, 0.2625), (0.6, 0.3)])
-def test_report_says_how_far_a_hand_opens_a_joint(tmp_path: Path, gap: float, goal: float) -> None:
+def test_report_states_the_reachable_opening_of_a_joint(
+    tmp_path: Path, gap: float, goal: float
+) -> None:
     """A wall in front of the drawer stops the hand before the joint's limit."""
     wall = BOX.format("wall", f"{-gap - 0.05} 0 0", "0.1 0.6 0.5")
     file = write_drawer(tmp_path, *BAR, walls=wall)
-    made = vkc.importing.import_object(file, tmp_path / "out", most=1)
-    assert made.proposals.find_goal("slide") == pytest.approx(goal)
+    imported = vkc.importing.import_object(file, tmp_path / "out", most=1)
+    assert imported.proposals.find_goal("slide") == pytest.approx(goal)
     text = f": a hand opens it to {goal:.3g} m, {goal / 0.3:.0%} of its range"
-    assert (text in made.summary()) is (goal < 0.3)
+    assert (text in imported.summary()) is (goal < 0.3)

@@ -29,11 +29,11 @@ def test_descriptions_load_as_the_same_attachments(
     )
     assert list(loaded.attachments) == [proposal.attachment.name for proposal in found.found]
     for proposal in found.found:
-        wanted, got = proposal.attachment, loaded.attachment(proposal.attachment.name)
-        assert np.allclose(wanted.placement.homogeneous, got.placement.homogeneous, atol=1e-5)
-        assert (wanted.joint, wanted.coordinates) == (got.joint, got.coordinates)
-        assert wanted.standoff == pytest.approx(got.standoff, abs=1e-5)
-        for one, other in zip(wanted.freedoms, got.freedoms, strict=True):
+        expected, actual = proposal.attachment, loaded.attachment(proposal.attachment.name)
+        assert np.allclose(expected.placement.homogeneous, actual.placement.homogeneous, atol=1e-5)
+        assert (expected.joint, expected.coordinates) == (actual.joint, actual.coordinates)
+        assert expected.standoff == pytest.approx(actual.standoff, abs=1e-5)
+        for one, other in zip(expected.freedoms, actual.freedoms, strict=True):
             assert (one.lower, one.upper) == (other.lower, other.upper)
             assert np.allclose(one.axis, other.axis)
 

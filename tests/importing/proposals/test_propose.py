@@ -26,16 +26,16 @@ def test_best_proposal_agrees_with_the_handwritten_attachment(
 ) -> None:
     """The hand can slide along the bar to the handwritten grasp."""
     item = vkc.load_object(name)
-    best, wanted = (
+    best, handwritten = (
         vkc.importing.propose_attachments(item).opening(joint)[0],
         item.attachment(handle),
     )
-    assert best.attachment.link == wanted.link
-    apart = best.attachment.placement.inverse() * wanted.placement
+    assert best.attachment.link == handwritten.link
+    offset = best.attachment.placement.inverse() * handwritten.placement
     slide = next(freedom for freedom in best.attachment.freedoms if freedom.kind == "prismatic")
-    assert np.linalg.norm(apart.translation[[0, 2]]) < 0.005
-    assert slide.lower - 0.02 <= apart.translation[1] <= slide.upper + 0.02
-    assert abs(apart.rotation[1, 1]) == pytest.approx(1.0)
+    assert np.linalg.norm(offset.translation[[0, 2]]) < 0.005
+    assert slide.lower - 0.02 <= offset.translation[1] <= slide.upper + 0.02
+    assert abs(offset.rotation[1, 1]) == pytest.approx(1.0)
     low, high = item.lower[item.coordinates.index(joint)], item.upper[item.coordinates.index(joint)]
     assert best.opens[joint] == pytest.approx(high if abs(high) >= abs(low) else low)
 
@@ -88,7 +88,7 @@ def test_bar_close_to_the_flap_is_grasped_with_the_fingertips(tmp_path: Path) ->
     assert all(proposal.kind != "bar" for proposal in tight.found)
 
 
-def test_invalid_arguments_are_named() -> None:
+def test_errors_name_the_invalid_argument() -> None:
     with pytest.raises(vkc.InputError, match="ArticulatedObject"):
         vkc.importing.propose_attachments("drawer")  # type: ignore[arg-type]
     with pytest.raises(vkc.UnknownNameError, match="husky_ur5e"):
@@ -100,7 +100,7 @@ def test_invalid_arguments_are_named() -> None:
 
 
 def test_fingers_close_partly_where_space_is_narrow(tmp_path: Path) -> None:
-    """Posts of the drawer's frame stand 60 mm from the middle of its handle, on both sides."""
+    """Posts of the drawer's frame are 60 mm from the middle of its handle, on both sides."""
     item, robot = vkc.load_object(describe_cheeks_drawer()), vkc.load_robot(write_gripper(tmp_path))
     found = vkc.importing.propose_attachments(item, robot)
     best = found.opening("slide")[0]
@@ -118,7 +118,7 @@ def test_fingers_close_partly_where_space_is_narrow(tmp_path: Path) -> None:
         vkc.load_object(describe_cheeks_drawer(gap=0.15)), robot
     )
     assert wide.found[0].attachment.opening is None
-    still = dataclasses.replace(robot, gripper=None)
+    without_gripper = dataclasses.replace(robot, gripper=None)
     assert best.kind not in {
-        one.kind for one in vkc.importing.propose_attachments(item, still).found
+        one.kind for one in vkc.importing.propose_attachments(item, without_gripper).found
     }

@@ -7,7 +7,7 @@ import pytest
 
 import vkc_pin as vkc
 
-# A case of 1.6 m x 0.3 m x 1 m, in front of it (towards -y) a panel on a joint.
+# A case of 1.6 m x 0.3 m x 1 m with a jointed panel in front of it, towards -y.
 CASE = '<link name="case"><collision><origin xyz="0 0 0.5"/><geometry><box size="1.6 0.3 1.0"/>'
 PANEL = '<link name="panel"><collision><origin xyz="{}"/><geometry><box size="{}"/>'
 END = "</geometry></collision></link>"
@@ -47,41 +47,41 @@ LEAF = {"size": "0.7 0.1 0.9", "middle": "0.35 0 0", "at": "-0.75 -0.6 0.5"}
         ({"axis": "0 0 1", "size": "0.7 0.1 0.3", "at": "0 -0.2 0.8"}, (0, 0, 1), 0.6),  # pushed up
         ({"limits": (-0.6, 0.0), "at": "0.4 -0.2 0.5"}, (-1, 0, 0), -0.6),
         ({"axis": "0 1 0", "at": "0 -0.6 0.5", "limits": (0.0, 0.2)}, (0, 1, 0), 0.2),  # a button
-        # A leaf that stands off and turns towards the case.
+        # An open leaf that turns towards the case.
         (LEAF | {"kind": "revolute", "axis": "0 0 1", "limits": (0.0, 0.4)}, (0, 1, 0), 0.4),
     ],
 )
 def test_joints_without_handle_are_pushed(
     tmp_path: Path, settings: dict[str, str], approach: tuple[int, int, int], opened: float
 ) -> None:
-    made = vkc.importing.import_object(write_panel(tmp_path, **settings), tmp_path / "out")  # type: ignore[arg-type]
-    best = made.proposals.found[0]
+    imported = vkc.importing.import_object(write_panel(tmp_path, **settings), tmp_path / "out")  # type: ignore[arg-type]
+    best = imported.proposals.found[0]
     assert best.kind == "push"
     assert best.opens == {"slide": pytest.approx(opened)}
-    attachment = made.object.attachments[best.attachment.name]
+    attachment = imported.object.attachments[best.attachment.name]
     assert attachment.contact == "push"
     np.testing.assert_allclose(attachment.placement.rotation[:, 2], approach, atol=1e-9)
-    assert "a face to push" in made.summary()
-    assert made.scene is not None
+    assert "a face to push" in imported.summary()
+    assert imported.scene is not None
 
 
 @pytest.mark.parametrize(
     "settings",
     [
-        {"axis": "0 -1 0"},  # a drawer: nothing behind its front can be reached
+        {"axis": "0 -1 0"},  # a drawer: the hand cannot reach behind its front
         {"frame": SIDES + END + FIXED, "at": "-0.4 -0.2 0.5"},  # a frame covers the edge
         {"size": "0.7 0.001 0.9"},  # an edge of 1 mm
         LEAF | {"kind": "revolute", "axis": "0 0 -1", "at": "-0.75 -0.2 0.5", "limits": (0.0, 1.5)},
         {"limits": (0.0, 0.0)},
     ],
 )
-def test_joints_that_no_hand_can_push_get_none(tmp_path: Path, settings: dict[str, str]) -> None:
-    made = vkc.importing.import_object(write_panel(tmp_path, **settings), tmp_path / "out")  # type: ignore[arg-type]
-    assert [proposal.kind for proposal in made.proposals.found if proposal.kind == "push"] == []
+def test_joints_that_no_hand_can_push_get_no_push(tmp_path: Path, settings: dict[str, str]) -> None:
+    imported = vkc.importing.import_object(write_panel(tmp_path, **settings), tmp_path / "out")  # type: ignore[arg-type]
+    assert [proposal.kind for proposal in imported.proposals.found if proposal.kind == "push"] == []
 
 
 def test_sliding_door_is_opened_by_a_push(tmp_path: Path) -> None:
-    made = vkc.importing.import_object(write_panel(tmp_path), tmp_path / "out")
-    assert made.scene is not None
-    plan = vkc.plan(vkc.load_scene(made.scene), [vkc.Actuate("p", {"slide": 0.4})])
+    imported = vkc.importing.import_object(write_panel(tmp_path), tmp_path / "out")
+    assert imported.scene is not None
+    plan = vkc.plan(vkc.load_scene(imported.scene), [vkc.Actuate("p", {"slide": 0.4})])
     assert plan.success, plan.summary()

@@ -22,7 +22,7 @@ FRONT = np.column_stack(
 )  # approaches along x, closes along y
 
 
-def opening_of(name_or_path: str | Path) -> Opening:
+def find_opening(name_or_path: str | Path) -> Opening:
     item = vkc.load_object(name_or_path)
     pieces: dict[int, list[Piece]] = {}
     for shape in item.collision.geometryObjects:
@@ -32,7 +32,7 @@ def opening_of(name_or_path: str | Path) -> Opening:
 
 def test_score_depends_on_leverage_side_and_name(tmp_path: Path) -> None:
     write_flap(tmp_path, BAR.format(""))
-    hinge = opening_of(tmp_path / "flap.yaml")
+    hinge = find_opening(tmp_path / "flap.yaml")
     bar = Candidate(
         Piece("flap", "flap_1", np.zeros((0, 3)), np.zeros((0, 3), int)),
         "bar",
@@ -42,24 +42,22 @@ def test_score_depends_on_leverage_side_and_name(tmp_path: Path) -> None:
         0,
     )
 
-    def at(
+    def score_at(
         *place: float, rotation: np.ndarray = FRONT, named: bool = False, grasp: Candidate = bar
     ) -> float:
         return score_grasp(grasp, pin.SE3(rotation, np.array(place)), hinge, named=named)
 
-    best = at(-0.08, 0.55, 0.5)
-    assert best > at(-0.08, 0.3, 0.5) > at(-0.08, 0.05, 0.5) > 0.0  # leverage
-    assert best > at(-0.08, 0.55, 0.85)  # in the middle of the flap's height
+    best = score_at(-0.08, 0.55, 0.5)
+    assert best > score_at(-0.08, 0.3, 0.5) > score_at(-0.08, 0.05, 0.5) > 0.0  # leverage
+    assert best > score_at(-0.08, 0.55, 0.85)  # in the middle of the flap's height
     behind = FRONT @ np.diag([-1.0, 1.0, -1.0])
-    assert best > at(
+    assert best > score_at(
         -0.08, 0.55, 0.5, rotation=behind
-    )  # the hand comes from where the flap goes to
+    )  # the hand approaches from the opening side
     along = np.column_stack([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    assert best > 2.0 * at(
-        -0.08, 0.55, 0.5, rotation=along
-    )  # a bar along the pull slips through the fingers
-    assert at(-0.08, 0.55, 0.5, named=True) > best
-    assert best > at(-0.08, 0.55, 0.5, grasp=dataclasses.replace(bar, kind="edge"))
+    assert best > 2.0 * score_at(-0.08, 0.55, 0.5, rotation=along)  # a bar along the pull slips
+    assert score_at(-0.08, 0.55, 0.5, named=True) > best
+    assert best > score_at(-0.08, 0.55, 0.5, grasp=dataclasses.replace(bar, kind="edge"))
 
 
 def test_handles_are_named_by_elements_and_meshes() -> None:

@@ -21,7 +21,7 @@ from vkc_pin.world.files.urdf import UrdfFile, read_urdf
 from vkc_pin.world.models.robot_model import build_full_model
 
 
-def arms_of(file: UrdfFile) -> list[Arm]:
+def find_all_arms(file: UrdfFile) -> list[Arm]:
     return find_arms(
         file, build_body_tree(file), {}, {shape.link for shape in file.read_shapes("collision")}
     )
@@ -29,7 +29,7 @@ def arms_of(file: UrdfFile) -> list[Arm]:
 
 def test_arms_are_found_by_their_hands(tmp_path: Path) -> None:
     file = read_urdf(write_arms(tmp_path, sides=("left_", "right_")))
-    arms = arms_of(file)
+    arms = find_all_arms(file)
     assert sorted(arm.name for arm in arms) == ["left", "right"]
     left = choose_arm(arms, "Left", file, {})
     assert left.joints == tuple(f"left_arm_{k}_joint" for k in range(1, 6))
@@ -63,19 +63,19 @@ def test_jaw_named_by_its_link_closes_against_the_hand(
         <joint name="beside" type="fixed"><parent link="hand"/><child link="side"/>
         <origin xyz="0 0 {0.06 if ahead else 0.03}"/></joint></robot>"""
     path.write_text(text, encoding="utf-8")
-    (arm,) = arms_of(read_urdf(path))
+    (arm,) = find_all_arms(read_urdf(path))
     assert len(arm.joints) == count
     assert [finger.name for finger in arm.fingers] == ["joint_6"] * (6 - count)
 
 
 def test_base_joints_are_not_part_of_the_arm(tmp_path: Path) -> None:
     file = read_urdf(write_arms(tmp_path, own_base=True))
-    assert own_base_of(file) == ("drive_x", "drive_y", "drive_yaw")
-    assert arms_of(file)[0].joints[0] == "arm_1_joint"
-    assert own_base_of(read_urdf(write_arms(tmp_path))) == ()
+    assert find_base_joints(file) == ("drive_x", "drive_y", "drive_yaw")
+    assert find_all_arms(file)[0].joints[0] == "arm_1_joint"
+    assert find_base_joints(read_urdf(write_arms(tmp_path))) == ()
 
 
-def own_base_of(file: UrdfFile) -> tuple[str, ...]:
+def find_base_joints(file: UrdfFile) -> tuple[str, ...]:
     solid = {shape.link for shape in file.read_shapes("collision")}
     return find_own_base(file, build_body_tree(file), solid)
 
@@ -96,8 +96,8 @@ def own_base_of(file: UrdfFile) -> tuple[str, ...]:
         ("fx pz py rz", 0),
     ],
 )
-def test_lifts_are_no_part_of_a_base(tmp_path: Path, chain: str, count: int) -> None:
-    """Each word is a joint: fixed, prismatic or revolute, and its axis."""
+def test_lifts_are_not_part_of_the_base(tmp_path: Path, chain: str, count: int) -> None:
+    """Each word of `chain` is a joint: its kind (fixed, prismatic, revolute) and its axis."""
     kinds, axes = (
         {"p": "prismatic", "r": "revolute", "f": "fixed"},
         {
@@ -117,12 +117,12 @@ def test_lifts_are_no_part_of_a_base(tmp_path: Path, chain: str, count: int) -> 
             <limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'''
         parent = f"l{k}"
     (tmp_path / "r.urdf").write_text(f'<robot name="r">{text}</robot>')
-    found = own_base_of(read_urdf(tmp_path / "r.urdf"))
+    found = find_base_joints(read_urdf(tmp_path / "r.urdf"))
     first = 1 if chain.startswith("f") else 0
     assert found == tuple(f"j{k}" for k in range(first, first + count))
 
 
-def robots(pattern: str) -> Path:
+def find_robot(pattern: str) -> Path:
     folder = resources.find_example_robot_data()
     assert folder is not None
     return next(iter(sorted((folder / "robots").glob(pattern))))
@@ -138,26 +138,26 @@ def robots(pattern: str) -> Path:
     ],
 )
 def test_arms_of_published_robots_are_found(pattern: str, joints: int, fingers: int) -> None:
-    best = arms_of(read_urdf(robots(pattern)))[0]
+    best = find_all_arms(read_urdf(find_robot(pattern)))[0]
     assert (len(best.joints), len(best.fingers)) == (joints, fingers)
 
 
 @pytest.mark.parametrize("pattern", ["**/anymal_b*/**/anymal.urdf", "**/allegro_right_hand.urdf"])
 def test_legs_and_hands_are_not_arms(pattern: str) -> None:
-    file = read_urdf(robots(pattern))
-    assert arms_of(file) == []
+    file = read_urdf(find_robot(pattern))
+    assert find_all_arms(file) == []
     with pytest.raises(vkc.InputError, match="no arm was found"):
         choose_arm([], None, file, {})
 
 
 def test_wheels_determine_the_base_kind(tmp_path: Path) -> None:
-    assert guess_base_kind(read_urdf(robots("**/tiago.urdf")).root)[0] == "differential"
-    assert guess_base_kind(read_urdf(robots("**/pr2.urdf")).root)[0] == "omni"
+    assert guess_base_kind(read_urdf(find_robot("**/tiago.urdf")).root)[0] == "differential"
+    assert guess_base_kind(read_urdf(find_robot("**/pr2.urdf")).root)[0] == "omni"
     assert guess_base_kind(read_urdf(write_arms(tmp_path)).root)[0] == "omni"
 
 
 @pytest.mark.parametrize(
-    ("changed", "groups"),
+    ("replacements", "groups"),
     [
         ({}, [("out_1", "out_2", "out_3", "out_4")]),
         ({'name="out_3" type="prismatic"': 'name="out_3" type="revolute"'}, [("out_1", "out_2")]),
@@ -169,11 +169,11 @@ def test_wheels_determine_the_base_kind(tmp_path: Path) -> None:
     ],
 )
 def test_telescope_segments_are_found(
-    tmp_path: Path, changed: dict[str, str], groups: list[tuple[str, ...]]
+    tmp_path: Path, replacements: dict[str, str], groups: list[tuple[str, ...]]
 ) -> None:
     file = write_telescope(tmp_path).parent / "robot.urdf"
     text = file.read_text()
-    for old, new in changed.items():
+    for old, new in replacements.items():
         text = text.replace(old, new, 1)
     urdf = read_urdf(file, text=text)
     names = ("lift", "out_1", "out_2", "out_3", "out_4", "yaw_joint", "pitch_joint", "roll_joint")

@@ -49,8 +49,10 @@ def test_inseparable_pairs_are_reported(tmp_path: Path) -> None:
         "body and arm_1 were never more than 30.0 mm" in text
         for text in find_texts(found, "fault", "pairs")
     )
-    fewer = vkc.importing.doctor(robot, samples=60, margin=1e-3)
-    assert len(find_texts(fewer, "fault", "pairs")) < len(find_texts(found, "fault", "pairs"))
+    small_margin = vkc.importing.doctor(robot, samples=60, margin=1e-3)
+    assert len(find_texts(small_margin, "fault", "pairs")) < len(
+        find_texts(found, "fault", "pairs")
+    )
 
 
 def test_missing_limits_and_masses_are_reported(tmp_path: Path) -> None:
@@ -104,11 +106,11 @@ def write_robot(folder: Path, **settings: object) -> Path:
         '<child link="tool"/><origin xyz="0 0 0.125" rpy="0 0 1.57079633"/></joint></robot>'
     )
     path.write_text(path.read_text(encoding="utf-8").replace("</robot>", tool), encoding="utf-8")
-    given: dict[str, object] = {"urdf": path.name, "tool_frame": "tool"}
-    given["locked_joints"] = {"finger_a_joint": 0.03, "finger_b_joint": 0.03}
-    given["base"] = {"height": HEIGHT}
-    given["touch_links"] = ["arm_5", "hand", "finger_a", "finger_b"]
-    (folder / "robot.yaml").write_text(json.dumps(given | settings), encoding="utf-8")
+    document: dict[str, object] = {"urdf": path.name, "tool_frame": "tool"}
+    document["locked_joints"] = {"finger_a_joint": 0.03, "finger_b_joint": 0.03}
+    document["base"] = {"height": HEIGHT}
+    document["touch_links"] = ["arm_5", "hand", "finger_a", "finger_b"]
+    (folder / "robot.yaml").write_text(json.dumps(document | settings), encoding="utf-8")
     return folder
 
 
@@ -146,7 +148,7 @@ OPEN = {"finger_a_joint": 0.03, "finger_b_joint": 0.03}
         ({"touch_links": ["arm_5"]}, "has no fingers: it can reach poses", ""),
     ],
 )
-def test_doctor_reports_the_bars_of_a_hand(
+def test_doctor_reports_the_bars_that_a_hand_can_grasp(
     tmp_path: Path, settings: dict[str, object], limitation: str, note: str
 ) -> None:
     found = vkc.importing.doctor(write_robot(tmp_path, **settings), samples=5)
@@ -166,9 +168,11 @@ def test_doctor_proposes_a_height_that_suits_common_tasks(tmp_path: Path) -> Non
     assert not find_texts(vkc.importing.doctor(robot, samples=5), "limitation", "hand")
 
 
-@pytest.mark.parametrize(("gap", "is_barred"), [(0.01, True), (0.03, False)])
-def test_doctor_keeps_the_clearances_of_plans(tmp_path: Path, gap: float, is_barred: bool) -> None:
-    """The hand rolls by a quarter turn for level bars, and a camera comes near fins beside it."""
+@pytest.mark.parametrize(("gap", "is_obstructed"), [(0.01, True), (0.03, False)])
+def test_doctor_applies_the_clearances_of_plans(
+    tmp_path: Path, gap: float, is_obstructed: bool
+) -> None:
+    """The hand rolls by 90° for level bars, and moves a camera close to fins beside it."""
     locked = OPEN | {"arm_5_joint": 0.0}
     robot = write_robot(tmp_path, locked_joints=locked, srdf="all_pairs.srdf")
     (tmp_path / "all_pairs.srdf").write_text('<robot name="robot"/>', encoding="utf-8")
@@ -184,7 +188,7 @@ def test_doctor_keeps_the_clearances_of_plans(tmp_path: Path, gap: float, is_bar
     text = path.read_text(encoding="utf-8").replace("</robot>", parts + "</robot>")
     path.write_text(text, encoding="utf-8")
     limitations = find_texts(vkc.importing.doctor(robot, samples=5), "limitation", "hand")
-    assert any("cannot grasp level bars" in text for text in limitations) == is_barred
+    assert any("cannot grasp level bars" in text for text in limitations) == is_obstructed
 
 
 @pytest.mark.parametrize(("range_", "side"), [((0.0, 2.0), "right"), ((-2.0, 0.0), "left")])
@@ -200,11 +204,11 @@ def test_doctor_reports_a_wrist_that_cannot_turn_a_lever(
     assert f"turn door levers with the free end on the {side}" in " ".join(limitations)
 
 
-def test_invalid_argument_is_named() -> None:
-    for wrong in ({"samples": 0}, {"margin": -1.0}):
-        with pytest.raises(vkc.InputError) as refused:
-            vkc.importing.doctor("husky_ur5e", **wrong)  # type: ignore[arg-type]
-        assert refused.value.field == next(iter(wrong))
+def test_errors_name_the_invalid_argument() -> None:
+    for argument in ({"samples": 0}, {"margin": -1.0}):
+        with pytest.raises(vkc.InputError) as caught:
+            vkc.importing.doctor("husky_ur5e", **argument)  # type: ignore[arg-type]
+        assert caught.value.field == next(iter(argument))
     with pytest.raises(vkc.UnknownNameError) as caught:
         vkc.importing.doctor("husky_ur5")
     assert caught.value.nearest == "husky_ur5e"
@@ -251,7 +255,7 @@ def test_robot_in_kilometres_is_too_small(tmp_path: Path) -> None:
     assert "body, is only 0.5 mm long" in find_texts(found, "fault", "units")[0]
 
 
-def test_lift_without_velocity_moves_slowly(tmp_path: Path) -> None:
+def test_lift_without_velocity_limit_is_assumed_to_be_slow(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
     text = path.read_text(encoding="utf-8").replace(' velocity="1.5"', ' velocity="0"')
     text = text.replace('name="arm_1_joint" type="revolute"', 'name="arm_1_joint" type="prismatic"')

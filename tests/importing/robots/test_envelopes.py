@@ -9,36 +9,36 @@ import vkc_pin as vkc
 from vkc_pin.importing.robots.envelopes import find_envelopes
 
 
-def caged(folder: Path, *, size: str = "0.3 0.3 0.3", visual: bool = False) -> Path:
-    """An arm whose hand is in a box that is not seen, unlike the hand."""
+def write_caged_arm(folder: Path, *, size: str = "0.3 0.3 0.3", visual: bool = False) -> Path:
+    """Write an arm whose hand is enclosed in a box, which has no visual shape by default."""
     file = write_arms(folder)
-    seen = "<visual><geometry><box size='0.05 0.14 0.06'/></geometry></visual>"
+    hand_visual = "<visual><geometry><box size='0.05 0.14 0.06'/></geometry></visual>"
     shape = f"<geometry><box size='{size}'/></geometry>"
-    drawn = f"<visual>{shape}</visual>" if visual else ""
-    cage = f"<link name='cage'><collision>{shape}</collision>{drawn}</link>"
+    cage_visual = f"<visual>{shape}</visual>" if visual else ""
+    cage = f"<link name='cage'><collision>{shape}</collision>{cage_visual}</link>"
     joint = (
         "<joint name='caging' type='fixed'><parent link='hand'/><child link='cage'/>"
         "<origin xyz='0 0 0.1'/></joint>"
     )
     text = file.read_text(encoding="utf-8").replace(
-        '<link name="hand">', f'<link name="hand">{seen}'
+        '<link name="hand">', f'<link name="hand">{hand_visual}'
     )
     file.write_text(text.replace("</robot>", f"{cage}{joint}</robot>"), encoding="utf-8")
     return file
 
 
 @pytest.mark.parametrize(
-    "given", [{"size": "0.02 0.02 0.02"}, {"visual": True}], ids=["small", "seen"]
+    "cage", [{"size": "0.02 0.02 0.02"}, {"visual": True}], ids=["small", "seen"]
 )
 def test_small_and_visible_shapes_are_not_envelopes(
-    tmp_path: Path, given: dict[str, object]
+    tmp_path: Path, cage: dict[str, object]
 ) -> None:
-    robot = vkc.load_robot(caged(tmp_path, **given), pairs="all", tool_frame="hand")  # type: ignore[arg-type]
+    robot = vkc.load_robot(write_caged_arm(tmp_path, **cage), pairs="all", tool_frame="hand")  # type: ignore[arg-type]
     assert find_envelopes(robot) == {}
 
 
 def test_import_removes_envelopes_and_doctor_reports_them(tmp_path: Path) -> None:
-    file = caged(tmp_path / "given")
+    file = write_caged_arm(tmp_path / "given")
     imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=50)
     assert "cage" not in imported.robot.links
     assert "cage" not in imported.robot.touch_links

@@ -15,7 +15,7 @@ from vkc_pin.world.models.grippers.bar_width import find_thickest_rod
 from vkc_pin.world.models.robot_model import build_full_model
 
 
-def found(path: Path) -> tuple[Arm, object]:
+def analyze_first_hand(path: Path) -> tuple[Arm, object]:
     file = read_urdf(path)
     arm = find_arms(
         file, build_body_tree(file), {}, {shape.link for shape in file.read_shapes("collision")}
@@ -24,11 +24,11 @@ def found(path: Path) -> tuple[Arm, object]:
 
 
 def test_tool_frame_lies_between_the_fingertips(tmp_path: Path) -> None:
-    _, hand = found(write_arms(tmp_path))
+    _, hand = analyze_first_hand(write_arms(tmp_path))
     assert hand.link == "arm_5"
     np.testing.assert_allclose(
         hand.tool.rotation[:, 2], [0, 0, 1], atol=1e-9
-    )  # approach: where fingers point
+    )  # approach, along the fingers
     np.testing.assert_allclose(np.abs(hand.tool.rotation[:, 0]), [0, 1, 0], atol=1e-9)  # closing
     assert np.linalg.det(hand.tool.rotation) == pytest.approx(1.0)
     np.testing.assert_allclose(hand.tool.translation[:2], 0.0, atol=2e-3)
@@ -45,12 +45,12 @@ def test_tool_frame_lies_between_the_fingertips(tmp_path: Path) -> None:
 def test_single_jaw_opens_from_the_hand(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
     text = path.read_text(encoding="utf-8")
-    still = text.replace(
+    fixed = text.replace(
         '<joint name="finger_b_joint" type="prismatic">',
         '<joint name="finger_b_joint" type="fixed">',
     )
-    path.write_text(still, encoding="utf-8")
-    arm, hand = found(path)
+    path.write_text(fixed, encoding="utf-8")
+    arm, hand = analyze_first_hand(path)
     assert [finger.name for finger in arm.fingers] == ["finger_a_joint"]
     assert hand.open == {"finger_a_joint": 0.04}
     np.testing.assert_allclose(hand.tool.rotation[:, 2], [0, 0, 1], atol=0.3)
@@ -62,11 +62,11 @@ def test_hand_beside_a_hinge_approaches_across_its_axis(tmp_path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     wrist = '<joint name="wrist" type="fixed"><origin xyz="0 {} 0.2"/>'
     path.write_text(text.replace(wrist.format(0), wrist.format(0.15)), encoding="utf-8")
-    _, hand = found(path)
+    _, hand = analyze_first_hand(path)
     np.testing.assert_allclose(hand.tool.rotation[:, 2], [0, 0, 1], atol=1e-9)
 
 
-def test_jaw_that_turns_far_opens_as_far_as_a_lever_fits(tmp_path: Path) -> None:
+def test_wide_jaw_opens_far_enough_for_a_lever(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
     text = path.read_text(encoding="utf-8").partition('<link name="finger_a">')[0]
     shape = '<collision><origin xyz="0 {} 0.04"/><geometry><box size="0.02 0.02 0.08"/></geometry>'
@@ -87,11 +87,9 @@ def test_tool_frame_of_a_flange_points_along_the_last_axis(tmp_path: Path) -> No
     path = write_arms(tmp_path)
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace('type="prismatic"', 'type="fixed"'), encoding="utf-8")
-    arm, hand = found(path)
+    arm, hand = analyze_first_hand(path)
     assert arm.fingers == ()
     assert hand.open == {}
     assert hand.settings() == {}
     np.testing.assert_allclose(hand.tool.rotation[:, 2], [0, 0, 1], atol=0.2)
-    assert hand.tool.translation[2] == pytest.approx(
-        0.2 + 0.14, abs=0.01
-    )  # in front of all that is there
+    assert hand.tool.translation[2] == pytest.approx(0.2 + 0.14, abs=0.01)  # in front of all shapes

@@ -34,7 +34,7 @@ def write_linkage(
     coupled: str = COUPLED,
     tail: str = "",
 ) -> Path:
-    """Write an arm of five joints with the gripper, open at 0: 140 mm between the fingers."""
+    """Write an arm of five joints with a gripper that is open by 140 mm at joint position 0."""
     arm, end = "", ""
     for k, axis in enumerate(("0 0 1", "0 1 0", "0 1 0", "0 1 0", "0 0 1")):
         arm += f'''<body name="arm_{k}" pos="0 0 {0.25 if k else 0.2}">
@@ -58,37 +58,37 @@ def write_linkage(
 @pytest.mark.parametrize("connect", [CONNECT, SITES])
 @pytest.mark.parametrize("coupled", [COUPLED, ""])
 def test_linkages_stay_closed(tmp_path: Path, connect: str, coupled: str) -> None:
-    """A parallelogram: the finger stays upright, whatever the driver's angle."""
-    found = convert_mjcf(write_linkage(tmp_path, connect=connect, coupled=coupled), tmp_path)
-    assert len(found.linkages) == (1 if coupled else 2)
-    ends = set()
-    for linkage in found.linkages:
+    """The linkage is a parallelogram: the finger stays upright at every driver angle."""
+    converted = convert_mjcf(write_linkage(tmp_path, connect=connect, coupled=coupled), tmp_path)
+    assert len(converted.linkages) == (1 if coupled else 2)
+    angles = set()
+    for linkage in converted.linkages:
         assert set(linkage[0].values()) == {0.0}
         for state in linkage:
             for side in {name.split("_")[0] for name in state}:
                 driver = state[f"{side}_driver_turn"]
                 assert state[f"{side}_link_turn"] == pytest.approx(driver, abs=1e-3)
                 assert state[f"{side}_finger_turn"] == pytest.approx(-driver, abs=1e-3)
-                ends.add(round(driver, 2))
-    assert {0.0, 1.2} <= ends
+                angles.add(round(driver, 2))
+    assert {0.0, 1.2} <= angles
 
 
 def test_linkage_gripper_opens_with_its_loops_closed(tmp_path: Path) -> None:
-    made = vkc.importing.import_robot(write_linkage(tmp_path), tmp_path / "out", samples=50)
-    gripper = made.robot.gripper
+    imported = vkc.importing.import_robot(write_linkage(tmp_path), tmp_path / "out", samples=50)
+    gripper = imported.robot.gripper
     assert gripper is not None
-    assert len(gripper.names) == 6  # all but the couplers, which only hold the loops together
+    assert len(gripper.names) == 6  # all but the couplers, which only close the loops
     # Fingers are 3 mm thick to either side, on links of 40 mm at 30 mm from the middle.
     assert gripper.max_opening == pytest.approx(2 * (0.03 + 0.04 - 0.003), abs=1e-3)
-    assert "between the fingers of a linkage" in str(made)
-    assert "to 134 mm" in str(made)
-    assert made.diagnosis.healthy
+    assert "between the fingers of a linkage" in str(imported)
+    assert "to 134 mm" in str(imported)
+    assert imported.diagnosis.healthy
 
 
 @pytest.mark.parametrize("travel", ["0 0", "0 0.0001"])
 def test_linkage_without_travel_keeps_the_pose_of_the_file(tmp_path: Path, travel: str) -> None:
     file = write_linkage(tmp_path, travel=travel)
-    made = vkc.importing.import_robot(file, tmp_path / "out", samples=50)
-    assert made.robot.gripper is None
-    assert "the gripper does not move: its fingers stay 134 mm apart" in str(made)
-    assert made.diagnosis.healthy
+    imported = vkc.importing.import_robot(file, tmp_path / "out", samples=50)
+    assert imported.robot.gripper is None
+    assert "the gripper does not move: its fingers stay 134 mm apart" in str(imported)
+    assert imported.diagnosis.healthy

@@ -70,7 +70,7 @@ def test_pieces_replace_meshes_and_visuals_are_copied(file: Path, tmp_path: Path
 
 
 def write_obj(file: Path, size: float, colour: str) -> Path:
-    """Write a cube as an OBJ file whose material, paint.mtl, has a colour; return it."""
+    """Write a cube as an OBJ file with a colour in paint.mtl, and return the file."""
     file.parent.mkdir(parents=True, exist_ok=True)
     cube = trimesh.creation.box((size,) * 3).export(
         file_type="obj", include_normals=False, include_texture=False
@@ -80,16 +80,16 @@ def write_obj(file: Path, size: float, colour: str) -> Path:
     return file
 
 
-def link(name: str, seen: str, solid: str) -> str:
-    shapes = f'<visual><geometry><mesh filename="{seen}"/></geometry></visual>'
-    shapes += f'<collision><geometry><mesh filename="{solid}"/></geometry></collision>'
+def format_link(name: str, visual: str, collision: str) -> str:
+    shapes = f'<visual><geometry><mesh filename="{visual}"/></geometry></visual>'
+    shapes += f'<collision><geometry><mesh filename="{collision}"/></geometry></collision>'
     ends = f'<parent link="root"/><child link="{name}"/>'
     joint = f'<joint name="{name}_joint" type="fixed">{ends}</joint>'
     return f'<link name="{name}">{shapes}</link>{joint}'
 
 
-def own(folder: Path, *links: str) -> UrdfFile:
-    """Return a robot with these links below its root, with meshes of its own."""
+def write_own_meshes(folder: Path, *links: str) -> UrdfFile:
+    """Write a robot with these links below its root, and return its copy with its own meshes."""
     (folder / "r.urdf").write_text(
         f'<robot name="r"><link name="root"/>{"".join(links)}</robot>', encoding="utf-8"
     )
@@ -102,17 +102,20 @@ def test_meshes_of_equal_names_keep_their_shapes_and_colours(
     tmp_path: Path,
 ) -> None:
     colours = {"a": (1.0, 0.0, 0.0, 1.0), "b": (0.0, 1.0, 0.0, 1.0), "c": (0.0, 0.0, 1.0, 1.0)}
-    seen = {
+    files = {
         name: write_obj(
             tmp_path / name / file, size, " ".join(f"{value:g}" for value in colours[name][:3])
         )
         for name, file, size in (("a", "x_2.obj", 0.1), ("b", "x.obj", 0.2), ("c", "x.obj", 0.3))
     }
-    made = own(
+    robot = write_own_meshes(
         tmp_path,
-        *(link(name, str(file.relative_to(tmp_path)), str(file)) for name, file in seen.items()),
+        *(
+            format_link(name, str(file.relative_to(tmp_path)), str(file))
+            for name, file in files.items()
+        ),
     )
-    shapes = {shape.link: shape for shape in made.read_shapes("visual")}
+    shapes = {shape.link: shape for shape in robot.read_shapes("visual")}
     assert {name: shape.make_mesh().volume for name, shape in shapes.items()} == pytest.approx(
         {"a": 0.1**3, "b": 0.2**3, "c": 0.3**3}
     )
@@ -125,4 +128,4 @@ def test_meshes_of_equal_names_keep_their_shapes_and_colours(
         *("x.obj", "x_2.obj", "x_3.obj"),
         *("paint.mtl", "paint_2.mtl", "paint_3.mtl"),
     }
-    assert (folder / "x_2.obj").read_bytes() == seen["a"].read_bytes(), "nothing to rename"
+    assert (folder / "x_2.obj").read_bytes() == files["a"].read_bytes(), "no reference to rename"

@@ -49,18 +49,20 @@ def file(tmp_path: Path) -> Path:
 
 
 def test_link_placements_agree_with_mujoco(file: Path, tmp_path: Path) -> None:
-    """Several joints of a body, anchors away from its origin, references: at random positions."""
+    """Bodies have several joints, anchors away from the origin, and reference positions."""
     root = convert_mjcf(file, tmp_path / "meshes").root
-    for limit in root.iter("limit"):  # Pinocchio insists on them
+    for limit in root.iter("limit"):  # required by Pinocchio
         limit.attrib.update(effort="1", velocity="1")
     model = pin.buildModelFromXML(ElementTree.tostring(root, encoding="unicode"))
-    theirs = mujoco.MjModel.from_xml_path(str(file))
-    state, data, rng = mujoco.MjData(theirs), model.createData(), np.random.default_rng(3)
+    reference = mujoco.MjModel.from_xml_path(str(file))
+    state, data, rng = mujoco.MjData(reference), model.createData(), np.random.default_rng(3)
     for _ in range(5):
-        state.qpos[:] = rng.uniform(-0.5, 0.5, theirs.nq)
-        mujoco.mj_kinematics(theirs, state)
-        moved = state.qpos - theirs.qpos0
-        positions = {theirs.joint(j).name: moved[theirs.jnt_qposadr[j]] for j in range(theirs.njnt)}
+        state.qpos[:] = rng.uniform(-0.5, 0.5, reference.nq)
+        mujoco.mj_kinematics(reference, state)
+        moved = state.qpos - reference.qpos0
+        positions = {
+            reference.joint(j).name: moved[reference.jnt_qposadr[j]] for j in range(reference.njnt)
+        }
         pin.framesForwardKinematics(model, data, make_configuration(model, positions))
         for name in ("foot", "upper", "fore", "tip"):
             place = data.oMf[model.getFrameId(name, pin.FrameType.BODY)]
@@ -68,35 +70,35 @@ def test_link_placements_agree_with_mujoco(file: Path, tmp_path: Path) -> None:
             np.testing.assert_allclose(place.rotation.ravel(), state.body(name).xmat, atol=1e-7)
 
 
-def test_limits_shapes_couplings_and_states_are_kept(file: Path, tmp_path: Path) -> None:
-    made = convert_mjcf(file, tmp_path / "meshes")
-    joints = {joint.get("name"): joint for joint in made.root.findall("joint")}
+def test_limits_shapes_couplings_and_states_are_converted(file: Path, tmp_path: Path) -> None:
+    converted = convert_mjcf(file, tmp_path / "meshes")
+    joints = {joint.get("name"): joint for joint in converted.root.findall("joint")}
 
     def limit(name: str, key: str) -> float:
         element = joints[name].find("limit")
         assert element is not None
         return float(element.get(key, "nan"))
 
-    assert limit("lift", "lower") == pytest.approx(np.radians(-55))  # of ref
+    assert limit("lift", "lower") == pytest.approx(np.radians(-55))  # relative to ref
     assert limit("out", "effort") == 40.0
     assert joints["twist"].get("type") == "continuous"
     mimic = joints["jaw"].find("mimic")
     assert mimic is not None
     assert mimic.attrib == {"joint": "out", "multiplier": "0.1", "offset": "0.01"}
-    assert made.states["home"]["lift"] == pytest.approx(0.4 - np.radians(10))
-    fore = next(link for link in made.root.findall("link") if link.get("name") == "fore")
+    assert converted.states["home"]["lift"] == pytest.approx(0.4 - np.radians(10))
+    fore = next(link for link in converted.root.findall("link") if link.get("name") == "fore")
     assert [element.find("geometry")[0].tag for element in fore.findall("collision")] == ["mesh"]  # type: ignore[index]
     assert len(fore.findall("visual")) == 1
-    masses = sum(float(element.get("value", "0")) for element in made.root.iter("mass"))
-    theirs = mujoco.MjModel.from_xml_path(str(file))
+    masses = sum(float(element.get("value", "0")) for element in converted.root.iter("mass"))
+    reference = mujoco.MjModel.from_xml_path(str(file))
     assert masses == pytest.approx(
-        theirs.body_mass[theirs.body_rootid == theirs.body("foot").id].sum(), rel=1e-6
+        reference.body_mass[reference.body_rootid == reference.body("foot").id].sum(), rel=1e-6
     )
-    assert any("table" in note for note in made.notes)
+    assert any("table" in note for note in converted.notes)
 
 
-def test_invalid_files_are_named(tmp_path: Path) -> None:
-    for name, text, said in (
+def test_errors_name_the_invalid_file(tmp_path: Path) -> None:
+    for name, text, message in (
         (
             "wrong.xml",
             "<mujoco><worldbody><body><joint axis='0 0 0'/></body></worldbody></mujoco>",
@@ -110,13 +112,13 @@ def test_invalid_files_are_named(tmp_path: Path) -> None:
     ):
         path = tmp_path / name
         path.write_text(text, encoding="utf-8")
-        with pytest.raises(vkc.InputError, match=said) as caught:
+        with pytest.raises(vkc.InputError, match=message) as caught:
             convert_mjcf(path, tmp_path)
         assert caught.value.file == path
 
 
-def coupled(*equalities: str) -> str:
-    """Return an MJCF of three sliding joints one on the other, with couplings."""
+def format_arm(*equalities: str) -> str:
+    """Return an MJCF of three prismatic joints in series, with couplings."""
     joints = "".join(
         f'<body><joint name="j{k}" type="slide" range="0 1"/><geom size="0.01"/>' for k in range(3)
     )
@@ -124,47 +126,47 @@ def coupled(*equalities: str) -> str:
     return f"<mujoco>{bodies}<equality>{''.join(equalities)}</equality></mujoco>"
 
 
-def same(one: str, other: str, more: str = "") -> str:
+def format_coupling(one: str, other: str, more: str = "") -> str:
     return f'<joint joint1="{one}" joint2="{other}" {more}/>'
 
 
 @pytest.mark.parametrize(
-    ("equalities", "follows", "noted"),
+    ("equalities", "follows", "expected_note"),
     [
-        ((same("j1", "j0"), same("j2", "j1")), {"j1": "j0", "j2": "j1"}, ""),
+        ((format_coupling("j1", "j0"), format_coupling("j2", "j1")), {"j1": "j0", "j2": "j1"}, ""),
         (
-            (same("j0", "j1"), same("j0", "j2", 'polycoef="0.1 2 0 0 0"')),
+            (format_coupling("j0", "j1"), format_coupling("j0", "j2", 'polycoef="0.1 2 0 0 0"')),
             {"j0": "j1", "j2": "j0"},
             "",
         ),  # the second is inverted: j0 = 0.1 + 2·j2
         (
-            (same("j0", "j1"), same("j1", "j0")),
+            (format_coupling("j0", "j1"), format_coupling("j1", "j0")),
             {"j0": "j1"},
             "j1 follows j0; another coupling of it is left out",
         ),
         (
-            (same("j1", "j0", 'polycoef="0 1 0.5 0 0"'),),
+            (format_coupling("j1", "j0", 'polycoef="0 1 0.5 0 0"'),),
             {"j1": "j0"},
             "j1 follows j0 by a nonlinear function",
         ),
-        ((same("j1", "j0", 'active="false"'),), {}, ""),
+        ((format_coupling("j1", "j0", 'active="false"'),), {}, ""),
     ],
 )
 def test_couplings_become_a_tree(
-    tmp_path: Path, equalities: tuple[str, ...], follows: dict[str, str], noted: str
+    tmp_path: Path, equalities: tuple[str, ...], follows: dict[str, str], expected_note: str
 ) -> None:
     path = tmp_path / "arm.xml"
-    path.write_text(coupled(*equalities))
-    made = convert_mjcf(path, tmp_path / "meshes")
-    said = {joint.get("name"): joint.find("mimic") for joint in made.root.findall("joint")}
+    path.write_text(format_arm(*equalities))
+    converted = convert_mjcf(path, tmp_path / "meshes")
+    mimics = {joint.get("name"): joint.find("mimic") for joint in converted.root.findall("joint")}
     assert {
-        name: mimic.get("joint") for name, mimic in said.items() if mimic is not None
+        name: mimic.get("joint") for name, mimic in mimics.items() if mimic is not None
     } == follows
-    assert any(noted in note for note in made.notes) == bool(noted)
+    assert any(expected_note in note for note in converted.notes) == bool(expected_note)
     if "j2" in follows and follows["j2"] == "j0":
         inverse = {"joint": "j0", "multiplier": "0.5", "offset": "-0.05"}
-        assert said["j2"] is not None
-        assert said["j2"].attrib == inverse
+        assert mimics["j2"] is not None
+        assert mimics["j2"].attrib == inverse
 
 
 def test_similar_names_become_distinct_links_and_joints(tmp_path: Path) -> None:

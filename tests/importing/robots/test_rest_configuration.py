@@ -37,29 +37,29 @@ def test_home_is_found_by_search(robot: vkc.Robot) -> None:
     again = find_home(robot, [], seed=1)
     assert home.how == "found by search"
     np.testing.assert_array_equal(home.positions, again.positions)
-    look = Clearances(robot)
-    look.place(home.positions)
-    assert look.least() == pytest.approx(home.clearance)
+    clearances = Clearances(robot)
+    clearances.place(home.positions)
+    assert clearances.least() == pytest.approx(home.clearance)
     assert home.clearance >= HOME_ROOM
     assert ((home.positions >= robot.lower[3:]) & (home.positions <= robot.upper[3:])).all()
 
 
 def test_inseparable_pairs_are_found(tmp_path: Path) -> None:
     robot = vkc.load_robot(write_arms(tmp_path), pairs="all")
-    near = find_inseparable_pairs(
+    pairs = find_inseparable_pairs(
         robot, 0.035, samples=50
     )  # the first link turns about the vertical, 30 mm above the body
-    assert near[("body", "arm_1")] == pytest.approx(0.03)
-    assert ("body", "arm_5") not in near
-    assert ("arm_1", "arm_2") not in near
+    assert pairs[("body", "arm_1")] == pytest.approx(0.03)
+    assert ("body", "arm_5") not in pairs
+    assert ("arm_1", "arm_2") not in pairs
     assert find_inseparable_pairs(robot, 0.025, samples=50) == {}
     # Links arm_2 and arm_3 are 40 mm apart in line and closer where they turn.
-    assert ("arm_2", "arm_3") not in near
+    assert ("arm_2", "arm_3") not in pairs
     assert ("arm_2", "arm_3") in find_inseparable_pairs(robot, 0.035, samples=50, share=0.5)
 
 
-def test_parts_of_a_telescope_lie_in_each_other_by_design(tmp_path: Path, robot: vkc.Robot) -> None:
-    """The links of the wrist, which overlap the retracted segments, too, are none of them."""
+def test_segments_of_a_telescope_are_nested(tmp_path: Path, robot: vkc.Robot) -> None:
+    """Wrist links also overlap the retracted segments, but are not nested."""
     telescope = vkc.load_robot(write_telescope(tmp_path), pairs="all")
     segments = [f"segment_{k}" for k in range(1, 5)]
     nested = [("carriage", "segment_1"), *itertools.combinations(segments, 2)]
@@ -67,7 +67,7 @@ def test_parts_of_a_telescope_lie_in_each_other_by_design(tmp_path: Path, robot:
     assert find_nested_pairs(robot, 0.025) == []
 
 
-def test_floor_heights_of_fixed_and_moving_links(robot: vkc.Robot) -> None:
+def test_floor_heights_are_measured_for_fixed_and_moving_links(robot: vkc.Robot) -> None:
     low, above = measure_floor_heights(robot)
     assert low == pytest.approx(-HEIGHT)
     assert above == pytest.approx(0.16 + 0.02, abs=0.01)  # its first link turns about the vertical

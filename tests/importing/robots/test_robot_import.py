@@ -20,7 +20,7 @@ SAMPLES = 150
 
 @pytest.fixture(scope="module")
 def imported(tmp_path_factory: pytest.TempPathFactory) -> vkc.importing.ImportedRobot:
-    """A robot with two arms on a mobile base, which is an open bin 0.35 m above the floor."""
+    """Import a robot with two arms on a mobile base, an open bin 0.35 m above the floor."""
     folder = tmp_path_factory.mktemp("imported")
     walls = [trimesh.creation.box((0.5, 0.4, 0.05)).apply_translation((0, 0, -0.325))]
     walls += [
@@ -45,14 +45,14 @@ def test_folder_describes_the_robot(imported: vkc.importing.ImportedRobot) -> No
         "mine.srdf",
         "collision",
     }
-    again = vkc.load_robot(imported.folder)
-    assert again.name == "mine"
-    assert again.coordinates.names[3:] == tuple(f"right_arm_{k}_joint" for k in range(1, 6))
-    assert again.tool_frame == "tool"
+    loaded = vkc.load_robot(imported.folder)
+    assert loaded.name == "mine"
+    assert loaded.coordinates.names[3:] == tuple(f"right_arm_{k}_joint" for k in range(1, 6))
+    assert loaded.tool_frame == "tool"
     touching = ("arm_5", "hand", "finger_a", "finger_b")
-    assert set(again.touch_links) == {f"right_{name}" for name in touching}
-    np.testing.assert_array_equal(again.home, imported.robot.home)
-    gripper = again.gripper
+    assert set(loaded.touch_links) == {f"right_{name}" for name in touching}
+    np.testing.assert_array_equal(loaded.home, imported.robot.home)
+    gripper = loaded.gripper
     assert gripper is not None
     assert gripper.names == ("right_finger_a_joint", "right_finger_b_joint")
     assert (gripper.min_opening, gripper.max_opening) == (0.0, pytest.approx(0.08, abs=2e-4))
@@ -72,16 +72,16 @@ def test_report_lists_guesses(imported: vkc.importing.ImportedRobot) -> None:
     assert imported.diagnosis.healthy
 
 
-def test_base_is_hollow_and_stands_on_the_floor(imported: vkc.importing.ImportedRobot) -> None:
+def test_base_is_hollow_and_rests_on_the_floor(imported: vkc.importing.ImportedRobot) -> None:
     (piece,) = imported.pieces
     assert piece.count == 3
     assert piece.overhead < 0.05
     assert piece.hull > 1.0
     assert len(list((imported.folder / "collision").iterdir())) == 3
-    look = Clearances(imported.robot)
-    look.place(imported.robot.home)
-    assert look.floor(moved=False)[0][1] == pytest.approx(0.0, abs=1e-5)
-    assert look.least() >= HOME_ROOM
+    clearances = Clearances(imported.robot)
+    clearances.place(imported.robot.home)
+    assert clearances.floor(moved=False)[0][1] == pytest.approx(0.0, abs=1e-5)
+    assert clearances.least() >= HOME_ROOM
     robot = imported.robot.model
     assert robot.frames[robot.getFrameId("body")].placement.translation[2] == pytest.approx(
         HEIGHT, abs=1e-5
@@ -89,7 +89,7 @@ def test_base_is_hollow_and_stands_on_the_floor(imported: vkc.importing.Imported
 
 
 def test_gripper_that_does_not_open_is_locked(tmp_path: Path) -> None:
-    """A bar across the fingertips leaves no room between the fingers, wherever they are."""
+    """A bar across the fingertips leaves no room between the fingers at any position."""
     file = write_arms(tmp_path / "given")
     shape = '<collision><geometry><box size="0.02 0.02 0.09"/></geometry></collision>'
     bar = f'<link name="bar">{shape}</link><joint name="bar_joint" type="fixed">'
@@ -98,12 +98,12 @@ def test_gripper_that_does_not_open_is_locked(tmp_path: Path) -> None:
         file.read_text(encoding="utf-8").replace("</robot>", bar + joint + "</robot>"),
         encoding="utf-8",
     )
-    made = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
-    said = (made.folder / "robot.yaml").read_text(encoding="utf-8")
-    assert made.robot.gripper is None
-    assert "gripper" not in said
-    assert "finger_a_joint: 0.04" in said
-    assert "the fingers are locked: the gripper does not open" in str(made)
+    imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
+    text = (imported.folder / "robot.yaml").read_text(encoding="utf-8")
+    assert imported.robot.gripper is None
+    assert "gripper" not in text
+    assert "finger_a_joint: 0.04" in text
+    assert "the fingers are locked: the gripper does not open" in str(imported)
 
 
 def test_reachable_poses_are_planned(imported: vkc.importing.ImportedRobot, tmp_path: Path) -> None:
@@ -113,7 +113,7 @@ def test_reachable_poses_are_planned(imported: vkc.importing.ImportedRobot, tmp_
     )
     loaded = vkc.load_scene(scene)
     robot, rng = loaded.robot, np.random.default_rng(4)
-    look, data, frame = (
+    clearances, data, frame = (
         Clearances(robot),
         robot.model.createData(),
         robot.model.getFrameId(robot.tool_frame),
@@ -121,8 +121,8 @@ def test_reachable_poses_are_planned(imported: vkc.importing.ImportedRobot, tmp_
     goals = []
     while len(goals) < 1:
         arm = rng.uniform(robot.lower[3:], robot.upper[3:])
-        look.place(arm)
-        if look.least() > HOME_ROOM:
+        clearances.place(arm)
+        if clearances.least() > HOME_ROOM:
             pin.framesForwardKinematics(
                 robot.model, data, robot.coordinates.q(np.concatenate([[1.0, 0.5, 2.0], arm]))
             )
@@ -142,23 +142,22 @@ def test_links_that_overlap_at_zero_are_separated_at_home(tmp_path: Path) -> Non
         )
     file.write_text(text, encoding="utf-8")
     plain = vkc.load_robot(file, pairs="all")
-    look = Clearances(plain)
-    look.place(np.zeros(5))
-    assert ("arm_4", "body") in {tuple(sorted(pair[:2])) for pair in look.links(0.0)}, (
-        "the test's own premise"
+    clearances = Clearances(plain)
+    clearances.place(np.zeros(5))
+    assert ("arm_4", "body") in {tuple(sorted(pair[:2])) for pair in clearances.links(0.0)}, (
+        "precondition of the test"
     )
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "error"
-        )  # "links that overlap at home are not checked", and names of folders that are gone
+        warnings.simplefilter("error")  # warnings about overlapping links or missing folders
         imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
-    look = Clearances(imported.robot)
-    look.place(imported.robot.home)
-    assert look.least() >= HOME_ROOM
-    kept_apart = {
-        tuple(sorted((imported.robot.link_of(a), imported.robot.link_of(b)))) for a, b in look.pairs
+    clearances = Clearances(imported.robot)
+    clearances.place(imported.robot.home)
+    assert clearances.least() >= HOME_ROOM
+    checked_pairs = {
+        tuple(sorted((imported.robot.link_of(a), imported.robot.link_of(b))))
+        for a, b in clearances.pairs
     }
-    assert ("arm_4", "body") in kept_apart
+    assert ("arm_4", "body") in checked_pairs
 
 
 def test_folder_is_replaced_only_with_force_and_kept_on_failure(tmp_path: Path) -> None:
@@ -182,41 +181,43 @@ def test_folder_is_replaced_only_with_force_and_kept_on_failure(tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("<sdf/>", r"expected <robot> \(URDF or xacro\) or <mujoco> \(MJCF\), got <sdf>"),
         ("<robot name='x'><link name='a'/></robot>", "the robot has no shapes"),
         ("not xml", "not valid XML"),
     ],
 )
-def test_invalid_robots_are_named(tmp_path: Path, text: str, said: str) -> None:
+def test_errors_name_the_problem_of_an_invalid_robot(
+    tmp_path: Path, text: str, message: str
+) -> None:
     file = tmp_path / "wrong.urdf"
     file.write_text(text, encoding="utf-8")
-    with pytest.raises(vkc.InputError, match=said):
+    with pytest.raises(vkc.InputError, match=message):
         vkc.importing.import_robot(file, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.long
 def test_telescope_is_proposed_as_one_coordinate(tmp_path: Path) -> None:
-    """Nothing is proposed if the file states it."""
-    for mimics, told in (("", True), ("chain", False)):
+    """No coupling is proposed if the file states the mimic joints."""
+    for mimics, is_proposed in (("", True), ("chain", False)):
         file = (
             write_telescope(tmp_path / f"given{mimics}", couplings="", mimics=mimics).parent
             / "robot.urdf"
         )
-        made = vkc.importing.import_robot(file, tmp_path / f"mine{mimics}", samples=SAMPLES)
-        assert made.robot.coordinates.names[3:] == (
+        imported = vkc.importing.import_robot(file, tmp_path / f"mine{mimics}", samples=SAMPLES)
+        assert imported.robot.coordinates.names[3:] == (
             "lift",
             "out_1",
             "yaw_joint",
             "pitch_joint",
             "roll_joint",
         )
-        said = yaml.safe_load((made.folder / "robot.yaml").read_text())
-        assert said.get("couplings", {}) == (FOLLOWERS if told else {})
-        assert ("out_2, out_3, out_4 follow out_1 as a telescope" in str(made)) == told
-        assert set(said["home"]) == {*made.robot.coordinates.names[3:]}
+        document = yaml.safe_load((imported.folder / "robot.yaml").read_text())
+        assert document.get("couplings", {}) == (FOLLOWERS if is_proposed else {})
+        assert ("out_2, out_3, out_4 follow out_1 as a telescope" in str(imported)) == is_proposed
+        assert set(document["home"]) == {*imported.robot.coordinates.names[3:]}
 
 
 def test_file_name_cannot_add_fields_to_the_description(
@@ -226,32 +227,32 @@ def test_file_name_cannot_add_fields_to_the_description(
     file = tmp_path / "x\ntool_frame: body\n#\x01\udcff.urdf"
     file.write_text(text, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    made = vkc.importing.import_robot(file, None, samples=20)
+    imported = vkc.importing.import_robot(file, None, samples=20)
     stem = "x_tool_frame__body____"
-    assert made.folder.name == stem
-    assert {path.stem for path in made.folder.glob("*.?rdf")} == {stem}
-    stated = (made.folder / "robot.yaml").read_text(encoding="utf-8")
+    assert imported.folder.name == stem
+    assert {path.stem for path in imported.folder.glob("*.?rdf")} == {stem}
+    stated = (imported.folder / "robot.yaml").read_text(encoding="utf-8")
     assert stated.startswith(
         "# Made of x\\ntool_frame: body\\n#\\x01\\udcff.urdf (URDF) by vkc-pin"
     )
     assert yaml.safe_load(stated)["tool_frame"] == "tool"
-    assert vkc.load_robot(made.folder).name == stem
+    assert vkc.load_robot(imported.folder).name == stem
 
 
 @pytest.mark.parametrize(
-    ("first", "named"), [("body", "all links"), ("arm_5", "arm_5, hand, finger_a, finger_b")]
+    ("first", "links"), [("body", "all links"), ("arm_5", "arm_5, hand, finger_a, finger_b")]
 )
 def test_visual_shapes_replace_missing_collision_shapes(
-    tmp_path: Path, first: str, named: str
+    tmp_path: Path, first: str, links: str
 ) -> None:
-    """The file has collision shapes before the link `first` only."""
+    """Only the links before `first` have collision shapes."""
     file = write_arms(tmp_path / "given")
     head, link, tail = file.read_text(encoding="utf-8").partition(f'<link name="{first}"')
     file.write_text(head + link + tail.replace("collision>", "visual>"), encoding="utf-8")
-    made = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
-    assert f"visual shapes are used for want of collision shapes: {named} [guess]" in str(made)
-    assert "which open from 0 to 80 mm" in str(made)
-    assert {"hand", "finger_a", "finger_b"} <= set(made.robot.touch_links)
+    imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
+    assert f"visual shapes are used for want of collision shapes: {links} [guess]" in str(imported)
+    assert "which open from 0 to 80 mm" in str(imported)
+    assert {"hand", "finger_a", "finger_b"} <= set(imported.robot.touch_links)
 
 
 STUCK = ("the gripper does not move: its fingers stay", False)
@@ -269,7 +270,7 @@ STUCK = ("the gripper does not move: its fingers stay", False)
         ("fixed", (0.0, 0.0), "'mine' has no fingers: it can reach", True),
     ],
 )
-def test_hand_that_cannot_open_is_a_fault(
+def test_opening_of_the_hand_is_diagnosed(
     tmp_path: Path, finger: str, limits: tuple[float, float], expected: str, healthy: bool
 ) -> None:
     file = write_arms(tmp_path, sides=("right_",))
@@ -279,10 +280,10 @@ def test_hand_that_cannot_open_is_a_fault(
     if finger == "fixed":
         text = text.partition('<link name="right_hand">')[0] + "</robot>"
     file.write_text(text, encoding="utf-8")
-    made = vkc.importing.import_robot(file, tmp_path / "mine", samples=30)
-    assert expected in str(made)
-    assert ".vkc-pin-" not in str(made)
-    assert made.diagnosis.healthy is healthy
+    imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=30)
+    assert expected in str(imported)
+    assert ".vkc-pin-" not in str(imported)
+    assert imported.diagnosis.healthy is healthy
 
 
 def test_column_of_a_lift_may_sink_into_the_floor(tmp_path: Path) -> None:
@@ -294,11 +295,11 @@ def test_column_of_a_lift_may_sink_into_the_floor(tmp_path: Path) -> None:
     text = file.read_text(encoding="utf-8").replace('name="robot">', f'name="robot">{foot}')
     text = text.replace("0 0 -0.1", "0 0 -0.5").replace("0.5 0.4 0.5", "0.1 0.1 1.0")
     file.write_text(text, encoding="utf-8")
-    made = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
-    assert "the lift sinks body into the floor" in str(made)
-    assert "body" not in made.robot.links
-    assert made.diagnosis.healthy
-    assert "level ones at 0.1 to 1.9 m" in str(made)
+    imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
+    assert "the lift sinks body into the floor" in str(imported)
+    assert "body" not in imported.robot.links
+    assert imported.diagnosis.healthy
+    assert "level ones at 0.1 to 1.9 m" in str(imported)
 
 
 @pytest.mark.parametrize(("first", "second"), [("a", "b"), ("b", "a")])
@@ -317,15 +318,15 @@ def test_closing_direction_suits_a_wrist_without_roll(
     post += '</link><joint name="post_joint" type="fixed"><origin xyz="0.6 0 0.1"/>'
     post += '<parent link="body"/><child link="post"/></joint></robot>'
     file.write_text(text.replace("</robot>", post), encoding="utf-8")
-    made = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
-    assert "thick: upright ones at" in str(made)
+    imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
+    assert "thick: upright ones at" in str(imported)
 
 
 @pytest.mark.parametrize(("first", "second"), [("a", "b"), ("b", "a")])
 def test_closing_direction_leaves_the_wrist_room_to_turn_levers(
     tmp_path: Path, first: str, second: str
 ) -> None:
-    """The arm pitches forwards only, and its wrist rolls by half a turn and little more."""
+    """The arm pitches forwards only, and its wrist rolls by slightly more than half a turn."""
     file = write_arms(tmp_path / "given")
     text = file.read_text(encoding="utf-8").replace("finger_a", f"finger_{first}_")
     text = text.replace("finger_b", f"finger_{second}_")
@@ -333,5 +334,5 @@ def test_closing_direction_leaves_the_wrist_room_to_turn_levers(
     for joint, limits in ((2, (0, 2)), (3, (0, 2)), (4, (-2.3, 1.6))):
         text = set_limits(text, f"arm_{joint}_joint", *limits)
     file.write_text(text, encoding="utf-8")
-    made = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
-    assert "turn door levers" not in str(made)
+    imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
+    assert "turn door levers" not in str(imported)

@@ -14,7 +14,7 @@ from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.world.files.xml import parse_xml
 
 
-def read(file: Path, scratch: Path) -> Source:
+def read_robot(file: Path, scratch: Path) -> Source:
     return read_source(file, scratch, packages={}, arguments={})
 
 
@@ -24,24 +24,24 @@ def test_foreign_elements_are_removed_and_missing_limits_noted(tmp_path: Path) -
     path.write_text(
         text.replace("</robot>", "<gazebo/><transmission name='t'/></robot>"), encoding="utf-8"
     )
-    source = read(path, tmp_path)
+    source = read_robot(path, tmp_path)
     assert source.kind == "URDF"
     assert "left out elements that a URDF does not have: <gazebo>, <transmission>" in source.notes
     assert any("state no effort or velocity limit: arm_1_joint" in note for note in source.notes)
     assert source.file.root.find("gazebo") is None
 
 
-def test_srdf_beside_the_urdf_is_read_unless_of_another_robot(tmp_path: Path) -> None:
+def test_srdf_beside_the_urdf_is_ignored_if_it_names_unknown_links(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
     other = "<robot name='x'><disable_collisions link1='elsewhere' link2='body'/></robot>"
     (tmp_path / "robot.srdf").write_text(other, encoding="utf-8")
     folder = resources.find_example_robot_data()
     assert folder is not None
-    panda = read(folder / "robots" / "panda_description" / "urdf" / "panda.urdf", tmp_path)
+    panda = read_robot(folder / "robots" / "panda_description" / "urdf" / "panda.urdf", tmp_path)
     assert panda.groups
     assert panda.srdf.states
     assert panda.srdf.allowed
-    source = read(path, tmp_path)
+    source = read_robot(path, tmp_path)
     assert any("links of another robot" in note for note in source.notes)
     with pytest.raises(vkc.UnknownNameError):
         read_source(path, tmp_path, packages={}, arguments={}, srdf=tmp_path / "robot.srdf")
@@ -68,28 +68,28 @@ PART = """<?xml version="1.0"?>
 def file(tmp_path: Path) -> Path:
     path = tmp_path / "work" / "my_robot" / "urdf" / "two.xacro"
     part = tmp_path / "work" / "my_parts" / "links.xacro"
-    for where, text in ((path, TEXT), (part, PART)):
-        where.parent.mkdir(parents=True)
-        where.write_text(text, encoding="utf-8")
+    for target, text in ((path, TEXT), (part, PART)):
+        target.parent.mkdir(parents=True)
+        target.write_text(text, encoding="utf-8")
     return path
 
 
-def size(text: str, file: Path) -> str | None:
+def find_box_size(text: str, file: Path) -> str | None:
     box = parse_xml(text, file).find("link/collision/geometry/box")
     assert box is not None
     return box.get("size")
 
 
 def test_packages_are_found_around_the_file(file: Path) -> None:
-    assert size(expand_xacro(file, {}, {}), file) == "0.6 0.1 0.1"
-    assert size(expand_xacro(file, {}, {"length": "0.5"}), file) == "1.0 0.1 0.1"
+    assert find_box_size(expand_xacro(file, {}, {}), file) == "0.6 0.1 0.1"
+    assert find_box_size(expand_xacro(file, {}, {"length": "0.5"}), file) == "1.0 0.1 0.1"
 
 
 def test_given_packages_take_precedence(file: Path, tmp_path: Path) -> None:
     other = tmp_path / "elsewhere"
     other.mkdir()
     (other / "links.xacro").write_text(PART.replace("2*length", "4*length"), encoding="utf-8")
-    assert size(expand_xacro(file, {"my_parts": other}, {}), file).startswith("1.2")  # type: ignore[union-attr]
+    assert find_box_size(expand_xacro(file, {"my_parts": other}, {}), file).startswith("1.2")  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(
@@ -106,15 +106,15 @@ def test_package_xml_names_a_package(file: Path, tmp_path: Path, folder: str, na
     (tmp_path / "work" / "my_parts").rename(tmp_path / "elsewhere")
     with pytest.raises(vkc.InputError, match="packages were not found: my_parts"):
         expand_xacro(file, {}, {})
-    place = tmp_path / folder
-    place.mkdir(exist_ok=True)
-    (tmp_path / "elsewhere" / "links.xacro").rename(place / "links.xacro")
+    package = tmp_path / folder
+    package.mkdir(exist_ok=True)
+    (tmp_path / "elsewhere" / "links.xacro").rename(package / "links.xacro")
     text = f'<?xml version="1.0"?><package format="2"><name>{names}</name></package>'
-    (place / "package.xml").write_text(text)
-    assert size(expand_xacro(file, {}, {}), file) == "0.6 0.1 0.1"
-    plain = place / "r.urdf"
+    (package / "package.xml").write_text(text)
+    assert find_box_size(expand_xacro(file, {}, {}), file) == "0.6 0.1 0.1"
+    plain = package / "r.urdf"
     plain.write_text('<robot name="r"><link name="a"/></robot>')
-    assert read_urdf(plain).resolve("package://my_parts/links.xacro") == place / "links.xacro"
+    assert read_urdf(plain).resolve("package://my_parts/links.xacro") == package / "links.xacro"
 
 
 def test_all_missing_packages_are_listed(file: Path) -> None:

@@ -9,15 +9,15 @@ from hypothesis import strategies as st
 
 from vkc_pin.planning.base_paths.arcs import Curves, find_nearest_arc, interpolate_arcs, sample_path
 
-PLACES = st.tuples(st.floats(-4.0, 4.0), st.floats(-4.0, 4.0), st.floats(-7.0, 7.0))
+POSES = st.tuples(st.floats(-4.0, 4.0), st.floats(-4.0, 4.0), st.floats(-7.0, 7.0))
 TURNING = 0.3
 
 
 def split_steps(path: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the motion of each step along and across its mean heading, and its turn."""
     step = np.diff(path, axis=0)
-    seen = np.exp(-1j * (path[:-1, 2] + step[:, 2] / 2)) * (step[:, 0] + 1j * step[:, 1])
-    return seen.real, seen.imag, step[:, 2]
+    local = np.exp(-1j * (path[:-1, 2] + step[:, 2] / 2)) * (step[:, 0] + 1j * step[:, 1])
+    return local.real, local.imag, step[:, 2]
 
 
 def equal(pose: np.ndarray, other: np.ndarray) -> bool:
@@ -29,7 +29,7 @@ def equal(pose: np.ndarray, other: np.ndarray) -> bool:
 
 @pytest.mark.parametrize("radius", [0.0, 0.5, 1.3])
 @settings(deadline=None)
-@given(PLACES, PLACES, st.integers(8, 60))
+@given(POSES, POSES, st.integers(8, 60))
 def test_every_step_of_a_curve_rolls_without_slip(
     radius: float, first: tuple[float, ...], last: tuple[float, ...], steps: int
 ) -> None:
@@ -51,9 +51,7 @@ def test_every_step_of_a_curve_rolls_without_slip(
 
 
 @settings(deadline=None)
-@given(
-    PLACES, st.floats(-2.0, 2.0), st.floats(-1.5, 1.5), st.floats(-0.5, 0.5), st.floats(0.0, 1.0)
-)
+@given(POSES, st.floats(-2.0, 2.0), st.floats(-1.5, 1.5), st.floats(-0.5, 0.5), st.floats(0.0, 1.0))
 def test_nearest_arc_beats_random_arcs(
     first: tuple[float, ...], dx: float, dy: float, turn: float, radius: float
 ) -> None:
@@ -79,7 +77,7 @@ def test_nearest_arc_beats_random_arcs(
             )
 
 
-def test_nearest_arc_of_an_arc_is_itself() -> None:
+def test_nearest_arc_ends_at_a_reachable_goal() -> None:
     rng = np.random.default_rng(0)
     first = rng.uniform(-3, 3, (200, 3))
     turn = rng.uniform(-0.7, 0.7, 200)
@@ -94,7 +92,7 @@ def test_nearest_arc_of_an_arc_is_itself() -> None:
 
 @settings(deadline=None)
 @given(
-    PLACES,
+    POSES,
     st.floats(-2.0, 2.0),
     st.floats(-2.0, 2.0),
     st.floats(-3.0, 3.0),
@@ -137,7 +135,7 @@ def test_paths_reach_the_end_with_fewer_steps_than_corners() -> None:
 
 
 def test_car_curves_replace_turns_in_place() -> None:
-    """The path avoids a wall; without it, it is the shortest curve."""
+    """The path avoids the wall. Without a wall it is the shortest curve."""
     path = np.array(
         [
             [0.0, 0.0, 1.5],
@@ -150,14 +148,14 @@ def test_car_curves_replace_turns_in_place() -> None:
     )
     curves = Curves(0.6, TURNING)
 
-    def free(pose: np.ndarray) -> bool:
+    def is_free(pose: np.ndarray) -> bool:
         return not (1.5 < pose[0] < 2.5 and pose[1] < 3.0)
 
-    around = curves.fit(path, free)
-    np.testing.assert_array_equal(around[0], path[0])
-    assert equal(around[-1], path[-1])
-    poses = np.vstack([path[:1], sample_path(around, 150, turning=TURNING)])
-    assert all(map(free, poses))
+    corners = curves.fit(path, is_free)
+    np.testing.assert_array_equal(corners[0], path[0])
+    assert equal(corners[-1], path[-1])
+    poses = np.vstack([path[:1], sample_path(corners, 150, turning=TURNING)])
+    assert all(map(is_free, poses))
     along, aside, turn = split_steps(poses)
     np.testing.assert_allclose(aside, 0.0, atol=1e-6)
     assert (np.abs(along) >= 0.6 * np.abs(turn) - 1e-6).all()

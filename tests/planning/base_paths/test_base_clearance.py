@@ -7,8 +7,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.base_scenes import (
-    BLINK,
     MARGIN,
+    MARGIN_TOLERANCE,
     compute_distance,
     interpolate_poses,
     make_arm_shapes,
@@ -39,17 +39,17 @@ def make_random_scene(seed: int) -> tuple[list[Shape], list[Shape], MovingShapes
         *make_arm_shapes()[:3],
         (make_wedge(), make_pose(0.3, -0.1, 0.6, 0.4)),
     ]
-    standing = [
+    obstacles = [
         *make_clutter(int(rng.integers(1000)), 8, reach=1.5),
         (make_wedge(), make_pose(*rng.uniform(-1.5, 1.5, 2), 0.3, 1.0)),
     ]
-    return shapes, standing, MovingShapes(shapes, Obstacles(standing), MARGIN)
+    return shapes, obstacles, MovingShapes(shapes, Obstacles(obstacles), MARGIN)
 
 
 def test_drives_and_turns_agree_with_coal() -> None:
     answers = []
     for seed in range(12):
-        shapes, standing, body = make_random_scene(seed)
+        shapes, obstacles, body = make_random_scene(seed)
         rng = np.random.default_rng(seed + 1)
         a, yaw = rng.uniform(-2.0, 2.0, 2), rng.uniform(-4.0, 4.0)
         b, end = a + rng.uniform(-1.0, 1.0, 2), yaw + rng.uniform(-2.0, 2.0) * rng.uniform()
@@ -57,8 +57,8 @@ def test_drives_and_turns_agree_with_coal() -> None:
             (body.is_drive_free(a, b, yaw), interpolate_poses([*a, yaw], [*b, yaw], length=0.004)),
             (body.is_turn_free(a, yaw, end), interpolate_poses([*a, yaw], [*a, end], angle=0.004)),
         ):
-            nearest = min(compute_distance(shapes, standing, pose) for pose in poses)
-            assert nearest >= MARGIN - BLINK if is_free else nearest < MARGIN + 0.004
+            nearest = min(compute_distance(shapes, obstacles, pose) for pose in poses)
+            assert nearest >= MARGIN - MARGIN_TOLERANCE if is_free else nearest < MARGIN + 0.004
             answers.append(is_free)
     assert 0.2 < np.mean(answers) < 0.8
 

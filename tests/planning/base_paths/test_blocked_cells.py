@@ -38,26 +38,26 @@ SCENES = {
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_found_cells_collide_and_few_are_missed(name: str) -> None:
-    standing, rng = SCENES[name], np.random.default_rng(0)
-    grid = BaseGrid(make_chassis(), CARRIED, standing, HALL, MARGIN)
-    blocked, known = np.zeros(2), np.zeros(2)
+def test_blocked_cells_collide_and_few_are_missed(name: str) -> None:
+    obstacles, rng = SCENES[name], np.random.default_rng(0)
+    grid = BaseGrid(make_chassis(), CARRIED, obstacles, HALL, MARGIN)
+    colliding, found = np.zeros(2), np.zeros(2)
     for i, j, heading in rng.integers([100, 100, 16], size=(400, 3)).tolist():
         pose = [*grid.center(i, j), grid.yaws[heading]]
         for body, (shapes, mask) in enumerate(
             ((make_chassis(), grid.blocked), (CARRIED, grid.carried_blocked))
         ):
-            hit = compute_distance(shapes, standing, pose) < MARGIN
+            hit = compute_distance(shapes, obstacles, pose) < MARGIN
             assert hit or not mask[i, j, heading]
-            blocked[body] += hit
-            known[body] += mask[i, j, heading]
-    assert blocked.min() > 25
-    assert known[0] > 0.9 * blocked[0]
-    assert known[1] > 0.4 * blocked[1]  # most others are above the base, where that collides
+            colliding[body] += hit
+            found[body] += mask[i, j, heading]
+    assert colliding.min() > 25
+    assert found[0] > 0.9 * colliding[0]
+    assert found[1] > 0.4 * colliding[1]  # the base collides in most cells that are missed
 
 
-def test_cells_of_a_box_before_a_wall() -> None:
-    """Cells are found whose centres are within half the box and the margin."""
+def test_blocked_cells_of_a_box_near_a_wall() -> None:
+    """A cell is blocked if the wall is closer than half the box plus the margin."""
     lattice = Lattice(np.array([0.05, 0.05]), np.array([0.1, 0.1]), 20, np.array([0.0, np.pi / 2]))
     wall: list[Shape] = [(coal.Box(0.2, 10.0, 1.0), make_pose(1.0, 1.0, 0.5))]
     base, carried = find_colliding_cells(
@@ -70,7 +70,7 @@ def test_cells_of_a_box_before_a_wall() -> None:
     assert not carried.any()
 
 
-def test_only_shapes_of_common_heights_collide() -> None:
+def test_shapes_collide_only_at_common_heights() -> None:
     lattice = Lattice(np.zeros(2), np.full(2, 0.1), 10, np.array([0.0, np.pi]))
     table: list[Shape] = [(coal.Box(5.0, 5.0, 0.05), make_pose(0.5, 0.5, 0.775))]
     low, high = (
@@ -80,22 +80,22 @@ def test_only_shapes_of_common_heights_collide() -> None:
     base, carried = find_colliding_cells(low, high, table, lattice, MARGIN)
     assert not base.any()
     assert carried.all()
-    both, over = find_colliding_cells(
+    both, above = find_colliding_cells(
         low, high, [(coal.Box(5.0, 5.0, 2.0), make_pose(0.5, 0.5, 1.0))], lattice, MARGIN
     )
     assert both.all()
-    assert not over.any()  # within the outline of the base, which collides
+    assert not above.any()  # within the outline of the colliding base
 
 
-def test_flat_shapes_and_unknown_ones_are_ignored() -> None:
+def test_flat_and_unsupported_shapes_are_ignored() -> None:
     lattice = Lattice(np.zeros(2), np.full(2, 0.1), 10, np.array([0.0, np.pi]))
-    odd: list[Shape] = [
+    ignored: list[Shape] = [
         (coal.Ellipsoid(1.0, 1.0, 1.0), make_pose(0.5, 0.5, 0.5)),
         (coal.Box(3.0, 3.0, 0.0), make_pose(0.5, 0.5, 0.1)),
     ]
     base, _ = find_colliding_cells(
-        [(coal.Box(0.5, 0.5, 0.4), make_pose(0.0, 0.0, 0.2))], [], odd, lattice, MARGIN
+        [(coal.Box(0.5, 0.5, 0.4), make_pose(0.0, 0.0, 0.2))], [], ignored, lattice, MARGIN
     )
     assert not base.any()
-    nothing, _ = find_colliding_cells([], [], odd, lattice, MARGIN)
-    assert not nothing.any()
+    empty, _ = find_colliding_cells([], [], ignored, lattice, MARGIN)
+    assert not empty.any()

@@ -6,9 +6,9 @@ import coal
 import numpy as np
 import pytest
 from helpers.base_scenes import (
-    BLINK,
     HALL,
     MARGIN,
+    MARGIN_TOLERANCE,
     compute_distance,
     interpolate_poses,
     make_arm_shapes,
@@ -24,19 +24,19 @@ from vkc_pin.planning.base_paths.base_clearance import Shape
 from vkc_pin.planning.base_paths.grid import HEADINGS, BaseGrid
 from vkc_pin.utils.optional_imports import import_compiled
 
-STANDING = [*make_furniture(), *make_clutter(2, 20)]
+OBSTACLES = [*make_furniture(), *make_clutter(2, 20)]
 
 
 @pytest.fixture(scope="module")
 def grid() -> BaseGrid:
-    return BaseGrid(make_chassis(), make_arm_shapes(), STANDING, HALL, MARGIN)
+    return BaseGrid(make_chassis(), make_arm_shapes(), OBSTACLES, HALL, MARGIN)
 
 
 def sample_states(count: int, seed: int) -> list[list[int]]:
     return np.random.default_rng(seed).integers([100, 100, HEADINGS], size=(count, 3)).tolist()
 
 
-def test_cells_and_headings(grid: BaseGrid) -> None:
+def test_moves_connect_cell_centers_along_their_headings(grid: BaseGrid) -> None:
     assert grid.center(0, 0) == pytest.approx((-4.95, -4.95))
     assert grid.center(99, 50) == pytest.approx((4.95, 0.05))
     assert np.all(np.diff(grid.yaws) > 0.0)
@@ -49,17 +49,17 @@ def test_free_cells_and_poses_agree_with_coal(grid: BaseGrid) -> None:
     answers = []
     for i, j, heading in sample_states(200, 0):
         pose = [*grid.center(i, j), grid.yaws[heading]]
-        base, over = (
-            compute_distance(make_chassis(), STANDING, pose),
-            compute_distance(make_arm_shapes(), STANDING, pose),
+        base, load = (
+            compute_distance(make_chassis(), OBSTACLES, pose),
+            compute_distance(make_arm_shapes(), OBSTACLES, pose),
         )
         assert grid.is_cell_free(i, j, heading, reaching=True) == (base >= MARGIN)
-        assert grid.is_cell_free(i, j, heading) == (min(base, over) >= MARGIN)
-        assert grid.is_pose_free(*pose) == (min(base, over) >= MARGIN)
-        answers.append([base >= MARGIN, over >= MARGIN])
+        assert grid.is_cell_free(i, j, heading) == (min(base, load) >= MARGIN)
+        assert grid.is_pose_free(*pose) == (min(base, load) >= MARGIN)
+        answers.append([base >= MARGIN, load >= MARGIN])
     assert np.all(np.mean(answers, axis=0) > 0.2)
     assert np.all(np.mean(answers, axis=0) < 0.9)
-    assert any(base and not over for base, over in answers)
+    assert any(base and not load for base, load in answers)
 
 
 @pytest.mark.parametrize("reaching", [True, False])
@@ -77,16 +77,16 @@ def test_moves_between_cells_agree_with_coal(grid: BaseGrid, reaching: bool) -> 
             (grid.is_left_turn_free(i, j, heading, reaching=reaching), [*here, turned]),
         ):
             nearest = min(
-                compute_distance(shapes, STANDING, pose)
+                compute_distance(shapes, OBSTACLES, pose)
                 for pose in interpolate_poses([*here, yaw], end, angle=0.01)
             )
-            assert nearest >= MARGIN - BLINK if free else nearest < MARGIN + 0.01
+            assert nearest >= MARGIN - MARGIN_TOLERANCE if free else nearest < MARGIN + 0.01
             answers.append(free)
     assert 0.2 < np.mean(answers) < 0.9
 
 
-def test_distances_use_the_moves_not_known_to_be_blocked(grid: BaseGrid) -> None:
-    """Distances equal those of a graph built move by move, and are lower bounds."""
+def test_distances_exclude_only_moves_known_to_be_blocked(grid: BaseGrid) -> None:
+    """Distances equal those in a graph that is built move by move."""
     start = grid.center(30, 20)
     found = grid.compute_distances(np.array([start[:2]]))[0]
     rows, columns, lengths = [], [], []
@@ -110,7 +110,7 @@ def test_distances_use_the_moves_not_known_to_be_blocked(grid: BaseGrid) -> None
     assert grid.blocked[np.isinf(found)].any(axis=1).all()
 
 
-def test_distances_around_a_wall() -> None:
+def test_distances_lead_around_a_wall() -> None:
     wall: list[Shape] = [(coal.Box(0.1, 8.0, 1.0), make_pose(0.0, -1.0, 0.5))]
     grid = BaseGrid(make_chassis(), [], wall, HALL, MARGIN)
     found = grid.compute_distances(np.array([(-2.0, -3.0)]))[0]
@@ -128,7 +128,7 @@ def test_distances_around_a_wall() -> None:
         )
 
 
-def test_distances_from_blocked_positions() -> None:
+def test_distances_from_a_blocked_position_are_finite_if_cells_are_free() -> None:
     for size, is_finite in ((2.0, True), (20.0, False)):
         block: list[Shape] = [(coal.Box(size, size, 1.0), make_pose(0.0, 0.0, 0.5))]
         grid = BaseGrid(make_chassis(), [], block, HALL, MARGIN)
@@ -136,7 +136,7 @@ def test_distances_from_blocked_positions() -> None:
         assert np.isfinite(distances).any() == is_finite
 
 
-def test_moves_out_of_the_arena_are_rejected(grid: BaseGrid) -> None:
+def test_moves_without_positive_lengths_are_rejected(grid: BaseGrid) -> None:
     floor = import_compiled("vkc_pin.planning.base_paths._driving").Floor
     for lengths in (np.zeros(HEADINGS), -grid.lengths, np.full(HEADINGS, np.nan)):
         with pytest.raises(ValueError, match="lead"):
@@ -144,12 +144,12 @@ def test_moves_out_of_the_arena_are_rejected(grid: BaseGrid) -> None:
 
 
 def test_arena_need_not_be_square() -> None:
-    standing: list[Shape] = [(coal.Box(0.5, 0.5, 1.0), make_pose(4.0, 1.0, 0.5))]
-    grid = BaseGrid(make_chassis(), [], standing, (0.0, 8.0, -1.0, 3.0), MARGIN, cells=40)
+    obstacles: list[Shape] = [(coal.Box(0.5, 0.5, 1.0), make_pose(4.0, 1.0, 0.5))]
+    grid = BaseGrid(make_chassis(), [], obstacles, (0.0, 8.0, -1.0, 3.0), MARGIN, cells=40)
     assert grid.step == pytest.approx([0.2, 0.1])
     for i, j, heading in sample_states(300, 0):
         i, j = i % 40, j % 40
         pose = [*grid.center(i, j), grid.yaws[heading]]
-        free = compute_distance(make_chassis(), standing, pose) >= MARGIN
+        free = compute_distance(make_chassis(), obstacles, pose) >= MARGIN
         assert grid.is_cell_free(i, j, heading) == free
         assert not (free and grid.blocked[i, j, heading])

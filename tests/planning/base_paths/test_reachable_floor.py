@@ -55,11 +55,11 @@ def test_obstacles_above_or_below_the_base_are_no_walls() -> None:
     )
     (plate,) = discs.make_walls(
         [make_box((1.0, 1.0, 0.01), (0.0, 0.0, 0.225))]
-    )  # thinner than the distance of levels
+    )  # thinner than the spacing of levels
     assert plate.radius == pytest.approx(0.335)
 
 
-def test_no_base_and_no_obstacle() -> None:
+def test_no_walls_without_base_or_obstacles() -> None:
     assert InscribedDiscs([]).make_walls([make_box((1.0, 1.0, 1.0), (0.0, 0.0, 0.5))]) == []
     assert InscribedDiscs(BASE).make_walls([]) == []
 
@@ -67,7 +67,7 @@ def test_no_base_and_no_obstacle() -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_base_collides_in_blocked_cells_at_every_heading(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    tilt = pin.SE3(
+    placement = pin.SE3(
         pin.rpy.rpyToMatrix(*rng.uniform(-0.6, 0.6, 3)),
         np.array([0.1, -0.2, rng.uniform(0.1, 0.3)]),
     )
@@ -79,18 +79,19 @@ def test_base_collides_in_blocked_cells_at_every_heading(seed: int) -> None:
     ][seed]
     cells, count = CellGrid.over(np.full(2, -1.5), np.full(2, 1.5), 0.05), 0
     request, result = coal.CollisionRequest(), coal.CollisionResult()
-    for wall in InscribedDiscs(BASE).make_walls([(shape, tilt)]):
-        (rows, columns), own = find_blocked_cells(cells, wall, -0.05 * np.sqrt(0.5))
+    for wall in InscribedDiscs(BASE).make_walls([(shape, placement)]):
+        (rows, columns), is_blocked = find_blocked_cells(cells, wall, -0.05 * np.sqrt(0.5))
         x, y = cells.centers()
-        for i, j in rng.permutation(np.argwhere(own))[:40].tolist():
+        for i, j in rng.permutation(np.argwhere(is_blocked))[:40].tolist():
             at = np.array([x[rows][i, 0], y[:, columns][0, j]]) + rng.uniform(-0.025, 0.025, 2)
             pose = pin.SE3(pin.utils.rotate("z", rng.uniform(-np.pi, np.pi)), np.array([*at, 0.0]))
             hit = False
-            for part, where in BASE:
+            for part, local in BASE:
                 result.clear()
-                there = pose * where
+                placed = pose * local
                 transforms = [
-                    coal.Transform3s(place.rotation, place.translation) for place in (there, tilt)
+                    coal.Transform3s(each.rotation, each.translation)
+                    for each in (placed, placement)
                 ]
                 hit |= coal.collide(part, transforms[0], shape, transforms[1], request, result) > 0
             assert hit

@@ -16,7 +16,7 @@ RADII = st.floats(0.2, 3.0)
 
 
 def follow(pieces: list[tuple[float, float]]) -> np.ndarray:
-    """Return the end of pieces (length, turn), by a chord for each arc."""
+    """Return the end pose of pieces (length, turn), each followed along its chord."""
     pose = np.zeros(3)
     for length, turn in pieces:
         heading, chord = pose[2] + turn / 2, length * np.sinc(turn / (2 * np.pi))
@@ -52,19 +52,18 @@ def test_length_is_invariant_to_reversal_and_mirroring(goal: tuple[float, float,
     assert lengths[0] >= abs(yaw) - 1e-9
 
 
-def test_no_random_word_is_shorter() -> None:
-    """Random words of up to five pieces are no shorter than the shortest path."""
+def test_shortest_path_is_no_longer_than_random_words() -> None:
     rng = np.random.default_rng(0)
     for count, _ in itertools.product(range(1, 6), range(100)):
         pieces = [
-            (length, length * way)
-            for length, way in zip(
+            (length, length * curvature)
+            for length, curvature in zip(
                 rng.uniform(-2, 2, count), rng.integers(-1, 2, count), strict=True
             )
         ]
-        where = follow(pieces)
-        where[2] = (where[2] + np.pi) % (2 * np.pi) - np.pi
-        (length,), _ = compute_lengths(where[None], 1.0)
+        end = follow(pieces)
+        end[2] = (end[2] + np.pi) % (2 * np.pi) - np.pi
+        (length,), _ = compute_lengths(end[None], 1.0)
         assert length <= sum(abs(piece) for piece, _ in pieces) + 1e-6
 
 
@@ -79,5 +78,5 @@ def test_no_random_word_is_shorter() -> None:
         ((0.0, 0.0, 0.0), 0.0),
     ],
 )
-def test_known_lengths(goal: tuple[float, float, float], length: float) -> None:
+def test_lengths_of_known_paths(goal: tuple[float, float, float], length: float) -> None:
     assert compute_lengths(np.array([goal]), 1.0)[0][0] == pytest.approx(length, abs=1e-6)

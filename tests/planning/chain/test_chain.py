@@ -1,4 +1,4 @@
-"""Compares the virtual kinematic chain with the robot and the objects it consists of."""
+"""Compares the virtual kinematic chain with its robot and objects."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def assert_same(first: pin.SE3, second: pin.SE3, tolerance: float = 1e-10) -> No
 def compute_virtual_motion(
     chain: VirtualKinematicChain, scene: Scene, name: str, grasp: str, z: np.ndarray
 ) -> pin.SE3:
-    """J(v) and the standoff after it, from their definition."""
+    """Return J(v) followed by the standoff, from their definition."""
     attachment = scene.objects[name].object.attachments[grasp]
 
     def value(suffix: str) -> float:
@@ -99,7 +99,7 @@ def compute_virtual_motion(
 def get_object_state(
     chain: VirtualKinematicChain, scene: Scene, name: str, z: np.ndarray
 ) -> np.ndarray:
-    """The object's own coordinates: those of the chain, and those it leaves as they are."""
+    """Return the object's coordinates, from the chain or else from the scene."""
     placed = scene.objects[name]
     values = [
         z[chain.index(f"{name}.{joint}")] if f"{name}.{joint}" in chain.names else value
@@ -108,14 +108,17 @@ def get_object_state(
     return np.array(values)
 
 
-def test_the_chain_begins_with_the_robot() -> None:
+def test_chain_begins_with_the_robot() -> None:
     scene = make_full_scene()
     chain, robot = consolidate(scene, GRASPS[-1]), scene.robot
     for z in sample_configurations(chain.lower, chain.upper, 4, np.random.default_rng(0)):
         q, q_robot = chain.coordinates.q(z), robot.coordinates.q(z[: robot.coordinates.size])
-        of_chain, of_robot = compute_frames(chain.model, q), compute_frames(robot.model, q_robot)
+        chain_frames, robot_frames = (
+            compute_frames(chain.model, q),
+            compute_frames(robot.model, q_robot),
+        )
         for index, frame in enumerate(robot.model.frames):
-            assert_same(of_chain[chain.model.getFrameId(frame.name)], of_robot[index])
+            assert_same(chain_frames[chain.model.getFrameId(frame.name)], robot_frames[index])
         found = compute_shapes(chain.model, chain.collision, q)
         expected = compute_shapes(robot.model, robot.collision, q_robot)
         for one, other in zip(found, expected, strict=False):
@@ -137,7 +140,7 @@ def test_the_chain_begins_with_the_robot() -> None:
         ),
     ],
 )
-def test_names_and_limits_follow_the_joints(
+def test_names_and_limits_are_those_of_the_joints(
     grasps: dict[str, str], added: list[str], limits: list[tuple[float, float, float, float]]
 ) -> None:
     scene = make_full_scene()
@@ -159,7 +162,7 @@ def test_names_and_limits_follow_the_joints(
         assert chain.index(name) == index
 
 
-def test_geometry_is_that_of_the_robot_and_of_moving_links() -> None:
+def test_geometry_consists_of_the_robot_and_moving_links() -> None:
     scene = make_full_scene()
     held = {
         Hold("door", "handle"): ["panel_0", "lever_0", "lever_1"],
@@ -250,19 +253,23 @@ CARRIED = [
 
 @cache
 def make_carried_scene() -> Scene:
-    """Return stick, ball, and a cabinet that can be carried away."""
-    scene, case = make_room(objects=("stick", "ball")), make_full_scene().objects["cabinet"]
+    """Return a scene with stick, ball, and a free cabinet."""
+    scene, cabinet = make_room(objects=("stick", "ball")), make_full_scene().objects["cabinet"]
     return replace_objects(
         scene,
-        {"cabinet": dataclasses.replace(case, object=dataclasses.replace(case.object, free=True))},
+        {
+            "cabinet": dataclasses.replace(
+                cabinet, object=dataclasses.replace(cabinet.object, free=True)
+            )
+        },
     )
 
 
 def compute_expected_frames(
     chain: VirtualKinematicChain, scene: Scene, hold: Hold, z: np.ndarray
 ) -> tuple[pin.SE3, dict[str, pin.SE3]]:
-    """Return the placements of an object's base and links, multiplied from the robot outwards."""
-    thing, grasp = (
+    """Return the placements of an object's base and links, computed from the robot outwards."""
+    item, grasp = (
         scene.objects[hold.object].object,
         scene.objects[hold.object].object.attachments[hold.attachment],
     )
@@ -274,10 +281,10 @@ def compute_expected_frames(
     else:
         holder = compute_expected_frames(chain, scene, hold.by, z)[1][hold.link or ""]
     own = compute_frames(
-        thing.model, thing.coordinates.q(get_object_state(chain, scene, hold.object, z))
+        item.model, item.coordinates.q(get_object_state(chain, scene, hold.object, z))
     )
     links = {
-        f.name: own[i] for i, f in enumerate(thing.model.frames) if f.type == pin.FrameType.BODY
+        f.name: own[i] for i, f in enumerate(item.model.frames) if f.type == pin.FrameType.BODY
     }
     motion = compute_virtual_motion(chain, scene, hold.object, hold.attachment, z)
     base = holder * (links[grasp.link] * grasp.placement * motion).inverse()
@@ -298,7 +305,10 @@ def test_objects_follow_hand_and_grasp(scene: Callable[[], Scene], holds: tuple[
         assert tuple(table) == holds
     for z in sample_configurations(chain.lower, chain.upper, 3, np.random.default_rng(4)):
         q = chain.coordinates.q(z)
-        of_shapes, data = compute_shapes(chain.model, chain.collision, q), chain.model.createData()
+        shape_placements, data = (
+            compute_shapes(chain.model, chain.collision, q),
+            chain.model.createData(),
+        )
         pin.forwardKinematics(chain.model, data, q)
         for hold in holds:
             placed = objects[hold.object]
@@ -310,11 +320,13 @@ def test_objects_follow_hand_and_grasp(scene: Callable[[], Scene], holds: tuple[
             assert_same(data.oMi[closure.joint] * closure.local, base)
             assert_same(closure.target, placed.link_placement(placed.object.base_link))
             state = get_object_state(chain, scene(), hold.object, z)
-            there = make_world_shapes(dataclasses.replace(placed, placement=base, state=state))
-            expected = {shape.name: shape.placement for shape in there}
+            world_shapes = make_world_shapes(
+                dataclasses.replace(placed, placement=base, state=state)
+            )
+            expected = {shape.name: shape.placement for shape in world_shapes}
             for index in chain.held_geometries[hold]:
                 shape = chain.collision.geometryObjects[index]
-                assert_same(of_shapes[index], expected[shape.name.rpartition(".")[2]])
+                assert_same(shape_placements[index], expected[shape.name.rpartition(".")[2]])
                 assert shape.parentJoint > 1
 
 
@@ -327,7 +339,7 @@ def test_all_links_of_a_free_object_move() -> None:
     assert names == {"cabinet.case_0", "cabinet.lid_0"}
 
 
-def test_every_hold_has_shapes_joints_and_names_of_its_own() -> None:
+def test_every_hold_has_its_own_shapes_joints_and_names() -> None:
     holds = (STICK, BALL, END, PULLED)
     chain = consolidate(make_carried_scene(), holds)
     robot = make_carried_scene().robot
@@ -347,12 +359,12 @@ def test_every_hold_has_shapes_joints_and_names_of_its_own() -> None:
     assert [len(chain.held_geometries[hold]) for hold in holds] == [5, 1, 5, 1]
     names = [shape.name for shape in chain.collision.geometryObjects]
     assert len(set(names)) == len(names)
-    body = [frame.name for frame in chain.model.frames]
-    assert len(set(body)) == len(body)
+    frames = [frame.name for frame in chain.model.frames]
+    assert len(set(frames)) == len(frames)
 
 
 def test_attachment_held_twice_is_rejected() -> None:
-    """Its freedom would have one name for two coordinates; without freedoms that is allowed."""
+    """Two coordinates would have the same name."""
     with pytest.raises(InputError, match="two coordinates share this name") as caught:
         consolidate(make_carried_scene(), [STICK, PULLED, Hold("ball", "pull")])
     assert str(caught.value.field).startswith("ball.pull_")

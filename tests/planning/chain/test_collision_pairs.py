@@ -48,11 +48,11 @@ def list_pairs(
 ) -> dict[tuple[str, str], list[float]]:
     """Return (link, link or obstacle) → margins of their pairs at a waypoint, or unreduced."""
     part = problem.contacts.phases[phase]
-    every = np.arange(len(part.pairs))
+    all_pairs = np.arange(len(part.pairs))
     margins = (
         part.margins
         if waypoint is None
-        else get_margins(part, every, np.full(len(every), waypoint))
+        else get_margins(part, all_pairs, np.full(len(all_pairs), waypoint))
     )
     found = collections.defaultdict(list)
     for (first, second), margin in zip(part.pairs, margins, strict=True):
@@ -61,7 +61,7 @@ def list_pairs(
 
 
 def count_link_pairs(problem: TrajectoryProblem, phase: int) -> dict[tuple[str, str], int]:
-    """Return (link, link or obstacle) → number of pairs, without those of the robot itself."""
+    """Return (link, link or obstacle) → number of pairs, without the robot's own pairs."""
     robot = set(problem.scene.robot.links)
     return {
         key: len(found) for key, found in list_pairs(problem, phase).items() if key[1] not in robot
@@ -69,7 +69,7 @@ def count_link_pairs(problem: TrajectoryProblem, phase: int) -> dict[tuple[str, 
 
 
 def count_shapes(problem: TrajectoryProblem) -> collections.Counter[str]:
-    """Return the number of shapes of each link of the robot and its objects, and obstacle."""
+    """Return the number of shapes of each obstacle and each link of the robot and objects."""
     scene = problem.scene
     robot = scene.robot.collision.geometryObjects
     counts = collections.Counter(get_link_name(shape.name) for shape in robot)
@@ -81,7 +81,7 @@ def count_shapes(problem: TrajectoryProblem) -> collections.Counter[str]:
 
 @pytest.mark.parametrize("phase", [0, 1, 2, 3])
 def test_pairs_of_every_phase(phase: int) -> None:
-    """Robot against all else, a grasped object against all that it does not move with."""
+    """The robot is paired with everything, a grasped object with robot and obstacles."""
     problem = make_door_problem()
     scene, part = problem.scene, problem.contacts.phases[phase]
     shapes = scene.robot.collision.geometryObjects
@@ -124,7 +124,7 @@ def test_hand_margins_are_reduced_before_grasps_and_after_releases() -> None:
 def test_attachment_sets_the_clearance_of_hand_and_object(
     own: float | None, expected: float
 ) -> None:
-    """It never exceeds the usual margin, and does not apply to anything else."""
+    """It never exceeds the usual margin, and applies to no other pairs."""
     scene = load_door_scene()
     placed = scene.objects["door"]
     handle = dataclasses.replace(placed.object.attachments["handle"], name="near", clearance=own)
@@ -140,7 +140,7 @@ def test_attachment_sets_the_clearance_of_hand_and_object(
             }
 
 
-def test_objects_stay_where_earlier_phases_left_them() -> None:
+def test_objects_keep_the_state_of_earlier_phases() -> None:
     problem = make_door_problem()
     knob = problem.task.phases[3].initial_values["door.knob"]
     for phase, state in ((0, {}), (3, {"hinge": 1.2, "knob": knob})):
@@ -166,19 +166,19 @@ def test_grasped_object_is_paired_with_other_objects() -> None:
 
 
 def test_links_of_a_grasped_object_that_can_collide_are_paired() -> None:
-    meeting = frozenset({frozenset({"arm", "flap"}), frozenset({"tray", "lid"})})
+    colliding = frozenset({frozenset({"arm", "flap"}), frozenset({"tray", "lid"})})
     placed = make_full_scene().objects["cabinet"]
     placed = dataclasses.replace(
-        placed, object=dataclasses.replace(placed.object, own_pairs=meeting)
+        placed, object=dataclasses.replace(placed.object, own_pairs=colliding)
     )
     scene = replace_objects(make_full_scene(), {"cabinet": placed})
     found = list_pairs(make_program(scene, [Actuate("cabinet", {"swing": 0.5})], options=SHORT), 1)
     own = {key: found[key] for key in found if all(k.startswith("cabinet.") for k in key)}
-    assert {frozenset(link.removeprefix("cabinet.") for link in key) for key in own} == meeting
+    assert {frozenset(link.removeprefix("cabinet.") for link in key) for key in own} == colliding
     assert all(set(margins) == {MARGIN} for margins in own.values())
 
 
-def test_objects_grasped_one_after_the_other() -> None:
+def test_objects_grasped_in_sequence_have_pairs_only_while_held() -> None:
     steps = [Grasp("door"), Actuate("drawer", {"slide": 0.2})]
     problem = make_program(make_full_scene(), steps, options=SHORT)
     phases = problem.task.phases
@@ -231,7 +231,7 @@ def make_moving_problem(scene: Scene, slide: float = 0.3) -> tuple[TrajectoryPro
 
 
 def test_neighbours_are_exempt_at_their_initial_positions() -> None:
-    """They keep half their initial distance, unless one starts away from the other's side."""
+    """They keep half their initial distance, unless one starts outside the exempt range."""
     problem, number = make_moving_problem(make_drawers())
     (exemption,) = find_clearance_exemptions(make_drawers(), SHORT.dist_safe)
     part = problem.contacts.phases[number]

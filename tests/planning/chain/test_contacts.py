@@ -23,7 +23,7 @@ from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.budget import Budget, BudgetExhaustedError
 from vkc_pin.world.task.steps import Actuate, GoTo
 
-COAL = 5e-6  # [m], differences between distances of coal, which depend on its last query
+COAL_TOLERANCE = 5e-6  # [m], since coal's distances depend on its previous query
 
 
 @cache
@@ -51,7 +51,7 @@ def compute_all_distances(problem: TrajectoryProblem, phase: int, z: np.ndarray)
 
 @cache
 def sample_distances(phase: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return random configurations of the door problem and the distances of all pairs there."""
+    """Return random configurations of the door problem and the distances of all pairs."""
     problem = make_door_problem()
     z = sample_configurations(
         problem.chain.lower, problem.chain.upper, 120, np.random.default_rng(phase)
@@ -71,11 +71,11 @@ def test_all_pairs_within_reach_are_found_with_their_distances(phase: int) -> No
     assert len(set(zip(contacts.waypoint.tolist(), which.tolist(), strict=True))) == len(which)
     found = np.zeros(distances.shape, bool)
     found[contacts.waypoint, which] = True
-    sure = np.abs(distances - reach) > 1e-5
-    np.testing.assert_array_equal(found[sure], (distances < reach)[sure])
+    is_certain = np.abs(distances - reach) > 1e-5
+    np.testing.assert_array_equal(found[is_certain], (distances < reach)[is_certain])
     assert np.all(contacts.distance < reach)
     np.testing.assert_allclose(
-        contacts.distance, distances[contacts.waypoint, which], rtol=0.0, atol=COAL
+        contacts.distance, distances[contacts.waypoint, which], rtol=0.0, atol=COAL_TOLERANCE
     )
     np.testing.assert_array_equal(
         contacts.margin, get_margins(part, which, waypoints[contacts.waypoint])
@@ -100,9 +100,11 @@ def test_batch_evaluation_equals_single_evaluations() -> None:
         here = together.waypoint == row
         np.testing.assert_array_equal(together.pair[here], alone.pair)
         np.testing.assert_array_equal(together.margin[here], alone.margin)
-        np.testing.assert_allclose(together.distance[here], alone.distance, rtol=0.0, atol=COAL)
         np.testing.assert_allclose(
-            together.normal[here], alone.normal, rtol=0.0, atol=np.sqrt(COAL)
+            together.distance[here], alone.distance, rtol=0.0, atol=COAL_TOLERANCE
+        )
+        np.testing.assert_allclose(
+            together.normal[here], alone.normal, rtol=0.0, atol=np.sqrt(COAL_TOLERANCE)
         )
         assert not alone.waypoint.any()
 
@@ -151,16 +153,16 @@ def test_waypoints_between_phases_belong_to_the_earlier_phase() -> None:
 
 @pytest.mark.parametrize("phase", [0, 2])
 def test_planes_have_value_and_gradient_of_the_signed_distance(phase: int) -> None:
-    """Where a distance bends, the slope must lie between the one-sided differences."""
+    """At kinks of the distance, the slope must lie between the one-sided differences."""
     problem, step, slots = make_door_problem(), 1e-4, 40
     chain, rng = problem.chain, np.random.default_rng(phase)
     z, distances = (part[:30] for part in sample_distances(phase))
     waypoints = np.full(len(z), problem.ends[phase])
     contacts = problem.contacts.evaluate(z, waypoints, reach=0.25, nearest=slots)
     planes, offsets = problem.contacts.compute_planes(z, contacts, slots=slots)
-    place = contacts.waypoint, contacts.slot
+    at = contacts.waypoint, contacts.slot
     is_unused = np.ones((len(z), slots), bool)
-    is_unused[place] = False
+    is_unused[at] = False
     assert not planes[is_unused].any()
     assert (offsets[is_unused] == -1.0).all()
 
@@ -168,10 +170,10 @@ def test_planes_have_value_and_gradient_of_the_signed_distance(phase: int) -> No
         rotations, translations = chain.joint_placements(z)
         columns = [rotations[:, 1:].swapaxes(2, 3), translations[:, 1:, None]]
         placements = np.concatenate(columns, axis=2).reshape(len(z), -1)
-        return np.einsum("ci,ci->c", planes[place], placements[contacts.waypoint])
+        return np.einsum("ci,ci->c", planes[at], placements[contacts.waypoint])
 
     shortfall = contacts.distance - contacts.margin
-    np.testing.assert_allclose(evaluate(z) - offsets[place], shortfall, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(evaluate(z) - offsets[at], shortfall, rtol=0.0, atol=1e-9)
     gradients = problem.contacts.compute_gradients(z, contacts)
     numbers = {
         tuple(pair): k for k, pair in enumerate(problem.contacts.phases[phase].pairs.tolist())
@@ -200,8 +202,8 @@ def test_planes_of_the_worst_contacts_are_kept() -> None:
     np.testing.assert_array_equal(few_offsets, many_offsets[:, :2])
 
 
-def test_evaluations_are_charged_to_the_budget() -> None:
-    """The search for the first collision stops there."""
+def test_evaluations_count_towards_the_budget() -> None:
+    """The search for the first collision stops at that waypoint."""
     problem = make_door_problem()
     z = np.tile(problem.start, (5, 1))
     inside = z.copy()

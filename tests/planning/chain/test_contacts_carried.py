@@ -1,4 +1,4 @@
-"""Tests collision pairs of carried objects, and of objects released where the motion chooses."""
+"""Tests collision pairs of carried objects, and of objects released at optimized poses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import GoTo, Grasp, Place, Reach, Release
 
-COAL = 5e-6  # [m], differences between distances of coal, which depend on its last query
+COAL_TOLERANCE = 5e-6  # [m], since coal's distances depend on its previous query
 MARGIN, CLOSE = SHORT.dist_safe, SHORT.grasp_clearance
 ASIDE = lift(STICK, [0.0, 0.5, 0.0])
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
@@ -27,7 +27,7 @@ def make_scene() -> Scene:
 
 @cache
 def make_placing_problem() -> TrajectoryProblem:
-    """Return the problem of taking the stick, putting it elsewhere, and driving away."""
+    """Return the problem of picking up the stick, placing it elsewhere, and driving away."""
     return make_program(make_scene(), [Place("stick", ASIDE), GoTo(0.0, 0.0)], options=SHORT)
 
 
@@ -49,15 +49,17 @@ def make_fetching_problem() -> TrajectoryProblem:
 def list_margins(
     problem: TrajectoryProblem, phase: int, *, at: str = ""
 ) -> dict[tuple[str, str], set[float]]:
-    """Return (link, link or obstacle) → margins of pairs, "first" or "last", or unreduced."""
-    part, every = (
+    """Return (link, link or obstacle) → margins at the first or last waypoint, or unreduced."""
+    part, all_pairs = (
         problem.contacts.phases[phase],
         np.arange(len(problem.contacts.phases[phase].pairs)),
     )
     found: dict[tuple[str, str], set[float]] = {}
     waypoint = problem.contacts.first_waypoint[phase + (at == "last")]
-    asked = get_margins(part, every, np.full(len(every), waypoint)) if at else part.margins
-    for (first, second), margin in zip(part.pairs, asked, strict=True):
+    margins = (
+        get_margins(part, all_pairs, np.full(len(all_pairs), waypoint)) if at else part.margins
+    )
+    for (first, second), margin in zip(part.pairs, margins, strict=True):
         found.setdefault((part.labels[first], part.labels[second]), set()).add(float(margin))
     return found
 
@@ -66,8 +68,8 @@ def list_partners(problem: TrajectoryProblem, phase: int, label: str) -> set[str
     return {a if b == label else b for a, b in list_margins(problem, phase) if label in (a, b)}
 
 
-def test_pairs_of_carried_and_resting_objects() -> None:
-    """A carried object is paired with everything but itself and the hand."""
+def test_carried_objects_are_paired_with_everything_but_the_hand() -> None:
+    """Resting objects are paired with the robot and carried objects only."""
     robot = make_scene().robot
     for phase in (0, 2):
         for label in ("stick.stick", "stick.tip", "ball.ball"):
@@ -101,11 +103,11 @@ def test_grasping_object_may_touch_the_grasped_one() -> None:
     assert before["stick.stick", "ball.ball"] == {MARGIN}
     assert before[make_scene().robot.touch_links[0], "ball.ball"] == {
         MARGIN
-    }  # the hand is not what takes it
+    }  # the stick grasps the ball, not the hand
     assert ("stick.tip", "ball.ball") not in held
     assert held["stick.stick", "ball.ball"] == {MARGIN}
-    robots = set(make_scene().robot.links)
-    assert list_partners(make_fetching_problem(), 2, "ball.ball") == robots | {
+    robot_links = set(make_scene().robot.links)
+    assert list_partners(make_fetching_problem(), 2, "ball.ball") == robot_links | {
         "stick.stick",
         "table",
         "stand",
@@ -116,7 +118,7 @@ def test_grasping_object_may_touch_the_grasped_one() -> None:
 
 
 def compute_expected_placement(problem: TrajectoryProblem, name: str, row: np.ndarray) -> pin.SE3:
-    """Return where the chain has an object at a configuration."""
+    """Return the placement of a held object at a configuration of the chain."""
     hold = next(hold for hold in problem.task.holds if hold.object == name)
     closure, data = problem.chain.closures[hold], problem.chain.model.createData()
     pin.forwardKinematics(problem.chain.model, data, problem.chain.coordinates.q(row))
@@ -129,18 +131,18 @@ def test_released_placements_do_not_depend_on_earlier_queries() -> None:
         problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(4)
     )
     waypoints = np.arange(1, problem.segments + 1)
-    before = problem.contacts.evaluate(z, waypoints, reach=0.3)  # as the task expects
+    before = problem.contacts.evaluate(z, waypoints, reach=0.3)  # with expected placements
     first, other, again = (problem.evaluate_contacts(rows, reach=0.3) for rows in (z, z[::-1], z))
     after = problem.contacts.evaluate(z, waypoints, reach=0.3)
     assert not np.array_equal(before.pair, first.pair)
     assert not np.array_equal(first.pair, other.pair)
     for one, same in ((before, after), (first, again)):
         np.testing.assert_array_equal(one.pair, same.pair)
-        np.testing.assert_allclose(one.distance, same.distance, rtol=0.0, atol=COAL)
+        np.testing.assert_allclose(one.distance, same.distance, rtol=0.0, atol=COAL_TOLERANCE)
 
 
 def test_distances_equal_those_of_the_scene_after_the_release() -> None:
-    """Compares with a problem of the last phase alone, in the scene that the motion leaves."""
+    """The reference is a problem of the last phase alone, in the scene after the release."""
     problem = make_fetching_problem()
     z = sample_configurations(
         problem.chain.lower,
@@ -150,17 +152,19 @@ def test_distances_equal_those_of_the_scene_after_the_release() -> None:
         arena=1.0,
     )
     contacts = problem.evaluate_contacts(z, reach=0.3)
-    stands = make_scene()
+    released_scene = make_scene()
     for name, end in (("ball", problem.ends[2]), ("stick", problem.ends[4])):
-        stands = stands.with_placement(name, compute_expected_placement(problem, name, z[end - 1]))
-    alone = make_program(stands, [GoTo(1.0, 0.0)], options=SHORT)
+        released_scene = released_scene.with_placement(
+            name, compute_expected_placement(problem, name, z[end - 1])
+        )
+    alone = make_program(released_scene, [GoTo(1.0, 0.0)], options=SHORT)
     rows = np.arange(problem.ends[4], problem.ends[5])
-    seen = alone.contacts.evaluate(
+    reference = alone.contacts.evaluate(
         z[rows][:, : alone.chain.size], np.ones(len(rows), int), reach=0.3
     )
     labels, own = problem.contacts.phases[5].labels, alone.contacts.phases[0].labels
 
-    def table_of(found, labels, offset):  # type: ignore[no-untyped-def]
+    def make_table(found, labels, offset):  # type: ignore[no-untyped-def]
         return sorted(
             (int(row) - offset, labels[a], labels[b], round(float(distance), 5))
             for row, (a, b), distance in zip(
@@ -169,9 +173,9 @@ def test_distances_equal_those_of_the_scene_after_the_release() -> None:
             if int(row) >= offset
         )
 
-    first, second = table_of(contacts, labels, int(rows[0])), table_of(seen, own, 0)
-    assert [entry[:3] for entry in first] == [entry[:3] for entry in second]
+    table, expected = make_table(contacts, labels, int(rows[0])), make_table(reference, own, 0)
+    assert [entry[:3] for entry in table] == [entry[:3] for entry in expected]
     np.testing.assert_allclose(
-        [entry[3] for entry in first], [entry[3] for entry in second], rtol=0.0, atol=2e-5
+        [entry[3] for entry in table], [entry[3] for entry in expected], rtol=0.0, atol=2e-5
     )
-    assert any("ball.ball" in entry for entry in first)
+    assert any("ball.ball" in entry for entry in table)

@@ -1,4 +1,4 @@
-"""Tests temporarily reduced margins: lifting, placing and touching."""
+"""Tests margins that are temporarily reduced for lifting, placing and touching."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from helpers.carrying import (
     solve_above,
     solve_reach,
 )
-from helpers.riding import describe_cup, make_plate_scene, make_scene
 from helpers.small_problems import SHORT, get_margins, make_program
+from helpers.supports import describe_cup, make_plate_scene, make_scene
 
 from vkc_pin.planning.chain.easing import REDUCED_MARGIN_RATIO
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
@@ -29,7 +29,7 @@ from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step, Touch
 
-GAP = 4e-3  # [m] of what the stick lies on
+GAP = 4e-3  # [m] between the stick and its support
 NEAR = SHORT.steps(CONTACT_WINDOW)
 LONG = dataclasses.replace(SHORT, reach_waypoints=2 * NEAR + 3)
 N = LONG.reach_waypoints
@@ -41,7 +41,7 @@ def make_problem(scene: Scene, *steps: Step) -> TrajectoryProblem:
 
 
 def compute_margins(p: TrajectoryProblem, phase: int) -> dict[tuple[str, str], np.ndarray]:
-    """Return links → smallest reduced margin at each waypoint of a phase, except of the hand."""
+    """Return links → smallest reduced margin at each waypoint of a phase, without the hand."""
     part, first = p.contacts.phases[phase], int(p.contacts.first_waypoint[phase])
     waypoints = range(first, first + p.task.phases[phase].segments + 1)
     found: dict[tuple[str, str], np.ndarray] = {}
@@ -55,7 +55,12 @@ def compute_margins(p: TrajectoryProblem, phase: int) -> dict[tuple[str, str], n
 
 
 def assert_reduced(
-    row: np.ndarray, margin: float, *, begin: bool = False, end: bool = False, within: float = 1e-6
+    row: np.ndarray,
+    margin: float,
+    *,
+    begin: bool = False,
+    end: bool = False,
+    tolerance: float = 1e-6,
 ) -> None:
     """Assert that a margin applies near begin or end, and dist_safe elsewhere."""
     expected = np.full(N + 1, LONG.dist_safe)
@@ -63,7 +68,7 @@ def assert_reduced(
         expected[: NEAR + 1] = margin
     if end:
         expected[-NEAR - 1 :] = margin
-    np.testing.assert_allclose(row, expected, rtol=0.0, atol=within)
+    np.testing.assert_allclose(row, expected, rtol=0.0, atol=tolerance)
 
 
 def test_margins_are_not_reduced_without_need() -> None:
@@ -74,37 +79,37 @@ def test_margins_are_not_reduced_without_need() -> None:
 
 
 def test_margins_are_reduced_where_objects_are_lifted_and_placed() -> None:
-    """Placed elsewhere, or grasped again, an object has its margins reduced there."""
+    """An object that is placed elsewhere and lifted again has reduced margins there, too."""
     steps = [Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 1.0)]
     p = make_problem(make_room(describe_table(gap=GAP)), *steps)
     names = ["reach stick.grip", "place stick", "reach stick.grip", "go to"]
     assert [phase.name for phase in p.task.phases] == names
     assert [compute_margins(p, phase) for phase in (0, 2)] == [{}, {}]
-    for phase, where in ((1, {"begin": True, "end": True}), (3, {"begin": True})):
+    for phase, windows in ((1, {"begin": True, "end": True}), (3, {"begin": True})):
         found = compute_margins(p, phase)
         assert set(found) == {("stick.stick", "table")}
-        assert_reduced(found["stick.stick", "table"], REDUCED_MARGIN_RATIO * GAP, **where)
+        assert_reduced(found["stick.stick", "table"], REDUCED_MARGIN_RATIO * GAP, **windows)
 
 
 def test_margin_is_half_the_distance_of_each_shape() -> None:
     wall = describe_box("wall", [0.3, 0.02, 0.3], [0.8, 0.25 + 0.01 + 0.01, TOP + 0.1])
     p = make_problem(make_room(describe_table(gap=GAP), wall), Place("stick", ASIDE))
     part, first = p.contacts.phases[1], int(p.contacts.first_waypoint[1])
-    eased = {
+    reduced = {
         (part.shapes[i].name, part.labels[j]): [*part.reduced_margins[k]]
         for k, (i, j) in enumerate(part.pairs.tolist())
         if k in part.reduced_margins
     }
-    assert set(eased) >= {
+    assert set(reduced) >= {
         ("stick.stick_1", "table"),
         ("stick.stick_2", "table"),
         ("stick.tip_1", "wall"),
     }
-    assert not {name for name, label in eased if label == "table"} - {
+    assert not {name for name, label in reduced if label == "table"} - {
         "stick.stick_1",
         "stick.stick_2",
     }
-    ((begin, end, margin),) = eased["stick.tip_1", "wall"]  # at the other end the wall is far away
+    ((begin, end, margin),) = reduced["stick.tip_1", "wall"]  # the wall is far from the other end
     assert (begin, end) == (first, first + NEAR)
     assert margin == pytest.approx(REDUCED_MARGIN_RATIO * 0.01, abs=1e-6)
 
@@ -173,13 +178,13 @@ def test_margins_of_supported_objects_are_reduced_where_transport_begins() -> No
 
 
 def test_margins_of_objects_on_a_tray_are_reduced_where_it_is_lifted() -> None:
-    """A cup on a tray is 1 cm in front of a wall; there is none where the tray is placed."""
-    things = [
+    """A cup on a tray is 1 cm in front of a wall. The tray is placed away from the wall."""
+    objects = [
         {"name": "tray", "type": "tray.yaml", "position": [0.8, 0.0, 0.7]},
         describe_cup(at=(0.82, 0.05, 0.72)),
     ]
     p = make_problem(
-        make_scene(things, [describe_box("wall", [0.02, 0.02, 0.05], [0.875, 0.05, 0.78])]),
+        make_scene(objects, [describe_box("wall", [0.02, 0.02, 0.05], [0.875, 0.05, 0.78])]),
         Place("tray", (-0.5, -1.5, 0.7)),
     )
     (number,) = (k for k, phase in enumerate(p.task.phases) if phase.supported)
@@ -187,7 +192,7 @@ def test_margins_of_objects_on_a_tray_are_reduced_where_it_is_lifted() -> None:
         compute_margins(p, number)["cup.cup", "wall"],
         REDUCED_MARGIN_RATIO * 0.01,
         begin=True,
-        within=1e-4,
+        tolerance=1e-4,
     )
 
 
@@ -219,17 +224,17 @@ def test_margins_are_reduced_before_and_after_a_touch(gap: float, margin: float 
     wall = describe_box("wall", [0.3, 0.1, 0.3], point + np.array([0.0, gap + 0.05, 0.0]))
     scene = make_room(wall).with_held({"stick": "grip"})
     p = make_problem(scene, Touch("stick.tip", point), GoTo(0.0, 0.0), GoTo(0.0, 1.0))
-    for phase, where in ((0, {"end": True}), (1, {"begin": True}), (2, {})):
+    for phase, windows in ((0, {"end": True}), (1, {"begin": True}), (2, {})):
         found = compute_margins(p, phase)
-        assert set(found) == ({("stick.tip", "wall")} if where and margin is not None else set())
+        assert set(found) == ({("stick.tip", "wall")} if windows and margin is not None else set())
         for row in found.values():  # a point has a size of 0.1 mm here
-            assert_reduced(row, margin or 0.0, **where, within=6e-5)
+            assert_reduced(row, margin or 0.0, **windows, tolerance=6e-5)
 
 
 def test_margins_are_reduced_for_touches_but_not_for_poses() -> None:
     scene = make_room(describe_table(gap=GAP)).with_held({"stick": "grip"})
-    reach = Touch("forearm_link", (0.8, 0.0, TOP))
-    found = compute_margins(make_problem(scene, reach), 0)
+    touch = Touch("forearm_link", (0.8, 0.0, TOP))
+    found = compute_margins(make_problem(scene, touch), 0)
     assert {first for first, _ in found} == {"forearm_link"}
     assert (
         compute_margins(

@@ -42,7 +42,7 @@ def make_solver(
     return PoseSolver(chain.model, PoseRow(*get_last_frame(chain), (), kind, shift))
 
 
-def place(
+def compute_placement(
     chain: VirtualKinematicChain, z: np.ndarray, frame: tuple[int, pin.SE3] | None = None
 ) -> pin.SE3:
     joint, local = frame or get_last_frame(chain)
@@ -79,8 +79,8 @@ def solve(
     weights: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return solutions and their mask, checked against limits and target."""
-    usual = get_limits(chain)
-    lower, upper = usual[0] if lower is None else lower, usual[1] if upper is None else upper
+    limits = get_limits(chain)
+    lower, upper = limits[0] if lower is None else lower, limits[1] if upper is None else upper
     z, found = make_solver(chain, kind, shift).solve(
         guesses,
         target,
@@ -93,7 +93,7 @@ def solve(
     assert np.isfinite(z).all()
     assert ((z >= lower) & (z <= upper)).all()
     if shift is None:
-        errors = np.array([compute_error(kind, place(chain, row), target) for row in z])
+        errors = np.array([compute_error(kind, compute_placement(chain, row), target) for row in z])
         assert (errors[found] < 3e-6).all()  # each residual is below 1e-6
         assert (errors[~found] > 5e-7).all()
     return z, found
@@ -111,21 +111,23 @@ def make_home(chain: VirtualKinematicChain, *base: float) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("shifted", [False, True])
-def test_residuals_and_jacobians(chain: VirtualKinematicChain, kind: str, shifted: bool) -> None:
+def test_residuals_equal_definitions_and_jacobians_equal_differences(
+    chain: VirtualKinematicChain, kind: str, shifted: bool
+) -> None:
     """A shift is fixed in another joint's frame, such as a hand's approach direction."""
     hand, vector = chain.robot.model.njoints - 1, (0.03, -0.05, 0.08)
     solver = make_solver(chain, kind, (hand, vector) if shifted else None)
     z = sample_configurations(chain.lower, chain.upper, 5, np.random.default_rng(0))
-    target = place(chain, z[0])
+    target = compute_placement(chain, z[0])
     residual, jacobian = solver.evaluate(z, target)
     assert residual.shape == (5, KINDS[kind])
     assert jacobian.shape == (5, KINDS[kind], chain.size)
     for row in range(5):
-        at = place(chain, z[row])
+        at = compute_placement(chain, z[row])
         offset = at.translation - target.translation
         if shifted:
             frame = (hand, pin.SE3.Identity())
-            offset = offset + place(chain, z[row], frame).rotation @ np.array(vector)
+            offset = offset + compute_placement(chain, z[row], frame).rotation @ np.array(vector)
         np.testing.assert_allclose(residual[row, :3], offset, rtol=0.0, atol=1e-9)
         turn = pin.log3(target.rotation.T @ at.rotation)
         angle = max(np.linalg.norm(turn), 1e-12)
@@ -146,11 +148,11 @@ def test_residuals_and_jacobians(chain: VirtualKinematicChain, kind: str, shifte
 def test_solutions_attain_the_goal_within_limits(chain: VirtualKinematicChain, kind: str) -> None:
     rng, turned, solved = np.random.default_rng(1), 0.0, []
     for row in sample_configurations(chain.lower, chain.upper, 4, rng, arena=1.0):
-        target = place(chain, row)
+        target = compute_placement(chain, row)
         guesses = np.clip(row + rng.uniform(-0.6, 0.6, (30, chain.size)), chain.lower, chain.upper)
         z, found = solve(chain, guesses, target, kind)
         solved.append(found.mean())
-        rotations = [place(chain, one).rotation for one in z[found]]
+        rotations = [compute_placement(chain, one).rotation for one in z[found]]
         turned = max(turned, *(np.linalg.norm(pin.log3(target.rotation.T @ r)) for r in rotations))
     assert np.mean(solved) > 0.7
     assert (turned > 0.3) == (kind != "pose")  # freedoms are used
@@ -158,12 +160,12 @@ def test_solutions_attain_the_goal_within_limits(chain: VirtualKinematicChain, k
 
 def test_guesses_at_the_goal_are_not_changed(chain: VirtualKinematicChain) -> None:
     z = sample_configurations(chain.lower, chain.upper, 1, np.random.default_rng(2))
-    same, found = solve(chain, z, place(chain, z[0]))
+    same, found = solve(chain, z, compute_placement(chain, z[0]))
     assert found.all()
     np.testing.assert_array_equal(same, z)
 
 
-def test_unreachable_goal(robot: VirtualKinematicChain) -> None:
+def test_unreachable_goal_has_no_solution(robot: VirtualKinematicChain) -> None:
     guesses = sample_configurations(robot.lower, robot.upper, 30, np.random.default_rng(3))
     far = pin.SE3(np.eye(3), np.array([0.0, 0.0, 9.0]))
     _, found = solve(robot, guesses, far)
@@ -172,7 +174,10 @@ def test_unreachable_goal(robot: VirtualKinematicChain) -> None:
 
 def test_equal_limits_fix_coordinates(robot: VirtualKinematicChain) -> None:
     goal, rng = make_home(robot, 0.5, -0.3, 0.4), np.random.default_rng(4)
-    target, guesses = place(robot, goal), goal + rng.uniform(-0.3, 0.3, (40, robot.size))
+    target, guesses = (
+        compute_placement(robot, goal),
+        goal + rng.uniform(-0.3, 0.3, (40, robot.size)),
+    )
     lower, upper = get_limits(robot)
     lower[5] = upper[5] = goal[5]
     _, found = solve(robot, guesses, target, lower=lower, upper=upper)
@@ -190,7 +195,7 @@ def test_goal_is_attained_despite_an_active_limit(robot: VirtualKinematicChain) 
     upper = get_limits(robot)[1]
     farthest = []
     for upper[0] in (3.0, -0.2):
-        z, found = solve(robot, guesses, place(robot, goal), upper=upper)
+        z, found = solve(robot, guesses, compute_placement(robot, goal), upper=upper)
         assert found.mean() > 0.8
         farthest.append(z[found, 0].max())
     assert farthest[0] > -0.15
@@ -202,7 +207,7 @@ def test_coordinates_of_large_weight_move_less(robot: VirtualKinematicChain) -> 
     travel = []
     for weight in (0.1, 100.0):
         weights = np.concatenate([np.full(3, weight), np.ones(robot.size - 3)])
-        z, found = solve(robot, guesses, place(robot, goal), weights=weights)
+        z, found = solve(robot, guesses, compute_placement(robot, goal), weights=weights)
         assert found.mean() > 0.8
         travel.append(np.abs(z - guesses)[found, :3].sum(axis=1).mean())
     assert travel[1] < 0.3 * travel[0]
@@ -212,14 +217,14 @@ def test_coordinates_of_large_weight_move_less(robot: VirtualKinematicChain) -> 
 def test_half_turns_are_no_solutions(robot: VirtualKinematicChain, axis: int) -> None:
     start = make_home(robot)
     half_turn = pin.SE3(pin.exp3(np.pi * np.eye(3)[axis]), np.zeros(3))
-    solve(robot, start[None], place(robot, start) * half_turn)
+    solve(robot, start[None], compute_placement(robot, start) * half_turn)
 
 
 @pytest.mark.parametrize("axis", range(2))
 def test_upside_down_frames_are_turned_upright(robot: VirtualKinematicChain, axis: int) -> None:
-    """The gradient of a plain tilt vanishes there."""
+    """The gradient of the tilt angle vanishes at half turns."""
     start = make_home(robot)
-    here = place(robot, start)
+    here = compute_placement(robot, start)
     target = pin.SE3(pin.exp3(np.pi * np.eye(3)[axis]) @ here.rotation, here.translation)
     assert compute_tilt(here, target) == pytest.approx(np.pi, abs=1e-6)
     others = np.random.default_rng(9).uniform(-0.3, 0.3, (40, robot.size))
@@ -234,7 +239,9 @@ def test_hand_stops_short_of_its_goal_along_the_approach(robot: VirtualKinematic
     joint, local = get_last_frame(robot)
     shift = (joint, tuple((0.08 * local.rotation[:, 2]).tolist()))
     guesses = goal + np.random.default_rng(11).uniform(-0.3, 0.3, (40, robot.size))
-    z, found = solve(robot, guesses, place(robot, goal), shift=shift)
+    z, found = solve(robot, guesses, compute_placement(robot, goal), shift=shift)
     assert found.mean() > 0.8
-    short = place(robot, goal) * pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.08]))
-    assert all(compute_error("pose", place(robot, row), short) < 3e-6 for row in z[found])
+    short = compute_placement(robot, goal) * pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.08]))
+    assert all(
+        compute_error("pose", compute_placement(robot, row), short) < 3e-6 for row in z[found]
+    )

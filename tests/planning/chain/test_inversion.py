@@ -1,11 +1,11 @@
-"""Compares kinematic trees that are re-rooted at any link with Pinocchio."""
+"""Compares re-rooted kinematic trees with Pinocchio."""
 
 from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.objects import SHAPES, format_joint, load_text
+from helpers.objects import SHAPES, format_joint, load_object_text
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,14 +15,12 @@ from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.object_file import load_object
 
 KINDS = ("revolute", "continuous", "prismatic", "fixed")
-
-
 AXES = ("1 0 0", "0 1 0", "0 0 1", "-1 0 0", "0 0 -1", "0.6 0 0.8", "1 -2 3")
 
 
 @st.composite
 def trees(draw: st.DrawFn) -> tuple[str, int]:
-    """Random URDF trees of 1 to 8 links, and the index of one of the links."""
+    """Draw a URDF tree of 1 to 8 links and the index of one of its links."""
     number = draw(st.integers(1, 8))
     length = st.floats(-1.0, 1.0).map(lambda x: round(x, 4))
     parts = []
@@ -53,7 +51,7 @@ def trees(draw: st.DrawFn) -> tuple[str, int]:
 def compute_placements(
     model: pin.Model, geometry: pin.GeometryModel, q: np.ndarray
 ) -> tuple[dict[str, pin.SE3], dict[str, pin.SE3]]:
-    """Placements in the universe frame of all body frames and of all shapes, by name."""
+    """Return the world placements of all body frames and of all shapes, by name."""
     data, shapes = model.createData(), geometry.createData()
     pin.framesForwardKinematics(model, data, q)
     pin.updateGeometryPlacements(model, data, geometry, shapes)
@@ -71,7 +69,7 @@ def compute_placements(
 @given(trees(), st.integers(0, 2**32 - 1))
 def test_inverted_trees_keep_all_frames_and_shapes(tree: tuple[str, int], seed: int) -> None:
     urdf, root = tree
-    item = load_text(urdf, "urdf: thing.urdf\nattachments: [{name: a, link: l0}]")
+    item = load_object_text(urdf, "urdf: thing.urdf\nattachments: [{name: a, link: l0}]")
     link, z = f"l{root}", np.random.default_rng(seed).uniform(-3.0, 3.0, item.coordinates.size)
     model, collision = invert(item, link, z)
     coordinates = Coordinates(model)
@@ -110,7 +108,7 @@ def test_only_joints_on_the_path_to_the_base_move() -> None:
         + format_joint("lid", "revolute", "base", "back", "1 0 0")
     )
     urdf = f'<robot name="t">{links}{joints}</robot>'
-    item = load_text(urdf, "urdf: thing.urdf\nattachments: [{name: a, link: hand}]")
+    item = load_object_text(urdf, "urdf: thing.urdf\nattachments: [{name: a, link: hand}]")
     assert [*invert(item, "hand", np.zeros(4))[0].names[1:]] == ["wrist", "shoulder"]
     assert invert(item, "base", np.zeros(4))[0].nq == 0
 

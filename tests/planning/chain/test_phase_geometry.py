@@ -20,11 +20,11 @@ def sample_placement(rng: np.random.Generator, size: float) -> pin.SE3:
 
 
 def make_random_geometry(
-    rng: np.random.Generator, moving: int = 7, standing: int = 9
+    rng: np.random.Generator, moving: int = 7, static: int = 9
 ) -> PhaseGeometry:
-    """Return boxes, balls and cylinders on joints and in a 3 m room, and 2/3 of all pairs."""
+    """Return random shapes on joints and in a 3 m room, with two thirds of all pairs."""
     shapes = []
-    for k in range(moving + standing):
+    for k in range(moving + static):
         size = rng.uniform(0.02, 0.4, 3)
         solid = [coal.Box(*size), coal.Sphere(size[0] / 2), coal.Cylinder(size[0] / 2, size[1])][
             int(rng.integers(3))
@@ -35,13 +35,13 @@ def make_random_geometry(
                 f"s{k}", joint, 0, sample_placement(rng, 0.3 if joint else 1.5), solid
             )
         )
-    every = [
+    candidates = [
         (a, b)
         for a in range(moving)
         for b in range(a + 1, len(shapes))
         if shapes[a].parentJoint != shapes[b].parentJoint
     ]
-    pairs = np.array([pair for pair in every if rng.random() < 0.66]).reshape(-1, 2)
+    pairs = np.array([pair for pair in candidates if rng.random() < 0.66]).reshape(-1, 2)
     boxes = [compute_bounding_box(shape) for shape in shapes]
     return PhaseGeometry(
         shapes=shapes,

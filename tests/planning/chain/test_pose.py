@@ -52,7 +52,7 @@ def evaluate(function: ca.Function, placement: pin.SE3, target: pin.SE3) -> np.n
 
 
 def compute_violation(kind: str, placement: pin.SE3, target: pin.SE3) -> float:
-    """Return by how much the worst row is outside its bounds."""
+    """Return the largest bound violation of the rows."""
     lower, upper = ROW_BOUNDS[kind]
     rows = evaluate(ROWS[kind], placement, target)
     assert rows.shape == lower.shape == upper.shape
@@ -67,7 +67,7 @@ def sample_axis(rng: np.random.Generator) -> np.ndarray:
 def turn(
     kind: str, target: pin.SE3, angle: float, rng: np.random.Generator, axis: np.ndarray | None
 ) -> pin.SE3:
-    """Return `target` turned by an angle: "upright" and "level" ones tilted, at any heading."""
+    """Return `target` turned by an angle; "upright" and "level": tilted, at a random heading."""
     if kind in ("upright", "level"):
         heading, about = rng.uniform(-np.pi, np.pi, 2)
         level = np.array([np.cos(about), np.sin(about), 0.0]) if axis is None else axis
@@ -113,8 +113,8 @@ def test_residual_and_rows_are_offset_and_angle(angle: float) -> None:
 @pytest.mark.parametrize(
     "angle", [0.0, 1e-3, 0.3, 1.6, 3.0, *(np.pi - x for x in (2e-3, 5e-4, 1e-6, 1e-12, 0, -1e-4))]
 )
-def test_goal_holds_at_the_target_only(kind: str, angle: float) -> None:
-    """½ vee(E − Eᵀ) vanishes at half turns too; a planner that used it converged to one."""
+def test_residuals_and_violations_vanish_only_at_the_target(kind: str, angle: float) -> None:
+    """A residual ½ vee(E − Eᵀ) would vanish at half turns, too."""
     rng = np.random.default_rng(8)
     for axis in (*np.eye(3)[: 2 if kind in ("upright", "level") else 3], *[None] * 5):
         target = pin.SE3.Random()
@@ -174,9 +174,9 @@ def test_residual_gradients_equal_finite_differences(kind: str, angle: float) ->
 @pytest.mark.parametrize("kind", KINDS)
 def test_rows_are_linear_in_the_placement(kind: str) -> None:
     """Therefore they add nothing to the program's second derivatives."""
-    everything = ca.vertcat(ca.vec(_R), _p)
-    gradient = ca.jacobian(build_pose_rows(kind, _R, _p, _target), everything)
-    assert ca.jacobian(gradient, everything).nnz() == 0
+    placement = ca.vertcat(ca.vec(_R), _p)
+    gradient = ca.jacobian(build_pose_rows(kind, _R, _p, _target), placement)
+    assert ca.jacobian(gradient, placement).nnz() == 0
 
 
 # --- relaxed targets
@@ -203,7 +203,7 @@ def compute_offsets(kind: str, target: pin.SE3, placements: list[pin.SE3]) -> np
 
 
 def sample_placements(kind: str, target: pin.SE3, angle: float) -> list[pin.SE3]:
-    """Return placements off by an angle and by offsets."""
+    """Return placements that differ from `target` by an angle and random offsets."""
     rng = np.random.default_rng(14)
     axes = np.eye(3) if kind == "pose" else ()
     placements = [turn(kind, target, angle, rng, axis) for axis in (*axes, *[None] * 8)]
@@ -211,7 +211,7 @@ def sample_placements(kind: str, target: pin.SE3, angle: float) -> list[pin.SE3]
 
 
 @pytest.mark.long
-def test_pose_offsets_leave_no_memory_behind() -> None:
+def test_pose_offsets_leak_no_memory() -> None:
     target, placements = pin.SE3.Random(), [pin.SE3.Random() for _ in range(50)]
     size, objects = measure_growth(lambda: compute_offsets("pose", target, placements))
     assert size <= 50 * 8
@@ -221,7 +221,7 @@ def test_pose_offsets_leave_no_memory_behind() -> None:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("angle", TURNS)
 def test_pose_offsets_are_translation_and_shortest_rotation(kind: str, angle: float) -> None:
-    """A fully relaxed target is where the frame is; a tilt is corrected about a level axis."""
+    """A fully relaxed target is the frame's pose; tilts are corrected about horizontal axes."""
     target = pin.SE3.Random()
     placements = sample_placements(kind, target, angle)
     offsets = compute_offsets(kind, target, placements)
@@ -261,15 +261,15 @@ def test_relaxed_targets_follow_a_straight_line_and_a_geodesic(kind: str, angle:
 
 @pytest.mark.parametrize("kind", ["upright", "level"])
 @pytest.mark.parametrize("heading", [0.0, 1.0])
-def test_exactly_upright_and_upside_down_frames(kind: str, heading: float) -> None:
+def test_offsets_of_exactly_upright_and_upside_down_frames(kind: str, heading: float) -> None:
     target = pin.SE3(pin.rpy.rpyToMatrix(0.0, 0.0, heading), np.zeros(3))
     rotations = np.stack([np.eye(3), np.diag([1.0, -1.0, -1.0])])
     found = compute_pose_offsets(kind, rotations, np.zeros((2, 3)), target)
     np.testing.assert_allclose(found[:, 6], [0.0, np.pi], rtol=0.0, atol=1e-12)
-    assert found[1, 5] == 0.0  # about a level axis
+    assert found[1, 5] == 0.0  # about a horizontal axis
     np.testing.assert_allclose(np.linalg.norm(found[:, 3:6], axis=1), 1.0)
-    none = compute_pose_offsets(kind, np.zeros((0, 3, 3)), np.zeros((0, 3)), target)
-    assert none.shape == (0, POSE_OFFSET_SIZE)
+    empty = compute_pose_offsets(kind, np.zeros((0, 3, 3)), np.zeros((0, 3)), target)
+    assert empty.shape == (0, POSE_OFFSET_SIZE)
 
 
 @pytest.mark.parametrize("shift", [None, (2, (0.1, -0.2, 0.3))], ids=["plain", "shifted"])

@@ -15,7 +15,7 @@ from helpers.carrying import (
     solve_reach,
 )
 from helpers.drives import make_hall
-from helpers.litter import BELOW, describe_shelf, make_littered_scene
+from helpers.litter import BELOW_SHELF, describe_shelf, make_littered_scene
 from helpers.small_problems import SHORT, load_door_scene, make_program
 
 import vkc_pin as vkc
@@ -40,7 +40,7 @@ def test_demo_has_no_violations() -> None:
     assert diagnose_goals(demo, 0) == []
 
 
-def test_goals_beyond_limits_of_every_kind() -> None:
+def test_goals_beyond_limits_are_reported() -> None:
     steps = [vkc.Actuate("door", {"hinge": -2.0}), vkc.GoTo(0.0, 3.0)]
     first, second = find_impossible_conditions(make_problem(load_door_scene(), *steps))
     assert first.constraint == second.constraint == "goal"
@@ -56,7 +56,7 @@ def test_goal_at_the_limit_is_allowed() -> None:
     assert find_impossible_conditions(make_problem(scene, *steps)) == []
 
 
-def test_start_in_contact() -> None:
+def test_start_in_contact_is_reported() -> None:
     scene = make_hall(obstacles=[{**CRATE, "position": [0.7, 0.0, 0.2]}])
     (violation, *_) = find_impossible_conditions(make_problem(scene, vkc.GoTo(-1.0, 0.0)))
     assert (violation.constraint, violation.subject, violation.waypoint) == (
@@ -128,7 +128,8 @@ def test_obstacles_of_all_goal_configurations_are_reported_by_phase() -> None:
 def test_grasp_is_free_when_placing() -> None:
     """Under a shelf the object can be placed from the side only, with another grasp."""
     below = make_problem(
-        make_littered_scene(describe_shelf(*BELOW[:2])), vkc.Place("litter", BELOW, "grip")
+        make_littered_scene(describe_shelf(*BELOW_SHELF[:2])),
+        vkc.Place("litter", BELOW_SHELF, "grip"),
     )
     assert [phase.kind for phase in below.task.phases] == ["grasp", "place"]
     assert diagnose_goal(below, 1, 0) is None
@@ -157,7 +158,7 @@ def make_far_drawer() -> vkc.Scene:
 
 
 def make_door_beside_a_wall() -> vkc.Scene:
-    """Return a door that opens into the room by more than the hand on its lever has room for."""
+    """Return a door beside a wall that leaves too little room for the hand on the lever."""
     document = dict(vkc.load_scene("door").document)
     wall = {"name": "wall", "type": "box", "size": [1.2, 0.05, 2.2], "position": [1.85, 0.59, 1.1]}
     return vkc.Scene.from_document({**document, "obstacles": [*document["obstacles"], wall]})
@@ -183,14 +184,14 @@ def test_range_of_a_blocked_joint(
     assert cause in blocked.text
     problem = make_problem(scene, vkc.Actuate(owner, {joint: goal}))
     text = describe_free_range(problem, blocked.phase, 0)
-    said, value, unit = text.removeprefix(joint).split()
-    assert (said, unit) == ("=", problem.unit(name))
+    sign, value, unit = text.removeprefix(joint).split()
+    assert (sign, unit) == ("=", problem.unit(name))
     beyond = 0.06 * (goal - problem.task.phases[0].initial_values[name])
     assert diagnose(float(value)) == []
     assert diagnose(float(value) + beyond) != []
 
 
-def test_no_range_of_goals_that_are_free_nowhere() -> None:
+def test_no_range_is_described_without_free_configurations() -> None:
     fixed = vkc.Scene.from_document(
         {**make_far_drawer().document, "start": {"base": [-0.5, 0, 0], "arm": "home"}}
     )

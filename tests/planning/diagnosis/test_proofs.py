@@ -1,4 +1,4 @@
-"""Tests that proven failures are impossible, and that feasible tasks are not."""
+"""Tests that only infeasible tasks are proven infeasible."""
 
 from __future__ import annotations
 
@@ -93,8 +93,8 @@ def test_passable_wall_proves_nothing(wall: dict[str, Any], step: Any) -> None:
 
 
 @pytest.mark.parametrize("height", [0.42, 0.47])
-def test_wall_that_the_arm_mount_hits_is_proven(height: float) -> None:
-    """The base passes under a shorter one at the arena's edge, with the mount beside it."""
+def test_wall_that_the_arm_mount_hits_separates_the_goal(height: float) -> None:
+    """The base passes under a shorter wall at the arena's edge, with the mount beside the wall."""
     longer, shorter = (
         describe_box("beam", (0.1, y, 1.0), (1.2, 0.0, 0.5 + height)) for y in (13.0, 12.0)
     )

@@ -1,4 +1,4 @@
-"""Tests of collisions that an object's own joint causes."""
+"""Tests the detection of collisions in the volume that an object's joint sweeps."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from helpers.small_problems import load_door_scene, make_program
 import vkc_pin as vkc
 from vkc_pin.planning.diagnosis.swept_volumes import find_swept_collisions
 
-POST = (3.2, 0.14, 0.25)  # where the leaf is at 1.14 rad
+POST = (3.2, 0.14, 0.25)  # in the leaf at 1.14 rad
 SIZE = (0.08, 0.1, 0.5)  # [m]
 OPTIONS = vkc.Options(reach_waypoints=4, turn_waypoints=3, move_waypoints=6)
 SLIDING_BAR = """<robot name="bar"><link name="base"/>

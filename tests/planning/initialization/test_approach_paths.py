@@ -1,4 +1,4 @@
-"""Tests of approach and retreat paths with a moving and a fixed base."""
+"""Tests approach and retreat paths with a moving and a fixed base."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_hand_approaches_and_retreats_straight(length: float) -> None:
             offset = hand.inverse() * other
             np.testing.assert_allclose(offset.translation, [0.0, 0.0, -length], atol=1e-3)
             np.testing.assert_allclose(offset.rotation, np.eye(3), atol=1e-3)
-            assert np.all(near[9:] == z[9:]), "the door stays where it is"
+            assert np.all(near[9:] == z[9:]), "the door does not move"
         driven = np.abs(approach[0] - grasp)[:3].max()
         assert (driven > 1e-3) == (not keeps_base_fixed or length == 0.9)
     alone = ApproachPaths(sampler).find_release_retreat(grasp, phases[3])

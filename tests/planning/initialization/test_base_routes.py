@@ -1,4 +1,4 @@
-"""Tests of base paths around a wall and through gates, and of folded arms."""
+"""Tests base paths around a wall and through gates, and folded arms."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.gates import GOAL, NARROW, TIGHT, make_gate_problem, make_wall_problem
+from helpers.gates import GOAL, NARROW, TOO_NARROW, make_gate_problem, make_wall_problem
 from helpers.small_problems import make_program
 
 import vkc_pin as vkc
@@ -57,7 +57,7 @@ def test_guess_follows_the_path_with_its_heading() -> None:
     assert problem.evaluate_contacts(guess.z, reach=0.02).compute_violation() < 0.02
 
 
-@pytest.mark.parametrize("width", [NARROW, TIGHT, 0.64])  # the base is 0.67 m wide
+@pytest.mark.parametrize("width", [NARROW, TOO_NARROW, 0.64])  # the base is 0.67 m wide
 def test_folded_arm_fits_through_a_narrow_gate(width: float) -> None:
     problem = make_gate_problem(width)
     routes, start, goal = BaseRoutes(problem), problem.start[:3], np.array(GOAL)
@@ -82,7 +82,10 @@ def test_folded_arm_fits_through_a_narrow_gate(width: float) -> None:
 
 
 def test_guide_reaches_goals_within_the_margin() -> None:
-    """Inverse kinematics often leads there; the wall begins at 1.9, the base is 0.5 m long."""
+    """Inverse kinematics often yields such goals.
+
+    The wall begins at x = 1.9 m, and the base extends 0.5 m to the front.
+    """
     problem = make_wall_problem(1.6)
     routes, start = BaseRoutes(problem), problem.start[:3]
     near, colliding = np.array([1.39, 1.0, 0.0]), np.array([1.5, 1.0, 0.0])
@@ -111,7 +114,7 @@ def test_similar_starts_share_distances() -> None:
 
 # --- folded arms
 
-TASKS = {  # scene, and steps in the last phase of which the load is carried
+TASKS = {  # scene, and steps; the load is carried in their last phase
     "nothing": ("household", [vkc.GoTo(1.0, 0.5)]),
     "cup": ("household", [vkc.Grasp("cup"), vkc.GoTo(1.0, 0.5)]),
     "stick": ("init_1", [vkc.Grasp("stick"), vkc.GoTo(0.0, 0.0)]),
@@ -119,14 +122,14 @@ TASKS = {  # scene, and steps in the last phase of which the load is carried
 
 
 @cache
-def carry(load: str) -> vkc.TrajectoryProblem:
+def make_carrying_problem(load: str) -> vkc.TrajectoryProblem:
     name, steps = TASKS[load]
     return make_program(vkc.load_scene(name), steps)
 
 
-def configure(load: str, arm: np.ndarray | None = None) -> np.ndarray:
+def make_configuration(load: str, arm: np.ndarray | None = None) -> np.ndarray:
     """Return a configuration at the origin with an arm posture. Default: at home."""
-    chain = carry(load).chain
+    chain = make_carrying_problem(load).chain
     z = np.clip(np.zeros(chain.size), chain.lower, chain.upper)
     z[3:9] = chain.robot.home if arm is None else arm
     return z
@@ -134,13 +137,13 @@ def configure(load: str, arm: np.ndarray | None = None) -> np.ndarray:
 
 @cache
 def find_arms(load: str) -> np.ndarray:
-    p = carry(load)
-    return find_folded_arms(p, len(p.task.phases) - 1, configure(load))
+    p = make_carrying_problem(load)
+    return find_folded_arms(p, len(p.task.phases) - 1, make_configuration(load))
 
 
 def compute_extent(load: str, z: np.ndarray, *, base: bool = False) -> np.ndarray:
     """Return the bounding box of arm and load or of the base by coal and Pinocchio, (2, 3)."""
-    chain = carry(load).chain
+    chain = make_carrying_problem(load).chain
     data, placed = chain.model.createData(), pin.GeometryData(chain.collision)
     pin.updateGeometryPlacements(chain.model, data, chain.collision, placed, chain.coordinates.q(z))
     corners = []
@@ -160,22 +163,22 @@ def compute_extent(load: str, z: np.ndarray, *, base: bool = False) -> np.ndarra
 
 @pytest.mark.parametrize("load", TASKS)
 def test_folded_arms_are_compact_and_free(load: str) -> None:
-    """No arm extends further than the first or the base; the package's boxes are larger."""
-    p, arms = carry(load), find_arms(load)
+    """No arm extends further than the first one or the base, up to the package's larger boxes."""
+    p, arms = make_carrying_problem(load), find_arms(load)
     assert len(arms) > 10
     first, home = (
-        compute_extent(load, configure(load, arms[0])),
-        compute_extent(load, configure(load)),
+        compute_extent(load, make_configuration(load, arms[0])),
+        compute_extent(load, make_configuration(load)),
     )
     assert np.abs(first[:, 1]).max() < 0.7 * np.abs(home[:, 1]).max()
-    assert first[0, 2] > 0.1, "it is above the floor"
+    assert first[0, 2] > 0.1, "the arm must be above the floor"
     assert np.abs(first[:, 0]).max() < 0.7
-    own = compute_extent(load, configure(load), base=True)
+    own = compute_extent(load, make_configuration(load), base=True)
     allowed = np.abs(np.vstack([first, own])).max(axis=0)[:2] + 0.03
     sizes, robot = [], p.chain.robot
     data, shapes = robot.model.createData(), robot.collision.createData()
     for arm in arms:
-        z = configure(load, arm)
+        z = make_configuration(load, arm)
         extent = np.abs(compute_extent(load, z)).max(axis=0)
         assert np.all(extent[:2] <= allowed)
         sizes.append(extent.sum())
@@ -188,13 +191,13 @@ def test_folded_arms_are_compact_and_free(load: str) -> None:
         assert contacts.compute_violation() == 0.0
     assert min(sizes) > sizes[0] - 0.03
     np.testing.assert_array_equal(
-        find_folded_arms(p, len(p.task.phases) - 1, configure(load)), arms
+        find_folded_arms(p, len(p.task.phases) - 1, make_configuration(load)), arms
     )
 
 
-def test_obstacles_do_not_count_for_folded_arms() -> None:
+def test_shortfall_can_ignore_static_obstacles() -> None:
     """The base is in the wall between the rooms."""
-    p, z = carry("nothing"), configure("nothing")
+    p, z = make_carrying_problem("nothing"), make_configuration("nothing")
     z[:2] = 0.0, 1.25
     assert compute_shortfall(p, z[None], 1)[0] > 0.1
     assert compute_shortfall(p, z[None], 1, static=False)[0] == 0.0
@@ -202,7 +205,7 @@ def test_obstacles_do_not_count_for_folded_arms() -> None:
 
 def test_nearest_folded_arm_minimizes_the_motion() -> None:
     """Angles that differ by full turns are the same posture."""
-    p, arms = carry("cup"), find_arms("cup")
+    p, arms = make_carrying_problem("cup"), find_arms("cup")
     routes, lower, upper = BaseRoutes(p), p.chain.lower[3:9], p.chain.upper[3:9]
     np.testing.assert_array_equal(routes.get_folded_arm(1), arms[0])
     metric, rng = p.chain.metric[3:9], np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Tests of the beam search over keyframes, forwards and backwards."""
+"""Tests the beam search over keyframes, forwards and backwards."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DIRECTIONS = pytest.mark.parametrize("backwards", [False, True], ids=["forwards"
 
 @cache
 def make_problem(*, drives: bool = False, grasps: bool = False) -> vkc.TrajectoryProblem:
-    """Return the problem of opening or just grasping the door; drives: the base goes before."""
+    """Return the problem of opening or grasping the door, optionally between two drives."""
     steps = [vkc.Grasp("door")] if grasps else [OPEN]
     before, after = ([vkc.GoTo(-1.0, y)] if drives else [] for y in (0.0, 0.5))
     return make_program(load_door_scene(), [*before, *steps, *after], options=FEW)
@@ -144,7 +144,7 @@ def test_search_is_deterministic(backwards: bool) -> None:
         np.testing.assert_array_equal(values, same)
 
 
-def grasp_with(*, firm: bool) -> vkc.TrajectoryProblem:
+def make_grasp_problem(*, firm: bool) -> vkc.TrajectoryProblem:
     """Return a door problem with a free or a rigid grasp."""
     scene = load_door_scene()
     door = scene.objects["door"]
@@ -156,7 +156,7 @@ def grasp_with(*, firm: bool) -> vkc.TrajectoryProblem:
 @pytest.mark.parametrize("firm", [False, True])
 def test_rigid_grasp_is_chosen_before_the_object_moves(firm: bool) -> None:
     """A rigid grasp is searched forwards, a free one backwards."""
-    p = grasp_with(firm=firm)
+    p = make_grasp_problem(firm=firm)
     assert bool(p.choices) == firm
     one, other = (make_search(p).search(thorough=True, backwards=each) for each in (False, True))
     assert np.array_equal(one.paths, other.paths) == firm
@@ -189,19 +189,19 @@ def make_result(jump: float, waypoint: int, *, collision_cost: float = 0.0) -> S
 
 
 @pytest.mark.parametrize("has_routes", [False, True])
-def test_grazes_are_acceptable_and_collisions_and_base_jumps_are_not(has_routes: bool) -> None:
-    """Jumps are checked in closed phases, given routes."""
+def test_grazes_are_acceptable_but_collisions_and_base_jumps_are_not(has_routes: bool) -> None:
+    """Jumps are checked in closed phases, if base routes are known."""
     routes = BaseRoutes(make_problem()) if has_routes else None
-    own = BeamSearch(make_search(make_problem()).sampler, routes)
+    search = BeamSearch(make_search(make_problem()).sampler, routes)
     reach, turn, move = make_problem().ends.tolist()
     for collision_cost, expected in ((0.0, True), (59.0, True), (61.0, False)):
         result = make_result(0.0, reach, collision_cost=collision_cost)
-        assert own.is_acceptable(result) == expected
-    assert own.is_acceptable(make_result(3.0, reach))
+        assert search.is_acceptable(result) == expected
+    assert search.is_acceptable(make_result(3.0, reach))
     for waypoint in (turn, move):
-        assert own.is_acceptable(make_result(0.4, waypoint))
+        assert search.is_acceptable(make_result(0.4, waypoint))
         for jump in (0.6, -0.6):
-            assert own.is_acceptable(make_result(jump, waypoint)) != has_routes
+            assert search.is_acceptable(make_result(jump, waypoint)) != has_routes
 
 
 def test_search_for_narrow_passages_finds_free_approaches() -> None:
@@ -209,15 +209,15 @@ def test_search_for_narrow_passages_finds_free_approaches() -> None:
     scene = vkc.load_scene("household").with_state("door", {"hinge": 1.52})
     steps = [vkc.Grasp("door", "handle_free"), vkc.Actuate("door", {"hinge": 0.0})]
     p = make_program(scene.with_start(base=(1.5, -0.5, 1.57)), steps)
-    grasp, routes, shares = int(p.ends[0]), BaseRoutes(p), []
+    grasp, routes, fractions = int(p.ends[0]), BaseRoutes(p), []
     before = grasp - p.options.steps(p.options.approach_time)
     for narrow in (False, True):
         sampler = KeyframeSampler(p, np.random.default_rng(0))
-        own = BeamSearch(sampler, routes, for_narrow_passages=narrow)
-        found = own.search(thorough=True, backwards=True)
+        search = BeamSearch(sampler, routes, for_narrow_passages=narrow)
+        found = search.search(thorough=True, backwards=True)
         free = found.paths[found.collision_cost == 0.0, found.waypoints.index(grasp)]
         assert len(free)
         near, reached = sampler.sample(free, before, "track")
         contacts = p.contacts.evaluate(near, np.full(len(near), before), reach=0.1)
-        shares.append(np.mean((contacts.compute_shortfall(len(near)) <= 1e-9) & reached))
-    assert shares[0] < shares[1] == 1.0
+        fractions.append(np.mean((contacts.compute_shortfall(len(near)) <= 1e-9) & reached))
+    assert fractions[0] < fractions[1] == 1.0

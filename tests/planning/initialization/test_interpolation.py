@@ -1,4 +1,4 @@
-"""Tests of interpolation between keyframes: straight, along base paths, and with RRT."""
+"""Tests interpolation between keyframes: straight, along base paths, and with RRT."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from vkc_pin.planning.initialization.keyframes import KeyframeSampler, sample_sm
 from vkc_pin.utils.budget import Budget
 
 FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
-ROBOT = 9  # x, y and yaw of the base, six joints of the arm
+ROBOT_SIZE = 9  # x, y and yaw of the base, six joints of the arm
 
 
 @cache
@@ -51,18 +51,18 @@ def assert_holds_the_handle(z: np.ndarray) -> None:
 
 def test_guess_passes_keyframes_and_closes_the_chain() -> None:
     p, keyframes, waypoints = make_door_problem()
-    given = keyframes.copy()
+    original = keyframes.copy()
     z = make_interpolator(p).interpolate(keyframes, waypoints)
     assert z is not None
-    np.testing.assert_array_equal(keyframes, given)
+    np.testing.assert_array_equal(keyframes, original)
     assert np.all((z >= p.lower) & (z <= p.upper))
     reach = int(p.ends[0])
     np.testing.assert_allclose(z[reach - 1], keyframes[waypoints.index(reach)], atol=1e-3)
     before = reach - FEW.steps(FEW.approach_time)
     first, last = p.start, z[before - 1]
-    share = np.linalg.norm(z[:before] - first, axis=1) / np.linalg.norm(last - first)
-    assert np.all(np.diff(share) > 0.0)
-    np.testing.assert_allclose(z[:before], first + np.outer(share, last - first), atol=1e-9)
+    fraction = np.linalg.norm(z[:before] - first, axis=1) / np.linalg.norm(last - first)
+    assert np.all(np.diff(fraction) > 0.0)
+    np.testing.assert_allclose(z[:before], first + np.outer(fraction, last - first), atol=1e-9)
     assert_holds_the_handle(z)
 
 
@@ -94,7 +94,7 @@ def test_base_path_ends_where_the_approach_begins() -> None:
 
 @pytest.mark.parametrize("turns", [-1, 2])
 def test_later_headings_continue_where_the_base_path_ends(turns: int) -> None:
-    """Keyframes may be full turns off."""
+    """Headings of keyframes may differ by full turns."""
     p, keyframes, waypoints = make_door_problem()
     wound = keyframes.copy()
     wound[1:, 2] += turns * 2 * np.pi
@@ -143,13 +143,15 @@ def test_missing_paths_are_noted_once_per_phase() -> None:
     p = make_program(
         make_wall_problem(0.0).scene, [vkc.GoTo(1.0, 1.0, 0.5), vkc.GoTo(4.0, 1.0, 0.5)]
     )
-    join = make_interpolator(p, AStarPaths(BaseRoutes(p)))
+    interpolator = make_interpolator(p, AStarPaths(BaseRoutes(p)))
     for x in (1.0, 0.9):
         keyframes = np.array(
             [p.start, make_waypoint(p, (x, 1.0, 0.5)), make_waypoint(p, (4.0, 1.0, 0.5))]
         )
-        assert join.interpolate(keyframes, [0, *p.ends.tolist()]) is None
-    assert join.blocked == ["go to: found no path for the base from (1.00, 1.00) to (4.00, 1.00)"]
+        assert interpolator.interpolate(keyframes, [0, *p.ends.tolist()]) is None
+    assert interpolator.blocked == [
+        "go to: found no path for the base from (1.00, 1.00) to (4.00, 1.00)"
+    ]
 
 
 def test_rrt_paths_lead_through_a_narrow_gate() -> None:
@@ -185,7 +187,7 @@ def test_rrt_paths_end_at_the_required_arm() -> None:
     for reaches in (True, False):
         path = paths.find_path(0, p.start, end, 30, turns=True, reaches=reaches)
         assert path is not None
-        assert path.shape == (30, ROBOT)
+        assert path.shape == (30, ROBOT_SIZE)
         np.testing.assert_allclose(path[-1, :3], GOAL, atol=1e-9)
         folded = paths.routes.find_nearest_folded_arm(0, p.start[3:], end[3:])
         arms = [end[3:], p.start[3:], p.chain.robot.home, paths.routes.get_folded_arm(0), folded]
@@ -202,7 +204,7 @@ def test_rrt_paths_turn_as_far_as_the_goal_requires(yaw: float) -> None:
     assert path is not None
     np.testing.assert_allclose(path[-1], end, atol=1e-9)
     z = np.tile(p.start, (60, 1))
-    z[:, :ROBOT] = path
+    z[:, :ROBOT_SIZE] = path
     assert p.evaluate_contacts(z, reach=0.1).compute_violation() < p.options.dist_safe + 0.02
     inside = np.abs(path[:, 0] - 2.0) < 0.1
     assert np.abs(np.sin(path[inside, 2])).max(initial=0.0) < 0.2
@@ -214,7 +216,7 @@ def test_searches_get_shorter_after_failures() -> None:
     scene = make_hall(base="fixed", obstacles=p.scene.document["obstacles"])
     p = make_program(scene, [vkc.Reach((0.5, 0.4, 1.0, 0.0, np.pi / 2, 0.0))] * 2)
     end, paths, used = p.start.copy(), make_rrt_paths(p), list[int]()
-    end[3:ROBOT] = 0.0, 1.2, 0.0, 0.0, 0.0, 0.0  # through the floor
+    end[3:ROBOT_SIZE] = 0.0, 1.2, 0.0, 0.0, 0.0, 0.0  # through the floor
     for phase in (0, 0, 0, 1):
         with Budget().activate() as budget:
             assert paths.find_path(phase, p.start, end, 9, turns=False, reaches=True) is None

@@ -1,4 +1,4 @@
-"""Tests of keyframes: feasible by Pinocchio, within limits, and reproducible."""
+"""Tests that keyframes are feasible by Pinocchio, within limits, and reproducible."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ def make_sampler(
     return KeyframeSampler(problem, np.random.default_rng(seed), cache)
 
 
-def test_the_profile_starts_and_ends_at_rest() -> None:
+def test_profile_starts_and_ends_at_rest() -> None:
     s = np.concatenate([[0.0], sample_smoothstep(100)])
     assert s[-1] == 1.0
     assert (np.diff(s) > 0).all()
-    np.testing.assert_allclose(s + s[::-1], 1.0)  # the same from both ends
+    np.testing.assert_allclose(s + s[::-1], 1.0)  # symmetric
     assert max(s[1], 1.0 - s[-2]) < 1e-3
     assert np.diff(s).max() == pytest.approx(1.5 / 100, rel=1e-3)
     np.testing.assert_array_equal(sample_smoothstep(1), [1.0])
@@ -89,7 +89,7 @@ def test_samples_hold_the_handle_at_every_waypoint(problem: vkc.TrajectoryProble
     assert track < shake < scatter
 
 
-def test_robots_stay_without_a_pose_constraint(drive: vkc.TrajectoryProblem) -> None:
+def test_configurations_stay_without_a_pose_constraint(drive: vkc.TrajectoryProblem) -> None:
     sampler = make_sampler(drive)
     assert sampler.find_pose(1) is None
     before = np.tile(drive.start, (3, 1)) + np.arange(3)[:, None] * 1e-3
@@ -125,7 +125,7 @@ def test_cached_results_are_not_computed_again(problem: vkc.TrajectoryProblem) -
 
 
 def test_shortfall_is_the_largest_of_any_pair(problem: vkc.TrajectoryProblem) -> None:
-    """Against Pinocchio's and coal's distances of all pairs, without culling."""
+    """Compare with the distances of all pairs by Pinocchio and coal, without culling."""
     sampler, grasp = make_sampler(problem), int(problem.ends[0])
     z, _ = sampler.sample(np.tile(problem.start, (24, 1)), grasp, "scatter")
     part, model = problem.contacts.phases[0], problem.chain.model
@@ -157,31 +157,31 @@ def test_free_keyframes_satisfy_the_pose_constraint(problem: vkc.TrajectoryProbl
 
 
 def test_goal_configurations_report_their_residuals(problem: vkc.TrajectoryProblem) -> None:
-    drawn = sample_goal_configurations(problem, int(problem.ends[0]), np.random.default_rng(0))
-    assert drawn is not None
-    z, residuals = drawn
+    samples = sample_goal_configurations(problem, int(problem.ends[0]), np.random.default_rng(0))
+    assert samples is not None
+    z, residuals = samples
     assert z.shape == (SAMPLE_COUNT, problem.chain.size)
     for row, residual in zip(z, residuals, strict=True):
-        off = compute_grasp_error(load_door_scene(), row[:9], 0.0, 0.0)
-        assert (off < 3e-4) == (
+        error = compute_grasp_error(load_door_scene(), row[:9], 0.0, 0.0)
+        assert (error < 3e-4) == (
             residual < 1e-4
-        ) or 1e-5 < residual < 1e-3  # the two measure angles alike only where small
+        ) or 1e-5 < residual < 1e-3  # the two measures agree for small angles only
     assert (residuals < 1e-4).any()
 
 
 def test_goal_configurations_at_a_base_goal(drive: vkc.TrajectoryProblem) -> None:
     assert sample_goal_configurations(drive, 1, np.random.default_rng(0)) is None, (
-        "nothing must hold there"
+        "the waypoint has no pose constraint"
     )
     placed = sample_goal_configurations(drive, drive.segments, np.random.default_rng(0))
     assert placed is not None
     np.testing.assert_allclose(placed[0][:, :2], np.tile([0.3, 0.2], (SAMPLE_COUNT, 1)), atol=1e-9)
     assert (placed[1] == 0.0).all()
-    assert np.ptp(placed[0][:, 2]) > 1.0, "at any heading"
+    assert np.ptp(placed[0][:, 2]) > 1.0, "the heading is free"
 
 
-def test_weights_are_those_of_searches(problem: vkc.TrajectoryProblem) -> None:
-    """Angles cost 1, lengths what they move the hand, except sliding grasps."""
+def test_weights_relate_lengths_to_angles(problem: vkc.TrajectoryProblem) -> None:
+    """Angles have weight 1, lengths the inverse lever of the hand, except in sliding grasps."""
     free = vkc.build(
         vkc.load_scene("init_3"), [vkc.Touch("stick.tip", (-1.0, 3.9, 0.1))], options=SHORT
     )
@@ -200,7 +200,7 @@ def test_weights_are_those_of_searches(problem: vkc.TrajectoryProblem) -> None:
     assert set(grasp.values()) == {1.0}
 
 
-def test_pushing_frees_many_configurations_and_leaves_free_ones() -> None:
+def test_pushing_frees_configurations_and_keeps_free_ones() -> None:
     """Most random configurations that touch the cube under the table collide."""
     scene = vkc.load_scene("init_1").with_held({"stick": "grip"}).with_start(base=[1.2, 1.0, 1.0])
     p = vkc.build(scene, [vkc.Touch("stick.tip", (-1.0, 3.897, 0.1))], options=SHORT)
@@ -212,8 +212,8 @@ def test_pushing_frees_many_configurations_and_leaves_free_ones() -> None:
 
     z, found = sampler.sample(np.tile(p.start, (96, 1)), waypoint, "scatter")
     z = z[found]
-    given, pushed = z.copy(), sampler.push_clear(z, waypoint)
-    np.testing.assert_array_equal(z, given)
+    original, pushed = z.copy(), sampler.push_clear(z, waypoint)
+    np.testing.assert_array_equal(z, original)
     assert np.count_nonzero(are_free(pushed)) >= np.count_nonzero(are_free(z)) + 5
     np.testing.assert_array_equal(pushed[are_free(z)], z[are_free(z)])
     assert np.all((pushed >= p.lower[-1] - 1e-12) & (pushed <= p.upper[-1] + 1e-12))
@@ -221,6 +221,6 @@ def test_pushing_frees_many_configurations_and_leaves_free_ones() -> None:
     np.testing.assert_allclose(again[are_free(pushed)], pushed[are_free(pushed)], atol=1e-4)
     assert np.abs(again - pushed)[~are_free(pushed)].max() > 1e-3
     heavy = make_sampler(p)
-    heavy.weights[:3] *= 100.0  # for the base
+    heavy.weights[:3] *= 100.0  # of the base
     moved = [np.abs(one.push_clear(z, waypoint) - z)[:, :3].sum() for one in (sampler, heavy)]
     assert moved[1] < 0.5 * moved[0]

@@ -1,4 +1,4 @@
-"""Tests of initial guesses: bounds, closed chains, order, determinism, narrow passages."""
+"""Tests initial guesses: bounds, closed chains, order, determinism, narrow passages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.drives import make_hall
-from helpers.gates import GOAL, NARROW, TIGHT, make_gate_problem
+from helpers.gates import GOAL, NARROW, TOO_NARROW, make_gate_problem
 from helpers.small_problems import SHORT, compute_grasp_error, load_door_scene, make_program
 from hypothesis import given
 from hypothesis import strategies as st
@@ -26,12 +26,12 @@ from vkc_pin.planning.initialization.methods import (
     interleave_guesses,
 )
 
-OPENED = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
+FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 
 
 @cache
 def make_problem() -> vkc.TrajectoryProblem:
-    return make_program(load_door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=OPENED)
+    return make_program(load_door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=FEW)
 
 
 @cache
@@ -101,7 +101,7 @@ def test_guess_opens_the_door_after_a_straight_approach() -> None:
     assert np.all(knob[turn - 1 :] >= 0.5)
     path = make_problem().waypoints(z)
     np.testing.assert_array_equal(path[0], make_problem().start)
-    before = int(reach) - OPENED.steps(OPENED.approach_time)
+    before = int(reach) - FEW.steps(FEW.approach_time)
     low, high = np.minimum(path[0], path[before]), np.maximum(path[0], path[before])
     assert np.all((path[: before + 1] >= low - 1e-9) & (path[: before + 1] <= high + 1e-9))
     first, last = (
@@ -109,19 +109,19 @@ def test_guess_opens_the_door_after_a_straight_approach() -> None:
         for k in (before, reach)
     )
     approach = first.inverse() * last
-    np.testing.assert_allclose(approach.translation, [0.0, 0.0, OPENED.approach], atol=1e-3)
+    np.testing.assert_allclose(approach.translation, [0.0, 0.0, FEW.approach], atol=1e-3)
     np.testing.assert_allclose(approach.rotation, np.eye(3), atol=1e-3)
     assert np.abs(np.diff(path, axis=0)).max() < 0.8
 
 
-def test_equal_random_seeds_give_equal_guesses_and_several_differ() -> None:
+def test_equal_seeds_give_equal_guesses_and_successive_guesses_differ() -> None:
     found = make_guesses("interpolated")
     again = list(initialize(make_problem(), "interpolated", 0, count=3))
     assert 2 <= len(found) == len(again)
     for guess, same in zip(found, again, strict=True):
         np.testing.assert_array_equal(guess.z, same.z)
     for guess, other in itertools.combinations(found, 2):
-        assert np.abs(guess.z - other.z)[:, :3].max() > OPENED.dist_safe
+        assert np.abs(guess.z - other.z)[:, :3].max() > FEW.dist_safe
     assert not np.array_equal(make_guesses("interpolated", 1)[0].z, found[0].z)
 
 
@@ -140,7 +140,7 @@ def test_stationary_guesses_move_the_base_straight_or_not_at_all() -> None:
     assert hinge[make_problem().ends[1] - 1] == 0.0
 
 
-def test_base_turns_the_shorter_direction() -> None:
+def test_base_turns_in_the_shorter_direction() -> None:
     scene = make_hall().with_start(base=[0.0, 0.0, 3.0])
     turn = make_program(scene, [vkc.GoTo(1.0, 0.5, -3.0)], options=SHORT)
     z = next(initialize(turn, "interpolated", 0)).z
@@ -149,11 +149,13 @@ def test_base_turns_the_shorter_direction() -> None:
 
 
 def test_unreachable_target_still_has_a_guess() -> None:
-    lost = make_program(make_hall(), [vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0))], options=SHORT)
-    found = list(initialize(lost, "interpolated", 0, count=2))
+    unreachable = make_program(
+        make_hall(), [vkc.Reach((1.0, 0.0, 4.0, 0.0, 0.0, 0.0))], options=SHORT
+    )
+    found = list(initialize(unreachable, "interpolated", 0, count=2))
     assert found
     for guess in found:
-        assert np.all((guess.z >= lost.lower) & (guess.z <= lost.upper))
+        assert np.all((guess.z >= unreachable.lower) & (guess.z <= unreachable.upper))
 
 
 def test_fixed_base_stays_in_every_guess() -> None:
@@ -190,11 +192,11 @@ def test_task_without_motion_has_a_guess() -> None:
 # --- order of the methods
 
 Penetrations = list[float | None]
-FINE, POOR, DEEP = (share * MAX_GOOD_PENETRATION for share in (0.9, 1.1, 4.4))
+FINE, POOR, DEEP = (ratio * MAX_GOOD_PENETRATION for ratio in (0.9, 1.1, 4.4))
 
 
 def interleave(*kinds: Penetrations) -> list[str]:
-    """Return what is requested (a0) and yielded (A0) of several methods; None: no guess."""
+    """Return the requests (a0) and yields (A0) of several methods; None: no guess."""
     events: list[str] = []
 
     def generate(kind: str, penetrations: Penetrations) -> Iterator[InitialGuess | None]:
@@ -247,7 +249,7 @@ def test_guesses_are_requested_once_and_good_ones_come_first(kinds: list[Penetra
                 turns = (yielded[kind], yielded[name[0]])
                 if not is_poor or other <= MAX_GOOD_PENETRATION or turns[0] == turns[1]:
                     assert penetration <= other
-                else:  # of poor guesses, one of the method with fewer turns
+                else:  # among poor guesses the method with fewer yields is next
                     assert turns[0] < turns[1]
             yielded[kind] += 1
     assert not waiting
@@ -256,7 +258,7 @@ def test_guesses_are_requested_once_and_good_ones_come_first(kinds: list[Penetra
 # --- narrow passages
 
 
-@pytest.mark.parametrize("width", [NARROW, TIGHT])
+@pytest.mark.parametrize("width", [NARROW, TOO_NARROW])
 def test_rrt_guess_leads_through_a_narrow_gate(width: float) -> None:
     """The base with its arm at home has no path."""
     gate, notes = make_gate_problem(width), list[str]()
@@ -269,20 +271,20 @@ def test_rrt_guess_leads_through_a_narrow_gate(width: float) -> None:
     )
     assert short.max() < gate.options.dist_safe + 0.01
     np.testing.assert_allclose(guess.z[-1, :3], GOAL, atol=1e-9)
-    if width == TIGHT:  # the arm at home just fits through the other gate
+    if width == TOO_NARROW:  # the arm at home just fits through the other gate
         assert np.ptp(guess.z[:, 3:9], axis=0).max() > 0.5
     (same,) = initialize(gate, "rrt", 0)
     np.testing.assert_array_equal(guess.z, same.z)
 
 
 @pytest.mark.parametrize("is_infeasible", [True, False])
-def test_auto_postpones_guesses_in_collision_and_asks_before_trees_grow(
+def test_auto_postpones_guesses_in_collision_and_checks_feasibility_before_rrt(
     is_infeasible: bool,
 ) -> None:
-    asked: list[Sequence[int]] = []
+    checked: list[Sequence[int]] = []
 
     def answer(phases: Sequence[int]) -> bool:
-        asked.append(phases)
+        checked.append(phases)
         return is_infeasible
 
     found = list(initialize(make_gate_problem(NARROW), "auto", 0, count=2, is_infeasible=answer))
@@ -290,7 +292,7 @@ def test_auto_postpones_guesses_in_collision_and_asks_before_trees_grow(
     assert [guess.name for guess in found[: len(names)]] == names
     assert found[len(names) - 1].penetration > MAX_GOOD_PENETRATION
     assert all("rrt" not in guess.name for guess in found) == is_infeasible
-    assert asked == [[]], "the robot is free at the goal of every phase"
+    assert checked == [[]], "the robot is free at the goal of every phase"
 
 
 def test_rrt_has_no_guess_if_there_is_no_path() -> None:
@@ -302,7 +304,7 @@ def test_rrt_has_no_guess_if_there_is_no_path() -> None:
 @pytest.mark.parametrize(("method", "is_fixed"), [("astar", False), ("rrt", True)])
 def test_rrt_keeps_the_base_fixed_during_the_approach(method: str, is_fixed: bool) -> None:
     reach = int(make_problem().ends[0])
-    begin = reach - OPENED.steps(OPENED.approach_time) - 1
+    begin = reach - FEW.steps(FEW.approach_time) - 1
     approach = make_guesses(method)[0].z[begin:reach, :3]
     assert (np.ptp(approach, axis=0).max() < 1e-4) == is_fixed
 

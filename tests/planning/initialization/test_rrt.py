@@ -1,4 +1,4 @@
-"""Tests of paths of base and arm by RRT: a narrow gate, a pole, a ball beside a moving door."""
+"""Tests RRT paths of base and arm: a narrow gate, a pole, a ball beside a moving door."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers.drives import make_hall
-from helpers.gates import GOAL, TIGHT, make_gate_problem, make_waypoint
+from helpers.gates import GOAL, TOO_NARROW, make_gate_problem, make_waypoint
 from helpers.small_problems import compute_grasp_error, load_door_scene, make_program
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -30,8 +30,8 @@ from vkc_pin.utils.budget import Budget, BudgetExhaustedError
 
 METRIC = np.array([2.0, 2.0, *np.ones(7)])  # x, y and yaw of the base, six joints of the arm
 STEPS = 60  # waypoints of open phases
-# [m] shortfall that may hide between two checks, 0.15 rad apart, and between waypoints
-HIDDEN = 0.03
+# [m] shortfall that is possible between two checks, 0.15 rad apart, and between waypoints
+UNCHECKED_SHORTFALL = 0.03
 
 
 def make_sampler(p: vkc.TrajectoryProblem, seed: int = 0) -> KeyframeSampler:
@@ -41,7 +41,7 @@ def make_sampler(p: vkc.TrajectoryProblem, seed: int = 0) -> KeyframeSampler:
 @cache
 def make_folding_problem() -> tuple[vkc.TrajectoryProblem, np.ndarray, np.ndarray]:
     """Return a problem that needs a folded arm, a guide path, and postures."""
-    problem = make_gate_problem(TIGHT)
+    problem = make_gate_problem(TOO_NARROW)
     routes = BaseRoutes(problem)
     guide = routes.find_guide_path(0, problem.start[:3], np.array(GOAL), 80)
     assert guide is not None
@@ -49,12 +49,20 @@ def make_folding_problem() -> tuple[vkc.TrajectoryProblem, np.ndarray, np.ndarra
 
 
 def find_path(
-    seed: int, ends: np.ndarray | None = None, *, tries: int = MAX_EXTENSIONS
+    seed: int, ends: np.ndarray | None = None, *, max_extensions: int = MAX_EXTENSIONS
 ) -> np.ndarray | None:
     """Find a path through the gate."""
     problem, guide, arms = make_folding_problem()
     ends = make_waypoint(problem, GOAL)[None] if ends is None else ends
-    return connect(problem, problem.start, ends, poses=guide, arms=arms, seed=seed, tries=tries)
+    return connect(
+        problem,
+        problem.start,
+        ends,
+        poses=guide,
+        arms=arms,
+        seed=seed,
+        max_extensions=max_extensions,
+    )
 
 
 def connect(
@@ -65,20 +73,26 @@ def connect(
     poses: np.ndarray,
     arms: np.ndarray,
     seed: int = 0,
-    tries: int = MAX_EXTENSIONS,
+    max_extensions: int = MAX_EXTENSIONS,
 ) -> np.ndarray | None:
     """Find a path in the first phase; return its waypoints with the first one."""
     sampler = make_sampler(problem, seed)
-    path = find_open_path(sampler, 0, first, ends, STEPS, tries, poses=poses, arms=arms)
+    path = find_open_path(sampler, 0, first, ends, STEPS, max_extensions, poses=poses, arms=arms)
     return None if path is None else np.vstack([first, path])
 
 
 def connect_directly(
-    problem: vkc.TrajectoryProblem, first: np.ndarray, last: np.ndarray, *, tries: int = 400
+    problem: vkc.TrajectoryProblem,
+    first: np.ndarray,
+    last: np.ndarray,
+    *,
+    max_extensions: int = 400,
 ) -> np.ndarray | None:
     """Find a path between two configurations, sampled near both of them."""
     ends = np.array([first, last])
-    return connect(problem, first, ends[1:], poses=ends[:, :3], arms=ends[:, 3:], tries=tries)
+    return connect(
+        problem, first, ends[1:], poses=ends[:, :3], arms=ends[:, 3:], max_extensions=max_extensions
+    )
 
 
 def compute_length(path: np.ndarray) -> float:
@@ -102,7 +116,7 @@ def compute_shortfall(problem: vkc.TrajectoryProblem, rows: np.ndarray) -> np.nd
 
 def assert_free(problem: vkc.TrajectoryProblem, path: np.ndarray) -> None:
     short, allowed = compute_shortfall(problem, refine(path)), problem.options.dist_safe
-    assert short.max() <= allowed + HIDDEN
+    assert short.max() <= allowed + UNCHECKED_SHORTFALL
     assert np.mean(short > allowed + 1e-6) < 0.1
     limits = np.array([problem.limits(name) for name in problem.chain.names[: path.shape[1]]])
     assert np.all((path >= limits[:, 0]) & (path <= limits[:, 1]))
@@ -121,7 +135,7 @@ def test_path_leads_through_the_gate_with_the_arm_folded(seed: int) -> None:
     rows = refine(path)
     inside = np.abs(rows[:, 0] + 0.3 - 2.0) < 0.1  # the arm at home is 0.2 to 0.45 m ahead
     assert np.abs(rows[inside, 3:] - problem.start[3:]).max(axis=1).min() > 0.1
-    # Shortcuts remove most of what the arm does besides folding and unfolding.
+    # Shortcuts remove most arm motion besides folding and unfolding.
     folding = np.abs(make_folding_problem()[2][1] - problem.start[3:]).sum()
     assert np.abs(np.diff(path[:, 3:], axis=0)).sum() < 5.0 * folding
 
@@ -156,17 +170,17 @@ def test_least_violating_end_is_tried() -> None:
     path = connect(problem, problem.start, np.array([towards[-1], near]), poses=poses, arms=arms)
     assert path is not None
     np.testing.assert_allclose(path[[0, -1]], [problem.start, near], rtol=0.0, atol=1e-9)
-    assert compute_shortfall(problem, refine(path)).max() <= allowed + HIDDEN
+    assert compute_shortfall(problem, refine(path)).max() <= allowed + UNCHECKED_SHORTFALL
 
 
 def test_free_path_is_straight_and_slow_at_both_ends() -> None:
     problem = make_program(make_hall(), [vkc.GoTo(2.0, 1.0, 0.5)])
     end = make_waypoint(problem, (2.0, 1.0, 0.5))
     end[3:] += 0.3
-    path = connect_directly(problem, problem.start, end, tries=1)
+    path = connect_directly(problem, problem.start, end, max_extensions=1)
     assert path is not None
-    share = np.arange(STEPS + 1)[:, None] / STEPS
-    expected = problem.start + (3.0 * share**2 - 2.0 * share**3) * (end - problem.start)
+    fraction = np.arange(STEPS + 1)[:, None] / STEPS
+    expected = problem.start + (3.0 * fraction**2 - 2.0 * fraction**3) * (end - problem.start)
     np.testing.assert_allclose(path, expected, rtol=0.0, atol=1e-9)
     path = connect_directly(problem, problem.start, problem.start)
     np.testing.assert_array_equal(path, np.tile(problem.start, (STEPS + 1, 1)))
@@ -187,7 +201,7 @@ def test_arm_on_a_fixed_base_avoids_a_pole() -> None:
     straight = np.array([first, last])
     assert compute_shortfall(problem, straight).max() == 0.0
     assert compute_shortfall(problem, refine(straight)).max() > 0.05
-    path = connect_directly(problem, first, last, tries=MAX_EXTENSIONS)
+    path = connect_directly(problem, first, last, max_extensions=MAX_EXTENSIONS)
     assert path is not None
     np.testing.assert_allclose(path[[0, -1]], straight, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(path[:, :3], np.tile(first[:3], (len(path), 1)), atol=1e-12)
@@ -204,13 +218,15 @@ def test_equal_random_seeds_give_equal_paths() -> None:
 
 def test_samples_along_the_guide_find_a_path_sooner() -> None:
     problem, guide, arms = make_folding_problem()
-    assert all(find_path(seed, tries=400) is not None for seed in range(3))
+    assert all(find_path(seed, max_extensions=400) is not None for seed in range(3))
     ends = make_waypoint(problem, GOAL)[None]
     sparse = guide[[0, -1]]
-    assert connect(problem, problem.start, ends, poses=sparse, arms=arms, tries=400) is None
+    assert (
+        connect(problem, problem.start, ends, poses=sparse, arms=arms, max_extensions=400) is None
+    )
 
 
-def test_a_budget_ends_the_search() -> None:
+def test_budget_ends_the_search() -> None:
     with Budget().activate() as budget:
         find_path(0)
     assert budget.evaluations > 200
@@ -240,8 +256,8 @@ def make_free_door() -> tuple[vkc.TrajectoryProblem, np.ndarray, list[int], np.n
     return p, path, found.waypoints, z
 
 
-def find_phase() -> tuple[np.ndarray, np.ndarray]:
-    """Return the keyframes and the straight waypoints of the phase."""
+def get_move_phase() -> tuple[np.ndarray, np.ndarray]:
+    """Return the keyframes and the straight waypoints of phase MOVE."""
     p, path, waypoints, z = make_free_door()
     begin, end = int(p.ends[MOVE - 1]), int(p.ends[MOVE])
     return path[[k for k, at in enumerate(waypoints) if begin <= at <= end]], z[begin:end]
@@ -250,7 +266,7 @@ def find_phase() -> tuple[np.ndarray, np.ndarray]:
 @cache
 def make_blocked_door() -> vkc.TrajectoryProblem:
     """Return the same problem with a ball in the elbow's path."""
-    p, straight = make_free_door()[0], find_phase()[1]
+    p, straight = make_free_door()[0], get_move_phase()[1]
     _, places = p.chain.joint_placements(straight[len(straight) // 2][None])
     elbow = p.chain.model.getJointId(str(load_door_scene().robot.model.names[4]))
     position = places[0, elbow].round(4).tolist()
@@ -261,10 +277,10 @@ def make_blocked_door() -> vkc.TrajectoryProblem:
     return make_program(scene, OPEN_AND_LEAVE, options=FEW)
 
 
-def find_path_with_door(seed: int, *, tries: int = MAX_EXTENSIONS) -> np.ndarray | None:
-    through, straight = find_phase()
+def find_path_with_door(seed: int, *, max_extensions: int = MAX_EXTENSIONS) -> np.ndarray | None:
+    through, straight = get_move_phase()
     sampler = make_sampler(make_blocked_door(), seed)
-    return find_closed_path(sampler, MOVE, through, len(straight), tries)
+    return find_closed_path(sampler, MOVE, through, len(straight), max_extensions)
 
 
 def compute_penetration(p: vkc.TrajectoryProblem, rows: np.ndarray) -> float:
@@ -280,7 +296,7 @@ def assert_holds_the_handle(p: vkc.TrajectoryProblem, rows: np.ndarray) -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_path_avoids_an_obstacle_and_holds_the_handle(seed: int) -> None:
-    p, (through, straight) = make_free_door()[0], find_phase()
+    p, (through, straight) = make_free_door()[0], get_move_phase()
     assert compute_penetration(make_blocked_door(), straight) > 0.02
     rows = find_path_with_door(seed)
     assert rows is not None
@@ -314,7 +330,7 @@ def test_next_phase_begins_where_the_closed_path_ends() -> None:
 
 
 def test_free_phases_and_colliding_starts_need_no_trees() -> None:
-    p, (through, straight) = make_free_door()[0], find_phase()
+    p, (through, straight) = make_free_door()[0], get_move_phase()
     assert compute_penetration(p, straight) <= 0.0
     assert not needs_trees(make_sampler(p), MOVE, through, straight)
     assert needs_trees(make_sampler(make_blocked_door()), MOVE, through, straight)
@@ -324,6 +340,6 @@ def test_free_phases_and_colliding_starts_need_no_trees() -> None:
 
 
 def test_extensions_and_budget_end_the_search() -> None:
-    assert find_path_with_door(0, tries=0) is None
+    assert find_path_with_door(0, max_extensions=0) is None
     with Budget(max_evaluations=50).activate(), pytest.raises(BudgetExhaustedError):
         find_path_with_door(0)

@@ -9,7 +9,7 @@ import pytest
 from vkc_pin.planning.kinematics.batch import BatchFunction
 
 
-def make() -> ca.Function:
+def make_function() -> ca.Function:
     x, y = ca.SX.sym("x", 3), ca.SX.sym("y", 2)
     matrix = ca.vertcat(
         ca.horzcat(x[0] * y[0], ca.sin(x[1])),
@@ -19,7 +19,7 @@ def make() -> ca.Function:
     return ca.Function("f", [x, y], [ca.densify(matrix), ca.sumsqr(x) + y[1]])
 
 
-FUNCTION = make()
+FUNCTION = make_function()
 
 
 def evaluate_one_by_one(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -30,8 +30,8 @@ def evaluate_one_by_one(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def test_batch_evaluation_equals_single_evaluations() -> None:
-    """Batch sizes may change; inputs may be one row for all, not contiguous, or integers."""
-    function, rng = BatchFunction(make()), np.random.default_rng(0)
+    """Batch sizes vary; inputs are single rows, not contiguous, or integers."""
+    function, rng = BatchFunction(make_function()), np.random.default_rng(0)
     for batch in [*range(1, 330, 16), 3, 1, 2]:
         x, y = rng.normal(size=(batch, 3)), rng.normal(size=(batch, 2))
         integers = np.arange(6 * batch)[::-1].reshape(batch, 6)[:, ::2] % 7
@@ -42,19 +42,19 @@ def test_batch_evaluation_equals_single_evaluations() -> None:
                 np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12)
 
 
-def test_results_are_the_callers_own() -> None:
-    function, rng = BatchFunction(make()), np.random.default_rng(0)
+def test_results_are_copies_and_inputs_are_not_modified() -> None:
+    function, rng = BatchFunction(make_function()), np.random.default_rng(0)
     first, second, y = rng.normal(size=(4, 3)), rng.normal(size=(4, 3)), rng.normal(size=(4, 2))
-    kept, _ = function(first, y)
-    kept_before, given_before = kept.copy(), first.copy()
+    result, _ = function(first, y)
+    result_before, input_before = result.copy(), first.copy()
     function(second, y)
-    np.testing.assert_array_equal(kept, kept_before)
-    np.testing.assert_array_equal(first, given_before)
-    kept[...] = np.nan
-    np.testing.assert_array_equal(function(first, y)[0], kept_before)
+    np.testing.assert_array_equal(result, result_before)
+    np.testing.assert_array_equal(first, input_before)
+    result[...] = np.nan
+    np.testing.assert_array_equal(function(first, y)[0], result_before)
 
 
 @pytest.mark.parametrize("shapes", [[(4, 3), (5, 2)], [(4, 2), (4, 2)], [(4, 3), (4, 3)], [(4, 3)]])
 def test_wrong_shapes_are_rejected(shapes: list[tuple[int, ...]]) -> None:
     with pytest.raises(ValueError, match=r"shape|argument"):
-        BatchFunction(make())(*(np.zeros(shape) for shape in shapes))
+        BatchFunction(make_function())(*(np.zeros(shape) for shape in shapes))

@@ -23,7 +23,7 @@ AXIS = np.array([0.36, -0.48, 0.8])
 
 
 def make_composite() -> pin.JointModelComposite:
-    """Return a joint made of three others, one of them continuous."""
+    """Return a composite of three joints, one of them continuous."""
     joint = pin.JointModelComposite(pin.JointModelRX())
     joint.addJoint(pin.JointModelPY(), pin.SE3.Random())
     joint.addJoint(pin.JointModelRUBZ(), pin.SE3.Random())
@@ -67,7 +67,7 @@ def make_tree(*kinds: str) -> pin.Model:
     for kind in kinds:
         parent = model.addJoint(parent, JOINTS[kind](), pin.SE3.Random(), kind)
         model.appendBodyToJoint(parent, pin.Inertia.Random(), pin.SE3.Random())
-        # What a fixed joint leaves behind: a frame with an inertia of its own.
+        # Pinocchio's parsers turn a fixed joint into such a frame, with the inertia of its link.
         model.addFrame(
             pin.Frame(
                 f"{kind}_tip",
@@ -88,7 +88,7 @@ def sample_configurations(model: pin.Model, count: int = 5) -> Iterator[np.ndarr
         yield pin.randomConfiguration(model, -bound, bound)
 
 
-def stack(placements: list[pin.SE3]) -> np.ndarray:
+def stack_placements(placements: list[pin.SE3]) -> np.ndarray:
     return np.array(
         [np.concatenate([m.rotation.T.ravel(), m.translation]) for m in placements]
     ).T.reshape(12, len(placements))
@@ -97,12 +97,12 @@ def stack(placements: list[pin.SE3]) -> np.ndarray:
 def compute_placements(model: pin.Model, q: np.ndarray) -> np.ndarray:
     data = model.createData()
     pin.forwardKinematics(model, data, q)
-    return stack([data.oMi[i] for i in range(1, model.njoints)])
+    return stack_placements([data.oMi[i] for i in range(1, model.njoints)])
 
 
 @pytest.fixture(scope="module")
 def arm() -> pin.Model:
-    """Every joint type with minimal coordinates in one chain."""
+    """Return a chain of all joint types with minimal coordinates."""
     return make_tree(*MINIMAL)
 
 
@@ -120,7 +120,9 @@ def test_kinematics_and_dynamics_equal_numeric_pinocchio(kind: str) -> None:
         np.testing.assert_allclose(
             joints(q).full(), compute_placements(model, q), atol=TOLERANCE, rtol=0
         )
-        np.testing.assert_allclose(tips(q).full(), stack(list(data.oMf)), atol=TOLERANCE, rtol=0)
+        np.testing.assert_allclose(
+            tips(q).full(), stack_placements(list(data.oMf)), atol=TOLERANCE, rtol=0
+        )
         expected = pin.rnea(model, data, q, v, a)
         np.testing.assert_allclose(
             torque(q, v, a).full().ravel(), expected, atol=TOLERANCE, rtol=TOLERANCE
@@ -151,15 +153,15 @@ def test_derivatives_equal_differences_of_numeric_pinocchio(arm: pin.Model) -> N
     derivatives = casadi.Function("derivatives", [z], casadi.hessian(value, z))
     point = random.normal(size=n)
 
-    def numeric(at: np.ndarray) -> float:
+    def evaluate(at: np.ndarray) -> float:
         return float(np.sum(weights * compute_placements(arm, coordinates.q(at))))
 
     hessian, gradient = (part.full().squeeze() for part in derivatives(point))
     for direction in random.normal(size=(20, n)):
-        ahead, behind = numeric(point + step * direction), numeric(point - step * direction)
+        ahead, behind = evaluate(point + step * direction), evaluate(point - step * direction)
         slope = (ahead - behind) / (2 * step)
         assert direction @ gradient == pytest.approx(slope, rel=1e-5, abs=1e-5)
-        curvature = (ahead - 2 * numeric(point) + behind) / step**2
+        curvature = (ahead - 2 * evaluate(point) + behind) / step**2
         exact = direction @ hessian @ direction
         assert exact == pytest.approx(curvature, rel=1e-5, abs=1e-4)
 
@@ -211,7 +213,7 @@ def test_rounded_quarter_turns_add_no_instructions() -> None:
     assert cpin.joint_placements(planar).nnz_out() == 7  # c, s, -s, c, 1, x, y
 
 
-def test_models_without_joints_and_empty_frame_lists() -> None:
+def test_models_without_joints_and_empty_frame_lists_have_no_columns() -> None:
     model = pin.Model()
     assert cpin.joint_placements(model).size_out(0) == (12, 0)
     assert cpin.frame_placements(model, []).size_out(0) == (12, 0)
@@ -223,7 +225,7 @@ def test_model_is_not_modified(arm: pin.Model) -> None:
     assert arm == before
 
 
-def test_frames_by_index_and_single_name(arm: pin.Model) -> None:
+def test_frames_are_accepted_by_index_and_by_name(arm: pin.Model) -> None:
     q, index = next(sample_configurations(arm)), arm.getFrameId("revolute_x_tip")
     by_name, by_index = (
         cpin.frame_placements(arm, "revolute_x_tip"),
@@ -252,7 +254,7 @@ def test_ambiguous_frame_names_are_rejected(arm: pin.Model) -> None:
 
 
 @pytest.mark.parametrize("installed", ["4.10.0", "5.1.0", "4.0.3"])
-def test_other_releases_are_rejected(installed: str) -> None:
+def test_incompatible_releases_are_rejected(installed: str) -> None:
     with pytest.raises(
         BuildError, match=rf"pin 4\.1\.0, but {installed} is installed.*pip install 'pin==4\.1\.\*'"
     ):
@@ -268,7 +270,7 @@ def test_patch_releases_are_accepted() -> None:
         backends.check_versions(built, {**installed, "pin": "unknown"})
 
 
-def test_a_missing_extension_says_what_to_install(
+def test_missing_extension_raises_an_error_that_names_the_compiler(
     monkeypatch: pytest.MonkeyPatch, arm: pin.Model
 ) -> None:
     monkeypatch.setitem(sys.modules, "vkc_pin.planning.kinematics._cpin", None)
@@ -278,7 +280,7 @@ def test_a_missing_extension_says_what_to_install(
     backends._import_extension.cache_clear()
 
 
-def test_backend_is_upstreams_where_it_can_be_imported(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_upstream_backend_is_used_if_available(monkeypatch: pytest.MonkeyPatch) -> None:
     for module, name in ((types.ModuleType("pinocchio.casadi"), "upstream"), (None, "compiled")):
         monkeypatch.setitem(sys.modules, "pinocchio.casadi", module)
         cpin._get_backend.cache_clear()
@@ -290,7 +292,7 @@ def test_backend_is_upstreams_where_it_can_be_imported(monkeypatch: pytest.Monke
     importlib.util.find_spec("pinocchio.casadi") is None,
     reason="this pinocchio has no casadi binding",
 )
-def test_upstream_equals_compiled(arm: pin.Model) -> None:
+def test_upstream_and_compiled_backends_agree(arm: pin.Model) -> None:
     q, (v, a) = next(sample_configurations(arm)), np.random.default_rng(6).normal(size=(2, arm.nv))
     frame = arm.getFrameId("planar_tip")
     for name, arguments, inputs in (
@@ -300,16 +302,16 @@ def test_upstream_equals_compiled(arm: pin.Model) -> None:
         ("rnea", (), (q, v, a)),
         ("center_of_mass", (), (q,)),
     ):
-        one, other = (
+        upstream, compiled = (
             backend(name, arm, *arguments)(*inputs).full()
             for backend in (backends.build_upstream, backends.build_compiled)
         )
-        np.testing.assert_allclose(one, other, atol=TOLERANCE)
+        np.testing.assert_allclose(upstream, compiled, atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("first", ["casadi", "pinocchio", "vkc_pin.planning.kinematics"])
 def test_compiled_module_is_imported_at_first_use(first: str) -> None:
-    """Whatever is imported first."""
+    """The order of imports does not matter."""
     code = f"""
 import {first}
 import sys, casadi, pinocchio, vkc_pin.planning.kinematics as cpin
@@ -318,8 +320,8 @@ model = pinocchio.Model()
 model.addJoint(0, pinocchio.JointModelRZ(), pinocchio.SE3.Identity(), "j")
 print(cpin.joint_placements(model)(0.5)[0])
 """
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
     )
-    assert done.returncode == 0, done.stderr
-    assert float(done.stdout) == pytest.approx(np.cos(0.5))
+    assert process.returncode == 0, process.stderr
+    assert float(process.stdout) == pytest.approx(np.cos(0.5))

@@ -44,35 +44,37 @@ def make_older(path: Path, seconds: float) -> None:
     os.utime(path, (time.time() - seconds,) * 2)
 
 
-def test_default_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def here() -> Path | None:
+def test_default_folder_follows_the_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def get_path() -> Path | None:
         found = Libraries.open_default()
         return found.path if found else None
 
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     for off in ("", "off", " OFF "):
         monkeypatch.setenv(CACHE_VARIABLE, off)
-        assert here() is None
+        assert get_path() is None
     assert not (tmp_path / "home").exists()
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "deep" / "own"))
-    assert here() == tmp_path / "deep" / "own" / "vkc_pin"
-    for made in (tmp_path / "deep" / "own", tmp_path / "deep" / "own" / "vkc_pin"):
-        assert made.stat().st_mode & 0o777 == 0o700
+    assert get_path() == tmp_path / "deep" / "own" / "vkc_pin"
+    for created in (tmp_path / "deep" / "own", tmp_path / "deep" / "own" / "vkc_pin"):
+        assert created.stat().st_mode & 0o777 == 0o700
     monkeypatch.setenv(CACHE_VARIABLE, "~/mine")
-    assert here() == tmp_path / "home" / "mine" / "vkc_pin"
+    assert get_path() == tmp_path / "home" / "mine" / "vkc_pin"
     monkeypatch.delenv(CACHE_VARIABLE)
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    assert here() == tmp_path / "home" / ".cache" / "vkc_pin"
+    assert get_path() == tmp_path / "home" / ".cache" / "vkc_pin"
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")
-    assert here() == tmp_path / "home" / ".cache" / "vkc_pin"
+    assert get_path() == tmp_path / "home" / ".cache" / "vkc_pin"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert here() == tmp_path / "xdg" / "vkc_pin"
+    assert get_path() == tmp_path / "xdg" / "vkc_pin"
 
 
 def test_unsafe_folders_are_not_used(
     tmp_path: Path, folder: Libraries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Other users may not write to them, and links may lead anywhere."""
+    """Folders that other users can write to, and symbolic links, are unsafe."""
     for path in (folder.path, folder.path.parent):
         for mode in (0o755, 0o770, 0o777, 0o702, 0o700):
             path.chmod(mode)
@@ -106,7 +108,7 @@ def test_published_libraries_are_found(folder: Libraries) -> None:
 
 @pytest.mark.parametrize("size", [0, 31, 32, 5000, len(LIBRARY) + 31, None])
 def test_damaged_library_is_removed(folder: Libraries, size: int | None) -> None:
-    """It is truncated, or one bit differs."""
+    """The file is truncated, or one of its bits is flipped."""
     folder.publish(A, LIBRARY)
     path = folder.path / f"{A}.so"
     data = path.read_bytes()
@@ -115,7 +117,7 @@ def test_damaged_library_is_removed(folder: Libraries, size: int | None) -> None
     assert list_names(folder) == []
 
 
-def test_files_that_others_could_write_are_not_used(
+def test_links_and_files_of_other_users_are_not_used(
     folder: Libraries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder.publish(A, LIBRARY)
@@ -133,7 +135,7 @@ def test_files_that_others_could_write_are_not_used(
         folder.read_job(C)
 
 
-def test_requests_are_listed_until_there_are_too_many(folder: Libraries) -> None:
+def test_requests_are_listed_up_to_a_maximum_number(folder: Libraries) -> None:
     for key in (B, A, B):  # a repeated request is pending, too: the first worker may be dead
         assert folder.request(key, b"job")
     assert folder.list_jobs() == [A, B]
@@ -180,9 +182,9 @@ def test_files_of_dead_processes_are_removed_after_a_day(folder: Libraries) -> N
     (build / "f.c").write_bytes(b"")
     folder.publish(A, LIBRARY)
     folder.evict()
-    everything = list_names(folder)
-    assert len(everything) == 6
-    for name in everything:
+    names = list_names(folder)
+    assert len(names) == 6
+    for name in names:
         make_older(folder.path / name, 90000)
     folder.evict()
     assert list_names(folder) == [f"{A}.so", "lock"]
@@ -194,13 +196,13 @@ FOREIGN = (
     *(f"{A}.txt", f"x{A}.so", f".{A}.so", f"{B}.so/inside", f"{B}.job/inside"),
     *(".build-1/f.c", ".build-abcdefgh.txt", ".new-1", ".new-abcdefgh.txt"),
 )
-"""Files that the package never creates in its cache, some with names like those that it creates."""
+"""Files that the package never creates in its cache, some with similar names."""
 
 
-def test_files_of_others_are_neither_removed_nor_compiled(
+def test_foreign_files_are_neither_removed_nor_compiled(
     folder: Libraries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both in the folder that the variable names, and in the cache's own folder."""
+    """Both in the folder that the variable names and in the cache folder within it."""
     monkeypatch.setattr(libraries, "_MAX_FILES", 2)
     monkeypatch.setattr(libraries, "_MAX_BYTES", 100)
     for place in (folder.path.parent, folder.path):
@@ -253,11 +255,11 @@ def test_only_one_process_compiles(folder: Libraries) -> None:
     os.close(third)
 
 
-def test_files_are_written_atomically(folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(self: Path, target: Path) -> Path:
+def test_failed_write_leaves_no_file(folder: Libraries, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(self: Path, target: Path) -> Path:
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(Path, "replace", full)
+    monkeypatch.setattr(Path, "replace", fail)
     with pytest.raises(OSError, match="no space"):
         folder.publish(A, LIBRARY)
     assert list_names(folder) == []

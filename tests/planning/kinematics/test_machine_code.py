@@ -41,7 +41,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Libraries:
     return found
 
 
-def make(factor: float = 3.0) -> ca.Function:
+def make_function(factor: float = 3.0) -> ca.Function:
     x, y = ca.SX.sym("x", 3), ca.SX.sym("y", 2)
     branch = ca.if_else(x[1] > 0.3, ca.sqrt(ca.fabs(x[0])), ca.atan2(y[0], y[1]))
     values = [
@@ -53,7 +53,7 @@ def make(factor: float = 3.0) -> ca.Function:
     return ca.Function("f", [x, y], [ca.vertcat(*values), ca.densify(x @ y.T)], {"cse": True})
 
 
-def equal(one: ca.Function, other: ca.Function, draws: int = 50) -> bool:
+def are_equal(one: ca.Function, other: ca.Function, draws: int = 50) -> bool:
     rng = np.random.default_rng(7)
     for _ in range(draws):
         inputs = [
@@ -65,7 +65,7 @@ def equal(one: ca.Function, other: ca.Function, draws: int = 50) -> bool:
     return True
 
 
-def compile_here(folder: Libraries) -> None:
+def compile_pending_jobs(folder: Libraries) -> None:
     lock = folder.lock()
     assert lock is not None
     compile_jobs(str(folder.path), lock)
@@ -90,8 +90,8 @@ def test_compiled_waypoint_functions_are_equal_bit_for_bit(folder: Libraries) ->
     assert functions.code.try_load()
     for one, other in zip(interpreted, functions.code.functions, strict=True):
         assert other.class_name() == "External"
-        assert equal(one, other)
-        assert equal(one.map(5), other.map(5), 5)
+        assert are_equal(one, other)
+        assert are_equal(one.map(5), other.map(5), 5)
     assert folder.list_jobs() == []
 
 
@@ -117,11 +117,13 @@ def test_program_is_rebuilt_when_machine_code_is_available(folder: Libraries) ->
     assert not second.uncompiled_functions
     rng = np.random.default_rng(0)
     x, parameters = rng.normal(size=first.size), rng.normal(size=first.parameters.numel())
-    rows, others = (evaluate(program, x, parameters) for program in (first, second))
+    rows, others = (evaluate_rows(program, x, parameters) for program in (first, second))
     assert rows == others
 
 
-def evaluate(program: Transcription, x: np.ndarray, parameters: np.ndarray) -> tuple[bytes, bytes]:
+def evaluate_rows(
+    program: Transcription, x: np.ndarray, parameters: np.ndarray
+) -> tuple[bytes, bytes]:
     function = ca.Function("rows", [program.x, program.parameters], [program.g, program.jacobian])
     values, jacobian = function(x, parameters)
     return np.array(values.nonzeros()).tobytes(), np.array(jacobian.nonzeros()).tobytes()
@@ -132,10 +134,12 @@ def test_frequently_used_batch_functions_are_compiled(
 ) -> None:
     rng = np.random.default_rng(0)
     x, y = rng.normal(size=(40, 3)), rng.normal(size=(40, 2))
-    function = BatchFunction(make())
+    function = BatchFunction(make_function())
     expected = [part.tobytes() for part in function(x, y)]
     assert folder.list_jobs() == []
-    monkeypatch.setattr(batch, "_MIN_INSTRUCTIONS_TO_COMPILE", 30 * make().n_instructions())
+    monkeypatch.setattr(
+        batch, "_MIN_INSTRUCTIONS_TO_COMPILE", 30 * make_function().n_instructions()
+    )
     assert [part.tobytes() for part in function(x, y)] == expected
     assert wait()
     assert [part.tobytes() for part in function(x, y)] == expected
@@ -145,7 +149,7 @@ def test_frequently_used_batch_functions_are_compiled(
 
 
 def test_libraries_are_shared_with_later_processes(folder: Libraries) -> None:
-    code = "from test_machine_code import *; MachineCode(make()).try_load()"
+    code = "from test_machine_code import *; MachineCode(make_function()).try_load()"
     environment = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path]),
@@ -155,53 +159,53 @@ def test_libraries_are_shared_with_later_processes(folder: Libraries) -> None:
     assert process.stderr == b""
     wait_until(lambda: not folder.list_jobs())
     assert len(list(folder.path.glob("*.so"))) == 1
-    mine = MachineCode(make())
-    assert mine.try_load()
-    assert equal(make(), mine.functions[0])
+    shared = MachineCode(make_function())
+    assert shared.try_load()
+    assert are_equal(make_function(), shared.functions[0])
 
 
-def test_concurrent_loading(folder: Libraries) -> None:
-    MachineCode(make()).try_load()
+def test_threads_can_load_a_library_concurrently(folder: Libraries) -> None:
+    MachineCode(make_function()).try_load()
     assert wait()
-    right: list[bool] = []
+    results: list[bool] = []
 
     def load() -> None:
         for _ in range(3):
-            code = MachineCode(make())
-            right.append(code.try_load() and equal(make(), code.functions[0], 5))
+            code = MachineCode(make_function())
+            results.append(code.try_load() and are_equal(make_function(), code.functions[0], 5))
 
     threads = [threading.Thread(target=load) for _ in range(3)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert right == [True] * 9
+    assert results == [True] * 9
 
 
 def test_libraries_depend_on_function_and_compiler(
     folder: Libraries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    codes = [MachineCode(make(3.0)), MachineCode(make(np.nextafter(3.0, 4.0)))]
+    codes = [MachineCode(make_function(3.0)), MachineCode(make_function(np.nextafter(3.0, 4.0)))]
     for code in codes:
         code.try_load()
     monkeypatch.setenv("CC", "cc -O2 -w")
-    codes.append(MachineCode(make(3.0)))
+    codes.append(MachineCode(make_function(3.0)))
     codes[2].try_load()
     assert wait()
     assert len(list(folder.path.glob("*.so"))) == 3
     assert all(code.try_load() for code in codes)
     functions = [code.functions[0] for code in codes]
-    assert equal(make(3.0), functions[0])
-    assert equal(functions[0], functions[2])
-    assert not equal(functions[0], functions[1])
+    assert are_equal(make_function(3.0), functions[0])
+    assert are_equal(functions[0], functions[2])
+    assert not are_equal(functions[0], functions[1])
 
 
 @pytest.mark.parametrize("command", ["/nowhere/cc", "no-such-compiler", "'unbalanced"])
-def test_nothing_is_requested_without_a_compiler(
+def test_no_compilation_is_requested_without_a_compiler(
     command: str, folder: Libraries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CC", command)
-    code = MachineCode(make())
+    code = MachineCode(make_function())
     assert not code.try_load()
     assert folder.list_jobs() == []
     assert code.functions[0](1.0, 2.0) is not None
@@ -218,28 +222,28 @@ BROKEN = {
 }
 
 
-SLOW = pytest.mark.long  # each waits for a compiler
+SLOW = pytest.mark.long  # waits for a compiler
 
 
 @pytest.mark.parametrize(
-    "how",
+    "fault",
     [
-        pytest.param(how, marks=() if how in ("fails", "computes something else") else SLOW)
-        for how in BROKEN
+        pytest.param(fault, marks=() if fault in ("fails", "computes something else") else SLOW)
+        for fault in BROKEN
     ],
 )
-def test_a_broken_compiler_is_tried_once(
-    how: str, folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_broken_compiler_is_tried_once(
+    fault: str, folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("CC", write_script(tmp_path / "broken", BROKEN[how]))
-    code = MachineCode(make())
+    monkeypatch.setenv("CC", write_script(tmp_path / "broken", BROKEN[fault]))
+    code = MachineCode(make_function())
     assert not code.try_load()
-    assert wait(), how
+    assert wait(), fault
     assert not code.try_load()
     assert not code.is_compiled
     assert list(folder.path.glob("*.so")) == []
     assert len(list(folder.path.glob("*.failed"))) == 1
-    assert not MachineCode(make()).try_load()
+    assert not MachineCode(make_function()).try_load()
     assert folder.list_jobs() == []
 
 
@@ -255,9 +259,9 @@ def test_hanging_compiler_is_killed(
     )
     monkeypatch.setattr(machine_code, "_COMPILER_TIMEOUT", 1.0)
     monkeypatch.setattr(machine_code, "has_python", lambda: False)
-    assert not MachineCode(make()).try_load()
+    assert not MachineCode(make_function()).try_load()
     assert not wait()
-    compile_here(folder)
+    compile_pending_jobs(folder)
     assert folder.list_jobs() == []
     assert len(list(folder.path.glob("*.failed"))) == 1
     wait_until(lambda: has_ended(int(pid.read_text())))
@@ -268,21 +272,21 @@ def test_embedding_program_is_not_started_as_worker(
     executable: str, folder: Libraries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "executable", executable)
-    assert not MachineCode(make()).try_load()
+    assert not MachineCode(make_function()).try_load()
     assert not wait()
     assert len(folder.list_jobs()) == 1
 
 
-def wait_until(done: Callable[[], bool]) -> None:
+def wait_until(condition: Callable[[], bool]) -> None:
     for _ in range(6000):
-        if done():
+        if condition():
             return
         time.sleep(0.02)
-    raise AssertionError("time is up")
+    raise AssertionError("timeout")
 
 
 def has_ended(pid: int) -> bool:
-    """Whether a process is no more, but for its entry."""
+    """Return whether a process has ended or is a zombie."""
     try:
         return (
             Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
@@ -293,7 +297,7 @@ def has_ended(pid: int) -> bool:
 
 
 def plan_door(planner: vkc.Planner | None = None) -> list[bytes]:
-    """Return a plan by the given planner, or by a new one without caches."""
+    """Return times and positions of a plan, by `planner` or by one without caches."""
     steps, options = [Grasp("door")], vkc.Options(reach_waypoints=10)
     plan = vkc.plan(load_door_scene(), steps, options=options, planner=planner or vkc.Planner())
     assert plan.success, plan.summary()
@@ -301,46 +305,46 @@ def plan_door(planner: vkc.Planner | None = None) -> list[bytes]:
 
 
 @pytest.fixture(scope="module")
-def expected() -> list[bytes]:
-    """Return the motion that is found without libraries."""
+def interpreted_plan() -> list[bytes]:
+    """Return the plan without compiled libraries."""
     assert os.environ[CACHE_VARIABLE] == "off"
     return plan_door()
 
 
 @pytest.mark.long
-def test_plans_are_equal_bit_for_bit(
-    folder: Libraries, expected: list[bytes], monkeypatch: pytest.MonkeyPatch
+def test_plans_are_equal_bit_for_bit_with_compiled_functions(
+    folder: Libraries, interpreted_plan: list[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(batch, "_MIN_INSTRUCTIONS_TO_COMPILE", 0)  # all that can be compiled is
+    monkeypatch.setattr(batch, "_MIN_INSTRUCTIONS_TO_COMPILE", 0)  # compile everything
     planner = vkc.Planner()
-    assert plan_door(planner) == expected
+    assert plan_door(planner) == interpreted_plan
     assert wait()
     monkeypatch.setattr(machine_code, "has_python", lambda: False)
     assert list(folder.path.glob("*.failed")) == []
     loaded: list[Any] = []
     external = ca.external
     monkeypatch.setattr(ca, "external", lambda *a: loaded.append(a) or external(*a))
-    assert plan_door(planner) == expected
+    assert plan_door(planner) == interpreted_plan
     assert len(loaded) > 2
     loaded.clear()
-    assert plan_door() == expected
+    assert plan_door() == interpreted_plan
     assert len(loaded) > 2
 
 
 @pytest.mark.parametrize(
-    "trouble",
+    "fault",
     ["broken compiler", "truncated", pytest.param("no folder", marks=pytest.mark.long)],
 )
-def test_planning_works_without_a_compiler(
-    trouble: str,
+def test_planning_works_without_usable_libraries(
+    fault: str,
     folder: Libraries,
     tmp_path: Path,
-    expected: list[bytes],
+    interpreted_plan: list[bytes],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    if trouble == "broken compiler":
+    if fault == "broken compiler":
         monkeypatch.setenv("CC", write_script(tmp_path / "broken", BROKEN["writes garbage"]))
-    elif trouble == "truncated":
+    elif fault == "truncated":
         monkeypatch.setattr(
             Libraries,
             "exists",
@@ -349,7 +353,7 @@ def test_planning_works_without_a_compiler(
     else:
         monkeypatch.setenv(CACHE_VARIABLE, "/proc/nowhere")
     planner = vkc.Planner()
-    assert plan_door(planner) == expected
-    assert wait() == (trouble != "no folder")
-    assert plan_door(planner) == expected
+    assert plan_door(planner) == interpreted_plan
+    assert wait() == (fault != "no folder")
+    assert plan_door(planner) == interpreted_plan
     assert list(folder.path.glob("*.so")) == []

@@ -17,7 +17,7 @@ WAYPOINT = SHORT.reach_waypoints - 1
 
 @pytest.fixture(scope="module")
 def problem() -> TrajectoryProblem:
-    """A door and a speed limit, which makes the step durations parameters of the program."""
+    """Return a problem with a speed limit, which makes the step durations parameters."""
     slow = vkc.Constraint("slow", lambda s: ca.sumsqr(s.velocity("tool")), upper=4.0)
     steps = [vkc.Actuate("door", {"hinge": 1.2})]
     return make_program(vkc.load_scene("door"), steps, options=SHORT, terms=[slow])
@@ -25,7 +25,7 @@ def problem() -> TrajectoryProblem:
 
 @pytest.fixture(scope="module")
 def z(problem: TrajectoryProblem) -> np.ndarray:
-    """Waypoints at which the arm is in front of the door."""
+    """Return waypoints with the arm in front of the door."""
     start = problem.start.copy()
     start[:3] = 1.4, -0.36, 0.2
     return np.tile(start, (problem.segments, 1))
@@ -53,7 +53,7 @@ def test_sizes_add_up() -> None:
 
 
 @pytest.mark.parametrize("at", [0, WAYPOINT - 1, -1])
-def test_planes_are_distances_to_first_order(
+def test_planes_equal_distances_to_first_order(
     problem: TrajectoryProblem, z: np.ndarray, at: int
 ) -> None:
     found = planes(problem, z, int(np.arange(1, len(z) + 1)[at]))

@@ -20,7 +20,7 @@ from vkc_pin.utils.budget import Budget
 def test_ipopt_stops_when_the_budget_is_exhausted(
     budget: dict[str, Any], iterations: int | None
 ) -> None:
-    """Each iteration, and the start, costs ten evaluations."""
+    """The start and each iteration cost ten evaluations."""
     x, p = ca.MX.sym("x", 2), ca.MX.sym("p")
     program = {
         "x": x,

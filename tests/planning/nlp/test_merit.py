@@ -1,4 +1,4 @@
-"""Tests of the constraint violations along a motion and of the exact ℓ1 merit function."""
+"""Tests constraint violations along a motion and the exact ℓ1 merit function."""
 
 from __future__ import annotations
 
@@ -62,14 +62,14 @@ def test_feasible_motion_has_no_violation() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_amounts_of_each_kind(seed: int) -> None:
+def test_amounts_equal_the_violations_of_each_kind(seed: int) -> None:
     p = make_problem("drive")
     z, timing = sample_path(p, seed), p.timing_for(p.still)
     found, path = measure(p, z, rates=True), p.waypoints(z)
     _, lateral, _ = p.rolling.compute_steps(path)
-    missing = np.maximum(p.rolling.compute_min_times(path) - timing.dt, 0.0)  # of the faster wheel
-    least = np.abs(lateral) + missing * p.rolling.wheel_speed
-    assert (found.amounts["rolling"] >= least - 1e-9).all()
+    deficit = np.maximum(p.rolling.compute_min_times(path) - timing.dt, 0.0)  # of the faster wheel
+    lower_bound = np.abs(lateral) + deficit * p.rolling.wheel_speed
+    assert (found.amounts["rolling"] >= lower_bound - 1e-9).all()
     relaxed = measure(p, z, rates=False).amounts
     np.testing.assert_allclose(relaxed["rolling"], np.abs(lateral), atol=1e-12)
     assert not relaxed["rates"].any()
@@ -98,15 +98,15 @@ def test_pose_amounts_are_distance_plus_angle() -> None:
     assert not found.rate_excess.size
 
 
-def test_shortfalls_are_those_of_pairs_with_planes() -> None:
+def test_shortfalls_equal_those_of_pairs_with_planes() -> None:
     p = make_problem("drive")
     contacts = p.evaluate_contacts(sample_path(p, 0), reach=p.options.contact_reach)
     found = compute_shortfalls(contacts, p.segments, 2)
     assert found.any()
     for row in range(p.segments):
-        mine = np.flatnonzero(contacts.waypoint == row)[:2]
-        expected = np.maximum(contacts.margin[mine] - contacts.distance[mine], 0.0)
-        np.testing.assert_allclose(found[row], np.pad(expected, (0, 2 - len(mine))))
+        own = np.flatnonzero(contacts.waypoint == row)[:2]
+        expected = np.maximum(contacts.margin[own] - contacts.distance[own], 0.0)
+        np.testing.assert_allclose(found[row], np.pad(expected, (0, 2 - len(own))))
 
 
 def test_penalty_is_the_weighted_sum_of_amounts() -> None:
@@ -128,5 +128,5 @@ def test_weights_of_violated_kinds_increase() -> None:
     increased = {"clearance": 2.0 * GROWTH, "terms": 2.0 * GROWTH}
     assert merit.weights == {**dict.fromkeys(KINDS, 2.0), **increased}
     assert not merit.increase_weights(make_infeasibility(poses=[0.09, 0.0]), 0.1)
-    merit.weights["clearance"] = MAX_WEIGHT  # a violation that more weight does not remove
+    merit.weights["clearance"] = MAX_WEIGHT  # the weight cannot increase further
     assert not merit.increase_weights(make_infeasibility(clearance=[0.2]), 0.1)

@@ -23,7 +23,7 @@ def make_cost(*, length: bool = True) -> MotionCost:
 
 
 def compute_rates(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return steps and their changes of z_0..z_N."""
+    """Return the steps of z_0..z_N and their changes."""
     first, second, start_first, start_second = MATRICES
     return first @ path[1:] + np.outer(start_first, path[0]), second @ path[1:] + np.outer(
         start_second, path[0]
@@ -64,7 +64,7 @@ def compute_path_length(path: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_squares_are_equation_1(seed: int) -> None:
+def test_squared_cost_equals_equation_1(seed: int) -> None:
     path, total = sample_path(seed), 0.0
     for begin, end in itertools.pairwise([0, *STOPS, ENDS[-1]]):
         step = np.diff(path[begin : end + 1], axis=0)
@@ -93,7 +93,7 @@ def test_stationary_motion_costs_nothing() -> None:
 
 
 def test_motion_at_constant_speed_costs_its_length() -> None:
-    """4 m on a slant and 2 rad of a joint; one of two phases has nine times the waypoints."""
+    """The base moves 4 m and a joint 2 rad; one phase has nine times the other's waypoints."""
     for ends in ((4, 40), (36, 40)):
         path = np.zeros((41, 6))
         path[:, :2] = np.outer(
@@ -101,9 +101,9 @@ def test_motion_at_constant_speed_costs_its_length() -> None:
         )
         path[:, 3] = np.interp(np.arange(41), [0, ends[0], 40], [0.0, 1.5, 2.0])
         matrices = make_differences(40, ())
-        given = [matrices[k] @ path[1:] + np.outer(matrices[k + 2], path[0]) for k in (0, 1)]
+        rates = [matrices[k] @ path[1:] + np.outer(matrices[k + 2], path[0]) for k in (0, 1)]
         assert MotionCost(METRIC, 0.0, np.array(ends), (), length=True).value(
-            *given
+            *rates
         ) == pytest.approx(4.0 + 0.1 * 2.0, abs=0.07)
 
 

@@ -114,7 +114,7 @@ def test_grasped_objects_do_not_move_and_freedoms_have_limits(
     assert set(units.values()) == {"m", "rad"}
 
 
-def test_goal_beyond_a_limit_is_the_limit() -> None:
+def test_goal_beyond_a_limit_is_clipped_to_it() -> None:
     steps = [Actuate("door", {"hinge": 2.0}), GoTo(0.0, 0.0)]
     problem = make_program(load_door_scene(), steps, options=SHORT)
     assert np.all(get_bounds(problem, "door.hinge")[problem.ends[2] - 1 :] == 1.57)
@@ -172,7 +172,7 @@ def test_start_is_the_state_of_the_scene() -> None:
     assert np.all(get_bounds(problem, "door.knob") == 0.2)
 
 
-def test_clip_and_waypoints(opening: TrajectoryProblem) -> None:
+def test_clip_applies_bounds_and_waypoints_include_the_start(opening: TrajectoryProblem) -> None:
     wild = 100.0 * np.random.default_rng(0).normal(size=(opening.segments, opening.chain.size))
     clipped = opening.clip(wild)
     np.testing.assert_array_equal(clipped, np.clip(wild, opening.lower, opening.upper))
@@ -186,8 +186,8 @@ def test_problem_is_immutable(opening: TrajectoryProblem) -> None:
             array[:1] = 0.0
     lower, upper = opening.lower.copy(), opening.upper.copy()
     lower[:, :3] = upper[:, :3] = opening.start[:3]
-    standing, moved = opening.with_bounds(lower, upper), opening.still + 0.5
-    np.testing.assert_array_equal(standing.clip(moved)[:, :3], opening.still[:, :3])
+    fixed_base, moved = opening.with_bounds(lower, upper), opening.still + 0.5
+    np.testing.assert_array_equal(fixed_base.clip(moved)[:, :3], opening.still[:, :3])
     assert np.all(opening.clip(moved)[:-1, :3] > opening.still[:-1, :3])
 
 
@@ -205,7 +205,7 @@ def test_closure_holds_from_the_grasp_to_the_release(opening: TrajectoryProblem)
     assert opening.targets == (opening.scene.objects["door"].placement,) * 2
 
 
-def test_goals_of_several_grasps(two_grasps: TrajectoryProblem) -> None:
+def test_every_grasp_has_closure_and_approach_goals(two_grasps: TrajectoryProblem) -> None:
     first, second, third, fourth = two_grasps.ends.tolist()
     assert get_goal_waypoints(two_grasps) == {
         "closure cabinet": (first,),
@@ -220,7 +220,7 @@ def test_goals_of_several_grasps(two_grasps: TrajectoryProblem) -> None:
     assert two_grasps.transcription.structure.stops == (first, second, third)
 
 
-def test_object_held_at_the_start_is_closed_from_the_first_waypoint() -> None:
+def test_closure_of_an_initially_held_object_holds_from_the_first_waypoint() -> None:
     scene = dataclasses.replace(load_door_scene(), holds=(HANDLE,))
     problem = make_program(scene, [Actuate("door", {"knob": 0.3})], options=SHORT)
     assert get_goal_waypoints(problem) == {"closure door": tuple(range(1, MOVE + 1))}
@@ -236,7 +236,7 @@ def test_any_frame_of_the_robot_can_reach_a_pose() -> None:
     assert (pose.joint, pose.local) == (frame.parentJoint, frame.placement)
 
 
-def test_pose_error_and_drift(opening: TrajectoryProblem) -> None:
+def test_pose_error_and_drift_equal_their_definitions(opening: TrajectoryProblem) -> None:
     """Pose error is the largest residual at goals; drift is measured between waypoints."""
     z, data = sample_path(opening), opening.chain.model.createData()
 
@@ -280,7 +280,7 @@ def test_pose_error_and_drift(opening: TrajectoryProblem) -> None:
 def test_hand_approaches_a_grasp_in_a_straight_line(
     step: Step, make_scene: Callable[[], Scene]
 ) -> None:
-    """Before the grasp, the tool is `approach` behind the grasp pose, whatever its freedoms."""
+    """Before the grasp, the tool is `approach` behind the grasp pose, at any freedom values."""
     problem = make_program(make_scene(), [step], options=SHORT)
     chain, (hold,) = problem.chain, problem.task.holds
     number = [goal.kind for goal in problem.pose_goals].index("approach")
@@ -346,7 +346,7 @@ def test_initially_held_object_stays_in_the_hand(fetching: TrajectoryProblem) ->
         assert np.all(get_bounds(fetching, column)[until:] == (-limit, limit))
     chosen = [fetching.chain.index(f"ball.pull_{axis}") for axis in "zyx"]
     assert fetching.choices == tuple((column, REACH, 2 * REACH) for column in chosen)
-    # they change only while grasping, at next to no cost
+    # they change only while grasping, at negligible cost
     weight = 1e-4 * fetching.options.velocity_weight_object
     np.testing.assert_allclose(fetching.motion_cost.metric[chosen], weight, rtol=1e-12)
 
@@ -413,7 +413,7 @@ def test_relaxed_program_with_rows_of_all_kinds_is_feasible_at_its_iterate() -> 
 
 
 @pytest.mark.parametrize("scale", [0.01, 3.0])
-def test_rate_violation_is_that_of_the_trajectory(
+def test_rate_violation_equals_that_of_the_trajectory(
     two_grasps: TrajectoryProblem, scale: float
 ) -> None:
     z = sample_path(two_grasps, scale)
@@ -425,11 +425,11 @@ def test_rate_violation_is_that_of_the_trajectory(
     assert timing.compute_violation(*two_grasps.rates(z)) == pytest.approx(expected, rel=1e-9)
 
 
-def test_only_long_runs_get_more_time(opening: TrajectoryProblem) -> None:
+def test_steps_are_longer_only_in_runs_with_long_motions(opening: TrajectoryProblem) -> None:
     stops = [0, *opening.transcription.structure.stops, opening.segments]
     first, *others = [slice(a, b) for a, b in itertools.pairwise(stops)]
-    z, share = opening.still, np.arange(1, first.stop + 1) / first.stop
-    z[first, 0] += 30.0 * share**2 * (3 - 2 * share)
+    z, progress = opening.still, np.arange(1, first.stop + 1) / first.stop
+    z[first, 0] += 30.0 * progress**2 * (3 - 2 * progress)
     z[first.stop :, 0] += 30.0
     still, timing = opening.timing_for(opening.still), opening.timing_for(z)
     np.testing.assert_array_equal(still.dt, SHORT.dt)
@@ -442,7 +442,9 @@ def test_only_long_runs_get_more_time(opening: TrajectoryProblem) -> None:
     assert opening.objective(opening.still, still.dt) == 0.0
 
 
-def test_contacts_are_those_of_each_phase(opening: TrajectoryProblem) -> None:
+def test_moving_geometry_of_an_object_has_contacts_only_while_held(
+    opening: TrajectoryProblem,
+) -> None:
     z = opening.clip(np.nan_to_num(sample_path(opening, 0.3)))
     contacts = opening.evaluate_contacts(z, reach=0.3, nearest=5)
     assert np.bincount(contacts.waypoint).max() == 5
@@ -452,12 +454,12 @@ def test_contacts_are_those_of_each_phase(opening: TrajectoryProblem) -> None:
     assert set(contacts.waypoint[held]) == set(range(opening.ends[0], opening.ends[2]))
 
 
-def test_repr(opening: TrajectoryProblem) -> None:
+def test_repr_names_phases_and_sizes(opening: TrajectoryProblem) -> None:
     phases = "reach door.handle → turn door.knob → move door.hinge, door.knob → go to"
     steps = f"{opening.segments} steps in {0.25 * opening.segments:g} s"
     assert f"{phases}: {steps}, {opening.transcription.size} variables" in repr(opening)
 
 
-def test_a_joint_cannot_be_grasped_twice() -> None:
+def test_joint_cannot_be_grasped_twice() -> None:
     with pytest.raises(InputError, match="two grasps of one joint"):
         make_program(load_door_scene(), [Grasp("door", "handle"), Grasp("door", "handle_free")])

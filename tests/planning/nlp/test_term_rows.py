@@ -115,8 +115,8 @@ def make_problem(name: str) -> vkc.TrajectoryProblem:
 NAMES = ["stick", "ball", "furniture"]
 
 
-class Numbers:
-    """Numeric State: frames of the plain models, and grasps by their definition."""
+class NumericState:
+    """Evaluates frames with the models of robot and objects, and grasps by their definition."""
 
     def __init__(
         self, p: vkc.TrajectoryProblem, path: np.ndarray, waypoint: int, dt: float
@@ -124,10 +124,10 @@ class Numbers:
         self.p, self.path, self.t, self.dt = p, path, waypoint, dt
         self.ends = [0, *p.ends.tolist()]
 
-    def phase(self, t: int) -> Phase:
+    def find_phase(self, t: int) -> Phase:
         return self.p.task.phases[max(int(np.searchsorted(self.ends, t)) - 1, 0)]
 
-    def _value(self, name: str, t: int) -> float:
+    def _get_value(self, name: str, t: int) -> float:
         chain = self.p.chain
         if name in chain.names:
             return float(self.path[t, chain.index(name)])
@@ -135,7 +135,7 @@ class Numbers:
         placed = self.p.scene.objects[owner]
         return float(placed.state[placed.object.coordinates.index(joint)])
 
-    def _place_on_robot(self, frame: str, t: int) -> pin.SE3:
+    def _compute_robot_frame(self, frame: str, t: int) -> pin.SE3:
         robot = self.p.scene.robot
         data = robot.model.createData()
         pin.forwardKinematics(
@@ -143,53 +143,55 @@ class Numbers:
         )
         return pin.updateFramePlacement(robot.model, data, robot.model.getFrameId(frame)).copy()
 
-    def _place_held(self, owner: str, t: int, hold: Any) -> pin.SE3:
+    def _compute_held_base(self, owner: str, t: int, hold: Any) -> pin.SE3:
         """Return the placement of a held base link: holder · (link · A · J(v) · D)⁻¹."""
         placed = self.p.scene.objects[owner]
         attachment = placed.object.attachments[hold.attachment]
-        values = [self._value(f"{owner}.{name}", t) for name in attachment.coordinates]
+        values = [self._get_value(f"{owner}.{name}", t) for name in attachment.coordinates]
         grasped = placed.object.link_placement(attachment.link, placed.state) * attachment.tool(
             np.array(values)
         )
         if hold.by is None:
-            holder = self._place_on_robot(self.p.scene.robot.tool_frame, t)
+            holder = self._compute_robot_frame(self.p.scene.robot.tool_frame, t)
         else:
             carrier = self.p.scene.objects[hold.by.object]
-            holder = self._place_held(hold.by.object, t, hold.by) * carrier.object.link_placement(
-                hold.link, carrier.state
-            )
+            holder = self._compute_held_base(
+                hold.by.object, t, hold.by
+            ) * carrier.object.link_placement(hold.link, carrier.state)
         return holder * grasped.inverse()
 
-    def place(self, frame: str, t: int, phase: Phase) -> pin.SE3:
+    def compute_placement(self, frame: str, t: int, phase: Phase) -> pin.SE3:
         owner, dot, link = frame.partition(".")
         if not dot:
-            return self._place_on_robot(frame, t)
+            return self._compute_robot_frame(frame, t)
         placed = self.p.scene.objects[owner]
         if not placed.object.free:
-            state = [self._value(f"{owner}.{name}", t) for name in placed.object.coordinates.names]
+            state = [
+                self._get_value(f"{owner}.{name}", t) for name in placed.object.coordinates.names
+            ]
             return placed.placement * placed.object.link_placement(link, state)
         hold = next((h for h in phase.held if h.object == owner), None)
         if hold is None and owner in phase.released_by:
             hold, last = phase.released_by[owner]
             t = self.ends[last + 1]
-        where = self._place_held(owner, t, hold) if hold else phase.resting[owner]
-        return where * placed.object.link_placement(link, placed.state)
+        base = self._compute_held_base(owner, t, hold) if hold else phase.resting[owner]
+        return base * placed.object.link_placement(link, placed.state)
 
     def position(self, frame: str) -> ca.DM:
-        return ca.DM(self.place(frame, self.t, self.phase(self.t)).translation)
+        return ca.DM(self.compute_placement(frame, self.t, self.find_phase(self.t)).translation)
 
     def rotation(self, frame: str) -> ca.DM:
-        return ca.DM(self.place(frame, self.t, self.phase(self.t)).rotation)
+        return ca.DM(self.compute_placement(frame, self.t, self.find_phase(self.t)).rotation)
 
     def velocity(self, frame: str) -> ca.DM:
-        before = self.place(frame, self.t - 1, self.phase(self.t - 1)).translation
+        before = self.compute_placement(frame, self.t - 1, self.find_phase(self.t - 1)).translation
         return (self.position(frame) - before) / self.dt
 
     def coordinate(self, name: str) -> float:
-        return self._value(name, self.t)
+        return self._get_value(name, self.t)
 
     def rate(self, name: str) -> float:
-        return (self._value(name, self.t) - self._value(name, self.t - 1)) / self.dt
+        return (self._get_value(name, self.t) - self._get_value(name, self.t - 1)) / self.dt
 
 
 def compute_expected_values(
@@ -200,16 +202,16 @@ def compute_expected_values(
     for phase, first, last in zip(p.task.phases, [0, *p.ends[:-1]], p.ends, strict=True):
         if term.is_active(phase.name, [hold.object for hold in phase.held]):
             for t in range(int(first) + 1, int(last) + 1):
-                value = term.expression(Numbers(p, path, t, dt[t - 1]))  # type: ignore[operator, arg-type]
+                value = term.expression(NumericState(p, path, t, dt[t - 1]))  # type: ignore[operator, arg-type]
                 found[t] = np.asarray(ca.DM(value)).ravel()
     return found
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_rows_and_costs_are_the_expressions_at_the_waypoints(name: str) -> None:
-    """Their excess is relaxed, as that of other rows, and their derivatives are exact."""
+def test_rows_and_costs_equal_the_expressions_at_the_waypoints(name: str) -> None:
+    """Their excess is relaxed like that of other rows, and their derivatives are exact."""
     p = make_problem(name)
-    point, t, cost, seen = make_random_point(p), p.transcription, 0.0, 0
+    point, t, cost, count = make_random_point(p), p.transcription, 0.0, 0
     rows, dt = point.rows(), point.dt
     by_name = {term.name: at for term, at in zip(p.terms, t.term_rows, strict=True)}
     for term in make_terms(name):
@@ -219,11 +221,11 @@ def test_rows_and_costs_are_the_expressions_at_the_waypoints(name: str) -> None:
         for waypoint, at in by_name.get(term.name, {}).items():
             excess = point.excess[at - t.first_relaxed_row]
             relaxed = expected[waypoint] - point.relaxation[waypoint - 1] * excess
-            # the root of a speed of zero is rounded to 1e-4
+            # the norm of a zero velocity is rounded to 1e-4
             atol = 1.01e-4 if term.name == "speed" else 1e-7
             np.testing.assert_allclose(rows[at], relaxed, atol=atol)
-            seen += len(at)
-    assert seen == len(p.term_evaluator.rows)
+            count += len(at)
+    assert count == len(p.term_evaluator.rows)
     squares = [np.sum(w * part**2) for w, part in zip(point.weights, p.rates(point.z), strict=True)]
     assert point.cost() == pytest.approx(cost + sum(squares) + point.penalties, rel=1e-6)
     steps = p.rates(point.z)
@@ -257,7 +259,7 @@ def test_position_after_release_depends_on_the_waypoint_of_release() -> None:
 
 
 def test_programs_differ_by_expressions_but_not_by_bounds() -> None:
-    def make(limit: float, upper: float, *, terms: bool = True) -> vkc.TrajectoryProblem:
+    def make_limited(limit: float, upper: float, *, terms: bool = True) -> vkc.TrajectoryProblem:
         near = vkc.Constraint("near", lambda s: s.position("tool")[2] - limit, upper=upper)
         return make_program(
             make_room(describe_table()),
@@ -266,14 +268,14 @@ def test_programs_differ_by_expressions_but_not_by_bounds() -> None:
             terms=[near] if terms else [],
         )
 
-    first, without = make(0.5, 1.0), make(0.5, 1.0, terms=False)
-    assert make(0.5, 2.0).transcription is first.transcription
-    assert make(0.6, 1.0).transcription is not first.transcription
+    first, without = make_limited(0.5, 1.0), make_limited(0.5, 1.0, terms=False)
+    assert make_limited(0.5, 2.0).transcription is first.transcription
+    assert make_limited(0.6, 1.0).transcription is not first.transcription
     assert first.transcription.rows == without.transcription.rows + OPTIONS.reach_waypoints
     assert first.term_evaluator.upper.tolist() == [1.0] * OPTIONS.reach_waypoints
 
 
-def test_violations_are_scaled_to_their_tolerance() -> None:
+def test_violations_are_scaled_by_their_tolerance() -> None:
     low = vkc.Constraint("low", lambda s: s.coordinate("base_x"), upper=0.5, tolerance=0.02)
     p = make_program(
         make_room(describe_table()), [vkc.GoTo(1.0, 0.0)], options=OPTIONS, terms=[low]
@@ -289,7 +291,7 @@ def test_violations_are_scaled_to_their_tolerance() -> None:
 
 
 def test_speed_limits_lengthen_the_steps() -> None:
-    def make(limit: float, start: float = 0.0) -> vkc.TrajectoryProblem:
+    def make_limited(limit: float, start: float = 0.0) -> vkc.TrajectoryProblem:
         slow = vkc.Constraint(
             "slow",
             lambda s: ca.norm_2(s.velocity("tool")),
@@ -300,17 +302,17 @@ def test_speed_limits_lengthen_the_steps() -> None:
         options = vkc.Options(reach_waypoints=8)
         return make_program(make_room(), [vkc.GoTo(2.0, 0.0)], options=options, terms=[slow])
 
-    share = np.linspace(0.0, 1.0, 9)[1:, None]
-    usual = make(9.0)
-    z = usual.start + share**2 * (3 - 2 * share) * np.r_[2.0, np.zeros(8)]
-    dt = usual.timing_for(z).dt
-    fastest = np.abs(np.diff(usual.waypoints(z)[:, 0])).max() / dt[0]
-    limited = make(fastest / 2)
+    progress = np.linspace(0.0, 1.0, 9)[1:, None]
+    unlimited = make_limited(9.0)
+    z = unlimited.start + progress**2 * (3 - 2 * progress) * np.r_[2.0, np.zeros(8)]
+    dt = unlimited.timing_for(z).dt
+    fastest = np.abs(np.diff(unlimited.waypoints(z)[:, 0])).max() / dt[0]
+    limited = make_limited(fastest / 2)
     slower = limited.timing_for(z)
     assert limited.term_evaluator.compute_violation(z, slower.dt) <= 1e-3
     assert 2.0 - 1e-2 <= slower.dt[0] / dt[0] <= 2.0 * 1.2
     np.testing.assert_allclose(slower.velocity, limited.chain.velocity * slower.dt[:, None])
-    infeasible = make(fastest / 2, start=fastest / 3)  # at rest, too
+    infeasible = make_limited(fastest / 2, start=fastest / 3)  # the lower bound is violated at rest
     assert infeasible.timing_for(z).dt[0] <= 8.0 * dt[0]
 
 
@@ -319,15 +321,15 @@ def test_speed_limits_lengthen_the_steps_between_two_stops(run: int, row: int) -
     """The first or last step before or after a grasp is too fast."""
     slow = vkc.Constraint("slow", lambda s: s.velocity("tool")[0], upper=0.1)
     steps = [vkc.Grasp("stick"), vkc.GoTo(1.0, 0.0)]
-    limited, usual = (
+    limited, unlimited = (
         make_program(make_room(describe_stand()), steps, options=OPTIONS, terms=terms)
         for terms in ([slow], [])
     )
-    (stop,) = usual.transcription.structure.stops
-    own = np.split(np.arange(usual.segments), [stop])[run]
-    z = usual.still
+    (stop,) = unlimited.transcription.structure.stops
+    own = np.split(np.arange(unlimited.segments), [stop])[run]
+    z = unlimited.still
     z[own[row] :, 0] += 0.1
-    ratio = limited.timing_for(z).dt / usual.timing_for(z).dt
+    ratio = limited.timing_for(z).dt / unlimited.timing_for(z).dt
     assert (ratio[own] > 1.2).all()
     assert (np.delete(ratio, own) == 1.0).all()
 
@@ -341,16 +343,16 @@ def test_speed_limits_lengthen_the_steps_between_two_stops(run: int, row: int) -
     ids=["derivative", "value"],
 )
 @pytest.mark.parametrize(
-    "make", [lambda e: vkc.Constraint("mine", e, upper=0.2), lambda e: vkc.Cost("mine", e)]
+    "make_term", [lambda e: vkc.Constraint("mine", e, upper=0.2), lambda e: vkc.Cost("mine", e)]
 )
-def test_terms_that_are_not_finite_are_rejected(expression: Any, make: Any) -> None:
+def test_terms_that_are_not_finite_are_rejected(expression: Any, make_term: Any) -> None:
     message = "its value or derivative is not finite at the start"
     with pytest.raises(vkc.InputError, match=rf"terms\['mine'\]\.expression: {message}"):
         make_program(
             make_room(describe_table()).with_held({"stick": "grip"}),
             [vkc.GoTo(0.5, 0.5)],
             options=OPTIONS,
-            terms=[make(expression)],
+            terms=[make_term(expression)],
         )
 
 

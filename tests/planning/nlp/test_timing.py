@@ -1,4 +1,4 @@
-"""Tests step durations: the profile fits, and runs that exceed a bound are stretched."""
+"""Tests that step durations fit a profile and that runs beyond a bound are stretched."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from vkc_pin.planning.nlp.timing import Timing, compute_step_times, split_at_stops
 
 
-def test_runs_are_between_rests() -> None:
+def test_runs_are_split_at_stops() -> None:
     assert list(split_at_stops([], 7)) == [(0, 7)]
     assert list(split_at_stops([2, 5], 7)) == [(0, 2), (2, 5), (5, 7)]
 
@@ -50,7 +50,7 @@ def test_profile_keeps_the_limits_in_the_time(seed: int, size: float) -> None:
 def compute_differences(
     path: np.ndarray, runs: list[tuple[int, int]]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return steps and their differences, which in every run begin and end with 0."""
+    """Return steps and their differences, from and to rest in every run."""
     steps = np.diff(path, axis=0)
     zero = np.zeros((1, path.shape[1]))
     return steps, np.vstack([np.diff(np.vstack([zero, steps[a:b], zero]), axis=0) for a, b in runs])
@@ -87,7 +87,7 @@ def test_runs_are_stretched_as_needed_up_to_a_limit(seed: int, size: float) -> N
     np.testing.assert_array_equal(timing.dt, dt)
 
 
-def test_slow_motions_keep_their_time() -> None:
+def test_slow_motions_keep_their_duration() -> None:
     runs = list(itertools.pairwise([0, 4]))
     timing = Timing(np.full(4, 0.5), np.full(4, 0.5), runs, (np.ones(2), np.full(2, 4.0)))
     first, second = compute_differences(np.linspace(0.0, 0.1, 5)[:, None] * np.ones(2), runs)

@@ -14,7 +14,7 @@ import pinocchio as pin
 import pytest
 from helpers.carrying import describe_stand, describe_table, make_room
 from helpers.program_points import QUIET, ProgramPoint, make_random_point
-from helpers.relaxed import Relaxed, check_relaxation, make_iterates
+from helpers.relaxed import RelaxedProgram, check_relaxation, make_iterates
 from helpers.small_problems import CACHE, load_door_scene, make_program
 from helpers.telescopes import write_coupled_scene
 
@@ -46,15 +46,15 @@ def make_problem(name: str) -> TrajectoryProblem:
     options = OPTIONS
     if name == "door":
         scene, steps = load_door_scene(), [Actuate("door", {"hinge": 1.2})]
-    elif name == "push":  # from the start, in the direction of a falling coordinate
+    elif name == "push":  # held at the start, pushed towards smaller angles
         scene = (
             load_door_scene().with_state("door", {"hinge": 1.0}).with_held({"door": "push_back"})
         )
         steps = [Actuate("door", {"hinge": 0.5}), GoTo(0.0, 0.0)]
-    elif name == "stick":  # the grasp is chosen and clamped; a point goal and an upright goal
+    elif name == "stick":  # a clamped grasp, a point goal and an upright goal
         scene = make_room(describe_table())
         steps = [Touch("stick.tip", (0.8, 0.9, 0.7)), Place("stick", (0.8, 0.5, 0.56))]
-    elif name == "fetch":  # a ball with the stick, which is then released
+    elif name == "fetch":  # fetches a ball with the stick, then releases the stick
         scene = make_room(describe_stand(), objects=("stick", "ball"))
         scene = scene.with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
         steps = [Grasp("ball", "pull", "stick.tip"), Place("ball", POSE), Release("stick")]
@@ -75,8 +75,8 @@ NAMES = ["door", "differential", "ackermann", "stick", "fetch", "push", "telesco
 def find_runs(p: TrajectoryProblem) -> list[np.ndarray]:
     """Return the waypoints of each run between rests: start, grasps, releases and end."""
     neighbours = zip(p.ends[:-1], p.task.phases[:-1], p.task.phases[1:], strict=True)
-    hands = [int(end) for end, a, b in neighbours if a.grasps or set(a.held) - set(b.held)]
-    return [np.arange(a, b + 1) for a, b in itertools.pairwise([0, *hands, p.segments])]
+    stops = [int(end) for end, a, b in neighbours if a.grasps or set(a.held) - set(b.held)]
+    return [np.arange(a, b + 1) for a, b in itertools.pairwise([0, *stops, p.segments])]
 
 
 def compute_changes(path: np.ndarray, run: np.ndarray) -> np.ndarray:
@@ -149,7 +149,7 @@ def compute_relaxed_rows(p: TrajectoryProblem, path: np.ndarray, gears: np.ndarr
 
 @pytest.mark.parametrize("name", NAMES)
 def test_rows_equal_their_definitions(name: str) -> None:
-    """A relaxation variable removes its share of the excess of its waypoint's rows."""
+    """A relaxation variable removes that fraction of the excess of its waypoint's rows."""
     p = make_problem(name)
     point, t = make_random_point(p), p.transcription
     found, expected = point.rows(), np.full(t.rows + t.rate_matrix.size1(), np.nan)
@@ -199,7 +199,7 @@ def test_problems_have_rows_of_all_kinds() -> None:
 
 
 @pytest.mark.parametrize("name", ["differential", "ackermann"])
-def test_bounds_of_wheels(name: str) -> None:
+def test_bounds_of_wheel_rows(name: str) -> None:
     """No lateral motion; forward arcs of at least the turning radius; limited wheel travel."""
     p = make_problem(name)
     timing, at = p.timing_for(p.still), p.transcription.base_rows
@@ -225,23 +225,23 @@ def test_fully_relaxed_program_is_feasible_at_its_iterate(name: str) -> None:
     expected = {"poses", "rates"} if name == "telescope" else {"poses", "clearance", "rates"}
     expected |= {"rolling"} if name in ("differential", "ackermann") else set()
     expected |= {"clamped"} if name in ("stick", "fetch", "push") else set()
-    assert violated == expected, "a test without violation shows nothing"
+    assert violated == expected, "the iterates violate other kinds of rows"
 
 
-@pytest.mark.parametrize("off", [0.0, 1e-9, 1e-4, 0.01])
+@pytest.mark.parametrize("deviation", [0.0, 1e-9, 1e-4, 0.01])
 @pytest.mark.parametrize("axis", [[1.0, 0.0, 0.0], [0.3, -0.8, 0.5]], ids=["x", "oblique"])
-def test_relaxed_program_is_feasible_near_half_turns(axis: list[float], off: float) -> None:
-    """Near a half turn the rows vanish, and the residual has two signs."""
+def test_relaxed_program_is_feasible_near_half_turns(axis: list[float], deviation: float) -> None:
+    """At a half turn the rows vanish, and the sign of the residual is arbitrary."""
     p = make_program(load_door_scene(), [Reach(POSE)], options=OPTIONS)
     (z, *_) = make_iterates(p, 1)
     pose, data = p.transcription.structure.poses[0], p.chain.model.createData()
     pin.forwardKinematics(p.chain.model, data, p.chain.coordinates.q(z[-1]))
-    turn = pin.AngleAxis(np.pi - off, np.array(axis) / np.linalg.norm(axis)).matrix()
-    there = data.oMi[pose.joint] * pose.local * pin.SE3(turn, np.array([0.1, -0.2, 0.3]))
-    turned = make_program(load_door_scene(), [Reach(there)], options=OPTIONS)
+    turn = pin.AngleAxis(np.pi - deviation, np.array(axis) / np.linalg.norm(axis)).matrix()
+    target = data.oMi[pose.joint] * pose.local * pin.SE3(turn, np.array([0.1, -0.2, 0.3]))
+    turned = make_program(load_door_scene(), [Reach(target)], options=OPTIONS)
     check_relaxation(turned, z)
-    expected = np.pi - off + np.linalg.norm([0.1, -0.2, 0.3])
-    found = Relaxed(turned, z).found.amounts["poses"][-1]
+    expected = np.pi - deviation + np.linalg.norm([0.1, -0.2, 0.3])
+    found = RelaxedProgram(turned, z).found.amounts["poses"][-1]
     assert found == pytest.approx(expected, abs=1e-8)
 
 
@@ -250,14 +250,14 @@ def test_relaxed_program_is_feasible_near_half_turns(axis: list[float], off: flo
 
 
 def test_one_program_serves_all_problems_of_a_structure() -> None:
-    scene, steps, door = (
+    scene, steps, objects = (
         load_door_scene(),
         [Actuate("door", {"hinge": 1.2})],
         load_door_scene().objects,
     )
-    first, spent = make_program(scene, steps, options=OPTIONS), CACHE.build_time
+    first, build_time = make_program(scene, steps, options=OPTIONS), CACHE.build_time
     shift = pin.SE3(pin.utils.rotate("z", 0.4), np.array([0.3, -0.2, 0.0]))
-    moved = dataclasses.replace(door["door"], placement=shift * door["door"].placement)
+    moved = dataclasses.replace(objects["door"], placement=shift * objects["door"].placement)
     safer = dataclasses.replace(OPTIONS, dist_safe=0.05, penalty=3.0)
     for other in (
         make_program(scene.sample_start(np.random.default_rng(0)), steps, options=OPTIONS),
@@ -269,7 +269,7 @@ def test_one_program_serves_all_problems_of_a_structure() -> None:
         make_program(scene.with_state("door", {"knob": 0.1}), steps, options=safer),
     ):
         assert other.transcription is first.transcription
-    assert CACHE.build_time == spent
+    assert CACHE.build_time == build_time
 
 
 @pytest.mark.parametrize(
@@ -287,15 +287,17 @@ def test_one_program_serves_all_problems_of_a_structure() -> None:
         {"pushed": ((3, 1, 4, -1),)},
         {"kind": "point"},
         {"waypoints": (1, 2)},
-        # other last digits
+        # different in the last digits only
         {"local": pin.SE3(np.eye(3), np.array([1e-14, 0.0, 0.0]))},
     ],
 )
-def test_other_structures_get_other_programs(change: dict[str, object]) -> None:
-    of = make_problem("door").transcription.structure
-    pose = dataclasses.replace(of.poses[0], local=pin.SE3.Identity())
-    one = Structure(model=of.model, segments=of.segments, poses=(pose,), slots=2)
-    same = Structure(model=of.model.copy(), segments=of.segments, poses=(pose,), slots=2)
+def test_different_structures_have_different_keys(change: dict[str, object]) -> None:
+    structure = make_problem("door").transcription.structure
+    pose = dataclasses.replace(structure.poses[0], local=pin.SE3.Identity())
+    one = Structure(model=structure.model, segments=structure.segments, poses=(pose,), slots=2)
+    same = Structure(
+        model=structure.model.copy(), segments=structure.segments, poses=(pose,), slots=2
+    )
     assert same.key == one.key
     if set(change) & {"kind", "waypoints", "local"}:
         change = {"poses": (dataclasses.replace(pose, **change),)}  # type: ignore[arg-type]
@@ -306,7 +308,7 @@ def test_solvers_are_cached() -> None:
     structure, cache = make_problem("differential").transcription.structure, Cache()
     t = transcribe(structure, cache)
     assert transcribe(structure, cache) is t
-    first, spent = t.solver(rates=False, options=QUIET), cache.build_time
+    first, build_time = t.solver(rates=False, options=QUIET), cache.build_time
     assert t.solver(rates=False, options=dict(reversed(QUIET.items()))) is first
-    assert cache.build_time == spent
+    assert cache.build_time == build_time
     assert t.solver(rates=False, options={**QUIET, "ipopt.tol": 1e-3}) is not first

@@ -48,12 +48,12 @@ def test_limits_are_kept_exactly_and_acceleration_is_continuous(
 def test_large_jerk_limits_cost_little_time() -> None:
     points = np.cumsum(np.random.default_rng(4).uniform(0.1, 0.4, (12, 3)), axis=0)
     path, pace, limits = make_path(points, 2000.0)
-    longest = [
+    durations = [
         limit_jerk(path, pace, 11, limits._replace(jerk=np.full(3, jerk))).times[-1]
         for jerk in (2000.0, 40.0, 10.0)
     ]
-    assert longest == sorted(longest)
-    assert longest[0] <= 1.03 * pace.times[-1]
+    assert durations == sorted(durations)
+    assert durations[0] <= 1.03 * pace.times[-1]
 
 
 def test_coordinates_without_limits_cause_no_warning() -> None:

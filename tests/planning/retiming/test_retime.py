@@ -15,12 +15,12 @@ from vkc_pin.planning.retiming.retime import retime_trajectory
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
-def check_limits(scene: vkc.Scene, motion: Trajectory, *, within: float = 1e-5) -> None:
+def check_limits(scene: vkc.Scene, motion: Trajectory, *, tolerance: float = 1e-5) -> None:
     times = np.arange(motion.times[0], motion.times[-1], 1e-3)
     lower, upper, velocity, acceleration, _ = Limits.from_scene(scene, motion.names, 0.0)
     places = motion(times)
-    assert (places >= lower - within).all()
-    assert (places <= upper + within).all()
+    assert (places >= lower - tolerance).all()
+    assert (places <= upper + tolerance).all()
     assert (np.abs(motion.velocity(times)) <= velocity * (1 + 1e-6)).all()
     assert (np.abs(motion.acceleration(times)) <= acceleration * (1 + 1e-6)).all()
     np.testing.assert_allclose(
@@ -44,13 +44,13 @@ def sample_trajectory(scene: vkc.Scene, seed: int = 0, count: int = 12) -> Traje
 
 @pytest.mark.parametrize("seed", range(3))
 def test_limits_hold_between_random_waypoints(seed: int) -> None:
-    """Sharp turns next to position limits may exceed these a little."""
+    """Sharp turns near position limits may exceed them slightly."""
     scene = vkc.load_scene("door")
     slow = sample_trajectory(scene, seed)
     motion = retime_trajectory(scene, slow)
     np.testing.assert_array_equal(motion.positions, slow.positions)
     np.testing.assert_allclose(motion(motion.times), slow.positions, atol=1e-12)
-    check_limits(scene, motion, within=1e-3)
+    check_limits(scene, motion, tolerance=1e-3)
 
 
 def test_steps_without_motion_are_waits() -> None:
@@ -83,16 +83,16 @@ def test_stationary_trajectory_is_kept() -> None:
 def test_more_parts_keep_the_path_straighter() -> None:
     scene = vkc.load_scene("door")
     slow = sample_trajectory(scene, 5)
-    off = []
+    deviations = []
     for parts in (1, 8):
         motion = retime_trajectory(scene, slow, np.full(12, parts))
         np.testing.assert_array_equal(motion.positions, slow.positions)
         fine = motion(np.linspace(motion.times[4], motion.times[5], 200))
         step = slow.positions[5] - slow.positions[4]
         along = np.clip((fine - slow.positions[4]) @ step / (step @ step), 0.0, 1.0)
-        off.append(np.abs(fine - slow.positions[4] - along[:, None] * step).max())
+        deviations.append(np.abs(fine - slow.positions[4] - along[:, None] * step).max())
         check_limits(scene, motion)
-    assert off[-1] < 0.2 * off[0]
+    assert deviations[-1] < 0.2 * deviations[0]
 
 
 def test_planned_motion_keeps_its_limits(door_plan: vkc.Plan) -> None:
@@ -118,7 +118,7 @@ def test_velocity_constraints_prevent_retiming() -> None:
 @pytest.mark.parametrize("jerk_time", [0.02, 0.5])
 @pytest.mark.parametrize("gap", [0.0, 1e-6, 2e-6, 1e-5, 3e-4])
 def test_tiny_step_costs_no_more_than_a_stop(gap: float, jerk_time: float) -> None:
-    """However small the jerk limits, a waypoint beside another does not slow down the motion."""
+    """A waypoint beside another does not slow down the motion, even with small jerk limits."""
     scene = vkc.load_scene("door")
     slow = sample_trajectory(scene)
     rows = np.insert(slow.positions, 6, slow.positions[6], axis=0)

@@ -55,5 +55,5 @@ def test_path_stays_within_limits(seed: int) -> None:
     assert (found >= lower - 1e-9).all()
     assert (found <= upper + 1e-9).all()
     np.testing.assert_allclose(path(path.x), waypoints, atol=1e-12)
-    outside = fit_path(waypoints, np.ones(3), (lower + 0.1, upper))  # as a start may be
+    outside = fit_path(waypoints, np.ones(3), (lower + 0.1, upper))  # like some starts
     assert outside(np.linspace(path.x[0], path.x[-1], 500)).min() >= waypoints.min() - 1e-9

@@ -64,7 +64,7 @@ def test_no_speeds_without_limits() -> None:
 
 
 def test_matplotlib_is_not_imported() -> None:
-    """It takes half a second, and only plots of toppra need it; these still work."""
+    """The import takes half a second and serves only the plots of toppra, which still work."""
     code = """
 import sys, numpy as np
 from vkc_pin.planning.retiming.spline_path import fit_path

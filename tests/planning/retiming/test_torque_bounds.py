@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.closers import load_door_with_closer
+from helpers.door_closers import load_door_with_closer
 from helpers.executions import plan_door
 from scipy.interpolate import CubicHermiteSpline
 
@@ -58,7 +58,7 @@ def test_curve_is_slowed_down_to_the_torque_limit() -> None:
     assert bounds.slow_down(slower) is slower
 
 
-def test_curve_too_heavy_at_rest_is_not_slowed_down() -> None:
+def test_curve_beyond_torque_limits_at_rest_is_not_slowed_down() -> None:
     bounds, _ = make_opening()
     plan = plan_door()
     phase = plan.trajectory.phases[-1]

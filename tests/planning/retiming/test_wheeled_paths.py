@@ -25,8 +25,8 @@ def make_arcs(steps: list[tuple[float, float]]) -> np.ndarray:
     """Return poses reached by arcs of given lengths [m] and turns [rad], and another coordinate."""
     poses = [np.array([0.3, -0.2, 0.9, 0.0])]
     for length, turn in steps:
-        way = length * np.sinc(turn / (2 * np.pi)) * np.exp(1j * (poses[-1][2] + turn / 2))
-        poses.append(poses[-1] + [way.real, way.imag, turn, 0.1])
+        displacement = length * np.sinc(turn / (2 * np.pi)) * np.exp(1j * (poses[-1][2] + turn / 2))
+        poses.append(poses[-1] + [displacement.real, displacement.imag, turn, 0.1])
     return np.array(poses)
 
 
@@ -124,7 +124,7 @@ def make_drive(base: str) -> Trajectory:
 
 @pytest.mark.parametrize("base", ["differential", "ackermann"])
 def test_trajectories_roll_within_wheel_limits(base: str) -> None:
-    """Also with points on the arcs between waypoints."""
+    """The limits also hold with points added on the arcs between waypoints."""
     motion, wheels = make_drive(base), vkc.load_robot("husky_ur5e", base="differential").wheels
     assert wheels is not None
     for trajectory in (

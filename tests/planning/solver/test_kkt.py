@@ -1,4 +1,4 @@
-"""Tests of Ipopt's linear solver against dense algebra, and within Ipopt."""
+"""Tests the linear solver against dense algebra and within Ipopt."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from vkc_pin.planning.solver.subproblem import make_linear_solver_options
 from vkc_pin.utils.optional_imports import import_compiled
 
 LIBRARY = ctypes.CDLL(import_compiled("vkc_pin.planning.solver._kkt").__file__)
-OWN = make_linear_solver_options()
+OWN_SOLVER = make_linear_solver_options()
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False}
 
 
-def lower_triangle(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def get_lower_triangle(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return rows, columns and values of a lower triangle, with all of its diagonal."""
     rows, columns = np.nonzero((np.tril(matrix) != 0.0) | np.eye(len(matrix), dtype=bool))
     return rows.astype(np.int32), columns.astype(np.int32), matrix[rows, columns]
@@ -30,15 +30,15 @@ class Factorization:
 
     def __init__(self, matrix: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> None:
         self.size, self.info = np.array([len(matrix)], np.int32), np.zeros(20, np.int32)
-        self.keep, self.kept, self.unused = (np.zeros(1, np.int32) for _ in range(3))
+        self.analysis, self.factors, self.unused = (np.zeros(1, np.int32) for _ in range(3))
         entries, places = np.array([len(rows)], np.int32), (rows + 1, columns + 1)
-        given = [self.size, entries, *places, None, None, self.keep, None, self.unused]
-        call("ma27ad_", *given, None, None, None, self.info, np.zeros(1))
+        arguments = [self.size, entries, *places, None, None, self.analysis, None, self.unused]
+        call("ma27ad_", *arguments, None, None, None, self.info, np.zeros(1))
         assert self.info[0] == 0
 
     def factor(self, values: np.ndarray) -> int:
         """Return MA27's flag: 0, -1 for an unknown system or -5 for a singular one."""
-        places = [self.kept, None, self.keep, None, self.unused, None, None, None]
+        places = [self.factors, None, self.analysis, None, self.unused, None, None, None]
         call("ma27bd_", *[None] * 4, values, None, *places, self.info)
         return int(self.info[0])
 
@@ -48,7 +48,7 @@ class Factorization:
 
     def solve(self, b: np.ndarray) -> np.ndarray:
         x = np.array(b, float)
-        call("ma27cd_", self.size, None, None, self.kept, *[None] * 3, x, *[None] * 4)
+        call("ma27cd_", self.size, None, None, self.factors, *[None] * 3, x, *[None] * 4)
         return x
 
 
@@ -58,7 +58,7 @@ def call(name: str, *arguments: np.ndarray | None) -> None:
 
 
 def factorize(matrix: np.ndarray) -> tuple[Factorization, bool]:
-    rows, columns, values = lower_triangle(matrix)
+    rows, columns, values = get_lower_triangle(matrix)
     factorization = Factorization(matrix, rows, columns)
     return factorization, factorization.factor(values) == 0
 
@@ -126,8 +126,7 @@ def test_any_matrix_is_solved_or_reported_singular(seed: int, size: int, density
     matrix = np.where(rng.uniform(size=(size, size)) < density, rng.normal(size=(size, size)), 0.0)
     matrix += matrix.T
     factorization, done = factorize(matrix)
-    # a pivot is zero, as it is in every singular matrix and, since pivots are taken as they come,
-    # in some others
+    # A pivot is zero in every singular matrix and, since there is no pivoting, in some others.
     if not done:
         assert min(abs(np.linalg.det(matrix[:k, :k])) for k in range(1, size + 1)) < 1e-8 or np.any(
             np.diag(matrix) == 0.0
@@ -140,20 +139,20 @@ def test_refactoring_does_not_depend_on_earlier_values() -> None:
     first, second = make_system(1, 4, 5, 2, 2), make_system(1, 4, 5, 2, 2)
     second[np.diag_indices(20)] += 3.0
     b = np.arange(len(first), dtype=float)
-    again, _ = factorize(first)
-    assert again.factor(lower_triangle(second)[2]) == 0
-    x = again.solve(b)
-    anew = Factorization(first, *lower_triangle(first)[:2])
-    assert again.factor(lower_triangle(first)[2]) == -1  # another system has taken its place
-    assert anew.factor(lower_triangle(second)[2]) == 0
-    np.testing.assert_array_equal(anew.solve(b), x)
+    reused, _ = factorize(first)
+    assert reused.factor(get_lower_triangle(second)[2]) == 0
+    x = reused.solve(b)
+    fresh = Factorization(first, *get_lower_triangle(first)[:2])
+    assert reused.factor(get_lower_triangle(first)[2]) == -1  # another system has taken its place
+    assert fresh.factor(get_lower_triangle(second)[2]) == 0
+    np.testing.assert_array_equal(fresh.solve(b), x)
 
 
 def test_dependent_rows_are_singular_and_the_next_system_is_solved() -> None:
     matrix = make_system(2, 3, 4, 2, 0)
     doubled = matrix.copy()
     doubled[-1], doubled[:, -1] = doubled[-2], doubled[:, -2]
-    rows, columns, values = lower_triangle(matrix)
+    rows, columns, values = get_lower_triangle(matrix)
     factorization = Factorization(matrix, rows, columns)
     assert factorization.factor(doubled[rows, columns]) == -5
     assert np.isnan(factorization.solve(np.ones(len(matrix)))).all()
@@ -173,41 +172,41 @@ def test_pivots_of_rounding_size_are_singular(size: int) -> None:
 
 
 def test_dual_rows_may_come_first() -> None:
-    """They follow the rows that they couple, whatever their numbers."""
+    """They are eliminated after the rows that they couple, in any numbering."""
     matrix = make_system(5, 4, 5, 2, 3)[::-1, ::-1]
     factorization, done = factorize(matrix)
     assert done
     check_solution(factorization, matrix)
 
 
-def test_nan_is_no_pivot() -> None:
+def test_nan_pivot_is_singular() -> None:
     matrix = make_system(3, 2, 3, 1, 0)
-    rows, columns, values = lower_triangle(matrix)
+    rows, columns, values = get_lower_triangle(matrix)
     values[0] = np.nan
     assert Factorization(matrix, rows, columns).factor(values) == -5
 
 
 def test_duplicate_and_upper_entries_are_summed() -> None:
     matrix = make_system(4, 3, 4, 1, 2)[::-1, ::-1]  # dual rows first
-    rows, columns, values = lower_triangle(matrix)
+    rows, columns, values = get_lower_triangle(matrix)
     flipped = np.arange(len(rows)) % 2 == 0
     places = np.where(flipped, columns, rows), np.where(flipped, rows, columns)
     twice = [np.concatenate([part, part]) for part in places]
     factorization = Factorization(matrix, *twice)
-    # by the last values alone, no row would be primal
+    # with the last values alone, no row would be primal
     assert factorization.factor(np.concatenate([1.5 * values, -0.5 * values])) == 0
     check_solution(factorization, matrix)
 
 
 def test_ipopt_is_deterministic_and_thread_safe() -> None:
-    """The result holds for a wrong inertia at first, and with other systems in between."""
+    """The inertia is wrong at first, and other systems are factorized in between."""
     x = ca.MX.sym("x", 40)
     f = ca.sumsqr(x[1:] - ca.sin(3.0 * x[:-1])) - 0.5 * ca.sumsqr(x[::3])
     program = {"x": x, "f": f, "g": x[:-1] * x[1:]}
     warm = {"ipopt.warm_start_init_point": "yes", "ipopt.mu_init": 1e-3}
 
     def solve(_: int) -> bytes:
-        solver = ca.nlpsol("solver", "ipopt", program, {**QUIET, **OWN, **warm})
+        solver = ca.nlpsol("solver", "ipopt", program, {**QUIET, **OWN_SOLVER, **warm})
         result = solver(x0=np.linspace(-1.0, 1.0, 40), lbg=-0.5, ubg=0.5, lbx=-2.0, ubx=2.0)
         return bytes(np.ravel(result["x"]).tobytes())
 
@@ -227,7 +226,7 @@ def test_ipopt_finds_the_same_solution_as_with_mumps(bounds: tuple[float, float]
         x[0] + x[1] - 1.0, x[2] * x[3] - 0.5, 2.0 * (x[0] + x[1] - 1.0), x[4] - ca.sin(x[5])
     )
     found = []
-    for options in ({"ipopt.linear_solver": "mumps"}, OWN):
+    for options in ({"ipopt.linear_solver": "mumps"}, OWN_SOLVER):
         solver = ca.nlpsol("solver", "ipopt", {"x": x, "f": f, "g": g}, {**QUIET, **options})
         result = solver(
             x0=np.full(6, 0.3), lbg=[bounds[0]] * 4, ubg=[bounds[1]] * 4, lbx=-5.0, ubx=5.0

@@ -1,4 +1,4 @@
-"""Tests of the witness-plane loop on small problems."""
+"""Tests the witness-plane loop on small problems."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FEW = vkc.Options(reach_waypoints=20, max_outer=12)
 ONE_BLOCK = vkc.Options(reach_waypoints=14)
 
 
-def drive(
+def make_drive_case(
     x: float, *obstacles: dict[str, object], options: vkc.Options = FEW
 ) -> tuple[vkc.TrajectoryProblem, np.ndarray]:
     """Return a drive ahead to `x` [m] and the straight path."""
@@ -58,29 +58,29 @@ def describe_box(name: str, x: float, y: float, size: list[float]) -> dict[str, 
 
 @cache
 def make_pillar_case() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
-    return drive(3.2, describe_post(1.6, 0.05, 0.15))
+    return make_drive_case(3.2, describe_post(1.6, 0.05, 0.15))
 
 
 @cache
 def make_roadside_case() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
     """The base grazes a post, and the first feasible motion can be shortened."""
-    return drive(3.2, describe_post(1.6, 0.3, 0.15))
+    return make_drive_case(3.2, describe_post(1.6, 0.3, 0.15))
 
 
 @cache
 def make_walls_case(
     options: vkc.Options = ONE_BLOCK,
 ) -> tuple[vkc.TrajectoryProblem, np.ndarray]:
-    """Two walls cross the straight path; all waypoints share one radius, unless there are more."""
+    """Two walls cross the straight path. By default all waypoints share one radius."""
     obstacles = [
         describe_box(f"wall_{k}", 1.5 + 1.2 * k, (-1.0) ** k, [0.1, 3.0, 1.0]) for k in range(2)
     ]
-    return drive(4.2, *obstacles, options=options)
+    return make_drive_case(4.2, *obstacles, options=options)
 
 
 @cache
-def reach() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
-    """A distant pose of the hand, from a stationary guess."""
+def make_reach_case() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
+    """The hand reaches a distant pose from a stationary guess."""
     scene = make_hall()
     tool = scene.tool_placement()
     tool.translation[0] += 5.0
@@ -89,8 +89,8 @@ def reach() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
 
 
 @cache
-def grasp() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
-    """A grasp between obstacles."""
+def make_grasp_case() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
+    """The hand grasps a stick between obstacles."""
     scene = vkc.load_scene("init_2").sample_start(np.random.default_rng(5))
     problem = make_program(scene, [vkc.Grasp("stick")])
     return problem, next(initialize(problem, "astar", 0)).z
@@ -98,12 +98,12 @@ def grasp() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
 
 @cache
 def make_blocked_case() -> tuple[vkc.TrajectoryProblem, np.ndarray]:
-    """A wall across the whole hall."""
-    return drive(4.0, describe_box("wall", 2.0, 0.0, [1.0, 12.0, 2.0]))
+    """A wall spans the hall."""
+    return make_drive_case(4.0, describe_box("wall", 2.0, 0.0, [1.0, 12.0, 2.0]))
 
 
 Case = Callable[[], tuple[vkc.TrajectoryProblem, np.ndarray]]
-SOLVED: list[Case] = [make_pillar_case, grasp, reach]
+SOLVED: list[Case] = [make_pillar_case, make_grasp_case, make_reach_case]
 
 
 @cache
@@ -121,9 +121,9 @@ def check_feasible(problem: vkc.TrajectoryProblem, solution: Solution) -> None:
     assert timing.compute_violation(*problem.rates(z)) < 1e-3
     assert problem.drift(z) < 1.0
     path = problem.waypoints(z)
-    shares = np.linspace(0.0, 1.0, 12)[1:-1]
-    states = np.concatenate([(1 - s) * path[:-1] + s * path[1:] for s in shares])
-    ends = np.tile(np.arange(1, len(path)), len(shares))
+    fractions = np.linspace(0.0, 1.0, 12)[1:-1]
+    states = np.concatenate([(1 - s) * path[:-1] + s * path[1:] for s in fractions])
+    ends = np.tile(np.arange(1, len(path)), len(fractions))
     assert not len(problem.contacts.evaluate(states, ends, reach=0.0).waypoint)
 
 
@@ -138,7 +138,7 @@ def test_solution_is_feasible(case: Case) -> None:
 
 
 @pytest.mark.parametrize("case", [*SOLVED, make_walls_case, make_blocked_case])
-def test_history_of_rounds(case: Case) -> None:
+def test_history_describes_every_round(case: Case) -> None:
     solution = solve_case(case)
     history = solution.history
     assert [row.round for row in history] == list(range(1, solution.rounds + 1))
@@ -158,7 +158,7 @@ def test_history_of_rounds(case: Case) -> None:
         assert after.radius <= max(1.5 * row.radius, FIRST_RADIUS) * (1 + 1e-6)
         is_free = row.shortfall < CLEARANCE_TOLERANCE
         if row.accepted and row.shortfall < NEARLY_FEASIBLE and row.pose_error < TOLERANCE:
-            # small steps, within which the planes are accurate, unless it is feasible
+            # the planes are accurate for small steps; feasible motions may take larger ones
             assert is_free or after.radius <= SETTLE_RADIUS or after.penalty > row.penalty
 
 
@@ -171,7 +171,7 @@ def test_rejected_rounds_shrink_the_trust_region() -> None:
 
 
 def test_nearly_feasible_motions_take_small_steps() -> None:
-    problem, guess = drive(3.2, describe_post(1.6, -0.1, 0.1))
+    problem, guess = make_drive_case(3.2, describe_post(1.6, -0.1, 0.1))
     history = solve(problem, guess).history
     nearly = [
         after
@@ -186,7 +186,7 @@ def test_nearly_feasible_motions_take_small_steps() -> None:
 
 @pytest.mark.parametrize("case", SOLVED)
 def test_feasible_motions_are_improved_while_worthwhile(case: Case) -> None:
-    """The last round improves little, or nothing limited its step."""
+    """The last round improves little, or the trust region did not limit its step."""
     *earlier, last = solve_case(case).history
     accepted = [row.objective for row in earlier if row.accepted]
     assert last.accepted
@@ -197,8 +197,8 @@ def test_feasible_motions_are_improved_while_worthwhile(case: Case) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_blocked_motions_end_early(seed: int) -> None:
-    """The goal is deep in a block across the hall; rounding may differ."""
-    problem, guess = drive(4.0, describe_box("block", 4.0, 0.0, [2.5, 12.0, 2.0]))
+    """The goal is deep in a block across the hall; noise imitates rounding errors."""
+    problem, guess = make_drive_case(4.0, describe_box("block", 4.0, 0.0, [2.5, 12.0, 2.0]))
     guess = guess + np.random.default_rng(seed).normal(0.0, 1e-9, guess.shape)
     solution = solve(problem, guess, rounds=vkc.Options().max_outer)
     assert (solution.status, solution.converged) == ("not converged", False)
@@ -209,9 +209,9 @@ def test_blocked_motions_end_early(seed: int) -> None:
     assert solve(problem, guess, rounds=2).rounds == 2
 
 
-def test_choosing_sides_of_a_closed_wall_is_no_progress() -> None:
+def test_switching_sides_of_a_closed_wall_is_no_progress() -> None:
     """The path goes through a thin wall, whose nearest side differs between waypoints."""
-    problem, guess = drive(4.0, describe_box("wall", 2.0, 0.0, [0.1, 12.0, 2.0]))
+    problem, guess = make_drive_case(4.0, describe_box("wall", 2.0, 0.0, [0.1, 12.0, 2.0]))
     solution = solve(problem, guess, rounds=vkc.Options().max_outer)
     assert not solution.converged
     assert solution.rounds < vkc.Options().max_outer
@@ -231,18 +231,18 @@ def test_solution_continues_with_given_radii() -> None:
     assert first.radius is not None
     assert len(np.unique(first.radius)) > 1, "one radius for all: choose a harder problem"
     for radius in (first.radius, np.linspace(0.02, 0.1, problem.segments)):
-        given = radius.copy()
+        original = radius.copy()
         second = solve(problem, first.z, rounds=1, radius=radius)
         assert second.history[0].radius == radius.max()
         assert np.all(np.abs(second.z - first.z).max(axis=1) <= radius * (1 + 1e-6))
-        np.testing.assert_array_equal(radius, given)
+        np.testing.assert_array_equal(radius, original)
 
 
 @pytest.mark.parametrize("penalty", [1.0, 200.0])
 def test_waypoints_do_not_jump_through_obstacles(penalty: float) -> None:
     """A guess around a thin post stays on its side, even if overlap costs less than the detour."""
     options = dataclasses.replace(FEW, penalty=penalty)
-    problem, guess = drive(3.2, describe_post(1.6, -0.42, 0.02), options=options)
+    problem, guess = make_drive_case(3.2, describe_post(1.6, -0.42, 0.02), options=options)
     guess[:, 1] -= 1.3 * np.sin(np.linspace(0.0, np.pi, len(guess) + 1)[1:])
     assert find_segment_contacts(problem, guess).is_free
     solution = solve(problem, guess)
@@ -257,7 +257,7 @@ def test_penalty_weights_are_raised_if_stalled_near_feasibility(
 ) -> None:
     """The base overlaps a wall at its goal; only a large overlap is reported."""
     wall = describe_box("wall", 1.565 - overlap, 0.0, [0.1, 2.0, 0.5])
-    problem, guess = drive(1.0, wall, options=vkc.Options(reach_waypoints=8))
+    problem, guess = make_drive_case(1.0, wall, options=vkc.Options(reach_waypoints=8))
     solution = solve(problem, guess)
     assert not solution.converged
     penalties = [row.penalty for row in solution.history]
@@ -266,7 +266,7 @@ def test_penalty_weights_are_raised_if_stalled_near_feasibility(
 
 
 def test_motion_to_the_start_is_stationary() -> None:
-    problem, still = drive(0.0)
+    problem, still = make_drive_case(0.0)
     solution = solve(problem, still)
     assert solution.converged
     np.testing.assert_allclose(solution.z, still, atol=0.05)
@@ -275,14 +275,14 @@ def test_motion_to_the_start_is_stationary() -> None:
 
 def test_steps_of_a_stationary_guess_are_lengthened() -> None:
     """Infeasible waypoints are a poor estimate of the duration."""
-    problem, guess = reach()
-    assert solve_case(reach).dt.min() > 1.5 * problem.timing_for(guess).dt.max()
+    problem, guess = make_reach_case()
+    assert solve_case(make_reach_case).dt.min() > 1.5 * problem.timing_for(guess).dt.max()
 
 
 def test_rate_limits_hold_if_the_guess_jumps() -> None:
     """Steps are lengthened by half at most, after which rate limits become constraints."""
     options = vkc.Options(reach_waypoints=12, dt=0.25)
-    problem, guess = drive(2.4, options=options)
+    problem, guess = make_drive_case(2.4, options=options)
     guess[:6] = problem.start
     guess[6:] = guess[-1]
     least = problem.timing_for(guess)
@@ -303,7 +303,7 @@ def test_exhausted_time_returns_the_guess_within_bounds() -> None:
         solution = solve(problem, guess + 20.0)
     assert (solution.status, solution.converged, solution.rounds) == ("time limit", False, 0)
     np.testing.assert_array_equal(solution.z, problem.clip(guess + 20.0))
-    assert solution.shortfall == 0.0  # it was not judged
+    assert solution.shortfall == 0.0  # it was not evaluated
 
 
 def test_evaluation_limit_is_deterministic() -> None:
@@ -311,8 +311,8 @@ def test_evaluation_limit_is_deterministic() -> None:
     with Budget().activate() as budget:
         whole = solve(*make_pillar_case())
     cut = []
-    for share in (0.8, 0.8, 1.0):
-        with Budget(max_evaluations=int(share * budget.evaluations)).activate():
+    for fraction in (0.8, 0.8, 1.0):
+        with Budget(max_evaluations=int(fraction * budget.evaluations)).activate():
             cut.append(solve(*make_pillar_case()))
     np.testing.assert_array_equal(cut[2].z, whole.z)
     assert cut[2].converged

@@ -1,4 +1,4 @@
-"""Tests of the contacts that represent collisions between waypoints."""
+"""Tests the contacts that represent collisions between waypoints."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_thin_obstacle_between_waypoints_is_avoided() -> None:
 
 
 def test_deepest_samples_become_planes_at_both_ends() -> None:
-    """For each pair, both planes miss the clearance that the segment lacks."""
+    """For each pair, both planes have the shortfall of the segment's deepest sample."""
     problem, z = make_post_case()
     found, dense = find_segment_contacts(problem, z).contacts, sample_segment(problem, z, 2)
     labels = problem.contacts.phases[0].labels
@@ -80,8 +80,8 @@ def test_deepest_samples_become_planes_at_both_ends() -> None:
     assert len(found.pair) == 2 * len(pairs)
     for pair in pairs:
         deepest = dense.distance[(dense.pair == pair).all(axis=1)].min()
-        missing = (found.margin - found.distance)[(found.pair == pair).all(axis=1)]
-        np.testing.assert_allclose(missing, SEGMENT_MARGIN - deepest, atol=1e-3)
+        shortfall = (found.margin - found.distance)[(found.pair == pair).all(axis=1)]
+        np.testing.assert_allclose(shortfall, SEGMENT_MARGIN - deepest, atol=1e-3)
 
 
 def test_lifting_both_ends_lifts_the_segment_to_first_order() -> None:
@@ -91,17 +91,17 @@ def test_lifting_both_ends_lifts_the_segment_to_first_order() -> None:
     index = int(np.argmax(found.margin - found.distance))
     pair, normal = found.pair[index], found.normal[index]
 
-    def depth(lift: float) -> float:
+    def compute_distance(lift: float) -> float:
         lifted = z.copy()
         lifted[1:3, :2] -= lift * normal[:2]  # the normal points away from the robot
         contacts = sample_segment(problem, lifted, 2, 2000)
         return float(contacts.distance[(contacts.pair == pair).all(axis=1)].min())
 
     value = found.margin[index] - SEGMENT_MARGIN
-    assert value == pytest.approx(found.distance[index] - depth(0.0), abs=1e-3)
+    assert value == pytest.approx(found.distance[index] - compute_distance(0.0), abs=1e-3)
     horizontal = float(normal[:2] @ normal[:2])
     for lift in (1e-3, 4e-3):
-        rise = depth(lift) - depth(0.0)
+        rise = compute_distance(lift) - compute_distance(0.0)
         assert rise == pytest.approx(lift * horizontal, rel=0.15, abs=2e-4)
 
 

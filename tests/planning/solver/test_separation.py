@@ -1,4 +1,4 @@
-"""Tests of how motions leave the obstacles that their initial guess passes through."""
+"""Tests the separation of motions from obstacles that the initial guess passes through."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def separate(
         ([(3.0, 0.1, 0.6)], [-1]),
         ([(3.0, -0.1, 0.6)], [1]),
         ([(2.0, 0.1, 0.4), (4.2, -0.1, 0.4)], [-1, 1]),
-        # A wall to the right leaves the left side alone, although it is farther.
+        # A wall to the right leaves only the left side, although it is farther.
         ([(3.0, 0.1, 0.6), (3.0, -1.2, 1.4)], [1, 1]),
     ],
 )
@@ -78,7 +78,7 @@ def test_straight_paths_pass_each_crate_on_one_side(
         assert np.sign(beside - y) == side
 
 
-def test_a_stretch_has_one_direction_whose_distance_is_a_lower_bound() -> None:
+def test_stretch_has_one_direction_whose_distance_is_a_lower_bound() -> None:
     problem, z = make_problem((3.0, 0.1, 0.6))
     separation, contacts, at, _ = separate(problem, z)
     assert separation.is_active
@@ -157,7 +157,7 @@ def test_shallow_overlaps_keep_coals_contacts(depth: float, is_active: bool) -> 
 
 
 def test_waypoints_beside_a_stretch_do_not_change_sides() -> None:
-    """It is shorter back out of the crate than aside, but the next waypoint is behind the crate."""
+    """Backing out of the crate is shorter than moving aside, but the next waypoint is behind it."""
     problem, path = make_problem((3.0, 0.1, 1.0))
     z = np.where(np.arange(len(path))[:, None] < 10, path[0], path[-1])
     z[10, :2] = 2.5, 0.1
@@ -169,7 +169,7 @@ def test_waypoints_beside_a_stretch_do_not_change_sides() -> None:
 
 @pytest.mark.parametrize("length", [0.06, 0.3])
 def test_waypoints_around_a_stretch_stay_where_no_segment_crosses(length: float) -> None:
-    """Back out of a thin wall is shorter than aside, but then the next segment leads through it."""
+    """Backing out of a thin wall is shorter than moving aside, but then a segment crosses it."""
     problem, z = make_problem((3.0, 0.1, length, 2.6))
     separation, contacts, _, _ = separate(problem, z)
     assert separation.is_active

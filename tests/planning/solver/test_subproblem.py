@@ -1,4 +1,4 @@
-"""Tests of the subproblem: the minimum of the merit model in the trust region."""
+"""Tests that the subproblem minimizes the merit model in the trust region."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SHORT = vkc.Options(reach_waypoints=8, turn_waypoints=4, move_waypoints=6)
 
 
 class Iterate(NamedTuple):
-    """An iterate and what its subproblem depends on."""
+    """An iterate and the inputs of its subproblem."""
 
     problem: vkc.TrajectoryProblem
     z: np.ndarray
@@ -69,22 +69,22 @@ def test_predicted_reduction_is_achieved_within_the_region(
     kind: str, rates: bool, size: float
 ) -> None:
     """Without close obstacles the model is exact up to Ipopt's tolerance."""
-    one = make_case(kind, rates=rates)
-    p, step = one.problem, one.solve(size, rates=rates)
-    assert np.all(np.abs(step.z - one.z) <= size * (1 + 1e-6))
+    iterate = make_case(kind, rates=rates)
+    p, step = iterate.problem, iterate.solve(size, rates=rates)
+    assert np.all(np.abs(step.z - iterate.z) <= size * (1 + 1e-6))
     assert np.all((step.z >= p.lower - 1e-6) & (step.z <= p.upper + 1e-6))
     assert np.all((step.relaxation >= 0.0) & (step.relaxation <= 1.0))
     assert (step.slack >= 0.0).all()
     o = p.options
     contacts = p.evaluate_contacts(step.z, reach=o.contact_reach, nearest=o.contact_slots)
-    found = measure_infeasibility(p, step.z, one.timing, contacts, rates=rates)
-    before, after = (p.objective(z, one.timing.dt) for z in (one.z, step.z))
-    others = one.merit.compute_penalty(one.found, clearance=False)
-    predicted = before + one.merit.compute_penalty(one.found, clearance=True).sum() - after
-    predicted -= (one.merit.weights["clearance"] * step.slack + others * step.relaxation).sum()
+    found = measure_infeasibility(p, step.z, iterate.timing, contacts, rates=rates)
+    before, after = (p.objective(z, iterate.timing.dt) for z in (iterate.z, step.z))
+    others = iterate.merit.compute_penalty(iterate.found, clearance=False)
+    predicted = before + iterate.merit.compute_penalty(iterate.found, clearance=True).sum() - after
+    predicted -= (iterate.merit.weights["clearance"] * step.slack + others * step.relaxation).sum()
     assert predicted >= -1e-3
     left = others @ step.relaxation
-    penalty = one.merit.compute_penalty(found, clearance=False).sum()
+    penalty = iterate.merit.compute_penalty(found, clearance=False).sum()
     assert penalty <= left + 1e-2 * max(1.0, left)
     if kind == "drive":
         assert not step.relaxation.any()
@@ -92,34 +92,34 @@ def test_predicted_reduction_is_achieved_within_the_region(
     else:
         assert predicted > 1.0
         assert not step.relaxation[others == 0.0].any()
-        assert size > 0.1 or (step.relaxation > 0.5).any(), "a small step does not get there"
+        assert size > 0.1 or (step.relaxation > 0.5).any(), "a small step must leave a relaxation"
 
 
 @pytest.mark.parametrize("size", [1e-3, 1e-2])
 def test_prediction_is_accurate_for_small_steps(size: float) -> None:
     """Linear models are accurate for small steps, also far from the goals."""
-    one = make_case("door")
-    p, step = one.problem, one.solve(size)
+    iterate = make_case("door")
+    p, step = iterate.problem, iterate.solve(size)
     after = measure_infeasibility(
-        p, step.z, one.timing, p.evaluate_contacts(step.z, reach=0.1), rates=False
+        p, step.z, iterate.timing, p.evaluate_contacts(step.z, reach=0.1), rates=False
     )
-    others = one.merit.compute_penalty(one.found, clearance=False)
-    actual = one.merit.compute_penalty(after, clearance=False).sum()
+    others = iterate.merit.compute_penalty(iterate.found, clearance=False)
+    actual = iterate.merit.compute_penalty(after, clearance=False).sum()
     assert actual < others.sum()
     gain = others.sum() - actual
     assert others @ step.relaxation == pytest.approx(actual, abs=0.02 * gain)
 
 
 def test_multipliers_warm_start_the_next_round() -> None:
-    one = make_case("drive")
-    solution = Solution(one.z, one.timing.dt)
-    subproblem = Subproblem(one.problem, solution)
+    iterate = make_case("drive")
+    solution = Solution(iterate.z, iterate.timing.dt)
+    subproblem = Subproblem(iterate.problem, solution)
     counts = []
     for reset in (False, False, True):
         if reset:
             subproblem.reset_multipliers()
         before = solution.iterations
-        one.solve(0.1, subproblem=subproblem)
+        iterate.solve(0.1, subproblem=subproblem)
         counts.append(solution.iterations - before)
     assert 0 < counts[1] <= counts[0] == counts[2]
     assert all(time > 0.0 for time in solution.timings.values())
@@ -127,14 +127,14 @@ def test_multipliers_warm_start_the_next_round() -> None:
 
 @pytest.mark.parametrize("is_violated", [False, True])
 def test_only_planes_violated_at_the_iterate_have_slack(is_violated: bool) -> None:
-    """The penalty weight does not matter next to a box beyond the margin."""
+    """Beyond the margin of the box, the penalty weight has no effect."""
     x = 1.6 if is_violated else 1.85
     obstacle = {"name": "box", "type": "box", "size": [0.2, 0.2, 1.0], "position": [x, 0.0, 0.5]}
     scene = make_hall(obstacles=[obstacle])
     problem = make_program(scene, [vkc.GoTo(1.2, 0.0)], options=SHORT)
     drive = drive_through(scene, scene.start, move_start(scene.start, x=1.2), steps=8).positions[1:]
-    one = make_iterate(problem, drive if is_violated else problem.still, weight=1e-3)
-    assert bool(one.found.amounts["clearance"].any()) == is_violated
-    step = one.solve(2.0)
+    iterate = make_iterate(problem, drive if is_violated else problem.still, weight=1e-3)
+    assert bool(iterate.found.amounts["clearance"].any()) == is_violated
+    step = iterate.solve(2.0)
     assert bool((step.slack > 1e-3).any()) == is_violated
     assert is_violated or not step.slack.any()

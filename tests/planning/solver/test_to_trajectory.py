@@ -1,4 +1,4 @@
-"""Tests of the conversion of waypoints to trajectories with pauses."""
+"""Tests the conversion of waypoints to trajectories with pauses."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ASIDE = lift(STICK, [0.0, 0.5, 0.0])
 
 
 @cache
-def fetch_problem() -> TrajectoryProblem:
+def make_fetch_problem() -> TrajectoryProblem:
     scene = make_room(describe_stand(), objects=("stick", "ball")).with_held(
         {"stick": "grip"}, at={"stick": (0.02, -0.1)}
     )
@@ -30,11 +30,11 @@ def fetch_problem() -> TrajectoryProblem:
 
 
 @cache
-def place_problem() -> TrajectoryProblem:
+def make_place_problem() -> TrajectoryProblem:
     return make_program(make_room(describe_table()), [Place("stick", ASIDE)], options=SHORT)
 
 
-def make_random(problem: TrajectoryProblem, seed: int = 0) -> tuple[np.ndarray, Trajectory]:
+def make_random_motion(problem: TrajectoryProblem, seed: int = 0) -> tuple[np.ndarray, Trajectory]:
     z = sample_configurations(
         problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(seed)
     )
@@ -52,7 +52,7 @@ def find_pauses(problem: TrajectoryProblem, motion: Trajectory) -> list[int]:
 
 
 def test_phases_list_attached_objects() -> None:
-    _, motion = make_random(fetch_problem())
+    _, motion = make_random_motion(make_fetch_problem())
     names = ["reach ball.pull by stick.tip", "place ball", "go to"]
     assert [phase.name for phase in motion.phases] == names
     both = {"stick": "grip", "ball": "pull"}
@@ -68,15 +68,15 @@ def test_phases_list_attached_objects() -> None:
         (n, 2 * n + 1),
         (2 * n + 1, 3 * n + 2),
     ]
-    assert find_pauses(fetch_problem(), motion) == [n + 1, 2 * n + 2]
+    assert find_pauses(make_fetch_problem(), motion) == [n + 1, 2 * n + 2]
 
 
 def test_last_object_is_released_at_the_end() -> None:
-    _, motion = make_random(place_problem())
+    _, motion = make_random_motion(make_place_problem())
     assert [phase.name for phase in motion.phases] == ["reach stick.grip", "place stick", "let go"]
     assert [dict(phase.held) for phase in motion.phases] == [{}, {"stick": "grip"}, {}]
     n = SHORT.reach_waypoints
-    assert find_pauses(place_problem(), motion) == [n + 1, 2 * n + 2]
+    assert find_pauses(make_place_problem(), motion) == [n + 1, 2 * n + 2]
     assert motion.phases[-1].last == len(motion.times) - 1
 
 
@@ -94,7 +94,7 @@ def test_hand_opens_at_the_end_only_on_request(
     steps: list[Step], held: dict[str, str], last: str
 ) -> None:
     scene = load_door_scene().with_held(held) if steps[0] == Release() else load_door_scene()
-    motion = make_random(make_program(scene, steps, options=SHORT))[1]
+    motion = make_random_motion(make_program(scene, steps, options=SHORT))[1]
     assert motion.phases[-1].name == last
     if last == "let go":
         assert dict(motion.phases[-1].held) == {}
@@ -102,11 +102,11 @@ def test_hand_opens_at_the_end_only_on_request(
 
 
 def test_robot_waits_only_for_the_gripper() -> None:
-    """It does not pause between turning the knob and moving the door."""
+    """There is no pause between turning the knob and moving the door."""
     steps: list[Step] = [Actuate("door", {"hinge": 1.2}), GoTo(0.0, 0.0)]
     problem = make_program(load_door_scene(), steps, options=SHORT)
     grasp, _, release, _ = problem.ends.tolist()
-    assert find_pauses(problem, make_random(problem)[1]) == [grasp + 1, release + 2]
+    assert find_pauses(problem, make_random_motion(problem)[1]) == [grasp + 1, release + 2]
 
 
 def test_object_grasped_at_the_start_is_released_first() -> None:
@@ -115,25 +115,25 @@ def test_object_grasped_at_the_start_is_released_first() -> None:
         problem = make_program(
             load_door_scene().with_held({"door": attachment}), [GoTo(0.0, 0.0)], options=SHORT
         )
-        motion = make_random(problem)[1]
+        motion = make_random_motion(problem)[1]
         assert [dict(phase.held) for phase in motion.phases] == [{}]
     assert np.all(motion.column("door.handle_free") == 0.0)
 
 
-@pytest.mark.parametrize("make", [fetch_problem, place_problem])
+@pytest.mark.parametrize("make", [make_fetch_problem, make_place_problem])
 def test_robot_follows_the_waypoints(make) -> None:  # type: ignore[no-untyped-def]
     problem = make()
-    z, motion = make_random(problem)
+    z, motion = make_random_motion(problem)
     rows = np.delete(motion.positions, find_pauses(problem, motion), axis=0)
     robot = motion.robot_size
     np.testing.assert_array_equal(rows[:, :robot], problem.waypoints(z)[:, :robot])
 
 
-@pytest.mark.parametrize("make", [fetch_problem, place_problem])
+@pytest.mark.parametrize("make", [make_fetch_problem, make_place_problem])
 def test_grasp_coordinates_hold_their_values(make) -> None:  # type: ignore[no-untyped-def]
-    """During the grasp, values are the program's; before and after, the nearest ones."""
+    """During the grasp, values are those of the solution; before and after, the nearest ones."""
     problem = make()
-    z, motion = make_random(problem)
+    z, motion = make_random_motion(problem)
     path = problem.waypoints(z)
     rows = np.delete(motion.positions, find_pauses(problem, motion), axis=0)
     ends = [0, *problem.ends.tolist()]

@@ -1,4 +1,4 @@
-"""Tests of step acceptance and trust-region adaptation, on either side of every threshold."""
+"""Tests step acceptance and trust-region adaptation, on either side of every threshold."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def test_each_block_adapts_to_its_own_prediction(
     factors: tuple[float, ...],
 ) -> None:
     """Blocks of two waypoints: reductions add up within a block, the largest step counts."""
-    given_radii = np.full(4, 0.3)
-    region = TrustRegion(4, 2, given_radii)
+    original_radii = np.full(4, 0.3)
+    region = TrustRegion(4, 2, original_radii)
     spread = np.zeros((3, 4))
     spread[0, ::2], spread[1, 1::2], spread[2, 1::2] = predicted, actual, 0.3 * np.array(step)
     region.adapt(*spread, accepted)
     np.testing.assert_allclose(region.radius, np.repeat(0.3 * np.array(factors), 2))
-    np.testing.assert_array_equal(given_radii, 0.3)
+    np.testing.assert_array_equal(original_radii, 0.3)
 
 
 @settings(max_examples=50, deadline=None)

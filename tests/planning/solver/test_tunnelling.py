@@ -1,4 +1,4 @@
-"""Tests of the detection of shapes that pass through each other."""
+"""Tests the detection of shapes that pass through each other."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ REACH, GRAZING = 8, -0.353
 
 @cache
 def make_posts_problem() -> TrajectoryProblem:
-    """Two posts at x = 2 and 4 m in the path of the base, which is a metre long."""
+    """Return a drive through posts at x = 2 and 4 m and back; the base is 1 m long."""
     obstacles = [
         {
             "name": f"post_{x}",
@@ -40,11 +40,11 @@ def find_base_crossings(
     """Return the first and last segments in which the base crosses each post."""
     problem = make_posts_problem()
     states = np.array([move_start(problem.start, x=x, y=y) for x in xs])
-    where = np.array(segments)
-    near = problem.contacts.evaluate(states, where + 1, reach=0.05)
+    indices = np.array(segments)
+    near = problem.contacts.evaluate(states, indices + 1, reach=0.05)
     labels = problem.contacts.phases[0].labels
     found: dict[str, list[tuple[int, int]]] = {}
-    for (a, b), first, last in find_crossings(problem.contacts, states, where, near):
+    for (a, b), first, last in find_crossings(problem.contacts, states, indices, near):
         if labels[a] == "base_link":
             found.setdefault(labels[b], []).append((first, last))
     return found
@@ -87,7 +87,7 @@ def test_grazing_is_no_crossing() -> None:
     assert "base_link" in {labels[pair[0]] for pair in near.pair}
 
 
-def test_new_crossings_are_of_new_pairs() -> None:
+def test_new_crossings_have_new_pairs() -> None:
     first, moved_on, other = Crossing((1, 2), 3, 4), Crossing((1, 2), 5, 6), Crossing((1, 3), 3, 4)
     assert find_new_crossings([moved_on], [first]) == []
     assert find_new_crossings([first, other], [moved_on]) == [other]

@@ -1,4 +1,4 @@
-"""Tests built objects: masses and inertias against Pinocchio, and their URDF."""
+"""Tests the object builder: masses and inertias against Pinocchio, and the shapes of a case."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vkc_pin.world.models.object_file import load_object
 def build_object() -> ObjectBuilder:
     builder = ObjectBuilder("thing", LinkBuilder("base"))
     builder.base.add_box((0.0, -0.2, 0.0), (0.3, 0.2, 0.5), "oak")
-    moved = builder.add_joint(
+    tray = builder.add_joint(
         "slide",
         "prismatic",
         (0.0, 0.0, 0.6),
@@ -23,13 +23,13 @@ def build_object() -> ObjectBuilder:
         link="tray",
         acceleration=1.5,
     )
-    moved.add_box((-0.1, -0.1, -0.05), (0.1, 0.1, 0.05), "white")
-    moved.add_cylinder((-0.2, 0.0, 0.0), 0.02, 0.3, "y", "steel")
-    moved.add_sphere((0.0, 0.0, 0.2), 0.05, "steel")
-    moved.add_rod((0.1, 0.0, 0.0), (0.3, -0.2, 0.4), 0.03, "steel")
+    tray.add_box((-0.1, -0.1, -0.05), (0.1, 0.1, 0.05), "white")
+    tray.add_cylinder((-0.2, 0.0, 0.0), 0.02, 0.3, "y", "steel")
+    tray.add_sphere((0.0, 0.0, 0.2), 0.05, "steel")
+    tray.add_rod((0.1, 0.0, 0.0), (0.3, -0.2, 0.4), 0.03, "steel")
     builder.add_attachment(
         "grip",
-        moved,
+        tray,
         (-0.2, 0.0, 0.0),
         (1, 0, 0),
         (0, 0, 1),
@@ -41,7 +41,7 @@ def build_object() -> ObjectBuilder:
 
 
 def test_masses_and_inertias_match_pinocchio() -> None:
-    thing = load_object(build_object().description)
+    loaded = load_object(build_object().description)
     shapes = (
         (pin.Inertia.FromBox(500.0 * 0.2 * 0.2 * 0.1, 0.2, 0.2, 0.1), pin.SE3.Identity()),
         (
@@ -54,26 +54,26 @@ def test_masses_and_inertias_match_pinocchio() -> None:
         ),
     )
     rod = np.array([0.2, -0.2, 0.4])
-    turned = pin.Quaternion.FromTwoVectors(
+    rotation = pin.Quaternion.FromTwoVectors(
         np.array([0.0, 0.0, 1.0]), rod / np.linalg.norm(rod)
     ).matrix()
     length = float(np.linalg.norm(rod))
     shapes += (
         (
             pin.Inertia.FromCylinder(500.0 * np.pi * 0.03**2 * length, 0.03, length),
-            pin.SE3(turned, np.array([0.2, -0.1, 0.2])),
+            pin.SE3(rotation, np.array([0.2, -0.1, 0.2])),
         ),
     )
     expected = pin.Inertia.Zero()
-    for inertia, where in shapes:
-        expected += where.act(inertia)
-    found = thing.model.inertias[1]
+    for inertia, placement in shapes:
+        expected += placement.act(inertia)
+    found = loaded.model.inertias[1]
     assert found.mass == pytest.approx(expected.mass, abs=1e-4)
     np.testing.assert_allclose(found.lever, expected.lever, rtol=0.0, atol=1e-4)
     np.testing.assert_allclose(found.inertia, expected.inertia, rtol=0.0, atol=1e-4)
 
 
-def test_a_case_is_open_in_front_and_closed_elsewhere() -> None:
+def test_case_is_open_only_in_front() -> None:
     link = LinkBuilder("case")
     link.add_case((0.0, -0.3, 0.1), (0.5, 0.3, 0.9), 0.02, "white", "oak")
     builder = ObjectBuilder("case", link)
@@ -91,4 +91,4 @@ def test_a_case_is_open_in_front_and_closed_elsewhere() -> None:
                 for point in ray
             )
             blocked.append(hit)
-    assert blocked == [False, True, True, True, True, True]  # but for -x
+    assert blocked == [False, True, True, True, True, True]  # open only towards -x

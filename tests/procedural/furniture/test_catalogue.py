@@ -1,4 +1,4 @@
-"""Tests random furniture: valid for all sizes, reproducible, and written to files."""
+"""Tests that random furniture is valid in all sizes, reproducible, and written to files."""
 
 from __future__ import annotations
 
@@ -20,13 +20,15 @@ from vkc_pin.world.models.shapes import (
 from vkc_pin.world.scene.placed_object import make_world_shapes
 
 ROBOT = vkc.load_robot("husky_ur5e")
-FEW = settings(max_examples=10, deadline=None, phases=[Phase.generate])
-EACH = st.sampled_from(sorted(KINDS))
+FEW_EXAMPLES = settings(max_examples=10, deadline=None, phases=[Phase.generate])
+ANY_KIND = st.sampled_from(sorted(KINDS))
 
 
 def place_object(kind: str, seed: int) -> vkc.PlacedObject:
-    thing = vkc.load_object(vkc.procedural.random_object(kind, seed))
-    return vkc.PlacedObject(kind, thing, pin.SE3.Identity(), np.clip(0.0, thing.lower, thing.upper))
+    loaded = vkc.load_object(vkc.procedural.random_object(kind, seed))
+    return vkc.PlacedObject(
+        kind, loaded, pin.SE3.Identity(), np.clip(0.0, loaded.lower, loaded.upper)
+    )
 
 
 def get_hand_shapes() -> list:
@@ -40,30 +42,30 @@ def get_hand_shapes() -> list:
     names = ("gripper", "wrist_3")
     found = zip(geometry.geometryObjects, shapes.oMg, strict=True)
     return [
-        (shape.geometry, tool.actInv(where))
-        for shape, where in found
+        (shape.geometry, tool.actInv(placement))
+        for shape, placement in found
         if shape.name.startswith(names)
     ]
 
 
-HAND = get_hand_shapes()
+HAND_SHAPES = get_hand_shapes()
 
 
-@FEW
-@given(EACH, st.integers(0, 5000))
-def test_the_hand_fits_around_every_handle(kind: str, seed: int) -> None:
-    """Open fingers keep a plan's clearances: 5 mm to the grasped link, 20 mm to others."""
-    own = place_object(kind, seed)
-    assert len(own.object.attachments) >= 2
-    for attachment in own.object.attachments.values():
-        tool = own.link_placement(attachment.link) * attachment.tool(
+@FEW_EXAMPLES
+@given(ANY_KIND, st.integers(0, 5000))
+def test_hand_fits_around_every_handle(kind: str, seed: int) -> None:
+    """Open fingers keep the planner's clearances: 5 mm to the grasped link, 20 mm to others."""
+    placed = place_object(kind, seed)
+    assert len(placed.object.attachments) >= 2
+    for attachment in placed.object.attachments.values():
+        tool = placed.link_placement(attachment.link) * attachment.tool(
             np.zeros(len(attachment.freedoms))
         )
-        for shape in make_world_shapes(own):
+        for shape in make_world_shapes(placed):
             link = shape.name.rpartition("_")[0]
             least = min(
-                compute_shape_distance(solid, tool * where, shape.geometry, shape.placement)
-                for solid, where in HAND
+                compute_shape_distance(solid, tool * placement, shape.geometry, shape.placement)
+                for solid, placement in HAND_SHAPES
             )
             assert least >= (0.005 if link == attachment.link else 0.02), (
                 attachment.name,
@@ -72,19 +74,19 @@ def test_the_hand_fits_around_every_handle(kind: str, seed: int) -> None:
             )
 
 
-@FEW
-@given(EACH, st.integers(0, 5000))
-def test_links_pass_each_other(kind: str, seed: int) -> None:
-    """One joint at a time, from end to end, no link enters the base or another link."""
-    own = place_object(kind, seed)
-    model = own.object.model
-    for k, joint in enumerate(own.object.coordinates.names):
+@FEW_EXAMPLES
+@given(ANY_KIND, st.integers(0, 5000))
+def test_moving_links_do_not_collide(kind: str, seed: int) -> None:
+    """No link penetrates the base or another link while one joint moves over its range."""
+    placed = place_object(kind, seed)
+    model = placed.object.model
+    for k, joint in enumerate(placed.object.coordinates.names):
         if model.parents[model.getJointId(joint)] != 0:
-            continue  # a door's lever has its spindle in the panel
-        for value in np.linspace(own.object.lower[k], own.object.upper[k], 7):
-            shapes = make_world_shapes(own.with_state({joint: value}))
-            parents = [shape.parentJoint for shape in own.object.collision.geometryObjects]
-            moved = own.object.links_moved_by({joint})
+            continue  # the spindle of a door lever is in the panel
+        for value in np.linspace(placed.object.lower[k], placed.object.upper[k], 7):
+            shapes = make_world_shapes(placed.with_state({joint: value}))
+            parents = [shape.parentJoint for shape in placed.object.collision.geometryObjects]
+            moved = placed.object.links_moved_by({joint})
             moving = [s for s in shapes if s.name.rpartition("_")[0] in moved]
             others = [
                 s
@@ -100,26 +102,26 @@ def test_links_pass_each_other(kind: str, seed: int) -> None:
             ), (joint, value, parents)
 
 
-@FEW
-@given(EACH, st.integers(0, 5000))
+@FEW_EXAMPLES
+@given(ANY_KIND, st.integers(0, 5000))
 def test_doors_open_towards_the_user(kind: str, seed: int) -> None:
-    own = place_object(kind, seed)
-    for attachment in own.object.attachments.values():
+    placed = place_object(kind, seed)
+    for attachment in placed.object.attachments.values():
         joint = (
-            own.object.coordinates.names[0]
+            placed.object.coordinates.names[0]
             if kind == "door"
             else next(
-                str(own.object.model.names[frame.parentJoint])
-                for frame in own.object.model.frames
+                str(placed.object.model.names[frame.parentJoint])
+                for frame in placed.object.model.frames
                 if frame.name == attachment.link
             )
         )
         before, after = (
             (
-                own.with_state({joint: value}).link_placement(attachment.link)
+                placed.with_state({joint: value}).link_placement(attachment.link)
                 * attachment.placement
             ).translation
-            for value in (0.0, 0.3 * own.object.upper[own.object.coordinates.index(joint)])
+            for value in (0.0, 0.3 * placed.object.upper[placed.object.coordinates.index(joint)])
         )
         moved = after - before
         if kind in ("dishwasher", "oven"):
@@ -138,14 +140,14 @@ def test_random_objects_are_reproducible() -> None:
 
 
 def test_objects_are_written_to_files(tmp_path: Path) -> None:
-    made = vkc.procedural.random_object("refrigerator", 5)
-    file = vkc.procedural.write_object(made, tmp_path / "new" / "thing.yaml")
+    description = vkc.procedural.random_object("refrigerator", 5)
+    file = vkc.procedural.write_object(description, tmp_path / "new" / "thing.yaml")
     assert sorted(path.name for path in file.parent.iterdir()) == ["thing.urdf", "thing.yaml"]
-    kept, described = vkc.load_object(file), vkc.load_object(made)
-    assert (kept.name, kept.urdf) == ("thing", tmp_path / "new" / "thing.urdf")
-    assert kept.model == described.model
-    assert list(kept.attachments) == list(described.attachments)
-    np.testing.assert_array_equal(kept.acceleration, described.acceleration)
+    loaded, expected = vkc.load_object(file), vkc.load_object(description)
+    assert (loaded.name, loaded.urdf) == ("thing", tmp_path / "new" / "thing.urdf")
+    assert loaded.model == expected.model
+    assert list(loaded.attachments) == list(expected.attachments)
+    np.testing.assert_array_equal(loaded.acceleration, expected.acceleration)
 
 
 def test_invalid_arguments_are_rejected(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Tests handles: the hand grasps the bar on its whole range, with clearance for open fingers."""
+"""Tests the attachments of handles: bars over their length, low bars, and knobs."""
 
 from __future__ import annotations
 
@@ -30,32 +30,32 @@ def make_builder(kind: str, height: float = 0.9) -> ObjectBuilder:
     return builder
 
 
-@pytest.mark.parametrize(("kind", "along"), [("upright", 2), ("level", 1)])
-def test_bar_can_be_grasped_anywhere_between_its_posts(kind: str, along: int) -> None:
-    thing = load_object(make_builder(kind).description)
-    fixed, free = thing.attachment("handle"), thing.attachment("handle_free")
+@pytest.mark.parametrize(("kind", "axis"), [("upright", 2), ("level", 1)])
+def test_bar_can_be_grasped_anywhere_between_its_posts(kind: str, axis: int) -> None:
+    bar = load_object(make_builder(kind).description)
+    fixed, free = bar.attachment("handle"), bar.attachment("handle_free")
     centre = np.array(FACE) - [0.06, 0.0, 0.0]
     np.testing.assert_allclose(fixed.placement.translation, centre, atol=1e-9)
     for slide, turn in itertools.product(*((f.lower, f.upper) for f in free.freedoms)):
         tool = free.tool([slide, turn])
-        off = np.delete(tool.translation - centre, along)
-        np.testing.assert_allclose(off, 0.0, atol=1e-9)
-        assert abs(tool.translation[along] - FACE[along]) == pytest.approx(
+        offset = np.delete(tool.translation - centre, axis)
+        np.testing.assert_allclose(offset, 0.0, atol=1e-9)
+        assert abs(tool.translation[axis] - FACE[axis]) == pytest.approx(
             0.1
-        )  # 0.03 from a post, at 0.13
-        assert abs(tool.rotation[along, 0]) < 1e-9  # the fingers close across the bar
-    level = fixed.placement.rotation
-    np.testing.assert_allclose(level[:, 2], [1, 0, 0], atol=1e-9)
+        )  # 0.03 m from a post at 0.13 m
+        assert abs(tool.rotation[axis, 0]) < 1e-9  # the fingers close across the bar
+    rotation = fixed.placement.rotation
+    np.testing.assert_allclose(rotation[:, 2], [1, 0, 0], atol=1e-9)
 
 
-@pytest.mark.parametrize(("height", "down"), [(0.9, 0.0), (0.55, 0.0), (0.3, 0.65), (0.1, 0.65)])
-def test_low_bars_are_grasped_from_above(height: float, down: float) -> None:
+@pytest.mark.parametrize(("height", "pitch"), [(0.9, 0.0), (0.55, 0.0), (0.3, 0.65), (0.1, 0.65)])
+def test_low_bars_are_grasped_from_above(height: float, pitch: float) -> None:
     approach = (
         load_object(make_builder("level", height).description)
         .attachment("handle")
         .placement.rotation[:, 2]
     )
-    np.testing.assert_allclose(approach, [np.cos(down), 0.0, -np.sin(down)], atol=1e-6)
+    np.testing.assert_allclose(approach, [np.cos(pitch), 0.0, -np.sin(pitch)], atol=1e-6)
 
 
 def test_knob_can_be_grasped_from_any_direction_in_front() -> None:
@@ -66,4 +66,4 @@ def test_knob_can_be_grasped_from_any_direction_in_front() -> None:
             rng.uniform([f.lower for f in free.freedoms], [f.upper for f in free.freedoms])
         )
         np.testing.assert_allclose(tool.translation, np.array(FACE) - [0.05, 0.0, 0.0], atol=1e-9)
-        assert tool.rotation[0, 2] > 0.4  # the approach
+        assert tool.rotation[0, 2] > 0.4  # approach direction

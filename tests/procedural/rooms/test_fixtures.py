@@ -1,4 +1,4 @@
-"""Tests objects that can be opened, given by name, path or description, and their sizes."""
+"""Tests fixtures created by name, path or description, and their sizes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_bounding_box_is_that_of_the_closed_object() -> None:
     assert door.in_wall
 
 
-def test_names() -> None:
+def test_fixture_names() -> None:
     assert make_fixture_name("random_oven") == "oven"
     assert make_fixture_name("door") == "door"
     assert make_fixture_name("/some/where/my.oven.yaml") == "my_oven"
@@ -41,7 +41,7 @@ def test_names() -> None:
     assert len(set(list_openable_types())) == len(list_openable_types())
 
 
-def test_sizes_follow_from_the_seed() -> None:
+def test_sizes_depend_on_the_seed() -> None:
     one, same, other = (make_fixture("random_microwave", seed) for seed in (1, 1, 2))
     assert (one.type, one.counter) == (same.type, same.counter)
     assert one.type != other.type
@@ -60,10 +60,10 @@ def test_raised_object_is_lowered_to_the_floor(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "nearest"), [("cabinett", "cabinet"), ("random_ovn", "random_oven")]
 )
-def test_unknown_objects(kind: str, nearest: str) -> None:
-    with pytest.raises(vkc.UnknownNameError) as found:
+def test_unknown_objects_are_rejected(kind: str, nearest: str) -> None:
+    with pytest.raises(vkc.UnknownNameError) as caught:
         make_fixture(kind)
-    assert (found.value.field, found.value.nearest) == ("objects", nearest)
+    assert (caught.value.field, caught.value.nearest) == ("objects", nearest)
 
 
 def test_free_objects_are_rejected() -> None:

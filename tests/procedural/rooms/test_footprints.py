@@ -36,7 +36,7 @@ def test_gap_bounds_the_distance_from_below(one: Rectangle, other: Rectangle) ->
 
 
 @given(RECTANGLES, st.floats(-3, 3), st.floats(-3, 3))
-def test_the_distance_of_a_point(one: Rectangle, x: float, y: float) -> None:
+def test_distance_to_a_point_agrees_with_coal(one: Rectangle, x: float, y: float) -> None:
     point = coal.Sphere(1e-3), pin.SE3(np.eye(3), np.array([x, y, 0.0]))
     expected = max(compute_shape_distance(*make_box(one), *point) + 1e-3, 0.0)
     (found,) = one.compute_distances([[x, y]])
@@ -49,9 +49,9 @@ def test_the_distance_of_a_point(one: Rectangle, x: float, y: float) -> None:
 def test_wall_frames_point_out_of_the_room(side: int, expected: tuple[float, float]) -> None:
     frame = Floor(6.0, 4.0).make_wall_frame(side, 1.0)
     assert (frame.x, frame.y) == pytest.approx(expected)
-    out = np.subtract(frame.transform_point(0.5, 0.0), (frame.x, frame.y))
+    outward = np.subtract(frame.transform_point(0.5, 0.0), (frame.x, frame.y))
     middle = [(3.0, 0.0), (0.0, 2.0), (-3.0, 0.0), (0.0, -2.0)][side]
-    assert out == pytest.approx(0.5 * np.array(middle) / np.linalg.norm(middle))
+    assert outward == pytest.approx(0.5 * np.array(middle) / np.linalg.norm(middle))
 
 
 def test_floor_contains_rectangles_between_the_walls() -> None:
@@ -72,7 +72,7 @@ def test_floor_contains_rectangles_between_the_walls() -> None:
 
 
 @pytest.mark.parametrize(("width", "expected"), [(2.4, True), (2.8, False)])
-def test_path_must_be_wide_enough_for_the_disc(width: float, expected: bool) -> None:
+def test_passage_must_be_wide_enough_for_the_disc(width: float, expected: bool) -> None:
     """A wall across a room 4 m wide leaves a passage at one end."""
     barrier = Frame(2.0, 0.0, 0.0).make_rectangle((-width, 0.0), (-0.1, 0.1))
     assert Floor(4.0, 6.0).is_connected([barrier], 0.65, [(0.0, -2.0), (0.0, 2.0)]) is expected

@@ -15,26 +15,26 @@ from vkc_pin.world.scene.placed_object import make_world_shapes
 FLOOR = Floor(6.0, 5.0)
 
 
-def make_scene(*standing: parts.Part, walls: bool = False) -> vkc.Scene:
+def make_scene(*room_parts: parts.Part, walls: bool = False) -> vkc.Scene:
     obstacles = [
-        *(parts.make_walls(FLOOR, 2.4, standing) if walls else []),
-        *(o for part in standing for o in part.obstacles),
+        *(parts.make_walls(FLOOR, 2.4, room_parts) if walls else []),
+        *(o for part in room_parts for o in part.obstacles),
     ]
-    objects = [entry for part in standing for entry in part.objects]
+    objects = [entry for part in room_parts for entry in part.objects]
     arena = {"x": [-6.0, 6.0], "y": [-6.0, 6.0]}
-    own = {"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}, "arena": arena, "floor": False}
-    return vkc.Scene.from_document({**own, "obstacles": obstacles, "objects": objects})
+    document = {"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}, "arena": arena, "floor": False}
+    return vkc.Scene.from_document({**document, "obstacles": obstacles, "objects": objects})
 
 
-def compute_extent(found: vkc.Scene) -> np.ndarray:
+def compute_extent(scene: vkc.Scene) -> np.ndarray:
     boxes = np.array(
-        [compute_world_box(shape.geometry, shape.placement) for shape in found.obstacles]
+        [compute_world_box(shape.geometry, shape.placement) for shape in scene.obstacles]
     )
     return np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
 
 @pytest.mark.parametrize("side", range(4))
-def test_a_table_stands_on_its_footprint_and_has_a_free_side(side: int) -> None:
+def test_table_covers_its_footprint_and_has_a_free_side(side: int) -> None:
     wall = FLOOR.make_wall_frame(side, 0.4)
     table = parts.make_table(
         "table", Frame(*wall.transform_point(-0.5, 0.0), wall.yaw), (0.8, 1.4, 0.74)
@@ -50,10 +50,10 @@ def test_a_table_stands_on_its_footprint_and_has_a_free_side(side: int) -> None:
     assert table.standing_place is not None
     assert np.linalg.norm(table.standing_place) < np.hypot(
         wall.x, wall.y
-    )  # on the side of the room
+    )  # on the side towards the room
 
 
-def test_a_shelf_stands_against_its_wall() -> None:
+def test_shelf_is_placed_against_its_wall() -> None:
     shelf = parts.make_shelf("shelf", FLOOR.make_wall_frame(0, 0.3), (0.3, 1.0, 1.8), 4)
     low, high = compute_extent(make_scene(shelf))
     assert np.array([low, high]) == pytest.approx(
@@ -67,18 +67,18 @@ def test_a_shelf_stands_against_its_wall() -> None:
 @pytest.mark.parametrize(
     ("kind", "side"), [("door", 0), ("drawer", 1), ("random_oven", 2), ("random_door", 3)]
 )
-def test_openable_object_is_at_its_wall_with_free_floor(kind: str, side: int) -> None:
+def test_openable_object_is_at_its_wall_with_clear_floor(kind: str, side: int) -> None:
     part = parts.make_openable(kind, make_fixture(kind, side), FLOOR, side, 0.5, 1.8)
     room = make_scene(part, walls=True)
     placed = room.objects[kind]
     walls = list_placed_shapes(room.obstacles)
     assert (
         compute_clearance(list_placed_shapes(make_world_shapes(placed)), walls) > -2e-3
-    )  # frames of doors touch their wall
+    )  # door frames touch their wall
     joint = placed.object.coordinates.names[0]
-    for share in np.linspace(0.0, 1.0, 6):  # moving parts keep the clearance that plans do
-        high = min(placed.object.upper[0], 1.57)
-        moved = placed.with_state({joint: share * high})
+    for fraction in np.linspace(0.0, 1.0, 6):  # moving links keep the planner's clearance
+        upper = min(placed.object.upper[0], 1.57)
+        moved = placed.with_state({joint: fraction * upper})
         parents = [shape.parentJoint for shape in placed.object.collision.geometryObjects]
         moving = [
             shape for shape, parent in zip(make_world_shapes(moved), parents, strict=True) if parent
@@ -91,14 +91,14 @@ def test_openable_object_is_at_its_wall_with_free_floor(kind: str, side: int) ->
     assert part.clear_floor is not None
     assert part.clear_floor.compute_distances([tool.translation[:2]])[0] == pytest.approx(
         0.0, abs=1e-6
-    )  # the handle is before it
+    )  # the handle is above the clear floor
     assert FLOOR.compute_half_length(side + 1) - abs(np.array(part.standing_place)[side % 2]) > 0.8
 
 
 @pytest.mark.parametrize(
     ("kind", "seed"), [("random_microwave", 0), ("random_faucet", 1), ("random_faucet", 2)]
 )
-def test_small_objects_are_on_a_counter(kind: str, seed: int) -> None:
+def test_small_objects_rest_on_a_counter(kind: str, seed: int) -> None:
     part = parts.make_openable("it", make_fixture(kind, seed), FLOOR, 2, 0.3, 1.8)
     low, high = compute_extent(make_scene(part))
     room = make_scene(part)
@@ -119,9 +119,9 @@ def test_small_objects_are_on_a_counter(kind: str, seed: int) -> None:
     assert part.clear_floor.compute_gap(part.footprint) == pytest.approx(0.0, abs=2e-3)
 
 
-def test_walls_close_the_room_but_for_doors() -> None:
+def test_walls_enclose_the_room_except_at_doors() -> None:
     door = parts.make_openable("door", make_fixture("door"), FLOOR, 1, -1.0, 1.8)
-    closed, open_ = (parts.make_walls(FLOOR, 2.4, standing) for standing in ((), (door,)))
+    closed, open_ = (parts.make_walls(FLOOR, 2.4, room_parts) for room_parts in ((), (door,)))
     assert [item["name"] for item in closed] == [
         "wall_east",
         "wall_north",

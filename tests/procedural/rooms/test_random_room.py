@@ -1,4 +1,4 @@
-"""Tests random rooms: reproducible, free of overlaps, with reachable places for the robot."""
+"""Tests that random rooms are reproducible, free of overlaps and accessible to the robot."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def group_shapes(layout: Layout, scene: vkc.Scene) -> dict[str, list]:
 
 @settings(max_examples=4, deadline=None, phases=[Phase.generate])
 @given(NUMBERS, st.floats(0.0, 1.0), OBJECTS, st.booleans())
-def test_rooms_are_free_of_overlaps_and_have_places_to_stand(
+def test_rooms_have_no_overlaps_and_reachable_standing_places(
     number: int, clutter: float, objects: tuple[str, ...] | None, cup: bool
 ) -> None:
     layout = sample_layout(
@@ -72,7 +72,7 @@ def test_rooms_are_free_of_overlaps_and_have_places_to_stand(
         assert distance >= least - 1e-9, (one, other, distance)
 
     assert scene.start_clearance() >= START_CLEARANCE
-    for yaw in np.linspace(-np.pi, np.pi, 7):  # it can turn where it starts
+    for yaw in np.linspace(-np.pi, np.pi, 7):  # the robot can turn at its start
         assert (
             scene.with_start(base=[*layout.start[:2], yaw]).start_clearance(reach=START_CLEARANCE)
             >= START_CLEARANCE
@@ -88,9 +88,9 @@ def test_rooms_are_free_of_overlaps_and_have_places_to_stand(
             if other.footprint != part.footprint
         )
         assert part.standing_place is not None
-        for yaw in (0.0, 1.5, 3.0):  # and where it has to stand
-            there = scene.with_start(base=[*part.standing_place, yaw])
-            assert there.start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE, part.name
+        for yaw in (0.0, 1.5, 3.0):  # and at the standing place
+            moved_scene = scene.with_start(base=[*part.standing_place, yaw])
+            assert moved_scene.start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE, part.name
     spots = [part.standing_place for part in layout.parts if part.standing_place is not None]
     assert layout.floor.is_connected(
         [p.footprint for p in layout.parts], layout.radius, [layout.start[:2], *spots]
@@ -133,14 +133,16 @@ def test_unknown_settings_and_parts_are_rejected() -> None:
 
 
 def test_error_if_parts_do_not_fit() -> None:
-    with pytest.raises(vkc.InputError) as found:
+    with pytest.raises(vkc.InputError) as caught:
         vkc.procedural.random_room(0, width=(4.0, 4.0), objects=("cabinet",) * 6)
-    assert found.value.field == "clutter"
-    assert "fewer objects" in str(found.value.expected)
+    assert caught.value.field == "clutter"
+    assert "fewer objects" in str(caught.value.expected)
 
 
-def test_imported_objects_and_robots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Imported objects have their frame in the middle: the floor is free in front of their face."""
+def test_imported_objects_and_robots_are_accepted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The front face of an imported object may lie at negative x of its frame."""
     box = '<geometry><box size="{1} 0.5 0.4"/></geometry>'
     box = f'<collision><origin xyz="{{0}} 0 0.2"/>{box}</collision>'
     body, door = box.format(0.03, 0.64), box.format(-0.3, 0.02)
@@ -150,8 +152,8 @@ def test_imported_objects_and_robots(tmp_path: Path, monkeypatch: pytest.MonkeyP
     joint = f'<joint name="hinge" type="revolute">{ends}</joint>'
     links = f'<link name="body">{body}</link><link name="door">{door}</link>'
     urdf = f'<robot name="oven">{links}{joint}</robot>'
-    own = make_fixture({"urdf": urdf, "attachments": []})
-    assert own.face == pytest.approx(-0.29)
+    fixture = make_fixture({"urdf": urdf, "attachments": []})
+    assert fixture.face == pytest.approx(-0.29)
     assert make_fixture("dishwasher").face == pytest.approx(0.0, abs=0.03)
     write_gripper(tmp_path / "mine")
     monkeypatch.chdir(tmp_path)

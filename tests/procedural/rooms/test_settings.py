@@ -26,11 +26,11 @@ import vkc_pin as vkc
     ],
 )
 def test_invalid_settings_are_rejected(changes: dict[str, Any], field: str, expected: str) -> None:
-    with pytest.raises(vkc.InputError) as found:
+    with pytest.raises(vkc.InputError) as caught:
         vkc.procedural.RoomSettings(**changes)
-    assert found.value.field == field
-    assert expected in str(found.value.expected)
-    assert found.value.got is not None
+    assert caught.value.field == field
+    assert expected in str(caught.value.expected)
+    assert caught.value.got is not None
 
 
 @pytest.mark.parametrize(
@@ -41,7 +41,7 @@ def test_invalid_settings_are_rejected(changes: dict[str, Any], field: str, expe
         ("carried", "cub", "cup"),
     ],
 )
-def test_unknown_types(field: str, name: str, nearest: str) -> None:
-    with pytest.raises(vkc.UnknownNameError) as found:
+def test_unknown_types_are_rejected(field: str, name: str, nearest: str) -> None:
+    with pytest.raises(vkc.UnknownNameError) as caught:
         vkc.procedural.RoomSettings(**{field: (name,)})  # type: ignore[arg-type]
-    assert (found.value.field, found.value.name, found.value.nearest) == (field, name, nearest)
+    assert (caught.value.field, caught.value.name, caught.value.nearest) == (field, name, nearest)

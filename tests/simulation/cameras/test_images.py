@@ -1,4 +1,4 @@
-"""Camera images agree with forward kinematics."""
+"""Tests that camera images agree with forward kinematics."""
 
 from __future__ import annotations
 

@@ -31,16 +31,16 @@ def test_target_is_centred_and_up_points_up(
 
 
 @pytest.mark.parametrize("target", [(0.0, 0.0, 1.0), (0.0, 0.0, 0.3)])
-def test_camera_with_undefined_orientation_is_refused(target: tuple[float, float, float]) -> None:
+def test_camera_with_undefined_orientation_is_rejected(target: tuple[float, float, float]) -> None:
     with pytest.raises(vkc.InputError, match="orientation of camera 'eye' is undefined"):
         Camera("eye", BASE, (0.0, 0.0, 1.0), target)
 
 
 def test_frames_resolve_to_robot_frames() -> None:
     robot = load_robot("husky_ur5e")
-    at = {"position": (0.0, 0.0, 1.0), "target": (1.0, 0.0, 0.0)}
-    assert Camera("eye", HAND, **at).find_frame(robot) == robot.tool_frame
-    assert Camera("eye", BASE, **at).find_frame(robot) == robot.model.names[1]
-    assert Camera("eye", "wrist_3_link", **at).find_frame(robot) == "wrist_3_link"
+    pose = {"position": (0.0, 0.0, 1.0), "target": (1.0, 0.0, 0.0)}
+    assert Camera("eye", HAND, **pose).find_frame(robot) == robot.tool_frame
+    assert Camera("eye", BASE, **pose).find_frame(robot) == robot.model.names[1]
+    assert Camera("eye", "wrist_3_link", **pose).find_frame(robot) == "wrist_3_link"
     with pytest.raises(vkc.UnknownNameError, match="did you mean 'wrist_3_link'"):
-        Camera("eye", "wrist_3_lnk", **at).find_frame(robot)
+        Camera("eye", "wrist_3_lnk", **pose).find_frame(robot)

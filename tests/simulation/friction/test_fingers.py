@@ -1,4 +1,4 @@
-"""Fingers are those of a described gripper or the pads of a hand."""
+"""Tests that fingers are the joints of a described gripper or the pads of a hand."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ def test_described_gripper_uses_its_own_joints(tmp_path: Path) -> None:
     assert (fingers.sides, fingers.names) == (None, ("finger_a_joint", "finger_b_joint"))
     np.testing.assert_allclose(fingers.closed, 0.0)
     np.testing.assert_allclose(fingers.open, 0.04)
-    own = make_servos(world, world.start[None], Physics())
+    servos = make_servos(world, world.start[None], Physics())
     limits = {
         servo.coordinate: servo.limit
-        for servo in limit_finger_servos(own, fingers, world, Physics(closing_force=7.0))
+        for servo in limit_finger_servos(servos, fingers, world, Physics(closing_force=7.0))
     }
     assert [limits[name] for name in fingers.names] == [7.0, 7.0]
     assert all(
         limits[servo.coordinate] == servo.limit
-        for servo in own
+        for servo in servos
         if servo.coordinate not in fingers.names
     )
 
 
-def test_hand_without_fingers_is_refused() -> None:
+def test_hand_without_fingers_is_rejected() -> None:
     scene = vkc.load_scene("drawer")
     touch_links = frozenset({"gripper_link", "gripper_left_finger"})
     robot = dataclasses.replace(scene.robot, touch_links=touch_links)

@@ -1,4 +1,4 @@
-"""Friction grasps carry objects within the friction cone and lose them beyond it."""
+"""Tests that friction grasps carry objects within the friction cone and lose them beyond it."""
 
 from __future__ import annotations
 
@@ -66,11 +66,11 @@ def test_described_gripper_closes_its_own_fingers(tmp_path: Path) -> None:
     assert result.ok, result.summary()
     assert not any("slide towards" in note for note in result.notes)
     # Fingers close on the handle, 20 mm apart, and slightly further as contacts are compliant.
-    world = result.rows[:, len(scene.start) : len(scene.start) + 2]
-    assert world.min() == pytest.approx(0.01, abs=0.004)
+    finger_positions = result.rows[:, len(scene.start) : len(scene.start) + 2]
+    assert finger_positions.min() == pytest.approx(0.01, abs=0.004)
 
 
-def test_object_in_hand_at_start_stays_there() -> None:
+def test_object_grasped_at_the_start_stays_in_the_hand() -> None:
     scene = make_grasping_scene()
     result = simulate(
         scene, [vkc.Grasp("stick")], make_stationary_motion(scene, 1.5), grasp="friction"
@@ -93,14 +93,14 @@ def test_pause_is_inserted_at_waypoint(make: object) -> None:
         np.linspace(0.0, time - 1e-6, 50),
         np.linspace(time + 1e-6, motion.times[-1], 50),
     )
-    for read in ("at", "velocity", "acceleration"):
-        one, other = getattr(longer, read), getattr(motion, read)
+    for method in ("at", "velocity", "acceleration"):
+        one, other = getattr(longer, method), getattr(motion, method)
         np.testing.assert_allclose(one(before), other(before), atol=1e-9)
         np.testing.assert_allclose(one(after + 0.5), other(after), atol=1e-6)
     inside = time + np.linspace(1e-6, 0.5 - 1e-6, 20)
     np.testing.assert_allclose(longer.at(inside), np.tile(motion.at(time), (20, 1)), atol=1e-12)
     assert np.abs(longer.velocity(inside)).max() < 1e-9
-    # The pause belongs to the phase that begins there.
+    # The pause belongs to the phase that begins at the waypoint.
     assert [(p.first, p.last) for p in longer.phases][:2] == [
         (0, at),
         (at, motion.phases[1].last + 1),
@@ -108,7 +108,7 @@ def test_pause_is_inserted_at_waypoint(make: object) -> None:
     assert [p.holds for p in longer.phases] == [p.holds for p in motion.phases]
 
 
-def test_pause_of_a_moving_curve_is_refused() -> None:
+def test_pause_during_motion_is_rejected() -> None:
     motion = plan_drawer().trajectory
     assert insert_pauses(motion, [], 0.25) is motion
     with pytest.raises(vkc.InputError, match="while the robot moves"):

@@ -21,7 +21,7 @@ def test_tasks_run_once_in_any_number_of_processes(jobs: int) -> None:
     assert sorted((int(key), value) for key, value in found) == [(k, 2 * k) for k in range(20)]
 
 
-def test_crashed_processes_lose_and_repeat_no_other_task(tmp_path: Path) -> None:
+def test_crashes_neither_lose_nor_repeat_other_tasks(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     tasks = [(str(k), (str(tmp_path), k)) for k in range(8)]
     found = list(run_tasks(crash_once, tasks, jobs=2, dask=True))
@@ -29,7 +29,7 @@ def test_crashed_processes_lose_and_repeat_no_other_task(tmp_path: Path) -> None
     assert (tmp_path / "2").exists()
 
 
-def test_tasks_that_no_process_survives_are_given_up() -> None:
+def test_tasks_that_crash_every_process_are_given_up() -> None:
     pytest.importorskip("distributed")
     found = dict(run_tasks(hang, make_tasks(4), jobs=2, dask=True, limit=1.0))
     assert isinstance(found["1"], CrashedTask)
@@ -38,22 +38,22 @@ def test_tasks_that_no_process_survives_are_given_up() -> None:
 
 
 @pytest.mark.parametrize("dask", [False, True])
-def test_tasks_are_taken_when_they_are_needed(dask: bool) -> None:
-    """The results so far decide how many tasks there are; Dask's processes have one thread."""
+def test_tasks_are_consumed_on_demand(dask: bool) -> None:
+    """Earlier results determine the number of tasks; Dask's processes have one thread."""
     if dask:
         pytest.importorskip("distributed")
-    taken, found = [], list[tuple[int, str]]()
+    consumed, found = [], list[tuple[int, str]]()
 
     def tasks() -> Any:
         for k in range(1000):
             if len(found) >= 8:
                 return
-            taken.append(k)
+            consumed.append(k)
             yield str(k), k
 
     for _, result in run_tasks(identify_worker, tasks(), jobs=2 if dask else 1, dask=dask):
         found.append(result)
-    assert 8 <= len(taken) <= 8 + 4
+    assert 8 <= len(consumed) <= 8 + 4
     if dask:
         assert len({process for process, _ in found} - {os.getpid()}) == 2
         assert {threads for _, threads in found} == {"1"}

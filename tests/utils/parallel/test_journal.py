@@ -32,11 +32,11 @@ def test_journals_are_read_while_they_are_written(tmp_path: Path) -> None:
             journal.append(make_line(key))
     with (tmp_path / "j").open("ab") as stream:
         stream.write(b'{"key": "5", "rec')
-    read = JournalContents.read(tmp_path / "j")
-    assert (read.lines, read.sessions) == (journal.lines, journal.sessions)
-    assert read.lines == {str(key): [{"number": key}] for key in (0, 4, 1, 2, 3)}
-    assert read.memory == journal.memory == 104.0
-    assert read.seconds == 2.0 + 1.5  # of each session, the time until its last task
+    contents = JournalContents.read(tmp_path / "j")
+    assert (contents.lines, contents.sessions) == (journal.lines, journal.sessions)
+    assert contents.lines == {str(key): [{"number": key}] for key in (0, 4, 1, 2, 3)}
+    assert contents.memory == journal.memory == 104.0
+    assert contents.seconds == 2.0 + 1.5  # the time of each session until its last task
     with pytest.raises(InputError, match="cannot read this"):
         JournalContents.read(tmp_path / "nothing")
     (tmp_path / "bad").write_bytes(b'{}\n{"key": "1"}\n')
@@ -54,7 +54,7 @@ def test_journals_are_read_while_they_are_written(tmp_path: Path) -> None:
         "\n",
     ],
 )
-def test_other_files_are_not_changed(tmp_path: Path, text: str) -> None:
+def test_foreign_files_are_not_changed(tmp_path: Path, text: str) -> None:
     (tmp_path / "j").write_text(text)
     with pytest.raises(InputError, match=r"not a journal|damaged|run otherwise") as caught:
         open_journal(tmp_path / "j")
@@ -70,10 +70,10 @@ def test_incomplete_lines_are_removed(tmp_path: Path) -> None:
     data = (tmp_path / "j").read_bytes()
     for cut in range(len(data)):
         (tmp_path / "cut").write_bytes(data[:cut])
-        again = open_journal(tmp_path / "cut")
-        assert len(again.lines) == max(0, data[:cut].count(b"\n") - 2)
+        reopened = open_journal(tmp_path / "cut")
+        assert len(reopened.lines) == max(0, data[:cut].count(b"\n") - 2)
         assert (tmp_path / "cut").read_bytes() == data[: data.rfind(b"\n", 0, max(cut, 58)) + 1]
-        del again
+        del reopened
 
 
 def test_records_stay_in_the_file(tmp_path: Path) -> None:
@@ -84,11 +84,11 @@ def test_records_stay_in_the_file(tmp_path: Path) -> None:
     tracemalloc.start()
     for key in range(300):
         journal.append({**make_line(key), "records": [{"number": key, "path": path}]})
-    read = JournalContents.read(tmp_path / "j")
+    contents = JournalContents.read(tmp_path / "j")
     size, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert size < (tmp_path / "j").stat().st_size / 5
-    for lines in (journal.lines, read.lines):
+    for lines in (journal.lines, contents.lines):
         assert len(lines) == 300
         assert lines["7"] == [{"number": 7, "path": path}]
         assert "300" not in lines
@@ -112,12 +112,12 @@ def test_memory_and_processor_time_are_recorded(tmp_path: Path) -> None:
                 "client_seconds": 0.01 * key,
             }
         )
-    read = JournalContents.read(tmp_path / "j")
-    assert read.memories == {"a": [10.0, 30.0], "b": [20.0]}
-    assert read.sessions == [{"jobs": 2, "trials": 4, "seconds": 1.5, "client_seconds": 0.03}]
+    contents = JournalContents.read(tmp_path / "j")
+    assert contents.memories == {"a": [10.0, 30.0], "b": [20.0]}
+    assert contents.sessions == [{"jobs": 2, "trials": 4, "seconds": 1.5, "client_seconds": 0.03}]
 
 
-def test_other_headers_raise(tmp_path: Path) -> None:
+def test_different_header_raises(tmp_path: Path) -> None:
     open_journal(tmp_path / "j")._stream.close()
     with pytest.raises(
         InputError, match=r"the episodes in this folder were run otherwise.*recipe abc.*recipe xyz"

@@ -1,4 +1,4 @@
-"""Reports name the limits that bound the duration."""
+"""Tests that reports name the limits that bound the duration."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from vkc_pin.validation.samples import Samples
 from vkc_pin.world.trajectory.dynamics.torques import sample_curve
 
 
-@pytest.mark.parametrize("made", [plan_door, plan_drawer])
-def test_motion_is_at_its_bounds_where_reported(made: object) -> None:
-    plan: vkc.Plan = made()  # type: ignore[operator]
+@pytest.mark.parametrize("make_plan", [plan_door, plan_drawer])
+def test_motion_is_at_its_limits_in_reported_intervals(make_plan: object) -> None:
+    plan: vkc.Plan = make_plan()  # type: ignore[operator]
     motion, samples = plan.trajectory, Samples(plan.scene, plan.trajectory)
     found = plan.report.bounds
     assert 0.9 < sum(bound.share for bound in found) <= 1.0 + 1e-9
@@ -30,12 +30,12 @@ def test_motion_is_at_its_bounds_where_reported(made: object) -> None:
         if bound.kind == "rest":
             np.testing.assert_allclose(motion.velocity(times), 0.0, atol=1e-9)
         elif bound.share > 0.1:
-            read, place = {
+            evaluate, column = {
                 "velocity": (motion.velocity, 2),
                 "acceleration": (motion.acceleration, 3),
             }[bound.kind]
-            values = np.abs(read(times)[:, motion.names.index(bound.subject)])
-            assert values.max() > 0.9 * samples.get_limits(bound.subject)[place]
+            values = np.abs(evaluate(times)[:, motion.names.index(bound.subject)])
+            assert values.max() > 0.9 * samples.get_limits(bound.subject)[column]
 
 
 def test_torques_bound_the_duration() -> None:
@@ -55,8 +55,8 @@ def test_longest_interval_is_reported() -> None:
     samples, curve = Samples(plan.scene, plan.trajectory), plan.trajectory.curve
     assert curve is not None
     moments, pieces = sample_curve(curve), len(curve.times) - 1
-    for long in ((0, 30), (20, 50), (pieces - 30, pieces)):
-        parts = [(0, 5), long, (pieces - 5, pieces)]
+    for longest in ((0, 30), (20, 50), (pieces - 30, pieces)):
+        parts = [(0, 5), longest, (pieces - 5, pieces)]
         torques = np.zeros((len(moments.times), plan.trajectory.robot_size))
         for begin, end in parts:
             torques[(moments.pieces >= begin) & (moments.pieces < end), 4] = 50.0
@@ -66,10 +66,10 @@ def test_longest_interval_is_reported() -> None:
             if bound.kind == "torque"
         )
         lengths = {(a, b): curve.times[b] - curve.times[a] for a, b in parts}
-        assert max(lengths, key=lambda part: lengths[part]) == long, (
-            "times are uneven: choose other stretches"
+        assert max(lengths, key=lambda part: lengths[part]) == longest, (
+            "times are uneven: choose other intervals"
         )
-        assert (first.begin, first.end) == (curve.times[long[0]], curve.times[long[1]])
+        assert (first.begin, first.end) == (curve.times[longest[0]], curve.times[longest[1]])
 
 
 def test_motion_without_curve_has_no_bounds() -> None:

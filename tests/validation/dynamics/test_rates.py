@@ -1,4 +1,4 @@
-"""Violated limits of velocity, acceleration and jerk are named, with the amount."""
+"""Tests that violations of velocity, acceleration and jerk limits state their amount."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def retime_smoothly() -> Trajectory:
     return retime_trajectory(plan.scene, plan.trajectory, jerk_time=0.2)
 
 
-def test_jerk_violation() -> None:
+def test_jerk_violation_is_reported() -> None:
     motion = retime_smoothly()
     assert not find_violations(motion, jerk_time=0.2)
     assert not find_violations(motion)
@@ -57,7 +57,7 @@ def move_elbow(share: float) -> Trajectory:
 @pytest.mark.parametrize(
     ("share", "kinds"), [(1.0005, set()), (1.0015, {"acceleration"}), (0.5, set())]
 )
-def test_tolerance_of_rates(share: float, kinds: set[str]) -> None:
+def test_rates_within_the_tolerance_are_accepted(share: float, kinds: set[str]) -> None:
     assert {kind for kind, _ in find_violations(move_elbow(share))} == kinds
 
 
@@ -76,7 +76,7 @@ def test_motion_must_begin_and_end_at_rest(speed: float, rests: bool, end: int) 
         assert (row.constraint, row.waypoint) == ("velocity", 0 if end == 0 else 1)
 
 
-def test_jumps_of_acceleration() -> None:
+def test_acceleration_jumps_are_reported() -> None:
     motion = plan_drawer().trajectory
     assert motion.curve is not None
     jumps = motion.curve.compute_jerks()[1][:, motion.names.index("elbow_joint")]
@@ -90,7 +90,7 @@ def test_jumps_of_acceleration() -> None:
     )
 
 
-def test_accelerated_motion_violates_all_rates() -> None:
+def test_motion_three_times_as_fast_violates_all_rate_limits() -> None:
     motion = retime_smoothly()
     assert motion.curve is not None
     quick = Curve(motion.curve.times / 3.0, motion.curve.positions, motion.curve.rates * 3.0)

@@ -1,4 +1,4 @@
-"""Violated torque limits are named by joint, time and amount, also by the oracle."""
+"""Tests that validation and oracle report torque violations with joint, time and amount."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.closers import load_door_with_closer, replace_object_fields
+from helpers.door_closers import load_door_with_closer, replace_object_fields
 from helpers.executions import make_grasping_scene, make_stationary_motion, plan_door
 from oracle.judge import judge
 
@@ -19,7 +19,7 @@ from vkc_pin.validation.report import Report
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.validate import validate
 
-HEAVY = {"stiffness": 120.0, "springref": -2.0}
+STIFF_SPRING = {"stiffness": 120.0, "springref": -2.0}
 
 
 def validate_door(scene: vkc.Scene, trajectory: vkc.Trajectory | None = None) -> Report:
@@ -29,20 +29,20 @@ def validate_door(scene: vkc.Scene, trajectory: vkc.Trajectory | None = None) ->
     )
 
 
-def test_torque_violation_of_a_heavy_door(tmp_path: Path) -> None:
-    report, plan = validate_door(load_door_with_closer(**HEAVY)), plan_door()
+def test_torque_violation_of_a_door_with_a_stiff_spring_is_reported(tmp_path: Path) -> None:
+    report, plan = validate_door(load_door_with_closer(**STIFF_SPRING)), plan_door()
     assert {violation.constraint for violation in report.violations} == {"torque"}
     worst = max(report.violations, key=lambda violation: violation.amount)
     assert worst.subject == "shoulder_pan_joint"
     assert worst.unit == "N·m"
     assert worst.amount == pytest.approx(150.0 * (report.torque - 1.0))
-    assert 6.0 < worst.time <= plan.trajectory.times[-1], "where the spring pulls most"
+    assert 6.0 < worst.time <= plan.trajectory.times[-1], "the spring torque is largest there"
     assert "exceeds the motor's 150 N·m" in worst.detail
     assert "even at rest" in worst.detail
-    planted = dataclasses.replace(
-        plan, scene=load_door_with_closer(**HEAVY), report=report, status="rejected"
+    rejected = dataclasses.replace(
+        plan, scene=load_door_with_closer(**STIFF_SPRING), report=report, status="rejected"
     )
-    verdict = judge(planted.save(tmp_path / "heavy.npz"))
+    verdict = judge(rejected.save(tmp_path / "heavy.npz"))
     assert verdict.agrees
     assert {(found.rule, found.subject) for found in verdict.found} == {
         (v.constraint, v.subject) for v in report.violations
@@ -60,13 +60,13 @@ def test_damped_door_must_be_opened_slowly() -> None:
     slower = retime_trajectory(scene, plan.trajectory)
     report = validate_door(scene, slower)
     assert report.ok
-    assert 0.9 < report.torque <= 1.0 + TORQUE_TOLERANCE, "no slower than it has to be"
+    assert 0.9 < report.torque <= 1.0 + TORQUE_TOLERANCE, "the motion is slower than necessary"
     assert 1.0 < slower.times[-1] / plan.trajectory.times[-1] < 1.3
     np.testing.assert_array_equal(slower.positions, plan.trajectory.positions)
     assert any(bound.kind == "torque" for bound in report.bounds)
 
 
-def test_torque_violation_at_rest() -> None:
+def test_torque_violation_at_rest_is_reported() -> None:
     heavy = replace_object_fields(vkc.load_scene("init_1"), "stick", mass=60.0).with_held(
         {"stick": "grip"}
     )
@@ -82,13 +82,13 @@ def test_torque_violation_at_rest() -> None:
     )
 
 
-def test_missing_masses_are_remarked() -> None:
+def test_report_remarks_on_missing_masses() -> None:
     scene = plan_door().scene
     model = pin.Model(scene.robot.model)
     for joint in range(1, model.njoints):
         model.inertias[joint] = pin.Inertia.Zero()
     scene = dataclasses.replace(
-        load_door_with_closer(**HEAVY), robot=dataclasses.replace(scene.robot, model=model)
+        load_door_with_closer(**STIFF_SPRING), robot=dataclasses.replace(scene.robot, model=model)
     )
     report = validate_door(scene)
     assert report.ok
@@ -96,7 +96,7 @@ def test_missing_masses_are_remarked() -> None:
     assert report.remarks == ("torques not checked: the URDF states no masses of the arm",)
 
 
-def test_massless_payload_is_remarked() -> None:
+def test_report_remarks_on_massless_payload() -> None:
     scene = replace_object_fields(vkc.load_scene("init_1"), "stick", mass=0.0).with_held(
         {"stick": "grip"}
     )

@@ -25,7 +25,7 @@ def curves(plan: Plan) -> dict[str, ClearanceCurve]:
 
 
 def test_clearance_curves_agree_with_coal(curves: dict[str, ClearanceCurve], plan: Plan) -> None:
-    """The smallest over all pairs, asked one by one, and the named pair really is that close."""
+    """The curve agrees with the minimum over all pairs and names the closest pair."""
     world, robot = World(plan.scene), plan.scene.robot
     data, shapes = world.model.createData(), world.collision.createData()
     assert list(curves) == [
@@ -36,14 +36,14 @@ def test_clearance_curves_agree_with_coal(curves: dict[str, ClearanceCurve], pla
         "gripper – grasped object",
     ]
     curve = curves["robot – obstacles"]
-    arm = range(len(robot.collision.geometryObjects))
+    robot_shapes = range(len(robot.collision.geometryObjects))
     labels, objects = world.collision_labels, world.collision.geometryObjects
-    obstacles = [i for i in range(len(arm), len(labels)) if "." not in labels[i]]
+    obstacles = [i for i in range(len(robot_shapes), len(labels)) if "." not in labels[i]]
     for k in (0, 6):
         q = world.coordinates.q(world.compute_positions(plan.trajectory, [TIMES[k]])[0])
         pin.updateGeometryPlacements(world.model, data, world.collision, shapes, q)
         nearest = (np.inf, ("", ""))
-        for i in arm:
+        for i in robot_shapes:
             for j in obstacles:
                 if labels[j] == "floor" and objects[i].parentJoint == 1:
                     continue
@@ -60,9 +60,9 @@ def test_clearance_curves_agree_with_coal(curves: dict[str, ClearanceCurve], pla
         assert curve.pairs[k] == nearest[1]
 
 
-def test_closest_moment_is_named(curves: dict[str, ClearanceCurve]) -> None:
+def test_closest_pair_and_its_time_are_reported(curves: dict[str, ClearanceCurve]) -> None:
     curve = curves["robot – objects"]
-    distance, when, pair = curve.closest()
+    distance, moment, pair = curve.closest()
     assert distance == curve.distances.min()
-    assert when in TIMES
+    assert moment in TIMES
     assert "door." in pair

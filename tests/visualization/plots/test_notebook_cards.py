@@ -4,7 +4,6 @@ import base64
 import dataclasses
 import io
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,23 +13,21 @@ import vkc_pin as vkc
 from vkc_pin.planning.plan import Plan
 from vkc_pin.validation.report import Report
 
-ROOT = Path(__file__).resolve().parents[3]
-
 
 @pytest.fixture(scope="module")
 def plan() -> Plan:
     return make_fake_plan()
 
 
-def picture(html: str) -> np.ndarray:
-    """Return the pixels of the only picture in it."""
+def decode_picture(html: str) -> np.ndarray:
+    """Return the pixels of the only picture in the card."""
     from PIL import Image
 
     (data,) = re.findall(r'src="data:image/png;base64,([A-Za-z0-9+/=]+)"', html)
     return np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"), int)
 
 
-def cells(html: str) -> dict[str, str]:
+def parse_cells(html: str) -> dict[str, str]:
     return dict(re.findall(r"<tr><td[^>]*>([^<]*)</td><td[^>]*>([^<]*)</td></tr>", html))
 
 
@@ -38,7 +35,7 @@ def test_card_of_a_failed_plan_lists_the_first_violations(plan: Plan) -> None:
     html = plan._repr_html_()
     assert re.search(r'door: <span style="color: #c62828">FAILED, rejected</span>', html)
     assert "<li>penetration forearm_link – sofa: overlap by 30 mm (waypoint 9, 4.00 s)</li>" in html
-    assert cells(html)["base"] == f"{plan.metrics['base_path_length']:.2f} m"
+    assert parse_cells(html)["base"] == f"{plan.metrics['base_path_length']:.2f} m"
     (violation,) = plan.report.violations
     report = Report((violation,) * 9, notes=("no path",))
     html = dataclasses.replace(plan, report=report)._repr_html_()
@@ -50,45 +47,45 @@ def test_card_of_a_valid_plan_shows_its_metrics_and_path(door_plan: Plan) -> Non
     html = door_plan._repr_html_()
     assert '<span style="color: #1a7f37">success</span>' in html
     assert "<li>" not in html
-    told, m = cells(html), door_plan.metrics
-    assert told["base"] == f"{m['base_path_length']:.2f} m"
-    assert told["arm"] == f"{m['arm_path_length']:.2f} rad"
-    assert told["clearance"] == f"{1e3 * m['clearance']:.1f} mm"
-    assert told["duration"] == f"{m['duration']:.1f} s"
-    assert told["planned in"] == f"{m['planning_time']:.2f} s"
-    assert told["seed"] == f"{door_plan.initialization}, random numbers 0"
+    values, metrics = parse_cells(html), door_plan.metrics
+    assert values["base"] == f"{metrics['base_path_length']:.2f} m"
+    assert values["arm"] == f"{metrics['arm_path_length']:.2f} rad"
+    assert values["clearance"] == f"{1e3 * metrics['clearance']:.1f} mm"
+    assert values["duration"] == f"{metrics['duration']:.1f} s"
+    assert values["planned in"] == f"{metrics['planning_time']:.2f} s"
+    assert values["seed"] == f"{door_plan.initialization}, random numbers 0"
     assert "reach door.handle" in html
     assert len(html) < 60_000
-    tool_path = (224, 51, 89)  # its colour
-    assert (np.abs(picture(html) - tool_path).max(axis=2) < 40).sum() > 20
-    scene = picture(door_plan.scene._repr_html_())
+    tool_path = (224, 51, 89)  # colour of the tool path
+    assert (np.abs(decode_picture(html) - tool_path).max(axis=2) < 40).sum() > 20
+    scene = decode_picture(door_plan.scene._repr_html_())
     assert not (np.abs(scene - tool_path).max(axis=2) < 40).any()
 
 
-def test_names_cannot_add_markup(plan: Plan) -> None:
-    bad = '<script>alert(1)</script>&"'
-    scene = dataclasses.replace(plan.scene, name=bad)
-    violation = dataclasses.replace(plan.report.violations[0], subject=bad, detail=bad)
-    phases = tuple(dataclasses.replace(phase, name=bad) for phase in plan.trajectory.phases)
-    evil = dataclasses.replace(
+def test_markup_in_names_is_escaped(plan: Plan) -> None:
+    markup = '<script>alert(1)</script>&"'
+    scene = dataclasses.replace(plan.scene, name=markup)
+    violation = dataclasses.replace(plan.report.violations[0], subject=markup, detail=markup)
+    phases = tuple(dataclasses.replace(phase, name=markup) for phase in plan.trajectory.phases)
+    modified = dataclasses.replace(
         plan,
         scene=scene,
-        status=bad,
-        initialization=bad,
+        status=markup,
+        initialization=markup,
         trajectory=dataclasses.replace(plan.trajectory, phases=phases),
-        report=Report((violation,), notes=(bad,)),
+        report=Report((violation,), notes=(markup,)),
     )
-    for html in (evil._repr_html_(), scene._repr_html_()):
+    for html in (modified._repr_html_(), scene._repr_html_()):
         assert "<script" not in html
         assert "&lt;script&gt;alert(1)&lt;/script&gt;&amp;&quot;" in html
 
 
 def test_card_of_a_scene_lists_its_objects() -> None:
     html = vkc.load_scene("init_3")._repr_html_()
-    told = cells(html)
-    assert "stick (can be carried)" in told["objects"]
-    assert re.fullmatch(r"[\d.]+ m × [\d.]+ m", told["arena"])
-    assert told["obstacles"] == str(len(vkc.load_scene("init_3").obstacle_names))
-    assert "door (hinge, knob)" in cells(vkc.load_scene("door")._repr_html_())["objects"]
+    values = parse_cells(html)
+    assert "stick (can be carried)" in values["objects"]
+    assert re.fullmatch(r"[\d.]+ m × [\d.]+ m", values["arena"])
+    assert values["obstacles"] == str(len(vkc.load_scene("init_3").obstacle_names))
+    assert "door (hinge, knob)" in parse_cells(vkc.load_scene("door")._repr_html_())["objects"]
     assert len(html) < 60_000
-    assert len(np.unique(picture(html).reshape(-1, 3), axis=0)) > 10
+    assert len(np.unique(decode_picture(html).reshape(-1, 3), axis=0)) > 10

@@ -32,16 +32,16 @@ def figures(plan: Plan, tmp_path_factory: pytest.TempPathFactory) -> dict[str, A
     return {"folder": folder, **figures}
 
 
-def lines(axes: Any) -> dict[str, Any]:
+def map_lines(axes: Any) -> dict[str, Any]:
     return {line.get_label(): line for line in axes.get_lines()}
 
 
 def test_joint_plot_shows_positions_rates_and_limits(figures: dict[str, Any], plan: Plan) -> None:
     axes = figures["joints"].axes
     assert [a.get_ylabel().split(" [")[0] for a in axes] == [
-        f"{group} {what}"
+        f"{group} {quantity}"
         for group in ("base", "arm", "object")
-        for what in ("position", "velocity", "acceleration")
+        for quantity in ("position", "velocity", "acceleration")
     ]
     assert all("[" in a.get_ylabel() for a in axes)
     assert [a.get_xlabel() for a in axes[-3:]] == ["time [s]"] * 3
@@ -49,32 +49,34 @@ def test_joint_plot_shows_positions_rates_and_limits(figures: dict[str, Any], pl
     (band,) = axes[0].patches  # the second phase is shaded
     assert (band.get_x(), band.get_width()) == pytest.approx((3.0, 3.0))
     motion = plan.trajectory
-    for shown, name in ((axes[0], "base_yaw"), (axes[6], "door.hinge")):
-        line = lines(shown)[name]
+    for panel, name in ((axes[0], "base_yaw"), (axes[6], "door.hinge")):
+        line = map_lines(panel)[name]
         assert set(motion.times) <= set(line.get_xdata())
         assert np.allclose(line.get_ydata(), motion(line.get_xdata())[:, motion.names.index(name)])
-    for shown, limit in ((axes[4], np.pi), (axes[5], 1.4)):  # of all the arm's joints
-        assert any(np.allclose(line.get_ydata(), limit, atol=0.01) for line in shown.get_lines())
-    speed, strength = (a.get_lines()[0] for a in axes[1:3])
-    assert np.allclose(speed.get_ydata(), motion.velocity(speed.get_xdata())[:, 0])
-    assert np.allclose(strength.get_xdata(), motion.times)  # without a curve, as eq. 5 has it
-    assert np.allclose(strength.get_ydata(), motion.accelerations()[:, 0])
+    for panel, limit in ((axes[4], np.pi), (axes[5], 1.4)):  # limits of the arm's joints
+        assert any(np.allclose(line.get_ydata(), limit, atol=0.01) for line in panel.get_lines())
+    velocity, acceleration = (a.get_lines()[0] for a in axes[1:3])
+    assert np.allclose(velocity.get_ydata(), motion.velocity(velocity.get_xdata())[:, 0])
+    assert np.allclose(
+        acceleration.get_xdata(), motion.times
+    )  # without a curve: at the waypoints, as in eq. 5
+    assert np.allclose(acceleration.get_ydata(), motion.accelerations()[:, 0])
     assert all(a.get_legend() is not None for a in axes[2::3])
 
 
-def test_rates_are_those_of_the_curve(plan: Plan) -> None:
-    """Accelerations jump at knots: both values are drawn, and no peak is lost between samples."""
+def test_rates_are_evaluated_on_the_curve(plan: Plan) -> None:
+    """Both values of a jump at a knot are drawn, and peaks between samples are preserved."""
     motion = plan.trajectory
     curve = Curve(
         motion.times, motion.positions, np.gradient(motion.positions, motion.times, axis=0)
     )
     smooth = dataclasses.replace(plan, trajectory=dataclasses.replace(motion, curve=curve))
-    for number, (shown, peaks) in enumerate(
+    for number, (panel, peaks) in enumerate(
         zip(plotting.plot_joints(smooth).axes[1:3], curve.compute_max_rates(), strict=True), 1
     ):
-        line = shown.get_lines()[2]
-        read = (curve.velocity, curve.acceleration)[number - 1]
-        assert np.allclose(line.get_ydata(), read(line.get_xdata())[:, 2])
+        line = panel.get_lines()[2]
+        evaluate = (curve.velocity, curve.acceleration)[number - 1]
+        assert np.allclose(line.get_ydata(), evaluate(line.get_xdata())[:, 2])
         assert np.abs(line.get_ydata()).max() == pytest.approx(peaks[:, 2].max(), rel=1e-3)
 
 
@@ -91,9 +93,9 @@ def test_top_view_shows_rooms_base_and_paths(figures: dict[str, Any], plan: Plan
     (axes,) = figures["top_view"].axes
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("x [m]", "y [m]")
     assert axes.get_aspect() == 1.0
-    drawn = lines(axes)
-    base = np.column_stack(drawn["path of the base"].get_data())
-    assert np.allclose(base[[0, -1]], plan.trajectory.positions[[0, -1], :2], atol=1e-6)
+    drawn = map_lines(axes)
+    base_path = np.column_stack(drawn["path of the base"].get_data())
+    assert np.allclose(base_path[[0, -1]], plan.trajectory.positions[[0, -1], :2], atol=1e-6)
     outlines = {patch.get_label(): patch.get_xy() for patch in axes.patches}
     for name, row in (("start", 0), ("end", -1)):
         corners = outlines[name]
@@ -112,7 +114,7 @@ def test_top_view_shows_rooms_base_and_paths(figures: dict[str, Any], plan: Plan
     assert any(not patch.get_fill() for patch in axes.patches), "the lintel is above the robot"
 
 
-def test_combined_figure_is_written_where_a_file_is_named(
+def test_combined_figure_is_written_only_to_a_named_file(
     plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -125,7 +127,7 @@ def test_combined_figure_is_written_where_a_file_is_named(
     assert file.read_bytes().startswith(b"<?xml")
 
 
-def test_arguments_that_cannot_be_plotted_are_refused(plan: Plan, tmp_path: Path) -> None:
+def test_invalid_arguments_are_rejected(plan: Plan, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="Plan"):
         plotting.plot(plan.scene)  # type: ignore[arg-type]
     (tmp_path / "taken").write_text("")

@@ -29,24 +29,24 @@ def test_close_pairs_match_an_exhaustive_search(seed: int, reach: float, with_fi
     rotations, centers = sample_rotations(rng, count), rng.uniform(-1.0, 1.0, (count, 3))
     halves = rng.uniform(0.02, 0.3, (count, 3))
     pairs = np.array([(a, b) for a, b in itertools.combinations(range(count), 2) if a < MOVING])
-    turned = sample_rotations(rng, STATES, JOINTS + 1)
-    moved = rng.uniform(-1.0, 1.0, (STATES, JOINTS + 1, 3))
-    turned[:, 0], moved[:, 0] = np.eye(3), 0.0
+    joint_rotations = sample_rotations(rng, STATES, JOINTS + 1)
+    joint_translations = rng.uniform(-1.0, 1.0, (STATES, JOINTS + 1, 3))
+    joint_rotations[:, 0], joint_translations[:, 0] = np.eye(3), 0.0
     rows, found, bounds = Boxes(joints, rotations, centers, halves, pairs).find_close_pairs(
-        reach, turned, moved, include_fixed=with_fixed
+        reach, joint_rotations, joint_translations, include_fixed=with_fixed
     )
     assert (np.diff(rows * len(pairs) + found) > 0).all(), "not strictly sorted"
     assert (bounds < reach).all()
-    counts = np.ones(len(pairs), bool) if with_fixed else joints[pairs[:, 1]] != 0
-    assert counts[found].all()
+    included = np.ones(len(pairs), bool) if with_fixed else joints[pairs[:, 1]] != 0
+    assert included[found].all()
     shapes, request = [coal.Box(*(2.0 * half)) for half in halves], coal.DistanceRequest()
     distances = np.empty((STATES, len(pairs)))
     for w in range(STATES):
-        turns, shifts = turned[w, joints], moved[w, joints]
+        turns, shifts = joint_rotations[w, joints], joint_translations[w, joints]
         positions = (turns @ centers[:, :, None])[:, :, 0] + shifts
         placed = list(zip(shapes, map(coal.Transform3s, turns @ rotations, positions), strict=True))
         for k, (a, b) in enumerate(pairs.tolist()):
             distances[w, k] = coal.distance(*placed[a], *placed[b], request, coal.DistanceResult())
     assert (bounds <= distances[rows, found] + 1e-6).all()
-    close = (distances < reach - 1e-6) & counts
+    close = (distances < reach - 1e-6) & included
     assert set(zip(*np.nonzero(close), strict=True)) <= set(zip(rows, found, strict=True))

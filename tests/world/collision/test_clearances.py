@@ -19,7 +19,7 @@ from vkc_pin.world.collision.placements import ShapePlacements
 from vkc_pin.world.collision.shapes import Shapes
 
 SEEDS = st.integers(0, 2**32 - 1)
-MOVING, STANDING, STATES, WAYPOINTS = 6, 7, 10, 5
+MOVING, FIXED, STATES, WAYPOINTS = 6, 7, 10, 5
 
 
 def sample_placement(rng: np.random.Generator, size: float) -> pin.SE3:
@@ -34,7 +34,7 @@ class Room:
         self.model, self.geometry, parent = pin.Model(), pin.GeometryModel(), 0
         for k, joint in enumerate((pin.JointModelPlanar, pin.JointModelRZ, pin.JointModelRX)):
             parent = self.model.addJoint(parent, joint(), sample_placement(rng, 0.3), f"j{k}")
-        self.halves = rng.uniform(0.02, 0.2, (MOVING + STANDING, 3))
+        self.halves = rng.uniform(0.02, 0.2, (MOVING + FIXED, 3))
         self.shapes = [coal.Box(*(2 * half)) for half in self.halves]
         for k in range(MOVING):
             joint = 1 + int(rng.integers(3))
@@ -42,13 +42,13 @@ class Room:
                 pin.GeometryObject(f"s{k}", joint, 0, sample_placement(rng, 0.2), self.shapes[k])
             )
         self.joints = np.array(
-            [*(s.parentJoint for s in self.geometry.geometryObjects), *[0] * STANDING]
+            [*(s.parentJoint for s in self.geometry.geometryObjects), *[0] * FIXED]
         )
-        self.standing = [sample_placement(rng, 0.6) for _ in range(STANDING)]
+        self.fixed = [sample_placement(rng, 0.6) for _ in range(FIXED)]
         self.pairs = np.array(
-            [(a, b) for a, b in itertools.combinations(range(MOVING + STANDING), 2) if a < MOVING]
+            [(a, b) for a, b in itertools.combinations(range(MOVING + FIXED), 2) if a < MOVING]
         )
-        self.usual = rng.choice([0.0, 0.02, 0.1], len(self.pairs))
+        self.default_margins = rng.choice([0.0, 0.02, 0.1], len(self.pairs))
         self.q = np.array(
             [
                 pin.integrate(self.model, pin.neutral(self.model), rng.normal(size=5))
@@ -56,46 +56,49 @@ class Room:
             ]
         )
         self.z, self.waypoints = rng.normal(size=(STATES, 2)), rng.integers(0, WAYPOINTS, STATES)
-        eased = {int(pair): [(1, 3, -0.05)] for pair in rng.permutation(len(self.pairs))[:8]}
-        away = MarginRegion(
+        reduced = {int(pair): [(1, 3, -0.05)] for pair in rng.permutation(len(self.pairs))[:8]}
+        exempt = MarginRegion(
             rng.permutation(len(self.pairs))[:20],
             -np.inf,
             np.array([1]),
             np.zeros(1),
             np.full(1, 9.0),
         )
-        self.margins = Margins(self.usual, eased, [away])
+        self.margins = Margins(self.default_margins, reduced, [exempt])
 
-    def clearances(self) -> Clearances:
-        placed = [*(shape.placement for shape in self.geometry.geometryObjects), *self.standing]
+    def make_clearances(self) -> Clearances:
+        placed = [*(shape.placement for shape in self.geometry.geometryObjects), *self.fixed]
         rotations = np.array([placement.rotation for placement in placed])
         centers = np.array([placement.translation for placement in placed])
-        shapes = Shapes(self.shapes, self.standing, threads=4)
+        shapes = Shapes(self.shapes, self.fixed, threads=4)
         boxes = Boxes(self.joints, rotations, centers, self.halves, self.pairs)
         return Clearances(ShapePlacements(self.model, self.geometry), boxes, shapes, self.margins)
 
-    def all_pairs(
-        self, reach: float, standing: bool
+    def list_close_pairs(
+        self, reach: float, include_fixed: bool
     ) -> list[list[tuple[float, float, int, float]]]:
-        """Return sorted (distance − margin, distance, pair, margin) of close pairs, by state."""
+        """Return (distance − margin, distance, pair, margin) of close pairs, sorted, by state."""
         data, placed, found = self.model.createData(), pin.GeometryData(self.geometry), []
-        every = np.arange(len(self.pairs))
+        pairs = np.arange(len(self.pairs))
         for state, q in enumerate(self.q):
             pin.updateGeometryPlacements(self.model, data, self.geometry, placed, q)
-            where, rows = [*placed.oMg, *self.standing], []
+            placements, rows = [*placed.oMg, *self.fixed], []
             margins = self.margins.compute_margins(
-                every,
-                np.full(len(every), self.waypoints[state]),
+                pairs,
+                np.full(len(pairs), self.waypoints[state]),
                 self.z,
-                np.full(len(every), state),
+                np.full(len(pairs), state),
             )
             for k, (a, b) in enumerate(self.pairs.tolist()):
                 request, result = coal.DistanceRequest(), coal.DistanceResult()
-                ends = [coal.Transform3s(where[i].rotation, where[i].translation) for i in (a, b)]
+                transforms = [
+                    coal.Transform3s(placements[i].rotation, placements[i].translation)
+                    for i in (a, b)
+                ]
                 distance = coal.distance(
-                    self.shapes[a], ends[0], self.shapes[b], ends[1], request, result
+                    self.shapes[a], transforms[0], self.shapes[b], transforms[1], request, result
                 )
-                if distance < reach and margins[k] > -np.inf and (standing or b < MOVING):
+                if distance < reach and margins[k] > -np.inf and (include_fixed or b < MOVING):
                     rows.append(
                         (float(distance - margins[k]), float(distance), k, float(margins[k]))
                     )
@@ -106,31 +109,36 @@ class Room:
 @settings(max_examples=25, deadline=None)
 @given(SEEDS, st.sampled_from([None, 0, 1, 4]), st.sampled_from([0.0, 0.1, 2.0]), st.booleans())
 def test_closest_pairs_match_an_exhaustive_search(
-    seed: int, most: int | None, reach: float, standing: bool
+    seed: int, max_pairs: int | None, reach: float, include_fixed: bool
 ) -> None:
     room = Room(seed)
     expected = [
         (state, *row)
-        for state, rows in enumerate(room.all_pairs(reach, standing))
-        for row in rows[:most]
+        for state, rows in enumerate(room.list_close_pairs(reach, include_fixed))
+        for row in rows[:max_pairs]
     ]
     with pytest.MonkeyPatch.context() as patch:
         for rows_per_thread in (1, 100):  # four threads, and one
             patch.setattr(clearances_module, "_MIN_ROWS_PER_THREAD", rows_per_thread)
-            found = room.clearances().find_closest_pairs(
-                room.q, room.z, room.waypoints, reach=reach, max_pairs=most, include_fixed=standing
+            found = room.make_clearances().find_closest_pairs(
+                room.q,
+                room.z,
+                room.waypoints,
+                reach=reach,
+                max_pairs=max_pairs,
+                include_fixed=include_fixed,
             )
-            short = found.distance - found.margin
-            mine = zip(
+            slack = found.distance - found.margin
+            actual = zip(
                 *(
                     part.tolist()
-                    for part in (found.row, short, found.distance, found.pair, found.margin)
+                    for part in (found.row, slack, found.distance, found.pair, found.margin)
                 ),
                 strict=True,
             )
-            assert [*mine] == expected
-            along = np.einsum("ci,ci->c", found.normal, found.second - found.first)
-            np.testing.assert_allclose(along, found.distance, atol=1e-6)
+            assert [*actual] == expected
+            projections = np.einsum("ci,ci->c", found.normal, found.second - found.first)
+            np.testing.assert_allclose(projections, found.distance, atol=1e-6)
 
 
 @settings(max_examples=25, deadline=None)
@@ -140,18 +148,18 @@ def test_first_violation_matches_an_exhaustive_search(
 ) -> None:
     room = Room(seed)
     room.waypoints[:] = waypoint = int(room.waypoints[0])
-    rows, order = room.all_pairs(reach, standing=True), room.rng.permutation(STATES)
+    rows, order = room.list_close_pairs(reach, include_fixed=True), room.rng.permutation(STATES)
     hit = [
         any(margin - distance > allowed for _, distance, _, margin in rows[state])
         for state in order
     ]
     expected = hit.index(True) if True in hit else STATES
-    mine = room.clearances().find_first_violation(
+    actual = room.make_clearances().find_first_violation(
         room.q[order], room.z[order], waypoint, reach=reach, allowed=allowed
     )
-    assert mine == expected
+    assert actual == expected
     assert (
-        room.clearances().find_first_violation(
+        room.make_clearances().find_first_violation(
             room.q[:0], room.z[:0], waypoint, reach=reach, allowed=allowed
         )
         == 0
@@ -160,29 +168,31 @@ def test_first_violation_matches_an_exhaustive_search(
 
 def test_fixed_shapes_can_be_moved() -> None:
     room = Room(4)
-    before, place = room.clearances(), sample_placement(room.rng, 0.6)
+    before, placement = room.make_clearances(), sample_placement(room.rng, 0.6)
     moved = np.array([MOVING + 2])
-    boxes = before.boxes.move_fixed(moved, place.rotation[None], place.translation[None])
-    after = before.move_fixed(boxes, {MOVING + 2: place})
-    room.standing[2] = place
-    for mine, anew in zip(
+    boxes = before.boxes.move_fixed(moved, placement.rotation[None], placement.translation[None])
+    after = before.move_fixed(boxes, {MOVING + 2: placement})
+    room.fixed[2] = placement
+    for actual, expected in zip(
         *(
             c.find_closest_pairs(room.q, room.z, room.waypoints, reach=0.3)
-            for c in (after, room.clearances())
+            for c in (after, room.make_clearances())
         ),
         strict=True,
     ):
-        np.testing.assert_array_equal(mine, anew)
-    unmoved = Room(4).clearances().find_closest_pairs(room.q, room.z, room.waypoints, reach=0.3)
+        np.testing.assert_array_equal(actual, expected)
+    unmoved = (
+        Room(4).make_clearances().find_closest_pairs(room.q, room.z, room.waypoints, reach=0.3)
+    )
     np.testing.assert_array_equal(
         before.find_closest_pairs(room.q, room.z, room.waypoints, reach=0.3).distance,
         unmoved.distance,
     )
 
 
-def test_mismatched_parts_raise() -> None:
+def test_mismatched_sizes_raise() -> None:
     room = Room(0)
-    mine = room.clearances()
+    clearances = room.make_clearances()
     for q, z, waypoints in (
         (room.q[:, :-1].copy(), room.z, room.waypoints),
         (room.q, room.z[:-1], room.waypoints),
@@ -190,9 +200,9 @@ def test_mismatched_parts_raise() -> None:
         (room.q, room.z, room.waypoints[:-1]),
     ):
         with pytest.raises(ValueError, match=r"shape|waypoints"):
-            mine.find_closest_pairs(q, z, waypoints, reach=0.1)
-    fewer = Margins(room.usual[:-1], {})
+            clearances.find_closest_pairs(q, z, waypoints, reach=0.1)
+    fewer = Margins(room.default_margins[:-1], {})
     with pytest.raises(ValueError, match="belong"):
-        Clearances(mine.placements, mine.boxes, mine.shapes, fewer).find_closest_pairs(
-            room.q, room.z, room.waypoints, reach=0.1
-        )
+        Clearances(
+            clearances.placements, clearances.boxes, clearances.shapes, fewer
+        ).find_closest_pairs(room.q, room.z, room.waypoints, reach=0.1)

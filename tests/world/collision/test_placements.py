@@ -18,9 +18,9 @@ def test_placements_are_flattened_by_columns() -> None:
     assert flatten_placements([]).shape == (0, 12)
 
 
-def check(model: pin.Model, geometry: pin.GeometryModel, q: np.ndarray) -> None:
-    mine = ShapePlacements(model, geometry)
-    found = mine.compute_placements(q)
+def check_placements(model: pin.Model, geometry: pin.GeometryModel, q: np.ndarray) -> None:
+    shape_placements = ShapePlacements(model, geometry)
+    found = shape_placements.compute_placements(q)
     assert found.shape == (len(q), len(geometry.geometryObjects), 12)
     data, placed = model.createData(), pin.GeometryData(geometry)
     for row, configuration in zip(found, q, strict=True):
@@ -29,7 +29,7 @@ def check(model: pin.Model, geometry: pin.GeometryModel, q: np.ndarray) -> None:
             np.testing.assert_array_equal(numbers[:9].reshape(3, 3).T, placement.rotation)
             np.testing.assert_array_equal(numbers[9:], placement.translation)
     np.testing.assert_array_equal(
-        mine.compute_placements(q[:1]), found[:1]
+        shape_placements.compute_placements(q[:1]), found[:1]
     )  # earlier results must not change
 
 
@@ -44,6 +44,7 @@ JOINTS = [
 
 
 def test_all_joint_types_are_supported() -> None:
+    pin.seed(0)
     rng, model, geometry, parent = np.random.default_rng(3), pin.Model(), pin.GeometryModel(), 0
     for k, joint in enumerate(JOINTS):
         parent = model.addJoint(parent, joint(), pin.SE3.Random(), f"j{k}")
@@ -53,7 +54,7 @@ def test_all_joint_types_are_supported() -> None:
         pin.GeometryObject("stands", 0, 0, pin.SE3.Random(), coal.Sphere(0.1))
     )
     neutral = pin.neutral(model)
-    check(
+    check_placements(
         model,
         geometry,
         np.array([pin.integrate(model, neutral, rng.normal(size=model.nv)) for _ in range(4)]),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 
 import coal
 import numpy as np
@@ -42,7 +41,7 @@ def sample_normal(rng: np.random.Generator) -> np.ndarray:
 def make_solid(kind: str, rng: np.random.Generator) -> coal.CollisionGeometry:
     a, b, c = rng.uniform(0.05, 0.4, 3)
     corners = rng.uniform(-0.3, 0.3, (3, 3))
-    made = {
+    makers = {
         "Box": lambda: coal.Box(a, b, c),
         "Sphere": lambda: coal.Sphere(a),
         "Capsule": lambda: coal.Capsule(a, b),
@@ -58,7 +57,7 @@ def make_solid(kind: str, rng: np.random.Generator) -> coal.CollisionGeometry:
         "Plane": lambda: coal.Plane(sample_normal(rng), a),
         "BVHModelOBBRSS": lambda: make_mesh(rng),
     }
-    return made[kind]()
+    return makers[kind]()
 
 
 CONVEX = (
@@ -77,16 +76,19 @@ KINDS = (*CONVEX, "Halfspace", "Plane", "BVHModelOBBRSS")
 
 def compute_with_bindings(
     first: coal.CollisionGeometry,
-    here: pin.SE3,
+    first_placement: pin.SE3,
     second: coal.CollisionGeometry,
-    there: pin.SE3,
+    second_placement: pin.SE3,
     tolerance: float = 1e-6,
 ) -> np.ndarray:
     """Return distance, normal and witness points from a fresh query of coal's bindings."""
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     request.gjk_tolerance = tolerance
-    one, other = (coal.Transform3s(place.rotation, place.translation) for place in (here, there))
-    coal.distance(first, one, second, other, request, result)
+    first_transform, second_transform = (
+        coal.Transform3s(placement.rotation, placement.translation)
+        for placement in (first_placement, second_placement)
+    )
+    coal.distance(first, first_transform, second, second_transform, request, result)
     return np.array(
         [
             result.min_distance,
@@ -110,29 +112,36 @@ def stack_table(found: Witnesses) -> np.ndarray:
     st.sampled_from([1e-6, 1e-8]),
 )
 def test_distances_equal_those_of_the_bindings(
-    one: str, other: str, seed: int, swept: float, tolerance: float
+    first_kind: str, second_kind: str, seed: int, swept: float, tolerance: float
 ) -> None:
     rng = np.random.default_rng(seed)
-    first, second = make_solid(one, rng), make_solid(other, rng)
-    if one != "TriangleP":
+    first, second = make_solid(first_kind, rng), make_solid(second_kind, rng)
+    if first_kind != "TriangleP":
         first.setSweptSphereRadius(swept)
-    here, there = sample_placement(rng), sample_placement(rng)
-    where, pair = flatten_placements([here, there])[None], (np.zeros(1, int), np.array([[0, 1]]))
-    both = Shapes([first, second], tolerance=tolerance)
+    first_placement, second_placement = sample_placement(rng), sample_placement(rng)
+    placements, pair = (
+        flatten_placements([first_placement, second_placement])[None],
+        (np.zeros(1, int), np.array([[0, 1]])),
+    )
+    shapes = Shapes([first, second], tolerance=tolerance)
     try:
-        expected = compute_with_bindings(first, here, second, there, tolerance)
+        expected = compute_with_bindings(
+            first, first_placement, second, second_placement, tolerance
+        )
     except (
         RuntimeError,
         ValueError,
     ) as error:  # e.g. triangle–box, or meshes with swept spheres
         with pytest.raises(type(error), match="not yet supported"):
-            both.compute_distances(where, *pair)
+            shapes.compute_distances(placements, *pair)
         return
-    np.testing.assert_array_equal(stack_table(both.compute_witnesses(where, *pair))[0], expected)
-    np.testing.assert_array_equal(both.compute_distances(where, *pair), expected[:1])
-    stands = Shapes([first, second], [there], tolerance=tolerance)
     np.testing.assert_array_equal(
-        stack_table(stands.compute_witnesses(where[:, :1], *pair))[0], expected
+        stack_table(shapes.compute_witnesses(placements, *pair))[0], expected
+    )
+    np.testing.assert_array_equal(shapes.compute_distances(placements, *pair), expected[:1])
+    with_fixed = Shapes([first, second], [second_placement], tolerance=tolerance)
+    np.testing.assert_array_equal(
+        stack_table(with_fixed.compute_witnesses(placements[:, :1], *pair))[0], expected
     )
 
 
@@ -145,25 +154,25 @@ class Room:
             make_solid(kind, rng)
             for kind in ("Box", "Convex", "Cylinder", "Capsule", "Box", "Sphere", "large Convex")
         ]
-        self.standing = [sample_placement(rng) for _ in self.solids[MOVING:]]
-        self.places = [[sample_placement(rng) for _ in range(MOVING)] for _ in range(states)]
-        self.where = np.array([flatten_placements(row) for row in self.places])
+        self.fixed = [sample_placement(rng) for _ in self.solids[MOVING:]]
+        self.placements = [[sample_placement(rng) for _ in range(MOVING)] for _ in range(states)]
+        self.flat_placements = np.array([flatten_placements(row) for row in self.placements])
         pairs = [
             pair for pair in itertools.combinations(range(len(self.solids)), 2) if pair[0] < MOVING
         ]
         self.states, which = np.divmod(rng.permutation(states * len(pairs)), len(pairs))
         self.pairs = np.array(pairs)[which]
 
-    def shapes(self, threads: int | None = None) -> Shapes:
-        return Shapes(self.solids, self.standing, threads=threads)
+    def make_shapes(self, threads: int | None = None) -> Shapes:
+        return Shapes(self.solids, self.fixed, threads=threads)
 
-    def expected(self, standing: Sequence[pin.SE3] | None = None) -> np.ndarray:
+    def compute_expected(self) -> np.ndarray:
         rows = []
         for state, (first, second) in zip(self.states, self.pairs.tolist(), strict=True):
-            at = [*self.places[state], *(self.standing if standing is None else standing)]
+            placements = [*self.placements[state], *self.fixed]
             rows.append(
                 compute_with_bindings(
-                    self.solids[first], at[first], self.solids[second], at[second]
+                    self.solids[first], placements[first], self.solids[second], placements[second]
                 )
             )
         return np.array(rows)
@@ -172,56 +181,59 @@ class Room:
 @settings(max_examples=15, deadline=None)
 @given(SEEDS, st.sampled_from([None, 0, 1, 3]), st.sampled_from([0.05, 0.3, np.inf]), st.booleans())
 def test_closest_pairs_match_an_exhaustive_search(
-    seed: int, most: int | None, reach: float, bounded: bool
+    seed: int, max_pairs: int | None, reach: float, bounded: bool
 ) -> None:
     """Holds for trivial lower bounds and for tight ones."""
     room, rng = Room(seed, states=8), np.random.default_rng(seed)
-    distances, margins = room.expected()[:, 0], rng.choice([0.0, 0.02, 0.1], len(room.pairs))
+    distances, margins = (
+        room.compute_expected()[:, 0],
+        rng.choice([0.0, 0.02, 0.1], len(room.pairs)),
+    )
     slack = rng.uniform(0.0, 0.2, len(margins)) if bounded else np.inf
     bounds = distances - margins - slack
-    order, numbers = np.lexsort((bounds, room.states)), rng.permutation(len(room.pairs))
-    wanted = []
+    order, ranks = np.lexsort((bounds, room.states)), rng.permutation(len(room.pairs))
+    expected = []
     for state in range(8):
         near = np.flatnonzero((room.states == state) & (distances < reach))
-        near = near[np.lexsort((numbers[near], distances[near], (distances - margins)[near]))]
-        wanted += near[:most].tolist()
-    chosen, found = room.shapes(3).find_closest_pairs(
-        room.where,
+        near = near[np.lexsort((ranks[near], distances[near], (distances - margins)[near]))]
+        expected += near[:max_pairs].tolist()
+    chosen, found = room.make_shapes(3).find_closest_pairs(
+        room.flat_placements,
         np.searchsorted(room.states[order], np.arange(9)),
         room.pairs[order],
-        ranks=numbers[order],
+        ranks=ranks[order],
         margins=margins[order],
         bounds=bounds[order],
         reach=reach,
-        max_pairs=most,
+        max_pairs=max_pairs,
         rounding=0.0,
     )
-    assert order[chosen].tolist() == wanted
-    np.testing.assert_array_equal(stack_table(found), room.expected()[order[chosen]])
+    assert order[chosen].tolist() == expected
+    np.testing.assert_array_equal(stack_table(found), room.compute_expected()[order[chosen]])
 
 
 def test_invalid_arrays_raise() -> None:
     room = Room(0)
-    shapes, one = room.shapes(), np.zeros(1, int)
+    shapes, one = room.make_shapes(), np.zeros(1, int)
     for states, pairs in ((one, [[0, 7]]), (one, [[-1, 0]]), (one + 20, [[0, 1]])):
         with pytest.raises(IndexError):
-            shapes.compute_distances(room.where, states, np.array(pairs))
+            shapes.compute_distances(room.flat_placements, states, np.array(pairs))
     with pytest.raises(ValueError, match="shape"):
-        shapes.compute_distances(room.where[:, :2], one, np.array([[0, 1]]))
+        shapes.compute_distances(room.flat_placements[:, :2], one, np.array([[0, 1]]))
     with pytest.raises(InputError, match="HeightField"):
         Shapes([coal.HeightFieldAABB(1.0, 1.0, np.zeros((3, 3)), 0.0)])
 
 
 def test_errors_of_coal_are_raised_from_threads() -> None:
     rng = np.random.default_rng(0)
-    both = Shapes([make_solid("Box", rng), make_solid("TriangleP", rng)], threads=2)
-    where = flatten_placements([sample_placement(rng), sample_placement(rng)])[None]
+    shapes = Shapes([make_solid("Box", rng), make_solid("TriangleP", rng)], threads=2)
+    placements = flatten_placements([sample_placement(rng), sample_placement(rng)])[None]
     with pytest.raises(ValueError, match="not yet supported"):
-        both.compute_distances(where, np.zeros(1000, int), np.tile([[0, 1]], (1000, 1)))
+        shapes.compute_distances(placements, np.zeros(1000, int), np.tile([[0, 1]], (1000, 1)))
 
 
 def test_distance_queries_are_counted() -> None:
     room = Room(0)
     before = count_distance_queries()
-    room.shapes().compute_distances(room.where, room.states, room.pairs)
+    room.make_shapes().compute_distances(room.flat_placements, room.states, room.pairs)
     assert count_distance_queries() - before == len(room.pairs)

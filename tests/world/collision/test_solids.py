@@ -18,17 +18,11 @@ from vkc_pin.world.collision.shapes import Shapes
 from vkc_pin.world.collision.solids import convert_solid
 from vkc_pin.world.files.meshes import make_convex_hull
 
-NOWHERE = np.array([[[1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0]] * 2])
+AT_ORIGIN = np.array([[[1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0]] * 2])
 
 
 def make_hull(seed: int) -> coal.Convex:
     return make_convex_hull(np.random.default_rng(seed).normal(size=(30, 3)))
-
-
-def compute_distance(first: coal.CollisionGeometry, second: coal.CollisionGeometry) -> float:
-    return float(
-        Shapes([first, second]).compute_distances(NOWHERE, np.zeros(1, int), np.array([[0, 1]]))[0]
-    )
 
 
 def test_unsupported_shapes_raise() -> None:
@@ -47,44 +41,52 @@ def test_hulls_are_cached_until_they_change() -> None:
     assert convert_solid(make_hull(1)) is not convert_solid(shape)
 
 
-def test_changed_dimensions_are_noticed() -> None:
+def test_changed_dimensions_take_effect() -> None:
     """Primitives are converted at every call."""
     box, ball = coal.Box(1.0, 1.0, 1.0), coal.Sphere(0.1)
-    where = NOWHERE.copy()
-    where[0, 1, 9] = 2.0
+    placements = AT_ORIGIN.copy()
+    placements[0, 1, 9] = 2.0
     pair = np.zeros(1, int), np.array([[0, 1]])
-    assert Shapes([box, ball]).compute_distances(where, *pair)[0] == pytest.approx(1.4, abs=1e-6)
+    assert Shapes([box, ball]).compute_distances(placements, *pair)[0] == pytest.approx(
+        1.4, abs=1e-6
+    )
     box.halfSide = np.array([1.0, 0.5, 0.5])
-    assert Shapes([box, ball]).compute_distances(where, *pair)[0] == pytest.approx(0.9, abs=1e-6)
+    assert Shapes([box, ball]).compute_distances(placements, *pair)[0] == pytest.approx(
+        0.9, abs=1e-6
+    )
     ball.setSweptSphereRadius(0.2)
-    assert Shapes([box, ball]).compute_distances(where, *pair)[0] == pytest.approx(0.7, abs=1e-6)
+    assert Shapes([box, ball]).compute_distances(placements, *pair)[0] == pytest.approx(
+        0.7, abs=1e-6
+    )
 
 
 def test_incompatible_modules_raise(monkeypatch: pytest.MonkeyPatch) -> None:
     """The module is missing, or was compiled against other releases."""
     solids.load_compiled.cache_clear()
-    for theirs, mine, message in (
+    for coal_version, pinocchio_version, message in (
         ("2.9.1", pin.__version__, r"against coal 2\.9\.1"),
         (coal.__version__, "3.9.0", r"pin 3\.9\.0"),
     ):
         with monkeypatch.context() as patch:
-            built = types.SimpleNamespace(COAL_VERSION=theirs, PINOCCHIO_VERSION=mine)
+            built = types.SimpleNamespace(
+                COAL_VERSION=coal_version, PINOCCHIO_VERSION=pinocchio_version
+            )
             patch.setattr(solids, "import_compiled", lambda _, built=built: built)
             with pytest.raises(BuildError, match=message):
                 solids.load_compiled()
 
-    def missing(name: str) -> types.ModuleType:
+    def raise_import_error(name: str) -> types.ModuleType:
         raise ImportError(f"no {name}")
 
     with monkeypatch.context() as patch:
-        patch.setattr(optional_imports, "import_module", missing)
+        patch.setattr(optional_imports, "import_module", raise_import_error)
         with pytest.raises(BuildError, match="compiler"):
             solids.load_compiled()
     solids.load_compiled.cache_clear()
     assert coal.__version__ == solids.load_compiled().COAL_VERSION
 
 
-_FIRST = """
+_FIRST_QUERY = """
 import numpy as np
 from vkc_pin.world.collision.shapes import Shapes
 import coal
@@ -97,9 +99,9 @@ print(float(shapes.compute_distances(where, np.zeros(1, int), np.array([[0, 1]])
 
 def test_box_sizes_do_not_depend_on_the_first_query() -> None:
     """A first query along an axis would make coal enlarge boxes by 1e-10 from then on."""
-    answers = {
+    outputs = {
         subprocess.run(
-            [sys.executable, "-c", before + _FIRST],
+            [sys.executable, "-c", before + _FIRST_QUERY],
             capture_output=True,
             text=True,
             check=True,
@@ -107,5 +109,5 @@ def test_box_sizes_do_not_depend_on_the_first_query() -> None:
         ).stdout
         for before in ("", "import vkc_pin as vkc; vkc.load_scene('door')\n")
     }
-    assert len(answers) == 1
-    assert float.fromhex(answers.pop().strip()) == pytest.approx(1.0, abs=1e-12)
+    assert len(outputs) == 1
+    assert float.fromhex(outputs.pop().strip()) == pytest.approx(1.0, abs=1e-12)

@@ -29,12 +29,12 @@ def test_close_pairs_match_an_exhaustive_search(
     rng = np.random.default_rng(seed)
     lower = np.cumsum(rng.normal(0.0, 0.2, (states, 5, 3)), axis=0) + rng.uniform(-2.0, 2.0, (5, 3))
     upper = lower + rng.uniform(0.0, 0.8, (5, 3))
-    floor = rng.uniform(-2.0, 2.0, (7, 3))
-    ceiling = floor + rng.uniform(0.0, 1.0, (7, 3))
-    boxes = WorldBoxes(lower, upper, floor, ceiling)
-    bottoms, tops = (
-        np.concatenate([own, np.broadcast_to(standing, (states, 7, 3))], axis=1)
-        for own, standing in ((lower, floor), (upper, ceiling))
+    fixed_lower = rng.uniform(-2.0, 2.0, (7, 3))
+    fixed_upper = fixed_lower + rng.uniform(0.0, 1.0, (7, 3))
+    boxes = WorldBoxes(lower, upper, fixed_lower, fixed_upper)
+    all_lower, all_upper = (
+        np.concatenate([own, np.broadcast_to(fixed, (states, 7, 3))], axis=1)
+        for own, fixed in ((lower, fixed_lower), (upper, fixed_upper))
     )
     first = np.arange(states - moving)
     last = first + moving
@@ -43,16 +43,16 @@ def test_close_pairs_match_an_exhaustive_search(
     moves = np.array([[True] * 5 + [False] * 7, [True, False, True, False, True] + [False] * 7])
     phases = (np.arange(len(first)) > len(first) // 2).astype(int)
     pairs = np.array([(i, j) for j in range(12) for i in range(min(j, 5))])
-    at, which = boxes.find_close_pairs(
+    intervals, found = boxes.find_close_pairs(
         first, last, pairs, moved=moved, moves=moves, phases=phases, limit=limit
     )
     expected = []
     for k, (a, b) in enumerate(zip(first, last, strict=True)):
         for p, (i, j) in enumerate(pairs.tolist()):
-            ends = sum(
-                compute_gap((bottoms[s, i], tops[s, i]), (bottoms[s, j], tops[s, j]))
+            gaps = sum(
+                compute_gap((all_lower[s, i], all_upper[s, i]), (all_lower[s, j], all_upper[s, j]))
                 for s in (a, b)
             )
-            if moves[phases[k], [i, j]].any() and (ends - moved[k, i] - moved[k, j]) / 2 < limit:
+            if moves[phases[k], [i, j]].any() and (gaps - moved[k, i] - moved[k, j]) / 2 < limit:
                 expected.append((k, p))
-    assert list(zip(at.tolist(), which.tolist(), strict=True)) == expected
+    assert list(zip(intervals.tolist(), found.tolist(), strict=True)) == expected

@@ -43,7 +43,7 @@ class Part(Schema):
     at: Vector3 = (0.0, 0.0, 0.0)
 
 
-class Thing(Schema):
+class Assembly(Schema):
     name: Name
     mass: Number = 1.0
     parts: tuple[Part, ...] = ()
@@ -83,7 +83,7 @@ def test_field_paths_are_formatted() -> None:
     assert format_field(()) == ""
 
 
-def test_empty_files_hold_no_data(tmp_path: Path) -> None:
+def test_empty_files_contain_no_data(tmp_path: Path) -> None:
     assert read_yaml(write_text(tmp_path, "# nothing\n")).data is None
 
 
@@ -132,50 +132,50 @@ def test_invalid_yaml_raises(tmp_path: Path, text: str, line: int | None, proble
         ("parts: [{size: 0}]\nname: 3\n", 1, "parts[0].size", "a number from 1e-06 to 10000"),
     ],
 )
-def test_the_first_wrong_field_is_reported(
+def test_the_first_invalid_field_is_reported(
     tmp_path: Path, text: str, line: int | None, field: str, message: str
 ) -> None:
     with pytest.raises(InputError, match=message) as caught:
-        parse_document(read_yaml(write_text(tmp_path, text)), Thing)
+        parse_document(read_yaml(write_text(tmp_path, text)), Assembly)
     assert (caught.value.field, caught.value.file) == (field, tmp_path / "thing.yaml")
     assert line is None or caught.value.line == line
 
 
-def test_valid_data_becomes_the_schema() -> None:
+def test_valid_data_is_parsed_to_the_schema() -> None:
     for at in ((1.0, 2.0, 3.0), [1, 2, 3]):
         data = {"name": "a", "parts": [{"size": 2, "at": at}]}
-        expected = Thing(name="a", parts=(Part(size=2.0, at=(1.0, 2.0, 3.0)),))
-        assert parse_document(Document(data), Thing) == expected
+        expected = Assembly(name="a", parts=(Part(size=2.0, at=(1.0, 2.0, 3.0)),))
+        assert parse_document(Document(data), Assembly) == expected
 
 
 @pytest.mark.parametrize(("opening", "closing"), [("[", "]"), ("{a: ", "}")])
 def test_deeply_nested_yaml_raises(tmp_path: Path, opening: str, closing: str) -> None:
     depth = documents.MAX_DEPTH
-    fine = read_yaml(write_text(tmp_path, opening * depth + "1" + closing * depth))
-    assert len(max(fine.lines, key=len)) == depth
+    nested = read_yaml(write_text(tmp_path, opening * depth + "1" + closing * depth))
+    assert len(max(nested.lines, key=len)) == depth
     for count in (depth + 1, 1_000_000):
         with pytest.raises(InputError, match=r"too many lists|not valid YAML"):
             read_yaml(write_text(tmp_path, opening * count + "1" + closing * count))
 
 
 @pytest.mark.parametrize("endless", [itertools.repeat(0.0), map(abs, itertools.count())])
-def test_iterators_are_refused(endless: Iterator[float]) -> None:
+def test_iterators_are_rejected(endless: Iterator[float]) -> None:
     with pytest.raises(InputError, match=r"parts\[0\].at: wrong type of value") as caught:
-        parse_document(Document({"name": "a", "parts": [{"size": 1.0, "at": endless}]}), Thing)
+        parse_document(Document({"name": "a", "parts": [{"size": 1.0, "at": endless}]}), Assembly)
     assert caught.value.expected == "a list, fields, text or a number"
 
 
-def test_text_without_encoding_and_recursive_data_raise() -> None:
+def test_unencodable_text_and_recursive_data_raise() -> None:
     for data in ({"name": "x", "parts": ["a\ud800"]}, {"x\udfff": [1]}, ["\ud800"]):
         with pytest.raises(InputError, match="not text"):
-            parse_document(Document(data), Thing)
+            parse_document(Document(data), Assembly)
     recursive: dict[str, object] = {}
     recursive["inside"] = recursive
     with pytest.raises(InputError, match="inside: too many lists inside each other"):
-        parse_document(Document(recursive), Thing)
+        parse_document(Document(recursive), Assembly)
 
 
-def test_errors_get_the_line_of_their_field(tmp_path: Path) -> None:
+def test_errors_are_annotated_with_the_line_of_their_field(tmp_path: Path) -> None:
     document = read_yaml(write_text(tmp_path, "a: 1\nb:\n  c: 2\n"))
     with (
         pytest.raises(InputError, match=r":3: b\.c: mass: too large"),
@@ -185,13 +185,15 @@ def test_errors_get_the_line_of_their_field(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError) as unknown, document.annotate_errors(("b",)):
         raise UnknownNameError("link", "armm", ["arm", "leg"])
     assert (unknown.value.line, unknown.value.nearest) == (2, "arm")
-    elsewhere = InputError("too large", file="other.yaml", line=7)
+    located = InputError("too large", file="other.yaml", line=7)
     with pytest.raises(InputError) as same, document.annotate_errors(("b",)):
-        raise elsewhere
-    assert same.value is elsewhere
+        raise located
+    assert same.value is located
 
 
-def test_files_within_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_size_and_type_of_files_are_limited(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = tmp_path / "file"
     file.write_bytes(b"\xef\xbb\xbfabc")
     assert (read_bytes(file, "plan"), read_text(file, "plan")) == (b"\xef\xbb\xbfabc", "abc")
@@ -201,14 +203,14 @@ def test_files_within_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     with pytest.raises(InputError, match="the YAML is too large"):
         read_yaml(file)
     (tmp_path / "bytes").write_bytes(b"\xff\xfe\x00")
-    os.mkfifo(tmp_path / "pipe")  # nobody writes into it
+    os.mkfifo(tmp_path / "pipe")  # without a writer
     for name in ("none", "bytes", ".", "pipe", "a\0b"):
         with pytest.raises(InputError, match="cannot read the YAML") as caught:
             read_text(tmp_path / name, "YAML")
         assert caught.value.file == tmp_path / name
 
 
-def test_json_within_bounds() -> None:
+def test_size_and_depth_of_json_are_limited() -> None:
     assert parse_json('{"a": [1, {"b": "[["}]}', "file") == {"a": [1, {"b": "[["}]}
     deepest = "[" * documents.MAX_DEPTH + "]" * documents.MAX_DEPTH
     assert str(parse_json(deepest, "file")) == deepest

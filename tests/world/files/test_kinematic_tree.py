@@ -137,7 +137,7 @@ LARGE = ("1.7976931348623157e308", "3.4028235e38", "1e16", "2147483647", "10000"
 
 
 @pytest.mark.parametrize("large", LARGE)
-def test_huge_limits_mean_none(tmp_path: Path, large: str) -> None:
+def test_huge_limits_count_as_unlimited(tmp_path: Path, large: str) -> None:
     limit = f'<limit lower="-{large}" upper="{large}" velocity="1"/>'
     model, _, _ = load_urdf(write_urdf(tmp_path, *format_pair("revolute", limit)))
     assert model.nq == 2, "a continuous joint has cosine and sine"
@@ -183,7 +183,7 @@ def test_velocity_and_effort_limits_are_optional(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_extensions_are_ignored(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    """Elements of simulators and undeclared prefixes change nothing, and no parser complains."""
+    """Elements of simulators and undeclared prefixes have no effect and print no errors."""
     lines = format_pair("continuous", '<axis xyz="0 0 1"/><limit effort="3"/>')
     plain, _, _ = load_urdf(write_urdf(tmp_path, *lines))
     gear = lines.pop().replace("</joint>", '<drake:gear ratio="x"/><calibration/></joint>')
@@ -229,7 +229,7 @@ def test_incomplete_inertials_warn(tmp_path: Path, inertial: str, message: str) 
 
 
 @pytest.mark.parametrize(("mass", "moment"), [(2e4, 400.0), (20.0, 4e5), (1e9, 1e9)])
-def test_large_masses_are_kept(tmp_path: Path, mass: float, moment: float) -> None:
+def test_large_masses_are_preserved(tmp_path: Path, mass: float, moment: float) -> None:
     moments = " ".join(f'{key}="{moment}"' for key in ("ixx", "iyy", "izz"))
     inertial = f'<inertial><mass value="{mass}"/><inertia {moments}/></inertial>'
     root, moving = format_links("r", "a")

@@ -18,8 +18,7 @@ from vkc_pin.world.files.meshes import (
     make_convex_hull,
 )
 
-# Two cubes of edge 1, one metre apart; in an OBJ file the indices go on counting through all
-# objects.
+# Two cubes of edge length 1, one metre apart. Vertex indices of OBJ files run through all objects.
 FACES = np.array(
     [[1, 2, 4, 3], [5, 7, 8, 6], [1, 5, 6, 2], [3, 4, 8, 7], [1, 3, 7, 5], [2, 6, 8, 4]]
 )
@@ -50,13 +49,13 @@ VERTICES = ["\n".join(f"v {x + 2 * k} {y} {z}" for x, y, z in CORNERS) + "\n" fo
 
 
 def format_faces(first: int, corner: str = "{}") -> str:
-    """Return the faces of a cube whose vertices count from `first`, which may be negative."""
+    """Return the faces of a cube whose first vertex has index `first`, which may be negative."""
     return "".join(
         "f " + " ".join(corner.format(i - 1 + first) for i in face) + "\n" for face in FACES
     )
 
 
-USUAL = VERTICES[0] + VERTICES[1] + format_faces(1) + format_faces(9)
+TWO_CUBES = VERTICES[0] + VERTICES[1] + format_faces(1) + format_faces(9)
 
 
 @pytest.mark.parametrize(
@@ -77,13 +76,13 @@ USUAL = VERTICES[0] + VERTICES[1] + format_faces(1) + format_faces(9)
         + format_faces(-8, "{}//1"),
         VERTICES[0]
         + format_faces(-8).replace("f ", "f  ").replace("\n", "  # a-b\n", 1)
-        # of the other cube, with lines that go on
+        # the second cube has continued lines
         + VERTICES[1]
         + format_faces(-8).replace(" -1 ", " \\\n-1 "),
-        "\ufeff" + USUAL,
-        USUAL.replace("\n", "\r"),
-        USUAL.replace("v ", "v\t").replace("f ", "f\t"),
-        USUAL.replace("v ", "  v ").replace("f ", "\tf "),
+        "\ufeff" + TWO_CUBES,
+        TWO_CUBES.replace("\n", "\r"),
+        TWO_CUBES.replace("v ", "v\t").replace("f ", "f\t"),
+        TWO_CUBES.replace("v ", "  v ").replace("f ", "\tf "),
     ],
     ids=[
         "interleaved",
@@ -91,17 +90,17 @@ USUAL = VERTICES[0] + VERTICES[1] + format_faces(1) + format_faces(9)
         "mixed",
         "textures",
         "normals",
-        "comments and lines that go on",
+        "comments and continued lines",
         "byte-order mark",
-        "line ends of old Macs",
+        "carriage returns as line ends",
         "tabs",
         "indented",
     ],
 )
-@pytest.mark.parametrize("coding", ["utf-8", "utf-16"])
-def test_obj_files_of_other_programs_are_read_alike(tmp_path: Path, text: str, coding: str) -> None:
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_obj_dialects_give_the_same_mesh(tmp_path: Path, text: str, encoding: str) -> None:
     file = tmp_path / "two.obj"
-    file.write_bytes(text.encode(coding))
+    file.write_bytes(text.encode(encoding))
     mesh = load_mesh(file)
     assert mesh.area == pytest.approx(12.0)
     assert abs(mesh.volume) == pytest.approx(2.0)
@@ -110,7 +109,7 @@ def test_obj_files_of_other_programs_are_read_alike(tmp_path: Path, text: str, c
 
 
 @pytest.mark.parametrize("index", ["0", "-9", "0/1"])
-def test_faces_without_vertices_are_refused(tmp_path: Path, index: str) -> None:
+def test_faces_with_invalid_vertex_indices_are_rejected(tmp_path: Path, index: str) -> None:
     file = tmp_path / "cube.obj"
     file.write_text(f"{VERTICES[0]}f 1 2 {index}\n")
     with pytest.raises(InputError, match=r"cube\.obj:9: f: no such vertex.*1 to 8.*got " + index):
@@ -158,7 +157,7 @@ def write_collada(path: Path, unit: str) -> Path:
         ('<unit name="meter"/>', 1.0),
     ],
 )
-def test_the_unit_of_collada_files_counts(tmp_path: Path, unit: str, metres: float) -> None:
+def test_the_unit_of_collada_files_is_applied(tmp_path: Path, unit: str, metres: float) -> None:
     file = write_collada(tmp_path / "block.dae", unit)
     size = np.array([6.0, 2.0, 3.0]) * metres
     np.testing.assert_allclose(load_mesh(file).extents, size)
@@ -169,20 +168,20 @@ def test_the_unit_of_collada_files_counts(tmp_path: Path, unit: str, metres: flo
 
 
 @pytest.mark.parametrize("unit", ["1e-300", "1e-9", "1e-7"])
-def test_tiny_meshes_are_refused(tmp_path: Path, unit: str) -> None:
+def test_tiny_meshes_are_rejected(tmp_path: Path, unit: str) -> None:
     file = write_collada(tmp_path / "block.dae", f'<unit meter="{unit}"/>')
     with pytest.raises(InputError, match=r"block\.dae: tip: .*too small: is its unit or scale"):
         load_convex(file, about="tip")
 
 
 @pytest.mark.parametrize("unit", ["0", "-1", "inch", "nan", "1e400", "0,01"])
-def test_units_that_are_no_lengths_are_refused(tmp_path: Path, unit: str) -> None:
+def test_invalid_collada_units_are_rejected(tmp_path: Path, unit: str) -> None:
     file = write_collada(tmp_path / "block.dae", f'<unit meter="{unit}"/>')
     with pytest.raises(InputError, match=rf"block\.dae: <unit> meter: .*got {unit}"):
         load_mesh(file)
 
 
-def test_submeshes_are_read_alone(tmp_path: Path) -> None:
+def test_submeshes_can_be_read_by_name(tmp_path: Path) -> None:
     two = write_two_cubes(tmp_path / "two.obj", materials=True)
     np.testing.assert_allclose(load_mesh(two, submesh="cube1").bounds, [[2, 0, 0], [3, 1, 1]])
     two.write_text(two.read_text().replace("o cube", "g all cube"))
@@ -205,7 +204,7 @@ def test_submeshes_are_read_alone(tmp_path: Path) -> None:
         assert caught.value.file == file
 
 
-def test_convex_hulls_equal_the_mesh(tmp_path: Path) -> None:
+def test_a_mesh_is_loaded_as_its_convex_hull(tmp_path: Path) -> None:
     shape = load_convex(write_two_cubes(tmp_path / "two.obj"), (0.5, 1.0, 2.0))
     assert isinstance(shape, coal.Convex)
     assert shape.computeVolume() == pytest.approx(1.5 * 1.0 * 2.0)
@@ -250,10 +249,10 @@ def test_simplified_meshes_keep_their_shape(tmp_path: Path) -> None:
     assert np.abs(np.linalg.norm(coarse.vertices, axis=1) - 0.1).max() < 0.01
 
 
-def test_thin_meshes_need_no_further_package(
+def test_hulls_of_thin_meshes_need_no_optional_dependency(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """For flat points trimesh would import networkx, which is no dependency."""
+    """For flat points trimesh would import networkx, which is not a dependency."""
     monkeypatch.setitem(sys.modules, "networkx", None)
     rng, file = np.random.default_rng(0), tmp_path / "few.off"
     for thickness in (1.0, 0.0, 1e-3, 1e-4, 1e-8, 1e-13) * 4:

@@ -44,22 +44,22 @@ def test_unknown_resources_raise() -> None:
 def test_installed_packages_contain_their_resources(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    inside = tmp_path / "site-packages" / "vkc_pin"
-    (inside / "scenes").mkdir(parents=True)
-    (inside / "scenes" / "own.yaml").write_text("")
+    package = tmp_path / "site-packages" / "vkc_pin"
+    (package / "scenes").mkdir(parents=True)
+    (package / "scenes" / "own.yaml").write_text("")
     monkeypatch.setattr(
-        "vkc_pin.world.files.resources.__file__", str(inside / "world" / "files" / "resources.py")
+        "vkc_pin.world.files.resources.__file__", str(package / "world" / "files" / "resources.py")
     )
-    assert find_resource_folder("scenes") == inside / "scenes"
+    assert find_resource_folder("scenes") == package / "scenes"
     assert list(list_resources("scenes", "*.yaml")) == ["own"]
     assert (
-        find_resource_folder("robots") == inside.parent / "robots"
-    )  # a source tree has them beside the package
+        find_resource_folder("robots") == package.parent / "robots"
+    )  # as in a source tree, beside the package
 
 
 # Names of new files
 
-FINE = re.compile(r"[A-Za-z0-9_-]{1,64}")
+PORTABLE = re.compile(r"[A-Za-z0-9_-]{1,64}")
 DEVICES = {
     "con",
     "prn",
@@ -83,7 +83,7 @@ def test_file_names_are_portable_unique_and_reproducible(names: list[str]) -> No
     assert choose_file_names(names) == chosen == choose_file_names(chosen)
     assert len({name.lower() for name in chosen}) == len(names)
     for name in chosen:
-        assert FINE.fullmatch(name)
+        assert PORTABLE.fullmatch(name)
         assert name.lower() not in DEVICES
     others = choose_file_names(names, taken=chosen)
     assert len({name.lower() for name in (*chosen, *others)}) == 2 * len(names)

@@ -13,8 +13,8 @@ from vkc_pin.world.files.srdf import Srdf, SrdfGroup, find_group_tip, read_group
 LINKS = ("base", "arm", "hand")
 
 
-def read(folder: Path, inside: str) -> Srdf:
-    (folder / "r.srdf").write_text(f'<robot name="r">\n{inside}\n</robot>')
+def read_text(folder: Path, content: str) -> Srdf:
+    (folder / "r.srdf").write_text(f'<robot name="r">\n{content}\n</robot>')
     return read_srdf(folder / "r.srdf", links=LINKS)
 
 
@@ -28,12 +28,12 @@ def test_pairs_are_sorted_and_keep_their_reason(tmp_path: Path) -> None:
         '<disable_collisions link1="hand" link2="arm" reason="Adjacent"/>'
         '<disable_collisions link1="arm" link2="base"/>'
     )
-    assert read(tmp_path, pairs).allowed == {("arm", "hand"): "Adjacent", ("arm", "base"): ""}
+    assert read_text(tmp_path, pairs).allowed == {("arm", "hand"): "Adjacent", ("arm", "base"): ""}
 
 
 def test_states_of_several_groups_are_merged(tmp_path: Path) -> None:
     """Joints with several coordinates are skipped."""
-    srdf = read(
+    srdf = read_text(
         tmp_path,
         format_state("home", a="0.5")
         + format_state("up", a="-1e-1", floating="1 0 0")
@@ -53,7 +53,7 @@ def test_states_of_several_groups_are_merged(tmp_path: Path) -> None:
 )
 def test_home_states_are_preferred(tmp_path: Path, names: list[str], chosen: str) -> None:
     values = {name: float(number) for number, name in enumerate(names)}
-    srdf = read(
+    srdf = read_text(
         tmp_path,
         "".join(format_state(name, a=str(value), b="0") for name, value in values.items())
         + format_state("home", c="1"),
@@ -65,7 +65,7 @@ def test_home_states_are_preferred(tmp_path: Path, names: list[str], chosen: str
 def test_unknown_links_raise(tmp_path: Path) -> None:
     pairs = [f'<disable_collisions link1="base" link2="{name}"/>' for name in ("arm", "hnad")]
     with pytest.raises(UnknownNameError) as caught:
-        read(tmp_path, "\n".join(pairs))
+        read_text(tmp_path, "\n".join(pairs))
     assert (caught.value.line, caught.value.nearest) == (3, "hand")
     assert caught.value.file == tmp_path / "r.srdf"
 

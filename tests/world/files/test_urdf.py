@@ -36,10 +36,10 @@ def test_too_many_shapes_raise(tmp_path: Path, kind: str) -> None:
     ):
         load_urdf(write_urdf(tmp_path, shape + many if kind == "visual" else many))
     enough = shape.replace("collision", kind) * 1000
-    _, collides, drawn = load_urdf(
+    _, collision, visual = load_urdf(
         write_urdf(tmp_path, shape + enough if kind == "visual" else enough)
     )
-    assert len((drawn if kind == "visual" else collides).geometryObjects) == 1000
+    assert len((visual if kind == "visual" else collision).geometryObjects) == 1000
 
 
 @pytest.mark.parametrize(
@@ -91,22 +91,22 @@ def test_colours_are_shared_by_name(tmp_path: Path) -> None:
 
 
 def test_mesh_addresses_are_resolved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Given packages, folders above the file, the file's own folder, and absolute paths."""
+    """Covers given packages, folders above the file, its own folder, and absolute paths."""
     for folder in ("elsewhere", "robots/pack/meshes", "robots/pack/urdf"):
         (tmp_path / folder).mkdir(parents=True)
-    named, around, beside = (
+    packaged, above, beside = (
         tmp_path / "elsewhere" / "a.stl",
         tmp_path / "robots" / "pack" / "meshes" / "b.stl",
         tmp_path / "robots" / "pack" / "urdf" / "c.stl",
     )
-    for file in (named, around, beside):
+    for file in (packaged, above, beside):
         file.write_text("")
     path = write_urdf(
         tmp_path / "robots" / "pack" / "urdf", format_collision('<sphere radius="1"/>')
     )
     robot = read_urdf(path, {"other": tmp_path / "elsewhere"})
-    assert robot.resolve("package://other/a.stl") == named
-    assert robot.resolve("package://pack/meshes/b.stl") == around
+    assert robot.resolve("package://other/a.stl") == packaged
+    assert robot.resolve("package://pack/meshes/b.stl") == above
     assert (
         robot.resolve("c.stl")
         == robot.resolve(f"file://{beside}")

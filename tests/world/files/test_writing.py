@@ -22,7 +22,7 @@ from vkc_pin.world.files.writing import (
 )
 
 
-def list_everything(folder: Path) -> set[str]:
+def list_paths(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*")}
 
 
@@ -49,18 +49,18 @@ def test_the_mode_of_a_file_is_preserved(tmp_path: Path) -> None:
         assert (path.read_bytes(), path.stat().st_mode & 0o7777) == (b"after", mode)
 
 
-@pytest.mark.parametrize("there", [True, False], ids=["file", "dangling"])
-def test_links_are_followed(tmp_path: Path, there: bool) -> None:
+@pytest.mark.parametrize("target_exists", [True, False], ids=["file", "dangling"])
+def test_links_are_followed(tmp_path: Path, target_exists: bool) -> None:
     target, link = tmp_path / "elsewhere" / "file", tmp_path / "link"
-    if there:
+    if target_exists:
         target.parent.mkdir()
         target.write_bytes(b"before")
     link.symlink_to(Path("elsewhere") / "file")
     assert check_writable(link) == target
-    assert target.parent.exists() == there
+    assert target.parent.exists() == target_exists
     assert write_atomically(link, b"after") == link
     assert (link.is_symlink(), target.read_bytes()) == (True, b"after")
-    assert list_everything(tmp_path) == {"link", "elsewhere", "elsewhere/file"}
+    assert list_paths(tmp_path) == {"link", "elsewhere", "elsewhere/file"}
 
 
 def _make_folder(path: Path) -> str:
@@ -83,12 +83,12 @@ def _make_circular_link(path: Path) -> str:
 def test_other_kinds_of_files_raise(tmp_path: Path, make: Callable[[Path], str]) -> None:
     path = tmp_path / "output"
     reason = make(path)
-    before = list_everything(tmp_path)
+    before = list_paths(tmp_path)
     for write in (check_writable, lambda path: write_atomically(path, b"data")):
         with pytest.raises(InputError, match=f"a regular file or a new one.*{reason}") as caught:
             write(path)
         assert caught.value.file == str(path)
-    assert list_everything(tmp_path) == before
+    assert list_paths(tmp_path) == before
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_invalid_paths_raise(
     for write in (check_writable, lambda path: write_atomically(path, b"data")):
         with pytest.raises(InputError, match=reason):
             write(path)
-    assert list_everything(tmp_path) <= {"file", "new"}
+    assert list_paths(tmp_path) <= {"file", "new"}
 
 
 def test_conflicting_outputs_raise(tmp_path: Path) -> None:
@@ -123,17 +123,17 @@ def test_conflicting_outputs_raise(tmp_path: Path) -> None:
         check_outputs({"--a": one}, inputs={"PLAN": one})
     with pytest.raises(InputError, match=r"--b: a file cannot be a folder .*file of --a"):
         check_outputs({"--a": one, "--b": one / "two" / "three"})
-    assert list_everything(tmp_path) == {"link"}
+    assert list_paths(tmp_path) == {"link"}
 
 
 def test_failed_writes_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "file.txt"
     path.write_bytes(b"before")
 
-    def full(self: Path, target: Path) -> None:
+    def raise_disk_full(self: Path, target: Path) -> None:
         raise OSError(errno.ENOSPC, "no space left")
 
-    monkeypatch.setattr(Path, "replace", full)
+    monkeypatch.setattr(Path, "replace", raise_disk_full)
     with pytest.raises(InputError, match="no space") as caught:
         write_atomically(path, b"after")
     assert caught.value.file == str(path)
@@ -147,13 +147,13 @@ def test_interrupts_are_deferred_until_the_file_is_complete(
     """The signal arrives three times between writing and renaming."""
     path, replace = tmp_path / "file.txt", Path.replace
 
-    def pressed(self: Path, target: Path) -> Path:
+    def replace_after_interrupts(self: Path, target: Path) -> Path:
         for _ in range(3):
             signal.raise_signal(signal.SIGINT)
         return replace(self, target)
 
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    monkeypatch.setattr(Path, "replace", pressed)
+    monkeypatch.setattr(Path, "replace", replace_after_interrupts)
     try:
         with pytest.raises(KeyboardInterrupt):
             write_atomically(path, b"whole")
@@ -168,14 +168,14 @@ def test_folders_are_written_completely_or_not_at_all(tmp_path: Path) -> None:
     with write_folder_atomically(target) as staging:
         (staging / "a").write_text("1", encoding="utf-8")
         assert not target.exists()
-    assert list_everything(target) == {".vkc-pin.json", "a"}
+    assert list_paths(target) == {".vkc-pin.json", "a"}
     with pytest.raises(FileNotFoundError), write_folder_atomically(target, force=True) as staging:
         (staging / "none" / "b").write_text("2", encoding="utf-8")
     with pytest.raises(InputError, match="already exists"), write_folder_atomically(target):
         pass
-    assert list_everything(target) == {".vkc-pin.json", "a"}
+    assert list_paths(target) == {".vkc-pin.json", "a"}
     write_folder(target)
-    assert list_everything(target.parent) == {
+    assert list_paths(target.parent) == {
         f"folder{name}" for name in ("", "/.vkc-pin.json", "/deep", "/deep/a")
     }
     with pytest.raises(InputError, match="no folder"):
@@ -195,15 +195,15 @@ def test_folders_with_foreign_files_are_not_replaced(tmp_path: Path, has_manifes
         write_folder(target)
     (target / other).parent.mkdir(parents=True, exist_ok=True)
     (target / other).write_text("mine")
-    before = list_everything(tmp_path)
+    before = list_paths(tmp_path)
     for check in (check_replaceable, write_folder):
         with pytest.raises(InputError, match="files that vkc-pin did not write") as caught:
             check(target)
         assert (caught.value.file, caught.value.got) == (target, other)
-    assert list_everything(tmp_path) == before
+    assert list_paths(tmp_path) == before
 
 
-def test_files_that_appear_meanwhile_are_kept(tmp_path: Path) -> None:
+def test_files_created_during_writing_are_preserved(tmp_path: Path) -> None:
     target = tmp_path / "folder"
     write_folder(target)
     with (
@@ -239,20 +239,20 @@ def test_damaged_manifests_list_no_files(tmp_path: Path, text: str) -> None:
 def test_folders_survive_a_failed_rename(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     target, rename = tmp_path / "folder", Path.rename
     write_folder(target)
-    before = list_everything(tmp_path)
+    before = list_paths(tmp_path)
 
-    def refuse(self: Path, other: Path) -> Path:
+    def fail_to_rename(self: Path, other: Path) -> Path:
         if other == target and (self / "new").exists():
             raise OSError(errno.EIO, "input/output error")
         return rename(self, other)
 
-    monkeypatch.setattr(Path, "rename", refuse)
+    monkeypatch.setattr(Path, "rename", fail_to_rename)
     with (
         pytest.raises(InputError, match="input/output error"),
         write_folder_atomically(target, force=True) as staging,
     ):
         (staging / "new").touch()
-    assert list_everything(tmp_path) == before
+    assert list_paths(tmp_path) == before
 
 
 @pytest.mark.parametrize("name", ["a", "ur5e v2.1", "Küche", "x" * 200, "a..b", "-"])

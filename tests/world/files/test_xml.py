@@ -21,20 +21,20 @@ FILE = Path("thing.urdf")
         st.text("ab <>&\n", max_size=5), lambda inside: st.lists(inside, max_size=4), max_leaves=20
     )
 )
-def test_elements_match_the_standard_library_and_have_lines(tree: object) -> None:
+def test_elements_match_the_standard_library_and_have_line_numbers(tree: object) -> None:
     lines = ["<robot>"]
 
-    def write(node: object) -> None:
+    def append_lines(node: object) -> None:
         if isinstance(node, str):
             escaped = node.replace("&", "&amp;").replace("<", "&lt;").replace("\n", "&#10;")
             lines.append(f'<text value="{escaped}">{escaped}</text>')
         elif isinstance(node, list):
             lines.append(f'<list number="{len(lines) + 1}">')
             for item in node:
-                write(item)
+                append_lines(item)
             lines.append("</list>")
 
-    write(tree)
+    append_lines(tree)
     text = "\n".join([*lines, "</robot>"])
     own, theirs = parse_xml(text, FILE), ElementTree.fromstring(text)
     assert ElementTree.tostring(own) == ElementTree.tostring(theirs)
@@ -54,7 +54,7 @@ def test_invalid_xml_raises(text: str, line: int) -> None:
     assert (caught.value.file, caught.value.line) == (FILE, line)
 
 
-def test_entities_are_refused() -> None:
+def test_entities_are_rejected() -> None:
     """A few lines of entities expand exponentially."""
     many = "".join(f'<!ENTITY e{k} "{f"&e{k - 1};" * 10 if k else "lol"}">' for k in range(12))
     with pytest.raises(InputError, match="e0: entities are not supported") as caught:
@@ -94,7 +94,7 @@ def test_forbidden_characters_become_replacement_characters() -> None:
 
 
 @pytest.mark.parametrize("depth", [199, 200, 100_000])
-def test_deep_elements_are_refused_before_they_exhaust_the_stack(depth: int) -> None:
+def test_deeply_nested_elements_are_rejected(depth: int) -> None:
     text = f"<robot>{'<a>' * depth}{'</a>' * depth}</robot>"
     if depth < 200:
         copied = copy.deepcopy(parse_xml(text, FILE))

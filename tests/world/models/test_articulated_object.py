@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.objects import URDF, load_text
+from helpers.objects import URDF, load_object_text
 from scipy.spatial.transform import Rotation
 
 from vkc_pin.errors import InputError, UnknownNameError
@@ -56,15 +56,15 @@ def test_attachments_move_with_their_virtual_joint(
         for part in (f"name: grip, link: panel, joint: {joint}, standoff: {standoff}", fields)
         if part
     )
-    grip = load_text(URDF, f"urdf: thing.urdf\nattachments: [{{{entry}}}]").attachment()
+    grip = load_object_text(URDF, f"urdf: thing.urdf\nattachments: [{{{entry}}}]").attachment()
     placement = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 1.0), np.array([0.1, 0.2, -0.3]))
     grip = dataclasses.replace(grip, placement=placement)
     assert (grip.joint, grip.standoff) == (joint, standoff)
     assert grip.coordinates == tuple(f"grip{suffix}" for suffix in suffixes)
-    stated = {"_turn": (-1.2, 1.1)} if joint == "cylindrical" else {}
-    usual = (-0.4, 0.5) if "limits" in fields else (-np.pi, np.pi)
+    limits = {"_turn": (-1.2, 1.1)} if joint == "cylindrical" else {}
+    default = (-0.4, 0.5) if "limits" in fields else (-np.pi, np.pi)
     assert [(f.lower, f.upper) for f in grip.freedoms] == [
-        stated.get(suffix, usual) for suffix in suffixes
+        limits.get(suffix, default) for suffix in suffixes
     ]
     v, axis = (
         np.random.default_rng(0).uniform(-1.0, 1.0, len(suffixes)),
@@ -100,10 +100,14 @@ def test_listed_freedoms_are_applied_in_order() -> None:
       - {name: around, turn: [0, 0, 2], through: [-0.3, 0, 0], limits: [-3, 3]}
       - {name: tilt, turn: [0, 1, 0], limits: [-0.5, 0.5]}
       - {name: slide, slide: [3, 0, 4], limits: [0, 0.02]}"""
-    rim = load_text(URDF, f"urdf: thing.urdf\nattachments: {entry}").attachment()
+    rim = load_object_text(URDF, f"urdf: thing.urdf\nattachments: {entry}").attachment()
     assert rim.coordinates == ("rim_around", "rim_tilt", "rim_slide")
-    assert [own.unit for own in rim.freedoms] == ["rad", "rad", "m"]
-    assert [(own.lower, own.upper) for own in rim.freedoms] == [(-3, 3), (-0.5, 0.5), (0, 0.02)]
+    assert [freedom.unit for freedom in rim.freedoms] == ["rad", "rad", "m"]
+    assert [(freedom.lower, freedom.upper) for freedom in rim.freedoms] == [
+        (-3, 3),
+        (-0.5, 0.5),
+        (0, 0.02),
+    ]
     rng = np.random.default_rng(3)
     down = np.diag([1.0, -1.0, -1.0])
     for around, tilt, slide in rng.uniform([-3, -0.5, 0], [3, 0.5, 0.02], (5, 3)):

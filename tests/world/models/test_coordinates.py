@@ -20,9 +20,9 @@ def make_mixed_model() -> pin.Model:
     model = pin.Model()
     base = model.addJoint(0, pin.JointModelPlanar(), pin.SE3.Identity(), "base")
     model.addJoint(base, pin.JointModelRUBZ(), pin.SE3.Identity(), "wheel")
-    thing = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "thing")
+    body = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "thing")
     limits = [np.array([value]) for value in (1.0, 2.0, -0.5, 0.7)]
-    model.addJoint(thing, pin.JointModelRX(), pin.SE3.Identity(), "lid", *limits)
+    model.addJoint(body, pin.JointModelRX(), pin.SE3.Identity(), "lid", *limits)
     model.addJoint(0, pin.JointModelPZ(), pin.SE3.Identity(), "lift", *limits)
     return model
 
@@ -65,12 +65,12 @@ def test_configurations_round_trip(seed: int) -> None:
     np.testing.assert_allclose(coordinates.q(longer), q, atol=1e-12)
     z, q = z[0, 0], q[0, 0]
     pin.forwardKinematics(model, data, q)
-    base, thing, lid = data.oMi[1], data.oMi[3], data.oMi[4]
-    assert thing.isApprox(pin.XYZQUATToSE3(z[4:11]), 1e-12)
+    base, body, lid = data.oMi[1], data.oMi[3], data.oMi[4]
+    assert body.isApprox(pin.XYZQUATToSE3(z[4:11]), 1e-12)
     np.testing.assert_allclose(base.translation, [*z[:2], 0.0])
     np.testing.assert_allclose(base.rotation, pin.utils.rotate("z", z[2]), atol=1e-12)
     expected = pin.utils.rotate("x", z[11])
-    np.testing.assert_allclose((thing.inverse() * lid).rotation, expected, atol=1e-12)
+    np.testing.assert_allclose((body.inverse() * lid).rotation, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("angle", [0.1, 2.0, np.pi - 1e-6])
@@ -80,11 +80,12 @@ def test_quaternions_interpolate_about_one_axis(angle: float) -> None:
     coordinates, data = Coordinates(model), model.createData()
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
+    pin.seed(0)
     first = pin.SE3.Random()
     second = pin.SE3(first.rotation @ pin.exp3(angle * axis), first.translation + 1.0)
     ends = np.zeros((2, coordinates.size))
     ends[:, 4:11] = [pin.SE3ToXYZQUAT(first), pin.SE3ToXYZQUAT(second)]
-    if ends[0, 7:11] @ ends[1, 7:11] < 0.0:  # the nearer of both quaternions of an orientation
+    if ends[0, 7:11] @ ends[1, 7:11] < 0.0:  # take the nearer of the two quaternions
         ends[1, 7:11] *= -1.0
     pin.forwardKinematics(model, data, coordinates.q(ends.mean(axis=0)))
     np.testing.assert_allclose(data.oMi[3].translation, first.translation + 0.5, atol=1e-12)

@@ -50,7 +50,7 @@ def make_random_tree(rng: np.random.Generator, joints: int) -> pin.Model:
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 6), st.integers(0, 5))
 def test_grafted_trees_move_as_before(seed: int, below: int, above: int) -> None:
-    """The tree that carries it also moves as before, and the mass is that of both."""
+    """The base tree also moves as before, and the total mass is the sum of both masses."""
     pin.seed(seed % 2**31)
     rng = np.random.default_rng(seed)
     trunk, branch = make_random_tree(rng, below), make_random_tree(rng, above)
@@ -61,39 +61,39 @@ def test_grafted_trees_move_as_before(seed: int, below: int, above: int) -> None
     assert joints == [parent, *range(trunk.njoints, trunk.njoints + above)]
     z_trunk, z_branch = rng.normal(size=trunk.nv), rng.normal(size=branch.nv)
     q = Coordinates(model).q(np.concatenate([z_trunk, z_branch]))
-    data, carrier, carried = model.createData(), trunk.createData(), branch.createData()
-    for tree, its, at in (
+    data, trunk_data, branch_data = model.createData(), trunk.createData(), branch.createData()
+    for tree, tree_data, configuration in (
         (model, data, q),
-        (trunk, carrier, Coordinates(trunk).q(z_trunk)),
-        (branch, carried, Coordinates(branch).q(z_branch)),
+        (trunk, trunk_data, Coordinates(trunk).q(z_trunk)),
+        (branch, branch_data, Coordinates(branch).q(z_branch)),
     ):
-        pin.framesForwardKinematics(tree, its, at)
-        pin.centerOfMass(tree, its, at)
+        pin.framesForwardKinematics(tree, tree_data, configuration)
+        pin.centerOfMass(tree, tree_data, configuration)
     for index in range(trunk.nframes):
-        assert data.oMf[index].isApprox(carrier.oMf[index], 1e-11)
-    root = carrier.oMi[parent] * placement
+        assert data.oMf[index].isApprox(trunk_data.oMf[index], 1e-11)
+    root = trunk_data.oMi[parent] * placement
     for index, frame in enumerate(branch.frames[1:], 1):
         found = data.oMf[model.getFrameId(f"b.{frame.name}", frame.type)]
-        assert found.isApprox(root * carried.oMf[index], 1e-10)
+        assert found.isApprox(root * branch_data.oMf[index], 1e-10)
     fixed = branch.inertias[0]
     masses = [trunk.inertias[0].mass, fixed.mass, *(i.mass for i in trunk.inertias[1:])]
     masses += [inertia.mass for inertia in branch.inertias[1:]]
     assert pin.computeTotalMass(model) + model.inertias[0].mass == pytest.approx(sum(masses))
     for index in range(1, branch.njoints):
-        there, alone = model.joints[joints[index]], branch.joints[index]
+        grafted, single = model.joints[joints[index]], branch.joints[index]
         assert model.names[joints[index]] == f"b.{branch.names[index]}"
-        assert there.shortname() == alone.shortname()
+        assert grafted.shortname() == single.shortname()
         for limit, first, size in (
             ("effortLimit", "idx_v", "nv"),
             ("velocityLimit", "idx_v", "nv"),
             ("lowerPositionLimit", "idx_q", "nq"),
             ("upperPositionLimit", "idx_q", "nq"),
         ):
-            mine, its = (
+            found_limits, expected_limits = (
                 getattr(tree, limit)[getattr(one, first) :][: getattr(one, size)]
-                for tree, one in ((model, there), (branch, alone))
+                for tree, one in ((model, grafted), (branch, single))
             )
-            np.testing.assert_array_equal(mine, its)
+            np.testing.assert_array_equal(found_limits, expected_limits)
 
 
 @settings(max_examples=15, deadline=None)
@@ -109,23 +109,23 @@ def test_shapes_move_with_the_grafted_tree(seed: int) -> None:
     geometry.addGeometryObject(pin.GeometryObject("first", 0, pin.SE3.Identity(), coal.Sphere(0.1)))
     joints = graft(model, branch, parent=1, placement=placement, prefix="b.")
     assert graft_geometry(geometry, [shape], joints=joints, placement=placement, prefix="b.") == [1]
-    twin = geometry.geometryObjects[1]
-    assert (twin.name, twin.meshPath, twin.overrideMaterial) == ("b.s", "mesh.stl", True)
-    np.testing.assert_array_equal(twin.meshColor, shape.meshColor)
-    np.testing.assert_array_equal(twin.meshScale, shape.meshScale)
+    copy = geometry.geometryObjects[1]
+    assert (copy.name, copy.meshPath, copy.overrideMaterial) == ("b.s", "mesh.stl", True)
+    np.testing.assert_array_equal(copy.meshColor, shape.meshColor)
+    np.testing.assert_array_equal(copy.meshScale, shape.meshScale)
     z_trunk, z_branch = rng.normal(size=trunk.nv), rng.normal(size=branch.nv)
-    data, below, above = model.createData(), trunk.createData(), branch.createData()
+    data, trunk_data, branch_data = model.createData(), trunk.createData(), branch.createData()
     pin.forwardKinematics(model, data, Coordinates(model).q(np.concatenate([z_trunk, z_branch])))
-    pin.forwardKinematics(trunk, below, Coordinates(trunk).q(z_trunk))
-    pin.forwardKinematics(branch, above, Coordinates(branch).q(z_branch))
-    found = data.oMi[twin.parentJoint] * twin.placement
-    expected = below.oMi[1] * placement * above.oMi[shape.parentJoint] * shape.placement
+    pin.forwardKinematics(trunk, trunk_data, Coordinates(trunk).q(z_trunk))
+    pin.forwardKinematics(branch, branch_data, Coordinates(branch).q(z_branch))
+    found = data.oMi[copy.parentJoint] * copy.placement
+    expected = trunk_data.oMi[1] * placement * branch_data.oMi[shape.parentJoint] * shape.placement
     np.testing.assert_allclose(found.homogeneous, expected.homogeneous, atol=1e-11)
 
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_rounding_preserves_placements(seed: int) -> None:
+def test_rounding_removes_only_rounding_errors(seed: int) -> None:
     pin.seed(seed % 2**31)
     placement = pin.SE3.Random()
     np.testing.assert_array_equal(round_placement(placement).homogeneous, placement.homogeneous)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.objects import SHAPES, URDF, load_text
+from helpers.objects import SHAPES, URDF, load_object_text
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.models.articulated_object import DEFAULT_ACCELERATION, DEFAULT_VELOCITY
@@ -17,7 +17,7 @@ ALONG = "name: along, slide: [1, 0, 0], limits: [0, 0.1]"
 SLIDE = "    axis: [0, 1, 0]\n    limits: [-0.1, 0.2]"
 
 
-BASE = """urdf: thing.urdf
+DESCRIPTION = """urdf: thing.urdf
 joints:
   hinge: {acceleration: 3}
 attachments:
@@ -29,18 +29,18 @@ latches:
 
 
 def test_attachments_may_be_empty_but_not_missing() -> None:
-    item = load_text(URDF, "urdf: thing.urdf\nattachments: []")
+    item = load_object_text(URDF, "urdf: thing.urdf\nattachments: []")
     assert dict(item.attachments) == {}
     with pytest.raises(InputError, match="no attachment"):
         item.attachment()
     with pytest.raises(InputError, match="attachments"):
-        load_text(URDF, "urdf: thing.urdf")
+        load_object_text(URDF, "urdf: thing.urdf")
 
 
 def test_default_limits() -> None:
-    thing = load_text(URDF, BASE)
-    np.testing.assert_array_equal(thing.velocity, [1.0, DEFAULT_VELOCITY])
-    np.testing.assert_array_equal(thing.acceleration, [3.0, DEFAULT_ACCELERATION])
+    item = load_object_text(URDF, DESCRIPTION)
+    np.testing.assert_array_equal(item.velocity, [1.0, DEFAULT_VELOCITY])
+    np.testing.assert_array_equal(item.acceleration, [3.0, DEFAULT_ACCELERATION])
 
 
 @pytest.mark.parametrize(
@@ -52,12 +52,12 @@ def test_grasps_of_free_objects_are_firm_by_default(free: int, stated: str, firm
         f"urdf: thing.urdf\nfree: {bool(free)}\n"
         f"attachments: [{{name: grip, link: panel, {stated}}}]"
     )
-    assert load_text(URDF, text).attachment().firm is bool(firm)
+    assert load_object_text(URDF, text).attachment().firm is bool(firm)
 
 
 def test_free_objects_cannot_be_pushed() -> None:
     with pytest.raises(InputError, match="cannot be pushed") as caught:
-        load_text(
+        load_object_text(
             URDF,
             "urdf: thing.urdf\nfree: true\nattachments: [{name: grip, link: panel, contact: push}]",
         )
@@ -71,7 +71,7 @@ def test_duplicate_coordinate_names_raise() -> None:
     )
     both = f"{{{grip}}}, {{{slide}}}"
     with pytest.raises(InputError, match="grip_slide") as caught:
-        load_text(URDF, f"urdf: thing.urdf\nattachments: [{both}]")
+        load_object_text(URDF, f"urdf: thing.urdf\nattachments: [{both}]")
     assert caught.value.field == "attachments[1].name"
 
 
@@ -90,7 +90,7 @@ def test_unknown_names_raise_with_a_suggestion(
     old: str, new: str, line: int, field: str, nearest: str
 ) -> None:
     with pytest.raises(UnknownNameError) as caught:
-        load_text(URDF, BASE.replace(old, new))
+        load_object_text(URDF, DESCRIPTION.replace(old, new))
     assert (caught.value.line, caught.value.field, caught.value.nearest) == (line, field, nearest)
 
 
@@ -125,7 +125,7 @@ def test_unknown_names_raise_with_a_suggestion(
 )
 def test_invalid_attachments_raise_with_their_line(entry: str, line: int, field: str) -> None:
     with pytest.raises(InputError) as caught:
-        load_text(URDF, BASE.replace("link: panel", f"link: panel\n    {entry}"))
+        load_object_text(URDF, DESCRIPTION.replace("link: panel", f"link: panel\n    {entry}"))
     assert (caught.value.line, caught.value.field) == (line, field), str(caught.value)
 
 
@@ -144,7 +144,7 @@ def test_invalid_attachments_raise_with_their_line(entry: str, line: int, field:
 )
 def test_invalid_values_raise_with_their_line(old: str, new: str, line: int, field: str) -> None:
     with pytest.raises(InputError) as caught:
-        load_text(URDF, BASE.replace(old, new))
+        load_object_text(URDF, DESCRIPTION.replace(old, new))
     assert (caught.value.line, caught.value.field) == (line, field), str(caught.value)
     assert Path(str(caught.value.file)).name == "thing.yaml"
 
@@ -168,7 +168,7 @@ def test_invalid_values_raise_with_their_line(old: str, new: str, line: int, fie
 )
 def test_invalid_urdfs_raise(old: str, new: str, message: str) -> None:
     with pytest.raises(InputError) as caught:
-        load_text(URDF.replace(old, new), BASE)
+        load_object_text(URDF.replace(old, new), DESCRIPTION)
     assert message in str(caught.value)
     assert Path(str(caught.value.file)).name == "thing.urdf"
 
@@ -188,7 +188,7 @@ def test_invalid_shapes_raise(kind: str, shape: str, problem: str) -> None:
     good = f"<collision><geometry>{SHAPES[0]}</geometry></collision>"
     wrong = f'<link name="panel">{good}<{kind}><geometry>{shape}</geometry></{kind}></link>'
     with pytest.raises(InputError, match=re.escape(problem)) as caught:
-        load_text(URDF.replace('<link name="panel"/>', wrong), BASE)
+        load_object_text(URDF.replace('<link name="panel"/>', wrong), DESCRIPTION)
     assert str(caught.value.field).startswith("panel_")
 
 
@@ -200,9 +200,9 @@ def test_unknown_objects_raise(tmp_path: Path) -> None:
         load_object(tmp_path / "none.yaml")
     assert missing.value.file == tmp_path / "none.yaml"
     (tmp_path / "thing.yaml").write_text("urdf: none.urdf\nattachments: [{name: a, link: b}]")
-    with pytest.raises(InputError) as lost:
+    with pytest.raises(InputError) as missing_urdf:
         load_object(tmp_path / "thing.yaml")
-    assert lost.value.file == tmp_path / "none.urdf"
+    assert missing_urdf.value.file == tmp_path / "none.urdf"
 
 
 def test_descriptions_can_be_mappings(tmp_path: Path) -> None:
@@ -212,9 +212,9 @@ def test_descriptions_can_be_mappings(tmp_path: Path) -> None:
     mesh = '<collision><geometry><mesh filename="wedge.obj"/></geometry></collision>'
     urdf = f'<robot name="wedge"><link name="base">{mesh}</link></robot>'
     description = {"urdf": urdf, "free": True, "attachments": [{"name": "grip", "link": "base"}]}
-    thing = load_object(description, folder=tmp_path)
-    assert (thing.name, thing.urdf, thing.free) == ("wedge", None, True)
-    assert thing.collision.geometryObjects[0].geometry.num_points == 4
+    item = load_object(description, folder=tmp_path)
+    assert (item.name, item.urdf, item.free) == ("wedge", None, True)
+    assert item.collision.geometryObjects[0].geometry.num_points == 4
     with pytest.raises(InputError, match=r"wedge\.obj"):
         load_object(description, folder=tmp_path / "elsewhere")
     file = tmp_path / "wedge.urdf"

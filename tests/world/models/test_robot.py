@@ -83,10 +83,12 @@ def test_collision_shapes_enclose_the_links(husky: Robot) -> None:
             for shape in shapes
         )
         frame = husky.model.frames[husky.model.getFrameId(link)].placement
-        skin = trimesh.util.concatenate(
+        visual = trimesh.util.concatenate(
             [shape.make_mesh() for shape in husky.file.read_shapes("visual") if shape.link == link]
         )
-        points = np.vstack([skin.vertices, trimesh.sample.sample_surface(skin, 3000, seed=0)[0]])
+        points = np.vstack(
+            [visual.vertices, trimesh.sample.sample_surface(visual, 3000, seed=0)[0]]
+        )
         points = points @ frame.rotation.T + frame.translation
         outside = np.full(len(points), np.inf)
         for shape in shapes:

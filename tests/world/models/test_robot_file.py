@@ -36,13 +36,13 @@ def test_wheels_and_turning_radius(tmp_path: Path) -> None:
     assert husky.wheels is not None
     assert husky.wheels.rim_speed == pytest.approx(husky.wheels.radius * husky.wheels.speed)
     file = write_small_urdf(tmp_path)
-    for given, expected in (
+    for arguments, expected in (
         ({"base": "ackermann"}, "turning_radius"),
         ({"base": "ackermann", "turning_radius": -1.0}, "> 0"),
         ({"base": "differential", "turning_radius": 1.0}, "or base='ackermann'"),
     ):
         with pytest.raises(InputError, match=expected) as caught:
-            load_robot(file, **given)  # type: ignore[arg-type]
+            load_robot(file, **arguments)  # type: ignore[arg-type]
         assert caught.value.field == "turning_radius"
     (tmp_path / "robot.yaml").write_text("urdf: small.urdf\nbase: {turning_radius: 1.2}\n")
     assert load_robot(file, base="ackermann").turning_radius == 1.2
@@ -60,9 +60,9 @@ def test_locked_joints_and_tool_frame() -> None:
     )
     whole = load_robot("husky_ur5e")
     arm = np.array([0.3, -1.0, -1.5, 0.4, 0.2, 0.0])
-    here = compute_placement(robot, "tool", np.concatenate([np.zeros(3), arm[[0, 1, 3, 4]]]))
-    there = compute_placement(whole, "tool", np.concatenate([np.zeros(3), arm]))
-    assert here.isApprox(there, 1e-12)
+    found = compute_placement(robot, "tool", np.concatenate([np.zeros(3), arm[[0, 1, 3, 4]]]))
+    expected = compute_placement(whole, "tool", np.concatenate([np.zeros(3), arm]))
+    assert found.isApprox(expected, 1e-12)
     with pytest.raises(UnknownNameError) as caught:
         load_robot("husky_ur5e", locked_joints={"elbow": 0.0})
     assert caught.value.nearest == "elbow_joint"
@@ -125,9 +125,9 @@ def test_robot_yaml_beside_the_urdf_is_used(tmp_path: Path) -> None:
 
 def test_robots_are_named_after_folder_or_file(tmp_path: Path) -> None:
     write_small_urdf(tmp_path)
-    for name, called in (("robot.yaml", tmp_path.name), ("mine.yaml", "mine")):
+    for name, expected in (("robot.yaml", tmp_path.name), ("mine.yaml", "mine")):
         (tmp_path / name).write_text("urdf: small.urdf\n")
-        assert load_robot(tmp_path / name, pairs="all").name == called
+        assert load_robot(tmp_path / name, pairs="all").name == expected
 
 
 def test_unknown_names_raise() -> None:
@@ -247,8 +247,8 @@ def test_groups_of_the_srdf_select_the_tool_frame(tmp_path: Path) -> None:
         '<group name="whole"><joint name="j0"/><joint name="j1"/><joint name="j2"/></group></robot>'
     )
     (tmp_path / "robot.yaml").write_text("urdf: small.urdf\narm: short\n")
-    for given, tool in (({}, "l2"), ({"arm": "whole"}, "l3"), ({"tool_frame": "l1"}, "l1")):
-        robot = load_robot(tmp_path, **given)
+    for arguments, tool in (({}, "l2"), ({"arm": "whole"}, "l3"), ({"tool_frame": "l1"}, "l1")):
+        robot = load_robot(tmp_path, **arguments)
         assert (robot.tool_frame, len(robot.home)) == (tool, int(tool[1]))
     with pytest.raises(UnknownNameError, match=r"arm: .*'short'.* There are: short, whole"):
         load_robot(tmp_path, arm="shrt")

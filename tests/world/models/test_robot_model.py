@@ -1,4 +1,4 @@
-"""Tests robot models with locked joints."""
+"""Tests the joint placements and visual geometry of robot models."""
 
 from __future__ import annotations
 

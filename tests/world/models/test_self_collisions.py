@@ -30,7 +30,7 @@ def test_committed_srdf_matches_sampling(husky: Robot) -> None:
     )
 
 
-def test_pairs_that_always_or_never_collide(tmp_path: Path) -> None:
+def test_sampled_pairs_are_adjacent_or_always_or_never_collide(tmp_path: Path) -> None:
     radii = {"foot": 1.0, "middle": 0.1, "inner": 0.2, "outer": 0.1}
     parts = [format_ball(name, radius) for name, radius in radii.items()]
     parts += [
@@ -96,7 +96,7 @@ def write_arm(folder: Path, *parts: str, srdf: str | None = None) -> Path:
     return file
 
 
-def write_bracket(folder: Path, *, far: float, srdf: str | None = None) -> Path:
+def write_bracket(folder: Path, *, elbow_x: float, srdf: str | None = None) -> Path:
     """Write a post with a fixed bracket, and a shoulder with a fixed cover and a remote elbow."""
     return write_arm(
         folder,
@@ -110,30 +110,30 @@ def write_bracket(folder: Path, *, far: float, srdf: str | None = None) -> Path:
         format_hinge("post", "bracket", 0.0, kind="fixed"),
         format_hinge("post", "shoulder", 0.0),
         format_hinge("shoulder", "cover", 0.0, kind="fixed"),
-        format_hinge("shoulder", "elbow", far),
+        format_hinge("shoulder", "elbow", elbow_x),
         srdf=srdf,
     )
 
 
 def test_close_neighbours_missing_in_the_srdf_are_adjacent(tmp_path: Path) -> None:
-    robot = load_robot(write_bracket(tmp_path, far=0.5, srdf=""))
-    kept_apart = {
+    robot = load_robot(write_bracket(tmp_path, elbow_x=0.5, srdf=""))
+    checked = {
         tuple(sorted((robot.link_of(p.first), robot.link_of(p.second))))
         for p in robot.collision.collisionPairs
     }
-    assert not kept_apart & {
+    assert not checked & {
         ("post", "shoulder"),
         ("bracket", "cover"),
         ("cover", "post"),
         ("bracket", "shoulder"),
     }
-    assert ("elbow", "post") in kept_apart
+    assert ("elbow", "post") in checked
 
 
-def write_slider(folder: Path, *, room: float, srdf: str | None = None, at: float = 0.0) -> Path:
-    """Write a finger of radius 20 mm on two slides, at most `room` away from the wall ahead."""
+def write_slider(folder: Path, *, gap: float, srdf: str | None = None, at: float = 0.0) -> Path:
+    """Write a finger of radius 20 mm on two slides, at most `gap` away from the wall ahead."""
     slides = [
-        format_hinge("wall", "carriage", 0.04 + at, kind="prismatic", axis="1 0 0", upper=room)
+        format_hinge("wall", "carriage", 0.04 + at, kind="prismatic", axis="1 0 0", upper=gap)
     ]
     slides.append(
         format_hinge("carriage", "finger", 0.0, kind="prismatic", axis="0 1 0", upper=1e-6)
@@ -149,7 +149,7 @@ def write_slider(folder: Path, *, room: float, srdf: str | None = None, at: floa
 
 
 def test_tight_pairs_have_half_their_distance_as_margin(tmp_path: Path) -> None:
-    robot = load_robot(write_slider(tmp_path, room=0.012, at=0.004))
+    robot = load_robot(write_slider(tmp_path, gap=0.012, at=0.004))
     assert list(robot.tight) == [("finger", "wall")]
     assert robot.tight["finger", "wall"] == pytest.approx(
         0.004, abs=1e-9
@@ -166,7 +166,7 @@ def test_tight_pairs_have_half_their_distance_as_margin(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("srdf", [None, ""], ids=["sampled", "srdf"])
 def test_links_that_always_touch_are_not_checked(tmp_path: Path, srdf: str | None) -> None:
-    file = write_slider(tmp_path, room=0.0005, srdf=srdf)
+    file = write_slider(tmp_path, gap=0.0005, srdf=srdf)
     other = (
         format_ball("far", 0.01)
         + format_hinge("finger", "far", 0.5, upper=3.1)
@@ -182,16 +182,16 @@ def test_links_that_always_touch_are_not_checked(tmp_path: Path, srdf: str | Non
             match=r"arm.urdf: links that always overlap or touch are not checked: finger – wall$",
         ):
             robot = load_robot(file)
-    kept_apart = {
+    checked = {
         tuple(sorted((robot.link_of(p.first), robot.link_of(p.second))))
         for p in robot.collision.collisionPairs
     }
-    assert ("finger", "wall") not in kept_apart
-    assert ("end", "wall") in kept_apart
+    assert ("finger", "wall") not in checked
+    assert ("end", "wall") in checked
 
 
 def test_overlap_at_a_stated_home_warns(tmp_path: Path) -> None:
-    file = write_slider(tmp_path, room=0.1, at=0.02, srdf="")
+    file = write_slider(tmp_path, gap=0.1, at=0.02, srdf="")
     home = {"carriage_joint": -0.03, "finger_joint": 0.0}
     with pytest.warns(
         UserWarning, match=r"links that overlap at home are not checked: finger – wall$"
@@ -202,7 +202,7 @@ def test_overlap_at_a_stated_home_warns(tmp_path: Path) -> None:
 
 def test_unstated_homes_are_collision_free(tmp_path: Path) -> None:
     """Only joints without stated position are moved, as little as possible, reproducibly."""
-    file = write_slider(tmp_path, room=0.1, at=-0.01)
+    file = write_slider(tmp_path, gap=0.1, at=-0.01)
     with pytest.warns(
         UserWarning,
         match=r"arm.urdf: links overlap at the default home; .* carriage_joint: 0.0\d+",
@@ -214,10 +214,10 @@ def test_unstated_homes_are_collision_free(tmp_path: Path) -> None:
 
 
 def test_analysis_is_cached_by_its_inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A second call uses the record; changed shapes, limits or homes make a new one."""
+    """A second call reads the cached file; changed shapes, limits or homes write a new one."""
     cache = tmp_path / "cache"
     monkeypatch.setenv(disk_cache.CACHE_VARIABLE, str(cache))
-    file = write_slider(tmp_path, room=0.012, at=0.004)
+    file = write_slider(tmp_path, gap=0.012, at=0.004)
     first, again = load_robot(file), load_robot(file)
     assert len(list(cache.rglob("*.json"))) == 1
     assert (first.tight, first.home.tolist(), first.own_margins(0.02)) == (

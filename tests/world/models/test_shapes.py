@@ -30,7 +30,7 @@ from vkc_pin.world.models.shapes import (
 
 Solid = tuple[coal.CollisionGeometry, pin.SE3]
 
-# Shape, its volume [m³].
+# Shapes and their volumes [m³].
 SOLIDS: list[tuple[Callable[[], coal.CollisionGeometry], float]] = [
     (lambda: coal.Box(0.2, 0.3, 0.4), 0.024),
     (lambda: coal.Sphere(0.2), 4 / 3 * np.pi * 0.008),
@@ -53,11 +53,11 @@ def make_random_solids(rng: np.random.Generator, count: int, size: float) -> lis
 def test_clearance_is_the_smallest_pair_distance(seed: int, size: float) -> None:
     rng = np.random.default_rng(seed)
     first, second = make_random_solids(rng, 4, size), make_random_solids(rng, 6, size)
-    least = min(compute_shape_distance(*one, *other) for one in first for other in second)
-    assert compute_clearance(first, second) == pytest.approx(least, abs=1e-6)
+    smallest = min(compute_shape_distance(*one, *other) for one in first for other in second)
+    assert compute_clearance(first, second) == pytest.approx(smallest, abs=1e-6)
     assert compute_clearance(first, []) == np.inf
     near = compute_clearance(first, second, reach=0.2)
-    assert near == pytest.approx(least, abs=1e-6) if least < 0.2 - 1e-6 else near >= 0.2
+    assert near == pytest.approx(smallest, abs=1e-6) if smallest < 0.2 - 1e-6 else near >= 0.2
 
 
 @pytest.mark.parametrize("number", range(len(SOLIDS)))
@@ -116,16 +116,17 @@ def test_values_outside_limits_raise(value: float) -> None:
 
 
 def test_copies_are_fixed_in_the_world() -> None:
+    pin.seed(0)
     shape = pin.GeometryObject("arm_3", 4, 7, pin.SE3.Random(), coal.Sphere(0.1))
-    place = pin.SE3(np.eye(3), np.array([1.0, 2.0, 3.0]))
-    copy = copy_shape(shape, "cup.arm_3", place)
+    placement = pin.SE3(np.eye(3), np.array([1.0, 2.0, 3.0]))
+    copy = copy_shape(shape, "cup.arm_3", placement)
     assert (copy.name, copy.parentJoint, copy.parentFrame, shape.name) == (
         "cup.arm_3",
         0,
         0,
         "arm_3",
     )
-    assert copy.placement.isApprox(place)
+    assert copy.placement.isApprox(placement)
     assert (
         get_local_name(copy.name),
         get_link_name(get_local_name(copy.name)),

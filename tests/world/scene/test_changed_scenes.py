@@ -34,7 +34,7 @@ angles = st.floats(-np.pi, np.pi)
 lengths = st.floats(-2.0, 2.0)
 
 
-def load(folder: Path, held: str) -> Scene:
+def load_hall(folder: Path, held: str) -> Scene:
     (folder / "hall.yaml").write_text(HALL.replace("held: {}", f"held: {held}"))
     return load_scene(folder / "hall.yaml")
 
@@ -54,28 +54,28 @@ def make_hall() -> Scene:
     )
 
 
-def assert_same(one: pin.SE3, other: pin.SE3, atol: float = 1e-9) -> None:
+def assert_close(one: pin.SE3, other: pin.SE3, atol: float = 1e-9) -> None:
     np.testing.assert_allclose(one.homogeneous, other.homogeneous, rtol=0.0, atol=atol)
 
 
-def start(draw: st.DrawFn, scene: Scene) -> Scene:
+def change_start(draw: st.DrawFn, scene: Scene) -> Scene:
     arm = draw(st.none() | st.lists(st.floats(-1.5, 1.5), min_size=6, max_size=6))
     return scene.with_start(base=draw(st.none() | st.tuples(lengths, lengths, angles)), arm=arm)
 
 
-def turn(draw: st.DrawFn, scene: Scene) -> Scene:
+def change_state(draw: st.DrawFn, scene: Scene) -> Scene:
     return scene.with_state("front", {"hinge": draw(st.floats(0.0, 1.2))})
 
 
-def move(draw: st.DrawFn, scene: Scene) -> Scene:
-    """Move an object anywhere, upside down and upright (where roll and yaw are one), too."""
+def change_placement(draw: st.DrawFn, scene: Scene) -> Scene:
+    """Move an object; poses include a pitch of π/2, where roll and yaw coincide."""
     pitch = st.sampled_from([0.0, np.pi / 2]) | angles
     rotation = pin.rpy.rpyToMatrix(*draw(st.tuples(angles, pitch, angles)))
     name = draw(st.sampled_from(["cane", "fruit", "front"]))
     return scene.with_placement(name, pin.SE3(rotation, np.array(draw(st.tuples(*[lengths] * 3)))))
 
 
-def hold(draw: st.DrawFn, scene: Scene) -> Scene:
+def change_holds(draw: st.DrawFn, scene: Scene) -> Scene:
     held, by = draw(st.sampled_from([({}, {}), (GRIP, {}), (BOTH, {}), (BOTH, BY)]))
     values = draw(st.none() | st.tuples(st.floats(-0.09, 0.09), st.floats(-1.0, 1.0)))
     return scene.with_held(held, by=by, at={"cane": values} if held and values else {})
@@ -84,7 +84,12 @@ def hold(draw: st.DrawFn, scene: Scene) -> Scene:
 @st.composite
 def changed_scenes(draw: st.DrawFn) -> Scene:
     scene = make_hall()
-    for change in draw(st.lists(st.sampled_from([start, turn, move, hold]), max_size=5)):
+    for change in draw(
+        st.lists(
+            st.sampled_from([change_start, change_state, change_placement, change_holds]),
+            max_size=5,
+        )
+    ):
         scene = change(draw, scene)
     return scene
 
@@ -98,7 +103,7 @@ def test_document_describes_the_changed_scene(scene: Scene) -> None:
     np.testing.assert_array_equal(again.start, scene.start)
     for name, placed in scene.objects.items():
         np.testing.assert_array_equal(again.objects[name].state, placed.state)
-        assert_same(again.objects[name].placement, placed.placement, 1e-12)
+        assert_close(again.objects[name].placement, placed.placement, 1e-12)
     assert again.document == scene.document
 
 
@@ -112,7 +117,7 @@ def test_documents_and_placements_are_copies() -> None:
     )
     make_hall().document["objects"].clear()
     front = {entry["name"]: entry for entry in moved.document["objects"]}["front"]
-    assert front["yaw"] == 0.7, "descriptions of unmoved objects are kept"
+    assert front["yaw"] == 0.7, "the description of an unmoved object changed"
 
 
 @pytest.mark.parametrize("values", [(0.0, 0.0), (0.05, -0.4), (-0.095, 1.2)])
@@ -124,10 +129,10 @@ def test_held_object_follows_the_hand(values: tuple[float, float]) -> None:
         held.with_placement("cane", pin.SE3.Identity()),
     ):
         grasp = compute_grasp_pose(pin.SE3.Identity(), values=values)
-        assert_same(scene.objects["cane"].placement, scene.tool_placement() * grasp.inverse())
+        assert_close(scene.objects["cane"].placement, scene.tool_placement() * grasp.inverse())
     released = held.with_held({})
     assert (released.holds, released.held) == ((), {})
-    assert_same(released.objects["cane"].placement, held.objects["cane"].placement)
+    assert_close(released.objects["cane"].placement, held.objects["cane"].placement)
 
 
 def test_object_held_through_another_follows_its_link(tmp_path: Path) -> None:
@@ -136,11 +141,11 @@ def test_object_held_through_another_follows_its_link(tmp_path: Path) -> None:
     held = make_hall().with_held({"fruit": "pull", "cane": "grip"}, by=BY, at=at)
     assert [str(one) for one in held.holds] == ["cane.grip", "fruit.pull by cane.tip"]
     fruit = "fruit: {attachment: pull, by: cane.tip, at: [0.3, 0.2, 0.1]}"
-    file = load(tmp_path, f"{{{fruit}, cane: {{attachment: grip, at: [0.05, -0.4]}}}}")
+    file = load_hall(tmp_path, f"{{{fruit}, cane: {{attachment: grip, at: [0.05, -0.4]}}}}")
     for scene in (held, held.with_start(base=[1.0, 2.0, -2.0]), file):
         tip = scene.objects["cane"].link_placement("tip")
         on_tip = compute_grasp_pose(pin.SE3.Identity(), "ball", "pull", roll)
-        assert_same(scene.objects["fruit"].placement, tip * on_tip.inverse())
+        assert_close(scene.objects["fruit"].placement, tip * on_tip.inverse())
     crate = {
         "name": "crate",
         "type": "sphere",
@@ -148,11 +153,11 @@ def test_object_held_through_another_follows_its_link(tmp_path: Path) -> None:
         "position": held.objects["fruit"].placement.translation.tolist(),
     }
     hit = Scene.from_document({**held.document, "obstacles": [crate]})
-    assert hit.start_clearance() < 0.0, "held objects belong to the robot"
+    assert hit.start_clearance() < 0.0, "held objects are part of the robot"
 
 
 def test_short_form_of_holds(tmp_path: Path) -> None:
-    scene = load(tmp_path, "{cane: end}")
+    scene = load_hall(tmp_path, "{cane: end}")
     assert scene.document["start"]["held"] == {"cane": {"attachment": "end"}}
     assert scene.held == make_hall().with_held(GRIP).with_held({"cane": "end"}).held
 
@@ -227,6 +232,6 @@ def test_invalid_holds_are_located_in_files(
     tmp_path: Path, held: str, field: str, details: str
 ) -> None:
     with pytest.raises(InputError, match=details.replace("?", r"\?")) as caught:
-        load(tmp_path, held)
+        load_hall(tmp_path, held)
     assert (caught.value.file, caught.value.line) == (tmp_path / "hall.yaml", 5)
     assert str(caught.value.field).startswith(field)

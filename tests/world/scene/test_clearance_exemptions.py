@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.drawers import add_boxes, load_drawer_scene, replace_drawer_fields
+from helpers.drawers import add_boxes, load_drawer_scene, replace_scene_fields
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -24,13 +24,13 @@ from vkc_pin.world.scene.clearance_exemptions import (
 from vkc_pin.world.scene.scene import Scene
 
 SAFE = 0.02
-# y of the side of the drawer's front, which reaches from x = 1.885 to 1.903 when it is shut
+# y of the side of the drawer's front; the shut front extends from x = 1.885 to 1.903
 TRAY = 0.295
 HINGE = {"hinge": 1.2}
 
 
 def make_panel_scene(gap: float, begin: float = 1.7) -> Scene:
-    """Return the drawer's room with a panel beside the drawer's front, from x = `begin` on."""
+    """Return the drawer scene with a panel beside the drawer's front that starts at x = `begin`."""
     depth = 2.3 - begin
     return add_boxes(
         load_drawer_scene(), side=((depth, 0.1, 0.9), (begin + depth / 2, TRAY + gap + 0.05, 0.45))
@@ -60,7 +60,7 @@ def make_wall_scene(depth: float = 0.05, **fields: Any) -> Scene:
 
 @given(gap=st.floats(0.001, 0.018), begin=st.floats(1.4, 1.8))
 @settings(max_examples=8, deadline=None)
-def test_drawer_is_exempt_from_a_panel_until_it_has_passed_it(gap: float, begin: float) -> None:
+def test_drawer_is_exempt_from_a_panel_until_it_has_passed(gap: float, begin: float) -> None:
     (close,) = find_close_pairs(make_panel_scene(gap, begin), SAFE)
     assert close[:2] == ("drawer.tray", "side")
     assert close.distance == pytest.approx(gap, abs=1e-6)
@@ -68,46 +68,44 @@ def test_drawer_is_exempt_from_a_panel_until_it_has_passed_it(gap: float, begin:
     assert (one.margin, one.distance) == (0.0, close.distance)
     lower, upper = one.ranges["drawer.slide"]
     assert lower == -np.inf
-    # When the front's back face has left the panel's end, the distance is √(gap² + travel²).
-    leaves = 1.903 - begin + np.sqrt(SAFE**2 - gap**2)
+    # Once the back face of the front is past the panel, the distance is √(gap² + travel²).
+    clear_at = 1.903 - begin + np.sqrt(SAFE**2 - gap**2)
     assert upper == (
         np.inf
-        if leaves > load_drawer_scene().objects["drawer"].object.upper[0]
-        else pytest.approx(leaves, abs=2e-4)
+        if clear_at > load_drawer_scene().objects["drawer"].object.upper[0]
+        else pytest.approx(clear_at, abs=2e-4)
     )
 
 
 def test_cache_depends_on_obstacles_and_states() -> None:
     scene = make_panel_scene(0.004, 1.4)
     (one,) = find_clearance_exemptions(scene, SAFE)
-    kept = [k for k, label in enumerate(scene.obstacle_labels) if label != "side"]
-    parts = {
-        name: tuple(getattr(scene, name)[k] for k in kept)
+    remaining = [k for k, label in enumerate(scene.obstacle_labels) if label != "side"]
+    fields = {
+        name: tuple(getattr(scene, name)[k] for k in remaining)
         for name in ("obstacles", "obstacle_labels")
     }
-    assert find_clearance_exemptions(dataclasses.replace(scene, **parts), SAFE) == ()
+    assert find_clearance_exemptions(dataclasses.replace(scene, **fields), SAFE) == ()
     assert find_clearance_exemptions(scene.with_start(base=[0.0, 0.0, 0.0]), SAFE) == (one,)
     ahead = add_boxes(
         load_drawer_scene(), ahead=((0.1, 0.5, 0.2), (1.43, 0.0, 0.755))
-    )  # 0.37 m before the front, which is 0.59 m wide
+    )  # 0.37 m ahead of the front, which is 0.59 m wide
     assert find_clearance_exemptions(ahead, SAFE) == ()
-    met = find_clearance_exemptions(ahead.with_state("drawer", {"slide": 0.4}), SAFE)
-    assert {(one.first, one.second) for one in met} == {("drawer.tray", "ahead")}
-    assert -np.inf in {one.margin for one in met}
-    assert len({one.shapes for one in met}) == len(
-        met
-    )  # each shape of the tray that is close has its own
+    found = find_clearance_exemptions(ahead.with_state("drawer", {"slide": 0.4}), SAFE)
+    assert {(one.first, one.second) for one in found} == {("drawer.tray", "ahead")}
+    assert -np.inf in {one.margin for one in found}
+    assert len({one.shapes for one in found}) == len(found)  # one for each close shape of the tray
 
 
 def test_drawers_side_by_side_are_exempt_until_either_has_passed() -> None:
-    gap, thick = 0.015, 0.018  # between the fronts, and of each
+    gap, thickness = 0.015, 0.018  # gap between the fronts, and their thickness
     drawer = {"type": "drawer", "position": [1.93, 0.0, 0.0]}
     at = [[1.93, y, 0.0] for y in (0.0, 2 * TRAY + gap)]
     pair = [
         {**drawer, "name": name, "position": place}
         for name, place in zip(("near", "next"), at, strict=True)
     ]
-    scene = replace_drawer_fields(load_drawer_scene(), objects=pair, obstacles=[])
+    scene = replace_scene_fields(load_drawer_scene(), objects=pair, obstacles=[])
     (one,) = find_clearance_exemptions(scene, SAFE)
     assert one.is_between("near.tray", "next.tray")
     # The ranges follow the state of either drawer.
@@ -117,9 +115,9 @@ def test_drawers_side_by_side_are_exempt_until_either_has_passed() -> None:
         assert sorted(each.ranges[f"{other}.slide"][1] for each in found) == pytest.approx(
             [upper, upper + 0.01], abs=4e-4
         )
-    leaves = thick + np.sqrt(SAFE**2 - gap**2)
+    clear_at = thickness + np.sqrt(SAFE**2 - gap**2)
     assert {name: ends[1] for name, ends in one.ranges.items()} == {
-        f"{name}.slide": pytest.approx(leaves, abs=2e-4) for name in ("near", "next")
+        f"{name}.slide": pytest.approx(clear_at, abs=2e-4) for name in ("near", "next")
     }
     out = np.array([[0.0, 0.0], [0.02, 0.03], [0.05, 0.0], [0.0, 0.05]])
     assert one.is_active(["near.slide", "next.slide"], out).tolist() == [True, True, False, False]
@@ -152,7 +150,7 @@ def test_warning_names_overlapping_links() -> None:
     assert (one.margin, one.ranges) == (-np.inf, {"door.hinge": (-np.inf, np.inf)})
 
 
-def test_exemptions_of_built_neighbours_hold_in_any_state() -> None:
+def test_exemptions_at_zero_joint_positions_apply_in_any_state() -> None:
     (one,) = find_clearance_exemptions(make_panel_scene(0.004), SAFE)
     opened = make_panel_scene(0.004).with_state("drawer", {"slide": 0.4})
     assert find_close_pairs(opened, SAFE) == []
@@ -192,7 +190,7 @@ def test_allowed_pairs_of_a_scene(tmp_path: Path, allow: list[Any], margin: floa
 
 
 @pytest.mark.parametrize(
-    ("allow", "field", "said"),
+    ("allow", "field", "message"),
     [
         ([["door.panle", "wall"]], "allow[0][0]", "did you mean 'door.panel'"),
         ([{"pair": ["door", "wal"]}], "allow[0].pair[1]", "did you mean 'wall'"),
@@ -201,23 +199,23 @@ def test_allowed_pairs_of_a_scene(tmp_path: Path, allow: list[Any], margin: floa
         ([{"pair": ["door", "wall"], "margin": "thin"}], "allow[0].margin", "a number"),
     ],
 )
-def test_errors_name_invalid_allowed_pairs(allow: list[Any], field: str, said: str) -> None:
+def test_errors_name_invalid_allowed_pairs(allow: list[Any], field: str, message: str) -> None:
     with pytest.raises(InputError) as caught:
         Scene.from_document({**make_wall_scene(-0.03).document, "allow": allow})
     assert caught.value.field == field
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
-def test_missing_file_suggests_the_nearest_one(tmp_path: Path) -> None:
+def test_missing_file_error_suggests_the_nearest_file(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     for name in ("door.yaml", "door.yml", "oven.yaml"):
         (tmp_path / "mine" / name).touch()
     door = {"name": "door", "type": "mine/dor.yaml", "position": [2.0, 0.0, 0.0]}
-    for missing, said in (
+    for missing, message in (
         ("mine/dor.yaml", ", perhaps mine/door.yaml, got"),
         ("none/dor.yaml", rf"a file in {tmp_path}, got"),
     ):
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=message):
             Scene.from_document(
                 {
                     **make_wall_scene(-0.03).document,
@@ -237,7 +235,7 @@ def test_unknown_links_in_srdf_are_located(tmp_path: Path) -> None:
 
 
 def test_door_opens_and_closes_in_its_wall() -> None:
-    """The oracle, which finds neighbours on its own, judges the plan too."""
+    """The oracle, which finds close pairs independently, also checks the plan."""
     with pytest.warns(UserWarning, match="overlap by 50"):
         scene = make_wall_scene()
     plan = vkc.plan(scene, [vkc.Actuate("door", HINGE), vkc.Actuate("door", {"hinge": 0.0})])
@@ -257,8 +255,8 @@ def test_cup_may_leave_but_not_enter_an_overlap() -> None:
     assert {violation.constraint for violation in deep.violations} == {"goal"}
 
 
-def test_allowed_margin_decides_about_a_leaf_that_turns_into_its_wall() -> None:
-    """3 mm are too few for a leaf 40 mm thick that turns about its edge."""
+def test_allowed_margin_lets_a_leaf_turn_into_its_wall() -> None:
+    """A gap of 3 mm is too small for a leaf 40 mm thick that turns about its edge."""
     scene = make_wall_scene(-0.003)
     plan = vkc.plan(scene, [vkc.Actuate("door", HINGE)])
     assert plan.status == "infeasible"
@@ -285,7 +283,7 @@ def format_box(position: str, size: str) -> str:
 
 
 def write_post_scene(folder: Path, *, block: bool) -> Scene:
-    """Return a room with a leaf 1 mm inside its post; the same obstacle may have a block."""
+    """Return a scene with a leaf 1 mm inside its post, and optionally a block on the same wall."""
     post, blocking = (
         format_box("0.02 0.049 1", "0.1 0.1 2"),
         format_box("0.3 -0.25 0.3", "0.2 0.2 0.6"),

@@ -1,4 +1,4 @@
-"""Tests each rule for shapes that may be close to each other."""
+"""Tests the rules for contact and clearance between hand and object."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ LEVER, PANEL = "door.lever", "door.panel"
 
 
 def load_door(attachment: str = "handle", **fields: object) -> Scene:
-    """Return the door's scene, with something about an attachment changed."""
+    """Return the door scene with changed fields of one attachment."""
     scene = load_door_scene()
-    given = scene.objects["door"].object.attachments
-    changed: Attachment = dataclasses.replace(given[attachment], **fields)  # type: ignore[arg-type]
-    return replace_object(scene, attachments={**given, attachment: changed})
+    attachments = scene.objects["door"].object.attachments
+    changed: Attachment = dataclasses.replace(attachments[attachment], **fields)  # type: ignore[arg-type]
+    return replace_object(scene, attachments={**attachments, attachment: changed})
 
 
 @pytest.mark.parametrize(
     ("clearance", "expected"),
-    [(None, 0.005), (0.012, 0.012), (0.0, 0.0), (0.5, 0.02)],  # no more than everything keeps
+    [(None, 0.005), (0.012, 0.012), (0.0, 0.0), (0.5, 0.02)],  # at most the general clearance
 )
-def test_a_hand_keeps_the_attachments_clearance(clearance: float | None, expected: float) -> None:
+def test_hand_clearance_is_that_of_the_attachment(clearance: float | None, expected: float) -> None:
     scene = load_door(clearance=clearance)
     for link in (LEVER, PANEL):
         assert compute_hand_clearance(scene, HANDLE, link, Options()) == expected
@@ -61,9 +61,9 @@ def test_pushing_or_indirect_hold_needs_no_clearance_from_its_link() -> None:
 
 
 @pytest.mark.parametrize(
-    ("attachment", "contact", "firm", "as_one"),
+    ("attachment", "contact", "firm", "is_rigid"),
     [
-        ("handle", "grasp", False, True),  # it leaves no freedom
+        ("handle", "grasp", False, True),  # without freedoms
         ("handle", "grasp", True, True),
         ("handle_free", "grasp", False, False),
         ("handle_free", "grasp", True, True),  # clamped
@@ -71,12 +71,12 @@ def test_pushing_or_indirect_hold_needs_no_clearance_from_its_link() -> None:
         ("handle_free", "push", True, False),
     ],
 )
-def test_rigid_grasps(attachment: str, contact: str, firm: bool, as_one: bool) -> None:
+def test_rigid_grasps(attachment: str, contact: str, firm: bool, is_rigid: bool) -> None:
     scene = load_door(attachment, contact=contact, firm=firm)
     assert bool(scene.objects["door"].object.attachments[attachment].freedoms) == (
         attachment == "handle_free"
     )
-    assert is_rigid_grasp(scene, Hold("door", attachment)) == as_one
+    assert is_rigid_grasp(scene, Hold("door", attachment)) == is_rigid
 
 
 def test_hand_frame_of_a_push_is_the_foremost_point() -> None:
@@ -89,7 +89,7 @@ def test_hand_frame_of_a_push_is_the_foremost_point() -> None:
 
 
 def test_gripper_openings(tmp_path: Path) -> None:
-    """At grasps, at the start, and without a gripper."""
+    """Covers grasps, the start, and robots without a gripper."""
     scene = write_cheeks_scene(write_gripper(tmp_path / "mine"), opening=0.04, start=0.03)
     hold = Hold("drawer", "grip")
     assert compute_grasp_opening(scene, hold) == pytest.approx(0.04)

@@ -1,4 +1,4 @@
-"""Tests holds: their dependencies, and invalid descriptions."""
+"""Tests the order of holds and the reversal of approaches."""
 
 from __future__ import annotations
 
@@ -68,15 +68,15 @@ def write_object(path: Path, name: str, old: str, new: str) -> str:
 def test_approach_from_inside_is_reversed(
     tmp_path: Path,
 ) -> None:
-    right = load_drawer_scene()
+    original = load_drawer_scene()
     item = {
-        **right.document["objects"][0],
+        **original.document["objects"][0],
         "type": write_object(tmp_path, "drawer", "approach: [1, 0, 0]", "approach: [-1, 0, 0]"),
     }
     with pytest.warns(
         UserWarning, match=r"the hand would approach drawer\.handle through the object"
     ) as caught:
-        scene = Scene.from_document({**right.document, "objects": [item]}, right.folder)
+        scene = Scene.from_document({**original.document, "objects": [item]}, original.folder)
     assert sorted(str(one.message).split()[5] for one in caught) == [
         "drawer.handle",
         "drawer.handle_free",
@@ -85,10 +85,12 @@ def test_approach_from_inside_is_reversed(
     placed = scene.objects["drawer"]
     assert placed.reversed == ("handle", "handle_free")
     for name in placed.reversed:
-        mine, given = (one.objects["drawer"].object.attachment(name) for one in (scene, right))
+        found, expected = (
+            one.objects["drawer"].object.attachment(name) for one in (scene, original)
+        )
         np.testing.assert_allclose(
-            mine.tool(np.zeros(len(mine.freedoms))),
-            given.tool(np.zeros(len(given.freedoms))),
+            found.tool(np.zeros(len(found.freedoms))),
+            expected.tool(np.zeros(len(expected.freedoms))),
             atol=1e-12,
         )
     with warnings.catch_warnings():
@@ -102,23 +104,23 @@ def test_approach_from_inside_is_reversed(
 
 def test_approach_from_below_the_floor_is_reversed(tmp_path: Path) -> None:
     free = "\n    closing: [1, 0, 0]\n    joint: spherical\n    limits: [-1.5, 1.5]"
-    said = write_object(
+    file = write_object(
         tmp_path,
         "ball",
         f"approach: [0, 0, -1]{free}",
         "approach: [0, 0, 1]\n    closing: [1, 0, 0]",
     )
     document = {"robot": "husky_ur5e", "start": {"base": [0.0, 0.0, 0.0]}}
-    ball = {"name": "ball", "type": said, "position": [1.2, 0.0, 0.036]}
+    ball = {"name": "ball", "type": file, "position": [1.2, 0.0, 0.036]}
     with pytest.warns(UserWarning, match=r"ball\.grip through the object or the floor"):
         scene = Scene.from_document({**document, "objects": [ball]})
     assert scene.objects["ball"].reversed == ("grip",)
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # high above the floor, from below is as good as any
+        warnings.simplefilter("error")  # high above the floor, an approach from below is valid
         high = Scene.from_document({**document, "objects": [{**ball, "position": [1.2, 0.0, 1.0]}]})
         flat = Scene.from_document({**document, "objects": [ball], "floor": False})
-        kept = Scene.from_document({**document, "objects": [{**ball, "reversed": []}]})
-    assert [one.objects["ball"].reversed for one in (high, flat, kept)] == [()] * 3
+        stated = Scene.from_document({**document, "objects": [{**ball, "reversed": []}]})
+    assert [one.objects["ball"].reversed for one in (high, flat, stated)] == [()] * 3
 
 
 @pytest.mark.parametrize("name", ["door", "ball", "stick"])
@@ -126,18 +128,20 @@ def test_reversing_twice_restores_the_approach(name: str) -> None:
     item = load_object(name)
     state = np.zeros(item.coordinates.size)
     placed = vkc.PlacedObject(name, item, pin.SE3.Identity(), state)
-    for attachment, given in item.attachments.items():
-        values = [0.3 * freedom.lower + 0.4 * freedom.upper for freedom in given.freedoms]
+    for attachment, grasp in item.attachments.items():
+        values = [0.3 * freedom.lower + 0.4 * freedom.upper for freedom in grasp.freedoms]
         turned = placed.with_reversed(attachment)
-        there, here = turned.object.attachment(attachment).tool(values), given.tool(values)
-        closing = there.rotation[:, 0], here.rotation[:, 0]
+        reversed_tool, tool = turned.object.attachment(attachment).tool(values), grasp.tool(values)
+        closing = reversed_tool.rotation[:, 0], tool.rotation[:, 0]
         np.testing.assert_allclose(*closing, atol=1e-12)
-        np.testing.assert_allclose(there.rotation[:, 2], -here.rotation[:, 2], atol=1e-12)
-        centre = [one.translation + given.standoff * one.rotation[:, 2] for one in (there, here)]
+        np.testing.assert_allclose(reversed_tool.rotation[:, 2], -tool.rotation[:, 2], atol=1e-12)
+        centre = [
+            one.translation + grasp.standoff * one.rotation[:, 2] for one in (reversed_tool, tool)
+        ]
         np.testing.assert_allclose(*centre, atol=1e-12)
         back = turned.with_reversed(attachment)
         again = back.object.attachment(attachment).tool(values)
-        np.testing.assert_allclose(again, here, atol=1e-12)
+        np.testing.assert_allclose(again, tool, atol=1e-12)
         assert back.reversed == ()
     with pytest.raises(UnknownNameError, match="there is no attachment"):
         placed.with_reversed("nowhere")

@@ -1,4 +1,4 @@
-"""Tests measured grasps: the virtual joint they give, their files, and their bounds."""
+"""Tests measured grasps: their virtual joints, files and bounds."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.drawers import STANDING, load_drawer_scene, make_grasping_scene
+from helpers.drawers import NEAR_HANDLE, load_drawer_scene, make_grasping_scene
 from helpers.small_problems import replace_objects
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -42,34 +42,34 @@ def make_hall() -> vkc.Scene:
     return vkc.Scene.from_document(HALL)
 
 
-def make_measured(name: str, attachment: str, at: list[float], off: np.ndarray) -> pin.SE3:
-    """Return the attachment's frame in that of a tool that is `off` the nominal grasp."""
+def make_measured(name: str, attachment: str, at: list[float], offset: np.ndarray) -> pin.SE3:
+    """Return the attachment's pose in a tool frame displaced from the nominal grasp by `offset`."""
     grasp = make_hall().objects[name].object.attachment(attachment)
-    return (grasp.motion(at) * pin.SE3(pin.exp3(off[3:]), off[:3])).inverse()
+    return (grasp.motion(at) * pin.SE3(pin.exp3(offset[3:]), offset[:3])).inverse()
 
 
 def make_measured_scene(
-    grasp: tuple[str, str], share: float, off: np.ndarray
+    grasp: tuple[str, str], fraction: float, offset: np.ndarray
 ) -> tuple[vkc.Scene, pin.SE3]:
-    """Return a scene with a grasp that is off in the direction `off`, and its measured pose."""
+    """Return a scene with a grasp displaced in the direction `offset`, and its measured pose."""
     name, attachment = grasp
-    at = choose_values(name, attachment, share)
-    measured = make_measured(*grasp, at, off * np.repeat([0.011, 0.11], 3))
+    at = choose_values(name, attachment, fraction)
+    measured = make_measured(*grasp, at, offset * np.repeat([0.011, 0.11], 3))
     scene = make_hall().with_held({name: attachment}, at={name: at}, measured={name: measured})
     return scene, measured
 
 
-def choose_values(name: str, attachment: str, share: float) -> list[float]:
+def choose_values(name: str, attachment: str, fraction: float) -> list[float]:
     freedoms = make_hall().objects[name].object.attachment(attachment).freedoms
-    return [one.lower + share * (one.upper - one.lower) for one in freedoms]
+    return [one.lower + fraction * (one.upper - one.lower) for one in freedoms]
 
 
 @settings(max_examples=25, deadline=None)
 @given(st.sampled_from(GRASPS), st.floats(0.0, 1.0), unit)
 def test_virtual_joint_is_the_measured_transform(
-    grasp: tuple[str, str], share: float, off: np.ndarray
+    grasp: tuple[str, str], fraction: float, offset: np.ndarray
 ) -> None:
-    (name, attachment), (scene, measured) = grasp, make_measured_scene(grasp, share, off)
+    (name, attachment), (scene, measured) = grasp, make_measured_scene(grasp, fraction, offset)
     at = scene.holds[0].at
     chain = consolidate(scene, scene.holds)
     z = np.zeros(chain.size)
@@ -92,10 +92,10 @@ def test_virtual_joint_is_the_measured_transform(
 
 @settings(max_examples=25, deadline=None)
 @given(st.sampled_from(GRASPS), st.floats(0.0, 1.0), unit)
-def test_measured_grasp_survives_files(
-    grasp: tuple[str, str], share: float, off: np.ndarray
+def test_measured_grasp_survives_serialization(
+    grasp: tuple[str, str], fraction: float, offset: np.ndarray
 ) -> None:
-    scene, _ = make_measured_scene(grasp, share, off)
+    scene, _ = make_measured_scene(grasp, fraction, offset)
     again = vkc.Scene.from_document(json.loads(json.dumps(scene.document)))
     assert again.holds == scene.holds
     assert again.holds[0].at == scene.holds[0].at
@@ -111,7 +111,7 @@ def test_measured_grasp_survives_files(
     assert vkc.Trajectory.from_dict(motion.to_dict()).phases == motion.phases
 
 
-def test_motion_keeps_its_measured_grasp_in_tables(tmp_path: Path) -> None:
+def test_tables_preserve_measured_grasps(tmp_path: Path) -> None:
     scene = make_hall().with_held({"cane": "grip"}, measured={"cane": (0.001, 0, 0, 0, 0, 0)})
     holds = (*scene.holds, Hold("fruit", "pull", scene.holds[0], "tip"))
     motion = vkc.Trajectory(
@@ -128,14 +128,14 @@ def test_motion_keeps_its_measured_grasp_in_tables(tmp_path: Path) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(st.floats(0.05, 0.95), unit)
-def test_freedoms_take_what_they_can_of_a_measured_grasp(share: float, off: np.ndarray) -> None:
+def test_freedoms_are_fitted_to_a_measured_grasp(fraction: float, offset: np.ndarray) -> None:
     name, attachment = "drawer", "handle_free"
-    at = choose_values(name, attachment, share)
+    at = choose_values(name, attachment, fraction)
     exact = make_measured(name, attachment, at, np.zeros(6))
     (hold,) = make_hall().with_held({name: attachment}, measured={name: exact}).holds
     assert hold.at == pytest.approx(at, abs=1e-5)
     assert np.abs(hold.deviation or 0.0).max() < 1e-5
-    measured = make_measured(name, attachment, at, off * np.repeat([0.011, 0.11], 3))
+    measured = make_measured(name, attachment, at, offset * np.repeat([0.011, 0.11], 3))
     fitted, stated = (
         make_hall().with_held({name: attachment}, at=values, measured={name: measured}).holds[0]
         for values in (None, {name: at})
@@ -156,18 +156,18 @@ def test_freedoms_are_fitted_all_around_a_rim(around: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("off", "got"),
+    ("offset", "got"),
     [
         ([0.0, 0.021, 0.0, 0.0, 0.0, 0.0], "21.0 mm and 0.000 rad"),
         ([0.0, 0.0, 0.0, 0.0, 0.21, 0.0], "0.0 mm and 0.210 rad"),
     ],
 )
-def test_hand_too_far_from_its_attachment_is_refused(off: list[float], got: str) -> None:
-    measured = make_measured("drawer", "handle", [], np.array(off))
+def test_hand_too_far_from_its_attachment_is_rejected(offset: list[float], got: str) -> None:
+    measured = make_measured("drawer", "handle", [], np.array(offset))
     with pytest.raises(InputError, match=f"held.drawer.measured.*20 mm and 0.2 rad.*{got}"):
         make_hall().with_held({"drawer": "handle"}, measured={"drawer": measured})
     with pytest.raises(InputError, match=rf"Hold\.deviation.*{got}"):
-        Hold("drawer", "handle", deviation=tuple(off))
+        Hold("drawer", "handle", deviation=tuple(offset))
     assert Hold("drawer", "handle", deviation=(0.0,) * 6) == Hold("drawer", "handle")
     with pytest.raises(InputError, match="wrong number of values"):
         Hold("drawer", "handle", deviation=(0.0,))
@@ -189,7 +189,7 @@ def test_hand_too_far_from_its_attachment_is_refused(off: list[float], got: str)
         ("derive", 3, "start.held.drawer.measured", "mm and"),
     ],
 )
-def test_errors_of_files_name_the_field(
+def test_errors_in_files_name_the_field(
     tmp_path: Path, measured: str, line: int, field: str, text: str
 ) -> None:
     file = tmp_path / "hall.yaml"
@@ -204,7 +204,7 @@ def test_errors_of_files_name_the_field(
 
 
 def test_grasp_is_derived_from_measured_positions() -> None:
-    """In one call, in steps, and in a file; the tool is where the arm has it."""
+    """Covers one call, several calls, and a file; the arm determines the tool pose."""
     scene, at = load_drawer_scene(), make_grasping_scene().start.copy()
     at[:3] += [0.004, -0.003, 0.002]
     found = scene.with_measured_grasp(
@@ -212,37 +212,39 @@ def test_grasp_is_derived_from_measured_positions() -> None:
     )
     placed, grasp = found.objects["drawer"], found.objects["drawer"].object.attachment("handle")
     nominal = placed.link_placement(grasp.link) * grasp.tool()
-    off = nominal.actInv(found.tool_placement())
-    np.testing.assert_allclose(found.holds[0].deviation[:3], off.translation, atol=2e-9)
-    np.testing.assert_allclose(found.holds[0].deviation[3:], pin.log3(off.rotation), atol=2e-9)
-    there = scene.with_start(at[:3], at[3:]).with_state("drawer", {"slide": 0.002})
-    document = there.document
+    offset = nominal.actInv(found.tool_placement())
+    np.testing.assert_allclose(found.holds[0].deviation[:3], offset.translation, atol=2e-9)
+    np.testing.assert_allclose(found.holds[0].deviation[3:], pin.log3(offset.rotation), atol=2e-9)
+    moved = scene.with_start(at[:3], at[3:]).with_state("drawer", {"slide": 0.002})
+    document = moved.document
     document["start"]["held"] = {"drawer": {"attachment": "handle", "measured": "derive"}}
     for other in (
-        there.with_measured_grasp("drawer"),
-        there.with_held({"drawer": "handle"}).with_measured_grasp("drawer"),
+        moved.with_measured_grasp("drawer"),
+        moved.with_held({"drawer": "handle"}).with_measured_grasp("drawer"),
         vkc.Scene.from_document(document, scene.folder),
     ):
         assert other.holds == found.holds
     with pytest.raises(InputError, match="too far from the attachment"):
-        scene.with_measured_grasp("drawer", base=STANDING[:3])
+        scene.with_measured_grasp("drawer", base=NEAR_HANDLE[:3])
 
 
-def test_measured_object_stays_where_it_was_seen_and_holds_others() -> None:
+def test_measured_object_keeps_its_placement_and_holds_others() -> None:
     both = make_hall().with_held({"cane": "grip", "fruit": "pull"}, by={"fruit": "cane.tip"})
-    seen = both.objects["cane"].placement * pin.SE3(pin.exp3(np.full(3, 0.02)), np.full(3, 0.004))
-    found = both.with_measured_grasp("cane", placement=seen)
+    measured = both.objects["cane"].placement * pin.SE3(
+        pin.exp3(np.full(3, 0.02)), np.full(3, 0.004)
+    )
+    found = both.with_measured_grasp("cane", placement=measured)
     assert [str(hold) for hold in found.holds] == [str(hold) for hold in both.holds]
     assert found.holds[1].by == found.holds[0] != both.holds[0]
-    now = found.objects["cane"].placement
-    np.testing.assert_allclose(now.homogeneous, seen.homogeneous, atol=1e-8)
+    found_placement = found.objects["cane"].placement
+    np.testing.assert_allclose(found_placement.homogeneous, measured.homogeneous, atol=1e-8)
     tip = [scene.objects["cane"].link_placement("tip") for scene in (both, found)]
     ball = [scene.objects["fruit"].placement for scene in (both, found)]
     np.testing.assert_allclose(tip[0].actInv(ball[0]), tip[1].actInv(ball[1]), atol=1e-8)
 
 
-def test_hand_may_be_as_close_as_in_the_measured_grasp() -> None:
-    """Of an attachment 20 mm further inside the drawer, whose palm is 10 mm from the bar."""
+def test_hand_clearance_is_at_most_that_of_the_measured_grasp() -> None:
+    """The attachment is 20 mm deeper in the drawer; the palm is 10 mm from the bar."""
     scene = make_grasping_scene()
     placed = scene.objects["drawer"]
     handle, deeper = placed.object.attachment("handle"), pin.SE3(np.eye(3), np.array([0, 0, 0.02]))
@@ -252,8 +254,12 @@ def test_hand_may_be_as_close_as_in_the_measured_grasp() -> None:
     found = []
     for depth in (0.0, 0.007, 0.017):
         measured = make_measured("drawer", "handle", [], np.array([0.0, 0.0, depth, 0.0, 0.0, 0.0]))
-        off = scene.with_held({"drawer": "handle"}, measured={"drawer": measured})
-        found.append(compute_hand_clearance(off, off.holds[0], "drawer.tray", Options()))
+        measured_scene = scene.with_held({"drawer": "handle"}, measured={"drawer": measured})
+        found.append(
+            compute_hand_clearance(
+                measured_scene, measured_scene.holds[0], "drawer.tray", Options()
+            )
+        )
     assert found[0] == Options().grasp_clearance
     assert found[2] < 0.0 < found[1] < found[0]
     assert found[1] - found[2] == pytest.approx(0.01, abs=1e-6)

@@ -50,39 +50,39 @@ def compute_volume(shape: pin.GeometryObject) -> float:
         ({"type": "mesh", "file": "wedge.obj", "scale": [2.0, 1.0, 3.0]}, 6.0 / 6.0),
     ],
 )
-def test_every_kind_has_its_volume_and_place(
+def test_every_type_has_its_volume_and_placement(
     fields: dict[str, Any], expected: float, tmp_path: Path
 ) -> None:
-    """Round shapes are drawn with so many corners that a few percent of the volume are missing."""
+    """The triangulation of round shapes loses a few percent of the volume."""
     (tmp_path / "wedge.obj").write_text(
         "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
     )
-    (drawn,), (solid,) = make_shapes(tmp_path, colour=[0.1, 0.2, 0.3, 0.4], **fields)
+    (visual,), (solid,) = make_shapes(tmp_path, colour=[0.1, 0.2, 0.3, 0.4], **fields)
     assert 0.95 * expected <= compute_volume(solid) <= expected * (1 + 1e-9)
-    for shape in (drawn, solid):
+    for shape in (visual, solid):
         assert shape.name == "item"
         assert shape.parentJoint == 0
         assert shape.placement.isApprox(POSE)
         np.testing.assert_allclose(shape.meshColor, [0.1, 0.2, 0.3, 0.4])
-    assert drawn.meshPath == (str(tmp_path / "wedge.obj") if fields["type"] == "mesh" else "")
+    assert visual.meshPath == (str(tmp_path / "wedge.obj") if fields["type"] == "mesh" else "")
     assert solid.meshPath == ""
 
 
-def test_a_urdf_stands_with_its_joints_at_zero(tmp_path: Path) -> None:
+def test_urdf_obstacles_have_their_joints_at_zero(tmp_path: Path) -> None:
     (tmp_path / "r.urdf").write_text(URDF)
     _, solid = make_shapes(tmp_path, type="urdf", file="r.urdf", colour=[1, 0, 0, 1])
     assert [shape.name for shape in solid] == ["item_0", "item_1"]
     assert all(shape.parentJoint == 0 for shape in solid)
-    where = [
+    placements = [
         pin.SE3(np.eye(3), np.array([0, 0, 1.0])),
         pin.SE3(pin.rpy.rpyToMatrix(0, 0, 0.4), np.array([0.5, 0, 0])),
     ]
-    for shape, local in zip(solid, where, strict=True):
+    for shape, local in zip(solid, placements, strict=True):
         assert shape.placement.isApprox(POSE * local, 1e-12)
         np.testing.assert_array_equal(shape.meshColor, [1, 0, 0, 1])
 
 
-def test_the_floor_lies_under_the_whole_arena_and_a_border() -> None:
+def test_floor_covers_the_arena_and_a_border() -> None:
     floor = make_floor_shape((-1.0, 4.0, 0.0, 2.5))
     low, high = compute_world_box(floor.geometry, floor.placement)
     np.testing.assert_allclose(low, [-3.0, -2.0, -0.1])

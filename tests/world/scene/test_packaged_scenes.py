@@ -1,4 +1,4 @@
-"""Tests the dimensions of the packaged scenes, and that motions fit into them."""
+"""Tests the dimensions and clearances of the packaged scenes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 
-DIST_SAFE, GRASP_CLEARANCE = 0.02, 0.005  # [m], the planner's
+DIST_SAFE, GRASP_CLEARANCE = 0.02, 0.005  # [m], defaults of the planner
 RANDOM_STARTS = sorted(
     file.stem
     for file in find_resource_folder("scenes").glob("*.yaml")
@@ -51,16 +51,16 @@ def list_parts(placed: PlacedObject, *links: str) -> list[pin.GeometryObject]:
     return [s for s in make_world_shapes(placed) if not links or get_link_name(s.name) in links]
 
 
-def list_obstacles(here: Scene, *names: str) -> list[pin.GeometryObject]:
+def list_obstacles(scene: Scene, *names: str) -> list[pin.GeometryObject]:
     """Return the shapes of obstacles, by default of all but the floor."""
-    labels = zip(here.obstacles, here.obstacle_labels, strict=True)
+    labels = zip(scene.obstacles, scene.obstacle_labels, strict=True)
     return [s for s, label in labels if (label in names if names else label != FLOOR)]
 
 
-def list_surroundings(here: Scene, without: str = "") -> list[pin.GeometryObject]:
+def list_surroundings(scene: Scene, excluded: str = "") -> list[pin.GeometryObject]:
     """Return the shapes of all obstacles but the floor, and of all objects but one."""
-    others = [placed for name, placed in here.objects.items() if name != without]
-    return list_obstacles(here) + [shape for placed in others for shape in list_parts(placed)]
+    others = [placed for name, placed in scene.objects.items() if name != excluded]
+    return list_obstacles(scene) + [shape for placed in others for shape in list_parts(placed)]
 
 
 def measure_clearance(
@@ -90,22 +90,22 @@ def place_robot_shapes(
 
 def place_hand(tool: pin.SE3) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:
     """Return the shapes of the open gripper with the tool frame at `tool`."""
-    here = load().with_start(base=[0.0, 0.0, 0.0], arm=load().robot.home)
-    back = tool * here.tool_placement().inverse()
-    shapes = place_robot_shapes(here.robot, here.start, here.robot.touch_links)
+    scene = load().with_start(base=[0.0, 0.0, 0.0], arm=load().robot.home)
+    back = tool * scene.tool_placement().inverse()
+    shapes = place_robot_shapes(scene.robot, scene.start, scene.robot.touch_links)
     return [(shape.geometry, back * shape.placement) for shape in shapes]
 
 
 @pytest.mark.parametrize("name", RANDOM_STARTS)
 def test_random_starts_fill_their_region(name: str) -> None:
-    here, rng = load(name), np.random.default_rng(0)
-    region = here.start_region
-    assert here.name == name
+    scene, rng = load(name), np.random.default_rng(0)
+    region = scene.start_region
+    assert scene.name == name
     assert region is not None
-    assert here.start_clearance() >= START_CLEARANCE
-    drawn = [here.sample_start(rng) for _ in range(25)]
-    assert min(one.start_clearance(reach=0.1) for one in drawn) >= START_CLEARANCE
-    bases = np.array([one.start[:3] for one in drawn])
+    assert scene.start_clearance() >= START_CLEARANCE
+    samples = [scene.sample_start(rng) for _ in range(25)]
+    assert min(one.start_clearance(reach=0.1) for one in samples) >= START_CLEARANCE
+    bases = np.array([one.start[:3] for one in samples])
     for column, (low, high) in enumerate((region.x, region.y)):
         assert low <= bases[:, column].min()
         assert bases[:, column].max() <= high
@@ -205,33 +205,33 @@ def test_dimensions_match_the_paper(
 def test_base_fits_through_passages(
     name: str, state: dict[str, float], begin: tuple[float, float], end: tuple[float, float]
 ) -> None:
-    here = load(name).with_state("door", state) if state else load(name)
+    scene = load(name).with_state("door", state) if state else load(name)
     heading = float(np.arctan2(end[1] - begin[1], end[0] - begin[0]))
     for x, y in np.linspace(begin, end, 20):
-        z = np.array([x, y, heading, *here.robot.home])
-        base = place_robot_shapes(here.robot, z, ["base_link"])
-        assert measure_clearance(base, list_surroundings(here)) > DIST_SAFE, (x, y)
+        z = np.array([x, y, heading, *scene.robot.home])
+        base = place_robot_shapes(scene.robot, z, ["base_link"])
+        assert measure_clearance(base, list_surroundings(scene)) > DIST_SAFE, (x, y)
 
 
 def test_gap_between_pillar_and_wall_is_the_only_passage() -> None:
-    here = load("gap_table")
+    scene = load("gap_table")
     for first, second, width in (
         ("pillar", "wall_south", 0.85),
         ("pillar", "sideboard", 0.0),
         ("sideboard", "wall_north", 0.0),
     ):
-        one, two = (list_placed_shapes(list_obstacles(here, name)) for name in (first, second))
+        one, two = (list_placed_shapes(list_obstacles(scene, name)) for name in (first, second))
         assert compute_clearance(one, two) == pytest.approx(width, abs=1e-6)
 
 
 def test_household_is_furnished_without_overlaps() -> None:
-    here = load()
+    scene = load()
     np.testing.assert_allclose(
-        compute_bounds(list_surroundings(here)), [[-4.1, -4.1, 0.0], [4.1, 4.1, 2.4]], atol=1e-9
+        compute_bounds(list_surroundings(scene)), [[-4.1, -4.1, 0.0], [4.1, 4.1, 2.4]], atol=1e-9
     )
-    assert len(list_surroundings(here)) >= 120
-    for name, placed in here.objects.items():
+    assert len(list_surroundings(scene)) >= 120
+    for name, placed in scene.objects.items():
         links = ("panel", "lever") if name == "door" else ()  # its frame fills an opening
         assert (
-            measure_clearance(list_parts(placed, *links), list_surroundings(here, name)) > 9e-4
+            measure_clearance(list_parts(placed, *links), list_surroundings(scene, name)) > 9e-4
         ), name

@@ -1,4 +1,4 @@
-"""Tests poses and points; for invalid ones see tests/world/task/test_steps.py."""
+"""Tests the conversion of poses and points; test_steps.py has further invalid ones."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from vkc_pin.world.scene.poses import as_placement, as_target
     "pose", [[2e4, 0, 0, 0, 0, 0], [0, 0, 0, 0, 1e300, 0], np.diag([1.0, 1.0, 1.0, 1.0]) + 1e5]
 )
 def test_distant_poses_are_rejected(pose: Any) -> None:
-    for read in (as_placement, as_target):
+    for convert in (as_placement, as_target):
         with pytest.raises(InputError, match="out of range") as caught:
-            read(pose, name="where")
+            convert(pose, name="where")
         assert caught.value.field == "where"
     with pytest.raises(InputError, match="out of range"):
         as_target([0.0, -2e4, 0.0], name="where")
@@ -30,10 +30,10 @@ def test_distant_poses_are_rejected(pose: Any) -> None:
     "pose",
     [["0", "0", "0", "0", "0", "0"], [1j] * 6, [True] * 6, [10**5000] * 6, b"123456", range(0)],
 )
-def test_numbers_are_numbers(pose: Any) -> None:
-    for read in (as_placement, as_target):
+def test_poses_that_are_not_numeric_are_rejected(pose: Any) -> None:
+    for convert in (as_placement, as_target):
         with pytest.raises(InputError, match="not a pose") as caught:
-            read(pose, name="where")
+            convert(pose, name="where")
         assert len(str(caught.value)) < 600
 
 
@@ -49,8 +49,8 @@ def test_three_numbers_are_a_point_and_six_a_pose() -> None:
 )
 def test_seven_numbers_are_a_pose_with_a_quaternion_scalar_last(quaternion: list[float]) -> None:
     x, y, z, w = np.array(quaternion) / np.linalg.norm(quaternion)
-    rough = np.round([x, y, z, w], 4)  # as files have it
-    found = as_target((1.0, 2.0, 3.0, *rough), name="where")
+    rounded = np.round([x, y, z, w], 4)  # four decimals, as in files
+    found = as_target((1.0, 2.0, 3.0, *rounded), name="where")
     angle, axis = 2.0 * np.arctan2(np.linalg.norm([x, y, z]), w), np.array([x, y, z])
     np.testing.assert_allclose(found.translation, [1.0, 2.0, 3.0])
     np.testing.assert_allclose(found.rotation @ found.rotation.T, np.eye(3), atol=1e-12)
@@ -63,7 +63,7 @@ def test_seven_numbers_are_a_pose_with_a_quaternion_scalar_last(quaternion: list
 @pytest.mark.parametrize(
     "quaternion", [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 1.0), (0.0, 0.0, 0.0, 0.99)]
 )
-def test_a_quaternion_has_length_one(quaternion: tuple[float, ...]) -> None:
-    for read in (as_placement, as_target):
+def test_quaternions_of_other_length_than_one_are_rejected(quaternion: tuple[float, ...]) -> None:
+    for convert in (as_placement, as_target):
         with pytest.raises(InputError, match=r"not a rotation .*unit quaternion \(x, y, z, w\)"):
-            read((0.0, 0.0, 0.0, *quaternion), name="where")
+            convert((0.0, 0.0, 0.0, *quaternion), name="where")

@@ -95,9 +95,9 @@ def test_start_is_sampled_with_free_held_objects_only(tmp_path: Path) -> None:
 
 def test_start_limits_are_infinite_for_a_fixed_base() -> None:
     robot, fixed = load_robot("husky_ur5e"), load_robot("husky_ur5e", base="fixed")
-    for mine, its in zip(robot.start_limits, (robot.lower, robot.upper), strict=True):
-        np.testing.assert_array_equal(mine, its)
-        assert mine is not its
+    for found, expected in zip(robot.start_limits, (robot.lower, robot.upper), strict=True):
+        np.testing.assert_array_equal(found, expected)
+        assert found is not expected
     lower, upper = fixed.start_limits
     assert np.isneginf(lower[:3]).all()
     assert np.isposinf(upper[:3]).all()

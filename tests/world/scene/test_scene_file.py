@@ -15,7 +15,7 @@ from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene, load_scene
 
 
-def test_every_kind_of_obstacle(tmp_path: Path) -> None:
+def test_all_types_of_obstacles_are_loaded(tmp_path: Path) -> None:
     (tmp_path / "wedge.obj").write_text(
         "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
     )
@@ -65,7 +65,7 @@ def test_orientations_may_be_quaternions(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("orientation", "said"),
+    ("orientation", "message"),
     [
         ("quaternion: [0, 0, 1, 1]", "not a rotation .*length 1, not 1.414"),
         ("quaternion: [0, 0, 1]", "4 values"),
@@ -76,8 +76,8 @@ def test_orientations_may_be_quaternions(tmp_path: Path) -> None:
         ("quaternion: [0, 0, 0, 1], rpy: [0, 0, 0]", "more than one orientation"),
     ],
 )
-def test_invalid_orientations_are_located(tmp_path: Path, orientation: str, said: str) -> None:
-    with pytest.raises(InputError, match=said) as caught:
+def test_invalid_orientations_are_located(tmp_path: Path, orientation: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
         load_scene_text(
             tmp_path,
             TINY
@@ -198,7 +198,7 @@ def test_errors_in_named_files_are_located_there(tmp_path: Path) -> None:
     assert broken.value.file == tmp_path / "bad.urdf"
 
 
-DESCRIBED = """\
+INLINE_SCENE = """\
 robot: husky_ur5e
 start: {base: [0, 0, 0]}
 objects:
@@ -225,9 +225,9 @@ objects:
 """
 
 
-def test_inline_object_descriptions(tmp_path: Path) -> None:
+def test_inline_object_descriptions_are_loaded(tmp_path: Path) -> None:
     file = tmp_path / "room.yaml"
-    file.write_text(DESCRIBED)
+    file.write_text(INLINE_SCENE)
     scene = load_scene(file)
     placed = scene.objects["trap"]
     assert (placed.object.name, placed.object.urdf, placed.object.acceleration[0]) == (
@@ -252,13 +252,13 @@ def test_inline_object_descriptions(tmp_path: Path) -> None:
 def test_errors_in_inline_descriptions_are_located(
     tmp_path: Path, old: str, new: str, line: int, field: str
 ) -> None:
-    """In the scene's file, or in the text of the URDF in it."""
-    assert old in DESCRIBED
-    (tmp_path / "room.yaml").write_text(DESCRIBED.replace(old, new))
+    """Covers the scene file and the URDF text inside it."""
+    assert old in INLINE_SCENE
+    (tmp_path / "room.yaml").write_text(INLINE_SCENE.replace(old, new))
     with pytest.raises(InputError) as caught:
         load_scene(tmp_path / "room.yaml")
     assert str(caught.value.file) == str(tmp_path / "room.yaml") + (
-        ": urdf" if "link=" in old or "size" in old else ""
+        ": urdf" if "link=" in old else ""
     )
     assert (caught.value.line, caught.value.field) == (line, field)
 

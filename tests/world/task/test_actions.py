@@ -4,32 +4,32 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.litter import AT, BIN, make_littered_scene
+from helpers.litter import BIN_POSITION, LITTER_POSITION, make_littered_scene
 
 import vkc_pin as vkc
 from vkc_pin.world.task.actions import compile_each_step, generate_alternatives, group_into_actions
 from vkc_pin.world.task.compiler import compile_task
 
-A, G, P = vkc.Actuate, vkc.Grasp, vkc.Place
-
-
 TABLE = (-3.0, 1.3, 1.051)  # on the bar table
 
 
-OPEN, SHUT = A("refrigerator", {"hinge": 1.57}), A("refrigerator", {"hinge": 0.0})
-CUP = (G("cold_cup"), P("cold_cup", TABLE))
+OPEN, SHUT = (
+    vkc.Actuate("refrigerator", {"hinge": 1.57}),
+    vkc.Actuate("refrigerator", {"hinge": 0.0}),
+)
+CUP = (vkc.Grasp("cold_cup"), vkc.Place("cold_cup", TABLE))
 
 
 def test_steps_with_one_object_form_one_action() -> None:
     steps = [
-        G("refrigerator"),
+        vkc.Grasp("refrigerator"),
         OPEN,
-        G("cold_cup"),
-        P("cold_cup", TABLE),
+        vkc.Grasp("cold_cup"),
+        vkc.Place("cold_cup", TABLE),
         SHUT,
-        G("broom"),
-        G("litter", "pull", by="broom.bristles"),
-        P("litter", (1.1, -2.9, 0.036)),
+        vkc.Grasp("broom"),
+        vkc.Grasp("litter", "pull", by="broom.bristles"),
+        vkc.Place("litter", (1.1, -2.9, 0.036)),
         vkc.Release(),
         vkc.GoTo(0, 0),
     ]
@@ -43,8 +43,7 @@ def test_steps_with_one_object_form_one_action() -> None:
     ]
 
 
-def test_steps_are_compiled_in_the_scene_that_the_previous_steps_leave() -> None:
-    """Each step is compiled in the scene that the steps before leave."""
+def test_steps_are_compiled_in_the_scene_after_the_previous_steps() -> None:
     scene, options = vkc.load_scene("household"), vkc.Options()
     steps = [OPEN, *CUP, SHUT]
     tasks = compile_each_step(scene, steps, options)
@@ -55,11 +54,13 @@ def test_steps_are_compiled_in_the_scene_that_the_previous_steps_leave() -> None
         ["place cold_cup"],
         ["reach refrigerator.handle", "move refrigerator.hinge"],
     ]
-    assert tasks[-1].state["refrigerator.hinge"] == pytest.approx(1.57), "it is open by then"
+    assert tasks[-1].state["refrigerator.hinge"] == pytest.approx(1.57), (
+        "the refrigerator is not open yet"
+    )
     assert tasks[-1].phases[-1].values == {"refrigerator.hinge": 0.0}
     assert [hold.object for hold in tasks[1].after] == ["cold_cup"]
     assert scene.objects["refrigerator"].state[0] == 0.0
-    again = compile_each_step(scene, [*steps, G("cold_cup")], options)[-1]
+    again = compile_each_step(scene, [*steps, vkc.Grasp("cold_cup")], options)[-1]
     (grasp,) = again.phases
     np.testing.assert_allclose(grasp.resting["cold_cup"].translation, TABLE, atol=1e-6)
 
@@ -67,9 +68,9 @@ def test_steps_are_compiled_in_the_scene_that_the_previous_steps_leave() -> None
 @pytest.mark.parametrize(
     ("steps", "field", "problem"),
     [
-        ([OPEN, G("cold_cup"), SHUT], "steps[2].object", "one hand"),
+        ([OPEN, vkc.Grasp("cold_cup"), SHUT], "steps[2].object", "one hand"),
         ([OPEN, *CUP, vkc.Release()], "steps[3]", "hand is empty"),
-        ([OPEN, G("no_cup")], "steps[1].object", "no object"),
+        ([OPEN, vkc.Grasp("no_cup")], "steps[1].object", "no object"),
     ],
 )
 def test_error_names_the_first_infeasible_step(
@@ -80,9 +81,9 @@ def test_error_names_the_first_infeasible_step(
     assert str(caught.value.field).startswith(field)
 
 
-@pytest.mark.parametrize("stands", [True, False])
-def test_free_object_is_regrasped_only_if_it_rests_on_a_support(stands: bool) -> None:
-    """In the air, it would fall."""
+@pytest.mark.parametrize("is_supported", [True, False])
+def test_free_object_is_regrasped_only_if_it_rests_on_a_support(is_supported: bool) -> None:
+    """Without a support it would fall."""
     x, y, z = (
         make_littered_scene().with_held({"litter": "grip"}).objects["litter"].placement.translation
     )
@@ -90,14 +91,14 @@ def test_free_object_is_regrasped_only_if_it_rests_on_a_support(stands: bool) ->
         "name": "table",
         "type": "box",
         "size": [0.2, 0.2, 0.02],
-        "position": [x, y, z - AT[2] - 0.01],
+        "position": [x, y, z - LITTER_POSITION[2] - 0.01],
     }
-    scene = make_littered_scene(*[table] * stands).with_held({"litter": "grip"})
-    place = vkc.Place("litter", BIN)
+    scene = make_littered_scene(*[table] * is_supported).with_held({"litter": "grip"})
+    place = vkc.Place("litter", BIN_POSITION)
     task = compile_task(scene, [place], vkc.Options())
-    again = (vkc.Release("litter"), vkc.Place("litter", BIN, "grip"))
+    again = (vkc.Release("litter"), vkc.Place("litter", BIN_POSITION, "grip"))
     assert (
         list(generate_alternatives(scene, task, anew=True))
-        == [("litter.grip, grasped again", again)] * stands
+        == [("litter.grip, grasped again", again)] * is_supported
     )
-    assert not list(generate_alternatives(scene, task)), "only where phases may be more"
+    assert not list(generate_alternatives(scene, task)), "a regrasp needs anew=True"

@@ -1,4 +1,4 @@
-"""Tests which joints a hand can push, and in which direction."""
+"""Tests the joints that a hand can push, and their directions."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ def differentiate_contact(
     placed: PlacedObject, attachment: Attachment, joint: str, values: list[float]
 ) -> float:
     """Return the advance of the contact into its face per unit of a joint, numerically."""
-    touched = attachment.placement
+    contact = attachment.placement
     for freedom, value in zip(attachment.freedoms, values, strict=True):
-        touched = touched * freedom.motion(value)
+        contact = contact * freedom.motion(value)
     now = float(placed.state[placed.object.coordinates.index(joint)])
-    ahead, behind, here = (
+    ahead, behind, link = (
         placed.with_state({joint: v}).link_placement(attachment.link)
         for v in (now + STEP, now - STEP, now)
     )
-    shift = (ahead.act(touched.translation) - behind.act(touched.translation)) / (2 * STEP)
-    return float((here * attachment.placement).rotation[:, 2] @ shift)
+    shift = (ahead.act(contact.translation) - behind.act(contact.translation)) / (2 * STEP)
+    return float((link * attachment.placement).rotation[:, 2] @ shift)
 
 
 @settings(deadline=None, max_examples=15)
@@ -53,18 +53,20 @@ def differentiate_contact(
     st.tuples(st.floats(-0.9, 1.9), st.floats(0.01, 0.29)),
 )
 def test_advance_matches_finite_differences(
-    rpy: list[float], at: list[float], where: list[float], state: tuple[float, float]
+    rpy: list[float], position: list[float], fractions: list[float], state: tuple[float, float]
 ) -> None:
-    """Advances of all points of a region lie between the extremes, which two points attain.
+    """The extremes bound the advance of all points of the face, and corners attain them.
 
     The face is on a tray that slides on a rotating arm.
     """
-    arm = make_full_scene().objects["cabinet"].with_state({"swing": state[0], "slide": state[1]})
+    cabinet = (
+        make_full_scene().objects["cabinet"].with_state({"swing": state[0], "slide": state[1]})
+    )
     slides = [
         Freedom(f"_{k}", "prismatic", axis, -0.1, 0.2) for k, axis in enumerate(np.eye(3)[:2])
     ]
     tilt = Freedom("_tilt", "revolute", np.array([1.0, 0.0, 0.0]), -0.5, 0.5)
-    placement = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(at))
+    placement = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(position))
     face = Attachment(
         name="face",
         link="tray",
@@ -74,18 +76,18 @@ def test_advance_matches_finite_differences(
         contact="push",
     )
     for joint in ("swing", "slide"):
-        least, most = compute_advance(arm, face, joint)
+        least, most = compute_advance(cabinet, face, joint)
         corners = [
-            differentiate_contact(arm, face, joint, [x, y, 0.3])
+            differentiate_contact(cabinet, face, joint, [x, y, 0.3])
             for x in (-0.1, 0.2)
             for y in (-0.1, 0.2)
         ]
         np.testing.assert_allclose([least, most], [min(corners), max(corners)], rtol=0.0, atol=1e-8)
         inside = [
-            own.lower + share * (own.upper - own.lower)
-            for own, share in zip(face.freedoms, where, strict=True)
+            freedom.lower + fraction * (freedom.upper - freedom.lower)
+            for freedom, fraction in zip(face.freedoms, fractions, strict=True)
         ]
-        assert least - 1e-8 <= differentiate_contact(arm, face, joint, inside) <= most + 1e-8
+        assert least - 1e-8 <= differentiate_contact(cabinet, face, joint, inside) <= most + 1e-8
 
 
 def compile_actuation(
@@ -99,24 +101,33 @@ def open_door(hinge: float) -> Scene:
 
 
 @pytest.mark.parametrize(
-    ("begin", "end", "face", "way"),
+    ("begin", "end", "face", "direction"),
     [(-1.2, 0.0, "push", 1), (1.57, 2.0, "push_back", -1), (0.3, 0.9, "push", 1)],
 )
-def test_door_is_pushed_shut_or_further_open(begin: float, end: float, face: str, way: int) -> None:
+def test_door_is_pushed_shut_or_further_open(
+    begin: float, end: float, face: str, direction: int
+) -> None:
     reach, move = compile_actuation(open_door(begin), {"hinge": end}, face).phases
-    assert (reach.pushed, move.pushed, move.name) == ({}, {"door.hinge": way}, "move door.hinge")
+    assert (reach.pushed, move.pushed, move.name) == (
+        {},
+        {"door.hinge": direction},
+        "move door.hinge",
+    )
 
 
 @pytest.mark.parametrize(
-    ("begin", "end", "face", "way"), [(-0.5, -1.0, "push", "up"), (0.5, 1.0, "push_back", "down")]
+    ("begin", "end", "face", "direction"),
+    [(-0.5, -1.0, "push", "up"), (0.5, 1.0, "push_back", "down")],
 )
-def test_push_cannot_pull(begin: float, end: float, face: str, way: str) -> None:
-    said = f"pushing 'door' at '{face}' moves 'hinge' {way} only: a hand that pushes cannot pull"
-    with pytest.raises(InputError, match=said) as caught:
+def test_push_cannot_pull(begin: float, end: float, face: str, direction: str) -> None:
+    message = (
+        f"pushing 'door' at '{face}' moves 'hinge' {direction} only: a hand that pushes cannot pull"
+    )
+    with pytest.raises(InputError, match=message) as caught:
         compile_actuation(open_door(begin), {"hinge": end}, face)
     assert caught.value.field == "steps[0].joints"
     other = "or an attachment that can be grasped: handle, handle_free"
-    assert caught.value.expected == f"{'≥' if way == 'up' else '≤'} {begin:g}, {other}"
+    assert caught.value.expected == f"{'≥' if direction == 'up' else '≤'} {begin:g}, {other}"
 
 
 def test_a_latched_door_cannot_be_pushed_open() -> None:

@@ -29,7 +29,7 @@ from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Reach, Step
 
 OPTIONS = Options(reach_waypoints=10, turn_waypoints=3, move_waypoints=7)
 OPEN = Actuate("door", {"hinge": 1.2})
-TURNED = 0.5 + LATCH_MARGIN  # the latch's threshold and a bit
+TURNED = 0.5 + LATCH_MARGIN  # threshold of the latch plus margin
 SHUT = {"door.hinge": 0.0, "door.knob": 0.0}
 HINGE, KNOB = (-1.57, 1.57), (0.0, 0.8)
 HANDLE = Hold("door", "handle")
@@ -45,11 +45,11 @@ def add_attachment(scene: Scene, name: str, link: str) -> Scene:
     attachment = dataclasses.replace(
         placed.object.attachment(), name=name, link=link, placement=pin.SE3.Identity()
     )
-    thing = dataclasses.replace(
+    changed = dataclasses.replace(
         placed.object, attachments={**placed.object.attachments, name: attachment}
     )
     return dataclasses.replace(
-        scene, objects={**scene.objects, "door": dataclasses.replace(placed, object=thing)}
+        scene, objects={**scene.objects, "door": dataclasses.replace(placed, object=changed)}
     )
 
 
@@ -80,7 +80,7 @@ def test_opening_a_door_has_three_phases() -> None:
     assert all(phase.base is None and phase.frames == () for phase in task.phases)
 
 
-def test_latch_is_turned_only_where_it_is_engaged() -> None:
+def test_latch_is_turned_only_if_it_is_engaged() -> None:
     for state, names in (
         ({"hinge": 0.3}, ["reach door.handle", "move door.hinge"]),
         ({"hinge": 0.03}, ["reach door.handle", "turn door.knob", "move door.hinge, door.knob"]),
@@ -96,7 +96,7 @@ def test_latch_is_turned_only_where_it_is_engaged() -> None:
     assert task.phases[1].initial_values == {"door.hinge": 0.0, "door.knob": 0.6}
 
 
-def test_hinge_and_knob_together() -> None:
+def test_hinge_and_knob_are_actuated_together() -> None:
     """The latch is released first; the knob reaches its goal once the door is open."""
     far = compile_steps([Actuate("door", {"hinge": 1.2, "knob": 0.7})])
     assert [phase.name for phase in far.phases] == [
@@ -140,7 +140,7 @@ def test_go_to_releases_fixed_objects() -> None:
 
 
 def test_objects_keep_their_state_between_grasps() -> None:
-    """The second stands still until it is grasped, the first stays as it was left."""
+    """The second object is static until it is grasped; the first keeps its last state."""
     task = compile_steps([OPEN, Actuate("drawer", {"slide": 0.2})], make_full_scene())
     names = [
         "reach door.handle",
@@ -167,7 +167,7 @@ def test_task_has_only_joints_that_its_grasps_can_move() -> None:
 
 
 def test_goal_beyond_a_limit_ends_at_the_limit() -> None:
-    """Planning then says by how much it fails; later steps start from the limit."""
+    """Planning then reports the violation; later steps start from the limit."""
     task = compile_steps([Actuate("door", {"hinge": 2.0}), GoTo(0.0, 0.0)])
     assert task.phases[2].values["door.hinge"] == 2.0
     assert task.phases[3].initial_values["door.hinge"] == HINGE[1]
@@ -217,7 +217,7 @@ def test_hand_must_be_able_to_release_the_latch() -> None:
 
 
 @pytest.mark.parametrize("steps", [[], (), [Grasp("door")]])
-def test_nothing_to_do(steps: list[Step]) -> None:
+def test_steps_without_motion_are_rejected(steps: list[Step]) -> None:
     with pytest.raises(InputError, match="nothing to do") as caught:
         compile_steps(steps, load_door_scene().with_held({"door": "handle"}))
     assert caught.value.field == "steps"
@@ -234,25 +234,25 @@ def test_invalid_steps_are_rejected(steps: Any, field: str) -> None:
 
 
 def test_default_attachment_is_the_first_that_moves_the_joints() -> None:
-    """The first of all moves only some of them."""
+    """The first attachment of the object moves only some of them."""
     placed = make_full_scene().objects["cabinet"]
     named = {
         name: dataclasses.replace(placed.object.attachment(), name=name, link=name)
         for name in ("case", "arm", "lid")
     }
-    thing = dataclasses.replace(placed.object, attachments={**named, **placed.object.attachments})
+    changed = dataclasses.replace(placed.object, attachments={**named, **placed.object.attachments})
     scene = replace_objects(
-        make_full_scene(), {"cabinet": dataclasses.replace(placed, object=thing)}
+        make_full_scene(), {"cabinet": dataclasses.replace(placed, object=changed)}
     )
-    for joints, taken in (
+    for joints, expected in (
         ({"swing": 0.5}, "arm"),
         ({"lid_hinge": 0.2}, "lid"),
         ({"swing": 0.5, "slide": 0.2}, "grip"),
     ):
         task = compile_steps([Actuate("cabinet", joints)], scene)
-        assert task.holds == (Hold("cabinet", taken),)
+        assert task.holds == (Hold("cabinet", expected),)
         assert task == dataclasses.replace(
-            compile_steps([Actuate("cabinet", joints, taken)], scene), steps=task.steps
+            compile_steps([Actuate("cabinet", joints, expected)], scene), steps=task.steps
         )
     assert compile_steps([Grasp("cabinet")], scene).holds == (Hold("cabinet", "case"),)
     with pytest.raises(
@@ -279,8 +279,8 @@ def test_present_or_previous_attachment_is_preferred() -> None:
     assert task.holds == (Hold("door", "handle_free"),)
 
 
-def test_object_grasped_at_two_attachments_in_turn() -> None:
-    """Holds of different joints share a chain; of the same joint they cannot."""
+def test_one_object_is_grasped_at_two_attachments_in_turn() -> None:
+    """Holds of different joints can share a chain; holds of the same joint cannot."""
     lid = replace_objects(
         make_full_scene(),
         {
@@ -317,7 +317,7 @@ def test_object_grasped_at_two_attachments_in_turn() -> None:
 
 
 def test_unused_initial_hold_is_dropped_if_another_moves_the_same_joints() -> None:
-    """With the joints that the new one does not move, which then are none of the task."""
+    """Joints that only the dropped hold moves are no longer part of the task."""
     scene = (
         add_attachment(load_door_scene(), "plate", "panel")
         .with_state("door", {"hinge": 0.4, "knob": 0.6})

@@ -30,12 +30,12 @@ POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array(POINT))
 
 @cache
 def make_scene() -> Scene:
-    """Return the door's room with drawer and cabinet, and stick and ball in it too."""
+    """Return the door scene with drawer, cabinet, stick and ball."""
     return replace_objects(make_full_scene(), make_room(objects=("stick", "ball")).objects)
 
 
-def compile_steps(*steps: Step, of: Scene | None = None) -> Task:
-    return compile_task(of or make_scene(), steps, OPTIONS)
+def compile_steps(*steps: Step, scene: Scene | None = None) -> Task:
+    return compile_task(scene or make_scene(), steps, OPTIONS)
 
 
 def get_names(task: Task) -> list[str]:
@@ -46,8 +46,7 @@ def get_holds(task: Task) -> list[tuple[Hold, ...]]:
     return [phase.held for phase in task.phases]
 
 
-# --- touching
-# ------------------------------------------------------------------------------------------
+# Touch
 
 
 def test_touch_with_a_stick_grasps_it_first() -> None:
@@ -64,8 +63,7 @@ def test_touch_with_a_stick_grasps_it_first() -> None:
     assert task.state == {}  # a stick has no joints
 
 
-# --- putting down, letting go
-# -----------------------------------------------------------------------------------------
+# Place and Release
 
 
 def test_place_grasps_carries_and_releases() -> None:
@@ -90,13 +88,13 @@ def test_place_grasps_carries_and_releases() -> None:
 
 def test_place_at_a_point_keeps_the_object_upright() -> None:
     lying = place_object(make_scene(), "stick", POSE)
-    task = compile_steps(Place("stick", (0.0, 1.0, 0.5)), GoTo(0.0, 0.0), of=lying)
+    task = compile_steps(Place("stick", (0.0, 1.0, 0.5)), GoTo(0.0, 0.0), scene=lying)
     (goal,) = task.phases[1].frames
     assert goal.kind == "upright"
     np.testing.assert_array_equal(goal.placement.translation, [0.0, 1.0, 0.5])
     np.testing.assert_array_equal(goal.placement.rotation, POSE.rotation)
     assert task.phases[1].released_by == {}
-    assert task.phases[2].released_by == {"stick": (GRIP, 1)}  # as the phase before left it
+    assert task.phases[2].released_by == {"stick": (GRIP, 1)}  # placement at the end of phase 1
     assert "stick" in task.phases[2].resting
 
 
@@ -111,24 +109,25 @@ def test_release_ends_the_holds() -> None:
 
 
 def test_release_of_objects_held_at_the_start() -> None:
-    task = compile_steps(Release(), of=make_scene().with_held({"stick": "grip"}))
+    task = compile_steps(Release(), scene=make_scene().with_held({"stick": "grip"}))
     assert (get_names(task), get_holds(task), task.after) == (["stand still"], [(GRIP,)], ())
-    later = compile_steps(Release(), GoTo(0.0, 0.0), of=make_scene().with_held({"stick": "grip"}))
+    later = compile_steps(
+        Release(), GoTo(0.0, 0.0), scene=make_scene().with_held({"stick": "grip"})
+    )
     assert later.phases[1].released == (GRIP,)
     assert not later.phases[1].released_by, (
-        "where it stands is known: it is let go of before anything has moved"
+        "the placement is known, as the release precedes all motion"
     )
     moved = compile_steps(
-        GoTo(0.0, 1.0), Release(), GoTo(0.0, 0.0), of=make_scene().with_held({"stick": "grip"})
+        GoTo(0.0, 1.0), Release(), GoTo(0.0, 0.0), scene=make_scene().with_held({"stick": "grip"})
     )
     assert moved.phases[1].released_by == {"stick": (GRIP, 0)}
 
 
-# --- holding through what is held
-# -------------------------------------------------------------------------------------
+# Grasps through held objects
 
 
-def test_held_object_is_placed_and_released_as_held() -> None:
+def test_invalid_placing_and_release_of_a_held_object_are_rejected() -> None:
     with pytest.raises(InputError, match="held elsewhere") as caught:
         compile_steps(Grasp("stick"), Place("stick", POSE, "end"))
     assert caught.value.field == "steps[1].attachment"
@@ -136,7 +135,7 @@ def test_held_object_is_placed_and_released_as_held() -> None:
         compile_steps(Grasp("stick"), Release("stik"))
 
 
-def test_empty_hand_releases_nothing() -> None:
+def test_release_with_an_empty_hand_is_rejected() -> None:
     for before in ([], [Place("stick", POSE)]):
         with pytest.raises(InputError, match="hand is empty") as caught:
             compile_steps(*before, Release())
@@ -217,8 +216,7 @@ def test_only_carried_objects_can_hold_others() -> None:
         compile_steps(Grasp("stick"), Grasp("door", by="stick.tip"))
 
 
-# --- one hand
-# ------------------------------------------------------------------------------------------
+# One hand
 
 
 @pytest.mark.parametrize(
@@ -239,13 +237,12 @@ def test_hand_holds_one_object_only(second: Step) -> None:
     assert str(caught.value.field).startswith("steps[2]")
     assert "stick.grip" in str(caught.value)
     with pytest.raises(InputError, match="one hand") as caught:
-        compile_steps(second, of=make_scene().with_held({"stick": "end"}))
+        compile_steps(second, scene=make_scene().with_held({"stick": "end"}))
     assert str(caught.value.field).startswith("steps[0]")
     compile_steps(first, Release(), second)
 
 
-# --- again
-# ------------------------------------------------------------------------------------------
+# Repeated grasps
 
 
 def test_placed_object_can_be_grasped_again() -> None:
@@ -284,8 +281,7 @@ def test_object_of_uncertain_placement_cannot_be_grasped(before: Sequence[Step])
     assert other.phases[-1].grasps == (Hold("ball", "grip"),)
 
 
-# --- what is wrong
-# ------------------------------------------------------------------------------------------
+# Invalid steps
 
 
 @pytest.mark.parametrize(
@@ -323,8 +319,8 @@ def test_fixed_objects_are_not_carried_and_free_objects_not_actuated(
     assert caught.value.field == field
 
 
-def test_every_phase_has_all_placements() -> None:
-    """A free object is either in the hand or stands somewhere, never both."""
+def test_every_phase_has_placements_of_all_free_objects() -> None:
+    """A free object is either held or at rest, never both."""
     task = compile_steps(
         Touch("stick.tip", POINT),
         Grasp("ball", by="stick.tip"),
@@ -335,14 +331,14 @@ def test_every_phase_has_all_placements() -> None:
         Actuate("drawer", {"slide": 0.1}),
     )
 
-    def where(phase: Phase) -> tuple[set[str], set[str]]:
+    def list_objects(phase: Phase) -> tuple[set[str], set[str]]:
         return {hold.object for hold in phase.held}, set(phase.resting)
 
     for phase in task.phases:
-        carried, standing = where(phase)
-        assert not carried & standing
-        assert (carried | standing) >= {"stick", "ball"}
-        assert set(phase.released_by) <= standing
+        carried, resting = list_objects(phase)
+        assert not carried & resting
+        assert (carried | resting) >= {"stick", "ball"}
+        assert set(phase.released_by) <= resting
     for before, after in zip(task.phases[:-1], task.phases[1:], strict=True):
         assert set(after.held) == ({*before.held, *before.grasps} - set(after.released))
         assert set(after.lifted) == {

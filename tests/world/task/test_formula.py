@@ -17,7 +17,7 @@ def make_state() -> State:
 
 
 def sample_inputs(formula: Formula, count: int = 5) -> np.ndarray:
-    """Return random inputs, shape (count, 2·half + 1); the step takes DT."""
+    """Return random inputs, shape (count, 2·state_size + 1), with time step DT."""
     inputs = np.random.default_rng(0).normal(size=(count, 2 * formula.state_size + 1))
     inputs[:, -1] = DT
     return inputs
@@ -80,14 +80,14 @@ def test_formula_evaluates_the_expression(expression) -> None:  # type: ignore[n
 
 
 def test_equal_formulas_compare_equal_and_survive_json() -> None:
-    def make(limit: float) -> Formula:
+    def make_formula(limit: float) -> Formula:
         s = make_state()
         return s.make_formula(ca.sumsqr(s.velocity("tool")) - limit)
 
-    assert make(0.5) == make(0.5)
-    assert hash(make(0.5)) == hash(make(0.5))
-    assert make(0.5) != make(0.6)
-    formula = make(0.1)  # no binary fraction
+    assert make_formula(0.5) == make_formula(0.5)
+    assert hash(make_formula(0.5)) == hash(make_formula(0.5))
+    assert make_formula(0.5) != make_formula(0.6)
+    formula = make_formula(0.1)  # not a binary fraction
     code = tuple(
         (name, tuple(read), to, value)
         for name, read, to, value in json.loads(json.dumps(formula.code))
@@ -101,10 +101,10 @@ def test_square_roots_are_differentiable_at_zero() -> None:
     x = ca.SX.sym("x", 25)
     value = formula.function(x)
     derivatives = ca.Function("d", [x], [value, ca.jacobian(value, x), ca.hessian(value, x)[0]])
-    still = np.r_[np.ones(24), DT]
-    found = [np.asarray(part.full()) for part in derivatives(still)]
+    at_rest = np.r_[np.ones(24), DT]
+    found = [np.asarray(part.full()) for part in derivatives(at_rest)]
     assert all(np.isfinite(part).all() for part in found)
     assert 0.0 <= found[0].item() <= 1e-4
-    moving = still.copy()
+    moving = at_rest.copy()
     moving[9] += 0.5 * DT
     assert float(formula.function(moving)) == pytest.approx(0.5, abs=2e-8)

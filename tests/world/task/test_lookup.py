@@ -1,4 +1,4 @@
-"""Tests the search for names of steps in a scene, and the errors for unknown names."""
+"""Tests the search for the joints that move an attachment."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vkc_pin.world.task.lookup import (
 
 
 def test_path_joints_move_the_attachment() -> None:
-    """By trying each of them, with Pinocchio."""
+    """Compares with the displacement of the frame by each joint in Pinocchio."""
     for placed in make_full_scene().objects.values():
         model, base = placed.object.model, placed.object.coordinates.q(placed.state)
         for attachment in placed.object.attachments.values():

@@ -40,7 +40,7 @@ def make_scene(steps: list[Step]) -> Scene:
 
 
 def describe_phases(task: Task) -> list[tuple[object, ...]]:
-    """Return all that is said about the phases but placements, which have no equality."""
+    """Return all fields of the phases except placements, which cannot be compared."""
     return [
         (
             p.key,
@@ -60,25 +60,25 @@ def describe_phases(task: Task) -> list[tuple[object, ...]]:
 
 
 @pytest.mark.parametrize("steps", [FURNITURE, CARRYING], ids=["furniture", "carrying"])
-def test_truncated_task_is_that_of_the_first_steps(steps: list[Step]) -> None:
+def test_truncated_task_equals_the_task_of_the_first_steps(steps: list[Step]) -> None:
     scene = make_scene(steps)
     whole = compile_task(scene, steps, SHORT)
     for count in range(1, len(steps) + 1):
-        part, alone = whole.truncate(count), compile_task(scene, steps[:count], SHORT)
-        assert describe_phases(part) == describe_phases(alone)
+        part, expected = whole.truncate(count), compile_task(scene, steps[:count], SHORT)
+        assert describe_phases(part) == describe_phases(expected)
         assert (part.steps, part.holds, part.after, part.segments) == (
-            alone.steps,
-            alone.holds,
-            alone.after,
-            alone.segments,
+            expected.steps,
+            expected.holds,
+            expected.after,
+            expected.segments,
         )
-        assert dict(part.state) == dict(alone.state)
-        assert part.boundaries == alone.boundaries
+        assert dict(part.state) == dict(expected.state)
+        assert part.boundaries == expected.boundaries
     assert whole.segments == sum(phase.segments for phase in whole.phases)
     assert describe_phases(whole.truncate(len(steps))) == describe_phases(whole)
 
 
-def test_phase_names() -> None:
+def test_phases_and_goals_are_named() -> None:
     names = [phase.name for phase in compile_task(make_scene(CARRYING), CARRYING, SHORT).phases]
     assert names == [
         "reach stick.grip",

@@ -110,7 +110,7 @@ def test_invalid_base_goals_are_rejected(field: str, value: Any) -> None:
     assert caught.value.field == f"GoTo.{field}"
 
 
-def test_numbers_become_plain() -> None:
+def test_numbers_are_converted_to_floats() -> None:
     step = GoTo(np.float32(1.0), np.int64(2), np.float64(3.0))  # type: ignore[arg-type]
     assert [type(value) for value in vars(step).values()] == [float] * 3
     assert {
@@ -134,7 +134,7 @@ def test_numbers_become_plain() -> None:
         GoTo(1.0, -2.0),
     ],
 )
-def test_round_trip(step: Step) -> None:
+def test_steps_survive_a_round_trip_through_data(step: Step) -> None:
     again = step_from_dict(json.loads(json.dumps(step_to_dict(step))))
     assert type(again) is type(step)
     assert step_to_dict(again) == step_to_dict(step)
@@ -165,7 +165,7 @@ def test_unknown_names_in_data_are_rejected(
         ({"step": "Place", "pose": [0.0, 0.0, 0.0]}, "Place.object"),
     ],
 )
-def test_incomplete_data_are_rejected(data: dict[str, Any], field: str) -> None:
+def test_incomplete_data_is_rejected(data: dict[str, Any], field: str) -> None:
     with pytest.raises(InputError) as caught:
         step_from_dict(data)
     assert caught.value.field == field

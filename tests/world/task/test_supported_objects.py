@@ -1,11 +1,11 @@
-"""Tests which objects are supported by moving links in the phases of a task."""
+"""Tests the objects that moving links support in the phases of a task."""
 
 from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.riding import TOP, describe_cup, make_plate_scene, make_tray_scene, write_objects
+from helpers.supports import TOP, describe_cup, make_plate_scene, make_tray_scene, write_objects
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
@@ -14,7 +14,7 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Task
 
-THERE = pin.SE3(np.eye(3), np.array([-0.5, -1.5, 0.7]))
+GOAL = pin.SE3(np.eye(3), np.array([-0.5, -1.5, 0.7]))
 
 
 def compile_steps(scene: Scene, *steps: vkc.Step) -> Task:
@@ -22,7 +22,7 @@ def compile_steps(scene: Scene, *steps: vkc.Step) -> Task:
 
 
 def list_supported(task: Task) -> list[list[tuple[str, str]]]:
-    return [[(ride.object, ride.support) for ride in phase.supported] for phase in task.phases]
+    return [[(item.object, item.support) for item in phase.supported] for phase in task.phases]
 
 
 def test_cup_on_the_plate_moves_with_it() -> None:
@@ -43,7 +43,7 @@ def test_cup_on_the_plate_moves_with_it() -> None:
     assert [hold.object for hold in task.phases[3].held] == ["cup"]
 
 
-def test_object_above_the_plate_or_on_the_post_does_not_move() -> None:
+def test_object_above_the_plate_does_not_move_with_it() -> None:
     assert list_supported(
         compile_steps(make_plate_scene(gap=0.05), vkc.Actuate("plate", {"slide": 0.4}))
     ) == [
@@ -93,35 +93,35 @@ def test_cup_placed_on_the_plate_moves_with_it() -> None:
     steps = vkc.Place("cup", [0.8, 0.05, TOP]), vkc.Actuate("plate", {"slide": 0.4})
     task = compile_steps(scene, *steps)
     assert list_supported(task)[-1] == [("cup", "plate.plate")]
-    assert "cup" in task.phases[-2].released_by  # at a heading that the motion decides
+    assert "cup" in task.phases[-2].released_by  # the motion determines its heading
     assert "cup" not in task.phases[-1].released_by
 
 
 def test_cup_on_the_held_tray_moves_with_it() -> None:
-    task = compile_steps(make_tray_scene(), vkc.Place("tray", THERE), vkc.GoTo(0.0, 0.0))
+    task = compile_steps(make_tray_scene(), vkc.Place("tray", GOAL), vkc.GoTo(0.0, 0.0))
     assert list_supported(task) == [[], [("cup", "tray.tray")], []]
     left = task.phases[2].resting["cup"].translation
     np.testing.assert_allclose(
-        left, THERE.translation + np.array([0.02, 0.05, 0.02]), rtol=0.0, atol=1e-12
+        left, GOAL.translation + np.array([0.02, 0.05, 0.02]), rtol=0.0, atol=1e-12
     )
 
 
 @pytest.mark.parametrize(("axis", "is_level"), [([0, 0, 1], True), ([1, 0, 0], False)])
 def test_goal_that_tilts_the_held_tray_is_rejected(axis: list[float], is_level: bool) -> None:
-    there = pin.SE3(pin.exp3(0.2 * np.array(axis, float)), THERE.translation)
+    goal = pin.SE3(pin.exp3(0.2 * np.array(axis, float)), GOAL.translation)
     for step, field in (
-        (vkc.Place("tray", there), "steps[0].pose"),
-        (vkc.Touch("tray.tray", there), "steps[0].target"),
+        (vkc.Place("tray", goal), "steps[0].pose"),
+        (vkc.Touch("tray.tray", goal), "steps[0].target"),
     ):
         if is_level:
             assert compile_steps(make_tray_scene(), step).phases
             continue
         with pytest.raises(
             InputError, match=r"'cup' rests on 'tray\.tray', which would tilt"
-        ) as at:
+        ) as caught:
             compile_steps(make_tray_scene(), step)
-        assert at.value.field == field
-        assert at.value.got == "0.2 rad"
+        assert caught.value.field == field
+        assert caught.value.got == "0.2 rad"
 
 
 def test_supported_object_cannot_be_grasped() -> None:
@@ -134,4 +134,4 @@ def test_supported_object_of_uncertain_placement_cannot_be_grasped() -> None:
         InputError, match="the placement of 'cup' at this step is known only after planning"
     ):
         compile_steps(make_tray_scene(), vkc.Place("tray", [-0.5, -1.5, 0.7]), vkc.Grasp("cup"))
-    compile_steps(make_tray_scene(), vkc.Place("tray", THERE), vkc.Grasp("cup"))
+    compile_steps(make_tray_scene(), vkc.Place("tray", GOAL), vkc.Grasp("cup"))

@@ -17,7 +17,7 @@ PERSON = np.array([1.0, 2.0, 1.0])
 SHORT = vkc.Options(reach_waypoints=3)
 
 
-def tilt(**fields: Any) -> vkc.Constraint:
+def make_upright(**fields: Any) -> vkc.Constraint:
     return vkc.Constraint(
         "upright", lambda s: s.rotation("stick.stick")[2, 2], **{"lower": 0.98, **fields}
     )
@@ -66,11 +66,17 @@ def test_bounds_are_extended_to_all_rows() -> None:
     assert isinstance(within, vkc.Constraint)
     np.testing.assert_array_equal(slow.compute_bounds(1), [[-unbounded], [0.0]])
     np.testing.assert_array_equal(within.compute_bounds(3), [[-1, -2, 0], [1, 2, unbounded]])
-    np.testing.assert_array_equal(tilt(upper=1).compute_bounds(2), [[0.98, 0.98], [1.0, 1.0]])
+    np.testing.assert_array_equal(
+        make_upright(upper=1).compute_bounds(2), [[0.98, 0.98], [1.0, 1.0]]
+    )
 
 
-def test_when_terms_are_active() -> None:
-    always, placing, carrying = tilt(), tilt(during="place stick"), tilt(holding="stick")
+def test_terms_are_active_in_their_phases_and_holds() -> None:
+    always, placing, carrying = (
+        make_upright(),
+        make_upright(during="place stick"),
+        make_upright(holding="stick"),
+    )
     assert placing.during == ("place stick",)
     assert [term.is_active("place stick", ()) for term in (always, placing, carrying)] == [
         True,
@@ -82,7 +88,7 @@ def test_when_terms_are_active() -> None:
         False,
         True,
     ]
-    both = tilt(during=["place stick", "go to"], holding="stick")
+    both = make_upright(during=["place stick", "go to"], holding="stick")
     assert [
         both.is_active(*when) for when in (("go to", ()), ("go to", ["stick"]), ("move", ["stick"]))
     ] == [False, True, False]
@@ -106,7 +112,7 @@ def test_when_terms_are_active() -> None:
 )
 def test_errors_name_the_invalid_field(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(vkc.InputError, match=message):
-        tilt(**fields)
+        make_upright(**fields)
 
 
 def test_names_expressions_and_weights_are_checked() -> None:
@@ -148,7 +154,7 @@ def test_errors_name_the_invalid_expression(
         trace_terms(make_hall(), [vkc.Constraint("mine", expression, lower=0.0)])
 
 
-def test_unknown_names_are_named() -> None:
+def test_unknown_names_in_expressions_are_rejected() -> None:
     scene = make_room(describe_table())
     for expression, nearest in (
         (lambda s: s.position("stick.tipp"), "stick.tip"),
@@ -159,22 +165,27 @@ def test_unknown_names_are_named() -> None:
             trace_terms(scene, [vkc.Cost("mine", expression)])
         assert (caught.value.nearest, caught.value.field) == (nearest, "terms['mine'].expression")
     with pytest.raises(vkc.UnknownNameError) as caught:
-        trace_terms(scene, [tilt(holding="stik")])
+        trace_terms(scene, [make_upright(holding="stik")])
     assert (caught.value.nearest, caught.value.field) == ("stick", "terms['upright'].holding")
-    with pytest.raises(vkc.UnknownNameError, match="there is no frame 'stick"):  # traced elsewhere
-        trace_terms(make_hall(), trace_terms(scene, [tilt()]))
+    with pytest.raises(vkc.UnknownNameError, match="there is no frame 'stick"):  # another scene
+        trace_terms(make_hall(), trace_terms(scene, [make_upright()]))
 
 
 def test_unknown_phases_are_rejected() -> None:
     phases = [("reach stick.grip", ()), ("place stick", ("stick",))]
-    check_terms_active([tilt(), tilt(during="place stick"), tilt(holding="stick")], phases)
+    check_terms_active(
+        [make_upright(), make_upright(during="place stick"), make_upright(holding="stick")], phases
+    )
     with pytest.raises(vkc.UnknownNameError, match="there is no phase 'place stik'") as caught:
-        check_terms_active([tilt(during=["place stick", "place stik"])], phases)
+        check_terms_active([make_upright(during=["place stick", "place stik"])], phases)
     assert (caught.value.nearest, caught.value.choices) == (
         "place stick",
         ("reach stick.grip", "place stick"),
     )
-    for wrong in (tilt(holding="ball"), tilt(holding="stick", during="reach stick.grip")):
+    for wrong in (
+        make_upright(holding="ball"),
+        make_upright(holding="stick", during="reach stick.grip"),
+    ):
         with pytest.raises(vkc.InputError, match="never held in these phases"):
             check_terms_active([wrong], phases)
 
@@ -184,14 +195,14 @@ def test_invalid_terms_are_found_before_planning(function: Callable[..., Any]) -
     steps = [vkc.Place("stick", (0.8, 0.5, 0.56)), vkc.GoTo(0.0, 0.0)]
     for terms, message in (
         (
-            [tilt(during="plaice stick")],
+            [make_upright(during="plaice stick")],
             "there is no phase 'plaice stick'; did you mean 'place stick'",
         ),
         ([vkc.Cost("far", lambda s: s.position("too")[0])], "there is no frame 'too'"),
-        ([tilt(lower=[0, 0])], "wrong number of bounds"),
-        (tilt(), "terms: not a list"),
-        ([tilt(), lambda s: 0], r"terms\[1\]: wrong type of entry"),
-        ([tilt(), tilt(lower=0.5)], "two terms share a name"),
+        ([make_upright(lower=[0, 0])], "wrong number of bounds"),
+        (make_upright(), "terms: not a list"),
+        ([make_upright(), lambda s: 0], r"terms\[1\]: wrong type of entry"),
+        ([make_upright(), make_upright(lower=0.5)], "two terms share a name"),
     ):
         with pytest.raises(vkc.InputError, match=message):
             function(make_room(describe_table()), steps, options=SHORT, terms=terms)
@@ -212,7 +223,7 @@ def test_invalid_terms_are_found_before_planning(function: Callable[..., Any]) -
     ],
 )
 def test_damaged_expressions_are_rejected(wrong: dict[str, Any]) -> None:
-    (term,) = trace_terms(make_room(describe_table()), [tilt()])
+    (term,) = trace_terms(make_room(describe_table()), [make_upright()])
     data = term_to_dict(term)
     with pytest.raises(vkc.InputError, match="not a saved term"):
         term_from_dict({**data, "expression": {**data["expression"], **wrong}})

@@ -22,49 +22,53 @@ def sample_curve(seed: int, knots: int = 7, size: int = 3) -> Curve:
 def test_values_and_derivatives_match_scipy(seed: int, knots: int) -> None:
     curve = sample_curve(seed, knots)
     other = CubicHermiteSpline(curve.times, curve.positions, curve.rates)
-    moments = np.random.default_rng(seed).uniform(curve.times[0], curve.times[-1], 40)
-    for order, mine in enumerate((curve.at, curve.velocity, curve.acceleration)):
-        np.testing.assert_allclose(mine(moments), other(moments, order), rtol=0.0, atol=1e-9)
-        np.testing.assert_allclose(mine(moments[3]), other(moments[3], order), rtol=0.0, atol=1e-9)
-        assert mine(moments.reshape(8, 5)).shape == (8, 5, 3)
+    sample_times = np.random.default_rng(seed).uniform(curve.times[0], curve.times[-1], 40)
+    for order, evaluate in enumerate((curve.at, curve.velocity, curve.acceleration)):
+        np.testing.assert_allclose(
+            evaluate(sample_times), other(sample_times, order), rtol=0.0, atol=1e-9
+        )
+        np.testing.assert_allclose(
+            evaluate(sample_times[3]), other(sample_times[3], order), rtol=0.0, atol=1e-9
+        )
+        assert evaluate(sample_times.reshape(8, 5)).shape == (8, 5, 3)
 
 
 def test_curve_is_at_rest_outside_its_span() -> None:
     curve = sample_curve(1)
-    moments = np.array([curve.times[0] - 1.0, curve.times[-1] + 1.0])
-    np.testing.assert_array_equal(curve.at(moments), curve.positions[[0, -1]])
-    np.testing.assert_array_equal(curve.velocity(moments), 0.0)
-    np.testing.assert_array_equal(curve.acceleration(moments), 0.0)
+    sample_times = np.array([curve.times[0] - 1.0, curve.times[-1] + 1.0])
+    np.testing.assert_array_equal(curve.at(sample_times), curve.positions[[0, -1]])
+    np.testing.assert_array_equal(curve.velocity(sample_times), 0.0)
+    np.testing.assert_array_equal(curve.acceleration(sample_times), 0.0)
 
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6), st.booleans())
 def test_extrema_and_rates_bound_dense_samples(seed: int, even: bool) -> None:
     curve = sample_curve(seed)
-    if even:  # parabolas and straight lines among them
+    if even:  # includes parabolas and straight lines
         chords = np.diff(curve.positions, axis=0) / np.diff(curve.times)[:, None]
         curve = Curve(curve.times, curve.positions, np.vstack([chords, chords[-1:]]))
     low, high = curve.compute_extrema()
     fastest, strongest = curve.compute_max_rates()
     for k, (begin, end) in enumerate(zip(curve.times, curve.times[1:], strict=False)):
-        moments = np.linspace(begin, end, 2001)[:-1]
-        places, velocities, changes = (
-            curve.at(moments),
-            np.abs(curve.velocity(moments)),
-            np.abs(curve.acceleration(moments)),
+        sample_times = np.linspace(begin, end, 2001)[:-1]
+        positions, velocities, accelerations = (
+            curve.at(sample_times),
+            np.abs(curve.velocity(sample_times)),
+            np.abs(curve.acceleration(sample_times)),
         )
         np.testing.assert_allclose(
-            low[k], np.minimum(places.min(axis=0), curve.positions[k + 1]), atol=1e-5
+            low[k], np.minimum(positions.min(axis=0), curve.positions[k + 1]), atol=1e-5
         )
         np.testing.assert_allclose(
-            high[k], np.maximum(places.max(axis=0), curve.positions[k + 1]), atol=1e-5
+            high[k], np.maximum(positions.max(axis=0), curve.positions[k + 1]), atol=1e-5
         )
-        assert (low[k] <= places.min(axis=0) + 1e-12).all()
-        assert (high[k] >= places.max(axis=0) - 1e-12).all()
+        assert (low[k] <= positions.min(axis=0) + 1e-12).all()
+        assert (high[k] >= positions.max(axis=0) - 1e-12).all()
         np.testing.assert_allclose(fastest[k], velocities.max(axis=0), rtol=2e-2, atol=1e-9)
         assert (fastest[k] >= velocities.max(axis=0) - 1e-12).all()
-        np.testing.assert_allclose(strongest[k], changes.max(axis=0), rtol=2e-2, atol=1e-9)
-        assert (strongest[k] >= changes.max(axis=0) - 1e-9).all()
+        np.testing.assert_allclose(strongest[k], accelerations.max(axis=0), rtol=2e-2, atol=1e-9)
+        assert (strongest[k] >= accelerations.max(axis=0) - 1e-9).all()
 
 
 def test_concatenated_parts_equal_the_whole() -> None:
@@ -100,7 +104,7 @@ def test_invalid_arrays_are_rejected(arrays: tuple[object, object, object], fiel
     assert raised.value.field == field
 
 
-def test_curve_must_lead_through_waypoints() -> None:
+def test_curve_must_pass_through_waypoints() -> None:
     curve = sample_curve(4)
     at = [0, 2, 6]
     curve.check_through(curve.times[at], curve.positions[at])

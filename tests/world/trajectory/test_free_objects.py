@@ -10,13 +10,13 @@ from helpers.carrying import (
     BALL,
     STICK,
     UP,
-    Script,
-    carry_over,
+    MotionBuilder,
     compute_freedom,
     compute_grasp_pose,
     describe_stand,
     describe_table,
     lift,
+    make_carrying_motion,
     make_room,
     move_base,
     solve_above,
@@ -30,13 +30,13 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
 TIP = pin.SE3(pin.utils.rotate("x", -np.pi / 2), np.array([0.0, 0.25, 0.0]))  # in the stick
-PULL = (np.pi / 2, 0.0, 0.0)  # how the ball lies on the tip that comes from the right
+PULL = (np.pi / 2, 0.0, 0.0)  # orientation of the ball on the tip, which approaches from the right
 
 
 def compute_placements(
     scene: Scene, motion: Trajectory, name: str, times: np.ndarray
 ) -> list[pin.SE3]:
-    """Return where a free object is at some times, as the world says."""
+    """Return the placements of a free object in the world model at given times."""
     world = World(scene)
     return [
         pin.XYZQUATToSE3(row)
@@ -45,7 +45,7 @@ def compute_placements(
 
 
 def compute_tools(scene: Scene, motion: Trajectory, times: np.ndarray) -> list[pin.SE3]:
-    """Return where the hand is, from the robot alone."""
+    """Return the placements of the tool, computed from the robot alone."""
     model, data, found = scene.robot.model, scene.robot.model.createData(), []
     for row in motion.at(times)[:, : motion.robot_size]:
         pin.framesForwardKinematics(model, data, scene.robot.coordinates.q(row))
@@ -54,21 +54,21 @@ def compute_tools(scene: Scene, motion: Trajectory, times: np.ndarray) -> list[p
 
 
 def sample_phase(motion: Trajectory, phase: int, count: int = 40) -> np.ndarray:
-    """Return times of a phase, both ends among them."""
+    """Return sample times of a phase, including both ends."""
     return np.linspace(
         motion.times[motion.phases[phase].first], motion.times[motion.phases[phase].last], count
     )
 
 
-def assert_same(first: pin.SE3, second: pin.SE3, tolerance: float = 1e-9) -> None:
+def assert_close(first: pin.SE3, second: pin.SE3, tolerance: float = 1e-9) -> None:
     np.testing.assert_allclose(first.homogeneous, second.homogeneous, rtol=0.0, atol=tolerance)
 
 
 @cache
 def make_carried_motion() -> tuple[Scene, Trajectory]:
-    """Return the stick that is carried over the table, and a ball that is not."""
+    """Return a scene and a motion that carries the stick over the table; the ball stays."""
     scene = make_room(describe_table(), objects=("stick", "ball"))
-    return scene, carry_over(scene, values=(0.03, 0.2)).motion()
+    return scene, make_carrying_motion(scene, values=(0.03, 0.2)).motion()
 
 
 def test_object_rests_before_the_grasp_and_after_the_release() -> None:
@@ -77,12 +77,12 @@ def test_object_rests_before_the_grasp_and_after_the_release() -> None:
     assert held == [2, 3, 4]
     for phase in (0, 1):
         for at in compute_placements(scene, motion, "stick", sample_phase(motion, phase)):
-            assert_same(at, STICK, 1e-12)
+            assert_close(at, STICK, 1e-12)
     for at in compute_placements(scene, motion, "stick", sample_phase(motion, 5)):
-        assert_same(at, lift(STICK, [0.0, 0.5, 0.0]))
+        assert_close(at, lift(STICK, [0.0, 0.5, 0.0]))
     for phase in range(len(motion.phases)):
         for at in compute_placements(scene, motion, "ball", sample_phase(motion, phase, 5)):
-            assert_same(at, BALL, 1e-12)
+            assert_close(at, BALL, 1e-12)
 
 
 def test_object_moves_rigidly_with_the_hand() -> None:
@@ -94,7 +94,7 @@ def test_object_moves_rigidly_with_the_hand() -> None:
             compute_tools(scene, motion, times),
             strict=True,
         ):
-            assert_same(
+            assert_close(
                 at.inverse() * tool, compute_grasp_pose(pin.SE3.Identity(), values=(0.03, 0.2))
             )
     lowest, highest = (
@@ -108,7 +108,7 @@ def test_object_moves_rigidly_with_the_hand() -> None:
 
 def test_grasp_freedoms_move_the_hand_along_the_object() -> None:
     scene = make_room(describe_table())
-    script = carry_over(scene)
+    script = make_carrying_motion(scene)
     count = len(script.rows)
     slide, turn = (
         0.05 * np.sin(np.linspace(0.0, 9.0, count)),
@@ -116,8 +116,8 @@ def test_grasp_freedoms_move_the_hand_along_the_object() -> None:
     )
     motion = script.motion(stick__grip_slide=slide, stick__grip_turn=turn)
     first = motion.phases[2].first
-    # Where the hand closes the stick lies as it lies, whatever the coordinates say; from then on
-    # they count.
+    # The stick keeps its placement at the grasp, even if the grasp coordinates disagree with it.
+    # Afterwards the coordinates determine its motion in the hand.
     offset = (
         compute_grasp_pose(pin.SE3.Identity(), values=(slide[first], turn[first]))
         * compute_grasp_pose(STICK).inverse()
@@ -133,22 +133,22 @@ def test_grasp_freedoms_move_the_hand_along_the_object() -> None:
         for at, tool, (s, t) in zip(
             sticks, compute_tools(scene, motion, times), values, strict=True
         ):
-            assert_same(
+            assert_close(
                 at, tool * compute_grasp_pose(pin.SE3.Identity(), values=(s, t)).inverse() * offset
             )
 
 
-def make_fetching_motion() -> tuple[Scene, Script]:
+def make_fetching_motion() -> tuple[Scene, MotionBuilder]:
     """Return a motion in which a held stick lifts a ball, carries it aside and puts it down."""
     scene = make_room(describe_stand(), objects=("stick", "ball"))
     south = pin.SE3(
         STICK.rotation, BALL.translation - np.array([0.0, 0.285, 0.0])
-    )  # of the stick when its tip is at the ball
+    )  # placement of the stick with its tip at the ball
     touch = solve_reach(compute_grasp_pose(south), solve_above(STICK))
     up = solve_reach(compute_grasp_pose(lift(south, UP / 4)), touch)
     scene = scene.with_held({"stick": "grip"}).with_start(arm=up[3:])
     script = (
-        Script(scene)
+        MotionBuilder(scene)
         .go(touch)
         .take("ball", "pull", PULL, by="stick.tip")
         .go(up)
@@ -171,7 +171,7 @@ def test_object_held_through_a_stick_follows_its_tip() -> None:
     ).inverse()
     flipped = pin.SE3(
         np.diag([1.0, -1.0, -1.0]), np.zeros(3)
-    )  # of the ball's attachment, which looks down
+    )  # rotation of the ball's attachment, which points down
     for phase in (1, 2, 3):
         times = sample_phase(motion, phase)
         sticks = compute_placements(scene, motion, "stick", times)
@@ -181,12 +181,12 @@ def test_object_held_through_a_stick_follows_its_tip() -> None:
             compute_tools(scene, motion, times),
             strict=True,
         ):
-            assert_same(ball, stick * TIP * on_tip * flipped)
-            assert_same(stick, tool * compute_grasp_pose(pin.SE3.Identity()).inverse())
-            assert_same(stick.inverse() * ball, pin.SE3(np.eye(3), np.array([0.0, 0.285, 0.0])))
-    assert_same(compute_placements(scene, motion, "ball", sample_phase(motion, 0))[7], BALL, 1e-12)
+            assert_close(ball, stick * TIP * on_tip * flipped)
+            assert_close(stick, tool * compute_grasp_pose(pin.SE3.Identity()).inverse())
+            assert_close(stick.inverse() * ball, pin.SE3(np.eye(3), np.array([0.0, 0.285, 0.0])))
+    assert_close(compute_placements(scene, motion, "ball", sample_phase(motion, 0))[7], BALL, 1e-12)
     for at in compute_placements(scene, motion, "ball", sample_phase(motion, 4)):
-        assert_same(at, lift(BALL, [0.0, 0.3, 0.0]))
+        assert_close(at, lift(BALL, [0.0, 0.3, 0.0]))
 
 
 def test_object_held_at_the_start_is_in_the_hand() -> None:
@@ -194,35 +194,34 @@ def test_object_held_at_the_start_is_in_the_hand() -> None:
     world = World(scene)
     tool = scene.tool_placement()
     expected = tool * compute_grasp_pose(pin.SE3.Identity(), values=(-0.04, 0.5)).inverse()
-    assert_same(
+    assert_close(
         pin.XYZQUATToSE3(world.start[world.get_placement_columns("stick")]), expected, 1e-12
     )
-    motion = Script(scene).go(move_base(scene.start, x=-1.0, yaw=2.0)).motion()
+    motion = MotionBuilder(scene).go(move_base(scene.start, x=-1.0, yaw=2.0)).motion()
     times = sample_phase(motion, 0)
     for at, tool in zip(
         compute_placements(scene, motion, "stick", times),
         compute_tools(scene, motion, times),
         strict=True,
     ):
-        assert_same(
+        assert_close(
             at, tool * compute_grasp_pose(pin.SE3.Identity(), values=(-0.04, 0.5)).inverse()
         )
 
 
 @cache
 def make_turning_motion() -> tuple[Scene, Trajectory]:
-    """Return the stick turned round and round: two turns of the base, and the arm's wrist too."""
+    """Return a motion that rotates the stick by two turns of the base, and by the arm."""
     scene = make_room(describe_table())
     down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
-    script = Script(scene).go(down).take("stick").go(np.array(scene.start))
-    there = move_base(scene.start, x=-2.0, yaw=4 * np.pi)
-    there[5:9] += [0.4, 1.0, -0.8, 3.0]
-    script.go(there, steps=60).let_go().go(move_base(there, x=-1.0))
+    script = MotionBuilder(scene).go(down).take("stick").go(np.array(scene.start))
+    turned = move_base(scene.start, x=-2.0, yaw=4 * np.pi)
+    turned[5:9] += [0.4, 1.0, -0.8, 3.0]
+    script.go(turned, steps=60).let_go().go(move_base(turned, x=-1.0))
     return scene, script.motion()
 
 
-def test_placements_are_continuous() -> None:
-    """Where one phase ends and the next begins, too."""
+def test_placements_are_continuous_at_phase_boundaries() -> None:
     for scene, motion in (
         make_carried_motion(),
         make_turning_motion(),
@@ -235,20 +234,18 @@ def test_placements_are_continuous() -> None:
                     scene, motion, name, np.array([edge - 1e-7, edge, edge + 1e-7])
                 )
                 for other in (near[0], near[2]):
-                    assert_same(near[1], other, 1e-5)
+                    assert_close(near[1], other, 1e-5)
 
 
 def test_quaternions_are_continuous() -> None:
-    """Of both quaternions of an orientation the nearer one, through two whole turns."""
+    """The sign of the quaternion is chosen for continuity, here through two full turns."""
     scene, motion = make_turning_motion()
     world, times = World(scene), np.linspace(0.0, motion.times[-1], 3000)
     rows = world.compute_positions(motion, times)[:, world.get_placement_columns("stick")]
     np.testing.assert_allclose(np.linalg.norm(rows[:, 3:], axis=1), 1.0, atol=1e-12)
     assert np.einsum("kc,kc->k", rows[1:, 3:], rows[:-1, 3:]).min() > 0.999
     assert np.abs(np.diff(rows, axis=0)).max() < 0.02
-    assert (
-        rows[:, 3:].min(axis=0) < -0.3
-    ).sum() >= 2  # it does come round to where the first choice would flip
+    assert (rows[:, 3:].min(axis=0) < -0.3).sum() >= 2  # a fixed sign convention would flip here
 
 
 @settings(max_examples=6, deadline=None)
@@ -259,9 +256,9 @@ def test_placements_do_not_depend_on_other_times(seed: int) -> None:
     times = np.sort(rng.uniform(-1.0, motion.times[-1] + 1.0, rng.integers(1, 9)))
     together = compute_placements(scene, motion, "stick", times)
     for at, time in zip(together, times, strict=True):
-        assert_same(at, compute_placements(scene, motion, "stick", np.array([time]))[0])
+        assert_close(at, compute_placements(scene, motion, "stick", np.array([time]))[0])
     assert compute_placements(scene, motion, "stick", np.zeros(0)) == []
     waypoints = compute_placements(scene, motion, "stick", motion.times)
     world = World(scene)
     for row, at in zip(world.compute_positions(motion), waypoints, strict=True):
-        assert_same(pin.XYZQUATToSE3(row[world.get_placement_columns("stick")]), at, 1e-12)
+        assert_close(pin.XYZQUATToSE3(row[world.get_placement_columns("stick")]), at, 1e-12)

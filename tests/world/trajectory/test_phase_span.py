@@ -1,4 +1,4 @@
-"""Tests phases as plain data."""
+"""Tests the conversion of phase spans to data and back."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STICK = Hold("stick", "grip")
         PhaseSpan("open", 1, 7, (Hold("door", "handle"),), 0.04),
     ],
 )
-def test_round_trip(span: PhaseSpan) -> None:
+def test_phase_spans_survive_a_round_trip_through_data(span: PhaseSpan) -> None:
     data = span.to_dict()
     assert ("opening" in data) == (span.opening is not None)
     assert PhaseSpan.from_dict(data, "phases[0]") == span

@@ -25,7 +25,7 @@ def motion(world: World, plan: Plan) -> Motion:
     return sample_motion(world, plan.trajectory)
 
 
-def test_key_times_are_waypoints_and_more_on_long_turns(plan: Plan) -> None:
+def test_key_times_include_waypoints_and_divide_long_turns(plan: Plan) -> None:
     times = key_times(plan.trajectory)
     assert set(plan.trajectory.times) <= set(times)
     assert np.abs(np.diff(plan.trajectory.at(times), axis=0)).max() <= 1.0 + 1e-9

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.written import NAMES, ROWS
+from helpers.trajectory_files import NAMES, ROWS
 
 from vkc_pin.errors import InputError
 from vkc_pin.world.scene.hold import Hold, make_holds
@@ -28,7 +28,7 @@ def test_missing_values_are_filled_from_their_neighbours() -> None:
 
 
 def make_parts() -> tuple[Trajectory, Trajectory, Trajectory]:
-    """Return motions that reach for the door, open it and go on; the second has its hinge."""
+    """Return motions that reach the door, open it and leave; only the second has a hinge column."""
     robot = NAMES[:5]
     held = (Hold("door", "handle"),)
     reach = Trajectory(
@@ -52,8 +52,8 @@ def test_concatenation_pauses_at_new_grasps() -> None:
     np.testing.assert_array_equal(whole.positions[:, :5], ROWS[[0, 1, 2, 2, 3, 0], :5])
     np.testing.assert_array_equal(
         whole.positions[:, 5], [0.0, 0.0, 0.0, 0.0, 1.2, 1.2]
-    )  # as it will be, or as it was
-    # Waiting belongs to what follows.
+    )  # filled from the nearest motion that has it
+    # The pause belongs to the next phase.
     assert [(p.name, p.first, p.last) for p in whole.phases] == [
         ("a", 0, 1),
         ("b", 1, 2),

@@ -1,4 +1,4 @@
-"""Trajectories: efforts and rates by hand, interpolation, phases, plain data, bad input."""
+"""Tests trajectories: path lengths, derivatives, interpolation, data and invalid input."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.written import NAMES, PHASES, ROWS, TIMES, make_example
+from helpers.trajectory_files import NAMES, PHASES, ROWS, TIMES, make_example_trajectory
 
 from vkc_pin.errors import InputError
 from vkc_pin.world.scene.hold import make_holds
@@ -15,16 +15,16 @@ from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
-def test_efforts() -> None:
-    assert make_example().base_path_length() == pytest.approx(5.0 + 1.0)
-    assert make_example().base_path_length_l1() == pytest.approx(3.0 + 4.0 + 1.0)
-    assert make_example().arm_path_length() == pytest.approx(
+def test_path_lengths() -> None:
+    assert make_example_trajectory().base_path_length() == pytest.approx(5.0 + 1.0)
+    assert make_example_trajectory().base_path_length_l1() == pytest.approx(3.0 + 4.0 + 1.0)
+    assert make_example_trajectory().arm_path_length() == pytest.approx(
         0.1 + 0.2 + 0.4 + 0.1
     )  # neither the heading nor the door counts
 
 
 def test_samples_and_velocities_of_linear_motions() -> None:
-    motion = make_example()
+    motion = make_example_trajectory()
     times, rows = motion.sample(2.0)
     np.testing.assert_allclose(times, np.arange(14) / 2.0)
     np.testing.assert_array_equal(rows, motion(times))
@@ -37,16 +37,16 @@ def test_samples_and_velocities_of_linear_motions() -> None:
     assert [part.times.tolist() for part in motion.parts()] == [[0.0, 2.0, 2.5], [2.5, 6.5]]
 
 
-def test_accelerations() -> None:
-    """The step of velocity over the shorter of both neighbours' durations; from and to rest."""
+def test_accelerations_at_waypoints() -> None:
+    """A velocity step is divided by the shorter adjacent duration; both ends are at rest."""
     x, hinge = [1.5 / 2.0, -1.5 / 0.5, -0.25 / 0.5, 0.25 / 4.0], [0.0, 0.0, 0.3 / 0.5, -0.3 / 4.0]
-    np.testing.assert_allclose(make_example().accelerations()[:, 0], x)
-    np.testing.assert_allclose(make_example().accelerations()[:, 5], hinge)
-    assert make_example().accelerations().shape == (4, 6)
+    np.testing.assert_allclose(make_example_trajectory().accelerations()[:, 0], x)
+    np.testing.assert_allclose(make_example_trajectory().accelerations()[:, 5], hinge)
+    assert make_example_trajectory().accelerations().shape == (4, 6)
 
 
-def test_at() -> None:
-    motion = make_example()
+def test_positions_are_interpolated_linearly() -> None:
+    motion = make_example_trajectory()
     np.testing.assert_allclose(motion.at(1.0), ROWS[1] / 2 + ROWS[0] / 2)
     np.testing.assert_allclose(
         motion.at([3.5, 6.5])[0], 0.75 * ROWS[2] + 0.25 * ROWS[3], atol=1e-15
@@ -57,14 +57,18 @@ def test_at() -> None:
 
 
 @pytest.mark.parametrize("time", ["soon", float("nan"), [0.0, float("inf")]])
-def test_what_is_no_time(time: Any) -> None:
-    for ask in (make_example().at, make_example().velocity, make_example().acceleration):
+def test_invalid_times_are_rejected(time: Any) -> None:
+    for evaluate in (
+        make_example_trajectory().at,
+        make_example_trajectory().velocity,
+        make_example_trajectory().acceleration,
+    ):
         with pytest.raises(InputError, match="time"):
-            ask(time)
+            evaluate(time)
 
 
-def test_round_trip() -> None:
-    motion = make_example(positions=np.random.default_rng(0).normal(size=ROWS.shape))
+def test_trajectories_survive_a_round_trip_through_data() -> None:
+    motion = make_example_trajectory(positions=np.random.default_rng(0).normal(size=ROWS.shape))
     again = Trajectory.from_dict(json.loads(json.dumps(motion.to_dict())))
     np.testing.assert_array_equal(again.positions, motion.positions)
     np.testing.assert_array_equal(again.times, motion.times)
@@ -75,10 +79,10 @@ def test_round_trip() -> None:
     )
 
 
-def test_what_is_held_through_something_is_kept_too() -> None:
+def test_indirect_holds_survive_a_round_trip_through_data() -> None:
     held, by = {"stick": "grip", "ball": "pull"}, {"ball": "stick.tip"}
     phases = (PhaseSpan("reach", 0, 2), PhaseSpan("carry", 2, 3, make_holds(held, by)))
-    data = json.loads(json.dumps(make_example(phases=phases).to_dict()))
+    data = json.loads(json.dumps(make_example_trajectory(phases=phases).to_dict()))
     assert [phase["by"] for phase in data["phases"]] == [{}, by]
     assert Trajectory.from_dict(data).phases == phases
     for phase in data["phases"]:  # as in older files
@@ -87,8 +91,8 @@ def test_what_is_held_through_something_is_kept_too() -> None:
 
 
 @pytest.mark.parametrize("key", ["names", "times", "positions", "phases", "robot_size"])
-def test_data_that_lacks_something(key: str) -> None:
-    data = make_example().to_dict()
+def test_missing_fields_are_rejected(key: str) -> None:
+    data = make_example_trajectory().to_dict()
     del data[key]
     with pytest.raises(InputError) as caught:
         Trajectory.from_dict(data)
@@ -121,7 +125,7 @@ def test_data_that_lacks_something(key: str) -> None:
         ("Trajectory.phases", {"phases": (PHASES[0], PhaseSpan("beyond", 2, 4))}),
     ],
 )
-def test_bad_input(field: str, changes: dict[str, Any]) -> None:
+def test_invalid_fields_are_rejected(field: str, changes: dict[str, Any]) -> None:
     with pytest.raises(InputError) as caught:
-        make_example(**changes)
+        make_example_trajectory(**changes)
     assert caught.value.field == field

@@ -1,4 +1,4 @@
-"""Tests steps of wheeled bases against finely divided motions."""
+"""Tests the steps of wheeled bases against numerically integrated arcs."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def integrate_arcs(speeds: list[tuple[float, float]]) -> np.ndarray:
 @settings(deadline=None)
 @given(SPEEDS)
 def test_arcs_do_not_slip_sideways(speeds: list[tuple[float, float]]) -> None:
-    """Their chords are as long as twice the radius times the sine of half of the turn."""
-    along, aside, turn = RollingLimits.compute_steps(integrate_arcs(speeds))
+    """The length of a chord is 2·radius·sin(turn / 2)."""
+    along, sideways, turn = RollingLimits.compute_steps(integrate_arcs(speeds))
     lengths, turns = np.array(speeds).T
-    np.testing.assert_allclose(aside, 0.0, atol=1e-6)
+    np.testing.assert_allclose(sideways, 0.0, atol=1e-6)
     np.testing.assert_allclose(turn, turns, atol=1e-9)
     np.testing.assert_allclose(along, lengths * np.sinc(turns / (2 * np.pi)), atol=1e-6)
     assert RollingLimits().compute_error(integrate_arcs(speeds)) < 1e-6

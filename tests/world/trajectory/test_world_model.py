@@ -1,4 +1,4 @@
-"""Tests the kinematic tree of a whole scene against those of robot and objects alone."""
+"""Tests the kinematic tree of a scene against the separate trees of robot and objects."""
 
 from __future__ import annotations
 
@@ -32,29 +32,29 @@ def test_frames_equal_those_of_robot_and_objects(world: World, seed: int) -> Non
     data = world.model.createData()
     pin.framesForwardKinematics(world.model, data, world.coordinates.q(z))
 
-    def where(name: str, kind: pin.FrameType) -> np.ndarray:
+    def get_placement(name: str, kind: pin.FrameType) -> np.ndarray:
         return data.oMf[world.model.getFrameId(name, kind)].homogeneous
 
-    robot, n, seen = scene.robot, scene.robot.coordinates.size, 1
-    alone = robot.model.createData()
-    pin.framesForwardKinematics(robot.model, alone, robot.coordinates.q(z[:n]))
+    robot, n, count = scene.robot, scene.robot.coordinates.size, 1
+    own_data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, own_data, robot.coordinates.q(z[:n]))
     for index, frame in enumerate(robot.model.frames[1:], 1):
         np.testing.assert_allclose(
-            where(frame.name, frame.type), alone.oMf[index].homogeneous, atol=1e-12
+            get_placement(frame.name, frame.type), own_data.oMf[index].homogeneous, atol=1e-12
         )
-        seen += 1
+        count += 1
     for name, placed in scene.objects.items():
         item, state = placed.object, z[n : n + placed.object.coordinates.size]
         n += item.coordinates.size
-        alone = item.model.createData()
-        pin.framesForwardKinematics(item.model, alone, item.coordinates.q(state))
+        own_data = item.model.createData()
+        pin.framesForwardKinematics(item.model, own_data, item.coordinates.q(state))
         for index, frame in enumerate(item.model.frames[1:], 1):
-            expected = (placed.placement * alone.oMf[index]).homogeneous
+            expected = (placed.placement * own_data.oMf[index]).homogeneous
             np.testing.assert_allclose(
-                where(f"{name}.{frame.name}", frame.type), expected, atol=1e-12
+                get_placement(f"{name}.{frame.name}", frame.type), expected, atol=1e-12
             )
-            seen += 1
-    assert seen == world.model.nframes
+            count += 1
+    assert count == world.model.nframes
     assert n == world.coordinates.size == world.model.nv
 
 
@@ -65,16 +65,16 @@ def test_shapes_equal_those_of_robot_and_objects(world: World, kind: str) -> Non
     data, shapes = world.model.createData(), geometry.createData()
     pin.updateGeometryPlacements(world.model, data, geometry, shapes, world.coordinates.q(z))
     found = {
-        shape.name: (shape, where)
-        for shape, where in zip(geometry.geometryObjects, shapes.oMg, strict=True)
+        shape.name: (shape, placement)
+        for shape, placement in zip(geometry.geometryObjects, shapes.oMg, strict=True)
     }
     expected: dict[str, tuple[pin.GeometryObject, pin.SE3]] = {}
     robot, n = scene.robot, scene.robot.coordinates.size
     source = getattr(robot, kind)
-    alone, bodies = robot.model.createData(), source.createData()
-    pin.updateGeometryPlacements(robot.model, alone, source, bodies, robot.coordinates.q(z[:n]))
-    for shape, where in zip(source.geometryObjects, bodies.oMg, strict=True):
-        expected[shape.name] = shape, where
+    own_data, bodies = robot.model.createData(), source.createData()
+    pin.updateGeometryPlacements(robot.model, own_data, source, bodies, robot.coordinates.q(z[:n]))
+    for shape, placement in zip(source.geometryObjects, bodies.oMg, strict=True):
+        expected[shape.name] = shape, placement
     for name, placed in scene.objects.items():
         joints = placed.object.coordinates.names
         posed = placed.with_state(dict(zip(joints, z[n : n + len(joints)].tolist(), strict=True)))
@@ -86,15 +86,18 @@ def test_shapes_equal_those_of_robot_and_objects(world: World, kind: str) -> Non
         expected[shape.name] = shape, shape.placement
     assert list(found) == list(
         expected
-    )  # none lost, none twice, robot before objects before obstacles
+    )  # complete, without duplicates, in the order robot, objects, obstacles
     assert len(geometry.geometryObjects) == len(expected)
-    for name, (shape, where) in expected.items():
-        twin, there = found[name]
-        np.testing.assert_allclose(there.homogeneous, where.homogeneous, atol=1e-9)
-        np.testing.assert_array_equal(twin.meshColor, shape.meshColor)
-        np.testing.assert_array_equal(twin.meshScale, shape.meshScale)
-        assert twin.geometry.getNodeType() == shape.geometry.getNodeType()
-        assert (twin.meshPath, twin.overrideMaterial) == (shape.meshPath, shape.overrideMaterial)
+    for name, (shape, placement) in expected.items():
+        found_shape, found_placement = found[name]
+        np.testing.assert_allclose(found_placement.homogeneous, placement.homogeneous, atol=1e-9)
+        np.testing.assert_array_equal(found_shape.meshColor, shape.meshColor)
+        np.testing.assert_array_equal(found_shape.meshScale, shape.meshScale)
+        assert found_shape.geometry.getNodeType() == shape.geometry.getNodeType()
+        assert (found_shape.meshPath, found_shape.overrideMaterial) == (
+            shape.meshPath,
+            shape.overrideMaterial,
+        )
     assert len(geometry.collisionPairs) == 0
 
 
@@ -106,14 +109,14 @@ def test_positions_along_a_motion(world: World) -> None:
     motion = Trajectory(
         names, np.array([0.0, 1.0, 3.0]), values, (PhaseSpan("all", 0, 2),), len(robot)
     )
-    rows, half = world.compute_positions(motion), world.compute_positions(motion, [0.5])
+    rows, middle = world.compute_positions(motion), world.compute_positions(motion, [0.5])
     for k, name in enumerate(world.coordinates.names):
         if name in names:
             np.testing.assert_array_equal(rows[:, k], values[:, names.index(name)])
-            assert half[0, k] == pytest.approx(values[:2, names.index(name)].mean())
+            assert middle[0, k] == pytest.approx(values[:2, names.index(name)].mean())
         else:
             assert (rows[:, k] == world.start[k]).all()
-            assert half[0, k] == world.start[k]
+            assert middle[0, k] == world.start[k]
     assert world.compute_positions(motion, np.zeros(0)).shape == (0, world.coordinates.size)
 
 

@@ -1,4 +1,4 @@
-"""Tests how coupled joints are found and checked."""
+"""Tests the search for coupled joints and their validation."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from helpers.telescopes import format_joint, format_link, write_telescope
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.files.urdf import UrdfFile, read_urdf
+from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.world.models.couplings.coupled_joints import JointCoupling, find_followers
 
 
-def write_chain(tmp_path: Path, *inside: str, kinds: str = "prismatic") -> Path:
+def write_chain(tmp_path: Path, *contents: str, kinds: str = "prismatic") -> Path:
     """Write a chain of joints j1, j2, ... with given contents, and shapes on every other link."""
     parts = [format_link("root", "0.1 0.1 0.1")]
-    for k, text in enumerate(inside, start=1):
+    for k, text in enumerate(contents, start=1):
         parts += [
             format_link(f"l{k}", "0.1 0.1 0.1" if k % 2 else ""),
             format_joint(f"j{k}", kinds, f"l{k - 1}" if k > 1 else "root", f"l{k}", inside=text),
@@ -30,14 +30,10 @@ def format_mimic(leader: str, multiplier: float = 1.0, offset: float = 0.0) -> s
     return f'<mimic joint="{leader}" multiplier="{multiplier}" offset="{offset}"/>'
 
 
-def read(path: Path) -> UrdfFile:
-    return read_urdf(path)
-
-
 def test_chains_are_resolved_to_their_leader(tmp_path: Path) -> None:
     """j3 = -0.5·j2 + 0.2 and j2 = 2·j1 + 0.1, in any order of the file."""
     found = find_followers(
-        read(
+        read_urdf(
             write_chain(tmp_path, "", format_mimic("j1", 2.0, 0.1), format_mimic("j2", -0.5, 0.2))
         ).root
     )
@@ -53,13 +49,15 @@ def test_chains_are_resolved_to_their_leader(tmp_path: Path) -> None:
 def test_a_leader_below_its_follower_becomes_a_follower(tmp_path: Path) -> None:
     """j1 = 2·j3 + 0.1 makes j3 = 0.5·j1 - 0.05, and j2 = -4·j3 makes j2 = -2·j1 + 0.2."""
     found = find_followers(
-        read(write_chain(tmp_path, format_mimic("j3", 2.0, 0.1), format_mimic("j3", -4.0), "")).root
+        read_urdf(
+            write_chain(tmp_path, format_mimic("j3", 2.0, 0.1), format_mimic("j3", -4.0), "")
+        ).root
     )
     assert found == {"j3": JointCoupling("j1", 0.5, -0.05), "j2": JointCoupling("j1", -2.0, 0.2)}
 
 
 @pytest.mark.parametrize(
-    ("inside", "message"),
+    ("contents", "message"),
     [
         (("", format_mimic("j3"), format_mimic("j2")), "j2: couplings are circular.* j2 → j3 → j2"),
         (("", format_mimic("j2")), "j2: couplings are circular.* j2 → j2"),
@@ -75,13 +73,13 @@ def test_a_leader_below_its_follower_becomes_a_follower(tmp_path: Path) -> None:
 )
 @pytest.mark.filterwarnings("ignore:.*there is no joint")
 def test_leaders_that_cannot_move_raise(
-    tmp_path: Path, inside: tuple[str, ...], message: str
+    tmp_path: Path, contents: tuple[str, ...], message: str
 ) -> None:
-    path = write_chain(tmp_path, *inside)
+    path = write_chain(tmp_path, *contents)
     fixed = format_link("aside") + format_joint("still", "fixed", "root", "aside")
     path.write_text(path.read_text().replace("</robot>", fixed + "</robot>"))
     with pytest.raises(InputError, match=message) as caught:
-        vkc.load_robot(path, pairs="all", tool_frame=f"l{len(inside)}")
+        vkc.load_robot(path, pairs="all", tool_frame=f"l{len(contents)}")
     assert (caught.value.file, caught.value.line) == (path, 1)
 
 

@@ -30,7 +30,7 @@ def make_random_robot(rng: np.random.Generator) -> tuple[str, str]:
     """Return a URDF of a random tree with random couplings, and its tool link."""
     count = int(rng.integers(3, 8))
     parts, order = [format_link("l0", "0.1 0.1 0.1")], rng.permutation(count)
-    leads = {
+    leaders = {
         int(one): int(other)
         for k, one in enumerate(order)
         for other in order[:k]
@@ -42,7 +42,7 @@ def make_random_robot(rng: np.random.Generator) -> tuple[str, str]:
             "offset": rng.uniform(-0.3, 0.3),
         }
         attributes = " ".join(f'{key}="{value}"' for key, value in numbers.items())
-        inside = f'<mimic joint="j{leads[k]}" {attributes}/>' if k in leads else ""
+        inside = f'<mimic joint="j{leaders[k]}" {attributes}/>' if k in leaders else ""
         above = f"l{k if rng.random() < 0.7 else rng.integers(0, k + 1)}"
         at, axis = (" ".join(map(str, rng.normal(size=3))) for _ in range(2))
         kind = str(rng.choice(KINDS))
@@ -63,32 +63,35 @@ def test_kinematics_match_independent_joints(seed: int) -> None:
     single = build_full_model(file)
     full = tighten_coupled_limits(single, file, tool)
     rest = compute_rest_positions(full, file, {})
-    model, follows = build_planned_model(full, file, tool, rest, {}), find_followers(file.root)
+    model, followers = build_planned_model(full, file, tool, rest, {}), find_followers(file.root)
     coordinates = Coordinates(model)
     z = rng.uniform(-1.0, 1.0, coordinates.size)
 
-    def everything(z: np.ndarray) -> np.ndarray:
+    def make_full_configuration(z: np.ndarray) -> np.ndarray:
         values = dict(zip(coordinates.names, z, strict=True))
         at = {**rest, **{name: value for name, value in values.items() if name in rest}}
-        at |= {name: led.factor * at[led.leader] + led.offset for name, led in follows.items()}
+        at |= {
+            name: coupling.factor * at[coupling.leader] + coupling.offset
+            for name, coupling in followers.items()
+        }
         q = make_configuration(single, at)
         q[:4] = z[0], z[1], np.cos(z[2]), np.sin(z[2])
         return q
 
-    data, theirs = model.createData(), single.createData()
+    data, single_data = model.createData(), single.createData()
     pin.framesForwardKinematics(model, data, coordinates.q(z))
-    pin.framesForwardKinematics(single, theirs, everything(z))
+    pin.framesForwardKinematics(single, single_data, make_full_configuration(z))
     for frame in (frame for frame in single.frames if frame.type == pin.FrameType.BODY):
         ours = data.oMf[model.getFrameId(frame.name, pin.FrameType.BODY)]
-        expected = theirs.oMf[single.getFrameId(frame.name, pin.FrameType.BODY)]
+        expected = single_data.oMf[single.getFrameId(frame.name, pin.FrameType.BODY)]
         np.testing.assert_allclose(ours.homogeneous, expected.homogeneous, atol=1e-9)
 
     differences = []
     for step in 1e-6 * np.eye(coordinates.size)[2:]:  # x and y in z are in the world frame
         ends = []
         for at in (z + step, z - step):
-            pin.framesForwardKinematics(single, theirs, everything(at))
-            ends.append(theirs.oMf[single.getFrameId(tool, pin.FrameType.BODY)].copy())
+            pin.framesForwardKinematics(single, single_data, make_full_configuration(at))
+            ends.append(single_data.oMf[single.getFrameId(tool, pin.FrameType.BODY)].copy())
         turn = pin.log3(ends[0].rotation @ ends[1].rotation.T)
         move = ends[0].translation - ends[1].translation
         differences.append(np.concatenate([move, turn]) / 2e-6)

@@ -1,9 +1,9 @@
-"""Tests how friction, damping and springs of joints are read, and their forces."""
+"""Tests the friction, damping and springs of joints, and their forces."""
 
 from __future__ import annotations
 
 import pytest
-from helpers.objects import URDF, load_text
+from helpers.objects import URDF, load_object_text
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -19,19 +19,19 @@ def add_dynamics(attributes: str) -> str:
 
 
 def test_resistance_is_zero_by_default() -> None:
-    thing = load_text(URDF, f"urdf: thing.urdf\n{TAIL}")
-    assert thing.resistance == {"hinge": Resistance(), "knob": Resistance()}
+    item = load_object_text(URDF, f"urdf: thing.urdf\n{TAIL}")
+    assert item.resistance == {"hinge": Resistance(), "knob": Resistance()}
     assert Resistance().force(0.7, -0.3) == 0.0
 
 
 def test_the_description_overrides_the_urdf_per_value() -> None:
     urdf = add_dynamics('friction="2" damping="0.5"')
-    plain = load_text(urdf, f"urdf: thing.urdf\n{TAIL}").resistance["hinge"]
+    plain = load_object_text(urdf, f"urdf: thing.urdf\n{TAIL}").resistance["hinge"]
     assert plain == Resistance(friction=2.0, damping=0.5)
     text = (
         f"urdf: thing.urdf\njoints: {{hinge: {{friction: 0, stiffness: 4, springref: -2}}}}\n{TAIL}"
     )
-    assert load_text(urdf, text).resistance["hinge"] == Resistance(
+    assert load_object_text(urdf, text).resistance["hinge"] == Resistance(
         friction=0.0, damping=0.5, stiffness=4.0, springref=-2.0
     )
 
@@ -51,8 +51,10 @@ def test_friction_and_damping_dissipate_and_springs_store_energy(
     position: float, velocity: float, resistance: Resistance
 ) -> None:
     passive = Resistance(stiffness=resistance.stiffness, springref=resistance.springref)
-    lost = (resistance.force(position, velocity) - passive.force(position, velocity)) * velocity
-    assert lost == pytest.approx(
+    dissipated = (
+        resistance.force(position, velocity) - passive.force(position, velocity)
+    ) * velocity
+    assert dissipated == pytest.approx(
         resistance.friction * abs(velocity) + resistance.damping * velocity**2, rel=1e-6, abs=1e-6
     )
     step = 1e-3
@@ -60,8 +62,8 @@ def test_friction_and_damping_dissipate_and_springs_store_energy(
         resistance.stiffness / 2.0 * (position + sign * step - resistance.springref) ** 2
         for sign in (-1.0, 1.0)
     ]
-    gained = (energy[1] - energy[0]) / (2.0 * step)
-    assert passive.force(position, velocity) == pytest.approx(gained, rel=1e-6, abs=1e-3)
+    gradient = (energy[1] - energy[0]) / (2.0 * step)
+    assert passive.force(position, velocity) == pytest.approx(gradient, rel=1e-6, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -75,7 +77,7 @@ def test_friction_and_damping_dissipate_and_springs_store_energy(
 )
 def test_invalid_values_raise_with_their_line(fields: str, field: str, problem: str) -> None:
     with pytest.raises(InputError, match=problem) as caught:
-        load_text(URDF, f"urdf: thing.urdf\njoints:\n  hinge:\n    {fields}\n{TAIL}")
+        load_object_text(URDF, f"urdf: thing.urdf\njoints:\n  hinge:\n    {fields}\n{TAIL}")
     assert (caught.value.field, caught.value.line) == (field, 4)
 
 
@@ -84,7 +86,9 @@ def test_invalid_values_raise_with_their_line(fields: str, field: str, problem: 
 )
 def test_invalid_urdf_dynamics_raise_with_their_line(attributes: str) -> None:
     with pytest.raises(InputError) as caught:
-        load_text(add_dynamics(attributes).replace("<link", "\n<link"), f"urdf: thing.urdf\n{TAIL}")
+        load_object_text(
+            add_dynamics(attributes).replace("<link", "\n<link"), f"urdf: thing.urdf\n{TAIL}"
+        )
     assert caught.value.line == 4
     assert caught.value.field == f"hinge: dynamics {attributes.partition('=')[0]}"
     assert str(caught.value.file).endswith("thing.urdf")

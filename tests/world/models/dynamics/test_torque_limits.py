@@ -1,4 +1,4 @@
-"""Tests torque limits of robots, and which of them are discarded."""
+"""Tests the torque limits of robots, and the removal of implausible ones."""
 
 from __future__ import annotations
 
@@ -69,12 +69,12 @@ def test_limits_that_cannot_hold_the_arm_are_discarded(husky: Robot) -> None:
 
 
 def write_robot(folder: Path, effort: object) -> Path:
-    home = vkc.load_robot("husky_ur5e").urdf.parent
-    about = yaml.safe_load((home / "robot.yaml").read_text(encoding="utf-8"))
-    about["urdf"] = str(home / about["urdf"])
-    about["srdf"] = str(next(home.glob("*.srdf")))
-    about["joints"] = {**about.get("joints", {}), "elbow_joint": {"effort": effort}}
-    (folder / "robot.yaml").write_text(yaml.safe_dump(about), encoding="utf-8")
+    source = vkc.load_robot("husky_ur5e").urdf.parent
+    description = yaml.safe_load((source / "robot.yaml").read_text(encoding="utf-8"))
+    description["urdf"] = str(source / description["urdf"])
+    description["srdf"] = str(next(source.glob("*.srdf")))
+    description["joints"] = {**description.get("joints", {}), "elbow_joint": {"effort": effort}}
+    (folder / "robot.yaml").write_text(yaml.safe_dump(description), encoding="utf-8")
     return folder / "robot.yaml"
 
 

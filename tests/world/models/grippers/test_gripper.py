@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.grippers import WIDEST, write_gripper
-from helpers.robots import compute_placement, get_rest
+from helpers.grippers import MAX_OPENING, write_gripper
+from helpers.robots import compute_placement, get_home_configuration
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,9 +25,13 @@ def compute_finger_centers(robot: Robot) -> list[np.ndarray]:
     """Return the centres of the fingers' shapes in the tool frame."""
     data, shapes = robot.model.createData(), robot.collision.createData()
     pin.updateGeometryPlacements(
-        robot.model, data, robot.collision, shapes, robot.coordinates.q(get_rest(robot))
+        robot.model,
+        data,
+        robot.collision,
+        shapes,
+        robot.coordinates.q(get_home_configuration(robot)),
     )
-    tool = compute_placement(robot, robot.tool_frame, get_rest(robot))
+    tool = compute_placement(robot, robot.tool_frame, get_home_configuration(robot))
     fingers = [k for k in range(len(shapes.oMg)) if robot.link_of(k).startswith("finger")]
     return [tool.actInv(shapes.oMg[k]).translation for k in fingers]
 
@@ -36,7 +40,7 @@ def test_grippers_are_open_by_default_and_mimic_joints_follow(robot: Robot) -> N
     gripper = robot.gripper
     assert gripper is not None
     assert gripper.names == ("finger_a_joint", "finger_b_joint")
-    assert gripper.rest_opening == gripper.max_opening == pytest.approx(WIDEST, abs=2e-4)
+    assert gripper.rest_opening == gripper.max_opening == pytest.approx(MAX_OPENING, abs=2e-4)
     assert gripper.min_opening == 0.0
     assert robot.opened(None) is robot
     np.testing.assert_allclose(gripper.compute_positions(None), [0.04, 0.04])
@@ -47,16 +51,16 @@ def test_grippers_are_open_by_default_and_mimic_joints_follow(robot: Robot) -> N
 @given(opening=st.floats(0.0, 0.0799))
 def test_fingers_are_symmetric_at_the_given_opening(robot: Robot, opening: float) -> None:
     opened = robot.opened(opening)
-    for middle, side in zip(
+    for center, side in zip(
         compute_finger_centers(opened), (1.0, -1.0), strict=True
     ):  # fingers are 10 mm thick
-        assert middle[0] == pytest.approx(side * (opening / 2.0 + 0.005), abs=1e-5)
+        assert center[0] == pytest.approx(side * (opening / 2.0 + 0.005), abs=1e-5)
     for link in ("finger_a", "finger_b", "hand", "tool"):
-        own = compute_placement(opened, link, get_rest(robot)).actInv(
-            compute_placement(robot, link, get_rest(robot))
+        displacement = compute_placement(opened, link, get_home_configuration(robot)).actInv(
+            compute_placement(robot, link, get_home_configuration(robot))
         )
-        away = WIDEST / 2.0 - opening / 2.0 if link.startswith("finger") else 0.0
-        assert np.linalg.norm(own.translation) == pytest.approx(away, abs=1e-5)
+        distance = MAX_OPENING / 2.0 - opening / 2.0 if link.startswith("finger") else 0.0
+        assert np.linalg.norm(displacement.translation) == pytest.approx(distance, abs=1e-5)
 
 
 def test_opening_moves_only_the_fingers(robot: Robot) -> None:

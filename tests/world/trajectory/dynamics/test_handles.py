@@ -1,4 +1,4 @@
-"""Tests wrenches at handles against closed forms and the work that they do."""
+"""Tests the wrenches at handles against closed forms and virtual work."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.closers import load_door_with_closer, replace_object_fields
+from helpers.door_closers import load_door_with_closer, replace_object_fields
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -18,7 +18,7 @@ REAL = st.floats(-1.0, 1.0)
 
 
 def make_motion(**coordinates: tuple[float, float, float]) -> Motion:
-    """Return one moment: coordinate (`_` for `.`) → position, velocity, acceleration."""
+    """Return a single sample; coordinate (`_` for `.`) → position, velocity, acceleration."""
     parts = (
         {name.replace("_", ".", 1): np.array([row[k]]) for name, row in coordinates.items()}
         for k in range(3)
@@ -30,19 +30,19 @@ def load_drawer(**resistance: float) -> vkc.Scene:
     return replace_object_fields(vkc.load_scene("drawer"), "drawer", joints={"slide": resistance})
 
 
-@pytest.mark.parametrize("riding", [0.0, 2.5])
-def test_drawer_needs_a_force_along_its_slide(riding: float) -> None:
+@pytest.mark.parametrize("payload", [0.0, 2.5])
+def test_drawer_needs_a_force_along_its_slide(payload: float) -> None:
     scene = load_drawer(friction=8.0, damping=20.0, stiffness=50.0, springref=-0.1)
     handle = Handle(
         scene,
         vkc.Hold("drawer", "handle"),
-        [(1, pin.Inertia(riding, np.zeros(3), np.zeros((3, 3))))],
+        [(1, pin.Inertia(payload, np.zeros(3), np.zeros((3, 3))))],
     )
     (wrench,) = handle.wrenches(make_motion(drawer_slide=(0.2, 0.3, 0.5)))
-    expected = 8.0 + 20.0 * 0.3 + 50.0 * 0.3 + (5.0 + riding) * 0.5
+    expected = 8.0 + 20.0 * 0.3 + 50.0 * 0.3 + (5.0 + payload) * 0.5
     placed = scene.objects["drawer"]
-    opened = (placed.object.link_placement("tray", [value]).translation for value in (1.0, 0.0))
-    direction = placed.placement.rotation @ np.subtract(*opened)
+    positions = (placed.object.link_placement("tray", [value]).translation for value in (1.0, 0.0))
+    direction = placed.placement.rotation @ np.subtract(*positions)
     np.testing.assert_allclose(wrench, [*(expected * direction), 0.0, 0.0, 0.0], atol=1e-9)
 
 
@@ -68,28 +68,30 @@ def test_wrench_does_the_work_of_the_joints_and_none_along_freedoms(
     placed = load_heavy_door().objects["door"]
     grasp = placed.object.attachment(attachment)
     rows = {f"door_{name}": (turn, 0.0, 0.0) for name in grasp.coordinates}
-    now = make_motion(door_hinge=hinge, door_knob=(knob, rate, 0.0), **rows)
+    motion = make_motion(door_hinge=hinge, door_knob=(knob, rate, 0.0), **rows)
     handle = Handle(load_heavy_door(), vkc.Hold("door", attachment))
-    (wrench,), (force,) = handle.wrenches(now), handle.forces(now)
+    (wrench,), (force,) = handle.wrenches(motion), handle.forces(motion)
 
-    def tool(values: np.ndarray) -> pin.SE3:
-        where = placed.placement * placed.object.link_placement(grasp.link, values[:2])
-        return where * grasp.tool([values[2], turn, turn][: len(grasp.coordinates)])
+    def compute_tool_pose(values: np.ndarray) -> pin.SE3:
+        link = placed.placement * placed.object.link_placement(grasp.link, values[:2])
+        return link * grasp.tool([values[2], turn, turn][: len(grasp.coordinates)])
 
-    def work(column: int) -> float:
+    def compute_work(column: int) -> float:
         shift = 1e-5 * np.eye(3)[column]
-        more, less = (tool(np.array([hinge[0], knob, turn]) + sign * shift) for sign in (1, -1))
+        more, less = (
+            compute_tool_pose(np.array([hinge[0], knob, turn]) + sign * shift) for sign in (1, -1)
+        )
         moved = more.translation - less.translation
         turned = pin.log3(more.rotation @ less.rotation.T)
         return float(wrench[:3] @ moved + wrench[3:] @ turned) / 2e-5
 
-    assert work(0) == pytest.approx(force[0], rel=1e-5, abs=1e-6)
+    assert compute_work(0) == pytest.approx(force[0], rel=1e-5, abs=1e-6)
     if attachment == "push":
         np.testing.assert_array_equal(wrench[3:], 0.0)
     else:
-        assert work(1) == pytest.approx(force[1], rel=1e-5, abs=1e-6)
+        assert compute_work(1) == pytest.approx(force[1], rel=1e-5, abs=1e-6)
     if attachment == "handle_free":
-        assert work(2) == pytest.approx(0.0, abs=1e-6)
+        assert compute_work(2) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_wrench_is_the_smallest_sufficient_one() -> None:
@@ -97,15 +99,15 @@ def test_wrench_is_the_smallest_sufficient_one() -> None:
         load_door_with_closer(stiffness=5.0, springref=-2.0), vkc.Hold("door", "handle")
     )
     (wrench,) = handle.wrenches(make_motion(door_hinge=(0.6, 0.2, 0.1), door_knob=(0.5, 0.0, 0.0)))
-    weigh = np.array([1.0] * 3 + [0.1] * 3)
+    scale = np.array([1.0] * 3 + [0.1] * 3)
     force = float(np.linalg.norm(wrench[:3]))
     assert force == pytest.approx(
         13.0 / 0.74, rel=0.1
-    )  # Q over the lever, and the inertia of the panel
-    assert float(np.linalg.norm(wrench / weigh)) == pytest.approx(force, rel=0.1)
+    )  # joint torque over the lever arm, plus the inertia of the panel
+    assert float(np.linalg.norm(wrench / scale)) == pytest.approx(force, rel=0.1)
 
 
-def test_bolts_and_stops_carry_resting_loads() -> None:
+def test_latches_and_joint_stops_carry_static_loads() -> None:
     shut = make_motion(door_hinge=(0.0, 0.0, 0.0), door_knob=(0.2, 0.5, 0.0))
     handle = Handle(
         load_door_with_closer(stiffness=5.0, springref=-2.0), vkc.Hold("door", "handle")

@@ -1,11 +1,11 @@
-"""Tests torques of the arm against energies and weights."""
+"""Tests the torques of the arm against changes of energy and weights."""
 
 from __future__ import annotations
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.closers import replace_object_fields
+from helpers.door_closers import replace_object_fields
 
 import vkc_pin as vkc
 from vkc_pin.world.trajectory.curve import Curve
@@ -14,7 +14,7 @@ from vkc_pin.world.trajectory.trajectory import PhaseSpan, Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
 
-def swing_stick(mass: float, *, base: float = 0.0) -> tuple[vkc.Scene, Trajectory]:
+def make_swing(mass: float, *, base: float = 0.0) -> tuple[vkc.Scene, Trajectory]:
     """Return a scene with the stick in the hand, and a motion of arm and base in it."""
     scene = replace_object_fields(vkc.load_scene("init_1"), "stick", mass=mass).with_held(
         {"stick": "grip"}
@@ -33,46 +33,45 @@ def swing_stick(mass: float, *, base: float = 0.0) -> tuple[vkc.Scene, Trajector
     )
 
 
-def compute_energy(world: World, motion: Trajectory, moment: float) -> float:
-    """Return what robot and stick have, of where their bodies are a moment before and after [J]."""
+def compute_energy(world: World, motion: Trajectory, time: float) -> float:
+    """Return the energy of robot and stick [J], from finite differences of body placements."""
     h = 1e-5
     rows = world.coordinates.q(
-        world.compute_positions(motion, np.array([moment - h, moment, moment + h]))
+        world.compute_positions(motion, np.array([time - h, time, time + h]))
     )
-    found, places = 0.0, []
+    energy, placements = 0.0, []
     for q in rows:
         data = world.model.createData()
         pin.forwardKinematics(world.model, data, q)
-        places.append([data.oMi[j].copy() for j in range(world.model.njoints)])
+        placements.append([data.oMi[j].copy() for j in range(world.model.njoints)])
     for j in range(2, world.model.njoints):
         inertia = world.model.inertias[j]
-        speed = (places[2][j] * inertia.lever - places[0][j] * inertia.lever) / (2.0 * h)
-        spin = pin.log3(places[0][j].rotation.T @ places[2][j].rotation) / (2.0 * h)
-        found += (
+        speed = (placements[2][j] * inertia.lever - placements[0][j] * inertia.lever) / (2.0 * h)
+        spin = pin.log3(placements[0][j].rotation.T @ placements[2][j].rotation) / (2.0 * h)
+        energy += (
             0.5 * inertia.mass * speed @ speed + 0.5 * spin @ np.asarray(inertia.inertia) @ spin
         )
-        found += 9.81 * inertia.mass * (places[1][j] * inertia.lever)[2]
-    return found
+        energy += 9.81 * inertia.mass * (placements[1][j] * inertia.lever)[2]
+    return energy
 
 
 @pytest.mark.parametrize("mass", [0.0, 4.0])
 def test_power_equals_the_change_of_energy(mass: float) -> None:
-    scene, motion = swing_stick(mass)
+    scene, motion = make_swing(mass)
     world = World(scene)
-    for moment in (0.35, 0.8, 1.3):
-        torques, rates = Torques(scene, motion).along(np.array([moment])), motion.velocity(moment)
+    for time in (0.35, 0.8, 1.3):
+        torques, rates = Torques(scene, motion).along(np.array([time])), motion.velocity(time)
         power = float(torques[0] @ rates[: motion.robot_size])
-        gained = (
-            compute_energy(world, motion, moment + 1e-3)
-            - compute_energy(world, motion, moment - 1e-3)
+        change = (
+            compute_energy(world, motion, time + 1e-3) - compute_energy(world, motion, time - 1e-3)
         ) / 2e-3
-        assert power == pytest.approx(gained, rel=2e-3, abs=2e-2)
+        assert power == pytest.approx(change, rel=2e-3, abs=2e-2)
 
 
 def test_payload_at_rest_adds_its_weight() -> None:
     torques = []
     for mass in (0.0, 3.0):
-        scene, motion = swing_stick(mass)
+        scene, motion = make_swing(mass)
         still = np.zeros_like(motion.positions[:1])
         torques.append(
             Torques(scene, motion).at(np.zeros(1, int), motion.positions[:1], still, still)[0]
@@ -83,16 +82,16 @@ def test_payload_at_rest_adds_its_weight() -> None:
     jacobian = pin.computeJointJacobians(world.model, data, q)[:, : motion.robot_size]
     pin.forwardKinematics(world.model, data, q)
     joint = world.model.getJointId("stick.placement")
-    where = data.oMi[joint] * world.model.inertias[joint].lever
-    axes, hand = jacobian.T, []
+    center = data.oMi[joint] * world.model.inertias[joint].lever
+    axes, expected = jacobian.T, []
     for twist in axes[3:]:
-        hand.append(3.0 * 9.81 * (twist[:3] + np.cross(twist[3:], where))[2])
-    np.testing.assert_allclose(torques[1][3:] - torques[0][3:], hand, atol=1e-6)
+        expected.append(3.0 * 9.81 * (twist[:3] + np.cross(twist[3:], center))[2])
+    np.testing.assert_allclose(torques[1][3:] - torques[0][3:], expected, atol=1e-6)
 
 
 def test_base_acceleration_loads_the_arm() -> None:
-    scene, motion = swing_stick(2.0, base=0.4)
-    _, still = swing_stick(2.0)
+    scene, motion = make_swing(2.0, base=0.4)
+    _, still = make_swing(2.0)
     times = np.array([0.4, 0.9])
     assert (
         np.abs(Torques(scene, motion).along(times) - Torques(scene, still).along(times))[

@@ -26,41 +26,45 @@ def saved(door_plan: vkc.Plan, tmp_path_factory: pytest.TempPathFactory) -> Path
     return door_plan.save(tmp_path_factory.mktemp("archives") / "door.npz")
 
 
-def pack(array: Any) -> bytes:
+def pack_array(array: Any) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, array)
     return buffer.getvalue()
 
 
-def read_parts(saved: Path) -> dict[str, bytes]:
+def read_members(saved: Path) -> dict[str, bytes]:
     with zipfile.ZipFile(saved) as archive:
         return {name.removesuffix(".npy"): archive.read(name) for name in archive.namelist()}
 
 
-def write_members(path: Path, found: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> Path:
+def write_members(
+    path: Path, members: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED
+) -> Path:
     with zipfile.ZipFile(path, "w", method) as archive:
-        for name, data in found.items():
+        for name, data in members.items():
             archive.writestr(f"{name}.npy", data)
     return path
 
 
 def write_changed(path: Path, saved: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
-    """The same file with another description."""
+    """Write a copy of the file with a changed description."""
     about, _ = read_archive(saved)
     change(about)
-    return write_members(path, {**read_parts(saved), "about": pack(np.array(json.dumps(about)))})
+    return write_members(
+        path, {**read_members(saved), "about": pack_array(np.array(json.dumps(about)))}
+    )
 
 
-def test_round_trip(tmp_path: Path, saved: Path) -> None:
+def test_archives_survive_a_round_trip(tmp_path: Path, saved: Path) -> None:
     about, arrays = read_archive(saved)
     whole = {**about, "trajectory": {**about["trajectory"], **arrays}}
     again, found = read_archive(write_archive(tmp_path / "again", whole))
     assert json.dumps(again) == json.dumps(about)
     other = {
-        "times": pack(arrays["times"].astype(">f8")),
-        "positions": pack(np.asfortranarray(arrays["positions"])),
+        "times": pack_array(arrays["times"].astype(">f8")),
+        "positions": pack_array(np.asfortranarray(arrays["positions"])),
     }
-    _, swapped = read_archive(write_members(tmp_path / "other", {**read_parts(saved), **other}))
+    _, swapped = read_archive(write_members(tmp_path / "other", {**read_members(saved), **other}))
     for name in ("times", "positions"):
         np.testing.assert_array_equal(found[name], arrays[name])
         np.testing.assert_array_equal(swapped[name], arrays[name])
@@ -108,21 +112,21 @@ def test_invalid_descriptions_are_rejected(
     assert caught.value.file == path
 
 
-def _add_holes(positions: np.ndarray) -> np.ndarray:
+def _set_nan(positions: np.ndarray) -> np.ndarray:
     positions[3, 4] = np.nan
     return positions
 
 
-def _turn_back(times: np.ndarray) -> np.ndarray:
+def _repeat_time(times: np.ndarray) -> np.ndarray:
     times[3] = times[2]
     return times
 
 
 @pytest.mark.parametrize(
-    ("name", "change", "said"),
+    ("name", "change", "message"),
     [
-        ("positions", _add_holes, r"positions\[3, 4\]: not finite"),
-        ("times", _turn_back, "times do not increase"),
+        ("positions", _set_nan, r"positions\[3, 4\]: not finite"),
+        ("times", _repeat_time, "times do not increase"),
         ("times", lambda times: times[:-1], "phases do not follow|wrong shape"),
         ("positions", lambda positions: positions[:, :-1], "wrong shape"),
         (
@@ -140,12 +144,12 @@ def _turn_back(times: np.ndarray) -> np.ndarray:
     ],
 )
 def test_invalid_arrays_are_rejected(
-    tmp_path: Path, saved: Path, name: str, change: Callable[[Any], Any], said: str
+    tmp_path: Path, saved: Path, name: str, change: Callable[[Any], Any], message: str
 ) -> None:
-    found = read_parts(saved)
-    array = np.load(io.BytesIO(found[name]))
-    path = write_members(tmp_path / "wrong", {**found, name: pack(change(array.copy()))})
-    with pytest.raises(vkc.InputError, match=said) as caught:
+    members = read_members(saved)
+    array = np.load(io.BytesIO(members[name]))
+    path = write_members(tmp_path / "wrong", {**members, name: pack_array(change(array.copy()))})
+    with pytest.raises(vkc.InputError, match=message) as caught:
         vkc.Plan.load(path)
     assert caught.value.file == path
 
@@ -158,18 +162,18 @@ def _make_header(shape: str, dtype: str = "<f8") -> bytes:
     return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
 
 
-def _make_bomb(found: dict[str, bytes]) -> dict[str, bytes]:
-    return {**found, "positions": _make_header("(100000, 125)") + bytes(100_000_000)}
+def _make_bomb(members: dict[str, bytes]) -> dict[str, bytes]:
+    return {**members, "positions": _make_header("(100000, 125)") + bytes(100_000_000)}
 
 
-def _exaggerate_shape(found: dict[str, bytes]) -> dict[str, bytes]:
-    return {**found, "positions": _make_header("(1000000000, 1000)") + bytes(80)}
+def _exaggerate_shape(members: dict[str, bytes]) -> dict[str, bytes]:
+    return {**members, "positions": _make_header("(1000000000, 1000)") + bytes(80)}
 
 
-def _nest_lists(found: dict[str, bytes]) -> dict[str, bytes]:
+def _nest_lists(members: dict[str, bytes]) -> dict[str, bytes]:
     return {
-        **found,
-        "about": pack(np.array('{"format": 1, "history": [' + "[]," * 3_000_000 + "[]]}")),
+        **members,
+        "about": pack_array(np.array('{"format": 1, "history": [' + "[]," * 3_000_000 + "[]]}")),
     }
 
 
@@ -191,34 +195,38 @@ print(int(peak[1]) / 1e3, time.process_time() - before)
 def test_large_contents_are_rejected_before_they_are_unpacked(
     tmp_path: Path, saved: Path, make: Callable[[Any], Any]
 ) -> None:
-    """In less than 500 MB, and 2 s of CPU time on an idle machine."""
-    path = write_members(tmp_path / "large", make(read_parts(saved)))
+    """Rejection takes less than 500 MB, and 2 s of CPU time on an idle machine."""
+    path = write_members(tmp_path / "large", make(read_members(saved)))
     run = [sys.executable, "-c", LOAD, str(saved), str(path)]
-    done = subprocess.run(run, capture_output=True, text=True, timeout=100, check=True)
-    said, figures = done.stdout.rsplit("\n", 2)[:2]
-    assert str(path) in said, done.stdout
+    result = subprocess.run(run, capture_output=True, text=True, timeout=100, check=True)
+    message, figures = result.stdout.rsplit("\n", 2)[:2]
+    assert str(path) in message, result.stdout
     memory, seconds = map(float, figures.split())
-    assert memory < 500.0, said
-    assert seconds < 10.0, said
+    assert memory < 500.0, message
+    assert seconds < 10.0, message
 
 
 def test_unreadable_files_are_rejected(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
-    for path, said in (
+    for path, message in (
         (tmp_path / "pipe", "a pipe or a device"),
         (tmp_path, "Is a directory"),
         (tmp_path / "none", "No such file"),
     ):
-        with pytest.raises(vkc.InputError, match=f"cannot read the plan .*got {said}"):
+        with pytest.raises(vkc.InputError, match=f"cannot read the plan .*got {message}"):
             vkc.Plan.load(path)
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2])
-def test_only_numpys_compression_is_accepted(tmp_path: Path, saved: Path, method: int) -> None:
+def test_only_compression_methods_of_numpy_are_accepted(
+    tmp_path: Path, saved: Path, method: int
+) -> None:
     with pytest.raises(vkc.InputError, match="compressed by an unknown method"):
-        vkc.Plan.load(write_members(tmp_path / "odd", read_parts(saved), method))
+        vkc.Plan.load(write_members(tmp_path / "odd", read_members(saved), method))
     assert (
-        vkc.Plan.load(write_members(tmp_path / "plain", read_parts(saved), zipfile.ZIP_STORED)).seed
+        vkc.Plan.load(
+            write_members(tmp_path / "plain", read_members(saved), zipfile.ZIP_STORED)
+        ).seed
         == 0
     )
 
@@ -227,9 +235,11 @@ def test_damaged_bytes_raise_input_errors_only(tmp_path: Path, saved: Path) -> N
     data, random = saved.read_bytes(), np.random.default_rng(0)
     path = tmp_path / "odd"
     for _ in range(40):
-        odd = bytearray(data)
+        damaged = bytearray(data)
         for at in random.integers(len(data), size=random.integers(1, 4)):
-            odd[at] = random.integers(256)
-        path.write_bytes(bytes(odd[: random.integers(len(odd))] if random.random() < 0.2 else odd))
+            damaged[at] = random.integers(256)
+        path.write_bytes(
+            bytes(damaged[: random.integers(len(damaged))] if random.random() < 0.2 else damaged)
+        )
         with contextlib.suppress(vkc.InputError):
             assert vkc.Plan.load(path).trajectory.times[0] == 0.0

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.fake_plan import make_fake_plan
-from helpers.written import FILES, trajectories, write_broken
+from helpers.trajectory_files import FILES, trajectories, write_text_file
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -47,11 +47,11 @@ def test_coordinates_stay_between_their_waypoints(positions: np.ndarray, seed: i
     velocities, accelerations = estimate_rates(times, positions)
     assert np.isfinite(velocities).all()
     assert np.isfinite(accelerations).all()
-    moments = np.sort(rng.uniform(times[0], times[-1], 50))
-    place, _, _ = evaluate_cubics(times, positions, velocities, moments)
-    at = np.clip(np.searchsorted(times, moments, side="right") - 1, 0, len(times) - 2)
-    assert (place >= np.minimum(positions[at], positions[at + 1])).all()
-    assert (place <= np.maximum(positions[at], positions[at + 1])).all()
+    sample_times = np.sort(rng.uniform(times[0], times[-1], 50))
+    position, _, _ = evaluate_cubics(times, positions, velocities, sample_times)
+    at = np.clip(np.searchsorted(times, sample_times, side="right") - 1, 0, len(times) - 2)
+    assert (position >= np.minimum(positions[at], positions[at + 1])).all()
+    assert (position <= np.maximum(positions[at], positions[at + 1])).all()
 
 
 def test_resting_coordinates_stay_at_rest() -> None:
@@ -59,11 +59,13 @@ def test_resting_coordinates_stay_at_rest() -> None:
     positions = np.array([[0.0], [1.0], [1.0], [1.0], [0.5]])
     velocities, accelerations = estimate_rates(times, positions)
     assert (velocities == 0.0).all()
-    assert (accelerations == 0.0).all(), "it turns round where it rests"
-    place, speed, change = evaluate_cubics(times, positions, velocities, np.linspace(1.0, 2.99, 20))
-    assert (place == 1.0).all()
-    assert (speed == 0.0).all()
-    assert (change == 0.0).all()
+    assert (accelerations == 0.0).all(), "the direction reverses at rest"
+    position, velocity, acceleration = evaluate_cubics(
+        times, positions, velocities, np.linspace(1.0, 2.99, 20)
+    )
+    assert (position == 1.0).all()
+    assert (velocity == 0.0).all()
+    assert (acceleration == 0.0).all()
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +75,7 @@ def plan() -> Plan:
 
 @FILES
 @given(trajectory=trajectories(largest=1e6))
-def test_ros_is_exact_to_a_nanosecond(trajectory: Trajectory) -> None:
+def test_ros_round_trip_is_exact_to_a_nanosecond(trajectory: Trajectory) -> None:
     back = Trajectory.from_ros(
         json.loads(json.dumps(trajectory.to_ros(joints="all"))), like=trajectory
     )
@@ -119,17 +121,22 @@ def test_number_of_points_is_limited(plan: Plan) -> None:
 def test_rests_keep_their_duration_at_any_rate(rate: float) -> None:
     """There are points at both ends of every rest."""
     knots = np.array([0.0, 1.1, 1.4, 2.0, 2.00002, 3.3])
-    places = np.array([0.0, 1.0, 1.0, 2.0, 2.0, 3.0])[:, None] * np.ones(3)
-    curve = Curve(knots, places, np.zeros((6, 3)))
+    waypoints = np.array([0.0, 1.0, 1.0, 2.0, 2.0, 3.0])[:, None] * np.ones(3)
+    curve = Curve(knots, waypoints, np.zeros((6, 3)))
     motion = Trajectory(
-        ("base_x", "base_y", "base_yaw"), knots, places, (vkc.PhaseSpan("drive", 0, 5),), 3, curve
+        ("base_x", "base_y", "base_yaw"),
+        knots,
+        waypoints,
+        (vkc.PhaseSpan("drive", 0, 5),),
+        3,
+        curve,
     )
-    sent = Trajectory.from_ros(motion.to_ros(rate=rate))
+    received = Trajectory.from_ros(motion.to_ros(rate=rate))
     even = np.append(np.arange(np.ceil(3.3 * rate - 1e-6)) / rate, 3.3)
     even = even[(np.abs(even[:, None] - knots[1:5]) > 1e-4).all(axis=1)]
-    np.testing.assert_allclose(sent.times, np.sort([*even, *knots[1:5]]), atol=1e-8)
-    moments = np.linspace(1.1, 1.4, 20)
-    np.testing.assert_allclose(sent.at(moments), 1.0, atol=1e-12)
+    np.testing.assert_allclose(received.times, np.sort([*even, *knots[1:5]]), atol=1e-8)
+    sample_times = np.linspace(1.1, 1.4, 20)
+    np.testing.assert_allclose(received.at(sample_times), 1.0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -197,37 +204,37 @@ def test_invalid_messages_are_rejected(
     with pytest.raises(vkc.InputError, match=f"^{expected}"):
         Trajectory.from_ros(message)
     with pytest.raises(vkc.InputError, match=f"bad.json: {expected}"):
-        Trajectory.from_ros(write_broken(tmp_path / "bad.json", json.dumps(message)))
+        Trajectory.from_ros(write_text_file(tmp_path / "bad.json", json.dumps(message)))
 
 
-def test_sent_knots_are_the_same_motion(door_plan: Plan) -> None:
-    """Clearances hold at waypoints: knots between two of them must not count as such."""
+def test_exported_knots_describe_the_same_motion(door_plan: Plan) -> None:
+    """Clearances hold at waypoints, so knots between them must not become waypoints."""
     motion = door_plan.trajectory
-    sent = Trajectory.from_ros(motion.to_ros(joints="all"), like=motion)
+    received = Trajectory.from_ros(motion.to_ros(joints="all"), like=motion)
     assert len(motion.times) < len(motion.curve.times)
-    np.testing.assert_allclose(sent.times, motion.times - motion.times[0], atol=1e-8)
-    assert [vars(phase) for phase in sent.phases] == [vars(phase) for phase in motion.phases]
-    moments = np.linspace(0.0, sent.times[-1], 500)
-    np.testing.assert_allclose(sent.at(moments), motion.at(moments), atol=1e-7)
+    np.testing.assert_allclose(received.times, motion.times - motion.times[0], atol=1e-8)
+    assert [vars(phase) for phase in received.phases] == [vars(phase) for phase in motion.phases]
+    sample_times = np.linspace(0.0, received.times[-1], 500)
+    np.testing.assert_allclose(received.at(sample_times), motion.at(sample_times), atol=1e-7)
     tight = dataclasses.replace(door_plan.options, dist_safe=door_plan.report.clearance - 1e-5)
-    assert vkc.validate(door_plan.scene, door_plan.steps, sent, tight).ok
+    assert vkc.validate(door_plan.scene, door_plan.steps, received, tight).ok
 
 
 @pytest.mark.parametrize("smooth", [True, False])
-def test_sent_motions_can_be_validated(door_plan: Plan, smooth: bool) -> None:
-    sent = Trajectory.from_ros(
+def test_exported_motions_can_be_validated(door_plan: Plan, smooth: bool) -> None:
+    received = Trajectory.from_ros(
         door_plan.to_ros(joints="all", rate=50.0, smooth=smooth), like=door_plan.trajectory
     )
-    assert [phase.name for phase in sent.phases] == [
+    assert [phase.name for phase in received.phases] == [
         phase.name for phase in door_plan.trajectory.phases
     ]
     options = dataclasses.replace(door_plan.options, dist_safe=0.01)  # the margin between waypoints
-    report = vkc.validate(door_plan.scene, door_plan.steps, sent, options)
-    wrong = (
+    report = vkc.validate(door_plan.scene, door_plan.steps, received, options)
+    expected = (
         {"acceleration", "closure"} if smooth else {"acceleration"}
-    )  # it jumps between linear pieces
-    assert {violation.constraint for violation in report.violations} <= wrong, report.lines()
+    )  # the velocity jumps between linear pieces
+    assert {violation.constraint for violation in report.violations} <= expected, report.lines()
     assert report.closure_error < (2e-3 if smooth else 1e-3)
-    assert np.abs(sent.positions - door_plan.trajectory.at(sent.times)).max() < (
+    assert np.abs(received.positions - door_plan.trajectory.at(received.times)).max() < (
         0.02 if smooth else 1e-9
     )

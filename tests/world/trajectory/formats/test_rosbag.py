@@ -24,33 +24,33 @@ Messages = dict[str, list[tuple[int, Any]]]
 
 @pytest.fixture(scope="module")
 def plan() -> Plan:
-    """A plan whose motion is a curve, as those that are planned."""
-    made = make_fake_plan()
-    motion = made.trajectory
+    """Return a plan whose trajectory has a curve, as planned trajectories do."""
+    plan = make_fake_plan()
+    motion = plan.trajectory
     rates = np.gradient(motion.positions, motion.times, axis=0)
     rates[[0, 6, -1]] = 0.0
     curve = Curve(motion.times, motion.positions, rates)
     again = Trajectory(
         motion.names, motion.times, motion.positions, motion.phases, motion.robot_size, curve
     )
-    object.__setattr__(made, "trajectory", again)
-    return made
+    object.__setattr__(plan, "trajectory", again)
+    return plan
 
 
-def read(folder: Path) -> Messages:
-    """Return topic → messages, each with when it was recorded [ns]."""
+def read_bag(folder: Path) -> Messages:
+    """Return topic → messages with their recording times [ns]."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     found: Messages = {}
     with Reader(folder) as reader:
-        for connection, when, data in reader.messages():
+        for connection, stamp, data in reader.messages():
             found.setdefault(connection.topic, []).append(
-                (when, store.deserialize_cdr(data, connection.msgtype))
+                (stamp, store.deserialize_cdr(data, connection.msgtype))
             )
     return found
 
 
 def convert_message(message: Any) -> dict[str, Any]:
-    """Return a JointTrajectory as `to_ros` has it."""
+    """Return a JointTrajectory in the format of `to_ros`."""
     keys = ("positions", "velocities", "accelerations", "effort")
     return {
         "header": {
@@ -72,48 +72,53 @@ def convert_message(message: Any) -> dict[str, Any]:
 
 
 def test_trajectories_equal_those_of_to_ros(plan: Plan, tmp_path: Path) -> None:
-    found = read(plan.to_rosbag(tmp_path / "bag", rate=100.0, frame="map", stamp=1.25))
+    found = read_bag(plan.to_rosbag(tmp_path / "bag", rate=100.0, frame="map", stamp=1.25))
     assert set(found) == {f"/vkc/{end}" for end in TOPICS}
     for group in ("arm", "base"):
-        ((when, message),) = found[f"/vkc/{group}/joint_trajectory"]
-        assert when == 1_250_000_000
+        ((recorded, message),) = found[f"/vkc/{group}/joint_trajectory"]
+        assert recorded == 1_250_000_000
         assert convert_message(message) == plan.to_ros(
             joints=group, rate=100.0, frame="map", stamp=1.25
         )
 
 
-def test_base_velocities_lead_along_the_path(plan: Plan, tmp_path: Path) -> None:
-    found, motion = read(plan.to_rosbag(tmp_path / "bag", rate=50.0, states=500.0)), plan.trajectory
+def test_base_velocities_follow_the_path(plan: Plan, tmp_path: Path) -> None:
+    found, motion = (
+        read_bag(plan.to_rosbag(tmp_path / "bag", rate=50.0, states=500.0)),
+        plan.trajectory,
+    )
     ((_, path),) = found["/vkc/base/path"]
     assert path.header.frame_id == "world"
     for pose in path.poses:
         time = pose.header.stamp.sec + 1e-9 * pose.header.stamp.nanosec
         x, y, yaw = motion.at(time)[:3]
-        where, turn = pose.pose.position, pose.pose.orientation
-        assert np.allclose([where.x, where.y, where.z], [x, y, 0.0], atol=1e-7)
-        assert np.isclose(np.cos(yaw - 2.0 * np.arctan2(turn.z, turn.w)), 1.0)
-    # Driving as the velocities say, in the base's own frame, it gets to where the motion ends.
+        position, orientation = pose.pose.position, pose.pose.orientation
+        assert np.allclose([position.x, position.y, position.z], [x, y, 0.0], atol=1e-7)
+        assert np.isclose(np.cos(yaw - 2.0 * np.arctan2(orientation.z, orientation.w)), 1.0)
+    # The velocities in the base frame integrate to the last pose of the motion.
     speeds = found["/vkc/base/cmd_vel"]
     moments = 1e-9 * np.array([when for when, _ in speeds])
-    own = np.array([[m.twist.linear.x, m.twist.linear.y, m.twist.angular.z] for _, m in speeds])
+    twists = np.array([[m.twist.linear.x, m.twist.linear.y, m.twist.angular.z] for _, m in speeds])
     assert {message.header.frame_id for _, message in speeds} == {"base_link"}
-    steps, place = np.diff(moments), np.array(motion.at(0.0)[:3])
-    for step, (ahead, aside, turning) in zip(steps, (own[1:] + own[:-1]) / 2.0, strict=True):
-        middle = place[2] + step * turning / 2.0
-        place += step * np.array(
+    steps, reached = np.diff(moments), np.array(motion.at(0.0)[:3])
+    for step, (forward, sideways, turning) in zip(
+        steps, (twists[1:] + twists[:-1]) / 2.0, strict=True
+    ):
+        middle = reached[2] + step * turning / 2.0
+        reached += step * np.array(
             [
-                np.cos(middle) * ahead - np.sin(middle) * aside,
-                np.sin(middle) * ahead + np.cos(middle) * aside,
+                np.cos(middle) * forward - np.sin(middle) * sideways,
+                np.sin(middle) * forward + np.cos(middle) * sideways,
                 turning,
             ]
         )
-    assert np.abs(place - motion.positions[-1, :3]).max() < 1e-3
-    assert np.abs(own[-1]).max() < 1e-9  # it stands at the end
+    assert np.abs(reached - motion.positions[-1, :3]).max() < 1e-3
+    assert np.abs(twists[-1]).max() < 1e-9  # at rest at the end
 
 
 def test_object_states_and_phases(plan: Plan, tmp_path: Path) -> None:
     found, motion = (
-        read(plan.to_rosbag(tmp_path / "bag", states=20.0, namespace="")),
+        read_bag(plan.to_rosbag(tmp_path / "bag", states=20.0, namespace="")),
         plan.trajectory,
     )
     states = found["/objects/joint_states"]
@@ -140,7 +145,7 @@ def test_object_states_and_phases(plan: Plan, tmp_path: Path) -> None:
     assert [phase["held"] for _, phase in phases] == [{}, {"door": "handle"}]
 
 
-def test_existing_folder_is_kept(plan: Plan, tmp_path: Path) -> None:
+def test_existing_folder_is_replaced_only_with_force(plan: Plan, tmp_path: Path) -> None:
     folder = plan.to_rosbag(tmp_path / "deep" / "bag")
     before = sorted((file.name, file.read_bytes()) for file in folder.iterdir())
     assert [name for name, _ in before] == [".vkc-pin.json", "bag.db3", "metadata.yaml"]
@@ -148,7 +153,8 @@ def test_existing_folder_is_kept(plan: Plan, tmp_path: Path) -> None:
         plan.to_rosbag(folder, rate=10.0)
     assert sorted((file.name, file.read_bytes()) for file in folder.iterdir()) == before
     assert (
-        len(read(plan.to_rosbag(folder, rate=10.0, force=True))["/vkc/base/path"][0][1].poses) == 61
+        len(read_bag(plan.to_rosbag(folder, rate=10.0, force=True))["/vkc/base/path"][0][1].poses)
+        == 61
     )
     assert [file.name for file in folder.parent.iterdir()] == ["bag"]
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.fake_plan import make_fake_plan
-from helpers.written import FILES, ROBOT, are_equal, trajectories, write_broken
+from helpers.trajectory_files import FILES, ROBOT, are_equal, trajectories, write_text_file
 from hypothesis import given
 
 import vkc_pin as vkc
@@ -30,13 +30,13 @@ def plan() -> Plan:
 
 @FILES
 @given(trajectory=trajectories())
-def test_tables_are_exact(trajectory: Trajectory, tmp_path: Path) -> None:
+def test_csv_round_trip_is_exact(trajectory: Trajectory, tmp_path: Path) -> None:
     assert are_equal(Trajectory.from_csv(trajectory.to_csv(tmp_path / "motion.csv")), trajectory)
 
 
 @FILES
 @given(trajectory=trajectories())
-def test_json_is_exact(trajectory: Trajectory, tmp_path: Path) -> None:
+def test_json_round_trip_is_exact(trajectory: Trajectory, tmp_path: Path) -> None:
     assert are_equal(Trajectory.from_json(trajectory.to_json(tmp_path / "motion.json")), trajectory)
 
 
@@ -82,7 +82,9 @@ def test_columns_have_names_and_units(plan: Plan, tmp_path: Path) -> None:
         ("all", 12),
     ],
 )
-def test_groups_of_joints(plan: Plan, tmp_path: Path, joints: Any, count: int) -> None:
+def test_joints_are_selected_by_group_or_name(
+    plan: Plan, tmp_path: Path, joints: Any, count: int
+) -> None:
     header = (
         plan.to_csv(tmp_path / "some.csv", joints=joints)
         .read_text(encoding="utf-8")
@@ -107,15 +109,15 @@ def test_unknown_joints_are_rejected(plan: Plan, tmp_path: Path) -> None:
 
 def test_plain_tables_are_read(tmp_path: Path) -> None:
     text = "\ufefftime,base_x,base_y,base_yaw,door.hinge\r\n0,0,0,0,0\r\n\r\n0.5,1,2,3,4\r\n"
-    found = Trajectory.from_csv(write_broken(tmp_path / "own.csv", text))
+    found = Trajectory.from_csv(write_text_file(tmp_path / "own.csv", text))
     assert (found.names, found.robot_size) == (("base_x", "base_y", "base_yaw", "door.hinge"), 3)
     assert found.phases == (PhaseSpan("motion", 0, 1),)
     assert found.positions[1].tolist() == [1.0, 2.0, 3.0, 4.0]
     assert Trajectory.from_csv(tmp_path / "own.csv", robot_size=4).robot_size == 4
 
 
-HEAD = "time [s],base_x [m],base_y [m],base_yaw [rad],phase,phase_name,held\n"
-GOOD = "0.0,0,0,0,1,go,{}\n"
+HEADER = "time [s],base_x [m],base_y [m],base_yaw [rad],phase,phase_name,held\n"
+ROW = "0.0,0,0,0,1,go,{}\n"
 
 
 @pytest.mark.parametrize(
@@ -123,24 +125,24 @@ GOOD = "0.0,0,0,0,1,go,{}\n"
     [
         ("", "bad.csv: an empty file"),
         ("x,y\n", "bad.csv:1: first column: not a table of waypoints .expected time, got 'x'"),
-        (HEAD + "0.0,0,0\n", "bad.csv:2: wrong number of columns .expected 7, got 3"),
+        (HEADER + "0.0,0,0\n", "bad.csv:2: wrong number of columns .expected 7, got 3"),
         (
-            HEAD + GOOD + "1.0,0,zero,0,1,go,{}\n",
+            HEADER + ROW + "1.0,0,zero,0,1,go,{}\n",
             "bad.csv:3: base_y: not a number .expected a finite number, got 'zero'",
         ),
         (
-            HEAD + GOOD + "1.0,0,0,0,3,go,{}\n",
+            HEADER + ROW + "1.0,0,0,0,3,go,{}\n",
             "bad.csv:3: phase: not the next phase .expected 1 or 2, got '3'",
         ),
-        (HEAD + "0.0,0,0,0,1,go,door\n", "bad.csv:2: held: not the held objects"),
-        (HEAD + '0.0,0,0,0,1,go,"[1]"\n', "bad.csv:2: held: not the held objects"),
-        (HEAD + GOOD, "bad.csv: Trajectory.times: times do not increase"),
+        (HEADER + "0.0,0,0,0,1,go,door\n", "bad.csv:2: held: not the held objects"),
+        (HEADER + '0.0,0,0,0,1,go,"[1]"\n', "bad.csv:2: held: not the held objects"),
+        (HEADER + ROW, "bad.csv: Trajectory.times: times do not increase"),
         ("time,arm\n0,0\n1,1\n", "bad.csv: Trajectory.robot_size: out of range"),
     ],
 )
 def test_invalid_tables_are_rejected(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(vkc.InputError, match=message):
-        Trajectory.from_csv(write_broken(tmp_path / "bad.csv", text))
+        Trajectory.from_csv(write_text_file(tmp_path / "bad.csv", text))
 
 
 def test_unreadable_files_are_rejected(tmp_path: Path) -> None:
@@ -156,7 +158,7 @@ def test_unreadable_files_are_rejected(tmp_path: Path) -> None:
             read(tmp_path / "picture")
 
 
-HELD = "0,0,0,0,1,a,"
+ROW_START = "0,0,0,0,1,a,"
 
 
 @pytest.mark.parametrize(
@@ -171,7 +173,7 @@ HELD = "0,0,0,0,1,a,"
         (Trajectory.from_csv, "time," + "x" * 200_000, ":1: not a table .got field larger"),
         (
             Trajectory.from_csv,
-            "time,x,y,yaw,phase,phase_name,held\n" + HELD + "[" * 100_000,
+            "time,x,y,yaw,phase,phase_name,held\n" + ROW_START + "[" * 100_000,
             ":2: held: not the held objects",
         ),
         (Trajectory.from_json, "[" * 1_000_000, "too many lists|not JSON"),
@@ -184,12 +186,12 @@ HELD = "0,0,0,0,1,a,"
     ],
     ids=lambda value: value if isinstance(value, str) and len(value) < 60 else "",
 )
-def test_large_and_deep_files_are_rejected_in_time(
+def test_large_and_deep_files_are_rejected_quickly(
     read: Any, text: str, message: str, tmp_path: Path
 ) -> None:
     began = time.process_time()
     with pytest.raises(vkc.InputError, match=message) as caught:
-        read(write_broken(tmp_path / "bad", text))
+        read(write_text_file(tmp_path / "bad", text))
     assert len(str(caught.value)) < 5000
     assert time.process_time() - began < 10.0
 
@@ -211,7 +213,7 @@ def test_large_and_deep_files_are_rejected_in_time(
 )
 def test_invalid_json_is_rejected(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(vkc.InputError, match=message):
-        Trajectory.from_json(write_broken(tmp_path / "bad.json", text))
+        Trajectory.from_json(write_text_file(tmp_path / "bad.json", text))
 
 
 def test_export_of_a_saved_plan(

@@ -1,4 +1,4 @@
-"""Runs a script as in an environment with the declared dependencies of the package alone."""
+"""Runs scripts with only the declared dependencies of the package."""
 
 from __future__ import annotations
 

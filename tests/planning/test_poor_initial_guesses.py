@@ -43,7 +43,7 @@ def test_actuation_from_a_stationary_guess(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(1))
-def test_perturbed_guess(seed: int) -> None:
+def test_drive_from_a_perturbed_guess(seed: int) -> None:
     options = vkc.Options(reach_waypoints=20)
     plan = vkc.plan(
         make_hall(obstacles=[PILLAR]),
@@ -59,8 +59,8 @@ def test_perturbed_guess(seed: int) -> None:
     ("axis", "angle"),
     [([1.0, 0.0, 0.0], np.pi), ([0.0, 1.0, 0.0], np.pi - 1e-3), ([0.0, 0.0, 1.0], -2.9)],
 )
-def test_tool_turns_around(axis: list[float], angle: float) -> None:
-    """From a stationary guess the residual's gradient vanishes, or points the long way round."""
+def test_large_tool_rotation_from_a_stationary_guess(axis: list[float], angle: float) -> None:
+    """At a stationary guess the residual's gradient vanishes or points along the longer turn."""
     scene = make_hall()
     tool = scene.tool_placement()
     shift = np.array([0.1, 0.1, 0.0])

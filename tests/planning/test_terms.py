@@ -1,4 +1,4 @@
-"""Plans with user constraints and costs; the results are measured on the plain world model."""
+"""Tests plans with user constraints and costs, measured on the plain world model."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import describe_box
-from helpers.drawers import make_open_scene
+from helpers.drawers import make_drawer_scene
 from helpers.drives import make_hall
 
 import vkc_pin as vkc
@@ -21,7 +21,7 @@ from vkc_pin.cli import main
 from vkc_pin.world.trajectory.world_model import World
 
 SHORT = vkc.Options(reach_waypoints=16)
-OVER = [vkc.Place("cup", [1.35, 1.1, 0.501])]
+STEPS = [vkc.Place("cup", [1.35, 1.1, 0.501])]
 PERSON = np.array([0.0, 0.6, 1.2])
 
 UPRIGHT = vkc.Constraint(
@@ -54,12 +54,12 @@ def make_room() -> vkc.Scene:
 
 @cache
 def plan_without_terms(seed: int = 0) -> vkc.Plan:
-    return check_success(vkc.plan(make_room(), OVER, options=SHORT, seed=seed))
+    return check_success(vkc.plan(make_room(), STEPS, options=SHORT, seed=seed))
 
 
 @cache
 def plan_upright(seed: int = 0) -> vkc.Plan:
-    return check_success(vkc.plan(make_room(), OVER, options=SHORT, seed=seed, terms=[UPRIGHT]))
+    return check_success(vkc.plan(make_room(), STEPS, options=SHORT, seed=seed, terms=[UPRIGHT]))
 
 
 def check_success(plan: vkc.Plan) -> vkc.Plan:
@@ -87,22 +87,21 @@ def compute_min_cosine(plan: vkc.Plan) -> float:
 
 
 def compute_speeds(plan: vkc.Plan, frame: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return speeds of a frame in every segment, and its positions at their ends."""
-    where = np.array([placement.translation for placement in compute_placements(plan, frame)])
-    return np.linalg.norm(np.diff(where, axis=0), axis=1) / np.diff(plan.trajectory.times), where[
-        1:
-    ]
+    """Return the speed of a frame in every segment, and its position at the segment's end."""
+    positions = np.array([placement.translation for placement in compute_placements(plan, frame)])
+    speeds = np.linalg.norm(np.diff(positions, axis=0), axis=1) / np.diff(plan.trajectory.times)
+    return speeds, positions[1:]
 
 
 def test_speed_limit_near_a_point() -> None:
-    plan = check_success(vkc.plan(make_room(), OVER, options=SHORT, terms=[SLOW]))
+    plan = check_success(vkc.plan(make_room(), STEPS, options=SHORT, terms=[SLOW]))
 
-    def excess(plan: vkc.Plan) -> float:
-        speed, where = compute_speeds(plan, "tool")
-        return float((speed - 0.5 * (np.linalg.norm(where - PERSON, axis=1) - 0.3)).max())
+    def compute_excess(plan: vkc.Plan) -> float:
+        speed, positions = compute_speeds(plan, "tool")
+        return float((speed - 0.5 * (np.linalg.norm(positions - PERSON, axis=1) - 0.3)).max())
 
-    assert excess(plan_without_terms()) > 0.05
-    assert excess(plan) <= 1e-3
+    assert compute_excess(plan_without_terms()) > 0.05
+    assert compute_excess(plan) <= 1e-3
     assert plan.trajectory.times[-1] > plan_without_terms().trajectory.times[-1]
 
 
@@ -111,7 +110,7 @@ def test_cost_changes_the_posture() -> None:
     def compute_mean_cost(*terms: vkc.Cost) -> float:
         elbows = [
             check_success(
-                vkc.plan(make_room(), OVER, options=SHORT, terms=terms, seed=seed)
+                vkc.plan(make_room(), STEPS, options=SHORT, terms=terms, seed=seed)
             ).trajectory.column("elbow_joint")
             for seed in range(2)
         ]
@@ -121,25 +120,25 @@ def test_cost_changes_the_posture() -> None:
 
 
 def test_constraint_on_a_link_of_a_fixed_object() -> None:
-    """The drawer's tray must be slow, the hand need not be."""
+    """The constraint slows down the tray, not the hand."""
     gently = vkc.Constraint("gently", lambda s: ca.norm_2(s.velocity("drawer.tray")), upper=0.03)
     steps, options = (
         [vkc.Actuate("drawer", {"slide": 0.3}, "handle_free")],
         vkc.Options(reach_waypoints=16, move_waypoints=12),
     )
-    plan = check_success(vkc.plan(make_open_scene(), steps, options=options, terms=[gently]))
+    plan = check_success(vkc.plan(make_drawer_scene(), steps, options=options, terms=[gently]))
     fast = vkc.Constraint(
         "fast", lambda s: ca.norm_2(s.velocity("drawer.tray")), upper=9.0
-    )  # in the program's own time, too
-    usual = check_success(vkc.plan(make_open_scene(), steps, options=options, terms=[fast]))
+    )  # inactive, but prevents retiming as well
+    usual = check_success(vkc.plan(make_drawer_scene(), steps, options=options, terms=[fast]))
     assert compute_speeds(usual, "drawer.tray")[0].max() > 0.1
     assert compute_speeds(plan, "drawer.tray")[0].max() <= 0.031
     assert compute_speeds(plan, "tool")[0].max() > 0.5
-    reached, usually = (
+    time, usual_time = (
         trajectory.times[trajectory.phases[0].last]
         for trajectory in (plan.trajectory, usual.trajectory)
     )
-    assert reached == pytest.approx(usually)
+    assert time == pytest.approx(usual_time)
 
 
 @pytest.mark.parametrize(
@@ -151,7 +150,7 @@ def test_constraint_on_a_link_of_a_fixed_object() -> None:
     ],
 )
 def test_terms_hold_for_several_steps(planner: Callable[..., vkc.Plan]) -> None:
-    """`during` names a phase of one step only."""
+    """`during` restricts each constraint to a phase of one step."""
     obstacles = [
         describe_box("table", [0.6, 0.6, 0.02], [1.4, 0.0, 0.49]),
         describe_box("other", [0.6, 0.6, 0.02], [-0.5, 2.2, 0.79]),
@@ -176,25 +175,24 @@ def test_terms_hold_for_several_steps(planner: Callable[..., vkc.Plan]) -> None:
     )
     assert [term.name for term in plan.terms] == ["level", "gently"]
     assert compute_min_cosine(plan) >= 0.9995 - 1e-4
-    (going,) = (phase for phase in plan.trajectory.phases if phase.name == "go to")
+    (drive,) = (phase for phase in plan.trajectory.phases if phase.name == "go to")
     speed, _ = compute_speeds(plan, "base_link")
-    assert speed[going.first : going.last].max() <= 0.201
-    assert speed[: going.first].max() > 0.21
+    assert speed[drive.first : drive.last].max() <= 0.201
+    assert speed[: drive.first].max() > 0.21
 
 
 def test_initial_guess_may_violate_a_constraint() -> None:
     over = vkc.Constraint(
         "elbow over", lambda s: s.coordinate("elbow_joint"), lower=1.0, during="place cup"
     )
-    plan = check_success(vkc.plan(make_room(), OVER, options=SHORT, terms=[over]))
+    plan = check_success(vkc.plan(make_room(), STEPS, options=SHORT, terms=[over]))
     placing = next(phase for phase in plan.trajectory.phases if phase.name == "place cup")
     assert (
         plan.trajectory.column("elbow_joint")[placing.first + 2 : placing.last + 1].min()
         >= 1.0 - 1e-3
     )
     assert plan_without_terms().trajectory.column("elbow_joint").max() < 0.0
-    # A wall that nobody else knows of: only the program keeps the base away, from a seed that goes
-    # right through.
+    # Only this constraint represents the obstacle, and the initial guess passes through it.
     middle = np.array([1.0, 0.02])
     around = vkc.Constraint(
         "around", lambda s: ca.sumsqr(s.position("base_link")[:2] - middle), lower=0.8**2
@@ -251,6 +249,6 @@ def test_plans_are_saved_with_their_terms(
     np.savez(file, **{**data, "about": np.array(json.dumps(about))})
     assert main(["check", str(file)]) == 2
     assert "not a saved term" in capsys.readouterr().err
-    del about["terms"]  # a plan of before there were any
+    del about["terms"]  # a plan from before terms existed
     np.savez(file, **{**data, "about": np.array(json.dumps(about))})
     assert vkc.Plan.load(file).terms == ()

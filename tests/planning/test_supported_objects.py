@@ -1,4 +1,4 @@
-"""Plans in which objects rest on moving links."""
+"""Tests plans in which objects rest on moving links."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.judging import get_violation_names
-from helpers.riding import TOP, make_plate_scene, make_tray_scene, slide_plate
+from helpers.supports import TOP, make_plate_scene, make_tray_scene, slide_plate
 
 import vkc_pin as vkc
 from vkc_pin.options import Options
@@ -38,8 +38,8 @@ def test_supported_object_moves_with_its_support() -> None:
     np.testing.assert_allclose(
         compute_placements(plan)[-1].translation, [0.2, -1.0, 0.0], rtol=0.0, atol=1e-3
     )
-    rides = FreeObjects(plan.scene, plan.trajectory).supports
-    assert [riding for riding in rides if riding] == [{"cup": "plate.plate"}]
+    supports = FreeObjects(plan.scene, plan.trajectory).supports
+    assert [support for support in supports if support] == [{"cup": "plate.plate"}]
 
 
 def test_tray_is_carried_level() -> None:
@@ -52,20 +52,20 @@ def test_tray_is_carried_level() -> None:
         )
         < 1e-3
     )
-    apart = compute_placements(plan, "tray")[-1].actInv(compute_placements(plan)[-1]).translation
-    np.testing.assert_allclose(apart, [0.02, 0.05, 0.02], rtol=0.0, atol=1e-9)
+    offset = compute_placements(plan, "tray")[-1].actInv(compute_placements(plan)[-1]).translation
+    np.testing.assert_allclose(offset, [0.02, 0.05, 0.02], rtol=0.0, atol=1e-9)
 
 
-def test_support_grasped_at_the_start() -> None:
+def test_support_grasped_at_the_start_carries_its_object() -> None:
     first = vkc.plan(make_tray_scene(), [vkc.Grasp("tray"), vkc.GoTo(-1.0, 0.3)])
     assert first.success, first.summary()
     after = compute_final_scene(first.scene, first.trajectory, first.trajectory.phases[-1].holds)
     second = vkc.plan(after, [vkc.Place("tray", [-0.5, -1.5, 0.7])])
     assert second.success, second.summary()
-    apart = (
+    offset = (
         compute_placements(second, "tray")[-1].actInv(compute_placements(second)[-1]).translation
     )
-    np.testing.assert_allclose(apart, [0.02, 0.05, 0.02], rtol=0.0, atol=1e-5)
+    np.testing.assert_allclose(offset, [0.02, 0.05, 0.02], rtol=0.0, atol=1e-5)
 
 
 def test_tilt_and_collision_of_supported_objects() -> None:
@@ -75,19 +75,21 @@ def test_tilt_and_collision_of_supported_objects() -> None:
     assert ("tips", "cup") not in get_violation_names(
         validate(flap, [vkc.Actuate("plate", {"tip": 0.05})], slide_plate(flap, 0.05), options)
     )
-    ahead = make_plate_scene()
+    blocked = make_plate_scene()
     post = {
         "name": "post",
         "type": "box",
         "size": [0.02, 0.02, 0.05],
         "position": [0.55, 0.05, TOP + 0.06],
     }
-    ahead = vkc.Scene.from_document({**ahead.document, "obstacles": [post]}, ahead.folder)
-    hit = validate(ahead, [vkc.Actuate("plate", {"slide": 0.4})], slide_plate(ahead, 0.4), options)
+    blocked = vkc.Scene.from_document({**blocked.document, "obstacles": [post]}, blocked.folder)
+    hit = validate(
+        blocked, [vkc.Actuate("plate", {"slide": 0.4})], slide_plate(blocked, 0.4), options
+    )
     assert ("penetration", "cup.cup – post") in get_violation_names(hit)
 
 
-def test_rest_for_the_gripper() -> None:
+def test_too_short_rest_for_the_gripper_is_a_violation() -> None:
     plan = vkc.plan(make_plate_scene(), [vkc.Actuate("plate", {"slide": 0.2})])
     assert plan.success, plan.summary()
     begin = plan.trajectory.phases[1].first

@@ -1,4 +1,4 @@
-"""A plate that slides on a post, a tray to carry, and cups that stand on them."""
+"""Makes scenes with cups on a sliding plate, or on a tray that the robot carries."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-TOP = 0.67  # [m] of the plate
+TOP = 0.67  # height of the plate [m]
 POST = (
     '<link name="post"><collision><origin xyz="0 0 0.3"/>'
     '<geometry><box size="0.3 0.3 0.6"/></geometry></collision></link>'
@@ -56,21 +56,21 @@ JOINTS = {
 
 @cache
 def write_objects() -> Path:
-    """Return a folder with descriptions of these objects."""
-    made = Path(tempfile.mkdtemp())
-    atexit.register(shutil.rmtree, made, ignore_errors=True)
+    """Write the descriptions of the objects, and return their folder."""
+    folder = Path(tempfile.mkdtemp())
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     for name, (joint, kind, axis) in JOINTS.items():
         plate = f'<link name="plate">{BOARD}{GRIP.format(z=0.01)}</link>'
         moving = JOINT.format(name=joint, kind=kind, axis=axis)
-        (made / f"{name}.urdf").write_text(f'<robot name="{name}">{POST}{plate}{moving}</robot>')
-        (made / f"{name}.yaml").write_text(
+        (folder / f"{name}.urdf").write_text(f'<robot name="{name}">{POST}{plate}{moving}</robot>')
+        (folder / f"{name}.yaml").write_text(
             OBJECT.format(name=name, free="false", link="plate", z=0.01)
         )
-    (made / "tray.urdf").write_text(
+    (folder / "tray.urdf").write_text(
         f'<robot name="tray"><link name="tray">{BOARD}{GRIP.format(z=0.03)}</link></robot>'
     )
-    (made / "tray.yaml").write_text(OBJECT.format(name="tray", free="true", link="tray", z=0.03))
-    return made
+    (folder / "tray.yaml").write_text(OBJECT.format(name="tray", free="true", link="tray", z=0.03))
+    return folder
 
 
 def make_scene(
@@ -94,7 +94,7 @@ def describe_cup(name: str = "cup", *, at: Sequence[float] = (0.8, 0.05, TOP)) -
 def make_plate_scene(
     kind: str = "plate", *, cups: int = 1, gap: float = 0.0, wall: float | None = None
 ) -> Scene:
-    """Return a plate with cups `gap` above it, and optionally a wall behind the first cup [m]."""
+    """Return a plate, cups `gap` [m] above it, and optionally a wall `wall` [m] behind one."""
     objects = [{"name": "plate", "type": f"{kind}.yaml", "position": [0.8, 0.0, 0.0]}]
     objects += [
         describe_cup(f"cup_{k}" if k else "cup", at=(0.8, 0.05 - 0.12 * k, TOP + gap))
@@ -116,7 +116,7 @@ def make_plate_scene(
 
 
 def slide_plate(scene: Scene, value: float, *, steps: int = 30) -> Trajectory:
-    """Return a motion of the plate's joint to a value, grasped by no hand."""
+    """Return a motion of the plate's joint to `value`, while the robot rests."""
     joint = scene.objects["plate"].object.coordinates.names[0]
     rows = np.column_stack(
         [np.tile(scene.start, (steps + 1, 1)), np.linspace(0.0, value, steps + 1)]
@@ -132,7 +132,7 @@ def slide_plate(scene: Scene, value: float, *, steps: int = 30) -> Trajectory:
 
 
 def make_tray_scene() -> Scene:
-    """Return a tray with a cup on it on one table, and another table."""
+    """Return a scene of two tables, one with a tray and a cup on it."""
     objects = [
         {"name": "tray", "type": "tray.yaml", "position": [0.8, 0.0, 0.7]},
         describe_cup(at=(0.82, 0.05, 0.72)),

@@ -1,4 +1,4 @@
-"""Trajectories of all kinds, and files that hold them."""
+"""Generates trajectories of all kinds, and writes invalid files."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ ROBOT = ("base_x", "base_y", "base_yaw", "lift", "elbow")
 @st.composite
 def trajectories(draw: st.DrawFn, largest: float | None = None) -> Trajectory:
     """Return trajectories of robots with up to five coordinates that grasp and carry objects."""
-    robot, things = (
+    robot, objects = (
         draw(st.integers(3, 5)),
         draw(st.lists(st.sampled_from("abcde"), max_size=4, unique=True)),
     )
-    names = (*ROBOT[:robot], *(f"{name}.joint" for name in things))
+    names = (*ROBOT[:robot], *(f"{name}.joint" for name in objects))
     steps = draw(st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=8))
     times = draw(st.floats(-1e3, 1e3)) + np.cumsum([0.0, *steps])
     numbers = (
@@ -50,9 +50,9 @@ def trajectories(draw: st.DrawFn, largest: float | None = None) -> Trajectory:
     for last in cuts:
         held = list(draw(st.dictionaries(name, label, max_size=3)).items())
         holds: list[Hold] = []
-        for thing, attachment in held:
+        for grasped, attachment in held:
             by = draw(st.sampled_from([None, *holds]))
-            holds.append(Hold(thing, attachment, by, draw(link) if by else None))
+            holds.append(Hold(grasped, attachment, by, draw(link) if by else None))
         phases.append(PhaseSpan(draw(label), first, last, tuple(holds)))
         first = last
     return Trajectory(names, times, rows, tuple(phases), robot)
@@ -62,7 +62,7 @@ def are_equal(one: Trajectory, other: Trajectory) -> bool:
     return one.to_dict() == other.to_dict()
 
 
-def write_broken(path: Path, text: str) -> Path:
+def write_text_file(path: Path, text: str) -> Path:
     path.write_text(text, encoding="utf-8")
     return path
 
@@ -83,7 +83,7 @@ PHASES = (
 )
 
 
-def make_example(**changes: Any) -> Trajectory:
+def make_example_trajectory(**changes: Any) -> Trajectory:
     fields = {
         "names": NAMES,
         "times": TIMES,

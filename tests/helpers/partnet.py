@@ -1,4 +1,4 @@
-"""Files of objects as others make them."""
+"""Provides object files in the style of public datasets."""
 
 from __future__ import annotations
 
@@ -8,42 +8,43 @@ import trimesh
 
 
 def write_partnet_object(folder: Path) -> Path:
-    """Write a cabinet as PartNet-Mobility has them, and return its `mobility.urdf`.
+    """Write a cabinet in the style of PartNet-Mobility, and return its `mobility.urdf`.
 
-    About one unit high, y up, set upright by a fixed joint below a link `base` without shapes; many
-    small meshes, which are seen and collide; names on what is seen; a drawer with a flat
-    decoration, a door without limits, a wheel without shape, and no effort or velocity anywhere.
+    The cabinet is about one unit high with y up; a fixed joint below the empty link `base` sets it
+    upright. Its many small meshes are visual and collision shapes, and only visuals have names. It
+    has a drawer with a flat decoration, a door without limits and a wheel without shape. No joint
+    has effort or velocity limits.
     """
     meshes = folder / "textured_objs"
     meshes.mkdir(parents=True)
 
-    def box(name: str, size: tuple[float, ...], at: tuple[float, ...]) -> str:
+    def write_box(name: str, size: tuple[float, ...], at: tuple[float, ...]) -> str:
         trimesh.creation.box(size).apply_translation(at).export(meshes / f"{name}.obj")
         return name
 
-    def elements(parts: dict[str, str], xyz: str = "0 0 0") -> str:
+    def format_shapes(parts: dict[str, str], xyz: str = "0 0 0") -> str:
         shapes = {
             file: f'<origin xyz="{xyz}"/><geometry>'
             f'<mesh filename="textured_objs/{file}.obj"/></geometry>'
             for file in parts
         }
-        seen = "".join(
+        visuals = "".join(
             f'<visual name="{name}">{shapes[file]}</visual>' for file, name in parts.items()
         )
-        return seen + "".join(f"<collision>{shape}</collision>" for shape in shapes.values())
+        return visuals + "".join(f"<collision>{shape}</collision>" for shape in shapes.values())
 
-    # x to the right, y up, z out of the front
+    # x to the right, y up, z to the front
     case = {
-        box("original-1", (0.04, 1.0, 0.6), (-0.38, 0.0, 0.0)): "frame-1",
-        box("original-2", (0.04, 1.0, 0.6), (0.38, 0.0, 0.0)): "frame-2",
-        box("original-3", (0.8, 1.0, 0.04), (0.0, 0.0, -0.28)): "frame-3",
-        box("original-4", (0.8, 0.04, 0.6), (0.0, 0.48, 0.0)): "frame-4",
+        write_box("original-1", (0.04, 1.0, 0.6), (-0.38, 0.0, 0.0)): "frame-1",
+        write_box("original-2", (0.04, 1.0, 0.6), (0.38, 0.0, 0.0)): "frame-2",
+        write_box("original-3", (0.8, 1.0, 0.04), (0.0, 0.0, -0.28)): "frame-3",
+        write_box("original-4", (0.8, 0.04, 0.6), (0.0, 0.48, 0.0)): "frame-4",
     }
     drawer = {
-        box("original-5", (0.7, 0.3, 0.02), (0.0, 0.25, 0.35)): "board-5",
-        box("original-7", (0.2, 0.02, 0.02), (0.0, 0.25, 0.45)): "handle-7",
-        box("original-8", (0.02, 0.02, 0.08), (-0.1, 0.25, 0.4)): "handle-8",
-        box("original-9", (0.02, 0.02, 0.08), (0.1, 0.25, 0.4)): "handle-9",
+        write_box("original-5", (0.7, 0.3, 0.02), (0.0, 0.25, 0.35)): "board-5",
+        write_box("original-7", (0.2, 0.02, 0.02), (0.0, 0.25, 0.45)): "handle-7",
+        write_box("original-8", (0.02, 0.02, 0.08), (-0.1, 0.25, 0.4)): "handle-8",
+        write_box("original-9", (0.02, 0.02, 0.08), (0.1, 0.25, 0.4)): "handle-9",
     }
     front = trimesh.Trimesh(
         [[-0.3, 0.12, 0.361], [0.3, 0.12, 0.361], [0.3, 0.38, 0.361], [-0.3, 0.38, 0.361]],
@@ -52,20 +53,20 @@ def write_partnet_object(folder: Path) -> Path:
     front.export(meshes / "original-6.obj")
     drawer["original-6"] = "decoration-6"
     door = {
-        box("original-10", (0.7, 0.4, 0.02), (0.0, -0.2, 0.35)): "board-10",
-        box("original-11", (0.02, 0.2, 0.02), (0.3, -0.2, 0.45)): "bar-11",
+        write_box("original-10", (0.7, 0.4, 0.02), (0.0, -0.2, 0.35)): "board-10",
+        write_box("original-11", (0.02, 0.2, 0.02), (0.3, -0.2, 0.45)): "bar-11",
     }
     text = f"""<?xml version="1.0" ?>
 <robot name="partnet_cabinet">
   <link name="base"/>
-  <link name="link_2">{elements(case)}</link>
+  <link name="link_2">{format_shapes(case)}</link>
   <joint name="joint_2" type="fixed"><origin rpy="1.570796326794897 0 -1.570796326794897"/>
     <child link="link_2"/><parent link="base"/></joint>
-  <link name="link_0">{elements(drawer)}</link>
+  <link name="link_0">{format_shapes(drawer)}</link>
   <joint name="joint_0" type="prismatic">
     <origin xyz="0 0 0"/><axis xyz="0 0 1"/><child link="link_0"/><parent link="link_2"/>
     <limit lower="0" upper="0.36"/></joint>
-  <link name="link_1">{elements(door, "0.38 0 -0.3")}</link>
+  <link name="link_1">{format_shapes(door, "0.38 0 -0.3")}</link>
   <joint name="joint_1" type="revolute"><origin xyz="-0.38 0 0.3"/><axis xyz="0 -1 0"/>
     <child link="link_1"/><parent link="link_2"/></joint>
   <link name="link_3"/>

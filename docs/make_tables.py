@@ -232,7 +232,7 @@ def evidence() -> str:
         )
         part = (
             f", {timed} of them"
-            if timed not in (0, len(trials)) and "robots" not in entry.get("options", ())
+            if 0 < timed < len(trials) and "robots" not in entry.get("options", ())
             else ""
         )
         rows[-1] += [f"{len(trials)}", f"{minutes:.1f} min, {jobs}{part}"]

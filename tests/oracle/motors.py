@@ -72,7 +72,8 @@ def check_motors(world: World, stage: Stage) -> Iterator[Violation]:
     def compute_link_poses(columns: np.ndarray) -> Mapping[str, Poses]:
         arm = {name: columns[:, 3 + k] for k, name in enumerate(robot.arm)}
         names = sorted({body.link for body in bodies} | {robot.tool})
-        return robot.tree.compute_links({**robot.locked, **arm}, columns[:, :3], names)
+        joints = {**robot.locked, **robot.compute_joint_values(arm)}
+        return robot.tree.compute_links(joints, columns[:, :3], names)
 
     loads = bodies + [Body(robot.tool, *inertia) for inertia in _find_payloads(world, stage)]
     arm = list(range(3, 3 + len(robot.arm)))

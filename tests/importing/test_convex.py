@@ -280,7 +280,7 @@ def test_cached_pieces_equal_computed_pieces(
     assert len(decompose(mesh, most_pieces=6).meshes) <= 6
 
 
-def test_box_without_its_lid_is_a_thin_shell_and_one_with_a_hole_is_solid() -> None:
+def test_open_boxes_are_thin_shells() -> None:
     whole = box((0.4, 0.3, 0.2)).subdivide_to_size(0.02)
     pierced, open_ = whole.copy(), whole.copy()
     pierced.update_faces(np.arange(len(whole.faces)) != 7)
@@ -288,7 +288,7 @@ def test_box_without_its_lid_is_a_thin_shell_and_one_with_a_hole_is_solid() -> N
     assert compute_solid_volume(whole) == pytest.approx(0.024)
     assert compute_solid_volume(open_) < 0.3 * 0.024
     assert not pierced.is_watertight
-    assert compute_solid_volume(pierced) == pytest.approx(0.024, rel=0.01)
+    assert compute_solid_volume(pierced) < 0.3 * 0.024
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
+from vkc_pin.importing.proposals.propose import propose_attachments
+from vkc_pin.world.models.object_file import load_object
+from vkc_pin.world.models.robot_file import load_robot
 
 # A case of 1.6 m x 0.3 m x 1 m with a jointed panel in front of it, towards -y.
 CASE = '<link name="case"><collision><origin xyz="0 0 0.5"/><geometry><box size="1.6 0.3 1.0"/>'
@@ -78,6 +81,15 @@ def test_joints_without_handle_are_pushed(
 def test_joints_that_no_hand_can_push_get_no_push(tmp_path: Path, settings: dict[str, str]) -> None:
     imported = vkc.importing.import_object(write_panel(tmp_path, **settings), tmp_path / "out")  # type: ignore[arg-type]
     assert [proposal.kind for proposal in imported.proposals.found if proposal.kind == "push"] == []
+
+
+@pytest.mark.parametrize("name", ["door", "narrow_door"])
+def test_latched_panels_are_not_pushed(name: str) -> None:
+    """Only the lever turns the knob that releases the latch."""
+    item = load_object(name)
+    assert item.latches
+    found = propose_attachments(item, load_robot("husky_ur5e")).found
+    assert {proposal.attachment.link for proposal in found} == {"lever"}
 
 
 def test_sliding_door_is_opened_by_a_push(tmp_path: Path) -> None:

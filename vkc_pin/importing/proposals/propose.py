@@ -161,8 +161,16 @@ class _Search:
         return found or self._propose_pushes(number)
 
     def _propose_pushes(self, number: int) -> list[Proposal]:
-        """Return pushes for a joint whose links offer no grasp, best first; at most two."""
+        """Return pushes for a joint whose links offer no grasp, best first; at most two.
+
+        A latched joint cannot be pushed if another joint, such as a knob, has to release it.
+        """
         opening, hand = self.openings[number], self.hand
+        path = {str(self.item.model.names[k]) for k in self.item.model.supports[number]}
+        if any(
+            one.joint == opening.joint for one in self.item.latches if one.released_by not in path
+        ):
+            return []
         self.fitting.place(self.closed)
         at = self.fitting.joint(number).copy()
         pushes = [

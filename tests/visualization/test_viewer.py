@@ -337,6 +337,7 @@ def test_invalid_messages_are_answered_and_leave_viewers_usable(viewer: Any, pla
     with context.socket(zmq.REQ) as client:  # disconnects before the reply
         client.connect(address)
         client.send(b"wait")
+        time.sleep(0.1)
     context.destroy()
     second_viewer = visualization.show(plan, open_browser=False)
     assert second_viewer.url() == viewer.url(), "the server still runs"

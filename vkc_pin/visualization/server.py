@@ -91,6 +91,8 @@ class LoopbackBridge(ZMQWebSocketBridge):
         """Send an answer, unless there is nothing to answer."""
         if self.zmq_socket.getsockopt(zmq.EVENTS) & zmq.POLLOUT:
             self.zmq_socket.send(data)
+            # Messages that arrived before the answer do not wake the stream: ZeroMQ signals edges.
+            self.ioloop.add_callback(self.zmq_stream.flush, zmq.POLLIN)
 
     def forward_to_websockets(self, frames):  # type: ignore[no-untyped-def]
         """Send a command to all open pages; skip closed ones, so that the sender gets an answer."""

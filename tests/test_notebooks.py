@@ -100,7 +100,7 @@ EXPECTED: dict[str, dict[str, tuple[str, ...]]] = {
         "typo-error": (r"^steps\[0\].object: there is no object 'drawr'; did you mean 'drawer'",),
         "limit-report": (
             "^drawer: FAILED, infeasible",
-            "goal drawer.slide: 0.9 is beyond the limits 0 to 0.4 by 0.5",
+            "goal drawer.slide: 0.9 m is beyond the limits 0 to 0.4 m by 0.5 m",
         ),
         "occupied-report": ("^drawer: FAILED, infeasible", "hits chair"),
         "data": ("clearance base_link – chair",),

@@ -81,7 +81,7 @@ def test_partly_blocked_door_reports_its_free_range() -> None:
 def test_goal_beyond_a_joint_limit(joints: dict[str, float], name: str, beyond: float) -> None:
     plan = vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", joints)], options=QUICK)
     assert plan.status == "infeasible"
-    check_explanation(plan, f"goal {name}: {next(iter(joints.values())):g} is beyond the limits")
+    check_explanation(plan, f"goal {name}: {next(iter(joints.values())):g} rad is beyond the limits")
     first = plan.report.violations[0]
     assert (first.constraint, first.subject, first.unit) == ("goal", name, "rad")
     assert first.amount == pytest.approx(beyond)
@@ -93,8 +93,8 @@ def test_goal_outside_the_arena() -> None:
     assert plan.status == "infeasible"
     check_explanation(
         plan,
-        "goal base_x: 9 is beyond the limits -6 to 6 by 3",
-        "goal base_y: -6.5 is beyond the limits -6 to 6 by 0.5",
+        "goal base_x: 9 m is beyond the limits -6 to 6 m by 3 m",
+        "goal base_y: -6.5 m is beyond the limits -6 to 6 m by 0.5 m",
     )
     goal = find_violation(plan, "goal", "base_x")
     assert goal.waypoint == QUICK.reach_waypoints

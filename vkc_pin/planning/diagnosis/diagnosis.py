@@ -91,8 +91,11 @@ def find_impossible_conditions(problem: TrajectoryProblem) -> list[Violation]:
             lower, upper = problem.limits(name)
             beyond = max(lower - value, value - upper)
             if beyond > 1e-9:
-                detail = f"{value:g} is beyond the limits {lower:g} to {upper:g} by {beyond:.4g}"
                 unit = problem.unit(name)
+                detail = (
+                    f"{value:g} {unit} is beyond the limits {lower:g} to {upper:g} {unit} "
+                    f"by {beyond:.4g} {unit}"
+                )
                 found.append(
                     Violation("goal", name, waypoint=end, amount=beyond, unit=unit, detail=detail)
                 )

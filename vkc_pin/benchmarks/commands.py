@@ -83,7 +83,7 @@ def _add_comparisons(benches: Any) -> None:
     parser = _add_experiment(benches, "peers", about, module="peers.run")
     _add_count(parser, "--trials", 20, "problems per task")
     _add_choice(parser, "tasks", "reach door drawer (default: all)")
-    _add_choice(parser, "methods", "trajopt OMPL roboplan B1 B2 VKC (default: all)")
+    _add_choice(parser, "methods", "trajopt OMPL roboplan HPP B1 B2 VKC (default: all)")
     about = "wall-clock limit of a trial (default 60)"
     parser.add_argument("--time-limit", type=float, default=60.0, metavar="SECONDS", help=about)
 

@@ -40,8 +40,8 @@ def add_completion(
 ) -> None:
     """Add the command completion, for all commands of the parser that `make_parser` returns."""
     about = (
-        "Print a script that completes commands and options. For bash: "
-        'eval "$(vkc-pin completion bash)" in ~/.bashrc.'
+        "Print a script that completes commands and options. In ~/.bashrc or ~/.zshrc: "
+        'eval "$(vkc-pin completion bash)", or zsh; fish: vkc-pin completion fish | source.'
     )
     run = functools.partial(_complete, make_parser)
     completion = add_command(commands, "completion", "complete commands in a shell", run, about)

@@ -206,7 +206,7 @@ class Plan:
         return to_html(self, path)
 
     def plot(self, path: str | Path | None = None) -> Any:
-        """Plot joints, velocities, clearance and a top view; see `plotting.plot`."""
+        """Plot joints, velocities, clearance and a top view; see `visualization.plots`."""
         from vkc_pin.visualization.plots.plots import plot
 
         return plot(self, path)

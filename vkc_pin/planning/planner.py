@@ -132,8 +132,8 @@ def plan(  # noqa: PLR0913 - keyword options of a public call
             returned with status "time limit". Success then depends on the machine and its load.
         max_evaluations: Limit on evaluated configurations, by searches for initial guesses and by
             every iteration of Ipopt at each waypoint; the status is then "evaluation limit". It
-            has the same effect on every machine. 100 000 evaluations take some ten seconds;
-            `plan.statistics.evaluations` counts them.
+            does not depend on the speed or load of the machine. 100 000 evaluations take some ten
+            seconds; `plan.statistics.evaluations` counts them.
         seed: Random seed. The result is reproducible bit for bit on the same machine, unless
             `time_limit` stops planning early.
         simultaneous: Plan all steps in one problem; otherwise each from the end of the one before,

@@ -35,7 +35,8 @@ class Violation:
     Attributes:
         constraint: "start", "limit", "velocity", "acceleration", "jerk", "torque", "slip",
             "turning", "wheels", "dwell", "closure", "latch", "unheld", "tips", "slide", "push",
-            "opening", "goal", "order", "clearance", "penetration" or "term" (a user constraint).
+            "opening", "goal", "order", "clearance", "penetration", "sampling" (the motion is too
+            long to be checked) or "term" (a user constraint).
         subject: Violating coordinate, object, goal, term or pair of links, e.g.
             "elbow_joint", "forearm_link – sofa".
         waypoint: Index from 0; between two waypoints, the earlier one.

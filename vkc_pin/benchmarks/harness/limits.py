@@ -1,4 +1,4 @@
-"""Limits trials by evaluations, so that verdicts are the same on every machine."""
+"""Limits trials by evaluations, so that results do not depend on the speed of the machine."""
 
 from __future__ import annotations
 

@@ -46,8 +46,8 @@ Function = Callable[[dict[str, Any]], Mapping[str, Any] | Sequence[Mapping[str, 
 """What runs one trial: takes its specification, returns its record, or several."""
 
 _JOURNAL = "trials.jsonl"
-# What shows results has no part in them: a table may be written anew after a change there.
-_NO_PART = ("cli/", "benchmarks/", "datasets/", "running/")
+# Packages that do not affect a trial: a run may be resumed after a change there.
+_NO_PART = ("cli/", "benchmarks/", "datasets/", "utils/parallel/")
 _DESCRIPTIONS = (".yaml", ".urdf", ".srdf")
 
 

@@ -267,7 +267,7 @@ def _check_limits_and_masses(robot: Robot) -> list[Finding]:
     if unlimited:
         findings.append(Finding("note", "limits", f"unlimited rotation: {_format_list(unlimited)}"))
     if no_effort:
-        hint = "`joints: {NAME: {no_effort: ...}}` in robot.yaml"
+        hint = "`joints: {NAME: {effort: ...}}` in robot.yaml"
         findings.append(
             Finding(
                 "note",

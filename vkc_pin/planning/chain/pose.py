@@ -37,7 +37,7 @@ ROW_BOUNDS: Mapping[str, tuple[Floats, Floats]] = {
     "upright": (np.zeros(6), np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.inf])),
     "level": (np.zeros(3), np.array([0.0, 0.0, np.inf])),
 }
-"""For every kind of goal, the bounds between which `pose_rows` must lie."""
+"""For every kind of goal, the bounds between which `build_pose_rows` must lie."""
 
 
 @dataclass(frozen=True)

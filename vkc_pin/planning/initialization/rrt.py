@@ -5,7 +5,7 @@ steps are projected to the closure manifold (Berenson, Srinivasa, Ferguson and K
 *Manipulation planning on constraint manifolds*, ICRA 2009), and the progress of the object joints
 along their given motion is one more coordinate: a door may wait until the arm is out of its frame.
 In open phases, samples are near a guide path of the base, with arm postures that are likely to be
-needed there, so that narrow passages are found quickly.
+needed there, so that narrow passages are found quickly. Why not OMPL: docs/decisions/0012.
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ def load_robot(  # noqa: PLR0913 - keyword options of a public call
     wherever they are; coupled joints share the coordinate of their leader.
 
     Limits come from the URDF and from a `robot.yaml` beside it. Defaults of velocity and
-    acceleration limits are π rad/s (m/s) and 1.4 rad/s² (m/s²) for joints, and 1 m/s, 2 rad/s,
+    acceleration limits are π rad/s or 0.1 m/s and 1.4 rad/s² (m/s²) for joints, and 1 m/s, 2 rad/s,
     3 m/s² and 6 rad/s² for the base. The default range of the base is ±20 m.
 
     The virtual base replaces the joints of a planar base in the URDF, unless `base` is "fixed".

@@ -81,7 +81,9 @@ def test_partly_blocked_door_reports_its_free_range() -> None:
 def test_goal_beyond_a_joint_limit(joints: dict[str, float], name: str, beyond: float) -> None:
     plan = vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", joints)], options=QUICK)
     assert plan.status == "infeasible"
-    check_explanation(plan, f"goal {name}: {next(iter(joints.values())):g} rad is beyond the limits")
+    check_explanation(
+        plan, f"goal {name}: {next(iter(joints.values())):g} rad is beyond the limits"
+    )
     first = plan.report.violations[0]
     assert (first.constraint, first.subject, first.unit) == ("goal", name, "rad")
     assert first.amount == pytest.approx(beyond)

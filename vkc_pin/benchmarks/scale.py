@@ -233,7 +233,7 @@ def format_results(result: Mapping[str, Any]) -> str:
         f"{about['starts']} random starts, the same for every number of {of}; seed "
         f"{about['seed']}. {JUDGED} Times are those of all trials; “ratio to {usual}” is the "
         f"median, over starts, of the ratio to the time with {usual} {of}. The other columns are "
-        "medians of parts of the time; the rest is problem setup.",
+        "medians of parts of the time; the rest is problem setup and retiming.",
         format_table(head, rows),
         "![Planning time](scale.png)",
     )

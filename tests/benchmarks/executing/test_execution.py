@@ -54,6 +54,14 @@ def test_motion_after_grasping_is_planned_from_the_measured_grasp(
         assert field in capsys.readouterr().err
 
 
+@pytest.mark.long
+def test_measured_grasps_default_to_tasks_that_move_a_single_object(tmp_path: Path) -> None:
+    _, trials = run_experiment("execution --trials 1 --off 2", tmp_path)
+    tasks = {trial["task"] for trial in trials}
+    assert {"door", "drawer", "household_cup"} <= tasks
+    assert "init_1" not in tasks
+
+
 def test_failed_executions_are_counted() -> None:
     executed = {
         "task": "drawer",

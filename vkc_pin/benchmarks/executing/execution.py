@@ -71,7 +71,7 @@ def run(
     out: str | Path,
     trials: int = 10,
     seed: int = 0,
-    tasks: Sequence[str] = tuple(TASKS),
+    tasks: Sequence[str] | None = None,
     grasp: str = "weld",
     off: Sequence[float] = (),
     **execution: Unpack[Execution],
@@ -82,14 +82,16 @@ def run(
         out: Folder.
         trials: Number of random starts per task, at least 1.
         seed: Random seed of starts and planning.
-        tasks: Some of `TASKS`.
+        tasks: Some of `TASKS`. Default: all; with `off`, those that move a single object.
         grasp: Kind of grasp; see `simulate`.
         off: Instead of whole tasks: the grasp is executed and measured, and the rest is planned
             from there and executed, for each distance [mm] by which the hand closes elsewhere.
     """
     import_mujoco()
     runner.check_positive(trials=trials)
-    names = runner.select_names("task", tasks, TASKS)
+    graspable = [task for task in TASKS if isinstance(ALL[task].steps[0], Actuate | Place)]
+    default = graspable if off else TASKS
+    names = runner.select_names("task", default if tasks is None else tasks, TASKS)
     settings = {
         "benchmark": "execution",
         "seed": seed,
@@ -106,9 +108,8 @@ def run(
         for k, mm in enumerate(given)
     ]
     if distances:
-        held = [task for task in TASKS if isinstance(ALL[task].steps[0], Actuate | Place)]
         for name in names:
-            check_choice(name, held, "task that moves a single object", "tasks")
+            check_choice(name, graspable, "task that moves a single object", "tasks")
         settings["off"] = distances
     specs: list[dict[str, Any]] = [
         {

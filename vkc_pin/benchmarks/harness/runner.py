@@ -272,7 +272,7 @@ def _sources() -> str:
     package, digest = find_package_folder(), hashlib.sha256()
     named = {
         path.relative_to(package).as_posix(): path
-        for suffix in ("py", "cpp")
+        for suffix in ("py", "cpp", "hpp")
         for path in package.rglob(f"*.{suffix}")
     }
     named = {name: path for name, path in named.items() if not name.startswith(_NO_PART)}

@@ -146,7 +146,7 @@ def format_results(result: Mapping[str, Any]) -> str:
         f"{about['goals']} random poses of free configurations, seed {about['seed']}, "
         f"{describe_limit(about)} each. {JUDGED} Importing, and loading again in a new process, "
         "are in "
-        "processor time. Room at home is the least distance between links that are not "
+        "processor time. Clearance at home is the least distance between links that are not "
         "neighbours, and of the arm to the floor.",
         format_table(_HEAD, [_row(name, select(records, robot=name)) for name in about["robots"]]),
         *(section if failed else []),

@@ -20,36 +20,33 @@ PILLAR = {
 }
 
 
-@pytest.mark.parametrize("seed", range(1))
-def test_reach_from_a_stationary_guess(seed: int) -> None:
-    start = load_door_scene().sample_start(np.random.default_rng(seed))
+def test_reach_from_a_stationary_guess() -> None:
+    start = load_door_scene().sample_start(np.random.default_rng(0))
     placed = start.objects["door"]
     attachment = placed.object.attachment()
     pose = placed.link_placement(attachment.link) * attachment.placement
-    plan = vkc.plan(start, [vkc.Reach(pin.SE3(pose))], initialization="stationary", seed=seed)
+    plan = vkc.plan(start, [vkc.Reach(pin.SE3(pose))], initialization="stationary", seed=0)
     assert plan.success, plan.summary()
     assert plan.initialization.startswith("stationary")
 
 
-@pytest.mark.parametrize("seed", range(1))
-def test_actuation_from_a_stationary_guess(seed: int) -> None:
+def test_actuation_from_a_stationary_guess() -> None:
     plan = vkc.plan(
         load_drawer_scene(),
         [vkc.Actuate("drawer", {"slide": 0.3})],
         initialization="stationary",
-        seed=seed,
+        seed=0,
     )
     assert plan.success, plan.summary()
 
 
-@pytest.mark.parametrize("seed", range(1))
-def test_drive_from_a_perturbed_guess(seed: int) -> None:
+def test_drive_from_a_perturbed_guess() -> None:
     options = vkc.Options(reach_waypoints=20)
     plan = vkc.plan(
         make_hall(obstacles=[PILLAR]),
         [vkc.GoTo(2.4, 0.0)],
         perturbation=0.5,
-        seed=seed,
+        seed=0,
         options=options,
     )
     assert plan.success, plan.summary()

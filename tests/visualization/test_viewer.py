@@ -422,6 +422,22 @@ def test_picture_changes_over_time(page: Path) -> None:
 
 @needs_chromium
 @pytest.mark.browser
+@pytest.mark.parametrize("count", [3, 5])
+def test_page_counts_the_reasons_that_it_does_not_show(
+    plan: Plan, tmp_path: Path, count: int
+) -> None:
+    reasons = tuple(f"reason {k}" for k in range(count))
+    report = dataclasses.replace(plan.report, notes=reasons)
+    page = visualization.to_html(dataclasses.replace(plan, report=report), tmp_path / "door.html")
+    text = browser.read_document(page, time=0.0, until="because reason 0")
+    shown = re.search(r'<div id="because">(.*?)</div>', text)
+    assert shown
+    hidden = [f"and {count - 3} more in the report"] if count > 3 else []
+    assert shown[1].split(" · ") == [*(f"because {reason}" for reason in reasons[:3]), *hidden]
+
+
+@needs_chromium
+@pytest.mark.browser
 def test_browser_shows_links_at_their_placements(page: Path, plan: Plan) -> None:
     probe = """
     <script>

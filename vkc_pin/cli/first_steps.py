@@ -40,8 +40,9 @@ def add_completion(
 ) -> None:
     """Add the command completion, for all commands of the parser that `make_parser` returns."""
     about = (
-        "Print a script that completes commands and options. In ~/.bashrc or ~/.zshrc: "
-        'eval "$(vkc-pin completion bash)", or zsh; fish: vkc-pin completion fish | source.'
+        "Print a script that completes commands and options. In ~/.bashrc: "
+        'eval "$(vkc-pin completion bash)"; in ~/.zshrc: eval "$(vkc-pin completion zsh)"; '
+        "in fish's config.fish: vkc-pin completion fish | source."
     )
     run = functools.partial(_complete, make_parser)
     completion = add_command(commands, "completion", "complete commands in a shell", run, about)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import os
@@ -219,6 +220,29 @@ def test_changed_settings_and_versions_are_refused(tmp_path: Path) -> None:
     (tmp_path / "trials.jsonl").write_bytes(before.replace(b'"sources": "', b'"sources": "x'))
     with pytest.raises(InputError, match=r"versions\.sources.*expected sources x"):
         run_trials(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "is_resumed"),
+    [
+        ("planning/solver/elimination.hpp", False),
+        ("planning/solver/_kkt.cpp", False),
+        ("planning/planner.py", False),
+        ("utils/parallel/engine.py", True),
+        ("cli/door.py", True),
+    ],
+)
+def test_changed_sources_of_planning_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, is_resumed: bool
+) -> None:
+    source = tmp_path / "package" / name
+    source.parent.mkdir(parents=True)
+    source.write_text("before", encoding="utf-8")
+    monkeypatch.setattr(runner, "find_package_folder", lambda: tmp_path / "package")
+    run_trials(tmp_path / "out")
+    source.write_text("after", encoding="utf-8")
+    with contextlib.nullcontext() if is_resumed else pytest.raises(InputError, match="sources"):
+        run_trials(tmp_path / "out")
 
 
 def test_workers_of_a_scheduler_run_the_trials(tmp_path: Path) -> None:

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from helpers.experiments import run_experiment
 
-from vkc_pin.benchmarks.peers.run import format_results, run
+from vkc_pin.benchmarks.peers.run import METHODS, format_results, run
+from vkc_pin.cli import main
 from vkc_pin.errors import InputError, UnknownNameError
 
 
@@ -24,6 +25,14 @@ def test_baseline_and_planner_solve_the_same_reach(tmp_path: Path) -> None:
     assert trials[0]["start"] == trials[1]["start"]
     assert "| reach | VKC | 1 of 1 | 0 |" in table
     assert len(list((tmp_path / "plans").glob("*.npz"))) == 2
+
+
+def test_help_lists_all_methods(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["bench", "peers", "--help"])
+    assert f"some of {' '.join(METHODS)} (default: all)" in " ".join(
+        capsys.readouterr().out.split()
+    )
 
 
 def test_wrong_arguments_are_refused(tmp_path: Path) -> None:

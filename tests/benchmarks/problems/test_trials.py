@@ -13,16 +13,16 @@ from vkc_pin.benchmarks.problems.problem_set import problem
 
 
 @pytest.fixture(scope="module")
-def planned() -> vkc.Plan:
+def solved_problem() -> vkc.Plan:
     case = problem(20)
     return vkc.plan(case.scene, case.steps)
 
 
-def test_objective_equals_that_of_the_last_accepted_round(planned: vkc.Plan) -> None:
+def test_objective_equals_that_of_the_last_accepted_round(solved_problem: vkc.Plan) -> None:
     """Without grasp freedoms, the objective covers all coordinates."""
-    assert planned.success, planned.summary()
-    (last, *_) = [row["objective"] for row in reversed(planned.history) if row["accepted"]]
-    assert trials.compute_objective(planned) == pytest.approx(last, rel=1e-6)
+    assert solved_problem.success, solved_problem.summary()
+    (last, *_) = [row["objective"] for row in reversed(solved_problem.history) if row["accepted"]]
+    assert trials.compute_objective(solved_problem) == pytest.approx(last, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -36,9 +36,9 @@ def test_objective_equals_that_of_the_last_accepted_round(planned: vkc.Plan) -> 
     ],
 )
 def test_first_guess_success_depends_on_solves_and_status(
-    planned: vkc.Plan, name: str, solves: int, expected: bool
+    solved_problem: vkc.Plan, name: str, solves: int, expected: bool
 ) -> None:
-    plan = dataclasses.replace(planned, initialization=name)
+    plan = dataclasses.replace(solved_problem, initialization=name)
     assert trials.is_first_guess_success(plan, solves) is expected
     assert not trials.is_first_guess_success(dataclasses.replace(plan, status="rejected"), solves)
 

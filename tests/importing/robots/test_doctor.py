@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -69,6 +70,8 @@ def test_missing_limits_and_masses_are_reported(tmp_path: Path) -> None:
     assert "arm_1_joint" in find_texts(found, "note", "effort")[0]
     assert "arm_4_joint" not in find_texts(found, "note", "effort")[0]
     assert "body" in find_texts(found, "note", "mass")[0]
+    hints = " ".join(finding.hint for finding in found.findings)
+    assert re.findall(r"joints: \{NAME: \{(\w+):", hints) == ["velocity", "effort"]
     stated = {"urdf": path.name, "joints": {"arm_1_joint": {"velocity": 2.0, "effort": 30.0}}}
     (tmp_path / "robot.yaml").write_text(json.dumps(stated), encoding="utf-8")
     found = vkc.importing.doctor(tmp_path, samples=5)

@@ -161,15 +161,9 @@ class _Search:
         return found or self._propose_pushes(number)
 
     def _propose_pushes(self, number: int) -> list[Proposal]:
-        """Return pushes for a joint whose links offer no grasp, best first; at most two.
-
-        A latched joint cannot be pushed if another joint, such as a knob, has to release it.
-        """
+        """Return pushes for a joint whose links offer no grasp, best first; at most two."""
         opening, hand = self.openings[number], self.hand
-        path = {str(self.item.model.names[k]) for k in self.item.model.supports[number]}
-        if any(
-            one.joint == opening.joint for one in self.item.latches if one.released_by not in path
-        ):
+        if self._is_latched(number):
             return []
         self.fitting.place(self.closed)
         at = self.fitting.joint(number).copy()
@@ -203,6 +197,17 @@ class _Search:
             found.append(Proposal(attachment, "push", False, 0.0, score, {opening.joint: opened}))
             taken.append(where)
         return sorted(found, key=lambda proposal: -proposal.score)[: min(2, self.most)]
+
+    def _is_latched(self, number: int) -> bool:
+        """Return whether a latch holds a closed joint, and no joint below it releases the latch."""
+        opening, model = self.openings[number], self.item.model
+        path = {str(model.names[k]) for k in model.supports[number]}
+        return any(
+            latch.joint == opening.joint
+            and latch.is_engaged(opening.closed)
+            and latch.released_by not in path
+            for latch in self.item.latches
+        )
 
     def _follow_push(self, push: Push, opening: Opening) -> float:
         """Return how far a hand pushes a joint open, [rad] or [m], before it is obstructed."""

@@ -174,6 +174,10 @@ class Latch:
     threshold: float
     engaged_within: float
 
+    def is_engaged(self, position: float) -> bool:
+        """Return whether the latch acts at a position of its joint, [rad] or [m]."""
+        return abs(position - self.held_at) <= self.engaged_within
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ArticulatedObject:

@@ -140,7 +140,7 @@ def find_engaged_latches(
         now = state.get(
             coordinate, float(placed.state[placed.object.coordinates.index(latch.joint)])
         )
-        if values.get(coordinate, now) != now and abs(now - latch.held_at) <= latch.engaged_within:
+        if values.get(coordinate, now) != now and latch.is_engaged(now):
             yield latch
 
 

@@ -29,12 +29,17 @@ def test_robot_without_a_hand_is_imported_once(
 @pytest.mark.parametrize(
     "file_name", ["robot.yaml", pytest.param("husky_ur5e.urdf", marks=pytest.mark.long)]
 )
-def test_robot_by_path_is_found_again(tmp_path: Path, file_name: str) -> None:
-    """The dataset stores the path of the URDF, since the robot's name is not sufficient."""
+def test_robot_by_path_is_found_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file_name: str
+) -> None:
+    """The dataset stores the path of the URDF, since the robot's name is not sufficient.
+
+    Paths are relative to the working directory, and not to the folder of scenes.
+    """
     pytest.importorskip("h5py")
-    shutil.copytree(find_robot("husky_ur5e").parent, tmp_path / "mine/rover")
-    recipe = {**SMALL, "robots": [str(tmp_path / "mine/rover" / file_name)]}
-    dataset = generate(recipe, 1, tmp_path / "out")
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(find_robot("husky_ur5e").parent, "mine/rover")
+    dataset = generate({**SMALL, "robots": [f"mine/rover/{file_name}"]}, 1, "out")
     (episode,) = dataset.episodes()
     assert episode.about["robot"] == ("rover" if file_name == "robot.yaml" else "husky_ur5e")
     assert episode.scene().robot.urdf == tmp_path / "mine/rover/husky_ur5e.urdf"

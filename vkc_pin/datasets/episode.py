@@ -105,7 +105,8 @@ class Episode:
             robot = dict(self.document["robot"])
             if self.robots is not None:
                 file = self.robots / check_name(robot["name"], "robot.name") / "robot.yaml"
-                robot["name"] = str(file) if file.is_file() else robot["name"]
+                # absolute: a scene's relative paths begin at the folder of its description
+                robot["name"] = str(file.resolve()) if file.is_file() else robot["name"]
             document = {**self.document, "robot": robot, "start": self.start}
             return Scene.from_document(document, self.where or find_resource_folder("scenes"))
 

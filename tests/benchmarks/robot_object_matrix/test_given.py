@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,8 @@ from vkc_pin.benchmarks.robot_object_matrix.given import (
     prepare_object,
     prepare_robot,
 )
-from vkc_pin.benchmarks.robot_object_matrix.pairs import load_description
+from vkc_pin.benchmarks.robot_object_matrix.pairs import load_description, make_hall
+from vkc_pin.world.models.robot_file import find_robot
 
 # A box with a drawer that is pulled towards +y, and a lamp beside it.
 DESK = """<robot name="desk">
@@ -117,3 +119,14 @@ def test_bundled_robot_is_used_and_robot_file_is_imported_once(tmp_path: Path) -
     changed = (folder / "robot.yaml").stat().st_mtime_ns
     prepare_robot(Request("two_arms", str(file)), tmp_path / "robots")
     assert (folder / "robot.yaml").stat().st_mtime_ns == changed
+
+
+@pytest.mark.parametrize("text", ["rover/robot.yaml", "rover"])
+def test_relative_path_of_a_robot_is_relative_to_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(find_robot("husky_ur5e").parent, "rover")
+    found = prepare_robot(Request("rover", f"./{text}"), Path("robots"))
+    scene = make_hall(found, "drawer", load_description("drawer"))
+    assert scene.robot.urdf == tmp_path / "rover/husky_ur5e.urdf"

@@ -16,7 +16,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.importing.objects.object_import import ImportedObject, import_object
 from vkc_pin.importing.robots.robot_import import import_robot
 from vkc_pin.world.files.writing import check_name, write_atomically, write_folder_atomically
-from vkc_pin.world.models.robot_file import find_robot, load_robot
+from vkc_pin.world.models.robot_file import find_robot, list_robots, load_robot
 
 __all__ = ["DEFAULT", "Request", "parse_requests", "prepare_object", "prepare_robot"]
 
@@ -84,7 +84,7 @@ def parse_requests(texts: Sequence[str], field: str, default: Sequence[str]) -> 
 
 
 def prepare_robot(one: Request, folder: Path) -> str:
-    """Return name or path of a robot, imported into `folder` unless it describes its hand.
+    """Return name or absolute path of a robot, imported into `folder` if its hand is unknown.
 
     Raises:
         InputError: There is no such robot, it cannot be imported, or its name is no file name.
@@ -96,9 +96,9 @@ def prepare_robot(one: Request, folder: Path) -> str:
         warnings.simplefilter("ignore")  # the doctor's report has them
         if not (made / "robot.yaml").is_file():
             if not mjcf and load_robot(one.path).touch_links:
-                return one.path
+                return one.path if one.path in list_robots() else str(file.resolve())
             import_robot(file, made, samples=_SAMPLES)
-    return str(made)
+    return str(made.resolve())
 
 
 def prepare_object(one: Request, folder: Path) -> str:

@@ -235,6 +235,19 @@ def test_shell_commands_are_valid() -> None:
     )
 
 
+def test_commands_on_a_page_do_not_share_folders() -> None:
+    """A folder belongs to one experiment."""
+    for page in PAGES:
+        commands = {
+            line
+            for block in find_blocks(page, "sh")
+            for line in block.splitlines()
+            if line.startswith(("vkc-pin bench", "vkc-pin generate"))
+        }
+        folders = re.findall(r"--out (?!DIR)(\S+)", "\n".join(commands))
+        assert sorted(folders) == sorted(set(folders)), page.name
+
+
 def test_every_command_has_help() -> None:
     for name, parser in find_commands().items():
         assert f"vkc-pin {name}" in parser.format_help()

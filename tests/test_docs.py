@@ -128,6 +128,9 @@ def test_yaml_examples_fit_their_schemas(tmp_path: Path) -> None:
         (closer, "door.urdf"),
     ):
         assert parse_document(Document(yaml.safe_load(text)), ObjectSchema).urdf == urdf
+    included = ROOT / "scenes/objects"
+    for text in (described, narrow, push, closer, rollers):
+        assert vkc.load_object(yaml.safe_load(text), folder=included).attachments
     (tmp_path / "hatch.yaml").write_text(whole, encoding="utf-8")
     assert vkc.load_scene(tmp_path / "hatch.yaml").objects["hatch"].object.name == "hatch"
     assert parse_document(Document(yaml.safe_load(described)), ObjectSchema).urdf == "door.urdf"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import re
 import subprocess
 import sys
 import tomllib
@@ -68,6 +70,17 @@ def test_conda_recipe_requires_the_same_packages(project: dict[str, Any]) -> Non
     found = {text.partition(" ")[0] for text in recipe["requirements"]["run"]} - {"python"}
     required = {Requirement(text).name for text in project["project"]["dependencies"]}
     assert found == {names.get(name, name) for name in required - {"cmeel-boost"}}
+
+
+def test_messages_refer_to_no_file_of_the_checkout() -> None:
+    """The installed package comes without the pages of the documentation."""
+    texts = [
+        node.value
+        for path in (CHECKOUT / "vkc_pin").rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    ]
+    assert not [text for text in texts if re.search(r"docs/\w+\.md", text)]
 
 
 def test_package_is_typed_and_licensed() -> None:

@@ -315,10 +315,7 @@ def _check_hand(robot: Robot, seed: int) -> list[Finding]:
             centre = shape.placement.act(np.asarray(shape.geometry.aabb_center, float))
             behind.append(float(frame.placement.actInv(centre)[2]))
     if behind and min(behind) > 0.0:
-        hint = (
-            "z of the tool frame is the direction of approach, x the closing direction, "
-            "see docs/robots.md"
-        )
+        hint = "z of the tool frame is the direction of approach, x the closing direction"
         findings.append(
             Finding(
                 "fault",
@@ -339,7 +336,7 @@ def _check_hand(robot: Robot, seed: int) -> list[Finding]:
         findings += _check_grasps(robot, make_hand(robot), seed)
     except InputError as error:
         if has_fingers(robot):
-            hint = f"attachments need {error.expected}, see docs/robots.md"
+            hint = f"attachments need {error.expected}"
             findings.append(Finding("fault", "hand", f"{error.problem}: it cannot grasp", hint))
         else:
             text = f"{error.problem}: it can reach poses, but not grasp objects"

@@ -72,6 +72,7 @@ _NEAR, _MOSTLY = 300, 0.75
 # [m] Distance up to which links are neighbours by design, such as the segments of a telescope
 _NEIGHBOURS = Options().dist_safe + 0.005
 _CLOSED = 0.01  # [m] opening below which fingers that do not move can grasp nothing
+_FINGERS = "in robot.yaml: `gripper: {FINGER_JOINT: {closed: POSITION, open: POSITION}}`"
 _AT_END = 3  # joints after which links belong to an arm or its hand
 _STANDING = 0.005  # [m] height up to which a root stands on the floor
 
@@ -125,7 +126,8 @@ def import_robot(  # noqa: PLR0913 - keyword options of a public call
             folder.
         arm: The arm to plan for: a name of `ImportedRobot.arms`, a part of one ("left"), or an SRDF
             group with its joints.
-        tool_frame: Tool frame, if it is not to be guessed; see docs/robots.md for its orientation.
+        tool_frame: Tool frame, if it is not to be guessed: z is the direction of approach, x the
+            closing direction.
         srdf: An SRDF; defaults to the one beside the file.
         packages: Folders for `package://` and `$(find ...)`; others are searched for around the
             file.
@@ -315,7 +317,8 @@ class _Importer:
             self._guess(
                 hand.sure,
                 f"hand: frame '{tool}' {hand.why}",
-                "if it is wrong: `tool_frame`, see docs/robots.md",
+                "if it is wrong: `tool_frame`, a link with z along the approach and x along the "
+                "closing direction",
             )
 
     def _turn_tool(self, robot: Robot, hand: Hand, seed: int) -> Robot:
@@ -340,7 +343,7 @@ class _Importer:
         }
         fixed = [f"{name} {low} to {high}" for name, (low, high) in limits.items() if low == high]
         text = f"the gripper does not move: its fingers stay {1e3 * hand.opening:.0f} mm apart"
-        hint = "`gripper`, see docs/robots.md"
+        hint = _FINGERS
         if fixed:
             text += f"; limits in the file: {', '.join(fixed)}"
             hint = (
@@ -364,7 +367,7 @@ class _Importer:
             self._guess(
                 "guess",
                 f"the fingers are locked: {error.problem}, {error.got}",
-                "`gripper`, see docs/robots.md",
+                _FINGERS,
             )
             return self._write_and_load()
 

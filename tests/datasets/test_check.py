@@ -63,6 +63,25 @@ def test_added_obstacle_makes_the_episode_invalid(copy: Path) -> None:
     assert "block" in found.refused[episode.number]
 
 
+def test_episode_without_a_scene_is_reported_once(copy: Path) -> None:
+    episode = next(Dataset.open(copy).episodes())
+    document = {**episode.document, "robot": {"name": "missing.yaml"}}
+    (copy / "scenes" / f"{compute_scene_name(document)}.json").write_text(json.dumps(document))
+    with h5py.File(get_shard(copy), "r+") as file:
+        file["data/demo_0"].attrs["scene"] = compute_scene_name(document)
+    found = check_dataset(copy)
+    assert list(found.refused) == [episode.number]
+    assert "missing.yaml" in found.refused[episode.number]
+    assert not found.problems
+
+
+def test_unreadable_episode_is_reported_once(copy: Path) -> None:
+    with h5py.File(get_shard(copy), "r+") as file:
+        del file["data/demo_1/motion"]
+    found = [text for text in check_dataset(copy).problems if "demo_1/motion: missing" in text]
+    assert len(found) == 1
+
+
 def test_repeated_episode_is_reported(copy: Path) -> None:
     with h5py.File(get_shard(copy), "r+") as file:
         numbers = [int(file[f"data/demo_{k}"].attrs["number"]) for k in range(4)]

@@ -160,7 +160,9 @@ def check_dataset(
     pixels, differences = _compare_pixels(
         dataset.recipe, shown_episodes, [valid[k] for k in chosen[:_RENDERED]]
     )
-    problems += differences
+    # An unreadable episode fails the checks of both layouts for the same reason.
+    reported = set(refused.values())
+    problems = [text for text in dict.fromkeys([*problems, *differences]) if text not in reported]
     text = make_statistics_page(
         dataset.recipe, records, failures, shown_episodes, refused, problems
     )
@@ -385,8 +387,10 @@ def _check_consistency(dataset: Dataset, records: list[dict[str, Any]]) -> Itera
             yield f"episode {record['number']} is nearly the same as {duplicate}"
     table = {int(row["number"]): row for row in read_table(dataset.folder / "episodes.csv")}
     if set(table) != set(counts):
-        yield f"episodes.csv names {len(table)} episodes, the shards have {len(counts)}"
+        yield f"episodes.csv names {len(table)} episodes, {len(counts)} can be read"
     for record in records:
+        if record["refused"]:  # reported already; an unreadable scene has no values to compare
+            continue
         row = table.get(record["number"], {})
         for name in row:
             if name in record and not _is_cell_of(row[name], record[name]):

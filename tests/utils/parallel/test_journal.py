@@ -126,6 +126,19 @@ def test_different_header_raises(tmp_path: Path) -> None:
     assert caught.value.field == "recipe"
 
 
+def test_header_of_another_benchmark_raises(tmp_path: Path) -> None:
+    header = {"settings": {"benchmark": "door", "scenes": "a"}}
+    open_journal(tmp_path / "j", header)._stream.close()
+    with pytest.raises(InputError) as caught:
+        open_journal(tmp_path / "j", {"settings": {"benchmark": "gap", "tasks": "b"}})
+    error = caught.value
+    assert (error.field, error.expected, error.got) == (
+        "benchmark",
+        "benchmark door",
+        "benchmark gap",
+    )
+
+
 def test_two_writers_raise(tmp_path: Path) -> None:
     first = open_journal(tmp_path / "j")
     with pytest.raises(InputError, match="another run is writing"):

@@ -238,6 +238,7 @@ class Journal(JournalContents):
         differing = [name for name in {**old, **new} if old.get(name) != new.get(name)]
         if differing:
             named = [name for name in differing if name != "specification"] or differing
+            named = ["benchmark"] if "benchmark" in named else named  # others have other settings
             was, now = (
                 ", ".join(f"{name.rpartition('.')[2]} {side.get(name)}" for name in named)
                 for side in (old, new)

@@ -170,6 +170,8 @@ def test_failed_plan_is_written_and_returns_1(
         ("plan door --set door.hinge=1 --max-evaluations 0", ["max_evaluations", "at least 1"]),
         ("plan door --set door.hinge=1 --time-limit soon", ["--time-limit", "soon"]),
         ("plan door --set door.hinge=1 --seed -1", ["--seed", "at least 0"]),
+        ("plan door --st x", ["usage: vkc-pin plan ", "--st x"]),
+        ("check door.json", ["door.json", "a saved plan (.npz) or a scene (.yaml)"]),
         ("check none.npz", ["none.npz", "No such file"]),
         ("view none.npz", ["none.npz", "No such file"]),
         ("view drawr", ["did you mean 'drawer'"]),

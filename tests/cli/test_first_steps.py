@@ -19,10 +19,12 @@ def test_demo_writes_the_page_of_the_door(
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("CC", "/nonexistent")
     assert main(["demo"]) == 0
     assert [file.name for file in tmp_path.iterdir()] == ["vkc-pin-demo.html"]
     out = capsys.readouterr().out
     assert "door: success" in out
+    assert "there is no C compiler (/nonexistent)" in out
     assert (tmp_path / "vkc-pin-demo.html").as_uri() in out
 
 
@@ -57,6 +59,13 @@ def test_bash_completes_commands_and_options(capsys: pytest.CaptureFixture[str])
             [bash, "-c", f"{script}\n{ask}"], capture_output=True, text=True, check=False
         )
         assert done.stdout.split() == [expected], done.stderr
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_lines_of_completion_can_be_copied(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["completion", "--help"])
+    assert f'eval "$(vkc-pin completion {shell})"\n' in capsys.readouterr().out
 
 
 def test_help_lists_commands_in_groups(capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,6 +24,7 @@ from vkc_pin.cli.options import (
     EXIT_INTERRUPTED,
     EXIT_MISUSE,
     EXIT_OK,
+    CommandParser,
     GroupedCommands,
     GroupedHelp,
     add_command,
@@ -261,7 +262,16 @@ def _check(arguments: argparse.Namespace) -> int:
             "not the name of a picture", field="--plot", expected=expected, got=arguments.plot
         )
     _check_outputs(files, SCENE=arguments.what)
-    found = vkc.check_scene(vkc.load_scene(arguments.what), seed=arguments.seed)
+    try:
+        scene = vkc.load_scene(arguments.what)
+    except InputError as error:
+        if Path(arguments.what).suffix in ("", ".yaml", ".yml"):
+            raise
+        expected = "a saved plan (.npz) or a scene (.yaml)"
+        raise InputError(
+            "neither a plan nor a scene", file=arguments.what, expected=expected
+        ) from error
+    found = vkc.check_scene(scene, seed=arguments.seed)
     if not _write(files, {"plot": found.plot}, f"{found}\n"):
         return EXIT_MISUSE
     return EXIT_OK if found.ok else EXIT_FAILED
@@ -323,7 +333,7 @@ def make_parser() -> argparse.ArgumentParser:
     """Return the command line parser; each command sets `run`, a function of the arguments."""
     from vkc_pin.benchmarks.harness.record import find_versions
 
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="vkc-pin",
         description="Whole-body planning on virtual kinematic chains.",
         epilog=_EPILOG,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import functools
+import os
 import shlex
 import sys
 from collections.abc import Callable
@@ -40,12 +41,14 @@ def add_completion(
 ) -> None:
     """Add the command completion, for all commands of the parser that `make_parser` returns."""
     about = (
-        "Print a script that completes commands and options. In ~/.bashrc: "
-        'eval "$(vkc-pin completion bash)"; in ~/.zshrc: eval "$(vkc-pin completion zsh)"; '
-        "in fish's config.fish: vkc-pin completion fish | source."
+        "Print a script that completes commands and options.\n\n"
+        'in ~/.bashrc: eval "$(vkc-pin completion bash)"\n'
+        'in ~/.zshrc: eval "$(vkc-pin completion zsh)"\n'
+        "in config.fish of fish: vkc-pin completion fish | source"
     )
     run = functools.partial(_complete, make_parser)
     completion = add_command(commands, "completion", "complete commands in a shell", run, about)
+    completion.formatter_class = argparse.RawDescriptionHelpFormatter  # lines can be copied
     add_option(completion, "shell SHELL", ", ".join(_SHELLS), choices=_SHELLS)
 
 
@@ -65,7 +68,8 @@ def _demo(arguments: argparse.Namespace) -> int:
         sys.stdout.write(f"open {page.as_uri()} in a browser\n")
     if find_compiler() is None:
         sys.stdout.write(
-            "there is no C compiler (cc): later plans of a kind take as long as the first, "
+            f"there is no C compiler ({os.environ.get('CC') or 'cc'}): later plans of a kind take "
+            "as long as the first, "
             "and with one up to a third less\n"
         )
     sys.stdout.write("next: vkc-pin new FOLDER starts a scene of your own\n")

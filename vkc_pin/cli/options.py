@@ -14,6 +14,7 @@ __all__ = [
     "EXIT_INTERRUPTED",
     "EXIT_MISUSE",
     "EXIT_OK",
+    "CommandParser",
     "GroupedCommands",
     "GroupedHelp",
     "add_command",
@@ -24,6 +25,17 @@ __all__ = [
 ]
 
 EXIT_FAILED, EXIT_MISUSE, EXIT_INFEASIBLE = 1, 2, 3
+
+
+class CommandParser(argparse.ArgumentParser):
+    """Parser whose commands report unknown arguments themselves, with their own usage."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse arguments; unknown ones are an error."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return found, unknown
 
 
 class GroupedCommands:

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.carrying import make_room
 from helpers.executions import make_stationary_motion, plan_drawer
 from helpers.telescopes import write_coupled_scene
 
@@ -94,6 +95,20 @@ def test_masses_agree_with_pinocchio() -> None:
             0.0, principal[2] - principal[0] - principal[1]
         )  # the cabinet's inertias are rounded
         np.testing.assert_allclose(np.sort(physical.model.body_inertia[body]), principal, rtol=1e-3)
+
+
+def test_ball_on_the_floor_comes_to_rest() -> None:
+    """Rolling friction decelerates a hollow ball at 0.17 m/s²."""
+    physical = build_model(make_room(objects=("ball",)))
+    model, data = physical.model, mujoco.MjData(physical.model)
+    data.qpos[:] = physical.to_qpos(physical.world.start)
+    position = physical.columns[physical.world.get_placement_columns("ball")][:3]
+    data.qpos[position] = [3.0, 0.0, 0.035]
+    velocity = data.qvel[-6:]  # of the only free joint
+    velocity[:] = [0.1, 0.0, 0.0, 0.0, 0.1 / 0.035, 0.0]
+    mujoco.mj_step(model, data, round(1.0 / model.opt.timestep))
+    assert np.abs(velocity).max() < 1e-3
+    assert 0.02 < data.qpos[position[0]] - 3.0 < 0.04
 
 
 def test_objects_have_the_described_joint_resistance() -> None:

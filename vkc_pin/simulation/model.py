@@ -231,18 +231,22 @@ class Builder:
 
     def _add_geoms(self, pairs: Pairs) -> None:
         """Add the collision shapes and their contact pairs."""
+        sliding, rolling = self.physics.friction, self.physics.rolling_friction
+        is_sphere = [isinstance(shape.geometry, coal.Sphere) for shape in self.world.shapes]
         for number, shape in enumerate(self.world.shapes):
             body, place = self.moved_shapes.get(
                 number, (self.bodies[shape.parentJoint], shape.placement)
             )
             geom = self.add_geom(body, f"shape {number}", shape.geometry, place)
             geom.contype, geom.conaffinity = int(pairs.types[number]), int(pairs.affinities[number])
-            geom.friction[0], geom.condim = self.physics.friction, 4
+            geom.friction[0], geom.friction[2] = sliding, rolling
+            geom.condim = 6 if is_sphere[number] else 4  # only the former have rolling friction
             geom.solref, geom.group = _CONTACT, 3
             geom.rgba = [*np.asarray(shape.meshColor)[:3], 1.0]
         for first, second in pairs.always.tolist():
             pair = self.spec.add_pair(geomname1=f"shape {first}", geomname2=f"shape {second}")
-            pair.condim, pair.friction[:2], pair.solref = 4, [self.physics.friction] * 2, _CONTACT
+            pair.condim = 6 if is_sphere[first] or is_sphere[second] else 4
+            pair.friction[:2], pair.friction[3:], pair.solref = sliding, rolling, _CONTACT
             if self.has_friction_grasps:
                 pair.solreffriction = [2.0 * self.physics.timestep, 1.0]
 

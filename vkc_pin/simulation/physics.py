@@ -32,6 +32,7 @@ _RANGES = {
     "prismatic_damping": (0.0, 1e6),
     "density": (1e-3, 1e5),
     "friction": (0.0, 100.0),
+    "rolling_friction": (0.0, 1.0),
     "grasp_force": (1e-6, 1e9),
     "grasp_torque": (1e-6, 1e9),
     "closing_force": (1e-6, 1e6),
@@ -57,6 +58,9 @@ class Physics:
         density: Density of links without a mass, in the volume of their collision shapes [kg/m³].
             The default suits hollow furniture.
         friction: Coulomb friction coefficient between any two surfaces.
+        rolling_friction: Coefficient of rolling friction of spheres [m]: the distance by which the
+            reaction leads the centre, a thirtieth of the radius of a rubber ball. Without it, a
+            ball that is put down never comes to rest.
         grasp_force: Force, averaged over 20 ms, above which a hand loses its hold [N]. A parallel
             gripper that closes with 235 N holds 2 · 0.6 · 235 N by its rubber pads.
         grasp_torque: Torque, averaged over 20 ms, above which a hand loses its hold [N·m].
@@ -81,6 +85,7 @@ class Physics:
     prismatic_damping: float = 1.0
     density: float = 300.0
     friction: float = 0.8
+    rolling_friction: float = 1e-3
     grasp_force: float = 280.0
     grasp_torque: float = 30.0
     closing_force: float = 235.0

@@ -91,6 +91,12 @@ def test_fetched_object_is_placed_on_another_table() -> None:
     )  # the ball's radius above the table top
 
 
+def test_any_grasp_is_one_of_the_hand() -> None:
+    """The ball's attachment `pull` is for the tip of a stick."""
+    recipe = {"tasks": ["fetch-place"], "carried": ["ball"], "grasps": "any"}
+    assert {sample(k, **recipe).about["attachment"] for k in range(6)} == {"grip"}
+
+
 def test_impossible_ranges_are_reported() -> None:
     with pytest.raises(NoProblemError, match="no free start in room_0"):
         sample(0, tasks=["drive-open"], start={"distance": [50.0, 60.0]})

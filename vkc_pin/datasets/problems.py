@@ -255,11 +255,10 @@ def _sample_fetch_task(
     free = [name for name, placed in scene.objects.items() if placed.object.free]
     name = str(rng.choice(sorted(free)))
     placed = scene.objects[name]
-    attachments = sorted(placed.object.attachments)
+    attachments = placed.object.attachments.values()
+    names = sorted(one.name for one in attachments if one.contact == "grasp")
     attachment = (
-        str(rng.choice(attachments))
-        if fields.grasps == "any"
-        else next(iter(placed.object.attachments))
+        str(rng.choice(names)) if fields.grasps == "any" else next(iter(placed.object.attachments))
     )
     others = [
         part for part in layout.parts if part.name.startswith("table_") and part.name != "table_1"

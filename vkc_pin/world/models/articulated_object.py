@@ -105,6 +105,8 @@ class Attachment:
         contact: "grasp": the hand closes on the link and moves it in any direction. "push": the
             hand's foremost point takes the place of the tool frame, against a face whose inward
             normal is the z axis of `placement`, and moves the link in that direction only.
+            "touch": a tool's tip touches the link and moves it in any direction, where no hand can
+            close.
         deviation: Measured pose of the hand in its nominal placement; None: as described.
     """
 

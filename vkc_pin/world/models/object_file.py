@@ -104,7 +104,7 @@ class AttachmentSchema(Schema):
     firm: bool | None = None  # default: whether the object is free
     clearance: NonNegative | None = None
     opening: NonNegative | None = None
-    contact: Literal["grasp", "push"] = "grasp"
+    contact: Literal["grasp", "push", "touch"] = "grasp"
 
     @model_validator(mode="after")
     def _consistent(self) -> AttachmentSchema:

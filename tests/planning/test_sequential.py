@@ -173,6 +173,27 @@ def test_object_is_regrasped_to_be_placed(offset: float) -> None:
     )
 
 
+@pytest.mark.parametrize("simultaneous", [True, pytest.param(False, marks=pytest.mark.long)])
+def test_object_is_regrasped_where_it_cannot_be_placed_from_the_first_grasp(
+    simultaneous: bool,
+) -> None:
+    """From its start, the robot grasps the object from the side without any motion."""
+    grasped = grasp_litter()
+    (hold,) = grasped.end_scene().holds
+    scene = compute_final_scene(make_littered_scene(), grasped.trajectory, [hold]).with_held({})
+    grasp, place = vkc.Grasp("litter", "grip"), vkc.Place("litter", BIN_POSITION)
+    plan = vkc.plan(scene, [grasp, place], simultaneous=simultaneous)
+    assert plan.success, plan.summary()
+    assert plan.steps == (
+        grasp,
+        vkc.Release("litter"),
+        vkc.Place("litter", BIN_POSITION, "grip"),
+    )
+    np.testing.assert_allclose(
+        plan.end_scene().objects["litter"].placement.translation, BIN_POSITION, atol=2e-3
+    )
+
+
 PLANNERS = [
     vkc.plan,
     pytest.param(functools.partial(vkc.plan, window=2), marks=pytest.mark.long),

@@ -8,6 +8,7 @@ import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from vkc_pin.errors import InputError
 from vkc_pin.planning.initialization.initial_guess import make_initial_guess
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.request import PlanningRequest
@@ -84,10 +85,13 @@ def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> Plan
     """
     parts = plan_each_step(scene, task, request)
     steps, statistics = _list_steps(task, parts), [part.result.plan.statistics for part in parts]
-    whole = task if steps == task.steps else compile_task(scene, steps, request.options)
+    try:
+        whole = task if steps == task.steps else compile_task(scene, steps, request.options)
+    except InputError:  # a free object is grasped anew, from where it lies only after planning
+        whole = None
     is_planned = parts and all(part.result.plan.success for part in parts) and not current_ending()
     # A chain can contain a joint only once.
-    if is_planned and find_shared_coordinate(scene, whole.holds) is None:
+    if is_planned and whole and find_shared_coordinate(scene, whole.holds) is None:
         pieces = [part.result.phase_waypoints() for part in parts]
         guess = functools.partial(make_initial_guess, parts=pieces)
         plan = solve_task(scene, whole, request, guess=guess).plan

@@ -10,7 +10,12 @@ from vkc_pin.planning.base_paths.arcs import Curves, interpolate_arcs, sample_pa
 from vkc_pin.planning.initialization.approach_paths import ApproachPaths
 from vkc_pin.planning.initialization.base_routes import BaseRoutes
 from vkc_pin.planning.initialization.keyframes import KeyframeSampler, sample_smoothstep
-from vkc_pin.planning.initialization.rrt import MAX_EXTENSIONS, find_open_path
+from vkc_pin.planning.initialization.rrt import (
+    MAX_EXTENSIONS,
+    find_closed_path,
+    find_open_path,
+    needs_trees,
+)
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.task.phases import Phase
 
@@ -62,10 +67,7 @@ class CurvePaths:
 
 
 class RrtPaths:
-    """Paths of base and arm by RRT, guided by a base path.
-
-    The maximum number of extensions is halved after every failure in a phase.
-    """
+    """Paths of base and arm by RRT: guided by a base path, or constrained to a closed chain."""
 
     def __init__(self, sampler: KeyframeSampler, routes: BaseRoutes) -> None:
         self.sampler, self.problem, self.routes = sampler, sampler.problem, routes
@@ -94,12 +96,28 @@ class RrtPaths:
         ends = np.tile(last, (1 if reaches else len(arms), 1))
         if not reaches:
             ends[:, arm] = arms
-        limit = max(1, MAX_EXTENSIONS // 2 ** self._failures[phase])
+        limit = self._get_extension_limit(phase)
         path = find_open_path(
             self.sampler, phase, first, ends, steps, limit, poses=poses, arms=arms
         )
-        self._failures[phase] = 0 if path is not None else self._failures[phase] + 1
+        self._count_failures(phase, path)
         return None if path is None else path[:, : arm.stop]
+
+    def find_closed_path(self, phase: int, through: Floats, straight: Floats) -> Floats | None:
+        """Find waypoints of a closed phase around obstacles; None if straight lines are free."""
+        if not needs_trees(self.sampler, phase, through, straight):
+            return None
+        limit = self._get_extension_limit(phase)
+        path = find_closed_path(self.sampler, phase, through, len(straight), limit)
+        self._count_failures(phase, path)
+        return path
+
+    def _get_extension_limit(self, phase: int) -> int:
+        """Return the maximum number of extensions, which is halved after every failure."""
+        return max(1, MAX_EXTENSIONS // 2 ** self._failures[phase])
+
+    def _count_failures(self, phase: int, path: Floats | None) -> None:
+        self._failures[phase] = 0 if path is not None else self._failures[phase] + 1
 
 
 Paths = CurvePaths | AStarPaths | RrtPaths
@@ -141,7 +159,11 @@ class Interpolator:
         Returns:
             z_1..z_N, shape (N, n); None if a phase has no path.
         """
-        problem, keyframes = self.problem, through.copy()
+        problem, keyframes, objects = (
+            self.problem,
+            through.copy(),
+            self.sampler.object_motion.copy(),
+        )
         z = np.empty((problem.segments, problem.chain.size))
         begin, previous = 0, None
         for number, (phase, end) in enumerate(
@@ -151,10 +173,18 @@ class Interpolator:
             rows = z[begin:end]
             if problem.is_closed(phase):
                 self._fill_straight(rows, keyframes[inside], [at[k] - begin for k in inside])
+                path = (
+                    self.paths.find_closed_path(number, keyframes[inside], rows)
+                    if isinstance(self.paths, RrtPaths)
+                    else None
+                )
+                if path is not None:
+                    rows[:] = objects[begin:end] = path
+                    keyframes[inside[-1]] = path[-1]
             elif not self._fill_open_phase(rows, keyframes, inside, number, previous):
                 return None
             begin, previous = end, phase
-        self._close_chain(z)
+        self._close_chain(z, objects)
         return problem.clip(z)
 
     def _fill_straight(self, z: Floats, through: Floats, when: list[int]) -> None:
@@ -229,10 +259,9 @@ class Interpolator:
         shortfall = self.sampler.compute_shortfall(z, waypoint) if len(z) else np.zeros(0)
         return bool(np.all(shortfall < self.problem.options.dist_safe / 2))
 
-    def _close_chain(self, z: Floats) -> None:
-        """Set the object joints in z, shape (N, n), to their motion, and solve the closures."""
+    def _close_chain(self, z: Floats, objects: Floats) -> None:
+        """Set object joints in z, shape (N, n), to those of `objects`, and solve the closures."""
         problem, columns = self.problem, self.sampler.object_columns
-        objects = self.sampler.object_motion
         z[:, columns] = objects[:, columns]
         for pose, row in enumerate(problem.transcription.structure.poses):
             if len(row.waypoints) > 1:

@@ -1,11 +1,17 @@
 """Finds paths of base and arm around obstacles with two random trees.
 
-RRT-Connect (Kuffner and LaValle, ICRA 2000) in all coordinates of the robot, for phases without a
-closed chain. Samples are near a guide path of the base, with arm postures that are likely to be
+RRT-Connect (Kuffner and LaValle, ICRA 2000) in all coordinates. In phases with a closed chain,
+steps are projected to the closure manifold (Berenson, Srinivasa, Ferguson and Kuffner,
+*Manipulation planning on constraint manifolds*, ICRA 2009), and the progress of the object joints
+along their given motion is one more coordinate: a door may wait until the arm is out of its frame.
+In open phases, samples are near a guide path of the base, with arm postures that are likely to be
 needed there, so that narrow passages are found quickly. Why not OMPL: docs/decisions/0012.
 """
 
 from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,16 +23,63 @@ from vkc_pin.planning.initialization.keyframes import (
 )
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 
-__all__ = ["MAX_EXTENSIONS", "find_open_path"]
+__all__ = [
+    "MAX_EXTENSIONS",
+    "find_closed_path",
+    "find_open_path",
+    "needs_trees",
+]
 
 MAX_EXTENSIONS = 1500
 """Maximum number of tree extensions."""
 _STEP = 0.15  # between collision checks, in the metric of searches: [rad] of a joint
-_GUIDED_SAMPLES = SAMPLE_COUNT // 8  # towards which a tree grows at once
-# largest standard deviation of samples from guide path and likely postures
+_GUIDED_SAMPLES = SAMPLE_COUNT // 8  # towards which a tree grows at once in an open phase
+_CLOSED_SAMPLES = SAMPLE_COUNT // 4
+# largest standard deviation of samples in open phases from guide path and likely postures
 _BASE_SPREAD, _ARM_SPREAD = 0.1, 0.4  # [m] and [rad]
 _STRAIGHTENING_ROUNDS = 3
 _MIN_SAVING = 1e-3  # relative saving in length that a partial shortcut needs
+
+
+def needs_trees(sampler: KeyframeSampler, phase: int, through: Floats, straight: Floats) -> bool:
+    """Return whether straight lines through a closed-chain phase collide and trees may help.
+
+    Trees do not help a base with wheels, whose arcs they ignore, or a phase that starts in
+    collision.
+
+    Args:
+        sampler: Keyframe sampler of the problem.
+        phase: Number of the phase, with a closed chain.
+        through: Configurations at its keyframes, shape (K, n).
+        straight: Waypoints on straight lines through them, shape (steps, n).
+    """
+    if sampler.curves is not None:
+        return False
+    search = _ClosedSearch(sampler, phase, through, len(straight))
+    closed, _ = search.project(straight, np.arange(search.begin + 1.0, search.end + 1.0))
+    return not search.are_free(closed).all() and bool(search.are_free(through[:1]).all())
+
+
+def find_closed_path(
+    sampler: KeyframeSampler, phase: int, through: Floats, steps: int, max_extensions: int
+) -> Floats | None:
+    """Find waypoints of a closed-chain phase from the first of some configurations.
+
+    Args:
+        sampler: Keyframe sampler of the problem, whose base has no steered wheels.
+        phase: Number of the phase.
+        through: Configurations at its keyframes, shape (K, n).
+        steps: Number of waypoints of the phase.
+        max_extensions: Maximum number of tree extensions.
+
+    Returns:
+        Nearly collision-free waypoints, shape (steps, n), which may end at another configuration;
+        None if no path was found.
+    """
+    search = _ClosedSearch(sampler, phase, through, steps)
+    ends = np.vstack([through[-1:], search.sample_waypoint(int(search.end))])
+    path = search.connect(through[:1], ends, max_extensions)
+    return None if path is None else search.resample(search.shorten(path), steps)
 
 
 def find_open_path(
@@ -55,38 +108,52 @@ def find_open_path(
     Returns:
         Nearly collision-free waypoints, shape (steps, n); None if no path was found.
     """
-    search = _Search(sampler, phase, first, poses, arms)
+    search = _OpenSearch(sampler, phase, first, poses, arms)
     path = search.connect(first[None], ends, max_extensions)
     return None if path is None else search.resample(search.straighten(search.shorten(path)), steps)
 
 
-class _Tree:
-    def __init__(self, z: Floats) -> None:
-        self.z, self.parents = z, np.full(len(z), -1)
+class _Path(NamedTuple):
+    """Configurations, shape (P, n), and their progress as fractional waypoints, shape (P,)."""
 
-    def add(self, z: Floats, parents: Ints) -> Ints:
-        self.z, self.parents = np.concatenate([self.z, z]), np.concatenate([self.parents, parents])
+    z: Floats
+    at: Floats
+
+
+class _Tree:
+    def __init__(self, z: Floats, at: float) -> None:
+        self.z, self.at, self.parents = z, np.full(len(z), at), np.full(len(z), -1)
+
+    def add(self, z: Floats, at: Floats, parents: Ints) -> Ints:
+        self.z, self.at = np.concatenate([self.z, z]), np.concatenate([self.at, at])
+        self.parents = np.concatenate([self.parents, parents])
         return np.arange(len(self.z) - len(z), len(self.z))
 
-    def trace_to_root(self, node: int) -> Floats:
+    def trace_to_root(self, node: int) -> _Path:
         nodes = [node]
         while self.parents[nodes[-1]] >= 0:
             nodes.append(int(self.parents[nodes[-1]]))
-        return self.z[nodes]
+        return _Path(self.z[nodes], self.at[nodes])
 
 
-class _Search:
-    """Searches paths, shape (P, n), in one phase, near a guide path of the base."""
+class _Search(ABC):
+    """Searches a path in one phase, from progress `begin` to `end`."""
 
-    def __init__(
-        self, sampler: KeyframeSampler, phase: int, first: Floats, poses: Floats, arms: Floats
-    ) -> None:
+    def __init__(self, sampler: KeyframeSampler, phase: int, begin: float) -> None:
         self.sampler, self.problem = sampler, sampler.problem
+        self.begin, self.end = begin, float(self.problem.ends[phase])
         self.waypoint = self.problem.contacts.find_waypoint(phase)
-        self.first, self.poses, self.arms = first, poses, arms
-        self.robot, self.arm = slice(sampler.robot_size), slice(3, sampler.robot_size)
-        names = self.problem.chain.names[self.robot]
-        self.lower, self.upper = np.array([self.problem.limits(name) for name in names]).T
+
+    @abstractmethod
+    def project(self, z: Floats, at: Floats) -> tuple[Floats, Bools]:
+        """Project configurations, shape (B, n), with their progress to the constraints.
+
+        Returns projected configurations, and a mask of those that satisfy the constraints.
+        """
+
+    @abstractmethod
+    def sample(self) -> tuple[Floats, float]:
+        """Sample nearly collision-free configurations, shape (B, n), and their progress."""
 
     def are_free(self, z: Floats) -> Bools:
         """Return which configurations are nearly collision-free, shape (B,).
@@ -104,51 +171,38 @@ class _Search:
     def compute_gaps(self, z: Floats) -> Floats:
         return self.compute_distances(z[1:], z[:-1])
 
-    def sample(self) -> Floats:
-        """Sample nearly collision-free configurations, shape (B, n)."""
-        rng, count = self.sampler.rng, _GUIDED_SAMPLES
-        z = np.tile(self.first, (count, 1))
-        z[:, :3] = rng.choice(self.poses, count)
-        z[:, self.arm] = rng.choice(self.arms, count)
-        # Half of them are exactly on the guide path, in one of the likely postures.
-        spread = rng.uniform(0.0, 1.0, (count, 1)) * rng.integers(2, size=(count, 1))
-        z[:, :3] += _BASE_SPREAD * spread * rng.normal(size=(count, 3))
-        z[:, self.arm] += _ARM_SPREAD * spread * rng.normal(size=z[:, self.arm].shape)
-        z[:, self.robot] = np.clip(z[:, self.robot], self.lower, self.upper)
-        return z[self.are_free(z)]
-
-    def connect(self, first: Floats, ends: Floats, max_extensions: int) -> Floats | None:
+    def connect(self, first: Floats, ends: Floats, max_extensions: int) -> _Path | None:
         """Find a path from `first`, shape (1, n), to one of `ends`, shape (E, n).
 
         If none of the ends is nearly collision-free, the least violating ones are used.
         """
         shortfall = self.compute_shortfall(ends)
         ends = ends[shortfall <= max(self.problem.options.dist_safe, float(shortfall.min()))]
-        one, other = _Tree(first), _Tree(ends)
+        one, other = _Tree(first, self.begin), _Tree(ends, self.end)
         forwards, grown, tips = True, 0, np.zeros(1, int)
         while grown < max_extensions:
             path = self.try_connect(one, other, tips)
             if path is not None:
-                return path if forwards else path[::-1]
+                return path if forwards else _Path(path.z[::-1], path.at[::-1])
             forwards, one, other = not forwards, other, one
-            goals = self.sample()
-            tips = np.unique(self.grow(one, goals))
+            goals, at = self.sample()
+            tips = np.unique(self.grow(one, goals, np.full(len(goals), at)))
             grown += max(len(goals), 1)
         return None
 
-    def try_connect(self, tree: _Tree, other: _Tree, tips: Ints) -> Floats | None:
+    def try_connect(self, tree: _Tree, other: _Tree, tips: Ints) -> _Path | None:
         """Grow `other` towards the `tips` of `tree`; return the connecting path if they meet."""
         if not len(tips):
             return None
-        reached = self.grow(other, tree.z[tips])
+        reached = self.grow(other, tree.z[tips], tree.at[tips])
         gaps = self.compute_distances(other.z[reached], tree.z[tips])
         best = int(np.argmin(gaps))
         if gaps[best] > _STEP:
             return None
         here, there = tree.trace_to_root(int(tips[best])), other.trace_to_root(int(reached[best]))
-        return np.vstack([here[::-1], there])
+        return _Path(np.vstack([here.z[::-1], there.z]), np.concatenate([here.at[::-1], there.at]))
 
-    def grow(self, tree: _Tree, goals: Floats) -> Ints:
+    def grow(self, tree: _Tree, goals: Floats, at: Floats) -> Ints:
         """Grow a tree step by step towards goals; return the last node of each branch, (B,)."""
         ends = np.array(
             [int(np.argmin(self.compute_distances(tree.z, goal))) for goal in goals], int
@@ -158,24 +212,35 @@ class _Search:
             left = self.compute_distances(tree.z[ends[growing]], goals[growing])
             growing, left = growing[left > _STEP], left[left > _STEP]
             here, share = ends[growing], _STEP / left
-            moved = tree.z[here] + share[:, None] * (goals[growing] - tree.z[here])
-            free = self.are_free(moved)
-            growing = growing[free]
-            ends[growing] = tree.add(moved[free], here[free])
+            progress = tree.at[here] + share * (at[growing] - tree.at[here])
+            moved, feasible = self.project(
+                tree.z[here] + share[:, None] * (goals[growing] - tree.z[here]), progress
+            )
+            nearer = left - self.compute_distances(moved, goals[growing])
+            good = (
+                feasible
+                & (self.compute_distances(moved, tree.z[here]) <= 2.0 * _STEP)
+                & (nearer > _STEP / 4.0)
+            )
+            good[good] = self.are_free(moved[good])
+            growing = growing[good]
+            ends[growing] = tree.add(moved[good], progress[good], here[good])
         return ends
 
-    def shorten(self, path: Floats) -> Floats:
-        """Shortcut a path between random points on it."""
-        for _ in range(len(path)):
-            first, last = sorted(self.sampler.rng.integers(len(path), size=2))
-            count = int(np.ceil(self.compute_distances(path[first], path[last]) / _STEP))
-            if 1 < count < last - first:
-                share = np.arange(1, count) / count
-                z = path[first] + share[:, None] * (path[last] - path[first])
-                path = self.replace(path, first, last, z)
+    def shorten(self, path: _Path) -> _Path:
+        """Shortcut a path between random points on it, with projected steps."""
+        for _ in range(len(path.z)):
+            first, last = sorted(self.sampler.rng.integers(len(path.z), size=2))
+            count = int(np.ceil(self.compute_distances(path.z[first], path.z[last]) / _STEP))
+            if not 1 < count < last - first:
+                continue
+            share = np.arange(1, count) / count
+            at = path.at[first] + share * (path.at[last] - path.at[first])
+            z = path.z[first] + share[:, None] * (path.z[last] - path.z[first])
+            path = self.replace(path, first, last, z, at)
         return path
 
-    def straighten(self, path: Floats) -> Floats:
+    def straighten(self, path: _Path) -> _Path:
         """Move the arm, and each joint alone, evenly along a path where that is collision-free.
 
         A path through a narrow passage with another posture moves all joints. Straight lines in all
@@ -186,27 +251,102 @@ class _Search:
         arm = range(3, self.sampler.robot_size)
         for number in range(1 + _STRAIGHTENING_ROUNDS):
             for columns in [list(arm), *([column] for column in arm)]:
-                first, last = 0, len(path) - 1
+                first, last = 0, len(path.z) - 1
                 if number:
-                    first, last = sorted(self.sampler.rng.integers(len(path), size=2))
+                    first, last = sorted(self.sampler.rng.integers(len(path.z), size=2))
                 if last - first > 1:
-                    part = path[first : last + 1]
+                    part = path.z[first : last + 1]
                     passed = np.cumsum(self.compute_gaps(part))
                     share, z = (passed[:-1] / max(passed[-1], 1e-12))[:, None], part[1:-1].copy()
                     z[:, columns] = part[0, columns] + share * (part[-1] - part[0])[columns]
-                    path = self.replace(path, first, last, z)
+                    path = self.replace(path, first, last, z, path.at[first + 1 : last])
         return path
 
-    def replace(self, path: Floats, first: int, last: int, z: Floats) -> Floats:
+    def replace(self, path: _Path, first: int, last: int, z: Floats, at: Floats) -> _Path:
         """Replace the piece between two points of a path by a shorter, collision-free one."""
-        gaps = self.compute_gaps(np.vstack([path[first], z, path[last]]))
-        before = self.compute_gaps(path[first : last + 1]).sum()
-        if gaps.sum() >= (1.0 - _MIN_SAVING) * before or not self.are_free(z).all():
+        z, feasible = self.project(z, at)
+        gaps = self.compute_gaps(np.vstack([path.z[first], z, path.z[last]]))
+        before = self.compute_gaps(path.z[first : last + 1]).sum()
+        is_shorter = gaps.max() <= 2.0 * _STEP and gaps.sum() < (1.0 - _MIN_SAVING) * before
+        if not (feasible.all() and is_shorter and self.are_free(z).all()):
             return path
-        return np.vstack([path[: first + 1], z, path[last:]])
+        return _Path(
+            np.vstack([path.z[: first + 1], z, path.z[last:]]),
+            np.concatenate([path.at[: first + 1], at, path.at[last:]]),
+        )
 
-    def resample(self, path: Floats, steps: int) -> Floats:
-        """Resample a path to `steps` waypoints, slow at both ends."""
-        passed = np.concatenate([[0.0], np.cumsum(self.compute_gaps(path) + 1e-12)])
+    def resample(self, path: _Path, steps: int) -> Floats | None:
+        """Resample a path to `steps` waypoints, slow at both ends; None if a projection fails."""
+        passed = np.concatenate([[0.0], np.cumsum(self.compute_gaps(path.z) + 1e-12)])
         rows = passed[-1] * sample_smoothstep(steps)
-        return np.stack([np.interp(rows, passed, column) for column in path.T], axis=1)
+        z = np.stack([np.interp(rows, passed, column) for column in path.z.T], axis=1)
+        z, feasible = self.project(z, np.interp(rows, passed, path.at))
+        return z if feasible.all() else None
+
+
+class _ClosedSearch(_Search):
+    """Searches in a phase with a closed chain, with the grasp of its first configuration."""
+
+    def __init__(self, sampler: KeyframeSampler, phase: int, through: Floats, steps: int) -> None:
+        end = int(sampler.problem.ends[phase])
+        super().__init__(sampler, phase, float(end - steps))
+        pose = sampler.find_pose(end)
+        assert pose is not None, "a grasped articulated object closes the chain"
+        self.pose, self.through = pose, through
+        motion = np.vstack([self.problem.start, sampler.object_motion])
+        self.object_motion = motion[end - steps : end + 1, sampler.object_columns]
+        self.grasp_columns = sampler.find_grasp_columns(end)
+
+    def project(self, z: Floats, at: Floats) -> tuple[Floats, Bools]:
+        z, columns = z.copy(), self.sampler.object_columns
+        whole = np.arange(self.begin, self.end + 1)
+        z[:, columns] = np.stack(
+            [np.interp(at, whole, column) for column in self.object_motion.T], axis=1
+        )
+        lower, upper = self.sampler.compute_limits(z, self.waypoint)
+        lower[:, columns] = upper[:, columns] = z[:, columns]
+        return self.sampler.solve_pose(z, self.pose, lower, upper)
+
+    def sample(self) -> tuple[Floats, float]:
+        waypoint = int(self.sampler.rng.integers(int(self.begin) + 1, int(self.end) + 1))
+        return self.sample_waypoint(waypoint), float(waypoint)
+
+    def sample_waypoint(self, waypoint: int) -> Floats:
+        """Sample nearly collision-free configurations at a waypoint with the phase's grasp."""
+        before, found = self.through[np.arange(_CLOSED_SAMPLES) % len(self.through)], []
+        for how in ("scatter", "shake"):
+            z, closed = self.sampler.sample(before, waypoint, how)
+            is_same = z[:, self.grasp_columns] == self.through[0, self.grasp_columns]
+            found.append(z[closed & is_same.all(axis=1)])
+        z = np.concatenate(found)
+        return z[self.are_free(z)] if len(z) else z
+
+
+class _OpenSearch(_Search):
+    """Searches in an open phase, near a guide path of the base."""
+
+    def __init__(
+        self, sampler: KeyframeSampler, phase: int, first: Floats, poses: Floats, arms: Floats
+    ) -> None:
+        super().__init__(sampler, phase, float(sampler.problem.ends[phase]))
+        self.first, self.poses, self.arms = first, poses, arms
+        names = self.problem.chain.names[: sampler.robot_size]
+        self.lower, self.upper = np.array([self.problem.limits(name) for name in names]).T
+
+    def project(self, z: Floats, at: Floats) -> tuple[Floats, Bools]:
+        robot, others = np.split(z, [len(self.lower)], axis=1)
+        z = np.hstack([np.clip(robot, self.lower, self.upper), others])
+        return z, np.ones(len(z), bool)
+
+    def sample(self) -> tuple[Floats, float]:
+        rng, count = self.sampler.rng, _GUIDED_SAMPLES
+        arm = slice(3, self.sampler.robot_size)
+        z = np.tile(self.first, (count, 1))
+        z[:, :3] = rng.choice(self.poses, count)
+        z[:, arm] = rng.choice(self.arms, count)
+        # Half of them are exactly on the guide path, in one of the likely postures.
+        spread = rng.uniform(0.0, 1.0, (count, 1)) * rng.integers(2, size=(count, 1))
+        z[:, :3] += _BASE_SPREAD * spread * rng.normal(size=(count, 3))
+        z[:, arm] += _ARM_SPREAD * spread * rng.normal(size=z[:, arm].shape)
+        z, _ = self.project(z, np.full(count, self.end))
+        return z[self.are_free(z)], self.end

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -138,6 +139,19 @@ def test_mjcf_home_is_imported(tmp_path: Path) -> None:
     assert any("'ground'" in note and "plane" in note for note in imported.notes)
     assert imported.scene.objects["mug"].placement.translation == pytest.approx([0.0, 2.3, 0.7])
     assert len(vkc.procedural.goals(imported.scene)) == 2
+    assert "floor at another height" not in imported.summary()
+
+
+def test_report_names_objects_above_the_hand(tmp_path: Path) -> None:
+    """The floor is 1.5 m too low; the cupboard's bar is 0.4 m above the right one."""
+    pytest.importorskip("mujoco")
+    (tmp_path / "small.xml").write_text(HOME_MJCF)
+    imported = vkc.importing.import_home(tmp_path / "small.xml", tmp_path / "out", floor=-1.5)
+    (note,) = [note for note in imported.notes if "floor at another height" in note]
+    found = re.search(r"reaches (\S+) m high: cupboard \((\S+) m\), mug \((\S+) m\);", note)
+    assert found, note
+    assert 1.5 < float(found[1]) < 1.9
+    assert float(found[2]) == 1.9
 
 
 def format_sdf_box(size: str, place: str, name: str) -> str:

@@ -38,6 +38,7 @@ from vkc_pin.utils.arguments import check_bool, check_instance, check_integer, c
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.resources import check_path, choose_file_names
 from vkc_pin.world.files.writing import write_folder_atomically
+from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
@@ -191,6 +192,7 @@ def import_home(
         *weight,
         *_note_floor_shapes(home),
         *_note_open_sides(bounds, (low, high)),
+        *_note_high_objects(scene, rng),
         *obstacle_notes,
         *(f"{item.name}: {note}" for item in objects for note in item.notes),
     )
@@ -230,6 +232,32 @@ def _note_open_sides(before: tuple[Floats, Floats], after: tuple[Floats, Floats]
     ]
     if sides:
         yield f"2 m of floor lie beyond the sides without walls: {', '.join(sides)}"
+
+
+def _note_high_objects(scene: Scene, rng: np.random.Generator) -> Iterator[str]:
+    """Note objects whose attachments are all above the hand's reach, as above a wrong floor."""
+    top, high = _compute_reaching_height(scene.robot, rng), list[str]()
+    for name, placed in scene.objects.items():
+        heights = [
+            placed.link_placement(one.link).act(one.placement.translation)[2]
+            for one in placed.object.attachments.values()
+        ]
+        if heights and min(heights) > top:
+            high.append(f"{name} ({min(heights):.1f} m)")
+    if high:
+        text = f"attachments above the hand, which reaches {top:.1f} m high: {', '.join(high)}"
+        yield f"{text}; is the floor at another height (`floor`)?"
+
+
+def _compute_reaching_height(robot: Robot, rng: np.random.Generator) -> float:
+    """Return the largest height of the hand over random configurations of the arm [m]."""
+    data, frame = robot.model.createData(), robot.model.getFrameId(robot.tool_frame)
+    low, high = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
+    heights = []
+    for z in rng.uniform(low, np.maximum(low, high), (_TRIES, len(low))):
+        pin.forwardKinematics(robot.model, data, robot.coordinates.q(z))
+        heights.append(pin.updateFramePlacement(robot.model, data, frame).translation[2])
+    return float(max(heights))
 
 
 def _count_shapes(home: Home) -> dict[str, int]:

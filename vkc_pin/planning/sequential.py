@@ -87,11 +87,13 @@ def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> Plan
     steps, statistics = _list_steps(task, parts), [part.result.plan.statistics for part in parts]
     try:
         whole = task if steps == task.steps else compile_task(scene, steps, request.options)
-    except InputError:  # a free object is grasped anew, from where it lies only after planning
-        whole = None
+    except InputError:
+        # A free object was grasped anew, from where it lies only after planning. All steps together
+        # choose another grasp.
+        return add_statistics(_plan_from_guesses(scene, task, request), statistics)
     is_planned = parts and all(part.result.plan.success for part in parts) and not current_ending()
     # A chain can contain a joint only once.
-    if is_planned and whole and find_shared_coordinate(scene, whole.holds) is None:
+    if is_planned and find_shared_coordinate(scene, whole.holds) is None:
         pieces = [part.result.phase_waypoints() for part in parts]
         guess = functools.partial(make_initial_guess, parts=pieces)
         plan = solve_task(scene, whole, request, guess=guess).plan

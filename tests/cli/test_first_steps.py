@@ -62,7 +62,9 @@ def test_bash_completes_commands_and_options(capsys: pytest.CaptureFixture[str])
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])
-def test_lines_of_completion_can_be_copied(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_of_completion_keeps_each_command_on_a_line(
+    shell: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
         main(["completion", "--help"])
     assert f'eval "$(vkc-pin completion {shell})"\n' in capsys.readouterr().out

@@ -43,6 +43,14 @@ def test_changed_motion_is_invalid(copy: Path) -> None:
 
 
 @pytest.mark.long
+def replace_first_scene(folder: Path, document: dict[str, Any]) -> None:
+    """Replace the scene of the first episode."""
+    name = compute_scene_name(document)
+    (folder / "scenes" / f"{name}.json").write_text(json.dumps(document))
+    with h5py.File(get_shard(folder), "r+") as file:
+        file["data/demo_0"].attrs["scene"] = name
+
+
 def test_added_obstacle_makes_the_episode_invalid(copy: Path) -> None:
     """The check builds the scene from its file and does not rely on the planner."""
     episode = next(Dataset.open(copy).episodes())
@@ -55,9 +63,7 @@ def test_added_obstacle_makes_the_episode_invalid(copy: Path) -> None:
         "position": [float(middle[0]), float(middle[1]), 0.5],
     }
     document["obstacles"].append(box)
-    (copy / "scenes" / f"{compute_scene_name(document)}.json").write_text(json.dumps(document))
-    with h5py.File(get_shard(copy), "r+") as file:
-        file["data/demo_0"].attrs["scene"] = compute_scene_name(document)
+    replace_first_scene(copy, document)
     found = check_dataset(copy)
     assert list(found.refused) == [episode.number]
     assert "block" in found.refused[episode.number]
@@ -66,9 +72,7 @@ def test_added_obstacle_makes_the_episode_invalid(copy: Path) -> None:
 def test_episode_without_a_scene_is_reported_once(copy: Path) -> None:
     episode = next(Dataset.open(copy).episodes())
     document = {**episode.document, "robot": {"name": "missing.yaml"}}
-    (copy / "scenes" / f"{compute_scene_name(document)}.json").write_text(json.dumps(document))
-    with h5py.File(get_shard(copy), "r+") as file:
-        file["data/demo_0"].attrs["scene"] = compute_scene_name(document)
+    replace_first_scene(copy, document)
     found = check_dataset(copy)
     assert list(found.refused) == [episode.number]
     assert "missing.yaml" in found.refused[episode.number]

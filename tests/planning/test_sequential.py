@@ -174,7 +174,7 @@ def test_object_is_regrasped_to_be_placed(offset: float) -> None:
 
 
 @pytest.mark.parametrize("simultaneous", [True, pytest.param(False, marks=pytest.mark.long)])
-def test_grasp_from_which_nothing_can_be_placed_is_replaced(
+def test_another_grasp_replaces_one_that_prevents_placing(
     simultaneous: bool,
 ) -> None:
     """From its start, the robot grasps the object from the side without any motion."""

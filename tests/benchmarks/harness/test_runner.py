@@ -232,7 +232,7 @@ def test_changed_settings_and_versions_are_refused(tmp_path: Path) -> None:
         ("cli/door.py", True),
     ],
 )
-def test_changed_sources_of_planning_are_refused(
+def test_resuming_with_other_sources_of_planning_raises(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, is_resumed: bool
 ) -> None:
     source = tmp_path / "package" / name

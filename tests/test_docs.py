@@ -347,9 +347,8 @@ def test_all_files_state_the_same_version() -> None:
         yaml.safe_load(read("tools/conda/recipe.yaml"))["context"]["version"] == citation["version"]
     )
     assert vkc.__version__ == project["version"]
-    assert (
-        re.findall(r"^## \[([^]]+)\]", read("CHANGELOG.md"), re.MULTILINE)[0] == citation["version"]
-    )
+    sections = re.findall(r"^## \[([^]]+)\]", read("CHANGELOG.md"), re.MULTILINE)
+    assert next(name for name in sections if name != "Unreleased") == citation["version"]
     for page in ("README.md", "docs/installation.md"):
         assert set(re.findall(r"[Vv]ersion (\d+\.\d+\.\d+)", read(page))) == {citation["version"]}
 

@@ -152,6 +152,16 @@ def test_characters_outside_the_encoding_are_escaped(
     assert "drawer: FAILED, time limit \\u2014 stand" in done.stdout
 
 
+def test_warnings_name_the_file_and_no_code(tmp_path: Path, full_device: Path) -> None:
+    scene = (ROOT / "scenes" / "drawer.yaml").read_text()
+    box = "{name: box, type: box, size: [.6, .3, .3], position: [1.8, 0, .7]}"
+    (tmp_path / "scene.yaml").write_text(f"{scene}  - {box}\n")
+    done = run_in_shell("", ["check", "scene.yaml"], tmp_path, full_device)
+    assert done.stderr.startswith("vkc-pin: scene.yaml: movable links overlap other shapes: ")
+    assert "Warning" not in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
 def start_process(words: list[str], folder: Path, *options: str) -> subprocess.Popen[str]:
     """Start a command that Ctrl-C interrupts, with options of the Python interpreter."""
     command = [COMMAND[0], *options, *COMMAND[1:], *words]

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,10 @@ VISUAL, MESH_GEOM = ' contype="0" conaffinity="0"', '<geom type="mesh" mesh="l"{
         ({"head": MESH, "more": MESH_GEOM.format(VISUAL)}, "'gone.obj' of body 'door'", 2),
         ({"head": MESH, "more": MESH_GEOM.format(""), "leaf": VISUAL}, "visual shapes collide", 2),
         ({"head": MESH}, "", 2),
+        ({"head": '<option apirate="100"/>'}, "settings of MuJoCo 2", 2),
+        ({"head": '<visual><map old="1"/></visual>'}, "settings of MuJoCo 2", 2),
+        ({"head": '<compiler convexhull="true"/>'}, "settings of MuJoCo 2", 2),
+        ({"head": '<default class="old"/>', "leaf": ' class="old"'}, "settings of MuJoCo 2", 2),
         ({"tail": '<keyframe><key qpos="0 0 0"/></keyframe>'}, "invalid qpos size", 2),
         ({"tail": '<sensor><touch site="none"/></sensor>'}, "unrecognized name 'none'", 2),
         ({"tail": '<actuator><motor joint="none"/></actuator>'}, "actuator", 2),
@@ -92,3 +97,33 @@ def test_all_missing_collision_meshes_are_listed(tmp_path: Path) -> None:
 def test_errors_in_the_geometry_are_raised(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"MuJoCo cannot read the file: .*size 0 must be"):
         compile_door(tmp_path, more='<geom type="sphere" size="0"/>')
+
+
+def test_a_file_for_mujoco_2_is_read_with_its_includes(tmp_path: Path) -> None:
+    """Furniture of furniture_sim has classes at the top level; MuJoCo 3 takes one there."""
+    (tmp_path / "parts" / "deep").mkdir(parents=True)
+    trimesh.creation.box((0.1, 0.2, 0.3)).export(tmp_path / "parts" / "box.stl")
+    (tmp_path / "parts" / "door.xml").write_text(
+        """<mujocoinclude><compiler angle="degree"/><asset><mesh name="box" file="parts/box.stl"/>
+        </asset><include file="parts/deep/classes.xml"/></mujocoinclude>"""
+    )
+    (tmp_path / "parts" / "deep" / "classes.xml").write_text(
+        """<mujocoinclude><default class="a"><geom type="mesh" mesh="box"/></default>
+        <default class="b"><geom type="sphere" size=".3"/></default></mujocoinclude>"""
+    )
+    more = '<geom class="a"/><geom class="b"/>'
+    include = '<include file="parts\\door.xml"/>'
+    model, note = compile_door(tmp_path, head=include, more=more)
+    assert "settings of MuJoCo 2" in note
+    assert model.ngeom == 4
+    assert sorted(model.geom_aabb[2, 3:]) == pytest.approx([0.05, 0.1, 0.15], abs=1e-6)
+    assert model.geom_size[3, 0] == pytest.approx(0.3)
+    assert model.jnt_range[0, 1] == pytest.approx(math.radians(1.0))
+
+
+@pytest.mark.parametrize("included", ['<include file="door.xml"/>', '<include file="none.xml"/>'])
+def test_a_file_for_mujoco_2_that_cannot_be_converted_is_refused(
+    tmp_path: Path, included: str
+) -> None:
+    with pytest.raises(InputError, match="MuJoCo cannot read the file"):
+        compile_door(tmp_path, head=f'<default class="old"/>{included}')

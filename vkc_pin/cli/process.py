@@ -10,6 +10,7 @@ import io
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Sequence
 from typing import Any, NoReturn, TextIO
 
@@ -38,6 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     _open_closed_streams()
     sys.stdout, printed = _make_tolerant(sys.stdout, 1)
     sys.stderr, _ = _make_tolerant(sys.stderr, 2)
+    warnings.formatwarning = _format_warning
     try:
         with explain_unfit_libraries():
             from vkc_pin.cli.commands import run
@@ -55,6 +57,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         code = code or _MISUSE
     sys.stderr.flush()
     return code
+
+
+def _format_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    line: str | None = None,
+) -> str:
+    """Return the text of a warning; those about the user's files name no line of code."""
+    where = "" if category is UserWarning else f"{filename}:{lineno}: {category.__name__}: "
+    return f"vkc-pin: {where}{message}\n"
 
 
 def _exit_at_once(number: int, frame: object) -> NoReturn:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +11,8 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.isolation import submit_isolated
 from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.utils.system import is_file
+from vkc_pin.world.files.documents import read_text
+from vkc_pin.world.files.xml import parse_xml
 
 __all__ = ["NO_MASS", "compile_mjcf"]
 
@@ -18,6 +22,9 @@ _REDUCED = (
     "read without actuators, sensors, key frames, contact pairs and couplings, as MuJoCo "
     "rejects them"
 )
+# What MuJoCo 2 knew and later versions reject: settings that do not matter for geometry.
+_SETTINGS = ("custom", "option", "size", "statistic", "visual")
+_COMPILER_SETTINGS = ("convexhull", "exactmeshinertia")
 
 
 def compile_mjcf(file: Path) -> tuple[Any, list[str]]:
@@ -44,8 +51,8 @@ def _compile(path: Path, file: Path) -> tuple[Any, list[str]]:
     first = None
     for repairs in (), (_replace_missing_meshes,), (_replace_missing_meshes, _remove_dynamics):
         try:
-            spec = mujoco.MjSpec.from_file(str(path))
-            notes = _remove_looks(spec, file)
+            spec, notes = _parse(path)
+            notes += _remove_looks(spec, file)
             for repair in repairs:
                 notes += repair(spec, file)
             # Simulators that merge the file with another model give bodies their mass then.
@@ -65,6 +72,54 @@ def _compile(path: Path, file: Path) -> tuple[Any, list[str]]:
     raise InputError(
         f"MuJoCo cannot read the file: {' '.join(str(first).split())}", file=file
     ) from first
+
+
+def _parse(path: Path) -> tuple[Any, list[str]]:
+    """Return the `mujoco.MjSpec` of a file, and a note if it was written for MuJoCo 2."""
+    import mujoco
+
+    try:
+        return mujoco.MjSpec.from_file(str(path)), []
+    except ValueError as error:
+        try:
+            spec = mujoco.MjSpec.from_string(_convert_from_mujoco_2(path))
+        except (InputError, ValueError):
+            raise error from None
+        spec.modelfiledir = str(path.parent)
+        return spec, [f"read without settings of MuJoCo 2 ({' '.join(str(error).split())})"]
+
+
+def _convert_from_mujoco_2(path: Path) -> str:
+    """Return a file with its included files, without what later versions of MuJoCo reject.
+
+    A class of defaults at the top level, which MuJoCo 2 added, becomes a class in "main".
+    """
+    root = _read_with_includes(path, path.parent, [])
+    for element in list(root):
+        if element.tag in _SETTINGS:
+            root.remove(element)
+        elif element.tag == "compiler":
+            for name in _COMPILER_SETTINGS:
+                element.attrib.pop(name, None)
+        elif element.tag == "default" and element.get("class", "main") != "main":
+            main = root[list(root).index(element)] = ElementTree.Element("default")
+            main.append(element)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _read_with_includes(file: Path, folder: Path, done: list[Path]) -> ElementTree.Element:
+    """Return the root of a file whose <include>, relative to `folder`, are replaced."""
+    if file in done:
+        raise InputError("a file is included twice", file=file)
+    done.append(file)
+    root = parse_xml(read_text(file, "MJCF"), file)
+    for parent in list(root.iter()):
+        for include in parent.findall("include"):
+            name = include.get("file", "").replace("\\", "/")
+            included = _read_with_includes(Path(os.path.normpath(folder / name)), folder, done)
+            place = list(parent).index(include)
+            parent[place : place + 1] = list(included)
+    return root
 
 
 def _remove_looks(spec: Any, file: Path) -> list[str]:

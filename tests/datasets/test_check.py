@@ -42,7 +42,6 @@ def test_changed_motion_is_invalid(copy: Path) -> None:
     assert str(number) in str(found)
 
 
-@pytest.mark.long
 def replace_first_scene(folder: Path, document: dict[str, Any]) -> None:
     """Replace the scene of the first episode."""
     name = compute_scene_name(document)
@@ -51,6 +50,7 @@ def replace_first_scene(folder: Path, document: dict[str, Any]) -> None:
         file["data/demo_0"].attrs["scene"] = name
 
 
+@pytest.mark.long
 def test_added_obstacle_makes_the_episode_invalid(copy: Path) -> None:
     """The check builds the scene from its file and does not rely on the planner."""
     episode = next(Dataset.open(copy).episodes())

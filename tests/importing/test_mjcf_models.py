@@ -49,6 +49,7 @@ VISUAL, MESH_GEOM = ' contype="0" conaffinity="0"', '<geom type="mesh" mesh="l"{
         ({"head": '<option apirate="100"/>'}, "settings of MuJoCo 2", 2),
         ({"head": '<visual><map old="1"/></visual>'}, "settings of MuJoCo 2", 2),
         ({"head": '<compiler convexhull="true"/>'}, "settings of MuJoCo 2", 2),
+        ({"head": '<compiler exactmeshinertia="true"/>'}, "settings of MuJoCo 2", 2),
         ({"head": '<default class="old"/>', "leaf": ' class="old"'}, "settings of MuJoCo 2", 2),
         ({"tail": '<keyframe><key qpos="0 0 0"/></keyframe>'}, "invalid qpos size", 2),
         ({"tail": '<sensor><touch site="none"/></sensor>'}, "unrecognized name 'none'", 2),
@@ -122,8 +123,6 @@ def test_a_file_for_mujoco_2_is_read_with_its_includes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("included", ['<include file="door.xml"/>', '<include file="none.xml"/>'])
-def test_a_file_for_mujoco_2_that_cannot_be_converted_is_refused(
-    tmp_path: Path, included: str
-) -> None:
+def test_invalid_includes_of_a_file_for_mujoco_2_raise(tmp_path: Path, included: str) -> None:
     with pytest.raises(InputError, match="MuJoCo cannot read the file"):
         compile_door(tmp_path, head=f'<default class="old"/>{included}')

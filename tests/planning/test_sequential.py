@@ -24,6 +24,7 @@ from helpers.litter import BIN_POSITION, LITTER_POSITION, describe_shelf, make_l
 from helpers.small_problems import make_full_scene, replace_objects
 
 import vkc_pin as vkc
+from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.benchmarks.robot_object_matrix.pairs import load_description, make_hall
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.hold import Hold
@@ -352,3 +353,18 @@ def test_holds_of_the_same_joint_are_planned_sequentially() -> None:
     assert "it.handle_left" not in ended.trajectory.names
     windowed = vkc.plan(make_refrigerator(), [first, second], window=2)
     assert windowed.success, windowed.summary()
+
+
+def test_steps_are_retimed_and_validated_if_no_budget_remains_for_the_whole() -> None:
+    scene = vkc.load_scene("init_1").sample_start(np.random.default_rng(5))
+    steps = [vkc.Grasp("stick", "grip"), vkc.Touch("stick.tip", TARGET)]
+    begin, alone = scene, list[vkc.Plan]()
+    for step in steps:
+        alone.append(vkc.plan(begin, [step]))
+        begin = alone[-1].end_scene()
+    needed = sum(plan.statistics.evaluations for plan in alone)
+    found = vkc.plan(scene, steps, max_evaluations=needed)
+    assert found.success, found.summary()
+    assert found.initialization == ", ".join(plan.initialization for plan in alone)
+    duration = sum(np.ptp(plan.trajectory.times) for plan in alone) + vkc.Options().grasp_time
+    assert np.ptp(found.trajectory.times) == pytest.approx(duration, abs=1e-6)

@@ -16,6 +16,7 @@ import vkc_pin as vkc
 from vkc_pin.benchmarks.problems.problem_set import problem as make_random_problem
 from vkc_pin.planning.initialization.initial_guess import InitialGuess
 from vkc_pin.planning.request import PlanningRequest
+from vkc_pin.planning.retime_validated import complete_draft
 from vkc_pin.planning.solve_task import solve_task
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.task.compiler import compile_task
@@ -52,6 +53,29 @@ def test_user_guess_is_the_only_one() -> None:
     assert result.plan.success, result.plan.summary()
     assert result.plan.initialization == "mine"
     assert problems == [result.problem]
+
+
+def test_draft_is_no_success_until_it_is_retimed_and_validated() -> None:
+    scene, request = make_hall(), PlanningRequest("auto", SHORT)
+    task = compile_task(scene, [vkc.GoTo(1.0, 0.0)], SHORT)
+    expected = solve_task(scene, task, request).plan
+    draft = solve_task(scene, task, dataclasses.replace(request, is_draft=True))
+    assert draft.is_solved
+    assert not draft.plan.success
+    found = complete_draft(draft.plan)
+    assert found.success, found.summary()
+    assert found.trajectory.times.tobytes() == expected.trajectory.times.tobytes()
+    assert found.report == expected.report
+    beside = dataclasses.replace(draft.plan, steps=(vkc.GoTo(1.0, 0.5),))
+    assert complete_draft(beside).status == "rejected"
+
+
+def test_drafts_of_infeasible_tasks_are_not_solved() -> None:
+    scene, request = make_hall(), PlanningRequest("auto", SHORT, is_draft=True)
+    result = solve_task(scene, compile_task(scene, [vkc.GoTo(30.0, 0.0)], SHORT), request)
+    assert not result.is_solved
+    assert result.plan.status == "infeasible"
+    assert not result.plan.report.ok
 
 
 def test_waypoints_of_too_coarse_phases_are_doubled() -> None:

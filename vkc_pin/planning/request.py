@@ -24,7 +24,12 @@ MAX_PERTURBATION = 3.0
 
 @dataclass(frozen=True)
 class PlanningRequest:
-    """Checked arguments of one planning call; see `planner.plan`."""
+    """Checked arguments of one planning call; see `planner.plan`.
+
+    Attributes:
+        is_draft: Whether solutions of the nonlinear program are returned as they are, neither
+            retimed nor validated: initial guesses for a larger problem, whose solution is.
+    """
 
     initialization: str
     options: Options
@@ -34,6 +39,7 @@ class PlanningRequest:
     terms: tuple[Term, ...] = ()
     progress: Progress = field(default_factory=Progress)
     cache: Cache = field(default_factory=Cache)
+    is_draft: bool = False
 
 
 def make_request(

@@ -13,6 +13,7 @@ from vkc_pin.planning.initialization.initial_guess import make_initial_guess
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.results import add_statistics, concatenate_plans
+from vkc_pin.planning.retime_validated import complete_draft
 from vkc_pin.planning.solve_task import TaskResult, solve_task
 from vkc_pin.utils.budget import current_ending, reserve_time, share_budget
 from vkc_pin.world.scene.scene import Scene
@@ -80,10 +81,13 @@ def _plan_from_guesses(scene: Scene, task: Task, request: PlanningRequest) -> Pl
 def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> Plan:
     """Plan all steps as one problem, from their solutions one after the other.
 
+    The solutions of the steps are drafts: they are retimed and validated only where the problem
+    that starts from them fails.
+
     Returns:
         The concatenated solutions of the steps if one fails, or if they cannot be improved.
     """
-    parts = plan_each_step(scene, task, request)
+    parts = plan_each_step(scene, task, dataclasses.replace(request, is_draft=True))
     steps, statistics = _list_steps(task, parts), [part.result.plan.statistics for part in parts]
     try:
         whole = task if steps == task.steps else compile_task(scene, steps, request.options)
@@ -91,7 +95,7 @@ def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> Plan
         # A free object was grasped anew, from where it lies only after planning. All steps together
         # choose another grasp.
         return add_statistics(_plan_from_guesses(scene, task, request), statistics)
-    is_planned = parts and all(part.result.plan.success for part in parts) and not current_ending()
+    is_planned = parts and all(part.result.is_solved for part in parts) and not current_ending()
     # A chain can contain a joint only once.
     if is_planned and find_shared_coordinate(scene, whole.holds) is None:
         pieces = [part.result.phase_waypoints() for part in parts]
@@ -100,7 +104,7 @@ def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> Plan
         statistics.append(plan.statistics)
         if plan.success:
             return add_statistics(plan, statistics)
-    plans = [part.result.plan for part in parts]
+    plans = [complete_draft(part.result.plan) for part in parts]
     return concatenate_plans(scene, steps, request, plans, statistics=statistics)
 
 
@@ -128,7 +132,7 @@ def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) 
     )
     with share_budget(lambda: 1 + len(alternatives())):
         first = last = solve_task(scene, task, request)
-    if first.plan.success or first.is_grasp_independent or current_ending():
+    if first.is_solved or first.is_grasp_independent or current_ending():
         return first
     statistics, notes = [first.plan.statistics], list[str]()
     if first.plan.report.notes:  # reasons that may be those of the grasp
@@ -139,7 +143,7 @@ def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) 
         with share_budget(len(alternatives()) - number):
             last = _solve_alternative(scene, steps, request)
         statistics.append(last.plan.statistics)
-        if last.plan.success:
+        if last.is_solved:
             return dataclasses.replace(last, plan=add_statistics(last.plan, statistics))
         notes.append(f"at {name}: {next(iter(last.plan.report.notes), last.plan.status)}")
     if not notes:
@@ -159,6 +163,7 @@ def _solve_alternative(scene: Scene, steps: Sequence[Step], request: PlanningReq
     task = compile_task(scene, steps, request.options)
     if find_shared_coordinate(scene, task.holds) is None:
         return solve_task(scene, task, request, check_goals_first=True)
+    request = dataclasses.replace(request, is_draft=False)
     results = [part.result for part in plan_each_step(scene, task, request)]
     plan = concatenate_plans(scene, steps, request, [result.plan for result in results])
     return dataclasses.replace(results[-1], scene=scene, plan=plan)
@@ -177,7 +182,7 @@ def plan_each_step(scene: Scene, task: Task, request: PlanningRequest) -> list[P
         request.progress.set_steps(number + 1, 1, len(task.steps))
         result = solve_with_alternatives(current, own, request)
         parts.append(PlannedStep(number, result))
-        if not result.plan.success or current_ending():
+        if not result.is_solved or current_ending():
             break
         reserved += result.check_time
         reserve_time("planned steps", reserved)

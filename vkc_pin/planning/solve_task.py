@@ -50,7 +50,7 @@ from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task
-from vkc_pin.world.task.terms import trace_terms
+from vkc_pin.world.task.terms import Term, trace_terms
 from vkc_pin.world.trajectory.formats.archives import PlanStatus
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -72,10 +72,10 @@ class TaskResult:
 
     Attributes:
         scene: Scene in which it starts.
-        plan: The best plan found.
+        plan: The best plan found. That of a draft is not validated, unless solving failed.
         problem: The nonlinear program; None if the budget ended before it was built.
         z: Its best waypoints z_1..z_N, shape (N, n).
-        check_time: Time of the last validation [s].
+        check_time: Time of the last validation [s]; 0 without any.
         is_grasp_independent: Whether the task fails for certain whatever the grasp.
     """
 
@@ -86,6 +86,11 @@ class TaskResult:
     z: Floats
     check_time: float
     is_grasp_independent: bool
+
+    @property
+    def is_solved(self) -> bool:
+        """Whether the plan is a success, or a draft of a converged solution."""
+        return self.plan.success or not self.plan.is_validated
 
     def phase_waypoints(self) -> PhaseWaypoints:
         """Return the best waypoints, as an initial guess of problems with more phases."""
@@ -142,6 +147,7 @@ def solve_task(
         initialization=best.name,
         history=tuple(search.history),
         terms=request.terms,
+        is_validated=best.is_validated,
     )
     found = best.problem, best.z, search.check_time, search.is_grasp_independent
     return TaskResult(scene, task, plan, *found)
@@ -157,6 +163,7 @@ class _Candidate:
     trajectory: Trajectory
     report: Report
     status: PlanStatus
+    is_validated: bool = True
 
     @property
     def violation(self) -> float:
@@ -367,21 +374,24 @@ class _Search:
             self.request.callback(row)
 
     def _evaluate(self, problem: TrajectoryProblem, solution: Solution, name: str) -> _Candidate:
-        """Retime and validate a solution; around violations the curve is refined."""
+        """Retime and validate a solution; around violations the curve is refined.
+
+        A converged solution of a draft is left as it is.
+        """
         with suspend_budget():
             waypoints = make_trajectory(problem, solution.z, solution.dt)
+        if self.request.is_draft and solution.converged:
+            return _Candidate(name, problem, solution.z, waypoints, Report(), "success", False)
         began, validated = time.perf_counter(), self.times["validation"]
-        if self._has_velocity_terms:
-            trajectory, report = waypoints, self._validate(waypoints)
-        else:
-            # Violations of solutions that have not converged are not the curve's.
-            trajectory, report = retime_validated(
-                self.scene,
-                waypoints,
-                self._validate,
-                repairs=MAX_REPAIRS if solution.converged else 0,
-                jerk_time=self.request.options.jerk_time,
-            )
+        # Violations of solutions that have not converged are not the curve's.
+        trajectory, report = retime_validated(
+            self.scene,
+            waypoints,
+            self._validate,
+            repairs=MAX_REPAIRS if solution.converged else 0,
+            jerk_time=self.request.options.jerk_time,
+            terms=self._terms,
+        )
         took = time.perf_counter() - began
         self.times["retiming"] += took - (self.times["validation"] - validated)
         failure: PlanStatus = "rejected" if solution.converged else "not converged"
@@ -389,11 +399,8 @@ class _Search:
         return _Candidate(name, problem, solution.z, trajectory, report, status)
 
     @cached_property
-    def _has_velocity_terms(self) -> bool:
-        """Whether user terms depend on velocities, for which the program's own times are kept."""
-        return any(
-            term.formula.uses_previous for term in trace_terms(self.scene, self.request.terms)
-        )
+    def _terms(self) -> tuple[Term, ...]:
+        return trace_terms(self.scene, self.request.terms)
 
     def _validate(self, trajectory: Trajectory) -> Report:
         began, request = time.perf_counter(), self.request

@@ -16,9 +16,8 @@ import pinocchio as pin
 from PIL import Image
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.harness.limits import LIMITS
-from vkc_pin.benchmarks.robot_object_matrix.given import parse_requests, prepare_robot
-from vkc_pin.benchmarks.robot_object_matrix.pairs import make_pair
+from vkc_pin.benchmarks.harness.runner import LIMITS
+from vkc_pin.benchmarks.robot_object_matrix.pairs import make_pair, parse_requests, prepare_robot
 from vkc_pin.visualization.plots.style import new_figure, save_figure, use_style
 from vkc_pin.visualization.room import load_drawn_parts
 from vkc_pin.world.trajectory.world_model import World

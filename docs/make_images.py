@@ -15,14 +15,14 @@ import pinocchio as pin
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import chores, gap
-from vkc_pin.importing.proposals.picture import plot_attachments
+from vkc_pin.importing.pictures import plot_attachments
 from vkc_pin.visualization import drawing
 from vkc_pin.visualization import viewer as visualization
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
 from vkc_pin.visualization.plots.top_view import draw_top_view
 from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.scene.placed_object import make_world_shapes
-from vkc_pin.world.trajectory.dynamics.torques import Torques
+from vkc_pin.world.trajectory.torques import Torques
 from vkc_pin.world.trajectory.world_model import World
 
 ROOT = Path(__file__).parent.parent

@@ -25,7 +25,7 @@ import vkc_pin as vkc
 from vkc_pin.cli.commands import make_parser
 from vkc_pin.validation.report import Violation
 from vkc_pin.world.files.documents import Document, parse_document
-from vkc_pin.world.models.dynamics.joint_resistance import ObjectJointSchema
+from vkc_pin.world.models.dynamics import ObjectJointSchema
 from vkc_pin.world.models.object_file import AttachmentSchema, LatchSchema, ObjectSchema
 from vkc_pin.world.models.robot_schema import BaseSchema, RobotSchema
 from vkc_pin.world.scene.scene_schema import (

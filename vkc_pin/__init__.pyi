@@ -12,8 +12,7 @@ from . import (
 )
 from .errors import BuildError, InputError, UnknownNameError, VkcError
 from .options import Options
-from .planning.chain.chain import VirtualKinematicChain, consolidate
-from .planning.chain.inversion import invert
+from .planning.chain.chain import VirtualKinematicChain, consolidate, invert
 from .planning.nlp.inspection import build
 from .planning.nlp.problem import TrajectoryProblem
 from .planning.plan import Plan
@@ -32,9 +31,8 @@ from .world.models.robot_file import load_robot
 from .world.scene.hold import Hold
 from .world.scene.placed_object import PlacedObject
 from .world.scene.scene import Scene, load_scene
-from .world.task.formula import State
 from .world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Touch
-from .world.task.terms import Constraint, Cost
+from .world.task.terms import Constraint, Cost, State
 from .world.trajectory.phase_span import PhaseSpan
 from .world.trajectory.trajectory import Trajectory
 

@@ -17,8 +17,7 @@ from helpers.drawers import (
 from helpers.small_problems import make_program
 
 import vkc_pin as vkc
-from vkc_pin.baselines.following import FollowResult, follow
-from vkc_pin.baselines.refining import CLEAR
+from vkc_pin.baselines.following import CLEAR, FollowResult, follow
 from vkc_pin.planning.initialization.keyframes import sample_smoothstep
 from vkc_pin.planning.nlp.merit import TOLERANCE
 

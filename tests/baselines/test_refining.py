@@ -18,8 +18,7 @@ from helpers.drawers import (
 from helpers.small_problems import make_program
 
 import vkc_pin as vkc
-from vkc_pin.baselines.arm_kinematics import ArmKinematics
-from vkc_pin.baselines.refining import CLEAR, refine_configuration
+from vkc_pin.baselines.following import CLEAR, ArmKinematics, refine_configuration
 from vkc_pin.planning.initialization.keyframes import KeyframeSampler
 from vkc_pin.planning.nlp.merit import TOLERANCE
 

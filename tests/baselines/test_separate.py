@@ -29,7 +29,7 @@ import vkc_pin as vkc
 from vkc_pin.baselines import BASELINES, attempt, plan_separately, postures, separate
 from vkc_pin.baselines.attempt import FINER
 from vkc_pin.benchmarks.household import TASKS
-from vkc_pin.planning.statistics import STAGES
+from vkc_pin.planning.plan import STAGES
 
 ROOT = Path(__file__).resolve().parents[2]
 PULL = vkc.Actuate("drawer", {"slide": 0.3})

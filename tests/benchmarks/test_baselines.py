@@ -16,10 +16,9 @@ from helpers.markdown import parse_cells
 import vkc_pin as vkc
 from vkc_pin.benchmarks import baselines
 from vkc_pin.benchmarks.baselines import COMPARED_PLANNERS
-from vkc_pin.benchmarks.comparison import choose_shown_trial
-from vkc_pin.benchmarks.comparison_tables import format_results
+from vkc_pin.benchmarks.comparison import choose_shown_trial, format_results
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.planning.statistics import PlanningStatistics
+from vkc_pin.planning.plan import PlanningStatistics
 from vkc_pin.validation.report import Report
 
 SUCCESSES = {"B1": {2, 3}, "B2": {1, 2}, "VKC": {0, 1, 2}}

@@ -16,7 +16,7 @@ import vkc_pin as vkc
 from vkc_pin.datasets.check import check_dataset
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generation import generate
-from vkc_pin.datasets.recipes.recipe import CAMERAS, load_recipe
+from vkc_pin.datasets.recipe import CAMERAS, load_recipe
 from vkc_pin.simulation import snapshots
 
 h5py = pytest.importorskip("h5py")

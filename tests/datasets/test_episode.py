@@ -7,7 +7,7 @@ import pytest
 from helpers.datasets import SMALL
 
 from vkc_pin.datasets.episode import compute_scene_name, pack, run_attempt, unpack
-from vkc_pin.datasets.recipes.recipe import load_recipe
+from vkc_pin.datasets.recipe import load_recipe
 from vkc_pin.planning.planner import plan
 from vkc_pin.world.scene.scene import load_scene
 from vkc_pin.world.task.steps import Actuate

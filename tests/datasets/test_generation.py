@@ -13,7 +13,7 @@ from helpers.datasets import SMALL
 
 from vkc_pin.datasets.dataset import Dataset, Register
 from vkc_pin.datasets.generation import generate
-from vkc_pin.datasets.recipes.recipe import load_recipe
+from vkc_pin.datasets.recipe import load_recipe
 from vkc_pin.errors import InputError, UnknownNameError, VkcError
 
 h5py = pytest.importorskip("h5py")

@@ -4,7 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin.datasets.grasping import find_grasping_start
+from vkc_pin.datasets.problems import find_grasping_start
 from vkc_pin.options import Options
 from vkc_pin.planning.planner import Planner, plan
 from vkc_pin.world.scene.scene import Scene, load_scene

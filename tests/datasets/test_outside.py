@@ -14,7 +14,7 @@ from helpers.datasets import SMALL
 from vkc_pin.datasets.check import check_dataset
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generation import generate
-from vkc_pin.datasets.recipes.recipe import RobotEntry, load_recipe
+from vkc_pin.datasets.recipe import RobotEntry, load_recipe
 from vkc_pin.datasets.robots import prepare_robots
 from vkc_pin.errors import InputError
 

@@ -7,7 +7,7 @@ import pytest
 from helpers.datasets import SMALL
 
 from vkc_pin.datasets.problems import NoProblemError, sample_problem
-from vkc_pin.datasets.recipes.recipe import get_robot_name, load_recipe
+from vkc_pin.datasets.recipe import get_robot_name, load_recipe
 from vkc_pin.planning.planner import Planner
 from vkc_pin.world.scene.scene import START_CLEARANCE
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, step_to_dict

@@ -9,7 +9,7 @@ from helpers.datasets import SMALL
 from vkc_pin.datasets import robots
 from vkc_pin.datasets.check import check_dataset
 from vkc_pin.datasets.generation import generate
-from vkc_pin.datasets.recipes.recipe import load_recipe
+from vkc_pin.datasets.recipe import load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.world.models.robot_file import find_robot, load_robot
 

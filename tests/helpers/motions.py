@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 
 from helpers.carrying import MotionBuilder, describe_table, make_room
-from vkc_pin.validation.pairs import PairTable
+from vkc_pin.validation.collisions import PairTable
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.phase_span import PhaseSpan

@@ -12,11 +12,11 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.options import Options
-from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
+from vkc_pin.planning.chain.collision_pairs import PhaseGeometry
 from vkc_pin.planning.nlp.inspection import build
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.cache import Cache
-from vkc_pin.world.collision.margins import Margins
+from vkc_pin.world.collision.distances import Margins
 from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment, Freedom
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.scene.placed_object import PlacedObject

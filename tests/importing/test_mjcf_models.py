@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.mjcf_models import NO_MASS, compile_mjcf
+from vkc_pin.importing.parsers import NO_MASS, compile_mjcf
 
 mujoco = pytest.importorskip("mujoco")
 

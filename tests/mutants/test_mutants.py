@@ -132,21 +132,21 @@ def test_tests_that_execute_the_line_come_first(line: int, expected: list[str]) 
 @pytest.mark.long
 def test_command_reports_faults_and_reuses_coverage() -> None:
     command = [sys.executable, "-m", "tests.mutants", "--sample", "4"]
-    command += ["--modules", "benchmarks/harness/limits.py"]
+    command += ["--modules", "benchmarks/harness/runner.py"]
     command += ["--tests", "tests/benchmarks/harness/test_limits.py"]
     for _ in range(2):
         process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     *lines, summary = process.stdout.splitlines()
     assert summary == "3 killed, 1 survived, 0 uncovered: 75% killed", process.stdout
     assert process.returncode == 1
-    place = "benchmarks/harness/limits.py:12: constant: 1800.0 → 3600.0"
+    place = "benchmarks/harness/runner.py:12: constant: 1800.0 → 3600.0"
     assert [line for line in lines if "survived" in line and line.endswith(place)]
     assert lines[0].startswith("1 of 4, "), "the second run reuses the coverage"
 
 
 def test_unknown_files_end_the_command() -> None:
     with pytest.raises(SystemExit, match=r"no such file or folder: .*validation/swept"):
-        list_files(["validation/sweep.py", "validation/swept"], PACKAGE, "*.py")
+        list_files(["validation/collisions.py", "validation/swept"], PACKAGE, "*.py")
 
 
 def test_sample_has_one_fault_of_each_line_first() -> None:

@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.benchmarks.scale import make_crowded_scene
+from vkc_pin.planning.chain.collision_pairs import PhaseGeometry
 from vkc_pin.planning.chain.contacts import ContactModel
-from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.planner import plan
-from vkc_pin.world.collision.shapes import count_distance_queries
+from vkc_pin.world.collision.distances import count_distance_queries
 from vkc_pin.world.models.shapes import compute_clearance, compute_shape_distance
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import make_world_shapes

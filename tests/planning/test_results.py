@@ -6,9 +6,9 @@ import pytest
 from helpers.carrying import describe_table, make_room
 
 import vkc_pin as vkc
+from vkc_pin.planning.plan import PlanningStatistics
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.results import concatenate_plans
-from vkc_pin.planning.statistics import PlanningStatistics
 
 
 @pytest.mark.parametrize("name", ["household"])

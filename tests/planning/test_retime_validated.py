@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.planning.retime_validated import retime_validated
+from vkc_pin.planning.results import retime_validated
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 

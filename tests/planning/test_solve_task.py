@@ -16,7 +16,7 @@ import vkc_pin as vkc
 from vkc_pin.benchmarks.problems.problem_set import problem as make_random_problem
 from vkc_pin.planning.initialization.initial_guess import InitialGuess
 from vkc_pin.planning.request import PlanningRequest
-from vkc_pin.planning.retime_validated import complete_draft
+from vkc_pin.planning.results import complete_draft
 from vkc_pin.planning.solve_task import solve_task
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.task.compiler import compile_task

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from vkc_pin.planning.statistics import STAGES, PlanningStatistics
+from vkc_pin.planning.plan import STAGES, PlanningStatistics
 
 
 def test_statistics_add_field_by_field() -> None:

@@ -8,8 +8,8 @@ from helpers.executions import make_grasping_scene, make_stationary_motion, plan
 import vkc_pin as vkc
 from vkc_pin.options import Options
 from vkc_pin.simulation.contacts import find_contact_pairs, find_unplanned_contacts
+from vkc_pin.validation.collisions import PairTable
 from vkc_pin.validation.distances import CollisionShapes
-from vkc_pin.validation.pairs import PairTable
 from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions
 from vkc_pin.world.scene.contact_rules import find_grasped_link, find_touch_links
 from vkc_pin.world.scene.obstacles import FLOOR

@@ -20,7 +20,7 @@ from vkc_pin.simulation.physics import Physics, complete_inertias
 from vkc_pin.simulation.result import SimulationResult
 from vkc_pin.simulation.servos import make_servos
 from vkc_pin.simulation.welds import find_latches
-from vkc_pin.world.models.dynamics.joint_resistance import Resistance
+from vkc_pin.world.models.dynamics import Resistance
 from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.world_model import World

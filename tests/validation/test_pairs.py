@@ -11,9 +11,9 @@ from helpers.motions import get_pair_names, make_random_door_motion
 from helpers.small_problems import load_door_scene, make_full_scene, make_program
 
 from vkc_pin.options import Options
+from vkc_pin.validation.collisions import PairTable
 from vkc_pin.validation.contact_windows import Window
 from vkc_pin.validation.distances import CollisionShapes
-from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.obstacles import FLOOR

@@ -13,7 +13,7 @@ import pytest
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
 from vkc_pin.validation.report import Bound, Exemption, Report, Violation
-from vkc_pin.visualization.plots.clearance import compute_clearance_curves
+from vkc_pin.visualization.plots.plots import compute_clearance_curves
 
 LIMIT = Violation(
     "limit",

@@ -30,11 +30,10 @@ from helpers.small_problems import load_door_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vkc_pin.validation.collisions import Hit, PairTable, sweep
 from vkc_pin.validation.contact_windows import Window
 from vkc_pin.validation.distances import CollisionShapes
-from vkc_pin.validation.pairs import PairTable
 from vkc_pin.validation.samples import Samples
-from vkc_pin.validation.sweep import Hit, sweep
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World

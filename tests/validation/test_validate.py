@@ -29,7 +29,7 @@ import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
 from vkc_pin.validation.validate import validate
-from vkc_pin.visualization.plots.clearance import compute_clearance_curves
+from vkc_pin.visualization.plots.plots import compute_clearance_curves
 from vkc_pin.world.scene.hold import make_holds
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene

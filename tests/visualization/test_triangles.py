@@ -6,7 +6,7 @@ import pinocchio as pin
 import pytest
 import trimesh
 
-from vkc_pin.visualization.triangles import (
+from vkc_pin.visualization.threejs import (
     Solid,
     make_box,
     make_tube,

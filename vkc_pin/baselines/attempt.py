@@ -25,11 +25,11 @@ from vkc_pin.planning.initialization.keyframes import KeyframeSampler, sample_sm
 from vkc_pin.planning.initialization.methods import initialize
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.plan import STAGES
 from vkc_pin.planning.results import make_stationary_trajectory
 from vkc_pin.planning.solver.loop import solve
 from vkc_pin.planning.solver.to_trajectory import make_trajectory
 from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
-from vkc_pin.planning.statistics import STAGES
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.budget import BudgetExhaustedError, record_evaluations
 from vkc_pin.utils.cache import Cache

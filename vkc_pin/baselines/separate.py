@@ -30,11 +30,10 @@ from typing import cast
 from vkc_pin.baselines.attempt import FINER, Attempt, BaselineStep
 from vkc_pin.errors import InputError, format_value
 from vkc_pin.options import Options
-from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.plan import Plan, PlanningStatistics
 from vkc_pin.planning.planner import Planner, acquire_cache
 from vkc_pin.planning.request import check_arguments, make_budget
-from vkc_pin.planning.retime_validated import retime_validated
-from vkc_pin.planning.statistics import PlanningStatistics
+from vkc_pin.planning.results import retime_validated
 from vkc_pin.utils.arguments import check_choice, check_integer
 from vkc_pin.utils.budget import reserve_time
 from vkc_pin.validation.report import Report

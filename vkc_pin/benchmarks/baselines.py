@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from vkc_pin.benchmarks.comparison import COMPARED_PLANNERS, Assignment, Comparison
-from vkc_pin.benchmarks.comparison_tables import select_compared_methods
+from vkc_pin.benchmarks.comparison import (
+    COMPARED_PLANNERS,
+    Assignment,
+    Comparison,
+    select_compared_methods,
+)
 from vkc_pin.benchmarks.harness.charts import criteria_chart
 from vkc_pin.benchmarks.harness.record import Record
 from vkc_pin.world.task.steps import Actuate

@@ -15,9 +15,8 @@ import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness import step_by_step as stepwise
-from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import Record, Solve, distribution, trial, values
-from vkc_pin.benchmarks.harness.runner import Execution
+from vkc_pin.benchmarks.harness.runner import LIMITS, Execution
 from vkc_pin.benchmarks.harness.tables import (
     JUDGED,
     count,

@@ -107,7 +107,7 @@ def _add_scenes(benches: Any) -> None:
     parser.add_argument("--counts", nargs="+", type=parse_positive, metavar="N", help=about)
 
     about = "open a door and a drawer with every kind of base"
-    parser = _add_experiment(benches, "bases", about, module="driving.bases")
+    parser = _add_experiment(benches, "bases", about, module="bases")
     _add_count(parser, "--trials", 50, "random starts per task and base")
     _add_choice(parser, "tasks", "door drawer (default: both)")
     _add_choice(parser, "bases", "omni differential ackermann (default: all)")
@@ -116,7 +116,7 @@ def _add_scenes(benches: Any) -> None:
     _add_count(parser, "--trials", 50, "random starts of base and arm")
 
     about = "execute plans of the experiments' tasks in MuJoCo (needs the extra `sim`)"
-    parser = _add_experiment(benches, "execution", about, module="executing.execution")
+    parser = _add_experiment(benches, "execution", about, module="execution")
     _add_count(parser, "--trials", 10, "random starts per task")
     tasks = "door corridor_door drawer household_refrigerator household_dishwasher"
     _add_choice(parser, "tasks", f"{tasks} household_cabinet household_cup init_1 (default: all)")
@@ -126,9 +126,7 @@ def _add_scenes(benches: Any) -> None:
     parser.add_argument("--off", nargs="+", type=float, default=[], metavar="MM", help=about)
 
     about = "measure validated episodes per hour of each dataset task"
-    parser = _add_experiment(
-        benches, "throughput", about, module="datasets.throughput", seeded=False
-    )
+    parser = _add_experiment(benches, "throughput", about, module="throughput", seeded=False)
     _add_count(parser, "--episodes", 200, "episodes per task")
     about = "robots, objects and rooms (default: home)"
     parser.add_argument("--recipe", metavar="RECIPE", help=about)

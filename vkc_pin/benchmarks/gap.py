@@ -9,8 +9,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.harness.limits import LIMITS, describe_limit
-from vkc_pin.benchmarks.harness.runner import Execution
+from vkc_pin.benchmarks.harness.runner import LIMITS, Execution, describe_limit
 from vkc_pin.benchmarks.harness.tables import JUDGED, format_table, join_sections
 from vkc_pin.benchmarks.problems.ablation import SUMMARIZED, SUMMARY, summary, tabulate_trials
 from vkc_pin.benchmarks.problems.poses import sample_random_start

@@ -16,9 +16,8 @@ import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.charts import success_chart
-from vkc_pin.benchmarks.harness.limits import LIMITS, describe_limit
 from vkc_pin.benchmarks.harness.record import Solve, trial
-from vkc_pin.benchmarks.harness.runner import Execution
+from vkc_pin.benchmarks.harness.runner import LIMITS, Execution, describe_limit
 from vkc_pin.benchmarks.harness.tables import JUDGED, comparison_table, join_sections, methods_table
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial
-from vkc_pin.benchmarks.harness.runner import Execution
+from vkc_pin.benchmarks.harness.runner import LIMITS, Execution
 from vkc_pin.benchmarks.harness.tables import (
     JUDGED,
     TIMES,

@@ -2,7 +2,7 @@ from .check import DatasetCheck, check_dataset
 from .dataset import Dataset
 from .episode import Episode
 from .generation import generate
-from .recipes.recipe import Recipe, load_recipe
+from .recipe import Recipe, load_recipe
 
 __all__ = [
     "Dataset",

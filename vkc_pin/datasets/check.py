@@ -22,14 +22,14 @@ from vkc_pin.datasets.episode import Episode, compute_scene_name, sample_times
 from vkc_pin.datasets.formats.hdf5 import Shard, open_shard, read_episodes, read_numbers
 from vkc_pin.datasets.formats.lerobot import find_differences
 from vkc_pin.datasets.problems import describe_problem, resolve_episode_terms
-from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
+from vkc_pin.datasets.recipe import Recipe, load_recipe
 from vkc_pin.datasets.statistics import make_statistics_page
 from vkc_pin.errors import VkcError, format_value
-from vkc_pin.simulation.cameras.images import Images, render_images
+from vkc_pin.simulation.cameras import Images, render_images
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.utils.arguments import check_integer, is_number
 from vkc_pin.utils.arrays import Bools, Ints
-from vkc_pin.utils.parallel.engine import CrashedTask, is_dask_installed, run_tasks
+from vkc_pin.utils.parallel import CrashedTask, is_dask_installed, run_tasks
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.files.writing import check_inside, check_writable, write_atomically
 

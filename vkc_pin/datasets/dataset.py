@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field, model_validator
 from vkc_pin.datasets.diversity import DuplicateFinder
 from vkc_pin.datasets.episode import Episode, get_work_file
 from vkc_pin.datasets.formats.hdf5 import read_episodes, read_numbers, write_shard
-from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
+from vkc_pin.datasets.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.world.files.documents import Document, parse_document, read_text
 from vkc_pin.world.files.fields import make_validation_error

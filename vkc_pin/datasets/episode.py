@@ -17,17 +17,16 @@ import numpy as np
 
 from vkc_pin.datasets.diversity import sample_coarse_trajectory
 from vkc_pin.datasets.problems import NoProblemError, sample_problem
-from vkc_pin.datasets.recipes.recipe import Recipe, load_recipe
+from vkc_pin.datasets.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, plan
-from vkc_pin.simulation.cameras.images import Images, render_images
+from vkc_pin.simulation.cameras import Images, render_images
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.simulation.result import SimulationResult
 from vkc_pin.utils.arrays import Floats, replace_infinite
-from vkc_pin.utils.parallel.machine import identify_process
-from vkc_pin.utils.system import measure_peak_memory, measure_resident_memory
+from vkc_pin.utils.system import identify_process, measure_peak_memory, measure_resident_memory
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.files.resources import find_resource_folder

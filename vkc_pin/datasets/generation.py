@@ -19,16 +19,15 @@ from vkc_pin.datasets.episode import Made, get_work_file
 from vkc_pin.datasets.formats import hdf5
 from vkc_pin.datasets.formats import lerobot as lerobot_layout
 from vkc_pin.datasets.formats.card import make_card
-from vkc_pin.datasets.formats.parts import make_parts
-from vkc_pin.datasets.recipes.recipe import CAMERAS, Recipe, load_recipe
-from vkc_pin.datasets.recipes.terms import make_entries
+from vkc_pin.datasets.formats.hdf5 import make_parts
+from vkc_pin.datasets.recipe import CAMERAS, Recipe, load_recipe, make_entries
 from vkc_pin.datasets.robots import check_frames, prepare_robots
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.simulation.physics import import_mujoco
 from vkc_pin.utils.arguments import check_bool, check_integer
-from vkc_pin.utils.parallel.engine import CrashedTask, require_dask, run_tasks
-from vkc_pin.utils.parallel.journal import Journal
-from vkc_pin.utils.parallel.machine import find_versions, identify_process
+from vkc_pin.utils.journal import Journal
+from vkc_pin.utils.parallel import CrashedTask, require_dask, run_tasks
+from vkc_pin.utils.system import find_versions, identify_process
 from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.writing import (
     check_links,

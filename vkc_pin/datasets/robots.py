@@ -7,10 +7,9 @@ from pathlib import Path
 
 import yaml
 
-from vkc_pin.datasets.recipes.recipe import Recipe, get_robot_name
-from vkc_pin.datasets.recipes.terms import check_robot
+from vkc_pin.datasets.recipe import Recipe, check_robot, get_robot_name
 from vkc_pin.importing.robots.robot_import import import_robot
-from vkc_pin.simulation.cameras.mount import check_frame
+from vkc_pin.simulation.cameras import check_frame
 from vkc_pin.simulation.physics import import_mujoco
 from vkc_pin.simulation.snapshots import open_gl_context
 from vkc_pin.world.files.documents import read_text

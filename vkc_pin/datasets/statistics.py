@@ -13,7 +13,7 @@ import numpy as np
 
 from vkc_pin.datasets.diversity import compute_coverage
 from vkc_pin.datasets.episode import Episode
-from vkc_pin.datasets.recipes.recipe import Recipe
+from vkc_pin.datasets.recipe import Recipe
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, use_style
 from vkc_pin.visualization.plots.top_view import draw_top_view
 from vkc_pin.world.trajectory.world_model import World

@@ -12,8 +12,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.planning.initialization.initial_guess import make_initial_guess
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.request import PlanningRequest
-from vkc_pin.planning.results import add_statistics, concatenate_plans
-from vkc_pin.planning.retime_validated import complete_draft
+from vkc_pin.planning.results import add_statistics, complete_draft, concatenate_plans
 from vkc_pin.planning.solve_task import TaskResult, solve_task
 from vkc_pin.utils.budget import current_ending, reserve_time, share_budget
 from vkc_pin.world.scene.scene import Scene

@@ -18,8 +18,7 @@ from vkc_pin.planning.diagnosis.diagnosis import (
     find_impossible_conditions,
 )
 from vkc_pin.planning.diagnosis.paths import diagnose_paths
-from vkc_pin.planning.diagnosis.proofs import find_proofs
-from vkc_pin.planning.diagnosis.swept_volumes import find_swept_collisions
+from vkc_pin.planning.diagnosis.proofs import find_proofs, find_swept_collisions
 from vkc_pin.planning.initialization.initial_guess import (
     InitialGuess,
     PhaseWaypoints,
@@ -28,14 +27,12 @@ from vkc_pin.planning.initialization.initial_guess import (
 )
 from vkc_pin.planning.initialization.methods import initialize
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.plan import STAGES, Plan, PlanningStatistics
 from vkc_pin.planning.request import PlanningRequest
-from vkc_pin.planning.results import make_stationary_trajectory
-from vkc_pin.planning.retime_validated import MAX_REPAIRS, retime_validated
+from vkc_pin.planning.results import MAX_REPAIRS, make_stationary_trajectory, retime_validated
 from vkc_pin.planning.solver.loop import solve
 from vkc_pin.planning.solver.solution import Iteration, Solution
 from vkc_pin.planning.solver.to_trajectory import make_trajectory
-from vkc_pin.planning.statistics import STAGES, PlanningStatistics
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.budget import (
     STOP_STATUSES,

@@ -10,11 +10,10 @@ from dataclasses import dataclass
 
 from vkc_pin.errors import InputError
 from vkc_pin.planning.initialization.initial_guess import PhaseWaypoints, make_initial_guess
-from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.plan import Plan, PlanningStatistics
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.results import FINAL, concatenate_plans
 from vkc_pin.planning.solve_task import Guess, TaskResult, solve_task
-from vkc_pin.planning.statistics import PlanningStatistics
 from vkc_pin.utils.budget import current_ending, reserve_time, share_budget
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import generate_alternatives, group_into_actions

@@ -1,6 +1,5 @@
 from .furniture.catalogue import random_object, write_object
-from .rooms.random_room import random_room
-from .rooms.settings import RoomSettings
+from .rooms.random_room import RoomSettings, random_room
 from .tasks import goals, random_task
 
 __all__ = [

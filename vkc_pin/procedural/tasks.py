@@ -9,8 +9,7 @@ import numpy as np
 from vkc_pin.errors import InputError
 from vkc_pin.procedural.furniture.catalogue import KINDS
 from vkc_pin.procedural.rooms.fixtures import RANDOM
-from vkc_pin.procedural.rooms.random_room import random_room
-from vkc_pin.procedural.rooms.settings import RoomSettings
+from vkc_pin.procedural.rooms.random_room import RoomSettings, random_room
 from vkc_pin.utils.arguments import check_instance, check_integer, check_number
 from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment
 from vkc_pin.world.scene.placed_object import PlacedObject

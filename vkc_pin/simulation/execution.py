@@ -10,18 +10,18 @@ import numpy as np
 
 from vkc_pin.errors import InputError
 from vkc_pin.simulation.contacts import Contact, Pairs, find_contact_pairs, find_unplanned_contacts
-from vkc_pin.simulation.friction.fingers import find_fingers, limit_finger_servos
-from vkc_pin.simulation.friction.friction_grasps import (
+from vkc_pin.simulation.friction import (
     Span,
     Squeezes,
+    find_fingers,
     find_grip_changes,
     insert_pauses,
+    limit_finger_servos,
     split_spans,
 )
-from vkc_pin.simulation.goals import measure_goal_errors
 from vkc_pin.simulation.model import Builder, PhysicalWorld
 from vkc_pin.simulation.physics import Physics, complete_inertias, import_mujoco
-from vkc_pin.simulation.result import SimulationResult, Tracking
+from vkc_pin.simulation.result import SimulationResult, Tracking, measure_goal_errors
 from vkc_pin.simulation.servos import (
     Servo,
     compute_feedforward,

@@ -22,7 +22,7 @@ from vkc_pin.simulation.physics import Physics, import_mujoco
 from vkc_pin.simulation.servos import Servo
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.models.coordinates import MovedJoint
-from vkc_pin.world.models.dynamics.joint_resistance import Resistance
+from vkc_pin.world.models.dynamics import Resistance
 from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.scene.contact_rules import is_rigid_grasp
 from vkc_pin.world.scene.hold import Hold

@@ -11,7 +11,7 @@ import pinocchio as pin
 from vkc_pin.utils.arguments import check_bool, check_number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import import_optional
-from vkc_pin.world.models.dynamics.mass import compute_solid_inertia
+from vkc_pin.world.models.dynamics import compute_solid_inertia
 from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["Physics", "complete_inertias", "import_mujoco"]

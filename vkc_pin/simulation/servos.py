@@ -12,7 +12,7 @@ import pinocchio as pin
 from vkc_pin.simulation.physics import Physics
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.trajectory.dynamics.torques import transform_to_base_axes
+from vkc_pin.world.trajectory.torques import transform_to_base_axes
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.wheels import rotate_into_base_frame
 from vkc_pin.world.trajectory.world_model import World

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.parallel.engine import exit_with_parent, run_with_time_limit
+from vkc_pin.utils.parallel import exit_with_parent, run_with_time_limit
 from vkc_pin.utils.system import limit_resource
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Queries the operating system, also with calls that not every POSIX system has."""
+"""Queries the operating system, and describes versions and machine of this process."""
 
 from __future__ import annotations
 
@@ -7,14 +7,21 @@ import ctypes
 import os
 import platform
 import resource
+import socket
 import sys
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 __all__ = [
+    "PACKAGES",
     "count_cores",
+    "describe_machine",
     "find_libc_version",
     "find_processor_name",
+    "find_versions",
     "has_screen",
+    "identify_process",
     "is_file",
     "limit_resource",
     "measure_peak_memory",
@@ -87,3 +94,34 @@ def limit_resource(name: str, limit: int) -> None:
     # Some limits do not exist on macOS, and none can be above that of the user.
     with contextlib.suppress(AttributeError, ValueError, OSError):
         resource.setrlimit(getattr(resource, name), (limit, limit))
+
+
+PACKAGES = ("vkc-pin", "pin", "coal", "casadi", "numpy")
+"""The package and the dependencies that affect motions."""
+
+
+def find_versions() -> dict[str, str]:
+    """Return the versions of `PACKAGES`."""
+    found = {}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "unknown"
+    return found
+
+
+def describe_machine() -> dict[str, Any]:
+    """Return system, processor and Python version."""
+    return {
+        "system": platform.system(),
+        "machine": platform.machine(),
+        "processor": find_processor_name(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+    }
+
+
+def identify_process() -> str:
+    """Return a name of this process that is unique among machines."""
+    return f"{socket.gethostname()}-{os.getpid()}"

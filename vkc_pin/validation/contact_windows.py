@@ -15,7 +15,7 @@ from vkc_pin.validation.goals import MOTION_TOLERANCE, make_hold
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.tolerances import Tolerances
-from vkc_pin.world.models.grippers.bar_width import WIDTH_TOLERANCE
+from vkc_pin.world.models.gripper import WIDTH_TOLERANCE
 from vkc_pin.world.scene.clearance_exemptions import ClearanceExemption, find_clearance_exemptions
 from vkc_pin.world.scene.contact_rules import (
     CONTACT_DEPTH,

@@ -13,9 +13,9 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.world.collision.placements import ShapePlacements, flatten_placements
-from vkc_pin.world.collision.shapes import Shapes
-from vkc_pin.world.collision.world_boxes import WorldBoxes
+from vkc_pin.world.collision.boxes import WorldBoxes
+from vkc_pin.world.collision.distances import Shapes
+from vkc_pin.world.collision.solids import ShapePlacements, flatten_placements
 from vkc_pin.world.models.coordinates import MovedJoint
 from vkc_pin.world.models.shapes import compute_bounding_box, compute_shape_distance
 from vkc_pin.world.trajectory.world_model import World

@@ -13,7 +13,7 @@ from vkc_pin.utils.arguments import check_choice
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.validation.report import Violation
 from vkc_pin.world.models.articulated_object import Attachment, Freedom
-from vkc_pin.world.models.grippers.bar_width import WIDTH_TOLERANCE
+from vkc_pin.world.models.gripper import WIDTH_TOLERANCE
 from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import Hold, get_attachment
 from vkc_pin.world.scene.scene import Scene

@@ -11,8 +11,7 @@ import pinocchio as pin
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
-from vkc_pin.world.task.formula import Formula
-from vkc_pin.world.task.terms import Constraint, Term
+from vkc_pin.world.task.terms import Constraint, Formula, Term
 
 __all__ = ["check_terms"]
 

@@ -16,16 +16,13 @@ from vkc_pin.options import Options
 from vkc_pin.utils.arguments import check_instance
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.closure import find_drift
+from vkc_pin.validation.collisions import Hit, PairTable, sweep
 from vkc_pin.validation.contact_windows import check_gripper, check_pushes, find_contact_windows
 from vkc_pin.validation.distances import CollisionShapes
-from vkc_pin.validation.dynamics.rates import check_rates
-from vkc_pin.validation.dynamics.torques import MotorLoads
 from vkc_pin.validation.goals import MOTION_TOLERANCE, check_goals, check_steps
-from vkc_pin.validation.pairs import PairTable
+from vkc_pin.validation.limits import MotorLoads, check_rates, check_rolling
 from vkc_pin.validation.report import Exemption, Report, Violation
-from vkc_pin.validation.rolling import check_rolling
 from vkc_pin.validation.samples import MAX_SAMPLES, Samples
-from vkc_pin.validation.sweep import Hit, sweep
 from vkc_pin.validation.terms import check_terms
 from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.scene.clearance_exemptions import (

@@ -25,14 +25,18 @@ from vkc_pin.visualization.camera import FIELD_OF_VIEW, choose_viewpoint
 from vkc_pin.visualization.room import Part, Room, load_drawn_parts
 from vkc_pin.visualization.threejs import (
     Ghost,
+    Solid,
     Sun,
     Triangles,
     Unshadow,
     add_node,
     encode_colour,
     make_material,
+    make_tube,
+    merge_solids,
+    simplify,
+    to_solid,
 )
-from vkc_pin.visualization.triangles import Solid, make_tube, merge_solids, simplify, to_solid
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.placements import Motion, sample_motion

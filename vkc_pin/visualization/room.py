@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.visualization.triangles import Solid, make_box, shade, to_solid
+from vkc_pin.visualization.threejs import Solid, make_box, shade, to_solid
 from vkc_pin.world.files.meshes import load_parts
 from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.scene import Scene

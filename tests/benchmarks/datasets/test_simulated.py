@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from helpers.datasets import SMALL
 
-from vkc_pin.benchmarks.datasets.simulated import Costs, measure_costs, simulate_workers
+from vkc_pin.benchmarks.throughput import Costs, measure_costs, simulate_workers
 from vkc_pin.datasets.dataset import Dataset
-from vkc_pin.datasets.recipes.recipe import load_recipe
+from vkc_pin.datasets.recipe import load_recipe
 
 
 def test_single_worker_is_fully_efficient() -> None:

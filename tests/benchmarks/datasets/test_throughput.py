@@ -7,10 +7,9 @@ import pytest
 import yaml
 from helpers.datasets import SMALL
 
-from vkc_pin.benchmarks.datasets.simulated import WORKERS
-from vkc_pin.benchmarks.datasets.throughput import run
+from vkc_pin.benchmarks.throughput import WORKERS, run
 from vkc_pin.cli import main
-from vkc_pin.datasets.recipes.recipe import TASKS
+from vkc_pin.datasets.recipe import TASKS
 
 pytest.importorskip("h5py")
 

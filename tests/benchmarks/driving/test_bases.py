@@ -9,7 +9,7 @@ import pytest
 from helpers.experiments import run_experiment
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.driving import bases
+from vkc_pin.benchmarks import bases
 from vkc_pin.benchmarks.harness.record import describe_environment
 
 

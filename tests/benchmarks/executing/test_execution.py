@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from helpers.experiments import run_experiment
 
-from vkc_pin.benchmarks.executing.execution import format_results
+from vkc_pin.benchmarks.execution import format_results
 from vkc_pin.cli import main
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vkc_pin.benchmarks.harness.limits import LIMITS, describe_limit
+from vkc_pin.benchmarks.harness.runner import LIMITS, describe_limit
 
 
 def test_description_states_evaluations_or_planning_time() -> None:

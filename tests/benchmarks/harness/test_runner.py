@@ -228,7 +228,7 @@ def test_changed_settings_and_versions_are_refused(tmp_path: Path) -> None:
         ("planning/solver/elimination.hpp", False),
         ("planning/solver/_kkt.cpp", False),
         ("planning/planner.py", False),
-        ("utils/parallel/engine.py", True),
+        ("utils/parallel.py", True),
         ("cli/door.py", True),
     ],
 )

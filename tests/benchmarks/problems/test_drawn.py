@@ -11,7 +11,7 @@ from oracle.agreement import judge_all, record_violations, write_verdicts
 from oracle.plan import read_plan
 
 from vkc_pin.benchmarks.problems import random_problems
-from vkc_pin.benchmarks.problems.drawn import sample_problem
+from vkc_pin.benchmarks.problems.random_problems import sample_problem
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.planning.plan import Plan
 from vkc_pin.procedural.tasks import random_task

@@ -10,13 +10,14 @@ import pytest
 from helpers.arm_urdf import write_arms
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.robot_object_matrix.given import (
+from vkc_pin.benchmarks.robot_object_matrix.pairs import (
     Request,
+    load_description,
+    make_hall,
     parse_requests,
     prepare_object,
     prepare_robot,
 )
-from vkc_pin.benchmarks.robot_object_matrix.pairs import load_description, make_hall
 from vkc_pin.world.models.robot_file import find_robot
 
 # A box with a drawer that is pulled towards +y, and a lamp beside it.

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from vkc_pin.benchmarks.harness.record import describe_environment
-from vkc_pin.benchmarks.robot_object_matrix.matrix import chart, format_results
+from vkc_pin.benchmarks.robot_object_matrix.run import chart, format_results
 
 
 def make_record(robot: str, name: str, status: str = "success", **fields: Any) -> dict[str, Any]:

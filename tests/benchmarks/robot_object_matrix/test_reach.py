@@ -4,7 +4,7 @@ import pytest
 from helpers.arm_urdf import write_arms
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.robot_object_matrix.reach import sample_reachable_poses
+from vkc_pin.benchmarks.robot_object_matrix.robots import sample_reachable_poses
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,8 @@ import pytest
 from helpers.datasets import SMALL
 
 from vkc_pin.datasets.episode import run_attempts
-from vkc_pin.datasets.formats.hdf5 import read_episodes, read_numbers, write_shard
-from vkc_pin.datasets.formats.parts import make_parts
-from vkc_pin.datasets.recipes.recipe import load_recipe
+from vkc_pin.datasets.formats.hdf5 import make_parts, read_episodes, read_numbers, write_shard
+from vkc_pin.datasets.recipe import load_recipe
 
 pytest.importorskip("h5py")
 

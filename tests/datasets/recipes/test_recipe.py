@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import yaml
 
-from vkc_pin.datasets.recipes.recipe import (
+from vkc_pin.datasets.recipe import (
     GoalSchema,
     RecipeSchema,
     RobotEntry,

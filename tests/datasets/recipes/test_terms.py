@@ -18,8 +18,13 @@ from vkc_pin.datasets.check import check_dataset
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generation import generate
 from vkc_pin.datasets.problems import resolve_episode_terms
-from vkc_pin.datasets.recipes.recipe import load_recipe
-from vkc_pin.datasets.recipes.terms import KeepOutSchema, SpeedSchema, TracedSchema, UprightSchema
+from vkc_pin.datasets.recipe import (
+    KeepOutSchema,
+    SpeedSchema,
+    TracedSchema,
+    UprightSchema,
+    load_recipe,
+)
 from vkc_pin.errors import InputError
 
 h5py = pytest.importorskip("h5py")

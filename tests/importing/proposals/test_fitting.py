@@ -10,9 +10,14 @@ from helpers.furniture import BAR, write_flap
 
 import vkc_pin as vkc
 from vkc_pin.importing.proposals.candidates import Piece, Thickness, find_candidates
-from vkc_pin.importing.proposals.fitting import GraspMotion, HandClearance, Obstruction
+from vkc_pin.importing.proposals.fitting import (
+    GraspMotion,
+    HandClearance,
+    Obstruction,
+    Opening,
+    find_openings,
+)
 from vkc_pin.importing.proposals.hand import make_hand
-from vkc_pin.importing.proposals.ranking import Opening, find_openings
 from vkc_pin.world.models.shapes import compute_clearance
 
 FRONT = np.column_stack(

@@ -7,7 +7,7 @@ import pytest
 from helpers.furniture import BAR, write_flap
 
 import vkc_pin as vkc
-from vkc_pin.importing.proposals.picture import plot_attachments
+from vkc_pin.importing.pictures import plot_attachments
 
 
 def test_picture_has_a_panel_for_every_attachment(tmp_path: Path) -> None:

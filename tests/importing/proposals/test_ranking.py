@@ -10,7 +10,7 @@ from helpers.furniture import BAR, write_flap
 
 import vkc_pin as vkc
 from vkc_pin.importing.proposals.candidates import Candidate, Piece
-from vkc_pin.importing.proposals.ranking import (
+from vkc_pin.importing.proposals.fitting import (
     Opening,
     find_named_handles,
     find_openings,

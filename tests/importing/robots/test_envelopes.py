@@ -6,7 +6,7 @@ import pytest
 from helpers.arm_urdf import write_arms
 
 import vkc_pin as vkc
-from vkc_pin.importing.robots.envelopes import find_envelopes
+from vkc_pin.importing.robots.hand_checks import find_envelopes
 
 
 def write_caged_arm(folder: Path, *, size: str = "0.3 0.3 0.3", visual: bool = False) -> Path:

@@ -11,7 +11,7 @@ from vkc_pin.importing.proposals.hand import make_hand
 from vkc_pin.importing.robots.arms import Arm, build_body_tree, find_arms
 from vkc_pin.importing.robots.hands import analyze_hand
 from vkc_pin.world.files.urdf import read_urdf
-from vkc_pin.world.models.grippers.bar_width import find_thickest_rod
+from vkc_pin.world.models.gripper import find_thickest_rod
 from vkc_pin.world.models.robot_model import build_full_model
 
 

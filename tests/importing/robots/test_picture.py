@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.importing.robots.picture import plot_robot
+from vkc_pin.importing.pictures import plot_robot
 
 
 @pytest.mark.parametrize("name", ["husky_ur5e", "panda"])

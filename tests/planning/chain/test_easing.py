@@ -22,7 +22,7 @@ from helpers.carrying import (
 from helpers.small_problems import SHORT, get_margins, make_program
 from helpers.supports import describe_cup, make_plate_scene, make_scene
 
-from vkc_pin.planning.chain.easing import REDUCED_MARGIN_RATIO
+from vkc_pin.planning.chain.collision_pairs import REDUCED_MARGIN_RATIO
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.world.scene.contact_rules import CONTACT_WINDOW
 from vkc_pin.world.scene.obstacles import FLOOR

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.planning.chain.inversion import invert
+from vkc_pin.planning.chain.chain import invert
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.object_file import load_object
 

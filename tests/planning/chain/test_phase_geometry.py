@@ -8,7 +8,7 @@ import pinocchio as pin
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
+from vkc_pin.planning.chain.collision_pairs import PhaseGeometry
 from vkc_pin.world.models.shapes import compute_bounding_box, compute_shape_distance
 
 JOINTS = 3

@@ -12,7 +12,7 @@ import pytest
 from helpers.small_problems import load_door_scene, make_program
 
 import vkc_pin as vkc
-from vkc_pin.planning.diagnosis.swept_volumes import find_swept_collisions
+from vkc_pin.planning.diagnosis.proofs import find_swept_collisions
 
 POST = (3.2, 0.14, 0.25)  # in the leaf at 1.14 rad
 SIZE = (0.08, 0.1, 0.5)  # [m]

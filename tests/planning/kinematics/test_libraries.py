@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from vkc_pin.planning.kinematics import libraries
-from vkc_pin.planning.kinematics.libraries import BUILD, CACHE_VARIABLE, Libraries
-from vkc_pin.planning.kinematics.machine_code import compile_jobs
+from vkc_pin.planning.kinematics import machine_code
+from vkc_pin.planning.kinematics.machine_code import BUILD, CACHE_VARIABLE, Libraries, compile_jobs
 from vkc_pin.utils.disk_cache import TEMPORARY_PREFIX
 
 LIBRARY = bytes(range(256)) * 40
@@ -162,10 +161,10 @@ def test_least_recently_used_libraries_are_evicted_first(
         folder.publish(key, LIBRARY)
         make_older(folder.path / f"{key}.so", 1000 - 100 * index)
     assert folder.find(A) is not None
-    monkeypatch.setattr(libraries, "_MAX_FILES", 4)
+    monkeypatch.setattr(machine_code, "_MAX_FILES", 4)
     folder.evict()
     assert list_names(folder) == [f"{A}.so", f"{C}.so", f"{D}.so", f"{E}.so"]
-    monkeypatch.setattr(libraries, "_MAX_BYTES", 2.5 * len(LIBRARY))
+    monkeypatch.setattr(machine_code, "_MAX_BYTES", 2.5 * len(LIBRARY))
     folder.evict()
     assert list_names(folder) == [f"{A}.so", f"{E}.so"]
 
@@ -203,8 +202,8 @@ def test_foreign_files_are_neither_removed_nor_compiled(
     folder: Libraries, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Both in the folder that the variable names and in the cache folder within it."""
-    monkeypatch.setattr(libraries, "_MAX_FILES", 2)
-    monkeypatch.setattr(libraries, "_MAX_BYTES", 100)
+    monkeypatch.setattr(machine_code, "_MAX_FILES", 2)
+    monkeypatch.setattr(machine_code, "_MAX_BYTES", 100)
     for place in (folder.path.parent, folder.path):
         for name in FOREIGN:
             (place / name).parent.mkdir(parents=True, exist_ok=True)

@@ -20,8 +20,13 @@ import vkc_pin as vkc
 from vkc_pin.options import Options
 from vkc_pin.planning.kinematics import batch, machine_code
 from vkc_pin.planning.kinematics.batch import BatchFunction
-from vkc_pin.planning.kinematics.libraries import CACHE_VARIABLE, Libraries
-from vkc_pin.planning.kinematics.machine_code import MachineCode, compile_jobs, wait
+from vkc_pin.planning.kinematics.machine_code import (
+    CACHE_VARIABLE,
+    Libraries,
+    MachineCode,
+    compile_jobs,
+    wait,
+)
 from vkc_pin.planning.nlp.transcription import Transcription, transcribe
 from vkc_pin.planning.nlp.waypoint import WaypointFunctions
 from vkc_pin.utils.cache import Cache

@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
-from vkc_pin.planning.retiming.jerk_limits import limit_jerk
-from vkc_pin.planning.retiming.limits import Limits
+from vkc_pin.planning.retiming.limits import Limits, limit_jerk
 from vkc_pin.planning.retiming.spline_path import fit_path
 from vkc_pin.planning.retiming.topp_ra import compute_speeds
 from vkc_pin.world.trajectory.curve import Curve

@@ -9,7 +9,7 @@ from helpers.executions import plan_door
 from scipy.interpolate import CubicHermiteSpline
 
 from vkc_pin.planning.retiming.torque_bounds import TorqueBounds
-from vkc_pin.world.trajectory.dynamics.torques import Torques
+from vkc_pin.world.trajectory.torques import Torques
 
 
 def make_opening(**resistance: float) -> tuple[TorqueBounds, CubicHermiteSpline]:

@@ -11,7 +11,7 @@ from helpers.small_problems import make_program
 
 import vkc_pin as vkc
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.solver.tunnelling import Crossing, find_crossings, find_new_crossings
+from vkc_pin.planning.solver.segment_planes import Crossing, find_crossings, find_new_crossings
 
 REACH, GRAZING = 8, -0.353
 

@@ -7,8 +7,13 @@ import itertools
 import numpy as np
 import pytest
 
-from vkc_pin.procedural.furniture.building import LinkBuilder, ObjectBuilder
-from vkc_pin.procedural.furniture.handles import add_knob, add_level_bar, add_upright_bar
+from vkc_pin.procedural.furniture.building import (
+    LinkBuilder,
+    ObjectBuilder,
+    add_knob,
+    add_level_bar,
+    add_upright_bar,
+)
 from vkc_pin.world.models.object_file import load_object
 
 FACE = (-0.01, 0.2, 0.3)

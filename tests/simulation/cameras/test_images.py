@@ -8,8 +8,7 @@ import pytest
 from helpers.executions import simulate_drawer
 
 import vkc_pin as vkc
-from vkc_pin.simulation.cameras.images import ROBOT, Images, render_images
-from vkc_pin.simulation.cameras.mount import Camera
+from vkc_pin.simulation.cameras import ROBOT, Camera, Images, render_images
 from vkc_pin.simulation.replay import Replay
 
 HEAD = Camera("head", "base", (0.0, 0.0, 1.5), (1.2, 0.0, 0.6), width=96, height=64)

@@ -6,7 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.simulation.cameras.mount import BASE, HAND, Camera
+from vkc_pin.simulation.cameras import BASE, HAND, Camera
 from vkc_pin.world.models.robot_file import load_robot
 
 points = st.tuples(*[st.floats(-3.0, 3.0)] * 3)

@@ -10,7 +10,7 @@ import pytest
 from helpers.grippers import write_cheeks_scene, write_gripper
 
 import vkc_pin as vkc
-from vkc_pin.simulation.friction.fingers import find_fingers, limit_finger_servos
+from vkc_pin.simulation.friction import find_fingers, limit_finger_servos
 from vkc_pin.simulation.physics import Physics
 from vkc_pin.simulation.servos import make_servos
 from vkc_pin.world.trajectory.world_model import World

@@ -17,7 +17,7 @@ from helpers.grippers import write_cheeks_scene, write_gripper
 
 import vkc_pin as vkc
 from vkc_pin.simulation.execution import simulate
-from vkc_pin.simulation.friction.friction_grasps import insert_pauses
+from vkc_pin.simulation.friction import insert_pauses
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 

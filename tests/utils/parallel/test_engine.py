@@ -8,7 +8,7 @@ import pytest
 from helpers.tasks import crash_once, double, hang, identify_worker
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.parallel.engine import MAX_CRASHES, CrashedTask, require_dask, run_tasks
+from vkc_pin.utils.parallel import MAX_CRASHES, CrashedTask, require_dask, run_tasks
 
 
 def make_tasks(count: int) -> list[tuple[str, int]]:
@@ -61,7 +61,7 @@ def test_tasks_are_consumed_on_demand(dask: bool) -> None:
 
 def test_missing_schedulers_raise(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
-    monkeypatch.setattr("vkc_pin.utils.parallel.engine._CONNECT_TIMEOUT", 1.0)
+    monkeypatch.setattr("vkc_pin.utils.parallel._CONNECT_TIMEOUT", 1.0)
     with pytest.raises(InputError, match="no scheduler answers") as caught:
         list(run_tasks(double, make_tasks(2), scheduler="tcp://127.0.0.1:9"))
     assert caught.value.field == "scheduler"
@@ -77,7 +77,7 @@ def test_invalid_addresses_raise(address: Any) -> None:
 
 def test_schedulers_without_workers_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     distributed = pytest.importorskip("distributed")
-    monkeypatch.setattr("vkc_pin.utils.parallel.engine._CHECK_INTERVAL", 0.2)
+    monkeypatch.setattr("vkc_pin.utils.parallel._CHECK_INTERVAL", 0.2)
     lines: list[str] = []
     with distributed.LocalCluster(
         n_workers=0, threads_per_worker=1, host="127.0.0.1", dashboard_address=None

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.parallel.journal import Journal, JournalContents
+from vkc_pin.utils.journal import Journal, JournalContents
 
 HEADER = {"settings": {"recipe": "abc"}, "versions": {"pin": "4"}}
 

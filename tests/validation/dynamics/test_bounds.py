@@ -9,9 +9,9 @@ import pytest
 from helpers.executions import plan_door, plan_drawer
 
 import vkc_pin as vkc
-from vkc_pin.validation.dynamics.bounds import find_limiting_constraints
+from vkc_pin.validation.limits import find_limiting_constraints
 from vkc_pin.validation.samples import Samples
-from vkc_pin.world.trajectory.dynamics.torques import sample_curve
+from vkc_pin.world.trajectory.torques import sample_curve
 
 
 @pytest.mark.parametrize("make_plan", [plan_door, plan_drawer])

@@ -10,7 +10,7 @@ from helpers.executions import plan_drawer
 
 import vkc_pin as vkc
 from vkc_pin.planning.retiming.retime import retime_trajectory
-from vkc_pin.validation.dynamics.rates import check_rates
+from vkc_pin.validation.limits import check_rates
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
 from vkc_pin.world.trajectory.curve import Curve

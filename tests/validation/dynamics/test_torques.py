@@ -14,7 +14,7 @@ from oracle.judge import judge
 
 import vkc_pin as vkc
 from vkc_pin.planning.retiming.retime import retime_trajectory
-from vkc_pin.validation.dynamics.torques import TORQUE_TOLERANCE, MotorLoads
+from vkc_pin.validation.limits import TORQUE_TOLERANCE, MotorLoads
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.validate import validate

@@ -7,7 +7,7 @@ import pytest
 from helpers.fake_plan import make_fake_plan
 
 from vkc_pin.planning.plan import Plan
-from vkc_pin.visualization.plots.clearance import ClearanceCurve, compute_clearance_curves
+from vkc_pin.visualization.plots.plots import ClearanceCurve, compute_clearance_curves
 from vkc_pin.world.trajectory.world_model import World
 
 TIMES = np.linspace(0.0, 6.0, 13)

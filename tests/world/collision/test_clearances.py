@@ -11,12 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.world.collision import clearances as clearances_module
+from vkc_pin.world.collision import distances as distances_module
 from vkc_pin.world.collision.boxes import Boxes
-from vkc_pin.world.collision.clearances import Clearances
-from vkc_pin.world.collision.margins import MarginRegion, Margins
-from vkc_pin.world.collision.placements import ShapePlacements
-from vkc_pin.world.collision.shapes import Shapes
+from vkc_pin.world.collision.distances import Clearances, MarginRegion, Margins, Shapes
+from vkc_pin.world.collision.solids import ShapePlacements
 
 SEEDS = st.integers(0, 2**32 - 1)
 MOVING, FIXED, STATES, WAYPOINTS = 6, 7, 10, 5
@@ -119,7 +117,7 @@ def test_closest_pairs_match_an_exhaustive_search(
     ]
     with pytest.MonkeyPatch.context() as patch:
         for rows_per_thread in (1, 100):  # four threads, and one
-            patch.setattr(clearances_module, "_MIN_ROWS_PER_THREAD", rows_per_thread)
+            patch.setattr(distances_module, "_MIN_ROWS_PER_THREAD", rows_per_thread)
             found = room.make_clearances().find_closest_pairs(
                 room.q,
                 room.z,

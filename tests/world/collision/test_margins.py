@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.world.collision.margins import MarginRegion, Margins
+from vkc_pin.world.collision.distances import MarginRegion, Margins
 
 PAIRS, COORDINATES = 12, 4
 

@@ -6,7 +6,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.world.collision.placements import ShapePlacements, flatten_placements
+from vkc_pin.world.collision.solids import ShapePlacements, flatten_placements
 
 
 def test_placements_are_flattened_by_columns() -> None:

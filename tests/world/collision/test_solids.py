@@ -14,7 +14,7 @@ import pytest
 from vkc_pin.errors import BuildError, InputError
 from vkc_pin.utils import optional_imports
 from vkc_pin.world.collision import solids
-from vkc_pin.world.collision.shapes import Shapes
+from vkc_pin.world.collision.distances import Shapes
 from vkc_pin.world.collision.solids import convert_solid
 from vkc_pin.world.files.meshes import make_convex_hull
 
@@ -88,7 +88,7 @@ def test_incompatible_modules_raise(monkeypatch: pytest.MonkeyPatch) -> None:
 
 _FIRST_QUERY = """
 import numpy as np
-from vkc_pin.world.collision.shapes import Shapes
+from vkc_pin.world.collision.distances import Shapes
 import coal
 turn = [1.0, 0, 0, 0, 1, 0, 0, 0, 1]
 where = np.array([[[*turn, 0, 0, 0], [*turn, -2, 0, 0]]])

@@ -7,8 +7,8 @@ import os
 import coal
 import pytest
 
-from vkc_pin.world.collision.shapes import Shapes
-from vkc_pin.world.collision.threads import count_threads
+from vkc_pin.world.collision.distances import Shapes
+from vkc_pin.world.collision.solids import count_threads
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.collision.world_boxes import WorldBoxes
+from vkc_pin.world.collision.boxes import WorldBoxes
 
 
 def compute_gap(first: tuple[Floats, Floats], second: tuple[Floats, Floats]) -> float:

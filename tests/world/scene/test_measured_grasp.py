@@ -20,8 +20,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import consolidate
 from vkc_pin.world.scene.contact_rules import compute_hand_clearance
-from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.measured_grasp import fit_grasp
+from vkc_pin.world.scene.hold import Hold, fit_grasp
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 
 HALL = {

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from vkc_pin.world.task.formula import ROUNDING, Formula, State
+from vkc_pin.world.task.terms import ROUNDING, Formula, State
 
 FRAMES, COORDINATES = ("tool", "cup.cup"), ("elbow_joint", "door.hinge")
 DT = 0.25

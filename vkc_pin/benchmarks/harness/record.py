@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.planning.plan import Plan
-from vkc_pin.utils.parallel.machine import describe_machine, find_versions
-from vkc_pin.utils.system import measure_peak_memory
+from vkc_pin.utils.system import describe_machine, find_versions, measure_peak_memory
 from vkc_pin.world.files.resources import find_package_folder
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory

@@ -19,12 +19,37 @@ from tqdm import tqdm
 from vkc_pin.benchmarks.harness.record import describe_environment, measure_peak_memory
 from vkc_pin.benchmarks.harness.tables import to_csv
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.utils.parallel.engine import CrashedTask, require_dask, run_tasks
-from vkc_pin.utils.parallel.journal import Journal
+from vkc_pin.utils.journal import Journal
+from vkc_pin.utils.parallel import CrashedTask, require_dask, run_tasks
 from vkc_pin.world.files.resources import find_package_folder, find_resource_folder
 from vkc_pin.world.files.writing import check_links, check_writable, write_atomically
 
-__all__ = ["Execution", "Function", "check_folder", "check_positive", "run", "select_names"]
+__all__ = [
+    "LIMITS",
+    "MAX_EVALUATIONS",
+    "TIME_LIMIT",
+    "Execution",
+    "Function",
+    "check_folder",
+    "check_positive",
+    "describe_limit",
+    "run",
+    "select_names",
+]
+
+MAX_EVALUATIONS = 1_000_000
+"""Several times the evaluations of a usual trial."""
+TIME_LIMIT = 1800.0
+"""Wall time of a call [s]; trials that it ends are no results of the method."""
+LIMITS: Mapping[str, Any] = {"max_evaluations": MAX_EVALUATIONS, "time_limit": TIME_LIMIT}
+"""Both, as arguments of planners, and for the record."""
+
+
+def describe_limit(about: Mapping[str, Any]) -> str:
+    """Return the limit of a record's trials in words; old records limit planning time."""
+    if "max_evaluations" in about:
+        return f"at most {about['max_evaluations']:,} evaluations".replace(",", " ")
+    return f"at most {about['time_limit']:g} s of planning"
 
 
 class Execution(TypedDict, total=False):

@@ -11,10 +11,8 @@ import numpy as np
 
 from vkc_pin.benchmarks.peers.tasks import PeerProblem
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.results import make_stationary_trajectory
-from vkc_pin.planning.retime_validated import retime_validated
-from vkc_pin.planning.statistics import PlanningStatistics
+from vkc_pin.planning.plan import Plan, PlanningStatistics
+from vkc_pin.planning.results import make_stationary_trajectory, retime_validated
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate

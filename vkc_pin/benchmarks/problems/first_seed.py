@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any, Unpack
 
 from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import distribution
-from vkc_pin.benchmarks.harness.runner import Execution
+from vkc_pin.benchmarks.harness.runner import LIMITS, Execution
 from vkc_pin.benchmarks.harness.tables import (
     JUDGED,
     compute_wilson_interval,

@@ -10,9 +10,8 @@ from typing import Any, Unpack
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.harness.limits import LIMITS, describe_limit
 from vkc_pin.benchmarks.harness.record import distribution, trial
-from vkc_pin.benchmarks.harness.runner import Execution
+from vkc_pin.benchmarks.harness.runner import LIMITS, Execution, describe_limit
 from vkc_pin.benchmarks.harness.tables import format_decimal, format_table, join_sections, select
 from vkc_pin.benchmarks.problems.ablation import tabulate_trials
 from vkc_pin.planning.diagnosis.proofs import PROVEN

@@ -10,9 +10,8 @@ from typing import Any, Unpack
 import numpy as np
 
 from vkc_pin.benchmarks.harness import runner
-from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import Record, values
-from vkc_pin.benchmarks.harness.runner import Execution
+from vkc_pin.benchmarks.harness.runner import LIMITS, Execution
 from vkc_pin.benchmarks.harness.tables import (
     compute_quartiles,
     count,

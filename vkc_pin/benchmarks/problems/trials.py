@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.benchmarks.harness.limits import LIMITS
 from vkc_pin.benchmarks.harness.record import trial
+from vkc_pin.benchmarks.harness.runner import LIMITS
 from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import Plan

@@ -1,9 +1,4 @@
-"""Reads and writes shards: HDF5 files of many episodes in robomimic's layout.
-
-Groups are `data/demo_<k>` with `actions`, `states`, `obs`, `rewards` and `dones`, attributes
-`total`, `env_args` and `num_samples`, and `mask`. Samples are in single precision; the trajectory
-itself is in double precision under `motion`.
-"""
+"""Reads and writes shards: HDF5 files of many episodes in robomimic's layout."""
 
 from __future__ import annotations
 
@@ -11,6 +6,8 @@ import contextlib
 import functools
 import io
 import json
+import time
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -20,12 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from vkc_pin.datasets.episode import Episode, compute_scene_name, make_episode
+from vkc_pin.datasets.episode import (
+    Episode,
+    Made,
+    compute_scene_name,
+    make_episode,
+    run_attempts,
+    unpack,
+)
 from vkc_pin.datasets.formats.hdf5_reader import Group, open_hdf5, require_h5py
 from vkc_pin.datasets.formats.samples import sample_episode
-from vkc_pin.datasets.recipes.recipe import Recipe
+from vkc_pin.datasets.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError, format_value
-from vkc_pin.simulation.cameras.images import Images
+from vkc_pin.simulation.cameras import Images
 from vkc_pin.utils.arrays import Floats, Ints, replace_infinite
 from vkc_pin.world.files.documents import Document, parse_document, parse_json, read_text
 from vkc_pin.world.files.fields import Name, Schema
@@ -41,6 +45,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Shard",
     "make_part",
+    "make_parts",
     "open_shard",
     "read_episodes",
     "read_numbers",
@@ -473,3 +478,34 @@ def _check_scene(document: Any, name: str, file: Path) -> Any:
         problem = "this scene is not what its name says"
         raise InputError(problem, file=file, expected=name, got=compute_scene_name(document))
     return document
+
+
+def make_parts(task: tuple[Mapping[str, Any], Sequence[int], Mapping[str, str]]) -> list[Made]:
+    """Make episodes as `run_attempts` does, packed by `make_part`, whose time is added."""
+    document, _, robots = task
+    recipe, found = load_recipe(document), []
+    folder = next((Path(file).parent.parent for file in robots.values()), None)
+    for record, data in run_attempts(task):
+        if data:
+            began, worked = time.perf_counter(), time.process_time()
+            episode = unpack(data, folder)
+            robot = _load_robot(recipe.digest, episode)
+            data = make_part(episode, robot, recipe.fields.rate, recipe.digest)
+            seconds, cpu_time = time.perf_counter() - began, time.process_time() - worked
+            record["seconds"] = round(record["seconds"] + seconds, 4)
+            record["cpu_time"] = round(record["cpu_time"] + cpu_time, 4)
+        found.append((record, data))
+    return found
+
+
+_ROBOTS: dict[tuple[str, str, float | None], Robot] = {}
+"""Robots of this process by recipe, name and height, since building every scene is slow."""
+
+
+def _load_robot(recipe: str, episode: Episode) -> Robot:
+    key = (recipe, str(episode.about["robot"]), episode.start.get("z"))
+    if key not in _ROBOTS:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # they were shown during generation
+            _ROBOTS[key] = episode.scene().robot
+    return _ROBOTS[key]

@@ -33,15 +33,10 @@ from vkc_pin.importing.objects.sdf import read_object_sdf
 from vkc_pin.importing.objects.urdf import read_object_urdf
 from vkc_pin.importing.objects.writing import write_description, write_urdf
 from vkc_pin.importing.parsers import expand_xacro, uses_xacro
-from vkc_pin.importing.proposals.picture import plot_attachments
+from vkc_pin.importing.pictures import plot_attachments
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
-from vkc_pin.importing.scenes import (
-    locate_robot,
-    make_object_scene,
-    refer_to_robot,
-    write_scene,
-)
+from vkc_pin.importing.scenes import locate_robot, make_object_scene, refer_to_robot, write_scene
 from vkc_pin.importing.targets import check_target, get_origin_marker
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import (

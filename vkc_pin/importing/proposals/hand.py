@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.models.grippers.bar_width import (
+from vkc_pin.world.models.gripper import (
     BAR_THICKNESS,
     WIDEST_BAR,
     find_widest_bar,

@@ -11,16 +11,18 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.importing.proposals.candidates import Candidate, Piece, Thickness, find_candidates
-from vkc_pin.importing.proposals.fitting import GraspMotion, HandClearance, Obstruction
-from vkc_pin.importing.proposals.hand import make_hand
-from vkc_pin.importing.proposals.proposal import Proposal, Proposals
-from vkc_pin.importing.proposals.pushing import Push, find_pushes
-from vkc_pin.importing.proposals.ranking import (
+from vkc_pin.importing.proposals.fitting import (
+    GraspMotion,
+    HandClearance,
+    Obstruction,
     Opening,
     find_named_handles,
     find_openings,
     score_grasp,
 )
+from vkc_pin.importing.proposals.hand import make_hand
+from vkc_pin.importing.proposals.proposal import Proposal, Proposals
+from vkc_pin.importing.proposals.pushing import Push, find_pushes
 from vkc_pin.utils.arguments import check_instance, check_integer, check_number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.urdf import read_urdf

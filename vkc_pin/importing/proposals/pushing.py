@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.importing.proposals.candidates import Piece
-from vkc_pin.importing.proposals.ranking import Opening
+from vkc_pin.importing.proposals.fitting import Opening
 from vkc_pin.utils.arrays import Floats
 
 __all__ = ["Push", "find_pushes"]

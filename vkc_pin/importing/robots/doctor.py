@@ -12,9 +12,9 @@ import numpy as np
 from vkc_pin.errors import InputError
 from vkc_pin.importing.convex import compute_concavity
 from vkc_pin.importing.proposals.hand import Hand, has_fingers, make_hand
-from vkc_pin.importing.robots.envelopes import find_envelopes
-from vkc_pin.importing.robots.reach import (
+from vkc_pin.importing.robots.hand_checks import (
     TASK_HEIGHTS,
+    find_envelopes,
     find_grasp_heights,
     find_missing_tasks,
 )
@@ -22,9 +22,9 @@ from vkc_pin.importing.robots.rest_configuration import Clearances, find_insepar
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import check_integer, check_number
 from vkc_pin.world.files.meshes import load_mesh
-from vkc_pin.world.models.couplings.limits import DEFAULT_JOINT_VELOCITY, DEFAULT_SLIDE_VELOCITY
-from vkc_pin.world.models.dynamics.torque_limits import UNLIMITED
-from vkc_pin.world.models.grippers.bar_width import find_thickest_rod
+from vkc_pin.world.models.couplings import DEFAULT_JOINT_VELOCITY, DEFAULT_SLIDE_VELOCITY
+from vkc_pin.world.models.dynamics import UNLIMITED
+from vkc_pin.world.models.gripper import find_thickest_rod
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.models.shapes import compute_bounding_box

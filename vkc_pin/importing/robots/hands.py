@@ -13,7 +13,7 @@ import pinocchio as pin
 from vkc_pin.importing.robots.arms import Arm, Body, sample_points
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.urdf import UrdfFile
-from vkc_pin.world.models.grippers.bar_width import (
+from vkc_pin.world.models.gripper import (
     WIDEST_BAR,
     PlacedShape,
     find_thickest_rod,

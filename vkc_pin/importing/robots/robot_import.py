@@ -16,6 +16,7 @@ import pinocchio as pin
 import yaml
 
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.importing.pictures import plot_robot
 from vkc_pin.importing.robots.arms import (
     Arm,
     Body,
@@ -27,11 +28,13 @@ from vkc_pin.importing.robots.arms import (
     guess_base_kind,
 )
 from vkc_pin.importing.robots.doctor import Diagnosis, Finding, doctor
-from vkc_pin.importing.robots.envelopes import find_envelopes, remove_collision_shapes
+from vkc_pin.importing.robots.hand_checks import (
+    find_envelopes,
+    remove_collision_shapes,
+    should_reverse_tool,
+)
 from vkc_pin.importing.robots.hands import Hand, analyze_hand
 from vkc_pin.importing.robots.mesh_pieces import Piece, write_meshes
-from vkc_pin.importing.robots.picture import plot_robot
-from vkc_pin.importing.robots.reach import should_reverse_tool
 from vkc_pin.importing.robots.rest_configuration import (
     HOME_ROOM,
     Home,

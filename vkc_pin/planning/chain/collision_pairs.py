@@ -1,26 +1,36 @@
-"""Selects the collision pairs of each phase of a task and their margins (eqs. 6 and 7)."""
+"""Selects the collision pairs of each phase and their margins (eqs. 6 and 7), eased at contacts."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import combinations
 
+import coal
 import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain
-from vkc_pin.planning.chain.easing import REDUCED_MARGIN_RATIO, find_reduced_margins
-from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.budget import record_evaluations
-from vkc_pin.world.collision.margins import MarginRegion
-from vkc_pin.world.models.shapes import compute_bounding_box, get_link_name, get_local_name
+from vkc_pin.world.collision.boxes import Boxes
+from vkc_pin.world.collision.distances import MarginRegion, Margins
+from vkc_pin.world.models.shapes import (
+    compute_bounding_box,
+    compute_shape_distance,
+    compute_world_box,
+    get_link_name,
+    get_local_name,
+)
 from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions, make_shape_keys
 from vkc_pin.world.scene.contact_rules import (
     CONTACT_DEPTH,
+    CONTACT_WINDOW,
     compute_hand_clearance,
     find_grasped_link,
     find_touch_links,
@@ -28,11 +38,246 @@ from vkc_pin.world.scene.contact_rules import (
 )
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.scene.support import SupportedObject
 from vkc_pin.world.task.phases import Phase, Task
 
-__all__ = ["build_phase_geometries"]
+__all__ = [
+    "REDUCED_MARGIN_RATIO",
+    "PhaseGeometry",
+    "build_phase_geometries",
+    "find_reduced_margins",
+]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PhaseGeometry:
+    """Geometry and collision pairs of one phase.
+
+    Attributes:
+        shapes: Geometry of the robot, of attached links, then of all that is fixed in the world.
+        labels: Link or obstacle of each geometry, e.g. "wrist_3_link", "door.panel", "sofa".
+        pairs: Geometry indices, shape (P, 2); at least the first of each pair moves.
+        margins: Required clearance of each pair, shape (P,) [m].
+        joint: Parent joint of each geometry, shape (G,); 0: fixed in the world.
+        center, half: Bounding boxes in the geometries' frames, shape (G, 3) [m].
+        rotation, translation: Placements on the joints, shapes (G, 3, 3) and (G, 3).
+        reduced_margins: Pair → (first waypoint, last waypoint, margin [m] that applies between
+            them).
+        margin_regions: Joint ranges in which pairs are exempt from their margins.
+        released: Object → its geometries, for objects released where the motion chooses.
+    """
+
+    shapes: Sequence[pin.GeometryObject]
+    labels: tuple[str, ...]
+    pairs: Ints
+    margins: Floats
+    joint: Ints
+    center: Floats
+    half: Floats
+    rotation: Floats
+    translation: Floats
+    reduced_margins: Mapping[int, Sequence[tuple[int, int, float]]] = field(default_factory=dict)
+    margin_regions: Sequence[MarginRegion] = ()
+    released: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+
+    def with_placements(self, placements: Mapping[int, pin.SE3]) -> PhaseGeometry:
+        """Return a copy with some static geometries at other placements in the world."""
+        shapes = list(self.shapes)
+        rotation, translation = self.rotation.copy(), self.translation.copy()
+        for geometry, placement in placements.items():
+            shapes[geometry] = pin.GeometryObject(shapes[geometry])
+            shapes[geometry].placement = placement
+            rotation[geometry], translation[geometry] = placement.rotation, placement.translation
+        moved = replace(self, shapes=tuple(shapes), rotation=rotation, translation=translation)
+        for name in ("_n_moving", "_pair_numbers", "margin_table"):  # independent of the placements
+            moved.__dict__[name] = getattr(self, name)
+        which = np.array(list(placements), int)
+        moved.__dict__["boxes"] = self.boxes.move_fixed(
+            which, rotation[which], moved._box_centers[which]
+        )
+        return moved
+
+    def find_static_near(self, reach: float, lower: Floats, upper: Floats) -> Ints:
+        """Return static geometries within `reach` [m] of a box with given corners, (3,)."""
+        lows, highs = self._static_boxes
+        near = (lows < (upper + reach)[:, None]) & (highs > (lower - reach)[:, None])
+        return np.flatnonzero(near.all(axis=0)) + self._n_moving
+
+    def find_pairs(self, first: int, seconds: Ints) -> Ints:
+        """Return the existing pairs of a moving geometry with some static ones."""
+        numbers = self._pair_numbers[first, seconds - self._n_moving]
+        return numbers[numbers >= 0]
+
+    @cached_property
+    def margin_table(self) -> Margins:
+        """Margins of all pairs with their exceptions."""
+        return Margins(self.margins, self.reduced_margins, self.margin_regions)
+
+    @cached_property
+    def _n_moving(self) -> int:
+        """Number of geometries on joints; these come first, the others are static."""
+        return int(np.count_nonzero(self.joint))
+
+    @cached_property
+    def _box_centers(self) -> Floats:
+        """Centre of each geometry's box in its joint's frame, shape (G, 3) [m]."""
+        return np.einsum("gij,gj->gi", self.rotation, self.center) + self.translation
+
+    @cached_property
+    def boxes(self) -> Boxes:
+        """Boxes of all geometries, for the broad phase."""
+        return Boxes(self.joint, self.rotation, self._box_centers, self.half, self.pairs)
+
+    @cached_property
+    def _pair_numbers(self) -> Ints:
+        """Pair number of each moving with each static geometry, shape (M, S); -1: no pair."""
+        moving = self._n_moving
+        number = np.full((moving, len(self.joint) - moving), -1)
+        (standing,) = np.nonzero(self.joint[self.pairs[:, 1]] == 0)
+        number[self.pairs[standing, 0], self.pairs[standing, 1] - moving] = standing
+        return number
+
+    @cached_property
+    def _static_boxes(self) -> tuple[Floats, Floats]:
+        """Lower and upper corners of the static axis-aligned boxes, shape (3, S) each [m]."""
+        standing = slice(self._n_moving, None)
+        extents = np.einsum("gij,gj->gi", np.abs(self.rotation[standing]), self.half[standing])
+        return (self._box_centers[standing] - extents).T, (self._box_centers[standing] + extents).T
+
+
+REDUCED_MARGIN_RATIO = 0.5  # margin relative to the distance at the contact
+
+ReducedMargins = dict[int, list[tuple[int, int, float]]]
+# geometry of the chain, shape and placement at a contact, whether it is at the begin of the phase,
+# and whether the shapes may overlap
+_Contact = tuple[int, coal.CollisionGeometry, pin.SE3, bool, bool]
+
+
+def find_reduced_margins(
+    scene: Scene,
+    chain: VirtualKinematicChain,
+    task: Task,
+    number: int,
+    part: PhaseGeometry,
+    options: Options,
+) -> ReducedMargins:
+    """Return pair → (first waypoint, last waypoint, margin [m]) of temporarily reduced margins.
+
+    A hand keeps the attachment's clearance from what it grasps or releases. A free object is close
+    to its support where it is lifted and placed, and so are the objects it supports; a frame that
+    touches a target is close to the surface there. The margin then is half the distance at the
+    contact. An initial penetration of a grasped object is allowed at the start. See
+    `world.scene.contact_rules`.
+    """
+    phase, reduced = task.phases[number], ReducedMargins()
+    first, steps = sum(p.segments for p in task.phases[:number]), options.steps(CONTACT_WINDOW)
+    last = first + phase.segments
+    windows = {True: (first, first + steps), False: (last - steps, last)}
+    for holds, begins in ((phase.released, True), (phase.grasps, False)):
+        for hold in holds:
+            is_hand = np.isin(part.labels, list(find_touch_links(scene, hold)))
+            is_object = np.array([label.startswith(f"{hold.object}.") for label in part.labels])
+            found = np.flatnonzero(is_hand[part.pairs[:, 0]] & is_object[part.pairs[:, 1]])
+            for k in found.tolist():
+                margin = compute_hand_clearance(scene, hold, part.labels[part.pairs[k, 1]], options)
+                reduced.setdefault(k, []).append((*windows[begins], margin))
+    reach = float(part.margins.max())
+    for moving, shape, where, begins, may_overlap in itertools.chain(
+        _find_supports(scene, chain, task, number, part), _find_touches(chain, task, number, part)
+    ):
+        nearby = part.find_static_near(reach, *compute_world_box(shape, where))
+        for k in part.find_pairs(moving, nearby).tolist():
+            other = part.shapes[int(part.pairs[k, 1])]
+            distance = compute_shape_distance(shape, where, other.geometry, other.placement)
+            margin = REDUCED_MARGIN_RATIO * max(distance, 0.0)
+            if may_overlap and distance < -CONTACT_DEPTH:
+                margin = distance
+            if distance < part.margins[k]:
+                reduced.setdefault(k, []).append((*windows[begins], margin))
+    return reduced
+
+
+def _find_touches(
+    chain: VirtualKinematicChain, task: Task, number: int, part: PhaseGeometry
+) -> Iterator[_Contact]:
+    """Yield geometry that touches a target at the end or the begin of a phase."""
+    before = task.phases[number - 1].frames if number else ()
+    goals = [(goal, False) for goal in task.phases[number].frames]
+    for goal, begins in (*goals, *((goal, True) for goal in before)):
+        if not goal.touches:
+            continue
+        point, where = coal.Sphere(1e-4), pin.SE3(np.eye(3), goal.placement.translation)
+        joint, _ = chain.frame(goal.frame, goal.hold)
+        for i in range(len(chain.collision.geometryObjects)):
+            if part.labels[i] == str(goal) if goal.hold else part.shapes[i].parentJoint == joint:
+                yield i, point, where, begins, False
+
+
+def _find_supports(
+    scene: Scene, chain: VirtualKinematicChain, task: Task, number: int, part: PhaseGeometry
+) -> Iterator[_Contact]:
+    """Yield geometry of objects that are lifted or placed; initially they may overlap others."""
+    earlier = {hold.object for phase in task.phases[:number] for hold in phase.held}
+    for geometries, placed, begins in _find_lift_and_place_moments(scene, chain, task, number):
+        placements = {shape.name: shape.placement for shape in make_world_shapes(placed)}
+        for i in geometries:
+            where = placements[get_local_name(part.shapes[i].name)]
+            may_overlap = begins and placed.name not in earlier
+            yield i, part.shapes[i].geometry, where, begins, may_overlap
+
+
+def _find_lift_and_place_moments(
+    scene: Scene, chain: VirtualKinematicChain, task: Task, number: int
+) -> Iterator[tuple[Sequence[int], PlacedObject, bool]]:
+    """Yield geometries, their object as placed, and whether it is lifted or placed then.
+
+    These are the objects whose transport begins (True) or ends (False) in a phase. Transport of an
+    object held at the start begins in the first phase.
+    """
+    phase = task.phases[number]
+    at_start = {
+        hold: scene.objects[hold.object].placement
+        for hold in phase.held
+        if number == 0 and hold in scene.holds
+    }
+    for moments, begins in ((at_start, True), (phase.lifted, True), (phase.lowered, False)):
+        for hold, placement in moments.items():
+            if not scene.objects[hold.object].object.free:
+                continue
+            placed = dataclasses.replace(scene.objects[hold.object], placement=placement)
+            yield chain.held_geometries[hold], placed, begins
+            for ride in phase.supported:
+                if ride.hold == hold:
+                    supported = _place_supported_object(scene, ride, placed)
+                    yield chain.ride_geometries[ride], supported, begins
+    for ride in phase.supported:
+        carrier = scene.objects[ride.hold.object]
+        if not carrier.object.free:
+            goals = {c: float(np.clip(v, *phase.ranges[c])) for c, v in phase.values.items()}
+            final_values = {**phase.initial_values, **goals}
+            for state, begins in ((phase.initial_values, True), (final_values, False)):
+                placed = _with_joint_positions(carrier, state)
+                placed = _place_supported_object(scene, ride, placed)
+                yield chain.ride_geometries[ride], placed, begins
+
+
+def _place_supported_object(
+    scene: Scene, ride: SupportedObject, carrier: PlacedObject
+) -> PlacedObject:
+    """Return the supported object, placed on its carrier."""
+    return dataclasses.replace(
+        scene.objects[ride.object],
+        placement=carrier.link_placement(ride.link) * ride.placement_in_link,
+    )
+
+
+def _with_joint_positions(placed: PlacedObject, state: Mapping[str, float]) -> PlacedObject:
+    """Return an object with those of the positions "<object>.<joint>" that are its own."""
+    return placed.with_state(
+        {c.partition(".")[2]: v for c, v in state.items() if c.partition(".")[0] == placed.name}
+    )
 
 
 def build_phase_geometries(

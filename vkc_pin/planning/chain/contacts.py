@@ -19,13 +19,11 @@ from numpy.typing import NDArray
 
 from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain
-from vkc_pin.planning.chain.collision_pairs import build_phase_geometries
-from vkc_pin.planning.chain.phase_geometry import PhaseGeometry
+from vkc_pin.planning.chain.collision_pairs import PhaseGeometry, build_phase_geometries
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.budget import record_evaluations
-from vkc_pin.world.collision.clearances import Clearances
-from vkc_pin.world.collision.placements import ShapePlacements
-from vkc_pin.world.collision.shapes import Shapes
+from vkc_pin.world.collision.distances import Clearances, Shapes
+from vkc_pin.world.collision.solids import ShapePlacements
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task

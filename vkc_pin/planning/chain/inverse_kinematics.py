@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.planning.chain.kinematics import get_kinematics
+from vkc_pin.planning.chain.chain import get_kinematics
 from vkc_pin.planning.chain.pose import PoseRow, build_pose_residual, flatten_target
 from vkc_pin.planning.kinematics.batch import BatchFunction
 from vkc_pin.utils.arrays import Bools, Floats

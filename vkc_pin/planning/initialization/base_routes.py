@@ -15,7 +15,7 @@ from vkc_pin.planning.base_paths.grid import BaseGrid, compute_fine_cell_count
 from vkc_pin.planning.initialization.keyframes import SIMILARITY_TOLERANCE, compute_shortfall
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.world.collision.threads import count_threads
+from vkc_pin.world.collision.solids import count_threads
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.obstacles import FLOOR
 

@@ -13,13 +13,13 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.planning.chain.kinematics import get_kinematics
+from vkc_pin.planning.chain.chain import get_kinematics
 from vkc_pin.planning.kinematics.batch import estimate_size
 from vkc_pin.planning.nlp.sparse import assemble
 from vkc_pin.utils.arrays import Ints
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.task.formula import Formula
+from vkc_pin.world.task.terms import Formula
 
 __all__ = ["FrameLocation", "TermLocation", "TermProgram", "TermRow", "Tree", "Value"]
 

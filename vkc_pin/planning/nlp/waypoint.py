@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.planning.chain.kinematics import get_kinematics
+from vkc_pin.planning.chain.chain import get_kinematics
 from vkc_pin.planning.chain.pose import POSE_OFFSET_SIZE, PoseRow, build_pose_rows, relax_target
 from vkc_pin.planning.kinematics.batch import estimate_size
 from vkc_pin.planning.kinematics.machine_code import MachineCode

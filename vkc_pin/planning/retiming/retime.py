@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vkc_pin.planning.base_paths.arcs import interpolate_arcs
-from vkc_pin.planning.retiming.jerk_limits import limit_jerk
-from vkc_pin.planning.retiming.limits import Limits
+from vkc_pin.planning.retiming.limits import Limits, limit_jerk
 from vkc_pin.planning.retiming.spline_path import fit_path
 from vkc_pin.planning.retiming.topp_ra import compute_speeds
 from vkc_pin.planning.retiming.torque_bounds import TorqueBounds
@@ -20,7 +19,7 @@ from vkc_pin.planning.retiming.wheeled_paths import compute_slip, fit_rolling_pa
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.curve import MIN_INTERVAL, Curve, concatenate_curves, sample_intervals
-from vkc_pin.world.trajectory.dynamics.torques import Torques
+from vkc_pin.world.trajectory.torques import Torques
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.wheels import RollingLimits, make_rolling_limits
 

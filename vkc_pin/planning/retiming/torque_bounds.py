@@ -8,7 +8,7 @@ import numpy as np
 
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.trajectory.curve import Curve
-from vkc_pin.world.trajectory.dynamics.torques import Torques, sample_curve
+from vkc_pin.world.trajectory.torques import Torques, sample_curve
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline

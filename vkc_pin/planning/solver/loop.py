@@ -19,6 +19,7 @@ from vkc_pin.planning.nlp.merit import (
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.solver.segment_planes import (
     SegmentContacts,
+    find_new_crossings,
     find_segment_contacts,
     merge_contacts,
 )
@@ -32,7 +33,6 @@ from vkc_pin.planning.solver.trust_region import (
     TrustRegion,
     is_step_acceptable,
 )
-from vkc_pin.planning.solver.tunnelling import find_new_crossings
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.budget import STOP_STATUSES, BudgetExhaustedError, record_evaluations
 

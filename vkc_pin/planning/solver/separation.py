@@ -10,8 +10,7 @@ import numpy as np
 
 from vkc_pin.planning.chain.contacts import Contacts, make_empty_contacts
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.solver.segment_planes import merge_contacts
-from vkc_pin.planning.solver.tunnelling import Crossing
+from vkc_pin.planning.solver.segment_planes import Crossing, merge_contacts
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.world.models.shapes import triangulate
 

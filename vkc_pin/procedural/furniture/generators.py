@@ -6,8 +6,14 @@ import math
 
 import numpy as np
 
-from vkc_pin.procedural.furniture.building import LinkBuilder, ObjectBuilder, Sampler
-from vkc_pin.procedural.furniture.handles import add_knob, add_level_bar, add_upright_bar
+from vkc_pin.procedural.furniture.building import (
+    LinkBuilder,
+    ObjectBuilder,
+    Sampler,
+    add_knob,
+    add_level_bar,
+    add_upright_bar,
+)
 
 __all__ = [
     "make_cabinet",

@@ -1,7 +1,4 @@
-"""Finds pairs of shapes that may be close, from their bounding boxes, at many configurations.
-
-`clearances` runs the same test inside its compiled loop; this module exposes it separately.
-"""
+"""Finds pairs of shapes that may be close, from their bounding boxes."""
 
 from __future__ import annotations
 
@@ -9,11 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.world.collision.solids import load_compiled
-from vkc_pin.world.collision.threads import count_threads
+from vkc_pin.utils.arrays import Bools, Floats, Ints
+from vkc_pin.world.collision.solids import count_threads, load_compiled
 
-__all__ = ["Boxes"]
+__all__ = ["Boxes", "WorldBoxes"]
 
 _MIN_ROWS_PER_THREAD = 32  # configurations, about 0.2 ms: fewer do not pay for another thread
 
@@ -81,3 +77,62 @@ class Boxes:
             reach, rotations, translations, include_fixed, threads
         )
         return np.asarray(rows), np.asarray(pairs), np.asarray(gaps)
+
+
+class WorldBoxes:
+    """Axis-aligned boxes in the world frame: of M moving shapes at W states, and of S fixed ones.
+
+    Args:
+        lower, upper: Corners of the moving shapes' boxes, shape (W, M, 3) [m].
+        fixed_lower, fixed_upper: Corners of the fixed shapes' boxes, shape (S, 3) [m].
+    """
+
+    def __init__(
+        self, lower: Floats, upper: Floats, fixed_lower: Floats, fixed_upper: Floats
+    ) -> None:
+        corners = (
+            np.ascontiguousarray(part, float) for part in (lower, upper, fixed_lower, fixed_upper)
+        )
+        self.compiled: Any = load_compiled().WorldBoxes(*corners)
+
+    def find_close_pairs(
+        self,
+        first: Ints,
+        last: Ints,
+        pairs: Ints,
+        *,
+        moved: Floats,
+        moves: Bools,
+        phases: Ints,
+        limit: float,
+    ) -> tuple[Ints, Ints]:
+        """Return all pairs that may come closer than `limit` during an interval.
+
+        With b and b' the distances of the boxes at the ends of an interval, two shapes are at least
+        (b + b' − relative motion) / 2 apart during it.
+
+        Args:
+            first: State at the start of each interval, shape (K,).
+            last: State at its end, shape (K,); equal without motion.
+            pairs: Pairs of shape indices, shape (P, 2).
+            moved: Largest motion of a point of each shape in each interval, shape (K, M + S) [m].
+            moves: Whether each shape moves in each phase, shape (phases, M + S). Pairs without
+                motion are omitted.
+            phases: Phase of each interval, shape (K,).
+            limit: Distance [m].
+
+        Returns:
+            Indices of interval and pair, shape (C,) each, sorted by interval, then by pair.
+        """
+        numbers = (
+            np.ascontiguousarray(part, np.int64)
+            for part in (np.column_stack([first, last]), phases)
+        )
+        flags, rows = (
+            np.ascontiguousarray(moves).view(np.uint8),
+            np.ascontiguousarray(pairs, np.int64),
+        )
+        intervals, which = self.compiled.near(
+            *numbers, flags, rows, np.ascontiguousarray(moved, float), limit
+        )
+        return np.asarray(intervals), np.asarray(which)

@@ -1,8 +1,10 @@
-"""Converts coal shapes to their counterparts in the compiled module."""
+"""Converts coal shapes and their placements to the arrays of the compiled module."""
 
 from __future__ import annotations
 
+import os
 import weakref
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -13,9 +15,28 @@ import pinocchio as pin
 from vkc_pin.errors import BuildError, InputError
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import REBUILD_HINT, import_compiled
+from vkc_pin.utils.system import count_cores
 from vkc_pin.world.files.meshes import get_triangles
 
-__all__ = ["convert_solid", "load_compiled"]
+__all__ = [
+    "ShapePlacements",
+    "convert_solid",
+    "count_threads",
+    "flatten_placements",
+    "load_compiled",
+]
+
+_MAX_THREADS = 8
+
+
+def count_threads() -> int:
+    """Return the number of threads to use.
+
+    That is the number of cores available to this process, limited to 8 and to `OMP_NUM_THREADS`.
+    """
+    requested = os.environ.get("OMP_NUM_THREADS", "")
+    cores = count_cores()
+    return max(1, min(int(requested) if requested.isdigit() else cores, cores, _MAX_THREADS))
 
 
 @cache
@@ -90,3 +111,46 @@ def _convert_cached(shape: Any, points: Floats, radius: float) -> Any:
     )
     _cache[key] = (weakref.ref(shape, lambda _: _cache.pop(key, None)), content, radius, solid)
     return solid
+
+
+_SIZE = 12
+
+
+def flatten_placements(placements: Sequence[pin.SE3]) -> Floats:
+    """Return placements as rows of numbers, shape (n, 12).
+
+    Each row has the columns of the rotation, then the translation [m].
+    """
+    rows = np.empty((len(placements), _SIZE))
+    for row, placement in zip(rows, placements, strict=True):
+        row[:9], row[9:] = placement.rotation.T.ravel(), placement.translation
+    return rows
+
+
+class ShapePlacements:
+    """Forward kinematics of the shapes of a model, equal to Pinocchio's bit for bit.
+
+    Args:
+        model: The model.
+        geometry: The M shapes on its joints.
+    """
+
+    def __init__(self, model: pin.Model, geometry: pin.GeometryModel) -> None:
+        shapes, serialized = geometry.geometryObjects, pin.serialization.StreamBuffer()
+        model.saveToBinary(serialized)
+        content = bytes(serialized.view())  # tobytes() would leak a view at every call
+        joints = np.array([shape.parentJoint for shape in shapes], np.int64)
+        self.compiled: Any = load_compiled().Bodies(
+            content, joints, flatten_placements([shape.placement for shape in shapes])
+        )
+
+    def compute_placements(self, q: Floats) -> Floats:
+        """Return the placements of the shapes in the world frame, shape (W, M, 12).
+
+        Args:
+            q: Pinocchio configurations, shape (W, nq).
+
+        Returns:
+            Placements in the format of `flatten_placements`.
+        """
+        return np.asarray(self.compiled.placements(q), float)

@@ -18,8 +18,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_array, check_choice, check_number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.models.dynamics.joint_resistance import Resistance
-from vkc_pin.world.models.dynamics.mass import compute_mass
+from vkc_pin.world.models.dynamics import Resistance, compute_mass
 
 __all__ = [
     "DEFAULT_ACCELERATION",

@@ -37,8 +37,7 @@ from vkc_pin.world.models.articulated_object import (
     Latch,
 )
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.models.dynamics.joint_resistance import ObjectJointSchema, read_resistances
-from vkc_pin.world.models.dynamics.mass import set_mass
+from vkc_pin.world.models.dynamics import ObjectJointSchema, read_resistances, set_mass
 from vkc_pin.world.models.grafting import round_placement
 
 __all__ = [

@@ -19,9 +19,9 @@ from vkc_pin.utils.arguments import check_integer
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.models.dynamics.torque_limits import TorqueLimits, compute_torque_limits
+from vkc_pin.world.models.dynamics import TorqueLimits, compute_torque_limits
 from vkc_pin.world.models.grafting import round_placement
-from vkc_pin.world.models.grippers.gripper import Gripper
+from vkc_pin.world.models.gripper import Gripper
 from vkc_pin.world.models.robot_model import load_visual_geometry
 from vkc_pin.world.models.robot_schema import Wheels
 from vkc_pin.world.models.shapes import compute_shape_distance, get_link_name, triangulate

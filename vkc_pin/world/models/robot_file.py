@@ -19,9 +19,12 @@ from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.srdf import Srdf, find_group_tip, read_srdf
 from vkc_pin.world.files.urdf import UrdfFile, read_urdf
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.models.couplings.coupled_joints import apply_couplings
-from vkc_pin.world.models.couplings.limits import apply_robot_limits, tighten_coupled_limits
-from vkc_pin.world.models.grippers.gripper import build_gripper
+from vkc_pin.world.models.couplings import (
+    apply_couplings,
+    apply_robot_limits,
+    tighten_coupled_limits,
+)
+from vkc_pin.world.models.gripper import build_gripper
 from vkc_pin.world.models.robot import Base, Robot
 from vkc_pin.world.models.robot_model import (
     build_full_model,

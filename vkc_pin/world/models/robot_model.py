@@ -12,13 +12,14 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.meshes import load_parts, make_bvh
 from vkc_pin.world.files.urdf import UrdfFile, UrdfShape, build_model
-from vkc_pin.world.models.couplings.coupled_joints import (
+from vkc_pin.world.models.couplings import (
     JointCoupling,
+    add_mimics,
     find_coupled_groups,
     find_followers,
     find_joint_path,
+    sort_joints,
 )
-from vkc_pin.world.models.couplings.mimic_joints import add_mimics, sort_joints
 from vkc_pin.world.models.grafting import add_joint, round_placement
 
 __all__ = [

@@ -20,7 +20,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Bools, Floats
-from vkc_pin.world.collision.shapes import Shapes
+from vkc_pin.world.collision.distances import Shapes
 from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box, get_link_name
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import (

@@ -13,7 +13,7 @@ from vkc_pin.errors import UnknownNameError
 from vkc_pin.utils.arguments import check_mapping, check_number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.pickling import freeze
-from vkc_pin.world.collision.placements import flatten_placements
+from vkc_pin.world.collision.solids import flatten_placements
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.world.models.shapes import (
     clamp_to_limits,

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.grafting import graft, graft_geometry
-from vkc_pin.world.models.grippers.gripper import Gripper
+from vkc_pin.world.models.gripper import Gripper
 from vkc_pin.world.models.shapes import get_link_name
 from vkc_pin.world.scene.clearance_exemptions import make_shape_keys
 from vkc_pin.world.scene.contact_rules import compute_start_opening

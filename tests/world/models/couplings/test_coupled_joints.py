@@ -10,7 +10,7 @@ from helpers.telescopes import format_joint, format_link, write_telescope
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.files.urdf import read_urdf
-from vkc_pin.world.models.couplings.coupled_joints import JointCoupling, find_followers
+from vkc_pin.world.models.couplings import JointCoupling, find_followers
 
 
 def write_chain(tmp_path: Path, *contents: str, kinds: str = "prismatic") -> Path:

@@ -14,8 +14,7 @@ import vkc_pin as vkc
 from vkc_pin.planning import kinematics as cpin
 from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.models.couplings.coupled_joints import find_followers
-from vkc_pin.world.models.couplings.limits import tighten_coupled_limits
+from vkc_pin.world.models.couplings import find_followers, tighten_coupled_limits
 from vkc_pin.world.models.robot_model import (
     build_full_model,
     build_planned_model,

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.models.dynamics.joint_resistance import Resistance
+from vkc_pin.world.models.dynamics import Resistance
 
 TAIL = "attachments: []\n"
 REAL = st.floats(-1e3, 1e3)

@@ -11,7 +11,7 @@ import yaml
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
-from vkc_pin.world.models.dynamics.torque_limits import TorqueLimits, compute_torque_limits
+from vkc_pin.world.models.dynamics import TorqueLimits, compute_torque_limits
 from vkc_pin.world.models.robot import Robot
 
 

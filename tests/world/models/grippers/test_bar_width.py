@@ -5,7 +5,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin.world.models.grippers.bar_width import WIDTH_TOLERANCE, check_bar_fits, find_widest_bar
+from vkc_pin.world.models.gripper import WIDTH_TOLERANCE, check_bar_fits, find_widest_bar
 
 
 def make_walls(left: float, right: float) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:

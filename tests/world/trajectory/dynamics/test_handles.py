@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.world.trajectory.dynamics.handles import Handle, Motion
+from vkc_pin.world.trajectory.torques import Handle, Motion
 
 REAL = st.floats(-1.0, 1.0)
 

@@ -9,7 +9,7 @@ from helpers.door_closers import replace_object_fields
 
 import vkc_pin as vkc
 from vkc_pin.world.trajectory.curve import Curve
-from vkc_pin.world.trajectory.dynamics.torques import Torques
+from vkc_pin.world.trajectory.torques import Torques
 from vkc_pin.world.trajectory.trajectory import PhaseSpan, Trajectory
 from vkc_pin.world.trajectory.world_model import World
 

@@ -1,1 +1,0 @@
-"""Measures and simulates the generation of datasets."""

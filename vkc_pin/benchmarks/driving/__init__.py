@@ -1,1 +1,0 @@
-"""How robots drive: kinds of base beside each other."""

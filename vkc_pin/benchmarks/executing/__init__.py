@@ -1,1 +1,0 @@
-"""Plans of the experiments' tasks, executed in physics."""

@@ -1,0 +1,576 @@
+"""Defines recipes of datasets and their terms; a recipe and a number determine an episode."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.options import Options
+from vkc_pin.procedural.rooms.fixtures import list_openable_types
+from vkc_pin.procedural.rooms.parts import CARRIED
+from vkc_pin.procedural.rooms.random_room import RoomSettings
+from vkc_pin.simulation.cameras import BASE, HAND, Camera, resolve_frame
+from vkc_pin.utils.arguments import check_choice, check_mapping
+from vkc_pin.world.files.documents import Document, parse_document, read_yaml
+from vkc_pin.world.files.fields import (
+    Name,
+    NonNegative,
+    Number,
+    Positive,
+    Schema,
+    Vector3,
+    require,
+    require_length,
+    wrap_text,
+)
+from vkc_pin.world.files.resources import find_file, list_resources
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.robot_file import find_robot
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.terms import (
+    Constraint,
+    State,
+    Term,
+    rename_term,
+    term_from_dict,
+    term_to_dict,
+    trace_terms_without_scene,
+)
+
+__all__ = [
+    "CAMERAS",
+    "OBJECT",
+    "TASKS",
+    "CameraSchema",
+    "GoalSchema",
+    "KeepOutSchema",
+    "Recipe",
+    "RecipeSchema",
+    "RobotEntry",
+    "RoomsSchema",
+    "SpeedSchema",
+    "StartSchema",
+    "TermSchema",
+    "TracedSchema",
+    "UprightSchema",
+    "check_entries",
+    "check_robot",
+    "get_robot_name",
+    "load_recipe",
+    "make_entries",
+    "resolve_terms",
+]
+
+OBJECT = "object"
+"""Frame of the grasped link, and the grasped object in `holding`."""
+
+Axis = Annotated[
+    Vector3,
+    require(lambda value: math.hypot(*value) > 0.0, "no direction", "an axis of some length"),
+]
+Size = Annotated[tuple[Positive, Positive, Positive], require_length(3)]
+
+
+class _Entry(Schema):
+    """A term: its name, and the tasks in which it holds; all if there are none."""
+
+    name: str | None = None
+    tasks: tuple[str, ...] = ()
+
+    def term(self) -> Term:
+        """Return the term with frames `BASE`, `HAND`, `OBJECT`, or frames by name."""
+        raise NotImplementedError
+
+
+class _Framed(_Entry):
+    type: str
+    frame: str = HAND
+    held: bool = False
+
+    @property
+    def called(self) -> str:
+        """Name in reports."""
+        return self.name or f"{self.type} {self.frame}"
+
+    @property
+    def holding(self) -> str | None:
+        """Object that must be grasped for it."""
+        return OBJECT if self.held else None
+
+
+class UprightSchema(_Framed):
+    """Limits the angle of a frame's axis from the vertical [rad]."""
+
+    type: Literal["upright"]
+    axis: Axis = (0.0, 0.0, 1.0)
+    angle: Annotated[Positive, Field(lt=math.pi)] = 0.2
+
+    def term(self) -> Term:
+        """Return the constraint on the vertical component of the axis."""
+        unit = [value / math.hypot(*self.axis) for value in self.axis]
+
+        def rises(s: State) -> Any:
+            return sum(value * s.rotation(self.frame)[2, k] for k, value in enumerate(unit))
+
+        return Constraint(self.called, rises, lower=math.cos(self.angle), holding=self.holding)
+
+
+class SpeedSchema(_Framed):
+    """Limits the speed of a frame's origin [m/s]."""
+
+    type: Literal["speed"]
+    most: Positive
+
+    def term(self) -> Term:
+        """Return the constraint on the speed."""
+
+        def speed(s: State) -> Any:
+            moved = s.velocity(self.frame)
+            return (moved.T @ moved) ** 0.5
+
+        return Constraint(self.called, speed, upper=self.most, holding=self.holding)
+
+
+class KeepOutSchema(_Framed):
+    """Keeps the origin of a frame out of a box in the world frame."""
+
+    type: Literal["keep-out"]
+    position: Vector3
+    size: Size
+
+    def term(self) -> Term:
+        """Return the constraint on the largest distance outside along an axis of the box [m]."""
+
+        def outside(s: State) -> Any:
+            away = s.position(self.frame)
+            x, y, z = ((away[k] - self.position[k]).fabs() - self.size[k] / 2.0 for k in range(3))
+            return x.fmax(y).fmax(z)
+
+        return Constraint(self.called, outside, lower=0.0, holding=self.holding)
+
+
+class TracedSchema(_Entry):
+    """A constraint or cost as recorded arithmetic operations."""
+
+    type: Literal["traced"]
+    traced: dict[str, Any]
+
+    def term(self) -> Term:
+        """Return the term."""
+        return term_from_dict(self.traced)
+
+
+TermSchema = Annotated[
+    UprightSchema | SpeedSchema | KeepOutSchema | TracedSchema, Field(discriminator="type")
+]
+Entry = UprightSchema | SpeedSchema | KeepOutSchema | TracedSchema
+
+
+def make_entries(terms: Sequence[Term]) -> list[dict[str, Any]]:
+    """Return terms as plain entries of a recipe.
+
+    Raises:
+        InputError: They are no terms, or name phases, which are not known yet.
+    """
+    for term in (found := trace_terms_without_scene(terms)):
+        if term.during is not None:
+            expected = (
+                f"holding={OBJECT!r}, or nothing: phases are called after objects that are drawn"
+            )
+            raise term.make_error("phases are not known yet", "during", expected, list(term.during))
+    return [{"type": "traced", "traced": term_to_dict(term)} for term in found]
+
+
+def check_entries(document: Document, entries: Sequence[Entry], tasks: Sequence[str]) -> None:
+    """Check the terms of a recipe.
+
+    Raises:
+        InputError: A term is wrong, or two have one name; the error names file, line and field.
+    """
+    names: list[str] = []
+    for k, entry in enumerate(entries):
+        for j, task in enumerate(entry.tasks):
+            if task not in tasks:
+                raise document.make_unknown_name_error(
+                    ("terms", k, "tasks", j), "task", task, tasks
+                )
+        with document.annotate_errors(("terms", k)):
+            (term,) = trace_terms_without_scene([entry.term()])
+        if term.name in names:
+            raise document.make_error(
+                ("terms", k), "two terms of one name", expected="another `name`", got=term.name
+            )
+        names.append(term.name)
+
+
+def check_robot(robot: Robot, terms: Sequence[Term]) -> None:
+    """Check that a robot has the frames and coordinates of terms, except those of objects.
+
+    Raises:
+        UnknownNameError: It lacks one.
+    """
+    frames = sorted(
+        {BASE, HAND, OBJECT, *(str(frame.name) for frame in robot.model.frames)} - {"universe"}
+    )
+    for term in terms:
+        where = f"terms[{term.name!r}]"
+        for frame in (name for name in term.formula.frames if "." not in name):
+            check_choice(frame, frames, f"frame of {robot.name}", where)
+        for coordinate in (name for name in term.formula.coordinates if "." not in name):
+            check_choice(coordinate, robot.coordinates.names, f"coordinate of {robot.name}", where)
+
+
+def resolve_terms(
+    terms: Sequence[Term], scene: Scene, name: str, attachment: str
+) -> tuple[Term, ...]:
+    """Return terms with the frames of a scene.
+
+    Args:
+        terms: Terms with `BASE`, `HAND` and `OBJECT`.
+        scene: Scene.
+        name: Object of the episode.
+        attachment: Attachment that is grasped.
+    """
+    link = scene.objects[name].object.attachments[attachment].link
+    frames = {word: resolve_frame(scene.robot, word) for word in (BASE, HAND)} | {
+        OBJECT: f"{name}.{link}"
+    }
+    return tuple(rename_term(term, frames, {OBJECT: name}) for term in terms)
+
+
+TASKS = ("given-open", "drive-open", "fetch-place")
+"""Tasks of episodes: open an object from a given grasp, drive there and open it, or move an object
+to another table."""
+
+_increasing = require(
+    lambda value: value[0] <= value[1], "the interval is empty", "[lowest, highest]"
+)
+_share = require(
+    lambda value: value[0] > 0.0 and value[1] <= 1.0, "out of range", "shares above 0 and up to 1"
+)
+Interval = Annotated[tuple[Number, Number], require_length(2), _increasing]
+Share = Annotated[Interval, _share]
+Whole = Annotated[int, Field(strict=True, ge=1, le=10**9)]
+Several = Annotated[int, Field(strict=True, ge=1, le=1000)]  # attempts of a process at a time
+Pixels = Annotated[int, Field(strict=True, ge=8, le=2048)]
+Names = Annotated[tuple[str, ...], require(lambda value: value, "there is nothing", "at least one")]
+
+
+class RobotEntry(Schema):
+    """A robot by name or path, and the height of its root link [m]; None for its default."""
+
+    name: str
+    height: Number | None = None
+
+
+class RoomsSchema(Schema):
+    """Random rooms: `count` numbers from `first`, or ever new ones, and ranges of their properties.
+
+    `episodes` consecutive episodes share a room and a robot, to save time.
+    """
+
+    count: Whole | None = 50
+    first: Annotated[int, Field(strict=True, ge=0, le=10**9)] = 0
+    episodes: Several = 4
+    objects: Annotated[int, Field(strict=True, ge=1, le=3)] = 2
+    clutter: Interval = (0.0, 0.4)
+    width: Interval = (5.5, 8.0)
+    front: Number = 1.8
+
+
+class StartSchema(Schema):
+    """Ranges of the distance of the base from its goal and of arm joints from home [m, rad]."""
+
+    distance: Interval = (0.0, 10.0)
+    arm: NonNegative = 0.0
+
+
+class GoalSchema(Schema):
+    """Ranges of the share of a joint's range, and of the distance from a table's edge [m]."""
+
+    share: Share = (0.35, 0.65)
+    edge: Interval = (0.1, 0.3)
+
+
+class CameraSchema(Schema):
+    """A camera on the robot; see `Camera`."""
+
+    name: Name
+    frame: str = BASE
+    position: Vector3
+    target: Vector3
+    up: Vector3 = (0.0, 0.0, 1.0)
+    width: Pixels = 128
+    height: Pixels = 128
+    fov: Annotated[Positive, Field(lt=180.0)] = 60.0
+
+
+CAMERAS = (
+    {
+        "name": "head",
+        "frame": BASE,
+        "position": [0.0, 0.0, 1.5],
+        "target": [1.2, 0.0, 0.6],
+        "fov": 90.0,
+    },
+    {
+        "name": "wrist",
+        "frame": HAND,
+        "position": [0, -0.12, -0.12],
+        "target": [0, 0, 0.1],
+        "up": [0, -1, 0],
+        "fov": 75.0,
+    },
+)
+"""Default cameras: one above the base, one beside the fingers."""
+
+_some = require(lambda value: value, "there is nothing", "at least one")
+Robots = Annotated[tuple[Annotated[RobotEntry, wrap_text("name")], ...], _some]
+
+
+class RecipeSchema(Schema):
+    """A recipe."""
+
+    name: Name
+    license: str = "CC-BY-4.0"
+    robots: Robots = (RobotEntry(name="husky_ur5e"),)
+    tasks: Annotated[
+        tuple[Literal[TASKS], ...],  # type: ignore[valid-type]
+        require(lambda v: v, "there is nothing", "at least one"),
+    ] = TASKS
+    objects: Names = (
+        "random_cabinet",
+        "random_drawers",
+        "random_dishwasher",
+        "random_oven",
+        "random_refrigerator",
+        "random_door",
+    )
+    carried: Names = ("ball",)
+    rooms: RoomsSchema = RoomsSchema()
+    scenes: tuple[str, ...] = ()
+    start: StartSchema = StartSchema()
+    goal: GoalSchema = GoalSchema()
+    grasps: Literal["freest", "any"] = "freest"
+    options: dict[str, Any] = Field(default_factory=dict)
+    max_evaluations: Whole = 100_000
+    time_limit: Positive = 60.0
+    variants: Several = 1
+    rate: Annotated[Positive, Field(ge=0.01, le=1000.0)] = 10.0
+    simulate: bool = False
+    cameras: Annotated[tuple[CameraSchema, ...], Field(max_length=16)] = ()
+    terms: tuple[TermSchema, ...] = ()
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A recipe that was read and checked.
+
+    Attributes:
+        fields: Its fields, with defaults.
+        options: How to plan.
+    """
+
+    fields: RecipeSchema
+    options: Options
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The recipe as plain data, which `load_recipe` accepts."""
+        return self.fields.model_dump(mode="json")
+
+    @property
+    def digest(self) -> str:
+        """Digest of all that determines the episodes."""
+        said = {
+            key: value for key, value in self.document.items() if key not in ("name", "license")
+        }
+        for name in ("cameras", "terms"):
+            if not said[name]:
+                del said[name]  # datasets without them are gone on with whatever the version
+        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Cameras that take images."""
+        return tuple(Camera(**entry.model_dump()) for entry in self.fields.cameras)
+
+    @functools.cached_property
+    def terms(self) -> tuple[Term, ...]:
+        """Additional constraints and costs."""
+        return trace_terms_without_scene([entry.term() for entry in self.fields.terms])
+
+    def select_terms(self, task: str) -> tuple[Term, ...]:
+        """Return the terms of a task."""
+        entries = zip(self.terms, self.fields.terms, strict=True)
+        return tuple(term for term, entry in entries if not entry.tasks or task in entry.tasks)
+
+    def rng(self, *words: object) -> np.random.Generator:
+        """Return a random generator determined by the recipe and some words, such as a number."""
+        text = "/".join([self.digest, *map(str, words)])
+        return np.random.default_rng(
+            int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "little")
+        )
+
+
+def load_recipe(recipe: str | Path | Mapping[str, Any] | Recipe, **changes: Any) -> Recipe:
+    """Load and check a recipe.
+
+    Args:
+        recipe: Name of a recipe of the package, path of a YAML file, or its contents.
+        changes: Fields to replace; None keeps them.
+
+    Raises:
+        UnknownNameError: It, or something that it names, does not exist.
+        InputError: A field is wrong; the error names file, line and field.
+    """
+    changes = {name: value for name, value in changes.items() if value is not None}
+    if isinstance(recipe, Recipe):
+        document = Document(recipe.document)
+    elif isinstance(recipe, Mapping):
+        document = Document(check_mapping(recipe, "recipe", "fields of a recipe"))
+    else:
+        document = read_yaml(find_file(recipe, "scenes", "recipes/*.yaml", noun="recipe"))
+    if isinstance(document.data, dict):
+        document = Document({**document.data, **changes}, document.file, document.lines)
+    fields = parse_document(document, RecipeSchema)
+    folder = document.file.parent if document.file else Path()
+    found = {
+        "robots": _robots(document, fields.robots, folder),
+        "objects": tuple(
+            _object(document, k, name, folder) for k, name in enumerate(fields.objects)
+        ),
+        "scenes": tuple(_scene(document, k, name, folder) for k, name in enumerate(fields.scenes)),
+    }
+    for k, kind in enumerate(fields.carried):
+        if kind not in CARRIED:
+            raise document.make_unknown_name_error(
+                ("carried", k), "object that is carried", kind, CARRIED
+            )
+    if fields.scenes and "fetch-place" in fields.tasks:
+        expected = "random rooms, whose tables are known, or only given-open and drive-open"
+        raise document.make_error(
+            ("tasks",),
+            "nothing says where to put things in scene files",
+            expected=expected,
+            got="fetch-place",
+        )
+    for k, camera in enumerate(fields.cameras):
+        with document.annotate_errors(("cameras", k)):
+            Camera(**camera.model_dump())
+        if camera.name in [other.name for other in fields.cameras[:k]]:
+            raise document.make_error(
+                ("cameras", k, "name"),
+                "two cameras of one name",
+                expected="another name",
+                got=camera.name,
+            )
+    check_entries(document, fields.terms, TASKS)
+    if fields.cameras and not fields.simulate:
+        expected = "`simulate: true` as well, or --simulate: images are of what happens in physics"
+        raise document.make_error(
+            ("cameras",), "nothing is simulated", expected=expected, got="cameras"
+        )
+    with document.annotate_errors(("rooms",)):
+        RoomSettings(
+            clutter=fields.rooms.clutter[0], width=fields.rooms.width, front=fields.rooms.front
+        )
+        RoomSettings(clutter=fields.rooms.clutter[1])
+    return Recipe(fields.model_copy(update=found), _options(document, fields.options))
+
+
+def _options(document: Document, given: Mapping[str, Any]) -> Options:
+    for name in given:
+        if name not in Options.__dataclass_fields__:
+            raise document.make_unknown_name_error(
+                ("options", name), "option", name, Options.__dataclass_fields__
+            )
+    try:
+        return Options(**given)
+    except InputError as error:
+        name = (error.field or "").removeprefix("Options.")
+        raise document.make_error(
+            ("options", name), error.problem, expected=error.expected, got=error.got
+        ) from error
+
+
+def get_robot_name(name: str) -> str:
+    """Return the name of a robot in a dataset: its name, or that of its file or folder."""
+    path = Path(name)
+    return (
+        (path.parent.name if path.name == "robot.yaml" else path.stem)
+        if len(path.parts) > 1
+        else name
+    )
+
+
+def _is_path(name: str) -> bool:
+    return name.endswith((".yaml", ".yml", ".urdf")) or "/" in name
+
+
+def _robots(
+    document: Document, entries: Sequence[RobotEntry], folder: Path
+) -> tuple[RobotEntry, ...]:
+    found: dict[str, str] = {}
+    robots = []
+    for k, entry in enumerate(entries):
+        with document.annotate_errors(("robots", k)):
+            path = find_robot(
+                str((folder / entry.name).resolve()) if _is_path(entry.name) else entry.name
+            )
+        robots.append(
+            entry.model_copy(update={"name": str(path)}) if _is_path(entry.name) else entry
+        )
+        name = robots[-1].name
+        if found.setdefault(get_robot_name(name), name) != name:
+            raise document.make_error(
+                ("robots", k),
+                "two robots of one name",
+                expected="folders of different names",
+                got=name,
+            )
+    return tuple(robots)
+
+
+def _object(document: Document, place: int, name: str, folder: Path) -> str:
+    if not _is_path(name):
+        if name not in list_openable_types():
+            raise document.make_unknown_name_error(
+                ("objects", place), "object that opens", name, list_openable_types()
+            )
+        return name
+    return _file(document, ("objects", place), folder / name)
+
+
+def _scene(document: Document, place: int, name: str, folder: Path) -> str:
+    if not _is_path(name):
+        known = list_resources("scenes", "*.yaml")
+        if name not in known:
+            raise UnknownNameError(
+                "scene",
+                name,
+                known,
+                file=document.file,
+                line=document.find_line(("scenes", place)),
+                field="scenes",
+            )
+        return name
+    return _file(document, ("scenes", place), folder / name)
+
+
+def _file(document: Document, path: tuple[str | int, ...], file: Path) -> str:
+    if not file.is_file():
+        raise document.make_error(
+            path, "there is no such file", expected="an existing file", got=file
+        )
+    return str(file.resolve())

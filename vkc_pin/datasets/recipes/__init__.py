@@ -1,1 +1,0 @@
-"""Describes datasets by recipes and named constraints."""

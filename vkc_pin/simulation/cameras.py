@@ -1,0 +1,247 @@
+"""Describes cameras on a robot, and renders their colour, depth and segmentation images."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.simulation.model import Builder, to_mujoco_quaternion
+from vkc_pin.simulation.replay import Execution
+from vkc_pin.simulation.snapshots import RenderedScene
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.models.robot import Robot
+
+__all__ = [
+    "BASE",
+    "HAND",
+    "ROBOT",
+    "Camera",
+    "Images",
+    "check_frame",
+    "render_images",
+    "resolve_frame",
+]
+
+BASE, HAND = "base", "hand"
+"""Frames of every robot: that of the mobile base, and the tool frame, whose z axis points ahead and
+along whose x axis the fingers close."""
+_PARALLEL = 1e-6  # sine of the angle up to which two directions are parallel
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera on a robot.
+
+    Attributes:
+        name: Camera name.
+        frame: `BASE`, `HAND`, or a frame of the robot.
+        position: Position in this frame [m].
+        target: Point in the centre of the image, in this frame [m].
+        up: Direction that is up in the image, in this frame.
+        width, height: Image size [pixels].
+        fov: Vertical field of view [deg].
+
+    Raises:
+        InputError: `target` equals `position`, or the viewing direction is parallel to `up`.
+    """
+
+    name: str
+    frame: str
+    position: tuple[float, float, float]
+    target: tuple[float, float, float]
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    width: int = 128
+    height: int = 128
+    fov: float = 60.0
+
+    def __post_init__(self) -> None:
+        ahead, up = np.subtract(self.target, self.position), np.array(self.up)
+        lengths = np.linalg.norm(ahead) * np.linalg.norm(up)
+        if np.linalg.norm(np.cross(ahead, up)) <= _PARALLEL * lengths:
+            expected = "a target other than the camera's position, and not in the direction `up`"
+            raise InputError(
+                f"the orientation of camera '{self.name}' is undefined",
+                field="target",
+                expected=expected,
+                got=list(self.target),
+            )
+
+    @property
+    def placement(self) -> pin.SE3:
+        """Placement in its frame, looking along −z with x right and y up, as in OpenGL."""
+        back: Floats = np.subtract(self.position, self.target)
+        back /= np.linalg.norm(back)
+        right = np.cross(self.up, back)
+        right /= np.linalg.norm(right)
+        return pin.SE3(
+            np.column_stack([right, np.cross(back, right), back]), np.array(self.position)
+        )
+
+    def find_frame(self, robot: Robot) -> str:
+        """Return the frame of a robot's model on which the camera is mounted.
+
+        Raises:
+            UnknownNameError: The robot lacks the frame.
+        """
+        check_frame(robot, self.frame)
+        return resolve_frame(robot, self.frame)
+
+
+def resolve_frame(robot: Robot, frame: str) -> str:
+    """Return the frame of a robot's model for `BASE`, `HAND`, or a frame name."""
+    if frame == BASE:
+        return str(robot.model.names[1])
+    return robot.tool_frame if frame == HAND else frame
+
+
+def check_frame(robot: Robot, frame: str) -> None:
+    """Check that a robot has a frame."""
+    known = sorted(
+        {
+            BASE,
+            HAND,
+            *(str(one.name) for one in robot.model.frames if one.type == pin.FrameType.BODY),
+        }
+    )
+    if frame not in known:
+        raise UnknownNameError(f"frame of {robot.name}", frame, known)
+
+
+ROBOT = "robot"
+"""Name of the robot's links in segmentation images."""
+_MAX_DEPTH = 65_535  # [mm] in 16 bits; pixels further away count as empty
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """Images of cameras.
+
+    Attributes:
+        pictures: Maps `<camera>_image` to colours, shape (N, height, width, 3), 8 bits;
+            `<camera>_depth` to distances along the camera's axis [mm], shape (N, height, width), 16
+            bits, 0 where nothing is visible; `<camera>_segmentation` to indices into `segments`,
+            shape (N, height, width), 16 bits.
+        segments: Names of visible bodies: "" for nothing, `ROBOT`, the floor, names of obstacles,
+            links of objects such as `door.panel`.
+    """
+
+    pictures: Mapping[str, NDArray[np.generic]]
+    segments: tuple[str, ...]
+
+    def to_bytes(self) -> bytes:
+        """Return the images as compressed bytes that `from_bytes` reads."""
+        buffer = io.BytesIO()
+        names: Any = np.array(json.dumps([list(self.pictures), self.segments]))
+        pictures: Any = {f"picture_{k}": pixels for k, pixels in enumerate(self.pictures.values())}
+        np.savez_compressed(buffer, allow_pickle=False, names=names, **pictures)
+        return buffer.getvalue()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> Images:
+        """Return the images that `to_bytes` encoded."""
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            names, segments = json.loads(str(archive["names"]))
+            return cls(
+                {name: archive[f"picture_{k}"] for k, name in enumerate(names)}, tuple(segments)
+            )
+
+
+def render_images(executed: Execution, cameras: Sequence[Camera], times: Floats) -> Images:
+    """Render the images of cameras at some times.
+
+    Args:
+        executed: The executed motion.
+        cameras: Cameras on the robot.
+        times: Times, shape (N,) [s].
+
+    Raises:
+        UnknownNameError: The robot lacks a camera's frame.
+        VkcError: OpenGL is not available without a display.
+    """
+
+    def add_cameras(builder: Builder) -> None:
+        builder.spec.visual.quality.offsamples = 0  # no anti-aliasing: each pixel shows one body
+        for camera in cameras:
+            body, place = builder.find_frame(camera.find_frame(robot))
+            camera_placement = place * camera.placement
+            body.add_camera(
+                name=camera.name,
+                pos=camera_placement.translation,
+                quat=to_mujoco_quaternion(camera_placement),
+                fovy=camera.fov,
+            )
+
+    robot: Robot = executed.scene.robot
+    size = (max(camera.width for camera in cameras), max(camera.height for camera in cameras))
+    scene = RenderedScene(executed, size=size, wall_opacity=1.0, add_extras=add_cameras)
+    segments, numbers = _number_segments(scene)
+    found: dict[str, list[NDArray[np.generic]]] = {}
+    for camera, picture in _render(scene, cameras, times, size):
+        for kind, pixels in zip(("image", "depth", "segmentation"), picture, strict=True):
+            found.setdefault(f"{camera}_{kind}", []).append(
+                numbers[pixels] if kind == "segmentation" else pixels
+            )
+    return Images({name: np.array(values) for name, values in found.items()}, segments)
+
+
+def _render(
+    scene: RenderedScene, cameras: Sequence[Camera], times: Floats, size: tuple[int, int]
+) -> Any:
+    """Yield the images of every camera at every time."""
+    mj, model = scene.mj, scene.model
+    view = mj.MjvCamera()
+    near, far = (
+        float(limit * model.stat.extent) for limit in (model.vis.map.znear, model.vis.map.zfar)
+    )
+    view.type = mj.mjtCamera.mjCAMERA_FIXED
+    flags = [int(mj.mjtRndFlag.mjRND_SEGMENT), int(mj.mjtRndFlag.mjRND_IDCOLOR)]
+    for data, gl_scene, gl_context in scene.iterate_states(times, size):
+        for camera in cameras:
+            view.fixedcamid = model.camera(camera.name).id
+            scene.update_view(data, gl_scene, view)
+            window = mj.MjrRect(0, 0, camera.width, camera.height)
+            colours, codes = np.zeros((2, camera.height, camera.width, 3), np.uint8)
+            depth = np.zeros(colours.shape[:2], np.float32)
+            mj.mjr_render(window, gl_scene, gl_context)
+            mj.mjr_readPixels(colours, depth, window, gl_context)
+            gl_scene.flags[flags] = 1
+            mj.mjr_render(window, gl_scene, gl_context)
+            mj.mjr_readPixels(codes, None, window, gl_context)
+            gl_scene.flags[flags] = 0
+            distances, geoms = _to_millimetres(depth, near, far), _decode_geoms(gl_scene, codes)
+            yield camera.name, (colours[::-1], distances[::-1], geoms[::-1])
+
+
+def _to_millimetres(depth: Any, near: float, far: float) -> NDArray[np.generic]:
+    """Return distances [mm] from OpenGL's depth, which is 0 at `near` and 1 at `far` [m]."""
+    distances = near / (1.0 - np.asarray(depth, float) * (1.0 - near / far))
+    whole = np.round(1000.0 * distances)
+    return np.where((depth >= 1.0) | (whole > _MAX_DEPTH), 0.0, whole).astype(np.uint16)
+
+
+def _decode_geoms(scene: Any, codes: Any) -> NDArray[np.generic]:
+    """Return one plus the geom visible at every pixel, decoded from MuJoCo's segment colours."""
+    visible_geoms = np.zeros(scene.ngeom + 1, np.intp)
+    for geom in scene.geoms[: scene.ngeom]:
+        visible_geoms[geom.segid + 1] = geom.objid + 1
+    code = codes[..., 0] + 256 * codes[..., 1].astype(int) + 65_536 * codes[..., 2].astype(int)
+    return visible_geoms[code]
+
+
+def _number_segments(scene: RenderedScene) -> tuple[tuple[str, ...], NDArray[np.generic]]:
+    """Return the names of visible bodies, and for one plus each geom the index of its name."""
+    names, numbers = [""], np.zeros(scene.model.ngeom + 1, np.uint16)
+    for geom, label, is_robot in scene.visible_geoms:
+        label = ROBOT if is_robot else label
+        if label not in names:
+            names.append(label)
+        numbers[geom + 1] = names.index(label)
+    return tuple(names), numbers

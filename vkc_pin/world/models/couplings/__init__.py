@@ -1,1 +1,0 @@
-"""Handles mimic joints: several joints that share one coordinate, as in a telescope."""

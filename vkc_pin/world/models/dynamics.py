@@ -1,0 +1,222 @@
+"""Defines joint resistances and masses of objects, and torque limits of robots."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.documents import Document
+from vkc_pin.world.files.fields import JointSchema, NonNegative, Number
+from vkc_pin.world.files.hulls import compute_hull
+from vkc_pin.world.files.kinematic_tree import parse_numbers
+from vkc_pin.world.files.xml import make_element_error, read_xml
+from vkc_pin.world.models.coordinates import Coordinates
+from vkc_pin.world.models.shapes import triangulate
+
+__all__ = [
+    "UNLIMITED",
+    "ObjectJointSchema",
+    "Resistance",
+    "TorqueLimits",
+    "compute_mass",
+    "compute_solid_inertia",
+    "compute_torque_limits",
+    "read_resistances",
+    "set_mass",
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Resistance:
+    """Passive forces of an object's joint, with the parameters of URDF and MuJoCo.
+
+    Attributes:
+        friction: Coulomb friction [N·m] or [N]; `friction` in URDF, `frictionloss` in MuJoCo.
+        damping: Viscous damping coefficient [N·m·s/rad] or [N·s/m].
+        stiffness: Stiffness of a spring that pulls the joint to `springref` [N·m/rad] or [N/m].
+        springref: Rest position of the spring [rad] or [m]; outside the joint's limits if the
+            spring is preloaded.
+    """
+
+    friction: float = 0.0
+    damping: float = 0.0
+    stiffness: float = 0.0
+    springref: float = 0.0
+
+    def force(self, position: Any, velocity: Any) -> Any:
+        """Return the force or torque that overcomes the resistance [N], [N·m]; no friction at rest.
+
+        stiffness · (position − springref) + damping · velocity + friction · sign(velocity)
+
+        Args:
+            position: Joint position, a number or an array [rad] or [m].
+            velocity: Joint velocity, of the same shape [rad/s] or [m/s].
+        """
+        return (
+            self.stiffness * (position - self.springref)
+            + self.damping * velocity
+            + self.friction * np.sign(velocity)
+        )
+
+
+class ObjectJointSchema(JointSchema):
+    """Properties of an object's joint that a URDF lacks, and its resistance; see `Resistance`."""
+
+    friction: NonNegative | None = None
+    damping: NonNegative | None = None
+    stiffness: NonNegative | None = None
+    springref: Number | None = None
+
+
+def read_resistances(
+    document: Document,
+    joints: Mapping[str, ObjectJointSchema],
+    urdf: Path,
+    text: str | None,
+    names: Sequence[str],
+) -> dict[str, Resistance]:
+    """Return the resistance of each movable joint of an object.
+
+    Values of the description take precedence over those of `<dynamics>` in the URDF. The default
+    is 0.
+
+    Args:
+        document: The description.
+        joints: Settings of the joints in the description; the joints exist.
+        urdf: Path of the URDF.
+        text: Text of the URDF, if it is part of the description.
+        names: Names of the movable joints.
+    """
+    _, root = read_xml(urdf, "URDF", text)
+    resistance = dict[str, Resistance]()
+    for joint in root.findall("joint"):
+        name, stated = joint.get("name", ""), dict[str, float]()
+        if name not in names:
+            continue
+        for dynamics in joint.findall("dynamics"):
+            for key in ("friction", "damping"):
+                (stated[key],) = parse_numbers(urdf, dynamics, key, 1, default="0", where=name)
+                if stated[key] < 0.0:
+                    problem, got = "friction and damping must not be negative", stated[key]
+                    field, expected = f"{name}: dynamics {key}", "0 or more"
+                    raise make_element_error(
+                        urdf, dynamics, problem, field=field, expected=expected, got=got
+                    )
+        given = joints.get(name, ObjectJointSchema())
+        if given.springref is not None and given.stiffness is None:
+            problem, expected = "springref without stiffness", "stiffness as well"
+            raise document.make_error(
+                ("joints", name, "springref"), problem, expected=expected, got=given.springref
+            )
+        described = given.model_dump(
+            include={"friction", "damping", "stiffness", "springref"}, exclude_none=True
+        )
+        resistance[name] = Resistance(**{**stated, **described})
+    return resistance
+
+
+def compute_mass(model: pin.Model) -> float:
+    """Return the total mass of all links of a model [kg]."""
+    return float(sum(inertia.mass for inertia in model.inertias))
+
+
+def set_mass(model: pin.Model, collision: pin.GeometryModel, mass: float) -> None:
+    """Scale the inertias of a model to a given total mass.
+
+    If the model has no mass, its collision shapes are assumed to be solids of uniform density.
+    Without collision shapes, all mass is placed at the origin of the base link.
+
+    Args:
+        model: Changed in place.
+        collision: Collision shapes of the model.
+        mass: Total mass, 0 or more [kg].
+    """
+    if not compute_mass(model) > 0.0:
+        for shape in collision.geometryObjects:
+            model.inertias[shape.parentJoint] += shape.placement.act(compute_solid_inertia(shape))
+        if not compute_mass(model) > 0.0:
+            model.inertias[0] = pin.Inertia(1.0, np.zeros(3), np.zeros((3, 3)))
+    factor = mass / compute_mass(model)
+    for joint, inertia in enumerate(model.inertias):
+        model.inertias[joint] = pin.Inertia(
+            factor * inertia.mass, inertia.lever, factor * np.asarray(inertia.inertia)
+        )
+
+
+def compute_solid_inertia(shape: pin.GeometryObject, density: float = 1.0) -> pin.Inertia:
+    """Return the inertia of a convex shape of uniform `density` [kg/m³], in its own frame."""
+    solid = compute_hull(triangulate(shape.geometry)[0])
+    solid.density = density
+    return pin.Inertia(
+        float(solid.mass), np.asarray(solid.center_mass), np.asarray(solid.moment_inertia)
+    )
+
+
+UNLIMITED = 1e300
+"""Effort limits of Pinocchio above this mean that there is no limit."""
+_SAMPLES = 200  # random configurations in which a motor must hold the arm
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueLimits:
+    """Torque and force limits of a robot's joints.
+
+    Attributes:
+        limits: Limit of each coordinate, shape (n,) [N·m], [N]; infinite for the base and where the
+            limit is unknown.
+        notes: Reasons why limits are unknown, one line each.
+    """
+
+    limits: Floats
+    notes: tuple[str, ...] = ()
+
+    @property
+    def is_known(self) -> bool:
+        """Whether any limit is known."""
+        return bool(np.isfinite(self.limits).any())
+
+
+def compute_torque_limits(
+    model: pin.Model, coordinates: Coordinates, lower: Floats, upper: Floats
+) -> TorqueLimits:
+    """Return the torque limits of a robot.
+
+    Limits are unknown if the URDF has no masses or no effort limit. They are also discarded if they
+    cannot hold the arm at rest with an empty hand in all sampled configurations: such values are
+    placeholders, or the model lacks a counterbalancing spring.
+
+    Args:
+        model: The robot; joint 1 is the base.
+        coordinates: Coordinates of the robot; the first three are the base's.
+        lower: Lower position limits, shape (n,) [m], [rad].
+        upper: Upper position limits, shape (n,) [m], [rad].
+    """
+    limits = np.asarray(model.effortLimit, float)[: coordinates.size].copy()
+    limits[:3] = np.inf
+    if not sum(inertia.mass for inertia in list(model.inertias)[2:]) > 0.0:
+        return TorqueLimits(np.full_like(limits, np.inf), ("the URDF states no masses of the arm",))
+    stated = (limits > 0.0) & (limits < UNLIMITED)
+    limits[~stated] = np.inf
+    names, notes = np.array(coordinates.names), list[str]()
+    if len(unstated := names[3:][~stated[3:]]):
+        notes.append(f"the URDF states no effort of {', '.join(unstated)}")
+    rng, data, gravity = np.random.default_rng(0), model.createData(), np.zeros_like(limits)
+    low, high = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
+    for z in rng.uniform(low, np.maximum(low, high), (_SAMPLES, len(low))):
+        gravity = np.maximum(
+            gravity, np.abs(pin.computeGeneralizedGravity(model, data, coordinates.q(z)))
+        )
+    for k in np.flatnonzero((gravity > limits) & stated):
+        unit = {"m": "N", "rad": "N·m"}[coordinates.units[k]]
+        notes.append(
+            f"{names[k]}: the effort limit of {limits[k]:g} {unit} cannot hold the arm, "
+            f"which needs up to {gravity[k]:.3g} {unit}"
+        )
+        limits[k] = np.inf
+    return TorqueLimits(limits, tuple(notes))

@@ -1,1 +1,0 @@
-"""Describes dynamics: masses, joint friction, damping and springs, and torque limits."""

@@ -1,1 +1,0 @@
-"""Models grippers: finger joints and the opening between the fingers."""

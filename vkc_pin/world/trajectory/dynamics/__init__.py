@@ -1,1 +1,0 @@
-"""Computes motor torques of the arm and contact wrenches of the hand along a motion."""

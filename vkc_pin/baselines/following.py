@@ -31,6 +31,18 @@ QP = "daqp"
 """Solver of quadratic programs, by its name in `qpsolvers`."""
 _ITERATIONS = 30
 _FRAME = "closure"
+CLEAR = CLEARANCE_TOLERANCE
+"""Accepted shortfall of clearances [m], as in the solver."""
+_ROUNDS = 12
+_REACH = 0.05  # distance beyond the clearance up to which contacts are considered [m]
+_LONGEST = 0.2  # largest step of a coordinate in one round [m] or [rad]
+_OBJECT = 10.0  # weight of the object's deviation from its time law; that of the arm is 1
+_SLACK = 1e3  # weight of the slack
+_REGULAR = 1e-6  # makes the program strictly convex in the slack
+SEEDS = 16
+"""Number of random arms for inverse kinematics where it fails from the waypoint before."""
+_CAUSES = ("", "collision", "no inverse kinematics")  # the best first
+_SPREAD = 1.0  # of half of the random arms around the waypoint before [rad]; others: anywhere
 
 
 class ArmKinematics:
@@ -107,17 +119,6 @@ class _Box:
         return self._rows, np.concatenate([most, -least])
 
 
-CLEAR = CLEARANCE_TOLERANCE
-"""Accepted shortfall of clearances [m], as in the solver."""
-
-_ROUNDS = 12
-_REACH = 0.05  # distance beyond the clearance up to which contacts are considered [m]
-_LONGEST = 0.2  # largest step of a coordinate in one round [m] or [rad]
-_OBJECT = 10.0  # weight of the object's deviation from its time law; that of the arm is 1
-_SLACK = 1e3  # weight of the slack
-_REGULAR = 1e-6  # makes the program strictly convex in the slack
-
-
 def refine_configuration(
     problem: TrajectoryProblem,
     sampler: KeyframeSampler,
@@ -172,12 +173,6 @@ def refine_configuration(
         z[free] += step[:-1]
     residual, _ = solver.evaluate(z[None], target)
     return z, bool(np.abs(residual).max() < TOLERANCE)
-
-
-SEEDS = 16
-"""Number of random arms for inverse kinematics where it fails from the waypoint before."""
-_CAUSES = ("", "collision", "no inverse kinematics")  # the best first
-_SPREAD = 1.0  # of half of the random arms around the waypoint before [rad]; others: anywhere
 
 
 class FailedError(Exception):

@@ -70,6 +70,12 @@ CRITERIA = {
 BUDGETS = {"1/10": 0.1, "1/3": 1 / 3, "2/3": 2 / 3, "whole budget": 1.0}
 """Name → share of the budget."""
 _OWN = "VKC"
+COMPARED_PLANNERS = (*BASELINES, "VKC")
+METHODS = (*COMPARED_PLANNERS[:-1], *WAYPOINTS, "VKC")  # in the order of the tables
+COLD = 5
+"""Number of trials of a task and method that are planned twice, cold and warm."""
+Draw = Callable[[Sequence[Record], Path, Mapping[str, str], Sequence[str]], list[str]]
+"""Draws the charts of records, in a folder, for tasks (name → description) and methods."""
 
 
 def select_compared_methods(methods: Sequence[str]) -> Sequence[str]:
@@ -343,15 +349,6 @@ def _spread(records: Sequence[Record], field: str) -> str:
     return (
         f"{mean} ± {deviation}; {format_decimal(distribution(records, field)[0])}" if found else "–"
     )
-
-
-COMPARED_PLANNERS = (*BASELINES, "VKC")
-METHODS = (*COMPARED_PLANNERS[:-1], *WAYPOINTS, "VKC")  # in the order of the tables
-COLD = 5
-"""Number of trials of a task and method that are planned twice, cold and warm."""
-
-Draw = Callable[[Sequence[Record], Path, Mapping[str, str], Sequence[str]], list[str]]
-"""Draws the charts of records, in a folder, for tasks (name → description) and methods."""
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,40 @@ DEGREES_PER_MM = 0.4
 """Rotation of a displaced hand per displacement [°/mm]."""
 _DRAWS = 20  # directions that are tried
 _TOLERANCE = 1e-8  # [m], [rad] of inverse kinematics
+TASKS: Mapping[str, str] = {
+    "door": "push a door with a latched lever",
+    "corridor_door": "the same in a corridor",
+    "drawer": "pull a drawer",
+    "household_refrigerator": "pull a refrigerator open",
+    "household_dishwasher": "pull a dishwasher's rack out",
+    "household_cabinet": "pull a cabinet open",
+    "household_cup": "carry a cup to a table",
+    "init_1": "touch a cube with a stick",
+}
+"""Task → description."""
+_HEAD = [
+    "task",
+    "plans",
+    "executed",
+    "of plans [%]",
+    "arm [°]",
+    "base [mm]",
+    "goal [mm]",
+    "goal [rad]",
+    "grasp [N]",
+    "grasp [N·m]",
+    "slip [mm]",
+]
+_FIGURES = {
+    "arm_error": (180.0 / np.pi, 2),
+    "base_error": (1e3, 1),
+    "miss_m": (1e3, 1),
+    "miss_rad": (1.0, 4),
+    "grasp_force": (1.0, 0),
+    "grasp_torque": (1.0, 1),
+    "slip": (1e3, 1),
+}
+"""Field of a record → factor to its displayed unit, and number of decimals."""
 
 
 def grasp_in_physics(
@@ -102,32 +136,6 @@ def _reach(scene: Scene, tool: pin.SE3) -> Floats | None:
         tolerance=_TOLERANCE,
     )
     return np.asarray(z[0]) if found[0] else None
-
-
-TASKS: Mapping[str, str] = {
-    "door": "push a door with a latched lever",
-    "corridor_door": "the same in a corridor",
-    "drawer": "pull a drawer",
-    "household_refrigerator": "pull a refrigerator open",
-    "household_dishwasher": "pull a dishwasher's rack out",
-    "household_cabinet": "pull a cabinet open",
-    "household_cup": "carry a cup to a table",
-    "init_1": "touch a cube with a stick",
-}
-"""Task → description."""
-_HEAD = [
-    "task",
-    "plans",
-    "executed",
-    "of plans [%]",
-    "arm [°]",
-    "base [mm]",
-    "goal [mm]",
-    "goal [rad]",
-    "grasp [N]",
-    "grasp [N·m]",
-    "slip [mm]",
-]
 
 
 def run(
@@ -253,18 +261,6 @@ def _row(name: str, records: Sequence[Record]) -> list[str]:
         found = values(planned, field)
         cells.append(f"{factor * max(found):.{digits}f}" if found else "–")
     return cells
-
-
-_FIGURES = {
-    "arm_error": (180.0 / np.pi, 2),
-    "base_error": (1e3, 1),
-    "miss_m": (1e3, 1),
-    "miss_rad": (1.0, 4),
-    "grasp_force": (1.0, 0),
-    "grasp_torque": (1.0, 1),
-    "slip": (1e3, 1),
-}
-"""Field of a record → factor to its displayed unit, and number of decimals."""
 
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:

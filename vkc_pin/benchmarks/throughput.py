@@ -42,6 +42,9 @@ WORKERS = (1, 2, 10, 100, 1000)
 _AHEAD = 2  # tasks in hand or waiting at a worker, as the engine has them
 _EACH = 100  # tasks of a worker, on average
 _SEED = 0
+RECIPE = "home"
+"""Of the package: which robots, objects and rooms."""
+_LEAST = 20  # attempts of a process from which a growth is computed
 
 
 @dataclass(frozen=True)
@@ -141,11 +144,6 @@ def simulate_workers(costs: Costs, workers: int, tasks: int | None = None) -> di
         "client": round(half * (len(spans) + results) / free, 4),
         "in_vain": round(others / all_time, 4),
     }
-
-
-RECIPE = "home"
-"""Of the package: which robots, objects and rooms."""
-_LEAST = 20  # attempts of a process from which a growth is computed
 
 
 def run(

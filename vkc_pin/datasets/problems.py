@@ -40,6 +40,13 @@ __all__ = [
 
 _BATCH = 48  # random configurations that inverse kinematics brings to the grasp at once
 _DRAWS = 6  # batches before there is none
+_EXACT = 1e-2 * TOLERANCE  # [m], [rad]: accepted distance of the hand from its grasp
+_CACHED_ROOMS = 48  # rooms in a process's cache
+_STARTS = 300  # sampled start poses
+_TABLES = 2
+_GAP = 0.001  # [m] gap between a placed object and its table
+_MARGIN = 0.12  # [m] from the ends of a table to the centre of a placed object
+_load_scene = functools.lru_cache(maxsize=_CACHED_ROOMS)(load_scene)
 
 
 def find_grasping_start(
@@ -109,16 +116,6 @@ def find_grasping_start(
                 there = scene.with_start(base=row[:3], arm=row[3:robot])
                 return there.with_held([Hold(name, attachment, at=tuple(row[freedoms].tolist()))])
     return None
-
-
-_EXACT = 1e-2 * TOLERANCE  # [m], [rad]: accepted distance of the hand from its grasp
-
-
-_CACHED_ROOMS = 48  # rooms in a process's cache
-_STARTS = 300  # sampled start poses
-_TABLES = 2
-_GAP = 0.001  # [m] gap between a placed object and its table
-_MARGIN = 0.12  # [m] from the ends of a table to the centre of a placed object
 
 
 class NoProblemError(VkcError):
@@ -246,9 +243,6 @@ def resolve_episode_terms(
     return resolve_terms(
         recipe.select_terms(about["task"]), scene, about["object"], about["attachment"]
     )
-
-
-_load_scene = functools.lru_cache(maxsize=_CACHED_ROOMS)(load_scene)
 
 
 @functools.lru_cache(maxsize=_CACHED_ROOMS)

@@ -79,6 +79,40 @@ Axis = Annotated[
     require(lambda value: math.hypot(*value) > 0.0, "no direction", "an axis of some length"),
 ]
 Size = Annotated[tuple[Positive, Positive, Positive], require_length(3)]
+TASKS = ("given-open", "drive-open", "fetch-place")
+"""Tasks of episodes: open an object from a given grasp, drive there and open it, or move an object
+to another table."""
+_increasing = require(
+    lambda value: value[0] <= value[1], "the interval is empty", "[lowest, highest]"
+)
+_share = require(
+    lambda value: value[0] > 0.0 and value[1] <= 1.0, "out of range", "shares above 0 and up to 1"
+)
+Interval = Annotated[tuple[Number, Number], require_length(2), _increasing]
+Share = Annotated[Interval, _share]
+Whole = Annotated[int, Field(strict=True, ge=1, le=10**9)]
+Several = Annotated[int, Field(strict=True, ge=1, le=1000)]  # attempts of a process at a time
+Pixels = Annotated[int, Field(strict=True, ge=8, le=2048)]
+Names = Annotated[tuple[str, ...], require(lambda value: value, "there is nothing", "at least one")]
+CAMERAS = (
+    {
+        "name": "head",
+        "frame": BASE,
+        "position": [0.0, 0.0, 1.5],
+        "target": [1.2, 0.0, 0.6],
+        "fov": 90.0,
+    },
+    {
+        "name": "wrist",
+        "frame": HAND,
+        "position": [0, -0.12, -0.12],
+        "target": [0, 0, 0.1],
+        "up": [0, -1, 0],
+        "fov": 75.0,
+    },
+)
+"""Default cameras: one above the base, one beside the fingers."""
+_some = require(lambda value: value, "there is nothing", "at least one")
 
 
 class _Entry(Schema):
@@ -248,24 +282,6 @@ def resolve_terms(
     return tuple(rename_term(term, frames, {OBJECT: name}) for term in terms)
 
 
-TASKS = ("given-open", "drive-open", "fetch-place")
-"""Tasks of episodes: open an object from a given grasp, drive there and open it, or move an object
-to another table."""
-
-_increasing = require(
-    lambda value: value[0] <= value[1], "the interval is empty", "[lowest, highest]"
-)
-_share = require(
-    lambda value: value[0] > 0.0 and value[1] <= 1.0, "out of range", "shares above 0 and up to 1"
-)
-Interval = Annotated[tuple[Number, Number], require_length(2), _increasing]
-Share = Annotated[Interval, _share]
-Whole = Annotated[int, Field(strict=True, ge=1, le=10**9)]
-Several = Annotated[int, Field(strict=True, ge=1, le=1000)]  # attempts of a process at a time
-Pixels = Annotated[int, Field(strict=True, ge=8, le=2048)]
-Names = Annotated[tuple[str, ...], require(lambda value: value, "there is nothing", "at least one")]
-
-
 class RobotEntry(Schema):
     """A robot by name or path, and the height of its root link [m]; None for its default."""
 
@@ -315,26 +331,6 @@ class CameraSchema(Schema):
     fov: Annotated[Positive, Field(lt=180.0)] = 60.0
 
 
-CAMERAS = (
-    {
-        "name": "head",
-        "frame": BASE,
-        "position": [0.0, 0.0, 1.5],
-        "target": [1.2, 0.0, 0.6],
-        "fov": 90.0,
-    },
-    {
-        "name": "wrist",
-        "frame": HAND,
-        "position": [0, -0.12, -0.12],
-        "target": [0, 0, 0.1],
-        "up": [0, -1, 0],
-        "fov": 75.0,
-    },
-)
-"""Default cameras: one above the base, one beside the fingers."""
-
-_some = require(lambda value: value, "there is nothing", "at least one")
 Robots = Annotated[tuple[Annotated[RobotEntry, wrap_text("name")], ...], _some]
 
 

@@ -23,6 +23,15 @@ from vkc_pin.world.files.xml import parse_xml
 __all__ = ["NO_MASS", "compile_mjcf", "expand_xacro", "uses_xacro"]
 
 _FIND = re.compile(r"\$\(find\s+([^\s()$]+)\s*\)")  # NAME in $(find NAME)
+NO_MASS = 1e-14
+"""Mass [kg] that a compiled body has if its file states none, just above MuJoCo's minimum."""
+_REDUCED = (
+    "read without actuators, sensors, key frames, contact pairs and couplings, as MuJoCo "
+    "rejects them"
+)
+# What MuJoCo 2 knew and later versions reject: settings that do not matter for geometry.
+_SETTINGS = ("custom", "option", "size", "statistic", "visual")
+_COMPILER_SETTINGS = ("convexhull", "exactmeshinertia")
 
 
 def uses_xacro(root: ElementTree.Element, file: Path) -> bool:
@@ -123,17 +132,6 @@ def _check_packages(
             expected="folders around the file with these names, or with a package.xml that states "
             "them; or state their folders (packages, --package NAME=FOLDER)",
         )
-
-
-NO_MASS = 1e-14
-"""Mass [kg] that a compiled body has if its file states none, just above MuJoCo's minimum."""
-_REDUCED = (
-    "read without actuators, sensors, key frames, contact pairs and couplings, as MuJoCo "
-    "rejects them"
-)
-# What MuJoCo 2 knew and later versions reject: settings that do not matter for geometry.
-_SETTINGS = ("custom", "option", "size", "statistic", "visual")
-_COMPILER_SETTINGS = ("convexhull", "exactmeshinertia")
 
 
 def compile_mjcf(file: Path) -> tuple[Any, list[str]]:

@@ -39,6 +39,10 @@ _STATIC_COLOUR, _MOVING_COLOUR, _HELD_COLOUR = (
     np.array([0.93, 0.80, 0.62]),
     np.array([0.82, 0.29, 0.36]),
 )
+_SHORT, _LONG = 0.08, 0.25  # [m] lengths of the tool's axes in the close-up and beside the robot
+_AXES = (("x closes", "#d1282e"), ("y", "#2a9d4f"), ("z approaches", "#2f6db5"))
+_TOUCH_COLOUR = np.array([0.93, 0.72, 0.45])
+_LINK_COLOURS = (np.array([0.80, 0.82, 0.84]), np.array([0.66, 0.71, 0.76]))
 
 
 def plot_attachments(proposals: Proposals, path: str | Path | None = None) -> Figure:
@@ -209,12 +213,6 @@ def to_rgb(colour: str) -> Floats:
     from matplotlib import colors
 
     return np.array(colors.to_rgb(colour))
-
-
-_SHORT, _LONG = 0.08, 0.25  # [m] lengths of the tool's axes in the close-up and beside the robot
-_AXES = (("x closes", "#d1282e"), ("y", "#2a9d4f"), ("z approaches", "#2f6db5"))
-_TOUCH_COLOUR = np.array([0.93, 0.72, 0.45])
-_LINK_COLOURS = (np.array([0.80, 0.82, 0.84]), np.array([0.66, 0.71, 0.76]))
 
 
 def plot_robot(robot: Robot, path: str | Path | None = None) -> Figure:

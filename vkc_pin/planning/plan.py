@@ -41,6 +41,8 @@ __all__ = ["STAGES", "Plan", "PlanningStatistics"]
 STAGES = ("initialization", "coal", "casadi", "ipopt", "retiming", "validation")
 """Stages of planning whose times are measured."""
 
+_SUMMARIZED = ("initialization", "coal", "casadi", "ipopt", "validation")  # stages with times
+
 
 @dataclass(frozen=True)
 class PlanningStatistics:
@@ -113,9 +115,6 @@ class PlanningStatistics:
             evaluations=int(metrics.get("evaluations", 0)),
             **times,
         )
-
-
-_SUMMARIZED = ("initialization", "coal", "casadi", "ipopt", "validation")  # stages with times
 
 
 @dataclass(frozen=True, eq=False)

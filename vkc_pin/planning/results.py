@@ -38,6 +38,9 @@ __all__ = [
 FINAL = (*STOP_STATUSES, "infeasible")
 """Statuses after which no alternative is tried."""
 
+MAX_REPAIRS = 3
+"""Largest number of refinements; each brings the curve four times as close to the segments."""
+
 
 def sum_statistics(parts: Iterable[PlanningStatistics]) -> PlanningStatistics:
     """Return the sum of statistics."""
@@ -129,10 +132,6 @@ def make_stationary_trajectory(scene: Scene, options: Options) -> Trajectory:
     phases = (PhaseSpan("stand", 0, 1, scene.holds, compute_start_opening(scene)),)
     times, positions = np.array([0.0, options.dt]), np.array([row, row])
     return Trajectory(tuple(values), times, positions, phases, len(scene.start))
-
-
-MAX_REPAIRS = 3
-"""Largest number of refinements; each brings the curve four times as close to the segments."""
 
 
 def retime_validated(

@@ -34,6 +34,9 @@ BASE, HAND = "base", "hand"
 """Frames of every robot: that of the mobile base, and the tool frame, whose z axis points ahead and
 along whose x axis the fingers close."""
 _PARALLEL = 1e-6  # sine of the angle up to which two directions are parallel
+ROBOT = "robot"
+"""Name of the robot's links in segmentation images."""
+_MAX_DEPTH = 65_535  # [mm] in 16 bits; pixels further away count as empty
 
 
 @dataclass(frozen=True)
@@ -113,11 +116,6 @@ def check_frame(robot: Robot, frame: str) -> None:
     )
     if frame not in known:
         raise UnknownNameError(f"frame of {robot.name}", frame, known)
-
-
-ROBOT = "robot"
-"""Name of the robot's links in segmentation images."""
-_MAX_DEPTH = 65_535  # [mm] in 16 bits; pixels further away count as empty
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,6 +39,14 @@ __all__ = [
 _MASS = 0.1  # [kg] of a sliding finger
 _REACH = 0.2  # [m] largest distance of a finger's shapes from the tool frame
 _COUPLING = (0.004, 1.0)  # time constant [s] and damping ratio of the coupling of fingers
+Span = tuple[Hold, float, float]
+"""A hold with its begin and end [s]."""
+# Fingers are commanded this fraction of their travel beyond the closed position, so that thin
+# objects are pressed too.
+_OVERTRAVEL = 0.15
+_LOST_TIME = 0.1  # [s] without contact after which the object counts as lost
+_AVERAGED_SAMPLES = 2  # number of samples over which forces are averaged
+_REST = 1e-6  # [m/s] or [rad/s] up to which the robot is at rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,15 +206,6 @@ def _project_on_x(place: pin.SE3, shape: pin.GeometryObject) -> Floats:
     return np.asarray(points @ place.rotation[0] + place.translation[0])
 
 
-Span = tuple[Hold, float, float]
-"""A hold with its begin and end [s]."""
-# Fingers are commanded this fraction of their travel beyond the closed position, so that thin
-# objects are pressed too.
-_OVERTRAVEL = 0.15
-_LOST_TIME = 0.1  # [s] without contact after which the object counts as lost
-_AVERAGED_SAMPLES = 2  # number of samples over which forces are averaged
-
-
 def find_grip_changes(trajectory: Trajectory, spans: Sequence[Span]) -> list[int]:
     """Return the waypoints at which the hand closes or opens."""
     moments = {time for _, begin, end in spans for time in (begin, end) if np.isfinite(time)}
@@ -362,9 +361,6 @@ def split_spans(spans: Sequence[Span], begin: float) -> tuple[list[Span], list[S
     own = [span for span in spans if span[0].by is None]
     others = [span for span in spans if span[0].by is not None]
     return [*((hold, first, begin) for hold, first, _ in own if first < begin), *others], own
-
-
-_REST = 1e-6  # [m/s] or [rad/s] up to which the robot is at rest
 
 
 def insert_pauses(trajectory: Trajectory, waypoints: Iterable[int], seconds: float) -> Trajectory:

@@ -42,6 +42,12 @@ from vkc_pin.world.trajectory.world_model import World, make_scene_at
 __all__ = ["Miss", "SimulationResult", "Tracking", "measure_goal_errors"]
 
 _TOLERANCE = 2e-3  # [m] or [rad] within which a plan counts as having completed a step
+GOAL = {"m": 0.01, "rad": 0.02}
+"""Tolerances within which a goal counts as reached."""
+DEPTH = 1e-3
+"""Penetration depth up to which an unplanned contact is harmless [m]."""
+_LISTED_CONTACTS = 8  # contacts in a report
+_LISTED_MOTORS = 4  # motors in a report, by decreasing load
 
 
 @dataclass(frozen=True)
@@ -166,14 +172,6 @@ def _compute_placement(world: World, row: Floats, frame: str) -> pin.SE3:
     data = world.model.createData()
     pin.forwardKinematics(world.model, data, world.coordinates.q(row))
     return pin.updateFramePlacement(world.model, data, world.model.getFrameId(frame)).copy()
-
-
-GOAL = {"m": 0.01, "rad": 0.02}
-"""Tolerances within which a goal counts as reached."""
-DEPTH = 1e-3
-"""Penetration depth up to which an unplanned contact is harmless [m]."""
-_LISTED_CONTACTS = 8  # contacts in a report
-_LISTED_MOTORS = 4  # motors in a report, by decreasing load
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,9 @@ __all__ = [
     "release_freed_memory",
 ]
 
+PACKAGES = ("vkc-pin", "pin", "coal", "casadi", "numpy")
+"""The package and the dependencies that affect motions."""
+
 
 def is_file(path: Path) -> bool:
     """Return whether there is a file; `Path.is_file` raises where the name is too long for one."""
@@ -94,10 +97,6 @@ def limit_resource(name: str, limit: int) -> None:
     # Some limits do not exist on macOS, and none can be above that of the user.
     with contextlib.suppress(AttributeError, ValueError, OSError):
         resource.setrlimit(getattr(resource, name), (limit, limit))
-
-
-PACKAGES = ("vkc-pin", "pin", "coal", "casadi", "numpy")
-"""The package and the dependencies that affect motions."""
 
 
 def find_versions() -> dict[str, str]:

@@ -19,6 +19,9 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 __all__ = ["Hit", "PairTable", "sweep"]
 
 _MOTION_TOLERANCE = 1e-9  # [m] or [rad]
+RESOLUTION = 1e-3  # largest penetration that may be missed between two samples [m]
+MIN_MOTION = 1e-6  # smaller relative motions between two samples are ignored [m]
+_Part = tuple[float, float, float, float]  # begin and end of it, distances there [m]
 
 
 class PairTable:
@@ -214,10 +217,6 @@ class _WindowIndex:
         which = self._which[place + np.arange(len(k))]
         holds = (self._first[which] <= first[k]) & (last[k] <= self._last[which])
         return k[holds], which[holds]
-
-
-RESOLUTION = 1e-3  # largest penetration that may be missed between two samples [m]
-MIN_MOTION = 1e-6  # smaller relative motions between two samples are ignored [m]
 
 
 class Hit(NamedTuple):
@@ -436,9 +435,6 @@ class Intervals(NamedTuple):
             self.before[which],
             self.after[which],
         )
-
-
-_Part = tuple[float, float, float, float]  # begin and end of it, distances there [m]
 
 
 def _pop_open_part(stack: list[_Part], motion: float) -> _Part | None:

@@ -28,6 +28,15 @@ __all__ = [
 
 _MOTION_TOLERANCE = 1e-9  # relative to a limit
 _MIN_SHARE = 5e-3  # smaller shares of the duration are not reported
+ACCEPTED_RATE_TOLERANCE = 1e-3  # relative excess over a limit
+REST_TOLERANCE = 1e-6  # [m/s] or [rad/s]
+JUMP_TOLERANCE = 1e-3  # jump of an acceleration, relative to its limit
+# Relative excess over a limit. Torques are evaluated only at three times of every cubic.
+TORQUE_TOLERANCE = 5e-3
+STEP_TOLERANCE = 1e-4  # lateral motion, or shortfall for the turn, between waypoints [m]
+SLIP_TOLERANCE = 1e-3  # lateral velocity, or shortfall for the turn, along a curve [m/s]
+WHEEL_TOLERANCE = 1e-3  # relative excess over the limit
+_SAMPLES_PER_CUBIC = 16
 
 
 def find_limiting_constraints(
@@ -73,11 +82,6 @@ def find_limiting_constraints(
     )
 
 
-ACCEPTED_RATE_TOLERANCE = 1e-3  # relative excess over a limit
-REST_TOLERANCE = 1e-6  # [m/s] or [rad/s]
-JUMP_TOLERANCE = 1e-3  # jump of an acceleration, relative to its limit
-
-
 def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
     """Yield the worst violations of velocity and acceleration limits (eq. 5) and of jerk limits.
 
@@ -116,10 +120,6 @@ def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
                 yield samples.make_violation(
                     kind, name, value - limit, f"{unit}/{per}", detail, waypoint=at
                 )
-
-
-# Relative excess over a limit. Torques are evaluated only at three times of every cubic.
-TORQUE_TOLERANCE = 5e-3
 
 
 class MotorLoads:
@@ -208,12 +208,6 @@ class MotorLoads:
             "bounds": found,
             "remarks": tuple(remarks),
         }
-
-
-STEP_TOLERANCE = 1e-4  # lateral motion, or shortfall for the turn, between waypoints [m]
-SLIP_TOLERANCE = 1e-3  # lateral velocity, or shortfall for the turn, along a curve [m/s]
-WHEEL_TOLERANCE = 1e-3  # relative excess over the limit
-_SAMPLES_PER_CUBIC = 16
 
 
 def check_rolling(samples: Samples) -> Iterator[Violation]:

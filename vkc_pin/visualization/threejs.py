@@ -40,6 +40,7 @@ _CREASE = np.radians(35.0)  # faces that meet at a larger angle keep an edge bet
 _SIDES = 8  # of a tube
 _GRAIN = 2.0**-14  # rounding of vertices, for better compression [m]
 _MAX_CACHED_SOLIDS = 512  # that a process keeps: robots are drawn again and again
+_GHOST_OPACITY = 0.30
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,9 +169,6 @@ def make_tube(points: Floats, radius: float) -> Solid | None:
 
 def _solid(vertices: NDArray[Any], faces: NDArray[Any], normals: NDArray[Any]) -> Solid:
     return Solid(vertices.astype(np.float32), faces.astype(np.uint32), normals.astype(np.float32))
-
-
-_GHOST_OPACITY = 0.30
 
 
 class Triangles(g.TriangularMeshGeometry):

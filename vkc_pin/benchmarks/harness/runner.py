@@ -44,6 +44,13 @@ TIME_LIMIT = 1800.0
 LIMITS: Mapping[str, Any] = {"max_evaluations": MAX_EVALUATIONS, "time_limit": TIME_LIMIT}
 """Both, as arguments of planners, and for the record."""
 
+Function = Callable[[dict[str, Any]], Mapping[str, Any] | Sequence[Mapping[str, Any]]]
+"""What runs one trial: takes its specification, returns its record, or several."""
+_JOURNAL = "trials.jsonl"
+# Packages that do not affect a trial: a run may be resumed after a change there.
+_NO_PART = ("cli/", "benchmarks/", "datasets/", "utils/parallel.py", "utils/journal.py")
+_DESCRIPTIONS = (".yaml", ".urdf", ".srdf")
+
 
 def describe_limit(about: Mapping[str, Any]) -> str:
     """Return the limit of a record's trials in words; old records limit planning time."""
@@ -65,15 +72,6 @@ class Execution(TypedDict, total=False):
     jobs: int
     scheduler: str | None
     progress: bool
-
-
-Function = Callable[[dict[str, Any]], Mapping[str, Any] | Sequence[Mapping[str, Any]]]
-"""What runs one trial: takes its specification, returns its record, or several."""
-
-_JOURNAL = "trials.jsonl"
-# Packages that do not affect a trial: a run may be resumed after a change there.
-_NO_PART = ("cli/", "benchmarks/", "datasets/", "utils/parallel/")
-_DESCRIPTIONS = (".yaml", ".urdf", ".srdf")
 
 
 def run(

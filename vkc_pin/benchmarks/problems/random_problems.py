@@ -45,6 +45,12 @@ _TRIES = 50  # rooms or obstacles in which something finds no place
 _OBSTACLES = 6  # at most
 _SECOND = 0.3  # share of problems of two steps
 _AIR = 1e-3  # [m] below placed objects
+_ROOMS = 100_000  # of one seed
+_LIMITS = {
+    **LIMITS,
+    "max_evaluations": LIMITS["max_evaluations"] // 10,
+}  # many of them cannot be done; those that can take up to 60 000
+OF = ("anything", "rooms")
 
 
 def sample_problem(seed: int, number: int) -> Problem:
@@ -201,14 +207,6 @@ def _touch(scene: Scene, name: str, rng: np.random.Generator) -> Step:
     links = [str(frame.name) for frame in item.model.frames if frame.type == pin.FrameType.BODY]
     x, y = _spot(scene, rng)
     return Touch(f"{name}.{links[-1]}", (float(x), float(y), float(rng.uniform(0.1, 1.2))))
-
-
-_ROOMS = 100_000  # of one seed
-_LIMITS = {
-    **LIMITS,
-    "max_evaluations": LIMITS["max_evaluations"] // 10,
-}  # many of them cannot be done; those that can take up to 60 000
-OF = ("anything", "rooms")
 
 
 def run(

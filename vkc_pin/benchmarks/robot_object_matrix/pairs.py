@@ -104,6 +104,12 @@ _DEPTH, _BESIDE, _MARGIN, _AIR = (
 )  # [m] of the counter: depth, margins beside, before and behind the object, height
 _OF_KIND = re.compile(r"(?P<kind>[a-z]+)_(?P<seed>\d+)")
 _SAME = 1e-6  # [rad] or [m]
+DEFAULT = "default"
+"""The word that stands for all names that are there by default."""
+_GIVEN = re.compile(r"(?:(?P<called>[A-Za-z]\w*)=)?(?P<path>[^#]+)(?:#(?P<link>.+))?")
+_FILES = (".urdf", ".xml", ".mjcf", ".sdf")
+_SAMPLES = 1000  # for pairs that need no check, as of robots that are loaded without an SRDF
+_LEVEL = 0.5  # cosine of how steep an approach may be that tells where the front is
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,15 +278,6 @@ def _of_kind(name: str) -> tuple[str, int] | None:
 
 def _is_path(name: str) -> bool:
     return name.endswith((".yaml", ".yml")) or "/" in name
-
-
-DEFAULT = "default"
-"""The word that stands for all names that are there by default."""
-
-_GIVEN = re.compile(r"(?:(?P<called>[A-Za-z]\w*)=)?(?P<path>[^#]+)(?:#(?P<link>.+))?")
-_FILES = (".urdf", ".xml", ".mjcf", ".sdf")
-_SAMPLES = 1000  # for pairs that need no check, as of robots that are loaded without an SRDF
-_LEVEL = 0.5  # cosine of how steep an approach may be that tells where the front is
 
 
 @dataclass(frozen=True)

@@ -73,6 +73,8 @@ _MOTION = {
 _IMAGES = {"_image": ("u1", 4), "_depth": ("u2", 3), "_segmentation": ("u2", 3)}
 _MAX_IMAGES = 4_000_000_000  # [bytes] of a camera in an episode
 _TOLERANCE = 1e-5  # of single precision, and of other machines; relative, and [m] or [rad]
+_ROBOTS: dict[tuple[str, str, float | None], Robot] = {}
+"""Robots of this process by recipe, name and height, since building every scene is slow."""
 
 
 def write_shard(path: Path, parts: Sequence[tuple[Path, int]], scenes: Path) -> Path:
@@ -496,10 +498,6 @@ def make_parts(task: tuple[Mapping[str, Any], Sequence[int], Mapping[str, str]])
             record["cpu_time"] = round(record["cpu_time"] + cpu_time, 4)
         found.append((record, data))
     return found
-
-
-_ROBOTS: dict[tuple[str, str, float | None], Robot] = {}
-"""Robots of this process by recipe, name and height, since building every scene is slow."""
 
 
 def _load_robot(recipe: str, episode: Episode) -> Robot:

@@ -33,6 +33,14 @@ _UNNAMED = 0.6  # factor for pieces that are not named as handles
 _THIN = 0.008  # [m] thickness below which a piece is rather a screw or a rim than a handle
 _UPWARDS = 0.5  # factor for grasps from below: few arms reach up from the floor
 _ASSUMED_TRAVEL = 2.0 * np.pi / 3.0  # [rad] assumed travel of joints without limits
+# [m] of a forearm: radius, length, and distance of its end behind the tool frame
+_ARM_RADIUS, _ARM_LENGTH, _ARM_START = 0.05, 0.4, 0.2
+Bools = NDArray[np.bool_]
+_SLIDE, _TURN = 0.01, 0.2  # steps, [m] and [rad]
+_LONGEST = 0.3  # [m] largest slide to either side
+_MIN_SLIDE, _MIN_TURN = 0.02, 0.3  # smallest ranges of a degree of freedom, [m] and [rad]
+_SAMPLES = 8  # positions of a joint at which the clearance is checked
+_BAR = np.array([0.0, 1.0, 0.0])  # direction of the bar in the tool frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,10 +189,6 @@ class Obstruction:
     link: str = ""
 
 
-# [m] of a forearm: radius, length, and distance of its end behind the tool frame
-_ARM_RADIUS, _ARM_LENGTH, _ARM_START = 0.05, 0.4, 0.2
-
-
 class HandClearance:
     """Clearance between a hand and an object at some joint positions."""
 
@@ -263,14 +267,6 @@ def _transform_box(box: tuple[Floats, Floats], where: pin.SE3) -> tuple[Floats, 
     """Return the lower and upper corner, in the world, of a box (centre, half extents)."""
     centre, extent = where.rotation @ box[0] + where.translation, np.abs(where.rotation) @ box[1]
     return centre - extent, centre + extent
-
-
-Bools = NDArray[np.bool_]
-_SLIDE, _TURN = 0.01, 0.2  # steps, [m] and [rad]
-_LONGEST = 0.3  # [m] largest slide to either side
-_MIN_SLIDE, _MIN_TURN = 0.02, 0.3  # smallest ranges of a degree of freedom, [m] and [rad]
-_SAMPLES = 8  # positions of a joint at which the clearance is checked
-_BAR = np.array([0.0, 1.0, 0.0])  # direction of the bar in the tool frame
 
 
 class GraspMotion:

@@ -25,6 +25,23 @@ __all__ = [
 _MIN_LINKS = 3  # smallest number of links of the hand: palm and two fingers
 _MIN_FRACTION = 0.5  # smallest enclosed fraction of the hand: fingertips may protrude
 _SLACK = 1e-3  # [m] by which an enclosed vertex may lie outside
+_HEIGHTS = np.arange(1, 20) / 10.0  # [m] of the bars
+_HANDLE, _LEVER = (0.7, 0.8), (1.0,)  # [m] heights around handles of drawers, and of door levers
+TASK_HEIGHTS = (*_HANDLE, *_LEVER)
+"""Heights of the bars that common tasks need [m]."""
+_TILT = 0.6  # [rad] largest slope of the approach
+# [rad] by which a lever is turned, and distance [m] of the hand from its axis
+_TURNS, _LEVER_ARM = (0.2, 0.4, 0.6), 0.07
+_SIDES = {"left": 1.0, "right": -1.0}  # of a lever's free end, and the sense in which it turns
+_RAISED = 1.0  # [m] above the floor, from which arms reach below their base
+_FEW = 1.15  # ratio of bars, of which a random search misses some
+# Distance [m] from the centre of a bar to the front behind it, less the clearance of links, and of
+# touch links
+_FACE, _TOUCH_FACE = 0.05, 0.065
+_SAMPLES, _STARTS, _STEPS = 500, 10, 30
+_STEP = 0.5  # largest step of a joint, [m] or [rad]
+_PROGRESS = 0.9  # factor by which the error must decrease in three steps
+_DAMPING, _TOLERANCE = 1e-6, 1e-3
 
 
 def find_envelopes(robot: Robot) -> dict[str, float]:
@@ -73,25 +90,6 @@ def _check_inside(faces: Floats, points: Floats) -> Floats:
     ]
     distances = (points @ normals.T - np.einsum("ij,ij->i", normals, base)).max(axis=1)
     return (distances <= _SLACK).astype(float)
-
-
-_HEIGHTS = np.arange(1, 20) / 10.0  # [m] of the bars
-_HANDLE, _LEVER = (0.7, 0.8), (1.0,)  # [m] heights around handles of drawers, and of door levers
-TASK_HEIGHTS = (*_HANDLE, *_LEVER)
-"""Heights of the bars that common tasks need [m]."""
-_TILT = 0.6  # [rad] largest slope of the approach
-# [rad] by which a lever is turned, and distance [m] of the hand from its axis
-_TURNS, _LEVER_ARM = (0.2, 0.4, 0.6), 0.07
-_SIDES = {"left": 1.0, "right": -1.0}  # of a lever's free end, and the sense in which it turns
-_RAISED = 1.0  # [m] above the floor, from which arms reach below their base
-_FEW = 1.15  # ratio of bars, of which a random search misses some
-# Distance [m] from the centre of a bar to the front behind it, less the clearance of links, and of
-# touch links
-_FACE, _TOUCH_FACE = 0.05, 0.065
-_SAMPLES, _STARTS, _STEPS = 500, 10, 30
-_STEP = 0.5  # largest step of a joint, [m] or [rad]
-_PROGRESS = 0.9  # factor by which the error must decrease in three steps
-_DAMPING, _TOLERANCE = 1e-6, 1e-3
 
 
 def should_reverse_tool(robot: Robot, *, seed: int = 0) -> bool:

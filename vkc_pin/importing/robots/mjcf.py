@@ -25,6 +25,7 @@ _STEPS = 8  # steps of the driving joint from rest to either end of its range
 _GAP = 1e-3  # [m] largest distance at which a loop counts as closed
 _STIFFNESS = 1e-4  # weight of the distance from the previous configuration
 _MAX_JOINTS = 24
+_FAR = 20.0  # [m] limits of prismatic joints without limits
 
 
 def solve_linkages(mujoco: Any, model: Any) -> list[list[dict[int, float]]]:
@@ -162,9 +163,6 @@ class _Linkage:
             for body, anchor in zip(ids, anchors, strict=True)
         )
         return first, second
-
-
-_FAR = 20.0  # [m] limits of prismatic joints without limits
 
 
 @dataclass

@@ -39,6 +39,9 @@ __all__ = [
     "invert",
 ]
 
+FREEDOM_VELOCITY = 1.0  # [rad/s] or [m/s], limit of a freedom of the grasp
+FREEDOM_ACCELERATION = 2.0
+
 
 class Kinematics:
     """Kinematics of one model; all symbolic users share its expressions."""
@@ -170,10 +173,6 @@ def _rotate_z_to(axis: Floats) -> Floats:
     x = x - axis * (axis @ x)
     x = x / np.linalg.norm(x)
     return np.column_stack([x, np.cross(axis, x), axis])
-
-
-FREEDOM_VELOCITY = 1.0  # [rad/s] or [m/s], limit of a freedom of the grasp
-FREEDOM_ACCELERATION = 2.0
 
 
 @dataclass(frozen=True, eq=False)

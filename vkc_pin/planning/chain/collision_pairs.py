@@ -50,6 +50,12 @@ __all__ = [
     "find_reduced_margins",
 ]
 
+REDUCED_MARGIN_RATIO = 0.5  # margin relative to the distance at the contact
+ReducedMargins = dict[int, list[tuple[int, int, float]]]
+# geometry of the chain, shape and placement at a contact, whether it is at the begin of the phase,
+# and whether the shapes may overlap
+_Contact = tuple[int, coal.CollisionGeometry, pin.SE3, bool, bool]
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PhaseGeometry:
@@ -145,14 +151,6 @@ class PhaseGeometry:
         standing = slice(self._n_moving, None)
         extents = np.einsum("gij,gj->gi", np.abs(self.rotation[standing]), self.half[standing])
         return (self._box_centers[standing] - extents).T, (self._box_centers[standing] + extents).T
-
-
-REDUCED_MARGIN_RATIO = 0.5  # margin relative to the distance at the contact
-
-ReducedMargins = dict[int, list[tuple[int, int, float]]]
-# geometry of the chain, shape and placement at a contact, whether it is at the begin of the phase,
-# and whether the shapes may overlap
-_Contact = tuple[int, coal.CollisionGeometry, pin.SE3, bool, bool]
 
 
 def find_reduced_margins(

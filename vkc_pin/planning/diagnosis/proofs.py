@@ -39,6 +39,8 @@ _BASE = 1  # the joint of the model that is the base
 
 # window of cells, and a mask of those that are blocked
 _Window = tuple[tuple[slice, slice], Bools]
+_CERTAIN_OVERLAP = 1e-3  # [m] more than validation accepts
+_SAMPLES = 200  # joint values between start and goal
 
 
 class _BaseGoal(NamedTuple):
@@ -285,10 +287,6 @@ def _list_names(problem: TrajectoryProblem, phase: Phase, names: Sequence[str]) 
         values = ", ".join(f"at {joint} = {value:.2f}" for joint, value in state.items())
         text += f"; {name} is {'closed' if is_closed else values} meanwhile"
     return text
-
-
-_CERTAIN_OVERLAP = 1e-3  # [m] more than validation accepts
-_SAMPLES = 200  # joint values between start and goal
 
 
 def find_swept_collisions(problem: TrajectoryProblem) -> list[str]:

@@ -58,6 +58,31 @@ _FILE_PATTERN = re.compile(
 )
 _BUILD_PATTERN = re.compile(re.escape(BUILD) + _RANDOM_SUFFIX)
 _DIGEST_SIZE = hashlib.sha256().digest_size  # bytes appended to a library; loaders ignore them
+# No fused multiply-add, the interpreter's own sine and cosine, and no instructions that another
+# machine with the same home may lack: results are equal bit for bit. -O2 took 1.4 times as long to
+# compile without making the code faster.
+_FLAGS = [
+    "-O1",
+    "-ffp-contract=off",
+    "-fno-builtin-sin",
+    "-fno-builtin-cos",
+    "-w",
+    "-fPIC",
+    "-shared",
+]
+_COMPILER_TIMEOUT = 600.0  # [s], timeout of the compiler, which takes 1 to 2 s on an idle processor
+# Samples at which a library is compared with the interpreter before it is stored. Each time it is
+# loaded, one sample is compared (1 ms).
+_COMPARISON_SAMPLES = 20
+_WORKER_SCRIPT = """
+import os, sys
+os.nice(19)
+sys.path[:] = sys.argv[3:]
+from vkc_pin.planning.kinematics.machine_code import compile_jobs
+compile_jobs(sys.argv[1], int(sys.argv[2]))
+"""
+_NICE_COMMAND = ("nice", "-n", "19")  # if available, Python itself starts with low priority
+_LOAD_LOCK = threading.Lock()
 
 
 class Libraries:
@@ -208,33 +233,6 @@ class Libraries:
 def _open(path: Path) -> BinaryIO:
     """Open a file, but no symbolic link, for reading."""
     return os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb")
-
-
-# No fused multiply-add, the interpreter's own sine and cosine, and no instructions that another
-# machine with the same home may lack: results are equal bit for bit. -O2 took 1.4 times as long to
-# compile without making the code faster.
-_FLAGS = [
-    "-O1",
-    "-ffp-contract=off",
-    "-fno-builtin-sin",
-    "-fno-builtin-cos",
-    "-w",
-    "-fPIC",
-    "-shared",
-]
-_COMPILER_TIMEOUT = 600.0  # [s], timeout of the compiler, which takes 1 to 2 s on an idle processor
-# Samples at which a library is compared with the interpreter before it is stored. Each time it is
-# loaded, one sample is compared (1 ms).
-_COMPARISON_SAMPLES = 20
-_WORKER_SCRIPT = """
-import os, sys
-os.nice(19)
-sys.path[:] = sys.argv[3:]
-from vkc_pin.planning.kinematics.machine_code import compile_jobs
-compile_jobs(sys.argv[1], int(sys.argv[2]))
-"""
-_NICE_COMMAND = ("nice", "-n", "19")  # if available, Python itself starts with low priority
-_LOAD_LOCK = threading.Lock()
 
 
 class MachineCode:

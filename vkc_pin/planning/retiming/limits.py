@@ -20,6 +20,12 @@ if TYPE_CHECKING:
 __all__ = ["Limits", "limit_jerk"]
 
 _ROUNDING = 1e-9  # relative
+# averaging intervals, as multiples of the time in which an acceleration may build up
+_SPAN_FACTORS = np.geomspace(0.25, 4.0, 9)
+_MIN_CUBICS_PER_STEP = 4
+_MAX_CUBIC_DURATION = 0.5  # relative to the averaging interval
+_SAMPLES_PER_CUBIC = 8  # to bracket the time of a waypoint
+_NEWTON_ITERATIONS = 6
 
 
 class Limits(NamedTuple):
@@ -86,14 +92,6 @@ class Limits(NamedTuple):
         """Return a curve, slowed down as much as its rate limits require."""
         factor = self.compute_slowdown(curve)
         return Curve(curve.times * factor, curve.positions, curve.rates / factor)
-
-
-# averaging intervals, as multiples of the time in which an acceleration may build up
-_SPAN_FACTORS = np.geomspace(0.25, 4.0, 9)
-_MIN_CUBICS_PER_STEP = 4
-_MAX_CUBIC_DURATION = 0.5  # relative to the averaging interval
-_SAMPLES_PER_CUBIC = 8  # to bracket the time of a waypoint
-_NEWTON_ITERATIONS = 6
 
 
 def limit_jerk(path: CubicHermiteSpline, pace: Curve, steps: int, limits: Limits) -> Curve:

@@ -21,6 +21,11 @@ __all__ = [
     "merge_contacts",
 ]
 
+SPACING = 0.02  # [m] or [rad] between the first samples, in the coordinate that moves most
+SEGMENT_MARGIN = 1e-2  # [m] clearance required between waypoints
+REFINEMENT_RANGE = 0.015  # [m] beyond `SEGMENT_MARGIN` within which samples are refined
+REFINEMENT = 4  # samples that replace one
+
 
 class Crossing(NamedTuple):
     """Indices of two geometries that pass through each other in segments `first` to `last`."""
@@ -74,12 +79,6 @@ def find_new_crossings(crossings: Sequence[Crossing], before: Sequence[Crossing]
     """Return the crossings of pairs without any crossing `before`."""
     known = {crossing.pair for crossing in before}
     return [crossing for crossing in crossings if crossing.pair not in known]
-
-
-SPACING = 0.02  # [m] or [rad] between the first samples, in the coordinate that moves most
-SEGMENT_MARGIN = 1e-2  # [m] clearance required between waypoints
-REFINEMENT_RANGE = 0.015  # [m] beyond `SEGMENT_MARGIN` within which samples are refined
-REFINEMENT = 4  # samples that replace one
 
 
 class SegmentContacts(NamedTuple):

@@ -47,6 +47,13 @@ _CYLINDER_RPY = {
 }  # roll, pitch, yaw of a cylinder
 _VELOCITY = {"revolute": 1.0, "prismatic": 0.5}  # [rad/s], [m/s]
 _EFFORT = {"revolute": 30.0, "prismatic": 40.0}  # [N·m], [N]
+_POST = 0.02  # [m] from a bar's ends to the posts that carry it
+_HALF_HAND = 0.03  # [m] from a post to the middle of the hand
+_TILT = 0.6  # [rad] largest tilt of a hand about a bar
+_SWING = 0.8  # [rad] largest rotation about an upright bar, or in any direction about a knob
+# [m] height above which a hand approaches horizontally; lower handles obliquely from above
+_LEVEL = 0.55
+_STEEPEST = 0.65  # [rad] largest slope of such an approach
 
 
 @dataclass(frozen=True)
@@ -270,15 +277,6 @@ def _round_all(values: Point) -> list[float]:
 
 def _to_plain_data(item: Mapping[str, Any]) -> dict[str, Any]:
     return {key: list(value) if isinstance(value, tuple) else value for key, value in item.items()}
-
-
-_POST = 0.02  # [m] from a bar's ends to the posts that carry it
-_HALF_HAND = 0.03  # [m] from a post to the middle of the hand
-_TILT = 0.6  # [rad] largest tilt of a hand about a bar
-_SWING = 0.8  # [rad] largest rotation about an upright bar, or in any direction about a knob
-# [m] height above which a hand approaches horizontally; lower handles obliquely from above
-_LEVEL = 0.55
-_STEEPEST = 0.65  # [rad] largest slope of such an approach
 
 
 def add_upright_bar(

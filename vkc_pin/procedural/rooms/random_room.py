@@ -41,6 +41,15 @@ from vkc_pin.world.scene.scene import START_CLEARANCE, Scene
 __all__ = ["Layout", "RoomSettings", "random_room", "sample_layout"]
 
 _MAX_CARRIED = 4  # on one table
+_MAX_TRIES = 60  # places for one part
+_MAX_ROOMS = 60  # rooms that are started because a part of the one before did not fit
+_MAX_STARTS = 1000  # places for the robot
+# [m] around a turning robot: more than a plan's clearance and half a grid cell
+_TURNING = 0.07
+_DENSITY = 0.45  # pieces of furniture per square metre of floor at clutter 1
+_BEYOND = 2.0  # [m] of floor beyond a wall with a door
+_COLOURS = ("teal", "terracotta", "blue", "cream", "orange", "grey", "green")
+_EDGE = 0.1  # [m] from the middle of a free object to the edges of its table
 
 
 @dataclass(frozen=True)
@@ -162,17 +171,6 @@ def _check_range(name: str, value: Any, low: float, high: float) -> None:
             expected=f"a number from {low:g} to {high:g}",
             got=format_value(value),
         )
-
-
-_MAX_TRIES = 60  # places for one part
-_MAX_ROOMS = 60  # rooms that are started because a part of the one before did not fit
-_MAX_STARTS = 1000  # places for the robot
-# [m] around a turning robot: more than a plan's clearance and half a grid cell
-_TURNING = 0.07
-_DENSITY = 0.45  # pieces of furniture per square metre of floor at clutter 1
-_BEYOND = 2.0  # [m] of floor beyond a wall with a door
-_COLOURS = ("teal", "terracotta", "blue", "cream", "orange", "grey", "green")
-_EDGE = 0.1  # [m] from the middle of a free object to the edges of its table
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,22 @@ __all__ = [
     "plot_top_view",
 ]
 
+_KINDS = (
+    "robot – itself",
+    "robot – objects",
+    "robot – obstacles",
+    "objects – surroundings",
+    "gripper – grasped object",
+)
+SAMPLES = 240
+"""Number of times at which a motion is drawn, besides its waypoints and knots."""
+_BEFORE = 1e-9  # offset before a knot, where accelerations jump [s]
+DASHES: Any = {"linestyle": (0, (5, 3)), "linewidth": 0.9}
+"""Style of limits."""
+PICTURES = (".png", ".svg", ".pdf")
+"""File name extensions of pictures."""
+_SHOWN = 0.30  # larger clearances are cut off [m]
+
 
 @dataclass(frozen=True, eq=False)
 class ClearanceCurve:
@@ -118,15 +134,6 @@ def compute_clearance_curves(
     return curves
 
 
-_KINDS = (
-    "robot – itself",
-    "robot – objects",
-    "robot – obstacles",
-    "objects – surroundings",
-    "gripper – grasped object",
-)
-
-
 def _find_kind(table: PairTable, pair: Ints, gripped: Set[tuple[str, str]]) -> str:
     first, second = (table.groups[int(i)] for i in pair)
     one, other = (table.world.collision_labels[int(i)] for i in pair)
@@ -136,13 +143,6 @@ def _find_kind(table: PairTable, pair: Ints, gripped: Set[tuple[str, str]]) -> s
         return _KINDS[3]
     owner = second if first == "robot" else first
     return {"robot": _KINDS[0], "": _KINDS[2]}.get(owner, _KINDS[1])
-
-
-SAMPLES = 240
-"""Number of times at which a motion is drawn, besides its waypoints and knots."""
-_BEFORE = 1e-9  # offset before a knot, where accelerations jump [s]
-DASHES: Any = {"linestyle": (0, (5, 3)), "linewidth": 0.9}
-"""Style of limits."""
 
 
 @dataclass(frozen=True)
@@ -332,11 +332,6 @@ def name_phases(axes: Axes, plan: CheckedMotion) -> None:
             fontsize=7.5,
             color="0.35",
         )
-
-
-PICTURES = (".png", ".svg", ".pdf")
-"""File name extensions of pictures."""
-_SHOWN = 0.30  # larger clearances are cut off [m]
 
 
 def plot(plan: CheckedMotion, path: str | Path | None = None) -> Figure | dict[str, Figure]:

@@ -32,6 +32,8 @@ __all__ = [
 
 TOLERANCE = 1e-6  # coal's default tolerance of GJK
 _MIN_PAIRS_PER_THREAD = 128  # distances, about 0.2 ms: fewer do not pay for another thread
+_ROUNDING = 1e-6  # [m] numerical error of coal's distances
+_MIN_ROWS_PER_THREAD = 16  # configurations, about 0.3 ms: fewer do not pay for another thread
 
 
 class Witnesses(NamedTuple):
@@ -212,10 +214,6 @@ class Margins:
             rows: Row of `z` for each pair, shape (n,).
         """
         return np.asarray(self.compiled.at(pairs, waypoints, z, rows), float)
-
-
-_ROUNDING = 1e-6  # [m] numerical error of coal's distances
-_MIN_ROWS_PER_THREAD = 16  # configurations, about 0.3 ms: fewer do not pay for another thread
 
 
 class ClosePairs(NamedTuple):

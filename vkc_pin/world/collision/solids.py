@@ -27,6 +27,8 @@ __all__ = [
 ]
 
 _MAX_THREADS = 8
+_cache: dict[int, tuple[weakref.ref[Any], bytes, float, Any]] = {}  # by the id of the shape
+_SIZE = 12
 
 
 def count_threads() -> int:
@@ -94,9 +96,6 @@ def convert_solid(shape: coal.CollisionGeometry) -> Any:
     )
 
 
-_cache: dict[int, tuple[weakref.ref[Any], bytes, float, Any]] = {}  # by the id of the shape
-
-
 def _convert_cached(shape: Any, points: Floats, radius: float) -> Any:
     key, content = id(shape), points.tobytes()
     if key in _cache:
@@ -111,9 +110,6 @@ def _convert_cached(shape: Any, points: Floats, radius: float) -> Any:
     )
     _cache[key] = (weakref.ref(shape, lambda _: _cache.pop(key, None)), content, radius, solid)
     return solid
-
-
-_SIZE = 12
 
 
 def flatten_placements(placements: Sequence[pin.SE3]) -> Floats:

@@ -35,6 +35,11 @@ __all__ = [
 ]
 
 _MOVING = ("revolute", "continuous", "prismatic")
+DEFAULT_JOINT_VELOCITY = np.pi
+"""Velocity limit of revolute joints for which no file states one [rad/s]."""
+DEFAULT_SLIDE_VELOCITY = 0.1
+"""Velocity limit of prismatic joints for which no file states one [m/s]; most of them are lifts."""
+_DEFAULT_JOINT_ACCELERATION = 1.4  # [rad/s²] or [m/s²]
 
 
 @dataclass(frozen=True)
@@ -266,13 +271,6 @@ def sort_joints(full: pin.Model, before: Mapping[int, Collection[int]]) -> list[
             )
         waiting = later
     return order
-
-
-DEFAULT_JOINT_VELOCITY = np.pi
-"""Velocity limit of revolute joints for which no file states one [rad/s]."""
-DEFAULT_SLIDE_VELOCITY = 0.1
-"""Velocity limit of prismatic joints for which no file states one [m/s]; most of them are lifts."""
-_DEFAULT_JOINT_ACCELERATION = 1.4  # [rad/s²] or [m/s²]
 
 
 def tighten_coupled_limits(full: pin.Model, file: UrdfFile, tool_frame: str) -> pin.Model:

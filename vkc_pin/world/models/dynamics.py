@@ -31,6 +31,10 @@ __all__ = [
     "set_mass",
 ]
 
+UNLIMITED = 1e300
+"""Effort limits of Pinocchio above this mean that there is no limit."""
+_SAMPLES = 200  # random configurations in which a motor must hold the arm
+
 
 @dataclass(frozen=True, kw_only=True)
 class Resistance:
@@ -156,11 +160,6 @@ def compute_solid_inertia(shape: pin.GeometryObject, density: float = 1.0) -> pi
     return pin.Inertia(
         float(solid.mass), np.asarray(solid.center_mass), np.asarray(solid.moment_inertia)
     )
-
-
-UNLIMITED = 1e300
-"""Effort limits of Pinocchio above this mean that there is no limit."""
-_SAMPLES = 200  # random configurations in which a motor must hold the arm
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,6 +46,8 @@ WIDEST_BAR = _MAX_WIDTH - WIDTH_TOLERANCE
 PlacedShape = tuple[coal.CollisionGeometry, pin.SE3]
 """A shape and its placement."""
 
+_BISECTION_STEPS = 30  # bisection of the range between closed and open, to 1e-9 of it
+
 
 def check_bar_fits(width: float, shapes: Sequence[PlacedShape]) -> bool:
     """Return whether a bar at the tool's origin collides with none of the shapes.
@@ -89,9 +91,6 @@ def _find_largest(check: Callable[[float], bool]) -> float:
         middle = (low + high) / 2.0
         low, high = (middle, high) if check(middle) else (low, middle)
     return low
-
-
-_BISECTION_STEPS = 30  # bisection of the range between closed and open, to 1e-9 of it
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -55,6 +55,13 @@ MAX_ANGLE_DEVIATION = 0.2
 _DECIMALS = 9  # of a deviation: converting it to a pose and back gives the same numbers
 _SLACK = 1e-9  # [m] or [rad] of rounding
 _MAX_STARTS = 81  # combinations of lower end, middle and upper end of the freedoms
+Solids = Sequence[tuple[coal.CollisionGeometry, pin.SE3]]
+"""Shapes with their placements in the world frame."""
+_MAX_OVERLAP = 0.01  # [m] of hand and object or floor: larger than opening inaccuracies
+_ROUNDING = 2e-4  # [m] of an opening: measured less accurately than it is written
+_APPROACH = (0.0, 0.04, 0.08)  # [m] distances before the grasp at which overlaps are checked
+MAX_HELD = 50
+"""Largest number of objects held at once; each may be held through another."""
 
 
 def apply_deviation(attachment: Attachment, deviation: Sequence[float]) -> Attachment:
@@ -133,16 +140,6 @@ def _fit_freedoms(
         for start in itertools.islice(starts, _MAX_STARTS)
     )
     return tuple(min(fits, key=lambda fit: float(fit.cost)).x.tolist())
-
-
-Solids = Sequence[tuple[coal.CollisionGeometry, pin.SE3]]
-"""Shapes with their placements in the world frame."""
-
-_MAX_OVERLAP = 0.01  # [m] of hand and object or floor: larger than opening inaccuracies
-_ROUNDING = 2e-4  # [m] of an opening: measured less accurately than it is written
-_APPROACH = (0.0, 0.04, 0.08)  # [m] distances before the grasp at which overlaps are checked
-MAX_HELD = 50
-"""Largest number of objects held at once; each may be held through another."""
 
 
 @dataclass(frozen=True)

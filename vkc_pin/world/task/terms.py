@@ -42,6 +42,9 @@ __all__ = [
 # Added under every square root, whose derivative is infinite at zero (as for a zero velocity).
 ROUNDING = 1e-8
 _COMPARISONS = ("lt", "le", "eq", "ne", "and", "or", "not")
+_CONSTANT = "it does not depend on the state"
+_DEPENDENT = "an expression of symbols that the State returns"
+Numbers = float | Sequence[float] | NDArray[np.float64]
 
 
 class State:
@@ -236,9 +239,6 @@ def _list_operations() -> dict[int, str]:
     }
 
 
-_CONSTANT = "it does not depend on the state"
-_DEPENDENT = "an expression of symbols that the State returns"
-Numbers = float | Sequence[float] | NDArray[np.float64]
 Expression = Callable[[State], Any] | Formula
 
 

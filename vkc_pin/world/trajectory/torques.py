@@ -29,6 +29,7 @@ _GRIP = 0.1  # lever arm of a hand, for the weighting of torques [m]
 _SINGULAR = 1e-9  # relative cutoff for joints that the hand cannot move
 # Velocity of a joint at rest [m/s], [rad/s], and distance from its latch or stop [m], [rad].
 _STILL = 1e-6
+_SHARES = np.array([0.0, 0.5, 1.0])  # of each cubic: accelerations jump at both ends
 
 
 class Motion(NamedTuple):
@@ -153,9 +154,6 @@ class Handle:
                 ..., None
             ]
         return np.tile(np.diag([1.0] * 3 + [_GRIP] * 3), (len(turns), 1, 1))
-
-
-_SHARES = np.array([0.0, 0.5, 1.0])  # of each cubic: accelerations jump at both ends
 
 
 @dataclass(frozen=True, eq=False)

@@ -133,7 +133,7 @@ def test_tests_that_execute_the_line_come_first(line: int, expected: list[str]) 
 def test_command_reports_faults_and_reuses_coverage() -> None:
     command = [sys.executable, "-m", "tests.mutants", "--sample", "4"]
     command += ["--modules", "benchmarks/harness/runner.py"]
-    command += ["--tests", "tests/benchmarks/harness/test_limits.py"]
+    command += ["--tests", "tests/benchmarks/harness/test_runner.py"]
     for _ in range(2):
         process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     *lines, summary = process.stdout.splitlines()

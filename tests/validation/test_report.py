@@ -13,6 +13,7 @@ import pytest
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
 from vkc_pin.validation.report import Bound, Exemption, Report, Violation
+from vkc_pin.validation.validate import validate
 from vkc_pin.visualization.plots.plots import compute_clearance_curves
 
 LIMIT = Violation(
@@ -168,3 +169,25 @@ def test_clearance_of_a_phase_is_at_most_that_of_its_waypoints(door_plan: vkc.Pl
         curves = compute_clearance_curves(door_plan.scene, fine, times)
         others = [curve for curve in curves if not curve.name.startswith("gripper")]
         assert close <= min(float(curve.distances.min()) for curve in others) + 1e-6
+
+
+@pytest.mark.parametrize(("angle", "ok"), [(0.049, False), (0.051, True)])
+def test_goals_within_the_tolerance_are_accepted(
+    door_plan: vkc.Plan, angle: float, ok: bool
+) -> None:
+    report = validate(
+        door_plan.scene,
+        [vkc.Actuate("door", {"hinge": 1.25})],
+        door_plan.trajectory,
+        tolerances=vkc.Tolerances(goal_angle=angle),
+    )
+    assert report.ok is ok
+
+
+@pytest.mark.parametrize(
+    "name", ["closure_position", "closure_angle", "goal_position", "goal_angle"]
+)
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, 11.0, "1", None])
+def test_invalid_tolerances_raise(name: str, value: Any) -> None:
+    with pytest.raises(InputError, match=name):
+        vkc.Tolerances(**{name: value})

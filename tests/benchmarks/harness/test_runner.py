@@ -1,3 +1,5 @@
+"""Tests the descriptions of trial limits."""
+
 from __future__ import annotations
 
 import contextlib
@@ -22,7 +24,13 @@ from helpers.trials import (
 )
 
 from vkc_pin.benchmarks.harness import runner
+from vkc_pin.benchmarks.harness.runner import LIMITS, describe_limit
 from vkc_pin.errors import InputError, VkcError
+
+
+def test_description_states_evaluations_or_planning_time() -> None:
+    assert describe_limit({**LIMITS, "seed": 3}) == "at most 1 000 000 evaluations"
+    assert describe_limit({"time_limit": 20.0}) == "at most 20 s of planning"
 
 
 class CountingSolver:

@@ -1,16 +1,96 @@
-"""Tests the robot–object matrix from the command line."""
+"""Tests the robot–object matrix: its tables, its chart and its command."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import vkc_pin as vkc
+from vkc_pin.benchmarks.harness.record import describe_environment
 from vkc_pin.benchmarks.robot_object_matrix.pairs import SHARE
-from vkc_pin.benchmarks.robot_object_matrix.run import run
+from vkc_pin.benchmarks.robot_object_matrix.run import chart, format_results, run
 from vkc_pin.cli import main
+
+
+def make_record(robot: str, name: str, status: str = "success", **fields: Any) -> dict[str, Any]:
+    times = (
+        {"planning_time": 1.0, "load_time": 0.5}
+        if status not in ("unreachable", "error", "no hand")
+        else {}
+    )
+    return {
+        "robot": robot,
+        "object": name,
+        "success": status == "success",
+        "status": status,
+        **times,
+        **fields,
+    }
+
+
+RECORDS = [
+    *(make_record("one", "oven_0", planning_time=time) for time in (1.0, 3.0)),
+    *(
+        make_record("one", "door", status, because=reason)
+        for status, reason in (("success", ""), ("infeasible", "the shelf | the wall"))
+    ),
+    make_record("one", "valve_1", "unreachable", because="turn: nothing of it fits"),
+    *(make_record("two", "oven_0", "not converged", because="") for _ in range(2)),
+    make_record("two", "door", "error", violations=["InputError: no"]),
+    make_record("two", "valve_1", "unreachable", because="turn: nothing of it fits"),
+    *(
+        make_record("three", name, "no hand", because="touch_links: not known")
+        for name in ("oven_0", "door", "valve_1")
+    ),
+]
+
+
+def test_tables_list_all_pairs() -> None:
+    text = format_results(
+        {
+            "meta": {**describe_environment(starts=2, seed=0, share=0.5, max_evaluations=1000)},
+            "trials": RECORDS,
+        }
+    )
+    assert "3 robots, 3 objects of 3 kinds, 2 random starts each" in text
+    assert "A joint is opened by 50% of its range" in text
+    assert "| one | 3 | 2 | 1 (50%) | 2 (100%) | 1.00 | 2.70 | 0.50 |" in text
+    assert "| two | 3 | 2 | 0 (0%) | 0 (0%) | 1.00 | 1.00 | 0.50 |" in text, "an error is a failure"
+    assert "| all | 9 | 4 | 1 (25%) | 2 (50%) |" in text
+    assert "| oven_0 | 2/2 | 0/2 | – |\n| door | 1/2 | ! | – |\n| valve_1 | – | – | – |" in text
+    assert "| one | door | infeasible | 1 | the shelf \\| the wall |" in text
+    assert "| two | oven_0 | not converged | 2 |  |" in text, "equal failures share a row"
+    assert "| two | door | error | 1 | InputError: no |" in text
+    assert "| three | every object | no hand | 3 | touch_links: not known |" in text
+    assert "| three | 3 | 0 | 0 (0%) | 0 (0%) | – | – | – |" in text
+    assert (
+        text.index("## What failed")
+        < text.index("## Out of reach")
+        < text.index("| one | valve_1 | unreachable")
+    )
+
+
+def test_chart_shows_the_successes_of_all_pairs(tmp_path: Path) -> None:
+    figure = chart(RECORDS, tmp_path / "success.png")
+    axes, _ = figure.axes
+    assert [text.get_text() for text in axes.texts] == [
+        "2/2",
+        "0/2",
+        "–",
+        "1/2",
+        "!",
+        "–",
+        "–",
+        "–",
+        "–",
+    ]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["oven_0", "door", "valve_1"]
+    rates = axes.images[0].get_array()
+    assert rates.tolist() == [[100.0, 0.0, None], [50.0, 0.0, None], [None, None, None]]
+    assert (tmp_path / "success.png").stat().st_size > 5000
 
 
 @pytest.mark.long

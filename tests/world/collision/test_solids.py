@@ -1,7 +1,8 @@
-"""Tests the conversion of coal shapes to compiled ones, and the check of library versions."""
+"""Tests the conversion of coal shapes and placements, library versions, and numbers of threads."""
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import types
@@ -15,8 +16,28 @@ from vkc_pin.errors import BuildError, InputError
 from vkc_pin.utils import optional_imports
 from vkc_pin.world.collision import solids
 from vkc_pin.world.collision.distances import Shapes
-from vkc_pin.world.collision.solids import convert_solid
+from vkc_pin.world.collision.solids import (
+    ShapePlacements,
+    convert_solid,
+    count_threads,
+    flatten_placements,
+)
 from vkc_pin.world.files.meshes import make_convex_hull
+
+
+@pytest.mark.parametrize(
+    ("requested", "expected"), [("1", 1), ("3", 3), ("0", 1), ("nonsense", 8), ("", 8)]
+)
+def test_thread_count_respects_cores_and_environment(
+    requested: str, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", requested)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(12)), raising=False)
+    assert count_threads() == expected
+    assert Shapes([coal.Sphere(0.1)]).threads == expected
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0}, raising=False)
+    assert count_threads() == 1
+
 
 AT_ORIGIN = np.array([[[1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0]] * 2])
 
@@ -111,3 +132,55 @@ def test_box_sizes_do_not_depend_on_the_first_query() -> None:
     }
     assert len(outputs) == 1
     assert float.fromhex(outputs.pop().strip()) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_placements_are_flattened_by_columns() -> None:
+    rotation = pin.exp3(np.array([0.1, 0.2, 0.3]))
+    (numbers,) = flatten_placements([pin.SE3(rotation, np.array([4.0, 5.0, 6.0]))])
+    np.testing.assert_array_equal(
+        numbers, [*rotation[:, 0], *rotation[:, 1], *rotation[:, 2], 4.0, 5.0, 6.0]
+    )
+    assert flatten_placements([]).shape == (0, 12)
+
+
+def check_placements(model: pin.Model, geometry: pin.GeometryModel, q: np.ndarray) -> None:
+    shape_placements = ShapePlacements(model, geometry)
+    found = shape_placements.compute_placements(q)
+    assert found.shape == (len(q), len(geometry.geometryObjects), 12)
+    data, placed = model.createData(), pin.GeometryData(geometry)
+    for row, configuration in zip(found, q, strict=True):
+        pin.updateGeometryPlacements(model, data, geometry, placed, configuration)
+        for numbers, placement in zip(row, placed.oMg, strict=True):
+            np.testing.assert_array_equal(numbers[:9].reshape(3, 3).T, placement.rotation)
+            np.testing.assert_array_equal(numbers[9:], placement.translation)
+    np.testing.assert_array_equal(
+        shape_placements.compute_placements(q[:1]), found[:1]
+    )  # earlier results must not change
+
+
+JOINTS = [
+    *(getattr(pin, f"JointModel{kind}{axis}") for kind in ("R", "P", "RUB") for axis in "XYZ"),
+    lambda: pin.JointModelRevoluteUnaligned(np.array([0.6, 0.0, 0.8])),
+    lambda: pin.JointModelPrismaticUnaligned(np.array([0.0, -0.6, 0.8])),
+    pin.JointModelPlanar,
+    pin.JointModelFreeFlyer,
+    pin.JointModelSpherical,
+]
+
+
+def test_all_joint_types_are_supported() -> None:
+    pin.seed(0)
+    rng, model, geometry, parent = np.random.default_rng(3), pin.Model(), pin.GeometryModel(), 0
+    for k, joint in enumerate(JOINTS):
+        parent = model.addJoint(parent, joint(), pin.SE3.Random(), f"j{k}")
+        shape = pin.GeometryObject(f"s{k}", parent, 0, pin.SE3.Random(), coal.Sphere(0.1))
+        geometry.addGeometryObject(shape)
+    geometry.addGeometryObject(
+        pin.GeometryObject("stands", 0, 0, pin.SE3.Random(), coal.Sphere(0.1))
+    )
+    neutral = pin.neutral(model)
+    check_placements(
+        model,
+        geometry,
+        np.array([pin.integrate(model, neutral, rng.normal(size=model.nv)) for _ in range(4)]),
+    )

@@ -1,23 +1,33 @@
-"""Tests the order of holds and the reversal of approaches."""
+"""Tests the order of holds, reversed approaches, and measured grasps."""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
+import json
 import shutil
 import warnings
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.drawers import load_drawer_scene
+from helpers.drawers import NEAR_HANDLE, load_drawer_scene, make_grasping_scene
+from helpers.small_problems import replace_objects
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.options import Options
+from vkc_pin.planning.chain.chain import consolidate
 from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.models.object_file import load_object
-from vkc_pin.world.scene.hold import Hold, check_hold_order, make_holds
+from vkc_pin.world.scene.contact_rules import compute_hand_clearance
+from vkc_pin.world.scene.hold import Hold, check_hold_order, fit_grasp, make_holds
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
 
 STICK = Hold("stick", "grip")
 BALL = Hold("ball", "pull", STICK, "tip")
@@ -163,3 +173,244 @@ def test_approach_through_a_held_object_is_reversed(tmp_path: Path) -> None:
         from_below = from_below.with_approaches([hold])
     assert "would approach ball.pull" in str(caught[0].message)
     assert from_below.objects["ball"].reversed == ("pull",)
+
+
+HALL = {
+    "robot": "husky_ur5e",
+    "start": {"base": [0.0, 0.0, 0.5]},
+    "objects": [
+        {"name": "drawer", "type": "drawer", "position": [2, 1, 0], "state": {"slide": 0.1}},
+        {"name": "cane", "type": "stick", "position": [2, 0, 0.05], "yaw": 0.3},
+        {"name": "fruit", "type": "ball", "position": [2, 1, 0.035]},
+    ],
+}
+GRASPS = [("drawer", "handle"), ("drawer", "handle_free"), ("cane", "grip"), ("fruit", "grip")]
+unit = st.tuples(*[st.floats(-1.0, 1.0)] * 6).map(np.array)
+
+
+@cache
+def make_hall() -> vkc.Scene:
+    return vkc.Scene.from_document(HALL)
+
+
+def make_measured(name: str, attachment: str, at: list[float], offset: np.ndarray) -> pin.SE3:
+    """Return the attachment's pose in a tool frame displaced from the nominal grasp by `offset`."""
+    grasp = make_hall().objects[name].object.attachment(attachment)
+    return (grasp.motion(at) * pin.SE3(pin.exp3(offset[3:]), offset[:3])).inverse()
+
+
+def make_measured_scene(
+    grasp: tuple[str, str], fraction: float, offset: np.ndarray
+) -> tuple[vkc.Scene, pin.SE3]:
+    """Return a scene with a grasp displaced in the direction `offset`, and its measured pose."""
+    name, attachment = grasp
+    at = choose_values(name, attachment, fraction)
+    measured = make_measured(*grasp, at, offset * np.repeat([0.011, 0.11], 3))
+    scene = make_hall().with_held({name: attachment}, at={name: at}, measured={name: measured})
+    return scene, measured
+
+
+def choose_values(name: str, attachment: str, fraction: float) -> list[float]:
+    freedoms = make_hall().objects[name].object.attachment(attachment).freedoms
+    return [one.lower + fraction * (one.upper - one.lower) for one in freedoms]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.sampled_from(GRASPS), st.floats(0.0, 1.0), unit)
+def test_virtual_joint_is_the_measured_transform(
+    grasp: tuple[str, str], fraction: float, offset: np.ndarray
+) -> None:
+    (name, attachment), (scene, measured) = grasp, make_measured_scene(grasp, fraction, offset)
+    at = scene.holds[0].at
+    chain = consolidate(scene, scene.holds)
+    z = np.zeros(chain.size)
+    z[: len(scene.start)] = scene.start
+    for joint, value in zip(chain.virtual[scene.holds[0]], reversed(at), strict=True):
+        z[chain.index(joint)] = value
+    placed, data = scene.objects[name], chain.model.createData()
+    for joint, value in zip(placed.object.coordinates.names, placed.state, strict=True):
+        z[chain.index(f"{name}.{joint}")] = value
+    pin.framesForwardKinematics(chain.model, data, chain.coordinates.q(z[None])[0])
+    closure = chain.closures[scene.holds[0]]
+    base = data.oMi[closure.joint] * closure.local
+    nominal = placed.object.attachment(attachment)
+    frame = placed.object.link_placement(nominal.link, placed.state) * nominal.placement
+    found = scene.tool_placement().actInv(base * frame)
+    np.testing.assert_allclose(found.homogeneous, measured.homogeneous, atol=1e-8)
+    if placed.object.free:
+        np.testing.assert_allclose(placed.placement.homogeneous, base.homogeneous, atol=1e-9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.sampled_from(GRASPS), st.floats(0.0, 1.0), unit)
+def test_measured_grasp_survives_serialization(
+    grasp: tuple[str, str], fraction: float, offset: np.ndarray
+) -> None:
+    scene, _ = make_measured_scene(grasp, fraction, offset)
+    again = vkc.Scene.from_document(json.loads(json.dumps(scene.document)))
+    assert again.holds == scene.holds
+    assert again.holds[0].at == scene.holds[0].at
+    span = PhaseSpan("move", 0, 1, scene.holds)
+    assert PhaseSpan.from_dict(json.loads(json.dumps(span.to_dict())), "phase") == span
+    motion = vkc.Trajectory(
+        scene.robot.coordinates.names,
+        np.arange(2.0),
+        np.tile(scene.start, (2, 1)),
+        (span,),
+        len(scene.start),
+    )
+    assert vkc.Trajectory.from_dict(motion.to_dict()).phases == motion.phases
+
+
+def test_tables_preserve_measured_grasps(tmp_path: Path) -> None:
+    scene = make_hall().with_held({"cane": "grip"}, measured={"cane": (0.001, 0, 0, 0, 0, 0)})
+    holds = (*scene.holds, Hold("fruit", "pull", scene.holds[0], "tip"))
+    motion = vkc.Trajectory(
+        scene.robot.coordinates.names,
+        np.arange(2.0),
+        np.tile(scene.start, (2, 1)),
+        (PhaseSpan("move", 0, 1, holds),),
+        len(scene.start),
+    )
+    assert scene.holds[0].deviation
+    again = vkc.Trajectory.from_csv(motion.to_csv(tmp_path / "motion.csv"))
+    assert again.phases == motion.phases
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0.05, 0.95), unit)
+def test_freedoms_are_fitted_to_a_measured_grasp(fraction: float, offset: np.ndarray) -> None:
+    name, attachment = "drawer", "handle_free"
+    at = choose_values(name, attachment, fraction)
+    exact = make_measured(name, attachment, at, np.zeros(6))
+    (hold,) = make_hall().with_held({name: attachment}, measured={name: exact}).holds
+    assert hold.at == pytest.approx(at, abs=1e-5)
+    assert np.abs(hold.deviation or 0.0).max() < 1e-5
+    measured = make_measured(name, attachment, at, offset * np.repeat([0.011, 0.11], 3))
+    fitted, stated = (
+        make_hall().with_held({name: attachment}, at=values, measured={name: measured}).holds[0]
+        for values in (None, {name: at})
+    )
+    scale = np.repeat([0.02, 0.2], 3)
+    sizes = [
+        np.linalg.norm(np.array(one.deviation or [0.0] * 6) / scale) for one in (fitted, stated)
+    ]
+    assert sizes[0] <= sizes[1] + 1e-6
+
+
+@pytest.mark.parametrize("around", [-3.0, 0.2, 3.0])
+def test_freedoms_are_fitted_all_around_a_rim(around: float) -> None:
+    rim = vkc.load_object("bowl").attachment("rim")
+    values, deviation = fit_grasp(rim, rim.motion([around, 0.1]).inverse(), None, "measured")
+    assert values == pytest.approx([around, 0.1], abs=1e-5)
+    assert np.abs(deviation or 0.0).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("offset", "got"),
+    [
+        ([0.0, 0.021, 0.0, 0.0, 0.0, 0.0], "21.0 mm and 0.000 rad"),
+        ([0.0, 0.0, 0.0, 0.0, 0.21, 0.0], "0.0 mm and 0.210 rad"),
+    ],
+)
+def test_hand_too_far_from_its_attachment_is_rejected(offset: list[float], got: str) -> None:
+    measured = make_measured("drawer", "handle", [], np.array(offset))
+    with pytest.raises(InputError, match=f"held.drawer.measured.*20 mm and 0.2 rad.*{got}"):
+        make_hall().with_held({"drawer": "handle"}, measured={"drawer": measured})
+    with pytest.raises(InputError, match=rf"Hold\.deviation.*{got}"):
+        Hold("drawer", "handle", deviation=tuple(offset))
+    assert Hold("drawer", "handle", deviation=(0.0,) * 6) == Hold("drawer", "handle")
+    with pytest.raises(InputError, match="wrong number of values"):
+        Hold("drawer", "handle", deviation=(0.0,))
+    near = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.001]))
+    with pytest.raises(InputError, match=r"held.drawer.measured: a hand that pushes only touches"):
+        make_hall().with_held({"drawer": "push"}, measured={"drawer": near})
+    with pytest.raises(UnknownNameError, match="drawr"):
+        make_hall().with_held({"drawer": "handle"}, measured={"drawr": measured})
+
+
+@pytest.mark.parametrize(
+    ("measured", "line", "field", "text"),
+    [
+        ("{position: [0, 0, 0.3]}", 3, "start.held.drawer.measured", "300.0 mm and"),
+        ("{position: [0, 0]}", 3, "start.held.drawer.measured.position", "3 values"),
+        ("{position: [0, 0, 0], rol: 1}", 3, "start.held.drawer.measured.rol", "position"),
+        ("{yaw: 0.1}", 3, "start.held.drawer.measured.position", "missing"),
+        ("deriv", 3, "start.held.drawer.measured", "derive, or a pose"),
+        ("derive", 3, "start.held.drawer.measured", "mm and"),
+    ],
+)
+def test_errors_in_files_name_the_field(
+    tmp_path: Path, measured: str, line: int, field: str, text: str
+) -> None:
+    file = tmp_path / "hall.yaml"
+    file.write_text(
+        "robot: husky_ur5e\nstart: {base: [0, 0, 0], held: {\n"
+        f"  drawer: {{attachment: handle, measured: {measured}}}}}}}\n"
+        "objects: [{name: drawer, type: drawer, position: [2, 1, 0]}]\n"
+    )
+    with pytest.raises(InputError, match=text) as caught:
+        vkc.load_scene(file)
+    assert (caught.value.file, caught.value.line, caught.value.field) == (file, line, field)
+
+
+def test_grasp_is_derived_from_measured_positions() -> None:
+    """Covers one call, several calls, and a file; the arm determines the tool pose."""
+    scene, at = load_drawer_scene(), make_grasping_scene().start.copy()
+    at[:3] += [0.004, -0.003, 0.002]
+    found = scene.with_measured_grasp(
+        "drawer", "handle", base=at[:3], arm=at[3:], state={"slide": 0.002}
+    )
+    placed, grasp = found.objects["drawer"], found.objects["drawer"].object.attachment("handle")
+    nominal = placed.link_placement(grasp.link) * grasp.tool()
+    offset = nominal.actInv(found.tool_placement())
+    np.testing.assert_allclose(found.holds[0].deviation[:3], offset.translation, atol=2e-9)
+    np.testing.assert_allclose(found.holds[0].deviation[3:], pin.log3(offset.rotation), atol=2e-9)
+    moved = scene.with_start(at[:3], at[3:]).with_state("drawer", {"slide": 0.002})
+    document = moved.document
+    document["start"]["held"] = {"drawer": {"attachment": "handle", "measured": "derive"}}
+    for other in (
+        moved.with_measured_grasp("drawer"),
+        moved.with_held({"drawer": "handle"}).with_measured_grasp("drawer"),
+        vkc.Scene.from_document(document, scene.folder),
+    ):
+        assert other.holds == found.holds
+    with pytest.raises(InputError, match="too far from the attachment"):
+        scene.with_measured_grasp("drawer", base=NEAR_HANDLE[:3])
+
+
+def test_measured_object_keeps_its_placement_and_holds_others() -> None:
+    both = make_hall().with_held({"cane": "grip", "fruit": "pull"}, by={"fruit": "cane.tip"})
+    measured = both.objects["cane"].placement * pin.SE3(
+        pin.exp3(np.full(3, 0.02)), np.full(3, 0.004)
+    )
+    found = both.with_measured_grasp("cane", placement=measured)
+    assert [str(hold) for hold in found.holds] == [str(hold) for hold in both.holds]
+    assert found.holds[1].by == found.holds[0] != both.holds[0]
+    found_placement = found.objects["cane"].placement
+    np.testing.assert_allclose(found_placement.homogeneous, measured.homogeneous, atol=1e-8)
+    tip = [scene.objects["cane"].link_placement("tip") for scene in (both, found)]
+    ball = [scene.objects["fruit"].placement for scene in (both, found)]
+    np.testing.assert_allclose(tip[0].actInv(ball[0]), tip[1].actInv(ball[1]), atol=1e-8)
+
+
+def test_hand_clearance_is_at_most_that_of_the_measured_grasp() -> None:
+    """The attachment is 20 mm deeper in the drawer; the palm is 10 mm from the bar."""
+    scene = make_grasping_scene()
+    placed = scene.objects["drawer"]
+    handle, deeper = placed.object.attachment("handle"), pin.SE3(np.eye(3), np.array([0, 0, 0.02]))
+    handle = dataclasses.replace(handle, placement=handle.placement * deeper)
+    item = dataclasses.replace(placed.object, attachments={"handle": handle})
+    scene = replace_objects(scene, {"drawer": dataclasses.replace(placed, object=item)})
+    found = []
+    for depth in (0.0, 0.007, 0.017):
+        measured = make_measured("drawer", "handle", [], np.array([0.0, 0.0, depth, 0.0, 0.0, 0.0]))
+        measured_scene = scene.with_held({"drawer": "handle"}, measured={"drawer": measured})
+        found.append(
+            compute_hand_clearance(
+                measured_scene, measured_scene.holds[0], "drawer.tray", Options()
+            )
+        )
+    assert found[0] == Options().grasp_clearance
+    assert found[2] < 0.0 < found[1] < found[0]
+    assert found[1] - found[2] == pytest.approx(0.01, abs=1e-6)

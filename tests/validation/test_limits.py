@@ -1,0 +1,466 @@
+"""Tests checks of rates, torques and wheels against their limits, and limiting constraints."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.door_closers import load_door_with_closer, replace_object_fields
+from helpers.drives import drive_through, make_hall, make_trajectory, move_start
+from helpers.executions import make_grasping_scene, make_stationary_motion, plan_door, plan_drawer
+from helpers.judging import get_only_violation
+from oracle.judge import judge
+
+import vkc_pin as vkc
+from vkc_pin.planning.retiming.retime import retime_trajectory
+from vkc_pin.validation.limits import (
+    TORQUE_TOLERANCE,
+    MotorLoads,
+    check_rates,
+    find_limiting_constraints,
+)
+from vkc_pin.validation.report import Report, Violation
+from vkc_pin.validation.samples import Samples
+from vkc_pin.validation.validate import validate
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.curve import Curve
+from vkc_pin.world.trajectory.torques import sample_curve
+from vkc_pin.world.trajectory.trajectory import PhaseSpan, Trajectory
+
+
+@pytest.mark.parametrize("make_plan", [plan_door, plan_drawer])
+def test_motion_is_at_its_limits_in_reported_intervals(make_plan: object) -> None:
+    plan: vkc.Plan = make_plan()  # type: ignore[operator]
+    motion, samples = plan.trajectory, Samples(plan.scene, plan.trajectory)
+    found = plan.report.bounds
+    assert 0.9 < sum(bound.share for bound in found) <= 1.0 + 1e-9
+    assert [bound.share for bound in found] == sorted(
+        (bound.share for bound in found), reverse=True
+    )
+    assert len({(bound.subject, bound.kind) for bound in found}) == len(found)
+    for bound in found:
+        assert 0.0 <= bound.begin < bound.end <= motion.times[-1] + 1e-9
+        times = np.linspace(bound.begin, bound.end, 400)
+        if bound.kind == "rest":
+            np.testing.assert_allclose(motion.velocity(times), 0.0, atol=1e-9)
+        elif bound.share > 0.1:
+            evaluate, column = {
+                "velocity": (motion.velocity, 2),
+                "acceleration": (motion.acceleration, 3),
+            }[bound.kind]
+            values = np.abs(evaluate(times)[:, motion.names.index(bound.subject)])
+            assert values.max() > 0.9 * samples.get_limits(bound.subject)[column]
+
+
+def test_torques_bound_the_duration() -> None:
+    plan = plan_door()
+    samples, curve = Samples(plan.scene, plan.trajectory), plan.trajectory.curve
+    assert curve is not None
+    moments = sample_curve(curve)
+    torques = np.zeros((len(moments.times), plan.trajectory.robot_size))
+    torques[moments.pieces < len(curve.times) // 2, 4] = 1.5
+    (first, *_) = find_limiting_constraints(samples, moments, torques, 0.0)
+    assert (first.subject, first.kind) == ("shoulder_lift_joint", "torque")
+    assert first.begin == 0.0
+
+
+def test_longest_interval_is_reported() -> None:
+    plan = plan_door()
+    samples, curve = Samples(plan.scene, plan.trajectory), plan.trajectory.curve
+    assert curve is not None
+    moments, pieces = sample_curve(curve), len(curve.times) - 1
+    for longest in ((0, 30), (20, 50), (pieces - 30, pieces)):
+        parts = [(0, 5), longest, (pieces - 5, pieces)]
+        torques = np.zeros((len(moments.times), plan.trajectory.robot_size))
+        for begin, end in parts:
+            torques[(moments.pieces >= begin) & (moments.pieces < end), 4] = 50.0
+        first = next(
+            bound
+            for bound in find_limiting_constraints(samples, moments, torques, 0.0)
+            if bound.kind == "torque"
+        )
+        lengths = {(a, b): curve.times[b] - curve.times[a] for a, b in parts}
+        assert max(lengths, key=lambda part: lengths[part]) == longest, (
+            "times are uneven: choose other intervals"
+        )
+        assert (first.begin, first.end) == (curve.times[longest[0]], curve.times[longest[1]])
+
+
+def test_motion_without_curve_has_no_bounds() -> None:
+    plan = plan_drawer()
+    bare = dataclasses.replace(plan.trajectory, curve=None)
+    assert (
+        find_limiting_constraints(
+            Samples(plan.scene, bare), sample_curve(plan.trajectory.curve), np.zeros((0, 0)), 0.0
+        )
+        == ()
+    )  # type: ignore[arg-type]
+
+
+def find_violations(motion: Trajectory, **options: float) -> dict[tuple[str, str], Violation]:
+    rows = check_rates(Samples(plan_drawer().scene, motion), vkc.Options(**options))  # type: ignore[arg-type]
+    return {(row.constraint, row.unit): row for row in rows if row.subject == "elbow_joint"}
+
+
+def retime_smoothly() -> Trajectory:
+    plan = plan_drawer()
+    return retime_trajectory(plan.scene, plan.trajectory, jerk_time=0.2)
+
+
+def test_jerk_violation_is_reported() -> None:
+    motion = retime_smoothly()
+    assert not find_violations(motion, jerk_time=0.2)
+    assert not find_violations(motion)
+    assert not find_violations(plan_drawer().trajectory)
+    (kind,) = find_violations(motion, jerk_time=1.0)
+    assert kind == ("jerk", "rad/s³")
+    assert motion.curve is not None
+    strongest = motion.curve.compute_jerks()[0][:, motion.names.index("elbow_joint")].max()
+    assert find_violations(motion, jerk_time=1.0)[kind].amount == pytest.approx(
+        strongest - 1.4 / 1.0
+    )
+
+
+def move_elbow(share: float) -> Trajectory:
+    """Move the elbow by one cubic, with `share` of its largest acceleration, 1.4 rad/s²."""
+    plan = plan_drawer()
+    motion, elbow = plan.trajectory, plan.trajectory.names.index("elbow_joint")
+    rows = np.tile(motion.positions[0], (2, 1))
+    rows[1, elbow] += share * 1.4 / 6.0 * 2.0**2  # 3s² − 2s³ in 2 s has 6 / 2² at its ends
+    times = np.array([0.0, 2.0])
+    curve = Curve(times, rows, np.zeros_like(rows))
+    return Trajectory(
+        motion.names, times, rows, (PhaseSpan("move", 0, 1),), motion.robot_size, curve
+    )
+
+
+@pytest.mark.parametrize(
+    ("share", "kinds"), [(1.0005, set()), (1.0015, {"acceleration"}), (0.5, set())]
+)
+def test_rates_within_the_tolerance_are_accepted(share: float, kinds: set[str]) -> None:
+    assert {kind for kind, _ in find_violations(move_elbow(share))} == kinds
+
+
+@pytest.mark.parametrize(("speed", "rests"), [(0.9e-6, True), (1.5e-6, False)])
+@pytest.mark.parametrize("end", [0, -1])
+def test_motion_must_begin_and_end_at_rest(speed: float, rests: bool, end: int) -> None:
+    motion = move_elbow(0.1)
+    assert motion.curve is not None
+    rates = motion.curve.rates.copy()
+    rates[end, motion.names.index("elbow_joint")] = speed
+    curve = Curve(motion.curve.times, motion.curve.positions, rates)
+    rows = find_violations(dataclasses.replace(motion, curve=curve))
+    assert (not rows) == rests
+    if not rests:
+        (row,) = rows.values()
+        assert (row.constraint, row.waypoint) == ("velocity", 0 if end == 0 else 1)
+
+
+def test_acceleration_jumps_are_reported() -> None:
+    motion = plan_drawer().trajectory
+    assert motion.curve is not None
+    jumps = motion.curve.compute_jerks()[1][:, motion.names.index("elbow_joint")]
+    violation = find_violations(motion, jerk_time=0.005)["jerk", "rad/s² at once"]
+    assert violation.amount == pytest.approx(jumps.max() - 1.4e-3)
+    at = motion.curve.times[int(np.argmax(jumps))]
+    assert (
+        motion.times[violation.waypoint]
+        <= at
+        <= motion.times[min(violation.waypoint + 1, len(motion.times) - 1)]
+    )
+
+
+def test_motion_three_times_as_fast_violates_all_rate_limits() -> None:
+    motion = retime_smoothly()
+    assert motion.curve is not None
+    quick = Curve(motion.curve.times / 3.0, motion.curve.positions, motion.curve.rates * 3.0)
+    rows = check_rates(
+        Samples(
+            plan_drawer().scene, dataclasses.replace(motion, times=motion.times / 3.0, curve=quick)
+        ),
+        vkc.Options(jerk_time=0.2),
+    )
+    assert {row.constraint for row in rows} == {"velocity", "acceleration", "jerk"}
+
+
+def test_jerk_bounds_the_duration() -> None:
+    plan = plan_drawer()
+    report = vkc.validate(plan.scene, plan.steps, retime_smoothly(), vkc.Options(jerk_time=0.2))
+    assert report.ok
+    assert "jerk" in {bound.kind for bound in report.bounds}
+    assert "jerk" not in {bound.kind for bound in plan.report.bounds}
+
+
+STIFF_SPRING = {"stiffness": 120.0, "springref": -2.0}
+
+
+def validate_door(scene: vkc.Scene, trajectory: vkc.Trajectory | None = None) -> Report:
+    plan = plan_door()
+    return validate(
+        scene, plan.steps, plan.trajectory if trajectory is None else trajectory, plan.options
+    )
+
+
+def test_torque_violation_of_a_door_with_a_stiff_spring_is_reported(tmp_path: Path) -> None:
+    report, plan = validate_door(load_door_with_closer(**STIFF_SPRING)), plan_door()
+    assert {violation.constraint for violation in report.violations} == {"torque"}
+    worst = max(report.violations, key=lambda violation: violation.amount)
+    assert worst.subject == "shoulder_pan_joint"
+    assert worst.unit == "N·m"
+    assert worst.amount == pytest.approx(150.0 * (report.torque - 1.0))
+    assert 6.0 < worst.time <= plan.trajectory.times[-1], "the spring torque is largest there"
+    assert "exceeds the motor's 150 N·m" in worst.detail
+    assert "even at rest" in worst.detail
+    rejected = dataclasses.replace(
+        plan, scene=load_door_with_closer(**STIFF_SPRING), report=report, status="rejected"
+    )
+    verdict = judge(rejected.save(tmp_path / "heavy.npz"))
+    assert verdict.agrees
+    assert {(found.rule, found.subject) for found in verdict.found} == {
+        (v.constraint, v.subject) for v in report.violations
+    }
+
+
+def test_damped_door_must_be_opened_slowly() -> None:
+    scene, plan = load_door_with_closer(damping=400.0), plan_door()
+    fast = validate_door(scene)
+    assert fast.violations
+    assert all(
+        violation.constraint == "torque" and "N·m at rest" in violation.detail
+        for violation in fast.violations
+    )
+    slower = retime_trajectory(scene, plan.trajectory)
+    report = validate_door(scene, slower)
+    assert report.ok
+    assert 0.9 < report.torque <= 1.0 + TORQUE_TOLERANCE, "the motion is slower than necessary"
+    assert 1.0 < slower.times[-1] / plan.trajectory.times[-1] < 1.3
+    np.testing.assert_array_equal(slower.positions, plan.trajectory.positions)
+    assert any(bound.kind == "torque" for bound in report.bounds)
+
+
+def test_torque_violation_at_rest_is_reported() -> None:
+    heavy = replace_object_fields(vkc.load_scene("init_1"), "stick", mass=60.0).with_held(
+        {"stick": "grip"}
+    )
+    found = MotorLoads(Samples(heavy, make_stationary_motion(heavy))).find_violations()
+    assert {violation.constraint for violation in found} == {"torque"}
+    assert "shoulder_lift_joint" in {violation.subject for violation in found}
+    assert all("even at rest" in violation.detail for violation in found)
+    assert (
+        MotorLoads(
+            Samples(make_grasping_scene(), make_stationary_motion(make_grasping_scene()))
+        ).find_violations()
+        == []
+    )
+
+
+def test_report_remarks_on_missing_masses() -> None:
+    scene = plan_door().scene
+    model = pin.Model(scene.robot.model)
+    for joint in range(1, model.njoints):
+        model.inertias[joint] = pin.Inertia.Zero()
+    scene = dataclasses.replace(
+        load_door_with_closer(**STIFF_SPRING), robot=dataclasses.replace(scene.robot, model=model)
+    )
+    report = validate_door(scene)
+    assert report.ok
+    assert report.torque == 0.0
+    assert report.remarks == ("torques not checked: the URDF states no masses of the arm",)
+
+
+def test_report_remarks_on_massless_payload() -> None:
+    scene = replace_object_fields(vkc.load_scene("init_1"), "stick", mass=0.0).with_held(
+        {"stick": "grip"}
+    )
+    (remark,) = MotorLoads(Samples(scene, make_stationary_motion(scene))).summarize()["remarks"]
+    assert remark == "carried as massless, since no mass is given: stick"
+    assert (
+        MotorLoads(
+            Samples(make_grasping_scene(), make_stationary_motion(make_grasping_scene()))
+        ).summarize()["remarks"]
+        == ()
+    )
+
+
+def test_torques_are_reported_and_saved(tmp_path: Path) -> None:
+    plan = plan_door()
+    assert plan.metrics["torque"] == plan.report.torque > 0.0
+    assert (
+        f"torques     at most {100.0 * plan.report.torque:.0f} % of the motors' limits"
+        in plan.summary()
+    )
+    assert f"bounded by  {plan.report.bounds[0]}" in plan.summary()
+    assert plan.to_dict()["bounds"][0] == dataclasses.asdict(plan.report.bounds[0])
+    loaded = vkc.Plan.load(plan.save(tmp_path / "door.npz"))
+    assert loaded.claimed == plan.report == loaded.report
+
+
+def test_slip_of_a_motion_without_curve_is_reported() -> None:
+    scene = make_hall(base="differential")
+    ahead = drive_through(
+        scene, scene.start, move_start(scene.start, x=2.0), move_start(scene.start, x=2.0, yaw=1.0)
+    )
+    assert validate(scene, [vkc.GoTo(2.0, 0.0, 1.0)], ahead).ok
+    heading = np.linspace(0.0, 1.5, 41)
+    curve = np.tile(
+        scene.start, (41, 1)
+    )  # circle of 1 m to the left; chords have the mean heading of their step
+    curve[:, 0], curve[:, 1], curve[:, 2] = np.sin(heading), 1.0 - np.cos(heading), heading
+    assert "slip" not in {
+        v.constraint
+        for v in validate(scene, [vkc.GoTo(1.0, 1.0)], make_trajectory(scene, curve)).violations
+    }
+    sideways = drive_through(scene, scene.start, move_start(scene.start, x=2.0, y=0.1))
+    found = get_only_violation(validate(scene, [vkc.GoTo(2.0, 0.1, 0.0)], sideways))
+    assert (found.constraint, found.subject, found.unit) == ("slip", "base", "m")
+    steps = np.diff(sideways.positions[:, 1])
+    assert found.amount == pytest.approx(steps.max())
+    assert found.waypoint == steps.argmax()
+    assert found.time == pytest.approx(sideways.times[found.waypoint])
+    for step, ok in ((0.9e-4, True), (1.5e-4, False)):  # the tolerance is 0.1 mm per step
+        aside = drive_through(
+            scene, scene.start, move_start(scene.start, x=2.0, y=0.1 * step / found.amount)
+        )
+        assert (
+            "slip"
+            not in {v.constraint for v in validate(scene, [vkc.GoTo(2.0, 0.0)], aside).violations}
+        ) == ok
+    assert validate(make_hall(), [vkc.GoTo(2.0, 0.1, 0.0)], sideways).ok
+
+
+@pytest.mark.parametrize(("radius", "ok"), [(0.99, True), (1.01, False)])
+def test_turning_radius_of_a_motion_without_curve_is_checked(radius: float, ok: bool) -> None:
+    scene = make_hall(base="ackermann", turning_radius=radius)
+    heading = np.concatenate([np.linspace(0.0, 1.5, 41), np.linspace(1.5, 0.3, 33)[1:]])
+    rows = np.tile(scene.start, (len(heading), 1))
+    rows[:, 0], rows[:, 1], rows[:, 2] = np.sin(heading), 1.0 - np.cos(heading), heading
+    motion = make_trajectory(scene, rows)
+    found = {v.constraint: v for v in validate(scene, [vkc.GoTo(*rows[-1, :3])], motion).violations}
+    assert "slip" not in found
+    assert ("turning" not in found) == ok
+    if not ok:
+        chord = 2.0 * np.sin(np.diff(heading)[0] / 2)
+        assert found["turning"].amount == pytest.approx(
+            radius * np.diff(heading)[0] - chord, rel=1e-6
+        )
+        assert (found["turning"].subject, found["turning"].unit) == ("base", "m")
+
+
+def test_steered_base_must_not_turn_in_place() -> None:
+    scene = make_hall(base="ackermann", turning_radius=0.8)
+    motion = drive_through(
+        scene, scene.start, move_start(scene.start, x=2.0), move_start(scene.start, x=2.0, yaw=1.0)
+    )
+    found = get_only_violation(validate(scene, [vkc.GoTo(2.0, 0.0, 1.0)], motion))
+    assert (found.constraint, found.subject, found.unit) == ("turning", "base", "m")
+    assert found.amount == pytest.approx(0.8 * np.diff(motion.positions[:, 2]).max())
+    assert "radius of 0.8 m" in found.detail
+
+
+@pytest.mark.parametrize("base", ["differential", "ackermann"])
+def test_wheel_speed_of_a_motion_without_curve_is_checked(base: str) -> None:
+    """On a circle of 1 m the outer wheels roll 1 + track / 2 times as fast as the base."""
+    scene = make_hall(base=base, **({"turning_radius": 0.8} if base == "ackermann" else {}))
+    wheels = scene.robot.wheels
+    assert wheels is not None
+    assert wheels.rim_speed == pytest.approx(
+        1.0, rel=1e-3
+    )  # Clearpath's speed limit of the Husky [m/s]
+    heading = np.concatenate(
+        [
+            np.zeros(1),
+            np.cumsum(np.interp(np.arange(60), [0, 10, 49, 59], [0.0, 0.9, 0.9, 0.0]) * 0.05),
+        ]
+    )
+    rows = np.tile(scene.start, (len(heading), 1))
+    rows[:, 0], rows[:, 1], rows[:, 2] = np.sin(heading), 1.0 - np.cos(heading), heading
+    goal = [vkc.GoTo(*rows[-1, :3])]
+    found = get_only_violation(validate(scene, goal, make_trajectory(scene, rows, dt=0.05)))
+    assert (found.constraint, found.subject, found.unit) == ("wheels", "base", "m/s")
+    turn = np.diff(heading).max()
+    fastest = (2.0 * np.sin(turn / 2) + turn * wheels.track / 2) / 0.05
+    assert found.amount == pytest.approx(fastest - wheels.rim_speed)
+    for excess, ok in (
+        (0.5, True),
+        (2.0, False),
+    ):  # multiples of the tolerance, a thousandth of the wheels' speed limit
+        dt = 0.05 * fastest / (wheels.rim_speed * (1.0 + excess * 1e-3))
+        assert validate(scene, goal, make_trajectory(scene, rows, dt=dt)).ok == ok
+    assert validate(scene, goal, make_trajectory(scene, rows, dt=0.05 * fastest)).ok
+    omni = make_hall()
+    assert validate(omni, goal, make_trajectory(omni, rows, dt=0.05)).ok
+    straight = drive_through(scene, scene.start, move_start(scene.start, x=1.0), dt=1.5 / 40 / 0.99)
+    assert validate(scene, [vkc.GoTo(1.0, 0.0)], straight).ok
+
+
+def make_circle(
+    scene: Scene, *, radius: float = 1.0, peak: float = 0.4, aside: float = 0.0
+) -> tuple[list[Any], Trajectory]:
+    """Return the goal and the motion of a quarter circle to the left, with a lateral velocity.
+
+    Args:
+        scene: The scene.
+        radius: Radius of the circle [m].
+        peak: Largest angular velocity [rad/s].
+        aside: Largest velocity along −x [m/s], which is lateral at the end.
+    """
+    duration = 1.5 * (np.pi / 2) / peak
+    times = np.linspace(0.0, duration, 81)
+    s = times / duration
+    yaw, turning = np.pi / 2 * (3.0 - 2.0 * s) * s**2, np.pi / 2 * 6.0 * (s - s**2) / duration
+    rows, rates = np.tile(scene.start, (81, 1)), np.zeros((81, len(scene.start)))
+    slide = aside * (1.0 - np.cos(2.0 * np.pi * s)) / 2
+    rows[:, 0], rows[:, 1], rows[:, 2] = radius * np.sin(yaw), radius * (1.0 - np.cos(yaw)), yaw
+    rates[:, 0], rates[:, 1] = radius * turning * np.cos(yaw), radius * turning * np.sin(yaw)
+    rates[:, 2] = turning
+    rows[1:, 0] -= np.cumsum((slide[1:] + slide[:-1]) / 2 * np.diff(times))
+    rates[:, 0] -= slide
+    motion = dataclasses.replace(
+        make_trajectory(scene, rows), times=times, curve=Curve(times, rows, rates)
+    )
+    return [vkc.GoTo(*rows[-1, :3])], motion
+
+
+def test_slip_along_a_curve_is_reported() -> None:
+    """At heading θ, the velocity along −x is lateral by a factor of sin θ."""
+    scene = make_hall(base="differential")
+    assert validate(scene, *make_circle(scene)).ok
+    goal, motion = make_circle(scene, aside=0.01)
+    found = get_only_violation(validate(scene, goal, motion))
+    assert (found.constraint, found.subject, found.unit) == ("slip", "base", "m/s")
+    moments = np.linspace(0.0, motion.times[-1], 5000)
+    (vx, vy), yaw = motion.velocity(moments)[:, :2].T, motion(moments)[:, 2]
+    slip = np.abs(np.cos(yaw) * vy - np.sin(yaw) * vx)
+    assert found.amount == pytest.approx(slip.max(), rel=1e-3)
+    assert found.time == pytest.approx(moments[slip.argmax()], abs=0.05)
+    assert motion.times[found.waypoint] <= found.time <= motion.times[found.waypoint + 1]
+    assert "mm/s" in found.detail
+    assert validate(make_hall(), goal, motion).ok
+    for allowed, ok in ((0.95e-3, True), (1.1e-3, False)):
+        report = validate(scene, *make_circle(scene, aside=0.01 * allowed / found.amount))
+        assert report.ok == ok
+
+
+@pytest.mark.parametrize(("radius", "ok"), [(0.997, True), (1.01, False)])
+def test_turning_radius_along_a_curve_is_checked(radius: float, ok: bool) -> None:
+    scene = make_hall(base="ackermann", turning_radius=radius)
+    report = validate(scene, *make_circle(scene))
+    assert report.ok == ok
+    if not ok:
+        found = get_only_violation(report)
+        assert (found.constraint, found.unit) == ("turning", "m/s")
+        assert found.amount == pytest.approx((radius - 1.0) * 0.4, rel=1e-2)
+
+
+def test_wheel_speed_along_a_curve_is_checked() -> None:
+    scene = make_hall(base="differential")
+    assert scene.robot.wheels is not None
+    peak = scene.robot.wheels.rim_speed / (1.0 + scene.robot.wheels.track / 2)
+    assert validate(scene, *make_circle(scene, peak=0.999 * peak)).ok
+    found = get_only_violation(validate(scene, *make_circle(scene, peak=1.02 * peak)))
+    assert (found.constraint, found.subject, found.unit) == ("wheels", "base", "m/s")
+    assert found.amount == pytest.approx(0.02 * scene.robot.wheels.rim_speed, rel=0.02)

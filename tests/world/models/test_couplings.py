@@ -1,0 +1,392 @@
+"""Tests the search for coupled joints, their validation, their models and their limits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.telescopes import format_joint, format_link, write_telescope
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import vkc_pin as vkc
+from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.planning import kinematics as cpin
+from vkc_pin.world.files.urdf import read_urdf
+from vkc_pin.world.models.coordinates import Coordinates
+from vkc_pin.world.models.couplings import JointCoupling, find_followers, tighten_coupled_limits
+from vkc_pin.world.models.robot_model import (
+    build_full_model,
+    build_planned_model,
+    compute_rest_positions,
+    make_configuration,
+)
+
+
+def write_chain(tmp_path: Path, *contents: str, kinds: str = "prismatic") -> Path:
+    """Write a chain of joints j1, j2, ... with given contents, and shapes on every other link."""
+    parts = [format_link("root", "0.1 0.1 0.1")]
+    for k, text in enumerate(contents, start=1):
+        parts += [
+            format_link(f"l{k}", "0.1 0.1 0.1" if k % 2 else ""),
+            format_joint(f"j{k}", kinds, f"l{k - 1}" if k > 1 else "root", f"l{k}", inside=text),
+        ]
+    path = tmp_path / "robot.urdf"
+    path.write_text(f'<robot name="robot">{"".join(parts)}</robot>', encoding="utf-8")
+    return path
+
+
+def format_mimic(leader: str, multiplier: float = 1.0, offset: float = 0.0) -> str:
+    return f'<mimic joint="{leader}" multiplier="{multiplier}" offset="{offset}"/>'
+
+
+def test_chains_are_resolved_to_their_leader(tmp_path: Path) -> None:
+    """j3 = -0.5·j2 + 0.2 and j2 = 2·j1 + 0.1, in any order of the file."""
+    found = find_followers(
+        read_urdf(
+            write_chain(tmp_path, "", format_mimic("j1", 2.0, 0.1), format_mimic("j2", -0.5, 0.2))
+        ).root
+    )
+    assert found.keys() == {"j2", "j3"}
+    assert found["j2"] == JointCoupling("j1", 2.0, 0.1)
+    assert (found["j3"].leader, found["j3"].factor, found["j3"].offset) == (
+        "j1",
+        -1.0,
+        pytest.approx(0.15),
+    )
+
+
+def test_a_leader_below_its_follower_becomes_a_follower(tmp_path: Path) -> None:
+    """j1 = 2·j3 + 0.1 makes j3 = 0.5·j1 - 0.05, and j2 = -4·j3 makes j2 = -2·j1 + 0.2."""
+    found = find_followers(
+        read_urdf(
+            write_chain(tmp_path, format_mimic("j3", 2.0, 0.1), format_mimic("j3", -4.0), "")
+        ).root
+    )
+    assert found == {"j3": JointCoupling("j1", 0.5, -0.05), "j2": JointCoupling("j1", -2.0, 0.2)}
+
+
+@pytest.mark.parametrize(
+    ("contents", "message"),
+    [
+        (("", format_mimic("j3"), format_mimic("j2")), "j2: couplings are circular.* j2 → j3 → j2"),
+        (("", format_mimic("j2")), "j2: couplings are circular.* j2 → j2"),
+        (
+            ("", format_mimic("other")),
+            "j2: .*follows one that cannot move.*'other', which does not exist",
+        ),
+        (
+            ("", format_mimic("j3"), format_mimic("still")),
+            "j2: .*follows one that cannot move.*'still', which is fixed",
+        ),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:.*there is no joint")
+def test_leaders_that_cannot_move_raise(
+    tmp_path: Path, contents: tuple[str, ...], message: str
+) -> None:
+    path = write_chain(tmp_path, *contents)
+    fixed = format_link("aside") + format_joint("still", "fixed", "root", "aside")
+    path.write_text(path.read_text().replace("</robot>", fixed + "</robot>"))
+    with pytest.raises(InputError, match=message) as caught:
+        vkc.load_robot(path, pairs="all", tool_frame=f"l{len(contents)}")
+    assert (caught.value.file, caught.value.line) == (path, 1)
+
+
+def test_invalid_couplings_off_the_tool_path_are_ignored(tmp_path: Path) -> None:
+    """The fingers of published robots have such couplings."""
+    path = write_chain(tmp_path, "", "", format_mimic("other"))
+    with pytest.warns(UserWarning, match="there is no joint 'other'"):
+        robot = vkc.load_robot(path, pairs="all", tool_frame="l2")
+    assert robot.coordinates.names[3:] == ("j1", "j2")
+
+
+def test_couplings_of_robot_yaml_override_the_urdf(tmp_path: Path) -> None:
+    """Both the short and the full form are read."""
+    write_chain(tmp_path, "", format_mimic("j1", 3.0), "")
+    text = (
+        "urdf: robot.urdf\ntool_frame: l3\ncouplings:\n  j2: j1\n"
+        "  j3: {joint: j2, multiplier: -2.0, offset: 0.5}\n"
+    )
+    (tmp_path / "robot.yaml").write_text(text)
+    found = find_followers(vkc.load_robot(tmp_path, pairs="all").file.root)
+    assert found == {"j2": JointCoupling("j1", 1.0, 0.0), "j3": JointCoupling("j1", -2.0, 0.5)}
+
+
+@pytest.mark.parametrize(
+    ("couplings", "field", "message"),
+    [
+        ("out_2: out1", "out_2", "no joint that turns or slides 'out1'; did you mean 'out_1'"),
+        ("oat_2: out_1", "oat_2", "no joint that turns or slides 'oat_2'; did you mean 'out_2'"),
+        ("out_2: out_3, out_3: out_2", "out_2", "circular"),
+        (
+            "out_2: {joint: out_1, multiplier: 0}",
+            "out_2.multiplier",
+            "multiplier must not be 0",
+        ),
+        ("out_2: {joint: out_1, multiplier: yes}", "out_2.multiplier", "a number"),
+        ("out_2: {joint: out_1, factor: 2}", "out_2.factor", "multiplier"),
+        ("out_2: {multiplier: 2}", "out_2.joint", "missing"),
+        ("out_2: 3", "out_2", "."),
+    ],
+)
+def test_invalid_couplings_raise(tmp_path: Path, couplings: str, field: str, message: str) -> None:
+    path = write_telescope(tmp_path, couplings=couplings)
+    with pytest.raises((InputError, UnknownNameError), match=message) as caught:
+        vkc.load_robot(path)
+    assert (caught.value.file, caught.value.line) == (path, 5)
+    assert caught.value.field == f"couplings.{field}"
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (
+            "locked_joints: {out_3: 0.0}",
+            "locked_joints.out_3: .* follows one that is not locked.*'out_1' is not locked",
+        ),
+        (
+            "home: {out_1: 0.1, out_3: 0.0}",
+            "home.out_3: this joint follows 'out_1'.*0.1, or no value.*got 0",
+        ),
+        ("home: {out_1: 0.2}", "home.out_1: .*outside the joint.s limits"),
+    ],
+)
+def test_rest_positions_must_respect_couplings(tmp_path: Path, more: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        vkc.load_robot(write_telescope(tmp_path, more=more))
+
+
+def test_locking_a_leader_locks_its_followers(tmp_path: Path) -> None:
+    robot = vkc.load_robot(write_telescope(tmp_path, more="locked_joints: {out_1: 0.1}\n"))
+    assert robot.coordinates.names[3:] == ("lift", "yaw_joint", "pitch_joint", "roll_joint")
+    free = vkc.load_robot(
+        write_telescope(tmp_path / "free", more="home: {out_1: 0.1, out_2: 0.1}\n")
+    )
+    tool = [one.model.frames[one.model.getFrameId("tool")] for one in (robot, free)]
+    assert tool[0].placement.isApprox(tool[1].placement, 1e-12)
+    assert robot.model.jointPlacements[3].translation[0] == pytest.approx(
+        4 * 0.1 + 0.05 + 3 * 0.005 + 0.24
+    )
+
+
+KINDS = ("revolute", "prismatic", "continuous")
+
+
+def make_random_robot(rng: np.random.Generator) -> tuple[str, str]:
+    """Return a URDF of a random tree with random couplings, and its tool link."""
+    count = int(rng.integers(3, 8))
+    parts, order = [format_link("l0", "0.1 0.1 0.1")], rng.permutation(count)
+    leaders = {
+        int(one): int(other)
+        for k, one in enumerate(order)
+        for other in order[:k]
+        if rng.random() < 0.3
+    }
+    for k in range(count):
+        numbers = {
+            "multiplier": rng.uniform(0.3, 2.0) * rng.choice([-1, 1]),
+            "offset": rng.uniform(-0.3, 0.3),
+        }
+        attributes = " ".join(f'{key}="{value}"' for key, value in numbers.items())
+        inside = f'<mimic joint="j{leaders[k]}" {attributes}/>' if k in leaders else ""
+        above = f"l{k if rng.random() < 0.7 else rng.integers(0, k + 1)}"
+        at, axis = (" ".join(map(str, rng.normal(size=3))) for _ in range(2))
+        kind = str(rng.choice(KINDS))
+        parts += [
+            format_link(f"l{k + 1}", "0.1 0.1 0.1", at),
+            format_joint(f"j{k}", kind, above, f"l{k + 1}", at, axis, (-5.0, 5.0), inside=inside),
+        ]
+    return f'<robot name="robot">{"".join(parts)}</robot>', f"l{count}"
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_kinematics_match_independent_joints(seed: int) -> None:
+    """Compares placements and Jacobians with finite differences of independent joints."""
+    rng = np.random.default_rng(seed)
+    text, tool = make_random_robot(rng)
+    file = read_urdf(Path("robot.urdf"), text=text)
+    single = build_full_model(file)
+    full = tighten_coupled_limits(single, file, tool)
+    rest = compute_rest_positions(full, file, {})
+    model, followers = build_planned_model(full, file, tool, rest, {}), find_followers(file.root)
+    coordinates = Coordinates(model)
+    z = rng.uniform(-1.0, 1.0, coordinates.size)
+
+    def make_full_configuration(z: np.ndarray) -> np.ndarray:
+        values = dict(zip(coordinates.names, z, strict=True))
+        at = {**rest, **{name: value for name, value in values.items() if name in rest}}
+        at |= {
+            name: coupling.factor * at[coupling.leader] + coupling.offset
+            for name, coupling in followers.items()
+        }
+        q = make_configuration(single, at)
+        q[:4] = z[0], z[1], np.cos(z[2]), np.sin(z[2])
+        return q
+
+    data, single_data = model.createData(), single.createData()
+    pin.framesForwardKinematics(model, data, coordinates.q(z))
+    pin.framesForwardKinematics(single, single_data, make_full_configuration(z))
+    for frame in (frame for frame in single.frames if frame.type == pin.FrameType.BODY):
+        ours = data.oMf[model.getFrameId(frame.name, pin.FrameType.BODY)]
+        expected = single_data.oMf[single.getFrameId(frame.name, pin.FrameType.BODY)]
+        np.testing.assert_allclose(ours.homogeneous, expected.homogeneous, atol=1e-9)
+
+    differences = []
+    for step in 1e-6 * np.eye(coordinates.size)[2:]:  # x and y in z are in the world frame
+        ends = []
+        for at in (z + step, z - step):
+            pin.framesForwardKinematics(single, single_data, make_full_configuration(at))
+            ends.append(single_data.oMf[single.getFrameId(tool, pin.FrameType.BODY)].copy())
+        turn = pin.log3(ends[0].rotation @ ends[1].rotation.T)
+        move = ends[0].translation - ends[1].translation
+        differences.append(np.concatenate([move, turn]) / 2e-6)
+    jacobian = np.array(cpin.frame_jacobian(model, tool)(coordinates.q(z)))
+    np.testing.assert_allclose(jacobian[:, 2:], np.transpose(differences), atol=1e-6)
+
+
+def test_dynamics_include_followers(tmp_path: Path) -> None:
+    robot = vkc.load_robot(write_telescope(tmp_path))
+    model, rng = pin.Model(robot.model), np.random.default_rng(0)
+    for j in range(1, model.njoints):
+        model.inertias[j] = pin.Inertia.Random()
+    z, v, a = rng.uniform(-0.5, 0.5, (3, model.nv))
+    q, data = robot.coordinates.q(z), model.createData()
+    torques, expected = cpin.rnea(model)(q, v, a), pin.rnea(model, data, q, v, a)
+    np.testing.assert_allclose(np.array(torques).ravel(), expected, atol=1e-9)
+    center, expected = cpin.center_of_mass(model)(q), pin.centerOfMass(model, data, q)
+    np.testing.assert_allclose(np.array(center).ravel(), expected, atol=1e-9)
+
+
+def test_leaders_may_be_on_another_branch(tmp_path: Path) -> None:
+    """As in a palletizer, the follower is on the path to the tool, its leader is not."""
+    parts = [
+        format_link("root", "0.1 0.1 0.1"),
+        format_link("a", "0.1 0.1 0.1"),
+        format_link("b", "0.1 0.1 0.1", "0 0 1"),
+    ]
+    parts += [
+        format_joint(
+            "follower", "revolute", "root", "a", inside='<mimic joint="leader" multiplier="-1"/>'
+        )
+    ]
+    parts += [format_joint("leader", "revolute", "root", "b")]
+    file = tmp_path / "robot.urdf"
+    file.write_text(f'<robot name="robot">{"".join(parts)}</robot>')
+    robot = vkc.load_robot(file, tool_frame="a", pairs="all")
+    assert robot.coordinates.names[3:] == ("leader",)
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, robot.coordinates.q([0.0, 0.0, 0.0, 0.4]))
+    for name, angle in (("a", -0.4), ("b", 0.4)):
+        np.testing.assert_allclose(
+            data.oMf[robot.model.getFrameId(name)].rotation,
+            pin.utils.rotate("z", angle),
+            atol=1e-12,
+        )
+
+
+def make_coupled_robot(
+    tmp_path: Path,
+    inside: str,
+    *,
+    first: tuple[float, float] = (-1.0, 1.0),
+    second: tuple[float, float] = (-1.0, 1.0),
+    kinds: tuple[str, str] = ("revolute", "revolute"),
+    yaml: str = "",
+) -> vkc.Robot:
+    """Return a robot with two joints, of which the second follows the first."""
+    parts = [format_link(f"l{k}", "0.1 0.1 0.1", f"0 0 {k}") for k in range(3)]
+    parts += [format_joint("one", kinds[0], "l0", "l1", limits=first, velocity=0.4)]
+    parts += [
+        format_joint(
+            "two",
+            kinds[1],
+            "l1",
+            "l2",
+            limits=second,
+            velocity=0.6,
+            inside=f'<mimic joint="one" {inside}/>',
+        )
+    ]
+    (tmp_path / "robot.urdf").write_text(f'<robot name="robot">{"".join(parts)}</robot>')
+    (tmp_path / "robot.yaml").write_text(f"urdf: robot.urdf\ntool_frame: l2\n{yaml}")
+    return vkc.load_robot(tmp_path, pairs="all")
+
+
+@pytest.mark.parametrize(
+    ("inside", "second", "limits", "velocity"),
+    [
+        ('multiplier="1"', (-1.0, 1.0), (-1.0, 1.0), 0.4),
+        ('multiplier="2"', (-1.0, 1.0), (-0.5, 0.5), 0.3),
+        ('multiplier="-2" offset="0.4"', (-1.0, 1.0), (-0.3, 0.7), 0.3),
+        ('multiplier="0.5"', (-0.1, 3.0), (-0.2, 1.0), 0.4),
+        ('multiplier="-0.5"', (0.1, 0.2), (-0.4, -0.2), 0.4),
+        ('multiplier="0" offset="0.3"', (-1.0, 1.0), (-1.0, 1.0), 0.4),
+    ],
+)
+def test_the_tightest_limits_apply(
+    tmp_path: Path,
+    inside: str,
+    second: tuple[float, float],
+    limits: tuple[float, float],
+    velocity: float,
+) -> None:
+    robot = make_coupled_robot(tmp_path, inside, second=second)
+    assert robot.coordinates.names[3:] == ("one",)
+    np.testing.assert_allclose(
+        [robot.lower[3], robot.upper[3], robot.velocity[3]], [*limits, velocity], rtol=1e-12
+    )
+    assert robot.lower[3] <= robot.home[0] <= robot.upper[3]
+
+
+def test_home_respects_the_limits_of_followers(tmp_path: Path) -> None:
+    """0 is within the limits of the leader, but not of the follower."""
+    assert make_coupled_robot(tmp_path, 'multiplier="1"', second=(0.2, 0.6)).home[
+        0
+    ] == pytest.approx(0.4)
+
+
+def test_robot_yaml_limits_any_coupled_joint(tmp_path: Path) -> None:
+    robot = make_coupled_robot(
+        tmp_path,
+        'multiplier="2"',
+        yaml="joints: {one: {acceleration: 3.0}, two: {velocity: 0.1, acceleration: 4.0}}\n",
+    )
+    assert (robot.velocity[3], robot.acceleration[3]) == (0.05, 2.0)
+
+
+def test_default_limits_apply_to_the_fastest_joint(tmp_path: Path) -> None:
+    couplings = (
+        "out_2: {joint: out_1, multiplier: 0.5}, "
+        "out_3: {joint: out_1, multiplier: -2.0, offset: 0.15}"
+    )
+    file = write_telescope(tmp_path, couplings=couplings).parent / "robot.urdf"
+    file.write_text(file.read_text().replace('velocity="0.5" ', ""))
+    robot = vkc.load_robot(tmp_path)
+    assert (robot.velocity[4], robot.acceleration[4]) == (0.05, 0.7)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "limits"),
+    [(("continuous", "revolute"), (-0.5, 0.5)), (("continuous", "continuous"), (-np.inf, np.inf))],
+)
+def test_continuous_leaders_become_revolute(
+    tmp_path: Path, kinds: tuple[str, str], limits: tuple[float, float]
+) -> None:
+    """A full turn of the leader changes the position of a follower with another factor."""
+    robot = make_coupled_robot(tmp_path, 'multiplier="2"', kinds=kinds)
+    assert (robot.lower[3], robot.upper[3]) == limits
+    z = np.array([0.0, 0.0, 0.0, 2.0 * np.pi / 2.0])
+    np.testing.assert_allclose(robot.coordinates.z(robot.coordinates.q(z)), z)
+    assert robot.model.joints[2].nq == 1
+
+
+def test_incompatible_limits_raise(tmp_path: Path) -> None:
+    with pytest.raises(
+        vkc.InputError,
+        match=r"one: no position satisfies the limits of its follower 'two'.*2 to 3.*-1 to 1",
+    ):
+        make_coupled_robot(tmp_path, 'multiplier="1"', second=(2.0, 3.0))

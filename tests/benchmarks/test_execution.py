@@ -77,7 +77,7 @@ def test_failed_executions_are_counted() -> None:
         "problems": ["cup – floor: 9 mm deep"],
     }
     unplanned = {"task": "drawer", "success": False, "executed": False}
-    record = Path(__file__).parents[3] / "docs/results/gap.json.gz"
+    record = Path(__file__).parents[2] / "docs/results/gap.json.gz"
     meta = json.loads(gzip.decompress(record.read_bytes()))["meta"]
     text = format_results(
         {

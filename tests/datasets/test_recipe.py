@@ -114,7 +114,7 @@ def test_invalid_values_are_rejected(tmp_path: Path, line: str, field: str) -> N
 
 
 def test_every_field_is_documented(tmp_path: Path) -> None:
-    page = (Path(__file__).parents[3] / "docs/datasets.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs/datasets.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"^```yaml\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
     assert load_recipe(write_recipe(tmp_path, block)).fields.name == "home"
     for schema in (RecipeSchema, RoomsSchema, StartSchema, GoalSchema, RobotEntry):

@@ -223,7 +223,7 @@ def test_invalid_terms_write_no_files(tmp_path: Path, terms: Any, text: str) -> 
 
 
 def test_every_field_is_documented() -> None:
-    page = (Path(__file__).parents[3] / "docs/datasets.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs/datasets.md").read_text(encoding="utf-8")
     for schema in (UprightSchema, SpeedSchema, KeepOutSchema, TracedSchema):
         assert [name for name in schema.model_fields if f"`{name}`" not in page] == [], (
             schema.__name__

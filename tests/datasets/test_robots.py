@@ -8,6 +8,7 @@ from helpers.datasets import SMALL
 
 from vkc_pin.datasets import robots
 from vkc_pin.datasets.check import check_dataset
+from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generation import generate
 from vkc_pin.datasets.recipe import load_recipe
 from vkc_pin.errors import InputError
@@ -32,7 +33,7 @@ def test_robot_without_a_hand_is_imported_once(
 def test_robot_by_path_is_found_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file_name: str
 ) -> None:
-    """The dataset stores the path of the URDF, since the robot's name is not sufficient.
+    """The dataset has a copy of the robot, so that both can be moved, and the robot changed.
 
     Paths are relative to the working directory, and not to the folder of scenes.
     """
@@ -42,8 +43,17 @@ def test_robot_by_path_is_found_again(
     dataset = generate({**SMALL, "robots": [f"mine/rover/{file_name}"]}, 1, "out")
     (episode,) = dataset.episodes()
     assert episode.about["robot"] == ("rover" if file_name == "robot.yaml" else "husky_ur5e")
-    assert episode.scene().robot.urdf == tmp_path / "mine/rover/husky_ur5e.urdf"
-    assert check_dataset(dataset.folder).ok
+    shutil.rmtree("mine")
+    Path("out").rename("moved")
+    monkeypatch.chdir("/")
+    (episode,) = Dataset.open(tmp_path / "moved").episodes()
+    robot, original = episode.scene().robot, load_robot("husky_ur5e")
+    assert robot.urdf.is_relative_to(tmp_path / "moved/robots")
+    assert robot.collision.collisionPairs.tolist() == original.collision.collisionPairs.tolist()
+    assert [shape.name for shape in robot.visual.geometryObjects] == [
+        shape.name for shape in original.visual.geometryObjects
+    ]
+    assert check_dataset(tmp_path / "moved").ok
 
 
 def test_robots_with_the_same_name_are_rejected(tmp_path: Path) -> None:

@@ -180,7 +180,7 @@ def check_shard(
     Args:
         task: The shard, the folder of its scenes, and its recipe's document.
     """
-    path, scenes, recipe = Path(task[0]), Path(task[1]), load_recipe(task[2])
+    path, scenes, recipe = Path(task[0]), Path(task[1]), load_recipe(task[2], find_files=False)
     records, problems = list[dict[str, Any]](), list[str]()
     name = f"{path.parent.name}/{path.name}"  # for messages
     with _collect_errors(problems, name), open_shard(path, scenes) as shard:

@@ -142,7 +142,7 @@ class Dataset:
                 file=path,
                 expected="a folder that `vkc-pin generate` has written",
             )
-        return cls(path, load_recipe(path / "recipe.yaml"))
+        return cls(path, load_recipe(path / "recipe.yaml", find_files=False))
 
     @property
     def shards(self) -> list[Path]:

@@ -419,11 +419,15 @@ class Recipe:
         )
 
 
-def load_recipe(recipe: str | Path | Mapping[str, Any] | Recipe, **changes: Any) -> Recipe:
+def load_recipe(
+    recipe: str | Path | Mapping[str, Any] | Recipe, *, find_files: bool = True, **changes: Any
+) -> Recipe:
     """Load and check a recipe.
 
     Args:
         recipe: Name of a recipe of the package, path of a YAML file, or its contents.
+        find_files: Whether files of robots, objects and scenes must exist. A dataset has copies,
+            and needs them no more.
         changes: Fields to replace; None keeps them.
 
     Raises:
@@ -441,13 +445,19 @@ def load_recipe(recipe: str | Path | Mapping[str, Any] | Recipe, **changes: Any)
         document = Document({**document.data, **changes}, document.file, document.lines)
     fields = parse_document(document, RecipeSchema)
     folder = document.file.parent if document.file else Path()
-    found = {
-        "robots": _robots(document, fields.robots, folder),
-        "objects": tuple(
-            _object(document, k, name, folder) for k, name in enumerate(fields.objects)
-        ),
-        "scenes": tuple(_scene(document, k, name, folder) for k, name in enumerate(fields.scenes)),
-    }
+    found = (
+        {
+            "robots": _robots(document, fields.robots, folder),
+            "objects": tuple(
+                _object(document, k, name, folder) for k, name in enumerate(fields.objects)
+            ),
+            "scenes": tuple(
+                _scene(document, k, name, folder) for k, name in enumerate(fields.scenes)
+            ),
+        }
+        if find_files
+        else {}
+    )
     for k, kind in enumerate(fields.carried):
         if kind not in CARRIED:
             raise document.make_unknown_name_error(

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import warnings
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import yaml
 
 from vkc_pin.datasets.recipe import Recipe, check_robot, get_robot_name
+from vkc_pin.importing.robots.mesh_pieces import copy_meshes
 from vkc_pin.importing.robots.robot_import import import_robot
 from vkc_pin.simulation.cameras import check_frame
 from vkc_pin.simulation.physics import import_mujoco
 from vkc_pin.simulation.snapshots import open_gl_context
 from vkc_pin.world.files.documents import read_text
+from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.world.files.writing import check_name, write_atomically
-from vkc_pin.world.models.robot_file import find_robot, load_robot
+from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.models.robot_file import find_robot, find_srdf, load_robot
 from vkc_pin.world.scene.scene import load_scene
 
 __all__ = ["check_frames", "prepare_robots"]
@@ -53,10 +57,10 @@ def prepare_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
     Args:
         recipe: Recipe.
         folder: Folder of the dataset's robots, visible to all workers. Robots without a described
-            hand are imported once; others by path are referred to.
+            hand are imported once; others by path are copied with their meshes.
 
     Raises:
-        InputError: A robot cannot be imported.
+        InputError: A robot cannot be imported, or one of its meshes is missing.
     """
     found = {}
     with warnings.catch_warnings():
@@ -64,23 +68,29 @@ def prepare_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
         for entry in () if recipe.fields.scenes else recipe.fields.robots:
             made = folder / check_name(get_robot_name(entry.name), "robots")
             if not (made / "robot.yaml").is_file():
-                if not load_robot(entry.name).touch_links:
+                if not (robot := load_robot(entry.name)).touch_links:
                     import_robot(find_robot(entry.name), made, samples=_SAMPLES)
                 elif Path(entry.name).is_absolute():
-                    _point(find_robot(entry.name), made)
+                    _copy_robot(robot, find_robot(entry.name), made)
                 else:
                     continue
             found[entry.name] = str((made / "robot.yaml").resolve())
     return found
 
 
-def _point(source: Path, folder: Path) -> None:
-    """Write a copy of a robot's description with absolute paths into a folder."""
+def _copy_robot(robot: Robot, source: Path, folder: Path) -> None:
+    """Copy a robot's files into a folder, robot.yaml last."""
     beside = source if source.name == "robot.yaml" else source.parent / "robot.yaml"
-    said = yaml.safe_load(read_text(beside, "YAML"))
-    for field in ("urdf", "srdf"):
-        if field in said:
-            said[field] = str((beside.parent / said[field]).resolve())
+    about = yaml.safe_load(read_text(beside, "YAML"))
+    # Without the couplings that were added to the robot's own tree.
+    root = copy_meshes(read_urdf(robot.urdf, robot.file.packages), folder)
+    about["urdf"], about["srdf"] = robot.urdf.name, f"{robot.urdf.stem}.srdf"
+    srdf = find_srdf(source)
+    if srdf is None:
+        del about["srdf"]
+    else:
+        write_atomically(folder / about["srdf"], srdf.read_bytes())
+    write_atomically(folder / about["urdf"], ElementTree.tostring(root, encoding="utf-8"))
     write_atomically(
-        folder / "robot.yaml", yaml.safe_dump(said, sort_keys=False, allow_unicode=True).encode()
+        folder / "robot.yaml", yaml.safe_dump(about, sort_keys=False, allow_unicode=True).encode()
     )

@@ -84,16 +84,17 @@ def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> Plan
     that starts from them fails.
 
     Returns:
-        The concatenated solutions of the steps if one fails, or if they cannot be improved.
+        The concatenated solutions of the steps if one fails, or if they cannot be improved; a
+        stationary plan, no success, if they are no one problem.
     """
     parts = plan_each_step(scene, task, dataclasses.replace(request, is_draft=True))
     steps, statistics = _list_steps(task, parts), [part.result.plan.statistics for part in parts]
     try:
         whole = task if steps == task.steps else compile_task(scene, steps, request.options)
     except InputError:
-        # A free object was grasped anew, from where it lies only after planning. All steps together
-        # choose another grasp.
-        return add_statistics(_plan_from_guesses(scene, task, request), statistics)
+        # A free object was grasped anew, from where it lies only after planning: these steps are no
+        # task that begins here. All steps together choose another grasp.
+        return concatenate_plans(scene, task.steps, request, [], statistics=statistics)
     is_planned = parts and all(part.result.is_solved for part in parts) and not current_ending()
     # A chain can contain a joint only once.
     if is_planned and find_shared_coordinate(scene, whole.holds) is None:

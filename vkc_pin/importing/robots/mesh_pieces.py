@@ -16,7 +16,7 @@ from vkc_pin.world.files.meshes import load_mesh
 from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.world.files.urdf import UrdfFile, UrdfShape
 
-__all__ = ["Piece", "write_meshes"]
+__all__ = ["Piece", "copy_meshes", "write_meshes"]
 
 # Protrusion of a hull over its mesh that is acceptable on a robot [m], and relative to the longest
 # edge of the mesh, since fingers are small
@@ -110,6 +110,21 @@ def write_meshes(
                 place, written = place + 1, written + 1
     _copy_visual(file, links, folder, notes)
     return root, decompositions, notes
+
+
+def copy_meshes(file: UrdfFile, folder: Path) -> ElementTree.Element:
+    """Copy all meshes of a URDF into a folder; return its root element, which refers to the copies.
+
+    Raises:
+        InputError: A mesh is missing.
+    """
+    root, users = copy.deepcopy(file.root), dict[Path, list[ElementTree.Element]]()
+    for mesh in root.iter("mesh"):
+        users.setdefault(file.resolve(mesh.get("filename", "")), []).append(mesh)
+    for path, copy_name in _copy_meshes(list(users), folder / "meshes").items():
+        for mesh in users[path]:
+            mesh.set("filename", f"meshes/{copy_name}")
+    return root
 
 
 def _copy_visual(

@@ -45,7 +45,7 @@ from vkc_pin.world.models.robot_schema import (
 from vkc_pin.world.models.self_collisions import apply_self_collision_analysis, set_collision_pairs
 from vkc_pin.world.models.shapes import LIMIT_SLACK
 
-__all__ = ["find_robot", "list_robots", "load_robot"]
+__all__ = ["find_robot", "find_srdf", "list_robots", "load_robot"]
 
 _BASES = get_args(Base)
 _PAIRS = ("srdf", "sampled", "all")
@@ -415,6 +415,11 @@ def _read_files(name: str | Path, packages: Mapping[str, str | Path]) -> _RobotF
     urdf = read_urdf(source.parent / settings.urdf, folders)
     apply_couplings(urdf, settings.couplings, document)
     return _RobotFiles(source, settings, document, urdf)
+
+
+def find_srdf(name: str | Path) -> Path | None:
+    """Return the SRDF of a robot: that named in its robot.yaml, or one beside its URDF, or None."""
+    return _read_files(name, {}).find_srdf()
 
 
 def _read_rest_state(

@@ -1,4 +1,8 @@
-"""Lets the arm follow base and object, waypoint by waypoint, without collisions."""
+"""Lets the arm follow base and object, waypoint by waypoint, without collisions.
+
+It uses the differential inverse kinematics of Pink (https://github.com/stephane-caron/pink), with
+joint limits.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Compares planning base and arm together (VKC) with planning them apart (B1, B2)."""
+"""Compares planning base and arm together (VKC) with planning them apart (B1, B2).
+
+All methods get the same tasks, random starts, limits and validation.
+"""
 
 from __future__ import annotations
 
@@ -504,7 +507,7 @@ class Comparison:
         saved: Mapping[str, str] | None = None,
         pictures: Sequence[str] = (),
     ) -> str:
-        """Return the tables of a result in Markdown; see `comparison_tables.format_results`."""
+        """Return the tables of a result in Markdown; see the function `format_results`."""
         names = {name: self.tasks[name].name for name in result["meta"]["tasks"]}
         return format_results(result, names, title=self.title, saved=saved, pictures=pictures)
 

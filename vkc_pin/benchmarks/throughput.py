@@ -1,4 +1,9 @@
-"""Measures validated episodes an hour, and simulates many workers from measured durations."""
+"""Measures validated episodes an hour, and simulates many workers from measured durations.
+
+A discrete-event simulation of `utils.parallel`: every worker has one task in progress and one
+queued; the single client handles results one after the other. The dataset ends with the last
+of its first numbers; tasks beyond are wasted.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Models fingers that grasp by friction, commands them, and measures their load and slip."""
+"""Models fingers that grasp by friction, commands them, and measures their load and slip.
+
+A hand whose robot.yaml describes no `gripper` has rigid fingers. For grasps by friction its pads
+slide towards each other: the shapes of the touch links that the x axis of the tool frame
+intersects, on either side. Fingers of one hand are coupled as if by one motor.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""Lists pairs that could collide, and finds close ones at waypoints and continuously in between."""
+"""Lists pairs that could collide, and finds close ones at waypoints and continuously in between.
+
+The distance of two bodies changes by at most the length of their relative motion. An interval
+between two waypoints is skipped for a pair only if this bound proves that it cannot come close.
+All remaining intervals are evaluated at once, then all their halves, and so on.
+"""
 
 from __future__ import annotations
 

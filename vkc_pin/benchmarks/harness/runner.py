@@ -65,7 +65,7 @@ class Execution(TypedDict, total=False):
     Attributes:
         jobs: Number of processes, each with one thread of BLAS. Default: this process alone.
         scheduler: Address of a Dask scheduler whose workers run the trials instead; see
-            `engine.results`.
+            `parallel.run_tasks`.
         progress: Whether to show a progress bar. Default: True.
     """
 

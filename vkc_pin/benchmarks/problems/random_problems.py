@@ -1,4 +1,7 @@
-"""Samples random problems, plans them and keeps the plans for `tests/oracle`."""
+"""Samples random problems, plans them and keeps the plans for `tests/oracle`.
+
+Some of them are infeasible; claims of plans must be right in either case.
+"""
 
 from __future__ import annotations
 

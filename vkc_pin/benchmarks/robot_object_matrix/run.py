@@ -169,7 +169,7 @@ def run(
         starts: Number of random starts per combination, at least 1.
         seed: Random seed of starts and planning.
         robots: Names and files for `load_robot`, or MJCF files; "default" stands for `ROBOTS`.
-            See `given.parse_requests`.
+            See `pairs.parse_requests`.
         objects: `<kind>_<seed>` of `random_object`, names in scenes/objects, descriptions, or URDF,
             MJCF and SDF files; "default" stands for `OBJECTS`.
 

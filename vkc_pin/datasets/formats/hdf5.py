@@ -1,4 +1,9 @@
-"""Reads and writes shards: HDF5 files of many episodes in robomimic's layout."""
+"""Reads and writes shards: HDF5 files of many episodes in robomimic's layout.
+
+Groups are `data/demo_<k>` with `actions`, `states`, `obs`, `rewards` and `dones`, attributes
+`total`, `env_args` and `num_samples`, and `mask`. Samples are in single precision; the trajectory
+itself is in double precision under `motion`.
+"""
 
 from __future__ import annotations
 

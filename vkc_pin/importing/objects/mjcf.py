@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.importing.mjcf_models import NO_MASS, compile_mjcf
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part, make_limits
-from vkc_pin.importing.parsers import NO_MASS, compile_mjcf
 from vkc_pin.utils.optional_imports import import_optional
 
 __all__ = ["read_object_mjcf"]

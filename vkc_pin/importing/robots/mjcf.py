@@ -1,4 +1,8 @@
-"""Converts an MJCF file to a URDF, closed linkages included."""
+"""Converts an MJCF file to a URDF, closed linkages included.
+
+MuJoCo's compiler resolves includes, defaults, classes and units; its result is read here, not the
+file.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.parsers import NO_MASS, compile_mjcf
+from vkc_pin.importing.mjcf_models import NO_MASS, compile_mjcf
 from vkc_pin.importing.targets import add_connection, add_origin, format_numbers
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import import_optional

@@ -1,4 +1,8 @@
-"""Compiles CasADi functions in the background, and keeps them in a folder of the user."""
+"""Compiles CasADi functions in the background, and keeps them in a folder of the user.
+
+Until a library is available, or without a compiler, functions are interpreted. What that
+costs: docs/decisions/0008.
+"""
 
 from __future__ import annotations
 

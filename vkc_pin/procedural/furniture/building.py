@@ -1,4 +1,8 @@
-"""Builds articulated objects of random sizes and their handles from simple shapes, as URDF."""
+"""Builds articulated objects of random sizes and their handles from simple shapes, as URDF.
+
+A finger reaches some 0.02 m beyond the tool's origin: a handle 0.05 m or more in front of its face
+leaves room behind it.
+"""
 
 from __future__ import annotations
 

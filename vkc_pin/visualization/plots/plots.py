@@ -1,4 +1,7 @@
-"""Plots joints and clearance over time, and the top view of a motion, with matplotlib."""
+"""Plots joints and clearance over time, and the top view of a motion, with matplotlib.
+
+Figures are made without pyplot: they need no screen, and none stays open.
+"""
 
 from __future__ import annotations
 
@@ -369,7 +372,7 @@ def plot(plan: CheckedMotion, path: str | Path | None = None) -> Figure | dict[s
 
 
 def plot_joints(plan: CheckedMotion) -> Figure:
-    """Plot positions, velocities and accelerations over time with their limits; see `joints`."""
+    """Plot positions, velocities and accelerations over time with their limits."""
     _check_plan(plan)
     with use_style():
         figure = new_figure(16.0, 2.5 * len(find_groups(plan.trajectory)) + 0.4)

@@ -1,4 +1,7 @@
-"""Finds pairs of shapes that may be close, from their bounding boxes."""
+"""Finds pairs of shapes that may be close, from their bounding boxes.
+
+The compiled loop of `distances` runs the same test; this module exposes it separately.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ class Boxes:
         centers: Centres in the same frame, shape (G, 3) [m].
         halves: Half extents along the boxes' axes, shape (G, 3) [m].
         pairs: Pairs to check, shape (P, 2); at least the first box of each pair moves.
-        threads: Maximum number of threads. Default: `threads.count_threads`.
+        threads: Maximum number of threads. Default: `solids.count_threads`.
     """
 
     def __init__(

@@ -146,7 +146,7 @@ Array<double> placements(const Bodies & bodies, const Numbers<2> & q)
 }
 
 // State, pair, distance, margin, normal and witness points of the pairs with least distance −
-// margin; see clearances.py.
+// margin; see distances.py.
 std::tuple<Array<Index>, Array<Index>, Array<double>, Array<double>, Array<double>, Array<double>, Array<double>> nearest(
   const Bodies & bodies,
   const Boxes & boxes,

@@ -64,7 +64,7 @@ class Shapes:
         tolerance: Tolerance of GJK. With 1e-8, normals are accurate enough for gradients; with
             coal's default of 1e-6, they are off by up to 5e-3. Both take the same time. EPA keeps
             its default, since below 1e-6 it fails for cylinders.
-        threads: Maximum number of threads. Default: `threads.count_threads`.
+        threads: Maximum number of threads. Default: `solids.count_threads`.
     """
 
     def __init__(

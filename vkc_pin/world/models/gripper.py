@@ -1,4 +1,8 @@
-"""Models grippers: maps the opening between the fingers to the positions of their joints."""
+"""Models grippers: maps the opening between the fingers to the positions of their joints.
+
+The opening is the width of the widest bar that fits between the fingers. All finger joints move
+from closed to open by the same fraction of their range, as with one motor; mimic joints follow.
+"""
 
 from __future__ import annotations
 

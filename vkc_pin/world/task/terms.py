@@ -1,4 +1,8 @@
-"""Defines constraints and costs of users: expressions of coordinates and frames, stored as data."""
+"""Defines constraints and costs of users: expressions of coordinates and frames, stored as data.
+
+The user's function is called once, with symbols, and its result is stored as plain data. The
+nonlinear program composes that with its kinematics; validation evaluates it independently.
+"""
 
 from __future__ import annotations
 

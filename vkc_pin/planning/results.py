@@ -170,6 +170,7 @@ def complete_draft(plan: Plan) -> Plan:
     """Return a plan whose trajectory is retimed and validated, if it is not yet."""
     if plan.is_validated:
         return plan
+    start = time.perf_counter()
 
     def check(trajectory: Trajectory) -> Report:
         return validate(plan.scene, plan.steps, trajectory, plan.options, plan.terms)
@@ -181,7 +182,12 @@ def complete_draft(plan: Plan) -> Plan:
         jerk_time=plan.options.jerk_time,
         terms=trace_terms(plan.scene, plan.terms),
     )
-    status = plan.status if report.ok else "rejected"
+    took = PlanningStatistics(planning_time=time.perf_counter() - start)
     return dataclasses.replace(
-        plan, trajectory=trajectory, report=report, status=status, is_validated=True
+        plan,
+        trajectory=trajectory,
+        report=report,
+        status=plan.status if report.ok else "rejected",
+        statistics=plan.statistics + took,
+        is_validated=True,
     )

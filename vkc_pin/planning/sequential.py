@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from vkc_pin.errors import InputError
 from vkc_pin.planning.initialization.initial_guess import make_initial_guess
-from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.plan import Plan, PlanningStatistics
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.results import add_statistics, complete_draft, concatenate_plans
 from vkc_pin.planning.solve_task import TaskResult, solve_task
@@ -88,7 +88,8 @@ def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> Plan
         stationary plan, no success, if they are no one problem.
     """
     parts = plan_each_step(scene, task, dataclasses.replace(request, is_draft=True))
-    steps, statistics = _list_steps(task, parts), [part.result.plan.statistics for part in parts]
+    steps, plans = _list_steps(task, parts), [part.result.plan for part in parts]
+    statistics, common = [plan.statistics for plan in plans], list[PlanningStatistics]()
     try:
         whole = task if steps == task.steps else compile_task(scene, steps, request.options)
     except InputError:
@@ -101,11 +102,12 @@ def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> Plan
         pieces = [part.result.phase_waypoints() for part in parts]
         guess = functools.partial(make_initial_guess, parts=pieces)
         plan = solve_task(scene, whole, request, guess=guess).plan
-        statistics.append(plan.statistics)
+        common.append(plan.statistics)
         if plan.success:
-            return add_statistics(plan, statistics)
-    plans = [complete_draft(part.result.plan) for part in parts]
-    return concatenate_plans(scene, steps, request, plans, statistics=statistics)
+            return add_statistics(plan, statistics + common)
+    plans = [complete_draft(plan) for plan in plans]
+    statistics = [plan.statistics for plan in plans]
+    return concatenate_plans(scene, steps, request, plans, statistics=statistics + common)
 
 
 def _list_steps(task: Task, parts: Sequence[PlannedStep]) -> tuple[Step, ...]:

@@ -72,7 +72,7 @@ class TaskResult:
         plan: The best plan found. That of a draft is not validated, unless solving failed.
         problem: The nonlinear program; None if the budget ended before it was built.
         z: Its best waypoints z_1..z_N, shape (N, n).
-        check_time: Time of the last validation [s]; 0 without any.
+        check_time: Time of the last validation [s]; for a draft, that it may take.
         is_grasp_independent: Whether the task fails for certain whatever the grasp.
     """
 
@@ -378,6 +378,7 @@ class _Search:
         with suspend_budget():
             waypoints = make_trajectory(problem, solution.z, solution.dt)
         if self.request.is_draft and solution.converged:
+            self.check_time = _CHECK_TIME * problem.segments
             return _Candidate(name, problem, solution.z, waypoints, Report(), "success", False)
         began, validated = time.perf_counter(), self.times["validation"]
         # Violations of solutions that have not converged are not the curve's.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from dataclasses import replace
 
@@ -223,9 +222,7 @@ def test_links_of_an_object_are_paired() -> None:
 def test_self_clearances_agree_with_the_program(door: Scene) -> None:
     first, second = next(iter(door.robot.own_margins(0.02)))
     one, other = sorted((door.robot.link_of(first), door.robot.link_of(second)))
-    scene = dataclasses.replace(
-        door, robot=dataclasses.replace(door.robot, tight={(one, other): 0.006})
-    )
+    scene = replace(door, robot=replace(door.robot, tight={(one, other): 0.006}))
     motion = make_random_door_motion(scene, 0, size=0.1)
     table = PairTable(scene, CollisionShapes(World(scene)), motion, 0.02, 0.01)
     margins = table.get_margins(np.arange(len(table.pairs)), np.zeros(len(table.pairs), int))

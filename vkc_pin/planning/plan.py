@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -83,7 +82,7 @@ class PlanningStatistics:
     def with_times(self, times: Mapping[str, float]) -> PlanningStatistics:
         """Return the statistics with the times of some of `STAGES` [s]."""
         fields: dict[str, Any] = {f"{name}_time": value for name, value in times.items()}
-        return dataclasses.replace(self, **fields)
+        return replace(self, **fields)
 
     def to_metrics(self) -> dict[str, float]:
         """Return the statistics by the names in records of benchmarks."""

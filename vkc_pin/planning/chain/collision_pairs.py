@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import combinations
 
 import coal
 import numpy as np
@@ -244,7 +242,7 @@ def _find_lift_and_place_moments(
         for hold, placement in moments.items():
             if not scene.objects[hold.object].object.free:
                 continue
-            placed = dataclasses.replace(scene.objects[hold.object], placement=placement)
+            placed = replace(scene.objects[hold.object], placement=placement)
             yield chain.held_geometries[hold], placed, begins
             for ride in phase.supported:
                 if ride.hold == hold:
@@ -265,7 +263,7 @@ def _place_supported_object(
     scene: Scene, ride: SupportedObject, carrier: PlacedObject
 ) -> PlacedObject:
     """Return the supported object, placed on its carrier."""
-    return dataclasses.replace(
+    return replace(
         scene.objects[ride.object],
         placement=carrier.link_placement(ride.link) * ride.placement_in_link,
     )
@@ -342,7 +340,7 @@ class _PairBuilder:
             ]
             pairs += [
                 (i, j, margin)
-                for i, j in combinations(attached_shapes[hold.object], 2)
+                for i, j in itertools.combinations(attached_shapes[hold.object], 2)
                 if self._can_self_collide(hold.object, labels[i], labels[j])
             ]
             moving += attached_shapes[hold.object]
@@ -369,9 +367,7 @@ class _PairBuilder:
             if placed.object.free:
                 if name in attached_shapes:
                     continue
-                placed = dataclasses.replace(
-                    placed, placement=phase.resting.get(name, placed.placement)
-                )
+                placed = replace(placed, placement=phase.resting.get(name, placed.placement))
             standing = make_world_shapes(placed.with_state(state))
             if name in attached_shapes:  # its static links; the others move with the hand
                 held_shapes = {get_local_name(shapes[i].name) for i in attached_shapes[name]}
@@ -440,7 +436,7 @@ class _PairBuilder:
             margin_regions=margin_regions,
             released=left,
         )
-        return dataclasses.replace(
+        return replace(
             part,
             reduced_margins=find_reduced_margins(
                 self.scene, self.chain, self.task, number, part, self.options

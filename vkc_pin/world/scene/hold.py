@@ -7,7 +7,6 @@ import itertools
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import product
 
 import coal
 import numpy as np
@@ -436,7 +435,9 @@ def _is_approach_free(placed: PlacedObject, attachment: str, hand: Solids, solid
     """
     grasp = placed.object.attachment(attachment)
     where = placed.link_placement(grasp.link)
-    for values in product(*({freedom.lower, 0.0, freedom.upper} for freedom in grasp.freedoms)):
+    for values in itertools.product(
+        *({freedom.lower, 0.0, freedom.upper} for freedom in grasp.freedoms)
+    ):
         tool = where * grasp.tool(values)
         approach = [tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, -back])) for back in _APPROACH]
         if (

@@ -7,7 +7,8 @@ import pytest
 import trimesh
 
 import vkc_pin as vkc
-from vkc_pin.importing.robots.mesh_pieces import write_meshes
+from vkc_pin.errors import InputError
+from vkc_pin.importing.robots.mesh_pieces import copy_meshes, write_meshes
 from vkc_pin.world.files.meshes import load_parts
 from vkc_pin.world.files.urdf import UrdfFile, read_urdf
 
@@ -129,3 +130,33 @@ def test_meshes_of_equal_names_keep_their_shapes_and_colours(
         *("paint.mtl", "paint_2.mtl", "paint_3.mtl"),
     }
     assert (folder / "x_2.obj").read_bytes() == files["a"].read_bytes(), "no reference to rename"
+
+
+def test_meshes_are_copied_unchanged(file: Path, tmp_path: Path) -> None:
+    original, folder = read_urdf(file), tmp_path / "copy"
+    root = copy_meshes(original, folder)
+    assert (
+        ElementTree.tostring(original.root).decode()
+        == ElementTree.tostring(ElementTree.fromstring(TEXT)).decode()
+    )
+    (folder / "r.urdf").write_bytes(ElementTree.tostring(root))
+    copied = read_urdf(folder / "r.urdf")
+    for kind, count in (("visual", 1), ("collision", 3)):  # one visual mesh is missing
+        shapes = copied.read_shapes(kind)
+        assert len(shapes) == count
+        for shape in shapes:
+            if shape.file is not None:
+                assert shape.file.parent == folder / "meshes"
+                source = file.parent / shape.file.name
+                assert shape.file.read_bytes() == source.read_bytes()
+    assert [shape.size for shape in copied.read_shapes("collision")] == [
+        shape.size for shape in original.read_shapes("collision")
+    ]
+    assert (folder / "meshes/paint.mtl").is_file()
+
+
+def test_missing_collision_meshes_are_refused(file: Path, tmp_path: Path) -> None:
+    (file.parent / "angle.stl").unlink()
+    with pytest.raises(InputError, match=r"angle\.stl"):
+        copy_meshes(read_urdf(file), tmp_path / "copy")
+    assert not (tmp_path / "copy").exists()

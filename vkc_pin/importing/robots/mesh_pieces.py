@@ -115,12 +115,23 @@ def write_meshes(
 def copy_meshes(file: UrdfFile, folder: Path) -> ElementTree.Element:
     """Copy all meshes of a URDF into a folder; return its root element, which refers to the copies.
 
+    Visual shapes without their meshes are left out.
+
     Raises:
-        InputError: A mesh is missing.
+        InputError: A mesh for collision is missing.
     """
     root, users = copy.deepcopy(file.root), dict[Path, list[ElementTree.Element]]()
-    for mesh in root.iter("mesh"):
-        users.setdefault(file.resolve(mesh.get("filename", "")), []).append(mesh)
+    for link in root.findall("link"):
+        for element in (*link.findall("visual"), *link.findall("collision")):
+            mesh = element.find("geometry/mesh")
+            if mesh is None:
+                continue
+            try:
+                users.setdefault(file.resolve(mesh.get("filename", "")), []).append(mesh)
+            except InputError:
+                if element.tag != "visual":
+                    raise
+                link.remove(element)
     for path, copy_name in _copy_meshes(list(users), folder / "meshes").items():
         for mesh in users[path]:
             mesh.set("filename", f"meshes/{copy_name}")

@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+import yaml
 from helpers.datasets import SMALL
 
 from vkc_pin.datasets import robots
@@ -12,7 +13,9 @@ from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generation import generate
 from vkc_pin.datasets.recipe import load_recipe
 from vkc_pin.errors import InputError
+from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.models.robot_file import find_robot, load_robot
+from vkc_pin.world.scene.scene import load_scene
 
 
 @pytest.mark.long
@@ -71,3 +74,34 @@ def test_robots_with_the_same_name_are_rejected(tmp_path: Path) -> None:
         )
         == 2
     )
+
+
+def write_scene_with_own_robot(folder: Path) -> Path:
+    """Write a scene and its robot, the packaged ones, as files of a user; return the scene."""
+    shutil.copytree(find_robot("husky_ur5e").parent, folder / "rover")
+    scene = load_scene("drawer").with_start(base=(-0.8, 0.5, 0.4)).document
+    scene["robot"]["name"] = "rover/robot.yaml"
+    file = folder / "scene.yaml"
+    file.write_text(yaml.safe_dump(scene), encoding="utf-8")
+    shutil.copytree(find_resource_folder("scenes") / "objects", folder / "objects")
+    return file
+
+
+def test_robots_of_scenes_are_copied(tmp_path: Path) -> None:
+    pytest.importorskip("h5py")
+    scene = write_scene_with_own_robot(tmp_path)
+    dataset = generate({**SMALL, "scenes": [str(scene)]}, 1, tmp_path / "out")
+    (episode,) = dataset.episodes()
+    shutil.rmtree(tmp_path / "rover")
+    assert episode.scene().robot.urdf == tmp_path / "out/robots/rover/husky_ur5e.urdf"
+    assert check_dataset(dataset.folder).ok
+
+
+def test_scenes_have_one_robot_of_a_name(tmp_path: Path) -> None:
+    scenes = []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        scenes.append(str(write_scene_with_own_robot(tmp_path / name)))
+    recipe = load_recipe({**SMALL, "scenes": scenes})
+    with pytest.raises(InputError, match=r"different robots of one name.*b/rover/robot\.yaml"):
+        robots.prepare_robots(recipe, tmp_path / "out")

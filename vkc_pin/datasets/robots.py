@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import warnings
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from pathlib import Path
 
 import yaml
 
 from vkc_pin.datasets.recipe import Recipe, check_robot, get_robot_name
+from vkc_pin.errors import InputError
 from vkc_pin.importing.robots.mesh_pieces import copy_meshes
 from vkc_pin.importing.robots.robot_import import import_robot
 from vkc_pin.simulation.cameras import check_frame
@@ -18,7 +20,7 @@ from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.world.files.writing import check_name, write_atomically
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.robot_file import find_robot, find_srdf, load_robot
+from vkc_pin.world.models.robot_file import find_robot, find_srdf, list_robots, load_robot
 from vkc_pin.world.scene.scene import load_scene
 
 __all__ = ["check_frames", "prepare_robots"]
@@ -57,15 +59,19 @@ def prepare_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
     Args:
         recipe: Recipe.
         folder: Folder of the dataset's robots, visible to all workers. Robots without a described
-            hand are imported once; others by path are copied with their meshes.
+            hand are imported once; others by path, and those of scenes, are copied with their
+            meshes.
 
     Raises:
-        InputError: A robot cannot be imported, or one of its meshes is missing.
+        InputError: A robot cannot be imported, one of its meshes is missing, or scenes have
+            different robots of one name.
     """
-    found = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the robot's folder lists guesses
-        for entry in () if recipe.fields.scenes else recipe.fields.robots:
+        if recipe.fields.scenes:
+            return _prepare_robots_of_scenes(recipe.fields.scenes, folder)
+        found = {}
+        for entry in recipe.fields.robots:
             made = folder / check_name(get_robot_name(entry.name), "robots")
             if not (made / "robot.yaml").is_file():
                 if not (robot := load_robot(entry.name)).touch_links:
@@ -78,10 +84,35 @@ def prepare_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
     return found
 
 
+def _prepare_robots_of_scenes(scenes: Sequence[str], folder: Path) -> dict[str, str]:
+    """Copy the robots that scenes give by path; see `prepare_robots`."""
+    found, sources = dict[str, str](), dict[str, Path]()
+    for name in scenes:
+        scene = load_scene(name)
+        given = str(scene.document["robot"]["name"])
+        if given in list_robots():
+            continue
+        source = find_robot(scene.folder / given)
+        robot = check_name(scene.robot.name, "robot.name")
+        if sources.setdefault(robot, source.resolve()) != source.resolve():
+            raise InputError(
+                "scenes have different robots of one name",
+                field="scenes",
+                expected=f"robots in folders of different names, or only {sources[robot]}",
+                got=source.resolve(),
+            )
+        if not (folder / robot / "robot.yaml").is_file():
+            _copy_robot(scene.robot, source, folder / robot)
+        found[robot] = str((folder / robot / "robot.yaml").resolve())
+    return found
+
+
 def _copy_robot(robot: Robot, source: Path, folder: Path) -> None:
     """Copy a robot's files into a folder, robot.yaml last."""
     beside = source if source.name == "robot.yaml" else source.parent / "robot.yaml"
-    about = yaml.safe_load(read_text(beside, "YAML"))
+    about = yaml.safe_load(read_text(beside, "YAML")) if beside.is_file() else {}
+    if Path(about.get("urdf", "")).name != robot.urdf.name:  # the robot.yaml of another robot
+        about = {}
     # Without the couplings that were added to the robot's own tree.
     root = copy_meshes(read_urdf(robot.urdf, robot.file.packages), folder)
     about["urdf"], about["srdf"] = robot.urdf.name, f"{robot.urdf.stem}.srdf"

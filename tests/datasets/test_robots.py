@@ -3,6 +3,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from helpers.datasets import SMALL
@@ -52,6 +53,8 @@ def test_robot_by_path_is_found_again(
     (episode,) = Dataset.open(tmp_path / "moved").episodes()
     robot, original = episode.scene().robot, load_robot("husky_ur5e")
     assert robot.urdf.is_relative_to(tmp_path / "moved/robots")
+    srdf = original.urdf.with_suffix(".srdf").read_bytes()
+    assert robot.urdf.with_suffix(".srdf").read_bytes() == srdf
     assert robot.collision.collisionPairs.tolist() == original.collision.collisionPairs.tolist()
     assert [shape.name for shape in robot.visual.geometryObjects] == [
         shape.name for shape in original.visual.geometryObjects
@@ -95,6 +98,20 @@ def test_robots_of_scenes_are_copied(tmp_path: Path) -> None:
     shutil.rmtree(tmp_path / "rover")
     assert episode.scene().robot.urdf == tmp_path / "out/robots/rover/husky_ur5e.urdf"
     assert check_dataset(dataset.folder).ok
+
+
+def test_robot_yaml_of_another_urdf_is_not_copied(tmp_path: Path) -> None:
+    scene = write_scene_with_own_robot(tmp_path)
+    shutil.copy(tmp_path / "rover/husky_ur5e.urdf", tmp_path / "rover/second.urdf")
+    document = yaml.safe_load(scene.read_text(encoding="utf-8"))
+    document |= {"robot": {"name": "rover/second.urdf"}, "start": {"base": [-0.8, 0.5, 0.4]}}
+    scene.write_text(yaml.safe_dump(document), encoding="utf-8")
+    recipe = load_recipe({**SMALL, "scenes": [str(scene)]})
+    (file,) = robots.prepare_robots(recipe, tmp_path / "out").values()
+    copied, original = load_robot(file), load_robot(tmp_path / "rover/second.urdf")
+    assert copied.urdf == tmp_path / "out/second/second.urdf"
+    assert (copied.touch_links, copied.tool_frame) == ((), original.tool_frame)
+    np.testing.assert_array_equal(copied.home, original.home)
 
 
 def test_scenes_have_one_robot_of_a_name(tmp_path: Path) -> None:

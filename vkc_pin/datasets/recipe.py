@@ -66,6 +66,7 @@ __all__ = [
     "check_entries",
     "check_robot",
     "get_robot_name",
+    "is_path",
     "load_recipe",
     "make_entries",
     "resolve_terms",
@@ -520,7 +521,8 @@ def get_robot_name(name: str) -> str:
     )
 
 
-def _is_path(name: str) -> bool:
+def is_path(name: str) -> bool:
+    """Return whether a robot, object or scene is given by the path of its file."""
     return name.endswith((".yaml", ".yml", ".urdf")) or "/" in name
 
 
@@ -532,10 +534,10 @@ def _robots(
     for k, entry in enumerate(entries):
         with document.annotate_errors(("robots", k)):
             path = find_robot(
-                str((folder / entry.name).resolve()) if _is_path(entry.name) else entry.name
+                str((folder / entry.name).resolve()) if is_path(entry.name) else entry.name
             )
         robots.append(
-            entry.model_copy(update={"name": str(path)}) if _is_path(entry.name) else entry
+            entry.model_copy(update={"name": str(path)}) if is_path(entry.name) else entry
         )
         name = robots[-1].name
         if found.setdefault(get_robot_name(name), name) != name:
@@ -549,7 +551,7 @@ def _robots(
 
 
 def _object(document: Document, place: int, name: str, folder: Path) -> str:
-    if not _is_path(name):
+    if not is_path(name):
         if name not in list_openable_types():
             raise document.make_unknown_name_error(
                 ("objects", place), "object that opens", name, list_openable_types()
@@ -559,7 +561,7 @@ def _object(document: Document, place: int, name: str, folder: Path) -> str:
 
 
 def _scene(document: Document, place: int, name: str, folder: Path) -> str:
-    if not _is_path(name):
+    if not is_path(name):
         known = list_resources("scenes", "*.yaml")
         if name not in known:
             raise UnknownNameError(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import yaml
 
-from vkc_pin.datasets.recipe import Recipe, check_robot, get_robot_name
+from vkc_pin.datasets.recipe import Recipe, check_robot, get_robot_name, is_path
 from vkc_pin.errors import InputError
 from vkc_pin.importing.robots.mesh_pieces import copy_meshes
 from vkc_pin.importing.robots.robot_import import import_robot
@@ -20,7 +20,7 @@ from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.world.files.writing import check_name, write_atomically
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.robot_file import find_robot, find_srdf, list_robots, load_robot
+from vkc_pin.world.models.robot_file import find_robot, find_robot_files, load_robot
 from vkc_pin.world.scene.scene import load_scene
 
 __all__ = ["check_frames", "prepare_robots"]
@@ -90,7 +90,7 @@ def _prepare_robots_of_scenes(scenes: Sequence[str], folder: Path) -> dict[str, 
     for name in scenes:
         scene = load_scene(name)
         given = str(scene.document["robot"]["name"])
-        if given in list_robots():
+        if not is_path(given):
             continue
         source = find_robot(scene.folder / given)
         robot = check_name(scene.robot.name, "robot.name")
@@ -109,17 +109,13 @@ def _prepare_robots_of_scenes(scenes: Sequence[str], folder: Path) -> dict[str, 
 
 def _copy_robot(robot: Robot, source: Path, folder: Path) -> None:
     """Copy a robot's files into a folder, robot.yaml last."""
-    beside = source if source.name == "robot.yaml" else source.parent / "robot.yaml"
-    about = yaml.safe_load(read_text(beside, "YAML")) if beside.is_file() else {}
-    if Path(about.get("urdf", "")).name != robot.urdf.name:  # the robot.yaml of another robot
-        about = {}
+    description, srdf = find_robot_files(source)
+    about = {} if description is None else yaml.safe_load(read_text(description, "YAML"))
     # Without the couplings that were added to the robot's own tree.
     root = copy_meshes(read_urdf(robot.urdf, robot.file.packages), folder)
-    about["urdf"], about["srdf"] = robot.urdf.name, f"{robot.urdf.stem}.srdf"
-    srdf = find_srdf(source)
-    if srdf is None:
-        del about["srdf"]
-    else:
+    about["urdf"] = robot.urdf.name
+    if srdf is not None:
+        about["srdf"] = f"{robot.urdf.stem}.srdf"
         write_atomically(folder / about["srdf"], srdf.read_bytes())
     write_atomically(folder / about["urdf"], ElementTree.tostring(root, encoding="utf-8"))
     write_atomically(

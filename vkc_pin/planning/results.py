@@ -18,7 +18,7 @@ from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.contact_rules import compute_start_opening
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
-from vkc_pin.world.task.terms import Term, trace_terms
+from vkc_pin.world.task.terms import Term
 from vkc_pin.world.trajectory.formats.archives import PlanStatus
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.splicing import concatenate_trajectories
@@ -180,7 +180,7 @@ def complete_draft(plan: Plan) -> Plan:
         plan.trajectory,
         check,
         jerk_time=plan.options.jerk_time,
-        terms=trace_terms(plan.scene, plan.terms),
+        terms=plan.terms,
     )
     took = PlanningStatistics(planning_time=time.perf_counter() - start)
     return dataclasses.replace(

@@ -7,7 +7,6 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -47,7 +46,6 @@ from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task
-from vkc_pin.world.task.terms import Term, trace_terms
 from vkc_pin.world.trajectory.formats.archives import PlanStatus
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -388,17 +386,13 @@ class _Search:
             self._validate,
             repairs=MAX_REPAIRS if solution.converged else 0,
             jerk_time=self.request.options.jerk_time,
-            terms=self._terms,
+            terms=self.request.terms,
         )
         took = time.perf_counter() - began
         self.times["retiming"] += took - (self.times["validation"] - validated)
         failure: PlanStatus = "rejected" if solution.converged else "not converged"
         status = "success" if report.ok else failure
         return _Candidate(name, problem, solution.z, trajectory, report, status)
-
-    @cached_property
-    def _terms(self) -> tuple[Term, ...]:
-        return trace_terms(self.scene, self.request.terms)
 
     def _validate(self, trajectory: Trajectory) -> Report:
         began, request = time.perf_counter(), self.request

@@ -56,7 +56,7 @@ class Shapes:
 
     Distances equal those of `coal.distance` with a fresh result bit for bit, for any number of
     threads. A state is the placements of the moving shapes in the world frame, shape (M, 12), in
-    the format of `placements.flatten_placements`.
+    the format of `solids.flatten_placements`.
 
     Args:
         geometries: coal's shapes, moving ones first.

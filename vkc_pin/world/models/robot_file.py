@@ -45,7 +45,7 @@ from vkc_pin.world.models.robot_schema import (
 from vkc_pin.world.models.self_collisions import apply_self_collision_analysis, set_collision_pairs
 from vkc_pin.world.models.shapes import LIMIT_SLACK
 
-__all__ = ["find_robot", "find_srdf", "list_robots", "load_robot"]
+__all__ = ["find_robot", "find_robot_files", "list_robots", "load_robot"]
 
 _BASES = get_args(Base)
 _PAIRS = ("srdf", "sampled", "all")
@@ -417,9 +417,10 @@ def _read_files(name: str | Path, packages: Mapping[str, str | Path]) -> _RobotF
     return _RobotFiles(source, settings, document, urdf)
 
 
-def find_srdf(name: str | Path) -> Path | None:
-    """Return the SRDF of a robot: that named in its robot.yaml, or one beside its URDF, or None."""
-    return _read_files(name, {}).find_srdf()
+def find_robot_files(name: str | Path) -> tuple[Path | None, Path | None]:
+    """Return the robot.yaml and the SRDF that `load_robot` reads for a robot, or None each."""
+    files = _read_files(name, {})
+    return files.source if files.source.suffix == ".yaml" else None, files.find_srdf()
 
 
 def _read_rest_state(

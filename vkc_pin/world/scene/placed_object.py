@@ -144,8 +144,8 @@ def sweep_link_shapes(
         values: Values of the coordinate, shape (V,), [rad] or [m].
 
     Returns:
-        Placements, shape (V, K, 12), see `solids.flatten_placements`, and lower and upper corners of
-            the axis-aligned bounding boxes, both (V, K, 3) [m].
+        Placements, shape (V, K, 12), see `solids.flatten_placements`, and lower and upper corners
+            of the axis-aligned bounding boxes, both (V, K, 3) [m].
     """
     model, own, state = placed.object.model, find_link_shapes(placed, link), placed.state.copy()
     data, size = model.createData(), (len(values), len(own))

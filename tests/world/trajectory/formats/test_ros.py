@@ -54,6 +54,14 @@ def test_coordinates_stay_between_their_waypoints(positions: np.ndarray, seed: i
     assert (position <= np.maximum(positions[at], positions[at + 1])).all()
 
 
+def test_motion_of_an_arm_alone_is_rejected() -> None:
+    points = [{"positions": [k] * 4, "time_from_start": {"sec": k, "nanosec": 0}} for k in (0, 1)]
+    message = {"joint_names": list("abcd"), "points": points}
+    with pytest.raises(vkc.InputError, match="joint_names: no base coordinates"):
+        Trajectory.from_ros(message)
+    assert Trajectory.from_ros(message, robot_size=4).robot_size == 4
+
+
 def test_resting_coordinates_stay_at_rest() -> None:
     times = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
     positions = np.array([[0.0], [1.0], [1.0], [1.0], [0.5]])

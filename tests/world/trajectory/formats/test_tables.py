@@ -137,7 +137,8 @@ ROW = "0.0,0,0,0,1,go,{}\n"
         (HEADER + "0.0,0,0,0,1,go,door\n", "bad.csv:2: held: not the held objects"),
         (HEADER + '0.0,0,0,0,1,go,"[1]"\n', "bad.csv:2: held: not the held objects"),
         (HEADER + ROW, "bad.csv: Trajectory.times: times do not increase"),
-        ("time,arm\n0,0\n1,1\n", "bad.csv: Trajectory.robot_size: out of range"),
+        ("time,arm\n0,0\n1,1\n", "bad.csv:1: no base coordinates"),
+        ("time,a,b,c,d\n0,0,0,0,0\n1,1,1,1,1\n", "bad.csv:1: no base coordinates"),
     ],
 )
 def test_invalid_tables_are_rejected(tmp_path: Path, text: str, message: str) -> None:

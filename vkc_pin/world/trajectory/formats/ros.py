@@ -160,14 +160,17 @@ def from_ros(
         rate = point.get("velocities", ())
         if isinstance(rate, list) and rate and not point.get("accelerations"):
             rates.append(_check_row(rate, len(names), file, f"{where}velocities"))
-    size = infer_robot_size(names)
-    if robot_size is not None:
+    if like is not None:
+        size = like["robot_size"]
+    elif robot_size is not None:
         size = check_integer(robot_size, "robot_size", low=3)
+    else:
+        size = infer_robot_size(names, file=file, field="joint_names")
     has_curve = bool(rates) and len(rates) == len(rows)
     waypoints = list(range(len(rows)))
     phases = [make_single_phase(len(rows))] if len(rows) > 1 else []
     if like is not None:
-        size, moments = like["robot_size"], np.array(like["times"], float)
+        moments = np.array(like["times"], float)
         between = (np.array(times[1:]) + np.array(times[:-1])) / 2.0
         at = np.searchsorted(between, moments - moments[0])  # the points that are nearest in time
         if has_curve:

@@ -39,6 +39,7 @@ _MAX_BYTES = 20_000_000  # of a file: about 30 000 waypoints of 25 coordinates
 _MAX_LINES, _MAX_COLUMNS = 200_000, 1000
 _TIME, _PHASES = "time", ("phase", "phase_name", "held")  # first and last columns of a table
 _RATE, _WAYPOINT = " velocity", "waypoint"  # additional columns of a curve
+_BASE = ("base_x", "base_y", "base_yaw")
 _OPENING = "opening"  # additional last column if a phase states a gripper opening
 
 
@@ -171,7 +172,9 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
         "names": names,
         "times": [row[0] for row in rows],
         "positions": [row[own] for row in rows],
-        "robot_size": infer_robot_size(names) if robot_size is None else robot_size,
+        "robot_size": infer_robot_size(names, file=path, line=1)
+        if robot_size is None
+        else robot_size,
         "phases": phases,
     }
     if is_curve:
@@ -254,8 +257,19 @@ def select_columns(motion: Mapping[str, Any], joints: str | Sequence[str]) -> li
     return [known.index(name) for name in names]
 
 
-def infer_robot_size(names: Sequence[str]) -> int:
-    """Infer the number of robot coordinates: those before the first name with a dot."""
+def infer_robot_size(names: Sequence[str], **where: Any) -> int:
+    """Infer the number of robot coordinates: those before the first name with a dot.
+
+    Args:
+        names: Names of all coordinates.
+        where: File, and line or field, for the error.
+
+    Raises:
+        InputError: The first ones are not those of the base, as in a motion of an arm alone.
+    """
+    if tuple(names[:3]) != _BASE:
+        expected = f"{', '.join(_BASE)} first, or the argument robot_size"
+        raise InputError("no base coordinates", expected=expected, got=tuple(names[:3]), **where)
     return next((k for k, name in enumerate(names) if "." in str(name)), len(names))
 
 

@@ -72,24 +72,18 @@ def extract_phase_waypoints(
 
 def make_initial_guess(problem: TrajectoryProblem, parts: Sequence[PhaseWaypoints]) -> InitialGuess:
     """Concatenate waypoints of parts of a task to an initial guess for the whole task."""
-    chain = problem.chain
-    z = np.full((problem.segments, chain.size), np.nan)
-    begin = number = 0
+    chain, phases = problem.chain, iter(problem.task.phases)
+    z, begin, phase = np.full((problem.segments, chain.size), np.nan), 0, next(phases, None)
     for part in parts:
-        count = len(part.phases)
-        phases = problem.task.phases[number : number + count]
-        if part.phases != tuple(phase.key for phase in phases):
-            # A phase that only waits for the gripper to open is no phase of the whole task.
-            continue
-        number += count
         # The other coordinates belong to objects that are no longer attached.
         known = [k for k, name in enumerate(part.names) if name in chain.names]
         columns = [chain.index(part.names[k]) for k in known]
-        for phase, waypoints in zip(phases, part.waypoints, strict=True):
-            z[begin : begin + phase.segments, columns] = _resample(
-                waypoints[:, known], phase.segments
-            )
-            begin += phase.segments
+        for key, waypoints in zip(part.phases, part.waypoints, strict=True):
+            # A phase that only waits for the gripper to open is no phase of the whole task.
+            if phase is not None and key == phase.key:
+                end = begin + phase.segments
+                z[begin:end, columns] = _resample(waypoints[:, known], phase.segments)
+                begin, phase = end, next(phases, None)
     z = fill_missing_values(z)
     z = np.where(np.isnan(z), problem.start, z)  # coordinates that no part moves
     name = ", ".join(part.initialization for part in parts) + ", then all at once"

@@ -24,7 +24,7 @@ from vkc_pin.planning.initialization.initial_guess import (
     extract_phase_waypoints,
     make_initial_guess,
 )
-from vkc_pin.planning.initialization.methods import initialize
+from vkc_pin.planning.initialization.methods import MAX_GOOD_PENETRATION, initialize
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import STAGES, Plan, PlanningStatistics
 from vkc_pin.planning.request import PlanningRequest
@@ -298,7 +298,7 @@ class _Search:
         status = "infeasible" if lines else best.status
         if lines and nearest is None:
             lines = [*lines, *self._blocked_phases]
-        elif is_search and not lines:
+        elif is_search and not lines and not self.request.is_draft:
             seed = self.request.random_seed
             lines, is_cut_off = diagnose_paths(
                 best.problem or problem, best.z, best.report, self._blocked_phases, seed
@@ -339,6 +339,8 @@ class _Search:
 
     def _generate_guesses(self, problem: TrajectoryProblem) -> Iterator[InitialGuess]:
         request = self.request
+        # Where a step's guesses are poor, "auto" rather searches guesses for all steps together.
+        needs_good = request.is_draft and request.initialization == "auto"
         guesses = initialize(
             problem,
             request.initialization,
@@ -360,6 +362,8 @@ class _Search:
                 took = time.perf_counter() - began
                 self.times["initialization"] += took - (request.cache.build_time - built)
             if guess is None or self._proofs:
+                return
+            if needs_good and guess.penetration > MAX_GOOD_PENETRATION:
                 return
             yield guess
 

@@ -18,7 +18,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.planning.initialization.initial_guess import InitialGuess
+from vkc_pin.planning.initialization.initial_guess import (
+    InitialGuess,
+    PhaseWaypoints,
+    extract_phase_waypoints,
+    make_initial_guess,
+)
 from vkc_pin.planning.initialization.methods import (
     INITIALIZATIONS,
     MAX_GOOD_PENETRATION,
@@ -189,6 +194,16 @@ def test_task_without_motion_has_a_guess() -> None:
     assert np.abs(guess.z - p.start).max() < 1e-9
 
 
+def test_phase_that_only_waits_is_no_part_of_a_guess_for_the_whole_task() -> None:
+    z = make_guesses("interpolated")[0].z
+    whole = extract_phase_waypoints(make_problem(), z, "interpolated")
+    standing = np.tile(make_problem().start, (4, 1))
+    part = PhaseWaypoints(
+        (("stand", ()), *whole.phases), whole.names, (standing, *whole.waypoints), "interpolated"
+    )
+    np.testing.assert_array_equal(make_initial_guess(make_problem(), [part]).z, z)
+
+
 # --- order of the methods
 
 Penetrations = list[float | None]
@@ -219,8 +234,8 @@ def interleave(*kinds: Penetrations) -> list[str]:
         (([FINE], [DEEP], [0.0]), "a0 A0 b0 c0 C0 B0"),
         (([POOR, 0.0], [FINE, 0.0], [0.0]), "a0 b0 B0 c0 C0 b1 B1 a1 A1 A0"),
         (([POOR], [POOR], [DEEP]), "a0 b0 c0 A0 B0 C0"),
-        (([DEEP, DEEP], [DEEP, DEEP], []), "a0 b0 A0 a1 b1 B0 A1 B1"),
-        (([POOR, POOR], [DEEP], []), "a0 b0 A0 a1 B0 A1"),
+        (([DEEP, DEEP], [DEEP, DEEP], []), "a0 b0 a1 b1 A0 B0 A1 B1"),
+        (([POOR, POOR], [DEEP], []), "a0 b0 a1 A0 B0 A1"),
         (([None, 0.0], [0.0], []), "a0 b0 B0 a1 A1"),
         (([None], [None], [None]), "a0 b0 c0"),
     ],
@@ -320,3 +335,12 @@ def test_narrow_door_is_closed_from_outside() -> None:
     assert plan.success, plan.summary()
     assert plan.trajectory.column("door.hinge")[-1] == pytest.approx(0.0, abs=1e-3)
     assert plan.trajectory.positions[-1, 1] < 1.0  # the wall is at 1.25
+
+
+def test_door_that_opens_towards_the_robot_does_not_lock_it_in() -> None:
+    """With the least motion, the robot pulls the door open and ends behind it."""
+    steps = [vkc.Actuate("door", {"hinge": -1.5}), vkc.GoTo(4.1, -0.3)]
+    plan = vkc.plan(vkc.load_scene("door"), steps, seed=0, max_evaluations=300_000)
+    assert plan.success, plan.summary()
+    assert plan.trajectory.column("door.hinge")[-1] == pytest.approx(-1.5, abs=1e-3)
+    np.testing.assert_allclose(plan.trajectory.positions[-1, :2], [4.1, -0.3], atol=1e-3)

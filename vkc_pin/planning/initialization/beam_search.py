@@ -106,7 +106,8 @@ class BeamSearch:
             thorough: Draw more samples, and perturb the arms at every keyframe of a closed chain.
             backwards: Search closed chains from the release back to the grasp. A passage may be
                 wide at its end only, and few configurations that are free at its beginning lead
-                there.
+                there. Or a path onward begins at few configurations only: who pulls a door open
+                may end behind it.
             keep_headings: Keep paths with diverse base headings. A steered base needs space to
                 turn, and the cheapest path may head where there is none.
         """
@@ -133,6 +134,11 @@ class BeamSearch:
             number = last + 1
         return found
 
+    @property
+    def has_dead_ends(self) -> bool:
+        """Whether a goal was out of reach from where the phases before it ended."""
+        return self.routes is not None and bool(self.sampler.cache.unreached)
+
     def is_acceptable(self, found: SearchResult) -> bool:
         """Return whether the cheapest path has few collisions and, given routes, no base jumps."""
         best = int(np.argmin(found.cost))
@@ -155,6 +161,9 @@ class BeamSearch:
         """Extend paths to the next keyframe, in a phase, and keep the cheapest."""
         more = self._sample_continuations(found, keyframe, phase, mode)
         total = self._compute_total(found, more.parents, more.z, phase) + more.penalty
+        total += self._compute_onward_cost(more.z, keyframe)
+        if keyframe == self.problem.ends[phase] and not self._is_closed(phase):
+            self._find_dead_end(found, more, phase)
         best = _select_beam(total, more.z, _SECTORS if mode.keep_headings else 1)
         parents = more.parents[best]
         return SearchResult(
@@ -185,6 +194,26 @@ class BeamSearch:
         return SearchResult(
             paths, cost, found.collision_cost, [*found.waypoints[:known], *keyframes]
         )
+
+    def _find_dead_end(self, found: SearchResult, more: _Continuations, phase: int) -> None:
+        """Record the goal of an open phase if no path leads there from where paths end."""
+        begin = found.waypoints[-1]
+        if self.routes is None or self.for_narrow_passages or not begin:
+            return
+        starts, goals = found.paths[more.parents, -1, :3], more.z[:, :3]
+        if np.isinf(self.routes.compute_distances(phase, starts, goals)).all():
+            goal = goals[int(np.argmin(more.penalty))]
+            self.sampler.cache.unreached.setdefault(begin, goal)
+
+    def _compute_onward_cost(self, z: Floats, waypoint: int) -> Floats:
+        """Return the cost of configurations from which no path leads onward, shape (B,)."""
+        goal = self.sampler.cache.unreached.get(waypoint)
+        if self.routes is None or goal is None:
+            return np.zeros(len(z))
+        phase = self.problem.contacts.find_phase(waypoint + 1)
+        goals = np.tile(goal, (len(z), 1))
+        distances = self.routes.compute_distances(phase, goals, z[:, :3])
+        return _UNREACHABLE_COST * np.isinf(distances)
 
     def _compute_total(self, found: SearchResult, parents: Ints, z: Floats, phase: int) -> Floats:
         """Return the costs of continuations, shape (B,), without penalties at their ends."""

@@ -42,12 +42,15 @@ class KeyframeCache:
             Values: samples, mask of feasible samples, generator state afterwards.
         shortfalls: Clearance shortfall, keyed by waypoint and configuration [m].
         pushed: Configuration after `KeyframeSampler.push_clear`, keyed in the same way.
+        unreached: Base pose at the end of a phase that no path reached from where the phase before
+            had ended, keyed by that waypoint, shape (3,).
     """
 
     def __init__(self) -> None:
         self.samples: dict[tuple[str, int, bytes], tuple[Floats, Bools, Any]] = {}
         self.shortfalls: _RowCache = {}
         self.pushed: _RowCache = {}
+        self.unreached: dict[int, Floats] = {}
 
 
 def _look_up_rows(

@@ -75,11 +75,14 @@ def initialize(
     else:
         notes = [] if notes is None else notes
         shared = _Shared(problem, random_seed, notes, BaseRoutes(problem), KeyframeCache())
-        kinds = ("interpolated", "astar", "rrt") if method == "auto" else (method,)
-        check = is_infeasible if method == "auto" else lambda _: False
-        guesses = interleave_guesses(
-            *(_generate_guesses(kind, shared, count, check) for kind in kinds)
-        )
+        if method == "auto":
+            kinds = ("interpolated", "astar", "rrt")
+            guesses = interleave_guesses(
+                *(_generate_guesses(kind, shared, count, is_infeasible) for kind in kinds)
+            )
+        else:
+            found = _generate_guesses(method, shared, count, lambda _: False)
+            guesses = (guess for guess in found if guess is not None)
     rng = np.random.default_rng([random_seed, 1])
     for guess in guesses:
         yield (
@@ -94,37 +97,33 @@ def interleave_guesses(*kinds: _Kind) -> Iterator[InitialGuess]:
 
     Methods are tried in order until one returns a good guess, which is nearly collision-free, and
     this is yielded. Next time, methods without a good guess come last, and otherwise those first
-    that have waited longest. Without a good guess, the best of the methods that were yielded least
-    often is next: guesses of one method tend to fail for the same reason.
+    that have waited longest. Searching costs less than solving from a poor guess, which seldom
+    succeeds, so these follow when no method offers any other: the best of the methods that were
+    yielded least often, since guesses of one method tend to fail for the same reason.
     """
-
-    def is_good(guess: InitialGuess | None) -> bool:
-        return guess is not None and not guess.penetration > MAX_GOOD_PENETRATION
-
-    def rank(one: tuple[_Kind, InitialGuess]) -> tuple[int, float]:
-        kind, guess = one
-        return 0 if is_good(guess) else 1 + turns[kind], guess.penetration
-
-    waiting, poor = list(kinds), set[_Kind]()
-    found, turns = list[tuple[_Kind, InitialGuess]](), Counter[_Kind]()
-    while waiting or found:
-        for kind in sorted(waiting, key=lambda kind: kind in poor):
+    waiting, failed = list(kinds), set[_Kind]()
+    poor, turns = list[tuple[_Kind, InitialGuess]](), Counter[_Kind]()
+    while waiting:
+        for kind in sorted(waiting, key=lambda kind: kind in failed):
             waiting.remove(kind)
             try:
                 guess = next(kind)
             except StopIteration:
                 continue
             waiting.append(kind)
-            (poor.discard if is_good(guess) else poor.add)(kind)
-            if guess is not None:
-                found.append((kind, guess))
-            if is_good(guess):
+            if guess is not None and not guess.penetration > MAX_GOOD_PENETRATION:
+                failed.discard(kind)
+                turns[kind] += 1
+                yield guess
                 break
-        if found:
-            best = min(found, key=rank)
-            found.remove(best)
-            turns[best[0]] += 1
-            yield best[1]
+            failed.add(kind)
+            if guess is not None:
+                poor.append((kind, guess))
+    while poor:
+        best = min(poor, key=lambda one: (turns[one[0]], one[1].penetration))
+        poor.remove(best)
+        turns[best[0]] += 1
+        yield best[1]
 
 
 def _generate_stationary_guesses(
@@ -221,7 +220,7 @@ class _GuessSearch:
                 return
 
     def _search(self, attempt: int) -> SearchResult | None:
-        found = self._run_beam_search(thorough=attempt > 0)
+        found = self._run_beam_search(thorough=attempt > 0, backwards=self.beam.has_dead_ends)
         return found if attempt > 0 or self.beam.is_acceptable(found) else None
 
     def _run_beam_search(self, **how: bool) -> SearchResult:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+from collections.abc import Callable
 from functools import cache
+from typing import Any
 
-import coal
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -18,7 +19,6 @@ from helpers.carrying import (
     describe_table,
     lift,
     make_room,
-    move_base,
     solve_above,
     solve_reach,
 )
@@ -32,14 +32,12 @@ from helpers.small_problems import (
     replace_objects,
 )
 from helpers.supports import describe_cup, make_plate_scene, make_scene
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
-from vkc_pin.planning.chain.collision_pairs import REDUCED_MARGIN_RATIO, PhaseGeometry
+from vkc_pin.planning.chain.collision_pairs import REDUCED_MARGIN_RATIO
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.world.models.shapes import compute_bounding_box, compute_shape_distance, get_link_name
+from vkc_pin.world.models.shapes import get_link_name
 from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions
 from vkc_pin.world.scene.contact_rules import CONTACT_WINDOW
 from vkc_pin.world.scene.hold import Hold
@@ -48,207 +46,186 @@ from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step, Touch
 
-JOINTS = 3
-COAL = 1e-5  # [m]
-
-
-def sample_placement(rng: np.random.Generator, size: float) -> pin.SE3:
-    return pin.SE3(pin.exp3(rng.normal(size=3)), rng.uniform(-size, size, 3))
-
-
-def make_random_geometry(
-    rng: np.random.Generator, moving: int = 7, static: int = 9
-) -> PhaseGeometry:
-    """Return random shapes on joints and in a 3 m room, with two thirds of all pairs."""
-    shapes = []
-    for k in range(moving + static):
-        size = rng.uniform(0.02, 0.4, 3)
-        solid = [coal.Box(*size), coal.Sphere(size[0] / 2), coal.Cylinder(size[0] / 2, size[1])][
-            int(rng.integers(3))
-        ]
-        joint = 1 + int(rng.integers(JOINTS)) if k < moving else 0
-        shapes.append(
-            pin.GeometryObject(
-                f"s{k}", joint, 0, sample_placement(rng, 0.3 if joint else 1.5), solid
-            )
-        )
-    candidates = [
-        (a, b)
-        for a in range(moving)
-        for b in range(a + 1, len(shapes))
-        if shapes[a].parentJoint != shapes[b].parentJoint
-    ]
-    pairs = np.array([pair for pair in candidates if rng.random() < 0.66]).reshape(-1, 2)
-    boxes = [compute_bounding_box(shape) for shape in shapes]
-    return PhaseGeometry(
-        shapes=shapes,
-        labels=tuple(shape.name for shape in shapes),
-        pairs=pairs,
-        margins=rng.uniform(0.01, 0.05, len(pairs)),
-        joint=np.array([shape.parentJoint for shape in shapes]),
-        center=np.array([center for center, _ in boxes]),
-        half=np.array([half for _, half in boxes]),
-        rotation=np.array([shape.placement.rotation for shape in shapes]),
-        translation=np.array([shape.placement.translation for shape in shapes]),
-    )
-
-
-def sample_joints(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return universe and joint placements, shapes (count, J + 1, 3, 3) and (count, J + 1, 3)."""
-    rotations = np.array(
-        [[np.eye(3), *(pin.exp3(rng.normal(size=3)) for _ in range(JOINTS))] for _ in range(count)]
-    )
-    translations = rng.uniform(-1.5, 1.5, (count, JOINTS + 1, 3))
-    translations[:, 0] = 0.0
-    return rotations, translations
-
-
-def compute_all_distances(
-    part: PhaseGeometry, rotations: np.ndarray, translations: np.ndarray
-) -> np.ndarray:
-    """Return coal's distance of every pair at every configuration, shape (W, P)."""
-    out = np.empty((len(rotations), len(part.pairs)))
-    for w in range(len(rotations)):
-        at = [
-            pin.SE3(rotations[w, s.parentJoint], translations[w, s.parentJoint]) * s.placement
-            for s in part.shapes
-        ]
-        for k, (a, b) in enumerate(part.pairs.tolist()):
-            out[w, k] = compute_shape_distance(
-                part.shapes[a].geometry, at[a], part.shapes[b].geometry, at[b]
-            )
-    return out
-
-
-@settings(max_examples=8, deadline=None)
-@given(st.integers(0, 2**32 - 1))
-def test_static_geometry_can_be_moved(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    part, joints = make_random_geometry(rng), sample_joints(rng, 4)
-    part.boxes.find_close_pairs(0.1, *joints)  # fills caches that the copy must not use
-    where = {geometry: sample_placement(rng, 1.5) for geometry in (8, 11)}
-    moved = part.with_placements(where)
-    at, pairs, _ = moved.boxes.find_close_pairs(0.1, *joints)
-    for geometry, placement in where.items():
-        assert moved.shapes[geometry].placement.isApprox(placement)
-        assert not part.shapes[geometry].placement.isApprox(placement)
-    close = np.argwhere(compute_all_distances(moved, *joints) < 0.1 - COAL).tolist()
-    assert {tuple(pair) for pair in close} <= set(zip(at.tolist(), pairs.tolist(), strict=True))
-
-
-@settings(max_examples=8, deadline=None)
-@given(st.integers(0, 2**32 - 1))
-def test_static_geometry_near_a_box(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    part = make_random_geometry(rng)
-    lower = rng.uniform(-1.5, 1.0, 3)
-    size = rng.uniform(0.05, 0.6, 3)
-    box, here = coal.Box(*size), pin.SE3(np.eye(3), lower + size / 2)
-    near = part.find_static_near(0.1, lower, lower + size).tolist()
-    for k in range(7, 16):
-        shape = part.shapes[k]
-        if compute_shape_distance(box, here, shape.geometry, shape.placement) < 0.1 - COAL:
-            assert k in near
-    assert min(near, default=7) >= 7
-    listed = part.pairs.tolist()
-    for first in range(7):
-        numbers = part.find_pairs(first, np.arange(7, 16)).tolist()
-        assert [listed[k] for k in numbers] == [
-            [first, b] for b in range(7, 16) if [first, b] in listed
-        ]
-
-
 GAP = 4e-3  # [m] between the stick and its support
+HALF = REDUCED_MARGIN_RATIO * GAP
 NEAR = SHORT.steps(CONTACT_WINDOW)
-LONG = dataclasses.replace(SHORT, reach_waypoints=2 * NEAR + 3)
-N = LONG.reach_waypoints
+N = 2 * NEAR + 3
+LONG = dataclasses.replace(SHORT, reach_waypoints=N, move_waypoints=N)
 ASIDE = lift(STICK, [0.0, 0.5, 0.0])
+FAR_ASIDE = lift(STICK, [0.0, 1.0, 0.0])
+RELIFT = [Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 1.0)]
+POINT = np.array([0.8, 0.7, 0.75])
+MarginEnds = tuple[float | None, float | None]
+"""Margins at begin and end of a phase; None: not reduced."""
 
 
-def make_problem(scene: Scene, *steps: Step) -> TrajectoryProblem:
-    return make_program(scene, steps, options=LONG)
+def make_room_with_table(gap: float, *others: dict[str, Any]) -> Scene:
+    return make_room(describe_table(gap=gap), *others)
+
+
+def make_room_with_turned_tables() -> Scene:
+    """Return a room with a table below the stick, one beside it, and a wall 1 cm beside its tip."""
+    table = describe_box("table", [1.3, 0.5, 0.02], [0.8, -0.3, TOP - GAP - 0.01])
+    other = describe_box("other", [0.5, 0.6, 0.02], [0.8, 1.0, TOP - GAP - 0.01])
+    wall = describe_box("wall", [0.3, 0.02, 0.3], [0.8, 0.27, TOP + 0.1])
+    return make_room({**table, "rpy": [0.0, 0.0, np.pi / 2]}, other, wall)
+
+
+def make_held_scene(gap: float, *, height: float = 0.0) -> Scene:
+    """Return a room in which the stick is held at the start, `height` above its place."""
+    scene = make_room_with_table(gap)
+    row = solve_reach(compute_grasp_pose(lift(STICK, [0.0, 0.0, height])), solve_above(STICK))
+    return scene.with_start(base=row[:3], arm=row[3:]).with_held({"stick": "grip"})
+
+
+def make_room_with_wall(gap: float) -> Scene:
+    """Return a room with a held stick and a wall `gap` [m] behind `POINT`."""
+    wall = describe_box("wall", [0.3, 0.1, 0.3], [POINT[0], POINT[1] + gap + 0.05, POINT[2]])
+    return make_room(wall).with_held({"stick": "grip"})
+
+
+def make_tray_before_wall() -> Scene:
+    """Return a cup on a tray, 1 cm in front of a wall."""
+    objects = [
+        {"name": "tray", "type": "tray.yaml", "position": [0.8, 0.0, 0.7]},
+        describe_cup(at=(0.82, 0.05, 0.72)),
+    ]
+    return make_scene(objects, [describe_box("wall", [0.02, 0.02, 0.05], [0.875, 0.05, 0.78])])
+
+
+def make_touches(*margins: MarginEnds) -> list[dict[tuple[str, str], MarginEnds]]:
+    return [{(f"stick.tip_{k}", "wall"): ends for k in (0, 1)} for ends in margins]
+
+
+def put_on(table: str, begin: float | None, end: float | None) -> dict[tuple[str, str], MarginEnds]:
+    """Return the expected margins of the stick's two discs."""
+    return {(f"stick.stick_{k}", table): (begin, end) for k in (1, 2)}
 
 
 def compute_margins(p: TrajectoryProblem, phase: int) -> dict[tuple[str, str], np.ndarray]:
-    """Return links → smallest reduced margin at each waypoint of a phase, without the hand."""
+    """Return (shape, link) → reduced margin at each waypoint of a phase, without the hand."""
     part, first = p.contacts.phases[phase], int(p.contacts.first_waypoint[phase])
-    waypoints = range(first, first + p.task.phases[phase].segments + 1)
+    waypoints = np.arange(first, first + p.task.phases[phase].segments + 1)
     found: dict[tuple[str, str], np.ndarray] = {}
-    for k, pair in enumerate(part.pairs.tolist()):
-        row = get_margins(part, np.full(len(waypoints), k), np.array(waypoints))
+    for k, (one, other) in enumerate(part.pairs.tolist()):
+        row = get_margins(part, np.full(len(waypoints), k), waypoints)
         assert k in part.reduced_margins or (row == part.margins[k]).all()
-        if k in part.reduced_margins and part.labels[pair[0]] not in p.scene.robot.touch_links:
-            key = (part.labels[pair[0]], part.labels[pair[1]])
-            found[key] = np.minimum(found.get(key, np.inf), row)
+        if k in part.reduced_margins and part.labels[one] not in p.scene.robot.touch_links:
+            found[part.shapes[one].name.replace("^", ""), part.labels[other]] = row
     return found
 
 
-def assert_reduced(
-    row: np.ndarray,
-    margin: float,
-    *,
-    begin: bool = False,
-    end: bool = False,
-    tolerance: float = 1e-6,
+@pytest.mark.parametrize(
+    ("make", "steps", "expected"),
+    [
+        pytest.param(
+            lambda: make_room_with_table(0.03),
+            [Place("stick", ASIDE)],
+            [{}, {}],
+            id="table farther than the margin",
+        ),
+        *(
+            pytest.param(
+                lambda gap=gap: make_room_with_table(gap),
+                RELIFT,
+                [{}, put_on("table", begin, end), {}, put_on("table", end, None)],
+                id=f"placed and lifted again, gap {gap}",
+            )
+            # an initial penetration may be left but not entered
+            for gap, begin, end in ((GAP, HALF, HALF), (0.0, 0.0, 0.0), (-1e-3, -1e-3, 0.0))
+        ),
+        pytest.param(
+            make_room_with_turned_tables,
+            [Place("stick", FAR_ASIDE)],
+            [
+                {},
+                put_on("table", HALF, None)
+                | put_on("other", None, HALF)
+                | {("stick.tip_1", "wall"): (REDUCED_MARGIN_RATIO * 0.01, None)},
+            ],
+            id="only what is close",
+        ),
+        pytest.param(
+            make_room,
+            [Place("stick", pin.SE3(np.eye(3), np.array([0.8, 0.0, 0.051])))],
+            [{}, put_on(FLOOR, None, REDUCED_MARGIN_RATIO * 1e-3)],
+            id="floor",
+        ),
+        *(
+            pytest.param(
+                lambda gap=gap: make_held_scene(gap),
+                [GoTo(0.0, 1.0), GoTo(0.0, 0.0)],
+                [put_on("table", margin, None), {}],
+                id=f"held at the start, gap {gap}",
+            )
+            for gap, margin in ((GAP, HALF), (0.0, 0.0), (-1e-3, -1e-3))
+        ),
+        pytest.param(
+            lambda: make_held_scene(GAP, height=0.1),
+            [GoTo(0.0, 1.0)],
+            [{}],
+            id="held above the table",
+        ),
+        *(
+            pytest.param(
+                lambda gap=gap: make_room_with_wall(gap),
+                [Touch("stick.tip", POINT), GoTo(0.0, 0.0), GoTo(0.0, 1.0)],
+                [*make_touches((None, margin), (margin, None)), {}]
+                if margin is not None
+                else [{}, {}, {}],
+                id=f"touch, gap {gap}",
+            )
+            for gap, margin in ((0.0, 0.0), (0.006, 0.003), (-0.01, 0.0), (0.03, None))
+        ),
+        pytest.param(
+            lambda: make_room_with_table(GAP),
+            [Touch("forearm_link", (0.8, 0.0, TOP))],
+            [{(f"forearm_link_{k}", "table"): (None, HALF) for k in range(2)}],
+            id="touch with a link of the robot",
+        ),
+        pytest.param(
+            lambda: make_room_with_table(GAP),
+            [Reach(pin.SE3(np.eye(3), np.array([0.8, 0.0, TOP])))],
+            [{}],
+            id="pose",
+        ),
+        pytest.param(
+            lambda: make_plate_scene(cups=1, wall=0.01),
+            [Actuate("plate", {"slide": 0.3})],
+            [{}, {("cup.cup_0", "wall"): (REDUCED_MARGIN_RATIO * 0.01, None)}],
+            id="cup on a plate that moves",
+        ),
+        pytest.param(
+            make_tray_before_wall,
+            [Place("tray", (-0.5, -1.5, 0.7))],
+            [{}, {("cup.cup_0", "wall"): (REDUCED_MARGIN_RATIO * 0.01, None)}],
+            id="cup on a tray that is lifted",
+        ),
+    ],
+)
+def test_margins_are_reduced_near_contacts(
+    make: Callable[[], Scene],
+    steps: list[Step],
+    expected: list[dict[tuple[str, str], MarginEnds]],
 ) -> None:
-    """Assert that a margin applies near begin or end, and dist_safe elsewhere."""
-    expected = np.full(N + 1, LONG.dist_safe)
-    if begin:
-        expected[: NEAR + 1] = margin
-    if end:
-        expected[-NEAR - 1 :] = margin
-    np.testing.assert_allclose(row, expected, rtol=0.0, atol=tolerance)
-
-
-def test_margins_are_not_reduced_without_need() -> None:
-    p = make_problem(make_room(describe_table(gap=GAP)), GoTo(0.0, 1.0))
-    assert compute_margins(p, 0) == {}
-    far = make_problem(make_room(describe_table(gap=0.03)), Place("stick", ASIDE))
-    assert [compute_margins(far, phase) for phase in (0, 1)] == [{}, {}]
-
-
-def test_margins_are_reduced_where_objects_are_lifted_and_placed() -> None:
-    """An object that is placed elsewhere and lifted again has reduced margins there, too."""
-    steps = [Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 1.0)]
-    p = make_problem(make_room(describe_table(gap=GAP)), *steps)
-    names = ["reach stick.grip", "place stick", "reach stick.grip", "go to"]
-    assert [phase.name for phase in p.task.phases] == names
-    assert [compute_margins(p, phase) for phase in (0, 2)] == [{}, {}]
-    for phase, windows in ((1, {"begin": True, "end": True}), (3, {"begin": True})):
+    """A margin is half the distance at the begin or end of a phase, and else `dist_safe`."""
+    p = make_program(make(), steps, options=LONG)
+    assert len(p.task.phases) == len(expected)
+    for phase, margins in enumerate(expected):
         found = compute_margins(p, phase)
-        assert set(found) == {("stick.stick", "table")}
-        assert_reduced(found["stick.stick", "table"], REDUCED_MARGIN_RATIO * GAP, **windows)
-
-
-def test_margin_is_half_the_distance_of_each_shape() -> None:
-    wall = describe_box("wall", [0.3, 0.02, 0.3], [0.8, 0.25 + 0.01 + 0.01, TOP + 0.1])
-    p = make_problem(make_room(describe_table(gap=GAP), wall), Place("stick", ASIDE))
-    part, first = p.contacts.phases[1], int(p.contacts.first_waypoint[1])
-    reduced = {
-        (part.shapes[i].name, part.labels[j]): [*part.reduced_margins[k]]
-        for k, (i, j) in enumerate(part.pairs.tolist())
-        if k in part.reduced_margins
-    }
-    assert set(reduced) >= {
-        ("stick.stick_1", "table"),
-        ("stick.stick_2", "table"),
-        ("stick.tip_1", "wall"),
-    }
-    assert not {name for name, label in reduced if label == "table"} - {
-        "stick.stick_1",
-        "stick.stick_2",
-    }
-    ((begin, end, margin),) = reduced["stick.tip_1", "wall"]  # the wall is far from the other end
-    assert (begin, end) == (first, first + NEAR)
-    assert margin == pytest.approx(REDUCED_MARGIN_RATIO * 0.01, abs=1e-6)
+        assert set(found) == set(margins)
+        for pair, (begin, end) in margins.items():
+            row = np.full(N + 1, LONG.dist_safe)
+            row[: NEAR + 1] = LONG.dist_safe if begin is None else begin
+            row[-NEAR - 1 :] = LONG.dist_safe if end is None else end
+            # a touched point has a size of 0.1 mm
+            np.testing.assert_allclose(found[pair], row, rtol=0.0, atol=6e-5)
 
 
 def test_duration_of_reduced_margins_does_not_depend_on_the_time_step() -> None:
     fine = dataclasses.replace(LONG, dt=LONG.dt / 2, reach_waypoints=2 * N)
     for options in (LONG, fine):
-        p = make_program(
-            make_room(describe_table(gap=GAP)), [Place("stick", ASIDE)], options=options
-        )
+        p = make_program(make_room_with_table(GAP), [Place("stick", ASIDE)], options=options)
         first, reduced = p.contacts.first_waypoint[1], p.contacts.phases[1].reduced_margins
         spans = {(begin - first, end - first) for row in reduced.values() for begin, end, _ in row}
         assert {(begin * options.dt, end * options.dt) for begin, end in spans} == {
@@ -257,120 +234,13 @@ def test_duration_of_reduced_margins_does_not_depend_on_the_time_step() -> None:
         }
 
 
-@pytest.mark.parametrize("gap", [0.0, -1e-3])
-def test_initial_penetration_may_be_left_but_not_entered(gap: float) -> None:
-    p = make_problem(
-        make_room(describe_table(gap=gap)), Place("stick", ASIDE), Grasp("stick"), GoTo(0.0, 0.0)
-    )
-    found = compute_margins(p, 1)["stick.stick", "table"]
-    np.testing.assert_allclose(found[: NEAR + 1], gap, rtol=0.0, atol=1e-6)
-    assert_reduced(np.append(np.zeros(NEAR + 1), found[NEAR + 1 :]), 0.0, begin=True, end=True)
-    assert_reduced(compute_margins(p, 3)["stick.stick", "table"], 0.0, begin=True)
-
-
-def test_margins_are_reduced_to_the_object_below_only() -> None:
-    other = describe_box("other", [0.5, 0.6, 0.02], [0.8, 1.0, TOP - GAP - 0.01])
-    small = describe_box("table", [0.5, 0.7, 0.02], [0.8, 0.0, TOP - GAP - 0.01])
-    p = make_problem(make_room(small, other), Place("stick", lift(STICK, [0.0, 1.0, 0.0])))
-    found = compute_margins(p, 1)
-    assert set(found) == {("stick.stick", "table"), ("stick.stick", "other")}
-    assert_reduced(found["stick.stick", "table"], REDUCED_MARGIN_RATIO * GAP, begin=True)
-    assert_reduced(found["stick.stick", "other"], REDUCED_MARGIN_RATIO * GAP, end=True)
-
-
-@pytest.mark.parametrize(
-    ("gap", "margin"), [(GAP, REDUCED_MARGIN_RATIO * GAP), (0.0, 0.0), (-1e-3, -1e-3)]
-)
-def test_object_grasped_at_the_start_may_leave_its_support(gap: float, margin: float) -> None:
-    scene, row = (
-        make_room(describe_table(gap=gap)),
-        solve_reach(compute_grasp_pose(STICK), solve_above(STICK)),
-    )
-    held = scene.with_start(base=row[:3], arm=row[3:]).with_held({"stick": "grip"})
-    found = compute_margins(make_problem(held, GoTo(0.0, 1.0), GoTo(0.0, 0.0)), 0)
-    assert set(found) == {("stick.stick", "table")}
-    assert_reduced(found["stick.stick", "table"], margin, begin=True)
-    assert compute_margins(make_problem(held, GoTo(0.0, 1.0), GoTo(0.0, 0.0)), 1) == {}
-    raised = held.with_start(base=move_base(row, x=-0.1)[:3], arm=solve_above(STICK)[3:])
-    assert compute_margins(make_problem(raised, GoTo(0.0, 1.0)), 0) == {}
-
-
-def test_margins_of_supported_objects_are_reduced_where_transport_begins() -> None:
-    options = dataclasses.replace(LONG, move_waypoints=N)
-    p = make_program(
-        make_plate_scene(cups=1, wall=0.01), [Actuate("plate", {"slide": 0.3})], options=options
-    )
-    (number,) = (k for k, phase in enumerate(p.task.phases) if phase.supported)
-    row = compute_margins(p, number)["cup.cup", "wall"]
-    assert row[0] == pytest.approx(REDUCED_MARGIN_RATIO * 0.01, abs=1e-4)
-    assert row[-1] == LONG.dist_safe
-
-
-def test_margins_of_objects_on_a_tray_are_reduced_where_it_is_lifted() -> None:
-    """A cup on a tray is 1 cm in front of a wall. The tray is placed away from the wall."""
-    objects = [
-        {"name": "tray", "type": "tray.yaml", "position": [0.8, 0.0, 0.7]},
-        describe_cup(at=(0.82, 0.05, 0.72)),
-    ]
-    p = make_problem(
-        make_scene(objects, [describe_box("wall", [0.02, 0.02, 0.05], [0.875, 0.05, 0.78])]),
-        Place("tray", (-0.5, -1.5, 0.7)),
-    )
-    (number,) = (k for k, phase in enumerate(p.task.phases) if phase.supported)
-    assert_reduced(
-        compute_margins(p, number)["cup.cup", "wall"],
-        REDUCED_MARGIN_RATIO * 0.01,
-        begin=True,
-        tolerance=1e-4,
-    )
-
-
 def test_short_phases_begin_and_end_with_reduced_margins() -> None:
     options = dataclasses.replace(SHORT, reach_waypoints=NEAR)
-    p = make_program(
-        make_room(describe_table(gap=GAP)),
-        [Place("stick", lift(STICK, [0.0, 0.5, -GAP]))],
-        options=options,
-    )
-    np.testing.assert_allclose(
-        compute_margins(p, 1)["stick.stick", "table"], np.zeros(NEAR + 1), atol=1e-6
-    )
-
-
-def test_margins_to_the_floor_are_reduced() -> None:
-    low = pin.SE3(np.eye(3), np.array([0.8, 0.0, 0.051]))
-    p = make_problem(make_room(), Place("stick", low))
-    found = compute_margins(p, 1)
-    assert set(found) == {("stick.stick", FLOOR)}
-    assert_reduced(found["stick.stick", FLOOR], REDUCED_MARGIN_RATIO * 1e-3, end=True)
-
-
-@pytest.mark.parametrize(
-    ("gap", "margin"), [(0.0, 0.0), (0.006, 0.003), (-0.01, 0.0), (0.03, None)]
-)
-def test_margins_are_reduced_before_and_after_a_touch(gap: float, margin: float | None) -> None:
-    point = np.array([0.8, 0.7, 0.75])
-    wall = describe_box("wall", [0.3, 0.1, 0.3], point + np.array([0.0, gap + 0.05, 0.0]))
-    scene = make_room(wall).with_held({"stick": "grip"})
-    p = make_problem(scene, Touch("stick.tip", point), GoTo(0.0, 0.0), GoTo(0.0, 1.0))
-    for phase, windows in ((0, {"end": True}), (1, {"begin": True}), (2, {})):
-        found = compute_margins(p, phase)
-        assert set(found) == ({("stick.tip", "wall")} if windows and margin is not None else set())
-        for row in found.values():  # a point has a size of 0.1 mm here
-            assert_reduced(row, margin or 0.0, **windows, tolerance=6e-5)
-
-
-def test_margins_are_reduced_for_touches_but_not_for_poses() -> None:
-    scene = make_room(describe_table(gap=GAP)).with_held({"stick": "grip"})
-    touch = Touch("forearm_link", (0.8, 0.0, TOP))
-    found = compute_margins(make_problem(scene, touch), 0)
-    assert {first for first, _ in found} == {"forearm_link"}
-    assert (
-        compute_margins(
-            make_problem(scene, Reach(pin.SE3(np.eye(3), np.array([0.8, 0.0, TOP])))), 0
-        )
-        == {}
-    )
+    lower = Place("stick", lift(STICK, [0.0, 0.5, -GAP]))
+    p = make_program(make_room_with_table(GAP), [lower], options=options)
+    assert set(compute_margins(p, 1)) == set(put_on("table", 0.0, 0.0))
+    for row in compute_margins(p, 1).values():
+        np.testing.assert_allclose(row, np.zeros(NEAR + 1), atol=1e-6)
 
 
 CABINET_FRAME = ("cabinet.case", "cabinet.lid")
@@ -445,25 +315,10 @@ def test_pairs_of_every_phase(phase: int) -> None:
         assert set(margins) == {CLOSE if close else MARGIN}
 
 
-def test_hand_margins_are_reduced_before_grasps_and_after_releases() -> None:
-    problem = make_door_problem()
-    hand = set(problem.scene.robot.touch_links)
-    assert CLOSE < MARGIN
-    near, begins = problem.options.steps(CONTACT_WINDOW), problem.contacts.first_waypoint
-    for phase, at, away in ((0, begins[1], -1), (3, begins[3], 1)):
-        for steps, close in ((0, CLOSE), (near, CLOSE), (near + 1, MARGIN)):
-            for (first, second), margins in list_pairs(
-                problem, phase, waypoint=int(at + away * steps)
-            ).items():
-                assert set(margins) == {
-                    close if first in hand and second.startswith("door.") else MARGIN
-                }
-
-
 @pytest.mark.parametrize(
     ("own", "expected"), [(None, CLOSE), (0.002, 0.002), (0.0, 0.0), (0.1, MARGIN)]
 )
-def test_attachment_sets_the_clearance_of_hand_and_object(
+def test_hand_has_the_clearance_of_its_attachment_from_before_grasp_to_after_release(
     own: float | None, expected: float
 ) -> None:
     """It never exceeds the usual margin, and applies to no other pairs."""
@@ -474,12 +329,22 @@ def test_attachment_sets_the_clearance_of_hand_and_object(
     problem = make_program(
         replace_objects(scene, {"door": replace_attachment(placed, handle)}), steps, options=SHORT
     )
-    hand, begins = set(scene.robot.touch_links), problem.contacts.first_waypoint
-    for phase, at in ((0, begins[1]), (1, begins[2]), (3, begins[3])):
-        for (first, second), margins in list_pairs(problem, phase, waypoint=int(at)).items():
-            assert set(margins) == {
-                expected if first in hand and second.startswith("door.") else MARGIN
-            }
+    hand, (_, grasp, turned, release, _) = (
+        set(scene.robot.touch_links),
+        problem.contacts.first_waypoint.tolist(),
+    )
+    for phase, waypoint, is_near in (
+        (0, grasp - NEAR - 1, False),
+        (0, grasp - NEAR, True),
+        (0, grasp, True),
+        (1, turned, True),
+        (3, release, True),
+        (3, release + NEAR, True),
+        (3, release + NEAR + 1, False),
+    ):
+        for (first, second), margins in list_pairs(problem, phase, waypoint=waypoint).items():
+            is_reduced = is_near and first in hand and second.startswith("door.")
+            assert set(margins) == {expected if is_reduced else MARGIN}
 
 
 def test_objects_keep_the_state_of_earlier_phases() -> None:
@@ -529,12 +394,6 @@ def test_objects_grasped_in_sequence_have_pairs_only_while_held() -> None:
         paired = set(part.pairs.ravel().tolist())
         for hold, indices in problem.chain.held_geometries.items():
             assert paired & set(indices) == (set(indices) if hold in phase.held else set())
-    hand = problem.scene.robot.touch_links
-    first, last = (
-        list_pairs(problem, 1, waypoint=int(at)) for at in problem.contacts.first_waypoint[1:3]
-    )
-    assert set(last[hand[0], "drawer.tray"]) == {CLOSE}
-    assert set(first[hand[0], "door.lever"]) == {CLOSE}
 
 
 def test_scene_without_collision_geometry_is_rejected() -> None:

@@ -107,6 +107,7 @@ def compute_margins(p: TrajectoryProblem, phase: int) -> dict[tuple[str, str], n
     part, first = p.contacts.phases[phase], int(p.contacts.first_waypoint[phase])
     waypoints = np.arange(first, first + p.task.phases[phase].segments + 1)
     found: dict[tuple[str, str], np.ndarray] = {}
+    assert set(part.reduced_margins) <= set(range(len(part.pairs)))
     for k, (one, other) in enumerate(part.pairs.tolist()):
         row = get_margins(part, np.full(len(waypoints), k), waypoints)
         assert k in part.reduced_margins or (row == part.margins[k]).all()
@@ -182,6 +183,9 @@ def compute_margins(p: TrajectoryProblem, phase: int) -> dict[tuple[str, str], n
             [Touch("forearm_link", (0.8, 0.0, TOP))],
             [{(f"forearm_link_{k}", "table"): (None, HALF) for k in range(2)}],
             id="touch with a link of the robot",
+        ),
+        pytest.param(
+            make_room, [Touch("base_link", (0.8, 0.0, 0.0))], [{}], id="touch without such a pair"
         ),
         pytest.param(
             lambda: make_room_with_table(GAP),

@@ -60,6 +60,8 @@ def test_batch_evaluation_equals_single_evaluations() -> None:
     z, waypoints = sample_distances(0)[0][:12], problem.ends[np.arange(12) % 4]
     together = problem.contacts.evaluate(z, waypoints, reach=0.3)
     assert set(together.waypoint.tolist()) == set(range(12))
+    phases = problem.contacts.find_phases(np.arange(waypoints.max() + 1)).tolist()
+    assert [problem.contacts.find_phase(waypoint) for waypoint in range(len(phases))] == phases
     for row in range(12):
         alone = problem.contacts.evaluate(z[[row]], waypoints[[row]], reach=0.3)
         here = together.select(np.flatnonzero(together.waypoint == row))

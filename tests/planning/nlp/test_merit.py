@@ -21,7 +21,7 @@ from vkc_pin.planning.nlp.merit import (
 
 KINDS = tuple(Merit(1.0).weights)
 SHORT = vkc.Options(reach_waypoints=8, turn_waypoints=4, move_waypoints=6)
-TALL = vkc.Constraint("tall", lambda s: s.position("tool")[2], lower=2.0)
+TALL = vkc.Constraint("tall", lambda s: s.position("tool")[2], lower=2.0, tolerance=0.02)
 PILLAR = {
     "name": "pillar",
     "type": "cylinder",

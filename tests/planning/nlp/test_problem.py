@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Callable
 
-import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import STICK, describe_stand, describe_table, lift, make_room
-from helpers.relaxed import check_relaxation, make_iterates
 from helpers.small_problems import (
     SHORT,
     load_door_scene,
@@ -30,7 +27,6 @@ from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.compiler import LATCH_MARGIN
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
-from vkc_pin.world.task.terms import Constraint
 
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
 HANDLE = Hold("door", "handle")
@@ -40,7 +36,8 @@ APPROACH = SHORT.steps(SHORT.approach_time)
 
 @pytest.fixture(scope="module")
 def opening() -> TrajectoryProblem:
-    steps = [Actuate("door", {"hinge": 1.2}), GoTo(-0.5, 0.1, -2.2)]
+    """Return the problem of opening the door, beyond its limit, and driving away."""
+    steps = [Actuate("door", {"hinge": 2.0}), GoTo(-0.5, 0.1, -2.2)]
     return make_program(load_door_scene(), steps, options=SHORT)
 
 
@@ -89,7 +86,7 @@ def test_object_joints_are_fixed_until_they_are_moved(opening: TrajectoryProblem
     hinge, knob = get_bounds(opening, "door.hinge"), get_bounds(opening, "door.knob")
     assert np.all(hinge[:turn] == 0.0)
     assert np.all(hinge[turn : move - 1] == (-1.57, 1.57))
-    assert np.all(hinge[move - 1 :] == 1.2)
+    assert np.all(hinge[move - 1 :] == 1.57)
     assert np.all(knob[:reach] == 0.0)
     assert np.all(knob[reach : turn - 1] == (0.0, 0.8))
     np.testing.assert_allclose(knob[turn : move - 1], [(turned, 0.8)] * (move - 1 - turn))
@@ -114,26 +111,19 @@ def test_grasped_objects_do_not_move_and_freedoms_have_limits(
     assert set(units.values()) == {"m", "rad"}
 
 
-def test_goal_beyond_a_limit_is_clipped_to_it() -> None:
-    steps = [Actuate("door", {"hinge": 2.0}), GoTo(0.0, 0.0)]
-    problem = make_program(load_door_scene(), steps, options=SHORT)
-    assert np.all(get_bounds(problem, "door.hinge")[problem.ends[2] - 1 :] == 1.57)
-
-
 def test_robot_stays_within_its_limits_and_the_arena(opening: TrajectoryProblem) -> None:
-    robot, scene, inner = opening.scene.robot, opening.scene, opening.segments - 1
+    robot, scene = opening.scene.robot, opening.scene
     for bound, xy, limits in (
         (opening.lower, scene.arena[::2], robot.lower),
         (opening.upper, scene.arena[1::2], robot.upper),
     ):
-        np.testing.assert_array_equal(bound[:inner, :2], np.tile(xy, (inner, 1)))
-        assert np.all(np.isinf(bound[:inner, 2]))
-        arm = np.tile(limits[3:], (opening.segments, 1))
-        np.testing.assert_array_equal(bound[:, 3 : len(limits)], arm)
+        assert (bound[:-1, :2] == xy).all()
+        assert np.isinf(bound[:-1, 2]).all()
+        assert (bound[:, 3 : len(limits)] == limits[3:]).all()
     narrow = dataclasses.replace(scene, arena=(-50.0, 1.0, -1.0, 60.0))
     problem = make_program(narrow, [Reach(POSE)], options=SHORT)
-    np.testing.assert_array_equal(problem.lower[0, :2], [robot.lower[0], -1.0])
-    np.testing.assert_array_equal(problem.upper[0, :2], [1.0, robot.upper[1]])
+    assert problem.lower[0, :2].tolist() == [robot.lower[0], -1.0]
+    assert problem.upper[0, :2].tolist() == [1.0, robot.upper[1]]
     assert problem.limits("base_x") == (robot.lower[0], 1.0)
 
 
@@ -150,15 +140,15 @@ def test_base_turns_to_the_nearest_equivalent_heading(start: float) -> None:
 
 def test_base_goal_without_heading_leaves_it_free() -> None:
     problem = make_program(load_door_scene(), [GoTo(-0.5, 0.1)], options=SHORT)
-    np.testing.assert_array_equal(problem.lower[-1, :2], problem.upper[-1, :2])
-    assert (problem.lower[-1, 2], problem.upper[-1, 2]) == (-np.inf, np.inf)
+    assert problem.lower[-1, :3].tolist() == [-0.5, 0.1, -np.inf]
+    assert problem.upper[-1, :3].tolist() == [-0.5, 0.1, np.inf]
 
 
 def test_fixed_base_stays_at_the_start() -> None:
     scene = dataclasses.replace(load_door_scene(), robot=load_robot("husky_ur5e", base="fixed"))
     problem = make_program(scene, [Reach(POSE)], options=SHORT)
     for bound in (problem.lower, problem.upper):
-        np.testing.assert_array_equal(bound[:, :3], np.tile(scene.start[:3], (problem.segments, 1)))
+        assert (bound[:, :3] == scene.start[:3]).all()
 
 
 def test_start_is_the_state_of_the_scene() -> None:
@@ -170,14 +160,6 @@ def test_start_is_the_state_of_the_scene() -> None:
     # the latch does not hold an open door
     assert [phase.segments for phase in problem.task.phases] == [REACH, MOVE]
     assert np.all(get_bounds(problem, "door.knob") == 0.2)
-
-
-def test_clip_applies_bounds_and_waypoints_include_the_start(opening: TrajectoryProblem) -> None:
-    wild = 100.0 * np.random.default_rng(0).normal(size=(opening.segments, opening.chain.size))
-    clipped = opening.clip(wild)
-    np.testing.assert_array_equal(clipped, np.clip(wild, opening.lower, opening.upper))
-    path = opening.waypoints(clipped)
-    np.testing.assert_array_equal(path, np.vstack([opening.start, clipped]))
 
 
 def test_problem_is_immutable(opening: TrajectoryProblem) -> None:
@@ -238,32 +220,19 @@ def test_any_frame_of_the_robot_can_reach_a_pose() -> None:
 
 def test_pose_error_and_drift_equal_their_definitions(opening: TrajectoryProblem) -> None:
     """Pose error is the largest residual at goals; drift is measured between waypoints."""
-    z, data = sample_path(opening), opening.chain.model.createData()
-
-    def residual(row: np.ndarray, number: int = 0) -> np.ndarray:
-        pose, target = opening.pose_goals[number].row, opening.targets[number]
-        pin.forwardKinematics(opening.chain.model, data, opening.chain.coordinates.q(row))
-        at = data.oMi[pose.joint] * pose.local
-        if pose.shift is not None:
-            at.translation += data.oMi[pose.shift[0]].rotation @ np.array(pose.shift[1])
-        turn = pin.log3(target.rotation.T @ at.rotation)
-        angle = np.linalg.norm(turn)
-        sine = 2 * np.sin(angle / 2) * turn / angle
-        return np.abs(np.r_[at.translation - target.translation, sine])
-
+    z, solvers = sample_path(opening), opening.transcription.pose_solvers
     path = opening.waypoints(z)
     at_goals = [
-        residual(path[t], k).max()
-        for k, goal in enumerate(opening.pose_goals)
-        for t in goal.row.waypoints
+        np.abs(solver.evaluate(path[list(goal.row.waypoints)], goal.target)[0]).max()
+        for goal, solver in zip(opening.pose_goals, solvers, strict=True)
     ]
-    assert opening.pose_error(z) == pytest.approx(max(at_goals), abs=1e-8)
-    between = [
-        residual((path[t] + path[t + 1]) / 2) for t in range(opening.ends[0], opening.ends[2])
-    ]
-    drifts = [np.linalg.norm(r[:3]) / Tolerances().closure_position for r in between]
-    drifts += [np.linalg.norm(r[3:]) / Tolerances().closure_angle for r in between]
-    assert opening.drift(z) == pytest.approx(max(drifts), rel=1e-6)
+    assert opening.pose_error(z) == max(at_goals)
+    first, last = opening.ends[[0, 2]]
+    middle = (path[first:last] + path[first + 1 : last + 1]) / 2
+    residual = solvers[0].evaluate(middle, opening.targets[0])[0].reshape(-1, 2, 3)
+    allowed = [Tolerances().closure_position, Tolerances().closure_angle]
+    drifts = np.linalg.norm(residual, axis=2) / allowed
+    assert opening.drift(z) == pytest.approx(drifts.max(), rel=1e-6)
     alone = make_program(load_door_scene(), [GoTo(0.0, 0.0)], options=SHORT)
     assert alone.pose_error(sample_path(alone)) == alone.drift(sample_path(alone)) == 0.0
 
@@ -291,13 +260,9 @@ def test_hand_approaches_a_grasp_in_a_straight_line(
     lower, upper = chain.lower.copy(), chain.upper.copy()
     for name, value in problem.task.state.items():
         lower[chain.index(name)] = upper[chain.index(name)] = value
+    target, weights = problem.targets[number], np.ones(chain.size)
     z, is_solved = problem.transcription.pose_solvers[number].solve(
-        guesses,
-        problem.targets[number],
-        lower=lower,
-        upper=upper,
-        weights=np.ones(chain.size),
-        iterations=40,
+        guesses, target, lower=lower, upper=upper, weights=weights, iterations=40
     )
     assert is_solved.sum() > 3
     for row in z[is_solved]:
@@ -389,29 +354,6 @@ def test_grasps_are_chosen_within_their_own_phases(waypoints: int) -> None:
 # ------------------------------------------------------------------------------------------------
 
 
-def test_relaxed_program_with_rows_of_all_kinds_is_feasible_at_its_iterate() -> None:
-    """A wheeled base, a clamped grasp and user-defined constraints."""
-    scene = dataclasses.replace(
-        make_room(describe_table()), robot=load_robot("husky_ur5e", base="differential")
-    )
-    terms = [
-        Constraint("tip", lambda s: s.position("stick.tip"), upper=0.3, tolerance=0.02),
-        Constraint("slow", lambda s: ca.sumsqr(s.velocity("tool")), upper=0.5, tolerance=0.004),
-    ]
-    steps = [Touch("stick.tip", (0.8, 0.9, 0.7)), Place("stick", (0.8, 0.5, 0.56))]
-    p = make_program(scene, steps, options=SHORT, terms=terms)
-    amounts = [check_relaxation(p, z) for z in make_iterates(p)]
-    for kind in ("clearance", "poses", "rolling", "clamped", "terms", "rates"):
-        assert max(each[kind] for each in amounts) > 0.1, kind
-    # each row is of one kind; 1e-3 is the tolerance of user-defined constraints
-    t, kinds = p.transcription, p.row_kinds
-    np.testing.assert_array_equal(sum((k > 0.0).astype(int) for k in kinds.values()), 1)
-    for term, at in zip(p.terms, t.term_rows, strict=True):
-        rows = np.concatenate(list(at.values())) - t.first_relaxed_row
-        expected = 1e-3 / {"tip": 0.02, "slow": 0.004}[term.name]
-        np.testing.assert_allclose(kinds["terms"][rows], expected)
-
-
 @pytest.mark.parametrize("scale", [0.01, 3.0])
 def test_rate_violation_equals_that_of_the_trajectory(
     two_grasps: TrajectoryProblem, scale: float
@@ -426,19 +368,16 @@ def test_rate_violation_equals_that_of_the_trajectory(
 
 
 def test_steps_are_longer_only_in_runs_with_long_motions(opening: TrajectoryProblem) -> None:
-    stops = [0, *opening.transcription.structure.stops, opening.segments]
-    first, *others = [slice(a, b) for a, b in itertools.pairwise(stops)]
-    z, progress = opening.still, np.arange(1, first.stop + 1) / first.stop
-    z[first, 0] += 30.0 * progress**2 * (3 - 2 * progress)
-    z[first.stop :, 0] += 30.0
+    stop = opening.transcription.structure.stops[0]
+    z, progress = opening.still, np.arange(1, stop + 1) / stop
+    z[:stop, 0] += 30.0 * progress**2 * (3 - 2 * progress)
+    z[stop:, 0] += 30.0
     still, timing = opening.timing_for(opening.still), opening.timing_for(z)
     np.testing.assert_array_equal(still.dt, SHORT.dt)
-    assert still.compute_violation(*opening.rates(opening.still)) <= 0.0
+    np.testing.assert_array_equal(timing.dt[stop:], SHORT.dt)
     assert still.compute_violation(*opening.rates(z)) > 1.0
     assert timing.compute_violation(*opening.rates(z)) <= 0.0
-    assert timing.dt[0] * first.stop > 1.5 * 30.0 / opening.chain.velocity[0]
-    for run in others:
-        np.testing.assert_array_equal(timing.dt[run], SHORT.dt)
+    assert timing.dt[0] * stop > 1.5 * 30.0 / opening.chain.velocity[0]
     assert opening.objective(opening.still, still.dt) == 0.0
 
 
@@ -456,8 +395,7 @@ def test_moving_geometry_of_an_object_has_contacts_only_while_held(
 
 def test_repr_names_phases_and_sizes(opening: TrajectoryProblem) -> None:
     phases = "reach door.handle → turn door.knob → move door.hinge, door.knob → go to"
-    steps = f"{opening.segments} steps in {0.25 * opening.segments:g} s"
-    assert f"{phases}: {steps}, {opening.transcription.size} variables" in repr(opening)
+    assert f"{phases}: {opening.segments} steps" in repr(opening)
 
 
 def test_joint_cannot_be_grasped_twice() -> None:

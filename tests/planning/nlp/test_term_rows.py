@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -15,7 +16,6 @@ from helpers.relaxed import check_relaxation, make_iterates
 from helpers.small_problems import make_full_scene, make_program
 
 import vkc_pin as vkc
-from vkc_pin.world.task.phases import Phase
 from vkc_pin.world.task.terms import Constraint, Cost
 
 OPTIONS = vkc.Options(reach_waypoints=3, turn_waypoints=2, move_waypoints=3, contact_slots=2)
@@ -88,28 +88,23 @@ def make_terms(name: str) -> list[Constraint | Cost]:
 def make_problem(name: str) -> vkc.TrajectoryProblem:
     if name == "stick":
         scene = make_room(describe_table())
-        steps = [
-            vkc.Touch("stick.tip", (0.8, 0.9, 0.7)),
-            vkc.Place("stick", (0.8, 0.5, 0.56)),
-            vkc.GoTo(0.0, 0.0),
-        ]
+        steps = [vkc.Touch("stick.tip", (0.8, 0.9, 0.7)), vkc.Place("stick", (0.8, 0.5, 0.56))]
     elif name == "ball":
-        scene = make_room(describe_stand(), objects=("stick", "ball")).with_held(
-            {"stick": "grip"}, at={"stick": (0.02, -0.1)}
-        )
-        steps = [
-            vkc.Grasp("ball", "pull", "stick.tip"),
-            vkc.Place("ball", (0.8, 0.6, 0.7)),
-            vkc.GoTo(0.0, 0.0),
-        ]
+        scene = make_room(describe_stand(), objects=("stick", "ball"))
+        scene = scene.with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
+        steps = [vkc.Grasp("ball", "pull", "stick.tip"), vkc.Place("ball", (0.8, 0.6, 0.7))]
     else:
         scene = make_full_scene()
-        steps = [
-            vkc.Actuate("cabinet", {"swing": 0.5}),
-            vkc.Actuate("door", {"hinge": 1.2}),
-            vkc.GoTo(0.0, 0.0),
-        ]
+        steps = [vkc.Actuate("cabinet", {"swing": 0.5}), vkc.Actuate("door", {"hinge": 1.2})]
+    steps = [*steps, vkc.GoTo(0.0, 0.0)]
     return make_program(scene, steps, options=OPTIONS, terms=make_terms(name))
+
+
+def make_drive(*terms: Constraint | Cost, held: bool = False) -> vkc.TrajectoryProblem:
+    """Return a drive by 1 m, beside the stick or with it in the hand."""
+    scene = make_room(describe_table())
+    scene = scene.with_held({"stick": "grip"}) if held else scene
+    return make_program(scene, [vkc.GoTo(1.0, 0.0)], options=OPTIONS, terms=terms)
 
 
 NAMES = ["stick", "ball", "furniture"]
@@ -124,67 +119,49 @@ class NumericState:
         self.p, self.path, self.t, self.dt = p, path, waypoint, dt
         self.ends = [0, *p.ends.tolist()]
 
-    def find_phase(self, t: int) -> Phase:
-        return self.p.task.phases[max(int(np.searchsorted(self.ends, t)) - 1, 0)]
-
     def _get_value(self, name: str, t: int) -> float:
-        chain = self.p.chain
-        if name in chain.names:
-            return float(self.path[t, chain.index(name)])
+        if name in self.p.chain.names:
+            return float(self.path[t, self.p.chain.index(name)])
         owner, _, joint = name.partition(".")
         placed = self.p.scene.objects[owner]
         return float(placed.state[placed.object.coordinates.index(joint)])
 
-    def _compute_robot_frame(self, frame: str, t: int) -> pin.SE3:
-        robot = self.p.scene.robot
-        data = robot.model.createData()
-        pin.forwardKinematics(
-            robot.model, data, robot.coordinates.q(self.path[t, : robot.coordinates.size])
-        )
-        return pin.updateFramePlacement(robot.model, data, robot.model.getFrameId(frame)).copy()
+    def _get_values(self, owner: str, names: Sequence[str], t: int) -> np.ndarray:
+        return np.array([self._get_value(f"{owner}.{name}", t) for name in names])
 
-    def _compute_held_base(self, owner: str, t: int, hold: Any) -> pin.SE3:
-        """Return the placement of a held base link: holder · (link · A · J(v) · D)⁻¹."""
-        placed = self.p.scene.objects[owner]
-        attachment = placed.object.attachments[hold.attachment]
-        values = [self._get_value(f"{owner}.{name}", t) for name in attachment.coordinates]
-        grasped = placed.object.link_placement(attachment.link, placed.state) * attachment.tool(
-            np.array(values)
-        )
-        if hold.by is None:
-            holder = self._compute_robot_frame(self.p.scene.robot.tool_frame, t)
-        else:
-            carrier = self.p.scene.objects[hold.by.object]
-            holder = self._compute_held_base(
-                hold.by.object, t, hold.by
-            ) * carrier.object.link_placement(hold.link, carrier.state)
-        return holder * grasped.inverse()
-
-    def compute_placement(self, frame: str, t: int, phase: Phase) -> pin.SE3:
-        owner, dot, link = frame.partition(".")
+    def _compute_placement(self, frame: str, t: int) -> pin.SE3:
+        """Return the placement of a frame; a held base is at holder · (link · A · J(v) · D)⁻¹."""
+        phase = self.p.task.phases[max(int(np.searchsorted(self.ends, t)) - 1, 0)]
+        robot, (owner, dot, link) = self.p.scene.robot, frame.partition(".")
         if not dot:
-            return self._compute_robot_frame(frame, t)
+            data = robot.model.createData()
+            q = robot.coordinates.q(self.path[t, : len(robot.lower)])
+            pin.framesForwardKinematics(robot.model, data, q)
+            return data.oMf[robot.model.getFrameId(frame)].copy()
         placed = self.p.scene.objects[owner]
-        if not placed.object.free:
-            state = [
-                self._get_value(f"{owner}.{name}", t) for name in placed.object.coordinates.names
-            ]
-            return placed.placement * placed.object.link_placement(link, state)
-        hold = next((h for h in phase.held if h.object == owner), None)
+        hold = next((hold for hold in phase.held if hold.object == owner), None)
         if hold is None and owner in phase.released_by:
             hold, last = phase.released_by[owner]
             t = self.ends[last + 1]
-        base = self._compute_held_base(owner, t, hold) if hold else phase.resting[owner]
-        return base * placed.object.link_placement(link, placed.state)
+        item, state = placed.object, self._get_values(owner, placed.object.coordinates.names, t)
+        own = item.link_placement(link, state)
+        if not item.free:
+            return placed.placement * own
+        if hold is None:
+            return phase.resting[owner] * own
+        grasp = item.attachments[hold.attachment]
+        tool = grasp.tool(self._get_values(owner, grasp.coordinates, t))
+        holder = self._compute_placement(str(hold.frame) if hold.by else robot.tool_frame, t)
+        return holder * (item.link_placement(grasp.link, state) * tool).inverse() * own
 
     def position(self, frame: str) -> ca.DM:
-        return ca.DM(self.compute_placement(frame, self.t, self.find_phase(self.t)).translation)
+        return ca.DM(self._compute_placement(frame, self.t).translation)
 
     def rotation(self, frame: str) -> ca.DM:
-        return ca.DM(self.compute_placement(frame, self.t, self.find_phase(self.t)).rotation)
+        return ca.DM(self._compute_placement(frame, self.t).rotation)
 
     def velocity(self, frame: str) -> ca.DM:
-        before = self.compute_placement(frame, self.t - 1, self.find_phase(self.t - 1)).translation
+        before = self._compute_placement(frame, self.t - 1).translation
         return (self.position(frame) - before) / self.dt
 
     def coordinate(self, name: str) -> float:
@@ -259,16 +236,11 @@ def test_position_after_release_depends_on_the_waypoint_of_release() -> None:
 
 
 def test_programs_differ_by_expressions_but_not_by_bounds() -> None:
-    def make_limited(limit: float, upper: float, *, terms: bool = True) -> vkc.TrajectoryProblem:
+    def make_limited(limit: float, upper: float) -> vkc.TrajectoryProblem:
         near = vkc.Constraint("near", lambda s: s.position("tool")[2] - limit, upper=upper)
-        return make_program(
-            make_room(describe_table()),
-            [vkc.GoTo(0.5, 0.5)],
-            options=OPTIONS,
-            terms=[near] if terms else [],
-        )
+        return make_drive(near)
 
-    first, without = make_limited(0.5, 1.0), make_limited(0.5, 1.0, terms=False)
+    first, without = make_limited(0.5, 1.0), make_drive()
     assert make_limited(0.5, 2.0).transcription is first.transcription
     assert make_limited(0.6, 1.0).transcription is not first.transcription
     assert first.transcription.rows == without.transcription.rows + OPTIONS.reach_waypoints
@@ -277,9 +249,7 @@ def test_programs_differ_by_expressions_but_not_by_bounds() -> None:
 
 def test_violations_are_scaled_by_their_tolerance() -> None:
     low = vkc.Constraint("low", lambda s: s.coordinate("base_x"), upper=0.5, tolerance=0.02)
-    p = make_program(
-        make_room(describe_table()), [vkc.GoTo(1.0, 0.0)], options=OPTIONS, terms=[low]
-    )
+    p = make_drive(low)
     z = p.still
     dt = p.timing_for(z).dt
     assert p.row_error(z, dt) == 0.0
@@ -348,17 +318,9 @@ def test_speed_limits_lengthen_the_steps_between_two_stops(run: int, row: int) -
 def test_terms_that_are_not_finite_are_rejected(expression: Any, make_term: Any) -> None:
     message = "its value or derivative is not finite at the start"
     with pytest.raises(vkc.InputError, match=rf"terms\['mine'\]\.expression: {message}"):
-        make_program(
-            make_room(describe_table()).with_held({"stick": "grip"}),
-            [vkc.GoTo(0.5, 0.5)],
-            options=OPTIONS,
-            terms=[make_term(expression)],
-        )
+        make_drive(make_term(expression), held=True)
 
 
 def test_constant_terms_have_no_rows() -> None:
     here = vkc.Constraint("here", lambda s: s.position("stick.tip"), upper=-9.0, during="go to")
-    p = make_program(
-        make_room(describe_table()), [vkc.GoTo(1.0, 0.0)], options=OPTIONS, terms=[here]
-    )
-    assert p.terms == ()
+    assert make_drive(here).terms == ()

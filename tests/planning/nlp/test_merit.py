@@ -73,6 +73,7 @@ def test_amounts_equal_the_violations_of_each_kind(seed: int) -> None:
     relaxed = measure(p, z, rates=False).amounts
     np.testing.assert_allclose(relaxed["rolling"], np.abs(lateral), atol=1e-12)
     assert not relaxed["rates"].any()
+    assert (np.count_nonzero(list(p.row_kinds.values()), axis=0) == 1).all()
     terms = p.term_evaluator.compute_violation(z, timing.dt)
     assert found.amounts["terms"].max() == pytest.approx(terms)
     limits = (timing.velocity, timing.acceleration)

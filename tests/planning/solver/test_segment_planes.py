@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
-from helpers.drives import drive_through, make_hall, move_start
+from helpers.carrying import describe_box
+from helpers.drives import make_hall, move_start
 from helpers.small_problems import make_program
+from helpers.straight_drives import make_straight_drive
 
 import vkc_pin as vkc
 from vkc_pin.planning.chain.contacts import Contacts
@@ -27,22 +30,19 @@ from vkc_pin.planning.solver.segment_planes import (
 REACH, GRAZING = 8, -0.353
 
 
+def describe_post(name: str, radius: float, x: float, y: float) -> dict[str, Any]:
+    where = {"position": [float(x), float(y), 0.8], "length": 1.6, "radius": radius}
+    return {"name": name, "type": "cylinder", **where}
+
+
 @cache
 def make_posts_problem() -> TrajectoryProblem:
     """Return a drive through posts at x = 2 and 4 m and back; the base is 1 m long."""
-    obstacles = [
-        {
-            "name": f"post_{x}",
-            "type": "cylinder",
-            "radius": 0.02,
-            "length": 1.6,
-            "position": [x, y, 0.8],
-        }
-        for x, y in ((2, 0.0), (4, 0.1))
-    ]
+    posts = [describe_post(f"post_{x}", 0.02, x, y) for x, y in ((2, 0.0), (4, 0.1))]
     steps = [vkc.GoTo(6.0, 0.0), vkc.GoTo(0.0, 0.0)]
-    options = vkc.Options(reach_waypoints=REACH)
-    return make_program(make_hall(obstacles=obstacles), steps, options=options)
+    return make_program(
+        make_hall(obstacles=posts), steps, options=vkc.Options(reach_waypoints=REACH)
+    )
 
 
 def find_base_crossings(
@@ -89,12 +89,12 @@ def test_crossings_enter_and_leave_on_opposite_sides(
 
 def test_grazing_is_no_crossing() -> None:
     """The side of the base overlaps the post, and the normal turns by less than a right angle."""
-    xs = np.linspace(1.0, 3.0, 200).tolist()
+    xs, problem = np.linspace(1.0, 3.0, 200).tolist(), make_posts_problem()
     assert find_base_crossings(xs, [0] * 200, y=-0.3) == {"post_2": [(0, 0)]}
     assert find_base_crossings(xs, [0] * 200, y=GRAZING) == {}
-    states = np.array([move_start(make_posts_problem().start, x=x, y=GRAZING) for x in xs])
-    near = make_posts_problem().contacts.evaluate(states, np.ones(200, int), reach=0.0)
-    labels = make_posts_problem().contacts.phases[0].labels
+    states = np.array([move_start(problem.start, x=x, y=GRAZING) for x in xs])
+    near = problem.contacts.evaluate(states, np.ones(200, int), reach=0.0)
+    labels = problem.contacts.phases[0].labels
     assert "base_link" in {labels[pair[0]] for pair in near.pair}
 
 
@@ -107,27 +107,22 @@ def test_new_crossings_have_new_pairs() -> None:
 
 ARM = [np.pi, -1.2, 1.9, -0.7, np.pi / 2, 0.0]  # stretched out ahead of the base
 WIDTH = 2.0  # [m] the base drives sideways
-FEW = vkc.Options(reach_waypoints=5, dt=1.0)
 
 
-def describe_box(x: float, y: float, size: list[float]) -> dict[str, object]:
-    return {"name": "box", "type": "box", "size": size, "position": [x, y, size[2] / 2]}
-
-
-def make_problem(scene: vkc.Scene, **goal: float) -> tuple[TrajectoryProblem, np.ndarray]:
-    """Return a problem with few waypoints and the straight path, shape (N, n)."""
-    end = move_start(scene.start, **goal)
-    problem = make_program(scene, [vkc.GoTo(*end[:3])], options=FEW)
-    return problem, drive_through(scene, scene.start, end, steps=FEW.reach_waypoints).positions[1:]
+def make_drive(
+    *obstacles: dict[str, Any], arm: list[float] | None = None, **goal: float
+) -> tuple[TrajectoryProblem, np.ndarray]:
+    """Return a drive in few steps and its straight path."""
+    scene = make_hall(obstacles=obstacles).with_start(arm=arm)
+    return make_straight_drive(scene, vkc.Options(reach_waypoints=5, dt=1.0), **goal)
 
 
 @cache
 def make_post_case() -> tuple[TrajectoryProblem, np.ndarray]:
     """The hand, moving sideways, passes through a post between the second and third waypoint."""
     tool = make_hall().with_start(arm=ARM).tool_placement().translation
-    post = {"name": "post", "type": "cylinder", "radius": 0.03, "length": 1.6}
-    post["position"] = [float(tool[0]) + 0.02, float(tool[1]) + WIDTH / 2, 0.8]
-    return make_problem(make_hall(obstacles=[post]).with_start(arm=ARM), y=WIDTH)
+    post = describe_post("post", 0.03, tool[0] + 0.02, tool[1] + WIDTH / 2)
+    return make_drive(post, arm=ARM, y=WIDTH)
 
 
 def sample_segment(
@@ -190,9 +185,8 @@ def test_lifting_both_ends_lifts_the_segment_to_first_order() -> None:
 
 
 def test_witness_points_are_fixed_in_their_bodies() -> None:
-    problem, z = make_problem(
-        make_hall(obstacles=[describe_box(0.0, 1.0, [0.04, 0.04, 1.6])]), y=WIDTH
-    )
+    post = describe_box("post", [0.04, 0.04, 1.6], [0.0, 1.0, 0.8])
+    problem, z = make_drive(post, y=WIDTH)
     found = find_segment_contacts(problem, z).contacts
     along = np.einsum("ci,ci->c", found.normal, found.second - found.first)
     np.testing.assert_allclose(found.distance, along, atol=1e-12)
@@ -207,20 +201,20 @@ def test_witness_points_are_fixed_in_their_bodies() -> None:
 @pytest.mark.parametrize(("gap", "is_free"), [(0.9, False), (1.1, True)])
 def test_segments_need_some_clearance(gap: float, is_free: bool) -> None:
     """The base passes a wall at `gap` times the tolerance."""
-    scene = make_hall(obstacles=[describe_box(1.0, 1.0, [4.0, 0.1, 0.5])])
-    problem, _ = make_problem(scene, x=2.0)
-    y = scene.start_clearance() - gap * CLEARANCE_TOLERANCE
-    z = np.array([move_start(scene.start, x=x, y=y) for x in (0.5, 1.0, 1.5, 2.0, 2.5)])
+    problem, _ = make_drive(describe_box("wall", [4.0, 0.1, 0.5], [1.0, 1.0, 0.25]), x=2.0)
+    y = problem.scene.start_clearance() - gap * CLEARANCE_TOLERANCE
+    z = np.array([move_start(problem.start, x=x, y=y) for x in (0.5, 1.0, 1.5, 2.0, 2.5)])
     found = find_segment_contacts(problem, z)
     assert found.is_free == is_free
     assert found.contacts.compute_violation() > 0.0
 
 
 def test_start_close_to_an_obstacle_can_be_left() -> None:
-    scene = make_hall(obstacles=[describe_box(0.546, 0.0, [0.1, 2.0, 0.5])])
-    assert 0.0 < scene.start_clearance() < SEGMENT_MARGIN
+    wall = describe_box("wall", [0.1, 2.0, 0.5], [0.546, 0.0, 0.25])
     for x, is_in_collision in ((-1.0, False), (1.0, True)):
-        found = find_segment_contacts(*make_problem(scene, x=x))
+        problem, z = make_drive(wall, x=x)
+        assert 0.0 < problem.scene.start_clearance() < SEGMENT_MARGIN
+        found = find_segment_contacts(problem, z)
         assert (0 in found.contacts.waypoint) == is_in_collision
         assert found.is_free != is_in_collision
 
@@ -230,10 +224,8 @@ def test_merged_contacts_are_sorted_by_waypoint_and_violation() -> None:
     parts = problem.evaluate_contacts(z, reach=0.3), find_segment_contacts(problem, z).contacts
     both = merge_contacts(*parts)
     assert len(both.waypoint) == sum(len(part.waypoint) for part in parts)
-    clearance = both.distance - both.margin
-    order = np.lexsort((clearance, both.waypoint))
-    np.testing.assert_array_equal(clearance[order], clearance)
-    np.testing.assert_array_equal(np.sort(both.waypoint), both.waypoint)
+    order = np.lexsort((both.distance - both.margin, both.waypoint))
+    np.testing.assert_array_equal(order, np.arange(len(order)))
     shuffled = both.select(np.random.default_rng(0).permutation(len(order)))
     np.testing.assert_array_equal(merge_contacts(shuffled).distance, both.distance)
 

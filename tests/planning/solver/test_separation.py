@@ -6,8 +6,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.drives import drive_through, make_hall, move_start
-from helpers.small_problems import make_program
+from helpers.carrying import describe_box
+from helpers.drives import make_hall
+from helpers.straight_drives import make_straight_drive
 
 import vkc_pin as vkc
 from vkc_pin.planning.chain.contacts import Contacts
@@ -26,20 +27,11 @@ def make_problem(*crates: tuple[float, ...]) -> tuple[TrajectoryProblem, np.ndar
     A crate with one size is square.
     """
     obstacles = [
-        {
-            "name": f"crate_{k}",
-            "type": "box",
-            "size": [size[0], size[-1], 0.5],
-            "position": [x, y, 0.25],
-        }
+        describe_box(f"crate_{k}", [size[0], size[-1], 0.5], [x, y, 0.25])
         for k, (x, y, *size) in enumerate(crates)
     ]
     scene = make_hall(obstacles=obstacles)
-    options = vkc.Options(reach_waypoints=30)
-    problem = make_program(scene, [vkc.GoTo(GOAL, 0.0, 0.0)], options=options)
-    goal = move_start(scene.start, x=GOAL)
-    path = drive_through(scene, scene.start, goal, steps=problem.segments).positions
-    return problem, path[1:].copy()
+    return make_straight_drive(scene, vkc.Options(reach_waypoints=30), x=GOAL)
 
 
 def separate(
@@ -85,10 +77,11 @@ def test_stretch_has_one_direction_whose_distance_is_a_lower_bound() -> None:
     labels = problem.contacts.phases[0].labels
     is_base = np.array([labels[first] == "base_link" for first, _ in at.pair.tolist()])
     inside = at.select(np.flatnonzero(is_base & (at.distance < -0.01)))
-    keys = [(row, *pair) for row, pair in zip(contacts.waypoint, contacts.pair, strict=True)]
-    rows = {tuple(map(int, key)): number for number, key in enumerate(keys)}
-    wanted = zip(inside.waypoint.tolist(), inside.pair.tolist(), strict=True)
-    own = contacts.select(np.array([rows[row, *pair] for row, pair in wanted]))
+    keys, wanted = (
+        list(map(tuple, np.column_stack([each.waypoint, each.pair]).tolist()))
+        for each in (contacts, inside)
+    )
+    own = contacts.select(np.array([keys.index(key) for key in wanted]))
     np.testing.assert_allclose(own.normal, np.tile(own.normal[0], (len(own.normal), 1)), atol=1e-9)
     assert abs(own.normal[0, 1]) > 0.99  # across the motion
     assert (own.distance <= inside.distance + 1e-6).all()
@@ -121,9 +114,8 @@ def test_gradients_of_a_direction_equal_finite_differences() -> None:
 
 
 def test_allowed_overlaps_may_be_passed_through() -> None:
-    crate = {"name": "crate", "type": "box", "size": [0.2, 0.2, 0.5], "position": [3.0, 0.0, 0.25]}
-    scene = make_hall(obstacles=[crate])
-    allow = [{"pair": [link, "crate"], "margin": -2.0} for link in scene.robot.links]
+    scene = make_problem((3.0, 0.0, 0.2))[0].scene
+    allow = [{"pair": [link, "crate_0"], "margin": -2.0} for link in scene.robot.links]
     scene = vkc.Scene.from_document({**scene.document, "allow": allow})
     plan = vkc.plan(scene, [vkc.GoTo(GOAL, 0.0, 0.0)], initialization="interpolated")
     assert plan.success

@@ -6,8 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from helpers.drives import drive_through, make_hall, move_start
+from helpers.carrying import describe_box
+from helpers.drives import make_hall
 from helpers.small_problems import load_door_scene, make_program
+from helpers.straight_drives import make_straight_drive
 
 import vkc_pin as vkc
 from vkc_pin.planning.chain.contacts import Contacts
@@ -56,10 +58,7 @@ def make_case(kind: str, *, rates: bool = False) -> Iterate:
             load_door_scene(), [vkc.Actuate("door", {"hinge": 1.2})], options=SHORT
         )
         return make_iterate(problem, problem.still, rates=rates)
-    scene = make_hall()
-    problem = make_program(scene, [vkc.GoTo(1.0, 0.0)], options=SHORT)
-    z = drive_through(scene, scene.start, move_start(scene.start, x=1.0), steps=8).positions[1:]
-    return make_iterate(problem, z, rates=rates)
+    return make_iterate(*make_straight_drive(make_hall(), SHORT, x=1.0), rates=rates)
 
 
 @pytest.mark.parametrize("kind", ["door", "drive"])
@@ -128,11 +127,8 @@ def test_multipliers_warm_start_the_next_round() -> None:
 @pytest.mark.parametrize("is_violated", [False, True])
 def test_only_planes_violated_at_the_iterate_have_slack(is_violated: bool) -> None:
     """Beyond the margin of the box, the penalty weight has no effect."""
-    x = 1.6 if is_violated else 1.85
-    obstacle = {"name": "box", "type": "box", "size": [0.2, 0.2, 1.0], "position": [x, 0.0, 0.5]}
-    scene = make_hall(obstacles=[obstacle])
-    problem = make_program(scene, [vkc.GoTo(1.2, 0.0)], options=SHORT)
-    drive = drive_through(scene, scene.start, move_start(scene.start, x=1.2), steps=8).positions[1:]
+    obstacle = describe_box("box", [0.2, 0.2, 1.0], [1.6 if is_violated else 1.85, 0.0, 0.5])
+    problem, drive = make_straight_drive(make_hall(obstacles=[obstacle]), SHORT, x=1.2)
     iterate = make_iterate(problem, drive if is_violated else problem.still, weight=1e-3)
     assert bool(iterate.found.amounts["clearance"].any()) == is_violated
     step = iterate.solve(2.0)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import block_diag
 
 from vkc_pin.planning.solver.subproblem import make_linear_solver_options
 from vkc_pin.utils.optional_imports import import_compiled
@@ -75,31 +76,16 @@ def check_solution(factorization: Factorization, matrix: np.ndarray) -> None:
 def make_system(seed: int, waypoints: int, size: int, equalities: int, planes: int) -> np.ndarray:
     """Return a trajectory-like system: coupled blocks, their constraints, and some slacks."""
     rng = np.random.default_rng(seed)
-    n, m = waypoints * size, waypoints * (equalities + planes)
-    hessian = np.zeros((n, n))
-    for k in range(waypoints):
-        block, root = slice(k * size, (k + 1) * size), rng.normal(size=(size, size))
-        hessian[block, block] += root @ root.T + 0.1 * np.eye(size)
-        if k > 1:
-            change = np.zeros((size, n))
-            change[:, block] = np.eye(size)
-            change[:, slice((k - 1) * size, k * size)] = -2.0 * np.eye(size)
-            change[:, slice((k - 2) * size, (k - 1) * size)] = np.eye(size)
-            hessian += 10.0 * change.T @ change
-    rows = np.zeros((m, n))
-    for row in range(m):
-        k = row // (equalities + planes)
-        rows[row, k * size : (k + 1) * size] = rng.normal(size=size)
-    slack = np.flatnonzero(np.arange(m) % (equalities + planes) >= equalities)
-    total = n + len(slack) + m
-    matrix = np.zeros((total, total))
-    matrix[:n, :n] = hessian
-    matrix[np.arange(n, n + len(slack)), np.arange(n, n + len(slack))] = 10.0 ** rng.uniform(
-        -4.0, 4.0, len(slack)
-    )
-    matrix[n + len(slack) :, :n] = rows
-    matrix[n + len(slack) + slack, n + np.arange(len(slack))] = -1.0
-    return np.tril(matrix) + np.tril(matrix, -1).T
+    roots = rng.normal(size=(waypoints, size, size))
+    changes = np.kron(np.diff(np.eye(waypoints), n=2, axis=0), np.eye(size))
+    hessian = block_diag(*(root @ root.T + 0.1 * np.eye(size) for root in roots))
+    hessian += 10.0 * changes.T @ changes
+    rows = block_diag(*rng.normal(size=(waypoints, equalities + planes, size)))
+    slacks = np.diag(10.0 ** rng.uniform(-4.0, 4.0, waypoints * planes))
+    has_slack = np.arange(len(rows)) % max(equalities + planes, 1) >= equalities
+    rows = np.hstack([rows, -np.eye(len(rows))[:, has_slack]])
+    upper = np.vstack([block_diag(hessian, slacks), rows])
+    return np.hstack([upper, np.vstack([rows.T, np.zeros((len(rows), len(rows)))])])
 
 
 @settings(max_examples=60, deadline=None)
@@ -148,42 +134,29 @@ def test_refactoring_does_not_depend_on_earlier_values() -> None:
     np.testing.assert_array_equal(fresh.solve(b), x)
 
 
-def test_dependent_rows_are_singular_and_the_next_system_is_solved() -> None:
+def test_dependent_rows_and_nan_are_singular_and_the_next_system_is_solved() -> None:
     matrix = make_system(2, 3, 4, 2, 0)
     doubled = matrix.copy()
     doubled[-1], doubled[:, -1] = doubled[-2], doubled[:, -2]
     rows, columns, values = get_lower_triangle(matrix)
+    invalid = values.copy()
+    invalid[0] = np.nan
     factorization = Factorization(matrix, rows, columns)
-    assert factorization.factor(doubled[rows, columns]) == -5
-    assert np.isnan(factorization.solve(np.ones(len(matrix)))).all()
+    for singular in (doubled[rows, columns], invalid):
+        assert factorization.factor(singular) == -5
+        assert np.isnan(factorization.solve(np.ones(len(matrix)))).all()
     assert factorization.factor(values) == 0
     check_solution(factorization, matrix)
 
 
 @pytest.mark.parametrize("size", [3, 9, 20])
 def test_pivots_of_rounding_size_are_singular(size: int) -> None:
-    """The last pivot is tested, also if only other panels update it."""
-    root = np.eye(size, size - 1) + 0.1 * np.random.default_rng(size).normal(
-        size=(size, size - 1)
-    )  # no other pivot is small
+    """The last pivot is tested, also if only other panels update it; no other pivot is small."""
+    noise = np.random.default_rng(size).normal(size=(size, size - 1))
+    root = np.eye(size, size - 1) + 0.1 * noise
     gram = root @ root.T
     assert not factorize(gram)[1]
     assert factorize(gram + 1e-6 * np.eye(size))[1]
-
-
-def test_dual_rows_may_come_first() -> None:
-    """They are eliminated after the rows that they couple, in any numbering."""
-    matrix = make_system(5, 4, 5, 2, 3)[::-1, ::-1]
-    factorization, done = factorize(matrix)
-    assert done
-    check_solution(factorization, matrix)
-
-
-def test_nan_pivot_is_singular() -> None:
-    matrix = make_system(3, 2, 3, 1, 0)
-    rows, columns, values = get_lower_triangle(matrix)
-    values[0] = np.nan
-    assert Factorization(matrix, rows, columns).factor(values) == -5
 
 
 def test_duplicate_and_upper_entries_are_summed() -> None:
@@ -220,17 +193,15 @@ def test_ipopt_is_deterministic_and_thread_safe() -> None:
 )
 def test_ipopt_finds_the_same_solution_as_with_mumps(bounds: tuple[float, float]) -> None:
     """The program has an indefinite Hessian and two dependent rows."""
+    lower, upper = bounds
     x = ca.MX.sym("x", 6)
     f = ca.sumsqr(x[1:] - x[:-1] ** 2) + ca.sumsqr(1.0 - x[:-1]) + ca.cos(3.0 * x[5])
-    g = ca.vertcat(
-        x[0] + x[1] - 1.0, x[2] * x[3] - 0.5, 2.0 * (x[0] + x[1] - 1.0), x[4] - ca.sin(x[5])
-    )
+    line = x[0] + x[1] - 1.0
+    g = ca.vertcat(line, x[2] * x[3] - 0.5, 2.0 * line, x[4] - ca.sin(x[5]))
     found = []
     for options in ({"ipopt.linear_solver": "mumps"}, OWN_SOLVER):
         solver = ca.nlpsol("solver", "ipopt", {"x": x, "f": f, "g": g}, {**QUIET, **options})
-        result = solver(
-            x0=np.full(6, 0.3), lbg=[bounds[0]] * 4, ubg=[bounds[1]] * 4, lbx=-5.0, ubx=5.0
-        )
+        result = solver(x0=np.full(6, 0.3), lbg=lower, ubg=upper, lbx=-5.0, ubx=5.0)
         assert solver.stats()["success"]
         found.append(np.ravel(result["x"]))
     np.testing.assert_allclose(found[1], found[0], atol=1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -55,19 +56,12 @@ def test_phases_list_attached_objects() -> None:
     _, motion = make_random_motion(make_fetch_problem())
     names = ["reach ball.pull by stick.tip", "place ball", "go to"]
     assert [phase.name for phase in motion.phases] == names
-    both = {"stick": "grip", "ball": "pull"}
-    assert [dict(phase.held) for phase in motion.phases] == [
-        {"stick": "grip"},
-        both,
-        {"stick": "grip"},
-    ]
+    stick, both = {"stick": "grip"}, {"stick": "grip", "ball": "pull"}
+    assert [dict(phase.held) for phase in motion.phases] == [stick, both, stick]
     assert [phase["by"] for phase in motion.to_dict()["phases"]] == [{}, {"ball": "stick.tip"}, {}]
     n = SHORT.reach_waypoints
-    assert [(phase.first, phase.last) for phase in motion.phases] == [
-        (0, n),
-        (n, 2 * n + 1),
-        (2 * n + 1, 3 * n + 2),
-    ]
+    assert [phase.first for phase in motion.phases] == [0, n, 2 * n + 1]
+    assert [phase.last for phase in motion.phases] == [n, 2 * n + 1, 3 * n + 2]
     assert find_pauses(make_fetch_problem(), motion) == [n + 1, 2 * n + 2]
 
 
@@ -121,32 +115,18 @@ def test_object_grasped_at_the_start_is_released_first() -> None:
 
 
 @pytest.mark.parametrize("make", [make_fetch_problem, make_place_problem])
-def test_robot_follows_the_waypoints(make) -> None:  # type: ignore[no-untyped-def]
+def test_robot_and_grasp_coordinates_follow_the_waypoints(
+    make: Callable[[], TrajectoryProblem],
+) -> None:
+    """Grasp coordinates hold their values before and after the grasp."""
     problem = make()
     z, motion = make_random_motion(problem)
     rows = np.delete(motion.positions, find_pauses(problem, motion), axis=0)
-    robot = motion.robot_size
-    np.testing.assert_array_equal(rows[:, :robot], problem.waypoints(z)[:, :robot])
-
-
-@pytest.mark.parametrize("make", [make_fetch_problem, make_place_problem])
-def test_grasp_coordinates_hold_their_values(make) -> None:  # type: ignore[no-untyped-def]
-    """During the grasp, values are those of the solution; before and after, the nearest ones."""
-    problem = make()
-    z, motion = make_random_motion(problem)
-    path = problem.waypoints(z)
-    rows = np.delete(motion.positions, find_pauses(problem, motion), axis=0)
+    path, robot = problem.waypoints(z), motion.robot_size
+    np.testing.assert_array_equal(rows[:, :robot], path[:, :robot])
     ends = [0, *problem.ends.tolist()]
     for hold, names in problem.chain.virtual.items():
         columns = [problem.chain.index(name) for name in names]
         held = [k for k, phase in enumerate(problem.task.phases) if hold in phase.held]
-        first, last = ends[held[0]], ends[held[-1] + 1]
-        np.testing.assert_array_equal(
-            rows[first : last + 1, columns], path[first : last + 1, columns]
-        )
-        np.testing.assert_array_equal(
-            rows[:first, columns], np.tile(path[first, columns], (first, 1))
-        )
-        np.testing.assert_array_equal(
-            rows[last:, columns], np.tile(path[last, columns], (len(rows) - last, 1))
-        )
+        nearest = np.clip(np.arange(len(rows)), ends[held[0]], ends[held[-1] + 1])
+        np.testing.assert_array_equal(rows[:, columns], path[nearest][:, columns])

@@ -16,14 +16,6 @@ from vkc_pin.utils.disk_cache import TEMPORARY_PREFIX
 LIBRARY = bytes(range(256)) * 40
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Libraries:
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    found = Libraries.open_default()
-    assert found is not None
-    return found
-
-
 A, B, C, D, E = (digit * 40 for digit in "abcde")
 
 
@@ -43,31 +35,38 @@ def make_older(path: Path, seconds: float) -> None:
     os.utime(path, (time.time() - seconds,) * 2)
 
 
+@pytest.mark.parametrize(
+    ("named", "xdg", "expected"),
+    [
+        *((off, None, None) for off in ("", "off", " OFF ")),
+        ("{}/deep/own", None, "deep/own"),
+        ("~/mine", None, "home/mine"),
+        (None, None, "home/.cache"),
+        (None, "relative", "home/.cache"),
+        (None, "{}/xdg", "xdg"),
+    ],
+)
 def test_default_folder_follows_the_environment(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    named: str | None,
+    xdg: str | None,
+    expected: str | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def get_path() -> Path | None:
-        found = Libraries.open_default()
-        return found.path if found else None
-
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    for off in ("", "off", " OFF "):
-        monkeypatch.setenv(CACHE_VARIABLE, off)
-        assert get_path() is None
-    assert not (tmp_path / "home").exists()
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "deep" / "own"))
-    assert get_path() == tmp_path / "deep" / "own" / "vkc_pin"
-    for created in (tmp_path / "deep" / "own", tmp_path / "deep" / "own" / "vkc_pin"):
-        assert created.stat().st_mode & 0o777 == 0o700
-    monkeypatch.setenv(CACHE_VARIABLE, "~/mine")
-    assert get_path() == tmp_path / "home" / "mine" / "vkc_pin"
-    monkeypatch.delenv(CACHE_VARIABLE)
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    assert get_path() == tmp_path / "home" / ".cache" / "vkc_pin"
-    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
-    assert get_path() == tmp_path / "home" / ".cache" / "vkc_pin"
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert get_path() == tmp_path / "xdg" / "vkc_pin"
+    for variable, value in ((CACHE_VARIABLE, named), ("XDG_CACHE_HOME", xdg)):
+        monkeypatch.delenv(variable, raising=False)
+        if value is not None:
+            monkeypatch.setenv(variable, value.format(tmp_path))
+    found = Libraries.open_default()
+    if expected is None:
+        assert found is None
+        assert not (tmp_path / "home").exists()
+        return
+    assert found is not None
+    assert found.path == tmp_path / expected / "vkc_pin"
+    for created in (found.path, found.path.parent):
+        assert created.stat().st_mode & 0o777 == 0o700 or named is None
 
 
 def test_unsafe_folders_are_not_used(

@@ -37,15 +37,6 @@ REACH = [Grasp("door")]
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes"}
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Libraries:
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    monkeypatch.delenv("CC", raising=False)
-    found = Libraries.open_default()
-    assert found is not None
-    return found
-
-
 def make_function(factor: float = 3.0) -> ca.Function:
     x, y = ca.SX.sym("x", 3), ca.SX.sym("y", 2)
     branch = ca.if_else(x[1] > 0.3, ca.sqrt(ca.fabs(x[0])), ca.atan2(y[0], y[1]))
@@ -105,10 +96,8 @@ def test_program_is_rebuilt_when_machine_code_is_available(folder: Libraries) ->
     short = make_program(load_door_scene(), REACH, options=OPTIONS).transcription
     assert not short.uncompiled_functions
     options = Options(reach_waypoints=8, contact_slots=2)
-    structure, cache = (
-        make_program(load_door_scene(), REACH, options=options).transcription.structure,
-        Cache(),
-    )
+    problem, cache = make_program(load_door_scene(), REACH, options=options), Cache()
+    structure = problem.transcription.structure
     first = transcribe(structure, cache)
     solver = first.solver(rates=True, options=QUIET)
     assert len(first.uncompiled_functions) == 1
@@ -140,16 +129,18 @@ def test_frequently_used_batch_functions_are_compiled(
     rng = np.random.default_rng(0)
     x, y = rng.normal(size=(40, 3)), rng.normal(size=(40, 2))
     function = BatchFunction(make_function())
-    expected = [part.tobytes() for part in function(x, y)]
+
+    def evaluate() -> list[bytes]:
+        return [part.tobytes() for part in function(x, y)]
+
+    expected, instructions = evaluate(), make_function().n_instructions()
     assert folder.list_jobs() == []
-    monkeypatch.setattr(
-        batch, "_MIN_INSTRUCTIONS_TO_COMPILE", 30 * make_function().n_instructions()
-    )
-    assert [part.tobytes() for part in function(x, y)] == expected
+    monkeypatch.setattr(batch, "_MIN_INSTRUCTIONS_TO_COMPILE", 30 * instructions)
+    assert evaluate() == expected
     assert wait()
-    assert [part.tobytes() for part in function(x, y)] == expected
+    assert evaluate() == expected
     assert function._code.is_compiled
-    assert [part.tobytes() for part in function(x, y)] == expected
+    assert evaluate() == expected
     assert function.nbytes > 0
 
 
@@ -256,12 +247,8 @@ def test_hanging_compiler_is_killed(
     folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pid = tmp_path / "pid"
-    monkeypatch.setenv(
-        "CC",
-        write_script(
-            tmp_path / "hangs", f"sleep 600 & echo $! > {pid}.part; mv {pid}.part {pid}; wait"
-        ),
-    )
+    script = f"sleep 600 & echo $! > {pid}.part; mv {pid}.part {pid}; wait"
+    monkeypatch.setenv("CC", write_script(tmp_path / "hangs", script))
     monkeypatch.setattr(machine_code, "_COMPILER_TIMEOUT", 1.0)
     monkeypatch.setattr(machine_code, "has_python", lambda: False)
     assert not MachineCode(make_function()).try_load()
@@ -293,12 +280,10 @@ def wait_until(condition: Callable[[], bool]) -> None:
 def has_ended(pid: int) -> bool:
     """Return whether a process has ended or is a zombie."""
     try:
-        return (
-            Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
-            == "Z"
-        )
+        status = Path(f"/proc/{pid}/stat").read_text()
     except (FileNotFoundError, ProcessLookupError):
         return True
+    return status.rpartition(")")[2].split()[0] == "Z"
 
 
 def plan_door(planner: vkc.Planner | None = None) -> list[bytes]:

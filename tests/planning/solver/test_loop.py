@@ -210,14 +210,6 @@ def test_switching_sides_of_a_closed_wall_is_no_progress() -> None:
     assert any(ends_early() for _ in range(8))
 
 
-def test_callback_receives_the_history() -> None:
-    rows: list[object] = []
-    solution = solve(*make_pillar_case(), callback=rows.append)
-    assert rows == solution.history
-    # the same guess gives the same motion
-    np.testing.assert_array_equal(solution.z, solve_case(make_pillar_case).z)
-
-
 def test_solution_continues_with_given_radii() -> None:
     problem, guess = make_blocked_case()
     first = solve(problem, guess, rounds=3)

@@ -1,0 +1,18 @@
+"""Provides an empty folder of compiled functions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from vkc_pin.planning.kinematics.machine_code import CACHE_VARIABLE, Libraries
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Libraries:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.delenv("CC", raising=False)
+    found = Libraries.open_default()
+    assert found is not None
+    return found

@@ -16,7 +16,6 @@ import pytest
 from vkc_pin.errors import BuildError, InputError, UnknownNameError
 from vkc_pin.planning import kinematics as cpin
 from vkc_pin.planning.kinematics import backends
-from vkc_pin.world.models.coordinates import Coordinates
 
 TOLERANCE = 1e-12
 AXIS = np.array([0.36, -0.48, 0.8])
@@ -131,28 +130,6 @@ def test_frame_jacobian_equals_numeric_pinocchio(kind: str) -> None:
         for q in sample_configurations(model, 2):
             expected = pin.computeFrameJacobian(model, data, q, frame, axes)
             np.testing.assert_allclose(jacobian(q=q)["J"].full(), expected, atol=TOLERANCE, rtol=0)
-
-
-def test_derivatives_equal_differences_of_numeric_pinocchio(arm: pin.Model) -> None:
-    coordinates, random = Coordinates(arm), np.random.default_rng(4)
-    n, step = coordinates.size, 1e-4
-    weights = random.normal(size=(12, arm.njoints - 1))
-    z = casadi.SX.sym("z", n)
-    value = casadi.dot(weights, cpin.joint_placements(arm)(coordinates.q_symbolic(z)))
-    derivatives = casadi.Function("derivatives", [z], casadi.hessian(value, z))
-    point = random.normal(size=n)
-
-    def evaluate(at: np.ndarray) -> float:
-        return float(np.sum(weights * compute_placements(arm, coordinates.q(at))))
-
-    hessian, gradient = (part.full().squeeze() for part in derivatives(point))
-    for direction in random.normal(size=(20, n)):
-        ahead, behind = evaluate(point + step * direction), evaluate(point - step * direction)
-        slope = (ahead - behind) / (2 * step)
-        assert direction @ gradient == pytest.approx(slope, rel=1e-5, abs=1e-5)
-        curvature = (ahead - 2 * evaluate(point) + behind) / step**2
-        exact = direction @ hessian @ direction
-        assert exact == pytest.approx(curvature, rel=1e-5, abs=1e-4)
 
 
 def test_dynamics_derivatives_equal_numeric_pinocchio() -> None:

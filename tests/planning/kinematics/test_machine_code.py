@@ -27,10 +27,9 @@ from vkc_pin.planning.kinematics.machine_code import (
     compile_jobs,
     wait,
 )
-from vkc_pin.planning.nlp.transcription import Transcription, transcribe
-from vkc_pin.planning.nlp.waypoint import WaypointFunctions
+from vkc_pin.planning.nlp.transcription import transcribe
 from vkc_pin.utils.cache import Cache
-from vkc_pin.world.task.steps import Actuate, Grasp
+from vkc_pin.world.task.steps import Grasp
 
 OPTIONS = Options(reach_waypoints=3, turn_waypoints=2, move_waypoints=3, contact_slots=2)
 REACH = [Grasp("door")]
@@ -75,23 +74,6 @@ def write_script(path: Path, text: str) -> str:
 
 
 @pytest.mark.long
-def test_compiled_waypoint_functions_are_equal_bit_for_bit(folder: Libraries) -> None:
-    steps = [Actuate("door", {"hinge": 1.2})]
-    structure = make_program(load_door_scene(), steps, options=OPTIONS).transcription.structure
-    functions = WaypointFunctions(structure.model, structure.slots, structure.poses, Cache())
-    interpreted = (functions.value, functions.jacobian, functions.hessian)
-    assert not functions.code.try_load()
-    assert functions.code.functions == interpreted
-    assert wait()
-    assert functions.code.try_load()
-    for one, other in zip(interpreted, functions.code.functions, strict=True):
-        assert other.class_name() == "External"
-        assert are_equal(one, other)
-        assert are_equal(one.map(5), other.map(5), 5)
-    assert folder.list_jobs() == []
-
-
-@pytest.mark.long
 def test_program_is_rebuilt_when_machine_code_is_available(folder: Libraries) -> None:
     short = make_program(load_door_scene(), REACH, options=OPTIONS).transcription
     assert not short.uncompiled_functions
@@ -109,18 +91,6 @@ def test_program_is_rebuilt_when_machine_code_is_available(folder: Libraries) ->
     assert second.solver(rates=True, options=QUIET) is not solver
     assert transcribe(structure, cache) is second
     assert not second.uncompiled_functions
-    rng = np.random.default_rng(0)
-    x, parameters = rng.normal(size=first.size), rng.normal(size=first.parameters.numel())
-    rows, others = (evaluate_rows(program, x, parameters) for program in (first, second))
-    assert rows == others
-
-
-def evaluate_rows(
-    program: Transcription, x: np.ndarray, parameters: np.ndarray
-) -> tuple[bytes, bytes]:
-    function = ca.Function("rows", [program.x, program.parameters], [program.g, program.jacobian])
-    values, jacobian = function(x, parameters)
-    return np.array(values.nonzeros()).tobytes(), np.array(jacobian.nonzeros()).tobytes()
 
 
 def test_frequently_used_batch_functions_are_compiled(

@@ -19,19 +19,7 @@ from vkc_pin.planning.chain.pose import (
 )
 
 KINDS = ("pose", "point", "upright", "level")
-ANGLES = [
-    0.0,
-    1e-9,
-    1e-6,
-    1e-3,
-    0.5,
-    np.pi / 2,
-    2.5,
-    np.pi - 1e-2,
-    np.pi - 1e-3,
-    np.pi - 1e-6,
-    np.pi,
-]
+ANGLES = [0.0, 1e-9, 1e-6, 1e-3, 0.5, np.pi / 2, 2.5, *(np.pi - x for x in (1e-2, 1e-3, 1e-6, 0))]
 
 _R, _p, _target = ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3), ca.SX.sym("W", 12)
 _twist = ca.SX.sym("w", 3)

@@ -54,13 +54,6 @@ def make_infeasibility(**amounts: list[float]) -> Infeasibility:
     return Infeasibility(rows, np.zeros((2, 0, 7)), np.zeros(0), np.zeros(0))
 
 
-def test_feasible_motion_has_no_violation() -> None:
-    p = make_program(make_hall(), [vkc.GoTo(0.0, 0.0, 0.0)], options=SHORT)
-    found = measure(p, p.still, rates=True)
-    assert (found.total, found.max_violation) == (0.0, 0.0)
-    assert set(found.amounts) == set(KINDS)
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_amounts_equal_the_violations_of_each_kind(seed: int) -> None:
     p = make_problem("drive")

@@ -8,7 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.carrying import STICK, describe_stand, describe_table, lift, make_room
+from helpers.carrying import STICK, describe_table, lift, make_room
+from helpers.held_sticks import make_scene_with_held_stick
 from helpers.small_problems import (
     SHORT,
     load_door_scene,
@@ -46,11 +47,6 @@ def two_grasps() -> TrajectoryProblem:
     return make_program(
         make_full_scene(), [Grasp("cabinet", "ball"), drawer, Reach(POSE)], options=SHORT
     )
-
-
-def make_scene_with_held_stick() -> Scene:
-    scene = make_room(describe_stand(), objects=("stick", "ball"))
-    return scene.with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
 
 
 @pytest.fixture(scope="module")

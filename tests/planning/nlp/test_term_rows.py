@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import describe_stand, describe_table, make_room
+from helpers.held_sticks import make_scene_with_held_stick
 from helpers.program_points import make_random_point
 from helpers.relaxed import check_relaxation, make_iterates
 from helpers.small_problems import make_full_scene, make_program
@@ -90,8 +91,7 @@ def make_problem(name: str) -> vkc.TrajectoryProblem:
         scene = make_room(describe_table())
         steps = [vkc.Touch("stick.tip", (0.8, 0.9, 0.7)), vkc.Place("stick", (0.8, 0.5, 0.56))]
     elif name == "ball":
-        scene = make_room(describe_stand(), objects=("stick", "ball"))
-        scene = scene.with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
+        scene = make_scene_with_held_stick()
         steps = [vkc.Grasp("ball", "pull", "stick.tip"), vkc.Place("ball", (0.8, 0.6, 0.7))]
     else:
         scene = make_full_scene()

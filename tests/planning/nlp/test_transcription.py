@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.carrying import describe_stand, describe_table, make_room
+from helpers.carrying import describe_table, make_room
+from helpers.held_sticks import make_scene_with_held_stick
 from helpers.program_points import QUIET, ProgramPoint, make_random_point
 from helpers.relaxed import check_relaxation, make_iterates
 from helpers.small_problems import CACHE, load_door_scene, make_program
@@ -56,8 +57,7 @@ def make_problem(name: str) -> TrajectoryProblem:
         scene = make_room(describe_table())
         steps = [Touch("stick.tip", (0.8, 0.9, 0.7)), Place("stick", (0.8, 0.5, 0.56))]
     elif name == "fetch":  # fetches a ball with the stick, then releases the stick
-        scene = make_room(describe_stand(), objects=("stick", "ball"))
-        scene = scene.with_held({"stick": "grip"}, at={"stick": (0.02, -0.1)})
+        scene = make_scene_with_held_stick()
         steps = [Grasp("ball", "pull", "stick.tip"), Place("ball", POSE), Release("stick")]
         steps.append(GoTo(0.0, 0.0))
     elif name == "telescope":  # one coordinate moves several joints

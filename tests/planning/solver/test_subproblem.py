@@ -63,7 +63,7 @@ def make_case(kind: str, *, rates: bool = False) -> Iterate:
 
 @pytest.mark.parametrize("kind", ["door", "drive"])
 @pytest.mark.parametrize("rates", [False, True])
-@pytest.mark.parametrize("size", [0.05, 0.5])
+@pytest.mark.parametrize("size", [1e-3, 1e-2, 0.05, 0.5])
 def test_predicted_reduction_is_achieved_within_the_region(
     kind: str, rates: bool, size: float
 ) -> None:
@@ -89,24 +89,12 @@ def test_predicted_reduction_is_achieved_within_the_region(
         assert not step.relaxation.any()
         assert step.succeeded
     else:
-        assert predicted > 1.0
+        assert predicted > 20.0 * size
+        # linear models are accurate for small steps, also far from the goals
+        gain = others.sum() - penalty
+        assert rates or size > 0.01 or left == pytest.approx(penalty, abs=0.02 * gain)
         assert not step.relaxation[others == 0.0].any()
         assert size > 0.1 or (step.relaxation > 0.5).any(), "a small step must leave a relaxation"
-
-
-@pytest.mark.parametrize("size", [1e-3, 1e-2])
-def test_prediction_is_accurate_for_small_steps(size: float) -> None:
-    """Linear models are accurate for small steps, also far from the goals."""
-    iterate = make_case("door")
-    p, step = iterate.problem, iterate.solve(size)
-    after = measure_infeasibility(
-        p, step.z, iterate.timing, p.evaluate_contacts(step.z, reach=0.1), rates=False
-    )
-    others = iterate.merit.compute_penalty(iterate.found, clearance=False)
-    actual = iterate.merit.compute_penalty(after, clearance=False).sum()
-    assert actual < others.sum()
-    gain = others.sum() - actual
-    assert others @ step.relaxation == pytest.approx(actual, abs=0.02 * gain)
 
 
 def test_multipliers_warm_start_the_next_round() -> None:

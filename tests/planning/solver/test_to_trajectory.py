@@ -7,7 +7,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.carrying import STICK, describe_stand, describe_table, lift, make_room
+from helpers.carrying import STICK, describe_table, lift, make_room
+from helpers.held_sticks import make_scene_with_held_stick
 from helpers.small_problems import SHORT, load_door_scene, make_program, sample_configurations
 
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
@@ -20,14 +21,8 @@ ASIDE = lift(STICK, [0.0, 0.5, 0.0])
 
 @cache
 def make_fetch_problem() -> TrajectoryProblem:
-    scene = make_room(describe_stand(), objects=("stick", "ball")).with_held(
-        {"stick": "grip"}, at={"stick": (0.02, -0.1)}
-    )
-    return make_program(
-        scene,
-        [Grasp("ball", "pull", "stick.tip"), Place("ball", (0.8, 0.6, 0.7)), GoTo(0.0, 0.0)],
-        options=SHORT,
-    )
+    steps = [Grasp("ball", "pull", "stick.tip"), Place("ball", (0.8, 0.6, 0.7)), GoTo(0.0, 0.0)]
+    return make_program(make_scene_with_held_stick(), steps, options=SHORT)
 
 
 @cache

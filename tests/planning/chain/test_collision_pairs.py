@@ -40,7 +40,6 @@ from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.world.models.shapes import get_link_name
 from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions
 from vkc_pin.world.scene.contact_rules import CONTACT_WINDOW
-from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene, load_scene
@@ -387,17 +386,6 @@ def test_links_of_a_grasped_object_that_can_collide_are_paired() -> None:
     own = {key: found[key] for key in found if all(k.startswith("cabinet.") for k in key)}
     assert {frozenset(link.removeprefix("cabinet.") for link in key) for key in own} == colliding
     assert all(set(margins) == {MARGIN} for margins in own.values())
-
-
-def test_objects_grasped_in_sequence_have_pairs_only_while_held() -> None:
-    steps = [Grasp("door"), Actuate("drawer", {"slide": 0.2})]
-    problem = make_program(make_full_scene(), steps, options=SHORT)
-    phases = problem.task.phases
-    assert [phase.held for phase in phases] == [(), (), (Hold("drawer", "handle"),)]
-    for phase, part in zip(phases, problem.contacts.phases, strict=True):
-        paired = set(part.pairs.ravel().tolist())
-        for hold, indices in problem.chain.held_geometries.items():
-            assert paired & set(indices) == (set(indices) if hold in phase.held else set())
 
 
 def test_scene_without_collision_geometry_is_rejected() -> None:

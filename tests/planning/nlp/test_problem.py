@@ -282,7 +282,13 @@ def test_free_objects_are_grasped_at_their_resting_poses() -> None:
         ("goal stick.stick", aside, (ends[2],), "pose"),
         ("approach stick.grip", aside, (ends[4] - APPROACH,), "pose"),
     ]
-    assert problem.transcription.structure.stops == (ends[0], ends[2])
+    structure = problem.transcription.structure
+    assert structure.stops == (ends[0], ends[2])
+    assert set(structure.clamped) == {
+        (problem.chain.index(f"stick.grip_{name}"), grasp - APPROACH, last)
+        for name in ("turn", "slide")
+        for grasp, last in ((ends[0], ends[2]), (ends[4], ends[4]))
+    }
     assert not any(problem.is_closed(phase) for phase in problem.task.phases)
 
 

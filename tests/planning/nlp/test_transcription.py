@@ -75,29 +75,13 @@ NAMES = ["door", "differential", "ackermann", "stick", "fetch", "push", "telesco
 
 def find_runs(p: TrajectoryProblem) -> list[np.ndarray]:
     """Return the waypoints of each run between rests: start, grasps, releases and end."""
-    neighbours = zip(p.ends[:-1], p.task.phases[:-1], p.task.phases[1:], strict=True)
-    stops = [int(end) for end, a, b in neighbours if a.grasps or set(a.held) - set(b.held)]
-    return [np.arange(a, b + 1) for a, b in itertools.pairwise([0, *stops, p.segments])]
+    stops = [0, *p.transcription.structure.stops, p.segments]
+    return [np.arange(a, b + 1) for a, b in itertools.pairwise(stops)]
 
 
 def compute_changes(path: np.ndarray, run: np.ndarray) -> np.ndarray:
     """Return the changes of the steps within a run, from and to rest."""
     return np.diff(np.diff(path[run], axis=0), axis=0, prepend=0.0, append=0.0)
-
-
-def find_clamped_steps(p: TrajectoryProblem) -> list[tuple[int, int]]:
-    """Return (column, waypoint) of the freedoms of firm grasps, while they are constant."""
-    found = []
-    for hold, names in p.chain.virtual.items():
-        firm = p.scene.objects[hold.object].object.attachments[hold.attachment].firm
-        for k, phase in enumerate(p.task.phases):
-            if firm and hold in phase.grasps:
-                later = range(k + 1, len(p.task.phases))
-                held = itertools.takewhile(lambda j, h=hold: h in p.task.phases[j].held, later)
-                last = int(p.ends[max([k, *held])])
-                first = max(1, int(p.ends[k]) - OPTIONS.steps(OPTIONS.approach_time))
-                found += [(p.chain.index(n), t) for n in names for t in range(first + 1, last + 1)]
-    return found
 
 
 def iterate_waypoint_rows(point: ProgramPoint) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -135,7 +119,8 @@ def compute_relaxed_rows(p: TrajectoryProblem, path: np.ndarray, gears: np.ndarr
             steered = [gears[k - 1] * x - radius * turn, gears[k - 1] * x + radius * turn]
             steered = steered if p.chain.robot.base == "ackermann" else []
             rows += [(v, k) for v in (y, *steered, x - arm * turn, x + arm * turn)]
-    rows += [(path[k, c] - path[k - 1, c], k) for c, k in find_clamped_steps(p)]
+    for c, first, last in p.transcription.structure.clamped:
+        rows += [(path[k, c] - path[k - 1, c], k) for k in range(first + 1, last + 1)]
     for phase, end in zip(p.task.phases, p.ends.tolist(), strict=True):
         for name, sign in phase.pushed.items():
             c, steps = p.chain.index(name), range(end - phase.segments + 1, end + 1)

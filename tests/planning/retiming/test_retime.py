@@ -14,91 +14,83 @@ from vkc_pin.planning.retiming.limits import Limits
 from vkc_pin.planning.retiming.retime import retime_trajectory
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
+SCENE = load_door_scene()
 
-def check_limits(scene: vkc.Scene, motion: Trajectory, *, tolerance: float = 1e-5) -> None:
+
+def check_limits(motion: Trajectory, *, scene: vkc.Scene = SCENE, tolerance: float = 1e-5) -> None:
     times = np.arange(motion.times[0], motion.times[-1], 1e-3)
     lower, upper, velocity, acceleration, _ = Limits.from_scene(scene, motion.names, 0.0)
-    places = motion(times)
+    places, rates = motion(times), motion.velocity(times + 5e-4)[:-1]
     assert (places >= lower - tolerance).all()
     assert (places <= upper + tolerance).all()
     assert (np.abs(motion.velocity(times)) <= velocity * (1 + 1e-6)).all()
     assert (np.abs(motion.acceleration(times)) <= acceleration * (1 + 1e-6)).all()
-    np.testing.assert_allclose(
-        np.diff(places, axis=0) / 1e-3, motion.velocity(times + 5e-4)[:-1], atol=1e-3
-    )
+    np.testing.assert_allclose(np.diff(places, axis=0) / 1e-3, rates, atol=1e-3)
     np.testing.assert_array_equal(motion.velocity(motion.times[[0, -1]]), 0.0)
 
 
-def sample_trajectory(scene: vkc.Scene, seed: int = 0, count: int = 12) -> Trajectory:
+def sample_trajectory(seed: int = 0, count: int = 12) -> Trajectory:
     """Return a trajectory of the robot through random waypoints near its start."""
-    steps = np.random.default_rng(seed).normal(size=(count, len(scene.start))) * 0.2
-    rows = np.asarray(scene.start) + np.concatenate(
-        [np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)]
-    )
-    rows = np.clip(rows, scene.robot.lower, scene.robot.upper)
+    start, robot = np.asarray(SCENE.start), SCENE.robot
+    steps = 0.2 * np.random.default_rng(seed).normal(size=(count, len(start)))
+    rows = start + np.vstack([np.zeros(len(start)), np.cumsum(steps, axis=0)])
+    rows = np.clip(rows, robot.lower, robot.upper)
     phases = (vkc.PhaseSpan("go", 0, count),)
-    return Trajectory(
-        scene.robot.coordinates.names, np.arange(count + 1.0), rows, phases, rows.shape[1]
-    )
+    return Trajectory(robot.coordinates.names, np.arange(count + 1.0), rows, phases, len(start))
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_limits_hold_between_random_waypoints(seed: int) -> None:
     """Sharp turns near position limits may exceed them slightly."""
-    scene = vkc.load_scene("door")
-    slow = sample_trajectory(scene, seed)
-    motion = retime_trajectory(scene, slow)
+    slow = sample_trajectory(seed)
+    motion = retime_trajectory(SCENE, slow)
     np.testing.assert_array_equal(motion.positions, slow.positions)
     np.testing.assert_allclose(motion(motion.times), slow.positions, atol=1e-12)
-    check_limits(scene, motion, tolerance=1e-3)
+    check_limits(motion, tolerance=1e-3)
 
 
 def test_steps_without_motion_are_waits() -> None:
-    scene = vkc.load_scene("door")
-    slow = sample_trajectory(scene)
+    slow = sample_trajectory()
     rows = np.insert(slow.positions, 6, slow.positions[6], axis=0)
     spans = (vkc.PhaseSpan("reach", 0, 6), vkc.PhaseSpan("hold", 6, 13))
     times = np.concatenate([np.arange(7.0), [6.7], np.arange(7.7, 13.0)])
     slow = dataclasses.replace(slow, times=times, positions=rows, phases=spans)
-    motion = retime_trajectory(scene, slow)
+    motion = retime_trajectory(SCENE, slow)
     assert motion.times[7] - motion.times[6] == pytest.approx(0.7)
     inside = np.linspace(motion.times[6], motion.times[7], 50)
     np.testing.assert_allclose(motion.velocity(inside), 0.0, atol=1e-12)
-    check_limits(scene, motion)
-    one = retime_trajectory(scene, dataclasses.replace(slow, phases=(vkc.PhaseSpan("go", 0, 13),)))
+    check_limits(motion)
+    one = retime_trajectory(SCENE, dataclasses.replace(slow, phases=(vkc.PhaseSpan("go", 0, 13),)))
     assert one.times[7] - one.times[6] < 0.01
 
 
 def test_stationary_trajectory_is_kept() -> None:
-    scene = vkc.load_scene("door")
-    still = sample_trajectory(scene)
+    still = sample_trajectory()
     still = dataclasses.replace(still, positions=np.tile(still.positions[:1], (13, 1)))
-    motion = retime_trajectory(scene, still)
+    motion = retime_trajectory(SCENE, still)
     assert motion.times[-1] == pytest.approx(1.0, abs=0.05)
-    np.testing.assert_allclose(
-        motion(np.linspace(0.0, 1.0, 30)), np.tile(still.positions[0], (30, 1)), atol=1e-12
-    )
+    places = motion(np.linspace(0.0, 1.0, 30))
+    np.testing.assert_allclose(places - still.positions[0], 0.0, atol=1e-12)
 
 
 def test_more_parts_keep_the_path_straighter() -> None:
-    scene = vkc.load_scene("door")
-    slow = sample_trajectory(scene, 5)
+    slow = sample_trajectory(5)
     deviations = []
     for parts in (1, 8):
-        motion = retime_trajectory(scene, slow, np.full(12, parts))
+        motion = retime_trajectory(SCENE, slow, np.full(12, parts))
         np.testing.assert_array_equal(motion.positions, slow.positions)
         fine = motion(np.linspace(motion.times[4], motion.times[5], 200))
         step = slow.positions[5] - slow.positions[4]
         along = np.clip((fine - slow.positions[4]) @ step / (step @ step), 0.0, 1.0)
         deviations.append(np.abs(fine - slow.positions[4] - along[:, None] * step).max())
-        check_limits(scene, motion)
+        check_limits(motion)
     assert deviations[-1] < 0.2 * deviations[0]
 
 
 def test_planned_motion_keeps_its_limits(door_plan: vkc.Plan) -> None:
     """The hinge rests while the knob turns, and the arm stops between the two."""
     motion = door_plan.trajectory
-    check_limits(door_plan.scene, motion)
+    check_limits(motion, scene=door_plan.scene)
     assert door_plan.success
     assert door_plan.report.closure_error < 1e-3
     turn = next(phase for phase in motion.phases if phase.name.startswith("turn"))
@@ -119,16 +111,14 @@ def test_velocity_constraints_prevent_retiming() -> None:
 @pytest.mark.parametrize("gap", [0.0, 1e-6, 2e-6, 1e-5, 3e-4])
 def test_tiny_step_costs_no_more_than_a_stop(gap: float, jerk_time: float) -> None:
     """A waypoint beside another does not slow down the motion, even with small jerk limits."""
-    scene = vkc.load_scene("door")
-    slow = sample_trajectory(scene)
+    slow = sample_trajectory()
     rows = np.insert(slow.positions, 6, slow.positions[6], axis=0)
     rows[7, 5] += gap
-    twice = Trajectory(
-        slow.names, np.arange(14.0), rows, (vkc.PhaseSpan("go", 0, 13),), rows.shape[1]
-    )
-    once = retime_trajectory(scene, slow, jerk_time=jerk_time)
-    motion = retime_trajectory(scene, twice, jerk_time=jerk_time)
+    phases = (vkc.PhaseSpan("go", 0, 13),)
+    twice = dataclasses.replace(slow, times=np.arange(14.0), positions=rows, phases=phases)
+    once = retime_trajectory(SCENE, slow, jerk_time=jerk_time)
+    motion = retime_trajectory(SCENE, twice, jerk_time=jerk_time)
     np.testing.assert_array_equal(motion.positions, rows)
     assert motion.times[-1] <= once.times[-1] + 2.0 + 2.0 * jerk_time
-    limits = Limits.from_scene(scene, motion.names, jerk_time)
+    limits = Limits.from_scene(SCENE, motion.names, jerk_time)
     assert limits.compute_slowdown(motion.curve) <= 1.0 + 1e-6  # type: ignore[arg-type]

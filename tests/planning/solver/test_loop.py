@@ -291,22 +291,6 @@ def test_exhausted_time_returns_the_guess_within_bounds() -> None:
     assert solution.shortfall == 0.0  # it was not evaluated
 
 
-def test_evaluation_limit_is_deterministic() -> None:
-    """The best iterate is returned; a sufficient budget changes nothing."""
-    with Budget().activate() as budget:
-        whole = solve(*make_pillar_case())
-    cut = []
-    for fraction in (0.8, 0.8, 1.0):
-        with Budget(max_evaluations=int(fraction * budget.evaluations)).activate():
-            cut.append(solve(*make_pillar_case()))
-    np.testing.assert_array_equal(cut[2].z, whole.z)
-    assert cut[2].converged
-    assert cut[0].status == "evaluation limit"
-    assert 0 < cut[0].rounds < whole.rounds
-    assert (cut[0].rounds, cut[0].iterations) == (cut[1].rounds, cut[1].iterations)
-    np.testing.assert_array_equal(cut[0].z, cut[1].z)
-
-
 def test_feasible_motion_is_kept_if_the_budget_ends() -> None:
     used: list[int] = []
     with Budget().activate() as budget:

@@ -34,7 +34,6 @@ from helpers.small_problems import (
 from helpers.supports import describe_cup, make_plate_scene, make_scene
 
 from vkc_pin.errors import InputError
-from vkc_pin.options import Options
 from vkc_pin.planning.chain.collision_pairs import REDUCED_MARGIN_RATIO
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.world.models.shapes import get_link_name
@@ -247,15 +246,15 @@ def test_short_phases_begin_and_end_with_reduced_margins() -> None:
 
 
 CABINET_FRAME = ("cabinet.case", "cabinet.lid")
-MARGIN, CLOSE = SHORT.dist_safe, SHORT.grasp_clearance
+MARGIN, CLOSE, SELF = SHORT.dist_safe, SHORT.grasp_clearance, 0.015
 
 
 @cache
 def make_door_problem() -> TrajectoryProblem:
     """Return the problem of opening the door and driving away: reach, turn, move, go to."""
-    return make_program(
-        load_door_scene(), [Actuate("door", {"hinge": 1.2}), GoTo(0.0, 0.0)], options=SHORT
-    )
+    steps = [Actuate("door", {"hinge": 1.2}), GoTo(0.0, 0.0)]
+    options = dataclasses.replace(SHORT, self_distance=SELF)
+    return make_program(load_door_scene(), steps, options=options)
 
 
 def list_pairs(
@@ -315,7 +314,7 @@ def test_pairs_of_every_phase(phase: int) -> None:
     assert len({frozenset(pair) for pair in part.pairs.tolist()}) == len(part.pairs)
     for (first, second), margins in list_pairs(problem, phase).items():
         close = held and first in hand and second.startswith("door.")
-        assert set(margins) == {CLOSE if close else MARGIN}
+        assert set(margins) == {SELF if second in robot else CLOSE if close else MARGIN}
 
 
 @pytest.mark.parametrize(
@@ -394,16 +393,6 @@ def test_scene_without_collision_geometry_is_rejected() -> None:
     empty = dataclasses.replace(scene, robot=robot, objects={}, obstacles=(), obstacle_labels=())
     with pytest.raises(InputError, match="no pair"):
         make_program(empty, [GoTo(0.0, 0.0)], options=SHORT)
-
-
-def test_margins_follow_the_options() -> None:
-    options = Options(dist_safe=0.05, self_distance=0.03, grasp_clearance=0.01, reach_waypoints=2)
-    for steps in ([GoTo(0.0, 0.0)], [Grasp("door", "handle_free")]):
-        problem = make_program(load_door_scene(), steps, options=options)
-        margins = {
-            margin for found in list_pairs(problem, 0, waypoint=2).values() for margin in found
-        }
-        assert margins == {0.05, 0.03, *([0.01] if isinstance(steps[0], Grasp) else [])}
 
 
 def make_drawers(*, opening: float = 0.0) -> Scene:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from functools import cache
 
@@ -17,6 +18,8 @@ from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Release, Step
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 ASIDE = lift(STICK, [0.0, 0.5, 0.0])
+HELD = {"stick": "grip"}
+HELD_BALL = {**HELD, "ball": "pull"}
 
 
 @cache
@@ -30,10 +33,9 @@ def make_place_problem() -> TrajectoryProblem:
     return make_program(make_room(describe_table()), [Place("stick", ASIDE)], options=SHORT)
 
 
-def make_random_motion(problem: TrajectoryProblem, seed: int = 0) -> tuple[np.ndarray, Trajectory]:
-    z = sample_configurations(
-        problem.chain.lower, problem.chain.upper, problem.segments, np.random.default_rng(seed)
-    )
+def make_random_motion(problem: TrajectoryProblem) -> tuple[np.ndarray, Trajectory]:
+    lower, upper, rng = problem.chain.lower, problem.chain.upper, np.random.default_rng(0)
+    z = sample_configurations(lower, upper, problem.segments, rng)
     return z, make_trajectory(problem, z, problem.timing_for(problem.still).dt)
 
 
@@ -47,26 +49,29 @@ def find_pauses(problem: TrajectoryProblem, motion: Trajectory) -> list[int]:
     return (np.flatnonzero(still) + 1).tolist()
 
 
-def test_phases_list_attached_objects() -> None:
-    _, motion = make_random_motion(make_fetch_problem())
-    names = ["reach ball.pull by stick.tip", "place ball", "go to"]
-    assert [phase.name for phase in motion.phases] == names
-    stick, both = {"stick": "grip"}, {"stick": "grip", "ball": "pull"}
-    assert [dict(phase.held) for phase in motion.phases] == [stick, both, stick]
-    assert [phase["by"] for phase in motion.to_dict()["phases"]] == [{}, {"ball": "stick.tip"}, {}]
+@pytest.mark.parametrize(
+    ("make", "phases"),
+    [
+        (
+            make_fetch_problem,
+            {"reach ball.pull by stick.tip": HELD, "place ball": HELD_BALL, "go to": HELD},
+        ),
+        # the last object is released at the end
+        (make_place_problem, {"reach stick.grip": {}, "place stick": HELD, "let go": {}}),
+    ],
+)
+def test_phases_list_attached_objects(
+    make: Callable[[], TrajectoryProblem], phases: dict[str, dict[str, str]]
+) -> None:
+    _, motion = make_random_motion(make())
+    assert {phase.name: dict(phase.held) for phase in motion.phases} == phases
+    for phase, data in zip(motion.phases, motion.to_dict()["phases"], strict=True):
+        assert data["by"] == ({"ball": "stick.tip"} if "ball" in dict(phase.held) else {})
     n = SHORT.reach_waypoints
-    assert [phase.first for phase in motion.phases] == [0, n, 2 * n + 1]
-    assert [phase.last for phase in motion.phases] == [n, 2 * n + 1, 3 * n + 2]
-    assert find_pauses(make_fetch_problem(), motion) == [n + 1, 2 * n + 2]
-
-
-def test_last_object_is_released_at_the_end() -> None:
-    _, motion = make_random_motion(make_place_problem())
-    assert [phase.name for phase in motion.phases] == ["reach stick.grip", "place stick", "let go"]
-    assert [dict(phase.held) for phase in motion.phases] == [{}, {"stick": "grip"}, {}]
-    n = SHORT.reach_waypoints
-    assert find_pauses(make_place_problem(), motion) == [n + 1, 2 * n + 2]
-    assert motion.phases[-1].last == len(motion.times) - 1
+    ends = [0, n, 2 * n + 1, len(motion.times) - 1]
+    spans = [(phase.first, phase.last) for phase in motion.phases]
+    assert spans == list(itertools.pairwise(ends))
+    assert find_pauses(make(), motion) == [n + 1, 2 * n + 2]
 
 
 @pytest.mark.parametrize(
@@ -101,10 +106,8 @@ def test_robot_waits_only_for_the_gripper() -> None:
 def test_object_grasped_at_the_start_is_released_first() -> None:
     """A door grasped at the start is attached in no phase; its grasp keeps its value."""
     for attachment in ("handle", "handle_free"):
-        problem = make_program(
-            load_door_scene().with_held({"door": attachment}), [GoTo(0.0, 0.0)], options=SHORT
-        )
-        motion = make_random_motion(problem)[1]
+        scene = load_door_scene().with_held({"door": attachment})
+        _, motion = make_random_motion(make_program(scene, [GoTo(0.0, 0.0)], options=SHORT))
         assert [dict(phase.held) for phase in motion.phases] == [{}]
     assert np.all(motion.column("door.handle_free") == 0.0)
 

@@ -353,38 +353,32 @@ def test_objects_keep_the_state_of_earlier_phases() -> None:
     problem = make_door_problem()
     knob = problem.task.phases[3].initial_values["door.knob"]
     for phase, state in ((0, {}), (3, {"hinge": 1.2, "knob": knob})):
-        part = problem.contacts.phases[phase]
-        shapes = {s.name: s.placement for s in part.shapes if s.parentJoint == 0}
+        shapes = {shape.name: shape.placement for shape in problem.contacts.phases[phase].shapes}
         for shape in make_world_shapes(problem.scene.objects["door"].with_state(state)):
             assert shapes[f"door.{shape.name}"].isApprox(shape.placement, 1e-9)
 
 
 def test_grasped_object_is_paired_with_other_objects() -> None:
-    """Its branches that do not move, case and lid, are obstacles to the robot only."""
-    problem = make_program(make_full_scene(), [Actuate("cabinet", {"swing": 0.5})], options=SHORT)
-    robot, held = set(problem.scene.robot.links), {f"cabinet.{k}" for k in ("arm", "tray", "flap")}
+    """Its branches that do not move are obstacles to the robot, and to links that can hit them."""
+    placed = make_full_scene().objects["cabinet"]
+    colliding = frozenset({frozenset({"arm", "flap"}), frozenset({"tray", "lid"})})
+    item = dataclasses.replace(placed.object, own_pairs=colliding)
+    placed = dataclasses.replace(placed, object=item)
+    scene = replace_objects(make_full_scene(), {"cabinet": placed})
+    problem = make_program(scene, [Actuate("cabinet", {"swing": 0.5})], options=SHORT)
+    robot, held = set(scene.robot.links), {f"cabinet.{k}" for k in ("arm", "tray", "flap")}
     others = {"door.frame", "door.panel", "door.lever", "drawer.cabinet", "drawer.tray"}
-    others |= set(problem.scene.obstacle_names)
+    others |= set(scene.obstacle_names)
     counts, found = count_shapes(problem), count_link_pairs(problem, 1)
     expected = {(link, other) for link in held for other in others}
     expected |= {(link, k) for link in robot for k in (*held, *others, *CABINET_FRAME)}
+    own = {("cabinet.arm", "cabinet.flap"), ("cabinet.tray", "cabinet.lid")}
     assert {key: count for key, count in found.items() if key[1] != FLOOR} == {
-        key: counts[key[0]] * counts[key[1]] for key in expected
+        key: counts[key[0]] * counts[key[1]] for key in expected | own
     }
     assert {first for first, second in found if second == FLOOR} <= robot
-
-
-def test_links_of_a_grasped_object_that_can_collide_are_paired() -> None:
-    colliding = frozenset({frozenset({"arm", "flap"}), frozenset({"tray", "lid"})})
-    placed = make_full_scene().objects["cabinet"]
-    placed = dataclasses.replace(
-        placed, object=dataclasses.replace(placed.object, own_pairs=colliding)
-    )
-    scene = replace_objects(make_full_scene(), {"cabinet": placed})
-    found = list_pairs(make_program(scene, [Actuate("cabinet", {"swing": 0.5})], options=SHORT), 1)
-    own = {key: found[key] for key in found if all(k.startswith("cabinet.") for k in key)}
-    assert {frozenset(link.removeprefix("cabinet.") for link in key) for key in own} == colliding
-    assert all(set(margins) == {MARGIN} for margins in own.values())
+    margins = list_pairs(problem, 1)
+    assert all(set(margins[pair]) == {MARGIN} for pair in own)
 
 
 def test_scene_without_collision_geometry_is_rejected() -> None:

@@ -159,20 +159,6 @@ def test_derivatives_equal_differences(name: str) -> None:
     make_random_point(make_problem(name), seed=1).check_derivatives()
 
 
-@pytest.mark.parametrize("name", ["differential", "ackermann"])
-def test_bounds_of_wheel_rows(name: str) -> None:
-    """No lateral motion; forward arcs of at least the turning radius; limited wheel travel."""
-    p = make_problem(name)
-    timing, at = p.timing_for(p.still), p.transcription.base_rows
-    lower, upper = (bound[at].reshape(p.segments, -1) for bound in p.row_bounds(timing))
-    assert not upper[:, 0].any()
-    np.testing.assert_array_equal(lower[:, :-2], 0.0)
-    assert np.isinf(upper[:, 1:-2]).all()
-    np.testing.assert_allclose(upper[:, -2:], OPTIONS.dt, rtol=1e-4)  # at 1 m/s
-    np.testing.assert_array_equal(lower[:, -2:], -upper[:, -2:])
-    assert np.isinf(p.row_bounds(None)[1][at].reshape(p.segments, -1)[:, -2:]).all()
-
-
 # --- relaxation
 # ------------------------------------------------------------------------------------------------
 

@@ -22,6 +22,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.validation.tolerances import Tolerances
+from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.compiler import LATCH_MARGIN
@@ -135,6 +136,13 @@ def test_base_goal_without_heading_leaves_it_free() -> None:
     problem = make_program(load_door_scene(), [GoTo(-0.5, 0.1)], options=SHORT)
     assert problem.lower[-1, :3].tolist() == [-0.5, 0.1, -np.inf]
     assert problem.upper[-1, :3].tolist() == [-0.5, 0.1, np.inf]
+
+
+def test_fixed_base_stays_at_the_start() -> None:
+    scene = dataclasses.replace(load_door_scene(), robot=load_robot("husky_ur5e", base="fixed"))
+    problem = make_program(scene, [Reach(POSE)], options=SHORT)
+    for bound in (problem.lower, problem.upper):
+        assert (bound[:, :3] == scene.start[:3]).all()
 
 
 def test_start_is_the_state_of_the_scene() -> None:

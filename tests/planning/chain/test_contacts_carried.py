@@ -65,21 +65,17 @@ def list_partners(problem: TrajectoryProblem, phase: int, label: str) -> set[str
 
 def test_carried_objects_are_paired_with_everything_but_the_hand() -> None:
     """Resting objects are paired with the robot and carried objects only."""
-    robot = make_scene().robot
+    problem, robot = make_placing_problem(), make_scene().robot
+    links, hand = set(robot.links), set(robot.touch_links)
     for phase in (0, 2):
         for label in ("stick.stick", "stick.tip", "ball.ball"):
-            assert list_partners(make_placing_problem(), phase, label) == set(robot.links)
-    assert list_partners(make_placing_problem(), 1, "ball.ball") == {
-        *robot.links,
-        "stick.stick",
-        "stick.tip",
-    }
-    for label in ("stick.stick", "stick.tip"):
-        hand = set(robot.touch_links) if label == "stick.stick" else set()
-        others = {"ball.ball", "table", "stand", FLOOR}
-        assert list_partners(make_placing_problem(), 1, label) == (set(robot.links) - hand) | others
-    for (first, second), found in list_margins(make_placing_problem(), 1).items():
-        assert found == {CLOSE if first in robot.touch_links and second == "stick.tip" else MARGIN}
+            assert list_partners(problem, phase, label) == links
+    others = {"ball.ball", "table", "stand", FLOOR}
+    assert list_partners(problem, 1, "stick.stick") == (links - hand) | others
+    assert list_partners(problem, 1, "stick.tip") == links | others
+    assert list_partners(problem, 1, "ball.ball") == links | {"stick.stick", "stick.tip"}
+    for (first, second), found in list_margins(problem, 1).items():
+        assert found == {CLOSE if first in hand and second == "stick.tip" else MARGIN}
 
 
 def test_grasping_object_may_touch_the_grasped_one() -> None:

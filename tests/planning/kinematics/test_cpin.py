@@ -157,11 +157,9 @@ def test_rounded_quarter_turns_add_no_instructions() -> None:
     exact = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     counts = []
     for rotation in (exact, pin.rpy.rpyToMatrix(0, 0, np.pi / 2)):
-        model, parent = pin.Model(), 0
-        for i in range(6):
-            parent = model.addJoint(
-                parent, pin.JointModelRX(), pin.SE3(rotation, np.array([0.1, 0, 0])), f"j{i}"
-            )
+        model, placement = pin.Model(), pin.SE3(rotation, np.array([0.1, 0, 0]))
+        for joint in range(6):
+            model.addJoint(joint, pin.JointModelRX(), placement, f"j{joint}")
         counts.append(cpin.joint_placements(model).n_instructions())
     assert counts[0] == counts[1]
     planar = make_tree("planar")
@@ -218,16 +216,6 @@ def test_only_patch_releases_are_compatible(installed: str, message: str) -> Non
         backends.check_versions(built, {**patched, "pin": installed})
 
 
-def test_missing_extension_raises_an_error_that_names_the_compiler(
-    monkeypatch: pytest.MonkeyPatch, arm: pin.Model
-) -> None:
-    monkeypatch.setitem(sys.modules, "vkc_pin.planning.kinematics._cpin", None)
-    backends._import_extension.cache_clear()
-    with pytest.raises(BuildError, match=r"apt install g\+\+"):
-        backends.build_compiled("joint_placements", arm)
-    backends._import_extension.cache_clear()
-
-
 def test_upstream_backend_is_used_if_available(monkeypatch: pytest.MonkeyPatch) -> None:
     for module, name in ((types.ModuleType("pinocchio.casadi"), "upstream"), (None, "compiled")):
         monkeypatch.setitem(sys.modules, "pinocchio.casadi", module)
@@ -266,10 +254,6 @@ import sys, casadi, pinocchio, vkc_pin.planning.kinematics as cpin
 assert "vkc_pin.planning.kinematics._cpin" not in sys.modules
 model = pinocchio.Model()
 model.addJoint(0, pinocchio.JointModelRZ(), pinocchio.SE3.Identity(), "j")
-print(cpin.joint_placements(model)(0.5)[0])
+assert abs(cpin.joint_placements(model)(0.5)[0] - {np.cos(0.5)}) < 1e-12
 """
-    process = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert process.returncode == 0, process.stderr
-    assert float(process.stdout) == pytest.approx(np.cos(0.5))
+    subprocess.run([sys.executable, "-c", code], timeout=60, check=True)

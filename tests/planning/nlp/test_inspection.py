@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.carrying import describe_stand, make_room
+from helpers.carrying import STICK, describe_stand, make_room
 from helpers.small_problems import SHORT, make_program
 
 import vkc_pin as vkc
@@ -33,8 +33,7 @@ def z(problem: TrajectoryProblem) -> np.ndarray:
 
 def test_sizes_add_up() -> None:
     low = vkc.Constraint("low", lambda s: s.coordinate("base_x"), upper=5.0, during=["go to"])
-    pose = make_program(make_room(describe_stand()), [vkc.Grasp("stick")], options=SHORT).targets[0]
-    steps = [vkc.Grasp("stick"), vkc.GoTo(0.0, 0.0), vkc.Reach(pose), vkc.Reach(pose)]
+    steps = [vkc.Grasp("stick"), vkc.GoTo(0.0, 0.0), vkc.Reach(STICK), vkc.Reach(STICK)]
     problem = make_program(make_room(describe_stand()), steps, options=SHORT, terms=[low])
     found, t = sizes(problem), problem.transcription
     for kind, total in (

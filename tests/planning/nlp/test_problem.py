@@ -43,19 +43,6 @@ def opening() -> TrajectoryProblem:
     return make_program(load_door_scene(), steps, options=SHORT)
 
 
-@pytest.fixture(scope="module")
-def two_grasps() -> TrajectoryProblem:
-    return make_program(
-        make_full_scene(), [Grasp("cabinet", "ball"), PULL, Reach(POSE)], options=SHORT
-    )
-
-
-@pytest.fixture(scope="module")
-def fetching() -> TrajectoryProblem:
-    steps = [Grasp("ball", "pull", "stick.tip"), Place("ball", (0.8, 0.6, 0.7)), Release("stick")]
-    return make_program(make_scene_with_held_stick(), [*steps, GoTo(0.0, 0.0)], options=SHORT)
-
-
 def get_bounds(problem: TrajectoryProblem, name: str) -> np.ndarray:
     """Return the bounds of a coordinate at each waypoint after the start, shape (N, 2)."""
     index = problem.chain.index(name)
@@ -87,22 +74,21 @@ def test_object_joints_are_fixed_until_they_are_moved(opening: TrajectoryProblem
     assert np.all(knob[[turn - 1, *range(move - 1, last)]] == turned)
 
 
-def test_grasped_objects_do_not_move_and_freedoms_have_limits(
-    two_grasps: TrajectoryProblem,
-) -> None:
-    assert np.all(get_bounds(two_grasps, "drawer.handle_free") == (-0.6, 0.6))
+def test_grasped_objects_do_not_move_and_freedoms_have_limits() -> None:
+    steps = [Grasp("cabinet", "ball"), PULL, Reach(POSE)]
+    problem = make_program(make_full_scene(), steps, options=SHORT)
+    assert np.all(get_bounds(problem, "drawer.handle_free") == (-0.6, 0.6))
     for letter in "xyz":
-        assert np.all(get_bounds(two_grasps, f"cabinet.ball_{letter}") == (-0.7, 0.6))
-    assert np.all(get_bounds(two_grasps, "cabinet.swing") == 0.3)
-    slide = get_bounds(two_grasps, "drawer.slide")
-    first, last = two_grasps.ends[1:3]
+        assert np.all(get_bounds(problem, f"cabinet.ball_{letter}") == (-0.7, 0.6))
+    assert np.all(get_bounds(problem, "cabinet.swing") == 0.3)
+    slide = get_bounds(problem, "drawer.slide")
+    first, last = problem.ends[1:3]
     assert np.all(slide[:first] == 0.0)
     assert np.all(slide[first : last - 1] == (0.0, 0.4))
     assert np.all(slide[last - 1 :] == 0.2)
     lengths = {"base_x", "base_y", "drawer.slide", "cabinet.slide"}
-    units = {name: two_grasps.unit(name) for name in two_grasps.chain.names}
-    assert {name for name, unit in units.items() if unit == "m"} == lengths
-    assert set(units.values()) == {"m", "rad"}
+    for name in problem.chain.names:
+        assert problem.unit(name) == ("m" if name in lengths else "rad")
 
 
 def test_robot_stays_within_its_limits_and_the_arena(opening: TrajectoryProblem) -> None:
@@ -306,24 +292,27 @@ def test_free_objects_are_grasped_at_their_resting_poses() -> None:
     assert not any(problem.is_closed(phase) for phase in problem.task.phases)
 
 
-def test_initially_held_object_stays_in_the_hand(fetching: TrajectoryProblem) -> None:
+def test_initially_held_object_stays_in_the_hand() -> None:
     """Clamped freedoms keep the scene's values until the release."""
-    assert [(goal.name, goal.row.kind) for goal in fetching.pose_goals] == [
+    steps = [Grasp("ball", "pull", "stick.tip"), Place("ball", (0.8, 0.6, 0.7)), Release("stick")]
+    scene = make_scene_with_held_stick()
+    problem = make_program(scene, [*steps, GoTo(0.0, 0.0)], options=SHORT)
+    assert [(goal.name, goal.row.kind) for goal in problem.pose_goals] == [
         ("grasp ball.pull by stick.tip", "pose"),
         ("approach ball.pull by stick.tip", "pose"),
         ("goal ball.ball", "upright"),
     ]
-    until = fetching.ends[1]
+    until = problem.ends[1]
     for name, value, limit in (("slide", 0.02, 0.095), ("turn", -0.1, 1.2)):
-        column = f"stick.grip_{name}"
-        assert fetching.start[fetching.chain.index(column)] == value
-        assert np.all(get_bounds(fetching, column)[:until] == value)
-        assert np.all(get_bounds(fetching, column)[until:] == (-limit, limit))
-    chosen = [fetching.chain.index(f"ball.pull_{axis}") for axis in "zyx"]
-    assert fetching.choices == tuple((column, REACH, 2 * REACH) for column in chosen)
+        bounds = get_bounds(problem, f"stick.grip_{name}")
+        assert problem.start[problem.chain.index(f"stick.grip_{name}")] == value
+        assert np.all(bounds[:until] == value)
+        assert np.all(bounds[until:] == (-limit, limit))
+    chosen = [problem.chain.index(f"ball.pull_{axis}") for axis in "zyx"]
+    assert problem.choices == tuple((column, REACH, 2 * REACH) for column in chosen)
     # they change only while grasping, at negligible cost
-    weight = 1e-4 * fetching.options.velocity_weight_object
-    np.testing.assert_allclose(fetching.motion_cost.metric[chosen], weight, rtol=1e-12)
+    weight = 1e-4 * problem.options.velocity_weight_object
+    np.testing.assert_allclose(problem.motion_cost.metric[chosen], weight, rtol=1e-12)
 
 
 def test_loose_grasps_are_not_clamped() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from helpers.drives import make_hall, make_trajectory
@@ -21,9 +23,11 @@ SCALE = np.array([1.0, 1.0, 0.5, 0.3])
 TANK = RollingLimits(track=1.0, wheel_speed=1.0)
 
 
-def make_arcs(steps: list[tuple[float, float]]) -> np.ndarray:
+def make_arcs(
+    steps: list[tuple[float, float]], *, start: Sequence[float] = (0.3, -0.2, 0.9)
+) -> np.ndarray:
     """Return poses reached by arcs of given lengths [m] and turns [rad], and another coordinate."""
-    poses = [np.array([0.3, -0.2, 0.9, 0.0])]
+    poses = [np.array([*start, 0.0])]
     for length, turn in steps:
         displacement = length * np.sinc(turn / (2 * np.pi)) * np.exp(1j * (poses[-1][2] + turn / 2))
         poses.append(poses[-1] + [displacement.real, displacement.imag, turn, 0.1])
@@ -111,13 +115,9 @@ SCENES = {
 
 def make_drive(base: str) -> Trajectory:
     scene = SCENES[base]
-    poses = make_arcs(
-        [(0.2, 0.0), (0.25, 0.1), (0.25, 0.2), (0.25, 0.25), (-0.1, 0.05), (-0.25, -0.2)]
-    )
-    rows = np.tile(scene.start, (len(poses), 1))
-    rows[:, :3] = poses[:, :3] - poses[0, :3]
-    turned = np.exp(-0.9j) * (rows[:, 0] + 1j * rows[:, 1])
-    rows[:, 0], rows[:, 1] = turned.real, turned.imag
+    steps = [(0.2, 0.0), (0.25, 0.1), (0.25, 0.2), (0.25, 0.25), (-0.1, 0.05), (-0.25, -0.2)]
+    rows = np.tile(scene.start, (len(steps) + 1, 1))
+    rows[:, :3] = make_arcs(steps, start=[0.0, 0.0, 0.0])[:, :3]
     rows[:, 3] += np.linspace(0.0, 0.4, len(rows))
     return retime_trajectory(scene, make_trajectory(scene, rows, dt=1.0))
 

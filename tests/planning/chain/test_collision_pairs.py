@@ -22,6 +22,7 @@ from helpers.carrying import (
     solve_above,
     solve_reach,
 )
+from helpers.pair_margins import list_pair_margins
 from helpers.small_problems import (
     SHORT,
     get_margins,
@@ -257,28 +258,13 @@ def make_door_problem() -> TrajectoryProblem:
     return make_program(load_door_scene(), steps, options=options)
 
 
-def list_pairs(
-    problem: TrajectoryProblem, phase: int, *, waypoint: int | None = None
-) -> dict[tuple[str, str], list[float]]:
-    """Return (link, link or obstacle) → margins of their pairs at a waypoint, or unreduced."""
-    part = problem.contacts.phases[phase]
-    all_pairs = np.arange(len(part.pairs))
-    margins = (
-        part.margins
-        if waypoint is None
-        else get_margins(part, all_pairs, np.full(len(all_pairs), waypoint))
-    )
-    found = collections.defaultdict(list)
-    for (first, second), margin in zip(part.pairs, margins, strict=True):
-        found[part.labels[first], part.labels[second]].append(float(margin))
-    return dict(found)
-
-
 def count_link_pairs(problem: TrajectoryProblem, phase: int) -> dict[tuple[str, str], int]:
     """Return (link, link or obstacle) → number of pairs, without the robot's own pairs."""
     robot = set(problem.scene.robot.links)
     return {
-        key: len(found) for key, found in list_pairs(problem, phase).items() if key[1] not in robot
+        key: len(found)
+        for key, found in list_pair_margins(problem, phase).items()
+        if key[1] not in robot
     }
 
 
@@ -312,7 +298,7 @@ def test_pairs_of_every_phase(phase: int) -> None:
     own = {tuple(pair) for pair in part.pairs.tolist() if max(pair) < len(shapes)}
     assert own == {(pair.first, pair.second) for pair in scene.robot.collision.collisionPairs}
     assert len({frozenset(pair) for pair in part.pairs.tolist()}) == len(part.pairs)
-    for (first, second), margins in list_pairs(problem, phase).items():
+    for (first, second), margins in list_pair_margins(problem, phase).items():
         close = held and first in hand and second.startswith("door.")
         assert set(margins) == {SELF if second in robot else CLOSE if close else MARGIN}
 
@@ -344,7 +330,9 @@ def test_hand_has_the_clearance_of_its_attachment_from_before_grasp_to_after_rel
         (3, release + NEAR, True),
         (3, release + NEAR + 1, False),
     ):
-        for (first, second), margins in list_pairs(problem, phase, waypoint=waypoint).items():
+        for (first, second), margins in list_pair_margins(
+            problem, phase, waypoint=waypoint
+        ).items():
             is_reduced = is_near and first in hand and second.startswith("door.")
             assert set(margins) == {expected if is_reduced else MARGIN}
 
@@ -377,7 +365,7 @@ def test_grasped_object_is_paired_with_other_objects() -> None:
         key: counts[key[0]] * counts[key[1]] for key in expected | own
     }
     assert {first for first, second in found if second == FLOOR} <= robot
-    margins = list_pairs(problem, 1)
+    margins = list_pair_margins(problem, 1)
     assert all(set(margins[pair]) == {MARGIN} for pair in own)
 
 
@@ -435,7 +423,7 @@ def test_exemptions_remove_pairs_or_reduce_margins(
     exemption = {"pair": ["near.tray", "next.tray"], **fields}
     document = {**make_drawers().document, "allow": [exemption]}
     problem, number = make_moving_problem(Scene.from_document(document, make_drawers().folder))
-    found = list_pairs(problem, number)
+    found = list_pair_margins(problem, number)
     own = {m for key in [*found] if set(key) == {"near.tray", "next.tray"} for m in found.pop(key)}
     assert own == (set() if margin is None else {margin})
     assert min(min(margins) for margins in found.values()) >= min(MARGIN, CLOSE)

@@ -7,7 +7,8 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 from helpers.carrying import STICK, describe_stand, describe_table, lift, make_room
-from helpers.small_problems import SHORT, get_margins, make_program, sample_configurations
+from helpers.pair_margins import list_pair_margins
+from helpers.small_problems import SHORT, make_program, sample_configurations
 
 from vkc_pin.planning.chain.contacts import Contacts
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
@@ -46,21 +47,9 @@ def make_fetching_problem() -> TrajectoryProblem:
     )
 
 
-def list_margins(
-    problem: TrajectoryProblem, phase: int, *, at: str = ""
-) -> dict[tuple[str, str], set[float]]:
-    """Return (link, link or obstacle) → margins at the first or last waypoint, or unreduced."""
-    part, found = problem.contacts.phases[phase], dict[tuple[str, str], set[float]]()
-    pairs, waypoint = np.arange(len(part.pairs)), problem.contacts.first_waypoint[phase:]
-    at_waypoint = np.full(len(pairs), waypoint[1 if at == "last" else 0])
-    margins = get_margins(part, pairs, at_waypoint) if at else part.margins
-    for (first, second), margin in zip(part.pairs, margins, strict=True):
-        found.setdefault((part.labels[first], part.labels[second]), set()).add(float(margin))
-    return found
-
-
 def list_partners(problem: TrajectoryProblem, phase: int, label: str) -> set[str]:
-    return {a if b == label else b for a, b in list_margins(problem, phase) if label in (a, b)}
+    pairs = list_pair_margins(problem, phase)
+    return {a if b == label else b for a, b in pairs if label in (a, b)}
 
 
 def test_carried_objects_are_paired_with_everything_but_the_hand() -> None:
@@ -74,21 +63,25 @@ def test_carried_objects_are_paired_with_everything_but_the_hand() -> None:
     assert list_partners(problem, 1, "stick.stick") == (links - hand) | others
     assert list_partners(problem, 1, "stick.tip") == links | others
     assert list_partners(problem, 1, "ball.ball") == links | {"stick.stick", "stick.tip"}
-    for (first, second), found in list_margins(problem, 1).items():
-        assert found == {CLOSE if first in hand and second == "stick.tip" else MARGIN}
+    for (first, second), found in list_pair_margins(problem, 1).items():
+        assert set(found) == {CLOSE if first in hand and second == "stick.tip" else MARGIN}
 
 
 def test_grasping_object_may_touch_the_grasped_one() -> None:
     """The stick grasps the ball, not the hand."""
     problem, robot = make_fetching_problem(), make_scene().robot
-    before, held = list_margins(problem, 1, at="last"), list_margins(problem, 2)
-    assert before["stick.tip", "ball.ball"] == {0.0}
-    assert before["stick.stick", "ball.ball"] == {MARGIN}
-    assert before[robot.touch_links[0], "ball.ball"] == {MARGIN}
-    assert held["stick.stick", "ball.ball"] == {MARGIN}
+    _, _, grasp, release, *_ = problem.contacts.first_waypoint.tolist()
+    before, held, after = (
+        list_pair_margins(problem, phase, waypoint=waypoint)
+        for phase, waypoint in ((1, grasp), (2, None), (3, release))
+    )
+    for margins in (before, after):
+        assert set(margins["stick.tip", "ball.ball"]) == {0.0}
+    for margins in (before, held):
+        assert set(margins["stick.stick", "ball.ball"]) == {MARGIN}
+    assert set(before[robot.touch_links[0], "ball.ball"]) == {MARGIN}
     others = {"stick.stick", "table", "stand", FLOOR}
     assert list_partners(problem, 2, "ball.ball") == {*robot.links, *others}
-    assert list_margins(problem, 3, at="first")["stick.tip", "ball.ball"] == {0.0}
 
 
 def compute_expected_placement(problem: TrajectoryProblem, name: str, row: np.ndarray) -> pin.SE3:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -67,10 +67,15 @@ def compile_pending_jobs(folder: Libraries) -> None:
     os.close(lock)
 
 
-def write_script(path: Path, text: str) -> str:
+def use_compiler(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = folder / "compiler"
     path.write_text(f"#!/bin/sh\n{text}\n", encoding="utf-8")
     path.chmod(0o755)
-    return str(path)
+    monkeypatch.setenv("CC", str(path))
+
+
+def count_files(folder: Libraries, suffix: str) -> int:
+    return len(list(folder.path.glob(f"*.{suffix}")))
 
 
 @pytest.mark.long
@@ -116,15 +121,12 @@ def test_frequently_used_batch_functions_are_compiled(
 
 def test_libraries_are_shared_with_later_processes(folder: Libraries) -> None:
     code = "from test_machine_code import *; MachineCode(make_function()).try_load()"
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path]),
-    }
-    run = [sys.executable, "-c", code]
+    paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    run, environment = [sys.executable, "-c", code], {**os.environ, "PYTHONPATH": paths}
     process = subprocess.run(run, env=environment, capture_output=True, timeout=120, check=True)
     assert process.stderr == b""
     wait_until(lambda: not folder.list_jobs())
-    assert len(list(folder.path.glob("*.so"))) == 1
+    assert count_files(folder, "so") == 1
     shared = MachineCode(make_function())
     assert shared.try_load()
     assert are_equal(make_function(), shared.functions[0])
@@ -133,19 +135,13 @@ def test_libraries_are_shared_with_later_processes(folder: Libraries) -> None:
 def test_threads_can_load_a_library_concurrently(folder: Libraries) -> None:
     MachineCode(make_function()).try_load()
     assert wait()
-    results: list[bool] = []
 
-    def load() -> None:
-        for _ in range(3):
-            code = MachineCode(make_function())
-            results.append(code.try_load() and are_equal(make_function(), code.functions[0], 5))
+    def load(_: int) -> bool:
+        code = MachineCode(make_function())
+        return code.try_load() and are_equal(make_function(), code.functions[0], 5)
 
-    threads = [threading.Thread(target=load) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert results == [True] * 9
+    with ThreadPoolExecutor(3) as threads:
+        assert all(threads.map(load, range(9)))
 
 
 def test_libraries_depend_on_function_and_compiler(
@@ -158,7 +154,7 @@ def test_libraries_depend_on_function_and_compiler(
     codes.append(MachineCode(make_function(3.0)))
     codes[2].try_load()
     assert wait()
-    assert len(list(folder.path.glob("*.so"))) == 3
+    assert count_files(folder, "so") == 3
     assert all(code.try_load() for code in codes)
     functions = [code.functions[0] for code in codes]
     assert are_equal(make_function(3.0), functions[0])
@@ -201,14 +197,14 @@ SLOW = pytest.mark.long  # waits for a compiler
 def test_broken_compiler_is_tried_once(
     fault: str, folder: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("CC", write_script(tmp_path / "broken", BROKEN[fault]))
+    use_compiler(BROKEN[fault], tmp_path, monkeypatch)
     code = MachineCode(make_function())
     assert not code.try_load()
     assert wait(), fault
     assert not code.try_load()
     assert not code.is_compiled
-    assert list(folder.path.glob("*.so")) == []
-    assert len(list(folder.path.glob("*.failed"))) == 1
+    assert count_files(folder, "so") == 0
+    assert count_files(folder, "failed") == 1
     assert not MachineCode(make_function()).try_load()
     assert folder.list_jobs() == []
 
@@ -218,14 +214,14 @@ def test_hanging_compiler_is_killed(
 ) -> None:
     pid = tmp_path / "pid"
     script = f"sleep 600 & echo $! > {pid}.part; mv {pid}.part {pid}; wait"
-    monkeypatch.setenv("CC", write_script(tmp_path / "hangs", script))
+    use_compiler(script, tmp_path, monkeypatch)
     monkeypatch.setattr(machine_code, "_COMPILER_TIMEOUT", 1.0)
     monkeypatch.setattr(machine_code, "has_python", lambda: False)
     assert not MachineCode(make_function()).try_load()
     assert not wait()
     compile_pending_jobs(folder)
     assert folder.list_jobs() == []
-    assert len(list(folder.path.glob("*.failed"))) == 1
+    assert count_files(folder, "failed") == 1
     wait_until(lambda: has_ended(int(pid.read_text())))
 
 
@@ -280,7 +276,7 @@ def test_plans_are_equal_bit_for_bit_with_compiled_functions(
     assert plan_door(planner) == interpreted_plan
     assert wait()
     monkeypatch.setattr(machine_code, "has_python", lambda: False)
-    assert list(folder.path.glob("*.failed")) == []
+    assert count_files(folder, "failed") == 0
     loaded: list[Any] = []
     external = ca.external
     monkeypatch.setattr(ca, "external", lambda *a: loaded.append(a) or external(*a))
@@ -303,7 +299,7 @@ def test_planning_works_without_usable_libraries(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     if fault == "broken compiler":
-        monkeypatch.setenv("CC", write_script(tmp_path / "broken", BROKEN["writes garbage"]))
+        use_compiler(BROKEN["writes garbage"], tmp_path, monkeypatch)
     elif fault == "truncated":
         monkeypatch.setattr(
             Libraries,
@@ -316,4 +312,4 @@ def test_planning_works_without_usable_libraries(
     assert plan_door(planner) == interpreted_plan
     assert wait() == (fault != "no folder")
     assert plan_door(planner) == interpreted_plan
-    assert list(folder.path.glob("*.so")) == []
+    assert count_files(folder, "so") == 0

@@ -140,13 +140,11 @@ def test_dynamics_derivatives_equal_numeric_pinocchio() -> None:
     q, v, a = random.normal(size=(3, model.nv))
     symbols = [casadi.SX.sym(name, model.nv) for name in "qva"]
     torque = cpin.rnea(model)(*symbols)
-    derivatives = casadi.Function(
-        "d", symbols, [casadi.jacobian(torque, symbol) for symbol in symbols]
-    )(q, v, a)
-    for exact, expected in zip(
-        derivatives, pin.computeRNEADerivatives(model, data, q, v, a), strict=True
-    ):
-        np.testing.assert_allclose(exact.full(), expected, atol=1e-11)
+    jacobians = [casadi.jacobian(torque, symbol) for symbol in symbols]
+    found = casadi.Function("d", symbols, jacobians)(q, v, a)
+    expected = pin.computeRNEADerivatives(model, data, q, v, a)
+    for derivative, numeric in zip(found, expected, strict=True):
+        np.testing.assert_allclose(derivative.full(), numeric, atol=1e-11)
     com = cpin.center_of_mass(model)
     slope = casadi.Function("c", symbols[:1], [casadi.jacobian(com(symbols[0]), symbols[0])])(q)
     np.testing.assert_allclose(slope.full(), pin.jacobianCenterOfMass(model, data, q), atol=1e-11)

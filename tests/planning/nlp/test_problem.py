@@ -107,17 +107,6 @@ def test_robot_stays_within_its_limits_and_the_arena(opening: TrajectoryProblem)
     assert problem.limits("base_x") == (robot.lower[0], 1.0)
 
 
-@pytest.mark.parametrize("start", [2.2, -2.2 - 2 * np.pi, 15.0])
-def test_base_turns_to_the_nearest_equivalent_heading(start: float) -> None:
-    scene = load_door_scene().with_start(base=[-0.7, 0.3, start])
-    problem = make_program(scene, [GoTo(-0.5, 0.1, -2.2)], options=SHORT)
-    np.testing.assert_array_equal(problem.lower[-1, :3], problem.upper[-1, :3])
-    np.testing.assert_array_equal(problem.lower[-1, :2], [-0.5, 0.1])
-    heading = problem.lower[-1, 2]
-    assert np.cos(heading + 2.2) == pytest.approx(1.0)
-    assert abs(heading - start) <= np.pi + 1e-9
-
-
 def test_base_goal_without_heading_leaves_it_free() -> None:
     problem = make_program(load_door_scene(), [GoTo(-0.5, 0.1)], options=SHORT)
     assert problem.lower[-1, :3].tolist() == [-0.5, 0.1, -np.inf]
@@ -334,32 +323,6 @@ def test_grasps_are_chosen_within_their_own_phases(waypoints: int) -> None:
 
 # --- rows and rates
 # ------------------------------------------------------------------------------------------------
-
-
-def test_steps_are_longer_only_in_runs_with_long_motions(opening: TrajectoryProblem) -> None:
-    stop = opening.transcription.structure.stops[0]
-    z, progress = opening.still, np.arange(1, stop + 1) / stop
-    z[:stop, 0] += 30.0 * progress**2 * (3 - 2 * progress)
-    z[stop:, 0] += 30.0
-    still, timing = opening.timing_for(opening.still), opening.timing_for(z)
-    np.testing.assert_array_equal(still.dt, SHORT.dt)
-    np.testing.assert_array_equal(timing.dt[stop:], SHORT.dt)
-    assert still.compute_violation(*opening.rates(z)) > 1.0
-    assert timing.compute_violation(*opening.rates(z)) <= 0.0
-    assert timing.dt[0] * stop > 1.5 * 30.0 / opening.chain.velocity[0]
-    assert opening.objective(opening.still, still.dt) == 0.0
-
-
-def test_moving_geometry_of_an_object_has_contacts_only_while_held(
-    opening: TrajectoryProblem,
-) -> None:
-    z = opening.clip(np.nan_to_num(sample_path(opening, 0.3)))
-    contacts = opening.evaluate_contacts(z, reach=0.3, nearest=5)
-    assert np.bincount(contacts.waypoint).max() == 5
-    contacts = opening.evaluate_contacts(z, reach=3.0)
-    held = np.isin(contacts.pair, opening.chain.held_geometries[HANDLE]).any(axis=1)
-    # row t belongs to waypoint t + 1
-    assert set(contacts.waypoint[held]) == set(range(opening.ends[0], opening.ends[2]))
 
 
 def test_repr_names_phases_and_sizes(opening: TrajectoryProblem) -> None:

@@ -21,6 +21,7 @@ from helpers.small_problems import (
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.solver.to_trajectory import make_trajectory
 from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.scene.hold import Hold
@@ -323,6 +324,18 @@ def test_grasps_are_chosen_within_their_own_phases(waypoints: int) -> None:
 
 # --- rows and rates
 # ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [0.01, 3.0])
+def test_rate_violation_equals_that_of_the_trajectory(
+    opening: TrajectoryProblem, scale: float
+) -> None:
+    z, timing = sample_path(opening, scale), opening.timing_for(opening.still)
+    trajectory, chain = make_trajectory(opening, z, timing.dt), opening.chain
+    velocity = np.abs(trajectory.velocities()) / chain.velocity
+    acceleration = np.abs(trajectory.accelerations()) / chain.acceleration
+    expected = max(velocity.max(), acceleration.max()) - 1.0
+    assert timing.compute_violation(*opening.rates(z)) == pytest.approx(expected, rel=1e-9)
 
 
 def test_repr_names_phases_and_sizes(opening: TrajectoryProblem) -> None:

@@ -7,42 +7,38 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import trimesh
+from helpers.descriptions import make_description, make_mesh_part, make_part
 
 import vkc_pin as vkc
 from vkc_pin.importing.homes.splitting import Home, HomeObject
-from vkc_pin.importing.homes.writing import ImportProgress, write_object, write_obstacles
-from vkc_pin.importing.objects.description import Description, Link, Part
-from vkc_pin.world.scene.scene import Scene
+from vkc_pin.importing.homes.writing import (
+    ImportedHomeObject,
+    ImportProgress,
+    write_object,
+    write_obstacles,
+)
+from vkc_pin.importing.objects.description import Link
+from vkc_pin.world.models.articulated_object import ArticulatedObject
 
 SETTINGS = {"stem": "can", "most": 2, "dist_safe": 0.02, "grasp_clearance": 0.005}
 
 
-def _make_can(radius: float) -> HomeObject:
-    part = Part(
-        name="",
-        placement=pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.06])),
-        kind="cylinder",
-        size=(radius, 0.12),
-    )
-    return HomeObject(
-        "can",
-        Description(Path("home.urdf"), {"can": Link("can", (part,), (part,))}, {}),
-        (1.0, 2.0, 0.7),
-        free=True,
-    )
+def write_can(folder: Path, radius: float) -> tuple[ImportedHomeObject, ArticulatedObject]:
+    """Write a free cylinder, and return it with what is read back."""
+    part = make_part("cylinder", (radius, 0.12), (0.0, 0.0, 0.06))
+    description = make_description([Link("can", (part,), (part,))])
+    can = HomeObject("can", description, (1.0, 2.0, 0.7), free=True)
+    written = write_object(can, vkc.load_robot("husky_ur5e"), folder, {}, **SETTINGS)
+    return written, vkc.load_object(folder / "objects" / "can" / "can.yaml")
 
 
 def test_free_object_has_no_joint(tmp_path: Path) -> None:
-    written = write_object(_make_can(0.03), vkc.load_robot("husky_ur5e"), tmp_path, {}, **SETTINGS)
-    item = vkc.load_object(tmp_path / "objects" / "can" / "can.yaml")
+    written, item = write_can(tmp_path, 0.03)
     assert item.free
     assert item.coordinates.size == 0
     assert item.base_link == "can"
-    assert (
-        list(item.attachments)
-        == [proposal.attachment.name for proposal in written.proposals.found]
-        != []
-    )
+    names = [proposal.attachment.name for proposal in written.proposals.found]
+    assert list(item.attachments) == names != []
     for attachment in item.attachments.values():
         assert attachment.placement.translation[2] > 0.0
         assert attachment.firm
@@ -55,30 +51,26 @@ def test_free_object_has_no_joint(tmp_path: Path) -> None:
 
 
 def test_thick_object_is_reported(tmp_path: Path) -> None:
-    written = write_object(_make_can(0.3), vkc.load_robot("husky_ur5e"), tmp_path, {}, **SETTINGS)
-    assert not vkc.load_object(tmp_path / "objects" / "can" / "can.yaml").attachments
+    written, item = write_can(tmp_path, 0.3)
+    assert not item.attachments
     assert "carried by no hand: nothing of it fits" in written.summary()
-
-
-def make_part(name: str, kind: str, size: tuple[float, ...], at: pin.SE3, **more: object) -> Part:
-    return Part(name=name, placement=at, kind=kind, size=size, **more)  # type: ignore[arg-type]
 
 
 def test_primitive_shapes_are_kept_and_meshes_become_urdf(tmp_path: Path) -> None:
     placement = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 1.1), np.array([1.0, 2.0, 0.7]))
     red = (1.0, 0.0, 0.0, 1.0)
-    visual = make_part("looks", "box", (2.0, 0.1, 2.0), placement, colour=red)
+    visual = make_part("box", (2.0, 0.1, 2.0), placement, colour=red)
     wedge = trimesh.convex.convex_hull([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
     building = Link(
         "walls",
         (visual,),
         (
-            make_part("a wall", "box", (2.0, 0.1, 2.0), placement),
-            make_part("", "capsule", (0.1, 1.0), placement),
+            make_part("box", (2.0, 0.1, 2.0), placement, "a wall"),
+            make_part("capsule", (0.1, 1.0), placement),
         ),
     )
-    mesh = Link("wedge", (), (make_part("", "mesh", (1.0, 1.0, 1.0), placement, triangles=wedge),))
-    ball = Link("a wall", (), (make_part("", "sphere", (0.2,), placement),))
+    mesh = Link("wedge", (), (make_mesh_part(wedge, placement),))
+    ball = Link("a wall", (), (make_part("sphere", (0.2,), placement),))
     home = Home((building,), (mesh, ball), (), (), 4, ())
     taken = {"ball", "wedge"}
     entries, notes = write_obstacles(
@@ -89,26 +81,16 @@ def test_primitive_shapes_are_kept_and_meshes_become_urdf(tmp_path: Path) -> Non
     assert entries[0]["colour"] == list(red)
     assert taken == {"ball", "wedge", "a_wall", "walls_1", "wedge_2", "a_wall_2"}
     assert not notes
-    scene = Scene.from_document(
-        {
-            "robot": "husky_ur5e",
-            "start": {"base": [-3, -3, 0]},
-            "obstacles": entries,
-            "floor": False,
-        },
-        tmp_path,
-    )
+    document = {"robot": "husky_ur5e", "start": {"base": [-3, -3, 0]}, "floor": False}
+    scene = vkc.Scene.from_document({**document, "obstacles": entries}, tmp_path)
     parts = [*building.collision, *mesh.collision, *ball.collision]
     assert scene.obstacle_labels == tuple(entry["name"] for entry in entries)
     for part, shape in zip(parts, scene.obstacles, strict=True):
         shape.geometry.computeLocalAABB()
-        box, own = (
-            shape.geometry.aabb_local,
-            dataclasses.replace(part, placement=shape.placement.inverse() * part.placement),
-        )
-        assert np.vstack([box.min_, box.max_]) == pytest.approx(
-            own.make_mesh().bounds, abs=2e-3
-        )  # triangulated spheres are smaller
+        box, place = shape.geometry.aabb_local, shape.placement.inverse() * part.placement
+        bounds = dataclasses.replace(part, placement=place).make_mesh().bounds
+        # Triangulated spheres are smaller.
+        assert np.vstack([box.min_, box.max_]) == pytest.approx(bounds, abs=2e-3)
         if part.kind != "mesh":
             assert shape.placement.isApprox(part.placement, 1e-5)
 
@@ -116,10 +98,7 @@ def test_primitive_shapes_are_kept_and_meshes_become_urdf(tmp_path: Path) -> Non
 def test_progress_is_logged_every_few_seconds(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    links = tuple(
-        Link(f"chair {k}", (), (make_part("", "sphere", (0.2,), pin.SE3.Identity()),))
-        for k in range(6)
-    )
+    links = tuple(Link(f"chair {k}", (), (make_part(),)) for k in range(6))
     now = 0.0
     monkeypatch.setattr("time.perf_counter", lambda: now)
     with caplog.at_level("INFO", "vkc_pin.importing"):

@@ -5,30 +5,13 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import trimesh
+from helpers.descriptions import make_description, make_joint, make_mesh_part, make_part
 from helpers.partnet import write_partnet_object
 
 from vkc_pin.importing.objects.clean_up import load_surfaces, merge_fixed_links
-from vkc_pin.importing.objects.description import Description, Joint, Link, Part
+from vkc_pin.importing.objects.description import Link
 from vkc_pin.importing.objects.pieces import PieceCache, decompose_links
 from vkc_pin.importing.objects.urdf import read_object_urdf
-
-IDENTITY = pin.SE3.Identity()
-
-
-def make_description(*meshes: trimesh.Trimesh) -> Description:
-    parts = tuple(
-        Part(name="p", placement=IDENTITY, kind="mesh", size=(1, 1, 1), triangles=mesh)
-        for mesh in meshes
-    )
-    joint = Joint(
-        name="j", kind="prismatic", parent="a", child="b", placement=IDENTITY, limits=(0.0, 1.0)
-    )
-    return Description(Path("f"), {"a": Link("a"), "b": Link("b", parts, parts)}, {"b": joint})
-
-
-def decompose_description(description: Description) -> tuple[tuple[Part, ...], tuple[str, ...]]:
-    found = decompose_links(description, load_surfaces(description))
-    return found.links["b"].collision, found.notes
 
 
 def test_flat_shapes_are_thickened_and_noted(tmp_path: Path) -> None:
@@ -44,15 +27,16 @@ def test_flat_shapes_are_thickened_and_noted(tmp_path: Path) -> None:
 def test_enclosed_pieces_are_removed() -> None:
     large, small = trimesh.creation.box((0.3, 0.3, 0.3)), trimesh.creation.box((0.1, 0.1, 0.1))
     beside = small.copy().apply_translation((0.15, 0.0, 0.0))
-    found, _ = decompose_description(make_description(small, large, beside))
+    parts = tuple(map(make_mesh_part, (small, large, beside)))
+    description = make_description([Link("a"), Link("b", parts, parts)], [make_joint("a", "b")])
+    found = decompose_links(description, load_surfaces(description)).links["b"].collision
     assert sorted(round(part.make_mesh().volume, 6) for part in found) == [0.001, 0.027]
 
 
 def test_visual_boxes_replace_missing_collision_geometry() -> None:
-    box = Part(name="", placement=IDENTITY, kind="box", size=(0.1, 0.1, 0.1))
-    found = decompose_links(
-        Description(Path("f"), {"a": Link("a", (box,))}, {}), {id(box): box.make_mesh()}
-    )
+    box = make_part()
+    description = make_description([Link("a", (box,))])
+    found = decompose_links(description, load_surfaces(description))
     assert found.links["a"].collision == (box,)
     assert any("visual geometry is used" in note for note in found.notes)
 
@@ -63,22 +47,17 @@ def test_repeated_mesh_is_decomposed_once(tmp_path: Path) -> None:
     places = [
         pin.SE3(pin.rpy.rpyToMatrix(0.2, 0.3, k), np.array([float(k), 0.0, 0.5])) for k in range(2)
     ]
-    parts = tuple(
-        Part(name="", placement=at, kind="mesh", size=(1.0, 1.0, 1.0), file=tmp_path / "twins.stl")
-        for at in places
-    )
     cache: PieceCache = {}
     found = []
-    for part in parts:
-        description = Description(tmp_path / "t.urdf", {"twins": Link("twins", (), (part,))}, {})
-        found.append(
-            decompose_links(description, load_surfaces(description), cache).links["twins"].collision
-        )
+    for at in places:
+        part = make_mesh_part(None, at, file=tmp_path / "twins.stl")
+        description = make_description([Link("twins", (), (part,))])
+        decomposed = decompose_links(description, load_surfaces(description), cache)
+        found.append(decomposed.links["twins"].collision)
     assert len(cache) == 1
     (cut,) = (pieces.meshes for pieces in cache.values())
     assert len(found[0]) == len(found[1]) == len(cut) > 1
     for at, pieces in zip(places, found, strict=True):
         for part, piece in zip(pieces, cut, strict=True):
-            assert np.allclose(
-                part.make_mesh().vertices, piece.copy().apply_transform(at.homogeneous).vertices
-            )
+            moved = piece.copy().apply_transform(at.homogeneous)
+            assert np.allclose(part.make_mesh().vertices, moved.vertices)

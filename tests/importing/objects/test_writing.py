@@ -7,9 +7,10 @@ import pinocchio as pin
 import pytest
 import trimesh
 import yaml
+from helpers.descriptions import make_description, make_joint, make_mesh_part, make_part
 
 import vkc_pin as vkc
-from vkc_pin.importing.objects.description import Description, Joint, Link, Part
+from vkc_pin.importing.objects.description import Link
 from vkc_pin.importing.objects.writing import write_description, write_urdf
 from vkc_pin.world.files.urdf import read_urdf
 
@@ -18,50 +19,31 @@ def test_written_object_is_read_back(tmp_path: Path) -> None:
     placement = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.4, 1.2), np.array([0.1, 0.2, 0.3]))
     red = (1.0, 0.0, 0.0, 1.0)
     parts = (
-        Part(
-            name="handle & bar", placement=placement, kind="cylinder", size=(0.01, 0.3), colour=red
-        ),
-        Part(name="", placement=placement, kind="capsule", size=(0.02, 0.3)),
-        Part(
-            name="",
-            placement=placement,
-            kind="mesh",
-            size=(0.5, 0.5, 0.5),
-            triangles=trimesh.creation.icosphere(),
-            colour=red,
+        make_part("cylinder", (0.01, 0.3), placement, "handle & bar", colour=red),
+        make_part("capsule", (0.02, 0.3), placement),
+        make_part(
+            "mesh", (0.5, 0.5, 0.5), placement, triangles=trimesh.creation.icosphere(), colour=red
         ),
     )
     axis = np.array([0.6, 0.0, 0.8])
-    joint = Joint(
-        name="hinge",
-        kind="revolute",
-        parent="a",
-        child="b",
-        placement=placement,
-        axis=axis,
-        limits=(-0.2, 1.1),
-        velocity=0.7,
-        damping=0.5,
-        friction=0.25,
-        stiffness=4.0,
-        springref=-1.1,
+    resistance = {"damping": 0.5, "friction": 0.25, "stiffness": 4.0, "springref": -1.1}
+    joint = make_joint(
+        "a", "b", at=placement, axis=axis, limits=(-0.2, 1.1), velocity=0.7, **resistance
     )
     inertia = placement.act(pin.Inertia(2.5, np.zeros(3), np.diag([0.1, 0.2, 0.25])))
-    links = {"a": Link("a", parts[:1], parts[:1]), "b": Link("b", parts, parts, inertia)}
-    write_urdf(Description(tmp_path / "x", links, {"b": joint}), tmp_path / "thing.urdf")
+    links = [Link("a", parts[:1], parts[:1]), Link("b", parts, parts, inertia)]
+    write_urdf(make_description(links, [joint]), tmp_path / "thing.urdf")
     about = ["One.", "Two."]
     write_description(tmp_path / "thing.yaml", "thing.urdf", (), about=about, joints=[joint])
     assert (tmp_path / "thing.yaml").read_text().startswith("# One.\n# Two.\nurdf: thing.urdf\n")
     assert yaml.safe_load((tmp_path / "thing.yaml").read_text()) == {
         "urdf": "thing.urdf",
-        "joints": {"hinge": {"stiffness": 4.0, "springref": -1.1}},
+        "joints": {"to_b": {"stiffness": 4.0, "springref": -1.1}},
         "attachments": [],
     }
     item = vkc.load_object(tmp_path / "thing.yaml")
     assert (item.lower[0], item.upper[0], item.velocity[0]) == (-0.2, 1.1, 0.7)
-    resistance = item.resistance["hinge"]
-    assert (resistance.damping, resistance.friction) == (0.5, 0.25)
-    assert (resistance.stiffness, resistance.springref) == (4.0, -1.1)
+    assert {name: getattr(item.resistance["to_b"], name) for name in resistance} == resistance
     assert item.model.inertias[1].isApprox(inertia, 1e-6)
     moved = placement * pin.SE3(pin.exp3(axis * 0.5), np.zeros(3))
     assert np.allclose(item.link_placement("b", [0.5]).homogeneous, moved.homogeneous, atol=1e-8)
@@ -77,11 +59,8 @@ def test_written_object_is_read_back(tmp_path: Path) -> None:
     assert (bar.geometry.radius, bar.geometry.halfLength) == (0.01, 0.15)
     assert 'name="handle &amp; bar"' in (tmp_path / "thing.urdf").read_text()
     ball = item.collision.geometryObjects[5]
-    assert np.allclose(
-        ball.placement.act(np.asarray(ball.geometry.points()).mean(axis=0)),
-        placement.translation,
-        atol=1e-3,
-    )
+    middle = ball.placement.act(np.asarray(ball.geometry.points()).mean(axis=0))
+    assert np.allclose(middle, placement.translation, atol=1e-3)
     assert np.allclose(item.visual.geometryObjects[1].meshColor, red)
 
 
@@ -91,32 +70,17 @@ def test_written_object_is_read_back(tmp_path: Path) -> None:
 def test_links_with_similar_names_keep_their_own_meshes(
     small: str, large: str, tmp_path: Path
 ) -> None:
-    def make_cube(size: float) -> tuple[Part, ...]:
-        mesh, identity = trimesh.creation.box((size,) * 3), pin.SE3.Identity()
-        return (
-            Part(name="", placement=identity, kind="mesh", size=(1.0, 1.0, 1.0), triangles=mesh),
-        )
-
-    parts = {small: make_cube(0.1), large: make_cube(0.2)}
-    links = {"case": Link("case"), **{name: Link(name, own, own) for name, own in parts.items()}}
-    joints = {
-        name: Joint(
-            name=f"{name}_format_joint",
-            kind="prismatic",
-            parent="case",
-            child=name,
-            placement=pin.SE3.Identity(),
-        )
-        for name in parts
+    sizes = {small: 0.1, large: 0.2}
+    parts = {
+        name: (make_mesh_part(trimesh.creation.box((size,) * 3)),) for name, size in sizes.items()
     }
-    write_urdf(Description(tmp_path / "x", links, joints), tmp_path / "thing.urdf")
-    shapes = {
-        kind: read_urdf(tmp_path / "thing.urdf").read_shapes(kind)
-        for kind in ("collision", "visual")
-    }
-    for kind, found in shapes.items():
+    links = [Link("case"), *(Link(name, own, own) for name, own in parts.items())]
+    joints = [make_joint("case", name, "prismatic") for name in parts]
+    write_urdf(make_description(links, joints), tmp_path / "thing.urdf")
+    for kind in ("collision", "visual"):
+        found = read_urdf(tmp_path / "thing.urdf").read_shapes(kind)
         volumes = {shape.link: shape.make_mesh().volume for shape in found}
-        assert volumes == pytest.approx({small: 0.1**3, large: 0.2**3}), kind
+        assert volumes == pytest.approx({name: size**3 for name, size in sizes.items()}), kind
         names = {shape.file.name for shape in found if shape.file is not None}
         assert len(names) == 2
         assert max(map(len, names)) < 80

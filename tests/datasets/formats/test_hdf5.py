@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -45,16 +44,9 @@ def test_groups_have_the_robomimic_layout(dataset: Dataset) -> None:
                 assert values.dtype in (np.float32, np.uint8), name
             assert group["dones"][:].tolist() == [0] * (count - 1) + [1]
             actions, observations = group["actions"][:], group["obs"]
-            robot = np.hstack(
-                [
-                    observations["base_pose"][:],
-                    observations["arm_position"][:],
-                    observations["gripper"][:],
-                ]
-            )
-            assert np.array_equal(
-                actions[:-1], robot[1:]
-            )  # an action is the next state of the robot
+            parts = ("base_pose", "arm_position", "gripper")
+            robot = np.hstack([observations[name][:] for name in parts])
+            assert np.array_equal(actions[:-1], robot[1:])  # an action is the robot's next state
 
 
 def test_episodes_are_read_back_to_1e_9(dataset: Dataset) -> None:
@@ -65,12 +57,8 @@ def test_episodes_are_read_back_to_1e_9(dataset: Dataset) -> None:
         times = np.linspace(fresh.trajectory.times[0], fresh.trajectory.times[-1], 300)
         assert np.abs(episode.trajectory.at(times) - fresh.trajectory.at(times)).max() <= 1e-9
         assert episode.trajectory.phases == fresh.trajectory.phases
-        assert (episode.steps, episode.options, episode.about) == (
-            fresh.steps,
-            fresh.options,
-            fresh.about,
-        )
-        assert episode.document == fresh.document
+        for name in ("steps", "options", "about", "document"):
+            assert getattr(episode, name) == getattr(fresh, name)
         assert np.array_equal(episode.scene().start, fresh.scene().start)
 
 
@@ -101,14 +89,11 @@ def test_samples_lie_on_the_trajectory(dataset: Dataset) -> None:
 
 def test_shards_are_reproducible(dataset: Dataset, tmp_path: Path) -> None:
     """Rewriting the episodes and copying the shard give the same bytes."""
-    files = []
+    files, recipe = [], dataset.recipe
     for episode in dataset.episodes():
         files.append(tmp_path / f"{episode.number}.hdf5")
-        files[-1].write_bytes(
-            make_part(
-                episode, episode.scene().robot, dataset.recipe.fields.rate, dataset.recipe.digest
-            )
-        )
+        part = make_part(episode, episode.scene().robot, recipe.fields.rate, recipe.digest)
+        files[-1].write_bytes(part)
     again = write_shard(tmp_path / "again.hdf5", [(file, 0) for file in files], tmp_path / "scenes")
     copied = write_shard(
         tmp_path / "copied.hdf5", [(dataset.shards[0], k) for k in range(4)], tmp_path / "scenes"
@@ -122,33 +107,11 @@ def test_shards_are_reproducible(dataset: Dataset, tmp_path: Path) -> None:
     assert scenes[0] == scenes[1]
 
 
-def test_damaged_files_raise(dataset: Dataset, tmp_path: Path) -> None:
-    copy = tmp_path / "copy"
-    shutil.copytree(dataset.folder, copy)
-    shard = Dataset.open(copy).shards[0]
-    with h5py.File(shard, "r+") as file:
-        del file["data/demo_1/motion/knot_rates"]
-    with pytest.raises(InputError, match="not an episode"):
-        list(Dataset.open(copy).episodes())
-    with h5py.File(shard, "r+") as file:
-        file["data/demo_0"].attrs["scene"] = "../../etc/passwd"
-    with pytest.raises(InputError, match="demo_0: scene: not a plain file name"):
-        list(Dataset.open(copy).episodes())
-    shard.write_bytes(shard.read_bytes()[:1000])
-    with pytest.raises(InputError, match="not an HDF5 file"):
-        list(Dataset.open(copy).episodes())
-
-
-def test_changed_scene_raises(dataset: Dataset, tmp_path: Path) -> None:
-    copy = tmp_path / "copy"
-    shutil.copytree(dataset.folder, copy)
+def test_changed_scene_raises(copy: Path) -> None:
     for file in (copy / "scenes").iterdir():
         file.write_text(file.read_text().replace('"floor":true', '"floor":false'))
     with pytest.raises(InputError, match="not what its name says"):
         list(Dataset.open(copy).episodes())
-
-
-pytest.importorskip("h5py")
 
 
 @pytest.mark.long
@@ -157,9 +120,8 @@ def test_parts_of_attempts_form_a_shard(tmp_path: Path) -> None:
     parts, attempts = make_parts((document, [0, 1], {})), run_attempts((document, [0, 1], {}))
     assert [record["success"] for record, _ in parts] == [True, True]
     for (record, data), (expected, _) in zip(parts, attempts, strict=True):
-        assert {key: record[key] for key in ("number", "way", "scene", "evaluations")} == {
-            key: expected[key] for key in ("number", "way", "scene", "evaluations")
-        }
+        for key in ("number", "way", "scene", "evaluations"):
+            assert record[key] == expected[key]
         (tmp_path / f"{record['number']}.hdf5").write_bytes(data)
     shard = write_shard(
         tmp_path / "shard.hdf5",
@@ -170,9 +132,7 @@ def test_parts_of_attempts_form_a_shard(tmp_path: Path) -> None:
     assert all(episode.validate().ok for episode in read_episodes(shard, tmp_path / "scenes"))
 
 
-def test_failures_have_no_data(tmp_path: Path) -> None:
-    document = load_recipe(
-        {**SMALL, "tasks": ["drive-open"], "start": {"distance": [90.0, 91.0]}}
-    ).document
-    ((record, data),) = make_parts((document, [0], {}))
+def test_failures_have_no_data() -> None:
+    far = {"tasks": ["drive-open"], "start": {"distance": [90.0, 91.0]}}
+    ((record, data),) = make_parts((load_recipe({**SMALL, **far}).document, [0], {}))
     assert (record["success"], data) == (False, b"")

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from helpers.datasets import SMALL
+from helpers.shards import change_demo, set_attribute
 
 from vkc_pin.datasets.check import check_dataset
 from vkc_pin.datasets.dataset import Dataset
@@ -18,35 +19,17 @@ from vkc_pin.datasets.recipe import RobotEntry, load_recipe
 from vkc_pin.datasets.robots import prepare_robots
 from vkc_pin.errors import InputError
 
-h5py = pytest.importorskip("h5py")
+pytest.importorskip("h5py")
 EPISODES = 4
-INVALID_NAMES = [
-    "../../../evil",
-    "/evil",
-    "a/b",
-    "..",
-    "",
-    ".hidden",
-    "a\\b",
-    "x" * 300,
-    "\ud800",
-    3,
-]
+INVALID_NAMES = ["../../../evil", "/evil", "..", "", ".hidden", "a\\b", "x" * 300, "\ud800", 3]
 
 
 @pytest.fixture
 def copy(dataset: Dataset, tmp_path: Path) -> Path:
     """Return a dataset without shards, in a nested folder among other files."""
     folder = tmp_path / "a" / "b" / "dataset"
-    shutil.copytree(dataset.folder, folder)
-    shutil.rmtree(folder / "shards")
-    for name in (
-        "notes.txt",
-        "a/notes.txt",
-        "a/b/evil.hdf5",
-        "outside/shards/deep/file",
-        "outside/README.md",
-    ):
+    shutil.copytree(dataset.folder, folder, ignore=shutil.ignore_patterns("shards"))
+    for name in ("notes.txt", "a/b/evil.hdf5", "outside/shards/deep/file"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("mine")
     return folder
@@ -54,44 +37,32 @@ def copy(dataset: Dataset, tmp_path: Path) -> Path:
 
 def read_surroundings(folder: Path, root: Path) -> dict[str, bytes | None]:
     """Return every path in `root` that is not in `folder`, with the contents of files."""
-    paths = [path for path in root.rglob("*") if path != folder and folder not in path.parents]
-    return {
-        str(path.relative_to(root)): path.read_bytes() if path.is_file() else None for path in paths
-    }
-
-
-def change_journal(folder: Path, **changes: Any) -> None:
-    """Update fields in the records of all attempts."""
-    file = folder / "journal.jsonl"
-    lines = [json.loads(line) for line in file.read_text().splitlines()]
-    for line in lines:
-        if "records" in line:
-            line["records"] = [{**line["records"][0], **changes}]
-    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    paths = [path for path in root.rglob("*") if folder not in (path, *path.parents)]
+    return {str(path): path.read_bytes() if path.is_file() else None for path in paths}
 
 
 @pytest.mark.parametrize("name", INVALID_NAMES, ids=repr)
 def test_robot_name_in_the_journal_is_checked(copy: Path, tmp_path: Path, name: Any) -> None:
-    change_journal(copy, robot=name)
+    file = copy / "journal.jsonl"
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    for line in lines:
+        for record in line.get("records", ()):
+            record["robot"] = name
+    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
     before = read_surroundings(copy, tmp_path)
     with pytest.raises(InputError, match="robot: not a plain file name") as caught:
         generate(SMALL, EPISODES, copy)
-    assert (caught.value.file, caught.value.field) == (copy / "journal.jsonl", "robot")
-    assert (
-        caught.value.expected
-        == "at most 200 bytes of text without slashes, not beginning with a dot"
-    )
-    if name == "../../../evil":
-        assert caught.value.got == "'../../../evil'"
+    assert (caught.value.file, caught.value.field) == (file, "robot")
+    assert "at most 200 bytes of text without slashes, not beginning" in str(caught.value)
     assert read_surroundings(copy, tmp_path) == before
     assert not (copy / "shards").exists()
 
 
-@pytest.mark.parametrize("name", ["../../evil", "/evil", "a/b", "..", "", 3], ids=repr)
+@pytest.mark.parametrize("name", ["../../evil", "/evil", "..", "", 3], ids=repr)
 def test_scene_name_in_a_work_file_is_checked(copy: Path, tmp_path: Path, name: Any) -> None:
     file = sorted((copy / "work").iterdir())[0]
-    with h5py.File(file, "r+") as opened:
-        opened["data/demo_0"].attrs["scene"] = str(tmp_path / "evil") if name == "/evil" else name
+    scene = str(tmp_path / "evil") if name == "/evil" else name
+    change_demo(file, set_attribute("scene", scene))
     before, scenes = read_surroundings(copy, tmp_path), sorted((copy / "scenes").iterdir())
     with pytest.raises(InputError, match="demo_0: scene: not a plain file name") as caught:
         generate(SMALL, EPISODES, copy)
@@ -134,13 +105,12 @@ def test_check_page_is_not_written_through_a_symlink(copy: Path, tmp_path: Path)
 
 
 def test_foreign_files_in_the_lerobot_folder_are_kept(copy: Path) -> None:
-    pytest.importorskip("pyarrow")
+    """The error precedes planning."""
+    notes = copy / "lerobot" / "husky_ur5e" / "notes.txt"
     generate(SMALL, EPISODES, copy, lerobot=True)
-    robot_folder = copy / "lerobot" / "husky_ur5e"
-    generate(SMALL, EPISODES, copy, lerobot=True)
-    (robot_folder / "notes.txt").write_text("mine")
+    notes.write_text("mine")
     with pytest.raises(InputError, match=r"would delete .*got notes\.txt\)") as caught:
         generate(SMALL, EPISODES + 1, copy, lerobot=True)
-    assert caught.value.file == robot_folder
-    assert (robot_folder / "notes.txt").read_text() == "mine"
-    assert len(Dataset.open(copy).numbers()) == EPISODES, "the error must precede planning"
+    assert caught.value.file == notes.parent
+    assert notes.read_text() == "mine"
+    assert len(Dataset.open(copy).numbers()) == EPISODES

@@ -16,7 +16,7 @@ import vkc_pin as vkc
 from vkc_pin.datasets.check import check_dataset
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generation import generate
-from vkc_pin.datasets.recipe import CAMERAS, load_recipe
+from vkc_pin.datasets.recipe import CAMERAS
 from vkc_pin.simulation import snapshots
 
 h5py = pytest.importorskip("h5py")
@@ -51,23 +51,20 @@ def test_images_are_read_back(dataset: Dataset) -> None:
     for episode in dataset.episodes():
         images = episode.images()
         assert images is not None
-        object_segments = {
-            name for name in images.segments if name.startswith(f"{episode.about['object']}.")
-        }
         visible = {images.segments[k] for k in np.unique(images.pictures["wrist_segmentation"])}
-        assert visible & object_segments  # the wrist camera sees the grasped object
+        # the wrist camera sees the grasped object
+        assert any(name.startswith(f"{episode.about['object']}.") for name in visible)
 
 
-def test_check_renders_images_again(dataset: Dataset, tmp_path: Path) -> None:
+def test_check_renders_images_again(copy: Path, shard: Path) -> None:
     """The check reports the three modified images and no others."""
-    copy = tmp_path / "copy"
-    shutil.copytree(dataset.folder, copy, ignore=shutil.ignore_patterns("lerobot"))
-    with h5py.File(Dataset.open(copy).shards[0], "r+") as file:
+    with h5py.File(shard, "r+") as file:
         demo = file["data/demo_0"]
         number, last = int(demo.attrs["number"]), len(demo["dones"]) - 1
         demo["obs/wrist_image"][0, :8] = 255 - demo["obs/wrist_image"][0, :8]
         demo["obs/head_depth"][-1, :, :10] += 500
         demo["obs/head_segmentation"][-1] = 999
+    shutil.rmtree(copy / "lerobot")
     found = check_dataset(copy)
     assert not found.refused
     assert "pixels rendered again and compared: episode 0 (samples 0, " in str(found)
@@ -94,47 +91,13 @@ def test_lerobot_layout_has_colour_images(dataset: Dataset) -> None:
     table = pq.read_table(root / "data/chunk-000/file-000.parquet")
     for camera in ("head", "wrist"):
         name = f"observation.images.{camera}"
-        assert features[name] == {
-            "dtype": "image",
-            "shape": [32, 40, 3],
-            "names": ["height", "width", "channels"],
-        }
-        decoded = [
-            np.asarray(image.open(io.BytesIO(entry["bytes"]))) for entry in table[name].to_pylist()
-        ]
-        expected = np.concatenate(
-            [episode.images().pictures[f"{camera}_image"] for episode in dataset.episodes()]
-        )  # type: ignore[union-attr]
-        np.testing.assert_array_equal(np.array(decoded), expected)
+        assert (features[name]["dtype"], features[name]["shape"]) == ("image", [32, 40, 3])
+        decoded = [image.open(io.BytesIO(entry["bytes"])) for entry in table[name].to_pylist()]
+        pictures = [episode.images().pictures for episode in dataset.episodes()]  # type: ignore[union-attr]
+        expected = np.concatenate([each[f"{camera}_image"] for each in pictures])
+        np.testing.assert_array_equal([np.asarray(each) for each in decoded], expected)
         assert np.shape(stats[name]["mean"]) == (3, 1, 1)
-        np.testing.assert_allclose(
-            np.ravel(stats[name]["mean"]), expected.mean(axis=(0, 1, 2)) / 255.0, atol=1e-9
-        )
-        np.testing.assert_allclose(
-            np.ravel(stats[name]["std"]), expected.std(axis=(0, 1, 2)) / 255.0, atol=1e-9
-        )
+        for key in ("mean", "std"):
+            of_colours = getattr(expected, key)(axis=(0, 1, 2)) / 255.0
+            np.testing.assert_allclose(np.ravel(stats[name][key]), of_colours, atol=1e-9)
         assert stats[name]["count"] == [len(expected)]
-
-
-def test_digest_depends_on_cameras() -> None:
-    without_cameras, with_cameras = load_recipe({**SMALL, "simulate": True}), load_recipe(RECIPE)
-    moved = load_recipe(
-        {**RECIPE, "cameras": [{**SMALL_CAMERAS[0], "fov": 61.0}, SMALL_CAMERAS[1]]}
-    )
-    assert len({without_cameras.digest, with_cameras.digest, moved.digest}) == 3
-    assert load_recipe({**SMALL, "simulate": True, "cameras": []}).digest == without_cameras.digest
-    assert load_recipe(with_cameras).cameras == with_cameras.cameras
-
-
-@pytest.mark.parametrize(
-    ("cameras", "message"),
-    [
-        ([{**SMALL_CAMERAS[0], "fov": 180.0}], "fov"),
-        ([{**SMALL_CAMERAS[0], "target": SMALL_CAMERAS[0]["position"]}], "is undefined"),
-        ([SMALL_CAMERAS[0], SMALL_CAMERAS[0]], "two cameras of one name"),
-        ([{**SMALL_CAMERAS[0], "wdth": 64}], "did you mean 'width'"),
-    ],
-)
-def test_invalid_cameras_are_rejected(cameras: Any, message: str) -> None:
-    with pytest.raises(vkc.InputError, match=message):
-        load_recipe({**RECIPE, "cameras": cameras})

@@ -31,27 +31,16 @@ def make_base_motion(*points: tuple[float, float]) -> Trajectory:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    post = {
-        "name": "post",
-        "type": "cylinder",
-        "radius": 0.1,
-        "length": 1.0,
-        "position": [0.0, 0.0, 0.5],
-    }
+    post = {"name": "post", "type": "cylinder", "radius": 0.1, "length": 1.0}
     lamp = {"name": "lamp", "type": "sphere", "radius": 0.1, "position": [0.0, 0.0, 2.2]}
-    document = {
-        "robot": "husky_ur5e",
-        "start": {"base": [2.0, -2.0, 0.0]},
-        "obstacles": [post, lamp],
-    }
+    obstacles = [{**post, "position": [0.0, 0.0, 0.5]}, lamp]
+    start = {"base": [2.0, -2.0, 0.0]}
+    document = {"robot": "husky_ur5e", "start": start, "obstacles": obstacles}
     return Scene.from_document(document, load_scene("door").folder)
 
 
 def test_winding_numbers_of_known_paths(scene: Scene) -> None:
-    right, left = (
-        make_base_motion((-2, -0.1), (0, -1), (2, -0.1)),
-        make_base_motion((-2, -0.1), (0, 1), (2, -0.1)),
-    )
+    right, left = (make_base_motion((-2, -0.1), (0, y), (2, -0.1)) for y in (-1, 1))
     assert compute_winding_numbers(scene, right) == {}  # on the same side as the straight line
     assert compute_winding_numbers(scene, left) == {"post": -1}  # clockwise around the post
     loop = make_base_motion((-2, -0.1), (0, -1), (2, 0), (0, 1), (-2, 0), (0, -1), (2, -0.1))
@@ -65,31 +54,21 @@ def test_paths_on_one_side_have_no_winding_number(
     assert compute_winding_numbers(scene, make_base_motion((-2.0, 0.5), *points, (2.0, 0.5))) == {}
 
 
-def make_record(number: int, motion: Trajectory, **changes: object) -> dict[str, object]:
-    return {
-        "number": number,
-        "scene": "s",
-        "task": "t",
-        "object": "o",
-        "goal": 1.0,
-        "way": sample_coarse_trajectory(motion),
-        **changes,
-    }
-
-
-def test_near_duplicates_are_found() -> None:
-    finder, straight = DuplicateFinder(), make_base_motion((0, 0), (1, 0), (2, 0))
-    assert finder.find_duplicate(make_record(3, straight)) is None
-    assert (
-        finder.find_duplicate(make_record(5, make_base_motion((0, 0), (1, 0.9 * NEAR), (2, 0))))
-        == 3
-    )
-    assert (
-        finder.find_duplicate(make_record(6, make_base_motion((0, 0), (1, 2.0 * NEAR), (2, 0))))
-        is None
-    )
-    assert finder.find_duplicate(make_record(7, straight, scene="another")) is None
-    assert finder.find_duplicate(make_record(8, straight, object="another")) is None
+@pytest.mark.parametrize(
+    ("y", "changes", "expected"),
+    [
+        (0.9 * NEAR, {}, 3),
+        (2.0 * NEAR, {}, None),
+        (0.0, {"scene": "another"}, None),
+        (0.0, {"object": "another"}, None),
+    ],
+)
+def test_near_duplicates_are_found(y: float, changes: dict[str, str], expected: int | None) -> None:
+    finder, about = DuplicateFinder(), {"scene": "s", "task": "t", "object": "o", "goal": 1.0}
+    for number, middle, more, found in ((3, 0.0, {}, None), (5, y, changes, expected)):
+        way = sample_coarse_trajectory(make_base_motion((0, 0), (1, middle), (2, 0)))
+        record = {**about, **more, "number": number, "way": way}
+        assert finder.find_duplicate(record) == found
 
 
 def test_coverage_of_an_interval() -> None:

@@ -8,16 +8,13 @@ import pytest
 from helpers.datasets import SMALL
 
 from vkc_pin.datasets.problems import NoProblemError, find_grasping_start, sample_problem
-from vkc_pin.datasets.recipe import get_robot_name, load_recipe
+from vkc_pin.datasets.recipe import load_recipe
 from vkc_pin.options import Options
 from vkc_pin.planning.planner import Planner, plan
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, step_to_dict
 
-STEPS = {
-    "drawer": Actuate("drawer", {"slide": 0.2}, "handle"),
-    "door": Actuate("door", {"hinge": 0.6}, "handle"),
-}
+GOALS = {"drawer": {"slide": 0.2}, "door": {"hinge": 0.6}}
 
 
 def compute_grasp_error(scene: Scene, name: str) -> float:
@@ -29,10 +26,10 @@ def compute_grasp_error(scene: Scene, name: str) -> float:
     return float(np.abs(pin.log6(expected.actInv(scene.tool_placement())).vector).max())
 
 
-@pytest.mark.parametrize("name", ["drawer", "door"])
+@pytest.mark.parametrize("name", GOALS)
 def test_grasping_start_places_the_hand_at_the_attachment(name: str) -> None:
     scene = load_scene(name)
-    step = Actuate(name, STEPS[name].joints, next(iter(scene.objects[name].object.attachments)))
+    step = Actuate(name, GOALS[name], next(iter(scene.objects[name].object.attachments)))
     rng, planner = np.random.default_rng(0), Planner()
     bases = []
     for _ in range(4):
@@ -47,23 +44,15 @@ def test_grasping_start_places_the_hand_at_the_attachment(name: str) -> None:
 
 def test_blocked_grasp_has_no_grasping_start() -> None:
     scene = load_scene("drawer")
-    document = scene.document
-    attachment, placed = (
-        next(iter(scene.objects["drawer"].object.attachments)),
-        scene.objects["drawer"],
-    )
-    position = placed.link_placement(
-        placed.object.attachments[attachment].link
-    ).translation.tolist()
-    document["obstacles"].append(
-        {"name": "block", "type": "box", "size": [1.0, 1.0, 1.0], "position": position}
-    )
+    placed = scene.objects["drawer"]
+    name = next(iter(placed.object.attachments))
+    position = placed.link_placement(placed.object.attachments[name].link).translation.tolist()
+    block = {"name": "block", "type": "box", "size": [1.0, 1.0, 1.0], "position": position}
+    obstacles = [*scene.document["obstacles"], block]
     with pytest.warns(UserWarning, match="overlap other shapes"):
-        blocked = Scene.from_document(document, scene.folder)
-    step = Actuate("drawer", {"slide": 0.2}, attachment)
-    assert (
-        find_grasping_start(blocked, step, np.random.default_rng(0), Options(), Planner()) is None
-    )
+        blocked = Scene.from_document({**scene.document, "obstacles": obstacles}, scene.folder)
+    step, rng = Actuate("drawer", {"slide": 0.2}, name), np.random.default_rng(0)
+    assert find_grasping_start(blocked, step, rng, Options(), Planner()) is None
 
 
 PLANNER = Planner()
@@ -110,10 +99,9 @@ def test_variants_differ_only_in_the_seed() -> None:
 
 
 def test_open_task_respects_the_ranges() -> None:
+    ranges = {"goal": {"share": [0.2, 0.3]}, "start": {"distance": [1.0, 4.0]}}
     for number in range(6):
-        problem = sample(
-            number, tasks=["drive-open"], goal={"share": [0.2, 0.3]}, start={"distance": [1.0, 4.0]}
-        )
+        problem = sample(number, tasks=["drive-open"], **ranges)
         (step,) = problem.steps
         assert isinstance(step, Actuate)
         placed = problem.scene.objects[step.object]
@@ -121,28 +109,20 @@ def test_open_task_respects_the_ranges() -> None:
         k = placed.object.coordinates.index(joint)
         fraction = abs(goal - placed.state[k]) / (placed.object.upper[k] - placed.object.lower[k])
         assert 0.199 <= fraction <= 0.301
-        assert (
-            1.0 <= np.linalg.norm(problem.scene.start[:2] - placed.placement.translation[:2]) <= 4.0
-        )
+        away = problem.scene.start[:2] - placed.placement.translation[:2]
+        assert 1.0 <= np.linalg.norm(away) <= 4.0
         assert problem.scene.start_clearance() >= START_CLEARANCE
         assert problem.scene.held == {}
 
 
 def test_fetched_object_is_placed_on_another_table() -> None:
     problem = sample(0, tasks=["fetch-place"])
-    grasp, place = problem.steps
-    assert isinstance(grasp, Grasp)
-    assert isinstance(place, Place)
-    obstacles = {
-        name: shape
-        for shape, name in zip(problem.scene.obstacles, problem.scene.obstacle_labels, strict=True)
-    }
-    top = obstacles["table_2_top"]
+    assert [type(step) for step in problem.steps] == [Grasp, Place]
+    top = problem.scene.obstacles[problem.scene.obstacle_labels.index("table_2_top")]
     local = top.placement.actInv(np.array(problem.about["goal"]))
     assert (np.abs(local[:2]) <= np.asarray(top.geometry.halfSide)[:2]).all()
-    assert local[2] == pytest.approx(
-        top.geometry.halfSide[2] + 0.035 + 0.001, abs=2e-3
-    )  # the ball's radius above the table top
+    # the ball's radius above the table top
+    assert local[2] == pytest.approx(top.geometry.halfSide[2] + 0.035 + 0.001, abs=2e-3)
 
 
 def test_any_grasp_is_one_of_the_hand() -> None:
@@ -155,23 +135,6 @@ def test_impossible_ranges_are_reported() -> None:
     with pytest.raises(NoProblemError, match="no free start in room_0"):
         sample(0, tasks=["drive-open"], start={"distance": [50.0, 60.0]})
     crowded = {"objects": 3, "width": [4.0, 4.0], "front": 3.0, "clutter": [1.0, 1.0]}
+    objects = ["random_door", "random_oven", "random_chest"]
     with pytest.raises(NoProblemError, match="room 0 for husky_ur5e"):
-        sample(
-            0,
-            tasks=["fetch-place"],
-            objects=["random_door", "random_oven", "random_chest"],
-            rooms=crowded,
-        )
-
-
-@pytest.mark.parametrize(
-    ("entry", "expected"),
-    [
-        ("panda", "panda"),
-        ("/a/b/panda/robot.yaml", "panda"),
-        ("/a/arm.urdf", "arm"),
-        ("/a/panda", "panda"),
-    ],
-)
-def test_robot_name_is_derived_from_the_entry(entry: str, expected: str) -> None:
-    assert get_robot_name(entry) == expected
+        sample(0, tasks=["fetch-place"], objects=objects, rooms=crowded)

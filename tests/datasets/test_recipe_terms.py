@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.datasets import SMALL
+from helpers.shards import Change, change_demo, set_description
 
 import vkc_pin as vkc
 from vkc_pin.datasets.check import check_dataset
@@ -19,55 +19,42 @@ from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generation import generate
 from vkc_pin.datasets.problems import resolve_episode_terms
 from vkc_pin.datasets.recipe import (
-    KeepOutSchema,
-    SpeedSchema,
-    TracedSchema,
-    UprightSchema,
     load_recipe,
 )
 from vkc_pin.errors import InputError
 
-h5py = pytest.importorskip("h5py")
+pytest.importorskip("h5py")
 SPEED_LIMIT = {"type": "speed", "frame": "base", "most": 0.3}
 RECIPE: dict[str, Any] = {**SMALL, "terms": [SPEED_LIMIT]}
 
 
+def make_limit(function: Callable[[Any], Any], **more: Any) -> vkc.Constraint:
+    return vkc.Constraint("low", function, upper=2.5, **more)
+
+
 def make_height_limit(frame: str = "hand") -> vkc.Constraint:
-    return vkc.Constraint("low", lambda s: s.position(frame)[2], upper=2.5)
-
-
-def make_recipe(*terms: dict[str, Any]) -> Any:
-    return load_recipe({**SMALL, "terms": list(terms)})
-
-
-def flatten_inputs(now: pin.SE3, before: pin.SE3, dt: float) -> np.ndarray:
-    columns = [np.concatenate([one.rotation.T.ravel(), one.translation]) for one in (now, before)]
-    return np.concatenate([*columns, [dt]])[None]
+    return make_limit(lambda s: s.position(frame)[2])
 
 
 def test_terms_agree_with_numpy() -> None:
     rng = np.random.default_rng(3)
     axis = np.array([1.0, 2.0, -0.5])
-    upright, speed, keep_out = make_recipe(
+    entries = [
         {"type": "upright", "frame": "object", "axis": axis.tolist(), "angle": 0.3, "held": True},
         {"type": "speed", "frame": "hand", "most": 0.4},
-        {
-            "type": "keep-out",
-            "frame": "base",
-            "position": [1.0, -0.5, 0.2],
-            "size": [2.0, 0.6, 1.0],
-        },
-    ).terms
-    assert [term.name for term in (upright, speed, keep_out)] == [
-        "upright object",
-        "speed hand",
-        "keep-out base",
+        {"type": "keep-out", "frame": "base", "position": [1.0, -0.5, 0.2], "size": [2, 0.6, 1]},
     ]
-    assert [term.holding for term in (upright, speed, keep_out)] == ["object", None, None]
+    terms = upright, speed, keep_out = load_recipe({**SMALL, "terms": entries}).terms
+    assert [(term.name, term.holding) for term in terms] == [
+        ("upright object", "object"),
+        ("speed hand", None),
+        ("keep-out base", None),
+    ]
     for _ in range(50):
         now, before, dt = pin.SE3.Random(), pin.SE3.Random(), float(rng.uniform(0.01, 0.5))
         now.translation, before.translation = rng.uniform(-2.0, 2.0, (2, 3))
-        row = flatten_inputs(now, before, dt)
+        poses = [[*one.rotation.T.ravel(), *one.translation] for one in (now, before)]
+        row = np.array([[*poses[0], *poses[1], dt]])
         tilt = math.acos(float((now.rotation @ axis)[2] / np.linalg.norm(axis)))
         assert (upright.formula.evaluate(row)[0, 0] >= upright.lower) == (tilt <= 0.3)
         expected = np.linalg.norm(now.translation - before.translation) / dt
@@ -98,118 +85,50 @@ def test_episodes_satisfy_their_terms(dataset: Dataset) -> None:
     assert check_dataset(dataset.folder).ok
 
 
-@pytest.fixture
-def copy(dataset: Dataset, tmp_path: Path) -> Path:
-    shutil.copytree(dataset.folder, tmp_path / "copy")
-    return tmp_path / "copy"
-
-
-def change_metadata(folder: Path, change: Any) -> int:
-    """Modify the metadata of an episode and return its number."""
-    with h5py.File(Dataset.open(folder).shards[0], "r+") as file:
-        group = file["data/demo_1"]
-        metadata = json.loads(group.attrs["episode"])
-        change(metadata)
-        group.attrs["episode"] = json.dumps(metadata)
-        return int(group.attrs["number"])
-
-
-def test_violated_term_is_reported(copy: Path) -> None:
-    def tighten(metadata: Any) -> None:
-        metadata["terms"][0]["upper"] = 0.01
-
-    number = change_metadata(copy, tighten)
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (set_description("terms", 0, "upper", value=0.01), "speed base"),
+        (set_description("terms", value=[]), "terms differ from those of the recipe"),
+    ],
+)
+def test_violated_and_missing_terms_are_reported(
+    copy: Path, shard: Path, change: Change, reason: str
+) -> None:
+    number = change_demo(shard, change, 1)
     found = check_dataset(copy)
     assert list(found.refused) == [number]
-    assert "speed base" in found.refused[number]
+    assert reason in found.refused[number]
 
 
-def test_terms_that_differ_from_the_recipe_are_reported(copy: Path) -> None:
-    number = change_metadata(copy, lambda metadata: metadata.pop("terms"))
-    found = check_dataset(copy)
-    assert list(found.refused) == [number]
-    assert "terms differ from those of the recipe" in found.refused[number]
-
-
-def test_digest_depends_on_terms(dataset: Dataset) -> None:
-    plain, slow = load_recipe(SMALL), load_recipe(RECIPE)
-    assert len({plain.digest, slow.digest, dataset.recipe.digest}) == 3
+def test_dataset_keeps_its_terms(dataset: Dataset) -> None:
     assert load_recipe(dataset.recipe.document).digest == dataset.recipe.digest
     assert load_recipe(dataset.folder / "recipe.yaml").terms == dataset.recipe.terms
     with pytest.raises(InputError, match="run otherwise"):
         generate(RECIPE, 3, dataset.folder)
-    assert (
-        generate(RECIPE, 3, dataset.folder, terms=[make_height_limit()]).numbers()
-        == dataset.numbers()
-    )
+    again = generate(RECIPE, 3, dataset.folder, terms=[make_height_limit()])
+    assert again.numbers() == dataset.numbers()
 
 
 def test_terms_apply_only_to_their_tasks(dataset: Dataset) -> None:
-    recipe = load_recipe(
-        {
-            **SMALL,
-            "tasks": ["given-open", "drive-open"],
-            "terms": [{**SPEED_LIMIT, "tasks": ["drive-open"]}],
-        }
+    tasks, limit = ["given-open", "drive-open"], {**SPEED_LIMIT, "tasks": ["drive-open"]}
+    recipe, episode = (
+        load_recipe({**SMALL, "tasks": tasks, "terms": [limit]}),
+        next(dataset.episodes()),
     )
-    episode = next(dataset.episodes())
-    found = [
-        resolve_episode_terms(recipe, episode.scene(), {**episode.about, "task": task})
-        for task in ("given-open", "drive-open")
+    counts = [
+        len(resolve_episode_terms(recipe, episode.scene(), {**episode.about, "task": task}))
+        for task in tasks
     ]
-    assert [len(terms) for terms in found] == [0, 1]
-
-
-@pytest.mark.parametrize(
-    ("entry", "field", "text"),
-    [
-        ("{type: uprigt}", "terms[0].type", "did you mean 'upright'"),
-        ("{type: speed, frame: hand}", "terms[0].most", "missing"),
-        ("{type: speed, most: -1}", "terms[0].most", "out of range"),
-        ("{type: speed, most: .nan}", "terms[0].most", "finite"),
-        ("{type: speed, most: 1, frme: hand}", "terms[0].frme", "did you mean 'frame'"),
-        ("{type: upright, axis: [0, 0, 0]}", "terms[0].axis", "no direction"),
-        ("{type: upright, angle: 4}", "terms[0].angle", "out of range"),
-        ("{type: keep-out, position: [0, 0], size: [1, 1, 1]}", "terms[0].position", "3 values"),
-        (
-            "{type: keep-out, position: [0, 0, 0], size: [1, 1, 0]}",
-            "terms[0].size[2]",
-            "out of range",
-        ),
-        (
-            "{type: speed, most: 1, tasks: [drive-opn]}",
-            "terms[0].tasks[0]",
-            "did you mean 'drive-open'",
-        ),
-        (
-            "{type: traced, traced: {term: Constraint, name: x, expression: import os}}",
-            "terms[0]",
-            "not a saved term",
-        ),
-        ("{type: python, expression: os.getcwd()}", "terms[0].type", "traced"),
-    ],
-)
-def test_invalid_terms_are_rejected(tmp_path: Path, entry: str, field: str, text: str) -> None:
-    file = tmp_path / "recipe.yaml"
-    file.write_text(f"name: small\nterms:\n  - {entry}\n", encoding="utf-8")
-    with pytest.raises(InputError) as caught:
-        load_recipe(file)
-    assert (caught.value.file, caught.value.line, caught.value.field) == (file, 3, field)
-    assert text in str(caught.value)
+    assert counts == [0, 1]
 
 
 @pytest.mark.parametrize(
     ("terms", "text"),
     [
         ([make_height_limit("hnd")], "did you mean 'hand'"),
-        (
-            [vkc.Constraint("x", lambda s: s.coordinate("elbow"), upper=1.0)],
-            "coordinate of husky_ur5e",
-        ),
-        (
-            [vkc.Constraint("x", lambda s: s.position("hand")[2], upper=1.0, during="reach")],
-            "phases are not known yet",
-        ),
+        ([make_limit(lambda s: s.coordinate("elbow"))], "coordinate of husky_ur5e"),
+        ([make_limit(lambda s: s.position("hand")[2], during="reach")], "are not known yet"),
         ([make_height_limit(), make_height_limit()], "two terms share a name"),
         (["low"], "a list of Constraint and Cost"),
         (3, "not a list"),
@@ -220,11 +139,3 @@ def test_invalid_terms_write_no_files(tmp_path: Path, terms: Any, text: str) -> 
         generate(SMALL, 1, tmp_path / "out", terms=terms)
     assert text in str(caught.value)
     assert not (tmp_path / "out").exists()
-
-
-def test_every_field_is_documented() -> None:
-    page = (Path(__file__).parents[2] / "docs/datasets.md").read_text(encoding="utf-8")
-    for schema in (UprightSchema, SpeedSchema, KeepOutSchema, TracedSchema):
-        assert [name for name in schema.model_fields if f"`{name}`" not in page] == [], (
-            schema.__name__
-        )

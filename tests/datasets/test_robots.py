@@ -19,6 +19,12 @@ from vkc_pin.world.models.robot_file import find_robot, load_robot
 from vkc_pin.world.scene.scene import load_scene
 
 
+def copy_robot(folder: Path) -> Path:
+    """Copy the packaged robot as `rover` into a folder, and return its robot.yaml."""
+    shutil.copytree(find_robot("husky_ur5e").parent, folder / "rover")
+    return folder / "rover" / "robot.yaml"
+
+
 @pytest.mark.long
 def test_robot_without_a_hand_is_imported_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -43,7 +49,7 @@ def test_robot_by_path_is_found_again(
     """
     pytest.importorskip("h5py")
     monkeypatch.chdir(tmp_path)
-    shutil.copytree(find_robot("husky_ur5e").parent, "mine/rover")
+    copy_robot(Path("mine"))
     dataset = generate({**SMALL, "robots": [f"mine/rover/{file_name}"]}, 1, "out")
     (episode,) = dataset.episodes()
     assert episode.about["robot"] == ("rover" if file_name == "robot.yaml" else "husky_ur5e")
@@ -63,25 +69,17 @@ def test_robot_by_path_is_found_again(
 
 
 def test_robots_with_the_same_name_are_rejected(tmp_path: Path) -> None:
-    for folder in ("a", "b"):
-        shutil.copytree(find_robot("husky_ur5e").parent, tmp_path / folder / "rover")
-    paths = [str(tmp_path / folder / "rover/robot.yaml") for folder in ("a", "b")]
+    paths = [str(copy_robot(tmp_path / folder)) for folder in ("a", "b")]
     with pytest.raises(InputError, match="two robots of one name") as caught:
         load_recipe({**SMALL, "robots": paths})
     assert caught.value.field == "robots[1]"
-    assert (
-        len(
-            load_recipe(
-                {**SMALL, "robots": [{"name": paths[0], "height": z} for z in (0.1, 0.2)]}
-            ).fields.robots
-        )
-        == 2
-    )
+    robots = [{"name": paths[0], "height": z} for z in (0.1, 0.2)]
+    assert len(load_recipe({**SMALL, "robots": robots}).fields.robots) == 2
 
 
 def write_scene_with_own_robot(folder: Path) -> Path:
     """Write a scene and its robot, the packaged ones, as files of a user; return the scene."""
-    shutil.copytree(find_robot("husky_ur5e").parent, folder / "rover")
+    copy_robot(folder)
     scene = load_scene("drawer").with_start(base=(-0.8, 0.5, 0.4)).document
     scene["robot"]["name"] = "rover/robot.yaml"
     file = folder / "scene.yaml"
@@ -115,10 +113,7 @@ def test_robot_yaml_of_another_urdf_is_not_copied(tmp_path: Path) -> None:
 
 
 def test_scenes_have_one_robot_of_a_name(tmp_path: Path) -> None:
-    scenes = []
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        scenes.append(str(write_scene_with_own_robot(tmp_path / name)))
+    scenes = [str(write_scene_with_own_robot(tmp_path / name)) for name in ("a", "b")]
     recipe = load_recipe({**SMALL, "scenes": scenes})
     with pytest.raises(InputError, match=r"different robots of one name.*b/rover/robot\.yaml"):
         robots.prepare_robots(recipe, tmp_path / "out")

@@ -35,13 +35,8 @@ def test_info_describes_the_features(root: Path) -> None:
     assert (info["total_episodes"], info["fps"], info["robot_type"]) == (4, 10, "husky_ur5e")
     assert info["splits"] == {"train": "0:4"}
     assert info["data_path"] == "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-    for name, dtype in (
-        ("timestamp", "float32"),
-        ("frame_index", "int64"),
-        ("episode_index", "int64"),
-        ("index", "int64"),
-        ("task_index", "int64"),
-    ):
+    for name in ("timestamp", "frame_index", "episode_index", "index", "task_index"):
+        dtype = "float32" if name == "timestamp" else "int64"
         assert info["features"][name] == {"dtype": dtype, "shape": [1], "names": None}
     for name in ("observation.state", "action"):
         assert info["features"][name]["shape"] == [len(info["features"][name]["names"])]
@@ -61,41 +56,29 @@ def test_frames_are_samples_of_episodes(dataset: Dataset, root: Path) -> None:
         rows = slice(first, first + count)
         assert set(table["episode_index"].to_pylist()[rows]) == {number}
         assert table["frame_index"].to_pylist()[rows] == list(range(count))
-        assert np.allclose(
-            np.array(table["timestamp"].to_pylist()[rows]) * info["fps"],
-            np.arange(count),
-            atol=1e-4,
-        )
+        times = np.array(table["timestamp"].to_pylist()[rows])
+        assert np.allclose(times * info["fps"], np.arange(count), atol=1e-4)
         assert np.allclose(state[rows, :3], found["base_pose"], atol=1e-6)
         assert np.allclose(np.array(table["action"].to_pylist())[rows], found["actions"], atol=1e-6)
         first += count
     assert first == len(table)
-    assert (
-        pq.ParquetFile(root / "data/chunk-000/file-000.parquet").num_row_groups == 4
-    )  # one per episode
+    # one per episode
+    assert pq.ParquetFile(root / "data/chunk-000/file-000.parquet").num_row_groups == 4
 
 
 def test_episode_and_task_tables_are_consistent(dataset: Dataset, root: Path) -> None:
     rows = pq.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
-    frames = load_info(root)["total_frames"]
     assert [row["episode_index"] for row in rows] == [0, 1, 2, 3]
-    assert [row["dataset_from_index"] for row in rows] == [
-        0,
-        *(row["dataset_to_index"] for row in rows[:-1]),
-    ]
-    assert rows[-1]["dataset_to_index"] == frames
-    assert all(row["length"] == row["dataset_to_index"] - row["dataset_from_index"] for row in rows)
-    assert {
-        "data/chunk_index",
-        "data/file_index",
-        "meta/episodes/chunk_index",
-        "stats/action/mean",
-    } <= set(rows[0])
+    ends = [row["dataset_to_index"] for row in rows]
+    assert [row["dataset_from_index"] for row in rows] == [0, *ends[:-1]]
+    assert ends[-1] == load_info(root)["total_frames"]
+    assert np.cumsum([row["length"] for row in rows]).tolist() == ends
+    assert {"data/chunk_index", "data/file_index", "meta/episodes/chunk_index"} <= set(rows[0])
+    assert "stats/action/mean" in rows[0]
     tasks = pq.read_table(root / "meta/tasks.parquet").to_pydict()
     indices = dict(zip(tasks["task"], tasks["task_index"], strict=True))
-    assert [row["tasks"] for row in rows] == [
-        [describe_task(episode.about)] for episode in dataset.episodes()
-    ]
+    described = [[describe_task(episode.about)] for episode in dataset.episodes()]
+    assert [row["tasks"] for row in rows] == described
     assert sorted(indices.values()) == list(range(len(indices)))
 
 
@@ -104,12 +87,10 @@ def test_statistics_cover_all_frames(root: Path) -> None:
     table = pq.read_table(root / "data/chunk-000/file-000.parquet")
     assert set(stats) == set(table.column_names)
     values = np.array(table["observation.velocity"].to_pylist(), float)
-    velocity_stats = stats["observation.velocity"]
-    assert np.allclose(velocity_stats["mean"], values.mean(axis=0), atol=1e-7)
-    assert np.allclose(velocity_stats["std"], values.std(axis=0), atol=1e-7)
-    assert np.allclose(velocity_stats["min"], values.min(axis=0))
-    assert np.allclose(velocity_stats["max"], values.max(axis=0))
-    assert velocity_stats["count"] == [len(values)]
+    found = stats["observation.velocity"]
+    for name in ("mean", "std", "min", "max"):
+        assert np.allclose(found[name], getattr(values, name)(axis=0), atol=1e-7)
+    assert found["count"] == [len(values)]
 
 
 def test_rate_must_be_a_whole_number(tmp_path: Path) -> None:

@@ -4,53 +4,60 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
 import trimesh
 import yaml
 from helpers.arm_urdf import HEIGHT, set_limits, write_arms
-from helpers.telescopes import FOLLOWERS, write_telescope
+from helpers.robots import compute_placement
+from helpers.telescopes import FOLLOWERS, format_joint, write_telescope
+from helpers.texts import format_box, format_fixed_link, replace_in_file
 
 import vkc_pin as vkc
 from vkc_pin.importing.robots.rest_configuration import HOME_ROOM, Clearances
-from vkc_pin.world.files.writing import write_atomically
 
 SAMPLES = 150
+HAND = ("hand", "finger_a", "finger_b")
+
+
+def import_arm(
+    folder: Path, *changes: tuple[str, str], samples: int = SAMPLES
+) -> vkc.importing.ImportedRobot:
+    """Import an arm with changes to its file."""
+    file = replace_in_file(write_arms(folder / "given"), *changes)
+    return vkc.importing.import_robot(file, folder / "mine", samples=samples)
+
+
+def add_elements(*elements: str) -> tuple[str, str]:
+    return "</robot>", "".join((*elements, "</robot>"))
 
 
 @pytest.fixture(scope="module")
 def imported(tmp_path_factory: pytest.TempPathFactory) -> vkc.importing.ImportedRobot:
     """Import a robot with two arms on a mobile base, an open bin 0.35 m above the floor."""
     folder = tmp_path_factory.mktemp("imported")
-    walls = [trimesh.creation.box((0.5, 0.4, 0.05)).apply_translation((0, 0, -0.325))]
-    walls += [
-        trimesh.creation.box((0.02, 0.4, 0.4)).apply_translation((x, 0, -0.099))
-        for x in (-0.24, 0.24)
+    walls = [
+        trimesh.creation.box(size).apply_translation((x, 0, z))
+        for size, x, z in (
+            ((0.5, 0.4, 0.05), 0, -0.325),
+            ((0.02, 0.4, 0.4), -0.24, -0.099),
+            ((0.02, 0.4, 0.4), 0.24, -0.099),
+        )
     ]
-    write_atomically(
-        folder / "given" / "bin.stl", trimesh.util.concatenate(walls).export(file_type="stl")
-    )
+    (folder / "given").mkdir()
+    trimesh.util.concatenate(walls).export(folder / "given" / "bin.stl")
     file = write_arms(folder / "given", sides=("left_", "right_"), own_base=True, mesh="bin.stl")
     return vkc.importing.import_robot(file, folder / "mine", arm="right", samples=SAMPLES)
 
 
 def test_folder_describes_the_robot(imported: vkc.importing.ImportedRobot) -> None:
     names = {path.name for path in imported.folder.iterdir()}
-    assert names == {
-        ".vkc-pin.json",
-        "robot.yaml",
-        "robot.png",
-        "scene.yaml",
-        "mine.urdf",
-        "mine.srdf",
-        "collision",
-    }
+    written = {f"robot.{kind}" for kind in ("yaml", "png")} | {"scene.yaml", ".vkc-pin.json"}
+    assert names == {*written, "mine.urdf", "mine.srdf", "collision"}
     loaded = vkc.load_robot(imported.folder)
     assert loaded.name == "mine"
     assert loaded.coordinates.names[3:] == tuple(f"right_arm_{k}_joint" for k in range(1, 6))
     assert loaded.tool_frame == "tool"
-    touching = ("arm_5", "hand", "finger_a", "finger_b")
-    assert set(loaded.touch_links) == {f"right_{name}" for name in touching}
+    assert set(loaded.touch_links) == {f"right_{name}" for name in ("arm_5", *HAND)}
     np.testing.assert_array_equal(loaded.home, imported.robot.home)
     gripper = loaded.gripper
     assert gripper is not None
@@ -83,22 +90,14 @@ def test_base_is_hollow_and_rests_on_the_floor(imported: vkc.importing.ImportedR
     assert clearances.floor(moved=False)[0][1] == pytest.approx(0.0, abs=1e-5)
     assert clearances.least() >= HOME_ROOM
     robot = imported.robot.model
-    assert robot.frames[robot.getFrameId("body")].placement.translation[2] == pytest.approx(
-        HEIGHT, abs=1e-5
-    )
+    height = robot.frames[robot.getFrameId("body")].placement.translation[2]
+    assert height == pytest.approx(HEIGHT, abs=1e-5)
 
 
 def test_gripper_that_does_not_open_is_locked(tmp_path: Path) -> None:
     """A bar across the fingertips leaves no room between the fingers at any position."""
-    file = write_arms(tmp_path / "given")
-    shape = '<collision><geometry><box size="0.02 0.02 0.09"/></geometry></collision>'
-    bar = f'<link name="bar">{shape}</link><joint name="bar_joint" type="fixed">'
-    joint = '<parent link="hand"/><child link="bar"/><origin xyz="0 0 0.1"/></joint>'
-    file.write_text(
-        file.read_text(encoding="utf-8").replace("</robot>", bar + joint + "</robot>"),
-        encoding="utf-8",
-    )
-    imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
+    bar = format_fixed_link("bar", "hand", "0 0 0.1", format_box("0.02 0.02 0.09"))
+    imported = import_arm(tmp_path, add_elements(bar))
     text = (imported.folder / "robot.yaml").read_text(encoding="utf-8")
     assert imported.robot.gripper is None
     assert "gripper" not in text
@@ -106,74 +105,50 @@ def test_gripper_that_does_not_open_is_locked(tmp_path: Path) -> None:
     assert "the fingers are locked: the gripper does not open" in str(imported)
 
 
-def test_reachable_poses_are_planned(imported: vkc.importing.ImportedRobot, tmp_path: Path) -> None:
-    scene = tmp_path / "scene.yaml"
-    scene.write_text(
-        f"robot: {imported.folder / 'robot.yaml'}\nstart: {{base: [0, 0, 0]}}\n", encoding="utf-8"
-    )
-    loaded = vkc.load_scene(scene)
-    robot, rng = loaded.robot, np.random.default_rng(4)
-    clearances, data, frame = (
-        Clearances(robot),
-        robot.model.createData(),
-        robot.model.getFrameId(robot.tool_frame),
-    )
-    arm = rng.uniform(robot.lower[3:], robot.upper[3:])
-    clearances.place(arm)
+def test_reachable_poses_are_planned(imported: vkc.importing.ImportedRobot) -> None:
+    scene = vkc.load_scene(imported.folder / "scene.yaml")
+    robot, rng, clearances = scene.robot, np.random.default_rng(4), Clearances(scene.robot)
+    clearances.place(arm := rng.uniform(robot.lower[3:], robot.upper[3:]))
     while clearances.least() <= HOME_ROOM:
-        arm = rng.uniform(robot.lower[3:], robot.upper[3:])
-        clearances.place(arm)
-    configuration = robot.coordinates.q(np.concatenate([[1.0, 0.5, 2.0], arm]))
-    pin.framesForwardKinematics(robot.model, data, configuration)
-    plan = vkc.plan(loaded, [vkc.Reach(data.oMf[frame].copy())])
+        clearances.place(arm := rng.uniform(robot.lower[3:], robot.upper[3:]))
+    pose = compute_placement(robot, robot.tool_frame, np.array([1.0, 0.5, 2.0, *arm]))
+    plan = vkc.plan(scene, [vkc.Reach(pose)])
     assert plan.success, plan.summary()
 
 
 def test_links_that_overlap_at_zero_are_separated_at_home(tmp_path: Path) -> None:
-    file = write_arms(tmp_path / "given")
-    text = file.read_text(encoding="utf-8")
-    for joint in ("arm_2_joint", "arm_3_joint"):
-        text = text.replace(
-            f'name="{joint}" type="revolute"><origin xyz="0 0 0.2"/>',
-            f'name="{joint}" type="revolute"><origin xyz="0 0 0.2" rpy="0 1.9 0"/>',
-        )
-    file.write_text(text, encoding="utf-8")
-    plain = vkc.load_robot(file, pairs="all")
-    clearances = Clearances(plain)
-    clearances.place(np.zeros(5))
-    assert ("arm_4", "body") in {tuple(sorted(pair[:2])) for pair in clearances.links(0.0)}, (
-        "precondition of the test"
-    )
+    bends = [
+        (f'{joint}"><origin xyz="0 0 0.2"/>', f'{joint}"><origin xyz="0 0 0.2" rpy="0 1.9 0"/>')
+        for joint in ('arm_2_joint" type="revolute', 'arm_3_joint" type="revolute')
+    ]
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # warnings about overlapping links or missing folders
-        imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
+        imported = import_arm(tmp_path, *bends)
+    plain = Clearances(vkc.load_robot(tmp_path / "given" / "robot.urdf", pairs="all"))
+    plain.place(np.zeros(5))
+    overlaps = {tuple(sorted(pair[:2])) for pair in plain.links(0.0)}
+    assert ("arm_4", "body") in overlaps, "precondition of the test"
     clearances = Clearances(imported.robot)
     clearances.place(imported.robot.home)
     assert clearances.least() >= HOME_ROOM
-    checked_pairs = {
-        tuple(sorted((imported.robot.link_of(a), imported.robot.link_of(b))))
-        for a, b in clearances.pairs
-    }
+    checked_pairs = {tuple(sorted(map(imported.robot.link_of, pair))) for pair in clearances.pairs}
     assert ("arm_4", "body") in checked_pairs
 
 
 def test_folder_is_replaced_only_with_force_and_kept_on_failure(tmp_path: Path) -> None:
     file, target = write_arms(tmp_path / "given"), tmp_path / "mine"
     vkc.importing.import_robot(file, target, samples=20)
-    (target / "notes.txt").write_text("dear", encoding="utf-8")
     with pytest.raises(vkc.InputError, match="--force"):
         vkc.importing.import_robot(file, target)
-    with pytest.raises(vkc.InputError, match=r"would delete .*got notes\.txt\)"):
-        vkc.importing.import_robot(file, target, samples=20, force=True)
-    (target / "notes.txt").unlink()
-    (target / "mine.urdf").write_text("changed by hand", encoding="utf-8")
+    urdf = target / "mine.urdf"
+    urdf.write_text("changed by hand", encoding="utf-8")
     with pytest.raises(vkc.UnknownNameError, match=r"given/robot\.urdf: tool_frame: .*'hand'"):
         vkc.importing.import_robot(file, target, tool_frame="hnd", force=True)
     with pytest.raises(vkc.UnknownNameError):
         vkc.importing.import_robot(file, target, arm="third", force=True)
-    assert (target / "mine.urdf").read_text(encoding="utf-8") == "changed by hand"
+    assert urdf.read_text(encoding="utf-8") == "changed by hand"
     vkc.importing.import_robot(file, target, samples=20, force=True)
-    assert (target / "mine.urdf").read_text(encoding="utf-8") != "changed by hand"
+    assert urdf.read_text(encoding="utf-8") != "changed by hand"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["given", "mine"]
 
 
@@ -199,41 +174,15 @@ def test_errors_name_the_problem_of_an_invalid_robot(
 def test_telescope_is_proposed_as_one_coordinate(tmp_path: Path) -> None:
     """No coupling is proposed if the file states the mimic joints."""
     for mimics, is_proposed in (("", True), ("chain", False)):
-        file = (
-            write_telescope(tmp_path / f"given{mimics}", couplings="", mimics=mimics).parent
-            / "robot.urdf"
-        )
+        given = write_telescope(tmp_path / f"given{mimics}", couplings="", mimics=mimics)
+        file = given.with_name("robot.urdf")
         imported = vkc.importing.import_robot(file, tmp_path / f"mine{mimics}", samples=SAMPLES)
-        assert imported.robot.coordinates.names[3:] == (
-            "lift",
-            "out_1",
-            "yaw_joint",
-            "pitch_joint",
-            "roll_joint",
-        )
+        names = imported.robot.coordinates.names[3:]
+        assert names == ("lift", "out_1", "yaw_joint", "pitch_joint", "roll_joint")
         document = yaml.safe_load((imported.folder / "robot.yaml").read_text())
         assert document.get("couplings", {}) == (FOLLOWERS if is_proposed else {})
         assert ("out_2, out_3, out_4 follow out_1 as a telescope" in str(imported)) == is_proposed
-        assert set(document["home"]) == {*imported.robot.coordinates.names[3:]}
-
-
-def test_file_name_cannot_add_fields_to_the_description(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = write_arms(tmp_path / "given").read_text(encoding="utf-8").replace(' name="robot"', "")
-    file = tmp_path / "x\ntool_frame: body\n#\x01\udcff.urdf"
-    file.write_text(text, encoding="utf-8")
-    monkeypatch.chdir(tmp_path)
-    imported = vkc.importing.import_robot(file, None, samples=20)
-    stem = "x_tool_frame__body____"
-    assert imported.folder.name == stem
-    assert {path.stem for path in imported.folder.glob("*.?rdf")} == {stem}
-    stated = (imported.folder / "robot.yaml").read_text(encoding="utf-8")
-    assert stated.startswith(
-        "# Made of x\\ntool_frame: body\\n#\\x01\\udcff.urdf (URDF) by vkc-pin"
-    )
-    assert yaml.safe_load(stated)["tool_frame"] == "tool"
-    assert vkc.load_robot(imported.folder).name == stem
+        assert set(document["home"]) == {*names}
 
 
 @pytest.mark.parametrize(
@@ -243,13 +192,12 @@ def test_visual_shapes_replace_missing_collision_shapes(
     tmp_path: Path, first: str, links: str
 ) -> None:
     """Only the links before `first` have collision shapes."""
-    file = write_arms(tmp_path / "given")
-    head, link, tail = file.read_text(encoding="utf-8").partition(f'<link name="{first}"')
-    file.write_text(head + link + tail.replace("collision>", "visual>"), encoding="utf-8")
-    imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
+    text = write_arms(tmp_path / "given").read_text(encoding="utf-8")
+    tail = text[text.index(f'<link name="{first}"') :]
+    imported = import_arm(tmp_path, (tail, tail.replace("collision>", "visual>")))
     assert f"visual shapes are used for want of collision shapes: {links} [guess]" in str(imported)
     assert "which open from 0 to 80 mm" in str(imported)
-    assert {"hand", "finger_a", "finger_b"} <= set(imported.robot.touch_links)
+    assert set(HAND) <= set(imported.robot.touch_links)
 
 
 STUCK = ("the gripper does not move: its fingers stay", False)
@@ -270,13 +218,14 @@ STUCK = ("the gripper does not move: its fingers stay", False)
 def test_opening_of_the_hand_is_diagnosed(
     tmp_path: Path, finger: str, limits: tuple[float, float], expected: str, healthy: bool
 ) -> None:
-    file = write_arms(tmp_path, sides=("right_",))
-    text = file.read_text(encoding="utf-8").replace('"prismatic"', f'"{finger}"')
     low, high = limits
-    text = text.replace('lower="0.0" upper="0.04"', f'lower="{low}" upper="{high}"')
+    changes = [('lower="0.0" upper="0.04"', f'lower="{low}" upper="{high}"')]
+    changes += [('"prismatic"', f'"{finger}"')]
+    file = write_arms(tmp_path, sides=("right_",))
     if finger == "fixed":
-        text = text.partition('<link name="right_hand">')[0] + "</robot>"
-    file.write_text(text, encoding="utf-8")
+        text = file.read_text(encoding="utf-8")
+        changes = [(text[text.index('<link name="right_hand">') :], "</robot>")]
+    replace_in_file(file, *changes)
     imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=30)
     assert expected in str(imported)
     assert ".vkc-pin-" not in str(imported)
@@ -284,52 +233,51 @@ def test_opening_of_the_hand_is_diagnosed(
 
 
 def test_column_of_a_lift_may_sink_into_the_floor(tmp_path: Path) -> None:
-    file = write_arms(tmp_path / "given")
-    foot = '<link name="foot"><collision><origin xyz="0 0 0.05"/><geometry>'
-    foot += '<box size="0.4 0.4 0.1"/></geometry></collision></link>'
-    foot += '<joint name="lift" type="prismatic"><parent link="foot"/><child link="body"/>'
-    foot += '<axis xyz="0 0 1"/><limit lower="0" upper="1" effort="9" velocity="1"/></joint>'
-    text = file.read_text(encoding="utf-8").replace('name="robot">', f'name="robot">{foot}')
-    text = text.replace("0 0 -0.1", "0 0 -0.5").replace("0.5 0.4 0.5", "0.1 0.1 1.0")
-    file.write_text(text, encoding="utf-8")
-    imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
+    foot = f'<link name="foot">{format_box("0.4 0.4 0.1", "0 0 0.05")}</link>'
+    lift = format_joint("lift", "prismatic", "foot", "body", limits=(0.0, 1.0))
+    column = [("0 0 -0.1", "0 0 -0.5"), ("0.5 0.4 0.5", "0.1 0.1 1.0")]
+    imported = import_arm(tmp_path, *column, add_elements(foot, lift))
     assert "the lift sinks body into the floor" in str(imported)
     assert "body" not in imported.robot.links
     assert imported.diagnosis.healthy
     assert "level ones at 0.1 to 1.9 m" in str(imported)
 
 
-@pytest.mark.parametrize(("first", "second"), [("a", "b"), ("b", "a")])
-def test_closing_direction_suits_a_wrist_without_roll(
-    tmp_path: Path, first: str, second: str
-) -> None:
-    """The arm pitches forwards only: the hand's y axis never turns upside down."""
-    file = write_arms(tmp_path / "given")
-    text = file.read_text(encoding="utf-8").replace("finger_a", f"finger_{first}_")
-    text = text.replace("finger_b", f"finger_{second}_")
-    for k in (3, 4):
-        text = text.replace(f'"arm_{k}_joint" type="revolute"', f'"arm_{k}_joint" type="fixed"')
-    for k in (2, 5):
-        text = set_limits(text, f"arm_{k}_joint", 0, 2)
-    post = '<link name="post"><collision><geometry><box size="0.1 0.1 0.9"/></geometry></collision>'
-    post += '</link><joint name="post_joint" type="fixed"><origin xyz="0.6 0 0.1"/>'
-    post += '<parent link="body"/><child link="post"/></joint></robot>'
-    file.write_text(text.replace("</robot>", post), encoding="utf-8")
-    imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
-    assert "thick: upright ones at" in str(imported)
+POST = format_fixed_link("post", "body", "0.6 0 0.1", format_box("0.1 0.1 0.9"))
 
 
 @pytest.mark.parametrize(("first", "second"), [("a", "b"), ("b", "a")])
-def test_closing_direction_leaves_the_wrist_room_to_turn_levers(
-    tmp_path: Path, first: str, second: str
+@pytest.mark.parametrize(
+    ("fixed", "limits", "elements", "part", "is_reported"),
+    [
+        # The hand's y axis never turns upside down.
+        ((3, 4), {2: (0, 2), 5: (0, 2)}, POST, "thick: upright ones at", True),
+        # The wrist rolls by slightly more than half a turn.
+        ((5,), {2: (0, 2), 3: (0, 2), 4: (-2.3, 1.6)}, "", "turn door levers", False),
+    ],
+    ids=["without roll", "with roll"],
+)
+def test_closing_direction_suits_the_wrist(
+    tmp_path: Path,
+    fixed: tuple[int, ...],
+    limits: dict[int, tuple[float, float]],
+    elements: str,
+    part: str,
+    is_reported: bool,
+    first: str,
+    second: str,
 ) -> None:
-    """The arm pitches forwards only, and its wrist rolls by slightly more than half a turn."""
-    file = write_arms(tmp_path / "given")
-    text = file.read_text(encoding="utf-8").replace("finger_a", f"finger_{first}_")
-    text = text.replace("finger_b", f"finger_{second}_")
-    text = text.replace('"arm_5_joint" type="revolute"', '"arm_5_joint" type="fixed"')
-    for joint, limits in ((2, (0, 2)), (3, (0, 2)), (4, (-2.3, 1.6))):
-        text = set_limits(text, f"arm_{joint}_joint", *limits)
-    file.write_text(text, encoding="utf-8")
-    imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
-    assert "turn door levers" not in str(imported)
+    """The arm pitches forwards only."""
+    text = write_arms(tmp_path / "given").read_text(encoding="utf-8")
+    limited = text
+    for joint, ends in limits.items():
+        limited = set_limits(limited, f"arm_{joint}_joint", *ends)
+    imported = import_arm(
+        tmp_path,
+        (text, limited),
+        ("finger_a", f"finger_{first}_"),
+        ("finger_b", f"finger_{second}_"),
+        *((f'arm_{k}_joint" type="revolute', f'arm_{k}_joint" type="fixed') for k in fixed),
+        add_elements(elements),
+    )
+    assert (part in str(imported)) == is_reported

@@ -28,8 +28,10 @@ def format_box(size: str, at: str = "0 0 0", kind: str = "collision", name: str 
     return f'<{kind}{label}><origin xyz="{at}"/>{geometry}</{kind}>'
 
 
-def format_fixed_link(name: str, parent: str, at: str = "0 0 0", shapes: str = "") -> str:
+def format_fixed_link(
+    name: str, parent: str, at: str = "0 0 0", shapes: str = "", *, rpy: str = "0 0 0"
+) -> str:
     """Return a link and the joint that fixes it to its parent."""
-    ends = f'<parent link="{parent}"/><child link="{name}"/><origin xyz="{at}"/>'
+    ends = f'<parent link="{parent}"/><child link="{name}"/><origin xyz="{at}" rpy="{rpy}"/>'
     joint = f'<joint name="{name}_joint" type="fixed">{ends}</joint>'
     return f'<link name="{name}">{shapes}</link>{joint}'

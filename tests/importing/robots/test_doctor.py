@@ -7,17 +7,15 @@ from pathlib import Path
 
 import pytest
 from helpers.arm_urdf import HEIGHT, set_limits, write_arms
+from helpers.texts import format_box, format_fixed_link, replace_in_file
 
 import vkc_pin as vkc
 from vkc_pin.importing.robots.doctor import Diagnosis
 
 
 def find_texts(diagnosis: Diagnosis, level: str, topic: str) -> list[str]:
-    return [
-        finding.text
-        for finding in diagnosis.findings
-        if (finding.level, finding.topic) == (level, topic)
-    ]
+    found = diagnosis.findings
+    return [each.text for each in found if (each.level, each.topic) == (level, topic)]
 
 
 def test_included_robot_is_healthy() -> None:
@@ -29,15 +27,12 @@ def test_included_robot_is_healthy() -> None:
 def test_home_in_collision_and_below_the_floor_is_reported(tmp_path: Path) -> None:
     file = write_arms(tmp_path / "robot")
     home = {"arm_2_joint": 1.9, "arm_3_joint": 1.9}
-    (tmp_path / "robot" / "robot.yaml").write_text(
-        json.dumps({"urdf": file.name, "home": home}), encoding="utf-8"
-    )
+    file.with_suffix(".yaml").write_text(json.dumps({"urdf": file.name, "home": home}))
     found = vkc.importing.doctor(tmp_path / "robot", samples=20)
     assert not found.healthy
     assert "below the floor" in " ".join(find_texts(found, "fault", "home"))
-    assert "links that overlap at home are not checked" in " ".join(
-        find_texts(found, "warning", "loading")
-    )
+    loading = " ".join(find_texts(found, "warning", "loading"))
+    assert "links that overlap at home are not checked" in loading
     assert str(found).startswith("robot: ")
     assert "fault" in str(found).splitlines()[1]
 
@@ -45,40 +40,31 @@ def test_home_in_collision_and_below_the_floor_is_reported(tmp_path: Path) -> No
 def test_inseparable_pairs_are_reported(tmp_path: Path) -> None:
     """The first link turns about the vertical, 30 mm above the body."""
     robot = vkc.load_robot(write_arms(tmp_path), pairs="all")
-    found = vkc.importing.doctor(robot, samples=60, margin=0.035)
-    assert any(
-        "body and arm_1 were never more than 30.0 mm" in text
-        for text in find_texts(found, "fault", "pairs")
+    found, small_margin = (
+        find_texts(vkc.importing.doctor(robot, samples=60, margin=margin), "fault", "pairs")
+        for margin in (0.035, 1e-3)
     )
-    small_margin = vkc.importing.doctor(robot, samples=60, margin=1e-3)
-    assert len(find_texts(small_margin, "fault", "pairs")) < len(
-        find_texts(found, "fault", "pairs")
-    )
+    assert any("body and arm_1 were never more than 30.0 mm" in text for text in found)
+    assert len(small_margin) < len(found)
 
 
 def test_missing_limits_and_masses_are_reported(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
-    text = path.read_text(encoding="utf-8").replace(
-        'effort="10" velocity="1.5"', 'effort="0" velocity="0"', 3
-    )
-    path.write_text(text, encoding="utf-8")
+    replace_in_file(path, ('effort="10" velocity="1.5"', 'effort="0" velocity="0"'), count=3)
     found = vkc.importing.doctor(path, samples=5)
-    assert (
-        "arm_1_joint, arm_2_joint, arm_3_joint (assumed: 3.14 rad/s)"
-        in find_texts(found, "warning", "limits")[0]
-    )
-    assert "arm_1_joint" in find_texts(found, "note", "effort")[0]
-    assert "arm_4_joint" not in find_texts(found, "note", "effort")[0]
+    (limits,) = find_texts(found, "warning", "limits")
+    assert "arm_1_joint, arm_2_joint, arm_3_joint (assumed: 3.14 rad/s)" in limits
+    efforts = find_texts(found, "note", "effort")[0]
+    assert "arm_1_joint" in efforts
+    assert "arm_4_joint" not in efforts
     assert "body" in find_texts(found, "note", "mass")[0]
     hints = " ".join(finding.hint for finding in found.findings)
     assert re.findall(r"joints: \{NAME: \{(\w+):", hints) == ["velocity", "effort"]
     stated = {"urdf": path.name, "joints": {"arm_1_joint": {"velocity": 2.0, "effort": 30.0}}}
-    (tmp_path / "robot.yaml").write_text(json.dumps(stated), encoding="utf-8")
+    path.with_suffix(".yaml").write_text(json.dumps(stated))
     found = vkc.importing.doctor(tmp_path, samples=5)
-    assert (
-        "no velocity limit in the file: arm_2_joint, arm_3_joint (assumed: 3.14 rad/s)"
-        in find_texts(found, "warning", "limits")
-    )
+    limits = "no velocity limit in the file: arm_2_joint, arm_3_joint (assumed: 3.14 rad/s)"
+    assert find_texts(found, "warning", "limits") == [limits]
     assert "arm_1_joint" not in find_texts(found, "note", "effort")[0]
 
 
@@ -87,34 +73,31 @@ def test_hand_in_front_of_its_tool_frame_is_reported(tmp_path: Path) -> None:
     assert find_texts(vkc.importing.doctor(path, samples=5), "limitation", "hand") == [
         "no link may touch what is grasped: it can reach poses, but not grasp objects"
     ]
-    text = path.read_text(encoding="utf-8").replace(
-        "</robot>",
-        '<link name="back"/><joint name="back_joint" type="fixed"><origin xyz="0 0 -0.1"/>'
-        '<parent link="hand"/>'
-        '<child link="back"/></joint></robot>',
-    )
-    path.write_text(text, encoding="utf-8")
-    settings = "urdf: robot.urdf\ntool_frame: back\ntouch_links: [hand, finger_a, finger_b]\n"
-    (tmp_path / "robot.yaml").write_text(settings, encoding="utf-8")
-    assert (
-        "in front of its tool frame back"
-        in find_texts(vkc.importing.doctor(tmp_path, samples=5), "fault", "hand")[0]
-    )
+    add_elements(path, format_fixed_link("back", "hand", "0 0 -0.1"))
+    settings = {"urdf": path.name, "tool_frame": "back", "touch_links": ["hand", "finger_a"]}
+    path.with_suffix(".yaml").write_text(json.dumps(settings))
+    faults = find_texts(vkc.importing.doctor(tmp_path, samples=5), "fault", "hand")
+    assert "in front of its tool frame back" in faults[0]
+
+
+def add_elements(path: Path, *elements: str) -> None:
+    replace_in_file(path, ("</robot>", "".join((*elements, "</robot>"))))
 
 
 def write_robot(folder: Path, **settings: object) -> Path:
     path = write_arms(folder)
-    tool = (
-        '<link name="tool"/><joint name="tool_joint" type="fixed"><parent link="hand"/>'
-        '<child link="tool"/><origin xyz="0 0 0.125" rpy="0 0 1.57079633"/></joint></robot>'
-    )
-    path.write_text(path.read_text(encoding="utf-8").replace("</robot>", tool), encoding="utf-8")
+    add_elements(path, format_fixed_link("tool", "hand", "0 0 0.125", rpy="0 0 1.57079633"))
     document: dict[str, object] = {"urdf": path.name, "tool_frame": "tool"}
     document["locked_joints"] = {"finger_a_joint": 0.03, "finger_b_joint": 0.03}
     document["base"] = {"height": HEIGHT}
     document["touch_links"] = ["arm_5", "hand", "finger_a", "finger_b"]
-    (folder / "robot.yaml").write_text(json.dumps(document | settings), encoding="utf-8")
+    path.with_suffix(".yaml").write_text(json.dumps(document | settings))
     return folder
+
+
+def find_limitations(robot: Path) -> list[str]:
+    """Return what the hand of a robot cannot do."""
+    return find_texts(vkc.importing.doctor(robot, samples=5), "limitation", "hand")
 
 
 def test_doctor_reports_a_closed_hand(tmp_path: Path) -> None:
@@ -168,7 +151,7 @@ def test_doctor_proposes_a_height_that_suits_common_tasks(tmp_path: Path) -> Non
     (hint,) = [finding.hint for finding in found.findings if finding.level == "limitation"]
     assert hint.startswith("mounted 0.7 m higher, it can: `base: {height: 0.4}`")
     write_robot(tmp_path, base={"height": 0.4})
-    assert not find_texts(vkc.importing.doctor(robot, samples=5), "limitation", "hand")
+    assert not find_limitations(robot)
 
 
 @pytest.mark.parametrize(("gap", "is_obstructed"), [(0.01, True), (0.03, False)])
@@ -178,20 +161,16 @@ def test_doctor_applies_the_clearances_of_plans(
     """The hand rolls by 90° for level bars, and moves a camera close to fins beside it."""
     locked = OPEN | {"arm_5_joint": 0.0}
     robot = write_robot(tmp_path, locked_joints=locked, srdf="all_pairs.srdf")
-    (tmp_path / "all_pairs.srdf").write_text('<robot name="robot"/>', encoding="utf-8")
-    path, parts = tmp_path / "robot.urdf", ""
-    for name, parent, place in (
-        ("left_fin", "arm_3", "0 0.1 0.15"),
-        ("right_fin", "arm_3", "0 -0.1 0.15"),
-        ("camera", "arm_4", f"0.1 0 {gap - 0.01}"),
-    ):
-        parts += f'<link name="{name}"><collision><geometry><box size="0.04 0.04 0.04"/>'
-        parts += f'</geometry></collision></link><joint name="{name}_joint" type="fixed">'
-        parts += f'<origin xyz="{place}"/><parent link="{parent}"/><child link="{name}"/></joint>'
-    text = path.read_text(encoding="utf-8").replace("</robot>", parts + "</robot>")
-    path.write_text(text, encoding="utf-8")
-    limitations = find_texts(vkc.importing.doctor(robot, samples=5), "limitation", "hand")
-    assert any("cannot grasp level bars" in text for text in limitations) == is_obstructed
+    (tmp_path / "all_pairs.srdf").write_text('<robot name="robot"/>')
+    cube = format_box("0.04 0.04 0.04")
+    add_elements(
+        tmp_path / "robot.urdf",
+        format_fixed_link("left_fin", "arm_3", "0 0.1 0.15", cube),
+        format_fixed_link("right_fin", "arm_3", "0 -0.1 0.15", cube),
+        format_fixed_link("camera", "arm_4", f"0.1 0 {gap - 0.01}", cube),
+    )
+    found = any("cannot grasp level bars" in text for text in find_limitations(robot))
+    assert found == is_obstructed
 
 
 @pytest.mark.parametrize(("range_", "side"), [((0.0, 2.0), "right"), ((-2.0, 0.0), "left")])
@@ -201,20 +180,24 @@ def test_doctor_reports_a_wrist_that_cannot_turn_a_lever(
     """From the pose that grasps level bars, the hand rolls in one direction only."""
     robot = write_robot(tmp_path, locked_joints=OPEN | {"arm_5_joint": 0.0})
     path = tmp_path / "robot.urdf"
-    text = set_limits(path.read_text(encoding="utf-8"), "arm_4_joint", *range_)
-    path.write_text(text, encoding="utf-8")
-    limitations = find_texts(vkc.importing.doctor(robot, samples=5), "limitation", "hand")
-    assert f"turn door levers with the free end on the {side}" in " ".join(limitations)
+    path.write_text(set_limits(path.read_text(encoding="utf-8"), "arm_4_joint", *range_))
+    text = " ".join(find_limitations(robot))
+    assert f"turn door levers with the free end on the {side}" in text
 
 
 def test_errors_name_the_invalid_argument() -> None:
-    for argument in ({"samples": 0}, {"margin": -1.0}):
+    for call, arguments, field in (
+        (vkc.importing.doctor, {"margin": -1.0}, "margin"),
+        (vkc.importing.doctor, {"samples": 0}, "samples"),
+        (vkc.importing.doctor, {"samples": 10**6 + 1}, "samples"),
+        (vkc.importing.import_robot, {"samples": 0}, "samples"),
+        (vkc.importing.import_robot, {"samples": 10**6 + 1}, "samples"),
+    ):
         with pytest.raises(vkc.InputError) as caught:
-            vkc.importing.doctor("husky_ur5e", **argument)  # type: ignore[arg-type]
-        assert caught.value.field == next(iter(argument))
-    with pytest.raises(vkc.UnknownNameError) as caught:
+            call("husky_ur5e", **arguments)  # type: ignore[operator]
+        assert caught.value.field == field
+    with pytest.raises(vkc.UnknownNameError, match="did you mean 'husky_ur5e'"):
         vkc.importing.doctor("husky_ur5")
-    assert caught.value.nearest == "husky_ur5e"
 
 
 SIZE, LIMITS = '<box size="0.5 0.4 0.5"/>', 'lower="-2" upper="2"'
@@ -227,7 +210,6 @@ SIZE, LIMITS = '<box size="0.5 0.4 0.5"/>', 'lower="-2" upper="2"'
         (SIZE, '<sphere radius="250"/>', "fault", "body is 500 m long"),
         (SIZE, '<cylinder radius="0.1" length="20"/>', "fault", "body is 20 m long"),
         (LIMITS, 'lower="-180" upper="180"', "warning", "moves from -180 to 180 rad"),
-        (LIMITS, 'lower="0" upper="90"', "warning", "moves from 0 to 90 rad"),
         (LIMITS, 'lower="-6.3" upper="6.3"', "", ""),
         (LIMITS, 'lower="-100000" upper="100000"', "", ""),
         (SIZE, '<box size="3 2 1"/>', "", ""),
@@ -236,8 +218,7 @@ SIZE, LIMITS = '<box size="0.5 0.4 0.5"/>', 'lower="-2" upper="2"'
 def test_wrong_units_are_recognized(
     tmp_path: Path, old: str, new: str, level: str, part: str
 ) -> None:
-    path = write_arms(tmp_path)
-    path.write_text(path.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
+    path = replace_in_file(write_arms(tmp_path), (old, new))
     found = vkc.importing.doctor(vkc.load_robot(path, pairs="all"), samples=1)
     texts = {each: find_texts(found, each, "units") for each in ("fault", "warning")}
     if not level:
@@ -259,22 +240,12 @@ def test_robot_in_kilometres_is_too_small(tmp_path: Path) -> None:
 
 
 def test_lift_without_velocity_limit_is_assumed_to_be_slow(tmp_path: Path) -> None:
-    path = write_arms(tmp_path)
-    text = path.read_text(encoding="utf-8").replace(' velocity="1.5"', ' velocity="0"')
-    text = text.replace('name="arm_1_joint" type="revolute"', 'name="arm_1_joint" type="prismatic"')
-    path.write_text(text, encoding="utf-8")
+    path = replace_in_file(
+        write_arms(tmp_path),
+        (' velocity="1.5"', ' velocity="0"'),
+        ('name="arm_1_joint" type="revolute"', 'name="arm_1_joint" type="prismatic"'),
+    )
     robot = vkc.load_robot(path)
     assert robot.velocity[3:].tolist() == pytest.approx([0.1, *[3.14159265] * 4])
     text = " ".join(find_texts(vkc.importing.doctor(robot, samples=1), "warning", "limits"))
     assert "arm_1_joint (assumed: 0.1 m/s); arm_2_joint, arm_3_joint" in text
-
-
-@pytest.mark.parametrize("samples", [0, 10**6 + 1, 10**12])
-def test_number_of_samples_is_limited(samples: int) -> None:
-    for call in (
-        lambda: vkc.importing.doctor("husky_ur5e", samples=samples),
-        lambda: vkc.importing.import_robot("husky_ur5e", "/nowhere", samples=samples),
-    ):
-        with pytest.raises(vkc.InputError) as caught:
-            call()
-        assert caught.value.field == "samples"

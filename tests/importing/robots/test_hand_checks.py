@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from helpers.arm_urdf import write_arms
+from helpers.texts import format_box, format_fixed_link, replace_in_file
 
 import vkc_pin as vkc
 from vkc_pin.importing.robots.hand_checks import find_envelopes
@@ -11,20 +12,13 @@ from vkc_pin.importing.robots.hand_checks import find_envelopes
 
 def write_caged_arm(folder: Path, *, size: str = "0.3 0.3 0.3", visual: bool = False) -> Path:
     """Write an arm whose hand is enclosed in a box, which has no visual shape by default."""
-    file = write_arms(folder)
-    hand_visual = "<visual><geometry><box size='0.05 0.14 0.06'/></geometry></visual>"
-    shape = f"<geometry><box size='{size}'/></geometry>"
-    cage_visual = f"<visual>{shape}</visual>" if visual else ""
-    cage = f"<link name='cage'><collision>{shape}</collision>{cage_visual}</link>"
-    joint = (
-        "<joint name='caging' type='fixed'><parent link='hand'/><child link='cage'/>"
-        "<origin xyz='0 0 0.1'/></joint>"
+    cage = format_box(size) + (format_box(size, kind="visual") if visual else "")
+    hand = '<link name="hand">'
+    return replace_in_file(
+        write_arms(folder),
+        (hand, hand + format_box("0.05 0.14 0.06", kind="visual")),
+        ("</robot>", format_fixed_link("cage", "hand", "0 0 0.1", cage) + "</robot>"),
     )
-    text = file.read_text(encoding="utf-8").replace(
-        '<link name="hand">', f'<link name="hand">{hand_visual}'
-    )
-    file.write_text(text.replace("</robot>", f"{cage}{joint}</robot>"), encoding="utf-8")
-    return file
 
 
 @pytest.mark.parametrize(

@@ -5,31 +5,30 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.arm_urdf import write_arms
+from helpers.texts import format_box, format_fixed_link, replace_in_file
 
 from vkc_pin.importing import import_robot
 from vkc_pin.importing.proposals.hand import make_hand
 from vkc_pin.importing.robots.arms import Arm, build_body_tree, find_arms
-from vkc_pin.importing.robots.hands import analyze_hand
+from vkc_pin.importing.robots.hands import Hand, analyze_hand
 from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.world.models.gripper import find_thickest_rod
 from vkc_pin.world.models.robot_model import build_full_model
 
 
-def analyze_first_hand(path: Path) -> tuple[Arm, object]:
+def analyze_first_hand(path: Path) -> tuple[Arm, Hand]:
     file = read_urdf(path)
-    arm = find_arms(
-        file, build_body_tree(file), {}, {shape.link for shape in file.read_shapes("collision")}
-    )[0]
+    solid = {shape.link for shape in file.read_shapes("collision")}
+    arm = find_arms(file, build_body_tree(file), {}, solid)[0]
     return arm, analyze_hand(file, build_full_model(file), arm)
 
 
 def test_tool_frame_lies_between_the_fingertips(tmp_path: Path) -> None:
     _, hand = analyze_first_hand(write_arms(tmp_path))
     assert hand.link == "arm_5"
-    np.testing.assert_allclose(
-        hand.tool.rotation[:, 2], [0, 0, 1], atol=1e-9
-    )  # approach, along the fingers
-    np.testing.assert_allclose(np.abs(hand.tool.rotation[:, 0]), [0, 1, 0], atol=1e-9)  # closing
+    # The approach is along the fingers, and the closing direction across them.
+    np.testing.assert_allclose(hand.tool.rotation[:, 2], [0, 0, 1], atol=1e-9)
+    np.testing.assert_allclose(np.abs(hand.tool.rotation[:, 0]), [0, 1, 0], atol=1e-9)
     assert np.linalg.det(hand.tool.rotation) == pytest.approx(1.0)
     np.testing.assert_allclose(hand.tool.translation[:2], 0.0, atol=2e-3)
     assert 0.2 + 0.06 + 0.05 < hand.tool.translation[2] < 0.2 + 0.06 + 0.08
@@ -44,12 +43,7 @@ def test_tool_frame_lies_between_the_fingertips(tmp_path: Path) -> None:
 
 def test_single_jaw_opens_from_the_hand(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
-    text = path.read_text(encoding="utf-8")
-    fixed = text.replace(
-        '<joint name="finger_b_joint" type="prismatic">',
-        '<joint name="finger_b_joint" type="fixed">',
-    )
-    path.write_text(fixed, encoding="utf-8")
+    replace_in_file(path, ('finger_b_joint" type="prismatic"', 'finger_b_joint" type="fixed"'))
     arm, hand = analyze_first_hand(path)
     assert [finger.name for finger in arm.fingers] == ["finger_a_joint"]
     assert hand.open == {"finger_a_joint": 0.04}
@@ -58,25 +52,22 @@ def test_single_jaw_opens_from_the_hand(tmp_path: Path) -> None:
 
 
 def test_hand_beside_a_hinge_approaches_across_its_axis(tmp_path: Path) -> None:
-    path = write_arms(tmp_path)
-    text = path.read_text(encoding="utf-8")
     wrist = '<joint name="wrist" type="fixed"><origin xyz="0 {} 0.2"/>'
-    path.write_text(text.replace(wrist.format(0), wrist.format(0.15)), encoding="utf-8")
+    path = replace_in_file(write_arms(tmp_path), (wrist.format(0), wrist.format(0.15)))
     _, hand = analyze_first_hand(path)
     np.testing.assert_allclose(hand.tool.rotation[:, 2], [0, 0, 1], atol=1e-9)
 
 
 def test_wide_jaw_opens_far_enough_for_a_lever(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
-    text = path.read_text(encoding="utf-8").partition('<link name="finger_a">')[0]
-    shape = '<collision><origin xyz="0 {} 0.04"/><geometry><box size="0.02 0.02 0.08"/></geometry>'
-    text += f"""<link name="jaw">{shape.format(0.01)}</collision></link>
+    text = path.read_text(encoding="utf-8")
+    jaw = format_box("0.02 0.02 0.08", "0 0.01 0.04")
+    side = format_box("0.02 0.02 0.08", "0 -0.01 0.04")
+    hand = f"""<link name="jaw">{jaw}</link>
         <joint name="jaw_joint" type="revolute"><parent link="hand"/><child link="jaw"/>
-        <origin xyz="0 0 0.06"/><axis xyz="-1 0 0"/><limit lower="0" upper="2.6"/></joint>
-        <link name="side">{shape.format(-0.01)}</collision></link>
-        <joint name="beside" type="fixed"><parent link="hand"/><child link="side"/>
-        <origin xyz="0 0 0.06"/></joint></robot>"""
-    path.write_text(text, encoding="utf-8")
+        <origin xyz="0 0 0.06"/><axis xyz="-1 0 0"/><limit lower="0" upper="2.6"/></joint>"""
+    hand += format_fixed_link("side", "hand", "0 0 0.06", side)
+    replace_in_file(path, (text[text.index('<link name="finger_a">') :], f"{hand}</robot>"))
     robot = import_robot(path, tmp_path / "mine", samples=20).robot
     assert find_thickest_rod(make_hand(robot).touch) > 0.035
     assert robot.gripper is not None
@@ -84,9 +75,7 @@ def test_wide_jaw_opens_far_enough_for_a_lever(tmp_path: Path) -> None:
 
 
 def test_tool_frame_of_a_flange_points_along_the_last_axis(tmp_path: Path) -> None:
-    path = write_arms(tmp_path)
-    text = path.read_text(encoding="utf-8")
-    path.write_text(text.replace('type="prismatic"', 'type="fixed"'), encoding="utf-8")
+    path = replace_in_file(write_arms(tmp_path), ('type="prismatic"', 'type="fixed"'))
     arm, hand = analyze_first_hand(path)
     assert arm.fingers == ()
     assert hand.open == {}

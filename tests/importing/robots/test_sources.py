@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from helpers.arm_urdf import write_arms
+from helpers.texts import replace_in_file
 
 import vkc_pin as vkc
 from vkc_pin.importing.parsers import expand_xacro
@@ -20,10 +21,8 @@ def read_robot(file: Path, scratch: Path) -> Source:
 
 def test_foreign_elements_are_removed_and_missing_limits_noted(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
-    text = path.read_text(encoding="utf-8").replace(' effort="10"', "", 1)
-    path.write_text(
-        text.replace("</robot>", "<gazebo/><transmission name='t'/></robot>"), encoding="utf-8"
-    )
+    foreign = "</robot>", "<gazebo/><transmission name='t'/></robot>"
+    replace_in_file(path, (' effort="10"', ""), foreign, count=1)
     source = read_robot(path, tmp_path)
     assert source.kind == "URDF"
     assert "left out elements that a URDF does not have: <gazebo>, <transmission>" in source.notes
@@ -74,22 +73,19 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def find_box_size(text: str, file: Path) -> str | None:
-    box = parse_xml(text, file).find("link/collision/geometry/box")
-    assert box is not None
-    return box.get("size")
+def expand_box_size(
+    file: Path, packages: dict[str, Path] | None = None, **arguments: str
+) -> str | None:
+    """Expand a xacro file and return the size of its box."""
+    box = parse_xml(expand_xacro(file, packages or {}, arguments), file).find(".//box")
+    return None if box is None else box.get("size")
 
 
-def test_packages_are_found_around_the_file(file: Path) -> None:
-    assert find_box_size(expand_xacro(file, {}, {}), file) == "0.6 0.1 0.1"
-    assert find_box_size(expand_xacro(file, {}, {"length": "0.5"}), file) == "1.0 0.1 0.1"
-
-
-def test_given_packages_take_precedence(file: Path, tmp_path: Path) -> None:
-    other = tmp_path / "elsewhere"
-    other.mkdir()
-    (other / "links.xacro").write_text(PART.replace("2*length", "4*length"), encoding="utf-8")
-    assert find_box_size(expand_xacro(file, {"my_parts": other}, {}), file).startswith("1.2")  # type: ignore[union-attr]
+def test_given_packages_and_those_around_the_file_are_found(file: Path, tmp_path: Path) -> None:
+    assert expand_box_size(file) == "0.6 0.1 0.1"
+    assert expand_box_size(file, length="0.5") == "1.0 0.1 0.1"
+    (tmp_path / "links.xacro").write_text(PART.replace("2*length", "4*length"), encoding="utf-8")
+    assert expand_box_size(file, {"my_parts": tmp_path}) == "1.2 0.1 0.1"
 
 
 @pytest.mark.parametrize(
@@ -111,7 +107,7 @@ def test_package_xml_names_a_package(file: Path, tmp_path: Path, folder: str, na
     (tmp_path / "elsewhere" / "links.xacro").rename(package / "links.xacro")
     text = f'<?xml version="1.0"?><package format="2"><name>{names}</name></package>'
     (package / "package.xml").write_text(text)
-    assert find_box_size(expand_xacro(file, {}, {}), file) == "0.6 0.1 0.1"
+    assert expand_box_size(file) == "0.6 0.1 0.1"
     plain = package / "r.urdf"
     plain.write_text('<robot name="r"><link name="a"/></robot>')
     assert read_urdf(plain).resolve("package://my_parts/links.xacro") == package / "links.xacro"
@@ -121,8 +117,8 @@ def test_all_missing_packages_are_listed(file: Path) -> None:
     include = '<xacro:include filename="$(find {})/x.xacro"/>'
     more = "".join(map(include.format, ("first_gone", "second_gone", "é" * 300)))
     part = file.parents[2] / "my_parts" / "links.xacro"
-    part.write_text(part.read_text().replace("</robot>", f"{include.format('third')}</robot>"))
-    file.write_text(TEXT.replace("</robot>", f"{more}</robot>"), encoding="utf-8")
+    replace_in_file(part, ("</robot>", f"{include.format('third')}</robot>"))
+    replace_in_file(file, ("</robot>", f"{more}</robot>"))
     with pytest.raises(vkc.InputError) as caught:
         expand_xacro(file, {}, {})
     message = str(caught.value)
@@ -134,11 +130,11 @@ def test_all_missing_packages_are_listed(file: Path) -> None:
 
 
 def test_errors_name_the_cause(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file.write_text(TEXT.replace("my_parts", "my_prats"), encoding="utf-8")
+    replace_in_file(file, ("my_parts", "my_prats"))
     with pytest.raises(vkc.InputError, match="my_prats") as caught:
         expand_xacro(file, {}, {})
     assert caught.value.file == file
-    file.write_text(TEXT.replace("$(arg length)", "${1/0}"), encoding="utf-8")
+    replace_in_file(file, ("my_prats", "my_parts"), ("$(arg length)", "${1/0}"))
     with pytest.raises(vkc.InputError, match="xacro cannot process the file"):
         expand_xacro(file, {}, {})
     monkeypatch.setitem(sys.modules, "xacro", None)

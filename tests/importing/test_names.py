@@ -4,46 +4,27 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import pytest
 import yaml
+from helpers.texts import format_box
 
 import vkc_pin as vkc
 
-NAMES = (
-    *(
-        "../../evil",
-        "/etc/evil",
-        "a b",
-        "a+b",
-        "é",
-        "ü",
-        "CON",
-        "con",
-        "\u67dc",
-        "x" * 300,
-        "é" * 200,
-    ),
-    *(
-        '"/><link name="y',
-        "{x: 1}",
-        "- a",
-        "# a",
-        "a: b",
-        "\u202ea",
-        "a\nfree: true",
-        "null",
-        "!!x",
-    ),
-)
+HOSTILE = ("../../evil", "/etc/evil", "a b", "a+b", "é", "ü", "CON", "con", "\u67dc", "x" * 300)
+YAML = ('"/><link name="y', "{x: 1}", "- a", "# a", "\u202ea", "a\nfree: true", "null", "!!x")
+NAMES = (*HOSTILE, "é" * 200, *YAML)
+INPUTS = Path(__file__).parents[1] / "fuzz" / "inputs"
 PORTABLE = re.compile(r"[A-Za-z0-9_.-]{1,80}")
 
 
-def format_box(name: str, size: str, at: str) -> str:
-    shape = f'<origin xyz="{at}"/><geometry><box size="{size}"/></geometry>'
-    return f"<link name={quoteattr(name)}><collision>{shape}</collision></link>"
+def format_link(name: str, size: str, at: str, count: int = 1) -> str:
+    """Return a link with `count` equal shapes."""
+    return f"<link name={quoteattr(name)}>{count * format_box(size, at)}</link>"
 
 
 def format_joint(name: str, kind: str, parent: str, child: str, at: str, axis: str) -> str:
@@ -63,9 +44,9 @@ def check_file_names(folder: Path, *others: str) -> None:
 
 
 def test_links_of_an_object_get_distinct_names(tmp_path: Path) -> None:
-    parts = [format_box("case", "0.4 0.5 3", "0 0 1.5")]
+    parts = [format_link("case", "0.4 0.5 3", "0 0 1.5")]
     for k, name in enumerate(NAMES):
-        parts += [format_box(name, "0.02 0.4 0.1", "0.22 0 0")]
+        parts += [format_link(name, "0.02 0.4 0.1", "0.22 0 0")]
         parts += [format_joint(name, "prismatic", "case", name, f"0 0 {0.1 + 0.13 * k}", "1 0 0")]
     text = f"<robot name={quoteattr(NAMES[0])}>{''.join(parts)}</robot>"
     (tmp_path / "o.urdf").write_text(text, encoding="utf-8")
@@ -79,12 +60,10 @@ def test_links_of_an_object_get_distinct_names(tmp_path: Path) -> None:
 
 
 def test_obstacles_and_objects_of_a_home_get_distinct_names(tmp_path: Path) -> None:
-    parts = [format_box("root", "8 8 0.01", "0 0 0")]
+    parts = [format_link("root", "8 8 0.01", "0 0 0")]
     for k, name in enumerate(NAMES):
-        size, at = "0.1 0.1 0.1", f"{0.3 * (k % 7) - 3} {0.5 * (k // 7) + 2} 0.2"
-        box, kind = format_box(name, size, "0 0 0"), "floating" if k < 3 else "fixed"
-        shape = box[box.index("<collision>") : box.index("</link>")]
-        parts += [box.replace(shape, 2 * shape)]
+        at, kind = f"{0.3 * (k % 7) - 3} {0.5 * (k // 7) + 2} 0.2", "fixed" if k > 2 else "floating"
+        parts += [format_link(name, "0.1 0.1 0.1", "0 0 0", 2)]
         parts += [format_joint(name, kind, "root", name, at, "1 0 0")]
     text = f'<robot name="h">{"".join(parts)}</robot>'
     (tmp_path / "h.urdf").write_text(text, encoding="utf-8")
@@ -95,8 +74,7 @@ def test_obstacles_and_objects_of_a_home_get_distinct_names(tmp_path: Path) -> N
 
 
 def test_links_of_a_robot_keep_their_names(tmp_path: Path) -> None:
-    file = Path(__file__).parents[1] / "fuzz" / "inputs" / "robot.urdf"
-    text = file.read_text(encoding="utf-8")
+    text = (INPUTS / "robot.urdf").read_text(encoding="utf-8")
     for k, name in enumerate(NAMES[4:10]):
         text = text.replace(f'"l{k}"', quoteattr(name))
     (tmp_path / "r.urdf").write_text(text, encoding="utf-8")
@@ -106,21 +84,39 @@ def test_links_of_a_robot_keep_their_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "stem", ["x\nfree: true\n#", "\x1b[2J", "x" * 240, "- a", "con", "é", "#", " "]
+    ("import_file", "name", "description"),
+    [
+        (vkc.importing.import_object, "cabinet.urdf", "[!s]*.yaml"),
+        (vkc.importing.import_robot, "robot.urdf", "robot.yaml"),
+        (vkc.importing.import_home, "cabinet.urdf", "scene.yaml"),
+    ],
 )
 def test_file_names_cannot_add_fields_to_the_description(
-    tmp_path: Path, stem: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    import_file: Callable[[Path], Any],
+    name: str,
+    description: str,
 ) -> None:
-    file = Path(__file__).parents[1] / "fuzz" / "inputs" / "cabinet.urdf"
-    (tmp_path / "in").mkdir()
-    source = tmp_path / "in" / f"{stem}.urdf"
-    source.write_bytes(file.read_bytes())
-    (tmp_path / "here").mkdir()
-    monkeypatch.chdir(tmp_path / "here")
-    imported = vkc.importing.import_object(source, most=1)
-    check_file_names(imported.file.parent.resolve())
-    assert not imported.object.free
-    assert yaml.safe_load(imported.file.read_text(encoding="utf-8")).keys() == {
-        "urdf",
-        "attachments",
-    }
+    found = []
+    stems = (
+        "plain",
+        "x\nfree: true\nfloor: false\n#\x01\udcff",
+        "\x1b[2J",
+        "x" * 240,
+        "- a",
+        "con",
+        "é",
+        " ",
+    )
+    for number, stem in enumerate(stems):
+        (tmp_path / str(number)).mkdir()
+        monkeypatch.chdir(tmp_path / str(number))
+        source = tmp_path / f"{stem}.urdf"
+        source.write_bytes((INPUTS / name).read_bytes())
+        import_file(source)
+        (folder,) = Path.cwd().iterdir()
+        check_file_names(folder)
+        (file,) = folder.glob(description)
+        found.append(yaml.safe_load(file.read_text(encoding="utf-8")).keys())
+    assert found == [found[0]] * len(stems)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import signal
@@ -18,11 +19,9 @@ import trimesh
 from vkc_pin.errors import InputError
 from vkc_pin.importing import import_home, import_object, import_robot
 from vkc_pin.importing.mjcf_models import NO_MASS, compile_mjcf
-from vkc_pin.importing.parsers import uses_xacro
 from vkc_pin.importing.robots.sources import read_source
 from vkc_pin.utils.isolation import TIME_VARIABLE
 from vkc_pin.world.files.meshes import load_mesh, load_parts
-from vkc_pin.world.files.xml import parse_xml
 
 XACRO = '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">{}<link name="a"/></robot>'
 BOMB = "".join(
@@ -52,7 +51,6 @@ HOSTILE_MJCF = {
     "heights": (f"<asset>{HEIGHTS}</asset>", "", "cannot read"),
     "include": ('<include file="a.xml"/>', "", "cannot read"),
 }
-IMPORTS = [import_object, import_robot, import_home]
 
 
 @pytest.fixture
@@ -85,7 +83,8 @@ def test_hostile_xacro_is_rejected(
     ("kind", "import_file"),
     [
         *((kind, import_object) for kind in HOSTILE_MJCF),
-        *(("itself", function) for function in IMPORTS[1:]),
+        ("itself", import_robot),
+        ("itself", import_home),
     ],
 )
 def test_hostile_mjcf_is_rejected(
@@ -107,29 +106,27 @@ def test_materials_and_textures_that_are_pipes_are_ignored(folder: Path) -> None
     (folder / "b.mtl").write_text("newmtl m\nmap_Kd pipe\n", encoding="utf-8")
     for name in ("a.obj", "b.obj"):
         assert len(load_parts(folder / name)) == len(load_mesh(folder / name).faces) == 1
-    (folder / "c.gltf").write_text(
-        '{"asset": {"version": "2.0"}, "buffers": [{"uri": "pipe", "byteLength": 9}]}',
-        encoding="utf-8",
-    )
+    buffers = '"buffers": [{"uri": "pipe", "byteLength": 9}]'
+    (folder / "c.gltf").write_text(f'{{"asset": {{"version": "2.0"}}, {buffers}}}')
     with pytest.raises(InputError, match=r"c\.gltf: cannot read the mesh: .*regular file"):
         load_mesh(folder / "c.gltf")
-
-
-PLY = b"ply\nformat ascii 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n"
 
 
 @pytest.mark.parametrize(
     ("name", "data"),
     [
         ("a.stl", bytes(80) + b"\xff\xff\xff\xff"),
-        ("a.ply", PLY),
+        (
+            "a.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 99999999999\nproperty float x\nend_header",
+        ),
         ("a.off", b"OFF\n99999999999 1 0\n0 0 0\n"),
         ("a.obj", b"v 0 0 0\nf 1 2 999999999999\n"),
         ("a.dae", b"<COLLADA><library_geometries/></COLLADA>"),
-        ("a.dae", b"<COLLADA>" + b"<a>" * 10**6 + b"</a>" * 10**6 + b"</COLLADA>"),
+        ("deep.dae", b"<COLLADA>" + b"<a>" * 10**6 + b"</a>" * 10**6 + b"</COLLADA>"),
         ("a.glb", b"glTF" + b"\xff" * 100),
     ],
-    ids=["stl", "ply", "off", "obj", "dae", "deep dae", "glb"],
+    ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_broken_meshes_are_rejected(folder: Path, name: str, data: bytes) -> None:
     (folder / name).write_bytes(data)
@@ -161,23 +158,14 @@ def test_ctrl_c_ends_an_import(folder: Path) -> None:
     ],
 )
 def test_only_xacro_elements_and_substitutions_need_xacro(
-    elements: str, name: str, expected: bool
+    elements: str, name: str, expected: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Files written by xacro contain neither, but declare its namespace."""
-    file = Path(name)
-    assert uses_xacro(parse_xml(XACRO.format(elements), file), file) == expected
-
-
-def test_robot_written_by_xacro_is_read_without_xacro(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setitem(sys.modules, "xacro", None)  # as if not installed
-    (tmp_path / "robot.urdf").write_text(XACRO.format(""))
-    source = read_source(tmp_path / "robot.urdf", tmp_path, packages={}, arguments={})
-    assert source.kind == "URDF"
-    (tmp_path / "robot.urdf").write_text(XACRO.format('<link name="${1}"/>'))
-    with pytest.raises(InputError, match="needs the Python package xacro"):
-        read_source(tmp_path / "robot.urdf", tmp_path, packages={}, arguments={})
+    (tmp_path / name).write_text(XACRO.format(elements))
+    with pytest.raises(InputError) if expected else contextlib.nullcontext() as caught:
+        read_source(tmp_path / name, tmp_path, packages={}, arguments={})
+    assert not expected or "needs the Python package xacro" in str(caught.value)
 
 
 mujoco = pytest.importorskip("mujoco")
@@ -197,46 +185,43 @@ def compile_door(folder: Path, **parts: str) -> tuple[object, str]:
 
 TEXTURE = '<asset><texture name="t" type="{}" {}/><material name="m" texture="t"/></asset>'
 MESH = '<asset><mesh name="l" file="gone.obj"/></asset>'
+MISSING = ("gone.obj", "there.stl", "lost.stl", f"{'é' * 300}.stl")  # all but one
 VISUAL, MESH_GEOM = ' contype="0" conaffinity="0"', '<geom type="mesh" mesh="l"{}/>'
 
 
 @pytest.mark.parametrize(
-    ("parts", "note", "count"),
+    ("parts", "note"),
     [
-        (
-            {"head": TEXTURE.format("2d", 'file="a/wood.png"'), "leaf": ' material="m"'},
-            "wood.png",
-            2,
+        ({"head": TEXTURE.format("2d", 'file="a/wood.png"'), "leaf": ' material="m"'}, "wood.png"),
+        ({"head": TEXTURE.format("cube", 'fileright="r.png"'), "leaf": ' material="m"'}, "r.png"),
+        ({"head": TEXTURE.format("skybox", 'file="sky.png"')}, "sky.png"),
+        ({"head": MESH, "more": MESH_GEOM.format(VISUAL)}, "'gone.obj' of body 'door'"),
+        ({"head": MESH, "more": MESH_GEOM.format(""), "leaf": VISUAL}, "visual shapes collide"),
+        ({"head": MESH}, ""),
+        *(
+            ({"head": head}, "settings of MuJoCo 2")
+            for head in (
+                '<option apirate="100"/>',
+                '<visual><map old="1"/></visual>',
+                '<compiler convexhull="true"/>',
+                '<compiler exactmeshinertia="true"/>',
+            )
         ),
-        (
-            {"head": TEXTURE.format("cube", 'fileright="r.png"'), "leaf": ' material="m"'},
-            "r.png",
-            2,
-        ),
-        ({"head": TEXTURE.format("skybox", 'file="sky.png"')}, "sky.png", 2),
-        ({"head": MESH, "more": MESH_GEOM.format(VISUAL)}, "'gone.obj' of body 'door'", 2),
-        ({"head": MESH, "more": MESH_GEOM.format(""), "leaf": VISUAL}, "visual shapes collide", 2),
-        ({"head": MESH}, "", 2),
-        ({"head": '<option apirate="100"/>'}, "settings of MuJoCo 2", 2),
-        ({"head": '<visual><map old="1"/></visual>'}, "settings of MuJoCo 2", 2),
-        ({"head": '<compiler convexhull="true"/>'}, "settings of MuJoCo 2", 2),
-        ({"head": '<compiler exactmeshinertia="true"/>'}, "settings of MuJoCo 2", 2),
-        ({"head": '<default class="old"/>', "leaf": ' class="old"'}, "settings of MuJoCo 2", 2),
-        ({"tail": '<keyframe><key qpos="0 0 0"/></keyframe>'}, "invalid qpos size", 2),
-        ({"tail": '<sensor><touch site="none"/></sensor>'}, "unrecognized name 'none'", 2),
-        ({"tail": '<actuator><motor joint="none"/></actuator>'}, "actuator", 2),
+        ({"head": '<default class="old"/>', "leaf": ' class="old"'}, "settings of MuJoCo 2"),
+        ({"tail": '<keyframe><key qpos="0 0 0"/></keyframe>'}, "invalid qpos size"),
+        ({"tail": '<sensor><touch site="none"/></sensor>'}, "unrecognized name 'none'"),
+        ({"tail": '<actuator><motor joint="none"/></actuator>'}, "actuator"),
         (
             {"inertial": '<inertial pos="0 0 0" mass="1" diaginertia="1 1 5"/>'},
             "inertia must satisfy",
-            2,
         ),
     ],
 )
 def test_errors_outside_the_geometry_are_noted(
-    tmp_path: Path, parts: dict[str, str], note: str, count: int
+    tmp_path: Path, parts: dict[str, str], note: str
 ) -> None:
     model, notes = compile_door(tmp_path, **parts)
-    assert model.ngeom == count
+    assert model.ngeom == 2
     assert model.geom_contype.all()
     assert model.njnt == 1
     assert note in notes
@@ -257,18 +242,31 @@ def test_masses_may_be_missing(tmp_path: Path, head: str, leaf: str) -> None:
     assert model.body_mass[2] <= NO_MASS
 
 
-def test_all_missing_collision_meshes_are_listed(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        (
+            {
+                "head": "".join(f'<asset><mesh file="{name}"/></asset>' for name in MISSING),
+                "more": "".join(
+                    f'<geom type="mesh" mesh="{Path(name).stem}"/>' for name in MISSING
+                ),
+            },
+            r"got no gone\.obj, lost\.stl, é",
+        ),
+        ({"more": '<geom type="sphere" size="0"/>'}, "cannot read the file: .*size 0 must be"),
+        *(
+            ({"head": f'<default class="old"/><include file="{name}.xml"/>'}, "cannot read")
+            for name in ("door", "none")  # of files for MuJoCo 2
+        ),
+    ],
+)
+def test_errors_in_the_geometry_and_in_includes_are_raised(
+    tmp_path: Path, parts: dict[str, str], message: str
+) -> None:
     trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "there.stl")
-    names = ("gone.obj", "there.stl", "lost.stl", f"{'é' * 300}.stl")
-    head = "".join(f'<mesh name="{name}" file="{name}"/>' for name in names)
-    more = "".join(f'<geom type="mesh" mesh="{name}"/>' for name in names)
-    with pytest.raises(InputError, match=r"got no gone\.obj, lost\.stl, é"):
-        compile_door(tmp_path, head=f"<asset>{head}</asset>", more=more)
-
-
-def test_errors_in_the_geometry_are_raised(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"MuJoCo cannot read the file: .*size 0 must be"):
-        compile_door(tmp_path, more='<geom type="sphere" size="0"/>')
+    with pytest.raises(InputError, match=message):
+        compile_door(tmp_path, **parts)
 
 
 def test_a_file_for_mujoco_2_is_read_with_its_includes(tmp_path: Path) -> None:
@@ -291,9 +289,3 @@ def test_a_file_for_mujoco_2_is_read_with_its_includes(tmp_path: Path) -> None:
     assert sorted(model.geom_aabb[2, 3:]) == pytest.approx([0.05, 0.1, 0.15], abs=1e-6)
     assert model.geom_size[3, 0] == pytest.approx(0.3)
     assert model.jnt_range[0, 1] == pytest.approx(math.radians(1.0))
-
-
-@pytest.mark.parametrize("included", ['<include file="door.xml"/>', '<include file="none.xml"/>'])
-def test_invalid_includes_of_a_file_for_mujoco_2_raise(tmp_path: Path, included: str) -> None:
-    with pytest.raises(InputError, match="MuJoCo cannot read the file"):
-        compile_door(tmp_path, head=f'<default class="old"/>{included}')

@@ -163,7 +163,7 @@ def test_sdf_world_is_imported(tmp_path: Path) -> None:
     assert list(item.coordinates.names) == ["slide"]
     assert {grasp.link for grasp in item.attachments.values()} == {"front"}
     assert "not static, but with joints, hence fixed in place: chest" in imported.notes
-    assert "2 m of floor lie beyond the sides without walls: -y, -x, +x" in imported.notes
+    assert "2 m of floor lie beyond the sides without walls: -x, -y, +x" in imported.notes
     assert imported.scene.objects["cup"].placement.translation == pytest.approx([2.2, 1.0, 0.8])
     # free floor on the three sides without a wall
     assert imported.scene.arena == pytest.approx((-5.0, 5.0, 0.7 - 2.0, 2.05))

@@ -13,9 +13,7 @@ from vkc_pin.importing.convex import Pieces, compute_concavity, compute_solid_vo
 from vkc_pin.utils import disk_cache
 
 Triangles = trimesh.Trimesh
-box, cylinder = trimesh.creation.box, trimesh.creation.cylinder
-revolve, torus = trimesh.creation.revolve, trimesh.creation.torus
-concatenate = trimesh.util.concatenate
+box, torus, concatenate = trimesh.creation.box, trimesh.creation.torus, trimesh.util.concatenate
 CAVITY = (0.24, 0.3, 0.4)  # in the middle of a cabinet
 
 
@@ -65,18 +63,17 @@ def turn(mesh: Triangles) -> Triangles:
     return mesh.copy().apply_transform(trimesh.transformations.euler_matrix(0.3, 0.4, 0.5))
 
 
-def make_two_blocks(*, tee: bool) -> Triangles:
-    """Make an L or a T of two blocks in one mesh."""
-    shift = 0.13 if tee else 0.0
+def make_two_blocks(shift: float = 0.0) -> Triangles:
+    """Make an L, or a T if the upright block is shifted, in one mesh."""
     return weld(
         make_block((0, 0, 0), (0.3, 0.04, 0.03)),
-        make_block((shift, 0.04 if tee else 0.0, 0), (shift + 0.04, 0.2, 0.03)),
+        make_block((shift, 0.04 if shift else 0.0, 0), (shift + 0.04, 0.2, 0.03)),
     )
 
 
 def make_cup(wall: float) -> Triangles:
     profile = [[0, 0], [0.1, 0], [0.1, 0.2], [0.1 - wall, 0.2], [0.1 - wall, wall], [0, wall]]
-    return revolve(np.array(profile if wall else profile[:3], float), sections=32)
+    return trimesh.creation.revolve(np.array(profile), sections=32)
 
 
 def make_bowl() -> Triangles:
@@ -98,7 +95,7 @@ def make_corrugated_sheet() -> Triangles:
     k = np.arange(n * n).reshape(n, n)
     a, b, c, d = (part.ravel() for part in (k[:-1, :-1], k[:-1, 1:], k[1:, 1:], k[1:, :-1]))
     vertices = np.column_stack([x.ravel(), y.ravel(), 0.05 * np.sin(x.ravel() / 0.05)])
-    return Triangles(vertices, np.vstack([np.column_stack([a, b, c]), np.column_stack([a, c, d])]))
+    return Triangles(vertices, np.hstack([(a, b, c), (a, c, d)]).T)
 
 
 def make_chain_link() -> Triangles:
@@ -109,25 +106,17 @@ Point = tuple[float, float, float]
 SHAPES: dict[str, tuple[Callable[[], Triangles], list[Point], int]] = {
     # Mesh, points that stay free, largest number of pieces
     "sheets": (make_sheet_cabinet, [CAVITY], 5),
-    "dense sheets": (lambda: make_sheet_cabinet().subdivide_to_size(0.04), [CAVITY], 5),
     "turned sheets": (lambda: turn(make_sheet_cabinet()), [], 5),
-    "basket": (lambda: remove_sides(box((0.4, 0.3, 0.2)), (2, 0.1)), [(0, 0, 0)], 5),
     "boards": (make_board_cabinet, [CAVITY], 5),
     "inverted boards": (lambda: mirror(make_board_cabinet()), [(0.24, -0.3, 0.4)], 5),
     "shelves": (lambda: make_board_cabinet(0.2, 0.5), [(0.24, 0.3, 0.35), (0.24, 0.3, 0.65)], 7),
-    "many shelves": (
-        lambda: make_board_cabinet(*np.arange(0.08, 0.75, 0.08)),
-        [(0.24, 0.3, 0.13 + 0.08 * k) for k in range(8)],
-        14,
-    ),
-    "L": (lambda: make_two_blocks(tee=False), [(0.1, 0.1, 0.015)], 3),
-    "T": (lambda: make_two_blocks(tee=True), [(0.05, 0.1, 0.015), (0.25, 0.1, 0.015)], 2),
-    "turned L": (lambda: turn(make_two_blocks(tee=False)), [], 3),
-    "dense L": (lambda: make_two_blocks(tee=False).subdivide_to_size(0.01), [(0.1, 0.1, 0.015)], 3),
+    "L": (make_two_blocks, [(0.1, 0.1, 0.015)], 3),
+    "T": (lambda: make_two_blocks(0.13), [(0.05, 0.1, 0.015), (0.25, 0.1, 0.015)], 2),
+    "turned L": (lambda: turn(make_two_blocks()), [], 3),
+    "dense L": (lambda: make_two_blocks().subdivide_to_size(0.01), [(0.1, 0.1, 0.015)], 3),
     "cup": (lambda: make_cup(0.01), [(0, 0, 0.1)], 12),
-    "cup of sheet": (lambda: make_cup(0.0), [(0, 0, 0.1)], 12),
     "tube": (
-        lambda: remove_sides(cylinder(0.1, 0.2, sections=24), (2, 0.1), (2, -0.1)),
+        lambda: remove_sides(trimesh.creation.cylinder(0.1, 0.2, sections=24), (2, 0.1), (2, -0.1)),
         [(0, 0, 0)],
         12,
     ),
@@ -172,19 +161,11 @@ def measure_distances(mesh: Triangles, points: np.ndarray) -> np.ndarray:
     triangles.addTriangles(faces)
     triangles.endModel()
     triangles.computeLocalAABB()
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
     sphere, identity = coal.Sphere(1e-9), coal.Transform3s()
+    places = [coal.Transform3s(np.eye(3), point) for point in points]
     return np.array(
-        [
-            coal.distance(
-                sphere,
-                coal.Transform3s(np.eye(3), point),
-                triangles,
-                identity,
-                coal.DistanceRequest(),
-                coal.DistanceResult(),
-            )
-            for point in points
-        ]
+        [coal.distance(sphere, at, triangles, identity, request, result) for at in places]
     )
 
 
@@ -201,18 +182,7 @@ def check_pieces(mesh: Triangles, pieces: Pieces) -> None:
         assert measure_distances(mesh, points).max(initial=0.0) < pieces.error + 2e-3
 
 
-SLOW_SHAPES = (
-    "bowl",
-    "cup",
-    "cup of sheet",
-    "dense L",
-    "dense sheets",
-    "links of a chain",
-    "many shelves",
-    "tube",
-    "turned L",
-    "wave",
-)
+SLOW_SHAPES = ("bowl", "cup", "dense L", "links of a chain", "tube", "turned L", "wave")
 
 
 @pytest.mark.parametrize(
@@ -239,14 +209,11 @@ def test_pieces_contain_the_mesh_and_leave_cavities_free(
 
 def test_long_narrow_strips_are_cut() -> None:
     """The grid that coarsens a ribbon of 1 m must be finer than the ribbon's width."""
-    x = np.linspace(0.0, 1.0, 400)
+    x, k = np.linspace(0.0, 1.0, 400), np.arange(399)
     z = 0.004 + 0.003 * np.sin(10.0 * x)
     edges = [np.column_stack([x, np.full(400, y), z]) for y in (0.001, 0.004)]
-    k = np.arange(399)
-    faces = np.vstack(
-        [np.column_stack([k, k + 1, k + 400]), np.column_stack([k + 1, k + 401, k + 400])]
-    )
-    ribbon = Triangles(np.vstack(edges), faces)
+    triangles = [(k, k + 1, k + 400), (k + 1, k + 401, k + 400)]
+    ribbon = Triangles(np.vstack(edges), np.hstack(triangles).T)
     pieces = decompose(ribbon, error=0.004)
     check_pieces(ribbon, pieces)
     assert pieces.error < 0.004 < compute_concavity(ribbon)
@@ -282,28 +249,38 @@ def test_cached_pieces_equal_computed_pieces(
 
 def test_open_boxes_are_thin_shells() -> None:
     whole = box((0.4, 0.3, 0.2)).subdivide_to_size(0.02)
-    pierced, open_ = whole.copy(), whole.copy()
-    pierced.update_faces(np.arange(len(whole.faces)) != 7)
-    open_.update_faces(whole.triangles_center[:, 2] < 0.0999)
     assert compute_solid_volume(whole) == pytest.approx(0.024)
-    assert compute_solid_volume(open_) < 0.3 * 0.024
-    assert not pierced.is_watertight
-    assert compute_solid_volume(pierced) < 0.3 * 0.024
+    for kept in (np.arange(len(whole.faces)) != 7, whole.triangles_center[:, 2] < 0.0999):
+        open_ = whole.copy()
+        open_.update_faces(kept)
+        assert compute_solid_volume(open_) < 0.3 * 0.024
+
+
+def break_vertex() -> Triangles:
+    broken = box((1, 1, 1))
+    broken.vertices[3, 1] = np.nan
+    return broken
 
 
 @pytest.mark.parametrize(
-    "argument", [{"most_pieces": 0}, {"error": 0.0}, {"error": float("nan")}, {"corners": 3}]
+    ("mesh", "argument", "field"),
+    [
+        *(
+            (box((1, 1, 1)), argument, next(iter(argument)))
+            for argument in (
+                {"most_pieces": 0},
+                {"error": 0.0},
+                {"error": float("nan")},
+                {"corners": 3},
+            )
+        ),
+        (break_vertex(), {}, "mesh.vertices[3, 1]"),
+        (Triangles(), {}, "mesh"),
+    ],
 )
-def test_errors_name_the_invalid_argument(argument: dict[str, float]) -> None:
+def test_errors_name_the_invalid_argument(
+    mesh: Triangles, argument: dict[str, float], field: str
+) -> None:
     with pytest.raises(vkc.InputError) as caught:
-        decompose(box((1, 1, 1)), **argument)  # type: ignore[arg-type]
-    assert caught.value.field == next(iter(argument))
-
-
-def test_errors_name_the_invalid_part_of_a_mesh() -> None:
-    broken = box((1, 1, 1))
-    broken.vertices[3, 1] = np.nan
-    for mesh, field in ((broken, "mesh.vertices[3, 1]"), (Triangles(), "mesh")):
-        with pytest.raises(vkc.InputError) as caught:
-            decompose(mesh)
-        assert caught.value.field == field
+        decompose(mesh, **argument)  # type: ignore[arg-type]
+    assert caught.value.field == field

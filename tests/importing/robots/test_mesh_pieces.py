@@ -5,12 +5,13 @@ from pathlib import Path
 
 import pytest
 import trimesh
+from helpers.texts import format_fixed_link
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
 from vkc_pin.importing.robots.mesh_pieces import copy_meshes, write_meshes
 from vkc_pin.world.files.meshes import load_parts
-from vkc_pin.world.files.urdf import UrdfFile, read_urdf
+from vkc_pin.world.files.urdf import read_urdf
 
 TEXT = """<robot name="r">
   <link name="a">
@@ -25,13 +26,10 @@ TEXT = """<robot name="r">
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    box = trimesh.creation.box
-    arms = [
-        box((2, 0.2, 1)).apply_translation((1.2, 0, 0)),
-        box((0.2, 2, 1)).apply_translation((0, 1.2, 0)),
-    ]
-    angle = trimesh.util.concatenate(arms)
-    angle.export(tmp_path / "angle.stl")
+    arms = [trimesh.creation.box(size) for size in ((2, 0.2, 1), (0.2, 2, 1))]
+    arms[0].apply_translation((1.2, 0, 0))
+    arms[1].apply_translation((0, 1.2, 0))
+    trimesh.util.concatenate(arms).export(tmp_path / "angle.stl")
     trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]).export(tmp_path / "sheet.stl")
     (tmp_path / "seen.obj").write_text(
         "mtllib paint.mtl\nusemtl red\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n"
@@ -48,11 +46,7 @@ def test_pieces_replace_meshes_and_visuals_are_copied(file: Path, tmp_path: Path
     (folder / "r.urdf").write_bytes(ElementTree.tostring(root))
     shapes = read_urdf(folder / "r.urdf").read_shapes("collision")
     assert [shape.kind for shape in shapes] == ["box", "mesh", "mesh", "mesh"]
-    before = next(
-        shape
-        for shape in read_urdf(file).read_shapes("collision")
-        if shape.file and shape.file.name == "angle.stl"
-    ).make_mesh()
+    before = read_urdf(file).read_shapes("collision")[1].make_mesh()
     after = trimesh.util.concatenate([shape.make_mesh() for shape in shapes[1:3]])
     assert after.bounds == pytest.approx(before.bounds)
     assert after.volume == pytest.approx(before.volume, rel=1e-5)
@@ -70,75 +64,48 @@ def test_pieces_replace_meshes_and_visuals_are_copied(file: Path, tmp_path: Path
         write_meshes(read_urdf(file), folder, most_pieces=4)
 
 
-def write_obj(file: Path, size: float, colour: str) -> Path:
-    """Write a cube as an OBJ file with a colour in paint.mtl, and return the file."""
-    file.parent.mkdir(parents=True, exist_ok=True)
+def write_obj(file: Path, size: float, colour: str) -> None:
+    """Write a cube as an OBJ file with a colour in paint.mtl."""
+    file.parent.mkdir()
     cube = trimesh.creation.box((size,) * 3).export(
         file_type="obj", include_normals=False, include_texture=False
     )
     file.write_text(f"mtllib paint.mtl\nusemtl own\n{cube}", encoding="utf-8")
     (file.parent / "paint.mtl").write_text(f"newmtl own\nKd {colour}\n", encoding="utf-8")
-    return file
 
 
-def format_link(name: str, visual: str, collision: str) -> str:
-    shapes = f'<visual><geometry><mesh filename="{visual}"/></geometry></visual>'
-    shapes += f'<collision><geometry><mesh filename="{collision}"/></geometry></collision>'
-    ends = f'<parent link="root"/><child link="{name}"/>'
-    joint = f'<joint name="{name}_joint" type="fixed">{ends}</joint>'
-    return f'<link name="{name}">{shapes}</link>{joint}'
-
-
-def write_own_meshes(folder: Path, *links: str) -> UrdfFile:
-    """Write a robot with these links below its root, and return its copy with its own meshes."""
-    (folder / "r.urdf").write_text(
-        f'<robot name="r"><link name="root"/>{"".join(links)}</robot>', encoding="utf-8"
-    )
-    root, _, _ = write_meshes(read_urdf(folder / "r.urdf"), folder / "own", most_pieces=1)
-    (folder / "own" / "r.urdf").write_bytes(ElementTree.tostring(root))
-    return read_urdf(folder / "own" / "r.urdf")
-
-
-def test_meshes_of_equal_names_keep_their_shapes_and_colours(
-    tmp_path: Path,
-) -> None:
+def test_meshes_of_equal_names_keep_their_shapes_and_colours(tmp_path: Path) -> None:
     colours = {"a": (1.0, 0.0, 0.0, 1.0), "b": (0.0, 1.0, 0.0, 1.0), "c": (0.0, 0.0, 1.0, 1.0)}
-    files = {
-        name: write_obj(
-            tmp_path / name / file, size, " ".join(f"{value:g}" for value in colours[name][:3])
-        )
-        for name, file, size in (("a", "x_2.obj", 0.1), ("b", "x.obj", 0.2), ("c", "x.obj", 0.3))
-    }
-    robot = write_own_meshes(
-        tmp_path,
-        *(
-            format_link(name, str(file.relative_to(tmp_path)), str(file))
-            for name, file in files.items()
-        ),
-    )
-    shapes = {shape.link: shape for shape in robot.read_shapes("visual")}
-    assert {name: shape.make_mesh().volume for name, shape in shapes.items()} == pytest.approx(
-        {"a": 0.1**3, "b": 0.2**3, "c": 0.3**3}
-    )
-    for name, shape in shapes.items():
-        assert shape.file is not None
-        (part,) = load_parts(shape.file)
+    sizes, links = {"a": 0.1, "b": 0.2, "c": 0.3}, ""
+    for name, size in sizes.items():
+        file = tmp_path / name / ("x_2.obj" if name == "a" else "x.obj")
+        write_obj(file, size, "{:g} {:g} {:g}".format(*colours[name]))
+        relative = file.relative_to(tmp_path)
+        shapes = f'<visual><geometry><mesh filename="{relative}"/></geometry></visual>'
+        shapes += f'<collision><geometry><mesh filename="{file}"/></geometry></collision>'
+        links += format_fixed_link(name, "root", shapes=shapes)
+    urdf, own = tmp_path / "r.urdf", tmp_path / "own"
+    urdf.write_text(f'<robot name="r"><link name="root"/>{links}</robot>')
+    root, _, _ = write_meshes(read_urdf(urdf), own, most_pieces=1)
+    (own / "r.urdf").write_bytes(ElementTree.tostring(root))
+    shapes = {shape.link: shape for shape in read_urdf(own / "r.urdf").read_shapes("visual")}
+    for name, size in sizes.items():
+        assert shapes[name].make_mesh().volume == pytest.approx(size**3)
+        (part,) = load_parts(shapes[name].file)
         assert part.colour == pytest.approx(colours[name], abs=0.01)
-    folder = tmp_path / "own" / "visual"
-    assert {path.name for path in folder.iterdir()} == {
+    assert {path.name for path in (own / "visual").iterdir()} == {
         *("x.obj", "x_2.obj", "x_3.obj"),
         *("paint.mtl", "paint_2.mtl", "paint_3.mtl"),
     }
-    assert (folder / "x_2.obj").read_bytes() == files["a"].read_bytes(), "no reference to rename"
+    # No reference in it is to be renamed.
+    assert (own / "visual" / "x_2.obj").read_bytes() == (tmp_path / "a" / "x_2.obj").read_bytes()
 
 
 def test_meshes_are_copied_unchanged(file: Path, tmp_path: Path) -> None:
     original, folder = read_urdf(file), tmp_path / "copy"
     root = copy_meshes(original, folder)
-    assert (
-        ElementTree.tostring(original.root).decode()
-        == ElementTree.tostring(ElementTree.fromstring(TEXT)).decode()
-    )
+    unchanged = ElementTree.fromstring(TEXT)
+    assert ElementTree.tostring(original.root) == ElementTree.tostring(unchanged)
     (folder / "r.urdf").write_bytes(ElementTree.tostring(root))
     copied = read_urdf(folder / "r.urdf")
     for kind, count in (("visual", 1), ("collision", 3)):  # one visual mesh is missing
@@ -149,9 +116,8 @@ def test_meshes_are_copied_unchanged(file: Path, tmp_path: Path) -> None:
                 assert shape.file.parent == folder / "meshes"
                 source = file.parent / shape.file.name
                 assert shape.file.read_bytes() == source.read_bytes()
-    assert [shape.size for shape in copied.read_shapes("collision")] == [
-        shape.size for shape in original.read_shapes("collision")
-    ]
+    sizes = [[shape.size for shape in urdf.read_shapes("collision")] for urdf in (original, copied)]
+    assert sizes[0] == sizes[1]
     assert (folder / "meshes/paint.mtl").is_file()
 
 

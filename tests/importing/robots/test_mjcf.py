@@ -75,9 +75,7 @@ def test_limits_shapes_couplings_and_states_are_converted(file: Path, tmp_path: 
     joints = {joint.get("name"): joint for joint in converted.root.findall("joint")}
 
     def limit(name: str, key: str) -> float:
-        element = joints[name].find("limit")
-        assert element is not None
-        return float(element.get(key, "nan"))
+        return float(joints[name].find("limit").get(key, "nan"))  # type: ignore[union-attr]
 
     assert limit("lift", "lower") == pytest.approx(np.radians(-55))  # relative to ref
     assert limit("out", "effort") == 40.0
@@ -91,82 +89,72 @@ def test_limits_shapes_couplings_and_states_are_converted(file: Path, tmp_path: 
     assert len(fore.findall("visual")) == 1
     masses = sum(float(element.get("value", "0")) for element in converted.root.iter("mass"))
     reference = mujoco.MjModel.from_xml_path(str(file))
-    assert masses == pytest.approx(
-        reference.body_mass[reference.body_rootid == reference.body("foot").id].sum(), rel=1e-6
-    )
+    arm = reference.body_rootid == reference.body("foot").id
+    assert masses == pytest.approx(reference.body_mass[arm].sum(), rel=1e-6)
     assert any("table" in note for note in converted.notes)
 
 
 def test_errors_name_the_invalid_file(tmp_path: Path) -> None:
-    for name, text, message in (
-        (
-            "wrong.xml",
-            "<mujoco><worldbody><body><joint axis='0 0 0'/></body></worldbody></mujoco>",
-            "MuJoCo cannot",
-        ),
-        (
-            "still.xml",
-            "<mujoco><worldbody><body><geom size='1'/></body></worldbody></mujoco>",
-            "the file has no joints",
-        ),
+    for content, message in (
+        ("<joint axis='0 0 0'/>", "MuJoCo cannot"),
+        ("<geom size='1'/>", "the file has no joints"),
     ):
-        path = tmp_path / name
-        path.write_text(text, encoding="utf-8")
+        path = tmp_path / "wrong.xml"
+        path.write_text(f"<mujoco><worldbody><body>{content}</body></worldbody></mujoco>")
         with pytest.raises(vkc.InputError, match=message) as caught:
             convert_mjcf(path, tmp_path)
         assert caught.value.file == path
 
 
-def format_arm(*equalities: str) -> str:
-    """Return an MJCF of three prismatic joints in series, with couplings."""
-    joints = "".join(
-        f'<body><joint name="j{k}" type="slide" range="0 1"/><geom size="0.01"/>' for k in range(3)
-    )
-    bodies = f"<worldbody>{joints}{'</body>' * 3}</worldbody>"
-    return f"<mujoco>{bodies}<equality>{''.join(equalities)}</equality></mujoco>"
-
-
-def format_coupling(one: str, other: str, more: str = "") -> str:
+def couple(one: str, other: str, more: str = "") -> str:
     return f'<joint joint1="{one}" joint2="{other}" {more}/>'
 
 
 @pytest.mark.parametrize(
     ("equalities", "follows", "expected_note"),
     [
-        ((format_coupling("j1", "j0"), format_coupling("j2", "j1")), {"j1": "j0", "j2": "j1"}, ""),
+        (couple("j1", "j0") + couple("j2", "j1"), {"j1": "j0", "j2": "j1"}, ""),
+        # The second is inverted: j0 = 0.1 + 2·j2.
         (
-            (format_coupling("j0", "j1"), format_coupling("j0", "j2", 'polycoef="0.1 2 0 0 0"')),
+            couple("j0", "j1") + couple("j0", "j2", 'polycoef="0.1 2 0 0 0"'),
             {"j0": "j1", "j2": "j0"},
             "",
-        ),  # the second is inverted: j0 = 0.1 + 2·j2
+        ),
         (
-            (format_coupling("j0", "j1"), format_coupling("j1", "j0")),
+            couple("j0", "j1") + couple("j1", "j0"),
             {"j0": "j1"},
             "j1 follows j0; another coupling of it is left out",
         ),
         (
-            (format_coupling("j1", "j0", 'polycoef="0 1 0.5 0 0"'),),
+            couple("j1", "j0", 'polycoef="0 1 0.5 0 0"'),
             {"j1": "j0"},
             "j1 follows j0 by a nonlinear function",
         ),
-        ((format_coupling("j1", "j0", 'active="false"'),), {}, ""),
+        (couple("j1", "j0", 'active="false"'), {}, ""),
     ],
 )
 def test_couplings_become_a_tree(
-    tmp_path: Path, equalities: tuple[str, ...], follows: dict[str, str], expected_note: str
+    tmp_path: Path, equalities: str, follows: dict[str, str], expected_note: str
 ) -> None:
+    """Three prismatic joints in series are coupled."""
+    bodies = "".join(
+        f'<body><joint name="j{k}" type="slide" range="0 1"/><geom size="0.01"/>' for k in range(3)
+    )
     path = tmp_path / "arm.xml"
-    path.write_text(format_arm(*equalities))
+    path.write_text(
+        f"<mujoco><worldbody>{bodies}{'</body>' * 3}</worldbody>"
+        f"<equality>{equalities}</equality></mujoco>"
+    )
     converted = convert_mjcf(path, tmp_path / "meshes")
-    mimics = {joint.get("name"): joint.find("mimic") for joint in converted.root.findall("joint")}
-    assert {
-        name: mimic.get("joint") for name, mimic in mimics.items() if mimic is not None
-    } == follows
+    mimics = {
+        joint.get("name"): mimic.attrib
+        for joint in converted.root.findall("joint")
+        if (mimic := joint.find("mimic")) is not None
+    }
+    assert {name: mimic["joint"] for name, mimic in mimics.items()} == follows
     assert any(expected_note in note for note in converted.notes) == bool(expected_note)
-    if "j2" in follows and follows["j2"] == "j0":
-        inverse = {"joint": "j0", "multiplier": "0.5", "offset": "-0.05"}
-        assert mimics["j2"] is not None
-        assert mimics["j2"].attrib == inverse
+    if follows.get("j2") == "j0":
+        assert mimics["j2"] == {"joint": "j0", "multiplier": "0.5", "offset": "-0.05"}
 
 
 def test_similar_names_become_distinct_links_and_joints(tmp_path: Path) -> None:
@@ -176,16 +164,15 @@ def test_similar_names_become_distinct_links_and_joints(tmp_path: Path) -> None:
         for k, (body, joint) in enumerate(names.items())
     )
     path = tmp_path / "arm.xml"
-    path.write_text(
-        f'<mujoco><worldbody><body name="base"><geom size="0.2"/>{bodies}</body></worldbody>'
-        "</mujoco>"
-    )
+    base = f'<body name="base"><geom size="0.2"/>{bodies}</body>'
+    path.write_text(f"<mujoco><worldbody>{base}</worldbody></mujoco>")
     root = convert_mjcf(path, tmp_path / "meshes").root
     check_tree(path, root)
-    radii = {}
-    for link in root.findall("link"):
-        for sphere in link.findall("collision/geometry/sphere"):
-            radii[link.get("name")] = float(sphere.attrib["radius"])
+    radii = {
+        link.get("name"): float(sphere.attrib["radius"])
+        for link in root.findall("link")
+        for sphere in link.findall("collision/geometry/sphere")
+    }
     assert radii == pytest.approx({"base": 0.2, "a_b": 0.1, "a_b_body": 0.11, "base_fixed": 0.12})
     moving = {joint.get("name") for joint in root.iter("joint") if joint.get("type") == "revolute"}
     assert moving == {"j_1", "j_1_joint", "base_joint"}

@@ -1,21 +1,26 @@
 from __future__ import annotations
 
 import itertools
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.furniture import BAR, write_flap
+from helpers.texts import format_box
 
 import vkc_pin as vkc
-from vkc_pin.importing.proposals.candidates import Piece, Thickness, find_candidates
+from vkc_pin.importing.proposals.candidates import Candidate, Piece, Thickness, find_candidates
 from vkc_pin.importing.proposals.fitting import (
     GraspMotion,
     HandClearance,
     Obstruction,
     Opening,
+    find_named_handles,
     find_openings,
+    score_grasp,
 )
 from vkc_pin.importing.proposals.hand import make_hand
 from vkc_pin.world.models.shapes import compute_clearance
@@ -25,26 +30,26 @@ FRONT = np.column_stack(
 )  # approaches along x, closes along y
 
 
+def make_fitting(folder: Path, **shapes: str) -> HandClearance:
+    """Return the clearance of a hand at a flap with a bar."""
+    flap = write_flap(folder, BAR.format(""), **shapes)  # type: ignore[arg-type]
+    return HandClearance(flap, make_hand(vkc.load_robot("husky_ur5e")), 0.02, 0.005)
+
+
 @pytest.fixture
 def fitting(tmp_path: Path) -> HandClearance:
-    return HandClearance(
-        write_flap(tmp_path, BAR.format("")), make_hand(vkc.load_robot("husky_ur5e")), 0.02, 0.005
-    )
+    return make_fitting(tmp_path)
 
 
 def test_obstruction_is_named(fitting: HandClearance) -> None:
-    middle = pin.SE3(FRONT, np.array([-0.08, 0.5, 0.5]))
-    assert fitting.find_obstruction(middle, "flap") is None
-    beside = pin.SE3(FRONT, np.array([-0.08, 0.535, 0.5]))
-    assert fitting.find_obstruction(beside, "flap") == Obstruction("fingers", "flap")
-    assert fitting.find_obstruction(
-        pin.SE3(FRONT, np.array([0.0, 0.3, 0.5])), "case"
-    ) == Obstruction("others", "flap")
-    below = pin.SE3(
-        np.column_stack([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
-        np.array([-0.3, 0.5, 0.15]),
-    )
-    assert fitting.find_obstruction(below, "flap") == Obstruction("floor")
+    from_below = np.column_stack([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    for rotation, place, link, expected in (
+        (FRONT, (-0.08, 0.5, 0.5), "flap", None),
+        (FRONT, (-0.08, 0.535, 0.5), "flap", Obstruction("fingers", "flap")),
+        (FRONT, (0.0, 0.3, 0.5), "case", Obstruction("others", "flap")),
+        (from_below, (-0.3, 0.5, 0.15), "flap", Obstruction("floor")),
+    ):
+        assert fitting.find_obstruction(pin.SE3(rotation, np.array(place)), link) == expected
 
 
 def test_clearance_agrees_with_coal(fitting: HandClearance) -> None:
@@ -52,14 +57,10 @@ def test_clearance_agrees_with_coal(fitting: HandClearance) -> None:
     shapes, hand = fitting.item.collision.geometryObjects, fitting.hand
     data = fitting.item.model.createData()
     pin.forwardKinematics(fitting.item.model, data, fitting.item.coordinates.q(np.zeros(1)))
-    groups = {
-        name: [
-            (s.geometry, data.oMi[s.parentJoint] * s.placement)
-            for s in shapes
-            if s.name.startswith(name)
-        ]
-        for name in ("case", "flap")
-    }
+    groups: dict[str, list[Any]] = {"case": [], "flap": []}
+    for shape in shapes:
+        placed = shape.geometry, data.oMi[shape.parentJoint] * shape.placement
+        groups[shape.name.partition("_")[0]].append(placed)
 
     def is_free(x: float) -> bool:
         tool = pin.SE3(FRONT, np.array([x, 0.5, 0.5]))
@@ -87,24 +88,10 @@ def test_clearance_agrees_with_coal(fitting: HandClearance) -> None:
 
 def make_grasp_motion(folder: Path, **shapes: str) -> tuple[GraspMotion, Opening, HandClearance]:
     """Return a frontal grasp at the bar's middle, the flap's opening and the hand's clearance."""
-    fitting = HandClearance(
-        write_flap(folder, BAR.format(""), **shapes),
-        make_hand(vkc.load_robot("husky_ur5e")),
-        0.02,
-        0.005,
-    )
-    pieces = {
-        1: [
-            Piece.from_shape(shape)
-            for shape in fitting.item.collision.geometryObjects
-            if shape.parentJoint == 1
-        ]
-    }
-    bar = next(
-        piece
-        for piece in pieces[1]
-        if np.ptp(piece.vertices[:, 0]) < 0.03 and np.ptp(piece.vertices[:, 1]) < 0.03
-    )
+    fitting = make_fitting(folder, **shapes)
+    moving = [each for each in fitting.item.collision.geometryObjects if each.parentJoint == 1]
+    pieces = {1: list(map(Piece.from_shape, moving))}
+    bar = pieces[1][1]
     grasps = find_candidates(bar, fitting.hand, 0.005, np.array([0.0, 0.0, 1.0]), Thickness())
     front = next(
         g
@@ -112,11 +99,6 @@ def make_grasp_motion(folder: Path, **shapes: str) -> tuple[GraspMotion, Opening
         if g.placement.rotation[0, 2] > 0.99 and abs(g.placement.translation[2]) < 1e-6
     )
     return GraspMotion(fitting, front, 0.0), find_openings(fitting.item, pieces)[1], fitting
-
-
-def make_box(position: str, size: str) -> str:
-    shape = f'<geometry><box size="{size}"/></geometry>'
-    return f'<collision><origin xyz="{position}"/>{shape}</collision>'
 
 
 def test_free_bar_permits_sliding_and_turning(tmp_path: Path) -> None:
@@ -133,15 +115,54 @@ def test_free_bar_permits_sliding_and_turning(tmp_path: Path) -> None:
 
 
 def test_obstacles_limit_slide_and_opening(tmp_path: Path) -> None:
-    above = make_box("-0.15 0.5 0.68", "0.3 0.6 0.02")
+    above = format_box("0.3 0.6 0.02", "-0.15 0.5 0.68")
     hand, opening, _ = make_grasp_motion(tmp_path, before=above)
     hand.follow(opening)
     slide = hand.freedoms()[1][0]
     assert slide.upper - slide.lower < 0.25
     assert hand.slack < 0.13
-    wall = make_box("-0.5 -0.3 0.5", "0.4 0.02 1.0")
+    wall = format_box("0.4 0.02 1.0", "-0.5 -0.3 0.5")
     hand, opening, _ = make_grasp_motion(tmp_path, before=wall)
     assert 0.5 < hand.follow(opening) <= 1.5
-    shelf = make_box("-0.7 0.3 0.5", "0.4 0.8 1.0")
+    shelf = format_box("0.4 0.8 1.0", "-0.7 0.3 0.5")
     hand, opening, _ = make_grasp_motion(tmp_path, before=shelf)
     assert hand.follow(opening) < 1.0
+
+
+def test_score_depends_on_leverage_side_and_name(tmp_path: Path) -> None:
+    _, hinge, fitting = make_grasp_motion(tmp_path)
+    bar = Piece.from_shape(fitting.item.collision.geometryObjects[-1])
+
+    def score_at(
+        y: float = 0.55,
+        z: float = 0.5,
+        rotation: np.ndarray = FRONT,
+        *,
+        kind: str = "bar",
+        named: bool = False,
+    ) -> float:
+        grasp = Candidate(bar, kind, pin.SE3.Identity(), 0.02, (0, 0), 0)
+        tool = pin.SE3(rotation, np.array([-0.08, y, z]))
+        return score_grasp(grasp, tool, hinge, named=named)
+
+    best = score_at()
+    assert best > score_at(y=0.3) > score_at(y=0.05) > 0.0  # leverage
+    assert best > score_at(z=0.85)  # in the middle of the flap's height
+    # The hand approaches from the opening side.
+    assert best > score_at(rotation=FRONT @ np.diag([-1.0, 1.0, -1.0]))
+    along = np.column_stack([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    assert best > 2.0 * score_at(rotation=along)  # a bar along the pull slips
+    assert score_at(named=True) > best
+    assert best > score_at(kind="edge")
+
+
+def test_handles_are_named_by_elements_and_meshes() -> None:
+    text = """<robot><link name="door"><collision/><collision name="Handle-3"/>
+    <collision><geometry><mesh filename="meshes/knob_7.obj"/></geometry></collision></link>
+    <link name="lever"><collision/></link></robot>"""
+    assert find_named_handles(ElementTree.fromstring(text)) == {
+        "door_0": False,
+        "door_1": True,
+        "door_2": True,
+        "lever_0": True,
+    }

@@ -3,17 +3,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from helpers.texts import format_box
 
 import vkc_pin as vkc
-
-BOX = '<collision name="{}"><origin xyz="{}"/><geometry><box size="{}"/></geometry></collision>'
 
 
 def write_drawer(folder: Path, *pieces: tuple[str, str, str], walls: str = "") -> Path:
     """Write a drawer that slides along -x, with pieces (name, place, size) on its front."""
-    front = BOX.format("front", "0.01 0 0", "0.02 0.5 0.3")
-    shapes = front + "".join(BOX.format(*piece) for piece in pieces)
-    case = BOX.format("case", "0.3 0 0", "0.5 0.5 0.5") + walls
+    shapes = format_box("0.02 0.5 0.3", "0.01 0 0")
+    shapes += "".join(format_box(size, at, name=name) for name, at, size in pieces)
+    case = format_box("0.5 0.5 0.5", "0.3 0 0") + walls
     (folder / "d.urdf").write_text(f"""<robot name="d"><link name="case">{case}</link>
       <link name="tray">{shapes}</link><joint name="slide" type="prismatic">
       <parent link="case"/><child link="tray"/><axis xyz="-1 0 0"/>
@@ -40,10 +39,8 @@ BAR = [
 )
 def test_bar_is_preferred_to_a_thin_knob(tmp_path: Path, knob: tuple[str, str, str]) -> None:
     """The bar is off the centre, and its name does not suggest a handle."""
-    imported = vkc.importing.import_object(
-        write_drawer(tmp_path, *BAR, knob), tmp_path / "out", most=1
-    )
-    (found,) = imported.proposals.found
+    file = write_drawer(tmp_path, *BAR, knob)
+    (found,) = vkc.importing.import_object(file, tmp_path / "out", most=1).proposals.found
     assert found.thickness > 0.01
 
 
@@ -51,7 +48,7 @@ def test_bar_is_preferred_to_a_thin_knob(tmp_path: Path, knob: tuple[str, str, s
 def test_reachable_bar_is_preferred_to_a_hidden_knob(tmp_path: Path, hidden: bool) -> None:
     """A board behind the knob obstructs the hand there, but not at the bar."""
     knob = ("knob", "-0.025 0 -0.05", "0.05 0.03 0.03")
-    board = BOX.format("board", "-0.7 0 -0.05", "0.2 0.5 0.02") if hidden else ""
+    board = format_box("0.2 0.5 0.02", "-0.7 0 -0.05") if hidden else ""
     file = write_drawer(tmp_path, *BAR, knob, walls=board)
     best = vkc.importing.import_object(file, tmp_path / "out").proposals.found[0]
     assert best.named is not hidden
@@ -63,7 +60,7 @@ def test_report_states_the_reachable_opening_of_a_joint(
     tmp_path: Path, gap: float, goal: float
 ) -> None:
     """A wall in front of the drawer stops the hand before the joint's limit."""
-    wall = BOX.format("wall", f"{-gap - 0.05} 0 0", "0.1 0.6 0.5")
+    wall = format_box("0.1 0.6 0.5", f"{-gap - 0.05} 0 0")
     file = write_drawer(tmp_path, *BAR, walls=wall)
     imported = vkc.importing.import_object(file, tmp_path / "out", most=1)
     assert imported.proposals.find_goal("slide") == pytest.approx(goal)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,12 +23,8 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> vkc.importing.Proposals:
 def test_descriptions_load_as_the_same_attachments(
     found: vkc.importing.Proposals, tmp_path: Path
 ) -> None:
-    written = yaml.safe_dump([proposal.description() for proposal in found.found])
-    loaded = write_flap(
-        tmp_path,
-        BAR.format(""),
-        attachments=yaml.safe_dump(yaml.safe_load(written), default_flow_style=True).strip(),
-    )
+    written = yaml.safe_dump([each.description() for each in found.found], default_flow_style=True)
+    loaded = write_flap(tmp_path, BAR.format(""), attachments=written.strip())
     assert list(loaded.attachments) == [proposal.attachment.name for proposal in found.found]
     for proposal in found.found:
         expected, actual = proposal.attachment, loaded.attachment(proposal.attachment.name)
@@ -65,13 +62,13 @@ def test_hand_dimensions_agree_with_the_data_sheet() -> None:
     assert len(hand.others) == 1  # the wrist
 
 
-def test_robot_without_touch_links_has_no_hand() -> None:
-    robot = dataclasses.replace(vkc.load_robot("husky_ur5e"), touch_links=())
-    with pytest.raises(vkc.InputError, match="touch_links"):
-        make_hand(robot)
-
-
-def test_tool_frame_inside_the_palm_is_rejected() -> None:
-    robot = dataclasses.replace(vkc.load_robot("husky_ur5e"), tool_frame="gripper_link")
-    with pytest.raises(vkc.InputError, match="no room between the fingers"):
-        make_hand(robot)
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"touch_links": ()}, "touch_links"),
+        ({"tool_frame": "gripper_link"}, "no room between the fingers"),  # inside the palm
+    ],
+)
+def test_robot_without_fingers_has_no_hand(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(vkc.InputError, match=message):
+        make_hand(dataclasses.replace(vkc.load_robot("husky_ur5e"), **changes))

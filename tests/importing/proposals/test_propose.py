@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,32 +13,31 @@ import vkc_pin as vkc
 from vkc_pin.importing.proposals.fitting import HandClearance
 from vkc_pin.importing.proposals.hand import make_hand
 
-HAND_WRITTEN = [
-    ("drawer", "slide", "handle"),
-    ("cabinet", "hinge", "handle"),
-    ("dishwasher", "door", "door_handle"),
-    ("door", "knob", "handle"),
-]
 
-
-@pytest.mark.parametrize(("name", "joint", "handle"), HAND_WRITTEN)
+@pytest.mark.parametrize(
+    ("name", "joint", "handle"),
+    [
+        ("drawer", "slide", "handle"),
+        ("cabinet", "hinge", "handle"),
+        ("dishwasher", "door", "door_handle"),
+        ("door", "knob", "handle"),
+    ],
+)
 def test_best_proposal_agrees_with_the_handwritten_attachment(
     name: str, joint: str, handle: str
 ) -> None:
     """The hand can slide along the bar to the handwritten grasp."""
     item = vkc.load_object(name)
-    best, handwritten = (
-        vkc.importing.propose_attachments(item).opening(joint)[0],
-        item.attachment(handle),
-    )
+    handwritten = item.attachment(handle)
+    best = vkc.importing.propose_attachments(item).opening(joint)[0]
     assert best.attachment.link == handwritten.link
     offset = best.attachment.placement.inverse() * handwritten.placement
     slide = next(freedom for freedom in best.attachment.freedoms if freedom.kind == "prismatic")
     assert np.linalg.norm(offset.translation[[0, 2]]) < 0.005
     assert slide.lower - 0.02 <= offset.translation[1] <= slide.upper + 0.02
     assert abs(offset.rotation[1, 1]) == pytest.approx(1.0)
-    low, high = item.lower[item.coordinates.index(joint)], item.upper[item.coordinates.index(joint)]
-    assert best.opens[joint] == pytest.approx(high if abs(high) >= abs(low) else low)
+    k = item.coordinates.index(joint)
+    assert best.opens[joint] == pytest.approx(max(item.lower[k], item.upper[k], key=abs))
 
 
 def test_obstructing_door_is_opened_first() -> None:
@@ -88,15 +88,19 @@ def test_bar_close_to_the_flap_is_grasped_with_the_fingertips(tmp_path: Path) ->
     assert all(proposal.kind != "bar" for proposal in tight.found)
 
 
-def test_errors_name_the_invalid_argument() -> None:
-    with pytest.raises(vkc.InputError, match="ArticulatedObject"):
-        vkc.importing.propose_attachments("drawer")  # type: ignore[arg-type]
-    with pytest.raises(vkc.UnknownNameError, match="husky_ur5e"):
-        vkc.importing.propose_attachments(vkc.load_object("drawer"), "husky_ur5")
-    with pytest.raises(vkc.InputError, match="dist_safe"):
-        vkc.importing.propose_attachments(vkc.load_object("drawer"), dist_safe=-0.1)
-    with pytest.raises(vkc.InputError, match="most"):
-        vkc.importing.propose_attachments(vkc.load_object("drawer"), most=0)
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"item": "drawer"}, "ArticulatedObject"),
+        ({"robot": "husky_ur5"}, "did you mean 'husky_ur5e'"),
+        ({"dist_safe": -0.1}, "dist_safe"),
+        ({"most": 0}, "most"),
+    ],
+)
+def test_errors_name_the_invalid_argument(arguments: dict[str, Any], message: str) -> None:
+    item = arguments.pop("item", None) or vkc.load_object("drawer")
+    with pytest.raises(vkc.InputError, match=message):
+        vkc.importing.propose_attachments(item, **arguments)
 
 
 def test_fingers_close_partly_where_space_is_narrow(tmp_path: Path) -> None:
@@ -109,16 +113,12 @@ def test_fingers_close_partly_where_space_is_narrow(tmp_path: Path) -> None:
     assert best.description()["opening"] == 0.03
     assert "20 mm thick, fingers 30 mm apart" in found.summary()
     fitting = HandClearance(item, make_hand(robot.opened(best.attachment.opening)), 0.02, 0.005)
-    tool = item.link_placement("front", [0.0]) * best.attachment.tool(
-        np.zeros(len(best.attachment.freedoms))
-    )
+    grasp = best.attachment.tool(np.zeros(len(best.attachment.freedoms)))
+    tool = item.link_placement("front", [0.0]) * grasp
     assert fitting.find_obstruction(tool, "front") is None
     assert HandClearance(item, found.hand, 0.02, 0.005).find_obstruction(tool, "front") is not None
-    wide = vkc.importing.propose_attachments(
-        vkc.load_object(describe_cheeks_drawer(gap=0.15)), robot
-    )
-    assert wide.found[0].attachment.opening is None
+    wide = vkc.load_object(describe_cheeks_drawer(gap=0.15))
+    assert vkc.importing.propose_attachments(wide, robot).found[0].attachment.opening is None
     without_gripper = dataclasses.replace(robot, gripper=None)
-    assert best.kind not in {
-        one.kind for one in vkc.importing.propose_attachments(item, without_gripper).found
-    }
+    others = vkc.importing.propose_attachments(item, without_gripper).found
+    assert best.kind not in {one.kind for one in others}

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.texts import format_box, format_fixed_link
 
 import vkc_pin as vkc
 from vkc_pin.importing.proposals.propose import propose_attachments
@@ -11,15 +12,11 @@ from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.robot_file import load_robot
 
 # A case of 1.6 m x 0.3 m x 1 m with a jointed panel in front of it, towards -y.
-CASE = '<link name="case"><collision><origin xyz="0 0 0.5"/><geometry><box size="1.6 0.3 1.0"/>'
-PANEL = '<link name="panel"><collision><origin xyz="{}"/><geometry><box size="{}"/>'
-END = "</geometry></collision></link>"
+CASE = f'<link name="case">{format_box("1.6 0.3 1.0", "0 0 0.5")}</link>'
 JOINT = """<joint name="slide" type="{}"><origin xyz="{}"/><parent link="case"/>
   <child link="panel"/><axis xyz="{}"/>
   <limit lower="{}" upper="{}" effort="1" velocity="1"/></joint>"""
-SIDES = '<link name="frame"><collision><geometry><box size="0.05 0.14 1.0"/>'
-FIXED = """<joint name="f" type="fixed"><origin xyz="-0.785 -0.22 0.5"/><parent link="case"/>
-  <child link="frame"/></joint>"""
+FRAME = format_fixed_link("frame", "case", "-0.785 -0.22 0.5", format_box("0.05 0.14 1.0"))
 
 
 def write_panel(
@@ -34,7 +31,7 @@ def write_panel(
     frame: str = "",
 ) -> Path:
     joint = JOINT.format(kind, at, axis, *limits)
-    text = f"{CASE}{END}{PANEL.format(middle, size)}{END}{joint}{frame}"
+    text = f'{CASE}<link name="panel">{format_box(size, middle)}</link>{joint}{frame}'
     (folder / "p.urdf").write_text(f'<robot name="p">{text}</robot>')
     return folder / "p.urdf"
 
@@ -72,7 +69,7 @@ def test_joints_without_handle_are_pushed(
     "settings",
     [
         {"axis": "0 -1 0"},  # a drawer: the hand cannot reach behind its front
-        {"frame": SIDES + END + FIXED, "at": "-0.4 -0.2 0.5"},  # a frame covers the edge
+        {"frame": FRAME},  # a frame covers the edge
         {"size": "0.7 0.001 0.9"},  # an edge of 1 mm
         LEAF | {"kind": "revolute", "axis": "0 0 -1", "at": "-0.75 -0.2 0.5", "limits": (0.0, 1.5)},
         {"limits": (0.0, 0.0)},

@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.partnet import write_partnet_object
+from helpers.texts import format_fixed_link
 
-from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.importing.objects.description import Link
+from vkc_pin.errors import InputError
+from vkc_pin.importing.objects.description import Description, Link
 from vkc_pin.importing.objects.urdf import read_object_urdf
 
 
@@ -27,41 +28,55 @@ def test_missing_values_of_partnet_are_none(tmp_path: Path) -> None:
     assert Link("", case.visual).solid == case.visual
 
 
+def read_text(folder: Path, text: str, **options: bool) -> Description:
+    """Read a URDF with these links and joints."""
+    (folder / "t.urdf").write_text(f'<robot name="t">{text}</robot>')
+    return read_object_urdf(folder / "t.urdf", **options)
+
+
+def format_joint(kind: str, child: str = "b", more: str = "") -> str:
+    ends = f'<parent link="a"/><child link="{child}"/>'
+    return f'<joint name="to_{child}" type="{kind}">{ends}{more}</joint>'
+
+
+LINKS = '<link name="a"/><link name="b"/><link name="c"/>'
+
+
 def test_swapped_limits_and_unsupported_joints_are_noted(tmp_path: Path) -> None:
-    text = """<robot name="t"><link name="a"/><link name="b"/><link name="c"/>
-    <joint name="j" type="revolute"><parent link="a"/><child link="b"/>
-      <limit lower="1" upper="-0.5"/>
-      <mimic joint="k"/><dynamics damping="0.4" friction="-1"/></joint>
-    <joint name="k" type="floating"><parent link="a"/><child link="c"/></joint></robot>"""
-    (tmp_path / "t.urdf").write_text(text)
-    found = read_object_urdf(tmp_path / "t.urdf")
-    assert found.joints["b"].limits == (-0.5, 1.0)
-    assert np.allclose(found.joints["b"].axis, [1.0, 0.0, 0.0])
-    assert (found.joints["b"].damping, found.joints["b"].friction) == (0.4, 0.0)
+    more = '<limit lower="1" upper="-0.5"/><mimic joint="k"/>'
+    swapped = format_joint("revolute", "b", f'{more}<dynamics damping="0.4" friction="-1"/>')
+    text = LINKS + swapped + format_joint("floating", "c")
+    found = read_text(tmp_path, text)
+    joint = found.joints["b"]
+    assert joint.limits == (-0.5, 1.0)
+    assert np.allclose(joint.axis, [1.0, 0.0, 0.0])
+    assert (joint.damping, joint.friction) == (0.4, 0.0)
     assert found.joints["c"].kind == "fixed"
-    assert [
-        word in " ".join(found.notes)
-        for word in ("lower limit above its upper limit", "floating", "mimics")
-    ] == [True] * 3
-    free = read_object_urdf(tmp_path / "t.urdf", free=True)
+    for words in ("lower limit above its upper limit", "floating", "mimics"):
+        assert words in " ".join(found.notes)
+    free = read_text(tmp_path, text, free=True)
     assert free.joints["c"].kind == "floating"
     assert "floating" not in " ".join(free.notes)
 
 
-def test_errors_name_file_and_element(tmp_path: Path) -> None:
-    file = tmp_path / "t.urdf"
-    file.write_text(
-        '<robot name="t"><link name="a"/><joint name="j" type="fixed">'
-        '<parent link="a"/><child link="d"/></joint></robot>'
-    )
-    with pytest.raises(UnknownNameError, match=r"t\.urdf"):
-        read_object_urdf(file)
-    geometry = '<geometry><mesh filename="gone.obj"/></geometry>'
-    file.write_text(
-        f'<robot name="t"><link name="a"><collision>{geometry}</collision></link></robot>'
-    )
-    with pytest.raises(InputError, match=r"gone\.obj"):
-        read_object_urdf(file)
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (LINKS + format_joint("fixed", "d"), r"t\.urdf"),
+        (
+            '<link name="a"><collision><geometry><mesh filename="gone.obj"/></geometry>'
+            "</collision></link>",
+            r"gone\.obj",
+        ),
+        (
+            LINKS + format_joint("revolute", "b", '<limit lower="-1.8e308" upper="1"/>'),
+            "to_b: limit lower: wrong numbers",  # beyond the largest float
+        ),
+    ],
+)
+def test_errors_name_file_and_element(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_text(tmp_path, text)
 
 
 def test_inertia_is_read(tmp_path: Path) -> None:
@@ -70,60 +85,42 @@ def test_inertia_is_read(tmp_path: Path) -> None:
     complete = f'<inertial>{origin}<mass value="2"/>{moments}</inertial>'
     unit = '<inertia ixx="1" iyy="1" izz="1"/>'
     impossible = '<inertia ixx="1" iyy="1" izz="1" ixy="3"/>'
-    text = f"""<robot name="t"><link name="a">{complete}</link><link name="b"/>
-    <link name="c"><inertial><mass value="1"/></inertial></link>
-    <link name="d"><inertial><mass value="-1"/>{unit}</inertial></link>
-    <link name="e"><inertial><mass value="1"/>{impossible}</inertial></link>
-    <link name="f"><inertial><mass value="heavy"/>{unit}</inertial></link>
-    """ + "".join(
-        f'<joint name="{c}" type="fixed"><parent link="a"/><child link="{c}"/></joint>'
-        for c in "bcdef"
+    text = f'<link name="a">{complete}</link><link name="b"/>' + "".join(
+        format_fixed_link(name, "a", shapes=f"<inertial>{mass}{inertia}</inertial>")
+        for name, mass, inertia in (
+            ("c", '<mass value="1"/>', ""),
+            ("d", '<mass value="-1"/>', unit),
+            ("e", '<mass value="1"/>', impossible),
+            ("f", '<mass value="heavy"/>', unit),
+        )
     )
-    (tmp_path / "t.urdf").write_text(text + "</robot>")
-    found = read_object_urdf(tmp_path / "t.urdf")
+    found = read_text(tmp_path, text + format_joint("fixed"))
     stated = found.links["a"].inertia
     assert (stated.mass, list(stated.lever)) == (2.0, [0.1, 0.2, 0.3])
-    assert np.allclose(
-        stated.inertia, [[0.2, -0.01, 0.0], [-0.01, 0.1, 0.0], [0.0, 0.0, 0.25]]
-    )  # along the link's axes
+    # along the link's axes
+    expected = [[0.2, -0.01, 0.0], [-0.01, 0.1, 0.0], [0.0, 0.0, 0.25]]
+    assert np.allclose(stated.inertia, expected)
     assert [found.links[name].inertia.mass for name in "bcdef"] == [0.0] * 5
-    link_notes = [next(note for note in found.notes if f"'{name}'" in note) for name in "cdef"]
-    for note, words in zip(
-        link_notes,
-        ("without <inertia>", "a negative mass", "moments of inertia", "heavy"),
-        strict=True,
-    ):
+    reasons = ("without <inertia>", "a negative mass", "moments of inertia", "heavy")
+    for name, words in zip("cdef", reasons, strict=True):
+        (note,) = (note for note in found.notes if f"'{name}'" in note)
         assert words in note
         assert "counts as none" in note
 
 
 @pytest.mark.parametrize(
-    ("kind", "limit", "expected_kind", "limits"),
+    ("kind", "limit", "expected"),
     [
-        ("revolute", 'lower="-1.8e308" upper="1.8e308"', None, None),
-        ("revolute", 'lower="-1.79769e308" upper="1.79769e308"', "continuous", None),
-        ("revolute", 'lower="-3.4028235e38" upper="3.4028235e38"', "continuous", None),
-        ("revolute", 'lower="-1e16" upper="1.5"', "revolute", (-np.inf, 1.5)),
-        ("prismatic", 'lower="-1e16" upper="1e16"', "prismatic", None),
-        ("prismatic", 'lower="0" upper="2147483647"', "prismatic", (0.0, np.inf)),
-        ("prismatic", 'lower="0" upper="0.4" velocity="-1" effort="-1"', "prismatic", (0.0, 0.4)),
+        ("revolute", 'lower="-1.79769e308" upper="1.79769e308"', ("continuous", None)),
+        ("revolute", 'lower="-1e16" upper="1.5"', ("revolute", (-np.inf, 1.5))),
+        ("prismatic", 'lower="-1e16" upper="1e16"', ("prismatic", None)),
+        ("prismatic", 'lower="0" upper="2147483647"', ("prismatic", (0.0, np.inf))),
+        ("prismatic", 'lower="0" upper="0.4" velocity="-1"', ("prismatic", (0.0, 0.4))),
     ],
 )
 def test_huge_limits_count_as_unlimited(
-    tmp_path: Path,
-    kind: str,
-    limit: str,
-    expected_kind: str | None,
-    limits: tuple[float, float] | None,
+    tmp_path: Path, kind: str, limit: str, expected: tuple[str, tuple[float, float] | None]
 ) -> None:
-    file = tmp_path / "t.urdf"
-    file.write_text(
-        f'<robot name="t"><link name="a"/><link name="b"/><joint name="j" type="{kind}">'
-        f'<parent link="a"/><child link="b"/><limit {limit}/></joint></robot>'
-    )
-    if expected_kind is None:  # beyond the largest float
-        with pytest.raises(InputError, match="j: limit lower: wrong numbers"):
-            read_object_urdf(file)
-        return
-    joint = read_object_urdf(file).joints["b"]
-    assert (joint.kind, joint.limits, joint.velocity) == (expected_kind, limits, None)
+    links = LINKS + format_joint("fixed", "c")
+    joint = read_text(tmp_path, links + format_joint(kind, "b", f"<limit {limit}/>")).joints["b"]
+    assert (joint.kind, joint.limits, joint.velocity) == (*expected, None)

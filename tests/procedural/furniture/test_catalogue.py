@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.robots import compute_placement, get_home_configuration
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
@@ -33,18 +34,15 @@ def place_object(kind: str, seed: int) -> vkc.PlacedObject:
 
 def get_hand_shapes() -> list:
     """Return the shapes of the gripper and the last link of the arm, in the tool's frame."""
-    model, data, geometry = ROBOT.model, ROBOT.model.createData(), ROBOT.collision
-    shapes = geometry.createData()
-    start = ROBOT.coordinates.q(np.concatenate([np.zeros(3), ROBOT.home]))
-    pin.updateGeometryPlacements(model, data, geometry, shapes, start)
-    pin.framesForwardKinematics(model, data, start)
-    tool = data.oMf[model.getFrameId(ROBOT.tool_frame)]
-    names = ("gripper", "wrist_3")
-    found = zip(geometry.geometryObjects, shapes.oMg, strict=True)
+    start, geometry = get_home_configuration(ROBOT), ROBOT.collision
+    data, shapes = ROBOT.model.createData(), geometry.createData()
+    q = ROBOT.coordinates.q(start)
+    pin.updateGeometryPlacements(ROBOT.model, data, geometry, shapes, q)
+    tool = compute_placement(ROBOT, ROBOT.tool_frame, start)
     return [
         (shape.geometry, tool.actInv(placement))
-        for shape, placement in found
-        if shape.name.startswith(names)
+        for shape, placement in zip(geometry.geometryObjects, shapes.oMg, strict=True)
+        if shape.name.startswith(("gripper", "wrist_3"))
     ]
 
 
@@ -62,16 +60,12 @@ def test_hand_fits_around_every_handle(kind: str, seed: int) -> None:
             np.zeros(len(attachment.freedoms))
         )
         for shape in make_world_shapes(placed):
-            link = shape.name.rpartition("_")[0]
+            own = shape.name.rpartition("_")[0] == attachment.link
             least = min(
                 compute_shape_distance(solid, tool * placement, shape.geometry, shape.placement)
                 for solid, placement in HAND_SHAPES
             )
-            assert least >= (0.005 if link == attachment.link else 0.02), (
-                attachment.name,
-                shape.name,
-                least,
-            )
+            assert least >= (0.005 if own else 0.02), (attachment.name, shape.name, least)
 
 
 @FEW_EXAMPLES
@@ -85,43 +79,30 @@ def test_moving_links_do_not_collide(kind: str, seed: int) -> None:
             continue  # the spindle of a door lever is in the panel
         for value in np.linspace(placed.object.lower[k], placed.object.upper[k], 7):
             shapes = make_world_shapes(placed.with_state({joint: value}))
-            parents = [shape.parentJoint for shape in placed.object.collision.geometryObjects]
             moved = placed.object.links_moved_by({joint})
-            moving = [s for s in shapes if s.name.rpartition("_")[0] in moved]
-            others = [
-                s
-                for s, parent in zip(shapes, parents, strict=True)
-                if s.name.rpartition("_")[0] not in moved
-            ]
+            groups: dict[bool, list] = {True: [], False: []}
+            for shape in shapes:
+                groups[shape.name.rpartition("_")[0] in moved].append(shape)
             least = 0.0 if kind in ("faucet", "valve") else 5e-4  # levers sit on their spindles
-            assert (
-                compute_clearance(
-                    list_placed_shapes(moving), list_placed_shapes(others), reach=0.01
-                )
-                >= least - 1e-6
-            ), (joint, value, parents)
+            clearance = compute_clearance(*map(list_placed_shapes, groups.values()), reach=0.01)
+            assert clearance >= least - 1e-6, (joint, value)
 
 
 @FEW_EXAMPLES
 @given(ANY_KIND, st.integers(0, 5000))
 def test_doors_open_towards_the_user(kind: str, seed: int) -> None:
     placed = place_object(kind, seed)
+    model = placed.object.model
     for attachment in placed.object.attachments.values():
-        joint = (
-            placed.object.coordinates.names[0]
-            if kind == "door"
-            else next(
-                str(placed.object.model.names[frame.parentJoint])
-                for frame in placed.object.model.frames
-                if frame.name == attachment.link
-            )
-        )
+        frame = next(each for each in model.frames if each.name == attachment.link)
+        joint = placed.object.coordinates.names[0] if kind == "door" else ""
+        joint = joint or str(model.names[frame.parentJoint])
+        most = placed.object.upper[placed.object.coordinates.index(joint)]
         before, after = (
-            (
-                placed.with_state({joint: value}).link_placement(attachment.link)
-                * attachment.placement
-            ).translation
-            for value in (0.0, 0.3 * placed.object.upper[placed.object.coordinates.index(joint)])
+            placed.with_state({joint: value})
+            .link_placement(attachment.link)
+            .act(attachment.placement.translation)
+            for value in (0.0, 0.3 * most)
         )
         moved = after - before
         if kind in ("dishwasher", "oven"):
@@ -155,10 +136,9 @@ def test_invalid_arguments_are_rejected(tmp_path: Path) -> None:
         vkc.procedural.random_object("refigerator")
     with pytest.raises(vkc.InputError, match="whole number"):
         vkc.procedural.random_object("oven", -1)
+    oven = vkc.procedural.random_object("oven")
     with pytest.raises(vkc.InputError, match=r"ends with \.yaml"):
-        vkc.procedural.write_object(vkc.procedural.random_object("oven"), tmp_path / "oven.urdf")
+        vkc.procedural.write_object(oven, tmp_path / "oven.urdf")
     with pytest.raises(vkc.InputError, match="attachments"):
-        vkc.procedural.write_object(
-            {"urdf": vkc.procedural.random_object("oven")["urdf"]}, tmp_path / "oven.yaml"
-        )
+        vkc.procedural.write_object({"urdf": oven["urdf"]}, tmp_path / "oven.yaml")
     assert not list(tmp_path.iterdir())

@@ -18,25 +18,31 @@ def test_only_output_of_the_same_command_may_be_replaced(tmp_path: Path) -> None
     check_target(folder, "import-home", force=False)
     folder.mkdir()
     check_target(folder, "import-home", force=False)
-    (folder / "a.yaml").write_text(
-        f"# Made of x {get_origin_marker('import-home')}.\n", encoding="utf-8"
-    )
     (folder / "b.yaml").write_bytes(b"\xff\n")
-    check_target(folder, "import-home", force=True)
-    for command, force, expected in (
-        ("import-home", False, r"--force.*got an earlier output of import-home"),
-        ("import-robot", True, r"expected a new or an empty folder, got other files"),
+    marker = f"{get_origin_marker('import-home')}.\n"
+    for text, command, force, expected in (
+        (
+            f"# Made of x {marker}",
+            "import-home",
+            False,
+            "--force.*an earlier output of import-home",
+        ),
+        (
+            f"# Made of x {marker}",
+            "import-robot",
+            True,
+            "a new or an empty folder, got other files",
+        ),
+        (f"no first line\n{marker}", "import-home", True, "other files"),
     ):
+        (folder / "a.yaml").write_text(text, encoding="utf-8")
         with pytest.raises(vkc.InputError, match=expected) as caught:
             check_target(folder, command, force=force)
         assert caught.value.field == "folder"
+    (folder / "a.yaml").write_text(f"# Made of x {marker}", encoding="utf-8")
+    check_target(folder, "import-home", force=True)
     with pytest.raises(vkc.InputError, match="got a file"):
         check_target(folder / "a.yaml", "import-home", force=True)
-    (folder / "a.yaml").write_text(
-        f"no first line\n{get_origin_marker('import-home')}.\n", encoding="utf-8"
-    )
-    with pytest.raises(vkc.InputError, match="other files"):
-        check_target(folder, "import-home", force=True)
 
 
 @given(st.text())

@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 from helpers.homes import HOME_MJCF, PLACES, WALLS, write_home_urdf
-from helpers.texts import format_box, format_fixed_link
+from helpers.texts import format_box
 
 import vkc_pin as vkc
 from vkc_pin.importing.homes.home_import import find_free_start
@@ -167,30 +166,6 @@ def test_sdf_world_is_imported(tmp_path: Path) -> None:
     assert imported.scene.objects["cup"].placement.translation == pytest.approx([2.2, 1.0, 0.8])
     # free floor on the three sides without a wall
     assert imported.scene.arena == pytest.approx((-5.0, 5.0, 0.7 - 2.0, 2.05))
-
-
-def test_xacro_home_is_imported(tmp_path: Path) -> None:
-    pytest.importorskip("xacro")
-    (tmp_path / "parts").mkdir()
-    trimesh.creation.box((0.4, 0.6, 0.8)).export(tmp_path / "parts" / "case.stl")
-    case = '<collision><geometry><mesh filename="package://furniture/case.stl"/></geometry>'
-    front = format_box("0.02 0.56 0.3") + format_box("0.02 0.2 0.02", "-0.07 0 0")
-    (tmp_path / "flat.urdf.xacro").write_text(
-        f"""<robot name="flat" xmlns:xacro="http://www.ros.org/wiki/xacro">
-        <xacro:arg name="depth" default="0.3"/><link name="rooms"/>
-        {format_fixed_link("chest", "rooms", "2 0 0.4", case + "</collision>")}
-        <link name="front">{front}</link>
-        <joint name="slide" type="prismatic"><parent link="chest"/><child link="front"/>
-          <origin xyz="-0.22 0 0.1"/><axis xyz="-1 0 0"/>
-          <limit lower="0" upper="$(arg depth)"/></joint></robot>"""
-    )
-    imported = vkc.importing.import_home(
-        tmp_path / "flat.urdf.xacro",
-        tmp_path / "out",
-        packages={"furniture": tmp_path / "parts"},
-        arguments={"depth": "0.25"},
-    )
-    assert imported.scene.objects["chest"].object.upper == pytest.approx([0.25])
 
 
 def test_second_import_replaces_only_its_own_output(tmp_path: Path) -> None:

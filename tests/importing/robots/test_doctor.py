@@ -10,6 +10,7 @@ from helpers.texts import format_box, format_fixed_link, replace_in_file
 
 import vkc_pin as vkc
 from vkc_pin.importing.robots.doctor import Diagnosis
+from vkc_pin.importing.robots.hand_checks import find_envelopes
 
 
 def find_texts(diagnosis: Diagnosis, level: str, topic: str) -> list[str]:
@@ -248,3 +249,31 @@ def test_lift_without_velocity_limit_is_assumed_to_be_slow(tmp_path: Path) -> No
     assert robot.velocity[3:].tolist() == pytest.approx([0.1, *[3.14159265] * 4])
     text = " ".join(find_texts(vkc.importing.doctor(robot, samples=1), "warning", "limits"))
     assert "arm_1_joint (assumed: 0.1 m/s); arm_2_joint, arm_3_joint" in text
+
+
+def write_caged_arm(folder: Path, *, size: str = "0.3 0.3 0.3", visual: bool = False) -> Path:
+    """Write an arm whose hand is enclosed in a box, which has no visual shape by default."""
+    cage = format_box(size) + (format_box(size, kind="visual") if visual else "")
+    hand = '<link name="hand">'
+    visible = hand + format_box("0.05 0.14 0.06", kind="visual")
+    path = replace_in_file(write_arms(folder), (hand, visible))
+    add_elements(path, format_fixed_link("cage", "hand", "0 0 0.1", cage))
+    return path
+
+
+def test_small_and_visible_shapes_are_not_envelopes(tmp_path: Path) -> None:
+    small = write_caged_arm(tmp_path / "small", size="0.02 0.02 0.02")
+    for file in (small, write_caged_arm(tmp_path / "visible", visual=True)):
+        assert find_envelopes(vkc.load_robot(file, pairs="all", tool_frame="hand")) == {}
+
+
+def test_import_removes_envelopes_and_doctor_reports_them(tmp_path: Path) -> None:
+    file = write_caged_arm(tmp_path / "given")
+    imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=50)
+    assert "cage" not in imported.robot.links
+    assert "cage" not in imported.robot.touch_links
+    assert {"hand", "finger_a", "finger_b"} <= set(imported.robot.touch_links)
+    assert "cage encloses" in str(imported)
+    found = vkc.importing.doctor(vkc.load_robot(file, tool_frame="hand"), samples=5)
+    assert "cage encloses" in str(found)
+    assert "cage" not in str(vkc.importing.doctor(imported.robot, samples=5))

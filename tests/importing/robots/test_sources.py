@@ -94,7 +94,6 @@ def test_given_packages_and_those_around_the_file_are_found(file: Path, tmp_path
         ("work/checkout-of-parts", "my_parts"),  # beside the robot's package
         ("work/my_robot/checkout", "my_parts"),  # within it
         ("work", "my_parts"),  # around it
-        ("work/my_robot", "my_parts"),
         ("work/z", " my_parts\n "),
     ],
 )

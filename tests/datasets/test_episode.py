@@ -46,14 +46,6 @@ def test_attempts_are_determined_by_their_number() -> None:
     json.dumps(record)
 
 
-def test_scene_name_is_a_digest() -> None:
-    episode = unpack(run_attempt(DOCUMENT, 0, {})[1])
-    assert "start" not in episode.document
-    name = compute_scene_name(episode.document)
-    assert name == compute_scene_name(json.loads(json.dumps(episode.document)))
-    assert name != compute_scene_name({**episode.document, "floor": False})
-
-
 def test_failed_plan_has_a_reason() -> None:
     record, data = run_attempt({**DOCUMENT, "max_evaluations": 1}, 0, {})
     assert (record["success"], data) == (False, b"")

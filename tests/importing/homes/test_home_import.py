@@ -197,6 +197,7 @@ def test_invalid_homes_and_arguments_are_rejected(tmp_path: Path) -> None:
         (tmp_path / "none.urdf", {}, r"none\.urdf"),
         (immovable, {}, r"still\.urdf.*the home has nothing movable"),
         (immovable, {"packages": {"p": 1}}, "packages"),
+        (immovable, {"arguments": 3}, "arguments"),
         (immovable, {"floor": float("nan")}, "floor"),
         (immovable, {"most": 0}, "most"),
         (immovable, {"robot": "husky_ur5"}, "husky_ur5e"),

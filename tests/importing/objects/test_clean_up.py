@@ -12,17 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
-from vkc_pin.errors import UnknownNameError
 from vkc_pin.importing.objects.clean_up import (
     add_missing_limits,
     choose_name,
     compute_bounds,
-    extract_subtree,
     find_multiple_objects,
     load_surfaces,
     make_upright,
     merge_fixed_links,
-    move_root,
     scale_object,
 )
 from vkc_pin.importing.objects.description import Description, Link
@@ -145,16 +142,6 @@ def test_missing_limits_open_outwards(cabinet: Description) -> None:
     degrees = dataclasses.replace(limited, joints={**limited.joints, "link_1": narrow})
     notes = add_missing_limits(degrees, load_surfaces(degrees)).notes
     assert any("only 1.6°" in note or "only 2°" in note for note in notes)
-
-
-def test_subtree_is_extracted_rotated_and_moved(cabinet: Description) -> None:
-    found = make_upright(extract_subtree(cabinet, "link_2"), "y")
-    low, high = compute_box(found)
-    assert (high - low)[2] == pytest.approx(1.0)
-    moved = move_root(found, pin.SE3(np.eye(3), np.array([0.0, 0.0, -low[2]])))
-    assert compute_box(moved)[0][2] == pytest.approx(0.0)
-    with pytest.raises(UnknownNameError, match="link_2"):
-        extract_subtree(cabinet, "link2")
 
 
 @given(st.lists(st.text(max_size=5), max_size=8))

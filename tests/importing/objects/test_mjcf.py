@@ -9,7 +9,7 @@ from helpers.partnet import MJCF
 from vkc_pin.errors import InputError
 from vkc_pin.importing.objects.mjcf import read_object_mjcf
 
-pytest.importorskip("mujoco")
+mujoco = pytest.importorskip("mujoco")
 
 
 def test_bodies_joints_and_shapes_are_read(tmp_path: Path) -> None:
@@ -23,27 +23,26 @@ def test_bodies_joints_and_shapes_are_read(tmp_path: Path) -> None:
     assert (hinge.damping, hinge.friction) == (0.4, 0.2)
     place = found.compute_placements()["door"]
     assert np.allclose(place.translation, [0.75, -0.3, 0.4])
-    assert [(part.name, part.kind) for part in found.links["door"].collision] == [
-        ("leaf", "box"),
-        ("handle", "capsule"),
-    ]
-    assert found.links["door"].collision[1].size == pytest.approx((0.01, 0.3))
-    assert [part.name for part in found.links["door"].visual] == ["leaf", "handle", "looks"]
-    looks = found.links["door"].visual[2].make_mesh()  # MuJoCo moves meshes to their principal axes
+    door = found.links["door"]
+    shapes = [(part.name, part.kind) for part in door.collision]
+    assert shapes == [("leaf", "box"), ("handle", "capsule")]
+    assert door.collision[1].size == pytest.approx((0.01, 0.3))
+    assert [part.name for part in door.visual] == ["leaf", "handle", "looks"]
+    looks = door.visual[2].make_mesh()  # MuJoCo moves meshes to their principal axes
     assert np.allclose(looks.bounds, [[-0.02, 0.1, 0.0], [0.08, 0.2, 0.1]], atol=1e-6)
     notes = " ".join(found.notes)
     assert "'cup' is free" in notes
     assert "'floor'" in notes
     with_free = read_object_mjcf(tmp_path / "t.xml", free=True)
-    assert (with_free.joints["cup"].kind, with_free.joints["cup"].parent) == ("floating", "world")
-    assert with_free.compute_placements()["cup"].translation == pytest.approx([2.0, 0.0, 0.0])
+    cup = with_free.joints["cup"]
+    assert (cup.kind, cup.parent) == ("floating", "world")
+    assert cup.placement.translation == pytest.approx([2.0, 0.0, 0.0])
     assert [part.kind for part in with_free.links["cup"].collision] == ["sphere"]
     assert "'cup'" not in " ".join(with_free.notes)
 
 
 def test_inertia_agrees_with_mujoco(tmp_path: Path) -> None:
     """MuJoCo infers masses from the geoms."""
-    mujoco = pytest.importorskip("mujoco")
     (tmp_path / "t.xml").write_text(MJCF)
     model = mujoco.MjModel.from_xml_string(MJCF)
     data = mujoco.MjData(model)

@@ -6,22 +6,10 @@ import numpy as np
 import pinocchio as pin
 import trimesh
 from helpers.descriptions import make_description, make_joint, make_mesh_part, make_part
-from helpers.partnet import write_partnet_object
 
-from vkc_pin.importing.objects.clean_up import load_surfaces, merge_fixed_links
+from vkc_pin.importing.objects.clean_up import load_surfaces
 from vkc_pin.importing.objects.description import Link
 from vkc_pin.importing.objects.pieces import PieceCache, decompose_links
-from vkc_pin.importing.objects.urdf import read_object_urdf
-
-
-def test_flat_shapes_are_thickened_and_noted(tmp_path: Path) -> None:
-    found = merge_fixed_links(read_object_urdf(write_partnet_object(tmp_path)))
-    decomposed = decompose_links(found, load_surfaces(found))
-    decoration = next(
-        part for part in decomposed.links["link_0"].collision if part.name == "decoration-6"
-    )
-    assert decoration.make_mesh().volume > 0.0
-    assert any("decoration-6" in note and "link_0" in note for note in decomposed.notes)
 
 
 def test_enclosed_pieces_are_removed() -> None:

@@ -120,7 +120,6 @@ def test_failed_plan_is_written_and_returns_1(run: RunCommand) -> None:
         ("plan door --reach 1 0 0 0 up 0", ["--reach", "'up'"]),
         ("plan door --set door.hinge=1 --initialization stationry", ["did you mean 'stationary'"]),
         ("plan door --set door.hinge=1 --time-limit -1", ["time_limit", "more than 0"]),
-        ("plan door --set door.hinge=1 --time-limit soon", ["--time-limit", "soon"]),
         ("plan door --st x", ["usage: vkc-pin plan ", "--st x"]),
         ("check door.json", ["door.json", "a saved plan (.npz) or a scene (.yaml)"]),
         ("check none.npz", ["none.npz", "No such file"]),

@@ -84,17 +84,14 @@ def test_digest_depends_only_on_fields_that_determine_episodes(
         ("options: {dist_saf: 0.1}", "options.dist_saf", "did you mean 'dist_safe'"),
         ("options: {dist_safe: -1}", "options.dist_safe", "dist_safe"),
         ("max_evaluations: 0", "max_evaluations", "out of range"),
-        ("variants: -1", "variants", "out of range"),
         ("variants: 1000000000", "variants", "out of range"),
         ("rate: 1.0e-9", "rate", "out of range"),
-        ("rate: 5000", "rate", "out of range"),
         ("rooms: {episodes: 100000}", "rooms.episodes", "out of range"),
         ("rooms: {first: 10000000000}", "rooms.first", "out of range"),
         ("rooms: {count: 0}", "rooms.count", "out of range"),
         ("rooms: {clutter: [0.0, 1.5]}", "rooms", "clutter"),
         ("robots: []", "robots", "robots"),
         ("goal: {share: [0.5, 0.4]}", "goal.share", "share"),
-        ("goal: {share: [0.0, 0.4]}", "goal.share", "share"),
         *(
             (f"terms: [{{{entry}}}]", f"terms[0]{field}", message)
             for entry, field, message in (
@@ -104,7 +101,6 @@ def test_digest_depends_only_on_fields_that_determine_episodes(
                 ("type: speed, most: .nan", ".most", "finite"),
                 ("type: speed, most: 1, frme: hand", ".frme", "did you mean 'frame'"),
                 ("type: upright, axis: [0, 0, 0]", ".axis", "no direction"),
-                ("type: upright, angle: 4", ".angle", "out of range"),
                 ("type: keep-out, position: [0, 0], size: [1, 1, 1]", ".position", "3 values"),
                 (
                     "type: keep-out, position: [0, 0, 0], size: [1, 1, 0]",

@@ -6,19 +6,16 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.datasets import SMALL
 
 from vkc_pin.datasets.dataset import Dataset
-from vkc_pin.datasets.episode import run_attempt, run_attempts, unpack
+from vkc_pin.datasets.episode import run_attempt, unpack
 from vkc_pin.datasets.formats.hdf5 import (
     make_part,
-    make_parts,
     read_episodes,
     read_numbers,
     write_shard,
 )
 from vkc_pin.datasets.formats.samples import sample_episode
-from vkc_pin.datasets.recipe import load_recipe
 from vkc_pin.errors import InputError
 
 h5py = pytest.importorskip("h5py")
@@ -112,27 +109,3 @@ def test_changed_scene_raises(copy: Path) -> None:
         file.write_text(file.read_text().replace('"floor":true', '"floor":false'))
     with pytest.raises(InputError, match="not what its name says"):
         list(Dataset.open(copy).episodes())
-
-
-@pytest.mark.long
-def test_parts_of_attempts_form_a_shard(tmp_path: Path) -> None:
-    document = load_recipe({**SMALL, "tasks": ["given-open"]}).document
-    parts, attempts = make_parts((document, [0, 1], {})), run_attempts((document, [0, 1], {}))
-    assert [record["success"] for record, _ in parts] == [True, True]
-    for (record, data), (expected, _) in zip(parts, attempts, strict=True):
-        for key in ("number", "way", "scene", "evaluations"):
-            assert record[key] == expected[key]
-        (tmp_path / f"{record['number']}.hdf5").write_bytes(data)
-    shard = write_shard(
-        tmp_path / "shard.hdf5",
-        [(tmp_path / f"{number}.hdf5", 0) for number in (1, 0)],
-        tmp_path / "scenes",
-    )
-    assert read_numbers(shard) == [1, 0]
-    assert all(episode.validate().ok for episode in read_episodes(shard, tmp_path / "scenes"))
-
-
-def test_failures_have_no_data() -> None:
-    far = {"tasks": ["drive-open"], "start": {"distance": [90.0, 91.0]}}
-    ((record, data),) = make_parts((load_recipe({**SMALL, **far}).document, [0], {}))
-    assert (record["success"], data) == (False, b"")

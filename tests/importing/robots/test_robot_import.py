@@ -49,7 +49,7 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> vkc.importing.Imported
     return vkc.importing.import_robot(file, folder / "mine", arm="right", samples=SAMPLES)
 
 
-def test_folder_describes_the_robot(imported: vkc.importing.ImportedRobot) -> None:
+def test_folder_and_report_describe_the_robot(imported: vkc.importing.ImportedRobot) -> None:
     names = {path.name for path in imported.folder.iterdir()}
     written = {f"robot.{kind}" for kind in ("yaml", "png")} | {"scene.yaml", ".vkc-pin.json"}
     assert names == {*written, "mine.urdf", "mine.srdf", "collision"}
@@ -65,9 +65,6 @@ def test_folder_describes_the_robot(imported: vkc.importing.ImportedRobot) -> No
     assert (gripper.min_opening, gripper.max_opening) == (0.0, pytest.approx(0.08, abs=2e-4))
     stated = yaml.safe_load((imported.folder / "robot.yaml").read_text(encoding="utf-8"))
     assert not set(stated["locked_joints"]) & set(stated["gripper"])
-
-
-def test_report_lists_guesses(imported: vkc.importing.ImportedRobot) -> None:
     assert imported.arms == ("right", "left")
     for part in (
         "drive_x, drive_y, drive_yaw are locked",

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
@@ -128,14 +127,8 @@ def test_all_missing_packages_are_listed(file: Path) -> None:
     assert "class" not in message
 
 
-def test_errors_name_the_cause(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    replace_in_file(file, ("my_parts", "my_prats"))
-    with pytest.raises(vkc.InputError, match="my_prats") as caught:
+def test_errors_name_the_cause(file: Path) -> None:
+    replace_in_file(file, ("$(arg length)", "${1/0}"))
+    with pytest.raises(vkc.InputError, match="xacro cannot process the file") as caught:
         expand_xacro(file, {}, {})
     assert caught.value.file == file
-    replace_in_file(file, ("my_prats", "my_parts"), ("$(arg length)", "${1/0}"))
-    with pytest.raises(vkc.InputError, match="xacro cannot process the file"):
-        expand_xacro(file, {}, {})
-    monkeypatch.setitem(sys.modules, "xacro", None)
-    with pytest.raises(vkc.InputError, match=r"vkc-pin\[import\]"):
-        expand_xacro(file, {}, {})

@@ -114,10 +114,16 @@ def set_field(*path: Any, value: Any) -> Callable[[str], str]:
     return change
 
 
+def repeat_record(line: str) -> str:
+    data = json.loads(line)
+    return json.dumps({**data, "records": 2 * data["records"]})
+
+
 JOURNAL_DAMAGES: list[Callable[[str], str]] = [
     *(set_field("key", value=value) for value in ("abc", "01", "-1", None, "9" * 5000, 1)),
-    *(set_field("records", value=value) for value in ([], [{}, {}], [3], [{}], {"number": 1})),
+    *(set_field("records", value=value) for value in ([], [3], [{}], {"number": 1})),
     *(set_field("records", 0, "number", value=value) for value in (0, 1.5)),
+    repeat_record,
     set_field("records", 0, "success", value="yes"),
     set_field("records", 0, "status", value=...),
     *(

@@ -104,21 +104,25 @@ def test_long_chains_of_fixed_links_are_merged() -> None:
 
 
 @pytest.mark.parametrize(
-    ("objects", "note"),
+    ("objects", "solid", "note"),
     [
         # Each object: kinds of its own joint and of those on it
         (
             [("fixed", "revolute"), ("fixed", "revolute", "prismatic")],
+            False,
             "'a' (1 joint), 'b' (2 joints)",
         ),
-        ([("fixed", "revolute")], ""),
-        ([("fixed", "revolute"), ("fixed",)], ""),
-        ([("prismatic",), ("prismatic",)], ""),
+        ([("fixed", "revolute"), ("fixed", "revolute")], True, ""),
+        ([("fixed", "revolute")], False, ""),
+        ([("fixed", "revolute"), ("fixed",)], False, ""),
+        ([("prismatic",), ("prismatic",)], False, ""),
     ],
-    ids=["two", "one", "one and a wall", "chest of drawers"],
+    ids=["two", "two on a body", "one", "one and a wall", "chest of drawers"],
 )
-def test_separate_objects_in_one_file_are_noted(objects: list[tuple[str, ...]], note: str) -> None:
-    links, joints = [Link("world")], []
+def test_separate_objects_in_one_file_are_noted(
+    objects: list[tuple[str, ...]], solid: bool, note: str
+) -> None:
+    links, joints = [Link("world", (), (make_part(),) * solid)], []
     for name, (own, *kinds) in zip("ab", objects, strict=False):
         ends = [("world", name), *((name, f"{name}{k}") for k in range(len(kinds)))]
         links += [Link(child, (), (make_part(),)) for _, child in ends]

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from vkc_pin.importing.proposals.candidates import (
     Candidate,
     Piece,
+    Section,
     Thickness,
     find_candidates,
 )
@@ -92,3 +93,13 @@ def test_axes_and_sections_of_a_rotated_box_are_found(
     assert np.allclose(section.centre, centre, atol=1e-3)
     assert np.ptp(section.polygon, axis=0) == pytest.approx([0.2, 0.05], rel=0.031)
     assert box.compute_section(0, float(box.extents[0, 1]) + 0.01) is None
+
+
+def test_clipping_cuts_off_a_part_of_the_section() -> None:
+    corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]) * 0.01
+    square = Section(np.zeros(3), np.eye(3)[:2], corners)
+    clipped = square.clip(np.array([1.0, 0.0]), -0.005)
+    assert clipped is not None
+    assert clipped.extent(np.array([1.0, 0.0])) == pytest.approx((-0.01, -0.005))
+    assert clipped.extent(np.array([0.0, 1.0])) == pytest.approx((-0.01, 0.01))
+    assert square.clip(np.array([1.0, 0.0]), -0.02) is None

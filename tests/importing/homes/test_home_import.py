@@ -204,7 +204,7 @@ def test_invalid_homes_and_arguments_are_rejected(tmp_path: Path) -> None:
         (immovable, {"options": 1}, "options"),
     ):
         with pytest.raises(vkc.InputError, match=message):
-            vkc.importing.import_home(file, tmp_path / "out", **argument)  # type: ignore[arg-type]
+            vkc.importing.import_home(file, tmp_path / "out", **argument)
     assert not (tmp_path / "out").exists()
     assert not list(tmp_path.glob(".import-home-*"))
 

@@ -194,7 +194,7 @@ def test_errors_name_the_invalid_argument() -> None:
         (vkc.importing.import_robot, {"samples": 10**6 + 1}, "samples"),
     ):
         with pytest.raises(vkc.InputError) as caught:
-            call("husky_ur5e", **arguments)  # type: ignore[operator]
+            call("husky_ur5e", **arguments)
         assert caught.value.field == field
     with pytest.raises(vkc.UnknownNameError, match="did you mean 'husky_ur5e'"):
         vkc.importing.doctor("husky_ur5")

@@ -88,10 +88,10 @@ def test_meshes_of_equal_names_keep_their_shapes_and_colours(tmp_path: Path) -> 
     urdf.write_text(f'<robot name="r"><link name="root"/>{links}</robot>')
     root, _, _ = write_meshes(read_urdf(urdf), own, most_pieces=1)
     (own / "r.urdf").write_bytes(ElementTree.tostring(root))
-    shapes = {shape.link: shape for shape in read_urdf(own / "r.urdf").read_shapes("visual")}
+    visuals = {shape.link: shape for shape in read_urdf(own / "r.urdf").read_shapes("visual")}
     for name, size in sizes.items():
-        assert shapes[name].make_mesh().volume == pytest.approx(size**3)
-        (part,) = load_parts(shapes[name].file)
+        assert visuals[name].make_mesh().volume == pytest.approx(size**3)
+        (part,) = load_parts(visuals[name].file)
         assert part.colour == pytest.approx(colours[name], abs=0.01)
     assert {path.name for path in (own / "visual").iterdir()} == {
         *("x.obj", "x_2.obj", "x_3.obj"),

@@ -127,6 +127,7 @@ def test_failed_plan_is_written_and_returns_1(run: RunCommand) -> None:
         ("bench door --trials 0", ["--trials", "at least 1"]),
         ("bench initialization --out o --jobs -2", ["--jobs", "at least 1", "'-2'"]),
         ("bench initialization --out o --scenes init1", ["'init1'", "did you mean 'init_1'"]),
+        ("bench initialization --out o --methods astra", ["'astra'", "did you mean 'astar'"]),
         ("srdf husky_ur5 --output x.srdf", ["husky_ur5e"]),
         ("srdf husky_ur5e", ["--output"]),
         ("", ["COMMAND"]),

@@ -348,7 +348,7 @@ def test_submesh_selects_a_part_of_a_mesh_file(tmp_path: Path) -> None:
 
 WORLD = """<sdf version="1.6"><world name="flat">
   <include><uri>model://bin</uri><pose>3 0 0 0 0 0</pose></include>
-  <include><uri>model://bin</uri><name>other</name><pose>4 0 0 0 0 0</pose>
+  <include><uri>model://plain</uri><name>other</name><pose>4 0 0 0 0 0</pose>
     <static>1</static></include>
   <model name="wall"><static>true</static><pose>0 2 1 0 0 0</pose><link name="l">
     <collision name="c"><geometry><box><size>4 0.1 2</size></box></geometry></collision></link>
@@ -363,7 +363,7 @@ WORLD = """<sdf version="1.6"><world name="flat">
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Return a folder `worlds` beside a folder `models` with one model in two versions."""
+    """Return a folder `worlds` beside `models` with a model in two versions, and in one."""
     bin_folder = tmp_path / "models" / "bin"
     bin_folder.mkdir(parents=True)
     (tmp_path / "worlds").mkdir()
@@ -372,7 +372,9 @@ def folder(tmp_path: Path) -> Path:
         "<geometry><ellipsoid><radii>0.1 0.2 0.3</radii></ellipsoid></geometry></collision></link>"
         "</model>"
     )
-    (bin_folder / "new.sdf").write_text(f'<sdf version="1.6">{body}</sdf>')
+    (tmp_path / "models" / "plain").mkdir()
+    for file in (bin_folder / "new.sdf", tmp_path / "models" / "plain" / "model.sdf"):
+        file.write_text(f'<sdf version="1.6">{body}</sdf>')
     (bin_folder / "old.sdf").write_text('<sdf version="1.4"/>')
     (bin_folder / "model.config").write_text(
         '<model><sdf version="1.4">old.sdf</sdf><sdf version="1.6">new.sdf</sdf></model>'

@@ -40,6 +40,7 @@ def test_report_lists_attachments_and_openings(found: vkc.importing.Proposals) -
     lines = found.summary().splitlines()
     assert found.make_object().attachment().name == found.found[0].attachment.name == "flap_bar"
     assert found.opening("hinge") == found.found
+    assert "flap_bar" in repr(found)
     assert lines[0] == "hinge, 0 to 1.5 rad"
     assert "flap_bar (bar, named as a handle): 20 mm thick, cylindrical" in lines[1]
     assert "opens to 1.5 rad" in lines[1]

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pytest
 from helpers.base_scenes import MARGIN, MARGIN_TOLERANCE, compute_distance, interpolate_poses
 from helpers.carrying import describe_box, make_room
-from helpers.drawers import SHORT, load_drawer_scene, make_drawer_scene, replace_scene_fields
+from helpers.drawers import (
+    SHORT,
+    add_boxes,
+    load_drawer_scene,
+    make_drawer_scene,
+    replace_scene_fields,
+)
 from helpers.drives import make_hall
 from helpers.small_problems import load_door_scene, make_program
 
@@ -23,24 +27,18 @@ from vkc_pin.world.scene.placed_object import make_world_shapes
 
 START, BESIDE = np.array([-1.5, 1.5, 0.0]), np.array([0.5, 1.0, 0.8])
 AISLE = np.array([1.0, -1.4, 0.0])  # behind the post
-POST: dict[str, Any] = {
-    "name": "post",
-    "type": "box",
-    "size": [0.2, 0.2, 1.0],
-    "position": [-0.3, -0.1, 0.5],
-}
+# [m], where waypoints may cut a corner
+CUT_MARGIN = MARGIN - MARGIN_TOLERANCE - 0.01
+POST = describe_box("post", [0.2, 0.2, 1.0], [-0.3, -0.1, 0.5])
 
 
 def make_paths(scene: vkc.Scene, name: str = "drawer", **joints: float) -> BasePaths:
-    return BasePaths(
-        make_program(scene, [vkc.Actuate(name, joints or {"slide": 0.3})], options=SHORT)
-    )
+    step = vkc.Actuate(name, joints or {"slide": 0.3})
+    return BasePaths(make_program(scene, [step], options=SHORT))
 
 
-def compute_clearance(
-    scene: vkc.Scene, poses: np.ndarray, *, without: Sequence[str] = ("drawer",)
-) -> float:
-    """Return the clearance of the base on straight lines between poses [m]."""
+def compute_clearance(scene: vkc.Scene, *poses: np.ndarray, without: str = "drawer") -> float:
+    """Return the clearance of the base on straight lines between poses, shape (n, 3) [m]."""
     base = [
         (s.geometry, s.placement)
         for s in scene.robot.collision.geometryObjects
@@ -49,32 +47,29 @@ def compute_clearance(
     labels = zip(scene.obstacle_labels, scene.obstacles, strict=True)
     fixed = [shape for label, shape in labels if label != FLOOR]
     for name, placed in scene.objects.items():
-        fixed += make_world_shapes(placed) if name not in without else []
-    rows = np.vstack(
-        [interpolate_poses(a, b, length=0.05, angle=0.1) for a, b in itertools.pairwise(poses)]
-    )
-    return min(compute_distance(base, list_placed_shapes(fixed), row.tolist()) for row in rows)
+        fixed += make_world_shapes(placed) if name != without else []
+    lines = itertools.pairwise(np.vstack(poses))
+    rows = [interpolate_poses(a, b, length=0.05, angle=0.1) for a, b in lines]
+    obstacles = list_placed_shapes(fixed)
+    return min(compute_distance(base, obstacles, row.tolist()) for row in np.vstack(rows))
 
 
 def test_free_path_is_straight() -> None:
     path = make_paths(make_drawer_scene(POST)).path(START, BESIDE, 10)
-    assert path is not None
-    u = np.arange(1, 11) / 10
-    for column in range(3):  # from rest to rest
-        expected = START[column] + (3 * u**2 - 2 * u**3) * (BESIDE[column] - START[column])
-        np.testing.assert_allclose(path[:, column], expected, atol=1e-12)
+    u = np.arange(1, 11)[:, None] / 10
+    expected = START + (3 * u**2 - 2 * u**3) * (BESIDE - START)  # from rest to rest
+    np.testing.assert_allclose(path, expected, atol=1e-12)
 
 
 def test_path_leads_around_an_obstacle() -> None:
     scene = make_drawer_scene(POST)
-    assert compute_clearance(scene, np.array([START, AISLE])) < 0.0
+    assert compute_clearance(scene, START, AISLE) < 0.0
     path = make_paths(scene).path(START, AISLE, 80)
     assert path is not None
     assert path.shape == (80, 3)
     np.testing.assert_array_equal(path[-1, :2], AISLE[:2])
     assert np.cos(path[-1, 2] - AISLE[2]) == pytest.approx(1.0)
-    # The path keeps its margin, except where waypoints cut a corner.
-    assert compute_clearance(scene, np.vstack([START, path])) >= MARGIN - MARGIN_TOLERANCE - 0.01
+    assert compute_clearance(scene, START, path) >= CUT_MARGIN
     steps = np.linalg.norm(np.diff(np.vstack([START, path])[:, :2], axis=0), axis=1)
     assert steps.sum() < 1.3 * np.hypot(*(AISLE - START)[:2])
     assert steps.max() < 0.15
@@ -84,58 +79,41 @@ def test_path_leads_around_an_obstacle() -> None:
 @pytest.mark.parametrize(
     "walls",
     [
-        [([0.1, 4.6, 1.0], [0.0, 0.0, 0.5])],  # from side to side
-        [
-            ([2.4, 0.1, 1.0], [-1.4, 0.6, 0.5]),
-            ([0.1, 4.0, 1.0], [-0.2, 1.5, 0.5]),
-        ],  # around the start
+        {"wall": ([0.1, 4.6, 1.0], [0.0, 0.0, 0.5])},  # from side to side
+        {
+            "wall": ([2.4, 0.1, 1.0], [-1.4, 0.6, 0.5]),
+            "other": ([0.1, 4.0, 1.0], [-0.2, 1.5, 0.5]),
+        },
     ],
     ids=["a wall across", "walled in"],
 )
-def test_walls_leave_no_path(walls: list[tuple[list[float], list[float]]]) -> None:
-    boxes = [
-        {"name": f"wall_{k}", "type": "box", "size": size, "position": at}
-        for k, (size, at) in enumerate(walls)
-    ]
-    scene = make_drawer_scene(*boxes)
-    assert compute_clearance(scene, np.array([START, START])) > MARGIN
-    assert compute_clearance(scene, np.array([AISLE, AISLE])) > MARGIN
+def test_walls_leave_no_path(walls: dict[str, tuple[list[float], list[float]]]) -> None:
+    scene = add_boxes(make_drawer_scene(), **walls)
+    for pose in (START, AISLE):
+        assert compute_clearance(scene, pose, pose) > MARGIN
     assert make_paths(scene).path(START, AISLE, 10) is None
-
-
-def test_differential_base_turns_in_place() -> None:
-    path = make_paths(make_drawer_scene(base="differential")).path(START, BESIDE, 400)
-    assert path is not None
-    steps = np.diff(np.vstack([START, path]), axis=0)
-    heading = np.vstack([START, path])[:-1, 2] + steps[:, 2] / 2
-    sideways = np.abs(np.cos(heading) * steps[:, 1] - np.sin(heading) * steps[:, 0])
-    assert sideways.max() < 5e-3, (
-        "the base turns in place, except in the step in which a turn begins"
-    )
-    assert np.median(sideways) < 1e-9
+    drive = make_drive(scene, *AISLE[:2].tolist())
+    assert list(BasePaths(drive, whole=True).make_guesses(drive, AISLE[None])) == []
 
 
 def test_other_objects_are_obstacles_in_their_state() -> None:
-    scene = load_drawer_scene()
     door = {"name": "door", "type": "door", "position": [0.0, 0.44, 0.0]}
-    both = replace_scene_fields(make_drawer_scene(), objects=[*scene.document["objects"], door])
+    objects = [*load_drawer_scene().document["objects"], door]
+    both = replace_scene_fields(make_drawer_scene(), objects=objects)
     before, after = np.array([-0.9, -0.05, 0.0]), np.array([0.8, -0.05, 0.0])
     for hinge, straight in ((0.0, False), (1.5, True)):
-        scene_with_state = both.with_state("door", {"hinge": hinge})
-        assert (compute_clearance(scene_with_state, np.array([before, after])) > MARGIN) == straight
-        path = make_paths(scene_with_state).path(before, after, 80)
+        scene = both.with_state("door", {"hinge": hinge})
+        assert (compute_clearance(scene, before, after) > MARGIN) == straight
+        path = make_paths(scene).path(before, after, 80)
         assert path is not None
         assert (np.ptp(path[:, 1]) < 1e-9) == straight
-        assert (
-            compute_clearance(scene_with_state, np.vstack([before, path]))
-            >= MARGIN - MARGIN_TOLERANCE - 0.01
-        )
+        assert compute_clearance(scene, before, path) >= CUT_MARGIN
 
 
 def test_grasped_door_is_no_obstacle() -> None:
     scene = load_door_scene()
     before, after = np.array([1.8, -0.05, 0.0]), np.array([3.3, -0.05, 0.0])
-    assert compute_clearance(scene, np.array([before, after]), without=()) < 0.0
+    assert compute_clearance(scene, before, after, without="") < 0.0
     paths = make_paths(scene, "door", hinge=1.2)
     path = paths.path(before, after, 10)
     assert path is not None
@@ -143,12 +121,7 @@ def test_grasped_door_is_no_obstacle() -> None:
     assert not paths.grid.is_pose_free(2.55, -0.5, 0.0)
 
 
-SHELF: dict[str, Any] = {
-    "name": "shelf",
-    "type": "box",
-    "size": [0.3, 1.0, 0.1],
-    "position": [-0.4, 0.65, 1.0],
-}  # over the base
+SHELF = describe_box("shelf", [0.3, 1.0, 0.1], [-0.4, 0.65, 1.0])  # over the base
 ARM_UP = np.array([-1.5, -1.57, 0.0, 0.0, 0.0, 0.0])  # the arm stretched out upwards
 
 
@@ -174,9 +147,7 @@ def test_path_avoids_collisions_of_the_arm() -> None:
     z = np.tile(problem.start, (len(path), 1))
     z[:, :3] = path
     contacts = problem.contacts.evaluate(z, np.ones(len(z), int), reach=MARGIN)
-    assert contacts.compute_violation() < 0.01 + MARGIN_TOLERANCE, (
-        "except where waypoints cut a corner"
-    )
+    assert contacts.compute_violation() < MARGIN - CUT_MARGIN
 
 
 def test_grasped_object_adds_its_shapes_to_the_base() -> None:
@@ -191,13 +162,11 @@ def test_grasped_object_adds_its_shapes_to_the_base() -> None:
 
 def test_nearest_reachable_goal_is_chosen() -> None:
     paths = make_paths(make_drawer_scene(POST))
-    blocked, free = AISLE, np.array([0.5, 1.0, 0.5])
-    path = paths.path(START, np.array([blocked, free]), 10)
+    path = paths.path(START, np.array([AISLE, BESIDE]), 10)
     assert path is not None
-    np.testing.assert_array_equal(path[-1], free)
-    near, far = np.array([-0.3, -0.7, 0.0]), np.array([1.0, -1.4, 0.0])
-    start = np.array([-0.3, 0.9, -np.pi / 2])
-    for goals in ([far, near], [near, far]):
+    np.testing.assert_array_equal(path[-1], BESIDE)  # the path to the other goal is not straight
+    near, start = np.array([-0.3, -0.7, 0.0]), np.array([-0.3, 0.9, -np.pi / 2])
+    for goals in ([AISLE, near], [near, AISLE]):
         path = paths.path(start, np.array(goals), 10)
         assert path is not None
         np.testing.assert_array_equal(path[-1, :2], near[:2])
@@ -207,17 +176,8 @@ def test_initial_guess_has_a_constant_arm() -> None:
     problem = make_drive(make_drawer_scene(POST), *AISLE[:2].tolist())
     goals = find_goal_poses(vkc.GoTo(*AISLE[:2].tolist()), 0.0)
     (guess,) = BasePaths(problem, whole=True).make_guesses(problem, goals)
-    assert guess.z.shape == (problem.segments, problem.chain.size)
     np.testing.assert_array_equal(guess.z[:, 3:], np.tile(problem.start[3:], (problem.segments, 1)))
     np.testing.assert_allclose(guess.z[-1, :2], AISLE[:2], atol=1e-12)
-    wall: dict[str, Any] = {
-        "name": "wall",
-        "type": "box",
-        "size": [0.1, 4.6, 1.0],
-        "position": [0.0, 0.0, 0.5],
-    }
-    problem = make_drive(make_drawer_scene(wall), *AISLE[:2].tolist())
-    assert list(BasePaths(problem, whole=True).make_guesses(problem, goals)) == []
 
 
 def test_path_leads_through_a_narrow_gate() -> None:
@@ -226,13 +186,9 @@ def test_path_leads_through_a_narrow_gate() -> None:
         describe_box(str(side), [0.2, 6.0, 1.5], [0.0, 0.09 + 3.365 * side, 0.75])
         for side in (1, -1)
     ]
-    narrow = make_hall(obstacles=walls).with_start(
-        arm=np.array([1.57, -2.2, 2.5, -1.9, -1.57, 0.0])
-    )  # the arm folded
-    paths, goal = (
-        BasePaths(make_drive(narrow, 1.5, 0.5, 0.0), whole=True),
-        np.array([1.5, 0.5, 0.0]),
-    )
+    narrow = make_hall(obstacles=walls).with_start(arm=[1.57, -2.2, 2.5, -1.9, -1.57, 0.0])
+    paths = BasePaths(make_drive(narrow, 1.5, 0.5, 0.0), whole=True)
+    goal = np.array([1.5, 0.5, 0.0])
     assert shortest_path(paths.grid, START.tolist(), goal[None]) is None
     path = paths.path(START, goal, 80)
     assert path is not None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import pytest
 from helpers.drawers import (
@@ -12,7 +10,6 @@ from helpers.drawers import (
     compute_handle_pose,
     compute_pose_error,
     compute_spare_clearance,
-    load_drawer_scene,
     make_grasping_scene,
 )
 from helpers.small_problems import make_program
@@ -32,27 +29,32 @@ class Pulling:
     def __init__(self, bottom: float, *, waypoint: int = HALF) -> None:
         scene = make_grasping_scene(attachment="handle_free")
         self.scene = add_boxes(scene, lamp=([0.3, 0.3, 0.1], [1.44, 0.0, bottom + 0.05]))
-        self.problem = make_program(
-            self.scene, [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT
-        )
+        pull = vkc.Actuate("drawer", {"slide": 0.3})
+        self.problem = make_program(self.scene, [pull], options=SHORT)
         self.sampler = KeyframeSampler(self.problem, np.random.default_rng(0))
-        arm = ArmKinematics(self.problem, self.sampler)
-        self.columns, self.waypoint = arm.columns, waypoint
-        self.z, closed = arm.solve(self.sampler.object_motion[waypoint - 1], waypoint)
+        self.arm, self.waypoint = ArmKinematics(self.problem, self.sampler), waypoint
+        self.z, closed = self.arm.solve(self.sampler.object_motion[waypoint - 1], waypoint)
         assert closed
 
     def refine_configuration(
         self, z: np.ndarray | None = None, wanted: np.ndarray | None = None
     ) -> tuple[np.ndarray, bool]:
-        start, near = self.z if z is None else z, self.z if wanted is None else wanted
         return refine_configuration(
             self.problem,
             self.sampler,
-            start,
-            wanted=near,
+            self.z if z is None else z,
+            wanted=self.z if wanted is None else wanted,
             waypoint=self.waypoint,
-            columns=self.columns,
+            columns=self.arm.columns,
         )
+
+    def refine_freely(self, z: np.ndarray | None = None, **wanted: np.ndarray) -> np.ndarray:
+        """Return the refined configuration, which is closed and collision-free."""
+        found, closed = self.refine_configuration(z, **wanted)
+        assert closed
+        assert self.compute_error(found) < np.sqrt(3.0) * TOLERANCE
+        assert self.compute_clearance(found) >= -CLEAR - ROUNDING
+        return found
 
     def compute_clearance(self, z: np.ndarray) -> float:
         return compute_spare_clearance(self.scene, z, slide=z[SLIDE], held=True)
@@ -61,59 +63,39 @@ class Pulling:
         return compute_pose_error(self.scene, z, compute_handle_pose(z[SLIDE], tilt=z[TILT]))
 
 
-@cache
-def make_low_lamp() -> Pulling:
-    return Pulling(0.92)
-
-
 @pytest.mark.parametrize("bottom", [0.96, 0.92, 0.9])
 def test_refined_configuration_is_collision_free(bottom: float) -> None:
     pulling = Pulling(bottom)
     before = pulling.z.copy()
     assert pulling.compute_clearance(before) < -5e-3
-    z, closed = pulling.refine_configuration()
-    assert closed
-    assert pulling.compute_clearance(z) >= -CLEAR - ROUNDING
-    assert pulling.compute_error(z) < np.sqrt(3.0) * TOLERANCE
+    z = pulling.refine_freely()
     np.testing.assert_array_equal(z[:3], before[:3])
     np.testing.assert_array_equal(pulling.z, before)
-    assert np.all(
-        (z >= pulling.problem.lower[HALF - 1] - ROUNDING)
-        & (z <= pulling.problem.upper[HALF - 1] + ROUNDING)
-    )
-    assert z[SLIDE] != before[SLIDE], "the drawer moves as well"
-    assert abs(z[SLIDE] - before[SLIDE]) < 0.02
+    lower, upper = pulling.problem.lower[HALF - 1], pulling.problem.upper[HALF - 1]
+    assert np.all((z >= lower - ROUNDING) & (z <= upper + ROUNDING))
+    assert 0.0 < abs(z[SLIDE] - before[SLIDE]) < 0.02, "the drawer moves as well"
 
 
 def test_result_is_near_the_wanted_configuration() -> None:
     pulling = Pulling(0.96)
-    near, _ = pulling.refine_configuration()
     wanted = pulling.z.copy()
     wanted[TILT] += 0.5
-    tilted, closed = pulling.refine_configuration(wanted=wanted)
-    assert closed
-    assert pulling.compute_clearance(tilted) >= -CLEAR - ROUNDING
+    tilted, near = pulling.refine_freely(wanted=wanted), pulling.refine_freely()
     assert tilted[TILT] > near[TILT] + 0.05
 
 
 def test_goal_of_the_object_is_kept() -> None:
     pulling = Pulling(0.92, waypoint=8)
     assert pulling.compute_clearance(pulling.z) < 0.0
-    z, closed = pulling.refine_configuration()
-    assert closed
-    assert pulling.compute_clearance(z) >= -CLEAR - ROUNDING
-    assert z[SLIDE] == pytest.approx(0.3, abs=ROUNDING)
+    assert pulling.refine_freely()[SLIDE] == pytest.approx(0.3, abs=ROUNDING)
 
 
 def test_open_chain_is_closed() -> None:
-    pulling = make_low_lamp()
+    pulling = Pulling(0.92)
     start = pulling.z.copy()
     start[3:9] += np.random.default_rng(0).normal(0.0, 0.05, 6)
     assert pulling.compute_error(start) > 0.01
-    z, closed = pulling.refine_configuration(start)
-    assert closed
-    assert pulling.compute_error(z) < np.sqrt(3.0) * TOLERANCE
-    assert pulling.compute_clearance(z) >= -CLEAR - ROUNDING
+    pulling.refine_freely(start)
 
 
 def test_penetration_does_not_grow_without_free_space() -> None:
@@ -126,20 +108,10 @@ def test_penetration_does_not_grow_without_free_space() -> None:
 
 
 def test_base_out_of_reach_leaves_the_chain_open() -> None:
-    pulling = make_low_lamp()
+    pulling = Pulling(0.92)
     away = pulling.z.copy()
     away[0] -= 1.5
     z, closed = pulling.refine_configuration(away, away)
     assert not closed
     assert np.isfinite(z).all()
     np.testing.assert_array_equal(z[:3], away[:3])
-
-
-def test_waypoints_without_closure_are_unchanged() -> None:
-    problem = make_program(load_drawer_scene(), [vkc.Grasp("drawer")])
-    sampler = KeyframeSampler(problem, np.random.default_rng(0))
-    z, closed = refine_configuration(
-        problem, sampler, problem.start, wanted=problem.start, waypoint=1, columns=np.arange(3, 9)
-    )
-    assert closed
-    np.testing.assert_array_equal(z, problem.start)

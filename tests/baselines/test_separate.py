@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from helpers.drawers import (
     make_grasping_scene,
     replace_scene_fields,
 )
+from helpers.judging import get_violation_names
 from helpers.small_problems import load_door_scene
 
 import vkc_pin as vkc
@@ -34,6 +36,7 @@ from vkc_pin.planning.plan import STAGES
 ROOT = Path(__file__).resolve().parents[2]
 PULL = vkc.Actuate("drawer", {"slide": 0.3})
 OPTIONS = vkc.Options(reach_waypoints=20, move_waypoints=15)
+DRIVE_AND_REACH = ["go to", "reach drawer.handle"]
 
 
 @cache
@@ -67,41 +70,36 @@ def limit_search(
     monkeypatch.setattr(attempt, "_STANDS", base_poses)
 
 
-def plan_failure(scene: vkc.Scene, **arguments: Any) -> vkc.Plan:
+def plan_failure(
+    scene: vkc.Scene, status: str, phases: Sequence[str], **arguments: Any
+) -> vkc.Plan:
+    """Plan to pull the drawer; check the cause of the failure and the phases before it."""
     plan = plan_separately(scene, [PULL], **{"options": OPTIONS, "retries": 1, **arguments})
-    assert not plan.success
+    assert (plan.success, plan.status, list_phase_names(plan)) == (False, status, [*phases])
     assert plan.report.violations
-    assert f"FAILED, {plan.status}" in plan.summary()
+    assert f"FAILED, {status}" in plan.summary()
     return plan
 
 
+def list_phase_names(plan: vkc.Plan) -> list[str]:
+    return [phase.name for phase in plan.trajectory.phases]
+
+
 @pytest.mark.parametrize("method", BASELINES)
-@pytest.mark.parametrize("task", PLANS)
-def test_both_methods_succeed_in_open_space(task: str, method: str) -> None:
+@pytest.mark.parametrize(
+    ("task", "name", "goal"), [("drawer", "drawer.slide", 0.3), ("door", "door.hinge", 0.3)]
+)
+def test_both_methods_succeed_in_open_space(task: str, name: str, goal: float, method: str) -> None:
     plan = PLANS[task](method)
     assert plan.success, plan.summary()
-    assert plan.status == "success"
-    report = vkc.validate(plan.scene, plan.steps, plan.trajectory, plan.options)
-    assert report.ok, report.lines()
-    assert report.clearance == plan.report.clearance > 0.0
-    np.testing.assert_allclose(plan.trajectory.positions[0, :9], plan.scene.start, atol=1e-9)
-    name, goal = {"drawer": ("drawer.slide", 0.3), "door": ("door.hinge", 0.3)}[task]
+    assert plan.report.clearance > 0.0
     assert plan.trajectory.column(name)[-1] == pytest.approx(goal, abs=1e-3)
     assert plan.initialization == f"{method}, try 1"
-
-
-@pytest.mark.parametrize("task", PLANS)
-def test_metrics_agree_with_trajectory_and_report(task: str) -> None:
-    plan = PLANS[task]("B1")
-    metrics, motion = plan.metrics, plan.trajectory
-    assert metrics["duration"] == motion.times[-1]
-    assert metrics["clearance"] == plan.report.clearance
-    assert metrics["closure_error"] == plan.report.closure_error
+    metrics = plan.metrics
     assert metrics["rounds"] == 1.0
     assert metrics["iterations"] > 0.0
     stage_times = sum(metrics[f"time_{stage}"] for stage in (*STAGES, "following"))
     assert 0.0 < stage_times <= metrics["planning_time"]
-    assert metrics["build_time"] >= 0.0
 
 
 @pytest.mark.parametrize("method", BASELINES)
@@ -113,42 +111,25 @@ def test_base_and_arm_move_one_after_the_other(task: str, method: str) -> None:
     assert reach.name == f"reach {task}.handle"
     assert [dict(phase.held) for phase in holds] == [{task: "handle"}] * len(holds)
     assert len(holds) == {"drawer": 1, "door": 2}[task]  # the door's knob is turned first
-    np.testing.assert_array_equal(
-        get_rows(plan, 0)[:, 3:], np.tile(plan.scene.start[3:], (len(get_rows(plan, 0)), 1))
-    )
-    np.testing.assert_array_equal(
-        get_rows(plan, 1)[:, :3], np.tile(get_rows(plan, 0)[-1, :3], (len(get_rows(plan, 1)), 1))
-    )
-    assert np.ptp(get_rows(plan, 0)[:, 0]) > 0.3
-    assert np.ptp(get_rows(plan, 1)[:, 3:], axis=0).max() > 0.3
+    driven, reached = get_rows(plan, 0), get_rows(plan, 1)
+    assert np.ptp(driven[:, 3:], axis=0).max() == np.ptp(reached[:, :3], axis=0).max() == 0.0
+    assert np.ptp(driven[:, 0]) > 0.3
+    assert np.ptp(reached[:, 3:], axis=0).max() > 0.3
     if task == "door":
         assert np.ptp(get_rows(plan, 2)[:, :3], axis=0).max() < 1e-5, (
             "the base stands still while the latch is released"
         )
         assert np.ptp(plan.trajectory.column("door.knob")[holds[0].first : holds[0].last]) > 0.3
-    # The object's joints move to their goals in finer steps.
+    # The object's joints move in finer steps, perhaps after the wait for the gripper.
     moved = holds[-1].last - holds[-1].first
-    assert moved in (
-        FINER * plan.options.move_waypoints,
-        FINER * plan.options.move_waypoints + 1,
-    )  # plus the wait for the gripper
+    assert moved - FINER * plan.options.move_waypoints in (0, 1)
 
 
 def test_b1_follows_the_time_law_of_the_object() -> None:
     plan = open_drawer("B1")
-    span = plan.trajectory.phases[-1]
-    slide = plan.trajectory.column("drawer.slide")[span.first : span.last + 1]
     share = np.linspace(0.0, 1.0, FINER * plan.options.move_waypoints + 1)
-    np.testing.assert_allclose(slide[-len(share) :], 0.3 * (3 * share**2 - 2 * share**3), atol=2e-6)
-    for row in plan.trajectory.positions[span.first : span.last + 1 : 7]:
-        assert (
-            compute_pose_error(
-                plan.scene,
-                row,
-                compute_handle_pose(row[plan.trajectory.names.index("drawer.slide")]),
-            )
-            < 1e-3
-        )
+    slide = plan.trajectory.column("drawer.slide")[-len(share) :]
+    np.testing.assert_allclose(slide, 0.3 * (3 * share**2 - 2 * share**3), atol=2e-6)
 
 
 def test_differential_base_does_not_slip_sideways() -> None:
@@ -188,44 +169,34 @@ def test_result_is_reproducible_in_another_process() -> None:
 @pytest.mark.parametrize("method", BASELINES)
 def test_narrow_aisle_has_no_base_pose(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     limit_search(monkeypatch)
-    plan = plan_failure(
-        add_boxes(load_drawer_scene(), counter_2=([0.9, 4.4, 1.2], [1.0, 0.0, 0.6])), method=method
-    )
-    assert plan.status == "no base pose"
-    assert [phase.name for phase in plan.trajectory.phases] == ["stand"]
+    scene = add_boxes(load_drawer_scene(), counter_2=([0.9, 4.4, 1.2], [1.0, 0.0, 0.6]))
+    plan = plan_failure(scene, "no base pose", ["stand"], method=method)
     assert np.ptp(plan.trajectory.positions, axis=0).max() == 0.0, "the robot stays at its start"
-    assert [(v.constraint, v.subject) for v in plan.report.violations] == [("goal", "drawer.slide")]
+    assert get_violation_names(plan.report) == {("goal", "drawer.slide")}
 
 
 def test_open_drawer_has_no_base_pose(monkeypatch: pytest.MonkeyPatch) -> None:
     limit_search(monkeypatch)
-    plan = plan_failure(add_boxes(make_drawer_scene(), post=([0.05, 0.05, 1.0], [1.65, 0.25, 0.5])))
-    assert plan.status == "no base pose"
-    assert [phase.name for phase in plan.trajectory.phases] == ["go to", "reach drawer.handle"]
+    scene = add_boxes(make_drawer_scene(), post=([0.05, 0.05, 1.0], [1.65, 0.25, 0.5]))
+    plan = plan_failure(scene, "no base pose", DRIVE_AND_REACH)
     last = plan.trajectory.positions[-1]
     assert compute_pose_error(plan.scene, last, compute_handle_pose()) < 1e-3
-    kinds = {v.constraint for v in plan.report.violations}
-    assert "goal" in kinds
     # Only a grasp exempts the hand from its clearance to the tray.
-    assert all(
-        v.subject.endswith("drawer.tray")
-        for v in plan.report.violations
-        if v.constraint == "clearance"
-    )
-    assert kinds <= {"goal", "clearance"}
+    goal, *others = sorted(get_violation_names(plan.report), reverse=True)
+    assert goal[0] == "goal"
+    assert all(name == "clearance" and pair.endswith("drawer.tray") for name, pair in others)
 
 
 def test_arm_does_not_reach_between_two_shelves(monkeypatch: pytest.MonkeyPatch) -> None:
     """The solver finds no path between two shelves."""
     limit_search(monkeypatch)
     shelves = {
-        name: ([0.1, 0.8, 0.02], [1.6, 0.0, 0.755 + z])
-        for name, z in (("above", 0.15), ("below", -0.15))
+        name: ([0.1, 0.8, 0.02], [1.6, 0.0, z]) for name, z in (("above", 0.905), ("below", 0.605))
     }
     options = dataclasses.replace(OPTIONS, max_restarts=1, max_iterations=20)
-    plan = plan_failure(add_boxes(make_drawer_scene(), **shelves), options=options)
-    assert plan.status == "arm does not reach"
-    assert [phase.name for phase in plan.trajectory.phases][-2:] == ["go to", "reach drawer.handle"]
+    scene = add_boxes(make_drawer_scene(), **shelves)
+    phases = ["go to", *DRIVE_AND_REACH]
+    plan = plan_failure(scene, "arm does not reach", phases, options=options)
     assert {"goal", "clearance"} & {v.constraint for v in plan.report.violations}
 
 
@@ -259,8 +230,13 @@ def test_failed_attempts_are_followed_by_others(
     assert vkc.validate(scene, task.steps, plan.trajectory, plan.options).ok
 
 
-@pytest.mark.parametrize("stage", ["solve", "follow", "find_base_poses"])
-def test_ctrl_c_interrupts_each_stage(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("stage", "phases"),
+    [("solve", ["stand"]), ("follow", DRIVE_AND_REACH), ("find_base_poses", ["stand"])],
+)
+def test_ctrl_c_interrupts_each_stage(
+    stage: str, phases: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     calls, original = [], getattr(attempt, stage)
 
     def press_ctrl_c(*arguments: Any, **keywords: Any) -> Any:
@@ -269,109 +245,82 @@ def test_ctrl_c_interrupts_each_stage(stage: str, monkeypatch: pytest.MonkeyPatc
         return original(*arguments, **keywords)
 
     monkeypatch.setattr(attempt, stage, press_ctrl_c)
-    plan = plan_failure(make_drawer_scene(), retries=3)
-    assert plan.status == "interrupted"
+    plan_failure(make_drawer_scene(), "interrupted", phases, retries=3)
     assert calls == [stage]
-    phases = {
-        "solve": ["stand"],
-        "find_base_poses": ["stand"],
-        "follow": ["go to", "reach drawer.handle"],
-    }[stage]
-    assert [phase.name for phase in plan.trajectory.phases] == phases
 
 
-MISUSES: dict[str, tuple[dict[str, Any], str, str]] = {
-    "unknown method": ({"method": "B3"}, "method", "B1"),
-    "method in small letters": ({"method": "b2"}, "method", "did you mean 'B2'"),
-    "no tries": ({"retries": 0}, "retries", "at least 1"),
-    "half a try": ({"retries": 1.5}, "retries", "1.5"),
-    "another step": (
-        {"steps": [PULL, vkc.Release()]},
-        "steps[1]",
-        "expected Actuate, Place, GoTo or Reach",
-    ),
-    "a grasp": (
-        {"steps": [vkc.Grasp("drawer")]},
-        "steps[0]",
-        "expected Actuate, Place, GoTo or Reach",
-    ),
-    "no steps": ({"steps": []}, "steps", "at least one step"),
-    "one step alone": ({"steps": PULL}, "steps", "a list of steps"),
-    "unknown object": (
-        {"steps": [vkc.Actuate("drawr", {"slide": 0.3})]},
-        "steps[0].object",
-        "did you mean 'drawer'",
-    ),
-    "unknown joint": (
-        {"steps": [PULL, vkc.Actuate("drawer", {"slid": 0.1})]},
-        "steps[1].joints",
-        "did you mean 'slide'",
-    ),
-    "unknown attachment": (
-        {"steps": [vkc.Actuate("drawer", {"slide": 0.3}, "handel")]},
-        "steps[0].attachment",
-        "did you mean 'handle'",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", MISUSES.values(), ids=MISUSES)
-def test_invalid_arguments_are_refused(case: tuple[dict[str, Any], str, str]) -> None:
-    arguments, field, text = case
-    call: dict[str, Any] = {"steps": [PULL], **arguments}
+@pytest.mark.parametrize(
+    ("arguments", "field", "text"),
+    [
+        ({"scene": "drawer"}, "scene", "a Scene"),
+        ({"method": "b2"}, "method", "did you mean 'B2'"),
+        ({"retries": 0}, "retries", "at least 1"),
+        ({"finer": 17}, "finer", "16"),
+        ({"seed": -1}, "seed", "-1"),
+        ({"time_limit": "5"}, "time_limit", "'5'"),
+        ({"options": {"dt": 0.1}}, "options", "Options"),
+        ({"steps": []}, "steps", "at least one step"),
+        ({"steps": [PULL, vkc.Release()]}, "steps[1]", "expected Actuate, Place, GoTo or Reach"),
+        ({"steps": [vkc.Actuate("drawr", {"slide": 0.3})]}, "steps[0].object", "'drawer'"),
+    ],
+    ids=str,
+)
+def test_invalid_arguments_are_refused(arguments: dict[str, Any], field: str, text: str) -> None:
+    call: dict[str, Any] = {"scene": load_drawer_scene(), "steps": [PULL], **arguments}
     with pytest.raises(vkc.InputError) as caught:
-        plan_separately(load_drawer_scene(), call.pop("steps"), **call)
+        plan_separately(call.pop("scene"), call.pop("steps"), **call)
     assert caught.value.field == field
     assert text in str(caught.value)
 
 
-@pytest.mark.parametrize("method", ["B1", "B2"])
+@pytest.mark.parametrize("method", BASELINES)
 def test_pose_is_reached(method: str) -> None:
     steps = [vkc.Reach((1.2, 0.4, 0.9, 0.0, 1.2, 0.3))]
     plan = plan_separately(load_drawer_scene(), steps, method=method, options=OPTIONS)
-    assert plan.success
-    assert vkc.validate(plan.scene, steps, plan.trajectory, OPTIONS).ok
+    assert plan.success, plan.summary()
     assert not plan.trajectory.phases[-1].held
 
 
-def test_two_objects_are_actuated_in_turn() -> None:
+def make_two_drawers() -> vkc.Scene:
     second = {"name": "second", "type": "drawer", "position": [1.93, -1.4, 0.0]}
-    scene = replace_scene_fields(
-        make_drawer_scene(), objects=[*load_drawer_scene().document["objects"], second]
-    )
-    plan = plan_separately(scene, [PULL, vkc.Actuate("second", {"slide": 0.2})], options=OPTIONS)
+    objects = [*load_drawer_scene().document["objects"], second]
+    return replace_scene_fields(make_drawer_scene(), objects=objects)
+
+
+MOVE = "move drawer.slide"
+
+
+@pytest.mark.parametrize(
+    ("make_scene", "other", "phases"),
+    [
+        (
+            make_two_drawers,
+            vkc.Actuate("second", {"slide": 0.2}),
+            [*DRIVE_AND_REACH, MOVE, "go to", "reach second.handle", "move second.slide"],
+        ),
+        (make_drawer_scene, vkc.Actuate("drawer", {"slide": 0.15}), [*DRIVE_AND_REACH, MOVE, MOVE]),
+        (lambda: make_grasping_scene(make_drawer_scene()), None, [MOVE]),
+    ],
+    ids=["two objects", "grasped by the first step", "grasped at the start"],
+)
+def test_object_is_reached_unless_it_is_grasped(
+    make_scene: Callable[[], vkc.Scene], other: vkc.Step | None, phases: list[str]
+) -> None:
+    steps = [PULL] if other is None else [PULL, other]
+    plan = plan_separately(make_scene(), steps, options=OPTIONS)
     assert plan.success, plan.summary()
-    names = [phase.name for phase in plan.trajectory.phases]
-    first = ["go to", "reach drawer.handle", "move drawer.slide"]
-    assert names == [*first, "go to", "reach second.handle", "move second.slide"]
-
-
-def test_grasped_object_is_not_grasped_again() -> None:
-    plan = plan_separately(
-        make_drawer_scene(), [vkc.Actuate("drawer", {"slide": 0.15}), PULL], options=OPTIONS
-    )
-    assert plan.success, plan.summary()
-    names = [phase.name for phase in plan.trajectory.phases]
-    assert names == ["go to", "reach drawer.handle", "move drawer.slide", "move drawer.slide"]
-
-
-def test_object_grasped_at_the_start_is_not_reached_again() -> None:
-    plan = plan_separately(make_grasping_scene(make_drawer_scene()), [PULL], options=OPTIONS)
-    assert plan.success, plan.summary()
-    assert [phase.name for phase in plan.trajectory.phases] == ["move drawer.slide"]
+    assert list_phase_names(plan) == phases
 
 
 def test_wall_blocks_the_base_path(monkeypatch: pytest.MonkeyPatch) -> None:
     limit_search(monkeypatch, base_poses=3)
-    plan = plan_failure(add_boxes(make_drawer_scene(), wall=([0.1, 4.6, 2.4], [0.15, 0.0, 1.2])))
-    assert plan.status == "no base path"
-    assert [phase.name for phase in plan.trajectory.phases] == ["go to"]
+    scene = add_boxes(make_drawer_scene(), wall=([0.1, 4.6, 2.4], [0.15, 0.0, 1.2]))
+    plan_failure(scene, "no base path", ["go to"])
 
 
 def test_time_limit_ends_planning(monkeypatch: pytest.MonkeyPatch) -> None:
     limit_search(monkeypatch, base_poses=4)
-    plan = plan_failure(make_drawer_scene(), time_limit=1e-6, retries=5)
-    assert plan.status == "time limit"
+    plan = plan_failure(make_drawer_scene(), "time limit", ["stand"], time_limit=1e-6, retries=5)
     assert plan.metrics["rounds"] == 1.0
 
 
@@ -387,21 +336,3 @@ def test_evaluation_limit_is_reproducible() -> None:
     ]
     assert [plan.status for plan in limited] == ["evaluation limit"] * 2
     assert compute_hash(limited[0]) == compute_hash(limited[1])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "field"),
-    [
-        ({"seed": -1}, "seed"),
-        ({"time_limit": "5"}, "time_limit"),
-        ({"options": {"dt": 0.1}}, "options"),
-        ({"scene": "drawer"}, "scene"),
-        ({"retries": True}, "retries"),
-    ],
-    ids=str,
-)
-def test_arguments_are_checked_as_in_plan(arguments: dict[str, Any], field: str) -> None:
-    call = {"scene": load_drawer_scene(), **arguments}
-    with pytest.raises(vkc.InputError) as caught:
-        plan_separately(call.pop("scene"), [PULL], **{"retries": 1, **call})
-    assert caught.value.field == field

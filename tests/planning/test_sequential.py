@@ -20,8 +20,10 @@ from helpers.carrying import (
     move_base,
     solve_above,
 )
+from helpers.drawers import compute_tool_pose
+from helpers.judging import replace_object
 from helpers.litter import BIN_POSITION, LITTER_POSITION, describe_shelf, make_littered_scene
-from helpers.small_problems import make_full_scene, replace_objects
+from helpers.small_problems import make_full_scene
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.initialization import TARGET
@@ -34,105 +36,63 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import compute_final_scene
 
 
-def make_end_motion(
-    scene: Scene, base: list[float], arm: np.ndarray, **objects: float
-) -> Trajectory:
-    """Return a motion that ends with these coordinates of base, arm and object joints."""
-    names = (*scene.robot.coordinates.names, *(name.replace("__", ".") for name in objects))
-    last = [*base, *arm, *objects.values()]
-    rows = np.array([np.zeros(len(last)), last])
-    return Trajectory(
-        names, np.array([0.0, 1.0]), rows, (PhaseSpan("move", 0, 1),), len(scene.start)
-    )
-
-
-def test_final_scene_has_the_final_coordinates() -> None:
-    scene = make_full_scene().with_state("door", {"knob": 0.2})
-    arm = np.linspace(-0.5, 0.5, len(scene.start) - 3)
-    after = compute_final_scene(
-        scene, make_end_motion(scene, [0.1, -0.2, 4.0], arm, door__hinge=0.4), []
-    )
-    np.testing.assert_array_equal(after.start, [0.1, -0.2, 4.0, *arm])
-    np.testing.assert_array_equal(after.objects["door"].state, [0.4, 0.2])
-    for name in ("drawer", "cabinet"):
-        np.testing.assert_array_equal(after.objects[name].state, scene.objects[name].state)
-    assert after.holds == ()
-
-
-def test_final_coordinates_are_clamped_to_their_limits() -> None:
-    scene, excess = make_full_scene(), 1e-4
-    robot, door = scene.robot, scene.objects["door"].object
-    sleeve = scene.objects["cabinet"].object.attachment("sleeve")
-    motion = make_end_motion(
-        scene,
-        [scene.arena[1] + excess, scene.arena[2] - excess, 0.0],
-        robot.upper[3:] + excess,
-        door__hinge=door.upper[0] + excess,
-        door__knob=door.lower[1] - excess,
-        cabinet__sleeve_slide=sleeve.freedoms[0].lower - excess,
-        cabinet__sleeve_turn=sleeve.freedoms[1].upper + excess,
+def test_final_scene_has_the_final_coordinates_clamped_to_their_limits() -> None:
+    scene, excess = make_full_scene().with_state("door", {"knob": 0.2}), 1e-4
+    robot, (_, east, _, north) = scene.robot, scene.arena
+    slide, turn = scene.objects["cabinet"].object.attachment("sleeve").freedoms
+    hinge = scene.objects["door"].object.upper[0]
+    objects = {
+        "door.hinge": hinge + excess,
+        "cabinet.sleeve_slide": slide.lower - excess,
+        "cabinet.sleeve_turn": turn.upper + excess,
+    }
+    base = [east + excess, north - 1.0, 4.0]
+    last = [*base, *(robot.upper[3:] + excess), *objects.values()]
+    motion = Trajectory(
+        (*robot.coordinates.names, *objects),
+        np.array([0.0, 1.0]),
+        np.array([np.zeros(len(last)), last]),
+        (PhaseSpan("move", 0, 1),),
+        len(scene.start),
     )
     after = compute_final_scene(scene, motion, [Hold("cabinet", "sleeve")])
-    np.testing.assert_array_equal(
-        after.start, [scene.arena[1], scene.arena[2], 0.0, *robot.upper[3:]]
-    )
-    np.testing.assert_array_equal(after.objects["door"].state, [door.upper[0], door.lower[1]])
+    np.testing.assert_array_equal(after.start, [east, north - 1.0, 4.0, *robot.upper[3:]])
+    np.testing.assert_array_equal(after.objects["door"].state, [hinge, 0.2])
+    for name in ("drawer", "cabinet"):
+        np.testing.assert_array_equal(after.objects[name].state, scene.objects[name].state)
     (hold,) = after.holds
-    assert (hold, hold.at) == (
-        Hold("cabinet", "sleeve"),
-        (sleeve.freedoms[0].lower, sleeve.freedoms[1].upper),
-    )
+    assert (hold, hold.at) == (Hold("cabinet", "sleeve"), (slide.lower, turn.upper))
 
 
 def test_final_placement_of_a_grasped_object() -> None:
     scene, values = make_room(describe_table()), (0.03, 0.2)
     down = solve_above(STICK, values=values)
-    script = (
-        MotionBuilder(scene)
-        .go(down)
-        .take("stick", values=values)
-        .go(move_base(down, x=-0.4, yaw=0.5))
-    )
-    after = compute_final_scene(scene, script.motion(), [Hold("stick", "grip")])
+    script = MotionBuilder(scene).go(down).take("stick", values=values)
+    motion = script.go(move_base(down, x=-0.4, yaw=0.5)).motion()
+    after = compute_final_scene(scene, motion, [Hold("stick", "grip")])
     assert [(hold, hold.at) for hold in after.holds] == [(Hold("stick", "grip"), values)]
-    data = scene.robot.model.createData()
-    pin.framesForwardKinematics(scene.robot.model, data, scene.robot.coordinates.q(script.rows[-1]))
-    tool = data.oMf[scene.robot.model.getFrameId(scene.robot.tool_frame)]
-    placed = after.objects["stick"].placement
-    np.testing.assert_allclose(
-        compute_grasp_pose(placed, values=values).homogeneous, tool.homogeneous, atol=1e-9
-    )
+    tool = compute_tool_pose(scene, script.rows[-1])
+    placed = compute_grasp_pose(after.objects["stick"].placement, values=values)
+    np.testing.assert_allclose(placed.homogeneous, tool.homogeneous, atol=1e-9)
 
 
 def test_final_placement_of_a_released_object() -> None:
     scene = make_room(describe_table())
-    script = make_carrying_motion(scene, values=(0.03, 0.2))
-    after = compute_final_scene(scene, script.motion(), [])
+    after = compute_final_scene(scene, make_carrying_motion(scene).motion(), [])
     assert dict(after.held) == {}
-    np.testing.assert_allclose(
-        after.objects["stick"].placement.homogeneous,
-        lift(STICK, [0.0, 0.5, 0.0]).homogeneous,
-        atol=1e-9,
-    )
-    assert (
-        Scene.from_document(after.document)
-        .objects["stick"]
-        .placement.isApprox(after.objects["stick"].placement, 1e-9)
-    )
+    placed = Scene.from_document(after.document).objects["stick"].placement
+    assert placed.isApprox(lift(STICK, [0.0, 0.5, 0.0]), 1e-9)
 
 
 def test_final_holds_by_a_tool() -> None:
     scene = make_room(describe_table(), objects=("stick", "ball")).with_held({"stick": "grip"})
     turns = scene.objects["ball"].object.attachment("pull").freedoms
     values = [0.5 * (turn.lower + turn.upper) for turn in turns]
-    script = (
-        MotionBuilder(scene)
-        .take("ball", "pull", values, by="stick.tip")
-        .go(move_base(scene.start, y=0.3))
-    )
+    script = MotionBuilder(scene).take("ball", "pull", values, by="stick.tip")
+    motion = script.go(move_base(scene.start, y=0.3)).motion()
     stick = Hold("stick", "grip")
     holds = (stick, Hold("ball", "pull", stick, "tip"))
-    after = compute_final_scene(scene, script.motion(), holds)
+    after = compute_final_scene(scene, motion, holds)
     assert after.holds == holds
     assert after.holds[1].at == tuple(values)
 
@@ -203,28 +163,17 @@ PLANNERS = [
 
 def add_attachment(scene: Scene, owner: str, name: str, z: float, *, depth: float = 0.0) -> Scene:
     """Return the scene with another first attachment, higher by `z` and deeper by `depth`."""
-    placed = scene.objects[owner]
-    grip = placed.object.attachment()
+    item = scene.objects[owner].object
+    grip = item.attachment()
     rotation, position = grip.placement.rotation, grip.placement.translation
     lifted = pin.SE3(rotation, position + [0.0, 0.0, z] + depth * rotation[:, 2])
-    attachments = {
-        name: dataclasses.replace(grip, name=name, placement=lifted),
-        **placed.object.attachments,
-    }
-    return replace_objects(
-        scene,
-        {
-            owner: dataclasses.replace(
-                placed, object=dataclasses.replace(placed.object, attachments=attachments)
-            )
-        },
-    )
+    added = dataclasses.replace(grip, name=name, placement=lifted)
+    return replace_object(scene, owner, attachments={name: added, **item.attachments})
 
 
 def make_refrigerator() -> Scene:
-    return make_hall(
-        "husky_ur5e", "refrigerator_0", load_description("refrigerator_0")
-    ).sample_start(np.random.default_rng(0))
+    hall = make_hall("husky_ur5e", "refrigerator_0", load_description("refrigerator_0"))
+    return hall.sample_start(np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
@@ -264,19 +213,9 @@ def test_attachments_share_the_budget(planner: Callable[..., vkc.Plan]) -> None:
 
 def test_failed_attachments_are_noted() -> None:
     scene = add_attachment(vkc.load_scene("drawer"), "drawer", "ceiling", 4.0)
-    drawer = scene.objects["drawer"]
-    attachments = {
-        name: one for name, one in drawer.object.attachments.items() if name == "ceiling"
-    }
-    attachments["roof"] = dataclasses.replace(attachments["ceiling"], name="roof")
-    scene = replace_objects(
-        scene,
-        {
-            "drawer": dataclasses.replace(
-                drawer, object=dataclasses.replace(drawer.object, attachments=attachments)
-            )
-        },
-    )
+    ceiling = scene.objects["drawer"].object.attachments["ceiling"]
+    roof = dataclasses.replace(ceiling, name="roof")
+    scene = replace_object(scene, "drawer", attachments={"ceiling": ceiling, "roof": roof})
     result = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.2})])
     assert result.status == "infeasible"
     assert result.steps == (vkc.Actuate("drawer", {"slide": 0.2}),)
@@ -319,34 +258,21 @@ def test_two_leaves_are_opened_in_one_problem() -> None:
     result = vkc.plan(make_refrigerator(), steps)
     assert result.success, result.summary()
     assert result.initialization.endswith("then all at once")
-    assert [phase.held for phase in result.trajectory.phases] == [
-        {},
-        {"it": "handle_left"},
-        {},
-        {"it": "handle_right"},
-    ]
-    ends = dict(zip(result.trajectory.names, result.trajectory.positions[-1], strict=True))
-    assert (ends["it.hinge_left"], ends["it.hinge_right"]) == (
-        pytest.approx(0.6, abs=1e-3),
-        pytest.approx(0.5, abs=1e-3),
-    )
-    assert result.end_scene().held == {"it": "handle_right"}
+    held = [dict(phase.held) for phase in result.trajectory.phases]
+    assert held == [{}, {"it": "handle_left"}, {}, {"it": "handle_right"}]
+    after = result.end_scene()
+    assert after.objects["it"].state == pytest.approx([0.6, 0.5], abs=1e-3)
+    assert after.held == held[-1]
 
 
 @pytest.mark.long
 def test_holds_of_the_same_joint_are_planned_sequentially() -> None:
-    first, second = (
-        vkc.Actuate("it", {"hinge_left": value}, name)
-        for value, name in ((0.3, "handle_left"), (0.6, "handle_left_free"))
-    )
+    first = vkc.Actuate("it", {"hinge_left": 0.3}, "handle_left")
+    second = vkc.Actuate("it", {"hinge_left": 0.6}, "handle_left_free")
     both = vkc.plan(make_refrigerator(), [first, second])
     assert both.success, both.summary()
-    assert [phase.held for phase in both.trajectory.phases] == [
-        {},
-        {"it": "handle_left"},
-        {},
-        {"it": "handle_left_free"},
-    ]
+    held = [dict(phase.held) for phase in both.trajectory.phases]
+    assert held == [{}, {"it": "handle_left"}, {}, {"it": "handle_left_free"}]
     begun = vkc.plan(make_refrigerator(), [first])
     ended = vkc.plan(begun.end_scene(), [second])
     assert ended.success, ended.summary()

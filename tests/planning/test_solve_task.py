@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.carrying import describe_box
 from helpers.drawers import SHORT, load_drawer_scene
 from helpers.drives import make_hall
 from helpers.gates import make_gate_problem
-from helpers.small_problems import load_door_scene, make_program
+from helpers.small_problems import load_door_scene
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.problems.problem_set import problem as make_random_problem
@@ -22,6 +23,7 @@ from vkc_pin.utils.cache import Cache
 from vkc_pin.world.task.compiler import compile_task
 
 PULL = [vkc.Actuate("drawer", {"slide": 0.3})]
+OPEN = [vkc.Actuate("door", {"hinge": 1.2})]
 
 
 @pytest.mark.parametrize(("number", "seed"), [(35, 9035)])
@@ -78,34 +80,38 @@ def test_drafts_of_infeasible_tasks_are_not_solved() -> None:
     assert not result.plan.report.ok
 
 
-def test_waypoints_of_too_coarse_phases_are_doubled() -> None:
+@pytest.mark.parametrize("max_refinements", [None, 0])
+def test_waypoints_of_too_coarse_phases_are_doubled_unless_fixed(
+    max_refinements: int | None,
+) -> None:
     """On five segments of a door's arc the hand drifts by 3 mm from the handle."""
-    scene, options = load_door_scene(), vkc.Options(move_waypoints=5)
+    is_fixed = max_refinements is not None
+    limits = {"max_refinements": 0, "max_restarts": 1} if is_fixed else {}
+    scene, options = load_door_scene(), vkc.Options(move_waypoints=5, **limits)
     task = compile_task(scene, [vkc.Actuate("door", {"hinge": 1.3}, "handle")], options)
     result = solve_task(scene, task, PlanningRequest("interpolated", options, random_seed=1))
+    assert result.problem is not None
+    if is_fixed:
+        assert result.problem.task.phases == task.phases
+        assert result.plan.status == "rejected"
+        assert {found.constraint for found in result.plan.report.violations} == {"closure"}
+        return
     assert result.plan.success, result.plan.summary()
     assert result.plan.initialization == "interpolated", "the name is that of the first guess"
-    assert result.problem is not None
-    segments = [phase.segments for phase in result.problem.task.phases]
-    before = [phase.segments for phase in task.phases]
-    assert segments == [*before[:-1], 10]
+    *before, _ = (phase.segments for phase in task.phases)
+    assert [phase.segments for phase in result.problem.task.phases] == [*before, 10]
     assert result.phase_waypoints().phases == tuple(phase.key for phase in task.phases)
-
-
-def test_numbers_of_waypoints_can_be_fixed() -> None:
-    options = vkc.Options(move_waypoints=5, max_refinements=0, max_restarts=1)
-    scene = load_door_scene()
-    task = compile_task(scene, [vkc.Actuate("door", {"hinge": 1.3}, "handle")], options)
-    result = solve_task(scene, task, PlanningRequest("interpolated", options, random_seed=1))
-    assert result.problem is not None
-    assert result.problem.task.phases == task.phases
-    assert result.plan.status == "rejected"
-    assert {found.constraint for found in result.plan.report.violations} == {"closure"}
 
 
 def test_infeasible_solution_with_the_least_shortfall_is_returned() -> None:
     """A wall spans the hall."""
-    wall = {"name": "wall", "type": "box", "size": [0.6, 12.0, 2.0], "position": [2.0, 0.0, 1.0]}
+
+    def make_straight_guess(problem: vkc.TrajectoryProblem) -> InitialGuess:
+        z = np.tile(problem.start, (problem.segments, 1))
+        z[:, 0] = np.linspace(0.0, 4.0, problem.segments + 1)[1:]
+        return InitialGuess("straight", z)
+
+    wall = describe_box("wall", [0.6, 12.0, 2.0], [2.0, 0.0, 1.0])
     scene, options = make_hall(obstacles=[wall]), vkc.Options(max_restarts=1)
     task = compile_task(scene, [vkc.GoTo(4.0, 0.0)], options)
     request = PlanningRequest("interpolated", options)
@@ -116,34 +122,24 @@ def test_infeasible_solution_with_the_least_shortfall_is_returned() -> None:
     assert plan.trajectory.positions[-1, 0] == pytest.approx(4.0, abs=0.1)
 
 
-def make_straight_guess(problem: vkc.TrajectoryProblem) -> InitialGuess:
-    z = np.tile(problem.start, (problem.segments, 1))
-    z[:, 0] = np.linspace(0.0, 4.0, problem.segments + 1)[1:]
-    return InitialGuess("straight", z)
-
-
-def test_budget_may_end_before_the_first_guess() -> None:
-    timed_out, exhausted = "time limit", "evaluation limit"
-    budgets: list[tuple[dict[str, Any], str]] = [
-        ({"time_limit": 1e-3}, timed_out),
-        ({"max_evaluations": 1}, exhausted),
-        ({"max_evaluations": 3000}, exhausted),
-    ]
-    for budget, status in budgets:
-        plan = vkc.plan(
-            load_door_scene(),
-            [vkc.Actuate("door", {"hinge": 1.2})],
-            planner=vkc.Planner(),
-            **budget,
-        )
-        assert (plan.status, plan.initialization, plan.metrics["rounds"]) == (status, "none", 0)
-        assert plan.report.violations
-        assert np.ptp(plan.trajectory.positions, axis=0).max() == 0.0
-        assert np.isfinite(plan.metrics["duration"])
+@pytest.mark.parametrize(
+    ("budget", "status"),
+    [
+        ({"time_limit": 1e-3}, "time limit"),
+        ({"max_evaluations": 1}, "evaluation limit"),
+        ({"max_evaluations": 3000}, "evaluation limit"),
+    ],
+)
+def test_budget_may_end_before_the_first_guess(budget: dict[str, Any], status: str) -> None:
+    plan = vkc.plan(load_door_scene(), OPEN, planner=vkc.Planner(), **budget)
+    assert (plan.status, plan.initialization, plan.metrics["rounds"]) == (status, "none", 0)
+    assert plan.report.violations
+    assert np.ptp(plan.trajectory.positions, axis=0).max() == 0.0
+    assert np.isfinite(plan.metrics["duration"])
 
 
 def test_sufficient_budget_changes_nothing() -> None:
-    scene, steps = load_door_scene(), [vkc.Actuate("door", {"hinge": 1.2})]
+    scene, steps = load_door_scene(), OPEN
     whole = vkc.plan(scene, steps, planner=vkc.Planner())
     assert whole.success
     used = int(whole.metrics["evaluations"])
@@ -157,23 +153,6 @@ def test_sufficient_budget_changes_nothing() -> None:
     ]
     assert [plan.status for plan in short] == ["evaluation limit"] * 2
     np.testing.assert_array_equal(short[0].trajectory.positions, short[1].trajectory.positions)
-
-
-def test_control_effort_of_a_turn() -> None:
-    """Σ w δ² + w_acc δδ²/dt² of a turn on the spot."""
-    options = dataclasses.replace(
-        vkc.Options.paper(),
-        reach_waypoints=SHORT.reach_waypoints,
-        velocity_weight_heading=0.7,
-        dt=0.5,
-    )
-    problem = make_program(make_hall(), [vkc.GoTo(0.0, 0.0, 1.0)], options=options)
-    z = np.tile(problem.start, (problem.segments, 1))
-    z[:, 2] = np.linspace(0.0, 1.0, problem.segments + 1)[1:] ** 2
-    first = np.diff(np.concatenate([[0.0], z[:, 2]]))
-    second = np.diff(np.concatenate([[0.0], first, [0.0]]))
-    expected = 0.7 * (np.sum(first**2) + options.acceleration_weight * np.sum(second**2) / 0.5**2)
-    assert problem.objective(z, problem.timing_for(z).dt) == pytest.approx(expected, rel=1e-9)
 
 
 def test_cache_is_trimmed_after_each_task() -> None:

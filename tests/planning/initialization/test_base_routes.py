@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from functools import cache
+import dataclasses
+import functools
+import itertools
 
 import numpy as np
 import pinocchio as pin
@@ -13,7 +15,6 @@ from helpers.small_problems import make_program
 import vkc_pin as vkc
 from vkc_pin.planning.initialization.base_routes import BaseRoutes, find_folded_arms
 from vkc_pin.planning.initialization.keyframes import SIMILARITY_TOLERANCE, compute_shortfall
-from vkc_pin.planning.initialization.methods import initialize
 
 BEYOND = np.array([4.0, 1.5, 0.0])  # [m], [rad] a pose beyond the wall
 
@@ -21,12 +22,9 @@ BEYOND = np.array([4.0, 1.5, 0.0])  # [m], [rad] a pose beyond the wall
 def test_path_leads_through_the_gap() -> None:
     problem = make_wall_problem(1.6)
     routes, start = BaseRoutes(problem), problem.start[:3]
-    path, guide = (
-        find(0, start, BEYOND, 40) for find in (routes.find_path, routes.find_guide_path)
-    )
+    path = routes.find_path(0, start, BEYOND, 40)
     assert path is not None
-    assert guide is not None
-    np.testing.assert_allclose(guide, path, atol=1e-9)
+    np.testing.assert_allclose(routes.find_guide_path(0, start, BEYOND, 40), path, atol=1e-9)
     assert path.shape == (40, 3)
     np.testing.assert_allclose(path[-1, :2], BEYOND[:2], atol=1e-9)
     assert abs((path[-1, 2] + np.pi) % (2 * np.pi) - np.pi) < 1e-9
@@ -34,27 +32,6 @@ def test_path_leads_through_the_gap() -> None:
     assert crossing[1] < -1.4  # the wall reaches from y = -1.4 up
     distance = routes.compute_distances(0, start[None], BEYOND[None])[0]
     assert distance > np.hypot(*(BEYOND - start)[:2]) + 1.0
-
-
-def test_missing_path_is_noted() -> None:
-    problem, notes = make_wall_problem(0.0), list[str]()
-    routes = BaseRoutes(problem)
-    assert routes.find_path(0, problem.start[:3], BEYOND, 40) is None
-    assert routes.find_guide_path(0, problem.start[:3], np.array([5.5, 0.0, 0.0]), 40) is None
-    assert list(initialize(problem, "astar", 0, notes=notes)) == []
-    (note,) = notes
-    assert "found no path for the base" in note
-
-
-def test_guess_follows_the_path_with_its_heading() -> None:
-    problem = make_wall_problem(1.6)
-    (guess,) = initialize(problem, "astar", 0)
-    path = problem.waypoints(guess.z)[:, :3]
-    steps = np.diff(path[:, :2], axis=0)
-    heading = path[:-1, 2] + np.diff(path[:, 2]) / 2
-    along = np.abs(steps[:, 0] * np.cos(heading) + steps[:, 1] * np.sin(heading))
-    assert np.sum(along) > 0.8 * np.sum(np.linalg.norm(steps, axis=1))
-    assert problem.evaluate_contacts(guess.z, reach=0.02).compute_violation() < 0.02
 
 
 @pytest.mark.parametrize("width", [NARROW, TOO_NARROW, 0.64])  # the base is 0.67 m wide
@@ -121,65 +98,70 @@ TASKS = {  # scene, and steps; the load is carried in their last phase
 }
 
 
-@cache
-def make_carrying_problem(load: str) -> vkc.TrajectoryProblem:
-    name, steps = TASKS[load]
-    return make_program(vkc.load_scene(name), steps)
+@dataclasses.dataclass
+class Load:
+    """A problem whose last phase carries an object or nothing."""
+
+    problem: vkc.TrajectoryProblem
+
+    def make_configuration(self, arm: np.ndarray | None = None) -> np.ndarray:
+        """Return a configuration at the origin with an arm posture. Default: at home."""
+        chain = self.problem.chain
+        z = np.clip(np.zeros(chain.size), chain.lower, chain.upper)
+        z[3:9] = chain.robot.home if arm is None else arm
+        return z
+
+    @functools.cached_property
+    def arms(self) -> np.ndarray:
+        return self.find_arms()
+
+    def find_arms(self) -> np.ndarray:
+        phase = len(self.problem.task.phases) - 1
+        return find_folded_arms(self.problem, phase, self.make_configuration())
+
+    def compute_extent(self, arm: np.ndarray | None = None, *, base: bool = False) -> np.ndarray:
+        """Return the bounding box of arm and load or of the base by coal, shape (2, 3)."""
+        chain = self.problem.chain
+        q = chain.coordinates.q(self.make_configuration(arm))
+        data, placed, corners = chain.model.createData(), pin.GeometryData(chain.collision), []
+        pin.updateGeometryPlacements(chain.model, data, chain.collision, placed, q)
+        for shape, where in zip(chain.collision.geometryObjects, placed.oMg, strict=True):
+            if (shape.parentJoint == 1) == base and shape.parentJoint > 0:
+                solid = shape.geometry
+                if not hasattr(solid, "points"):
+                    solid.computeLocalAABB()
+                    box = solid.aabb_local
+                    points = np.array([*itertools.product(*zip(box.min_, box.max_, strict=True))])
+                else:
+                    points = np.asarray(solid.points())
+                corners.append(points @ where.rotation.T + where.translation)
+        rows = np.vstack(corners)
+        return np.array([rows.min(axis=0), rows.max(axis=0)])
 
 
-def make_configuration(load: str, arm: np.ndarray | None = None) -> np.ndarray:
-    """Return a configuration at the origin with an arm posture. Default: at home."""
-    chain = make_carrying_problem(load).chain
-    z = np.clip(np.zeros(chain.size), chain.lower, chain.upper)
-    z[3:9] = chain.robot.home if arm is None else arm
-    return z
+@functools.cache
+def make_load(name: str) -> Load:
+    scene, steps = TASKS[name]
+    return Load(make_program(vkc.load_scene(scene), steps))
 
 
-@cache
-def find_arms(load: str) -> np.ndarray:
-    p = make_carrying_problem(load)
-    return find_folded_arms(p, len(p.task.phases) - 1, make_configuration(load))
-
-
-def compute_extent(load: str, z: np.ndarray, *, base: bool = False) -> np.ndarray:
-    """Return the bounding box of arm and load or of the base by coal and Pinocchio, (2, 3)."""
-    chain = make_carrying_problem(load).chain
-    data, placed = chain.model.createData(), pin.GeometryData(chain.collision)
-    pin.updateGeometryPlacements(chain.model, data, chain.collision, placed, chain.coordinates.q(z))
-    corners = []
-    for shape, where in zip(chain.collision.geometryObjects, placed.oMg, strict=True):
-        if (shape.parentJoint == 1) if base else (shape.parentJoint > 1):
-            if hasattr(shape.geometry, "points"):
-                points = np.asarray(shape.geometry.points())
-            else:
-                shape.geometry.computeLocalAABB()
-                box = shape.geometry.aabb_local
-                points = np.array(np.meshgrid(*zip(box.min_, box.max_, strict=True)))
-                points = points.reshape(3, -1).T
-            corners.append(points @ where.rotation.T + where.translation)
-    rows = np.vstack(corners)
-    return np.array([rows.min(axis=0), rows.max(axis=0)])
-
-
-@pytest.mark.parametrize("load", TASKS)
-def test_folded_arms_are_compact_and_free(load: str) -> None:
+@pytest.mark.parametrize("name", TASKS)
+def test_folded_arms_are_compact_and_free(name: str) -> None:
     """No arm extends further than the first one or the base, up to the package's larger boxes."""
-    p, arms = make_carrying_problem(load), find_arms(load)
+    load = make_load(name)
+    p, arms = load.problem, load.arms
     assert len(arms) > 10
-    first, home = (
-        compute_extent(load, make_configuration(load, arms[0])),
-        compute_extent(load, make_configuration(load)),
-    )
+    first, home = load.compute_extent(arms[0]), load.compute_extent()
     assert np.abs(first[:, 1]).max() < 0.7 * np.abs(home[:, 1]).max()
     assert first[0, 2] > 0.1, "the arm must be above the floor"
     assert np.abs(first[:, 0]).max() < 0.7
-    own = compute_extent(load, make_configuration(load), base=True)
+    own = load.compute_extent(base=True)
     allowed = np.abs(np.vstack([first, own])).max(axis=0)[:2] + 0.03
     sizes, robot = [], p.chain.robot
     data, shapes = robot.model.createData(), robot.collision.createData()
     for arm in arms:
-        z = make_configuration(load, arm)
-        extent = np.abs(compute_extent(load, z)).max(axis=0)
+        z = load.make_configuration(arm)
+        extent = np.abs(load.compute_extent(arm)).max(axis=0)
         assert np.all(extent[:2] <= allowed)
         sizes.append(extent.sum())
         assert np.all((z >= p.chain.lower) & (z <= p.chain.upper))
@@ -190,22 +172,21 @@ def test_folded_arms_are_compact_and_free(load: str) -> None:
         contacts = p.contacts.evaluate(z[None], np.array([p.segments]), reach=p.options.dist_safe)
         assert contacts.compute_violation() == 0.0
     assert min(sizes) > sizes[0] - 0.03
-    np.testing.assert_array_equal(
-        find_folded_arms(p, len(p.task.phases) - 1, make_configuration(load)), arms
-    )
+    np.testing.assert_array_equal(load.find_arms(), arms)
 
 
 def test_shortfall_can_ignore_static_obstacles() -> None:
     """The base is in the wall between the rooms."""
-    p, z = make_carrying_problem("nothing"), make_configuration("nothing")
+    load = make_load("nothing")
+    z = load.make_configuration()
     z[:2] = 0.0, 1.25
-    assert compute_shortfall(p, z[None], 1)[0] > 0.1
-    assert compute_shortfall(p, z[None], 1, static=False)[0] == 0.0
+    assert compute_shortfall(load.problem, z[None], 1)[0] > 0.1
+    assert compute_shortfall(load.problem, z[None], 1, static=False)[0] == 0.0
 
 
 def test_nearest_folded_arm_minimizes_the_motion() -> None:
     """Angles that differ by full turns are the same posture."""
-    p, arms = make_carrying_problem("cup"), find_arms("cup")
+    p, arms = make_load("cup").problem, make_load("cup").arms
     routes, lower, upper = BaseRoutes(p), p.chain.lower[3:9], p.chain.upper[3:9]
     np.testing.assert_array_equal(routes.get_folded_arm(1), arms[0])
     metric, rng = p.chain.metric[3:9], np.random.default_rng(0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
@@ -37,59 +38,48 @@ def make_interpolator(p: vkc.TrajectoryProblem, paths: Paths | None = None) -> I
     return Interpolator(sampler, ApproachPaths(sampler), paths)
 
 
-def make_rrt_paths(p: vkc.TrajectoryProblem, seed: int = 0) -> RrtPaths:
-    return RrtPaths(KeyframeSampler(p, np.random.default_rng(seed)), BaseRoutes(p))
+def make_rrt_paths(p: vkc.TrajectoryProblem) -> RrtPaths:
+    return RrtPaths(KeyframeSampler(p, np.random.default_rng(0)), BaseRoutes(p))
 
 
-def assert_holds_the_handle(z: np.ndarray) -> None:
-    p, _, _ = make_door_problem()
-    hinge, knob = (p.chain.index(f"door.{name}") for name in ("hinge", "knob"))
-    for row in z[int(p.ends[0]) - 1 :]:
-        assert compute_grasp_error(load_door_scene(), row, row[hinge], row[knob]) < 1e-3
-    assert z[-1, hinge] == pytest.approx(1.2)
-
-
-def test_guess_passes_keyframes_and_closes_the_chain() -> None:
-    p, keyframes, waypoints = make_door_problem()
-    original = keyframes.copy()
-    z = make_interpolator(p).interpolate(keyframes, waypoints)
+def interpolate(
+    p: vkc.TrajectoryProblem,
+    *ends: Sequence[float],
+    paths: Paths | None = None,
+) -> np.ndarray:
+    """Interpolate from the start to poses of the base at the ends of the phases."""
+    keyframes = np.array([p.start, *(make_waypoint(p, end) for end in ends)])
+    z = make_interpolator(p, paths).interpolate(keyframes, [0, *p.ends.tolist()])
     assert z is not None
-    np.testing.assert_array_equal(keyframes, original)
-    assert np.all((z >= p.lower) & (z <= p.upper))
-    reach = int(p.ends[0])
-    np.testing.assert_allclose(z[reach - 1], keyframes[waypoints.index(reach)], atol=1e-3)
-    before = reach - FEW.steps(FEW.approach_time)
-    first, last = p.start, z[before - 1]
-    fraction = np.linalg.norm(z[:before] - first, axis=1) / np.linalg.norm(last - first)
-    assert np.all(np.diff(fraction) > 0.0)
-    np.testing.assert_allclose(z[:before], first + np.outer(fraction, last - first), atol=1e-9)
-    assert_holds_the_handle(z)
+    return z
 
 
 def test_straight_paths_start_and_end_at_rest() -> None:
     p = make_program(make_hall(), [vkc.GoTo(2.0, 1.0, 0.5)])
-    z = make_interpolator(p).interpolate(
-        np.array([p.start, make_waypoint(p, (2.0, 1.0, 0.5))]), [0, p.segments]
-    )
-    assert z is not None
     expected = np.outer(sample_smoothstep(p.segments), [2.0, 1.0, 0.5])
+    z = interpolate(p, (2.0, 1.0, 0.5))
     np.testing.assert_allclose(z[:, :3], expected, atol=1e-12)
 
 
 def test_base_path_ends_where_the_approach_begins() -> None:
     p, keyframes, waypoints = make_door_problem()
-    routes = BaseRoutes(p)
+    original, routes = keyframes.copy(), BaseRoutes(p)
     z = make_interpolator(p, AStarPaths(routes)).interpolate(keyframes, waypoints)
     assert z is not None
+    np.testing.assert_array_equal(keyframes, original)
     steps = int(p.ends[0]) - FEW.steps(FEW.approach_time)
     grasp = keyframes[waypoints.index(int(p.ends[0]))]
-    (near,) = ApproachPaths(KeyframeSampler(p, np.random.default_rng(0))).find_approach_start(
-        grasp, p.task.phases[0]
-    )
+    approach = ApproachPaths(KeyframeSampler(p, np.random.default_rng(0)))
+    (near,) = approach.find_approach_start(grasp, p.task.phases[0])
     path = routes.find_path(0, p.start[:3], near[:3], steps)
     assert path is not None
     np.testing.assert_allclose(z[:steps, :2], path[:, :2], atol=1e-4)
-    assert_holds_the_handle(z)
+    error = z[int(p.ends[0]) - 1] - grasp
+    np.testing.assert_allclose(np.delete(error, 2), 0.0, atol=1e-3)  # the heading may be wound
+    hinge, knob = (p.chain.index(f"door.{name}") for name in ("hinge", "knob"))
+    for row in z[int(p.ends[0]) - 1 :]:
+        assert compute_grasp_error(load_door_scene(), row, row[hinge], row[knob]) < 1e-3
+    assert z[-1, hinge] == pytest.approx(1.2)
 
 
 @pytest.mark.parametrize("turns", [-1, 2])
@@ -98,11 +88,8 @@ def test_later_headings_continue_where_the_base_path_ends(turns: int) -> None:
     p, keyframes, waypoints = make_door_problem()
     wound = keyframes.copy()
     wound[1:, 2] += turns * 2 * np.pi
-    plain, other = (
-        make_interpolator(p, AStarPaths(BaseRoutes(p))).interpolate(each, waypoints)
-        for each in (keyframes, wound)
-    )
-    assert plain is not None
+    interpolator = make_interpolator(p, AStarPaths(BaseRoutes(p)))
+    plain, other = (interpolator.interpolate(each, waypoints) for each in (keyframes, wound))
     assert other is not None
     np.testing.assert_allclose(other, plain, atol=1e-3)
     assert np.abs(np.diff(other[:, 2])).max() < 1.0
@@ -111,70 +98,46 @@ def test_later_headings_continue_where_the_base_path_ends(turns: int) -> None:
 @pytest.mark.parametrize("turns", [-1, 0, 1])
 def test_base_path_unwinds_if_the_goal_fixes_the_heading(turns: int) -> None:
     p = make_wall_problem(1.6)
-    routes, end = BaseRoutes(p), make_waypoint(p, (4.0, 1.5, turns * 2 * np.pi))
+    paths, end = AStarPaths(BaseRoutes(p)), make_waypoint(p, (4.0, 1.5, turns * 2 * np.pi))
     free, fixed = (
-        AStarPaths(routes).find_path(0, p.start, end, 40, turns=each, reaches=True)
-        for each in (True, False)
+        paths.find_path(0, p.start, end, 40, turns=each, reaches=True) for each in (True, False)
     )
     assert free is not None
     assert fixed is not None
     np.testing.assert_allclose(free[-1, :3], [4.0, 1.5, 0.0], atol=1e-9)
-    np.testing.assert_allclose(fixed[-1, :3], end[:3], atol=1e-9)
     added = np.arange(1, 41) / 40 * turns * 2 * np.pi
-    np.testing.assert_allclose(fixed[:, 2], free[:, 2] + added, atol=1e-9)
+    np.testing.assert_allclose(fixed[:, :3], free[:, :3] + np.outer(added, [0, 0, 1]), atol=1e-9)
 
 
 def test_astar_paths_move_the_arm_straight() -> None:
     p = make_wall_problem(1.6)
     routes, end = BaseRoutes(p), make_waypoint(p, (4.0, 1.5, 0.0))
     end[3:] += 0.2
-    z = make_interpolator(p, AStarPaths(routes)).interpolate(
-        np.array([p.start, end]), [0, p.segments]
-    )
-    expected = routes.find_path(0, p.start[:3], end[:3], p.segments)
+    interpolator = make_interpolator(p, AStarPaths(routes))
+    z = interpolator.interpolate(np.array([p.start, end]), [0, p.segments])
     assert z is not None
-    assert expected is not None
+    expected = routes.find_path(0, p.start[:3], end[:3], p.segments)
     np.testing.assert_allclose(z[:, :3], expected, atol=1e-9)
     lifted = np.outer(sample_smoothstep(p.segments), np.full(6, 0.2))
     np.testing.assert_allclose(z[:, 3:], p.start[3:] + lifted, atol=1e-9)
 
 
 def test_missing_paths_are_noted_once_per_phase() -> None:
-    p = make_program(
-        make_wall_problem(0.0).scene, [vkc.GoTo(1.0, 1.0, 0.5), vkc.GoTo(4.0, 1.0, 0.5)]
-    )
+    steps = [vkc.GoTo(1.0, 1.0, 0.5), vkc.GoTo(4.0, 1.0, 0.5)]
+    p = make_program(make_wall_problem(0.0).scene, steps)
     interpolator = make_interpolator(p, AStarPaths(BaseRoutes(p)))
     for x in (1.0, 0.9):
-        keyframes = np.array(
-            [p.start, make_waypoint(p, (x, 1.0, 0.5)), make_waypoint(p, (4.0, 1.0, 0.5))]
-        )
-        assert interpolator.interpolate(keyframes, [0, *p.ends.tolist()]) is None
-    assert interpolator.blocked == [
-        "go to: found no path for the base from (1.00, 1.00) to (4.00, 1.00)"
-    ]
-
-
-def test_rrt_paths_lead_through_a_narrow_gate() -> None:
-    p = make_gate_problem(NARROW)
-    ends, violations = np.array([p.start, make_waypoint(p, GOAL)]), []
-    assert (
-        make_interpolator(p, AStarPaths(BaseRoutes(p))).interpolate(ends, [0, p.segments]) is None
-    )
-    for paths in (None, make_rrt_paths(p)):
-        z = make_interpolator(p, paths).interpolate(ends, [0, p.segments])
-        assert z is not None
-        np.testing.assert_allclose(z[-1, :3], GOAL, atol=1e-9)
-        violations.append(p.evaluate_contacts(z, reach=0.1).compute_violation())
-    assert violations[0] > 0.2
-    assert violations[1] < p.options.dist_safe + 0.02
+        ends = [make_waypoint(p, (x, 1.0, 0.5)), make_waypoint(p, (4.0, 1.0, 0.5))]
+        assert interpolator.interpolate(np.array([p.start, *ends]), [0, *p.ends.tolist()]) is None
+    note = "go to: found no path for the base from (1.00, 1.00) to (4.00, 1.00)"
+    assert interpolator.blocked == [note]
 
 
 def test_next_phase_begins_where_the_arm_ended() -> None:
     """The arm is folded in the gate and has no goal, so it may stay folded."""
-    p = make_program(make_gate_problem(NARROW).scene, [vkc.GoTo(*GOAL), vkc.GoTo(4.5, 0.5, 0.0)])
-    keyframes = np.array([p.start, make_waypoint(p, GOAL), make_waypoint(p, (4.5, 0.5, 0.0))])
-    z = make_interpolator(p, make_rrt_paths(p)).interpolate(keyframes, [0, *p.ends.tolist()])
-    assert z is not None
+    beyond = (4.5, 0.5, 0.0)
+    p = make_program(make_gate_problem(NARROW).scene, [vkc.GoTo(*GOAL), vkc.GoTo(*beyond)])
+    z = interpolate(p, GOAL, beyond, paths=make_rrt_paths(p))
     assert np.abs(np.diff(p.waypoints(z), axis=0)).max() < 1.0
     assert p.evaluate_contacts(z, reach=0.1).compute_violation() < p.options.dist_safe + 0.02
 

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from helpers.drawers import replace_scene_fields
 from helpers.drives import make_hall
 from helpers.gates import GOAL, TOO_NARROW, make_gate_problem, make_waypoint
 from helpers.small_problems import compute_grasp_error, load_door_scene, make_program
@@ -49,20 +50,17 @@ def make_folding_problem() -> tuple[vkc.TrajectoryProblem, np.ndarray, np.ndarra
 
 
 def find_path(
-    seed: int, ends: np.ndarray | None = None, *, max_extensions: int = MAX_EXTENSIONS
+    seed: int,
+    ends: np.ndarray | None = None,
+    *,
+    poses: np.ndarray | None = None,
+    max_extensions: int = MAX_EXTENSIONS,
 ) -> np.ndarray | None:
-    """Find a path through the gate."""
+    """Find a path through the gate, with samples near `poses` or the guide path."""
     problem, guide, arms = make_folding_problem()
     ends = make_waypoint(problem, GOAL)[None] if ends is None else ends
-    return connect(
-        problem,
-        problem.start,
-        ends,
-        poses=guide,
-        arms=arms,
-        seed=seed,
-        max_extensions=max_extensions,
-    )
+    near = {"poses": guide if poses is None else poses, "arms": arms}
+    return connect(problem, problem.start, ends, **near, seed=seed, max_extensions=max_extensions)
 
 
 def connect(
@@ -95,16 +93,12 @@ def connect_directly(
     )
 
 
-def compute_length(path: np.ndarray) -> float:
-    return float(np.linalg.norm(np.diff(path, axis=0) * METRIC, axis=1).sum())
-
-
 def refine(path: np.ndarray, spacing: float = 0.02) -> np.ndarray:
     """Return configurations along a path, at most `spacing` [rad] apart."""
     rows = [path[:1]]
     for a, b in itertools.pairwise(path):
         count = max(1, int(np.ceil(np.abs((b - a) * METRIC).max() / spacing)))
-        rows.append(a + np.arange(1, count + 1)[:, None] / count * (b - a))
+        rows.append(np.linspace(a, b, count + 1)[1:])
     return np.vstack(rows)
 
 
@@ -125,7 +119,7 @@ def assert_free(problem: vkc.TrajectoryProblem, path: np.ndarray) -> None:
 @settings(max_examples=5, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_path_leads_through_the_gate_with_the_arm_folded(seed: int) -> None:
-    problem, _, _ = make_folding_problem()
+    problem, _, arms = make_folding_problem()
     straight = np.array([problem.start, make_waypoint(problem, GOAL)])
     assert compute_shortfall(problem, refine(straight)).max() > 0.1
     path = find_path(seed)
@@ -136,7 +130,7 @@ def test_path_leads_through_the_gate_with_the_arm_folded(seed: int) -> None:
     inside = np.abs(rows[:, 0] + 0.3 - 2.0) < 0.1  # the arm at home is 0.2 to 0.45 m ahead
     assert np.abs(rows[inside, 3:] - problem.start[3:]).max(axis=1).min() > 0.1
     # Shortcuts remove most arm motion besides folding and unfolding.
-    folding = np.abs(make_folding_problem()[2][1] - problem.start[3:]).sum()
+    folding = np.abs(arms[1] - problem.start[3:]).sum()
     assert np.abs(np.diff(path[:, 3:], axis=0)).sum() < 5.0 * folding
 
 
@@ -146,7 +140,7 @@ def test_path_ends_at_a_reachable_end() -> None:
     ends[1:3, :3], ends[1:3, 3:] = GOAL, arms
     path = find_path(0, ends)
     assert path is not None
-    assert any(np.allclose(path[-1], end, rtol=0.0, atol=1e-9) for end in ends[1:3])
+    assert np.abs(ends[1:3] - path[-1]).max(axis=1).min() < 1e-9
     assert_free(problem, path)
 
 
@@ -159,15 +153,14 @@ def test_walled_in_goal_has_no_path(pose: tuple[float, float, float]) -> None:
 def test_least_violating_end_is_tried() -> None:
     """A goal slightly within the margin is reached; one in the wall is not."""
     problem, _, arms = make_folding_problem()
-    end = np.array([*make_waypoint(problem, (1.895 - 0.49, 1.5, np.pi / 2))[:3], *arms[1]])
     allowed = problem.options.dist_safe
-    towards = np.tile(end, (241, 1))
+    towards = np.tile([1.405, 1.5, np.pi / 2, *arms[1]], (241, 1))
     towards[:, 0] += np.linspace(-0.3, 0.3, 241)
     short = compute_shortfall(problem, towards)
-    near = towards[int(np.argmax(short > allowed))]
-    assert allowed < compute_shortfall(problem, near[None])[0] < allowed + 3e-3
-    poses = np.array([problem.start[:3], near[:3]])
-    path = connect(problem, problem.start, np.array([towards[-1], near]), poses=poses, arms=arms)
+    index = int(np.argmax(short > allowed))
+    assert allowed < short[index] < allowed + 3e-3
+    near = towards[index]
+    path = find_path(0, towards[[-1, index]], poses=np.array([problem.start[:3], near[:3]]))
     assert path is not None
     np.testing.assert_allclose(path[[0, -1]], [problem.start, near], rtol=0.0, atol=1e-9)
     assert compute_shortfall(problem, refine(path)).max() <= allowed + UNCHECKED_SHORTFALL
@@ -187,54 +180,25 @@ def test_free_path_is_straight_and_slow_at_both_ends() -> None:
 
 
 def test_arm_on_a_fixed_base_avoids_a_pole() -> None:
-    pole = {
-        "name": "pole",
-        "type": "cylinder",
-        "radius": 0.05,
-        "length": 1.2,
-        "position": [0.37, 0.25, 1.7],
-    }
+    size = {"radius": 0.05, "length": 1.2}
+    pole = {"name": "pole", "type": "cylinder", **size, "position": [0.37, 0.25, 1.7]}
     reach = vkc.Reach((0.6, 0.35, 0.9, 0.0, np.pi / 2, 0.0))
     problem = make_program(make_hall(base="fixed", obstacles=[pole]), [reach])
-    first, last = problem.start.copy(), problem.start.copy()
-    first[3:6], last[3:6] = (0.57, -1.2, -1.2), (2.57, -1.2, -1.2)
-    straight = np.array([first, last])
+    straight = np.tile(problem.start, (2, 1))
+    straight[:, 3:6] = (0.57, -1.2, -1.2), (2.57, -1.2, -1.2)
     assert compute_shortfall(problem, straight).max() == 0.0
     assert compute_shortfall(problem, refine(straight)).max() > 0.05
-    path = connect_directly(problem, first, last, max_extensions=MAX_EXTENSIONS)
+    path = connect_directly(problem, *straight, max_extensions=MAX_EXTENSIONS)
     assert path is not None
     np.testing.assert_allclose(path[[0, -1]], straight, rtol=0.0, atol=1e-9)
-    np.testing.assert_allclose(path[:, :3], np.tile(first[:3], (len(path), 1)), atol=1e-12)
+    assert np.ptp(path[:, :3], axis=0).max() < 1e-12
     assert_free(problem, path)
 
 
-def test_equal_random_seeds_give_equal_paths() -> None:
-    one, same, other = find_path(3), find_path(3), find_path(4)
-    assert one is not None
-    assert other is not None
-    np.testing.assert_array_equal(one, same)
-    assert one.shape != other.shape or not np.array_equal(one, other)
-
-
 def test_samples_along_the_guide_find_a_path_sooner() -> None:
-    problem, guide, arms = make_folding_problem()
+    _, guide, _ = make_folding_problem()
     assert all(find_path(seed, max_extensions=400) is not None for seed in range(3))
-    ends = make_waypoint(problem, GOAL)[None]
-    sparse = guide[[0, -1]]
-    assert (
-        connect(problem, problem.start, ends, poses=sparse, arms=arms, max_extensions=400) is None
-    )
-
-
-def test_budget_ends_the_search() -> None:
-    with Budget().activate() as budget:
-        find_path(0)
-    assert budget.evaluations > 200
-    with (
-        Budget(max_evaluations=budget.evaluations // 2).activate(),
-        pytest.raises(BudgetExhaustedError),
-    ):
-        find_path(0)
+    assert find_path(0, poses=guide[[0, -1]], max_extensions=400) is None
 
 
 # --- closed chains
@@ -260,7 +224,8 @@ def get_move_phase() -> tuple[np.ndarray, np.ndarray]:
     """Return the keyframes and the straight waypoints of phase MOVE."""
     p, path, waypoints, z = make_free_door()
     begin, end = int(p.ends[MOVE - 1]), int(p.ends[MOVE])
-    return path[[k for k, at in enumerate(waypoints) if begin <= at <= end]], z[begin:end]
+    is_within = [begin <= at <= end for at in waypoints]
+    return path[is_within], z[begin:end]
 
 
 @cache
@@ -268,13 +233,13 @@ def make_blocked_door() -> vkc.TrajectoryProblem:
     """Return the same problem with a ball in the elbow's path."""
     p, straight = make_free_door()[0], get_move_phase()[1]
     _, places = p.chain.joint_placements(straight[len(straight) // 2][None])
-    elbow = p.chain.model.getJointId(str(load_door_scene().robot.model.names[4]))
+    scene = load_door_scene()
+    elbow = p.chain.model.getJointId(str(scene.robot.model.names[4]))
     position = places[0, elbow].round(4).tolist()
     ball = {"name": "ball", "type": "sphere", "radius": 0.06, "position": position}
-    document = load_door_scene().document
-    obstacles = [*document.get("obstacles", []), ball]
-    scene = vkc.Scene.from_document({**document, "obstacles": obstacles}, load_door_scene().folder)
-    return make_program(scene, OPEN_AND_LEAVE, options=FEW)
+    obstacles = [*scene.document["obstacles"], ball]
+    blocked = replace_scene_fields(scene, obstacles=obstacles)
+    return make_program(blocked, OPEN_AND_LEAVE, options=FEW)
 
 
 def find_path_with_door(seed: int, *, max_extensions: int = MAX_EXTENSIONS) -> np.ndarray | None:

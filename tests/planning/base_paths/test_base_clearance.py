@@ -63,39 +63,18 @@ def test_drives_and_turns_agree_with_coal() -> None:
     assert 0.2 < np.mean(answers) < 0.8
 
 
-def test_shapes_at_different_heights_form_no_pairs() -> None:
-    table = [(coal.Box(2.0, 2.0, 0.05), make_pose(0.0, 0.0, 0.775))]
-    body = MovingShapes([*make_chassis(), *make_arm_shapes()], Obstacles(table), MARGIN)
-    assert 0 not in body.moving
-    assert len(body.moving) > 0
-    assert MovingShapes(make_chassis(), Obstacles(table), MARGIN).is_drive_free(
-        np.zeros(2), np.ones(2), 0.3
-    )
-
-
-def test_all_motions_are_free_without_obstacles() -> None:
-    for body in (
-        MovingShapes([], Obstacles(make_clutter(0, 5)), MARGIN),
-        MovingShapes(make_chassis(), Obstacles([]), MARGIN),
-    ):
-        assert body.is_drive_free(np.zeros(2), np.ones(2), 0.0)
-        assert body.is_turn_free(np.zeros(2), 0.0, 6.0)
-
-
 def test_exit_margins_keep_the_initial_distance() -> None:
-    box = (coal.Box(1.0, 1.0, 1.0), make_pose(1.01, 0.0, 0.5))
-    near, far = (
-        (coal.Box(1.0, 1.0, 1.0), make_pose(0.0, 0.845, 0.5)),
-        (coal.Box(1.0, 1.0, 1.0), make_pose(-3.0, 0.0, 0.5)),
-    )
-    body = MovingShapes(
-        [(coal.Box(1.0, 0.67, 0.4), make_pose(0.0, 0.0, 0.2))], Obstacles([box, near, far]), MARGIN
-    )
+    boxes = [
+        (coal.Box(1.0, 1.0, 1.0), make_pose(x, y, 0.5))
+        for x, y in ((1.01, 0.0), (0.0, 0.845), (-3.0, 0.0))
+    ]
+    body = MovingShapes(make_chassis(), Obstacles(boxes), MARGIN)
     margins = body.compute_exit_margins(np.zeros(2), 0.0)
     assert margins == pytest.approx([0.01, 0.01, MARGIN], abs=1e-5)
-    assert body.is_drive_free(np.zeros(2), np.array([-1.0, 0.0]), 0.0, margins)
-    assert not body.is_drive_free(np.zeros(2), np.array([-1.0, 0.0]), 0.0)
-    assert not body.is_drive_free(np.zeros(2), np.array([0.005, 0.0]), 0.0, margins)
+    away, towards = np.array([-1.0, 0.0]), np.array([0.005, 0.0])
+    assert body.is_drive_free(np.zeros(2), away, 0.0, margins)
+    assert not body.is_drive_free(np.zeros(2), away, 0.0)
+    assert not body.is_drive_free(np.zeros(2), towards, 0.0, margins)
     inside = body.compute_exit_margins(np.array([0.2, 0.0]), 0.0)
     assert inside[0] == -np.inf
 

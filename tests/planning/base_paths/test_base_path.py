@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import coal
 import numpy as np
@@ -43,21 +44,20 @@ def make_wall_with_gap(width: float, *, height: float = 1.0) -> list[Shape]:
 
 
 def check(
-    path: BasePath,
-    start: NDArray[np.float64],
+    path: BasePath | None,
+    start: Sequence[float],
     goals: NDArray[np.float64],
-    base: list[Shape],
     carried: list[Shape],
     obstacles: list[Shape],
 ) -> None:
     """Check ends, moves and cost of a path, and with coal its clearance every centimetre."""
+    assert path is not None
     poses, goal = path.poses, goals[path.goal]
     np.testing.assert_array_equal(poses[0], start)
     np.testing.assert_array_equal(poses[-1][:2], goal[:2])
-    assert (poses[-1, 2] - goal[2]) / (2 * np.pi) == pytest.approx(
-        round((poses[-1, 2] - goal[2]) / (2 * np.pi)), abs=1e-12
-    )
-    cost = 0.0
+    turns = (poses[-1, 2] - goal[2]) / (2 * np.pi)
+    assert turns == pytest.approx(round(turns), abs=1e-12)
+    ends, cost = [np.array(start), *goals], 0.0
     for a, b in itertools.pairwise(poses):
         displacement = b[:2] - a[:2]
         length = np.hypot(*displacement)
@@ -68,28 +68,29 @@ def check(
                 cost += length * (1.0 if forward > 0.0 else BACKWARDS)
             else:  # a sideways drive next to start or goal
                 assert length <= 0.6
-                assert any(np.array_equal(p[:2], end[:2]) for p in (a, b) for end in (start, goal))
+                assert any(np.array_equal(p[:2], e[:2]) for p in (a, b) for e in (start, goal))
                 cost += SIDEWAYS * length
         else:
             cost += TURNING * abs(b[2] - a[2])
         for pose in interpolate_poses(a, b):
-            assert compute_distance(base, obstacles, pose) >= MARGIN - MARGIN_TOLERANCE
-            if min(np.hypot(*(pose[:2] - end[:2])) for end in [start, *goals]) > NEAR + 1e-9:
+            assert compute_distance(make_chassis(), obstacles, pose) >= MARGIN - MARGIN_TOLERANCE
+            if min(np.hypot(*(pose[:2] - end[:2])) for end in ends) > NEAR + 1e-9:
                 assert compute_distance(carried, obstacles, pose) >= MARGIN - MARGIN_TOLERANCE
     assert path.cost == pytest.approx(cost, abs=1e-9)
 
 
 def find_path(
     obstacles: list[Shape],
-    start: list[float],
-    goals: list[list[float]],
-    *,
+    start: Sequence[float],
+    *goals: Sequence[float],
     base: list[Shape] | None = None,
-    **options: object,
+    carried: Sequence[Shape] = (),
+    near: float = NEAR,
+    costs: list[float] | None = None,
 ) -> BasePath | None:
-    """Return the shortest path of a base without load."""
-    grid = BaseGrid(base or make_chassis(), [], obstacles, HALL, MARGIN)
-    return shortest_path(grid, start, np.array(goals), **options)  # type: ignore[arg-type]
+    """Return the shortest path of a base."""
+    grid = BaseGrid(base or make_chassis(), [*carried], obstacles, HALL, MARGIN, near=near)
+    return shortest_path(grid, start, np.array(goals).reshape(-1, 3), costs=costs)
 
 
 @settings(max_examples=2, deadline=None)
@@ -108,8 +109,8 @@ def test_paths_are_collision_free(seed: int) -> None:
     assert (path is None) == (plain is None)
     if path is not None and plain is not None:
         assert path.cost <= plain.cost + 1e-9
-        check(path, start, goals, make_chassis(), make_arm_shapes(), standing)
-        check(plain, start, goals, make_chassis(), make_arm_shapes(), standing)
+        for one in (path, plain):
+            check(one, start, goals, make_arm_shapes(), standing)
 
 
 HEADING = np.arctan2(3.7, 6.1)
@@ -128,7 +129,7 @@ HEADING = np.arctan2(3.7, 6.1)
     ],
 )
 def test_shortest_paths_without_obstacles(poses: list[list[float]], cost: float) -> None:
-    path = find_path([], poses[0], [poses[-1]])
+    path = find_path([], poses[0], poses[-1])
     assert path is not None
     np.testing.assert_allclose(path.poses, poses, atol=1e-9)
     assert path.cost == pytest.approx(cost)
@@ -139,68 +140,50 @@ def test_base_drives_sideways_along_a_wall() -> None:
     """Without walls it turns instead."""
     walls: list[Shape] = [(coal.Box(3.0, 0.1, 1.0), make_pose(x, 0.0, 0.5)) for x in (-2.0, 2.0)]
     y = 0.05 + 0.335 + 0.03
-    start, goals = np.array([-2.0, y, 0.0]), np.array([[2.0, y, 0.0]])
-    path = find_path(walls, start, goals)  # type: ignore[arg-type]
-    assert path is not None
-    check(path, start, goals, make_chassis(), [], walls)
-    free = find_path([], [0.0, 0.0, 0.0], [[0.0, 2.0, 0.0]])
+    start, goal = [-2.0, y, 0.0], [2.0, y, 0.0]
+    check(find_path(walls, start, goal), start, np.array([goal]), [], walls)
+    free = find_path([], [0.0, 0.0, 0.0], [0.0, 2.0, 0.0])
     assert free is not None
     assert free.cost == pytest.approx(2.0 + TURNING * np.pi)
 
 
 def test_narrow_gap_is_passed_lengthwise() -> None:
-    walls, start, goals = (
-        make_wall_with_gap(0.85),
-        [-2.5, 1.0, np.pi / 2],
-        [[2.5, -1.0, np.pi / 2]],
-    )
-    path = find_path(walls, start, goals)
-    assert path is not None
-    check(path, np.array(start), np.array(goals), make_chassis(), [], walls)
-    assert find_path(walls, start, goals, base=make_chassis(1.0, 0.85)) is None
-    assert (
-        find_path(make_wall_with_gap(1.2), start, goals, base=make_chassis(1.0, 0.85)) is not None
-    )
+    walls, wide = make_wall_with_gap(0.85), make_chassis(1.0, 0.85)
+    start, goal = [-2.5, 1.0, np.pi / 2], [2.5, -1.0, np.pi / 2]
+    check(find_path(walls, start, goal), start, np.array([goal]), [], walls)
+    assert find_path(walls, start, goal, base=wide) is None
+    assert find_path(make_wall_with_gap(1.2), start, goal, base=wide) is not None
 
 
-def test_long_load_fits_through_a_gap_lengthwise_only() -> None:
-    walls, start, goals = (
-        make_wall_with_gap(1.0),
-        np.array([-2.5, 0.0, 0.0]),
-        np.array([[2.5, 0.0, 0.0]]),
-    )
-    across: list[Shape] = [(coal.Box(0.05, 1.4, 0.05), make_pose(0.4, 0.0, 0.8))]
-    lengthwise: list[Shape] = [(coal.Box(1.4, 0.05, 0.05), make_pose(0.4, 0.0, 0.8))]
-    for carried, fits in (([], True), (lengthwise, True), (across, False)):
-        path = shortest_path(BaseGrid(make_chassis(), carried, walls, HALL, MARGIN), start, goals)
-        assert (path is not None) == fits
-    path_above = shortest_path(
-        BaseGrid(make_chassis(), across, make_wall_with_gap(1.0, height=0.6), HALL, MARGIN),
-        start,
-        goals,
-    )
-    assert path_above is not None  # the load passes above the walls
+@pytest.mark.parametrize(
+    ("size", "height", "fits"),
+    [((1.4, 0.05), 1.0, True), ((0.05, 1.4), 1.0, False), ((0.05, 1.4), 0.6, True)],
+    ids=["lengthwise", "across", "above the walls"],
+)
+def test_long_load_fits_through_a_gap_lengthwise_or_above_the_walls(
+    size: tuple[float, float], height: float, fits: bool
+) -> None:
+    load: list[Shape] = [(coal.Box(*size, 0.05), make_pose(0.4, 0.0, 0.8))]
+    walls, start = make_wall_with_gap(1.0, height=height), [-2.5, 0.0, 0.0]
+    assert (find_path(walls, start, [2.5, 0.0, 0.0], carried=load) is not None) == fits
 
 
 def test_only_the_base_counts_near_start_and_goals() -> None:
     """The load may overlap the tables at either end, but not a third one in between."""
     rod: list[Shape] = [(coal.Box(0.4, 0.05, 0.4), make_pose(0.6, 0.0, 0.8))]
-    tables = [(coal.Box(1.0, 2.0, 0.1), make_pose(x, 0.0, 0.85)) for x in (-3.5, 3.5)]
-    start, goals = np.array([-2.5, 0.0, np.pi]), np.array([[2.5, 0.0, 0.0]])
-    grid = BaseGrid(make_chassis(), rod, tables, HALL, MARGIN, near=NEAR)
-    assert not grid.is_pose_free(*start)
-    assert not grid.is_pose_free(*goals[0])
-    path = shortest_path(grid, start, goals)
-    assert path is not None
-    check(path, start, goals, make_chassis(), rod, tables)
+    tables: list[Shape] = [(coal.Box(1.0, 2.0, 0.1), make_pose(x, 0.0, 0.85)) for x in (-3.5, 3.5)]
+    ends = [[-2.5, 0.0, np.pi], [2.5, 0.0, 0.0]]
+    assert all(compute_distance(rod, tables, end) < 0.0 for end in ends)
+    path = find_path(tables, *ends, carried=rod)
+    check(path, ends[0], np.array(ends[1:]), rod, tables)
     three_tables = [*tables, (coal.Box(0.4, 20.0, 0.1), make_pose(0.0, 0.0, 0.85))]
     for obstacles, near, is_free in (
         (three_tables, NEAR, False),
         (three_tables, 3.0, True),
         (tables, 0.0, False),
     ):
-        grid = BaseGrid(make_chassis(), rod, obstacles, HALL, MARGIN, near=near)
-        assert (shortest_path(grid, start, goals) is not None) == is_free
+        path = find_path(obstacles, *ends, carried=rod, near=near)
+        assert (path is not None) == is_free
 
 
 @pytest.mark.parametrize(
@@ -217,7 +200,7 @@ def test_base_leaves_a_blocked_start_without_crossing_the_obstacle(
     clearance: float,
 ) -> None:
     obstacles: list[Shape] = [(coal.Box(*block, 1.0), make_pose(0.0, 0.0, 0.5))]
-    path = find_path(obstacles, [*start, 0.0], [[*goal, 0.0]])
+    path = find_path(obstacles, [*start, 0.0], [*goal, 0.0])
     assert path is not None
     poses = np.concatenate([interpolate_poses(a, b) for a, b in itertools.pairwise(path.poses)])
     distances = np.array([compute_distance(make_chassis(), obstacles, pose) for pose in poses])
@@ -231,21 +214,23 @@ def test_base_leaves_a_blocked_start_without_crossing_the_obstacle(
     assert path.cost > 4.0
 
 
-def test_blocked_goals_are_skipped() -> None:
-    block: list[Shape] = [(coal.Box(1.0, 1.0, 1.0), make_pose(2.0, 0.0, 0.5))]
-    path = find_path(block, [0.0, 0.0, 0.0], [[2.0, 0.2, 0.0], [-4.0, 0.0, 1.0]])
+@pytest.mark.parametrize(
+    ("costs", "goal", "cost"),
+    [
+        (None, 1, 1.0),
+        ([0.0, 0.0, 0.5], 1, 1.0),
+        ([0.0, 1.5, 0.0], 2, 2.0),
+        ([0.0, 1.5, 1.0], 1, 2.5),
+    ],
+)
+def test_goal_costs_are_added_and_blocked_goals_are_skipped(
+    costs: list[float] | None, goal: int, cost: float
+) -> None:
+    block: list[Shape] = [(coal.Box(1.0, 1.0, 1.0), make_pose(0.0, 2.0, 0.5))]
+    goals = [[0.0, 2.2, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]
+    path = find_path(block, [0.0, 0.0, 0.0], *goals, costs=costs)
     assert path is not None
-    assert path.goal == 1
-
-
-def test_goal_costs_are_added_to_the_path_cost() -> None:
-    start, goals = [0.0, 0.0, 0.0], [[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]
-    found = [
-        find_path([], start, goals, costs=costs)
-        for costs in (None, [0.0, 0.5], [1.5, 0.0], [1.5, 1.0])
-    ]
-    assert [path.goal for path in found if path is not None] == [0, 0, 1, 0]
-    assert [path.cost for path in found if path is not None] == pytest.approx([1.0, 1.0, 2.0, 2.5])
+    assert (path.goal, path.cost) == (goal, pytest.approx(cost))
 
 
 def test_unreachable_goals_have_no_path() -> None:
@@ -255,19 +240,16 @@ def test_unreachable_goals_have_no_path() -> None:
     room += [(coal.Box(0.1, 3.0, 1.0), make_pose(x, 0.0, 0.5)) for x in (-1.5, 1.5)]
     inside, outside = [0.0, 0.0, 0.0], [4.0, 4.0, 0.0]
     for obstacles in (block, room):
-        assert find_path(obstacles, inside, [outside]) is None
-        assert find_path(obstacles, outside, [inside]) is None
-    assert find_path(room, [0.3, 0.0, 0.0], [[-0.3, 0.0, 2.0]]) is not None
-    assert find_path([], [20.0, 0.0, 0.0], [outside]) is not None  # start outside the arena
-    assert (
-        shortest_path(BaseGrid(make_chassis(), [], [], HALL, MARGIN), inside, np.empty((0, 3)))
-        is None
-    )
+        assert find_path(obstacles, inside, outside) is None
+        assert find_path(obstacles, outside, inside) is None
+    assert find_path(room, [0.3, 0.0, 0.0], [-0.3, 0.0, 2.0]) is not None
+    assert find_path([], [20.0, 0.0, 0.0], outside) is not None  # start outside the arena
+    assert find_path([], inside) is None
 
 
 @pytest.fixture(scope="module")
 def path_around_furniture() -> BasePath:
-    path = find_path(make_furniture(), [2.0, -4.3, 1.0], [[2.5, 2.8, 0.0], [1.3, 1.0, 0.0]])
+    path = find_path(make_furniture(), [2.0, -4.3, 1.0], [2.5, 2.8, 0.0], [1.3, 1.0, 0.0])
     assert path is not None
     return path
 
@@ -283,10 +265,8 @@ def test_poses_are_sampled_along_a_path(path_around_furniture: BasePath, steps: 
     waypoints = sample_poses(path, steps, turning=TURNING)
     assert waypoints.shape == (steps, 3)
     np.testing.assert_array_equal(waypoints[-1], path.poses[-1])
-    change = np.diff(path.poses, axis=0)
-    travel = np.concatenate(
-        [[0.0], np.cumsum(np.hypot(change[:, 0], change[:, 1]) + TURNING * np.abs(change[:, 2]))]
-    )
+    change = np.abs(np.diff(path.poses, axis=0))
+    travel = np.append(0.0, np.cumsum(np.hypot(*change.T[:2]) + TURNING * change[:, 2]))
     dense = np.linspace(0.0, travel[-1], 20_001)
     poses = np.column_stack([np.interp(dense, travel, column) for column in path.poses.T])
     nearest = [np.abs(poses - waypoint).max(axis=1).argmin() for waypoint in waypoints]

@@ -56,13 +56,16 @@ def test_blocked_cells_collide_and_few_are_missed(name: str) -> None:
     assert found[1] > 0.4 * colliding[1]  # the base collides in most cells that are missed
 
 
+BASE: list[Shape] = [(coal.Box(0.5, 0.5, 0.4), make_pose(0.0, 0.0, 0.2))]
+LATTICE = Lattice(np.zeros(2), np.full(2, 0.1), 10, np.array([0.0, np.pi]))
+
+
 def test_blocked_cells_of_a_box_near_a_wall() -> None:
     """A cell is blocked if the wall is closer than half the box plus the margin."""
     lattice = Lattice(np.array([0.05, 0.05]), np.array([0.1, 0.1]), 20, np.array([0.0, np.pi / 2]))
     wall: list[Shape] = [(coal.Box(0.2, 10.0, 1.0), make_pose(1.0, 1.0, 0.5))]
-    base, carried = find_colliding_cells(
-        [(coal.Box(0.6, 0.3, 0.4), make_pose(0.0, 0.0, 0.2))], [], wall, lattice, MARGIN
-    )
+    box: list[Shape] = [(coal.Box(0.6, 0.3, 0.4), make_pose(0.0, 0.0, 0.2))]
+    base, carried = find_colliding_cells(box, [], wall, lattice, MARGIN)
     x = 0.05 + 0.1 * np.arange(20)
     for heading, half in ((0, 0.3), (1, 0.15)):
         expected = np.abs(x - 1.0) < half + 0.1 + MARGIN - 1e-9
@@ -70,32 +73,28 @@ def test_blocked_cells_of_a_box_near_a_wall() -> None:
     assert not carried.any()
 
 
-def test_shapes_collide_only_at_common_heights() -> None:
-    lattice = Lattice(np.zeros(2), np.full(2, 0.1), 10, np.array([0.0, np.pi]))
-    table: list[Shape] = [(coal.Box(5.0, 5.0, 0.05), make_pose(0.5, 0.5, 0.775))]
-    low, high = (
-        [(coal.Box(0.5, 0.5, 0.4), make_pose(0.0, 0.0, 0.2))],
-        [(coal.Box(0.1, 0.1, 0.4), make_pose(0.0, 0.0, 0.7))],
-    )
-    base, carried = find_colliding_cells(low, high, table, lattice, MARGIN)
-    assert not base.any()
-    assert carried.all()
-    both, above = find_colliding_cells(
-        low, high, [(coal.Box(5.0, 5.0, 2.0), make_pose(0.5, 0.5, 1.0))], lattice, MARGIN
-    )
-    assert both.all()
-    assert not above.any()  # within the outline of the colliding base
+@pytest.mark.parametrize(
+    ("height", "z", "expected"),
+    [
+        (0.05, 0.775, (False, True)),
+        (2.0, 1.0, (True, False)),  # above the outline of the colliding base
+    ],
+)
+def test_shapes_collide_only_at_common_heights(
+    height: float, z: float, expected: tuple[bool, bool]
+) -> None:
+    table: list[Shape] = [(coal.Box(5.0, 5.0, height), make_pose(0.5, 0.5, z))]
+    high: list[Shape] = [(coal.Box(0.1, 0.1, 0.4), make_pose(0.0, 0.0, 0.7))]
+    for cells, collide in zip(
+        find_colliding_cells(BASE, high, table, LATTICE, MARGIN), expected, strict=True
+    ):
+        assert (cells == collide).all()
 
 
 def test_flat_and_unsupported_shapes_are_ignored() -> None:
-    lattice = Lattice(np.zeros(2), np.full(2, 0.1), 10, np.array([0.0, np.pi]))
     ignored: list[Shape] = [
         (coal.Ellipsoid(1.0, 1.0, 1.0), make_pose(0.5, 0.5, 0.5)),
         (coal.Box(3.0, 3.0, 0.0), make_pose(0.5, 0.5, 0.1)),
     ]
-    base, _ = find_colliding_cells(
-        [(coal.Box(0.5, 0.5, 0.4), make_pose(0.0, 0.0, 0.2))], [], ignored, lattice, MARGIN
-    )
-    assert not base.any()
-    empty, _ = find_colliding_cells([], [], ignored, lattice, MARGIN)
-    assert not empty.any()
+    for base in (BASE, []):
+        assert not find_colliding_cells(base, [], ignored, LATTICE, MARGIN)[0].any()

@@ -6,6 +6,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.base_scenes import compute_distance
 
 from vkc_pin.planning.base_paths.base_clearance import Shape
 from vkc_pin.planning.base_paths.reachable_floor import (
@@ -29,48 +30,40 @@ BASE = [
 ]
 
 
-def test_disc_is_inscribed_in_the_union_of_shapes() -> None:
-    discs = InscribedDiscs(BASE)
-    assert discs.get_radius(0.2) == pytest.approx(0.335)
-    assert discs.get_radius(0.299) == pytest.approx(0.335)
-    assert discs.get_radius(0.05) <= 0.0  # between the wheels
-    assert discs.get_radius(0.35) <= 0.0
+APART = [make_box((0.4, 0.4, 0.2), (0.0, 0.0, 0.1)), make_box((0.4, 0.4, 0.2), (0.0, 0.5, 0.1))]
 
 
-def test_separate_shapes_do_not_extend_the_disc() -> None:
-    apart = [make_box((0.4, 0.4, 0.2), (0.0, 0.0, 0.1)), make_box((0.4, 0.4, 0.2), (0.0, 0.5, 0.1))]
-    assert InscribedDiscs(apart).get_radius(0.1) == pytest.approx(0.195)
+@pytest.mark.parametrize(
+    ("shapes", "height", "radius"),
+    [
+        (BASE, 0.2, 0.335),
+        (BASE, 0.299, 0.335),
+        (BASE, 0.05, 0.0),  # between the wheels
+        (BASE, 0.35, 0.0),
+        (APART, 0.1, 0.195),
+    ],
+)
+def test_disc_is_inscribed_in_the_union_of_shapes(
+    shapes: list[Shape], height: float, radius: float
+) -> None:
+    assert max(InscribedDiscs(shapes).get_radius(height), 0.0) == pytest.approx(radius)
 
 
-def test_obstacles_above_or_below_the_base_are_no_walls() -> None:
-    discs = InscribedDiscs(BASE)
-    assert (
-        discs.make_walls(
-            [
-                make_box((1.0, 1.0, 0.1), (0.0, 0.0, 0.5)),
-                make_box((1.0, 1.0, 0.04), (0.0, 0.0, 0.0)),
-            ]
-        )
-        == []
-    )
-    (plate,) = discs.make_walls(
-        [make_box((1.0, 1.0, 0.01), (0.0, 0.0, 0.225))]
-    )  # thinner than the spacing of levels
+def test_only_obstacles_at_the_height_of_the_base_are_walls() -> None:
+    discs, above, below, thin = InscribedDiscs(BASE), (0.1, 0.5), (0.04, 0.0), (0.01, 0.225)
+    others = [make_box((1.0, 1.0, size), (0.0, 0.0, z)) for size, z in (above, below)]
+    assert discs.make_walls(others) == []
+    # Thinner than the spacing of levels.
+    (plate,) = discs.make_walls([make_box((1.0, 1.0, thin[0]), (0.0, 0.0, thin[1]))])
     assert plate.radius == pytest.approx(0.335)
-
-
-def test_no_walls_without_base_or_obstacles() -> None:
-    assert InscribedDiscs([]).make_walls([make_box((1.0, 1.0, 1.0), (0.0, 0.0, 0.5))]) == []
-    assert InscribedDiscs(BASE).make_walls([]) == []
+    assert InscribedDiscs([]).make_walls(BASE) == []
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_base_collides_in_blocked_cells_at_every_heading(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    placement = pin.SE3(
-        pin.rpy.rpyToMatrix(*rng.uniform(-0.6, 0.6, 3)),
-        np.array([0.1, -0.2, rng.uniform(0.1, 0.3)]),
-    )
+    tilt, height = pin.rpy.rpyToMatrix(*rng.uniform(-0.6, 0.6, 3)), rng.uniform(0.1, 0.3)
+    placement = pin.SE3(tilt, np.array([0.1, -0.2, height]))
     shape = [
         coal.Box(*rng.uniform(0.1, 0.8, 3)),
         coal.Cylinder(0.3, 0.3),
@@ -78,36 +71,24 @@ def test_base_collides_in_blocked_cells_at_every_heading(seed: int) -> None:
         coal.Capsule(0.1, 0.4),
     ][seed]
     cells, count = CellGrid.over(np.full(2, -1.5), np.full(2, 1.5), 0.05), 0
-    request, result = coal.CollisionRequest(), coal.CollisionResult()
     for wall in InscribedDiscs(BASE).make_walls([(shape, placement)]):
         (rows, columns), is_blocked = find_blocked_cells(cells, wall, -0.05 * np.sqrt(0.5))
         x, y = cells.centers()
         for i, j in rng.permutation(np.argwhere(is_blocked))[:40].tolist():
             at = np.array([x[rows][i, 0], y[:, columns][0, j]]) + rng.uniform(-0.025, 0.025, 2)
-            pose = pin.SE3(pin.utils.rotate("z", rng.uniform(-np.pi, np.pi)), np.array([*at, 0.0]))
-            hit = False
-            for part, local in BASE:
-                result.clear()
-                placed = pose * local
-                transforms = [
-                    coal.Transform3s(each.rotation, each.translation)
-                    for each in (placed, placement)
-                ]
-                hit |= coal.collide(part, transforms[0], shape, transforms[1], request, result) > 0
-            assert hit
+            pose = [*at, rng.uniform(-np.pi, np.pi)]
+            assert compute_distance(BASE, [(shape, placement)], pose) <= 0.0
             count += 1
     assert count > 40
 
 
 def test_flood_fill_passes_corners_only_if_allowed() -> None:
-    free = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 0]], bool)
-    begin = np.zeros((3, 3), bool)
+    free, begin = np.diag([True, True, False]), np.zeros((3, 3), bool)
     begin[0, 0] = True
     assert flood_fill(free, begin, corners=True).sum() == 2
     assert flood_fill(free, begin, corners=False).sum() == 1
 
 
 def test_flood_fill_may_begin_in_blocked_cells() -> None:
-    free, begin = np.ones((1, 5), bool), np.zeros((1, 5), bool)
-    free[0, 2], begin[0, 2] = False, True
-    assert flood_fill(free, begin, corners=True).all()
+    begin = np.array([[False, False, True, False, False]])
+    assert flood_fill(~begin, begin, corners=True).all()

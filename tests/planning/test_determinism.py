@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import subprocess
 import sys
-import threading
 from functools import cache
 from pathlib import Path
 
@@ -78,26 +77,3 @@ def test_plan_is_the_same_with_a_tiny_cache() -> None:
     assert compute_hash(plan_door(planner)) == hash_in_process("door")
     assert planner.info().entries <= 1
     assert compute_hash(plan_door(planner)) == hash_in_process("door")
-
-
-@pytest.mark.long
-def test_plans_are_the_same_in_concurrent_threads() -> None:
-    planner = vkc.Planner()
-    found: dict[int, str] = {}
-
-    def work(number: int) -> None:
-        found[number] = compute_hash((plan_door, plan_stick)[number % 2](planner))
-
-    for _ in range(2):  # the second time with a filled cache
-        found.clear()
-        threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        assert found == {
-            0: hash_in_process("door"),
-            1: hash_in_process("stick"),
-            2: hash_in_process("door"),
-            3: hash_in_process("stick"),
-        }

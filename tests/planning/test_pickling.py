@@ -26,29 +26,28 @@ COPY_METHODS = {
     "copy": copy.copy,
     "dask": lambda value: pickle.loads(pytest.importorskip("cloudpickle").dumps(value)),
 }
-ERRORS = [
-    VkcError("it failed"),
-    BuildError("no compiler"),
-    NoProblemError("no free start"),
-    InputError("wrong"),
-    InputError("wrong", file=Path("a.yaml"), line=3, field="size", expected="1", got=2.5),
-    InputError("wrong", expected=(item for item in ()), got=lambda: None),
-    UnknownNameError("link", "wrst", ["base", "wrist"], file="r.yaml", line=2, field="tool"),
-    UnknownNameError("link", "wrst", []),
-]
 
 
-@pytest.mark.parametrize("error", ERRORS, ids=range(len(ERRORS)))
+@pytest.mark.parametrize(
+    "error",
+    [
+        BuildError("no compiler"),
+        NoProblemError("no free start"),
+        InputError("wrong", file=Path("a.yaml"), line=3, field="size", expected="1", got=2.5),
+        InputError("wrong", expected=(item for item in ()), got=lambda: None),
+        UnknownNameError("link", "wrst", ["base", "wrist"], file="r.yaml", line=2, field="tool"),
+        UnknownNameError("link", "wrst", []),
+    ],
+    ids=range(6),
+)
 @pytest.mark.parametrize("method", COPY_METHODS)
 def test_copied_errors_keep_their_text_and_details(method: str, error: VkcError) -> None:
     copied = COPY_METHODS[method](error)
     assert type(copied) is type(error)
     assert (str(copied), copied.args) == (str(error), error.args)
     assert vars(copied).keys() == vars(error).keys()
-    comparable = {
-        key: value for key, value in vars(error).items() if key not in ("expected", "got")
-    }
-    assert vars(copied).items() >= comparable.items()
+    comparable = vars(error).keys() - {"expected", "got"}
+    assert all(vars(copied)[key] == vars(error)[key] for key in comparable)
 
 
 def test_copied_budget_error_keeps_its_status() -> None:
@@ -70,10 +69,8 @@ def make_plan() -> vkc.Plan:
 
 def assert_same_motion(one: vkc.Plan, other: vkc.Plan) -> None:
     assert other.success
-    for name in ("times", "positions"):
-        np.testing.assert_array_equal(
-            getattr(other.trajectory, name), getattr(one.trajectory, name), strict=True
-        )
+    np.testing.assert_array_equal(other.trajectory.times, one.trajectory.times)
+    np.testing.assert_array_equal(other.trajectory.positions, one.trajectory.positions)
     assert repr(other.report) == repr(one.report)
 
 
@@ -81,13 +78,11 @@ def test_process_pool_plans_the_same_motion() -> None:
     plan = make_plan()
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         returned = pool.submit(vkc.plan, plan.scene, STEPS).result(timeout=120)
-        report = pool.submit(
-            vkc.validate, plan.scene, plan.steps, plan.trajectory
-        ).result(timeout=120)  # fmt: skip
+        checked = pool.submit(vkc.validate, plan.scene, plan.steps, plan.trajectory)
+        report = checked.result(timeout=120)
     assert_same_motion(plan, returned)
-    assert repr(report) == repr(plan.report)
     again = vkc.validate(returned.scene, returned.steps, returned.trajectory)
-    assert repr(again) == repr(plan.report)
+    assert repr(again) == repr(report) == repr(plan.report)
 
 
 def test_joblib_plans_the_same_motion() -> None:
@@ -101,14 +96,13 @@ def test_copied_scenes_and_plans_give_the_same_motions_and_reports(method: str) 
     plan, copied = make_plan(), COPY_METHODS[method](make_plan())
     assert copied.scene.document == plan.scene.document
     assert_same_motion(plan, copied)
-    report = vkc.validate(COPY_METHODS[method](plan.scene), STEPS, copied.trajectory)
-    assert repr(report) == repr(plan.report)
-    if method in ("pickle", "deepcopy"):
-        assert_same_motion(plan, vkc.plan(COPY_METHODS[method](plan.scene), STEPS))
+    scene = COPY_METHODS[method](plan.scene)
+    assert repr(vkc.validate(scene, STEPS, copied.trajectory)) == repr(plan.report)
+    assert_same_motion(plan, vkc.plan(scene, STEPS))
 
 
 @pytest.mark.parametrize("method", COPY_METHODS)
-@pytest.mark.parametrize("name", ["household", "fetch", "drawer", "gap_table"])
+@pytest.mark.parametrize("name", ["household", "gap_table"])
 def test_copied_scenes_have_the_same_shapes_and_stay_read_only(name: str, method: str) -> None:
     scene = vkc.load_scene(name)
     copied: Any = COPY_METHODS[method](scene)
@@ -118,9 +112,9 @@ def test_copied_scenes_have_the_same_shapes_and_stay_read_only(name: str, method
     with pytest.raises(TypeError):
         copied.objects["new"] = None
     for key, placed in scene.objects.items():
-        item = COPY_METHODS[method](placed.object)
-        assert list(item.attachments) == list(placed.object.attachments)
-        assert COPY_METHODS[method](placed).object.name == copied.objects[key].object.name
+        same = COPY_METHODS[method](placed).object
+        assert list(same.attachments) == list(placed.object.attachments)
+        assert same.name == copied.objects[key].object.name
     robot = COPY_METHODS[method](scene.robot)
     np.testing.assert_array_equal(robot.home, scene.robot.home)
     assert robot.model == scene.robot.model

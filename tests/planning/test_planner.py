@@ -330,6 +330,8 @@ def test_another_robot_reaches_a_pose() -> None:
         ({"max_evaluations": 0}, "max_evaluations", "at least 1"),
         ({"options": {"dt": 0.1}}, "options", "Options"),
         ({"seed": -1}, "seed", "-1"),
+        ({"perturbation": -0.1}, "perturbation", "-0.1"),
+        ({"perturbation": float("inf")}, "perturbation", "inf"),
         ({"steps": 5}, "steps", "a list of steps"),
         ({"steps": vkc.GoTo(0.0, 0.0)}, "steps", "a list of steps"),
         ({"steps": []}, "steps", "at least one step"),

@@ -19,14 +19,11 @@ points = st.tuples(*[st.floats(-3.0, 3.0)] * 3)
 def test_target_is_centred_and_up_points_up(
     position: tuple[float, ...], target: tuple[float, ...], up: tuple[float, ...]
 ) -> None:
-    ahead = np.subtract(target, position)
-    assume(
-        np.linalg.norm(np.cross(ahead, up))
-        > 1e-2 * max(1.0, np.linalg.norm(ahead) * np.linalg.norm(up))
-    )
+    distance = np.linalg.norm(ahead := np.subtract(target, position))
+    sine = np.linalg.norm(np.cross(ahead, up))
+    assume(sine > 1e-2 * max(1.0, distance * np.linalg.norm(up)))
     place = Camera("eye", BASE, position, target, up=up).placement  # type: ignore[arg-type]
-    in_camera = place.inverse().act(np.array(target))
-    np.testing.assert_allclose(in_camera, [0.0, 0.0, -np.linalg.norm(ahead)], atol=1e-9)
+    np.testing.assert_allclose(place.actInv(np.array(target)), [0.0, 0.0, -distance], atol=1e-9)
     above = place.rotation.T @ np.array(up)
     assert above[1] > 0.0
     assert above[0] == pytest.approx(0.0, abs=1e-9)
@@ -41,12 +38,14 @@ def test_camera_with_undefined_orientation_is_rejected(target: tuple[float, floa
 
 def test_frames_resolve_to_robot_frames() -> None:
     robot = load_robot("husky_ur5e")
-    pose = {"position": (0.0, 0.0, 1.0), "target": (1.0, 0.0, 0.0)}
-    assert Camera("eye", HAND, **pose).find_frame(robot) == robot.tool_frame
-    assert Camera("eye", BASE, **pose).find_frame(robot) == robot.model.names[1]
-    assert Camera("eye", "wrist_3_link", **pose).find_frame(robot) == "wrist_3_link"
+
+    def find_frame(name: str) -> str:
+        return Camera("eye", name, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)).find_frame(robot)
+
+    expected = [robot.tool_frame, robot.model.names[1], "wrist_3_link"]
+    assert [find_frame(name) for name in (HAND, BASE, "wrist_3_link")] == expected
     with pytest.raises(vkc.UnknownNameError, match="did you mean 'wrist_3_link'"):
-        Camera("eye", "wrist_3_lnk", **pose).find_frame(robot)
+        find_frame("wrist_3_lnk")
 
 
 HEAD = Camera("head", "base", (0.0, 0.0, 1.5), (1.2, 0.0, 0.6), width=96, height=64)
@@ -74,14 +73,11 @@ def images() -> Images:
 
 def test_images_have_expected_shapes_and_types(images: Images) -> None:
     formats = {name: (pixels.shape, str(pixels.dtype)) for name, pixels in images.pictures.items()}
-    assert formats == {
-        "head_image": ((3, 64, 96, 3), "uint8"),
-        "head_depth": ((3, 64, 96), "uint16"),
-        "head_segmentation": ((3, 64, 96), "uint16"),
-        "wrist_image": ((3, 48, 48, 3), "uint8"),
-        "wrist_depth": ((3, 48, 48), "uint16"),
-        "wrist_segmentation": ((3, 48, 48), "uint16"),
-    }
+    expected: dict[str, tuple[tuple[int, ...], str]] = {}
+    for name, size in (("head", (3, 64, 96)), ("wrist", (3, 48, 48))):
+        expected[f"{name}_image"] = ((*size, 3), "uint8")
+        expected |= {f"{name}_{kind}": (size, "uint16") for kind in ("depth", "segmentation")}
+    assert formats == expected
     assert {"", ROBOT, "floor", "drawer.tray", "counter"} <= set(images.segments)
 
 
@@ -94,27 +90,27 @@ def test_images_change_only_with_time(images: Images) -> None:
 def test_depth_of_floor_pixels_is_consistent(images: Images) -> None:
     """Floor pixels, projected back along their rays, lie at height 0 and all others above."""
     executed = simulate_drawer()
-    world = Replay(executed.scene, executed.trajectory.times, executed.rows)
+    robot, world = (
+        executed.scene.robot,
+        Replay(executed.scene, executed.trajectory.times, executed.rows),
+    )
+    row = world.compute_positions(executed.trajectory, executed.planned.times[-1:])[0]
     data = world.model.createData()
-    row = world.compute_positions(executed.trajectory, np.array([executed.planned.times[-1]]))[0]
     pin.framesForwardKinematics(world.model, data, world.coordinates.q(row))
     for camera, least in ((HEAD, 300), (WRIST, 5)):
-        camera_placement = (
-            data.oMf[world.model.getFrameId(camera.find_frame(executed.scene.robot))]
-            * camera.placement
-        )
+        frame = data.oMf[world.model.getFrameId(camera.find_frame(robot))]
+        place = frame * camera.placement
         depth = images.pictures[f"{camera.name}_depth"][2].astype(float) / 1000.0
         segments = images.pictures[f"{camera.name}_segmentation"][2]
         v, u = np.mgrid[: camera.height, : camera.width]
         focal = camera.height / 2.0 / np.tan(np.radians(camera.fov) / 2.0)
         x, y = (u + 0.5 - camera.width / 2.0) / focal, -(v + 0.5 - camera.height / 2.0) / focal
-        points = (
-            np.stack([x, y, -np.ones_like(x)], axis=-1) * depth[..., None]
-        ) @ camera_placement.rotation.T + camera_placement.translation
+        rays = np.stack([x, y, -np.ones_like(x)], axis=-1)
+        heights = depth * (rays @ place.rotation[2]) + place.translation[2]
         floor = segments == images.segments.index("floor")
         assert floor.sum() >= least
-        assert np.abs(points[floor][:, 2]).max() < 0.01
-        assert points[(segments > 0) & ~floor][:, 2].min() > -0.01
+        assert np.abs(heights[floor]).max() < 0.01
+        assert heights[(segments > 0) & ~floor].min() > -0.01
 
 
 def test_images_round_trip_through_bytes(images: Images) -> None:

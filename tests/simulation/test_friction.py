@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,6 @@ from vkc_pin.simulation.execution import simulate
 from vkc_pin.simulation.friction import find_fingers, insert_pauses, limit_finger_servos
 from vkc_pin.simulation.physics import Physics
 from vkc_pin.simulation.servos import make_servos
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
 
@@ -29,15 +29,11 @@ def test_pads_slide_without_a_described_gripper() -> None:
     world = World(vkc.load_scene("drawer"))
     fingers = find_fingers(world, Physics(closing_force=100.0))
     assert fingers.sides is not None
-    assert fingers.sides.travel == pytest.approx(
-        0.043, abs=5e-4
-    )  # half the opening in the robot's README
-    names = [{world.collision_labels[k] for k in side} for side in fingers.sides.shapes]
-    assert names == [{"gripper_right_finger"}, {"gripper_left_finger"}]
-    assert [len(side) for side in fingers.sides.shapes] == [
-        1,
-        1,
-    ]  # the pads, not the linkages behind them
+    # Half the opening in the robot's README.
+    assert fingers.sides.travel == pytest.approx(0.043, abs=5e-4)
+    # The pads, not the linkages behind them.
+    names = [[world.collision_labels[k] for k in side] for side in fingers.sides.shapes]
+    assert names == [["gripper_right_finger"], ["gripper_left_finger"]]
     assert [servo.limit for servo in fingers.servos] == [100.0, 100.0]
 
 
@@ -48,16 +44,9 @@ def test_described_gripper_uses_its_own_joints(tmp_path: Path) -> None:
     np.testing.assert_allclose(fingers.closed, 0.0)
     np.testing.assert_allclose(fingers.open, 0.04)
     servos = make_servos(world, world.start[None], Physics())
-    limits = {
-        servo.coordinate: servo.limit
-        for servo in limit_finger_servos(servos, fingers, world, Physics(closing_force=7.0))
-    }
-    assert [limits[name] for name in fingers.names] == [7.0, 7.0]
-    assert all(
-        limits[servo.coordinate] == servo.limit
-        for servo in servos
-        if servo.coordinate not in fingers.names
-    )
+    weak = limit_finger_servos(servos, fingers, world, Physics(closing_force=7.0))
+    expected = {one.coordinate: one.limit for one in servos} | dict.fromkeys(fingers.names, 7.0)
+    assert {one.coordinate: one.limit for one in weak} == expected
 
 
 def test_hand_without_fingers_is_rejected() -> None:
@@ -109,9 +98,7 @@ def test_cup_is_carried_and_placed() -> None:
 
 def test_described_gripper_closes_its_own_fingers(tmp_path: Path) -> None:
     scene = write_cheeks_scene(write_gripper(tmp_path), opening=0.03)
-    plan = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.15})])
-    assert plan.success, plan.summary()
-    result = plan.simulate(grasp="friction")
+    result = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.15})]).simulate(grasp="friction")
     assert result.ok, result.summary()
     assert not any("slide towards" in note for note in result.notes)
     # Fingers close on the handle, 20 mm apart, and slightly further as contacts are compliant.
@@ -121,9 +108,8 @@ def test_described_gripper_closes_its_own_fingers(tmp_path: Path) -> None:
 
 def test_object_grasped_at_the_start_stays_in_the_hand() -> None:
     scene = make_grasping_scene()
-    result = simulate(
-        scene, [vkc.Grasp("stick")], make_stationary_motion(scene, 1.5), grasp="friction"
-    )
+    motion = make_stationary_motion(scene, 1.5)
+    result = simulate(scene, [vkc.Grasp("stick")], motion, grasp="friction")
     (grip,) = result.grips
     assert grip.broken is None, result.summary()
     assert grip.force == pytest.approx(9.81 * 0.4, rel=0.3)
@@ -131,17 +117,15 @@ def test_object_grasped_at_the_start_stays_in_the_hand() -> None:
 
 
 @pytest.mark.parametrize("make", [plan_drawer, make_fake_plan])
-def test_pause_is_inserted_at_waypoint(make: object) -> None:
-    motion: Trajectory = make().trajectory  # type: ignore[operator]
+def test_pause_is_inserted_at_waypoint(make: Callable[[], vkc.Plan]) -> None:
+    """The pause belongs to the phase that begins at the waypoint."""
+    motion = make().trajectory
     at = motion.phases[1].first
-    time = float(motion.times[at])
+    time, end = float(motion.times[at]), motion.times[-1]
     longer = insert_pauses(motion, [at, at], 0.5)
     assert len(longer.times) == len(motion.times) + 1
-    assert longer.times[-1] == pytest.approx(motion.times[-1] + 0.5)
-    before, after = (
-        np.linspace(0.0, time - 1e-6, 50),
-        np.linspace(time + 1e-6, motion.times[-1], 50),
-    )
+    assert longer.times[-1] == pytest.approx(end + 0.5)
+    before, after = np.linspace(0.0, time - 1e-6, 50), np.linspace(time + 1e-6, end, 50)
     for method in ("at", "velocity", "acceleration"):
         one, other = getattr(longer, method), getattr(motion, method)
         np.testing.assert_allclose(one(before), other(before), atol=1e-9)
@@ -149,11 +133,8 @@ def test_pause_is_inserted_at_waypoint(make: object) -> None:
     inside = time + np.linspace(1e-6, 0.5 - 1e-6, 20)
     np.testing.assert_allclose(longer.at(inside), np.tile(motion.at(time), (20, 1)), atol=1e-12)
     assert np.abs(longer.velocity(inside)).max() < 1e-9
-    # The pause belongs to the phase that begins at the waypoint.
-    assert [(p.first, p.last) for p in longer.phases][:2] == [
-        (0, at),
-        (at, motion.phases[1].last + 1),
-    ]
+    first, second = longer.phases[:2]
+    assert (first.last, second.first, second.last) == (at, at, motion.phases[1].last + 1)
     assert [p.holds for p in longer.phases] == [p.holds for p in motion.phases]
 
 

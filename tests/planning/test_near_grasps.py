@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from helpers.drawers import add_boxes, load_drawer_scene
 from oracle.judge import judge
 
 import vkc_pin as vkc
@@ -19,53 +19,39 @@ BAR = 0.755  # [m] height of the drawer's bar
 STEPS = [vkc.Actuate("drawer", {"slide": 0.3}, "handle")]
 
 
-def add_ledge(
-    folder: Path, *, gap: float, clearance: float | None = None, is_link: bool = True
-) -> vkc.Scene:
-    """Return the drawer with a ledge `gap` above the open hand: cabinet link or obstacle."""
-    size, at = [0.1, 0.6, 0.02], [-0.1, 0.0, BAR + FINGERS + gap + 0.01]
+def add_ledge(folder: Path, *, gap: float, clearance: float | None = None) -> vkc.Scene:
+    """Return the drawer whose cabinet has a ledge `gap` above the open hand."""
+    box = (
+        f'<collision><origin xyz="-0.1 0 {BAR + FINGERS + gap + 0.01}"/>'
+        '<geometry><box size="0.1 0.6 0.02"/></geometry></collision>'
+    )
+    glue = '<joint name="glue" type="fixed"><parent link="cabinet"/><child link="ledge"/></joint>'
     urdf = (OBJECTS / "drawer.urdf").read_text()
-    if is_link:
-        shape = '<geometry><box size="0.1 0.6 0.02"/></geometry>'
-        box = f'<collision><origin xyz="{at[0]} 0 {at[2]}"/>{shape}</collision>'
-        glue = (
-            '<joint name="glue" type="fixed"><parent link="cabinet"/><child link="ledge"/></joint>'
-        )
-        urdf = urdf.replace("</robot>", f'<link name="ledge">{box}</link>{glue}</robot>')
+    urdf = urdf.replace("</robot>", f'<link name="ledge">{box}</link>{glue}</robot>')
     (folder / "drawer.urdf").write_text(urdf)
     description: dict[str, Any] = yaml.safe_load((OBJECTS / "drawer.yaml").read_text())
-    description["attachments"][0] |= {} if clearance is None else {"clearance": clearance}
+    if clearance is not None:
+        description["attachments"][0]["clearance"] = clearance
     (folder / "drawer.yaml").write_text(yaml.safe_dump(description))
-    shutil.copy(OBJECTS.parent / "drawer.yaml", folder / "scene.yaml")
-    scene = vkc.load_scene(folder / "scene.yaml").document
-    scene["objects"][0]["type"] = "drawer.yaml"
-    place = scene["objects"][0]["position"]
-    obstacle = {
-        "name": "ledge",
-        "type": "box",
-        "size": size,
-        "position": [place[0] + at[0], place[1], at[2]],
-    }
-    scene["obstacles"] += [] if is_link else [obstacle]
-    return vkc.Scene.from_document(scene, folder)
+    document = load_drawer_scene().document
+    (drawer,) = document["objects"]
+    objects = [{**drawer, "type": "drawer.yaml"}]
+    return vkc.Scene.from_document({**document, "objects": objects}, folder)
 
 
 def test_handle_close_to_another_link_of_its_object_is_grasped(tmp_path: Path) -> None:
-    scene = add_ledge(tmp_path, gap=0.012)
-    plan = vkc.plan(scene, STEPS)
+    plan = vkc.plan(add_ledge(tmp_path, gap=0.012), STEPS)
     assert plan.success, plan.summary()
     assert 0.0 < plan.report.clearance < 0.0125  # the hand passes close to the ledge
     file = plan.save(tmp_path / "plan.npz")
     assert judge(file).agrees
-    stricter = add_ledge(
-        tmp_path, gap=0.012, clearance=0.016
-    )  # overwrites the files of the plan's scene
+    # Overwrites the files of the plan's scene.
+    stricter = add_ledge(tmp_path, gap=0.012, clearance=0.016)
     found = {(one.rule, one.subject.partition(" - ")[2]) for one in judge(file).found}
     assert found == {("clearance", "drawer.ledge")}
     violations = vkc.validate(stricter, STEPS, plan.trajectory).violations
-    assert {(one.constraint, "drawer.ledge" in one.subject) for one in violations} == {
-        ("clearance", True)
-    }
+    assert {one.constraint for one in violations} == {"clearance"}
+    assert all("drawer.ledge" in one.subject for one in violations)
     add_ledge(tmp_path, gap=0.012)  # restored, since the plan is judged again
 
 
@@ -75,19 +61,15 @@ def test_handle_close_to_another_link_of_its_object_is_grasped(tmp_path: Path) -
 def test_plan_fails_without_the_clearance_of_the_attachment(
     tmp_path: Path, gap: float, clearance: float | None
 ) -> None:
-    plan = vkc.plan(
-        add_ledge(tmp_path, gap=gap, clearance=clearance),
-        STEPS,
-        options=vkc.Options(max_restarts=1),
-    )
+    scene = add_ledge(tmp_path, gap=gap, clearance=clearance)
+    plan = vkc.plan(scene, STEPS, options=vkc.Options(max_restarts=1))
     assert not plan.success
     assert any("drawer.ledge" in str(one) for one in plan.report.violations)
     if clearance is not None:  # 4 mm are missing, also in the model
         assert len({row["penalty"] for row in plan.history}) > 2
 
 
-def test_obstacles_keep_the_full_clearance(tmp_path: Path) -> None:
-    plan = vkc.plan(
-        add_ledge(tmp_path, gap=0.012, is_link=False), STEPS, options=vkc.Options(max_restarts=1)
-    )
-    assert not plan.success
+def test_obstacles_keep_the_full_clearance() -> None:
+    place = (1.83, 0.0, BAR + FINGERS + 0.012 + 0.01)
+    scene = add_boxes(load_drawer_scene(), ledge=((0.1, 0.6, 0.02), place))
+    assert not vkc.plan(scene, STEPS, options=vkc.Options(max_restarts=1)).success

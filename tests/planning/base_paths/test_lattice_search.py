@@ -152,7 +152,12 @@ def make_task(
     """Return a small room with obstacles, a free start, three goals and their costs."""
     rng = np.random.default_rng(seed)
     rod: list[Shape] = [(coal.Box(0.1, 0.8, 0.05), make_pose(0.2, 0.0, 0.7))]
-    obstacles = make_clutter(int(rng.integers(10_000)), 7, reach=1.8)
+    obstacles = make_clutter(int(rng.integers(10_000)), 4, reach=1.8)
+    # Ellipsoids block no cells in advance: only exact checks of a path find them.
+    obstacles += [
+        (coal.Ellipsoid(0.1, 0.15, 0.3), make_pose(*rng.uniform(-1.8, 1.8, 2), 0.2))
+        for _ in range(8)
+    ]
     grid = BaseGrid(
         make_chassis(0.7, 0.4),
         rod if seed % 2 else [],
@@ -168,7 +173,7 @@ def make_task(
 
 
 @pytest.mark.parametrize(
-    "seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))]
+    "seed", range(10)
 )
 def test_cheapest_path_is_found(seed: int) -> None:
     grid, start, goals, extra = make_task(seed)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import functools
 import json
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import describe_box
-from helpers.drawers import make_drawer_scene
+from helpers.drawers import make_drawer_scene, replace_scene_fields
 from helpers.drives import make_hall
 
 import vkc_pin as vkc
@@ -35,31 +34,27 @@ SLOW = vkc.Constraint(
 ELBOW = vkc.Cost("elbow", lambda s: (s.coordinate("elbow_joint") - 1.5) ** 2, weight=0.1)
 
 
+def make_cup_scene(*obstacles: dict[str, Any]) -> vkc.Scene:
+    """Return a hall with a cup on a table, and more obstacles."""
+    table = describe_box("table", [0.6, 0.6, 0.02], [1.4, 0.0, 0.49])
+    cup = {"name": "cup", "type": "cup", "position": [1.35, 0.0, 0.501]}
+    return replace_scene_fields(make_hall(obstacles=[table, *obstacles]), objects=[cup])
+
+
 @cache
 def make_room() -> vkc.Scene:
-    obstacles = [
-        describe_box("table", [0.6, 0.6, 0.02], [1.4, 0.0, 0.49]),
+    return make_cup_scene(
         describe_box("other", [0.6, 0.6, 0.02], [1.4, 1.2, 0.49]),
-    ]
-    scene = make_hall(
-        obstacles=[*obstacles, describe_box("wall", [1.0, 0.05, 0.9], [1.5, 0.6, 0.45])]
-    )
-    return vkc.Scene.from_document(
-        {
-            **scene.document,
-            "objects": [{"name": "cup", "type": "cup", "position": [1.35, 0.0, 0.501]}],
-        }
+        describe_box("wall", [1.0, 0.05, 0.9], [1.5, 0.6, 0.45]),
     )
 
 
-@cache
-def plan_without_terms(seed: int = 0) -> vkc.Plan:
-    return check_success(vkc.plan(make_room(), STEPS, options=SHORT, seed=seed))
+def plan_cup(*terms: vkc.Constraint | vkc.Cost, seed: int = 0) -> vkc.Plan:
+    """Plan to place the cup on the other table."""
+    return check_success(vkc.plan(make_room(), STEPS, options=SHORT, seed=seed, terms=terms))
 
 
-@cache
-def plan_upright(seed: int = 0) -> vkc.Plan:
-    return check_success(vkc.plan(make_room(), STEPS, options=SHORT, seed=seed, terms=[UPRIGHT]))
+plan_without_terms = cache(plan_cup)
 
 
 def check_success(plan: vkc.Plan) -> vkc.Plan:
@@ -81,9 +76,7 @@ def compute_placements(
 def compute_min_cosine(plan: vkc.Plan) -> float:
     """Return the smallest cosine of the cup's tilt at 1000 times."""
     times = np.linspace(0.0, plan.trajectory.times[-1], 1000)
-    return min(
-        float(placement.rotation[2, 2]) for placement in compute_placements(plan, "cup.cup", times)
-    )
+    return min(float(one.rotation[2, 2]) for one in compute_placements(plan, "cup.cup", times))
 
 
 def compute_speeds(plan: vkc.Plan, frame: str) -> tuple[np.ndarray, np.ndarray]:
@@ -94,7 +87,7 @@ def compute_speeds(plan: vkc.Plan, frame: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_speed_limit_near_a_point() -> None:
-    plan = check_success(vkc.plan(make_room(), STEPS, options=SHORT, terms=[SLOW]))
+    plan = plan_cup(SLOW)
 
     def compute_excess(plan: vkc.Plan) -> float:
         speed, positions = compute_speeds(plan, "tool")
@@ -108,57 +101,44 @@ def test_speed_limit_near_a_point() -> None:
 @pytest.mark.long
 def test_cost_changes_the_posture() -> None:
     def compute_mean_cost(*terms: vkc.Cost) -> float:
-        elbows = [
-            check_success(
-                vkc.plan(make_room(), STEPS, options=SHORT, terms=terms, seed=seed)
-            ).trajectory.column("elbow_joint")
-            for seed in range(2)
-        ]
+        plans = [plan_cup(*terms, seed=seed) for seed in range(2)]
+        elbows = [plan.trajectory.column("elbow_joint") for plan in plans]
         return float(np.mean([((elbow - 1.5) ** 2).mean() for elbow in elbows]))
 
     assert compute_mean_cost(ELBOW) < 0.7 * compute_mean_cost()
 
 
 def test_constraint_on_a_link_of_a_fixed_object() -> None:
-    """The constraint slows down the tray, not the hand."""
-    gently = vkc.Constraint("gently", lambda s: ca.norm_2(s.velocity("drawer.tray")), upper=0.03)
-    steps, options = (
-        [vkc.Actuate("drawer", {"slide": 0.3}, "handle_free")],
-        vkc.Options(reach_waypoints=16, move_waypoints=12),
-    )
-    plan = check_success(vkc.plan(make_drawer_scene(), steps, options=options, terms=[gently]))
-    fast = vkc.Constraint(
-        "fast", lambda s: ca.norm_2(s.velocity("drawer.tray")), upper=9.0
-    )  # inactive, but prevents retiming as well
-    usual = check_success(vkc.plan(make_drawer_scene(), steps, options=options, terms=[fast]))
-    assert compute_speeds(usual, "drawer.tray")[0].max() > 0.1
-    assert compute_speeds(plan, "drawer.tray")[0].max() <= 0.031
-    assert compute_speeds(plan, "tool")[0].max() > 0.5
-    time, usual_time = (
-        trajectory.times[trajectory.phases[0].last]
-        for trajectory in (plan.trajectory, usual.trajectory)
-    )
-    assert time == pytest.approx(usual_time)
+    """The constraint slows down the tray, not the hand. An inactive one prevents retiming, too."""
+    steps = [vkc.Actuate("drawer", {"slide": 0.3}, "handle_free")]
+    options = vkc.Options(reach_waypoints=16, move_waypoints=12)
+    plans = []
+    for limit in (0.03, 9.0):
+        gently = vkc.Constraint(
+            "gently", lambda s: ca.norm_2(s.velocity("drawer.tray")), upper=limit
+        )
+        found = vkc.plan(make_drawer_scene(), steps, options=options, terms=[gently])
+        plans.append(check_success(found))
+    slow, fast = (compute_speeds(plan, "drawer.tray")[0].max() for plan in plans)
+    assert slow <= 0.031
+    assert fast > 0.1
+    assert compute_speeds(plans[0], "tool")[0].max() > 0.5
+    motions = [plan.trajectory for plan in plans]
+    slow, fast = (motion.times[motion.phases[0].last] for motion in motions)
+    assert slow == pytest.approx(fast), "the hand reaches the handle as fast"
 
 
 @pytest.mark.parametrize(
-    "planner",
+    "options",
     [
-        vkc.plan,
-        pytest.param(functools.partial(vkc.plan, window=2), marks=pytest.mark.long),
-        pytest.param(functools.partial(vkc.plan, simultaneous=False), marks=pytest.mark.long),
+        {},
+        pytest.param({"window": 2}, marks=pytest.mark.long),
+        pytest.param({"simultaneous": False}, marks=pytest.mark.long),
     ],
 )
-def test_terms_hold_for_several_steps(planner: Callable[..., vkc.Plan]) -> None:
+def test_terms_hold_for_several_steps(options: dict[str, Any]) -> None:
     """`during` restricts each constraint to a phase of one step."""
-    obstacles = [
-        describe_box("table", [0.6, 0.6, 0.02], [1.4, 0.0, 0.49]),
-        describe_box("other", [0.6, 0.6, 0.02], [-0.5, 2.2, 0.79]),
-    ]
-    document = {
-        **make_hall(obstacles=obstacles).document,
-        "objects": [{"name": "cup", "type": "cup", "position": [1.35, 0.0, 0.501]}],
-    }
+    scene = make_cup_scene(describe_box("other", [0.6, 0.6, 0.02], [-0.5, 2.2, 0.79]))
     steps = [vkc.Place("cup", [-0.5, 2.1, 0.801]), vkc.GoTo(0.0, 0.0)]
     level = vkc.Constraint(
         "level",
@@ -170,9 +150,7 @@ def test_terms_hold_for_several_steps(planner: Callable[..., vkc.Plan]) -> None:
     gently = vkc.Constraint(
         "gently", lambda s: ca.norm_2(s.velocity("base_link")), upper=0.2, during="go to"
     )
-    plan = check_success(
-        planner(vkc.Scene.from_document(document), steps, options=SHORT, terms=[level, gently])
-    )
+    plan = check_success(vkc.plan(scene, steps, options=SHORT, terms=[level, gently], **options))
     assert [term.name for term in plan.terms] == ["level", "gently"]
     assert compute_min_cosine(plan) >= 0.9995 - 1e-4
     (drive,) = (phase for phase in plan.trajectory.phases if phase.name == "go to")
@@ -185,14 +163,15 @@ def test_initial_guess_may_violate_a_constraint() -> None:
     over = vkc.Constraint(
         "elbow over", lambda s: s.coordinate("elbow_joint"), lower=1.0, during="place cup"
     )
-    plan = check_success(vkc.plan(make_room(), STEPS, options=SHORT, terms=[over]))
+    plan = plan_cup(over)
     placing = next(phase for phase in plan.trajectory.phases if phase.name == "place cup")
-    assert (
-        plan.trajectory.column("elbow_joint")[placing.first + 2 : placing.last + 1].min()
-        >= 1.0 - 1e-3
-    )
+    elbow = plan.trajectory.column("elbow_joint")
+    assert elbow[placing.first + 2 : placing.last + 1].min() >= 1.0 - 1e-3
     assert plan_without_terms().trajectory.column("elbow_joint").max() < 0.0
-    # Only this constraint represents the obstacle, and the initial guess passes through it.
+
+
+def test_constraint_can_represent_an_obstacle() -> None:
+    """The initial guess passes through it."""
     middle = np.array([1.0, 0.02])
     around = vkc.Constraint(
         "around", lambda s: ca.sumsqr(s.position("base_link")[:2] - middle), lower=0.8**2
@@ -204,17 +183,12 @@ def test_initial_guess_may_violate_a_constraint() -> None:
 
 def test_infeasible_constraint_is_reported() -> None:
     never = vkc.Constraint("never", lambda s: s.position("tool")[2], lower=9.0)
-    plan = vkc.plan(
-        make_hall(),
-        [vkc.GoTo(0.5, 0.0)],
-        options=vkc.Options(reach_waypoints=5, max_restarts=1, max_outer=4),
-        terms=[never],
-    )
+    options = vkc.Options(reach_waypoints=5, max_restarts=1, max_outer=4)
+    plan = vkc.plan(make_hall(), [vkc.GoTo(0.5, 0.0)], options=options, terms=[never])
     assert not plan.success
     assert "term never:" in plan.summary()
-    (violation,) = [
-        v for v in plan.report.violations if v.constraint == "term" and "between" not in v.detail
-    ]
+    violations = [one for one in plan.report.violations if one.constraint == "term"]
+    (violation,) = (one for one in violations if "between" not in one.detail)
     assert violation.amount > 7.0
 
 
@@ -222,33 +196,28 @@ def test_infeasible_constraint_is_reported() -> None:
 def test_plans_are_saved_with_their_terms(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert compute_min_cosine(plan_upright()) >= 0.97
-    file = plan_upright().save(tmp_path / "cup.npz")
+    plan = plan_cup(UPRIGHT)
+    assert compute_min_cosine(plan) >= 0.97
+    file = plan.save(tmp_path / "cup.npz")
     loaded = vkc.Plan.load(file)
-    assert loaded.terms == plan_upright().terms
-    assert vkc.validate(
-        loaded.scene, loaded.steps, loaded.trajectory, loaded.options, loaded.terms
-    ).ok
+    assert loaded.terms == plan.terms
     assert main(["check", str(file)]) == 0
-    again = check_success(
-        vkc.plan(loaded.scene, loaded.steps, options=loaded.options, terms=loaded.terms)
-    )
-    np.testing.assert_allclose(
-        again.trajectory.positions, plan_upright().trajectory.positions, atol=1e-6
-    )
-    assert plan_without_terms().terms == ()
+    again = plan_cup(*loaded.terms)
+    np.testing.assert_allclose(again.trajectory.positions, plan.trajectory.positions, atol=1e-6)
     with np.load(file, allow_pickle=False) as archive:
-        data = {name: archive[name] for name in archive.files}
+        data = dict(archive)
     about = json.loads(str(data["about"]))
+
+    def save() -> str:
+        np.savez(file, **{**data, "about": np.array(json.dumps(about))})
+        return str(file)
+
     about["terms"][0] |= {"lower": 0.99999, "tolerance": 1e-6}
-    np.savez(file, **{**data, "about": np.array(json.dumps(about))})
     capsys.readouterr()
-    assert main(["check", str(file)]) == 1
+    assert main(["check", save()]) == 1
     assert "term upright cup:" in capsys.readouterr().out
     about["terms"][0]["expression"]["code"][0][0] = "open"
-    np.savez(file, **{**data, "about": np.array(json.dumps(about))})
-    assert main(["check", str(file)]) == 2
+    assert main(["check", save()]) == 2
     assert "not a saved term" in capsys.readouterr().err
     del about["terms"]  # a plan from before terms existed
-    np.savez(file, **{**data, "about": np.array(json.dumps(about))})
-    assert vkc.Plan.load(file).terms == ()
+    assert vkc.Plan.load(save()).terms == ()

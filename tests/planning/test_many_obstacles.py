@@ -16,7 +16,7 @@ from vkc_pin.planning.chain.contacts import ContactModel
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.planner import plan
 from vkc_pin.world.collision.distances import count_distance_queries
-from vkc_pin.world.models.shapes import compute_clearance, compute_shape_distance
+from vkc_pin.world.models.shapes import compute_shape_distance
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Reach, Release
@@ -67,33 +67,26 @@ def check_contacts(
 ) -> None:
     """Compare contacts within `reach`, or the nearest of them, with the distances of all pairs."""
     z = sample_configurations(problem.chain.lower, problem.chain.upper, 8, rng)
-    part, waypoints = model.phases[phase], np.full(len(z), problem.ends[phase])
+    part, end = model.phases[phase], problem.ends[phase]
     distances = compute_all_distances(problem, part, z)
-    contacts = model.evaluate(z, waypoints, reach=reach, nearest=nearest)
+    contacts = model.evaluate(z, np.full(len(z), end), reach=reach, nearest=nearest)
     indices = {tuple(pair): k for k, pair in enumerate(part.pairs.tolist())}
     index = np.array([indices[tuple(pair)] for pair in contacts.pair.tolist()], int)
-    pairs, ends = np.arange(len(part.pairs)), np.full(len(part.pairs), problem.ends[phase])
-    margins = np.array(
-        [
-            part.margin_table.compute_margins(pairs, ends, z, np.full(len(pairs), row))
-            for row in range(len(z))
-        ]
-    )
-    assert len(set(zip(contacts.waypoint.tolist(), index.tolist(), strict=True))) == len(index)
-    np.testing.assert_allclose(
-        contacts.distance, distances[contacts.waypoint, index], rtol=0.0, atol=COAL_TOLERANCE
-    )
-    np.testing.assert_array_equal(contacts.margin, margins[contacts.waypoint, index])
+    every = np.indices(distances.shape)  # rows and pairs
+    margins = part.margin_table.compute_margins(
+        every[1].ravel(), np.full(distances.size, end), z, every[0].ravel()
+    ).reshape(distances.shape)
+    at = contacts.waypoint, index
+    assert len(set(zip(*(each.tolist() for each in at), strict=True))) == len(index)
+    np.testing.assert_allclose(contacts.distance, distances[at], rtol=0.0, atol=COAL_TOLERANCE)
+    np.testing.assert_array_equal(contacts.margin, margins[at])
     for row in range(len(z)):
-        found = (
-            contacts.distance[contacts.waypoint == row] - contacts.margin[contacts.waypoint == row]
-        )
+        found = (contacts.distance - contacts.margin)[contacts.waypoint == row]
         assert np.all(np.diff(found) >= 0.0)
         is_expected = (distances[row] < reach) & (margins[row] > -np.inf)
         expected = np.sort((distances[row] - margins[row])[is_expected])[:nearest]
-        is_unambiguous = (
-            np.abs(distances[row] - reach) > COAL_TOLERANCE
-        ).all()  # a pair at the limit of the reach may be included or not
+        # A pair at the limit of the reach may be included or not.
+        is_unambiguous = (np.abs(distances[row] - reach) > COAL_TOLERANCE).all()
         assert not is_unambiguous or len(found) == len(expected)
         np.testing.assert_allclose(
             found[: len(expected)], expected[: len(found)], rtol=0.0, atol=COAL_TOLERANCE
@@ -103,15 +96,17 @@ def check_contacts(
 REACHES, NEAREST = st.sampled_from([0.0, 0.02, 0.25, 1.0]), st.sampled_from([None, 1, 6])
 
 
+def make_door_problem(seed: int, count: int) -> TrajectoryProblem:
+    scene = make_cluttered_scene(seed, count)
+    return make_program(scene, [Actuate("door", {"hinge": 1.2})], options=SHORT)
+
+
 @settings(max_examples=10, deadline=None)
 @given(SEEDS, st.sampled_from([0, 3, 40, 150]), REACHES, NEAREST)
 def test_contacts_are_those_among_all_pairs(
     seed: int, count: int, reach: float, nearest: int | None
 ) -> None:
-    problem = make_program(
-        make_cluttered_scene(seed, count), [Actuate("door", {"hinge": 1.2})], options=SHORT
-    )
-    rng = np.random.default_rng(seed)
+    problem, rng = make_door_problem(seed, count), np.random.default_rng(seed)
     for phase in (0, 2):
         check_contacts(problem, problem.contacts, phase, rng, reach=reach, nearest=nearest)
 
@@ -121,13 +116,8 @@ def test_contacts_are_those_among_all_pairs(
 def test_contacts_of_grasped_objects_are_those_among_all_pairs(
     seed: int, count: int, reach: float, nearest: int | None
 ) -> None:
-    steps = [
-        Grasp("stick"),
-        Grasp("ball", "pull", "stick.tip"),
-        Reach(POSE),
-        Release("ball"),
-        GoTo(0.0, 0.0),
-    ]
+    grasps = [Grasp("stick"), Grasp("ball", "pull", "stick.tip"), Reach(POSE)]
+    steps = [*grasps, Release("ball"), GoTo(0.0, 0.0)]
     problem = make_program(make_cluttered_room(seed, count), steps, options=SHORT)
     rng = np.random.default_rng(seed)
     z = sample_configurations(problem.chain.lower, problem.chain.upper, problem.segments, rng)
@@ -140,12 +130,8 @@ def test_contacts_of_grasped_objects_are_those_among_all_pairs(
 @settings(max_examples=8, deadline=None)
 @given(SEEDS, st.sampled_from([3, 60]))
 def test_distances_do_not_depend_on_earlier_queries(seed: int, count: int) -> None:
-    problem = make_program(
-        make_cluttered_scene(seed, count), [Actuate("door", {"hinge": 1.2})], options=SHORT
-    )
-    z = sample_configurations(
-        problem.chain.lower, problem.chain.upper, 6, np.random.default_rng(seed)
-    )
+    problem, rng = make_door_problem(seed, count), np.random.default_rng(seed)
+    z = sample_configurations(problem.chain.lower, problem.chain.upper, 6, rng)
     waypoints = np.full(len(z), problem.ends[2])
     few = problem.contacts.evaluate(z, waypoints, reach=0.3, nearest=3)
     every = problem.contacts.evaluate(z[::-1], waypoints, reach=0.3)
@@ -161,22 +147,14 @@ def test_start_clearance_is_that_of_all_pairs(seed: int, count: int, reach: floa
     scene = make_cluttered_scene(seed, count)
     model, geometry = scene.robot.model, scene.robot.collision
     data, shapes = model.createData(), geometry.createData()
-    pin.updateGeometryPlacements(
-        model, data, geometry, shapes, scene.robot.coordinates.q(scene.start)
-    )
-    moving = [
-        (shape.geometry, where)
-        for shape, where in zip(geometry.geometryObjects, shapes.oMg, strict=True)
-    ]
-    standing = [
-        s for s, label in zip(scene.obstacles, scene.obstacle_labels, strict=True) if label != FLOOR
-    ]
-    standing += make_world_shapes(scene.objects["door"])
+    q = scene.robot.coordinates.q(scene.start)
+    pin.updateGeometryPlacements(model, data, geometry, shapes, q)
+    labels = zip(scene.obstacles, scene.obstacle_labels, strict=True)
+    fixed = [shape for shape, label in labels if label != FLOOR]
     expected = min(
-        compute_shape_distance(shape, where, other.geometry, other.placement)
-        for shape, where in moving
-        for other in standing
+        compute_shape_distance(shape.geometry, where, other.geometry, other.placement)
+        for shape, where in zip(geometry.geometryObjects, shapes.oMg, strict=True)
+        for other in (*fixed, *make_world_shapes(scene.objects["door"]))
     )
     found = scene.start_clearance(reach=reach)
     assert found == (pytest.approx(expected, abs=1e-9) if expected < reach else reach)
-    assert compute_clearance(moving, []) == np.inf

@@ -13,7 +13,6 @@ from helpers.drawers import make_grasping_scene
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
-from vkc_pin.world.trajectory.trajectory import Trajectory
 
 PULL = vkc.Actuate("drawer", {"slide": 0.2})
 
@@ -30,22 +29,21 @@ def plan_measured() -> vkc.Plan:
 
 
 def test_drawer_held_beside_its_handle_is_opened(tmp_path: Path) -> None:
-    plan, tool = plan_measured(), plan_measured().scene.tool_placement()
+    plan = plan_measured()
     assert plan.success, plan.summary()
     assert np.linalg.norm(plan.scene.holds[0].deviation) == pytest.approx(0.005, abs=1e-5)
-    end = plan.end_scene()
-    moved = end.tool_placement()  # with the drawer, which opens along −x
-    slide = end.objects["drawer"].state[0]
-    along = pin.SE3(np.eye(3), np.array([-slide, 0.0, 0.0]))
-    np.testing.assert_allclose((along * tool).homogeneous, moved.homogeneous, atol=1e-4)
-    assert end.holds == plan.scene.holds
+    end = plan.end_scene()  # the hand moves with the drawer, which opens along −x
+    along = pin.SE3(np.eye(3), np.array([-end.objects["drawer"].state[0], 0.0, 0.0]))
+    moved = along * plan.scene.tool_placement()
+    np.testing.assert_allclose(end.tool_placement().homogeneous, moved.homogeneous, atol=1e-4)
     loaded = vkc.Plan.load(plan.save(tmp_path / "plan.npz"))
     assert loaded.success
-    assert loaded.scene.holds == plan.scene.holds
+    assert loaded.scene.holds == end.holds == plan.scene.holds
 
 
 def test_nominal_grasp_applies_after_the_release() -> None:
-    steps = [PULL, vkc.Release(), vkc.Actuate("drawer", {"slide": 0.1})]
+    """A grasp step is satisfied by the measured grasp."""
+    steps = [vkc.Grasp("drawer"), PULL, vkc.Release(), vkc.Actuate("drawer", {"slide": 0.1})]
     plan = vkc.plan(plan_measured().scene, steps)
     assert plan.success, plan.summary()
     holds = [phase.holds[0] for phase in plan.trajectory.phases if phase.holds]
@@ -53,29 +51,16 @@ def test_nominal_grasp_applies_after_the_release() -> None:
     assert holds[-1] == holds[0].nominal != holds[0]
 
 
-def test_measured_grasp_satisfies_a_grasp_step() -> None:
-    plan = vkc.plan(plan_measured().scene, [vkc.Grasp("drawer"), PULL])
-    assert plan.success, plan.summary()
-
-
-def _replace_holds(plan: vkc.Plan, scene: vkc.Scene) -> Trajectory:
-    phases = tuple(
-        dataclasses.replace(phase, holds=scene.holds) for phase in plan.trajectory.phases
-    )
-    return dataclasses.replace(plan.trajectory, phases=phases)
-
-
 def test_motion_must_keep_the_grasp_of_its_scene() -> None:
     plan, nominal = plan_measured(), make_start(0.005)
-    assert vkc.validate(plan.scene, [PULL], plan.trajectory).ok
-    other = vkc.validate(plan.scene, [PULL], _replace_holds(plan, nominal))
-    amounts = {one.constraint: one.amount for one in other.violations}
+    phases = (dataclasses.replace(one, holds=nominal.holds) for one in plan.trajectory.phases)
+    motion = dataclasses.replace(plan.trajectory, phases=tuple(phases))
+    violations = vkc.validate(plan.scene, [PULL], motion).violations
+    amounts = {one.constraint: one.amount for one in violations}
     assert amounts["closure"] == pytest.approx(0.004, abs=1e-5)
-    with pytest.raises(InputError, match=r"phases\[0\].deviation.*drawer.handle"):
-        vkc.validate(nominal, [PULL], plan.trajectory)
-    closer = make_start(0.004).with_measured_grasp("drawer")
-    with pytest.raises(InputError, match=r"phases\[0\].deviation"):
-        vkc.validate(closer, [PULL], plan.trajectory)
+    for scene in (nominal, make_start(0.004).with_measured_grasp("drawer")):
+        with pytest.raises(InputError, match=r"phases\[0\].deviation.*drawer.handle"):
+            vkc.validate(scene, [PULL], plan.trajectory)
 
 
 def test_infeasible_unmeasured_grasp_suggests_with_measured_grasp() -> None:

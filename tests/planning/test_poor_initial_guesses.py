@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -11,13 +13,13 @@ from helpers.small_problems import load_door_scene
 
 import vkc_pin as vkc
 
-PILLAR = {
-    "name": "pillar",
-    "type": "cylinder",
-    "radius": 0.15,
-    "length": 1.6,
-    "position": [1.2, 0.05, 0.8],
-}
+FEW = vkc.Options(reach_waypoints=20)
+
+
+def plan_stationary(scene: vkc.Scene, step: vkc.Step, **options: Any) -> None:
+    plan = vkc.plan(scene, [step], initialization="stationary", **options)
+    assert plan.success, plan.summary()
+    assert plan.initialization.startswith("stationary")
 
 
 def test_reach_from_a_stationary_guess() -> None:
@@ -25,30 +27,17 @@ def test_reach_from_a_stationary_guess() -> None:
     placed = start.objects["door"]
     attachment = placed.object.attachment()
     pose = placed.link_placement(attachment.link) * attachment.placement
-    plan = vkc.plan(start, [vkc.Reach(pin.SE3(pose))], initialization="stationary", seed=0)
-    assert plan.success, plan.summary()
-    assert plan.initialization.startswith("stationary")
+    plan_stationary(start, vkc.Reach(pin.SE3(pose)))
 
 
 def test_actuation_from_a_stationary_guess() -> None:
-    plan = vkc.plan(
-        load_drawer_scene(),
-        [vkc.Actuate("drawer", {"slide": 0.3})],
-        initialization="stationary",
-        seed=0,
-    )
-    assert plan.success, plan.summary()
+    plan_stationary(load_drawer_scene(), vkc.Actuate("drawer", {"slide": 0.3}))
 
 
 def test_drive_from_a_perturbed_guess() -> None:
-    options = vkc.Options(reach_waypoints=20)
-    plan = vkc.plan(
-        make_hall(obstacles=[PILLAR]),
-        [vkc.GoTo(2.4, 0.0)],
-        perturbation=0.5,
-        seed=0,
-        options=options,
-    )
+    pillar = {"name": "pillar", "type": "cylinder", "radius": 0.15, "length": 1.6}
+    scene = make_hall(obstacles=[{**pillar, "position": [1.2, 0.05, 0.8]}])
+    plan = vkc.plan(scene, [vkc.GoTo(2.4, 0.0)], perturbation=0.5, options=FEW)
     assert plan.success, plan.summary()
 
 
@@ -58,10 +47,7 @@ def test_drive_from_a_perturbed_guess() -> None:
 )
 def test_large_tool_rotation_from_a_stationary_guess(axis: list[float], angle: float) -> None:
     """At a stationary guess the residual's gradient vanishes or points along the longer turn."""
-    scene = make_hall()
-    tool = scene.tool_placement()
+    tool = make_hall().tool_placement()
     shift = np.array([0.1, 0.1, 0.0])
     turned = pin.SE3(tool.rotation @ pin.exp3(angle * np.array(axis)), tool.translation + shift)
-    options = vkc.Options(reach_waypoints=20)
-    plan = vkc.plan(scene, [vkc.Reach(turned)], initialization="stationary", options=options)
-    assert plan.success, plan.summary()
+    plan_stationary(make_hall(), vkc.Reach(turned), options=FEW)

@@ -21,9 +21,8 @@ from vkc_pin.world.trajectory.formats.archives import FORMAT
 def test_statistics_add_field_by_field() -> None:
     one = PlanningStatistics(1.0, 0.5, 3, 2, 100, coal_time=0.25)
     other = PlanningStatistics(0.5, 0.0, 1, 1, 11, coal_time=0.5, ipopt_time=0.125)
-    total = one + other
-    assert dataclasses.astuple(total) == (1.5, 0.5, 4, 3, 111, 0.0, 0.75, 0.0, 0.125, 0.0, 0.0, 0.0)
-    assert sum([one, other], start=PlanningStatistics()) == total
+    total = sum([one, other], start=PlanningStatistics())
+    assert total == PlanningStatistics(1.5, 0.5, 4, 3, 111, coal_time=0.75, ipopt_time=0.125)
 
 
 def test_records_keep_their_keys() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from helpers.executions import make_stationary_motion, plan_door
+from helpers.executions import make_stationary_motion
 from helpers.telescopes import write_coupled_scene
 
 import vkc_pin as vkc
@@ -17,22 +17,8 @@ from vkc_pin.simulation.physics import Physics, complete_inertias
 from vkc_pin.simulation.servos import (
     compute_feedforward,
     make_servos,
-    sample_reference,
 )
 from vkc_pin.world.trajectory.world_model import World
-
-
-def test_reference_contains_positions_velocities_and_accelerations() -> None:
-    motion = plan_door().trajectory
-    middles = (motion.times[:-1] + motion.times[1:]) / 2.0
-    positions, velocities, accelerations = sample_reference(motion, middles)
-    np.testing.assert_allclose(accelerations, motion.acceleration(middles)[:, : motion.robot_size])
-    np.testing.assert_allclose(positions, motion.at(middles)[:, : motion.robot_size])
-    np.testing.assert_allclose(
-        velocities, motion.velocity(middles)[:, : motion.robot_size], atol=1e-9
-    )
-    before = np.array([motion.times[0] - 1.0])
-    assert not sample_reference(motion, before)[1].any()
 
 
 @pytest.mark.parametrize("name", ["door", "coupled"])
@@ -54,17 +40,12 @@ def test_feedforward_agrees_with_inverse_dynamics_of_mujoco(name: str, tmp_path:
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     transmission = np.zeros((model.nv, robot.size))
     for move in robot.moves:
-        dof = model.body_dofadr[physical.bodies[move.joint]] + (
-            move.coordinate if move.coordinate < 3 else 0
-        )
+        dof = model.body_dofadr[physical.bodies[move.joint]]
+        dof += move.coordinate if move.coordinate < 3 else 0
         transmission[dof, move.coordinate] = move.factor
     for row, v, a, torques in zip(rows, velocities, accelerations, found, strict=True):
-        data.qpos[:], data.qvel[:], data.qacc[:] = (
-            physical.to_qpos(row),
-            transmission @ v,
-            transmission @ a,
-        )
+        data.qpos[:], data.qvel[:] = physical.to_qpos(row), transmission @ v
+        data.qacc[:] = transmission @ a
         mujoco.mj_inverse(model, data)
-        np.testing.assert_allclose(
-            torques[: robot.size], transmission.T @ data.qfrc_inverse, atol=1e-6
-        )
+        expected = transmission.T @ data.qfrc_inverse
+        np.testing.assert_allclose(torques[: robot.size], expected, atol=1e-6)

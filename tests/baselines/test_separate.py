@@ -28,7 +28,7 @@ from helpers.judging import get_violation_names
 from helpers.small_problems import load_door_scene
 
 import vkc_pin as vkc
-from vkc_pin.baselines import BASELINES, attempt, plan_separately, postures, separate
+from vkc_pin.baselines import BASELINES, attempt, plan_separately, postures
 from vkc_pin.baselines.attempt import FINER
 from vkc_pin.benchmarks.household import TASKS
 from vkc_pin.planning.plan import STAGES
@@ -125,13 +125,6 @@ def test_base_and_arm_move_one_after_the_other(task: str, method: str) -> None:
     assert moved - FINER * plan.options.move_waypoints in (0, 1)
 
 
-def test_b1_follows_the_time_law_of_the_object() -> None:
-    plan = open_drawer("B1")
-    share = np.linspace(0.0, 1.0, FINER * plan.options.move_waypoints + 1)
-    slide = plan.trajectory.column("drawer.slide")[-len(share) :]
-    np.testing.assert_allclose(slide, 0.3 * (3 * share**2 - 2 * share**3), atol=2e-6)
-
-
 def test_differential_base_does_not_slip_sideways() -> None:
     scene = make_drawer_scene(base="differential")
     plan = plan_separately(scene, [PULL], options=OPTIONS)
@@ -201,33 +194,16 @@ def test_arm_does_not_reach_between_two_shelves(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.long
-def test_failed_attempts_are_followed_by_others(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    seeds, ends = list[list[int]](), list[tuple[vkc.Trajectory, float, str]]()
-
-    class RecordedAttempt(attempt.Attempt):
-        def __init__(self, *arguments: Any, **keywords: Any) -> None:
-            seeds.append(list(keywords["seed"]))
-            super().__init__(*arguments, **keywords)
-
-        def run(self, steps: Any) -> tuple[vkc.Trajectory, float, str]:
-            ends.append(super().run(steps))
-            return ends[-1]
-
-    monkeypatch.setattr(separate, "Attempt", RecordedAttempt)
+def test_failed_attempts_are_followed_by_others() -> None:
     scene = vkc.load_scene("household").with_start(base=[0.968827218, -0.761078307, 0.355251978])
-    task = TASKS["door"]
-    plan = plan_separately(scene, task.steps, method="B1", seed=111)
+    steps = TASKS["door"].steps
+    plan = plan_separately(scene, steps, method="B1", seed=111)
     tries = int(plan.initialization.removeprefix("B1, try "))
     assert plan.success, plan.summary()
-    assert seeds == [[111, number] for number in range(tries)]
     assert tries > 1, "the first try sufficed: choose another start"
-    assert plan.metrics["rounds"] == len(ends) == tries
-    assert [cause for _, _, cause in ends][-1] == ""
-    for motion, _, cause in ends[:-1]:
-        assert cause or not vkc.validate(scene, task.steps, motion, plan.options).ok
-    assert vkc.validate(scene, task.steps, plan.trajectory, plan.options).ok
+    assert plan.metrics["rounds"] == tries
+    failed = plan_separately(scene, steps, method="B1", seed=111, retries=tries - 1)
+    assert not failed.success
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ import io
 import os
 import re
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 from helpers.drives import make_hall
@@ -94,9 +93,3 @@ def test_nothing_is_written_to_a_pipe(capfd: pytest.CaptureFixture[str]) -> None
         line.set_activity("something")
         assert line.write is None
     assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize("value", [None, 1, "yes"])
-def test_progress_must_be_a_bool(value: Any) -> None:
-    with pytest.raises(vkc.InputError, match="progress: wrong type of argument"):
-        vkc.plan(make_hall(), [vkc.GoTo(-1.0, 0.5)], progress=value)

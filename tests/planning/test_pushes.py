@@ -7,14 +7,11 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from helpers.drawers import compute_tool_pose, replace_scene_fields
-from helpers.robots import get_home_configuration
 from oracle.judge import judge
 
 import vkc_pin as vkc
-from vkc_pin.world.models.robot import Robot
 
 CASES = [  # scene, object, joint, initial value, attachment
     ("door", "door", "hinge", -1.2, "push"),
@@ -34,35 +31,6 @@ def get_hold_phase(plan: vkc.Plan) -> vkc.PhaseSpan:
     return phase
 
 
-def compute_reach(robot: Robot) -> float:
-    """Return the distance of the hand's foremost point from the tool frame [m]."""
-    data, shapes = robot.model.createData(), robot.collision.createData()
-    q = robot.coordinates.q(get_home_configuration(robot))
-    pin.updateGeometryPlacements(robot.model, data, robot.collision, shapes, q)
-    tool = pin.updateFramePlacement(robot.model, data, robot.model.getFrameId(robot.tool_frame))
-    return max(
-        float(tool.actInv(place.act(point))[2])
-        for k, (shape, place) in enumerate(
-            zip(robot.collision.geometryObjects, shapes.oMg, strict=True)
-        )
-        if robot.link_of(k) in robot.touch_links
-        for point in shape.geometry.points()
-    )
-
-
-def measure_gaps(plan: vkc.Plan, owner: str, joint: str, face: str) -> np.ndarray:
-    """Return distances of the hand's foremost point from the face while it pushes [m]."""
-    motion, placed, phase = plan.trajectory, plan.scene.objects[owner], get_hold_phase(plan)
-    attachment, reach = placed.object.attachments[face], compute_reach(plan.scene.robot)
-    values, found = motion.column(f"{owner}.{joint}"), []
-    for k in range(phase.first, phase.last + 1):
-        link = placed.with_state({joint: values[k]}).link_placement(attachment.link)
-        tool = compute_tool_pose(plan.scene, motion.positions[k])
-        foremost = tool.act(np.array([0.0, 0.0, reach]))
-        found.append(-(link * attachment.placement).actInv(foremost)[2])
-    return np.array(found)
-
-
 @pytest.mark.parametrize(
     "case",
     [
@@ -71,17 +39,12 @@ def measure_gaps(plan: vkc.Plan, owner: str, joint: str, face: str) -> np.ndarra
     ],
 )
 def test_open_objects_are_pushed_shut(case: tuple[str, str, str, float, str]) -> None:
-    """The hand stays on the face, up to its tilt, and the joint never moves back."""
-    plan, (_, owner, joint, begin, face) = push_shut(*case), case
+    """The joint never moves back; the oracle checks that the hand stays on the face."""
+    plan, (_, owner, joint, begin, _) = push_shut(*case), case
     assert plan.success, plan.summary()
     column = plan.trajectory.column(f"{owner}.{joint}")
     assert (column[0], abs(column[-1]) < 1e-3) == (begin, True)
     assert (np.diff(column) * np.sign(begin)).max() < 1e-6
-    distance = measure_gaps(plan, owner, joint, face)
-    standoff = plan.scene.objects[owner].object.attachments[face].standoff
-    assert standoff > 0.0
-    assert distance.min() > standoff * np.cos(0.4) - 1.1e-3
-    assert distance.max() < standoff + 1.1e-3
 
 
 def test_backward_push_is_a_violation(tmp_path: Path) -> None:

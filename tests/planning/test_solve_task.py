@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.carrying import describe_box
-from helpers.drawers import SHORT, load_drawer_scene
+from helpers.drawers import SHORT
 from helpers.drives import make_hall
 from helpers.gates import make_gate_problem
 from helpers.small_problems import load_door_scene
@@ -18,11 +18,9 @@ from vkc_pin.benchmarks.problems.problem_set import problem as make_random_probl
 from vkc_pin.planning.initialization.initial_guess import InitialGuess
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.results import complete_draft
-from vkc_pin.planning.solve_task import solve_task
-from vkc_pin.utils.cache import Cache
+from vkc_pin.planning.solve_task import TaskResult, solve_task
 from vkc_pin.world.task.compiler import compile_task
 
-PULL = [vkc.Actuate("drawer", {"slide": 0.3})]
 OPEN = [vkc.Actuate("door", {"hinge": 1.2})]
 
 
@@ -58,26 +56,25 @@ def test_user_guess_is_the_only_one() -> None:
 
 
 def test_draft_is_no_success_until_it_is_retimed_and_validated() -> None:
-    scene, request = make_hall(), PlanningRequest("auto", SHORT)
-    task = compile_task(scene, [vkc.GoTo(1.0, 0.0)], SHORT)
-    expected = solve_task(scene, task, request).plan
-    draft = solve_task(scene, task, dataclasses.replace(request, is_draft=True))
+    request = PlanningRequest("auto", SHORT, is_draft=True)
+
+    def drive(x: float, request: PlanningRequest = request) -> TaskResult:
+        return solve_task(
+            make_hall(), compile_task(make_hall(), [vkc.GoTo(x, 0.0)], SHORT), request
+        )
+
+    draft, expected = drive(1.0), drive(1.0, dataclasses.replace(request, is_draft=False)).plan
     assert draft.is_solved
     assert not draft.plan.success
     found = complete_draft(draft.plan)
     assert found.success, found.summary()
-    assert found.trajectory.times.tobytes() == expected.trajectory.times.tobytes()
+    np.testing.assert_array_equal(found.trajectory.times, expected.trajectory.times)
     assert found.report == expected.report
     beside = dataclasses.replace(draft.plan, steps=(vkc.GoTo(1.0, 0.5),))
     assert complete_draft(beside).status == "rejected"
-
-
-def test_drafts_of_infeasible_tasks_are_not_solved() -> None:
-    scene, request = make_hall(), PlanningRequest("auto", SHORT, is_draft=True)
-    result = solve_task(scene, compile_task(scene, [vkc.GoTo(30.0, 0.0)], SHORT), request)
-    assert not result.is_solved
-    assert result.plan.status == "infeasible"
-    assert not result.plan.report.ok
+    infeasible = drive(30.0)
+    assert (infeasible.is_solved, infeasible.plan.report.ok) == (False, False)
+    assert infeasible.plan.status == "infeasible"
 
 
 @pytest.mark.parametrize("max_refinements", [None, 0])
@@ -153,14 +150,6 @@ def test_sufficient_budget_changes_nothing() -> None:
     ]
     assert [plan.status for plan in short] == ["evaluation limit"] * 2
     np.testing.assert_array_equal(short[0].trajectory.positions, short[1].trajectory.positions)
-
-
-def test_cache_is_trimmed_after_each_task() -> None:
-    scene, cache = load_drawer_scene(), Cache(max_nbytes=1.0)
-    request = PlanningRequest("auto", SHORT, cache=cache)
-    assert solve_task(scene, compile_task(scene, PULL, SHORT), request).plan.success
-    assert cache.info().entries == 1
-    assert cache.info().misses > 1
 
 
 @pytest.mark.parametrize(

@@ -34,38 +34,34 @@ def get_state_index(grid: BaseGrid, i: int, j: int, heading: int) -> int:
 
 def add_moves(grid: BaseGrid, add_edge: Callable[[int, int, float], None]) -> None:
     """Add the free moves between cells and the free turns."""
+    turns = TURNING * np.abs(wrap_angle(np.roll(grid.yaws, -1) - grid.yaws))
     for i, j, heading in np.ndindex(grid.cells, grid.cells, HEADINGS):
         k, m = np.add((i, j), grid.moves[heading])
-        here, length = get_state_index(grid, i, j, heading), grid.lengths[heading]
+        here, left = (get_state_index(grid, i, j, heading + turn) for turn in (0, 1))
         if 0 <= k < grid.cells and 0 <= m < grid.cells and grid.is_move_free(i, j, heading):
-            add_edge(here, get_state_index(grid, k, m, heading), length)
-            add_edge(get_state_index(grid, k, m, heading), here, BACKWARDS * length)
+            there, length = get_state_index(grid, k, m, heading), grid.lengths[heading]
+            add_edge(here, there, length)
+            add_edge(there, here, BACKWARDS * length)
         if grid.is_left_turn_free(i, j, heading):
-            turn = TURNING * abs(
-                wrap_angle(grid.yaws[(heading + 1) % HEADINGS] - grid.yaws[heading])
-            )
-            add_edge(here, get_state_index(grid, i, j, heading + 1), turn)
-            add_edge(get_state_index(grid, i, j, heading + 1), here, turn)
+            add_edge(here, left, turns[heading])
+            add_edge(left, here, turns[heading])
 
 
-def compute_heading(
-    a: NDArray[np.float64], b: NDArray[np.float64], kind: int, default: float
-) -> float:
-    ahead = np.arctan2(*(b - a)[::-1]) if np.hypot(*(b - a)) > 1e-9 else default
-    return float(ahead + np.pi * kind if kind < 2 else default)
+def compute_drive(
+    grid: BaseGrid, start: NDArray[np.float64], end: NDArray[np.float64], kind: int, default: float
+) -> tuple[float, int]:
+    """Return the cost of a drive between poses and the turns at its ends, infinite if blocked.
 
-
-def compute_cost(
-    grid: BaseGrid,
-    a: NDArray[np.float64],
-    b: NDArray[np.float64],
-    before: float,
-    yaw: float,
-    after: float,
-    kind: int,
-) -> float:
-    """Return the cost of a drive and the turns at its ends, infinite if it is blocked."""
+    A drive ahead (0) or backwards (1) has the heading of its line, or, if it is short or sideways
+    (2), a default one. A missing heading at one of the ends, NaN, is the nearest of the grid, which
+    is returned, too.
+    """
+    (a, before), (b, after) = ((pose[:2], pose[2]) for pose in (start, end))
     length = np.hypot(*(b - a))
+    yaw = np.arctan2(*(b - a)[::-1]) if length > 1e-9 else default
+    yaw = yaw + np.pi * kind if kind < 2 else default
+    heading = int(np.abs(wrap_angle(grid.yaws - yaw)).argmin())
+    before, after = (grid.yaws[heading] if np.isnan(one) else one for one in (before, after))
     yaw = before + wrap_angle(yaw - before)
     after = yaw + wrap_angle(after - yaw)
     free = (
@@ -73,10 +69,9 @@ def compute_cost(
         and grid.is_drive_free(a, b, yaw)
         and grid.is_turn_free(b, yaw, after)
     )
-    cost = length * (1.0, BACKWARDS, SIDEWAYS)[kind] + TURNING * (
-        abs(yaw - before) + abs(after - yaw)
-    )
-    return float(cost) if free else np.inf
+    turned = abs(yaw - before) + abs(after - yaw)
+    cost = length * (1.0, BACKWARDS, SIDEWAYS)[kind] + TURNING * turned
+    return float(cost) if free else np.inf, heading
 
 
 def search_full_graph(
@@ -86,63 +81,31 @@ def search_full_graph(
     extra: NDArray[np.float64],
 ) -> float:
     """Return the cost of the cheapest path over a graph of all states, or infinity."""
-    count = grid.cells**2 * HEADINGS
-    rows, columns, costs = [], [], []
-
-    def add_edge(a: int, b: int, cost: float) -> None:
-        rows.append(a)
-        columns.append(b)
-        costs.append(max(cost, 1e-12))
-
-    add_moves(grid, add_edge)
-
+    count, edges = grid.cells**2 * HEADINGS, dict[tuple[int, int], float]()
     first, last = count, count + 1
     radius = max(ENTRY, 1.5 * grid.step.max())
-    for i, j in np.ndindex(grid.cells, grid.cells):
-        center = np.array(grid.center(i, j))
-        for kind in range(3):
-            if np.hypot(*(center - start[:2])) <= radius:
-                yaw = compute_heading(start[:2], center, kind, start[2])
-                heading = int(np.abs(wrap_angle(grid.yaws - yaw)).argmin())
-                cost = compute_cost(
-                    grid, start[:2], center, start[2], yaw, grid.yaws[heading], kind
-                )
-                if cost < np.inf:
-                    add_edge(first, get_state_index(grid, i, j, heading), cost)
-            for goal, goal_cost in zip(goals, extra, strict=True):
-                if np.hypot(*(center - goal[:2])) <= radius and grid.is_pose_free(*goal):
-                    yaw = compute_heading(center, goal[:2], kind, goal[2])
-                    heading = int(np.abs(wrap_angle(grid.yaws - yaw)).argmin())
-                    cost = compute_cost(
-                        grid, center, goal[:2], grid.yaws[heading], yaw, goal[2], kind
-                    )
-                    if cost < np.inf:
-                        add_edge(get_state_index(grid, i, j, heading), last, cost + goal_cost)
+
+    def add_edge(a: int, b: int, cost: float) -> None:
+        if cost < edges.get((a, b), np.inf):
+            edges[a, b] = max(cost, 1e-12)
+
+    add_moves(grid, add_edge)
+    for i, j, kind in np.ndindex(grid.cells, grid.cells, 3):
+        center = np.array([*grid.center(i, j), np.nan])
+        if np.hypot(*(center - start)[:2]) <= radius:
+            cost, heading = compute_drive(grid, start, center, kind, start[2])
+            add_edge(first, get_state_index(grid, i, j, heading), cost)
+        for goal, goal_cost in zip(goals, extra, strict=True):
+            if np.hypot(*(center - goal)[:2]) <= radius and grid.is_pose_free(*goal):
+                cost, heading = compute_drive(grid, center, goal, kind, goal[2])
+                add_edge(get_state_index(grid, i, j, heading), last, cost + goal_cost)
     for goal, goal_cost in zip(goals, extra, strict=True):
         for kind in range(3):
-            cost = compute_cost(
-                grid,
-                start[:2],
-                goal[:2],
-                start[2],
-                compute_heading(start[:2], goal[:2], kind, start[2]),
-                goal[2],
-                kind,
-            )
-            if cost < np.inf and (kind < 2 or np.hypot(*(goal - start)[:2]) <= ENTRY):
+            if kind < 2 or np.hypot(*(goal - start)[:2]) <= ENTRY:
+                cost, _ = compute_drive(grid, start, goal, kind, start[2])
                 add_edge(first, last, cost + goal_cost)
-    order = np.argsort(costs, kind="stable")[
-        ::-1
-    ]  # the last of parallel edges, the cheapest, is kept
-    cheapest = dict(
-        zip(
-            zip(np.take(rows, order), np.take(columns, order), strict=True),
-            np.take(costs, order),
-            strict=True,
-        )
-    )
-    a, b = np.array(list(cheapest)).T
-    graph = csr_array((list(cheapest.values()), (a, b)), shape=(count + 2, count + 2))
+    a, b = np.array(list(edges)).T
+    graph = csr_array((list(edges.values()), (a, b)), shape=(count + 2, count + 2))
     return float(dijkstra(graph, indices=first)[last])
 
 
@@ -172,9 +135,7 @@ def make_task(
     return grid, start, poses[100:103], rng.choice([0.0, 1.0], 3)
 
 
-@pytest.mark.parametrize(
-    "seed", range(10)
-)
+@pytest.mark.parametrize("seed", range(10))
 def test_cheapest_path_is_found(seed: int) -> None:
     grid, start, goals, extra = make_task(seed)
     expected = search_full_graph(grid, start, goals, extra)

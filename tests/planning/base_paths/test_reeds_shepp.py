@@ -65,18 +65,3 @@ def test_shortest_path_is_no_longer_than_random_words() -> None:
         end[2] = (end[2] + np.pi) % (2 * np.pi) - np.pi
         (length,), _ = compute_lengths(end[None], 1.0)
         assert length <= sum(abs(piece) for piece, _ in pieces) + 1e-6
-
-
-@pytest.mark.parametrize(
-    ("goal", "length"),
-    [
-        ((3.0, 0.0, 0.0), 3.0),  # straight ahead
-        ((-3.0, 0.0, 0.0), 3.0),  # straight back
-        ((0.0, 2.0, np.pi), np.pi),  # half a circle
-        ((1.0, 1.0, np.pi / 2), np.pi / 2),  # a quarter
-        ((0.0, 0.0, np.pi), np.pi),  # three arcs of 60 degrees
-        ((0.0, 0.0, 0.0), 0.0),
-    ],
-)
-def test_lengths_of_known_paths(goal: tuple[float, float, float], length: float) -> None:
-    assert compute_lengths(np.array([goal]), 1.0)[0][0] == pytest.approx(length, abs=1e-6)

@@ -42,22 +42,6 @@ def test_goal_at_the_limit_is_allowed() -> None:
     assert find_impossible_conditions(make_problem(scene, *steps)) == []
 
 
-def test_links_of_several_shapes_are_listed_once() -> None:
-    """The deepest pair counts; here many shapes of the base touch one URDF object."""
-    wall = "".join(
-        f'<collision><origin xyz="0 {y} 0.4"/>'
-        '<geometry><box size="0.2 0.5 0.8"/></geometry></collision>'
-        for y in (0, 0.3)
-    )
-    urdf = f'<robot name="wall"><link name="wall">{wall}</link></robot>'
-    item = {"name": "wall", "type": {"urdf": urdf, "attachments": []}, "position": [0.4, 0.0, 0.0]}
-    scene = vkc.Scene.from_document({**make_hall().document, "objects": [item]})
-    found = find_impossible_conditions(make_problem(scene, vkc.GoTo(-1.0, 0.0)))
-    subjects = [violation.subject for violation in found]
-    assert "base_link – wall.wall" in subjects
-    assert len(subjects) == len(set(subjects))
-
-
 def hold_stick_above_table(*obstacles: dict[str, Any]) -> list[Violation]:
     """Return the violations at the start of a robot that holds the stick on a table."""
     down = solve_reach(compute_grasp_pose(STICK), solve_above(STICK))

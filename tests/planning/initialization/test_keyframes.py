@@ -5,14 +5,11 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from helpers.small_problems import (
     SHORT,
     compute_grasp_error,
-    get_margins,
     load_door_scene,
-    make_all_pairs,
 )
 
 import vkc_pin as vkc
@@ -97,23 +94,6 @@ def test_cached_results_are_not_computed_again(problem: vkc.TrajectoryProblem) -
     assert not np.array_equal(z, other)
     np.testing.assert_array_equal(sampler.compute_shortfall(z[::-1], grasp), shortfalls[::-1])
     assert not np.array_equal(make_sampler(problem, 4).sample(start, grasp, "scatter")[0], z)
-
-
-def test_shortfall_is_the_largest_of_any_pair(problem: vkc.TrajectoryProblem) -> None:
-    """Compare with the distances of all pairs by Pinocchio and coal, without culling."""
-    sampler, grasp = make_sampler(problem), int(problem.ends[0])
-    z, _ = sampler.sample(np.tile(problem.start, (24, 1)), grasp, "scatter")
-    part, model = problem.contacts.phases[0], problem.chain.model
-    geometry, data = make_all_pairs(part), model.createData()
-    shapes, pairs = pin.GeometryData(geometry), np.arange(len(part.pairs))
-    margins, expected = get_margins(part, pairs, np.full(len(pairs), grasp)), []
-    for q in problem.chain.coordinates.q(z):
-        pin.updateGeometryPlacements(model, data, geometry, shapes, q)
-        pin.computeDistances(geometry, shapes)
-        distances = np.array([result.min_distance for result in shapes.distanceResults])
-        expected.append(max(0.0, float((margins - distances).max())))
-    assert min(expected) < 0.01 < max(expected)
-    np.testing.assert_allclose(compute_shortfall(problem, z, grasp), expected, atol=1e-5)
 
 
 def test_free_keyframes_satisfy_the_pose_constraint(problem: vkc.TrajectoryProblem) -> None:

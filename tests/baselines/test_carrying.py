@@ -43,7 +43,7 @@ def make_room() -> vkc.Scene:
     return replace_scene_fields(make_hall(obstacles=tables), objects=[cup])
 
 
-def plan_steps(scene: vkc.Scene, *steps: vkc.Step) -> vkc.Plan:
+def plan_steps(scene: vkc.Scene, *steps: vkc.steps.Step) -> vkc.Plan:
     plan = plan_separately(scene, steps, options=OPTIONS, retries=1)
     assert plan.success, plan.summary()
     return plan

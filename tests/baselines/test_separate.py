@@ -280,7 +280,7 @@ MOVE = "move drawer.slide"
     ids=["two objects", "grasped by the first step", "grasped at the start"],
 )
 def test_object_is_reached_unless_it_is_grasped(
-    make_scene: Callable[[], vkc.Scene], other: vkc.Step | None, phases: list[str]
+    make_scene: Callable[[], vkc.Scene], other: vkc.steps.Step | None, phases: list[str]
 ) -> None:
     steps = [PULL] if other is None else [PULL, other]
     plan = plan_separately(make_scene(), steps, options=OPTIONS)

@@ -20,7 +20,7 @@ QUICK = vkc.Options(
 )
 
 
-def plan_failure(scene: vkc.Scene, *steps: vkc.Step, texts: Sequence[str]) -> vkc.Plan:
+def plan_failure(scene: vkc.Scene, *steps: vkc.steps.Step, texts: Sequence[str]) -> vkc.Plan:
     """Plan an infeasible task; check that all violations have a waypoint and an amount."""
     plan = vkc.plan(scene, steps, options=QUICK)
     assert not plan.success
@@ -77,7 +77,7 @@ def test_partly_blocked_door_reports_its_free_range() -> None:
     ],
 )
 def test_goal_beyond_a_limit(
-    step: vkc.Step, subject: str, unit: str, beyond: float, text: str
+    step: vkc.steps.Step, subject: str, unit: str, beyond: float, text: str
 ) -> None:
     plan = plan_failure(load_door_scene(), step, texts=[f"goal {subject}: {text}"])
     goal = find_violation(plan, "goal", subject)
@@ -148,7 +148,7 @@ SHELF = describe_box("shelf", (0.4, 2.0, 1.0), (5.0, 3.0, 0.5))
     ids=["drive behind a fence", "reach behind a fence", "drive into a crate"],
 )
 def test_unreachable_base_goal(
-    obstacles: list[dict[str, Any]], step: vkc.Step, texts: list[str]
+    obstacles: list[dict[str, Any]], step: vkc.steps.Step, texts: list[str]
 ) -> None:
     plan = plan_failure(make_hall(obstacles=obstacles), step, texts=texts)
     assert plan.metrics["rounds"] == 0  # the solver did not run

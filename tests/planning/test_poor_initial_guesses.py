@@ -16,7 +16,7 @@ import vkc_pin as vkc
 FEW = vkc.Options(reach_waypoints=20)
 
 
-def plan_stationary(scene: vkc.Scene, step: vkc.Step, **options: Any) -> None:
+def plan_stationary(scene: vkc.Scene, step: vkc.steps.Step, **options: Any) -> None:
     plan = vkc.plan(scene, [step], initialization="stationary", **options)
     assert plan.success, plan.summary()
     assert plan.initialization.startswith("stationary")

@@ -25,7 +25,7 @@ def sample_start() -> vkc.Scene:
     return vkc.load_scene("init_1").sample_start(np.random.default_rng(5))
 
 
-def plan_parts(*steps: vkc.Step) -> list[TaskResult]:
+def plan_parts(*steps: vkc.steps.Step) -> list[TaskResult]:
     task = compile_task(sample_start(), steps, REQUEST.options)
     return [part.result for part in plan_each_step(sample_start(), task, REQUEST)]
 

@@ -30,7 +30,11 @@ def load_home() -> vkc.Scene:
 
 
 def plan_actions(
-    steps: Sequence[vkc.Step], *, scene: vkc.Scene | None = None, window: int = 2, **options: Any
+    steps: Sequence[vkc.steps.Step],
+    *,
+    scene: vkc.Scene | None = None,
+    window: int = 2,
+    **options: Any,
 ) -> vkc.Plan:
     return vkc.plan(scene or load_home(), steps, window=window, **options)
 
@@ -48,7 +52,7 @@ def plan_actions(
     ],
 )
 def test_impossible_steps_are_refused(
-    steps: list[vkc.Step], error: type[InputError], field: str, text: str
+    steps: list[vkc.steps.Step], error: type[InputError], field: str, text: str
 ) -> None:
     with pytest.raises(error) as caught:
         plan_actions([OPEN, *steps, SHUT])

@@ -230,7 +230,8 @@ def test_goal_costs_are_added_and_blocked_goals_are_skipped(
     goals = [[0.0, 2.2, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]
     path = find_path(block, [0.0, 0.0, 0.0], *goals, costs=costs)
     assert path is not None
-    assert (path.goal, path.cost) == (goal, pytest.approx(cost))
+    assert path.goal == goal
+    assert path.cost == pytest.approx(cost)
 
 
 def test_unreachable_goals_have_no_path() -> None:

@@ -22,7 +22,7 @@ from vkc_pin.planning.diagnosis.proofs import PROVEN, find_proofs, find_swept_co
 from vkc_pin.planning.initialization.base_routes import collect_grid_shapes
 
 
-def find_hall_proofs(obstacles: Sequence[dict[str, Any]], *steps: vkc.Step) -> list[str]:
+def find_hall_proofs(obstacles: Sequence[dict[str, Any]], *steps: vkc.steps.Step) -> list[str]:
     return find_proofs(make_program(make_hall(obstacles=obstacles), list(steps), options=SHORT))
 
 
@@ -60,7 +60,7 @@ def test_gap_too_narrow_for_the_base_is_proven(width: float) -> None:
     ],
     ids=["arm reaches across", "base passes under"],
 )
-def test_passable_wall_proves_nothing(wall: dict[str, Any], step: vkc.Step) -> None:
+def test_passable_wall_proves_nothing(wall: dict[str, Any], step: vkc.steps.Step) -> None:
     assert find_hall_proofs([wall], step) == []
 
 

@@ -23,7 +23,7 @@ OPEN = vkc.Actuate("door", {"hinge": 1.2})
 @cache
 def make_problem(*, drives: bool = False, grasps: bool = False) -> vkc.TrajectoryProblem:
     """Return the problem of opening or grasping the door, optionally between two drives."""
-    steps = [vkc.Grasp("door") if grasps else OPEN]
+    steps: list[vkc.steps.Step] = [vkc.Grasp("door") if grasps else OPEN]
     if drives:
         steps = [vkc.GoTo(-1.0, 0.0), *steps, vkc.GoTo(-1.0, 0.5)]
     return make_program(load_door_scene(), steps, options=FEW)

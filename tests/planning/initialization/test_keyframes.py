@@ -120,6 +120,8 @@ def test_goal_configurations_report_their_residuals(problem: vkc.TrajectoryProbl
     is_clear = (residuals <= 1e-5) | (residuals >= 1e-3)  # the measures agree for small angles
     np.testing.assert_array_equal((np.array(errors) < 3e-4)[is_clear], (residuals < 1e-4)[is_clear])
     assert (residuals < 1e-4).any()
+    drive = vkc.build(load_door_scene(), [vkc.GoTo(0.3, 0.2)], options=SHORT)
+    assert sample_goal_configurations(drive, 1, np.random.default_rng(0)) is None, "no goal there"
 
 
 def test_weights_relate_lengths_to_angles() -> None:

@@ -28,9 +28,12 @@ from helpers.small_problems import make_full_scene
 import vkc_pin as vkc
 from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.benchmarks.robot_object_matrix.pairs import load_description, make_hall
+from vkc_pin.planning.request import PlanningRequest
+from vkc_pin.planning.sequential import plan_each_step
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import compute_final_scene
@@ -294,3 +297,18 @@ def test_steps_are_retimed_and_validated_if_no_budget_remains_for_the_whole() ->
     assert found.initialization == ", ".join(plan.initialization for plan in alone)
     duration = sum(np.ptp(plan.trajectory.times) for plan in alone) + vkc.Options().grasp_time
     assert np.ptp(found.trajectory.times) == pytest.approx(duration, abs=1e-6)
+
+
+def test_step_that_begins_in_a_dead_end_is_planned_with_the_one_before() -> None:
+    """After the least motion that pulls the door open, the robot is behind it."""
+    scene, options = vkc.load_scene("door"), vkc.Options()
+    steps = [vkc.Actuate("door", {"hinge": -1.5}), vkc.GoTo(4.1, -0.3), vkc.GoTo(3.9, 0.3)]
+    request = PlanningRequest("auto", options, random_seed=1, is_draft=True)
+    first, last = plan_each_step(scene, compile_task(scene, steps, options), request)
+    assert (first.first, first.last, last.first, last.last) == (0, 1, 2, 2)
+    for part, names in ((first, ["reach", "turn", "move", "go"]), (last, ["go"])):
+        assert part.result.is_solved
+        assert [phase.name.split()[0] for phase in part.result.task.phases] == names
+    draft = first.result.plan.trajectory
+    assert draft.column("door.hinge")[-1] == pytest.approx(-1.5, abs=1e-3)
+    np.testing.assert_allclose(draft.positions[-1, :2], [4.1, -0.3], atol=1e-3)

@@ -37,9 +37,15 @@ __all__ = [
 
 
 class PlannedStep(NamedTuple):
-    """Number of a step, from 0, and the result of its task."""
+    """Result of a step, or of two steps planned as one problem.
 
-    number: int
+    Attributes:
+        first, last: Numbers of the first and the last step, from 0.
+        result: Result of their task.
+    """
+
+    first: int
+    last: int
     result: TaskResult
 
 
@@ -114,7 +120,10 @@ def _list_steps(task: Task, parts: Sequence[PlannedStep]) -> tuple[Step, ...]:
     """Return the steps of a task, with the attachments of their plans."""
     steps: list[tuple[Step, ...]] = [(step,) for step in task.steps]
     for part in parts:  # one step becomes several where an object is grasped anew
-        steps[part.number] = part.result.plan.steps
+        steps[part.first : part.last + 1] = [
+            part.result.plan.steps,
+            *[()] * (part.last - part.first),
+        ]
     return tuple(itertools.chain(*steps))
 
 
@@ -172,7 +181,11 @@ def _solve_alternative(scene: Scene, steps: Sequence[Step], request: PlanningReq
 
 
 def plan_each_step(scene: Scene, task: Task, request: PlanningRequest) -> list[PlannedStep]:
-    """Plan every step that changes the world from the end of the one before, until one fails."""
+    """Plan every step that changes the world from the end of the one before, until one fails.
+
+    If a step of a longer draft fails, it is planned with the one before as one problem: its start
+    may have been a dead end.
+    """
     current, parts, reserved = scene, list[PlannedStep](), 0.0
     for number, step in enumerate(task.steps):
         # The end of a step is known only once it is planned; the first starts where the task does.
@@ -183,10 +196,27 @@ def plan_each_step(scene: Scene, task: Task, request: PlanningRequest) -> list[P
             continue
         request.progress.set_steps(number + 1, 1, len(task.steps))
         result = solve_with_alternatives(current, own, request)
-        parts.append(PlannedStep(number, result))
+        part = PlannedStep(number, number, result)
+        if request.is_draft and parts and len(task.steps) > 2 and not result.is_solved:
+            part = _join_steps(task, parts.pop(), part, request)
+            result = part.result
+        parts.append(part)
         if not result.is_solved or current_ending():
             break
         reserved += result.check_time
         reserve_time("planned steps", reserved)
-        current = compute_final_scene(current, result.plan.trajectory, result.task.after)
+        current = compute_final_scene(result.scene, result.plan.trajectory, result.task.after)
     return parts
+
+
+def _join_steps(
+    task: Task, before: PlannedStep, failed: PlannedStep, request: PlanningRequest
+) -> PlannedStep:
+    """Plan a step that failed with the one before as one problem, if their holds permit it."""
+    scene, results = before.result.scene, [before.result, failed.result]
+    steps = task.steps[before.first : failed.last + 1]
+    joint = compile_task(scene, steps, request.options, nothing=True)
+    if find_shared_coordinate(scene, joint.holds) is None and not current_ending():
+        results.append(solve_task(scene, joint, request))
+    plan = add_statistics(results[-1].plan, [result.plan.statistics for result in results])
+    return PlannedStep(before.first, failed.last, dataclasses.replace(results[-1], plan=plan))

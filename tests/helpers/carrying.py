@@ -135,6 +135,11 @@ def solve_above(stick: pin.SE3, **grasp: Any) -> np.ndarray:
     return solve_reach(compute_grasp_pose(lift(stick), **grasp), _make_guess_above())
 
 
+def solve_grasp() -> np.ndarray:
+    """Return robot coordinates with the hand at the grasp of the stick on the table."""
+    return solve_reach(compute_grasp_pose(STICK), solve_above(STICK))
+
+
 @dataclasses.dataclass
 class MotionBuilder:
     """Builds a motion from grasps and robot configurations.

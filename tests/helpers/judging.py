@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from typing import Any
 
 import pinocchio as pin
 
@@ -19,6 +20,16 @@ def get_only_violation(report: Report) -> Violation:
     """Return the only violation of a report."""
     assert len(report.violations) == 1, "\n".join(report.lines())
     return report.violations[0]
+
+
+def check_only_violation(
+    report: Report, constraint: str, subject: str, unit: str | None = None, **fields: Any
+) -> Violation:
+    """Check and return the only violation of a report; `fields` are further expected values."""
+    found = get_only_violation(report)
+    expected = {"constraint": constraint, "subject": subject, "unit": unit or found.unit, **fields}
+    assert {name: getattr(found, name) for name in expected} == expected
+    return found
 
 
 def get_violation_names(report: Report) -> set[tuple[str, str]]:

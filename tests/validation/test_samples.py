@@ -6,11 +6,11 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
-from helpers.carrying import MotionBuilder, make_room
+from helpers.carrying import make_room
 from helpers.drives import make_hall, make_trajectory, move_start
-from helpers.small_problems import load_door_scene, make_full_scene, replace_objects
+from helpers.robots import compute_placement
+from helpers.small_problems import load_door_scene, make_full_scene
 from helpers.telescopes import write_coupled_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,33 +18,24 @@ from scipy.spatial.transform import Rotation
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.validation.samples import ANGLE_STEP, LENGTH_STEP, MAX_SAMPLES, Samples
+from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import Hold, make_holds
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 
-VIRTUAL = {
-    "grip": (),
-    "rail": ("rail",),
-    "bar": ("bar",),
-    "ball": ("ball_z", "ball_y", "ball_x"),
-    "sleeve": ("sleeve_turn", "sleeve_slide"),
-    "socket": ("socket_z", "socket_y", "socket_x"),
-}
+GRASPS = sorted(make_full_scene().objects["cabinet"].object.attachments)
 
 
-def sample_motion(scene: Scene, seed: int, *, grasp: str = "grip", number: int = 5) -> Trajectory:
-    rng = np.random.default_rng(seed)
-    objects = [
-        f"{name}.{joint}"
-        for name, placed in scene.objects.items()
-        for joint in placed.object.coordinates.names
-    ]
+def sample_motion(seed: int, *, grasp: str = "grip", number: int = 5) -> Trajectory:
+    """Return a random motion of all objects of the full scene, with a grasp of the cabinet."""
+    scene, rng = make_full_scene(), np.random.default_rng(seed)
+    attachment = scene.objects["cabinet"].object.attachments[grasp]
     names = (
-        *scene.robot.coordinates.names,
-        *objects,
-        *(f"cabinet.{name}" for name in VIRTUAL[grasp]),
+        *World(scene).coordinates.names,
+        *(f"cabinet.{name}" for name in attachment.coordinates),
     )
     positions = rng.uniform(-1.0, 1.0, (number, len(names))) * rng.choice(
         [0.0, 0.01, 1.0], len(names)
@@ -74,13 +65,12 @@ def test_samples_of_coupled_joints_are_dense(tmp_path: Path) -> None:
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.sampled_from(sorted(VIRTUAL)))
+@given(st.integers(0, 2**32 - 1), st.sampled_from(GRASPS))
 def test_samples_are_dense(seed: int, grasp: str) -> None:
-    trajectory = sample_motion(make_full_scene(), seed, grasp=grasp)
-    samples = Samples(make_full_scene(), trajectory)
+    trajectory = sample_motion(seed, grasp=grasp)
+    samples, rows = Samples(make_full_scene(), trajectory), np.arange(len(trajectory.times))
     steps = np.abs(np.diff(trajectory.at(samples.times), axis=0))
-    slides = ("drawer.slide", "cabinet.slide", "cabinet.rail", "cabinet.sleeve_slide")
-    lengths = np.array([name in ("base_x", "base_y", *slides) for name in trajectory.names])
+    lengths = np.array([samples.get_unit(name) == "m" for name in trajectory.names])
     assert steps[:, lengths].max(initial=0.0) <= LENGTH_STEP * (1 + 1e-6)
     assert steps[:, ~lengths].max(initial=0.0) <= ANGLE_STEP * (1 + 1e-6)
     assert np.linalg.norm(steps[:, :2], axis=1).max() <= LENGTH_STEP * (1 + 1e-6)
@@ -89,66 +79,35 @@ def test_samples_are_dense(seed: int, grasp: str) -> None:
         samples.z[samples.waypoint_rows], samples.world.compute_positions(trajectory), atol=1e-9
     )
     assert (np.diff(samples.times) > 0).all()
-    assert [samples.find_waypoint(int(row)) for row in samples.waypoint_rows] == list(
-        range(len(trajectory.times))
-    )
-    assert all(
-        samples.find_waypoint(int(row) - 1) == t for t, row in enumerate(samples.waypoint_rows[1:])
-    )
-    assert [samples.get_unit(name) == "m" for name in trajectory.names] == lengths.tolist()
+    at, before = (map(samples.find_waypoint, samples.waypoint_rows - k) for k in (0, 1))
+    np.testing.assert_array_equal([*at], rows)
+    np.testing.assert_array_equal([*before][1:], rows[:-1])
 
 
-@settings(max_examples=15, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.sampled_from(sorted(VIRTUAL)))
-def test_grasp_errors_are_the_displacement_of_the_object(seed: int, grasp: str) -> None:
-    """The cabinet is placed where the tool grasps it exactly, then displaced."""
-    scene = make_full_scene()
-    trajectory, rng = sample_motion(scene, seed, grasp=grasp, number=2), np.random.default_rng(seed)
-    robot, placed = scene.robot, scene.objects["cabinet"]
-    attachment, z = placed.object.attachments[grasp], trajectory.positions[0]
-    data = robot.model.createData()
-    pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(z[: len(scene.start)]))
-    tool = data.oMf[robot.model.getFrameId(robot.tool_frame)]
-    value = {name: trajectory.column(f"cabinet.{name}")[0] for name in VIRTUAL[grasp]}
-    freedom = pin.SE3.Identity()
-    if attachment.joint in ("prismatic", "cylindrical"):
-        freedom.translation = attachment.freedoms[0].axis * value.get(
-            "rail", value.get("sleeve_slide", 0.0)
+@pytest.mark.parametrize("grasp", GRASPS)
+def test_grasp_errors_are_measured_from_the_frame_of_the_attachment(grasp: str) -> None:
+    scene, trajectory = make_full_scene(), sample_motion(4, grasp=grasp)
+    samples, placed = Samples(scene, trajectory), scene.objects["cabinet"]
+    attachment, robot = placed.object.attachments[grasp], scene.robot
+    hand, expected = compute_hand_frame(robot, attachment), []
+    for row in trajectory.positions:
+        value = dict(zip(trajectory.names, row, strict=True))
+        state, freedoms = (
+            [value[f"cabinet.{name}"] for name in names]
+            for names in (placed.object.coordinates.names, attachment.coordinates)
         )
-    if attachment.joint in ("revolute", "cylindrical"):
-        turn = attachment.freedoms[-1].axis * value.get("bar", value.get("sleeve_turn", 0.0))
-        freedom.rotation = Rotation.from_rotvec(turn).as_matrix()
-    elif attachment.joint == "spherical":
-        freedom.rotation = Rotation.from_euler(
-            "XYZ", [value[f"{grasp}_{axis}"] for axis in "xyz"]
-        ).as_matrix()
-    freedom.translation = freedom.translation - attachment.standoff * freedom.rotation[:, 2]
-    state = np.array(
-        [trajectory.column(f"cabinet.{joint}")[0] for joint in placed.object.coordinates.names]
-    )
-    hand = placed.object.link_placement(attachment.link, state) * attachment.placement * freedom
-    here = replace_objects(
-        scene, {"cabinet": dataclasses.replace(placed, placement=tool * hand.inverse())}
-    )
-    np.testing.assert_allclose(
-        Samples(here, trajectory).compute_grasp_errors(Hold("cabinet", grasp), np.array([0])),
-        0.0,
-        atol=1e-7,
-    )
-    shift, turn = rng.normal(size=3), rng.uniform(-1.0, 1.0, 3)
-    off = tool * pin.SE3(pin.exp3(turn), shift)
-    there = replace_objects(
-        scene, {"cabinet": dataclasses.replace(placed, placement=off * hand.inverse())}
-    )
-    (errors,) = Samples(there, trajectory).compute_grasp_errors(
-        Hold("cabinet", grasp), np.array([0])
-    )
-    assert errors[0] == pytest.approx(np.linalg.norm(shift))
-    assert errors[1] == pytest.approx(np.linalg.norm(turn))
+        link = placed.placement * placed.object.link_placement(attachment.link, state)
+        grasped = link * attachment.tool(freedoms)
+        tool = compute_placement(robot, robot.tool_frame, row[: len(scene.start)])
+        error = grasped.actInv(tool * hand)
+        turn = Rotation.from_matrix(error.rotation).magnitude()
+        expected.append((np.linalg.norm(error.translation), turn))
+    errors = samples.compute_grasp_errors(Hold("cabinet", grasp), samples.waypoint_rows)
+    np.testing.assert_allclose(errors, expected, atol=1e-9)
 
 
 def test_grasps_drive_the_joints_between_root_and_attachment() -> None:
-    samples = Samples(make_full_scene(), sample_motion(make_full_scene(), 0))
+    samples = Samples(make_full_scene(), sample_motion(0))
     assert samples.find_driven_coordinates(()) == set()
     assert samples.find_driven_coordinates(make_holds({"cabinet": "grip"})) == {
         "cabinet.swing",
@@ -178,30 +137,6 @@ def test_limits_of_the_base_include_the_arena() -> None:
     np.testing.assert_array_equal(limits[2:, 1], upper[2:])
     np.testing.assert_array_equal(limits[:, 2], robot.velocity)
     np.testing.assert_array_equal(limits[:, 3], robot.acceleration)
-
-
-def test_fixed_base_is_limited_to_its_start() -> None:
-    scene = make_hall(base="fixed").with_start(base=[1.0, -2.0, 0.5])
-    samples, robot = sample_stationary_motion(scene), scene.robot
-    limits = np.array([samples.get_limits(name)[:2] for name in robot.coordinates.names])
-    np.testing.assert_array_equal(limits[:3], [(1.0, 1.0), (-2.0, -2.0), (0.5, 0.5)])
-    np.testing.assert_array_equal(limits[3:], np.column_stack([robot.lower, robot.upper])[3:])
-
-
-def test_objects_and_grasps_have_the_limits_of_their_joints() -> None:
-    scene = make_room()
-    samples = Samples(scene, MotionBuilder(scene).take("stick").wait().motion())
-    freedoms = scene.objects["stick"].object.attachment("grip").freedoms
-    for freedom, name in zip(freedoms, ("slide", "turn"), strict=True):
-        limits = samples.get_limits(f"stick.grip_{name}")
-        assert limits == (freedom.lower, freedom.upper, np.inf, np.inf)
-        assert samples.get_unit(f"stick.grip_{name}") == freedom.unit
-    item = load_door_scene().objects["door"].object
-    for i, joint in enumerate(item.coordinates.names):
-        arrays = (item.lower, item.upper, item.velocity, item.acceleration)
-        assert sample_stationary_motion(load_door_scene()).get_limits(f"door.{joint}") == tuple(
-            float(values[i]) for values in arrays
-        )
 
 
 def test_number_of_samples_grows_with_the_step() -> None:

@@ -26,36 +26,28 @@ def find_violations(
     return [violation for violation in report.violations if violation.constraint == "term"]
 
 
-def limit_tip(upper: float, **fields: Any) -> vkc.Constraint:
-    return vkc.Constraint("low tip", lambda s: s.position("stick.tip")[2], upper=upper, **fields)
-
-
 def test_constraint_on_a_grasped_object_is_checked() -> None:
-    scene = make_room(describe_table())
-    motion, place = (
-        make_carrying_motion(scene, aside=0.3).motion(),
-        [vkc.Place("stick", (0.8, 0.3, 0.551))],
-    )
+    scene, low = make_room(describe_table()), TOP + 0.1
+    motion, place = make_carrying_motion(scene, aside=0.3).motion(), (0.8, 0.3, 0.551)
+
+    def find(upper: float, **fields: Any) -> list[vkc.Violation]:
+        term = vkc.Constraint(
+            "low tip", lambda s: s.position("stick.tip")[2], upper=upper, **fields
+        )
+        return find_violations(scene, motion, term, [vkc.Place("stick", place)])
+
     link = scene.objects["stick"].object.link_placement("tip", [])
     highest = (STICK * link).translation[2] + 0.2
-    assert find_violations(scene, motion, limit_tip(highest + 1e-4), place) == []
-    (violation,) = find_violations(scene, motion, limit_tip(TOP + 0.1), place)
+    assert find(highest + 1e-4) == []
+    (violation,) = find(low)
     assert (violation.subject, violation.unit) == ("low tip", "")
-    assert violation.amount == pytest.approx(highest - TOP - 0.1, abs=1e-6)
+    assert violation.amount == pytest.approx(highest - low, abs=1e-6)
     assert f"{highest:.6g} is more than 0.6 by" in violation.detail
     held = [phase for phase in motion.phases if phase.held]
     assert motion.times[held[0].first] <= violation.time <= motion.times[held[-1].last]
     # The constraint holds before and after the transport.
-    assert (
-        find_violations(
-            scene,
-            motion,
-            limit_tip(TOP + 0.1, during=[motion.phases[0].name, motion.phases[-1].name]),
-            place,
-        )
-        == []
-    )
-    assert len(find_violations(scene, motion, limit_tip(TOP + 0.1, holding="stick"), place)) == 1
+    assert find(low, during=[motion.phases[0].name, motion.phases[-1].name]) == []
+    assert len(find(low, holding="stick")) == 1
 
 
 def test_worst_violation_is_reported_with_entry_and_time() -> None:
@@ -74,20 +66,8 @@ def test_worst_violation_is_reported_with_entry_and_time() -> None:
     (violation,) = find_violations(scene, motion, dataclasses.replace(within, during="drive 1"))
     assert violation.detail == "entry 0: 2 is more than 1.5 by 0.5"
     assert violation.waypoint == 40
-    report = vkc.validate(scene, [vkc.GoTo(2.0, 1.0)], motion, terms=[within])
-    assert not report.ok
-    assert any("term within: entry 1: 1 is more than 0.25" in line for line in report.lines())
-    assert vkc.validate(scene, [vkc.GoTo(2.0, 1.0)], motion).ok
-
-
-def test_costs_are_ignored() -> None:
-    motion = drive_through(make_hall(), START, move_start(START, x=2.0))
-    assert vkc.validate(
-        make_hall(),
-        [vkc.GoTo(2.0, 0.0)],
-        motion,
-        terms=[vkc.Cost("far", lambda s: s.coordinate("base_x"))],
-    ).ok
+    far = vkc.Cost("far", lambda s: s.coordinate("base_x"))
+    assert vkc.validate(scene, [vkc.GoTo(2.0, 1.0)], motion, terms=[far]).ok
 
 
 @pytest.mark.parametrize(
@@ -98,17 +78,11 @@ def test_violation_at_waypoints_beyond_the_tolerance_is_reported(
     bound: str, excess: float, violated: bool
 ) -> None:
     motion = drive_through(make_hall(), START, move_start(START, x=2.0))
-    limit = 2.0 - excess if bound == "upper" else excess
-    fields = {bound: limit, "during": "drive 1"}
-    term = vkc.Constraint(
-        "x",
-        lambda s: s.coordinate("base_x") if bound == "upper" else 2 - s.coordinate("base_x"),
-        **fields,
-    )
+    sign, limit = (1.0, 2.0 - excess) if bound == "upper" else (-1.0, excess - 2.0)
+    term = vkc.Constraint("x", lambda s: sign * s.coordinate("base_x"), **{bound: limit})
     assert len(find_violations(make_hall(), motion, term)) == violated
-    assert (
-        find_violations(make_hall(), motion, dataclasses.replace(term, tolerance=2 * excess)) == []
-    )
+    tolerant = dataclasses.replace(term, tolerance=2 * excess)
+    assert find_violations(make_hall(), motion, tolerant) == []
 
 
 @pytest.mark.parametrize(("turn", "violated"), [(0.2, False), (0.6, True)])
@@ -116,12 +90,11 @@ def test_violation_between_waypoints_beyond_the_tolerance_is_reported(
     turn: float, violated: bool
 ) -> None:
     """The hand swings out by r·(1 − cos(turn/2)) in the middle of a turn of the base."""
-    scene, steps = make_hall(), 2
+    scene = make_hall()
     arm = scene.tool_placement().translation
     ahead, away = np.arctan2(arm[1], arm[0]), float(np.hypot(*arm[:2]))
     rows = [START, *(move_start(START, yaw=-ahead + sign * turn / 2) for sign in (-1.0, 1.0))]
     motion = make_trajectory(scene, np.array(rows), dt=5.0)
-    assert len(motion.times) == steps + 1
     edge = away * np.cos(turn / 2)
     term = vkc.Constraint("behind", lambda s: s.position("tool")[0], upper=edge)
     out = away - edge
@@ -133,14 +106,8 @@ def test_violation_between_waypoints_beyond_the_tolerance_is_reported(
         assert violation.waypoint == 1
         assert violation.time == pytest.approx(7.5, abs=0.1)
         assert "between waypoints" in violation.detail
-    assert (
-        len(
-            find_violations(
-                scene, motion, dataclasses.replace(term, tolerance=out / INTERMEDIATE_FACTOR * 0.9)
-            )
-        )
-        == 1
-    )
+    strict = dataclasses.replace(term, tolerance=out / INTERMEDIATE_FACTOR * 0.9)
+    assert len(find_violations(scene, motion, strict)) == 1
 
 
 def test_velocities_at_waypoints_are_those_of_the_segment_before() -> None:
@@ -171,21 +138,15 @@ def test_velocities_at_waypoints_are_those_of_the_segment_before() -> None:
 
 
 def test_constraint_holds_after_the_first_waypoint_of_its_phases() -> None:
-    scene = make_hall()
-    motion = drive_through(scene, START, move_start(START, x=2.0), move_start(START, x=2.5))
-    ahead = vkc.Constraint("ahead", lambda s: s.coordinate("base_x"), lower=2.0)
-    assert len(find_violations(scene, motion, ahead)) == 1
-    assert find_violations(scene, motion, dataclasses.replace(ahead, during="drive 2")) == []
-    clear = dataclasses.replace(ahead, lower=motion.positions[41, 0], during="drive 2")
-    assert find_violations(scene, motion, clear) == []  # although the phase begins before that
-    assert (
-        len(
-            find_violations(
-                scene, motion, dataclasses.replace(clear, during=["drive 1", "drive 2"])
-            )
-        )
-        == 1
-    )
+    motion = drive_through(make_hall(), START, move_start(START, x=2.0), move_start(START, x=2.5))
+    for lower, during, count in (
+        (2.0, None, 1),
+        (2.0, "drive 2", 0),
+        (motion.positions[41, 0], "drive 2", 0),  # although the phase begins before that
+        (motion.positions[41, 0], ["drive 1", "drive 2"], 1),
+    ):
+        term = vkc.Constraint("ahead", lambda s: s.coordinate("base_x"), lower=lower, during=during)
+        assert len(find_violations(make_hall(), motion, term)) == count
 
 
 def test_constraint_holds_after_the_wait_for_the_gripper() -> None:

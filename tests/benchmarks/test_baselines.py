@@ -17,7 +17,6 @@ import vkc_pin as vkc
 from vkc_pin.benchmarks import baselines
 from vkc_pin.benchmarks.baselines import COMPARED_PLANNERS
 from vkc_pin.benchmarks.comparison import choose_shown_trial, format_results
-from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.planning.plan import PlanningStatistics
 from vkc_pin.validation.report import Report
 
@@ -217,15 +216,3 @@ def test_shown_trial_has_most_successes(
         for m in COMPARED_PLANNERS
     ]
     assert choose_shown_trial(records, COMPARED_PLANNERS) == expected
-
-
-def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(UnknownNameError, match=r"no task 'drawers'.*did you mean 'drawer'"):
-        run(tmp_path, tasks=["drawers"])
-    with pytest.raises(UnknownNameError, match=r"no method 'B3'.*B1"):
-        run(tmp_path, methods=["B3"])
-    with pytest.raises(InputError, match="methods: there is nothing to run"):
-        run(tmp_path, methods=[])
-    with pytest.raises(InputError, match=r"trials: out of range.*at least 1.*got 0"):
-        run(tmp_path, trials=0)
-    assert not list_files(tmp_path)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from helpers.experiments import run_experiment
 
-import vkc_pin as vkc
 from vkc_pin.benchmarks import bases
 from vkc_pin.benchmarks.harness.record import describe_environment
 
@@ -50,18 +49,3 @@ def test_failures_are_listed() -> None:
     text = bases.format_results({"meta": {**describe_environment(), **meta}, "trials": [failure]})
     assert "- door, ackermann, start 4: rejected; turning base" in text
     assert "| door | ackermann | 0 of 1 |" in text
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"bases": ["diferential"]}, "differential"),
-        ({"tasks": ["drawers"]}, "drawer"),
-        ({"trials": 0}, "trials"),
-    ],
-)
-def test_wrong_arguments_are_refused(
-    wrong: dict[str, object], message: str, tmp_path: Path
-) -> None:
-    with pytest.raises(vkc.InputError, match=message):
-        bases.run(out=tmp_path, **wrong)  # type: ignore[arg-type]

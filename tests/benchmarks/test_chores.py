@@ -14,7 +14,7 @@ from helpers.fake_plan import replace_metrics
 import vkc_pin as vkc
 from vkc_pin.benchmarks import chores
 from vkc_pin.benchmarks.harness.record import describe_environment
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError
 from vkc_pin.world.scene.clearance_exemptions import find_close_pairs
 from vkc_pin.world.task.actions import compile_each_step, group_into_actions
 
@@ -124,10 +124,3 @@ def test_table_of_seeds_counts_successes_and_steps() -> None:
     assert "| fetch | 0 | step by step | 2 of 3 | 1, all, all |" in text
     assert "| 8.0–9.0 | 12 | 6 |" in text, "(9 - 8) / 8 and (9 - 8) / (9 + 8)"
     assert "nan" not in text
-
-
-def test_wrong_names_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(UnknownNameError, match="did you mean 'fetch'"):
-        chores.run(trials=1, seed=0, out=tmp_path, chores=("fetsh",))
-    with pytest.raises(InputError, match="chores: there is nothing to run"):
-        chores.run(trials=1, seed=0, out=tmp_path, chores=())

@@ -60,8 +60,3 @@ def test_trial_is_recorded_and_tabulated(
     distance = np.linalg.norm(np.array(gap.POSE[:2]) - record["start"][:2])
     assert record["base_path_length"] > distance - reach
     assert f"| {gap.SCENE} | 1 of 1 | {int(record['first_seed'])} of 1 |" in table
-
-
-def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(vkc.InputError, match="trials"):
-        gap.run(out=tmp_path, trials=0)

@@ -22,7 +22,6 @@ from vkc_pin.benchmarks.household import (
     make_paper_home,
     sample_cup_pose,
 )
-from vkc_pin.cli import main
 from vkc_pin.world.models.shapes import compute_clearance, list_placed_shapes
 from vkc_pin.world.scene.placed_object import make_world_shapes
 
@@ -120,19 +119,3 @@ def test_cup_poses_and_starts_depend_on_seed_and_task_alone() -> None:
         selected = [s for s in specs if (s["scene"], s["number"]) == ("cup", number)]
         assert [(s["placed"], s["base"]) for s in selected] == 2 * [(pose, base)]
     assert all("placed" not in s for s in specs if s["scene"] != "cup")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--tasks", "fridge"], "there is no task 'fridge'"),
-        (["--methods", "B3"], "'B3'"),
-        (["--variant", "papers"], "there is no variant 'papers'"),
-    ],
-)
-def test_wrong_names_are_refused(
-    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["bench", "household", "--out", str(tmp_path / "out"), *arguments]) == 2
-    assert message in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()

@@ -16,7 +16,6 @@ from helpers.markdown import parse_cells
 import vkc_pin as vkc
 from vkc_pin.benchmarks import initialization
 from vkc_pin.benchmarks.initialization import COMPARED_INITIALIZATIONS, STEPWISE, TARGET
-from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.validation.report import Report
 
 
@@ -126,13 +125,3 @@ def test_planned_trial_is_recorded(tmp_path: Path) -> None:
     assert 0.0 < sum(stage_times) <= trial["planning_time"]
     assert trial["waypoints"] == 82, "two times 40 segments, the start, and a pause for the gripper"
     assert f"| init_1: no obstacle | astar | 1 of 1 | {trial['planning_time']:.2f} |" in table
-
-
-def test_wrong_names_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(UnknownNameError, match="did you mean 'astar'"):
-        run(tmp_path, methods=["astra"])
-    with pytest.raises(UnknownNameError, match="init_1"):
-        run(tmp_path, scenes=["door"], solve=initialization.plan_trial)  # the scene has no stick
-    with pytest.raises(InputError, match="scenes: there is nothing to run"):
-        run(tmp_path, scenes=[])
-    assert not list(tmp_path.iterdir())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from helpers.experiments import run_experiment
 import vkc_pin as vkc
 from vkc_pin.benchmarks import scale
 from vkc_pin.benchmarks.scale import make_crowded_scene, make_refined_options
-from vkc_pin.errors import InputError
 
 
 def test_larger_sets_of_obstacles_contain_the_smaller_ones() -> None:
@@ -85,17 +83,3 @@ def test_errors_have_no_planning_time() -> None:
         {"meta": {**meta, "machine": machine, "versions": {}}, "trials": [error]}
     )
     assert f"| 12 | 0 of 1 |{' – |' * 9}" in text
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"counts": ()}, "counts"),
-        ({"counts": (0, 10)}, "counts"),
-        ({"of": "segments", "counts": (3, 20)}, "counts"),
-        ({"of": "doors"}, "obstacles or segments"),
-    ],
-)
-def test_wrong_arguments_are_refused(wrong: dict[str, Any], message: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=message):
-        scale.run(starts=1, seed=0, out=tmp_path, **wrong)

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 from helpers.experiments import run_experiment
 
-import vkc_pin as vkc
 from vkc_pin.benchmarks.harness.record import describe_environment
 from vkc_pin.benchmarks.problems import ablation
 
@@ -66,20 +65,3 @@ def test_ratios_are_of_problems_that_both_settings_solve() -> None:
     triple, same = "3.000 (3.000–3.000)", "1.000 (1.000–1.000)"
     assert f"| {changed} | 1 | {triple} | {same} | {same} | – | {triple} |" in text
     assert "| unchanged | 2 of 4 | 2 of 4 | 1.00 | 1.33 |" in text
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"problems": [60]},
-        {"problems": []},
-        {"changes": ["Options.none=1"]},
-        {"tasks": ["dor"]},
-        {"tasks": ["door"], "problems": [1]},
-        {"tasks": ["door"], "starts": 0},
-    ],
-)
-def test_wrong_arguments_are_refused(wrong: dict[str, Any], tmp_path: Path) -> None:
-    with pytest.raises(vkc.InputError):
-        ablation.run(out=tmp_path, **wrong)
-    assert list(tmp_path.iterdir()) == []

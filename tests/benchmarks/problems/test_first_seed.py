@@ -7,9 +7,6 @@ from pathlib import Path
 import pytest
 from helpers.experiments import run_experiment
 
-import vkc_pin as vkc
-from vkc_pin.benchmarks.problems import first_seed
-
 
 @pytest.mark.long
 def test_first_guess_successes_are_counted(tmp_path: Path) -> None:
@@ -20,10 +17,3 @@ def test_first_guess_successes_are_counted(tmp_path: Path) -> None:
         counts = f"{int(r['success'])} of 1 | {int(r['first_seed'])} of 1"
         assert f"| {r['task']} | {counts} |" in table
     assert f"| all | {sum(r['success'] for r in trials)} of 2 |" in table
-
-
-def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(vkc.InputError, match="trials"):
-        first_seed.run(out=tmp_path, trials=0)
-    with pytest.raises(vkc.UnknownNameError, match="did you mean 'drawer'"):
-        first_seed.run(out=tmp_path, tasks=["drawr"])

@@ -9,7 +9,7 @@ import pytest
 from helpers.experiments import run_experiment
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.problems.impossible import KINDS, run, sample_impossible_problem
+from vkc_pin.benchmarks.problems.impossible import KINDS, sample_impossible_problem
 
 
 @pytest.mark.parametrize(
@@ -39,8 +39,3 @@ def test_trials_are_explained_and_proven_infeasible(tmp_path: Path) -> None:
         assert "proven: " in t["notes"][0]
         assert t["notes"][0] in table
         assert t["wall_time"] > 0.0
-
-
-def test_experiment_needs_a_problem(tmp_path: Path) -> None:
-    with pytest.raises(vkc.InputError, match="at least 1"):
-        run(out=tmp_path, problems=0)

@@ -12,7 +12,7 @@ from oracle.plan import read_plan
 
 from vkc_pin.benchmarks.problems import random_problems
 from vkc_pin.benchmarks.problems.random_problems import sample_problem
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError
 from vkc_pin.planning.plan import Plan
 from vkc_pin.procedural.tasks import random_task
 from vkc_pin.world.files.resources import list_resources
@@ -92,10 +92,3 @@ def test_tasks_in_random_rooms_are_planned_and_saved(tmp_path: Path) -> None:
     assert "# Random rooms, one task each" in table
     with pytest.raises(InputError, match="run otherwise"):  # the folder has other problems
         random_problems.run(problems=2, out=tmp_path / "rooms")
-
-
-def test_wrong_arguments_raise_errors(tmp_path: Path) -> None:
-    with pytest.raises(UnknownNameError, match="rooms"):
-        random_problems.run(of="room", out=tmp_path / "none")
-    with pytest.raises(InputError, match="problems"):
-        random_problems.run(problems=0, out=tmp_path / "none")

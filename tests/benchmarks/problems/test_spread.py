@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 from helpers.experiments import run_experiment
 
-import vkc_pin as vkc
 from vkc_pin.benchmarks.problems import spread
 
 
@@ -29,9 +28,3 @@ def test_spread_covers_successes_only() -> None:
     assert spread.compute_spread(records, "x") == pytest.approx(0.5)
     assert spread.compute_spread(records[1:], "x") is None
     assert spread.compute_spread([{"success": True, "x": 0.0}, *records], "x") is None
-
-
-@pytest.mark.parametrize("seeds", [1, 2.0, True])
-def test_spread_needs_two_seeds(seeds: int, tmp_path: Path) -> None:
-    with pytest.raises(vkc.InputError, match="at least 2"):
-        spread.run(out=tmp_path, seeds=seeds)

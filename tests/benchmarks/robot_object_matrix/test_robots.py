@@ -9,7 +9,6 @@ from helpers.arm_urdf import write_arms
 import vkc_pin as vkc
 from vkc_pin.benchmarks.robot_object_matrix.robots import (
     format_results,
-    run,
     sample_reachable_poses,
 )
 from vkc_pin.cli import main
@@ -113,16 +112,3 @@ def test_report_lists_failures_by_robot() -> None:
     assert "| two | 6 | 7 | 4.00 | 0.50 | – | – |" in text
     assert "| one | infeasible | too deep |" in text
     assert "| two | hardly free | only 1 of 9 |" in text
-
-
-def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(vkc.InputError, match="goals: out of range"):
-        run(out=tmp_path, goals=0)
-    with pytest.raises(vkc.InputError, match="robots: not a choice"):
-        run(out=tmp_path, robots=["panda", "panda"])
-    with pytest.raises(vkc.InputError, match="robots: not a choice"):
-        run(out=tmp_path, robots=[])
-    with pytest.raises(vkc.InputError, match="there is no such file"):
-        run(out=tmp_path, robots=[str(tmp_path / "none.urdf")])
-    with pytest.raises(vkc.UnknownNameError, match="did you mean 'panda'"):
-        run(out=tmp_path, robots=["pandas"])

@@ -11,7 +11,7 @@ import pytest
 import vkc_pin as vkc
 from vkc_pin.benchmarks.harness.record import describe_environment
 from vkc_pin.benchmarks.robot_object_matrix.pairs import SHARE
-from vkc_pin.benchmarks.robot_object_matrix.run import chart, format_results, run
+from vkc_pin.benchmarks.robot_object_matrix.run import chart, format_results
 from vkc_pin.cli import main
 
 
@@ -144,16 +144,3 @@ def test_command_opens_a_drawer_and_records_an_unreachable_object(
     assert main([*command, "--out", str(out)]) == 0
     again = (out / "trials.jsonl").read_bytes()
     assert again == journal, "no trial was run again"
-
-
-def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(vkc.InputError, match="starts: out of range"):
-        run(out=tmp_path, starts=0)
-    with pytest.raises(vkc.InputError, match="robots: not a choice"):
-        run(out=tmp_path, robots=["husky_ur5e", "husky_ur5e"])
-    with pytest.raises(vkc.InputError, match="objects: not a choice"):
-        run(out=tmp_path, objects=[])
-    with pytest.raises(vkc.UnknownNameError, match="husky_ur5e"):
-        run(out=tmp_path, robots=["husky_ur5"])
-    with pytest.raises(vkc.UnknownNameError, match="did you mean 'oven_0'"):
-        run(out=tmp_path, objects=["ofen_0"])

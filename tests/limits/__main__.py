@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from .check import check_motion
-from .files import read_csv, read_limits, read_npz
+from .files import read_csv, read_npz
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -39,11 +39,11 @@ def main(arguments: list[str] | None = None) -> int:
     plans, samples, violating, ratios = 0, 0, 0, [0.0, 0.0]
     for path in options.paths:
         for file in sorted(path.rglob("*.npz")) if path.is_dir() else [path]:
-            motion, metadata = read_npz(file)
+            motion, limits = read_npz(file)
             tables = [read_csv(table)] if (table := file.with_suffix(".csv")).is_file() else []
             excesses = []
             for each in (motion, *tables):
-                verdict = check_motion(each, read_limits(metadata, file))
+                verdict = check_motion(each, limits)
                 excesses += verdict.excesses
                 ratios = [max(ratios[0], verdict.velocity), max(ratios[1], verdict.acceleration)]
                 samples += verdict.samples

@@ -49,9 +49,10 @@ def check_motion(motion: Motion, limits: Mapping[str, Limits]) -> Verdict:
     of positions at intervals of 1 ms, independent of the cubics. Jerks are differences of
     accelerations.
     """
-    count = int(np.floor((motion.times[-1] - motion.times[0]) * RATE + 1e-9))
-    times = motion.times[0] + np.arange(count + 1) / RATE
-    positions, velocities, accelerations = (_sample(motion, times, order) for order in range(3))
+    curve = motion.curve
+    count = int(np.floor((curve.times[-1] - curve.times[0]) * RATE + 1e-9))
+    times = curve.times[0] + np.arange(count + 1) / RATE
+    positions, velocities, accelerations = (curve.evaluate(times, order) for order in range(3))
     first, second = np.diff(positions, axis=0) * RATE, np.diff(positions, 2, axis=0) * RATE**2
     excesses, ratios = list[Excess](), {"velocity": 0.0, "acceleration": 0.0}
     for k, name in enumerate(motion.names):
@@ -78,8 +79,8 @@ def check_motion(motion: Motion, limits: Mapping[str, Limits]) -> Verdict:
             jerks,
             own_limits.jerk,
         )
-        ends = motion.velocities[[0, -1], k]
-        excesses += _find_worst("rest", name, np.abs(ends) - REST, motion.times[[0, -1]], ends, 0.0)
+        ends = curve.velocities[[0, -1], k]
+        excesses += _find_worst("rest", name, np.abs(ends) - REST, curve.times[[0, -1]], ends, 0.0)
     return Verdict(len(times), excesses, **ratios)
 
 
@@ -97,26 +98,3 @@ def _find_worst(
         if excess[k] <= 0.0
         else [Excess(quantity, name, float(times[k]), float(values[k]), limit)]
     )
-
-
-def _sample(motion: Motion, times: np.ndarray, order: int) -> np.ndarray:
-    """Return positions (0), velocities (1) or accelerations (2) at some times, shape (K, n)."""
-    k = np.clip(np.searchsorted(motion.times, times, side="right") - 1, 0, len(motion.times) - 2)
-    span = np.diff(motion.times)[k][:, None]
-    s = (times - motion.times[k])[:, None] / span
-    weights = {
-        0: (2 * s**3 - 3 * s**2 + 1, s**3 - 2 * s**2 + s, 3 * s**2 - 2 * s**3, s**3 - s**2),
-        1: (6 * s**2 - 6 * s, 3 * s**2 - 4 * s + 1, 6 * s - 6 * s**2, 3 * s**2 - 2 * s),
-        2: (12 * s - 6, 6 * s - 4, 6 - 12 * s, 6 * s - 2),
-    }[order]
-    p, v, q, w = (
-        motion.positions[k],
-        motion.velocities[k],
-        motion.positions[k + 1],
-        motion.velocities[k + 1],
-    )
-    # Differences of positions avoid rounding errors, which a division by span² amplifies.
-    from_p = weights[0] + weights[2] if order == 0 else 0.0
-    return (
-        from_p * p + weights[2] * (q - p) + span * (weights[1] * v + weights[3] * w)
-    ) / span**order

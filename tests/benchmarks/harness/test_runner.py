@@ -1,4 +1,4 @@
-"""Tests the descriptions of trial limits."""
+"""Tests that trials are run, recorded and resumed."""
 
 from __future__ import annotations
 
@@ -48,26 +48,17 @@ class CountingSolver:
 
 
 def run_trials(
-    out: Path,
-    function: Any = solve_square,
-    number: int = 6,
-    jobs: int = 1,
-    scheduler: str | None = None,
-    **settings: Any,
+    out: Path, function: Any = solve_square, number: int = 6, *, jobs: int = 1, **settings: Any
 ) -> dict[str, Any]:
-    arguments: dict[str, Any] = {"jobs": jobs, "scheduler": scheduler, "progress": False}
-    return runner.run(
-        make_trials(number), function, out, settings={**SETTINGS, **settings}, **arguments
-    )
-
-
-def read_results(out: Path) -> dict[str, Any]:
-    return json.loads((out / "results.json").read_text(encoding="utf-8"))
+    settings = {**SETTINGS, **settings}
+    trials = make_trials(number)
+    return runner.run(trials, function, out, settings=settings, jobs=jobs, progress=False)
 
 
 def test_results_contain_records_and_settings(tmp_path: Path) -> None:
-    result = run_trials(tmp_path / "new" / "out")
-    assert read_results(tmp_path / "new" / "out") == result
+    out = tmp_path / "new" / "out"
+    result = run_trials(out)
+    assert json.loads((out / "results.json").read_text(encoding="utf-8")) == result
     assert [t["key"] for t in result["trials"]] == ["000", "001", "002", "003", "004", "005"]
     assert result["trials"][3] == {
         "key": "003",
@@ -104,33 +95,24 @@ def test_csv_and_json_have_the_same_records(tmp_path: Path) -> None:
 
 
 def test_trial_may_have_several_records(tmp_path: Path) -> None:
-    result = run_trials(
-        tmp_path, lambda spec: [{"part": part, "number": spec["number"]} for part in "ba"], number=2
-    )
-    assert [(t["key"], t["part"]) for t in result["trials"]] == [
-        ("000", "b"),
-        ("000", "a"),
-        ("001", "b"),
-        ("001", "a"),
-    ]
+    result = run_trials(tmp_path, lambda spec: [{"part": part} for part in "ba"], number=2)
+    records = [(t["key"], t["part"]) for t in result["trials"]]
+    assert records == [("000", "b"), ("000", "a"), ("001", "b"), ("001", "a")]
 
 
 @pytest.mark.parametrize("stop_after", [0, 4])
 def test_interrupted_run_is_resumed(tmp_path: Path, stop_after: int) -> None:
     first, second = CountingSolver(stop_after), CountingSolver()
+    stopped, whole = tmp_path / "stopped", tmp_path / "whole"
     with pytest.raises(KeyboardInterrupt, match=f"{stop_after} of 6 trials are done"):
-        run_trials(tmp_path / "stopped", first)
-    assert not (tmp_path / "stopped" / "results.json").exists()
-    resumed = run_trials(tmp_path / "stopped", second)
-    assert sorted(first.keys + second.keys) == [t["key"] for t in make_trials()][::-1]
-    assert (
-        first.keys == [t["key"] for t in make_trials()][:stop_after]
-    )  # in the given order, not sorted by key
+        run_trials(stopped, first)
+    assert not (stopped / "results.json").exists()
+    resumed = run_trials(stopped, second)
+    assert len(first.keys) == stop_after
+    assert first.keys + second.keys == [t["key"] for t in make_trials()]  # not sorted by key
     assert [s["trials"] for s in resumed["meta"]["sessions"]] == [stop_after, 6 - stop_after]
-    assert resumed["trials"] == run_trials(tmp_path / "whole")["trials"]
-    assert (tmp_path / "stopped" / "results.csv").read_bytes() == (
-        tmp_path / "whole" / "results.csv"
-    ).read_bytes()
+    assert resumed["trials"] == run_trials(whole)["trials"]
+    assert (stopped / "results.csv").read_bytes() == (whole / "results.csv").read_bytes()
 
 
 def test_interrupted_record_interrupts_the_run(tmp_path: Path) -> None:
@@ -140,30 +122,14 @@ def test_interrupted_record_interrupts_the_run(tmp_path: Path) -> None:
 
 
 def test_trial_of_a_truncated_last_line_is_run_again(tmp_path: Path) -> None:
-    whole = run_trials(tmp_path)
-    file = tmp_path / "trials.jsonl"
-    data = file.read_bytes()
-    lines = data.splitlines(keepends=True)
+    whole, file = run_trials(tmp_path), tmp_path / "trials.jsonl"
+    lines = file.read_bytes().splitlines(keepends=True)
     assert len(lines) == 2 + 6  # header, session, trials in the order of running
-    # Truncated inside the header, the session's line and trials: within a line or before its end.
-    for count, length in ((0, 40), (1, 5), (3, 25), (7, len(lines[7]) - 1), (7, 1)):
-        file.write_bytes(b"".join(lines[:count]) + lines[count][:length])
+    for count in (0, 1, 3, 7):
+        file.write_bytes(b"".join(lines[:count]) + lines[count][:-1])
         again = CountingSolver()
         assert run_trials(tmp_path, again)["trials"] == whole["trials"]
         assert again.keys == [t["key"] for t in make_trials()][max(count - 2, 0) :]
-        assert [
-            json.loads(line) for line in file.read_bytes().splitlines()
-        ]  # the truncated line is gone
-
-
-def test_damaged_line_raises_an_error(tmp_path: Path) -> None:
-    run_trials(tmp_path)
-    file = tmp_path / "trials.jsonl"
-    lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
-    for damage in ('{"key": "00\n', "[]\n", "{}\n"):
-        file.write_text("".join([*lines[:3], damage, *lines[4:]]), encoding="utf-8")
-        with pytest.raises(InputError, match=r"trials\.jsonl:4: this line is damaged"):
-            run_trials(tmp_path)
 
 
 def test_folder_with_other_files_is_refused(tmp_path: Path) -> None:
@@ -180,14 +146,6 @@ def test_folder_with_other_files_is_refused(tmp_path: Path) -> None:
     (tmp_path / "folders" / "objects").mkdir(parents=True)
     (tmp_path / "folders" / ".gitignore").touch()
     assert run_trials(tmp_path / "folders")["trials"]
-
-
-def test_foreign_file_with_the_name_of_the_journal_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "trials.jsonl").write_text("court cases, in one line")
-    with pytest.raises(InputError, match="not a journal"):
-        run_trials(tmp_path)
-    assert (tmp_path / "trials.jsonl").read_text() == "court cases, in one line"
-    assert [path.name for path in tmp_path.iterdir()] == ["trials.jsonl"]
 
 
 @pytest.mark.parametrize(
@@ -209,21 +167,13 @@ def test_symbolic_links_out_of_the_folder_are_refused(tmp_path: Path, name: str)
 def test_changed_settings_and_versions_are_refused(tmp_path: Path) -> None:
     run_trials(tmp_path)
     before = (tmp_path / "trials.jsonl").read_bytes()
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match="use another folder") as caught:
         run_trials(tmp_path, seed=4, methods=["x"])
-    text = str(caught.value)
-    for part in (
-        "seed 3",
-        "seed 4",
-        "methods None",
-        "methods ['x']",
-        "use another folder",
-        str(tmp_path),
-    ):
-        assert part in text
+    for part in ("seed 3", "seed 4", "methods None", "methods ['x']", str(tmp_path)):
+        assert part in str(caught.value)
     assert caught.value.field == "seed, methods"
     with pytest.raises(InputError, match="specification"):  # same settings, other trials
-        runner.run(make_trials(5), solve_square, tmp_path, settings=SETTINGS, progress=False)
+        run_trials(tmp_path, number=5)
     assert (tmp_path / "trials.jsonl").read_bytes() == before
     (tmp_path / "trials.jsonl").write_bytes(before.replace(b'"sources": "', b'"sources": "x'))
     with pytest.raises(InputError, match=r"versions\.sources.*expected sources x"):
@@ -258,18 +208,15 @@ def test_workers_of_a_scheduler_run_the_trials(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed")
     options = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
     with distributed.LocalCluster(host="127.0.0.1", **options) as cluster:
-        address = cluster.scheduler_address
-        trials = run_trials(tmp_path / "there", identify_worker, number=2, scheduler=address)[
-            "trials"
-        ]
+        how = {"settings": SETTINGS, "scheduler": cluster.scheduler_address, "progress": False}
+        trials = runner.run(make_trials(2), identify_worker, tmp_path, **how)["trials"]
     assert {t["process"] for t in trials}.isdisjoint({os.getpid()})
 
 
 def test_results_are_the_same_for_any_number_of_jobs(tmp_path: Path) -> None:
-    assert run_trials(tmp_path / "two", jobs=2)["trials"] == run_trials(tmp_path / "one")["trials"]
-    assert (tmp_path / "two" / "results.csv").read_bytes() == (
-        tmp_path / "one" / "results.csv"
-    ).read_bytes()
+    one, two = tmp_path / "one", tmp_path / "two"
+    assert run_trials(two, jobs=2)["trials"] == run_trials(one)["trials"]
+    assert (two / "results.csv").read_bytes() == (one / "results.csv").read_bytes()
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
@@ -287,9 +234,8 @@ def test_error_is_recorded_as_failure(
     }
     assert [t["status"] for t in records].count("error") == 1
     stderr = capsys.readouterr().err
-    assert "002 failed with an error" in stderr
-    assert "nothing to divide by" in stderr
-    assert "in divide_by_zero" in stderr  # the traceback
+    for part in ("002 failed with an error", "nothing to divide by", "in divide_by_zero"):
+        assert part in stderr
 
 
 def test_killed_worker_raises_an_error(tmp_path: Path) -> None:
@@ -300,10 +246,9 @@ def test_killed_worker_raises_an_error(tmp_path: Path) -> None:
 
 def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="no folder"):
-        run_trials(tmp_path / "file")
-    with pytest.raises(InputError, match="no folder"):
-        run_trials(tmp_path / "file" / "out")
+    for out in (tmp_path / "file", tmp_path / "file" / "out"):
+        with pytest.raises(InputError, match="no folder"):
+            run_trials(out)
     with pytest.raises(InputError, match="same key"):
         runner.run([*make_trials(2), *make_trials(1)], solve_square, tmp_path, settings=SETTINGS)
     with pytest.raises(InputError, match="jobs"):
@@ -319,8 +264,10 @@ runner.run(make_trials(), solve_slowly, sys.argv[1], **more)
 """
 
 
-@pytest.mark.parametrize(("jobs", "kind"), [(1, "SIGKILL"), (2, "SIGINT")])
-def test_stopped_process_keeps_finished_trials(tmp_path: Path, jobs: int, kind: str) -> None:
+@pytest.mark.parametrize(("jobs", "kind"), [(1, signal.SIGKILL), (2, signal.SIGINT)])
+def test_stopped_process_keeps_finished_trials(
+    tmp_path: Path, jobs: int, kind: signal.Signals
+) -> None:
     path = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
     process = subprocess.Popen(
         [sys.executable, "-c", SCRIPT, str(tmp_path), str(jobs)],
@@ -337,13 +284,9 @@ def test_stopped_process_keeps_finished_trials(tmp_path: Path, jobs: int, kind: 
         assert time.monotonic() < deadline
         assert process.poll() is None, process.communicate()[1]
         time.sleep(0.02)
-    if kind == "SIGINT":  # like Ctrl-C, which all processes receive
-        os.killpg(process.pid, signal.SIGINT)
-    else:
-        process.kill()
-    _, stderr = process.communicate(timeout=30)  # running workers keep the pipe open
-    if kind == "SIGINT":
-        assert "of 6 trials are done" in stderr
+    os.killpg(process.pid, kind)  # like Ctrl-C, which all processes receive
+    _, stderr = process.communicate(timeout=30)
+    assert ("of 6 trials are done" in stderr) == (kind == signal.SIGINT)
     counting = CountingSolver()
     assert run_trials(tmp_path, counting)["trials"] == run_trials(tmp_path / "whole")["trials"]
     assert 0 < len(counting.keys) <= 4

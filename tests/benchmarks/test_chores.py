@@ -39,35 +39,27 @@ def test_cluttered_home_contains_the_home() -> None:
     assert len(cluttered.obstacles) + sum(shapes) > 500
 
 
-def compute_distance(scene: vkc.Scene, first: str, second: str) -> float:
-    """Return the distance between two links [m]."""
-    (pair,) = [
-        pair
-        for pair in find_close_pairs(scene, 0.02)
-        if {pair.first, pair.second} == {first, second}
-    ]
-    return pair.distance
-
-
-def test_cluttered_home_has_overlaps_and_small_gaps() -> None:
+@pytest.mark.parametrize(
+    ("first", "second", "distance"),
+    [
+        ("door.panel", "casing_above", -0.05),
+        ("door.panel", "casing_beside", -0.02),
+        ("refrigerator.door", "panel_east", 0.0),
+        ("refrigerator.door", "panel_west", 0.009),
+        ("door.lever", "bag", 0.01),
+        ("open door.panel", "casing_above", -0.05),
+        ("open door.lever", "wardrobe", 0.01),
+    ],
+)
+def test_cluttered_home_has_overlaps_and_small_gaps(
+    first: str, second: str, distance: float
+) -> None:
     """Door leaves overlap and touch walls; handles are near obstacles."""
-    cluttered = chores.make_cluttered_home()
-    opened = cluttered.with_state("door", {"hinge": 1.52})
-    assert compute_distance(cluttered, "door.panel", "casing_above") == pytest.approx(
-        -0.05, abs=1e-4
-    )
-    assert compute_distance(opened, "door.panel", "casing_above") == pytest.approx(-0.05, abs=1e-4)
-    assert compute_distance(cluttered, "door.panel", "casing_beside") == pytest.approx(
-        -0.02, abs=1e-4
-    )
-    assert compute_distance(cluttered, "refrigerator.door", "panel_east") == pytest.approx(
-        0.0, abs=1e-4
-    )
-    assert compute_distance(cluttered, "refrigerator.door", "panel_west") == pytest.approx(
-        0.009, abs=1e-4
-    )
-    assert compute_distance(cluttered, "door.lever", "bag") == pytest.approx(0.01, abs=1e-4)
-    assert compute_distance(opened, "door.lever", "wardrobe") == pytest.approx(0.01, abs=5e-4)
+    scene, link = chores.make_cluttered_home(), first.removeprefix("open ")
+    if link != first:
+        scene = scene.with_state("door", {"hinge": 1.52})
+    found = {frozenset((one.first, one.second)): one for one in find_close_pairs(scene, 0.02)}
+    assert found[frozenset((link, second))].distance == pytest.approx(distance, abs=5e-4)
     assert chores.CHORES["cluttered"].options.dist_safe == 0.005
 
 
@@ -106,17 +98,13 @@ def test_trials_are_recorded(tmp_path: Path) -> None:
 
 def test_table_of_seeds_counts_successes_and_steps() -> None:
     def make_record(seed: int, method: str, done: int | None) -> dict[str, Any]:
-        fields = {"scene": "fetch", "number": 0, "method": method, "seed": seed, "steps_done": done}
         success = done == 10
+        fields = {"scene": "fetch", "number": 0, "method": method, "seed": seed, "steps_done": done}
         status = "success" if success else "not converged"
         return {**fields, "success": success, "status": status, "arm_path_length": 3.0 + seed}
 
-    trials = [make_record(4, "VKC", None), make_record(4, "step by step", 1)]
-    trials += [
-        make_record(5, "VKC", 10),
-        make_record(5, "step by step", 10),
-        make_record(6, "step by step", 10),
-    ]
+    trials = [make_record(4, "VKC", None), make_record(5, "VKC", 10)]
+    trials += [make_record(seed, "step by step", done) for seed, done in ((4, 1), (5, 10), (6, 10))]
     meta = {"chores": ["fetch"], "steps": {"fetch": 10 * ["x"]}, "starts": 1, "seed": 4}
     meta |= {"seeds": 3, "window": 2, "methods": ["VKC", "step by step"]}
     text = chores.format_results({"meta": {**describe_environment(), **meta}, "trials": trials})

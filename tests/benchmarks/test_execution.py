@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import gzip
-import json
 from pathlib import Path
 
 import pytest
 from helpers.experiments import run_experiment
 
 from vkc_pin.benchmarks.execution import format_results
+from vkc_pin.benchmarks.harness.record import describe_environment
 
 
 def test_drawer_is_opened_with_a_welded_grasp(tmp_path: Path) -> None:
@@ -52,28 +51,13 @@ def test_measured_grasps_default_to_tasks_that_move_a_single_object(tmp_path: Pa
 
 
 def test_failed_executions_are_counted() -> None:
-    executed = {
-        "task": "drawer",
-        "success": True,
-        "executed": True,
-        "arm_error": 0.01,
-        "problems": [],
-    }
-    failed = {
-        **executed,
-        "executed": False,
-        "arm_error": 0.02,
-        "problems": ["cup – floor: 9 mm deep"],
-    }
+    executed = {"task": "drawer", "success": True, "executed": True}
+    executed |= {"arm_error": 0.01, "problems": []}
+    problems = ["cup – floor: 9 mm deep"]
+    failed = {**executed, "executed": False, "arm_error": 0.02, "problems": problems}
     unplanned = {"task": "drawer", "success": False, "executed": False}
-    record = Path(__file__).parents[2] / "docs/results/gap.json.gz"
-    meta = json.loads(gzip.decompress(record.read_bytes()))["meta"]
-    text = format_results(
-        {
-            "meta": {**meta, "starts": 3, "tasks": ["drawer"]},
-            "trials": [executed, failed, unplanned],
-        }
-    )
+    meta = describe_environment(starts=3, seed=0, tasks=["drawer"], max_evaluations=1000)
+    text = format_results({"meta": meta, "trials": [executed, failed, unplanned]})
     assert "| drawer | 2 of 3 | 1 of 2 |" in text
-    assert "1.15" in text
+    assert "1.15" in text, "degrees, of 0.02 rad"
     assert "- drawer: cup – floor: 9 mm deep" in text

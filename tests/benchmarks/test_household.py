@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import coal
 import numpy as np
@@ -26,6 +27,12 @@ from vkc_pin.world.models.shapes import compute_clearance, list_placed_shapes
 from vkc_pin.world.scene.placed_object import make_world_shapes
 
 
+def place_cup(scene: vkc.Scene, placement: pin.SE3) -> Any:
+    """Return the shapes of the cup at a placement."""
+    placed = scene.with_placement("cup", placement).objects["cup"]
+    return list_placed_shapes(make_world_shapes(placed))
+
+
 def test_tasks_can_be_compiled() -> None:
     scene = vkc.load_scene("household")
     for task in TASKS.values():
@@ -46,9 +53,8 @@ def test_variant_has_the_numbers_of_the_papers_code() -> None:
         if name == "dishwasher":
             upper[other.object.coordinates.names.index("rack")] = 0.8
         np.testing.assert_array_equal(other.object.upper, upper)
-    scene = theirs.with_placement("cup", pin.SE3(np.eye(3), np.array([-0.6, -1.6, 1.11])))
-    cup = list_placed_shapes(make_world_shapes(scene.objects["cup"]))
-    clearance = compute_clearance(cup, list_placed_shapes(scene.obstacles))
+    cup = place_cup(theirs, pin.SE3(np.eye(3), np.array([-0.6, -1.6, 1.11])))
+    clearance = compute_clearance(cup, list_placed_shapes(theirs.obstacles))
     assert clearance == pytest.approx(1e-3, abs=1e-6), "the cup rests on the table"
     assert vkc.Scene.from_document(theirs.document, theirs.folder).document == theirs.document
     plain, paper = (
@@ -90,7 +96,7 @@ def test_every_task_is_planned(name: str, method: str) -> None:
 
 def test_cup_rests_entirely_on_the_coffee_table() -> None:
     scene, rng = vkc.load_scene("household"), np.random.default_rng(0)
-    labelled = list(zip(scene.obstacles, scene.obstacle_labels, strict=True))
+    labelled = zip(scene.obstacles, scene.obstacle_labels, strict=True)
     table = [shape for shape, label in labelled if label == "coffee_table"]
     plate = max(table, key=lambda shape: shape.placement.translation[2])
     assert isinstance(plate.geometry, coal.Box)
@@ -99,8 +105,7 @@ def test_cup_rests_entirely_on_the_coffee_table() -> None:
     others = list_placed_shapes([shape for shape in scene.obstacles if shape is not plate])
     poses = np.array([sample_cup_pose(scene, rng)["cup"] for _ in range(300)])
     for pose in poses[:40]:
-        placed = scene.with_placement("cup", pin.SE3(pin.rpy.rpyToMatrix(*pose[3:]), pose[:3]))
-        cup = list_placed_shapes(make_world_shapes(placed.objects["cup"]))
+        cup = place_cup(scene, pin.SE3(pin.rpy.rpyToMatrix(*pose[3:]), pose[:3]))
         assert np.all(np.abs(pose[:2] - center) + 0.035 < half), "the whole foot is on the plate"
         on_plate = compute_clearance(cup, list_placed_shapes([plate]))
         assert on_plate == pytest.approx(1e-3, abs=1e-6)

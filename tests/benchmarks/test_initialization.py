@@ -55,21 +55,19 @@ def result(out: Path) -> dict[str, Any]:
 
 def test_trials_are_recorded(result: dict[str, Any]) -> None:
     trials = result["trials"]
-    recorded = {(t["method"], t["number"], t["repeat"]) for t in trials}
     numbers = [(n, r) for n in range(3) for r in range(2)]
-    assert recorded == {(m, *at) for m in COMPARED_INITIALIZATIONS for at in numbers} | {
-        (STEPWISE, n, 0) for n in range(3)
-    }
-    assert len(trials) == len(recorded)
+    expected = [(m, *at) for m in COMPARED_INITIALIZATIONS for at in numbers]
+    expected += [(STEPWISE, n, 0) for n in range(3)]
+    assert sorted((t["method"], t["number"], t["repeat"]) for t in trials) == sorted(expected)
     seeds = {t["number"]: t["seed"] for t in trials if t["repeat"] == 0}
     assert len(set(seeds.values())) == len(seeds), "each start has its own random seed"
     for t in trials:
         assert t["seed"] == seeds[t["number"]] + t["repeat"]
         assert t["perturbation"] == (0.05 if t["repeat"] else 0.0)
         assert t["success"] == (t["status"] == "success") == (not t["violations"])
-    meta = result["meta"]
-    assert (meta["benchmark"], meta["seed"], meta["starts"]) == ("initialization", 5, 3)
-    assert (meta["repeats"], meta["target"]) == (2, list(TARGET))
+    meta = {"benchmark": "initialization", "seed": 5, "starts": 3, "repeats": 2}
+    assert {name: result["meta"][name] for name in meta} == meta
+    assert result["meta"]["target"] == list(TARGET)
 
 
 def test_starts_are_shared_by_methods_and_selections(
@@ -115,13 +113,10 @@ def test_planned_trial_is_recorded(tmp_path: Path) -> None:
     assert trial["initialization"].startswith("astar")
     assert 0.0 <= trial["clearance"] < 0.02, "the stick is near the table and the cube"
     assert 0.0 <= trial["closure_error"] <= 1e-3
-    assert (
-        trial["base_path_length"]
-        <= trial["base_path_length_l1"]
-        <= np.sqrt(2.0) * trial["base_path_length"]
-    )
-    stage_times = [trial[name] for name in trial if name.startswith("time_")]
-    assert all(stage_time >= 0.0 for stage_time in stage_times)
-    assert 0.0 < sum(stage_times) <= trial["planning_time"]
+    length, sides = trial["base_path_length"], trial["base_path_length_l1"]
+    assert length <= sides <= np.sqrt(2.0) * length
+    stages = [trial[name] for name in trial if name.startswith("time_")]
+    assert min(stages) >= 0.0
+    assert 0.0 < sum(stages) <= trial["planning_time"]
     assert trial["waypoints"] == 82, "two times 40 segments, the start, and a pause for the gripper"
     assert f"| init_1: no obstacle | astar | 1 of 1 | {trial['planning_time']:.2f} |" in table

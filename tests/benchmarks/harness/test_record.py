@@ -27,17 +27,12 @@ def test_commit_is_none_without_git(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_failure_is_recorded_with_the_first_violation() -> None:
     plan = make_fake_plan()
     trial = record.trial(plan, method="VKC", seed=3, number=7)
-    assert (trial["scene"], trial["method"], trial["seed"], trial["number"]) == (
-        "door",
-        "VKC",
-        3,
-        7,
-    )
-    assert (trial["success"], trial["status"]) == (False, "rejected")
-    assert trial["failed_constraint"] == "penetration forearm_link – sofa"
-    assert trial["violations"] == [str(plan.report.violations[0])]
-    assert trial["base_path_length"] == plan.metrics["base_path_length"]
-    assert trial["waypoints"] == len(plan.trajectory.times)
+    expected = {"scene": "door", "method": "VKC", "seed": 3, "number": 7, "success": False}
+    expected |= {"status": "rejected", "violations": [str(plan.report.violations[0])]}
+    expected |= {"failed_constraint": "penetration forearm_link – sofa"}
+    expected |= {"base_path_length": plan.metrics["base_path_length"]}
+    expected |= {"waypoints": len(plan.trajectory.times)}
+    assert {name: trial[name] for name in expected} == expected
     np.testing.assert_allclose(trial["start"], plan.scene.start, atol=1e-9)
     timed_out = dataclasses.replace(plan, status="time limit", report=Report())
     assert record.trial(timed_out, method="VKC", seed=0)["failed_constraint"] == "time limit"

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import gzip
-import json
 from pathlib import Path
 
 import pytest
 from helpers.experiments import run_experiment
 
+from vkc_pin.benchmarks.harness.record import describe_environment
 from vkc_pin.benchmarks.peers.run import METHODS, format_results
 from vkc_pin.cli import main
 
@@ -35,20 +34,13 @@ def test_help_lists_all_methods(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_table_counts_trials_that_timed_out() -> None:
-    record = Path(__file__).parents[3] / "docs/results/gap.json.gz"
-    meta = json.loads(gzip.decompress(record.read_bytes()))["meta"]
-    meta |= {"starts": 2, "tasks": ["door"], "methods": ["OMPL", "VKC"]}
+    meta = describe_environment(starts=2, seed=0, tasks=["door"], methods=["OMPL", "VKC"])
     meta |= {"peers": {"ompl": "2"}, "time_limit": 60.0}
     timed_out = {"task": "door", "method": "OMPL", "success": False, "status": "timed out"}
+    success = {**timed_out, "success": True, "status": "success"}
     timed_out |= {"time_final": 9.0, "time_own": 8.0}
-    success = {
-        **timed_out,
-        "success": True,
-        "status": "success",
-        "time_final": 3.0,
-        "time_own": 0.5,
-    }
-    success |= {"time_first": 1.0, "base_path_length": 1.5, "arm_path_length": 2.0}
+    success |= {"time_final": 3.0, "time_own": 0.5, "time_first": 1.0}
+    success |= {"base_path_length": 1.5, "arm_path_length": 2.0}
     success |= {"clearance_at": 0.03, "clearance_between": 0.025}
     text = format_results({"meta": meta, "trials": [timed_out, success]})
     numbers = "1 of 2 | 1 | 1.00 | 6.00 | 8.70 | 4.25 | 1.50 | 2.00 | 30.0 | 25.0"

@@ -63,10 +63,8 @@ def test_wrong_request_does_not_end_the_worker(solver: str, package: str, key: s
         timeout=120,
         env={**os.environ, "LD_LIBRARY_PATH": libraries},
     )
-    first, *answers = [
-        json.loads(line) for line in process.stdout.splitlines() if line.startswith("{")
-    ]
+    lines = [line for line in process.stdout.splitlines() if line.startswith("{")]
+    first, *answers = map(json.loads, lines)
     assert first["ready"] is True
-    assert len(answers) == 2
-    assert all(key in answer["error"] for answer in answers)
+    assert [key in answer["error"] for answer in answers] == [True, True]
     assert process.returncode == 0

@@ -41,17 +41,11 @@ def test_tasks_are_planned_from_random_starts_with_each_setting(tmp_path: Path) 
 
 def test_ratios_are_of_problems_that_both_settings_solve() -> None:
     def make_record(number: int, method: str, time: float, success: bool = True) -> dict[str, Any]:
-        counts = {"rounds": 1, "iterations": 2, "cpu_time": 1, "planning_time": time}
-        lengths = {"base_path_length": 1.0, "arm_path_length": 0.0, "objective": 2.0 * time}
-        fields = {
-            "number": number,
-            "method": method,
-            "kind": "reach",
-            "seed": 0,
-            "success": success,
-        }
-        status = "success" if success else "error"
-        return {**fields, **counts, **lengths, "first_seed": success, "status": status}
+        record = {"number": number, "method": method, "kind": "reach", "seed": 0}
+        record |= {"success": success, "first_seed": success}
+        record |= {"rounds": 1, "iterations": 2, "cpu_time": 1, "planning_time": time}
+        record |= {"base_path_length": 1.0, "arm_path_length": 0.0, "objective": 2.0 * time}
+        return {**record, "status": "success" if success else "error"}
 
     changed = "Options.dt=0.3"
     trials = [make_record(0, "unchanged", 1.0), make_record(0, changed, 3.0)]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import pytest
 
 import vkc_pin as vkc
@@ -18,26 +20,13 @@ def test_changed_option_leaves_the_defaults_unchanged() -> None:
         assert vkc.Options() == UNCHANGED.options
 
 
-def test_constant_is_changed_within_the_context() -> None:
-    before = loop.PROGRESS
-    change = parse_change("solver.loop:PROGRESS=0.6")
-    assert change.options == vkc.Options()
-    with change.apply():
-        assert loop.PROGRESS == 0.6
-    assert before == loop.PROGRESS
-
-
 def test_constant_is_changed_in_importing_modules_and_restored() -> None:
     before = trust_region.ACTIVE_FRACTION
-    assert before == loop.ACTIVE_FRACTION
-
-    def fail() -> None:
-        with parse_change("solver.trust_region:ACTIVE_FRACTION=0.123").apply():
-            assert trust_region.ACTIVE_FRACTION == loop.ACTIVE_FRACTION == 0.123
-            raise KeyError
-
-    with pytest.raises(KeyError):
-        fail()
+    change = parse_change("solver.trust_region:ACTIVE_FRACTION=0.123")
+    assert change.options == vkc.Options()
+    with contextlib.suppress(KeyError), change.apply():
+        assert trust_region.ACTIVE_FRACTION == loop.ACTIVE_FRACTION == 0.123
+        raise KeyError
     assert trust_region.ACTIVE_FRACTION == loop.ACTIVE_FRACTION == before
 
 

@@ -104,46 +104,19 @@ def test_a_package_without_a_layer_is_refused(package_copy: Path) -> None:
     assert "new_package" in done.stdout + done.stderr
 
 
-@pytest.mark.parametrize("name", ["trimesh", "matplotlib.pyplot", "scipy", "meshcat"])
-def test_heavy_imports_at_the_top_of_a_module_are_refused(package_copy: Path, name: str) -> None:
-    with (package_copy / "vkc_pin" / "errors.py").open("a", encoding="utf-8") as stream:
-        stream.write(f"\nimport {name}\n")
-    command = [sys.executable, "-m", "ruff", "check", "--no-cache", "--select", "TID253", "vkc_pin"]
-    done = subprocess.run(
-        command, cwd=package_copy, capture_output=True, text=True, timeout=60, check=False
-    )
-    assert done.returncode != 0
-    assert "TID253" in done.stdout
-
-
 def test_names_are_imported_from_modules_and_not_from_packages() -> None:
-    known, wrong = find_modules(), []
-    packages = {
-        name.rpartition(".")[0].removeprefix("vkc_pin.") for name in known if name.count(".") > 1
-    }
-    for name, file in known.items():
-        if file.name == "__init__.py":
-            continue
-        for node in ast.walk(parse(file)):
-            if (
-                isinstance(node, ast.ImportFrom)
-                and node.module == "vkc_pin"
-                and name != "vkc_pin.cli.commands"
-            ):
-                wrong += [
-                    f"{name}: from vkc_pin import {a.name}"
-                    for a in node.names
-                    if f"vkc_pin.{a.name}" not in known
-                ]
-            if (
-                isinstance(node, ast.ImportFrom)
-                and node.module
-                and node.module.removeprefix("vkc_pin.") in packages
-            ):
-                package = node.module.removeprefix("vkc_pin.")
-                names = [a.name for a in node.names if f"vkc_pin.{package}.{a.name}" not in known]
-                if names and package != "planning.kinematics":
-                    wrong.append(f"{name}: from vkc_pin.{package} import {', '.join(names)}")
+    known = find_modules()
+    packages = {name.rpartition(".")[0] for name in known if name.count(".")}
+    packages.remove("vkc_pin.planning.kinematics")
+    wrong = [
+        f"{name}: from {node.module} import {alias.name}"
+        for name, file in known.items()
+        if file.name != "__init__.py" and name != "vkc_pin.cli.commands"
+        for node in ast.walk(parse(file))
+        if isinstance(node, ast.ImportFrom) and node.module in packages
+        for alias in node.names
+        if f"{node.module}.{alias.name}" not in known
+    ]
     assert wrong == []
 
 
@@ -153,27 +126,12 @@ def test_calls_of_the_operating_system_are_in_one_module() -> None:
     assert found == ["vkc_pin.utils.system"]
 
 
-def test_every_module_has_a_docstring_and_lists_its_public_names() -> None:
-    for name, file in find_modules().items():
-        tree = parse(file)
-        assert ast.get_docstring(tree), name
-        if file.name != "__init__.py" and name not in SCRIPTS:
-            assert any(
-                isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__"
-                for node in tree.body
-            ), name
-
-
 def test_architecture_page_lists_every_package() -> None:
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-    rows = text.split("## The packages")[1].split("\n## ")[0].splitlines()
-    named = {
-        name
-        for row in rows
-        if row.startswith("| `")
-        for name in re.findall(r"`(\w+)`", row.split("|")[1])
-    }
-    assert named == {name.split(".")[1] for name in find_modules() if "." in name}
+    table = text.split("## The packages")[1].split("\n## ")[0]
+    first_cells = "".join(re.findall(r"^\| (`[^|]*)\|", table, re.MULTILINE))
+    packages = {name.split(".")[1] for name in find_modules() if "." in name}
+    assert set(re.findall(r"`(\w+)`", first_cells)) == packages
 
 
 def test_architecture_diagram_is_up_to_date() -> None:

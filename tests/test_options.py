@@ -30,30 +30,9 @@ def test_every_option_is_documented() -> None:
     [
         *((name, value) for name in INTEGERS for value in (-1, 2.0, True, "4", None)),
         *((name, 0) for name in INTEGERS if name != "max_refinements"),
-    ],
-)
-def test_invalid_integers_raise(name: str, value: Any) -> None:
-    with pytest.raises(InputError) as caught:
-        Options(**{name: value})
-    assert caught.value.field == f"Options.{name}"
-    assert caught.value.got == repr(value)
-
-
-INVALID = [(name, value) for name in REALS for value in (-1.0, np.nan, np.inf, "0.1")]
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [*INVALID, *((name, 0.0) for name in REALS if name != "jerk_time")]
-)
-def test_invalid_numbers_raise(name: str, value: Any) -> None:
-    with pytest.raises(InputError) as caught:
-        Options(**{name: value})
-    assert caught.value.field == f"Options.{name}"
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
+        *((name, value) for name in REALS for value in (-1.0, np.nan, np.inf, "0.1")),
+        *((name, 0.0) for name in REALS if name != "jerk_time"),
+        *(("objective", value) for value in ("lengths", None, 1, np.nan)),
         ("reach_waypoints", 5000),
         ("move_waypoints", 501),
         ("contact_slots", 1000),
@@ -64,8 +43,8 @@ def test_invalid_numbers_raise(name: str, value: Any) -> None:
         *(("jerk_time", value) for value in (5e-324, 1e-12, 1e-9, 1e-4, 4.9e-3, 11.0)),
     ],
 )
-def test_values_out_of_range_raise(name: str, value: Any) -> None:
-    with pytest.raises(InputError, match=r"at most|from") as caught:
+def test_invalid_values_raise(name: str, value: Any) -> None:
+    with pytest.raises(InputError) as caught:
         Options(**{name: value})
     assert caught.value.field == f"Options.{name}"
 
@@ -85,23 +64,10 @@ def test_times_are_rounded_to_steps() -> None:
     assert Options(dt=0.1).steps(1.0) == 10
 
 
-def test_objective_is_path_length_or_control_effort() -> None:
-    assert Options(objective="control_effort").objective == "control_effort"
-    for value in ("lengths", None, 1, np.nan):
-        with pytest.raises(InputError, match="'path_length' or 'control_effort'") as caught:
-            Options(objective=value)  # type: ignore[arg-type]
-        assert caught.value.field == "Options.objective"
-
-
 def test_options_of_the_paper_have_equal_weights() -> None:
     paper = Options.paper(dt=0.5, velocity_weight_base=2.0)
     assert (paper.objective, paper.dt, paper.velocity_weight_base) == ("control_effort", 0.5, 2.0)
-    assert (
-        paper.velocity_weight_heading
-        == paper.velocity_weight_arm
-        == paper.velocity_weight_object
-        == 1.0
-    )
+    assert {getattr(paper, f"velocity_weight_{n}") for n in ("heading", "arm", "object")} == {1.0}
 
 
 @pytest.mark.parametrize("value", [0, 0.0, -0.0, 0.005, 10])

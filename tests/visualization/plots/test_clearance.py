@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import coal
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -8,6 +7,7 @@ from helpers.fake_plan import make_fake_plan
 
 from vkc_pin.planning.plan import Plan
 from vkc_pin.visualization.plots.plots import ClearanceCurve, compute_clearance_curves
+from vkc_pin.world.models.shapes import compute_shape_distance
 from vkc_pin.world.trajectory.world_model import World
 
 TIMES = np.linspace(0.0, 6.0, 13)
@@ -35,29 +35,28 @@ def test_clearance_curves_agree_with_coal(curves: dict[str, ClearanceCurve], pla
         "objects – surroundings",
         "gripper – grasped object",
     ]
-    curve = curves["robot – obstacles"]
-    robot_shapes = range(len(robot.collision.geometryObjects))
+    curve, count = curves["robot – obstacles"], len(robot.collision.geometryObjects)
     labels, objects = world.collision_labels, world.collision.geometryObjects
-    obstacles = [i for i in range(len(robot_shapes), len(labels)) if "." not in labels[i]]
+    pairs = [
+        (i, j)
+        for i in range(count)
+        for j in range(count, len(labels))
+        if "." not in labels[j] and not (labels[j] == "floor" and objects[i].parentJoint == 1)
+    ]
     for k in (0, 6):
         q = world.coordinates.q(world.compute_positions(plan.trajectory, [TIMES[k]])[0])
         pin.updateGeometryPlacements(world.model, data, world.collision, shapes, q)
-        nearest = (np.inf, ("", ""))
-        for i in robot_shapes:
-            for j in obstacles:
-                if labels[j] == "floor" and objects[i].parentJoint == 1:
-                    continue
-                a, b = (
-                    coal.Transform3s(shapes.oMg[m].rotation, shapes.oMg[m].translation)
-                    for m in (i, j)
-                )
-                request, result = coal.DistanceRequest(), coal.DistanceResult()
-                distance = coal.distance(
-                    objects[i].geometry, a, objects[j].geometry, b, request, result
-                )
-                nearest = min(nearest, (distance, (labels[i], labels[j])))
-        assert curve.distances[k] == pytest.approx(nearest[0], abs=1e-5)
-        assert curve.pairs[k] == nearest[1]
+        nearest, pair = min(
+            (
+                compute_shape_distance(
+                    objects[i].geometry, shapes.oMg[i], objects[j].geometry, shapes.oMg[j]
+                ),
+                (labels[i], labels[j]),
+            )
+            for i, j in pairs
+        )
+        assert curve.distances[k] == pytest.approx(nearest, abs=1e-5)
+        assert curve.pairs[k] == pair
 
 
 def test_closest_pair_and_its_time_are_reported(curves: dict[str, ClearanceCurve]) -> None:

@@ -22,8 +22,8 @@ import pytest
 import yaml
 
 import vkc_pin as vkc
+from vkc_pin import Violation
 from vkc_pin.cli.commands import make_parser
-from vkc_pin.validation.report import Violation
 from vkc_pin.world.files.documents import Document, parse_document
 from vkc_pin.world.models.dynamics import ObjectJointSchema
 from vkc_pin.world.models.object_file import AttachmentSchema, LatchSchema, ObjectSchema

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from vkc_pin.errors import InputError, UnknownNameError, VkcError, find_nearest_name, format_value
+from vkc_pin import InputError, UnknownNameError, VkcError
+from vkc_pin.errors import find_nearest_name, format_value
 
 
 @pytest.mark.parametrize(

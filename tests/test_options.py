@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vkc_pin.errors import InputError
-from vkc_pin.options import Options
+from vkc_pin import InputError, Options
 
 INTEGERS = [item.name for item in fields(Options) if item.type == "int"]
 REALS = [item.name for item in fields(Options) if item.type == "float"]

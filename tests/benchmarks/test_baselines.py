@@ -14,11 +14,11 @@ from helpers.fake_plan import make_fake_plan, replace_metrics
 from helpers.markdown import parse_cells
 
 import vkc_pin as vkc
+from vkc_pin import Report
 from vkc_pin.benchmarks import baselines
 from vkc_pin.benchmarks.baselines import COMPARED_PLANNERS
 from vkc_pin.benchmarks.comparison import choose_shown_trial, format_results
 from vkc_pin.planning.plan import PlanningStatistics
-from vkc_pin.validation.report import Report
 
 SUCCESSES = {"B1": {2, 3}, "B2": {1, 2}, "VKC": {0, 1, 2}}
 """Method → numbers of the starts from which `solve` succeeds."""

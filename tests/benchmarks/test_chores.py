@@ -12,9 +12,9 @@ import pytest
 from helpers.fake_plan import replace_metrics
 
 import vkc_pin as vkc
+from vkc_pin import InputError
 from vkc_pin.benchmarks import chores
 from vkc_pin.benchmarks.harness.record import describe_environment
-from vkc_pin.errors import InputError
 from vkc_pin.world.scene.clearance_exemptions import find_close_pairs
 from vkc_pin.world.task.actions import compile_each_step, group_into_actions
 

@@ -9,9 +9,9 @@ import pytest
 from helpers.experiments import run_experiment
 
 import vkc_pin as vkc
+from vkc_pin import validate
 from vkc_pin.benchmarks import gap
 from vkc_pin.benchmarks.problems.poses import CLEAR, sample_random_start
-from vkc_pin.validation.validate import validate
 
 
 def test_starts_are_random_free_and_reproducible() -> None:

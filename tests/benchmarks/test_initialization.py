@@ -14,9 +14,9 @@ from helpers.fake_plan import make_fake_plan, replace_metrics
 from helpers.markdown import parse_cells
 
 import vkc_pin as vkc
+from vkc_pin import Report
 from vkc_pin.benchmarks import initialization
 from vkc_pin.benchmarks.initialization import COMPARED_INITIALIZATIONS, STEPWISE, TARGET
-from vkc_pin.validation.report import Report
 
 
 def solve(scene: vkc.Scene, spec: Mapping[str, Any]) -> vkc.Plan:

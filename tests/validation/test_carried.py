@@ -32,14 +32,17 @@ from helpers.carrying import (
 from helpers.judging import check_only_violation, get_only_violation, get_violation_names
 
 import vkc_pin as vkc
-from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.validation.report import Report
-from vkc_pin.validation.validate import validate
-from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.scene import Scene
+from vkc_pin import (
+    Hold,
+    InputError,
+    PhaseSpan,
+    Report,
+    Scene,
+    Trajectory,
+    UnknownNameError,
+    validate,
+)
 from vkc_pin.world.task.steps import Step
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
 
 ASIDE = lift(STICK, [0.0, 0.5, 0.0])
 PLACED = vkc.Place("stick", ASIDE)

@@ -9,15 +9,13 @@ import pytest
 from helpers.small_problems import make_full_scene
 
 import vkc_pin as vkc
-from vkc_pin.planning.plan import Plan
+from vkc_pin import Plan, Trajectory, validate
 from vkc_pin.validation.closure import (
     RESOLUTION,
     find_drift,
 )
 from vkc_pin.validation.samples import Samples
-from vkc_pin.validation.validate import validate
 from vkc_pin.world.trajectory.curve import Curve
-from vkc_pin.world.trajectory.trajectory import Trajectory
 
 LIMITS = (vkc.Tolerances().closure_position, vkc.Tolerances().closure_angle)
 

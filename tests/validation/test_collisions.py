@@ -29,17 +29,12 @@ from helpers.small_problems import load_door_scene, make_full_scene, make_progra
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.options import Options
+from vkc_pin import GoTo, Hold, Options, PhaseSpan, Scene, Trajectory, load_scene
 from vkc_pin.validation.collisions import Hit, PairTable, sweep
 from vkc_pin.validation.contact_windows import Window
 from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.samples import Samples
-from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.scene import Scene, load_scene
-from vkc_pin.world.task.steps import GoTo
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
 

@@ -26,7 +26,18 @@ from helpers.grippers import write_cheeks_scene, write_gripper
 from helpers.small_problems import load_door_scene
 from helpers.supports import make_plate_scene, slide_plate
 
-from vkc_pin.options import Options
+from vkc_pin import (
+    Actuate,
+    Grasp,
+    Hold,
+    Options,
+    PhaseSpan,
+    Scene,
+    Tolerances,
+    Touch,
+    Trajectory,
+    validate,
+)
 from vkc_pin.validation.contact_windows import (
     Window,
     check_gripper,
@@ -35,14 +46,8 @@ from vkc_pin.validation.contact_windows import (
 )
 from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.samples import Samples
-from vkc_pin.validation.tolerances import Tolerances
-from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH
-from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.steps import Actuate, Grasp, Step, Touch
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.task.steps import Step
 
 STEPS = 4  # moving time steps in a window
 HANDS = set(load_door_scene().robot.touch_links)

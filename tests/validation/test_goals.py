@@ -15,12 +15,8 @@ from helpers.judging import check_only_violation, get_approach, get_violation_na
 from helpers.robots import compute_placement
 
 import vkc_pin as vkc
-from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.validation.report import Report
-from vkc_pin.validation.validate import validate
-from vkc_pin.world.scene.scene import Scene
+from vkc_pin import InputError, Report, Scene, Trajectory, UnknownNameError, validate
 from vkc_pin.world.task.steps import Step
-from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 @pytest.fixture(scope="module")

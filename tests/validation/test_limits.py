@@ -16,6 +16,7 @@ from helpers.judging import check_only_violation, get_violation_names
 from oracle.judge import judge
 
 import vkc_pin as vkc
+from vkc_pin import PhaseSpan, Report, Scene, Trajectory, Violation, validate
 from vkc_pin.planning.retiming.retime import retime_trajectory
 from vkc_pin.validation.limits import (
     TORQUE_TOLERANCE,
@@ -23,13 +24,9 @@ from vkc_pin.validation.limits import (
     check_rates,
     find_limiting_constraints,
 )
-from vkc_pin.validation.report import Report, Violation
 from vkc_pin.validation.samples import Samples
-from vkc_pin.validation.validate import validate
-from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.torques import sample_curve
-from vkc_pin.world.trajectory.trajectory import PhaseSpan, Trajectory
 
 
 @pytest.mark.parametrize("make_plan", [plan_door, plan_drawer])

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.errors import InputError
-from vkc_pin.validation.report import Bound, Exemption, Report, Violation
-from vkc_pin.validation.validate import validate
+from vkc_pin import InputError, Report, Violation, validate
+from vkc_pin.validation.report import Bound, Exemption
 from vkc_pin.visualization.plots.plots import compute_clearance_curves
 
 LIMIT = Violation(

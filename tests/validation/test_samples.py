@@ -16,14 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin import Hold, InputError, PhaseSpan, Scene, Trajectory, UnknownNameError
 from vkc_pin.validation.samples import ANGLE_STEP, LENGTH_STEP, MAX_SAMPLES, Samples
 from vkc_pin.world.scene.contact_rules import compute_hand_frame
-from vkc_pin.world.scene.hold import Hold, make_holds
-from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.scene.hold import make_holds
 from vkc_pin.world.trajectory.curve import Curve
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
 GRASPS = sorted(make_full_scene().objects["cabinet"].object.attachments)

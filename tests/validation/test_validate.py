@@ -26,17 +26,21 @@ from helpers.judging import (
 )
 
 import vkc_pin as vkc
-from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.options import Options
-from vkc_pin.validation.report import Report, Violation
-from vkc_pin.validation.validate import validate
+from vkc_pin import (
+    InputError,
+    Options,
+    PhaseSpan,
+    PlacedObject,
+    Report,
+    Scene,
+    Trajectory,
+    UnknownNameError,
+    Violation,
+    validate,
+)
 from vkc_pin.visualization.plots.plots import compute_clearance_curves
 from vkc_pin.world.scene.hold import make_holds
-from vkc_pin.world.scene.placed_object import PlacedObject
-from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.curve import Curve
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
 
 WRIST = "wrist_3_joint"
 

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from vkc_pin import Scene, load_scene
 from vkc_pin.visualization.room import Room
-from vkc_pin.world.scene.scene import Scene, load_scene
 
 
 @pytest.fixture(scope="module")

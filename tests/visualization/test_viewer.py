@@ -23,10 +23,8 @@ from helpers import browser
 from helpers.fake_plan import HINGE, make_fake_plan
 from helpers.pages import read_clips, read_commands
 
-from vkc_pin.errors import InputError, VkcError
-from vkc_pin.planning.plan import Plan
+from vkc_pin import InputError, Plan, VkcError, load_scene
 from vkc_pin.visualization import viewer as visualization
-from vkc_pin.world.scene.scene import load_scene
 from vkc_pin.world.trajectory.world_model import World
 
 needs_chromium = pytest.mark.skipif(browser.CHROMIUM is None, reason="Chromium is not installed")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers.fake_plan import make_fake_plan
 
+from vkc_pin import Report
 from vkc_pin.benchmarks.harness.charts import (
     criteria_chart,
     means_chart,
@@ -17,7 +18,6 @@ from vkc_pin.benchmarks.harness.charts import (
 )
 from vkc_pin.benchmarks.harness.tables import TIMES, compute_wilson_interval
 from vkc_pin.benchmarks.scale import scale_chart
-from vkc_pin.validation.report import Report
 
 SCENES = {"a": "easy", "b": "hard"}
 RATES = {("a", "one"): (4, 4), ("a", "two"): (3, 4), ("b", "one"): (1, 4), ("b", "two"): (0, 4)}

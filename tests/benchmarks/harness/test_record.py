@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from helpers.fake_plan import make_fake_plan
 
+from vkc_pin import PhaseSpan, Report, Trajectory
 from vkc_pin.benchmarks.harness import record
-from vkc_pin.validation.report import Report
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def test_commit_is_none_without_git(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,9 +23,9 @@ from helpers.trials import (
     solve_square,
 )
 
+from vkc_pin import InputError, VkcError
 from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.runner import LIMITS, describe_limit
-from vkc_pin.errors import InputError, VkcError
 
 
 def test_description_states_evaluations_or_planning_time() -> None:

@@ -10,10 +10,9 @@ from helpers.experiments import run_experiment
 from oracle.agreement import judge_all, record_violations, write_verdicts
 from oracle.plan import read_plan
 
+from vkc_pin import InputError, Plan
 from vkc_pin.benchmarks.problems import random_problems
 from vkc_pin.benchmarks.problems.random_problems import sample_problem
-from vkc_pin.errors import InputError
-from vkc_pin.planning.plan import Plan
 from vkc_pin.procedural.tasks import random_task
 from vkc_pin.world.files.resources import list_resources
 from vkc_pin.world.task.steps import step_to_dict

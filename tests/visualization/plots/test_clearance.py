@@ -5,7 +5,7 @@ import pinocchio as pin
 import pytest
 from helpers.fake_plan import make_fake_plan
 
-from vkc_pin.planning.plan import Plan
+from vkc_pin import Plan
 from vkc_pin.visualization.plots.plots import ClearanceCurve, compute_clearance_curves
 from vkc_pin.world.models.shapes import compute_shape_distance
 from vkc_pin.world.trajectory.world_model import World

@@ -10,8 +10,7 @@ import pytest
 from helpers.fake_plan import make_fake_plan
 
 import vkc_pin as vkc
-from vkc_pin.planning.plan import Plan
-from vkc_pin.validation.report import Report
+from vkc_pin import Plan, Report
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from helpers.fake_plan import make_fake_plan
 
-from vkc_pin.errors import InputError
-from vkc_pin.planning.plan import Plan
+from vkc_pin import InputError, Plan
 from vkc_pin.visualization.plots import plots as plotting
 from vkc_pin.world.trajectory.curve import Curve
 

@@ -56,21 +56,9 @@ def _import_home(path: Path, **options: Any) -> None:
     vkc.importing.import_home(HOME, path, most=1, **options)
 
 
-def _import_robot(path: Path, **options: Any) -> None:
-    vkc.importing.import_robot(ROBOT, path, samples=100, most_pieces=1, **options)
-
-
 def _generate(path: Path) -> None:
     pytest.importorskip("h5py")
     vkc.datasets.generate(SMALL, 1, path)
-
-
-def _run_trial(trial: dict[str, Any]) -> dict[str, Any]:
-    return {**trial, "status": "success"}
-
-
-def _run_benchmark(path: Path) -> None:
-    run([{"key": "0"}], _run_trial, path, settings={}, progress=False)
 
 
 def _render_film(path: Path) -> None:
@@ -108,9 +96,20 @@ FOLDERS: dict[str, Callable[..., Any]] = {
     "bag": _write_rosbag,
     "object": _import_object,
     "home": _import_home,
-    "robot": _import_robot,
+    "robot": lambda path, **options: vkc.importing.import_robot(
+        ROBOT, path, samples=100, most_pieces=1, **options
+    ),
 }
-RESUMED: dict[str, Callable[[Path], Any]] = {"dataset": _generate, "benchmark": _run_benchmark}
+RESUMED: dict[str, Callable[[Path], Any]] = {
+    "dataset": _generate,
+    "benchmark": lambda path: run(
+        [{"key": "0"}],
+        lambda trial: {**trial, "status": "success"},
+        path,
+        settings={},
+        progress=False,
+    ),
+}
 """Writers that continue an unfinished folder."""
 SLOW: dict[str, Callable[[Path], Any]] = {
     "a.html": lambda path: make_plan().to_html(path),

@@ -29,7 +29,7 @@ from helpers.carrying import (
     solve_grasp,
     solve_reach,
 )
-from helpers.judging import check_only_violation, get_only_violation, get_violation_names
+from helpers.judging import check_only_violation, get_violation_names
 
 import vkc_pin as vkc
 from vkc_pin import (
@@ -267,27 +267,12 @@ def test_object_grasped_at_the_start_is_placed_upright() -> None:
 
 
 def test_object_placed_at_a_point_may_stay_upside_down() -> None:
-    scene = place_object(
-        make_hall(), "stick", pin.SE3(pin.utils.rotate("y", np.pi), ASIDE.translation)
-    )
-    stands = MotionBuilder(scene).go(move_base(scene.start, x=-0.5)).motion()
-    assert judge([vkc.Place("stick", ASIDE.translation)], stands, scene).ok
-    assert get_only_violation(judge([PLACED], stands, scene)).amount == pytest.approx(
-        np.pi - 1e-3, abs=1e-6
-    )
-    lying = carry().motion()
-    turned = place_object(
-        make_hall(),
-        "stick",
-        pin.SE3(pin.utils.rotate("y", np.pi) @ STICK.rotation, STICK.translation),
-    )
-    report = judge([vkc.Place("stick", (0.8, 0.5, 0.55))], lying, turned)
-    assert ("goal", "stick.stick") not in get_violation_names(
-        report
-    )  # its orientation has not changed
-    assert ("closure", "stick.grip") in get_violation_names(
-        report
-    )  # but the hand cannot grasp it there
+    turned = pin.SE3(pin.utils.rotate("y", np.pi), ASIDE.translation)
+    scene = place_object(make_hall(), "stick", turned)
+    stands = MotionBuilder(scene).go(move_base(scene.start, x=-0.5))
+    assert judge([vkc.Place("stick", ASIDE.translation)], stands).ok
+    amount = pytest.approx(np.pi - 1e-3, abs=1e-6)
+    check_only_violation(judge([PLACED], stands), "goal", "stick.stick", "rad", amount=amount)
 
 
 def test_object_must_be_released() -> None:
@@ -449,26 +434,6 @@ def test_object_may_rest_on_a_table_but_not_penetrate_it(gap: float, ok: bool) -
         check_only_violation(report, "penetration", "stick.stick – table", amount=amount)
 
 
-def test_only_supports_may_be_close() -> None:
-    down = solve_grasp()
-    passing = (
-        MotionBuilder(make_hall())
-        .go(down)
-        .take("stick")
-        .go(np.array(make_hall().start))
-        .go(move_base(make_hall().start, y=1.0))
-    )
-    passing.go(move_base(down, y=1.0)).let_go().go(move_base(make_hall().start, y=1.0))
-    motion, steps = passing.motion(), [vkc.Place("stick", lift(STICK, [0.0, 1.0, 0.0]))]
-    assert judge(steps, motion).ok
-    shelf = describe_box(
-        "shelf", [0.1, 0.2, 0.1], [0.8, 0.6, 0.7 - 0.05 - 0.01]
-    )  # the discs' lowest points pass at 0.7
-    report = judge(steps, motion, make_room(describe_table(), shelf))
-    assert get_violation_names(report) == {("clearance", "stick.stick – shelf")}
-    assert get_only_violation(report).amount == pytest.approx(0.01 - 1e-3, abs=1e-4)
-
-
 def test_grasped_object_must_not_hit_the_robot() -> None:
     scene = make_room().with_held({"stick": "grip"})
     bent = np.array(scene.start)
@@ -476,22 +441,6 @@ def test_grasped_object_must_not_hit_the_robot() -> None:
     report = judge([vkc.GoTo(0.0, 0.0)], MotionBuilder(scene).go(bent))
     assert get_violation_names(report) == {("penetration", "forearm_link – stick.stick")}
     assert judge([vkc.GoTo(0.0, 0.0)], MotionBuilder(make_room()).go(bent)).ok  # the robot alone
-
-
-def test_grasped_object_must_not_hit_free_objects() -> None:
-    scene = make_room(describe_stand(), objects=("stick", "ball")).with_held({"stick": "grip"})
-    start = solve_reach(
-        compute_grasp_pose(pin.SE3(STICK.rotation, BALL.translation - np.array([0.0, 0.4, 0.0]))),
-        solve_above(STICK),
-    )
-    scene = scene.with_start(arm=start[3:])
-    for forward, constraint in ((0.08, None), (0.1, "clearance"), (0.125, "penetration")):
-        report = judge(
-            [vkc.GoTo(0.0, forward)], MotionBuilder(scene).go(move_base(start, y=forward))
-        )
-        assert get_violation_names(report) == (
-            {(constraint, "stick.tip – ball.ball")} if constraint else set()
-        ), "\n".join(report.lines())
 
 
 @cache

@@ -100,13 +100,3 @@ def test_drift_of_grasps_with_freedoms_agrees_with_a_fine_grid(attachment: str) 
     drift = find_drift(samples, span, span.holds[0], (0.0, 0.0))
     fine = samples.compute_grasp_errors_at(span.holds[0], np.linspace(*times, 5001))
     np.testing.assert_allclose(drift.measured, fine.max(axis=0), rtol=0.0, atol=5e-6)
-
-
-def test_drift_below_half_of_the_limit_is_only_bounded(plan: Plan) -> None:
-    samples = Samples(plan.scene, plan.trajectory)
-    phase, hold = find_grasp_phase(samples)
-    exact, coarse = (
-        find_drift(samples, phase, hold, limits) for limits in ((0.0, 0.0), (1.0, 1.0))
-    )
-    assert (coarse.measured <= exact.measured).all()
-    assert (coarse.bound == coarse.measured).all()

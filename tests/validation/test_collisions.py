@@ -150,28 +150,24 @@ def test_links_of_an_object_are_paired() -> None:
     }
 
 
-def test_self_clearances_agree_with_the_program(door: Scene) -> None:
+def test_links_of_the_robot_have_their_own_clearance(door: Scene) -> None:
     first, second = next(iter(door.robot.own_margins(0.02)))
-    one, other = sorted((door.robot.link_of(first), door.robot.link_of(second)))
-    scene = replace(door, robot=replace(door.robot, tight={(one, other): 0.006}))
+    tight = frozenset({door.robot.link_of(first), door.robot.link_of(second)})
+    robot = replace(door.robot, tight={tuple(sorted(tight)): 0.006})
+    scene, robots = replace(door, robot=robot), len(robot.collision.geometryObjects)
     motion = make_random_door_motion(scene, 0, size=0.1)
     table = PairTable(scene, CollisionShapes(World(scene)), motion, 0.02, 0.01)
     margins = table.get_margins(np.arange(len(table.pairs)), np.zeros(len(table.pairs), int))
-    by_pair = {
-        frozenset(pair): float(margin)
-        for pair, margin in zip(table.pairs.tolist(), margins, strict=True)
-    }
     problem = make_program(scene, [GoTo(1.0, 0.0)], options=Options(self_distance=0.01))
-    robots = len(scene.robot.collision.geometryObjects)
-    part, own = problem.contacts.phases[0], 0
+    part, planned = problem.contacts.phases[0], dict[frozenset[int], float]()
     for pair, margin in zip(part.pairs.tolist(), part.margins.tolist(), strict=True):
+        planned[frozenset(pair)] = margin
+    for pair, margin in zip(table.pairs.tolist(), margins.tolist(), strict=True):
         if max(pair) < robots:
-            assert by_pair[frozenset(pair)] == margin
-            tight = {scene.robot.link_of(i) for i in pair} == {one, other}
-            assert margin == (0.003 if tight else 0.01)
-            own += 1
-    assert own == len(scene.robot.collision.collisionPairs)
-    assert {margin for pair, margin in by_pair.items() if max(pair) >= robots} == {0.02}
+            is_tight = {robot.link_of(k) for k in pair} == tight
+            assert margin == planned[frozenset(pair)] == (0.003 if is_tight else 0.01)
+        else:
+            assert margin == 0.02
 
 
 COAL = 2e-5  # accuracy of coal's distances [m]

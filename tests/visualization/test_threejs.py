@@ -23,6 +23,13 @@ def make_mesh(solid: Solid) -> trimesh.Trimesh:
     return mesh
 
 
+def check_winding(solid: Solid) -> None:
+    """Check that the faces are wound outwards, as the normals of their corners point."""
+    faces = trimesh.Trimesh(solid.vertices, solid.faces, process=False).face_normals
+    normals = solid.normals[solid.faces[:, 0]]
+    assert (np.einsum("ij,ij->i", faces, normals) > 0).all()
+
+
 def make_ball(radius: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
     return np.array(mesh.vertices), np.array(mesh.faces)
@@ -46,9 +53,7 @@ def test_sides_of_a_box_face_outwards() -> None:
         axis, positive = divmod(side, 2)
         assert np.allclose(solid.vertices[:, axis], (lower, upper)[positive][axis])
         assert np.allclose(solid.normals, (2 * positive - 1) * np.eye(3)[axis])
-        corners = solid.vertices[solid.faces]
-        face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        assert (np.einsum("ij,ij->i", face_normals, solid.normals[:2]) > 0).all()
+        check_winding(solid)
 
 
 def test_coarse_copy_has_fewer_faces_and_the_same_volume() -> None:
@@ -76,9 +81,5 @@ def test_tube_follows_its_line() -> None:
     assert solid is not None
     distances = np.linalg.norm(solid.vertices[:, None] - line[None], axis=2).min(axis=1)
     assert np.allclose(distances, 0.01, atol=1e-3)
-    corners = solid.vertices[solid.faces]
-    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    assert (np.einsum("ij,ij->i", face_normals, solid.normals[solid.faces[:, 0]]) > 0).all(), (
-        "faces are wound outwards"
-    )
+    check_winding(solid)
     assert make_tube(np.zeros((5, 3)), 0.01) is None, "a line of length zero has no tube"

@@ -67,16 +67,6 @@ def test_every_public_name_is_documented() -> None:
         assert "Raises:" in (getattr(vkc, name).__doc__ or ""), name
 
 
-@pytest.mark.parametrize("name", ["plan", "build", "load_robot"])
-def test_options_are_keyword_only(name: str) -> None:
-    positional = [
-        p
-        for p in inspect.signature(getattr(vkc, name)).parameters.values()
-        if p.kind is not p.KEYWORD_ONLY
-    ]
-    assert len(positional) <= 2
-
-
 def test_heavy_dependencies_are_loaded_on_first_use() -> None:
     heavy = (
         "casadi",

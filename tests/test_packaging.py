@@ -17,8 +17,6 @@ import yaml
 from helpers.dependencies import SCRIPTS, find_undeclared, run_without
 from packaging.requirements import Requirement
 
-import vkc_pin
-
 CHECKOUT = Path(__file__).resolve().parents[1]
 
 
@@ -81,11 +79,6 @@ def test_messages_refer_to_no_file_of_the_checkout() -> None:
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     ]
     assert not [text for text in texts if re.search(r"docs/\w+\.md", text)]
-
-
-def test_package_is_typed_and_licensed() -> None:
-    assert (Path(vkc_pin.__file__).parent / "py.typed").is_file()
-    assert metadata.metadata("vkc-pin")["License-Expression"] == "BSD-2-Clause"
 
 
 def build(kind: str, folder: Path) -> Path:

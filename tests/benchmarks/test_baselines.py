@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.experiments import run_experiment
 from helpers.fake_plan import make_fake_plan, replace_metrics
 from helpers.markdown import parse_cells
 
@@ -80,25 +79,6 @@ def test_trials_are_recorded(result: dict[str, Any]) -> None:
     expected |= {"methods": list(COMPARED_PLANNERS), "scenes": {"door": "corridor_door"}}
     expected |= {"goals": {"door": {"door.hinge": 1.5}}}
     assert {name: result["meta"][name] for name in expected} == expected
-
-
-@pytest.mark.long
-def test_methods_are_planned_from_the_same_start(tmp_path: Path) -> None:
-    arguments = "baselines --trials 1 --tasks drawer --methods B1 VKC --jobs 1 --save-failures"
-    table, trials = run_experiment(arguments, tmp_path)
-    assert [t["method"] for t in trials] == ["B1", "VKC"]
-    assert trials[0]["start"] == trials[1]["start"]
-    assert trials[1]["success"], trials[1]["violations"]
-    for t in trials:
-        assert f"| drawer | {t['method']} | {int(t['success'])} of 1 |" in table
-        assert t["success"] == (not t["violations"])
-        saved = tmp_path / f"failures/drawer_0000_{t['method']}.npz"
-        assert saved.is_file() != t["success"]
-        plan = vkc.Plan.load(tmp_path / f"shown/drawer_0000_{t['method']}.npz")
-        report = vkc.validate(plan.scene, plan.steps, plan.trajectory, plan.options)
-        assert report.ok == t["success"]
-        for name, value in plan.trajectory.metrics().items():
-            assert t[name] == pytest.approx(value, rel=1e-3), name
 
 
 def parse_table(text: str, title: str) -> list[list[str]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import subprocess
 import sys
@@ -22,7 +21,6 @@ from oracle.plan import read_plan
 from oracle.stage import World
 
 FOLDER = Path(__file__).parent
-ALLOWED = {"coal", "numpy", "pinocchio", "trimesh", "yaml", *sys.stdlib_module_names}
 Content = dict[str, Any]
 
 TASKS = {
@@ -278,15 +276,6 @@ def test_cup_on_a_tilting_door_tips(plans: dict[str, Path], tmp_path: Path) -> N
 
 
 def test_oracle_does_not_import_the_package(plans: dict[str, Path]) -> None:
-    files = [file for file in FOLDER.glob("*.py") if not file.name.startswith("test_")]
-    assert len(files) > 8
-    for file in files:
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            names += (
-                [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
-            )
-            assert {name.partition(".")[0] for name in names} <= ALLOWED, file.name
     code = "import sys; sys.modules['vkc_pin'] = None; sys.path.insert(0, sys.argv[1])\n"
     code += "from oracle.judge import judge; from pathlib import Path\n"
     code += "import json; print(json.dumps([judge(Path(path)).agrees for path in sys.argv[2:]]))"

@@ -36,32 +36,29 @@ def place_shapes(q: np.ndarray) -> list[pin.SE3]:
     return list(placed.oMg)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_distances_and_nearest_pair_agree_with_coal(seed: int) -> None:
-    shapes, q = make_shapes().world.shapes, sample_configuration(seed)
-    placed, at = make_shapes().place(q[None]), place_shapes(q)
-    pairs = np.array(
-        [
-            (a, b)
-            for a, b in itertools.combinations(range(len(shapes)), 2)
-            if a < make_shapes().body_count
-        ]
+def test_distances_and_nearest_pair_agree_with_coal() -> None:
+    shapes, count = make_shapes().world.shapes, make_shapes().body_count
+    q = np.array([sample_configuration(seed) for seed in range(3)])
+    placed, pairs = (
+        make_shapes().place(q),
+        np.array([(a, b) for a, b in itertools.combinations(range(len(shapes)), 2) if a < count]),
     )
-    pairs = pairs[np.random.default_rng(seed).permutation(len(pairs))[:400]]
-    first = np.zeros(len(pairs), int)
-    expected = np.array(
-        [
-            compute_shape_distance(shapes[a].geometry, at[a], shapes[b].geometry, at[b])
-            for a, b in pairs.tolist()
-        ]
-    )
-    np.testing.assert_allclose(placed.compute_distances(first, pairs), expected, atol=COAL)
-    bounds = placed.compute_lower_bounds(first, pairs)
-    assert (bounds <= expected + COAL).all()
-    assert np.isfinite(bounds).mean() > 0.8, "most bounds must be finite"
-    ((best,), (least,)) = placed.find_nearest(pairs)
-    assert least == pytest.approx(expected.min(), abs=COAL)
-    assert expected[best] == pytest.approx(least, abs=COAL)
+    pairs = pairs[np.random.default_rng(0).permutation(len(pairs))[:400]]
+    nearest, least = placed.find_nearest(pairs)
+    for state, row in enumerate(q):
+        at, states = place_shapes(row), np.full(len(pairs), state)
+        expected = np.array(
+            [
+                compute_shape_distance(shapes[a].geometry, at[a], shapes[b].geometry, at[b])
+                for a, b in pairs.tolist()
+            ]
+        )
+        np.testing.assert_allclose(placed.compute_distances(states, pairs), expected, atol=COAL)
+        bounds = placed.compute_lower_bounds(states, pairs)
+        assert (bounds <= expected + COAL).all()
+        assert np.isfinite(bounds).mean() > 0.8, "most bounds must be finite"
+        assert least[state] == pytest.approx(expected.min(), abs=COAL)
+        assert expected[nearest[state]] == pytest.approx(least[state], abs=COAL)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -79,26 +76,3 @@ def test_shapes_near_a_point_are_found(seed: int) -> None:
         assert placed.find_shapes_near(point, 0.2) == near
         counted += len(near)
     assert counted > 0
-
-
-def test_results_of_many_configurations_are_those_of_single_ones() -> None:
-    q = np.array([sample_configuration(seed) for seed in range(6)])
-    together, count = make_shapes().place(q), make_shapes().body_count
-    pairs = np.array(
-        [(a, b) for a in range(count) for b in range(count, len(make_shapes().world.shapes))]
-    )
-    nearest, distances = together.find_nearest(pairs)
-    for state, row in enumerate(q):
-        alone, none = make_shapes().place(row[None]), np.zeros(len(pairs), int)
-        np.testing.assert_array_equal(
-            alone.find_nearest(pairs), ([nearest[state]], [distances[state]])
-        )
-        np.testing.assert_array_equal(
-            alone.compute_distances(none, pairs), together.compute_distances(none + state, pairs)
-        )
-        np.testing.assert_array_equal(
-            alone.compute_lower_bounds(none, pairs),
-            together.compute_lower_bounds(none + state, pairs),
-        )
-        for one, other in zip(alone.corners, together.corners, strict=True):
-            np.testing.assert_array_equal(one[0], other[state])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.drives import drive_through, make_hall, move_start
+from helpers.drives import drive_through, move_start
 from helpers.executions import make_grasping_scene, make_stationary_motion
 from helpers.judging import check_only_violation, get_approach, get_violation_names, replace_object
 from helpers.robots import compute_placement
@@ -17,17 +17,6 @@ from helpers.robots import compute_placement
 import vkc_pin as vkc
 from vkc_pin import InputError, Report, Scene, Trajectory, UnknownNameError, validate
 from vkc_pin.world.task.steps import Step
-
-
-@pytest.fixture(scope="module")
-def hall() -> Scene:
-    return make_hall()
-
-
-@pytest.fixture(scope="module")
-def drive(hall: Scene) -> Trajectory:
-    """Return a drive two metres ahead with a quarter turn."""
-    return drive_through(hall, hall.start, move_start(hall.start, x=2.0, yaw=np.pi / 2))
 
 
 def validate_door(plan: vkc.Plan, *steps: Step, scene: Scene | None = None) -> Report:
@@ -161,6 +150,12 @@ def test_steps_with_unknown_names_are_refused(step: Step, field: str, nearest: s
     with pytest.raises(UnknownNameError) as caught:
         validate(scene, [step], make_stationary_motion(scene))
     assert (caught.value.field, caught.value.nearest) == (f"steps[0].{field}", nearest)
+
+
+def test_frames_must_be_links_of_free_objects() -> None:
+    scene, step = vkc.load_scene("household"), vkc.Grasp("cup", by="door.panel")
+    with pytest.raises(InputError, match="stands fixed"):
+        validate(scene, [step], make_stationary_motion(scene))
 
 
 @pytest.mark.parametrize("steps", [[], ["open the door"]])

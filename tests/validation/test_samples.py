@@ -7,17 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.carrying import make_room
 from helpers.drives import make_hall, make_trajectory, move_start
 from helpers.robots import compute_placement
-from helpers.small_problems import load_door_scene, make_full_scene
+from helpers.small_problems import make_full_scene
 from helpers.telescopes import write_coupled_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from vkc_pin import Hold, InputError, PhaseSpan, Scene, Trajectory, UnknownNameError
-from vkc_pin.validation.samples import ANGLE_STEP, LENGTH_STEP, MAX_SAMPLES, Samples
+from vkc_pin import Hold, InputError, PhaseSpan, Scene, Trajectory
+from vkc_pin.validation.samples import ANGLE_STEP, LENGTH_STEP, Samples
 from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import make_holds
 from vkc_pin.world.trajectory.curve import Curve
@@ -176,26 +175,9 @@ def test_number_of_samples_along_a_curve_follows_its_largest_speed() -> None:
         assert set(knots.tolist()) <= set(samples.times.tolist())
 
 
-@pytest.mark.parametrize(("size", "ok"), [(0.99e12, True), (1.01e12, False)])
-def test_coordinates_out_of_range_are_refused(size: float, ok: bool) -> None:
+def test_coordinates_out_of_range_are_refused() -> None:
     scene = make_hall()
-    motion = make_trajectory(scene, np.array([scene.start, move_start(scene.start, y=-size)]))
-    if ok:
-        samples = Samples(scene, motion)
-        assert samples.required_count > MAX_SAMPLES
-        np.testing.assert_array_equal(samples.times, motion.times)
-    else:
-        with pytest.raises(InputError) as caught:
-            Samples(scene, motion)
-        assert caught.value.field == "trajectory.positions[1, 1]"
-
-
-def test_frames_must_be_links_of_free_objects() -> None:
-    samples = sample_stationary_motion(make_room())
-    samples.check_frame("stick.tip", "by")
-    for frame in ("stik.tip", "stick.tap"):
-        with pytest.raises(UnknownNameError) as caught:
-            samples.check_frame(frame, "by")
-        assert caught.value.field == "by"
-    with pytest.raises(InputError, match="stands fixed"):
-        sample_stationary_motion(load_door_scene()).check_frame("door.panel", "by")
+    motion = make_trajectory(scene, np.array([scene.start, move_start(scene.start, y=-1.01e12)]))
+    with pytest.raises(InputError) as caught:
+        Samples(scene, motion)
+    assert caught.value.field == "trajectory.positions[1, 1]"

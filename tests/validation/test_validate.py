@@ -45,17 +45,6 @@ from vkc_pin.world.trajectory.curve import Curve
 WRIST = "wrist_3_joint"
 
 
-@pytest.fixture(scope="module")
-def hall() -> Scene:
-    return make_hall()
-
-
-@pytest.fixture(scope="module")
-def drive(hall: Scene) -> Trajectory:
-    """Return a drive two metres ahead with a quarter turn."""
-    return drive_through(hall, hall.start, move_start(hall.start, x=2.0, yaw=np.pi / 2))
-
-
 def test_planned_motion_is_valid(door_plan: vkc.Plan) -> None:
     report = check(door_plan)
     assert report.ok, "\n".join(report.lines())

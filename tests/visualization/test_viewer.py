@@ -22,6 +22,7 @@ import zmq
 from helpers import browser
 from helpers.fake_plan import HINGE, make_fake_plan
 from helpers.pages import read_clips, read_commands
+from scipy.spatial.transform import Rotation, Slerp
 
 from vkc_pin import InputError, Plan, VkcError, load_scene
 from vkc_pin.visualization import viewer as visualization
@@ -163,16 +164,13 @@ def compute_local_placement(
 ) -> pin.SE3:
     placement = pin.SE3(np.array(static.get(path, np.eye(4).ravel())).reshape(4, 4).T)
     for track in clips.get(path, {"tracks": []})["tracks"]:
-        times = np.array([key["time"] for key in track["keys"]])
-        values = np.array([key["value"] for key in track["keys"]])
-        i = int(np.clip(np.searchsorted(times, moment, side="right") - 1, 0, len(times) - 2))
-        part = (moment - times[i]) / (times[i + 1] - times[i])
+        times, values = (
+            np.array([key[name] for key in track["keys"]]) for name in ("time", "value")
+        )
         if track["name"] == ".position":
-            placement.translation = (1 - part) * values[i] + part * values[i + 1]
+            placement.translation = np.array([np.interp(moment, times, x) for x in values.T])
         elif track["name"] == ".quaternion":
-            placement.rotation = (
-                pin.Quaternion(values[i]).slerp(part, pin.Quaternion(values[i + 1])).matrix()
-            )
+            placement.rotation = Slerp(times, Rotation.from_quat(values))(moment).as_matrix()
     return placement
 
 

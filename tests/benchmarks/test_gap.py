@@ -42,8 +42,7 @@ def test_robot_drives_through_the_gap_and_reaches_over_the_table() -> None:
     assert beside.any()
     half_width = 0.335
     assert ((y > -2.0 + half_width) & (y < -1.15 - half_width))[beside].all()
-    end = plan.trajectory.positions[-1]
-    tool = plan.scene.with_start(base=end[:3], arm=end[3:]).tool_placement()
+    tool = plan.end_scene().tool_placement()
     np.testing.assert_allclose(tool.translation, gap.POSE[:3], atol=2e-3)
     np.testing.assert_allclose(tool.rotation[:, 2], [0.0, 0.0, -1.0], atol=5e-3)
 

@@ -70,12 +70,14 @@ def _leave_arena(c: Content) -> None:
     c["scene"]["arena"]["x"][0] = float(c["column"]("base_x").min()) + 0.05
 
 
+def add_obstacle(c: Content, name: str, kind: str, position: list[float], **size: Any) -> None:
+    c["scene"]["obstacles"].append({"name": name, "type": kind, "position": position, **size})
+
+
 def _add_wall(c: Content) -> None:
     k = int(np.argmax(np.abs(np.diff(c["column"]("base_x")))))
     x, y = (float(c["column"](name)[k : k + 2].mean()) for name in ("base_x", "base_y"))
-    c["scene"]["obstacles"].append(
-        {"name": "post", "type": "cylinder", "radius": 0.02, "length": 0.2, "position": [x, y, 0.3]}
-    )
+    add_obstacle(c, "post", "cylinder", [x, y, 0.3], radius=0.02, length=0.2)
 
 
 def _drift(c: Content) -> None:
@@ -122,16 +124,9 @@ def _prepend_step(c: Content) -> None:
 
 
 def _block_drawer(c: Content) -> None:
-    drawer = c["scene"]["objects"][0]
-    x, y, _ = drawer["position"]
-    position = [
-        x - 0.28,
-        y,
-        0.0,
-    ]  # in front of the handle: overlaps at the start are exempt
-    c["scene"]["obstacles"].append(
-        {"name": "box", "type": "box", "size": [0.05, 0.05, 3.0], "position": position}
-    )
+    x, y, _ = c["scene"]["objects"][0]["position"]
+    in_front = [x - 0.28, y, 0.0]  # of the handle: overlaps at the start are exempt
+    add_obstacle(c, "box", "box", in_front, size=[0.05, 0.05, 3.0])
 
 
 CHANGES: list[tuple[str, Callable[[Content], None], str, str]] = [
@@ -177,6 +172,17 @@ def test_faults_of_changed_plans_are_found(
     ), list(map(str, verdict.found))
 
 
+def _move_sideways(c: Content) -> None:
+    yaw, share = c["column"]("base_yaw"), np.linspace(0.0, 0.05, len(c["times"]))
+    c["column"]("base_x")[:] -= share * np.sin(yaw)
+    c["column"]("base_y")[:] += share * np.cos(yaw)
+
+
+def _turn_in_place(c: Content) -> None:
+    for name in ("base_x", "base_y"):
+        c["column"](name)[:] = c["column"](name)[0]
+
+
 @pytest.mark.parametrize("base", ["differential", "ackermann"])
 def test_slipping_and_fast_wheels_are_found(base: str, tmp_path: Path) -> None:
     """A base must not slip, turn against its kinematics or exceed its wheel speed."""
@@ -185,54 +191,32 @@ def test_slipping_and_fast_wheels_are_found(base: str, tmp_path: Path) -> None:
     assert plan.success, plan.summary()
     path = plan.save(tmp_path / "plan.npz")
     assert judge(path).agrees
-
-    def find_rules(change: Callable[[Content], None]) -> set[str]:
-        return {
-            one.rule for one in judge(write_changed(path, tmp_path / "changed.npz", change)).found
-        }
-
-    def move_sideways(c: Content) -> None:
-        yaw, share = c["column"]("base_yaw"), np.linspace(0.0, 0.05, len(c["times"]))
-        c["column"]("base_x")[:] -= share * np.sin(yaw)
-        c["column"]("base_y")[:] += share * np.cos(yaw)
-
-    def turn_in_place(c: Content) -> None:
-        for name in ("base_x", "base_y"):
-            c["column"](name)[:] = c["column"](name)[0]
-
-    def speed_up(c: Content) -> None:
-        c["times"][:] *= 0.1
-
-    assert "slip" in find_rules(move_sideways)
-    assert ("turning" in find_rules(turn_in_place)) == (base == "ackermann")
-    assert "slip" not in find_rules(turn_in_place)
-    assert "wheels" in find_rules(speed_up)
+    sideways, in_place, fast = (
+        {one.rule for one in judge(write_changed(path, tmp_path / "changed.npz", change)).found}
+        for change in (_move_sideways, _turn_in_place, _speed_up)
+    )
+    assert "slip" in sideways
+    assert ("turning" in in_place) == (base == "ackermann")
+    assert "slip" not in in_place
+    assert "wheels" in fast
 
 
 def test_shape_within_the_clearance_is_found(plans: dict[str, Path], tmp_path: Path) -> None:
     """A ball 15 mm above the base violates the clearance; a ball at 25 mm does not."""
 
-    def make_change(height: float) -> Callable[[Content], None]:
+    def find_amounts(height: float) -> list[tuple[str, float]]:
         def change(c: Content) -> None:
-            x, y = (float(c["column"](key)[0]) for key in ("base_x", "base_y"))
-            yaw = float(c["column"]("base_yaw")[0])
-            position = [x - 0.3 * np.cos(yaw), y - 0.3 * np.sin(yaw), 0.39 + height + 0.01]
             for column in c["positions"].T:
                 column[1:] = column[0]
-            c["scene"]["obstacles"].append(
-                {"name": "ball", "type": "sphere", "radius": 0.01, "position": position}
-            )
+            x, y, yaw = (float(c["column"](f"base_{name}")[0]) for name in ("x", "y", "yaw"))
+            above = [x - 0.3 * np.cos(yaw), y - 0.3 * np.sin(yaw), 0.39 + height + 0.01]
+            add_obstacle(c, "ball", "sphere", above, radius=0.01)
 
-        return change
+        found = judge(write_changed(plans["drawer"], tmp_path / "b.npz", change)).found
+        return [(one.subject, one.amount) for one in found if one.rule == "clearance"]
 
-    near, far = (
-        judge(write_changed(plans["drawer"], tmp_path / "b.npz", make_change(height))).found
-        for height in (0.015, 0.025)
-    )
-    (found,) = [one for one in near if one.rule == "clearance"]
-    assert found.subject == "base_link - ball"
-    assert found.amount == pytest.approx(0.019 - 0.015, abs=1e-3)
-    assert not [one for one in far if one.rule == "clearance"]
+    assert find_amounts(0.015) == [("base_link - ball", pytest.approx(0.019 - 0.015, abs=1e-3))]
+    assert find_amounts(0.025) == []
 
 
 def test_cup_in_a_drawer_moves_with_it(plans: dict[str, Path], tmp_path: Path) -> None:

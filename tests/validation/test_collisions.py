@@ -264,16 +264,6 @@ def test_no_penetration_is_missed_between_sparse_samples(seed: int, size: float)
 BOX = describe_box("box", [0.4, 0.4, 0.6], [2.0, 0.0, 0.3])
 
 
-def test_overlaps_at_a_sample_are_not_searched_between_samples() -> None:
-    scene = make_hall(obstacles=[BOX])
-    motion = make_trajectory(scene, np.vstack([scene.start, move_start(scene.start, x=2.0)]))
-    samples, table = Samples(scene, motion), make_table(scene, motion)
-    hits = list(sweep(table, samples.z[[0, -1]], np.array([0, 1])))
-    inside = {hit.shapes for hit in hits if hit.distance < 0 and hit.at_waypoint}
-    assert inside
-    assert not [hit for hit in hits if hit.shapes in inside and not hit.at_waypoint]
-
-
 @pytest.mark.parametrize(
     ("overlap", "together", "before"),
     [(None, False, 0), (0.0, True, 0), (0.0, True, 1), (0.0, False, 0), (1e-4, False, 0)],

@@ -124,7 +124,7 @@ def test_steps_without_effect_are_accepted_anywhere(door_plan: vkc.Plan) -> None
         [*own, vkc.Grasp("door")],
     ):
         report = validate_door(door_plan, *steps)
-        assert report.ok, "\n".join(report.lines())
+        assert report.ok, report.lines()
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from vkc_pin import Hold, InputError, PhaseSpan, Scene, Trajectory
+from vkc_pin import Hold, InputError, PhaseSpan, Trajectory
 from vkc_pin.validation.samples import ANGLE_STEP, LENGTH_STEP, Samples
 from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import make_holds
@@ -121,17 +121,14 @@ def test_grasps_drive_the_joints_between_root_and_attachment() -> None:
     }
 
 
-def sample_stationary_motion(scene: Scene) -> Samples:
-    return Samples(scene, make_trajectory(scene, np.tile(scene.start, (2, 1))))
-
-
 def test_limits_of_the_base_include_the_arena() -> None:
     scene = dataclasses.replace(make_hall(), arena=(-5.0, 6.0, -7.0, 8.0))
     robot = scene.robot
     lower, upper = robot.lower.copy(), robot.upper.copy()
     lower[:3], upper[:3] = [-1.0, -9.0, -2.0], [9.0, 1.0, 3.0]
     robot = dataclasses.replace(robot, lower=lower, upper=upper)
-    samples = sample_stationary_motion(dataclasses.replace(scene, robot=robot))
+    scene = dataclasses.replace(scene, robot=robot)
+    samples = Samples(scene, make_trajectory(scene, np.tile(scene.start, (2, 1))))
     limits = np.array([samples.get_limits(name) for name in robot.coordinates.names])
     np.testing.assert_array_equal(limits[:2, :2], [(-1.0, 6.0), (-7.0, 1.0)])
     np.testing.assert_array_equal(limits[2:, 0], lower[2:])

@@ -19,7 +19,6 @@ from helpers.drives import (
 from helpers.judging import (
     check,
     check_only_violation,
-    get_approach,
     get_violation_names,
     replace_attachments,
     replace_object,
@@ -47,7 +46,7 @@ WRIST = "wrist_3_joint"
 
 def test_planned_motion_is_valid(door_plan: vkc.Plan) -> None:
     report = check(door_plan)
-    assert report.ok, "\n".join(report.lines())
+    assert report.ok, report.lines()
     assert report.clearance > 0.0
     assert report.closure_error <= 1e-3
     assert report.closure_angle <= 1e-3
@@ -331,7 +330,7 @@ def test_clearance_violation_at_a_waypoint_is_reported(
         fields = {"waypoint": 40, "amount": pytest.approx(amount, abs=1e-5)}
         check_only_violation(report, constraint, "base_link – crate", "m", **fields)
     else:
-        assert report.ok, "\n".join(report.lines())
+        assert report.ok, report.lines()
 
 
 def test_penetration_between_waypoints_is_found() -> None:
@@ -397,8 +396,6 @@ def test_fingers_may_be_close_to_the_grasped_link(door_plan: vkc.Plan) -> None:
     near = check(door_plan, scene=close)
     assert find_hand_violations(near) == []
     assert near.clearance < 0.0085
-    grasp = validate(close, [vkc.Grasp("door")], get_approach(door_plan))
-    assert find_hand_violations(grasp) == []
     found = find_hand_violations(
         check(door_plan, scene=thicken_lever(door_plan.scene, gap + 0.008))
     )

@@ -193,26 +193,22 @@ def test_every_command_and_option_is_documented() -> None:
         assert [one for one in options - {"-h", "--help"} if one not in section] == [], name
 
 
-def test_shell_commands_are_valid() -> None:
-    lines = [
-        line for page in PAGES for line in find_shell_lines(page) if line.startswith("vkc-pin")
-    ]
-    assert len(lines) >= 8
-    parser = make_parser()
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_shell_commands_are_valid_and_do_not_share_folders(page: Path) -> None:
+    """A folder belongs to one experiment."""
+    lines = {line for line in find_shell_lines(page) if line.startswith("vkc-pin")}
     for line in lines:
         words = line.partition("#")[0].split()[1:]
-        assert callable(parser.parse_args(words).run), line
+        assert callable(make_parser().parse_args(words).run), line
+    experiments = [line for line in lines if re.match(r"vkc-pin (bench|generate)", line)]
+    folders = re.findall(r"--out (?!DIR)(\S+)", "\n".join(experiments))
+    assert len(folders) == len(set(folders))
+
+
+def test_make_targets_of_the_readme_exist() -> None:
     targets = set(re.findall(r"^(\w+):", read("Makefile"), re.MULTILINE))
     readme = "\n".join(find_shell_lines(ROOT / "README.md"))
     assert set(re.findall(r"^make (\w+)", readme, re.MULTILINE)) <= targets
-
-
-def test_commands_on_a_page_do_not_share_folders() -> None:
-    """A folder belongs to one experiment."""
-    for page in PAGES:
-        lines = {one for one in find_shell_lines(page) if re.match(r"vkc-pin (bench|gen)", one)}
-        folders = re.findall(r"--out (?!DIR)(\S+)", "\n".join(lines))
-        assert sorted(folders) == sorted(set(folders)), page.name
 
 
 @pytest.mark.parametrize("page", [*PAGES, *DECISIONS], ids=lambda page: page.name)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pinocchio as pin
 
@@ -72,3 +74,14 @@ def make_random_stick_motion(
         there += size * rng.uniform(-1.0, 1.0, len(there)) * rng.choice([0.0, 0.1, 1.0], len(there))
         script.go(there, steps=2)
     return scene, script.motion()
+
+
+def make_object_motion(
+    scene: Scene, owner: str, *phases: PhaseSpan, dt: float = 1.0, **values: Sequence[float]
+) -> Trajectory:
+    """Return a motion of an object's coordinates, with the robot at rest."""
+    count, robot = len(next(iter(values.values()))), scene.robot.coordinates.names
+    rows = np.column_stack([np.tile(scene.start, (count, 1)), *values.values()])
+    names = (*robot, *(f"{owner}.{name}" for name in values))
+    phases = phases or (PhaseSpan("move", 0, count - 1),)
+    return Trajectory(names, dt * np.arange(count), rows, phases, len(robot))

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from helpers.executions import plan_drawer
 from helpers.small_problems import make_full_scene
 
 import vkc_pin as vkc
@@ -22,9 +23,7 @@ LIMITS = (vkc.Tolerances().closure_position, vkc.Tolerances().closure_angle)
 
 @pytest.fixture(scope="module")
 def plan() -> Plan:
-    found = vkc.plan(vkc.load_scene("drawer"), [vkc.Actuate("drawer", {"slide": 0.3})])
-    assert found.success, found.summary()
-    return found
+    return plan_drawer()
 
 
 def bend(trajectory: Trajectory, column: int, by: float) -> Trajectory:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +21,7 @@ from helpers.drives import make_hall, make_trajectory, move_start
 from helpers.motions import (
     compute_all_distances,
     get_pair_names,
+    make_object_motion,
     make_random_door_motion,
     make_random_stick_motion,
 )
@@ -54,13 +54,6 @@ def find_partners(scene: Scene, motion: Trajectory) -> dict[str, set[str]]:
         for one, other in (pair, pair[::-1]):
             partners.setdefault(one, set()).add(other)
     return partners
-
-
-def make_object_motion(scene: Scene, hold: Hold, **values: Sequence[float]) -> Trajectory:
-    """Return a motion of an object's joints between two waypoints, with the robot at rest."""
-    names = (*scene.robot.coordinates.names, *(f"{hold.object}.{joint}" for joint in values))
-    rows = np.column_stack([np.tile(scene.start, (2, 1)), *values.values()])
-    return Trajectory(names, np.arange(2.0), rows, (PhaseSpan("all", 0, 1, (hold,)),), 9)
 
 
 def test_robot_objects_and_walls_are_paired(door: Scene) -> None:
@@ -113,9 +106,8 @@ def test_windows_change_margin_and_contact_of_their_pairs(door: Scene) -> None:
 
 def test_static_links_are_not_paired_with_obstacles() -> None:
     scene = make_full_scene()
-    motion = make_object_motion(
-        scene, Hold("cabinet", "grip"), slide=[0.1, 0.11], swing=[0.3, 0.31]
-    )
+    phase = PhaseSpan("all", 0, 1, (Hold("cabinet", "grip"),))
+    motion = make_object_motion(scene, "cabinet", phase, slide=[0.1, 0.11], swing=[0.3, 0.31])
     partners = find_partners(scene, motion)
     for still in ("cabinet.lid", "cabinet.case"):
         assert "forearm_link" in partners[still]
@@ -141,7 +133,8 @@ def test_free_objects_are_paired_with_obstacles_while_carried() -> None:
 
 def test_links_of_an_object_are_paired() -> None:
     scene = load_scene("household")
-    motion = make_object_motion(scene, Hold("dishwasher", "handle"), rack=[0.0, 0.2])
+    phase = PhaseSpan("all", 0, 1, (Hold("dishwasher", "handle"),))
+    motion = make_object_motion(scene, "dishwasher", phase, rack=[0.0, 0.2])
     partners = find_partners(scene, motion)
     own = {name for name in partners if name.startswith("dishwasher.")}
     assert {name: own & partners[name] for name in own if own & partners[name]} == {

@@ -21,8 +21,9 @@ from helpers.carrying import (
     solve_grasp,
 )
 from helpers.drawers import add_boxes, load_drawer_scene, replace_scene_fields
-from helpers.drives import drive_through, make_trajectory
+from helpers.drives import drive_through, make_trajectory, replace_positions
 from helpers.grippers import write_cheeks_scene, write_gripper
+from helpers.motions import make_object_motion
 from helpers.small_problems import load_door_scene
 from helpers.supports import make_plate_scene, slide_plate
 
@@ -127,11 +128,8 @@ def test_pushed_links_must_not_move_back(back: float, is_wrong: bool) -> None:
     slide = 0.3 - np.cumsum([0.0, 0.1, 0.0, -back, 0.1])
     push = Hold("drawer", "push")
     freedoms = scene.objects["drawer"].object.attachments["push"].coordinates
-    names = (*scene.robot.coordinates.names, *(f"drawer.{name}" for name in ("slide", *freedoms)))
-    rows = np.tile(np.append(scene.start, np.zeros(len(freedoms) + 1)), (len(slide), 1))
-    rows[:, len(scene.start)] = slide
-    spans = (PhaseSpan("push", 0, len(slide) - 1, (push,)),)
-    motion = Trajectory(names, np.arange(5.0), rows, spans, len(scene.start))
+    phase, still = PhaseSpan("push", 0, 4, (push,)), dict.fromkeys(freedoms, np.zeros(5))
+    motion = make_object_motion(scene, "drawer", phase, slide=slide, **still)
     found = list(check_pushes(Samples(scene, motion)))
     assert [(one.constraint, one.waypoint) for one in found] == [("push", 3)] * is_wrong
     for one in found:
@@ -151,10 +149,9 @@ def test_hand_may_be_close_to_the_object_of_a_grasp_step_without_hold() -> None:
 def test_only_rigid_grasps_move_together(attachment: str, rigid: bool) -> None:
     scene = load_door_scene().with_held({"door": attachment})
     freedoms = scene.objects["door"].object.attachment(attachment).coordinates
-    names = (*scene.robot.coordinates.names, *(f"door.{name}" for name in freedoms))
-    rows = np.column_stack([np.tile(scene.start, (2, 1)), np.zeros((2, len(names) - 9))])
-    phases = (PhaseSpan("hold", 0, 1, scene.holds),)
-    near, lever = list_windows(Samples(scene, Trajectory(names, np.arange(2.0), rows, phases, 9)))
+    values = dict.fromkeys(("hinge", *freedoms), np.zeros(2))
+    motion = make_object_motion(scene, "door", PhaseSpan("hold", 0, 1, scene.holds), **values)
+    near, lever = list_windows(Samples(scene, motion))
     assert (near.moves_together, near.margin, near.contact) == (False, 0.005, 0.0)
     expected = (True, 0.0, CONTACT_DEPTH) if rigid else (False, 0.005, CONTACT_DEPTH)
     assert (lever.moves_together, lever.margin, lever.contact) == expected
@@ -215,9 +212,7 @@ def test_exempt_pairs_may_be_close(
         scene = replace_scene_fields(add_boxes(load_drawer_scene(), side=box), allow=allow)
         scene = scene.with_state("drawer", {"slide": 0.3})
     slide = np.array([0.3, 0.1, 0.03, 0.0, 0.0, 0.0, 0.03, 0.1, 0.3])
-    rows = np.column_stack([np.tile(scene.start, (9, 1)), slide])
-    names, phases = (*scene.robot.coordinates.names, "drawer.slide"), (PhaseSpan("slide", 0, 8),)
-    samples = Samples(scene, Trajectory(names, np.arange(9.0), rows, phases, 9))
+    samples = Samples(scene, make_object_motion(scene, "drawer", slide=slide))
     found = [window for window in list_windows(samples) if len(window.pairs)]
     for window in found:
         assert get_labels(samples, window) == {("drawer.tray", "side")}
@@ -329,11 +324,10 @@ def test_window_lasts_one_second_but_at_least_four_moving_steps(dt: float, last:
 def test_robot_must_rest_at_a_grasp(positions: list[float], rest: float) -> None:
     """The door may move meanwhile."""
     scene, hold = load_door_scene(), (Hold("door", "handle"),)
-    rows = np.column_stack([np.tile(scene.start, (7, 1)), 0.01 * np.arange(7), np.zeros(7)])
-    rows[:, 0] += 0.01 * np.array(positions)
-    names = (*scene.robot.coordinates.names, "door.hinge", "door.knob")
     phases = (PhaseSpan("reach", 0, 3), PhaseSpan("move", 3, 6, hold))
-    motion = Trajectory(names, np.arange(7.0), rows, phases, 9)
+    motion = make_object_motion(scene, "door", *phases, hinge=0.01 * np.arange(7), knob=np.zeros(7))
+    moves = np.outer(0.01 * np.array(positions), np.arange(len(motion.names)) == 0)
+    motion = replace_positions(motion, motion.positions + moves)
     found = check_gripper(Samples(scene, motion), Options(grasp_time=2.0))
     assert [(one.constraint, one.subject, one.waypoint, one.time, one.amount) for one in found] == [
         ("dwell", "door.handle", 3, 3.0, pytest.approx(2.0 - rest))

@@ -68,16 +68,11 @@ def test_timing_describes_the_limiting_constraints() -> None:
     assert FULL.measures() == {"clearance": -0.01, "closure_error": 0.001, "torque": 0.5}
 
 
-@pytest.mark.parametrize(
-    ("difference", "differs"), [(0.9e-5, False), (1.5e-5, True), (math.nan, True)]
-)
 @pytest.mark.parametrize("field", ["clearance", "closure_error", "closure_angle"])
-def test_contradictions_list_different_numbers(
-    field: str, difference: float, differs: bool
-) -> None:
+def test_contradictions_list_different_numbers(field: str) -> None:
     numbers = dict.fromkeys(("clearance", "closure_error", "closure_angle"), 0.5)
-    for sign in (-1.0, 1.0):
-        other = Report(**{**numbers, field: 0.5 + sign * difference})  # type: ignore[arg-type]
+    for difference, differs in ((0.9e-5, False), (1.5e-5, True), (-1.5e-5, True), (math.nan, True)):
+        other = Report(**{**numbers, field: 0.5 + difference})  # type: ignore[arg-type]
         lines = Report(**numbers).contradictions(other)  # type: ignore[arg-type]
         assert [line.partition(" ")[0] for line in lines] == [field] * differs
 

@@ -50,10 +50,7 @@ def test_samples_of_coupled_joints_are_dense(tmp_path: Path) -> None:
     scene = write_coupled_scene(tmp_path)
     rows = np.tile(scene.start, (3, 1))
     rows[1:, 3:] += [[0.4, 0.0, 0.0], [0.4, 0.1, 0.9]]
-    names, phases = scene.robot.coordinates.names, (PhaseSpan("all", 0, 2, ()),)
-    samples = Samples(
-        scene, Trajectory(names, np.array([0.0, 1.0, 2.0]), rows, phases, len(scene.start))
-    )
+    samples = Samples(scene, make_trajectory(scene, rows, dt=1.0))
     steps = np.abs(np.diff(samples.z, axis=0)).max(axis=0)
     travel = {
         str(samples.world.model.names[m.joint]): abs(m.factor) * steps[m.coordinate]

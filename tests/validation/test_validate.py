@@ -8,6 +8,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.carrying import describe_box
 from helpers.drives import (
     DT,
     drive_through,
@@ -23,12 +24,12 @@ from helpers.judging import (
     replace_attachments,
     replace_object,
 )
+from helpers.motions import make_object_motion
 
 import vkc_pin as vkc
 from vkc_pin import (
     InputError,
     Options,
-    PhaseSpan,
     PlacedObject,
     Report,
     Scene,
@@ -263,10 +264,7 @@ def compute_latch_shortfall(
     """Return the amount of the latch violation of a door that moves alone, 0 without one."""
     scene = replace_latch(scene, engaged_within=reach)
     scene = scene.with_state("door", {"hinge": hinge[0], "knob": knob[0]})
-    rows = np.column_stack([np.tile(scene.start, (len(hinge), 1)), hinge, knob])
-    names = (*scene.robot.coordinates.names, "door.hinge", "door.knob")
-    phases, times = (PhaseSpan("stand", 0, len(rows) - 1),), 2.0 * np.arange(len(rows))
-    motion = Trajectory(names, times, rows, phases, len(scene.start))
+    motion = make_object_motion(scene, "door", dt=2.0, hinge=hinge, knob=knob)
     report = validate(scene, [vkc.Actuate("door", {"hinge": hinge[-1]})], motion)
     found = [violation for violation in report.violations if violation.constraint == "latch"]
     assert {violation.subject for violation in found} <= {"door.hinge"}
@@ -301,13 +299,14 @@ def test_joints_must_not_move_without_a_grasp(door_plan: vkc.Plan) -> None:
 
 def make_drive_to_a_crate(gap: float) -> tuple[Scene, Trajectory]:
     """Return a hall with a crate, and a drive that ends `gap` in front of it."""
-    crate = {"name": "crate", "type": "box", "size": [0.4, 2.0, 0.3], "position": [2.5, 0.0, 0.15]}
-    scene = make_hall(obstacles=[crate])
-    there = move_start(scene.start, x=1.0)
-    crate["position"] = [2.5 - scene.with_start(base=there[:3]).start_clearance() + gap, 0.0, 0.15]
-    scene = make_hall(obstacles=[crate])
-    assert scene.with_start(base=there[:3]).start_clearance() == pytest.approx(gap, abs=1e-6)
-    return scene, drive_through(scene, scene.start, there)
+
+    def place_crate(x: float) -> tuple[Scene, float]:
+        scene = make_hall(obstacles=[describe_box("crate", [0.4, 2.0, 0.3], [x, 0.0, 0.15])])
+        return scene, scene.with_start(base=[1.0, 0.0, 0.0]).start_clearance()
+
+    scene, clearance = place_crate(2.5 - place_crate(2.5)[1] + gap)
+    assert clearance == pytest.approx(gap, abs=1e-6)
+    return scene, drive_through(scene, scene.start, move_start(scene.start, x=1.0))
 
 
 @pytest.mark.parametrize(
@@ -334,8 +333,7 @@ def test_clearance_violation_at_a_waypoint_is_reported(
 
 
 def test_penetration_between_waypoints_is_found() -> None:
-    board = {"name": "board", "type": "box", "size": [0.005, 1.0, 0.2], "position": [2.0, 0.0, 0.1]}
-    scene = make_hall(obstacles=[board])
+    scene = make_hall(obstacles=[describe_box("board", [0.005, 1.0, 0.2], [2.0, 0.0, 0.1])])
     rows = np.array([scene.start, move_start(scene.start, x=4.0)])
     motion = make_trajectory(scene, rows, dt=20.0)
     for row in rows:

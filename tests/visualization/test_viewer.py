@@ -20,7 +20,7 @@ import pinocchio as pin
 import pytest
 import zmq
 from helpers import browser
-from helpers.fake_plan import HINGE, make_fake_plan
+from helpers.fake_plan import HINGE
 from helpers.pages import read_clips, read_commands
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -29,11 +29,6 @@ from vkc_pin.visualization import viewer as visualization
 from vkc_pin.world.trajectory.world_model import World
 
 needs_chromium = pytest.mark.skipif(browser.CHROMIUM is None, reason="Chromium is not installed")
-
-
-@pytest.fixture(scope="module")
-def plan() -> Plan:
-    return make_fake_plan()
 
 
 @pytest.fixture(scope="module")

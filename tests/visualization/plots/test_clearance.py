@@ -3,7 +3,6 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.fake_plan import make_fake_plan
 
 from vkc_pin import Plan
 from vkc_pin.visualization.plots.plots import ClearanceCurve, compute_clearance_curves
@@ -11,11 +10,6 @@ from vkc_pin.world.models.shapes import compute_shape_distance
 from vkc_pin.world.trajectory.world_model import World
 
 TIMES = np.linspace(0.0, 6.0, 13)
-
-
-@pytest.fixture(scope="module")
-def plan() -> Plan:
-    return make_fake_plan()
 
 
 @pytest.fixture(scope="module")

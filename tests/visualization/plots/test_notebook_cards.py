@@ -6,16 +6,9 @@ import io
 import re
 
 import numpy as np
-import pytest
-from helpers.fake_plan import make_fake_plan
 
 import vkc_pin as vkc
 from vkc_pin import Plan, Report
-
-
-@pytest.fixture(scope="module")
-def plan() -> Plan:
-    return make_fake_plan()
 
 
 def decode_picture(html: str) -> np.ndarray:

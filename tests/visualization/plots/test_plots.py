@@ -6,16 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.fake_plan import make_fake_plan
 
 from vkc_pin import InputError, Plan
 from vkc_pin.visualization.plots import plots as plotting
 from vkc_pin.world.trajectory.curve import Curve
-
-
-@pytest.fixture(scope="module")
-def plan() -> Plan:
-    return make_fake_plan()
 
 
 @pytest.fixture(scope="module")

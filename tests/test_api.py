@@ -63,8 +63,6 @@ def test_every_public_name_is_documented() -> None:
         value = getattr(vkc, public)
         if inspect.isclass(value) or inspect.isfunction(value):
             assert inspect.getdoc(value), public
-    for name in ("plan", "build", "load_scene", "load_robot", "load_object", "validate"):
-        assert "Raises:" in (getattr(vkc, name).__doc__ or ""), name
 
 
 def test_heavy_dependencies_are_loaded_on_first_use() -> None:

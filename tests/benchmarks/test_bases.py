@@ -34,18 +34,14 @@ def test_both_bases_open_the_drawer(tmp_path: Path) -> None:
         )
 
 
+TIMES = dict.fromkeys(("planning_time", "evaluations", "iterations", "duration"), 1.0)
+TIMES |= {"base_path_length": 1.0, "arm_path_length": 1.0}
+
+
 def test_failures_are_listed() -> None:
-    fields = (
-        "planning_time",
-        "evaluations",
-        "iterations",
-        "base_path_length",
-        "arm_path_length",
-        "duration",
-    )
     meta = {"starts": 5, "seed": 0, "radius": 0.8, "tasks": ["door"], "bases": ["ackermann"]}
     failure = {"task": "door", "base": "ackermann", "number": 4, "success": False}
-    failure |= {"status": "rejected", "violations": ["turning base"], **dict.fromkeys(fields, 1.0)}
+    failure |= {"status": "rejected", "violations": ["turning base"], **TIMES}
     text = bases.format_results({"meta": {**describe_environment(), **meta}, "trials": [failure]})
     assert "- door, ackermann, start 4: rejected; turning base" in text
     assert "| door | ackermann | 0 of 1 |" in text

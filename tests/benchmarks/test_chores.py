@@ -47,7 +47,6 @@ def test_cluttered_home_contains_the_home() -> None:
         ("refrigerator.door", "panel_east", 0.0),
         ("refrigerator.door", "panel_west", 0.009),
         ("door.lever", "bag", 0.01),
-        ("open door.panel", "casing_above", -0.05),
         ("open door.lever", "wardrobe", 0.01),
     ],
 )

@@ -55,7 +55,4 @@ def test_trial_is_recorded_and_tabulated(
     assert record["success"] is True, record["violations"]
     assert record["first_seed"] is (record["solves"] == 1)
     np.testing.assert_allclose(record["start"], gap.make_start(0, 0).start, atol=1e-8)
-    reach = 1.4
-    distance = np.linalg.norm(np.array(gap.POSE[:2]) - record["start"][:2])
-    assert record["base_path_length"] > distance - reach
     assert f"| {gap.SCENE} | 1 of 1 | {int(record['first_seed'])} of 1 |" in table

@@ -10,6 +10,7 @@ from helpers.experiments import run_experiment
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import scale
+from vkc_pin.benchmarks.harness.record import describe_environment
 from vkc_pin.benchmarks.scale import make_crowded_scene, make_refined_options
 
 
@@ -61,25 +62,20 @@ def test_planning_times_are_tabulated_by_count(
 
 @pytest.mark.parametrize("segments", [4, 20, 76, 320])
 def test_refined_options_divide_the_same_time(segments: int) -> None:
-    phases = [
-        np.array([o.reach_waypoints, o.turn_waypoints, o.move_waypoints])
-        for o in (make_refined_options(segments), vkc.Options())
-    ]
-    assert phases[0].sum() == segments
-    assert make_refined_options(segments).dt * segments == pytest.approx(
-        vkc.Options().dt * phases[1].sum()
+    refined, usual = make_refined_options(segments), vkc.Options()
+    parts, shares = (
+        np.array([one.reach_waypoints, one.turn_waypoints, one.move_waypoints])
+        for one in (refined, usual)
     )
+    assert parts.sum() == segments
+    assert refined.dt * segments == pytest.approx(usual.dt * shares.sum())
     if segments >= 20:
-        shares = [part / part.sum() for part in phases]
-        np.testing.assert_allclose(*shares, atol=0.05)
-    assert (make_refined_options(segments) == vkc.Options()) == (segments == 76)
+        np.testing.assert_allclose(parts / segments, shares / shares.sum(), atol=0.05)
+    assert (refined == usual) == (segments == 76)
 
 
 def test_errors_have_no_planning_time() -> None:
-    meta = {"of": "obstacles", "counts": [12], "starts": 1, "seed": 0}
-    machine = {"system": "x", "machine": "x", "processor": "x", "cores": 2, "python": "3"}
+    meta = describe_environment(of="obstacles", counts=[12], starts=1, seed=0, time_limit=1.0)
     error = {"obstacles": 12, "number": 0, "success": False, "status": "error"}
-    text = scale.format_results(
-        {"meta": {**meta, "machine": machine, "versions": {}}, "trials": [error]}
-    )
+    text = scale.format_results({"meta": meta, "trials": [error]})
     assert f"| 12 | 0 of 1 |{' – |' * 9}" in text

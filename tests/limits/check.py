@@ -93,8 +93,5 @@ def _find_worst(
     limit: float,
 ) -> list[Excess]:
     k = int(np.argmax(excess))
-    return (
-        []
-        if excess[k] <= 0.0
-        else [Excess(quantity, name, float(times[k]), float(values[k]), limit)]
-    )
+    found = Excess(quantity, name, float(times[k]), float(values[k]), limit)
+    return [found] if excess[k] > 0.0 else []

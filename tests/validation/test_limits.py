@@ -70,12 +70,6 @@ def test_longest_interval_is_reported() -> None:
         assert (found.subject, found.begin, found.end) == ("shoulder_lift_joint", begin, end)
 
 
-def test_motion_without_curve_has_no_bounds() -> None:
-    plan = plan_drawer()
-    loads = MotorLoads(Samples(plan.scene, replace(plan.trajectory, curve=None)))
-    assert loads.summarize()["bounds"] == ()
-
-
 def find_violations(motion: Trajectory, **options: float) -> dict[tuple[str, str], Violation]:
     rows = check_rates(Samples(plan_drawer().scene, motion), vkc.Options(**options))  # type: ignore[arg-type]
     return {(row.constraint, row.unit): row for row in rows if row.subject == "elbow_joint"}
@@ -259,7 +253,9 @@ with_and_without_curve = pytest.mark.parametrize("is_smooth", [True, False], ids
 def test_slip_is_reported(is_smooth: bool) -> None:
     """At heading θ, the velocity along −x is lateral by a factor of sin θ."""
     scene = make_hall(base="differential")
-    assert validate(scene, *make_circle(scene, is_smooth=is_smooth)).ok
+    rolling = validate(scene, *make_circle(scene, is_smooth=is_smooth))
+    assert rolling.ok
+    assert bool(rolling.bounds) == is_smooth, "only curves have limiting constraints"
     goal, motion = make_circle(scene, is_smooth=is_smooth, aside=0.01)
     unit, tolerance = ("m/s", 1e-3) if is_smooth else ("m", 1e-4)
     found = check_only_violation(validate(scene, goal, motion), "slip", "base", unit)

@@ -213,7 +213,6 @@ def test_latch_violation_of_a_planned_motion_is_reported(door_plan: vkc.Plan) ->
             [0.0, 0.6, 0.6],
             0.5,
         ),  # both at once: the hinge leaves with the knob at 0
-        ([0.0, 0.0, 0.3], [0.0, 0.4, 0.4], 0.1),
         (
             [0.0, 0.0, 0.3],
             [0.0, 0.6, 0.0],

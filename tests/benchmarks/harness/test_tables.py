@@ -21,23 +21,13 @@ def make_record(
 ) -> dict[str, Any]:
     """Return a record; `failure` is "status" or "status: constraint subject", "" for a success."""
     status, _, constraint = (failure or "success").partition(": ")
-    fields = {
-        "scene": scene,
-        "method": method,
-        "number": number,
-        "repeat": 0,
-        "success": not failure,
-        "status": status,
-    }
-    fields |= {"failed_constraint": (constraint or status) if failure else None}
-    if time is not None:
-        fields |= {
-            "planning_time": time,
-            "base_path_length": base,
-            "base_path_length_l1": 2.0 * base,
-            "arm_path_length": arm,
-        }
-    return fields
+    record = {"scene": scene, "method": method, "number": number, "repeat": 0, "status": status}
+    record |= {"success": not failure}
+    record |= {"failed_constraint": (constraint or status) if failure else None}
+    if time is None:
+        return record
+    lengths = {"base_path_length": base, "base_path_length_l1": 2.0 * base, "arm_path_length": arm}
+    return {**record, "planning_time": time, **lengths}
 
 
 RECORDS = [

@@ -8,6 +8,7 @@ from helpers.arm_urdf import write_arms
 from helpers.experiments import run_experiment
 
 import vkc_pin as vkc
+from vkc_pin.benchmarks.harness.record import describe_environment
 from vkc_pin.benchmarks.robot_object_matrix.robots import (
     format_results,
     sample_reachable_poses,
@@ -60,8 +61,7 @@ def test_command_records_reached_poses_and_a_failed_import(tmp_path: Path) -> No
 
 
 def test_report_lists_failures_by_robot() -> None:
-    meta = {"robots": ["one", "two"], "goals": 2, "seed": 0, "time_limit": 5.0, "versions": {}}
-    meta["machine"] = {"cores": 2, "processor": "x", "machine": "x", "system": "x", "python": "3"}
+    meta = describe_environment(robots=["one", "two"], goals=2, seed=0, time_limit=5.0)
     facts = {"import_time": 4.0, "load_time": 0.5, "joints": 6, "pairs": 7, "home_room": -0.004}
     failed = {**facts, "success": False}
     infeasible = {"status": "infeasible", "planning_time": 3.0, "violations": ["too deep"]}

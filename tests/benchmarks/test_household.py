@@ -10,7 +10,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.experiments import run_experiment
-from helpers.small_problems import make_program
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.comparison import place_objects
@@ -31,13 +30,6 @@ def place_cup(scene: vkc.Scene, placement: pin.SE3) -> Any:
     """Return the shapes of the cup at a placement."""
     placed = scene.with_placement("cup", placement).objects["cup"]
     return list_placed_shapes(make_world_shapes(placed))
-
-
-def test_tasks_can_be_compiled() -> None:
-    scene = vkc.load_scene("household")
-    for task in TASKS.values():
-        assert task.scene == "household"
-        assert make_program(scene, task.steps).segments > 0
 
 
 @pytest.mark.long

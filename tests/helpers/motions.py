@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from helpers.carrying import MotionBuilder, describe_table, make_room
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.collisions import PairTable
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
@@ -77,7 +78,11 @@ def make_random_stick_motion(
 
 
 def make_object_motion(
-    scene: Scene, owner: str, *phases: PhaseSpan, dt: float = 1.0, **values: Sequence[float]
+    scene: Scene,
+    owner: str,
+    *phases: PhaseSpan,
+    dt: float = 1.0,
+    **values: Sequence[float] | Floats,
 ) -> Trajectory:
     """Return a motion of an object's coordinates, with the robot at rest."""
     count, robot = len(next(iter(values.values()))), scene.robot.coordinates.names

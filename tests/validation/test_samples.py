@@ -29,7 +29,7 @@ LENGTHS = {"base_x", "base_y", "drawer.slide", "cabinet.slide", "cabinet.rail"}
 LENGTHS |= {"cabinet.sleeve_slide", "cabinet.face_x", "cabinet.face_y"}
 
 
-def sample_motion(seed: int, *, grasp: str = "grip", number: int = 5) -> Trajectory:
+def sample_motion(seed: int, *, grasp: str = "grip") -> Trajectory:
     """Return a random motion of all objects of the full scene, with a grasp of the cabinet."""
     scene, rng = make_full_scene(), np.random.default_rng(seed)
     attachment = scene.objects["cabinet"].object.attachments[grasp]
@@ -37,12 +37,10 @@ def sample_motion(seed: int, *, grasp: str = "grip", number: int = 5) -> Traject
         *World(scene).coordinates.names,
         *(f"cabinet.{name}" for name in attachment.coordinates),
     )
-    positions = rng.uniform(-1.0, 1.0, (number, len(names))) * rng.choice(
-        [0.0, 0.01, 1.0], len(names)
-    )
-    phases = (PhaseSpan("all", 0, number - 1, (Hold("cabinet", grasp),)),)
+    positions = rng.uniform(-1.0, 1.0, (5, len(names))) * rng.choice([0.0, 0.01, 1.0], len(names))
+    phases = (PhaseSpan("all", 0, 4, (Hold("cabinet", grasp),)),)
     return Trajectory(
-        names, np.cumsum(rng.uniform(0.1, 2.0, number)), positions, phases, len(scene.start)
+        names, np.cumsum(rng.uniform(0.1, 2.0, 5)), positions, phases, len(scene.start)
     )
 
 

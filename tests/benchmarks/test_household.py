@@ -109,3 +109,5 @@ def test_cup_poses_and_starts_depend_on_seed_and_task_alone() -> None:
         selected = [s for s in specs if (s["scene"], s["number"]) == ("cup", number)]
         assert [(s["placed"], s["base"]) for s in selected] == 2 * [(pose, base)]
     assert all("placed" not in s for s in specs if s["scene"] != "cup")
+    (alone,) = COMPARISON.specify(trials=1, seed=3, tasks=["dishwasher"], methods=["VKC"])
+    assert alone in specs

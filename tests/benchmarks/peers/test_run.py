@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 from helpers.experiments import run_experiment
 
 from vkc_pin.benchmarks.harness.record import describe_environment
-from vkc_pin.benchmarks.peers.run import METHODS, format_results
-from vkc_pin.cli import main
+from vkc_pin.benchmarks.peers.run import format_results
 
 
 def test_baseline_and_planner_solve_the_same_reach(tmp_path: Path) -> None:
@@ -23,14 +21,6 @@ def test_baseline_and_planner_solve_the_same_reach(tmp_path: Path) -> None:
     assert trials[0]["start"] == trials[1]["start"]
     assert "| reach | VKC | 1 of 1 | 0 |" in table
     assert len(list((tmp_path / "plans").glob("*.npz"))) == 2
-
-
-def test_help_lists_all_methods(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["bench", "peers", "--help"])
-    assert f"some of {' '.join(METHODS)} (default: all)" in " ".join(
-        capsys.readouterr().out.split()
-    )
 
 
 def test_table_counts_trials_that_timed_out() -> None:

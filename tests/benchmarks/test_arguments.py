@@ -27,6 +27,7 @@ from vkc_pin.benchmarks.robot_object_matrix import run as matrix
 ONE, ONE_START = {"trials": 1, "seed": 0}, {"starts": 1, "seed": 0}
 WRONG: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     (ablation.run, {"problems": [60]}, "0 to 59"),
+    (ablation.run, {"problems": []}, "nothing to run"),
     (ablation.run, {"changes": ["Options.none=1"]}, "none"),
     (ablation.run, {"tasks": ["dor"]}, "did you mean 'door'"),
     (ablation.run, {"tasks": ["door"], "problems": [1]}, "tasks"),

@@ -34,8 +34,17 @@ def test_both_bases_open_the_drawer(tmp_path: Path) -> None:
         )
 
 
-TIMES = dict.fromkeys(("planning_time", "evaluations", "iterations", "duration"), 1.0)
-TIMES |= {"base_path_length": 1.0, "arm_path_length": 1.0}
+TIMES = dict.fromkeys(
+    (
+        "planning_time",
+        "evaluations",
+        "iterations",
+        "duration",
+        "base_path_length",
+        "arm_path_length",
+    ),
+    1.0,
+)
 
 
 def test_failures_are_listed() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.experiments import run_experiment
+from helpers.small_problems import make_program
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.comparison import place_objects
@@ -77,6 +78,11 @@ def test_every_task_is_planned(name: str, method: str) -> None:
     report = vkc.validate(scene, task.steps, plan.trajectory, plan.options)
     assert report.ok == plan.success
     assert report.contradictions(plan.report) == []
+
+
+def test_tasks_can_be_compiled() -> None:
+    for task in TASKS.values():
+        assert make_program(vkc.load_scene(task.scene), task.steps).segments > 0
 
 
 def test_cup_rests_entirely_on_the_coffee_table() -> None:

@@ -20,7 +20,6 @@ from oracle.judge import judge
 from oracle.plan import read_plan
 from oracle.stage import World
 
-FOLDER = Path(__file__).parent
 Content = dict[str, Any]
 
 TASKS = {
@@ -263,6 +262,12 @@ def test_oracle_does_not_import_the_package(plans: dict[str, Path]) -> None:
     code = "import sys; sys.modules['vkc_pin'] = None; sys.path.insert(0, sys.argv[1])\n"
     code += "from oracle.judge import judge; from pathlib import Path\n"
     code += "import json; print(json.dumps([judge(Path(path)).agrees for path in sys.argv[2:]]))"
-    command = [sys.executable, "-c", code, str(FOLDER.parent), *map(str, plans.values())]
+    command = [
+        sys.executable,
+        "-c",
+        code,
+        str(Path(__file__).parents[1]),
+        *map(str, plans.values()),
+    ]
     process = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
     assert json.loads(process.stdout) == [True] * len(plans)

@@ -25,8 +25,16 @@ from vkc_pin.world.trajectory.world_model import World
 GRASPS = sorted(make_full_scene().objects["cabinet"].object.attachments)
 
 
-LENGTHS = {"base_x", "base_y", "drawer.slide", "cabinet.slide", "cabinet.rail"}
-LENGTHS |= {"cabinet.sleeve_slide", "cabinet.face_x", "cabinet.face_y"}
+LENGTHS = {
+    "base_x",
+    "base_y",
+    "drawer.slide",
+    "cabinet.slide",
+    "cabinet.rail",
+    "cabinet.sleeve_slide",
+    "cabinet.face_x",
+    "cabinet.face_y",
+}
 
 
 def sample_motion(seed: int, *, grasp: str = "grip") -> Trajectory:

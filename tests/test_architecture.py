@@ -124,6 +124,12 @@ def test_calls_of_the_operating_system_are_in_one_module() -> None:
     assert found == ["vkc_pin.utils.system"]
 
 
+def test_every_module_lists_its_public_names() -> None:
+    for name, file in find_modules().items():
+        if file.name != "__init__.py" and name not in SCRIPTS:
+            assert re.search(r"^__all__ = ", file.read_text(encoding="utf-8"), re.MULTILINE), name
+
+
 def test_architecture_page_lists_every_package() -> None:
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     table = text.split("## The packages")[1].split("\n## ")[0]

@@ -405,3 +405,13 @@ def test_site_is_complete_and_loads_no_external_files(site: Path) -> None:
         page.read_text(encoding="utf-8") for page in (site / "docs/api").glob("*.html")
     )
     assert [name for name in find_documented() if f'id="vkc_pin.{name}"' not in reference] == []
+
+
+@pytest.mark.parametrize("contents", ["docs/_contents.md", "docs/api/index.md"])
+def test_every_page_is_in_the_contents(contents: str) -> None:
+    path = ROOT / contents
+    entries = [
+        entry.strip() for block in find_blocks(contents, "{toctree}") for entry in block.split()
+    ]
+    listed = {page for entry in entries for page in path.parent.glob(f"{entry}.md")}
+    assert set(path.parent.glob("*.md")) - listed <= {path, path.parent / "index.md"}

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.expected_errors import expect_error
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.isolation import (
@@ -53,7 +54,7 @@ def test_results_and_errors_are_passed_on() -> None:
     )
     with pytest.raises(ValueError, match="invalid literal for int"):
         call_isolated(int, "five")
-    with pytest.raises(InputError, match="PRIVATE_LIMIT: out of range"):
+    with expect_error("PRIVATE_LIMIT: out of range"):
         call_isolated(_fail)
     assert call_isolated(os.getpid) == child
 
@@ -102,13 +103,13 @@ def test_child_process_cannot_fill_the_disk_or_the_current_folder(tmp_path: Path
 
 def test_limits_come_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(MEMORY_VARIABLE, "0.5")
-    with pytest.raises(InputError, match=r"at most 0\.5 GB"):
+    with expect_error(r"at most 0\.5 GB"):
         call_isolated(np.ones, 10**8)
     monkeypatch.setenv(MEMORY_VARIABLE, "2")
     assert call_isolated(np.ones, 10**7).sum() == 10**7
     for wrong in ("much", "0", "-1", "nan", "inf", "1e9"):
         monkeypatch.setenv(TIME_VARIABLE, wrong)
-        with pytest.raises(InputError, match=f"{TIME_VARIABLE}: wrong environment variable"):
+        with expect_error(f"{TIME_VARIABLE}: wrong environment variable"):
             call_isolated(abs, 1)
 
 

@@ -4,6 +4,7 @@ import tracemalloc
 from pathlib import Path
 
 import pytest
+from helpers.expected_errors import expect_error
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.journal import Journal, JournalContents
@@ -37,10 +38,10 @@ def test_journals_are_read_while_they_are_written(tmp_path: Path) -> None:
     assert contents.lines == {str(key): [{"number": key}] for key in (0, 4, 1, 2, 3)}
     assert contents.memory == journal.memory == 104.0
     assert contents.seconds == 2.0 + 1.5  # the time of each session until its last task
-    with pytest.raises(InputError, match="cannot read this"):
+    with expect_error("cannot read this"):
         JournalContents.read(tmp_path / "nothing")
     (tmp_path / "bad").write_bytes(b'{}\n{"key": "1"}\n')
-    with pytest.raises(InputError, match="bad:2: this line is damaged"):
+    with expect_error("bad:2: this line is damaged"):
         JournalContents.read(tmp_path / "bad")
 
 
@@ -56,9 +57,8 @@ def test_journals_are_read_while_they_are_written(tmp_path: Path) -> None:
 )
 def test_foreign_files_are_not_changed(tmp_path: Path, text: str) -> None:
     (tmp_path / "j").write_text(text)
-    with pytest.raises(InputError, match=r"not a journal|damaged|run otherwise") as caught:
+    with expect_error(r"not a journal|damaged|run otherwise", file=tmp_path / "j"):
         open_journal(tmp_path / "j")
-    assert caught.value.file == tmp_path / "j"
     assert (tmp_path / "j").read_text() == text
 
 
@@ -119,11 +119,10 @@ def test_memory_and_processor_time_are_recorded(tmp_path: Path) -> None:
 
 def test_different_header_raises(tmp_path: Path) -> None:
     open_journal(tmp_path / "j")._stream.close()
-    with pytest.raises(
-        InputError, match=r"the episodes in this folder were run otherwise.*recipe abc.*recipe xyz"
-    ) as caught:
+    with expect_error(
+        r"the episodes in this folder were run otherwise.*recipe abc.*recipe xyz", field="recipe"
+    ):
         open_journal(tmp_path / "j", {**HEADER, "settings": {"recipe": "xyz"}})
-    assert caught.value.field == "recipe"
 
 
 def test_header_of_another_benchmark_raises(tmp_path: Path) -> None:
@@ -141,7 +140,7 @@ def test_header_of_another_benchmark_raises(tmp_path: Path) -> None:
 
 def test_two_writers_raise(tmp_path: Path) -> None:
     first = open_journal(tmp_path / "j")
-    with pytest.raises(InputError, match="another run is writing"):
+    with expect_error("another run is writing"):
         open_journal(tmp_path / "j")
     first._stream.close()
     open_journal(tmp_path / "j")

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.expected_errors import expect_error
 from helpers.tasks import crash_once, double, hang, identify_worker
 
-from vkc_pin.errors import InputError
 from vkc_pin.utils.parallel import MAX_CRASHES, CrashedTask, require_dask, run_tasks
 
 
@@ -62,17 +62,15 @@ def test_tasks_are_consumed_on_demand(dask: bool) -> None:
 def test_missing_schedulers_raise(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr("vkc_pin.utils.parallel._CONNECT_TIMEOUT", 1.0)
-    with pytest.raises(InputError, match="no scheduler answers") as caught:
+    with expect_error("no scheduler answers", field="scheduler"):
         list(run_tasks(double, make_tasks(2), scheduler="tcp://127.0.0.1:9"))
-    assert caught.value.field == "scheduler"
 
 
 @pytest.mark.parametrize("address", ["here", "tcp://here", "tcp://:8786", 3])
 def test_invalid_addresses_raise(address: Any) -> None:
     pytest.importorskip("distributed")
-    with pytest.raises(InputError, match="not an address") as caught:
+    with expect_error("not an address", field="scheduler"):
         require_dask(address)
-    assert caught.value.field == "scheduler"
 
 
 def test_schedulers_without_workers_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.expected_errors import expect_error
 
-from vkc_pin.errors import InputError
 from vkc_pin.world.files.urdf import load_urdf, read_urdf
 
 SHAPE = "<collision><geometry><sphere radius='0.1'/></geometry></collision>"
@@ -118,9 +118,8 @@ def test_invalid_trees_raise(
     tmp_path: Path, lines: list[str], line: int | None, message: str
 ) -> None:
     file = write_urdf(tmp_path, *lines)
-    with pytest.raises(InputError, match=message) as caught:
+    with expect_error(message, file=file, line=line):
         read_urdf(file)
-    assert (caught.value.file, caught.value.line) == (file, line)
 
 
 @pytest.mark.parametrize("text", ["1, 2, 3", "1,2,3", " 1 ,2 , 3 ", "1.0, 2.0, 3.0,", "1,\n2,\n3"])

@@ -8,8 +8,9 @@ import coal
 import numpy as np
 import pytest
 import trimesh
+from helpers.expected_errors import expect_error
 
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import UnknownNameError
 from vkc_pin.world.files.meshes import (
     load_convex,
     load_mesh,
@@ -112,7 +113,7 @@ def test_obj_dialects_give_the_same_mesh(tmp_path: Path, text: str, encoding: st
 def test_faces_with_invalid_vertex_indices_are_rejected(tmp_path: Path, index: str) -> None:
     file = tmp_path / "cube.obj"
     file.write_text(f"{VERTICES[0]}f 1 2 {index}\n")
-    with pytest.raises(InputError, match=r"cube\.obj:9: f: no such vertex.*1 to 8.*got " + index):
+    with expect_error(r"cube\.obj:9: f: no such vertex.*1 to 8.*got " + index):
         load_mesh(file)
 
 
@@ -170,14 +171,14 @@ def test_the_unit_of_collada_files_is_applied(tmp_path: Path, unit: str, metres:
 @pytest.mark.parametrize("unit", ["1e-300", "1e-9", "1e-7"])
 def test_tiny_meshes_are_rejected(tmp_path: Path, unit: str) -> None:
     file = write_collada(tmp_path / "block.dae", f'<unit meter="{unit}"/>')
-    with pytest.raises(InputError, match=r"block\.dae: tip: .*too small: is its unit or scale"):
+    with expect_error(r"block\.dae: tip: .*too small: is its unit or scale"):
         load_convex(file, about="tip")
 
 
 @pytest.mark.parametrize("unit", ["0", "-1", "inch", "nan", "1e400", "0,01"])
 def test_invalid_collada_units_are_rejected(tmp_path: Path, unit: str) -> None:
     file = write_collada(tmp_path / "block.dae", f'<unit meter="{unit}"/>')
-    with pytest.raises(InputError, match=rf"block\.dae: <unit> meter: .*got {unit}"):
+    with expect_error(rf"block\.dae: <unit> meter: .*got {unit}"):
         load_mesh(file)
 
 
@@ -267,7 +268,7 @@ def test_hulls_of_thin_meshes_need_no_optional_dependency(
 
 @pytest.mark.parametrize("scale", [(1.0, 0.0, 1.0), (1.0, 2.0), (np.nan, 1.0, 1.0)])
 def test_invalid_scales_raise(tmp_path: Path, scale: tuple[float, ...]) -> None:
-    with pytest.raises(InputError, match="scale"):
+    with expect_error("scale"):
         load_mesh(write_two_cubes(tmp_path / "two.obj"), scale)
 
 
@@ -286,9 +287,8 @@ def test_invalid_meshes_raise(tmp_path: Path, name: str, text: str | None, probl
     file = tmp_path / name
     if text is not None:
         file.write_text(text)
-    with pytest.raises(InputError, match=problem) as caught:
+    with expect_error(problem, file=file):
         load_convex(file)
-    assert caught.value.file == file
 
 
 @pytest.mark.parametrize(

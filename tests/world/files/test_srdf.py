@@ -6,8 +6,9 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
+from helpers.expected_errors import expect_error
 
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import UnknownNameError
 from vkc_pin.world.files.srdf import Srdf, SrdfGroup, find_group_tip, read_groups, read_srdf
 
 LINKS = ("base", "arm", "hand")
@@ -64,14 +65,12 @@ def test_home_states_are_preferred(tmp_path: Path, names: list[str], chosen: str
 
 def test_unknown_links_raise(tmp_path: Path) -> None:
     pairs = [f'<disable_collisions link1="base" link2="{name}"/>' for name in ("arm", "hnad")]
-    with pytest.raises(UnknownNameError) as caught:
+    with expect_error(line=3, nearest="hand", file=tmp_path / "r.srdf"):
         read_text(tmp_path, "\n".join(pairs))
-    assert (caught.value.line, caught.value.nearest) == (3, "hand")
-    assert caught.value.file == tmp_path / "r.srdf"
 
 
 def test_missing_files_raise(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot read the SRDF"):
+    with expect_error("cannot read the SRDF"):
         read_srdf(tmp_path / "none.srdf", links=LINKS)
 
 
@@ -93,8 +92,7 @@ def test_groups_are_joints_or_chains(tmp_path: Path) -> None:
         "shoulder": SrdfGroup(("a", "b"), "two"),
     }
     assert find_group_tip(file, urdf, "arm") == "three"
-    with pytest.raises(UnknownNameError, match=r"arm: .*There are: arm, shoulder") as caught:
+    with expect_error(r"arm: .*There are: arm, shoulder", nearest="shoulder", file=file):
         find_group_tip(file, urdf, "shouldr")
-    assert (caught.value.nearest, caught.value.file) == ("shoulder", file)
     with pytest.raises(UnknownNameError, match="there are: none"):
         find_group_tip(None, urdf, "arm")

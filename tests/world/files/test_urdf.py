@@ -9,8 +9,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import trimesh
+from helpers.expected_errors import expect_error
 
-from vkc_pin.errors import InputError
 from vkc_pin.world.files.urdf import load_urdf, read_urdf
 
 WEDGE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
@@ -31,9 +31,7 @@ def test_too_many_shapes_raise(tmp_path: Path, kind: str) -> None:
     """Pinocchio needs minutes for thousands of shapes."""
     shape = format_collision('<sphere radius="0.2"/>')
     many = shape.replace("collision", kind) * 7000
-    with pytest.raises(
-        InputError, match=f"too many <{kind}> elements.*expected at most 1000.*got 7000"
-    ):
+    with expect_error(f"too many <{kind}> elements.*expected at most 1000.*got 7000"):
         load_urdf(write_urdf(tmp_path, shape + many if kind == "visual" else many))
     enough = shape.replace("collision", kind) * 1000
     _, collision, visual = load_urdf(
@@ -137,14 +135,13 @@ def test_mesh_addresses_are_resolved(tmp_path: Path, monkeypatch: pytest.MonkeyP
     monkeypatch.setenv("GZ_SIM_RESOURCE_PATH", f"/nowhere:{tmp_path}/robots/gazebo")
     for name in ("bin", "tap"):
         assert robot.resolve(f"model://{name}/d.stl").parent.name == name
-    with pytest.raises(InputError, match=r"not supported.*got https"):
+    with expect_error(r"not supported.*got https"):
         robot.resolve("https://fuel.gazebosim.org/1.0/a.stl")
-    with pytest.raises(InputError, match=r"such as c\.stl"):
+    with expect_error(r"such as c\.stl"):
         robot.resolve("c.std")
     for address in ("package://other/b.stl", "package://nowhere/a.stl", "a.stl"):
-        with pytest.raises(InputError, match="no such mesh") as caught:
+        with expect_error("no such mesh", file=path, field=address):
             robot.resolve(address)
-        assert (caught.value.file, caught.value.field) == (path, address)
 
 
 def test_trees_equal_those_of_pinocchio(tmp_path: Path) -> None:

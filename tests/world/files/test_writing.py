@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from helpers.expected_errors import expect_error
 
 from vkc_pin.errors import InputError
 from vkc_pin.world.files.writing import (
@@ -85,9 +86,8 @@ def test_other_kinds_of_files_raise(tmp_path: Path, make: Callable[[Path], str])
     reason = make(path)
     before = list_paths(tmp_path)
     for write in (check_writable, lambda path: write_atomically(path, b"data")):
-        with pytest.raises(InputError, match=f"a regular file or a new one.*{reason}") as caught:
+        with expect_error(f"a regular file or a new one.*{reason}", file=str(path)):
             write(path)
-        assert caught.value.file == str(path)
     assert list_paths(tmp_path) == before
 
 
@@ -107,7 +107,7 @@ def test_invalid_paths_raise(
     (tmp_path / "file").write_text("")
     monkeypatch.chdir(tmp_path)
     for write in (check_writable, lambda path: write_atomically(path, b"data")):
-        with pytest.raises(InputError, match=reason):
+        with expect_error(reason):
             write(path)
     assert list_paths(tmp_path) <= {"file", "new"}
 
@@ -117,11 +117,11 @@ def test_conflicting_outputs_raise(tmp_path: Path) -> None:
     one, other = tmp_path / "one", tmp_path / "other"
     check_outputs({"--a": one, "--b": other, "--c": tmp_path / "new" / "file"})
     for again in (one, tmp_path / "new" / ".." / "one", tmp_path / "link"):
-        with pytest.raises(InputError, match=r"--b: this file is named twice .*than --a"):
+        with expect_error(r"--b: this file is named twice .*than --a"):
             check_outputs({"--a": one, "--b": again})
-    with pytest.raises(InputError, match=r"--a: this file is named twice .*than PLAN"):
+    with expect_error(r"--a: this file is named twice .*than PLAN"):
         check_outputs({"--a": one}, inputs={"PLAN": one})
-    with pytest.raises(InputError, match=r"--b: a file cannot be a folder .*file of --a"):
+    with expect_error(r"--b: a file cannot be a folder .*file of --a"):
         check_outputs({"--a": one, "--b": one / "two" / "three"})
     assert list_paths(tmp_path) == {"link"}
 
@@ -134,9 +134,8 @@ def test_failed_writes_change_nothing(tmp_path: Path, monkeypatch: pytest.Monkey
         raise OSError(errno.ENOSPC, "no space left")
 
     monkeypatch.setattr(Path, "replace", raise_disk_full)
-    with pytest.raises(InputError, match="no space") as caught:
+    with expect_error("no space", file=str(path)):
         write_atomically(path, b"after")
-    assert caught.value.file == str(path)
     assert path.read_bytes() == b"before"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -171,14 +170,14 @@ def test_folders_are_written_completely_or_not_at_all(tmp_path: Path) -> None:
     assert list_paths(target) == {".vkc-pin.json", "a"}
     with pytest.raises(FileNotFoundError), write_folder_atomically(target, force=True) as staging:
         (staging / "none" / "b").write_text("2", encoding="utf-8")
-    with pytest.raises(InputError, match="already exists"), write_folder_atomically(target):
+    with expect_error("already exists"), write_folder_atomically(target):
         pass
     assert list_paths(target) == {".vkc-pin.json", "a"}
     write_folder(target)
     assert list_paths(target.parent) == {
         f"folder{name}" for name in ("", "/.vkc-pin.json", "/deep", "/deep/a")
     }
-    with pytest.raises(InputError, match="no folder"):
+    with expect_error("no folder"):
         write_folder(target / "deep" / "a")
 
 
@@ -197,9 +196,8 @@ def test_folders_with_foreign_files_are_not_replaced(tmp_path: Path, has_manifes
     (target / other).write_text("mine")
     before = list_paths(tmp_path)
     for check in (check_replaceable, write_folder):
-        with pytest.raises(InputError, match="files that vkc-pin did not write") as caught:
+        with expect_error("files that vkc-pin did not write", file=target, got=other):
             check(target)
-        assert (caught.value.file, caught.value.got) == (target, other)
     assert list_paths(tmp_path) == before
 
 
@@ -207,7 +205,7 @@ def test_files_created_during_writing_are_preserved(tmp_path: Path) -> None:
     target = tmp_path / "folder"
     write_folder(target)
     with (
-        pytest.raises(InputError, match="would delete"),
+        expect_error("would delete"),
         write_folder_atomically(target, force=True),
     ):
         (target / "notes.txt").write_text("mine")
@@ -222,7 +220,7 @@ def test_links_in_replaced_folders_are_not_followed(tmp_path: Path) -> None:
     write_folder(target)
     shutil.rmtree(target / "deep")
     (target / "deep").symlink_to(outside)
-    with pytest.raises(InputError, match="got deep"):
+    with expect_error("got deep"):
         write_folder(target)
     assert (outside / "a").read_text() == "mine"
 
@@ -232,7 +230,7 @@ def test_damaged_manifests_list_no_files(tmp_path: Path, text: str) -> None:
     for name in ("a", "b", "c", "d", "e"):
         (tmp_path / name).touch()
     (tmp_path / ".vkc-pin.json").write_text(text)
-    with pytest.raises(InputError, match="got a, b, c and 2 more"):
+    with expect_error("got a, b, c and 2 more"):
         check_replaceable(tmp_path)
 
 
@@ -248,7 +246,7 @@ def test_folders_survive_a_failed_rename(tmp_path: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(Path, "rename", fail_to_rename)
     with (
-        pytest.raises(InputError, match="input/output error"),
+        expect_error("input/output error"),
         write_folder_atomically(target, force=True) as staging,
     ):
         (staging / "new").touch()
@@ -280,7 +278,7 @@ def test_links_out_of_a_folder_raise(tmp_path: Path, target: str) -> None:
     with pytest.raises(InputError, match="leads out of the folder") as caught:
         check_links(tmp_path / "folder")
     assert str(caught.value.file) == str(link)
-    with pytest.raises(InputError, match="leads out of the folder"):
+    with expect_error("leads out of the folder"):
         check_inside(link, tmp_path / "folder")
 
 
@@ -292,5 +290,5 @@ def test_links_inside_a_folder_are_accepted(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to("folder")
     check_links(tmp_path / "link")
     check_inside(tmp_path / "link" / "new", folder)
-    with pytest.raises(InputError, match="cannot write this"):
+    with expect_error("cannot write this"):
         check_links(tmp_path / "none")

@@ -7,10 +7,10 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
+from helpers.expected_errors import expect_error
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vkc_pin.errors import InputError
 from vkc_pin.world.files.xml import check_collada, find_line, parse_xml, quote, replace_forbidden
 
 FILE = Path("thing.urdf")
@@ -49,17 +49,15 @@ def test_elements_match_the_standard_library_and_have_line_numbers(tree: object)
     [("<robot>\n<a>\n</robot>", 3), ("", 1), ("<robot/>\n<robot/>", 2), ("<robot", 1)],
 )
 def test_invalid_xml_raises(text: str, line: int) -> None:
-    with pytest.raises(InputError, match="not valid XML") as caught:
+    with expect_error("not valid XML", file=FILE, line=line):
         parse_xml(text, FILE)
-    assert (caught.value.file, caught.value.line) == (FILE, line)
 
 
 def test_entities_are_rejected() -> None:
     """A few lines of entities expand exponentially."""
     many = "".join(f'<!ENTITY e{k} "{f"&e{k - 1};" * 10 if k else "lol"}">' for k in range(12))
-    with pytest.raises(InputError, match="e0: entities are not supported") as caught:
+    with expect_error("e0: entities are not supported", line=2):
         parse_xml(f'<?xml version="1.0"?>\n<!DOCTYPE r [{many}]><robot name="&e11;"/>', FILE)
-    assert caught.value.line == 2
 
 
 @pytest.mark.parametrize("indices", ["0 ~ 1", "0 1.5 2", "0 1 2x", "<![CDATA[0 ~ 1]]>"])
@@ -67,7 +65,7 @@ def test_entities_are_rejected() -> None:
 def test_invalid_indices_raise(tmp_path: Path, indices: str, tag: str) -> None:
     file = tmp_path / "mesh.dae"
     file.write_text(f"<a xmlns:c='c'>\n<{tag}>{indices}</{tag}></a>", encoding="utf-8")
-    with pytest.raises(InputError, match=r"mesh.dae:2: <.*>: not indices"):
+    with expect_error(r"mesh.dae:2: <.*>: not indices"):
         check_collada(file)
 
 
@@ -76,9 +74,9 @@ def test_valid_indices_are_accepted(tmp_path: Path) -> None:
     file.write_text("<a><p>0 1 -1\n2 &#51;<!-- x --></p><n>x</n><p/></a>", encoding="utf-16")
     check_collada(file)
     file.write_text("<a><p>0", encoding="utf-8")
-    with pytest.raises(InputError, match="not valid XML"):
+    with expect_error("not valid XML"):
         check_collada(file)
-    with pytest.raises(InputError, match="cannot read"):
+    with expect_error("cannot read"):
         check_collada(tmp_path)
 
 
@@ -100,5 +98,5 @@ def test_deeply_nested_elements_are_rejected(depth: int) -> None:
         copied = copy.deepcopy(parse_xml(text, FILE))
         assert ElementTree.tostring(copied) == ElementTree.tostring(parse_xml(text, FILE))
         return
-    with pytest.raises(InputError, match=r"thing\.urdf:1: a: too many elements inside each other"):
+    with expect_error(r"thing\.urdf:1: a: too many elements inside each other"):
         parse_xml(text, FILE)

@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import yaml
+from helpers.expected_errors import expect_error
 from helpers.objects import URDF, load_object_text
 from hypothesis import given
 from hypothesis import strategies as st
@@ -85,9 +86,8 @@ def test_friction_and_damping_dissipate_and_springs_store_energy(
     ],
 )
 def test_invalid_values_raise_with_their_line(fields: str, field: str, problem: str) -> None:
-    with pytest.raises(InputError, match=problem) as caught:
+    with expect_error(problem, field=field, line=4):
         load_object_text(URDF, f"urdf: thing.urdf\njoints:\n  hinge:\n    {fields}\n{TAIL}")
-    assert (caught.value.field, caught.value.line) == (field, 4)
 
 
 @pytest.mark.parametrize(
@@ -147,18 +147,16 @@ def test_mass_is_zero_by_default_and_may_be_zero() -> None:
 
 @pytest.mark.parametrize("value", ["-1.0", "heavy", ".inf"])
 def test_invalid_masses_raise(value: str) -> None:
-    with pytest.raises(InputError) as caught:
+    with expect_error(field="mass", line=3):
         load_block("", f"mass: {value}")
-    assert (caught.value.field, caught.value.line) == ("mass", 3)
 
 
 def test_fixed_objects_cannot_have_a_mass() -> None:
-    with pytest.raises(InputError, match="applies to free objects only") as caught:
+    with expect_error("applies to free objects only", field="mass", line=2):
         load_object_text(
             '<robot name="t"><link name="a"/></robot>',
             "urdf: thing.urdf\nmass: 3\nattachments: []\n",
         )
-    assert (caught.value.field, caught.value.line) == ("mass", 2)
 
 
 @pytest.fixture(scope="module")
@@ -233,6 +231,5 @@ def test_robot_yaml_overrides_the_urdf(tmp_path: Path, effort: float, limit: flo
 
 @pytest.mark.parametrize("effort", [-1.0, "strong", float("nan")])
 def test_invalid_effort_limits_raise(tmp_path: Path, effort: object) -> None:
-    with pytest.raises(InputError) as caught:
+    with expect_error(field="joints.elbow_joint.effort"):
         vkc.load_robot(write_robot(tmp_path, effort))
-    assert caught.value.field == "joints.elbow_joint.effort"

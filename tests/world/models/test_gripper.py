@@ -8,6 +8,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.expected_errors import expect_error
 from helpers.grippers import MAX_OPENING, write_gripper
 from helpers.robots import compute_placement, get_home_configuration
 from hypothesis import given, settings
@@ -113,14 +114,14 @@ def test_openings_are_clamped_to_the_range(robot: Robot) -> None:
     assert robot.opening(None) is None
     assert robot.opening(0.05) == 0.05
     assert robot.opening(0.3) == gripper.max_opening
-    with pytest.raises(vkc.InputError, match=r"out of the gripper.s range.*0 to 0\.0799"):
+    with expect_error(r"out of the gripper.s range.*0 to 0\.0799"):
         robot.opened(0.3)
 
 
 def test_robots_without_gripper_have_no_opening() -> None:
     robot = vkc.load_robot("husky_ur5e")
     assert robot.opening(0.05) is None
-    with pytest.raises(vkc.InputError, match="no gripper that opens"):
+    with expect_error("no gripper that opens"):
         robot.opened(0.05)
 
 
@@ -166,6 +167,5 @@ def test_invalid_grippers_raise_with_file_and_line(
     tmp_path: Path, gripper: str, problem: str
 ) -> None:
     file = write_gripper(tmp_path, gripper=f"gripper: {{{gripper}}}\n")
-    with pytest.raises(vkc.InputError, match=problem) as caught:
+    with expect_error(problem, file=file, line=6):
         vkc.load_robot(file)
-    assert (caught.value.file, caught.value.line) == (file, 6)

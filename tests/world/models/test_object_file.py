@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.expected_errors import expect_error
 from helpers.objects import SHAPES, URDF, load_object_text
 
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.errors import InputError
 from vkc_pin.world.models.articulated_object import DEFAULT_ACCELERATION, DEFAULT_VELOCITY
 from vkc_pin.world.models.object_file import load_object
 
@@ -31,9 +32,9 @@ latches:
 def test_attachments_may_be_empty_but_not_missing() -> None:
     item = load_object_text(URDF, "urdf: thing.urdf\nattachments: []")
     assert dict(item.attachments) == {}
-    with pytest.raises(InputError, match="no attachment"):
+    with expect_error("no attachment"):
         item.attachment()
-    with pytest.raises(InputError, match="attachments"):
+    with expect_error("attachments"):
         load_object_text(URDF, "urdf: thing.urdf")
 
 
@@ -56,12 +57,11 @@ def test_grasps_of_free_objects_are_firm_by_default(free: int, stated: str, firm
 
 
 def test_free_objects_cannot_be_pushed() -> None:
-    with pytest.raises(InputError, match="cannot be pushed") as caught:
+    with expect_error("cannot be pushed", line=3, field="attachments[0].contact"):
         load_object_text(
             URDF,
             "urdf: thing.urdf\nfree: true\nattachments: [{name: grip, link: panel, contact: push}]",
         )
-    assert (caught.value.line, caught.value.field) == (3, "attachments[0].contact")
 
 
 def test_duplicate_coordinate_names_raise() -> None:
@@ -70,9 +70,8 @@ def test_duplicate_coordinate_names_raise() -> None:
         "name: grip, link: panel, joint: cylindrical, axis: [1, 0, 0], limits: [0, 1], turn: [0, 1]"
     )
     both = f"{{{grip}}}, {{{slide}}}"
-    with pytest.raises(InputError, match="grip_slide") as caught:
+    with expect_error("grip_slide", field="attachments[1].name"):
         load_object_text(URDF, f"urdf: thing.urdf\nattachments: [{both}]")
-    assert caught.value.field == "attachments[1].name"
 
 
 @pytest.mark.parametrize(
@@ -89,9 +88,8 @@ def test_duplicate_coordinate_names_raise() -> None:
 def test_unknown_names_raise_with_a_suggestion(
     old: str, new: str, line: int, field: str, nearest: str
 ) -> None:
-    with pytest.raises(UnknownNameError) as caught:
+    with expect_error(line=line, field=field, nearest=nearest):
         load_object_text(URDF, DESCRIPTION.replace(old, new))
-    assert (caught.value.line, caught.value.field, caught.value.nearest) == (line, field, nearest)
 
 
 @pytest.mark.parametrize(
@@ -124,9 +122,8 @@ def test_unknown_names_raise_with_a_suggestion(
     ],
 )
 def test_invalid_attachments_raise_with_their_line(entry: str, line: int, field: str) -> None:
-    with pytest.raises(InputError) as caught:
+    with expect_error(line=line, field=field):
         load_object_text(URDF, DESCRIPTION.replace("link: panel", f"link: panel\n    {entry}"))
-    assert (caught.value.line, caught.value.field) == (line, field), str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -193,16 +190,13 @@ def test_invalid_shapes_raise(kind: str, shape: str, problem: str) -> None:
 
 
 def test_unknown_objects_raise(tmp_path: Path) -> None:
-    with pytest.raises(UnknownNameError) as caught:
+    with expect_error(nearest="door"):
         load_object("dor")
-    assert caught.value.nearest == "door"
-    with pytest.raises(InputError) as missing:
+    with expect_error(file=tmp_path / "none.yaml"):
         load_object(tmp_path / "none.yaml")
-    assert missing.value.file == tmp_path / "none.yaml"
     (tmp_path / "thing.yaml").write_text("urdf: none.urdf\nattachments: [{name: a, link: b}]")
-    with pytest.raises(InputError) as missing_urdf:
+    with expect_error(file=tmp_path / "none.urdf"):
         load_object(tmp_path / "thing.yaml")
-    assert missing_urdf.value.file == tmp_path / "none.urdf"
 
 
 def test_descriptions_can_be_mappings(tmp_path: Path) -> None:
@@ -215,7 +209,7 @@ def test_descriptions_can_be_mappings(tmp_path: Path) -> None:
     item = load_object(description, folder=tmp_path)
     assert (item.name, item.urdf, item.free) == ("wedge", None, True)
     assert item.collision.geometryObjects[0].geometry.num_points == 4
-    with pytest.raises(InputError, match=r"wedge\.obj"):
+    with expect_error(r"wedge\.obj"):
         load_object(description, folder=tmp_path / "elsewhere")
     file = tmp_path / "wedge.urdf"
     file.write_text(urdf)

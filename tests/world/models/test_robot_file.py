@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.arm_urdf import write_arms
+from helpers.expected_errors import expect_error
 from helpers.robots import compute_placement, write_small_urdf
 
 from vkc_pin.errors import InputError, UnknownNameError
@@ -53,7 +54,7 @@ def test_base_types() -> None:
     fixed = load_robot("husky_ur5e", base="fixed")
     np.testing.assert_array_equal(fixed.lower[:3], fixed.upper[:3])
     assert load_robot("husky_ur5e", base="differential").base == "differential"
-    with pytest.raises(InputError, match="base"):
+    with expect_error("base"):
         load_robot("husky_ur5e", base="wheels")  # type: ignore[arg-type]
 
 
@@ -68,9 +69,8 @@ def test_wheels_and_turning_radius(tmp_path: Path) -> None:
         ({"base": "ackermann", "turning_radius": -1.0}, "> 0"),
         ({"base": "differential", "turning_radius": 1.0}, "or base='ackermann'"),
     ):
-        with pytest.raises(InputError, match=expected) as caught:
+        with expect_error(expected, field="turning_radius"):
             load_robot(file, **arguments)  # type: ignore[arg-type]
-        assert caught.value.field == "turning_radius"
     (tmp_path / "robot.yaml").write_text("urdf: small.urdf\nbase: {turning_radius: 1.2}\n")
     assert load_robot(file, base="ackermann").turning_radius == 1.2
     assert load_robot(file, base="ackermann", turning_radius=0.7).turning_radius == 0.7
@@ -90,9 +90,8 @@ def test_locked_joints_and_tool_frame() -> None:
     found = compute_placement(robot, "tool", np.concatenate([np.zeros(3), arm[[0, 1, 3, 4]]]))
     expected = compute_placement(whole, "tool", np.concatenate([np.zeros(3), arm]))
     assert found.isApprox(expected, 1e-12)
-    with pytest.raises(UnknownNameError) as caught:
+    with expect_error(nearest="elbow_joint"):
         load_robot("husky_ur5e", locked_joints={"elbow": 0.0})
-    assert caught.value.nearest == "elbow_joint"
 
 
 @pytest.mark.parametrize(
@@ -163,10 +162,9 @@ def test_unknown_names_raise() -> None:
         (lambda: load_robot("pandas"), "panda"),
         (lambda: load_robot("husky_ur5e", tool_frame="tol"), "tool"),
     ):
-        with pytest.raises(UnknownNameError) as caught:
+        with expect_error(nearest=nearest):
             call()
-        assert caught.value.nearest == nearest
-    with pytest.raises(InputError, match="this robot file does not exist"):
+    with expect_error("this robot file does not exist"):
         load_robot("nowhere/robot.urdf")
 
 
@@ -178,7 +176,7 @@ def test_invalid_files_raise(tmp_path: Path) -> None:
         (re.sub("<box.*?/>", '<mesh filename="package://no/m.stl"/>', text), "package://no/m.stl"),
     ):
         file.write_text(new)
-        with pytest.raises(InputError, match=problem):
+        with expect_error(problem):
             load_robot(file)
 
 
@@ -187,7 +185,7 @@ def test_srdf_that_allows_all_pairs_raises(tmp_path: Path) -> None:
         f'<disable_collisions link1="l{i}" link2="l{j}"/>' for i in range(4) for j in range(i)
     )
     (tmp_path / "small.srdf").write_text(f"<robot>{pairs}</robot>")
-    with pytest.raises(InputError, match="no pair of links"):
+    with expect_error("no pair of links"):
         load_robot(write_small_urdf(tmp_path))
 
 
@@ -197,13 +195,11 @@ def test_positions_outside_limits_raise(tmp_path: Path, field: str, joint: str) 
     urdf, file = write_small_urdf(tmp_path), tmp_path / "robot.yaml"
     file.write_text(f"urdf: small.urdf\ntool_frame: l2\n{field}: {{{joint}: 2.5}}\n")
     problem = r"outside the joint.s limits .expected between -2 and 2, got 2.5"
-    with pytest.raises(InputError, match=problem) as caught:
+    with expect_error(problem, field=f"{field}.{joint}", line=3):
         load_robot(file)
-    assert (caught.value.field, caught.value.line) == (f"{field}.{joint}", 3)
     file.unlink()
-    with pytest.raises(InputError, match=problem) as caught:
+    with expect_error(problem, file=urdf, line=None):
         load_robot(urdf, **{field: {joint: 2.5}})  # type: ignore[arg-type]
-    assert (caught.value.file, caught.value.line) == (urdf, None)
     load_robot(urdf, **{field: {joint: 2.0 + 1e-7}})  # type: ignore[arg-type]
 
 
@@ -263,7 +259,7 @@ def test_height_of_the_root_link(tmp_path: Path) -> None:
             assert compute_placement(robot, frame, z).isApprox(expected, 1e-12)
         shape, other = (one.collision.geometryObjects[0] for one in (robot, low))
         assert shape.placement.isApprox(raised * other.placement, 1e-12)
-    with pytest.raises(InputError, match="height"):
+    with expect_error("height"):
         load_robot(file, height=float("nan"))
 
 
@@ -279,10 +275,10 @@ def test_groups_of_the_srdf_select_the_tool_frame(tmp_path: Path) -> None:
         assert (robot.tool_frame, len(robot.home)) == (tool, int(tool[1]))
     with pytest.raises(UnknownNameError, match=r"arm: .*'short'.* There are: short, whole"):
         load_robot(tmp_path, arm="shrt")
-    with pytest.raises(InputError, match="exclude each other"):
+    with expect_error("exclude each other"):
         load_robot(tmp_path, arm="short", tool_frame="l2")
     (tmp_path / "robot.yaml").write_text("urdf: small.urdf\ntool_frame: l3\narm: short\n")
-    with pytest.raises(InputError, match=r"robot\.yaml:3: arm: .*exclude each other"):
+    with expect_error(r"robot\.yaml:3: arm: .*exclude each other"):
         load_robot(tmp_path)
 
 
@@ -295,5 +291,5 @@ def test_folders_do_not_shadow_robot_names(tmp_path: Path, monkeypatch: pytest.M
         assert find_robot(path).resolve() == folder / "robot.yaml"
         assert load_robot(path).urdf.resolve() == folder / "robot.urdf"
     assert find_robot("husky_ur5e").parent != folder
-    with pytest.raises(InputError, match="this robot file does not exist"):
+    with expect_error("this robot file does not exist"):
         find_robot("./husky")

@@ -9,10 +9,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import trimesh
+from helpers.expected_errors import expect_error
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.errors import InputError
 from vkc_pin.world.files.meshes import MeshPart, make_bvh
 from vkc_pin.world.models.shapes import (
     LIMIT_SLACK,
@@ -83,7 +83,7 @@ def test_meshes_keep_their_triangles() -> None:
 
 
 def test_unbounded_shapes_raise() -> None:
-    with pytest.raises(InputError, match="cannot be drawn"):
+    with expect_error("cannot be drawn"):
         triangulate(coal.Halfspace(0.0, 0.0, 1.0, 0.0))
 
 
@@ -110,9 +110,8 @@ def test_rounding_errors_are_clamped(value: float, expected: float) -> None:
 
 @pytest.mark.parametrize("value", [1.0 + 2 * LIMIT_SLACK, -1.0, np.nan, np.inf])
 def test_values_outside_limits_raise(value: float) -> None:
-    with pytest.raises(InputError) as caught:
+    with expect_error(field="joint"):
         clamp_to_limits(value, 0.0, 1.0, "joint")
-    assert caught.value.field == "joint"
 
 
 def test_copies_are_fixed_in_the_world() -> None:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.expected_errors import expect_error
 from helpers.rooms import TINY, load_scene_text
 
-from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.scene.scene import Scene, load_scene
 
@@ -19,23 +19,20 @@ def door() -> Scene:
 
 
 def test_with_methods_reject_invalid_values(door: Scene) -> None:
-    with pytest.raises(InputError, match="base: wrong number of values"):
+    with expect_error("base: wrong number of values"):
         door.with_start(base=[0.0, 1.0])
-    with pytest.raises(InputError, match="arm: wrong number of values"):
+    with expect_error("arm: wrong number of values"):
         door.with_start(arm=[0.0])
-    with pytest.raises(InputError, match=r"base\.base_x: not a finite number"):
+    with expect_error(r"base\.base_x: not a finite number"):
         door.with_start(base=[np.nan, 0.0, 0.0])
-    with pytest.raises(InputError, match="outside the joint's limits"):
+    with expect_error("outside the joint's limits"):
         door.with_start(arm=[100.0, *door.robot.home[1:]])
-    with pytest.raises(UnknownNameError) as caught:
+    with expect_error(nearest="door"):
         door.with_state("dor", {"hinge": 0.0})
-    assert caught.value.nearest == "door"
-    with pytest.raises(UnknownNameError) as caught:
+    with expect_error(nearest="hinge"):
         door.with_state("door", {"hing": 0.0})
-    assert caught.value.nearest == "hinge"
-    with pytest.raises(
-        InputError,
-        match=r"door\.hinge: outside the joint's limits \(expected -1\.57 to 1\.57, got 2\)",
+    with expect_error(
+        r"door\.hinge: outside the joint's limits \(expected -1\.57 to 1\.57, got 2\)"
     ):
         door.with_state("door", {"hinge": 2.0})
 
@@ -69,7 +66,7 @@ def test_sampling_needs_a_free_start_region(tmp_path: Path) -> None:
     none = load_scene_text(
         tmp_path, TINY.replace("start_region: {x: [-1, 1], y: [-1, 1], yaw: any}\n", "")
     )
-    with pytest.raises(InputError, match="no start region"):
+    with expect_error("no start region"):
         none.sample_start(rng)
     text = TINY.replace("x: [-1, 1], y: [-1, 1]", "x: [2, 2.1], y: [2, 2.1]")
     full = load_scene_text(
@@ -77,7 +74,7 @@ def test_sampling_needs_a_free_start_region(tmp_path: Path) -> None:
         text[: text.index("objects:")]
         + text[text.index("obstacles:") : text.index("  - name: post")],
     )
-    with pytest.raises(InputError, match="no collision-free start"):
+    with expect_error("no collision-free start"):
         full.sample_start(rng)
 
 
@@ -89,7 +86,7 @@ def test_start_is_sampled_with_free_held_objects_only(tmp_path: Path) -> None:
         if is_valid:
             assert scene.sample_start(np.random.default_rng(0)).held == {"pole": "end"}
         else:
-            with pytest.raises(InputError, match=r"start\.held\.front"):
+            with expect_error(r"start\.held\.front"):
                 scene.sample_start(np.random.default_rng(0))
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.expected_errors import expect_error
 from helpers.rooms import TINY, load_scene_text
 
 from vkc_pin.errors import InputError, UnknownNameError
@@ -77,13 +78,12 @@ def test_orientations_may_be_quaternions(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_orientations_are_located(tmp_path: Path, orientation: str, message: str) -> None:
-    with pytest.raises(InputError, match=message) as caught:
+    with expect_error(message, line=len(TINY.splitlines()) + 1):
         load_scene_text(
             tmp_path,
             TINY
             + f"  - {{name: b, type: box, size: [1, 2, 3], position: [0, 3, 2], {orientation}}}\n",
         )
-    assert caught.value.line == len(TINY.splitlines()) + 1
 
 
 def test_floor_is_optional(tmp_path: Path) -> None:
@@ -171,31 +171,24 @@ def test_invalid_input_is_located(
 
 
 def test_the_first_error_in_the_file_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(InputError) as caught:
+    with expect_error(line=4):
         load_scene_text(
             tmp_path,
             TINY.replace("radius: 0.1", "radius: -1")
             .replace("arm: home", "arm: 3")
             .replace("size: [0.5", "size: [0"),
         )
-    assert caught.value.line == 4
 
 
 def test_errors_in_named_files_are_located_there(tmp_path: Path) -> None:
     (tmp_path / "bad.yaml").write_text("urdf: none.urdf\nattachment: []\n")
-    with pytest.raises(UnknownNameError) as caught:
+    with expect_error(file=tmp_path / "bad.yaml", line=2, nearest="attachments"):
         load_scene_text(tmp_path, TINY.replace("type: door", "type: bad.yaml"))
-    assert (caught.value.file, caught.value.line, caught.value.nearest) == (
-        tmp_path / "bad.yaml",
-        2,
-        "attachments",
-    )
     (tmp_path / "bad.urdf").write_text("<robot>")
-    with pytest.raises(InputError) as broken:
+    with expect_error(file=tmp_path / "bad.urdf"):
         load_scene_text(
             tmp_path, TINY.replace("type: box, size: [0.5, 0.4, 0.3]", "type: urdf, file: bad.urdf")
         )
-    assert broken.value.file == tmp_path / "bad.urdf"
 
 
 INLINE_SCENE = """\
@@ -264,12 +257,10 @@ def test_errors_in_inline_descriptions_are_located(
 
 
 def test_missing_scenes_are_reported(tmp_path: Path) -> None:
-    with pytest.raises(UnknownNameError) as caught:
+    with expect_error(nearest="door"):
         load_scene("dor")
-    assert caught.value.nearest == "door"
-    with pytest.raises(InputError) as missing:
+    with expect_error(file=tmp_path / "none.yaml"):
         load_scene(tmp_path / "none.yaml")
-    assert missing.value.file == tmp_path / "none.yaml"
 
 
 def test_start_may_have_a_height(tmp_path: Path) -> None:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.expected_errors import expect_error
 
-from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.scene.poses import as_placement
 from vkc_pin.world.task.steps import (
     Actuate,
@@ -59,12 +59,10 @@ def corrupt(row: int, column: int, value: float) -> np.ndarray:
     ],
 )
 def test_invalid_poses_are_rejected(pose: Any, problem: str) -> None:
-    with pytest.raises(InputError, match=problem) as caught:
+    with expect_error(problem, field="Reach.pose"):
         Reach(pose)
-    assert caught.value.field == "Reach.pose"
-    with pytest.raises(InputError) as caught:
+    with expect_error(field="target"):
         as_placement(pose, name="target")
-    assert caught.value.field == "target"
 
 
 @pytest.mark.parametrize(
@@ -77,9 +75,8 @@ def test_invalid_poses_are_rejected(pose: Any, problem: str) -> None:
     ],
 )
 def test_invalid_joints_are_rejected(joints: Any, field: str) -> None:
-    with pytest.raises(InputError) as caught:
+    with expect_error(field=field):
         Actuate("door", joints)
-    assert caught.value.field == field
 
 
 @pytest.mark.parametrize(
@@ -97,17 +94,15 @@ def test_invalid_targets_are_rejected(target: Any, problem: str) -> None:
         (lambda: Touch("stick.tip", target), "Touch.target"),
         (lambda: Place("stick", target), "Place.pose"),
     ):
-        with pytest.raises(InputError, match=problem) as caught:
+        with expect_error(problem, field=field):
             make()
-        assert caught.value.field == field
 
 
 @pytest.mark.parametrize("field", ["x", "y", "yaw"])
 @pytest.mark.parametrize("value", ["there", np.nan, [1.0, 2.0]])
 def test_invalid_base_goals_are_rejected(field: str, value: Any) -> None:
-    with pytest.raises(InputError) as caught:
+    with expect_error(field=f"GoTo.{field}"):
         GoTo(**{"x": 0.0, "y": 0.0, "yaw": 0.0, field: value})
-    assert caught.value.field == f"GoTo.{field}"
 
 
 def test_numbers_are_converted_to_floats() -> None:
@@ -153,9 +148,8 @@ def test_steps_survive_a_round_trip_through_data(step: Step) -> None:
 def test_unknown_names_in_data_are_rejected(
     data: dict[str, Any], field: str, nearest: str | None
 ) -> None:
-    with pytest.raises(UnknownNameError) as caught:
+    with expect_error(field=field, nearest=nearest):
         step_from_dict(data)
-    assert (caught.value.field, caught.value.nearest) == (field, nearest)
 
 
 @pytest.mark.parametrize(
@@ -166,6 +160,5 @@ def test_unknown_names_in_data_are_rejected(
     ],
 )
 def test_incomplete_data_is_rejected(data: dict[str, Any], field: str) -> None:
-    with pytest.raises(InputError) as caught:
+    with expect_error(field=field):
         step_from_dict(data)
-    assert caught.value.field == field

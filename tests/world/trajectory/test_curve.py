@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.expected_errors import expect_error
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
-from vkc_pin.errors import InputError
 from vkc_pin.world.trajectory.curve import Curve, concatenate_curves
 
 
@@ -99,21 +99,19 @@ def test_concatenated_parts_equal_the_whole() -> None:
     ],
 )
 def test_invalid_arrays_are_rejected(arrays: tuple[object, object, object], field: str) -> None:
-    with pytest.raises(InputError) as raised:
+    with expect_error(field=field):
         Curve(*arrays)  # type: ignore[arg-type]
-    assert raised.value.field == field
 
 
 def test_curve_must_pass_through_waypoints() -> None:
     curve = sample_curve(4)
     at = [0, 2, 6]
     curve.check_through(curve.times[at], curve.positions[at])
-    with pytest.raises(InputError, match="a waypoint is none of its knots"):
+    with expect_error("a waypoint is none of its knots"):
         curve.check_through(curve.times[[0, 2, 5]], curve.positions[[0, 2, 5]])
-    with pytest.raises(InputError, match="a waypoint is none of its knots"):
+    with expect_error("a waypoint is none of its knots"):
         curve.check_through(curve.times[at] + [0.0, 1e-3, 0.0], curve.positions[at])
-    with pytest.raises(InputError, match="does not lead through a waypoint") as raised:
+    with expect_error("does not lead through a waypoint", field="positions[1]"):
         curve.check_through(curve.times[at], curve.positions[at] + [[0.0], [1e-6], [0.0]])
-    assert raised.value.field == "positions[1]"
-    with pytest.raises(InputError, match="wrong number of coordinates"):
+    with expect_error("wrong number of coordinates"):
         curve.check_through(curve.times[at], curve.positions[at][:, :2])

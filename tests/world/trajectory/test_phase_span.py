@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from helpers.expected_errors import expect_error
 
-from vkc_pin.errors import InputError
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 
@@ -37,13 +37,12 @@ def test_phase_spans_survive_a_round_trip_through_data(span: PhaseSpan) -> None:
     ],
 )
 def test_invalid_fields_are_rejected(wrong: dict[str, Any], field: str) -> None:
-    with pytest.raises(InputError) as raised:
+    with expect_error(field=field):
         PhaseSpan.from_dict({**PhaseSpan("go", 0, 4).to_dict(), **wrong}, "phases[0]")
-    assert raised.value.field == field
 
 
 def test_missing_fields_are_named() -> None:
-    with pytest.raises(InputError, match="held: this is missing from a trajectory"):
+    with expect_error("held: this is missing from a trajectory"):
         PhaseSpan.from_dict({"name": "go", "first": 0, "last": 1}, "phases[0]")
-    with pytest.raises(InputError, match=r"phases\[3\]"):
+    with expect_error(r"phases\[3\]"):
         PhaseSpan.from_dict("go", "phases[3]")

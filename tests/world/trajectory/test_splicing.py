@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.expected_errors import expect_error
 from helpers.trajectory_files import NAMES, ROWS
 
 from vkc_pin.errors import InputError
@@ -80,15 +81,14 @@ def test_indirect_grasps_pause_too() -> None:
 
 def test_motions_must_follow_one_another() -> None:
     reach, opens, _ = make_parts()
-    with pytest.raises(InputError) as raised:
+    with expect_error(field="parts[1]"):
         concatenate_trajectories([reach, reach], pause=0.1)
-    assert raised.value.field == "parts[1]"
     moved = Trajectory(NAMES, opens.times, opens.positions + 2e-6, opens.phases, 5)
     with pytest.raises(InputError):
         concatenate_trajectories([reach, moved], pause=0.1)
     closer = Trajectory(NAMES, opens.times, opens.positions + 5e-7, opens.phases, 5)
     assert len(concatenate_trajectories([reach, closer], pause=0.1).times) == 5
-    with pytest.raises(InputError, match="nothing to concatenate"):
+    with expect_error("nothing to concatenate"):
         concatenate_trajectories([], pause=0.1)
 
 

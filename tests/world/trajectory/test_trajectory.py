@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.expected_errors import expect_error
 from helpers.trajectory_files import NAMES, PHASES, ROWS, TIMES, make_example_trajectory
 
-from vkc_pin.errors import InputError
 from vkc_pin.world.scene.hold import make_holds
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -32,7 +32,7 @@ def test_samples_and_velocities_of_linear_motions() -> None:
     np.testing.assert_allclose(rates[1], [1.5, 2.0, 0.25, 0.05, -0.1, 0.0])
     assert not rates[[0, 2]].any()
     assert not motion.acceleration(times).any()
-    with pytest.raises(InputError, match="too many samples"):
+    with expect_error("too many samples"):
         motion.sample(1e6)
     assert [part.times.tolist() for part in motion.parts()] == [[0.0, 2.0, 2.5], [2.5, 6.5]]
 
@@ -63,7 +63,7 @@ def test_invalid_times_are_rejected(time: Any) -> None:
         make_example_trajectory().velocity,
         make_example_trajectory().acceleration,
     ):
-        with pytest.raises(InputError, match="time"):
+        with expect_error("time"):
             evaluate(time)
 
 
@@ -94,9 +94,8 @@ def test_indirect_holds_survive_a_round_trip_through_data() -> None:
 def test_missing_fields_are_rejected(key: str) -> None:
     data = make_example_trajectory().to_dict()
     del data[key]
-    with pytest.raises(InputError) as caught:
+    with expect_error(field=key):
         Trajectory.from_dict(data)
-    assert caught.value.field == key
 
 
 @pytest.mark.parametrize(
@@ -126,6 +125,5 @@ def test_missing_fields_are_rejected(key: str) -> None:
     ],
 )
 def test_invalid_fields_are_rejected(field: str, changes: dict[str, Any]) -> None:
-    with pytest.raises(InputError) as caught:
+    with expect_error(field=field):
         make_example_trajectory(**changes)
-    assert caught.value.field == field

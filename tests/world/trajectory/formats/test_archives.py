@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.expected_errors import expect_error
 
 import vkc_pin as vkc
 from vkc_pin.world.trajectory.formats.archives import read_archive, write_archive
@@ -107,9 +108,8 @@ def test_invalid_descriptions_are_rejected(
     tmp_path: Path, saved: Path, change: Change, message: str
 ) -> None:
     path = write_changed(tmp_path / "wrong", saved, change)
-    with pytest.raises(vkc.InputError, match=message) as caught:
+    with expect_error(message, file=path):
         vkc.Plan.load(path)
-    assert caught.value.file == path
 
 
 def _set_nan(positions: np.ndarray) -> np.ndarray:
@@ -149,9 +149,8 @@ def test_invalid_arrays_are_rejected(
     members = read_members(saved)
     array = np.load(io.BytesIO(members[name]))
     path = write_members(tmp_path / "wrong", {**members, name: pack_array(change(array.copy()))})
-    with pytest.raises(vkc.InputError, match=message) as caught:
+    with expect_error(message, file=path):
         vkc.Plan.load(path)
-    assert caught.value.file == path
 
 
 def _make_header(shape: str, dtype: str = "<f8") -> bytes:
@@ -213,7 +212,7 @@ def test_unreadable_files_are_rejected(tmp_path: Path) -> None:
         (tmp_path, "Is a directory"),
         (tmp_path / "none", "No such file"),
     ):
-        with pytest.raises(vkc.InputError, match=f"cannot read the plan .*got {message}"):
+        with expect_error(f"cannot read the plan .*got {message}"):
             vkc.Plan.load(path)
 
 
@@ -221,7 +220,7 @@ def test_unreadable_files_are_rejected(tmp_path: Path) -> None:
 def test_only_compression_methods_of_numpy_are_accepted(
     tmp_path: Path, saved: Path, method: int
 ) -> None:
-    with pytest.raises(vkc.InputError, match="compressed by an unknown method"):
+    with expect_error("compressed by an unknown method"):
         vkc.Plan.load(write_members(tmp_path / "odd", read_members(saved), method))
     assert (
         vkc.Plan.load(

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.expected_errors import expect_error
 from helpers.fake_plan import make_fake_plan
 from helpers.trajectory_files import FILES, trajectories, write_text_file
 from hypothesis import given
@@ -157,7 +158,7 @@ def test_rests_keep_their_duration_at_any_rate(rate: float) -> None:
     ],
 )
 def test_invalid_options_are_rejected(plan: Plan, options: dict[str, Any], message: str) -> None:
-    with pytest.raises(vkc.InputError, match=message):
+    with expect_error(message):
         plan.to_ros(**options)
 
 
@@ -209,9 +210,9 @@ def test_invalid_messages_are_rejected(
     plan: Plan, tmp_path: Path, path: str, value: Any, expected: str
 ) -> None:
     message = replace_value(plan.to_ros(), path, value)
-    with pytest.raises(vkc.InputError, match=f"^{expected}"):
+    with expect_error(f"^{expected}"):
         Trajectory.from_ros(message)
-    with pytest.raises(vkc.InputError, match=f"bad.json: {expected}"):
+    with expect_error(f"bad.json: {expected}"):
         Trajectory.from_ros(write_text_file(tmp_path / "bad.json", json.dumps(message)))
 
 

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.expected_errors import expect_error
 from helpers.fake_plan import make_fake_plan
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-import vkc_pin as vkc
 from vkc_pin.planning.plan import Plan
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.formats.rosbag import TOPICS
@@ -149,7 +149,7 @@ def test_existing_folder_is_replaced_only_with_force(plan: Plan, tmp_path: Path)
     folder = plan.to_rosbag(tmp_path / "deep" / "bag")
     before = sorted((file.name, file.read_bytes()) for file in folder.iterdir())
     assert [name for name, _ in before] == [".vkc-pin.json", "bag.db3", "metadata.yaml"]
-    with pytest.raises(vkc.InputError, match="already exists"):
+    with expect_error("already exists"):
         plan.to_rosbag(folder, rate=10.0)
     assert sorted((file.name, file.read_bytes()) for file in folder.iterdir()) == before
     assert (
@@ -171,9 +171,8 @@ def test_existing_folder_is_replaced_only_with_force(plan: Plan, tmp_path: Path)
 def test_invalid_arguments_are_rejected(
     plan: Plan, tmp_path: Path, options: dict[str, Any], field: str
 ) -> None:
-    with pytest.raises(vkc.InputError) as caught:
+    with expect_error(field=field):
         plan.to_rosbag(tmp_path / "bag", **options)
-    assert caught.value.field == field
     assert not list(tmp_path.iterdir())
 
 
@@ -181,7 +180,6 @@ def test_missing_package_names_the_extra(
     plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "rosbags", None)
-    with pytest.raises(vkc.InputError, match="rosbags") as caught:
+    with expect_error("rosbags", expected='pip install "vkc-pin[ros]"'):
         plan.to_rosbag(tmp_path / "bag")
-    assert caught.value.expected == 'pip install "vkc-pin[ros]"'
     assert not list(tmp_path.iterdir())

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.expected_errors import expect_error
 from helpers.fake_plan import make_fake_plan
 from helpers.trajectory_files import FILES, ROBOT, are_equal, trajectories, write_text_file
 from hypothesis import given
@@ -49,7 +50,7 @@ def test_curves_and_openings_survive_files(tmp_path: Path) -> None:
     assert are_equal(Trajectory.from_csv(table), trajectory)
     assert are_equal(Trajectory.from_json(trajectory.to_json(tmp_path / "motion.json")), trajectory)
     table.write_text(table.read_text().replace("base_y velocity", "base_z velocity"))
-    with pytest.raises(vkc.InputError, match="not the velocities of its coordinates"):
+    with expect_error("not the velocities of its coordinates"):
         Trajectory.from_csv(table)
 
 
@@ -102,7 +103,7 @@ def test_unknown_joints_are_rejected(plan: Plan, tmp_path: Path) -> None:
         plan.to_ros(joints="robo")
     with pytest.raises(vkc.UnknownNameError, match=r"joints\[1\].*door.hinge"):
         plan.to_csv(tmp_path / "x.csv", joints=["base_x", "door.hinges"])
-    with pytest.raises(vkc.InputError, match="twice"):
+    with expect_error("twice"):
         plan.to_ros(joints=["base_x", "base_x"])
     assert list(tmp_path.iterdir()) == []
 
@@ -142,20 +143,16 @@ ROW = "0.0,0,0,0,1,go,{}\n"
     ],
 )
 def test_invalid_tables_are_rejected(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(vkc.InputError, match=message):
+    with expect_error(message):
         Trajectory.from_csv(write_text_file(tmp_path / "bad.csv", text))
 
 
 def test_unreadable_files_are_rejected(tmp_path: Path) -> None:
     for read in (Trajectory.from_csv, Trajectory.from_json, Trajectory.from_ros):
-        with pytest.raises(
-            vkc.InputError, match=r"none.csv: cannot read the (CSV|JSON) .*No such file"
-        ):
+        with expect_error(r"none.csv: cannot read the (CSV|JSON) .*No such file"):
             read(tmp_path / "none.csv")
         (tmp_path / "picture").write_bytes(b"\xff\xfe\x00")
-        with pytest.raises(
-            vkc.InputError, match=r"picture: cannot read the (CSV|JSON) .*no text: byte 0"
-        ):
+        with expect_error(r"picture: cannot read the (CSV|JSON) .*no text: byte 0"):
             read(tmp_path / "picture")
 
 
@@ -213,7 +210,7 @@ def test_large_and_deep_files_are_rejected_quickly(
     ],
 )
 def test_invalid_json_is_rejected(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(vkc.InputError, match=message):
+    with expect_error(message):
         Trajectory.from_json(write_text_file(tmp_path / "bad.json", text))
 
 

@@ -11,20 +11,17 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.carrying import compute_grasp_pose
+import yaml
+from helpers.carrying import compute_grasp_pose, describe_box
 from helpers.expected_errors import expect_error
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.scene.scene import Scene, load_scene
 
 HALL = """\
 robot: husky_ur5e
-start:
-  base: [0.0, 0.0, 0.5]
-  arm: home
-  held: {}
+start: {base: [0.0, 0.0, 0.5], held: HELD}
 objects:
   - {name: cane, type: stick, position: [2, 0, 0.05], yaw: 0.3}
   - {name: fruit, type: ball, position: [2, 1, 0.035]}
@@ -36,62 +33,39 @@ lengths = st.floats(-2.0, 2.0)
 
 
 def load_hall(folder: Path, held: str) -> Scene:
-    (folder / "hall.yaml").write_text(HALL.replace("held: {}", f"held: {held}"))
+    (folder / "hall.yaml").write_text(HALL.replace("HELD", held))
     return load_scene(folder / "hall.yaml")
 
 
 @cache
 def make_hall() -> Scene:
-    return Scene.from_document(
-        {
-            "robot": "husky_ur5e",
-            "start": {"base": [0.0, 0.0, 0.5]},
-            "objects": [
-                {"name": "cane", "type": "stick", "position": [2, 0, 0.05], "yaw": 0.3},
-                {"name": "fruit", "type": "ball", "position": [2, 1, 0.035]},
-                {"name": "front", "type": "door", "position": [4, 0, 0], "yaw": 0.7},
-            ],
-        }
-    )
+    return Scene.from_document(yaml.safe_load(HALL.replace("HELD", "{}")))
 
 
 def assert_close(one: pin.SE3, other: pin.SE3, atol: float = 1e-9) -> None:
-    np.testing.assert_allclose(one.homogeneous, other.homogeneous, rtol=0.0, atol=atol)
-
-
-def change_start(draw: st.DrawFn, scene: Scene) -> Scene:
-    arm = draw(st.none() | st.lists(st.floats(-1.5, 1.5), min_size=6, max_size=6))
-    return scene.with_start(base=draw(st.none() | st.tuples(lengths, lengths, angles)), arm=arm)
-
-
-def change_state(draw: st.DrawFn, scene: Scene) -> Scene:
-    return scene.with_state("front", {"hinge": draw(st.floats(0.0, 1.2))})
-
-
-def change_placement(draw: st.DrawFn, scene: Scene) -> Scene:
-    """Move an object; poses include a pitch of π/2, where roll and yaw coincide."""
-    pitch = st.sampled_from([0.0, np.pi / 2]) | angles
-    rotation = pin.rpy.rpyToMatrix(*draw(st.tuples(angles, pitch, angles)))
-    name = draw(st.sampled_from(["cane", "fruit", "front"]))
-    return scene.with_placement(name, pin.SE3(rotation, np.array(draw(st.tuples(*[lengths] * 3)))))
-
-
-def change_holds(draw: st.DrawFn, scene: Scene) -> Scene:
-    held, by = draw(st.sampled_from([({}, {}), (GRIP, {}), (BOTH, {}), (BOTH, BY)]))
-    values = draw(st.none() | st.tuples(st.floats(-0.09, 0.09), st.floats(-1.0, 1.0)))
-    return scene.with_held(held, by=by, at={"cane": values} if held and values else {})
+    np.testing.assert_allclose(one, other, rtol=0.0, atol=atol)
 
 
 @st.composite
 def changed_scenes(draw: st.DrawFn) -> Scene:
+    """Return changed copies; poses include a pitch of π/2, where roll and yaw coincide."""
     scene = make_hall()
-    for change in draw(
-        st.lists(
-            st.sampled_from([change_start, change_state, change_placement, change_holds]),
-            max_size=5,
-        )
-    ):
-        scene = change(draw, scene)
+    for change in draw(st.lists(st.sampled_from(["start", "state", "place", "hold"]), max_size=5)):
+        if change == "start":
+            arm = draw(st.none() | st.lists(st.floats(-1.5, 1.5), min_size=6, max_size=6))
+            base = draw(st.none() | st.tuples(lengths, lengths, angles))
+            scene = scene.with_start(base=base, arm=arm)
+        elif change == "state":
+            scene = scene.with_state("front", {"hinge": draw(st.floats(0.0, 1.2))})
+        elif change == "place":
+            pitch = st.sampled_from([0.0, np.pi / 2]) | angles
+            rotation = pin.rpy.rpyToMatrix(*draw(st.tuples(angles, pitch, angles)))
+            placement = pin.SE3(rotation, np.array(draw(st.tuples(*[lengths] * 3))))
+            scene = scene.with_placement(draw(st.sampled_from(list(scene.objects))), placement)
+        else:
+            held, by = draw(st.sampled_from([({}, {}), (GRIP, {}), (BOTH, {}), (BOTH, BY)]))
+            values = draw(st.none() | st.tuples(st.floats(-0.09, 0.09), st.floats(-1.0, 1.0)))
+            scene = scene.with_held(held, by=by, at={"cane": values} if held and values else {})
     return scene
 
 
@@ -112,13 +86,13 @@ def test_documents_and_placements_are_copies() -> None:
     placement = pin.SE3(np.eye(3), np.array([1.0, 0.0, 0.05]))
     moved = make_hall().with_placement("cane", placement)
     placement.translation[:] = 9.0
-    np.testing.assert_array_equal(moved.objects["cane"].placement.translation, [1.0, 0.0, 0.05])
-    np.testing.assert_array_equal(
-        make_hall().objects["cane"].placement.translation, [2.0, 0.0, 0.05]
-    )
+    for scene, x in ((moved, 1.0), (make_hall(), 2.0)):
+        assert scene.objects["cane"].placement.translation.tolist() == [x, 0.0, 0.05]
     make_hall().document["objects"].clear()
     front = {entry["name"]: entry for entry in moved.document["objects"]}["front"]
     assert front["yaw"] == 0.7, "the description of an unmoved object changed"
+    with expect_error("did you mean 'cane'"):
+        moved.with_placement("cana", placement)
 
 
 @pytest.mark.parametrize("values", [(0.0, 0.0), (0.05, -0.4), (-0.095, 1.2)])
@@ -147,12 +121,7 @@ def test_object_held_through_another_follows_its_link(tmp_path: Path) -> None:
         tip = scene.objects["cane"].link_placement("tip")
         on_tip = compute_grasp_pose(pin.SE3.Identity(), "ball", "pull", roll)
         assert_close(scene.objects["fruit"].placement, tip * on_tip.inverse())
-    crate = {
-        "name": "crate",
-        "type": "sphere",
-        "radius": 0.01,
-        "position": held.objects["fruit"].placement.translation.tolist(),
-    }
+    crate = describe_box("crate", [0.02] * 3, held.objects["fruit"].placement.translation.tolist())
     hit = Scene.from_document({**held.document, "obstacles": [crate]})
     assert hit.start_clearance() < 0.0, "held objects are part of the robot"
 
@@ -164,33 +133,15 @@ def test_short_form_of_holds(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("held", "by", "at", "field", "nearest"),
+    ("held", "by", "at", "message"),
     [
-        ({"cana": "grip"}, {}, {}, "held", "cane"),
-        ({"cane": "gripp"}, {}, {}, None, "grip"),
-        (BOTH, {"fruit": "cana.tip"}, {}, "by", "cane"),
-        ({"fruit": "pull"}, BY, {}, "by", None),
-        (BOTH, {"fruit": "cane.tap"}, {}, None, "tip"),
-        (GRIP, BY, {}, "by", None),
-        (GRIP, {}, {"cana": (0.0, 0.0)}, "at", "cane"),
-    ],
-)
-def test_unknown_names_are_rejected(
-    held: Mapping[str, str],
-    by: Mapping[str, str],
-    at: Mapping[str, Any],
-    field: str | None,
-    nearest: str | None,
-) -> None:
-    with expect_error(field=field, nearest=nearest):
-        make_hall().with_held(held, by=by, at=at)
-    with pytest.raises(UnknownNameError, match="did you mean 'cane'"):
-        make_hall().with_placement("cana", pin.SE3.Identity())
-
-
-@pytest.mark.parametrize(
-    ("held", "by", "at", "match"),
-    [
+        ({"cana": "grip"}, {}, {}, "^held: .*did you mean 'cane'"),
+        ({"cane": "gripp"}, {}, {}, "did you mean 'grip'"),
+        (BOTH, {"fruit": "cana.tip"}, {}, "^by: .*did you mean 'cane'"),
+        ({"fruit": "pull"}, BY, {}, "^by: there is no"),
+        (BOTH, {"fruit": "cane.tap"}, {}, "did you mean 'tip'"),
+        (GRIP, BY, {}, "^by: there is no"),
+        (GRIP, {}, {"cana": (0.0, 0.0)}, "^at: .*did you mean 'cane'"),
         (GRIP, {}, {"cane": (0.0,)}, "wrong number of values"),
         ({"cane": "end"}, {}, {"cane": (0.0,)}, "wrong number of values"),
         (GRIP, {}, {"cane": (0.1, 0.0)}, "outside"),
@@ -201,37 +152,28 @@ def test_unknown_names_are_rejected(
         ({"fruit": "pull", "front": "handle"}, {"fruit": "front.lever"}, {}, "through a free one"),
     ],
 )
-def test_impossible_holds_are_rejected(
-    held: Mapping[str, str], by: Mapping[str, str], at: Mapping[str, Any], match: str
+def test_invalid_holds_are_rejected(
+    held: Mapping[str, str], by: Mapping[str, str], at: Mapping[str, Any], message: str
 ) -> None:
-    with expect_error(match):
+    with expect_error(message):
         make_hall().with_held(held, by=by, at=at)
 
 
 @pytest.mark.parametrize(
-    ("held", "field", "details"),
+    ("held", "message"),
     [
-        ("{cane: gripp}", "start.held.cane", "did you mean 'grip'?"),
-        ("{cana: grip}", "start.held.cana", "did you mean 'cane'?"),
-        (
-            "{cane: {attachement: grip}}",
-            "start.held.cane.attachement",
-            "did you mean 'attachment'?",
-        ),
-        ("{cane: {at: [0.0, 0.0]}}", "start.held.cane.attachment", "missing"),
-        ("{cane: {attachment: grip, at: [0.2, 0.0]}}", "start.held.cane", "outside the joint's"),
-        ("{cane: {attachment: grip, at: [0.0, yes]}}", "start.held.cane.at[1]", "a number"),
+        ("{cane: gripp}", "cane: .*did you mean 'grip'"),
+        ("{cana: grip}", "cana: .*did you mean 'cane'"),
+        ("{cane: {attachement: grip}}", r"cane\.attachement: .*did you mean 'attachment'"),
+        ("{cane: {at: [0.0, 0.0]}}", r"cane\.attachment: .*missing"),
+        ("{cane: {attachment: grip, at: [0.2, 0.0]}}", "cane.*outside the joint's"),
+        ("{cane: {attachment: grip, at: [0.0, yes]}}", r"cane\.at\[1\]: .*a number"),
         (
             "{cane: {attachment: grip, by: fruit.ball}, fruit: {attachment: pull, by: cane.tip}}",
-            "start.held",
-            "in a cycle",
+            ".*in a cycle",
         ),
     ],
 )
-def test_invalid_holds_are_located_in_files(
-    tmp_path: Path, held: str, field: str, details: str
-) -> None:
-    with pytest.raises(InputError, match=details.replace("?", r"\?")) as caught:
+def test_invalid_holds_are_located_in_files(tmp_path: Path, held: str, message: str) -> None:
+    with expect_error(rf"start\.held\.?{message}", file=tmp_path / "hall.yaml", line=2):
         load_hall(tmp_path, held)
-    assert (caught.value.file, caught.value.line) == (tmp_path / "hall.yaml", 5)
-    assert str(caught.value.field).startswith(field)

@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.drawers import NEAR_HANDLE, load_drawer_scene, make_grasping_scene
+from helpers.drives import make_trajectory
 from helpers.expected_errors import expect_error
 from helpers.small_problems import replace_objects
 from hypothesis import given, settings
@@ -240,10 +241,8 @@ def test_measured_grasp_survives_serialization(
     assert again.holds == scene.holds
     assert again.holds[0].at == scene.holds[0].at
     holds = (*scene.holds, Hold("fly", "leg", scene.holds[0], "tip"))
-    names, phases = scene.robot.coordinates.names, (PhaseSpan("move", 0, 1, holds),)
-    motion = vkc.Trajectory(
-        names, np.arange(2.0), np.tile(scene.start, (2, 1)), phases, len(scene.start)
-    )
+    phases = (PhaseSpan("move", 0, 1, holds),)
+    motion = make_trajectory(scene, np.tile(scene.start, (2, 1)), phases=phases)
     with tempfile.TemporaryDirectory() as folder:
         table = vkc.Trajectory.from_csv(motion.to_csv(Path(folder) / "motion.csv"))
     data = vkc.Trajectory.from_dict(json.loads(json.dumps(motion.to_dict())))

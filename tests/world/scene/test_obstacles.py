@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import coal
 import numpy as np
 import pinocchio as pin
 import pydantic
 import pytest
-import trimesh
+from helpers.meshes import write_wedge
 
-from vkc_pin.world.models.shapes import compute_world_box, triangulate
+from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.obstacles import FLOOR, make_floor_shape, make_obstacle_shapes
 from vkc_pin.world.scene.scene_schema import ObstacleSchema
 
@@ -19,9 +20,8 @@ POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.2, 1.0), np.array([1.0, -2.0, 0.5]))
 URDF = """<robot name="r"><link name="a"><collision><origin xyz="0 0 1"/><geometry>
 <sphere radius="0.1"/></geometry></collision></link><link name="b">
 <collision><geometry><box size="1 2 3"/></geometry></collision></link>
-<joint name="j" type="revolute"><parent link="a"/><child link="b"/>
-<origin xyz="0.5 0 0" rpy="0 0 0.4"/><axis xyz="0 0 1"/>
-<limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>"""
+<joint name="j" type="continuous"><parent link="a"/><child link="b"/>
+<origin xyz="0.5 0 0" rpy="0 0 0.4"/><axis xyz="0 0 1"/></joint></robot>"""
 
 
 def make_shapes(
@@ -33,51 +33,42 @@ def make_shapes(
     return make_obstacle_shapes(item, POSE, folder)
 
 
-def compute_volume(shape: pin.GeometryObject) -> float:
-    return float(trimesh.Trimesh(*triangulate(shape.geometry)).volume)
-
-
 @pytest.mark.parametrize(
     ("fields", "expected"),
     [
-        ({"type": "box", "size": [0.2, 0.3, 0.4]}, 0.024),
-        ({"type": "sphere", "radius": 0.2}, 4 / 3 * np.pi * 0.008),
-        ({"type": "cylinder", "radius": 0.2, "length": 0.5}, np.pi * 0.04 * 0.5),
-        (
-            {"type": "capsule", "radius": 0.2, "length": 0.5},
-            np.pi * 0.04 * 0.5 + 4 / 3 * np.pi * 0.008,
-        ),
-        ({"type": "mesh", "file": "wedge.obj", "scale": [2.0, 1.0, 3.0]}, 6.0 / 6.0),
+        ({"type": "box", "size": [0.2, 0.3, 0.4]}, coal.Box(0.2, 0.3, 0.4)),
+        ({"type": "sphere", "radius": 0.2}, coal.Sphere(0.2)),
+        ({"type": "cylinder", "radius": 0.2, "length": 0.5}, coal.Cylinder(0.2, 0.5)),
+        ({"type": "capsule", "radius": 0.2, "length": 0.5}, coal.Capsule(0.2, 0.5)),
+        ({"type": "mesh", "file": "wedge.obj", "scale": [2.0, 1.0, 3.0]}, None),
     ],
 )
-def test_every_type_has_its_volume_and_placement(
-    fields: dict[str, Any], expected: float, tmp_path: Path
+def test_every_type_has_its_shape_and_placement(
+    fields: dict[str, Any], expected: coal.CollisionGeometry | None, tmp_path: Path
 ) -> None:
-    """The triangulation of round shapes loses a few percent of the volume."""
-    (tmp_path / "wedge.obj").write_text(
-        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
-    )
+    write_wedge(tmp_path / "wedge.obj")
     (visual,), (solid,) = make_shapes(tmp_path, colour=[0.1, 0.2, 0.3, 0.4], **fields)
-    assert 0.95 * expected <= compute_volume(solid) <= expected * (1 + 1e-9)
+    if expected is None:
+        assert solid.geometry.computeVolume() == pytest.approx(1.0)
+    else:
+        assert solid.geometry == expected
     for shape in (visual, solid):
-        assert shape.name == "item"
-        assert shape.parentJoint == 0
+        assert (shape.name, shape.parentJoint) == ("item", 0)
         assert shape.placement.isApprox(POSE)
         np.testing.assert_allclose(shape.meshColor, [0.1, 0.2, 0.3, 0.4])
-    assert visual.meshPath == (str(tmp_path / "wedge.obj") if fields["type"] == "mesh" else "")
+    assert visual.meshPath == ("" if expected else str(tmp_path / "wedge.obj"))
     assert solid.meshPath == ""
 
 
 def test_urdf_obstacles_have_their_joints_at_zero(tmp_path: Path) -> None:
     (tmp_path / "r.urdf").write_text(URDF)
     _, solid = make_shapes(tmp_path, type="urdf", file="r.urdf", colour=[1, 0, 0, 1])
-    assert [shape.name for shape in solid] == ["item_0", "item_1"]
-    assert all(shape.parentJoint == 0 for shape in solid)
     placements = [
         pin.SE3(np.eye(3), np.array([0, 0, 1.0])),
-        pin.SE3(pin.rpy.rpyToMatrix(0, 0, 0.4), np.array([0.5, 0, 0])),
+        pin.SE3(pin.utils.rotate("z", 0.4), np.array([0.5, 0, 0])),
     ]
-    for shape, local in zip(solid, placements, strict=True):
+    for k, (shape, local) in enumerate(zip(solid, placements, strict=True)):
+        assert (shape.name, shape.parentJoint) == (f"item_{k}", 0)
         assert shape.placement.isApprox(POSE * local, 1e-12)
         np.testing.assert_array_equal(shape.meshColor, [1, 0, 0, 1])
 

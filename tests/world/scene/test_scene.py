@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.expected_errors import expect_error
 from helpers.rooms import TINY, load_scene_text
 
 from vkc_pin.world.models.robot_file import load_robot
+from vkc_pin.world.models.shapes import LIMIT_SLACK
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene, load_scene
 
 
@@ -18,29 +22,49 @@ def door() -> Scene:
     return load_scene("door")
 
 
-def test_with_methods_reject_invalid_values(door: Scene) -> None:
-    with expect_error("base: wrong number of values"):
-        door.with_start(base=[0.0, 1.0])
-    with expect_error("arm: wrong number of values"):
-        door.with_start(arm=[0.0])
-    with expect_error(r"base\.base_x: not a finite number"):
-        door.with_start(base=[np.nan, 0.0, 0.0])
-    with expect_error("outside the joint's limits"):
-        door.with_start(arm=[100.0, *door.robot.home[1:]])
-    with expect_error(nearest="door"):
-        door.with_state("dor", {"hinge": 0.0})
-    with expect_error(nearest="hinge"):
-        door.with_state("door", {"hing": 0.0})
-    with expect_error(
-        r"door\.hinge: outside the joint's limits \(expected -1\.57 to 1\.57, got 2\)"
-    ):
-        door.with_state("door", {"hinge": 2.0})
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: s.with_start(base=[0.0, 1.0]), "base: wrong number of values"),
+        (lambda s: s.with_start(arm=[0.0]), "arm: wrong number of values"),
+        (lambda s: s.with_start(base=[np.nan, 0, 0]), r"base\.base_x: not a finite number"),
+        (lambda s: s.with_start(arm=[100.0, *s.robot.home[1:]]), "outside the joint's limits"),
+        (lambda s: s.with_state("dor", {"hinge": 0.0}), "did you mean 'door'"),
+        (lambda s: s.with_state("door", {"hing": 0.0}), r"door\.hing: .*did you mean 'hinge'"),
+        (
+            lambda s: s.with_state("door", {"hinge": 2.0}),
+            r"door\.hinge: outside the joint's limits \(expected -1\.57 to 1\.57, got 2\)",
+        ),
+        (lambda s: s.with_state("door", {"hinge": np.nan}), r"door\.hinge: "),
+        (lambda s: s.with_state("door", {"hinge": 1.57 + 3 * LIMIT_SLACK}), "outside"),
+    ],
+)
+def test_invalid_changes_are_rejected(
+    door: Scene, change: Callable[[Scene], Scene], message: str
+) -> None:
+    with expect_error(message):
+        change(door)
 
 
 def test_values_are_clamped_to_limits_within_rounding(door: Scene) -> None:
     assert door.with_state("door", {"hinge": 1.57 + 1e-8}).objects["door"].state[0] == 1.57
-    arm = door.robot.upper[3:] + 1e-8
-    np.testing.assert_array_equal(door.with_start(arm=arm).start[3:], door.robot.upper[3:])
+    for limits, sign in ((door.robot.lower, -1.0), (door.robot.upper, 1.0)):
+        arm = door.with_start(arm=limits[3:] + sign * 1e-8).start[3:]
+        np.testing.assert_array_equal(arm, limits[3:])
+
+
+def test_world_shapes_follow_the_joints(tmp_path: Path) -> None:
+    scene = load_scene_text(tmp_path, TINY)
+    placed = scene.with_state("front", {"knob": 0.5}).objects["front"]
+    assert placed.state.tolist() == [0.3, 0.5]
+    assert scene.objects["front"].state.tolist() == [0.3, 0.0]
+    turn = pin.utils.rotate("z", 0.3)
+    shapes = {s.name: s for s in make_world_shapes(placed)}
+    middle = np.array([3.0, 0.0, 0.0]) + turn @ [0.0, -0.45, 1.01]
+    np.testing.assert_allclose(shapes["panel_0"].placement.translation, middle, atol=1e-12)
+    assert {s.parentJoint for s in shapes.values()} == {0}
+    assert len(make_world_shapes(placed, visual=True)) == len(placed.object.visual.geometryObjects)
+    np.testing.assert_allclose(placed.link_placement("panel").rotation, turn, atol=1e-12)
 
 
 def test_fixed_base_starts_anywhere_in_the_arena(tmp_path: Path) -> None:
@@ -54,28 +78,22 @@ def test_fixed_base_starts_anywhere_in_the_arena(tmp_path: Path) -> None:
     np.testing.assert_array_equal(scene.with_start(base=[0.1, 0.2, 0.3]).start[:3], [0.1, 0.2, 0.3])
 
 
-def test_start_clearance_includes_obstacles_and_objects(door: Scene) -> None:
-    into_the_sofa = door.with_start(base=[-1.5, -1.5, 0.0])
-    assert into_the_sofa.start_clearance() < -0.1
-    into_the_door = door.with_start(base=[2.2, 0.0, 0.0])
-    assert into_the_door.start_clearance() < -0.1
+@pytest.mark.parametrize("base", [(-1.5, -1.5), (2.2, 0.0)], ids=["sofa", "door"])
+def test_start_clearance_includes_obstacles_and_objects(
+    door: Scene, base: tuple[float, float]
+) -> None:
+    assert door.with_start(base=[*base, 0.0]).start_clearance() < -0.1
 
 
 def test_sampling_needs_a_free_start_region(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    none = load_scene_text(
-        tmp_path, TINY.replace("start_region: {x: [-1, 1], y: [-1, 1], yaw: any}\n", "")
-    )
-    with expect_error("no start region"):
-        none.sample_start(rng)
-    text = TINY.replace("x: [-1, 1], y: [-1, 1]", "x: [2, 2.1], y: [2, 2.1]")
-    full = load_scene_text(
-        tmp_path,
-        text[: text.index("objects:")]
-        + text[text.index("obstacles:") : text.index("  - name: post")],
-    )
-    with expect_error("no collision-free start"):
-        full.sample_start(rng)
+    region = "start_region: {x: [-1, 1], y: [-1, 1], yaw: any}\n"
+    for other, message in (
+        ("", "no start region"),
+        ("start_region: {x: [2, 2.1], y: [2, 2.1]}\n", "no collision-free start"),
+    ):
+        scene = load_scene_text(tmp_path, TINY.replace(region, other))
+        with expect_error(message):
+            scene.sample_start(np.random.default_rng(0))
 
 
 def test_start_is_sampled_with_free_held_objects_only(tmp_path: Path) -> None:

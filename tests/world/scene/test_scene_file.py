@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.expected_errors import expect_error
+from helpers.meshes import write_wedge
 from helpers.rooms import TINY, load_scene_text
 
-from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene, load_scene
 
 
 def test_all_types_of_obstacles_are_loaded(tmp_path: Path) -> None:
-    (tmp_path / "wedge.obj").write_text(
-        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
-    )
+    write_wedge(tmp_path / "wedge.obj")
     box = '<collision><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
-    joint = '<joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint>'
-    links = f'<link name="a">{box}</link><link name="b">{box}</link>'
-    (tmp_path / "chest.urdf").write_text(f'<robot name="chest">{links}{joint}</robot>')
+    (tmp_path / "chest.urdf").write_text(
+        f'<robot name="chest"><link name="a">{box}{box}</link></robot>'
+    )
     extra = """\
   - {name: ball, type: sphere, radius: 0.2, position: [0, 2, 0.2], colour: red}
   - {name: pole, type: capsule, radius: 0.05, length: 1, position: [-3, 0, 1]}
@@ -31,14 +30,13 @@ def test_all_types_of_obstacles_are_loaded(tmp_path: Path) -> None:
   - {name: chest, type: urdf, file: chest.urdf, position: [-1, 2, 0]}
 """
     scene = load_scene_text(tmp_path, TINY + extra)
+    assert FLOOR not in load_scene_text(tmp_path, TINY + "floor: false\n").obstacle_labels
     shapes = {s.name: s for s in scene.obstacles}
     names = ("crate", "post", "ball", "pole", "rock", "chest")
     assert scene.obstacle_labels == (*names, "chest", FLOOR)
     assert scene.obstacle_names == names
     assert {"chest_0", "chest_1"} < shapes.keys()
     np.testing.assert_allclose(np.max(shapes["rock"].geometry.points(), axis=0), [0.3] * 3)
-    np.testing.assert_allclose(shapes["crate"].meshColor, [1.0, 0.0, 0.0, 1.0])
-    np.testing.assert_allclose(2.0 * shapes["crate"].geometry.halfSide, [0.5, 0.4, 0.3])
     turn = pin.utils.rotate("z", 0.2)
     np.testing.assert_allclose(shapes["crate"].placement.rotation, turn, atol=1e-12)
     again = Scene.from_document(json.loads(json.dumps(scene.document)), tmp_path)
@@ -48,21 +46,17 @@ def test_all_types_of_obstacles_are_loaded(tmp_path: Path) -> None:
 def test_number_of_obstacles_is_limited() -> None:
     ball = {"name": "b", "type": "sphere", "radius": 0.01, "position": [9, 9, 9]}
     document = {"robot": "husky_ur5e", "start": {"base": [0, 0, 0]}, "obstacles": [ball] * 10_001}
-    with pytest.raises(InputError, match="too many") as caught:
+    with expect_error("^obstacles: .{0,20}too many.{0,250}$"):
         Scene.from_document(document)
-    assert caught.value.field == "obstacles"
-    assert len(str(caught.value)) < 300
+
+
+BOX = "  - {{name: b, type: box, size: [1, 2, 3], position: [0, 3, 2], {}}}\n"
 
 
 def test_orientations_may_be_quaternions(tmp_path: Path) -> None:
-    extra = f"""\
-  - {{name: turned, type: box, size: [1, 2, 3], position: [0, 3, 2], yaw: {np.pi / 2}}}
-  - {{name: same, type: box, size: [1, 2, 3], position: [0, -3, 2],
-     quaternion: [0, 0, 0.7071, 0.7071]}}
-"""
-    scene = load_scene_text(tmp_path, TINY + extra)
-    turns = {shape.name: shape.placement.rotation for shape in scene.obstacles}
-    np.testing.assert_allclose(turns["turned"], turns["same"], atol=1e-12)
+    scene = load_scene_text(tmp_path, TINY + BOX.format("quaternion: [0, 0, 0.7071, 0.7071]"))
+    turn = pin.utils.rotate("z", np.pi / 2)
+    np.testing.assert_allclose(scene.obstacles[2].placement.rotation, turn, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -79,44 +73,7 @@ def test_orientations_may_be_quaternions(tmp_path: Path) -> None:
 )
 def test_invalid_orientations_are_located(tmp_path: Path, orientation: str, message: str) -> None:
     with expect_error(message, line=len(TINY.splitlines()) + 1):
-        load_scene_text(
-            tmp_path,
-            TINY
-            + f"  - {{name: b, type: box, size: [1, 2, 3], position: [0, 3, 2], {orientation}}}\n",
-        )
-
-
-def test_floor_is_optional(tmp_path: Path) -> None:
-    assert FLOOR not in load_scene_text(tmp_path, TINY + "floor: false\n").obstacle_labels
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "line", "field", "nearest"),
-    [
-        ("robot: husky_ur5e", "robot: husky_ur5", 1, "robot", "husky_ur5e"),
-        ("robot: husky_ur5e", "robot: {name: husky_ur5e, base: omnni}", 1, "robot.base", "omni"),
-        ("  arm: home", "  arn: home", 4, "start.arn", "arm"),
-        ("type: door", "type: doors", 9, "objects[0].type", "door"),
-        ("state: {hinge: 0.3}", "state: {hing: 0.3}", 11, "objects[0].state.hing", "hinge"),
-        ("type: box", "type: bax", 13, "obstacles[0].type", "box"),
-        ("    radius: 0.1", "    radus: 0.1", 16, "obstacles[1].radus", "radius"),
-    ],
-)
-def test_unknown_names_are_located_with_a_suggestion(
-    tmp_path: Path, old: str, new: str, line: int, field: str, nearest: str
-) -> None:
-    assert old in TINY
-    with pytest.raises(UnknownNameError) as caught:
-        load_scene_text(tmp_path, TINY.replace(old, new))
-    error = caught.value
-    assert (error.file, error.line, error.field, error.nearest) == (
-        tmp_path / "room.yaml",
-        line,
-        field,
-        nearest,
-    ), str(error)
-    assert f"room.yaml:{line}: {field}: " in str(error)
-    assert f"did you mean '{nearest}'?" in str(error)
+        load_scene_text(tmp_path, TINY + BOX.format(orientation))
 
 
 SIZE, BASE = "size: [0.5, 0.4, 0.3]", "base: [0.0, 0.0, 0.5]"
@@ -125,6 +82,25 @@ SIZE, BASE = "size: [0.5, 0.4, 0.3]", "base: [0.0, 0.0, 0.5]"
 @pytest.mark.parametrize(
     ("old", "new", "line", "field", "details"),
     [
+        ("robot: husky_ur5e", "robot: husky_ur5", 1, "robot", "did you mean 'husky_ur5e'?"),
+        (
+            "robot: husky_ur5e",
+            "robot: {name: husky_ur5e, base: omnni}",
+            1,
+            "robot.base",
+            "did you mean 'omni'?",
+        ),
+        ("  arm: home", "  arn: home", 4, "start.arn", "did you mean 'arm'?"),
+        ("type: door", "type: doors", 9, "objects[0].type", "did you mean 'door'?"),
+        (
+            "state: {hinge: 0.3}",
+            "state: {hing: 0.3}",
+            11,
+            "objects[0].state.hing",
+            "did you mean 'hinge'?",
+        ),
+        ("type: box", "type: bax", 13, "obstacles[0].type", "did you mean 'box'?"),
+        ("    radius: 0.1", "    radus: 0.1", 16, "obstacles[1].radus", "did you mean 'radius'?"),
         (BASE, "base: [0.0, 0.0]", 3, "start.base", "expected 3 values, got [0.0, 0.0]"),
         (BASE, "base: [0.0, .inf, 0.5]", 3, "start.base[1]", "expected a finite number, got inf"),
         (BASE, "base: [0.0, yes, 0.5]", 3, "start.base[1]", "expected a number, got True"),
@@ -161,23 +137,14 @@ def test_invalid_input_is_located(
     tmp_path: Path, old: str, new: str, line: int | None, field: str | None, details: str
 ) -> None:
     assert old in TINY
-    with pytest.raises(InputError) as caught:
+    with expect_error(re.escape(details), file=tmp_path / "room.yaml", line=line, field=field):
         load_scene_text(tmp_path, TINY.replace(old, new))
-    error = caught.value
-    assert (error.file, error.line, error.field) == (tmp_path / "room.yaml", line, field), str(
-        error
-    )
-    assert details in str(error)
 
 
 def test_the_first_error_in_the_file_is_reported(tmp_path: Path) -> None:
+    text = TINY.replace("radius: 0.1", "radius: -1").replace("size: [0.5", "size: [0")
     with expect_error(line=4):
-        load_scene_text(
-            tmp_path,
-            TINY.replace("radius: 0.1", "radius: -1")
-            .replace("arm: home", "arm: 3")
-            .replace("size: [0.5", "size: [0"),
-        )
+        load_scene_text(tmp_path, text.replace("arm: home", "arm: 3"))
 
 
 def test_errors_in_named_files_are_located_there(tmp_path: Path) -> None:
@@ -223,12 +190,8 @@ def test_inline_object_descriptions_are_loaded(tmp_path: Path) -> None:
     file.write_text(INLINE_SCENE)
     scene = load_scene(file)
     placed = scene.objects["trap"]
-    assert (placed.object.name, placed.object.urdf, placed.object.acceleration[0]) == (
-        "trap_door",
-        None,
-        3.0,
-    )
-    assert placed.state[0] == 0.3
+    assert (placed.object.name, placed.object.urdf, placed.state[0]) == ("trap_door", None, 0.3)
+    assert placed.object.acceleration[0] == 3.0
     elsewhere = Scene.from_document(json.loads(json.dumps(scene.document)), "/")
     assert elsewhere.document == scene.document
     assert elsewhere.objects["trap"].object.model == placed.object.model
@@ -248,19 +211,20 @@ def test_errors_in_inline_descriptions_are_located(
     """Covers the scene file and the URDF text inside it."""
     assert old in INLINE_SCENE
     (tmp_path / "room.yaml").write_text(INLINE_SCENE.replace(old, new))
-    with pytest.raises(InputError) as caught:
+    place = r"room\.yaml: urdf:" if "link=" in old else r"room\.yaml:"
+    with expect_error(f"{place}{line}: ", line=line, field=field):
         load_scene(tmp_path / "room.yaml")
-    assert str(caught.value.file) == str(tmp_path / "room.yaml") + (
-        ": urdf" if "link=" in old else ""
-    )
-    assert (caught.value.line, caught.value.field) == (line, field)
 
 
-def test_missing_scenes_are_reported(tmp_path: Path) -> None:
+def test_missing_files_are_reported(tmp_path: Path) -> None:
     with expect_error(nearest="door"):
         load_scene("dor")
     with expect_error(file=tmp_path / "none.yaml"):
         load_scene(tmp_path / "none.yaml")
+    for name in ("dor.yaml", "dor.yml"):
+        (tmp_path / name).touch()
+    with expect_error(rf"a file in {tmp_path}, perhaps dor\.yaml, got door\.yaml"):
+        load_scene_text(tmp_path, TINY.replace("type: door", "type: door.yaml"))
 
 
 def test_start_may_have_a_height(tmp_path: Path) -> None:
@@ -271,8 +235,5 @@ def test_start_may_have_a_height(tmp_path: Path) -> None:
     assert "z" not in low.document["start"]
     again = Scene.from_document(high.with_start(base=[1.0, 0.0, 0.0]).document, tmp_path)
     assert again.document["start"]["z"] == again.robot.height == 0.4
-    rise = (
-        high.tool_placement().translation
-        - low.with_start(base=high.start[:3]).tool_placement().translation
-    )
+    rise = high.tool_placement().translation - low.tool_placement().translation
     np.testing.assert_allclose(rise, [0.0, 0.0, 0.4], atol=1e-12)

@@ -3,16 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.fake_plan import make_fake_plan
 
 from vkc_pin.planning.plan import Plan
 from vkc_pin.world.trajectory.placements import Motion, key_times, sample_motion
 from vkc_pin.world.trajectory.world_model import World
-
-
-@pytest.fixture(scope="module")
-def plan() -> Plan:
-    return make_fake_plan()
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import math
@@ -66,11 +65,8 @@ def test_archives_survive_a_round_trip(tmp_path: Path, saved: Path) -> None:
         "positions": pack_array(np.asfortranarray(arrays["positions"])),
     }
     _, swapped = read_archive(write_members(tmp_path / "other", {**read_members(saved), **other}))
-    for name in ("times", "positions"):
-        np.testing.assert_array_equal(found[name], arrays[name])
-        np.testing.assert_array_equal(swapped[name], arrays[name])
-    for name, values in arrays["curve"].items():
-        np.testing.assert_array_equal(found["curve"][name], values)
+    np.testing.assert_equal(found, arrays)
+    np.testing.assert_equal(swapped, arrays)
 
 
 Change = Callable[[dict[str, Any]], Any]
@@ -153,20 +149,8 @@ def test_invalid_arrays_are_rejected(
         vkc.Plan.load(path)
 
 
-def _make_header(shape: str, dtype: str = "<f8") -> bytes:
-    text = (
-        f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}".encode().ljust(117)
-        + b"\n"
-    )
-    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
-
-
 def _make_bomb(members: dict[str, bytes]) -> dict[str, bytes]:
-    return {**members, "positions": _make_header("(100000, 125)") + bytes(100_000_000)}
-
-
-def _exaggerate_shape(members: dict[str, bytes]) -> dict[str, bytes]:
-    return {**members, "positions": _make_header("(1000000000, 1000)") + bytes(80)}
+    return {**members, "positions": pack_array(np.zeros((100_000, 125)))}
 
 
 def _nest_lists(members: dict[str, bytes]) -> dict[str, bytes]:
@@ -190,7 +174,7 @@ print(int(peak[1]) / 1e3, time.process_time() - before)
 """
 
 
-@pytest.mark.parametrize("make", [_make_bomb, _exaggerate_shape, _nest_lists])
+@pytest.mark.parametrize("make", [_make_bomb, _nest_lists])
 def test_large_contents_are_rejected_before_they_are_unpacked(
     tmp_path: Path, saved: Path, make: Callable[[Any], Any]
 ) -> None:
@@ -216,29 +200,9 @@ def test_unreadable_files_are_rejected(tmp_path: Path) -> None:
             vkc.Plan.load(path)
 
 
-@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2])
-def test_only_compression_methods_of_numpy_are_accepted(
-    tmp_path: Path, saved: Path, method: int
-) -> None:
+def test_only_compression_methods_of_numpy_are_accepted(tmp_path: Path, saved: Path) -> None:
+    members = read_members(saved)
     with expect_error("compressed by an unknown method"):
-        vkc.Plan.load(write_members(tmp_path / "odd", read_members(saved), method))
-    assert (
-        vkc.Plan.load(
-            write_members(tmp_path / "plain", read_members(saved), zipfile.ZIP_STORED)
-        ).seed
-        == 0
-    )
-
-
-def test_damaged_bytes_raise_input_errors_only(tmp_path: Path, saved: Path) -> None:
-    data, random = saved.read_bytes(), np.random.default_rng(0)
-    path = tmp_path / "odd"
-    for _ in range(40):
-        damaged = bytearray(data)
-        for at in random.integers(len(data), size=random.integers(1, 4)):
-            damaged[at] = random.integers(256)
-        path.write_bytes(
-            bytes(damaged[: random.integers(len(damaged))] if random.random() < 0.2 else damaged)
-        )
-        with contextlib.suppress(vkc.InputError):
-            assert vkc.Plan.load(path).trajectory.times[0] == 0.0
+        vkc.Plan.load(write_members(tmp_path / "odd", members, zipfile.ZIP_BZIP2))
+    plain = write_members(tmp_path / "plain", members, zipfile.ZIP_STORED)
+    assert vkc.Plan.load(plain).seed == 0

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.expected_errors import expect_error
-from helpers.fake_plan import make_fake_plan
 from helpers.trajectory_files import FILES, trajectories, write_text_file
 from hypothesis import given
 from hypothesis import strategies as st
@@ -75,11 +74,6 @@ def test_resting_coordinates_stay_at_rest() -> None:
     assert (position == 1.0).all()
     assert (velocity == 0.0).all()
     assert (acceleration == 0.0).all()
-
-
-@pytest.fixture(scope="module")
-def plan() -> Plan:
-    return make_fake_plan()
 
 
 @FILES

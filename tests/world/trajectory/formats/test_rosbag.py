@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -17,7 +18,6 @@ from rosbags.typesys import Stores, get_typestore
 from vkc_pin.planning.plan import Plan
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.formats.rosbag import TOPICS
-from vkc_pin.world.trajectory.trajectory import Trajectory
 
 Messages = dict[str, list[tuple[int, Any]]]
 
@@ -30,11 +30,7 @@ def plan() -> Plan:
     rates = np.gradient(motion.positions, motion.times, axis=0)
     rates[[0, 6, -1]] = 0.0
     curve = Curve(motion.times, motion.positions, rates)
-    again = Trajectory(
-        motion.names, motion.times, motion.positions, motion.phases, motion.robot_size, curve
-    )
-    object.__setattr__(plan, "trajectory", again)
-    return plan
+    return dataclasses.replace(plan, trajectory=dataclasses.replace(motion, curve=curve))
 
 
 def read_bag(folder: Path) -> Messages:
@@ -49,26 +45,18 @@ def read_bag(folder: Path) -> Messages:
     return found
 
 
-def convert_message(message: Any) -> dict[str, Any]:
-    """Return a JointTrajectory in the format of `to_ros`."""
-    keys = ("positions", "velocities", "accelerations", "effort")
-    return {
-        "header": {
-            "stamp": {"sec": message.header.stamp.sec, "nanosec": message.header.stamp.nanosec},
-            "frame_id": message.header.frame_id,
-        },
-        "joint_names": list(message.joint_names),
-        "points": [
-            {
-                **{key: getattr(point, key).tolist() for key in keys},
-                "time_from_start": {
-                    "sec": point.time_from_start.sec,
-                    "nanosec": point.time_from_start.nanosec,
-                },
-            }
-            for point in message.points
-        ],
-    }
+def convert_message(message: Any) -> Any:
+    """Return a message in the format of `to_ros`."""
+    if isinstance(message, np.ndarray | list):
+        return [convert_message(item) for item in message]
+    if hasattr(message, "__msgtype__"):
+        fields = {name: convert_message(value) for name, value in vars(message).items()}
+        return {name: value for name, value in fields.items() if name != "__msgtype__"}
+    return message
+
+
+def read_time(stamp: Any) -> float:
+    return float(stamp.sec + 1e-9 * stamp.nanosec)
 
 
 def test_trajectories_equal_those_of_to_ros(plan: Plan, tmp_path: Path) -> None:
@@ -83,15 +71,12 @@ def test_trajectories_equal_those_of_to_ros(plan: Plan, tmp_path: Path) -> None:
 
 
 def test_base_velocities_follow_the_path(plan: Plan, tmp_path: Path) -> None:
-    found, motion = (
-        read_bag(plan.to_rosbag(tmp_path / "bag", rate=50.0, states=500.0)),
-        plan.trajectory,
-    )
+    found = read_bag(plan.to_rosbag(tmp_path / "bag", rate=50.0, states=500.0))
+    motion = plan.trajectory
     ((_, path),) = found["/vkc/base/path"]
     assert path.header.frame_id == "world"
     for pose in path.poses:
-        time = pose.header.stamp.sec + 1e-9 * pose.header.stamp.nanosec
-        x, y, yaw = motion.at(time)[:3]
+        x, y, yaw = motion.at(read_time(pose.header.stamp))[:3]
         position, orientation = pose.pose.position, pose.pose.orientation
         assert np.allclose([position.x, position.y, position.z], [x, y, 0.0], atol=1e-7)
         assert np.isclose(np.cos(yaw - 2.0 * np.arctan2(orientation.z, orientation.w)), 1.0)
@@ -117,45 +102,30 @@ def test_base_velocities_follow_the_path(plan: Plan, tmp_path: Path) -> None:
 
 
 def test_object_states_and_phases(plan: Plan, tmp_path: Path) -> None:
-    found, motion = (
-        read_bag(plan.to_rosbag(tmp_path / "bag", states=20.0, namespace="")),
-        plan.trajectory,
-    )
-    states = found["/objects/joint_states"]
-    times = np.array(
-        [message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec for _, message in states]
-    )
-    assert np.allclose(times, 1e-9 * np.array([when for when, _ in states]))
+    found = read_bag(plan.to_rosbag(tmp_path / "bag", states=20.0, namespace=""))
+    motion = plan.trajectory
+    recorded, states = zip(*found["/objects/joint_states"], strict=True)
+    times = np.array([read_time(state.header.stamp) for state in states])
+    assert np.allclose(times, 1e-9 * np.array(recorded))
     assert np.allclose(np.diff(times)[:-1], 0.05)
-    assert list(states[0][1].name) == ["door.hinge", "door.knob", "door.handle_free"]
-    assert np.allclose(
-        [message.position for _, message in states],
-        motion.at(times)[:, motion.robot_size :],
-        atol=1e-7,
-    )
-    assert np.allclose(
-        [message.velocity for _, message in states],
-        motion.velocity(times)[:, motion.robot_size :],
-        atol=1e-6,
-    )
-    phases = [(when, json.loads(message.data)) for when, message in found["/phases"]]
-    assert [when for when, _ in phases] == [
-        round(1e9 * motion.times[phase.first]) for phase in motion.phases
-    ]
-    assert [phase["held"] for _, phase in phases] == [{}, {"door": "handle"}]
+    assert list(states[0].name) == ["door.hinge", "door.knob", "door.handle_free"]
+    for name, expected in (("position", motion.at(times)), ("velocity", motion.velocity(times))):
+        values = [getattr(state, name) for state in states]
+        assert np.allclose(values, expected[:, motion.robot_size :], atol=1e-6)
+    phases = [(when, json.loads(message.data)["held"]) for when, message in found["/phases"]]
+    begins = [round(1e9 * motion.times[phase.first]) for phase in motion.phases]
+    assert phases == list(zip(begins, [{}, {"door": "handle"}], strict=True))
 
 
 def test_existing_folder_is_replaced_only_with_force(plan: Plan, tmp_path: Path) -> None:
     folder = plan.to_rosbag(tmp_path / "deep" / "bag")
-    before = sorted((file.name, file.read_bytes()) for file in folder.iterdir())
-    assert [name for name, _ in before] == [".vkc-pin.json", "bag.db3", "metadata.yaml"]
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    assert before.keys() == {".vkc-pin.json", "bag.db3", "metadata.yaml"}
     with expect_error("already exists"):
         plan.to_rosbag(folder, rate=10.0)
-    assert sorted((file.name, file.read_bytes()) for file in folder.iterdir()) == before
-    assert (
-        len(read_bag(plan.to_rosbag(folder, rate=10.0, force=True))["/vkc/base/path"][0][1].poses)
-        == 61
-    )
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+    ((_, path),) = read_bag(plan.to_rosbag(folder, rate=10.0, force=True))["/vkc/base/path"]
+    assert len(path.poses) == 61
     assert [file.name for file in folder.parent.iterdir()] == ["bag"]
 
 

@@ -15,16 +15,10 @@ from hypothesis import strategies as st
 
 from vkc_pin.world.files.meshes import MeshPart, make_bvh
 from vkc_pin.world.models.shapes import (
-    LIMIT_SLACK,
-    clamp_to_limits,
     compute_bounding_box,
     compute_clearance,
     compute_shape_distance,
     compute_world_box,
-    copy_shape,
-    get_link_name,
-    get_local_name,
-    list_placed_shapes,
     triangulate,
 )
 
@@ -99,43 +93,3 @@ def test_world_boxes_enclose_the_surface(seed: int) -> None:
         compute_bounding_box(pin.GeometryObject("s", 0, 0, placement, shape))[1]
     )
     assert (high - low <= diagonal + 1e-9).all()
-
-
-@pytest.mark.parametrize(
-    ("value", "expected"), [(0.5, 0.5), (1.0 + LIMIT_SLACK / 2, 1.0), (-LIMIT_SLACK / 2, 0.0)]
-)
-def test_rounding_errors_are_clamped(value: float, expected: float) -> None:
-    assert clamp_to_limits(value, 0.0, 1.0, "joint") == expected
-
-
-@pytest.mark.parametrize("value", [1.0 + 2 * LIMIT_SLACK, -1.0, np.nan, np.inf])
-def test_values_outside_limits_raise(value: float) -> None:
-    with expect_error(field="joint"):
-        clamp_to_limits(value, 0.0, 1.0, "joint")
-
-
-def test_copies_are_fixed_in_the_world() -> None:
-    pin.seed(0)
-    shape = pin.GeometryObject("arm_3", 4, 7, pin.SE3.Random(), coal.Sphere(0.1))
-    placement = pin.SE3(np.eye(3), np.array([1.0, 2.0, 3.0]))
-    copy = copy_shape(shape, "cup.arm_3", placement)
-    assert (copy.name, copy.parentJoint, copy.parentFrame, shape.name) == (
-        "cup.arm_3",
-        0,
-        0,
-        "arm_3",
-    )
-    assert copy.placement.isApprox(placement)
-    assert (
-        get_local_name(copy.name),
-        get_link_name(get_local_name(copy.name)),
-        get_link_name("upper_arm_link_12"),
-    ) == (
-        "arm_3",
-        "arm",
-        "upper_arm_link",
-    )
-    ((geometry, at),) = list_placed_shapes([copy])
-    assert compute_shape_distance(
-        geometry, at, coal.Sphere(0.1), pin.SE3.Identity()
-    ) == pytest.approx(np.sqrt(14) - 0.2)

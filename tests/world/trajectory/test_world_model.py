@@ -26,38 +26,6 @@ def sample_rows(world: World, seed: int, count: int = 1) -> np.ndarray:
     return sample_configurations(lower, upper, count, np.random.default_rng(seed))
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_frames_equal_those_of_robot_and_objects(world: World, seed: int) -> None:
-    scene, (z,) = world.scene, sample_rows(world, seed)
-    data = world.model.createData()
-    pin.framesForwardKinematics(world.model, data, world.coordinates.q(z))
-
-    def get_placement(name: str, kind: pin.FrameType) -> np.ndarray:
-        return data.oMf[world.model.getFrameId(name, kind)].homogeneous
-
-    robot, n, count = scene.robot, scene.robot.coordinates.size, 1
-    own_data = robot.model.createData()
-    pin.framesForwardKinematics(robot.model, own_data, robot.coordinates.q(z[:n]))
-    for index, frame in enumerate(robot.model.frames[1:], 1):
-        np.testing.assert_allclose(
-            get_placement(frame.name, frame.type), own_data.oMf[index].homogeneous, atol=1e-12
-        )
-        count += 1
-    for name, placed in scene.objects.items():
-        item, state = placed.object, z[n : n + placed.object.coordinates.size]
-        n += item.coordinates.size
-        own_data = item.model.createData()
-        pin.framesForwardKinematics(item.model, own_data, item.coordinates.q(state))
-        for index, frame in enumerate(item.model.frames[1:], 1):
-            expected = (placed.placement * own_data.oMf[index]).homogeneous
-            np.testing.assert_allclose(
-                get_placement(f"{name}.{frame.name}", frame.type), expected, atol=1e-12
-            )
-            count += 1
-    assert count == world.model.nframes
-    assert n == world.coordinates.size == world.model.nv
-
-
 @pytest.mark.parametrize("kind", ["collision", "visual"])
 def test_shapes_equal_those_of_robot_and_objects(world: World, kind: str) -> None:
     scene, (z,) = world.scene, sample_rows(world, 3)

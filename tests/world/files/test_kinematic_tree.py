@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.expected_errors import expect_error
 
@@ -66,9 +67,6 @@ def format_pair(kind: str = "fixed", inside: str = "") -> list[str]:
         ),
         (format_pair("hinge"), 4, "j: this joint type is not supported .*got hinge"),
         (format_pair("prismatic"), 4, "j: a prismatic joint without limits"),
-        (format_pair(inside='<origin xyz="nan 0 0"/>'), 4, "j: origin xyz: wrong numbers"),
-        (format_pair(inside='<origin rpy="0 0"/>'), 4, "j: origin rpy: wrong numbers"),
-        (format_pair(inside='<origin xyz="20000 0 0"/>'), 4, "expected at most 10000"),
         (format_pair("continuous", '<axis xyz="0 0 0"/>'), 4, "j: an axis without direction"),
         (
             format_pair("revolute", '<limit lower="1" upper="0" velocity="1"/>'),
@@ -96,13 +94,6 @@ def format_pair(kind: str = "fixed", inside: str = "") -> list[str]:
             "j: limit effort: effort limit out of range",
         ),
         (
-            format_pair(inside='<origin xyz="1,5 0 0"/>'),
-            4,
-            "j: origin xyz: wrong numbers .*3 finite numbers with spaces between them, got 1,5 0 0",
-        ),
-        (format_pair(inside='<origin xyz="0,5 0"/>'), 4, "origin xyz: wrong numbers"),
-        (format_pair(inside='<origin xyz="1,,2"/>'), 4, "origin xyz: wrong numbers"),
-        (
             format_pair("continuous", '<mimic joint="j" multiplier="twice"/>'),
             4,
             "j: mimic multiplier: wrong numbers .*got twice",
@@ -111,6 +102,20 @@ def format_pair(kind: str = "fixed", inside: str = "") -> list[str]:
             [*format_links("a"), '<xacro:wheel side="left"/>'],
             3,
             "xacro has not .*got <xacro:wheel>",
+        ),
+        *(
+            (format_pair(inside=f"<origin {text}/>"), 4, f"j: origin {message}")
+            for text, message in (
+                ('xyz="nan 0 0"', "xyz: wrong numbers"),
+                ('rpy="0 0"', "rpy: wrong numbers"),
+                ('xyz="20000 0 0"', "xyz: .*expected at most 10000"),
+                (
+                    'xyz="1,5 0 0"',
+                    "xyz: .*3 finite numbers with spaces between them, got 1,5 0 0",
+                ),
+                ('xyz="0,5 0"', "xyz: wrong numbers"),
+                ('xyz="1,,2"', "xyz: wrong numbers"),
+            )
         ),
     ],
 )
@@ -137,43 +142,37 @@ LARGE = ("1.7976931348623157e308", "3.4028235e38", "1e16", "2147483647", "10000"
 
 @pytest.mark.parametrize("large", LARGE)
 def test_huge_limits_count_as_unlimited(tmp_path: Path, large: str) -> None:
-    limit = f'<limit lower="-{large}" upper="{large}" velocity="1"/>'
-    model, _, _ = load_urdf(write_urdf(tmp_path, *format_pair("revolute", limit)))
-    assert model.nq == 2, "a continuous joint has cosine and sine"
-    model, _, _ = load_urdf(write_urdf(tmp_path, *format_pair("prismatic", limit)))
-    assert (model.lowerPositionLimit[0], model.upperPositionLimit[0]) == (-1e4, 1e4)
-    limit = f'<limit lower="-1" upper="{large}" velocity="1"/>'
-    model, _, _ = load_urdf(write_urdf(tmp_path, *format_pair("revolute", limit)))
-    assert (model.nq, *model.lowerPositionLimit, *model.upperPositionLimit) == (1, -1.0, 1e4)
-
-
-def test_fixed_joints_need_no_axis(tmp_path: Path) -> None:
-    assert read_urdf(write_urdf(tmp_path, *format_pair(inside='<axis xyz="0 0 0"/>'))).links == (
-        "a",
-        "b",
-    )
+    for kind, lower, nq in (
+        ("revolute", f"-{large}", 2),
+        ("prismatic", f"-{large}", 1),
+        ("revolute", "-1", 1),
+    ):
+        limit = f'<limit lower="{lower}" upper="{large}" velocity="1"/>'
+        model, _, _ = load_urdf(write_urdf(tmp_path, *format_pair(kind, limit)))
+        assert model.nq == nq  # a continuous joint has cosine and sine
+        if nq == 1:
+            assert model.lowerPositionLimit[0] == max(float(lower), -1e4)
+            assert model.upperPositionLimit[0] == 1e4
 
 
 def test_incomplete_limits_and_couplings_warn(tmp_path: Path) -> None:
-    limit = '<limit effort="1" velocity="1"/>'
-    with pytest.warns(UserWarning, match="thing.urdf:4: j: a limit without lower and upper"):
-        load_urdf(write_urdf(tmp_path, *format_pair("revolute", limit)))
-    with pytest.warns(UserWarning, match="thing.urdf:4: j: there is no joint 'k' to follow"):
-        read_urdf(write_urdf(tmp_path, *format_pair("continuous", '<mimic joint="k"/>')))
+    for read, kind, inside, message in (
+        (load_urdf, "revolute", '<limit velocity="1"/>', "a limit without lower and upper"),
+        (read_urdf, "continuous", '<mimic joint="k"/>', "there is no joint 'k' to follow"),
+    ):
+        with pytest.warns(UserWarning, match=f"thing.urdf:4: j: {message}"):
+            read(write_urdf(tmp_path, *format_pair(kind, inside)))
 
 
 def test_velocity_and_effort_limits_are_optional(tmp_path: Path) -> None:
+    """The axes of fixed joints have no effect."""
     lines = [
-        *format_links("a", "b", "c"),
+        *format_links("a", "b", "c", "d"),
         format_joint("k", "b", "c", kind="prismatic", inside='<limit upper="2" velocity="3"/>'),
+        format_joint("j", "a", "b", kind="revolute", inside='<limit lower="-1" upper="0.5"/>'),
+        format_joint("l", "c", "d", inside='<axis xyz="0 0 0"/>'),
     ]
-    model, _, _ = load_urdf(
-        write_urdf(
-            tmp_path,
-            *lines,
-            format_joint("j", "a", "b", kind="revolute", inside='<limit lower="-1" upper="0.5"/>'),
-        )
-    )
+    model, _, _ = load_urdf(write_urdf(tmp_path, *lines))
     assert list(model.names)[1:] == ["j", "k"]
     np.testing.assert_array_equal(model.velocityLimit, [np.inf, 3.0])
     np.testing.assert_array_equal(model.lowerPositionLimit, [-1.0, 0.0])
@@ -197,47 +196,37 @@ def test_extensions_are_ignored(tmp_path: Path, capfd: pytest.CaptureFixture[str
     assert not capfd.readouterr().err
 
 
+def load_inertia(folder: Path, inside: str) -> pin.Inertia:
+    """Return the inertia of a link that a joint moves."""
+    root, moving = format_links("r", "a")
+    inertial = f"<inertial>{inside}</inertial>"
+    lines = [moving.replace("</link>", f"{inertial}</link>"), root]
+    joint = format_joint("j", "r", "a", kind="continuous")
+    model, _, _ = load_urdf(write_urdf(folder, *lines, joint))
+    return model.inertias[1]
+
+
 @pytest.mark.parametrize(
-    ("inertial", "message"),
+    ("inside", "message"),
     [
-        ("<inertial/>", "2: a: an <inertial> without <mass>.*counts as none"),
-        (
-            '<inertial><mass value="1"/></inertial>',
-            "2: a: an <inertial> without <inertia>.*counts as none",
-        ),
-        (
-            '<inertial><mass value="heavy"/><inertia ixx="1"/></inertial>',
-            "a: mass value: wrong numbers .*got heavy.*counts as none",
-        ),
-        (
-            '<inertial><mass value="-3"/><inertia ixx="1"/></inertial>',
-            "2: a: a negative mass .*got -3.*counts as none",
-        ),
-        (
-            '<inertial><mass value="1e10"/><inertia ixx="1"/></inertial>',
-            "a: mass value: wrong numbers .*at most 1e.09, got 1e10.*counts as none",
-        ),
+        ("", "2: a: an <inertial> without <mass>"),
+        ('<mass value="1"/>', "2: a: an <inertial> without <inertia>"),
+        ('<mass value="heavy"/><inertia ixx="1"/>', "a: mass value: wrong numbers .*got heavy"),
+        ('<mass value="-3"/><inertia ixx="1"/>', "2: a: a negative mass .*got -3"),
+        ('<mass value="1e10"/><inertia ixx="1"/>', "a: mass value: .*at most 1e.09, got 1e10"),
     ],
 )
-def test_incomplete_inertials_warn(tmp_path: Path, inertial: str, message: str) -> None:
-    lines = [*format_links("r", "a"), format_joint("j", "r", "a", kind="continuous")]
-    lines[:2] = [lines[1].replace("</link>", f"{inertial}</link>"), lines[0]]
-    with pytest.warns(UserWarning, match=message):
-        model, _, _ = load_urdf(write_urdf(tmp_path, *lines))
-    assert model.inertias[1].mass == 0.0
+def test_incomplete_inertials_warn(tmp_path: Path, inside: str, message: str) -> None:
+    with pytest.warns(UserWarning, match=f"{message}.*counts as none"):
+        assert load_inertia(tmp_path, inside).mass == 0.0
 
 
 @pytest.mark.parametrize(("mass", "moment"), [(2e4, 400.0), (20.0, 4e5), (1e9, 1e9)])
 def test_large_masses_are_preserved(tmp_path: Path, mass: float, moment: float) -> None:
     moments = " ".join(f'{key}="{moment}"' for key in ("ixx", "iyy", "izz"))
-    inertial = f'<inertial><mass value="{mass}"/><inertia {moments}/></inertial>'
-    root, moving = format_links("r", "a")
-    lines = [root, moving.replace("</link>", f"{inertial}</link>")]
-    model, _, _ = load_urdf(
-        write_urdf(tmp_path, *lines, format_joint("j", "r", "a", kind="continuous"))
-    )
-    assert model.inertias[1].mass == mass
-    np.testing.assert_allclose(model.inertias[1].inertia, moment * np.eye(3))
+    inertia = load_inertia(tmp_path, f'<mass value="{mass}"/><inertia {moments}/>')
+    assert inertia.mass == mass
+    np.testing.assert_allclose(inertia.inertia, moment * np.eye(3))
 
 
 def test_unnamed_robots_are_named_after_their_file(tmp_path: Path) -> None:

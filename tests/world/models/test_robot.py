@@ -5,12 +5,12 @@ import dataclasses
 import coal
 import numpy as np
 import pinocchio as pin
-import pytest
 import trimesh
+from helpers.meshes import compute_excess
 from helpers.robots import compute_placement
 
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.robot_file import load_robot
+from vkc_pin.world.models.shapes import get_link_name
 
 ARM = [
     "shoulder_pan_joint",
@@ -20,11 +20,6 @@ ARM = [
     "wrist_2_joint",
     "wrist_3_joint",
 ]
-
-
-@pytest.fixture(scope="module")
-def husky() -> Robot:
-    return load_robot("husky_ur5e")
 
 
 def compute_ur5e(q: np.ndarray) -> np.ndarray:
@@ -62,26 +57,16 @@ def test_forward_kinematics_match_the_manufacturer(husky: Robot) -> None:
         base = pin.SE3(pin.rpy.rpyToMatrix(0, 0, z[2]), np.array([z[0], z[1], 0.0])).homogeneous
         foot = pin.SE3(np.eye(3), np.array([0.25, 0.0, 0.39])).homogeneous
         flange = base @ foot @ compute_ur5e(z[3:])
-        np.testing.assert_allclose(
-            compute_placement(husky, "tool0", z).homogeneous, flange, atol=1e-12
-        )
         tool = flange @ pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.142224])).homogeneous
-        np.testing.assert_allclose(
-            compute_placement(husky, husky.tool_frame, z).homogeneous, tool, atol=1e-12
-        )
+        for frame, expected in (("tool0", flange), (husky.tool_frame, tool)):
+            np.testing.assert_allclose(compute_placement(husky, frame, z), expected, atol=1e-12)
 
 
 def test_collision_shapes_enclose_the_links(husky: Robot) -> None:
     for link in husky.links:
-        shapes = [
-            shape
-            for shape in husky.collision.geometryObjects
-            if shape.name.rpartition("_")[0] == link
-        ]
-        assert all(
-            isinstance(shape.geometry, coal.Convex) and shape.geometry.num_points <= 40
-            for shape in shapes
-        )
+        shapes = [s for s in husky.collision.geometryObjects if get_link_name(s.name) == link]
+        assert all(isinstance(shape.geometry, coal.Convex) for shape in shapes)
+        assert all(shape.geometry.num_points <= 40 for shape in shapes)
         frame = husky.model.frames[husky.model.getFrameId(link)].placement
         visual = trimesh.util.concatenate(
             [shape.make_mesh() for shape in husky.file.read_shapes("visual") if shape.link == link]
@@ -94,26 +79,37 @@ def test_collision_shapes_enclose_the_links(husky: Robot) -> None:
         for shape in shapes:
             local = (points - shape.placement.translation) @ shape.placement.rotation
             hull = trimesh.convex.convex_hull(np.asarray(shape.geometry.points()))
-            planes = np.einsum("ij,ij->i", hull.face_normals, hull.triangles[:, 0])
-            outside = np.minimum(outside, (local @ hull.face_normals.T - planes).max(axis=1))
+            outside = np.minimum(outside, compute_excess(local, hull))
         assert outside.max() < 1e-6, link
 
 
 def test_front_is_the_foremost_corner_of_the_hand(husky: Robot) -> None:
     """Covers all corners of touch links; without touch links it is the tool frame."""
     frame = husky.model.frames[husky.model.getFrameId(husky.tool_frame)]
-    hand = [
-        s
-        for k, s in enumerate(husky.collision.geometryObjects)
-        if husky.link_of(k) in husky.touch_links
-    ]
     ahead = [
-        frame.placement.actInv(s.placement).act(point)[2]
-        for s in hand
-        for point in s.geometry.points()
+        frame.placement.actInv(shape.placement).act(point)[2]
+        for k, shape in enumerate(husky.collision.geometryObjects)
+        if husky.link_of(k) in husky.touch_links
+        for point in shape.geometry.points()
     ]
     np.testing.assert_allclose(husky.front.translation, [0.0, 0.0, max(ahead)], rtol=0.0, atol=1e-6)
     np.testing.assert_array_equal(husky.front.rotation, np.eye(3))
     np.testing.assert_array_equal(
         dataclasses.replace(husky, touch_links=()).front.homogeneous, np.eye(4)
     )
+
+
+def test_joint_placements_are_rounded(husky: Robot) -> None:
+    for joint in husky.model.jointPlacements:
+        for entry in np.asarray(joint.homogeneous).ravel():
+            assert entry in (0.0, 1.0, -1.0) or abs(entry) > 1e-3
+
+
+def test_visual_geometry_is_simplified_and_coloured(husky: Robot) -> None:
+    shapes = husky.visual.geometryObjects
+    triangles = sum(
+        shape.geometry.num_tris for shape in shapes if isinstance(shape.geometry, coal.BVHModelBase)
+    )
+    assert 10_000 < triangles < 100_000
+    assert all(shape.meshPath == "" for shape in shapes)
+    assert len({tuple(shape.meshColor.round(3)) for shape in shapes}) > 5

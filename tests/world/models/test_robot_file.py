@@ -14,7 +14,6 @@ from helpers.expected_errors import expect_error
 from helpers.robots import compute_placement, write_small_urdf
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import find_robot, load_robot
 
 
@@ -43,11 +42,6 @@ def test_invalid_robot_yaml_raises_with_its_line(
     assert caught.value.file is not None
     if line is not None:
         assert (caught.value.file, caught.value.line) == (tmp_path / "robot.yaml", line)
-
-
-@pytest.fixture(scope="module")
-def husky() -> Robot:
-    return load_robot("husky_ur5e")
 
 
 def test_base_types() -> None:

@@ -18,11 +18,6 @@ from vkc_pin.world.models.self_collisions import (
 SRDF = resources.find_resource_folder("robots") / "husky_ur5e" / "husky_ur5e.srdf"
 
 
-@pytest.fixture(scope="module")
-def husky() -> Robot:
-    return load_robot("husky_ur5e")
-
-
 def test_committed_srdf_matches_sampling(husky: Robot) -> None:
     assert (
         sample_allowed_pairs(husky, samples=3000, seed=7)

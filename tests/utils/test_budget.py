@@ -16,6 +16,7 @@ from vkc_pin.utils.budget import (
     reserve_time,
     suspend_budget,
 )
+from vkc_pin.utils.interrupt import defer_interrupt, raise_on_interrupt
 
 
 @pytest.fixture(autouse=True)
@@ -99,3 +100,41 @@ def test_time_is_reserved_for_validation(monkeypatch: pytest.MonkeyPatch) -> Non
     assert budget.stop_status == ""
     budget.is_interrupted = True
     assert budget.stop_status == "interrupted"
+
+
+def test_interrupts_are_deferred() -> None:
+    done = []
+    with pytest.raises(KeyboardInterrupt), raise_on_interrupt(), defer_interrupt():  # noqa: PT012
+        press_ctrl_c()
+        press_ctrl_c()
+        done.append("all")
+    assert done == ["all"]
+
+
+def test_deferred_interrupts_reach_the_budget() -> None:
+    with Budget().activate() as budget, defer_interrupt():
+        press_ctrl_c()
+        assert not budget.is_interrupted
+    assert budget.is_interrupted
+
+
+def test_ignored_interrupts_stay_ignored() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with Budget().activate() as budget, raise_on_interrupt(), defer_interrupt():
+            press_ctrl_c()
+        assert not budget.is_interrupted
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_interrupts_raise_on_request() -> None:
+    received: list[int] = []
+    previous = signal.signal(signal.SIGINT, lambda number, frame: received.append(number))
+    try:
+        with pytest.raises(KeyboardInterrupt), raise_on_interrupt():
+            press_ctrl_c()
+        press_ctrl_c()
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    assert received == [signal.SIGINT]

@@ -20,10 +20,6 @@ def test_door_properties() -> None:
     assert door.coordinates.names == ("hinge", "knob")
     assert (door.base_link, door.links) == ("frame", ("frame", "panel", "lever"))
     assert not door.free
-    np.testing.assert_array_equal(
-        [door.lower, door.upper, door.velocity, door.acceleration],
-        [[-1.57, 0.0], [1.57, 0.8], [1.0, 2.0], [1.0, 4.0]],
-    )
     assert door.latches == (Latch("hinge", 0.0, "knob", 0.5, 0.05),)
     assert list(door.attachments) == ["handle", "handle_free", "push", "push_back"]
     assert door.attachment() is door.attachment("handle")

@@ -72,26 +72,6 @@ def test_configurations_round_trip(seed: int) -> None:
     np.testing.assert_allclose((body.inverse() * lid).rotation, expected, atol=1e-12)
 
 
-@pytest.mark.parametrize("angle", [0.1, 2.0, np.pi - 1e-6])
-def test_quaternions_interpolate_about_one_axis(angle: float) -> None:
-    """The midpoint of a linear interpolation is at half the angle."""
-    model, rng = make_mixed_model(), np.random.default_rng(0)
-    coordinates, data = Coordinates(model), model.createData()
-    axis = rng.normal(size=3)
-    axis /= np.linalg.norm(axis)
-    pin.seed(0)
-    first = pin.SE3.Random()
-    second = pin.SE3(first.rotation @ pin.exp3(angle * axis), first.translation + 1.0)
-    ends = np.zeros((2, coordinates.size))
-    ends[:, 4:11] = [pin.SE3ToXYZQUAT(first), pin.SE3ToXYZQUAT(second)]
-    if ends[0, 7:11] @ ends[1, 7:11] < 0.0:  # take the nearer of the two quaternions
-        ends[1, 7:11] *= -1.0
-    pin.forwardKinematics(model, data, coordinates.q(ends.mean(axis=0)))
-    np.testing.assert_allclose(data.oMi[3].translation, first.translation + 0.5, atol=1e-12)
-    turn = pin.log3(first.rotation.T @ data.oMi[3].rotation)
-    np.testing.assert_allclose(turn, 0.5 * angle * axis, atol=1e-6)
-
-
 def test_symbolic_configurations_match_numeric_ones() -> None:
     model = pin.Model()
     base = model.addJoint(0, pin.JointModelPlanar(), pin.SE3.Identity(), "base")

@@ -12,15 +12,6 @@ from helpers.robots import compute_placement
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import get_link_name
 
-ARM = [
-    "shoulder_pan_joint",
-    "shoulder_lift_joint",
-    "elbow_joint",
-    "wrist_1_joint",
-    "wrist_2_joint",
-    "wrist_3_joint",
-]
-
 
 def compute_ur5e(q: np.ndarray) -> np.ndarray:
     """Compute forward kinematics with the Denavit-Hartenberg parameters of the manufacturer."""
@@ -35,19 +26,6 @@ def compute_ur5e(q: np.ndarray) -> np.ndarray:
             [0, 0, 0, 1],
         ]
     return total
-
-
-def test_coordinates_and_limits_of_husky(husky: Robot) -> None:
-    assert husky.coordinates.names == ("base_x", "base_y", "base_yaw", *ARM)
-    assert husky.model.names[1] == "base"
-    assert husky.model.joints[1].shortname() == "JointModelPlanar"
-    turn = 2.0 * np.pi
-    np.testing.assert_allclose(husky.upper, [20, 20, np.inf, turn, turn, np.pi, turn, turn, turn])
-    np.testing.assert_allclose(husky.lower, -husky.upper)
-    np.testing.assert_allclose(husky.velocity, [1, 1, 2, *[np.pi] * 6])
-    np.testing.assert_allclose(husky.acceleration, [3, 3, 6, *[1.4] * 6])
-    np.testing.assert_allclose(husky.home, [1.57, -0.8678, -2.2043, -0.0347, 1.6315, 0])
-    assert husky.touch_links == ("gripper_link", "gripper_left_finger", "gripper_right_finger")
 
 
 def test_forward_kinematics_match_the_manufacturer(husky: Robot) -> None:

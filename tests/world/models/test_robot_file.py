@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -14,6 +14,7 @@ from helpers.expected_errors import expect_error
 from helpers.robots import compute_placement, write_small_urdf
 
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import find_robot, load_robot
 
 
@@ -44,26 +45,26 @@ def test_invalid_robot_yaml_raises_with_its_line(
         assert (caught.value.file, caught.value.line) == (tmp_path / "robot.yaml", line)
 
 
-def test_base_types() -> None:
+def test_base_types(tmp_path: Path) -> None:
     fixed = load_robot("husky_ur5e", base="fixed")
     np.testing.assert_array_equal(fixed.lower[:3], fixed.upper[:3])
     assert load_robot("husky_ur5e", base="differential").base == "differential"
-    with expect_error("base"):
-        load_robot("husky_ur5e", base="wheels")  # type: ignore[arg-type]
-
-
-def test_wheels_and_turning_radius(tmp_path: Path) -> None:
     husky = load_robot("husky_ur5e", base="ackermann", turning_radius=0.8)
     assert husky.turning_radius == 0.8
     assert husky.wheels is not None
     assert husky.wheels.rim_speed == pytest.approx(husky.wheels.radius * husky.wheels.speed)
     file = write_small_urdf(tmp_path)
-    for arguments, expected in (
-        ({"base": "ackermann"}, "turning_radius"),
-        ({"base": "ackermann", "turning_radius": -1.0}, "> 0"),
-        ({"base": "differential", "turning_radius": 1.0}, "or base='ackermann'"),
+    for arguments, field, message in (
+        ({"base": "wheels"}, "base", "omni"),
+        ({"base": "ackermann"}, "turning_radius", "turning_radius"),
+        ({"base": "ackermann", "turning_radius": -1.0}, "turning_radius", "> 0"),
+        (
+            {"base": "differential", "turning_radius": 1.0},
+            "turning_radius",
+            "or base='ackermann'",
+        ),
     ):
-        with expect_error(expected, field="turning_radius"):
+        with expect_error(message, field=field):
             load_robot(file, **arguments)  # type: ignore[arg-type]
     (tmp_path / "robot.yaml").write_text("urdf: small.urdf\nbase: {turning_radius: 1.2}\n")
     assert load_robot(file, base="ackermann").turning_radius == 1.2
@@ -71,7 +72,7 @@ def test_wheels_and_turning_radius(tmp_path: Path) -> None:
     assert load_robot(file, base="differential").turning_radius == 0.0
 
 
-def test_locked_joints_and_tool_frame() -> None:
+def test_locked_joints_and_tool_frame(husky: Robot) -> None:
     robot = load_robot("husky_ur5e", tool_frame="wrist_2_link", locked_joints={"elbow_joint": -1.5})
     assert robot.coordinates.names[3:] == (
         "shoulder_pan_joint",
@@ -79,13 +80,10 @@ def test_locked_joints_and_tool_frame() -> None:
         "wrist_1_joint",
         "wrist_2_joint",
     )
-    whole = load_robot("husky_ur5e")
     arm = np.array([0.3, -1.0, -1.5, 0.4, 0.2, 0.0])
     found = compute_placement(robot, "tool", np.concatenate([np.zeros(3), arm[[0, 1, 3, 4]]]))
-    expected = compute_placement(whole, "tool", np.concatenate([np.zeros(3), arm]))
+    expected = compute_placement(husky, "tool", np.concatenate([np.zeros(3), arm]))
     assert found.isApprox(expected, 1e-12)
-    with expect_error(nearest="elbow_joint"):
-        load_robot("husky_ur5e", locked_joints={"elbow": 0.0})
 
 
 @pytest.mark.parametrize(
@@ -102,21 +100,17 @@ def test_robots_of_example_robot_data_can_be_loaded(name: str, tool: str, joints
 
 
 def test_defaults_of_a_urdf(tmp_path: Path) -> None:
-    wheel = (
+    """Joints off the path to the tool are left out; a follower limits its leader."""
+    joints = (
         '<joint name="wheel" type="continuous"><parent link="l0"/><child link="w"/></joint>'
         '<joint name="follower" type="revolute">'
         '<parent link="l3"/><child link="f"/><mimic joint="j0"/>'
         '<limit lower="-1" upper="1" velocity="1" effort="1"/></joint>'
     )
-    robot = load_robot(
-        write_small_urdf(tmp_path, joints=wheel, links='<link name="w"/><link name="f"/>'),
-        pairs="all",
-    )
+    links = '<link name="w"/><link name="f"/>'
+    robot = load_robot(write_small_urdf(tmp_path, joints=joints, links=links), pairs="all")
     assert robot.coordinates.names[3:] == ("j0", "j1", "j2")
-    assert robot.name == "small"
-    np.testing.assert_allclose(
-        robot.velocity, [1, 1, 2, 1.0, 1.5, 1.5]
-    )  # the first is limited by its follower
+    np.testing.assert_allclose(robot.velocity, [1, 1, 2, 1.0, 1.5, 1.5])
     np.testing.assert_allclose(robot.acceleration, [3, 3, 6, 1.4, 1.4, 1.4])
     np.testing.assert_array_equal(
         robot.model.jointPlacements[3].rotation, [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
@@ -130,17 +124,10 @@ def test_robot_yaml_beside_the_urdf_is_used(tmp_path: Path) -> None:
         "joints: {j2: {velocity: 0.2, acceleration: 9}}\n"
     )
     robot = load_robot(file, pairs="all")
-    assert (robot.tool_frame, robot.home.tolist(), robot.velocity[5], robot.acceleration[5]) == (
-        "l3",
-        [0.0, 0.5, 0.0],
-        0.2,
-        9.0,
-    )
-    assert load_robot(tmp_path / "robot.yaml", pairs="all", home={"j1": -1.0}).home.tolist() == [
-        0.0,
-        -1.0,
-        0.0,
-    ]
+    assert (robot.tool_frame, robot.home.tolist()) == ("l3", [0.0, 0.5, 0.0])
+    assert (robot.velocity[5], robot.acceleration[5]) == (0.2, 9.0)
+    moved = load_robot(tmp_path / "robot.yaml", pairs="all", home={"j1": -1.0})
+    assert moved.home.tolist() == [0.0, -1.0, 0.0]
 
 
 def test_robots_are_named_after_folder_or_file(tmp_path: Path) -> None:
@@ -150,16 +137,18 @@ def test_robots_are_named_after_folder_or_file(tmp_path: Path) -> None:
         assert load_robot(tmp_path / name, pairs="all").name == expected
 
 
-def test_unknown_names_raise() -> None:
-    for call, nearest in (
-        (lambda: load_robot("husky_ur5"), "husky_ur5e"),
-        (lambda: load_robot("pandas"), "panda"),
-        (lambda: load_robot("husky_ur5e", tool_frame="tol"), "tool"),
-    ):
-        with expect_error(nearest=nearest):
-            call()
-    with expect_error("this robot file does not exist"):
-        load_robot("nowhere/robot.urdf")
+@pytest.mark.parametrize(
+    ("name", "arguments", "nearest"),
+    [
+        ("husky_ur5", {}, "husky_ur5e"),
+        ("pandas", {}, "panda"),
+        ("husky_ur5e", {"tool_frame": "tol"}, "tool"),
+        ("husky_ur5e", {"locked_joints": {"elbow": 0.0}}, "elbow_joint"),
+    ],
+)
+def test_unknown_names_raise(name: str, arguments: dict[str, Any], nearest: str) -> None:
+    with expect_error(nearest=nearest):
+        load_robot(name, **arguments)
 
 
 def test_invalid_files_raise(tmp_path: Path) -> None:
@@ -198,46 +187,46 @@ def test_positions_outside_limits_raise(tmp_path: Path, field: str, joint: str) 
 
 
 def write_driving_urdf(
-    folder: Path, *, order: str = "xyt", shape: bool = False, tilted: bool = False
+    folder: Path, *, order: str = "xyt", shape: str = "", tilt: float = 0.0
 ) -> Path:
     """Write the small robot on a planar base of joints and empty links, as in simulators."""
-    file, names = write_small_urdf(folder), ["world", "m0", "m1", "l0"]
+    names = ["world", "m0", "m1", "l0"]
     axes = {"x": "1 0 0", "y": "0 1 0", "t": "0 0 1"}
-    solid = "<collision><geometry><sphere radius='1'/></geometry></collision>"
-    parts = [f'<link name="{name}"/>' for name in names[:2]]
-    parts.append(f'<link name="m1">{solid if shape else ""}</link>')
-    for k, letter in enumerate(order):
-        kind = "continuous" if letter == "t" else "prismatic"
-        parts.append(
-            f'<joint name="drive_{k}" type="{kind}"><parent link="{names[k]}"/>'
-            f'<child link="{names[k + 1]}"/><origin rpy="{0.3 * (tilted and not k)} 0 0"/>'
-            f'<axis xyz="{axes[letter]}"/><limit lower="-9" upper="9"/></joint>'
-        )
-    file.write_text(file.read_text().replace("</robot>", f"{''.join(parts)}</robot>"))
-    return file
+    links = f'<link name="world"/><link name="m0"/><link name="m1">{shape}</link>'
+    joints = "".join(
+        f'<joint name="drive_{k}" type="{"continuous" if letter == "t" else "prismatic"}">'
+        f'<parent link="{names[k]}"/><child link="{names[k + 1]}"/>'
+        f'<origin rpy="{0.0 if k else tilt} 0 0"/>'
+        f'<axis xyz="{axes[letter]}"/><limit lower="-9" upper="9"/></joint>'
+        for k, letter in enumerate(order)
+    )
+    return write_small_urdf(folder, links=links, joints=joints)
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("order", ["xyt", "yxt", "txy", "xty"])
 def test_planar_bases_in_the_urdf_are_locked(tmp_path: Path, order: str) -> None:
     file = write_driving_urdf(tmp_path, order=order)
     with pytest.warns(UserWarning, match=r"small.urdf: the .* locked: drive_0, drive_1, drive_2$"):
         robot = load_robot(file)
     assert robot.coordinates.names == ("base_x", "base_y", "base_yaw", "j0", "j1", "j2")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")  # no warning if their positions are given
-        load_robot(file, locked_joints={f"drive_{k}": 0.0 for k in range(3)})
+    # There is no warning if their positions are given.
+    load_robot(file, locked_joints={f"drive_{k}": 0.0 for k in range(3)})
     assert len(load_robot(file, base="fixed").home) == 6
     plain, z = load_robot(write_small_urdf(tmp_path)), np.array([0.3, -0.2, 1.0, 0.5, -0.4, 0.3])
     assert compute_placement(robot, "l3", z).isApprox(compute_placement(plain, "l3", z), 1e-12)
 
 
+SHAPE = "<collision><geometry><sphere radius='1'/></geometry></collision>"
+
+
 @pytest.mark.parametrize(
     "change",
-    [{"shape": True}, {"tilted": True}, {"order": "xxt"}, {"order": "xyx"}, {"order": "ttx"}],
+    [{"shape": SHAPE}, {"tilt": 0.3}, {"order": "xxt"}, {"order": "xyx"}, {"order": "ttx"}],
 )
-def test_other_joints_are_not_a_planar_base(tmp_path: Path, change: dict[str, object]) -> None:
+def test_other_joints_are_not_a_planar_base(tmp_path: Path, change: dict[str, Any]) -> None:
     """Collision shapes, non-horizontal axes or parallel axes exclude a planar base."""
-    assert len(load_robot(write_driving_urdf(tmp_path, **change)).coordinates.names) == 9  # type: ignore[arg-type]
+    assert len(load_robot(write_driving_urdf(tmp_path, **change)).coordinates.names) == 9
 
 
 def test_height_of_the_root_link(tmp_path: Path) -> None:
@@ -251,8 +240,8 @@ def test_height_of_the_root_link(tmp_path: Path) -> None:
         for frame in ("l0", "l3"):
             expected = raised * compute_placement(low, frame, z)
             assert compute_placement(robot, frame, z).isApprox(expected, 1e-12)
-        shape, other = (one.collision.geometryObjects[0] for one in (robot, low))
-        assert shape.placement.isApprox(raised * other.placement, 1e-12)
+        shape, other = (one.collision.geometryObjects[0].placement for one in (robot, low))
+        assert shape.isApprox(raised * other, 1e-12)
     with expect_error("height"):
         load_robot(file, height=float("nan"))
 

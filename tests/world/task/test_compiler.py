@@ -22,6 +22,7 @@ from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actuation import find_shared_coordinate
 from vkc_pin.world.task.compiler import LATCH_MARGIN, compile_task
+from vkc_pin.world.task.lookup import find_path_joints
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Reach, Step
 
@@ -263,3 +264,24 @@ def test_unused_initial_hold_is_dropped_if_another_moves_the_same_joints() -> No
         assert task.state == {"door.hinge": 0.4}
         assert all(phase.initial_values == {"door.hinge": 0.4} for phase in task.phases)
         assert task.phases[0].released == (HANDLE,)
+
+
+def test_path_joints_move_the_attachment() -> None:
+    """Compares with the displacement of the frame by each joint in Pinocchio."""
+    for placed in make_full_scene().objects.values():
+        model, base = placed.object.model, placed.object.coordinates.q(placed.state)
+        for attachment in placed.object.attachments.values():
+            frame, moving = model.getFrameId(attachment.link, pin.FrameType.BODY), []
+            for index, name in enumerate(placed.object.coordinates.names):
+                state = placed.state.copy()
+                state[index] += 0.1
+                data, other = model.createData(), model.createData()
+                pin.framesForwardKinematics(model, data, base)
+                pin.framesForwardKinematics(model, other, placed.object.coordinates.q(state))
+                if not data.oMf[frame].isApprox(other.oMf[frame], 1e-9):
+                    moving.append(name)
+            assert sorted(find_path_joints(placed, attachment)) == sorted(moving)
+    cabinet = make_full_scene().objects["cabinet"]
+    assert find_path_joints(cabinet, cabinet.object.attachments["grip"]) == ["swing", "slide"], (
+        "base first"
+    )

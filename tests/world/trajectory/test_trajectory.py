@@ -67,18 +67,6 @@ def test_invalid_times_are_rejected(time: Any) -> None:
             evaluate(time)
 
 
-def test_trajectories_survive_a_round_trip_through_data() -> None:
-    motion = make_example_trajectory(positions=np.random.default_rng(0).normal(size=ROWS.shape))
-    again = Trajectory.from_dict(json.loads(json.dumps(motion.to_dict())))
-    np.testing.assert_array_equal(again.positions, motion.positions)
-    np.testing.assert_array_equal(again.times, motion.times)
-    assert (again.names, again.phases, again.robot_size) == (
-        motion.names,
-        motion.phases,
-        motion.robot_size,
-    )
-
-
 def test_indirect_holds_survive_a_round_trip_through_data() -> None:
     held, by = {"stick": "grip", "ball": "pull"}, {"ball": "stick.tip"}
     phases = (PhaseSpan("reach", 0, 2), PhaseSpan("carry", 2, 3, make_holds(held, by)))
@@ -127,3 +115,24 @@ def test_missing_fields_are_rejected(key: str) -> None:
 def test_invalid_fields_are_rejected(field: str, changes: dict[str, Any]) -> None:
     with expect_error(field=field):
         make_example_trajectory(**changes)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "field"),
+    [
+        ({"first": -1}, "PhaseSpan.first"),
+        ({"name": 3}, "PhaseSpan.name"),
+        ({"opening": -0.1}, "PhaseSpan.opening"),
+        ({"opening": "wide"}, "PhaseSpan.opening"),
+    ],
+)
+def test_invalid_phases_are_rejected(wrong: dict[str, Any], field: str) -> None:
+    with expect_error(field=field):
+        PhaseSpan.from_dict({**PhaseSpan("go", 0, 4).to_dict(), **wrong}, "phases[0]")
+
+
+def test_missing_fields_of_phases_are_named() -> None:
+    with expect_error("held: this is missing from a trajectory"):
+        PhaseSpan.from_dict({"name": "go", "first": 0, "last": 1}, "phases[0]")
+    with expect_error(r"phases\[3\]"):
+        PhaseSpan.from_dict("go", "phases[3]")

@@ -15,6 +15,7 @@ from vkc_pin.world.collision import distances as distances_module
 from vkc_pin.world.collision.boxes import Boxes
 from vkc_pin.world.collision.distances import Clearances, MarginRegion, Margins, Shapes
 from vkc_pin.world.collision.solids import ShapePlacements
+from vkc_pin.world.models.shapes import compute_shape_distance
 
 SEEDS = st.integers(0, 2**32 - 1)
 MOVING, FIXED, STATES, WAYPOINTS = 6, 7, 10, 5
@@ -33,26 +34,18 @@ class Room:
         for k, joint in enumerate((pin.JointModelPlanar, pin.JointModelRZ, pin.JointModelRX)):
             parent = self.model.addJoint(parent, joint(), sample_placement(rng, 0.3), f"j{k}")
         self.halves = rng.uniform(0.02, 0.2, (MOVING + FIXED, 3))
-        self.shapes = [coal.Box(*(2 * half)) for half in self.halves]
-        for k in range(MOVING):
-            joint = 1 + int(rng.integers(3))
-            self.geometry.addGeometryObject(
-                pin.GeometryObject(f"s{k}", joint, 0, sample_placement(rng, 0.2), self.shapes[k])
-            )
-        self.joints = np.array(
-            [*(s.parentJoint for s in self.geometry.geometryObjects), *[0] * FIXED]
-        )
+        self.solids = [coal.Box(*(2 * half)) for half in self.halves]
+        for k, solid in enumerate(self.solids[:MOVING]):
+            joint, at = 1 + int(rng.integers(3)), sample_placement(rng, 0.2)
+            self.geometry.addGeometryObject(pin.GeometryObject(f"s{k}", joint, 0, at, solid))
         self.fixed = [sample_placement(rng, 0.6) for _ in range(FIXED)]
         self.pairs = np.array(
             [(a, b) for a, b in itertools.combinations(range(MOVING + FIXED), 2) if a < MOVING]
         )
         self.default_margins = rng.choice([0.0, 0.02, 0.1], len(self.pairs))
-        self.q = np.array(
-            [
-                pin.integrate(self.model, pin.neutral(self.model), rng.normal(size=5))
-                for _ in range(STATES)
-            ]
-        )
+        self.q = pin.neutral(self.model) * np.ones((STATES, 1))
+        for row in self.q:
+            row[:] = pin.integrate(self.model, row, rng.normal(size=5))
         self.z, self.waypoints = rng.normal(size=(STATES, 2)), rng.integers(0, WAYPOINTS, STATES)
         reduced = {int(pair): [(1, 3, -0.05)] for pair in rng.permutation(len(self.pairs))[:8]}
         exempt = MarginRegion(
@@ -64,44 +57,70 @@ class Room:
         )
         self.margins = Margins(self.default_margins, reduced, [exempt])
 
-    def make_clearances(self) -> Clearances:
-        placed = [*(shape.placement for shape in self.geometry.geometryObjects), *self.fixed]
+    def make_boxes(self) -> Boxes:
+        moving = self.geometry.geometryObjects
+        joints = np.array([*(shape.parentJoint for shape in moving), *[0] * FIXED])
+        placed = [*(shape.placement for shape in moving), *self.fixed]
         rotations = np.array([placement.rotation for placement in placed])
         centers = np.array([placement.translation for placement in placed])
-        shapes = Shapes(self.shapes, self.fixed, threads=4)
-        boxes = Boxes(self.joints, rotations, centers, self.halves, self.pairs)
-        return Clearances(ShapePlacements(self.model, self.geometry), boxes, shapes, self.margins)
+        return Boxes(joints, rotations, centers, self.halves, self.pairs)
+
+    def make_clearances(self) -> Clearances:
+        shapes = Shapes(self.solids, self.fixed, threads=4)
+        placements = ShapePlacements(self.model, self.geometry)
+        return Clearances(placements, self.make_boxes(), shapes, self.margins)
+
+    def compute_distances(self) -> np.ndarray:
+        """Return the distances of all pairs at all states, shape (STATES, P) [m]."""
+        data, placed = self.model.createData(), pin.GeometryData(self.geometry)
+        distances = np.empty((STATES, len(self.pairs)))
+        for state, q in enumerate(self.q):
+            pin.updateGeometryPlacements(self.model, data, self.geometry, placed, q)
+            at = [*placed.oMg, *self.fixed]
+            for k, (a, b) in enumerate(self.pairs.tolist()):
+                distances[state, k] = compute_shape_distance(
+                    self.solids[a], at[a], self.solids[b], at[b]
+                )
+        return distances
 
     def list_close_pairs(
         self, reach: float, include_fixed: bool
     ) -> list[list[tuple[float, float, int, float]]]:
         """Return (distance − margin, distance, pair, margin) of close pairs, sorted, by state."""
-        data, placed, found = self.model.createData(), pin.GeometryData(self.geometry), []
-        pairs = np.arange(len(self.pairs))
-        for state, q in enumerate(self.q):
-            pin.updateGeometryPlacements(self.model, data, self.geometry, placed, q)
-            placements, rows = [*placed.oMg, *self.fixed], []
-            margins = self.margins.compute_margins(
-                pairs,
-                np.full(len(pairs), self.waypoints[state]),
-                self.z,
-                np.full(len(pairs), state),
-            )
-            for k, (a, b) in enumerate(self.pairs.tolist()):
-                request, result = coal.DistanceRequest(), coal.DistanceResult()
-                transforms = [
-                    coal.Transform3s(placements[i].rotation, placements[i].translation)
-                    for i in (a, b)
-                ]
-                distance = coal.distance(
-                    self.shapes[a], transforms[0], self.shapes[b], transforms[1], request, result
-                )
-                if distance < reach and margins[k] > -np.inf and (include_fixed or b < MOVING):
-                    rows.append(
-                        (float(distance - margins[k]), float(distance), k, float(margins[k]))
-                    )
-            found.append(sorted(rows))
+        found, pairs = [], np.arange(len(self.pairs))
+        for state, distances in enumerate(self.compute_distances()):
+            waypoints, states = (np.full(len(pairs), k) for k in (self.waypoints[state], state))
+            margins = self.margins.compute_margins(pairs, waypoints, self.z, states)
+            close = (distances < reach) & (margins > -np.inf)
+            close &= include_fixed | (self.pairs[:, 1] < MOVING)
+            rows = (distances - margins, distances, pairs, margins)
+            found.append(sorted(zip(*(row[close].tolist() for row in rows), strict=True)))
         return found
+
+
+@settings(max_examples=25, deadline=None)
+@given(SEEDS, st.sampled_from([0.0, 0.02, 0.3, 10.0]), st.booleans())
+def test_close_boxes_match_an_exhaustive_search(seed: int, reach: float, with_fixed: bool) -> None:
+    """No pair of close boxes is missed, and bounds are lower bounds of distances."""
+    room = Room(seed)
+    rotations, translations = (np.empty((STATES, 4, 3, *more)) for more in ((3,), ()))
+    for state, q in enumerate(room.q):
+        data = room.model.createData()
+        pin.forwardKinematics(room.model, data, q)
+        for joint, placement in enumerate(data.oMi):
+            rotations[state, joint] = placement.rotation
+            translations[state, joint] = placement.translation
+    rows, found, bounds = room.make_boxes().find_close_pairs(
+        reach, rotations, translations, include_fixed=with_fixed
+    )
+    assert (np.diff(rows * len(room.pairs) + found) > 0).all(), "not strictly sorted"
+    assert (bounds < reach).all()
+    included = with_fixed | (room.pairs[:, 1] < MOVING)
+    assert included[found].all()
+    distances = room.compute_distances()
+    assert (bounds <= distances[rows, found] + 1e-6).all()
+    close = (distances < reach - 1e-6) & included
+    assert set(zip(*np.nonzero(close), strict=True)) <= set(zip(rows, found, strict=True))
 
 
 @settings(max_examples=25, deadline=None)
@@ -127,14 +146,8 @@ def test_closest_pairs_match_an_exhaustive_search(
                 include_fixed=include_fixed,
             )
             slack = found.distance - found.margin
-            actual = zip(
-                *(
-                    part.tolist()
-                    for part in (found.row, slack, found.distance, found.pair, found.margin)
-                ),
-                strict=True,
-            )
-            assert [*actual] == expected
+            parts = found.row, slack, found.distance, found.pair, found.margin
+            assert list(zip(*(part.tolist() for part in parts), strict=True)) == expected
             projections = np.einsum("ci,ci->c", found.normal, found.second - found.first)
             np.testing.assert_allclose(projections, found.distance, atol=1e-6)
 
@@ -152,16 +165,10 @@ def test_first_violation_matches_an_exhaustive_search(
         for state in order
     ]
     expected = hit.index(True) if True in hit else STATES
-    actual = room.make_clearances().find_first_violation(
-        room.q[order], room.z[order], waypoint, reach=reach, allowed=allowed
-    )
-    assert actual == expected
-    assert (
-        room.make_clearances().find_first_violation(
-            room.q[:0], room.z[:0], waypoint, reach=reach, allowed=allowed
-        )
-        == 0
-    )
+    clearances, limits = room.make_clearances(), {"reach": reach, "allowed": allowed}
+    for rows, first in ((order, expected), (order[:0], 0)):
+        actual = clearances.find_first_violation(room.q[rows], room.z[rows], waypoint, **limits)
+        assert actual == first
 
 
 def test_fixed_shapes_can_be_moved() -> None:
@@ -171,21 +178,13 @@ def test_fixed_shapes_can_be_moved() -> None:
     boxes = before.boxes.move_fixed(moved, placement.rotation[None], placement.translation[None])
     after = before.move_fixed(boxes, {MOVING + 2: placement})
     room.fixed[2] = placement
-    for actual, expected in zip(
-        *(
-            c.find_closest_pairs(room.q, room.z, room.waypoints, reach=0.3)
-            for c in (after, room.make_clearances())
-        ),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(actual, expected)
-    unmoved = (
-        Room(4).make_clearances().find_closest_pairs(room.q, room.z, room.waypoints, reach=0.3)
-    )
-    np.testing.assert_array_equal(
-        before.find_closest_pairs(room.q, room.z, room.waypoints, reach=0.3).distance,
-        unmoved.distance,
-    )
+    unmoved, fresh = Room(4).make_clearances(), room.make_clearances()
+    for one, other in ((after, fresh), (before, unmoved)):
+        found, expected = (
+            clearances.find_closest_pairs(room.q, room.z, room.waypoints, reach=0.3)
+            for clearances in (one, other)
+        )
+        np.testing.assert_equal(found._asdict(), expected._asdict())
 
 
 def test_mismatched_sizes_raise() -> None:
@@ -199,11 +198,10 @@ def test_mismatched_sizes_raise() -> None:
     ):
         with pytest.raises(ValueError, match=r"shape|waypoints"):
             clearances.find_closest_pairs(q, z, waypoints, reach=0.1)
-    fewer = Margins(room.default_margins[:-1], {})
+    clearances.margins = Margins(room.default_margins[:-1], {})
+    fewer = clearances.move_fixed(clearances.boxes, {})
     with pytest.raises(ValueError, match="belong"):
-        Clearances(
-            clearances.placements, clearances.boxes, clearances.shapes, fewer
-        ).find_closest_pairs(room.q, room.z, room.waypoints, reach=0.1)
+        fewer.find_closest_pairs(room.q, room.z, room.waypoints, reach=0.1)
 
 
 PAIRS, COORDINATES = 12, 4

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from helpers.expected_errors import expect_error
@@ -24,12 +26,8 @@ def test_values_and_derivatives_match_scipy(seed: int, knots: int) -> None:
     other = CubicHermiteSpline(curve.times, curve.positions, curve.rates)
     sample_times = np.random.default_rng(seed).uniform(curve.times[0], curve.times[-1], 40)
     for order, evaluate in enumerate((curve.at, curve.velocity, curve.acceleration)):
-        np.testing.assert_allclose(
-            evaluate(sample_times), other(sample_times, order), rtol=0.0, atol=1e-9
-        )
-        np.testing.assert_allclose(
-            evaluate(sample_times[3]), other(sample_times[3], order), rtol=0.0, atol=1e-9
-        )
+        for times in (sample_times, sample_times[3]):
+            np.testing.assert_allclose(evaluate(times), other(times, order), rtol=0.0, atol=1e-9)
         assert evaluate(sample_times.reshape(8, 5)).shape == (8, 5, 3)
 
 
@@ -50,25 +48,22 @@ def test_extrema_and_rates_bound_dense_samples(seed: int, even: bool) -> None:
         curve = Curve(curve.times, curve.positions, np.vstack([chords, chords[-1:]]))
     low, high = curve.compute_extrema()
     fastest, strongest = curve.compute_max_rates()
-    for k, (begin, end) in enumerate(zip(curve.times, curve.times[1:], strict=False)):
+    for k, (begin, end) in enumerate(itertools.pairwise(curve.times)):
         sample_times = np.linspace(begin, end, 2001)[:-1]
-        positions, velocities, accelerations = (
-            curve.at(sample_times),
-            np.abs(curve.velocity(sample_times)),
-            np.abs(curve.acceleration(sample_times)),
-        )
-        np.testing.assert_allclose(
-            low[k], np.minimum(positions.min(axis=0), curve.positions[k + 1]), atol=1e-5
-        )
-        np.testing.assert_allclose(
-            high[k], np.maximum(positions.max(axis=0), curve.positions[k + 1]), atol=1e-5
-        )
-        assert (low[k] <= positions.min(axis=0) + 1e-12).all()
-        assert (high[k] >= positions.max(axis=0) - 1e-12).all()
-        np.testing.assert_allclose(fastest[k], velocities.max(axis=0), rtol=2e-2, atol=1e-9)
-        assert (fastest[k] >= velocities.max(axis=0) - 1e-12).all()
-        np.testing.assert_allclose(strongest[k], accelerations.max(axis=0), rtol=2e-2, atol=1e-9)
-        assert (strongest[k] >= accelerations.max(axis=0) - 1e-9).all()
+        positions = np.vstack([curve.at(sample_times), curve.positions[k + 1]])
+        lowest, highest = positions.min(axis=0), positions.max(axis=0)
+        velocity = np.abs(curve.velocity(sample_times)).max(axis=0)
+        acceleration = np.abs(curve.acceleration(sample_times)).max(axis=0)
+        for bound, sampled, rounding in (
+            (-low[k], -lowest, 1e-12),
+            (high[k], highest, 1e-12),
+            (fastest[k], velocity, 1e-12),
+            (strongest[k], acceleration, 1e-9),
+        ):
+            assert (bound >= sampled - rounding).all()
+        np.testing.assert_allclose([low[k], high[k]], [lowest, highest], atol=1e-5)
+        rates = [velocity, acceleration]
+        np.testing.assert_allclose([fastest[k], strongest[k]], rates, rtol=2e-2, atol=1e-9)
 
 
 def test_concatenated_parts_equal_the_whole() -> None:
@@ -85,17 +80,20 @@ def test_concatenated_parts_equal_the_whole() -> None:
     )
 
 
+ZEROS = np.zeros((2, 1))
+
+
 @pytest.mark.parametrize(
     ("arrays", "field"),
     [
-        (([0.0, 0.0], np.zeros((2, 1)), np.zeros((2, 1))), "curve.times"),
-        (([0.0], np.zeros((1, 1)), np.zeros((1, 1))), "curve.times"),
-        (([0.0, np.nan], np.zeros((2, 1)), np.zeros((2, 1))), "curve.times"),
-        (([0.0, 1.0], np.zeros((3, 1)), np.zeros((2, 1))), "curve.positions"),
-        (([0.0, 1.0], np.zeros((2, 1)), np.zeros((2, 2))), "curve.rates"),
-        (([0.0, 1.0], np.zeros((2, 1)), np.full((2, 1), np.inf)), "curve.rates"),
-        (([0.0, 1.0], np.full((2, 1), 1e300), np.zeros((2, 1))), "curve.positions"),
-        (([0.0, 1.0], "here", np.zeros((2, 1))), "curve.positions"),
+        (([0.0, 0.0], ZEROS, ZEROS), "curve.times"),
+        (([0.0], ZEROS[:1], ZEROS[:1]), "curve.times"),
+        (([0.0, np.nan], ZEROS, ZEROS), "curve.times"),
+        (([0.0, 1.0], np.zeros((3, 1)), ZEROS), "curve.positions"),
+        (([0.0, 1.0], ZEROS, np.zeros((2, 2))), "curve.rates"),
+        (([0.0, 1.0], ZEROS, ZEROS + np.inf), "curve.rates"),
+        (([0.0, 1.0], ZEROS + 1e300, ZEROS), "curve.positions"),
+        (([0.0, 1.0], "here", ZEROS), "curve.positions"),
     ],
 )
 def test_invalid_arrays_are_rejected(arrays: tuple[object, object, object], field: str) -> None:
@@ -106,12 +104,17 @@ def test_invalid_arrays_are_rejected(arrays: tuple[object, object, object], fiel
 def test_curve_must_pass_through_waypoints() -> None:
     curve = sample_curve(4)
     at = [0, 2, 6]
-    curve.check_through(curve.times[at], curve.positions[at])
-    with expect_error("a waypoint is none of its knots"):
-        curve.check_through(curve.times[[0, 2, 5]], curve.positions[[0, 2, 5]])
-    with expect_error("a waypoint is none of its knots"):
-        curve.check_through(curve.times[at] + [0.0, 1e-3, 0.0], curve.positions[at])
-    with expect_error("does not lead through a waypoint", field="positions[1]"):
-        curve.check_through(curve.times[at], curve.positions[at] + [[0.0], [1e-6], [0.0]])
-    with expect_error("wrong number of coordinates"):
-        curve.check_through(curve.times[at], curve.positions[at][:, :2])
+    times, positions = curve.times[at], curve.positions[at]
+    curve.check_through(times, positions)
+    for other_times, other_positions, message in (
+        (curve.times[[0, 2, 5]], curve.positions[[0, 2, 5]], "a waypoint is none of its knots"),
+        (times + np.array([0.0, 1e-3, 0.0]), positions, "a waypoint is none of its knots"),
+        (
+            times,
+            positions + np.array([[0.0], [1e-6], [0.0]]),
+            r"positions\[1\]: .*does not lead through a waypoint",
+        ),
+        (times, positions[:, :2], "wrong number of coordinates"),
+    ):
+        with expect_error(message):
+            curve.check_through(other_times, other_positions)

@@ -32,40 +32,31 @@ def test_shapes_equal_those_of_robot_and_objects(world: World, kind: str) -> Non
     geometry = getattr(world, kind)
     data, shapes = world.model.createData(), geometry.createData()
     pin.updateGeometryPlacements(world.model, data, geometry, shapes, world.coordinates.q(z))
-    found = {
-        shape.name: (shape, placement)
-        for shape, placement in zip(geometry.geometryObjects, shapes.oMg, strict=True)
-    }
-    expected: dict[str, tuple[pin.GeometryObject, pin.SE3]] = {}
+    expected: list[tuple[str, pin.GeometryObject, pin.SE3]] = []
     robot, n = scene.robot, scene.robot.coordinates.size
     source = getattr(robot, kind)
     own_data, bodies = robot.model.createData(), source.createData()
     pin.updateGeometryPlacements(robot.model, own_data, source, bodies, robot.coordinates.q(z[:n]))
     for shape, placement in zip(source.geometryObjects, bodies.oMg, strict=True):
-        expected[shape.name] = shape, placement
+        expected.append((shape.name, shape, placement))
     for name, placed in scene.objects.items():
         joints = placed.object.coordinates.names
         posed = placed.with_state(dict(zip(joints, z[n : n + len(joints)].tolist(), strict=True)))
         n += len(joints)
         for shape in make_world_shapes(posed, visual=kind == "visual"):
-            expected[f"{name}.{shape.name}"] = shape, shape.placement
-    obstacles = scene.obstacles if kind == "collision" else scene.obstacle_visual
-    for shape in obstacles:
-        expected[shape.name] = shape, shape.placement
-    assert list(found) == list(
-        expected
-    )  # complete, without duplicates, in the order robot, objects, obstacles
-    assert len(geometry.geometryObjects) == len(expected)
-    for name, (shape, placement) in expected.items():
-        found_shape, found_placement = found[name]
-        np.testing.assert_allclose(found_placement.homogeneous, placement.homogeneous, atol=1e-9)
-        np.testing.assert_array_equal(found_shape.meshColor, shape.meshColor)
-        np.testing.assert_array_equal(found_shape.meshScale, shape.meshScale)
-        assert found_shape.geometry.getNodeType() == shape.geometry.getNodeType()
-        assert (found_shape.meshPath, found_shape.overrideMaterial) == (
-            shape.meshPath,
-            shape.overrideMaterial,
-        )
+            expected.append((f"{name}.{shape.name}", shape, shape.placement))
+    for shape in scene.obstacles if kind == "collision" else scene.obstacle_visual:
+        expected.append((shape.name, shape, shape.placement))
+    assert n == world.coordinates.size == world.model.nv
+    found = zip(geometry.geometryObjects, shapes.oMg, strict=True)
+    for (name, shape, placement), (copy, at) in zip(expected, found, strict=True):
+        assert copy.name == name
+        np.testing.assert_allclose(at, placement, atol=1e-9)
+        np.testing.assert_array_equal(copy.meshColor, shape.meshColor)
+        np.testing.assert_array_equal(copy.meshScale, shape.meshScale)
+        assert copy.geometry.getNodeType() == shape.geometry.getNodeType()
+        for field in ("meshPath", "overrideMaterial"):
+            assert getattr(copy, field) == getattr(shape, field)
     assert len(geometry.collisionPairs) == 0
 
 
@@ -74,17 +65,14 @@ def test_positions_along_a_motion(world: World) -> None:
     robot = world.scene.robot.coordinates.names
     names = (*robot, "drawer.slide", "door.handle_free", "door.hinge")
     values = np.random.default_rng(0).normal(size=(3, len(names)))
-    motion = Trajectory(
-        names, np.array([0.0, 1.0, 3.0]), values, (PhaseSpan("all", 0, 2),), len(robot)
-    )
-    rows, middle = world.compute_positions(motion), world.compute_positions(motion, [0.5])
-    for k, name in enumerate(world.coordinates.names):
-        if name in names:
-            np.testing.assert_array_equal(rows[:, k], values[:, names.index(name)])
-            assert middle[0, k] == pytest.approx(values[:2, names.index(name)].mean())
-        else:
-            assert (rows[:, k] == world.start[k]).all()
-            assert middle[0, k] == world.start[k]
+    phases = (PhaseSpan("all", 0, 2),)
+    motion = Trajectory(names, np.array([0.0, 1.0, 3.0]), values, phases, len(robot))
+    for times, expected in ((None, values), ([0.5], values[:2].mean(axis=0, keepdims=True))):
+        rows = np.tile(world.start, (len(expected), 1))
+        for k, name in enumerate(world.coordinates.names):
+            if name in names:
+                rows[:, k] = expected[:, names.index(name)]
+        np.testing.assert_allclose(world.compute_positions(motion, times), rows, atol=1e-15)
     assert world.compute_positions(motion, np.zeros(0)).shape == (0, world.coordinates.size)
 
 

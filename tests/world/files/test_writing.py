@@ -2,9 +2,7 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 import signal
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -39,15 +37,10 @@ def test_parents_are_created_and_files_replaced(tmp_path: Path, umask: int) -> N
         os.umask(before)
     assert list(path.parent.iterdir()) == [path]
     assert path.stat().st_mode & 0o777 == 0o666 & ~umask
-
-
-def test_the_mode_of_a_file_is_preserved(tmp_path: Path) -> None:
-    path = tmp_path / "file"
-    for mode in (0o600, 0o640, 0o755):
-        path.write_bytes(b"before")
+    for mode in (0o600, 0o640, 0o755):  # the mode of an existing file is preserved
         path.chmod(mode)
         write_atomically(path, b"after")
-        assert (path.read_bytes(), path.stat().st_mode & 0o7777) == (b"after", mode)
+        assert path.stat().st_mode & 0o7777 == mode
 
 
 @pytest.mark.parametrize("target_exists", [True, False], ids=["file", "dangling"])
@@ -64,36 +57,12 @@ def test_links_are_followed(tmp_path: Path, target_exists: bool) -> None:
     assert list_paths(tmp_path) == {"link", "elsewhere", "elsewhere/file"}
 
 
-def _make_folder(path: Path) -> str:
-    path.mkdir()
-    return "got a folder"
-
-
-def _make_pipe(path: Path) -> str:
-    os.mkfifo(path)
-    return "got a pipe"
-
-
-def _make_circular_link(path: Path) -> str:
-    path.with_name("other").symlink_to(path)
-    path.symlink_to(path.with_name("other"))
-    return "Too many levels of symbolic links"
-
-
-@pytest.mark.parametrize("make", [_make_folder, _make_pipe, _make_circular_link])
-def test_other_kinds_of_files_raise(tmp_path: Path, make: Callable[[Path], str]) -> None:
-    path = tmp_path / "output"
-    reason = make(path)
-    before = list_paths(tmp_path)
-    for write in (check_writable, lambda path: write_atomically(path, b"data")):
-        with expect_error(f"a regular file or a new one.*{reason}", file=str(path)):
-            write(path)
-    assert list_paths(tmp_path) == before
-
-
 @pytest.mark.parametrize(
     ("path", "reason"),
     [
+        ("folder", "a regular file or a new one.*got a folder"),
+        ("pipe", "a regular file or a new one.*got a pipe"),
+        ("loop", "a regular file or a new one.*Too many levels of symbolic links"),
         ("file/plan.npz", "Not a directory"),
         ("new/", "got a folder"),
         ("new/" + "x" * 256 + "/plan.npz", "File name too long"),
@@ -104,12 +73,16 @@ def test_other_kinds_of_files_raise(tmp_path: Path, make: Callable[[Path], str])
 def test_invalid_paths_raise(
     tmp_path: Path, path: str, reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "file").write_text("")
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "loop").symlink_to("loop")
     monkeypatch.chdir(tmp_path)
+    before = list_paths(tmp_path)
     for write in (check_writable, lambda path: write_atomically(path, b"data")):
         with expect_error(reason):
             write(path)
-    assert list_paths(tmp_path) <= {"file", "new"}
+    assert list_paths(tmp_path) <= before | {"new"}
 
 
 def test_conflicting_outputs_raise(tmp_path: Path) -> None:
@@ -174,9 +147,8 @@ def test_folders_are_written_completely_or_not_at_all(tmp_path: Path) -> None:
         pass
     assert list_paths(target) == {".vkc-pin.json", "a"}
     write_folder(target)
-    assert list_paths(target.parent) == {
-        f"folder{name}" for name in ("", "/.vkc-pin.json", "/deep", "/deep/a")
-    }
+    assert list_paths(target) == {".vkc-pin.json", "deep", "deep/a"}
+    assert list(target.parent.iterdir()) == [target]
     with expect_error("no folder"):
         write_folder(target / "deep" / "a")
 
@@ -204,10 +176,7 @@ def test_folders_with_foreign_files_are_not_replaced(tmp_path: Path, has_manifes
 def test_files_created_during_writing_are_preserved(tmp_path: Path) -> None:
     target = tmp_path / "folder"
     write_folder(target)
-    with (
-        expect_error("would delete"),
-        write_folder_atomically(target, force=True),
-    ):
+    with expect_error("would delete"), write_folder_atomically(target, force=True):
         (target / "notes.txt").write_text("mine")
     assert (target / "notes.txt").read_text() == "mine"
     assert (target / "deep" / "a").exists()
@@ -215,14 +184,12 @@ def test_files_created_during_writing_are_preserved(tmp_path: Path) -> None:
 
 def test_links_in_replaced_folders_are_not_followed(tmp_path: Path) -> None:
     target, outside = tmp_path / "folder", tmp_path / "outside"
-    outside.mkdir()
-    (outside / "a").write_text("mine")
     write_folder(target)
-    shutil.rmtree(target / "deep")
+    (target / "deep").rename(outside)
     (target / "deep").symlink_to(outside)
     with expect_error("got deep"):
         write_folder(target)
-    assert (outside / "a").read_text() == "mine"
+    assert (outside / "a").exists()
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"files": 3}', '{"files": [["notes.txt"]]}'])

@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.telescopes import format_joint
 
 from vkc_pin.utils import disk_cache
 from vkc_pin.world.files import resources
@@ -27,15 +29,14 @@ def test_committed_srdf_matches_sampling(husky: Robot) -> None:
 
 def test_sampled_pairs_are_adjacent_or_always_or_never_collide(tmp_path: Path) -> None:
     radii = {"foot": 1.0, "middle": 0.1, "inner": 0.2, "outer": 0.1}
-    parts = [format_ball(name, radius) for name, radius in radii.items()]
-    parts += [
+    file = write_arm(
+        tmp_path,
+        *(format_ball(name, radius) for name, radius in radii.items()),
         format_hinge("foot", "middle", 0.3, upper=1.0),
         format_hinge("middle", "inner", 0.2, upper=1.0),
-    ]
-    parts += [format_hinge("inner", "outer", 4.0, upper=1.0)]
-    assert sample_allowed_pairs(
-        load_robot(write_arm(tmp_path, *parts), pairs="all"), samples=50
-    ) == {
+        format_hinge("inner", "outer", 4.0, upper=1.0),
+    )
+    assert sample_allowed_pairs(load_robot(file, pairs="all"), samples=50) == {
         ("foot", "inner"): "Always",
         ("foot", "middle"): "Adjacent",
         ("foot", "outer"): "Never",
@@ -70,17 +71,13 @@ def format_hinge(
     axis: str = "0 0 1",
     upper: float = 1.5,
 ) -> str:
-    limit = (
-        ""
-        if kind == "fixed"
-        else f'<axis xyz="{axis}"/>'
-        f'<limit lower="{-upper}" upper="{upper}" velocity="1" effort="1"/>'
-    )
-    return (
-        f'<joint name="{child}_joint" type="{kind}"><parent link="{parent}"/>'
-        f'<child link="{child}"/><origin xyz="{x} 0 0"/>'
-        f"{limit}</joint>"
-    )
+    return format_joint(f"{child}_joint", kind, parent, child, f"{x} 0 0", axis, (-upper, upper))
+
+
+def list_checked(robot: Robot) -> set[tuple[str, ...]]:
+    """Return the sorted pairs of links that are checked for collisions."""
+    pairs = robot.collision.collisionPairs
+    return {tuple(sorted((robot.link_of(p.first), robot.link_of(p.second)))) for p in pairs}
 
 
 def write_arm(folder: Path, *parts: str, srdf: str | None = None) -> Path:
@@ -95,16 +92,14 @@ def write_bracket(folder: Path, *, elbow_x: float, srdf: str | None = None) -> P
     """Write a post with a fixed bracket, and a shoulder with a fixed cover and a remote elbow."""
     return write_arm(
         folder,
-        *(
-            format_ball("post", 0.05),
-            format_ball("bracket", 0.02, 0.09),
-            format_ball("shoulder", 0.03),
-            format_ball("cover", 0.03, 0.05),
-            format_ball("elbow", 0.02),
-        ),
-        format_hinge("post", "bracket", 0.0, kind="fixed"),
-        format_hinge("post", "shoulder", 0.0),
-        format_hinge("shoulder", "cover", 0.0, kind="fixed"),
+        format_ball("post", 0.05),
+        format_ball("bracket", 0.02, 0.09),
+        format_ball("shoulder", 0.03),
+        format_ball("cover", 0.03, 0.05),
+        format_ball("elbow", 0.02),
+        format_hinge("post", "bracket", kind="fixed"),
+        format_hinge("post", "shoulder"),
+        format_hinge("shoulder", "cover", kind="fixed"),
         format_hinge("shoulder", "elbow", elbow_x),
         srdf=srdf,
     )
@@ -112,10 +107,7 @@ def write_bracket(folder: Path, *, elbow_x: float, srdf: str | None = None) -> P
 
 def test_close_neighbours_missing_in_the_srdf_are_adjacent(tmp_path: Path) -> None:
     robot = load_robot(write_bracket(tmp_path, elbow_x=0.5, srdf=""))
-    checked = {
-        tuple(sorted((robot.link_of(p.first), robot.link_of(p.second))))
-        for p in robot.collision.collisionPairs
-    }
+    checked = list_checked(robot)
     assert not checked & {
         ("post", "shoulder"),
         ("bracket", "cover"),
@@ -127,18 +119,13 @@ def test_close_neighbours_missing_in_the_srdf_are_adjacent(tmp_path: Path) -> No
 
 def write_slider(folder: Path, *, gap: float, srdf: str | None = None, at: float = 0.0) -> Path:
     """Write a finger of radius 20 mm on two slides, at most `gap` away from the wall ahead."""
-    slides = [
-        format_hinge("wall", "carriage", 0.04 + at, kind="prismatic", axis="1 0 0", upper=gap)
-    ]
-    slides.append(
-        format_hinge("carriage", "finger", 0.0, kind="prismatic", axis="0 1 0", upper=1e-6)
-    )
     return write_arm(
         folder,
         format_ball("wall", 0.02),
         format_ball("carriage", 0.001, 2.0),
         format_ball("finger", 0.02),
-        *slides,
+        format_hinge("wall", "carriage", 0.04 + at, kind="prismatic", axis="1 0 0", upper=gap),
+        format_hinge("carriage", "finger", kind="prismatic", axis="0 1 0", upper=1e-6),
         srdf=srdf,
     )
 
@@ -152,11 +139,9 @@ def test_tight_pairs_have_half_their_distance_as_margin(tmp_path: Path) -> None:
     assert robot.own_margin(("finger", "wall"), 0.02) == pytest.approx(0.002, abs=1e-9)
     assert robot.own_margin(("finger", "wall"), 0.001) == 0.001
     assert robot.own_margin(("carriage", "wall"), 0.02) == 0.02
-    margins = {
-        tuple(sorted((robot.link_of(i), robot.link_of(j)))): value
-        for (i, j), value in robot.own_margins(0.02).items()
-    }
-    assert margins == {("finger", "wall"): pytest.approx(0.002, abs=1e-9)}
+    ((pair, margin),) = robot.own_margins(0.02).items()
+    assert {robot.link_of(k) for k in pair} == {"finger", "wall"}
+    assert margin == pytest.approx(0.002, abs=1e-9)
 
 
 @pytest.mark.parametrize("srdf", [None, ""], ids=["sampled", "srdf"])
@@ -169,18 +154,10 @@ def test_links_that_always_touch_are_not_checked(tmp_path: Path, srdf: str | Non
         + format_hinge("far", "end", 0.4)
     )
     file.write_text(file.read_text().replace("</robot>", f"{other}</robot>"))
-    if srdf is None:
-        robot = load_robot(file)
-    else:
-        with pytest.warns(
-            UserWarning,
-            match=r"arm.urdf: links that always overlap or touch are not checked: finger – wall$",
-        ):
-            robot = load_robot(file)
-    checked = {
-        tuple(sorted((robot.link_of(p.first), robot.link_of(p.second))))
-        for p in robot.collision.collisionPairs
-    }
+    message = r"arm.urdf: links that always overlap or touch are not checked: finger – wall$"
+    warning = nullcontext() if srdf is None else pytest.warns(UserWarning, match=message)
+    with warning:
+        checked = list_checked(load_robot(file))
     assert ("finger", "wall") not in checked
     assert ("end", "wall") in checked
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers.expected_errors import expect_error
 
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin import InputError, UnknownNameError
 from vkc_pin.utils.arguments import (
     check_array,
     check_bool,

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from helpers.expected_errors import expect_error
 
-from vkc_pin.errors import InputError
+from vkc_pin import InputError
 from vkc_pin.utils.isolation import (
     MEMORY_VARIABLE,
     TIME_VARIABLE,

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from helpers.expected_errors import expect_error
 
-from vkc_pin.errors import InputError
+from vkc_pin import InputError
 from vkc_pin.utils.journal import Journal, JournalContents
 
 HEADER = {"settings": {"recipe": "abc"}, "versions": {"pin": "4"}}

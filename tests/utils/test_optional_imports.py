@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.errors import BuildError
 from vkc_pin.planning.base_paths.base_path import shortest_path
 from vkc_pin.planning.base_paths.grid import BaseGrid
 from vkc_pin.utils import optional_imports
@@ -26,7 +25,7 @@ def test_missing_compiled_modules_raise(monkeypatch: pytest.MonkeyPatch) -> None
     with monkeypatch.context() as patch:
         patch.setattr(optional_imports, "import_module", raise_import_error)
         with pytest.raises(
-            BuildError, match=r"_driving cannot be imported \(no .*compiler.*pip install"
+            vkc.BuildError, match=r"_driving cannot be imported \(no .*compiler.*pip install"
         ):
             find_path()
     assert find_path() is not None
@@ -41,7 +40,7 @@ def test_incompatible_library_releases_are_named(
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setitem(sys.modules, "vkc_pin.planning.base_paths._driving", None)
     expected = r"does not fit .* casadi 3\.9\.1 \(.*pip install 'casadi<3\.9,>=3\.8', or"
-    with pytest.raises(BuildError, match=expected):
+    with pytest.raises(vkc.BuildError, match=expected):
         find_path()
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.errors import InputError
+from vkc_pin import InputError
 from vkc_pin.world.collision.distances import Shapes, Witnesses, count_distance_queries
 from vkc_pin.world.collision.solids import flatten_placements
 from vkc_pin.world.files.meshes import make_convex_hull

@@ -13,7 +13,7 @@ import pinocchio as pin
 import pytest
 from helpers.expected_errors import expect_error
 
-from vkc_pin.errors import BuildError
+from vkc_pin import BuildError
 from vkc_pin.world.collision import solids
 from vkc_pin.world.collision.distances import Shapes
 from vkc_pin.world.collision.solids import (

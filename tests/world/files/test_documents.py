@@ -15,7 +15,7 @@ from helpers.expected_errors import expect_error
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin import InputError, UnknownNameError
 from vkc_pin.world.files import documents
 from vkc_pin.world.files.documents import (
     Document,

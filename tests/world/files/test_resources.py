@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vkc_pin.errors import UnknownNameError
+from vkc_pin import UnknownNameError
 from vkc_pin.world.files.resources import (
     choose_file_names,
     find_file,

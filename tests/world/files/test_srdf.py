@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from helpers.expected_errors import expect_error
 
-from vkc_pin.errors import UnknownNameError
+from vkc_pin import UnknownNameError
 from vkc_pin.world.files.srdf import Srdf, SrdfGroup, find_group_tip, read_groups, read_srdf
 
 LINKS = ("base", "arm", "hand")

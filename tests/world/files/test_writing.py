@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from helpers.expected_errors import expect_error
 
-from vkc_pin.errors import InputError
+from vkc_pin import InputError
 from vkc_pin.world.files.writing import (
     check_inside,
     check_links,

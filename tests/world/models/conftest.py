@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.robot_file import load_robot
+from vkc_pin import Robot, load_robot
 
 
 @pytest.fixture(scope="session")

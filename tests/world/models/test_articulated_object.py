@@ -11,8 +11,7 @@ from helpers.expected_errors import expect_error
 from helpers.objects import URDF, load_object_text
 from scipy.spatial.transform import Rotation
 
-from vkc_pin.world.models.articulated_object import Latch
-from vkc_pin.world.models.object_file import load_object
+from vkc_pin import Latch, load_object
 
 
 def test_door_properties() -> None:

@@ -14,10 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.world.models.dynamics import Resistance, TorqueLimits, compute_torque_limits
-from vkc_pin.world.models.object_file import load_object
-from vkc_pin.world.models.robot import Robot
 
 TAIL = "attachments: []\n"
 REAL = st.floats(-1e3, 1e3)
@@ -97,14 +94,14 @@ def test_invalid_urdf_dynamics_raise_with_their_line(attributes: str) -> None:
 BOX = '<collision><origin xyz="0 0 0.2"/><geometry><box size="0.2 0.4 0.6"/></geometry></collision>'
 
 
-def load_block(contents: str, more: str = "mass: 6.0") -> ArticulatedObject:
+def load_block(contents: str, more: str = "mass: 6.0") -> vkc.ArticulatedObject:
     urdf = f'<robot name="t"><link name="block">{contents}</link></robot>'
     return load_object_text(urdf, f"urdf: thing.urdf\nfree: true\n{more}\n{TAIL}")
 
 
 def test_masses_of_the_urdf_are_scaled_uniformly() -> None:
-    plain = load_object("broom")
-    heavy = load_object(
+    plain = vkc.load_object("broom")
+    heavy = vkc.load_object(
         {"urdf": "broom.urdf", "free": True, "mass": 6.5, "attachments": []},
         folder="scenes/objects",
     )
@@ -150,17 +147,17 @@ def test_invalid_masses_raise(more: str, problem: str) -> None:
         load_object_text(urdf, f"urdf: thing.urdf\n{more}\n{TAIL}")
 
 
-def compute_limits(robot: Robot, model: pin.Model) -> TorqueLimits:
+def compute_limits(robot: vkc.Robot, model: pin.Model) -> TorqueLimits:
     return compute_torque_limits(model, robot.coordinates, robot.lower, robot.upper)
 
 
-def test_limits_are_those_of_the_urdf(husky: Robot) -> None:
+def test_limits_are_those_of_the_urdf(husky: vkc.Robot) -> None:
     assert husky.efforts.is_known
     assert husky.efforts.notes == ()
     np.testing.assert_array_equal(husky.efforts.limits, [np.inf] * 3 + [150.0] * 3 + [28.0] * 3)
 
 
-def test_limits_are_unknown_without_masses(husky: Robot) -> None:
+def test_limits_are_unknown_without_masses(husky: vkc.Robot) -> None:
     model = pin.Model(husky.model)
     for joint in range(2, model.njoints):
         model.inertias[joint] = pin.Inertia.Zero()
@@ -169,7 +166,7 @@ def test_limits_are_unknown_without_masses(husky: Robot) -> None:
     assert found.notes == ("the URDF states no masses of the arm",)
 
 
-def replace_limit(robot: Robot, index: int, limit: float) -> TorqueLimits:
+def replace_limit(robot: vkc.Robot, index: int, limit: float) -> TorqueLimits:
     """Return the torque limits of a robot whose URDF states another effort of a joint."""
     model = pin.Model(robot.model)
     limits = np.array(model.effortLimit)
@@ -179,14 +176,14 @@ def replace_limit(robot: Robot, index: int, limit: float) -> TorqueLimits:
 
 
 @pytest.mark.parametrize("stated", [0.0, np.inf, np.finfo(float).max])
-def test_joints_without_effort_limit_are_noted(husky: Robot, stated: float) -> None:
+def test_joints_without_effort_limit_are_noted(husky: vkc.Robot, stated: float) -> None:
     found = replace_limit(husky, 5, stated)
     assert np.isinf(found.limits[5])
     assert np.isfinite(found.limits[[3, 4, 6, 7, 8]]).all()
     assert found.notes == ("the URDF states no effort of elbow_joint",)
 
 
-def test_limits_that_cannot_hold_the_arm_are_discarded(husky: Robot) -> None:
+def test_limits_that_cannot_hold_the_arm_are_discarded(husky: vkc.Robot) -> None:
     outstretched = husky.coordinates.q(np.zeros(9))
     torques = pin.computeGeneralizedGravity(husky.model, husky.model.createData(), outstretched)
     gravity = abs(torques[4])
@@ -198,7 +195,7 @@ def test_limits_that_cannot_hold_the_arm_are_discarded(husky: Robot) -> None:
     assert replace_limit(husky, 4, 1.2 * gravity).limits[4] == pytest.approx(1.2 * gravity)
 
 
-def load_robot_with_effort(folder: Path, effort: object) -> Robot:
+def load_robot_with_effort(folder: Path, effort: object) -> vkc.Robot:
     source = vkc.load_robot("husky_ur5e").urdf.parent
     description = yaml.safe_load((source / "robot.yaml").read_text(encoding="utf-8"))
     description["urdf"] = str(source / description["urdf"])

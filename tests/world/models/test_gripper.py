@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin.world.models.gripper import WIDTH_TOLERANCE, check_bar_fits, find_widest_bar
-from vkc_pin.world.models.robot import Robot
 
 
 def make_walls(left: float, right: float) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:
@@ -48,11 +47,11 @@ def test_shapes_beside_the_bar_are_ignored() -> None:
 
 
 @pytest.fixture(scope="module")
-def robot(tmp_path_factory: pytest.TempPathFactory) -> Robot:
+def robot(tmp_path_factory: pytest.TempPathFactory) -> vkc.Robot:
     return vkc.load_robot(write_gripper(tmp_path_factory.mktemp("gripper")))
 
 
-def compute_finger_centers(robot: Robot) -> list[np.ndarray]:
+def compute_finger_centers(robot: vkc.Robot) -> list[np.ndarray]:
     """Return the centres of the fingers' shapes in the tool frame."""
     data, shapes = robot.model.createData(), robot.collision.createData()
     pin.updateGeometryPlacements(
@@ -67,7 +66,7 @@ def compute_finger_centers(robot: Robot) -> list[np.ndarray]:
     return [tool.actInv(shapes.oMg[k]).translation for k in fingers]
 
 
-def test_grippers_are_open_by_default_and_mimic_joints_follow(robot: Robot) -> None:
+def test_grippers_are_open_by_default_and_mimic_joints_follow(robot: vkc.Robot) -> None:
     gripper = robot.gripper
     assert gripper is not None
     assert gripper.names == ("finger_a_joint", "finger_b_joint")
@@ -80,7 +79,7 @@ def test_grippers_are_open_by_default_and_mimic_joints_follow(robot: Robot) -> N
 
 @settings(max_examples=20, deadline=None)
 @given(opening=st.floats(0.0, 0.0799))
-def test_fingers_are_symmetric_at_the_given_opening(robot: Robot, opening: float) -> None:
+def test_fingers_are_symmetric_at_the_given_opening(robot: vkc.Robot, opening: float) -> None:
     opened = robot.opened(opening)
     for center, side in zip(
         compute_finger_centers(opened), (1.0, -1.0), strict=True
@@ -94,7 +93,7 @@ def test_fingers_are_symmetric_at_the_given_opening(robot: Robot, opening: float
         assert np.linalg.norm(displacement.translation) == pytest.approx(distance, abs=1e-5)
 
 
-def test_opening_moves_only_the_fingers(robot: Robot) -> None:
+def test_opening_moves_only_the_fingers(robot: vkc.Robot) -> None:
     opened = robot.opened(0.03)
     assert opened is robot.opened(0.03)
     assert list(opened.model.names) == list(robot.model.names)
@@ -108,7 +107,7 @@ def test_opening_moves_only_the_fingers(robot: Robot) -> None:
     assert moved == {"finger_a", "finger_b"}
 
 
-def test_openings_are_clamped_to_the_range(robot: Robot) -> None:
+def test_openings_are_clamped_to_the_range(robot: vkc.Robot) -> None:
     gripper = robot.gripper
     assert gripper is not None
     assert robot.opening(None) is None

@@ -10,9 +10,8 @@ import pytest
 from helpers.expected_errors import expect_error
 from helpers.objects import SHAPES, URDF, load_object_text
 
-from vkc_pin.errors import InputError
+from vkc_pin import InputError, load_object
 from vkc_pin.world.models.articulated_object import DEFAULT_ACCELERATION, DEFAULT_VELOCITY
-from vkc_pin.world.models.object_file import load_object
 
 ALONG = "name: along, slide: [1, 0, 0], limits: [0, 0.1]"
 SLIDE = "    axis: [0, 1, 0]\n    limits: [-0.1, 0.2]"

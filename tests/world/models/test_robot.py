@@ -9,7 +9,7 @@ import trimesh
 from helpers.meshes import compute_excess
 from helpers.robots import compute_placement
 
-from vkc_pin.world.models.robot import Robot
+from vkc_pin import Robot
 from vkc_pin.world.models.shapes import get_link_name
 
 

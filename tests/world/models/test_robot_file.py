@@ -13,9 +13,8 @@ from helpers.arm_urdf import write_arms
 from helpers.expected_errors import expect_error
 from helpers.robots import compute_placement, write_small_urdf
 
-from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.robot_file import find_robot, load_robot
+from vkc_pin import InputError, Robot, UnknownNameError, load_robot
+from vkc_pin.world.models.robot_file import find_robot
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from helpers.telescopes import format_joint
 
+from vkc_pin import Robot, load_robot
 from vkc_pin.utils import disk_cache
 from vkc_pin.world.files import resources
 from vkc_pin.world.files.srdf import read_srdf
-from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.models.self_collisions import (
     sample_allowed_pairs,
     write_srdf,

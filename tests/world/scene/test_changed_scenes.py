@@ -17,7 +17,7 @@ from helpers.expected_errors import expect_error
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin import Scene, load_scene
 
 HALL = """\
 robot: husky_ur5e

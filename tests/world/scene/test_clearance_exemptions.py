@@ -15,12 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.clearance_exemptions import (
     find_clearance_exemptions,
     find_close_pairs,
 )
-from vkc_pin.world.scene.scene import Scene
 
 SAFE = 0.02
 # y of the side of the drawer's front; the shut front extends from x = 1.885 to 1.903
@@ -28,7 +26,7 @@ TRAY = 0.295
 HINGE = {"hinge": 1.2}
 
 
-def make_panel_scene(gap: float, begin: float = 1.7) -> Scene:
+def make_panel_scene(gap: float, begin: float = 1.7) -> vkc.Scene:
     """Return the drawer scene with a panel beside the drawer's front that starts at x = `begin`."""
     depth = 2.3 - begin
     return add_boxes(
@@ -36,7 +34,7 @@ def make_panel_scene(gap: float, begin: float = 1.7) -> Scene:
     )
 
 
-def make_wall_scene(*depths: float, folder: str | Path = ".", **fields: Any) -> Scene:
+def make_wall_scene(*depths: float, folder: str | Path = ".", **fields: Any) -> vkc.Scene:
     """Return a room with a door whose leaf overlaps walls at its hinges, at y = 0, by `depths`."""
     document = {
         "name": "tight",
@@ -51,7 +49,7 @@ def make_wall_scene(*depths: float, folder: str | Path = ".", **fields: Any) -> 
             )
         ],
     }
-    return Scene.from_document({**document, **fields}, folder)
+    return vkc.Scene.from_document({**document, **fields}, folder)
 
 
 @given(gap=st.floats(0.001, 0.018), begin=st.floats(1.4, 1.8))
@@ -149,7 +147,7 @@ def test_allowed_pairs_raise_no_warning(tmp_path: Path, allow: list[Any], margin
     assert scene.allowed[frozenset(("door.panel", "wall_0"))] == margin
     assert find_close_pairs(scene, SAFE) == []
     assert all(isinstance(label, str) for pair in scene.allowed for label in pair)
-    again = Scene.from_document(scene.document, tmp_path)
+    again = vkc.Scene.from_document(scene.document, tmp_path)
     assert dict(again.allowed) == dict(scene.allowed)
     assert dict(scene.with_state("door", {"hinge": 0.4}).allowed) == dict(scene.allowed)
 
@@ -194,7 +192,7 @@ def test_cup_may_leave_but_not_enter_an_overlap() -> None:
         scene = make_wall_scene(objects=[cup], obstacles=[table])
     plan = vkc.plan(scene, [vkc.Place("cup", (1.5, 0.4, 0.751))])
     assert plan.success, plan.summary()
-    deep = validate(scene, [vkc.Place("cup", (1.5, 0.4, 0.749))], plan.trajectory)
+    deep = vkc.validate(scene, [vkc.Place("cup", (1.5, 0.4, 0.749))], plan.trajectory)
     assert {violation.constraint for violation in deep.violations} == {"goal"}
 
 
@@ -216,7 +214,7 @@ def format_box(position: str, size: str) -> str:
     return f'<collision><origin xyz="{position}"/>{geometry}</collision>'
 
 
-def write_post_scene(folder: Path, *, blocking: str = "") -> Scene:
+def write_post_scene(folder: Path, *, blocking: str = "") -> vkc.Scene:
     """Return a scene with a leaf 1 mm inside its post, and optionally a block on the same wall."""
     folder.mkdir()
     post = format_box("0.02 0.049 1", "0.1 0.1 2")
@@ -260,7 +258,7 @@ def test_exemption_applies_to_shapes_not_links(tmp_path: Path) -> None:
     blocked = write_post_scene(tmp_path / "blocked", blocking=block)
     (one,) = find_clearance_exemptions(blocked, SAFE)
     assert one.shapes == ("door.leaf_0", "wall_0")
-    report = validate(blocked, steps, opened.trajectory)
+    report = vkc.validate(blocked, steps, opened.trajectory)
     (hit,) = (found for found in report.violations if found.constraint == "penetration")
     assert hit.subject == "door.leaf – wall"
     assert hit.amount == pytest.approx(0.161, abs=0.002)

@@ -12,8 +12,7 @@ from helpers.grippers import write_cheeks_scene, write_gripper
 from helpers.judging import replace_object
 from helpers.small_problems import load_door_scene
 
-from vkc_pin.options import Options
-from vkc_pin.world.models.articulated_object import Attachment
+from vkc_pin import Attachment, Hold, Options, Scene
 from vkc_pin.world.scene.contact_rules import (
     compute_grasp_opening,
     compute_hand_clearance,
@@ -21,8 +20,6 @@ from vkc_pin.world.scene.contact_rules import (
     compute_start_opening,
     is_rigid_grasp,
 )
-from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.scene import Scene
 
 HANDLE, FREE = Hold("door", "handle"), Hold("door", "handle_free")
 THROUGH = Hold("door", "handle", Hold("stick", "grip"), "tip")

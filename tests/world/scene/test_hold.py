@@ -22,29 +22,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.options import Options
-from vkc_pin.planning.chain.chain import consolidate
 from vkc_pin.world.files.resources import find_resource_folder
-from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.scene.contact_rules import compute_hand_clearance
-from vkc_pin.world.scene.hold import Hold, check_hold_order, fit_grasp, make_holds
-from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.scene.hold import check_hold_order, fit_grasp, make_holds
 
-STICK = Hold("stick", "grip")
-BALL = Hold("ball", "pull", STICK, "tip")
-FLY = Hold("fly", "leg", BALL, "ball")
+STICK = vkc.Hold("stick", "grip")
+BALL = vkc.Hold("ball", "pull", STICK, "tip")
+FLY = vkc.Hold("fly", "leg", BALL, "ball")
 
 
 def test_holds_are_equal_by_object_attachment_and_frame() -> None:
     assert (STICK.frame, BALL.frame) == (None, "stick.tip")
     assert [str(hold) for hold in (STICK, BALL)] == ["stick.grip", "ball.pull by stick.tip"]
-    again = Hold("ball", "pull", Hold("stick", "grip", at=(0.1, 2.0)), "tip")
+    again = vkc.Hold("ball", "pull", vkc.Hold("stick", "grip", at=(0.1, 2.0)), "tip")
     assert (again, hash(again)) == (BALL, hash(BALL))
     for other in (
-        Hold("ball", "pull"),
-        Hold("ball", "pull", STICK, "stick"),
-        Hold("ball", "pull", Hold("stick", "end"), "tip"),
+        vkc.Hold("ball", "pull"),
+        vkc.Hold("ball", "pull", STICK, "stick"),
+        vkc.Hold("ball", "pull", vkc.Hold("stick", "end"), "tip"),
     ):
         assert other != BALL
 
@@ -62,7 +57,7 @@ def test_holds_are_ordered_by_dependency(order: tuple[str, ...]) -> None:
 
 
 def test_a_hold_comes_after_the_one_it_depends_on() -> None:
-    for holds in ((BALL,), (BALL, STICK), (STICK, FLY), (Hold("stick", "end"), BALL)):
+    for holds in ((BALL,), (BALL, STICK), (STICK, FLY), (vkc.Hold("stick", "end"), BALL)):
         with expect_error("not held before"):
             check_hold_order(holds)
 
@@ -86,7 +81,7 @@ def test_approach_from_inside_is_reversed(tmp_path: Path) -> None:
     }
     message = r"the hand would approach drawer\.handle(_free)? through the object"
     with pytest.warns(UserWarning, match=message) as caught:
-        scene = Scene.from_document({**original.document, "objects": [item]}, original.folder)
+        scene = vkc.Scene.from_document({**original.document, "objects": [item]}, original.folder)
     assert [one.filename for one in caught] == [__file__] * 2
     placed = scene.objects["drawer"]
     assert placed.reversed == ("handle", "handle_free")
@@ -96,16 +91,16 @@ def test_approach_from_inside_is_reversed(tmp_path: Path) -> None:
         )
         values = np.zeros(len(found.freedoms))
         np.testing.assert_allclose(found.tool(values), expected.tool(values), atol=1e-12)
-    again = Scene.from_document(scene.document, scene.folder)
+    again = vkc.Scene.from_document(scene.document, scene.folder)
     assert again.objects["drawer"].reversed == placed.reversed
     np.testing.assert_array_equal(
         again.objects["drawer"].object.attachment().placement, placed.object.attachment().placement
     )
 
 
-def make_scene(*objects: dict[str, Any], **fields: Any) -> Scene:
+def make_scene(*objects: dict[str, Any], **fields: Any) -> vkc.Scene:
     document = {"robot": "husky_ur5e", "start": {"base": [0.0, 0.0, 0.0]}, "objects": [*objects]}
-    return Scene.from_document({**document, **fields})
+    return vkc.Scene.from_document({**document, **fields})
 
 
 @pytest.mark.filterwarnings("error")
@@ -130,7 +125,7 @@ def test_approach_from_below_the_floor_is_reversed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["door", "ball", "stick"])
 def test_reversing_twice_restores_the_approach(name: str) -> None:
-    item = load_object(name)
+    item = vkc.load_object(name)
     state = np.zeros(item.coordinates.size)
     placed = vkc.PlacedObject(name, item, pin.SE3.Identity(), state)
     for attachment, grasp in item.attachments.items():
@@ -211,7 +206,7 @@ def test_virtual_joint_is_the_measured_transform(
 ) -> None:
     (name, attachment), (scene, measured) = grasp, make_measured_scene(grasp, fraction, offset)
     at = scene.holds[0].at
-    chain = consolidate(scene, scene.holds)
+    chain = vkc.consolidate(scene, scene.holds)
     z = np.zeros(chain.size)
     z[: len(scene.start)] = scene.start
     for joint, value in zip(chain.virtual[scene.holds[0]], reversed(at), strict=True):
@@ -240,8 +235,8 @@ def test_measured_grasp_survives_serialization(
     again = vkc.Scene.from_document(json.loads(json.dumps(scene.document)))
     assert again.holds == scene.holds
     assert again.holds[0].at == scene.holds[0].at
-    holds = (*scene.holds, Hold("fly", "leg", scene.holds[0], "tip"))
-    phases = (PhaseSpan("move", 0, 1, holds),)
+    holds = (*scene.holds, vkc.Hold("fly", "leg", scene.holds[0], "tip"))
+    phases = (vkc.PhaseSpan("move", 0, 1, holds),)
     motion = make_trajectory(scene, np.tile(scene.start, (2, 1)), phases=phases)
     with tempfile.TemporaryDirectory() as folder:
         table = vkc.Trajectory.from_csv(motion.to_csv(Path(folder) / "motion.csv"))
@@ -288,13 +283,13 @@ def test_hand_too_far_from_its_attachment_is_rejected(offset: list[float], got: 
     with expect_error(f"held.drawer.measured.*20 mm and 0.2 rad.*{got}"):
         make_hall().with_held({"drawer": "handle"}, measured={"drawer": measured})
     with expect_error(rf"Hold\.deviation.*{got}"):
-        Hold("drawer", "handle", deviation=tuple(offset))
+        vkc.Hold("drawer", "handle", deviation=tuple(offset))
 
 
 def test_invalid_measured_grasps_are_rejected() -> None:
-    assert Hold("drawer", "handle", deviation=(0.0,) * 6) == Hold("drawer", "handle")
+    assert vkc.Hold("drawer", "handle", deviation=(0.0,) * 6) == vkc.Hold("drawer", "handle")
     with expect_error("wrong number of values"):
-        Hold("drawer", "handle", deviation=(0.0,))
+        vkc.Hold("drawer", "handle", deviation=(0.0,))
     near = pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.001]))
     with expect_error("held.drawer.measured: a hand that pushes only touches"):
         make_hall().with_held({"drawer": "push"}, measured={"drawer": near})
@@ -380,9 +375,9 @@ def test_hand_clearance_is_at_most_that_of_the_measured_grasp() -> None:
         measured_scene = scene.with_held({"drawer": "handle"}, measured={"drawer": measured})
         found.append(
             compute_hand_clearance(
-                measured_scene, measured_scene.holds[0], "drawer.tray", Options()
+                measured_scene, measured_scene.holds[0], "drawer.tray", vkc.Options()
             )
         )
-    assert found[0] == Options().grasp_clearance
+    assert found[0] == vkc.Options().grasp_clearance
     assert found[2] < 0.0 < found[1] < found[0]
     assert found[1] - found[2] == pytest.approx(0.01, abs=1e-6)

@@ -10,9 +10,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from vkc_pin import PlacedObject, Robot, Scene, load_object, load_scene
 from vkc_pin.world.files.resources import find_resource_folder
-from vkc_pin.world.models.object_file import load_object
-from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import (
     compute_clearance,
     compute_world_box,
@@ -20,8 +19,8 @@ from vkc_pin.world.models.shapes import (
     list_placed_shapes,
 )
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
-from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
+from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.scene.scene import START_CLEARANCE
 
 DIST_SAFE, GRASP_CLEARANCE = 0.02, 0.005  # [m], defaults of the planner
 RANDOM_STARTS = sorted(

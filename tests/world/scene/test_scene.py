@@ -11,10 +11,9 @@ import pytest
 from helpers.expected_errors import expect_error
 from helpers.rooms import TINY, load_scene_text
 
-from vkc_pin.world.models.robot_file import load_robot
+from vkc_pin import Scene, load_robot, load_scene
 from vkc_pin.world.models.shapes import LIMIT_SLACK
 from vkc_pin.world.scene.placed_object import make_world_shapes
-from vkc_pin.world.scene.scene import Scene, load_scene
 
 
 @pytest.fixture(scope="module")

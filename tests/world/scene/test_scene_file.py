@@ -13,8 +13,8 @@ from helpers.expected_errors import expect_error
 from helpers.meshes import write_wedge
 from helpers.rooms import TINY, load_scene_text
 
+from vkc_pin import Scene, load_scene
 from vkc_pin.world.scene.obstacles import FLOOR
-from vkc_pin.world.scene.scene import Scene, load_scene
 
 
 def test_all_types_of_obstacles_are_loaded(tmp_path: Path) -> None:

@@ -7,9 +7,9 @@ import pinocchio as pin
 import pytest
 from helpers.supports import TOP, describe_cup, make_plate_scene, make_scene, write_objects
 
+from vkc_pin import Scene
 from vkc_pin.world.models.shapes import get_link_name
 from vkc_pin.world.scene.placed_object import make_world_shapes
-from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.scene.support import (
     compute_tilt,
     find_supported_objects,

@@ -18,10 +18,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.options import Options
-from vkc_pin.world.models.articulated_object import Attachment, Freedom
-from vkc_pin.world.scene.placed_object import PlacedObject
-from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actuation import compute_advance
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Task
@@ -30,7 +26,7 @@ STEP = 1e-6  # [rad] or [m]
 
 
 def differentiate_contact(
-    placed: PlacedObject, attachment: Attachment, joint: str, values: list[float]
+    placed: vkc.PlacedObject, attachment: vkc.Attachment, joint: str, values: list[float]
 ) -> float:
     """Return the advance of the contact into its face per unit of a joint, numerically."""
     contact = attachment.placement
@@ -63,11 +59,11 @@ def test_advance_matches_finite_differences(
         make_full_scene().objects["cabinet"].with_state({"swing": state[0], "slide": state[1]})
     )
     slides = [
-        Freedom(f"_{k}", "prismatic", axis, -0.1, 0.2) for k, axis in enumerate(np.eye(3)[:2])
+        vkc.Freedom(f"_{k}", "prismatic", axis, -0.1, 0.2) for k, axis in enumerate(np.eye(3)[:2])
     ]
-    tilt = Freedom("_tilt", "revolute", np.array([1.0, 0.0, 0.0]), -0.5, 0.5)
+    tilt = vkc.Freedom("_tilt", "revolute", np.array([1.0, 0.0, 0.0]), -0.5, 0.5)
     placement = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(position))
-    face = Attachment(
+    face = vkc.Attachment(
         name="face",
         link="tray",
         placement=placement,
@@ -90,11 +86,11 @@ def test_advance_matches_finite_differences(
         assert least - 1e-8 <= differentiate_contact(cabinet, face, joint, inside) <= most + 1e-8
 
 
-def push(scene: Scene, joints: dict[str, float], face: str, name: str = "door") -> Task:
-    return compile_task(scene, [vkc.Actuate(name, joints, face)], Options())
+def push(scene: vkc.Scene, joints: dict[str, float], face: str, name: str = "door") -> Task:
+    return compile_task(scene, [vkc.Actuate(name, joints, face)], vkc.Options())
 
 
-def open_door(hinge: float) -> Scene:
+def open_door(hinge: float) -> vkc.Scene:
     return load_door_scene().with_state("door", {"hinge": hinge})
 
 
@@ -134,7 +130,7 @@ def test_a_latched_door_cannot_be_pushed_open() -> None:
 
 def test_push_along_the_joint_axis_is_rejected() -> None:
     placement = pin.SE3(pin.rpy.rpyToMatrix(0.0, np.pi / 2, 0.0), np.array([0.0, 6e-4, 0.0]))
-    face = Attachment(name="face", link="arm", placement=placement, contact="push")
+    face = vkc.Attachment(name="face", link="arm", placement=placement, contact="push")
     cabinet = replace_attachment(make_full_scene().objects["cabinet"], face)
     scene = replace_objects(load_door_scene(), {"cabinet": cabinet})
     with expect_error("does not move 'swing' in a single direction"):

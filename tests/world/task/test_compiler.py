@@ -17,14 +17,12 @@ from helpers.small_problems import (
     make_full_scene,
 )
 
-from vkc_pin.options import Options
-from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.scene import Scene
+from vkc_pin import Actuate, GoTo, Grasp, Hold, Options, Reach, Scene
 from vkc_pin.world.task.actuation import find_shared_coordinate
 from vkc_pin.world.task.compiler import LATCH_MARGIN, compile_task
 from vkc_pin.world.task.lookup import find_path_joints
 from vkc_pin.world.task.phases import Task
-from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Reach, Step
+from vkc_pin.world.task.steps import Step
 
 OPTIONS = Options(reach_waypoints=10, turn_waypoints=3, move_waypoints=7)
 OPEN = Actuate("door", {"hinge": 1.2})

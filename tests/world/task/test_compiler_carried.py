@@ -13,12 +13,10 @@ from helpers.carrying import BALL, STICK, make_room, place_object
 from helpers.expected_errors import expect_error
 from helpers.small_problems import make_full_scene, replace_objects
 
-from vkc_pin.options import Options
-from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.scene import Scene
+from vkc_pin import Actuate, GoTo, Grasp, Hold, Options, Place, Reach, Release, Scene, Touch
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Phase, Task
-from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
+from vkc_pin.world.task.steps import Step
 
 OPTIONS = Options(reach_waypoints=10, turn_waypoints=3, move_waypoints=7)
 GRIP = Hold("stick", "grip")

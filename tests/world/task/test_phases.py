@@ -8,11 +8,10 @@ import pytest
 from helpers.carrying import describe_stand, make_room
 from helpers.small_problems import SHORT, make_full_scene
 
-from vkc_pin.world.scene.hold import Hold
-from vkc_pin.world.scene.scene import Scene
+from vkc_pin import Actuate, GoTo, Grasp, Hold, Place, Reach, Release, Scene, Touch
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import FrameGoal, Phase, Task
-from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
+from vkc_pin.world.task.steps import Step
 
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array([0.4, 0.2, 0.9]))
 FURNITURE: list[Step] = [

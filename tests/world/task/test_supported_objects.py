@@ -16,16 +16,14 @@ from helpers.supports import (
 )
 
 import vkc_pin as vkc
-from vkc_pin.options import Options
-from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Task
 
 GOAL = pin.SE3(np.eye(3), np.array([-0.5, -1.5, 0.7]))
 
 
-def compile_steps(scene: Scene, *steps: vkc.Step) -> Task:
-    return compile_task(scene, steps, Options())
+def compile_steps(scene: vkc.Scene, *steps: vkc.Step) -> Task:
+    return compile_task(scene, steps, vkc.Options())
 
 
 def list_supported(task: Task) -> list[list[tuple[str, str]]]:

@@ -15,7 +15,6 @@ import vkc_pin as vkc
 from vkc_pin.world.task.terms import (
     ROUNDING,
     Formula,
-    State,
     check_terms_active,
     term_from_dict,
     term_to_dict,
@@ -26,8 +25,8 @@ FRAMES, COORDINATES = ("tool", "cup.cup"), ("elbow_joint", "door.hinge")
 DT = 0.25
 
 
-def make_state() -> State:
-    return State(FRAMES, COORDINATES)
+def make_state() -> vkc.State:
+    return vkc.State(FRAMES, COORDINATES)
 
 
 def sample_inputs(formula: Formula, count: int = 5) -> np.ndarray:

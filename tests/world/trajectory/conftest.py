@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from helpers.fake_plan import make_fake_plan
 
-from vkc_pin.planning.plan import Plan
+from vkc_pin import Plan
 
 
 @pytest.fixture(scope="session")

@@ -25,8 +25,7 @@ from helpers.carrying import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin import Scene, Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
 TIP = pin.SE3(pin.utils.rotate("x", -np.pi / 2), np.array([0.0, 0.25, 0.0]))  # in the stick

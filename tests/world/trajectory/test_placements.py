@@ -4,7 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin.planning.plan import Plan
+from vkc_pin import Plan
 from vkc_pin.world.trajectory.placements import Motion, key_times, sample_motion
 from vkc_pin.world.trajectory.world_model import World
 

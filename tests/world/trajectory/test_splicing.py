@@ -7,15 +7,13 @@ import pytest
 from helpers.expected_errors import expect_error
 from helpers.trajectory_files import NAMES, ROWS
 
-from vkc_pin.errors import InputError
-from vkc_pin.world.scene.hold import Hold, make_holds
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin import Hold, InputError, PhaseSpan, Trajectory
+from vkc_pin.world.scene.hold import make_holds
 from vkc_pin.world.trajectory.splicing import (
     concatenate_trajectories,
     extract_phases,
     fill_missing_values,
 )
-from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def test_missing_values_are_filled_from_their_neighbours() -> None:

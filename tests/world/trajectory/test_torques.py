@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 import vkc_pin as vkc
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.torques import Handle, Motion, Torques
-from vkc_pin.world.trajectory.trajectory import PhaseSpan, Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
 REAL = st.floats(-1.0, 1.0)
@@ -117,7 +116,7 @@ def test_latches_and_joint_stops_carry_static_loads() -> None:
     assert slide.forces(make_motion(drawer_slide=(0.1, 0.0, 0.0)))[0, 0] == pytest.approx(55.0)
 
 
-def make_swing(mass: float, *, base: float = 0.0) -> tuple[vkc.Scene, Trajectory]:
+def make_swing(mass: float, *, base: float = 0.0) -> tuple[vkc.Scene, vkc.Trajectory]:
     """Return a scene with the stick in the hand, and a motion of arm and base in it."""
     scene = replace_object_fields(vkc.load_scene("init_1"), "stick", mass=mass).with_held(
         {"stick": "grip"}
@@ -130,13 +129,13 @@ def make_swing(mass: float, *, base: float = 0.0) -> tuple[vkc.Scene, Trajectory
     positions[:, :size] += scale * np.cumsum(rng.uniform(-1.0, 1.0, (6, size)), axis=0)
     rates = np.zeros_like(positions)
     rates[1:-1, :size] = scale * rng.uniform(-1.0, 1.0, (4, size))
-    phase = PhaseSpan("swing", 0, 5, scene.holds)
-    return scene, Trajectory(
+    phase = vkc.PhaseSpan("swing", 0, 5, scene.holds)
+    return scene, vkc.Trajectory(
         names, times, positions, (phase,), size, Curve(times, positions, rates)
     )
 
 
-def compute_energy(world: World, motion: Trajectory, time: float) -> float:
+def compute_energy(world: World, motion: vkc.Trajectory, time: float) -> float:
     """Return the energy of robot and stick [J], from finite differences of body placements."""
     h = 1e-5
     rows = world.coordinates.q(

@@ -10,9 +10,8 @@ import pytest
 from helpers.expected_errors import expect_error
 from helpers.trajectory_files import NAMES, PHASES, ROWS, TIMES, make_example_trajectory
 
+from vkc_pin import PhaseSpan, Trajectory
 from vkc_pin.world.scene.hold import make_holds
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 def test_path_lengths() -> None:

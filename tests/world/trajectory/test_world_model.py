@@ -9,8 +9,6 @@ from helpers.small_problems import make_full_scene, sample_configurations
 
 import vkc_pin as vkc
 from vkc_pin.world.scene.placed_object import make_world_shapes
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World, find_coordinate_units
 
 
@@ -65,8 +63,8 @@ def test_positions_along_a_motion(world: World) -> None:
     robot = world.scene.robot.coordinates.names
     names = (*robot, "drawer.slide", "door.handle_free", "door.hinge")
     values = np.random.default_rng(0).normal(size=(3, len(names)))
-    phases = (PhaseSpan("all", 0, 2),)
-    motion = Trajectory(names, np.array([0.0, 1.0, 3.0]), values, phases, len(robot))
+    phases = (vkc.PhaseSpan("all", 0, 2),)
+    motion = vkc.Trajectory(names, np.array([0.0, 1.0, 3.0]), values, phases, len(robot))
     for times, expected in ((None, values), ([0.5], values[:2].mean(axis=0, keepdims=True))):
         rows = np.tile(world.start, (len(expected), 1))
         for k, name in enumerate(world.coordinates.names):

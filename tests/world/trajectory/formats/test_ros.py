@@ -17,10 +17,8 @@ from hypothesis.extra.numpy import arrays
 from scipy.interpolate import PchipInterpolator
 
 import vkc_pin as vkc
-from vkc_pin.planning.plan import Plan
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.formats.ros import estimate_rates, evaluate_cubics
-from vkc_pin.world.trajectory.trajectory import Trajectory
 
 COLUMNS = arrays(
     float, st.tuples(st.integers(2, 8), st.integers(1, 3)), elements=st.floats(-10.0, 10.0)
@@ -78,8 +76,8 @@ def test_resting_coordinates_stay_at_rest() -> None:
 
 @FILES
 @given(trajectory=trajectories(largest=1e6))
-def test_ros_round_trip_is_exact_to_a_nanosecond(trajectory: Trajectory) -> None:
-    back = Trajectory.from_ros(
+def test_ros_round_trip_is_exact_to_a_nanosecond(trajectory: vkc.Trajectory) -> None:
+    back = vkc.Trajectory.from_ros(
         json.loads(json.dumps(trajectory.to_ros(joints="all"))), like=trajectory
     )
     np.testing.assert_allclose(
@@ -88,7 +86,7 @@ def test_ros_round_trip_is_exact_to_a_nanosecond(trajectory: Trajectory) -> None
     assert {**back.to_dict(), "times": 0} == {**trajectory.to_dict(), "times": 0}
 
 
-def test_a_message_has_the_fields_of_a_joint_trajectory(plan: Plan) -> None:
+def test_a_message_has_the_fields_of_a_joint_trajectory(plan: vkc.Plan) -> None:
     message = plan.to_ros(frame="map", stamp=1.5)
     assert json.loads(json.dumps(message)) == message, "plain data"
     assert set(message) == {"header", "joint_names", "points"}
@@ -112,7 +110,7 @@ def test_a_message_has_the_fields_of_a_joint_trajectory(plan: Plan) -> None:
         assert set(end["velocities"]) == {0.0}
 
 
-def test_number_of_points_is_limited(plan: Plan) -> None:
+def test_number_of_points_is_limited(plan: vkc.Plan) -> None:
     duration = float(np.ptp(plan.trajectory.times))
     with pytest.raises(vkc.InputError, match="too many points") as caught:
         plan.to_ros(rate=1.1e6 / duration / len(plan.scene.start))
@@ -126,7 +124,7 @@ def test_rests_keep_their_duration_at_any_rate(rate: float) -> None:
     knots = np.array([0.0, 1.1, 1.4, 2.0, 2.00002, 3.3])
     waypoints = np.array([0.0, 1.0, 1.0, 2.0, 2.0, 3.0])[:, None] * np.ones(3)
     curve = Curve(knots, waypoints, np.zeros((6, 3)))
-    motion = Trajectory(
+    motion = vkc.Trajectory(
         ("base_x", "base_y", "base_yaw"),
         knots,
         waypoints,
@@ -134,7 +132,7 @@ def test_rests_keep_their_duration_at_any_rate(rate: float) -> None:
         3,
         curve,
     )
-    received = Trajectory.from_ros(motion.to_ros(rate=rate))
+    received = vkc.Trajectory.from_ros(motion.to_ros(rate=rate))
     even = np.append(np.arange(np.ceil(3.3 * rate - 1e-6)) / rate, 3.3)
     even = even[(np.abs(even[:, None] - knots[1:5]) > 1e-4).all(axis=1)]
     np.testing.assert_allclose(received.times, np.sort([*even, *knots[1:5]]), atol=1e-8)
@@ -151,7 +149,9 @@ def test_rests_keep_their_duration_at_any_rate(rate: float) -> None:
         ({"joints": []}, "joints: no joints"),
     ],
 )
-def test_invalid_options_are_rejected(plan: Plan, options: dict[str, Any], message: str) -> None:
+def test_invalid_options_are_rejected(
+    plan: vkc.Plan, options: dict[str, Any], message: str
+) -> None:
     with expect_error(message):
         plan.to_ros(**options)
 
@@ -201,19 +201,19 @@ def replace_value(message: dict[str, Any], path: str, value: Any) -> dict[str, A
     ],
 )
 def test_invalid_messages_are_rejected(
-    plan: Plan, tmp_path: Path, path: str, value: Any, expected: str
+    plan: vkc.Plan, tmp_path: Path, path: str, value: Any, expected: str
 ) -> None:
     message = replace_value(plan.to_ros(), path, value)
     with expect_error(f"^{expected}"):
-        Trajectory.from_ros(message)
+        vkc.Trajectory.from_ros(message)
     with expect_error(f"bad.json: {expected}"):
-        Trajectory.from_ros(write_text_file(tmp_path / "bad.json", json.dumps(message)))
+        vkc.Trajectory.from_ros(write_text_file(tmp_path / "bad.json", json.dumps(message)))
 
 
-def test_exported_knots_describe_the_same_motion(door_plan: Plan) -> None:
+def test_exported_knots_describe_the_same_motion(door_plan: vkc.Plan) -> None:
     """Clearances hold at waypoints, so knots between them must not become waypoints."""
     motion = door_plan.trajectory
-    received = Trajectory.from_ros(motion.to_ros(joints="all"), like=motion)
+    received = vkc.Trajectory.from_ros(motion.to_ros(joints="all"), like=motion)
     assert len(motion.times) < len(motion.curve.times)
     np.testing.assert_allclose(received.times, motion.times - motion.times[0], atol=1e-8)
     assert [vars(phase) for phase in received.phases] == [vars(phase) for phase in motion.phases]
@@ -224,8 +224,8 @@ def test_exported_knots_describe_the_same_motion(door_plan: Plan) -> None:
 
 
 @pytest.mark.parametrize("smooth", [True, False])
-def test_exported_motions_can_be_validated(door_plan: Plan, smooth: bool) -> None:
-    received = Trajectory.from_ros(
+def test_exported_motions_can_be_validated(door_plan: vkc.Plan, smooth: bool) -> None:
+    received = vkc.Trajectory.from_ros(
         door_plan.to_ros(joints="all", rate=50.0, smooth=smooth), like=door_plan.trajectory
     )
     assert [phase.name for phase in received.phases] == [

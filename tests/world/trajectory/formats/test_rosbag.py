@@ -15,7 +15,7 @@ from helpers.fake_plan import make_fake_plan
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from vkc_pin.planning.plan import Plan
+from vkc_pin import Plan
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.formats.rosbag import TOPICS
 

@@ -17,34 +17,33 @@ from hypothesis import given
 
 import vkc_pin as vkc
 from vkc_pin import cli
-from vkc_pin.planning.plan import Plan
 from vkc_pin.world.trajectory.curve import Curve
-from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
 @pytest.mark.parametrize("kind", ["csv", "json"])
 @FILES
 @given(trajectory=trajectories())
-def test_round_trips_are_exact(trajectory: Trajectory, kind: str, tmp_path: Path) -> None:
+def test_round_trips_are_exact(trajectory: vkc.Trajectory, kind: str, tmp_path: Path) -> None:
     file = getattr(trajectory, f"to_{kind}")(tmp_path / "motion")
-    assert are_equal(getattr(Trajectory, f"from_{kind}")(file), trajectory)
+    assert are_equal(getattr(vkc.Trajectory, f"from_{kind}")(file), trajectory)
 
 
 def test_curves_and_openings_survive_files(tmp_path: Path) -> None:
     times, rows = np.array([0.0, 0.5, 1.0]), np.arange(9.0).reshape(3, 3)
     curve = Curve(times, rows, 0.1 * rows)
-    phases = (PhaseSpan("go", 0, 1, opening=0.04),)
-    trajectory = Trajectory(ROBOT[:3], times[[0, 2]], rows[[0, 2]], phases, 3, curve)
+    phases = (vkc.PhaseSpan("go", 0, 1, opening=0.04),)
+    trajectory = vkc.Trajectory(ROBOT[:3], times[[0, 2]], rows[[0, 2]], phases, 3, curve)
     table = trajectory.to_csv(tmp_path / "motion.csv")
-    assert are_equal(Trajectory.from_csv(table), trajectory)
-    assert are_equal(Trajectory.from_json(trajectory.to_json(tmp_path / "motion.json")), trajectory)
+    assert are_equal(vkc.Trajectory.from_csv(table), trajectory)
+    assert are_equal(
+        vkc.Trajectory.from_json(trajectory.to_json(tmp_path / "motion.json")), trajectory
+    )
     table.write_text(table.read_text().replace("base_y velocity", "base_z velocity"))
     with expect_error("not the velocities of its coordinates"):
-        Trajectory.from_csv(table)
+        vkc.Trajectory.from_csv(table)
 
 
-def test_columns_have_names_and_units(plan: Plan, tmp_path: Path) -> None:
+def test_columns_have_names_and_units(plan: vkc.Plan, tmp_path: Path) -> None:
     with plan.to_csv(tmp_path / "door.csv").open(encoding="utf-8", newline="") as file:
         header, *lines = csv.reader(file)
     assert header[:4] == ["time [s]", "base_x [m]", "base_y [m]", "base_yaw [rad]"]
@@ -68,7 +67,7 @@ def test_columns_have_names_and_units(plan: Plan, tmp_path: Path) -> None:
     ],
 )
 def test_joints_are_selected_by_group_or_name(
-    plan: Plan, tmp_path: Path, joints: Any, count: int
+    plan: vkc.Plan, tmp_path: Path, joints: Any, count: int
 ) -> None:
     table, message = plan.to_csv(tmp_path / "some", joints=joints), plan.to_ros(joints=joints)
     columns = table.read_text(encoding="utf-8").splitlines()[0].split(",")[1:-3]
@@ -77,7 +76,7 @@ def test_joints_are_selected_by_group_or_name(
     assert {len(point["positions"]) for point in message["points"]} == {count}
 
 
-def test_unknown_joints_are_rejected(plan: Plan, tmp_path: Path) -> None:
+def test_unknown_joints_are_rejected(plan: vkc.Plan, tmp_path: Path) -> None:
     with pytest.raises(vkc.UnknownNameError, match="did you mean 'robot'"):
         plan.to_ros(joints="robo")
     with pytest.raises(vkc.UnknownNameError, match=r"joints\[1\].*door.hinge"):
@@ -89,11 +88,11 @@ def test_unknown_joints_are_rejected(plan: Plan, tmp_path: Path) -> None:
 
 def test_plain_tables_are_read(tmp_path: Path) -> None:
     text = "\ufefftime,base_x,base_y,base_yaw,door.hinge\r\n0,0,0,0,0\r\n\r\n0.5,1,2,3,4\r\n"
-    found = Trajectory.from_csv(write_text_file(tmp_path / "own.csv", text))
+    found = vkc.Trajectory.from_csv(write_text_file(tmp_path / "own.csv", text))
     assert (found.names, found.robot_size) == (("base_x", "base_y", "base_yaw", "door.hinge"), 3)
-    assert found.phases == (PhaseSpan("motion", 0, 1),)
+    assert found.phases == (vkc.PhaseSpan("motion", 0, 1),)
     assert found.positions[1].tolist() == [1.0, 2.0, 3.0, 4.0]
-    assert Trajectory.from_csv(tmp_path / "own.csv", robot_size=4).robot_size == 4
+    assert vkc.Trajectory.from_csv(tmp_path / "own.csv", robot_size=4).robot_size == 4
 
 
 HEADER = "time [s],base_x [m],base_y [m],base_yaw [rad],phase,phase_name,held\n"
@@ -123,12 +122,12 @@ ROW = "0.0,0,0,0,1,go,{}\n"
 )
 def test_invalid_tables_are_rejected(tmp_path: Path, text: str, message: str) -> None:
     with expect_error(message):
-        Trajectory.from_csv(write_text_file(tmp_path / "bad.csv", text))
+        vkc.Trajectory.from_csv(write_text_file(tmp_path / "bad.csv", text))
 
 
 @pytest.mark.parametrize("kind", ["csv", "json", "ros"])
 def test_unreadable_files_are_rejected(tmp_path: Path, kind: str) -> None:
-    read = getattr(Trajectory, f"from_{kind}")
+    read = getattr(vkc.Trajectory, f"from_{kind}")
     with expect_error(r"none: cannot read the (CSV|JSON) .*No such file"):
         read(tmp_path / "none")
     (tmp_path / "picture").write_bytes(b"\xff\xfe\x00")
@@ -158,7 +157,7 @@ def test_large_and_deep_files_are_rejected_quickly(
 ) -> None:
     began = time.process_time()
     with pytest.raises(vkc.InputError, match=message) as caught:
-        getattr(Trajectory, f"from_{kind}")(write_text_file(tmp_path / "bad", text))
+        getattr(vkc.Trajectory, f"from_{kind}")(write_text_file(tmp_path / "bad", text))
     assert len(str(caught.value)) < 5000
     assert time.process_time() - began < 10.0
 
@@ -180,18 +179,18 @@ def test_large_and_deep_files_are_rejected_quickly(
 )
 def test_invalid_json_is_rejected(tmp_path: Path, text: str, message: str) -> None:
     with expect_error(message):
-        Trajectory.from_json(write_text_file(tmp_path / "bad.json", text))
+        vkc.Trajectory.from_json(write_text_file(tmp_path / "bad.json", text))
 
 
 def test_export_of_a_saved_plan(
-    plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    plan: vkc.Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     saved, out = str(plan.save(tmp_path / "door.npz")), tmp_path / "new"
     files = [part for kind in ("csv", "json", "ros") for part in (f"--{kind}", str(out / kind))]
     assert cli.main(["export", saved, *files]) == 0
     assert capsys.readouterr().out == "".join(f"wrote {file}\n" for file in files[1::2])
-    assert are_equal(Trajectory.from_csv(out / "csv"), plan.trajectory)
-    assert are_equal(Trajectory.from_json(out / "json"), plan.trajectory)
+    assert are_equal(vkc.Trajectory.from_csv(out / "csv"), plan.trajectory)
+    assert are_equal(vkc.Trajectory.from_json(out / "json"), plan.trajectory)
     assert json.loads((out / "ros").read_text(encoding="utf-8")) == plan.to_ros()
     few = ["--joints", "base_x,door.hinge"]
     files = ["--ros", str(out / "ros"), "--csv", str(out / "csv")]
@@ -212,7 +211,7 @@ def test_export_of_a_saved_plan(
     ],
 )
 def test_invalid_export_options_are_rejected(
-    plan: Plan,
+    plan: vkc.Plan,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,

@@ -21,7 +21,7 @@ from vkc_pin.world.scene.contact_rules import (
     is_rigid_grasp,
 )
 
-HANDLE, FREE = Hold("door", "handle"), Hold("door", "handle_free")
+HANDLE = Hold("door", "handle")
 THROUGH = Hold("door", "handle", Hold("stick", "grip"), "tip")
 LEVER, PANEL = "door.lever", "door.panel"
 
@@ -48,13 +48,15 @@ def test_hand_clearance_is_that_of_the_attachment(clearance: float | None, expec
 
 
 def test_pushing_or_indirect_hold_needs_no_clearance_from_its_link() -> None:
-    options = Options()
-    pushed = load_door(contact="push")
-    assert compute_hand_clearance(pushed, HANDLE, LEVER, options) == 0.0
-    assert compute_hand_clearance(pushed, HANDLE, PANEL, options) == 0.005
-    assert compute_hand_clearance(load_door(), THROUGH, LEVER, options) == 0.0
-    assert compute_hand_clearance(load_door(), THROUGH, PANEL, options) == 0.005
-    assert compute_hand_clearance(load_door(), HANDLE, LEVER, options) == 0.005
+    pushed, door = load_door(contact="push"), load_door()
+    for scene, hold, link, expected in (
+        (pushed, HANDLE, LEVER, 0.0),
+        (pushed, HANDLE, PANEL, 0.005),
+        (door, THROUGH, LEVER, 0.0),
+        (door, THROUGH, PANEL, 0.005),
+        (door, HANDLE, LEVER, 0.005),
+    ):
+        assert compute_hand_clearance(scene, hold, link, Options()) == expected
 
 
 @pytest.mark.parametrize(

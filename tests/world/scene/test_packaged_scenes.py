@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from functools import cache
 
 import coal
@@ -10,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin import PlacedObject, Robot, Scene, load_object, load_scene
+from vkc_pin import PlacedObject, Scene, load_object, load_scene
 from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.models.shapes import (
     compute_clearance,
@@ -18,7 +17,7 @@ from vkc_pin.world.models.shapes import (
     get_link_name,
     list_placed_shapes,
 )
-from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.clearance_exemptions import find_close_pairs
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import START_CLEARANCE
 
@@ -50,49 +49,28 @@ def list_parts(placed: PlacedObject, *links: str) -> list[pin.GeometryObject]:
     return [s for s in make_world_shapes(placed) if not links or get_link_name(s.name) in links]
 
 
-def list_obstacles(scene: Scene, *names: str) -> list[pin.GeometryObject]:
-    """Return the shapes of obstacles, by default of all but the floor."""
+def list_obstacles(scene: Scene, name: str) -> list[pin.GeometryObject]:
     labels = zip(scene.obstacles, scene.obstacle_labels, strict=True)
-    return [s for s, label in labels if (label in names if names else label != FLOOR)]
+    return [shape for shape, label in labels if label == name]
 
 
-def list_surroundings(scene: Scene, excluded: str = "") -> list[pin.GeometryObject]:
-    """Return the shapes of all obstacles but the floor, and of all objects but one."""
-    others = [placed for name, placed in scene.objects.items() if name != excluded]
-    return list_obstacles(scene) + [shape for placed in others for shape in list_parts(placed)]
-
-
-def measure_clearance(
-    shapes: Iterable[pin.GeometryObject], others: Iterable[pin.GeometryObject]
-) -> float:
-    return compute_clearance(list_placed_shapes(shapes), list_placed_shapes(others), reach=0.2)
-
-
-def compute_bounds(shapes: Iterable[pin.GeometryObject]) -> np.ndarray:
-    """Return the lowest and highest x, y, z, shape (2, 3) [m]."""
-    boxes = np.array([compute_world_box(shape.geometry, shape.placement) for shape in shapes])
-    return np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
-
-
-def place_robot_shapes(
-    robot: Robot, z: np.ndarray, links: Iterable[str]
-) -> list[pin.GeometryObject]:
-    """Return the shapes of some links at a configuration, in the world frame."""
-    data, places = robot.model.createData(), robot.collision.createData()
-    pin.updateGeometryPlacements(robot.model, data, robot.collision, places, robot.coordinates.q(z))
-    return [
-        pin.GeometryObject(shape.name, 0, 0, places.oMg[k], shape.geometry)
-        for k, shape in enumerate(robot.collision.geometryObjects)
-        if robot.link_of(k) in links
-    ]
+def list_close_labels(scene: Scene, reach: float) -> set[str]:
+    """Return the labels of links and obstacles that are closer than `reach` [m] to others."""
+    return {label for pair in find_close_pairs(scene, reach) for label in pair[:2]}
 
 
 def place_hand(tool: pin.SE3) -> list[tuple[coal.CollisionGeometry, pin.SE3]]:
     """Return the shapes of the open gripper with the tool frame at `tool`."""
-    scene = load().with_start(base=[0.0, 0.0, 0.0], arm=load().robot.home)
-    back = tool * scene.tool_placement().inverse()
-    shapes = place_robot_shapes(scene.robot, scene.start, scene.robot.touch_links)
-    return [(shape.geometry, back * shape.placement) for shape in shapes]
+    scene = load()
+    robot, back = scene.robot, tool * scene.tool_placement().inverse()
+    data, places = robot.model.createData(), robot.collision.createData()
+    q = robot.coordinates.q(scene.start)
+    pin.updateGeometryPlacements(robot.model, data, robot.collision, places, q)
+    return [
+        (shape.geometry, back * places.oMg[k])
+        for k, shape in enumerate(robot.collision.geometryObjects)
+        if robot.link_of(k) in robot.touch_links
+    ]
 
 
 @pytest.mark.parametrize("name", RANDOM_STARTS)
@@ -129,18 +107,19 @@ def test_random_starts_fill_their_region(name: str) -> None:
 def test_joints_move_freely_over_their_range(
     name: str, owner: str, joint: str, upper: float
 ) -> None:
-    placed, rest = load(name).objects[owner], list_surroundings(load(name), owner)
-    item = placed.object
+    scene, item = load(name), load(name).objects[owner].object
     k = item.coordinates.index(joint)
     assert item.upper[k] == pytest.approx(upper)
     moving = item.links_moved_by({joint})
+    others = [link for link in item.links if link not in moving]
     for value in np.linspace(item.lower[k], item.upper[k], 12):
-        moved = placed.with_state({joint: float(value)})
-        assert measure_clearance(list_parts(moved, *moving), rest) > DIST_SAFE, value
-        others = [link for link in item.links if link not in moving]
-        assert measure_clearance(list_parts(moved, *moving), list_parts(moved, *others)) > 0.004, (
-            value
+        moved = scene.with_state(owner, {joint: float(value)})
+        assert not list_close_labels(moved, DIST_SAFE) & {f"{owner}.{link}" for link in moving}
+        own, rest = (
+            list_placed_shapes(list_parts(moved.objects[owner], *links))
+            for links in (moving, others)
         )
+        assert compute_clearance(own, rest) > 0.004, value
 
 
 @pytest.mark.parametrize("name", OBJECTS)
@@ -183,11 +162,16 @@ def test_hand_fits_around_every_attachment(name: str) -> None:
 def test_dimensions_match_the_paper(
     name: str, names: list[str], low: tuple[float, ...], high: tuple[float, ...]
 ) -> None:
-    shapes = list_obstacles(load(name), *names)
-    for label in names if not shapes else ():
-        owner, _, link = label.partition(".")
-        shapes = list_parts(load(name).objects[owner], link)
-    np.testing.assert_allclose(compute_bounds(shapes), [low, high], atol=1e-9)
+    owner, _, link = names[0].partition(".")
+    scene = load(name)
+    shapes = (
+        list_parts(scene.objects[owner], link)
+        if link
+        else [shape for label in names for shape in list_obstacles(scene, label)]
+    )
+    boxes = np.array([compute_world_box(shape.geometry, shape.placement) for shape in shapes])
+    bounds = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    np.testing.assert_allclose(bounds, [low, high], atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -207,9 +191,8 @@ def test_base_fits_through_passages(
     scene = load(name).with_state("door", state) if state else load(name)
     heading = float(np.arctan2(end[1] - begin[1], end[0] - begin[0]))
     for x, y in np.linspace(begin, end, 20):
-        z = np.array([x, y, heading, *scene.robot.home])
-        base = place_robot_shapes(scene.robot, z, ["base_link"])
-        assert measure_clearance(base, list_surroundings(scene)) > DIST_SAFE, (x, y)
+        moved = scene.with_start(base=[x, y, heading], arm=[0.0, *scene.robot.home[1:]])
+        assert moved.start_clearance(reach=0.1) > DIST_SAFE, (x, y)
 
 
 def test_gap_between_pillar_and_wall_is_the_only_passage() -> None:
@@ -224,13 +207,8 @@ def test_gap_between_pillar_and_wall_is_the_only_passage() -> None:
 
 
 def test_household_is_furnished_without_overlaps() -> None:
+    """The frame of the door fills an opening."""
     scene = load()
-    np.testing.assert_allclose(
-        compute_bounds(list_surroundings(scene)), [[-4.1, -4.1, 0.0], [4.1, 4.1, 2.4]], atol=1e-9
-    )
-    assert len(list_surroundings(scene)) >= 120
-    for name, placed in scene.objects.items():
-        links = ("panel", "lever") if name == "door" else ()  # its frame fills an opening
-        assert (
-            measure_clearance(list_parts(placed, *links), list_surroundings(scene, name)) > 9e-4
-        ), name
+    shapes = [shape for placed in scene.objects.values() for shape in list_parts(placed)]
+    assert len(shapes) + len(scene.obstacles) > 120
+    assert list_close_labels(scene, 9e-4) <= {"door.frame", *scene.obstacle_labels}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -48,8 +49,8 @@ def test_coordinates_stay_between_their_waypoints(positions: np.ndarray, seed: i
     sample_times = np.sort(rng.uniform(times[0], times[-1], 50))
     position, _, _ = evaluate_cubics(times, positions, velocities, sample_times)
     at = np.clip(np.searchsorted(times, sample_times, side="right") - 1, 0, len(times) - 2)
-    assert (position >= np.minimum(positions[at], positions[at + 1])).all()
-    assert (position <= np.maximum(positions[at], positions[at + 1])).all()
+    ends = np.sort([positions[at], positions[at + 1]], axis=0)
+    assert ((ends[0] <= position) & (position <= ends[1])).all()
 
 
 def test_motion_of_an_arm_alone_is_rejected() -> None:
@@ -66,44 +67,30 @@ def test_resting_coordinates_stay_at_rest() -> None:
     velocities, accelerations = estimate_rates(times, positions)
     assert (velocities == 0.0).all()
     assert (accelerations == 0.0).all(), "the direction reverses at rest"
-    position, velocity, acceleration = evaluate_cubics(
-        times, positions, velocities, np.linspace(1.0, 2.99, 20)
-    )
-    assert (position == 1.0).all()
-    assert (velocity == 0.0).all()
-    assert (acceleration == 0.0).all()
+    for values, expected in zip(
+        evaluate_cubics(times, positions, velocities, np.linspace(1.0, 2.99, 20)),
+        (1.0, 0.0, 0.0),
+        strict=True,
+    ):
+        assert (values == expected).all()
 
 
 @FILES
 @given(trajectory=trajectories(largest=1e6))
 def test_ros_round_trip_is_exact_to_a_nanosecond(trajectory: vkc.Trajectory) -> None:
-    back = vkc.Trajectory.from_ros(
-        json.loads(json.dumps(trajectory.to_ros(joints="all"))), like=trajectory
-    )
-    np.testing.assert_allclose(
-        back.times, trajectory.times - trajectory.times[0], rtol=0.0, atol=1e-9
-    )
+    message = json.loads(json.dumps(trajectory.to_ros(joints="all")))
+    back, times = vkc.Trajectory.from_ros(message, like=trajectory), trajectory.times
+    np.testing.assert_allclose(back.times, times - times[0], rtol=0.0, atol=1e-9)
     assert {**back.to_dict(), "times": 0} == {**trajectory.to_dict(), "times": 0}
 
 
-def test_a_message_has_the_fields_of_a_joint_trajectory(plan: vkc.Plan) -> None:
-    message = plan.to_ros(frame="map", stamp=1.5)
+def test_a_message_has_all_motors_and_the_times_of_waypoints(plan: vkc.Plan) -> None:
+    """The tests of ROS bags compare all fields with those of the message types."""
+    message = plan.to_ros()
     assert json.loads(json.dumps(message)) == message, "plain data"
-    assert set(message) == {"header", "joint_names", "points"}
-    assert message["header"] == {"stamp": {"sec": 1, "nanosec": 500_000_000}, "frame_id": "map"}
-    assert message["joint_names"] == list(plan.trajectory.names[:9]), "coordinates with motors"
+    assert message["joint_names"] == list(plan.trajectory.names[:9])
     for point, moment in zip(message["points"], plan.trajectory.times, strict=True):
-        assert set(point) == {
-            "positions",
-            "velocities",
-            "accelerations",
-            "effort",
-            "time_from_start",
-        }
-        assert {len(point[key]) for key in ("positions", "velocities", "accelerations")} == {9}
-        assert point["effort"] == []
         since = point["time_from_start"]
-        assert type(since["sec"]) is type(since["nanosec"]) is int
         assert 0 <= since["nanosec"] < 1_000_000_000
         assert since["sec"] + 1e-9 * since["nanosec"] == pytest.approx(moment, abs=1e-9)
     for end in (message["points"][0], message["points"][-1]):
@@ -112,10 +99,9 @@ def test_a_message_has_the_fields_of_a_joint_trajectory(plan: vkc.Plan) -> None:
 
 def test_number_of_points_is_limited(plan: vkc.Plan) -> None:
     duration = float(np.ptp(plan.trajectory.times))
-    with pytest.raises(vkc.InputError, match="too many points") as caught:
+    highest = f"{1e6 // len(plan.scene.start) / duration:.4g} a second"
+    with expect_error(f"rate: too many points.*{re.escape(highest)}"):
         plan.to_ros(rate=1.1e6 / duration / len(plan.scene.start))
-    assert caught.value.field == "rate"
-    assert f"{1e6 // len(plan.scene.start) / duration:.4g} a second" in str(caught.value)
 
 
 @pytest.mark.parametrize("rate", [1.0, 25.0])
@@ -124,14 +110,8 @@ def test_rests_keep_their_duration_at_any_rate(rate: float) -> None:
     knots = np.array([0.0, 1.1, 1.4, 2.0, 2.00002, 3.3])
     waypoints = np.array([0.0, 1.0, 1.0, 2.0, 2.0, 3.0])[:, None] * np.ones(3)
     curve = Curve(knots, waypoints, np.zeros((6, 3)))
-    motion = vkc.Trajectory(
-        ("base_x", "base_y", "base_yaw"),
-        knots,
-        waypoints,
-        (vkc.PhaseSpan("drive", 0, 5),),
-        3,
-        curve,
-    )
+    names, phases = ("base_x", "base_y", "base_yaw"), (vkc.PhaseSpan("drive", 0, 5),)
+    motion = vkc.Trajectory(names, knots, waypoints, phases, 3, curve)
     received = vkc.Trajectory.from_ros(motion.to_ros(rate=rate))
     even = np.append(np.arange(np.ceil(3.3 * rate - 1e-6)) / rate, 3.3)
     even = even[(np.abs(even[:, None] - knots[1:5]) > 1e-4).all(axis=1)]
@@ -225,19 +205,14 @@ def test_exported_knots_describe_the_same_motion(door_plan: vkc.Plan) -> None:
 
 @pytest.mark.parametrize("smooth", [True, False])
 def test_exported_motions_can_be_validated(door_plan: vkc.Plan, smooth: bool) -> None:
-    received = vkc.Trajectory.from_ros(
-        door_plan.to_ros(joints="all", rate=50.0, smooth=smooth), like=door_plan.trajectory
-    )
-    assert [phase.name for phase in received.phases] == [
-        phase.name for phase in door_plan.trajectory.phases
-    ]
+    message, motion = door_plan.to_ros(joints="all", rate=50.0, smooth=smooth), door_plan.trajectory
+    received = vkc.Trajectory.from_ros(message, like=motion)
+    assert [phase.name for phase in received.phases] == [phase.name for phase in motion.phases]
     options = dataclasses.replace(door_plan.options, dist_safe=0.01)  # the margin between waypoints
     report = vkc.validate(door_plan.scene, door_plan.steps, received, options)
-    expected = (
-        {"acceleration", "closure"} if smooth else {"acceleration"}
-    )  # the velocity jumps between linear pieces
+    # The velocity jumps between linear pieces.
+    expected = {"acceleration", "closure"} if smooth else {"acceleration"}
     assert {violation.constraint for violation in report.violations} <= expected, report.lines()
     assert report.closure_error < (2e-3 if smooth else 1e-3)
-    assert np.abs(received.positions - door_plan.trajectory.at(received.times)).max() < (
-        0.02 if smooth else 1e-9
-    )
+    deviation = np.abs(received.positions - motion.at(received.times)).max()
+    assert deviation < (0.02 if smooth else 1e-9)

@@ -87,14 +87,10 @@ def test_object_moves_rigidly_with_the_hand() -> None:
     scene, motion = make_carried_motion()
     for phase in (2, 3, 4):
         times = sample_phase(motion, phase)
-        for at, tool in zip(
-            compute_placements(scene, motion, "stick", times),
-            compute_tools(scene, motion, times),
-            strict=True,
-        ):
-            assert_close(
-                at.inverse() * tool, compute_grasp_pose(pin.SE3.Identity(), values=(0.03, 0.2))
-            )
+        sticks = compute_placements(scene, motion, "stick", times)
+        grasp = compute_grasp_pose(pin.SE3.Identity(), values=(0.03, 0.2))
+        for at, tool in zip(sticks, compute_tools(scene, motion, times), strict=True):
+            assert_close(at.inverse() * tool, grasp)
     ends = motion.times[[motion.phases[k].last for k in (1, 2)]]
     lowest, highest = compute_placements(scene, motion, "stick", ends)
     np.testing.assert_allclose(highest.translation - lowest.translation, UP, atol=1e-9)
@@ -104,80 +100,59 @@ def test_grasp_freedoms_move_the_hand_along_the_object() -> None:
     scene = make_room(describe_table())
     script = make_carrying_motion(scene)
     count = len(script.rows)
-    slide, turn = (
-        0.05 * np.sin(np.linspace(0.0, 9.0, count)),
-        0.3 * np.sin(np.linspace(0.0, 5.0, count)),
-    )
+    slide = 0.05 * np.sin(np.linspace(0.0, 9.0, count))
+    turn = 0.3 * np.sin(np.linspace(0.0, 5.0, count))
     motion = script.motion(stick__grip_slide=slide, stick__grip_turn=turn)
     first = motion.phases[2].first
     # The stick keeps its placement at the grasp, even if the grasp coordinates disagree with it.
     # Afterwards the coordinates determine its motion in the hand.
-    offset = (
-        compute_grasp_pose(pin.SE3.Identity(), values=(slide[first], turn[first]))
-        * compute_grasp_pose(STICK).inverse()
-        * STICK
-    )
+    grasp = compute_grasp_pose(pin.SE3.Identity(), values=(slide[first], turn[first]))
+    offset = grasp * compute_grasp_pose(STICK).inverse() * STICK
     assert np.abs(pin.log6(offset).vector).max() > 1e-2
     for phase in (2, 3, 4):
         times = sample_phase(motion, phase, 23)
-        values = np.column_stack(
-            [np.interp(times, motion.times, column) for column in (slide, turn)]
-        )
+        values = zip(*(np.interp(times, motion.times, row) for row in (slide, turn)), strict=True)
         sticks = compute_placements(scene, motion, "stick", times)
-        for at, tool, (s, t) in zip(
-            sticks, compute_tools(scene, motion, times), values, strict=True
-        ):
-            assert_close(
-                at, tool * compute_grasp_pose(pin.SE3.Identity(), values=(s, t)).inverse() * offset
-            )
+        for at, tool, held in zip(sticks, compute_tools(scene, motion, times), values, strict=True):
+            grasp = compute_grasp_pose(pin.SE3.Identity(), values=held)
+            assert_close(at, tool * grasp.inverse() * offset)
 
 
 def make_fetching_motion() -> tuple[Scene, MotionBuilder]:
     """Return a motion in which a held stick lifts a ball, carries it aside and puts it down."""
     scene = make_room(describe_stand(), objects=("stick", "ball"))
-    south = pin.SE3(
-        STICK.rotation, BALL.translation - np.array([0.0, 0.285, 0.0])
-    )  # placement of the stick with its tip at the ball
+    # The stick's tip is at the ball.
+    south = pin.SE3(STICK.rotation, BALL.translation - np.array([0.0, 0.285, 0.0]))
     touch = solve_reach(compute_grasp_pose(south), solve_above(STICK))
     up = solve_reach(compute_grasp_pose(lift(south, UP / 4)), touch)
     scene = scene.with_held({"stick": "grip"}).with_start(arm=up[3:])
-    script = (
-        MotionBuilder(scene)
-        .go(touch)
-        .take("ball", "pull", PULL, by="stick.tip")
-        .go(up)
-        .go(move_base(up, y=0.3))
-    )
-    script.go(move_base(touch, y=0.3)).let_go("ball").go(move_base(touch, y=0.1))
+    script = MotionBuilder(scene).go(touch).take("ball", "pull", PULL, by="stick.tip").go(up)
+    script.go(move_base(up, y=0.3)).go(move_base(touch, y=0.3)).let_go("ball")
+    script.go(move_base(touch, y=0.1))
     return scene, script
 
 
 def test_object_held_through_a_stick_follows_its_tip() -> None:
     scene, script = make_fetching_motion()
     motion = script.motion()
-    assert [phase["by"] for phase in motion.to_dict()["phases"]] == [
-        {},
-        *[{"ball": "stick.tip"}] * 3,
-        {},
-    ]
-    on_tip = (
-        compute_freedom("pull", PULL) * pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.035]))
-    ).inverse()
-    flipped = pin.SE3(
-        np.diag([1.0, -1.0, -1.0]), np.zeros(3)
-    )  # rotation of the ball's attachment, which points down
+    by = {"ball": "stick.tip"}
+    assert [phase["by"] for phase in motion.to_dict()["phases"]] == [{}, by, by, by, {}]
+    centre = pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.035]))
+    on_tip = (compute_freedom("pull", PULL) * centre).inverse()
+    flipped = pin.SE3(np.diag([1.0, -1.0, -1.0]), np.zeros(3))  # the ball's attachment points down
+    ahead = pin.SE3(np.eye(3), np.array([0.0, 0.285, 0.0]))
+    grasp = compute_grasp_pose(pin.SE3.Identity())
     for phase in (1, 2, 3):
         times = sample_phase(motion, phase)
-        sticks = compute_placements(scene, motion, "stick", times)
         for ball, stick, tool in zip(
             compute_placements(scene, motion, "ball", times),
-            sticks,
+            compute_placements(scene, motion, "stick", times),
             compute_tools(scene, motion, times),
             strict=True,
         ):
             assert_close(ball, stick * TIP * on_tip * flipped)
-            assert_close(stick, tool * compute_grasp_pose(pin.SE3.Identity()).inverse())
-            assert_close(stick.inverse() * ball, pin.SE3(np.eye(3), np.array([0.0, 0.285, 0.0])))
+            assert_close(stick, tool * grasp.inverse())
+            assert_close(stick.inverse() * ball, ahead)
     assert_close(compute_placements(scene, motion, "ball", sample_phase(motion, 0))[7], BALL, 1e-12)
     for at in compute_placements(scene, motion, "ball", sample_phase(motion, 4)):
         assert_close(at, lift(BALL, [0.0, 0.3, 0.0]))

@@ -51,7 +51,7 @@ class Assembly(Schema):
 
 def write_text(folder: Path, text: str) -> Path:
     file = folder / "thing.yaml"
-    file.write_text(text, encoding="utf-8")
+    file.write_text(text)
     return file
 
 

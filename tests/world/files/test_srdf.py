@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 from helpers.expected_errors import expect_error
 
-from vkc_pin import UnknownNameError
-from vkc_pin.world.files.srdf import Srdf, SrdfGroup, find_group_tip, read_groups, read_srdf
+from vkc_pin.world.files.srdf import Srdf, SrdfGroup, read_groups, read_srdf
 
 LINKS = ("base", "arm", "hand")
 
@@ -69,11 +68,6 @@ def test_unknown_links_raise(tmp_path: Path) -> None:
         read_text(tmp_path, "\n".join(pairs))
 
 
-def test_missing_files_raise(tmp_path: Path) -> None:
-    with expect_error("cannot read the SRDF"):
-        read_srdf(tmp_path / "none.srdf", links=LINKS)
-
-
 def test_groups_are_joints_or_chains(tmp_path: Path) -> None:
     """A chain lists its joints from the tip; groups of links only are ignored."""
     urdf = ElementTree.fromstring(
@@ -91,8 +85,3 @@ def test_groups_are_joints_or_chains(tmp_path: Path) -> None:
         "arm": SrdfGroup(("c", "b"), "three"),
         "shoulder": SrdfGroup(("a", "b"), "two"),
     }
-    assert find_group_tip(file, urdf, "arm") == "three"
-    with expect_error(r"arm: .*There are: arm, shoulder", nearest="shoulder", file=file):
-        find_group_tip(file, urdf, "shouldr")
-    with pytest.raises(UnknownNameError, match="there are: none"):
-        find_group_tip(None, urdf, "arm")

@@ -138,11 +138,11 @@ def test_interrupts_are_deferred_until_the_file_is_complete(
 def test_folders_are_written_completely_or_not_at_all(tmp_path: Path) -> None:
     target = tmp_path / "new" / "folder"
     with write_folder_atomically(target) as staging:
-        (staging / "a").write_text("1", encoding="utf-8")
+        (staging / "a").write_text("1")
         assert not target.exists()
     assert list_paths(target) == {".vkc-pin.json", "a"}
     with pytest.raises(FileNotFoundError), write_folder_atomically(target, force=True) as staging:
-        (staging / "none" / "b").write_text("2", encoding="utf-8")
+        (staging / "none" / "b").write_text("2")
     with expect_error("already exists"), write_folder_atomically(target):
         pass
     assert list_paths(target) == {".vkc-pin.json", "a"}
@@ -156,7 +156,7 @@ def test_folders_are_written_completely_or_not_at_all(tmp_path: Path) -> None:
 def write_folder(target: Path, force: bool = True) -> None:
     with write_folder_atomically(target, force=force) as staging:
         (staging / "deep").mkdir()
-        (staging / "deep" / "a").write_text("own", encoding="utf-8")
+        (staging / "deep" / "a").write_text("own")
 
 
 @pytest.mark.parametrize("has_manifest", [True, False])

@@ -34,7 +34,7 @@ def write_chain(tmp_path: Path, *contents: str) -> Path:
             format_joint(f"j{k}", "prismatic", f"l{k - 1}", f"l{k}", inside=text),
         ]
     path = tmp_path / "robot.urdf"
-    path.write_text(f'<robot name="robot">{"".join(parts)}</robot>', encoding="utf-8")
+    path.write_text(f'<robot name="robot">{"".join(parts)}</robot>')
     return path
 
 

@@ -197,11 +197,11 @@ def test_limits_that_cannot_hold_the_arm_are_discarded(husky: vkc.Robot) -> None
 
 def load_robot_with_effort(folder: Path, effort: object) -> vkc.Robot:
     source = vkc.load_robot("husky_ur5e").urdf.parent
-    description = yaml.safe_load((source / "robot.yaml").read_text(encoding="utf-8"))
+    description = yaml.safe_load((source / "robot.yaml").read_text())
     description["urdf"] = str(source / description["urdf"])
     description["srdf"] = str(next(source.glob("*.srdf")))
     description["joints"] = {**description.get("joints", {}), "elbow_joint": {"effort": effort}}
-    (folder / "robot.yaml").write_text(yaml.safe_dump(description), encoding="utf-8")
+    (folder / "robot.yaml").write_text(yaml.safe_dump(description))
     return vkc.load_robot(folder / "robot.yaml")
 
 

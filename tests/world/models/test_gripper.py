@@ -118,7 +118,7 @@ def test_openings_of_revolute_fingers(tmp_path: Path) -> None:
     """Inner faces pass through the joint axes; the near edge of the bar is 64 mm ahead."""
     file = write_gripper(tmp_path, gripper="gripper: {finger_a_joint: {closed: 0.0, open: 0.5}}\n")
     urdf = file.parent / "robot.urdf"
-    text = urdf.read_text(encoding="utf-8")
+    text = urdf.read_text()
     text = text.replace('type="prismatic"', 'type="revolute"').replace(
         'upper="0.04"', 'upper="0.5"'
     )
@@ -127,7 +127,7 @@ def test_openings_of_revolute_fingers(tmp_path: Path) -> None:
         after = after.replace('xyz="0 0 0.06"', f'xyz="0 {sign * 0.01} 0.06"', 1)
         after = after.replace(f'<axis xyz="0 {sign} 0"/>', f'<axis xyz="{-sign} 0 0"/>', 1)
         text = before + joint + after
-    urdf.write_text(text, encoding="utf-8")
+    urdf.write_text(text)
     gripper = vkc.load_robot(file).gripper
     assert gripper is not None
     assert gripper.min_opening == pytest.approx(0.02, abs=2e-4)

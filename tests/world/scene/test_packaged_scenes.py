@@ -25,7 +25,7 @@ DIST_SAFE, GRASP_CLEARANCE = 0.02, 0.005  # [m], defaults of the planner
 RANDOM_STARTS = sorted(
     file.stem
     for file in find_resource_folder("scenes").glob("*.yaml")
-    if "\nstart_region:" in file.read_text(encoding="utf-8")
+    if "\nstart_region:" in file.read_text()
 )
 OBJECTS = (
     *("narrow_door", "low_drawer", "dishwasher", "refrigerator", "cabinet", "cup", "broom"),

@@ -70,7 +70,7 @@ def test_joints_are_selected_by_group_or_name(
     plan: vkc.Plan, tmp_path: Path, joints: Any, count: int
 ) -> None:
     table, message = plan.to_csv(tmp_path / "some", joints=joints), plan.to_ros(joints=joints)
-    columns = table.read_text(encoding="utf-8").splitlines()[0].split(",")[1:-3]
+    columns = table.read_text().splitlines()[0].split(",")[1:-3]
     assert len(columns) == count
     assert [re.sub(r" \[.*", "", name) for name in columns] == message["joint_names"]
     assert {len(point["positions"]) for point in message["points"]} == {count}
@@ -191,14 +191,14 @@ def test_export_of_a_saved_plan(
     assert capsys.readouterr().out == "".join(f"wrote {file}\n" for file in files[1::2])
     assert are_equal(vkc.Trajectory.from_csv(out / "csv"), plan.trajectory)
     assert are_equal(vkc.Trajectory.from_json(out / "json"), plan.trajectory)
-    assert json.loads((out / "ros").read_text(encoding="utf-8")) == plan.to_ros()
+    assert json.loads((out / "ros").read_text()) == plan.to_ros()
     few = ["--joints", "base_x,door.hinge"]
     files = ["--ros", str(out / "ros"), "--csv", str(out / "csv")]
     assert cli.main(["export", saved, *files, *few, "--rate", "10"]) == 0
     message = plan.to_ros(joints=["base_x", "door.hinge"], rate=10)
-    assert json.loads((out / "ros").read_text(encoding="utf-8")) == message
+    assert json.loads((out / "ros").read_text()) == message
     header = "time [s],base_x [m],door.hinge [rad],phase"
-    assert (out / "csv").read_text(encoding="utf-8").startswith(header)
+    assert (out / "csv").read_text().startswith(header)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import json
 import re
 from pathlib import Path
 
+import coal
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -14,31 +15,51 @@ from helpers.meshes import write_wedge
 from helpers.rooms import TINY, load_scene_text
 
 from vkc_pin import Scene, load_scene
+from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.obstacles import FLOOR
 
 
 def test_all_types_of_obstacles_are_loaded(tmp_path: Path) -> None:
     write_wedge(tmp_path / "wedge.obj")
-    box = '<collision><geometry><box size="0.1 0.2 0.3"/></geometry></collision>'
     (tmp_path / "chest.urdf").write_text(
-        f'<robot name="chest"><link name="a">{box}{box}</link></robot>'
+        """<robot name="r"><link name="a"><collision><origin xyz="0 0 1"/><geometry>
+        <sphere radius="0.1"/></geometry></collision></link><link name="b">
+        <collision><geometry><box size="1 2 3"/></geometry></collision></link>
+        <joint name="j" type="continuous"><parent link="a"/><child link="b"/>
+        <origin xyz="0.5 0 0" rpy="0 0 0.4"/><axis xyz="0 0 1"/></joint></robot>"""
     )
     extra = """\
   - {name: ball, type: sphere, radius: 0.2, position: [0, 2, 0.2], colour: red}
   - {name: pole, type: capsule, radius: 0.05, length: 1, position: [-3, 0, 1]}
-  - {name: rock, type: mesh, file: wedge.obj, scale: 0.3, position: [1, 2, 0]}
-  - {name: chest, type: urdf, file: chest.urdf, position: [-1, 2, 0]}
+  - {name: rock, type: mesh, file: wedge.obj, scale: [2, 1, 3], position: [1, 2, 0]}
+  - {name: chest, type: urdf, file: chest.urdf, position: [-1, 2, 0], colour: [1, 0, 0]}
 """
     scene = load_scene_text(tmp_path, TINY + extra)
+    assert scene.obstacle_names == ("crate", "post", "ball", "pole", "rock", "chest")
+    assert scene.obstacle_labels == (*scene.obstacle_names, "chest", FLOOR)
+    names = ("crate", "post", "ball", "pole", "rock", "chest_0", "chest_1", FLOOR)
+    assert tuple(shape.name for shape in scene.obstacles) == names
+    assert {shape.parentJoint for shape in scene.obstacles} == {0}
+    crate, post, ball, pole, rock, *chest, floor = scene.obstacles
+    solids = [shape.geometry for shape in (crate, post, ball, pole)]
+    assert [type(s) for s in solids] == [coal.Box, coal.Cylinder, coal.Sphere, coal.Capsule]
+    np.testing.assert_allclose(2.0 * solids[0].halfSide, [0.5, 0.4, 0.3])
+    assert [solid.radius for solid in solids[1:]] == [0.1, 0.2, 0.05]
+    assert [2.0 * solid.halfLength for solid in solids[1::2]] == [1.0, 1.0]
+    np.testing.assert_allclose(np.max(rock.geometry.points(), axis=0), [2, 1, 3])
+    paths = {shape.meshPath for shape in scene.obstacle_visual}
+    assert paths == {"", str(tmp_path / "wedge.obj")}
+    for shape, at, rotation in (
+        (crate, [2, 2, 0.15], pin.utils.rotate("z", 0.2)),
+        (chest[0], [-1, 2, 1], np.eye(3)),
+        (chest[1], [-0.5, 2, 0], pin.utils.rotate("z", 0.4)),  # with joints at zero
+    ):
+        np.testing.assert_allclose(shape.placement, pin.SE3(rotation, np.array(at, float)))
+        np.testing.assert_array_equal(shape.meshColor, [1, 0, 0, 1])
+    # The floor covers the arena and a border.
+    bounds = compute_world_box(floor.geometry, floor.placement)
+    np.testing.assert_allclose(bounds, [[-6, -5, -0.1], [6, 5, 0.0]], atol=1e-12)
     assert FLOOR not in load_scene_text(tmp_path, TINY + "floor: false\n").obstacle_labels
-    shapes = {s.name: s for s in scene.obstacles}
-    names = ("crate", "post", "ball", "pole", "rock", "chest")
-    assert scene.obstacle_labels == (*names, "chest", FLOOR)
-    assert scene.obstacle_names == names
-    assert {"chest_0", "chest_1"} < shapes.keys()
-    np.testing.assert_allclose(np.max(shapes["rock"].geometry.points(), axis=0), [0.3] * 3)
-    turn = pin.utils.rotate("z", 0.2)
-    np.testing.assert_allclose(shapes["crate"].placement.rotation, turn, atol=1e-12)
     again = Scene.from_document(json.loads(json.dumps(scene.document)), tmp_path)
     assert [s.name for s in again.obstacles] == [s.name for s in scene.obstacles]
 

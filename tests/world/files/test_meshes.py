@@ -32,19 +32,6 @@ FACES = np.array(
 CORNERS = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 
 
-def write_two_cubes(path: Path, materials: bool = False) -> Path:
-    lines = ["mtllib two.mtl"] if materials else []
-    for k in range(2):
-        lines += [f"o cube{k}", *(f"v {x + 2 * k} {y} {z}" for x, y, z in CORNERS)]
-        lines += [f"usemtl colour{k}"] if materials else []
-        lines += ["f " + " ".join(str(i + 8 * k) for i in face) for face in FACES]
-    path.write_text("\n".join(lines) + "\n")
-    (path.parent / "two.mtl").write_text(
-        "newmtl colour0\nKd 1.0 0.0 0.0\nnewmtl colour1\nKd 0.0 0.0 1.0\n"
-    )
-    return path
-
-
 VERTICES = ["\n".join(f"v {x + 2 * k} {y} {z}" for x, y, z in CORNERS) + "\n" for k in range(2)]
 
 
@@ -56,6 +43,16 @@ def format_faces(first: int, corner: str = "{}") -> str:
 
 
 TWO_CUBES = VERTICES[0] + VERTICES[1] + format_faces(1) + format_faces(9)
+
+
+def write_two_cubes(path: Path) -> Path:
+    """Write two objects of different colours."""
+    cubes = (f"o cube{k}\n{VERTICES[k]}usemtl colour{k}\n{format_faces(1 + 8 * k)}" for k in (0, 1))
+    path.write_text("mtllib two.mtl\n" + "".join(cubes))
+    (path.parent / "two.mtl").write_text(
+        "newmtl colour0\nKd 1.0 0.0 0.0\nnewmtl colour1\nKd 0.0 0.0 1.0\n"
+    )
+    return path
 
 
 @pytest.mark.parametrize(
@@ -174,7 +171,7 @@ def test_invalid_collada_units_are_rejected(tmp_path: Path, unit: str) -> None:
 
 
 def test_submeshes_can_be_read_by_name(tmp_path: Path) -> None:
-    two = write_two_cubes(tmp_path / "two.obj", materials=True)
+    two = write_two_cubes(tmp_path / "two.obj")
     named = tmp_path / "named.obj"
     named.write_text(two.read_text().replace("o cube", "g all cube"))
     block = write_collada(tmp_path / "block.dae", '<unit meter="0.1"/>')
@@ -219,7 +216,7 @@ def test_hulls_with_many_neighbours_are_simplified() -> None:
 
 
 def test_colours_divide_meshes_into_parts(tmp_path: Path) -> None:
-    parts = load_parts(write_two_cubes(tmp_path / "two.obj", materials=True), 2.0)
+    parts = load_parts(write_two_cubes(tmp_path / "two.obj"), 2.0)
     assert {part.colour for part in parts} == {(0.0, 0.0, 1.0, 1.0), (1.0, 0.0, 0.0, 1.0)}
     assert sum(len(part.faces) for part in parts) == 24
     assert max(part.vertices.max() for part in parts) == pytest.approx(6.0)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import pytest
 from helpers.expected_errors import expect_error
 
-from vkc_pin.world.files.srdf import Srdf, SrdfGroup, read_groups, read_srdf
+from vkc_pin.world.files.srdf import Srdf, read_srdf
 
 LINKS = ("base", "arm", "hand")
 
@@ -66,22 +65,3 @@ def test_unknown_links_raise(tmp_path: Path) -> None:
     pairs = [f'<disable_collisions link1="base" link2="{name}"/>' for name in ("arm", "hnad")]
     with expect_error(line=3, nearest="hand", file=tmp_path / "r.srdf"):
         read_text(tmp_path, "\n".join(pairs))
-
-
-def test_groups_are_joints_or_chains(tmp_path: Path) -> None:
-    """A chain lists its joints from the tip; groups of links only are ignored."""
-    urdf = ElementTree.fromstring(
-        '<robot><joint name="a"><parent link="base"/><child link="one"/></joint>'
-        '<joint name="b"><parent link="one"/><child link="two"/></joint>'
-        '<joint name="c"><parent link="two"/><child link="three"/></joint></robot>'
-    )
-    file = tmp_path / "groups.srdf"
-    file.write_text(
-        '<robot name="r"><group name="arm"><chain base_link="one" tip_link="three"/></group>'
-        '<group name="shoulder"><joint name="a"/><joint name="b"/><joint name="elsewhere"/></group>'
-        '<group name="hand"><link name="three"/></group></robot>'
-    )
-    assert read_groups(file, urdf) == {
-        "arm": SrdfGroup(("c", "b"), "three"),
-        "shoulder": SrdfGroup(("a", "b"), "two"),
-    }

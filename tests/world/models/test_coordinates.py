@@ -39,12 +39,12 @@ def test_names_joints_and_limits_of_coordinates() -> None:
     assert coordinates.names == ("base_x", "base_y", "base_yaw", "wheel", *FREE, "lid", "lift")
     assert coordinates.joints == (1, 1, 1, 2, *[3] * 7, 4, 5)
     assert coordinates.units == ("m", "m", "rad", "rad", *"mmm1111", "rad", "m")
-    assert coordinates.size == 13
-    assert coordinates.nq == 4 + 2 + 7 + 1 + 1
-    assert (coordinates.lower[2:11] == -np.inf).all()
-    assert (coordinates.upper[2:11] == np.inf).all()
-    np.testing.assert_array_equal(coordinates.lower[11:], [-0.5, -0.5])
-    np.testing.assert_array_equal(coordinates.upper[11:], [0.7, 0.7])
+    assert (coordinates.size, coordinates.nq) == (13, 4 + 2 + 7 + 1 + 1)
+    ends = [-0.5] * 2, [0.7] * 2
+    for limits, infinite, finite in zip(
+        (coordinates.lower, coordinates.upper), (-np.inf, np.inf), ends, strict=True
+    ):
+        np.testing.assert_array_equal(limits[2:], [infinite] * 9 + finite)
     assert [coordinates.index(name) for name in coordinates.names] == list(range(13))
     with expect_error(nearest="thing_qw"):
         coordinates.index("thing_quw")

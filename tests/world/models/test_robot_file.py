@@ -250,7 +250,8 @@ def test_groups_of_the_srdf_select_the_tool_frame(tmp_path: Path) -> None:
         load_robot(write_small_urdf(tmp_path), arm="short")
     (tmp_path / "small.srdf").write_text(
         '<robot name="small"><group name="short"><chain base_link="l0" tip_link="l2"/></group>'
-        '<group name="whole"><joint name="j0"/><joint name="j1"/><joint name="j2"/></group></robot>'
+        '<group name="whole"><joint name="j0"/><joint name="elsewhere"/><joint name="j2"/></group>'
+        '<group name="links"><link name="l3"/></group></robot>'
     )
     (tmp_path / "robot.yaml").write_text("urdf: small.urdf\narm: short\n")
     for arguments, tool in (({}, "l2"), ({"arm": "whole"}, "l3"), ({"tool_frame": "l1"}, "l1")):

@@ -214,9 +214,9 @@ def test_virtual_joint_is_the_measured_transform(
     nominal = placed.object.attachment(attachment)
     frame = placed.object.link_placement(nominal.link, placed.state) * nominal.placement
     found = scene.tool_placement().actInv(base * frame)
-    np.testing.assert_allclose(found.homogeneous, measured.homogeneous, atol=1e-8)
+    np.testing.assert_allclose(found, measured, atol=1e-8)
     if placed.object.free:
-        np.testing.assert_allclose(placed.placement.homogeneous, base.homogeneous, atol=1e-9)
+        np.testing.assert_allclose(placed.placement, base, atol=1e-9)
 
 
 @settings(max_examples=25, deadline=None)
@@ -349,7 +349,7 @@ def test_measured_object_keeps_its_placement_and_holds_others() -> None:
     assert [str(hold) for hold in found.holds] == [str(hold) for hold in both.holds]
     assert found.holds[1].by == found.holds[0] != both.holds[0]
     found_placement = found.objects["cane"].placement
-    np.testing.assert_allclose(found_placement.homogeneous, measured.homogeneous, atol=1e-8)
+    np.testing.assert_allclose(found_placement, measured, atol=1e-8)
     tip = [scene.objects["cane"].link_placement("tip") for scene in (both, found)]
     ball = [scene.objects["fruit"].placement for scene in (both, found)]
     np.testing.assert_allclose(tip[0].actInv(ball[0]), tip[1].actInv(ball[1]), atol=1e-8)

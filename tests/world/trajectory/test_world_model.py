@@ -9,6 +9,7 @@ from helpers.small_problems import make_full_scene, sample_configurations
 
 import vkc_pin as vkc
 from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.trajectory.placements import key_times, sample_motion
 from vkc_pin.world.trajectory.world_model import World, find_coordinate_units
 
 
@@ -80,3 +81,27 @@ def test_units_of_sliding_joints_and_grasps() -> None:
     stick = find_coordinate_units(vkc.load_scene("init_3"))
     assert {stick[name] for name in stick if name.endswith("_slide")} == {"m"}
     assert {stick[name] for name in stick if name.endswith("_turn")} == {"rad"}
+
+
+def test_key_times_limit_the_change_of_coordinates(plan: vkc.Plan) -> None:
+    motion, names = plan.trajectory, plan.trajectory.names
+    times = key_times(motion)
+    assert set(motion.times) <= set(times)
+    assert np.abs(np.diff(motion.at(times), axis=0)).max() <= 1.0 + 1e-9
+    assert (np.diff(times) > 0).all()
+    finer = key_times(motion, {names[0]: 2.0, names[3]: 0.0125})
+    assert np.abs(np.diff(motion.at(finer)[:, 3])).max() <= 0.0125 + 1e-9
+
+
+def test_placements_equal_those_of_the_world_model(plan: vkc.Plan) -> None:
+    world, k = World(plan.scene), 5
+    motion, data = sample_motion(world, plan.trajectory), world.model.createData()
+    (row,) = world.compute_positions(plan.trajectory, [motion.times[k]])
+    pin.framesForwardKinematics(world.model, data, world.coordinates.q(row))
+    tool = data.oMf[world.model.getFrameId(plan.scene.robot.tool_frame)].translation
+    assert np.allclose(motion.tool[k], tool)
+    assert np.allclose(motion.base[k, :2], row[:2])
+    for j in range(1, world.model.njoints):
+        assert np.allclose(motion.world[k, j], data.oMi[j].homogeneous)
+        parent = motion.world[k, world.model.parents[j]]
+        assert np.allclose(parent @ motion.local[j][k].homogeneous, data.oMi[j].homogeneous)

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 from helpers.expected_errors import expect_error
 
-from vkc_pin import InputError
 from vkc_pin.utils.journal import Journal, JournalContents
 
 HEADER = {"settings": {"recipe": "abc"}, "versions": {"pin": "4"}}
@@ -117,25 +116,29 @@ def test_memory_and_processor_time_are_recorded(tmp_path: Path) -> None:
     assert contents.sessions == [{"jobs": 2, "trials": 4, "seconds": 1.5, "client_seconds": 0.03}]
 
 
-def test_different_header_raises(tmp_path: Path) -> None:
-    open_journal(tmp_path / "j")._stream.close()
-    with expect_error(
-        r"the episodes in this folder were run otherwise.*recipe abc.*recipe xyz", field="recipe"
-    ):
-        open_journal(tmp_path / "j", {**HEADER, "settings": {"recipe": "xyz"}})
-
-
-def test_header_of_another_benchmark_raises(tmp_path: Path) -> None:
-    header = {"settings": {"benchmark": "door", "scenes": "a"}}
-    open_journal(tmp_path / "j", header)._stream.close()
-    with pytest.raises(InputError) as caught:
-        open_journal(tmp_path / "j", {"settings": {"benchmark": "gap", "tasks": "b"}})
-    error = caught.value
-    assert (error.field, error.expected, error.got) == (
-        "benchmark",
-        "benchmark door",
-        "benchmark gap",
-    )
+@pytest.mark.parametrize(
+    ("settings", "other", "field", "message"),
+    [
+        (
+            {"recipe": "abc"},
+            {"recipe": "xyz"},
+            "recipe",
+            "run otherwise.*recipe abc.*recipe xyz",
+        ),
+        (
+            {"benchmark": "door", "scenes": "a"},
+            {"benchmark": "gap", "tasks": "b"},
+            "benchmark",
+            "expected benchmark door, got benchmark gap",
+        ),
+    ],
+)
+def test_different_headers_raise(
+    tmp_path: Path, settings: dict[str, str], other: dict[str, str], field: str, message: str
+) -> None:
+    open_journal(tmp_path / "j", {"settings": settings})._stream.close()
+    with expect_error(f"the episodes in this folder .*{message}", field=field):
+        open_journal(tmp_path / "j", {"settings": other})
 
 
 def test_two_writers_raise(tmp_path: Path) -> None:

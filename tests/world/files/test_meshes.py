@@ -5,9 +5,7 @@ import tracemalloc
 import warnings
 from pathlib import Path
 
-import coal
 import numpy as np
-import pinocchio as pin
 import pytest
 import trimesh
 from helpers.expected_errors import expect_error
@@ -23,7 +21,6 @@ from vkc_pin.world.files.meshes import (
     make_bvh,
     make_convex_hull,
 )
-from vkc_pin.world.models.shapes import compute_shape_distance
 
 # Two cubes of edge length 1, one metre apart. Vertex indices of OBJ files run through all objects.
 FACES = np.array(
@@ -194,16 +191,6 @@ def test_submeshes_can_be_read_by_name(tmp_path: Path) -> None:
     for file, word in ((two, "cube1"), (block, "second"), (pot, "lid")):
         with expect_error(f"submesh 'cub'.*{word}", file=file):
             load_mesh(file, submesh="cub")
-
-
-def test_a_mesh_is_loaded_as_its_convex_hull(tmp_path: Path) -> None:
-    shape = load_convex(write_two_cubes(tmp_path / "two.obj"), (0.5, 1.0, 2.0))
-    assert isinstance(shape, coal.Convex)
-    assert shape.computeVolume() == pytest.approx(1.5 * 1.0 * 2.0)
-    assert shape.num_points == 8
-    at = pin.SE3(np.eye(3), np.array([1.5 + 0.7 + 0.25, 0.5, 0.5]))
-    distance = compute_shape_distance(shape, pin.SE3.Identity(), coal.Sphere(0.25), at)
-    assert distance == pytest.approx(0.7, abs=1e-6)
 
 
 def test_hulls_with_many_neighbours_are_simplified() -> None:

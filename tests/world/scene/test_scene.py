@@ -11,7 +11,7 @@ import pytest
 from helpers.expected_errors import expect_error
 from helpers.rooms import TINY, load_scene_text
 
-from vkc_pin import Scene, load_robot, load_scene
+from vkc_pin import Scene, load_scene
 from vkc_pin.world.models.shapes import LIMIT_SLACK
 from vkc_pin.world.scene.placed_object import make_world_shapes
 
@@ -105,17 +105,6 @@ def test_start_is_sampled_with_free_held_objects_only(tmp_path: Path) -> None:
         else:
             with expect_error(r"start\.held\.front"):
                 scene.sample_start(np.random.default_rng(0))
-
-
-def test_start_limits_are_infinite_for_a_fixed_base() -> None:
-    robot, fixed = load_robot("husky_ur5e"), load_robot("husky_ur5e", base="fixed")
-    for found, expected in zip(robot.start_limits, (robot.lower, robot.upper), strict=True):
-        np.testing.assert_array_equal(found, expected)
-        assert found is not expected
-    lower, upper = fixed.start_limits
-    assert np.isneginf(lower[:3]).all()
-    assert np.isposinf(upper[:3]).all()
-    np.testing.assert_array_equal(lower[3:], fixed.lower[3:])
 
 
 def test_random_starts_are_reproducible(door: Scene) -> None:

@@ -20,7 +20,6 @@ from helpers.small_problems import (
 from vkc_pin import Actuate, GoTo, Grasp, Hold, Options, Reach, Scene
 from vkc_pin.world.task.actuation import find_shared_coordinate
 from vkc_pin.world.task.compiler import LATCH_MARGIN, compile_task
-from vkc_pin.world.task.lookup import find_path_joints
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Step
 
@@ -262,20 +261,3 @@ def test_unused_initial_hold_is_dropped_if_another_moves_the_same_joints() -> No
         assert task.state == {"door.hinge": 0.4}
         assert all(phase.initial_values == {"door.hinge": 0.4} for phase in task.phases)
         assert task.phases[0].released == (HANDLE,)
-
-
-def test_path_joints_move_the_attachment() -> None:
-    """Compares with the columns of Jacobians."""
-    for placed in make_full_scene().objects.values():
-        model, coordinates = placed.object.model, placed.object.coordinates
-        data, q = model.createData(), coordinates.q(placed.state)
-        for attachment in placed.object.attachments.values():
-            frame = model.getFrameId(attachment.link, pin.FrameType.BODY)
-            jacobian = pin.computeFrameJacobian(model, data, q, frame).reshape(6, -1)
-            sizes = zip(coordinates.names, np.abs(jacobian).max(axis=0), strict=True)
-            moving = [name for name, size in sizes if size > 1e-9]
-            assert sorted(find_path_joints(placed, attachment)) == sorted(moving)
-    cabinet = make_full_scene().objects["cabinet"]
-    assert find_path_joints(cabinet, cabinet.object.attachments["grip"]) == ["swing", "slide"], (
-        "base first"
-    )

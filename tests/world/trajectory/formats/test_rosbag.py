@@ -85,18 +85,11 @@ def test_base_velocities_follow_the_path(plan: Plan, tmp_path: Path) -> None:
     moments = 1e-9 * np.array([when for when, _ in speeds])
     twists = np.array([[m.twist.linear.x, m.twist.linear.y, m.twist.angular.z] for _, m in speeds])
     assert {message.header.frame_id for _, message in speeds} == {"base_link"}
-    steps, reached = np.diff(moments), np.array(motion.at(0.0)[:3])
-    for step, (forward, sideways, turning) in zip(
-        steps, (twists[1:] + twists[:-1]) / 2.0, strict=True
-    ):
-        middle = reached[2] + step * turning / 2.0
-        reached += step * np.array(
-            [
-                np.cos(middle) * forward - np.sin(middle) * sideways,
-                np.sin(middle) * forward + np.cos(middle) * sideways,
-                turning,
-            ]
-        )
+    steps, means = np.diff(moments), (twists[1:] + twists[:-1]) / 2.0
+    turns = steps * means[:, 2]
+    headings = motion.at(0.0)[2] + np.cumsum(turns) - turns / 2.0
+    moved = (steps * (means[:, 0] + 1j * means[:, 1]) * np.exp(1j * headings)).sum()
+    reached = np.array([moved.real, moved.imag, turns.sum()]) + motion.at(0.0)[:3]
     assert np.abs(reached - motion.positions[-1, :3]).max() < 1e-3
     assert np.abs(twists[-1]).max() < 1e-9  # at rest at the end
 

@@ -16,9 +16,7 @@ from vkc_pin import Latch, load_object
 
 def test_door_properties() -> None:
     door = load_object("door")
-    assert door.coordinates.names == ("hinge", "knob")
     assert (door.base_link, door.links) == ("frame", ("frame", "panel", "lever"))
-    assert not door.free
     assert door.latches == (Latch("hinge", 0.0, "knob", 0.5, 0.05),)
     assert list(door.attachments) == ["handle", "handle_free", "push", "push_back"]
     assert door.attachment() is door.attachment("handle")

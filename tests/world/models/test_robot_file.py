@@ -13,8 +13,14 @@ from helpers.arm_urdf import write_arms
 from helpers.expected_errors import expect_error
 from helpers.robots import compute_placement, write_small_urdf
 
-from vkc_pin import InputError, Robot, UnknownNameError, load_robot
+from vkc_pin import Robot, UnknownNameError, load_robot
 from vkc_pin.world.models.robot_file import find_robot
+
+
+def write_yaml(folder: Path, text: str) -> Path:
+    file = folder / "robot.yaml"
+    file.write_text(f"urdf: small.urdf\n{text}\n")
+    return file
 
 
 @pytest.mark.parametrize(
@@ -36,12 +42,10 @@ def test_invalid_robot_yaml_raises_with_its_line(
     tmp_path: Path, text: str, line: int | None, problem: str
 ) -> None:
     write_small_urdf(tmp_path)
-    (tmp_path / "robot.yaml").write_text(f"urdf: small.urdf\n{text}\n")
-    with pytest.raises(InputError, match=problem) as caught:
-        load_robot(tmp_path / "robot.yaml")
-    assert caught.value.file is not None
-    if line is not None:
-        assert (caught.value.file, caught.value.line) == (tmp_path / "robot.yaml", line)
+    file = write_yaml(tmp_path, text)
+    place = {} if line is None else {"file": file, "line": line}
+    with expect_error(problem, **place):
+        load_robot(file)
 
 
 def test_base_types(tmp_path: Path) -> None:
@@ -65,7 +69,7 @@ def test_base_types(tmp_path: Path) -> None:
     ):
         with expect_error(message, field=field):
             load_robot(file, **arguments)  # type: ignore[arg-type]
-    (tmp_path / "robot.yaml").write_text("urdf: small.urdf\nbase: {turning_radius: 1.2}\n")
+    write_yaml(tmp_path, "base: {turning_radius: 1.2}\n")
     assert load_robot(file, base="ackermann").turning_radius == 1.2
     assert load_robot(file, base="ackermann", turning_radius=0.7).turning_radius == 0.7
     assert load_robot(file, base="differential").turning_radius == 0.0
@@ -118,9 +122,9 @@ def test_defaults_of_a_urdf(tmp_path: Path) -> None:
 
 def test_robot_yaml_beside_the_urdf_is_used(tmp_path: Path) -> None:
     file = write_small_urdf(tmp_path)
-    (tmp_path / "robot.yaml").write_text(
-        "urdf: small.urdf\ntool_frame: l3\nhome: {j1: 0.5}\n"
-        "joints: {j2: {velocity: 0.2, acceleration: 9}}\n"
+    write_yaml(
+        tmp_path,
+        "tool_frame: l3\nhome: {j1: 0.5}\njoints: {j2: {velocity: 0.2, acceleration: 9}}\n",
     )
     robot = load_robot(file, pairs="all")
     assert (robot.tool_frame, robot.home.tolist()) == ("l3", [0.0, 0.5, 0.0])
@@ -175,7 +179,7 @@ def test_srdf_that_allows_all_pairs_raises(tmp_path: Path) -> None:
 @pytest.mark.parametrize("joint", ["j1", "j2"], ids=["planned", "locked"])
 def test_positions_outside_limits_raise(tmp_path: Path, field: str, joint: str) -> None:
     urdf, file = write_small_urdf(tmp_path), tmp_path / "robot.yaml"
-    file.write_text(f"urdf: small.urdf\ntool_frame: l2\n{field}: {{{joint}: 2.5}}\n")
+    write_yaml(tmp_path, f"tool_frame: l2\n{field}: {{{joint}: 2.5}}")
     problem = r"outside the joint.s limits .expected between -2 and 2, got 2.5"
     with expect_error(problem, field=f"{field}.{joint}", line=3):
         load_robot(file)
@@ -232,7 +236,7 @@ def test_height_of_the_root_link(tmp_path: Path) -> None:
     """The whole robot is raised at any base pose; the argument overrides the file."""
     file = write_small_urdf(tmp_path)
     low, z = load_robot(file), np.array([0.3, -0.2, 1.0, 0.5, -0.4, 0.3])
-    (tmp_path / "robot.yaml").write_text("urdf: small.urdf\nbase: {height: 0.25}\n")
+    write_yaml(tmp_path, "base: {height: 0.25}\n")
     for robot, height in ((load_robot(file), 0.25), (load_robot(file, height=0.7), 0.7)):
         raised = pin.SE3(np.eye(3), np.array([0.0, 0.0, height]))
         assert robot.height == height
@@ -253,7 +257,7 @@ def test_groups_of_the_srdf_select_the_tool_frame(tmp_path: Path) -> None:
         '<group name="whole"><joint name="j0"/><joint name="elsewhere"/><joint name="j2"/></group>'
         '<group name="links"><link name="l3"/></group></robot>'
     )
-    (tmp_path / "robot.yaml").write_text("urdf: small.urdf\narm: short\n")
+    write_yaml(tmp_path, "arm: short\n")
     for arguments, tool in (({}, "l2"), ({"arm": "whole"}, "l3"), ({"tool_frame": "l1"}, "l1")):
         robot = load_robot(tmp_path, **arguments)
         assert (robot.tool_frame, len(robot.home)) == (tool, int(tool[1]))
@@ -261,7 +265,7 @@ def test_groups_of_the_srdf_select_the_tool_frame(tmp_path: Path) -> None:
         load_robot(tmp_path, arm="shrt")
     with expect_error("exclude each other"):
         load_robot(tmp_path, arm="short", tool_frame="l2")
-    (tmp_path / "robot.yaml").write_text("urdf: small.urdf\ntool_frame: l3\narm: short\n")
+    write_yaml(tmp_path, "tool_frame: l3\narm: short\n")
     with expect_error(r"robot\.yaml:3: arm: .*exclude each other"):
         load_robot(tmp_path)
 

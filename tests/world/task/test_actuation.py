@@ -123,11 +123,6 @@ def test_push_cannot_pull(begin: float, end: float, face: str, direction: str) -
         push(open_door(begin), {"hinge": end}, face)
 
 
-def test_a_latched_door_cannot_be_pushed_open() -> None:
-    with expect_error("latched"):
-        push(open_door(0.0), {"hinge": 1.0}, "push")
-
-
 def test_push_along_the_joint_axis_is_rejected() -> None:
     placement = pin.SE3(pin.rpy.rpyToMatrix(0.0, np.pi / 2, 0.0), np.array([0.0, 6e-4, 0.0]))
     face = vkc.Attachment(name="face", link="arm", placement=placement, contact="push")

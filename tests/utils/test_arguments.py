@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers.expected_errors import expect_error
 
-from vkc_pin import InputError, UnknownNameError
+from vkc_pin import InputError
 from vkc_pin.utils.arguments import (
     check_array,
     check_bool,
@@ -89,12 +89,6 @@ def test_lists_are_finite_and_typed() -> None:
             check_list(value, "it", "texts")
     with expect_error(r"it\[1\]: wrong type of entry \(expected texts, got 3\)"):
         check_list(["a", 3], "it", "texts", str)
-
-
-def test_unknown_choices_have_suggestions() -> None:
-    assert check_choice(np.str_("door"), ["door"], "object") == "door"
-    with pytest.raises(UnknownNameError, match="did you mean 'door'"):
-        check_choice("dor", ["door"], "object")
 
 
 def test_paths_have_valid_names(tmp_path: Path) -> None:

@@ -44,12 +44,6 @@ def test_incompatible_library_releases_are_named(
         find_path()
 
 
-def test_installed_packages_are_returned() -> None:
-    assert optional_imports.import_optional("yaml", "import", purpose="nothing").safe_load(
-        "a: 1"
-    ) == {"a": 1}
-
-
 @pytest.mark.parametrize("name", ["mujoco", "mujoco.inside"])
 def test_missing_packages_name_the_extra(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)

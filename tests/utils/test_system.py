@@ -1,12 +1,10 @@
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
 
 from vkc_pin.utils.arrays import find_unique_rows
-from vkc_pin.utils.system import count_cores, measure_peak_memory, measure_resident_memory
+from vkc_pin.utils.system import measure_peak_memory, measure_resident_memory
 
 
 def test_memory_is_in_megabytes() -> None:
@@ -16,10 +14,6 @@ def test_memory_is_in_megabytes() -> None:
     assert 100.0 < now - before < 160.0
     assert now - 16.0 < measure_peak_memory() < now + 4000.0
     assert block.nbytes == 2**27
-
-
-def test_cores_are_those_of_this_process() -> None:
-    assert 1 <= count_cores() <= (os.cpu_count() or 1)
 
 
 @pytest.mark.parametrize("shape", [(1, 3), (40, 2), (200, 3), (0, 3)])

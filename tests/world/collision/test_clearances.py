@@ -213,35 +213,27 @@ def test_the_smallest_margin_applies(seed: int) -> None:
     rng = np.random.default_rng(seed)
     default_margins = rng.uniform(0.0, 0.05, PAIRS)
     reduced = {
-        int(pair): [
-            (int(first), int(first + rng.integers(4)), float(rng.normal()))
-            for first in rng.integers(0, 8, 2)
-        ]
+        int(pair): [(int(k), int(k) + 2, float(rng.normal())) for k in rng.integers(8, size=2)]
         for pair in rng.permutation(PAIRS)[:4]
     }
     regions = []
-    for _ in range(3):
-        columns, low = rng.permutation(COORDINATES)[: rng.integers(1, 3)], rng.normal(size=4)
-        lower = low[: len(columns)]
-        margin = float(rng.choice([-np.inf, -0.01, 0.01]))
-        regions.append(
-            MarginRegion(rng.permutation(PAIRS)[:5], margin, columns, lower, lower + 1.5)
-        )
+    for margin in (-np.inf, -0.01, 0.01):
+        columns = rng.permutation(COORDINATES)[: rng.integers(1, 3)]
+        lower = rng.normal(size=len(columns))
+        pairs = rng.permutation(PAIRS)[:5]
+        regions.append(MarginRegion(pairs, margin, columns, lower, lower + 1.5))
     pairs, waypoints = (grid.ravel() for grid in np.meshgrid(np.arange(PAIRS), np.arange(10)))
     z, rows = rng.normal(size=(6, COORDINATES)), rng.integers(0, 6, len(pairs))
-    expected = []
-    for pair, waypoint, row in zip(pairs.tolist(), waypoints.tolist(), rows.tolist(), strict=True):
-        margins = [
-            default_margins[pair],
-            *(margin for first, last, margin in reduced.get(pair, ()) if first <= waypoint <= last),
-        ]
-        for region in regions:
-            values = z[row, region.columns]
-            if pair in region.pairs and np.all((region.lower <= values) & (values <= region.upper)):
-                margins.append(region.margin)
-        expected.append(min(margins))
-    assert expected != default_margins[pairs].tolist(), "no margin is reduced"
-    np.testing.assert_array_equal(
-        Margins(default_margins, reduced, regions).compute_margins(pairs, waypoints, z, rows),
-        expected,
-    )
+    expected = default_margins[pairs]
+    for pair, spans in reduced.items():
+        for first, last, margin in spans:
+            active = (pairs == pair) & (first <= waypoints) & (waypoints <= last)
+            expected[active] = np.minimum(expected[active], margin)
+    for region in regions:
+        values = z[rows][:, region.columns]
+        active = ((region.lower <= values) & (values <= region.upper)).all(axis=1)
+        active &= np.isin(pairs, region.pairs)
+        expected[active] = np.minimum(expected[active], region.margin)
+    assert (expected < default_margins[pairs]).any(), "no margin is reduced"
+    margins = Margins(default_margins, reduced, regions)
+    np.testing.assert_array_equal(margins.compute_margins(pairs, waypoints, z, rows), expected)

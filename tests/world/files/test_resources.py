@@ -103,7 +103,4 @@ def test_file_names_are_portable_unique_and_reproducible(names: list[str]) -> No
 )
 def test_file_names_of_examples(names: list[str], expected: list[str]) -> None:
     assert choose_file_names(names) == expected
-
-
-def test_the_fallback_replaces_names_without_ascii() -> None:
     assert choose_file_names(["робот", "r2", "+"], fallback="robot") == ["robot", "r2", "robot_2"]

@@ -83,18 +83,11 @@ def test_fingers_are_symmetric_at_the_given_opening(robot: vkc.Robot, opening: f
         assert np.linalg.norm(moved.translation) == pytest.approx(distance, abs=1e-5)
 
 
-def test_opening_moves_only_the_fingers(robot: vkc.Robot) -> None:
+def test_opened_robots_are_cached_and_keep_their_margins(robot: vkc.Robot) -> None:
     opened = robot.opened(0.03)
     assert opened is robot.opened(0.03)
     assert list(opened.model.names) == list(robot.model.names)
     assert opened.own_margins(0.02) == robot.own_margins(0.02)
-    shapes = zip(robot.collision.geometryObjects, opened.collision.geometryObjects, strict=True)
-    moved = {
-        robot.link_of(k)
-        for k, (one, other) in enumerate(shapes)
-        if one.placement != other.placement
-    }
-    assert moved == {"finger_a", "finger_b"}
 
 
 def test_openings_are_clamped_to_the_range(robot: vkc.Robot) -> None:

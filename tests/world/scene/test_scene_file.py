@@ -127,7 +127,6 @@ SIZE, BASE = "size: [0.5, 0.4, 0.3]", "base: [0.0, 0.0, 0.5]"
         (f"  {BASE}\n", "", 2, "start.base", "missing"),
         ("arm: home", "arm: [0, 0, 0]", 4, "start.arm", "wrong number of arm joints"),
         ("arm: home", "arm: rest", 4, "start.arm", "expected home, or a list of joint values"),
-        ("arm: home", "z: high", 4, "start.z", "a number"),
         ("x: [-1, 1], y", "x: [1, -1], y", 5, "start_region.x", "expected [lowest, highest]"),
         ("x: [-1, 1], y", "x: [-9, 1], y", 5, "start_region.x", "expected x from -4 to 4"),
         ("yaw: any", "yaw: north", 5, "start_region.yaw", "expected any, or [lowest, highest]"),
@@ -146,8 +145,6 @@ SIZE, BASE = "size: [0.5, 0.4, 0.3]", "base: [0.0, 0.0, 0.5]"
         ("name: front", "name: a.b", 8, "objects[0].name", "not a name"),
         (f"box, {SIZE}", "mesh, file: none.obj", 13, "obstacles[0].file", "got none.obj"),
         ("robot: husky_ur5e\n", "", 1, "robot", "missing"),
-        ("start:\n", "robot: x\nstart:\n", 2, "robot", "lines 1 and 2"),
-        ("  arm: home", "  arm: [home", 5, None, "not valid YAML"),
         (TINY, "- 1\n", 1, "", "expected fields (name: value), got [1]"),
     ],
 )

@@ -17,16 +17,6 @@ from vkc_pin.world.files.resources import (
 )
 
 
-def test_resources_of_the_package_exist() -> None:
-    assert {"door", "drawer"} <= set(list_resources("scenes", "*.yaml"))
-    assert "husky_ur5e" in list_resources("robots", "*")
-    for kind, pattern in (("scenes", "*.yaml"), ("robots", "*")):
-        for name, path in list_resources(kind, pattern).items():
-            assert path.exists()
-            assert path.stem == name
-            assert path.parent == find_resource_folder(kind)
-
-
 def test_files_are_found_by_name_or_path() -> None:
     door = find_resource("scenes", "*.yaml", "door", noun="scene")
     for name, found in (("door", door), ("a/b", "a/b"), ("b.yaml", "b.yaml"), (Path("b"), "b")):

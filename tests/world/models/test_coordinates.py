@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -70,15 +69,6 @@ def test_configurations_round_trip(seed: int) -> None:
     np.testing.assert_allclose(base.rotation, pin.utils.rotate("z", z[2]), atol=1e-12)
     expected = pin.utils.rotate("x", z[11])
     np.testing.assert_allclose((body.inverse() * lid).rotation, expected, atol=1e-12)
-
-
-def test_symbolic_configurations_match_numeric_ones() -> None:
-    model = pin.Model()
-    base = model.addJoint(0, pin.JointModelPlanar(), pin.SE3.Identity(), "base")
-    model.addJoint(base, pin.JointModelRUBZ(), pin.SE3.Identity(), "wheel")
-    coordinates, z = Coordinates(model), ca.SX.sym("z", 4)
-    function, row = ca.Function("q", [z], [coordinates.q_symbolic(z)]), [0.3, -2.0, 1.2, -0.7]
-    np.testing.assert_allclose(np.array(function(row)).ravel(), coordinates.q(row), atol=1e-15)
 
 
 def test_invalid_arguments_raise() -> None:

@@ -10,7 +10,7 @@ from helpers.expected_errors import expect_error
 from helpers.meshes import write_wedge
 from helpers.objects import SHAPES, URDF, load_object_text
 
-from vkc_pin import InputError, load_object
+from vkc_pin import load_object
 from vkc_pin.world.models.articulated_object import DEFAULT_ACCELERATION, DEFAULT_VELOCITY
 
 ALONG = "name: along, slide: [1, 0, 0], limits: [0, 0.1]"
@@ -67,24 +67,6 @@ def test_conflicting_attachments_raise() -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "line", "field", "nearest"),
-    [
-        ("acceleration", "aceleration", 3, "joints.hinge.aceleration", "acceleration"),
-        ("  hinge:", "  hingge:", 3, "joints.hingge", "hinge"),
-        ("link: panel", "link: panell", 6, "attachments[0].link", "panel"),
-        ("joint: hinge", "joint: hinges", 8, "latches[0].joint", "hinge"),
-        ("released_by: knob", "released_by: knot", 8, "latches[0].released_by", "knob"),
-        ("link: panel", "link: panel\n    joint: revolut", 7, "attachments[0].joint", "revolute"),
-    ],
-)
-def test_unknown_names_raise_with_a_suggestion(
-    old: str, new: str, line: int, field: str, nearest: str
-) -> None:
-    with expect_error(line=line, field=field, nearest=nearest):
-        load_object_text(URDF, DESCRIPTION.replace(old, new))
-
-
-@pytest.mark.parametrize(
     ("entry", "line", "field"),
     [
         ("joint: revolute", 5, "attachments[0]"),
@@ -119,23 +101,59 @@ def test_invalid_attachments_raise_with_their_line(entry: str, line: int, field:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "line", "field"),
+    ("old", "new", "line", "field", "message"),
     [
-        ("acceleration: 3", "acceleration: -3", 3, "joints.hinge.acceleration"),
-        ("acceleration: 3", "acceleration: 1e-300", 3, "joints.hinge.acceleration"),
-        ("acceleration: 3", "velocity: 1e-7", 3, "joints.hinge.velocity"),
-        ("link: panel", "position: [0, 0, 0]", 5, "attachments[0].link"),
-        ("link: panel", "link: panel\n  - name: grip\n    link: panel", 7, "attachments[1].name"),
-        ("joint: hinge,", "joint: hinge, held_at: 2,", 8, "latches[0].held_at"),
-        ("released_by: knob", "released_by: hinge", 8, "latches[0].released_by"),
-        ("engaged_within: 0.05", "engaged_within: 0", 8, "latches[0].engaged_within"),
+        (
+            "acceleration",
+            "aceleration",
+            3,
+            "joints.hinge.aceleration",
+            "did you mean 'acceleration'",
+        ),
+        ("  hinge:", "  hingge:", 3, "joints.hingge", "did you mean 'hinge'"),
+        ("link: panel", "link: panell", 6, "attachments[0].link", "did you mean 'panel'"),
+        ("joint: hinge", "joint: hinges", 8, "latches[0].joint", "did you mean 'hinge'"),
+        (
+            "released_by: knob",
+            "released_by: knot",
+            8,
+            "latches[0].released_by",
+            "did you mean 'knob'",
+        ),
+        (
+            "link: panel",
+            "link: panel\n    joint: revolut",
+            7,
+            "attachments[0].joint",
+            "did you mean 'revolute'",
+        ),
+        ("acceleration: 3", "acceleration: -3", 3, "joints.hinge.acceleration", ""),
+        ("acceleration: 3", "acceleration: 1e-300", 3, "joints.hinge.acceleration", ""),
+        ("acceleration: 3", "velocity: 1e-7", 3, "joints.hinge.velocity", ""),
+        ("link: panel", "position: [0, 0, 0]", 5, "attachments[0].link", ""),
+        (
+            "link: panel",
+            "link: panel\n  - name: grip\n    link: panel",
+            7,
+            "attachments[1].name",
+            "",
+        ),
+        ("joint: hinge,", "joint: hinge, held_at: 2,", 8, "latches[0].held_at", ""),
+        ("released_by: knob", "released_by: hinge", 8, "latches[0].released_by", ""),
+        (
+            "engaged_within: 0.05",
+            "engaged_within: 0",
+            8,
+            "latches[0].engaged_within",
+            "",
+        ),
     ],
 )
-def test_invalid_values_raise_with_their_line(old: str, new: str, line: int, field: str) -> None:
-    with pytest.raises(InputError) as caught:
+def test_invalid_values_raise_with_their_line(
+    old: str, new: str, line: int, field: str, message: str
+) -> None:
+    with expect_error(rf"thing\.yaml.*{message}", line=line, field=field):
         load_object_text(URDF, DESCRIPTION.replace(old, new))
-    assert (caught.value.line, caught.value.field) == (line, field), str(caught.value)
-    assert Path(str(caught.value.file)).name == "thing.yaml"
 
 
 @pytest.mark.parametrize(

@@ -119,12 +119,6 @@ def test_object_held_through_another_follows_its_link(tmp_path: Path) -> None:
     assert hit.start_clearance() < 0.0, "held objects are part of the robot"
 
 
-def test_short_form_of_holds(tmp_path: Path) -> None:
-    scene = load_hall(tmp_path, "{cane: end}")
-    assert scene.document["start"]["held"] == {"cane": {"attachment": "end"}}
-    assert scene.held == make_hall().with_held(GRIP).with_held({"cane": "end"}).held
-
-
 @pytest.mark.parametrize(
     ("held", "by", "at", "message"),
     [

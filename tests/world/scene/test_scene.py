@@ -63,7 +63,6 @@ def test_world_shapes_follow_the_joints(tmp_path: Path) -> None:
     np.testing.assert_allclose(shapes["panel_0"].placement.translation, middle, atol=1e-12)
     assert {s.parentJoint for s in shapes.values()} == {0}
     assert len(make_world_shapes(placed, visual=True)) == len(placed.object.visual.geometryObjects)
-    np.testing.assert_allclose(placed.link_placement("panel").rotation, turn, atol=1e-12)
 
 
 def test_fixed_base_starts_anywhere_in_the_arena(tmp_path: Path) -> None:
@@ -105,9 +104,3 @@ def test_start_is_sampled_with_free_held_objects_only(tmp_path: Path) -> None:
         else:
             with expect_error(r"start\.held\.front"):
                 scene.sample_start(np.random.default_rng(0))
-
-
-def test_random_starts_are_reproducible(door: Scene) -> None:
-    one, same, other = (door.sample_start(np.random.default_rng(k)).start for k in (7, 7, 8))
-    np.testing.assert_array_equal(one, same)
-    assert not np.array_equal(one, other)

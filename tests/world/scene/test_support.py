@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.carrying import describe_box
 from helpers.supports import TOP, describe_cup, make_plate_scene, make_scene, write_objects
 
 from vkc_pin import Scene
@@ -44,11 +45,7 @@ def test_adjacent_shape_is_no_support(apart: float) -> None:
 
 
 def test_floor_and_several_tables_can_be_supports() -> None:
-    size = [0.2, 0.5, 0.5]
-    tables = [
-        {"name": f"table_{k}", "type": "box", "size": size, "position": [0.2 * k, 0.0, 0.25]}
-        for k in range(3)
-    ]
+    tables = [describe_box(f"table_{k}", [0.2, 0.5, 0.5], [0.2 * k, 0.0, 0.25]) for k in range(3)]
     assert find_supports_of(make_scene([describe_cup(at=(0.1, 0.0, 0.5))], tables)) == {
         "table_0",
         "table_1",

@@ -33,12 +33,12 @@ def differentiate_contact(
     for freedom, value in zip(attachment.freedoms, values, strict=True):
         contact = contact * freedom.motion(value)
     now = float(placed.state[placed.object.coordinates.index(joint)])
-    ahead, behind, link = (
-        placed.with_state({joint: v}).link_placement(attachment.link)
-        for v in (now + STEP, now - STEP, now)
+    ahead, behind = (
+        placed.with_state({joint: at}).link_placement(attachment.link).act(contact.translation)
+        for at in (now + STEP, now - STEP)
     )
-    shift = (ahead.act(contact.translation) - behind.act(contact.translation)) / (2 * STEP)
-    return float((link * attachment.placement).rotation[:, 2] @ shift)
+    normal = (placed.link_placement(attachment.link) * attachment.placement).rotation[:, 2]
+    return float(normal @ (ahead - behind)) / (2 * STEP)
 
 
 @settings(deadline=None, max_examples=15)

@@ -22,6 +22,7 @@ from helpers.carrying import (
     solve_above,
     solve_reach,
 )
+from helpers.drawers import compute_tool_pose
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -45,11 +46,7 @@ def compute_placements(
 
 def compute_tools(scene: Scene, motion: Trajectory, times: np.ndarray) -> list[pin.SE3]:
     """Return the placements of the tool, computed from the robot alone."""
-    model, data, found = scene.robot.model, scene.robot.model.createData(), []
-    for row in motion.at(times)[:, : motion.robot_size]:
-        pin.framesForwardKinematics(model, data, scene.robot.coordinates.q(row))
-        found.append(data.oMf[model.getFrameId(scene.robot.tool_frame)].copy())
-    return found
+    return [compute_tool_pose(scene, row) for row in motion.at(times)]
 
 
 def sample_phase(motion: Trajectory, phase: int, count: int = 40) -> np.ndarray:
@@ -204,7 +201,3 @@ def test_placements_do_not_depend_on_other_times(seed: int) -> None:
     for at, time in zip(together, times, strict=True):
         assert_close(at, compute_placements(scene, motion, "stick", np.array([time]))[0])
     assert compute_placements(scene, motion, "stick", np.zeros(0)) == []
-    waypoints = compute_placements(scene, motion, "stick", motion.times)
-    world = World(scene)
-    for row, at in zip(world.compute_positions(motion), waypoints, strict=True):
-        assert_close(pin.XYZQUATToSE3(row[world.get_placement_columns("stick")]), at, 1e-12)

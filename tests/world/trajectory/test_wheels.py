@@ -49,14 +49,14 @@ def test_error_is_the_larger_of_slip_and_turn() -> None:
 def test_gears_persist_at_rest() -> None:
     x = np.cumsum([0.0, 0.0, 0.2, 0.1, 0.0, -0.1, 0.0, 0.00005, 0.3])
     path = np.column_stack([x, 0.0 * x, 0.0 * x])
-    np.testing.assert_array_equal(
-        RollingLimits(turning_radius=1.0).compute_gears(path), [1, 1, 1, 1, -1, -1, -1, 1]
-    )
-    np.testing.assert_array_equal(
-        RollingLimits(turning_radius=1.0).compute_gears(-path), [-1, -1, -1, -1, 1, 1, 1, -1]
-    )
-    np.testing.assert_array_equal(RollingLimits().compute_gears(0.0 * path), np.ones(8))
-    np.testing.assert_array_equal(OMNIDIRECTIONAL.compute_gears(-path), np.ones(8))
+    car = RollingLimits(turning_radius=1.0)
+    for limits, poses, gears in (
+        (car, path, [1, 1, 1, 1, -1, -1, -1, 1]),
+        (car, -path, [-1, -1, -1, -1, 1, 1, 1, -1]),
+        (RollingLimits(), 0.0 * path, [1] * 8),
+        (OMNIDIRECTIONAL, -path, [1] * 8),
+    ):
+        assert limits.compute_gears(poses).tolist() == gears
 
 
 def test_times_follow_the_faster_wheel() -> None:
@@ -77,8 +77,6 @@ def test_limits_follow_from_the_robot() -> None:
         for robot in ({"base": "differential"}, {"base": "ackermann", "turning_radius": 0.8})
     )
     assert (tank.turning_radius, car.turning_radius) == (0.0, 0.8)
-    assert (
-        (tank.track, tank.wheel_speed)
-        == (car.track, car.wheel_speed)
-        == (pytest.approx(0.5708 * 1.875, abs=1e-3), pytest.approx(1.0, rel=1e-3))
-    )
+    for limits in (tank, car):
+        assert limits.track == pytest.approx(0.5708 * 1.875, abs=1e-3)
+        assert limits.wheel_speed == pytest.approx(1.0, rel=1e-3)

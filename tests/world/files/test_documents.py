@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import os
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -142,14 +141,6 @@ def test_deeply_nested_yaml_raises(tmp_path: Path, opening: str, closing: str) -
     for count in (depth + 1, 1_000_000):
         with expect_error(r"too many lists|not valid YAML"):
             read_yaml(write_text(tmp_path, opening * count + "1" + closing * count))
-
-
-@pytest.mark.parametrize("at", [itertools.repeat(0.0), map(abs, itertools.count())])
-def test_iterators_are_rejected(at: Iterator[float]) -> None:
-    data = {"name": "a", "parts": [{"size": 1.0, "at": at}]}
-    expected = "a list, fields, text or a number"
-    with expect_error(r"parts\[0\].at: wrong type of value", expected=expected):
-        parse_document(Document(data), Assembly)
 
 
 def test_unencodable_text_and_recursive_data_raise() -> None:

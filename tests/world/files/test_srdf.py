@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.expected_errors import expect_error
 
 from vkc_pin.world.files.srdf import Srdf, read_srdf
 
@@ -59,9 +58,3 @@ def test_home_states_are_preferred(tmp_path: Path, names: list[str], chosen: str
     )
     assert srdf.state(["a", "b"])["a"] == values[chosen]
     assert srdf.state(["a", "z"]) == {}
-
-
-def test_unknown_links_raise(tmp_path: Path) -> None:
-    pairs = [f'<disable_collisions link1="base" link2="{name}"/>' for name in ("arm", "hnad")]
-    with expect_error(line=3, nearest="hand", file=tmp_path / "r.srdf"):
-        read_text(tmp_path, "\n".join(pairs))

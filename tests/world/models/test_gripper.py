@@ -86,7 +86,6 @@ def test_fingers_are_symmetric_at_the_given_opening(robot: vkc.Robot, opening: f
 def test_opened_robots_are_cached_and_keep_their_margins(robot: vkc.Robot) -> None:
     opened = robot.opened(0.03)
     assert opened is robot.opened(0.03)
-    assert list(opened.model.names) == list(robot.model.names)
     assert opened.own_margins(0.02) == robot.own_margins(0.02)
 
 
@@ -139,7 +138,7 @@ def test_openings_of_revolute_fingers(tmp_path: Path) -> None:
         ("finger_a_joint: {closed: 0, open: 0.4}", "between 0 and 0.04"),
         ("finger_a_joint: {closed: 0.04, open: 0.04}", "does not move"),
         ("finger_a_joint: {closed: 0.04, open: 0.0}", "does not open"),
-        ("finger_b_joint: {closed: 0, open: 0.04}", "'finger_a_joint', which it follows"),
+        ("finger_b_joint: {closed: 0, open: 0.04}", "which it follows"),
         ("arm_5_joint: {closed: 0, open: 0.04}", "not a finger joint"),
     ],
 )

@@ -68,7 +68,7 @@ def test_base_types(tmp_path: Path) -> None:
         ),
     ):
         with expect_error(message, field=field):
-            load_robot(file, **arguments)  # type: ignore[arg-type]
+            load_robot(file, **arguments)
     write_yaml(tmp_path, "base: {turning_radius: 1.2}\n")
     assert load_robot(file, base="ackermann").turning_radius == 1.2
     assert load_robot(file, base="ackermann", turning_radius=0.7).turning_radius == 0.7
@@ -77,12 +77,8 @@ def test_base_types(tmp_path: Path) -> None:
 
 def test_locked_joints_and_tool_frame(husky: Robot) -> None:
     robot = load_robot("husky_ur5e", tool_frame="wrist_2_link", locked_joints={"elbow_joint": -1.5})
-    assert robot.coordinates.names[3:] == (
-        "shoulder_pan_joint",
-        "shoulder_lift_joint",
-        "wrist_1_joint",
-        "wrist_2_joint",
-    )
+    names = husky.coordinates.names
+    assert robot.coordinates.names == (*names[:5], *names[6:8])
     arm = np.array([0.3, -1.0, -1.5, 0.4, 0.2, 0.0])
     found = compute_placement(robot, "tool", np.concatenate([np.zeros(3), arm[[0, 1, 3, 4]]]))
     expected = compute_placement(husky, "tool", np.concatenate([np.zeros(3), arm]))

@@ -32,7 +32,6 @@ FLY = vkc.Hold("fly", "leg", BALL, "ball")
 
 
 def test_holds_are_equal_by_object_attachment_and_frame() -> None:
-    assert [str(hold) for hold in (STICK, BALL)] == ["stick.grip", "ball.pull by stick.tip"]
     again = vkc.Hold("ball", "pull", vkc.Hold("stick", "grip", at=(0.1, 2.0)), "tip")
     assert (again, hash(again)) == (BALL, hash(BALL))
     for other in (

@@ -27,7 +27,6 @@ def corrupt(row: int, column: int, value: float) -> np.ndarray:
     ("pose", "problem"),
     [
         ("here", "not a pose"),
-        ([1.0, 2.0], "not a pose"),
         (np.zeros((3, 1)), "not a pose"),
         (["0", "0", "0", "0", "0", "0"], "not a pose"),
         (range(0), "not a pose"),

@@ -200,4 +200,3 @@ def test_placements_do_not_depend_on_other_times(seed: int) -> None:
     together = compute_placements(scene, motion, "stick", times)
     for at, time in zip(together, times, strict=True):
         assert_close(at, compute_placements(scene, motion, "stick", np.array([time]))[0])
-    assert compute_placements(scene, motion, "stick", np.zeros(0)) == []

@@ -13,7 +13,13 @@ from vkc_pin.world.scene.hold import make_holds
 from vkc_pin.world.trajectory.splicing import (
     concatenate_trajectories,
     extract_phases,
+    fill_missing_values,
 )
+
+
+def test_coordinates_without_values_keep_none() -> None:
+    table = np.array([[np.nan, 1.0], [np.nan, np.nan]])
+    np.testing.assert_array_equal(fill_missing_values(table), [[np.nan, 1.0]] * 2)
 
 
 def make_parts() -> tuple[Trajectory, Trajectory, Trajectory]:

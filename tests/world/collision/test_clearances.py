@@ -57,18 +57,15 @@ class Room:
         )
         self.margins = Margins(self.default_margins, reduced, [exempt])
 
-    def make_boxes(self) -> Boxes:
+    def make_clearances(self) -> Clearances:
         moving = self.geometry.geometryObjects
         joints = np.array([*(shape.parentJoint for shape in moving), *[0] * FIXED])
         placed = [*(shape.placement for shape in moving), *self.fixed]
         rotations = np.array([placement.rotation for placement in placed])
         centers = np.array([placement.translation for placement in placed])
-        return Boxes(joints, rotations, centers, self.halves, self.pairs)
-
-    def make_clearances(self) -> Clearances:
+        boxes = Boxes(joints, rotations, centers, self.halves, self.pairs)
         shapes = Shapes(self.solids, self.fixed, threads=4)
-        placements = ShapePlacements(self.model, self.geometry)
-        return Clearances(placements, self.make_boxes(), shapes, self.margins)
+        return Clearances(ShapePlacements(self.model, self.geometry), boxes, shapes, self.margins)
 
     def compute_distances(self) -> np.ndarray:
         """Return the distances of all pairs at all states, shape (STATES, P) [m]."""
@@ -98,29 +95,34 @@ class Room:
         return found
 
 
-@settings(max_examples=25, deadline=None)
-@given(SEEDS, st.sampled_from([0.0, 0.02, 0.3, 10.0]), st.booleans())
-def test_close_boxes_match_an_exhaustive_search(seed: int, reach: float, with_fixed: bool) -> None:
-    """No pair of close boxes is missed, and bounds are lower bounds of distances."""
+@settings(max_examples=15, deadline=None)
+@given(SEEDS, st.sampled_from([None, 0, 1, 3]), st.sampled_from([0.05, 0.3, np.inf]), st.booleans())
+def test_closest_shapes_match_an_exhaustive_search(
+    seed: int, max_pairs: int | None, reach: float, bounded: bool
+) -> None:
     room = Room(seed)
-    rotations, translations = (np.empty((STATES, 4, 3, *more)) for more in ((3,), ()))
-    for state, q in enumerate(room.q):
-        data = room.model.createData()
-        pin.forwardKinematics(room.model, data, q)
-        for joint, placement in enumerate(data.oMi):
-            rotations[state, joint] = placement.rotation
-            translations[state, joint] = placement.translation
-    rows, found, bounds = room.make_boxes().find_close_pairs(
-        reach, rotations, translations, include_fixed=with_fixed
+    distances, margins = room.compute_distances(), room.default_margins
+    slack = room.rng.uniform(0.0, 0.2, distances.shape) if bounded else np.inf
+    bounds = distances - margins - slack
+    order, count = np.argsort(bounds, axis=1), len(margins)
+    chosen, found = Shapes(room.solids, room.fixed, threads=3).find_closest_pairs(
+        ShapePlacements(room.model, room.geometry).compute_placements(room.q),
+        count * np.arange(STATES + 1),
+        room.pairs[order.ravel()],
+        ranks=order.ravel(),
+        margins=margins[order].ravel(),
+        bounds=np.sort(bounds).ravel(),
+        reach=reach,
+        max_pairs=max_pairs,
+        rounding=0.0,
     )
-    assert (np.diff(rows * len(room.pairs) + found) > 0).all(), "not strictly sorted"
-    assert (bounds < reach).all()
-    included = with_fixed | (room.pairs[:, 1] < MOVING)
-    assert included[found].all()
-    distances = room.compute_distances()
-    assert (bounds <= distances[rows, found] + 1e-6).all()
-    close = (distances < reach - 1e-6) & included
-    assert set(zip(*np.nonzero(close), strict=True)) <= set(zip(rows, found, strict=True))
+    expected: list[tuple[int, int]] = []
+    for state, row in enumerate(distances):
+        near = np.flatnonzero(row < reach)
+        near = near[np.lexsort((near, row[near], (row - margins)[near]))][:max_pairs]
+        expected += [(state, pair) for pair in near.tolist()]
+    assert list(zip(chosen // count, order.ravel()[chosen], strict=True)) == expected
+    np.testing.assert_array_equal(found.distance, [distances[one] for one in expected])
 
 
 @settings(max_examples=25, deadline=None)

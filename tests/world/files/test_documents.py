@@ -143,10 +143,12 @@ def test_deeply_nested_yaml_raises(tmp_path: Path, opening: str, closing: str) -
             read_yaml(write_text(tmp_path, opening * count + "1" + closing * count))
 
 
-def test_unencodable_text_and_recursive_data_raise() -> None:
+def test_unencodable_endless_or_recursive_data_raise() -> None:
     for data in ({"name": "x", "parts": ["a\ud800"]}, {"x\udfff": [1]}, ["\ud800"]):
         with expect_error("not text"):
             parse_document(Document(data), Assembly)
+    with expect_error("parts: wrong type of value"):
+        parse_document(Document({"parts": itertools.count()}), Assembly)
     recursive: dict[str, object] = {}
     recursive["inside"] = recursive
     with expect_error("inside: too many lists inside each other"):

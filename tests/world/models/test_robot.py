@@ -77,10 +77,9 @@ def test_front_is_the_foremost_corner_of_the_hand(husky: Robot) -> None:
     )
 
 
-def test_visual_geometry_is_simplified_and_coloured(husky: Robot) -> None:
+def test_visual_geometry_is_simplified(husky: Robot) -> None:
     shapes = husky.visual.geometryObjects
     triangles = sum(
         shape.geometry.num_tris for shape in shapes if isinstance(shape.geometry, coal.BVHModelBase)
     )
     assert 10_000 < triangles < 100_000
-    assert len({tuple(shape.meshColor.round(3)) for shape in shapes}) > 5

@@ -87,7 +87,6 @@ def test_key_times_limit_the_change_of_coordinates(plan: vkc.Plan) -> None:
     times = key_times(motion)
     assert set(motion.times) <= set(times)
     assert np.abs(np.diff(motion.at(times), axis=0)).max() <= 1.0 + 1e-9
-    assert (np.diff(times) > 0).all()
     finer = key_times(motion, {names[0]: 2.0, names[3]: 0.0125})
     assert np.abs(np.diff(motion.at(finer)[:, 3])).max() <= 0.0125 + 1e-9
 

@@ -41,8 +41,7 @@ NB_MODULE(_distances, module)
     .def(
       nb::init<
         const Indices<1> &, const Numbers<3> &, const Numbers<2> &, const Numbers<2> &, const Indices<2> &>())
-    .def("placed", &Boxes::placed)
-    .def("near", &Boxes::near);
+    .def("placed", &Boxes::placed);
   nb::class_<Bodies>(module, "Bodies")
     .def(
       "__init__",

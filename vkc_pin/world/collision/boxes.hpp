@@ -11,7 +11,6 @@
 #include <limits>
 #include <memory>
 #include <stdexcept>
-#include <tuple>
 
 #include "arrays.hpp"
 #include "vectors.hpp"
@@ -93,42 +92,6 @@ public:
     }
     other.corners();
     return other;
-  }
-
-  // Returns all (configuration, pair), sorted, that boxes cannot prove to be `reach` apart, with
-  // lower bounds of distances.
-  std::tuple<Array<Index>, Array<Index>, Array<double>> near(
-    double reach, const Numbers<4> & rotations, const Numbers<3> & translations, bool standing, std::size_t threads) const
-  {
-    const std::size_t states = rotations.shape(0), joints = rotations.shape(1);
-    if (
-      rotations.shape(2) != 3 || rotations.shape(3) != 3 || translations.shape(0) != states
-      || translations.shape(1) != joints || translations.shape(2) != 3)
-      throw std::invalid_argument("placements of joints are of shapes (W, J, 3, 3) and (W, J, 3)");
-    if (Index(joints) <= pairs_->most_joints)
-      throw std::out_of_range("no such joint");
-    std::vector<Index> where, which;
-    std::vector<double> gaps;
-    const double *turned = rotations.data(), *moved = translations.data();
-    {
-      nb::gil_scoped_release released;
-      threads = std::max<std::size_t>(threads, 1);
-      std::vector<std::vector<Found>> parts(threads);
-      in_parts(states, threads, [&](std::size_t part, std::size_t first, std::size_t last) {
-        Looking look(*this, reach);
-        for (std::size_t w = first; w < last; ++w)
-          look.at(w, turned + 9 * joints * w, moved + 3 * joints * w, standing, parts[part]);
-      });
-      for (const auto & part : parts)
-        for (const auto & found : part)
-        {
-          where.push_back(found.state);
-          which.push_back(found.pair);
-          gaps.push_back(found.gap);
-        }
-    }
-    const std::size_t n = where.size();
-    return {handed_over(std::move(where), {n}), handed_over(std::move(which), {n}), handed_over(std::move(gaps), {n})};
   }
 
   struct Found { Index state, pair; double gap; };

@@ -1,6 +1,6 @@
 """Finds pairs of shapes that may be close, from their bounding boxes.
 
-The compiled loop of `distances` runs the same test; this module exposes it separately.
+The compiled loop of `distances` tests those of `Boxes`.
 """
 
 from __future__ import annotations
@@ -10,11 +10,9 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.utils.arrays import Bools, Floats, Ints
-from vkc_pin.world.collision.solids import count_threads, load_compiled
+from vkc_pin.world.collision.solids import load_compiled
 
 __all__ = ["Boxes", "WorldBoxes"]
-
-_MIN_ROWS_PER_THREAD = 32  # configurations, about 0.2 ms: fewer do not pay for another thread
 
 
 class Boxes:
@@ -26,21 +24,11 @@ class Boxes:
         centers: Centres in the same frame, shape (G, 3) [m].
         halves: Half extents along the boxes' axes, shape (G, 3) [m].
         pairs: Pairs to check, shape (P, 2); at least the first box of each pair moves.
-        threads: Maximum number of threads. Default: `solids.count_threads`.
     """
 
     def __init__(
-        self,
-        joints: Ints,
-        rotations: Floats,
-        centers: Floats,
-        halves: Floats,
-        pairs: Ints,
-        *,
-        threads: int | None = None,
+        self, joints: Ints, rotations: Floats, centers: Floats, halves: Floats, pairs: Ints
     ) -> None:
-        self.threads = count_threads() if threads is None else threads
-        self.pairs = pairs
         self.compiled: Any = load_compiled().Boxes(joints, rotations, centers, halves, pairs)
 
     def move_fixed(self, which: Ints, rotations: Floats, centers: Floats) -> Boxes:
@@ -52,34 +40,8 @@ class Boxes:
             centers: Centres in the world frame, shape (n, 3) [m].
         """
         other = object.__new__(Boxes)
-        other.threads, other.pairs = self.threads, self.pairs
         other.compiled = self.compiled.placed(which, rotations, centers)
         return other
-
-    def find_close_pairs(
-        self, reach: float, rotations: Floats, translations: Floats, *, include_fixed: bool = True
-    ) -> tuple[Ints, Ints, Floats]:
-        """Return all pairs that bounding volumes cannot prove to be `reach` [m] apart.
-
-        Bounding spheres are tested first (against boxes, for fixed shapes), then the face normals
-        of both boxes.
-
-        Args:
-            reach: Distance below which a pair is close [m].
-            rotations: Orientations of all joints in the world frame, shape (W, J, 3, 3); 0 is the
-                world.
-            translations: Positions of all joints in the world frame, shape (W, J, 3) [m].
-            include_fixed: Include pairs of a moving and a fixed shape.
-
-        Returns:
-            Index of the configuration, index of the pair, and a lower bound of the signed distance
-            [m], shape (C,) each, sorted by configuration, then by pair.
-        """
-        threads = max(1, min(self.threads, len(rotations) // _MIN_ROWS_PER_THREAD))
-        rows, pairs, gaps = self.compiled.near(
-            reach, rotations, translations, include_fixed, threads
-        )
-        return np.asarray(rows), np.asarray(pairs), np.asarray(gaps)
 
 
 class WorldBoxes:

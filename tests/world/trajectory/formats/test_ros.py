@@ -60,8 +60,8 @@ def test_motion_of_an_arm_alone_is_rejected() -> None:
     points = [{"positions": [k] * 4, "time_from_start": {"sec": k, "nanosec": 0}} for k in (0, 1)]
     message = {"joint_names": list("abcd"), "points": points}
     with pytest.raises(vkc.InputError, match="joint_names: no base coordinates"):
-        Trajectory.from_ros(message)
-    assert Trajectory.from_ros(message, robot_size=4).robot_size == 4
+        vkc.Trajectory.from_ros(message)
+    assert vkc.Trajectory.from_ros(message, robot_size=4).robot_size == 4
 
 
 @FILES

@@ -65,6 +65,10 @@ def test_partly_blocked_door_reports_its_free_range() -> None:
     found = float(plan.summary().split("were found up to hinge = ")[1].split()[0])
     assert -1.3 < found < -1.1
     assert vkc.plan(scene, [vkc.Actuate("door", {"hinge": found})], options=QUICK).success
+    task = vkc.GoTo(0.0, 0.0), vkc.Actuate("door", {"hinge": -1.4}, "handle"), vkc.GoTo(-1.0, 0.0)
+    plan = plan_failure(scene, *task, texts=texts)
+    phases = ["go to", "reach door.handle", "turn door.knob", "move door.hinge, door.knob"]
+    assert [phase.name for phase in plan.trajectory.phases] == phases  # the rest cannot help
 
 
 @pytest.mark.parametrize(

@@ -67,31 +67,35 @@ def plan_simultaneously(scene: Scene, task: Task, request: PlanningRequest) -> P
     order = (_plan_from_steps, _plan_from_guesses)
     plan_first, plan_second = order if is_auto else order[::-1]
     with share_budget(2):
-        first = plan_first(scene, task, request)
-    if first.success or current_ending():
+        first, is_final = plan_first(scene, task, request)
+    if first.success or is_final or current_ending():
         return first
-    has_alternatives = any(has_open_attachment(scene, step) for step in task.steps)
-    if not is_auto and first.status == "infeasible" and not has_alternatives:
-        return first
-    second = plan_second(scene, task, request)
+    second, _ = plan_second(scene, task, request)
     best = second if second.success or is_auto else first
     return add_statistics(best, [first.statistics, second.statistics])
 
 
-def _plan_from_guesses(scene: Scene, task: Task, request: PlanningRequest) -> Plan:
-    """Plan all steps as one problem, from initial guesses for the whole."""
-    return solve_task(scene, task, request).plan
+def _plan_from_guesses(scene: Scene, task: Task, request: PlanningRequest) -> tuple[Plan, bool]:
+    """Plan all steps as one problem, from initial guesses for the whole.
+
+    Returns:
+        The plan, and whether planning from steps would fail, too.
+    """
+    plan = solve_task(scene, task, request).plan
+    has_alternatives = any(has_open_attachment(scene, step) for step in task.steps)
+    return plan, plan.status == "infeasible" and not has_alternatives
 
 
-def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> Plan:
+def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> tuple[Plan, bool]:
     """Plan all steps as one problem, from their solutions one after the other.
 
     The solutions of the steps are drafts: they are retimed and validated only where the problem
     that starts from them fails.
 
     Returns:
-        The concatenated solutions of the steps if one fails, or if they cannot be improved; a
-        stationary plan, no success, if they are no one problem.
+        The plan, and whether planning from guesses would fail, too: if the goal of a step that
+        uses no earlier grasp is blocked. The concatenated solutions of the steps if one fails,
+        or if they cannot be improved; a stationary plan, no success, if they are no one problem.
     """
     parts = plan_each_step(scene, task, dataclasses.replace(request, is_draft=True))
     steps, plans = _list_steps(task, parts), [part.result.plan for part in parts]
@@ -101,7 +105,7 @@ def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> Plan
     except InputError:
         # A free object was grasped anew, from where it lies only after planning: these steps are no
         # task that begins here. All steps together choose another grasp.
-        return concatenate_plans(scene, task.steps, request, [], statistics=statistics)
+        return concatenate_plans(scene, task.steps, request, [], statistics=statistics), False
     is_planned = parts and all(part.result.is_solved for part in parts) and not current_ending()
     # A chain can contain a joint only once.
     if is_planned and find_shared_coordinate(scene, whole.holds) is None:
@@ -110,10 +114,17 @@ def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> Plan
         plan = solve_task(scene, whole, request, guess=guess).plan
         common.append(plan.statistics)
         if plan.success:
-            return add_statistics(plan, statistics + common)
+            return add_statistics(plan, statistics + common), True
     plans = [complete_draft(plan) for plan in plans]
     statistics = [plan.statistics for plan in plans]
-    return concatenate_plans(scene, steps, request, plans, statistics=statistics + common)
+    plan = concatenate_plans(scene, steps, request, plans, statistics=statistics + common)
+    return plan, bool(parts) and _is_blocked(parts[-1].result)
+
+
+def _is_blocked(result: TaskResult) -> bool:
+    """Return whether a step fails wherever the robot begins: no earlier grasp affects its goal."""
+    kept = {hold for phase in result.task.phases for hold in phase.held} & {*result.scene.holds}
+    return result.is_goal_blocked and not kept
 
 
 def _list_steps(task: Task, parts: Sequence[PlannedStep]) -> tuple[Step, ...]:
@@ -197,7 +208,8 @@ def plan_each_step(scene: Scene, task: Task, request: PlanningRequest) -> list[P
         request.progress.set_steps(number + 1, 1, len(task.steps))
         result = solve_with_alternatives(current, own, request)
         part = PlannedStep(number, number, result)
-        if request.is_draft and parts and len(task.steps) > 2 and not result.is_solved:
+        can_join = request.is_draft and parts and len(task.steps) > 2
+        if can_join and not result.is_solved and not _is_blocked(result):
             part = _join_steps(task, parts.pop(), part, request)
             result = part.result
         parts.append(part)

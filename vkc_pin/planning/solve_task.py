@@ -72,6 +72,7 @@ class TaskResult:
         z: Its best waypoints z_1..z_N, shape (N, n).
         check_time: Time of the last validation [s]; for a draft, that it may take.
         is_grasp_independent: Whether the task fails for certain whatever the grasp.
+        is_goal_blocked: Whether all configurations found at one of its goals are blocked.
     """
 
     scene: Scene
@@ -81,6 +82,7 @@ class TaskResult:
     z: Floats
     check_time: float
     is_grasp_independent: bool
+    is_goal_blocked: bool
 
     @property
     def is_solved(self) -> bool:
@@ -144,8 +146,9 @@ def solve_task(
         terms=request.terms,
         is_validated=best.is_validated,
     )
-    found = best.problem, best.z, search.check_time, search.is_grasp_independent
-    return TaskResult(scene, task, plan, *found)
+    found = best.problem, best.z, search.check_time
+    causes = search.is_grasp_independent, search.is_goal_blocked
+    return TaskResult(scene, task, plan, *found, *causes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +197,7 @@ class _Search:
         self.problem: TrajectoryProblem | None = None
         self.times = dict.fromkeys(STAGES, 0.0)
         self.rounds = self.iterations = 0
-        self.check_time, self.is_grasp_independent = 0.0, False
+        self.check_time, self.is_grasp_independent, self.is_goal_blocked = 0.0, False, False
         self.history: list[dict[str, float]] = []
         self._blocked_phases: list[str] = []  # phases without a path of the base
         self._best: _Candidate | None = None
@@ -239,6 +242,8 @@ class _Search:
             if any(goal.is_deep for goal in goals):
                 break
         record_evaluations()
+        if self.request.is_draft and not goals:  # poor guesses were not tried
+            goals = [goal for goal in self._find_blocked_goals(problem) if goal.is_deep]
         return self._explain_failure(problem, goals, is_search=is_search)
 
     def _build_problem(self, task: Task) -> TrajectoryProblem:
@@ -293,6 +298,7 @@ class _Search:
             best = self._make_stationary(problem)
             return best.with_notes(self._find_proofs(problem)), "infeasible"
         lines = [self._describe_goal(problem, goal) for goal in goals]
+        self.is_goal_blocked = bool(lines)
         nearest = self.find_nearest()
         best = nearest or self._make_stationary(problem)
         status = "infeasible" if lines else best.status

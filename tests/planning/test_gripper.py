@@ -61,7 +61,7 @@ def test_narrow_opening_avoids_a_collision(robot: Path, plan: vkc.Plan) -> None:
     wide = vkc.plan(write_cheeks_scene(robot), PULL)
     assert not wide.success
     assert CLOSE_PAIRS & get_violation_names(wide.report)
-    assert get_openings(wide.trajectory) == [None, None, None]
+    assert set(get_openings(wide.trajectory)) == {None}
     assert get_openings(plan.trajectory) == [NARROW, NARROW, NARROW]
 
 
@@ -206,9 +206,9 @@ def test_opening_without_a_gripper_is_ignored_with_a_warning(tmp_path: Path) -> 
     with pytest.warns(UserWarning, match=text):
         scene = write_cheeks_scene(robot, opening=NARROW, start=0.02)
     motion = vkc.plan(scene, PULL).trajectory
-    assert get_openings(motion) == [None, None, None]
+    assert set(get_openings(motion)) == {None}
     with pytest.raises(vkc.InputError, match=r"phases\[1\].opening.*does not open"):
-        validate(scene, PULL, replace_openings(motion, None, NARROW, None))
+        validate(scene, PULL, replace_openings(motion, None, NARROW))
 
 
 @pytest.mark.parametrize("place", ["opening", "start"])

@@ -57,7 +57,7 @@ OPENED = {
 
 sys.path.insert(0, str(ROOT / "tests"))
 from helpers.browser import save_screenshot  # noqa: E402
-from helpers.closers import load_door_with_closer  # noqa: E402
+from helpers.door_closers import load_door_with_closer  # noqa: E402
 from helpers.grippers import write_cheeks_scene, write_gripper  # noqa: E402
 from helpers.homes import write_home_urdf  # noqa: E402
 
@@ -278,6 +278,19 @@ def bases_picture() -> None:
         save_figure(figure, IMAGES / "bases.png")
 
 
+def pull_picture() -> None:
+    """Draw a door that is pulled open, from above: alone, and to drive through afterwards."""
+    scene, pull = vkc.load_scene("door"), vkc.Actuate("door", {"hinge": -1.5})
+    with use_style():
+        figure = new_figure(11.0, 3.5)
+        tasks = [pull], [pull, vkc.GoTo(4.1, -0.3)]
+        for part, steps in zip(figure.subfigures(1, 2), tasks, strict=True):
+            plan = vkc.plan(scene, steps)
+            sys.stdout.write(plan.summary() + "\n")
+            draw_top_view(part, World(scene), plan.trajectory)
+        save_figure(figure, IMAGES / "pulled_door.png")
+
+
 def opening_picture() -> None:
     """Draw fingers between two cheeks, from above: fully open, and at the attachment's opening."""
     from scipy.spatial import ConvexHull
@@ -402,6 +415,7 @@ def main() -> int:
     tray_picture()
     push_picture()
     bases_picture()
+    pull_picture()
     opening_picture()
     torque_picture()
     return 0

@@ -24,7 +24,7 @@ from vkc_pin.planning.initialization.initial_guess import (
     extract_phase_waypoints,
     make_initial_guess,
 )
-from vkc_pin.planning.initialization.methods import MAX_GOOD_PENETRATION, initialize
+from vkc_pin.planning.initialization.methods import initialize
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import STAGES, Plan, PlanningStatistics
 from vkc_pin.planning.request import PlanningRequest
@@ -242,7 +242,7 @@ class _Search:
             if any(goal.is_deep for goal in goals):
                 break
         record_evaluations()
-        if self.request.is_draft and not goals:  # poor guesses were not tried
+        if self.request.is_draft and not goals:  # deep guesses were not tried
             goals = [goal for goal in self._find_blocked_goals(problem) if goal.is_deep]
         return self._explain_failure(problem, goals, is_search=is_search)
 
@@ -345,8 +345,8 @@ class _Search:
 
     def _generate_guesses(self, problem: TrajectoryProblem) -> Iterator[InitialGuess]:
         request = self.request
-        # Where a step's guesses are poor, "auto" rather searches guesses for all steps together.
-        needs_good = request.is_draft and request.initialization == "auto"
+        # Where a step has only deep guesses, "auto" rather searches guesses for all steps together.
+        skips_deep = request.is_draft and request.initialization == "auto"
         guesses = initialize(
             problem,
             request.initialization,
@@ -369,9 +369,8 @@ class _Search:
                 self.times["initialization"] += took - (request.cache.build_time - built)
             if guess is None or self._proofs:
                 return
-            if needs_good and guess.penetration > MAX_GOOD_PENETRATION:
-                return
-            yield guess
+            if not (skips_deep and guess.is_deep):
+                yield guess
 
     def _report_round(self, row: Iteration) -> None:
         self.request.progress(row)

@@ -202,7 +202,7 @@ def test_phase_that_only_waits_is_no_part_of_a_guess_for_the_whole_task() -> Non
 # --- order of the methods
 
 Penetrations = list[float | None]
-FINE, POOR, DEEP = (ratio * MAX_GOOD_PENETRATION for ratio in (0.9, 1.1, 4.4))
+FINE, POOR, SHALLOW, DEEP = (ratio * MAX_GOOD_PENETRATION for ratio in (0.9, 1.1, 2.2, 4.4))
 
 
 def interleave(*kinds: Penetrations) -> list[str]:
@@ -226,7 +226,7 @@ def interleave(*kinds: Penetrations) -> list[str]:
         (([0.0, 0.0], [0.0, 0.0], [0.0]), "a0 A0 b0 B0 c0 C0 a1 A1 b1 B1"),
         (([POOR, 0.0], [FINE, 0.0], [0.0]), "a0 b0 B0 c0 C0 b1 B1 a1 A1 A0"),
         (([DEEP, DEEP], [DEEP, DEEP], []), "a0 b0 a1 b1 A0 B0 A1 B1"),
-        (([POOR, POOR], [DEEP], []), "a0 b0 a1 A0 B0 A1"),
+        (([POOR, POOR], [DEEP], []), "a0 b0 A0 a1 A1 B0"),
         (([None, 0.0], [0.0], [None]), "a0 b0 B0 c0 a1 A1"),
     ],
 )
@@ -236,27 +236,29 @@ def test_methods_take_turns(kinds: Sequence[Penetrations], expected: str) -> Non
 
 @given(st.lists(st.lists(st.sampled_from([0.0, FINE, POOR, DEEP, None]), max_size=5), max_size=3))
 def test_guesses_are_requested_once_and_good_ones_come_first(kinds: list[Penetrations]) -> None:
-    events, waiting, yielded = interleave(*kinds), dict[str, float](), Counter[str]()
+    events, waiting, yielded = interleave(*kinds), set[str](), Counter[str]()
     penetrations = {
         f"{kind}{k}": value
         for kind, found in zip("abc", kinds, strict=False)
         for k, value in enumerate(found)
     }
     assert sorted(filter(str.islower, events)) == sorted(penetrations)
-    for event in events:
-        penetration = penetrations[event.lower()]
-        if event.islower() and penetration is not None:
-            waiting[event] = penetration
-        elif event.isupper():
-            assert waiting.pop(event.lower()) == penetration
-            kind, is_poor = event[0].lower(), penetration > MAX_GOOD_PENETRATION
-            for name, other in waiting.items():
-                turns = (yielded[kind], yielded[name[0]])
-                if not is_poor or other <= MAX_GOOD_PENETRATION or turns[0] == turns[1]:
-                    assert penetration <= other
-                else:  # among poor guesses the method with fewer yields is next
-                    assert turns[0] < turns[1]
-            yielded[kind] += 1
+
+    def rank(name: str) -> tuple[int, float]:
+        penetration = penetrations[name] or 0.0
+        return 0 if penetration <= MAX_GOOD_PENETRATION else 1 + yielded[name[0]], penetration
+
+    for number, event in enumerate(events):
+        name = event.lower()
+        if event.isupper():
+            waiting.remove(name)
+            is_deep = (penetrations[name] or 0.0) > SHALLOW
+            others = [one for one in waiting if is_deep or (penetrations[one] or 0.0) <= SHALLOW]
+            assert all(rank(name) <= rank(other) for other in others)
+            assert not (is_deep and any(map(str.islower, events[number:])))
+            yielded[name[0]] += 1
+        elif penetrations[name] is not None:
+            waiting.add(name)
     assert not waiting
 
 

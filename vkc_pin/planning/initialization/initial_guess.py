@@ -21,6 +21,7 @@ __all__ = [
     "perturb",
 ]
 
+_DEEP = 0.1  # [m] penetration of a guess from which the solver seldom succeeds
 # [m], [rad] initial trust region: a nearly feasible guess is improved in smaller steps
 _WARM_RADIUS = 0.2
 
@@ -41,6 +42,11 @@ class InitialGuess:
     z: Floats
     penetration: float = float("nan")
     radius: Floats | None = None
+
+    @property
+    def is_deep(self) -> bool:
+        """Whether it penetrates too deeply for the solver to resolve it in most cases."""
+        return self.penetration > _DEEP
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,33 +97,39 @@ def interleave_guesses(*kinds: _Kind) -> Iterator[InitialGuess]:
 
     Methods are tried in order until one returns a good guess, which is nearly collision-free, and
     this is yielded. Next time, methods without a good guess come last, and otherwise those first
-    that have waited longest. Searching costs less than solving from a poor guess, which seldom
-    succeeds, so these follow when no method offers any other: the best of the methods that were
-    yielded least often, since guesses of one method tend to fail for the same reason.
+    that have waited longest. Without a good guess, the best of the methods that were yielded least
+    often is next: guesses of one method tend to fail for the same reason. Deep guesses wait until
+    the searches have ended: these take less time than solving from one, which seldom succeeds.
     """
-    waiting, failed = list(kinds), set[_Kind]()
-    poor, turns = list[tuple[_Kind, InitialGuess]](), Counter[_Kind]()
-    while waiting:
-        for kind in sorted(waiting, key=lambda kind: kind in failed):
+
+    def is_good(guess: InitialGuess | None) -> bool:
+        return guess is not None and not guess.penetration > MAX_GOOD_PENETRATION
+
+    def rank(one: tuple[_Kind, InitialGuess]) -> tuple[int, float]:
+        kind, guess = one
+        return 0 if is_good(guess) else 1 + turns[kind], guess.penetration
+
+    waiting, poor = list(kinds), set[_Kind]()
+    found, turns = list[tuple[_Kind, InitialGuess]](), Counter[_Kind]()
+    while waiting or found:
+        for kind in sorted(waiting, key=lambda kind: kind in poor):
             waiting.remove(kind)
             try:
                 guess = next(kind)
             except StopIteration:
                 continue
             waiting.append(kind)
-            if guess is not None and not guess.penetration > MAX_GOOD_PENETRATION:
-                failed.discard(kind)
-                turns[kind] += 1
-                yield guess
-                break
-            failed.add(kind)
+            (poor.discard if is_good(guess) else poor.add)(kind)
             if guess is not None:
-                poor.append((kind, guess))
-    while poor:
-        best = min(poor, key=lambda one: (turns[one[0]], one[1].penetration))
-        poor.remove(best)
-        turns[best[0]] += 1
-        yield best[1]
+                found.append((kind, guess))
+            if is_good(guess):
+                break
+        ready = [one for one in found if not waiting or not one[1].is_deep]
+        if ready:
+            best = min(ready, key=rank)
+            found.remove(best)
+            turns[best[0]] += 1
+            yield best[1]
 
 
 def _generate_stationary_guesses(

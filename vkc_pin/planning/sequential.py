@@ -93,9 +93,9 @@ def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> tupl
     that starts from them fails.
 
     Returns:
-        The plan, and whether planning from guesses would fail, too: if the goal of a step that
-        uses no earlier grasp is blocked. The concatenated solutions of the steps if one fails,
-        or if they cannot be improved; a stationary plan, no success, if they are no one problem.
+        The plan, and whether planning from guesses would fail, too: if the goal of a step is
+        blocked. The concatenated solutions of the steps if one fails, or if they cannot be
+        improved; a stationary plan, no success, if they are no one problem.
     """
     parts = plan_each_step(scene, task, dataclasses.replace(request, is_draft=True))
     steps, plans = _list_steps(task, parts), [part.result.plan for part in parts]
@@ -118,13 +118,21 @@ def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> tupl
     plans = [complete_draft(plan) for plan in plans]
     statistics = [plan.statistics for plan in plans]
     plan = concatenate_plans(scene, steps, request, plans, statistics=statistics + common)
-    return plan, bool(parts) and _is_blocked(parts[-1].result)
+    return plan, bool(parts) and _is_blocked(scene, parts[-1].result)
 
 
-def _is_blocked(result: TaskResult) -> bool:
-    """Return whether a step fails wherever the robot begins: no earlier grasp affects its goal."""
+def _is_blocked(scene: Scene, result: TaskResult) -> bool:
+    """Return whether the goal of a step is blocked however the steps before are done.
+
+    These begin in `scene`. They decide on grasps that the step keeps, and on where they place free
+    objects, which may be turned.
+    """
     kept = {hold for phase in result.task.phases for hold in phase.held} & {*result.scene.holds}
-    return result.is_goal_blocked and not kept
+    moved = any(
+        placed.object.free and not placed.placement.isApprox(scene.objects[name].placement)
+        for name, placed in result.scene.objects.items()
+    )
+    return result.is_goal_blocked and not kept and not moved
 
 
 def _list_steps(task: Task, parts: Sequence[PlannedStep]) -> tuple[Step, ...]:
@@ -209,9 +217,11 @@ def plan_each_step(scene: Scene, task: Task, request: PlanningRequest) -> list[P
         result = solve_with_alternatives(current, own, request)
         part = PlannedStep(number, number, result)
         can_join = request.is_draft and parts and len(task.steps) > 2
-        if can_join and not result.is_solved and not _is_blocked(result):
-            part = _join_steps(task, parts.pop(), part, request)
-            result = part.result
+        if can_join and not result.is_solved and not _is_blocked(scene, result):
+            joint = _join_steps(task, parts[-1], part, request)
+            if joint is not None:
+                parts.pop()
+                part, result = joint, joint.result
         parts.append(part)
         if not result.is_solved or current_ending():
             break
@@ -223,12 +233,13 @@ def plan_each_step(scene: Scene, task: Task, request: PlanningRequest) -> list[P
 
 def _join_steps(
     task: Task, before: PlannedStep, failed: PlannedStep, request: PlanningRequest
-) -> PlannedStep:
-    """Plan a step that failed with the one before as one problem, if their holds permit it."""
+) -> PlannedStep | None:
+    """Plan a step that failed with the one before as one problem; None: their holds prevent it."""
     scene, results = before.result.scene, [before.result, failed.result]
     steps = task.steps[before.first : failed.last + 1]
     joint = compile_task(scene, steps, request.options, nothing=True)
-    if find_shared_coordinate(scene, joint.holds) is None and not current_ending():
-        results.append(solve_task(scene, joint, request))
+    if find_shared_coordinate(scene, joint.holds) is not None or current_ending():
+        return None
+    results.append(solve_task(scene, joint, request))
     plan = add_statistics(results[-1].plan, [result.plan.statistics for result in results])
     return PlannedStep(before.first, failed.last, dataclasses.replace(results[-1], plan=plan))

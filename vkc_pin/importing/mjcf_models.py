@@ -80,6 +80,8 @@ def _parse(path: Path) -> tuple[Any, list[str]]:
 
     try:
         return mujoco.MjSpec.from_file(str(path)), []
+    except TypeError as error:
+        raise InputError("MuJoCo needs a file name in UTF-8", file=path) from error
     except ValueError as error:
         try:
             spec = mujoco.MjSpec.from_string(_convert_from_mujoco_2(path))

@@ -95,11 +95,12 @@ def test_limits_shapes_couplings_and_states_are_converted(file: Path, tmp_path: 
 
 
 def test_errors_name_the_invalid_file(tmp_path: Path) -> None:
-    for content, message in (
-        ("<joint axis='0 0 0'/>", "MuJoCo cannot"),
-        ("<geom size='1'/>", "the file has no joints"),
+    for name, content, message in (
+        ("wrong.xml", "<joint axis='0 0 0'/>", "MuJoCo cannot"),
+        ("wrong.xml", "<geom size='1'/>", "the file has no joints"),
+        ("\udcff.xml", "<geom size='1'/>", "MuJoCo needs a file name in UTF-8"),
     ):
-        path = tmp_path / "wrong.xml"
+        path = tmp_path / name
         path.write_text(f"<mujoco><worldbody><body>{content}</body></worldbody></mujoco>")
         with pytest.raises(vkc.InputError, match=message) as caught:
             convert_mjcf(path, tmp_path)

@@ -18,6 +18,15 @@ from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 HINGE = 1.2
+VIOLATION = Violation(
+    "penetration",
+    "forearm_link – sofa",
+    waypoint=9,
+    time=4.0,
+    amount=0.03,
+    unit="m",
+    detail="overlap by 30 mm",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,20 +69,11 @@ def make_fake_plan(scene: Scene | None = None) -> Plan:
         PhaseSpan("reach door.handle", 0, 6),
         PhaseSpan("move door.hinge", 6, len(times) - 1, (Hold("door", "handle"),)),
     )
-    collision = Violation(
-        "penetration",
-        "forearm_link – sofa",
-        waypoint=9,
-        time=4.0,
-        amount=0.03,
-        unit="m",
-        detail="overlap by 30 mm",
-    )
     return Plan(
         scene=scene,
         steps=(Actuate("door", {"hinge": HINGE}),),
         options=Options(),
         trajectory=Trajectory(names, times, positions, phases, len(robot)),
-        report=Report((collision,), -0.03, states=100, notes=("go to: found no path",)),
+        report=Report((VIOLATION,), -0.03, states=100, notes=("go to: found no path",)),
         status="rejected",
     )

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.fake_plan import VIOLATION
 
 import vkc_pin as vkc
 from vkc_pin.planning.plan import STAGES, PlanningStatistics
-from vkc_pin.validation.report import Report, Violation
+from vkc_pin.validation.report import Report
 from vkc_pin.world.trajectory.formats.archives import FORMAT
 
 
@@ -219,16 +220,7 @@ def test_report_of_a_success(door_plan: vkc.Plan) -> None:
 def test_success_requires_status_and_validation(door_plan: vkc.Plan) -> None:
     assert door_plan.success
     assert not dataclasses.replace(door_plan, status="not converged").success
-    violation = Violation(
-        "penetration",
-        "forearm_link – sofa",
-        waypoint=9,
-        time=4.0,
-        amount=0.03,
-        unit="m",
-        detail="overlap by 30 mm",
-    )
-    failed = dataclasses.replace(door_plan, status="rejected", report=Report((violation,)))
+    failed = dataclasses.replace(door_plan, status="rejected", report=Report((VIOLATION,)))
     assert not dataclasses.replace(failed, status="success").success
     report = failed.summary()
     assert report.startswith("door: FAILED, rejected — reach")

@@ -9,20 +9,11 @@ from typing import Any
 
 import casadi
 import pytest
+from helpers.fake_plan import VIOLATION
 
 import vkc_pin as vkc
-from vkc_pin.validation.report import Report, Violation
+from vkc_pin.validation.report import Report
 from vkc_pin.world.task.terms import trace_terms
-
-VIOLATION = Violation(
-    "penetration",
-    "forearm_link – sofa",
-    waypoint=9,
-    time=4.0,
-    amount=0.03,
-    unit="m",
-    detail="overlap by 30 mm",
-)
 
 
 def invalidate_motion(plan: vkc.Plan, size: float = 1.5) -> vkc.Plan:

@@ -242,8 +242,6 @@ class _Search:
             if any(goal.is_deep for goal in goals):
                 break
         record_evaluations()
-        if self.request.is_draft and not goals:  # deep guesses were not tried
-            goals = [goal for goal in self._find_blocked_goals(problem) if goal.is_deep]
         return self._explain_failure(problem, goals, is_search=is_search)
 
     def _build_problem(self, task: Task) -> TrajectoryProblem:
@@ -297,6 +295,8 @@ class _Search:
         if is_search and self._find_proofs(problem):
             best = self._make_stationary(problem)
             return best.with_notes(self._find_proofs(problem)), "infeasible"
+        if self.request.is_draft and not goals:  # deep guesses were not tried
+            goals = [goal for goal in self._find_blocked_goals(problem) if goal.is_deep]
         lines = [self._describe_goal(problem, goal) for goal in goals]
         self.is_goal_blocked = bool(lines)
         nearest = self.find_nearest()

@@ -18,7 +18,7 @@ h5py = pytest.importorskip("h5py")
 
 
 def replace_member(member: str, value: Any) -> Change:
-    """Return a function that replaces a member of an episode by a value or what it creates."""
+    """Return a function that replaces a member of an episode; `value` may be a function, too."""
 
     def change(demo: Any) -> None:
         group, name = demo[member].parent, member.rpartition("/")[2]

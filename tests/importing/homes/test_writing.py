@@ -24,7 +24,7 @@ SETTINGS = {"stem": "can", "most": 2, "dist_safe": 0.02, "grasp_clearance": 0.00
 
 
 def write_can(folder: Path, radius: float) -> tuple[ImportedHomeObject, ArticulatedObject]:
-    """Write a free cylinder, and return it with what is read back."""
+    """Write a free cylinder; return it, and the object read from the file."""
     part = make_part("cylinder", (radius, 0.12), (0.0, 0.0, 0.06))
     description = make_description([Link("can", (part,), (part,))])
     can = HomeObject("can", description, (1.0, 2.0, 0.7), free=True)

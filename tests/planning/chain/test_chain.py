@@ -311,8 +311,8 @@ def test_every_hold_has_its_own_shapes_joints_and_names() -> None:
     )
     assert [len(chain.virtual[hold]) for hold in holds] == [2, 3, 0, 3]
     assert chain.prefixes == {STICK: "stick.", BALL: "ball.", END: "stick'.", PULLED: "ball'."}
-    for things in (chain.collision.geometryObjects, chain.model.frames):
-        names = [thing.name for thing in things]
+    for named in (chain.collision.geometryObjects, chain.model.frames):
+        names = [one.name for one in named]
         assert len(set(names)) == len(names)
     indices = [index for hold in holds for index in chain.held_geometries[hold]]
     count = len(robot.collision.geometryObjects)

@@ -143,7 +143,7 @@ def compute_margins(p: TrajectoryProblem, phase: int) -> dict[tuple[str, str], n
                 | put_on("other", None, HALF)
                 | {("stick.tip_1", "wall"): (REDUCED_MARGIN_RATIO * 0.01, None)},
             ],
-            id="only what is close",
+            id="only close shapes",
         ),
         pytest.param(
             make_room,

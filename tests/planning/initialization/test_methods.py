@@ -105,10 +105,10 @@ def test_guess_opens_the_door_after_a_straight_approach() -> None:
     assert np.all(knob[turn - 1 :] >= 0.5)
     path, before = p.waypoints(z), int(reach) - FEW.steps(FEW.approach_time)
     np.testing.assert_array_equal(path[0], p.start)
-    way = path[before] - path[0]
-    fraction = np.linalg.norm(path[: before + 1] - path[0], axis=1) / np.linalg.norm(way)
+    shift = path[before] - path[0]
+    fraction = np.linalg.norm(path[: before + 1] - path[0], axis=1) / np.linalg.norm(shift)
     assert np.all(np.diff(fraction) > 0.0)
-    np.testing.assert_allclose(path[: before + 1], path[0] + np.outer(fraction, way), atol=1e-9)
+    np.testing.assert_allclose(path[: before + 1], path[0] + np.outer(fraction, shift), atol=1e-9)
     first, last = (compute_tool_pose(load_door_scene(), path[k]) for k in (before, reach))
     approach = first.inverse() * last
     np.testing.assert_allclose(approach.translation, [0.0, 0.0, FEW.approach], atol=1e-3)

@@ -106,8 +106,8 @@ class BeamSearch:
             thorough: Draw more samples, and perturb the arms at every keyframe of a closed chain.
             backwards: Search closed chains from the release back to the grasp. A passage may be
                 wide at its end only, and few configurations that are free at its beginning lead
-                there. Or a path onward begins at few configurations only: who pulls a door open
-                may end behind it.
+                there. Or a path onward begins at few configurations only: a robot that pulls a door
+                open may end behind it.
             keep_headings: Keep paths with diverse base headings. A steered base needs space to
                 turn, and the cheapest path may head where there is none.
         """

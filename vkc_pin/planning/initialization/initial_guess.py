@@ -21,7 +21,7 @@ __all__ = [
     "perturb",
 ]
 
-_DEEP = 0.1  # [m] penetration of a guess from which the solver seldom succeeds
+_DEEP = 0.1  # [m] penetration of a guess beyond which the solver seldom succeeds: 2 of 79
 # [m], [rad] initial trust region: a nearly feasible guess is improved in smaller steps
 _WARM_RADIUS = 0.2
 

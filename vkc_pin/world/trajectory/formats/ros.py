@@ -160,11 +160,10 @@ def from_ros(
         rate = point.get("velocities", ())
         if isinstance(rate, list) and rate and not point.get("accelerations"):
             rates.append(_check_row(rate, len(names), file, f"{where}velocities"))
+    size = None if robot_size is None else check_integer(robot_size, "robot_size", low=3)
     if like is not None:
         size = like["robot_size"]
-    elif robot_size is not None:
-        size = check_integer(robot_size, "robot_size", low=3)
-    else:
+    elif size is None:
         size = infer_robot_size(names, file=file, field="joint_names")
     has_curve = bool(rates) and len(rates) == len(rows)
     waypoints = list(range(len(rows)))

@@ -39,7 +39,7 @@ _MAX_BYTES = 20_000_000  # of a file: about 30 000 waypoints of 25 coordinates
 _MAX_LINES, _MAX_COLUMNS = 200_000, 1000
 _TIME, _PHASES = "time", ("phase", "phase_name", "held")  # first and last columns of a table
 _RATE, _WAYPOINT = " velocity", "waypoint"  # additional columns of a curve
-_BASE = ("base_x", "base_y", "base_yaw")
+_BASE = ("base_x", "base_y", "base_yaw")  # of any robot
 _OPENING = "opening"  # additional last column if a phase states a gripper opening
 
 
@@ -166,15 +166,15 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
             _add_phase(phases, cells[last : last + 3], stated, len(rows) - 1, path, number)
     if not has_phases and len(rows) > 1:
         phases = [make_single_phase(len(rows))]
-    if robot_size is not None:
+    if robot_size is None:
+        robot_size = infer_robot_size(names, file=path, line=1)
+    else:
         robot_size = check_integer(robot_size, "robot_size", low=3)
     motion = {
         "names": names,
         "times": [row[0] for row in rows],
         "positions": [row[own] for row in rows],
-        "robot_size": infer_robot_size(names, file=path, line=1)
-        if robot_size is None
-        else robot_size,
+        "robot_size": robot_size,
         "phases": phases,
     }
     if is_curve:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.carrying import describe_box
+from helpers.carrying import describe_box, describe_table, lift, make_room
 from helpers.drawers import SHORT
 from helpers.drives import make_hall
 from helpers.gates import make_gate_problem
@@ -22,6 +22,35 @@ from vkc_pin.planning.solve_task import TaskResult, solve_task
 from vkc_pin.world.task.compiler import compile_task
 
 OPEN = [vkc.Actuate("door", {"hinge": 1.2})]
+
+
+def test_draft_is_not_solved_from_a_deep_guess() -> None:
+    """The robot is behind a door, through which the only guess leads."""
+    scene = vkc.load_scene("door").with_state("door", {"hinge": -1.5})
+    scene, request = scene.with_start(base=(1.7, 1.2, -1.4)), PlanningRequest("auto", SHORT)
+    task = compile_task(scene, [vkc.GoTo(4.1, -0.3)], SHORT)
+    results = [
+        solve_task(scene, task, dataclasses.replace(request, is_draft=is_draft))
+        for is_draft in (False, True)
+    ]
+    assert [result.plan.metrics["rounds"] > 0 for result in results] == [True, False]
+    assert not any(result.is_solved for result in results)
+
+
+def test_blocked_goal_may_be_due_to_a_kept_grasp_or_a_placed_object() -> None:
+    scene = make_room(describe_table())
+
+    def is_blocked(begin: vkc.Scene, **changes: Any) -> bool:
+        task = compile_task(begin, [vkc.GoTo(0.0, 0.3)], SHORT)
+        result = solve_task(begin, task, PlanningRequest("auto", SHORT))
+        return dataclasses.replace(result, **changes).is_blocked_after(scene)
+
+    assert is_blocked(scene, is_goal_blocked=True)
+    assert not is_blocked(scene)
+    held = dataclasses.replace(scene, holds=scene.with_held({"stick": "grip"}).holds)
+    aside = lift(scene.objects["stick"].placement, [0.0, 0.1, 0.0])
+    for begin in (held, scene.with_placement("stick", aside)):
+        assert not is_blocked(begin, is_goal_blocked=True)
 
 
 @pytest.mark.parametrize(("number", "seed"), [(35, 9035)])

@@ -118,21 +118,7 @@ def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> tupl
     plans = [complete_draft(plan) for plan in plans]
     statistics = [plan.statistics for plan in plans]
     plan = concatenate_plans(scene, steps, request, plans, statistics=statistics + common)
-    return plan, bool(parts) and _is_blocked(scene, parts[-1].result)
-
-
-def _is_blocked(scene: Scene, result: TaskResult) -> bool:
-    """Return whether the goal of a step is blocked however the steps before are done.
-
-    These begin in `scene`. They decide on grasps that the step keeps, and on where they place free
-    objects, which may be turned.
-    """
-    kept = {hold for phase in result.task.phases for hold in phase.held} & {*result.scene.holds}
-    moved = any(
-        placed.object.free and not placed.placement.isApprox(scene.objects[name].placement)
-        for name, placed in result.scene.objects.items()
-    )
-    return result.is_goal_blocked and not kept and not moved
+    return plan, bool(parts) and parts[-1].result.is_blocked_after(scene)
 
 
 def _list_steps(task: Task, parts: Sequence[PlannedStep]) -> tuple[Step, ...]:
@@ -217,7 +203,7 @@ def plan_each_step(scene: Scene, task: Task, request: PlanningRequest) -> list[P
         result = solve_with_alternatives(current, own, request)
         part = PlannedStep(number, number, result)
         can_join = request.is_draft and parts and len(task.steps) > 2
-        if can_join and not result.is_solved and not _is_blocked(scene, result):
+        if can_join and not result.is_solved and not result.is_blocked_after(scene):
             joint = _join_steps(task, parts[-1], part, request)
             if joint is not None:
                 parts.pop()

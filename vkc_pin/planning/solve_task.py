@@ -89,6 +89,18 @@ class TaskResult:
         """Whether the plan is a success, or a draft of a converged solution."""
         return self.plan.success or not self.plan.is_validated
 
+    def is_blocked_after(self, start: Scene) -> bool:
+        """Return whether a goal is blocked however the steps from `start` to the task are done.
+
+        They decide on grasps that the task keeps, and on where free objects are placed.
+        """
+        kept = {hold for phase in self.task.phases for hold in phase.held} & {*self.scene.holds}
+        moved = any(
+            placed.object.free and not placed.placement.isApprox(start.objects[name].placement)
+            for name, placed in self.scene.objects.items()
+        )
+        return self.is_goal_blocked and not kept and not moved
+
     def phase_waypoints(self) -> PhaseWaypoints:
         """Return the best waypoints, as an initial guess of problems with more phases."""
         assert self.problem is not None

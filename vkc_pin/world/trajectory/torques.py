@@ -48,13 +48,17 @@ class Handle:
         item = self.placed.object
         self.attachment = get_attachment(scene.objects, hold)
         self.point = compute_hand_frame(scene.robot, self.attachment)
-        own, loaded = pin.Model(item.model), pin.Model(item.model)
-        for joint, inertia in loads:
-            loaded.inertias[joint] += inertia
-        own.gravity.linear = loaded.gravity.linear = (
-            self.placed.placement.rotation.T @ item.model.gravity.linear
-        )
-        self._own, self._loaded = own, loaded
+        own = pin.Model(item.model)
+        own.gravity.linear = np.zeros(3)  # springs carry the object itself, not its loads
+        self._models = [own]
+        if loads:
+            loaded = pin.Model(item.model)
+            loaded.gravity.linear = self.placed.placement.rotation.T @ item.model.gravity.linear
+            for joint in range(loaded.njoints):
+                loaded.inertias[joint] = pin.Inertia.Zero()
+            for joint, inertia in loads:
+                loaded.inertias[joint] += inertia
+            self._models.append(loaded)
         self._frame = item.link_frame(self.attachment.link)
         path = list(own.supports[own.frames[self._frame].parentJoint])
         self._moved = [k for k, joint in enumerate(item.coordinates.joints) if joint in path]
@@ -68,16 +72,9 @@ class Handle:
         values = np.column_stack(
             [np.zeros((len(z), 0)), *(motion.positions[name] for name in columns)]
         )
-        data, links = self._own.createData(), list[pin.SE3]()
-        jacobians = np.empty((len(z), 6, self._own.nv))
-        for k, q in enumerate(item.coordinates.q(z)):
-            pin.computeJointJacobians(self._own, data, q)
-            links.append(pin.updateFramePlacement(self._own, data, self._frame).copy())
-            jacobians[k] = pin.getFrameJacobian(
-                self._own, data, self._frame, pin.LOCAL_WORLD_ALIGNED
-            ).reshape(6, -1)
-        turns = np.array([link.rotation for link in links])
-        origins = np.array([link.translation for link in links])
+        jacobians, turns, origins = _compute_jacobians(
+            self._models[0], self._frame, item.coordinates.q(z)
+        )
         points, free = self._grasp(turns, origins, values)
         directions = np.swapaxes(jacobians[:, :, self._moved], 1, 2)
         directions[..., :3] += np.cross(directions[..., 3:], (points - origins)[:, None])
@@ -121,10 +118,11 @@ class Handle:
             self._rows(part, np.zeros(len(self.placed.state)))
             for part in (motion.velocities, motion.accelerations)
         )
-        data, found = self._own.createData(), np.empty(z.shape)
-        for k, q in enumerate(item.coordinates.q(z)):
-            carried = pin.computeGeneralizedGravity(self._own, data, q)
-            found[k] = pin.rnea(self._loaded, data, q, v[k], a[k]) - carried
+        found, configurations = np.zeros(z.shape), item.coordinates.q(z)
+        for model in self._models:
+            data = model.createData()
+            for k, q in enumerate(configurations):
+                found[k] += pin.rnea(model, data, q, v[k], a[k])
         held = {latch.joint: latch.held_at for latch in item.latches}
         for k, name in enumerate(item.coordinates.names):
             resistance, rests = item.resistance.get(name), np.abs(v[:, k]) <= _STILL
@@ -283,13 +281,7 @@ class Torques:
         )
         motion, frame = Motion(*parts), load.model.getFrameId(robot.tool_frame)
         for handle in load.handles:
-            jacobians = np.empty((len(positions), 6, load.model.nv))
-            turns = np.empty((len(positions), 3, 3))
-            for k, q in enumerate(configurations):
-                jacobians[k] = pin.computeFrameJacobian(
-                    load.model, data, q, frame, pin.LOCAL_WORLD_ALIGNED
-                )
-                turns[k] = data.oMf[frame].rotation
+            jacobians, turns, _ = _compute_jacobians(load.model, frame, configurations)
             wrenches = handle.wrenches(motion)
             wrenches[:, 3:] += np.cross(turns @ handle.point.translation, wrenches[:, :3])
             found += np.einsum("kij,ki->kj", jacobians, wrenches)
@@ -342,6 +334,24 @@ class Torques:
                 pin.forwardKinematics(item.model, inside, item.coordinates.q(state))
                 joint = item.model.frames[item.link_frame(link)].parentJoint
                 loads[owner].append((joint, inside.oMi[joint].actInv(own)))
+
+
+def _compute_jacobians(
+    model: pin.Model, frame: int, configurations: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Compute Jacobians of a frame at its origin, in the model's root axes, shape (K, 6, nv).
+
+    Also returns the frame's rotations, shape (K, 3, 3), and origins, shape (K, 3) [m].
+    """
+    data, count = model.createData(), len(configurations)
+    placement = data.oMf[frame]  # both are views, which every evaluation updates
+    turn, origin = placement.rotation, placement.translation
+    jacobians = np.empty((count, 6, model.nv))
+    turns, origins = np.empty((count, 3, 3)), np.empty((count, 3))
+    for k, q in enumerate(configurations):
+        found = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
+        jacobians[k], turns[k], origins[k] = found.reshape(6, -1), turn, origin
+    return jacobians, turns, origins
 
 
 def _compute_inertia(item: ArticulatedObject, state: Floats) -> pin.Inertia:

@@ -236,6 +236,22 @@ def test_start_closer_than_dist_safe_is_accepted() -> None:
     assert plan.report.clearance == pytest.approx(scene.start_clearance(), abs=1e-6)
 
 
+@pytest.mark.parametrize("goal", [0.0, -0.8])
+def test_door_is_closed_onto_its_latch_or_swung_past_it(goal: float) -> None:
+    scene = vkc.load_scene("door").with_state("door", {"hinge": 0.6})
+    plan = vkc.plan(scene, [vkc.Actuate("door", {"hinge": goal})])
+    check_success(plan)
+    hinge, knob = (get_column(plan, f"door.{name}") for name in ("hinge", "knob"))
+    assert hinge[-1] == goal
+    within = np.abs(hinge) <= 0.05  # where the latch acts
+    if goal == 0.0:
+        assert np.flatnonzero(within).tolist() == [len(hinge) - 1]
+        assert knob.max() < 0.5
+    else:
+        assert within.any()
+        assert knob[within].min() > 0.5
+
+
 def compute_rolling(plan: vkc.Plan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the distance ahead and aside and the turn of every step, along the mean heading."""
     dx, dy, turn = np.diff(plan.trajectory.positions[:, :3], axis=0).T

@@ -294,6 +294,21 @@ def test_next_phase_begins_where_the_closed_path_ends() -> None:
     assert np.abs(np.diff(z, axis=0))[:, 3:9].max() < 1.0
 
 
+def test_closed_path_stays_within_the_limits_of_the_object() -> None:
+    """Nodes between two waypoints may exceed those of both."""
+    p = make_blocked_door()
+    inside, hinge = slice(int(p.ends[MOVE - 1]), int(p.ends[MOVE]) - 1), p.chain.index("door.hinge")
+    upper = p.upper.copy()
+    upper[inside, hinge] = 1.0
+    sampler = make_sampler(p.with_bounds(p.lower, upper))
+    approach = ApproachPaths(sampler, keeps_base_fixed=True)
+    paths = RrtPaths(sampler, BaseRoutes(sampler.problem))
+    z = Interpolator(sampler, approach, paths).interpolate(*make_free_door()[1:3])
+    assert z is not None
+    assert z[inside, hinge].max() == 1.0
+    assert_holds_the_handle(p, z[inside])
+
+
 def test_free_phases_and_colliding_starts_need_no_trees() -> None:
     p, (through, straight) = make_free_door()[0], get_move_phase()
     assert compute_penetration(p, straight) <= 0.0

@@ -19,7 +19,7 @@ from helpers.small_problems import (
 
 from vkc_pin import Actuate, GoTo, Grasp, Hold, Options, Reach, Scene
 from vkc_pin.world.task.actuation import find_shared_coordinate
-from vkc_pin.world.task.compiler import LATCH_MARGIN, compile_task
+from vkc_pin.world.task.compiler import LATCH_GAP, LATCH_MARGIN, compile_task
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Step
 
@@ -77,12 +77,33 @@ def test_latch_is_turned_only_if_it_is_engaged() -> None:
     for state, names in (
         ({"hinge": 0.3}, ["reach door.handle", "move door.hinge"]),
         ({"hinge": 0.03}, OPENING),
+        ({"hinge": -0.3}, OPENING),  # it would pass the latched position
         ({"knob": 0.6}, [OPENING[0], OPENING[2]]),
     ):
         task = compile_steps([OPEN], load_door_scene().with_state("door", state))
         assert get_names(task) == names
     assert task.phases[1].ranges["door.knob"] == (TURNED, KNOB[1])
     assert task.phases[1].initial_values == {"door.hinge": 0.0, "door.knob": 0.6}
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "allowed"),
+    [
+        (1.2, 0.0, (0.05 + LATCH_GAP, 1.57)),
+        (-1.2, 0.0, (-1.57, -0.05 - LATCH_GAP)),
+        (1.2, 0.03, (0.05 + LATCH_GAP, 1.57)),  # within the range of the latch
+        (0.0505, 0.0, (0.0505, 1.57)),
+        (1.2, 0.06, HINGE),
+    ],
+)
+def test_closing_joint_enters_the_range_of_its_latch_at_the_end(
+    begin: float, end: float, allowed: tuple[float, float]
+) -> None:
+    """There it could not move back."""
+    scene = load_door_scene().with_state("door", {"hinge": begin})
+    move = compile_steps([Actuate("door", {"hinge": end})], scene).phases[-1]
+    assert (move.name, move.values) == ("move door.hinge", {"door.hinge": end})
+    assert move.ranges["door.hinge"] == pytest.approx(allowed)
 
 
 def test_hinge_and_knob_are_actuated_together() -> None:

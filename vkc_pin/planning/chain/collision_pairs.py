@@ -39,6 +39,7 @@ from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.scene.support import SupportedObject
+from vkc_pin.world.task.lookup import find_joint_limits
 from vkc_pin.world.task.phases import Phase, Task
 
 __all__ = [
@@ -251,7 +252,11 @@ def _find_lift_and_place_moments(
     for ride in phase.supported:
         carrier = scene.objects[ride.hold.object]
         if not carrier.object.free:
-            goals = {c: float(np.clip(v, *phase.ranges[c])) for c, v in phase.values.items()}
+            goals = {
+                name: float(np.clip(value, *find_joint_limits(carrier, name)))
+                for name, value in phase.values.items()
+                if name.partition(".")[0] == carrier.name
+            }
             final_values = {**phase.initial_values, **goals}
             for state, begins in ((phase.initial_values, True), (final_values, False)):
                 placed = _with_joint_positions(carrier, state)

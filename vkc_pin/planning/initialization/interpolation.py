@@ -184,7 +184,7 @@ class Interpolator:
             elif not self._fill_open_phase(rows, keyframes, inside, number, previous):
                 return None
             begin, previous = end, phase
-        self._close_chain(z, objects)
+        self._close_chain(z, problem.clip(objects))
         return problem.clip(z)
 
     def _fill_straight(self, z: Floats, through: Floats, when: list[int]) -> None:

@@ -23,9 +23,9 @@ __all__ = [
     "check_actuation",
     "choose_attachment",
     "compute_advance",
+    "find_blocking_latches",
     "find_driven_coordinates",
     "find_driving_attachments",
-    "find_engaged_latches",
     "find_push_directions",
     "find_shared_coordinate",
 ]
@@ -121,10 +121,10 @@ def find_push_directions(
     return directions
 
 
-def find_engaged_latches(
+def find_blocking_latches(
     placed: PlacedObject, state: Mapping[str, float], values: Mapping[str, float]
 ) -> Iterator[Latch]:
-    """Yield the engaged latches of an object that block joints which are to move.
+    """Yield the latches of an object that block joints which are to move, now or on the way.
 
     Entries that the caller adds to `values` meanwhile count, since what releases a latch may itself
     be latched.
@@ -140,7 +140,9 @@ def find_engaged_latches(
         now = state.get(
             coordinate, float(placed.state[placed.object.coordinates.index(latch.joint)])
         )
-        if values.get(coordinate, now) != now and latch.is_engaged(now):
+        goal = values.get(coordinate, now)
+        passes = (now - latch.held_at) * (goal - latch.held_at) < 0.0
+        if goal != now and (latch.is_engaged(now) or passes):
             yield latch
 
 
@@ -163,7 +165,7 @@ def check_actuation(
         {f"{name}.{joint}": value for joint, value in joints} | dict(state),
         dict(values),
     )
-    for latch in find_engaged_latches(placed, state, wanted):
+    for latch in find_blocking_latches(placed, state, wanted):
         release = f"{name}.{latch.released_by}"
         if latch.released_by in path:
             wanted.setdefault(release, max(latch.threshold, state[release]))

@@ -16,8 +16,8 @@ from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actuation import (
     choose_attachment,
+    find_blocking_latches,
     find_driven_coordinates,
-    find_engaged_latches,
     find_push_directions,
     find_shared_coordinate,
 )
@@ -47,6 +47,7 @@ from vkc_pin.world.task.supported_objects import SupportTracker
 __all__ = ["compile_task", "make_nothing_to_do_error"]
 
 LATCH_MARGIN = 0.02  # [rad] or [m] past the threshold at which a latch is released
+LATCH_GAP = 1e-3  # [rad] or [m] outside the range of a latch, where a joint is still free
 
 
 class _Compiler:
@@ -276,7 +277,7 @@ class _Compiler:
         ranges = {coordinate: find_joint_limits(placed, coordinate) for coordinate in values}
         path = find_path_joints(placed, placed.object.attachments[hold.attachment])
         after: dict[str, float] = {}
-        for latch in find_engaged_latches(placed, self.state, values):
+        for latch in find_blocking_latches(placed, self.state, values):
             release = f"{step.object}.{latch.released_by}"
             if latch.released_by not in path:  # and it is past the threshold
                 continue
@@ -290,10 +291,35 @@ class _Compiler:
                 after[release] = values[release]
             ranges[release] = (turned, upper)
             values[release] = turned if release in after else values.get(release, turned)
+        ranges |= self._keep_latches_open(placed, values, ranges)
         self._append_motion("move", hold, where, values, ranges)
         if after:
             limits = {release: find_joint_limits(placed, release) for release in after}
             self._append_motion("turn", hold, where, after, limits)
+
+    def _keep_latches_open(
+        self,
+        placed: PlacedObject,
+        values: Mapping[str, float],
+        ranges: Mapping[str, tuple[float, float]],
+    ) -> dict[str, tuple[float, float]]:
+        """Return narrower ranges of joints that close, so that their latches engage at the end.
+
+        Once a joint is in the range of its latch, it can only move on to the latched position.
+        """
+        narrowed = {}
+        for latch in placed.object.latches:
+            name = f"{placed.name}.{latch.joint}"
+            begin = self.state.get(name, latch.held_at)
+            if latch.is_engaged(values.get(name, begin)) and not latch.is_engaged(begin):
+                away = min(abs(begin - latch.held_at), latch.engaged_within + LATCH_GAP)
+                lower, upper = ranges[name]
+                narrowed[name] = (
+                    (max(lower, latch.held_at + away), upper)
+                    if begin > latch.held_at
+                    else (lower, min(upper, latch.held_at - away))
+                )
+        return narrowed
 
     def touch(self, step: Touch, where: str) -> None:
         """Add the phase that brings a frame to its target; free held objects are carried along."""

@@ -71,8 +71,8 @@ class Phase:
         segments: Number of time steps; the phase has `segments + 1` waypoints, the first of which
             is the last of the previous phase.
         held: Holds during the phase, each after the one it depends on.
-        ranges: Object coordinate → (lower, upper) at all waypoints after the first; all other
-            coordinates are constant.
+        ranges: Object coordinate → (lower, upper) at all waypoints between the first and the last;
+            all other coordinates are constant.
         values: Object coordinate → value at the last waypoint.
         pushed: Object coordinate → 1 or -1, for coordinates that are pushed and can only increase
             or decrease.

@@ -92,6 +92,9 @@ def test_digest_depends_only_on_fields_that_determine_episodes(
         ("rooms: {clutter: [0.0, 1.5]}", "rooms", "clutter"),
         ("robots: []", "robots", "robots"),
         ("goal: {share: [0.5, 0.4]}", "goal.share", "share"),
+        ("goal: {edge: [-0.1, 0.2]}", "goal.edge[0]", "out of range"),
+        ("start: {distance: [-2, 5]}", "start.distance[0]", "out of range"),
+        ("robots: [missing/robot.yaml]", "robots[0]", "missing/robot.yaml"),
         *(
             (f"terms: [{{{entry}}}]", f"terms[0]{field}", message)
             for entry, field, message in (

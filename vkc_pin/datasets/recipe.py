@@ -91,6 +91,7 @@ _share = require(
 )
 Interval = Annotated[tuple[Number, Number], require_length(2), _increasing]
 Share = Annotated[Interval, _share]
+Distances = Annotated[tuple[NonNegative, NonNegative], require_length(2), _increasing]
 Whole = Annotated[int, Field(strict=True, ge=1, le=10**9)]
 Several = Annotated[int, Field(strict=True, ge=1, le=1000)]  # attempts of a process at a time
 Pixels = Annotated[int, Field(strict=True, ge=8, le=2048)]
@@ -308,7 +309,7 @@ class RoomsSchema(Schema):
 class StartSchema(Schema):
     """Ranges of the distance of the base from its goal and of arm joints from home [m, rad]."""
 
-    distance: Interval = (0.0, 10.0)
+    distance: Distances = (0.0, 10.0)
     arm: NonNegative = 0.0
 
 
@@ -316,7 +317,7 @@ class GoalSchema(Schema):
     """Ranges of the share of a joint's range, and of the distance from a table's edge [m]."""
 
     share: Share = (0.35, 0.65)
-    edge: Interval = (0.1, 0.3)
+    edge: Distances = (0.1, 0.3)
 
 
 class CameraSchema(Schema):
@@ -532,6 +533,13 @@ def _robots(
     found: dict[str, str] = {}
     robots = []
     for k, entry in enumerate(entries):
+        if is_path(entry.name) and not (folder / entry.name).exists():
+            raise document.make_error(
+                ("robots", k),
+                "there is no such file",
+                expected="a URDF file, a robot.yaml, or a robot's name",
+                got=(folder / entry.name).resolve(),
+            )
         with document.annotate_errors(("robots", k)):
             path = find_robot(
                 str((folder / entry.name).resolve()) if is_path(entry.name) else entry.name

@@ -67,10 +67,32 @@ def test_finished_dataset_is_left_unchanged(dataset: Dataset) -> None:
     assert sorted(file for file in dataset.folder.rglob("*") if file.is_file()) == sorted(files)
     assert [file.read_bytes() for file in files] == before
     with pytest.raises(InputError, match="more episodes"):
-        generate(SMALL, EPISODES - 1, dataset.folder)
+        generate({**SMALL, "name": "other"}, EPISODES - 1, dataset.folder)
+    assert [file.read_bytes() for file in files] == before
 
 
-@pytest.mark.parametrize("removed", ["shards/*/*", pytest.param("work/*", marks=pytest.mark.long)])
+def test_leftovers_of_killed_runs_are_removed(dataset: Dataset, copy: Path) -> None:
+    leftovers = [copy / name / f".vkc-pin-{'0' * 16}" for name in (".", "work", "lerobot")]
+    for leftover in leftovers[:2]:
+        leftover.write_text("{")
+    (leftovers[2] / "husky_ur5e").mkdir(parents=True)
+    (leftovers[2] / "husky_ur5e/info.json").write_text("{")
+    generate(SMALL, EPISODES, copy, lerobot=True)
+    assert not any(leftover.exists() for leftover in leftovers)
+    assert read_contents(copy) == read_contents(dataset.folder)
+
+
+def test_lerobot_layout_is_extended_with_its_dataset(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    for episodes, lerobot in ((1, True), (2, False)):
+        generate(SMALL, episodes, tmp_path / "out", lerobot=lerobot)
+    info = json.loads((tmp_path / "out/lerobot/husky_ur5e/meta/info.json").read_text())
+    assert info["total_episodes"] == 2
+
+
+@pytest.mark.parametrize(
+    "removed", ["shards/*/*", "scenes/*", pytest.param("work/*", marks=pytest.mark.long)]
+)
 def test_dataset_is_extended_and_removed_files_are_recreated(
     dataset: Dataset, tmp_path: Path, removed: str
 ) -> None:
@@ -90,10 +112,15 @@ def test_damaged_files_are_recreated(dataset: Dataset, copy: Path, shard: Path) 
     for file, data in zip(work_files, (b"", b"x", work_files[2].read_bytes()[:2000]), strict=False):
         file.write_bytes(data)
     shard.write_bytes(shard.read_bytes()[:-100])
+    next((copy / "scenes").iterdir()).write_text("{")
     with pytest.warns(UserWarning, match="damaged one .*; its episodes are made again"):
         generate(SMALL, EPISODES, copy, lerobot=True)
     assert read_contents(copy) == read_contents(dataset.folder)
     change_demo(shard, lambda demo: demo.pop("motion"), 2)  # then read from the work files
+    generate(SMALL, EPISODES, copy, lerobot=True)
+    assert read_contents(copy) == read_contents(dataset.folder)
+    for file in [*copy.glob("work/*"), next(copy.glob("scenes/*"))]:
+        file.unlink()
     generate(SMALL, EPISODES, copy, lerobot=True)
     assert read_contents(copy) == read_contents(dataset.folder)
 

@@ -15,7 +15,7 @@ from pydantic import BaseModel, Field, model_validator
 
 from vkc_pin.datasets.diversity import DuplicateFinder
 from vkc_pin.datasets.episode import Episode, get_work_file
-from vkc_pin.datasets.formats.hdf5 import read_episodes, read_numbers, write_shard
+from vkc_pin.datasets.formats.hdf5 import read_episodes, read_numbers, read_scene, write_shard
 from vkc_pin.datasets.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.world.files.documents import Document, parse_document, read_text
@@ -28,6 +28,7 @@ __all__ = [
     "Dataset",
     "Register",
     "check_attempt",
+    "has_intact_scene",
     "read_intact_numbers",
     "read_table",
     "write_table",
@@ -95,7 +96,8 @@ def check_attempt(key: str, records: list[dict[str, Any]]) -> None:
     if len(records) != 1:
         raise InputError("wrong number", field="records", expected="one", got=len(records))
     if records[0].get("success"):
-        check_name(records[0].get("robot"), "robot")
+        for name in ("robot", "scene"):
+            check_name(records[0].get(name), name)
     record = parse_document(Document(records[0]), _AttemptSchema)
     if str(record.number) != key:
         expected = f"{key}, as the line's key"
@@ -114,6 +116,21 @@ def read_intact_numbers(file: Path) -> list[int]:
     except InputError as error:
         warnings.warn(f"{error}; its episodes are made again", stacklevel=2)
         return []
+
+
+def has_intact_scene(scenes: Path, name: str) -> bool:
+    """Return whether a folder of scenes has the file of a scene, and it is not damaged.
+
+    A damaged file counts as removed: the episodes in the scene are made again. A warning names it.
+    """
+    if not (scenes / f"{name}.json").exists():
+        return False
+    try:
+        read_scene(scenes, name)
+    except InputError as error:
+        warnings.warn(f"{error}; its episodes are made again", stacklevel=2)
+        return False
+    return True
 
 
 @dataclass(frozen=True)
@@ -184,7 +201,7 @@ class Register:
         self.dataset, self.wanted = dataset, wanted
         self.accepted: list[Mapping[str, Any]] = []
         self.failures: list[Mapping[str, Any]] = []
-        self._shards: dict[Path, list[int]] = {}  # folder of a robot's shards → its episodes
+        self._shards: dict[Path, list[Mapping[str, Any]]] = {}  # folder → rows of its episodes
         self._pending: dict[int, Mapping[str, Any]] = {}
         self._next, self._duplicates = 0, DuplicateFinder()
 
@@ -217,32 +234,42 @@ class Register:
         name = check_name(record.get("robot"), "robot", file=self.dataset.folder / "journal.jsonl")
         folder = self.dataset.folder / "shards" / name
         self.accepted.append(_row(record))
-        numbers = self._shards.setdefault(folder, [])
-        numbers.append(int(record["number"]))
-        if len(numbers) % EPISODES_A_SHARD == 0:
-            self._write(folder, len(numbers) // EPISODES_A_SHARD - 1)
+        rows = self._shards.setdefault(folder, [])
+        rows.append(self.accepted[-1])
+        if len(rows) % EPISODES_A_SHARD == 0:
+            self._write(folder, len(rows) // EPISODES_A_SHARD - 1)
 
     def finish(self) -> None:
         """Write incomplete shards and the tables."""
-        for folder, numbers in self._shards.items():
-            if len(numbers) % EPISODES_A_SHARD:
-                self._write(folder, len(numbers) // EPISODES_A_SHARD)
+        for folder, rows in self._shards.items():
+            if len(rows) % EPISODES_A_SHARD:
+                self._write(folder, len(rows) // EPISODES_A_SHARD)
         write_table(self.dataset.folder / "episodes.csv", self.accepted)
         write_table(self.dataset.folder / "failures.csv", self.failures)
 
     def _write(self, folder: Path, k: int) -> None:
-        """Write shard `k` of a folder, unless it exists; delete the work files of a full one."""
-        numbers = self._shards[folder][k * EPISODES_A_SHARD : (k + 1) * EPISODES_A_SHARD]
+        """Write shard `k` of a folder and its scenes, unless they exist.
+
+        The work files of a full shard are deleted.
+        """
+        rows = self._shards[folder][k * EPISODES_A_SHARD : (k + 1) * EPISODES_A_SHARD]
+        numbers = [int(row["number"]) for row in rows]
+        scenes = self.dataset.folder / "scenes"
+        lost = {
+            name for name in {row["scene"] for row in rows} if not has_intact_scene(scenes, name)
+        }
         path = folder / f"shard-{k:05d}.hdf5"
         files = [get_work_file(self.dataset.folder, number) for number in numbers]
         existing = read_intact_numbers(path)
-        if existing != numbers:
+        if existing != numbers or lost:
             # Episodes whose work file was removed may be in the shard that is replaced.
             parts = [
-                (path, existing.index(number)) if number in existing else (file, 0)
-                for file, number in zip(files, numbers, strict=True)
+                (path, existing.index(number))
+                if number in existing and row["scene"] not in lost
+                else (file, 0)  # it also has the scene
+                for file, number, row in zip(files, numbers, rows, strict=True)
             ]
-            write_shard(path, parts, self.dataset.folder / "scenes")
+            write_shard(path, parts, scenes)
         if len(numbers) == EPISODES_A_SHARD:
             for file in files:
                 file.unlink(missing_ok=True)

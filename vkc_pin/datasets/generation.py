@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import sys
 import time
@@ -14,7 +15,13 @@ from typing import Any
 import yaml
 from tqdm import tqdm
 
-from vkc_pin.datasets.dataset import Dataset, Register, check_attempt, read_intact_numbers
+from vkc_pin.datasets.dataset import (
+    Dataset,
+    Register,
+    check_attempt,
+    has_intact_scene,
+    read_intact_numbers,
+)
 from vkc_pin.datasets.episode import Made, get_work_file
 from vkc_pin.datasets.formats import hdf5
 from vkc_pin.datasets.formats import lerobot as lerobot_layout
@@ -33,6 +40,8 @@ from vkc_pin.world.files.writing import (
     check_links,
     check_replaceable,
     check_writable,
+    is_leftover,
+    remove_leftovers,
     write_atomically,
 )
 from vkc_pin.world.task.terms import Term
@@ -83,7 +92,7 @@ def generate(  # noqa: PLR0913 - keyword options of a public call
         terms: Additional constraints and costs for all trajectories, which become part of the
             recipe. Frames are "base", "hand", "object" (the grasped link), or those of all robots
             of the recipe; `holding="object"` means while it is grasped.
-        lerobot: Whether to write LeRobot's layout as well.
+        lerobot: Whether to write LeRobot's layout as well. A dataset that has it gets it anyway.
         progress: Whether to show a progress bar.
 
     Raises:
@@ -97,16 +106,17 @@ def generate(  # noqa: PLR0913 - keyword options of a public call
     wanted = check_integer(episodes, "episodes", low=1, high=10**9)
     jobs = check_integer(jobs, "jobs", low=1, high=4096)
     loaded = _load_recipe(recipe, terms, variants=variants, simulate=simulate, cameras=cameras)
-    if check_bool(lerobot, "lerobot"):
+    folder = check_path(out, "out", "a folder")
+    lerobot = check_bool(lerobot, "lerobot") or (folder / "lerobot").is_dir()
+    if lerobot:
         lerobot_layout.require_pyarrow(loaded.fields.rate)
     if jobs > 1 or scheduler is not None:
         require_dask(scheduler)
-    folder = check_path(out, "out", "a folder")
     with _open_journal(folder, loaded) as journal:
-        if lerobot and (folder / "lerobot").is_dir():
+        remove_leftovers(folder)
+        if (folder / "lerobot").is_dir():
             for robot in (folder / "lerobot").iterdir():
                 check_replaceable(robot)
-        _prepare_folder(folder, loaded)
         dataset = Dataset(folder, loaded)
         numbers = {n for shard in dataset.shards for n in read_intact_numbers(shard)}
         if (existing := len(numbers)) > wanted:
@@ -117,6 +127,7 @@ def generate(  # noqa: PLR0913 - keyword options of a public call
                 expected=f"at least {existing}",
                 got=wanted,
             )
+        _prepare_folder(folder, loaded)
         register = Register(dataset, wanted)
         for key in _find_lost(dataset, journal, numbers):
             del journal.lines[key]  # they are generated again
@@ -157,7 +168,8 @@ def _open_journal(folder: Path, recipe: Recipe) -> Iterator[Journal]:
     file = folder / "journal.jsonl"
     if folder.exists() and not folder.is_dir():
         raise InputError("`out` is not a folder", file=folder, field="out")
-    if folder.is_dir() and not file.is_file() and any(folder.iterdir()):
+    others = not all(map(is_leftover, folder.iterdir())) if folder.is_dir() else False
+    if others and not file.is_file():
         expected = "a new or empty folder, or one with episodes of this recipe"
         raise InputError(
             "the folder holds other files", file=folder, field="out", expected=expected
@@ -190,12 +202,13 @@ def _get_record(journal: Journal, key: str) -> dict[str, Any]:
 
 
 def _find_lost(dataset: Dataset, journal: Journal, existing: Set[int]) -> list[str]:
-    """Return successful episodes of the journal that neither a shard nor a work file holds."""
+    """Return successful episodes of the journal that neither work file nor shard and scene hold."""
+    is_intact = functools.cache(functools.partial(has_intact_scene, dataset.folder / "scenes"))
     return [
         key
         for key in journal.lines
-        if int(key) not in existing
-        and _get_record(journal, key)["success"]
+        if (record := _get_record(journal, key))["success"]
+        and not (int(key) in existing and is_intact(record["scene"]))
         and read_intact_numbers(get_work_file(dataset.folder, int(key))) != [int(key)]
     ]
 

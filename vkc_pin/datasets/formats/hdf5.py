@@ -54,6 +54,7 @@ __all__ = [
     "open_shard",
     "read_episodes",
     "read_numbers",
+    "read_scene",
     "require_h5py",
     "write_shard",
 ]
@@ -157,12 +158,15 @@ def _make_masks(numbers: Sequence[int]) -> dict[str, list[str]]:
 
 
 def _keep_scene(found: Group, name: str, scenes: Path) -> None:
-    """Write the scene of an episode unless it exists."""
-    path = scenes / f"{name}.json"
-    if "scene" in found.list_names() and not path.is_file():
-        data = found.read_array("scene", "u1", (None,)).tobytes()
-        _check_scene(parse_json(data.decode(errors="replace"), found.file), name, found.file)
-        write_atomically(path, data)
+    """Write the scene of an episode unless it exists and is intact."""
+    if "scene" not in found.list_names():
+        return
+    with contextlib.suppress(InputError):
+        read_scene(scenes, name)
+        return
+    data = found.read_array("scene", "u1", (None,)).tobytes()
+    _check_scene(parse_json(data.decode(errors="replace"), found.file), name, found.file)
+    write_atomically(scenes / f"{name}.json", data)
 
 
 def _make_arrays(episode: Episode, robot: Robot, rate: float) -> dict[str, NDArray[np.generic]]:
@@ -283,7 +287,7 @@ class Shard:
         _check_members(demo)
         name = _read_scene_name(demo)
         if name not in self._documents:
-            self._documents[name] = _read_scene(self._scenes, name)
+            self._documents[name] = read_scene(self._scenes, name)
         with Document(None, self.file).annotate_errors((f"demo_{k}",)):
             options = parse_json(self._data.read_text("options"), self.file)
             said = _read_description(demo)
@@ -474,7 +478,12 @@ def _read_images(path: Path, k: int) -> Images:
         return Images(arrays, tuple(said["segments"]))
 
 
-def _read_scene(scenes: Path, name: str) -> Any:
+def read_scene(scenes: Path, name: str) -> Any:
+    """Return the description of a scene from its file.
+
+    Raises:
+        InputError: The file is missing, damaged, or not what its name says.
+    """
     file = scenes / f"{name}.json"
     return _check_scene(parse_json(read_text(file, "scene"), file), name, file)
 

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import json
 import os
+import re
 import secrets
 import shutil
 import stat
@@ -25,12 +26,15 @@ __all__ = [
     "check_outputs",
     "check_replaceable",
     "check_writable",
+    "is_leftover",
+    "remove_leftovers",
     "write_atomically",
     "write_folder_atomically",
 ]
 
 MANIFEST = ".vkc-pin.json"
 """File that lists the other files in a folder of `write_folder_atomically`."""
+_LEFTOVER = re.compile(r"\.vkc-pin-[0-9a-f]{16}")  # names of `_make_temporary_path`
 _MAX_NAME_LENGTH = 200  # bytes, so that an ending can be added
 _FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _MAX_LISTED = 3  # files that a message names
@@ -154,6 +158,22 @@ def check_links(folder: str | Path) -> None:
         links = [entry.path for entry in _walk_files(folder) if entry.is_symlink()]
     for link in links:
         check_inside(link, folder)
+
+
+def is_leftover(path: Path) -> bool:
+    """Return whether a file or folder has the name of a temporary one, as a killed run leaves."""
+    return _LEFTOVER.fullmatch(path.name) is not None
+
+
+def remove_leftovers(folder: str | Path) -> None:
+    """Remove temporary files and folders of killed runs; no other run may be writing the folder."""
+    with _report_path_errors(folder):
+        for place, folders, files in os.walk(folder):
+            for name in filter(_LEFTOVER.fullmatch, files):
+                Path(place, name).unlink(missing_ok=True)
+            for name in filter(_LEFTOVER.fullmatch, folders):
+                if not Path(place, name).is_symlink():
+                    shutil.rmtree(Path(place, name), ignore_errors=True)
 
 
 def check_replaceable(folder: str | Path) -> None:

@@ -363,6 +363,10 @@ class Plan:
             if got != value and not abs(got - value) <= tolerance:
                 problem = "not that of motion and report"
                 raise InputError(problem, field=f"metrics.{name}", expected=value, got=got)
+        if len(claimed.clearances) not in (0, len(trajectory.phases)):
+            problem, expected = "wrong number", f"{len(trajectory.phases)}, one per phase"
+            got = len(claimed.clearances)
+            raise InputError(problem, field="validation.clearances", expected=expected, got=got)
         options = [item.name for item in fields(Options)]
         for name in about["options"]:
             check_choice(name, options, "option", f"options.{name}")

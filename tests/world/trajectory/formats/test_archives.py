@@ -84,6 +84,7 @@ DESCRIPTIONS: list[tuple[Change, str]] = [
         "base_path_length: not that of motion",
     ),
     (lambda about: about["validation"].update(clearance=math.nan), "clearance: out of range"),
+    (lambda about: about["validation"].update(clearances=[0.1] * 9), "clearances: wrong number"),
     (lambda about: about["validation"].update(violations=[{"constraint": "goal"}]), "missing"),
     (lambda about: about.update(success=True), "success: there is no field 'success'"),
     (lambda about: about.update(status="sucess"), "did you mean 'success'"),

@@ -439,7 +439,7 @@ def _read_description(demo: Group) -> dict[str, Any]:
     try:
         return parse_document(Document(data), _EpisodeSchema).model_dump()
     except InputError as error:
-        where = f"{demo.name.rpartition('/')[2]}: {error.field}"
+        where = f"{demo.name.rpartition('/')[2]}: {error.field or 'episode'}"
         raise InputError(
             error.problem, file=demo.file, field=where, expected=error.expected, got=error.got
         ) from error

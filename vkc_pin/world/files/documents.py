@@ -58,10 +58,10 @@ _SIGNS = {
 }
 
 
-def format_field(path: tuple[Key, ...]) -> str:
-    """Return the path of a field as users write it: `obstacles[3].size`."""
+def format_field(path: tuple[Key, ...]) -> str | None:
+    """Return the path of a field as users write it, `obstacles[3].size`; None for the whole."""
     text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path)
-    return text.removeprefix(".")
+    return text.removeprefix(".") or None
 
 
 @dataclass(frozen=True)

@@ -177,6 +177,7 @@ def test_unwritable_outputs_are_rejected_before_planning(
         ("view plan.npz --html plan.npz", "this file is named twice"),
         ("srdf plan.npz --output plan.npz", "this file is named twice"),
         ("simulate plan.npz --json plan.npz", "--json"),
+        ("simulate plan.npz --actual a.yaml --json a.yaml", "another file than --actual"),
         ("simulate plan.npz --actual door --json data.json", "lacks the object 'drawer'"),
         ("simulate plan.npz --grasp glue", "expected weld, friction, got glue"),
         ("check plan.npz --plot door.png", "--plot"),
@@ -189,6 +190,13 @@ def test_misuse_with_a_saved_plan_changes_no_file(
     assert text in run_misused(run, command)
     assert [file.name for file in tmp_path.iterdir()] == ["plan.npz"]
     assert Path("plan.npz").read_bytes() == before
+
+
+def test_page_does_not_replace_the_description_in_a_folder(run: RunCommand) -> None:
+    Path("hall").mkdir()
+    Path("hall/scene.yaml").write_text("[1]")
+    assert "named twice" in run_misused(run, "view hall --html hall/scene.yaml")
+    assert "hall/scene.yaml:1: wrong value" in run_misused(run, "view hall/scene.yaml")
 
 
 def test_version_lists_dependencies(run: RunCommand) -> None:

@@ -302,6 +302,14 @@ def test_jobs_do_not_affect_the_check(copy: Path) -> None:
     assert serial.records == parallel.records
 
 
+@pytest.mark.parametrize("name", ["recipe.yaml", "shards/husky_ur5e/shard-00000.hdf5"])
+def test_page_does_not_replace_files_of_the_dataset(dataset: Dataset, name: str) -> None:
+    before = (dataset.folder / name).read_bytes()
+    with pytest.raises(InputError, match="page: a file of the dataset"):
+        check_dataset(dataset.folder, page=dataset.folder / name)
+    assert (dataset.folder / name).read_bytes() == before
+
+
 def test_folder_without_a_dataset_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="the folder holds no dataset"):
         check_dataset(tmp_path)

@@ -281,7 +281,10 @@ def _simulate(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
 
     files = _get_given(arguments, "html", "picture", "video", "json")
-    _check_outputs(files, PLAN=arguments.plan)
+    inputs = _get_given(arguments, "plan", "actual")
+    _check_outputs(
+        files, **{"PLAN" if name == "plan" else "--actual": inputs[name] for name in inputs}
+    )
     plan = vkc.Plan.load(arguments.plan)
     actual = None
     if arguments.actual is not None:
@@ -301,10 +304,10 @@ def _simulate(arguments: argparse.Namespace) -> int:
 
 def _view(arguments: argparse.Namespace) -> int:
     from vkc_pin import visualization
-    from vkc_pin.cli.shown import load_shown
+    from vkc_pin.cli.shown import find_description, load_shown
 
     files, what = _get_given(arguments, "html"), str(arguments.what)
-    _check_outputs(files, WHAT=what)
+    _check_outputs(files, WHAT=str(find_description(Path(what))))
     shown, frames = load_shown(what)
     if files:
         writers = {"html": functools.partial(visualization.to_html, shown, frames=frames)}

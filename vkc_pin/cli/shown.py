@@ -20,7 +20,7 @@ from vkc_pin.world.scene.scene import Scene, load_scene
 if TYPE_CHECKING:
     from vkc_pin.planning.plan import Plan
 
-__all__ = ["load_shown"]
+__all__ = ["find_description", "load_shown"]
 
 _ROBOT = "husky_ur5e"  # stands beside an object, for scale
 _BESIDE = 1.5  # [m] between the centre of its base and the object
@@ -38,7 +38,7 @@ def load_shown(what: str) -> tuple[Plan | Scene, dict[str, pin.SE3]]:
         from vkc_pin.planning.plan import Plan
 
         return Plan.load(what), {}
-    path = _find_description(Path(what)) if "/" in what or Path(what).exists() else None
+    path = find_description(Path(what)) if "/" in what or Path(what).exists() else None
     if path is None:
         return _load_by_name(what)
     if path.suffix.lower() == ".urdf" or path.name == "robot.yaml":
@@ -49,7 +49,7 @@ def load_shown(what: str) -> tuple[Plan | Scene, dict[str, pin.SE3]]:
     return load_scene(path), {}
 
 
-def _find_description(path: Path) -> Path:
+def find_description(path: Path) -> Path:
     """Return the file that describes the content of a folder."""
     if not path.is_dir():
         return path

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.datasets.dataset import Dataset, read_table
+from vkc_pin.datasets.dataset import MEMBERS, Dataset, read_table
 from vkc_pin.datasets.diversity import (
     DuplicateFinder,
     compute_winding_numbers,
@@ -24,7 +24,7 @@ from vkc_pin.datasets.formats.lerobot import find_differences
 from vkc_pin.datasets.problems import describe_problem, resolve_episode_terms
 from vkc_pin.datasets.recipe import Recipe, load_recipe
 from vkc_pin.datasets.statistics import make_statistics_page
-from vkc_pin.errors import VkcError, format_value
+from vkc_pin.errors import InputError, VkcError, format_value
 from vkc_pin.simulation.cameras import Images, render_images
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.utils.arguments import check_integer, is_number
@@ -128,7 +128,7 @@ def check_dataset(
     target = dataset.folder / "statistics.html" if page is None else Path(page)
     if page is None:
         check_inside(target, dataset.folder)
-    check_writable(target, field="page")
+    _check_page(target, dataset)
     shards = dataset.shards
     recipe = dataset.recipe.document
     tasks = (
@@ -170,6 +170,14 @@ def check_dataset(
     return DatasetCheck(
         dataset.folder, len(records), refused, tuple(problems), tuple(records), target, pixels
     )
+
+
+def _check_page(page: Path, dataset: Dataset) -> None:
+    """Check that a page can be written, and is no other file of the dataset."""
+    place, folder = check_writable(page, field="page"), dataset.folder.resolve()
+    if place.is_relative_to(folder) and place.relative_to(folder).parts[0] in MEMBERS:
+        expected = "statistics.html, or a file elsewhere"
+        raise InputError("a file of the dataset", file=page, field="page", expected=expected)
 
 
 def check_shard(

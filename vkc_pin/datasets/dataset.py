@@ -25,6 +25,8 @@ from vkc_pin.world.files.writing import check_name, write_atomically
 
 __all__ = [
     "EPISODES_A_SHARD",
+    "FOLDERS",
+    "MEMBERS",
     "Dataset",
     "Register",
     "check_attempt",
@@ -36,6 +38,13 @@ __all__ = [
 
 EPISODES_A_SHARD = 100
 """Episodes in one shard; the last one of each robot may have fewer."""
+FOLDERS = ("lerobot", "robots", "scenes", "shards", "work")
+"""Folders in that of a dataset."""
+MEMBERS = (
+    *FOLDERS,
+    *("README.md", "episodes.csv", "failures.csv", "journal.jsonl", "recipe.yaml"),
+)
+"""Files and folders in that of a dataset, but for its page of statistics."""
 _COLUMNS = (
     *("number", "task", "robot", "room", "object", "kind", "attachment", "joint", "goal"),
     *("variant", "status", "reason", "duration", "base_path_length", "arm_path_length"),

@@ -16,6 +16,7 @@ import yaml
 from tqdm import tqdm
 
 from vkc_pin.datasets.dataset import (
+    FOLDERS,
     Dataset,
     Register,
     check_attempt,
@@ -176,7 +177,7 @@ def _open_journal(folder: Path, recipe: Recipe) -> Iterator[Journal]:
         )
     if folder.is_dir():
         check_links(folder)
-        for name in ("lerobot", "robots", "scenes", "shards", "work"):
+        for name in FOLDERS:
             if (folder / name).exists() and not (folder / name).is_dir():
                 raise InputError("this is no folder", file=folder / name, expected="a folder")
     check_writable(file)

@@ -15,6 +15,7 @@ from helpers.executions import plan_drawer
 import vkc_pin as vkc
 from vkc_pin.benchmarks import door
 from vkc_pin.cli import commands
+from vkc_pin.world.files.resources import find_resource_folder
 
 TIMED_OUT = (
     "plan drawer --set drawer.slide=0.3 --quiet --time-limit 0.001 --initialization stationary"
@@ -190,6 +191,14 @@ def test_misuse_with_a_saved_plan_changes_no_file(
     assert text in run_misused(run, command)
     assert [file.name for file in tmp_path.iterdir()] == ["plan.npz"]
     assert Path("plan.npz").read_bytes() == before
+
+
+def test_other_robot_of_the_actual_scene_is_named(run: RunCommand) -> None:
+    plan_drawer().save("plan.npz")
+    scene = find_resource_folder("scenes") / "drawer.yaml"
+    Path("other.yaml").write_text(scene.read_text().replace("husky_ur5e", "panda"))
+    error = run_misused(run, "simulate plan.npz --actual other.yaml")
+    assert "`actual` has another robot (expected husky_ur5e, got panda)" in error
 
 
 def test_page_does_not_replace_the_description_in_a_folder(run: RunCommand) -> None:

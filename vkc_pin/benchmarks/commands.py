@@ -275,7 +275,7 @@ def report_interruption(given: Sequence[str], stop: KeyboardInterrupt) -> int:
     again = shlex.join(["vkc-pin", *given])
     detail = f"; {stop}" if str(stop) else ""
     sys.stderr.write(
-        f"\nvkc-pin: stopped{detail}. The same command resumes the experiment:\n{again}\n"
+        f"\nvkc-pin: stopped{detail}. The same command resumes it:\n{again}\n"
     )
     return EXIT_INTERRUPTED
 

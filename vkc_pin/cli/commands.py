@@ -55,7 +55,7 @@ _OUTPUTS = {
 }
 _EXPORTS = {
     "--json FILE": "write trajectory, metrics and report as JSON",
-    "--csv FILE": "write a table with a line per waypoint",
+    "--csv FILE": "write a table with a line per knot of the curve",
     "--ros FILE": "write JSON with the fields of trajectory_msgs/JointTrajectory",
     "--rosbag FOLDER": "write a recording of ROS 2 (rosbag2); needs the extra `ros`",
 }
@@ -288,8 +288,10 @@ def _simulate(arguments: argparse.Namespace) -> int:
     plan = vkc.Plan.load(arguments.plan)
     actual = None
     if arguments.actual is not None:
-        start = plan.scene.start
-        actual = vkc.load_scene(arguments.actual).with_start(base=start[:3], arm=start[3:])
+        start, names = plan.scene.start, plan.scene.robot.coordinates.names
+        actual = vkc.load_scene(arguments.actual)
+        if actual.robot.coordinates.names == names:  # `simulate` refuses another robot
+            actual = actual.with_start(base=start[:3], arm=start[3:])
     result = plan.simulate(actual=actual, grasp=arguments.grasp)
     writers: Writers = {
         "html": result.to_html,

@@ -30,7 +30,7 @@ __all__ = [
     "needs_trees",
 ]
 
-MAX_EXTENSIONS = 1500
+MAX_EXTENSIONS = 3000
 """Maximum number of tree extensions."""
 _STEP = 0.15  # between collision checks, in the metric of searches: [rad] of a joint
 _GUIDED_SAMPLES = SAMPLE_COUNT // 8  # towards which a tree grows at once in an open phase

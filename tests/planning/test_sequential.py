@@ -67,6 +67,21 @@ def test_final_scene_has_the_final_coordinates_clamped_to_their_limits() -> None
     assert (hold, hold.at) == (Hold("cabinet", "sleeve"), (slide.lower, turn.upper))
 
 
+def test_fixed_base_stays_where_it_is() -> None:
+    """Its limits, 0, are relative to the start."""
+    document = vkc.load_scene("door").document
+    robot = {**document["robot"], "base": "fixed"}
+    scene = vkc.Scene.from_document({**document, "robot": robot})
+    (x, y, yaw), tool = scene.start[:3].tolist(), scene.tool_placement()
+    steps = [vkc.Reach(tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.1]))), vkc.Reach(tool)]
+    for simultaneous in (True, False):
+        plan = vkc.plan(scene, steps, simultaneous=simultaneous)
+        assert plan.success, plan.summary()
+        assert plan.end_scene().start[:3].tolist() == [x, y, yaw]
+    plan = vkc.plan(plan.end_scene(), [vkc.GoTo(x, y, yaw + 1.0)])
+    assert "base_yaw: 3.2 rad is beyond the limits 2.2 to 2.2 rad by 1 rad" in plan.summary()
+
+
 def test_final_placement_of_a_grasped_object() -> None:
     scene, values = make_room(describe_table()), (0.03, 0.2)
     down = solve_above(STICK, values=values)

@@ -103,7 +103,8 @@ def find_grasping_start(
             z[:, search.object_columns] = problem.start[
                 search.object_columns
             ]  # as it is at the start, not a step later
-            lower, upper = np.tile(chain.lower, (_BATCH, 1)), np.tile(chain.upper, (_BATCH, 1))
+            limits = np.array([problem.limits(name) for name in chain.names]).T
+            lower, upper = (np.tile(limit, (_BATCH, 1)) for limit in limits)
             fixed = [*freedoms, *search.object_columns.tolist()]
             lower[:, fixed] = upper[:, fixed] = z[:, fixed]
             z, found = solver.solve(

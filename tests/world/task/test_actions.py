@@ -90,3 +90,17 @@ def test_free_object_is_regrasped_only_if_it_rests_on_a_support(is_supported: bo
         == [("litter.grip, grasped again", again)] * is_supported
     )
     assert not list(generate_alternatives(scene, task)), "a regrasp needs anew=True"
+
+
+def test_only_the_grasp_of_a_step_is_repeated() -> None:
+    """Neither one that moves other joints, nor one by a tool, which cannot be put down."""
+    scene = vkc.load_scene("household").with_held({"dishwasher": "handle"})
+    task = compile_task(scene, [vkc.Actuate("dishwasher", {"door": 0.0})], vkc.Options())
+    found = [name for name, _ in generate_alternatives(scene, task, anew=True)]
+    assert found == ["dishwasher.door_push"]
+    fetch = vkc.load_scene("fetch").with_held(
+        {"stick": "grip", "ball": "pull"}, by={"ball": "stick.tip"}
+    )
+    x, y, _ = fetch.objects["ball"].placement.translation
+    task = compile_task(fetch, [vkc.Place("ball", (x, y, 0.05))], vkc.Options())
+    assert not list(generate_alternatives(fetch, task, anew=True))

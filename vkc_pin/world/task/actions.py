@@ -8,11 +8,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.scene.support import find_supports
-from vkc_pin.world.task.actuation import find_driving_attachments
+from vkc_pin.world.task.actuation import check_actuation, find_driving_attachments
 from vkc_pin.world.task.compiler import compile_task, make_nothing_to_do_error
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Release, Step, as_steps
@@ -49,11 +50,27 @@ def group_into_actions(steps: Sequence[Step]) -> list[tuple[Step, ...]]:
 def has_open_attachment(scene: Scene, step: Step) -> bool:
     """Return whether a step moves joints of an object by one of several attachments left open.
 
-    That is not so if the object is held already.
+    That is not so if it keeps the present grasp.
     """
-    if not isinstance(step, Actuate) or step.attachment is not None or step.object in scene.held:
+    if not isinstance(step, Actuate) or step.attachment is not None:
         return False
-    return len(scene.objects[step.object].object.attachments) > 1
+    return len(scene.objects[step.object].object.attachments) > 1 and not _keeps_grasp(scene, step)
+
+
+def _keeps_grasp(scene: Scene, step: Actuate | Place) -> bool:
+    """Return whether the hand moves an object with the grasp in which it holds it at the start."""
+    hold = next((hold for hold in scene.holds if hold.object == step.object), None)
+    if hold is None or hold.by is not None or step.attachment not in (None, hold.attachment):
+        return False
+    if isinstance(step, Place):
+        return True
+    placed = scene.objects[step.object]
+    values = {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
+    try:
+        check_actuation(placed, placed.object.attachments[hold.attachment], {}, values, "steps")
+    except InputError:
+        return False
+    return True
 
 
 def generate_alternatives(
@@ -113,13 +130,12 @@ def _regrasp(scene: Scene, step: Step) -> tuple[Release, Actuate | Place] | None
     """
     if not isinstance(step, Actuate | Place):
         return None
-    held = scene.held.get(step.object)
-    if held is None or step.attachment not in (None, held):
+    if not _keeps_grasp(scene, step):
         return None
     placed = scene.objects[step.object]
     if placed.object.free and not find_supports(placed, _list_resting_shapes(scene)):
         return None
-    return Release(step.object), dataclasses.replace(step, attachment=held)
+    return Release(step.object), dataclasses.replace(step, attachment=scene.held[step.object])
 
 
 def _list_resting_shapes(scene: Scene) -> list[tuple[str, pin.GeometryObject]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -126,11 +126,13 @@ def _find_base_goals(problem: TrajectoryProblem, number: int) -> tuple[list[_Bas
         at = goal.target.translation
         height = abs(at[2] - shoulder[2])
         if height > length:
-            beyond.append(
-                f"{goal.about} at z = {at[2]:.2f} m is {height - length:.3g} m too high "
-                f"or low, wherever the base is: it turns about a joint at z = {shoulder[2]:.2f} m, "
-                f"and the whole arm with it is {length:.2f} m long"
-            )
+            text = f"{goal.about} at z = {at[2]:.2f} m is {height - length:.3g} m too high or low, "
+            if goal.row.joint > _BASE:
+                text += f"wherever the base is: it turns about a joint at z = {shoulder[2]:.2f} m, "
+                text += f"and the whole arm with it is {length:.2f} m long"
+            else:
+                text += f"since the base keeps it at z = {shoulder[2]:.2f} m"
+            beyond.append(text)
         elif np.isfinite(length):
             radius = float(np.hypot(*shoulder[:2]) + np.sqrt(length**2 - height**2))
             goals.append(_BaseGoal(at[:2].copy(), radius))
@@ -225,14 +227,14 @@ def _explain_missing_path(
                 f"{part.phase.name}: no place for the base, {PROVEN}"
                 "the goal is in reach from outside the arena alone"
             )
-        cause = (
-            f"no path for the base, {PROVEN}"
-            "at any heading, with the arm anywhere, it is cut off by "
-            if (goal & (count == 0)).any()
-            else f"no place for the base, {PROVEN}"
-            "wherever it would have to be, at any heading, it hits "
-        )
-        numbers = _find_separating_obstacles(here, goal, reached, blocked, count)
+        if (goal & (count == 0)).any():
+            cause = f"no path for the base, {PROVEN}"
+            cause += "at any heading, with the arm anywhere, it is cut off by "
+            numbers = _find_separating_obstacles(here, goal, reached, blocked, count)
+        else:
+            cause = f"no place for the base, {PROVEN}"
+            cause += "wherever it would have to be, at any heading, it hits "
+            numbers = _find_covering_obstacles(goal, blocked, count)
         names = [part.names[number] for number in numbers]
         return f"{part.phase.name}: {cause}{_list_names(problem, part.phase, names)}"
     return ""
@@ -254,18 +256,46 @@ def _find_separating_obstacles(
     from scipy import ndimage
 
     border = ndimage.binary_dilation(reached, structure=np.ones((3, 3), bool)) & ~reached
+
+    def separates(free: Bools) -> bool:
+        return not (flood_fill(free, here, corners=True) & goal).any()
+
+    return _minimize_obstacles(separates, border, blocked, count)
+
+
+def _find_covering_obstacles(
+    goal: Bools, blocked: dict[int, list[_Window]], count: NDArray[np.int16]
+) -> list[int]:
+    """Return a minimal set of obstacles that leave no place for the base at its goals."""
+    return _minimize_obstacles(lambda free: not (free & goal).any(), goal, blocked, count)
+
+
+def _minimize_obstacles(
+    suffices: Callable[[Bools], bool],
+    near: Bools,
+    blocked: dict[int, list[_Window]],
+    count: NDArray[np.int16],
+) -> list[int]:
+    """Return a minimal set of obstacles whose free cells satisfy a condition.
+
+    Args:
+        suffices: The condition on free cells, shape (X, Y); all obstacles together satisfy it.
+        near: Cells whose obstacles are preferred, shape (X, Y).
+        blocked: Obstacle → the cells that it blocks.
+        count: Number of obstacles that block each cell, shape (X, Y).
+    """
     kept = set(blocked)
     seen = {
         number
         for number, windows in blocked.items()
-        if any((own & border[window]).any() for window, own in windows)
+        if any((own & near[window]).any() for window, own in windows)
     }
     order = [*sorted(seen), *sorted(kept - seen)]
     for some in (kept - seen, *({number} for number in order)):
         some = some & kept
         less = count.copy()
         _add_windows(less, itertools.chain.from_iterable(blocked[number] for number in some), -1)
-        if some and not (flood_fill(less == 0, here, corners=True) & goal).any():
+        if some and suffices(less == 0):
             count, kept = less, kept - some
     return sorted(kept)
 

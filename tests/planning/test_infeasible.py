@@ -92,6 +92,18 @@ def test_goal_beyond_a_limit(
     assert plan.metrics["rounds"] == 0  # the solver did not run
 
 
+@pytest.mark.parametrize(
+    "step", [vkc.Actuate("door", {"knob": np.float32(0.8)}), vkc.GoTo(0.5, -2.1 - 1e-7, 0.0)]
+)
+def test_goal_beyond_a_limit_by_rounding_is_clamped(step: vkc.steps.Step) -> None:
+    scene = load_door_scene()
+    document = {**scene.document, "obstacles": []}
+    scene = vkc.Scene.from_document(document, scene.folder)
+    plan = vkc.plan(scene, [step], options=QUICK)
+    assert plan.success, plan.summary()
+    assert vkc.plan(plan.end_scene(), [vkc.GoTo(0.0, 0.0)], options=QUICK).success
+
+
 def test_target_out_of_reach(tmp_path: Path) -> None:
     texts = ("because reach with tool: out of reach, proven: ", "1.25 m too high or low", "m long")
     plan = plan_failure(make_hall(), vkc.Reach((1.5, 0.0, 3.0, 0.0, 0.0, 0.0)), texts=texts)
@@ -101,6 +113,11 @@ def test_target_out_of_reach(tmp_path: Path) -> None:
     loaded = vkc.Plan.load(plan.save(tmp_path / "failed.npz"))
     assert not loaded.success
     assert loaded.summary() == plan.summary()
+
+
+def test_height_of_the_base_is_fixed() -> None:
+    texts = ["base_link at z = 1.00 m is 0.98 m too high or low, since the base keeps it at z = 0"]
+    plan_failure(make_hall(), vkc.Reach((1.5, 0.0, 1.0, 0.0, 0.0, 0.0), "base_link"), texts=texts)
 
 
 def test_goal_slightly_out_of_reach() -> None:
@@ -148,8 +165,13 @@ SHELF = describe_box("shelf", (0.4, 2.0, 1.0), (5.0, 3.0, 0.5))
             vkc.GoTo(1.5, 0.0, 0.0),
             ["because go to: no place for the base, proven: ", "it hits crate"],
         ),
+        (
+            [FENCE, describe_box("block", (0.6, 0.6, 0.4), (3.0, 0.0, 0.2))],
+            vkc.GoTo(3.0, 0.0, 0.0),
+            ["because go to: no place for the base, proven: ", "any heading, it hits block"],
+        ),
     ],
-    ids=["drive behind a fence", "reach behind a fence", "drive into a crate"],
+    ids=["drive behind a fence", "reach behind a fence", "into a crate", "into one behind a fence"],
 )
 def test_unreachable_base_goal(
     obstacles: list[dict[str, Any]], step: vkc.steps.Step, texts: list[str]

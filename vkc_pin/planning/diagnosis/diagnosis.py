@@ -15,6 +15,7 @@ from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.tolerances import Tolerances
+from vkc_pin.world.models.shapes import LIMIT_SLACK
 from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH
 from vkc_pin.world.task.steps import Actuate
 
@@ -85,12 +86,10 @@ def find_impossible_conditions(problem: TrajectoryProblem) -> list[Violation]:
                     Violation("closure", goal.about, amount=error, unit="m", detail=detail)
                 )
     for phase, end in zip(problem.task.phases, problem.ends.tolist(), strict=True):
-        goals, base = dict(phase.values), () if phase.base is None else phase.base[:2]
-        goals |= {n: v for n, v in zip(problem.chain.names, base, strict=False) if v is not None}
-        for name, value in goals.items():
+        for name, value in problem.coordinate_goals(phase).items():
             lower, upper = problem.limits(name)
             beyond = max(lower - value, value - upper)
-            if beyond > 1e-9:
+            if beyond > LIMIT_SLACK:
                 unit = problem.unit(name)
                 detail = (
                     f"{value:g} {unit} is beyond the limits {lower:g} to {upper:g} {unit} "

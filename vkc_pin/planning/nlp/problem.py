@@ -186,15 +186,8 @@ class TrajectoryProblem:
             for name, value in phase.initial_values.items():
                 low_high = phase.ranges.get(name, (value, value))
                 bounds[inside, self.chain.index(name)] = low_high
-            for name, value in phase.values.items():
-                column = self.chain.index(name)
-                nearest = np.clip(value, self.chain.lower[column], self.chain.upper[column])
-                bounds[end - 1, column] = nearest
-            for column, goal in enumerate(phase.base or ()):
-                if goal is not None and column == 2:  # the equivalent heading nearest to the start
-                    goal = self.start[2] + wrap_angle(goal - self.start[2])
-                if goal is not None:
-                    bounds[end - 1, column] = goal
+            for name, value in self.coordinate_goals(phase).items():
+                bounds[end - 1, self.chain.index(name)] = np.clip(value, *self.limits(name))
         # Clamped freedoms are constant until the object is released.
         for hold in self._continued_holds:
             if self.scene.objects[hold.object].object.attachments[hold.attachment].firm:
@@ -237,6 +230,18 @@ class TrajectoryProblem:
             low, high = self.scene.arena[2 * column : 2 * column + 2]
             lower, upper = max(lower, low), min(upper, high)
         return lower, upper
+
+    def coordinate_goals(self, phase: Phase) -> dict[str, float]:
+        """Return coordinate → value at the end of a phase, as requested, [m] and [rad].
+
+        A heading of the base is the equivalent one nearest to the start.
+        """
+        base = zip(self.chain.names, phase.base or (), strict=False)
+        goals = dict(phase.values) | {name: goal for name, goal in base if goal is not None}
+        heading = self.chain.names[2]
+        if heading in goals:
+            goals[heading] = self.start[2] + wrap_angle(goals[heading] - self.start[2])
+        return goals
 
     def unit(self, name: str) -> str:
         """Return the unit of a coordinate, "m" or "rad"."""

@@ -35,17 +35,19 @@ LIMIT_SLACK = 1e-6
 _CIRCLE_SEGMENTS = 28  # segments of a circle
 
 
-def clamp_to_limits(value: float, lower: float, upper: float, field: str | None) -> float:
+def clamp_to_limits(
+    value: float,
+    lower: float,
+    upper: float,
+    field: str | None,
+    problem: str = "outside the joint's limits",
+) -> float:
     """Return `value`, clamped to its limits if it exceeds them by rounding only."""
     if not np.isfinite(value):
         raise InputError("not a finite number", field=field, expected="a finite number", got=value)
     if not lower - LIMIT_SLACK <= value <= upper + LIMIT_SLACK:
-        raise InputError(
-            "outside the joint's limits",
-            field=field,
-            expected=f"{lower:g} to {upper:g}",
-            got=f"{value:g}",
-        )
+        expected = f"{lower:g} to {upper:g}"
+        raise InputError(problem, field=field, expected=expected, got=f"{value:.12g}")
     return float(min(max(value, lower), upper))
 
 

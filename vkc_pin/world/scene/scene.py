@@ -169,16 +169,12 @@ class Scene:
                 clamp_to_limits(value, low, high, f"{part_name}.{name}")
                 for value, low, high, name in zip(given, lower, upper, names[part], strict=True)
             ]
-        for value, low, high, name in zip(
-            start[:2], self.arena[::2], self.arena[1::2], names[:2], strict=True
-        ):
-            if not low <= value <= high:
-                raise InputError(
-                    "outside the arena",
-                    field=f"base.{name}",
-                    expected=f"{low:g} to {high:g}",
-                    got=f"{value:g}",
-                )
+        start[:2] = [
+            clamp_to_limits(value, low, high, f"base.{name}", "outside the arena")
+            for value, low, high, name in zip(
+                start[:2], self.arena[::2], self.arena[1::2], names[:2], strict=True
+            )
+        ]
         return self._with(start=start)
 
     def with_state(self, name: str, values: Mapping[str, float]) -> Scene:

@@ -255,9 +255,7 @@ def check_robot(robot: Robot, terms: Sequence[Term]) -> None:
     Raises:
         UnknownNameError: It lacks one.
     """
-    frames = sorted(
-        {BASE, HAND, OBJECT, *(str(frame.name) for frame in robot.model.frames)} - {"universe"}
-    )
+    frames = sorted({BASE, HAND, OBJECT, *robot.frame_names})
     for term in terms:
         where = f"terms[{term.name!r}]"
         for frame in (name for name in term.formula.frames if "." not in name):

@@ -45,7 +45,7 @@ def check_steps(samples: Samples, steps: Sequence[Step]) -> None:
         elif isinstance(step, Touch) and step.frame.partition(".")[0] in samples.scene.objects:
             samples.check_frame(step.frame, f"{where}.frame")
         elif isinstance(step, Reach | Touch) and step.frame is not None:
-            frames = [frame.name for frame in samples.scene.robot.model.frames]
+            frames = samples.scene.robot.frame_names
             check_choice(step.frame, frames, "frame of the robot", f"{where}.frame")
 
 

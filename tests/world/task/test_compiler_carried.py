@@ -107,6 +107,14 @@ def test_release_of_objects_held_at_the_start() -> None:
         assert (phase.released, phase.released_by) == ((GRIP,), released_by)
 
 
+def test_released_object_takes_along_what_is_held_through_it() -> None:
+    held = make_scene().with_held({"stick": "grip", "ball": "pull"}, by={"ball": "stick.tip"})
+    tasks = [compile_steps(step, scene=held) for step in (Release("stick"), Release())]
+    assert [hold.object for hold in tasks[0].phases[0].lowered] == ["ball", "stick"]
+    assert tasks[0].phases == tasks[1].phases
+    assert tasks[0].after == ()
+
+
 def test_fixed_objects_are_released_before_other_steps() -> None:
     for step in (Reach(POSE), GoTo(0.0, 0.0), Touch("forearm_link", POINT)):
         assert get_holds(compile_steps(Grasp("stick"), step)) == [(), (GRIP,)]
@@ -219,8 +227,11 @@ HOLDING = [Grasp("stick")]
         ([], Actuate("dor", {"hinge": 1.0}), "object", "did you mean 'door'"),
         ([], Actuate("door", {"hing": 1.0}), "joints", "did you mean 'hinge'"),
         ([], Actuate("door", {"hinge": 1.0}, "handel"), "attachment", "did you mean 'handle'"),
-        ([], Actuate("ball", {"x": 0.0}), "joints", "there is no joint"),
-        ([], Actuate("stick", {"tip_joint": 0.0}), "joints", "there is no joint"),
+        ([], Actuate("ball", {"x": 0.0}), "object", "a free object"),
+        ([], Actuate("stick", {"tip_joint": 0.0}), "object", "a free object"),
+        ([], Touch("stick", POINT), "frame", "an object, not .* one of stick.stick, stick.tip"),
+        ([], Touch("universe", POINT), "frame", "there is no frame of the robot"),
+        ([], Reach(POSE, "universe"), "frame", "there is no frame of the robot"),
         ([], Touch("door.lever", POINT), "frame", "cannot be carried"),
         ([], Place("door", POSE), "object", "is fixed in the world"),
         (HOLDING, Place("stick", POSE, "end"), "attachment", "held elsewhere"),

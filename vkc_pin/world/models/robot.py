@@ -124,6 +124,11 @@ class Robot:
         return max(float(np.sqrt(squares / _LEVER_SAMPLES).mean()), _MIN_LEVER)
 
     @cached_property
+    def frame_names(self) -> tuple[str, ...]:
+        """Names of its frames, without that of the world."""
+        return tuple(str(frame.name) for frame in self.model.frames if frame.name != "universe")
+
+    @cached_property
     def efforts(self) -> TorqueLimits:
         """Torque limits of the joints, as far as the description is plausible."""
         return compute_torque_limits(self.model, self.coordinates, self.lower, self.upper)

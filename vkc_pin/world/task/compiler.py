@@ -257,15 +257,15 @@ class _Compiler:
 
     def actuate(self, step: Actuate, where: str) -> None:
         placed = find_object(self.scene, step.object, f"{where}.object")
+        if placed.object.free:
+            problem = f"'{step.object}' is a free object: a hand cannot drive its joints"
+            raise InputError(problem, field=f"{where}.object", expected="a fixed object")
         names = placed.object.coordinates.names
         for joint in step.joints:
             if joint not in names:
                 raise UnknownNameError(
                     f"joint of '{step.object}'", joint, names, field=f"{where}.joints"
                 )
-        if placed.object.free:
-            problem = f"'{step.object}' is a free object: a hand cannot drive its joints"
-            raise InputError(problem, field=f"{where}.object", expected="a fixed object")
         values = {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
         used = [
             one.attachment
@@ -333,8 +333,13 @@ class _Compiler:
                 raise InputError(problem, field=f"{where}.frame", expected=expected)
             check_link(placed, link, f"{where}.frame")
             hold = self._find_hold(owner) or self.grasp(owner, None, where)
-        elif dot and step.frame not in [f.name for f in self.scene.robot.model.frames]:
+        elif dot and step.frame not in self.scene.robot.frame_names:
             raise UnknownNameError("object", owner, self.scene.objects, field=f"{where}.frame")
+        elif owner in self.scene.objects and owner not in self.scene.robot.frame_names:
+            links = self.scene.objects[owner].object.links
+            expected = f"one of {', '.join(f'{owner}.{name}' for name in links)}"
+            problem = "this is an object, not one of its links"
+            raise InputError(problem, field=f"{where}.frame", expected=expected, got=owner)
         else:
             link = find_robot_frame(self.scene, step.frame, f"{where}.frame")
         self._release_fixed_objects()
@@ -381,7 +386,10 @@ class _Compiler:
         if step.object is not None and self._find_hold(step.object) is None:
             held = [hold.object for hold in self.held]
             raise UnknownNameError("held object", step.object, held, field=f"{where}.object")
-        released = [hold for hold in reversed(self.held) if step.object in (None, hold.object)]
+        released: list[Hold] = []  # with what is held through them, which is released first
+        for hold in self.held:
+            if step.object in (None, hold.object) or hold.by in released:
+                released.insert(0, hold)
         if not (has_moved := bool(self.phases)):
             objects = self.scene.objects
             lowered = {

@@ -57,7 +57,7 @@ def check_link(placed: PlacedObject, link: str, where: str) -> None:
 def find_robot_frame(scene: Scene, name: str | None, where: str) -> str:
     """Return the name of a robot frame, by default the tool frame."""
     frame = name or scene.robot.tool_frame
-    frames = [f.name for f in scene.robot.model.frames]
+    frames = scene.robot.frame_names
     if frame not in frames:
         raise UnknownNameError("frame of the robot", frame, frames, field=where)
     return frame

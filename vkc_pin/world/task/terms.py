@@ -403,9 +403,9 @@ def trace_terms(scene: Scene, terms: Sequence[Term]) -> tuple[Term, ...]:
     terms = check_list(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost))
     if not terms:
         return ()
-    robot = [str(frame.name) for frame in scene.robot.model.frames if frame.name != "universe"]
     items_by_name = [(name, placed.object) for name, placed in scene.objects.items()]
-    frames = [*robot, *(f"{name}.{link}" for name, item in items_by_name for link in item.links)]
+    links = [f"{name}.{link}" for name, item in items_by_name for link in item.links]
+    frames = [*scene.robot.frame_names, *links]
     joints = [f"{name}.{joint}" for name, item in items_by_name for joint in item.coordinates.names]
     for term in terms:
         if term.holding is not None and term.holding not in scene.objects:

@@ -112,5 +112,7 @@ def test_numbers_have_bounds() -> None:
         check_coordinate(10001, "it")
     with expect_error("an integer of 16610 bits"):
         check_integer(10**5000, "it", low=0)
+    with expect_error("from 0 to 9223372036854775807, got"):
+        check_integer(2**63, "it", low=0)
     whole = check_integer(np.int8(3), "it", low=3)
     assert (whole, type(whole)) == (3, int)

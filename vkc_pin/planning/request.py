@@ -71,9 +71,8 @@ def make_request(
 def make_budget(time_limit: object, max_evaluations: object) -> Budget:
     """Return the budget of a planning call, which starts now. Raises `InputError`."""
     if time_limit is not None:
-        time_limit = check_number(
-            time_limit, "time_limit", "seconds, more than 0", low=0.0, strict=True
-        )
+        expected = "a finite time [s], more than 0, or None"
+        time_limit = check_number(time_limit, "time_limit", expected, low=0.0, strict=True)
     if max_evaluations is not None:
         max_evaluations = check_integer(max_evaluations, "max_evaluations", low=1)
     return Budget(time_limit, max_evaluations)

@@ -14,7 +14,7 @@ from vkc_pin.planning.plan import Plan, PlanningStatistics
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.results import add_statistics, complete_draft, concatenate_plans
 from vkc_pin.planning.solve_task import TaskResult, solve_task
-from vkc_pin.utils.budget import current_ending, reserve_time, share_budget
+from vkc_pin.utils.budget import STOP_STATUSES, current_ending, reserve_time, share_budget
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import (
     generate_alternatives,
@@ -161,8 +161,9 @@ def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) 
         statistics.append(last.plan.statistics)
         if last.is_solved:
             return dataclasses.replace(last, plan=add_statistics(last.plan, statistics))
-        notes.append(f"at {name}: {next(iter(last.plan.report.notes), last.plan.status)}")
-    if not notes:
+        reason = next(iter(last.plan.report.notes), last.plan.status)
+        notes += [f"at {name}: {reason}"] * (reason not in STOP_STATUSES)
+    if not notes and len(statistics) == 1:
         return first
     plan = first.plan
     status = current_ending() or plan.status

@@ -20,7 +20,7 @@ from vkc_pin.world.task.actions import generate_alternatives, group_into_actions
 from vkc_pin.world.task.actuation import find_shared_coordinate
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Task
-from vkc_pin.world.task.steps import Step
+from vkc_pin.world.task.steps import Step, describe_step
 from vkc_pin.world.trajectory.splicing import extract_phases
 from vkc_pin.world.trajectory.world_model import compute_final_scene
 
@@ -274,7 +274,7 @@ class _SlidingWindow:
         if failed is not None:
             parts.append(failed)
             number = len(self._steps(0, len(self.decided)))
-            step = f"steps[{number}], {steps[number]}"
+            step = f"steps[{number}], {describe_step(steps[number])}"
             notes.append(f"{step}, could not be planned: {failed.status}")
         return concatenate_plans(
             self.scene,

@@ -41,6 +41,10 @@ def _fail(problem: str, field: str, expected: str, value: Any) -> NoReturn:
     raise InputError(problem, field=field, expected=expected, got=format_value(value)) from None
 
 
+def _add_article(noun: str) -> str:
+    return f"{'an' if noun[0] in 'AEIOaeio' else 'a'} {noun}"
+
+
 def is_number(value: object) -> bool:
     """Return whether a value is a real number of Python or NumPy, including NaN but no booleans."""
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
@@ -92,7 +96,8 @@ def check_integer(value: Any, field: str, *, low: int, high: int = 2**63 - 1) ->
     """Return an integer from `low` to `high`."""
     is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not is_integer or not low <= value <= high:
-        bounds = f"of at least {low}" if high == 2**63 - 1 else f"from {low} to {high}"
+        has_bound = high < 2**63 - 1 or (is_integer and value > high)
+        bounds = f"from {low} to {high}" if has_bound else f"of at least {low}"
         _fail("out of range", field, f"a whole number {bounds}", value)
     return int(value)
 
@@ -152,7 +157,7 @@ def check_bool(value: Any, field: str) -> bool:
 
 def check_choice(value: Any, choices: Collection[str], kind: str, field: str | None = None) -> str:
     """Return a name that is one of `choices`, the names of a `kind`."""
-    name = check_text(value, field or kind, f"the name of a {kind}")
+    name = check_text(value, field or kind, f"the name of {_add_article(kind)}")
     if name not in choices:
         raise UnknownNameError(kind, name, choices, field=field)
     return name
@@ -165,7 +170,7 @@ def check_instance(
     if not isinstance(value, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)
         name = " or ".join(one.__name__ for one in kinds)
-        _fail("wrong type of argument", field, expected or f"a {name}", value)
+        _fail("wrong type of argument", field, expected or _add_article(name), value)
     return value
 
 

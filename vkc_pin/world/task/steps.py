@@ -29,6 +29,7 @@ __all__ = [
     "Step",
     "Touch",
     "as_steps",
+    "describe_step",
     "step_from_dict",
     "step_to_dict",
 ]
@@ -218,6 +219,12 @@ def as_steps(steps: Sequence[Step]) -> tuple[Step, ...]:
                 "not a step", field=f"steps[{number}]", expected=expected, got=format_value(step)
             )
     return found
+
+
+def describe_step(step: Step) -> str:
+    """Return kind and subject of a step, for example "Place of cup"."""
+    subject = getattr(step, "object", None) or getattr(step, "frame", None)
+    return f"{type(step).__name__} of {subject}" if subject else type(step).__name__
 
 
 def step_to_dict(step: Step) -> dict[str, Any]:

@@ -184,6 +184,16 @@ def test_exported_knots_describe_the_same_motion(door_plan: vkc.Plan) -> None:
     assert vkc.validate(door_plan.scene, door_plan.steps, received, tight).ok
 
 
+def test_exported_knots_keep_jerk_limits() -> None:
+    """Knots are only 35 µs apart, where rounding a time to 1 ns changes accelerations by 1 %."""
+    scene, options = vkc.load_scene("door"), vkc.Options(jerk_time=0.005)
+    plan = vkc.plan(scene, [vkc.GoTo(0.0, 0.0, 0.0)] * 2, options=options)
+    assert plan.success
+    received = vkc.Trajectory.from_ros(plan.to_ros(joints="all"), like=plan.trajectory)
+    report = vkc.validate(scene, plan.steps, received, options)
+    assert report.ok, report.lines()
+
+
 @pytest.mark.parametrize("smooth", [True, False])
 def test_exported_motions_can_be_validated(door_plan: vkc.Plan, smooth: bool) -> None:
     message, motion = door_plan.to_ros(joints="all", rate=50.0, smooth=smooth), door_plan.trajectory

@@ -93,6 +93,8 @@ def to_ros(
             raise InputError("too many points", field="rate", expected=expected, got=rate)
         moments = _add_rests(sample_evenly(times, rate), times, every)
     if has_curve:
+        # At the times of the message: its cubics would else exceed limits where knots are close.
+        moments = np.minimum(np.round(moments * _NANO) / _NANO, times[-1])
         curve = Curve(times, positions, np.array(source["rates"], float)[:, columns])
         parts = [read(moments) for read in (curve.at, curve.velocity, curve.acceleration)]
     elif smooth and rate is not None:

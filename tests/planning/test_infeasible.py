@@ -92,6 +92,16 @@ def test_goal_beyond_a_limit(
     assert plan.metrics["rounds"] == 0  # the solver did not run
 
 
+@pytest.mark.parametrize("arguments", [{"simultaneous": False}, {"window": 1}])
+def test_later_goal_beyond_a_limit(arguments: dict[str, Any]) -> None:
+    steps = [vkc.GoTo(0.0, 0.0), vkc.GoTo(6.5, 0.0)]
+    plan = vkc.plan(load_door_scene(), steps, options=QUICK, **arguments)
+    assert plan.status == "infeasible"
+    reason = "goal base_x: 6.5 m is beyond the limits -2.6 to 5.2 m by 1.3 m"
+    assert plan.report.notes[-1] == reason
+    assert f"because {reason}" in plan.summary()
+
+
 @pytest.mark.parametrize(
     "step", [vkc.Actuate("door", {"knob": np.float32(0.8)}), vkc.GoTo(0.5, -2.1 - 1e-7, 0.0)]
 )

@@ -98,7 +98,7 @@ def concatenate_plans(
     took = time.perf_counter() - start
     if parts:
         total += PlanningStatistics(planning_time=took, validation_time=took)
-        report = dataclasses.replace(report, notes=(*notes, *parts[-1].report.notes))
+        report = dataclasses.replace(report, notes=(*notes, *_list_reasons(parts[-1])))
         status = "success" if report.ok else status
     if began is not None:
         planning_time = time.perf_counter() - began - total.build_time
@@ -116,6 +116,16 @@ def concatenate_plans(
         history=tuple(rows),
         terms=request.terms,
     )
+
+
+def _list_reasons(plan: Plan) -> tuple[str, ...]:
+    """Return the notes of a plan, or the impossible conditions that ended planning at once.
+
+    Validation of a whole motion does not find conditions of one step, as a goal beyond a limit.
+    """
+    if plan.report.notes or plan.status != "infeasible":
+        return plan.report.notes
+    return tuple(violation.text for violation in plan.report.violations)
 
 
 def make_stationary_trajectory(scene: Scene, options: Options) -> Trajectory:

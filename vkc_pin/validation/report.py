@@ -55,9 +55,13 @@ class Violation:
     unit: str
     detail: str
 
+    @property
+    def text(self) -> str:
+        """Constraint, subject and detail, without the place."""
+        return f"{self.constraint} {self.subject}: {self.detail}"
+
     def __str__(self) -> str:
-        where = f"waypoint {self.waypoint}, {self.time:.2f} s"
-        return f"{self.constraint} {self.subject}: {self.detail} ({where})"
+        return f"{self.text} (waypoint {self.waypoint}, {self.time:.2f} s)"
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .goals import find_touched
+from .goals import End, find_misses, find_touched
 from .plan import Hold
 from .stage import Solid, Stage, World
 from .supports import compute_distance
@@ -104,7 +104,6 @@ def find_exemptions(world: World, stages: list[Stage]) -> list[Exemption]:
 
 def _exempt_grasps(world: World, stages: list[Stage], clock: _Clock) -> Iterator[Exemption]:
     plan = world.plan
-    last = len(plan.times) - 1
     spans: list[tuple[Hold, float, float]] = []
     for number, phase in enumerate(plan.phases):
         before = set(world.held if number == 0 else plan.phases[number - 1].holds)
@@ -121,11 +120,13 @@ def _exempt_grasps(world: World, stages: list[Stage], clock: _Clock) -> Iterator
             spans.append((hold, begin, end))
     spans += [(hold, -np.inf, clock.find_end(0)) for hold in world.held]
     for step in plan.steps:
-        if step["step"] == "Grasp":  # the motion may end when the hand closes
+        if step["step"] == "Grasp":  # the motion may end when the hand closes, or let go at once
             grasp = world.objects[step["object"]].get_grasp(step["attachment"])
-            spans.append(
-                (Hold(step["object"], grasp.name, step["by"]), clock.find_begin(last), np.inf)
-            )
+            hold = Hold(step["object"], grasp.name, step["by"])
+            for number, phase in enumerate(plan.phases, start=1):
+                if not find_misses(world, step, End(world, stages, number)):
+                    begin, end = clock.find_begin(phase.last), clock.find_end(phase.last)
+                    spans.append((hold, begin, end))
     for hold, begin, end in spans:
         obj = world.objects[hold.object]
         grasp = world.get_grasp(hold)

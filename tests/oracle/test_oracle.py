@@ -26,12 +26,13 @@ TASKS = {
     "drawer": ("drawer", [vkc.Actuate("drawer", {"slide": 0.3})]),
     "cup": ("household", [vkc.Place("cup", (-0.6, -1.6, 0.751))]),
     "stick": ("init_1", [vkc.Grasp("stick"), vkc.Touch("stick.tip", (-1.0, 3.897, 0.1))]),
+    "leave": ("fetch", [vkc.Grasp("cabinet"), vkc.Touch("tool", (0.0, -0.5, 1.0))]),
 }
 
 
 @pytest.fixture(scope="module")
 def plans(tmp_path_factory: pytest.TempPathFactory, door_plan: vkc.Plan) -> dict[str, Path]:
-    """Return saved plans of a door, a drawer, a cup and a stick."""
+    """Return saved plans; of the last, the next step releases the handle at once."""
     folder, planned = tmp_path_factory.mktemp("plans"), {"door": door_plan}
     for name, (scene, steps) in TASKS.items():
         planned[name] = vkc.plan(vkc.load_scene(scene), steps)
@@ -43,7 +44,7 @@ def test_valid_plans_pass(plans: dict[str, Path], capsys: pytest.CaptureFixture[
     code = main([str(next(iter(plans.values())).parent)])
     output = capsys.readouterr().out
     assert code == 0, output
-    assert "| success | success, and nothing found | 4 |" in output
+    assert "| success | success, and nothing found | 5 |" in output
 
 
 # Changes: plan, change, violated rule and beginning of the subject.

@@ -66,6 +66,17 @@ def test_invalid_window(window: Any) -> None:
         plan_actions([OPEN], window=window)
 
 
+@pytest.mark.parametrize("window", [None, 1, 2])
+def test_object_may_be_released_where_it_is_grasped(
+    window: int | None, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """No phase holds it then, and a phase at rest has more equations than variables."""
+    steps = [vkc.Grasp("tray"), vkc.Release(), vkc.GoTo(0.0, 0.0)]
+    plan = vkc.plan(vkc.load_scene("tray"), steps, window=window)
+    assert plan.success, plan.summary()
+    assert capfd.readouterr() == ("", "")
+
+
 @pytest.mark.long
 def test_evaluation_limit_applies_to_all_actions_together() -> None:
     opening = dataclasses.replace(OPEN, attachment="handle")

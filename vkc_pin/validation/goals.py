@@ -146,8 +146,11 @@ def _find_missing_grasps(
     near |= set() if end else set(samples.scene.held)
     wanted = set(hands[number + 1])
     step = steps[number]
-    if isinstance(step, Grasp) and end == len(phases):
-        wanted.discard(step.object)  # no phase follows the grasp
+    if isinstance(step, Grasp):
+        after = next(iter(steps[number + 1 :]), None)
+        ends_at_once = isinstance(after, Release) and after.object in (None, step.object)
+        if end == len(phases) or ends_at_once:
+            wanted.discard(step.object)  # no phase with the grasp follows
     return [GoalError(name, 1.0, "holds", "is not grasped") for name in sorted(wanted - near)]
 
 

@@ -113,6 +113,12 @@ def test_hand_may_be_close_to_a_grasped_object() -> None:
     assert find_windows(door, rest, steps) == {}, "the holds of the motion decide"
     released_at_once = make_hand_windows("door.lever", (0, 10), (0, 0), DOOR)
     assert find_windows(held, rest) == released_at_once
+    freedom = np.linspace(0.0, 0.1, len(rest.times))  # of a later grasp
+    columns = {
+        "names": (*rest.names, "door.handle_free"),
+        "positions": np.column_stack([rest.positions, freedom]),
+    }
+    assert find_windows(held, dataclasses.replace(rest, **columns)) == released_at_once
     motion = drive_through(door, door.start, move_base(door.start, y=0.3))
     hold = (Hold("door", "handle"),)
     spans = (PhaseSpan("reach", 0, 15), PhaseSpan("hold", 15, 30, hold), PhaseSpan("leave", 30, 40))

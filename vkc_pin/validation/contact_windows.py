@@ -164,7 +164,9 @@ class _WindowFinder:
         self.labels, self.keys = np.array(world.collision_labels), world.collision_keys
         self.q = world.coordinates.q(samples.z[samples.waypoint_rows])
         low, high = samples.ranges
-        self.steps = (high - low).max(axis=1) > _MOTION_TOLERANCE
+        # Freedoms of later grasps may change at rest.
+        columns = [name not in samples.grasp_freedoms for name in self.trajectory.names]
+        self.steps = (high - low)[:, columns].max(axis=1) > _MOTION_TOLERANCE
         self.robots = len(self.scene.robot.collision.geometryObjects)
         self.supports = samples.free_objects.supports
 

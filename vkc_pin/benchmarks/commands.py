@@ -274,9 +274,7 @@ def report_interruption(given: Sequence[str], stop: KeyboardInterrupt) -> int:
     """
     again = shlex.join(["vkc-pin", *given])
     detail = f"; {stop}" if str(stop) else ""
-    sys.stderr.write(
-        f"\nvkc-pin: stopped{detail}. The same command resumes it:\n{again}\n"
-    )
+    sys.stderr.write(f"\nvkc-pin: stopped{detail}. The same command resumes it:\n{again}\n")
     return EXIT_INTERRUPTED
 
 

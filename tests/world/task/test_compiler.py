@@ -104,6 +104,10 @@ def test_closing_joint_enters_the_range_of_its_latch_at_the_end(
     move = compile_steps([Actuate("door", {"hinge": end})], scene).phases[-1]
     assert (move.name, move.values) == ("move door.hinge", {"door.hinge": end})
     assert move.ranges["door.hinge"] == pytest.approx(allowed)
+    released = scene.with_state("door", {"knob": 0.5})
+    assert compile_steps([Actuate("door", {"hinge": end})], released).phases[-1].ranges == {
+        "door.hinge": HINGE
+    }
 
 
 def test_hinge_and_knob_are_actuated_together() -> None:

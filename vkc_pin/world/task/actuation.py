@@ -24,6 +24,7 @@ __all__ = [
     "choose_attachment",
     "compute_advance",
     "find_blocking_latches",
+    "find_closing_latches",
     "find_driven_coordinates",
     "find_driving_attachments",
     "find_push_directions",
@@ -136,14 +137,30 @@ def find_blocking_latches(
         values: Coordinate → final value, for the joints that are to move.
     """
     for latch in placed.object.latches:
-        coordinate = f"{placed.name}.{latch.joint}"
-        now = state.get(
-            coordinate, float(placed.state[placed.object.coordinates.index(latch.joint)])
-        )
-        goal = values.get(coordinate, now)
+        now, goal = _find_motion(placed, latch.joint, state, values)
         passes = (now - latch.held_at) * (goal - latch.held_at) < 0.0
         if goal != now and (latch.is_engaged(now) or passes):
             yield latch
+
+
+def find_closing_latches(
+    placed: PlacedObject, state: Mapping[str, float], values: Mapping[str, float]
+) -> Iterator[Latch]:
+    """Yield the latches that begin to act when joints move; see `find_blocking_latches`."""
+    for latch in placed.object.latches:
+        now, goal = _find_motion(placed, latch.joint, state, values)
+        is_released = min(_find_motion(placed, latch.released_by, state, values)) >= latch.threshold
+        if latch.is_engaged(goal) and not latch.is_engaged(now) and not is_released:
+            yield latch
+
+
+def _find_motion(
+    placed: PlacedObject, joint: str, state: Mapping[str, float], values: Mapping[str, float]
+) -> tuple[float, float]:
+    """Return the initial and the final value of a joint, [rad] or [m]."""
+    name = f"{placed.name}.{joint}"
+    now = state.get(name, float(placed.state[placed.object.coordinates.index(joint)]))
+    return now, values.get(name, now)
 
 
 def check_actuation(

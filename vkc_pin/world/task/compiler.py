@@ -17,6 +17,7 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actuation import (
     choose_attachment,
     find_blocking_latches,
+    find_closing_latches,
     find_driven_coordinates,
     find_push_directions,
     find_shared_coordinate,
@@ -291,35 +292,19 @@ class _Compiler:
                 after[release] = values[release]
             ranges[release] = (turned, upper)
             values[release] = turned if release in after else values.get(release, turned)
-        ranges |= self._keep_latches_open(placed, values, ranges)
+        # Once a joint is in the range of its latch, it can only move on to the latched position.
+        for latch in find_closing_latches(placed, self.state, values):
+            name = f"{step.object}.{latch.joint}"
+            (lower, upper), distance = ranges[name], self.state[name] - latch.held_at
+            away = min(abs(distance), latch.engaged_within + LATCH_GAP)
+            if distance > 0.0:
+                ranges[name] = max(lower, latch.held_at + away), upper
+            else:
+                ranges[name] = lower, min(upper, latch.held_at - away)
         self._append_motion("move", hold, where, values, ranges)
         if after:
             limits = {release: find_joint_limits(placed, release) for release in after}
             self._append_motion("turn", hold, where, after, limits)
-
-    def _keep_latches_open(
-        self,
-        placed: PlacedObject,
-        values: Mapping[str, float],
-        ranges: Mapping[str, tuple[float, float]],
-    ) -> dict[str, tuple[float, float]]:
-        """Return narrower ranges of joints that close, so that their latches engage at the end.
-
-        Once a joint is in the range of its latch, it can only move on to the latched position.
-        """
-        narrowed = {}
-        for latch in placed.object.latches:
-            name = f"{placed.name}.{latch.joint}"
-            begin = self.state.get(name, latch.held_at)
-            if latch.is_engaged(values.get(name, begin)) and not latch.is_engaged(begin):
-                away = min(abs(begin - latch.held_at), latch.engaged_within + LATCH_GAP)
-                lower, upper = ranges[name]
-                narrowed[name] = (
-                    (max(lower, latch.held_at + away), upper)
-                    if begin > latch.held_at
-                    else (lower, min(upper, latch.held_at - away))
-                )
-        return narrowed
 
     def touch(self, step: Touch, where: str) -> None:
         """Add the phase that brings a frame to its target; free held objects are carried along."""

@@ -25,11 +25,13 @@ from helpers.judging import (
     replace_object,
 )
 from helpers.motions import make_object_motion
+from helpers.supports import make_plate_scene, slide_plate
 
 import vkc_pin as vkc
 from vkc_pin import (
     InputError,
     Options,
+    PhaseSpan,
     PlacedObject,
     Report,
     Scene,
@@ -294,6 +296,32 @@ def test_joints_must_not_move_without_a_grasp(door_plan: vkc.Plan) -> None:
     assert unheld["door.hinge"].amount == pytest.approx(np.abs(hinge).max())
     assert hinge[unheld["door.hinge"].waypoint] == pytest.approx(hinge[np.argmax(np.abs(hinge))])
     assert "door is not grasped" in unheld["door.hinge"].detail
+
+
+@pytest.mark.parametrize(
+    ("tip", "held", "amount"),
+    [
+        (0.099, [True], 0.0),
+        (0.12, [True], 0.02),
+        (0.18, [True, True], 0.08),  # half of it in each phase
+        (0.18, [True, False, True], 0.08),
+    ],
+)
+def test_tilt_of_a_supported_object_counts_from_where_it_was_put_down(
+    tip: float, held: list[bool], amount: float
+) -> None:
+    scene = make_plate_scene("flap")
+    motion = slide_plate(scene, tip)
+    (moving,) = motion.phases
+    ends = np.linspace(0, moving.last, len(held) + 1).astype(int).tolist()
+    phases = tuple(
+        PhaseSpan(f"part {k}", ends[k], ends[k + 1], moving.holds if is_held else ())
+        for k, is_held in enumerate(held)
+    )
+    report = validate(scene, [vkc.Actuate("plate", {"tip": tip})], replace(motion, phases=phases))
+    found = [one for one in report.violations if one.constraint == "tips"]
+    expected = [("cup", "rad", 30, pytest.approx(amount, abs=1e-9))] * (amount > 0.0)
+    assert [(one.subject, one.unit, one.waypoint, one.amount) for one in found] == expected
 
 
 def make_drive_to_a_crate(gap: float) -> tuple[Scene, Trajectory]:

@@ -11,6 +11,7 @@ import bisect
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+import pinocchio as pin
 
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import check_instance
@@ -196,17 +197,21 @@ def _check_limits(samples: Samples) -> Iterator[Violation]:
 
 
 def _check_tilt(samples: Samples) -> Iterator[Violation]:
-    """Check that moving links that support an object stay level."""
-    supports = zip(samples.trajectory.phases, samples.free_objects.supports, strict=True)
-    for phase, supported in supports:
+    """Check that objects on moving links stay as upright as they were when last put down."""
+    phases, objects = samples.trajectory.phases, samples.scene.objects
+    put_down: dict[str, pin.SE3] = {}
+    for phase, supported in zip(phases, samples.free_objects.supports, strict=True):
+        put_down = {name: there for name, there in put_down.items() if name not in phase.held}
         rows = samples.get_rows(phase)
         for owner, label in supported.items():
-            links = samples.compute_placements(rows, label)
-            angles = np.array([compute_tilt(links[0], link) for link in links])
+            frame = f"{owner}.{objects[owner].object.base_link}"
+            placements = samples.compute_placements(rows, frame)
+            begin = put_down.setdefault(owner, placements[0])
+            angles = np.array([compute_tilt(begin, placement) for placement in placements])
             worst = int(np.argmax(angles))
             if not angles[worst] <= MAX_TILT:
                 angle = f"{angles[worst]:.2f} rad, more than {MAX_TILT:g} rad"
-                detail = f"its support '{label}' tilts by {angle}"
+                detail = f"its support '{label}' tilts it by {angle}, since it was put down"
                 yield samples.make_violation(
                     "tips", owner, angles[worst] - MAX_TILT, "rad", detail, row=int(rows[worst])
                 )

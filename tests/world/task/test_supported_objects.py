@@ -62,6 +62,10 @@ def test_tilting_support_is_rejected() -> None:
     message = r"'cup' rests on 'plate\.plate', which would tilt too much.*0\.5 rad"
     with expect_error(message, field="steps[0]"):
         compile_steps(make_plate_scene("flap"), vkc.Actuate("plate", {"tip": 0.5}))
+    tips = [vkc.Actuate("plate", {"tip": tip}) for tip in (0.09, 0.0, 0.09, 0.18)]
+    compile_steps(make_plate_scene("flap"), *tips[:3])
+    with expect_error("would tilt too much", field="steps[3]", got="0.18 rad"):
+        compile_steps(make_plate_scene("flap"), *tips)
 
 
 def test_object_on_moving_and_fixed_links_is_rejected() -> None:

@@ -44,10 +44,11 @@ class SupportTracker:
         self.carried: tuple[SupportedObject, ...] = ()
         self.moved: set[str] = set()
         self._on_moving: tuple[SupportedObject, ...] = ()
-        self._before: dict[str, PlacedObject] = {}
+        self._put_down: dict[str, pin.SE3] = {}  # placements where last put down
 
     def add_carried(self, hold: Hold, state: Mapping[str, float], where: str) -> None:
         """Add the objects that rest on an object that is grasped, if that is free."""
+        self._put_down.pop(hold.object, None)
         placed = self.scene.objects[hold.object]
         if placed.object.free:
             now = {hold.object: placed, **place_objects(self.scene, state, self.resting)}
@@ -76,16 +77,18 @@ class SupportTracker:
         self, hold: Hold, joints: Set[str], state: Mapping[str, float], where: str
     ) -> None:
         """Add the objects that rest on a fixed object of which joints begin to move."""
-        self._before = place_objects(self.scene, state, self.resting)
-        self._on_moving = find_objects_supported_by(self.scene, self._before, hold, joints, where)
-        self.moved |= {one.object for one in self._on_moving}
+        before = place_objects(self.scene, state, self.resting)
+        self._on_moving = find_objects_supported_by(self.scene, before, hold, joints, where)
+        for one in self._on_moving:
+            self._put_down.setdefault(one.object, self.resting[one.object])
+            self.moved.add(one.object)
 
     def end_motion(self, state: Mapping[str, float], where: str) -> None:
         """Release the objects added by `begin_motion` at their new placements."""
         for one in self._on_moving:
             name, after = one.hold.object, place_objects(self.scene, state, self.resting)
             self.resting[one.object] = compute_placement_after_motion(
-                one, self._before[name], after[name], where
+                one, self._put_down[one.object], after[name], where
             )
         self._on_moving = ()
 
@@ -149,12 +152,15 @@ def find_objects_supported_by(
 
 
 def compute_placement_after_motion(
-    one: SupportedObject, before: PlacedObject, after: PlacedObject, where: str
+    one: SupportedObject, put_down: pin.SE3, after: PlacedObject, where: str
 ) -> pin.SE3:
-    """Return the placement of a supported object after a joint of its support has moved."""
-    link = after.link_placement(one.link)
-    _check_tilt(one, compute_tilt(before.link_placement(one.link), link), MAX_TILT, where)
-    return link * one.placement_in_link
+    """Return the placement of a supported object after a joint of its support has moved.
+
+    The motion must not tilt the object too much from `put_down`, where it was last put down.
+    """
+    placement = after.link_placement(one.link) * one.placement_in_link
+    _check_tilt(one, compute_tilt(put_down, placement), MAX_TILT, where)
+    return placement
 
 
 def _check_tilt(one: SupportedObject, angle: float, most: float, where: str) -> None:

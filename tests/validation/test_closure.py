@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers.executions import plan_drawer
+from helpers.judging import replace_object
 from helpers.small_problems import make_full_scene
+from helpers.telescopes import write_telescope
 
 import vkc_pin as vkc
-from vkc_pin import Plan, Trajectory, validate
+from vkc_pin import PhaseSpan, Plan, Trajectory, validate
 from vkc_pin.validation.closure import (
     RESOLUTION,
     find_drift,
 )
 from vkc_pin.validation.samples import Samples
+from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.trajectory.curve import Curve
 
 LIMITS = (vkc.Tolerances().closure_position, vkc.Tolerances().closure_angle)
@@ -99,3 +104,140 @@ def test_drift_of_grasps_with_freedoms_agrees_with_a_fine_grid(attachment: str) 
     drift = find_drift(samples, span, span.holds[0], (0.0, 0.0))
     fine = samples.compute_grasp_errors_at(span.holds[0], np.linspace(*times, 5001))
     np.testing.assert_allclose(drift.measured, fine.max(axis=0), rtol=0.0, atol=5e-6)
+
+
+FAR = 5.0  # [m] a lever arm that is longer than all others together
+BOOM = """<robot name="boom">
+<link name="base"/><link name="arm"/><link name="mast"/><link name="tip"/>
+<joint name="hinge" type="revolute"><parent link="base"/><child link="arm"/>
+  <axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="9" effort="9"/></joint>
+<joint name="extend" type="prismatic"><parent link="arm"/><child link="mast"/>
+  <origin xyz="{joint} 0 0"/>
+  <axis xyz="1 0 0"/><limit lower="-9" upper="9" velocity="9" effort="9"/></joint>
+<joint name="pin" type="fixed"><parent link="mast"/><child link="tip"/>
+  <origin xyz="{link} 0 0"/></joint>
+</robot>"""
+
+
+def grasp_boom(
+    values: dict[str, float], *, robot: str = "husky_ur5e", by: vkc.Hold | None = None
+) -> tuple[vkc.Scene, vkc.Hold]:
+    """Return a scene whose robot grasps a boom exactly, and the hold. In a hand, it is level.
+
+    Args:
+        values: Values of joints and freedoms, and lengths [m] along the boom: "joint", "link",
+            "grip" and, to the axis of a freedom, "through".
+        robot: Name or file of the robot.
+        by: Hold of a stick whose tip grasps the boom. Default: the hand grasps it.
+    """
+    document: dict[str, Any] = {"robot": robot, "start": {"base": [0.0, 0.0, 0.0]}}
+    document["arena"] = {"x": [-3.0, 3.0], "y": [-3.0, 3.0]}
+    tool = vkc.Scene.from_document(document).tool_placement().rotation
+    lengths = {name: values.get(name, 0.0) for name in ("joint", "link", "grip", "through")}
+    along, up = tool[0].tolist(), tool[2].tolist()  # axes of the boom in the tool's frame
+    through = [lengths["through"] * entry for entry in along]
+    freedoms: list[dict[str, Any]] = [
+        {"name": "turn", "turn": up, "limits": [-1, 1]},
+        {"name": "slide", "slide": along, "limits": [-9, 9]},
+        {"name": "spin", "turn": up, "limits": [-4, 4], "through": through},
+    ]
+    grip = {"name": "grip", "link": "tip", "position": [lengths["grip"], 0.0, 0.0]}
+    grip |= {"approach": tool[:, 2].tolist(), "closing": tool[:, 0].tolist(), "freedoms": freedoms}
+    boom = {"urdf": BOOM.format(**lengths), "attachments": [grip]}
+    document["objects"] = [{"name": "boom", "type": boom, "position": [0.0, 0.0, 0.0]}]
+    if by is not None:
+        document["objects"].append({"name": "stick", "type": "stick", "position": [0.0, 0.0, 1.0]})
+    scene = vkc.Scene.from_document(document).with_held({"stick": "grip"} if by else {})
+    item = scene.objects["boom"].object
+    attachment = item.attachments["grip"]
+    state, freedom = (
+        [values.get(name, 0.0) for name in names]
+        for names in (("hinge", "extend"), ("turn", "slide", "spin"))
+    )
+    grasped = item.link_placement("tip", state) * attachment.tool(freedom)
+    hand = scene.objects["stick"].link_placement("tip") if by else scene.tool_placement()
+    there = hand * compute_hand_frame(scene.robot, attachment) * grasped.inverse()
+    hold = vkc.Hold("boom", "grip", by, "tip" if by else None)
+    return replace_object(scene, "boom", placement=there), hold
+
+
+@pytest.mark.parametrize(
+    ("bump", "values"),
+    [
+        ("boom.hinge", {"joint": FAR}),
+        ("boom.hinge", {"link": FAR}),
+        ("boom.hinge", {"grip": FAR}),
+        ("boom.hinge", {"extend": FAR}),
+        ("boom.hinge", {"slide": FAR}),
+        ("boom.hinge", {"through": FAR, "spin": np.pi}),
+        ("boom.extend", {}),
+        ("boom.grip_turn", {"slide": FAR}),
+        ("boom.grip_turn", {"through": FAR, "spin": np.pi}),
+        ("boom.grip_slide", {}),
+        ("boom.grip_spin", {"through": FAR}),
+        ("base_x", {}),
+        ("base_yaw", {}),
+        ("wrist_3_joint", {}),
+        ("lift", {}),  # of a robot with a wrist that turns five times as fast
+        ("stick.grip_turn", {}),  # the tip of a stick grasps the boom
+        ("stick.grip_slide", {}),
+    ],
+    ids=str,
+)
+def test_drift_between_exact_grasps_is_found(
+    bump: str, values: dict[str, float], tmp_path: Path
+) -> None:
+    """One coordinate follows a parabola; the grasp is exact at the only two samples."""
+    robot, by = "husky_ur5e", None
+    if bump == "lift":
+        couplings = "roll_joint: {joint: lift, multiplier: 5.0}"
+        robot = str(write_telescope(tmp_path, couplings=couplings))
+    elif bump.startswith("stick."):
+        by = vkc.Hold("stick", "grip")
+    scene, hold = grasp_boom(values, robot=robot, by=by)
+    items = ("hinge", "extend", "grip_turn", "grip_slide", "grip_spin")
+    row = [*scene.start, *(values.get(name.removeprefix("grip_"), 0.0) for name in items)]
+    names = (*scene.robot.coordinates.names, *(f"boom.{name}" for name in items))
+    if by is not None:
+        names, row = (*names, "stick.grip_slide", "stick.grip_turn"), [*row, 0.0, 0.0]
+    height, times = 1.5e-4, np.array([0.0, 0.5])
+    rows, rates = np.tile(row, (2, 1)), np.zeros((2, len(row)))
+    rates[:, names.index(bump)] = np.array([4.0, -4.0]) * height / times[1]
+    span = PhaseSpan("all", 0, 1, (hold,) if by is None else (by, hold))
+    curve = Curve(times, rows, rates)
+    motion = Trajectory(names, times, rows, (span,), len(scene.start), curve)
+    expected = check_drift_is_found(Samples(scene, motion), hold)
+    assert expected.max() >= 0.99 * height
+
+
+def check_drift_is_found(samples: Samples, hold: vkc.Hold) -> np.ndarray:
+    """Check the drift of a grasp that is exact at the only two samples; return it."""
+    (span,), times = samples.trajectory.phases, samples.times
+    assert len(times) == 2
+    np.testing.assert_allclose(samples.compute_grasp_errors(hold, np.arange(2)), 0.0, atol=1e-8)
+    expected = samples.compute_grasp_errors_at(hold, times.mean(keepdims=True))[0]
+    for kind in np.flatnonzero(expected > 5.0 * RESOLUTION).tolist():
+        limits = [1e3, 1e3]
+        limits[kind] = 0.99 * expected[kind]
+        drift = find_drift(samples, span, hold, (limits[0], limits[1]))
+        assert drift.measured[kind] == pytest.approx(expected[kind], abs=RESOLUTION)
+        assert drift.bound[kind] > limits[kind]
+    return expected
+
+
+def test_drift_of_a_constant_turn_is_found() -> None:
+    """The boom's end moves along an arc, and the hand along its chord at the same heading."""
+    radius, turn = 0.5, 9e-3
+    scene, hold = grasp_boom({"joint": radius})
+    angles = np.array([-0.5, 0.5]) * turn
+    change = radius * np.column_stack([np.cos(angles) - 1.0, np.sin(angles), 0.0 * angles])
+    rows = np.tile([*scene.start, *np.zeros(5)], (2, 1))
+    rows[:, :2] += (change @ scene.objects["boom"].placement.rotation.T)[:, :2]
+    robot = len(scene.start)
+    rows[:, robot], rows[:, robot + 2] = angles, -angles
+    names = [*scene.robot.coordinates.names, "boom.hinge", "boom.extend"]
+    names += [f"boom.grip_{name}" for name in ("turn", "slide", "spin")]
+    span = PhaseSpan("all", 0, 1, (hold,))
+    motion = Trajectory(tuple(names), np.array([0.0, 0.5]), rows, (span,), robot)
+    expected = check_drift_is_found(Samples(scene, motion), hold)
+    assert expected[0] == pytest.approx(radius * turn**2 / 8.0, rel=0.01)

@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import describe_box
+from helpers.drawers import replace_scene_fields
 from helpers.drives import (
     DT,
     drive_through,
@@ -75,6 +76,7 @@ def test_objects_must_begin_at_their_state(door_plan: vkc.Plan) -> None:
     [
         ("base_x", 6.2, 0.2, "m"),
         ("base_y", -6.2, 0.2, "m"),
+        ("base_x", 6.00008, 8e-5, "m"),
         (WRIST, 2 * np.pi + 0.05, 0.05, "rad"),
         (WRIST, -2 * np.pi - 0.01, 0.01, "rad"),
     ],
@@ -91,21 +93,22 @@ def test_limit_violation_names_coordinate_waypoint_and_excess(
     assert f"by {excess:.4f} {unit}" in found.detail
 
 
-def test_limit_violation_between_waypoints_is_found(hall: Scene) -> None:
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_limit_violation_between_waypoints_is_found(hall: Scene, side: float) -> None:
     """The curve overshoots the limit by 0.1 m after the second waypoint."""
-    rows = np.array([move_start(hall.start, x=x) for x in (0.0, 5.9, 5.9)])
+    rows = np.array([move_start(hall.start, x=side * x) for x in (0.0, 5.9, 5.9)])
     rates = np.zeros_like(rows)
-    rates[1:, 0] = [0.8, -0.8]
+    rates[1:, 0] = [0.8 * side, -0.8 * side]
     times = np.array([0.0, 20.0, 21.0])
     motion = replace(make_trajectory(hall, rows), times=times, curve=Curve(times, rows, rates))
-    report = validate(hall, [vkc.GoTo(5.9, 0.0)], motion)
+    report = validate(hall, [vkc.GoTo(side * 5.9, 0.0)], motion)
     (found,) = [one for one in report.violations if one.constraint == "limit"]
     assert (found.subject, found.waypoint) == ("base_x", 1)
     assert found.amount == pytest.approx(0.1)
 
 
 def test_start_may_exceed_limits_slightly(hall: Scene) -> None:
-    for outside, constraints in ((1e-8, []), (5e-3, []), (0.02, ["limit"])):
+    for outside, constraints in ((1e-8, []), (9e-3, []), (0.011, ["limit"])):
         start = np.array(hall.start)
         start[-1] = hall.robot.upper[-1] + outside
         end = move_start(start, x=1.0)
@@ -247,6 +250,8 @@ def test_latch_releases_the_hinge_only_with_the_knob_turned(
     ("hinge", "knob", "shortfall"),
     [
         ([0.0, 0.0, 0.3], [0.0, 0.4, 0.4], 0.1),
+        ([0.0, 0.0, 0.3], [0.0, 0.4995, 0.4995], 5e-4),
+        ([0.0, 0.0, 5e-4], [0.0, 0.0, 0.0], 0.5),
         ([0.3, -0.305, -0.305], [0.0, 0.0, 0.0], 0.5),
         ([0.0, 0.0, 0.3], [0.0, 0.5, 0.5], 0.0),
         ([0.0, 0.0, 0.3], [0.0, 0.51, 0.0], 0.0),
@@ -301,27 +306,42 @@ def test_joints_must_not_move_without_a_grasp(door_plan: vkc.Plan) -> None:
 @pytest.mark.parametrize(
     ("tip", "held", "amount"),
     [
-        (0.099, [True], 0.0),
-        (0.12, [True], 0.02),
-        (0.18, [True, True], 0.08),  # half of it in each phase
-        (0.18, [True, False, True], 0.08),
+        (0.099, ["plate"], 0.0),
+        (0.12, ["plate"], 0.02),
+        (0.18, ["plate", "plate"], 0.08),  # half of it in each phase
+        (0.18, ["plate", None, "plate"], 0.08),
+        (0.18, ["plate", "cup", "plate"], 0.0),  # the hand grasps the cup in between
     ],
 )
 def test_tilt_of_a_supported_object_counts_from_where_it_was_put_down(
-    tip: float, held: list[bool], amount: float
+    tip: float, held: list[str | None], amount: float
 ) -> None:
     scene = make_plate_scene("flap")
     motion = slide_plate(scene, tip)
-    (moving,) = motion.phases
-    ends = np.linspace(0, moving.last, len(held) + 1).astype(int).tolist()
+    holds = {"plate": motion.phases[0].holds, "cup": (vkc.Hold("cup", "side"),), None: ()}
+    ends = np.linspace(0, motion.phases[0].last, len(held) + 1).astype(int).tolist()
     phases = tuple(
-        PhaseSpan(f"part {k}", ends[k], ends[k + 1], moving.holds if is_held else ())
-        for k, is_held in enumerate(held)
+        PhaseSpan(f"part {k}", ends[k], ends[k + 1], holds[name]) for k, name in enumerate(held)
     )
-    report = validate(scene, [vkc.Actuate("plate", {"tip": tip})], replace(motion, phases=phases))
+    grasp = np.zeros((len(motion.times), 2))
+    motion = replace(
+        motion,
+        names=(*motion.names, "cup.side_slide", "cup.side_turn"),
+        positions=np.hstack([motion.positions, grasp]),
+        phases=phases,
+    )
+    report = validate(scene, [vkc.Actuate("plate", {"tip": tip})], motion)
     found = [one for one in report.violations if one.constraint == "tips"]
     expected = [("cup", "rad", 30, pytest.approx(amount, abs=1e-9))] * (amount > 0.0)
     assert [(one.subject, one.unit, one.waypoint, one.amount) for one in found] == expected
+
+
+@pytest.mark.parametrize("change", [2e-5, -2e-5])
+def test_slightest_motion_without_a_grasp_is_reported(door_plan: vkc.Plan, change: float) -> None:
+    scene = door_plan.scene.with_state("door", {"hinge": 0.5})
+    motion = make_object_motion(scene, "door", hinge=[0.5, 0.5, 0.5 + change], knob=[0.0] * 3)
+    report = validate(scene, [vkc.GoTo(*scene.start[:3])], motion)
+    check_only_violation(report, "unheld", "door.hinge", "rad", amount=pytest.approx(2e-5))
 
 
 def make_drive_to_a_crate(gap: float) -> tuple[Scene, Trajectory]:
@@ -343,6 +363,7 @@ def make_drive_to_a_crate(gap: float) -> tuple[Scene, Trajectory]:
         (0.0191, "", 0.0),
         (0.0185, "clearance", 0.0005),
         (0.015, "clearance", 0.004),
+        (-5e-5, "penetration", 5e-5),
         (-0.03, "penetration", 0.03),
     ],
 )
@@ -357,6 +378,62 @@ def test_clearance_violation_at_a_waypoint_is_reported(
         check_only_violation(report, constraint, "base_link – crate", "m", **fields)
     else:
         assert report.ok, report.lines()
+
+
+@pytest.mark.parametrize(
+    ("gap", "margin", "constraint", "amount"),
+    [
+        (0.0042, 0.005, "", 0.0),
+        (0.003, 0.005, "clearance", 0.001),
+        (-0.002, -0.003, "", 0.0),
+        (-0.002, -0.0025, "", 0.0),
+        (-0.002, -0.001, "penetration", 0.002),
+        (-0.002, 0.005, "penetration", 0.002),
+    ],
+)
+def test_exempt_pair_must_keep_its_own_margin(
+    gap: float, margin: float, constraint: str, amount: float
+) -> None:
+    scene, motion = make_drive_to_a_crate(gap)
+    allow = [{"pair": ["base_link", "crate"], "margin": margin}]
+    report = validate(replace_scene_fields(scene, allow=allow), [vkc.GoTo(1.0, 0.0)], motion)
+    found = [(one.constraint, one.amount) for one in report.violations]
+    assert found == ([(constraint, pytest.approx(amount, abs=1e-5))] if constraint else [])
+
+
+def test_clearance_is_checked_from_the_first_waypoint_on() -> None:
+    """The start may be closer to the crate than `dist_safe`."""
+    for begin, end, amounts in ((0.99, 1.0, [0.004]), (1.0, 0.99, [])):
+        scene, _ = make_drive_to_a_crate(0.015)
+        scene = scene.with_start(base=[begin, 0.0, 0.0])
+        rows = np.array([scene.start, move_start(scene.start, x=end)])
+        report = validate(scene, [vkc.GoTo(end, 0.0)], make_trajectory(scene, rows, dt=1.0))
+        found = [(one.constraint, one.waypoint, one.amount) for one in report.violations]
+        assert found == [("clearance", 1, pytest.approx(a, abs=1e-5)) for a in amounts]
+
+
+def test_links_of_the_robot_keep_self_distance(hall: Scene, drive: Trajectory) -> None:
+    """In an empty hall the links of the robot are the closest pair."""
+    steps = [vkc.GoTo(2.0, 0.0, np.pi / 2)]
+    nearest = validate(hall, steps, drive).clearance
+    for dist_safe, self_distance, short in (
+        (0.001, nearest + 0.005, 0.004),
+        (nearest + 0.005, 0.001, 0.0),
+    ):
+        options = Options(dist_safe=dist_safe, self_distance=self_distance)
+        report = validate(hall, steps, drive, options)
+        assert {one.constraint for one in report.violations} == ({"clearance"} if short else set())
+        worst = max((one.amount for one in report.violations), default=0.0)
+        assert worst == pytest.approx(short, abs=1e-5)
+
+
+def test_clearance_is_required_at_waypoints_only() -> None:
+    board = describe_box("board", [0.3, 0.02, 0.3], [2.0, -0.36, 0.15])
+    scene = make_hall(obstacles=[board])
+    rows = np.array([scene.start, move_start(scene.start, x=4.0)])
+    report = validate(scene, [vkc.GoTo(4.0, 0.0)], make_trajectory(scene, rows, dt=20.0))
+    assert report.ok, report.lines()
+    assert 0.0 < report.clearance < Options().dist_safe
 
 
 def test_penetration_between_waypoints_is_found() -> None:

@@ -203,6 +203,35 @@ def test_torque_violation_at_rest_is_reported() -> None:
     assert load_stationary(make_grasping_scene()).find_violations() == []
 
 
+@pytest.mark.parametrize(("ratio", "ok"), [(1.004, True), (1.006, False)])
+def test_torques_within_the_tolerance_are_accepted(ratio: float, ok: bool) -> None:
+    """At rest, torques are linear in the mass of the stick."""
+    masses = np.array([10.0, 20.0])
+    known = [load_stationary(hold_stick(mass)).torque_ratios.max(axis=0) for mass in masses]
+    joint = int(known[1].argmax())
+    mass = 10.0 + 10.0 * (ratio - known[0][joint]) / (known[1][joint] - known[0][joint])
+    loads = load_stationary(hold_stick(mass))
+    assert loads.torque_ratios.max() == pytest.approx(ratio, abs=1e-6)
+    excess = np.abs(loads.torques[:, joint]).max() * (1.0 - 1.0 / ratio)
+    found = [one.amount for one in loads.find_violations()]
+    assert found == ([] if ok else [pytest.approx(excess, rel=1e-3)])
+
+
+def test_weight_counts_from_the_first_cubic_of_a_grasp() -> None:
+    scene = hold_stick(60.0)
+    motion, times = make_stationary_motion(scene), np.arange(3.0)
+    rows = np.tile(motion.positions[0], (3, 1))
+    phases = (PhaseSpan("before", 0, 1), PhaseSpan("grasped", 1, 2, scene.holds))
+    curve = Curve(times, rows, np.zeros_like(rows))
+    motion = replace(motion, times=times, positions=rows, phases=phases, curve=curve)
+    found = MotorLoads(Samples(scene.with_held({}), motion)).find_violations()
+    expected = load_stationary(scene).find_violations()
+    assert {one.subject: one.amount for one in found} == pytest.approx(
+        {one.subject: one.amount for one in expected}
+    )
+    assert {one.waypoint for one in found} == {1}
+
+
 def test_report_remarks_on_missing_masses() -> None:
     scene = load_door_with_closer(**STIFF_SPRING)
     model = pin.Model(scene.robot.model)
@@ -221,7 +250,12 @@ def test_report_remarks_on_massless_payload() -> None:
 
 
 def make_circle(
-    scene: Scene, *, is_smooth: bool, peak: float = 0.4, aside: float = 0.0
+    scene: Scene,
+    *,
+    is_smooth: bool,
+    peak: float = 0.4,
+    aside: float = 0.0,
+    signs: tuple[int, int] = (1, 1),
 ) -> tuple[list[Any], Trajectory]:
     """Return the goal and the motion of a quarter circle of 1 m, with a lateral velocity.
 
@@ -230,6 +264,7 @@ def make_circle(
         is_smooth: Whether the motion has a curve.
         peak: Largest angular velocity [rad/s].
         aside: Largest velocity along −x [m/s], which is lateral at the end.
+        signs: 1 or −1 for motion ahead or back, and for a turn to the left or right.
     """
     duration = 1.5 * (np.pi / 2) / peak
     times = np.linspace(0.0, duration, 81)
@@ -241,22 +276,27 @@ def make_circle(
     rates[:, 0], rates[:, 1], rates[:, 2] = turning * np.cos(yaw), turning * np.sin(yaw), turning
     rows[1:, 0] -= np.cumsum((slide[1:] + slide[:-1]) / 2 * np.diff(times))
     rates[:, 0] -= slide
+    ahead, left = signs
+    for values in (rows, rates):
+        values[:, :3] *= [ahead, ahead * left, left]
     curve = Curve(times, rows, rates) if is_smooth else None
     motion = replace(make_trajectory(scene, rows), times=times, curve=curve)
     return [vkc.GoTo(*rows[-1, :3])], motion
 
 
+in_all_directions = pytest.mark.parametrize("signs", [(1, 1), (1, -1), (-1, 1), (-1, -1)], ids=str)
 with_and_without_curve = pytest.mark.parametrize("is_smooth", [True, False], ids=["curve", "steps"])
 
 
 @with_and_without_curve
-def test_slip_is_reported(is_smooth: bool) -> None:
+@in_all_directions
+def test_slip_is_reported(signs: tuple[int, int], is_smooth: bool) -> None:
     """At heading θ, the velocity along −x is lateral by a factor of sin θ."""
     scene = make_hall(base="differential")
-    rolling = validate(scene, *make_circle(scene, is_smooth=is_smooth))
+    rolling = validate(scene, *make_circle(scene, is_smooth=is_smooth, signs=signs))
     assert rolling.ok
     assert bool(rolling.bounds) == is_smooth, "only curves have limiting constraints"
-    goal, motion = make_circle(scene, is_smooth=is_smooth, aside=0.01)
+    goal, motion = make_circle(scene, is_smooth=is_smooth, aside=0.01, signs=signs)
     unit, tolerance = ("m/s", 1e-3) if is_smooth else ("m", 1e-4)
     found = check_only_violation(validate(scene, goal, motion), "slip", "base", unit)
     if is_smooth:
@@ -273,18 +313,40 @@ def test_slip_is_reported(is_smooth: bool) -> None:
     assert validate(make_hall(), goal, motion).ok
     for ratio, ok in ((0.95, True), (1.1, False)):
         aside = 0.01 * ratio * tolerance / found.amount
-        assert validate(scene, *make_circle(scene, is_smooth=is_smooth, aside=aside)).ok == ok
+        circle = make_circle(scene, is_smooth=is_smooth, aside=aside, signs=signs)
+        assert validate(scene, *circle).ok == ok
+
+
+def test_slip_within_one_cubic_is_found() -> None:
+    """The base turns by 0.2 rad while it moves along a chord: it rolls half-way, and at rest."""
+    scene, turn = make_hall(base="differential"), 0.2
+    rows = np.array([scene.start, scene.start])
+    rows[1, :3] += [np.cos(turn / 2), np.sin(turn / 2), turn]
+    times = np.array([0.0, 10.0])
+    curve = Curve(times, rows, np.zeros_like(rows))
+    motion = replace(make_trajectory(scene, rows), times=times, curve=curve)
+    report = validate(scene, [vkc.GoTo(*rows[1, :3])], motion)
+    moments = np.linspace(*times, 2001)
+    angles = motion(moments)[:, 2] - turn / 2
+    slip = np.abs(np.linalg.norm(motion.velocity(moments)[:, :2], axis=1) * np.sin(angles))
+    amount = pytest.approx(slip.max(), rel=0.02)
+    check_only_violation(report, "slip", "base", "m/s", amount=amount)
 
 
 @with_and_without_curve
+@in_all_directions
 @pytest.mark.parametrize(("radius", "ok"), [(0.997, True), (1.01, False)])
-def test_turning_radius_is_checked(radius: float, ok: bool, is_smooth: bool) -> None:
+def test_turning_radius_is_checked(
+    radius: float, ok: bool, signs: tuple[int, int], is_smooth: bool
+) -> None:
     scene = make_hall(base="ackermann", turning_radius=radius)
-    goal, motion = make_circle(scene, is_smooth=is_smooth)
+    goal, motion = make_circle(scene, is_smooth=is_smooth, signs=signs)
     report = validate(scene, goal, motion)
     assert report.ok == ok
     if not ok:
-        unit, turn = ("m/s", 0.4) if is_smooth else ("m", np.diff(motion.positions[:, 2]).max())
+        unit, turn = (
+            ("m/s", 0.4) if is_smooth else ("m", np.abs(np.diff(motion.positions[:, 2])).max())
+        )
         amount = pytest.approx((radius - 1.0) * turn, rel=1e-2)
         check_only_violation(report, "turning", "base", unit, amount=amount)
 
@@ -302,16 +364,20 @@ def test_steered_base_must_not_turn_in_place() -> None:
 
 
 @with_and_without_curve
+@in_all_directions
 @pytest.mark.parametrize("base", ["differential", "ackermann"])
-def test_wheel_speed_is_checked(base: str, is_smooth: bool) -> None:
+def test_wheel_speed_is_checked(base: str, signs: tuple[int, int], is_smooth: bool) -> None:
     """On a circle of 1 m the outer wheels roll 1 + track / 2 times as fast as the base."""
     scene = make_hall(base=base, **({"turning_radius": 0.8} if base == "ackermann" else {}))
     assert scene.robot.wheels is not None
     rim = scene.robot.wheels.rim_speed
     peak = rim / (1.0 + scene.robot.wheels.track / 2)
-    assert validate(scene, *make_circle(scene, is_smooth=is_smooth, peak=0.9995 * peak)).ok
-    goal, motion = make_circle(scene, is_smooth=is_smooth, peak=1.02 * peak)
+    below, above, far = (
+        make_circle(scene, is_smooth=is_smooth, peak=share * peak, signs=signs)
+        for share in (0.9995, 1.002, 1.02)
+    )
+    assert validate(scene, *below).ok
     amount = pytest.approx(0.02 * rim, rel=0.02)
-    check_only_violation(validate(scene, goal, motion), "wheels", "base", "m/s", amount=amount)
-    assert not validate(scene, *make_circle(scene, is_smooth=is_smooth, peak=1.002 * peak)).ok
-    assert validate(make_hall(), goal, motion).ok
+    check_only_violation(validate(scene, *far), "wheels", "base", "m/s", amount=amount)
+    assert not validate(scene, *above).ok
+    assert validate(make_hall(), *far).ok

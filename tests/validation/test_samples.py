@@ -88,6 +88,30 @@ def test_samples_are_dense(seed: int, grasp: str) -> None:
     np.testing.assert_array_equal([*before][1:], rows[:-1])
 
 
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("share", [1.0, 100.0])
+def test_samples_of_a_curve_are_close_to_it(share: float, seed: int) -> None:
+    """Between two samples, a curve deviates from its chord by at most a tenth of a step.
+
+    Its coordinates move by about `share` of a step between two knots, and back.
+    """
+    motion, rng = sample_motion(seed), np.random.default_rng(seed)
+    lengths = np.array([name in LENGTHS for name in motion.names])
+    steps = np.where(lengths, LENGTH_STEP, ANGLE_STEP)
+    rates = 0.1 * share * steps * rng.uniform(-1.0, 1.0, motion.positions.shape)
+    rows, times = np.tile(motion.positions[0], (len(rates), 1)), 10.0 * motion.times
+    curve = Curve(times, rows, rates)
+    samples = Samples(
+        make_full_scene(), dataclasses.replace(motion, times=times, positions=rows, curve=curve)
+    )
+    rows, spans = curve.at(samples.times), np.diff(samples.times)
+    assert (np.abs(np.diff(rows, axis=0)) <= steps * (1 + 1e-6)).all()
+    for at in (0.25, 0.5, 0.75):
+        chord = (1.0 - at) * rows[:-1] + at * rows[1:]
+        deviation = np.abs(curve.at(samples.times[:-1] + at * spans) - chord)
+        assert (deviation <= 0.1 * steps * (1 + 1e-6)).all()
+
+
 @pytest.mark.parametrize("grasp", GRASPS)
 def test_grasp_errors_are_measured_from_the_frame_of_the_attachment(grasp: str) -> None:
     scene, trajectory = make_full_scene(), sample_motion(4, grasp=grasp)

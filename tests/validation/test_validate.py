@@ -128,6 +128,9 @@ def test_fixed_base_must_not_move() -> None:
     driven = drive_through(scene, scene.start, move_start(scene.start, x=1.1))
     found = validate(scene, [vkc.GoTo(1.1, -2.0)], driven)
     assert ("limit", "base_x") in get_violation_names(found)
+    moved = drive_through(scene, scene.start, move_start(scene.start, yaw=0.51))
+    found = validate(scene, [vkc.GoTo(1.0, -2.0)], moved)
+    check_only_violation(found, "limit", "base_yaw", "rad", amount=pytest.approx(0.01))
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from helpers.carrying import (
     move_base,
     solve_above,
 )
-from helpers.drawers import compute_tool_pose
+from helpers.drawers import add_boxes, compute_tool_pose
 from helpers.judging import replace_object
 from helpers.litter import BIN_POSITION, LITTER_POSITION, describe_shelf, make_littered_scene
 from helpers.small_problems import make_full_scene
@@ -327,3 +327,32 @@ def test_step_that_begins_in_a_dead_end_is_planned_with_the_one_before() -> None
     draft = first.result.plan.trajectory
     assert draft.column("door.hinge")[-1] == pytest.approx(-1.5, abs=1e-3)
     np.testing.assert_allclose(draft.positions[-1, :2], [4.1, -0.3], atol=1e-3)
+
+
+def test_failed_step_stays_alone_if_its_holds_cannot_be_joined() -> None:
+    """Two holds of one joint are no chain, so that the step is not planned with the one before.
+
+    A post stands in the way of the door between the ends of both steps.
+    """
+    scene, options = make_refrigerator(), vkc.Options()
+    refrigerator = scene.objects["it"]
+    (handle, free), half = ("handle_left", "handle_left_free"), {"hinge_left": 0.45}
+    grip = refrigerator.object.attachments[handle]
+    post = refrigerator.with_state(half).link_placement(grip.link) * grip.placement
+    x, y, z = post.translation.tolist()
+    scene = add_boxes(scene, post=((0.02, 0.02, 0.1), (x, y, z + 0.6)))
+    steps = [
+        vkc.GoTo(*(scene.start[:2] + 0.1)),
+        vkc.Actuate("it", {"hinge_left": 0.2}, handle),
+        vkc.Actuate("it", {"hinge_left": 0.8}, free),
+    ]
+    request = PlanningRequest("auto", options, random_seed=1, is_draft=True)
+    parts = plan_each_step(scene, compile_task(scene, steps, options), request)
+    assert [(part.first, part.last) for part in parts] == [(0, 0), (1, 1), (2, 2)]
+    assert [part.result.is_solved for part in parts] == [True, True, False]
+    last = parts[-1].result
+    assert last.plan.steps == (steps[-1],)
+    assert not last.is_blocked_after(scene)
+    (note,) = last.plan.report.notes
+    assert "no path for it.hinge_left, proven" in note
+    assert "it.door_left – post" in note

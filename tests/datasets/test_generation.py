@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import csv
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -10,13 +12,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from helpers.datasets import SMALL
+from helpers.door_closers import replace_object_fields
 from helpers.shards import change_demo
 
 from vkc_pin.datasets.dataset import Dataset, Register
 from vkc_pin.datasets.generation import generate
 from vkc_pin.datasets.recipe import load_recipe
 from vkc_pin.errors import InputError, UnknownNameError, VkcError
+from vkc_pin.world.scene.scene import load_scene
 
 pytest.importorskip("h5py")
 EPISODES = 4
@@ -234,6 +239,36 @@ def test_generation_without_success_raises(tmp_path: Path) -> None:
     far = {**SMALL, "tasks": ["drive-open"], "start": {"distance": [90.0, 91.0]}}
     with pytest.raises(VkcError, match=r"attempts gave 0 of 1 episodes.*no free start"):
         generate(far, 1, tmp_path / "out")
+
+
+def test_attempts_that_fail_in_physics_are_kept_with_their_reason(tmp_path: Path) -> None:
+    """The first drawer resists more than the hand can hold, which plans do not consider."""
+    pytest.importorskip("mujoco")
+    stiff = replace_object_fields(
+        load_scene("drawer"), "drawer", joints={"slide": {"friction": 282.0}}
+    )
+    file = tmp_path / "stiff.yaml"
+    file.write_text(yaml.safe_dump(stiff.document), encoding="utf-8")
+    recipe = {"name": "physics", "tasks": ["drive-open"], "scenes": [str(file), "drawer"]}
+    recipe |= {"rooms": {"episodes": 1}, "simulate": True}
+    out = generate(recipe, 1, tmp_path / "out").folder
+    (failed,) = csv.DictReader((out / "failures.csv").open(encoding="utf-8"))
+    assert (failed["number"], failed["status"]) == ("0", "physics")
+    assert re.match(r"step 1: drawer.slide misses its goal by \d+\.\d mm at", failed["reason"])
+    assert re.search(r"; drawer\.handle\w* was pulled out of the hand at", failed["reason"])
+    records = [
+        record
+        for line in (out / "journal.jsonl").read_text(encoding="utf-8").splitlines()
+        for record in json.loads(line).get("records", ())
+    ]
+    assert [(one["number"], one["success"], one["simulated"]) for one in records] == [
+        (0, False, True),
+        (1, True, True),
+    ]
+    assert records[0]["reason"] == failed["reason"]
+    assert records[0]["evaluations"] > 0  # as planned, before physics
+    assert Dataset.open(out).numbers() == [1]
+    assert sorted(file.name for file in (out / "work").iterdir()) == ["00000001.hdf5"]
 
 
 def make_record(number: int) -> dict[str, Any]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.drives import make_hall
+from helpers.telescopes import write_coupled_scene
 
 import vkc_pin as vkc
 from oracle.__main__ import main
@@ -257,6 +260,41 @@ def test_cup_on_a_tilting_door_tips(plans: dict[str, Path], tmp_path: Path) -> N
     (tipped,) = [one for one in found if one.rule == "tips"]
     assert (tipped.subject, tipped.amount) == ("cold_cup", pytest.approx(0.17 - 0.1, abs=2e-3))
     assert "unheld dishwasher.door" in {f"{one.rule} {one.subject}" for one in found}
+
+
+INERTIAL = (
+    '<inertial><origin xyz="0.05 0 0.02"/><mass value="2"/>'
+    '<inertia ixx="0.02" iyy="0.03" izz="0.04" ixy="0" ixz="0" iyz="0"/></inertial>'
+)
+
+
+def load_coupled_robot(folder: Path, effort: float) -> vkc.Scene:
+    """Return a scene whose robot has coupled joints, moving links of 2 kg and effort limits."""
+    scene = write_coupled_scene(folder)
+    file = folder / "robot.urdf"
+    urdf = file.read_text(encoding="utf-8").replace('effort="10"', f'effort="{effort}"')
+    moving = r'<link name="(segment_\d|yaw|pitch|roll|hand)">'
+    urdf = re.sub(moving, lambda match: match.group(0) + INERTIAL, urdf)
+    file.write_text(urdf, encoding="utf-8")
+    return vkc.Scene.from_document(scene.document, folder)
+
+
+def test_torques_of_coupled_joints_agree_with_validation(tmp_path: Path) -> None:
+    """The lift also turns the wrist: its motor accelerates both, at first by 155.5 N."""
+    scene = load_coupled_robot(tmp_path, 1000.0)
+    goal = scene.with_start(base=scene.start[:3], arm=scene.start[3:] + np.array([0.3, 0.1, 0.5]))
+    plan = vkc.plan(scene, [vkc.Reach(goal.tool_placement())])
+    assert plan.success, plan.summary()
+    limit = 152.5  # holds the arm at rest
+    weak = load_coupled_robot(tmp_path, limit)
+    report = vkc.validate(weak, plan.steps, plan.trajectory, plan.options)
+    (expected,) = report.violations
+    changed = dataclasses.replace(plan, scene=weak, report=report, status="rejected")
+    (found,) = judge(changed.save(tmp_path / "weak.npz")).found
+    assert (found.rule, found.subject) == (expected.constraint, expected.subject)
+    assert found.subject == "lift"
+    assert found.amount + 0.01 * limit == pytest.approx(expected.amount, abs=1e-2)
+    load_coupled_robot(tmp_path, 1000.0)  # restored, since the plan is judged again
 
 
 def test_oracle_does_not_import_the_package(plans: dict[str, Path]) -> None:

@@ -12,11 +12,13 @@ import pytest
 from helpers.drives import drive_through, move_start
 from helpers.executions import make_grasping_scene, make_stationary_motion
 from helpers.judging import check_only_violation, get_approach, get_violation_names, replace_object
+from helpers.motions import make_object_motion
 from helpers.robots import compute_placement
 
 import vkc_pin as vkc
 from vkc_pin import InputError, Report, Scene, Trajectory, UnknownNameError, validate
 from vkc_pin.world.task.steps import Step
+from vkc_pin.world.trajectory.curve import Curve
 
 
 def validate_door(plan: vkc.Plan, *steps: Step, scene: Scene | None = None) -> Report:
@@ -79,6 +81,7 @@ def test_missed_reach_is_reported(hall: Scene, drive: Trajectory, frame: str | N
     [
         ((2.003, 0.004, np.pi / 2), "base", "m", 0.005),
         ((2.0, 0.0, np.pi / 2 + 2 * np.pi - 0.02), "base heading", "rad", 0.02),
+        ((2.0, 0.0, np.pi / 2 + 0.02), "base heading", "rad", 0.02),
     ],
 )
 def test_missed_base_pose_is_reported(
@@ -86,6 +89,34 @@ def test_missed_base_pose_is_reported(
 ) -> None:
     report, amount = validate(hall, [vkc.GoTo(*goal)], drive), pytest.approx(error - 1e-3)
     check_only_violation(report, "goal", subject, unit, waypoint=40, amount=amount)
+    field = {"m": "goal_position", "rad": "goal_angle"}[unit]
+    for accepted, ok in ((1.01 * error, True), (0.99 * error, False)):
+        tolerances = dataclasses.replace(vkc.Tolerances(), **{field: accepted})
+        assert validate(hall, [vkc.GoTo(*goal)], drive, tolerances=tolerances).ok == ok
+
+
+@pytest.mark.parametrize("between", [False, True])
+def test_object_must_not_move_and_return_before_its_step(
+    door_plan: vkc.Plan, between: bool
+) -> None:
+    """The door is opened and shut again, at or between waypoints, although a drive comes first."""
+    scene, here = door_plan.scene, door_plan.scene.start[:3].tolist()
+    hold = (vkc.Hold("door", "handle"),)
+    phases = (vkc.PhaseSpan("swing", 0, 2, hold), vkc.PhaseSpan("drive", 2, 3, hold))
+    swing = [0.0, 0.0 if between else 0.1, 0.0, 0.0]
+    motion = make_object_motion(scene, "door", *phases, hinge=swing, knob=[0.0] * 4)
+    rows = motion.positions.copy()
+    rows[3, 0] += 1.0
+    rates = np.zeros_like(rows)
+    rates[:2, motion.names.index("door.hinge")] = np.array([4.0, -4.0]) * 0.1
+    curve = Curve(motion.times, rows, rates) if between else None
+    motion = dataclasses.replace(motion, positions=rows, curve=curve)
+    steps = [vkc.GoTo(here[0] + 1.0, *here[1:]), vkc.Actuate("door", {"hinge": 0.0})]
+    report = validate(scene, steps, motion)
+    (found,) = [one for one in report.violations if one.constraint == "order"]
+    assert (found.subject, found.waypoint) == ("door", 0)
+    overshoot = 0.4 * 4.0 / 27.0  # in the second segment, to the other side
+    assert found.amount == pytest.approx(0.1 + between * overshoot)
 
 
 def test_goals_must_hold_in_order_at_phase_ends(hall: Scene) -> None:

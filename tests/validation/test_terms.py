@@ -171,6 +171,14 @@ def test_constraint_holds_after_the_wait_for_the_gripper() -> None:
     assert len(find_violations(still, ahead, vkc.GoTo(1.0, 0.0))) == 1
 
 
+def test_constraint_holds_where_the_robot_passes_its_start_again() -> None:
+    rows = np.array([move_start(START, x=x) for x in (0.0, 1.0, 0.0, 1.0)])
+    motion = make_trajectory(make_hall(), rows, dt=5.0)
+    ahead = vkc.Constraint("ahead", lambda s: s.coordinate("base_x"), lower=0.5)
+    (violation,) = find_violations(motion, ahead)
+    assert (violation.waypoint, violation.amount) == (2, pytest.approx(0.5))
+
+
 def test_nan_is_a_violation() -> None:
     motion = drive_through(make_hall(), START, move_start(START, x=2.0))
     term = vkc.Constraint("log", lambda s: ca.log(s.coordinate("base_x") - 1.0), lower=-100.0)

@@ -218,8 +218,8 @@ def _measure_joint_motion(samples: Samples, number: int) -> dict[str, tuple[floa
         if name not in driven:
             continue
         owner = name.partition(".")[0]
-        values = samples.trajectory.positions[phase.first : phase.last + 1, column]
-        if (spread := float(np.ptp(values))) > MOTION_TOLERANCE:
+        low, high = (side[phase.first : phase.last, column] for side in samples.ranges)
+        if (spread := float(high.max() - low.min())) > MOTION_TOLERANCE:
             moved[owner] = max(moved.get(owner, (0.0, "")), (spread, samples.get_unit(name)))
     return moved
 

@@ -310,3 +310,38 @@ def test_objects_at_rest_are_not_checked() -> None:
         rows = {hit.row for hit in hits if (hit.first, hit.second) == (name, "table")}
         assert rows == set() or begin <= min(rows) <= max(rows) <= end
     assert end in {hit.row for hit in hits if (hit.first, hit.second) == ("stick.stick", "table")}
+
+
+BLADE = """<robot name="blade"><link name="rail"/>
+<link name="blade"><collision><geometry><box size="0.003 0.1 0.1"/></geometry></collision></link>
+<joint name="slide" type="prismatic"><parent link="rail"/><child link="blade"/>
+  <axis xyz="1 0 0"/><limit lower="0" upper="1" velocity="9" effort="9"/></joint></robot>"""
+
+
+@pytest.mark.parametrize("part", [0.5, 3.5, 10.5, 21.5, 31.5])
+def test_thin_shapes_that_pass_each_other_between_two_samples_are_found(part: float) -> None:
+    """A blade moves by 0.2 m through a board; both are 3 mm thick, and overlap along 6 mm."""
+    grip = {"name": "grip", "link": "blade", "approach": [1, 0, 0], "closing": [0, 0, 1]}
+    blade = {"urdf": BLADE, "attachments": [grip]}
+    document = {
+        "robot": "husky_ur5e",
+        "arena": {"x": [-3.0, 3.0], "y": [-3.0, 3.0]},
+        "start": {"base": [-2.0, 0.0, 0.0]},
+        "objects": [{"name": "blade", "type": blade, "position": [0.5, 0.0, 1.0]}],
+        "obstacles": [describe_box("board", [0.003, 0.5, 0.5], [0.5 + part * 0.2 / 32, 0.0, 1.0])],
+    }
+    scene = Scene.from_document(document)
+    phase = PhaseSpan("all", 0, 1, (Hold("blade", "grip"),))
+    motion = make_object_motion(scene, "blade", phase, slide=[0.0, 0.2])
+    hits = sweep(make_table(scene, motion), World(scene).compute_positions(motion), np.arange(2))
+    found = [hit for hit in hits if (hit.first, hit.second) == ("blade.blade", "board")]
+    assert min(hit.distance for hit in found) < 0.0
+    assert {hit.row for hit in found if hit.distance < 0.0 and not hit.at_waypoint} == {0}
+
+
+def test_penetration_of_a_robot_at_rest_is_reported() -> None:
+    scene = make_hall(obstacles=[BOX])
+    scene = scene.with_start(base=[1.5, 0.0, 0.0])
+    _, _, hits = sweep_motion(scene, make_trajectory(scene, np.tile(scene.start, (3, 1))))
+    inside = [hit for hit in hits if (hit.first, hit.second) == ("base_link", "box")]
+    assert min(hit.distance for hit in inside) < -0.1

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import describe_box
-from helpers.drawers import replace_scene_fields
+from helpers.drawers import add_boxes, replace_scene_fields
 from helpers.drives import (
     DT,
     drive_through,
@@ -402,6 +402,19 @@ def test_exempt_pair_must_keep_its_own_margin(
     report = validate(replace_scene_fields(scene, allow=allow), [vkc.GoTo(1.0, 0.0)], motion)
     found = [(one.constraint, one.amount) for one in report.violations]
     assert found == ([(constraint, pytest.approx(amount, abs=1e-5))] if constraint else [])
+
+
+def test_every_pair_must_keep_the_clearance_not_only_the_nearest() -> None:
+    scene, _ = make_drive_to_a_crate(5e-4)
+    scene = add_boxes(scene, board=((0.3, 0.02, 0.3), (1.0, -0.36, 0.15)))
+    rows = np.array([scene.start, move_start(scene.start, x=1.0)])
+    motion = make_trajectory(scene, rows, dt=10.0)
+    report = validate(scene, [vkc.GoTo(1.0, 0.0)], motion, Options(dist_safe=0.02))
+    found = {one.subject.split(" – ")[1]: one for one in report.violations}
+    assert set(found) == {"crate", "board"}
+    assert {one.constraint for one in report.violations} == {"clearance"}
+    assert found["crate"].amount == pytest.approx(0.02 - 1e-3 - 5e-4, abs=1e-5)
+    assert 0.0 < found["board"].amount < found["crate"].amount - 5e-3
 
 
 def test_clearance_is_checked_from_the_first_waypoint_on() -> None:

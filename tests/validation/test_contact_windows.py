@@ -24,6 +24,7 @@ from helpers.drawers import add_boxes, load_drawer_scene, replace_scene_fields
 from helpers.drives import drive_through, make_trajectory, replace_positions
 from helpers.grippers import write_cheeks_scene, write_gripper
 from helpers.motions import make_object_motion
+from helpers.robots import compute_placement
 from helpers.small_problems import load_door_scene
 from helpers.supports import make_plate_scene, slide_plate
 
@@ -128,7 +129,9 @@ def test_hand_may_be_close_to_a_grasped_object() -> None:
     )
 
 
-@pytest.mark.parametrize(("back", "is_wrong"), [(0.9 * CONTACT_DEPTH, False), (0.05, True)])
+@pytest.mark.parametrize(
+    ("back", "is_wrong"), [(0.9 * CONTACT_DEPTH, False), (2.0 * CONTACT_DEPTH, True), (0.05, True)]
+)
 def test_pushed_links_must_not_move_back(back: float, is_wrong: bool) -> None:
     scene = load_drawer_scene()
     slide = 0.3 - np.cumsum([0.0, 0.1, 0.0, -back, 0.1])
@@ -275,7 +278,15 @@ def test_touching_link_may_be_close_to_shapes_at_the_target(gap: float, touches:
     touch = {("stick.tip", "wall"): [(20 - STEPS, 20 + STEPS)]} if touches else {}
     for goal in (tuple(target), pin.SE3(np.eye(3), target)):
         assert find_windows(scene, motion, [Touch("stick.tip", goal)]) == {**hands, **touch}
-    assert find_windows(scene, motion, [Touch("stick.tip", tuple(target + 0.05))]) == hands
+    assert find_windows(scene, motion, [Touch("stick.tip", tuple(target + 0.02))]) == hands
+
+
+def test_only_the_link_of_the_touching_frame_may_be_close() -> None:
+    scene = load_door_scene()
+    target = compute_placement(scene.robot, "forearm_link", scene.start).translation
+    scene = add_boxes(scene, ball=((0.02, 0.02, 0.02), tuple(target.tolist())))
+    found = find_windows(scene, make_stationary_motion(scene), [Touch("forearm_link", target)])
+    assert found == {("forearm_link", "ball"): [(0, 10)]}
 
 
 def test_supported_objects_move_with_their_support() -> None:
@@ -291,7 +302,12 @@ def test_supported_objects_move_with_their_support() -> None:
 
 @pytest.mark.parametrize(
     ("openings", "count"),
-    [((0.04, 0.04, 0.04), 0), ((None, 0.04, 0.04), 1), ((0.04, None, 0.04), 1)],
+    [
+        ((0.04, 0.04, 0.04), 0),
+        ((None, 0.04, 0.04), 1),
+        ((0.04, None, 0.04), 1),
+        ((0.0398, 0.04, 0.04), 1),
+    ],
 )
 def test_gripper_must_be_open_as_required(
     tmp_path: Path, openings: tuple[float | None, ...], count: int
@@ -327,10 +343,13 @@ def test_window_lasts_one_second_but_at_least_four_moving_steps(dt: float, last:
         ([2, 2, 3, 3, 4, 4, 4], 1.0),
     ],
 )
-def test_robot_must_rest_at_a_grasp(positions: list[float], rest: float) -> None:
+@pytest.mark.parametrize("grasps", [True, False], ids=["grasp", "release"])
+def test_robot_must_rest_at_a_grasp(grasps: bool, positions: list[float], rest: float) -> None:
     """The door may move meanwhile."""
-    scene, hold = load_door_scene(), (Hold("door", "handle"),)
-    phases = (PhaseSpan("reach", 0, 3), PhaseSpan("move", 3, 6, hold))
+    hold = (Hold("door", "handle"),)
+    before, after = ((), hold) if grasps else (hold, ())
+    scene = load_door_scene().with_held({hold.object: hold.attachment for hold in before})
+    phases = (PhaseSpan("before", 0, 3, before), PhaseSpan("after", 3, 6, after))
     motion = make_object_motion(scene, "door", *phases, hinge=0.01 * np.arange(7), knob=np.zeros(7))
     moves = np.outer(0.01 * np.array(positions), np.arange(len(motion.names)) == 0)
     motion = replace_positions(motion, motion.positions + moves)

@@ -145,7 +145,7 @@ SIZE, BASE = "size: [0.5, 0.4, 0.3]", "base: [0.0, 0.0, 0.5]"
         ("name: front", "name: a.b", 8, "objects[0].name", "not a name"),
         (f"box, {SIZE}", "mesh, file: none.obj", 13, "obstacles[0].file", "got none.obj"),
         ("robot: husky_ur5e\n", "", 1, "robot", "missing"),
-        (TINY, "- 1\n", 1, "", "expected fields (name: value), got [1]"),
+        (TINY, "- 1\n", 1, None, "expected fields (name: value), got [1]"),
     ],
 )
 def test_invalid_input_is_located(

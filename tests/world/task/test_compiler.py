@@ -105,9 +105,15 @@ def test_closing_joint_enters_the_range_of_its_latch_at_the_end(
     assert (move.name, move.values) == ("move door.hinge", {"door.hinge": end})
     assert move.ranges["door.hinge"] == pytest.approx(allowed)
     released = scene.with_state("door", {"knob": 0.5})
-    assert compile_steps([Actuate("door", {"hinge": end})], released).phases[-1].ranges == {
-        "door.hinge": HINGE
-    }
+    for knob, expected in ((0.5, HINGE), (0.0, allowed)):
+        step = Actuate("door", {"hinge": end, "knob": knob})
+        ranges = compile_steps([step], released).phases[-1].ranges
+        assert ranges == {"door.hinge": pytest.approx(expected), "door.knob": KNOB}
+
+
+def test_closed_door_allows_the_knob_to_turn() -> None:
+    turn = compile_steps([Actuate("door", {"knob": 0.3})]).phases[-1]
+    assert (turn.ranges, turn.values) == ({"door.knob": KNOB}, {"door.knob": 0.3})
 
 
 def test_hinge_and_knob_are_actuated_together() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import cache
 
 import numpy as np
@@ -48,6 +49,26 @@ def test_drawer_needs_a_force_along_its_slide(payload: float, velocity: float) -
     positions = (placed.object.link_placement("tray", [value]).translation for value in (1.0, 0.0))
     direction = placed.placement.rotation @ np.subtract(*positions)
     np.testing.assert_allclose(wrench, [*(expected * direction), 0.0, 0.0, 0.0], atol=1e-9)
+
+
+def test_hand_lifts_loads_but_not_the_object_itself() -> None:
+    """Springs carry the object; its slide is inclined here."""
+    scene = vkc.load_scene("drawer")
+    placed = scene.objects["drawer"]
+    tilted = pin.SE3(pin.rpy.rpyToMatrix(0.3, -0.4, 0.5), placed.placement.translation)
+    placed = dataclasses.replace(placed, placement=tilted)
+    scene = dataclasses.replace(scene, objects={**scene.objects, "drawer": placed})
+    positions = (placed.object.link_placement("tray", [value]).translation for value in (1.0, 0.0))
+    slope = float((tilted.rotation @ np.subtract(*positions))[2])
+    assert abs(slope) > 0.2
+    for payload in (0.0, 2.5):
+        loads = [(1, pin.Inertia(payload, np.zeros(3), np.zeros((3, 3))))] * (payload > 0.0)
+        handle = Handle(scene, vkc.Hold("drawer", "handle"), loads)
+        (force,) = handle.forces(make_motion(drawer_slide=(0.2, 0.3, 0.5)))[0]
+        assert force == pytest.approx((5.0 + payload) * 0.5 + payload * 9.81 * slope)
+    dishwasher = Handle(vkc.load_scene("household"), vkc.Hold("dishwasher", "handle"))
+    at_rest = make_motion(dishwasher_door=(0.5, 0.0, 0.0), dishwasher_rack=(0.0, 0.0, 0.0))
+    np.testing.assert_array_equal(dishwasher.forces(at_rest), 0.0)
 
 
 @cache

@@ -332,7 +332,7 @@ def test_step_that_begins_in_a_dead_end_is_planned_with_the_one_before() -> None
 def test_failed_step_stays_alone_if_its_holds_cannot_be_joined() -> None:
     """Two holds of one joint are no chain, so that the step is not planned with the one before.
 
-    A post stands in the way of the door between the ends of both steps.
+    A post blocks the door between the ends of both steps.
     """
     scene, options = make_refrigerator(), vkc.Options()
     refrigerator = scene.objects["it"]

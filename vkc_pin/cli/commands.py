@@ -281,10 +281,10 @@ def _simulate(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
 
     files = _get_given(arguments, "html", "picture", "video", "json")
-    inputs = _get_given(arguments, "plan", "actual")
-    _check_outputs(
-        files, **{"PLAN" if name == "plan" else "--actual": inputs[name] for name in inputs}
-    )
+    inputs = {"PLAN": arguments.plan}
+    if arguments.actual is not None:
+        inputs["--actual"] = arguments.actual
+    _check_outputs(files, **inputs)
     plan = vkc.Plan.load(arguments.plan)
     actual = None
     if arguments.actual is not None:

@@ -267,6 +267,8 @@ class Register:
         lost = {
             name for name in {row["scene"] for row in rows} if not has_intact_scene(scenes, name)
         }
+        for name in lost:  # a damaged file would stay
+            (scenes / f"{name}.json").unlink(missing_ok=True)
         path = folder / f"shard-{k:05d}.hdf5"
         files = [get_work_file(self.dataset.folder, number) for number in numbers]
         existing = read_intact_numbers(path)

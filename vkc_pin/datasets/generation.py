@@ -169,8 +169,8 @@ def _open_journal(folder: Path, recipe: Recipe) -> Iterator[Journal]:
     file = folder / "journal.jsonl"
     if folder.exists() and not folder.is_dir():
         raise InputError("`out` is not a folder", file=folder, field="out")
-    others = not all(map(is_leftover, folder.iterdir())) if folder.is_dir() else False
-    if others and not file.is_file():
+    has_others = folder.is_dir() and not all(map(is_leftover, folder.iterdir()))
+    if has_others and not file.is_file():
         expected = "a new or empty folder, or one with episodes of this recipe"
         raise InputError(
             "the folder holds other files", file=folder, field="out", expected=expected

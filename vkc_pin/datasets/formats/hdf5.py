@@ -158,15 +158,12 @@ def _make_masks(numbers: Sequence[int]) -> dict[str, list[str]]:
 
 
 def _keep_scene(found: Group, name: str, scenes: Path) -> None:
-    """Write the scene of an episode unless it exists and is intact."""
-    if "scene" not in found.list_names():
-        return
-    with contextlib.suppress(InputError):
-        read_scene(scenes, name)
-        return
-    data = found.read_array("scene", "u1", (None,)).tobytes()
-    _check_scene(parse_json(data.decode(errors="replace"), found.file), name, found.file)
-    write_atomically(scenes / f"{name}.json", data)
+    """Write the scene of an episode unless it exists."""
+    path = scenes / f"{name}.json"
+    if "scene" in found.list_names() and not path.is_file():
+        data = found.read_array("scene", "u1", (None,)).tobytes()
+        _check_scene(parse_json(data.decode(errors="replace"), found.file), name, found.file)
+        write_atomically(path, data)
 
 
 def _make_arrays(episode: Episode, robot: Robot, rate: float) -> dict[str, NDArray[np.generic]]:

@@ -128,9 +128,7 @@ def _regrasp(scene: Scene, step: Step) -> tuple[Release, Actuate | Place] | None
 
     A free object is released only if it rests on a support.
     """
-    if not isinstance(step, Actuate | Place):
-        return None
-    if not _keeps_grasp(scene, step):
+    if not isinstance(step, Actuate | Place) or not _keeps_grasp(scene, step):
         return None
     placed = scene.objects[step.object]
     if placed.object.free and not find_supports(placed, _list_resting_shapes(scene)):
